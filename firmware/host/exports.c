@@ -1,0 +1,112 @@
+/* For tests in Python: sizes and fields of what the portable files hold. */
+#include <string.h>
+
+#include "board.h"
+
+uint32_t host_board_bytes(void);
+uint32_t host_chip_bytes(void);
+uint32_t host_writer_bytes(void);
+uint32_t host_reader_bytes(void);
+void host_board_init(struct board *board, const struct hardware *hardware, const uint8_t *device_id, bool can_transmit,
+                     uint8_t reset_cause);
+struct dw1000 *host_board_chip(struct board *board);
+uint32_t host_board_stage(const struct board *board);
+uint32_t host_chip_state(const struct dw1000 *chip);
+uint64_t host_chip_number(const struct dw1000 *chip, uint32_t which);
+const uint8_t *host_chip_frame(const struct dw1000 *chip);
+const uint8_t *host_writer_line(const struct link_writer *writer);
+uint32_t host_writer_length(const struct link_writer *writer);
+const uint8_t *host_reader_record(const struct link_reader *reader);
+uint32_t host_reader_number(const struct link_reader *reader, uint32_t which);
+
+uint32_t host_board_bytes(void)
+{
+    return sizeof(struct board);
+}
+
+uint32_t host_chip_bytes(void)
+{
+    return sizeof(struct dw1000);
+}
+
+uint32_t host_writer_bytes(void)
+{
+    return sizeof(struct link_writer);
+}
+
+uint32_t host_reader_bytes(void)
+{
+    return sizeof(struct link_reader);
+}
+
+void host_board_init(struct board *board, const struct hardware *hardware, const uint8_t *device_id, bool can_transmit,
+                     uint8_t reset_cause)
+{
+    struct board_identity identity = {.can_transmit = can_transmit, .reset_cause = reset_cause};
+
+    (void)memcpy(identity.device_id, device_id, sizeof identity.device_id);
+    board_init(board, hardware, &identity);
+}
+
+struct dw1000 *host_board_chip(struct board *board)
+{
+    return &board->chip;
+}
+
+uint32_t host_board_stage(const struct board *board)
+{
+    return (uint32_t)board->stage;
+}
+
+uint32_t host_chip_state(const struct dw1000 *chip)
+{
+    return (uint32_t)chip->state;
+}
+
+/* Numbers that a test asks for, in the order of its list. */
+uint64_t host_chip_number(const struct dw1000 *chip, uint32_t which)
+{
+    const uint64_t numbers[] = {
+        chip->received,
+        chip->errors,
+        chip->sent,
+        chip->late,
+        chip->rx_ticks,
+        chip->tx_ticks,
+        chip->frame_bytes,
+        (uint64_t)(int64_t)chip->rx_power_cdbm,
+        (uint64_t)(int64_t)chip->first_path_cdbm,
+        (uint64_t)(int64_t)chip->offset_ppb,
+        (uint64_t)(int64_t)chip->temperature_cc,
+        chip->millivolts,
+    };
+
+    return numbers[which];
+}
+
+const uint8_t *host_chip_frame(const struct dw1000 *chip)
+{
+    return chip->frame;
+}
+
+const uint8_t *host_writer_line(const struct link_writer *writer)
+{
+    return writer->line;
+}
+
+uint32_t host_writer_length(const struct link_writer *writer)
+{
+    return writer->length;
+}
+
+const uint8_t *host_reader_record(const struct link_reader *reader)
+{
+    return reader->record;
+}
+
+uint32_t host_reader_number(const struct link_reader *reader, uint32_t which)
+{
+    const uint32_t numbers[] = {reader->length, reader->garbled, reader->overlong};
+
+    return numbers[which];
+}

@@ -1,0 +1,482 @@
+#include "board.h"
+
+#include <string.h>
+
+/* Version of the firmware, in HELLO */
+static const uint8_t VERSION[3] = {0u, 2u, 0u};
+
+/* How long before its time a frame is handed to the chip: a reception that is being reported then, the SPI, the preamble
+ * (docs/hardware.md), and two steps of a clock of 30 us. */
+#define LEAD_US 600
+/* A time closer than this is not checked again against the chip's counter. */
+#define CLOSE_US 30
+/* After its time a frame is cancelled if the chip has not reported that it was sent. */
+#define OVERDUE_US 2000
+/* How often the chip is polled without its interrupt line being high: one that has lost its settings raises none. */
+#define POLL_US 50000u
+/* The same where the line does not follow the chip's events: shorter than a slot less a frame. */
+#define FAST_POLL_US 250u
+/* So many polls in a row that disagree with the interrupt line show that it is stuck. */
+#define DISAGREEMENTS 4u
+/* A silence of this length is an empty slot of 2.1 ms, with 1.6 ms left of it. */
+#define QUIET_US 2400u
+/* Nothing long is begun in this time before a frame is due. */
+#define CLEARANCE_US 5000
+/* How often a chip is asked for its settings: after a failed supply it may receive nothing for ever and look normal. */
+#define CHECK_US 1000000u
+/* How often temperature and supply are measured, which takes 1.1 ms without the receiver: in a free slot, */
+#define MEASURE_US 10000000u
+/* or wherever no frame is due, if there was no free slot for so long. */
+#define MEASURE_ANYWHERE_US 60000000u
+/* After so many garbled lines in a row the line is restarted. */
+#define GARBLED_IN_A_ROW 20u
+/* Period of the light that blinks, as a bit of the clock: 0.52 s on, 0.52 s off. */
+#define BLINK_BIT 0x80000u
+#define READ_BYTES 64u
+
+static int32_t from_to(uint32_t earlier_us, uint32_t later_us)
+{
+    return (int32_t)(later_us - earlier_us);
+}
+
+/* To the host */
+
+static bool send_line(struct board *board)
+{
+    bool fits = board->hardware->write_line(board->writer.line, board->writer.length);
+
+    if (!fits) {
+        board->unsent++;
+    }
+    return fits;
+}
+
+static void send_hello(struct board *board)
+{
+    struct link_hello hello;
+
+    (void)memcpy(hello.firmware, VERSION, sizeof hello.firmware);
+    (void)memcpy(hello.identity, board->identity.device_id, sizeof hello.identity);
+    hello.capabilities = board->identity.can_transmit ? LINK_CAN_TRANSMIT : 0u;
+    hello.reset_cause = board->identity.reset_cause;
+    link_write_hello(&board->writer, &hello);
+    (void)send_line(board);
+}
+
+static void send_status(struct board *board)
+{
+    const struct dw1000 *chip = &board->chip;
+    struct link_status status = {0};
+
+    if (board->is_configured) {
+        status.state |= LINK_IS_CONFIGURED;
+        status.now_ticks = dw1000_now(&board->chip);
+    }
+    if (board->is_receiving) {
+        status.state |= LINK_IS_RECEIVING;
+    }
+    if (board->stage != NO_FRAME) {
+        status.state |= LINK_HAS_FRAME_WAITING;
+    }
+    if (board->is_polled) {
+        status.state |= LINK_IS_POLLED;
+    }
+    status.received = chip->received;
+    status.errors = chip->errors;
+    status.sent = chip->sent;
+    status.late = board->late;
+    status.garbled = board->unknown + board->reader.garbled + board->reader.overlong;
+    status.unsent = board->unsent;
+    status.temperature_cc = chip->temperature_cc;
+    status.millivolts = chip->millivolts;
+    link_write_status(&board->writer, &status);
+    (void)send_line(board);
+}
+
+static void refuse(struct board *board, uint32_t kind, uint32_t reason)
+{
+    link_write_refused(&board->writer, kind, reason);
+    (void)send_line(board);
+}
+
+static void report_late(struct board *board, uint64_t dx_ticks, uint32_t reason)
+{
+    board->late++;
+    link_write_tx_late(&board->writer, dx_ticks, reason);
+    (void)send_line(board);
+}
+
+/* The chip */
+
+/* Report that the frame held will not be sent. */
+static void forget_frame(struct board *board)
+{
+    if (board->stage != NO_FRAME) {
+        board->stage = NO_FRAME;
+        report_late(board, board->dx_ticks, LINK_LATE_NOT_READY);
+    }
+}
+
+/* The chip has lost its settings; after a HELLO the host asks for the state, and configures it again. */
+static void on_lost(struct board *board)
+{
+    forget_frame(board);
+    board->is_configured = false;
+    board->is_receiving = false;
+    send_hello(board);
+}
+
+/* Compare the interrupt line before a poll with what the poll has found: one that is high without an event, or low with
+ * one, several times in a row, is stuck until the opposite is seen. */
+static void judge_line(struct board *board, bool was_high, bool had_event)
+{
+    if (was_high) {
+        board->low_with_event = 0u;
+        if (board->high_without_event < DISAGREEMENTS) {
+            board->high_without_event = had_event ? 0u : (board->high_without_event + 1u);
+        }
+    } else {
+        board->high_without_event = 0u;
+        if (had_event && (board->low_with_event < DISAGREEMENTS)) {
+            board->low_with_event++;
+        }
+    }
+    board->is_polled = (board->high_without_event == DISAGREEMENTS) || (board->low_with_event == DISAGREEMENTS);
+}
+
+/* Report what has happened at the chip. */
+static void poll(struct board *board, bool line_is_high)
+{
+    struct dw1000 *chip = &board->chip;
+    uint32_t events = dw1000_poll(chip);
+
+    judge_line(board, line_is_high, events != 0u);
+    if (events == 0u) {
+        return;
+    }
+    if ((events & DW1000_RECEIVED) != 0u) {
+        const struct link_measured measured = {chip->rx_power_cdbm, chip->first_path_cdbm, chip->offset_ppb};
+
+        link_write_rx(&board->writer, chip->rx_ticks, &measured, chip->frame, chip->frame_bytes);
+        (void)send_line(board);
+    }
+    if (((events & DW1000_SENT) != 0u) && (board->stage == FRAME_HANDED_OVER)) {
+        board->stage = NO_FRAME;
+        board->is_own_slot = true;
+        link_write_tx_done(&board->writer, board->dx_ticks, chip->tx_ticks);
+        (void)send_line(board);
+    }
+    if ((events & DW1000_LOST) != 0u) {
+        on_lost(board);
+    }
+    board->busy_us = board->hardware->now_us();
+}
+
+static bool is_poll_due(const struct board *board, bool line_is_high, uint32_t now_us)
+{
+    if (line_is_high && !board->is_polled) {
+        return true;
+    }
+    return (now_us - board->polled_us) >= (board->is_polled ? FAST_POLL_US : POLL_US);
+}
+
+/* The frame to be sent */
+
+static void hand_over(struct board *board)
+{
+    enum dw1000_queued result;
+
+    if (board->is_polled || board->hardware->interrupt_line()) {
+        poll(board, board->hardware->interrupt_line()); /* or a frame that has just come would be lost */
+        if (board->stage != FRAME_HELD) {
+            return;
+        }
+    }
+    result = dw1000_transmit_at(&board->chip, board->dx_ticks, board->frame, board->frame_bytes);
+    if (result == DW1000_QUEUED) {
+        board->stage = FRAME_HANDED_OVER;
+        board->due_us = board->hardware->now_us() + LEAD_US + OVERDUE_US;
+    } else {
+        board->stage = NO_FRAME;
+        report_late(board, board->dx_ticks, (uint32_t)result); /* the driver's reasons have the link's numbers */
+    }
+}
+
+/* The frame is due by the board's clock: hand it over, or cancel it when it is overdue. That clock may be off by a few
+ * per cent, so the time left is read from the chip until it is short. */
+static void serve_frame(struct board *board)
+{
+    const struct hardware *hardware = board->hardware;
+    int32_t left_us;
+
+    if (board->stage == FRAME_HANDED_OVER) {
+        board->due_us = hardware->now_us() + OVERDUE_US;
+        if (dw1000_cancel(&board->chip)) {
+            board->stage = NO_FRAME;
+            report_late(board, board->dx_ticks, LINK_LATE_FOR_RADIO);
+        }
+        return;
+    }
+    left_us = dw1000_micros_until(dw1000_now(&board->chip), board->dx_ticks) - LEAD_US;
+    if (left_us > CLOSE_US) {
+        board->due_us = hardware->now_us() + (uint32_t)(left_us - (left_us / 16));
+    } else {
+        hand_over(board);
+    }
+}
+
+/* The host */
+
+static void accept_frame(struct board *board, const uint8_t *record, uint32_t length)
+{
+    const uint8_t *frame = &record[LINK_TX_FRAME_AT];
+    uint32_t frame_bytes = length - LINK_TX_FRAME_AT;
+    bool is_ready = board->is_configured && board->identity.can_transmit;
+    uint64_t dx_ticks;
+
+    if ((length < (LINK_TX_FRAME_AT + DW1000_MIN_PSDU_BYTES)) || (frame_bytes > DW1000_MAX_PSDU_BYTES) ||
+        (link_fcs(frame, frame_bytes - 2u) != link_number(&frame[frame_bytes - 2u], 2u))) {
+        refuse(board, LINK_TX_AT, LINK_REFUSED_MALFORMED);
+        return;
+    }
+    dx_ticks = link_number(&record[LINK_BODY_AT], LINK_STAMP_BYTES);
+    if (!is_ready) {
+        report_late(board, dx_ticks, LINK_LATE_NOT_READY);
+    } else if (board->stage != NO_FRAME) {
+        report_late(board, dx_ticks, LINK_LATE_BUSY);
+    } else {
+        board->dx_ticks = dx_ticks;
+        board->frame_bytes = frame_bytes;
+        (void)memcpy(board->frame, frame, frame_bytes);
+        board->stage = FRAME_HELD;
+        board->due_us = board->hardware->now_us(); /* its time is read in this turn */
+    }
+}
+
+static bool is_known_setting(const uint8_t *record)
+{
+    /* Channel 5, PRF 64 MHz, 6.8 Mbit/s, code 9, 128 symbols */
+    return (record[2] == 5u) && (record[3] == 64u) && (record[4] == 2u) && (record[5] == 9u) &&
+           (link_number(&record[6], 2u) == 128u);
+}
+
+static void configure(struct board *board, const uint8_t *record, uint32_t length)
+{
+    if (length < LINK_CONFIG_BYTES) {
+        refuse(board, LINK_CONFIG, LINK_REFUSED_MALFORMED);
+        return;
+    }
+    if (!is_known_setting(record)) {
+        refuse(board, LINK_CONFIG, LINK_REFUSED_SETTING);
+        return;
+    }
+    forget_frame(board);
+    board->is_receiving = false;
+    board->is_configured =
+        dw1000_start(&board->chip, (uint32_t)link_number(&record[8], 2u), (uint32_t)link_number(&record[10], 2u));
+    board->was_refused = !board->is_configured;
+    board->high_without_event = 0u;
+    board->low_with_event = 0u;
+    board->is_polled = false;
+    board->checked_us = board->hardware->now_us();
+    if (board->is_configured) {
+        send_status(board);
+    } else {
+        refuse(board, LINK_CONFIG, LINK_REFUSED_RADIO);
+    }
+}
+
+static void receive(struct board *board)
+{
+    if (board->is_configured) {
+        board->is_receiving = true;
+        dw1000_receive(&board->chip);
+        send_status(board);
+    } else {
+        refuse(board, LINK_RX_ON, LINK_REFUSED_MALFORMED);
+    }
+}
+
+static void obey(struct board *board, const uint8_t *record, uint32_t length)
+{
+    switch (record[0]) {
+    case LINK_TX_AT:
+        accept_frame(board, record, length);
+        break;
+    case LINK_ASK_STATUS:
+        send_status(board);
+        break;
+    case LINK_ASK_HELLO:
+        send_hello(board);
+        break;
+    case LINK_CONFIG:
+        configure(board, record, length);
+        break;
+    case LINK_RX_ON:
+        receive(board);
+        break;
+    default:
+        board->unknown++;
+        break;
+    }
+}
+
+/* Obey the commands in what has come; whether anything has. */
+static bool serve_host(struct board *board)
+{
+    struct link_reader *reader = &board->reader;
+    uint8_t data[READ_BYTES];
+    uint32_t size = board->hardware->read_line(data, sizeof data);
+    uint32_t at = 0u;
+
+    while (at < size) {
+        at += link_read(reader, &data[at], size - at);
+        if (reader->length > 0u) {
+            board->understood_until = reader->garbled + reader->overlong;
+            obey(board, reader->record, reader->length);
+        }
+    }
+    if ((reader->garbled + reader->overlong - board->understood_until) >= GARBLED_IN_A_ROW) {
+        board->understood_until = reader->garbled + reader->overlong;
+        board->hardware->restart_line();
+    }
+    return size > 0u;
+}
+
+/* What can wait */
+
+/* Whether a millisecond and a half is free: the rest of the own slot, or of an empty one; never where a frame is on its
+ * way out, nor shortly before one is due. */
+static bool is_free(const struct board *board, uint32_t now_us)
+{
+    if ((board->stage == FRAME_HANDED_OVER) ||
+        ((board->stage == FRAME_HELD) && (from_to(now_us, board->due_us) < CLEARANCE_US))) {
+        return false;
+    }
+    return board->is_own_slot || ((now_us - board->busy_us) >= QUIET_US) ||
+           ((now_us - board->measured_us) >= MEASURE_ANYWHERE_US);
+}
+
+/* Check and measure a chip that is configured. */
+static void do_chores(struct board *board, uint32_t now_us)
+{
+    if ((now_us - board->checked_us) >= CHECK_US) {
+        board->checked_us = now_us;
+        if (!dw1000_check(&board->chip)) {
+            on_lost(board);
+            return;
+        }
+    }
+    if (((now_us - board->measured_us) >= MEASURE_US) && is_free(board, now_us)) {
+        board->measured_us = now_us;
+        (void)dw1000_measure(&board->chip);
+    }
+}
+
+/* The whole */
+
+static void show(const struct board *board, uint32_t now_us)
+{
+    uint32_t lights = 0u;
+
+    if (board->is_receiving || ((now_us & BLINK_BIT) != 0u)) {
+        lights |= LIGHT_READY;
+    }
+    if ((board->chip.received & 16u) != 0u) {
+        lights |= LIGHT_RECEIVED;
+    }
+    if ((board->chip.sent & 4u) != 0u) {
+        lights |= LIGHT_SENT;
+    }
+    if (board->was_refused || board->is_polled) {
+        lights |= LIGHT_FAULT;
+    }
+    board->hardware->show(lights);
+}
+
+static uint32_t least(uint32_t one, uint32_t other)
+{
+    return (one < other) ? one : other;
+}
+
+/* What is left of a period that began at `since_us`. */
+static uint32_t left_of(uint32_t period_us, uint32_t since_us, uint32_t now_us)
+{
+    uint32_t passed_us = now_us - since_us;
+
+    return (passed_us >= period_us) ? 0u : (period_us - passed_us);
+}
+
+/* Until something has to be done by the clock. */
+static uint32_t idle_us(const struct board *board, bool has_read, bool line_is_high)
+{
+    uint32_t now_us = board->hardware->now_us();
+    uint32_t left_us = BLINK_BIT - (now_us & (BLINK_BIT - 1u));
+
+    if (has_read || (line_is_high && board->is_configured && !board->is_polled)) {
+        return 0u;
+    }
+    if (board->is_configured) {
+        left_us = least(left_us, left_of(board->is_polled ? FAST_POLL_US : POLL_US, board->polled_us, now_us));
+        left_us = least(left_us, left_of(CHECK_US, board->checked_us, now_us));
+        if ((now_us - board->measured_us) >= MEASURE_US) {
+            uint32_t quiet_us = left_of(QUIET_US, board->busy_us, now_us);
+
+            left_us = least(left_us, (quiet_us == 0u) ? POLL_US : quiet_us);
+        }
+    }
+    if (board->stage != NO_FRAME) {
+        int32_t due_in_us = from_to(now_us, board->due_us);
+
+        left_us = least(left_us, (due_in_us > 0) ? (uint32_t)due_in_us : 0u);
+    }
+    return left_us;
+}
+
+void board_init(struct board *board, const struct hardware *hardware, const struct board_identity *identity)
+{
+    (void)memset(board, 0, sizeof *board);
+    board->hardware = hardware;
+    board->identity = *identity;
+    dw1000_init(&board->chip, hardware);
+    board->busy_us = hardware->now_us();
+    board->polled_us = board->busy_us;
+    board->checked_us = board->busy_us;
+    board->measured_us = board->busy_us - MEASURE_US;
+    board->chip.millivolts = LINK_NO_VOLTAGE;
+}
+
+void board_begin(struct board *board)
+{
+    const uint8_t zero = 0u;
+
+    (void)board->hardware->write_line(&zero, 1u);
+    send_hello(board);
+}
+
+uint32_t board_turn(struct board *board)
+{
+    uint32_t now_us = board->hardware->now_us();
+    bool line_is_high = board->hardware->interrupt_line();
+    bool has_read;
+
+    board->is_own_slot = false;
+    if (board->is_configured && is_poll_due(board, line_is_high, now_us)) {
+        board->polled_us = now_us;
+        poll(board, line_is_high);
+    }
+    has_read = serve_host(board);
+    if (has_read) {
+        board->busy_us = board->hardware->now_us();
+    }
+    now_us = board->hardware->now_us();
+    if ((board->stage != NO_FRAME) && (from_to(board->due_us, now_us) >= 0)) {
+        serve_frame(board);
+    } else if (board->is_configured) {
+        do_chores(board, now_us);
+    } else {
+        /* nothing to do before the host has configured the chip */
+    }
+    show(board, now_us);
+    return idle_us(board, has_read, board->hardware->interrupt_line());
+}

@@ -1,0 +1,70 @@
+/* A board that receives and sends for its host: the chip's driver on one side, the serial link on the other.
+ *
+ * The host decides (docs/serial.md). The board holds at most one frame until shortly before its time, because the
+ * receiver is off from then on.
+ */
+#ifndef BOARD_H
+#define BOARD_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "dw1000.h"
+#include "hardware.h"
+#include "link.h"
+
+enum frame_stage { NO_FRAME, FRAME_HELD, FRAME_HANDED_OVER };
+
+/* What a board is. */
+struct board_identity {
+    bool can_transmit;
+    uint8_t device_id[LINK_IDENTITY_BYTES];
+    uint8_t reset_cause; /* as in HELLO */
+};
+
+struct board {
+    const struct hardware *hardware;
+    struct board_identity identity;
+    struct dw1000 chip;
+    struct link_writer writer;
+    struct link_reader reader;
+    bool is_configured;
+    bool is_receiving;
+    bool was_refused; /* the chip did not start when it was last configured */
+
+    /* The frame that the host wants to be sent */
+    enum frame_stage stage;
+    uint64_t dx_ticks;
+    uint32_t frame_bytes;
+    uint8_t frame[DW1000_MAX_PSDU_BYTES];
+
+    /* Counts since the start, as in STATUS */
+    uint32_t late;
+    uint32_t unknown;
+    uint32_t unsent;
+    uint32_t understood_until; /* garbled and overlong lines up to the last record */
+
+    /* Polls in a row that the interrupt line does not agree with */
+    uint32_t high_without_event;
+    uint32_t low_with_event;
+    bool is_polled; /* it is stuck */
+
+    /* Times of `now_us` */
+    uint32_t due_us;      /* when the frame is looked at again */
+    uint32_t polled_us;
+    uint32_t busy_us;     /* last event of chip or host */
+    uint32_t checked_us;
+    uint32_t measured_us;
+    bool is_own_slot;     /* the own frame has just left */
+};
+
+void board_init(struct board *board, const struct hardware *hardware, const struct board_identity *identity);
+
+/* Send the identity, after a 0 that ends whatever was on the line. */
+void board_begin(struct board *board);
+
+/* Serve chip, host and time once. For how many microseconds nothing is to be done unless the interrupt line rises or
+ * bytes come; 0: call it again at once. */
+uint32_t board_turn(struct board *board);
+
+#endif

@@ -1,0 +1,132 @@
+/* The serial link between a board and its host, to the byte (docs/serial.md): framing, check, records.
+ *
+ * A record is kind | number | body | CRC-16, made free of zeros (COBS) and ended by a 0 byte. The host's end is
+ * src/skyless/radios/serial/link.py; a test compares both.
+ */
+#ifndef LINK_H
+#define LINK_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#define LINK_MAJOR 1u
+#define LINK_MINOR 1u
+
+/* From the board */
+#define LINK_HELLO 0x01u
+#define LINK_RX 0x02u
+#define LINK_TX_DONE 0x03u
+#define LINK_TX_LATE 0x04u
+#define LINK_STATUS 0x05u
+#define LINK_REFUSED 0x06u
+
+/* From the host */
+#define LINK_ASK_HELLO 0x41u
+#define LINK_CONFIG 0x42u
+#define LINK_TX_AT 0x43u
+#define LINK_RX_ON 0x44u
+#define LINK_ASK_STATUS 0x45u
+
+#define LINK_BODY_AT 2u /* after kind and number */
+#define LINK_TX_FRAME_AT 7u
+#define LINK_CONFIG_BYTES 13u
+#define LINK_IDENTITY_BYTES 8u
+#define LINK_STAMP_BYTES 5u
+
+#define LINK_NOT_MEASURED (-32768)
+#define LINK_NO_VOLTAGE 0xFFFFu
+
+#define LINK_CAN_TRANSMIT 0x01u
+
+/* State in STATUS */
+#define LINK_IS_CONFIGURED 0x01u
+#define LINK_IS_RECEIVING 0x02u
+#define LINK_HAS_FRAME_WAITING 0x04u
+#define LINK_IS_POLLED 0x08u /* the chip's interrupt line does not follow its events */
+
+/* Why a frame was not sent */
+#define LINK_LATE_FOR_RADIO 1u
+#define LINK_LATE_BUSY 2u
+#define LINK_LATE_NOT_READY 3u
+
+/* Why a command was refused */
+#define LINK_REFUSED_SETTING 1u
+#define LINK_REFUSED_MALFORMED 2u
+#define LINK_REFUSED_RADIO 3u
+
+#define LINK_RATE_KHZ 63897600u
+#define LINK_COUNTER_BITS 40u
+#define LINK_COUNT_MASK 0x3FFFFFFFu
+
+#define LINK_MAX_RECORD_BYTES 250u /* with its check */
+#define LINK_MAX_LINE_BYTES 253u   /* with code and 0, and one that is never needed */
+
+/* Writes records; each function leaves a line in `line`, `length` bytes. */
+struct link_writer {
+    uint32_t length;
+    uint32_t fill;
+    uint8_t number;
+    uint8_t record[LINK_MAX_RECORD_BYTES];
+    uint8_t line[LINK_MAX_LINE_BYTES];
+};
+
+/* Measured values of a reception, as the link carries them. */
+struct link_measured {
+    int32_t rx_power_cdbm;
+    int32_t first_path_cdbm;
+    int32_t offset_ppb;
+};
+
+struct link_status {
+    uint64_t now_ticks;
+    uint32_t state;
+    uint32_t received;
+    uint32_t errors;
+    uint32_t sent;
+    uint32_t late;
+    uint32_t garbled;
+    uint32_t unsent;
+    int32_t temperature_cc;
+    uint32_t millivolts;
+};
+
+struct link_hello {
+    uint8_t firmware[3];
+    uint8_t identity[LINK_IDENTITY_BYTES];
+    uint32_t capabilities;
+    uint32_t reset_cause;
+};
+
+void link_write_hello(struct link_writer *writer, const struct link_hello *hello);
+void link_write_rx(struct link_writer *writer, uint64_t rx_ticks, const struct link_measured *measured,
+                   const uint8_t *frame, uint32_t frame_bytes);
+void link_write_tx_done(struct link_writer *writer, uint64_t dx_ticks, uint64_t tx_ticks);
+void link_write_tx_late(struct link_writer *writer, uint64_t dx_ticks, uint32_t reason);
+void link_write_status(struct link_writer *writer, const struct link_status *status);
+void link_write_refused(struct link_writer *writer, uint32_t kind, uint32_t reason);
+
+/* Finds records in bytes that may hold anything. `record[0..length)` is the one that was found, without its check;
+ * `length` is 0 where there is none. */
+struct link_reader {
+    uint32_t length;
+    uint32_t garbled;  /* stretches between two zeros that are no record */
+    uint32_t overlong; /* those that no record can be */
+    uint32_t fill;
+    bool is_skipping;
+    uint8_t line[LINK_MAX_RECORD_BYTES + 2u];
+    uint8_t record[LINK_MAX_RECORD_BYTES + 2u];
+};
+
+/* Process `data` up to the end of the next record; how many bytes that were. */
+uint32_t link_read(struct link_reader *reader, const uint8_t *data, uint32_t size);
+
+/* CRC-16/IBM-3740: x^16 + x^12 + x^5 + 1 from 0xFFFF; 0 over what ends with its own, high byte first. */
+uint32_t link_crc16(const uint8_t *data, uint32_t size);
+
+/* The frame check sequence of IEEE 802.15.4 (7.2.10): the same polynomial, reflected, from 0. */
+uint32_t link_fcs(const uint8_t *data, uint32_t size);
+
+/* Little-endian number of up to eight bytes. */
+uint64_t link_number(const uint8_t *data, uint32_t size);
+
+#endif

@@ -1,0 +1,132 @@
+/* The receiver fills a ring again and again (short from ENDRX to STARTRX), and TIMER1 counts its bytes through PPI. What
+ * is sent waits in another ring, from which the transmitter gets one piece after the other. */
+#include "serial_port.h"
+
+#include "nrf52832.h"
+#include "pins.h"
+
+#define IN_BYTES UARTE_MOST_BYTES
+#define OUT_BYTES 1024u
+#define STOP_TURNS 2000u /* loops of some 0.1 us: longer than the bytes in the receiver's buffer */
+
+static uint8_t in_ring[IN_BYTES];
+static uint32_t in_at;
+static uint32_t in_count; /* bytes read since the receiver's start */
+static uint8_t out_ring[OUT_BYTES];
+static uint32_t out_at;
+static uint32_t out_held;
+static uint32_t out_sending; /* of these, the piece that the transmitter has */
+
+static void start_receiver(void)
+{
+    TIMER1_STOP = 1u;
+    TIMER1_CLEAR = 1u;
+    TIMER1_START = 1u;
+    in_at = 0u;
+    in_count = 0u;
+    UARTE_RXD_PTR = (uint32_t)in_ring;
+    UARTE_RXD_MAXCNT = IN_BYTES;
+    UARTE_SHORTS = UARTE_SHORT_ENDRX_STARTRX;
+    UARTE_STARTRX = 1u;
+}
+
+void serial_port_start(void)
+{
+    GPIO_OUTSET = 1u << PIN_UART_TX;
+    GPIO_PIN_CNF(PIN_UART_TX) = PIN_OUTPUT;
+    GPIO_PIN_CNF(PIN_UART_RX) = PIN_INPUT_PULL_UP;
+    UARTE_PSEL_RTS = NOT_CONNECTED;
+    UARTE_PSEL_CTS = NOT_CONNECTED;
+    UARTE_PSEL_TXD = PIN_UART_TX;
+    UARTE_PSEL_RXD = PIN_UART_RX;
+    UARTE_BAUDRATE = UARTE_1_MBAUD;
+    UARTE_CONFIG = 0u;
+    UARTE_ENABLE = UARTE_ENABLED;
+    TIMER1_MODE = TIMER_COUNTS;
+    TIMER1_BITMODE = TIMER_32_BITS;
+    PPI_CH0_EEP = UARTE_RXDRDY_ADDRESS;
+    PPI_CH0_TEP = TIMER1_COUNT_ADDRESS;
+    PPI_CHENSET = 1u;
+    UARTE_INTENSET = UARTE_INT_RXDRDY | UARTE_INT_ENDTX;
+    NVIC_ISER0 = 1u << UARTE_IRQ;
+    start_receiver();
+}
+
+void serial_port_restart(void)
+{
+    UARTE_SHORTS = 0u;
+    UARTE_RXTO = 0u;
+    UARTE_STOPRX = 1u;
+    for (uint32_t turn = 0u; (turn < STOP_TURNS) && (UARTE_RXTO == 0u); turn++) {
+    }
+    start_receiver();
+}
+
+uint32_t serial_port_read(uint8_t *into, uint32_t size)
+{
+    uint32_t fresh;
+    uint32_t count;
+
+    UARTE_RXDRDY = 0u;
+    TIMER1_CAPTURE0 = 1u;
+    fresh = TIMER1_CC0 - in_count;
+    if (fresh > IN_BYTES) { /* overwritten */
+        in_at = (in_at + fresh) % IN_BYTES;
+        in_count += fresh;
+        fresh = 0u;
+    }
+    count = (fresh < size) ? fresh : size;
+    for (uint32_t at = 0u; at < count; at++) {
+        into[at] = in_ring[in_at];
+        in_at++;
+        if (in_at == IN_BYTES) {
+            in_at = 0u;
+        }
+    }
+    in_count += count;
+    return count;
+}
+
+void serial_port_pump(void)
+{
+    uint32_t to_end;
+
+    if (out_sending > 0u) {
+        if (UARTE_ENDTX == 0u) {
+            return;
+        }
+        UARTE_ENDTX = 0u;
+        out_at = (out_at + out_sending) % OUT_BYTES;
+        out_held -= out_sending;
+        out_sending = 0u;
+    }
+    if (out_held > 0u) {
+        to_end = OUT_BYTES - out_at;
+        out_sending = (out_held < to_end) ? out_held : to_end;
+        if (out_sending > UARTE_MOST_BYTES) {
+            out_sending = UARTE_MOST_BYTES;
+        }
+        UARTE_TXD_PTR = (uint32_t)&out_ring[out_at];
+        UARTE_TXD_MAXCNT = out_sending;
+        UARTE_STARTTX = 1u;
+    }
+}
+
+bool serial_port_write(const uint8_t *line, uint32_t size)
+{
+    uint32_t fill = (out_at + out_held) % OUT_BYTES;
+
+    if (size > (OUT_BYTES - out_held)) {
+        return false;
+    }
+    for (uint32_t at = 0u; at < size; at++) {
+        out_ring[fill] = line[at];
+        fill++;
+        if (fill == OUT_BYTES) {
+            fill = 0u;
+        }
+    }
+    out_held += size;
+    serial_port_pump();
+    return true;
+}

@@ -1,0 +1,97 @@
+/* From reset to main, and from any fault back to reset. */
+#include "startup.h"
+
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+#include "nrf52832.h"
+
+#define FAULT_MARK 0x0FA17ED0u
+
+/* From the linker script */
+extern uint32_t data_in_flash[];
+extern uint32_t data_begin[];
+extern uint32_t data_end[];
+extern uint32_t bss_begin[];
+extern uint32_t bss_end[];
+extern uint32_t stack_top[];
+
+int main(void);
+void reset_handler(void);
+
+/* Survives a reset: whether a fault caused it. */
+static volatile uint32_t fault_mark __attribute__((section(".noinit")));
+
+bool startup_take_fault(void)
+{
+    bool was_fault = fault_mark == FAULT_MARK;
+
+    fault_mark = 0u;
+    return was_fault;
+}
+
+void startup_reset(void)
+{
+    SCB_AIRCR = AIRCR_RESET;
+    for (;;) {
+    }
+}
+
+/* There is no place for an error message: the serial line carries the link. HELLO reports the cause. */
+static void on_fault(void)
+{
+    fault_mark = FAULT_MARK;
+    startup_reset();
+}
+
+void reset_handler(void)
+{
+    const uint32_t *from = data_in_flash;
+
+    __asm volatile("cpsid i"); /* for good: interrupts only end the processor's sleep */
+    for (uint32_t *to = data_begin; to < data_end; to++) {
+        *to = *from;
+        from++;
+    }
+    for (uint32_t *to = bss_begin; to < bss_end; to++) {
+        *to = 0u;
+    }
+    (void)main();
+    startup_reset();
+}
+
+/* The system exceptions of the Armv7-M; interrupts are never taken. */
+typedef void (*handler)(void);
+
+__attribute__((section(".vectors"), used)) static const struct {
+    const uint32_t *stack;
+    handler handlers[15];
+} VECTORS = {
+    stack_top,
+    {reset_handler, on_fault, on_fault, on_fault, on_fault, on_fault, NULL, NULL, NULL, NULL, on_fault, on_fault, NULL,
+     on_fault, on_fault},
+};
+
+/* What the compiler may call. */
+
+void *memcpy(void *restrict to, const void *restrict from, size_t size)
+{
+    uint8_t *out = to;
+    const uint8_t *in = from;
+
+    for (size_t at = 0u; at < size; at++) {
+        out[at] = in[at];
+    }
+    return to;
+}
+
+void *memset(void *to, int value, size_t size)
+{
+    uint8_t *out = to;
+
+    for (size_t at = 0u; at < size; at++) {
+        out[at] = (uint8_t)value;
+    }
+    return to;
+}
