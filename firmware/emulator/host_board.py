@@ -11,9 +11,6 @@ from skyless.simulation.dw1000.chip import Chip
 from skyless.simulation.medium import Timeline
 
 LIBRARY: Final = Path(__file__).parents[1] / "build" / "libskyless-board.so"
-_IDENTITY_BYTES: Final = 8
-_BOARD_BYTES: Final = 1 << 14
-"""More than a ``struct board`` has."""
 _TURN_S: Final = 5e-6
 """What a turn takes besides its transfers (assumed; the emulated processor counts it)."""
 
@@ -37,16 +34,6 @@ class _Hardware(ctypes.Structure):
     ]
 
 
-class _Identity(ctypes.Structure):
-    """``struct board_identity`` of board.h."""
-
-    _fields_: ClassVar = [
-        ("can_transmit", ctypes.c_bool),
-        ("device_id", ctypes.c_uint8 * _IDENTITY_BYTES),
-        ("reset_cause", ctypes.c_uint8),
-    ]
-
-
 class HostBoard(ProgramBoard):
     """One board; the library keeps no state, so one serves any number."""
 
@@ -64,7 +51,7 @@ class HostBoard(ProgramBoard):
         self._failed: BaseException | None = None
         self._library = ctypes.CDLL(str(library))
         self._library.board_turn.restype = ctypes.c_uint32
-        self._identity = _Identity(can_transmit, (ctypes.c_uint8 * _IDENTITY_BYTES)(*identity), 0)
+        self._can_transmit, self._identity = can_transmit, identity
         types = dict(_Hardware._fields_)
         calls: dict[str, Callable[..., Any]] = {
             "transfer": self._on_transfer,
@@ -84,8 +71,9 @@ class HostBoard(ProgramBoard):
     def program(self) -> None:
         """Run the board's loop, as the image's ``main`` does."""
         self._failed = None
-        board = ctypes.create_string_buffer(_BOARD_BYTES)
-        self._library.board_init(board, ctypes.byref(self._hardware), ctypes.byref(self._identity))
+        board = ctypes.create_string_buffer(self._library.host_board_bytes())
+        hardware, can_transmit = ctypes.byref(self._hardware), ctypes.c_bool(self._can_transmit)
+        self._library.host_board_init(board, hardware, self._identity, can_transmit, ctypes.c_uint8(0))
         self._call(self._library.board_begin, board)
         while True:
             wait_us = self._call(self._library.board_turn, board)

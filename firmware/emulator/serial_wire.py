@@ -10,6 +10,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
 
+from host_programs import HostLatency
 from msgspec import Struct
 from virtual_time import wake
 
@@ -24,34 +25,14 @@ _USB_S: Final = 1e-3
 _READ_BYTES: Final = 4096
 
 
-class HostPauses(Struct, frozen=True):
-    """What a computer takes until its program runs, evenly between two values and now and then long, and its work.
-
-    The defaults are those of CPython on a Raspberry Pi (``benchmarks/host_programs.py``); all assumed.
-    """
-
-    least_s: float = 20e-6
-    most_s: float = 100e-6
-    spike_probability: float = 2e-4
-    spike_s: float = 5e-3
-    work_s: float = 0.2e-3
-    """For each piece that comes, and for each that is written."""
-
-    def draw(self, generator: random.Random) -> float:
-        """One pause."""
-        if generator.random() < self.spike_probability:
-            return generator.uniform(self.most_s, self.spike_s)
-        return generator.uniform(self.least_s, self.most_s)
-
-
 class WireSettings(Struct, frozen=True):
     """What lies between a board and its host."""
 
     baud: int = 1_000_000
     usb: bool = False
     """Through a probe's USB port, else through a UART of the computer itself."""
-    host: HostPauses | None = None
-    """None for a computer that takes no time."""
+    host: HostLatency | None = None
+    """Each piece that comes, and each that is written, costs it a pause and its work. None: it takes no time."""
     piece_bytes: int = 1
     """The board gets so many bytes at once, when the last of them has come."""
 

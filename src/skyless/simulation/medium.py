@@ -62,6 +62,11 @@ class Timeline(Generic[Result]):
         """When the next event happens; None while nothing is planned."""
         return self._events[0][0] if self._events else None
 
+    @property
+    def until_ticks(self) -> int:
+        """Where the present ``run`` ends."""
+        return self._until_ticks
+
     def at(self, ticks: int, happen: Callable[[], Result | None]) -> None:
         """Plan an event; one in the past happens now."""
         self._serial += 1
