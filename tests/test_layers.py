@@ -14,7 +14,7 @@ import skyless
 SOURCE = Path(skyless.__file__).parent
 
 LAYERS = (
-    {"constants", "errors", "method_names", "whole_files", "kernels", "firmware"},
+    {"constants", "errors", "method_names", "whole_files", "kernels"},
     {"arguments", "rate_limit", "ticks"},
     {"air", "uncertainty"},
     {"site"},
@@ -142,7 +142,7 @@ def package(module):
 
 
 def test_a_package_names_the_modules_that_others_import():
-    """Its docstring says which are public; commands are loaded by name, and firmware runs on boards."""
+    """Its docstring says which are public; commands are loaded by name."""
     public = {}
     for module, path in MODULES.items():
         for other in imported_modules(path):
@@ -153,7 +153,7 @@ def test_a_package_names_the_modules_that_others_import():
         docstring = ast.get_docstring(ast.parse(MODULES[name].read_text("utf-8")))
         said = re.search(r"^Public: ([^.]*)\.", docstring, re.MULTILINE)
         named[name] = set(re.split(r",\s+", said[1])) if said else None
-    exempt = {name for name in public if name.split(".")[1] in {"cli", "firmware"}}
+    exempt = {name for name in public if name.split(".")[1] == "cli"}
     assert {name: names for name, names in named.items() if name not in exempt} == {
         name: names for name, names in public.items() if name not in exempt
     }

@@ -23,7 +23,7 @@ static const uint8_t VERSION[3] = {0u, 2u, 0u};
 /* Nothing long is begun in this time before a frame is due. */
 #define CLEARANCE_US 5000
 /* How often a chip is asked for its settings: after a failed supply it may receive nothing for ever and look normal. */
-#define CHECK_US 1000000u
+#define CHECK_US 200000u
 /* How often temperature and supply are measured, which takes 1.1 ms without the receiver: in a free slot, */
 #define MEASURE_US 10000000u
 /* or wherever no frame is due, if there was no free slot for so long. */
@@ -191,6 +191,10 @@ static void hand_over(struct board *board)
         if (board->stage != FRAME_HELD) {
             return;
         }
+    }
+    if (!dw1000_check(&board->chip)) { /* or it would be sent with other settings, at another time */
+        on_lost(board);
+        return;
     }
     result = dw1000_transmit_at(&board->chip, board->dx_ticks, board->frame, board->frame_bytes);
     if (result == DW1000_QUEUED) {
@@ -360,14 +364,16 @@ static bool is_free(const struct board *board, uint32_t now_us)
 /* Check and measure a chip that is configured. */
 static void do_chores(struct board *board, uint32_t now_us)
 {
-    if ((now_us - board->checked_us) >= CHECK_US) {
+    bool measures = ((now_us - board->measured_us) >= MEASURE_US) && is_free(board, now_us);
+
+    if (measures || ((now_us - board->checked_us) >= CHECK_US)) {
         board->checked_us = now_us;
         if (!dw1000_check(&board->chip)) {
             on_lost(board);
             return;
         }
     }
-    if (((now_us - board->measured_us) >= MEASURE_US) && is_free(board, now_us)) {
+    if (measures) {
         board->measured_us = now_us;
         (void)dw1000_measure(&board->chip);
     }

@@ -11,9 +11,9 @@ from skyless.air.masterless_packets import Packet, Relay
 from skyless.air.reception import Reception, Transmission
 from skyless.anchor import Anchor
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
-from skyless.firmware import link
 from skyless.nodes.board import LinkProtocol, SnifferProtocol
 from skyless.radios.interface import Late, Restarted, Sent
+from skyless.radios.serial import link
 from skyless.radios.serial.foreign_radios import SnifferStream
 from skyless.radios.serial.link_records import Done, Hello, NotDone, Status, TooLate, decode
 from skyless.simulation.impairments import lab_impairments
@@ -47,46 +47,39 @@ class Host:
         self.board = LinkProtocol(self.radio, self._take, can_transmit=can_transmit)
 
     def _take(self, data):
-        at = 0
-        while at < len(data) and not self.full:
-            at = self._reader.read(bytearray(data), at, len(data))
-            if self._reader.length:
-                self.said.append(decode(bytes(self._reader.record[: self._reader.length])))
+        if not self.full:
+            self.said += map(decode, self._reader.read(data))
         return not self.full
 
-    def say(self, end):
+    def say(self, line):
         """What the board answers."""
         self.said.clear()
-        self.board.on_host_data(bytes(self.writer.line[:end]))
+        self.board.on_host_data(line)
         return list(self.said)
 
     def ready(self):
         self.say(self.writer.config(DELAY, DELAY))
-        self.say(self.writer.ask(link.RX_ON))
+        self.say(self.writer.rx_on())
         return self
-
-
-def dx(ticks):
-    return bytearray(ticks.to_bytes(5, "little"))
 
 
 def test_it_greets_and_is_configured_step_by_step():
     host = Host(can_transmit=False)
-    (hello,) = host.say(host.writer.ask(link.ASK_HELLO))
-    assert hello == Hello(1, 0, (0, 0, 0), b"a board ", 63_897_600, 40, can_transmit=False)
-    (status,) = host.say(host.writer.ask(link.ASK_STATUS))
+    (hello,) = host.say(host.writer.ask_hello())
+    assert hello == Hello(1, 1, (0, 0, 0), b"a board ", 63_897_600, 40, can_transmit=False, reset_cause=0)
+    (status,) = host.say(host.writer.ask_status())
     assert (status.ticks, status.configured, status.receiving) == (77, False, False)
-    assert host.say(host.writer.ask(link.RX_ON)) == [NotDone(link.RX_ON, link.REFUSED_MALFORMED)]
+    assert host.say(host.writer.rx_on()) == [NotDone(link.RX_ON, link.REFUSED_MALFORMED)]
     (status,) = host.say(host.writer.config(DELAY, DELAY))
     assert (status.configured, status.receiving) == (True, False)
     host.board.on_radio_event(Reception(b"not wanted yet", 5))
-    (status,) = host.say(host.writer.ask(link.RX_ON))
+    (status,) = host.say(host.writer.rx_on())
     assert (status.configured, status.receiving, status.received) == (True, True, 0)
     host.said.clear()
     host.board.on_radio_event(Restarted())
     (hello,) = host.said
     assert isinstance(hello, Hello)
-    (status,) = host.say(host.writer.ask(link.ASK_STATUS))
+    (status,) = host.say(host.writer.ask_status())
     assert not status.configured
 
 
@@ -95,48 +88,44 @@ def test_another_channel_or_preamble_is_refused(at):
     host = Host()
     wanted = bytearray([5, 64, 2, 9, 128, 0, 1, 0, 1, 0, 0])
     wanted[at] += 1
-    host.writer.begin(link.CONFIG)
-    host.writer.append_bytes(wanted, 0, 11)
-    assert host.say(host.writer.end()) == [NotDone(link.CONFIG, link.REFUSED_SETTING)]
-    host.writer.begin(link.CONFIG)
-    host.writer.append_bytes(wanted, 0, 10)
-    assert host.say(host.writer.end()) == [NotDone(link.CONFIG, link.REFUSED_MALFORMED)]
+    assert host.say(host.writer.record(link.CONFIG, wanted)) == [NotDone(link.CONFIG, link.REFUSED_SETTING)]
+    assert host.say(host.writer.record(link.CONFIG, wanted[:10])) == [NotDone(link.CONFIG, link.REFUSED_MALFORMED)]
 
 
 def test_a_frame_leaves_at_dx_without_its_low_bits_and_the_antenna_delay_later():
     host = Host().ready()
-    frame = bytearray(b"a frame")
-    assert host.say(host.writer.tx_at(dx(2**40 - 1), frame, 7)) == []
+    frame = b"a frame"
+    assert host.say(host.writer.tx_at(2**40 - 1, frame)) == []
     tx_ticks = (2**40 - 512 + DELAY) % 2**40
     assert host.radio.transmissions == [Transmission(b"a frame", tx_ticks)]
-    assert host.say(host.writer.tx_at(dx(512), frame, 7)) == [TooLate(512, link.LATE_BUSY)]
+    assert host.say(host.writer.tx_at(512, frame)) == [TooLate(512, link.LATE_BUSY)]
     host.said.clear()
     host.board.on_radio_event(Sent(tx_ticks))
     assert host.said == [Done(2**40 - 1, tx_ticks)]
-    host.say(host.writer.tx_at(dx(512), frame, 7))
+    host.say(host.writer.tx_at(512, frame))
     host.board.on_radio_event(Late(512 + DELAY))
     assert host.said == [TooLate(512, link.LATE_FOR_RADIO)]
     host.board.on_radio_event(Sent(5))  # none of its own
-    (status,) = host.say(host.writer.ask(link.ASK_STATUS))
+    (status,) = host.say(host.writer.ask_status())
     assert (status.sent, status.late) == (1, 2)
     for length in (0, 128):
-        host.writer.begin(link.TX_AT)
-        host.writer.append_bytes(bytearray(133), 0, 5 + length)
-        assert host.say(host.writer.end()) == [NotDone(link.TX_AT, link.REFUSED_MALFORMED)]
+        assert host.say(host.writer.record(link.TX_AT, bytes(5 + length))) == [
+            NotDone(link.TX_AT, link.REFUSED_MALFORMED)
+        ]
     silent = Host(can_transmit=False).ready()
-    assert silent.say(silent.writer.tx_at(dx(512), frame, 7)) == [TooLate(512, link.LATE_NOT_READY)]
+    assert silent.say(silent.writer.tx_at(512, frame)) == [TooLate(512, link.LATE_NOT_READY)]
 
 
 def test_a_board_whose_radio_is_dead_logs_nothing_and_one_that_is_not_fetched_counts():
     host = Host()
     host.radio.ticks = None
-    assert host.say(host.writer.ask(link.ASK_HELLO)) == []
+    assert host.say(host.writer.ask_hello()) == []
     host.radio.ticks = 5
     host.ready()
     host.full = True
     host.board.on_radio_event(Reception(b"lost", 5))
     host.full = False
-    (status,) = host.say(host.writer.ask(link.ASK_STATUS))
+    (status,) = host.say(host.writer.ask_status())
     assert isinstance(status, Status)
     assert (status.received, status.unsent_records) == (1, 1)
 
@@ -144,12 +133,12 @@ def test_a_board_whose_radio_is_dead_logs_nothing_and_one_that_is_not_fetched_co
 def test_garbage_from_the_host_is_counted_and_hurts_nothing():
     host, rng = Host().ready(), random.Random(2)
     for _ in range(500):
-        record = bytearray(host.writer.line[: host.writer.tx_at(dx(512), bytearray(b"frame"), 5)])
+        record = bytearray(host.writer.tx_at(512, b"frame"))
         record[rng.randrange(len(record))] ^= 1 << rng.randrange(8)
         host.board.on_host_data(rng.randbytes(rng.randrange(200)) + b"\0" + bytes(record))
     host.board.on_host_data(b"\0")
-    host.say(host.writer.ask(0x7F))
-    (status,) = host.say(host.writer.ask(link.ASK_STATUS))
+    host.say(host.writer.record(0x7F))
+    (status,) = host.say(host.writer.ask_status())
     assert status.receiving
     assert status.garbled > 900
     assert host.radio.transmissions == []

@@ -7,7 +7,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from skyless.air.ieee802154 import after_rmarker_s, fcs
 from skyless.air.reception import Diagnostics, Reception, Transmission
-from skyless.firmware import dw1000
+from skyless.radios.dw1000 import driver as dw1000
 from skyless.radios.interface import AntennaDelays, Late, Sent
 from skyless.simulation.dw1000 import registers as r
 from skyless.ticks import from_seconds, wrap

@@ -71,10 +71,10 @@ class PlayedSpi(ModelBus):
         super().__init__(node.chip, node.pause)
         self.closed = self.broken = False
 
-    def _exchange(self, out):
+    def transfer(self, out):
         if self.broken:
             raise OSError(5, "Input/output error")
-        return super()._exchange(out)
+        return super().transfer(out)
 
     def fileno(self):
         return None

@@ -21,8 +21,8 @@ from skyless.air.uci_measurements import (
     SessionInfo,
     encode_session_info,
 )
-from skyless.firmware import link
 from skyless.radios.interface import AntennaDelays
+from skyless.radios.serial import link
 from skyless.radios.serial.foreign_radios import ListenerRadio, SnifferStream, UciRadio
 from skyless.radios.serial.serial_radio import LinkSession
 from skyless.recordings.foreign.anchor_frame import AnchorFrame
@@ -54,8 +54,8 @@ class LinkLine:
         self.session = LinkSession("board", AntennaDelays(), lambda data: None, self._take, self.counters)
         self.session.begin(0.0)
         self._writer = link.Writer()
-        self.feed(bytes(self._writer.line[: self._writer.hello((1, 0, 0), bytearray(8), 1)]))
-        self.feed(bytes(self._writer.line[: self._writer.status(bytearray(5), 3, [0] * 6)]))
+        self.feed(self._writer.hello((1, 0, 0), bytes(8), 1))
+        self.feed(self._writer.status(0, 3, [0] * 6))
         self.found.clear()
 
     def _take(self, event):
@@ -65,9 +65,7 @@ class LinkLine:
         self.session.on_data(data, 0.0)
 
     def record(self, number, rng):
-        frame = bytearray(rng.randbytes(rng.randrange(1, 128)))
-        end = self._writer.rx(bytearray(number.to_bytes(5, "little")), 1, 2, 3, frame, len(frame))
-        return bytes(self._writer.line[:end])
+        return self._writer.rx(number, 1, 2, 3, rng.randbytes(rng.randrange(1, 128)))
 
 
 class ListenerLine:

@@ -1,23 +1,20 @@
 """A conversation over the serial link with a board that the test plays record by record."""
 
+import struct
 from collections import Counter
 
 import pytest
 from serial_stage import quantised
 
 from skyless.air.reception import Diagnostics, Reception, Transmission
-from skyless.firmware import link
 from skyless.radios.interface import AntennaDelays, Gone, Hint, Late, Restarted, Sent
+from skyless.radios.serial import link
 from skyless.radios.serial.serial_radio import BOARD_SILENCE_S, MOST_PENDING_FRAMES, STATUS_S, LinkSession
 
 DELAYS = AntennaDelays(16_450, 16_500)
 COUNTS = [7, 1, 3, 2, 0, 5]
 ON = link.IS_CONFIGURED | link.IS_RECEIVING
 T0 = 0xFE_1234_5600
-
-
-def stamp(ticks):
-    return bytearray(ticks.to_bytes(5, "little"))
 
 
 class Talk:
@@ -32,11 +29,7 @@ class Talk:
         self.session.begin(self.now_s)
 
     def _take(self, data):
-        at = 0
-        while at < len(data):
-            at = self._reader.read(bytearray(data), at, len(data))
-            if self._reader.length:
-                self.commands.append(bytes(self._reader.record[: self._reader.length]))
+        self.commands += self._reader.read(data)
 
     def kinds(self):
         """Commands since last asked."""
@@ -44,17 +37,14 @@ class Talk:
         self.commands.clear()
         return kinds
 
-    def say(self, end):
-        self.hear(bytes(self.board.line[:end]))
-
     def hear(self, data):
         self.session.on_data(data, self.now_s)
 
-    def hello(self):
-        self.say(self.board.hello((1, 2, 3), bytearray(b"board-01"), link.CAN_TRANSMIT))
+    def hello(self, cause=0):
+        self.hear(self.board.hello((1, 2, 3), b"board-01", link.CAN_TRANSMIT, cause))
 
     def status(self, state=ON, ticks=T0):
-        self.say(self.board.status(stamp(ticks), state, COUNTS, 2150, 3300))
+        self.hear(self.board.status(ticks, state, COUNTS, 2150, 3300))
 
     def ready(self):
         self.hello()
@@ -78,7 +68,7 @@ def test_a_board_is_greeted_configured_and_ready():
     talk.hello()
     (config,) = (command for command in talk.commands if command[0] == link.CONFIG)
     assert tuple(config[2:8]) == (5, 64, 2, 9, 128, 0)
-    assert [link.unsigned(config, at, 2) for at in (8, 10)] == [16_450, 16_500]
+    assert struct.unpack_from("<2H", config, 8) == (16_450, 16_500)
     assert talk.kinds() == [link.CONFIG, link.RX_ON]
     talk.status(link.IS_CONFIGURED)
     assert talk.events == []
@@ -99,8 +89,8 @@ def test_a_board_is_greeted_configured_and_ready():
 def test_receptions_come_through_with_their_measurements_in_the_line_s_units():
     talk = Talk().ready()
     frame = bytes(range(40))
-    talk.say(talk.board.rx(stamp(2**40 - 1), -7953, -8312, -12_345, bytearray(frame), 40))
-    talk.say(talk.board.rx(stamp(0), link.NOT_MEASURED, link.NOT_MEASURED, link.NOT_MEASURED, bytearray(frame), 1))
+    talk.hear(talk.board.rx(2**40 - 1, -7953, -8312, -12_345, frame))
+    talk.hear(talk.board.rx(0, link.NOT_MEASURED, link.NOT_MEASURED, link.NOT_MEASURED, frame[:1]))
     assert talk.events[1:] == [
         Reception(frame, 2**40 - 1, talk.now_s, Diagnostics(-79.53, -83.12, -12.345)),
         Reception(frame[:1], 0, talk.now_s, Diagnostics()),
@@ -118,23 +108,23 @@ def test_transmissions_are_asked_for_by_dx_and_their_end_is_reported_by_tx_ticks
         record = talk.commands[-1]
         assert (record[0], record[link.TX_FRAME_AT :]) == (link.TX_AT, frame)
         assert int.from_bytes(record[2:7], "little") == (T0 & ~0x1FF) + 512 * number
-    dx = stamp(T0 & ~0x1FF)
-    talk.say(talk.board.tx_done(dx, stamp(tx_ticks)))
-    talk.say(talk.board.tx_done(dx, stamp(tx_ticks)))  # nobody asked for that one any more
-    talk.say(talk.board.tx_late(stamp((T0 & ~0x1FF) + 512), link.LATE_FOR_RADIO))
+    dx = T0 & ~0x1FF
+    talk.hear(talk.board.tx_done(dx, tx_ticks))
+    talk.hear(talk.board.tx_done(dx, tx_ticks))  # nobody asked for that one any more
+    talk.hear(talk.board.tx_late((T0 & ~0x1FF) + 512, link.LATE_FOR_RADIO))
     assert talk.events[1:] == [Sent(tx_ticks), Late(tx_ticks + 512)]
     assert not +talk.counters
     talk.session.transmit(Transmission(b"three", tx_ticks))
-    talk.say(talk.board.tx_done(dx, stamp(tx_ticks + 1)))
+    talk.hear(talk.board.tx_done(dx, tx_ticks + 1))
     assert talk.counters == {"sent-at-another-time": 1}
 
 
 def test_before_the_board_is_ready_everything_is_late_and_nothing_is_heard():
     talk = Talk()
-    talk.say(talk.board.rx(stamp(5), 0, 0, 0, bytearray(b"frame"), 5))
+    talk.hear(talk.board.rx(5, 0, 0, 0, b"frame"))
     talk.session.transmit(Transmission(b"one", 77))
     talk.hello()
-    talk.say(talk.board.rx(stamp(5), 0, 0, 0, bytearray(b"frame"), 5))
+    talk.hear(talk.board.rx(5, 0, 0, 0, b"frame"))
     assert talk.events == [Late(77)]
 
 
@@ -146,17 +136,17 @@ def test_dx_wraps_with_the_counter():
 
 def test_lost_copied_unknown_malformed_and_garbled_records_are_counted():
     talk = Talk().ready()
-    frame = bytearray(b"frame")
-    talk.say(talk.board.rx(stamp(1), 0, 0, 0, frame, 5))
-    line = bytes(talk.board.line[: talk.board.rx(stamp(2), 0, 0, 0, frame, 5)])
+    frame = b"frame"
+    talk.hear(talk.board.rx(1, 0, 0, 0, frame))
+    line = talk.board.rx(2, 0, 0, 0, frame)
     talk.hear(line + line)
-    talk.board.ask(link.RX_ON)  # two that never arrive
-    talk.board.ask(link.RX_ON)
-    talk.say(talk.board.rx(stamp(3), 0, 0, 0, frame, 5))
-    talk.say(talk.board.ask(0x3F))
-    talk.say(talk.board.rx(stamp(3), 0, 0, 0, frame, 0))
+    talk.board.rx_on()  # two that never arrive
+    talk.board.rx_on()
+    talk.hear(talk.board.rx(3, 0, 0, 0, frame))
+    talk.hear(talk.board.record(0x3F))
+    talk.hear(talk.board.rx(3, 0, 0, 0, b""))
     for kind in (link.TX_DONE, link.TX_LATE, link.STATUS, link.REFUSED, link.HELLO):
-        talk.say(talk.board.ask(kind))
+        talk.hear(talk.board.record(kind))
     talk.hear(b"\x05garbage\0" + line[:10] + b"\0")
     assert [event.rx_ticks for event in talk.events[1:]] == [1, 2, 3]
     assert talk.counters == {
@@ -171,15 +161,12 @@ def test_lost_copied_unknown_malformed_and_garbled_records_are_counted():
 def test_records_of_a_later_minor_version_are_read():
     talk = Talk()
     board = talk.board
-    board.begin(link.HELLO)
-    board.append_bytes(bytearray([link.MAJOR, 9, 1, 2, 3, *range(8)]), 0, 13)
-    board.append(link.RATE_KHZ, 4)
-    board.append_bytes(bytearray([40, 0xFF, 1, 2, 3]), 0, 5)
-    talk.say(board.end())
-    board.begin(link.STATUS)
-    board.append_bytes(bytearray([*stamp(T0), ON, *bytes(24), 0, 0x80, 0xFF, 0xFF, 9, 9]), 0, 36)
-    talk.say(board.end())
+    rate = link.RATE_KHZ.to_bytes(4, "little")
+    talk.hear(board.record(link.HELLO, bytes([link.MAJOR, 9, 1, 2, 3, *range(8), *rate, 40, 0xFF, 2, 3, 4])))
+    stamp = T0.to_bytes(5, "little")
+    talk.hear(board.record(link.STATUS, bytes([*stamp, ON, *bytes(24), 0, 0x80, 0xFF, 0xFF, 9, 9])))
     assert talk.events == [Restarted()]
+    assert talk.session.hello.reset_cause == 2
     assert (talk.session.status.temperature_c, talk.session.status.supply_v) == (None, None)
 
 
@@ -187,14 +174,11 @@ def test_a_board_of_another_major_version_is_refused_once_and_taken_when_it_has_
     talk = Talk()
     talk.kinds()
     for _ in range(3):
-        talk.board.begin(link.HELLO)
-        talk.board.append(2, 1)
-        talk.board.append(0, 1)
-        talk.say(talk.board.end())
+        talk.hear(talk.board.record(link.HELLO, bytes([2, 0])))
         talk.poll(STATUS_S)
     (gone,) = talk.events
     assert gone == Gone(
-        "the board at /dev/board has version 2.0 of the serial link, this program 1.0; bring the board's firmware "
+        "the board at /dev/board has version 2.0 of the serial link, this program 1.1; bring the board's firmware "
         "and Skyless to the same release"
     )
     assert set(talk.kinds()) == {link.ASK_HELLO}
@@ -208,17 +192,14 @@ def test_a_board_of_another_major_version_is_refused_once_and_taken_when_it_has_
 def test_a_board_that_refuses_its_configuration_or_counts_otherwise_cannot_be_used():
     talk = Talk()
     talk.hello()
-    talk.say(talk.board.refused(link.CONFIG, link.REFUSED_SETTING))
-    talk.say(talk.board.refused(link.TX_AT, link.REFUSED_MALFORMED))
+    talk.hear(talk.board.refused(link.CONFIG, link.REFUSED_SETTING))
+    talk.hear(talk.board.refused(link.TX_AT, link.REFUSED_MALFORMED))
     assert [type(event) for event in talk.events] == [Gone]
     assert "refuses its configuration" in talk.events[0].reason
     assert talk.counters == {"refused-command": 1}
     talk = Talk()
-    talk.board.begin(link.HELLO)
-    talk.board.append_bytes(bytearray([link.MAJOR, 0, 1, 2, 3, *range(8)]), 0, 13)
-    talk.board.append(1000, 4)
-    talk.board.append_bytes(bytearray([32, 1]), 0, 2)
-    talk.say(talk.board.end())
+    rate = (1000).to_bytes(4, "little")
+    talk.hear(talk.board.record(link.HELLO, bytes([link.MAJOR, 0, 1, 2, 3, *range(8), *rate, 32, 1])))
     assert "counts 1000 kHz in 32 bits" in talk.events[0].reason
 
 
@@ -226,14 +207,14 @@ def test_a_board_whose_radio_does_not_start_is_reported_of_once_and_taken_when_i
     talk = Talk()
     for _ in range(4):
         talk.hello()
-        talk.say(talk.board.refused(link.CONFIG, link.REFUSED_RADIO))
+        talk.hear(talk.board.refused(link.CONFIG, link.REFUSED_RADIO))
         talk.poll(STATUS_S)
     gone = Gone("the board at /dev/board refuses its configuration: its radio does not answer or start")
     assert talk.events == [gone]
     talk.hello()
     talk.status()
     assert talk.events == [gone, Restarted()]
-    talk.say(talk.board.refused(link.CONFIG, link.REFUSED_RADIO))
+    talk.hear(talk.board.refused(link.CONFIG, link.REFUSED_RADIO))
     assert talk.events == [gone, Restarted(), gone]
 
 
@@ -243,13 +224,13 @@ def test_frames_whose_answer_was_lost_on_the_line_are_not_kept_for_ever():
         talk.session.transmit(Transmission(b"frame", (number << 9) + DELAYS.tx_ticks))
     assert len(talk.session._pending) == MOST_PENDING_FRAMES
     told = len(talk.events)
-    talk.say(talk.board.tx_done(stamp(999 << 9), stamp((999 << 9) + DELAYS.tx_ticks)))
+    talk.hear(talk.board.tx_done(999 << 9, (999 << 9) + DELAYS.tx_ticks))
     assert talk.events[told:] == [Sent((999 << 9) + DELAYS.tx_ticks)]
 
 
 def test_an_anchor_needs_a_board_that_can_transmit():
     talk = Talk(transmits=True)
-    talk.say(talk.board.hello((1, 2, 3), bytearray(8), 0))
+    talk.hear(talk.board.hello((1, 2, 3), bytes(8), 0))
     talk.status()
     assert talk.events == [Gone("the board at /dev/board only listens; an anchor needs one that can transmit")]
     talk = Talk(transmits=True)
@@ -270,7 +251,7 @@ def test_a_board_that_starts_again_is_configured_again_and_its_numbers_begin_aga
     talk.status(ON, 1000)
     assert talk.events == [Restarted(), Restarted()]
     assert talk.session.clock.read(talk.now_s) == 1000
-    talk.say(talk.board.tx_done(stamp(T0 & ~0x1FF), stamp(tx_ticks)))  # of its former life
+    talk.hear(talk.board.tx_done(T0 & ~0x1FF, tx_ticks))  # of its former life
     assert talk.events == [Restarted(), Restarted()]
     assert talk.counters == {"board-restart": 1}
 
@@ -286,8 +267,51 @@ def test_a_board_that_starts_again_and_again_is_counted_and_reported_once():
         talk.status(0)
     (hint,) = talk.events
     assert isinstance(hint, Hint)
-    assert "the board at /dev/board starts again and again (3 times within 4 s)" in hint.text
+    assert "the board at /dev/board starts again and again (3 times within 4 s, at last by power" in hint.text
     assert talk.counters == {"board-restart": 6}
+
+
+@pytest.mark.parametrize(
+    ("cause", "words"),
+    [
+        (0, ", at last by power on or too low a supply)"),
+        (link.RESET_BY_PIN, ", at last by its reset pin)"),
+        (link.RESET_BY_WATCHDOG, ", at last by its watchdog)"),
+        (link.RESET_BY_SOFTWARE, ", at last by its firmware)"),
+        (link.RESET_BY_LOCKUP, ", at last by a lockup of its processor)"),
+        (
+            link.RESET_BY_FAULT | link.RESET_BY_SOFTWARE,
+            ", at last by a fault that its firmware noticed and its firmware)",
+        ),
+        (0x40, ", at last by cause 0x40)"),
+        (None, "within 4 s):"),
+    ],
+)
+def test_the_report_of_a_board_that_starts_repeatedly_names_the_last_cause(cause, words):
+    """None: a board of version 1.0, whose HELLO has no cause."""
+    talk = Talk()
+    talk.hello()
+    rate = link.RATE_KHZ.to_bytes(4, "little")
+    body = bytes([link.MAJOR, 0, 1, 2, 3, *range(8), *rate, 40, link.CAN_TRANSMIT])
+    for last in (link.RESET_BY_PIN, link.RESET_BY_PIN, cause):
+        talk.poll(2.0)
+        talk.board = link.Writer()
+        talk.hear(talk.board.record(link.HELLO, body if last is None else body + bytes([last])))
+        talk.status(0)
+    (hint,) = talk.events
+    assert words in hint.text
+    assert talk.session.hello.reset_cause == cause
+
+
+def test_an_interrupt_line_that_does_not_follow_is_counted_and_reported_once():
+    talk = Talk().ready()
+    for state in (ON, ON | link.IS_POLLED, ON | link.IS_POLLED, ON, ON | link.IS_POLLED):
+        talk.status(state)
+    hints = [event for event in talk.events if isinstance(event, Hint)]
+    assert len(hints) == 1
+    assert "interrupt line of the radio on the board at /dev/board does not follow its events" in hints[0].text
+    assert talk.counters == {"interrupt-line-stuck": 2}
+    assert talk.session.ready
 
 
 def test_a_board_that_answers_and_never_listens_is_reported_once():
@@ -334,7 +358,7 @@ def test_a_loop_that_comes_back_after_a_calm_time_is_reported_again():
 def test_receptions_with_errors_that_the_board_reports_are_counted_since_the_first_status():
     talk = Talk().ready()
     for errors in (1, 5, 9, 2):  # the last one after a start
-        talk.say(talk.board.status(stamp(T0), ON, [7, errors, 0, 0, 0, 0], 2150, 3300))
+        talk.hear(talk.board.status(T0, ON, [7, errors, 0, 0, 0, 0], 2150, 3300))
     assert talk.counters == {"rx-error": 8}
 
 

@@ -16,10 +16,10 @@ from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.anchor import Anchor
 from skyless.errors import SkylessError
 from skyless.evaluation.scenarios import Request, impairments_of
-from skyless.firmware import link
 from skyless.nodes.board import ListenerProtocol
 from skyless.nodes.open_radio import is_simulated, open_radios, open_sniffers
 from skyless.radios.interface import AntennaDelays, Gone, Late, Restarted, Sent
+from skyless.radios.serial import link
 from skyless.radios.serial.foreign_radios import ListenerRadio
 from skyless.radios.serial.pseudo_terminal import Pty
 from skyless.radios.serial.serial_radio import SerialRadio
@@ -200,14 +200,11 @@ def test_a_board_of_another_version_is_refused_in_words():
         writer = link.Writer()
 
         def answer(data):
-            writer.begin(link.HELLO)
-            writer.append(7, 1)
-            writer.append(3, 1)
-            board.pty.send(bytes(writer.line[: writer.end()]))
+            board.pty.send(writer.record(link.HELLO, bytes([7, 3])))
 
         board.protocol.on_host_data = answer
         async with board, radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1")) as host:
-            assert "has version 7.3 of the serial link, this program 1.0" in (await host.until(Gone)).reason
+            assert "has version 7.3 of the serial link, this program 1.1" in (await host.until(Gone)).reason
             await asyncio.sleep(1.2)
             assert len(host.events) == 1
             assert host.radio.now_ticks() is None

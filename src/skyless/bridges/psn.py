@@ -35,7 +35,7 @@ INFO_TRACKERS: Final = 2
 INFO_TRACKER_NAME: Final = 0
 POSITION: Final = 0
 SPEED: Final = 1
-STATUS: Final = 3
+TRACKER_STATUS: Final = 3
 TIMESTAMP: Final = 6
 
 _HOLDS_CHUNKS: Final = 0x8000
@@ -131,11 +131,11 @@ class PsnFrames:
 
     def _data(self, tracker: Tracker) -> bytes:
         if tracker.position_m is None:
-            return _chunk(STATUS, struct.pack("<f", 0.0))
+            return _chunk(TRACKER_STATUS, struct.pack("<f", 0.0))
         chunks = [_chunk(POSITION, struct.pack("<3f", *tracker.position_m))]
         if tracker.velocity_mps is not None:
             chunks.append(_chunk(SPEED, struct.pack("<3f", *tracker.velocity_mps)))
-        chunks.append(_chunk(STATUS, struct.pack("<f", 1.0)))
+        chunks.append(_chunk(TRACKER_STATUS, struct.pack("<f", 1.0)))
         chunks.append(_chunk(TIMESTAMP, struct.pack("<Q", self._stamp_us(tracker.unix_s))))
         return b"".join(chunks)
 

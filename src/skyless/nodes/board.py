@@ -12,10 +12,10 @@ from skyless.air.beacon import Beacon
 from skyless.air.codec import decode_cached
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
-from skyless.firmware import link
 from skyless.nodes.process import Log
 from skyless.nodes.uci_board import UciProtocol
 from skyless.radios.interface import Gone, Hint, Late, Radio, RadioEvent, Restarted, Sent
+from skyless.radios.serial import link
 from skyless.radios.serial.link_records import to_steps
 from skyless.radios.serial.pseudo_terminal import Pty
 from skyless.recordings.foreign.bitcraze import TDOA3
@@ -50,14 +50,15 @@ class BoardProtocol(Protocol):
 
 
 class LinkProtocol:
-    """The serial link, as the firmware implements it."""
+    """The serial link, as the firmware of real boards speaks it (``firmware/source/board.c``)."""
 
     def __init__(self, radio: Radio, send: Send, *, can_transmit: bool) -> None:
         self._radio, self._send, self._can_transmit = radio, send, can_transmit
         self._reader, self._writer = link.Reader(), link.Writer()
         self._configured = self._receiving = False
         self._tx_delay_ticks = 0
-        self._waiting: dict[int, bytearray] = {}
+        self._waiting: dict[int, int] = {}
+        """dx by TX stamp, of frames that have not left."""
         self.counts = dict.fromkeys(("received", "errors", "sent", "late", "garbled", "unsent"), 0)
 
     def on_radio_event(self, event: RadioEvent) -> None:
@@ -65,12 +66,12 @@ class LinkProtocol:
         if isinstance(event, Reception):
             self._report(event)
         elif isinstance(event, Sent | Late):
-            dx = self._waiting.pop(event.tx_ticks, None)
-            if dx is not None and isinstance(event, Sent):
+            dx_ticks = self._waiting.pop(event.tx_ticks, None)
+            if dx_ticks is not None and isinstance(event, Sent):
                 self.counts["sent"] += 1
-                self._write(self._writer.tx_done(dx, _stamp(event.tx_ticks)))
-            elif dx is not None:
-                self._late(dx, link.LATE_FOR_RADIO)
+                self._write(self._writer.tx_done(dx_ticks, event.tx_ticks))
+            elif dx_ticks is not None:
+                self._late(dx_ticks, link.LATE_FOR_RADIO)
         elif isinstance(event, Restarted):
             self._configured = self._receiving = False
             self._waiting.clear()
@@ -81,37 +82,36 @@ class LinkProtocol:
         if not self._receiving:
             return
         self.counts["received"] += 1
-        measured, frame = reception.diagnostics or Diagnostics(), bytearray(reception.frame)
-        self._write(self._writer.rx(_stamp(reception.rx_ticks), *to_steps(measured), frame, len(frame)))
+        measured = to_steps(reception.diagnostics or Diagnostics())
+        self._write(self._writer.rx(reception.rx_ticks, *measured, reception.frame))
 
     def on_host_data(self, data: bytes) -> None:
         """Execute commands; a board whose radio is dead does nothing."""
-        reader, buffer, at = self._reader, bytearray(data), 0
-        while at < len(buffer):
-            at = reader.read(buffer, at, len(buffer))
-            if reader.length and self._radio.now_ticks() is not None:
-                self._execute(reader.record, reader.length)
+        for record in self._reader.read(data):
+            if self._radio.now_ticks() is not None:
+                self._execute(record)
 
-    def _execute(self, record: bytearray, length: int) -> None:
+    def _execute(self, record: bytes) -> None:
         kind = record[0]
         if kind == link.ASK_HELLO:
             self._hello()
         elif kind == link.ASK_STATUS:
             self._status()
         elif kind == link.CONFIG:
-            self._configure(record, length)
+            self._configure(record)
         elif kind == link.RX_ON and self._configured:
             self._receiving = True
             self._status()
-        elif kind == link.TX_AT and link.TX_FRAME_AT < length <= link.TX_FRAME_AT + link.MAX_FRAME_BYTES:
-            self._transmit(record[link.BODY_AT : link.TX_FRAME_AT], bytes(record[link.TX_FRAME_AT : length]))
+        elif kind == link.TX_AT and link.TX_FRAME_AT < len(record) <= link.TX_FRAME_AT + link.MAX_FRAME_BYTES:
+            dx_ticks = int.from_bytes(record[link.BODY_AT : link.TX_FRAME_AT], "little")
+            self._transmit(dx_ticks, record[link.TX_FRAME_AT :])
         elif kind in (link.RX_ON, link.TX_AT):
             self._write(self._writer.refused(kind, link.REFUSED_MALFORMED))
         else:
             self.counts["garbled"] += 1
 
     def _hello(self) -> None:
-        name = bytearray(self._radio.name.encode()[:8].ljust(8, b"\0"))
+        name = self._radio.name.encode()[:8].ljust(8, b"\0")
         self._write(self._writer.hello(_EMULATED_FIRMWARE, name, link.CAN_TRANSMIT if self._can_transmit else 0))
 
     def _status(self) -> None:
@@ -119,50 +119,38 @@ class LinkProtocol:
         state = self._configured * link.IS_CONFIGURED | self._receiving * link.IS_RECEIVING
         state |= bool(self._waiting) * link.HAS_FRAME_WAITING
         counts = self.counts | {"garbled": self.counts["garbled"] + self._reader.garbled + self._reader.overlong}
-        self._write(self._writer.status(_stamp(ticks or 0), state, list(counts.values())))
+        self._write(self._writer.status(ticks or 0, state, list(counts.values())))
 
-    def _configure(self, record: bytearray, length: int) -> None:
+    def _configure(self, record: bytes) -> None:
         """Set the antenna delays; the other settings must be those of the air."""
-        if length < link.CONFIG_BYTES or record[2:8] != _CONFIG[2:8]:
-            reason = link.REFUSED_MALFORMED if length < link.CONFIG_BYTES else link.REFUSED_SETTING
+        if len(record) < link.CONFIG_BYTES or record[2:8] != _CONFIG[2:8]:
+            reason = link.REFUSED_MALFORMED if len(record) < link.CONFIG_BYTES else link.REFUSED_SETTING
             self._write(self._writer.refused(link.CONFIG, reason))
             return
-        self._tx_delay_ticks = link.unsigned(record, 8, 2)
+        self._tx_delay_ticks = int.from_bytes(record[8:10], "little")
         self._configured, self._receiving = True, False
         self._status()
 
-    def _transmit(self, dx: bytearray, frame: bytes) -> None:
+    def _transmit(self, dx_ticks: int, frame: bytes) -> None:
         if not (self._configured and self._can_transmit):
-            self._late(dx, link.LATE_NOT_READY)
+            self._late(dx_ticks, link.LATE_NOT_READY)
         elif self._waiting:
-            self._late(dx, link.LATE_BUSY)
+            self._late(dx_ticks, link.LATE_BUSY)
         else:
-            dx_ticks = int.from_bytes(dx, "little") & ~0x1FF
-            tx_ticks = wrap(dx_ticks + self._tx_delay_ticks)
-            self._waiting[tx_ticks] = dx
+            tx_ticks = wrap((dx_ticks & ~0x1FF) + self._tx_delay_ticks)
+            self._waiting[tx_ticks] = dx_ticks
             self._radio.transmit(Transmission(frame, tx_ticks))
 
-    def _late(self, dx: bytearray, reason: int) -> None:
+    def _late(self, dx_ticks: int, reason: int) -> None:
         self.counts["late"] += 1
-        self._write(self._writer.tx_late(dx, reason))
+        self._write(self._writer.tx_late(dx_ticks, reason))
 
-    def _write(self, length: int) -> None:
-        if not self._send(bytes(self._writer.line[:length])):
+    def _write(self, line: bytes) -> None:
+        if not self._send(line):
             self.counts["unsent"] += 1
 
 
-def _stamp(ticks: int) -> bytearray:
-    return bytearray(ticks.to_bytes(5, "little"))
-
-
-def _usual_config() -> bytes:
-    """The record of a CONFIG, without delays."""
-    writer, reader = link.Writer(), link.Reader()
-    reader.read(writer.line, 0, writer.config(0, 0))
-    return bytes(reader.record[: reader.length])
-
-
-_CONFIG: Final = _usual_config()
+(_CONFIG,) = link.Reader().read(link.Writer().config(0, 0))
 
 
 class ListenerProtocol:
@@ -211,7 +199,8 @@ class SnifferProtocol:
         payload = self._payload(beacon)
         if self._binary:
             length = struct.pack("<H", len(payload))
-            self._send(b"\xbc" + _stamp(event.rx_ticks) + bytes((beacon.anchor, 0xFF)) + length + payload + length)
+            stamp = event.rx_ticks.to_bytes(5, "little")
+            self._send(b"\xbc" + stamp + bytes((beacon.anchor, 0xFF)) + length + payload + length)
         else:
             self._send(b"From %02x to ff @%010x: %s\r\n" % (beacon.anchor, event.rx_ticks, payload.hex().encode()))
 

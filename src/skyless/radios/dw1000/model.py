@@ -4,7 +4,7 @@ import time
 from typing import Final
 
 from skyless.air.reception import Diagnostics, Reception, Transmission
-from skyless.firmware.dw1000 import ChipError
+from skyless.radios.dw1000.driver import ChipError
 from skyless.radios.dw1000.radio import Dw1000Radio
 from skyless.radios.emulated import EmulatedRadio
 from skyless.radios.interface import AntennaDelays, Gone, Late, RadioEvent, Restarted, Sent

@@ -7,8 +7,8 @@ from typing import Final, Protocol
 
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.constants import TICK_S
-from skyless.firmware import dw1000
-from skyless.firmware.dw1000 import DW1000, Bus, ChipError
+from skyless.radios.dw1000 import driver as dw1000
+from skyless.radios.dw1000.driver import DW1000, Bus, ChipError
 from skyless.radios.interface import AntennaDelays, Gone, Hint, Late, Listener, RadioEvent, Restarted, Sent, ignore
 from skyless.ticks import difference, from_seconds, wrap
 
@@ -42,7 +42,7 @@ class ChipSession:
 
     def read_ticks(self) -> int | None:
         """The chip's counter, read over the bus; None for a chip that is off."""
-        return None if self.driver.state == dw1000.OFF else _ticks(self.driver.now())
+        return None if self.driver.state == dw1000.OFF else self.driver.now()
 
     @property
     def overdue_ticks(self) -> int | None:
@@ -52,9 +52,8 @@ class ChipSession:
     def transmit(self, transmission: Transmission, host_s: float | None = None) -> None:
         """Have a frame sent at its tick; a frame that has just been received is read first."""
         self.serve(host_s)
-        dx = bytearray(wrap(transmission.tx_ticks - self._delays.tx_ticks).to_bytes(5, "little"))
-        frame = bytearray(transmission.frame)
-        if self.driver.transmit_at(dx, frame, 0, len(frame)) == dw1000.QUEUED:
+        dx_ticks = wrap(transmission.tx_ticks - self._delays.tx_ticks)
+        if self.driver.transmit_at(dx_ticks, transmission.frame) == dw1000.QUEUED:
             self._pending = transmission.tx_ticks
         else:
             self._listener(Late(transmission.tx_ticks))
@@ -76,8 +75,7 @@ class ChipSession:
         if events & dw1000.SENT:
             self._on_sent()
         if events & dw1000.RECEIVED:
-            frame = bytes(driver.frame[: driver.frame_bytes])
-            self._listener(Reception(frame, _ticks(driver.rx_ticks), host_s, self._diagnostics()))
+            self._listener(Reception(driver.frame, driver.rx_ticks, host_s, self._diagnostics()))
         return True
 
     def is_alive(self) -> bool:
@@ -90,7 +88,7 @@ class ChipSession:
         tx_ticks, self._pending = self._pending, None
         if tx_ticks is None:
             return
-        if _ticks(self.driver.tx_ticks) != tx_ticks:
+        if self.driver.tx_ticks != tx_ticks:
             self._counters["sent-at-another-time"] += 1
         self._listener(Sent(tx_ticks))
 
@@ -110,10 +108,6 @@ class ChipSession:
             self._listener(Late(tx_ticks))
         else:
             self.serve()
-
-
-def _ticks(stamp: memoryview) -> int:
-    return int.from_bytes(stamp, "little")
 
 
 def _value(steps: int, per_unit: int) -> float | None:

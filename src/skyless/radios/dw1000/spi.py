@@ -11,7 +11,7 @@ from types import ModuleType
 from typing import Any, Final
 
 from skyless.errors import SkylessError
-from skyless.firmware.dw1000 import Bus, ChipError
+from skyless.radios.dw1000.driver import ChipError
 from skyless.radios.dw1000.radio import Dw1000Radio
 
 START_HZ: Final = 2_000_000
@@ -38,8 +38,11 @@ _MOST_EDGE_READS: Final = 8
 """Each reads all that the kernel keeps; a line that rises faster than it is read is not waited for."""
 
 
-class SpiBus(Bus):
-    """One chip's SPI device and lines; transfers raise OSError where the kernel refuses them."""
+class SpiBus:
+    """One chip's SPI device and lines (``skyless.radios.dw1000.driver.Bus``).
+
+    Transfers raise OSError where the kernel refuses them.
+    """
 
     def __init__(
         self,
@@ -103,13 +106,9 @@ class SpiBus(Bus):
                 "should be free, and the user in the group gpio"
             ) from None
 
-    def transfer(self, out: memoryview, into: memoryview) -> None:
+    def transfer(self, out: bytes) -> bytes:
         """One transaction in both directions."""
-        into[:] = bytes(self._spi.xfer2(list(out)))
-
-    def write(self, header: memoryview, data: memoryview) -> None:
-        """One transaction that only sends."""
-        self._spi.xfer2([*header, *data])
+        return bytes(self._spi.xfer2(list(out)))
 
     def slow(self) -> None:
         """2 MHz from the next transfer on."""
@@ -162,7 +161,7 @@ class SpiPort:
     """A chip on SPI (``skyless.radios.dw1000.radio.Port``)."""
 
     def __init__(self, name: str, open_bus: Callable[[], SpiBus]) -> None:
-        """``open_bus`` is is_high again after each failure."""
+        """``open_bus`` is called again after each failure."""
         self._name, self._open_bus = name, open_bus
 
     async def run(self, radio: Dw1000Radio) -> None:

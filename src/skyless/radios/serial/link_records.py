@@ -6,7 +6,7 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.air.reception import Diagnostics
-from skyless.firmware import link
+from skyless.radios.serial import link
 
 _STEPS: Final = (100, 100, 1000)
 """Units of powers and carrier offset: steps per dB and per ppm."""
@@ -23,6 +23,8 @@ class Hello(Struct, frozen=True):
     rate_khz: int
     counter_bits: int
     can_transmit: bool
+    reset_cause: int | None
+    """Why it has started, as bits (``link.RESET_BY_PIN`` …); None for a board of version 1.0."""
 
 
 class Heard(Struct, frozen=True, gc=False):
@@ -53,6 +55,8 @@ class Status(Struct, frozen=True):
     ticks: int
     configured: bool
     receiving: bool
+    polled: bool
+    """Whether the chip is polled because its interrupt line does not follow its events."""
     received: int
     errors: int
     sent: int
@@ -111,11 +115,13 @@ def _hello(record: bytes) -> Hello | None:
         return None
     major, minor = record[2], record[3]
     if major != link.MAJOR:
-        return Hello(major, minor, (0, 0, 0), b"", 0, 0, can_transmit=False)
+        return Hello(major, minor, (0, 0, 0), b"", 0, 0, can_transmit=False, reset_cause=None)
     if len(record) < link.HELLO_BYTES:
         return None
     *firmware, device_id, rate_khz, bits, abilities = struct.unpack_from("<3B8sIBB", record, 4)
-    return Hello(major, minor, tuple(firmware), device_id, rate_khz, bits, bool(abilities & link.CAN_TRANSMIT))
+    can_transmit = bool(abilities & link.CAN_TRANSMIT)
+    reset_cause = record[link.HELLO_BYTES] if len(record) > link.HELLO_BYTES else None
+    return Hello(major, minor, tuple(firmware), device_id, rate_khz, bits, can_transmit, reset_cause)
 
 
 def _heard(record: bytes) -> Heard | None:
@@ -143,6 +149,7 @@ def _status(record: bytes) -> Status | None:
         _ticks(record),
         bool(state & link.IS_CONFIGURED),
         bool(state & link.IS_RECEIVING),
+        bool(state & link.IS_POLLED),
         *(received, errors, sent, late, garbled, unsent),
         _value(centidegrees, 100),
         supply_v,

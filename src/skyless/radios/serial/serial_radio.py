@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Final
 
 from skyless.air.reception import Reception, Transmission
-from skyless.firmware import link
 from skyless.radios.interface import AntennaDelays, Gone, Hint, Late, Listener, RadioEvent, Restarted, Sent, ignore
+from skyless.radios.serial import link
 from skyless.radios.serial.link_records import Done, Heard, Hello, NotDone, Record, Status, TooLate, decode
 from skyless.radios.serial.serial_port import BoardClock, SerialPort
 from skyless.ticks import wrap
@@ -32,6 +32,13 @@ _REASONS: Final = {
     link.REFUSED_SETTING: "it has not these settings",
     link.REFUSED_MALFORMED: "it did not understand it",
     link.REFUSED_RADIO: "its radio does not answer or start",
+}
+_RESET_CAUSES: Final = {
+    link.RESET_BY_FAULT: "a fault that its firmware noticed",
+    link.RESET_BY_LOCKUP: "a lockup of its processor",
+    link.RESET_BY_WATCHDOG: "its watchdog",
+    link.RESET_BY_SOFTWARE: "its firmware",
+    link.RESET_BY_PIN: "its reset pin",
 }
 
 
@@ -66,7 +73,7 @@ class LinkSession:
         self._refused = self._reported = ""
         self._heard_s = self._asked_s = 0.0
         self._starts: deque[float] = deque(maxlen=_MOST_STARTS)
-        self._reported_starts = self._reported_idle = False
+        self._reported_starts = self._reported_idle = self._reported_line = False
         self._idle_polls = 0
 
     def begin(self, host_s: float) -> None:
@@ -82,7 +89,7 @@ class LinkSession:
         if self.hello is None or self._refused:
             self._ask_hello(host_s)
         elif self.ready:
-            self._write(self._writer.ask(link.ASK_STATUS))
+            self._send(self._writer.ask_status())
         else:
             self._configure()
             self._count_idle_poll()
@@ -98,7 +105,7 @@ class LinkSession:
 
     def _ask_hello(self, host_s: float) -> None:
         self._asked_s = host_s
-        self._write(self._writer.ask(link.ASK_HELLO))
+        self._send(self._writer.ask_hello())
 
     def _reason_of_silence(self) -> str:
         if self.hello is not None:
@@ -116,18 +123,15 @@ class LinkSession:
         self._pending[dx_ticks] = transmission.tx_ticks
         if len(self._pending) > MOST_PENDING_FRAMES:
             del self._pending[next(iter(self._pending))]
-        dx, frame = dx_ticks.to_bytes(5, "little"), transmission.frame
-        self._write(self._writer.tx_at(bytearray(dx), bytearray(frame), len(frame)))
+        self._send(self._writer.tx_at(dx_ticks, transmission.frame))
 
     def on_data(self, data: bytes, host_s: float) -> None:
         """Process bytes from the port."""
         self._bytes += len(data)
-        reader, buffer, at = self._reader, bytearray(data), 0
+        reader = self._reader
         before = reader.garbled + reader.overlong
-        while at < len(buffer):
-            at = reader.read(buffer, at, len(buffer))
-            if reader.length:
-                self._on_record(bytes(reader.record[: reader.length]), host_s)
+        for record in reader.read(data):
+            self._on_record(record, host_s)
         self._count("garbled-record", reader.garbled + reader.overlong - before)
 
     def _on_record(self, raw: bytes, host_s: float) -> None:
@@ -187,7 +191,7 @@ class LinkSession:
     def _on_hello(self, hello: Hello, host_s: float) -> None:
         """Configure a board of this version; after a repeated HELLO its status shows whether it has restarted."""
         if self.hello is not None and host_s - self._asked_s > _HELLO_ANSWER_S:
-            self._count_start(host_s)
+            self._count_start(host_s, hello.reset_cause)
         is_repeated, self.hello = self.hello is not None and not self._refused, hello
         if hello.major != link.MAJOR:
             self._refuse(
@@ -204,12 +208,15 @@ class LinkSession:
         else:
             self._refused = ""
             if is_repeated:
-                self._write(self._writer.ask(link.ASK_STATUS))
+                self._send(self._writer.ask_status())
             else:
                 self._configure()
 
-    def _count_start(self, host_s: float) -> None:
-        """Count that the board has restarted, and report once that it does so repeatedly."""
+    def _count_start(self, host_s: float, cause: int | None) -> None:
+        """Count that the board has restarted, and report once that it does so repeatedly.
+
+        ``cause`` is what the board said of it, None where it said nothing.
+        """
         self.counters["board-restart"] += 1
         self._idle_polls = 0
         starts = self._starts
@@ -219,7 +226,7 @@ class LinkSession:
         within_s = host_s - starts[0]
         if len(starts) == _MOST_STARTS and within_s <= _MOST_STARTS_S and not self._reported_starts:
             self._reported_starts = True
-            often = f"starts again and again ({_MOST_STARTS} times within {within_s:.0f} s)"
+            often = f"starts again and again ({_MOST_STARTS} times within {within_s:.0f} s{_last_cause(cause)})"
             self._listener(Hint(f"the board at {self._port} {often}: is its supply good, does its firmware fail?"))
 
     def _refuse(self, reason: str) -> None:
@@ -239,12 +246,13 @@ class LinkSession:
             self.counters["refused-command"] += 1
 
     def _configure(self) -> None:
-        self._write(self._writer.config(self._delays.tx_ticks, self._delays.rx_ticks))
-        self._write(self._writer.ask(link.RX_ON))
+        self._send(self._writer.config(self._delays.tx_ticks, self._delays.rx_ticks))
+        self._send(self._writer.rx_on())
 
     def _on_status(self, status: Status, host_s: float) -> None:
         if self.status is not None:
             self._count("rx-error", max(status.errors - self.status.errors, 0))
+        self._check_line(status, was_polled=self.status is not None and self.status.polled)
         self.status = status
         if self._refused:
             return
@@ -252,7 +260,7 @@ class LinkSession:
             if self.ready:  # it has restarted
                 # count it, unless its HELLO did
                 if not self._starts or host_s - self._starts[-1] > _HELLO_ANSWER_S:
-                    self._count_start(host_s)
+                    self._count_start(host_s, None)
                 self._reset()
                 self._configure()
             return
@@ -264,13 +272,34 @@ class LinkSession:
             self._idle_polls, self._reported_idle = 0, False
             self._listener(Restarted())
 
+    def _check_line(self, status: Status, *, was_polled: bool) -> None:
+        """Count when the board begins to poll its radio, and report it once."""
+        if not status.polled or was_polled:
+            return
+        self.counters["interrupt-line-stuck"] += 1
+        if not self._reported_line:
+            self._reported_line = True
+            self._listener(
+                Hint(
+                    f"the interrupt line of the radio on the board at {self._port} does not follow its events; the "
+                    "board polls it, and receptions may come late: is the module sound (on a DWM1001 its GPIO 19)?"
+                )
+            )
+
     def _reset(self) -> None:
         self.ready = False
         self._pending.clear()
         self.clock.reset()
 
-    def _write(self, length: int) -> None:
-        self._send(bytes(self._writer.line[:length]))
+
+def _last_cause(cause: int | None) -> str:
+    """Why a board has started, for a message; empty where it did not say."""
+    if cause is None:
+        return ""
+    words = [text for bit, text in _RESET_CAUSES.items() if cause & bit]
+    if cause == 0:
+        words = ["power on or too low a supply"]
+    return f", at last by {' and '.join(words) or f'cause {cause:#04x}'}"
 
 
 class SerialRadio:

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import Final
 
 from skyless.air.reception import Diagnostics
-from skyless.firmware.dw1000 import Bus
 from skyless.simulation.dw1000 import registers as r
 from skyless.simulation.dw1000.clocking import Clocking, Sensors
 from skyless.simulation.dw1000.memory import Access, Memory, decode_header
@@ -162,8 +161,8 @@ class Chip:
         return outcome
 
 
-class ModelBus(Bus):
-    """A driver's bus to a model of the chip.
+class ModelBus:
+    """A driver's bus to a model of the chip (``skyless.radios.dw1000.driver.Bus``).
 
     ``spend`` lets the host's time pass; a transfer reaches the chip when its time is over.
     """
@@ -175,18 +174,11 @@ class ModelBus(Bus):
         self._spend, self._latency_s = spend, latency_s
         self._hz = _SLOW_HZ
 
-    def _exchange(self, out: bytes) -> bytes:
+    def transfer(self, out: bytes) -> bytes:
+        """One transaction in both directions."""
         if self._spend is not None:
             self._spend((0.0 if self._latency_s is None else self._latency_s()) + 8 * len(out) / self._hz)
         return self.chip.transfer(out, self._hz)
-
-    def transfer(self, out: memoryview, into: memoryview) -> None:
-        """One transaction in both directions."""
-        into[:] = self._exchange(bytes(out))
-
-    def write(self, header: memoryview, data: memoryview) -> None:
-        """One transaction that only sends."""
-        self._exchange(bytes(header) + bytes(data))
 
     def slow(self) -> None:
         """Clock slowly from now on."""

@@ -1,56 +1,26 @@
-"""The DW1000 driver on a scripted bus: bytes against the manual's, numbers against floating point, MicroPython."""
+"""The DW1000 driver on a scripted bus: bytes against the manual's, numbers against floating point."""
 
-import ast
-import importlib.util
 import math
-import shutil
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+import scripted_chip
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.firmware import dw1000
+from skyless.radios.dw1000 import driver as dw1000
 from skyless.simulation.channel import power_bias_m
 
-VECTORS = Path(__file__).with_name("dw1000_vectors.py")
-FOLDER = Path(dw1000.__file__).parent
-TABLE = bytearray(dw1000.LOG10_TABLE)
-MICROPYTHON = shutil.which("micropython", path=Path(sys.executable).parent) or shutil.which("micropython")
-LISTEN_ANEW = ["w f603 e0", "w f603 f0", "w 8d 0001"]
+LISTEN_AGAIN = ["w f603 e0", "w f603 f0", "w 8d 0001"]
 """The receiver is reset whenever it was turned off in what may have been a frame."""
 SPEED_OF_LIGHT = 299_702_547.0  # in air, as Decawave's notes have it
 TICK_M = SPEED_OF_LIGHT / (128 * 499.2e6)
 
 
-def run(interpreter):
-    done = subprocess.run(
-        [interpreter, str(VECTORS), str(FOLDER)], capture_output=True, text=True, timeout=100, check=True
-    )
-    return done.stdout.splitlines(), done.stderr
-
-
 @pytest.fixture(scope="module")
 def here():
-    """What the vectors print in this interpreter: their lines by name."""
-    lines, _ = run(sys.executable)
-    by_name = {}
-    for line in lines:
-        name, _, rest = line.partition(" ")
-        by_name.setdefault(name, []).append(rest)
-    return by_name
-
-
-@pytest.mark.skipif(MICROPYTHON is None, reason="MicroPython's unix port is only on PyPI for x86-64")
-def test_micropython_says_the_same_and_allocates_nothing_per_frame():
-    lines, said = run(MICROPYTHON)
-    assert lines == run(sys.executable)[0]
-    assert "allocated 0" in said
-    passed = next(line for line in lines if line.startswith("passed"))
-    assert passed.split()[2:] == ["3", "3", "3", "3"]  # received, sent, errors, late: all of it was run
+    """What the driver does in its life, as lines by name."""
+    return scripted_chip.Story().lines
 
 
 def test_headers_are_those_of_the_manuals_examples():
@@ -102,28 +72,13 @@ def test_what_the_maker_measured_is_read_from_otp_and_used(here):
 
 
 @pytest.mark.parametrize(
-    ("given_trim", "stored", "written"), [(-1, 0, 0x70), (-1, 7, 0x67), (0, 7, 0x60), (31, 7, 0x7F)]
+    ("given_trim", "stored", "written"), [(None, 0, 0x70), (None, 7, 0x67), (0, 7, 0x60), (31, 7, 0x7F)]
 )
 def test_the_crystals_trim_is_the_given_one_or_the_makers_or_the_middle(given_trim, stored, written, monkeypatch):
-    vectors = module_of_vectors()
-    monkeypatch.setitem(vectors.OTP, 0x1E, stored)
-    bus = vectors.ScriptedBus()
+    monkeypatch.setitem(scripted_chip.OTP, 0x1E, stored)
+    bus = scripted_chip.ScriptedBus()
     dw1000.DW1000(bus).start(0, 0, crystal_trim=given_trim)
     assert f"w eb0e {written:02x}" in bus.log
-
-
-def module_of_vectors():
-    """The vectors' fakes, over the driver that this test imports."""
-    spec = importlib.util.spec_from_file_location("dw1000_vectors_here", VECTORS)
-    module = importlib.util.module_from_spec(spec)
-    arguments, sys.argv = sys.argv, [str(VECTORS), str(FOLDER)]
-    try:
-        spec.loader.exec_module(module)
-    finally:
-        sys.argv = arguments
-        sys.path.remove(str(FOLDER))
-    module.dw1000 = dw1000
-    return module
 
 
 def test_a_frame_is_read_whole_before_the_receiver_goes_on(here):
@@ -163,11 +118,11 @@ def test_a_frame_is_handed_over_before_the_receiver_goes_off_and_its_time_loses_
     assert here["busy"] == ["2 []"]
     assert here["waiting"] == ["0 ['r 0f 5']"]
     assert here["sent"] == ["2 343eaccdef 1 2"]
-    assert here["done"] == ["r 0f 5", "r 17 5", "w 8f f000000000", *LISTEN_ANEW]
+    assert here["done"] == ["r 0f 5", "r 17 5", "w 8f f000000000", *LISTEN_AGAIN]
 
 
 def test_a_frame_that_comes_too_late_is_taken_back(here):
-    taken_back = ["r 0f 5", "w 8d 40", "r 0f 5", "w 8d 40", "w 8f f8ffff3707", *LISTEN_ANEW]
+    taken_back = ["r 0f 5", "w 8d 40", "r 0f 5", "w 8d 40", "w 8f f8ffff3707", *LISTEN_AGAIN]
     assert here["late"] == ["1 2 1", *taken_back]
     assert here["unready"] == ["1 2 2", *taken_back]
 
@@ -181,7 +136,7 @@ def test_a_frame_that_has_left_is_not_called_late(here):
 def test_each_error_resets_the_receiver_and_listens_on(here):
     told = [line for line in here["failed"] if line[0].isdigit()]
     assert [line.split()[2:] for line in told] == [["4", str(count), "2"] for count in range(1, 10)]
-    recovery = ["r 0f 5", "w 8d 40", "w 8f f8ffff3707", *LISTEN_ANEW]
+    recovery = ["r 0f 5", "w 8d 40", "w 8f f8ffff3707", *LISTEN_AGAIN]
     assert [line for line in here["failed"] if not line[0].isdigit()] == 9 * recovery
 
 
@@ -193,8 +148,7 @@ def test_a_chip_that_forgot_or_does_not_answer_is_lost(here):
 
 @pytest.mark.parametrize("octet", [0x00, 0xFF])
 def test_a_bus_with_nothing_on_it_is_a_lost_chip(octet):
-    vectors = module_of_vectors()
-    bus, chip = vectors.started()
+    bus, chip = scripted_chip.started()
     chip.receive()
     for file in (0x0F, 0x1F):
         bus.put(file, 0, bytes([octet]) * 5)
@@ -212,10 +166,8 @@ def test_what_does_not_start_says_why(here):
 
 
 def test_waiting_frames_outlive_receive_and_can_be_taken_back():
-    vectors = module_of_vectors()
-    _, chip = vectors.started()
-    frame = bytearray(20)
-    assert chip.transmit_at(bytearray(5), frame, 0, 20) == dw1000.QUEUED
+    _, chip = scripted_chip.started()
+    assert chip.transmit_at(0, bytes(20)) == dw1000.QUEUED
     chip.receive()
     assert chip.state == dw1000.SENDING
     assert chip.cancel()
@@ -233,85 +185,22 @@ def test_transactions_per_frame_are_few(here):
     assert here["handed"] == ["over in 7 transactions 132 octets"]
 
 
-COMPILED_ON_BOARDS = ("copy", "copy_masked", "log10")
-
-
-def operations(act):
-    """How many bytecodes of the driver CPython runs for it, but for what boards run as machine code."""
-    count = 0
-
-    def trace(frame, event, argument):
-        nonlocal count
-        code = frame.f_code
-        if code.co_filename != dw1000.__file__ or code.co_name in COMPILED_ON_BOARDS:
-            return None
-        frame.f_trace_opcodes, frame.f_trace_lines = True, False
-        count += event == "opcode"
-        return trace
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        act()
-    finally:
-        sys.settrace(before)
-    return count
-
-
-def test_bytecodes_per_frame_are_few():
-    """CPython's, which are much the same as MicroPython's; a board of 64 MHz runs some two in a microsecond."""
-    vectors = module_of_vectors()
-    bus = vectors.QuietBus()
-    chip = dw1000.DW1000(bus)
-    chip.state = dw1000.IDLE
-    chip.receive()
-    bus.status, bus.status_1 = 0x03, 0x6F
-    assert 100 < operations(chip.poll) < 650
-    assert chip.received == 1
-    bus.status, bus.status_1 = 0x02, 0
-    assert 100 < operations(lambda: chip.transmit_at(bytearray(5), bytearray(127), 0, 127)) < 280
-    bus.status = 0x83
-    assert 100 < operations(chip.poll) < 230
-    assert chip.sent == 1
-
-
-class Small(int):
-    """A number that MicroPython holds without memory on 32-bit boards; what is computed of it must be one too."""
-
-    def __new__(cls, value):
-        assert -(2**30) <= value < 2**30, f"{value} needs memory"
-        return super().__new__(cls, value)
-
-
-def _checked(name):
-    def operate(self, *others):
-        result = getattr(int, name)(self, *others)
-        return Small(result) if isinstance(result, int) and not isinstance(result, bool) else result
-
-    return operate
-
-
-for _name in ("add", "sub", "mul", "floordiv", "lshift", "rshift", "and", "or", "xor", "mod"):
-    for _prefix in ("__", "__r"):
-        setattr(Small, f"{_prefix}{_name}__", _checked(f"{_prefix}{_name}__"))
-Small.__neg__ = _checked("__neg__")
-
 U16 = st.integers(0, 0xFFFF)
 
 
 @given(st.integers(1, 2**30 - 1))
 def test_the_logarithm_is_that_of_floating_point(value):
-    assert abs(dw1000.log10(Small(value), TABLE) - 1e5 * math.log10(value)) < 8
+    assert abs(dw1000.log10(value) - 1e5 * math.log10(value)) < 8
 
 
 def test_the_logarithm_is_right_where_its_pieces_meet():
     for value in [base + step for base in range(0x8000, 0x10000, 0x400) for step in (-1, 0, 1)]:
-        assert abs(dw1000.log10(value, TABLE) - 1e5 * math.log10(value)) < 8
+        assert abs(dw1000.log10(value) - 1e5 * math.log10(value)) < 8
 
 
 @given(U16, st.integers(-5, 0xFFF))
 def test_received_power_is_the_manuals_formula(cir_power, symbols):
-    power = dw1000.power_cdbm(Small(cir_power), dw1000.accumulated(Small(symbols)))
+    power = dw1000.power_cdbm(cir_power, dw1000.accumulated(symbols))
     if cir_power == 0 or symbols <= 0:
         assert power == dw1000.NOT_MEASURED
     else:
@@ -320,7 +209,7 @@ def test_received_power_is_the_manuals_formula(cir_power, symbols):
 
 @given(U16, U16, U16, st.integers(0, 0xFFF))
 def test_first_path_power_is_the_manuals_formula(f1, f2, f3, symbols):
-    power = dw1000.first_path_cdbm(Small(f1), Small(f2), Small(f3), dw1000.accumulated(Small(symbols)))
+    power = dw1000.first_path_cdbm(f1, f2, f3, dw1000.accumulated(symbols))
     if f1 == f2 == f3 == 0 or symbols == 0:
         assert power == dw1000.NOT_MEASURED
     else:
@@ -331,7 +220,7 @@ def test_first_path_power_is_the_manuals_formula(f1, f2, f3, symbols):
 @given(st.integers(-(2**20), 2**20 - 1))
 def test_carrier_offset_is_the_manuals_formula(integrator):
     exact = -integrator * 998.4e6 / 2 / 1024 / 131072 / 6489.6e6 * 1e9
-    ppb = dw1000.carrier_offset_ppb(Small(integrator))
+    ppb = dw1000.carrier_offset_ppb(integrator)
     if ppb == dw1000.NOT_MEASURED:
         assert abs(exact) > 32_760
     else:
@@ -342,7 +231,7 @@ def test_carrier_offset_is_the_manuals_formula(integrator):
 @given(st.integers(-(2**18), 2**18 - 1))
 def test_tracked_clock_offset_is_the_manuals_formula(offset):
     exact = offset / 0x01FC0000 * 1e9
-    ppb = dw1000.clock_offset_ppb(Small(offset))
+    ppb = dw1000.clock_offset_ppb(offset)
     assert abs(ppb - exact) < 0.51 if ppb != dw1000.NOT_MEASURED else abs(exact) > 32_740
 
 
@@ -355,21 +244,7 @@ def test_the_manuals_examples_of_clock_offsets():
 @given(st.integers(-32768, 0))
 def test_the_bias_is_that_of_the_note(power_cdbm):
     """Within half a tick of the table that the emulation has, 2.3 mm."""
-    assert abs(dw1000.bias_ticks(Small(power_cdbm)) - power_bias_m(power_cdbm / 100) / TICK_M) < 0.55
-
-
-@given(st.integers(0, 2**40 - 1), st.integers(-(2**23), 2**23))
-def test_stamps_are_shifted_modulo_their_counter(ticks, change):
-    stamp = bytearray(ticks.to_bytes(5, "little"))
-    dw1000.add_ticks(stamp, Small(change))
-    assert int.from_bytes(stamp, "little") == (ticks + change) % 2**40
-
-
-@given(st.integers(0, 2**40 - 1), st.integers(-(2**39) + 2**17, 2**39 - 2**17))
-def test_the_way_to_a_stamp_goes_the_short_way_round(now, distance):
-    then = (now + distance) % 2**40
-    steps = dw1000.micros_until(now.to_bytes(5, "little"), then.to_bytes(5, "little"))
-    assert abs(steps - distance / 65536) < 1
+    assert abs(dw1000.bias_ticks(power_cdbm) - power_bias_m(power_cdbm / 100) / TICK_M) < 0.55
 
 
 def test_temperature_and_supply_are_the_manuals_formulas(here):
@@ -377,19 +252,9 @@ def test_temperature_and_supply_are_the_manuals_formulas(here):
     assert here["measured"] == [
         f"{round(100 * ((0 - 0x86) * 1.14 + 23))} {math.floor(1000 * ((0 - 0x7D) / 173 + 3.3))}"
     ]
-    chip = dw1000.DW1000(dw1000.Bus())
+    chip = dw1000.DW1000(scripted_chip.ScriptedBus())
     chip._convert(175, 122)
     assert (chip.millivolts, chip.temperature_cc) == pytest.approx((3300, 2486), abs=100)
-
-
-def test_the_file_needs_nothing_that_boards_lack():
-    """No imports but MicroPython's own or its stand-in, no floating point, no division but that of integers."""
-    tree = list(ast.walk(ast.parse(Path(dw1000.__file__).read_text(encoding="utf-8"))))
-    assert [ast.unparse(node) for node in tree if isinstance(node, ast.Import | ast.ImportFrom)] == [
-        "from skyless.firmware import micropython, ptr8", "import micropython"
-    ]  # fmt: skip
-    assert not [node for node in tree if isinstance(node, ast.Constant) and isinstance(node.value, float)]
-    assert not [node for node in tree if isinstance(node, ast.Div | ast.Pow)]
 
 
 def test_the_tables_pieces_are_logarithms():

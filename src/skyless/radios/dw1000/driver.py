@@ -1,7 +1,8 @@
-"""Driver of the DW1000, for MicroPython and CPython alike: integers only, and nothing is allocated per frame.
+"""Driver of the DW1000, over a bus that its caller gives; integers only.
 
 Written from the DW1000 User Manual v2.12 ("UM", pages of that version); ``docs/dw1000.md`` lists which table was
-compared with which other source. It has never run on a chip. What it needs of the hardware is a ``Bus``.
+compared with which other source. It has never run on a chip. The firmware in C (``firmware/source/dw1000.c``) does the
+same, transaction by transaction. What the driver needs of the hardware is a ``Bus``.
 
 States, in ``DW1000.state``:
 
@@ -14,93 +15,91 @@ States, in ``DW1000.state``:
 
 ``poll`` is to be called when the interrupt line is high, or periodically; it returns what happened as a sum of
 RECEIVED, SENT, FAILED, CLOCK_SLIPPED and LOST, and has already turned the receiver on again. Until the next ``poll``,
-what was received is in ``rx_ticks``, ``frame[:frame_bytes]``, ``rx_power_cdbm``, ``first_path_cdbm`` and
-``offset_ppb``, the stamp of what was SENT in ``tx_ticks``. If SENT does not come within 1 ms after its time, call
-``cancel``. After LOST the chip is OFF and its counter has restarted: ``start`` again. Before ``transmit_at`` poll once,
-or a frame that has just come is lost.
-
-Stamps are raw 40-bit ticks in 5 bytes, the lowest first, as the chip has them; they are never numbers here.
+what was received is in ``rx_ticks``, ``frame``, ``rx_power_cdbm``, ``first_path_cdbm`` and ``offset_ppb``, the stamp of
+what was SENT in ``tx_ticks``. If SENT does not come within 1 ms after its time, call ``cancel``. After LOST the chip is
+OFF and its counter has restarted: ``start`` again. Before ``transmit_at`` poll once, or a frame that has just come is
+lost. Frames are sent and read in steps of 8 octets, as the firmware does.
 """
 
-try:
-    from skyless.firmware import micropython, ptr8
-except ImportError:  # a board, where MicroPython brings both
-    import micropython  # type: ignore[no-redef]
+import struct
+from typing import Final, Protocol
 
-OFF = 0
-IDLE = 1
-LISTENING = 2
-SENDING = 3
+from skyless.ticks import wrap
+
+OFF: Final = 0
+IDLE: Final = 1
+LISTENING: Final = 2
+SENDING: Final = 3
 """States."""
 
-RECEIVED = 1
-SENT = 2
-FAILED = 4
-CLOCK_SLIPPED = 8
-LOST = 16
+RECEIVED: Final = 1
+SENT: Final = 2
+FAILED: Final = 4
+CLOCK_SLIPPED: Final = 8
+LOST: Final = 16
 """Results of ``poll``: a frame was received, ours was sent; a reception failed; the clock's PLL was losing lock (stamps
 around that time are unreliable); the chip does not answer or was reset."""
 
-QUEUED = 0
-LATE = 1
-BUSY = 2
-NOT_READY = 3
+QUEUED: Final = 0
+LATE: Final = 1
+BUSY: Final = 2
+NOT_READY: Final = 3
 """Results of ``transmit_at``: the frame will be sent at its time; or nothing is sent, because it was too late, another
 frame waits, or the chip is OFF."""
 
-NOT_MEASURED = -32768
+NOT_MEASURED: Final = -32768
 """A measured value that is missing."""
-MIN_PSDU_BYTES = 3
-MAX_PSDU_BYTES = 127
+MIN_PSDU_BYTES: Final = 3
+MAX_PSDU_BYTES: Final = 127
 """FCS included, which the chip makes and checks (UM p. 80)."""
 
-DEVICE_ID = b"\x30\x01\xca\xde"
+DEVICE_ID: Final = b"\x30\x01\xca\xde"
 """DEV_ID 0xDECA0130, low byte first (UM 7.2.2)."""
 
-# SYS_STATUS (UM 7.2.17, pp. 86-92), bits 0 to 23 as one number; octets 3 and 4 apart, as numbers stay below 2**30.
-CPLOCK = 1 << 1
-TXFRS = 1 << 7
-LDEDONE = 1 << 10
-RXPHE = 1 << 12
-RXFCG = 1 << 14
-RXFCE = 1 << 15
-RXRFSL = 1 << 16
-RXRFTO = 1 << 17
-LDEERR = 1 << 18
-RXOVRR = 1 << 20
-RXPTO = 1 << 21
-SLP2INIT = 1 << 23
-RX_ERRORS = RXPHE | RXFCE | RXRFSL | RXRFTO | LDEERR | RXOVRR | RXPTO
-CLKPLL_LL_3 = 1 << 1
-RXSFDTO_3 = 1 << 2
-HPDWARN_3 = 1 << 3
-AFFREJ_3 = 1 << 5
-RX_ERRORS_3 = RXSFDTO_3 | AFFREJ_3
-TXPUTE_4 = 1 << 2
-UNUSED_4 = 0xF8
-"""Bits of SYS_STATUS; _3 and _4 are within octet 3 and 4."""
+# SYS_STATUS (UM 7.2.17, pp. 86-92)
+CPLOCK: Final = 1 << 1
+TXFRS: Final = 1 << 7
+LDEDONE: Final = 1 << 10
+RXPHE: Final = 1 << 12
+RXFCG: Final = 1 << 14
+RXFCE: Final = 1 << 15
+RXRFSL: Final = 1 << 16
+RXRFTO: Final = 1 << 17
+LDEERR: Final = 1 << 18
+RXOVRR: Final = 1 << 20
+RXPTO: Final = 1 << 21
+SLP2INIT: Final = 1 << 23
+CLKPLL_LL: Final = 1 << 25
+RXSFDTO: Final = 1 << 26
+HPDWARN: Final = 1 << 27
+AFFREJ: Final = 1 << 29
+TXPUTE: Final = 1 << 34
+RX_ERRORS: Final = RXPHE | RXFCE | RXRFSL | RXRFTO | LDEERR | RXOVRR | RXPTO | RXSFDTO | AFFREJ
+UNUSED: Final = 0xF8 << 32
+"""Bits that do not exist."""
+STATUS_OCTETS: Final = 5
 
-CLEARED = b"\xf8\xff\xff\x37\x07"
+CLEARED: Final = 0x07_37FF_FFF8
 """What is written back to SYS_STATUS at most: not CPLOCK, which shows that the chip still runs as it was started, nor
 bits that cannot be written."""
 
 # SYS_CTRL (UM 7.2.15, pp. 80-84)
-TXSTRT_TXDLYS = 0x06
-TRXOFF = 0x40
-RXENAB = 0x0100
+TXSTRT_TXDLYS: Final = 0x06
+TRXOFF: Final = 0x40
+RXENAB: Final = 0x0100
 
-SYS_MASK_EVENTS = (TXFRS | RXFCG | RX_ERRORS, CLKPLL_LL_3 | RX_ERRORS_3)
-"""Which events raise the interrupt line: octets 0 to 2, octet 3 (UM 7.2.16)."""
+SYS_MASK_EVENTS: Final = TXFRS | RXFCG | RX_ERRORS | CLKPLL_LL
+"""Which events raise the interrupt line (UM 7.2.16)."""
 
-TX_FCTRL = 0x0016_C000
+TX_FCTRL: Final = 0x0016_C000
 """6.8 Mbit/s (TXBR 2), ranging bit, PRF 64 MHz (TXPRF 2), 128 symbols (TXPSR 1, PE 1); the length is added
 (UM 7.2.10, Table 16)."""
 
-TX_POWER = 0x2545_6585
+TX_POWER: Final = 0x2545_6585
 """Smart power, channel 5, PRF 64 MHz: the manual's reference values (UM 7.2.31, Tables 19 and 20). A beacon of up to
 67 bytes uses the third octet; the rule behind it is one frame per millisecond."""
 
-CONFIGURATION = (
+CONFIGURATION: Final = (
     # file, sub-address, octets, value; channel 5, PRF 64 MHz, 6.8 Mbit/s, preamble of 128 symbols with code 9
     (0x04, 0x00, 4, 0x0000_1200),  # SYS_CFG: IRQ high, one RX buffer, smart power, no filter, no RXAUTR (UM 7.2.6)
     (0x1F, 0x00, 4, 0x4A48_0055),  # CHAN_CTRL: channels 5, RXPRF 2, codes 9, standard SFD (UM 7.2.32)
@@ -125,39 +124,37 @@ CONFIGURATION = (
 )
 
 # Addresses in the one-time programmable memory (UM 6.3, Table 10)
-OTP_LDOTUNE = 0x04
-OTP_PART_ID = 0x06
-OTP_LOT_ID = 0x07
-OTP_VOLTAGE = 0x08
-OTP_TEMPERATURE = 0x09
-OTP_CRYSTAL_TRIM = 0x1E
+OTP_LDOTUNE: Final = 0x04
+OTP_PART_ID: Final = 0x06
+OTP_LOT_ID: Final = 0x07
+OTP_VOLTAGE: Final = 0x08
+OTP_TEMPERATURE: Final = 0x09
+OTP_CRYSTAL_TRIM: Final = 0x1E
 
-RESET_US = 5000
+RESET_US: Final = 5000
 """From the release of RSTn until the chip is in INIT (data sheet 5.6: some 3 ms)."""
-LDE_LOAD_US = 300
+LDE_LOAD_US: Final = 300
 """The microcode's load takes 150 µs (UM 2.5.5.10, Table 4)."""
-LOCK_TRIES = 50
-LDE_TRIES = 10
+LOCK_TRIES: Final = 50
+LDE_TRIES: Final = 10
 """How often 100 µs for the PLL's lock, and 20 µs for the first path's search, are waited for."""
 
-SFD_ACCUMULATED = 5
+SFD_ACCUMULATED: Final = 5
 """Symbols of the standard SFD in RXPACC where it did not saturate (UM 7.2.18, p. 95, Table 18)."""
-POWER_A = 1_217_400
+POWER_A: Final = 1_217_400
 """The constant A at PRF 64 MHz, 121.74 dB, in 1e-4 dB (UM 4.7.1, p. 46)."""
-LOG10_2 = 30_103
-COUNT_MASK = 0x3FFF_FFFF
+LOG10_2: Final = 30_103
 
 # fmt: off
-_LOG10 = (
+_LOG10: Final = (
     0, 1336, 2633, 3892, 5115, 6305, 7463, 8591, 9691, 10763, 11810,
     12832, 13830, 14806, 15761, 16695, 17609, 18505, 19382, 20242, 21085, 21913,
     22724, 23521, 24304, 25072, 25828, 26570, 27300, 28018, 28724, 29419, 30103,
 )
 # fmt: on
-LOG10_TABLE = b"".join([value.to_bytes(2, "little") for value in _LOG10])
-"""100 000 log10(1 + i/32), two bytes each."""
+"""100 000 log10(1 + i/32)."""
 
-_BIAS_MM = (-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71, 76, 81, 86)
+_BIAS_MM: Final = (-110, -105, -100, -93, -82, -69, -51, -27, 0, 21, 35, 42, 49, 62, 71, 76, 81, 86)
 """How far off a received stamp is at -61, -63 … -95 dBm (Decawave APS011, Table 2: 500 MHz, PRF 64 MHz)."""
 
 
@@ -165,32 +162,23 @@ class ChipError(Exception):
     """There is no DW1000 on the bus, or it does not start; the message states what was found."""
 
 
-class Bus:
-    """The hardware that the driver needs. Buffers belong to the driver; no reference to them may be kept."""
+class Bus(Protocol):
+    """The hardware that the driver needs; each method may raise OSError."""
 
-    def transfer(self, out: memoryview, into: memoryview) -> None:
-        """One SPI transaction (mode 0) in both directions; both have the same length."""
-        raise NotImplementedError
-
-    def write(self, header: memoryview, data: memoryview) -> None:
-        """One SPI transaction that sends the header and, without a pause of the chip select, the data."""
-        raise NotImplementedError
+    def transfer(self, out: bytes) -> bytes:
+        """One SPI transaction (mode 0): what the chip sends while it receives ``out``, as many octets."""
 
     def slow(self) -> None:
         """Clock at most 3 MHz from now on: the chip's PLL has no lock (UM 2.3.2)."""
-        raise NotImplementedError
 
     def fast(self) -> None:
         """Clock at most 20 MHz from now on."""
-        raise NotImplementedError
 
     def reset(self) -> bool:
         """Pull RSTn low for a moment and let go (never drive it high); False where it is not wired."""
-        return False
 
     def pause_us(self, microseconds: int) -> None:
         """Wait at least that long."""
-        raise NotImplementedError
 
 
 def header(is_write: bool, file: int, sub: int) -> bytes:
@@ -203,48 +191,8 @@ def header(is_write: bool, file: int, sub: int) -> bytes:
     return bytes((first | 0x40, 0x80 | (sub & 0x7F), sub >> 7))
 
 
-class _Reading:
-    """A register that is read repeatedly; ``data`` is what was read."""
-
-    def __init__(self, file: int, sub: int, size: int) -> None:
-        head = header(False, file, sub)
-        self.out = memoryview(bytearray(head + bytes(size)))
-        self.into = memoryview(bytearray(len(head) + size))
-        self.data = self.into[len(head) :]
-
-
-class _Writing:
-    """A register that is written repeatedly; ``data`` is what will be written."""
-
-    def __init__(self, file: int, sub: int, content: bytes) -> None:
-        self.header = memoryview(header(True, file, sub))
-        self.data = memoryview(bytearray(content))
-
-
-@micropython.viper
-def copy(source: ptr8, at: int, end: int, out: ptr8) -> int:
-    """Copy ``source[at:end]`` to the beginning of ``out``; return how much that is."""
-    fill = 0
-    while at < end:
-        out[fill] = source[at]
-        at += 1
-        fill += 1
-    return fill
-
-
-@micropython.viper
-def copy_masked(source: ptr8, mask: ptr8, end: int, out: ptr8) -> int:
-    """Copy ``source[:end]`` to ``out``, only the bits that ``mask`` has."""
-    at = 0
-    while at < end:
-        out[at] = source[at] & mask[at]
-        at += 1
-    return end
-
-
-@micropython.viper
-def log10(value: int, table: ptr8) -> int:
-    """100 000 log10 of a number from 1 to 2**30 - 1, to 8 of its units, with ``LOG10_TABLE``."""
+def log10(value: int) -> int:
+    """100 000 log10 of a number from 1 to 2**30 - 1, to 8 of its units."""
     exponent = 15
     while value >= 0x10000:
         value >>= 1
@@ -252,22 +200,20 @@ def log10(value: int, table: ptr8) -> int:
     while value < 0x8000:
         value <<= 1
         exponent -= 1
-    at = ((value - 0x8000) >> 10) << 1
-    low = table[at] | (table[at + 1] << 8)
-    high = table[at + 2] | (table[at + 3] << 8)
-    return exponent * 30103 + low + (((high - low) * (value & 0x3FF)) >> 10)
+    at = (value - 0x8000) >> 10
+    return exponent * LOG10_2 + _LOG10[at] + (((_LOG10[at + 1] - _LOG10[at]) * (value & 0x3FF)) >> 10)
 
 
 def accumulated(symbols: int) -> int:
     """What the formulas of power subtract for RXPACC symbols in 1e-4 dB: A, and 20 log10; 0 where there are none."""
-    return POWER_A + 2 * log10(symbols, LOG10_TABLE) if symbols > 0 else 0
+    return POWER_A + 2 * log10(symbols) if symbols > 0 else 0
 
 
 def power_cdbm(cir_power: int, level: int) -> int:
     """Received power in 0.01 dBm from CIR_PWR and what ``accumulated`` gave (UM 4.7.2), or NOT_MEASURED."""
     if cir_power == 0 or level == 0:
         return NOT_MEASURED
-    power: int = log10(cir_power, LOG10_TABLE) + 17 * LOG10_2 - level
+    power = log10(cir_power) + 17 * LOG10_2 - level
     return (power + 50) // 100
 
 
@@ -283,7 +229,7 @@ def first_path_cdbm(f1: int, f2: int, f3: int, level: int) -> int:
     squares = f1 * f1 + f2 * f2 + f3 * f3
     if squares == 0:
         return NOT_MEASURED
-    power: int = log10(squares, LOG10_TABLE) - level
+    power = log10(squares) - level
     return (power + 50) // 100
 
 
@@ -314,23 +260,8 @@ def bias_ticks(rx_power_cdbm: int) -> int:
     return (parts * 1000 + 469_176) // 938_353  # a tick is 4.691764 mm
 
 
-def add_ticks(ticks: bytearray | memoryview, change: int) -> None:
-    """Add a number of less than 24 bits to a stamp of 5 bytes, modulo 2**40."""
-    for at in range(5):
-        change += ticks[at]
-        ticks[at] = change & 0xFF
-        change >>= 8
-
-
-def micros_until(now: bytearray | memoryview, then: bytearray | memoryview) -> int:
-    """From one stamp to another in 65 536 ticks (1.026 µs), negative if it was before; at most 8.6 s."""
-    distance = (then[2] | then[3] << 8 | then[4] << 16) - (now[2] | now[3] << 8 | now[4] << 16)
-    distance &= 0xFF_FFFF
-    return distance - 0x100_0000 if distance & 0x80_0000 else distance
-
-
 class DW1000:
-    """One chip. Counts wrap at 30 bits. ``errors`` are failed receptions of any kind."""
+    """One chip. ``errors`` are failed receptions of any kind."""
 
     def __init__(self, bus: Bus) -> None:
         self.state = OFF
@@ -343,8 +274,10 @@ class DW1000:
         self.sent = 0
         self.late = 0
         self.error_status = 0
-        """SYS_STATUS, octets 0 to 2, of the last error; 0 for a frame that was too short."""
-        self.frame_bytes = 0
+        """SYS_STATUS of the last error; 0 for a frame that was too short."""
+        self.frame = b""
+        self.rx_ticks = 0
+        self.tx_ticks = 0
         self.rx_power_cdbm = NOT_MEASURED
         self.first_path_cdbm = NOT_MEASURED
         self.offset_ppb = NOT_MEASURED
@@ -358,45 +291,17 @@ class DW1000:
         self._listening = False
         self._temperature_23 = 0
         self._voltage_33 = 0
-        self._make_registers()
+        self._status = 0
+        """SYS_STATUS as it was read last."""
+        self._tx_buffer = bytearray(128)
+        """What the chip's buffer holds."""
 
-    def _make_registers(self) -> None:
-        """All buffers that frames pass through."""
-        self._status = _Reading(0x0F, 0, 5)
-        self._frame_info = _Reading(0x10, 0, 4)
-        self._quality = _Reading(0x12, 0, 8)
-        self._tracking = _Reading(0x14, 0, 3)
-        self._rx_time = _Reading(0x15, 0, 9)
-        self._tx_time = _Reading(0x17, 0, 5)
-        self._time = _Reading(0x06, 0, 5)
-        self._carrier = _Reading(0x27, 0x28, 6)
-        self._rx_buffer = _Reading(0x11, 0, 128)
-        self.rx_ticks = self._rx_time.data[:5]
-        self.tx_ticks = self._tx_time.data
-        self.now_ticks = self._time.data
-        self.frame = self._rx_buffer.data
-        # Slices allocate, so those that frames need are made beforehand, in steps of 8 bytes.
-        self._rx_outs = [self._rx_buffer.out[: 1 + end] for end in range(0, 129, 8)]
-        self._rx_intos = [self._rx_buffer.into[: 1 + end] for end in range(0, 129, 8)]
-        self._tx_buffer = _Writing(0x09, 0, bytes(128))
-        self._tx_parts = [self._tx_buffer.data[:end] for end in range(0, 129, 8)]
-        self._tx_control = _Writing(0x08, 0, TX_FCTRL.to_bytes(4, "little"))
-        self._dx = _Writing(0x0A, 0, bytes(5))
-        self._clear_status = _Writing(0x0F, 0, bytes(5))
-        self._clear_slipped = _Writing(0x0F, 0, bytes((0, 0, 0, CLKPLL_LL_3, 0)))
-        self._clear_all = _Writing(0x0F, 0, CLEARED)
-        self._transmit = _Writing(0x0D, 0, bytes((TXSTRT_TXDLYS,)))
-        self._off = _Writing(0x0D, 0, bytes((TRXOFF,)))
-        self._enable = _Writing(0x0D, 0, RXENAB.to_bytes(2, "little"))
-        self._reset_rx = _Writing(0x36, 3, b"\xe0")
-        self._reset_none = _Writing(0x36, 3, b"\xf0")
-
-    # Starting; this may allocate
+    # Starting
 
     def start(
-        self, tx_antenna_delay: int, rx_antenna_delay: int, tx_power: int = TX_POWER, crystal_trim: int = -1
+        self, tx_delay_ticks: int, rx_delay_ticks: int, tx_power: int = TX_POWER, crystal_trim: int | None = None
     ) -> None:
-        """Reset and configure the chip; antenna delays of 16 bits in ticks, crystal trim from OTP unless it is given.
+        """Reset and configure the chip; antenna delays of 16 bits, crystal trim from OTP unless it is given.
 
         Raises:
             ChipError: no DW1000 answers, or its clock does not lock.
@@ -416,30 +321,31 @@ class DW1000:
         for file, sub, size, value in CONFIGURATION:
             self._write(file, sub, size, value)
         self._write(0x1E, 0, 4, tx_power)
-        self.set_antenna_delays(tx_antenna_delay, rx_antenna_delay)
-        self._write(0x0E, 0, 4, SYS_MASK_EVENTS[0] | SYS_MASK_EVENTS[1] << 24)
+        self.set_antenna_delays(tx_delay_ticks, rx_delay_ticks)
+        self._write(0x0E, 0, 4, SYS_MASK_EVENTS)
         self._off_and_clear()
         self.state = IDLE
 
-    def set_antenna_delays(self, tx_ticks: int, rx_ticks: int) -> None:
+    def set_antenna_delays(self, tx_delay_ticks: int, rx_delay_ticks: int) -> None:
         """TX_ANTD (UM 7.2.26, p. 103) and LDE_RXANTD (7.2.47.5), which the chip includes in all its stamps."""
-        self._write(0x18, 0, 2, tx_ticks)
-        self._write(0x2E, 0x1804, 2, rx_ticks)
+        self._write(0x18, 0, 2, tx_delay_ticks)
+        self._write(0x2E, 0x1804, 2, rx_delay_ticks)
 
     def _write(self, file: int, sub: int, size: int, value: int) -> None:
-        content = bytes([value >> 8 * octet & 0xFF for octet in range(size)])
-        self._bus.write(memoryview(header(True, file, sub)), memoryview(content))
+        self._bus.transfer(header(True, file, sub) + value.to_bytes(size, "little"))
 
     def _read(self, file: int, sub: int, size: int) -> bytes:
-        reading = _Reading(file, sub, size)
-        self._bus.transfer(reading.out, reading.into)
-        return bytes(reading.data)
+        head = header(False, file, sub)
+        return self._bus.transfer(head + bytes(size))[len(head) :]
+
+    def _read_number(self, file: int, sub: int, size: int) -> int:
+        return int.from_bytes(self._read(file, sub, size), "little")
 
     def _identify(self, when: str) -> None:
         found = self._read(0x00, 0, 4)
         if found != DEVICE_ID:
-            number = "".join(["%02X" % found[octet] for octet in (3, 2, 1, 0)])  # noqa: UP031 - MicroPython too
-            raise ChipError("no DW1000" + when + ": its identifier is DECA0130, read was " + number)
+            number = found[::-1].hex().upper()
+            raise ChipError(f"no DW1000{when}: its identifier is DECA0130, read was {number}")
 
     def _soft_reset(self) -> None:
         """Crystal clock; nothing to be restored by the always-on block; SOFTRESET (UM 7.2.50.1, 7.2.45)."""
@@ -461,7 +367,7 @@ class DW1000:
         self._write(0x2D, 0x06, 1, 0x00)
         return self._read(0x2D, 0x0A, 4)
 
-    def _calibrate(self, crystal_trim: int) -> None:
+    def _calibrate(self, crystal_trim: int | None) -> None:
         """What was measured when the chip or module was made: supply, crystal, temperature (UM 2.5.5.11, 8.1, 6.4)."""
         self._write(0x24, 0x00, 4, 0x04)  # EC_CTRL: PLLLDT, without which CPLOCK means nothing (UM 7.2.37.1)
         if self._read_otp(OTP_LDOTUNE)[0] != 0:
@@ -469,10 +375,9 @@ class DW1000:
         self._voltage_33 = self._read_otp(OTP_VOLTAGE)[0]
         self._temperature_23 = self._read_otp(OTP_TEMPERATURE)[0]
         self.identity = self._read_otp(OTP_PART_ID) + self._read_otp(OTP_LOT_ID)
-        trim = self._read_otp(OTP_CRYSTAL_TRIM)[0] & 0x1F if crystal_trim < 0 else crystal_trim & 0x1F
-        if trim == 0 and crystal_trim < 0:
-            trim = 0x10  # not trimmed: mid-range
-        self._write(0x2B, 0x0E, 1, 0x60 | trim)  # FS_XTALT: the upper three bits are 011 (UM 7.2.44.5)
+        if crystal_trim is None:
+            crystal_trim = self._read_otp(OTP_CRYSTAL_TRIM)[0] & 0x1F or 0x10  # not trimmed: mid-range
+        self._write(0x2B, 0x0E, 1, 0x60 | crystal_trim & 0x1F)  # FS_XTALT: the upper three bits are 011 (UM 7.2.44.5)
 
     def _load_microcode(self) -> None:
         """The leading-edge search, without which there are no RX stamps (UM 2.5.5.10, Table 4)."""
@@ -485,11 +390,11 @@ class DW1000:
         self._write(0x36, 0, 2, 0x0200)  # PMSC_CTRL0: clocks by themselves
         for _ in range(LOCK_TRIES):
             self._bus.pause_us(100)
-            if self._read(0x0F, 0, 5)[0] & CPLOCK:
+            if self._read_status() & CPLOCK:
                 return
         raise ChipError("the DW1000's clock does not lock: is its crystal or supply sound?")
 
-    # Running; nothing of this allocates, but for measure
+    # Running
 
     def receive(self) -> None:
         """Listen from now on; a frame that waits to be sent is sent before."""
@@ -506,33 +411,28 @@ class DW1000:
             self._off_and_clear()
             self.state = IDLE
 
-    def transmit_at(self, dx: bytearray | memoryview, frame: bytearray | memoryview, at: int, end: int) -> int:
-        """Send the PSDU ``frame[at:end]`` when the counter is at ``dx``; QUEUED, or why not.
+    def transmit_at(self, dx_ticks: int, frame: bytes) -> int:
+        """Send a PSDU when the counter is at ``dx_ticks``; QUEUED, or why not.
 
-        ``dx`` has 5 bytes; its low nine bits are ignored (UM p. 26). The stamp will be that + the TX antenna
-        delay. The last two bytes are replaced by the FCS, which the chip makes.
+        Its low nine bits are ignored (UM p. 26). The stamp will be that + the TX antenna delay. The last two bytes of
+        the frame are replaced by the FCS, which the chip makes.
 
         Raises:
             ValueError: no PSDU has this length.
         """
-        size = end - at
-        if size < MIN_PSDU_BYTES or size > MAX_PSDU_BYTES:
+        size = len(frame)
+        if not MIN_PSDU_BYTES <= size <= MAX_PSDU_BYTES:
             raise ValueError("a PSDU has 3 to 127 bytes")
         if self.state == OFF:
             return NOT_READY
         if self.state == SENDING:
             return BUSY
-        bus = self._bus
-        copy(frame, at, end - 2, self._tx_buffer.data)
-        bus.write(self._tx_buffer.header, self._tx_parts[(size + 5) >> 3])
-        self._tx_control.data[0] = size
-        bus.write(self._tx_control.header, self._tx_control.data)
-        copy(dx, 0, 5, self._dx.data)
-        self._dx.data[0] = 0
-        self._dx.data[1] &= 0xFE
-        bus.write(self._dx.header, self._dx.data)
+        self._tx_buffer[: size - 2] = frame[:-2]
+        self._bus.transfer(header(True, 0x09, 0) + self._tx_buffer[: _whole_steps(size - 2)])
+        self._write(0x08, 0, 4, TX_FCTRL | size)
+        self._write(0x0A, 0, 5, dx_ticks & ~0x1FF)
         self._off_and_clear()
-        bus.write(self._transmit.header, self._transmit.data)
+        self._write(0x0D, 0, 1, TXSTRT_TXDLYS)
         self.state = SENDING
         return self._was_in_time()
 
@@ -543,19 +443,19 @@ class DW1000:
         the stamp would be right, but the preamble is damaged. What is already out when TRXOFF comes counts as sent.
         """
         status = self._read_status()
-        if status[0] & TXFRS or not (status[3] & HPDWARN_3 or status[4] & TXPUTE_4):
+        if status & TXFRS or not status & (HPDWARN | TXPUTE):
             return QUEUED
         if not self.cancel():
             return QUEUED
-        self.late = (self.late + 1) & COUNT_MASK
+        self.late += 1
         return LATE
 
     def cancel(self) -> bool:
         """Cancel a frame that has not been sent; False where it has, which the next ``poll`` will return."""
         if self.state != SENDING:
             return True
-        self._bus.write(self._off.header, self._off.data)
-        if self._read_status()[0] & TXFRS:
+        self._turn_off()
+        if self._read_status() & TXFRS:
             return False
         self._resume()
         return True
@@ -565,22 +465,20 @@ class DW1000:
         if self.state == OFF:
             return LOST
         status = self._read_status()
-        seen = status[0] | status[1] << 8 | status[2] << 16
-        if (not seen & CPLOCK or seen & SLP2INIT or status[4] & UNUSED_4) and not self.check():
+        if (not status & CPLOCK or status & (SLP2INIT | UNUSED)) and not self.check():
             return LOST
         events = 0
-        if status[3] & CLKPLL_LL_3:
+        if status & CLKPLL_LL:
             events = CLOCK_SLIPPED
-            self._clear_slip()
+            self._write(0x0F, 0, STATUS_OCTETS, CLKPLL_LL)  # alone: a frame may be coming in
         if self.state == SENDING:
-            if seen & TXFRS:
+            if status & TXFRS:
                 events |= self._finish_sending()
-            return events
-        if self.state == LISTENING:
-            if seen & RX_ERRORS or status[3] & RX_ERRORS_3:
-                return events | self._recover(seen)
-            if seen & RXFCG:
-                return events | self._read_frame()
+        elif self.state == LISTENING:
+            if status & RX_ERRORS:
+                events |= self._recover(status)
+            elif status & RXFCG:
+                events |= self._read_frame()
         return events
 
     def check(self) -> bool:
@@ -597,16 +495,13 @@ class DW1000:
         self._listening = False
         return False
 
-    def now(self) -> memoryview:
-        """The counter now, in 5 bytes that the next call overwrites (UM 7.2.8)."""
-        self._bus.transfer(self._time.out, self._time.into)
-        return self.now_ticks
+    def now(self) -> int:
+        """The counter now, in steps of 512 ticks (UM 7.2.8)."""
+        return self._read_number(0x06, 0, 5)
 
     def track(self) -> int:
         """Clock offset of the frame's sender by time tracking in 1e-9; before the next frame comes (UM 7.2.22)."""
-        self._bus.transfer(self._tracking.out, self._tracking.into)
-        data = self._tracking.data
-        offset = data[0] | data[1] << 8 | (data[2] & 0x07) << 16
+        offset = self._read_number(0x14, 0, 3) & 0x7_FFFF
         return clock_offset_ppb(offset - 0x8_0000 if offset & 0x4_0000 else offset)
 
     def measure(self) -> bool:
@@ -637,23 +532,24 @@ class DW1000:
         else:
             self.millivolts = voltage * 57 // 10 + 2300
 
-    def _read_status(self) -> memoryview:
-        self._bus.transfer(self._status.out, self._status.into)
-        return self._status.data
+    def _read_status(self) -> int:
+        self._status = self._read_number(0x0F, 0, STATUS_OCTETS)
+        return self._status
 
     def _clear(self) -> None:
         """Clear what the last reading of SYS_STATUS has shown; what came since stays."""
-        copy_masked(self._status.data, CLEARED, 5, self._clear_status.data)
-        self._bus.write(self._clear_status.header, self._clear_status.data)
+        self._write(0x0F, 0, STATUS_OCTETS, self._status & CLEARED)
 
-    def _clear_slip(self) -> None:
-        """Clear CLKPLL_LL alone: a frame may be coming in."""
-        self._bus.write(self._clear_slipped.header, self._clear_slipped.data)
+    def _turn_off(self) -> None:
+        self._write(0x0D, 0, 1, TRXOFF)
+
+    def _enable(self) -> None:
+        self._write(0x0D, 0, 2, RXENAB)
 
     def _off_and_clear(self) -> None:
         """Turn the transceiver off and forget all events (UM 7.2.15)."""
-        self._bus.write(self._off.header, self._off.data)
-        self._bus.write(self._clear_all.header, self._clear_all.data)
+        self._turn_off()
+        self._write(0x0F, 0, STATUS_OCTETS, CLEARED)
 
     def _resume(self) -> None:
         """LISTENING or IDLE again, with all events forgotten."""
@@ -666,73 +562,69 @@ class DW1000:
         It must be reset then, or the next stamp may be wrong (UM 4.1.6, pp. 34-35).
         """
         if self._listening:
-            self._bus.write(self._reset_rx.header, self._reset_rx.data)
-            self._bus.write(self._reset_none.header, self._reset_none.data)
-            self._bus.write(self._enable.header, self._enable.data)
+            self._write(0x36, 3, 1, 0xE0)
+            self._write(0x36, 3, 1, 0xF0)
+            self._enable()
             self.state = LISTENING
         else:
             self.state = IDLE
 
     def _finish_sending(self) -> int:
-        self._bus.transfer(self._tx_time.out, self._tx_time.into)
-        self.sent = (self.sent + 1) & COUNT_MASK
+        self.tx_ticks = self._read_number(0x17, 0, 5)
+        self.sent += 1
         self._clear()
         self._listen_again()
         return SENT
 
     def _recover(self, status: int) -> int:
         """Count an error and listen on."""
-        self.errors = (self.errors + 1) & COUNT_MASK
+        self.errors += 1
         self.error_status = status
         self._resume()
         return FAILED
 
     def _read_frame(self) -> int:
         """Read a frame and all that was measured of it, and listen on."""
-        bus = self._bus
         tries = LDE_TRIES
-        while not self._status.data[1] & (LDEDONE >> 8):
+        while not self._status & LDEDONE:
             if tries == 0:
                 return self._recover(RXFCG)
             tries -= 1
-            bus.pause_us(20)
-            if self._read_status()[2] & (LDEERR >> 16):
+            self._bus.pause_us(20)
+            if self._read_status() & LDEERR:
                 return self._recover(RXFCG | LDEERR)
-        info = self._frame_info
-        bus.transfer(info.out, info.into)
-        size = info.data[0] & 0x7F
+        info = self._read_number(0x10, 0, 4)
+        size = info & 0x7F
         if size < MIN_PSDU_BYTES:
             return self._recover(0)
-        step = (size + 7) >> 3
-        bus.transfer(self._rx_outs[step], self._rx_intos[step])
-        bus.transfer(self._rx_time.out, self._rx_time.into)
-        self.frame_bytes = size
+        self.frame = self._read(0x11, 0, _whole_steps(size))[:size]
+        time = self._read(0x15, 0, 9)
+        self.rx_ticks = int.from_bytes(time[:5], "little")
         if self.measuring:
-            self._read_diagnostics(info.data[2] >> 4 | info.data[3] << 4)
+            self._read_diagnostics(symbols=info >> 20, first_amplitude=time[7] | time[8] << 8)
         else:
             self.rx_power_cdbm = self.first_path_cdbm = self.offset_ppb = NOT_MEASURED
-        self.received = (self.received + 1) & COUNT_MASK
+        self.received += 1
         self._clear()
-        self._bus.write(self._enable.header, self._enable.data)
+        self._enable()
         return RECEIVED
 
-    def _read_diagnostics(self, symbols: int) -> None:
-        """Powers and carrier offset; ``symbols`` is RXPACC (UM 4.7, 7.2.18, 7.2.20, 7.2.23, 7.2.40.11)."""
-        bus = self._bus
-        bus.transfer(self._quality.out, self._quality.into)
-        bus.transfer(self._carrier.out, self._carrier.into)
-        carrier = self._carrier.data
-        if symbols == (carrier[4] | carrier[5] << 8):
+    def _read_diagnostics(self, *, symbols: int, first_amplitude: int) -> None:
+        """Powers and carrier offset from RXPACC and FP_AMPL1 (UM 4.7, 7.2.18, 7.2.20, 7.2.23, 7.2.40.11)."""
+        _, second_amplitude, third_amplitude, cir_power = struct.unpack("<4H", self._read(0x12, 0, 8))
+        carrier = self._read(0x27, 0x28, 6)
+        if symbols == int.from_bytes(carrier[4:], "little"):
             symbols -= SFD_ACCUMULATED
-        quality = self._quality.data
-        time = self._rx_time.data
         level = accumulated(symbols)
-        self.rx_power_cdbm = power_cdbm(quality[6] | quality[7] << 8, level)
-        self.first_path_cdbm = first_path_cdbm(
-            time[7] | time[8] << 8, quality[2] | quality[3] << 8, quality[4] | quality[5] << 8, level
-        )
-        integrator = carrier[0] | carrier[1] << 8 | (carrier[2] & 0x1F) << 16
+        self.rx_power_cdbm = power_cdbm(cir_power, level)
+        self.first_path_cdbm = first_path_cdbm(first_amplitude, second_amplitude, third_amplitude, level)
+        integrator = int.from_bytes(carrier[:3], "little") & 0x1F_FFFF
         self.carrier_integrator = integrator - 0x20_0000 if integrator & 0x10_0000 else integrator
         self.offset_ppb = carrier_offset_ppb(self.carrier_integrator)
         if self.correct_bias and self.rx_power_cdbm != NOT_MEASURED:
-            add_ticks(self.rx_ticks, -bias_ticks(self.rx_power_cdbm))
+            self.rx_ticks = wrap(self.rx_ticks - bias_ticks(self.rx_power_cdbm))
+
+
+def _whole_steps(octets: int) -> int:
+    """As many octets in whole steps of 8."""
+    return (octets + 7) & ~7

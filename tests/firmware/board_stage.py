@@ -1,0 +1,194 @@
+"""The firmware's loop, compiled for this computer, on the chip's model in an air whose clock a test moves."""
+
+from binascii import crc_hqx
+from itertools import count
+
+import pytest
+from board_library import HAS_HOST_COMPILER, CBoard
+from chip_stage import HandClock
+from cobs import cobs
+
+from skyless.air.ieee802154 import after_rmarker_s, fcs
+from skyless.air.reception import Diagnostics
+from skyless.constants import TICK_RATE_HZ
+from skyless.radios.interface import AntennaDelays
+from skyless.radios.serial.link_records import decode
+from skyless.simulation.dw1000.chip import Chip
+from skyless.ticks import from_seconds, wrap
+
+DELAYS = AntennaDelays(16_500, 16_300)
+TICKS_PER_US = TICK_RATE_HZ / 1e6
+DEVICE_ID = b"identity"
+SLOW_HZ, FAST_HZ = 2_000_000, 8_000_000
+
+HELLO, RX, TX_DONE, TX_LATE, STATUS, REFUSED = range(1, 7)
+ASK_HELLO, CONFIG, TX_AT, RX_ON, ASK_STATUS = range(0x41, 0x46)
+
+needs_compiler = pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")
+
+
+def line_of(kind, body, number=0):
+    """A line of the serial link, made by others: the package ``cobs`` and the standard library's CRC."""
+    record = bytes((kind, number)) + body
+    return cobs.encode(record + crc_hqx(record, 0xFFFF).to_bytes(2, "big")) + b"\0"
+
+
+def frame_of(body):
+    return bytes(body) + fcs(bytes(body))
+
+
+class Bus:
+    """Hardware on a model of the chip: transfers and pauses take time, the line is two buffers."""
+
+    def __init__(self, air, chip):
+        self.air, self.chip = air, chip
+        self.hz = SLOW_HZ
+        self.to_board, self.from_board = bytearray(), bytearray()
+        self.transactions = []
+        self.restarts = self.lights = 0
+        self.room = 1 << 30
+        self.stuck = None
+        """What the interrupt line shows whatever the chip does; None where it works."""
+        self.present = True
+
+    def transfer(self, out):
+        self.transactions.append(out)
+        self.air.pass_s(8 * len(out) / self.hz)
+        return self.chip.transfer(out, self.hz) if self.present else bytes(len(out))
+
+    def set_spi_fast(self, fast):
+        self.hz = FAST_HZ if fast else SLOW_HZ
+
+    def reset_chip(self):
+        self.chip.pull_reset()
+
+    def pause_us(self, microseconds):
+        self.air.pass_s(1e-6 * microseconds)
+
+    def now_us(self):
+        return int(self.air.ticks / TICKS_PER_US)
+
+    def interrupt_line(self):
+        return (self.chip.irq and self.present) if self.stuck is None else self.stuck
+
+    def read_line(self, size):
+        data = bytes(self.to_board[:size])
+        del self.to_board[:size]
+        return data
+
+    def write_line(self, line):
+        if len(self.from_board) + len(line) > self.room:
+            return False
+        self.from_board += line
+        return True
+
+    def restart_line(self):
+        self.restarts += 1
+        self.to_board.clear()
+
+    def show(self, lights):
+        self.lights = lights
+
+
+class BoardStage:
+    """A board, its chip and a host that writes commands."""
+
+    def __init__(self, *, can_transmit=True, ticks=10**12, reset_cause=0):
+        self.air = HandClock(ticks)
+        self.chip = Chip(self.air, DELAYS.tx_ticks, DELAYS.rx_ticks, self.air.now_s)
+        self.bus = Bus(self.air, self.chip)
+        self.board = CBoard(self.bus, can_transmit=can_transmit, device_id=DEVICE_ID, reset_cause=reset_cause)
+        self._numbers = count()
+
+    def send(self, kind, body=b""):
+        self.bus.to_board += line_of(kind, body, next(self._numbers) & 0xFF)
+
+    def config(self):
+        words = (128).to_bytes(2, "little"), *(d.to_bytes(2, "little") for d in (DELAYS.tx_ticks, DELAYS.rx_ticks))
+        self.send(CONFIG, bytes((5, 64, 2, 9)) + b"".join(words) + b"\0")
+
+    def tx_at(self, ahead_us, frame):
+        """Ask for a frame; the tick of its RMARKER at the antenna."""
+        dx = wrap(self.air.ticks + round(ahead_us * TICKS_PER_US))
+        self.send(TX_AT, dx.to_bytes(5, "little") + frame)
+        return wrap((dx & ~0x1FF) + DELAYS.tx_ticks)
+
+    def turn(self, turns=1, step_us=5):
+        """Let the board turn; between two turns time passes, and what waits for the air's clock happens."""
+        for _ in range(turns):
+            self.board.turn()
+            self.air.pass_s(1e-6 * step_us)
+
+    def pass_us(self, microseconds):
+        """Turn as a board does that sleeps as long as it may: until its deadline, an interrupt, or a byte."""
+        until = self.air.ticks + round(microseconds * TICKS_PER_US)
+        while self.air.ticks < until:
+            idle_us = self.board.turn()
+            before = self.air.ticks
+            while self.air.ticks < min(until, before + idle_us * TICKS_PER_US):
+                self.air.pass_s(min(5e-6, 1e-6 * idle_us))
+                if self.bus.interrupt_line() or self.bus.to_board:
+                    break
+            self.air.pass_s(1e-6)
+
+    def reports(self):
+        """Values of the records that the board has written since."""
+        data = bytes(self.bus.from_board)
+        self.bus.from_board.clear()
+        assert not data or data[-1] == 0
+        records = [cobs.decode(piece) for piece in data.split(b"\0") if piece]
+        assert all(crc_hqx(record, 0xFFFF) == 0 for record in records)
+        return [decode(record[:-2]) for record in records]
+
+    def ready(self):
+        """As a host finds it."""
+        self.board.begin()
+        self.config()
+        self.send(RX_ON)
+        self.turn(8)
+        self.reports()
+        return self
+
+    def arrive(self, frame, *, fault=None, power_dbm=-80.0):
+        """A frame whose end is now; its RX stamp."""
+        stamp = wrap(self.air.ticks - from_seconds(after_rmarker_s(len(frame))))
+        self.outcome = self.chip.receive(frame, stamp, Diagnostics(power_dbm, power_dbm - 3.0, 1.0), fault)
+        return stamp
+
+
+class ScriptedHardware:
+    """Registers that answer what was written into them by a test; every transaction is noted."""
+
+    def __init__(self, answers):
+        self.answers, self.log = answers, []
+
+    def transfer(self, out):
+        self.log.append(bytes(out).hex())
+        return self.answers(bytes(out))
+
+    def set_spi_fast(self, fast):
+        self.log.append("fast" if fast else "slow")
+
+    def reset_chip(self):
+        self.log.append("reset")
+
+    def pause_us(self, microseconds):
+        self.log.append(f"pause {microseconds}")
+
+    def now_us(self):
+        return 0
+
+    def interrupt_line(self):
+        return False
+
+    def read_line(self, size):
+        return b""
+
+    def write_line(self, line):
+        return True
+
+    def restart_line(self):
+        pass
+
+    def show(self, lights):
+        pass

@@ -1,0 +1,433 @@
+"""The firmware's loop on the chip's model: what it answers, when it sends, what it does when something fails."""
+
+import random
+
+import pytest
+from board_stage import (
+    ASK_HELLO,
+    ASK_STATUS,
+    CONFIG,
+    DELAYS,
+    RX_ON,
+    TX_AT,
+    BoardStage,
+    frame_of,
+    line_of,
+    needs_compiler,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skyless.radios.serial.link_records import Done, Heard, Hello, NotDone, Status, TooLate
+from skyless.ticks import difference, wrap
+
+pytestmark = needs_compiler
+
+FRAME = frame_of(range(98))
+SHORT = frame_of(range(40))
+LEAD_US, CLOSE_US, POLL_US, CHECK_US = 600, 30, 50_000, 200_000
+FOR_RADIO, BUSY, NOT_READY = 1, 2, 3
+SETTING, MALFORMED, RADIO = 1, 2, 3
+
+
+def kinds(reports):
+    return [type(one) for one in reports]
+
+
+# What it answers
+
+
+def test_a_board_reports_itself_and_is_configured_by_its_host():
+    stage = BoardStage(reset_cause=0x82)
+    stage.board.begin()
+    assert stage.bus.from_board[0] == 0
+    stage.send(ASK_HELLO)
+    stage.turn(2)
+    for hello in stage.reports():
+        assert (hello.major, hello.minor, hello.device_id, hello.can_transmit) == (1, 1, b"identity", True)
+        assert (hello.rate_khz, hello.counter_bits, hello.reset_cause) == (63_897_600, 40, 0x82)
+    stage.send(RX_ON)
+    stage.turn(2)
+    assert stage.reports() == [NotDone(RX_ON, MALFORMED)]
+    stage.config()
+    stage.turn(2)
+    (status,) = stage.reports()
+    assert (status.configured, status.receiving, status.temperature_c, status.supply_v) == (True, False, None, None)
+    stage.send(RX_ON)
+    stage.turn()
+    (status,) = stage.reports()
+    assert (status.configured, status.receiving) == (True, True)
+    assert 0 <= difference(wrap(stage.air.ticks), status.ticks) < 200 * 63_898
+    assert not +stage.chip.misuse
+
+
+RIGHT = bytes((5, 64, 2, 9, 128, 0, 52, 64, 52, 64, 0))
+
+
+@pytest.mark.parametrize(
+    ("kind", "body", "reason"),
+    [
+        (CONFIG, RIGHT[:-1], MALFORMED),
+        (CONFIG, b"", MALFORMED),
+        *[(CONFIG, RIGHT[:at] + b"\7" + RIGHT[at + 1 :], SETTING) for at in range(6)],
+        (TX_AT, bytes(3), MALFORMED),
+        (TX_AT, bytes(5), MALFORMED),
+        (TX_AT, bytes(7), MALFORMED),
+        (TX_AT, bytes(5) + frame_of(bytes(126)), MALFORMED),
+        (TX_AT, bytes(5) + FRAME[:-1] + bytes((FRAME[-1] ^ 1,)), MALFORMED),
+    ],
+)
+def test_what_it_cannot_do_is_refused(kind, body, reason):
+    stage = BoardStage().ready()
+    stage.bus.to_board += line_of(kind, body)
+    stage.turn(5)
+    assert stage.reports() == [NotDone(kind, reason)]
+    assert stage.board.chip.state == "LISTENING"
+
+
+def test_a_later_version_may_append_fields_and_add_kinds():
+    stage = BoardStage().ready()
+    for line in (line_of(CONFIG, RIGHT + b"more"), line_of(0x7E, b"new")):
+        stage.bus.to_board += line
+    stage.turn(2)
+    (status,) = stage.reports()
+    assert (status.configured, status.garbled) == (True, 0)
+    stage.send(ASK_STATUS)
+    stage.turn()
+    assert stage.reports()[0].garbled == 1
+
+
+@pytest.mark.parametrize("size", [1, 98, 125])
+def test_receptions_are_reported_with_the_chips_own_stamp(size):
+    stage = BoardStage().ready()
+    stage.air.pass_s(1e-3)
+    stamp = stage.arrive(frame_of(range(size)))
+    stage.turn()
+    (heard,) = stage.reports()
+    assert (heard.frame, heard.rx_ticks) == (frame_of(range(size)), stamp)
+    assert heard.diagnostics.rx_power_dbm == pytest.approx(-80.0, abs=0.03)
+    assert heard.diagnostics.carrier_offset_ppm == pytest.approx(1.0, abs=0.002)
+    assert stage.board.chip.state == "LISTENING"
+
+
+def test_errors_are_counted_and_it_listens_on():
+    stage = BoardStage().ready()
+    for fault in ("header", "parity", "delimiter", "first-path"):
+        stage.air.pass_s(1e-3)
+        stage.arrive(FRAME, fault=fault)
+        stage.turn(3)
+        assert stage.reports() == []
+    stage.send(ASK_STATUS)
+    stage.turn()
+    assert stage.reports()[0].errors == 4
+    stage.air.pass_s(1e-3)
+    stage.arrive(FRAME)
+    stage.turn()
+    assert kinds(stage.reports()) == [Heard]
+
+
+# When it sends
+
+
+@pytest.mark.parametrize("ahead_us", [450, 1000, 1200, 3000, 14_700, 2_000_000])
+@pytest.mark.parametrize("step_us", [1, 37, 100])
+def test_frames_leave_at_their_tick_and_the_receiver_is_off_no_longer_than_needed(ahead_us, step_us):
+    stage = BoardStage().ready()
+    tx_ticks = stage.tx_at(ahead_us, SHORT)
+    off_us, reports = 0, []
+    if ahead_us > 10_000:
+        stage.pass_us(ahead_us - 5000)
+    for _ in range(round((min(ahead_us, 5000) + 1000) / step_us)):
+        stage.turn(1, step_us)
+        off_us += step_us * (stage.board.chip.state != "LISTENING")
+        reports += stage.reports()
+    dx_ticks = wrap(tx_ticks - DELAYS.tx_ticks)
+    (done,) = reports
+    assert isinstance(done, Done)
+    assert (done.dx_ticks & ~0x1FF, done.tx_ticks) == (dx_ticks, tx_ticks)
+    assert [(one.frame, one.tx_ticks) for one in stage.air.sent] == [(SHORT, tx_ticks)]
+    assert off_us <= LEAD_US + CLOSE_US + 200 + 3 * step_us
+    assert stage.board.chip.state == "LISTENING"
+    assert not +stage.chip.misuse
+
+
+@pytest.mark.parametrize("ahead_us", [120, 0, -1, -5000, -8_000_000])
+def test_what_comes_too_late_is_reported_and_never_sent(ahead_us):
+    stage = BoardStage().ready()
+    stage.tx_at(ahead_us - 20, SHORT)
+    stage.turn(500)
+    (late,) = stage.reports()
+    assert (type(late), late.reason) == (TooLate, FOR_RADIO)
+    assert stage.air.sent == []
+    assert stage.board.chip.state == "LISTENING"
+
+
+def test_every_frame_is_answered_once_and_one_is_held_at_a_time():
+    stage = BoardStage().ready()
+    first = stage.tx_at(5000, SHORT)
+    stage.turn(2)
+    second = stage.tx_at(9000, SHORT)
+    stage.pass_us(12_000)
+    late, done = stage.reports()
+    assert (type(late), late.reason, wrap((late.dx_ticks & ~0x1FF) + DELAYS.tx_ticks)) == (TooLate, BUSY, second)
+    assert (type(done), done.tx_ticks) == (Done, first)
+
+
+def test_a_tag_or_an_unconfigured_board_sends_nothing():
+    for stage in (BoardStage(), BoardStage(can_transmit=False).ready()):
+        stage.tx_at(5000, SHORT)
+        stage.pass_us(8000)
+        (late,) = stage.reports()
+        assert (type(late), late.reason) == (TooLate, NOT_READY)
+        assert stage.air.sent == []
+
+
+def test_a_frame_that_comes_shortly_before_ones_own_is_not_lost():
+    stage = BoardStage().ready()
+    stage.tx_at(4000, SHORT)
+    stage.pass_us(4000 - LEAD_US - 100)
+    stage.arrive(FRAME)
+    stage.pass_us(2000)
+    assert kinds(stage.reports()) == [Heard, Done]
+
+
+def test_a_frame_whose_end_the_chip_never_reports_is_cancelled():
+    stage = BoardStage().ready()
+    stage.air.in_time = False  # the air refuses it, and the chip shows nothing
+    stage.tx_at(3000, SHORT)
+    stage.pass_us(9000)
+    (late,) = stage.reports()
+    assert (type(late), late.reason) == (TooLate, FOR_RADIO)
+    assert stage.board.chip.state == "LISTENING"
+    assert stage.air.sent == []
+
+
+# When something fails
+
+
+def test_a_chip_that_was_reset_is_reported_and_can_be_configured_again():
+    stage = BoardStage().ready()
+    stage.tx_at(900_000, SHORT)
+    stage.turn(4)
+    stage.chip.pull_reset()
+    stage.pass_us(POLL_US + 1000)
+    late, hello = stage.reports()
+    assert (type(late), late.reason, type(hello)) == (TooLate, NOT_READY, Hello)
+    stage.send(ASK_STATUS)
+    stage.turn()
+    (status,) = stage.reports()
+    assert (status.configured, status.receiving, status.ticks) == (False, False, 0)
+    stage.pass_us(1_000_000)
+    assert stage.air.sent == []
+    stage.ready()
+    stage.pass_us(5000)
+    stage.arrive(FRAME)
+    stage.turn()
+    assert kinds(stage.reports()) == [Heard]
+
+
+@pytest.mark.parametrize("after_us", [1, 10_000, 14_350, 14_420, 14_600, 14_900])
+def test_a_chip_that_loses_its_supply_before_a_frame_is_due_sends_nothing_wrong(after_us):
+    stage = BoardStage().ready()
+    stage.pass_us(20_000)
+    stage.tx_at(15_000, SHORT)
+    stage.pass_us(after_us)
+    stage.chip.pull_reset()
+    stage.pass_us(300_000)
+    assert stage.chip.transceiver.counts["sent-with-other-settings"] == 0
+    assert stage.chip.transceiver.counts["sent"] == 0
+    assert TooLate in kinds(stage.reports())
+
+
+def test_a_chip_that_looks_right_and_has_lost_its_settings_is_found_soon():
+    stage = BoardStage().ready()
+    stage.chip.memory.write(0x1F, 0, b"\0")
+    stage.pass_us(CHECK_US + 1000)
+    assert kinds(stage.reports()) == [Hello]
+    stage.send(ASK_STATUS)
+    stage.turn()
+    assert not stage.reports()[0].configured
+
+
+def test_a_board_without_a_chip_says_so_and_goes_on():
+    stage = BoardStage()
+    stage.bus.present = False
+    stage.board.begin()
+    stage.config()
+    stage.send(RX_ON)
+    stage.turn(4)
+    assert stage.reports()[1:] == [NotDone(CONFIG, RADIO), NotDone(RX_ON, MALFORMED)]
+    assert stage.bus.lights & 8
+    stage.bus.present = True
+    stage.ready()
+    assert stage.board.chip.state == "LISTENING"
+    assert not stage.bus.lights & 8
+
+
+@pytest.mark.parametrize("stuck", [True, False])
+def test_a_stuck_interrupt_line_is_reported_and_the_chip_is_polled(stuck):
+    stage = BoardStage().ready()
+    stage.bus.stuck = stuck
+    for _ in range(8):  # what the slow polls find shows that the line is dead
+        stage.arrive(FRAME)
+        stage.pass_us(60_000)
+    for _ in range(200):
+        stage.arrive(FRAME)
+        stage.pass_us(1050)
+    assert stage.chip.arrivals["heard"] >= 206  # a measurement may cost two
+    assert kinds(stage.reports()) == [Heard] * stage.chip.arrivals["heard"]
+    stage.tx_at(3000, SHORT)
+    stage.pass_us(5000)
+    assert kinds(stage.reports()) == [Done]
+    stage.send(ASK_STATUS)
+    stage.turn()
+    assert stage.reports()[0].polled
+    assert stage.bus.lights & 8
+    stage.bus.stuck = None  # and back
+    for _ in range(4):
+        stage.pass_us(3000)
+        stage.arrive(FRAME)
+    stage.pass_us(3000)
+    stage.send(ASK_STATUS)
+    stage.turn()
+    assert not stage.reports()[-1].polled
+
+
+def test_a_sound_interrupt_line_is_never_called_stuck():
+    stage, draw = BoardStage().ready(), random.Random(2)
+    for _ in range(400):
+        stage.pass_us(draw.randrange(1, 2000))
+        stage.arrive(FRAME)
+        stage.turn(draw.randrange(1, 4), step_us=1)
+        stage.send(ASK_STATUS)
+        stage.turn(2)
+        assert not [one for one in stage.reports() if isinstance(one, Status) and one.polled]
+
+
+# When it measures
+
+
+def superframe(stage, slot_us=2100, slots=7, mine=3):
+    """All slots of a superframe but the own one are heard; the own frame is asked for early."""
+    begin = stage.air.now_s()
+    stage.tx_at(mine * slot_us, FRAME)
+    for slot in range(slots):
+        stage.pass_us(1e6 * (begin - stage.air.now_s()) + slot * slot_us + 200)
+        if slot != mine:
+            stage.arrive(FRAME)
+            assert stage.outcome == "heard"
+    stage.pass_us(1e6 * (begin - stage.air.now_s()) + slots * slot_us)
+
+
+def test_temperature_and_supply_are_measured_in_the_own_slot_where_all_others_send():
+    stage = BoardStage().ready()
+    superframe(stage)
+    assert kinds(stage.reports()) == [Heard, Heard, Heard, Done, Heard, Heard, Heard]
+    stage.send(ASK_STATUS)
+    stage.turn()
+    (status,) = stage.reports()
+    assert status.temperature_c == pytest.approx(31.0, abs=1.2)
+    assert status.supply_v == pytest.approx(3.3, abs=0.02)
+    for _ in range(10):
+        superframe(stage)
+    assert stage.board.chip.received == 11 * 6
+    assert stage.board.chip.sent == 11
+
+
+@given(st.integers(0, 9000), st.integers(20, 200))
+@settings(max_examples=40, deadline=None)
+def test_nothing_long_is_begun_shortly_before_a_frame_is_due(ahead_us, quiet_us):
+    stage = BoardStage().ready()
+    stage.pass_us(quiet_us)
+    stage.tx_at(ahead_us, SHORT)
+    stage.pass_us(ahead_us + 5000)
+    assert stage.air.sent or ahead_us <= 450
+    assert (stage.board.chip.sent, len(stage.reports())) == (len(stage.air.sent) - stage.air.withdrawn, 1)
+
+
+def test_where_no_slot_is_free_the_measurement_costs_one_reception_a_minute():
+    stage = BoardStage(can_transmit=False).ready()
+    lost = 0
+    for _ in range(60):
+        stage.air.pass_s(0.998)  # as if it were one slot of many
+        stage.turn()
+        stage.pass_us(1900)
+        stage.arrive(FRAME)
+        lost += stage.outcome != "heard"
+        stage.turn()
+    assert lost <= 1
+    stage.send(ASK_STATUS)
+    stage.turn()
+    assert stage.reports()[-1].temperature_c is not None
+
+
+# What comes from the host may be anything
+
+
+@given(
+    st.lists(st.one_of(st.binary(max_size=70), st.sampled_from(["hello", "status", "rx", "tx", "cut"])), max_size=30)
+)
+@settings(max_examples=60, deadline=None)
+def test_nothing_that_a_host_says_stops_a_board(pieces):
+    stage = BoardStage().ready()
+    commands = {
+        "hello": lambda: stage.send(ASK_HELLO),
+        "status": lambda: stage.send(ASK_STATUS),
+        "rx": lambda: stage.send(RX_ON),
+        "tx": lambda: stage.tx_at(2000, SHORT),
+        "cut": lambda: stage.bus.to_board.extend(line_of(TX_AT, bytes(60))[:30]),
+    }
+    for piece in pieces:
+        if isinstance(piece, str):
+            commands[piece]()
+        else:
+            stage.bus.to_board += piece
+        stage.turn(3)
+        assert not [one for one in stage.reports() if isinstance(one, str)]
+    stage.bus.to_board += b"\0"
+    stage.send(ASK_STATUS)
+    stage.turn(40)
+    assert kinds(stage.reports())[-1] is Status
+    assert not +stage.chip.misuse
+    assert {one.frame for one in stage.air.sent} <= {SHORT}
+
+
+def test_a_flood_of_noise_costs_no_reception_and_restarts_the_line():
+    stage, noise = BoardStage().ready(), random.Random(5)
+    for _ in range(300):
+        stage.air.pass_s(1e-3)
+        stage.bus.to_board += noise.randbytes(noise.randrange(1, 200))
+        stage.arrive(FRAME)
+        stage.turn(5)
+    assert stage.board.chip.received == 300
+    assert stage.bus.restarts >= 1
+    assert kinds(stage.reports()) == [Heard] * 300
+    stage.bus.to_board[:] = b"\0"
+    stage.send(ASK_STATUS)
+    stage.turn(2)
+    assert stage.reports()[-1].garbled > 100
+
+
+def test_a_host_that_does_not_read_costs_records_and_they_are_counted():
+    stage = BoardStage().ready()
+    stage.bus.room = 1024
+    for _ in range(100):
+        stage.air.pass_s(1e-3)
+        stage.arrive(FRAME)
+        stage.turn(2)
+    assert stage.board.chip.received == 100
+    kept = len(stage.reports())
+    assert 0 < kept < 12
+    stage.send(ASK_STATUS)
+    stage.turn()
+    assert stage.reports()[0].unsent_records == 100 - kept
+
+
+def test_the_clock_may_wrap():
+    stage = BoardStage(ticks=round((2**32 - 20_000) * 63_897.6)).ready()
+    for _ in range(20):
+        stage.tx_at(3000, SHORT)
+        stage.pass_us(6000)
+        stage.arrive(FRAME)
+        stage.turn(2)
+    assert kinds(stage.reports()) == [Done, Heard] * 20

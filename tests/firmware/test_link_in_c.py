@@ -1,0 +1,182 @@
+"""The firmware's end of the serial link against the host's, the package ``cobs`` and published check values."""
+
+import ctypes
+import itertools
+from binascii import crc_hqx
+
+import pytest
+from board_library import HAS_HOST_COMPILER, library
+from cobs import cobs
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyless.air.ieee802154 import fcs
+from skyless.radios.serial import link
+from skyless.radios.serial.link_records import Done, Heard, Hello, NotDone, Status, TooLate, decode
+
+pytestmark = pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")
+
+STAMPS = st.integers(0, 2**40 - 1)
+SIXTEEN = st.integers(-0x8000, 0x7FFF)
+COUNTS = st.integers(0, 2**32 - 1)
+FRAMES = st.binary(min_size=1, max_size=127)
+NOISE = st.one_of(st.binary(max_size=300), st.binary(max_size=40).map(lambda piece: piece * 20))
+
+
+class Measured(ctypes.Structure):
+    _fields_ = tuple((name, ctypes.c_int32) for name in ("rx_power_cdbm", "first_path_cdbm", "offset_ppb"))
+
+
+class StatusFields(ctypes.Structure):
+    _fields_ = (
+        ("now_ticks", ctypes.c_uint64),
+        *((name, ctypes.c_uint32) for name in ("state", "received", "errors", "sent", "late", "garbled", "unsent")),
+        ("temperature_cc", ctypes.c_int32),
+        ("millivolts", ctypes.c_uint32),
+    )
+
+
+class HelloFields(ctypes.Structure):
+    _fields_ = (
+        ("firmware", ctypes.c_uint8 * 3),
+        ("identity", ctypes.c_uint8 * 8),
+        ("capabilities", ctypes.c_uint32),
+        ("reset_cause", ctypes.c_uint32),
+    )
+
+
+class Writer:
+    def __init__(self):
+        self._memory = ctypes.create_string_buffer(library().host_writer_bytes())
+
+    def write(self, name, *arguments):
+        """The record without its check, taken out of its line by others."""
+        c = library()
+        getattr(c, f"link_write_{name}")(self._memory, *arguments)
+        line = ctypes.string_at(c.host_writer_line(self._memory), c.host_writer_length(self._memory))
+        assert line[-1] == 0
+        assert 0 not in line[:-1]
+        record = cobs.decode(line[:-1])
+        assert crc_hqx(record, 0xFFFF) == 0
+        assert cobs.encode(record) == line[:-1]
+        return record[:-2]
+
+
+class Reader:
+    def __init__(self):
+        self._memory = ctypes.create_string_buffer(library().host_reader_bytes())
+
+    def read(self, data, cuts=()):
+        c, found = library(), []
+        for begin, end in itertools.pairwise([0, *sorted(cut % (len(data) + 1) for cut in cuts), len(data)]):
+            at = begin
+            while at < end:
+                at += c.link_read(self._memory, data[at:end], end - at)
+                length = c.host_reader_number(self._memory, 0)
+                if length:
+                    found.append(ctypes.string_at(c.host_reader_record(self._memory), length))
+        return found
+
+    @property
+    def faults(self):
+        return library().host_reader_number(self._memory, 1) + library().host_reader_number(self._memory, 2)
+
+
+def u64(value):
+    return ctypes.c_uint64(value)
+
+
+@given(st.binary(max_size=300))
+def test_the_checks_are_those_of_the_standard_library_and_of_the_beacons(data):
+    assert library().link_crc16(data, len(data)) == crc_hqx(data, 0xFFFF)
+    assert library().link_fcs(data, len(data)).to_bytes(2, "little") == fcs(data)
+
+
+def test_the_check_is_the_published_one():
+    """CRC-16/IBM-3740: 0x29B1 over the nine digits; CRC-16/KERMIT, the FCS's relative: 0x2189."""
+    assert library().link_crc16(b"123456789", 9) == 0x29B1
+    assert library().link_fcs(b"123456789", 9) == 0x2189
+
+
+@given(STAMPS, SIXTEEN, SIXTEEN, SIXTEEN, FRAMES)
+def test_a_reception_arrives_as_it_was(ticks, rx_power, first_path, offset, frame):
+    record = Writer().write("rx", u64(ticks), ctypes.byref(Measured(rx_power, first_path, offset)), frame, len(frame))
+    heard = decode(record)
+    assert isinstance(heard, Heard)
+    assert (heard.rx_ticks, heard.frame) == (ticks, frame)
+    values = [heard.diagnostics.rx_power_dbm, heard.diagnostics.first_path_power_dbm, heard.diagnostics.carrier_offset_ppm]
+    for value, steps, unit in zip(values, (rx_power, first_path, offset), (100, 100, 1000), strict=True):
+        assert value == (None if steps == -32768 else steps / unit)
+
+
+@given(STAMPS, STAMPS, st.integers(0, 255), st.integers(0, 255))
+def test_ends_of_frames_and_refusals_arrive_as_they_were(dx_ticks, tx_ticks, kind, reason):
+    writer = Writer()
+    assert decode(writer.write("tx_done", u64(dx_ticks), u64(tx_ticks))) == Done(dx_ticks, tx_ticks)
+    assert decode(writer.write("tx_late", u64(dx_ticks), reason)) == TooLate(dx_ticks, reason)
+    assert decode(writer.write("refused", kind, reason)) == NotDone(kind, reason)
+
+
+@given(STAMPS, st.integers(0, 15), st.lists(COUNTS, min_size=6, max_size=6), SIXTEEN, st.integers(0, 0xFFFF))
+def test_the_status_arrives_as_it_was(ticks, state, counts, temperature, millivolts):
+    record = Writer().write("status", ctypes.byref(StatusFields(ticks, state, *counts, temperature, millivolts)))
+    status = decode(record)
+    assert isinstance(status, Status)
+    assert status.ticks == ticks
+    assert status.configured | status.receiving << 1 | status.polled << 3 == state & 11
+    got = (status.received, status.errors, status.sent, status.late, status.garbled, status.unsent_records)
+    assert got == tuple(count % 2**30 for count in counts)
+    assert status.temperature_c == (None if temperature == -32768 else temperature / 100)
+    assert status.supply_v == (None if millivolts == 0xFFFF else millivolts / 1000)
+
+
+@given(st.binary(min_size=3, max_size=3), st.binary(min_size=8, max_size=8), st.booleans(), st.integers(0, 255))
+def test_the_identity_arrives_as_it_was(firmware, identity, can_transmit, cause):
+    fields = HelloFields((ctypes.c_uint8 * 3)(*firmware), (ctypes.c_uint8 * 8)(*identity), can_transmit, cause)
+    hello = decode(Writer().write("hello", ctypes.byref(fields)))
+    assert isinstance(hello, Hello)
+    assert (hello.major, hello.minor) == (link.MAJOR, link.MINOR)
+    assert (hello.firmware, hello.device_id) == (tuple(firmware), identity)
+    assert (hello.can_transmit, hello.reset_cause) == (can_transmit, cause)
+    assert (hello.rate_khz * 1000, hello.counter_bits) == (499_200_000 * 128, 40)
+
+
+def test_numbers_wrap_at_256():
+    writer = Writer()
+    numbers = [writer.write("refused", 1, 1)[1] for _ in range(300)]
+    assert numbers == [number % 256 for number in range(300)]
+
+
+def lines(bodies):
+    records = [bytes((kind, number & 0xFF)) + body for number, (kind, body) in enumerate(bodies)]
+    return records, [cobs.encode(one + crc_hqx(one, 0xFFFF).to_bytes(2, "big")) + b"\0" for one in records]
+
+
+RECORDS = st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=246)), max_size=12)
+CUTS = st.lists(st.integers(0, 5000), max_size=20)
+
+
+@given(RECORDS, CUTS)
+def test_records_are_found_however_the_stream_is_cut(bodies, cuts):
+    records, sent = lines(bodies)
+    reader = Reader()
+    assert reader.read(b"".join(sent), cuts) == records
+    assert reader.faults == 0
+
+
+@given(NOISE, RECORDS, CUTS)
+def test_after_any_garbage_the_next_zero_is_enough(noise, bodies, cuts):
+    records, sent = lines(bodies)
+    reader = Reader()
+    found = reader.read(noise + b"\0" + b"".join(sent), cuts)
+    assert found[len(found) - len(records) :] == records
+    assert reader.faults > 0 or not noise.strip(b"\0") or len(found) > len(records)
+
+
+@given(NOISE, RECORDS, CUTS)
+def test_both_ends_find_the_same_in_anything(noise, bodies, cuts):
+    _, sent = lines(bodies)
+    data = b"".join(sent) + noise + b"".join(sent)
+    reader, host = Reader(), link.Reader()
+    assert reader.read(data, cuts) == list(host.read(data))
+    assert reader.faults == host.garbled + host.overlong
