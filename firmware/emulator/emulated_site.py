@@ -19,7 +19,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
 from serial_wire import SerialWire, WireSettings
-from site_air import SiteAir
+from site_air import SITE_TURNAROUND_S, SiteAir
 from virtual_time import run_on
 from watched_radio import WatchedRadio
 
@@ -142,7 +142,7 @@ class EmulatedSite:
         self.trajectories = list(trajectories)
         faults = replace(impairments_of(Request(site, seed=seed), site), diagnostics=True)
         tags = [TagSpec(trajectory) for trajectory in trajectories]
-        self.medium: Medium[bool] = Medium(site, tags, faults, seed, self._deliver)
+        self.medium: Medium[bool] = Medium(site, tags, faults, seed, self._deliver, SITE_TURNAROUND_S)
         self.anchors = [
             self._node(number, str(anchor.id), AntennaDelays(anchor.tx_antenna_delay_ticks, anchor.rx_antenna_delay_ticks))
             for number, anchor in enumerate(site.anchors)

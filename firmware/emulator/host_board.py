@@ -1,41 +1,20 @@
-"""The firmware's C, compiled for this computer, as a board (``make -C firmware host``)."""
+"""The firmware's C, compiled for this computer, as a board."""
 
-import ctypes
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
+from board_library import CBoard
 from program_board import ProgramBoard
 
 from skyless.simulation.dw1000.chip import Chip
 from skyless.simulation.medium import Timeline
 
-LIBRARY: Final = Path(__file__).parents[1] / "build" / "libskyless-board.so"
 _TURN_S: Final = 5e-6
 """What a turn takes besides its transfers (assumed; the emulated processor counts it)."""
 
-_Bytes = ctypes.POINTER(ctypes.c_uint8)
-
-
-class _Hardware(ctypes.Structure):
-    """``struct hardware`` of hardware.h."""
-
-    _fields_: ClassVar = [
-        ("transfer", ctypes.CFUNCTYPE(None, _Bytes, _Bytes, ctypes.c_uint32)),
-        ("set_spi_fast", ctypes.CFUNCTYPE(None, ctypes.c_bool)),
-        ("reset_chip", ctypes.CFUNCTYPE(None)),
-        ("pause_us", ctypes.CFUNCTYPE(None, ctypes.c_uint32)),
-        ("now_us", ctypes.CFUNCTYPE(ctypes.c_uint32)),
-        ("interrupt_line", ctypes.CFUNCTYPE(ctypes.c_bool)),
-        ("read_line", ctypes.CFUNCTYPE(ctypes.c_uint32, _Bytes, ctypes.c_uint32)),
-        ("write_line", ctypes.CFUNCTYPE(ctypes.c_bool, _Bytes, ctypes.c_uint32)),
-        ("restart_line", ctypes.CFUNCTYPE(None)),
-        ("show", ctypes.CFUNCTYPE(None, ctypes.c_uint32)),
-    ]
-
 
 class HostBoard(ProgramBoard):
-    """One board; the library keeps no state, so one serves any number."""
+    """One board."""
 
     def __init__(
         self,
@@ -45,69 +24,68 @@ class HostBoard(ProgramBoard):
         *,
         can_transmit: bool,
         identity: bytes,
-        library: Path = LIBRARY,
     ) -> None:
-        self.lights = 0
-        self._failed: BaseException | None = None
-        self._library = ctypes.CDLL(str(library))
-        self._library.board_turn.restype = ctypes.c_uint32
         self._can_transmit, self._identity = can_transmit, identity
-        types = dict(_Hardware._fields_)
-        calls: dict[str, Callable[..., Any]] = {
-            "transfer": self._on_transfer,
-            "set_spi_fast": self.set_spi_fast,
-            "reset_chip": self.reset_chip,
-            "pause_us": lambda microseconds: self.pause_s(1e-6 * microseconds),
-            "now_us": lambda: self.now_us() & 0xFFFFFFFF,
-            "interrupt_line": lambda: self.chip.irq,
-            "read_line": self._on_read,
-            "write_line": lambda line, size: self.write_line(ctypes.string_at(line, size)),
-            "restart_line": self.restart_line,
-            "show": self._on_show,
-        }
-        self._hardware = _Hardware(*(types[name](self._guarded(call)) for name, call in calls.items()))
         super().__init__(timeline, chip, send)
 
     def program(self) -> None:
         """Run the board's loop, as the image's ``main`` does."""
-        self._failed = None
-        board = ctypes.create_string_buffer(self._library.host_board_bytes())
-        hardware, can_transmit = ctypes.byref(self._hardware), ctypes.c_bool(self._can_transmit)
-        self._library.host_board_init(board, hardware, self._identity, can_transmit, ctypes.c_uint8(0))
-        self._call(self._library.board_begin, board)
+        hardware = _Guarded(self)
+        board = CBoard(hardware, can_transmit=self._can_transmit, device_id=self._identity)
+        board.begin()
         while True:
-            wait_us = self._call(self._library.board_turn, board)
+            wait_us = board.turn()
+            if hardware.failed is not None:
+                raise hardware.failed
             self.pause_s(_TURN_S)
             if wait_us:
                 self.wait_s(1e-6 * wait_us)
 
-    def _call(self, function: Callable[[Any], int], board: Any) -> int:
-        """Call the C; what a callback raised, as the end of the world, is raised here."""
-        result = function(board)
-        if self._failed is not None:
-            raise self._failed
-        return result
 
-    def _guarded(self, call: Callable[..., Any]) -> Callable[..., Any]:
-        """C knows no exceptions: keep one until the C has returned, and let it call nothing more."""
+class _Guarded:
+    """The board's hardware for C, which knows no exceptions.
 
-        def guarded(*values: Any) -> Any:
-            if self._failed is None:
-                try:
-                    return call(*values) or 0
-                except BaseException as error:  # noqa: BLE001 - raised by _call
-                    self._failed = error
-            return 0
+    One that is raised, as the end of the program, is kept until the C has returned, which until then reads zeros.
+    """
 
-        return guarded
+    def __init__(self, board: HostBoard) -> None:
+        self.failed: BaseException | None = None
+        self._board = board
 
-    def _on_transfer(self, out: Any, into: Any, size: int) -> None:
-        ctypes.memmove(into, self.transfer(ctypes.string_at(out, size)), size)
+    def _call(self, call: Callable[..., Any], *values: Any) -> Any:
+        if self.failed is None:
+            try:
+                return call(*values)
+            except BaseException as error:  # noqa: BLE001 - raised by HostBoard.program
+                self.failed = error
+        return None
 
-    def _on_read(self, into: Any, size: int) -> int:
-        data = self.read_line(size)
-        ctypes.memmove(into, data, len(data))
-        return len(data)
+    def transfer(self, out: bytes) -> bytes:
+        return self._call(self._board.transfer, out) or bytes(len(out))
 
-    def _on_show(self, lights: int) -> None:
-        self.lights = lights
+    def set_spi_fast(self, fast: bool) -> None:
+        self._call(self._board.set_spi_fast, fast)
+
+    def reset_chip(self) -> None:
+        self._call(self._board.reset_chip)
+
+    def pause_us(self, microseconds: int) -> None:
+        self._call(self._board.pause_s, 1e-6 * microseconds)
+
+    def now_us(self) -> int:
+        return self._call(self._board.now_us) or 0
+
+    def interrupt_line(self) -> bool:
+        return self._call(lambda: self._board.chip.irq) or False
+
+    def read_line(self, size: int) -> bytes:
+        return self._call(self._board.read_line, size) or b""
+
+    def write_line(self, line: bytes) -> bool:
+        return self._call(self._board.write_line, line) or False
+
+    def restart_line(self) -> None:
+        self._call(self._board.restart_line)
+
+    def show(self, lights: int) -> None:
+        self._board.lights = lights

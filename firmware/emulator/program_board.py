@@ -29,6 +29,7 @@ class ProgramBoard:
 
     def __init__(self, timeline: Timeline[Any], chip: Chip, send: Callable[[bytes], None]) -> None:
         self.chip = chip
+        self.lights = 0
         self._timeline, self._send = timeline, send
         self._start()
 

@@ -10,13 +10,15 @@ from typing import Any, Final
 
 from skyless.air.ieee802154 import preamble_s
 from skyless.air.reception import Transmission
-from skyless.simulation.medium import TURNAROUND_S, Medium
+from skyless.simulation.medium import Medium
 from skyless.simulation.oscillator import clock_rate
 from skyless.ticks import difference, from_seconds, wrap
 
-_GRID_TICKS: Final = from_seconds(20e-6)
-_COMMIT_TICKS: Final = from_seconds(preamble_s() + TURNAROUND_S) + _GRID_TICKS
-"""The medium gets a frame at a multiple of the grid of true time at least so long before its RMARKER."""
+SITE_TURNAROUND_S: Final = 4e-6
+"""For a medium with such air: a real chip sends what it gets until its preamble begins. Frames in slots never overlap."""
+_GRID_TICKS: Final = from_seconds(10e-6)
+_COMMIT_TICKS: Final = from_seconds(preamble_s() + SITE_TURNAROUND_S + 1e-6)
+"""The medium gets a frame at the last multiple of the grid of true time that is so long before its RMARKER."""
 
 
 class SiteAir:
