@@ -12,7 +12,7 @@ import contextlib
 import random
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from msgspec import Struct
@@ -38,10 +38,7 @@ from skyless.simulation.stations import TagSpec
 from skyless.simulation.trajectory import Trajectory
 from skyless.simulation.world import diagnostics_of
 from skyless.site.model import Site
-from skyless.ticks import wrap
-
-_OFF_S: Final = 20e-3
-"""How long a supply fails."""
+from skyless.ticks import difference, wrap
 
 
 class Board(Protocol):
@@ -116,13 +113,30 @@ class SiteNode:
         """Frames that the antenna got while it was not sending, by their bytes and stamps: when each ended, in s."""
         self.board: Board | None = None
         self.wire: SerialWire | None = None
-        self.radio: WatchedRadio | None = None
+        self.radios: list[WatchedRadio] = []
+        """Of its programs one after the other."""
         self.task: asyncio.Task[None] | None = None
 
     @property
-    def is_on(self) -> bool:
-        """Whether its supply is good."""
-        return self.board is not None
+    def radio(self) -> WatchedRadio:
+        """Of its present program, or its last one."""
+        return self.radios[-1]
+
+    @property
+    def heard(self) -> set[tuple[bytes, int]]:
+        """Frames and stamps that reached its programs."""
+        return set[tuple[bytes, int]]().union(*(radio.heard for radio in self.radios))
+
+    @property
+    def made(self) -> set[tuple[bytes, int]]:
+        """Frames of its programs and their times."""
+        return set[tuple[bytes, int]]().union(*(radio.made for radio in self.radios))
+
+    @property
+    def is_sending(self) -> bool:
+        """Whether the RMARKER of its frame has left, and its end has not."""
+        sending = self.chip.transceiver.sending
+        return sending is not None and difference(self.air.now_ticks(), sending.marker_ticks) > 0
 
 
 class EmulatedSite:
@@ -222,7 +236,7 @@ class EmulatedSite:
     def start_host(self, node: SiteNode) -> None:
         """Start the program of a node."""
         radio = WatchedRadio(self._radio(node), node.air)
-        node.radio = radio
+        node.radios.append(radio)
         if node in self.anchors:
             anchors = Anchors(self.site, [radio], None, self.log.append, simulated=lambda: True)
             self.programs[node.name] = anchors.nodes[0]
@@ -248,7 +262,6 @@ class EmulatedSite:
                 await task
 
     def _on_fix(self, node: SiteNode, fix: FixMessage) -> None:
-        assert node.radio is not None
         assert node.radio.present is not None
         self.fixes[node.name].append((fix, node.at_antenna[node.radio.present]))
 
@@ -318,24 +331,22 @@ def judge(site: EmulatedSite, warmup_s: float) -> SiteResult:
     count, end_s = len(site.anchors), site.medium.now_s - 5e-3  # what is on its way at the end is not judged
     slots = set()
     wrong = 0
+    made = [node.made for node in site.nodes]
     for one in site.sent:
         beacon = decode_cached(one.frame)
-        radio = site.nodes[one.node].radio
-        assert radio is not None
-        wrong += (one.frame, one.tx_ticks) not in radio.made
+        wrong += (one.frame, one.tx_ticks) not in made[one.node]
         if isinstance(beacon, Beacon) and warmup_s <= one.time_s < end_s:
             slots.add(beacon.superframe * count + one.node)
     first, last = (min(slots), max(slots) + 1) if slots else (0, 0)
     misused: Counter[str] = Counter()
     at_antennas, reported, least = 0, 0, 1.0
     for node in site.nodes:
-        radio = node.radio
-        assert radio is not None
+        heard = node.heard
         judged = {key for key, ended_s in node.at_antenna.items() if warmup_s <= ended_s < end_s}
-        wrong += len(radio.heard - node.at_antenna.keys())
+        wrong += len(heard - node.at_antenna.keys())
         at_antennas += len(judged)
-        reported += len(judged & radio.heard)
-        least = min(least, len(judged & radio.heard) / max(len(judged), 1))
+        reported += len(judged & heard)
+        least = min(least, len(judged & heard) / max(len(judged), 1))
         misused += node.chip.misuse + node.air.counts
     errors_m2 = [
         float(np.sum((np.array(fix.position_m) - site.trajectories[index].position(ended_s))[:2] ** 2))
@@ -343,7 +354,7 @@ def judge(site: EmulatedSite, warmup_s: float) -> SiteResult:
         for fix, ended_s in site.fixes[node.name]
         if warmup_s <= ended_s
     ]
-    late = sum(time_s >= warmup_s for node in site.anchors if node.radio for time_s in node.radio.late)
+    late = sum(time_s >= warmup_s for node in site.anchors for radio in node.radios for time_s in radio.late)
     return SiteResult(
         slots=last - first,
         sent=len(slots),

@@ -29,7 +29,6 @@ class RepeatingRadio:
 
     def __init__(self, node: SiteNode, before: SiteNode) -> None:
         """``before`` is the node in the run with boards."""
-        assert before.radio is not None
         self.name = node.name
         self.counters: Counter[str] = Counter()
         self._node = node
