@@ -4,17 +4,11 @@ The same C as on a board, with the undefined-behaviour sanitizer; bus, clock and
 """
 
 import ctypes
-import os
-import shutil
-import subprocess
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import Protocol
 
-FIRMWARE = Path(__file__).parents[1]
-LIBRARY = FIRMWARE / "build" / "libskyless-board.so"
-HAS_HOST_COMPILER = shutil.which(os.environ.get("HOST_CC", "gcc")) is not None and shutil.which("make") is not None
+from build import build
 
 CHIP_NUMBERS = (
     "received", "errors", "sent", "late", "rx_ticks", "tx_ticks", "frame_bytes",
@@ -85,10 +79,7 @@ def library() -> ctypes.CDLL:
     Raises:
         RuntimeError: it cannot be built; the message has the compiler's.
     """
-    built = subprocess.run(["make", "-C", str(FIRMWARE), "host"], capture_output=True, text=True, check=False)
-    if built.returncode:
-        raise RuntimeError(f"make -C firmware host fails:\n{built.stdout}{built.stderr}")
-    loaded = ctypes.CDLL(str(LIBRARY))
+    loaded = ctypes.CDLL(str(build("host")))
     loaded.host_board_chip.restype = ctypes.c_void_p
     loaded.host_chip_number.restype = ctypes.c_int64
     for name in ("host_chip_frame", "host_writer_line", "host_reader_record"):

@@ -6,9 +6,6 @@
 
 #define WRITE 0x80u
 
-/* What is written back to SYS_STATUS at most. */
-static const uint8_t CLEARED[5] = {0xF8u, 0xFFu, 0xFFu, 0x37u, 0x07u};
-
 struct setting {
     uint8_t file;
     uint16_t sub;
@@ -129,7 +126,7 @@ static uint32_t sixteen(const uint8_t *data)
     return (uint32_t)data[0] | ((uint32_t)data[1] << 8);
 }
 
-static uint64_t stamp(const uint8_t *data)
+static uint64_t forty(const uint8_t *data)
 {
     uint64_t ticks = 0u;
 
@@ -179,34 +176,35 @@ static void write_bytes(struct dw1000 *chip, uint32_t file, uint32_t sub, const 
     chip->hardware->transfer(chip->out, chip->into, head + octets);
 }
 
-static void write_register(struct dw1000 *chip, uint32_t file, uint32_t sub, uint32_t octets, uint32_t value)
+static void write_register(struct dw1000 *chip, uint32_t file, uint32_t sub, uint32_t octets, uint64_t value)
 {
-    const uint8_t data[4] = {(uint8_t)value, (uint8_t)(value >> 8), (uint8_t)(value >> 16), (uint8_t)(value >> 24)};
+    const uint8_t data[5] = {(uint8_t)value, (uint8_t)(value >> 8), (uint8_t)(value >> 16), (uint8_t)(value >> 24),
+                             (uint8_t)(value >> 32)};
 
     write_bytes(chip, file, sub, data, octets);
 }
 
 static void read_status(struct dw1000 *chip)
 {
-    (void)memcpy(chip->status, read_register(chip, 0x0Fu, 0u, 5u), sizeof chip->status);
+    chip->status = forty(read_register(chip, 0x0Fu, 0u, STATUS_OCTETS));
+}
+
+static void clear_status(struct dw1000 *chip, uint64_t events)
+{
+    write_register(chip, 0x0Fu, 0u, STATUS_OCTETS, events);
 }
 
 /* Clear what the last reading of SYS_STATUS has shown; what came since stays. */
 static void clear_seen(struct dw1000 *chip)
 {
-    uint8_t seen[5];
-
-    for (uint32_t at = 0u; at < sizeof seen; at++) {
-        seen[at] = chip->status[at] & CLEARED[at];
-    }
-    write_bytes(chip, 0x0Fu, 0u, seen, sizeof seen);
+    clear_status(chip, chip->status & CLEARED);
 }
 
 /* Turn the transceiver off and forget all events. */
 static void off_and_clear(struct dw1000 *chip)
 {
     write_register(chip, 0x0Du, 0u, 1u, TRXOFF);
-    write_bytes(chip, 0x0Fu, 0u, CLEARED, sizeof CLEARED);
+    clear_status(chip, CLEARED);
 }
 
 /* Starting */
@@ -276,7 +274,8 @@ static bool lock(struct dw1000 *chip)
     write_register(chip, 0x36u, 0x00u, 2u, 0x0200u); /* PMSC_CTRL0: clocks by themselves */
     for (uint32_t tries = 0u; tries < LOCK_TRIES; tries++) {
         chip->hardware->pause_us(100u);
-        if ((read_register(chip, 0x0Fu, 0u, 5u)[0] & CPLOCK) != 0u) {
+        read_status(chip);
+        if ((chip->status & CPLOCK) != 0u) {
             return true;
         }
     }
@@ -323,8 +322,7 @@ bool dw1000_start(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t rx_an
     write_register(chip, 0x1Eu, 0u, 4u, TX_POWER);
     write_register(chip, 0x18u, 0u, 2u, tx_antenna_delay);      /* TX_ANTD */
     write_register(chip, 0x2Eu, 0x1804u, 2u, rx_antenna_delay); /* LDE_RXANTD */
-    write_register(chip, 0x0Eu, 0u, 4u,                         /* SYS_MASK */
-                   TXFRS | RXFCG | RX_ERRORS | ((CLKPLL_LL_3 | RX_ERRORS_3) << 24));
+    write_register(chip, 0x0Eu, 0u, 4u, SYS_MASK_EVENTS);
     off_and_clear(chip);
     chip->state = DW1000_IDLE;
     return true;
@@ -367,7 +365,7 @@ bool dw1000_cancel(struct dw1000 *chip)
     if (chip->state == DW1000_SENDING) {
         write_register(chip, 0x0Du, 0u, 1u, TRXOFF);
         read_status(chip);
-        if ((chip->status[0] & TXFRS) != 0u) {
+        if ((chip->status & TXFRS) != 0u) {
             return false;
         }
         resume(chip);
@@ -380,8 +378,7 @@ bool dw1000_cancel(struct dw1000 *chip)
 static enum dw1000_queued was_in_time(struct dw1000 *chip)
 {
     read_status(chip);
-    if (((chip->status[0] & TXFRS) != 0u) ||
-        (((chip->status[3] & HPDWARN_3) == 0u) && ((chip->status[4] & TXPUTE_4) == 0u)) || !dw1000_cancel(chip)) {
+    if (((chip->status & TXFRS) != 0u) || ((chip->status & (HPDWARN | TXPUTE)) == 0u) || !dw1000_cancel(chip)) {
         return DW1000_QUEUED;
     }
     chip->late++;
@@ -397,17 +394,9 @@ enum dw1000_queued dw1000_transmit_at(struct dw1000 *chip, uint64_t dx_ticks, co
         return DW1000_BUSY;
     }
 
-    uint32_t written = (frame_bytes + 5u) & ~7u; /* without the FCS, in steps of 8 */
-    uint64_t dx = dx_ticks & ~(uint64_t)0x1FFu;
-    const uint8_t dx_octets[5] = {(uint8_t)dx, (uint8_t)(dx >> 8), (uint8_t)(dx >> 16), (uint8_t)(dx >> 24),
-                                  (uint8_t)(dx >> 32)};
-
-    (void)memset(&chip->out[1], 0, written);
-    (void)memcpy(&chip->out[1], frame, frame_bytes - 2u);
-    chip->out[0] = (uint8_t)(WRITE | 0x09u);
-    chip->hardware->transfer(chip->out, chip->into, 1u + written);
+    write_bytes(chip, 0x09u, 0u, frame, frame_bytes - 2u);
     write_register(chip, 0x08u, 0u, 4u, TX_FCTRL | frame_bytes);
-    write_bytes(chip, 0x0Au, 0u, dx_octets, sizeof dx_octets);
+    write_register(chip, 0x0Au, 0u, 5u, dx_ticks & ~(uint64_t)0x1FFu);
     off_and_clear(chip);
     write_register(chip, 0x0Du, 0u, 1u, TXSTRT_TXDLYS);
     chip->state = DW1000_SENDING;
@@ -416,7 +405,7 @@ enum dw1000_queued dw1000_transmit_at(struct dw1000 *chip, uint64_t dx_ticks, co
 
 static uint32_t finish_sending(struct dw1000 *chip)
 {
-    chip->tx_ticks = stamp(read_register(chip, 0x17u, 0u, 5u));
+    chip->tx_ticks = forty(read_register(chip, 0x17u, 0u, 5u));
     chip->sent++;
     clear_seen(chip);
     listen_again(chip);
@@ -461,14 +450,14 @@ static uint32_t read_frame(struct dw1000 *chip)
 {
     uint32_t tries = LDE_TRIES;
 
-    while ((chip->status[1] & (LDEDONE >> 8)) == 0u) {
+    while ((chip->status & LDEDONE) == 0u) {
         if (tries == 0u) {
             return recover(chip);
         }
         tries--;
         chip->hardware->pause_us(20u);
         read_status(chip);
-        if ((chip->status[2] & (LDEERR >> 16)) != 0u) {
+        if ((chip->status & LDEERR) != 0u) {
             return recover(chip);
         }
     }
@@ -480,11 +469,11 @@ static uint32_t read_frame(struct dw1000 *chip)
     if (size < DW1000_MIN_PSDU_BYTES) {
         return recover(chip);
     }
-    (void)read_into(chip, chip->frame_into, 0x11u, 0u, (size + 7u) & ~7u);
+    (void)read_into(chip, chip->frame_into, 0x11u, 0u, size);
 
     const uint8_t *time = read_register(chip, 0x15u, 0u, 9u);
 
-    chip->rx_ticks = stamp(time);
+    chip->rx_ticks = forty(time);
     chip->frame_bytes = size;
     read_measured(chip, symbols, sixteen(&time[7]));
     chip->received++;
@@ -502,24 +491,21 @@ uint32_t dw1000_poll(struct dw1000 *chip)
     }
     read_status(chip);
 
-    uint32_t seen = sixteen(chip->status) | ((uint32_t)chip->status[2] << 16);
+    uint64_t seen = chip->status;
 
-    if ((((seen & CPLOCK) == 0u) || ((seen & SLP2INIT) != 0u) || ((chip->status[4] & UNUSED_4) != 0u)) &&
-        !dw1000_check(chip)) {
+    if ((((seen & CPLOCK) == 0u) || ((seen & (SLP2INIT | UNUSED)) != 0u)) && !dw1000_check(chip)) {
         return DW1000_LOST;
     }
-    if ((chip->status[3] & CLKPLL_LL_3) != 0u) {
-        const uint8_t slipped[5] = {0u, 0u, 0u, CLKPLL_LL_3, 0u};
-
+    if ((seen & CLKPLL_LL) != 0u) {
         events = DW1000_CLOCK_SLIPPED;
-        write_bytes(chip, 0x0Fu, 0u, slipped, sizeof slipped); /* alone: a frame may be coming in */
+        clear_status(chip, CLKPLL_LL); /* alone: a frame may be coming in */
     }
     if (chip->state == DW1000_SENDING) {
         if ((seen & TXFRS) != 0u) {
             events |= finish_sending(chip);
         }
     } else if (chip->state == DW1000_LISTENING) {
-        if (((seen & RX_ERRORS) != 0u) || ((chip->status[3] & RX_ERRORS_3) != 0u)) {
+        if ((seen & RX_ERRORS) != 0u) {
             events |= recover(chip);
         } else if ((seen & RXFCG) != 0u) {
             events |= read_frame(chip);
@@ -547,7 +533,7 @@ bool dw1000_check(struct dw1000 *chip)
 
 uint64_t dw1000_now(struct dw1000 *chip)
 {
-    return stamp(read_register(chip, 0x06u, 0u, 5u));
+    return forty(read_register(chip, 0x06u, 0u, 5u));
 }
 
 /* From the converter's readings; with typical values where the chip brought none of its own. */

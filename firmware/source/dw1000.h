@@ -62,7 +62,7 @@ struct dw1000 {
     uint32_t temperature_23;
     uint32_t voltage_33;
 
-    uint8_t status[5];
+    uint64_t status; /* SYS_STATUS as it was read last */
     uint8_t out[DW1000_MAX_TRANSFER_BYTES];
     uint8_t into[DW1000_MAX_TRANSFER_BYTES];
     uint8_t frame_into[DW1000_MAX_TRANSFER_BYTES];

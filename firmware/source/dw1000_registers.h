@@ -5,27 +5,29 @@
 
 #define DEVICE_ID 0xDECA0130u
 
-/* SYS_STATUS, octets 0 to 2 as one number; octets 3 and 4 apart */
-#define CPLOCK 0x000002u
-#define TXFRS 0x000080u
-#define LDEDONE 0x000400u
-#define RXPHE 0x001000u
-#define RXFCG 0x004000u
-#define RXFCE 0x008000u
-#define RXRFSL 0x010000u
-#define RXRFTO 0x020000u
-#define LDEERR 0x040000u
-#define RXOVRR 0x100000u
-#define RXPTO 0x200000u
-#define SLP2INIT 0x800000u
-#define RX_ERRORS (RXPHE | RXFCE | RXRFSL | RXRFTO | LDEERR | RXOVRR | RXPTO)
-#define CLKPLL_LL_3 0x02u
-#define RXSFDTO_3 0x04u
-#define HPDWARN_3 0x08u
-#define AFFREJ_3 0x20u
-#define RX_ERRORS_3 (RXSFDTO_3 | AFFREJ_3)
-#define TXPUTE_4 0x04u
-#define UNUSED_4 0xF8u
+/* SYS_STATUS, 40 bits */
+#define CPLOCK (1ull << 1)
+#define TXFRS (1ull << 7)
+#define LDEDONE (1ull << 10)
+#define RXPHE (1ull << 12)
+#define RXFCG (1ull << 14)
+#define RXFCE (1ull << 15)
+#define RXRFSL (1ull << 16)
+#define RXRFTO (1ull << 17)
+#define LDEERR (1ull << 18)
+#define RXOVRR (1ull << 20)
+#define RXPTO (1ull << 21)
+#define SLP2INIT (1ull << 23)
+#define CLKPLL_LL (1ull << 25)
+#define RXSFDTO (1ull << 26)
+#define HPDWARN (1ull << 27)
+#define AFFREJ (1ull << 29)
+#define TXPUTE (1ull << 34)
+#define RX_ERRORS (RXPHE | RXFCE | RXRFSL | RXRFTO | LDEERR | RXOVRR | RXPTO | RXSFDTO | AFFREJ)
+#define UNUSED (0xF8ull << 32)
+#define CLEARED 0x0737FFFFF8ull /* what is written back at most */
+#define STATUS_OCTETS 5u
+#define SYS_MASK_EVENTS (TXFRS | RXFCG | RX_ERRORS | CLKPLL_LL)
 
 /* SYS_CTRL */
 #define TXSTRT_TXDLYS 0x06u

@@ -4,7 +4,8 @@ from binascii import crc_hqx
 from itertools import count
 
 import pytest
-from board_library import HAS_HOST_COMPILER, CBoard
+from board_library import CBoard
+from build import HAS_HOST_COMPILER
 from chip_stage import HandClock
 from cobs import cobs
 

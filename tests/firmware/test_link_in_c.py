@@ -5,7 +5,8 @@ import itertools
 from binascii import crc_hqx
 
 import pytest
-from board_library import HAS_HOST_COMPILER, library
+from board_library import library
+from build import HAS_HOST_COMPILER
 from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
@@ -104,7 +105,11 @@ def test_a_reception_arrives_as_it_was(ticks, rx_power, first_path, offset, fram
     heard = decode(record)
     assert isinstance(heard, Heard)
     assert (heard.rx_ticks, heard.frame) == (ticks, frame)
-    values = [heard.diagnostics.rx_power_dbm, heard.diagnostics.first_path_power_dbm, heard.diagnostics.carrier_offset_ppm]
+    values = [
+        heard.diagnostics.rx_power_dbm,
+        heard.diagnostics.first_path_power_dbm,
+        heard.diagnostics.carrier_offset_ppm,
+    ]
     for value, steps, unit in zip(values, (rx_power, first_path, offset), (100, 100, 1000), strict=True):
         assert value == (None if steps == -32768 else steps / unit)
 

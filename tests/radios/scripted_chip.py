@@ -130,8 +130,8 @@ class Story:
 
     def __init__(self):
         self.lines = {}
-        for tell in (self.start, self.frames, self.transmissions, self.errors, self.refusals, self.costs):
-            tell()
+        for part in (self.start, self.frames, self.transmissions, self.errors, self.refusals, self.costs):
+            part()
 
     def note(self, name, *values):
         self.lines.setdefault(name, []).append(" ".join(map(str, values)))
@@ -175,7 +175,7 @@ class Story:
         bus.take()
         script_frame(bus, bytes(range(9)))
         self.note("short", chip.poll(), bus.take())
-        self.note("untold", chip.rx_power_cdbm, chip.first_path_cdbm, chip.offset_ppb)
+        self.note("unmeasured", chip.rx_power_cdbm, chip.first_path_cdbm, chip.offset_ppb)
 
     def transmissions(self):
         bus, chip = started()

@@ -293,8 +293,6 @@ class DW1000:
         self._voltage_33 = 0
         self._status = 0
         """SYS_STATUS as it was read last."""
-        self._tx_buffer = bytearray(128)
-        """What the chip's buffer holds."""
 
     # Starting
 
@@ -427,8 +425,7 @@ class DW1000:
             return NOT_READY
         if self.state == SENDING:
             return BUSY
-        self._tx_buffer[: size - 2] = frame[:-2]
-        self._bus.transfer(header(True, 0x09, 0) + self._tx_buffer[: _whole_steps(size - 2)])
+        self._bus.transfer(header(True, 0x09, 0) + frame[:-2])
         self._write(0x08, 0, 4, TX_FCTRL | size)
         self._write(0x0A, 0, 5, dx_ticks & ~0x1FF)
         self._off_and_clear()
@@ -597,7 +594,7 @@ class DW1000:
         size = info & 0x7F
         if size < MIN_PSDU_BYTES:
             return self._recover(0)
-        self.frame = self._read(0x11, 0, _whole_steps(size))[:size]
+        self.frame = self._read(0x11, 0, size)
         time = self._read(0x15, 0, 9)
         self.rx_ticks = int.from_bytes(time[:5], "little")
         if self.measuring:
@@ -623,8 +620,3 @@ class DW1000:
         self.offset_ppb = carrier_offset_ppb(self.carrier_integrator)
         if self.correct_bias and self.rx_power_cdbm != NOT_MEASURED:
             self.rx_ticks = wrap(self.rx_ticks - bias_ticks(self.rx_power_cdbm))
-
-
-def _whole_steps(octets: int) -> int:
-    """As many octets in whole steps of 8."""
-    return (octets + 7) & ~7
