@@ -1,0 +1,429 @@
+"""A DWM1001 that executes the firmware's image: an nRF52832 with a DW1000 on its SPI, in true time.
+
+    image = Image(timeline, chip, send, elf=path, can_transmit=True, identity=bytes(8))
+
+The processor's costs and what is assumed of them: ``cycles.py``. Its peripherals: ``peripherals.py`` and
+``serial_peripherals.py``. WFI ends 3 µs after the interrupt that ends it (assumed; the specification gives about that
+for a regulator and a clock that have to start). The 64 MHz clock is exact but for ``clock_ppm``; a reset takes no time.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import peripherals as p
+from cortex_m4 import Core, EmulationError, functions_of, load_elf
+from cycles import spent_at
+from msgspec import Struct
+from paths import PathCost, Paths
+from processors import TICKS_PER_CYCLE, Processors
+from serial_peripherals import Spim, Uarte
+
+from skyless.constants import TICK_S
+from skyless.simulation.dw1000.chip import Chip
+from skyless.simulation.medium import Timeline
+
+WAKE_UP_CYCLES: Final = 3 * 64
+_LOCKUP_RESET_CYCLES: Final = 64
+
+SELECT_PIN: Final = 17
+INTERRUPT_PIN: Final = 19
+RESET_PIN: Final = 24
+ROLE_PIN: Final = 13
+UART_RX_PIN: Final = 11
+LED_PINS: Final = {"green": 30, "blue": 31, "red": 14, "red-2": 22}
+
+_WINDOWS: Final = [(0x10000000, 0x1000), (0x40000000, 0x20000), (0x50000000, 0x1000), (0xE000E000, 0x1000)]
+_PULL_UP: Final = 3
+
+
+class Latency(Struct, frozen=True):
+    """From a rise of the chip's interrupt line to the start of the firmware's next SPI transfer, in s of true time."""
+
+    count: int
+    mean_s: float
+    most_s: float
+
+
+class Image:
+    """A board of the emulated site (``Board`` of ``site.py``): this one executes the ELF file's machine code."""
+
+    def __init__(
+        self,
+        timeline: "Timeline[Any]",
+        chip: Chip,
+        send: Callable[[bytes], None],
+        *,
+        elf: Path,
+        can_transmit: bool,
+        identity: bytes,
+        clock_ppm: float = 0.0,
+    ) -> None:
+        """``send`` gets bytes when they have left the UART's pin completely.
+
+        Without ``can_transmit`` the role's pin is connected to ground.
+
+        Raises:
+            EmulationError: the file is no image for this processor, here or where the firmware uses what is not
+                modelled.
+            ValueError: ``identity`` has not 8 bytes.
+        """
+        if len(identity) != 8:
+            raise ValueError("a board's identity has 8 bytes")
+        self.misuse: Counter[str] = Counter()
+        """What the firmware did to its processor that the specification forbids, and bytes that it lost."""
+        self.resets: Counter[str] = Counter()
+        """Resets after the first start, by their cause."""
+        self._timeline, self._chip, self._send = timeline, chip, send
+        self._can_transmit, self._identity, self._elf = can_transmit, identity, elf
+        self._ticks_per_cycle = TICKS_PER_CYCLE * (1 + 1e-6 * clock_ppm)
+        self._processors = Processors.of(timeline)
+        self._epoch_ticks = timeline.now_ticks
+        self._paths = Paths()
+        self._irq_was_high = False
+        self._rise_ticks: int | None = None
+        self._latency = (0, 0, 0)
+        self._executing = False
+        self._life = 0
+        self.core = Core(load_elf(elf), _WINDOWS, self._read, self._write)
+        self._start(cause=0, watchdog=None, retained=(0, 0))
+
+    # What the site sees
+
+    def notify(self) -> None:
+        """The chip's interrupt line may have changed."""
+        self._sample_interrupt()
+
+    def receive(self, data: bytes) -> None:
+        """Bytes have arrived on the UART's line."""
+        self._paths.note_bytes(data)
+        self._uarte.receive(data)
+
+    def power_cycle(self) -> None:
+        """The processor's supply failed and is back: RAM, registers and the cause of the reset are lost."""
+        self.core.reset(keep_ram=False)
+        self.resets["power"] += 1
+        self._start(cause=0, watchdog=None, retained=(0, 0))
+
+    @property
+    def faults(self) -> list[str]:
+        """Faults that the firmware has run into."""
+        return self.core.faults
+
+    @property
+    def leds(self) -> frozenset[str]:
+        """Lights that are on (``LED_PINS``); they are so when their pin is low."""
+        return frozenset(name for name, pin in LED_PINS.items() if self._gpio.is_driven(pin, high=False))
+
+    @property
+    def is_asleep(self) -> bool:
+        """Whether the processor waits in WFI."""
+        return self._asleep
+
+    @property
+    def busy_share(self) -> float:
+        """Share of the time since the first start in which the processor was awake, waits for transfers included."""
+        passed = max(self._cycle_at(self._timeline.now_ticks), 1)
+        return 1.0 - (self._slept_cycles + (passed - self._asleep_since if self._asleep else 0)) / passed
+
+    def cycles_by_path(self) -> dict[str, PathCost]:
+        """Cycles from each wake-up to the next WFI, by what was done (``paths.py``)."""
+        return self._paths.costs()
+
+    def cycles_by_function(self) -> dict[str, int]:
+        """Cycles spent in each function, waits for peripherals apart; the costliest first."""
+        spent = spent_at(self.core.state)
+        rows = [(name, int(spent[at >> 1 : (at + size) >> 1].sum())) for at, size, name in functions_of(self._elf)]
+        return {name: cycles for name, cycles in sorted(rows, key=lambda row: -row[1]) if cycles}
+
+    def forget_paths(self) -> None:
+        """Measure paths, functions and latencies from now on."""
+        spent_at(self.core.state)[:] = 0
+        self._paths = Paths()
+        self._paths.begin(self.cycles)
+        self._latency = (0, 0, 0)
+
+    @property
+    def interrupt_latency(self) -> Latency:
+        """How long the firmware needs to turn to the chip."""
+        count, total, most = self._latency
+        return Latency(count, total * TICK_S / max(count, 1), most * TICK_S)
+
+    # Start and resets
+
+    def _start(self, cause: int, watchdog: p.Watchdog | None, retained: tuple[int, int]) -> None:
+        """Peripherals as after a reset; a watchdog that is given runs on."""
+        self._life += 1
+        self._cause = 0
+        self._reset_asked = False
+        self._clock = p.Clock(self, cause, retained)
+        self._timers = [p.Timer(self, number) for number in range(3)]
+        self._gpio = p.Gpio(self, self._level, self._on_output)
+        self._gpiote = p.Gpiote(self)
+        self._watchdog = watchdog or p.Watchdog(self)
+        self._ppi = p.Ppi(self)
+        self._nvmc = p.Nvmc(self, self.core.use_cache)
+        self._nvic = p.Nvic(self, lambda: (self.core.hfsr, self.core.cfsr, self.core.bfar), self._ask_for_reset)
+        self._uarte = Uarte(self, self._send)
+        self._spim = Spim(self, self)
+        self._pages: dict[int, p.Peripheral] = {
+            one.base >> 12: one
+            for one in (
+                self._clock,
+                *self._timers,
+                self._gpio,
+                self._gpiote,
+                self._watchdog,
+                self._ppi,
+                self._nvmc,
+                self._nvic,
+                self._uarte,
+                self._spim,
+                p.Ficr(self, self._identity),
+            )
+        }
+        self._selected = False
+        if getattr(self, "_holds_chip", False):
+            self._chip.pull_reset()
+        self._holds_chip = False
+        self._stalled_until: int | None = None
+        if not hasattr(self, "_slept_cycles"):
+            self._slept_cycles = self._asleep_since = 0
+            self._asleep = False
+        elif self._asleep:
+            self._slept_cycles += max(self._cycle_at(self._timeline.now_ticks) - self._asleep_since, 0)
+        self._asleep = False
+        self.core.cycles = max(self.core.cycles, self._cycle_at(self._timeline.now_ticks))
+        self._paths.begin_start(self.core.cycles)
+        self._processors.plan(self, self._ticks_at(self.core.cycles))
+
+    def _ask_for_reset(self) -> None:
+        self._reset_asked = True
+        self.core.stop_at(0)
+
+    def _reset(self, cause: int, name: str) -> None:
+        """A reset other than that of power-on; only soft resets and lockups leave RAM and watchdog as they are."""
+        self.resets[name] += 1
+        soft = cause in {p.RESET_SOFTWARE, p.RESET_LOCKUP}
+        causes = self._clock.registers[0x400] | cause
+        retained = self._clock.registers[0x51C], self._clock.registers[0x520]
+        watchdog = self._watchdog if soft and self._watchdog.is_running else None
+        self.core.reset(keep_ram=soft)
+        self._start(causes, watchdog, retained)
+
+    # True time
+
+    def _ticks_at(self, cycles: int) -> int:
+        """True time at which the clock has counted so far, rounded up."""
+        return self._epoch_ticks + -int(-(cycles * self._ticks_per_cycle) // 1)
+
+    def _cycle_at(self, ticks: int) -> int:
+        return int((ticks - self._epoch_ticks) / self._ticks_per_cycle + 1e-6)
+
+    @property
+    def cycles(self) -> int:
+        """The present in cycles of the processor's clock since the first start."""
+        return self.core.cycles if self._executing else self._cycle_at(self._timeline.now_ticks)
+
+    def plan(self, cycles: int, happen: Callable[[], None]) -> None:
+        """Let something happen, unless the processor is reset before."""
+        life = self._life
+
+        def act() -> None:
+            if life == self._life:
+                happen()
+
+        self._timeline.at(self._ticks_at(cycles), act)
+        if self._executing:
+            self.core.stop_at(cycles)
+
+    def advance(self, due_ticks: int, until_ticks: int) -> int | None:
+        """Execute up to a true time (``processors.Processor``)."""
+        if self._asleep:
+            self.core.cycles = max(self._cycle_at(due_ticks), self._asleep_since)
+            self._update_timers()
+            if self._watchdog.due_cycles <= self.core.cycles:
+                self._reset(p.RESET_WATCHDOG, "watchdog")
+            elif self._nvic.wakes:
+                return self._ticks_at(self._wake())
+            else:
+                return self._sleep_until()
+        limit = self._cycle_at(until_ticks) + 1
+        while self.core.cycles < limit:
+            if self._stalled_until is not None:
+                if self._spim.end_cycles is not None:
+                    return max(self._ticks_at(self._spim.end_cycles), until_ticks)
+                self._end_stall()
+            stop = self._execute(min(limit, self._watchdog.due_cycles))
+            if self._after(stop):
+                return self._sleep_until()
+            if self._timeline.next_ticks is not None:
+                limit = min(limit, self._cycle_at(self._timeline.next_ticks) + 1)
+        return self._ticks_at(self.core.cycles)
+
+    def _execute(self, limit: int) -> str:
+        self._executing = True
+        try:
+            return self.core.run(limit)
+        finally:
+            self._executing = False
+
+    def _after(self, stop: str) -> bool:
+        """Deal with what ended a run; whether the processor sleeps now."""
+        if stop == "lockup":
+            self.core.spend(_LOCKUP_RESET_CYCLES)
+            self._reset(p.RESET_LOCKUP, "lockup")
+        elif self._reset_asked:
+            self._reset(p.RESET_SOFTWARE, "software")
+        elif self.core.cycles >= self._watchdog.due_cycles:
+            self._reset(p.RESET_WATCHDOG, "watchdog")
+        elif stop == "sleep":
+            self._update_timers()
+            if not self.core.masks_interrupts:
+                raise EmulationError(
+                    f"WFI at PC 0x{self.core.pc - 2:x} with PRIMASK clear: interrupts are not modelled"
+                )
+            if not self._nvic.wakes:
+                self._paths.end(self.core.cycles)
+                self._asleep, self._asleep_since = True, self.core.cycles
+                return True
+        return False
+
+    def _sleep_until(self) -> int | None:
+        due = min(self._watchdog.due_cycles, *(timer.due_cycles for timer in self._timers))
+        return self._ticks_at(max(due, self._asleep_since)) if due < 1 << 62 else None
+
+    def _wake(self) -> int:
+        """End the sleep; the count of cycles at which the processor goes on."""
+        self._slept_cycles += self.core.cycles - self._asleep_since
+        self._asleep = False
+        self.core.spend(WAKE_UP_CYCLES)
+        self._paths.begin(self.core.cycles)
+        return self.core.cycles
+
+    def _end_stall(self) -> None:
+        """The transfer that the firmware polled for is over."""
+        until = self._stalled_until or 0
+        if until > self.core.cycles:
+            self._paths.note_wait(until - self.core.cycles)
+            self.core.cycles = until
+        self._stalled_until = None
+
+    def _update_timers(self) -> None:
+        """Up to the processor's present."""
+        self._executing = True
+        for timer in self._timers:
+            timer.update()
+        self._executing = False
+
+    # What the peripherals see
+
+    def load(self, address: int, size: int) -> bytes:
+        """Read RAM."""
+        return self.core.load(address, size)
+
+    def store(self, address: int, data: bytes) -> None:
+        """Write RAM."""
+        self.core.store(address, data)
+
+    def run_task(self, address: int) -> None:
+        """Start a task by its address."""
+        peripheral = self._pages.get(address >> 12)
+        if peripheral is None:
+            raise EmulationError(f"PPI starts a task at 0x{address:08x}, where no peripheral is modelled")
+        peripheral.write(address & 0xFFF, 1)
+
+    def run_channels(self, address: int) -> None:
+        """Start what PPI connects to an event."""
+        self._ppi.on_event(address)
+
+    def update_interrupt(self, peripheral: p.Peripheral) -> None:
+        """A peripheral's line may have changed."""
+        if peripheral.irq is None:
+            return
+        self._nvic.set_line(peripheral.irq, peripheral.line)
+        if self._asleep and self._nvic.wakes:
+            self._processors.plan(self, self._timeline.now_ticks)
+
+    def _read(self, address: int, size: int) -> int:
+        peripheral = self._peripheral(address, size)
+        value = peripheral.read(address & 0xFFF)
+        if peripheral is self._spim and address & 0xFFF == 0x118 and not value and self._spim.end_cycles is not None:
+            self._stalled_until = self._spim.end_cycles
+            self.core.stop_at(0)
+        return value
+
+    def _write(self, address: int, size: int, value: int) -> None:
+        peripheral = self._peripheral(address, size)
+        if peripheral is self._spim and address & 0xFFF == 0x010 and value == 1:
+            self._measure_latency()
+        peripheral.write(address & 0xFFF, value)
+
+    def _peripheral(self, address: int, size: int) -> p.Peripheral:
+        peripheral = self._pages.get(address >> 12)
+        if peripheral is None:
+            raise EmulationError(f"no peripheral is modelled at 0x{address:08x} ({self._where})")
+        if size != 4 or address & 3:
+            raise EmulationError(f"access of {size} bytes at 0x{address:08x} ({self._where}): whole words only")
+        return peripheral
+
+    @property
+    def _where(self) -> str:
+        """The instruction that is executed, as well as it is known during an access."""
+        return f"in the block at PC 0x{self.core.pc:x}"
+
+    # Pins
+
+    def _level(self, pin: int, pull: int) -> bool:
+        if pin == INTERRUPT_PIN:
+            return self._irq_was_high  # of the last notification or transaction, since nothing else changes it
+        if pin == ROLE_PIN:
+            if self._can_transmit and pull != _PULL_UP:
+                self.misuse["role-pin-without-pull-up"] += 1
+            return self._can_transmit and pull == _PULL_UP
+        if pin == RESET_PIN:
+            return not self._holds_chip
+        return pin == UART_RX_PIN or pull == _PULL_UP
+
+    def _on_output(self) -> None:
+        gpio = self._gpio
+        selected = gpio.is_driven(SELECT_PIN, high=False)
+        if selected != self._selected:
+            self._selected = selected
+            self._spim.select(selected)
+        if gpio.is_driven(RESET_PIN, high=True):
+            self.misuse["chip-reset-driven-high"] += 1
+        holds = gpio.is_driven(RESET_PIN, high=False)
+        if holds != self._holds_chip:
+            self._holds_chip = holds
+            self.plan(self.cycles, self._pull_reset)
+
+    def _pull_reset(self) -> None:
+        """RSTn went low, or is released: either way the chip begins anew there."""
+        self._chip.pull_reset()
+        self._sample_interrupt()
+
+    def exchange(self, out: bytes, hz: int) -> bytes:
+        """One whole SPI transaction; a chip in reset answers nothing."""
+        self._paths.note_transaction(out)
+        if self._holds_chip:
+            return bytes(len(out))
+        answer = self._chip.transfer(out, hz)
+        self._sample_interrupt()
+        return answer
+
+    def _sample_interrupt(self) -> None:
+        high = self._chip.irq
+        if high == self._irq_was_high:
+            return
+        self._irq_was_high = high
+        self._rise_ticks = self._timeline.now_ticks if high else None
+        self._gpiote.on_edge(INTERRUPT_PIN, high)
+
+    def _measure_latency(self) -> None:
+        if self._rise_ticks is not None:
+            taken = self._ticks_at(self.core.cycles) - self._rise_ticks
+            count, total, most = self._latency
+            self._latency = count + 1, total + taken, max(most, taken)
+            self._rise_ticks = None

@@ -1,0 +1,573 @@
+"""Peripherals of the nRF52832 without those that move data: registers as in its product specification (v1.4).
+
+Each has its tasks, events and plain registers by offset; whatever the firmware uses besides is an ``EmulationError``.
+Not modelled: start-up times except those of the clocks, power consumption, flash writes, pins as the processor's
+analogue or debug functions, and timers' events in counter mode.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from typing import Final, Protocol
+
+from cortex_m4 import EmulationError
+
+HFCLK_START_CYCLES: Final = 64 * 360
+LFCLK_START_CYCLES: Final = 64 * 600
+"""Start-up times of the crystal and of the RC oscillator, as the specification gives them."""
+
+RESET_PIN: Final = 1 << 0
+RESET_WATCHDOG: Final = 1 << 1
+RESET_SOFTWARE: Final = 1 << 2
+RESET_LOCKUP: Final = 1 << 3
+"""Bits of RESETREAS."""
+
+_WATCHDOG_KEY: Final = 0x6E524635
+_NEVER: Final = 1 << 62
+
+
+class System(Protocol):
+    """What a peripheral knows of its processor."""
+
+    misuse: Counter[str]
+
+    @property
+    def cycles(self) -> int:
+        """The present, in cycles of 64 MHz since power-on."""
+
+    def run_task(self, address: int) -> None:
+        """Start a task by its address, as PPI does."""
+
+    def run_channels(self, address: int) -> None:
+        """Start what PPI connects to the event at this address."""
+
+    def update_interrupt(self, peripheral: "Peripheral") -> None:
+        """A peripheral's line may have changed."""
+
+
+class Peripheral:
+    """Tasks, events, interrupts by INTENSET, and registers."""
+
+    base = 0
+    irq: int | None = None
+
+    def __init__(self, system: System) -> None:
+        self.system = system
+        self.event_bits = {offset: 1 << ((offset - 0x100) >> 2) for offset in self.event_offsets()}
+        """Of each event its bit in INTEN, by offset."""
+        self.events = 0
+        """Bits of the events that have happened and were not cleared."""
+        self.inten = 0
+        self.registers: dict[int, int] = dict.fromkeys(self.register_offsets(), 0)
+        self.tasks = self.make_tasks()
+
+    def make_tasks(self) -> dict[int, Callable[[], None]]:
+        """Tasks by offset."""
+        return {}
+
+    def event_offsets(self) -> tuple[int, ...]:
+        """Events that are modelled."""
+        return ()
+
+    def register_offsets(self) -> tuple[int, ...]:
+        """Registers that keep what is written."""
+        return ()
+
+    def read(self, offset: int) -> int:
+        """A load."""
+        if offset in self.event_bits:
+            return int(bool(self.events & self.event_bits[offset]))
+        if offset in self.registers:
+            return self.registers[offset]
+        if offset in {0x304, 0x308} and self.event_bits:
+            return self.inten
+        raise self.unknown(offset)
+
+    def write(self, offset: int, value: int) -> None:
+        """A store."""
+        if offset in self.tasks:
+            if value == 1:
+                self.tasks[offset]()
+        elif offset in self.event_bits:
+            bit = self.event_bits[offset]
+            self.events = self.events | bit if value else self.events & ~bit
+            self.system.update_interrupt(self)
+        elif offset in self.registers:
+            self.registers[offset] = value
+        elif offset in {0x300, 0x304, 0x308} and self.event_bits:
+            changed = {0x300: value, 0x304: self.inten | value, 0x308: self.inten & ~value}
+            self.inten = changed[offset]
+            self.system.update_interrupt(self)
+        else:
+            raise self.unknown(offset)
+
+    def unknown(self, offset: int) -> EmulationError:
+        """The error for a register that is not modelled."""
+        return EmulationError(f"{type(self).__name__} has no register 0x{offset:03x} (0x{self.base + offset:08x})")
+
+    def happen(self, offset: int) -> None:
+        """An event: it runs PPI's tasks, and may ask for an interrupt."""
+        self.events |= self.event_bits[offset]
+        self.system.run_channels(self.base + offset)
+        self.system.update_interrupt(self)
+
+    @property
+    def line(self) -> bool:
+        """Whether the peripheral asks for an interrupt."""
+        return bool(self.events & self.inten)
+
+
+class Clock(Peripheral):
+    """CLOCK and POWER."""
+
+    base = 0x40000000
+    irq = 0
+
+    def __init__(self, system: System, cause: int, retained: tuple[int, int]) -> None:
+        super().__init__(system)
+        self.registers[0x51C], self.registers[0x520] = retained
+        self.registers[0x400] = cause
+        self._ready = {0x100: _NEVER, 0x104: _NEVER}
+
+    def make_tasks(self) -> dict[int, Callable[[], None]]:
+        """Both clocks; CONSTLAT, with which the latency stays the one assumed."""
+        return {
+            0x000: self.start_hfclk,
+            0x004: self.stop_hfclk,
+            0x008: self.start_lfclk,
+            0x00C: self.stop_lfclk,
+            0x078: lambda: None,
+        }
+
+    def event_offsets(self) -> tuple[int, ...]:
+        """Started clocks."""
+        return 0x100, 0x104
+
+    def register_offsets(self) -> tuple[int, ...]:
+        """RESETREAS, LFCLKSRC, GPREGRET, GPREGRET2, DCDCEN."""
+        return 0x400, 0x518, 0x51C, 0x520, 0x578
+
+    def start_hfclk(self) -> None:
+        """Start the crystal."""
+        self._ready[0x100] = self.system.cycles + HFCLK_START_CYCLES
+
+    def start_lfclk(self) -> None:
+        """Start the slow clock."""
+        self._ready[0x104] = self.system.cycles + LFCLK_START_CYCLES
+
+    def stop_hfclk(self) -> None:
+        """Go on with the internal oscillator."""
+        self._ready[0x100] = _NEVER
+
+    def stop_lfclk(self) -> None:
+        """Stop the slow clock."""
+        self._ready[0x104] = _NEVER
+
+    def read(self, offset: int) -> int:
+        """A load; clocks that have started meanwhile are shown."""
+        for event, ready in self._ready.items():
+            if ready <= self.system.cycles:
+                self._ready[event] = _NEVER
+                self.events |= self.event_bits[event]
+        return super().read(offset)
+
+    def write(self, offset: int, value: int) -> None:
+        """A store; ones clear RESETREAS."""
+        if offset in {0x304, 0x308, 0x300} and value:
+            raise self.unknown(offset)
+        super().write(offset, self.registers[0x400] & ~value if offset == 0x400 else value)
+
+
+class Timer(Peripheral):
+    """TIMER0 to TIMER2; comparisons in timer mode only."""
+
+    _widths = (16, 8, 24, 32)
+
+    def __init__(self, system: System, number: int) -> None:
+        self.base, self.irq = 0x40008000 + 0x1000 * number, 8 + number
+        super().__init__(system)
+        self.registers[0x510] = 4
+        self._counted = 0
+        """Count when the timer was started or stopped last, or of events."""
+        self._started_cycles: int | None = None
+        self._next_match = [_NEVER] * 4
+
+    def make_tasks(self) -> dict[int, Callable[[], None]]:
+        """START, STOP, COUNT, CLEAR, CAPTURE."""
+        tasks: dict[int, Callable[[], None]] = {
+            0x000: self.start,
+            0x004: self.stop,
+            0x008: self.count,
+            0x00C: self.clear,
+        }
+        return tasks | {0x040 + 4 * n: partial(self.capture, n) for n in range(4)}
+
+    def event_offsets(self) -> tuple[int, ...]:
+        """COMPARE."""
+        return tuple(0x140 + 4 * n for n in range(4))
+
+    def register_offsets(self) -> tuple[int, ...]:
+        """SHORTS is not modelled; MODE, BITMODE, PRESCALER, CC."""
+        return 0x504, 0x508, 0x510, *(0x540 + 4 * n for n in range(4))
+
+    @property
+    def _cycles_per_count(self) -> int:
+        return 4 << self.registers[0x510]
+
+    @property
+    def _mask(self) -> int:
+        return (1 << self._widths[self.registers[0x508] & 3]) - 1
+
+    def _value(self) -> int:
+        if self._started_cycles is None or self.registers[0x504]:
+            return self._counted & self._mask
+        return (self._counted + (self.system.cycles - self._started_cycles) // self._cycles_per_count) & self._mask
+
+    def start(self) -> None:
+        """Start."""
+        if self._started_cycles is None:
+            self._started_cycles = self.system.cycles
+        self._foresee_all()
+
+    def stop(self) -> None:
+        """Stop."""
+        self._counted, self._started_cycles = self._value(), None
+        self._foresee_all()
+
+    def count(self) -> None:
+        """Count one event."""
+        if self.registers[0x504] and self._started_cycles is not None:
+            self._counted += 1
+
+    def clear(self) -> None:
+        """Count from 0."""
+        self._counted = 0
+        if self._started_cycles is not None:
+            self._started_cycles = self.system.cycles
+        self._foresee_all()
+
+    def capture(self, n: int) -> None:
+        """Copy the count."""
+        self.registers[0x540 + 4 * n] = self._value()
+        self._foresee(n)
+
+    def write(self, offset: int, value: int) -> None:
+        """A store."""
+        super().write(offset, value)
+        if offset >= 0x540:
+            self._foresee((offset - 0x540) >> 2)
+        elif offset >= 0x504:
+            self._foresee_all()
+
+    def _foresee_all(self) -> None:
+        for n in range(4):
+            self._foresee(n)
+
+    def _foresee(self, n: int) -> None:
+        """When the count will next become equal to a CC; one that is equal already has to wait for a whole turn."""
+        if self._started_cycles is None or self.registers[0x504]:
+            self._next_match[n] = _NEVER
+            return
+        step, mask = self._cycles_per_count, self._mask
+        elapsed = (self.system.cycles - self._started_cycles) // step
+        ahead = (self.registers[0x540 + 4 * n] - self._counted - elapsed) & mask or mask + 1
+        self._next_match[n] = self._started_cycles + (elapsed + ahead) * step
+
+    def update(self) -> None:
+        """Raise the events of counts that have been reached."""
+        now = self.system.cycles
+        for n in range(4):
+            if self._next_match[n] <= now:
+                self._next_match[n] += (self._mask + 1) * self._cycles_per_count
+                self.happen(0x140 + 4 * n)
+
+    @property
+    def due_cycles(self) -> int:
+        """When the next interrupt will be asked for."""
+        return min((at for n, at in enumerate(self._next_match) if self.inten >> (16 + n) & 1), default=_NEVER)
+
+    def read(self, offset: int) -> int:
+        """A load."""
+        self.update()
+        return super().read(offset)
+
+
+class Gpio(Peripheral):
+    """Pins of port 0; one whose input buffer is off reads 0.
+
+    ``level`` gives what is on an input from outside, by pin and pull; ``on_output`` is called at every change.
+    """
+
+    base = 0x50000000
+
+    def __init__(self, system: System, level: Callable[[int, int], bool], on_output: Callable[[], None]) -> None:
+        super().__init__(system)
+        self.out = self.directions = 0
+        self.configured = [2] * 32
+        self._inputs: list[int] = []
+        """Pins whose input buffer is on."""
+        self._level, self._on_output = level, on_output
+
+    def is_driven(self, pin: int, high: bool) -> bool:
+        """Whether the processor holds a pin at a level."""
+        return bool(self.directions >> pin & 1) and bool(self.out >> pin & 1) == high
+
+    def read(self, offset: int) -> int:
+        """A load."""
+        if offset == 0x510:
+            return sum(self._input(pin) << pin for pin in self._inputs)
+        if 0x700 <= offset < 0x780:
+            pin = (offset - 0x700) >> 2
+            return self.configured[pin] & ~1 | (self.directions >> pin & 1)
+        values = {
+            0x504: self.out,
+            0x508: self.out,
+            0x50C: self.out,
+            **dict.fromkeys((0x514, 0x518, 0x51C), self.directions),
+        }
+        if offset not in values:
+            raise self.unknown(offset)
+        return values[offset]
+
+    def _input(self, pin: int) -> int:
+        """A pin that the processor drives reads as driven."""
+        if self.directions >> pin & 1:
+            return self.out >> pin & 1
+        return int(self._level(pin, self.configured[pin] >> 2 & 3))
+
+    def write(self, offset: int, value: int) -> None:
+        """A store."""
+        if offset == 0x504:
+            self.out = value
+        elif offset == 0x508:
+            self.out |= value
+        elif offset == 0x50C:
+            self.out &= ~value
+        elif offset == 0x514:
+            self.directions = value
+        elif offset == 0x518:
+            self.directions |= value
+        elif offset == 0x51C:
+            self.directions &= ~value
+        elif 0x700 <= offset < 0x780:
+            pin = (offset - 0x700) >> 2
+            self.configured[pin] = value
+            self._inputs = [pin for pin in range(32) if not self.configured[pin] & 2]
+            self.directions = self.directions & ~(1 << pin) | (value & 1) << pin
+        else:
+            raise self.unknown(offset)
+        self._on_output()
+
+
+class Gpiote(Peripheral):
+    """Events of pins: all channels, in event mode."""
+
+    base = 0x40006000
+    irq = 6
+
+    def event_offsets(self) -> tuple[int, ...]:
+        """IN and PORT."""
+        return *(0x100 + 4 * n for n in range(8)), 0x17C
+
+    def register_offsets(self) -> tuple[int, ...]:
+        """CONFIG."""
+        return tuple(0x510 + 4 * n for n in range(8))
+
+    def on_edge(self, pin: int, high: bool) -> None:
+        """A pin has changed; polarity 1 is rising, 2 falling, 3 both."""
+        for n in range(8):
+            config = self.registers[0x510 + 4 * n]
+            if config & 3 == 1 and config >> 8 & 31 == pin and config >> 16 & 3 & (1 if high else 2):
+                self.happen(0x100 + 4 * n)
+
+
+class Watchdog(Peripheral):
+    """WDT; once started it runs through soft resets."""
+
+    base = 0x40010000
+    irq = 16
+
+    def __init__(self, system: System) -> None:
+        super().__init__(system)
+        self.registers[0x504], self.registers[0x508], self.registers[0x50C] = 0xFFFFFFFF, 1, 1
+        self.due_cycles = _NEVER
+        self._fed = 0
+
+    def make_tasks(self) -> dict[int, Callable[[], None]]:
+        """START."""
+        return {0x000: self.start}
+
+    def event_offsets(self) -> tuple[int, ...]:
+        """TIMEOUT."""
+        return (0x100,)
+
+    def register_offsets(self) -> tuple[int, ...]:
+        """CRV, RREN, CONFIG."""
+        return 0x504, 0x508, 0x50C
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it has been started."""
+        return self.due_cycles < _NEVER
+
+    def _restart(self) -> None:
+        self._fed = 0
+        self.due_cycles = self.system.cycles + (self.registers[0x504] + 1) * 64_000_000 // 32_768
+
+    def start(self) -> None:
+        """Start; its settings are fixed from now on."""
+        if not self.is_running:
+            self._restart()
+
+    def read(self, offset: int) -> int:
+        """A load."""
+        if offset == 0x400:
+            return int(self.is_running)
+        if offset == 0x404:
+            return self.registers[0x508] & ~self._fed
+        return super().read(offset)
+
+    def write(self, offset: int, value: int) -> None:
+        """A store."""
+        if 0x600 <= offset < 0x620:
+            if value == _WATCHDOG_KEY and self.is_running:
+                self._fed |= 1 << ((offset - 0x600) >> 2)
+                if self._fed & self.registers[0x508] == self.registers[0x508]:
+                    self._restart()
+            return
+        if offset in self.registers and self.is_running:
+            return
+        super().write(offset, value)
+        if offset == 0x50C and not value & 1:
+            raise EmulationError("the watchdog is to stop while the processor sleeps, which is not modelled")
+
+
+class Ppi(Peripheral):
+    """Programmable channels from events to tasks."""
+
+    base = 0x4001F000
+
+    def __init__(self, system: System) -> None:
+        super().__init__(system)
+        self._enabled = 0
+
+    def register_offsets(self) -> tuple[int, ...]:
+        """EEP and TEP."""
+        return tuple(range(0x510, 0x5B0, 4))
+
+    def read(self, offset: int) -> int:
+        """A load."""
+        return self._enabled if offset in {0x500, 0x504, 0x508} else super().read(offset)
+
+    def write(self, offset: int, value: int) -> None:
+        """A store."""
+        if offset == 0x500:
+            self._enabled = value
+        elif offset == 0x504:
+            self._enabled |= value
+        elif offset == 0x508:
+            self._enabled &= ~value
+        else:
+            super().write(offset, value)
+
+    def on_event(self, address: int) -> None:
+        """Start the tasks of an event's channels."""
+        enabled, n = self._enabled, 0
+        while enabled:
+            if enabled & 1 and self.registers[0x510 + 8 * n] == address:
+                self.system.run_task(self.registers[0x514 + 8 * n])
+            enabled >>= 1
+            n += 1
+
+
+class Nvmc(Peripheral):
+    """The flash's controller: only the cache."""
+
+    base = 0x4001E000
+
+    def __init__(self, system: System, use_cache: Callable[[bool], None]) -> None:
+        super().__init__(system)
+        self.registers[0x400] = 1
+        self._use_cache = use_cache
+
+    def register_offsets(self) -> tuple[int, ...]:
+        """READY, ICACHECNF."""
+        return 0x400, 0x540
+
+    def write(self, offset: int, value: int) -> None:
+        """A store."""
+        if offset != 0x540:
+            raise self.unknown(offset)
+        super().write(offset, value)
+        self._use_cache(bool(value & 1))
+
+
+class Ficr(Peripheral):
+    """Factory information: the device identifier, low word first."""
+
+    base = 0x10000000
+
+    def __init__(self, system: System, identity: bytes) -> None:
+        super().__init__(system)
+        self.registers = {0x060 + 4 * n: int.from_bytes(identity[4 * n : 4 * n + 4], "little") for n in range(2)}
+
+    def write(self, offset: int, value: int) -> None:  # noqa: ARG002
+        """A store, which hardware has not."""
+        raise self.unknown(offset)
+
+
+class Nvic(Peripheral):
+    """Interrupt controller and System Control Block; its ``irq`` lines are levels."""
+
+    base = 0xE000E000
+
+    def __init__(
+        self, system: System, fault_status: Callable[[], tuple[int, int, int]], reset: Callable[[], None]
+    ) -> None:
+        super().__init__(system)
+        self.enabled = self.pending = self.asserted = 0
+        self._fault_status, self._reset = fault_status, reset
+
+    def register_offsets(self) -> tuple[int, ...]:
+        """Priorities of interrupts and exceptions, VTOR, SCR, CCR, SHCSR, CPACR: kept, without effect."""
+        return *range(0x400, 0x428, 4), 0xD08, 0xD10, 0xD14, 0xD18, 0xD1C, 0xD20, 0xD24, 0xD88
+
+    @property
+    def wakes(self) -> bool:
+        """Whether an interrupt is pending that ends WFI."""
+        return bool(self.pending & self.enabled)
+
+    def set_line(self, irq: int, asserted: bool) -> None:
+        """A peripheral's line is high or low now."""
+        if asserted:
+            self.asserted |= 1 << irq
+            self.pending |= 1 << irq
+        else:
+            self.asserted &= ~(1 << irq)
+
+    def read(self, offset: int) -> int:
+        """A load."""
+        hfsr, cfsr, bfar = self._fault_status()
+        values = {0xD28: cfsr, 0xD2C: hfsr, 0xD38: bfar, 0xD34: 0, 0xD0C: 0xFA050000, 0xD00: 0x410FC241, 0xD04: 0}
+        values |= dict.fromkeys((0x100, 0x180), self.enabled & 0xFFFFFFFF)
+        values |= dict.fromkeys((0x104, 0x184), self.enabled >> 32)
+        values |= dict.fromkeys((0x200, 0x280), self.pending & 0xFFFFFFFF)
+        values |= dict.fromkeys((0x204, 0x284), self.pending >> 32)
+        return values[offset] if offset in values else super().read(offset)
+
+    def write(self, offset: int, value: int) -> None:
+        """A store."""
+        bits = value << (32 if offset & 4 else 0)
+        if offset in {0x100, 0x104}:
+            self.enabled |= bits
+        elif offset in {0x180, 0x184}:
+            self.enabled &= ~bits
+        elif offset in {0x200, 0x204}:
+            self.pending |= bits
+        elif offset in {0x280, 0x284}:
+            self.pending = self.pending & ~bits | self.asserted
+        elif offset == 0xD0C:
+            if value >> 16 == 0x05FA and value & 4:
+                self._reset()
+        elif offset not in {0xD28, 0xD2C}:  # flags that ones clear; nothing reads them again
+            super().write(offset, value)

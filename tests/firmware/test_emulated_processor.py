@@ -1,0 +1,351 @@
+"""The emulated nRF52832: small programs whose behaviour is known by the processor's specification, counted by hand."""
+
+import re
+
+import pytest
+from board_stage import line_of
+from cobs import cobs
+from processor_stage import DELAYS, IDENTITY, Stage, build_firmware, build_program, needs_processor
+
+from skyless.air.ieee802154 import after_rmarker_s, fcs
+from skyless.air.reception import Diagnostics
+from skyless.radios.serial.link_records import decode
+from skyless.simulation.dw1000 import registers as r
+from skyless.ticks import from_seconds, wrap
+
+pytestmark = needs_processor
+
+WATCHDOG, SOFTWARE, LOCKUP = 2, 4, 8
+"""Bits of RESETREAS."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("programs")
+
+
+@pytest.fixture(scope="module")
+def firmware(tmp_path_factory):
+    return build_firmware(tmp_path_factory.mktemp("firmware"))
+
+
+# The line
+
+
+def test_bytes_take_their_time_both_ways(folder):
+    stage = Stage(build_program(folder, "START"))
+    stage.run(1e-3)
+    assert stage.sent == b"\0"
+    for value in (10, 20, 255):
+        arrived_us = stage.write(bytes((value,)))
+        stage.run(1e-3)
+        came_us, data = stage.lines[-1]
+        assert data == bytes(((value + 1) & 0xFF,))
+        assert 13.0 < came_us - arrived_us < 16.0  # 3 µs to wake up, some instructions, 10 µs on the line
+    assert stage.image.misuse.total() == 0
+
+
+def test_a_long_transfer_arrives_record_by_record(folder, firmware):
+    stage = Stage(firmware)
+    stage.run(5e-3)
+    (zero_us, zero), (hello_us, hello) = stage.lines
+    assert zero == b"\0"
+    assert hello[-1] == 0
+    assert 0 not in hello[:-1]
+    assert hello_us - zero_us >= 10.0 * len(hello) - 0.1
+
+
+def test_the_ring_goes_round_without_the_processor(folder):
+    stage = Stage(build_program(folder, "RING"))
+    stage.run(1e-3)
+    total = 0
+    for length in (3, 254, 255, 256, 700):
+        data = bytes(1 + at % 250 for at in range(length - 1)) + b"\0"
+        stage.write(data)
+        stage.run(length * 10e-6 + 1e-3)
+        total += length
+        assert stage.sent[-7:] == total.to_bytes(4, "little") + data[-3:]
+        assert len(stage.lines[-1][1]) >= 1
+    assert stage.image.misuse.total() == 0
+
+
+def test_what_comes_to_a_receiver_that_is_off_is_lost_and_counted(folder):
+    stage = Stage(build_program(folder, "SLEEP"))
+    stage.run(1e-3)
+    stage.write(b"abc")
+    stage.run(1e-3)
+    assert stage.image.misuse == {"uarte-byte-lost": 3}
+
+
+# The chip
+
+
+def test_the_chip_answers_over_spi_and_its_line_wakes_the_processor(folder):
+    stage = Stage(build_program(folder, "CHIP"))
+    stage.run(2e-3)
+    assert stage.sent == r.DEV_ID.reset.to_bytes(4, "little")
+    (came_us, _), *_ = stage.lines
+    assert came_us > 8 * 5 / 2.0 + 40.0  # five bytes at 2 Mbit/s, four on the line
+    assert stage.image.is_asleep
+    assert not stage.chip.irq
+    stage.chip.memory.set(r.SYS_CFG, r.HIRQ_POL)
+    stage.chip.memory.set(r.SYS_MASK, r.CPLOCK)
+    stage.chip.transceiver.raise_bits(r.CPLOCK)
+    stage.image.notify()
+    stage.run(1e-3)
+    assert stage.sent[4:6] == b"\1\1"
+    assert int.from_bytes(stage.sent[6:], "little") & r.CPLOCK
+    latency = stage.image.interrupt_latency
+    assert latency.count == 1
+    assert 23e-6 < latency.most_s < 30e-6  # two bytes are sent before the transfer
+    assert stage.chip.misuse.total() == stage.image.misuse.total() == 0
+
+
+# Time
+
+
+@pytest.mark.parametrize("clock_ppm", [0.0, 40.0])
+def test_the_timer_ends_sleeps(folder, clock_ppm):
+    stage = Stage(build_program(folder, "SLEEP"), clock_ppm=clock_ppm)
+    stage.run(10e-3)
+    slept = [int.from_bytes(stage.sent[at : at + 4], "little") for at in (0, 4)]
+    assert 1003 <= slept[0] <= 1006  # 3 µs to wake up
+    assert 53 <= slept[1] <= 56 + 51  # and the first word on the line
+    (first_us, _), *_ = stage.lines
+    assert first_us > (1000 + 50) * (1 + 1e-6 * clock_ppm)
+    busy = stage.image.busy_share
+    assert 0.0 < busy < 0.03
+
+
+@pytest.mark.parametrize("macros", [{}, {"AWAKE": 1}])
+def test_a_watchdog_that_is_not_fed_resets(folder, macros):
+    stage = Stage(build_program(folder, "WATCHDOG", **macros))
+    stage.run(36e-3)
+    assert stage.sent == b"\0"
+    stage.run(36e-3)
+    assert stage.sent == bytes((0, WATCHDOG))
+    (start_us, _), (again_us, _) = stage.lines
+    assert again_us - start_us == pytest.approx(27e3 + 328 / 32768 * 1e6, abs=60.0)
+    assert stage.image.resets == {"watchdog": 1}
+
+
+def test_a_power_cycle_leaves_no_cause(folder):
+    stage = Stage(build_program(folder, "WATCHDOG"))
+    stage.run(40e-3)
+    stage.image.power_cycle()
+    stage.run(5e-3)
+    assert stage.sent == bytes((0, WATCHDOG, 0))
+
+
+# Faults
+
+READ_NOWHERE = "(void)REGISTER(0x90000000u)"
+UNDEFINED = '__asm volatile("udf #0")'
+INTO_FLASH = "REGISTER(0x00000100u)=1u"
+JUMP_NOWHERE = "((void(*)(void))0x60000001u)()"
+
+
+@pytest.mark.parametrize(
+    ("forbidden", "address"),
+    [(READ_NOWHERE, "0x90000000"), (UNDEFINED, None), (INTO_FLASH, "0x00000100"), (JUMP_NOWHERE, "0x60000000")],
+)
+def test_a_fault_ends_in_its_handler(folder, forbidden, address):
+    stage = Stage(build_program(folder, "FAULT", FORBIDDEN=forbidden))
+    stage.run(5e-3)
+    assert stage.sent[0] == 0
+    assert stage.sent[2:] == bytes((SOFTWARE, 0x77))
+    (fault,) = stage.image.faults
+    assert "PC 0x" in fault
+    assert address is None or address in fault
+
+
+def test_a_fault_in_the_handler_is_a_lockup(folder):
+    stage = Stage(build_program(folder, "FAULT", FORBIDDEN=UNDEFINED, FAULT_IN_HANDLER=1))
+    stage.run(5e-3)
+    assert stage.sent[2:] == bytes((LOCKUP, 0x77))
+    assert len(stage.image.faults) == 2
+
+
+@pytest.mark.parametrize(
+    ("forbidden", "message"),
+    [
+        ("(void)REGISTER(0x40005000u)", r"no peripheral is modelled at 0x40005000 \(in the block at PC 0x[0-9a-f]+\)"),
+        ("(void)REGISTER(0x40008999u&~3u)", "Timer has no register 0x998"),
+        ("*(volatile uint8_t*)0x40008544u=1u", "access of 1 bytes at 0x40008544"),
+        ("UARTE_TXD_PTR=256u;UARTE_TXD_MAXCNT=9u;start_line();UARTE_STARTTX=1u", "DMA of 9 bytes at 0x00000100"),
+        ('__asm volatile("cpsie i\\nwfi")', "PRIMASK"),
+    ],
+)
+def test_what_is_not_modelled_is_an_error_that_names_it(folder, forbidden, message):
+    from cortex_m4 import EmulationError
+
+    stage = Stage(build_program(folder, "SILENT", FORBIDDEN=forbidden))
+    with pytest.raises(EmulationError, match=message):
+        stage.run(1e-3)
+
+
+def test_a_file_that_is_no_image_is_refused(tmp_path):
+    from cortex_m4 import EmulationError, load_elf
+
+    path = tmp_path / "image.elf"
+    for data in (b"", b"\x7fELF", b"\x7fELF\x02\x01" + bytes(60)):
+        path.write_bytes(data)
+        with pytest.raises(EmulationError, match=r"image\.elf is not a 32-bit ELF file for Arm"):
+            load_elf(path)
+
+
+# Instructions
+
+
+def test_conditional_instructions_around_peripherals(folder):
+    stage = Stage(build_program(folder, "CONDITIONAL"))
+    for _ in range(400):
+        stage.run(7.3e-6)  # many stops within the program
+    stage.run(5e-3)
+    values = [int.from_bytes(stage.sent[at : at + 4], "little") for at in (0, 4, 8)]
+    assert values == [250, 750, 999]
+
+
+@pytest.mark.parametrize("cached", [False, True])
+@pytest.mark.parametrize(
+    ("body", "cycles"),
+    [
+        ("nop", 1 + 1 + 1 + 3),
+        ("add r4, r1, r2", 1 + 1 + 4),
+        ("ldr r4, [r3]", 2 + 1 + 4),
+        ("str r4, [r3, #4]", 2 + 1 + 4),
+        ("ldrd r4, r5, [r3]", 3 + 1 + 4),
+        ("push {r4, r5}\\n pop {r4, r5}", 3 + 3 + 1 + 4),
+        ("ldmia r3, {r1, r2, r4}", 4 + 1 + 4),
+        ("mul r4, r1, r2", 1 + 1 + 4),
+        ("mla r4, r1, r2, r1", 2 + 1 + 4),
+        ("umull r4, r5, r1, r2", 1 + 1 + 4),
+        ("udiv r4, r1, r2", 12 + 1 + 4),
+        ("b 2f\\n2:", 1 + 1 + 4),
+        ("cmp r1, r2\\n it ne\\n movne r4, r1", 3 + 1 + 4),
+    ],
+)
+def test_cycles_of_a_loop(folder, body, cycles, cached):
+    spent = []
+    for count in (1000, 3000):
+        macros = {"COUNT": f'"{count}"', "BODY": f'"{body}"'} | ({"CACHED": 1} if cached else {})
+        stage = Stage(build_program(folder, "LOOP", **macros))
+        stage.run(10e-3)
+        spent.append(stage.image.cycles_by_path()["idle"].most)
+    assert spent[1] - spent[0] == 2000 * cycles
+
+
+def test_code_in_two_lines_of_flash_waits_unless_it_is_cached(folder):
+    body = "\\n".join(["nop"] * 10)
+    spent = {}
+    for cached in (False, True):
+        for count in (1000, 3000):
+            macros = {"COUNT": f'"{count}"', "BODY": f'"{body}"'} | ({"CACHED": 1} if cached else {})
+            stage = Stage(build_program(folder, "LOOP", **macros))
+            stage.run(10e-3)
+            spent[cached, count] = stage.image.cycles_by_path()["idle"].most
+    turn = 10 + 1 + 4
+    assert spent[True, 3000] - spent[True, 1000] == 2000 * turn
+    assert spent[False, 3000] - spent[False, 1000] == 2000 * (turn + 2 + 2)
+
+
+def test_costs_of_all_instructions_of_the_firmware_are_those_of_their_names(firmware):
+    """Another disassembler names every instruction; its cost follows from that name and its operands."""
+    capstone = pytest.importorskip("capstone")
+    from cortex_m4 import functions_of, load_elf
+    from cycles import cost_16, cost_32
+
+    code = load_elf(firmware)
+    disassembler = capstone.Cs(capstone.CS_ARCH_ARM, capstone.CS_MODE_THUMB | capstone.CS_MODE_MCLASS)
+    seen = set()
+    for address, size, _ in functions_of(firmware):
+        for one in disassembler.disasm(code[address : address + size], address):
+            first, second = (int.from_bytes(one.bytes[at : at + 2], "little") for at in (0, 2))
+            cost = cost_16(first) if one.size == 2 else cost_32(first, second)
+            name = one.mnemonic.split(".")[0]
+            if re.match(r"(ldm|stm|push|pop|ldrd|strd|ldr|str|udiv|sdiv|mla|mls)", name):
+                assert cost == expected(name, one.op_str), f"{one.mnemonic} {one.op_str}"
+            elif name not in {"tbb", "tbh"}:
+                assert cost == 1, f"{one.mnemonic} {one.op_str}"
+            seen.add(name)
+    assert len(seen) > 40
+
+
+def expected(name, operands):
+    if name.startswith(("ldm", "stm", "push", "pop")):
+        listed = operands[operands.index("{") + 1 : operands.index("}")]
+        return 1 + len(listed.split(","))
+    if name.startswith(("udiv", "sdiv")):
+        return 12
+    if name.startswith(("ldrd", "strd")):
+        return 3
+    return 2 + 2 * (name.startswith("ldr") and "[pc" in operands)
+
+
+# The firmware
+
+
+def start_radio(stage):
+    stage.run(5e-3)
+    stage.write(line_of(0x42, bytes((5, 64, 2, 9, 128, 0)) + DELAYS.tx_ticks.to_bytes(2, "little")
+                        + DELAYS.rx_ticks.to_bytes(2, "little") + b"\0"))  # fmt: skip
+    stage.run(60e-3)
+    stage.write(line_of(0x44, b"", 1))
+    stage.run(5e-3)
+
+
+def records_of(stage):
+    """Whole records, their checks included."""
+    return [cobs.decode(line) for line in stage.sent.split(b"\0") if line]
+
+
+def test_the_firmware_receives_and_sends(firmware):
+    stage = Stage(firmware)
+    start_radio(stage)
+    records = records_of(stage)
+    assert [record[0] for record in records] == [1, 5, 5]
+    hello = decode(records[0][:-2])
+    assert (hello.device_id, hello.reset_cause, hello.can_transmit) == (IDENTITY, 0, True)
+    assert records[-1][2 + 5] == 3  # configured, receiving
+    frame = bytes(range(100)) + fcs(bytes(range(100)))
+    rx_ticks = wrap(stage.timeline.now_ticks - from_seconds(after_rmarker_s(len(frame))))
+    stage.chip.receive(frame, rx_ticks, Diagnostics())
+    stage.image.notify()
+    stage.run(3e-3)
+    record = records_of(stage)[-1]
+    assert (record[0], record[13:-2]) == (2, frame)
+    assert int.from_bytes(record[2:7], "little") == rx_ticks
+    dx = wrap(stage.timeline.now_ticks + from_seconds(3e-3)) & ~0x1FF
+    stage.write(line_of(0x43, dx.to_bytes(5, "little") + frame, 2))
+    stage.run(4e-3)
+    assert stage.air.sent == [(frame, wrap(dx + DELAYS.tx_ticks))]
+    stage.chip.transceiver.finish()
+    stage.image.notify()
+    stage.run(1e-3)
+    record = records_of(stage)[-1]
+    assert (record[0], record[2:7]) == (3, dx.to_bytes(5, "little"))
+    assert stage.image.faults == []
+    assert stage.image.misuse.total() == stage.chip.misuse.total() == 0
+    paths = stage.image.cycles_by_path()
+    assert {"start", "reception", "end of transmission"} <= set(paths)
+    assert paths["reception"].most_us < 400.0
+    functions = stage.image.cycles_by_function()
+    assert {"main", "board_turn"} <= set(functions)
+
+
+def test_a_grounded_pin_makes_a_tag(firmware):
+    capabilities = []
+    for can_transmit in (True, False):
+        stage = Stage(firmware, can_transmit=can_transmit)
+        stage.run(5e-3)
+        capabilities.append(decode(records_of(stage)[0][:-2]).can_transmit)
+    assert capabilities == [True, False]
+
+
+def test_a_run_repeats_itself(firmware):
+    runs = []
+    for _ in range(2):
+        stage = Stage(firmware)
+        start_radio(stage)
+        runs.append((stage.lines, stage.image.core.cycles, stage.image.cycles_by_path()))
+    assert runs[0] == runs[1]
