@@ -11,17 +11,16 @@ adapting theirs. ``--repeat``: each run again with the emulated radio, whose fix
 
 import argparse
 import contextlib
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-FIRMWARE = Path(__file__).parents[1] / "firmware"
-sys.path.insert(0, str(FIRMWARE / "emulator"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "firmware" / "emulator"))
 
 import numpy as np
+from build import build
 from emulated_site import EmulatedSite, MakeBoard, SiteResult
 from host_programs import HostLatency
 from msgspec.structs import replace
@@ -45,8 +44,7 @@ def make_boards(kind: str) -> MakeBoard:
         return HostBoard
     from nrf52832 import Image
 
-    subprocess.run(["make", "-s", "-C", str(FIRMWARE)], check=True, stdout=subprocess.DEVNULL)
-    return partial(Image, elf=FIRMWARE / "build" / "skyless-dwm1001.elf")
+    return partial(Image, elf=build("all"))
 
 
 @contextlib.contextmanager
@@ -71,8 +69,7 @@ def is_repeated(site: EmulatedSite, seconds: float) -> bool:
     """Whether the emulated radio gives the same frames and the same fixes."""
     again = RepeatedSite(site)
     again.run(seconds)
-    frames = [(one.frame, one.tx_ticks) for one in site.sent] == [(one.frame, one.tx_ticks) for one in again.sent]
-    return frames and len(site.fixes["tag1"]) > 0 and site.fixes == again.fixes
+    return site.sent_frames() == again.sent_frames() and len(site.fixes["tag1"]) > 0 and site.fixes == again.fixes
 
 
 def row(slot_ms: float, lead_ms: float | None, results: list[SiteResult], wall_s: float, repeated: str) -> str:

@@ -292,6 +292,10 @@ class EmulatedSite:
 
     # What came of it
 
+    def sent_frames(self) -> list[tuple[int, bytes, int]]:
+        """Node, frame and stamp of all that was sent as a whole."""
+        return [(one.node, one.frame, one.tx_ticks) for one in self.sent]
+
     def result(self, warmup_s: float = 3.0) -> "SiteResult":
         """What was sent, reported and computed since ``warmup_s``."""
         return judge(self, warmup_s)
@@ -320,7 +324,7 @@ class SiteResult(Struct, frozen=True):
     wrong: int
     """Receptions at programs that no antenna got with that stamp, and frames on the air that no anchor made so."""
     misused: dict[str, int]
-    """Uses of chips that the manual forbids."""
+    """Uses of chips, and of an emulated processor, that their manuals forbid."""
     fixes: int
     rms_m: float
     """Error of the tags' positions (2-D), root mean square over all fixes."""
@@ -347,7 +351,7 @@ def judge(site: EmulatedSite, warmup_s: float) -> SiteResult:
         at_antennas += len(judged)
         reported += len(judged & heard)
         least = min(least, len(judged & heard) / max(len(judged), 1))
-        misused += node.chip.misuse + node.air.counts
+        misused += node.chip.misuse + node.air.counts + getattr(node.board, "misuse", Counter())
     errors_m2 = [
         float(np.sum((np.array(fix.position_m) - site.trajectories[index].position(ended_s))[:2] ** 2))
         for index, node in enumerate(site.tags)
