@@ -3,10 +3,11 @@
 python benchmarks/firmware_site.py [--boards image|host] [--slot-ms 2.1 ...] [--seconds 5] [--seeds 4]
     [--usb] [--pauses] [--lead-ms 1.8 ...] [--repeat]
 
-``image`` is the ARM image on an emulated nRF52832, ``host`` the same C compiled for this computer. The lab's six anchors
-and a tag that walks; the programs are those of ``skyless anchor`` and ``skyless tag``. ``--usb``: through a debugger's
-probe. ``--pauses``: hosts need time, as a Raspberry Pi with CPython. ``--lead-ms``: anchors keep to this lead instead of
-adapting theirs. ``--repeat``: each run again with the emulated radio, whose fixes must be the same bit for bit.
+``image`` is the ARM image on an emulated nRF52832, ``host`` the same C compiled for this computer. The lab's six
+anchors and a tag that walks; the programs are those of ``skyless anchor`` and ``skyless tag``. ``--usb``: through a
+debugger's probe. ``--pauses``: hosts need time, as a Raspberry Pi with CPython. ``--lead-ms``: anchors keep to this lead
+instead of adapting theirs. ``--repeat``: each run again with the emulated radio, whose fixes must be the same bit for
+bit.
 """
 
 import argparse
@@ -22,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "firmware" / "emulator"))
 import numpy as np
 from build import build
 from emulated_site import EmulatedSite, MakeBoard, SiteResult
+from host_board import HostBoard
 from host_programs import HostLatency
 from msgspec.structs import replace
 from repeated_site import RepeatedSite
@@ -39,10 +41,8 @@ _WARMUP_S = 1.0
 def make_boards(kind: str) -> MakeBoard:
     """What makes the boards of a site; the firmware is built."""
     if kind == "host":
-        from host_board import HostBoard
-
         return HostBoard
-    from nrf52832 import Image
+    from nrf52832 import Image  # noqa: PLC0415 - needs unicorn
 
     return partial(Image, elf=build("all"))
 

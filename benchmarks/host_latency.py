@@ -2,9 +2,9 @@
 
 python benchmarks/host_latency.py [SECONDS [SEEDS [SLOT_MS ...]]]
 
-A site whose anchors and tag are DW1000s on the SPI of slow hosts. Hosts run the driver (``skyless.radios.dw1000.driver``) on
-the register model; every transfer costs time, in which the air and the other hosts go on. Frames that come too late are
-skipped, and cost their slots.
+A site whose anchors and tag are DW1000s on the SPI of slow hosts. Hosts run the driver
+(``skyless.radios.dw1000.driver``) on the register model; every transfer costs time, in which the air and the other
+hosts go on. Frames that come too late are skipped, and cost their slots.
 """
 
 import random

@@ -12,7 +12,7 @@ import contextlib
 import random
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, Protocol
+from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 from msgspec import Struct
@@ -31,7 +31,7 @@ from skyless.mqtt.messages import FixMessage
 from skyless.nodes.anchor import AnchorNode, Anchors
 from skyless.nodes.open_radio import open_radios
 from skyless.nodes.tag import TagNode, Tags, TagSettings
-from skyless.radios.interface import AntennaDelays, Late, Radio
+from skyless.radios.interface import AntennaDelays, Radio
 from skyless.simulation.dw1000.chip import Chip
 from skyless.simulation.medium import Delivery, Medium, Timeline
 from skyless.simulation.stations import TagSpec
@@ -39,6 +39,10 @@ from skyless.simulation.trajectory import Trajectory
 from skyless.simulation.world import diagnostics_of
 from skyless.site.model import Site
 from skyless.ticks import difference, wrap
+
+TAG_SETTINGS: Final = TagSettings(publish_hz=1000.0)
+"""All fixes are kept."""
+DIRECT_WIRE: Final = WireSettings()
 
 
 class Board(Protocol):
@@ -149,16 +153,17 @@ class EmulatedSite:
         make_board: MakeBoard,
         *,
         seed: int = 1,
-        wire: WireSettings = WireSettings(),
-        settings: TagSettings = TagSettings(publish_hz=1000.0),
+        wire: WireSettings = DIRECT_WIRE,
     ) -> None:
-        self.site, self.seed, self._make_board, self._wire, self.settings = site, seed, make_board, wire, settings
+        self.site, self.seed, self._make_board, self._wire = site, seed, make_board, wire
         self.trajectories = list(trajectories)
         faults = replace(impairments_of(Request(site, seed=seed), site), diagnostics=True)
         tags = [TagSpec(trajectory) for trajectory in trajectories]
         self.medium: Medium[bool] = Medium(site, tags, faults, seed, self._deliver, SITE_TURNAROUND_S)
         self.anchors = [
-            self._node(number, str(anchor.id), AntennaDelays(anchor.tx_antenna_delay_ticks, anchor.rx_antenna_delay_ticks))
+            self._node(
+                number, str(anchor.id), AntennaDelays(anchor.tx_antenna_delay_ticks, anchor.rx_antenna_delay_ticks)
+            )
             for number, anchor in enumerate(site.anchors)
         ]
         count = len(self.anchors)
@@ -242,7 +247,7 @@ class EmulatedSite:
             self.programs[node.name] = anchors.nodes[0]
             work = anchors.run()
         else:
-            tags = Tags(self.settings, [radio], None, self.log.append, lambda fix: self._on_fix(node, fix))
+            tags = Tags(TAG_SETTINGS, [radio], None, self.log.append, lambda fix: self._on_fix(node, fix))
             self.programs[node.name] = tags.tags[0].node
             work = tags.run()
         node.task = asyncio.ensure_future(work)

@@ -1,13 +1,15 @@
 """The firmware's C, compiled for this computer, as a board."""
 
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from board_library import CBoard
 from program_board import ProgramBoard
 
 from skyless.simulation.dw1000.chip import Chip
 from skyless.simulation.medium import Timeline
+
+Value = TypeVar("Value")
 
 _TURN_S: Final = 5e-6
 """What a turn takes besides its transfers (assumed; the emulated processor counts it)."""
@@ -52,7 +54,7 @@ class _Guarded:
         self.failed: BaseException | None = None
         self._board = board
 
-    def _call(self, call: Callable[..., Any], *values: Any) -> Any:
+    def _call(self, call: Callable[..., Value], *values: object) -> Value | None:
         if self.failed is None:
             try:
                 return call(*values)

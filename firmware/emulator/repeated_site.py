@@ -10,9 +10,8 @@ offsets are those that the boards reported, because chips round them.
 import asyncio
 import time
 from collections import Counter
-from typing import Any
 
-from emulated_site import EmulatedSite, SiteNode
+from emulated_site import Board, EmulatedSite, SiteNode
 from msgspec.structs import replace
 
 from skyless.air.reception import Reception, Transmission
@@ -70,16 +69,16 @@ class RepeatingRadio:
 
     def transmit(self, transmission: Transmission) -> None:
         """Hand a frame to the medium, unless its board was late with it."""
-        if transmission.tx_ticks not in self._late:
-            if not self._node.air.transmit(transmission.frame, transmission.tx_ticks):
-                raise DivergedError(f"{self.name}: a frame is late at {time.monotonic():.6f} s")
+        is_due = transmission.tx_ticks not in self._late
+        if is_due and not self._node.air.transmit(transmission.frame, transmission.tx_ticks):
+            raise DivergedError(f"{self.name}: a frame is late at {time.monotonic():.6f} s")
 
 
 class RepeatedSite(EmulatedSite):
     """The site of a run that has ended, again with emulated radios."""
 
     def __init__(self, before: EmulatedSite) -> None:
-        super().__init__(before.site, before.trajectories, _no_board, seed=before.seed, settings=before.settings)
+        super().__init__(before.site, before.trajectories, _no_board, seed=before.seed)
         self._before = {node.name: node for node in before.nodes}
 
     def plug_in(self, node: SiteNode) -> None:
@@ -89,5 +88,5 @@ class RepeatedSite(EmulatedSite):
         return RepeatingRadio(node, self._before[node.name])
 
 
-def _no_board(*_: Any, **__: Any) -> Any:
+def _no_board(*_: object, **__: object) -> Board:
     raise AssertionError

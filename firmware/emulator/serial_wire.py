@@ -23,6 +23,8 @@ _USB_BYTES: Final = 64
 _USB_S: Final = 1e-3
 """A debugger's probe passes on at most so much at most so often, as a packet of full-speed USB (assumed)."""
 _READ_BYTES: Final = 4096
+_FIFO_BYTES: Final = 32
+"""A computer's UART wakes its program at most once for so many bytes (assumed)."""
 
 
 class WireSettings(Struct, frozen=True):
@@ -32,7 +34,7 @@ class WireSettings(Struct, frozen=True):
     usb: bool = False
     """Through a probe's USB port, else through a UART of the computer itself."""
     host: HostLatency | None = None
-    """Each piece that comes, and each that is written, costs it a pause and its work. None: it takes no time."""
+    """A pause before it reads or writes, and work for each line. None: it takes no time."""
     piece_bytes: int = 1
     """The board gets so many bytes at once, when the last of them has come."""
 
@@ -60,7 +62,8 @@ class SerialWire:
         """How often bytes that nobody read were dropped."""
         self._receive: Callable[[bytes], None] | None = None
         self._byte_ticks = from_seconds(BITS_A_BYTE / settings.baud)
-        self._line_free = self._host_free = 0
+        self._line_free = self._host_free = self._read_ticks = 0
+        self._unread = bytearray()
         self._packets = {True: _Packets(timeline, self._to_pins), False: _Packets(timeline, self._to_computer)}
 
     def start(self, receive: Callable[[bytes], None]) -> None:
@@ -87,16 +90,23 @@ class SerialWire:
         data = self.noise_to_host(data)
         if self._settings.host is None:
             self._write(data)
-        else:
-            self._timeline.at(self._when_host_has_time(), partial(self._write, data))
+            return
+        if not self._unread:
+            earliest = max(self._timeline.now_ticks, self._host_free, self._read_ticks + _FIFO_BYTES * self._byte_ticks)
+            self._timeline.at(earliest + self._pause_ticks(self._settings.host), self._wake_host)
+        self._unread += data
 
-    def _when_host_has_time(self) -> int:
-        """A computer does one thing after the other."""
-        host = self._settings.host
-        assert host is not None
-        ready = self._timeline.now_ticks + from_seconds(host.draw(self._generator))
-        self._host_free = max(ready, self._host_free) + from_seconds(host.work_s)
-        return self._host_free
+    def _wake_host(self) -> None:
+        """The program gets to read all that has come."""
+        assert self._settings.host is not None
+        data = bytes(self._unread)
+        self._unread.clear()
+        self._read_ticks = self._timeline.now_ticks
+        self._host_free = self._read_ticks + data.count(0) * from_seconds(self._settings.host.work_s)
+        self._write(data)
+
+    def _pause_ticks(self, host: HostLatency) -> int:
+        return from_seconds(host.draw(self._generator))
 
     def _write(self, data: bytes) -> None:
         try:
@@ -113,10 +123,13 @@ class SerialWire:
     def _read(self) -> None:
         with contextlib.suppress(BlockingIOError):
             data = os.read(self._inner, _READ_BYTES)
-            if self._settings.host is None:
+            host = self._settings.host
+            if host is None:
                 self._to_adapter(data)
-            else:
-                self._timeline.at(self._when_host_has_time(), partial(self._to_adapter, data))
+                return
+            begins = max(self._timeline.now_ticks, self._host_free) + self._pause_ticks(host)
+            self._host_free = begins + from_seconds(host.work_s)
+            self._timeline.at(self._host_free, partial(self._to_adapter, data))
 
     def _to_adapter(self, data: bytes) -> None:
         if self._settings.usb:

@@ -8,6 +8,8 @@ over.
 from collections import Counter
 from typing import Any, Final
 
+from msgspec import Struct
+
 from skyless.air.ieee802154 import preamble_s
 from skyless.air.reception import Transmission
 from skyless.simulation.medium import Medium
@@ -15,10 +17,21 @@ from skyless.simulation.oscillator import clock_rate
 from skyless.ticks import difference, from_seconds, wrap
 
 SITE_TURNAROUND_S: Final = 4e-6
-"""For a medium with such air: a real chip sends what it gets until its preamble begins. Frames in slots never overlap."""
+"""For the medium: a real chip sends what it gets until its preamble begins. Frames in slots never overlap."""
 _GRID_TICKS: Final = from_seconds(10e-6)
 _COMMIT_TICKS: Final = from_seconds(preamble_s() + SITE_TURNAROUND_S + 1e-6)
-"""The medium gets a frame at the last multiple of the grid of true time that is so long before its RMARKER."""
+"""The medium gets a frame at the last instant of a grid of true time that is so long before its RMARKER.
+
+Which one that is, is decided at these instants, when what is known of the clock no longer depends on the hand-over.
+"""
+_EARLIER: Final = 2
+"""Steps of the grid by which the time may be wrong that is foreseen at the hand-over."""
+
+
+class _Pending(Struct, frozen=True):
+    transmission: Transmission
+    serial: int
+    boot: int
 
 
 class SiteAir:
@@ -44,19 +57,29 @@ class SiteAir:
     def transmit(self, frame: bytes, leaves_ticks: int) -> bool:
         """Plan the frame's flight, unless it is too late."""
         now = self._medium.timeline.now_ticks
-        marker = now + difference(leaves_ticks, self.now_ticks())
-        commit = (marker - _COMMIT_TICKS) // _GRID_TICKS * _GRID_TICKS
-        if commit < now:
+        first = -(-now // _GRID_TICKS)
+        last = self._commit_ticks(leaves_ticks) // _GRID_TICKS
+        if last < first:
             return False
         self._serial += 1
-        serial, boot = self._serial, self._medium.boots[self.node]
-        self._medium.timeline.at(commit, lambda: self._commit(Transmission(frame, leaves_ticks), serial, boot))
+        pending = _Pending(Transmission(frame, leaves_ticks), self._serial, self._medium.boots[self.node])
+        self._plan(pending, max(first, last - _EARLIER))
         return True
 
-    def _commit(self, transmission: Transmission, serial: int, boot: int) -> None:
-        if serial != self._serial or boot != self._medium.boots[self.node]:
+    def _commit_ticks(self, leaves_ticks: int) -> int:
+        """By when the medium must have a frame, in true time, as far as the clock is known now."""
+        return self._medium.timeline.now_ticks + difference(leaves_ticks, self.now_ticks()) - _COMMIT_TICKS
+
+    def _plan(self, pending: "_Pending", step: int) -> None:
+        self._medium.timeline.at(step * _GRID_TICKS, lambda: self._check(pending, step))
+
+    def _check(self, pending: "_Pending", step: int) -> None:
+        """Hand a frame to the medium at the last instant of the grid that is early enough."""
+        if pending.serial != self._serial or pending.boot != self._medium.boots[self.node]:
             return
-        if not self._medium.transmit(self.node, transmission):
+        if self._commit_ticks(pending.transmission.tx_ticks) >= (step + 1) * _GRID_TICKS:
+            self._plan(pending, step + 1)
+        elif not self._medium.transmit(self.node, pending.transmission):
             self.counts["refused-by-the-medium"] += 1
 
     def withdraw(self) -> None:

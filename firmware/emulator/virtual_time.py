@@ -66,7 +66,9 @@ class TimelineLoop(asyncio.SelectorEventLoop):
         """The timeline's present in s."""
         return self._timeline.now_ticks * TICK_S
 
-    def run_in_executor(self, executor: Any, func: Callable[..., Value], *args: Any) -> asyncio.Future[Value]:  # type: ignore[override]  # noqa: ARG002
+    def run_in_executor(  # type: ignore[override]
+        self, _executor: object, func: Callable[..., Value], *args: object
+    ) -> asyncio.Future[Value]:
         """Do it here and at once, because a thread would take another time in each run."""
         done: asyncio.Future[Value] = self.create_future()
         try:
