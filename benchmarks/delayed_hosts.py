@@ -16,8 +16,8 @@ from skyless.air.reception import Diagnostics, Reception
 from skyless.anchor import Anchor
 from skyless.constants import TICK_S
 from skyless.method_names import DEFAULT_METHOD
-from skyless.nodes.anchor import ASK_AGAIN_S, LEAD_GAIN, LEAD_LOSS, LEAD_S, MAX_LEAD_S
-from skyless.radios.dw1000.radio import ChipSession
+from skyless.nodes.anchor import ASK_AGAIN_S, LEAD_GAIN, LEAD_LOSS, MAX_LEAD_S
+from skyless.radios.dw1000.radio import SPI_LEAD_S, ChipSession
 from skyless.radios.interface import AntennaDelays, Late, RadioEvent, Sent
 from skyless.receiver import Receiver
 from skyless.simulation.dw1000.chip import Chip, ModelBus
@@ -102,8 +102,8 @@ class AnchorHost(Host):
     def __init__(
         self, medium: Medium[Any], site: Site, node: int, latency: HostLatency, generator: random.Random
     ) -> None:
-        self.machine = Anchor(site, site.anchors[node].id, lead_s=LEAD_S)
-        self.lead_s = LEAD_S
+        self.machine = Anchor(site, site.anchors[node].id, lead_s=SPI_LEAD_S)
+        self.lead_s = SPI_LEAD_S
         self.late = 0
         self._answered = True
         self._wait_s = 0.0
@@ -147,7 +147,7 @@ class AnchorHost(Host):
             self.machine.hear(event)
         elif isinstance(event, Sent):
             self._answered = True
-            self.lead_s = max(self.lead_s * LEAD_LOSS, LEAD_S)
+            self.lead_s = max(self.lead_s * LEAD_LOSS, SPI_LEAD_S)
         elif isinstance(event, Late):
             self._answered = True
             self.late += 1

@@ -45,12 +45,16 @@ def play(main):
         runner.run(main)
 
 
+LEAD_S = 1.8e-3
+
+
 class FakeRadio:
     """What a node asks of a radio; events are what the test says."""
 
     def __init__(self, name="1", begin_ticks=2**40 - 10**9):
         self.name = name
         self.counters = Counter()
+        self.lead_s = LEAD_S
         self.ready = True
         self.begin_ticks = begin_ticks
         """The counter at the loop's 1000 s; it soon wraps."""

@@ -5,12 +5,12 @@ import contextlib
 import itertools
 
 import pytest
-from node_stage import LAB, FakeRadio, play, receptions
+from node_stage import LAB, LEAD_S, FakeRadio, play, receptions
 
 from skyless.air.codec import decode
 from skyless.constants import TICK_RATE_HZ
 from skyless.master_election import SILENT_SUPERFRAMES
-from skyless.nodes.anchor import ASK_AGAIN_S, LEAD_S, LOST_ANSWER_S, AnchorNode, TransmissionCount
+from skyless.nodes.anchor import ASK_AGAIN_S, LOST_ANSWER_S, AnchorNode, TransmissionCount
 from skyless.radios.interface import Gone, Late, Restarted, Sent
 from skyless.site.slots import superframe_ticks_of
 from skyless.ticks import difference, wrap

@@ -35,14 +35,12 @@ from skyless.site.slots import superframe_ticks_of
 from skyless.slot_claims import SlotRole
 from skyless.ticks import difference
 
-LEAD_S: Final = 1.8e-3
-"""How long before its RMARKER a frame is handed to the radio: its preamble, the transfer, and a host's timers."""
-
 MAX_LEAD_S: Final = 8e-3
 LEAD_GAIN: Final = 1.25
 LEAD_LOSS: Final = 0.998
-"""A host that is late hands its frames over earlier: by the gain with each late one, up to the maximum, and back by the
-loss with each one sent. The cost of an earlier frame is relayed stamps that are older by as much."""
+"""Frames are handed over as long before their RMARKERs as the radio asks for at first. A host that is late does so
+earlier: by the gain with each late one, up to the maximum, and back by the loss with each one sent. The cost of an
+earlier frame is relayed stamps that are older by as much."""
 
 ASK_AGAIN_S: Final = 5e-3
 LOST_ANSWER_S: Final = 0.25
@@ -83,7 +81,7 @@ class AnchorNode:
         self.started_s = time.monotonic()
         self.late = 0
         self.transmissions = TransmissionCount(site)
-        self.lead_s = LEAD_S
+        self.lead_s = radio.lead_s
         """How long before its RMARKER the next frame is made."""
         self.heard_s: dict[int, float] = {}
         """When each other anchor was last heard, by the host's monotonic clock."""
@@ -92,7 +90,7 @@ class AnchorNode:
         self._timer: asyncio.TimerHandle | None = None
 
     def _new_machine(self) -> AnyAnchor:
-        machine = new_anchor(self._radio_site, self.id, lead_s=LEAD_S)
+        machine = new_anchor(self._radio_site, self.id, lead_s=self.radio.lead_s)
         if self.site is not self._radio_site:
             machine.place(self.site)
         return machine
@@ -149,7 +147,7 @@ class AnchorNode:
             self._note(event)
         elif isinstance(event, Sent):
             self.transmissions.sent += 1
-            self.lead_s = max(self.lead_s * LEAD_LOSS, LEAD_S)
+            self.lead_s = max(self.lead_s * LEAD_LOSS, self.radio.lead_s)
             self._schedule()
         elif isinstance(event, Late):
             self.late += 1

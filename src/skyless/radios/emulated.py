@@ -22,6 +22,9 @@ _SHIFT_S: Final = 15.0
 _RECEIVE_BUFFER_BYTES: Final = 1 << 16
 """A radio keeps few frames for a host that does not fetch them; so does this one, 0.2 s of them."""
 
+_LEAD_S: Final = 1.8e-3
+"""The preamble, the transfer to the ether, and a host's timers."""
+
 
 class EmulatedRadio:
     """One node's radio (``skyless.radios.interface.Radio``)."""
@@ -29,6 +32,7 @@ class EmulatedRadio:
     def __init__(self, connection: "EtherConnection", node: int, name: str) -> None:
         self.name = name
         self.counters: Counter[str] = Counter()
+        self.lead_s = _LEAD_S
         self._connection = connection
         self._node = node
         self._listener: Listener = ignore

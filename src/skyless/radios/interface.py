@@ -65,6 +65,10 @@ class Radio(Protocol):
     def counters(self) -> Counter[str]:
         """What was lost or could not be used on the way from the radio, by reason."""
 
+    @property
+    def lead_s(self) -> float:
+        """How long before its RMARKER a frame should be handed to ``transmit``, at first; 0 where it cannot send."""
+
     async def run(self, listener: Listener) -> None:
         """Configure the radio and receive until cancelled; a radio that has gone is looked for by itself."""
 

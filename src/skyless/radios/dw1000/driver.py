@@ -18,7 +18,7 @@ RECEIVED, SENT, FAILED, CLOCK_SLIPPED and LOST, and has already turned the recei
 what was received is in ``rx_ticks``, ``frame``, ``rx_power_cdbm``, ``first_path_cdbm`` and ``offset_ppb``, the stamp of
 what was SENT in ``tx_ticks``. If SENT does not come within 1 ms after its time, call ``cancel``. After LOST the chip is
 OFF and its counter has restarted: ``start`` again. Before ``transmit_at`` poll once, or a frame that has just come is
-lost. Frames are sent and read in steps of 8 octets, as the firmware does.
+lost.
 """
 
 import struct

@@ -17,6 +17,10 @@ OVERDUE_TICKS: Final = from_seconds(1e-3)
 CHECK_S: Final = 1.0
 """A chip from which nothing came for this time is asked whether it still has its settings."""
 
+SPI_LEAD_S: Final = 1.8e-3
+"""The preamble, seven transfers of up to 0.1 ms, a reception that is served before, and a host's timers
+(``benchmarks/host_latency.py``)."""
+
 _FAILURES: Final = {dw1000.FAILED: "rx-error", dw1000.CLOCK_SLIPPED: "clock-slipped"}
 
 
@@ -127,6 +131,7 @@ class Dw1000Radio:
     def __init__(self, port: Port, name: str, delays: AntennaDelays) -> None:
         self.name = name
         self.counters: Counter[str] = Counter()
+        self.lead_s = SPI_LEAD_S
         self._port, self._delays = port, delays
         self._listener: Listener = ignore
         self._session: ChipSession | None = None

@@ -39,6 +39,7 @@ class _ListeningBoard(ABC, Generic[_Event]):
     def __init__(self, path: str, baud: int, name: str) -> None:
         self.name = name
         self.counters: Counter[str] = Counter()
+        self.lead_s = 0.0
         self._port = SerialPort(path, baud, lambda reason: self._listener(Gone(reason)))
         self._listener: Callable[[_Event | Restarted | Gone], None] = ignore
         self._silent = True

@@ -28,6 +28,10 @@ _MOST_STARTS: Final = 3
 _MOST_STARTS_S: Final = 60.0
 """A board that starts so often within this time does not start because somebody wants it to."""
 
+_LEAD_S: Final = 4.0e-3
+"""A command of 112 bytes on the line (1.1 ms), the lag of the estimate of the board's counter, which is the shortest
+transfer of a record (1.2 ms), what a USB bridge holds back, and the board (``benchmarks/firmware_site.py``)."""
+
 _REASONS: Final = {
     link.REFUSED_SETTING: "it has not these settings",
     link.REFUSED_MALFORMED: "it did not understand it",
@@ -311,6 +315,7 @@ class SerialRadio:
         """``transmits``: refuse a board that only listens."""
         self.name = name
         self.counters: Counter[str] = Counter()
+        self.lead_s = _LEAD_S
         self._delays = AntennaDelays() if delays is None else delays
         self._transmits = transmits
         self._port = SerialPort(path, baud, lambda reason: self._listener(Gone(reason)))
