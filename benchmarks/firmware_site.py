@@ -48,21 +48,24 @@ def make_boards(kind: str) -> MakeBoard:
 
 
 @contextlib.contextmanager
-def fixed_lead(lead_s: float | None) -> Iterator[None]:
-    """Let anchors hand their frames over so early, late or not; None leaves them as they are."""
-    before = anchor.LEAD_S, anchor.LEAD_GAIN, anchor.LEAD_LOSS
-    if lead_s is not None:
-        anchor.LEAD_S, anchor.LEAD_GAIN, anchor.LEAD_LOSS = lead_s, 1.0, 1.0  # type: ignore[misc]
+def fixed_lead(*, fixed: bool) -> Iterator[None]:
+    """Let anchors not adapt their lead."""
+    before = anchor.LEAD_GAIN, anchor.LEAD_LOSS
+    if fixed:
+        anchor.LEAD_GAIN, anchor.LEAD_LOSS = 1.0, 1.0  # type: ignore[misc]
     try:
         yield
     finally:
-        anchor.LEAD_S, anchor.LEAD_GAIN, anchor.LEAD_LOSS = before  # type: ignore[misc]
+        anchor.LEAD_GAIN, anchor.LEAD_LOSS = before  # type: ignore[misc]
 
 
-def site_of(slot_ms: float, make: MakeBoard, seed: int, wire: WireSettings) -> EmulatedSite:
+def site_of(
+    slot_ms: float, make: MakeBoard, seed: int, wire: WireSettings, lead_ms: float | None = None
+) -> EmulatedSite:
     """The lab with this slot length, and a tag that walks."""
     lab = replace(ideal_lab_site(), schedule=ScheduleSite(slot_s=1e-3 * slot_ms))
-    return EmulatedSite(lab, trajectories_of(Request(lab, seed=seed)), make, seed=seed, wire=wire)
+    lead_s = None if lead_ms is None else 1e-3 * lead_ms
+    return EmulatedSite(lab, trajectories_of(Request(lab, seed=seed)), make, seed=seed, wire=wire, lead_s=lead_s)
 
 
 def is_repeated(site: EmulatedSite, seconds: float) -> bool:
@@ -82,7 +85,7 @@ def row(slot_ms: float, lead_ms: float | None, results: list[SiteResult], wall_s
     wrong = sum(result.wrong + sum(result.misused.values()) for result in results)
     lead = "as it adapts" if lead_ms is None else f"{lead_ms:g} ms"
     return (
-        f"| {slot_ms:g} ms | {lead} | {100 * sent / slots:.2f} % | {late} | {100 * reported / got:.2f} % "
+        f"| {slot_ms:g} ms | {lead} | {100 * sent / max(slots, 1):.2f} % | {late} | {100 * reported / max(got, 1):.2f} % "
         f"| {100 * min(result.least_reported for result in results):.2f} % | {wrong} | {fixes} | {100 * rms_m:.2f} cm "
         f"| {repeated} | {wall_s:.0f} s |"
     )
@@ -110,8 +113,8 @@ def main() -> None:
         for lead_ms in asked.lead_ms:
             results, repeated, begun_s = [], 0, time.perf_counter()
             for seed in range(1, asked.seeds + 1):
-                with fixed_lead(None if lead_ms is None else 1e-3 * lead_ms):
-                    site = site_of(slot_ms, make, seed, wire)
+                with fixed_lead(fixed=lead_ms is not None):
+                    site = site_of(slot_ms, make, seed, wire, lead_ms)
                     site.run(asked.seconds)
                     results.append(site.result(_WARMUP_S))
                     repeated += asked.repeat and is_repeated(site, asked.seconds)

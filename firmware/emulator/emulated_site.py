@@ -154,8 +154,11 @@ class EmulatedSite:
         *,
         seed: int = 1,
         wire: WireSettings = DIRECT_WIRE,
+        lead_s: float | None = None,
     ) -> None:
+        """``lead_s``: how early anchors hand their frames over at first; None for what their radios ask for."""
         self.site, self.seed, self._make_board, self._wire = site, seed, make_board, wire
+        self._lead_s = lead_s
         self.trajectories = list(trajectories)
         faults = replace(impairments_of(Request(site, seed=seed), site), diagnostics=True)
         tags = [TagSpec(trajectory) for trajectory in trajectories]
@@ -240,7 +243,7 @@ class EmulatedSite:
 
     def start_host(self, node: SiteNode) -> None:
         """Start the program of a node."""
-        radio = WatchedRadio(self._radio(node), node.air)
+        radio = WatchedRadio(self._radio(node), node.air, self._lead_s)
         node.radios.append(radio)
         if node in self.anchors:
             anchors = Anchors(self.site, [radio], None, self.log.append, simulated=lambda: True)

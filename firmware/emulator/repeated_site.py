@@ -28,7 +28,7 @@ class RepeatingRadio:
 
     def __init__(self, node: SiteNode, before: SiteNode) -> None:
         """``before`` is the node in the run with boards."""
-        self.name = node.name
+        self.name, self.lead_s = node.name, before.radio.lead_s
         self.counters: Counter[str] = Counter()
         self._node = node
         self._number = {key: number for number, key in enumerate(before.at_antenna)}

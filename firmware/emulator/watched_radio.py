@@ -23,8 +23,10 @@ class Instants(Struct):
 class WatchedRadio:
     """One node's (``skyless.radios.interface.Radio``)."""
 
-    def __init__(self, radio: Radio, air: SiteAir) -> None:
+    def __init__(self, radio: Radio, air: SiteAir, lead_s: float | None = None) -> None:
+        """``lead_s``: another one than the radio asks for."""
         self._radio, self._air = radio, air
+        self.lead_s = radio.lead_s if lead_s is None else lead_s
         self._listener: Listener = ignore
         self.instants = Instants([], [])
         self.heard: set[tuple[bytes, int]] = set()
