@@ -5,9 +5,9 @@ python benchmarks/firmware_site.py [--boards image|host] [--slot-ms 2.1 ...] [--
 
 ``image`` is the ARM image on an emulated nRF52832, ``host`` the same C compiled for this computer. The lab's six
 anchors and a tag that walks; the programs are those of ``skyless anchor`` and ``skyless tag``. ``--usb``: through a
-debugger's probe. ``--pauses``: hosts need time, as a Raspberry Pi with CPython. ``--lead-ms``: anchors keep to this lead
-instead of adapting theirs. ``--repeat``: each run again with the emulated radio, whose fixes must be the same bit for
-bit.
+debugger's probe. ``--pauses``: hosts need time, as a Raspberry Pi with CPython. ``--lead-ms``: anchors keep to this
+lead instead of adapting theirs. ``--repeat``: each run again with the emulated radio, whose fixes must be the same bit
+for bit.
 """
 
 import argparse
@@ -85,9 +85,9 @@ def row(slot_ms: float, lead_ms: float | None, results: list[SiteResult], wall_s
     wrong = sum(result.wrong + sum(result.misused.values()) for result in results)
     lead = "as it adapts" if lead_ms is None else f"{lead_ms:g} ms"
     return (
-        f"| {slot_ms:g} ms | {lead} | {100 * sent / max(slots, 1):.2f} % | {late} | {100 * reported / max(got, 1):.2f} % "
-        f"| {100 * min(result.least_reported for result in results):.2f} % | {wrong} | {fixes} | {100 * rms_m:.2f} cm "
-        f"| {repeated} | {wall_s:.0f} s |"
+        f"| {slot_ms:g} ms | {lead} | {100 * sent / max(slots, 1):.2f} % | {late} "
+        f"| {100 * reported / max(got, 1):.2f} % | {100 * min(result.least_reported for result in results):.2f} % "
+        f"| {wrong} | {fixes} | {100 * rms_m:.2f} cm | {repeated} | {wall_s:.0f} s |"
     )
 
 

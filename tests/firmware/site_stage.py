@@ -19,10 +19,9 @@ from skyless.site.model import ScheduleSite
 LAB = ideal_lab_site()
 
 HAS_ARM = HAS_ARM_COMPILER and find_spec("unicorn") is not None
-KINDS = [
-    pytest.param("host", marks=pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")),
-    pytest.param("image", marks=pytest.mark.skipif(not HAS_ARM, reason="gcc-arm-none-eabi or unicorn is missing")),
-]
+HOST = pytest.param("host", marks=pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed"))
+IMAGE = pytest.param("image", marks=pytest.mark.skipif(not HAS_ARM, reason="gcc-arm-none-eabi or unicorn is missing"))
+KINDS = [HOST, IMAGE]
 
 
 @cache

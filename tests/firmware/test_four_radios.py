@@ -79,14 +79,18 @@ def over_a_board(kind, tape):
     air = TapeAir(timeline)
     chip = Chip(air, DELAYS.tx_ticks, DELAYS.rx_ticks, air.now_s)
     events, counters = [], Counter()
-    session = LinkSession("the line", DELAYS, lambda data: board.receive(data), events.append, counters)
+    lines = []
+    session = LinkSession("the line", DELAYS, lines.append, events.append, counters)
     board = boards(kind)(
-        timeline, chip, lambda data: session.on_data(data, air.now_s()), can_transmit=False, identity=bytes(8)
+        timeline, chip, lambda data: talk(session.on_data, data), can_transmit=False, identity=bytes(8)
     )
     first_s = tape[0].host_s
 
-    def start():
-        session.begin(air.now_s())
+    def talk(call, *values):
+        """Let the host do something, and the board get what it writes."""
+        call(*values, air.now_s())
+        while lines:
+            board.receive(lines.pop(0))
 
     def arrive(reception):
         ended = timeline.now_ticks
@@ -94,7 +98,7 @@ def over_a_board(kind, tape):
         chip.receive(reception.frame, reception.rx_ticks, reception.diagnostics)
         board.notify()
 
-    timeline.at(from_seconds(STARTS_S / 2), start)
+    timeline.at(from_seconds(STARTS_S / 2), lambda: talk(session.begin))
     air.reading = wrap(tape[0].rx_ticks - from_seconds(STARTS_S)), 0
     for reception in tape:
         at = from_seconds(STARTS_S + reception.host_s - first_s)
