@@ -77,7 +77,7 @@ class Core:
     @property
     def cycles(self) -> int:
         """Cycles of the 64 MHz clock since power-on, sleep included."""
-        return int(self.state[c.CYCLES])
+        return self.state.item(c.CYCLES)
 
     @cycles.setter
     def cycles(self, cycles: int) -> None:

@@ -42,7 +42,7 @@ BLOCKS: Final = 5
 CODE_HALFWORDS: Final = 6
 _TAGS: Final = 8
 _COSTS: Final = _TAGS + CACHE_LINES
-"""Columns of the counter's state: one int64 each, then the cache's tags; then by halfword the costs of blocks, the code,
+"""Columns of the counter's state: one int64 each, then the cache's tags; then by halfword costs of blocks, the code,
 and the cycles spent in each block.
 """
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import peripherals as p
 from cortex_m4 import Core, EmulationError, functions_of, load_elf
-from cycles import spent_at
+from cycles import CYCLES, spent_at
 from msgspec import Struct
 from paths import PathCost, Paths
 from processors import TICKS_PER_CYCLE, Processors
@@ -22,6 +22,7 @@ from serial_peripherals import Spim, Uarte
 
 from skyless.constants import TICK_S
 from skyless.simulation.dw1000.chip import Chip
+from skyless.simulation.dw1000.registers import SYS_STATUS
 from skyless.simulation.medium import Timeline
 
 WAKE_UP_CYCLES: Final = 3 * 64
@@ -36,10 +37,17 @@ LED_PINS: Final = {"green": 30, "blue": 31, "red": 14, "red-2": 22}
 
 _WINDOWS: Final = [(0x10000000, 0x1000), (0x40000000, 0x20000), (0x50000000, 0x1000), (0xE000E000, 0x1000)]
 _PULL_UP: Final = 3
+_SPIM_START: Final = 0x40003010
+_SPIM_END: Final = 0x40003118
+_COUNT_OF_BYTES: Final = 0x40009040
+"""TIMER1's CAPTURE[0], with which the firmware reads how many bytes have come."""
+_WATCHDOG_FED: Final = 0x40010600
+_READS_STATUS: Final = bytes((SYS_STATUS.file,))
+"""Header of the transaction with which the firmware asks what has happened."""
 
 
 class Latency(Struct, frozen=True):
-    """From a rise of the chip's interrupt line to the start of the firmware's next SPI transfer, in s of true time."""
+    """From a rise of the chip's interrupt line until the firmware begins to read SYS_STATUS, in s of true time."""
 
     count: int
     mean_s: float
@@ -84,7 +92,8 @@ class Image:
         self._irq_was_high = False
         self._rise_ticks: int | None = None
         self._latency = (0, 0, 0)
-        self._executing = False
+        self._executing = self._asleep = self._holds_chip = False
+        self._asleep_since = self._slept_cycles = 0
         self._life = 0
         self.core = Core(load_elf(elf), _WINDOWS, self._read, self._write)
         self._start(cause=0, watchdog=None, retained=(0, 0))
@@ -128,7 +137,7 @@ class Image:
         return 1.0 - (self._slept_cycles + (passed - self._asleep_since if self._asleep else 0)) / passed
 
     def cycles_by_path(self) -> dict[str, PathCost]:
-        """Cycles from each wake-up to the next WFI, by what was done (``paths.py``)."""
+        """Cycles of the firmware's turns by what was done in them (``paths.py``)."""
         return self._paths.costs()
 
     def cycles_by_function(self) -> dict[str, int]:
@@ -155,7 +164,6 @@ class Image:
     def _start(self, cause: int, watchdog: p.Watchdog | None, retained: tuple[int, int]) -> None:
         """Peripherals as after a reset; a watchdog that is given runs on."""
         self._life += 1
-        self._cause = 0
         self._reset_asked = False
         self._clock = p.Clock(self, cause, retained)
         self._timers = [p.Timer(self, number) for number in range(3)]
@@ -184,14 +192,12 @@ class Image:
             )
         }
         self._selected = False
-        if getattr(self, "_holds_chip", False):
+        if self._holds_chip:
             self._chip.pull_reset()
         self._holds_chip = False
         self._stalled_until: int | None = None
-        if not hasattr(self, "_slept_cycles"):
-            self._slept_cycles = self._asleep_since = 0
-            self._asleep = False
-        elif self._asleep:
+        self._rise_ticks = None
+        if self._asleep:
             self._slept_cycles += max(self._cycle_at(self._timeline.now_ticks) - self._asleep_since, 0)
         self._asleep = False
         self.core.cycles = max(self.core.cycles, self._cycle_at(self._timeline.now_ticks))
@@ -224,7 +230,7 @@ class Image:
     @property
     def cycles(self) -> int:
         """The present in cycles of the processor's clock since the first start."""
-        return self.core.cycles if self._executing else self._cycle_at(self._timeline.now_ticks)
+        return self.core.state.item(CYCLES) if self._executing else self._cycle_at(self._timeline.now_ticks)
 
     def plan(self, cycles: int, happen: Callable[[], None]) -> None:
         """Let something happen, unless the processor is reset before."""
@@ -347,31 +353,32 @@ class Image:
             self._processors.plan(self, self._timeline.now_ticks)
 
     def _read(self, address: int, size: int) -> int:
-        peripheral = self._peripheral(address, size)
+        peripheral = self._pages.get(address >> 12)
+        if peripheral is None or size != 4 or address & 3:
+            raise self._unknown_access(address, size)
         value = peripheral.read(address & 0xFFF)
-        if peripheral is self._spim and address & 0xFFF == 0x118 and not value and self._spim.end_cycles is not None:
+        if address == _SPIM_END and not value and self._spim.end_cycles is not None:
             self._stalled_until = self._spim.end_cycles
             self.core.stop_at(0)
         return value
 
     def _write(self, address: int, size: int, value: int) -> None:
-        peripheral = self._peripheral(address, size)
-        if peripheral is self._spim and address & 0xFFF == 0x010 and value == 1:
-            self._measure_latency()
+        peripheral = self._pages.get(address >> 12)
+        if peripheral is None or size != 4 or address & 3:
+            raise self._unknown_access(address, size)
+        if address == _SPIM_START:
+            self._note_transaction(self.core.load(self._spim.registers[0x544], self._spim.registers[0x548]))
+        elif address == _COUNT_OF_BYTES:
+            self._paths.note_count_of_bytes()
+        elif address == _WATCHDOG_FED:
+            self._paths.end_turn(self.core.cycles)
         peripheral.write(address & 0xFFF, value)
 
-    def _peripheral(self, address: int, size: int) -> p.Peripheral:
-        peripheral = self._pages.get(address >> 12)
-        if peripheral is None:
-            raise EmulationError(f"no peripheral is modelled at 0x{address:08x} ({self._where})")
-        if size != 4 or address & 3:
-            raise EmulationError(f"access of {size} bytes at 0x{address:08x} ({self._where}): whole words only")
-        return peripheral
-
-    @property
-    def _where(self) -> str:
-        """The instruction that is executed, as well as it is known during an access."""
-        return f"in the block at PC 0x{self.core.pc:x}"
+    def _unknown_access(self, address: int, size: int) -> EmulationError:
+        where = f"0x{address:08x} (in the block at PC 0x{self.core.pc:x})"
+        if address >> 12 not in self._pages:
+            return EmulationError(f"no peripheral is modelled at {where}")
+        return EmulationError(f"access of {size} bytes at {where}: whole words only")
 
     # Pins
 
@@ -406,7 +413,6 @@ class Image:
 
     def exchange(self, out: bytes, hz: int) -> bytes:
         """One whole SPI transaction; a chip in reset answers nothing."""
-        self._paths.note_transaction(out)
         if self._holds_chip:
             return bytes(len(out))
         answer = self._chip.transfer(out, hz)
@@ -421,8 +427,10 @@ class Image:
         self._rise_ticks = self._timeline.now_ticks if high else None
         self._gpiote.on_edge(INTERRUPT_PIN, high)
 
-    def _measure_latency(self) -> None:
-        if self._rise_ticks is not None:
+    def _note_transaction(self, out: bytes) -> None:
+        """The firmware begins a transfer to the chip."""
+        self._paths.note_transaction(out)
+        if self._rise_ticks is not None and out[:1] == _READS_STATUS:
             taken = self._ticks_at(self.core.cycles) - self._rise_ticks
             count, total, most = self._latency
             self._latency = count + 1, total + taken, max(most, taken)

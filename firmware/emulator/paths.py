@@ -1,4 +1,8 @@
-"""What the firmware's work costs: cycles from one wake-up to the next WFI, by what was done between them."""
+"""What the firmware's work costs: the cycles of each turn of its loop, by what was done in it.
+
+A turn begins with a wake-up or where the watchdog is fed, and ends where it is fed again or with WFI. Bytes belong to
+the turn that reads their number.
+"""
 
 from collections import Counter
 from typing import Final
@@ -9,7 +13,7 @@ from skyless.simulation.dw1000 import registers as r
 from skyless.simulation.dw1000.memory import decode_header
 
 IDLE: Final = "idle"
-"""Nothing came from the chip or the host; a timer ended the sleep."""
+"""Neither the chip nor the host had anything."""
 START: Final = "start"
 """From a reset."""
 BYTE: Final = "byte"
@@ -27,7 +31,7 @@ _ABOVE: Final = {BYTE: {COMMAND, START}, POLL: {RECEPTION, TRANSMISSION, END_OF_
 
 
 class PathCost(Struct, frozen=True):
-    """Cycles of the 64 MHz clock from wake-ups to the WFI after them."""
+    """Cycles of the 64 MHz clock that turns took."""
 
     count: int
     least: int
@@ -52,27 +56,38 @@ class Paths:
 
     def __init__(self) -> None:
         self._work: Counter[str] = Counter()
+        self._unread = 0
+        self._unread_ends = 0
+        """Bytes, and zeros among them, that have come since their number was read."""
         self._begin_cycles = 0
+        self._just_woken = False
         self._transfer_cycles = 0
         self._sums: dict[str, tuple[int, int, int, int, int]] = {}
 
     def begin(self, cycles: int) -> None:
         """The processor has woken up."""
-        self._begin_cycles, self._transfer_cycles = cycles, 0
+        self._begin_cycles, self._transfer_cycles, self._just_woken = cycles, 0, True
 
     def begin_start(self, cycles: int) -> None:
         """The processor begins after a reset."""
         self._work.clear()
         self._work[START] = 1
         self.begin(cycles)
+        self._just_woken = False
 
     def note_bytes(self, data: bytes) -> None:
         """These came from the host."""
-        self._work[BYTE] += 1
-        self._work[COMMAND] += data.count(0)
+        self._unread += len(data)
+        self._unread_ends += data.count(0)
+
+    def note_count_of_bytes(self) -> None:
+        """The firmware reads how many bytes have come."""
+        self._work[BYTE] += self._unread
+        self._work[COMMAND] += self._unread_ends
+        self._unread = self._unread_ends = 0
 
     def note_transaction(self, sent: bytes) -> None:
-        """A transaction with the chip."""
+        """A transaction with the chip begins, with these first bytes."""
         access = decode_header(sent)
         work = POLL
         if access is not None and access.file == r.RX_BUFFER.file and not access.is_write:
@@ -86,6 +101,13 @@ class Paths:
     def note_wait(self, cycles: int) -> None:
         """The processor waited for a transfer."""
         self._transfer_cycles += cycles
+
+    def end_turn(self, cycles: int) -> None:
+        """The watchdog is fed: the loop begins again, unless the processor has just woken up before its beginning."""
+        if not self._just_woken:
+            self.end(cycles)
+            self.begin(cycles)
+        self._just_woken = False
 
     def end(self, cycles: int) -> None:
         """The processor goes to sleep."""

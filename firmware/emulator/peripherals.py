@@ -75,10 +75,10 @@ class Peripheral:
 
     def read(self, offset: int) -> int:
         """A load."""
-        if offset in self.event_bits:
-            return int(bool(self.events & self.event_bits[offset]))
         if offset in self.registers:
             return self.registers[offset]
+        if offset in self.event_bits:
+            return int(self.events & self.event_bits[offset] != 0)
         if offset in {0x304, 0x308} and self.event_bits:
             return self.inten
         raise self.unknown(offset)
@@ -187,6 +187,7 @@ class Timer(Peripheral):
         self.base, self.irq = 0x40008000 + 0x1000 * number, 8 + number
         super().__init__(system)
         self.registers[0x510] = 4
+        self._step_cycles, self._mask, self._counts_events = 64, 0xFFFF, False
         self._counted = 0
         """Count when the timer was started or stopped last, or of events."""
         self._started_cycles: int | None = None
@@ -210,18 +211,14 @@ class Timer(Peripheral):
         """SHORTS is not modelled; MODE, BITMODE, PRESCALER, CC."""
         return 0x504, 0x508, 0x510, *(0x540 + 4 * n for n in range(4))
 
-    @property
-    def _cycles_per_count(self) -> int:
-        return 4 << self.registers[0x510]
-
-    @property
-    def _mask(self) -> int:
-        return (1 << self._widths[self.registers[0x508] & 3]) - 1
+    def _elapsed(self) -> int:
+        """Counts since the start."""
+        return (self.system.cycles - (self._started_cycles or 0)) // self._step_cycles
 
     def _value(self) -> int:
-        if self._started_cycles is None or self.registers[0x504]:
+        if self._started_cycles is None or self._counts_events:
             return self._counted & self._mask
-        return (self._counted + (self.system.cycles - self._started_cycles) // self._cycles_per_count) & self._mask
+        return (self._counted + self._elapsed()) & self._mask
 
     def start(self) -> None:
         """Start."""
@@ -236,7 +233,7 @@ class Timer(Peripheral):
 
     def count(self) -> None:
         """Count one event."""
-        if self.registers[0x504] and self._started_cycles is not None:
+        if self._counts_events and self._started_cycles is not None:
             self._counted += 1
 
     def clear(self) -> None:
@@ -249,7 +246,8 @@ class Timer(Peripheral):
     def capture(self, n: int) -> None:
         """Copy the count."""
         self.registers[0x540 + 4 * n] = self._value()
-        self._foresee(n)
+        if self._started_cycles is not None and not self._counts_events:  # equal now, and again a whole turn later
+            self._next_match[n] = self._started_cycles + (self._elapsed() + self._mask + 1) * self._step_cycles
 
     def write(self, offset: int, value: int) -> None:
         """A store."""
@@ -257,6 +255,9 @@ class Timer(Peripheral):
         if offset >= 0x540:
             self._foresee((offset - 0x540) >> 2)
         elif offset >= 0x504:
+            self._step_cycles = 4 << self.registers[0x510]
+            self._mask = (1 << self._widths[self.registers[0x508] & 3]) - 1
+            self._counts_events = self.registers[0x504] != 0
             self._foresee_all()
 
     def _foresee_all(self) -> None:
@@ -265,20 +266,19 @@ class Timer(Peripheral):
 
     def _foresee(self, n: int) -> None:
         """When the count will next become equal to a CC; one that is equal already has to wait for a whole turn."""
-        if self._started_cycles is None or self.registers[0x504]:
+        if self._started_cycles is None or self._counts_events:
             self._next_match[n] = _NEVER
             return
-        step, mask = self._cycles_per_count, self._mask
-        elapsed = (self.system.cycles - self._started_cycles) // step
-        ahead = (self.registers[0x540 + 4 * n] - self._counted - elapsed) & mask or mask + 1
-        self._next_match[n] = self._started_cycles + (elapsed + ahead) * step
+        elapsed = self._elapsed()
+        ahead = (self.registers[0x540 + 4 * n] - self._counted - elapsed) & self._mask or self._mask + 1
+        self._next_match[n] = self._started_cycles + (elapsed + ahead) * self._step_cycles
 
     def update(self) -> None:
         """Raise the events of counts that have been reached."""
         now = self.system.cycles
         for n in range(4):
             if self._next_match[n] <= now:
-                self._next_match[n] += (self._mask + 1) * self._cycles_per_count
+                self._next_match[n] += (self._mask + 1) * self._step_cycles
                 self.happen(0x140 + 4 * n)
 
     @property
@@ -288,7 +288,8 @@ class Timer(Peripheral):
 
     def read(self, offset: int) -> int:
         """A load."""
-        self.update()
+        if offset in self.event_bits:
+            self.update()
         return super().read(offset)
 
 

@@ -144,16 +144,13 @@ static void judge_line(struct board *board, bool was_high, bool had_event)
     board->is_polled = (board->high_without_event == DISAGREEMENTS) || (board->low_with_event == DISAGREEMENTS);
 }
 
-/* Report what has happened at the chip. */
-static void poll(struct board *board, bool line_is_high)
+/* Report what has happened at the chip; whether anything has. */
+static bool poll(struct board *board, bool line_is_high)
 {
     struct dw1000 *chip = &board->chip;
     uint32_t events = dw1000_poll(chip);
 
     judge_line(board, line_is_high, events != 0u);
-    if (events == 0u) {
-        return;
-    }
     if ((events & DW1000_RECEIVED) != 0u) {
         const struct link_measured measured = {chip->rx_power_cdbm, chip->first_path_cdbm, chip->offset_ppb};
 
@@ -169,7 +166,7 @@ static void poll(struct board *board, bool line_is_high)
     if ((events & DW1000_LOST) != 0u) {
         on_lost(board);
     }
-    board->busy_us = board->hardware->now_us();
+    return events != 0u;
 }
 
 static bool is_poll_due(const struct board *board, bool line_is_high, uint32_t now_us)
@@ -185,9 +182,10 @@ static bool is_poll_due(const struct board *board, bool line_is_high, uint32_t n
 static void hand_over(struct board *board)
 {
     enum dw1000_queued result;
+    bool line_is_high = board->hardware->interrupt_line();
 
-    if (board->is_polled || board->hardware->interrupt_line()) {
-        poll(board, board->hardware->interrupt_line()); /* or a frame that has just come would be lost */
+    if (line_is_high || board->is_polled) {
+        (void)poll(board, line_is_high); /* or a frame that has just come would be lost */
         if (board->stage != FRAME_HELD) {
             return;
         }
@@ -361,22 +359,24 @@ static bool is_free(const struct board *board, uint32_t now_us)
            ((now_us - board->measured_us) >= MEASURE_ANYWHERE_US);
 }
 
-/* Check and measure a chip that is configured. */
-static void do_chores(struct board *board, uint32_t now_us)
+/* Check and measure a chip that is configured; whether something was due. */
+static bool do_chores(struct board *board, uint32_t now_us)
 {
     bool measures = ((now_us - board->measured_us) >= MEASURE_US) && is_free(board, now_us);
+    bool checks = measures || ((now_us - board->checked_us) >= CHECK_US);
 
-    if (measures || ((now_us - board->checked_us) >= CHECK_US)) {
+    if (checks) {
         board->checked_us = now_us;
         if (!dw1000_check(&board->chip)) {
             on_lost(board);
-            return;
+        } else if (measures) {
+            board->measured_us = now_us;
+            (void)dw1000_measure(&board->chip);
+        } else {
+            /* it is as it should be */
         }
     }
-    if (measures) {
-        board->measured_us = now_us;
-        (void)dw1000_measure(&board->chip);
-    }
+    return checks;
 }
 
 /* The whole */
@@ -413,15 +413,11 @@ static uint32_t left_of(uint32_t period_us, uint32_t since_us, uint32_t now_us)
     return (passed_us >= period_us) ? 0u : (period_us - passed_us);
 }
 
-/* Until something has to be done by the clock. */
-static uint32_t idle_us(const struct board *board, bool has_read, bool line_is_high)
+/* Until something has to be done by the clock, of a board that has nothing to do now. */
+static uint32_t idle_us(const struct board *board, uint32_t now_us)
 {
-    uint32_t now_us = board->hardware->now_us();
     uint32_t left_us = BLINK_BIT - (now_us & (BLINK_BIT - 1u));
 
-    if (has_read || (line_is_high && board->is_configured && !board->is_polled)) {
-        return 0u;
-    }
     if (board->is_configured) {
         left_us = least(left_us, left_of(board->is_polled ? FAST_POLL_US : POLL_US, board->polled_us, now_us));
         left_us = least(left_us, left_of(CHECK_US, board->checked_us, now_us));
@@ -432,9 +428,7 @@ static uint32_t idle_us(const struct board *board, bool has_read, bool line_is_h
         }
     }
     if (board->stage != NO_FRAME) {
-        int32_t due_in_us = from_to(now_us, board->due_us);
-
-        left_us = least(left_us, (due_in_us > 0) ? (uint32_t)due_in_us : 0u);
+        left_us = least(left_us, (uint32_t)from_to(now_us, board->due_us));
     }
     return left_us;
 }
@@ -464,25 +458,26 @@ uint32_t board_turn(struct board *board)
 {
     uint32_t now_us = board->hardware->now_us();
     bool line_is_high = board->hardware->interrupt_line();
-    bool has_read;
+    bool is_busy = false;
 
     board->is_own_slot = false;
     if (board->is_configured && is_poll_due(board, line_is_high, now_us)) {
         board->polled_us = now_us;
-        poll(board, line_is_high);
+        is_busy = poll(board, line_is_high) || (line_is_high && !board->is_polled);
     }
-    has_read = serve_host(board);
-    if (has_read) {
-        board->busy_us = board->hardware->now_us();
+    is_busy = serve_host(board) || is_busy;
+    if (is_busy) {
+        now_us = board->hardware->now_us();
+        board->busy_us = now_us;
     }
-    now_us = board->hardware->now_us();
     if ((board->stage != NO_FRAME) && (from_to(board->due_us, now_us) >= 0)) {
         serve_frame(board);
+        is_busy = true;
     } else if (board->is_configured) {
-        do_chores(board, now_us);
+        is_busy = do_chores(board, now_us) || is_busy;
     } else {
         /* nothing to do before the host has configured the chip */
     }
     show(board, now_us);
-    return idle_us(board, has_read, board->hardware->interrupt_line());
+    return is_busy ? 0u : idle_us(board, now_us);
 }

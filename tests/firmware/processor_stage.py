@@ -1,11 +1,11 @@
 """A processor with a chip that runs a small program, or the firmware, in an air of its own."""
 
-import shutil
 import subprocess
 from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
-from conftest import ROOT
+from build import FIRMWARE, HAS_ARM_COMPILER
 
 from skyless.constants import TICK_RATE_HZ
 from skyless.radios.interface import AntennaDelays
@@ -13,13 +13,12 @@ from skyless.simulation.dw1000.chip import Chip
 from skyless.simulation.medium import Timeline
 from skyless.ticks import from_seconds, wrap
 
-COMPILER = "arm-none-eabi-gcc"
 DELAYS = AntennaDelays(16_500, 16_300)
 IDENTITY = b"identity"
 
 needs_processor = pytest.mark.skipif(
-    shutil.which(COMPILER) is None or find_spec("unicorn") is None,
-    reason=f"{COMPILER} or the package unicorn is not installed",
+    not HAS_ARM_COMPILER or find_spec("unicorn") is None,
+    reason="gcc-arm-none-eabi, make or the package unicorn is not installed",
 )
 
 
@@ -27,20 +26,11 @@ def build_program(folder, program, **macros):
     """An ELF file of tests/firmware/processor_programs.c."""
     elf = folder / f"{program}-{abs(hash(frozenset(macros.items()))):x}.elf"
     definitions = [f"-D{name}={value}" for name, value in {"PROGRAM": program, **macros}.items()]
-    subprocess.run(
-        [COMPILER, "-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=soft", "-O2", "-ffreestanding", "-nostdlib", "-w"]
-        + [*definitions, "-I", ROOT / "firmware" / "source", "-T", ROOT / "firmware" / "dwm1001.ld"]
-        + [ROOT / "tests" / "firmware" / "processor_programs.c", "-o", elf],
-        check=True,
-    )
+    flags = ["-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=soft", "-O2", "-ffreestanding", "-nostdlib", "-w"]
+    paths = ["-I", FIRMWARE / "source", "-T", FIRMWARE / "dwm1001.ld"]
+    program_file = Path(__file__).with_name("processor_programs.c")
+    subprocess.run(["arm-none-eabi-gcc", *flags, *definitions, *paths, program_file, "-o", elf], check=True)
     return elf
-
-
-def build_firmware(folder):
-    """The ELF file of the firmware."""
-    command = ["make", "-s", "-C", ROOT / "firmware", f"BUILD={folder}"]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    return folder / "skyless-dwm1001.elf"
 
 
 class LoneAir:
