@@ -1,8 +1,12 @@
 """Slow hosts of ``host_latency``: programs on a Raspberry Pi with a DW1000, in the simulated world's time."""
 
 import random
+import sys
 from collections import Counter
+from pathlib import Path
 from typing import Any, Final
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "firmware" / "emulator"))
 
 import numpy as np
 from host_programs import HostLatency, NodeAir, Process

@@ -55,21 +55,21 @@ class TagNode:
         publish: FixListener,
         log: Log,
         before: Callable[[Receiver, Reception, int], None] | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] | None = None,
     ) -> None:
         """``before`` is called before each reception that is processed: with receiver, reception and number of fixes.
 
-        ``clock`` gives the host's monotonic time in s, as ``host_s`` of the receptions.
+        ``clock`` gives the host's monotonic time in s, as ``host_s`` of the receptions; None for ``time.monotonic``.
         """
         self.settings, self.radio = settings, radio
+        self._before, self._clock = before, time.monotonic if clock is None else clock
         self.name = radio.name
         self.receiver = self.new_receiver()
         self.receptions = 0
         """Those that were too old at their turn among them."""
-        self.fix_log = FixLog(self.name, publish, settings.publish_hz, clock)
+        self.fix_log = FixLog(self.name, publish, settings.publish_hz, self._clock)
         self.phases = PhaseLog()
         self.monitor = RadioMonitor(f"tag {self.name}", "listening", log, radio.advice)
-        self._before, self._clock = before, clock
 
     def new_receiver(self) -> Receiver:
         """A receiver that has heard nothing yet."""

@@ -37,7 +37,6 @@ TURNAROUND_S: Final = 0.2e-3
 Longer than any frame after its RMARKER (177 µs), so that all frames that overlap it are known when the RMARKER leaves.
 """
 
-_TURNAROUND_TICKS: Final = from_seconds(TURNAROUND_S)
 _PREAMBLE_TICKS: Final = from_seconds(preamble_s())
 _DX_MASK: Final = ~(DELAYED_TX_GRANULARITY_TICKS - 1)
 
@@ -241,13 +240,17 @@ class Medium(MediumBase[Result]):
         impairments: Impairments,
         seed: int,
         deliver: Callable[[Delivery], Result | None],
+        turnaround_s: float = TURNAROUND_S,
     ) -> None:
         """``deliver`` is called with every frame when it ends; ``run`` yields what it returns.
+
+        ``turnaround_s`` is for a smaller one than usual, where frames keep to slots that never overlap.
 
         Raises ValueError when an impairment names an anchor that the site has not.
         """
         super().__init__(site, tags, impairments, deliver)
         self._impairments = impairments
+        self._least_ahead_ticks = _PREAMBLE_TICKS + from_seconds(turnaround_s)
         _check_names(impairments, self.node_of)
         keys = [(ANCHOR_KEY, anchor.id) for anchor in site.anchors] + [(TAG_KEY, tag) for tag in range(len(tags))]
         self._setups = [stream(seed, *key, purpose=1) for key in keys]
@@ -310,7 +313,7 @@ class Medium(MediumBase[Result]):
         delay_ticks = self._anchors[node].tx_antenna_delay_ticks
         leaves = wrap(((transmission.tx_ticks - delay_ticks) & _DX_MASK) + delay_ticks)
         ahead = difference(leaves, wrap(local_ticks))
-        if ahead < _PREAMBLE_TICKS + _TURNAROUND_TICKS:
+        if ahead < self._least_ahead_ticks:
             self._late += 1
             return False
         marker = self.foresee(node, local_ticks + ahead)

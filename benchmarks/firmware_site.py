@@ -1,0 +1,126 @@
+"""A site on the firmware: frames in time, receptions that reach the hosts, errors. Emulated, in virtual time.
+
+python benchmarks/firmware_site.py [--boards image|host] [--slot-ms 2.1 ...] [--seconds 5] [--seeds 4]
+    [--usb] [--pauses] [--lead-ms 1.8 ...] [--repeat]
+
+``image`` is the ARM image on an emulated nRF52832, ``host`` the same C compiled for this computer. The lab's six
+anchors and a tag that walks; the programs are those of ``skyless anchor`` and ``skyless tag``. ``--usb``: through a
+debugger's probe. ``--pauses``: hosts need time, as a Raspberry Pi with CPython. ``--lead-ms``: anchors keep to this
+lead instead of adapting theirs. ``--repeat``: each run again with the emulated radio, whose fixes must be the same bit
+for bit.
+"""
+
+import argparse
+import contextlib
+import sys
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "firmware" / "emulator"))
+
+import numpy as np
+from build import build
+from emulated_site import EmulatedSite, MakeBoard, SiteResult
+from host_board import HostBoard
+from host_programs import HostLatency
+from msgspec.structs import replace
+from repeated_site import RepeatedSite
+from serial_wire import WireSettings
+
+from skyless.evaluation.compile_ahead import compile_kernels
+from skyless.evaluation.scenarios import Request, trajectories_of
+from skyless.nodes import anchor
+from skyless.site.lab import ideal_lab_site
+from skyless.site.model import ScheduleSite
+
+_WARMUP_S = 1.0
+
+
+def make_boards(kind: str) -> MakeBoard:
+    """What makes the boards of a site; the firmware is built."""
+    if kind == "host":
+        return HostBoard
+    from nrf52832 import Image  # noqa: PLC0415 - needs unicorn
+
+    return partial(Image, elf=build("all"))
+
+
+@contextlib.contextmanager
+def fixed_lead(*, fixed: bool) -> Iterator[None]:
+    """Let anchors not adapt their lead."""
+    before = anchor.LEAD_GAIN, anchor.LEAD_LOSS
+    if fixed:
+        anchor.LEAD_GAIN, anchor.LEAD_LOSS = 1.0, 1.0  # type: ignore[misc]
+    try:
+        yield
+    finally:
+        anchor.LEAD_GAIN, anchor.LEAD_LOSS = before  # type: ignore[misc]
+
+
+def site_of(
+    slot_ms: float, make: MakeBoard, seed: int, wire: WireSettings, lead_ms: float | None = None
+) -> EmulatedSite:
+    """The lab with this slot length, and a tag that walks."""
+    lab = replace(ideal_lab_site(), schedule=ScheduleSite(slot_s=1e-3 * slot_ms))
+    lead_s = None if lead_ms is None else 1e-3 * lead_ms
+    return EmulatedSite(lab, trajectories_of(Request(lab, seed=seed)), make, seed=seed, wire=wire, lead_s=lead_s)
+
+
+def is_repeated(site: EmulatedSite, seconds: float) -> bool:
+    """Whether the emulated radio gives the same frames and the same fixes."""
+    again = RepeatedSite(site)
+    again.run(seconds)
+    return site.sent_frames() == again.sent_frames() and len(site.fixes["tag1"]) > 0 and site.fixes == again.fixes
+
+
+def row(slot_ms: float, lead_ms: float | None, results: list[SiteResult], wall_s: float, repeated: str) -> str:
+    """A line of the table."""
+    sent, late, slots, got, reported, fixes = (
+        sum(getattr(result, name) for result in results)
+        for name in ("sent", "late", "slots", "at_antennas", "reported", "fixes")
+    )
+    rms_m = np.sqrt(np.mean([result.rms_m**2 for result in results]))
+    wrong = sum(result.wrong + sum(result.misused.values()) for result in results)
+    lead = "as it adapts" if lead_ms is None else f"{lead_ms:g} ms"
+    return (
+        f"| {slot_ms:g} ms | {lead} | {100 * sent / max(slots, 1):.2f} % | {late} "
+        f"| {100 * reported / max(got, 1):.2f} % | {100 * min(result.least_reported for result in results):.2f} % "
+        f"| {wrong} | {fixes} | {100 * rms_m:.2f} cm | {repeated} | {wall_s:.0f} s |"
+    )
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--boards", choices=("image", "host"), default="image")
+    parser.add_argument("--slot-ms", type=float, nargs="+", default=[2.1])
+    parser.add_argument("--lead-ms", type=float, nargs="+", default=[None])
+    parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--usb", action="store_true")
+    parser.add_argument("--pauses", action="store_true")
+    parser.add_argument("--repeat", action="store_true")
+    asked = parser.parse_args()
+    compile_kernels()
+    make = make_boards(asked.boards)
+    pieces = 64 if asked.boards == "host" else 1
+    wire = WireSettings(usb=asked.usb, host=HostLatency() if asked.pauses else None, piece_bytes=pieces)
+    heads = "slot | lead | slots with a frame | late | reported | worst node | wrong | fixes | error | repeated | time"
+    print(f"| {heads} |\n{'|---' * (heads.count('|') + 1)}|")
+    for slot_ms in asked.slot_ms:
+        for lead_ms in asked.lead_ms:
+            results, repeated, begun_s = [], 0, time.perf_counter()
+            for seed in range(1, asked.seeds + 1):
+                with fixed_lead(fixed=lead_ms is not None):
+                    site = site_of(slot_ms, make, seed, wire, lead_ms)
+                    site.run(asked.seconds)
+                    results.append(site.result(_WARMUP_S))
+                    repeated += asked.repeat and is_repeated(site, asked.seconds)
+            same = f"{repeated} of {asked.seeds}" if asked.repeat else "-"
+            print(row(slot_ms, lead_ms, results, time.perf_counter() - begun_s, same), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,120 @@
+"""A board whose program runs on this computer, in the timeline's time: its clock, its line, its bus and its chip's pin.
+
+What the program computes takes no time; transfers, pauses and bytes on the line take theirs.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final
+
+from host_programs import Process
+
+from skyless.constants import TICK_S
+from skyless.simulation.dw1000.chip import Chip
+from skyless.simulation.medium import Timeline
+from skyless.ticks import from_seconds
+
+BYTE_S: Final = 10e-6
+"""On the UART: ten bits at 1 Mbaud."""
+LINE_BYTES: Final = 1024
+"""Bytes that wait to be sent, or to be read."""
+SLOW_HZ: Final = 2_000_000
+FAST_HZ: Final = 8_000_000
+_TRANSFER_S: Final = 5e-6
+"""Of a transfer besides its bits: chip select and the start of the DMA (assumed)."""
+
+
+class ProgramBoard:
+    """What the program stands on; ``program`` is run again after the supply failed."""
+
+    def __init__(self, timeline: Timeline[Any], chip: Chip, send: Callable[[bytes], None]) -> None:
+        self.chip = chip
+        self.lights = 0
+        self._timeline, self._send = timeline, send
+        self._start()
+
+    def program(self) -> None:
+        """The board's program; never returns."""
+        raise NotImplementedError
+
+    def _start(self) -> None:
+        self._came = bytearray()
+        self._hz = SLOW_HZ
+        self._unsent_ticks = self._timeline.now_ticks
+        self._starts_ticks = self._timeline.now_ticks
+        self.process = Process(self._timeline, self.program)
+
+    # What the site calls
+
+    def notify(self) -> None:
+        """The chip's interrupt line may have risen."""
+        if self.chip.irq:
+            self.process.notify()
+
+    def receive(self, data: bytes) -> None:
+        """These bytes have come on the UART."""
+        if len(self._came) + len(data) <= LINE_BYTES:
+            self._came += data
+        self.process.notify()
+
+    def power_cycle(self) -> None:
+        """The supply failed and is back."""
+        self.process.close()
+        self._start()
+
+    def close(self) -> None:
+        """End the program."""
+        self.process.close()
+
+    # What the program calls
+
+    def now_us(self) -> int:
+        """Microseconds since the start."""
+        return int((self._timeline.now_ticks - self._starts_ticks) * TICK_S * 1e6)
+
+    def transfer(self, out: bytes) -> bytes:
+        """One SPI transaction; it reaches the chip when its time is over."""
+        self.process.sleep(_TRANSFER_S + 8 * len(out) / self._hz)
+        return self.chip.transfer(out, self._hz)
+
+    def set_spi_fast(self, fast: bool) -> None:
+        """Clock the SPI fast from now on, or slowly."""
+        self._hz = FAST_HZ if fast else SLOW_HZ
+
+    def reset_chip(self) -> None:
+        """Pull RSTn low for a moment."""
+        self.chip.pull_reset()
+
+    def pause_s(self, seconds: float) -> None:
+        """Wait."""
+        self.process.sleep(seconds)
+
+    def wait_s(self, seconds: float) -> None:
+        """Wait, at most until the interrupt line rises or bytes come."""
+        if not self._came and not self.chip.irq:
+            self.process.wait(seconds)
+
+    def read_line(self, size: int) -> bytes:
+        """What has come on the UART, at most ``size`` bytes."""
+        data = bytes(self._came[:size])
+        del self._came[:size]
+        return data
+
+    def write_line(self, data: bytes) -> bool:
+        """Send, now or when what waits is sent; False where it does not fit."""
+        now = self._timeline.now_ticks
+        begins = max(now, self._unsent_ticks)
+        if (begins - now) * TICK_S / BYTE_S + len(data) > LINE_BYTES:
+            return False
+        self._unsent_ticks = begins + from_seconds(len(data) * BYTE_S)
+        self._timeline.at(self._unsent_ticks, partial(self._deliver, data, self.process))
+        return True
+
+    def _deliver(self, data: bytes, sender: Process) -> None:
+        """The bytes have left the pin, unless the supply failed meanwhile."""
+        if sender is self.process:
+            self._send(data)
+
+    def restart_line(self) -> None:
+        """Discard all that has come."""
+        self._came.clear()

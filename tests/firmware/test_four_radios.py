@@ -1,0 +1,143 @@
+"""One seed, four radios: emulated, Python driver and register model, the firmware's C, its ARM image. The same fixes.
+
+A tag gets the frames of one simulated site; powers and carrier offsets are given to the emulated radio as the Python
+driver reads them, because chips round them.
+"""
+
+from collections import Counter
+
+import msgspec
+import pytest
+from chip_stage import TimedNode, WorldAir
+from site_stage import KINDS, boards
+
+from skyless.anchor import Anchor
+from skyless.evaluation.compile_ahead import compile_kernels
+from skyless.evaluation.scenarios import Request, impairments_of
+from skyless.radios.interface import AntennaDelays, Reception
+from skyless.radios.serial.serial_radio import LinkSession
+from skyless.receiver import Receiver
+from skyless.simulation.dw1000.chip import Chip
+from skyless.simulation.medium import Timeline
+from skyless.simulation.stations import TagSpec
+from skyless.simulation.trajectory import Static
+from skyless.simulation.world import World
+from skyless.site.lab import lab_site
+from skyless.ticks import from_seconds, wrap
+
+LAB = lab_site()
+SECONDS = 1.5
+SEED = 7
+STARTS_S = 0.1
+"""Before the first frame a board is configured."""
+DELAYS = AntennaDelays()
+
+
+@pytest.fixture(scope="module")
+def tape():
+    """What the tag's antenna gets, and what the Python driver makes of it; ``host_s`` is when each frame ended."""
+    compile_kernels()
+    faults = msgspec.structs.replace(impairments_of(Request(LAB, nlos=0.1), LAB), diagnostics=True)
+    world = World(LAB, lambda number: Anchor(LAB, number), [TagSpec(Static(2.0, 3.0, 0.0))], faults, SEED)
+    tag = TimedNode(WorldAir(world.medium, len(LAB.anchors)))
+    tag.start()
+    emulated, driver = [], []
+    for broadcast in world.run(SECONDS):
+        for _, reception, _ in broadcast.receptions():
+            emulated.append(msgspec.structs.replace(reception, host_s=world.medium.now_s))
+            driver.append(tag.hear(reception.frame, reception.rx_ticks, reception.diagnostics, world.medium.now_s))
+    rounded = [
+        msgspec.structs.replace(one, diagnostics=other.diagnostics) for one, other in zip(emulated, driver, strict=True)
+    ]
+    return emulated, rounded, driver
+
+
+class TapeAir:
+    """An air that only receives; its counter is that of the newest stamp, and what has passed since."""
+
+    def __init__(self, timeline):
+        self.timeline = timeline
+        self.reading = 0, 0
+
+    def now_ticks(self):
+        ticks, at = self.reading
+        return wrap(ticks + self.timeline.now_ticks - at)
+
+    def now_s(self):
+        return self.timeline.now_ticks / 63.8976e9
+
+    def transmit(self, frame, leaves_ticks):
+        raise AssertionError("a tag sends nothing")
+
+    def withdraw(self):
+        pass
+
+
+def over_a_board(kind, tape):
+    """What a session with such a board reports."""
+    timeline = Timeline()
+    air = TapeAir(timeline)
+    chip = Chip(air, DELAYS.tx_ticks, DELAYS.rx_ticks, air.now_s)
+    events, counters = [], Counter()
+    lines = []
+    session = LinkSession("the line", DELAYS, lines.append, events.append, counters)
+    board = boards(kind)(
+        timeline, chip, lambda data: talk(session.on_data, data), can_transmit=False, identity=bytes(8)
+    )
+    first_s = tape[0].host_s
+
+    def talk(call, *values):
+        """Let the host do something, and the board get what it writes."""
+        call(*values, air.now_s())
+        while lines:
+            board.receive(lines.pop(0))
+
+    def arrive(reception):
+        ended = timeline.now_ticks
+        air.reading = wrap(reception.rx_ticks + from_seconds(180e-6)), ended
+        chip.receive(reception.frame, reception.rx_ticks, reception.diagnostics)
+        board.notify()
+
+    timeline.at(from_seconds(STARTS_S / 2), lambda: talk(session.begin))
+    air.reading = wrap(tape[0].rx_ticks - from_seconds(STARTS_S)), 0
+    for reception in tape:
+        at = from_seconds(STARTS_S + reception.host_s - first_s)
+        timeline.at(at, lambda reception=reception: arrive(reception))
+    for _ in timeline.run(from_seconds(STARTS_S + SECONDS + 0.1)):
+        pass
+    getattr(board, "close", lambda: None)()
+    assert set(chip.arrivals) == {"heard"}
+    assert not +counters
+    assert not +chip.misuse
+    return [event for event in events if isinstance(event, Reception)]
+
+
+def fixes_of(heard, method="joint"):
+    receiver = Receiver(method)
+    return [fix_bits(fix) for fix in map(receiver.hear, heard)]
+
+
+def fix_bits(fix):
+    if fix is None:
+        return None
+    arrays = (fix.position_m, fix.covariance_m2, fix.velocity_mps, fix.velocity_covariance)
+    rest = (fix.time_s, fix.std_m, fix.dops, fix.anchors, fix.chi2, fix.dof, fix.hpl_m, fix.vpl_m, fix.alert)
+    return tuple(None if array is None else array.tobytes() for array in arrays), rest
+
+
+def test_the_python_driver(tape):
+    _, rounded, driver = tape
+    assert len(driver) > 400
+    assert fixes_of(driver) == fixes_of(rounded)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_board_gives_the_fixes_of_the_emulated_radio_bit_for_bit(kind, tape):
+    emulated, rounded, _ = tape
+    heard = over_a_board(kind, emulated)
+    assert [(one.frame, one.rx_ticks, one.diagnostics) for one in heard] == [
+        (one.frame, one.rx_ticks, one.diagnostics) for one in rounded
+    ]
+    here = fixes_of(rounded)
+    assert sum(fix is not None for fix in here) > 150
+    assert fixes_of(heard) == here
