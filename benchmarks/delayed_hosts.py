@@ -6,10 +6,10 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, Final
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "firmware" / "emulator"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "firmware"))
 
 import numpy as np
-from host_programs import HostLatency, NodeAir, Process
+from emulator.site.host_programs import HostLatency, NodeAir, Process
 from numpy.typing import NDArray
 
 from skyless.air.reception import Diagnostics, Reception

@@ -10,13 +10,12 @@ import re
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "firmware" / "emulator"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "firmware"))
 
-from build import build
-from cycle_table import markdown, measure_cycles
+from emulator.build import build
+from emulator.processor.cycle_table import markdown, measure_cycles
 
-PAGE = ROOT / "docs" / "hardware.md"
+PAGE = Path(__file__).parents[1] / "docs" / "hardware.md"
 PLACE = re.compile(r"(<!-- cycles: benchmarks/firmware_cycles.py --write -->\n).*?(<!-- end -->)", re.DOTALL)
 
 

@@ -18,16 +18,16 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "firmware" / "emulator"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "firmware"))
 
 import numpy as np
-from build import build
-from emulated_site import EmulatedSite, MakeBoard, SiteResult
-from host_board import HostBoard
-from host_programs import HostLatency
+from emulator.build import build
+from emulator.site.emulated_site import EmulatedSite, MakeBoard, SiteResult
+from emulator.site.host_board import HostBoard
+from emulator.site.host_programs import HostLatency
+from emulator.site.repeated_site import RepeatedSite
+from emulator.site.serial_wire import WireSettings
 from msgspec.structs import replace
-from repeated_site import RepeatedSite
-from serial_wire import WireSettings
 
 from skyless.evaluation.compile_ahead import compile_kernels
 from skyless.evaluation.scenarios import Request, trajectories_of
@@ -42,7 +42,7 @@ def make_boards(kind: str) -> MakeBoard:
     """What makes the boards of a site; the firmware is built."""
     if kind == "host":
         return HostBoard
-    from nrf52832 import Image  # noqa: PLC0415 - needs unicorn
+    from emulator.processor.nrf52832 import Image  # noqa: PLC0415 - needs unicorn
 
     return partial(Image, elf=build("all"))
 

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 from delayed_hosts import AnchorHost, Host, TagHost
-from host_programs import HostLatency
+from emulator.site.host_programs import HostLatency
 from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Protocol
 
-from build import build
+from emulator.build import build
 
 CHIP_NUMBERS = (
     "received", "errors", "sent", "late", "rx_ticks", "tx_ticks", "frame_bytes",

@@ -4,4 +4,4 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-sys.path.insert(0, str(Path(__file__).parents[2] / "firmware" / "emulator"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "firmware"))

@@ -1,8 +1,8 @@
 """A site on slow hosts: slots are skipped and counted, and never a frame leaves with a wrong stamp."""
 
 import pytest
+from emulator.site.host_programs import HostLatency
 from host_latency import run_hosts
-from host_programs import HostLatency
 
 MOST_RATIO = 2.0
 """Error over bound. Four runs of 11 s give 1.27 with latency and 1.32 without it at 5 ms, 1.37 and 1.32 at 2.1 ms: the

@@ -1,7 +1,7 @@
 """Programs that take simulated time."""
 
 import pytest
-from host_programs import Process
+from emulator.site.host_programs import Process
 
 from skyless.simulation.medium import Timeline
 from skyless.ticks import from_seconds, to_seconds

@@ -4,10 +4,10 @@ from binascii import crc_hqx
 from itertools import count
 
 import pytest
-from board_library import CBoard
-from build import HAS_HOST_COMPILER
 from chip_stage import HandClock
 from cobs import cobs
+from emulator.board_library import CBoard
+from emulator.build import HAS_HOST_COMPILER
 
 from skyless.air.ieee802154 import after_rmarker_s, fcs
 from skyless.air.reception import Diagnostics

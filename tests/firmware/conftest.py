@@ -4,5 +4,5 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "firmware" / "emulator"))
+sys.path.insert(0, str(ROOT / "firmware"))
 sys.path.append(str(ROOT / "tests" / "radios"))

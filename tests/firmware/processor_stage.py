@@ -5,7 +5,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from build import FIRMWARE, HAS_ARM_COMPILER
+from emulator.build import FIRMWARE, HAS_ARM_COMPILER
 
 needs_processor = pytest.mark.skipif(
     not HAS_ARM_COMPILER or find_spec("unicorn") is None,

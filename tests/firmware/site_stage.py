@@ -5,12 +5,12 @@ from functools import cache, partial
 from importlib.util import find_spec
 
 import pytest
-from build import HAS_ARM_COMPILER, HAS_HOST_COMPILER, build
-from emulated_site import EmulatedSite
-from host_board import HostBoard
+from emulator.build import HAS_ARM_COMPILER, HAS_HOST_COMPILER, build
+from emulator.site.emulated_site import EmulatedSite
+from emulator.site.host_board import HostBoard
+from emulator.site.serial_wire import WireSettings
+from emulator.site.virtual_time import run_on
 from msgspec.structs import replace
-from serial_wire import WireSettings
-from virtual_time import run_on
 
 from skyless.evaluation.scenarios import Request, trajectories_of
 from skyless.site.lab import ideal_lab_site
@@ -29,7 +29,7 @@ def boards(kind):
     """What makes boards: the C on this computer, or the ARM image on an emulated processor."""
     if kind == "host":
         return HostBoard
-    from nrf52832 import Image
+    from emulator.processor.nrf52832 import Image
 
     return partial(Image, elf=build("all"))
 

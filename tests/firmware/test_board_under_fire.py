@@ -2,7 +2,6 @@
 
 from collections import Counter
 
-from board_library import CBoard
 from board_stage import (
     ASK_HELLO,
     ASK_STATUS,
@@ -15,6 +14,7 @@ from board_stage import (
     line_of,
     needs_compiler,
 )
+from emulator.board_library import CBoard
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule

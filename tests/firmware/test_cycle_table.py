@@ -3,8 +3,8 @@
 import re
 
 import pytest
-from build import FIRMWARE, build
-from cycle_table import markdown, measure_cycles
+from emulator.build import FIRMWARE, build
+from emulator.processor.cycle_table import markdown, measure_cycles
 from processor_stage import needs_processor
 
 PAGE = FIRMWARE.parent / "docs" / "hardware.md"

@@ -2,9 +2,9 @@
 
 import re
 
-from board_library import CChip, library
 from board_stage import needs_compiler
-from build import FIRMWARE
+from emulator.board_library import CChip, library
+from emulator.build import FIRMWARE
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scripted_chip import ScriptedBus, script_frame

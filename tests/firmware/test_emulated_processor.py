@@ -5,9 +5,9 @@ import subprocess
 
 import pytest
 from board_stage import line_of
-from build import build
 from cobs import cobs
-from lone_board import DELAYS, IDENTITY, LoneBoard
+from emulator.build import build
+from emulator.processor.lone_board import DELAYS, IDENTITY, LoneBoard
 from processor_stage import build_program, needs_processor
 
 from skyless.air.ieee802154 import after_rmarker_s, fcs
@@ -180,7 +180,7 @@ def test_a_fault_in_the_handler_is_a_lockup(folder):
     ],
 )
 def test_what_is_not_modelled_is_an_error_that_names_it(folder, forbidden, message):
-    from cortex_m4 import EmulationError
+    from emulator.processor.cortex_m4 import EmulationError
 
     stage = LoneBoard(build_program(folder, "SILENT", FORBIDDEN=forbidden))
     with pytest.raises(EmulationError, match=message):
@@ -188,7 +188,7 @@ def test_what_is_not_modelled_is_an_error_that_names_it(folder, forbidden, messa
 
 
 def test_a_file_that_is_no_image_is_refused(tmp_path):
-    from cortex_m4 import EmulationError, load_elf
+    from emulator.processor.cortex_m4 import EmulationError, load_elf
 
     path = tmp_path / "image.elf"
     for data in (b"", b"\x7fELF", b"\x7fELF\x02\x01" + bytes(60)):
@@ -254,7 +254,7 @@ def test_code_in_two_lines_of_flash_waits_unless_it_is_cached(folder):
 
 def test_costs_of_all_instructions_of_the_firmware_are_those_of_their_names(firmware):
     """GNU's disassembler names every instruction; its cost follows from that name and its operands."""
-    from cycles import cost_16, cost_32
+    from emulator.processor.cycles import cost_16, cost_32
 
     listing = subprocess.run(
         ["arm-none-eabi-objdump", "-d", "-j", ".text", firmware], capture_output=True, text=True, check=True

@@ -4,7 +4,7 @@ The programs are those of ``skyless anchor`` and ``skyless tag``, behind pseudo-
 """
 
 import pytest
-from repeated_site import RepeatedSite
+from emulator.site.repeated_site import RepeatedSite
 from site_stage import KINDS, site_of
 
 from skyless.evaluation.compile_ahead import compile_kernels

@@ -6,7 +6,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from build import FIRMWARE, HAS_ARM_COMPILER, HAS_HOST_COMPILER, build
+from emulator.build import FIRMWARE, HAS_ARM_COMPILER, HAS_HOST_COMPILER, build
 
 needs_arm = pytest.mark.skipif(not HAS_ARM_COMPILER, reason="gcc-arm-none-eabi or make is not installed")
 

@@ -5,9 +5,9 @@ import itertools
 from binascii import crc_hqx
 
 import pytest
-from board_library import library
-from build import HAS_HOST_COMPILER
 from cobs import cobs
+from emulator.board_library import library
+from emulator.build import HAS_HOST_COMPILER
 from hypothesis import given
 from hypothesis import strategies as st
 

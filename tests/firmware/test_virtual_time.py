@@ -6,7 +6,7 @@ import time
 import tty
 
 import pytest
-from virtual_time import UNIX_S, run_on, wake
+from emulator.site.virtual_time import UNIX_S, run_on, wake
 
 from skyless.constants import TICK_S
 from skyless.simulation.medium import Timeline

@@ -10,8 +10,7 @@ import heapq
 from typing import Any, ClassVar, Final, Protocol
 from weakref import WeakKeyDictionary
 
-from cycles import CPU_HZ
-
+from emulator.processor.cycles import CPU_HZ
 from skyless.constants import TICK_RATE_HZ
 from skyless.simulation.medium import Timeline
 

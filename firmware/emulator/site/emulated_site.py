@@ -18,11 +18,11 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
-from serial_wire import SerialWire, WireSettings
-from site_air import SITE_TURNAROUND_S, SiteAir
-from virtual_time import run_on
-from watched_radio import WatchedRadio
 
+from emulator.site.serial_wire import SerialWire, WireSettings
+from emulator.site.site_air import SITE_TURNAROUND_S, SiteAir
+from emulator.site.virtual_time import run_on
+from emulator.site.watched_radio import WatchedRadio
 from skyless.air.beacon import Beacon
 from skyless.air.codec import decode_cached
 from skyless.air.reception import Diagnostics

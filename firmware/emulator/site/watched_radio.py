@@ -4,8 +4,8 @@ import time
 from collections import Counter
 
 from msgspec import Struct
-from site_air import SiteAir
 
+from emulator.site.site_air import SiteAir
 from skyless.air.reception import Reception, Transmission
 from skyless.constants import TICK_S
 from skyless.radios.interface import Late, Listener, Radio, RadioEvent, Sent, ignore

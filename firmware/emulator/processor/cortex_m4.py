@@ -11,7 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Literal
 
-import cycles as c
 from unicorn import (
     UC_ARCH_ARM,
     UC_HOOK_BLOCK,
@@ -28,6 +27,8 @@ from unicorn import (
 )
 from unicorn import arm_const as arm
 from unicorn.unicorn_py3.unicorn import uclib
+
+from emulator.processor import cycles as c
 
 RAM_BASE: Final = 0x20000000
 RAM_BYTES: Final = 64 * 1024

@@ -3,9 +3,8 @@
 from collections.abc import Callable
 from typing import Any, Final, TypeVar
 
-from board_library import CBoard
-from program_board import ProgramBoard
-
+from emulator.board_library import CBoard
+from emulator.site.program_board import ProgramBoard
 from skyless.simulation.dw1000.chip import Chip
 from skyless.simulation.medium import Timeline
 

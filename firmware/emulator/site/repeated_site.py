@@ -11,9 +11,9 @@ import asyncio
 import time
 from collections import Counter
 
-from emulated_site import Board, EmulatedSite, SiteNode
 from msgspec.structs import replace
 
+from emulator.site.emulated_site import Board, EmulatedSite, SiteNode
 from skyless.air.reception import Reception, Transmission
 from skyless.radios.interface import Late, Listener, Radio, RadioEvent
 from skyless.ticks import wrap

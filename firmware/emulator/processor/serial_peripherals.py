@@ -3,8 +3,7 @@
 from collections.abc import Callable
 from typing import Protocol
 
-from peripherals import Peripheral, System
-
+from emulator.processor.peripherals import Peripheral, System
 from skyless.simulation.dw1000.memory import decode_header
 
 

@@ -7,8 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
 
-from host_programs import Process
-
+from emulator.site.host_programs import Process
 from skyless.constants import TICK_S
 from skyless.simulation.dw1000.chip import Chip
 from skyless.simulation.medium import Timeline

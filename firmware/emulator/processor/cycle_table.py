@@ -8,11 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from cycles import CPU_HZ
-from lone_board import DELAYS, LoneBoard
 from msgspec import Struct
-from paths import BYTE, COMMAND, END_OF_TRANSMISSION, IDLE, POLL, RECEPTION, TRANSMISSION, PathCost
 
+from emulator.processor.cycles import CPU_HZ
+from emulator.processor.lone_board import DELAYS, LoneBoard
+from emulator.processor.paths import BYTE, COMMAND, END_OF_TRANSMISSION, IDLE, POLL, RECEPTION, TRANSMISSION, PathCost
 from skyless.air.ieee802154 import after_rmarker_s, fcs
 from skyless.air.reception import Diagnostics
 from skyless.radios.serial.link import Writer

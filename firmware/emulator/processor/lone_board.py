@@ -4,8 +4,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from nrf52832 import Image
-
+from emulator.processor.nrf52832 import Image
 from skyless.constants import TICK_RATE_HZ
 from skyless.radios.interface import AntennaDelays
 from skyless.simulation.dw1000.chip import Chip

@@ -12,14 +12,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-import peripherals as p
-from cortex_m4 import Core, EmulationError, functions_of, load_elf
-from cycles import CYCLES, spent_at
 from msgspec import Struct
-from paths import PathCost, Paths
-from processors import TICKS_PER_CYCLE, Processors
-from serial_peripherals import Spim, Uarte
 
+from emulator.processor import peripherals as p
+from emulator.processor.cortex_m4 import Core, EmulationError, functions_of, load_elf
+from emulator.processor.cycles import CYCLES, spent_at
+from emulator.processor.paths import PathCost, Paths
+from emulator.processor.processors import TICKS_PER_CYCLE, Processors
+from emulator.processor.serial_peripherals import Spim, Uarte
 from skyless.constants import TICK_S
 from skyless.simulation.dw1000.chip import Chip
 from skyless.simulation.dw1000.registers import SYS_STATUS

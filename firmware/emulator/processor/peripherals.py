@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Final, Protocol
 
-from cortex_m4 import EmulationError
+from emulator.processor.cortex_m4 import EmulationError
 
 HFCLK_START_CYCLES: Final = 64 * 360
 LFCLK_START_CYCLES: Final = 64 * 600

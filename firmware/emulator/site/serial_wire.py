@@ -10,10 +10,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
 
-from host_programs import HostLatency
 from msgspec import Struct
-from virtual_time import wake
 
+from emulator.site.host_programs import HostLatency
+from emulator.site.virtual_time import wake
 from skyless.simulation.medium import Timeline
 from skyless.ticks import from_seconds
 
