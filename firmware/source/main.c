@@ -95,7 +95,7 @@ static void start_chip_pins(void)
 {
     GPIO_OUTSET = 1u << PIN_CHIP_SELECT;
     GPIO_PIN_CNF(PIN_CHIP_SELECT) = PIN_OUTPUT;
-    GPIO_PIN_CNF(PIN_CHIP_SCK) = PIN_FAST_OUTPUT;
+    GPIO_PIN_CNF(PIN_CHIP_SCK) = PIN_FAST_CLOCK;
     GPIO_PIN_CNF(PIN_CHIP_MOSI) = PIN_FAST_OUTPUT;
     GPIO_PIN_CNF(PIN_CHIP_MISO) = PIN_INPUT_PULL_DOWN;
     GPIO_PIN_CNF(PIN_CHIP_IRQ) = PIN_INPUT_PULL_DOWN;
@@ -165,8 +165,20 @@ static uint32_t reset_cause(void)
 {
     uint32_t cause = POWER_RESETREAS & RESETREAS_MASK;
 
+    if ((cause & RESETREAS_PIN) != 0u) {
+        cause = RESETREAS_PIN; /* the others may be set with it (anomaly 136) */
+    }
     POWER_RESETREAS = 0xFFFFFFFFu; /* each bit is cleared by writing it */
     return startup_take_fault() ? (cause | FAULT_CAUSE) : cause;
+}
+
+static void prepare_sleep(void)
+{
+    if (CHIP_REVISION <= REVISION_1) {
+        POWER_KEEP_RAM = FICR_KEEP_RAM;
+    }
+    GPIO_OUTSET = 1u << PIN_AWAKE;
+    GPIO_PIN_CNF(PIN_AWAKE) = PIN_OUTPUT;
 }
 
 /* Sleep until the time is over, the chip's interrupt line has risen, a byte has come or the transmitter is free. Events
@@ -174,7 +186,9 @@ static uint32_t reset_cause(void)
 static void sleep_us(uint32_t microseconds)
 {
     TIMER0_CC0 = now_us() + microseconds;
+    GPIO_OUTCLR = 1u << PIN_AWAKE;
     __asm volatile("dsb\n\twfi" ::: "memory");
+    GPIO_OUTSET = 1u << PIN_AWAKE;
 }
 
 static void clear_events(void)
@@ -182,7 +196,7 @@ static void clear_events(void)
     GPIOTE_IN0 = 0u;
     TIMER0_COMPARE0 = 0u;
     UARTE_RXDRDY = 0u;
-    (void)TIMER0_COMPARE0; /* the writes have arrived before the interrupts are cleared (PS 14.1) */
+    (void)TIMER0_COMPARE0; /* the writes have arrived before the interrupts are cleared (PS 15) */
     NVIC_ICPR0 = (1u << UARTE_IRQ) | (1u << GPIOTE_IRQ) | (1u << TIMER0_IRQ);
 }
 
@@ -205,8 +219,11 @@ int main(void)
 
     identity.reset_cause = (uint8_t)reset_cause();
     start_watchdog();
-    start_clocks();
     start_lights();
+    show(LIGHT_FAULT); /* until the crystal runs; if it never does the watchdog starts all again */
+    start_clocks();
+    show(0u);
+    prepare_sleep();
     start_chip_pins();
     for (uint32_t at = 0u; at < sizeof identity.device_id; at++) {
         identity.device_id[at] = (uint8_t)(FICR_DEVICEID[at / 4u] >> (8u * (at % 4u)));

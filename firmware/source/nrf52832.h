@@ -12,17 +12,25 @@
 #define CLOCK_HFCLKSTARTED REGISTER(0x40000100u)
 #define POWER_RESETREAS REGISTER(0x40000400u)
 #define RESETREAS_MASK 0x0Fu /* 0 reset pin, 1 watchdog, 2 software, 3 lockup */
+#define RESETREAS_PIN 0x01u
+
+/* Anomaly 108 (nRF52832 errata, and Nordic's system_nrf52.c): revisions up to 1, which the chip calls 5, keep their RAM in
+ * sleep only with a value that the factory has left for each chip. */
+#define CHIP_REVISION ((REGISTER(0xF0000FE8u) >> 4) & 0xFu)
+#define REVISION_1 5u
+#define POWER_KEEP_RAM REGISTER(0x40000EE4u)
+#define FICR_KEEP_RAM (REGISTER(0x10000258u) & 0x4Fu)
 
 /* UARTE (PS 35) */
 #define UARTE_STARTRX REGISTER(0x40002000u)
 #define UARTE_STOPRX REGISTER(0x40002004u)
 #define UARTE_STARTTX REGISTER(0x40002008u)
-#define UARTE_STOPTX REGISTER(0x4000200Cu)
+#define UARTE_FLUSHRX REGISTER(0x4000202Cu)
 #define UARTE_RXDRDY REGISTER(0x40002108u)
 #define UARTE_RXDRDY_ADDRESS 0x40002108u
+#define UARTE_ENDRX REGISTER(0x40002110u)
 #define UARTE_ENDTX REGISTER(0x40002120u)
 #define UARTE_RXTO REGISTER(0x40002144u)
-#define UARTE_TXSTOPPED REGISTER(0x40002158u)
 #define UARTE_SHORTS REGISTER(0x40002200u)
 #define UARTE_SHORT_ENDRX_STARTRX (1u << 5)
 #define UARTE_INTENSET REGISTER(0x40002304u)
@@ -92,7 +100,7 @@
 #define TIMER_32_BITS 3u
 #define TIMER_1_MHZ 4u /* 16 MHz / 2^4 */
 
-/* WDT (PS 37) */
+/* WDT (PS 40) */
 #define WDT_START REGISTER(0x40010000u)
 #define WDT_CRV REGISTER(0x40010504u)
 #define WDT_RREN REGISTER(0x40010508u)
@@ -114,6 +122,7 @@
 #define GPIO_PIN_CNF(pin) REGISTER(0x50000700u + (4u * (pin)))
 #define PIN_OUTPUT 0x003u /* input buffer disconnected */
 #define PIN_FAST_OUTPUT 0x303u /* high drive, for 8 MHz */
+#define PIN_FAST_CLOCK 0x301u  /* and its input buffer, without which a SPIM does not work (Nordic's nrfx_spim.c) */
 #define PIN_INPUT 0x000u
 #define PIN_INPUT_PULL_DOWN 0x004u
 #define PIN_INPUT_PULL_UP 0x00Cu

@@ -11,6 +11,7 @@
 #define PIN_CHIP_IRQ 19u
 #define PIN_CHIP_MOSI 20u
 #define PIN_CHIP_RESET 24u
+#define PIN_AWAKE 15u /* free; high while the processor is awake, for an oscilloscope */
 
 /* On the DWM1001-DEV only, lit when low */
 #define PIN_LIGHT_READY 30u    /* green */

@@ -7,7 +7,7 @@
 
 #define IN_BYTES UARTE_MOST_BYTES
 #define OUT_BYTES 1024u
-#define STOP_TURNS 2000u /* loops of some 0.1 us: longer than the bytes in the receiver's buffer */
+#define WAIT_TURNS 2000u /* loops of some 0.1 us: longer than the five bytes that a receiver needs to stop */
 
 static uint8_t in_ring[IN_BYTES];
 static uint32_t in_at;
@@ -52,13 +52,23 @@ void serial_port_start(void)
     start_receiver();
 }
 
+static void wait_for(const volatile uint32_t *event)
+{
+    for (uint32_t turn = 0u; (turn < WAIT_TURNS) && (*event == 0u); turn++) {
+    }
+}
+
+/* A receiver that stops keeps up to four bytes more (PS 35), which TIMER1 has counted. They are flushed, or the next
+ * start would put them before the bytes that are counted then, and all that comes would be read four bytes late. */
 void serial_port_restart(void)
 {
     UARTE_SHORTS = 0u;
     UARTE_RXTO = 0u;
     UARTE_STOPRX = 1u;
-    for (uint32_t turn = 0u; (turn < STOP_TURNS) && (UARTE_RXTO == 0u); turn++) {
-    }
+    wait_for(&UARTE_RXTO);
+    UARTE_ENDRX = 0u;
+    UARTE_FLUSHRX = 1u;
+    wait_for(&UARTE_ENDRX);
     start_receiver();
 }
 

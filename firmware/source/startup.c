@@ -33,6 +33,7 @@ bool startup_take_fault(void)
 
 void startup_reset(void)
 {
+    __asm volatile("dsb" ::: "memory"); /* what is to survive has been written */
     SCB_AIRCR = AIRCR_RESET;
     for (;;) {
     }

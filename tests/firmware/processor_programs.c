@@ -165,6 +165,7 @@ static void run(void)
 {
     start_line();
     GPIO_OUTSET = 1u << 17;
+    GPIO_PIN_CNF(16) = PIN_FAST_CLOCK;
     GPIO_PIN_CNF(17) = PIN_OUTPUT;
     GPIO_PIN_CNF(19) = PIN_INPUT;
     SPIM_PSEL_SCK = 16u;

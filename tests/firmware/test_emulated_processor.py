@@ -7,6 +7,7 @@ import pytest
 from board_stage import line_of
 from cobs import cobs
 from emulator.build import build
+from emulator.processor import peripherals
 from emulator.processor.lone_board import DELAYS, IDENTITY, LoneBoard
 from processor_stage import build_program, needs_processor
 
@@ -18,6 +19,7 @@ from skyless.ticks import from_seconds, wrap
 
 pytestmark = needs_processor
 
+AWAKE_PIN = 15
 WATCHDOG, SOFTWARE, LOCKUP = 2, 4, 8
 """Bits of RESETREAS."""
 
@@ -350,6 +352,47 @@ def test_a_grounded_pin_makes_a_tag(firmware):
         stage.run(5e-3)
         capabilities.append(decode(records_of(stage)[0][:-2]).can_transmit)
     assert capabilities == [True, False]
+
+
+def test_what_the_processors_errata_ask_for_is_done(firmware):
+    """Anomalies 108 (RAM in sleep) and 136 (causes that are set besides the reset pin's)."""
+    stage = LoneBoard(firmware)
+    assert not stage.image.keeps_ram
+    stage.run(5e-3)
+    assert stage.image.keeps_ram
+    stage.image.pull_reset_pin()
+    stage.run(5e-3)
+    assert [decode(record[:-2]).reset_cause for record in records_of(stage)] == [0, 1]
+
+
+def test_a_crystal_that_never_starts_is_shown(firmware, monkeypatch):
+    monkeypatch.setattr(peripherals, "HFCLK_START_CYCLES", 1 << 60)
+    stage = LoneBoard(firmware)
+    for _ in range(5):
+        stage.run(0.01)
+        assert stage.image.leds == {"red"}
+    assert stage.sent == b""
+
+
+def test_a_line_that_starts_again_in_the_middle_of_bytes_is_not_behind(firmware):
+    """Bytes that come while the receiver stops are counted, but get to RAM only when they are flushed."""
+    stage = LoneBoard(firmware)
+    stage.run(5e-3)
+    stage.write(b"\1\1\0" * 40)
+    stage.run(3e-3)
+    stage.write(b"\0" + line_of(0x45, b""))
+    stage.run(3e-3)
+    assert [record[0] for record in records_of(stage)] == [1, 5]
+    assert stage.image.misuse.total() <= 1  # the fifth byte while it stops
+
+
+def test_a_pin_is_high_while_the_firmware_is_awake(firmware):
+    stage = LoneBoard(firmware)
+    seen = set()
+    for _ in range(2000):
+        stage.run(1.7e-6)
+        seen.add((stage.image.is_asleep, stage.image.is_driven(AWAKE_PIN, high=True)))
+    assert seen == {(False, False), (False, True), (True, False)}  # not yet an output; awake; asleep
 
 
 def test_a_run_repeats_itself(firmware):

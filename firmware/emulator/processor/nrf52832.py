@@ -35,7 +35,7 @@ ROLE_PIN: Final = 13
 UART_RX_PIN: Final = 11
 LED_PINS: Final = {"green": 30, "blue": 31, "red": 14, "red-2": 22}
 
-_WINDOWS: Final = [(0x10000000, 0x1000), (0x40000000, 0x20000), (0x50000000, 0x1000), (0xE000E000, 0x1000)]
+_WINDOWS: Final = [(0x10000000, 0x1000), (0x40000000, 0x20000), (0x50000000, 0x1000), (0xE000E000, 0x1000), (0xF0000000, 0x1000)]
 _PULL_UP: Final = 3
 _SPIM_START: Final = 0x40003010
 _SPIM_END: Final = 0x40003118
@@ -115,6 +115,15 @@ class Image:
         self.resets["power"] += 1
         self._start(cause=0, watchdog=None, retained=(0, 0))
 
+    def pull_reset_pin(self) -> None:
+        """The reset pin was low for a moment; all causes of resets are set then, as anomaly 136 has it."""
+        self._reset(p.RESET_BY_PIN | p.RESET_WATCHDOG | p.RESET_SOFTWARE | p.RESET_LOCKUP, "pin")
+
+    @property
+    def keeps_ram(self) -> bool:
+        """Whether the firmware has set what sleep needs for RAM not to be lost (anomaly 108)."""
+        return self._clock.registers[0xEE4] == p.KEEP_RAM
+
     @property
     def faults(self) -> list[str]:
         """Faults that the firmware has run into."""
@@ -124,6 +133,10 @@ class Image:
     def leds(self) -> frozenset[str]:
         """Lights that are on (``LED_PINS``); they are so when their pin is low."""
         return frozenset(name for name, pin in LED_PINS.items() if self._gpio.is_driven(pin, high=False))
+
+    def is_driven(self, pin: int, *, high: bool) -> bool:
+        """Whether the processor holds a pin at a level."""
+        return self._gpio.is_driven(pin, high)
 
     @property
     def is_asleep(self) -> bool:
@@ -189,6 +202,7 @@ class Image:
                 self._uarte,
                 self._spim,
                 p.Ficr(self, self._identity),
+                p.Revision(self),
             )
         }
         self._selected = False
@@ -343,6 +357,10 @@ class Image:
     def run_channels(self, address: int) -> None:
         """Start what PPI connects to an event."""
         self._ppi.on_event(address)
+
+    def has_input_buffer(self, pin: int) -> bool:
+        """Whether the processor sees a pin's level."""
+        return self._gpio.has_input_buffer(pin)
 
     def update_interrupt(self, peripheral: p.Peripheral) -> None:
         """A peripheral's line may have changed."""

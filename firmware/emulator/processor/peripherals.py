@@ -16,11 +16,14 @@ HFCLK_START_CYCLES: Final = 64 * 360
 LFCLK_START_CYCLES: Final = 64 * 600
 """Start-up times of the crystal and of the RC oscillator, as the specification gives them."""
 
-RESET_PIN: Final = 1 << 0
+RESET_BY_PIN: Final = 1 << 0
 RESET_WATCHDOG: Final = 1 << 1
 RESET_SOFTWARE: Final = 1 << 2
 RESET_LOCKUP: Final = 1 << 3
 """Bits of RESETREAS."""
+
+KEEP_RAM: Final = 0x45
+"""What the factory has left for anomaly 108 of this processor, in the bits that count."""
 
 _WATCHDOG_KEY: Final = 0x6E524635
 _NEVER: Final = 1 << 62
@@ -144,8 +147,8 @@ class Clock(Peripheral):
         return 0x100, 0x104
 
     def register_offsets(self) -> tuple[int, ...]:
-        """RESETREAS, LFCLKSRC, GPREGRET, GPREGRET2, DCDCEN."""
-        return 0x400, 0x518, 0x51C, 0x520, 0x578
+        """RESETREAS, LFCLKSRC, GPREGRET, GPREGRET2, DCDCEN, and the one that anomaly 108 is about."""
+        return 0x400, 0x518, 0x51C, 0x520, 0x578, 0xEE4
 
     def start_hfclk(self) -> None:
         """Start the crystal."""
@@ -313,6 +316,10 @@ class Gpio(Peripheral):
         """Whether the processor holds a pin at a level."""
         return bool(self.directions >> pin & 1) and bool(self.out >> pin & 1) == high
 
+    def has_input_buffer(self, pin: int) -> bool:
+        """Whether the processor sees a pin's level."""
+        return not self.configured[pin] & 2
+
     def read(self, offset: int) -> int:
         """A load."""
         if offset == 0x510:
@@ -353,7 +360,7 @@ class Gpio(Peripheral):
         elif 0x700 <= offset < 0x780:
             pin = (offset - 0x700) >> 2
             self.configured[pin] = value
-            self._inputs = [pin for pin in range(32) if not self.configured[pin] & 2]
+            self._inputs = [pin for pin in range(32) if self.has_input_buffer(pin)]
             self.directions = self.directions & ~(1 << pin) | (value & 1) << pin
         else:
             raise self.unknown(offset)
@@ -504,13 +511,28 @@ class Nvmc(Peripheral):
 
 
 class Ficr(Peripheral):
-    """Factory information: the device identifier, low word first."""
+    """Factory information: the device identifier, low word first, and the value for anomaly 108."""
 
     base = 0x10000000
 
     def __init__(self, system: System, identity: bytes) -> None:
         super().__init__(system)
         self.registers = {0x060 + 4 * n: int.from_bytes(identity[4 * n : 4 * n + 4], "little") for n in range(2)}
+        self.registers[0x258] = 0xFFFFFF00 | KEEP_RAM
+
+    def write(self, offset: int, value: int) -> None:  # noqa: ARG002
+        """A store, which hardware has not."""
+        raise self.unknown(offset)
+
+
+class Revision(Peripheral):
+    """Identification of the processor: an nRF52832 of revision 1, which is 5 there."""
+
+    base = 0xF0000000
+
+    def __init__(self, system: System) -> None:
+        super().__init__(system)
+        self.registers = {0xFE0: 0x06, 0xFE4: 0x00, 0xFE8: 0x50}
 
     def write(self, offset: int, value: int) -> None:  # noqa: ARG002
         """A store, which hardware has not."""

@@ -19,12 +19,16 @@ class DataSystem(System, Protocol):
     def plan(self, cycles: int, happen: Callable[[], None]) -> None:
         """Let something happen at a count of cycles, unless the processor is reset before."""
 
+    def has_input_buffer(self, pin: int) -> bool:
+        """Whether the processor sees a pin's level."""
+
 
 class Uarte(Peripheral):
     """UARTE0. ``send`` gets the bytes that have left completely, up to a 0 or to the transfer's end.
 
-    A receiver that has not been started loses bytes (hardware keeps up to six); STOPRX acts at once. Parity, flow
-    control and line errors are not modelled.
+    A receiver that has not been started loses bytes. One that is stopped keeps up to four more of those that arrive in
+    five bytes' time, until RXTO (assumed from what the specification says of flow control); FLUSHRX or the next STARTRX
+    writes them to RAM. Parity, flow control and line errors are not modelled.
     """
 
     base = 0x40002000
@@ -38,7 +42,9 @@ class Uarte(Peripheral):
         self.received = self.sent = 0
         """Bytes."""
         self._into = self._room = self._filled = 0
-        self._is_receiving = False
+        self._is_receiving = self._is_stopping = False
+        self._kept = b""
+        """Bytes that came while it stopped."""
         self._transfer = 0
         """Number of the transfer that is being sent; 0 while none is."""
         self._transfers = 0
@@ -89,7 +95,8 @@ class Uarte(Peripheral):
     def start_rx(self) -> None:
         """Receive into the buffer that is set now."""
         if self._is_ready(0x514):
-            self._into, self._room, self._filled = self.registers[0x534], self.registers[0x538], 0
+            self._into, self._room, self._filled = self.registers[0x534], self.registers[0x538], len(self._kept)
+            self._write_kept()
             self._is_receiving = True
             self.happen(0x14C)
 
@@ -97,12 +104,24 @@ class Uarte(Peripheral):
         """Receive no more, unless ENDRX starts it again."""
         if self._is_receiving:
             self._end_rx()
+        if not self._is_receiving:
+            self._is_stopping = True
+            self.system.plan(self.system.cycles + round(5 * self._byte_cycles), self._stopped)
+
+    def _stopped(self) -> None:
+        self._is_stopping = False
         self.happen(self._RXTO)
 
     def flush_rx(self) -> None:
-        """There is never anything to flush."""
-        self.registers[0x53C] = 0
+        """Write what came while it stopped to RAM."""
+        self.registers[0x53C] = len(self._kept)
+        self._write_kept()
         self.happen(self._ENDRX)
+
+    def _write_kept(self) -> None:
+        if self._kept:
+            self.system.store(self.registers[0x534], self._kept)
+            self._kept = b""
 
     def _end_rx(self) -> None:
         self.registers[0x53C] = self._filled
@@ -114,6 +133,11 @@ class Uarte(Peripheral):
     def receive(self, data: bytes) -> None:
         """These bytes have arrived."""
         for byte in data:
+            if self._is_stopping and len(self._kept) < 4:
+                self._kept += bytes((byte,))
+                self.received += 1
+                self.happen(self._RXDRDY)
+                continue
             if not self._is_receiving or self._filled == self._room:
                 self.system.misuse["uarte-byte-lost"] += 1
                 continue
@@ -233,6 +257,8 @@ class Spim(Peripheral):
             return
         if self.registers[0x554]:
             self.system.misuse["spim-wrong-mode"] += 1  # the chip uses mode 0, most significant bit first
+        if not self.system.has_input_buffer(self.registers[0x508]):
+            self.system.misuse["spim-clock-without-input-buffer"] += 1  # hardware does not finish the transfer then
         receive, transmit = self.registers[0x538], self.registers[0x548]
         if receive == 1 and transmit <= 1:
             self.system.misuse["spim-erratum-58"] += 1  # one byte more would be clocked
