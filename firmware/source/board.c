@@ -18,7 +18,8 @@ static const uint8_t VERSION[3] = {0u, 2u, 0u};
 #define FAST_POLL_US 250u
 /* So many polls in a row that disagree with the interrupt line show that it is stuck. */
 #define DISAGREEMENTS 4u
-/* A silence of this length is an empty slot of 2.1 ms, with 1.6 ms left of it. */
+/* So long after a reception was reported a slot of 2.1 ms was empty, and the next frame begins in 1.2 ms. Of slots from 2.7
+ * to 4.1 ms it may not be one, which costs one reception. */
 #define QUIET_US 2400u
 /* Nothing long is begun in this time before a frame is due. */
 #define CLEARANCE_US 5000
@@ -347,7 +348,7 @@ static bool serve_host(struct board *board)
 
 /* What can wait */
 
-/* Whether a millisecond and a half is free: the rest of the own slot, or of an empty one; never where a frame is on its
+/* Whether the time of a measurement is free: the rest of the own slot, or of an empty one; never where a frame is on its
  * way out, nor shortly before one is due. */
 static bool is_free(const struct board *board, uint32_t now_us)
 {
