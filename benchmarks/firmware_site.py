@@ -1,10 +1,11 @@
 """A site on the firmware: frames in time, receptions that reach the hosts, errors. Emulated, in virtual time.
 
 python benchmarks/firmware_site.py [--boards image|host] [--slot-ms 2.1 ...] [--seconds 5] [--seeds 4]
-    [--usb] [--pauses] [--lead-ms 1.8 ...] [--repeat]
+    [--anchors 7] [--usb] [--pauses] [--lead-ms 1.8 ...] [--repeat]
 
 ``image`` is the ARM image on an emulated nRF52832, ``host`` the same C compiled for this computer. The lab's six
-anchors and a tag that walks; the programs are those of ``skyless anchor`` and ``skyless tag``. ``--usb``: through a
+anchors, a seventh in the middle of a short wall, and a tag that walks; the programs are those of ``skyless anchor`` and
+``skyless tag``. ``--usb``: through a
 debugger's probe. ``--pauses``: hosts need time, as a Raspberry Pi with CPython. ``--lead-ms``: anchors keep to this
 lead instead of adapting theirs. ``--repeat``: each run again with the emulated radio, whose fixes must be the same bit
 for bit.
@@ -33,7 +34,7 @@ from skyless.evaluation.compile_ahead import compile_kernels
 from skyless.evaluation.scenarios import Request, trajectories_of
 from skyless.nodes import anchor
 from skyless.site.lab import ideal_lab_site
-from skyless.site.model import ScheduleSite
+from skyless.site.model import AnchorSite, ScheduleSite
 
 _WARMUP_S = 1.0
 
@@ -60,10 +61,13 @@ def fixed_lead(*, fixed: bool) -> Iterator[None]:
 
 
 def site_of(
-    slot_ms: float, make: MakeBoard, seed: int, wire: WireSettings, lead_ms: float | None = None
+    slot_ms: float, anchors: int, make: MakeBoard, seed: int, wire: WireSettings, lead_ms: float | None = None
 ) -> EmulatedSite:
-    """The lab with this slot length, and a tag that walks."""
-    lab = replace(ideal_lab_site(), schedule=ScheduleSite(slot_s=1e-3 * slot_ms))
+    """The lab with this slot length and so many anchors, and a tag that walks."""
+    lab = ideal_lab_site()
+    lab = replace(
+        lab, anchors=(*lab.anchors, AnchorSite(7, 3.0, 0.0))[:anchors], schedule=ScheduleSite(slot_s=1e-3 * slot_ms)
+    )
     lead_s = None if lead_ms is None else 1e-3 * lead_ms
     return EmulatedSite(lab, trajectories_of(Request(lab, seed=seed)), make, seed=seed, wire=wire, lead_s=lead_s)
 
@@ -97,6 +101,7 @@ def main() -> None:
     parser.add_argument("--boards", choices=("image", "host"), default="image")
     parser.add_argument("--slot-ms", type=float, nargs="+", default=[2.1])
     parser.add_argument("--lead-ms", type=float, nargs="+", default=[None])
+    parser.add_argument("--anchors", type=int, choices=(4, 5, 6, 7), default=7)
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--usb", action="store_true")
@@ -114,7 +119,7 @@ def main() -> None:
             results, repeated, begun_s = [], 0, time.perf_counter()
             for seed in range(1, asked.seeds + 1):
                 with fixed_lead(fixed=lead_ms is not None):
-                    site = site_of(slot_ms, make, seed, wire, lead_ms)
+                    site = site_of(slot_ms, asked.anchors, make, seed, wire, lead_ms)
                     site.run(asked.seconds)
                     results.append(site.result(_WARMUP_S))
                     repeated += asked.repeat and is_repeated(site, asked.seconds)

@@ -7,6 +7,7 @@ import pytest
 
 from skyless.air.beacon import Beacon, Heard
 from skyless.air.codec import encode
+from skyless.air.ieee802154 import fcs
 from skyless.air.masterless_packets import Packet, Relay
 from skyless.air.reception import Reception, Transmission
 from skyless.anchor import Anchor
@@ -23,6 +24,10 @@ from skyless.simulation.world import World
 from skyless.site.lab import ideal_lab_site
 
 DELAY = 16_450
+
+
+def frame_of(body):
+    return body + fcs(body)
 
 
 class Radio:
@@ -94,10 +99,10 @@ def test_another_channel_or_preamble_is_refused(at):
 
 def test_a_frame_leaves_at_dx_without_its_low_bits_and_the_antenna_delay_later():
     host = Host().ready()
-    frame = b"a frame"
+    frame = frame_of(b"a frame")
     assert host.say(host.writer.tx_at(2**40 - 1, frame)) == []
     tx_ticks = (2**40 - 512 + DELAY) % 2**40
-    assert host.radio.transmissions == [Transmission(b"a frame", tx_ticks)]
+    assert host.radio.transmissions == [Transmission(frame, tx_ticks)]
     assert host.say(host.writer.tx_at(512, frame)) == [TooLate(512, link.LATE_BUSY)]
     host.said.clear()
     host.board.on_radio_event(Sent(tx_ticks))
@@ -108,10 +113,8 @@ def test_a_frame_leaves_at_dx_without_its_low_bits_and_the_antenna_delay_later()
     host.board.on_radio_event(Sent(5))  # none of its own
     (status,) = host.say(host.writer.ask_status())
     assert (status.sent, status.late) == (1, 2)
-    for length in (0, 128):
-        assert host.say(host.writer.record(link.TX_AT, bytes(5 + length))) == [
-            NotDone(link.TX_AT, link.REFUSED_MALFORMED)
-        ]
+    for wrong in (b"", b"\0\0", frame[:-1] + b"\1", frame_of(bytes(126))):
+        assert host.say(host.writer.tx_at(512, wrong)) == [NotDone(link.TX_AT, link.REFUSED_MALFORMED)]
     silent = Host(can_transmit=False).ready()
     assert silent.say(silent.writer.tx_at(512, frame)) == [TooLate(512, link.LATE_NOT_READY)]
 
@@ -133,7 +136,7 @@ def test_a_board_whose_radio_is_dead_logs_nothing_and_one_that_is_not_fetched_co
 def test_garbage_from_the_host_is_counted_and_hurts_nothing():
     host, rng = Host().ready(), random.Random(2)
     for _ in range(500):
-        record = bytearray(host.writer.tx_at(512, b"frame"))
+        record = bytearray(host.writer.tx_at(512, frame_of(b"frame")))
         record[rng.randrange(len(record))] ^= 1 << rng.randrange(8)
         host.board.on_host_data(rng.randbytes(rng.randrange(200)) + b"\0" + bytes(record))
     host.board.on_host_data(b"\0")

@@ -12,6 +12,7 @@ import pytest
 from radio_events import radio_events
 from serial_stage import PlayedBoard, linked, quantised
 
+from skyless.air.ieee802154 import fcs
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.anchor import Anchor
 from skyless.errors import SkylessError
@@ -30,6 +31,10 @@ from skyless.simulation.world import World
 from skyless.site.lab import lab_site
 
 LAB = lab_site()
+
+
+def frame_of(body):
+    return body + fcs(body)
 
 
 def receptions(seconds):
@@ -102,14 +107,14 @@ def test_frames_are_sent_at_their_tick_and_their_end_is_reported():
         async with linked() as (board, host):
             ticks = 512 * 10**6 + AntennaDelays().tx_ticks
             for event in (Sent, Late):
-                host.radio.transmit(Transmission(b"a frame", ticks))
+                host.radio.transmit(Transmission(frame_of(b"a frame"), ticks))
                 while not board.radio.transmissions:
                     await asyncio.sleep(0.001)
-                assert board.radio.transmissions.pop() == Transmission(b"a frame", ticks)
+                assert board.radio.transmissions.pop() == Transmission(frame_of(b"a frame"), ticks)
                 board.protocol.on_radio_event(event(ticks))
                 assert await host.until(event) == event(ticks)
-            host.radio.transmit(Transmission(b"one", ticks))
-            host.radio.transmit(Transmission(b"two", ticks + 512))  # there is room for one
+            host.radio.transmit(Transmission(frame_of(b"one"), ticks))
+            host.radio.transmit(Transmission(frame_of(b"two"), ticks + 512))  # there is room for one
             assert await host.until(Late, 2) == Late(ticks + 512)
             async with asyncio.timeout(20):
                 while (host.radio._session.status.sent, host.radio._session.status.late) != (1, 2):
@@ -122,7 +127,7 @@ def test_frames_are_sent_at_their_tick_and_their_end_is_reported():
 def test_a_board_that_only_listens_sends_nothing():
     async def play():
         async with linked(can_transmit=False) as (board, host):
-            host.radio.transmit(Transmission(b"one", 77 * 512))
+            host.radio.transmit(Transmission(frame_of(b"one"), 77 * 512))
             assert await host.until(Late) == Late(77 * 512)
             assert board.radio.transmissions == []
 

@@ -10,6 +10,7 @@ from typing import Final, Literal, Protocol
 
 from skyless.air.beacon import Beacon
 from skyless.air.codec import decode_cached
+from skyless.air.ieee802154 import is_intact
 from skyless.air.reception import Diagnostics, Reception, Transmission
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
 from skyless.nodes.process import Log
@@ -102,7 +103,7 @@ class LinkProtocol:
         elif kind == link.RX_ON and self._configured:
             self._receiving = True
             self._status()
-        elif kind == link.TX_AT and link.TX_FRAME_AT < len(record) <= link.TX_FRAME_AT + link.MAX_FRAME_BYTES:
+        elif kind == link.TX_AT and _is_frame(record[link.TX_FRAME_AT :]):
             dx_ticks = int.from_bytes(record[link.BODY_AT : link.TX_FRAME_AT], "little")
             self._transmit(dx_ticks, record[link.TX_FRAME_AT :])
         elif kind in (link.RX_ON, link.TX_AT):
@@ -151,6 +152,11 @@ class LinkProtocol:
 
 
 (_CONFIG,) = link.Reader().read(link.Writer().config(0, 0))
+
+
+def _is_frame(psdu: bytes) -> bool:
+    """Whether a board sends these bytes: what the line has damaged is refused."""
+    return 3 <= len(psdu) <= link.MAX_FRAME_BYTES and is_intact(psdu)
 
 
 class ListenerProtocol:
