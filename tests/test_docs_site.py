@@ -32,7 +32,7 @@ SOURCES = ("src", "tests", "benchmarks", "scripts", "firmware", "docs", "example
 OTHER_PROGRAMS = {
     "--nthreads",
     "--nworkers",
-    "--eraseall",
+    "--chiperase",
     "--no-dev",
     "--compile-bytecode",
     "--help",

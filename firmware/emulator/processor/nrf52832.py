@@ -35,7 +35,13 @@ ROLE_PIN: Final = 13
 UART_RX_PIN: Final = 11
 LED_PINS: Final = {"green": 30, "blue": 31, "red": 14, "red-2": 22}
 
-_WINDOWS: Final = [(0x10000000, 0x1000), (0x40000000, 0x20000), (0x50000000, 0x1000), (0xE000E000, 0x1000), (0xF0000000, 0x1000)]
+_WINDOWS: Final = [
+    (0x10000000, 0x1000),
+    (0x40000000, 0x20000),
+    (0x50000000, 0x1000),
+    (0xE000E000, 0x1000),
+    (0xF0000000, 0x1000),
+]
 _PULL_UP: Final = 3
 _SPIM_START: Final = 0x40003010
 _SPIM_END: Final = 0x40003118
