@@ -10,9 +10,9 @@
 #include "startup.h"
 
 #define WATCHDOG_PERIODS (2u * 32768u) /* 2 s; no turn lasts longer than 30 ms, no sleep longer than 0.6 s */
-#define RESET_LOW_US 100u
-#define PULL_UP_US 20u
-#define FAULT_CAUSE 0x80u
+#define RESET_LOW_US 100u /* the chip needs some ns (DW1000 data sheet, RSTn) */
+#define PULL_UP_US 20u    /* 13 kOhm load a wire of 100 pF in some us */
+#define FAULT_CAUSE 0x80u /* in HELLO: a fault that the firmware noticed */
 /* Shorter sleeps are waited for: the compare value must still lie ahead when it is written. */
 #define SHORTEST_SLEEP_US 4u
 

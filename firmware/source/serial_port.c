@@ -6,7 +6,7 @@
 #include "pins.h"
 
 #define IN_BYTES UARTE_MOST_BYTES
-#define OUT_BYTES 1024u
+#define OUT_BYTES 1024u /* eight receptions with 100 bytes: 10 ms of the line */
 #define WAIT_TURNS 2000u /* loops of some 0.1 us: longer than the five bytes that a receiver needs to stop */
 
 static uint8_t in_ring[IN_BYTES];

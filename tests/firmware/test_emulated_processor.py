@@ -171,6 +171,15 @@ def test_a_fault_in_the_handler_is_a_lockup(folder):
     assert len(stage.image.faults) == 2
 
 
+def test_a_stack_that_is_too_long_changes_no_variable(folder):
+    """Below it is nothing: the processor can neither go on nor enter its handler."""
+    beyond = '__asm volatile("ldr r0, =stack_top-2040\\n mov sp, r0\\n push {r0-r3}")'
+    stage = LoneBoard(build_program(folder, "FAULT", FORBIDDEN=beyond))
+    stage.run(100e-6)
+    assert stage.sent[2] == LOCKUP
+    assert set(stage.image.resets) == {"lockup"}
+
+
 @pytest.mark.parametrize(
     ("forbidden", "message"),
     [
