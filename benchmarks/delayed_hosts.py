@@ -101,10 +101,18 @@ class AnchorHost(Host):
     """An anchor's, which does what ``nodes/anchor.py`` does: hands frames over earlier after a late one."""
 
     def __init__(
-        self, medium: Medium[Any], site: Site, node: int, latency: HostLatency, generator: random.Random
+        self,
+        medium: Medium[Any],
+        site: Site,
+        node: int,
+        latency: HostLatency,
+        generator: random.Random,
+        lead_s: float | None,
     ) -> None:
-        self.machine = Anchor(site, site.anchors[node].id, lead_s=SPI_LEAD_S)
-        self.lead_s = SPI_LEAD_S
+        """``lead_s``: the lead that it keeps to; None for one that adapts."""
+        self.lead_s = SPI_LEAD_S if lead_s is None else lead_s
+        self.machine = Anchor(site, site.anchors[node].id, lead_s=self.lead_s)
+        self._adapts = lead_s is None
         self.late = 0
         self._answered = True
         self._wait_s = 0.0
@@ -148,11 +156,13 @@ class AnchorHost(Host):
             self.machine.hear(event)
         elif isinstance(event, Sent):
             self._answered = True
-            self.lead_s = max(self.lead_s * LEAD_LOSS, SPI_LEAD_S)
+            if self._adapts:
+                self.lead_s = max(self.lead_s * LEAD_LOSS, SPI_LEAD_S)
         elif isinstance(event, Late):
             self._answered = True
             self.late += 1
-            self.lead_s = min(self.lead_s * LEAD_GAIN, MAX_LEAD_S)
+            if self._adapts:
+                self.lead_s = min(self.lead_s * LEAD_GAIN, MAX_LEAD_S)
             self._wait_s = ASK_AGAIN_S
 
 

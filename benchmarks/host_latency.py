@@ -1,14 +1,16 @@
 """Which slot length suits a Raspberry Pi: the table of docs/hardware.md. Simulated; some minutes.
 
-python benchmarks/host_latency.py [SECONDS [SEEDS [SLOT_MS ...]]]
+python benchmarks/host_latency.py [SECONDS [SEEDS [SLOT_MS ...]]] [--lead-ms 1.8 ...]
 
 A site whose anchors and tag are DW1000s on the SPI of slow hosts. Hosts run the driver
 (``skyless.radios.dw1000.driver``) on the register model; every transfer costs time, in which the air and the other
-hosts go on. Frames that come too late are skipped, and cost their slots.
+hosts go on. Frames that come too late are skipped, and cost their slots. ``--lead-ms``: anchors keep to this lead
+instead of adapting theirs.
 """
 
+import argparse
 import random
-import sys
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -34,6 +36,8 @@ _SLOTS_MS: Final = (1.05, 2.1, 2.5, 5.0, 10.0)
 _QA: Final = 0.3
 _SPEED_STD_MPS: Final = 1.0
 _WARMUP_S: Final = 3.0
+_TURNAROUND_S: Final = 10e-6
+"""The chips themselves decide whether a frame is too late."""
 
 
 class LatencyResult(Struct, frozen=True):
@@ -69,18 +73,20 @@ class LatencyResult(Struct, frozen=True):
 class LatencyWorld:
     """The lab with another slot length on such hosts, deterministic by its seed."""
 
-    def __init__(self, slot_s: float, latency: HostLatency, seed: int = 1) -> None:
+    def __init__(self, slot_s: float, latency: HostLatency, seed: int, lead_s: float | None) -> None:
         lab = ideal_lab_site()
         self.site = replace(lab, schedule=ScheduleSite(slot_s=slot_s))
         request = Request(self.site, seed=seed)
         self.trajectory = trajectories_of(request)[0]
         faults = replace(impairments_of(request, self.site), diagnostics=True)
-        self.medium: Medium[None] = Medium(self.site, [TagSpec(self.trajectory)], faults, seed, self._deliver)
+        self.medium: Medium[None] = Medium(
+            self.site, [TagSpec(self.trajectory)], faults, seed, self._deliver, _TURNAROUND_S
+        )
         generators = [random.Random(f"{seed} {node}") for node in range(len(self.site.anchors) + 1)]
         for node in range(len(generators)):
             self.medium.switch_on(node)
         self.anchors = [
-            AnchorHost(self.medium, self.site, node, latency, generators[node])
+            AnchorHost(self.medium, self.site, node, latency, generators[node], lead_s)
             for node in range(len(self.site.anchors))
         ]
         self.tag = TagHost(self.medium, len(self.anchors), latency, generators[-1], _QA)
@@ -114,9 +120,11 @@ class LatencyWorld:
                 self.hosts[int(row["node"])].arrive(reception, slot, row["position_m"].copy())
 
 
-def run_hosts(slot_s: float, latency: HostLatency, seconds: float, seed: int = 1) -> LatencyResult:
-    """Run the lab on such hosts for some seconds, ``_WARMUP_S`` included."""
-    world = LatencyWorld(slot_s, latency, seed)
+def run_hosts(
+    slot_s: float, latency: HostLatency, seconds: float, seed: int = 1, lead_s: float | None = None
+) -> LatencyResult:
+    """Run the lab on such hosts for some seconds, ``_WARMUP_S`` included; ``lead_s``: a lead that anchors keep to."""
+    world = LatencyWorld(slot_s, latency, seed, lead_s)
     world.run(seconds)
     sent = {slot: position_m for slot, time_s, position_m in world.sent_frames if time_s >= _WARMUP_S}
     first, last = min(sent), max(sent)
@@ -170,9 +178,16 @@ def _bound(site: Site, world: LatencyWorld, heard: NDArray[np.bool_], first: int
 
 
 def main() -> None:
-    """Print the table."""
-    seconds, seeds = (float(word) for word in (*sys.argv[1:3], *("10", "4")[len(sys.argv[1:3]) :]))
-    slots_ms = [float(word) for word in sys.argv[3:]] or _SLOTS_MS
+    """Print the table, or the one of leads."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("seconds", type=float, nargs="?", default=10.0)
+    parser.add_argument("seeds", type=int, nargs="?", default=4)
+    parser.add_argument("slots_ms", type=float, nargs="*", default=_SLOTS_MS)
+    parser.add_argument("--lead-ms", type=float, nargs="+")
+    asked = parser.parse_args()
+    if asked.lead_ms:
+        _print_leads(asked.lead_ms, asked.slots_ms, asked.seconds, asked.seeds)
+        return
     heads = (
         "slot",
         "messages/s",
@@ -184,13 +199,11 @@ def main() -> None:
         "ratio",
         "without latency",
     )
-    print(f"| {' | '.join(heads)} |")
-    print("|---" * len(heads) + "|")
-    for slot_ms in slots_ms:
-        results = runs(slot_ms, HostLatency(), seconds, int(seeds))
-        assert not any(result.wrong_stamps or result.misused for result in results)
+    _print_heads(heads)
+    for slot_ms in asked.slots_ms:
+        results = runs(slot_ms, HostLatency(), asked.seconds, asked.seeds)
         error_m, bound_m = rms(results)
-        ideal_m, ideal_bound_m = rms(runs(slot_ms, HostLatency.none(), seconds, int(seeds)))
+        ideal_m, ideal_bound_m = rms(runs(slot_ms, HostLatency.none(), asked.seconds, asked.seeds))
         sent, slots = (sum(getattr(result, name) for result in results) for name in ("sent", "slots"))
         heard, relayed = (np.mean([getattr(result, name) for result in results]) for name in ("heard", "relayed"))
         print(
@@ -201,9 +214,31 @@ def main() -> None:
         )
 
 
-def runs(slot_ms: float, latency: HostLatency, seconds: float, seeds: int) -> list[LatencyResult]:
-    """One run for each seed."""
-    return [run_hosts(1e-3 * slot_ms, latency, seconds, seed) for seed in range(1, seeds + 1)]
+def _print_leads(leads_ms: Sequence[float], slots_ms: Sequence[float], seconds: float, seeds: int) -> None:
+    _print_heads(("slot", "lead", "skipped", "anchors heard", "error"))
+    for slot_ms in slots_ms:
+        for lead_ms in leads_ms:
+            results = runs(slot_ms, HostLatency(), seconds, seeds, 1e-3 * lead_ms)
+            skipped, relayed = (np.mean([getattr(one, name) for one in results]) for name in ("skipped", "relayed"))
+            print(
+                f"| {slot_ms:g} ms | {lead_ms:g} ms | {100 * skipped:.2f} % | {100 * relayed:.1f} % "
+                f"| {100 * rms(results)[0]:.2f} cm |",
+                flush=True,
+            )
+
+
+def _print_heads(heads: Sequence[str]) -> None:
+    print(f"| {' | '.join(heads)} |")
+    print("|---" * len(heads) + "|")
+
+
+def runs(
+    slot_ms: float, latency: HostLatency, seconds: float, seeds: int, lead_s: float | None = None
+) -> list[LatencyResult]:
+    """One run for each seed; none with a wrong stamp."""
+    results = [run_hosts(1e-3 * slot_ms, latency, seconds, seed, lead_s) for seed in range(1, seeds + 1)]
+    assert not any(result.wrong_stamps or result.misused for result in results)
+    return results
 
 
 def rms(results: list[LatencyResult]) -> tuple[float, float]:

@@ -40,6 +40,7 @@ OTHER_PROGRAMS = {
     "--user",
     "--ros-args",
     "--spin-time",
+    "--recover",
 }
 GENERATOR = ("sphinx", "myst_parser", "furo", "latex2mathml")
 
