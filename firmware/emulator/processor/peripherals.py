@@ -16,11 +16,10 @@ HFCLK_START_CYCLES: Final = 64 * 360
 LFCLK_START_CYCLES: Final = 64 * 600
 """Start-up times of the crystal and of the RC oscillator, as the specification gives them."""
 
-RESET_PIN: Final = 1 << 0
 RESET_WATCHDOG: Final = 1 << 1
 RESET_SOFTWARE: Final = 1 << 2
 RESET_LOCKUP: Final = 1 << 3
-"""Bits of RESETREAS."""
+"""Bits of RESETREAS; nothing here pulls the reset pin."""
 
 _WATCHDOG_KEY: Final = 0x6E524635
 _NEVER: Final = 1 << 62
@@ -123,9 +122,8 @@ class Clock(Peripheral):
     base = 0x40000000
     irq = 0
 
-    def __init__(self, system: System, cause: int, retained: tuple[int, int]) -> None:
+    def __init__(self, system: System, cause: int) -> None:
         super().__init__(system)
-        self.registers[0x51C], self.registers[0x520] = retained
         self.registers[0x400] = cause
         self._ready = {0x100: _NEVER, 0x104: _NEVER}
 
@@ -144,8 +142,8 @@ class Clock(Peripheral):
         return 0x100, 0x104
 
     def register_offsets(self) -> tuple[int, ...]:
-        """RESETREAS, LFCLKSRC, GPREGRET, GPREGRET2, DCDCEN."""
-        return 0x400, 0x518, 0x51C, 0x520, 0x578
+        """RESETREAS, LFCLKSRC, DCDCEN."""
+        return 0x400, 0x518, 0x578
 
     def start_hfclk(self) -> None:
         """Start the crystal."""
