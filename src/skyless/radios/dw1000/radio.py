@@ -17,7 +17,7 @@ OVERDUE_TICKS: Final = from_seconds(1e-3)
 CHECK_S: Final = 1.0
 """A chip from which nothing came for this time is asked whether it still has its settings."""
 
-SPI_LEAD_S: Final = 1.8e-3
+SPI_LEAD_S: Final = 1.5e-3
 """The preamble, seven transfers of up to 0.1 ms, a reception that is served before, and a host's timers
 (``benchmarks/host_latency.py``)."""
 
