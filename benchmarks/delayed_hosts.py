@@ -9,7 +9,8 @@ from typing import Any, Final
 sys.path.insert(0, str(Path(__file__).parents[1] / "firmware"))
 
 import numpy as np
-from emulator.site.host_programs import HostLatency, NodeAir, Process
+from emulator.site.host_programs import HostLatency, Process
+from emulator.site.site_air import NodeAir
 from numpy.typing import NDArray
 
 from skyless.air.reception import Diagnostics, Reception

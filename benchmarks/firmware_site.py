@@ -5,17 +5,17 @@ python benchmarks/firmware_site.py [--boards image|host] [--slot-ms 2.1 ...] [--
 
 ``image`` is the ARM image on an emulated nRF52832, ``host`` the same C compiled for this computer. The lab's six
 anchors, a seventh in the middle of a short wall, and a tag that walks; the programs are those of ``skyless anchor`` and
-``skyless tag``. ``--usb``: through a
-debugger's probe. ``--pauses``: hosts need time, as a Raspberry Pi with CPython. ``--lead-ms``: anchors keep to this
-lead instead of adapting theirs. ``--repeat``: each run again with the emulated radio, whose fixes must be the same bit
-for bit.
+``skyless tag``. The first second is not judged. ``--usb``: through a debugger's probe. ``--pauses``: hosts need time,
+as a Raspberry Pi with CPython. ``--lead-ms``: anchors keep to this lead instead of adapting theirs. ``--repeat``: each
+run again with the emulated radio, whose fixes must be the same bit for bit.
 """
 
 import argparse
 import contextlib
+import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -30,11 +30,13 @@ from emulator.site.repeated_site import RepeatedSite
 from emulator.site.serial_wire import WireSettings
 from msgspec.structs import replace
 
+from skyless.errors import SkylessError
 from skyless.evaluation.compile_ahead import compile_kernels
 from skyless.evaluation.scenarios import Request, trajectories_of
 from skyless.nodes import anchor
+from skyless.site.check import check_site
 from skyless.site.lab import ideal_lab_site
-from skyless.site.model import AnchorSite, ScheduleSite
+from skyless.site.model import AnchorSite, ScheduleSite, Site
 
 _WARMUP_S = 1.0
 
@@ -60,14 +62,19 @@ def fixed_lead(*, fixed: bool) -> Iterator[None]:
         anchor.LEAD_GAIN, anchor.LEAD_LOSS = before  # type: ignore[misc]
 
 
+def lab_of(slot_ms: float, anchors: int) -> Site:
+    """The lab with this slot length and so many anchors."""
+    lab = ideal_lab_site()
+    return replace(
+        lab, anchors=(*lab.anchors, AnchorSite(7, 3.0, 0.0))[:anchors], schedule=ScheduleSite(slot_s=1e-3 * slot_ms)
+    )
+
+
 def site_of(
     slot_ms: float, anchors: int, make: MakeBoard, seed: int, wire: WireSettings, lead_ms: float | None = None
 ) -> EmulatedSite:
-    """The lab with this slot length and so many anchors, and a tag that walks."""
-    lab = ideal_lab_site()
-    lab = replace(
-        lab, anchors=(*lab.anchors, AnchorSite(7, 3.0, 0.0))[:anchors], schedule=ScheduleSite(slot_s=1e-3 * slot_ms)
-    )
+    """The lab, and a tag that walks."""
+    lab = lab_of(slot_ms, anchors)
     lead_s = None if lead_ms is None else 1e-3 * lead_ms
     return EmulatedSite(lab, trajectories_of(Request(lab, seed=seed)), make, seed=seed, wire=wire, lead_s=lead_s)
 
@@ -77,6 +84,27 @@ def is_repeated(site: EmulatedSite, seconds: float) -> bool:
     again = RepeatedSite(site)
     again.run(seconds)
     return site.sent_frames() == again.sent_frames() and len(site.fixes["tag1"]) > 0 and site.fixes == again.fixes
+
+
+def more_than(least: float, kind: type = float) -> Callable[[str], float]:
+    """Reads an argument that must be a number above another."""
+
+    def number(text: str) -> float:
+        with contextlib.suppress(ValueError):
+            value = kind(text)
+            if least < value < math.inf:
+                return value
+        raise argparse.ArgumentTypeError(
+            f"{text!r} should be {'an integer' if kind is int else 'a number'} above {least:g}"
+        )
+
+    return number
+
+
+def show(line: str) -> None:
+    """Replace the line that says how far it is, on a terminal."""
+    if sys.stderr.isatty():
+        print(f"\r\033[K{line}", end="", file=sys.stderr, flush=True)
 
 
 def row(slot_ms: float, lead_ms: float | None, results: list[SiteResult], wall_s: float, repeated: str) -> str:
@@ -99,15 +127,20 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--boards", choices=("image", "host"), default="image")
-    parser.add_argument("--slot-ms", type=float, nargs="+", default=[2.1])
-    parser.add_argument("--lead-ms", type=float, nargs="+", default=[None])
+    parser.add_argument("--slot-ms", type=more_than(0), nargs="+", default=[2.1])
+    parser.add_argument("--lead-ms", type=more_than(0), nargs="+", default=[None])
     parser.add_argument("--anchors", type=int, choices=(4, 5, 6, 7), default=7)
-    parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--seconds", type=more_than(_WARMUP_S), default=5.0)
+    parser.add_argument("--seeds", type=more_than(0, int), default=4)
     parser.add_argument("--usb", action="store_true")
     parser.add_argument("--pauses", action="store_true")
     parser.add_argument("--repeat", action="store_true")
     asked = parser.parse_args()
+    for slot_ms in asked.slot_ms:
+        try:
+            check_site(lab_of(slot_ms, asked.anchors), Path("the lab"))
+        except SkylessError as error:
+            parser.error(f"argument --slot-ms: {error}")
     compile_kernels()
     make = make_boards(asked.boards)
     pieces = 64 if asked.boards == "host" else 1
@@ -120,12 +153,19 @@ def main() -> None:
             for seed in range(1, asked.seeds + 1):
                 with fixed_lead(fixed=lead_ms is not None):
                     site = site_of(slot_ms, asked.anchors, make, seed, wire, lead_ms)
-                    site.run(asked.seconds)
+                    what = f"slots of {slot_ms:g} ms, seed {seed} of {asked.seeds}"
+                    site.run(
+                        asked.seconds, lambda now_s, what=what: show(f"{what}: {now_s:.1f} of {asked.seconds:g} s")
+                    )
                     results.append(site.result(_WARMUP_S))
                     repeated += asked.repeat and is_repeated(site, asked.seconds)
             same = f"{repeated} of {asked.seeds}" if asked.repeat else "-"
+            show("")
             print(row(slot_ms, lead_ms, results, time.perf_counter() - begun_s, same), flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except KeyboardInterrupt:
+        sys.exit(130)

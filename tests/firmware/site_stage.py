@@ -34,10 +34,15 @@ def boards(kind):
     return partial(Image, elf=build("all"))
 
 
+def wire_of(kind):
+    """The host's C gets bytes in pieces, because each wakes its thread."""
+    return WireSettings(piece_bytes=64 if kind == "host" else 1)
+
+
 def site_of(kind, slot_ms, seed=1, trajectories=None):
     lab = replace(LAB, schedule=ScheduleSite(slot_s=1e-3 * slot_ms))
     paths = trajectories or trajectories_of(Request(lab, seed=seed))
-    return EmulatedSite(lab, paths, boards(kind), seed=seed, wire=WireSettings(piece_bytes=64 if kind == "host" else 1))
+    return EmulatedSite(lab, paths, boards(kind), seed=seed, wire=wire_of(kind))
 
 
 def play(site, script):

@@ -4,8 +4,11 @@ import re
 
 import pytest
 from emulator.build import FIRMWARE, build
-from emulator.processor.cycle_table import markdown, measure_cycles
 from processor_stage import needs_processor
+
+pytest.importorskip("unicorn")
+
+from emulator.processor.cycle_table import markdown, measure_cycles
 
 PAGE = FIRMWARE.parent / "docs" / "hardware.md"
 RENEW = "python benchmarks/firmware_cycles.py --write renews docs/hardware.md"

@@ -6,9 +6,7 @@ import subprocess
 import pytest
 from board_stage import line_of
 from cobs import cobs
-from emulator.build import build
-from emulator.processor import peripherals
-from emulator.processor.lone_board import DELAYS, IDENTITY, LoneBoard
+from emulator.build import FIRMWARE, build
 from processor_stage import build_program, needs_processor
 
 from skyless.air.ieee802154 import after_rmarker_s, fcs
@@ -16,6 +14,14 @@ from skyless.air.reception import Diagnostics
 from skyless.radios.serial.link_records import decode
 from skyless.simulation.dw1000 import registers as r
 from skyless.ticks import from_seconds, wrap
+
+pytest.importorskip("unicorn")
+
+from emulator.processor import peripherals
+from emulator.processor.cortex_m4 import EmulationError, load_elf
+from emulator.processor.cycles import cost_16, cost_32
+from emulator.processor.lone_board import DELAYS, IDENTITY, LoneBoard
+from emulator.processor.nrf52832 import LED_PINS
 
 pytestmark = needs_processor
 
@@ -191,16 +197,12 @@ def test_a_stack_that_is_too_long_changes_no_variable(folder):
     ],
 )
 def test_what_is_not_modelled_is_an_error_that_names_it(folder, forbidden, message):
-    from emulator.processor.cortex_m4 import EmulationError
-
     stage = LoneBoard(build_program(folder, "SILENT", FORBIDDEN=forbidden))
     with pytest.raises(EmulationError, match=message):
         stage.run(1e-3)
 
 
 def test_a_file_that_is_no_image_is_refused(tmp_path):
-    from emulator.processor.cortex_m4 import EmulationError, load_elf
-
     path = tmp_path / "image.elf"
     for data in (b"", b"\x7fELF", b"\x7fELF\x02\x01" + bytes(60)):
         path.write_bytes(data)
@@ -265,8 +267,6 @@ def test_code_in_two_lines_of_flash_waits_unless_it_is_cached(folder):
 
 def test_costs_of_all_instructions_of_the_firmware_are_those_of_their_names(firmware):
     """GNU's disassembler names every instruction; its cost follows from that name and its operands."""
-    from emulator.processor.cycles import cost_16, cost_32
-
     listing = subprocess.run(
         ["arm-none-eabi-objdump", "-d", "-j", ".text", firmware], capture_output=True, text=True, check=True
     )
@@ -354,6 +354,66 @@ def test_the_firmware_receives_and_sends(firmware):
     assert {"main", "board_turn"} <= set(functions)
 
 
+def lights_of(stage, seconds):
+    """Those that are on at instants of the next seconds, as sets of their names."""
+    seen = []
+    for _ in range(20):
+        stage.run(seconds / 20)
+        seen.append(set(stage.image.leds))
+    return seen
+
+
+def test_the_lights_say_what_the_page_of_the_firmware_states(firmware):
+    page = (FIRMWARE / "README.md").read_text("utf-8")
+    assert dict(re.findall(r"^\| \w+ \((D\d+), pin (\d+)\)", page, re.MULTILINE)) == {
+        name: str(pin) for name, pin in LED_PINS.items()
+    }
+    stage = LoneBoard(firmware)
+    waiting = lights_of(stage, 2.2)
+    assert set() in waiting
+    assert {"D9"} in waiting
+    assert all(lights <= {"D9"} for lights in waiting)
+    start_radio(stage)
+    assert lights_of(stage, 1.1) == [{"D9"}] * 20
+    frame = bytes(range(100)) + fcs(bytes(range(100)))
+    changes = {"D10": 0, "D11": 0}
+    for number in range(32):
+        before = set(stage.image.leds)
+        stage.chip.receive(frame, wrap(stage.timeline.now_ticks - from_seconds(after_rmarker_s(102))), Diagnostics())
+        stage.image.notify()
+        if number % 4 == 0:
+            dx = wrap(stage.timeline.now_ticks + from_seconds(4e-3)) & ~0x1FF
+            stage.write(line_of(0x43, dx.to_bytes(5, "little") + frame, number & 0xFF))
+        stage.run(6e-3)
+        if number % 4 == 0:
+            stage.chip.transceiver.finish()
+            stage.image.notify()
+        stage.run(1e-3)
+        for name in before ^ set(stage.image.leds):
+            changes[name] += 1
+    assert changes == {"D10": 2, "D11": 2}
+    stage.chip.pull_reset()
+    stage.chip.transfer = lambda out, hz: b"\xff" * len(out)  # the chip is gone
+    start_radio(stage)
+    assert "D12" in stage.image.leds
+
+
+def test_half_of_the_stack_is_never_used(firmware):
+    """A configuration, a reception, a frame that is sent, a measurement, and bytes that are no record."""
+    (size,) = re.findall(r"^STACK_BYTES = (\d+)K;", (FIRMWARE / "dwm1001.ld").read_text("utf-8"), re.MULTILINE)
+    stage = LoneBoard(firmware)
+    start_radio(stage)
+    frame = bytes(98) + fcs(bytes(98))
+    stage.chip.receive(frame, wrap(stage.timeline.now_ticks - from_seconds(after_rmarker_s(100))), Diagnostics())
+    stage.image.notify()
+    stage.run(3e-3)
+    dx = wrap(stage.timeline.now_ticks + from_seconds(4e-3)) & ~0x1FF
+    stage.write(b"garbage\0" + line_of(0x43, dx.to_bytes(5, "little") + frame, 2))
+    stage.run(20e-3)
+    assert len(stage.air.sent) == 1
+    assert 1024 * int(size) / 2 < stage.image.core.unused_stack_bytes < 1024 * int(size)
+
+
 def test_a_grounded_pin_makes_a_tag(firmware):
     capabilities = []
     for can_transmit in (True, False):
@@ -379,7 +439,7 @@ def test_a_crystal_that_never_starts_is_shown(firmware, monkeypatch):
     stage = LoneBoard(firmware)
     for _ in range(5):
         stage.run(0.01)
-        assert stage.image.leds == {"red"}
+        assert stage.image.leds == {"D12"}
     assert stage.sent == b""
 
 

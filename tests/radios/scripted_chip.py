@@ -102,7 +102,6 @@ def script_frame(bus, frame):
     bus.put(0x12, 0, b"\x30\x00" + b"\x10\x27" + b"\x20\x28" + b"\x50\x46")  # F2 10000, F3 10272, CIR_PWR 18000
     bus.put(0x15, 0, b"\xfe\xff\xff\x12\xff" + b"\x00\x2e" + b"\x08\x25" + bytes(5))  # F1 9480
     bus.put(0x27, 0x28, b"\x00\xf0\xff\x00\x76\x00")  # -4096; NOSAT 118: 5 symbols of SFD
-    bus.put(0x14, 0, b"\x0c\xff\x07")
     bus.put(0x0F, 0, b"\x03\x6f\x00\x00\x00")
 
 
@@ -167,7 +166,6 @@ class Story:
             self.note("poll", chip.poll())
             self.show("rx", bus.take())
             self.received(chip)
-        self.note("tracked", chip.track())
         chip.correct_bias = True
         script_frame(bus, bytes(range(9)))
         self.note("corrected", chip.poll(), stamp_text(chip.rx_ticks))

@@ -102,7 +102,6 @@ def life():
         air.spend(1e-3)
         chip.receive(frame, air.now_ticks(), Diagnostics(-80.0, -82.0, 1.0), fault)
         driver.poll()
-        driver.track()
     for ahead_s in (2e-3, 0.1e-3):
         driver.transmit_at(wrap(air.now_ticks() + round(ahead_s * 63.8976e9)), frame)
         air.spend(3e-3)

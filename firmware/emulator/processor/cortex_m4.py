@@ -13,7 +13,6 @@ from typing import Final, Literal
 
 from unicorn import (
     UC_ARCH_ARM,
-    UC_HOOK_BLOCK,
     UC_HOOK_INTR,
     UC_HOOK_MEM_INVALID,
     UC_MEM_FETCH_UNMAPPED,
@@ -26,9 +25,9 @@ from unicorn import (
     UcError,
 )
 from unicorn import arm_const as arm
-from unicorn.unicorn_py3.unicorn import uclib
 
 from emulator.processor import cycles as c
+from emulator.processor.unicorn_library import hook_blocks, map_window
 
 RAM_BASE: Final = 0x20000000
 RAM_BYTES: Final = 64 * 1024
@@ -50,10 +49,6 @@ Read = Callable[[int, int], int]
 """Address and bytes of a load from a peripheral; its value."""
 Write = Callable[[int, int, int], None]
 """Address, bytes and value of a store to a peripheral."""
-
-
-_READ = ctypes.CFUNCTYPE(ctypes.c_uint64, ctypes.c_void_p, ctypes.c_uint64, ctypes.c_uint, ctypes.c_void_p)
-_WRITE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_uint64, ctypes.c_uint, ctypes.c_uint64, ctypes.c_void_p)
 
 
 class EmulationError(Exception):
@@ -133,9 +128,10 @@ class Core:
         return at
 
     @property
-    def untouched_bytes(self) -> int:
-        """Longest stretch of RAM that still has its contents of power-on: what lies between data and stack."""
-        return max(map(len, _stretches(bytes(self.ram))))
+    def unused_stack_bytes(self) -> int:
+        """What lies between the data and the stack's deepest end since power-on."""
+        stack_top = struct.unpack_from("<I", self._code)[0] - RAM_BASE
+        return max(map(len, _stretches(bytes(self.ram[:stack_top]))))
 
     # Running
 
@@ -144,6 +140,7 @@ class Core:
         if not keep_ram:
             ctypes.memset(self.ram, _GARBAGE, RAM_BYTES)
         self._kept: list[object] = []
+        """What the engine calls."""
         uc = self._uc = Uc(UC_ARCH_ARM, UC_MODE_THUMB | UC_MODE_MCLASS)
         uc.ctl_set_cpu_model(arm.UC_CPU_ARM_CORTEX_M4)
         uc.mem_map(0, FLASH_BYTES, UC_PROT_READ | UC_PROT_EXEC)
@@ -151,17 +148,7 @@ class Core:
         uc.mem_map_ptr(RAM_BASE, RAM_BYTES, UC_PROT_ALL, ctypes.addressof(self.ram))
         for base, size in self._windows:
             self._map_window(base, size)
-        handle = ctypes.c_size_t()
-        # Directly, since Unicorn's Python binding only takes functions of Python, which cost a microsecond a block.
-        uclib.uc_hook_add(
-            uc._uch,
-            ctypes.byref(handle),
-            UC_HOOK_BLOCK,
-            ctypes.cast(c.on_block.address, ctypes.c_void_p),
-            ctypes.c_void_p(self.state.ctypes.data),
-            ctypes.c_uint64(1),
-            ctypes.c_uint64(0),
-        )
+        hook_blocks(uc, c.on_block.address, self.state.ctypes.data)
         uc.hook_add(UC_HOOK_INTR, self._on_exception)
         uc.hook_add(UC_HOOK_MEM_INVALID, self._on_invalid_access)
         self._error: Exception | None = None
@@ -176,9 +163,7 @@ class Core:
         self.use_cache(False)
 
     def _map_window(self, base: int, size: int) -> None:
-        """Directly too: the binding's own wrappers double the time of an access."""
-
-        def read(_engine: int, offset: int, width: int, _data: int) -> int:
+        def load(offset: int, width: int) -> int:
             self.state[c.CYCLES] += c.PERIPHERAL_WAIT_CYCLES
             try:
                 return self._read(base + offset, width)
@@ -186,18 +171,14 @@ class Core:
                 self._fail(error)
                 return 0
 
-        def write(_engine: int, offset: int, width: int, value: int, _data: int) -> None:
+        def store(offset: int, width: int, value: int) -> None:
             self.state[c.CYCLES] += c.PERIPHERAL_WAIT_CYCLES
             try:
                 self._write(base + offset, width, value)
             except Exception as error:  # noqa: BLE001
                 self._fail(error)
 
-        functions = _READ(read), _WRITE(write)
-        self._kept.append(functions)  # ctypes keeps no reference
-        status = uclib.uc_mmio_map(self._uc._uch, base, size, functions[0], None, functions[1], None)
-        if status:
-            raise UcError(status)
+        self._kept.append(map_window(self._uc, base, size, load, store))
 
     def _fail(self, error: Exception) -> None:
         self._error = self._error or error

@@ -11,13 +11,13 @@ loads of constant tables cost no waits; each access to a peripheral costs 3 cycl
 the DMA of SPIM and UARTE never delays the processor. Altogether the counts are good to about ±25 %.
 """
 
-import ctypes
 from typing import Final
 
 import numpy as np
 from numba import carray, cfunc, njit, types
 from numpy.typing import NDArray
-from unicorn.unicorn_py3.unicorn import uclib
+
+from emulator.processor.unicorn_library import stop_engine
 
 CPU_HZ: Final = 64_000_000
 PERIPHERAL_WAIT_CYCLES: Final = 3
@@ -45,8 +45,6 @@ _COSTS: Final = _TAGS + CACHE_LINES
 """Columns of the counter's state: one int64 each, then the cache's tags; then by halfword costs of blocks, the code,
 and the cycles spent in each block.
 """
-
-_stop = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)(("uc_emu_stop", uclib))
 
 
 def make_state(code: bytes) -> NDArray[np.int64]:
@@ -158,7 +156,7 @@ def on_block(engine, address, size, data):  # noqa: ANN001, ANN201
     """Unicorn's block hook; a block before which the processor stops is not charged."""
     head = carray(data, (_COSTS,), np.int64)
     if head[CYCLES] >= head[LIMIT]:
-        _stop(engine)
+        stop_engine(engine)
         return
     state = carray(data, (_COSTS + 3 * head[CODE_HALFWORDS],), np.int64)
     charge(state, np.int64(address), np.int64(size))

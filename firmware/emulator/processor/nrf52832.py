@@ -33,7 +33,8 @@ INTERRUPT_PIN: Final = 19
 RESET_PIN: Final = 24
 ROLE_PIN: Final = 13
 UART_RX_PIN: Final = 11
-LED_PINS: Final = {"green": 30, "blue": 31, "red": 14, "red-2": 22}
+LED_PINS: Final = {"D9": 30, "D10": 31, "D11": 22, "D12": 14}
+"""By the names that are printed on a DWM1001-DEV."""
 
 _WINDOWS: Final = [
     (0x10000000, 0x1000),
@@ -102,7 +103,7 @@ class Image:
         self._asleep_since = self._slept_cycles = 0
         self._life = 0
         self.core = Core(load_elf(elf), _WINDOWS, self._read, self._write)
-        self._start(cause=0, watchdog=None, retained=(0, 0))
+        self._start(cause=0, watchdog=None)
 
     # What the site sees
 
@@ -119,7 +120,7 @@ class Image:
         """The processor's supply failed and is back: RAM, registers and the cause of the reset are lost."""
         self.core.reset(keep_ram=False)
         self.resets["power"] += 1
-        self._start(cause=0, watchdog=None, retained=(0, 0))
+        self._start(cause=0, watchdog=None)
 
     def pull_reset_pin(self) -> None:
         """The reset pin was low for a moment; all causes of resets are set then, as anomaly 136 has it."""
@@ -180,11 +181,11 @@ class Image:
 
     # Start and resets
 
-    def _start(self, cause: int, watchdog: p.Watchdog | None, retained: tuple[int, int]) -> None:
+    def _start(self, cause: int, watchdog: p.Watchdog | None) -> None:
         """Peripherals as after a reset; a watchdog that is given runs on."""
         self._life += 1
         self._reset_asked = False
-        self._clock = p.Clock(self, cause, retained)
+        self._clock = p.Clock(self, cause)
         self._timers = [p.Timer(self, number) for number in range(3)]
         self._gpio = p.Gpio(self, self._level, self._on_output)
         self._gpiote = p.Gpiote(self)
@@ -233,10 +234,9 @@ class Image:
         self.resets[name] += 1
         soft = cause in {p.RESET_SOFTWARE, p.RESET_LOCKUP}
         causes = self._clock.registers[0x400] | cause
-        retained = self._clock.registers[0x51C], self._clock.registers[0x520]
         watchdog = self._watchdog if soft and self._watchdog.is_running else None
         self.core.reset(keep_ram=soft)
-        self._start(causes, watchdog, retained)
+        self._start(causes, watchdog)
 
     # True time
 

@@ -41,11 +41,6 @@ class PathCost(Struct, frozen=True):
     """Of the mean, what the processor waited for SPI transfers."""
 
     @property
-    def mean_us(self) -> float:
-        """Mean time."""
-        return self.mean / 64
-
-    @property
     def most_us(self) -> float:
         """Longest time."""
         return self.most / 64

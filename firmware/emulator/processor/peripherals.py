@@ -126,9 +126,8 @@ class Clock(Peripheral):
     base = 0x40000000
     irq = 0
 
-    def __init__(self, system: System, cause: int, retained: tuple[int, int]) -> None:
+    def __init__(self, system: System, cause: int) -> None:
         super().__init__(system)
-        self.registers[0x51C], self.registers[0x520] = retained
         self.registers[0x400] = cause
         self._ready = {0x100: _NEVER, 0x104: _NEVER}
 
@@ -147,8 +146,8 @@ class Clock(Peripheral):
         return 0x100, 0x104
 
     def register_offsets(self) -> tuple[int, ...]:
-        """RESETREAS, LFCLKSRC, GPREGRET, GPREGRET2, DCDCEN, and the one that anomaly 108 is about."""
-        return 0x400, 0x518, 0x51C, 0x520, 0x578, 0xEE4
+        """RESETREAS, LFCLKSRC, DCDCEN, and the one that anomaly 108 is about."""
+        return 0x400, 0x518, 0x578, 0xEE4
 
     def start_hfclk(self) -> None:
         """Start the crystal."""

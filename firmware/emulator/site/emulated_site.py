@@ -43,6 +43,7 @@ from skyless.ticks import difference, wrap
 TAG_SETTINGS: Final = TagSettings(publish_hz=1000.0)
 """All fixes are kept."""
 DIRECT_WIRE: Final = WireSettings()
+_REPORT_S: Final = 0.1
 
 
 class Board(Protocol):
@@ -187,13 +188,15 @@ class EmulatedSite:
 
     # Time
 
-    def run(self, seconds: float) -> None:
-        """Let everything start, run for some seconds, and end."""
-        run_on(self.medium.timeline, self._play(seconds))
+    def run(self, seconds: float, report: Callable[[float], None] = lambda _: None) -> None:
+        """Let everything start, run for some seconds, and end; ``report`` is called with the time now and then."""
+        run_on(self.medium.timeline, self._play(seconds, report))
 
-    async def _play(self, seconds: float) -> None:
+    async def _play(self, seconds: float, report: Callable[[float], None]) -> None:
         async with self:
-            await asyncio.sleep(seconds)
+            while (left_s := seconds - self.medium.now_s) > 0.0:
+                report(self.medium.now_s)
+                await asyncio.sleep(min(left_s, _REPORT_S))
 
     async def __aenter__(self) -> "EmulatedSite":
         """Plug all boards in, and start all programs."""

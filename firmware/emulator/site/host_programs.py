@@ -1,17 +1,14 @@
-"""Programs of hosts in the simulated world: the time that they take, and the air around their chips."""
+"""Programs of hosts in the simulated world, and the time that they take."""
 
 import random
 import threading
-from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
 from msgspec import Struct
 
-from skyless.air.reception import Transmission
-from skyless.simulation.medium import Medium, Timeline
-from skyless.simulation.oscillator import clock_rate
-from skyless.ticks import from_seconds, wrap
+from skyless.simulation.medium import Timeline
+from skyless.ticks import from_seconds
 
 
 class HostLatency(Struct, frozen=True):
@@ -38,33 +35,6 @@ class HostLatency(Struct, frozen=True):
         if generator.random() < self.spike_probability:
             return generator.uniform(self.most_s, self.spike_s)
         return generator.uniform(self.least_s, self.most_s)
-
-
-class NodeAir:
-    """A node of the simulated medium as the air of a chip (``skyless.simulation.dw1000.transceiver.Air``)."""
-
-    def __init__(self, medium: Medium[Any], node: int) -> None:
-        self._medium, self._node = medium, node
-        self.counts: Counter[str] = Counter()
-
-    def now_ticks(self) -> int:
-        """The node's counter, from its last instant by its present rate: reading it draws no noise."""
-        clock = self._medium.clocks[self._node]
-        passed = self._medium.timeline.now_ticks - int(clock["true_ticks"]) - float(clock["true_fraction"])
-        gain = passed * clock_rate(self._medium.clocks, self._node)
-        return wrap(int(clock["local_ticks"]) + round(float(clock["local_fraction"]) + passed + gain))
-
-    def now_s(self) -> float:
-        """True time."""
-        return self._medium.now_s
-
-    def transmit(self, frame: bytes, leaves_ticks: int) -> bool:
-        """Plan the frame's flight, unless it is too late."""
-        return self._medium.transmit(self._node, Transmission(frame, leaves_ticks))
-
-    def withdraw(self) -> None:
-        """The medium cancels nothing; counted, as a frame then flies that its sender takes for cancelled."""
-        self.counts["not-withdrawn"] += 1
 
 
 class _EndedError(BaseException):

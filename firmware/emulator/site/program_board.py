@@ -38,6 +38,7 @@ class ProgramBoard:
 
     def _start(self) -> None:
         self._came = bytearray()
+        self._line_was_high = False
         self._hz = SLOW_HZ
         self._unsent_ticks = self._timeline.now_ticks
         self._starts_ticks = self._timeline.now_ticks
@@ -46,9 +47,11 @@ class ProgramBoard:
     # What the site calls
 
     def notify(self) -> None:
-        """The chip's interrupt line may have risen."""
-        if self.chip.irq:
+        """The chip's interrupt line may have changed; a rise wakes the program, and a line that stays high does not."""
+        is_high = self.chip.irq
+        if is_high and not self._line_was_high:
             self.process.notify()
+        self._line_was_high = is_high
 
     def receive(self, data: bytes) -> None:
         """These bytes have come on the UART."""
@@ -74,7 +77,9 @@ class ProgramBoard:
     def transfer(self, out: bytes) -> bytes:
         """One SPI transaction; it reaches the chip when its time is over."""
         self.process.sleep(_TRANSFER_S + 8 * len(out) / self._hz)
-        return self.chip.transfer(out, self._hz)
+        answer = self.chip.transfer(out, self._hz)
+        self.notify()
+        return answer
 
     def set_spi_fast(self, fast: bool) -> None:
         """Clock the SPI fast from now on, or slowly."""
@@ -90,7 +95,7 @@ class ProgramBoard:
 
     def wait_s(self, seconds: float) -> None:
         """Wait, at most until the interrupt line rises or bytes come."""
-        if not self._came and not self.chip.irq:
+        if not self._came:
             self.process.wait(seconds)
 
     def read_line(self, size: int) -> bytes:

@@ -1,8 +1,8 @@
-"""A node of the simulated medium as the air of a chip, where it does not matter when a frame is handed over.
+"""Nodes of the simulated medium as the air of a chip: as the medium is, and so that hand-overs make no difference.
 
-The medium draws a node's clock noise when it reads its counter. Here that happens at an instant that follows from the
-frame's own time alone, so that two runs whose frames are the same have the same noise, however early each was handed
-over.
+The medium draws a node's clock noise when it reads its counter. A ``SiteAir`` lets that happen at an instant that
+follows from the frame's own time alone, so that two runs whose frames are the same have the same noise, however early
+each was handed over.
 """
 
 from collections import Counter
@@ -28,20 +28,12 @@ _EARLIER: Final = 2
 """Steps of the grid by which the time may be wrong that is foreseen at the hand-over."""
 
 
-class _Pending(Struct, frozen=True):
-    transmission: Transmission
-    serial: int
-    boot: int
-
-
-class SiteAir:
-    """One node's (``skyless.simulation.dw1000.transceiver.Air``)."""
+class NodeAir:
+    """A node of the simulated medium as the air of a chip (``skyless.simulation.dw1000.transceiver.Air``)."""
 
     def __init__(self, medium: Medium[Any], node: int) -> None:
         self._medium, self.node = medium, node
         self.counts: Counter[str] = Counter()
-        self._serial = 0
-        """Of the newest frame; one that was withdrawn is no longer the newest."""
 
     def now_ticks(self) -> int:
         """The node's counter, from its last instant by its present rate: reading it draws no noise."""
@@ -53,6 +45,29 @@ class SiteAir:
     def now_s(self) -> float:
         """True time."""
         return self._medium.now_s
+
+    def transmit(self, frame: bytes, leaves_ticks: int) -> bool:
+        """Plan the frame's flight, unless it is too late."""
+        return self._medium.transmit(self.node, Transmission(frame, leaves_ticks))
+
+    def withdraw(self) -> None:
+        """The medium cancels nothing; counted, as a frame then flies that its sender takes for cancelled."""
+        self.counts["not-withdrawn"] += 1
+
+
+class _Pending(Struct, frozen=True):
+    transmission: Transmission
+    serial: int
+    boot: int
+
+
+class SiteAir(NodeAir):
+    """The same, and it does not matter when a frame is handed over."""
+
+    def __init__(self, medium: Medium[Any], node: int) -> None:
+        super().__init__(medium, node)
+        self._serial = 0
+        """Of the newest frame; one that was withdrawn is no longer the newest."""
 
     def transmit(self, frame: bytes, leaves_ticks: int) -> bool:
         """Plan the frame's flight, unless it is too late."""

@@ -243,13 +243,6 @@ def carrier_offset_ppb(integrator: int) -> int:
     return (8192 - integrator * 9390) >> 14
 
 
-def clock_offset_ppb(offset: int) -> int:
-    """The sender's clock against ours in 1e-9 from RXTOFS, over RXTTCKI = 0x01FC0000; positive: fast (UM p. 99)."""
-    if offset > 1090 or offset < -1090:
-        return NOT_MEASURED
-    return (offset * 30_037 + 500) // 1000
-
-
 def bias_ticks(rx_power_cdbm: int) -> int:
     """How many ticks late a stamp is at that power: straight lines between the values of APS011, held beyond them."""
     below = -6100 - rx_power_cdbm  # 0.01 dB
@@ -495,11 +488,6 @@ class DW1000:
     def now(self) -> int:
         """The counter now, in steps of 512 ticks (UM 7.2.8)."""
         return self._read_number(0x06, 0, 5)
-
-    def track(self) -> int:
-        """Clock offset of the frame's sender by time tracking in 1e-9; before the next frame comes (UM 7.2.22)."""
-        offset = self._read_number(0x14, 0, 3) & 0x7_FFFF
-        return clock_offset_ppb(offset - 0x8_0000 if offset & 0x4_0000 else offset)
 
     def measure(self) -> bool:
         """Measure temperature and supply in some 1.1 ms, in which nothing is received (UM 6.4, pp. 158-159)."""

@@ -1,0 +1,49 @@
+"""``skyless anchor`` and ``skyless tag`` by their command lines, on a whole site of boards in virtual time."""
+
+import msgspec
+import pytest
+from emulator.site.command_site import CommandSite, program_of
+from emulator.site.emulated_site import EmulatedSite
+from site_stage import KINDS, boards, wire_of
+
+from skyless.cli.main import main
+from skyless.errors import SkylessError
+from skyless.evaluation.compile_ahead import compile_kernels
+from skyless.mqtt.messages import FixMessage
+from skyless.simulation.trajectory import Static
+from skyless.site.load import load_site
+
+PATHS = [Static(2.0, 3.0, 0.0)]
+SECONDS = {"host": 1.0, "image": 0.5}
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    """A site file as ``skyless site new`` writes it."""
+    compile_kernels()
+    path = tmp_path_factory.mktemp("site") / "hall.toml"
+    assert main(["site", "new", str(path), "--width", "6", "--depth", "8"]) == 0
+    return path
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_commands_give_the_fixes_that_their_classes_give(kind, file, capfd):
+    site = load_site(file)
+    of_classes = EmulatedSite(site, PATHS, boards(kind), wire=wire_of(kind))
+    of_classes.run(SECONDS[kind])
+    capfd.readouterr()
+    of_commands = CommandSite(file, PATHS, boards(kind), wire=wire_of(kind))
+    of_commands.run(SECONDS[kind])
+    printed, said = capfd.readouterr()
+    fixes = [msgspec.json.decode(line, type=FixMessage) for line in printed.splitlines()]
+    assert len(fixes) > 20
+    assert fixes == [fix for fix, _ in of_classes.fixes["tag1"]]
+    assert of_commands.sent_frames() == of_classes.sent_frames()
+    assert all(f"anchor {anchor.id}" in said for anchor in site.anchors)
+
+
+def test_a_command_line_that_is_wrong_is_refused_as_at_a_shell():
+    with pytest.raises(SkylessError, match="IDS is 99"):
+        program_of(["anchor", "99", "--radio", "serial:/dev/null"])
+    with pytest.raises(ValueError, match="runs 0 programs"):
+        program_of(["site", "--help"])
