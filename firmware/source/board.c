@@ -5,8 +5,8 @@
 /* Version of the firmware, in HELLO */
 static const uint8_t VERSION[3] = {0u, 2u, 0u};
 
-/* How long before its time a frame is handed to the chip: a reception that is being reported then, the SPI, the preamble
- * (docs/hardware.md), and two steps of a clock of 30 us. */
+/* How long before its time a frame is handed to the chip: a reception that is being reported then (0.29 ms), what is
+ * written over the SPI until it starts (0.14 ms; docs/hardware.md) and its preamble (0.14 ms). */
 #define LEAD_US 600
 /* A time closer than this is not checked again against the chip's counter. */
 #define CLOSE_US 30
@@ -42,14 +42,11 @@ static int32_t from_to(uint32_t earlier_us, uint32_t later_us)
 
 /* To the host */
 
-static bool send_line(struct board *board)
+static void send_line(struct board *board)
 {
-    bool fits = board->hardware->write_line(board->writer.line, board->writer.length);
-
-    if (!fits) {
+    if (!board->hardware->write_line(board->writer.line, board->writer.length)) {
         board->unsent++;
     }
-    return fits;
 }
 
 static void send_hello(struct board *board)
@@ -61,7 +58,7 @@ static void send_hello(struct board *board)
     hello.capabilities = board->identity.can_transmit ? LINK_CAN_TRANSMIT : 0u;
     hello.reset_cause = board->identity.reset_cause;
     link_write_hello(&board->writer, &hello);
-    (void)send_line(board);
+    send_line(board);
 }
 
 static void send_status(struct board *board)
@@ -91,20 +88,20 @@ static void send_status(struct board *board)
     status.temperature_cc = chip->temperature_cc;
     status.millivolts = chip->millivolts;
     link_write_status(&board->writer, &status);
-    (void)send_line(board);
+    send_line(board);
 }
 
 static void refuse(struct board *board, uint32_t kind, uint32_t reason)
 {
     link_write_refused(&board->writer, kind, reason);
-    (void)send_line(board);
+    send_line(board);
 }
 
 static void report_late(struct board *board, uint64_t dx_ticks, uint32_t reason)
 {
     board->late++;
     link_write_tx_late(&board->writer, dx_ticks, reason);
-    (void)send_line(board);
+    send_line(board);
 }
 
 /* The chip */
@@ -156,13 +153,13 @@ static bool poll(struct board *board, bool line_is_high)
         const struct link_measured measured = {chip->rx_power_cdbm, chip->first_path_cdbm, chip->offset_ppb};
 
         link_write_rx(&board->writer, chip->rx_ticks, &measured, chip->frame, chip->frame_bytes);
-        (void)send_line(board);
+        send_line(board);
     }
     if (((events & DW1000_SENT) != 0u) && (board->stage == FRAME_HANDED_OVER)) {
         board->stage = NO_FRAME;
         board->is_own_slot = true;
         link_write_tx_done(&board->writer, board->dx_ticks, chip->tx_ticks);
-        (void)send_line(board);
+        send_line(board);
     }
     if ((events & DW1000_LOST) != 0u) {
         on_lost(board);
