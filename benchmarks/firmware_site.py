@@ -1,13 +1,14 @@
 """A site on the firmware: frames in time, receptions that reach the hosts, errors. Emulated, in virtual time.
 
 python benchmarks/firmware_site.py [--boards image|host] [--slot-ms 2.1 ...] [--seconds 5] [--seeds 4]
-    [--anchors 7] [--usb] [--pauses] [--lead-ms 1.8 ...] [--repeat]
+    [--anchors 7] [--usb] [--pauses] [--lead-ms 1.8 ...] [--repeat] [--room]
 
 ``image`` is the ARM image on an emulated nRF52832, ``host`` the same C compiled for this computer. The lab's six
 anchors, a seventh in the middle of a short wall, and a tag that walks; the programs are those of ``skyless anchor`` and
 ``skyless tag``. The first second is not judged. ``--usb``: through a debugger's probe. ``--pauses``: hosts need time,
 as a Raspberry Pi with CPython. ``--lead-ms``: anchors keep to this lead instead of adapting theirs. ``--repeat``: each
-run again with the emulated radio, whose fixes must be the same bit for bit.
+run again with the emulated radio, whose fixes must be the same bit for bit. ``--room``: with a real room's errors of
+survey and ranges, and a tag that wanders.
 """
 
 import argparse
@@ -32,10 +33,10 @@ from msgspec.structs import replace
 
 from skyless.errors import SkylessError
 from skyless.evaluation.compile_ahead import compile_kernels
-from skyless.evaluation.scenarios import Request, trajectories_of
+from skyless.evaluation.scenarios import Request, Room, trajectories_of
 from skyless.nodes import anchor
 from skyless.site.check import check_site
-from skyless.site.lab import ideal_lab_site
+from skyless.site.lab import ideal_lab_site, lab_site
 from skyless.site.model import AnchorSite, ScheduleSite, Site
 
 _WARMUP_S = 1.0
@@ -62,21 +63,21 @@ def fixed_lead(*, fixed: bool) -> Iterator[None]:
         anchor.LEAD_GAIN, anchor.LEAD_LOSS = before  # type: ignore[misc]
 
 
-def lab_of(slot_ms: float, anchors: int) -> Site:
-    """The lab with this slot length and so many anchors."""
-    lab = ideal_lab_site()
+def lab_of(slot_ms: float, anchors: int, *, in_room: bool) -> Site:
+    """The lab with this slot length and number of anchors."""
+    lab = lab_site() if in_room else ideal_lab_site()
     return replace(
         lab, anchors=(*lab.anchors, AnchorSite(7, 3.0, 0.0))[:anchors], schedule=ScheduleSite(slot_s=1e-3 * slot_ms)
     )
 
 
 def site_of(
-    slot_ms: float, anchors: int, make: MakeBoard, seed: int, wire: WireSettings, lead_ms: float | None = None
+    lab: Site, make: MakeBoard, seed: int, wire: WireSettings, lead_ms: float | None, room: Room | None
 ) -> EmulatedSite:
     """The lab, and a tag that walks."""
-    lab = lab_of(slot_ms, anchors)
     lead_s = None if lead_ms is None else 1e-3 * lead_ms
-    return EmulatedSite(lab, trajectories_of(Request(lab, seed=seed)), make, seed=seed, wire=wire, lead_s=lead_s)
+    paths = trajectories_of(Request(lab, seed=seed, room=room))
+    return EmulatedSite(lab, paths, make, seed=seed, wire=wire, lead_s=lead_s, room=room)
 
 
 def is_repeated(site: EmulatedSite, seconds: float) -> bool:
@@ -135,10 +136,11 @@ def main() -> None:
     parser.add_argument("--usb", action="store_true")
     parser.add_argument("--pauses", action="store_true")
     parser.add_argument("--repeat", action="store_true")
+    parser.add_argument("--room", action="store_true")
     asked = parser.parse_args()
     for slot_ms in asked.slot_ms:
         try:
-            check_site(lab_of(slot_ms, asked.anchors), Path("the lab"))
+            check_site(lab_of(slot_ms, asked.anchors, in_room=asked.room), Path("the lab"))
         except SkylessError as error:
             parser.error(f"argument --slot-ms: {error}")
     compile_kernels()
@@ -148,11 +150,12 @@ def main() -> None:
     heads = "slot | lead | slots with a frame | late | reported | worst node | wrong | fixes | error | repeated | time"
     print(f"| {heads} |\n{'|---' * (heads.count('|') + 1)}|")
     for slot_ms in asked.slot_ms:
+        lab = lab_of(slot_ms, asked.anchors, in_room=asked.room)
         for lead_ms in asked.lead_ms:
             results, repeated, begun_s = [], 0, time.perf_counter()
             for seed in range(1, asked.seeds + 1):
                 with fixed_lead(fixed=lead_ms is not None):
-                    site = site_of(slot_ms, asked.anchors, make, seed, wire, lead_ms)
+                    site = site_of(lab, make, seed, wire, lead_ms, Room() if asked.room else None)
                     what = f"slots of {slot_ms:g} ms, seed {seed} of {asked.seeds}"
                     site.run(
                         asked.seconds, lambda now_s, what=what: show(f"{what}: {now_s:.1f} of {asked.seconds:g} s")

@@ -9,6 +9,7 @@ instead of adapting theirs.
 """
 
 import argparse
+import math
 import random
 from collections.abc import Sequence
 from typing import Final
@@ -185,6 +186,9 @@ def main() -> None:
     parser.add_argument("slots_ms", type=float, nargs="*", default=_SLOTS_MS)
     parser.add_argument("--lead-ms", type=float, nargs="+")
     asked = parser.parse_args()
+    least_s = _WARMUP_S + 1.0
+    if not least_s <= asked.seconds < math.inf or asked.seeds < 1:
+        parser.error(f"SECONDS should be at least {least_s:g}, SEEDS at least 1")
     if asked.lead_ms:
         _print_leads(asked.lead_ms, asked.slots_ms, asked.seconds, asked.seeds)
         return

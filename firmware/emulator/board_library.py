@@ -60,7 +60,7 @@ class Hardware(Protocol):
         """Whether the chip's interrupt line is high."""
 
     def read_line(self, size: int) -> bytes:
-        """At most so many bytes from the host."""
+        """Bytes from the host, at most ``size``."""
 
     def write_line(self, line: bytes) -> bool:
         """Queue a line for the host; False where it does not fit."""

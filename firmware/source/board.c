@@ -16,7 +16,7 @@ static const uint8_t VERSION[3] = {0u, 2u, 0u};
 #define POLL_US 50000u
 /* The same where the line does not follow the chip's events: shorter than a slot less a frame. */
 #define FAST_POLL_US 250u
-/* So many polls in a row that disagree with the interrupt line show that it is stuck. */
+/* This number of polls in a row that disagree with the interrupt line shows that it is stuck. */
 #define DISAGREEMENTS 4u
 /* So long after a reception was reported a slot of 2.1 ms was empty, and the next frame begins in 1.2 ms. Of slots from 2.7
  * to 4.1 ms it may not be one, which costs one reception. */
@@ -29,7 +29,7 @@ static const uint8_t VERSION[3] = {0u, 2u, 0u};
 #define MEASURE_US 10000000u
 /* or wherever no frame is due, if there was no free slot for so long. */
 #define MEASURE_ANYWHERE_US 60000000u
-/* After so many garbled lines in a row the line is restarted. */
+/* After this number of garbled lines in a row the line is restarted. */
 #define GARBLED_IN_A_ROW 20u
 /* Period of the light that blinks, as a bit of the clock: 0.52 s on, 0.52 s off. */
 #define BLINK_BIT 0x80000u

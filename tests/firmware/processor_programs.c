@@ -281,7 +281,7 @@ static void run(void)
     sleep_for_good();
 }
 #elif PROGRAM == LOOP
-/* Between two sleeps so many turns of a loop, for a count of its cycles; the loop stands in one line of the flash. */
+/* Between two sleeps a number of turns of a loop, for a count of its cycles; the loop stands in one line of the flash. */
 static void run(void)
 {
 #ifdef CACHED

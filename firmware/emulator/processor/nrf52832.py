@@ -431,7 +431,7 @@ class Image:
             self.plan(self.cycles, self._pull_reset)
 
     def _pull_reset(self) -> None:
-        """RSTn went low, or is released: either way the chip begins anew there."""
+        """RSTn went low, or is released: either way the chip starts again there."""
         self._chip.pull_reset()
         self._sample_interrupt()
 

@@ -26,7 +26,7 @@ from emulator.site.watched_radio import WatchedRadio
 from skyless.air.beacon import Beacon
 from skyless.air.codec import decode_cached
 from skyless.air.reception import Diagnostics
-from skyless.evaluation.scenarios import Request, impairments_of
+from skyless.evaluation.scenarios import Request, Room, impairments_of
 from skyless.mqtt.messages import FixMessage
 from skyless.nodes.anchor import AnchorNode, Anchors
 from skyless.nodes.open_radio import open_radios
@@ -156,12 +156,16 @@ class EmulatedSite:
         seed: int = 1,
         wire: WireSettings = DIRECT_WIRE,
         lead_s: float | None = None,
+        room: Room | None = None,
     ) -> None:
-        """``lead_s``: how early anchors hand their frames over at first; None for what their radios ask for."""
-        self.site, self.seed, self._make_board, self._wire = site, seed, make_board, wire
+        """``lead_s``: how early anchors hand their frames over at first; None for what their radios ask for.
+
+        ``room``: errors of survey and ranges; None for none.
+        """
+        self.site, self.seed, self.room, self._make_board, self._wire = site, seed, room, make_board, wire
         self._lead_s = lead_s
         self.trajectories = list(trajectories)
-        faults = replace(impairments_of(Request(site, seed=seed), site), diagnostics=True)
+        faults = replace(impairments_of(Request(site, seed=seed, room=room), site), diagnostics=True)
         tags = [TagSpec(trajectory) for trajectory in trajectories]
         self.medium: Medium[bool] = Medium(site, tags, faults, seed, self._deliver, SITE_TURNAROUND_S)
         self.anchors = [

@@ -3,7 +3,7 @@
 What a frame contains depends on what its anchor had been given when it made it, and that depends on how long receptions
 are on their way. So the programs run again with the instants of the run with boards, and nothing else of it: when each
 reception and each end of a frame reached them, which frames were late, and how far the board's counter was estimated
-wrongly. Frames and stamps are made anew by the anchors' machines and the medium of the same seed. Powers and carrier
+wrongly. Frames and stamps are made again by the anchors' machines and the medium of the same seed. Powers and carrier
 offsets are those that the boards reported, because chips round them.
 """
 
@@ -78,7 +78,7 @@ class RepeatedSite(EmulatedSite):
     """The site of a run that has ended, again with emulated radios."""
 
     def __init__(self, before: EmulatedSite) -> None:
-        super().__init__(before.site, before.trajectories, _no_board, seed=before.seed)
+        super().__init__(before.site, before.trajectories, _no_board, seed=before.seed, room=before.room)
         self._before = {node.name: node for node in before.nodes}
 
     def plug_in(self, node: SiteNode) -> None:

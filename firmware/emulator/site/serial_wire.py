@@ -24,7 +24,7 @@ _USB_S: Final = 1e-3
 """A debugger's probe passes on at most so much at most so often, as a packet of full-speed USB (assumed)."""
 _READ_BYTES: Final = 4096
 _FIFO_BYTES: Final = 32
-"""A computer's UART wakes its program at most once for so many bytes (assumed)."""
+"""A computer's UART wakes its program at most once for this number of bytes (assumed)."""
 
 
 class WireSettings(Struct, frozen=True):
@@ -36,7 +36,7 @@ class WireSettings(Struct, frozen=True):
     host: HostLatency | None = None
     """A pause before it reads or writes, and work for each line. None: it takes no time."""
     piece_bytes: int = 1
-    """The board gets so many bytes at once, when the last of them has come."""
+    """The board gets this number of bytes at once, when the last of them has come."""
 
 
 Change = Callable[[bytes], bytes]
