@@ -119,6 +119,8 @@ IDENTIFIERS = [
 HEARING = {
     "anchor.py",
     "anchors/free.py",
+    "evaluation/trusted_air.py",
+    "trusted_receiver.py",
     "anchors/slots.py",
     "receiver.py",
     "simulation/world.py",

@@ -3,9 +3,9 @@
 from beacon_strategies import accuracy_pages, coordinates_m, georeference_pages, noise_pages, unsigned
 from hypothesis import strategies as st
 
-from skyless.air.almanac import SitePage
+from skyless.air.almanac import KeyPage, SitePage
 from skyless.air.beacon import Heard
-from skyless.air.beacon2 import Beacon2, SlotTime, StatedPosition, StatedSiteTime
+from skyless.air.beacon2 import Authentication, Beacon2, SlotTime, StatedPosition, StatedSiteTime
 from skyless.air.codec2 import heard_capacity_2
 from skyless.air.page_codec import MAX_SUPERFRAME_TICKS
 
@@ -30,14 +30,25 @@ site_times = st.builds(StatedSiteTime, signed_steps(24, 256), unsigned(16).map(l
 site_pages = st.builds(
     SitePage, st.integers(1, 255), st.integers(1, MAX_SUPERFRAME_TICKS), unsigned(8), st.none() | coordinates_m
 )
-pages = st.one_of(site_pages, noise_pages, georeference_pages, accuracy_pages)
+pages = st.one_of(
+    st.builds(KeyPage, st.binary(min_size=16, max_size=16)), site_pages, noise_pages, georeference_pages, accuracy_pages
+)
 
 
 @st.composite
 def beacons2(draw):
-    slot_time, position, page = draw(st.none() | slot_times), draw(st.none() | positions), draw(st.none() | pages)
+    certificate = draw(st.none() | st.binary(min_size=94, max_size=94))
+    slot_time = position = page = None
+    if certificate is None:
+        slot_time, position, page = draw(st.none() | slot_times), draw(st.none() | positions), draw(st.none() | pages)
     site_time = None if slot_time is None else draw(st.none() | site_times)
-    fit = heard_capacity_2(slot_time is not None, position is not None, site_time is not None, page is not None)
+    fit = heard_capacity_2(
+        slot_time=slot_time is not None,
+        position=position is not None,
+        site_time=site_time is not None,
+        page=page is not None,
+        certificate=certificate is not None,
+    )
     anchor, *others = draw(st.lists(unsigned(16), min_size=1, max_size=1 + fit, unique=True))
     return Beacon2(
         site=draw(unsigned(16)),
@@ -51,6 +62,8 @@ def beacons2(draw):
         heard=tuple(Heard(other, draw(unsigned(8)), draw(unsigned(40))) for other in others),
         weak=draw(st.integers(0, (1 << len(others)) - 1)),
         page=page,
+        certificate=certificate,
+        authentication=draw(st.none() | st.builds(Authentication, unsigned(16), st.binary(min_size=8, max_size=8))),
     )
 
 

@@ -3,12 +3,21 @@ import pytest
 from beacon2_strategies import FULL_2, beacons2
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from skyless.air.almanac import SitePage
 from skyless.air.beacon import HEARD, Heard, Malformed
-from skyless.air.beacon2 import Beacon2, SlotTime, StatedPosition, StatedSiteTime
+from skyless.air.beacon2 import Authentication, Beacon2, SlotTime, StatedPosition, StatedSiteTime
 from skyless.air.codec import decode
-from skyless.air.codec2 import decode_2, encode_2, heard_capacity_2, packed_relays_2, pulse_age
+from skyless.air.codec2 import (
+    authenticate_2,
+    decode_2,
+    encode_2,
+    heard_capacity_2,
+    packed_relays_2,
+    pulse_age,
+    signed_bytes_2,
+)
 from skyless.air.frames import decode_any
 from skyless.air.ieee802154 import air_time_s, fcs
 from skyless.air.page_codec import encode_page
@@ -33,7 +42,7 @@ def test_round_trip_over_all_ranges(beacon):
     assert decode_2(frame) == beacon
     assert decode_any(frame) == beacon
     assert decode(frame) is Malformed.UNKNOWN_VERSION
-    assert len(frame) <= 127 - 8
+    assert len(frame) <= 127 - (10 if beacon.authentication is None else 0)
 
 
 @given(beacons2())
@@ -90,18 +99,55 @@ def test_length_and_air_time_of_the_document():
         (True, True, True, True, 5),
         (False, True, False, True, 8),
         (True, False, False, True, 7),
-        (False, False, False, False, 12),
+        (False, False, False, False, 11),
     ],
 )
 def test_capacity_leaves_space_for_authentication(slot_time, position, site_time, page, entries):
-    assert heard_capacity_2(slot_time, position, site_time, page) == entries
+    assert heard_capacity_2(slot_time=slot_time, position=position, site_time=site_time, page=page) == entries
 
 
-def test_authentication_is_passed_over():
+def test_authentication_follows_all_that_it_covers():
     frame = encode_2(FULL_2)
-    body = bytearray(frame[:-2] + bytes(range(8)))
+    signed = []
+    authentic = authenticate_2(frame, 0xABCD, lambda data: signed.append(data) or bytes(range(8)))
+    body = bytearray(frame[:-2] + b"\xcd\xab")
     body[FLAGS_AT] |= 0x10
-    assert decode_2(with_fcs(body)) == decode_2(frame)
+    assert signed == [bytes(body)] == [signed_bytes_2(authentic)]
+    assert authentic == with_fcs(body + bytes(range(8)))
+    decoded = decode_2(authentic)
+    assert decoded.authentication == Authentication(0xABCD, bytes(range(8)))
+    assert replace(decoded, authentication=None) == decode_2(frame)
+
+
+def test_a_certificate_fills_a_frame():
+    alone = replace(
+        FULL_2, slot_time=None, position=None, site_time=None, heard=(), weak=0, page=None, certificate=bytes(range(94))
+    )
+    frame = authenticate_2(encode_2(alone), 1, lambda _: bytes(8))
+    assert len(frame) == 127
+    assert decode_2(frame).certificate == bytes(range(94))
+    for part in ("slot_time", "position", "page"):
+        with pytest.raises(ValueError, match="certificate has no"):
+            encode_2(replace(alone, **{part: getattr(FULL_2, part)}))
+    with pytest.raises(ValueError, match="93 bytes; it must have 94"):
+        encode_2(replace(alone, certificate=bytes(93)))
+
+
+@pytest.mark.parametrize("flag", [0x01, 0x02, 0x04, 0x08])
+def test_a_certificate_comes_alone(flag):
+    body = bytearray(encode_2(FULL_2)[:-2])
+    body[FLAGS_AT] = 0x20 | flag
+    assert decode_2(with_fcs(body)) is Malformed.BAD_FLAGS
+
+
+@pytest.mark.parametrize(
+    ("authentication", "named"),
+    [(Authentication(1 << 16, bytes(8)), "interval"), (Authentication(-1, bytes(8)), "interval"),
+     (Authentication(0, bytes(7)), "mac has 7 bytes")],
+)  # fmt: skip
+def test_impossible_authentication_is_named(authentication, named):
+    with pytest.raises(ValueError, match=named):
+        encode_2(replace(FULL_2, heard=(), weak=0, authentication=authentication))
 
 
 def test_pages_of_types_not_known_are_passed_over():

@@ -139,6 +139,6 @@ def test_what_decodes_encodes_again(data):
         assert decode_page(encode_page(page)) == page
 
 
-@pytest.mark.parametrize("kind", [0, 7, 255])
+@pytest.mark.parametrize("kind", [0, 8, 255])
 def test_unknown_types_are_not_errors(kind):
     assert decode_page(bytes((kind,)) + bytes(16)) is None

@@ -65,7 +65,7 @@ def test_rows_give_the_same_values_as_the_beacon():
     ("slot_time", "site_time", "bare", "entries"), [(False, False, 52, 8), (True, False, 68, 6), (True, True, 73, 5)]
 )
 def test_lengths_and_air_times_of_the_table(slot_time, site_time, bare, entries):
-    assert heard_capacity_2(slot_time, True, site_time, True) == entries
+    assert heard_capacity_2(slot_time=slot_time, position=True, site_time=site_time) == entries
     longest = bare + 8 * entries
     assert f"| {bare} | {entries} | {longest} | {1e6 * air_time_s(longest):.0f} µs |" in DOCUMENT
 

@@ -72,4 +72,11 @@ class SitePage(Struct, frozen=True, gc=False, tag="site"):
     """Height at which every tag of the site moves (2-D positioning); None where height is to be estimated."""
 
 
-Page = AnchorPage | SchedulePage | NoisePage | AccuracyPage | GeoreferencePage | SitePage
+class KeyPage(Struct, frozen=True, gc=False, tag="key"):
+    """A disclosed key of the site's chain: that of the interval of its frame less the lag of the chain."""
+
+    key: bytes
+    """16 bytes."""
+
+
+Page = AnchorPage | SchedulePage | NoisePage | AccuracyPage | GeoreferencePage | SitePage | KeyPage

@@ -55,6 +55,15 @@ class StatedSiteTime(Struct, frozen=True, gc=False):
     """Its standard deviation; sent in steps of 1/64 tick, rounded up, at most 1023.98."""
 
 
+class Authentication(Struct, frozen=True, gc=False):
+    """What shows that a frame is of an anchor of the site, once the key of its interval is known."""
+
+    interval: int
+    """Number of the interval, its lowest 16 bits."""
+    mac: bytes
+    """Message authentication code of all bytes before it, 8 bytes."""
+
+
 class Beacon2(Struct, frozen=True, gc=False):
     """One decoded beacon frame, version 2."""
 
@@ -80,3 +89,8 @@ class Beacon2(Struct, frozen=True, gc=False):
     """Bit k is set where the first path of entry k of ``heard`` was weak: it may be late."""
     page: Page | None
     """One page of what is common to the site."""
+    certificate: bytes | None = None
+    """Signed statement about the site's key chain (``skyless.authentication.certificate``); then the beacon has no
+    slot time, position, site time or page."""
+    authentication: Authentication | None = None
+    """None of anchors without keys."""

@@ -2,12 +2,21 @@
 
 import math
 import struct
+from collections.abc import Callable
 from functools import lru_cache
 from operator import index
 from typing import Final, SupportsIndex
 
 from skyless.air.beacon import HEARD, Heard, Malformed, PackedHeard
-from skyless.air.beacon2 import MAX_HEARD, MOST_PULSE_AGE, Beacon2, SlotTime, StatedPosition, StatedSiteTime
+from skyless.air.beacon2 import (
+    MAX_HEARD,
+    MOST_PULSE_AGE,
+    Authentication,
+    Beacon2,
+    SlotTime,
+    StatedPosition,
+    StatedSiteTime,
+)
 from skyless.air.codec import (
     BEACON_MAGIC,
     BROADCAST,
@@ -23,8 +32,12 @@ from skyless.air.page_codec import PAGE_BYTES, decode_page, encode_page
 from skyless.constants import SUBTICKS
 
 VERSION_2: Final = BEACON_MAGIC | 0x0200
-AUTHENTICATION_BYTES_2: Final = 8
-"""Bytes that every frame reserves for authentication."""
+MAC_BYTES: Final = 8
+"""Of a message authentication code: the first 64 bits of an HMAC-SHA-256."""
+INTERVAL_BITS: Final = 16
+"""Of the number of an interval that a frame states."""
+CERTIFICATE_BYTES: Final = 94
+"""Of a certificate (``skyless.authentication.certificate``)."""
 
 RATE_STEPS: Final = 2.0**36
 MAX_RATE: Final = ((1 << 23) - 1) / RATE_STEPS
@@ -38,8 +51,10 @@ _HAS_POSITION: Final = 0x02
 _HAS_SITE_TIME: Final = 0x04
 _HAS_PAGE: Final = 0x08
 _HAS_AUTHENTICATION: Final = 0x10
-_RESERVED_FLAGS: Final = 0xE0
-_COMBINATIONS: Final = 0x20
+_HAS_CERTIFICATE: Final = 0x20
+_RESERVED_FLAGS: Final = 0xC0
+_NOT_WITH_CERTIFICATE: Final = _HAS_SLOT_TIME | _HAS_POSITION | _HAS_SITE_TIME | _HAS_PAGE
+_COMBINATIONS: Final = 0x40
 
 _FIXED: Final = struct.Struct("<HBHHHHBIBH")
 _FLAGS_AT: Final = 11
@@ -47,6 +62,7 @@ _SLOT_TIME: Final = struct.Struct("<IBHIBBHb")
 _POSITION: Final = struct.Struct("<HbHbHbBbB")
 _SITE_TIME: Final = struct.Struct("<HbH")
 _COUNT: Final = struct.Struct("<H")
+_AUTHENTICATION: Final = struct.Struct("<H8s")
 _COUNT_BITS: Final = 4
 _COUNT_MASK: Final = (1 << _COUNT_BITS) - 1
 _STD_STEPS_PER_M: Final = 1000
@@ -59,7 +75,8 @@ def _bare_bytes(flags: int) -> int:
         _count_at(flags)
         + _COUNT.size
         + (PAGE_BYTES if flags & _HAS_PAGE else 0)
-        + (AUTHENTICATION_BYTES_2 if flags & _HAS_AUTHENTICATION else 0)
+        + (CERTIFICATE_BYTES if flags & _HAS_CERTIFICATE else 0)
+        + (_AUTHENTICATION.size if flags & _HAS_AUTHENTICATION else 0)
         + FCS_BYTES
     )
 
@@ -76,14 +93,26 @@ def _count_at(flags: int) -> int:
 _BARE_BYTES: Final = tuple(_bare_bytes(flags) for flags in range(_COMBINATIONS))
 _COUNT_AT: Final = tuple(_count_at(flags) for flags in range(_COMBINATIONS))
 _CAPACITY: Final = tuple(
-    min((MAX_FRAME_BYTES - _bare_bytes(flags | _HAS_AUTHENTICATION)) // HEARD.size, MAX_HEARD)
+    0
+    if flags & _HAS_CERTIFICATE
+    else min((MAX_FRAME_BYTES - _bare_bytes(flags | _HAS_AUTHENTICATION)) // HEARD.size, MAX_HEARD)
     for flags in range(_COMBINATIONS)
 )
+_TRAILER_BYTES: Final = _AUTHENTICATION.size + FCS_BYTES
 _HEARD_ANCHORS: Final = tuple(struct.Struct("<" + count * "H6x") for count in range(MAX_HEARD + 4))
 
 
-def heard_capacity_2(slot_time: bool, position: bool, site_time: bool, page: bool) -> int:
-    """How many ``heard`` entries a frame with these parts may carry, with space for authentication: 5 to 10."""
+def heard_capacity_2(
+    *,
+    slot_time: bool = False,
+    position: bool = False,
+    site_time: bool = False,
+    page: bool = True,
+    certificate: bool = False,
+) -> int:
+    """How many ``heard`` entries a frame with these parts may carry, with space for authentication: 5 to 11."""
+    if certificate:
+        return 0
     flags = slot_time * _HAS_SLOT_TIME | position * _HAS_POSITION | site_time * _HAS_SITE_TIME | page * _HAS_PAGE
     return _CAPACITY[flags]
 
@@ -96,7 +125,7 @@ def encode_2(beacon: Beacon2) -> bytes:
             names it.
     """
     flags = _flags(beacon)
-    fault = _fault(beacon, _CAPACITY[flags])
+    fault = _fault(beacon, _CAPACITY[flags]) or _authentication_fault(beacon, flags)
     if fault is not None:
         raise ValueError(fault)
     slot_time, position, site_time = beacon.slot_time, beacon.position, beacon.site_time
@@ -124,8 +153,34 @@ def encode_2(beacon: Beacon2) -> bytes:
     parts.append(_packed(beacon.heard))
     if beacon.page is not None:
         parts.append(encode_page(beacon.page))
+    if beacon.certificate is not None:
+        parts.append(beacon.certificate)
+    if beacon.authentication is not None:
+        parts.append(_AUTHENTICATION.pack(beacon.authentication.interval, beacon.authentication.mac))
     body = b"".join(parts)
     return body + fcs(body)
+
+
+def authenticate_2(frame: bytes, interval: int, mac_of: Callable[[bytes], bytes]) -> bytes:
+    """Return a frame of ``encode_2`` without authentication as one with it.
+
+    ``interval``: its lowest 16 bits; ``mac_of`` gives the code of the bytes from the first to the interval.
+    """
+    signed = bytearray(frame[:-FCS_BYTES])
+    signed[_FLAGS_AT] |= _HAS_AUTHENTICATION
+    signed += interval.to_bytes(2, "little")
+    signed += mac_of(bytes(signed))
+    return bytes(signed) + fcs(bytes(signed))
+
+
+def is_authenticated_2(frame: bytes) -> bool:
+    """Whether a whole and well-formed frame of version 2 carries authentication."""
+    return bool(frame[_FLAGS_AT] & _HAS_AUTHENTICATION)
+
+
+def signed_bytes_2(frame: bytes) -> bytes:
+    """The bytes of an authenticated frame that its code is made of: all before the code."""
+    return frame[: -FCS_BYTES - MAC_BYTES]
 
 
 def decode_2(frame: bytes) -> Beacon2 | Malformed:
@@ -156,9 +211,13 @@ def decode_2(frame: bytes) -> Beacon2 | Malformed:
     if flags & _HAS_SITE_TIME:
         low, high, std_steps = _SITE_TIME.unpack_from(frame, at)
         site_time = StatedSiteTime((low | high << 16) / SUBTICKS, std_steps / STD_STEPS_PER_TICK)
+    certificate = frame[page_at : page_at + CERTIFICATE_BYTES] if flags & _HAS_CERTIFICATE else None
+    authentication = None
+    if flags & _HAS_AUTHENTICATION:
+        authentication = Authentication(*_AUTHENTICATION.unpack_from(frame, len(frame) - _TRAILER_BYTES))
     return Beacon2(
         site, anchor, sequence, tx_low | tx_high << 32, issue, slot_time, position, site_time,
-        PackedHeard(frame[heard_at:page_at]), weak, page,
+        PackedHeard(frame[heard_at:page_at]), weak, page, certificate, authentication,
     )  # fmt: skip
 
 
@@ -181,7 +240,12 @@ def _frame_fault(frame: bytes) -> Malformed | None:
 
 def _length_fault(frame: bytes) -> Malformed | None:
     flags, length = frame[_FLAGS_AT], len(frame)
-    if flags & _RESERVED_FLAGS or (flags & _HAS_SITE_TIME and not flags & _HAS_SLOT_TIME):
+    is_alone = not flags & _NOT_WITH_CERTIFICATE
+    if (
+        flags & _RESERVED_FLAGS
+        or (flags & _HAS_SITE_TIME and not flags & _HAS_SLOT_TIME)
+        or (flags & _HAS_CERTIFICATE and not is_alone)
+    ):
         return Malformed.BAD_FLAGS
     if length < _BARE_BYTES[flags]:
         return Malformed.BAD_LENGTH
@@ -224,7 +288,24 @@ def _flags(beacon: Beacon2) -> int:
         | (beacon.position is not None) * _HAS_POSITION
         | (beacon.site_time is not None) * _HAS_SITE_TIME
         | (beacon.page is not None) * _HAS_PAGE
+        | (beacon.authentication is not None) * _HAS_AUTHENTICATION
+        | (beacon.certificate is not None) * _HAS_CERTIFICATE
     )
+
+
+def _authentication_fault(beacon: Beacon2, flags: int) -> str | None:
+    certificate, authentication = beacon.certificate, beacon.authentication
+    if certificate is not None:
+        if flags & _NOT_WITH_CERTIFICATE:
+            return "a beacon with a certificate has no slot_time, position, site_time or page"
+        if len(certificate) != CERTIFICATE_BYTES:
+            return f"certificate has {len(certificate)} bytes; it must have {CERTIFICATE_BYTES}"
+    if authentication is not None:
+        if len(authentication.mac) != MAC_BYTES:
+            return f"authentication.mac has {len(authentication.mac)} bytes; it must have {MAC_BYTES}"
+        if not 0 <= authentication.interval < 1 << INTERVAL_BITS:
+            return f"authentication.interval is {authentication.interval!r}; it must be from 0 to 65535"
+    return None
 
 
 def _split24(value: int) -> tuple[int, int]:

@@ -1,10 +1,20 @@
 """Almanac pages and their 17 bytes: a type, then 16 bytes of contents (``docs/protocol.md``, "Pages")."""
 
 import struct
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Final, Literal
 
-from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, Page, SchedulePage, SitePage
+from skyless.air.almanac import (
+    AccuracyPage,
+    AnchorPage,
+    GeoreferencePage,
+    KeyPage,
+    NoisePage,
+    Page,
+    SchedulePage,
+    SitePage,
+)
 from skyless.air.beacon import Malformed
 
 PAGE_BYTES: Final = 17
@@ -29,6 +39,7 @@ _NOISE_TYPE: Final = 3
 _GEOREFERENCE_TYPE: Final = 4
 _ACCURACY_TYPE: Final = 5
 _SITE_TYPE: Final = 6
+_KEY_TYPE: Final = 7
 
 _HEIGHT_GIVEN: Final = 0x01
 _MAX_COORDINATE_MM: Final = round(MAX_COORDINATE_M * 1000)
@@ -40,7 +51,7 @@ _CIRCLE: Final = 3_600_000_000
 
 
 @lru_cache(maxsize=1024)
-def encode_page(page: Page) -> bytes:
+def encode_page(page: Page) -> bytes:  # noqa: PLR0911 - one for each type
     """Return the 17 bytes of a page.
 
     Coordinates are rounded to 1 mm, angles to 1e-7 degree (at most 5.6 mm on the ground), noise to float32.
@@ -63,6 +74,8 @@ def encode_page(page: Page) -> bytes:
             return _encode_accuracy(page)
         case SitePage():
             return _encode_site(page)
+        case KeyPage():
+            return _encode_key(page)
 
 
 @lru_cache(maxsize=1024)
@@ -169,6 +182,12 @@ def _encode_site(page: SitePage) -> bytes:
     )
 
 
+def _encode_key(page: KeyPage) -> bytes:
+    if len(page.key) != PAGE_BYTES - 1:
+        raise ValueError(f"KeyPage.key has {len(page.key)} bytes; it must have {PAGE_BYTES - 1}")
+    return bytes((_KEY_TYPE,)) + page.key
+
+
 def _decode_anchor(data: bytes) -> AnchorPage | None:
     _, anchor, x_mm, y_mm, z_mm, slot = _ANCHOR.unpack(data)
     if max(abs(x_mm), abs(y_mm), abs(z_mm)) > _MAX_COORDINATE_MM:
@@ -222,11 +241,16 @@ def _decode_site(data: bytes) -> SitePage | None:
     return SitePage(pages, superframe_ticks, slots, height_m) if possible else None
 
 
-_DECODERS: Final = {
+def _decode_key(data: bytes) -> KeyPage:
+    return KeyPage(data[1:])
+
+
+_DECODERS: Final[dict[int, Callable[[bytes], Page | None]]] = {
     _ANCHOR_TYPE: _decode_anchor,
     _SCHEDULE_TYPE: _decode_schedule,
     _NOISE_TYPE: _decode_noise,
     _GEOREFERENCE_TYPE: _decode_georeference,
     _ACCURACY_TYPE: _decode_accuracy,
     _SITE_TYPE: _decode_site,
+    _KEY_TYPE: _decode_key,
 }

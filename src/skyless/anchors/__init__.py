@@ -1,4 +1,4 @@
 """The protocol machines of anchors of protocol 2, and the choice of the machine for a site.
 
-Public: factory, slots. Within the package: free, neighbours.
+Public: authentication, factory, slots. Within the package: free, neighbours.
 """

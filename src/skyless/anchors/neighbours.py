@@ -8,9 +8,10 @@ from msgspec import Struct
 
 from skyless.air.beacon import Heard, Malformed
 from skyless.air.beacon2 import Beacon2, StatedPosition
-from skyless.air.frames import decode_any
+from skyless.air.frames import AnyBeacon, decode_any
 from skyless.air.reception import Reception
 from skyless.anchor import MAX_RELAY_AGE_S, anchor_of
+from skyless.anchors.authentication import BeaconAuthentication
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ
 from skyless.positioning.methods.observations import AnchorStamps, is_weak_first_path
 from skyless.site.local_almanac import stated_position
@@ -41,13 +42,16 @@ class Admitted(Struct, frozen=True, gc=False):
 class Neighbours:
     """Receptions of the site's other anchors."""
 
-    def __init__(self, site: Site, anchor_id: int, counters: Counter[str]) -> None:
+    def __init__(
+        self, site: Site, anchor_id: int, counters: Counter[str], authentication: BeaconAuthentication | None
+    ) -> None:
+        """With ``authentication`` only what it verifies is admitted."""
         self.own_ticks = Unwrapper()
         self.position = position_of(site, anchor_id)
         """The own one; None for an anchor without."""
         self._site_id, self._own = site.id, anchor_id
         self._known = frozenset(anchor.id for anchor in site.all_anchors) - {anchor_id}
-        self._counters = counters
+        self._counters, self._authentication = counters, authentication
         self._stamps = AnchorStamps(counters)
         self._superframe_ticks = superframe_ticks_of(site)
         self._heard: dict[int, tuple[Heard, int, bool]] = {}
@@ -65,17 +69,12 @@ class Neighbours:
     def admit(self, reception: Reception) -> Admitted | None:
         """The beacon of a reception; one that does not belong here is counted and dropped."""
         beacon = decode_any(reception.frame)
-        if isinstance(beacon, Malformed):
-            self._counters[beacon] += 1
+        if not isinstance(beacon, Beacon2) or beacon.site != self._site_id or beacon.anchor not in self._known:
+            self._counters[self._foreign(beacon)] += 1
             return None
-        if beacon.site != self._site_id:
-            self._counters["foreign-site"] += 1
-            return None
-        if not isinstance(beacon, Beacon2):
-            self._counters["other-version"] += 1
-            return None
-        if beacon.anchor not in self._known:
-            self._counters["unknown-anchor"] += 1
+        fault = None if self._authentication is None else self._authentication.fault_of(beacon, reception)
+        if fault is not None:
+            self._counters[fault] += 1
             return None
         rx_ticks = self.own_ticks.unwrap(reception.rx_ticks, reception.host_s)
         fits = beacon.anchor in self._stamps.tracks.of_anchor
@@ -89,6 +88,14 @@ class Neighbours:
         self._heard.pop(beacon.anchor, None)
         self._heard[beacon.anchor] = (Heard(beacon.anchor, beacon.sequence, reception.rx_ticks), rx_ticks, weak)
         return Admitted(beacon, rx_ticks, tx_ticks, fits, power_dbm or 0.0)
+
+    def _foreign(self, beacon: AnyBeacon | Malformed) -> str:
+        """What a frame is that is no beacon of another anchor of the site."""
+        if isinstance(beacon, Malformed):
+            return beacon
+        if beacon.site != self._site_id:
+            return "foreign-site"
+        return "unknown-anchor" if isinstance(beacon, Beacon2) else "other-version"
 
     def relayed(self, tx_ticks: int, capacity: int) -> tuple[tuple[Heard, ...], int]:
         """Receptions for a frame at that own time, the most recent first, and the bit mask of the weak ones."""

@@ -14,12 +14,13 @@ from skyless.air.beacon2 import Beacon2, SlotTime, StatedSiteTime
 from skyless.air.codec2 import MOST_RESIDUAL_TICKS, encode_2, heard_capacity_2
 from skyless.air.reception import Reception, Transmission
 from skyless.anchor import anchor_of, delay_change_ticks
+from skyless.anchors.authentication import BeaconAuthentication, contents_of, sealed
 from skyless.anchors.neighbours import Admitted, Neighbours, on_radio_grid
 from skyless.clocks.composed_time import SUPERFRAME_BITS, ComposedTime
 from skyless.clocks.composition import MEAN_LATE_TICKS
 from skyless.clocks.filter import MAX_RELATIVE_RATE, clock_noise, stamp_variance_m2
 from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, MAX_DRIFT, SUBTICKS, TICK_M, TICK_S
-from skyless.site.local_almanac import site_issue, site_page_for, site_pages_of
+from skyless.site.local_almanac import site_issue, site_pages_of
 from skyless.site.model import Site
 from skyless.site.slots import first_slots, schedule_of
 from skyless.slot_claims import ClaimVerdict, Lead, SlotClaims, SlotRole, first_wait_superframes, rank_of
@@ -58,8 +59,12 @@ class _Pending(Struct, frozen=True, gc=False):
 class SlotsAnchor:
     """One anchor of a site of mode slots. Like ``Anchor`` it does no I/O and reads no clock."""
 
-    def __init__(self, site: Site, anchor_id: int, lead_s: float = 1e-3) -> None:
+    def __init__(
+        self, site: Site, anchor_id: int, lead_s: float = 1e-3, authentication: BeaconAuthentication | None = None
+    ) -> None:
         """``lead_s``: how long before its RMARKER a frame must be in the driver's hands.
+
+        ``authentication``: the keys; None for an anchor that sends without codes and accepts all frames.
 
         Raises:
             KeyError: the site has no such anchor.
@@ -75,7 +80,8 @@ class SlotsAnchor:
         self._states_site_time = site.schedule.site_time
         self._pages = site_pages_of(site)
         self._issue = site_issue(self._pages)
-        self._neighbours = Neighbours(site, anchor_id, self.counters)
+        self.authentication = authentication
+        self._neighbours = Neighbours(site, anchor_id, self.counters, authentication)
         superframe_ticks = self._schedule.superframe_ticks
         wait = first_wait_superframes(rank_of(anchor_id, (anchor.id for anchor in site.all_anchors)))
         self._claims = SlotClaims(anchor_id, superframe_ticks, wait)
@@ -162,22 +168,27 @@ class SlotsAnchor:
         unwrapped = self._neighbours.own_ticks.expect(tx_ticks)
         self._advance(unwrapped - self._lead_ticks)
         stated_ticks = unwrapped + self._correction_ticks
-        slot_time, site_time = self._stated(pending, stated_ticks)
-        position = self._neighbours.position
+        added = contents_of(self.authentication, tx_ticks, self._sequence, self.id)
+        slot_time, site_time, position = None, None, None
+        if added.certificate is None:
+            slot_time, site_time = self._stated(pending, stated_ticks)
+            position = self._neighbours.position
         capacity = heard_capacity_2(
-            slot_time=slot_time is not None, position=position is not None, site_time=site_time is not None, page=True
+            slot_time=slot_time is not None,
+            position=position is not None,
+            site_time=site_time is not None,
+            certificate=added.certificate is not None,
         )
         heard, weak = self._neighbours.relayed(unwrapped, capacity)
-        page = site_page_for(self._pages, self._sequence, self.id)
         beacon = Beacon2(
             self._site.id, self.id, self._sequence, wrap(stated_ticks), self._issue, slot_time, position, site_time,
-            heard, weak, page,
+            heard, weak, added.page(self._pages, self._sequence, self.id), added.certificate,
         )  # fmt: skip
         self._claims.on_sent(unwrapped)
         self._neighbours.on_sent(self._sequence, stated_ticks)
         self._sequence = (self._sequence + 1) & 0xFF
         self.counters["sent"] += 1
-        return Transmission(encode_2(beacon), tx_ticks)
+        return Transmission(sealed(self.authentication, encode_2(beacon), added), tx_ticks)
 
     def _update_claims(self, admitted: Admitted, stated: SlotTime) -> None:
         """Follow the claim of a beacon, and its sender if it is a parent."""

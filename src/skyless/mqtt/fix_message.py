@@ -33,6 +33,8 @@ def fix_message(tag: str, serial: int, fix: Fix, unix_s: float, latency_s: float
         vpl_m=fix.vpl_m,
         integrity_risk=fix.integrity_risk,
         alert=None if fix.alert is None else fix.alert.value,
+        verified_until_s=fix.verified_until_s,
+        unverified=fix.unverified,
     )
 
 

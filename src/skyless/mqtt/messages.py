@@ -85,6 +85,10 @@ class FixMessage(Struct, frozen=True):
     """Probability, for each fix, that the error exceeds its level."""
     alert: str | None = None
     """A value of ``skyless.positioning.alert.Alert``."""
+    verified_until_s: float | None = None
+    """Up to this time, on the scale of ``time_s``, all beacons that count are verified; None where none is."""
+    unverified: float = 1.0
+    """Share of the beacons of the last second that are not verified, or not yet."""
 
 
 class Counters(Struct, frozen=True):
@@ -141,6 +145,15 @@ class TagHealth(Struct, frozen=True):
     has them as ``late-reception`` and ``late-fix``."""
     lateness_s: float = 0.0
     """Largest age of a reception at its turn, or of a fix when it was made, in the last second."""
+    trust: Literal["open", "verified"] | None = None
+    """Which fixes a tag gives that verifies beacons; None for one without the site's public key."""
+    is_verified: bool = False
+    """Whether beacons have been verified within the last seconds."""
+    faults: dict[str, str] = {}
+    """Anchors whose beacons, or beacons in whose name, were not accepted within the last seconds, and why
+    (``skyless.authentication.fault.Fault``)."""
+    clock_error_s: float | None = None
+    """How far the host's clock is ahead of the site's where that is more than the bound; None where all is well."""
 
 
 class AnchorHealth(Struct, frozen=True):
@@ -181,6 +194,14 @@ class AnchorHealth(Struct, frozen=True):
     """Mode slots: the anchors whose slot time it follows."""
     missed_share: float = 0.0
     """Share of its transmissions of the last second that came too late."""
+    chain: int | None = None
+    """Serial number of the key chain that it uses; None for an anchor without keys."""
+    chain_ends_unix_s: float | None = None
+    """When the last of its key chains ends."""
+    code_fault: str | None = None
+    """Why an anchor with keys sends without codes (``skyless.authentication.fault.Fault``); None where it has them."""
+    faults: dict[str, str] = {}
+    """Other anchors whose beacons, or beacons in whose name, were not accepted within the last seconds, and why."""
 
 
 class EtherHealth(Struct, frozen=True):

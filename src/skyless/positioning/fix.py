@@ -68,6 +68,10 @@ class Fix(Struct, frozen=True, gc=False):
     """Degrees of freedom of ``chi2``; 1 for the running mean of a filter."""
     requirement: IntegrityRequirement | None = None
     """What the protection levels answer; None for methods that know none."""
+    verified_until_s: float | None = None
+    """Up to this time, on the scale of ``time_s``, every beacon that counts is verified; None where none is."""
+    unverified: float = 1.0
+    """Share of the beacons of the last second that are not verified, or not yet."""
 
     def __repr__(self) -> str:
         return (

@@ -7,7 +7,16 @@ from zlib import crc32
 from msgspec import Meta, Struct
 from msgspec.structs import asdict
 
-from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, Page, SchedulePage, SitePage
+from skyless.air.almanac import (
+    AccuracyPage,
+    AnchorPage,
+    GeoreferencePage,
+    KeyPage,
+    NoisePage,
+    Page,
+    SchedulePage,
+    SitePage,
+)
 from skyless.air.beacon import Malformed
 from skyless.air.page_codec import PAGE_BYTES, decode_page, encode_page
 from skyless.site.model import AccuracySite, Site
@@ -221,7 +230,7 @@ class AlmanacAssembly:
         return True
 
     def _add(self, key: object, page: Page) -> bool:
-        if isinstance(page, SitePage):  # of protocol 2
+        if isinstance(page, SitePage | KeyPage):  # of protocol 2
             return False
         held = self._pages.get(key)
         if held == page:

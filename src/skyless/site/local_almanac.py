@@ -8,7 +8,7 @@ from zlib import crc32
 import numpy as np
 from msgspec import Meta, Struct
 
-from skyless.air.almanac import AccuracyPage, GeoreferencePage, NoisePage, Page, SitePage
+from skyless.air.almanac import AccuracyPage, GeoreferencePage, KeyPage, NoisePage, Page, SitePage
 from skyless.air.beacon import Malformed
 from skyless.air.beacon2 import Beacon2, StatedPosition
 from skyless.air.page_codec import PAGE_BYTES, decode_page, encode_page
@@ -185,7 +185,7 @@ class LocalAlmanac:
         self._keep(beacon, rx_ticks, is_confirmed)
         if beacon.almanac_issue == self.issue:
             return False
-        if beacon.page is not None:
+        if beacon.page is not None and not isinstance(beacon.page, KeyPage):
             self._collect(beacon.anchor, beacon.almanac_issue, beacon.page)
         return self._is_majority(beacon.almanac_issue, rx_ticks) and self._complete(beacon.almanac_issue)
 

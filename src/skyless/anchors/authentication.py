@@ -1,0 +1,189 @@
+"""What an anchor with keys adds to its frames, and how it verifies those of others: it knows all keys, so at once."""
+
+from collections.abc import Iterable
+from statistics import median
+from typing import Final
+
+from msgspec import Struct
+
+from skyless.air.almanac import KeyPage, Page
+from skyless.air.beacon2 import Beacon2
+from skyless.air.codec2 import INTERVAL_BITS, authenticate_2, signed_bytes_2
+from skyless.air.reception import Reception
+from skyless.authentication.certificate import ChainTiming
+from skyless.authentication.chain import Chain, ChainKeys, ChainRing
+from skyless.authentication.fault import Fault
+from skyless.authentication.key_chain import is_mac, mac_of
+from skyless.constants import TICK_S
+from skyless.site.local_almanac import site_page_for
+from skyless.ticks import difference, nearest
+
+CERTIFICATE_EVERY: Final = 16
+"""One frame in so many carries a certificate, and every fourth of these that of what comes next."""
+_SUCCESSOR_EVERY: Final = 4
+
+FAR_S: Final = 10.0
+FAR_EVERY_S: Final = 1.0
+"""Codes of intervals farther from the present than the former are checked at most once in the latter: each takes
+milliseconds, and anybody can state any interval."""
+
+RECENT_S: Final = 2.0
+LEAST_OTHERS: Final = 2
+"""Own clock against this number of others: with one it is not known which of the two is wrong."""
+
+
+class Contents(Struct, frozen=True, gc=False):
+    """What authentication puts in the next frame."""
+
+    interval: int | None = None
+    """Under whose key the frame is; None without authentication."""
+    certificate: bytes | None = None
+    key: KeyPage | None = None
+
+    def page(self, pages: tuple[Page, ...], sequence: int, anchor: int) -> Page | None:
+        """The page of the frame: a key, else one of the site's; none with a certificate."""
+        if self.certificate is not None:
+            return None
+        return self.key or site_page_for(pages, sequence if self.interval is None else sequence >> 1, anchor)
+
+
+class _Offset(Struct):
+    """How far another anchor's clock is behind the own one: the least that frames of the last seconds have shown."""
+
+    unix_s: float
+    present_s: float
+    before_s: float
+
+    def add(self, unix_s: float, offset_s: float) -> None:
+        if unix_s - self.unix_s > 0.5 * RECENT_S:
+            self.unix_s, self.before_s, self.present_s = unix_s, self.present_s, offset_s
+        self.present_s = min(self.present_s, offset_s)
+
+    @property
+    def least_s(self) -> float:
+        return min(self.present_s, self.before_s)
+
+
+class BeaconAuthentication:
+    """Keys, time and neighbours of one anchor, as far as authentication needs them. No I/O, no clock of its own."""
+
+    def __init__(self, site: int, chains: Iterable[Chain]) -> None:
+        self.site = site
+        self.faults: dict[int, tuple[Fault, float]] = {}
+        """The last fault of each other anchor, or of frames in its name, and when it was, in Unix seconds."""
+        self._ring = ChainRing(chains)
+        self._now: tuple[int, float] | None = None
+        self._offsets: dict[int, _Offset] = {}
+        self._far_s = 0.0
+
+    def set_chains(self, chains: Iterable[Chain]) -> None:
+        """Use these chains from now on: a successor, or one instead of a revoked one."""
+        self._ring = ChainRing(chains)
+
+    def set_time(self, now_ticks: int, unix_s: float) -> None:
+        """The own counter (40 bits) and the host's clock at the same moment; needed every few seconds."""
+        self._now = (now_ticks, unix_s)
+
+    def fault(self) -> Fault | None:
+        """Why own frames are sent without a code; None where they have one."""
+        timing = self._ring.timing
+        if self._now is None or timing is None:
+            return Fault.NO_TIME if self._now is None else Fault.NO_CHAIN
+        if self._is_clock_wrong(timing, self._now[1]):
+            return Fault.CLOCK_WRONG
+        return None if self._ring.at(timing.interval_at(self._now[1])) is not None else Fault.NO_CHAIN
+
+    def contents(self, tx_ticks: int, sequence: int, anchor: int) -> Contents:
+        """What the frame with this TX stamp (40 bits) is to hold."""
+        timing = self._ring.timing
+        if timing is None or self.fault() is not None:
+            return Contents()
+        interval = timing.interval_at(self._unix_s(tx_ticks))
+        keys = self._ring.at(interval)
+        if keys is None:
+            return Contents(certificate=self._ring.successor(interval) if _has_certificate(sequence, anchor) else None)
+        self._ring.prepare(interval)
+        if _has_certificate(sequence, anchor):
+            is_next = sequence // CERTIFICATE_EVERY % _SUCCESSOR_EVERY == _SUCCESSOR_EVERY - 1
+            successor = self._ring.successor(interval) if is_next else None
+            return Contents(interval, certificate=successor or keys.certificate(interval))
+        disclosed = interval - timing.lag
+        disclosing = self._ring.at(disclosed)
+        has_key = bool(sequence & 1) and disclosing is not None
+        return Contents(interval, key=KeyPage(disclosing.key(disclosed)) if has_key and disclosing else None)
+
+    def seal(self, frame: bytes, interval: int | None) -> bytes:
+        """The frame with its code."""
+        keys = None if interval is None else self._ring.at(interval)
+        if keys is None or interval is None:
+            return frame
+        key = keys.mac_key(interval)
+        return authenticate_2(frame, interval & (1 << INTERVAL_BITS) - 1, lambda signed: mac_of(signed, key))
+
+    def fault_of(self, beacon: Beacon2, reception: Reception) -> Fault | None:
+        """Why a beacon of another anchor is not used; None where it is genuine, or the own chains do not hold now."""
+        timing = self._ring.timing
+        if self._now is None or timing is None:
+            return Fault.NO_TIME if self._now is None else None
+        unix_s = self._unix_s(reception.rx_ticks)
+        fault = self._fault_of(beacon, reception.frame, unix_s, timing)
+        if fault is not None:
+            self.faults[beacon.anchor] = (fault, unix_s)
+        return fault
+
+    def _fault_of(self, beacon: Beacon2, frame: bytes, unix_s: float, timing: ChainTiming) -> Fault | None:
+        present = timing.interval_at(unix_s)
+        stated = beacon.authentication
+        if stated is None:
+            return Fault.NO_CODE if self._ring.at(present) is not None else None
+        interval = nearest(stated.interval, present, INTERVAL_BITS)
+        offset_s = unix_s - timing.start_s(interval)
+        if abs(offset_s) > FAR_S:
+            if unix_s - self._far_s < FAR_EVERY_S:
+                return Fault.LATE if offset_s > 0.0 else Fault.EARLY
+            self._far_s = unix_s
+        keys = self._ring.at(interval)
+        if keys is None:
+            return None if self._ring.at(present) is None else Fault.LATE
+        signed = signed_bytes_2(frame)
+        if not is_mac(signed, stated.mac, keys.mac_key(interval)):
+            return self._code_fault(signed, stated.mac, interval)
+        self._note_offset(beacon.anchor, unix_s, offset_s)
+        if offset_s >= timing.interval_s * timing.lag:
+            return Fault.LATE
+        return Fault.EARLY if offset_s < -timing.most_clock_error_s else None
+
+    def _code_fault(self, signed: bytes, mac: bytes, interval: int) -> Fault:
+        revoked: tuple[ChainKeys, ...] = self._ring.revoked(interval)
+        is_revoked = any(is_mac(signed, mac, keys.mac_key(interval)) for keys in revoked)
+        return Fault.REVOKED_CHAIN if is_revoked else Fault.BAD_CODE
+
+    def _note_offset(self, anchor: int, unix_s: float, offset_s: float) -> None:
+        known = self._offsets.get(anchor)
+        if known is None or unix_s - known.unix_s > RECENT_S:
+            self._offsets[anchor] = _Offset(unix_s, offset_s, offset_s)
+        else:
+            known.add(unix_s, offset_s)
+
+    def _is_clock_wrong(self, timing: ChainTiming, unix_s: float) -> bool:
+        """Whether the own clock is far from that of most other anchors; repeated old frames show nothing."""
+        recent = [one.least_s for one in self._offsets.values() if abs(unix_s - one.unix_s) <= RECENT_S]
+        return len(recent) >= LEAST_OTHERS and abs(median(recent)) > 0.5 * timing.most_clock_error_s
+
+    def _unix_s(self, ticks: int) -> float:
+        assert self._now is not None
+        return self._now[1] + difference(ticks, self._now[0]) * TICK_S
+
+
+def contents_of(authentication: BeaconAuthentication | None, tx_ticks: int, sequence: int, anchor: int) -> Contents:
+    """What authentication puts in a frame; nothing without keys."""
+    return Contents() if authentication is None else authentication.contents(tx_ticks, sequence, anchor)
+
+
+def sealed(authentication: BeaconAuthentication | None, frame: bytes, contents: Contents) -> bytes:
+    """A frame with these contents, with its code where the anchor has keys."""
+    return frame if authentication is None else authentication.seal(frame, contents.interval)
+
+
+def _has_certificate(sequence: int, anchor: int) -> bool:
+    return (sequence - anchor) % CERTIFICATE_EVERY == 0

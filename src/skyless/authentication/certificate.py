@@ -1,0 +1,127 @@
+"""The certificate: what a site states about one section of its key chain, signed with the site's key (Ed25519)."""
+
+import struct
+from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct
+
+from skyless.air.codec2 import CERTIFICATE_BYTES
+from skyless.authentication.key_chain import SECTION_BITS, SectionName
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
+CERTIFICATE_SIGNATURE_BYTES: Final = 64
+PUBLIC_KEY_BYTES: Final = 32
+
+_STATEMENT: Final = struct.Struct("<HIBIHB16s")
+_LABEL: Final = b"skyless chain"
+_SITE: Final = struct.Struct("<H")
+assert _STATEMENT.size + CERTIFICATE_SIGNATURE_BYTES == CERTIFICATE_BYTES
+
+
+class ChainTiming(Struct, frozen=True, gc=False):
+    """When keys hold and are disclosed."""
+
+    interval_ms: int = 100
+    """Length of an interval, 10 to 10000."""
+    lag: int = 3
+    """A key is disclosed this number of intervals after its own, 2 to 255."""
+
+    @property
+    def interval_s(self) -> float:
+        """Length of an interval."""
+        return self.interval_ms * 1e-3
+
+    @property
+    def most_clock_error_s(self) -> float:
+        """How far a tag's clock may be off without a frame being refused: half of what lies between interval and key.
+
+        A frame is sent up to the end of its interval, by a clock that may be late by as much as the tag's is early.
+        """
+        return 0.5 * (self.lag - 1) * self.interval_s
+
+    def interval_at(self, unix_s: float) -> int:
+        """Number of the interval at a Unix time."""
+        return int(unix_s * 1000.0) // self.interval_ms
+
+    def start_s(self, interval: int) -> float:
+        """Unix time at which an interval begins."""
+        return interval * self.interval_ms * 1e-3
+
+    def is_possible(self) -> bool:
+        """Whether a chain may have this timing."""
+        return 10 <= self.interval_ms <= 10_000 and 2 <= self.lag <= 255
+
+
+USUAL_TIMING: Final = ChainTiming()
+"""A key is known 0.3 to 0.4 s after a frame, and clocks may be off by 0.1 s."""
+
+
+class Certificate(Struct, frozen=True, gc=False):
+    """What is stated of a section."""
+
+    name: SectionName
+    timing: ChainTiming
+    first: int
+    """The first interval in which this chain counts, instead of those with lower serial numbers; 40 bits."""
+    root: bytes
+    """16 bytes."""
+
+    def signed_bytes(self) -> bytes:
+        """What is signed: a label, the site, and all that is sent but the signature."""
+        return _LABEL + _SITE.pack(self.name.site) + self._statement()
+
+    def _statement(self) -> bytes:
+        name, timing = self.name, self.timing
+        return _STATEMENT.pack(
+            name.serial, self.first & 0xFFFFFFFF, self.first >> 32, name.section,
+            timing.interval_ms, timing.lag, self.root,
+        )  # fmt: skip
+
+    def sent_bytes(self, signature: bytes) -> bytes:
+        """The bytes in a frame."""
+        return self._statement() + signature
+
+
+def read_certificate(site: int, sent: bytes) -> tuple[Certificate, bytes] | None:
+    """The certificate in a frame of a site, and its signature, not yet verified; None where a value is impossible."""
+    serial, low, high, section, interval_ms, lag, root = _STATEMENT.unpack_from(sent)
+    timing = ChainTiming(interval_ms, lag)
+    first = low | high << 32
+    if not timing.is_possible() or first >> SECTION_BITS > section:
+        return None
+    return Certificate(SectionName(site, serial, section), timing, first, root), sent[_STATEMENT.size :]
+
+
+def section_of(sent: bytes) -> int:
+    """The section that a certificate in a frame names."""
+    section: int = _STATEMENT.unpack_from(sent)[3]
+    return section
+
+
+def sign(certificate: Certificate, private: "Ed25519PrivateKey") -> bytes:
+    """The signature of the site."""
+    return private.sign(certificate.signed_bytes())
+
+
+def public_key(data: bytes) -> "Ed25519PublicKey":
+    """The key in 32 bytes.
+
+    Raises:
+        ValueError: there are not as many.
+    """
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey  # noqa: PLC0415 - loads OpenSSL
+
+    return Ed25519PublicKey.from_public_bytes(data)
+
+
+def is_signed(certificate: Certificate, signature: bytes, public: "Ed25519PublicKey") -> bool:
+    """Whether the owner of the key has signed it."""
+    from cryptography.exceptions import InvalidSignature  # noqa: PLC0415 - loads OpenSSL
+
+    try:
+        public.verify(signature, certificate.signed_bytes())
+    except InvalidSignature:
+        return False
+    return True

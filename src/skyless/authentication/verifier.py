@@ -1,0 +1,223 @@
+"""``Verifier``: what a listener with the site's public key does with beacons. Frames in, decisions about them out.
+
+A frame waits until the key of its interval is disclosed; then its code shows whether an anchor of the site made it. A
+frame counts only if it was received before any anchor can have disclosed that key: else anybody could have made it.
+"""
+
+from collections import Counter, deque
+from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct
+
+from skyless.air.almanac import KeyPage
+from skyless.air.beacon2 import Authentication, Beacon2
+from skyless.air.codec2 import INTERVAL_BITS, signed_bytes_2
+from skyless.air.reception import Reception
+from skyless.authentication.certificate import ChainTiming, section_of
+from skyless.authentication.fault import Fault
+from skyless.authentication.key_chain import is_mac
+from skyless.authentication.known_keys import CertificateUse, KeyUse, KnownKeys
+from skyless.authentication.site_clock import SiteClock
+from skyless.ticks import Unwrapper, from_seconds, nearest
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+MOST_UNDECIDED: Final = 8192
+"""Frames that wait: more than a radio can receive before their keys come, one after the other, 0.1 ms each."""
+
+LONGEST_WAIT_TICKS: Final = from_seconds(2.0)
+"""A frame whose key has not come by then is dropped, so that fixes go on with later ones."""
+
+FAULT_TICKS: Final = from_seconds(2.0)
+"""A fault is reported for this time after it was seen last."""
+
+MOST_REPEATED: Final = 4096
+"""Codes that are remembered: more than there are in the intervals whose frames are still accepted."""
+
+MOST_FAULTY_ANCHORS: Final = 64
+"""Anchors with faults that are remembered: forged frames can name any."""
+
+
+class Decided(Struct, frozen=True, gc=False):
+    """A frame and what became of it."""
+
+    beacon: Beacon2
+    reception: Reception
+    rx_ticks: int
+    """Own counter, unwrapped."""
+    is_genuine: bool
+
+
+class _Waiting(Struct, frozen=True, gc=False):
+    beacon: Beacon2
+    authentication: Authentication
+    reception: Reception
+    rx_ticks: int
+    present_s: float
+    upper_s: float
+    """The site's time when it was received, and its upper bound."""
+    interval: int | None
+    """Number of the interval; None where no certificate was known yet: the frame's time is still to be checked."""
+
+
+class _AnchorFault(Struct, frozen=True, gc=False):
+    """The last fault of an anchor, or of frames that name it."""
+
+    fault: Fault
+    rx_ticks: int
+
+
+class Verifier:
+    """Verifies the beacons of one site. It does no I/O and reads no clock."""
+
+    def __init__(
+        self,
+        site: int,
+        public: "Ed25519PublicKey",
+        clock_bound_s: float,
+        counters: Counter[str],
+        *,
+        least_serial: int = 0,
+        certificates: "Iterable[bytes]" = (),
+    ) -> None:
+        """``clock_bound_s``: how far the host's clock may be from those of anchors.
+
+        ``certificates``: those of an earlier run.
+        """
+        self.keys = KnownKeys(site, public, least_serial)
+        self.keys.restore(certificates)
+        self.clock = SiteClock(clock_bound_s, offsets_s=deque())
+        self._counters = counters
+        self._own_ticks = Unwrapper()
+        self._waiting: deque[_Waiting] = deque()
+        self._faults: dict[int, _AnchorFault] = {}
+        self._genuine: dict[bytes, None] = {}
+        """Codes of the last genuine frames, in their order; a second frame with one of them is a repetition."""
+        self._newest_ticks = 0
+
+    def waiting(self) -> "Iterable[Decided]":
+        """Frames that wait, in the order in which they were received; nothing shows yet whether they are genuine."""
+        return [Decided(one.beacon, one.reception, one.rx_ticks, is_genuine=False) for one in self._waiting]
+
+    def faults(self) -> dict[int, Fault]:
+        """Anchors with a fault within the last seconds."""
+        oldest = self._newest_ticks - FAULT_TICKS
+        return {anchor: one.fault for anchor, one in self._faults.items() if one.rx_ticks > oldest}
+
+    def is_suspect(self, anchor: int) -> bool:
+        """Whether frames of an anchor, or frames in its name, were not accepted within the last seconds."""
+        known = self._faults.get(anchor)
+        return known is not None and self._newest_ticks - known.rx_ticks < FAULT_TICKS
+
+    def add(self, beacon: Beacon2, reception: Reception, unix_s: float) -> int | None:
+        """Process a beacon of the site, received at this time of the host's clock.
+
+        Returns the own counter, unwrapped, if the frame now waits for its key, None if it was refused.
+        """
+        rx_ticks = self._own_ticks.unwrap(reception.rx_ticks, reception.host_s)
+        self._newest_ticks = rx_ticks
+        clock = self.clock
+        clock.advance(rx_ticks, unix_s)
+        if beacon.certificate is not None:
+            self._on_certificate(beacon.anchor, beacon.certificate, rx_ticks)
+        stated = beacon.authentication
+        if stated is None:
+            self._refuse(beacon.anchor, Fault.NO_CODE, rx_ticks)
+            return None
+        timing, interval = self.keys.timing, None
+        if timing is not None:
+            interval = _interval(stated.interval, clock.present_s, timing)
+            fault = self._time_fault(interval, clock.upper_s, timing)
+            if isinstance(beacon.page, KeyPage):
+                self._on_key(beacon.page.key, interval - timing.lag, timing, is_early=fault is Fault.EARLY)
+            if fault is None and self.keys.is_disclosed(interval):
+                fault = Fault.LATE
+            if fault is not None:
+                self._refuse(beacon.anchor, fault, rx_ticks)
+                return None
+        if len(self._waiting) >= MOST_UNDECIDED:
+            self._counters[Fault.TOO_MANY] += 1
+            return None
+        self._waiting.append(_Waiting(beacon, stated, reception, rx_ticks, clock.present_s, clock.upper_s, interval))
+        return rx_ticks
+
+    def decided(self) -> list[Decided]:
+        """Frames about which it is known by now, in the order in which they were received; each is returned once."""
+        timing, decided = self.keys.timing, list[Decided]()
+        while self._waiting:
+            one = self._waiting[0]
+            is_genuine = None if timing is None or self.clock.is_late else self._is_genuine(one, timing)
+            if is_genuine is None:
+                if self._newest_ticks - one.rx_ticks < LONGEST_WAIT_TICKS:
+                    break
+                self._counters[Fault.NO_KEY] += 1
+            self._waiting.popleft()
+            decided.append(Decided(one.beacon, one.reception, one.rx_ticks, bool(is_genuine)))
+        return decided
+
+    def _is_genuine(self, one: _Waiting, timing: ChainTiming) -> bool | None:
+        """Whether an anchor of the site made a frame; None while the key of its interval is not known."""
+        interval, fault = one.interval, None
+        if interval is None:
+            interval = _interval(one.authentication.interval, one.present_s, timing)
+            fault = self._time_fault(interval, one.upper_s, timing)
+        if fault is None:
+            key = self.keys.mac_key(interval)
+            if key is None:
+                return None
+            mac = one.authentication.mac
+            if not is_mac(signed_bytes_2(one.reception.frame), mac, key):
+                fault = Fault.BAD_CODE
+            elif mac in self._genuine:
+                fault = Fault.REPEATED
+            else:
+                self._genuine[mac] = None
+                if len(self._genuine) > MOST_REPEATED:
+                    del self._genuine[next(iter(self._genuine))]
+                return True
+        self._refuse(one.beacon.anchor, fault, one.rx_ticks)
+        return False
+
+    @staticmethod
+    def _time_fault(interval: int, upper_s: float, timing: ChainTiming) -> Fault | None:
+        """What is wrong with a frame of an interval that was received before this time."""
+        if upper_s >= timing.start_s(interval + timing.lag):
+            return Fault.LATE
+        return Fault.EARLY if upper_s < timing.start_s(interval) else None
+
+    def _on_certificate(self, anchor: int, sent: bytes, rx_ticks: int) -> None:
+        use = self.keys.on_certificate(sent, self.clock.present_s)
+        if use is CertificateUse.FORGED:
+            self._counters["forged-certificate"] += 1
+            return
+        if use is CertificateUse.REVOKED:
+            self._refuse(anchor, Fault.REVOKED_CHAIN, rx_ticks)
+        timing = self.keys.timing
+        if use is not CertificateUse.IGNORED and timing is not None:
+            self.clock.on_section(section_of(sent), timing)
+
+    def _on_key(self, key: bytes, interval: int, timing: ChainTiming, *, is_early: bool) -> None:
+        use = self.keys.on_key(key, interval, self.clock.present_s, is_expected=not is_early)
+        if use is KeyUse.NEW:
+            self.clock.on_key(interval, timing)
+        elif use is KeyUse.FORGED:
+            self._counters["forged-key"] += 1
+
+    def _refuse(self, anchor: int, fault: Fault, rx_ticks: int) -> None:
+        """Count a frame that is not used, and remember its anchor's fault."""
+        self._counters[fault] += 1
+        before = self._faults.pop(anchor, None)
+        if before is not None and before.fault is Fault.REVOKED_CHAIN and rx_ticks - before.rx_ticks < FAULT_TICKS:
+            self._faults[anchor] = before if fault is not Fault.REVOKED_CHAIN else _AnchorFault(fault, rx_ticks)
+            return
+        if len(self._faults) >= MOST_FAULTY_ANCHORS:
+            del self._faults[next(iter(self._faults))]
+        self._faults[anchor] = _AnchorFault(fault, rx_ticks)
+
+
+def _interval(lowest_bits: int, present_s: float, timing: ChainTiming) -> int:
+    """The interval that a frame states, which is near the present one."""
+    return nearest(lowest_bits, timing.interval_at(present_s), INTERVAL_BITS)

@@ -1,0 +1,194 @@
+"""``TrustedReceiver``: a tag that verifies beacons with its site's public key. Like ``Receiver`` it does no I/O.
+
+It runs the same ``Receiver`` on frames that have been verified, which is half a second behind. Where that is all that
+is wanted (trust ``verified``), its fixes are given. Else (``open``) a second one processes each frame at once; when a
+frame that it used turns out to be forged, it continues from the state of the first one.
+"""
+
+import copy
+from collections import Counter, deque
+from collections.abc import Iterable
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from skyless.air.beacon import Malformed
+from skyless.air.beacon2 import Beacon2
+from skyless.air.frames import decode_any
+from skyless.air.reception import Reception
+from skyless.authentication.certificate import public_key
+from skyless.authentication.fault import Fault
+from skyless.authentication.verifier import Verifier
+from skyless.constants import TICK_S
+from skyless.positioning.fix import Fix
+from skyless.positioning.methods.observations import FixTime
+from skyless.receiver import Receiver
+from skyless.ticks import from_seconds
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+SHARE_TICKS: Final = from_seconds(1.0)
+"""Of the beacons received within this time a fix states the share that is not verified."""
+
+
+class Trust(StrEnum):
+    """Which fixes a tag gives."""
+
+    OPEN = "open"
+    """Each at once; it states how far it is verified."""
+    VERIFIED = "verified"
+    """Only those of verified beacons, half a second later."""
+
+
+class SiteTrust(Struct, frozen=True):
+    """Which beacons a tag accepts."""
+
+    site: int
+    public: bytes
+    """The site's public key, 32 bytes."""
+    least_serial: int = 0
+    """Key chains with lower serial numbers have been revoked."""
+    trust: Trust = Trust.OPEN
+    clock_bound_s: float = 0.1
+    """How far the tag's clock may be from those of the anchors."""
+
+
+class GivenFix(Struct, frozen=True, gc=False):
+    """A fix, and the reception that made it: the last one that it contains."""
+
+    fix: Fix
+    reception: Reception
+
+
+class TrustedReceiver:
+    """One listening tag that knows its site's public key."""
+
+    def __init__(
+        self, trust: SiteTrust, new_receiver: "Callable[[], Receiver]", certificates: Iterable[bytes] = ()
+    ) -> None:
+        """``new_receiver`` makes a receiver that has heard nothing; ``certificates``: those of an earlier run.
+
+        Raises:
+            ValueError: the public key has not 32 bytes.
+        """
+        self.trust = trust
+        self.counters: Counter[str] = Counter()
+        """Frames that were refused, by the reason."""
+        self.verifier = Verifier(
+            trust.site,
+            public_key(trust.public),
+            trust.clock_bound_s,
+            self.counters,
+            least_serial=trust.least_serial,
+            certificates=certificates,
+        )
+        self._verified = new_receiver()
+        self._live = new_receiver() if trust.trust is Trust.OPEN else None
+        self._genuine_ticks: deque[int] = deque()
+        """When the verified frames of the last second were received."""
+        self._used: deque[int] = deque()
+        """When the frames that wait and that the live receiver has used were received."""
+        self._given_ticks: int | None = None
+        self._first_time: FixTime | None = None
+        """From where times of fixes count."""
+
+    @property
+    def receiver(self) -> Receiver:
+        """The one whose fixes are given."""
+        return self._verified if self._live is None else self._live
+
+    @property
+    def is_verified(self) -> bool:
+        """Whether beacons have been verified within the last second."""
+        return bool(self._genuine_ticks)
+
+    def faults(self) -> dict[int, Fault]:
+        """Anchors whose beacons, or beacons in whose name, were not accepted within the last seconds."""
+        return self.verifier.faults()
+
+    def hear(self, reception: Reception, unix_s: float) -> list[GivenFix]:
+        """Process a frame from the air, received at that time of the host's clock; the fixes that it makes possible.
+
+        They are in the order of their times. Nothing on the air raises.
+        """
+        beacon = decode_any(reception.frame)
+        if isinstance(beacon, Malformed):
+            self.counters[beacon] += 1
+            return []
+        if not isinstance(beacon, Beacon2) or beacon.site != self.trust.site:
+            self.counters["foreign-site"] += 1
+            return []
+        given = []
+        rx_ticks = self.verifier.add(beacon, reception, unix_s)
+        if self._live is not None and rx_ticks is not None and not self.verifier.is_suspect(beacon.anchor):
+            self._used.append(rx_ticks)
+            fix = self._live.hear_beacon(beacon, reception)
+            if fix is not None:
+                self._first_time = self._first_time or copy.copy(self._live.state().time)
+                given.append((rx_ticks, GivenFix(self._with_trust(fix, rx_ticks), reception)))
+        return [one for ticks, one in self._verify() + given if self._is_next(ticks)]
+
+    def _is_next(self, rx_ticks: int) -> bool:
+        """Whether a fix is later than those that were given."""
+        if self._given_ticks is not None and rx_ticks <= self._given_ticks:
+            return False
+        self._given_ticks = rx_ticks
+        return True
+
+    def _verify(self) -> list[tuple[int, GivenFix]]:
+        """Process the frames that are decided; fixes of the genuine ones."""
+        given, was_deceived = [], False
+        for one in self.verifier.decided():
+            was_used = bool(self._used) and self._used[0] == one.rx_ticks
+            if was_used:
+                self._used.popleft()
+            if not one.is_genuine:
+                was_deceived |= was_used
+                continue
+            was_deceived |= not was_used
+            if not self._genuine_ticks:
+                self._begin_verified()
+            self._genuine_ticks.append(one.rx_ticks)
+            fix = self._verified.hear_beacon(one.beacon, one.reception)
+            if fix is not None:
+                given.append((one.rx_ticks, GivenFix(self._with_trust(fix, one.rx_ticks), one.reception)))
+        if self._genuine_ticks:
+            newest = self._genuine_ticks[-1]
+            while self._genuine_ticks[0] < newest - SHARE_TICKS:
+                self._genuine_ticks.popleft()
+        if was_deceived and self._live is not None:
+            self._return_to_verified()
+        return given
+
+    def _begin_verified(self) -> None:
+        """Let the verified receiver count time from the first fix of the live one."""
+        if self._live is None or self._first_time is None or self._verified.counters["fixes"]:
+            return
+        state, live = self._verified.state(), self._live.state()
+        state = replace(state, time=self._first_time, own_ticks=copy.copy(live.own_ticks))
+        self._verified = Receiver.from_state(state)
+
+    def _return_to_verified(self) -> None:
+        """Let the live receiver continue from the verified one with the frames that wait and look right."""
+        assert self._live is not None
+        counters = self._live.counters
+        live = Receiver.from_state(copy.deepcopy(self._verified.state()))
+        self._used.clear()
+        for one in self.verifier.waiting():
+            if not self.verifier.is_suspect(one.beacon.anchor):
+                self._used.append(one.rx_ticks)
+                live.hear_beacon(one.beacon, one.reception)
+        live.counters.clear()
+        live.counters.update(counters)
+        self._live = live
+
+    def _with_trust(self, fix: Fix, rx_ticks: int) -> Fix:
+        """The fix with how far it is verified."""
+        genuine, unverified = self._genuine_ticks, len(self._used)
+        if not genuine:
+            return fix
+        share = unverified / (unverified + len(genuine)) if rx_ticks > genuine[-1] else 0.0
+        return replace(fix, verified_until_s=fix.time_s - max(rx_ticks - genuine[-1], 0) * TICK_S, unverified=share)
