@@ -1,7 +1,6 @@
 """What an anchor with keys adds to its frames, and how it verifies those of others: it knows all keys, so at once."""
 
 from collections.abc import Iterable
-from statistics import median
 from typing import Final
 
 from msgspec import Struct
@@ -166,9 +165,10 @@ class BeaconAuthentication:
             known.add(unix_s, offset_s)
 
     def _is_clock_wrong(self, timing: ChainTiming, unix_s: float) -> bool:
-        """Whether the own clock is far from that of most other anchors; repeated old frames show nothing."""
+        """Whether the own clock is far from those of most other anchors; repeated old frames show nothing."""
         recent = [one.least_s for one in self._offsets.values() if abs(unix_s - one.unix_s) <= RECENT_S]
-        return len(recent) >= LEAST_OTHERS and abs(median(recent)) > 0.5 * timing.most_clock_error_s
+        far = sum(abs(offset_s) > 0.5 * timing.most_clock_error_s for offset_s in recent)
+        return len(recent) >= LEAST_OTHERS and 2 * far > len(recent)
 
     def _unix_s(self, ticks: int) -> float:
         assert self._now is not None
