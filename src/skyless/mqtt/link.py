@@ -42,6 +42,8 @@ _LONGEST_WAIT_S: Final = 5.0
 _LONGEST_WAIT_LOOPBACK_S: Final = 0.5
 _LEAVE_S: Final = 1.0
 _SAME_TROUBLE_S: Final = 30.0
+_ECHO_S: Final = 5.0
+"""A broker that has not returned a link's own status by then does not let its user publish it."""
 _QUICK_START_S: Final = 0.5
 """A first connection that takes no longer is not logged."""
 
@@ -94,6 +96,7 @@ class Link:
         self._logged: tuple[str, float] = ("", 0.0)
         self._logged_fault = False
         self._stopping = False
+        self._has_echo = False
         self.subscribe(self._status_topic, self._correct_status)
 
     @property
@@ -190,6 +193,8 @@ class Link:
         self._publish_online()
         self._set_state(connected=True, trouble=None)
         self._pump()
+        self._has_echo = False
+        asyncio.get_running_loop().call_later(_ECHO_S, self._check_echo, connection)
 
     def _down(self, reason: str) -> None:
         self._connection = None
@@ -216,8 +221,14 @@ class Link:
 
     def _correct_status(self, _topic: str, payload: bytes) -> None:
         """Publish the status again after a late last will, of a connection that the broker held open."""
+        self._has_echo = True
         if not self._stopping and b'"online":false' in payload:
             self._publish_online()
+
+    def _check_echo(self, connection: Connection) -> None:
+        """Warn if the broker drops what it acknowledges: MQTT 3.1.1 has no other answer to a missing permission."""
+        if self._connection is connection and not self._has_echo and not self.unacknowledged:
+            _log.warning("the broker %s does not let this user publish %s", self.address, self._status_topic)
 
     async def _leave(self, connection: Connection) -> None:
         self._stopping = True
