@@ -39,9 +39,7 @@ def create_access(folder: Path, address: MqttAddress) -> tuple[Path, ...]:
         raise SkylessError(f"--mqtt is {str(address)!r}; it should be the broker's address without a user")
     missing = {role: folder / f"{role}.env" for role in USERS if not os.path.lexists(folder / f"{role}.env")}
     if not missing:
-        raise SkylessError(
-            f"{folder} has the files of all roles; one that is to be replaced should be removed first"
-        )
+        raise SkylessError(f"{folder} has the files of all roles; one that is to be replaced should be removed first")
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         for role, file in missing.items():

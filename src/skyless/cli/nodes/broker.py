@@ -84,7 +84,7 @@ def create(folder: Path, /, *, mqtt: str = "mqtt://127.0.0.1:1883", json: bool =
     folder
         Folder of passwords, for skyless broker --access.
     mqtt
-        Broker as its clients reach it, mqtt://HOST[:PORT] or mqtts://HOST[:PORT].
+        Broker to state in the files, as its clients reach it: mqtt://HOST[:PORT] or mqtts://HOST[:PORT].
     json
         Write one JSON object instead of the lines.
     """
