@@ -238,17 +238,36 @@ def test_strangers_and_wrong_passwords_are_refused(make_access):
 def test_a_program_of_the_wrong_role_is_warned(role, make_access, caplog):
     """Anchors may not read a tag's status; the page may, but what it publishes there never comes back."""
     access = make_access()
+    access.client(Role.TAGS).publish('{"online":true}', ["skyless/v1/7/tag/n1/status"], retain=True)
 
     async def check():
         link = Link(access.address(role), "n1", site=7, kind="tag")
         task = asyncio.ensure_future(link.run())
-        await until(lambda: "does not let this user publish skyless/v1/7/tag/n1/status" in caplog.text)
+        await until(lambda: "has not returned skyless/v1/7/tag/n1/status" in caplog.text)
         task.cancel()
         await asyncio.wait([task])
 
     asyncio.run(check())
     assert ("subscribe to skyless/v1/7/tag/n1/status" in caplog.text) == (role is Role.ANCHORS)
     assert access.passwords[role] not in caplog.text
+
+
+def test_a_program_of_the_right_role_is_not_warned(make_access, caplog):
+    """Here the check does not wait for its time: it comes as soon as the status has been returned."""
+    access = make_access()
+
+    async def check():
+        link = Link(access.address(Role.TAGS), "n1", site=7, kind="tag")
+        returned = []
+        link.subscribe("skyless/v1/7/tag/+/status", lambda _, payload: returned.append(payload))
+        task = asyncio.ensure_future(link.run())
+        await until(lambda: returned and not link.unacknowledged)
+        link._check_echo(link._connection)
+        task.cancel()
+        await asyncio.wait([task])
+
+    asyncio.run(check())
+    assert caplog.text == ""
 
 
 # The files

@@ -74,7 +74,7 @@ def broker(
 
 
 @app.command(name="access", help_epilogue="Example: skyless broker access passwords --mqtt mqtts://hall.local")
-def create(folder: Path, /, *, mqtt: str = "mqtt://127.0.0.1:1883", json: bool = False) -> None:
+def create_passwords(folder: Path, /, *, mqtt: str = "mqtt://127.0.0.1:1883", json: bool = False) -> None:
     """Make random passwords for the roles at the broker, a file for each; existing files stay as they are.
 
     Each file sets SKYLESS_MQTT and SKYLESS_MQTT_PASSWORD for programs of its role.
