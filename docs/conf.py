@@ -28,6 +28,7 @@ NAVIGATION = {
     ],
     "How to": [
         "docs/howto/run_a_site",
+        "docs/howto/secure_a_site",
         "docs/setup",
         "docs/howto/simulate",
         "docs/howto/plan",
