@@ -72,6 +72,7 @@ class KnownKeys:
         """When keys hold; None before the first certificate."""
         self.newest = -1
         """The newest interval whose key is known."""
+        self._newest_key: tuple[int, bytes] | None = None
         self._sections: dict[SectionName, _Section] = {}
         self._mac_keys: dict[int, bytes] = {}
         """By interval, of the chain that counts there."""
@@ -112,6 +113,8 @@ class KnownKeys:
 
     def on_key(self, key: bytes, interval: int, now_s: float, *, is_expected: bool = True) -> KeyUse:
         """Process the key of an interval, as somebody disclosed it at a time, which may not be the expected one."""
+        if (interval, key) == self._newest_key:
+            return KeyUse.KNOWN
         section = self._section_of(interval)
         if section is None:
             return KeyUse.KNOWN
@@ -136,7 +139,8 @@ class KnownKeys:
         section.newest = interval
         for old in list(section.keys)[:-KEPT_KEYS]:
             del section.keys[old]
-        self.newest = max(self.newest, interval)
+        if interval > self.newest:
+            self.newest, self._newest_key = interval, (interval, between[interval])
         self.serial = max(self.serial, name.serial)
         self._present = max(self._present, name.section)
         return KeyUse.NEW

@@ -41,21 +41,14 @@ MOST_FAULTY_ANCHORS: Final = 64
 """Anchors with faults that are remembered: forged frames can name any."""
 
 
-class Decided(Struct, frozen=True, gc=False):
-    """A frame and what became of it."""
+class ReceivedFrame(Struct, frozen=True, gc=False):
+    """A frame with a code, which waits for its key or is decided."""
 
-    beacon: Beacon2
-    reception: Reception
-    rx_ticks: int
-    """Own counter, unwrapped."""
-    is_genuine: bool
-
-
-class _Waiting(Struct, frozen=True, gc=False):
     beacon: Beacon2
     authentication: Authentication
     reception: Reception
     rx_ticks: int
+    """Own counter, unwrapped."""
     present_s: float
     upper_s: float
     """The site's time when it was received, and its upper bound."""
@@ -92,16 +85,16 @@ class Verifier:
         self.clock = SiteClock(clock_bound_s, offsets_s=deque())
         self._counters = counters
         self._own_ticks = Unwrapper()
-        self._waiting: deque[_Waiting] = deque()
+        self._waiting: deque[ReceivedFrame] = deque()
         self._faults: dict[int, _AnchorFault] = {}
         self._genuine: dict[bytes, None] = {}
         """Codes of the last genuine frames, in their order; a second frame with one of them is a repetition."""
         self._newest_ticks = 0
         self._has_new_key = False
 
-    def waiting(self) -> "Iterable[Decided]":
+    def waiting(self) -> "Iterable[ReceivedFrame]":
         """Frames that wait, in the order in which they were received; nothing shows yet whether they are genuine."""
-        return [Decided(one.beacon, one.reception, one.rx_ticks, is_genuine=False) for one in self._waiting]
+        return tuple(self._waiting)
 
     def faults(self) -> dict[int, Fault]:
         """Anchors with a fault within the last seconds."""
@@ -142,12 +135,14 @@ class Verifier:
         if len(self._waiting) >= MOST_UNDECIDED:
             self._counters[Fault.TOO_MANY] += 1
             return None
-        self._waiting.append(_Waiting(beacon, stated, reception, rx_ticks, clock.present_s, clock.upper_s, interval))
+        self._waiting.append(
+            ReceivedFrame(beacon, stated, reception, rx_ticks, clock.present_s, clock.upper_s, interval)
+        )
         return rx_ticks
 
-    def decided(self) -> list[Decided]:
-        """Frames about which it is known by now, in the order in which they were received; each is returned once."""
-        timing, decided = self.keys.timing, list[Decided]()
+    def decided(self) -> list[tuple[ReceivedFrame, bool]]:
+        """Frames of which it is known by now whether they are genuine; in the order of reception, each once."""
+        timing, decided = self.keys.timing, list[tuple[ReceivedFrame, bool]]()
         if not self._has_new_key and not self._is_overdue():
             return decided
         self._has_new_key = False
@@ -159,14 +154,14 @@ class Verifier:
                     break
                 self._counters[Fault.NO_KEY] += 1
             self._waiting.popleft()
-            decided.append(Decided(one.beacon, one.reception, one.rx_ticks, bool(is_genuine)))
+            decided.append((one, bool(is_genuine)))
         return decided
 
     def _is_overdue(self) -> bool:
         """Whether the first frame that waits has waited too long."""
         return bool(self._waiting) and self._newest_ticks - self._waiting[0].rx_ticks >= LONGEST_WAIT_TICKS
 
-    def _is_genuine(self, one: _Waiting, timing: ChainTiming) -> bool | None:
+    def _is_genuine(self, one: ReceivedFrame, timing: ChainTiming) -> bool | None:
         """Whether an anchor of the site made a frame; None while the key of its interval is not known."""
         interval, fault = one.interval, None
         if interval is None:
