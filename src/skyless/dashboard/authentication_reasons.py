@@ -115,14 +115,20 @@ def _chains(keyed: Mapping[str, AnchorHealth]) -> Iterable[Reason]:
     advice = "Make a successor with skyless site keys rotate, and give the anchors its files."
     ended = [name for name, health in keyed.items() if _left_s(health) <= 0.0]
     if ended:
-        text = f"the key chain of {listed('anchor', ended)} has ended: {verb(ended, 'it sends', 'they send')} no codes"
+        text = (
+            f"the key chain of {_all_or_some(ended, keyed)} has ended: {verb(ended, 'it sends', 'they send')} no codes"
+        )
         yield Reason("chain-ended", "bad", text, advice, names_of("anchor", ended))
     soon = {name: _left_s(health) for name, health in keyed.items() if 0.0 < _left_s(health) < CHAIN_ENDS_S}
     if soon:
         least_s = min(soon.values())
         left = f"{least_s / 86400.0:.0f} days" if least_s >= 2 * 86400.0 else f"{least_s / 3600.0:.0f} hours"
-        text = f"the key chain of {listed('anchor', list(soon))} ends in {left}"
+        text = f"the key chain of {_all_or_some(list(soon), keyed)} ends in {left}"
         yield Reason("chain", "warning", text, advice, names_of("anchor", list(soon)))
+
+
+def _all_or_some(names: list[str], keyed: Mapping[str, AnchorHealth]) -> str:
+    return f"all {len(names)} anchors" if 1 < len(names) == len(keyed) else listed("anchor", names)
 
 
 def _codes(evidence: Evidence, keyed: Mapping[str, AnchorHealth], now_s: float) -> Iterable[Reason]:
