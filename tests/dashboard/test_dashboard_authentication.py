@@ -199,6 +199,9 @@ def test_a_beacon_without_code_is_forged_only_where_its_anchor_sends_codes():
 def test_what_a_wrong_clock_explains_is_not_stated_of_others():
     site = Site().change("t1", clock_error_s=9.0, is_verified=False, faults=dict.fromkeys("123456", "late-frame"))
     assert site.run().keys() == {"clock"}
+    reasons = site.change("t1", clock_error_s=None).run()
+    assert reasons["not-verified"].text == "nothing that tag t1 receives is verified (late frame)"
+    assert reasons.keys() == {"not-verified"}
     site = Site().change("2", code_fault="clock-wrong", faults=dict.fromkeys("13456", "early-frame"))
     assert site.run().keys() == {"codes"}
 

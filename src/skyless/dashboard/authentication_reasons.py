@@ -98,7 +98,10 @@ def _not_verified(evidence: Evidence, tags: Mapping[str, TagHealth], now_s: floa
     common = Counter(fault for health in found.values() for fault in health.faults.values()).most_common(1)
     text = f"nothing that {listed('tag', list(found))} {verb(found, 'receives', 'receive')} is verified"
     text += f" ({common[0][0].replace('-', ' ')})" if common else ""
-    advice = "Its positions may be forged: see whether anchors send codes, and whether it has this site's public key."
+    advice = (
+        "Its positions may be forged. See whether the anchors send codes, whether its clock is right, and whether "
+        "it has this site's public key."
+    )
     yield Reason("not-verified", "bad", text, advice, names_of("tag", list(found)))
 
 
@@ -206,7 +209,7 @@ def _statements(
                 found.setdefault(anchor, {})[node] = fault
 
     for name, tag in tags.items():
-        add(("tag", name), tag.faults, is_clock_wrong=tag.clock_error_s is not None)
+        add(("tag", name), tag.faults, is_clock_wrong=tag.clock_error_s is not None or not tag.is_verified)
     for name, anchor in anchors.items():
         add(("anchor", name), anchor.faults, is_clock_wrong=anchor.code_fault == Fault.CLOCK_WRONG)
     return found

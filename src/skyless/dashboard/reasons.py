@@ -52,6 +52,10 @@ _ADVICE_NO_FIX: Final = {
     "not-converged": "What it receives is contradictory: check the anchors' positions and antenna delays.",
     "residuals-too-large": "What it receives is contradictory: check the anchors' positions and antenna delays.",
     "acquiring": "It still looks for its first position.",
+    "no-code": "Anchors send without codes: start them with the site's keys, or the tag with --trust open.",
+    "no-certificate": "No certificate of a key chain that holds now has come: see whether the tag has this site's key.",
+    "no-key": "No key of the site's key chain has come yet; the anchors send them all the time.",
+    "clock-wrong": "Synchronise the clock of its computer with those of the anchors' computers, as by NTP.",
     "no-master": "Its method needs a master, and this site has none: use another method.",
 }
 _Severity = Literal["warning", "bad"]
