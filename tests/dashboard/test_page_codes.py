@@ -91,6 +91,9 @@ def test_an_anchor_shows_its_codes_its_key_chain_and_what_it_does_not_accept(hal
             assert words in shown[name][0]
             assert shown[name][1] == grade
     assert "Key chain" not in page.evaluate(read)
+    page.locator(
+        "#panel-anchors tr.warn button:text-is('8 no codes')"
+    ).wait_for()  # rows in view are drawn now and then
     assert page.locator("#panel-anchors tr.warn button").all_inner_texts() == ["2 no codes", "4 no codes", "8 no codes"]
 
 
