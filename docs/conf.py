@@ -66,6 +66,7 @@ NAVIGATION = {
         "docs/mqtt",
         "docs/protocol",
         "docs/protocol2",
+        "docs/authentication",
         "docs/serial",
         "docs/glossary",
         "CHANGELOG",

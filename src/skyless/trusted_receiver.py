@@ -141,11 +141,11 @@ class TrustedReceiver:
     def _verify(self) -> list[tuple[int, GivenFix]]:
         """Process the frames that are decided; fixes of the genuine ones."""
         given, was_deceived = [], False
-        for one in self.verifier.decided():
+        for one, is_genuine in self.verifier.decided():
             was_used = bool(self._used) and self._used[0] == one.rx_ticks
             if was_used:
                 self._used.popleft()
-            if not one.is_genuine:
+            if not is_genuine:
                 was_deceived |= was_used
                 continue
             was_deceived |= not was_used
