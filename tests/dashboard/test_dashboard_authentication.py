@@ -142,7 +142,7 @@ def test_each_cause_is_named_alone_and_gone_afterwards(names, values, kind, leve
 
 def test_a_chain_of_all_anchors_is_named_in_few_words():
     site = Site(replace(KEYED, chain_ends_unix_s=UNIX_S + 59.6 * DAY_S))
-    assert site.run()["chain"].text == "the key chain of all 6 anchors ends in 60 days"
+    assert site.run()["chain"].text == "the key chain of all 6 anchors ends in 59 days"
     site.change(*"123456", chain_ends_unix_s=UNIX_S - 1.0, code_fault="no-chain")
     assert site.run()["chain-ended"].text == "the key chain of all 6 anchors has ended: they send no codes"
 

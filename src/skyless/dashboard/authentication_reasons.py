@@ -125,7 +125,7 @@ def _chains(keyed: Mapping[str, AnchorHealth]) -> Iterable[Reason]:
     soon = {name: _left_s(health) for name, health in keyed.items() if 0.0 < _left_s(health) < CHAIN_ENDS_S}
     if soon:
         least_s = min(soon.values())
-        left = f"{least_s / 86400.0:.0f} days" if least_s >= 2 * 86400.0 else f"{least_s / 3600.0:.0f} hours"
+        left = f"{least_s // 86400.0:.0f} days" if least_s >= 2 * 86400.0 else f"{least_s // 3600.0:.0f} hours"
         text = f"the key chain of {_all_or_some(list(soon), keyed)} ends in {left}"
         yield Reason("chain", "warning", text, advice, names_of("anchor", list(soon)))
 
