@@ -1,7 +1,7 @@
 """Files that a reader finds whole: the old one or the new one, never a part."""
 
 import secrets
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -28,8 +28,14 @@ def write_whole(path: Path, data: bytes) -> None:
     replace_files({path: data})
 
 
-def replace_files(files: Mapping[Path, bytes]) -> None:
-    """Write files, in their order; none where not all fit. Raises OSError."""
+def replace_files(files: Mapping[Path, bytes], secret: Collection[Path] = ()) -> None:
+    """Write files, in their order; none where not all fit. Raises OSError.
+
+    ``secret``: those of them that only their owner may read.
+    """
     with ExitStack() as stack:
         for path, data in reversed(list(files.items())):  # the last one that is entered is put in place first
-            stack.enter_context(whole_file(path)).write_bytes(data)
+            scratch = stack.enter_context(whole_file(path))
+            if path in secret:
+                scratch.touch(0o600)
+            scratch.write_bytes(data)

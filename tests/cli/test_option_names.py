@@ -107,4 +107,5 @@ def test_a_number_that_is_none_is_refused_by_every_option(options, capsys):
 
 
 _POSITIONAL = dict.fromkeys(("plan", "replay", "calibrate", "site new", "site check", "board"), ("x",))
+_POSITIONAL |= dict.fromkeys(("site keys new", "site keys rotate", "site keys revoke"), ("x",))
 _POSITIONAL["study"] = ("loss",)

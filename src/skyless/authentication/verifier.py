@@ -89,7 +89,8 @@ class Verifier:
         self._faults: dict[int, _AnchorFault] = {}
         self._genuine: dict[bytes, None] = {}
         """Codes of the last genuine frames, in their order; a second frame with one of them is a repetition."""
-        self._newest_ticks = 0
+        self.newest_ticks = 0
+        """When the last frame of the site was received: own counter, unwrapped."""
         self._has_new_key = False
 
     def waiting(self) -> "Iterable[ReceivedFrame]":
@@ -98,13 +99,13 @@ class Verifier:
 
     def faults(self) -> dict[int, Fault]:
         """Anchors with a fault within the last seconds."""
-        oldest = self._newest_ticks - FAULT_TICKS
+        oldest = self.newest_ticks - FAULT_TICKS
         return {anchor: one.fault for anchor, one in self._faults.items() if one.rx_ticks > oldest}
 
     def is_suspect(self, anchor: int) -> bool:
         """Whether frames of an anchor, or frames in its name, were not accepted within the last seconds."""
         known = self._faults.get(anchor)
-        return known is not None and self._newest_ticks - known.rx_ticks < FAULT_TICKS
+        return known is not None and self.newest_ticks - known.rx_ticks < FAULT_TICKS
 
     def add(self, beacon: Beacon2, reception: Reception, unix_s: float) -> int | None:
         """Process a beacon of the site, received at this time of the host's clock.
@@ -112,7 +113,7 @@ class Verifier:
         Returns the own counter, unwrapped, if the frame now waits for its key, None if it was refused.
         """
         rx_ticks = self._own_ticks.unwrap(reception.rx_ticks, reception.host_s)
-        self._newest_ticks = rx_ticks
+        self.newest_ticks = rx_ticks
         clock = self.clock
         clock.advance(rx_ticks, unix_s)
         if beacon.certificate is not None:
@@ -159,7 +160,7 @@ class Verifier:
 
     def _is_overdue(self) -> bool:
         """Whether the first frame that waits has waited too long."""
-        return bool(self._waiting) and self._newest_ticks - self._waiting[0].rx_ticks >= LONGEST_WAIT_TICKS
+        return bool(self._waiting) and self.newest_ticks - self._waiting[0].rx_ticks >= LONGEST_WAIT_TICKS
 
     def _is_genuine(self, one: ReceivedFrame, timing: ChainTiming) -> bool | None:
         """Whether an anchor of the site made a frame; None while the key of its interval is not known."""

@@ -1,4 +1,4 @@
-"""``skyless site``: write and check site files."""
+"""``skyless site``: write and check site files; its keys are in ``site_keys``."""
 
 import secrets
 from pathlib import Path
@@ -27,6 +27,7 @@ _LONGEST_TABLE: Final = 40
 _Count = Annotated[int, Parameter(validator=Number(gte=1, lte=255))]
 
 app = App(name="site", help_epilogue="Example: skyless site check site.toml")
+app.command("skyless.cli.site_keys:app", name="keys", help="Make, replace and show the keys of a site.")
 
 
 @app.command(help_epilogue="Example: skyless site new hall.toml --width 30 --depth 20 --anchor-count 8 --height 4")

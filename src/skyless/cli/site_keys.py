@@ -1,0 +1,316 @@
+"""``skyless site keys``: make, replace and show the keys of a site, with which its beacons are verified."""
+
+import time
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+from cyclopts import App, Parameter
+from cyclopts.validators import Number
+
+from skyless.cli.common.output import console, print_facts, print_json, print_warnings
+from skyless.cli.common.progress import progress_bar
+from skyless.cli.nodes.options import site_named
+from skyless.errors import SkylessError
+
+if TYPE_CHECKING:
+    from skyless.authentication.chain import Chain
+    from skyless.authentication.key_files import SitePublic
+    from skyless.site.model import Site
+
+_DAY_S: Final = 86_400.0
+_YEAR_S: Final = 365.25 * _DAY_S
+_LATEST_S: Final = 20.0 * _YEAR_S
+"""A chain may begin this long from now at most."""
+
+_LITTLE_LEFT_S: Final = 60.0 * _DAY_S
+_OVERLAP_S: Final = 5.0
+"""A chain that counts at once begins this long ago, as clocks of hosts differ."""
+
+_Years = Annotated[float, Parameter(validator=Number(gt=0, lte=10))]
+
+app = App(
+    name="keys",
+    help="Make, replace and show the keys of a site, with which its beacons are verified.",
+    help_epilogue="Example: skyless site keys new site.toml",
+)
+
+
+@app.command(help_epilogue='Example: skyless site keys new site.toml --starts "2030-01-31 06:00"')
+def new(site: str, /, *, keys: Path | None = None, years: _Years = 2.0, starts: str | None = None) -> None:
+    """Make the keys of a site: its key pair and its first key chain. Nothing that is there is overwritten.
+
+    Two years take five minutes of one processor; all are used.
+
+    Parameters
+    ----------
+    site
+        Site file, of mode slots or free.
+    keys
+        Folder of the site's keys; by default keys beside the site file.
+    years
+        How long the chain lasts.
+    starts
+        When the chain begins to count: ISO date and time, local where no zone is given; by default at once. Until then
+        anchors with keys send without codes, so that all of them can get their keys before.
+    """
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+    from skyless.authentication.key_files import SITE_PRIVATE, SITE_PUBLIC, SitePublic, private_bytes, serials_in
+    from skyless.authentication.key_files import site_public_bytes as public_bytes
+
+    plan = _site_with_codes(site)
+    folder = _folder(site, keys)
+    if folder.exists() and not folder.is_dir():
+        raise SkylessError(f"{folder} is no folder; --keys should name a folder to make")
+    present = [file for file in (folder / SITE_PRIVATE, folder / SITE_PUBLIC) if file.exists()]
+    if present or (folder.is_dir() and serials_in(folder)):
+        raise SkylessError(
+            f"{folder} holds keys already; skyless site keys rotate makes another chain, --keys names another folder"
+        )
+    starts_s = time.time() - _OVERLAP_S if starts is None else _planned(starts)
+    private = Ed25519PrivateKey.generate()
+    public = SitePublic(plan.id, private.public_key().public_bytes_raw())
+    chain = _made(public, 1, starts_s, years, private.private_bytes_raw())
+    files = {folder / SITE_PRIVATE: private_bytes(private), folder / SITE_PUBLIC: public_bytes(public)}
+    _write(folder, chain, files)
+    console().print(
+        f"{_written(folder, chain)}; fingerprint of the public key: {public.fingerprint}\n"
+        f"next: 1. keep {SITE_PRIVATE} where only you can read it; no anchor and no tag needs it\n"
+        f"2. copy {SITE_PUBLIC}, chain-1.public and chain-1.seed to each host of anchors: skyless anchor … --keys "
+        "FOLDER\n"
+        f"3. copy {SITE_PUBLIC} to each tag: skyless tag … --site-key {SITE_PUBLIC}",
+        markup=False,
+        soft_wrap=True,
+    )
+
+
+@app.command(help_epilogue='Example: skyless site keys rotate site.toml --starts "2030-01-31 06:00"')
+def rotate(site: str, /, *, keys: Path | None = None, years: _Years = 2.0, starts: str | None = None) -> None:
+    """Make the next key chain of a site, which counts from a planned time on; until then the present one does.
+
+    Parameters
+    ----------
+    site
+        Site file, of mode slots or free.
+    keys
+        Folder of the site's keys; by default keys beside the site file.
+    years
+        How long the chain lasts.
+    starts
+        When the chain begins to count: ISO date and time, local where no zone is given; by default in a day. All
+        anchors should have its files before.
+    """
+    folder, public, chains = _present(site, keys)
+    starts_s = time.time() + _DAY_S if starts is None else _planned(starts)
+    chain = _successor(folder, public, chains, starts_s, years)
+    _write(folder, chain, {})
+    warnings = []
+    last = chains[-1]
+    ends_s = _ends_s(last)
+    if ends_s < starts_s:
+        warnings.append(f"chain {last.serial} ends {_when(ends_s)}: until {_when(starts_s)} beacons carry no codes")
+    console().print(
+        f"{_written(folder, chain)}\n"
+        f"next: copy chain-{chain.serial}.public and chain-{chain.serial}.seed to each host of anchors before it "
+        "begins; anchors that run use them without a restart, and tags need nothing",
+        markup=False,
+        soft_wrap=True,
+    )
+    print_warnings(warnings)
+
+
+@app.command(help_epilogue="Example: skyless site keys revoke site.toml --years 0.1")
+def revoke(site: str, /, *, keys: Path | None = None, years: _Years = 2.0) -> None:
+    """Replace all key chains of a site at once, as a seed was stolen or an anchor's host lost.
+
+    Parameters
+    ----------
+    site
+        Site file, of mode slots or free.
+    keys
+        Folder of the site's keys; by default keys beside the site file.
+    years
+        How long the new chain lasts; a short one is made sooner.
+    """
+    from msgspec.structs import replace
+
+    from skyless.authentication.key_files import SITE_PUBLIC, site_public_bytes
+
+    folder, public, chains = _present(site, keys)
+    chain = _successor(folder, public, chains, time.time() - _OVERLAP_S, years)
+    raised = replace(public, least_serial=chain.serial)
+    _write(folder, chain, {folder / SITE_PUBLIC: site_public_bytes(raised)})
+    console().print(
+        f"{_written(folder, chain)}; chains before it are revoked\n"
+        f"next: 1. copy chain-{chain.serial}.public and chain-{chain.serial}.seed at once to each host of anchors that "
+        "you trust; anchors that run use them without a restart, and tags that receive them refuse the former chain\n"
+        f"2. copy {SITE_PUBLIC} to each host of anchors and each tag, so that tags that were off refuse it as well\n"
+        "3. delete the seeds of former chains",
+        markup=False,
+        soft_wrap=True,
+    )
+
+
+@app.command(help_epilogue="Example: skyless site keys show site.toml --json")
+def show(site: str, /, *, keys: Path | None = None, json: bool = False) -> None:
+    """Show the key chains of a site: from when to when, and which counts now. No secret is shown.
+
+    Parameters
+    ----------
+    site
+        Site file, of mode slots or free.
+    keys
+        Folder of the site's keys; by default keys beside the site file.
+    json
+        Write one JSON object instead of the table.
+    """
+    folder, public, chains = _present(site, keys)
+    report = _report(folder, public, chains, time.time())
+    if json:
+        print_json(report)
+        return
+    rows = [("site", str(public.site)), ("public key", public.fingerprint)]
+    for chain in report["chains"]:
+        state = "revoked" if chain["is_revoked"] else "counts now" if chain["serial"] == report["present"] else ""
+        seed = "" if chain["has_seed"] else "seed not here"
+        span = f"{_when(chain['begins_unix_s'])} to {_when(chain['ends_unix_s'])}"
+        rows.append((f"chain {chain['serial']}", ", ".join(filter(None, (span, state, seed)))))
+    rows.append(("left", f"{report['days_left']:.0f} days"))
+    print_facts(f"keys of site {public.site} ({folder})", rows)
+    print_warnings(report["warnings"])
+
+
+def _report(folder: Path, public: "SitePublic", chains: "list[Chain]", now_s: float) -> dict[str, Any]:
+    """What is to be said of the chains."""
+    from skyless.authentication.chain import ChainRing
+    from skyless.authentication.key_files import chain_seed_file
+
+    ring = ChainRing(chains)
+    at = None if ring.timing is None else ring.at(ring.timing.interval_at(now_s))
+    present = None if at is None or at.chain.serial < public.least_serial else at.chain.serial
+    left_s = _ends_s(chains[-1]) - now_s
+    warnings = []
+    if left_s < _LITTLE_LEFT_S:
+        end = f"ends in {left_s / _DAY_S:.0f} days" if left_s > 0.0 else "has ended"
+        warnings.append(f"the last chain {end}: run skyless site keys rotate, and copy its files to all anchors")
+    if present is None and left_s > 0.0:
+        warnings.append("no chain counts at present: beacons carry no codes")
+    return {
+        "site": public.site,
+        "keys": folder,
+        "fingerprint": public.fingerprint,
+        "least_serial": public.least_serial,
+        "present": present,
+        "days_left": max(left_s, 0.0) / _DAY_S,
+        "chains": [
+            {
+                "serial": chain.serial,
+                "begins_unix_s": chain.timing.start_s(chain.first),
+                "ends_unix_s": _ends_s(chain),
+                "sections": chain.sections,
+                "is_revoked": chain.serial < public.least_serial,
+                "has_seed": chain_seed_file(folder, chain.serial).exists(),
+            }
+            for chain in chains
+        ],
+        "warnings": warnings,
+    }
+
+
+# Parts of the commands
+
+
+def _site_with_codes(site: str) -> "Site":
+    """The site, whose beacons can carry codes. Raises SkylessError."""
+    plan = site_named(site)
+    if plan.schedule.needs_master:
+        raise SkylessError(
+            f'{site}: schedule.mode is "master", whose beacons carry no codes; it should be slots or free'
+        )
+    return plan
+
+
+def _folder(site: str, keys: Path | None) -> Path:
+    return Path(site).parent / "keys" if keys is None else keys
+
+
+def _present(site: str, keys: Path | None) -> "tuple[Path, SitePublic, list[Chain]]":
+    """Folder, public key and chains, without their seeds, of a site that has keys. Raises SkylessError."""
+    from skyless.authentication.key_files import read_chain_public, read_folder_public, serials_in
+
+    plan, folder = _site_with_codes(site), _folder(site, keys)
+    public = read_folder_public(folder, plan.id)
+    chains = [read_chain_public(folder, serial, plan.id) for serial in serials_in(folder)]
+    if not chains:
+        raise SkylessError(f"{folder} holds no chain-N.public; it should be the folder of skyless site keys new")
+    return folder, public, chains
+
+
+def _successor(folder: Path, public: "SitePublic", chains: "list[Chain]", starts_s: float, years: float) -> "Chain":
+    """The next chain of a site. Raises SkylessError."""
+    from skyless.authentication.key_files import MOST_SERIAL, read_private
+
+    private = read_private(folder, public)
+    serial = max(chains[-1].serial, public.least_serial) + 1
+    if serial > MOST_SERIAL:
+        raise SkylessError(f"{folder} holds chain {MOST_SERIAL}, the last one; skyless site keys new makes new keys")
+    return _made(public, serial, starts_s, years, private.private_bytes_raw())
+
+
+def _made(public: "SitePublic", serial: int, starts_s: float, years: float, private: bytes) -> "Chain":
+    """A new chain, with a bar while it is made."""
+    from skyless.authentication.chain_maker import new_chain
+
+    with progress_bar("making the key chain", 1.0) as bar:
+        return new_chain(public.site, serial, starts_s, starts_s + years * _YEAR_S, private, bar.reach)
+
+
+def _write(folder: Path, chain: "Chain", more: dict[Path, bytes]) -> None:
+    """Write the files of a chain and others. Raises SkylessError, and then none is there."""
+    from skyless.authentication.key_files import (
+        SITE_PRIVATE,
+        chain_public_bytes,
+        chain_public_file,
+        chain_seed_file,
+        seed_bytes,
+    )
+    from skyless.whole_files import replace_files
+
+    seed, chain_public = chain_seed_file(folder, chain.serial), chain_public_file(folder, chain.serial)
+    for file in (seed, chain_public):
+        if file.exists():
+            raise SkylessError(f"{file} is there already; nothing was written")
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        files = {**more, seed: seed_bytes(chain), chain_public: chain_public_bytes(chain)}
+        replace_files(files, secret=(folder / SITE_PRIVATE, seed))
+    except OSError as error:
+        raise SkylessError(f"{folder} cannot be written: {error.strerror}") from None
+
+
+def _planned(text: str) -> float:
+    """Unix time of a future moment. Raises SkylessError."""
+    try:
+        starts_s = datetime.fromisoformat(text).timestamp()
+    except (ValueError, OverflowError, OSError):
+        raise SkylessError(f'--starts is {text!r}; it should be a date and time, as "2030-01-31 06:00"') from None
+    now_s = time.time()
+    if not now_s <= starts_s <= now_s + _LATEST_S:
+        side = "past" if starts_s < now_s else "far future"
+        raise SkylessError(f"--starts is {text!r}, which is in the {side}; it should be within the next 20 years")
+    return starts_s
+
+
+def _ends_s(chain: "Chain") -> float:
+    return chain.timing.start_s(chain.end)
+
+
+def _when(unix_s: float) -> str:
+    """Local date and time for people."""
+    return datetime.fromtimestamp(unix_s).astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")
+
+
+def _written(folder: Path, chain: "Chain") -> str:
+    begins_s = chain.timing.start_s(chain.first)
+    return f"wrote chain {chain.serial} to {folder}: it counts from {_when(begins_s)} to {_when(_ends_s(chain))}"
