@@ -20,7 +20,7 @@ from skyless.air.frames import decode_any
 from skyless.air.reception import Reception
 from skyless.authentication.certificate import public_key
 from skyless.authentication.fault import Fault
-from skyless.authentication.verifier import Verifier
+from skyless.authentication.verifier import LONGEST_WAIT_TICKS, Verifier
 from skyless.constants import TICK_S
 from skyless.positioning.fix import Fix
 from skyless.positioning.methods.observations import FixTime
@@ -102,8 +102,9 @@ class TrustedReceiver:
 
     @property
     def is_verified(self) -> bool:
-        """Whether beacons have been verified within the last second."""
-        return bool(self._genuine_ticks)
+        """Whether beacons have been verified that were among those of the last seconds."""
+        genuine = self._genuine_ticks
+        return bool(genuine) and self.verifier.newest_ticks - genuine[-1] < LONGEST_WAIT_TICKS
 
     def faults(self) -> dict[int, Fault]:
         """Anchors whose beacons, or beacons in whose name, were not accepted within the last seconds."""

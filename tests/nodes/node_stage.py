@@ -73,7 +73,10 @@ class FakeRadio:
     def now_ticks(self):
         if not self.ready:
             return None
-        return wrap(self.begin_ticks + round((self.loop_s() - 1000.0) * TICK_RATE_HZ))
+        return self.ticks_at(self.loop_s())
+
+    def ticks_at(self, loop_s):
+        return wrap(self.begin_ticks + round((loop_s - 1000.0) * TICK_RATE_HZ))
 
     def loop_s(self):
         return asyncio.get_running_loop().time()

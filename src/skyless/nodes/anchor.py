@@ -15,6 +15,7 @@ from skyless.air.beacon import Malformed
 from skyless.air.frames import decode_any
 from skyless.air.reception import Reception
 from skyless.anchor import Anchor
+from skyless.anchors.authentication import BeaconAuthentication
 from skyless.anchors.factory import AnyAnchor, new_anchor
 from skyless.anchors.slots import SlotsAnchor
 from skyless.constants import TICK_RATE_HZ
@@ -24,6 +25,8 @@ from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import AnchorHealth, Counters, PlacementMessage, RequestMessage
 from skyless.mqtt.topics import health_topic, placement_topic, request_topic, stamps_topic
+from skyless.nodes.keys.anchor_keys import KEYS_S, AnchorKeys
+from skyless.nodes.keys.anchor_report import AnchorReport, recent_faults
 from skyless.nodes.process import HEALTH_S, Log, SitePublisher, every, keep, link_of, together
 from skyless.nodes.radio_monitor import RadioMonitor
 from skyless.nodes.stamp_log import StampLog
@@ -67,10 +70,13 @@ _ROLES: Final[dict[Role | SlotRole, Literal["master", "root", "anchor", "listeni
 class AnchorNode:
     """Runs the machine of an anchor on a radio."""
 
-    def __init__(self, site: Site, anchor_id: int, radio: Radio, log: Log) -> None:
+    def __init__(self, site: Site, anchor_id: int, radio: Radio, log: Log, keys: AnchorKeys | None = None) -> None:
+        """``keys``: of its site; None for an anchor that sends without codes."""
         self.site, self.id, self.radio = site, anchor_id, radio
         self._radio_site, self._log = site, log
         """The radio is configured with the antenna delays of this site, and keeps them."""
+        self._keys, self._report = keys, AnchorReport(anchor_id, log)
+        self.authentication: BeaconAuthentication | None = None
         self.machine = self._new_machine()
         self.stamps = StampLog(anchor_id, secrets.token_hex(4))
         self.refused = Counter[str]()
@@ -90,7 +96,9 @@ class AnchorNode:
         self._timer: asyncio.TimerHandle | None = None
 
     def _new_machine(self) -> AnyAnchor:
-        machine = new_anchor(self._radio_site, self.id, lead_s=self.radio.lead_s)
+        if self._keys is not None:
+            self.authentication = BeaconAuthentication(self.site.id, self._keys.chains)
+        machine = new_anchor(self._radio_site, self.id, self.radio.lead_s, self.authentication)
         if self.site is not self._radio_site:
             machine.place(self.site)
         return machine
@@ -143,8 +151,10 @@ class AnchorNode:
         """Process an event of the radio."""
         if isinstance(event, Reception):
             self._received += 1
+            accepted = self.machine.counters["heard"]
             self.machine.hear(event)
-            self._note(event)
+            if self.authentication is None or self.machine.counters["heard"] > accepted:
+                self._note(event)
         elif isinstance(event, Sent):
             self.transmissions.sent += 1
             self.lead_s = max(self.lead_s * LEAD_LOSS, self.radio.lead_s)
@@ -169,6 +179,28 @@ class AnchorNode:
         drops = Counter({reason: count for reason, count in counters.items() if reason not in _NOT_DROPS})
         self.monitor.check(now_s, self._received, counters["heard"], drops + self.radio.counters)
 
+    def check_codes(self, unix_s: float, now_s: float) -> None:
+        """Log what has changed of codes; ``now_s`` is the host's monotonic clock."""
+        if self._keys is not None and self.authentication is not None:
+            accepted_s = max(self.heard_s.values(), default=self.started_s)
+            self._report.update(self.authentication, self._keys.present(unix_s), accepted_s, unix_s, now_s)
+
+    def with_codes(self, health: AnchorHealth) -> AnchorHealth:
+        """An anchor's state with what it knows of key chains and codes."""
+        keys, authentication = self._keys, self.authentication
+        if keys is None or authentication is None:
+            return health
+        fault = authentication.fault()
+        return replace(
+            health,
+            chain=keys.present(health.unix_s),
+            chain_ends_unix_s=keys.ends_s,
+            code_fault=None if fault is None else fault.value,
+            faults={
+                str(other): why.value for other, why in sorted(recent_faults(authentication, health.unix_s).items())
+            },
+        )
+
     def _note(self, reception: Reception) -> None:
         beacon = decode_any(reception.frame)
         if isinstance(beacon, Malformed) or beacon.site != self.site.id or beacon.anchor not in self._others:
@@ -185,6 +217,8 @@ class AnchorNode:
     def _schedule(self) -> None:
         """Ask the machine for its next transmission."""
         now_ticks = self.radio.now_ticks()
+        if now_ticks is not None and self.authentication is not None:
+            self.authentication.set_time(now_ticks, time.time())
         tx_ticks = None if now_ticks is None else self.machine.next_transmission_ticks(now_ticks)
         self.transmissions.plan(tx_ticks)
         if now_ticks is None or tx_ticks is None:
@@ -235,11 +269,12 @@ class Anchors:
         *,
         simulated: Callable[[], bool],
         floor_plan: Path | None = None,
+        keys: AnchorKeys | None = None,
     ) -> None:
         """``simulated`` is asked again when a radio has restarted: its port may lead to another device."""
-        self._site, self._log = site, log
+        self._site, self._log, self._keys = site, log, keys
         self._site_publisher = SitePublisher(site, simulated, floor_plan)
-        self.nodes = tuple(AnchorNode(site, int(radio.name), radio, log) for radio in radios)
+        self.nodes = tuple(AnchorNode(site, int(radio.name), radio, log, keys) for radio in radios)
         self._links = tuple(self._link(node, address) for node in self.nodes)
 
     def _link(self, node: AnchorNode, address: MqttAddress | None) -> Link | None:
@@ -266,7 +301,20 @@ class Anchors:
         """Serve until cancelled."""
         parts = [node.run() for node in self.nodes]
         parts += [keep(link, self._log) for link in self._links if link is not None]
-        await together(*parts, every(HEALTH_S, self._publish_health), every(STAMPS_S, self._publish_stamps))
+        parts += [every(HEALTH_S, self._publish_health), every(STAMPS_S, self._publish_stamps)]
+        if self._keys is not None:
+            parts.append(every(KEYS_S, self.update_keys))
+        await together(*parts)
+
+    def update_keys(self) -> None:
+        """Use other key chains where their files have changed."""
+        if self._keys is None:
+            return
+        if self._keys.update():
+            for node in self.nodes:
+                if node.authentication is not None:
+                    node.authentication.set_chains(self._keys.chains)
+        self._keys.warn(time.time())
 
     def _publish_stamps(self) -> None:
         """Publish the stamps that were requested and are due."""
@@ -282,6 +330,7 @@ class Anchors:
         self._site_publisher.update(sum(node.monitor.restarts for node in self.nodes))
         for node, link in zip(self.nodes, self._links, strict=True):
             node.check_reception(now_s)
+            node.check_codes(unix_s, now_s)
             if link is not None:
                 if leads(node.machine, is_first=node is self.nodes[0]):
                     self._site_publisher.publish(link)
@@ -323,6 +372,7 @@ def health_of(node: AnchorNode, mqtt: Counters, unix_s: float, now_s: float) -> 
     )
     if isinstance(machine, Anchor):
         return _with_master(health, machine, now_ticks)
+    health = node.with_codes(health)
     return _with_root(health, machine, now_ticks) if isinstance(machine, SlotsAnchor) else health
 
 

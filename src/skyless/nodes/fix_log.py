@@ -41,6 +41,9 @@ class FixLog:
         """Since the start."""
         self.last_fix_s: float | None = None
         """When the last fix was made, by the host's monotonic clock."""
+        self.due_s = 0.0
+        """When the last frame had ended without which the newest fix could not be made: its own, except for a verified
+        fix, which needs a key that comes later."""
         self.latencies = Latencies()
         self.lateness = Lateness()
         """Which receptions and fixes are too old."""
@@ -51,14 +54,18 @@ class FixLog:
         """Measure again how far Unix time is from the host's monotonic clock: it is set now and then."""
         self.unix_less_host_s = time.time() - self._clock()
 
-    def add(self, fix: Fix, ended_s: float, done_s: float) -> None:
-        """Add a fix: when its last frame ended, and when it was made, by the host's monotonic clock."""
+    def add(self, fix: Fix, ended_s: float, done_s: float, due_s: float | None = None) -> None:
+        """Add a fix: when its last frame ended, and when it was made, by the host's monotonic clock.
+
+        ``due_s``: when it could be made, where that is not at its last frame; its age counts from then.
+        """
         self.serial += 1
+        self.due_s = ended_s if due_s is None else due_s
         self.last_fix_s = done_s
         self.latencies.add(done_s - ended_s)
         if self.first_fix_s is None:
             self.first_fix_s = done_s - self.started_s
-        if self.lateness.gives(ended_s, done_s) and self._rate.is_due(ended_s):
+        if self.lateness.gives(self.due_s, done_s) and self._rate.is_due(ended_s):
             unix_s = ended_s + self.unix_less_host_s
             self._publish(fix_message(self.tag, self.serial, fix, unix_s, done_s - ended_s))
 

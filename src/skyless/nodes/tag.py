@@ -9,6 +9,7 @@ from typing import Final
 
 import msgspec
 from msgspec import Struct
+from msgspec.structs import replace
 
 from skyless.air.reception import Reception
 from skyless.method_names import DEFAULT_METHOD
@@ -17,16 +18,23 @@ from skyless.mqtt.link import Link
 from skyless.mqtt.messages import Counters, FixMessage, RequestMessage, TagHealth
 from skyless.mqtt.topics import fix_topic, health_topic, receptions_topic, request_topic
 from skyless.nodes.fix_log import FixListener, FixLog, PhaseLog
+from skyless.nodes.keys.tag_memory import Remembered, TagMemory
+from skyless.nodes.keys.tag_report import TagReport, trust_reason
 from skyless.nodes.lateness import FIX_LEAVES_S
-from skyless.nodes.process import HEALTH_S, Log, Usage, every, keep, together
+from skyless.nodes.process import HEALTH_S, Log, Usage, data_folder, every, keep, together
 from skyless.nodes.radio_monitor import RadioMonitor
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.radios.interface import Gone, Hint, Radio, RadioEvent, Restarted
 from skyless.receiver import NOT_DROPS, Receiver
 from skyless.recordings.mcap.reception_log import ReceptionLog, receiver_settings
+from skyless.trusted_receiver import GivenFix, SiteTrust, Trust, TrustedReceiver
 
 RECEPTIONS_S: Final = 0.05
 """Interval of the messages with raw receptions."""
+
+VERIFIED_S: Final = 2.0
+"""Beacons that were received before this time do not count as verified any more."""
+
 HealthListener = Callable[[TagHealth, Receiver], None]
 """Called with a tag's state, and with its receiver, which knows the site."""
 
@@ -43,6 +51,8 @@ class TagSettings(Struct, frozen=True):
     integrity: IntegrityRequirement = IntegrityRequirement()
     publish_hz: float = 50.0
     """Largest rate of fixes on MQTT; all of them count."""
+    trust: SiteTrust | None = None
+    """Which beacons and fixes are accepted; None for a tag that does not know the site's public key."""
 
 
 class TagNode:
@@ -56,15 +66,22 @@ class TagNode:
         log: Log,
         before: Callable[[Receiver, Reception, int], None] | None = None,
         clock: Callable[[], float] | None = None,
+        memory: TagMemory | None = None,
     ) -> None:
         """``before`` is called before each reception that is processed: with receiver, reception and number of fixes.
 
         ``clock`` gives the host's monotonic time in s, as ``host_s`` of the receptions; None for ``time.monotonic``.
+        ``memory``: what is known of the site's keys from earlier runs.
         """
         self.settings, self.radio = settings, radio
         self._before, self._clock = before, time.monotonic if clock is None else clock
         self.name = radio.name
-        self.receiver = self.new_receiver()
+        self._memory = memory
+        self._trusted = self._new_trusted()
+        self._receiver = self.new_receiver()
+        self._report = None if settings.trust is None else TagReport(radio.name, settings.trust.site, log)
+        self._heard_s = 0.0
+        """When the last reception was processed."""
         self.receptions = 0
         """Those that were too old at their turn among them."""
         self.fix_log = FixLog(self.name, publish, settings.publish_hz, self._clock)
@@ -76,12 +93,59 @@ class TagNode:
         asked = self.settings
         return Receiver(asked.method, site=asked.site, qa=asked.qa, integrity=asked.integrity)
 
+    def _new_trusted(self) -> TrustedReceiver | None:
+        """What verifies beacons, with all that is remembered of the site's keys; None without a public key."""
+        trust = self.settings.trust
+        if trust is None:
+            return None
+        known = Remembered() if self._memory is None else self._memory.remembered
+        newest = replace(trust, least_serial=max(trust.least_serial, known.serial))
+        return TrustedReceiver(newest, self.new_receiver, known.certificates)
+
+    @property
+    def receiver(self) -> Receiver:
+        """The one whose fixes are given."""
+        return self._receiver if self._trusted is None else self._trusted.receiver
+
     @property
     def drops(self) -> Counter[str]:
         """What could not be used, by reason."""
         counters = self.receiver.counters.items()
         dropped = Counter({reason: count for reason, count in counters if reason not in NOT_DROPS})
-        return dropped + self.radio.counters + self.fix_log.lateness.drops
+        refused = Counter[str]() if self._trusted is None else self._trusted.counters
+        return dropped + refused + self.radio.counters + self.fix_log.lateness.drops
+
+    @property
+    def reason(self) -> str:
+        """Why there is no fix, where there is none."""
+        trusted = self._trusted
+        is_given = trusted is None or trusted.trust.trust is Trust.OPEN
+        return (None if is_given or trusted is None else trust_reason(trusted)) or str(self.receiver.reason)
+
+    def with_trust(self, health: TagHealth) -> TagHealth:
+        """A tag's state with what it knows of verified beacons."""
+        trusted = self._trusted
+        if trusted is None:
+            return health
+        return replace(
+            health,
+            trust=trusted.trust.trust.value,
+            is_verified=self._is_verified(trusted),
+            faults={str(anchor): str(fault) for anchor, fault in sorted(trusted.faults().items())},
+            clock_error_s=trusted.verifier.clock.error_s,
+        )
+
+    def check_trust(self) -> None:
+        """Log what has changed of verified beacons, and remember what is known of the site's keys."""
+        trusted = self._trusted
+        if trusted is None or self._report is None:
+            return
+        self._report.update(trusted, self._clock(), is_verified=self._is_verified(trusted))
+        if self._memory is not None:
+            self._memory.keep(trusted.verifier.keys.serial, trusted.verifier.keys.certificates)
+
+    def _is_verified(self, trusted: TrustedReceiver) -> bool:
+        return trusted.is_verified and self._clock() - self._heard_s < VERIFIED_S
 
     def check_reception(self, now_s: float) -> None:
         """Log where to look if it receives nothing usable; ``now_s`` is the host's monotonic clock."""
@@ -98,7 +162,8 @@ class TagNode:
         elif isinstance(event, Restarted | Gone | Hint):
             self.monitor.on_event(event)
             if isinstance(event, Restarted) and self.receptions:
-                self.receiver = self.new_receiver()
+                self.check_trust()
+                self._receiver, self._trusted = self.new_receiver(), self._new_trusted()
 
     def _receive(self, reception: Reception) -> None:
         self.receptions += 1
@@ -106,12 +171,22 @@ class TagNode:
             return
         if self._before is not None:
             self._before(self.receiver, reception, self.fix_log.serial)
-        fix = self.receiver.hear(reception)
-        done_s = self._clock()
-        ended_s = done_s if reception.host_s is None else reception.host_s
-        self.phases.add(reception.frame, ended_s, done_s, made_fix=fix is not None)
-        if fix is not None:
-            self.fix_log.add(fix, ended_s, done_s)
+        given = self._fixes_of(reception)
+        done_s = self._heard_s = self._clock()
+        due_s = done_s if reception.host_s is None else reception.host_s
+        self.phases.add(reception.frame, due_s, done_s, made_fix=bool(given))
+        for one in given:
+            ended_s = one.reception.host_s
+            self.fix_log.add(one.fix, due_s if ended_s is None else ended_s, done_s, due_s)
+
+    def _fixes_of(self, reception: Reception) -> list[GivenFix]:
+        """The fixes that a reception makes possible."""
+        if self._trusted is not None:
+            host_s = reception.host_s
+            unix_s = time.time() if host_s is None else host_s + self.fix_log.unix_less_host_s
+            return self._trusted.hear(reception, unix_s)
+        fix = self._receiver.hear(reception)
+        return [] if fix is None else [GivenFix(fix, reception)]
 
 
 class Tag:
@@ -136,7 +211,8 @@ class Tag:
         self._fix_topic = self._health_topic = self._receptions_topic = ""
         asked = receiver_settings(settings.method, settings.site, settings.qa, integrity=settings.integrity)
         self.reception_log = ReceptionLog(radio.name, asked, secrets.token_hex(4))
-        self.node = TagNode(settings, radio, self._publish, log, self.reception_log.add)
+        memory = None if settings.trust is None else TagMemory(settings.trust, data_folder())
+        self.node = TagNode(settings, radio, self._publish, log, self.reception_log.add, memory=memory)
 
     async def run(self) -> None:
         """Serve until cancelled."""
@@ -152,8 +228,7 @@ class Tag:
             self._on_fix(message)
         self._connect()
         if self.link is not None:
-            ended_s = message.unix_s - self.node.fix_log.unix_less_host_s
-            self.link.publish(self._fix_topic, message, until_s=ended_s + FIX_LEAVES_S)
+            self.link.publish(self._fix_topic, message, until_s=self.node.fix_log.due_s + FIX_LEAVES_S)
 
     def _connect(self) -> None:
         """Make the link to the site to which the tag listens."""
@@ -195,10 +270,11 @@ class Tag:
         node.fix_log.update_clock_offset()
         self._connect()
         node.check_reception(time.monotonic())
-        health = node.fix_log.health(
+        node.check_trust()
+        counted = node.fix_log.health(
             method=node.settings.method,
             receptions=node.receptions,
-            reason=str(node.receiver.reason),
+            reason=node.reason,
             counters=node.drops | self.reception_log.counters,
             mqtt=Counters(0, 0, 0) if self.link is None else self.link.counters,
             cpu=cpu,
@@ -206,6 +282,7 @@ class Tag:
             phases=node.phases.last,
             late_in_link=self._late_before + (0 if self.link is None else self.link.late),
         )
+        health = node.with_trust(counted)
         if self._on_health is not None:
             self._on_health(health, node.receiver)
         if self.link is not None:

@@ -20,6 +20,7 @@ def anchor(
     *ids: Annotated[int, Parameter(name="IDS")],
     site: str = "lab",
     radio: str = DEFAULT_RADIO,
+    keys: Annotated[Path | None, Parameter(env_var="SKYLESS_KEYS")] = None,
     broker: MqttOptions = MqttOptions(),
 ) -> None:
     """Run anchors of a site until Ctrl-C.
@@ -36,11 +37,16 @@ def anchor(
     radio
         Radio of the anchors: ether:HOST:PORT is the emulated air of skyless ether, serial:PATH a board,
         spi:BUS.DEVICE,irq=PIN,reset=PIN a DW1000 on this computer's SPI, model:HOST:PORT a model of one on that air.
+    keys
+        Folder of the site's keys, so that beacons carry codes (modes slots and free): site.public, chain-N.public and
+        chain-N.seed of skyless site keys. Files that change are used without a restart. SKYLESS_CHAIN_SEEDS, as
+        "1:HEX 2:HEX", may hold the seeds instead.
     broker.mqtt
         Broker to publish health and site to, or none.
     """
     from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.nodes.anchor import Anchors
+    from skyless.nodes.keys.anchor_keys import AnchorKeys
     from skyless.nodes.open_radio import is_simulated, open_radios
     from skyless.nodes.process import run
     from skyless.preparation.parts import SIMULATED
@@ -55,9 +61,19 @@ def anchor(
         )
     delays = [AntennaDelays(nodes[i].tx_antenna_delay_ticks, nodes[i].rx_antenna_delay_ticks) for i in ids]
     radios = open_radios(radio, "anchor", tuple(map(str, ids)), delays)
+    chains = None
+    if keys is not None:
+        if plan.schedule.needs_master:
+            raise SkylessError(
+                f'--keys is given, but {site} has schedule.mode "master", whose beacons carry no codes; it should be '
+                "slots or free"
+            )
+        chains = AnchorKeys(keys, plan.id, log)
     image = None if plan.floor_plan is None else Path(site).parent / plan.floor_plan.image
     with loading_kernels(SIMULATED):
         compile_kernels(WEIGHTED)
     with contextlib.suppress(KeyboardInterrupt):
-        anchors = Anchors(plan, radios, address, log, simulated=lambda: is_simulated(radio), floor_plan=image)
+        anchors = Anchors(
+            plan, radios, address, log, simulated=lambda: is_simulated(radio), floor_plan=image, keys=chains
+        )
         run(anchors.run(), punctual=True)

@@ -22,7 +22,7 @@ from skyless.positioning.alert import Alert
 
 CSV_COLUMNS: Final = (
     *("unix_s", "tag", "x_m", "y_m", "z_m", "std_m", "vx_mps", "vy_mps", "vz_mps"),
-    *("anchors", "latency_s", "hpl_m", "vpl_m", "alert"),
+    *("anchors", "latency_s", "hpl_m", "vpl_m", "alert", "time_s", "verified_until_s", "unverified"),
 )
 """Columns of ``--csv``."""
 
@@ -76,7 +76,9 @@ def csv_row(fix: FixMessage) -> str:
     velocity = (None, None, None) if fix.velocity_mps is None else fix.velocity_mps
     moved = [_figure(value) for value in (*fix.position_m, fix.std_m, *velocity)]
     levels = [_figure(value) for value in (fix.latency_s, fix.hpl_m, fix.vpl_m)]
-    return ",".join([f"{fix.unix_s:.6f}", fix.tag, *moved, " ".join(map(str, fix.anchors)), *levels, fix.alert or ""])
+    trust = [_figure(value) for value in (fix.time_s, fix.verified_until_s, fix.unverified)]
+    anchors = " ".join(map(str, fix.anchors))
+    return ",".join([f"{fix.unix_s:.6f}", fix.tag, *moved, anchors, *levels, fix.alert or "", *trust])
 
 
 def _figure(value: float | None) -> str:

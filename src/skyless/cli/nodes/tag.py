@@ -4,7 +4,7 @@ import contextlib
 import re
 from collections.abc import Coroutine, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from skyless.nodes.fix_log import FixListener
     from skyless.nodes.packet_tags import PacketTagSettings
     from skyless.site.model import GeoreferenceSite
+    from skyless.trusted_receiver import SiteTrust
 
 _TAG_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
@@ -75,6 +76,14 @@ class TagOptions:
     to: tuple[str, ...] = ()
     """Where fixes go as well, without a broker: a program or device of another kind; may be given several times.
     skyless bridge --help lists the targets, as nmea+tcp://:10110."""
+    site_key: Annotated[Path | None, Parameter(env_var="SKYLESS_SITE_KEY")] = None
+    """File with the site's public key, the site.public of skyless site keys: beacons of that site alone are accepted,
+    and their codes verified."""
+    trust: Literal["open", "verified"] | None = None
+    """Which fixes are given: open, the default, each at once, stating how far it is verified; verified, half a second
+    later, only those of verified beacons (with --site-key)."""
+    clock_bound_ms: Annotated[float | None, Parameter(validator=Number(gt=0, lte=10_000))] = None
+    """How far this computer's clock may be from those of the anchors, in ms; 100 by default (with --site-key)."""
     tag_height: str | None = None
     """The tags' height (sniffers and FiRa boards): metres, free (estimated) or auto, the default: estimated unless the
     anchors lie too flat, then theirs."""
@@ -110,6 +119,8 @@ def tag(
         )
     check_method(asked.method)
     if receives_packets(asked.radio):
+        if (asked.site_key, asked.trust, asked.clock_bound_ms) != (None,) * 3:
+            raise SkylessError("--site-key, --trust and --clock-bound-ms are not for sniffers and FiRa boards")
         if asked.protection.given:
             raise SkylessError(
                 "--integrity-risk, --alert-limit-m and --max-acceleration are not for sniffers and FiRa boards"
@@ -165,11 +176,36 @@ def _on_radios(
     from skyless.preparation.parts import parts_of
 
     required = asked.protection.requirement(asked.method, asked.tag_height_std)
-    settings = TagSettings(asked.method, asked.qa, asked.site_id, integrity=required, publish_hz=asked.publish_hz)
+    trust = _site_trust(asked)
+    settings = TagSettings(
+        asked.method,
+        asked.qa,
+        asked.site_id if trust is None else trust.site,
+        integrity=required,
+        publish_hz=asked.publish_hz,
+        trust=trust,
+    )
     radios = open_radios(asked.radio, "tag", names)
     with loading_kernels(*parts_of(asked.method)):
         compile_kernels(asked.method)
     return Tags(settings, radios, address, log, on_fix, None if bridge is None else bridge.on_health).run()
+
+
+def _site_trust(asked: TagOptions) -> "SiteTrust | None":
+    """Which beacons and fixes are accepted; None without a public key. Raises SkylessError."""
+    from skyless.authentication.key_files import read_site_public
+    from skyless.trusted_receiver import SiteTrust, Trust
+
+    if asked.site_key is None:
+        option = "--clock-bound-ms" if asked.trust is None else f"--trust {asked.trust}"
+        if (asked.trust, asked.clock_bound_ms) != (None, None):
+            raise SkylessError(f"{option} needs --site-key, the site.public of skyless site keys")
+        return None
+    public = read_site_public(asked.site_key)
+    if asked.site_id not in (None, public.site):
+        raise SkylessError(f"--site-id is {asked.site_id}, but {asked.site_key} is of site {public.site}")
+    bound_s = 1e-3 * (100.0 if asked.clock_bound_ms is None else asked.clock_bound_ms)
+    return SiteTrust(public.site, public.public, public.least_serial, Trust(asked.trust or "open"), bound_s)
 
 
 def _on_sniffers(

@@ -1,0 +1,50 @@
+"""A site whose anchors have keys, for tests of programs: its files, and what a tag receives of it."""
+
+from functools import lru_cache
+
+from msgspec.structs import replace
+from node_stage import LAB, PLACE_M
+
+from skyless.authentication.key_files import (
+    SITE_PUBLIC,
+    SitePublic,
+    chain_public_bytes,
+    chain_public_file,
+    chain_seed_file,
+    seed_bytes,
+    site_public_bytes,
+)
+from skyless.evaluation.scenarios import Request, impairments_of
+from skyless.evaluation.trusted_air import anchors_with_keys, made_keys
+from skyless.simulation.stations import TagSpec
+from skyless.simulation.trajectory import Static
+from skyless.simulation.world import World
+from skyless.site.model import ScheduleSite
+
+FREE = replace(LAB, schedule=ScheduleSite(mode="free", rate_hz=50.0))
+KEYS = made_keys(FREE.id, 0.0, 30.0)
+"""A first chain, and one that counts from 30 s on."""
+FIRST, SECOND = KEYS.chains
+OTHER_KEYS = made_keys(FREE.id, 0.0, number=2)
+"""Of somebody else for the same site."""
+
+
+def put(folder, *chains, least_serial=1, seeds=True):
+    """Write files of keys as an operator copies them."""
+    (folder / SITE_PUBLIC).write_bytes(site_public_bytes(SitePublic(FREE.id, KEYS.public, least_serial)))
+    for chain in chains:
+        chain_public_file(folder, chain.serial).write_bytes(chain_public_bytes(chain))
+        if seeds:
+            seed = chain_seed_file(folder, chain.serial)
+            seed.touch(0o600)
+            seed.write_bytes(seed_bytes(chain))
+
+
+@lru_cache(maxsize=4)
+def tape(seconds=4.0, chains=(FIRST,), seed=1):
+    """What a tag at ``PLACE_M`` receives; ``START_UNIX_S`` is the host's time 0."""
+    worlds = []
+    make = anchors_with_keys(FREE, lambda: worlds[0].now_s, chains)
+    world = World(FREE, make, [TagSpec(Static(*PLACE_M[:2]))], impairments_of(Request(FREE), FREE), seed)
+    worlds.append(world)
+    return tuple(one for broadcast in world.run(seconds) for _, one, _ in broadcast.receptions())

@@ -1,0 +1,278 @@
+"""The anchor's program with keys: codes on the air, files that change while it runs, and what it logs."""
+
+import asyncio
+
+import pytest
+from keyed_site import FIRST, FREE, KEYS, OTHER_KEYS, SECOND, put
+from node_stage import FakeRadio, play
+
+from skyless.air.codec2 import decode_2
+from skyless.air.reception import Reception
+from skyless.anchors.authentication import BeaconAuthentication
+from skyless.anchors.free import FreeAnchor
+from skyless.authentication.fault import Fault
+from skyless.authentication.key_files import SEEDS_VARIABLE, chain_public_file, chain_seed_file, seed_bytes
+from skyless.cli.main import main
+from skyless.constants import TICK_S
+from skyless.errors import SkylessError
+from skyless.evaluation.trusted_air import START_UNIX_S
+from skyless.mqtt.messages import Counters
+from skyless.nodes.anchor import Anchors, health_of
+from skyless.nodes.keys.anchor_keys import AnchorKeys
+from skyless.nodes.keys.anchor_report import AnchorReport
+from skyless.nodes.keys.faults import CALM_S, LASTING_S, MOST_NAMED, FaultLines
+from skyless.radios.interface import Restarted
+from skyless.ticks import difference
+
+BEGIN_S = 1000.0
+"""The first instant of the loop, at which ``START_UNIX_S`` is the time."""
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """The host's clocks are the loop's."""
+
+    def loop_s():
+        return asyncio.get_running_loop().time() - BEGIN_S
+
+    monkeypatch.setattr("time.time", lambda: START_UNIX_S + loop_s())
+    monkeypatch.setattr("time.monotonic", loop_s)
+
+
+class Stage:
+    """Anchors of the site in a jumping loop."""
+
+    def __init__(self, folder, *names, environment=None):
+        self.said = []
+        keys = AnchorKeys(folder, FREE.id, self.said.append, environment or {})
+        self.radios = [FakeRadio(name) for name in names or ("1",)]
+        self.anchors = Anchors(FREE, self.radios, None, self.said.append, simulated=lambda: True, keys=keys)
+        self.node = self.anchors.nodes[0]
+
+    async def __aenter__(self):
+        self._task = asyncio.ensure_future(self.anchors.run())
+        await asyncio.sleep(0)
+        for radio, node in zip(self.radios, self.anchors.nodes, strict=True):
+            radio.sends = True
+            node.on_event(Restarted())
+        return self
+
+    async def __aexit__(self, *_):
+        self._task.cancel()
+        await asyncio.wait([self._task])
+
+    def frames(self):
+        return [decode_2(transmission.frame) for _, transmission in self.radios[0].transmissions]
+
+    def health(self):
+        now_s = asyncio.get_running_loop().time() - BEGIN_S
+        return health_of(self.node, Counters(0, 0, 0), START_UNIX_S + now_s, now_s)
+
+
+def test_frames_carry_codes_and_other_chains_are_used_without_a_restart(tmp_path, clock):
+    put(tmp_path, FIRST)
+
+    async def check():
+        async with Stage(tmp_path) as stage:
+            await asyncio.sleep(5.0)
+            assert all(frame.authentication is not None for frame in stage.frames())
+            health = stage.health()
+            assert (health.chain, health.code_fault, health.faults) == (1, None, {})
+            ends_s = health.chain_ends_unix_s
+            put(tmp_path, SECOND)
+            await asyncio.sleep(10.0)
+            assert stage.health().chain == 1
+            assert stage.health().chain_ends_unix_s >= ends_s
+            await asyncio.sleep(20.0)
+            assert (stage.health().chain, stage.health().code_fault) == (2, None)
+            assert all(frame.authentication is not None for frame in stage.frames())
+            codes = [line for line in stage.said if "codes" in line]
+            assert codes == [f"anchor 1: beacons carry codes of key chain {serial}" for serial in (1, 2)]
+            other, faults = BeaconAuthentication(FREE.id, KEYS.chains), set()
+            for sent_s, transmission in stage.radios[0].transmissions:
+                ahead_s = difference(transmission.tx_ticks, stage.radios[0].ticks_at(sent_s)) * TICK_S
+                other.set_time(transmission.tx_ticks, START_UNIX_S + sent_s - BEGIN_S + ahead_s)
+                beacon = decode_2(transmission.frame)
+                faults.add(other.fault_of(beacon, Reception(transmission.frame, transmission.tx_ticks)))
+            assert faults == {None}
+
+    play(check())
+
+
+def test_several_anchors_share_the_files(tmp_path, clock):
+    put(tmp_path, FIRST)
+
+    async def check():
+        async with Stage(tmp_path, "1", "2", "3") as stage:
+            await asyncio.sleep(1.5)
+            assert {node.authentication.fault() for node in stage.anchors.nodes} == {None}
+            assert len({id(node.authentication) for node in stage.anchors.nodes}) == 3
+
+    play(check())
+
+
+def test_files_that_are_copied_at_the_moment_change_nothing(tmp_path, clock):
+    put(tmp_path, FIRST)
+
+    async def check():
+        async with Stage(tmp_path) as stage:
+            await asyncio.sleep(4.0)
+            put(tmp_path, SECOND)
+            file = chain_public_file(tmp_path, 2)
+            whole = file.read_bytes()
+            file.write_bytes(whole[:-9])
+            await asyncio.sleep(10.0)
+            said = [line for line in stage.said if line.startswith("keys: the former ones stay in use:")]
+            assert len(said) == 1
+            assert "chain-2.public" in said[0]
+            assert [chain.serial for chain in stage.anchors._keys.chains] == [1]
+            file.write_bytes(whole)
+            await asyncio.sleep(4.0)
+            assert [chain.serial for chain in stage.anchors._keys.chains] == [1, 2]
+            assert stage.health().code_fault is None
+
+    play(check())
+
+
+def test_a_chain_whose_seed_is_still_to_come_is_named(tmp_path):
+    put(tmp_path, FIRST)
+    said = []
+    keys = AnchorKeys(tmp_path, FREE.id, said.append, {})
+    put(tmp_path, SECOND, seeds=False)
+    assert not keys.update()
+    assert said == [f"keys: chain 2 has no seed in {tmp_path}; chain 1 stays in use"]
+    seed = chain_seed_file(tmp_path, 2)
+    seed.touch(0o600)
+    seed.write_bytes(seed_bytes(SECOND))
+    assert keys.update()
+    assert not keys.update()
+
+
+def test_seeds_of_the_environment(tmp_path):
+    put(tmp_path, FIRST, seeds=False)
+    keys = AnchorKeys(tmp_path, FREE.id, print, {SEEDS_VARIABLE: f"1:{FIRST.seed.hex()}"})
+    assert keys.chains == (FIRST,)
+    with pytest.raises(SkylessError, match=r"chain-1\.seed is missing"):
+        AnchorKeys(tmp_path, FREE.id, print, {})
+
+
+def test_the_end_of_the_last_chain_is_logged_once_a_day(tmp_path):
+    put(tmp_path, FIRST)
+    said = []
+    keys = AnchorKeys(tmp_path, FREE.id, said.append, {})
+    day_s = 86_400.0
+    keys.warn(keys.ends_s - 61.0 * day_s)
+    assert said == []
+    for moment_s in (-2.5 * day_s, -2.4 * day_s, -1.5 * day_s, -10.0, 10.0, 20.0):
+        keys.warn(keys.ends_s + moment_s)
+    what = ["ends in 2 days", "ends in 1 days", "ends within a day", "has ended"]
+    assert len(said) == 4
+    assert all(words in line for words, line in zip(what, said, strict=True))
+
+
+def test_an_anchor_whose_chain_has_not_begun_says_so_and_sends_without_codes(tmp_path, clock):
+    put(tmp_path, SECOND)
+
+    async def check():
+        async with Stage(tmp_path) as stage:
+            await asyncio.sleep(3.0)
+            assert {frame.authentication for frame in stage.frames()} == {None}
+            assert (stage.health().chain, stage.health().code_fault) == (None, "no-chain")
+            assert "anchor 1: beacons carry no codes: no key chain counts now (skyless site keys show)" in stage.said
+
+    play(check())
+
+
+def reported(faults, accepted_s=float("-inf")):
+    """Lines of an anchor whose others have these faults for ten seconds."""
+    said = []
+    authentication = BeaconAuthentication(FREE.id, KEYS.chains)
+    report = AnchorReport(1, said.append)
+    for now_s in range(10):
+        unix_s = START_UNIX_S + now_s
+        authentication.set_time(0, unix_s)
+        authentication.faults = {anchor: (fault, unix_s) for anchor, fault in faults.items()}
+        report.update(authentication, 1, max(accepted_s, -100.0) if accepted_s < 0 else now_s, unix_s, float(now_s))
+    return said[1:]
+
+
+def test_an_anchor_that_accepts_nobody_suspects_itself():
+    faults = {2: Fault.BAD_CODE, 3: Fault.BAD_CODE}
+    assert reported(faults) == [
+        "anchor 1: no other anchor's code fits: the own seed or this host's clock is probably wrong"
+    ]
+
+
+def test_another_anchor_that_is_refused_is_named():
+    (line,) = reported({2: Fault.BAD_CODE}, accepted_s=1.0)
+    assert line.startswith("anchor 1: beacons of anchor 2 are not accepted: their codes are wrong")
+
+
+def test_lines_of_faults_come_once_and_are_few():
+    said = []
+    lines = FaultLines("x", said.append)
+    for now_s in range(60):
+        lines.update(dict.fromkeys(range(100), Fault.BAD_CODE) if now_s < 20 else {}, float(now_s))
+    assert len(said) == 2 * MOST_NAMED
+    assert sum("was refused for" in line for line in said) == MOST_NAMED
+    lines.update({1: Fault.LATE}, 100.0)
+    lines.update({}, 100.0 + LASTING_S)
+    lines.update({}, 100.0 + 2.0 * CALM_S)
+    assert len(said) == 2 * MOST_NAMED
+
+
+@pytest.mark.parametrize(
+    ("case", "words"),
+    [
+        ("master", 'has schedule.mode "master", whose beacons carry no codes; it should be slots or free'),
+        ("foreign", "is of site 1; it should be of site 300"),
+        ("none", "is no folder"),
+    ],
+)
+def test_wrong_keys_are_refused_before_anything_runs(tmp_path, capsys, case, words):
+    site = tmp_path / "hall.toml"
+    size = ["--width", "20", "--depth", "20", "--site-id", "300"]
+    assert main(["site", "new", str(site), *size, *(() if case == "master" else ("--spacing", "10"))]) == 0
+    put(tmp_path, FIRST)
+    folder = tmp_path / "none" if case == "none" else tmp_path
+    capsys.readouterr()
+    assert main(["anchor", "1", "--site", str(site), "--keys", str(folder), "--mqtt", "none"]) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--trust", "verified"], "--trust verified needs --site-key, the site.public of skyless site keys"),
+        (["--clock-bound-ms", "20"], "--clock-bound-ms needs --site-key"),
+        (["--site-key", "KEYS", "--site-id", "9"], "--site-id is 9, but"),
+        (["--site-key", "none"], "none is missing"),
+        (["--site-key", "KEYS", "--radio", "sniffer:/dev/null"], "are not for sniffers and FiRa boards"),
+    ],
+)
+def test_wrong_options_of_a_tag_are_refused(tmp_path, capsys, arguments, words):
+    put(tmp_path, FIRST)
+    given = [str(tmp_path / "site.public") if one == "KEYS" else one for one in arguments]
+    assert main(["tag", "t1", "--mqtt", "none", *given]) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
+
+
+def test_stamps_of_beacons_that_are_not_accepted_are_not_kept(tmp_path, clock):
+    """A survey would use them."""
+    put(tmp_path, FIRST)
+
+    async def check():
+        async with Stage(tmp_path) as stage:
+            await asyncio.sleep(1.0)
+            for chains, is_kept in ((OTHER_KEYS.chains, False), ((), False), (KEYS.chains, True)):
+                now_ticks = stage.radios[0].now_ticks()
+                sender = FreeAnchor(FREE, 2, authentication=BeaconAuthentication(FREE.id, chains))
+                sender.authentication.set_time(now_ticks, START_UNIX_S + 1.0)
+                stage.node.on_event(Reception(sender.transmission(now_ticks).frame, now_ticks))
+                assert (2 in stage.node.heard_s) is is_kept
+
+    play(check())
