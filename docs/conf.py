@@ -29,6 +29,7 @@ NAVIGATION = {
     "How to": [
         "docs/howto/run_a_site",
         "docs/howto/secure_a_site",
+        "docs/howto/secure_the_air",
         "docs/setup",
         "docs/howto/simulate",
         "docs/howto/plan",

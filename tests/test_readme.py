@@ -36,10 +36,14 @@ SHORTER = {
         'skyless simulate --waypoints "1,1;5,1;5,7" --speed 0.5 --outage 1:2:3 --fixes-csv fixes.csv --duration 4'
     ),
     "skyless simulate --scenario room --tags 5": "skyless simulate --scenario room --tags 1 --duration 3",
+    "skyless site keys new hall.toml": "skyless site keys new hall.toml --years 0.001",
+    "skyless site keys rotate hall.toml": "skyless site keys rotate hall.toml --years 0.001",
+    "skyless site keys revoke hall.toml --years 0.1": "skyless site keys revoke hall.toml --years 0.001",
 }
 """Lines that take long, and what is run in their stead: less of the same."""
 
 DEMO = "tests/cli/test_demo_command.py::"
+KEYED = "tests/nodes/test_no_key_leaves.py::test_no_key_leaves_the_programs"
 SITE = "tests/nodes/test_running_site.py::test_a_site_rides_through_the_death_and_the_freezing_of_every_process"
 BOARD = "tests/nodes/test_boards_live.py::"
 BROKER = "tests/nodes/test_broker.py::"
@@ -61,6 +65,11 @@ ELSEWHERE = {
     "skyless ether --site hall.toml --tags 2": SITE,
     "skyless anchor 1 2 3 4 5 6 --site hall.toml": SITE,
     "skyless tag tag1 tag2": SITE,
+    "skyless anchor 3 --site hall.toml --keys /etc/skyless/keys": KEYED,
+    "skyless tag tag1 --site-key site.public --trust verified": KEYED,
+    "chmod 600 /etc/skyless/keys/*.seed": (
+        "tests/authentication/test_key_files.py::test_a_secret_that_others_can_read_is_refused_with_what_to_do"
+    ),
     "skyless tag tag1 --print": (
         "tests/nodes/test_fix_lines.py::test_lines_for_people_have_time_tag_position_and_sigma"
     ),
