@@ -166,9 +166,15 @@ class BeaconAuthentication:
             known.add(unix_s, offset_s)
 
     def _is_clock_wrong(self, timing: ChainTiming, unix_s: float) -> bool:
-        """Whether the own clock is far from that of most other anchors; repeated old frames show nothing."""
+        """Whether the own clock is far from that of most other anchors; repeated old frames show nothing.
+
+        Anywhere in its interval a frame is in time: in slots an anchor may always send near the end of one.
+        """
         recent = [one.least_s for one in self._offsets.values() if abs(unix_s - one.unix_s) <= RECENT_S]
-        return len(recent) >= LEAST_OTHERS and abs(median(recent)) > 0.5 * timing.most_clock_error_s
+        if len(recent) < LEAST_OTHERS:
+            return False
+        least_s = median(recent)
+        return max(-least_s, least_s - timing.interval_s) > 0.5 * timing.most_clock_error_s
 
     def _unix_s(self, ticks: int) -> float:
         assert self._now is not None
