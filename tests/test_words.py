@@ -119,6 +119,7 @@ IDENTIFIERS = [
 HEARING = {
     "anchor.py",
     "anchors/free.py",
+    "evaluation/attacked_air.py",
     "evaluation/trusted_air.py",
     "trusted_receiver.py",
     "anchors/slots.py",
