@@ -54,7 +54,7 @@ def test_the_workflow_runs_the_scripts_of_the_repository():
     assert workflow.keys() >= {"name", True, "permissions", "jobs"}  # YAML 1.1 reads the key ``on`` as true
     assert workflow["jobs"]["test"]["strategy"]["matrix"]["python"] == ["3.11", "3.13"]
     lines = {step["run"] for job in workflow["jobs"].values() for step in job["steps"] if "run" in step}
-    assert lines == {"scripts/check", "scripts/test", "scripts/docs"}
+    assert lines == {"scripts/check", "scripts/test", "scripts/docs", "scripts/audit"}
     for line in lines:
         assert (ROOT / line).stat().st_mode & 0o111, line
     for job in workflow["jobs"].values():

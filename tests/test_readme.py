@@ -43,6 +43,7 @@ DEMO = "tests/cli/test_demo_command.py::"
 SITE = "tests/nodes/test_running_site.py::test_a_site_rides_through_the_death_and_the_freezing_of_every_process"
 BOARD = "tests/nodes/test_boards_live.py::"
 BROKER = "tests/nodes/test_broker.py::"
+ROLES = "tests/nodes/test_site_with_roles.py::"
 MQTT = "tests/cli/test_node_commands.py::test_the_demo_tells_how_to_watch_its_broker"
 PLAN = "tests/cli/test_plan_command.py::"
 REPLAY = "tests/cli/test_replay_command.py::"
@@ -85,6 +86,22 @@ ELSEWHERE = {
     "skyless dashboard --listen 0.0.0.0:8080 --mqtt mqtt://hall@127.0.0.1": (
         "tests/dashboard/test_dashboard_end_to_end.py::test_other_machines_need_the_token_that_is_printed"
     ),
+    "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 3650"
+    " -keyout key.pem -out certificate.pem -subj /CN=hall.local -addext subjectAltName=DNS:hall.local"
+    " -addext keyUsage=critical,digitalSignature,keyCertSign": (
+        ROLES + "test_a_broker_with_another_certificate_gets_no_password"
+    ),
+    "skyless broker access passwords --mqtt mqtts://hall.local": (
+        "tests/nodes/test_broker_access.py::test_the_files_are_private_complete_and_never_replaced"
+    ),
+    "skyless broker --listen 0.0.0.0:8883 --access passwords --certificate certificate.pem --key key.pem": (
+        "tests/nodes/test_broker_access.py::test_roles_open_the_broker_to_other_machines"
+    ),
+    "skyless broker --listen 0.0.0.0:8883 --access passwords --strangers-read --certificate certificate.pem"
+    " --key key.pem": "tests/nodes/test_broker_access.py::test_each_role_receives_exactly_what_the_table_says",
+    "export SKYLESS_MQTT_CA=certificate.pem": ROLES + "test_the_programs_of_a_site_may_do_all_that_they_do",
+    "set -a; . passwords/tags.env; set +a": ROLES + "test_a_shell_reads_the_file_of_a_role",
+    "skyless tag tag1": ROLES + "test_the_programs_of_a_site_may_do_all_that_they_do",
     "skyless plan big_hall.toml --plot big_hall.png --html big_hall.html --target 5": PLAN + "test_all_files_at_once",
     "skyless plan big_hall.toml --optimise 8 --heights 0.5,3.5 --out better.toml": (
         PLAN + "test_an_optimised_site_is_a_site"
@@ -130,6 +147,9 @@ NEVER_RUN = (
     "cp packaging",
     "echo RADIO=",
     "systemctl ",
+    "install -d ",
+    "runuser ",
+    "SURVEY_MQTT=",
 )
 """Lines that need a Raspberry Pi, systemd or Docker begin like this; the pages that show them say so."""
 

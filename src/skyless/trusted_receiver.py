@@ -1,6 +1,6 @@
 """``TrustedReceiver``: a tag that verifies beacons with its site's public key. Like ``Receiver`` it does no I/O.
 
-It runs the same ``Receiver`` on frames that have been verified, which is half a second behind. Where that is all that
+It runs the same ``Receiver`` on frames that have been verified, which is 0.2 to 0.4 s behind. Where that is all that
 is wanted (trust ``verified``), its fixes are given. Else (``open``) a second one processes each frame at once; when a
 frame that it used turns out to be forged, it continues from the state of the first one.
 """
@@ -40,7 +40,7 @@ class Trust(StrEnum):
     OPEN = "open"
     """Each at once; it states how far it is verified."""
     VERIFIED = "verified"
-    """Only those of verified beacons, half a second later."""
+    """Only those of verified beacons, 0.2 to 0.4 s later."""
 
 
 class SiteTrust(Struct, frozen=True):
@@ -141,11 +141,11 @@ class TrustedReceiver:
     def _verify(self) -> list[tuple[int, GivenFix]]:
         """Process the frames that are decided; fixes of the genuine ones."""
         given, was_deceived = [], False
-        for one in self.verifier.decided():
+        for one, is_genuine in self.verifier.decided():
             was_used = bool(self._used) and self._used[0] == one.rx_ticks
             if was_used:
                 self._used.popleft()
-            if not one.is_genuine:
+            if not is_genuine:
                 was_deceived |= was_used
                 continue
             was_deceived |= not was_used

@@ -30,8 +30,8 @@ async def player(answer):
         (1, "answer is not MQTT"),
         (2, "refuses: Client identifier not valid"),
         (3, "refuses: Server unavailable"),
-        (4, "refuses: wrong user name or password; the password goes in SKYLESS_MQTT_PASSWORD"),
-        (5, "refuses: wrong user name or password, or no permission; the password goes in"),
+        (4, "refuses: wrong user name or password; the address has no user: it should be USER@HOST"),
+        (5, "refuses: wrong user name or password, or no permission; the address has no user"),
         (99, "refuses: "),
     ],
 )

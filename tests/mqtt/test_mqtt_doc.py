@@ -9,6 +9,7 @@ import msgspec
 import pytest
 
 from skyless.mqtt import messages, topics
+from skyless.mqtt.access import ACCESS
 
 TEXT = Path(__file__).parents[2].joinpath("docs", "mqtt.md").read_text(encoding="utf-8")
 EXAMPLES = dict(re.findall(r"### `(\S+)`\n(?:(?!###).)*?```json\n(.*?)```", TEXT, re.DOTALL))
@@ -76,3 +77,11 @@ def test_no_topic_is_forgotten():
 def test_readers_ignore_fields_that_they_do_not_know():
     example = json.loads(EXAMPLES[topics.fix_topic(SITE, TAG)]) | {"later": 1}
     assert msgspec.convert(example, messages.FixMessage).tag == "tag1"
+
+
+def test_the_table_of_roles_is_that_of_the_broker():
+    def cell(filters):
+        return ", ".join(f"`{name.removeprefix('skyless/v1/+/')}`" for name in filters) or "nothing"
+
+    rows = re.findall(r"^\| \*\*(\w+)\*\* \| .*? \| (.*?) \| (.*?) \|$", TEXT, re.MULTILINE)
+    assert rows == [(str(role), cell(access.publish), cell(access.subscribe)) for role, access in ACCESS.items()]

@@ -41,7 +41,8 @@ def site_file(folder):
 class Program:
     """One ``skyless`` program as a process, which ends with the test however that ends."""
 
-    def __init__(self, *arguments):
+    def __init__(self, *arguments, environment=None):
+        self.environment = environment
         self.arguments = [str(argument) for argument in arguments]
         self.process = None
         self.said = []
@@ -58,6 +59,7 @@ class Program:
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.STDOUT,
+            env=self.environment,
             preexec_fn=end_with_parent(),
         )
         self._reader = asyncio.ensure_future(self._read(self.process))

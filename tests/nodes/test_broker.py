@@ -163,7 +163,10 @@ def test_a_home_that_cannot_be_written_costs_nothing(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "right"),
     [
-        (["--listen", "0.0.0.0"], "it should come with --user and a password in SKYLESS_MQTT_PASSWORD"),
+        (
+            ["--listen", "0.0.0.0"],
+            "it should come with --access, or with --user and a password in SKYLESS_MQTT_PASSWORD",
+        ),
         (["--user", "ann"], "--user and a password in SKYLESS_MQTT_PASSWORD belong together"),
         (["--listen", "nowhere.invalid", "--user", "ann"], "belong together"),
         (["--certificate", "c.pem"], "--certificate and --key belong together"),

@@ -10,6 +10,7 @@ import yaml
 
 from skyless.cli import small_runs
 from skyless.cli.main import program
+from skyless.mqtt.access import Role
 
 ROOT = Path(__file__).parents[2]
 COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text(encoding="utf-8"))
@@ -47,6 +48,26 @@ def test_the_demo_starts_without_a_profile_and_the_site_brings_its_own_services(
     for name, service in services.items():
         assert service["read_only"], name
         assert service["cap_drop"] == ["ALL"], name
+
+
+ROLES = {"anchor": Role.ANCHORS, "tag": Role.TAGS} | dict.fromkeys(("dashboard", "record", "survey"), Role.PAGE)
+"""Of each program that uses the broker."""
+
+
+def test_each_program_gets_the_password_of_its_role_and_no_other():
+    services = [service for name, service in COMPOSE["services"].items() if name not in {"demo", "broker"}]
+    for service in services:
+        role = ROLES[service["command"][0]]
+        assert service["env_file"] == [{"path": f"access/{role}.env", "required": False}]
+    found = {}
+    for unit in UNITS:
+        text = unit.read_text(encoding="utf-8")
+        (program,) = re.findall(r"^ExecStart=/opt/skyless/bin/skyless (\w+)", text, re.MULTILINE)
+        found[program] = re.findall(
+            r"skyless\.env\n(?:#.*\n)?EnvironmentFile=-/etc/skyless/access/(\w+)\.env$", text, re.M
+        )
+        assert len(re.findall("access/", text)) == len(found[program])
+    assert found == {"broker": [], "warm": []} | {program: [role] for program, role in ROLES.items()}
 
 
 def test_the_image_runs_as_a_user_without_rights_and_holds_only_what_is_copied():

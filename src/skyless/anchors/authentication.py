@@ -1,7 +1,6 @@
 """What an anchor with keys adds to its frames, and how it verifies those of others: it knows all keys, so at once."""
 
 from collections.abc import Iterable
-from statistics import median
 from typing import Final
 
 from msgspec import Struct
@@ -166,15 +165,14 @@ class BeaconAuthentication:
             known.add(unix_s, offset_s)
 
     def _is_clock_wrong(self, timing: ChainTiming, unix_s: float) -> bool:
-        """Whether the own clock is far from that of most other anchors; repeated old frames show nothing.
+        """Whether the own clock is far from those of most other anchors; repeated old frames show nothing.
 
         Anywhere in its interval a frame is in time: in slots an anchor may always send near the end of one.
         """
         recent = [one.least_s for one in self._offsets.values() if abs(unix_s - one.unix_s) <= RECENT_S]
-        if len(recent) < LEAST_OTHERS:
-            return False
-        least_s = median(recent)
-        return max(-least_s, least_s - timing.interval_s) > 0.5 * timing.most_clock_error_s
+        most_s = 0.5 * timing.most_clock_error_s
+        far = sum(not -most_s <= offset_s <= timing.interval_s + most_s for offset_s in recent)
+        return len(recent) >= LEAST_OTHERS and 2 * far > len(recent)
 
     def _unix_s(self, ticks: int) -> float:
         assert self._now is not None

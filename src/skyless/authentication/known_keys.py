@@ -58,7 +58,6 @@ class _Section(Struct):
     """The newest interval whose key is known; that before the section's first for its root."""
     keys: dict[int, bytes]
     """Keys of the last intervals; the newest is the last entry."""
-    mac_keys: dict[int, bytes] = {}
 
 
 class KnownKeys:
@@ -69,7 +68,14 @@ class KnownKeys:
         self._site, self._public = site, public
         self.serial = least_serial
         """The highest serial number of a chain that has been seen to count."""
+        self.timing: ChainTiming | None = None
+        """When keys hold; None before the first certificate."""
+        self.newest = -1
+        """The newest interval whose key is known."""
+        self._newest_key: tuple[int, bytes] | None = None
         self._sections: dict[SectionName, _Section] = {}
+        self._mac_keys: dict[int, bytes] = {}
+        """By interval, of the chain that counts there."""
         self._present = 0
         self._steps, self._checks, self._refilled_s = MOST_STEPS, MOST_CHECKS, 0.0
 
@@ -77,12 +83,6 @@ class KnownKeys:
     def certificates(self) -> tuple[bytes, ...]:
         """As they are sent: what lets a listener start at once the next time."""
         return tuple(section.sent for section in self._sections.values())
-
-    @property
-    def timing(self) -> ChainTiming | None:
-        """When keys hold; None before the first certificate."""
-        newest = max(self._sections.values(), key=lambda one: one.certificate.name.serial, default=None)
-        return None if newest is None else newest.certificate.timing
 
     def restore(self, certificates: Iterable[bytes]) -> None:
         """Add certificates of an earlier run; signatures are checked again."""
@@ -113,6 +113,8 @@ class KnownKeys:
 
     def on_key(self, key: bytes, interval: int, now_s: float, *, is_expected: bool = True) -> KeyUse:
         """Process the key of an interval, as somebody disclosed it at a time, which may not be the expected one."""
+        if (interval, key) == self._newest_key:
+            return KeyUse.KNOWN
         section = self._section_of(interval)
         if section is None:
             return KeyUse.KNOWN
@@ -127,39 +129,35 @@ class KnownKeys:
             self._steps -= steps
         name = section.certificate.name
         between = {interval: key}
-        for earlier in range(interval - 1, section.newest, -1):
-            key = earlier_key(key, name)
-            if interval - earlier < KEPT_KEYS:
-                between[earlier] = key
-        if not compare_digest(earlier_key(key, name), section.keys[section.newest]):
+        oldest = max(section.newest + 1, interval - KEPT_KEYS + 1)
+        for earlier in range(interval - 1, oldest - 1, -1):
+            key = between[earlier] = earlier_key(key, name)
+        if not compare_digest(earlier_key(key, name, oldest - section.newest), section.keys[section.newest]):
             return KeyUse.FORGED
         for one in sorted(between):
             section.keys[one] = between[one]
         section.newest = interval
         for old in list(section.keys)[:-KEPT_KEYS]:
             del section.keys[old]
-            section.mac_keys.pop(old, None)
+        if interval > self.newest:
+            self.newest, self._newest_key = interval, (interval, between[interval])
         self.serial = max(self.serial, name.serial)
         self._present = max(self._present, name.section)
         return KeyUse.NEW
 
     def mac_key(self, interval: int) -> bytes | None:
         """What codes of an interval are made with; None while its key is not known."""
+        made = self._mac_keys.get(interval)
+        if made is not None:
+            return made
         section = self._section_of(interval)
-        if section is None:
+        key = None if section is None else section.keys.get(interval)
+        if section is None or key is None:
             return None
-        made = section.mac_keys.get(interval)
-        if made is None:
-            key = section.keys.get(interval)
-            if key is None or interval < section.certificate.name.first_interval:
-                return None
-            made = section.mac_keys[interval] = mac_key(key, section.certificate.name)
+        if len(self._mac_keys) >= KEPT_KEYS:
+            del self._mac_keys[next(iter(self._mac_keys))]
+        made = self._mac_keys[interval] = mac_key(key, section.certificate.name)
         return made
-
-    def is_disclosed(self, interval: int) -> bool:
-        """Whether the key of an interval is known, so that anybody can make its codes."""
-        section = self._section_of(interval)
-        return section is not None and interval <= section.newest
 
     def _section_of(self, interval: int) -> _Section | None:
         """The section of the chain that counts in an interval; None where its certificate is not known."""
@@ -177,12 +175,14 @@ class KnownKeys:
         name = certificate.name
         if name in self._sections:
             return
+        self._mac_keys.clear()  # another chain may count from now on
         root_at = name.first_interval - 1
         self._sections[name] = _Section(certificate, sent, root_at, {root_at: certificate.root})
         while len(self._sections) > MOST_CERTIFICATES:
             del self._sections[
                 min(self._sections, key=lambda one: (one.section >= self._present, one.serial, one.section))
             ]
+        self.timing = self._sections[max(self._sections, key=lambda one: one.serial)].certificate.timing
 
     def _refill(self, now_s: float) -> None:
         """Renew the allowances by the time that has passed."""

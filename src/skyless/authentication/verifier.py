@@ -41,21 +41,14 @@ MOST_FAULTY_ANCHORS: Final = 64
 """Anchors with faults that are remembered: forged frames can name any."""
 
 
-class Decided(Struct, frozen=True, gc=False):
-    """A frame and what became of it."""
+class ReceivedFrame(Struct, frozen=True, gc=False):
+    """A frame with a code, which waits for its key or is decided."""
 
-    beacon: Beacon2
-    reception: Reception
-    rx_ticks: int
-    """Own counter, unwrapped."""
-    is_genuine: bool
-
-
-class _Waiting(Struct, frozen=True, gc=False):
     beacon: Beacon2
     authentication: Authentication
     reception: Reception
     rx_ticks: int
+    """Own counter, unwrapped."""
     present_s: float
     upper_s: float
     """The site's time when it was received, and its upper bound."""
@@ -92,15 +85,16 @@ class Verifier:
         self.clock = SiteClock(clock_bound_s, offsets_s=deque())
         self._counters = counters
         self._own_ticks = Unwrapper()
-        self._waiting: deque[_Waiting] = deque()
+        self._waiting: deque[ReceivedFrame] = deque()
         self._faults: dict[int, _AnchorFault] = {}
         self._genuine: dict[bytes, None] = {}
         """Codes of the last genuine frames, in their order; a second frame with one of them is a repetition."""
         self._newest_ticks = 0
+        self._has_new_key = False
 
-    def waiting(self) -> "Iterable[Decided]":
+    def waiting(self) -> "Iterable[ReceivedFrame]":
         """Frames that wait, in the order in which they were received; nothing shows yet whether they are genuine."""
-        return [Decided(one.beacon, one.reception, one.rx_ticks, is_genuine=False) for one in self._waiting]
+        return tuple(self._waiting)
 
     def faults(self) -> dict[int, Fault]:
         """Anchors with a fault within the last seconds."""
@@ -129,11 +123,11 @@ class Verifier:
             return None
         timing, interval = self.keys.timing, None
         if timing is not None:
-            interval = _interval(stated.interval, clock.present_s, timing)
-            fault = self._time_fault(interval, clock.upper_s, timing)
+            interval = nearest(stated.interval, timing.interval_at(clock.present_s), INTERVAL_BITS)
+            fault = _time_fault(interval, clock.upper_s, timing)
             if isinstance(beacon.page, KeyPage):
                 self._on_key(beacon.page.key, interval - timing.lag, timing, is_early=fault is Fault.EARLY)
-            if fault is None and self.keys.is_disclosed(interval):
+            if fault is None and interval <= self.keys.newest:
                 fault = Fault.LATE
             if fault is not None:
                 self._refuse(beacon.anchor, fault, rx_ticks)
@@ -141,29 +135,38 @@ class Verifier:
         if len(self._waiting) >= MOST_UNDECIDED:
             self._counters[Fault.TOO_MANY] += 1
             return None
-        self._waiting.append(_Waiting(beacon, stated, reception, rx_ticks, clock.present_s, clock.upper_s, interval))
+        self._waiting.append(
+            ReceivedFrame(beacon, stated, reception, rx_ticks, clock.present_s, clock.upper_s, interval)
+        )
         return rx_ticks
 
-    def decided(self) -> list[Decided]:
-        """Frames about which it is known by now, in the order in which they were received; each is returned once."""
-        timing, decided = self.keys.timing, list[Decided]()
+    def decided(self) -> list[tuple[ReceivedFrame, bool]]:
+        """Frames of which it is known by now whether they are genuine; in the order of reception, each once."""
+        timing, decided = self.keys.timing, list[tuple[ReceivedFrame, bool]]()
+        if not self._has_new_key and not self._is_overdue():
+            return decided
+        self._has_new_key = False
         while self._waiting:
             one = self._waiting[0]
             is_genuine = None if timing is None or self.clock.is_late else self._is_genuine(one, timing)
             if is_genuine is None:
-                if self._newest_ticks - one.rx_ticks < LONGEST_WAIT_TICKS:
+                if not self._is_overdue():
                     break
                 self._counters[Fault.NO_KEY] += 1
             self._waiting.popleft()
-            decided.append(Decided(one.beacon, one.reception, one.rx_ticks, bool(is_genuine)))
+            decided.append((one, bool(is_genuine)))
         return decided
 
-    def _is_genuine(self, one: _Waiting, timing: ChainTiming) -> bool | None:
+    def _is_overdue(self) -> bool:
+        """Whether the first frame that waits has waited too long."""
+        return bool(self._waiting) and self._newest_ticks - self._waiting[0].rx_ticks >= LONGEST_WAIT_TICKS
+
+    def _is_genuine(self, one: ReceivedFrame, timing: ChainTiming) -> bool | None:
         """Whether an anchor of the site made a frame; None while the key of its interval is not known."""
         interval, fault = one.interval, None
         if interval is None:
-            interval = _interval(one.authentication.interval, one.present_s, timing)
-            fault = self._time_fault(interval, one.upper_s, timing)
+            interval = nearest(one.authentication.interval, timing.interval_at(one.present_s), INTERVAL_BITS)
+            fault = _time_fault(interval, one.upper_s, timing)
         if fault is None:
             key = self.keys.mac_key(interval)
             if key is None:
@@ -181,13 +184,6 @@ class Verifier:
         self._refuse(one.beacon.anchor, fault, one.rx_ticks)
         return False
 
-    @staticmethod
-    def _time_fault(interval: int, upper_s: float, timing: ChainTiming) -> Fault | None:
-        """What is wrong with a frame of an interval that was received before this time."""
-        if upper_s >= timing.start_s(interval + timing.lag):
-            return Fault.LATE
-        return Fault.EARLY if upper_s < timing.start_s(interval) else None
-
     def _on_certificate(self, anchor: int, sent: bytes, rx_ticks: int) -> None:
         use = self.keys.on_certificate(sent, self.clock.present_s)
         if use is CertificateUse.FORGED:
@@ -202,6 +198,7 @@ class Verifier:
     def _on_key(self, key: bytes, interval: int, timing: ChainTiming, *, is_early: bool) -> None:
         use = self.keys.on_key(key, interval, self.clock.present_s, is_expected=not is_early)
         if use is KeyUse.NEW:
+            self._has_new_key = True
             self.clock.on_key(interval, timing)
         elif use is KeyUse.FORGED:
             self._counters["forged-key"] += 1
@@ -218,6 +215,8 @@ class Verifier:
         self._faults[anchor] = _AnchorFault(fault, rx_ticks)
 
 
-def _interval(lowest_bits: int, present_s: float, timing: ChainTiming) -> int:
-    """The interval that a frame states, which is near the present one."""
-    return nearest(lowest_bits, timing.interval_at(present_s), INTERVAL_BITS)
+def _time_fault(interval: int, upper_s: float, timing: ChainTiming) -> Fault | None:
+    """What is wrong with a frame of an interval that was received before this time."""
+    if upper_s >= timing.start_s(interval + timing.lag):
+        return Fault.LATE
+    return Fault.EARLY if upper_s < timing.start_s(interval) else None

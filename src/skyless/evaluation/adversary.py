@@ -157,7 +157,7 @@ def _measurement(adversary: Adversary) -> Beacon2:
 def _with_space(beacon: Beacon2) -> Beacon2:
     """The beacon with so few relays that every other part fits."""
     most = heard_capacity_2(slot_time=True, position=True, site_time=True)
-    return replace(beacon, heard=tuple(entry for entry, _ in zip(beacon.heard, range(most), strict=False)), weak=0)
+    return replace(beacon, heard=tuple(islice(beacon.heard, most)), weak=0)
 
 
 def _packed(beacon: Beacon2) -> bytes:
@@ -188,12 +188,8 @@ def false_page(adversary: Adversary) -> bytes:
         AccuracyPage(1.0, 1.0, 0.1, 1.0, 1.0, 1.0),
     )
     position = StatedPosition(draw.uniform(-100.0, 100.0), draw.uniform(-100.0, 100.0), 0.0)
-    heard = beacon.heard[: heard_capacity_2(slot_time=True, position=True, site_time=True)]
-    return encode_2(
-        replace(
-            beacon, page=draw.choice(pages), almanac_issue=draw.randrange(8), position=position, heard=heard, weak=0
-        )
-    )
+    page, issue = draw.choice(pages), draw.randrange(8)
+    return encode_2(replace(_with_space(beacon), page=page, almanac_issue=issue, position=position))
 
 
 def restarted_counter(adversary: Adversary) -> bytes:

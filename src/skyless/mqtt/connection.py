@@ -329,7 +329,10 @@ async def check_broker(address: MqttAddress, tls: ssl.SSLContext | None = None) 
 def trouble_with(address: MqttAddress, error: OSError | RefusedError) -> str:
     """One line for a person about a connection that cannot be made."""
     if isinstance(error, RefusedError):
-        hint = "; the password goes in SKYLESS_MQTT_PASSWORD or after the user's name" if "user" in str(error) else ""
+        hint = ""
+        if "user" in str(error):
+            place = "the password goes in SKYLESS_MQTT_PASSWORD or after the user's name"
+            hint = f"; {place}" if address.user is not None else "; the address has no user: it should be USER@HOST"
         return f"the broker {address} refuses: {error}{hint}"
     if isinstance(error, ssl.SSLCertVerificationError):
         return (

@@ -42,6 +42,8 @@ _LONGEST_WAIT_S: Final = 5.0
 _LONGEST_WAIT_LOOPBACK_S: Final = 0.5
 _LEAVE_S: Final = 1.0
 _SAME_TROUBLE_S: Final = 30.0
+_ECHO_S: Final = 5.0
+"""When a broker should have returned a link's own status."""
 _QUICK_START_S: Final = 0.5
 """A first connection that takes no longer is not logged."""
 
@@ -94,6 +96,7 @@ class Link:
         self._logged: tuple[str, float] = ("", 0.0)
         self._logged_fault = False
         self._stopping = False
+        self._online, self._has_echo = b"", False
         self.subscribe(self._status_topic, self._correct_status)
 
     @property
@@ -187,9 +190,11 @@ class Link:
         self._reconnects += 1
         self._log_return()
         self._outbox.restart()
+        self._has_echo = False
         self._publish_online()
         self._set_state(connected=True, trouble=None)
         self._pump()
+        asyncio.get_running_loop().call_later(_ECHO_S, self._check_echo, connection)
 
     def _down(self, reason: str) -> None:
         self._connection = None
@@ -212,12 +217,23 @@ class Link:
             pid=os.getpid(),
             unix_s=time.time(),
         )
-        self.publish(self._status_topic, status, qos=1, retain=True)
+        self._online = _encode(status)
+        self.publish(self._status_topic, self._online, qos=1, retain=True)
 
     def _correct_status(self, _topic: str, payload: bytes) -> None:
         """Publish the status again after a late last will, of a connection that the broker held open."""
+        self._has_echo = self._has_echo or payload == self._online
         if not self._stopping and b'"online":false' in payload:
             self._publish_online()
+
+    def _check_echo(self, connection: Connection) -> None:
+        """Warn if the broker drops what it acknowledges: MQTT 3.1.1 has no other answer to a missing permission."""
+        if self._connection is connection and not self._has_echo and not self.unacknowledged:
+            _log.warning(
+                "the broker %s has not returned %s: its user may not publish it, or not read it",
+                self.address,
+                self._status_topic,
+            )
 
     async def _leave(self, connection: Connection) -> None:
         self._stopping = True

@@ -10,14 +10,16 @@ import socket
 import ssl
 import sysconfig
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Final, Self
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from skyless.errors import SkylessError
+from skyless.mqtt.access import ACCESS, Role
 from skyless.mqtt.address import PASSWORD_VARIABLE, MqttAddress
 from skyless.mqtt.connection import check_broker
 from skyless.nodes.broker_address import StatedAddress
@@ -53,6 +55,10 @@ class BrokerSettings(Struct, frozen=True):
     certificate: Path | None = None
     key: Path | None = None
     """Certificate and private key in PEM form, for TLS."""
+    roles: Mapping[Role, str] | None = None
+    """The passwords of the roles, each of which may do what ``ACCESS`` says, instead of one user for everything."""
+    strangers_read: bool = False
+    """Whether clients without user and password have the stranger's role; otherwise they are refused."""
 
     def check(self) -> None:
         """Check the options for access.
@@ -62,10 +68,14 @@ class BrokerSettings(Struct, frozen=True):
         """
         if (self.user is None) != (self.password is None):
             raise SkylessError(f"--user and a password in {PASSWORD_VARIABLE} belong together")
-        if self.user is None and not MqttAddress(self.listen, 1).loopback:
+        if self.user is not None and self.roles is not None:
+            raise SkylessError("--user and --access exclude each other; the role operator may do everything")
+        if self.strangers_read and self.roles is None:
+            raise SkylessError("--strangers-read needs --access; without it everybody, or --user, may do everything")
+        if self.user is None and self.roles is None and not MqttAddress(self.listen, 1).loopback:
             raise SkylessError(
                 f"--listen is {self.listen!r}, where others can reach the broker; "
-                f"it should come with --user and a password in {PASSWORD_VARIABLE}"
+                f"it should come with --access, or with --user and a password in {PASSWORD_VARIABLE}"
             )
         if (self.certificate is None) != (self.key is None):
             raise SkylessError("--certificate and --key belong together")
@@ -76,7 +86,7 @@ class BrokerSettings(Struct, frozen=True):
             raise SkylessError("the broker's password should not begin with $2, which nats-server takes for a hash")
 
     def address(self, port: int) -> MqttAddress:
-        """Its address for clients on this machine."""
+        """Its address for clients on this machine; where there are roles, each puts its own user there."""
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.listen, self.listen)
         return MqttAddress(host, port, self.certificate is not None, self.user, self.password)
 
@@ -99,7 +109,27 @@ def _configuration(settings: BrokerSettings, port: int, data: Path) -> str:
     }
     if settings.user is not None:
         whole["authorization"] = {"user": settings.user, "password": settings.password}
+    if settings.roles is not None:
+        users = [_user(role, password) for role, password in settings.roles.items()]
+        if settings.strangers_read:
+            users.append(_user(Role.STRANGER, ""))
+            whole["no_auth_user"] = str(Role.STRANGER)
+        whole["authorization"] = {"users": users}
     return json.dumps(whole, ensure_ascii=False, indent=1) + "\n"
+
+
+def _user(role: Role, password: str) -> dict[str, object]:
+    access = ACCESS[role]
+    permissions = {"publish": _permission(access.publish), "subscribe": _permission(access.subscribe)}
+    return {"user": str(role), "password": password, "permissions": permissions}
+
+
+def _permission(filters: tuple[str, ...]) -> dict[str, list[str]]:
+    """Topic filters as subjects of NATS. An empty list of allowed subjects would allow all of them."""
+    subjects = [name.replace("/", ".").replace("+", "*").replace("#", ">") for name in filters]
+    # In MQTT "a/#" includes "a"; nats-server subscribes to both.
+    subjects += [subject.removesuffix(".>") for subject in subjects if subject.endswith(".>")]
+    return {"allow": subjects} if subjects else {"deny": [">"]}
 
 
 # The folder and the port
@@ -268,8 +298,11 @@ async def _spawn(
         pass_fds=(lock.fileno(),),  # the folder stays locked while nats-server writes there
         preexec_fn=end_with_parent(signal.SIGKILL),
     )
+    address = settings.address(port)
+    if settings.roles is not None:
+        address = replace(address, user=str(Role.OPERATOR), password=settings.roles[Role.OPERATOR])
     try:
-        await _until_ready(process, settings.address(port), data)
+        await _until_ready(process, address, data)
     except BaseException:
         await end(process)
         raise

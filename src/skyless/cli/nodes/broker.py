@@ -11,7 +11,7 @@ from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
 from skyless.cli.common.output import print_json
-from skyless.cli.nodes.options import listen_address
+from skyless.cli.nodes.options import listen_address, log
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
@@ -27,6 +27,8 @@ def broker(
     listen: str = "127.0.0.1",
     data: Path | None = None,
     user: str | None = None,
+    access: Path | None = None,
+    strangers_read: bool = False,
     certificate: Path | None = None,
     key: Path | None = None,
     json: bool = False,
@@ -44,7 +46,11 @@ def broker(
     data
         Folder for retained messages and sessions; by default skyless/broker in the user's data folder.
     user
-        Name that clients must give; their password is taken from SKYLESS_MQTT_PASSWORD.
+        Name that clients must give; their password is taken from SKYLESS_MQTT_PASSWORD. They may do everything.
+    access
+        Folder of passwords, made by skyless broker access: each role of clients may do what docs/mqtt.md says.
+    strangers_read
+        Admit clients without user and password, which may read fixes and the site and publish nothing.
     certificate
         Certificate in PEM form; with it and --key the broker uses TLS.
     key
@@ -52,6 +58,7 @@ def broker(
     json
         Write one JSON object instead of the address.
     """
+    from skyless.mqtt.access_files import read_access
     from skyless.mqtt.address import PASSWORD_VARIABLE
     from skyless.nodes.broker import FIRST_PORT, BrokerSettings
 
@@ -59,8 +66,38 @@ def broker(
     host, listen_port = listen_address(listen, FIRST_PORT)
     if port is not None and listen_port not in (None, port):
         raise SkylessError(f"--port is {port}, and --listen is {listen!r}; give the port once")
-    settings = BrokerSettings(port or listen_port, host, data, user, password, certificate, key)
+    roles = None if access is None else read_access(access)
+    settings = BrokerSettings(
+        port or listen_port, host, data, user, password, certificate, key, roles, strangers_read=strangers_read
+    )
     asyncio.run(_serve(settings, json=json))
+
+
+@app.command(name="access", help_epilogue="Example: skyless broker access passwords --mqtt mqtts://hall.local")
+def create_passwords(folder: Path, /, *, mqtt: str = "mqtt://127.0.0.1:1883", json: bool = False) -> None:
+    """Make random passwords for the roles at the broker, a file for each; existing files stay as they are.
+
+    Each file sets SKYLESS_MQTT and SKYLESS_MQTT_PASSWORD for programs of its role.
+
+    Parameters
+    ----------
+    folder
+        Folder of passwords, for skyless broker --access.
+    mqtt
+        Broker to state in the files, as its clients reach it: mqtt://HOST[:PORT] or mqtts://HOST[:PORT].
+    json
+        Write one JSON object instead of the lines.
+    """
+    from skyless.mqtt.access_files import create_access
+    from skyless.mqtt.address import mqtt_address
+
+    files = create_access(folder, mqtt_address(mqtt))
+    if json:
+        print_json({"files": files})
+    else:
+        for file in files:
+            print(file)
+        log(f"start the broker with --access {folder}; copy each file to the machines of its role only")
 
 
 async def _serve(settings: "BrokerSettings", *, json: bool) -> None:

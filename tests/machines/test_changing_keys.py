@@ -1,0 +1,230 @@
+"""Rotation, revocation, wrong seeds and wrong clocks at a simulated site: what is reported, and who goes on."""
+
+from collections import Counter
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from free_site import FREE
+from msgspec.structs import replace
+
+from skyless.authentication.chain import Chain
+from skyless.authentication.fault import Fault
+from skyless.evaluation.scenarios import Request, impairments_of
+from skyless.evaluation.trusted_air import START_UNIX_S, anchors_with_keys, made_keys
+from skyless.receiver import Receiver
+from skyless.simulation.stations import TagSpec
+from skyless.simulation.trajectory import Static
+from skyless.simulation.world import World
+from skyless.ticks import from_seconds, wrap
+from skyless.trusted_receiver import SiteTrust, Trust, TrustedReceiver
+
+TRUTH_M = np.array((3.0, 4.0, 0.0))
+KEYS = made_keys(FREE.id, 0.0)
+ROTATED = made_keys(FREE.id, 0.0, 1.5)
+"""A second chain counts from 1.5 s on."""
+
+
+def on_air(keys, seconds, *, others=None, errors_s=None, seed=1):
+    """All that one tag receives of a site with keys, and the anchors' machines."""
+    machines = {}
+
+    def new(anchor):
+        machines[anchor] = make(anchor)
+        return machines[anchor]
+
+    world = World(FREE, new, [TagSpec(Static(*TRUTH_M))], impairments_of(Request(FREE), FREE), seed)
+    make = anchors_with_keys(FREE, lambda: world.now_s, keys.chains, others=others or {}, errors_s=errors_s or {})
+    received = [reception for broadcast in world.run(seconds) for _, reception, _ in broadcast.receptions()]
+    return received, {anchor: one.machine for anchor, one in machines.items()}
+
+
+@lru_cache(maxsize=4)
+def usual_tape(seconds=3.0):
+    return tuple(on_air(KEYS, seconds)[0])
+
+
+def tag(public, trust=Trust.VERIFIED, **fields):
+    return TrustedReceiver(SiteTrust(FREE.id, public, trust=trust, **fields), lambda: Receiver(site=FREE.id))
+
+
+def fixes_of(receiver, received, error_s=0.0):
+    """Fixes, with the time at which each was given, of a tag whose clock is ahead by an error."""
+    given = []
+    for reception in received:
+        heard = receiver.hear(reception, START_UNIX_S + reception.host_s + error_s)
+        given += [(reception.host_s, one) for one in heard]
+    return given
+
+
+def errors_m(given):
+    return np.array([np.linalg.norm((one.fix.position_m - TRUTH_M)[:2]) for _, one in given])
+
+
+def longest_gap_s(given):
+    return np.diff([one.reception.host_s for _, one in given]).max()
+
+
+def test_verified_fixes_are_those_of_a_plain_tag():
+    received = usual_tape()
+    plain, receiver = Receiver(site=FREE.id), tag(KEYS.public)
+    expected = [fix for reception in received if (fix := plain.hear(reception)) is not None]
+    given = fixes_of(receiver, received)
+    assert len(given) > 600
+    for (_, one), fix in zip(given, expected, strict=False):
+        assert one.fix.rows == fix.rows
+        assert (one.fix.verified_until_s, one.fix.unverified) == (fix.time_s, 0.0)
+    assert not receiver.counters
+    assert receiver.faults() == {}
+    assert receiver.is_verified
+
+
+def test_an_open_tag_gives_each_fix_at_once_and_states_how_far_it_is_verified():
+    received = usual_tape()
+    plain, receiver = Receiver(site=FREE.id), tag(KEYS.public, Trust.OPEN)
+    expected = [fix for reception in received if (fix := plain.hear(reception)) is not None]
+    given = fixes_of(receiver, received)
+    assert [one.fix.rows for _, one in given] == [fix.rows for fix in expected]
+    assert all(at_s == one.reception.host_s for at_s, one in given)
+    unverified = [one.fix for at_s, one in given if at_s < 0.3]
+    assert {(fix.verified_until_s, fix.unverified) for fix in unverified} == {(None, 1.0)}
+    later = [one.fix for at_s, one in given if at_s > 1.5]
+    assert all(0.2 <= fix.time_s - fix.verified_until_s < 0.4 for fix in later)  # (lag - 1) intervals and more
+    assert all(0.1 < fix.unverified < 0.4 for fix in later)
+
+
+@pytest.mark.parametrize("certificates", [False, True])
+def test_first_verified_fix(certificates):
+    before = tag(KEYS.public)
+    received = usual_tape()
+    fixes_of(before, received)
+    known = before.verifier.keys.certificates if certificates else ()
+    after = TrustedReceiver(
+        SiteTrust(FREE.id, KEYS.public, trust=Trust.VERIFIED), lambda: Receiver(site=FREE.id), known
+    )
+    first_s = fixes_of(after, received)[0][0] - received[0].host_s
+    assert first_s < (1.0 if certificates else 3.0)
+
+
+def test_a_new_chain_takes_over_without_a_gap():
+    received, machines = on_air(ROTATED, 3.0)
+    receiver = tag(ROTATED.public)
+    given = fixes_of(receiver, received)
+    plain = Receiver(site=FREE.id)
+    expected = [reception.host_s for reception in received if plain.hear(reception) is not None]
+    assert [one.reception.host_s for _, one in given] == expected[: len(given)]
+    assert given[-1][1].reception.host_s > 2.5
+    assert not receiver.counters
+    assert receiver.verifier.keys.serial == 2
+    for machine in machines.values():
+        assert not Counter({name: machine.counters[name] for name in Fault}).total()
+
+
+def test_an_anchor_with_a_wrong_seed_is_named_and_left_out():
+    wrong = made_keys(FREE.id, 0.0, number=2).chains
+    received, machines = on_air(KEYS, 3.0, others={4: wrong})
+    for trust in Trust:
+        receiver = tag(KEYS.public, trust)
+        given = fixes_of(receiver, received)
+        assert receiver.faults() == {4: Fault.BAD_CODE}
+        late = [one.fix for at_s, one in given if at_s > 1.0]
+        assert all(4 not in fix.anchors for fix in late)
+        assert len(late) > 300
+        assert errors_m(given).max() < 0.2
+        assert longest_gap_s(given) < 0.1
+    for anchor, machine in machines.items():
+        faults = {other: fault for other, (fault, _) in machine.authentication.faults.items()}
+        others = set(machines) - {4}
+        assert faults == (dict.fromkeys(others, Fault.BAD_CODE) if anchor == 4 else {4: Fault.BAD_CODE})
+
+
+def test_an_anchor_without_keys_is_named_and_left_out():
+    received, machines = on_air(KEYS, 2.0, others={4: ()})
+    receiver = tag(KEYS.public)
+    given = fixes_of(receiver, received)
+    assert receiver.faults() == {4: Fault.NO_CODE}
+    assert all(4 not in one.fix.anchors for _, one in given)
+    assert machines[1].authentication.faults[4][0] is Fault.NO_CODE
+    assert machines[4].authentication.fault() is Fault.NO_CHAIN
+
+
+def test_an_anchor_with_a_revoked_chain_is_named_and_left_out():
+    received, machines = on_air(ROTATED, 4.0, others={4: ROTATED.chains[:1]})
+    receiver = tag(ROTATED.public)
+    given = fixes_of(receiver, received)
+    assert receiver.faults() == {4: Fault.REVOKED_CHAIN}
+    assert any(4 in one.fix.anchors for _, one in given if one.reception.host_s < 1.4)
+    late = [one for _, one in given if one.reception.host_s > 3.0]
+    assert all(4 not in one.fix.anchors for one in late)
+    assert len(late) > 100
+    assert longest_gap_s(given) < 0.1
+    assert machines[1].authentication.faults[4][0] is Fault.REVOKED_CHAIN
+    assert machines[4].authentication.faults[1][0] is Fault.BAD_CODE
+
+
+def test_a_stolen_chain_does_not_count_for_who_knows_that_it_was_revoked():
+    stolen = Chain(
+        FREE.id, 1, *(getattr(ROTATED.chains[0], name) for name in ("timing", "first", "signatures", "seed"))
+    )
+    received, _ = on_air(replace(ROTATED, chains=(stolen,)), 2.0)
+    assert fixes_of(tag(ROTATED.public), received)
+    informed = tag(ROTATED.public, least_serial=2)
+    assert not fixes_of(informed, received)
+    assert set(informed.faults().values()) == {Fault.REVOKED_CHAIN}
+
+
+def test_all_anchors_lose_power_and_go_on():
+    """Everything is lost but the seed and the host's clock: the chain needs no other state."""
+    receiver, off_s = tag(KEYS.public), 6.5
+    before, _ = on_air(KEYS, 1.5)
+    again, _ = on_air(KEYS, 1.5, errors_s=dict.fromkeys(range(1, 8), off_s), seed=2)
+    ticks_off = before[-1].rx_ticks + from_seconds(again[0].host_s + off_s - before[-1].host_s) - again[0].rx_ticks
+    after = [replace(one, host_s=one.host_s + off_s, rx_ticks=wrap(one.rx_ticks + ticks_off)) for one in again]
+    assert fixes_of(receiver, before)
+    given = fixes_of(receiver, after)
+    assert given[0][0] - after[0].host_s < 1.0
+    assert errors_m(given).max() < 0.3
+    assert not {Fault.BAD_CODE, Fault.LATE, Fault.EARLY} & receiver.counters.keys()
+    assert receiver.verifier.clock.error_s is None
+
+
+@pytest.mark.parametrize("error_s", [-86400.0, -3600.0, -30.0, -0.4, -0.15, 0.15, 0.4, 30.0, 3600.0, 86400.0])
+def test_a_tag_with_a_wrong_clock_notices(error_s):
+    receiver = tag(KEYS.public)
+    given = fixes_of(receiver, usual_tape(), error_s)
+    assert receiver.verifier.clock.error_s == pytest.approx(error_s, abs=0.05 if abs(error_s) < 1000.0 else 900.0)
+    if abs(error_s) > 0.3 or error_s < 0.0:
+        assert not given
+
+
+@pytest.mark.parametrize("error_s", [-0.09, -0.05, 0.0, 0.05, 0.09])
+def test_a_clock_within_its_bound_costs_nothing(error_s):
+    receiver = tag(KEYS.public)
+    given = fixes_of(receiver, usual_tape(), error_s)
+    assert receiver.verifier.clock.error_s is None
+    assert len(given) > 600
+    assert not receiver.counters
+
+
+def test_a_host_clock_that_is_set_later_does_no_harm():
+    receiver, given = tag(KEYS.public), 0
+    for reception in usual_tape():
+        error_s = 0.0 if reception.host_s < 1.0 else 7200.0
+        given += len(receiver.hear(reception, START_UNIX_S + reception.host_s + error_s))
+    assert given > 600
+    assert not receiver.counters
+    assert receiver.verifier.clock.error_s == pytest.approx(7200.0, abs=0.1)
+
+
+@pytest.mark.parametrize("error_s", [-3.0, -0.2, 0.2, 3.0])
+def test_an_anchor_with_a_wrong_clock_sends_without_codes(error_s):
+    received, machines = on_air(KEYS, 4.0, errors_s={4: error_s})
+    assert machines[4].authentication.fault() is Fault.CLOCK_WRONG
+    assert all(machine.authentication.fault() is None for anchor, machine in machines.items() if anchor != 4)
+    receiver = tag(KEYS.public)
+    given = fixes_of(receiver, received)
+    late = [one for _, one in given if one.reception.host_s > 2.5]
+    assert len(late) > 200
+    assert all(4 not in one.fix.anchors for one in late)
+    assert receiver.faults() == {4: Fault.NO_CODE}
+    assert errors_m(given).max() < 0.2
