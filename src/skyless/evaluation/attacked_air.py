@@ -4,7 +4,7 @@ The attacker has some radios of its own among the anchors. Their frames overlap 
 anchors like any other; as noise they have the same times and lengths and mean nothing: the baseline of an attack.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from random import Random
 from typing import Final
 
@@ -34,6 +34,8 @@ _NOISE_BYTES: Final = 40
 class Received(Struct, frozen=True, gc=False):
     """A reception of the tag."""
 
+    anchor: int
+    """The sender, or one of the attacker's radios."""
     reception: Reception
     is_genuine: bool
     """Whether an anchor of the site sent it."""
@@ -122,7 +124,7 @@ class AttackedAir:
                 self.adversary.overhear(broadcast.frame, broadcast.emission_s)
             for _, reception, position_m in broadcast.receptions():
                 self.adversary.tag_m = position_m
-                yield Received(reception, is_genuine, position_m)
+                yield Received(broadcast.anchor, reception, is_genuine, position_m)
 
     def forged(self, ahead_s: float) -> bytes:
         """The attacker's frame for a time from now on."""
@@ -133,3 +135,17 @@ class AttackedAir:
             return bytes(_NOISE_BYTES)
         frame = attack.forgery(adversary)
         return bytes(len(frame)) if attack.is_noise else frame
+
+
+def delayed(received: Iterable[Received], delay_s: Callable[[Received], float]) -> list[Received]:
+    """Receptions of a tag near which frames are disturbed and repeated later, without any further error.
+
+    ``delay_s``: of each; 0 for one that is left alone. They are in the order in which they are then received.
+    """
+    repeated = []
+    for one in received:
+        later_s, before = delay_s(one), one.reception
+        rx_ticks = wrap(before.rx_ticks + from_seconds(later_s))
+        host_s = None if before.host_s is None else before.host_s + later_s
+        repeated.append(replace(one, reception=replace(before, rx_ticks=rx_ticks, host_s=host_s)))
+    return sorted(repeated, key=lambda one: one.reception.host_s or 0.0)
