@@ -35,7 +35,10 @@ from skyless.trusted_receiver import SiteTrust, Trust
 
 FORGED_EACH = 2
 """Of each kind, for a genuine frame; each is used several times, altered in other ways."""
-ROUND = 200_000
+FLAGS_AT = 11
+LATELY = 1500
+"""Forged frames of the last 0.1 s, of which the next ones are drawn: the intervals of most still hold."""
+ROUND = 100_000
 
 
 def recorded(
@@ -58,7 +61,7 @@ def recorded(
 def altered(frame: bytes, draw: Random) -> bytes:
     """The frame as it is, or with some other bits or bytes."""
     kind = draw.random()
-    if kind < 0.3 or len(frame) < 4:
+    if kind < 0.3 or len(frame) <= FLAGS_AT + 2:
         return frame
     body = bytearray(frame[:-2])
     if kind < 0.7:
@@ -67,7 +70,7 @@ def altered(frame: bytes, draw: Random) -> bytes:
         for at in draw.sample(range(len(body)), min(len(body), 4)):
             body[at] = draw.randrange(256)
     else:
-        body[11] ^= draw.randrange(256)
+        body[FLAGS_AT] ^= draw.randrange(256)
     return bytes(body) + fcs(bytes(body))
 
 
@@ -83,7 +86,7 @@ def with_forged(
         begin_s, end_s = one.reception.host_s or 0.0, after.reception.host_s or 0.0
         step_s = (end_s - begin_s) / (each + 1)
         last = bisect_right(times_s, begin_s)
-        first = max(0, last - 4000)
+        first = max(0, last - LATELY)
         for number in range(1, each + 1):
             frame = altered(forged[draw.randrange(first, last)], draw)
             if frame in sent and frame not in received:
