@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from skyless.site.lab import lab_site
     from skyless.site.load import load_site
     from skyless.site.model import Site
+    from skyless.trusted_receiver import SiteTrust, Trust, TrustedReceiver
 
     __version__: str
 
@@ -46,9 +47,12 @@ _MODULES: Final = {
     "SimulationResult": "skyless.api.simulate",
     "Site": "skyless.site.model",
     "SkylessError": "skyless.errors",
+    "SiteTrust": "skyless.trusted_receiver",
     "SlotPlanResult": "skyless.api.slot_plan",
     "StudyResult": "skyless.api.study",
     "Transmission": "skyless.air.reception",
+    "Trust": "skyless.trusted_receiver",
+    "TrustedReceiver": "skyless.trusted_receiver",
     "calibrate": "skyless.api.calibrate",
     "fleet_of": "skyless.evaluation.scenarios",
     "lab_site": "skyless.site.lab",
@@ -75,10 +79,13 @@ __all__ = [
     "Request",
     "SimulationResult",
     "Site",
+    "SiteTrust",
     "SkylessError",
     "SlotPlanResult",
     "StudyResult",
     "Transmission",
+    "Trust",
+    "TrustedReceiver",
     "calibrate",
     "fleet_of",
     "lab_site",

@@ -83,9 +83,10 @@ def of_tag(name, tag="tag1", **labels):
 def metrics():
     metrics = SiteMetrics(positions=True)
     metrics.on_site(SITE)
-    metrics.on_fix(a_fix(serial=200, latency_s=0.004, hpl_m=0.3), 100.0)
-    metrics.on_health(tag_health(fixes=190, counters={"foreign": 2}, mqtt=Counters(50, 4, 1)), 100.0)
-    metrics.on_health(anchor_health(), 100.0)
+    metrics.on_fix(a_fix(serial=200, latency_s=0.004, hpl_m=0.3, verified_until_s=11.7, unverified=0.25), 100.0)
+    trust = {"trust": "open", "is_verified": True, "clock_error_s": -0.5, "faults": {"2": "bad-code", "3": "bad-code"}}
+    metrics.on_health(tag_health(fixes=190, counters={"foreign": 2}, mqtt=Counters(50, 4, 1), **trust), 100.0)
+    metrics.on_health(anchor_health(chain=2, chain_ends_unix_s=1.9e9, faults={"5": "late-frame"}), 100.0)
     metrics.on_status(StatusMessage(online=True, kind="tag", name="tag1"))
     metrics.on_status(StatusMessage(online=False, kind="anchor", name="2"))
     metrics.on_status(StatusMessage(online=True, kind="dashboard", name="pi"))
@@ -107,6 +108,13 @@ def test_what_is_known_of_a_tag_and_an_anchor(metrics):
         of_tag("tag_latency_seconds_count"): 1,
         of_tag("tag_latency_seconds_bucket", le="0.002"): 0,
         of_tag("tag_latency_seconds_bucket", le="0.005"): 1,
+        of_tag("tag_verified"): 1,
+        of_tag("tag_verified_ratio"): 0.75,
+        of_tag("tag_clock_error_seconds"): -0.5,
+        of_tag("tag_not_accepted", reason="bad-code"): 2,
+        ("skyless_anchor_codes", ("anchor", "2")): 1,
+        ("skyless_anchor_chain_end_timestamp_seconds", ("anchor", "2")): 1.9e9,
+        ("skyless_anchor_not_accepted", ("anchor", "2"), ("reason", "late-frame")): 1,
         ("skyless_anchor_online", ("anchor", "2")): 0,
         ("skyless_anchor_synchronised", ("anchor", "2")): 1,
         ("skyless_anchor_offset_std_metres", ("anchor", "2")): 0.012,
@@ -117,6 +125,23 @@ def test_what_is_known_of_a_tag_and_an_anchor(metrics):
     }
     assert {key: samples[key] for key in expected} == pytest.approx(expected)
     assert "dashboard" not in str(samples)
+
+
+KEY_METRICS = ("verified", "clock_error", "not_accepted", "codes", "chain_end")
+
+
+def test_nothing_is_said_of_keys_where_there_are_none_and_nothing_old():
+    metrics = SiteMetrics()
+    metrics.on_fix(a_fix(), 100.0)
+    metrics.on_health(tag_health(), 100.0)
+    metrics.on_health(anchor_health(), 100.0)
+    assert not any(name in metrics.text(100.0) for name in KEY_METRICS)
+    metrics.on_health(tag_health(trust="open"), 100.0)
+    metrics.on_health(anchor_health(chain_ends_unix_s=1.0, code_fault="no-chain"), 100.0)
+    samples = read(metrics)
+    assert (samples[of_tag("tag_verified")], samples[of_tag("tag_verified_ratio")]) == (0.0, 0.0)
+    assert samples["skyless_anchor_codes", ("anchor", "2")] == 0.0
+    assert not any(name in metrics.text(100.0 + 2 * GAUGE_AGE_S) for name in KEY_METRICS)
 
 
 def test_positions_are_given_on_request_only():

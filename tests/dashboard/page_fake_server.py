@@ -43,6 +43,8 @@ class FakeServer:
         self.placed = placed
         self.stored = []
         self.silent_tags = set()
+        self.tag_reports, self.anchor_reports, self.verified = {}, {}, {}
+        """Changes to healths, and how far fixes are verified: age of that and share of other beacons, by tag."""
         self.refuse = False
         self.mute = False
         self.answers_pings = True
@@ -229,7 +231,11 @@ class FakeServer:
             named = enumerate(made_up.names(self.tags))
             now = time.time()
             since = now - self.started
-            rows = [made_up.state_row(name, n, since, now) for n, name in named if name not in self.silent_tags]
+            rows = [
+                made_up.state_row(name, n, since, now, self.verified.get(name, (None, None)))
+                for n, name in named
+                if name not in self.silent_tags
+            ]
             if rows and not self.mute:
                 await _send(websocket, lock, {"type": "state", "unix_s": now, "tags": rows})
             await asyncio.sleep(max(0.0, now + 1 / self.rate_hz - time.time()))
@@ -258,10 +264,11 @@ class FakeServer:
         anchors = [made_up.anchor_health(n, since, now - (20 if n == 8 else 0), n != 5) for n in range(1, 9)]
         if self.mode != "master":
             anchors = [made_up.anchor_health_2(n, since, now, self.mode) for n in range(1, 9)]
+        anchors = [health | self.anchor_reports.get(health["anchor"], {}) for health in anchors]
         tags = []
         for number, name in enumerate(made_up.names(self.tags)):
             reason = "too-few-anchors" if name in self.silent_tags else None
-            tags.append(made_up.tag_health(name, number, since, now, reason))
+            tags.append(made_up.tag_health(name, number, since, now, reason) | self.tag_reports.get(name, {}))
         ether = {"unix_s": now, "simulated_s": since, "transmissions": int(476 * since), "late": 0, "at_anchors": {},
                  "at_tags": {}, "stalls": 0, "overruns": 0}  # fmt: skip
         old = self.mode == "master"

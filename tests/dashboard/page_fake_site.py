@@ -49,7 +49,7 @@ def truth(number, time_s):
     return centre_x + across * math.cos(angle), centre_y + up * math.sin(angle), *velocity
 
 
-def state_row(name, number, time_s, unix_s):
+def state_row(name, number, time_s, unix_s, verified=(None, None)):
     """A row of a state message, fields in the order of ``page/tracks.js``."""
     x, y, vx, vy = truth(number, time_s)
     ease = 1.0 + 0.5 * math.sin(0.3 * time_s + number)
@@ -70,6 +70,7 @@ def state_row(name, number, time_s, unix_s):
         ALERTS[number % 5],
         int(not estimated),
         0.08 if estimated else None,
+        *verified,
     ]
     return [name, *(round(value, 5) for value in numbers), *rest]
 

@@ -10,7 +10,19 @@ from skyless.mqtt.messages import AnchorHealth, Counters, EtherHealth
 
 POSITION = ("name", "x_m", "y_m", "z_m", "vx", "vy")
 ERRORS = ("cov_xx", "cov_xy", "cov_yy", "std_m", "error_m", "true_x", "true_y")
-FIELDS = (*POSITION, *ERRORS, "anchors_used", "chi2", "fix_unix_s", "hpl_m", "alert", "height_given", "std_z_m")
+FIELDS = (
+    *POSITION,
+    *ERRORS,
+    "anchors_used",
+    "chi2",
+    "fix_unix_s",
+    "hpl_m",
+    "alert",
+    "height_given",
+    "std_z_m",
+    "verified_age_s",
+    "unverified",
+)
 
 
 def rows(state, since=0):
@@ -48,6 +60,8 @@ def test_a_row_has_the_fields_in_order():
         None,
         1,
         None,
+        None,
+        None,
     )
     assert message["tags"] == [list(expected)]
     state.add_fix(fix(velocity_mps=None), 0.0, 1000.0)
@@ -67,6 +81,13 @@ def test_rows_say_whether_the_height_was_given():
     for known, std_z_m in ((True, None), (False, 0.03)):
         state.add_fix(fix(covariance_m2=covariance, height_known=known), 0.0, 1000.0)
         assert (rows(state)[0]["height_given"], rows(state)[0]["std_z_m"]) == (int(known), std_z_m)
+
+
+def test_rows_say_how_far_a_fix_is_verified():
+    state = SiteState()
+    for until_s, shown in ((None, (None, None)), (999.7, (0.3, 0.179)), (1000.0, (0.0, 0.179))):
+        state.add_fix(fix(time_s=1000.0, verified_until_s=until_s, unverified=0.1789), 0.0, 1000.0)
+        assert (rows(state)[0]["verified_age_s"], rows(state)[0]["unverified"]) == shown
 
 
 @pytest.mark.parametrize(("unix_s", "shown_unix_s"), [(1000.4, 1000.4), (1000.6, 1000.0), (4600.0, 1000.0)])

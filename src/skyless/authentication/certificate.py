@@ -86,6 +86,8 @@ class Certificate(Struct, frozen=True, gc=False):
 
 def read_certificate(site: int, sent: bytes) -> tuple[Certificate, bytes] | None:
     """The certificate in a frame of a site, and its signature, not yet verified; None where a value is impossible."""
+    if len(sent) != CERTIFICATE_BYTES:
+        return None
     serial, low, high, section, interval_ms, lag, root = _STATEMENT.unpack_from(sent)
     timing = ChainTiming(interval_ms, lag)
     first = low | high << 32

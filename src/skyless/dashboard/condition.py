@@ -11,6 +11,7 @@ from typing import Final, Literal
 from msgspec import Struct
 from msgspec.structs import replace
 
+from skyless.dashboard.authentication_reasons import authentication_reasons
 from skyless.dashboard.evidence import FRESH_S, Evidence
 from skyless.dashboard.reasons import (
     LAG_S,
@@ -118,6 +119,7 @@ class ConditionMonitor:
             if reason is not None:
                 yield reason
         yield from alert_reasons(evidence)
+        yield from authentication_reasons(evidence, now_s)
         if lag_s > LAG_S:
             self._blind_until_s = now_s + 2 * EVALUATION_S  # what has arrived meanwhile is still to be read
         if not self.is_blind(now_s):

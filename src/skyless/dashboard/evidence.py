@@ -32,7 +32,7 @@ ALERT_WORDS: Final = {
 class Node:
     """A tag, an anchor or the emulated air."""
 
-    __slots__ = ("alert", "fix_s", "health", "health_s", "host", "online", "previous", "since_s", "used_s")
+    __slots__ = ("alert", "codes_s", "fix_s", "health", "health_s", "host", "online", "previous", "since_s", "used_s")
 
     def __init__(self) -> None:
         self.online: bool | None = None
@@ -52,6 +52,8 @@ class Node:
         """When the last fix came that used it as an anchor."""
         self.alert: str | None = None
         """The worst of its fixes since the last evaluation."""
+        self.codes_s: float | None = None
+        """Since when it states that its beacons have codes."""
 
     def begin(self, now_s: float) -> None:
         """It is there since now, unless it has been before."""
@@ -65,6 +67,10 @@ class Node:
     def has_fix(self, now_s: float) -> bool:
         """Whether a fix has come lately."""
         return now_s - self.fix_s < FRESH_S
+
+    def codes_for_s(self, now_s: float) -> float:
+        """For how long its beacons have had codes, as it states; 0 where they have none."""
+        return 0.0 if self.codes_s is None else now_s - self.codes_s
 
 
 class Evidence:
@@ -102,7 +108,7 @@ class Evidence:
             node.since_s = now_s
         node.online, node.host = status.online, status.host or node.host
         if not status.online:
-            node.alert, node.previous = None, None
+            node.alert, node.previous, node.codes_s = None, None, None
             self.ages.remove(status.name)
 
     def add_health(self, kind: str, name: str, health: Health, now_s: float, unix_s: float) -> None:
@@ -113,6 +119,10 @@ class Evidence:
         node.begin(now_s)
         node.previous, node.health, node.health_s = node.health, health, now_s
         if isinstance(health, AnchorHealth):
+            if health.chain is None or health.code_fault is not None:
+                node.codes_s = None
+            elif node.codes_s is None:
+                node.codes_s = now_s
             self.leader.update(health, now_s)
         elif isinstance(health, TagHealth) and node.host == self.host:
             self.ages.add_health(name, unix_s - health.unix_s, now_s)

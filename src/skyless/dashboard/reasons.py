@@ -1,7 +1,7 @@
 """What can be wrong with a live site: each function looks for one cause and gives its reason. No I/O."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence, Sized
 from typing import Final, Literal
 
 from msgspec import Struct
@@ -52,6 +52,10 @@ _ADVICE_NO_FIX: Final = {
     "not-converged": "What it receives is contradictory: check the anchors' positions and antenna delays.",
     "residuals-too-large": "What it receives is contradictory: check the anchors' positions and antenna delays.",
     "acquiring": "It still looks for its first position.",
+    "no-code": "Anchors send without codes: start them with the site's keys, or the tag with --trust open.",
+    "no-certificate": "No certificate of a key chain that holds now has come: see whether the tag has this site's key.",
+    "no-key": "No key of the site's key chain has come yet; the anchors send them all the time.",
+    "clock-wrong": "Synchronise the clock of its computer with those of the anchors' computers, as by NTP.",
     "no-master": "Its method needs a master, and this site has none: use another method.",
 }
 _Severity = Literal["warning", "bad"]
@@ -84,7 +88,7 @@ def late_reason(evidence: Evidence, ages: Mapping[str, tuple[float, float]]) -> 
         return None
     worst = max(late, key=lambda name: ages[name][0])
     age_s, made_s = ages[worst]
-    whose = "positions" if len(late) == len(ages) else f"positions of {_listed('tag', late)}"
+    whose = "positions" if len(late) == len(ages) else f"positions of {listed('tag', late)}"
     host = evidence.nodes["tag", worst].host if ("tag", worst) in evidence.nodes else ""
     if made_s > 0.5 * age_s:
         why = f"{evidence.computer(host)} does not keep up with the receptions"
@@ -97,7 +101,7 @@ def late_reason(evidence: Evidence, ages: Mapping[str, tuple[float, float]]) -> 
                 f" Measured against the quickest message from {host} in the last minutes, whatever its clock shows."
             )
     text = f"{whose} are {age_s:.1f} s behind: {why}"
-    return Reason("late", "bad" if age_s > VERY_LATE_S else "warning", text, advice, _names("tag", late))
+    return Reason("late", "bad" if age_s > VERY_LATE_S else "warning", text, advice, names_of("tag", late))
 
 
 def slow_reason(evidence: Evidence, now_s: float, lag_s: float) -> Reason | None:
@@ -144,7 +148,7 @@ def _missed(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
             shares.setdefault(anchor.host, {})[name] = share
     for host, late in shares.items():
         worst = max(late.values())
-        yield host, worst, f"{_counted('anchor', list(late))} missed up to {100.0 * worst:.0f} % of the transmissions"
+        yield host, worst, f"{counted('anchor', list(late))} missed up to {100.0 * worst:.0f} % of the transmissions"
 
 
 def _dropped(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
@@ -161,7 +165,7 @@ def _dropped(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
     for host, drops in found.items():
         names = [name for name, _, _ in drops]
         count, worst = sum(count for _, count, _ in drops), max(share for _, _, share in drops)
-        yield host, worst, f"{_counted('tag', names)} dropped {count} receptions or fixes that were too old"
+        yield host, worst, f"{counted('tag', names)} dropped {count} receptions or fixes that were too old"
 
 
 def fix_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
@@ -178,17 +182,17 @@ def fix_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
         if not causes:
             why, advice = ": they do not report", "See whether their programs and computers still run."
         yield Reason(
-            "no-fixes", "bad", f"no positions, although {though}{why}", advice, _names("tag", [n for n, _ in without])
+            "no-fixes", "bad", f"no positions, although {though}{why}", advice, names_of("tag", [n for n, _ in without])
         )
         return
     if causes:
         why, advice = _causes(causes, len(causes))
-        text = f"{_listed('tag', list(causes))} {_number(causes, 'has', 'have')} no fix{why}"
-        yield Reason("no-fix", "warning", text, advice, _names("tag", list(causes)))
+        text = f"{listed('tag', list(causes))} {verb(causes, 'has', 'have')} no fix{why}"
+        yield Reason("no-fix", "warning", text, advice, names_of("tag", list(causes)))
     if silent:
-        text = f"{_listed('tag', silent)} {_number(silent, 'does', 'do')} not report any more"
+        text = f"{listed('tag', silent)} {verb(silent, 'does', 'do')} not report any more"
         advice = "Its program does not respond, or its computer is cut off: see there, and start it again."
-        yield Reason("silent", "warning", text, advice, _names("tag", silent))
+        yield Reason("silent", "warning", text, advice, names_of("tag", silent))
 
 
 def _cause(tag: Node) -> str:
@@ -197,17 +201,17 @@ def _cause(tag: Node) -> str:
 
 def _causes(causes: Mapping[str, str], tags: int) -> tuple[str, str]:
     """Why ``tags`` tags have no fix, with names where it is not the same for all, and what to do for most of them."""
-    groups = [(cause, names) for cause, names in _alike(causes) if cause]
+    groups = [(cause, names) for cause, names in alike(causes) if cause]
     words = [cause.replace("-", " ") for cause, _ in groups]
     common, most = groups[0] if groups else ("", [])
     advice = _ADVICE_NO_FIX.get(common, "See whether fixes are published, and the log of the tag.")
     if groups and len(most) < tags:
-        words = [f"{word} ({_listed('tag', names)})" for word, (_, names) in zip(words, groups, strict=True)]
-        advice = f"For {_listed('tag', most)}: {advice}"
+        words = [f"{word} ({listed('tag', names)})" for word, (_, names) in zip(words, groups, strict=True)]
+        advice = f"For {listed('tag', most)}: {advice}"
     return f": {'; '.join(words)}" if words else "", advice
 
 
-def _alike(values: Mapping[str, str]) -> list[tuple[str, list[str]]]:
+def alike(values: Mapping[str, str]) -> list[tuple[str, list[str]]]:
     """Each value with the names that have it, the most common first."""
     return [
         (value, [name for name, of_name in values.items() if of_name == value])
@@ -227,8 +231,8 @@ def alert_reasons(evidence: Evidence) -> Iterable[Reason]:
     for kind, grade, level, advice in _ALERT_REASONS:
         alerts = {name: str(tag.alert) for name, tag in evidence.of("tag") if ALERTS.get(tag.alert, 0) == grade}
         if alerts:
-            text = "; ".join(f"{_listed('tag', names)}: {ALERT_WORDS[alert]}" for alert, names in _alike(alerts))
-            yield Reason(kind, level, text, advice, _names("tag", list(alerts)))
+            text = "; ".join(f"{listed('tag', names)}: {ALERT_WORDS[alert]}" for alert, names in alike(alerts))
+            yield Reason(kind, level, text, advice, names_of("tag", list(alerts)))
 
 
 def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
@@ -255,19 +259,21 @@ def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
     unseen = len(offline) == len(names) and all(node.since_s is None for _, node in evidence.of("anchor"))
     if offline and not (unseen and now_s - evidence.ready_s < START_S):
         which = f"all {len(names)} anchors are" if len(offline) == len(names) else ""
-        which = which or f"{_listed('anchor', offline)} of {len(names)} {_number(offline, 'is', 'are')}"
+        which = which or f"{listed('anchor', offline)} of {len(names)} {verb(offline, 'is', 'are')}"
         advice = "See whether power and program run there; positions are less accurate without them."
         too_few = len(names) - len(offline) < _MIN_ANCHORS
-        yield Reason("anchors", "bad" if too_few else "warning", f"{which} offline", advice, _names("anchor", offline))
+        yield Reason(
+            "anchors", "bad" if too_few else "warning", f"{which} offline", advice, names_of("anchor", offline)
+        )
     if cut_off:
-        text = f"{_listed('anchor', cut_off)} {_number(cut_off, 'does', 'do')} not report, though on the air"
+        text = f"{listed('anchor', cut_off)} {verb(cut_off, 'does', 'do')} not report, though on the air"
         advice = "The program has lost the broker, or the page lost its messages: see its log."
-        yield Reason("silent-anchors", "warning", text, advice, _names("anchor", cut_off))
+        yield Reason("silent-anchors", "warning", text, advice, names_of("anchor", cut_off))
     if idle:
-        text = f"{_listed('anchor', idle)} {_number(idle, 'is', 'are')} not synchronised and sends nothing"
+        text = f"{listed('anchor', idle)} {verb(idle, 'is', 'are')} not synchronised and sends nothing"
         text = text if len(idle) == 1 else text.replace("sends", "send")
         advice = "Too few messages of the others arrive there: see what blocks them."
-        yield Reason("not-synchronised", "warning", text, advice, _names("anchor", idle))
+        yield Reason("not-synchronised", "warning", text, advice, names_of("anchor", idle))
 
 
 def _is_idle(health: AnchorHealth) -> bool:
@@ -300,11 +306,15 @@ def watch_reasons(watch: WatchMessage | None, age_s: float | None) -> Iterable[R
         advice = "Move it back, or survey again." if kind == "moved" else "See there; survey again where it stays so."
         names = dict.fromkeys(str(anchor) for finding in chosen for anchor in finding.anchors)
         yield Reason(
-            kind, "bad" if kind == "moved" and not ended else "warning", text, advice, _names("anchor", list(names))
+            kind, "bad" if kind == "moved" and not ended else "warning", text, advice, names_of("anchor", list(names))
         )
 
 
-_ORDER: Final = ("broker", "slow", "busy", "late", "no-fixes", "limit", "moved", "anchors", "master", "no-fix", "alert")
+_ORDER: Final = (
+    *("broker", "slow", "busy", "late", "forged", "clock", "chain-ended", "codes", "not-verified", "no-fixes", "limit"),
+    *("moved", "anchors", "master", "no-fix", "alert", "keys", "not-synchronised", "silent-anchors", "silent", "watch"),
+    "chain",
+)
 """Causes before their effects."""
 
 
@@ -313,11 +323,12 @@ def rank(reason: Reason) -> tuple[bool, int]:
     return reason.level != "bad", _ORDER.index(reason.kind) if reason.kind in _ORDER else len(_ORDER)
 
 
-def _names(kind: str, names: list[str]) -> tuple[str, ...]:
+def names_of(kind: str, names: Sequence[str]) -> tuple[str, ...]:
+    """``names`` of a reason."""
     return tuple(f"{kind}/{name}" for name in names[:_MOST_NAMED])
 
 
-def _listed(kind: str, names: list[str]) -> str:
+def listed(kind: str, names: Sequence[str]) -> str:
     """``anchors 3, 5 and 8``; of many only the first."""
     if len(names) == 1:
         return f"{kind} {names[0]}"
@@ -326,9 +337,11 @@ def _listed(kind: str, names: list[str]) -> str:
     return f"{kind}s {', '.join(names[:-1])} and {names[-1]}"
 
 
-def _counted(kind: str, names: list[str]) -> str:
+def counted(kind: str, names: Sequence[str]) -> str:
+    """``anchor 3``, or ``5 anchors``."""
     return f"{kind} {names[0]}" if len(names) == 1 else f"{len(names)} {kind}s"
 
 
-def _number(items: list[str] | dict[str, str], one: str, many: str) -> str:
+def verb(items: Sized, one: str, many: str) -> str:
+    """The verb's form for one item or for many."""
     return one if len(items) == 1 else many

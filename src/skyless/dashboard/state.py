@@ -153,6 +153,7 @@ def _row(fix: FixMessage, true_m: Vector | None, ended_unix_s: float) -> list[An
     x, y, z = fix.position_m
     xx, xy, _, _, yy = fix.covariance_m2[:5]
     vx, vy, _ = fix.velocity_mps or (None, None, None)
+    verified_s = fix.verified_until_s
     return [
         fix.tag,
         round(x, 4),
@@ -174,4 +175,6 @@ def _row(fix: FixMessage, true_m: Vector | None, ended_unix_s: float) -> list[An
         fix.alert,
         int(fix.height_known),
         None if fix.height_known else round(math.sqrt(max(fix.covariance_m2[8], 0.0)), 5),
+        None if verified_s is None else round(fix.time_s - verified_s, 2),
+        None if verified_s is None else round(fix.unverified, 3),
     ]

@@ -227,6 +227,7 @@ class SiteMetrics:
         yield from _gauge(
             "skyless_tag_memory_bytes", text, [(labels, health.memory_bytes) for labels, health in healthy]
         )
+        yield from _trust_lines([(labels, health) for labels, health in healthy if health.trust is not None], fresh)
         if self._positions:
             text = "Position of the tag's last fix in the site's frame."
             positions = [
@@ -269,6 +270,14 @@ class SiteMetrics:
         yield from _gauge(
             "skyless_anchor_missed_ratio", text, [(labels, health.missed_share) for labels, health in fresh]
         )
+        text = "Whether the beacons of an anchor with keys have codes."
+        keyed = [(labels, h) for labels, h in fresh if h.chain is not None or h.code_fault is not None]
+        yield from _gauge("skyless_anchor_codes", text, [(labels, float(h.code_fault is None)) for labels, h in keyed])
+        text = "When the anchor's last key chain ends, in Unix time."
+        ends = [(labels, health.chain_ends_unix_s) for labels, health in fresh]
+        yield from _gauge("skyless_anchor_chain_end_timestamp_seconds", text, ends)
+        text = "Other anchors whose beacons an anchor with keys has lately not accepted, by fault."
+        yield from _gauge("skyless_anchor_not_accepted", text, _faults([(labels, h.faults) for labels, h in keyed]))
 
     def _link_lines(self) -> Iterator[str]:
         groups: tuple[tuple[str, Mapping[str, _Node]], ...] = (("tag", self._tags), ("anchor", self._anchors))
@@ -279,6 +288,32 @@ class SiteMetrics:
             ("skyless_mqtt_reconnects_total", "Connections that the node has made again."),
         ):
             yield from family(name, "counter", text, _totals(nodes, name))
+
+
+def _trust_lines(
+    trusting: Iterable[tuple[Labels, TagHealth]], fresh: Iterable[tuple[Labels, FixMessage]]
+) -> Iterator[str]:
+    """Of tags with the site's public key."""
+    trusting = list(trusting)
+    names = {labels["tag"] for labels, _ in trusting}
+    text = "Whether beacons that a tag with the site's public key received lately are verified."
+    yield from _gauge("skyless_tag_verified", text, [(labels, float(h.is_verified)) for labels, h in trusting])
+    text = "Share of the last second's beacons that were verified when the tag's last fix was made."
+    shares = [(labels, 1.0 - fix.unverified) for labels, fix in fresh if labels["tag"] in names]
+    yield from _gauge("skyless_tag_verified_ratio", text, shares)
+    text = "How far the clock of the tag's host is ahead of the site's, where that is more than its bound."
+    yield from _gauge("skyless_tag_clock_error_seconds", text, [(labels, h.clock_error_s) for labels, h in trusting])
+    text = "Anchors whose beacons the tag has lately not accepted, by fault."
+    yield from _gauge("skyless_tag_not_accepted", text, _faults([(labels, h.faults) for labels, h in trusting]))
+
+
+def _faults(nodes: Iterable[tuple[Labels, Mapping[str, str]]]) -> list[tuple[Labels, float]]:
+    """The number of anchors for each fault that a node states."""
+    return [
+        ({**labels, "reason": fault}, count)
+        for labels, faults in nodes
+        for fault, count in sorted(Counter(faults.values()).items())[:_MOST_REASONS]
+    ]
 
 
 def _gauge(name: str, text: str, values: Iterable[tuple[Labels, float | None]]) -> list[str]:

@@ -7,10 +7,11 @@ const GAP_S = 1.0;
 /** A state older than the last by more than this comes after the server's clock was set back. */
 const SET_BACK_S = 5;
 
-export const COLUMNS = 19;
+export const COLUMNS = 21;
 /**
  * Columns of a track: the fields of a `state` message's row after the tag's name, in the order of the wire.
- * `HEIGHT_GIVEN` is 1 where z was given and not estimated; `STD_Z` is NaN there.
+ * `HEIGHT_GIVEN` is 1 where z was given and not estimated; `STD_Z` is NaN there. `VERIFIED_AGE` is how long before the
+ * fix its last verified beacon was, `UNVERIFIED` the share of others in the last second; NaN where none is verified.
  */
 export const [
   X,
@@ -32,6 +33,8 @@ export const [
   ALERT,
   HEIGHT_GIVEN,
   STD_Z,
+  VERIFIED_AGE,
+  UNVERIFIED,
 ] = Array(COLUMNS).keys();
 
 /** Integrity alerts by their names on the wire; a track holds their index. */

@@ -7,6 +7,7 @@ import { DASH, duration, length, number } from "../format.js";
 import { anchorHistory } from "../history.js";
 import { anchorMark, condition, leads, wordsOf } from "../map/anchors.js";
 import { findingAt, findingWords, findings, markWords } from "../survey/watch.js";
+import { chainWords, codeWords, faultWords } from "./codes.js";
 import { facts, selectionTable, split } from "./parts.js";
 
 export const title = "Anchors";
@@ -60,19 +61,25 @@ function healthOf(id) {
   return state.mode === "live" ? state.health.anchors.get(id) : null;
 }
 
+function codesOf(health) {
+  return health && codeWords(health, state.health.anchors.values());
+}
+
 function describe(id) {
   const kind = condition(id);
   const leading = leads(id);
   const health = healthOf(id);
   const finding = findingAt(id);
+  const noCodes = kind === "good" && codesOf(health)?.grade ? "no codes" : "";
+  const shown = finding ? "bad" : noCodes ? "warn" : kind;
   const words = finding ? `${wordsOf(kind)}; ${markWords(finding)}` : wordsOf(kind);
   const known = kind === "good" && health;
   return {
-    condition: finding ? "bad" : kind,
-    words,
-    key: words + leading,
-    mark: () => anchorMark(kind, leading !== ""),
-    name: [id, leading, finding && markWords(finding)].filter(Boolean).join(" "),
+    condition: shown,
+    words: [words, noCodes].filter(Boolean).join("; "),
+    key: words + leading + noCodes,
+    mark: () => anchorMark(noCodes ? "warn" : kind, leading !== ""),
+    name: [id, leading, finding && markWords(finding), noCodes].filter(Boolean).join(" "),
     figures: [
       leading ? "reference" : known ? number(health.offset_s, 4, "s") : DASH,
       leading || !known ? DASH : number(health.rate_ppm, 3, "ppm"),
@@ -95,6 +102,9 @@ function makeDetail() {
     "Slot time led by",
     "Hops",
     "Parents",
+    "Codes",
+    "Key chain",
+    "Not accepted",
     "Term",
     "Superframe",
     "Sent",
@@ -121,6 +131,9 @@ function makeDetail() {
     if (!health) return;
     text(heading, `Anchor ${id}`);
     list.show(anchorFacts(id, health));
+    list.grade("Codes", codesOf(health)?.grade ?? "");
+    list.grade("Key chain", chainWords(health)?.grade ?? "");
+    list.grade("Not accepted", "bad");
     list.grade("State", condition(id) === "good" ? "" : condition(id));
     list.grade("Last report", "bad");
     charts.hidden = leads(id) !== "";
@@ -155,6 +168,9 @@ function anchorFacts(id, health) {
     "Slot time led by": health.root == null || health.root === id ? null : `anchor ${health.root}`,
     Hops: number(health.hop),
     Parents: health.parents?.length ? health.parents.map((parent) => `anchor ${parent}`).join(", ") : null,
+    Codes: codesOf(health)?.words,
+    "Key chain": chainWords(health)?.words,
+    "Not accepted": faultWords(health.faults),
     Term: number(health.term),
     Superframe: number(health.superframe),
     Sent: number(health.sent),

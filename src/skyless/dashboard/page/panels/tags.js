@@ -19,12 +19,15 @@ import {
   STD,
   STD_Z,
   TIME,
+  UNVERIFIED,
+  VERIFIED_AGE,
   VX,
   VY,
   X,
   Y,
   Z,
 } from "../tracks.js";
+import { clockWords, faultWords, isUnverified, verifiedWords } from "./codes.js";
 import { facts, selectionTable, split } from "./parts.js";
 
 export const title = "Tags";
@@ -107,12 +110,13 @@ function describe(name, { track, style: look }) {
   const health = reports ? state.health.tags.get(name) : null;
   if (!known) row.fill(NaN);
   const alert = Object.values(ALERTS)[row[ALERT]];
+  const unverified = isUnverified(health);
   return {
     condition: alert?.grade ? `${condition} alert-${alert.grade}` : condition,
-    words: WORDS[condition],
-    key: `${condition} ${look.colour} ${look.shape}`,
+    words: unverified ? `${WORDS[condition]}, not verified` : WORDS[condition],
+    key: `${condition} ${unverified} ${look.colour} ${look.shape}`,
     mark: () => (condition === "fresh" ? tagMark(look) : h("span", { "aria-hidden": "true" }, MARKS[condition])),
-    name,
+    name: unverified ? `${name} not verified` : name,
     figures: [
       metres(row[X]),
       metres(row[Y]),
@@ -149,6 +153,9 @@ function makeDetail() {
     "Rate",
     "Protection level",
     "Integrity alert",
+    "Verified",
+    "Not accepted",
+    "Clock",
     "Anchors used",
     "Time to first fix",
     "Latency",
@@ -199,7 +206,16 @@ function makeDetail() {
     reason.hidden = !health?.reason;
     text(reason, health?.reason ? `No fix: ${health.reason.replaceAll("-", " ")}` : "");
     const known = track.at(shown_s(), row, false);
-    list.show({ ...(known ? fixFacts(track) : {}), ...(health ? healthFacts(health) : {}) });
+    if (!known) row.fill(NaN);
+    const verified = verifiedWords(health, row[VERIFIED_AGE] + age_s(track), row[UNVERIFIED]);
+    list.show({
+      ...(known ? fixFacts(track) : {}),
+      ...(health ? healthFacts(health) : {}),
+      Verified: verified?.words,
+    });
+    list.grade("Verified", verified?.grade ?? "");
+    list.grade("Not accepted", "bad");
+    list.grade("Clock", "bad");
     list.grade("Integrity alert", (known && Object.values(ALERTS)[row[ALERT]]?.grade) || "");
     showCharts(track);
   };
@@ -223,13 +239,16 @@ function fixFacts(track) {
   };
 }
 
-function healthFacts({ updates_per_s, first_fix_s, latency_p50_s, latency_p99_s, method, counters, cpu, memory_bytes }) {
+function healthFacts(health) {
+  const { updates_per_s, first_fix_s, latency_p50_s, latency_p99_s, method, counters, cpu, memory_bytes } = health;
   const dropped = Object.entries(counters).filter(([, count]) => count);
   return {
     Rate: number(updates_per_s, 0, "Hz"),
     "Time to first fix": first_fix_s == null ? null : duration(first_fix_s),
     Latency: latency_p50_s == null ? null : `${duration(latency_p50_s)}, p99 ${duration(latency_p99_s)}`,
     Method: method,
+    "Not accepted": faultWords(health.faults),
+    Clock: clockWords(health),
     Dropped: dropped.map(([name, count]) => `${count} ${name}`).join(", ") || "none",
     CPU: `${(100 * cpu).toFixed(1)} %`,
     Memory: bytes(memory_bytes),

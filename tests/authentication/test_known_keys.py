@@ -1,0 +1,160 @@
+"""What a listener keeps of certificates and keys: nothing that is forged, and at a bounded cost."""
+
+import secrets
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skyless.authentication import known_keys
+from skyless.authentication.certificate import ChainTiming, public_key, read_certificate
+from skyless.authentication.chain import Chain, ChainKeys, section_signatures
+from skyless.authentication.key_chain import SECTION_BITS, SECTION_INTERVALS, earlier_key
+from skyless.authentication.known_keys import CertificateUse, KeyUse, KnownKeys
+
+SITE = 42
+TIMING = ChainTiming()
+SECTION = 2_197_265
+FIRST = SECTION << SECTION_BITS
+PRIVATE = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
+PUBLIC = public_key(PRIVATE.public_key().public_bytes_raw())
+
+
+def chain(serial=1, first=FIRST, sections=2, site=SITE, private=PRIVATE):
+    covered = range(first >> SECTION_BITS, (first >> SECTION_BITS) + sections)
+    seed = bytes((serial,)) * 32
+    return Chain(
+        site, serial, TIMING, first, section_signatures(seed, site, serial, TIMING, first, covered, private), seed
+    )
+
+
+CHAIN = chain()
+KEYS = ChainKeys(CHAIN)
+SENT = KEYS.certificate(FIRST)
+
+
+def at_s(interval):
+    return TIMING.start_s(interval)
+
+
+def known():
+    made = KnownKeys(SITE, PUBLIC)
+    assert made.on_certificate(SENT, at_s(FIRST)) is CertificateUse.NEW
+    return made
+
+
+@given(st.integers(0, 8 * len(SENT) - 1))
+@settings(max_examples=60)
+def test_no_bit_of_a_certificate_can_be_changed(bit):
+    made = KnownKeys(SITE, PUBLIC)
+    altered = (int.from_bytes(SENT, "big") ^ 1 << bit).to_bytes(len(SENT), "big")
+    assert made.on_certificate(altered, at_s(FIRST)) is CertificateUse.FORGED
+    assert made.certificates == ()
+    assert made.timing is None
+
+
+@given(st.binary(min_size=94, max_size=94))
+def test_any_bytes_are_a_forged_certificate(sent):
+    assert KnownKeys(SITE, PUBLIC).on_certificate(sent, at_s(FIRST)) is CertificateUse.FORGED
+
+
+def test_certificates_of_other_sites_and_owners_are_forged():
+    for other in (chain(site=43), chain(private=Ed25519PrivateKey.generate())):
+        sent = ChainKeys(other).certificate(FIRST)
+        assert KnownKeys(SITE, PUBLIC).on_certificate(sent, at_s(FIRST)) is CertificateUse.FORGED
+
+
+@given(st.lists(st.integers(0, 3000), min_size=1, max_size=8))
+@settings(max_examples=30)
+def test_keys_are_accepted_in_any_order_and_give_those_between(offsets):
+    made, newest = known(), -1
+    for offset in offsets:
+        use = made.on_key(KEYS.key(FIRST + offset), FIRST + offset, at_s(FIRST + offset))
+        assert use is (KeyUse.NEW if offset > newest else KeyUse.KNOWN)
+        newest = max(newest, offset)
+    assert made.newest == FIRST + newest
+    for offset in range(max(0, newest - 200), newest + 1):
+        assert made.mac_key(FIRST + offset) == KEYS.mac_key(FIRST + offset)
+    assert made.mac_key(FIRST + newest + 1) is None
+
+
+@given(st.integers(-3, 300), st.binary(min_size=16, max_size=16))
+def test_a_forged_key_changes_nothing(offset, key):
+    made = known()
+    made.on_key(KEYS.key(FIRST + 10), FIRST + 10, at_s(FIRST))
+    assert made.on_key(key, FIRST + offset, at_s(FIRST)) in {KeyUse.FORGED, KeyUse.KNOWN}
+    assert made.newest == FIRST + 10
+    assert made.mac_key(FIRST + 10) == KEYS.mac_key(FIRST + 10)
+
+
+def test_a_key_of_another_interval_is_forged():
+    made = known()
+    assert made.on_key(KEYS.key(FIRST + 11), FIRST + 10, at_s(FIRST)) is KeyUse.FORGED
+
+
+def test_forged_keys_far_ahead_cost_a_bounded_number_of_steps(monkeypatch):
+    steps = 0
+
+    def counted(key, name, number=1):
+        nonlocal steps
+        steps += number
+        return earlier_key(key, name, number)
+
+    monkeypatch.setattr(known_keys, "earlier_key", counted)
+    made, interval = known(), FIRST + SECTION_INTERVALS - 1
+    for number in range(1000):  # within a second
+        made.on_key(secrets.token_bytes(16), interval, at_s(FIRST) + 1e-3 * number)
+    assert steps <= known_keys.MOST_STEPS + known_keys.STEPS_PER_S
+    steps = 0
+    assert made.on_key(KEYS.key(FIRST + 3), FIRST + 3, at_s(FIRST) + 1.0) is KeyUse.NEW  # the expected ones are free
+
+
+def test_forged_certificates_cost_a_bounded_number_of_checks():
+    made, uses = KnownKeys(SITE, PUBLIC), []
+    for number in range(400):
+        sent = SENT[:-2] + number.to_bytes(2, "big")
+        uses.append(made.on_certificate(sent, at_s(FIRST) + 1e-3 * number))
+    assert uses.count(CertificateUse.FORGED) <= known_keys.MOST_CHECKS + 0.4 * known_keys.CHECKS_PER_S
+    assert uses[-1] is CertificateUse.IGNORED
+    assert made.on_certificate(SENT, at_s(FIRST) + 2.0) is CertificateUse.NEW
+
+
+def test_the_next_section_and_the_next_chain_go_on():
+    made, last = known(), FIRST + SECTION_INTERVALS - 1
+    assert made.on_certificate(KEYS.certificate(last + 1), at_s(last)) is CertificateUse.NEW
+    for interval in (last, last + 1, last + 5):
+        assert made.on_key(KEYS.key(interval), interval, at_s(last)) is KeyUse.NEW
+        assert made.mac_key(interval) == KEYS.mac_key(interval)
+    second = ChainKeys(chain(serial=2, first=last + 100, sections=2))
+    assert made.on_certificate(second.certificate(last + 100), at_s(last)) is CertificateUse.NEW
+    assert made.serial == 1  # it does not count yet
+    assert made.on_key(KEYS.key(last + 99), last + 99, at_s(last)) is KeyUse.NEW
+    assert made.on_key(KEYS.key(last + 100), last + 100, at_s(last)) is KeyUse.FORGED
+    assert made.on_key(second.key(last + 101), last + 101, at_s(last)) is KeyUse.NEW
+    assert made.mac_key(last + 100) == second.mac_key(last + 100)
+    assert made.mac_key(last + 99) == KEYS.mac_key(last + 99)
+    assert made.serial == 2
+    assert made.on_certificate(KEYS.certificate(last + 1), at_s(last + 110)) is CertificateUse.REVOKED
+
+
+def test_old_certificates_make_way():
+    made = KnownKeys(SITE, PUBLIC)
+    long = ChainKeys(chain(sections=12))
+    for section in range(12):
+        interval = FIRST + section * SECTION_INTERVALS
+        assert made.on_certificate(long.certificate(interval), at_s(interval)) is CertificateUse.NEW
+        assert len(made.certificates) <= known_keys.MOST_CERTIFICATES
+        assert read_certificate(SITE, made.certificates[-1])[0].name.section == SECTION + section
+        assert made.on_key(long.key(interval), interval, at_s(interval)) is KeyUse.NEW
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda sent: sent[:-1] + b"\0", lambda sent: bytes(94), lambda sent: sent[:40], lambda sent: sent[::-1]]
+)
+def test_damaged_certificates_of_an_earlier_run_are_ignored(damage):
+    made = KnownKeys(SITE, PUBLIC)
+    made.restore([damage(SENT)])
+    assert made.certificates == ()
+    made.restore([SENT])
+    assert made.certificates == (SENT,)
