@@ -119,6 +119,8 @@ IDENTIFIERS = [
 HEARING = {
     "anchor.py",
     "anchors/free.py",
+    "evaluation/attacked_air.py",
+    "evaluation/trusted_fixes.py",
     "evaluation/trusted_air.py",
     "trusted_receiver.py",
     "anchors/slots.py",

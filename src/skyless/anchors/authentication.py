@@ -165,9 +165,13 @@ class BeaconAuthentication:
             known.add(unix_s, offset_s)
 
     def _is_clock_wrong(self, timing: ChainTiming, unix_s: float) -> bool:
-        """Whether the own clock is far from those of most other anchors; repeated old frames show nothing."""
+        """Whether the own clock is far from those of most other anchors; repeated old frames show nothing.
+
+        Anywhere in its interval a frame is in time: in slots an anchor may always send near the end of one.
+        """
         recent = [one.least_s for one in self._offsets.values() if abs(unix_s - one.unix_s) <= RECENT_S]
-        far = sum(abs(offset_s) > 0.5 * timing.most_clock_error_s for offset_s in recent)
+        most_s = 0.5 * timing.most_clock_error_s
+        far = sum(not -most_s <= offset_s <= timing.interval_s + most_s for offset_s in recent)
         return len(recent) >= LEAST_OTHERS and 2 * far > len(recent)
 
     def _unix_s(self, ticks: int) -> float:

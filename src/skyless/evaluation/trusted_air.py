@@ -46,7 +46,8 @@ class ClockedAnchor:
     """An anchor whose host has a clock: the simulation's, ahead by an error."""
 
     def __init__(self, machine: AnyAnchor, now_s: Callable[[], float], error_s: float = 0.0) -> None:
-        self.machine, self._now_s, self._error_s = machine, now_s, error_s
+        self.id, self.machine = machine.id, machine
+        self._now_s, self._error_s = now_s, error_s
 
     def hear(self, reception: Reception) -> None:
         """As ``AnchorMachine``."""
