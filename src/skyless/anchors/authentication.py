@@ -1,5 +1,6 @@
 """What an anchor with keys adds to its frames, and how it verifies those of others: it knows all keys, so at once."""
 
+import math
 from collections.abc import Iterable
 from typing import Final
 
@@ -27,6 +28,8 @@ FAR_EVERY_S: Final = 1.0
 milliseconds, and anybody can state any interval."""
 
 RECENT_S: Final = 2.0
+SPACINGS: Final = 3.0
+"""The first frame of an anchor in an interval comes within so many of its mean times between two frames."""
 LEAST_OTHERS: Final = 2
 """Own clock against this number of others: with one it is not known which of the two is wrong."""
 
@@ -47,20 +50,30 @@ class Contents(Struct, frozen=True, gc=False):
 
 
 class _Offset(Struct):
-    """How far another anchor's clock is behind the own one: the least that frames of the last seconds have shown."""
+    """How far another anchor's clock is behind the own one, by its frames of the present second and the one before.
 
-    unix_s: float
-    present_s: float
-    before_s: float
+    A frame shows what it is after the beginning of its interval, and the least of many is hardly more than the clocks'
+    difference. Repeated old frames show more, so they do no harm.
+    """
+
+    since_s: float
+    present_s: float = math.inf
+    before_s: float = math.inf
+    frames: int = 0
+    frames_before: int = 0
 
     def add(self, unix_s: float, offset_s: float) -> None:
-        if unix_s - self.unix_s > 0.5 * RECENT_S:
-            self.unix_s, self.before_s, self.present_s = unix_s, self.present_s, offset_s
+        if unix_s - self.since_s > 1.0:
+            self.since_s, self.before_s, self.frames_before = unix_s, self.present_s, self.frames
+            self.present_s, self.frames = math.inf, 0
         self.present_s = min(self.present_s, offset_s)
+        self.frames += 1
 
-    @property
-    def least_s(self) -> float:
-        return min(self.present_s, self.before_s)
+    def is_far(self, timing: ChainTiming, most_s: float) -> bool:
+        """Whether the clocks differ by more than this, whatever the instants at which that anchor sends."""
+        least_s = min(self.present_s, self.before_s)
+        latest_s = min(SPACINGS / self.frames_before, timing.interval_s) if self.frames_before else timing.interval_s
+        return least_s < -most_s or least_s > most_s + latest_s
 
 
 class BeaconAuthentication:
@@ -159,19 +172,14 @@ class BeaconAuthentication:
 
     def _note_offset(self, anchor: int, unix_s: float, offset_s: float) -> None:
         known = self._offsets.get(anchor)
-        if known is None or unix_s - known.unix_s > RECENT_S:
-            self._offsets[anchor] = _Offset(unix_s, offset_s, offset_s)
-        else:
-            known.add(unix_s, offset_s)
+        if known is None or unix_s - known.since_s > RECENT_S:
+            known = self._offsets[anchor] = _Offset(unix_s)
+        known.add(unix_s, offset_s)
 
     def _is_clock_wrong(self, timing: ChainTiming, unix_s: float) -> bool:
-        """Whether the own clock is far from those of most other anchors; repeated old frames show nothing.
-
-        Anywhere in its interval a frame is in time: in slots an anchor may always send near the end of one.
-        """
-        recent = [one.least_s for one in self._offsets.values() if abs(unix_s - one.unix_s) <= RECENT_S]
-        most_s = 0.5 * timing.most_clock_error_s
-        far = sum(not -most_s <= offset_s <= timing.interval_s + most_s for offset_s in recent)
+        """Whether the own clock is far from those of most other anchors."""
+        recent = [one for one in self._offsets.values() if abs(unix_s - one.since_s) <= RECENT_S]
+        far = sum(one.is_far(timing, 0.5 * timing.most_clock_error_s) for one in recent)
         return len(recent) >= LEAST_OTHERS and 2 * far > len(recent)
 
     def _unix_s(self, ticks: int) -> float:
