@@ -20,7 +20,7 @@ MOST_CERTIFICATES: Final = 6
 NEAR_STEPS: Final = 512
 """Keys that follow within this number of intervals on a verified one are hashed at once, others as far as the allowance
 for long ones goes: whoever sends forged keys must not keep the processor busy."""
-STEPS_PER_S: Final = 200_000.0
+STEPS_PER_S: Final = 100_000.0
 MOST_STEPS: Final = 40_000.0
 
 CHECKS_PER_S: Final = 100.0
@@ -183,6 +183,8 @@ class KnownKeys:
                 min(self._sections, key=lambda one: (one.section >= self._present, one.serial, one.section))
             ]
         self.timing = self._sections[max(self._sections, key=lambda one: one.serial)].certificate.timing
+        counting = [one.newest for one in self._sections.values() if self._section_of(one.newest) is one]
+        self.newest = max(counting, default=-1)  # keys of a chain that was revoked show nothing any more
 
     def _refill(self, now_s: float) -> None:
         """Renew the allowances by the time that has passed."""

@@ -34,8 +34,8 @@ LONGEST_WAIT_TICKS: Final = from_seconds(2.0)
 FAULT_TICKS: Final = from_seconds(2.0)
 """A fault is reported for this time after it was seen last."""
 
-MOST_REPEATED: Final = 4096
-"""Codes that are remembered: more than there are in the intervals whose frames are still accepted."""
+CODES_KEPT: Final = 2048
+"""So many codes at least are remembered: more than there are in the intervals whose frames are still accepted."""
 
 MOST_FAULTY_ANCHORS: Final = 64
 """Anchors with faults that are remembered: forged frames can name any."""
@@ -49,9 +49,8 @@ class ReceivedFrame(Struct, frozen=True, gc=False):
     reception: Reception
     rx_ticks: int
     """Own counter, unwrapped."""
-    present_s: float
     upper_s: float
-    """The site's time when it was received, and its upper bound."""
+    """Upper bound of the site's time when it was received."""
     interval: int | None
     """Number of the interval; None where no certificate was known yet: the frame's time is still to be checked."""
 
@@ -87,8 +86,11 @@ class Verifier:
         self._own_ticks = Unwrapper()
         self._waiting: deque[ReceivedFrame] = deque()
         self._faults: dict[int, _AnchorFault] = {}
-        self._genuine: dict[bytes, None] = {}
-        """Codes of the last genuine frames, in their order; a second frame with one of them is a repetition."""
+        self._codes: set[bytes] = set()
+        self._codes_before: set[bytes] = set()
+        """Codes of the last genuine frames; a second frame with one of them is a repetition."""
+        self._anchors: set[int] = set()
+        """Anchors that have sent a genuine frame."""
         self.newest_ticks = 0
         """When the last frame of the site was received: own counter, unwrapped."""
         self._has_new_key = False
@@ -103,7 +105,13 @@ class Verifier:
         return {anchor: one.fault for anchor, one in self._faults.items() if one.rx_ticks > oldest}
 
     def is_suspect(self, anchor: int) -> bool:
-        """Whether frames of an anchor, or frames in its name, were not accepted within the last seconds."""
+        """Whether frames of an anchor are to be verified before they are used.
+
+        That is so when some in its name were not accepted within the last seconds, and, once there are genuine frames,
+        while there are none of it.
+        """
+        if self._anchors and anchor not in self._anchors:
+            return True
         known = self._faults.get(anchor)
         return known is not None and self.newest_ticks - known.rx_ticks < FAULT_TICKS
 
@@ -124,8 +132,9 @@ class Verifier:
             return None
         timing, interval = self.keys.timing, None
         if timing is not None:
-            interval = nearest(stated.interval, timing.interval_at(clock.present_s), INTERVAL_BITS)
-            fault = _time_fault(interval, clock.upper_s, timing)
+            present = timing.interval_at(clock.upper_s)
+            interval = nearest(stated.interval, present, INTERVAL_BITS)
+            fault = _time_fault(interval, present, timing.lag)
             if isinstance(beacon.page, KeyPage):
                 self._on_key(beacon.page.key, interval - timing.lag, timing, is_early=fault is Fault.EARLY)
             if fault is None and interval <= self.keys.newest:
@@ -136,54 +145,57 @@ class Verifier:
         if len(self._waiting) >= MOST_UNDECIDED:
             self._counters[Fault.TOO_MANY] += 1
             return None
-        self._waiting.append(
-            ReceivedFrame(beacon, stated, reception, rx_ticks, clock.present_s, clock.upper_s, interval)
-        )
+        self._waiting.append(ReceivedFrame(beacon, stated, reception, rx_ticks, clock.upper_s, interval))
         return rx_ticks
 
     def decided(self) -> list[tuple[ReceivedFrame, bool]]:
         """Frames of which it is known by now whether they are genuine; in the order of reception, each once."""
-        timing, decided = self.keys.timing, list[tuple[ReceivedFrame, bool]]()
-        if not self._has_new_key and not self._is_overdue():
+        decided = list[tuple[ReceivedFrame, bool]]()
+        waiting, timing = self._waiting, self.keys.timing
+        oldest = self.newest_ticks - LONGEST_WAIT_TICKS
+        if not (self._has_new_key or (waiting and waiting[0].rx_ticks <= oldest)):
             return decided
         self._has_new_key = False
-        while self._waiting:
-            one = self._waiting[0]
-            is_genuine = None if timing is None or self.clock.is_late else self._is_genuine(one, timing)
-            if is_genuine is None:
-                if not self._is_overdue():
-                    break
-                self._counters[Fault.NO_KEY] += 1
-            self._waiting.popleft()
-            decided.append((one, bool(is_genuine)))
+        can_decide = timing is not None and not self.clock.is_late
+        while waiting:
+            one = waiting[0]
+            fault = self._fault(one, timing) if can_decide and timing is not None else Fault.NO_KEY
+            if fault is Fault.NO_KEY and one.rx_ticks > oldest and not self._is_key_lost(one):
+                break
+            waiting.popleft()
+            decided.append((one, fault is None))
+            if fault is Fault.NO_KEY:
+                self._counters[fault] += 1
+            elif fault is not None:
+                self._refuse(one.beacon.anchor, fault, one.rx_ticks)
         return decided
 
-    def _is_overdue(self) -> bool:
-        """Whether the first frame that waits has waited too long."""
-        return bool(self._waiting) and self.newest_ticks - self._waiting[0].rx_ticks >= LONGEST_WAIT_TICKS
-
-    def _is_genuine(self, one: ReceivedFrame, timing: ChainTiming) -> bool | None:
-        """Whether an anchor of the site made a frame; None while the key of its interval is not known."""
-        interval, fault = one.interval, None
+    def _fault(self, one: ReceivedFrame, timing: ChainTiming) -> Fault | None:
+        """What is wrong with a frame; ``NO_KEY`` while the key of its interval is not known."""
+        interval = one.interval
         if interval is None:
-            interval = nearest(one.authentication.interval, timing.interval_at(one.present_s), INTERVAL_BITS)
-            fault = _time_fault(interval, one.upper_s, timing)
-        if fault is None:
-            key = self.keys.mac_key(interval)
-            if key is None:
-                return None
-            mac = one.authentication.mac
-            if not is_mac(signed_bytes_2(one.reception.frame), mac, key):
-                fault = Fault.BAD_CODE
-            elif mac in self._genuine:
-                fault = Fault.REPEATED
-            else:
-                self._genuine[mac] = None
-                if len(self._genuine) > MOST_REPEATED:
-                    del self._genuine[next(iter(self._genuine))]
-                return True
-        self._refuse(one.beacon.anchor, fault, one.rx_ticks)
-        return False
+            present = timing.interval_at(one.upper_s)
+            interval = nearest(one.authentication.interval, present, INTERVAL_BITS)
+            fault = _time_fault(interval, present, timing.lag)
+            if fault is not None:
+                return fault
+        key = self.keys.mac_key(interval)
+        if key is None:
+            return Fault.NO_KEY
+        mac = one.authentication.mac
+        if not is_mac(signed_bytes_2(one.reception.frame), mac, key):
+            return Fault.BAD_CODE
+        if mac in self._codes or mac in self._codes_before:
+            return Fault.REPEATED
+        self._codes.add(mac)
+        if len(self._codes) >= CODES_KEPT:
+            self._codes, self._codes_before = set(), self._codes
+        self._anchors.add(one.beacon.anchor)
+        return None
+
+    def _is_key_lost(self, one: ReceivedFrame) -> bool:
+        """Whether a frame's key is not known though a later one is: a section has ended, or begun, in between."""
+        return one.interval is not None and one.interval <= self.keys.newest and not self.clock.is_late
 
     def _on_certificate(self, anchor: int, sent: bytes, rx_ticks: int) -> None:
         use = self.keys.on_certificate(sent, self.clock.present_s)
@@ -212,12 +224,13 @@ class Verifier:
             self._faults[anchor] = before if fault is not Fault.REVOKED_CHAIN else _AnchorFault(fault, rx_ticks)
             return
         if len(self._faults) >= MOST_FAULTY_ANCHORS:
-            del self._faults[next(iter(self._faults))]
+            strangers = (one for one in self._faults if one not in self._anchors)
+            del self._faults[next(strangers, next(iter(self._faults)))]
         self._faults[anchor] = _AnchorFault(fault, rx_ticks)
 
 
-def _time_fault(interval: int, upper_s: float, timing: ChainTiming) -> Fault | None:
-    """What is wrong with a frame of an interval that was received before this time."""
-    if upper_s >= timing.start_s(interval + timing.lag):
+def _time_fault(interval: int, present: int, lag: int) -> Fault | None:
+    """What is wrong with a frame of an interval that was received in another, or before it."""
+    if interval + lag <= present:
         return Fault.LATE
-    return Fault.EARLY if upper_s < timing.start_s(interval) else None
+    return Fault.EARLY if interval > present else None
