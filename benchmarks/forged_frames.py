@@ -101,7 +101,7 @@ def admitted_by_anchor(
     site: Site, keys: MadeKeys, mixed: list[Received], sent: set[bytes], counters: Counter[str]
 ) -> tuple[int, int]:
     """Forged frames that an anchor admits, and repetitions of genuine ones."""
-    authentication = BeaconAuthentication(site.id, keys.chains)
+    authentication = BeaconAuthentication(site, keys.chains)
     neighbours = Neighbours(site, site.anchors[0].id, counters, authentication)
     forged = repeated = 0
     for one in mixed:

@@ -210,7 +210,7 @@ def test_anchors_admit_no_forged_frame():
     tape = genuine_tape()
     own = FREE.anchors[0].id
     counters = Counter()
-    authentication = BeaconAuthentication(FREE.id, KEYS.chains)
+    authentication = BeaconAuthentication(FREE, KEYS.chains)
     neighbours = Neighbours(FREE, own, counters, authentication)
     forged = iter(forged_frames())
     next_s, frame = next(forged)

@@ -88,7 +88,7 @@ def test_frames_carry_codes_and_other_chains_are_used_without_a_restart(tmp_path
             assert all(frame.authentication is not None for frame in stage.frames())
             codes = [line for line in stage.said if "codes" in line]
             assert codes == [f"anchor 1: beacons carry codes of key chain {serial}" for serial in (1, 2)]
-            other, faults = BeaconAuthentication(FREE.id, KEYS.chains), set()
+            other, faults = BeaconAuthentication(FREE, KEYS.chains), set()
             for sent_s, transmission in stage.radios[0].transmissions:
                 ahead_s = difference(transmission.tx_ticks, stage.radios[0].ticks_at(sent_s)) * TICK_S
                 other.set_time(transmission.tx_ticks, START_UNIX_S + sent_s - BEGIN_S + ahead_s)
@@ -186,7 +186,7 @@ def test_an_anchor_whose_chain_has_not_begun_says_so_and_sends_without_codes(tmp
 def reported(faults, accepted_s=float("-inf")):
     """Lines of an anchor whose others have these faults for ten seconds."""
     said = []
-    authentication = BeaconAuthentication(FREE.id, KEYS.chains)
+    authentication = BeaconAuthentication(FREE, KEYS.chains)
     report = AnchorReport(1, said.append)
     for now_s in range(10):
         unix_s = START_UNIX_S + now_s
@@ -270,7 +270,7 @@ def test_stamps_of_beacons_that_are_not_accepted_are_not_kept(tmp_path, clock):
             await asyncio.sleep(1.0)
             for chains, is_kept in ((OTHER_KEYS.chains, False), ((), False), (KEYS.chains, True)):
                 now_ticks = stage.radios[0].now_ticks()
-                sender = FreeAnchor(FREE, 2, authentication=BeaconAuthentication(FREE.id, chains))
+                sender = FreeAnchor(FREE, 2, authentication=BeaconAuthentication(FREE, chains))
                 sender.authentication.set_time(now_ticks, START_UNIX_S + 1.0)
                 stage.node.on_event(Reception(sender.transmission(now_ticks).frame, now_ticks))
                 assert (2 in stage.node.heard_s) is is_kept

@@ -16,10 +16,14 @@ from skyless.authentication.fault import Fault
 from skyless.authentication.key_chain import is_mac, mac_of
 from skyless.constants import TICK_S
 from skyless.site.local_almanac import site_page_for
+from skyless.site.model import Site
+from skyless.site.slots import beacon_period_s
 from skyless.ticks import difference, nearest
 
-CERTIFICATE_EVERY: Final = 16
-"""One frame in so many carries a certificate, and every fourth of these that of what comes next."""
+CERTIFICATE_S: Final = 0.5
+CERTIFICATE_EVERY: Final = (8, 16, 32)
+"""An anchor sends a certificate about twice a second, in one of so many frames: such a frame has no relays. Every
+fourth of these is that of what comes next."""
 _SUCCESSOR_EVERY: Final = 4
 
 FAR_S: Final = 10.0
@@ -79,8 +83,9 @@ class _Offset(Struct):
 class BeaconAuthentication:
     """Keys, time and neighbours of one anchor, as far as authentication needs them. No I/O, no clock of its own."""
 
-    def __init__(self, site: int, chains: Iterable[Chain]) -> None:
-        self.site = site
+    def __init__(self, site: Site, chains: Iterable[Chain]) -> None:
+        period_s = beacon_period_s(site)
+        self._certificate_every = min(CERTIFICATE_EVERY, key=lambda every: abs(every * period_s - CERTIFICATE_S))
         self.faults: dict[int, tuple[Fault, float]] = {}
         """The last fault of each other anchor, or of frames in its name, and when it was, in Unix seconds."""
         self._ring = ChainRing(chains)
@@ -113,10 +118,12 @@ class BeaconAuthentication:
         interval = timing.interval_at(self._unix_s(tx_ticks))
         keys = self._ring.at(interval)
         if keys is None:
-            return Contents(certificate=self._ring.successor(interval) if _has_certificate(sequence, anchor) else None)
+            return Contents(
+                certificate=self._ring.successor(interval) if self._has_certificate(sequence, anchor) else None
+            )
         self._ring.prepare(interval)
-        if _has_certificate(sequence, anchor):
-            is_next = sequence // CERTIFICATE_EVERY % _SUCCESSOR_EVERY == _SUCCESSOR_EVERY - 1
+        if self._has_certificate(sequence, anchor):
+            is_next = sequence // self._certificate_every % _SUCCESSOR_EVERY == _SUCCESSOR_EVERY - 1
             successor = self._ring.successor(interval) if is_next else None
             return Contents(interval, certificate=successor or keys.certificate(interval))
         disclosed = interval - timing.lag
@@ -182,6 +189,9 @@ class BeaconAuthentication:
         far = sum(one.is_far(timing, 0.5 * timing.most_clock_error_s) for one in recent)
         return len(recent) >= LEAST_OTHERS and 2 * far > len(recent)
 
+    def _has_certificate(self, sequence: int, anchor: int) -> bool:
+        return (sequence - anchor) % self._certificate_every == 0
+
     def _unix_s(self, ticks: int) -> float:
         assert self._now is not None
         return self._now[1] + difference(ticks, self._now[0]) * TICK_S
@@ -195,7 +205,3 @@ def contents_of(authentication: BeaconAuthentication | None, tx_ticks: int, sequ
 def sealed(authentication: BeaconAuthentication | None, frame: bytes, contents: Contents) -> bytes:
     """A frame with these contents, with its code where the anchor has keys."""
     return frame if authentication is None else authentication.seal(frame, contents.interval)
-
-
-def _has_certificate(sequence: int, anchor: int) -> bool:
-    return (sequence - anchor) % CERTIFICATE_EVERY == 0

@@ -3,6 +3,6 @@
 As in Galileo's OSNMA (TESLA): codes are made with keys that are disclosed later, so a listener needs no secret, but
 must know the time (``docs/authentication.md``).
 
-Public: certificate, chain, chain_maker, fault, key_chain, key_files, verifier. Within the package: known_keys,
-site_clock.
+Public: certificate, chain, chain_maker, fault, key_chain, key_files, verifier. Within the package: arrivals,
+known_keys, site_clock.
 """

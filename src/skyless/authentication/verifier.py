@@ -13,6 +13,7 @@ from skyless.air.almanac import KeyPage
 from skyless.air.beacon2 import Authentication, Beacon2
 from skyless.air.codec2 import INTERVAL_BITS, signed_bytes_2
 from skyless.air.reception import Reception
+from skyless.authentication.arrivals import Arrivals, Stamps
 from skyless.authentication.certificate import ChainTiming, section_of
 from skyless.authentication.fault import Fault
 from skyless.authentication.key_chain import is_mac
@@ -86,6 +87,7 @@ class Verifier:
         self._own_ticks = Unwrapper()
         self._waiting: deque[ReceivedFrame] = deque()
         self._faults: dict[int, _AnchorFault] = {}
+        self._arrivals = Arrivals()
         self._codes: set[bytes] = set()
         self._codes_before: set[bytes] = set()
         """Codes of the last genuine frames; a second frame with one of them is a repetition."""
@@ -168,7 +170,20 @@ class Verifier:
                 self._counters[fault] += 1
             elif fault is not None:
                 self._refuse(one.beacon.anchor, fault, one.rx_ticks)
-        return decided
+        return self._without_delayed(decided)
+
+    def _without_delayed(self, decided: list[tuple[ReceivedFrame, bool]]) -> list[tuple[ReceivedFrame, bool]]:
+        """The same, where genuine frames that came late by the counters are not accepted either."""
+        genuine = [one for one, is_genuine in decided if is_genuine]
+        stamps = [Stamps(one.beacon.anchor, one.rx_ticks, one.beacon.tx_ticks) for one in genuine]
+        in_time = self._arrivals.in_time(stamps)
+        if all(in_time):
+            return decided
+        late = {id(one) for one, is_in_time in zip(genuine, in_time, strict=True) if not is_in_time}
+        for one in genuine:
+            if id(one) in late:
+                self._refuse(one.beacon.anchor, Fault.LATE, one.rx_ticks)
+        return [(one, is_genuine and id(one) not in late) for one, is_genuine in decided]
 
     def _fault(self, one: ReceivedFrame, timing: ChainTiming) -> Fault | None:
         """What is wrong with a frame; ``NO_KEY`` while the key of its interval is not known."""

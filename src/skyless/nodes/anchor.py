@@ -97,7 +97,7 @@ class AnchorNode:
 
     def _new_machine(self) -> AnyAnchor:
         if self._keys is not None:
-            self.authentication = BeaconAuthentication(self.site.id, self._keys.chains)
+            self.authentication = BeaconAuthentication(self.site, self._keys.chains)
         machine = new_anchor(self._radio_site, self.id, self.radio.lead_s, self.authentication)
         if self.site is not self._radio_site:
             machine.place(self.site)
