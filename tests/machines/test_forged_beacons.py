@@ -98,7 +98,7 @@ def test_no_forged_frame_moves_a_verified_fix_or_an_anchor(mode, name):
 @pytest.mark.parametrize("mode", SITES)
 @pytest.mark.parametrize("name", [*FORGERIES, "any"])
 def test_a_tag_that_is_switched_on_in_an_attack(mode, name):
-    """Only repetitions of frames that it lost can disturb its first fixes: before it knows the counters of anchors."""
+    """Not even repetitions of frames that it lost disturb its first fixes, before it knows the anchors' counters."""
     forgery = FORGERIES.get(name, any_forgery)
     tape, air = air_of(mode, forgery)
     later = [one for one in tape if one.reception.host_s > SWITCHED_ON_S]
@@ -106,9 +106,7 @@ def test_a_tag_that_is_switched_on_in_an_attack(mode, name):
     found = compare(run, later, FREE.id)
     assert found.fixes > 100
     assert run.given[0].given_s < SWITCHED_ON_S + 0.8
-    if name not in (*REPEATED, "any"):
-        assert (found.moved, found.forged) == (0, 0)
-    assert found.most_moved_m < 1.0
+    assert (found.moved, found.forged) == (0, 0)
     sent = {one.frame for one in air.adversary.recent}
     assert {frame for _, frame in run.accepted} <= sent
 

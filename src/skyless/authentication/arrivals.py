@@ -1,6 +1,7 @@
 """When frames arrive by the counters of both ends: a genuine frame that somebody sends again comes too late."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
+from enum import Enum, auto
 from typing import Final
 
 from msgspec import Struct
@@ -15,13 +16,6 @@ SILENCE_TICKS: Final = from_seconds(1.0)
 """An anchor none of whose frames has fitted for this time may have a counter that has restarted."""
 
 
-class _Arrival(Struct):
-    """The last frame of an anchor that was in time."""
-
-    rx_ticks: int
-    tx_ticks: int
-
-
 class Stamps(Struct, frozen=True, gc=False):
     """Of one genuine frame."""
 
@@ -32,43 +26,67 @@ class Stamps(Struct, frozen=True, gc=False):
     """The anchor's, 40 bits."""
 
 
+class Arrival(Enum):
+    """How a frame came."""
+
+    IN_TIME = auto()
+    FIRST = auto()
+    """Nothing shows it yet: no other frame of its anchor agrees with it."""
+    LATE = auto()
+
+
+class _Reference(Struct):
+    """The earliest frame of an anchor, by both counters, or the last one that agrees with it."""
+
+    rx_ticks: int
+    tx_ticks: int
+    frames: int = 0
+    """Frames that agree."""
+
+
 class Arrivals:
     """What a listener knows of when frames of each anchor are due."""
 
     def __init__(self) -> None:
-        self._last: dict[int, _Arrival] = {}
+        self._references: dict[int, _Reference] = {}
 
-    def in_time(self, frames: Iterable[Stamps]) -> list[bool]:
-        """Of genuine frames in the order of their reception, whether each came without delay.
+    def of(self, frames: Sequence[Stamps]) -> list[Arrival]:
+        """How genuine frames came that are known together, in the order of their reception.
 
         Nobody can send a frame before its anchor does. So where two of an anchor do not agree the later one is late.
         """
-        frames = list(frames)
-        for one in frames:  # the earliest of all is right, also where the first ones are late
-            last = self._last.get(one.anchor)
-            if (
-                last is None
-                or one.rx_ticks - last.rx_ticks > SILENCE_TICKS
-                or _delay_ticks(last, one) < -_limit(last, one)
-            ):
-                self._last[one.anchor] = _Arrival(one.rx_ticks, one.tx_ticks)
-        return [self._is_in_time(one) for one in frames]
+        for one in frames:
+            last = self._references.get(one.anchor)
+            if last is None or _replaces(one, last):
+                self._references[one.anchor] = _Reference(one.rx_ticks, one.tx_ticks)
+        late = [not self._agrees(one) for one in frames]
+        return [
+            Arrival.LATE if is_late else (Arrival.IN_TIME if self._references[one.anchor].frames > 1 else Arrival.FIRST)
+            for one, is_late in zip(frames, late, strict=True)
+        ]
 
-    def _is_in_time(self, one: Stamps) -> bool:
-        last = self._last[one.anchor]
-        if _delay_ticks(last, one) > _limit(last, one):
+    def _agrees(self, one: Stamps) -> bool:
+        last = self._references[one.anchor]
+        if _delay_ticks(last, one) > _limit_ticks(last, one):
             return False
+        last.frames += 1
         if one.rx_ticks > last.rx_ticks:
             last.rx_ticks, last.tx_ticks = one.rx_ticks, one.tx_ticks
         return True
 
 
-def _delay_ticks(last: _Arrival, one: Stamps) -> int:
+def _replaces(one: Stamps, last: _Reference) -> bool:
+    """Whether a frame came too early for those before it, or does not agree with them after a silence."""
+    delay_ticks, limit_ticks = _delay_ticks(last, one), _limit_ticks(last, one)
+    return delay_ticks < -limit_ticks or (delay_ticks > limit_ticks and one.rx_ticks - last.rx_ticks > SILENCE_TICKS)
+
+
+def _delay_ticks(last: _Reference, one: Stamps) -> int:
     """How much later a frame came than by the one that was in time."""
     elapsed = one.rx_ticks - last.rx_ticks
     return difference(wrap(last.tx_ticks + elapsed), one.tx_ticks)
 
 
-def _limit(last: _Arrival, one: Stamps) -> int:
+def _limit_ticks(last: _Reference, one: Stamps) -> int:
     """How much the counters may differ by then."""
     return SLACK_TICKS + round(MAX_DRIFT * abs(one.rx_ticks - last.rx_ticks))

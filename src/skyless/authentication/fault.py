@@ -18,6 +18,8 @@ class Fault(StrEnum):
     """Its interval has not begun."""
     REPEATED = "repeated-frame"
     """The same frame was received before."""
+    FIRST = "first-frame"
+    """The first genuine frame of its anchor: another one has to agree with when it came."""
     NO_KEY = "no-key"
     """The key of its interval did not come in time."""
     TOO_MANY = "too-many-frames"

@@ -13,7 +13,7 @@ from skyless.air.almanac import KeyPage
 from skyless.air.beacon2 import Authentication, Beacon2
 from skyless.air.codec2 import INTERVAL_BITS, signed_bytes_2
 from skyless.air.reception import Reception
-from skyless.authentication.arrivals import Arrivals, Stamps
+from skyless.authentication.arrivals import Arrival, Arrivals, Stamps
 from skyless.authentication.certificate import ChainTiming, section_of
 from skyless.authentication.fault import Fault
 from skyless.authentication.key_chain import is_mac
@@ -175,15 +175,16 @@ class Verifier:
     def _without_delayed(self, decided: list[tuple[ReceivedFrame, bool]]) -> list[tuple[ReceivedFrame, bool]]:
         """The same, where genuine frames that came late by the counters are not accepted either."""
         genuine = [one for one, is_genuine in decided if is_genuine]
-        stamps = [Stamps(one.beacon.anchor, one.rx_ticks, one.beacon.tx_ticks) for one in genuine]
-        in_time = self._arrivals.in_time(stamps)
-        if all(in_time):
+        arrivals = self._arrivals.of([Stamps(one.beacon.anchor, one.rx_ticks, one.beacon.tx_ticks) for one in genuine])
+        if all(arrival is Arrival.IN_TIME for arrival in arrivals):
             return decided
-        late = {id(one) for one, is_in_time in zip(genuine, in_time, strict=True) if not is_in_time}
-        for one in genuine:
-            if id(one) in late:
+        for one, arrival in zip(genuine, arrivals, strict=True):
+            if arrival is Arrival.LATE:
                 self._refuse(one.beacon.anchor, Fault.LATE, one.rx_ticks)
-        return [(one, is_genuine and id(one) not in late) for one, is_genuine in decided]
+            elif arrival is Arrival.FIRST:
+                self._counters[Fault.FIRST] += 1
+        answers = iter(arrivals)
+        return [(one, is_genuine and next(answers) is Arrival.IN_TIME) for one, is_genuine in decided]
 
     def _fault(self, one: ReceivedFrame, timing: ChainTiming) -> Fault | None:
         """What is wrong with a frame; ``NO_KEY`` while the key of its interval is not known."""
