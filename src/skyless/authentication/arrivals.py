@@ -36,12 +36,12 @@ class Arrival(Enum):
 
 
 class _Reference(Struct):
-    """The earliest frame of an anchor, by both counters, or the last one that agrees with it."""
+    """The last frame of an anchor that agrees with the earliest one, by both counters."""
 
     rx_ticks: int
     tx_ticks: int
-    frames: int = 0
-    """Frames that agree."""
+    frames: int
+    """Number of frames that agree."""
 
 
 class Arrivals:
@@ -55,38 +55,24 @@ class Arrivals:
 
         Nobody can send a frame before its anchor does. So where two of an anchor do not agree the later one is late.
         """
-        for one in frames:
-            last = self._references.get(one.anchor)
-            if last is None or _replaces(one, last):
-                self._references[one.anchor] = _Reference(one.rx_ticks, one.tx_ticks)
-        late = [not self._agrees(one) for one in frames]
-        return [
-            Arrival.LATE if is_late else (Arrival.IN_TIME if self._references[one.anchor].frames > 1 else Arrival.FIRST)
-            for one, is_late in zip(frames, late, strict=True)
-        ]
-
-    def _agrees(self, one: Stamps) -> bool:
-        last = self._references[one.anchor]
-        if _delay_ticks(last, one) > _limit_ticks(last, one):
-            return False
-        last.frames += 1
-        if one.rx_ticks > last.rx_ticks:
-            last.rx_ticks, last.tx_ticks = one.rx_ticks, one.tx_ticks
-        return True
-
-
-def _replaces(one: Stamps, last: _Reference) -> bool:
-    """Whether a frame came too early for those before it, or does not agree with them after a silence."""
-    delay_ticks, limit_ticks = _delay_ticks(last, one), _limit_ticks(last, one)
-    return delay_ticks < -limit_ticks or (delay_ticks > limit_ticks and one.rx_ticks - last.rx_ticks > SILENCE_TICKS)
-
-
-def _delay_ticks(last: _Reference, one: Stamps) -> int:
-    """How much later a frame came than by the one that was in time."""
-    elapsed = one.rx_ticks - last.rx_ticks
-    return difference(wrap(last.tx_ticks + elapsed), one.tx_ticks)
-
-
-def _limit_ticks(last: _Reference, one: Stamps) -> int:
-    """How much the counters may differ by then."""
-    return SLACK_TICKS + round(MAX_DRIFT * abs(one.rx_ticks - last.rx_ticks))
+        references, late = self._references, set[int]()
+        for number, one in enumerate(frames):
+            last = references.get(one.anchor)
+            if last is None:
+                references[one.anchor] = _Reference(one.rx_ticks, one.tx_ticks, 1)
+                continue
+            elapsed = one.rx_ticks - last.rx_ticks
+            delay_ticks = difference(wrap(last.tx_ticks + elapsed), one.tx_ticks)
+            limit_ticks = SLACK_TICKS + MAX_DRIFT * abs(elapsed)
+            if abs(delay_ticks) <= limit_ticks:
+                last.frames += 1
+                last.rx_ticks, last.tx_ticks = one.rx_ticks, one.tx_ticks
+            elif delay_ticks > 0 and elapsed <= SILENCE_TICKS:
+                late.add(number)
+            else:
+                late.update(before for before in range(number) if frames[before].anchor == one.anchor)
+                references[one.anchor] = _Reference(one.rx_ticks, one.tx_ticks, 1)
+        if not late and all(references[one.anchor].frames > 1 for one in frames):
+            return [Arrival.IN_TIME] * len(frames)
+        known = [Arrival.IN_TIME if references[one.anchor].frames > 1 else Arrival.FIRST for one in frames]
+        return [Arrival.LATE if number in late else arrival for number, arrival in enumerate(known)]
