@@ -152,12 +152,12 @@ class Verifier:
 
     def decided(self) -> list[tuple[ReceivedFrame, bool]]:
         """Frames of which it is known by now whether they are genuine; in the order of reception, each once."""
-        decided = list[tuple[ReceivedFrame, bool]]()
-        waiting, timing = self._waiting, self.keys.timing
+        decided: list[tuple[ReceivedFrame, bool]] = []
+        waiting = self._waiting
         oldest = self.newest_ticks - LONGEST_WAIT_TICKS
-        if not (self._has_new_key or (waiting and waiting[0].rx_ticks <= oldest)):
+        if not self._has_new_key and (not waiting or waiting[0].rx_ticks > oldest):
             return decided
-        self._has_new_key = False
+        self._has_new_key, timing = False, self.keys.timing
         can_decide = timing is not None and not self.clock.is_late
         while waiting:
             one = waiting[0]
