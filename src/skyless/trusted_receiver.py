@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 SHARE_TICKS: Final = from_seconds(1.0)
 """Of the beacons received within this time a fix states the share that is not verified."""
 
+MOST_IN_SHARE: Final = 4096
+"""More frames than a radio receives in that time."""
+
 
 class Trust(StrEnum):
     """Which fixes a tag gives."""
@@ -87,8 +90,10 @@ class TrustedReceiver:
         )
         self._verified = new_receiver()
         self._live = new_receiver() if trust.trust is Trust.OPEN else None
-        self._genuine_ticks: deque[int] = deque()
+        self._genuine_ticks: deque[int] = deque(maxlen=MOST_IN_SHARE)
         """When the verified frames of the last second were received."""
+        self._verified_ticks: int | None = None
+        """When the newest verified frame was received."""
         self._used: deque[int] = deque()
         """When the frames that wait and that the live receiver has used were received."""
         self._given_ticks: int | None = None
@@ -103,8 +108,8 @@ class TrustedReceiver:
     @property
     def is_verified(self) -> bool:
         """Whether beacons have been verified that were among those of the last seconds."""
-        genuine = self._genuine_ticks
-        return bool(genuine) and self.verifier.newest_ticks - genuine[-1] < LONGEST_WAIT_TICKS
+        until_ticks = self._verified_ticks
+        return until_ticks is not None and self.verifier.newest_ticks - until_ticks < LONGEST_WAIT_TICKS
 
     def faults(self) -> dict[int, Fault]:
         """Anchors whose beacons, or beacons in whose name, were not accepted within the last seconds."""
@@ -150,16 +155,13 @@ class TrustedReceiver:
                 was_deceived |= was_used
                 continue
             was_deceived |= not was_used
-            if not self._genuine_ticks:
+            if self._verified_ticks is None:
                 self._begin_verified()
+            self._verified_ticks = one.rx_ticks
             self._genuine_ticks.append(one.rx_ticks)
             fix = self._verified.hear_beacon(one.beacon, one.reception)
             if fix is not None:
                 given.append((one.rx_ticks, GivenFix(self._with_trust(fix, one.rx_ticks), one.reception)))
-        if self._genuine_ticks:
-            newest = self._genuine_ticks[-1]
-            while self._genuine_ticks[0] < newest - SHARE_TICKS:
-                self._genuine_ticks.popleft()
         if was_deceived and self._live is not None:
             self._return_to_verified()
         return given
@@ -188,8 +190,11 @@ class TrustedReceiver:
 
     def _with_trust(self, fix: Fix, rx_ticks: int) -> Fix:
         """The fix with how far it is verified."""
-        genuine, unverified = self._genuine_ticks, len(self._used)
-        if not genuine:
+        genuine, until_ticks = self._genuine_ticks, self._verified_ticks
+        if until_ticks is None:
             return fix
-        share = unverified / (unverified + len(genuine)) if rx_ticks > genuine[-1] else 0.0
-        return replace(fix, verified_until_s=fix.time_s - max(rx_ticks - genuine[-1], 0) * TICK_S, unverified=share)
+        while genuine and genuine[0] < rx_ticks - SHARE_TICKS:
+            genuine.popleft()
+        unverified = len(self._used) if rx_ticks > until_ticks else 0
+        share = unverified / max(unverified + len(genuine), 1)
+        return replace(fix, verified_until_s=fix.time_s - max(rx_ticks - until_ticks, 0) * TICK_S, unverified=share)
