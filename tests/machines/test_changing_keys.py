@@ -206,14 +206,21 @@ def test_a_clock_within_its_bound_costs_nothing(error_s):
     assert not receiver.counters
 
 
-def test_a_host_clock_that_is_set_later_does_no_harm():
-    receiver, given = tag(KEYS.public), 0
+@pytest.mark.parametrize("error_s", [-7200.0, 7200.0])
+def test_a_host_clock_that_is_set_while_the_tag_is_on(error_s):
+    """Set back it does no harm; ahead it counts, as the tag may have been suspended, and only stops fixes."""
+    receiver, given = tag(KEYS.public), []
     for reception in usual_tape():
-        error_s = 0.0 if reception.host_s < 1.0 else 7200.0
-        given += len(receiver.hear(reception, START_UNIX_S + reception.host_s + error_s))
-    assert given > 600
-    assert not receiver.counters
-    assert receiver.verifier.clock.error_s == pytest.approx(7200.0, abs=0.1)
+        jump_s = 0.0 if reception.host_s < 1.0 else error_s
+        given += receiver.hear(reception, START_UNIX_S + reception.host_s + jump_s)
+    last_s = given[-1].reception.host_s
+    assert last_s < 1.0 if error_s > 0.0 else last_s > 2.4
+    assert errors_m([(0.0, one) for one in given]).max() < 0.2
+    if error_s < 0.0:
+        assert not receiver.counters
+        assert receiver.verifier.clock.error_s == pytest.approx(error_s, abs=0.1)
+    else:
+        assert receiver.verifier.clock.error_s is not None
 
 
 @pytest.mark.parametrize("error_s", [-3.0, -0.2, 0.2, 3.0])

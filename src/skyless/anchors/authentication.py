@@ -26,10 +26,13 @@ CERTIFICATE_EVERY: Final = (8, 16, 32)
 fourth of these is that of what comes next."""
 _SUCCESSOR_EVERY: Final = 4
 
+_WRONG: Final = (Fault.BAD_CODE, Fault.LATE, Fault.EARLY)
+
 FAR_S: Final = 10.0
-FAR_EVERY_S: Final = 1.0
-"""Codes of intervals farther from the present than the former are checked at most once in the latter: each takes
-milliseconds, and anybody can state any interval."""
+"""Codes of intervals farther from the present are not checked: anybody can state any, and their keys take long."""
+
+QUIET_S: Final = 2.0
+"""For so long no key is disclosed after a start and after a step of the host's clock: others may find it wrong."""
 
 RECENT_S: Final = 2.0
 SPACINGS: Final = 3.0
@@ -67,7 +70,7 @@ class _Offset(Struct):
     frames_before: int = 0
 
     def add(self, unix_s: float, offset_s: float) -> None:
-        if unix_s - self.since_s > 1.0:
+        if abs(unix_s - self.since_s) > 1.0:
             self.since_s, self.before_s, self.frames_before = unix_s, self.present_s, self.frames
             self.present_s, self.frames = math.inf, 0
         self.present_s = min(self.present_s, offset_s)
@@ -83,7 +86,8 @@ class _Offset(Struct):
 class BeaconAuthentication:
     """Keys, time and neighbours of one anchor, as far as authentication needs them. No I/O, no clock of its own."""
 
-    def __init__(self, site: Site, chains: Iterable[Chain]) -> None:
+    def __init__(self, site: Site, chains: Iterable[Chain], quiet_s: float = QUIET_S) -> None:
+        """``quiet_s``: how long no key is disclosed after a start; 0 for an anchor that has been on before."""
         period_s = beacon_period_s(site)
         self._certificate_every = min(CERTIFICATE_EVERY, key=lambda every: abs(every * period_s - CERTIFICATE_S))
         self.faults: dict[int, tuple[Fault, float]] = {}
@@ -91,7 +95,9 @@ class BeaconAuthentication:
         self._ring = ChainRing(chains)
         self._now: tuple[int, float] | None = None
         self._offsets: dict[int, _Offset] = {}
-        self._far_s = 0.0
+        self._quiet_s, self._quiet_until_s = quiet_s, 0.0
+        self._refused_s: dict[int, float] = {}
+        """When the last beacon in the name of each other anchor came whose time or code was wrong."""
 
     def set_chains(self, chains: Iterable[Chain]) -> None:
         """Use these chains from now on: a successor, or one instead of a revoked one."""
@@ -99,6 +105,10 @@ class BeaconAuthentication:
 
     def set_time(self, now_ticks: int, unix_s: float) -> None:
         """The own counter (40 bits) and the host's clock at the same moment; needed every few seconds."""
+        timing = self._ring.timing
+        step_s = math.inf if self._now is None else abs(unix_s - self._unix_s(now_ticks))
+        if timing is not None and step_s > timing.most_clock_error_s:
+            self._quiet_until_s = unix_s + self._quiet_s
         self._now = (now_ticks, unix_s)
 
     def fault(self) -> Fault | None:
@@ -106,7 +116,8 @@ class BeaconAuthentication:
         timing = self._ring.timing
         if self._now is None or timing is None:
             return Fault.NO_TIME if self._now is None else Fault.NO_CHAIN
-        if self._is_clock_wrong(timing, self._now[1]):
+        far, near = self._clocks(timing, self._now[1])
+        if far > near and near < LEAST_OTHERS <= far:
             return Fault.CLOCK_WRONG
         return None if self._ring.at(timing.interval_at(self._now[1])) is not None else Fault.NO_CHAIN
 
@@ -128,8 +139,9 @@ class BeaconAuthentication:
             return Contents(interval, certificate=successor or keys.certificate(interval))
         disclosed = interval - timing.lag
         disclosing = self._ring.at(disclosed)
-        has_key = bool(sequence & 1) and disclosing is not None
-        return Contents(interval, key=KeyPage(disclosing.key(disclosed)) if has_key and disclosing else None)
+        if not sequence & 1 or disclosing is None or not self._may_disclose(timing):
+            return Contents(interval)
+        return Contents(interval, key=KeyPage(disclosing.key(disclosed)))
 
     def seal(self, frame: bytes, interval: int | None) -> bytes:
         """The frame with its code."""
@@ -148,6 +160,8 @@ class BeaconAuthentication:
         fault = self._fault_of(beacon, reception.frame, unix_s, timing)
         if fault is not None:
             self.faults[beacon.anchor] = (fault, unix_s)
+        if fault in _WRONG:
+            self._refused_s[beacon.anchor] = unix_s
         return fault
 
     def _fault_of(self, beacon: Beacon2, frame: bytes, unix_s: float, timing: ChainTiming) -> Fault | None:
@@ -158,9 +172,7 @@ class BeaconAuthentication:
         interval = nearest(stated.interval, present, INTERVAL_BITS)
         offset_s = unix_s - timing.start_s(interval)
         if abs(offset_s) > FAR_S:
-            if unix_s - self._far_s < FAR_EVERY_S:
-                return Fault.LATE if offset_s > 0.0 else Fault.EARLY
-            self._far_s = unix_s
+            return Fault.LATE if offset_s > 0.0 else Fault.EARLY
         keys = self._ring.at(interval)
         if keys is None:
             return None if self._ring.at(present) is None else Fault.LATE
@@ -179,15 +191,28 @@ class BeaconAuthentication:
 
     def _note_offset(self, anchor: int, unix_s: float, offset_s: float) -> None:
         known = self._offsets.get(anchor)
-        if known is None or unix_s - known.since_s > RECENT_S:
+        if known is None or abs(unix_s - known.since_s) > RECENT_S:
             known = self._offsets[anchor] = _Offset(unix_s)
         known.add(unix_s, offset_s)
 
-    def _is_clock_wrong(self, timing: ChainTiming, unix_s: float) -> bool:
-        """Whether the own clock is far from those of most other anchors."""
+    def _clocks(self, timing: ChainTiming, unix_s: float) -> tuple[int, int]:
+        """How many of the other anchors' clocks are far from the own one, and how many near."""
         recent = [one for one in self._offsets.values() if abs(unix_s - one.since_s) <= RECENT_S]
         far = sum(one.is_far(timing, 0.5 * timing.most_clock_error_s) for one in recent)
-        return len(recent) >= LEAST_OTHERS and 2 * far > len(recent)
+        return far, len(recent) - far
+
+    def _may_disclose(self, timing: ChainTiming) -> bool:
+        """Whether nothing speaks against the own clock: a key that is disclosed too early lets anybody make codes.
+
+        Without keys of this anchor nobody lacks any, as others disclose the same ones.
+        """
+        assert self._now is not None
+        unix_s = self._now[1]
+        if unix_s < self._quiet_until_s:
+            return False
+        far, near = self._clocks(timing, unix_s)
+        refused = sum(abs(unix_s - when_s) <= RECENT_S for when_s in self._refused_s.values())
+        return far <= near and (near > 0 or refused < LEAST_OTHERS)
 
     def _has_certificate(self, sequence: int, anchor: int) -> bool:
         return (sequence - anchor) % self._certificate_every == 0

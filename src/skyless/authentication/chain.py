@@ -151,7 +151,7 @@ class ChainRing:
         present = self.at(interval)
         later = [keys for keys in self._chains if keys.chain.first > interval]
         next_interval = (interval >> SECTION_BITS) + 1 << SECTION_BITS
-        if later and later[-1].chain.first <= next_interval:
+        if later and later[-1].chain.first < next_interval + SECTION_INTERVALS:
             return later[-1].certificate(later[-1].chain.first)
         if present is not None and present.chain.holds(next_interval):
             return present.certificate(next_interval)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from msgspec import Struct
 
 from skyless.authentication.certificate import Certificate, ChainTiming, is_signed, read_certificate
-from skyless.authentication.key_chain import SECTION_BITS, SectionName, earlier_key, mac_key
+from skyless.authentication.key_chain import SECTION_BITS, SECTION_INTERVALS, SectionName, earlier_key, mac_key
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
@@ -17,7 +17,7 @@ KEPT_KEYS: Final = 256
 """Of one section: frames wait for their key for seconds only."""
 MOST_CERTIFICATES: Final = 6
 
-NEAR_STEPS: Final = 512
+NEAR_STEPS: Final = 16
 """Keys that follow within this number of intervals on a verified one are hashed at once, others as far as the allowance
 for long ones goes: whoever sends forged keys must not keep the processor busy."""
 STEPS_PER_S: Final = 100_000.0
@@ -124,9 +124,9 @@ class KnownKeys:
             return KeyUse.FORGED if known is not None and not compare_digest(known, key) else KeyUse.KNOWN
         if steps > NEAR_STEPS or not is_expected:
             self._refill(now_s)
-            if self._steps < steps:
+            if self._steps < SECTION_INTERVALS:
                 return KeyUse.KNOWN
-            self._steps -= steps
+            self._steps -= SECTION_INTERVALS  # whatever it takes, so that short ones do not displace long ones
         name = section.certificate.name
         between = {interval: key}
         oldest = max(section.newest + 1, interval - KEPT_KEYS + 1)

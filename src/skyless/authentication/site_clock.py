@@ -23,7 +23,8 @@ class SiteClock(Struct):
     """Bounds of the site's time in Unix seconds.
 
     They come from the host's clock and its stated bound. Once a key has been verified they are carried on by the own
-    counter, and the host's clock only narrows them: it may be set to another time without harm.
+    counter, and the host's clock narrows them. One that is set back does no harm. One that is ahead of the upper bound
+    counts, as a bound that is too early would let forged frames pass.
     """
 
     bound_s: float
@@ -54,7 +55,11 @@ class SiteClock(Struct):
         elif elapsed_s >= 0.0:
             self.lower_s += elapsed_s * (1.0 - DRIFT)
             self.upper_s += elapsed_s * (1.0 + DRIFT)
-            if low <= self.upper_s and high >= self.lower_s:
+            if (
+                low > self.upper_s
+            ):  # the counter, or the host's monotonic clock, stood still, or the host's clock is wrong
+                self.lower_s, self.upper_s, self.is_verified = low, high, False
+            elif high >= self.lower_s:
                 self.lower_s, self.upper_s = max(self.lower_s, low), min(self.upper_s, high)
         else:
             return  # out of order

@@ -218,17 +218,19 @@ class Verifier:
         if use is CertificateUse.FORGED:
             self._counters["forged-certificate"] += 1
             return
+        timing = self.keys.timing
         if use is CertificateUse.REVOKED:
             self._refuse(anchor, Fault.REVOKED_CHAIN, rx_ticks)
-        timing = self.keys.timing
-        if use is not CertificateUse.IGNORED and timing is not None:
+        elif use is not CertificateUse.IGNORED and timing is not None:
             self.clock.on_section(section_of(sent), timing)
 
     def _on_key(self, key: bytes, interval: int, timing: ChainTiming, *, is_early: bool) -> None:
+        newest = self.keys.newest
         use = self.keys.on_key(key, interval, self.clock.present_s, is_expected=not is_early)
         if use is KeyUse.NEW:
             self._has_new_key = True
-            self.clock.on_key(interval, timing)
+            if interval > newest:
+                self.clock.on_key(interval, timing)
         elif use is KeyUse.FORGED:
             self._counters["forged-key"] += 1
 

@@ -10,6 +10,7 @@ export const FAULTS = {
   "late-frame": "too late",
   "early-frame": "too early",
   "repeated-frame": "repeated",
+  "first-frame": "the first one",
   "no-key": "its key has not come",
   "too-many-frames": "too many",
   "no-time": "the time is not known yet",
