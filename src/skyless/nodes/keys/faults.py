@@ -22,7 +22,8 @@ MOST_NAMED: Final = 8
 _WORDS: Final = {
     Fault.NO_CODE: "they carry no codes: it has no keys, or somebody forges its beacons",
     Fault.BAD_CODE: "their codes are wrong: it has a wrong seed, or somebody forges its beacons",
-    Fault.REVOKED_CHAIN: "it uses a key chain that the site has replaced (copy the new one to its host), or somebody repeats old beacons",
+    Fault.REVOKED_CHAIN: "it uses a key chain that the site has replaced (copy the new one to its host), or somebody "
+    "repeats old beacons",
     Fault.LATE: "they come too late: its clock or this one is wrong, or somebody repeats old beacons",
     Fault.EARLY: "they come too early: its clock or this one is wrong",
     Fault.REPEATED: "somebody repeats them",
