@@ -31,7 +31,7 @@ _WRONG: Final = (Fault.BAD_CODE, Fault.LATE, Fault.EARLY)
 FAR_S: Final = 10.0
 """Codes of intervals farther from the present are not checked: anybody can state any, and their keys take long."""
 
-QUIET_S: Final = 2.0
+UNPROVEN_S: Final = 2.0
 """For so long no key is disclosed after a start and after a step of the host's clock: others may find it wrong."""
 
 RECENT_S: Final = 2.0
@@ -86,7 +86,7 @@ class _Offset(Struct):
 class BeaconAuthentication:
     """Keys, time and neighbours of one anchor, as far as authentication needs them. No I/O, no clock of its own."""
 
-    def __init__(self, site: Site, chains: Iterable[Chain], quiet_s: float = QUIET_S) -> None:
+    def __init__(self, site: Site, chains: Iterable[Chain], quiet_s: float = UNPROVEN_S) -> None:
         """``quiet_s``: how long no key is disclosed after a start; 0 for an anchor that has been on before."""
         period_s = beacon_period_s(site)
         self._certificate_every = min(CERTIFICATE_EVERY, key=lambda every: abs(every * period_s - CERTIFICATE_S))
