@@ -10,7 +10,7 @@ from skyless.air.almanac import KeyPage
 from skyless.air.beacon2 import Beacon2
 from skyless.air.codec2 import authenticate_2, decode_2, encode_2
 from skyless.air.reception import Reception
-from skyless.anchors.authentication import UNPROVEN_S, BeaconAuthentication
+from skyless.anchors.authentication import NO_KEYS_S, BeaconAuthentication
 from skyless.authentication import chain, known_keys
 from skyless.authentication.fault import Fault
 from skyless.authentication.key_chain import SECTION_INTERVALS, earlier_key, mac_of
@@ -82,12 +82,12 @@ def test_an_anchor_discloses_keys_some_time_after_its_start():
             at_s = 0.1 * number
             anchor.hear_others(at_s, others=others)
             anchor.at(at_s + 0.05)
-            assert (anchor.contents(at_s + 0.05).key is not None) == (at_s + 0.05 >= UNPROVEN_S)
+            assert (anchor.contents(at_s + 0.05).key is not None) == (at_s + 0.05 >= NO_KEYS_S)
 
 
 @pytest.mark.parametrize("step_s", [200.0, -200.0])
 def test_an_anchor_discloses_no_key_when_its_clock_has_just_been_set(step_s):
-    anchor = OneAnchor(quiet_s=UNPROVEN_S)
+    anchor = OneAnchor(no_keys_s=NO_KEYS_S)
     for number in range(60):
         at_s = 0.1 * number
         ahead_s = step_s if number >= 40 else 0.0
@@ -96,7 +96,7 @@ def test_an_anchor_discloses_no_key_when_its_clock_has_just_been_set(step_s):
         contents = anchor.contents(at_s + 0.05)
         if number >= 40:
             assert contents.key is None
-        elif at_s > UNPROVEN_S:
+        elif at_s > NO_KEYS_S:
             assert contents.key is not None
 
 

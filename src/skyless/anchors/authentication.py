@@ -22,8 +22,8 @@ from skyless.ticks import difference, nearest
 
 CERTIFICATE_S: Final = 0.5
 CERTIFICATE_EVERY: Final = (8, 16, 32)
-"""An anchor sends a certificate about twice a second, in one of so many frames: such a frame has no relays. Every
-fourth of these is that of what comes next."""
+"""An anchor sends a certificate about twice a second, in one of 8, 16 or 32 frames: such a frame has no relays. Every
+fourth certificate is that of what comes next."""
 _SUCCESSOR_EVERY: Final = 4
 
 _WRONG: Final = (Fault.BAD_CODE, Fault.LATE, Fault.EARLY)
@@ -31,12 +31,12 @@ _WRONG: Final = (Fault.BAD_CODE, Fault.LATE, Fault.EARLY)
 FAR_S: Final = 10.0
 """Codes of intervals farther from the present are not checked: anybody can state any, and their keys take long."""
 
-UNPROVEN_S: Final = 2.0
-"""For so long no key is disclosed after a start and after a step of the host's clock: others may find it wrong."""
+NO_KEYS_S: Final = 2.0
+"""No key is disclosed for this time after a start and after a step of the host's clock: others may find it wrong."""
 
 RECENT_S: Final = 2.0
 SPACINGS: Final = 3.0
-"""The first frame of an anchor in an interval comes within so many of its mean times between two frames."""
+"""An anchor's first frame in an interval comes within this number of its mean times between two frames."""
 LEAST_OTHERS: Final = 2
 """Own clock against this number of others: with one it is not known which of the two is wrong."""
 
@@ -86,8 +86,8 @@ class _Offset(Struct):
 class BeaconAuthentication:
     """Keys, time and neighbours of one anchor, as far as authentication needs them. No I/O, no clock of its own."""
 
-    def __init__(self, site: Site, chains: Iterable[Chain], quiet_s: float = UNPROVEN_S) -> None:
-        """``quiet_s``: how long no key is disclosed after a start; 0 for an anchor that has been on before."""
+    def __init__(self, site: Site, chains: Iterable[Chain], no_keys_s: float = NO_KEYS_S) -> None:
+        """``no_keys_s``: how long no key is disclosed after a start; 0 for an anchor that has been on before."""
         period_s = beacon_period_s(site)
         self._certificate_every = min(CERTIFICATE_EVERY, key=lambda every: abs(every * period_s - CERTIFICATE_S))
         self.faults: dict[int, tuple[Fault, float]] = {}
@@ -95,7 +95,7 @@ class BeaconAuthentication:
         self._ring = ChainRing(chains)
         self._now: tuple[int, float] | None = None
         self._offsets: dict[int, _Offset] = {}
-        self._quiet_s, self._quiet_until_s = quiet_s, 0.0
+        self._no_keys_s, self._no_keys_until_s = no_keys_s, 0.0
         self._refused_s: dict[int, float] = {}
         """When the last beacon in the name of each other anchor came whose time or code was wrong."""
 
@@ -108,7 +108,7 @@ class BeaconAuthentication:
         timing = self._ring.timing
         step_s = math.inf if self._now is None else abs(unix_s - self._unix_s(now_ticks))
         if timing is not None and step_s > timing.most_clock_error_s:
-            self._quiet_until_s = unix_s + self._quiet_s
+            self._no_keys_until_s = unix_s + self._no_keys_s
         self._now = (now_ticks, unix_s)
 
     def fault(self) -> Fault | None:
@@ -208,7 +208,7 @@ class BeaconAuthentication:
         """
         assert self._now is not None
         unix_s = self._now[1]
-        if unix_s < self._quiet_until_s:
+        if unix_s < self._no_keys_until_s:
             return False
         far, near = self._clocks(timing, unix_s)
         refused = sum(abs(unix_s - when_s) <= RECENT_S for when_s in self._refused_s.values())

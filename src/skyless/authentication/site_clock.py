@@ -13,7 +13,7 @@ DRIFT: Final = 50e-6
 """How much the own counter's rate may be off."""
 
 RECENT_KEYS: Final = 10
-"""Of so many keys the one that came soonest after its disclosure shows how far the host's clock is off."""
+"""Of this number of keys the one that came soonest after its disclosure shows how far the host's clock is off."""
 
 RESTART_S: Final = 1.0
 """A counter that goes back farther has restarted."""

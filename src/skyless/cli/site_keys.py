@@ -47,7 +47,7 @@ def new(site: str, /, *, keys: Path | None = None, years: _Years = 2.0, starts: 
     site
         Site file, of mode slots or free.
     keys
-        Folder of the site's keys; by default keys beside the site file.
+        Folder of the site's keys; by default keys in that of the site file.
     years
         How long the chain lasts.
     starts
@@ -94,7 +94,7 @@ def rotate(site: str, /, *, keys: Path | None = None, years: _Years = 2.0, start
     site
         Site file, of mode slots or free.
     keys
-        Folder of the site's keys; by default keys beside the site file.
+        Folder of the site's keys; by default keys in that of the site file.
     years
         How long the chain lasts.
     starts
@@ -129,7 +129,7 @@ def revoke(site: str, /, *, keys: Path | None = None, years: _Years = 2.0) -> No
     site
         Site file, of mode slots or free.
     keys
-        Folder of the site's keys; by default keys beside the site file.
+        Folder of the site's keys; by default keys in that of the site file.
     years
         How long the new chain lasts; a short one is made sooner.
     """
@@ -161,7 +161,7 @@ def show(site: str, /, *, keys: Path | None = None, json: bool = False) -> None:
     site
         Site file, of mode slots or free.
     keys
-        Folder of the site's keys; by default keys beside the site file.
+        Folder of the site's keys; by default keys in that of the site file.
     json
         Write one JSON object instead of the table.
     """

@@ -76,7 +76,7 @@ def anchors_with_keys(
     """Makes a site's anchors: with these chains, some with others, and with clocks that are ahead."""
 
     def new(anchor: int) -> ClockedAnchor:
-        authentication = BeaconAuthentication(site, others.get(anchor, chains), quiet_s=0.0)
+        authentication = BeaconAuthentication(site, others.get(anchor, chains), no_keys_s=0.0)
         return ClockedAnchor(new_anchor(site, anchor, 1e-3, authentication), now_s, errors_s.get(anchor, 0.0))
 
     return new
