@@ -83,6 +83,9 @@ MISFIT_RANGE_STD_M: Final = 0.3
 MOST_RELAYS_REJECTED: Final = 4.0
 """Relays beyond the gate lately; fewer may be late ones."""
 
+FITTING_CHI2: Final = 2.0
+"""Largest χ² for each anchor of range errors that are as the settings state them."""
+
 FADING: Final = 0.95
 """What a packet leaves of the counts of relays lately."""
 
@@ -685,6 +688,14 @@ class Estimator:
         s = self._state
         pairs = ((one, other) for one in range(len(s.anchors)) for other in range(one + 1))
         return float(self._levels[LASTING_CHI2]) - max(explained_chi2(s, one, other) for one, other in pairs)
+
+    @property
+    def fits_settings(self) -> bool:
+        """Whether the constants of the ranges are as small as the settings state, as far as they are known."""
+        s, count = self._state, len(self._state.anchors)
+        constants = slice((first := layout(self.dim, count).constant), first + count)
+        variances = s.P[constants, constants] + self.settings.range_std_m**2 * np.eye(count)
+        return bool(s.x[constants] @ np.linalg.solve(variances, s.x[constants]) < FITTING_CHI2 * count)
 
     @property
     def is_late_often(self) -> bool:

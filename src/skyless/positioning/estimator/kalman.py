@@ -43,8 +43,9 @@ def predict(s: EstimatorState, rx_ticks: int) -> None:
     dt = (rx_ticks - status["epoch_ticks"]) * TICK_S
     speed_squared = 0.0
     for axis in range(dim):
-        speed_squared += s.x[where.velocity + axis] ** 2
-    status["walked_m"] += np.sqrt(speed_squared) * dt
+        speed = where.velocity + axis
+        speed_squared += s.x[speed] ** 2 - s.P[speed, speed]  # less its noise, which moves no tag at rest
+    status["walked_m"] += np.sqrt(max(speed_squared, 0.0)) * dt
     if status["obstruction"] > 0.0:
         status["obstruction"] *= np.exp(-dt / OBSTRUCTION_MEMORY_S)
     _advance(s, where.velocity, dt)
@@ -88,6 +89,14 @@ def _advance(s: EstimatorState, values: int, dt: float) -> None:
 
 
 @step
+def jump_share(s: EstimatorState) -> float:
+    """1 where range errors have jumped lately, 0 where they do not, or where multipath that was learnt explains it."""
+    status = s.status[0]
+    is_learnt = status["place_variance_m2"] > s.settings[0]["place_std_m"] ** 2
+    return 0.0 if is_learnt else min(float(status["obstruction"]), 1.0)
+
+
+@step
 def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float) -> None:
     """Time update of an anchor's range errors over what has passed and was walked since its newest packet.
 
@@ -95,14 +104,15 @@ def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float
     forget within seconds; one that has jumped itself wanders from where it is.
     """
     status, settings = s.status[0], s.settings[0]
-    where, share = layout(settings["dim"], len(s.anchors)), min(status["obstruction"], 1.0)
+    where, share = layout(settings["dim"], len(s.anchors)), jump_share(s)
     change, constant = where.change + anchor, where.constant + anchor
     obstructed = share * dt / OBSTRUCTED_S
     if s.anchors[anchor]["is_obstructed"]:
         s.P[change, change] += OBSTRUCTED_WALK * s.anchors[anchor]["change_scale"] * dt
     else:
-        variance = s.anchors[anchor]["change_variance_m2"] + share * OBSTRUCTED_STD_M**2
-        usual = dt / settings["place_time_s"] + walked_m / settings["place_distance_m"]
+        place_variance = max(s.anchors[anchor]["change_variance_m2"], status["place_variance_m2"])
+        variance = place_variance + share * OBSTRUCTED_STD_M**2
+        usual = dt / settings["place_time_s"] + walked_m / status["place_distance_m"]
         if variance > 0.0:
             _decay(s, change, np.exp(-obstructed - (1.0 - share) * usual), variance)
     if obstructed > 1e-6 and settings["range_std_m"] > 0.0:

@@ -26,6 +26,7 @@ from skyless.positioning.estimator.kalman import (
     OBSTRUCTED_STD_M,
     compute_ph,
     dynamic_states,
+    jump_share,
     relax_range_error,
     reset_state,
     update,
@@ -42,18 +43,28 @@ from skyless.positioning.estimator.monitor import (
     has_jumped,
     is_common,
     is_warm,
+    learn_place,
     open_range_error,
     variance_scale,
 )
-from skyless.positioning.estimator.state import EstimatorState, direction_terms, layout, uncertain_states
+from skyless.positioning.estimator.state import (
+    ALL_RANGE_ERRORS,
+    EstimatorState,
+    direction_terms,
+    layout,
+    uncertain_states,
+)
 from skyless.ticks import TICK_MASK
 
 SLOPE_FROM_M: Final = 4.0
 """Where the errors that grow with distance pass through zero, and by which range they change once (APS011)."""
 
-SLOPE_STEP_M: Final = 0.25
-"""The slope counts at a range that is updated in steps of this: if it contained the estimate's noise, which is in the
-innovation as well, the slope would be estimated from noise alone at a stationary tag (Huang and Roumeliotis 2008)."""
+HELD_STEP_M: Final = 0.15
+HELD_SHARE: Final = 0.1
+HELD_STD: Final = 3.0
+"""A range is linearised at a held point of the tag, which moves onto the estimate when that is farther away than the
+first, or the second as a share of the range if that is less, and than the third number of standard deviations
+(``docs/maths.md`` section 6, Linearisation)."""
 
 CURVATURE_SHARE: Final = 0.01
 """Where ranges are so curved that it counts for more than this part of the stamps' variance, it is counted."""
@@ -68,6 +79,18 @@ JOIN_VARIANCE_M2: Final = 1.0
 """Where packets are late often an anchor's first one may be so too."""
 
 PAIR_JUMP_M2: Final = 0.25
+
+PAIR_RELAYS: Final = 12
+"""Relays of a pair in either direction after which their mean is a measurement of its range."""
+
+PAIR_SUSPECT: Final = 3.0
+"""A range between two anchors beyond this number of standard deviations contradicts the survey, ..."""
+
+MISPLACED_PAIRS: Final = 2
+"""... and an anchor with this number of them, more than the other end has, stands elsewhere, ..."""
+
+MISPLACED_STD_M: Final = 0.3
+"""... by about so much in each coordinate."""
 
 REPORT_GAIN: Final = 1.25
 """A report is used where the filter's own variance is larger by this factor."""
@@ -88,30 +111,45 @@ STATIONARY_STD_MPS: Final = 0.01
 
 
 @step
-def _add_direction(s: EstimatorState, term: int, anchor: int, sign: float) -> float:
-    """Write the unit vector from an anchor to the tag into the measurement; returns their distance.
+def _hold_direction(s: EstimatorState, anchor: int) -> None:
+    """Move the point at which ranges to an anchor are linearised onto the estimate, once that is far enough away."""
+    dim, a = s.settings[0]["dim"], s.anchors[anchor]
+    moved_m, squared, variance = 0.0, 0.0, 0.0
+    for axis in range(dim):
+        variance += s.P[axis, axis]
+    for axis in range(3):
+        given_m = s.settings[0]["height_m"] if axis >= dim else s.x[axis]
+        moved_m += (given_m - a["held_m"][axis]) ** 2
+        squared += (given_m - a["position_m"][axis]) ** 2
+    if not moved_m <= max(HELD_STD**2 * variance, min(HELD_STEP_M**2, HELD_SHARE**2 * squared)):
+        a["held_range_m"] = max(np.sqrt(squared), 1e-6)
+        for axis in range(3):
+            a["held_m"][axis] = s.settings[0]["height_m"] if axis >= dim else s.x[axis]
 
-    The anchor's survey error follows with the opposite sign, and the height's: ``direction_terms`` in all.
+
+@step
+def _add_direction(s: EstimatorState, term: int, anchor: int, sign: float) -> float:
+    """Write the unit vector from an anchor to the tag into the measurement; returns their distance as estimated.
+
+    The anchor's survey error follows with the opposite sign, and the height's: ``direction_terms`` in all. The vector
+    is that of the held point, of the surveyed anchor and of the given height: were it that of the newest estimate, its
+    noise would seem to give information on what the ranges leave open.
     """
     dim, count, x = s.settings[0]["dim"], len(s.anchors), s.x
     a, where = s.anchors[anchor], layout(dim, count)
+    _hold_direction(s, anchor)
     survey = where.survey + dim * anchor
-    up_m = 0.0
-    if dim == 2:
-        up_m = s.settings[0]["height_m"] + x[where.height] - a["position_m"][2]
-    squared = up_m * up_m
+    squared = 0.0
     for axis in range(dim):
-        step_m = x[axis] - a["position_m"][axis] - x[survey + axis]
-        s.h[term + axis] = step_m
-        squared += step_m * step_m
-    range_m = max(np.sqrt(squared), 1e-6)
-    if dim == 2:
-        s.h[term + 2 * dim], s.h_index[term + 2 * dim] = sign * up_m / range_m, where.height
-    for axis in range(dim):
-        towards = sign * s.h[term + axis] / range_m
+        squared += (x[axis] - a["position_m"][axis] - x[survey + axis]) ** 2
+        towards = sign * (a["held_m"][axis] - a["position_m"][axis]) / a["held_range_m"]
         s.h[term + axis], s.h_index[term + axis] = towards, axis
         s.h[term + dim + axis], s.h_index[term + dim + axis] = -towards, survey + axis
-    return float(range_m)
+    if dim == 2:
+        up_m = s.settings[0]["height_m"] - a["position_m"][2]
+        squared += (up_m + x[where.height]) ** 2
+        s.h[term + 2 * dim], s.h_index[term + 2 * dim] = sign * up_m / a["held_range_m"], where.height
+    return float(max(np.sqrt(squared), 1e-6))
 
 
 @step
@@ -121,15 +159,12 @@ def _set_term(s: EstimatorState, term: int, state: int, weight: float) -> int:
 
 
 @step
-def _range_error_terms(s: EstimatorState, term: int, anchor: int, range_m: float, sign: float) -> int:
+def _range_error_terms(s: EstimatorState, term: int, anchor: int, sign: float) -> int:
     """Range errors of an anchor: the part that changes, the part that stays, and the slope."""
     where = layout(s.settings[0]["dim"], len(s.anchors))
     term = _set_term(s, term, where.change + anchor, sign)
     term = _set_term(s, term, where.constant + anchor, sign)
-    a = s.anchors[anchor]
-    if abs(range_m - a["slope_range_m"]) > SLOPE_STEP_M:
-        a["slope_range_m"] = range_m
-    far = min(max((a["slope_range_m"] - SLOPE_FROM_M) / SLOPE_FROM_M, -1.0), 1.0)
+    far = min(max((s.anchors[anchor]["held_range_m"] - SLOPE_FROM_M) / SLOPE_FROM_M, -1.0), 1.0)
     return int(_set_term(s, term, where.slope, sign * far))
 
 
@@ -173,7 +208,7 @@ def reception_terms(s: EstimatorState, anchor: int, has_tx_noise: int) -> tuple[
     term = _set_term(s, direction_terms(dim), where.offset + anchor, 1.0)
     if has_tx_noise:
         term = _set_term(s, term, where.tx_noise + anchor, 1.0)
-    return _range_error_terms(s, term, anchor, range_m, 1.0), range_m
+    return _range_error_terms(s, term, anchor, 1.0), range_m
 
 
 @step
@@ -203,6 +238,7 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
     innovation_variance = compute_ph(s, terms) + rx_variance
     a["range_m"] = range_m
     a["innovation"] = innovation / np.sqrt(innovation_variance)
+    learn_place(s, anchor, innovation + s.x[where.change + anchor])
     clock_jumped = False
     if is_warm(s) and abs(a["innovation"]) > COMMON and is_common(s, a["innovation"]):
         status["walk_scale"] = settings["max_walk_scale"]
@@ -248,7 +284,7 @@ def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_vari
     if innovation < 0.0:
         before_m = _h_dot_x(s, 0, terms)
         if a["is_obstructed"]:
-            share = min(status["obstruction"], 1.0)
+            share = jump_share(s)
             reset_state(s, change, a["change_variance_m2"] + share * OBSTRUCTED_STD_M**2)
         else:
             end_lasting_fault(s, anchor)
@@ -277,7 +313,7 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
     reset_state(s, offset, 0.0)
     range_m = _add_direction(s, 0, anchor, 1.0)
     other = direction_terms(dim)
-    terms = _range_error_terms(s, _set_term(s, other, noise, 1.0), anchor, range_m, 1.0)
+    terms = _range_error_terms(s, _set_term(s, other, noise, 1.0), anchor, 1.0)
     variance = settings["rx_variance_m2"]
     curvature_m = _curvature_m(s, range_m, variance)
     variance += 2.0 * curvature_m * curvature_m + compute_ph(s, terms)
@@ -358,6 +394,7 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
         if link["outliers_in_row"] >= PAIR_OUTLIERS:
             link["outliers_in_row"] = 0
             link["variance_m2"] += PAIR_JUMP_M2
+            s.links[listener, sender]["relays"] = s.links[sender, listener]["relays"] = 0
     else:
         status["relays_used"] += 1
         status["relays_lately_accepted"] += 1.0
@@ -368,7 +405,62 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
         compute_fault_input(s, term, -1)
         gather_evidence(s, innovation, innovation_variance)
         update(s, innovation, innovation_variance, 1.0, dynamic_states(s))
+        forth, back = s.links[listener, sender], s.links[sender, listener]
+        forth["relays"] += 1
+        if forth["relays"] == PAIR_RELAYS and back["relays"] >= PAIR_RELAYS:
+            _survey_pair(s, listener, sender)
     s.anchors[sender]["is_relayed"] = 1
+
+
+@step
+def _survey_pair(s: EstimatorState, one: int, other: int) -> None:
+    """Use the range between two anchors for their survey; anchors that contradict most of theirs are misplaced."""
+    count, dim = len(s.anchors), s.settings[0]["dim"]
+    link = s.links[min(one, other), max(one, other)]
+    link["contradicts"] = 0
+    if not _pair_range(s, one, other):
+        link["contradicts"] = 1
+        contradicted, rival = 0, 0
+        for anchor in range(count):
+            contradicted += s.links[min(one, anchor), max(one, anchor)]["contradicts"]
+            rival += s.links[min(other, anchor), max(other, anchor)]["contradicts"]
+        misplaced = one if contradicted > rival else other
+        if max(contradicted, rival) >= MISPLACED_PAIRS and contradicted != rival:
+            survey = layout(dim, count).survey + dim * misplaced
+            s.status[0]["range_errors"] = ALL_RANGE_ERRORS
+            if s.anchors[misplaced]["is_obstructed"]:  # what seemed to be an obstacle
+                change = layout(dim, count).change + misplaced
+                reset_state(s, change, s.anchors[misplaced]["change_variance_m2"])
+                s.anchors[misplaced]["is_obstructed"] = 0
+            for axis in range(dim):
+                s.P[survey + axis, survey + axis] += MISPLACED_STD_M**2
+            for anchor in range(count):
+                pair = s.links[min(misplaced, anchor), max(misplaced, anchor)]
+                if pair["contradicts"] and _pair_range(s, misplaced, anchor):
+                    pair["contradicts"] = 0
+
+
+@step
+def _pair_range(s: EstimatorState, one: int, other: int) -> bool:
+    """Process the mean range between two anchors, |a + δa − a' − δa'| + constant; False if it contradicts the survey."""
+    dim, term, squared = s.settings[0]["dim"], 0, 0.0
+    a, b = s.anchors[one], s.anchors[other]
+    survey = layout(dim, len(s.anchors)).survey
+    for axis in range(3):
+        squared += (a["position_m"][axis] - b["position_m"][axis]) ** 2
+    for axis in range(dim):
+        towards = (a["position_m"][axis] - b["position_m"][axis]) / np.sqrt(squared)
+        term = _set_term(s, term, survey + dim * one + axis, towards)
+        term = _set_term(s, term, survey + dim * other + axis, -towards)
+    link = s.links[min(one, other), max(one, other)]
+    innovation = link["constant_m"] - _h_dot_x(s, 0, term)
+    innovation_variance = compute_ph(s, term) + s.settings[0]["pair_std_m"] ** 2 + link["variance_m2"]
+    fits = innovation * innovation <= PAIR_SUSPECT**2 * innovation_variance
+    if fits:
+        compute_fault_input(s, term, -1)
+        gather_evidence(s, innovation, innovation_variance)
+        update(s, innovation, innovation_variance, 1.0, len(s.x))
+    return bool(fits)
 
 
 # An anchor reports what its clock reads against the master's
@@ -433,8 +525,8 @@ def difference_terms(s: EstimatorState, a: int, b: int) -> tuple[int, float]:
     for axis in range(dim):
         s.h[axis] += s.h[near + axis]
         s.h[near + axis] = 0.0
-    term = _range_error_terms(s, 2 * near, b, far_m, 1.0)
-    return _range_error_terms(s, term, a, near_m, -1.0), far_m - near_m
+    term = _range_error_terms(s, 2 * near, b, 1.0)
+    return _range_error_terms(s, term, a, -1.0), far_m - near_m
 
 
 @step

@@ -12,6 +12,7 @@ import numpy as np
 
 from skyless.kernels.compiled import step
 from skyless.positioning.estimator.faults import begin_obstruction
+from skyless.positioning.estimator.kalman import jump_share
 from skyless.positioning.estimator.state import CHANGING_RANGE_ERRORS, EstimatorState, layout
 
 FORGETTING: Final = 0.02
@@ -76,6 +77,24 @@ DIFFERENCE_HUBER: Final = 1.0
 MAX_CHANGE_STD_M: Final = 0.5
 """Of the part of range errors that changes as the tag moves; larger ones are jumps."""
 
+PLACE_STEP_M: Final = 0.1
+"""Distance walked after which range errors are compared, and after twice as much."""
+
+PLACE_SAMPLES: Final = 100
+"""Comparisons, of all anchors together, before they count, ..."""
+
+PLACE_MEMORY: Final = 1000
+"""... and over which their mean is taken."""
+
+PLACE_LIMIT: Final = 9.0
+"""No comparison counts as more than this number of times what is expected: jumps are not multipath."""
+
+PLACE_LEAST_M2: Final = 9e-4
+"""Mean square beyond the stamps' noise from which the changes are larger than the site file states."""
+
+PLACE_LEAST_KEPT, PLACE_MOST_KEPT = 0.1, 0.9
+"""Bounds of the correlation after one step."""
+
 MOVED: Final = 1.0
 """Mean square of what a tag is away from where it was, over the variances, beyond which it counts as moving."""
 
@@ -99,7 +118,7 @@ clock has left its rate: nothing else makes all of them late, or early, at once.
 WALK_GAIN: Final = 1.1
 WALK_LOSS: Final = 0.99
 RELAY_GAIN: Final = 0.05
-RELAY_LIMIT: Final = 16.0
+RELAY_LIMIT: Final = 9.0
 RELAY_WALK_GAIN: Final = 1.2
 RELAY_WALK_LOSS: Final = 0.99
 
@@ -126,7 +145,7 @@ def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_var
     free = 0
     for other in range(len(s.anchors)):
         free += 0 if s.anchors[other]["is_obstructed"] else 1
-    share = min(status["obstruction"], 1.0) if free > s.settings[0]["dim"] + 1 else 0.0
+    share = jump_share(s) if free > s.settings[0]["dim"] + 1 else 0.0
     suspect = SUSPECT + share * (OBSTRUCTED_SUSPECT - SUSPECT)
     together = TOGETHER + share * (OBSTRUCTED_TOGETHER - TOGETHER)
     if innovation * innovation <= suspect * suspect * innovation_variance:
@@ -185,9 +204,9 @@ def adapt_change_noise(s: EstimatorState, anchor: int, normalised: float) -> Non
 def end_small_obstruction(s: EstimatorState, anchor: int) -> None:
     """End an obstruction that has gone without a jump back: the range error is known, and is hardly there."""
     a, change = s.anchors[anchor], layout(s.settings[0]["dim"], len(s.anchors)).change + anchor
-    error_m, variance = s.x[change], s.P[change, change]
-    settled = a["is_obstructed"] and a["change_scale"] < SETTLED_CHANGE_SCALE and variance < ENDED_STD_M**2
-    if settled and error_m * error_m < ENDED * ENDED * variance:
+    error_m, variance, usual = s.x[change], s.P[change, change], s.status[0]["place_variance_m2"]
+    settled = a["is_obstructed"] and a["change_scale"] < SETTLED_CHANGE_SCALE and variance < ENDED_STD_M**2 + usual
+    if settled and error_m * error_m < ENDED * ENDED * (variance + usual):
         a["is_obstructed"] = 0
         s.status[0]["ends_of_obstructions"] += 1
 
@@ -251,6 +270,38 @@ def adapt_change_variance(s: EstimatorState, anchor: int, elapsed_s: float) -> N
         square = s.x[change] ** 2 + s.P[change, change]
         variance = a["change_variance_m2"] + min(elapsed_s / memory_s, 0.5) * (square - a["change_variance_m2"])
         a["change_variance_m2"] = min(max(variance, settings["least_change_std_m"] ** 2), MAX_CHANGE_STD_M**2)
+
+
+@step
+def learn_place(s: EstimatorState, anchor: int, residual_m: float) -> None:
+    """Learn how range errors change with the distance walked, from what they differ by after one and two steps.
+
+    Half the mean square of the differences is noise + σ²·(1 − c) after one step and noise + σ²·(1 − c²) after two, for
+    a Gauss–Markov process of variance σ² with the correlation c over a step (a semivariogram, Matheron 1963).
+    """
+    settings, status, a = s.settings[0], s.status[0], s.anchors[anchor]
+    step_m = status["walked_m"] - a["place_walked_m"]
+    if step_m >= PLACE_STEP_M:
+        a["place_steps"] = a["place_steps"] + 1 if step_m < 2.0 * PLACE_STEP_M else 0
+        if a["place_steps"] >= 2:
+            status["place_samples"] = min(status["place_samples"] + 1, PLACE_MEMORY)
+            noise = settings["tx_variance_m2"] + settings["rx_variance_m2"]
+            for lag in range(2):
+                half = 0.5 * (residual_m - a["place_residual_m"][lag]) ** 2
+                mean = status["place_square_m2"][lag]
+                excess = min(half, PLACE_LIMIT * (noise + max(mean, 0.0))) - noise
+                status["place_square_m2"][lag] = mean + (excess - mean) / status["place_samples"]
+        a["place_residual_m"][1] = a["place_residual_m"][0]
+        a["place_residual_m"][0] = residual_m
+        a["place_walked_m"] = status["walked_m"]
+        near, far = status["place_square_m2"][0], status["place_square_m2"][1]
+        status["place_variance_m2"] = settings["place_std_m"] ** 2
+        status["place_distance_m"] = settings["place_distance_m"]
+        if status["place_samples"] >= PLACE_SAMPLES and near > PLACE_LEAST_M2:
+            kept = min(max(far / near - 1.0, PLACE_LEAST_KEPT), PLACE_MOST_KEPT)
+            variance = min(near / (1.0 - kept), MAX_CHANGE_STD_M**2)
+            if variance > status["place_variance_m2"]:
+                status["place_variance_m2"], status["place_distance_m"] = variance, -PLACE_STEP_M / np.log(kept)
 
 
 @step

@@ -34,7 +34,7 @@ from skyless.positioning.integrity import RISK, limits_of
 MAX_CLOCK_RATE: Final = 50e-6
 """Two crystals of ±20 ppm, and margin."""
 
-PAIR_STD_M: Final = 0.05
+PAIR_STD_M: Final = 0.02
 """Of the constant of a pair of anchors besides what the survey makes of it (a line of sight of DW1000s: 5.4 cm)."""
 
 
@@ -152,7 +152,8 @@ ANCHOR_DTYPE: Final = np.dtype(
         ("rx_ticks", np.int64),  # ... and the tag's
         ("offset_ticks", np.int64),  # whole ticks of the offset
         ("range_m", np.float64),  # at its newest packet
-        ("slope_range_m", np.float64),  # at which its range errors' slope counts
+        ("held_m", np.float64, (3,)),  # the tag's position at which ranges to it are linearised, ...
+        ("held_range_m", np.float64),  # ... and its distance from there
         ("walked_m", np.float64),  # the tag's walked distance at its newest packet
         ("is_relayed", np.int64),  # whether others relay its packets
         ("has_tx_noise", np.int64),  # whether its newest packet's TX noise is a state
@@ -169,6 +170,9 @@ ANCHOR_DTYPE: Final = np.dtype(
         ("relay_mean", np.float64),  # running mean of what relays show of its clock, normalised
         ("walk_scale", np.float64),  # factor on its oscillator's random walk
         ("change_variance_m2", np.float64),  # of the part of its range error that changes as the tag moves
+        ("place_steps", np.int64),  # steps of the tag after which its range error was compared, in a row
+        ("place_walked_m", np.float64),  # the tag's walked distance at the newest of them
+        ("place_residual_m", np.float64, (2,)),  # what its reception left after the last two
     ],
     align=True,
 )
@@ -183,6 +187,8 @@ LINK_DTYPE: Final = np.dtype(
         ("constant_m", np.float64),  # of the pair, in the row of the lower index; its estimate ...
         ("variance_m2", np.float64),  # ... and variance
         ("outliers_in_row", np.int64),
+        ("relays", np.int64),  # used in this direction
+        ("contradicts", np.int64),  # whether its range contradicts the survey
     ],
     align=True,
 )
@@ -219,6 +225,10 @@ STATUS_DTYPE: Final = np.dtype(
         ("q_scale", np.float64),  # factor on qa
         ("common_mean", np.float64),  # running mean of all innovations: the tag's own clock
         ("walk_scale", np.float64),  # factor on its random walk
+        ("place_samples", np.int64),  # comparisons of range errors at places a step apart
+        ("place_square_m2", np.float64, (2,)),  # half their mean square after one and two steps, less the stamps' noise
+        ("place_variance_m2", np.float64),  # of the part of range errors that changes as the tag moves, as learnt ...
+        ("place_distance_m", np.float64),  # ... and the distance over which it changes
         ("obstruction", np.float64),  # 1 where range errors have jumped lately, 0 where they do not
         ("walked_m", np.float64),
         ("stationary_s", np.float64),  # since the tag last showed motion ...
@@ -360,6 +370,8 @@ def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors
     status["height_ticks"] = NEVER
     status["walk_scale"] = min(START_WALK_SCALE, settings.max_walk_scale)
     status["fault_std_m"] = LASTING_STD_M
+    status["place_variance_m2"] = settings.place_std_m**2
+    status["place_distance_m"] = settings.place_distance_m
     status["mean_square_m2"] = settings.tx_variance_m2 + settings.rx_variance_m2
     P = np.zeros((n, n))
     P[where.slope, where.slope] = settings.slope_std_m**2
@@ -385,14 +397,17 @@ def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors
     )
 
 
-START_WALK_SCALE: Final = 100.0
-"""Of the tag's oscillator, which warms up after it was switched on."""
+START_WALK_SCALE: Final = 10.0
+"""Factor on the random walk of oscillators at first, as they may be warming up."""
 
 LASTING_STD_M: Final = 0.3
 """Of a fault that has been there since the anchor joined, ..."""
 
 CONTRADICTED_STD_M: Final = 1.0
 """... and where the packets that led to the start contradict each other, so that some are late by more."""
+
+OPEN_PAIR_STD_M: Final = 0.3
+"""Of the range between two anchors against the survey, before it is measured."""
 
 OPEN_RANGE_STD_M: Final = 1.0
 OPEN_SURVEY_STD_M: Final = 0.15
@@ -411,12 +426,13 @@ def with_anchor(
     dim, last = int(settings["dim"]), grown.anchors[count]
     last["table_index"], last["position_m"] = table_index, position_m
     last["tx_ticks"] = last["rx_ticks"] = NEVER
-    last["walk_scale"] = 1.0
+    last["held_m"] = np.nan
+    last["walk_scale"] = START_WALK_SCALE
     last["change_variance_m2"] = settings["place_std_m"] ** 2
     grown.packets[count] = (NEVER, NEVER, NEVER)
     pair_variance = 0.0
     if settings["range_std_m"] > 0.0 or settings["survey_std_m"] > 0.0 or std_m:
-        pair_variance = settings["pair_std_m"] ** 2
+        pair_variance = OPEN_PAIR_STD_M**2
     for link in (grown.links[count], grown.links[:, count]):
         link["tx_ticks"], link["variance_m2"] = NEVER, pair_variance
     where = layout(dim, count + 1)

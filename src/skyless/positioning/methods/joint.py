@@ -71,7 +71,7 @@ LATE_SHARE_KNOWN_S: Final = 0.5
 """By then it is known how often packets are late; a start that was wrong for that reason is repeated."""
 
 OPEN_START_HOLD_S: Final = 1.0
-"""A start with open range errors is not repeated for this time."""
+"""A start with open range errors is not repeated for this time; then it is, without them, once they fit the settings."""
 
 REORDERED_S: Final = 0.1
 """Packets that are older than the newest by less are late from the radio or the host; others mean another counter."""
@@ -298,8 +298,11 @@ class Estimation:
                 False  # the start was contradicted by single late packets
             )
             return True
+        age_s = (rx_ticks - self._started_ticks) * TICK_S
+        if self._is_open and age_s > OPEN_START_HOLD_S and self._estimator.fits_settings:
+            self._open_range_errors = False
+            return True
         if self._estimator.rows.item(QUALITY, 2) > SURE_CHI2:
-            age_s = (rx_ticks - self._started_ticks) * TICK_S
             limit = SURE_CHI2 if age_s < EARLY_FAULT_S or self._start_was_contradicted else UNCOVERED_CHI2
             calm = self._estimator.obstruction < CALM_OBSTRUCTION
             if (
