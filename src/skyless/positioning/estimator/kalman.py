@@ -27,6 +27,9 @@ OBSTRUCTED_WALK: Final = 0.004
 
 OBSTRUCTION_MEMORY_S: Final = 10.0
 
+MULTIPATH_STD_M: Final = 0.06
+"""Learnt multipath of this standard deviation makes errors that would be taken for jumps."""
+
 STATIONARY_NOISE_SHARE: Final = 2e-7
 """Part of the process noise of motion that is left for a stationary tag: 5 cm within half a minute."""
 
@@ -90,10 +93,9 @@ def _advance(s: EstimatorState, values: int, dt: float) -> None:
 
 @step
 def jump_share(s: EstimatorState) -> float:
-    """1 where range errors have jumped lately, 0 where they do not, or where multipath that was learnt explains it."""
-    status = s.status[0]
-    is_learnt = status["place_variance_m2"] > s.settings[0]["place_std_m"] ** 2
-    return 0.0 if is_learnt else min(float(status["obstruction"]), 1.0)
+    """1 where range errors have jumped lately, 0 where they do not, or where learnt multipath is as large as jumps."""
+    share = min(s.status[0]["obstruction"], 1.0)
+    return float(share) if s.status[0]["place_variance_m2"] < MULTIPATH_STD_M**2 else 0.0
 
 
 @step
@@ -108,7 +110,8 @@ def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float
     change, constant = where.change + anchor, where.constant + anchor
     obstructed = share * dt / OBSTRUCTED_S
     if s.anchors[anchor]["is_obstructed"]:
-        s.P[change, change] += OBSTRUCTED_WALK * s.anchors[anchor]["change_scale"] * dt
+        variance = 0.5 * OBSTRUCTION_MEMORY_S * OBSTRUCTED_WALK * s.anchors[anchor]["change_scale"]
+        _decay(s, change, np.exp(-dt / OBSTRUCTION_MEMORY_S), variance)
     else:
         place_variance = max(s.anchors[anchor]["change_variance_m2"], status["place_variance_m2"])
         variance = place_variance + share * OBSTRUCTED_STD_M**2

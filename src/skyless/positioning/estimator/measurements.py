@@ -61,10 +61,12 @@ SLOPE_FROM_M: Final = 4.0
 
 HELD_STEP_M: Final = 0.15
 HELD_SHARE: Final = 0.1
+"""A range is linearised at a held point of the tag, which moves onto the estimate when that is this distance away, or
+this share of the range if that is less (``docs/maths.md`` section 6, Linearisation), ..."""
+
 HELD_STD: Final = 3.0
-"""A range is linearised at a held point of the tag, which moves onto the estimate when that is farther away than the
-first, or the second as a share of the range if that is less, and than the third number of standard deviations
-(``docs/maths.md`` section 6, Linearisation)."""
+HELD_MOST_M: Final = 0.4
+"""... but no sooner than at this number of standard deviations, up to this distance: an estimate's noise is no motion."""
 
 CURVATURE_SHARE: Final = 0.01
 """Where ranges are so curved that it counts for more than this part of the stamps' variance, it is counted."""
@@ -121,7 +123,8 @@ def _hold_direction(s: EstimatorState, anchor: int) -> None:
         given_m = s.settings[0]["height_m"] if axis >= dim else s.x[axis]
         moved_m += (given_m - a["held_m"][axis]) ** 2
         squared += (given_m - a["position_m"][axis]) ** 2
-    if not moved_m <= max(HELD_STD**2 * variance, min(HELD_STEP_M**2, HELD_SHARE**2 * squared)):
+    noise = min(HELD_STD**2 * variance, HELD_MOST_M**2)
+    if not moved_m <= max(noise, min(HELD_STEP_M**2, HELD_SHARE**2 * squared)):
         a["held_range_m"] = max(np.sqrt(squared), 1e-6)
         for axis in range(3):
             a["held_m"][axis] = s.settings[0]["height_m"] if axis >= dim else s.x[axis]

@@ -80,16 +80,21 @@ MAX_CHANGE_STD_M: Final = 0.5
 PLACE_STEP_M: Final = 0.1
 """Distance walked after which range errors are compared, and after twice as much."""
 
+PLACE_FIRST: Final = 20
+"""Number of comparisons for which the stamps' noise stands at first."""
+
 PLACE_SAMPLES: Final = 100
 """Comparisons, of all anchors together, before they count, ..."""
 
 PLACE_MEMORY: Final = 1000
 """... and over which their mean is taken."""
 
-PLACE_LIMIT: Final = 9.0
-"""No comparison counts as more than this number of times what is expected: jumps are not multipath."""
+PLACE_LIMIT: Final = 2.0
+PLACE_LIMITED_MEAN: Final = 0.742
+"""No comparison counts as more than this number of times their mean, as jumps are not multipath; this is what remains
+of the mean square of normal differences."""
 
-PLACE_LEAST_M2: Final = 9e-4
+PLACE_LEAST_M2: Final = 12e-4
 """Mean square beyond the stamps' noise from which the changes are larger than the site file states."""
 
 PLACE_LEAST_KEPT, PLACE_MOST_KEPT = 0.1, 0.9
@@ -285,16 +290,16 @@ def learn_place(s: EstimatorState, anchor: int, residual_m: float) -> None:
         a["place_steps"] = a["place_steps"] + 1 if step_m < 2.0 * PLACE_STEP_M else 0
         if a["place_steps"] >= 2:
             status["place_samples"] = min(status["place_samples"] + 1, PLACE_MEMORY)
-            noise = settings["tx_variance_m2"] + settings["rx_variance_m2"]
             for lag in range(2):
                 half = 0.5 * (residual_m - a["place_residual_m"][lag]) ** 2
                 mean = status["place_square_m2"][lag]
-                excess = min(half, PLACE_LIMIT * (noise + max(mean, 0.0))) - noise
-                status["place_square_m2"][lag] = mean + (excess - mean) / status["place_samples"]
+                limited = min(half, PLACE_LIMIT * mean) / PLACE_LIMITED_MEAN
+                status["place_square_m2"][lag] += (limited - mean) / (PLACE_FIRST + status["place_samples"])
         a["place_residual_m"][1] = a["place_residual_m"][0]
         a["place_residual_m"][0] = residual_m
         a["place_walked_m"] = status["walked_m"]
-        near, far = status["place_square_m2"][0], status["place_square_m2"][1]
+        noise = settings["tx_variance_m2"] + settings["rx_variance_m2"]
+        near, far = status["place_square_m2"][0] - noise, status["place_square_m2"][1] - noise
         status["place_variance_m2"] = settings["place_std_m"] ** 2
         status["place_distance_m"] = settings["place_distance_m"]
         if status["place_samples"] >= PLACE_SAMPLES and near > PLACE_LEAST_M2:
