@@ -169,7 +169,7 @@ def _rooms(plan: Plan) -> list[Case]:
             plan,
             "anchors in a line",
             "rooms",
-            _exceeded(0.0),
+            *(Limit("level", most=0.0), _exceeded(0.0)),
             site=line_site(plan.noise_ps),
             paths=partial(_beside_the_line, plan.tags),
         ),

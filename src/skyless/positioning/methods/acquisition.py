@@ -17,7 +17,7 @@ from msgspec import Struct
 from skyless.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.kernels.arrays import Array
 from skyless.positioning.fix import NoFixReason
-from skyless.positioning.methods.locate import RESIDUAL_TAIL, NoSolution, locate_pseudoranges
+from skyless.positioning.methods.locate import RESIDUAL_TAIL, RIVAL_MINIMUM_CHI2, NoSolution, locate_pseudoranges
 from skyless.positioning.observation import Observation
 
 START_MAX_AGE_S: Final = 0.5
@@ -107,6 +107,8 @@ class Acquisition(Struct):
     _max_age_s: float
     _speed_std_mps: float
     """Of a tag that is assumed to be fast this makes a start wide, and more anchors do not help."""
+    _error_variance_m2: float = 0.0
+    """Of survey and ranges: rivals differ by more than these errors, too, lest a start takes a mirror image."""
     _heard: dict[int, list[Observation]] = {}
     _possible_ticks: int | None = None
     """When a start was first possible."""
@@ -276,18 +278,13 @@ class Acquisition(Struct):
             height_m=self._height_m,
             z_bounds_m=self._z_bounds_m,
             residual_tail=residual_tail,
+            rival_chi2=RIVAL_MINIMUM_CHI2 * (1.0 + self._error_variance_m2 / float(variances.min())),
         )
         if isinstance(result, NoSolution):
             return result.reason
         dim = 3 if self._height_m is None else 2
         solution = np.append(result.position_m[:dim], result.bias_m)
-        return Start(
-            tuple(newest),
-            now,
-            solution,
-            result.covariance_joint_m2,
-            self._speed_std_mps**2,
-        )
+        return Start(tuple(newest), now, solution, result.covariance_joint_m2, self._speed_std_mps**2)
 
 
 def _offset_ticks(observation: Observation) -> tuple[int, float]:
