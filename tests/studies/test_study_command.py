@@ -113,6 +113,8 @@ def test_every_study_can_be_drawn(name, tmp_path):
         (["room", "--episodes", "5"], "room takes --worlds and --seconds"),
         (["room", "--integrity-risk", "1e-3"], "are for the study integrity"),
         (["room", "--method", "guess"], "it should be one of literal"),
+        (["loss", "--qa", "1", "--dynamics", "drone"], "--qa and --dynamics both set the process noise"),
+        (["efficiency", "--dynamics", "drone"], "--dynamics is not for the study efficiency"),
         (["efficiency", "--seconds", "5"], "--seconds is not for the study efficiency"),
         (["efficiency", "--method", "literal"], "--method is 'literal'"),
         (["loss", "--integrity-risk", "1e-3"], "are for the study integrity"),
