@@ -115,6 +115,8 @@ class Acquisition(Struct):
     _contradicted_ticks: int | None = None
     """When packets first contradicted each other."""
     _links: dict[tuple[int, int], _Link] = {}
+    _rival_count: int = 0
+    """Anchors with which two positions fitted alike; as many of them are tried again once a superframe only."""
 
     def expect_height(self, low_m: float, high_m: float) -> None:
         """Look only between these heights from now on."""
@@ -154,9 +156,10 @@ class Acquisition(Struct):
         needed = 4 if self._height_m is None else 3
         if len(pairs) < needed:
             return NoFixReason.TOO_FEW_ANCHORS
-        if not came_around:
-            return NoFixReason.ACQUIRING
+        if not came_around or (len(pairs) == self._rival_count and observation.anchor != pairs[0][-1].anchor):
+            return NoFixReason.MIRROR if self._rival_count else NoFixReason.ACQUIRING
         result = self._solve(pairs, now)
+        self._rival_count = len(pairs) if result is NoFixReason.MIRROR else 0
         if isinstance(result, Start):
             return self._unless_wide(result)
         if result not in CONTRADICTIONS or len(pairs) <= needed + 1 or observation.anchor != pairs[0][-1].anchor:
