@@ -127,13 +127,13 @@ def is_side_open(s: EstimatorState) -> bool:
                 work[dim + 2, axis] = foot_m - probe_m * normal[axis]
                 tag_m += (foot_m + probe_m * normal[axis]) ** 2
                 image_m += (foot_m - probe_m * normal[axis]) ** 2
-            image_m = work[dim + 2, dim] = np.sqrt(image_m)
-            apart_m = image_m - np.sqrt(tag_m)
+            apart_m, nearness, work[dim + 2, dim] = np.sqrt(image_m) - np.sqrt(tag_m), 1.0 / np.sqrt(image_m), 1.0
             square += apart_m * apart_m
             for one in range(dim + 1):
-                work[dim + 1, one] += work[dim + 2, one] * apart_m / image_m
+                work[dim + 2, one] *= nearness if one < dim else 1.0
+                work[dim + 1, one] += work[dim + 2, one] * apart_m
                 for other in range(one + 1):
-                    work[one, other] += work[dim + 2, one] * work[dim + 2, other] / image_m**2
+                    work[one, other] += work[dim + 2, one] * work[dim + 2, other]
         whiten(work, dim + 1, 1)
         for one in range(dim + 1):
             square -= work[dim + 1, one] ** 2
