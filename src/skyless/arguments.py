@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from skyless.errors import SkylessError
+from skyless.method_names import DYNAMICS_QA_M2PS3
 
 _LONGEST_VALUE: Final = 60
 
@@ -51,6 +52,16 @@ def check_choice(name: str, value: object, choices: Sequence[str]) -> None:
     """See that a text is one of several. Raises SkylessError."""
     if value not in choices:
         raise wrong(name, value, f"one of {', '.join(choices)}")
+
+
+def process_noise(qa: float | None, dynamics: str | None) -> float | None:
+    """What filters assume, by either option; None where neither is given. Raises SkylessError."""
+    if dynamics is None:
+        return qa
+    check_choice("--dynamics", dynamics, tuple(DYNAMICS_QA_M2PS3))
+    if qa is not None:
+        raise SkylessError("--qa and --dynamics both set the process noise; give either")
+    return DYNAMICS_QA_M2PS3[dynamics]
 
 
 def sequence(name: str, value: object, right: str) -> tuple[Any, ...]:

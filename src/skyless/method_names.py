@@ -1,6 +1,6 @@
-"""Names of the positioning methods."""
+"""Names of the positioning methods, and of how tags move."""
 
-from typing import Final
+from typing import Final, Literal
 
 SNAPSHOTS: Final = ("literal", "literal-delayed", "weighted", "bracketed")
 FILTERS: Final = ("joint",)
@@ -11,3 +11,8 @@ WEIGHTED: Final = "weighted"
 DEFAULT_METHOD: Final = "joint"
 PROTECTED: Final = "joint"
 """The one whose fixes have protection levels."""
+
+Dynamics = Literal["walk", "robot", "drone"]
+"""How tags move: as people, as robots at some 5 m/s, as drones at some 10 m/s."""
+DYNAMICS_QA_M2PS3: Final[dict[str, float]] = {"walk": 0.3, "robot": 1.0, "drone": 3.0}
+"""Process noise that filters assume of each."""

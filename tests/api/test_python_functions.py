@@ -312,6 +312,8 @@ SIMULATE = [
     ({"seed": -1}, "seed is -1; it should be a whole number, at least 0"),
     ({"fixes": "3"}, "fixes is '3'; it should be a whole number, at least 1"),
     ({"qa": float("inf")}, "qa is inf; it should be a number, above 0"),
+    ({"qa": 1.0, "dynamics": "robot"}, "^qa and dynamics both set the process noise; give either"),
+    ({"dynamics": "car"}, "^dynamics is 'car'; it should be one of walk, robot, drone"),
     ({"biases": ((1, 2),)}, r"biases\[0\] is \(1, 2\); it should be a skyless.simulation.impairments.AnchorBias"),
     ({"biases": (AnchorBias(99, 1.0),)}, "99"),
     ({"site": "no.toml"}, "site is 'no.toml'; it should be a file"),
@@ -391,7 +393,15 @@ PLAN = [
 
 @pytest.mark.parametrize(
     "arguments",
-    [{"qa": 1.0}, {"search_s": 3.0}, {"verify_rounds": 200}, {"seed": 2}, {"method": "weighted"}, {"optimise": 4}],
+    [
+        {"qa": 1.0},
+        {"dynamics": "robot"},
+        {"search_s": 3.0},
+        {"verify_rounds": 200},
+        {"seed": 2},
+        {"method": "weighted"},
+        {"optimise": 4},
+    ],
     ids=str,
 )
 def test_what_has_no_effect_on_a_plan_of_slots_is_refused(arguments):

@@ -249,6 +249,7 @@ A, T = ["--anchors", "anchors.csv"], ["--truth", "truth.csv"]
         (["tdoa-table", *A, "--plot", "plot"], ["--plot", "ending"]),
         (["tdoa-table", *A, "--qa", "0"], ["--qa", "0"]),
         (["tdoa-table", *A, "--qa", "inf"], ["--qa", "inf"]),
+        (["tdoa-table", *A, "--qa", "1", "--dynamics", "drone"], ["--qa", "--dynamics", "either"]),
         (["tdoa-table", *A, "--tdoa-std", "nan"], ["--tdoa-std", "nan"]),
         (["tdoa-table", *A, "--settle", "-1"], ["--settle", "-1"]),
         (["tdoa-table", *A, "--above", "nan"], ["--above", "nan"]),

@@ -206,6 +206,8 @@ def test_a_table_for_people_has_no_control_characters(run):
         (["--alert-limit-m", "0.1", "--method", "weighted"], ["--alert-limit-m", "0.1", "weighted"]),
         (["--position", "1,2", "--tags", "5"], ["--position", "--tags", "either"]),
         (["--position", "1,2", "--speed", "2"], ["--position", "--speed", "either"]),
+        (["--qa", "1", "--dynamics", "robot"], ["--qa", "--dynamics", "either"]),
+        (["--dynamics", "car"], ["--dynamics", "car", "drone"]),
         (["--waypoints", "1,1;5,1", "--tags", "2"], ["--waypoints", "--tags", "either"]),
         (["--waypoints", "1,1"], ["--waypoints", "'1,1'", "two or more", "quotes"]),
         (["--waypoints", "1,1;5"], ["--waypoints", "'5'", "2 or 3"]),

@@ -234,6 +234,13 @@ def test_a_bias_lasts_from_one_time_to_another():
     assert late_m == pytest.approx(np.where((t_s >= 1.0) & (t_s % 0.5 >= 0.3), 1.0, 0.0), abs=1.01 * TICK_M)
 
 
+def test_a_bias_that_creeps_grows_from_its_beginning_and_ends_at_once():
+    late = _late_m(_with(anchor_biases=(AnchorBias(2, 0.1, from_s=0.5, to_s=1.5, creep_mps=0.4),)), 2.0)
+    t_s, late_m = late[2].T
+    grown_m = np.where((t_s >= 0.5) & (t_s < 1.5), 0.1 + 0.4 * (t_s - 0.5), 0.0)
+    assert late_m == pytest.approx(grown_m, abs=1.01 * TICK_M)
+
+
 @pytest.mark.parametrize("ppm", [1.0, -1.0, 5.0])
 def test_a_warming_crystal_gains_what_its_curve_says(ppm):
     """The tag's stamps run ahead by ppm·(t − τ(1 − e^(−t/τ))), t from the start of the warm-up."""

@@ -70,7 +70,7 @@ def test_the_study_of_the_room_tells_levels_and_what_is_missed(run, tmp_path):
     code, out, err = run("room", *small, "--json", "--out", "folder")
     assert (code, err, out.count("\n")) == (0, "", 1)
     rows = json.loads(out)["rows"]
-    assert len(rows) == 38
+    assert len(rows) == 52
     first = rows[0]
     assert (first["case"], first["method"], first["runs"]) == ("the room", "joint", 2)
     assert {limit["figure"] for limit in first["limits"]} == {"rmse_m", "nees", "level", "exceeded", "hpl_m", "ratio"}
@@ -82,7 +82,7 @@ def test_the_study_of_the_room_tells_levels_and_what_is_missed(run, tmp_path):
         assert row["said_m"] > 0.0
     with (tmp_path / "folder" / "room.csv").open(newline="") as file:
         table = list(csv.DictReader(file))
-    assert table[0]["limits"].split()[:2] == ["rmse_m:..0.029", "nees:0.7..1.3"]
+    assert table[0]["limits"].split()[:2] == ["rmse_m:..0.03", "nees:0.7..1.3"]
     assert ElementTree.fromstring((tmp_path / "folder" / "room.svg").read_bytes()).tag.endswith("svg")
 
 
@@ -113,6 +113,8 @@ def test_every_study_can_be_drawn(name, tmp_path):
         (["room", "--episodes", "5"], "room takes --worlds and --seconds"),
         (["room", "--integrity-risk", "1e-3"], "are for the study integrity"),
         (["room", "--method", "guess"], "it should be one of literal"),
+        (["loss", "--qa", "1", "--dynamics", "drone"], "--qa and --dynamics both set the process noise"),
+        (["efficiency", "--dynamics", "drone"], "--dynamics is not for the study efficiency"),
         (["efficiency", "--seconds", "5"], "--seconds is not for the study efficiency"),
         (["efficiency", "--method", "literal"], "--method is 'literal'"),
         (["loss", "--integrity-risk", "1e-3"], "are for the study integrity"),

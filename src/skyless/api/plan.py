@@ -16,6 +16,7 @@ from skyless.arguments import (
     check_point,
     check_whole,
     named_as_arguments,
+    process_noise,
     sequence,
     wrong,
 )
@@ -127,7 +128,8 @@ def plan(
     *,
     method: str = DEFAULT_METHOD,
     noise_ps: float | None = None,
-    qa: float = 0.3,
+    qa: float | None = None,
+    dynamics: str | None = None,
     range_m: float | None = None,
     step_m: float | None = None,
     tag_heights_m: Sequence[float] | None = None,
@@ -154,7 +156,8 @@ def plan(
         site: A site, or the path of its file.
         method: One of ``skyless.METHODS``.
         noise_ps: Noise of every TX and RX stamp; by default the site's own figures.
-        qa: Process noise that ``joint`` assumes, spectral density of the acceleration in m²/s³.
+        qa: Process noise that ``joint`` assumes, spectral density of the acceleration in m²/s³; 0.3 by default.
+        dynamics: How tags move: ``walk`` (as people), ``robot`` or ``drone``, which sets the process noise instead.
         range_m: How far a frame carries in the open: half arrive there; by default what the link budget gives.
         step_m: Spacing of the map's points; by default some ten thousand points.
         tag_heights_m: Heights of the tags, for sites that estimate the height (3-D); by default three.
@@ -183,7 +186,8 @@ def plan(
     outline, region = _outline(outline_m), _region(region_m)
     if not known.schedule.needs_master:
         of_masters = {
-            "method": method, "noise_ps": noise_ps, "qa": qa, "target_m": target_m, "optimise": optimise,
+            "method": method, "noise_ps": noise_ps, "qa": qa, "dynamics": dynamics, "target_m": target_m,
+            "optimise": optimise,
             "anchor_heights_m": anchor_heights_m, "mounts_m": mounts_m, "search_s": search_s,
             "verify_points": verify_points, "verify_rounds": verify_rounds, "seed": seed,
         }  # fmt: skip
@@ -206,7 +210,7 @@ def plan(
     walls_m, levels_m = _mounts(mounts_m), _heights("anchor_heights_m", anchor_heights_m)
     with named_as_arguments(_ARGUMENTS):
         channel = ChannelModel() if range_m is None else with_range(ChannelModel(), range_m)
-        settings = PlanSettings(method, noise_ps, qa, channel)
+        settings = PlanSettings(method, noise_ps, process_noise(qa, dynamics) or 0.3, channel)
         if optimise is None:
             check_anchor_count(known, file)
         floor = floor_of(known, file, outline, region)

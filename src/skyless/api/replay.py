@@ -17,6 +17,7 @@ from skyless.arguments import (
     check_point,
     existing_file,
     named_as_arguments,
+    process_noise,
     wrong,
 )
 from skyless.errors import SkylessError
@@ -110,6 +111,7 @@ def replay(
     settle_s: float | None = None,
     above_m: float | None = None,
     qa: float | None = None,
+    dynamics: str | None = None,
     tdoa_std_m: float | None = None,
     uncalibrated: bool = False,
     tag: str | None = None,
@@ -140,6 +142,7 @@ def replay(
         settle_s: Seconds from the start that are not judged; by default 3 with a truth, 2 without.
         above_m: Judge only while the true height exceeds this.
         qa: Process noise that the filter assumes, spectral density of the acceleration in m²/s³.
+        dynamics: How tags move: ``walk`` (as people), ``robot`` or ``drone``, which sets the process noise instead.
         tdoa_std_m: Noise of what is new in a time difference.
         uncalibrated: Leave out the calibration that a table of anchors holds.
         tag: Name of the tag, in recordings of ``skyless record``; by default all.
@@ -167,7 +170,8 @@ def replay(
     required = requirement_of(method, integrity_risk, alert_limit_m, max_acceleration_mps2, tag_height_std_m)
     of_others = {
         "anchors": anchors, "truth": truth, "lever_arm_m": lever_arm_m, "format": format, "listener": listener,
-        "qa": qa, "tdoa_std_m": tdoa_std_m, "measurements": measurements, "uncalibrated": uncalibrated or None,
+        "qa": qa, "dynamics": dynamics, "tdoa_std_m": tdoa_std_m, "measurements": measurements,
+        "uncalibrated": uncalibrated or None,
         "tag_height_m": None if isinstance(tag_height_m, str) and tag_height_m == "auto" else tag_height_m,
     }  # fmt: skip
     of_sites = {
@@ -195,7 +199,7 @@ def replay(
             tag_height_std_m=tag_height_std_m,
             settle_s=settle_s,
             above_m=above_m,
-            qa=qa,
+            qa=process_noise(qa, dynamics),
             tdoa_std_m=tdoa_std_m,
             calibration=read_calibration(anchors) if isinstance(anchors, str | Path) and not uncalibrated else None,
             measurements=measurements,

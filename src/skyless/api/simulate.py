@@ -10,7 +10,15 @@ from msgspec.structs import replace
 from skyless.api.fixes import Fixes, FixRecorder
 from skyless.api.inputs import AnySite, Progress, requirement_of, silent, site_of
 from skyless.api.result import Result, cm
-from skyless.arguments import check_choice, check_kinds, check_number, check_whole, named_as_arguments, sequence
+from skyless.arguments import (
+    check_choice,
+    check_kinds,
+    check_number,
+    check_whole,
+    named_as_arguments,
+    process_noise,
+    sequence,
+)
 from skyless.errors import SkylessError
 from skyless.evaluation.fleet import FleetReport, JudgedFix, report
 from skyless.evaluation.fleet_run import end_s, run_fleet
@@ -101,7 +109,8 @@ def simulate(
     paths_m: Sequence[Sequence[Sequence[float]]] = (),
     tags: int | None = None,
     speed_mps: float | None = None,
-    qa: float = 0.3,
+    qa: float | None = None,
+    dynamics: str | None = None,
     noise_ps: float | None = None,
     fixes: int | None = None,
     duration_s: float | None = None,
@@ -132,7 +141,8 @@ def simulate(
         paths_m: Paths of tags, each two points or more, walked once, or for ever if it ends where it begins.
         tags: How many tags walk about where neither positions nor paths are given; 1 by default.
         speed_mps: How fast tags walk; 1 by default.
-        qa: Process noise that ``joint`` assumes, spectral density of the acceleration in m²/s³.
+        qa: Process noise that ``joint`` assumes, spectral density of the acceleration in m²/s³; 0.3 by default.
+        dynamics: How tags move: ``walk`` (as people), ``robot`` or ``drone``, which sets the process noise instead.
         noise_ps: Noise of every TX and RX stamp, known to the filters; by default the site's own figures.
         fixes: Stop when every tag has this many judged fixes (one per superframe), or has had none for 60 s.
         duration_s: Stop after this simulated time; by default 60 s unless ``fixes`` is given.
@@ -157,11 +167,14 @@ def simulate(
     """
     required = requirement_of(method, integrity_risk, alert_limit_m, max_acceleration_mps2)
     check_number("noise_ps", noise_ps, above=0.0)
+    check_number("qa", qa, above=0.0)
     check_whole("fixes", fixes, least=1)
     check_number("duration_s", duration_s, above=0.0)
     check_number("settle_s", settle_s, least=0.0)
     positions_m = sequence("positions_m", positions_m, "points, (x, y) or (x, y, z) in metres each")
     paths_m = sequence("paths_m", paths_m, "paths, two or more points each")
+    with named_as_arguments({}):
+        noise = process_noise(qa, dynamics)
     _check_motion(positions_m, paths_m, tags, speed_mps, scenario)
     request = Request(
         site=_site(site, scenario),
@@ -172,7 +185,7 @@ def simulate(
         paths_m=tuple(_points(f"paths_m[{number}]", path_m) for number, path_m in enumerate(paths_m)),
         tags=1 if tags is None else tags,
         speed_mps=1.0 if speed_mps is None else speed_mps,
-        qa=qa,
+        qa=noise or 0.3,
         integrity=required or IntegrityRequirement(),
         warmup_s=settle_s,
         most_fixes=fixes,

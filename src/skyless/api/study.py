@@ -9,7 +9,13 @@ import numpy as np
 
 from skyless.api.inputs import Progress, silent
 from skyless.api.result import Result, cm, data_frame, figures
-from skyless.arguments import check_choice, check_number, check_whole, named_as_arguments
+from skyless.arguments import (
+    check_choice,
+    check_number,
+    check_whole,
+    named_as_arguments,
+    process_noise,
+)
 from skyless.errors import SkylessError
 from skyless.evaluation.scenarios import NOISIEST_PS
 from skyless.kernels.arrays import Vector
@@ -99,6 +105,7 @@ def study(
     seconds: float | None = None,
     noise_ps: float | None = None,
     qa: float | None = None,
+    dynamics: str | None = None,
     integrity_risk: float | None = None,
     alert_limit_m: float | None = None,
     mesh: bool = True,
@@ -121,6 +128,7 @@ def study(
         seconds: Simulated seconds for which each world is judged.
         noise_ps: Noise of every TX and RX stamp, known to the filters; 100 by default.
         qa: Process noise that filters assume at rest, spectral density of the acceleration in m²/s³; 0.3 by default.
+        dynamics: How tags move: ``walk`` (as people), ``robot`` or ``drone``, which sets the process noise instead.
         integrity_risk: Probability, for each fix, that the error exceeds its protection level (integrity).
         alert_limit_m: Fixes whose level exceeds this count as not available (integrity).
         mesh: Whether anchors also relay when they heard anchors that are not the master.
@@ -145,6 +153,8 @@ def study(
     check_whole("processes", processes, least=1, most=1024)
     if scheduler is not None and processes is not None:
         raise SkylessError("processes are on this machine, scheduler is for others; give either")
+    with named_as_arguments({}):
+        noise = process_noise(qa, dynamics)
     started_s, chosen = time.perf_counter(), STUDIES[name]
     plan = plan_of(
         method,
@@ -152,7 +162,7 @@ def study(
         study=name,
         quick=quick,
         noise_ps=noise_ps or 100.0,
-        qa=qa or 0.3,
+        qa=noise or 0.3,
         mesh=mesh,
         worlds=worlds,
         seconds=seconds,
@@ -168,6 +178,7 @@ def study(
             seconds=seconds,
             noise_ps=noise_ps,
             qa=qa,
+            dynamics=dynamics,
             integrity_risk=integrity_risk,
             alert_limit_m=alert_limit_m,
         )

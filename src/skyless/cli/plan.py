@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
+from skyless.arguments import process_noise
 from skyless.cli.common.options import (
     Positive,
     Seed,
@@ -21,7 +22,7 @@ from skyless.cli.common.progress import progress_bar
 from skyless.cli.plan_output import show, write_files, write_site
 from skyless.cli.plan_slots import conflicts_of, show_slots, write_slots
 from skyless.errors import ConfigurationError, SkylessError
-from skyless.method_names import DEFAULT_METHOD
+from skyless.method_names import DEFAULT_METHOD, Dynamics
 
 if TYPE_CHECKING:
     from skyless.kernels.arrays import Matrix
@@ -44,8 +45,10 @@ class PlanOptions:
     """How positions are computed: literal, literal-delayed, weighted, bracketed or joint."""
     noise_ps: Positive | None = None
     """Noise of every TX and RX stamp in picoseconds; by default the site's own figures."""
-    qa: Positive = 0.3
-    """Process noise that joint assumes: spectral density of the acceleration, m²/s³."""
+    qa: Positive | None = None
+    """Process noise that joint assumes: spectral density of the acceleration, m²/s³; by default 0.3."""
+    dynamics: Dynamics | None = None
+    """How tags move: walk (as people), robot or drone, which sets the process noise instead of --qa."""
     range_m: Annotated[Positive | None, Parameter(name="--range")] = None
     """How far a frame carries in the open, metres: half arrive there; by default what the link budget gives (31 m)."""
     step: Positive | None = None
@@ -148,8 +151,8 @@ def plan(file: Path, /, *, asked: PlanOptions = PlanOptions()) -> None:
 
 _FOR_PROTOCOL_2: Final = ("exponent", "conflicts", "write", "force")
 _FOR_ONE_MASTER: Final = (
-    "method", "noise_ps", "qa", "target", "grid", "html", "optimise", "out", "heights", "mounts", "search_seconds",
-    "verify", "rounds", "seed",
+    "method", "noise_ps", "qa", "dynamics", "target", "grid", "html", "optimise", "out", "heights", "mounts",
+    "search_seconds", "verify", "rounds", "seed",
 )  # fmt: skip
 
 
@@ -262,7 +265,7 @@ def _settings(asked: PlanOptions) -> "PlanSettings":
 
     check_method(asked.method)
     channel = ChannelModel() if asked.range_m is None else with_range(ChannelModel(), asked.range_m)
-    return PlanSettings(asked.method, asked.noise_ps, asked.qa, channel)
+    return PlanSettings(asked.method, asked.noise_ps, process_noise(asked.qa, asked.dynamics) or 0.3, channel)
 
 
 def _outline(text: str | None) -> "Matrix | None":

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from cyclopts import App
 
+from skyless.arguments import process_noise
 from skyless.cli.common.options import (
     Finite,
     IntegrityRisk,
@@ -25,7 +26,7 @@ from skyless.cli.common.output import new_table, number, print_facts, print_json
 from skyless.cli.common.progress import loading_kernels, progress_bar
 from skyless.cli.common.recording_inputs import is_mcap, lever_arm, wished_height
 from skyless.errors import SkylessError
-from skyless.method_names import DEFAULT_METHOD
+from skyless.method_names import DEFAULT_METHOD, Dynamics
 
 if TYPE_CHECKING:
     from skyless.evaluation.judge import Judge
@@ -97,6 +98,8 @@ class ReplayOptions:
     it and later flies, as tags on the floor hear reflections only."""
     qa: Positive | None = None
     """Process noise that the filter assumes: spectral density of the acceleration, m²/s³."""
+    dynamics: Dynamics | None = None
+    """How tags move: walk (as people), robot or drone, which sets the process noise instead of --qa."""
     tdoa_std: Positive | None = None
     """Noise of what is new in a time difference, metres."""
     uncalibrated: bool = False
@@ -195,7 +198,7 @@ def _replay_foreign(file: Path, asked: ReplayOptions) -> "ReplayReport":
             tag_height_std_m=asked.tag_height_std,
             settle_s=asked.settle,
             above_m=asked.above,
-            qa=asked.qa,
+            qa=process_noise(asked.qa, asked.dynamics),
             tdoa_std_m=asked.tdoa_std,
             calibration=None if asked.anchors is None or asked.uncalibrated else read_calibration(asked.anchors),
             measurements=asked.measurements,
@@ -240,8 +243,8 @@ def _replay_site(file: Path, asked: ReplayOptions) -> "list[TagReport]":
 
     useless = {
         "anchors": asked.anchors, "truth": asked.truth, "lever-arm": asked.lever_arm, "format": asked.format,
-        "listener": asked.listener, "qa": asked.qa, "tdoa-std": asked.tdoa_std, "measurements": asked.measurements,
-        "tag-height": None if asked.tag_height == "auto" else asked.tag_height,
+        "listener": asked.listener, "qa": asked.qa, "dynamics": asked.dynamics, "tdoa-std": asked.tdoa_std,
+        "measurements": asked.measurements, "tag-height": None if asked.tag_height == "auto" else asked.tag_height,
         "uncalibrated": asked.uncalibrated or None,
     }  # fmt: skip
     check_left_out(useless, "a recording of skyless record brings its own")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TextIO
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
+from skyless.arguments import process_noise
 from skyless.cli.common.options import (
     NotNegative,
     Picoseconds,
@@ -26,7 +27,7 @@ from skyless.cli.common.output import cm, new_table, print_facts, print_json
 from skyless.cli.common.progress import loading_kernels, progress_bar
 from skyless.cli.common.simulated_site import check_simulated
 from skyless.errors import SkylessError
-from skyless.method_names import DEFAULT_METHOD
+from skyless.method_names import DEFAULT_METHOD, Dynamics
 
 if TYPE_CHECKING:
     from skyless.evaluation.fleet import FleetReport, JudgedFix, TagFleet
@@ -83,8 +84,10 @@ class SimulateOptions:
     """How many tags walk about where neither --position nor --waypoints is given; 1 by default."""
     speed: Annotated[float, Parameter(validator=Number(gt=0, lte=1000))] | None = None
     """How fast tags walk, in m/s; 1 by default. In the room only for --waypoints."""
-    qa: Positive = 0.3
-    """Process noise that joint assumes: spectral density of the acceleration, m²/s³."""
+    qa: Positive | None = None
+    """Process noise that joint assumes: spectral density of the acceleration, m²/s³; by default 0.3."""
+    dynamics: Dynamics | None = None
+    """How tags move: walk (as people), robot or drone, which sets the process noise instead of --qa."""
     protection: ProtectionOptions = ProtectionOptions()
     noise_ps: Picoseconds | None = None
     """Noise of every TX and RX stamp in picoseconds, known to the filters; by default the site's own figures."""
@@ -184,7 +187,7 @@ def _request(asked: SimulateOptions) -> "Request":
         paths_m=tuple(map(_path, asked.waypoints or ())),
         tags=asked.tags or 1,
         speed_mps=asked.speed or 1.0,
-        qa=asked.qa,
+        qa=process_noise(asked.qa, asked.dynamics) or 0.3,
         integrity=asked.protection.requirement(asked.method),
         warmup_s=asked.settle,
         most_fixes=asked.fixes,

@@ -13,6 +13,7 @@ import msgspec
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
+from skyless.arguments import process_noise
 from skyless.cli.common.options import (
     IntegrityRisk,
     Picoseconds,
@@ -25,7 +26,7 @@ from skyless.cli.common.options import (
 from skyless.cli.common.output import console, print_json, to_json
 from skyless.cli.common.progress import loading_kernels, progress_bar
 from skyless.errors import SkylessError
-from skyless.method_names import DEFAULT_METHOD
+from skyless.method_names import DEFAULT_METHOD, Dynamics
 from skyless.whole_files import write_whole
 
 if TYPE_CHECKING:
@@ -159,6 +160,8 @@ class StudyOptions:
     """Noise of every TX and RX stamp in picoseconds, known to the filters; by default 100."""
     qa: Positive | None = None
     """Process noise that the filters assume at rest: spectral density of the acceleration, m²/s³; by default 0.3."""
+    dynamics: Dynamics | None = None
+    """How tags move: walk (as people), robot or drone, which sets the process noise instead of --qa."""
     integrity_risk: IntegrityRisk | None = None
     """Probability, for each fix, that the error exceeds its protection level (integrity); 1e-4 by default."""
     alert_limit_m: Positive | None = None
@@ -215,6 +218,7 @@ def _check(name: str, asked: StudyOptions) -> None:
         seconds=asked.seconds,
         noise_ps=asked.noise_ps,
         qa=asked.qa,
+        dynamics=asked.dynamics,
         integrity_risk=asked.integrity_risk,
         alert_limit_m=asked.alert_limit_m,
     )
@@ -240,7 +244,7 @@ def _plan(name: str, asked: StudyOptions) -> "Plan":
         study=name,
         quick=asked.quick,
         noise_ps=asked.noise_ps or 100.0,
-        qa=asked.qa or 0.3,
+        qa=process_noise(asked.qa, asked.dynamics) or 0.3,
         mesh=not asked.without_mesh,
         worlds=asked.worlds,
         seconds=asked.seconds,

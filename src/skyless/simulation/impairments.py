@@ -21,13 +21,15 @@ class AnchorBias(Struct, frozen=True, forbid_unknown_fields=True):
     from_s: float = 0.0
     to_s: float = math.inf
     """With ``from_s``: the interval of true time that has a bias, or bursts of it."""
+    creep_mps: float = 0.0
+    """By how much the bias grows from ``from_s`` on."""
 
     def active_m(self, t_s: float) -> float:
         """Bias at a true time, 0 between bursts."""
         if not self.from_s <= t_s < self.to_s:
             return 0.0
         if self.burst_s is None or t_s % (self.burst_s + self.pause_s) >= self.pause_s:
-            return self.bias_m
+            return self.bias_m + self.creep_mps * (t_s - self.from_s)
         return 0.0
 
 

@@ -17,13 +17,13 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.evaluation.scenarios import ROOM_QA_M2PS3, Room, wanderers
+from skyless.evaluation.scenarios import ROOM_QA_M2PS3, Room, wanderer, wanderers
 from skyless.evaluation.statistics import LevelCounts
 from skyless.kernels.arrays import Array
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.simulation.impairments import AnchorBias, Body, WarmUp
 from skyless.simulation.range_errors import RangeErrorModel
-from skyless.simulation.trajectory import Trajectory, Waypoints
+from skyless.simulation.trajectory import Static, Trajectory, Waypoints
 from skyless.site.lab import lab_site
 from skyless.site.model import AnchorSite, Site, TagsSite, WallSite
 from skyless.studies.common.plan import Cell, Limit, Plan, Row, seed_of, with_limits
@@ -39,6 +39,9 @@ _WARMUP_S: Final = 1.5
 _BOUND_RATIO: Final = 1.15
 """Over the Cramér–Rao bound, at most, in the room itself."""
 
+_LATER_RATIO: Final = 1.2
+"""Of the RMSE of tags that have lain still for long to that at first, at most."""
+
 _SHARE: Final = 0.25
 """Worlds of each case but the room itself, of those that the room has."""
 
@@ -49,6 +52,13 @@ _HALL_M: Final = (12.0, 16.0)
 _ROOM_3D_M: Final = (8.0, 6.0)
 _HEIGHTS_M: Final = (0.2, 3.0)
 """Of neighbouring anchors in the 3-D room."""
+_STAIRWELL_M: Final = (4.0, 6.0)
+_STAIRWELL_HEIGHTS_M: Final = (0.2, 3.8, 1.4, 5.0, 0.8, 4.4, 2.0, 5.2)
+"""Of its anchors, one after the other round the walls."""
+_LINE_M: Final = (10.0, 0.1)
+"""Length of the row of anchors along a wall, and by how much every second one stands off it."""
+_BESIDE_M: Final = ((0.5, 1.0), (9.5, 5.0))
+"""Corners of the box in which tags wander beside that row."""
 
 WALL: Final = WallSite(4.0, 3.0, 4.0, 5.0, delay_m=0.25)
 """Between the tags that walk past and three of the anchors, low enough for these to hear the others over it."""
@@ -63,6 +73,29 @@ _LATE_S: Final = (_WARMUP_S + 3.0, _WARMUP_S + 9.0)
 _CRYSTALS: Final = ((1.0, 20.0), (-1.0, 20.0), (2.0, 20.0), (-2.0, 20.0), (5.0, 60.0))
 """What tags' crystals gain in the end in ppm, and the time constant in s."""
 
+_POWER_CUT_PPM: Final = (0.5, 3.0)
+_POWER_CUT_TAU_S: Final = 60.0
+"""By how much the crystals of anchors that were all cold warm up, each by its own draw and with its own sign."""
+_DRAUGHTS_PPMPS: Final = ((0.01, 0.03), (0.03, 0.1))
+"""By how much the frequencies of all anchors change in a second."""
+_DRAUGHT_TAU_S: Final = 1e4
+"""Long enough for a warm-up to be a straight line in a study."""
+
+_FIELDS_M: Final = ((0.05, 0.075), (0.10, 0.12))
+"""Standard deviations of multipath, and the largest RMSE with each."""
+_FIELD_LENGTH_M: Final = 0.1
+"""Way in which the correlation of multipath falls to 1/e."""
+
+_CREEP_MPS: Final = 0.05
+_CREEPS_S: Final = (5.0, 20.0, 60.0)
+
+_LONG_WORLDS: Final = 2
+"""Of cases whose worlds last for minutes."""
+_REST_SPANS: Final = 8
+_WALK_SPANS: Final = 4
+"""Of as much time as is judged elsewhere: of tags at rest, with the span judged, and of walks before it."""
+_QUICK_SPANS: Final = 2
+
 TURNS_MPS2: Final = (3.0, 6.0, 10.0, 30.0)
 _TURNING_MPS: Final = 3.0
 _STATED_MPS2: Final = 10.0
@@ -70,6 +103,7 @@ _STATED_MPS2: Final = 10.0
 
 _LATE_KEY: Final = 23
 _PATH_KEY: Final = 29
+_CRYSTAL_KEY: Final = 31
 """Of streams of random numbers, next to the worlds' own."""
 
 _BOUND_SPEED_STD_MPS: Final = 1.0
@@ -83,7 +117,8 @@ Paths = Callable[[int], Sequence[Trajectory]]
 
 def cases(plan: Plan) -> list[Case]:
     """The room, and what differs from it in one thing."""
-    return [*_rooms(plan), *_errors(plan), *_obstacles(plan), *_late(plan), *_crystals(plan), *_turns(plan)]
+    changes = (*_crystals(plan), *_power_cuts(plan), *_turns(plan))
+    return [*_rooms(plan), *_rests(plan), *_errors(plan), *_fields(plan), *_obstacles(plan), *_late(plan), *changes]
 
 
 def _case(
@@ -94,14 +129,15 @@ def _case(
     site: Site | None = None,
     paths: Paths | None = None,
     bounded: bool = False,
+    long: bool = False,
     **faults: Any,  # noqa: ANN401 - of ``worlds``
 ) -> Case:
     """``bounded``: nothing is wrong but what the room's errors of survey and ranges are, so that there is a bound."""
     in_site = site or lab_site(plan.noise_ps)
-    count = plan.worlds if name == BASE else max(2, round(_SHARE * plan.worlds))
+    count = plan.worlds if name == BASE else max(2, _LONG_WORLDS if long else round(_SHARE * plan.worlds))
     trajectories = paths or partial(wanderers, in_site, plan.tags)
-    faults = {"room": Room(), **faults}
-    runs = worlds(plan, in_site, trajectories, warmup_s=_WARMUP_S, count=count, **faults)
+    faults = {"room": Room(), "warmup_s": _WARMUP_S, **faults}
+    runs = worlds(plan, in_site, trajectories, count=count, **faults)
     return Case(name, series, None, runs, limits=limits, biases=biases_of(faults["room"]) if bounded else None)
 
 
@@ -110,8 +146,9 @@ def _exceeded(most: float) -> Limit:
 
 
 def _rooms(plan: Plan) -> list[Case]:
+    hall = (Limit("level", 0.97), Limit("nees", 0.5, 1.5))
     usual = (
-        Limit("rmse_m", most=0.029),
+        Limit("rmse_m", most=0.030),
         Limit("nees", 0.7, 1.3),
         Limit("level", 0.99),
         _exceeded(1e-4),
@@ -120,9 +157,56 @@ def _rooms(plan: Plan) -> list[Case]:
     return [
         replace(_case(plan, BASE, "rooms", *usual, bounded=True), limit=_BOUND_RATIO),
         _case(plan, AIR, "rooms", Limit("rmse_m", most=0.019), room=None, bounded=True),
-        _case(plan, "hall, 8 anchors", "rooms", Limit("level", 0.97), site=hall_site(plan.noise_ps), bounded=True),
-        _case(plan, "3-D room, 8 anchors", "rooms", site=room_3d_site(plan.noise_ps), bounded=True),
+        _case(plan, "hall, 8 anchors", "rooms", *hall, site=hall_site(plan.noise_ps), bounded=True),
+        *(
+            _case(plan, name, "rooms", Limit("rmse_m", most=most_m), site=site, bounded=True)
+            for name, most_m, site in (
+                ("3-D room, 8 anchors", 0.050, room_3d_site(plan.noise_ps)),
+                ("stairwell in 3-D, 8 anchors", 0.038, stairwell_site(plan.noise_ps)),
+            )
+        ),
+        _case(
+            plan,
+            "anchors in a line",
+            "rooms",
+            *(Limit("level", most=0.0), _exceeded(0.0)),
+            site=line_site(plan.noise_ps),
+            paths=partial(_beside_the_line, plan.tags),
+        ),
     ]
+
+
+def _spans_s(plan: Plan, spans: int) -> float:
+    return min(spans, _QUICK_SPANS if plan.quick else spans) * plan.seconds
+
+
+def _rests(plan: Plan) -> list[Case]:
+    """Tags that lie still from the start on: judged at first, and a second time when they have lain for long."""
+    later_s = _WARMUP_S + _spans_s(plan, _REST_SPANS) - plan.seconds
+    limits = (Limit("nees", most=2.0), _exceeded(0.0))
+    found = []
+    for name, site, room in (
+        ("at rest, unbiased air", lab_site(plan.noise_ps), None),
+        ("at rest", lab_site(plan.noise_ps), Room()),
+        ("at rest, 3-D room", room_3d_site(plan.noise_ps), Room()),
+    ):
+        resting = partial(_still, site, plan.tags)
+        first = _case(plan, name, "rest", *limits, site=site, paths=resting, room=room, long=True)
+        later = _case(
+            plan, f"{name}, later", "rest", *limits, site=site, paths=resting, room=room, long=True, warmup_s=later_s
+        )
+        found += [first, replace(later, of=name, limit=_LATER_RATIO)]
+    return found
+
+
+def _still(site: Site, tags: int, seed: int) -> Sequence[Trajectory]:
+    """Tags that stay where those that wander begin."""
+    return [Static(*path.position(0.0).tolist()) for path in wanderers(site, tags, seed)]
+
+
+def _beside_the_line(tags: int, seed: int) -> Sequence[Trajectory]:
+    low_m, high_m = (np.array((*corner_m, 0.0)) for corner_m in _BESIDE_M)
+    return [wanderer(low_m, high_m, seed, tag) for tag in range(tags)]
 
 
 def _errors(plan: Plan) -> list[Case]:
@@ -152,6 +236,22 @@ def _errors(plan: Plan) -> list[Case]:
     ]
 
 
+def _fields(plan: Plan) -> list[Case]:
+    """Multipath over centimetres besides the room's own errors, at tags that have walked through it for a while."""
+    return [
+        _case(
+            plan,
+            f"multipath of {100 * std_m:.0f} cm over {100 * _FIELD_LENGTH_M:.0f} cm",
+            "ranges",
+            *(Limit("rmse_m", most=most_m), Limit("nees", most=2.0), _exceeded(1e-3)),
+            room=Room(ranges=replace(Room().ranges, changing_m=std_m, correlation_m=_FIELD_LENGTH_M)),
+            long=True,
+            warmup_s=_spans_s(plan, _WALK_SPANS),
+        )
+        for std_m, most_m in _FIELDS_M
+    ]
+
+
 def _obstacles(plan: Plan) -> list[Case]:
     lab = lab_site(plan.noise_ps)
     wall = (Limit("rmse_m", most=0.08), Limit("nees", most=3.0), _exceeded(1e-3))
@@ -173,7 +273,18 @@ def _late(plan: Plan) -> list[Case]:
                 limits = () if count == 1 else (_exceeded(1e-3),)
                 late = partial(late_anchors, plan, count, span_m, from_s, to_s)
                 found.append(_case(plan, name, "late anchors", *limits, biases=late))
+    for creep_s in _CREEPS_S[: 1 if plan.quick else None]:
+        name, long = f"1 of 6 creeps 5 cm/s for {creep_s:.0f} s", creep_s > plan.seconds
+        late = partial(creeping_anchor, plan, creep_s)
+        seconds = max(plan.seconds, creep_s)
+        found.append(_case(plan, name, "late anchors", _exceeded(1e-3), biases=late, seconds=seconds, long=long))
     return found
+
+
+def creeping_anchor(plan: Plan, creep_s: float, number: int) -> tuple[AnchorBias, ...]:
+    """Another anchor in each world, whose range creeps from the start of the judging on and is then right again."""
+    anchor = anchor_of(lab_site(plan.noise_ps), number).id
+    return (AnchorBias(anchor, 0.0, from_s=_WARMUP_S, to_s=_WARMUP_S + creep_s, creep_mps=_CREEP_MPS),)
 
 
 def late_anchors(
@@ -200,6 +311,33 @@ def _crystals(plan: Plan) -> list[Case]:
         replace(case, of=BASE, limit=1.3)
         for case in (*tags, _case(plan, "an anchor's crystal +1 ppm", "crystals", warm_ups=of_an_anchor))
     ]
+
+
+def _power_cuts(plan: Plan) -> list[Case]:
+    """All anchors' crystals change at once from the start on: cold ones warm up, or draughts cool and warm them."""
+    low, high = _POWER_CUT_PPM
+    cases = [(f"all anchors' crystals ±{low:g}–{high:g} ppm", low, high, _POWER_CUT_TAU_S, 0.04)]
+    for (low, high), most_m in zip(_DRAUGHTS_PPMPS, (0.04, 0.08), strict=True):
+        name = f"all anchors' crystals ±{low:g}–{high:g} ppm/s"
+        cases.append((name, low * _DRAUGHT_TAU_S, high * _DRAUGHT_TAU_S, _DRAUGHT_TAU_S, most_m))
+    return [
+        _case(
+            plan,
+            name,
+            "crystals",
+            *(Limit("rmse_m", most=most_m), Limit("level", 0.95), _exceeded(1e-3)),
+            warm_ups=partial(warming_anchors, plan, low, high, tau_s),
+        )
+        for name, low, high, tau_s, most_m in cases
+    ]
+
+
+def warming_anchors(plan: Plan, low_ppm: float, high_ppm: float, tau_s: float, number: int) -> tuple[WarmUp, ...]:
+    """Each anchor's crystal by its own amount and sign, from before the tags are switched on."""
+    anchors = lab_site(plan.noise_ps).anchors
+    draw = np.random.default_rng(seed_of(plan.seed, number, _CRYSTAL_KEY))
+    gains_ppm = draw.uniform(low_ppm, high_ppm, len(anchors)) * draw.choice((-1.0, 1.0), len(anchors))
+    return tuple(WarmUp(ppm, tau_s, 0.0, one.id) for one, ppm in zip(anchors, gains_ppm.tolist(), strict=True))
 
 
 def _turns(plan: Plan) -> list[Case]:
@@ -233,10 +371,28 @@ def hall_site(noise_ps: float) -> Site:
 
 def room_3d_site(noise_ps: float) -> Site:
     """Eight anchors on the walls of 8 m × 6 m, high and low by turns; the height of tags is not given."""
+    return _site_3d(noise_ps, "3-D room", _ROOM_3D_M, tuple(_HEIGHTS_M[k % 2] for k in range(1, 9)))
+
+
+def stairwell_site(noise_ps: float) -> Site:
+    """Eight anchors on the walls of 4 m × 6 m, over 5 m of height; the height of tags is not given."""
+    return _site_3d(noise_ps, "stairwell", _STAIRWELL_M, _STAIRWELL_HEIGHTS_M)
+
+
+def _site_3d(noise_ps: float, name: str, floor_m: tuple[float, float], heights_m: Sequence[float]) -> Site:
     anchors = tuple(
-        AnchorSite(id=k, x_m=x, y_m=y, z_m=_HEIGHTS_M[k % 2]) for k, (x, y) in enumerate(_around(*_ROOM_3D_M), start=1)
+        AnchorSite(id=k, x_m=x, y_m=y, z_m=z_m)
+        for k, ((x, y), z_m) in enumerate(zip(_around(*floor_m), heights_m, strict=True), start=1)
     )
-    return replace(lab_site(noise_ps), name="3-D room", anchors=anchors, tags=TagsSite())
+    return replace(lab_site(noise_ps), name=name, anchors=anchors, tags=TagsSite())
+
+
+def line_site(noise_ps: float) -> Site:
+    """Six anchors along one wall, every second one a little off it: all tags are on one side, which ranges hide."""
+    (length_m, off_m), lab = _LINE_M, lab_site(noise_ps)
+    places = enumerate(np.linspace(0.0, length_m, len(lab.anchors)).tolist())
+    anchors = tuple(AnchorSite(id=k + 1, x_m=x_m, y_m=off_m * (k % 2)) for k, x_m in places)
+    return replace(lab, name="line", anchors=anchors)
 
 
 def _around(x_m: float, y_m: float) -> list[tuple[float, float]]:

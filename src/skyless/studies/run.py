@@ -22,6 +22,7 @@ def check_amounts(
     seconds: float | None,
     noise_ps: float | None,
     qa: float | None,
+    dynamics: str | None,
     integrity_risk: float | None,
     alert_limit_m: float | None,
 ) -> None:
@@ -31,7 +32,7 @@ def check_amounts(
     if name not in OF_EPISODES and episodes is not None:
         takes = f"{name} takes --worlds and --seconds"
         raise SkylessError(f"--episodes is for the studies efficiency and integrity; {takes}")
-    others = {"worlds": worlds, "seconds": seconds, "noise-ps": noise_ps, "qa": qa}
+    others = {"worlds": worlds, "seconds": seconds, "noise-ps": noise_ps, "qa": qa, "dynamics": dynamics}
     given = [option for option, value in others.items() if value is not None]
     unfit = [option for option in given if option in {"worlds", "seconds"}]
     if name == "integrity" and unfit:

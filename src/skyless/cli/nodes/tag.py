@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
+from skyless.arguments import process_noise
 from skyless.cli.common.options import (
     NotNegative,
     Positive,
@@ -22,7 +23,7 @@ from skyless.cli.common.progress import loading_kernels
 from skyless.cli.nodes.fix_lines import FixLines, LineOptions
 from skyless.cli.nodes.options import MqttOptions, SiteId, log
 from skyless.errors import SkylessError
-from skyless.method_names import DEFAULT_METHOD
+from skyless.method_names import DEFAULT_METHOD, Dynamics
 from skyless.nodes.open_radio import (
     DEFAULT_RADIO,
     hears_positions,
@@ -59,8 +60,10 @@ class TagOptions:
     Several tags have several paths, with commas; PATH@BAUD gives another rate."""
     method: str = DEFAULT_METHOD
     """How positions are computed (sniffers and FiRa boards: always joint)."""
-    qa: Positive = 0.3
-    """Process noise for the tags' motion: spectral density of the acceleration in m²/s³ (joint)."""
+    qa: Positive | None = None
+    """Process noise for the tags' motion: spectral density of the acceleration in m²/s³ (joint); by default 0.3."""
+    dynamics: Dynamics | None = None
+    """How tags move: walk (as people), robot or drone, which sets the process noise instead of --qa."""
     protection: ProtectionOptions = ProtectionOptions()
     tag_height_std: NotNegative | None = None
     """Standard deviation of the tags' height from the one that is given, in metres, which fixes and levels then
@@ -179,7 +182,7 @@ def _on_radios(
     trust = _site_trust(asked)
     settings = TagSettings(
         asked.method,
-        asked.qa,
+        process_noise(asked.qa, asked.dynamics) or 0.3,
         asked.site_id if trust is None else trust.site,
         integrity=required,
         publish_hz=asked.publish_hz,
@@ -271,7 +274,7 @@ def _system(asked: TagOptions) -> "PacketTagSettings":
     return PacketTagSettings(
         anchors_m,
         site=TDOA_SITE if asked.site_id is None else asked.site_id,
-        qa=asked.qa,
+        qa=process_noise(asked.qa, asked.dynamics) or 0.3,
         height_m=height_m,
         height_std_m=std_m if asked.tag_height_std is None else asked.tag_height_std,
         auto_height=asked.anchors is None and asked.tag_height in (None, "auto"),

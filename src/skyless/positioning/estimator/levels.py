@@ -77,65 +77,71 @@ def protect(s: EstimatorState, levels: Vector) -> None:
     levels[VPL] += s.settings[0]["max_acceleration_mps2"] * np.sqrt(up)
 
 
-# Whether the anchors determine the height
+# Whether the anchors determine on which side of them the tag is
 
 
 PROBE_M: Final = 1.0
 """Least distance from the plane at which the two sides are compared; for a tag that is farther off it is its own."""
 
+SHIFT_PART: Final = 0.25
+"""Of that distance: standard deviation of how far the best position on the other side may lie from the mirror image."""
+
 SIDES_CHI2: Final = 25.0
 """The sides differ where their ranges' squared differences, over the variance of range errors, sum to more."""
-
-LEAST_ANCHORS: Final = 3
 
 SENSOR_VALID_S: Final = 1.0
 """Time for which a sensor's height resolves which side it is."""
 
 
 def fit_plane(s: EstimatorState) -> None:
-    """Find the plane of least squares through the anchors, where the height is estimated."""
-    status, anchors_m = s.status[0], s.anchors["position_m"]
+    """Find the plane of least squares through the anchors; where the height is given, the line on the floor plan."""
+    status, dim = s.status[0], int(s.settings[0]["dim"])
+    anchors_m = s.anchors["position_m"][:, :dim]
     status["plane_normal"] = 0.0
-    if s.settings[0]["dim"] == 3 and len(anchors_m) >= LEAST_ANCHORS:
-        status["plane_m"] = anchors_m.mean(axis=0)
-        status["plane_normal"] = np.linalg.svd(anchors_m - status["plane_m"], full_matrices=False)[2][2]
+    if len(anchors_m) >= dim:
+        status["plane_m"][:dim] = anchors_m.mean(axis=0)
+        status["plane_normal"][:dim] = np.linalg.svd(anchors_m - status["plane_m"][:dim])[2][dim - 1]
 
 
 @step
-def _apart_m(s: EstimatorState, anchor: int, off_m: float, probe_m: float) -> float:
-    """By how much an anchor is farther from a point above the tag's foot in the plane than from one below."""
-    normal, a_m = s.status[0]["plane_normal"], s.anchors[anchor]["position_m"]
-    above, below = 0.0, 0.0
-    for axis in range(3):
-        foot_m = s.x[axis] - off_m * normal[axis] - a_m[axis]
-        above += (foot_m + probe_m * normal[axis]) ** 2
-        below += (foot_m - probe_m * normal[axis]) ** 2
-    return float(np.sqrt(above) - np.sqrt(below))
+def is_side_open(s: EstimatorState) -> bool:
+    """Whether the tag and its mirror image behind the anchors' plane, or in 2-D their line, explain the ranges alike.
 
-
-@step
-def is_height_open(s: EstimatorState) -> bool:
-    """Whether the tag and its mirror image behind the anchors' plane explain the ranges alike.
-
-    Range errors make up for what is left of the difference, and what all ranges have in common is the tag's clock.
+    Range errors make up for what the tag's clock and a shift of the image, by least squares, leave of the difference.
     Not where the image lies where the tag cannot be, nor while a sensor measures the height.
     """
-    status, settings = s.status[0], s.settings[0]
-    normal, count, off_m, square, total = status["plane_normal"], len(s.anchors), 0.0, 0.0, 0.0
+    status, settings, work, off_m, square = s.status[0], s.settings[0], s.work, 0.0, 0.0
+    normal, dim, count = status["plane_normal"], settings["dim"], len(s.anchors)
     variance = settings["range_std_m"] ** 2 + settings["survey_std_m"] ** 2 + settings["rx_variance_m2"]
-    if settings["dim"] == 3:
-        for axis in range(3):
-            off_m += normal[axis] * (s.x[axis] - status["plane_m"][axis])
+    for axis in range(dim):
+        off_m += normal[axis] * (s.x[axis] - status["plane_m"][axis])
+    probe_m = max(abs(off_m), PROBE_M) * (1.0 if off_m > 0.0 else -1.0)
+    if count > dim:
+        for one in range(dim + 2):
+            for other in range(dim + 1):
+                work[one, other] = variance / (SHIFT_PART * probe_m) ** 2 if one == other < dim else 0.0
         for anchor in range(count):
-            apart_m = _apart_m(s, anchor, off_m, max(abs(off_m), PROBE_M))
-            total += apart_m
+            tag_m = image_m = 0.0 if dim == 3 else (settings["height_m"] - s.anchors[anchor]["position_m"][2]) ** 2
+            for axis in range(dim):
+                foot_m = s.x[axis] - off_m * normal[axis] - s.anchors[anchor]["position_m"][axis]
+                work[dim + 2, axis] = foot_m - probe_m * normal[axis]
+                tag_m += (foot_m + probe_m * normal[axis]) ** 2
+                image_m += (foot_m - probe_m * normal[axis]) ** 2
+            apart_m, nearness, work[dim + 2, dim] = np.sqrt(image_m) - np.sqrt(tag_m), 1.0 / np.sqrt(image_m), 1.0
             square += apart_m * apart_m
-    is_flat = square - total * total / count < SIDES_CHI2 * variance
+            for one in range(dim + 1):
+                work[dim + 2, one] *= nearness if one < dim else 1.0
+                work[dim + 1, one] += work[dim + 2, one] * apart_m
+                for other in range(one + 1):
+                    work[one, other] += work[dim + 2, one] * work[dim + 2, other]
+        whiten(work, dim + 1, 1)
+        for one in range(dim + 1):
+            square -= work[dim + 1, one] ** 2
     image_z_m = s.x[2] - 2.0 * off_m * normal[2]
-    is_image_possible = settings["lowest_m"] <= image_z_m <= settings["highest_m"]
+    is_possible = dim == 2 or settings["lowest_m"] <= image_z_m <= settings["highest_m"]
     is_near = off_m * off_m * normal[2] ** 2 <= s.P[2, 2]
     has_sensor = (status["epoch_ticks"] - status["height_ticks"]) * TICK_S < SENSOR_VALID_S
-    return bool(settings["dim"] == 3 and is_flat and not has_sensor and (is_image_possible or is_near))
+    return bool(square < SIDES_CHI2 * variance and not has_sensor and (is_possible or is_near))
 
 
 # Whether a position can be relied on
@@ -161,25 +167,17 @@ change, and a filter that is linearised at a wrong position becomes too certain 
 
 
 @step
-def _relative_std(s: EstimatorState) -> float:
-    """The position's horizontal standard deviation as a part of the mean range; levels are of first order in it."""
-    range_m = 0.0
-    for anchor in range(len(s.anchors)):
-        range_m += s.anchors[anchor]["range_m"] / len(s.anchors)
-    return float(np.sqrt(s.P[0, 0] + s.P[1, 1]) / max(range_m, 1e-6))
-
-
-@step
 def integrity_state(s: EstimatorState, levels: Vector) -> int:
     """Whether a position's levels can be relied on: ``SOUND``, ``OBSTRUCTED``, ``CONTRADICTED`` or ``UNAVAILABLE``."""
     count, status = len(s.anchors), s.status[0]
-    state = SOUND
+    state, range_m = SOUND, 0.0
     for anchor in range(count):
+        range_m += s.anchors[anchor]["range_m"] / count
         if s.anchors[anchor]["is_obstructed"] or s.anchors[anchor]["has_fault"]:
             state = OBSTRUCTED
     was_contradicted = status["fault_std_m"] > LASTING_STD_M  # then none are selected
     limit = SURE_CHI2 if was_contradicted else UNCOVERED_CHI2
-    share = _relative_std(s)
+    share = np.sqrt(s.P[0, 0] + s.P[1, 1]) / max(range_m, 1e-6)  # levels are of first order in it
     if status["withholds_levels"] or max(levels[LASTING_CHI2], levels[RECENT_CHI2]) > limit:
         state = CONTRADICTED
     if was_contradicted and (status["epoch_ticks"] - status["start_ticks"]) * TICK_S < CONTRADICTED_START_S:
@@ -187,6 +185,6 @@ def integrity_state(s: EstimatorState, levels: Vector) -> int:
     if status["open_range_errors"] and share > MAX_OPEN_LEVEL_STD:
         state = CONTRADICTED
     is_new = count <= s.settings[0]["dim"] or status["packets"] < FIRST_PACKETS * count
-    if is_new or share > MAX_LEVEL_STD or is_height_open(s):
+    if is_new or share > MAX_LEVEL_STD or is_side_open(s):
         state = UNAVAILABLE
     return state

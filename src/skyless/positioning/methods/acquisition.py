@@ -17,7 +17,7 @@ from msgspec import Struct
 from skyless.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.kernels.arrays import Array
 from skyless.positioning.fix import NoFixReason
-from skyless.positioning.methods.locate import RESIDUAL_TAIL, NoSolution, locate_pseudoranges
+from skyless.positioning.methods.locate import RESIDUAL_TAIL, RIVAL_MINIMUM_CHI2, NoSolution, locate_pseudoranges
 from skyless.positioning.observation import Observation
 
 START_MAX_AGE_S: Final = 0.5
@@ -107,12 +107,16 @@ class Acquisition(Struct):
     _max_age_s: float
     _speed_std_mps: float
     """Of a tag that is assumed to be fast this makes a start wide, and more anchors do not help."""
+    _error_variance_m2: float = 0.0
+    """Of survey and ranges: rivals differ by more than these errors, too, lest a start takes a mirror image."""
     _heard: dict[int, list[Observation]] = {}
     _possible_ticks: int | None = None
     """When a start was first possible."""
     _contradicted_ticks: int | None = None
     """When packets first contradicted each other."""
     _links: dict[tuple[int, int], _Link] = {}
+    _rival_count: int = 0
+    """Anchors with which two positions fitted alike; as many of them are tried again once a superframe only."""
 
     def expect_height(self, low_m: float, high_m: float) -> None:
         """Look only between these heights from now on."""
@@ -152,9 +156,10 @@ class Acquisition(Struct):
         needed = 4 if self._height_m is None else 3
         if len(pairs) < needed:
             return NoFixReason.TOO_FEW_ANCHORS
-        if not came_around:
-            return NoFixReason.ACQUIRING
+        if not came_around or (len(pairs) == self._rival_count and observation.anchor != pairs[0][-1].anchor):
+            return NoFixReason.MIRROR if self._rival_count else NoFixReason.ACQUIRING
         result = self._solve(pairs, now)
+        self._rival_count = len(pairs) if result is NoFixReason.MIRROR else 0
         if isinstance(result, Start):
             return self._unless_wide(result)
         if result not in CONTRADICTIONS or len(pairs) <= needed + 1 or observation.anchor != pairs[0][-1].anchor:
@@ -276,18 +281,13 @@ class Acquisition(Struct):
             height_m=self._height_m,
             z_bounds_m=self._z_bounds_m,
             residual_tail=residual_tail,
+            rival_chi2=RIVAL_MINIMUM_CHI2 * (1.0 + self._error_variance_m2 / float(variances.min())),
         )
         if isinstance(result, NoSolution):
             return result.reason
         dim = 3 if self._height_m is None else 2
         solution = np.append(result.position_m[:dim], result.bias_m)
-        return Start(
-            tuple(newest),
-            now,
-            solution,
-            result.covariance_joint_m2,
-            self._speed_std_mps**2,
-        )
+        return Start(tuple(newest), now, solution, result.covariance_joint_m2, self._speed_std_mps**2)
 
 
 def _offset_ticks(observation: Observation) -> tuple[int, float]:

@@ -325,9 +325,10 @@ class Estimation:
         settings = self._settings
         max_age_s = max(START_MAX_AGE_S, 2.5 * self._superframe_s)
         variance = settings.tx_variance_m2 + settings.rx_variance_m2
+        errors = settings.range_std_m**2 + settings.survey_std_m**2
         if self._superframe_s > LONGEST_SUPERFRAME_S:
-            variance += settings.range_std_m**2 + settings.survey_std_m**2
-        return Acquisition(settings.height_m, variance, self._z_bounds_m, max_age_s, self._speed_std_mps)
+            variance += errors
+        return Acquisition(settings.height_m, variance, self._z_bounds_m, max_age_s, self._speed_std_mps, errors)
 
     def _is_out_of_reach(self, observation: Observation) -> bool:
         """Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back."""

@@ -166,6 +166,7 @@ def locate(
     weighted: bool = True,
     z_bounds_m: tuple[float, float] | None = None,
     residual_tail: float = RESIDUAL_TAIL,
+    rival_chi2: float = RIVAL_MINIMUM_CHI2,
 ) -> Solution | NoSolution:
     """Locate a tag by TDoAs ``tdoa_m[i] = |p − anchors_m[i + 1]| − |p − anchors_m[0]|``.
 
@@ -173,9 +174,9 @@ def locate(
     symmetric. ``height_m``: the tag's known height (2-D positioning; anchors may have any
     heights). ``weighted=False`` minimises the plain sum of squares; its covariance still follows from Σ.
 
-    Where two positions explain the data about equally well, as the two sides of the anchors' plane do in 3-D,
-    ``z_bounds_m`` may decide; else the answer is MIRROR. A tag so near that plane that the two have merged is put
-    into it, with a variance that covers both. Residuals less likely than ``residual_tail`` give RESIDUALS (0 lets
+    Where two positions explain the data about equally well (``rival_chi2``), as the two sides of the anchors' plane do
+    in 3-D, ``z_bounds_m`` may decide; else the answer is MIRROR. A tag so near that plane that the two have merged is
+    put into it, with a variance that covers both. Residuals less likely than ``residual_tail`` give RESIDUALS (0 lets
     everything pass). No value raises; arrays that do not fit each other raise ValueError.
     """
     problem = _prepare(
@@ -187,20 +188,17 @@ def locate(
     )
     if isinstance(problem, NoSolution):
         return problem
-    limit = chi2_limit(problem.dof, residual_tail)
     minima, status = find_minima(problem)
     if not minima:
         return _why_none(problem, status)
     best = minima[0]
+    excess = below_plane(best) if problem.kind == PLANE else 0.0
+    if best.chi2 + excess > chi2_limit(problem.dof + (1 if excess else 0), residual_tail):
+        return NoSolution(NoFixReason.RESIDUALS, f"no position fits these TDoAs: chi2 is {best.chi2 + excess:.3g}")
     if problem.kind == PLANE:
-        excess = below_plane(best)
-        if best.chi2 + excess > (chi2_limit(problem.dof + 1, residual_tail) if excess else limit):
-            return _residuals_too_large(best.chi2 + excess)
         minima = unfold(best)
-    elif best.chi2 > limit:
-        return _residuals_too_large(best.chi2)
     else:
-        minima = [best, *(m for m in minima[1:] if m.chi2 <= best.chi2 + RIVAL_MINIMUM_CHI2 and distinct(best, m))]
+        minima = [best, *(m for m in minima[1:] if m.chi2 <= best.chi2 + rival_chi2 and distinct(best, m))]
     return _decide(problem, minima, z_bounds_m)
 
 
@@ -212,6 +210,7 @@ def locate_pseudoranges(
     height_m: float | None = None,
     z_bounds_m: tuple[float, float] | None = None,
     residual_tail: float = RESIDUAL_TAIL,
+    rival_chi2: float = RIVAL_MINIMUM_CHI2,
 ) -> PseudorangeSolution | NoSolution:
     """Locate a tag by pseudoranges |p − anchors_m[i]| + bias with independent errors.
 
@@ -234,6 +233,7 @@ def locate_pseudoranges(
         height_m=height_m,
         z_bounds_m=z_bounds_m,
         residual_tail=residual_tail,
+        rival_chi2=rival_chi2,
     )
     if isinstance(solution, NoSolution):
         return solution
@@ -320,10 +320,6 @@ def _why_none(problem: Problem, status: int) -> NoSolution:
     return NoSolution(NoFixReason.BAD_GEOMETRY, "these anchors do not determine a position there")
 
 
-def _residuals_too_large(chi2: float) -> NoSolution:
-    return NoSolution(NoFixReason.RESIDUALS, f"no position fits these TDoAs: chi2 is {chi2:.3g}")
-
-
 def _decide(problem: Problem, minima: list[Minimum], z_bounds_m: tuple[float, float] | None) -> Solution | NoSolution:
     """Choose among rivals by the height's bounds, and reject what is not resolved."""
     positions = [problem.origin + problem.axes.T @ minimum.state for minimum in minima]
@@ -339,15 +335,9 @@ def _decide(problem: Problem, minima: list[Minimum], z_bounds_m: tuple[float, fl
     distance = float(np.abs(minimum.state).sum())
     if not covariance.trace() < (problem.extent + distance) ** 2:
         return NoSolution(NoFixReason.BAD_GEOMETRY, "the position's error exceeds its distance from the anchors")
-    return Solution(
-        position_m=positions[chosen],
-        covariance_m2=covariance,
-        residuals_m=minimum.residuals,
-        chi2=minimum.chi2,
-        dof=problem.dof,
-        mirror_m=positions[0 if chosen else 1] if len(minima) > 1 else None,
-        iterations=minimum.iterations,
-    )
+    mirror_m = positions[0 if chosen else 1] if len(minima) > 1 else None
+    found = (minimum.residuals, minimum.chi2, problem.dof, mirror_m, minimum.iterations)
+    return Solution(positions[chosen], covariance, *found)
 
 
 def _by_height(positions: list[Array], covariances: list[Array], z_bounds_m: tuple[float, float] | None) -> int | None:
@@ -386,16 +376,18 @@ def find_minima(problem: Problem) -> tuple[list[Minimum], int]:
     """All minima that are found, the best first, and how the last iteration that failed ended.
 
     The closed form's starts depend on the reference and miss about one rival in a hundred; the anchors' centroid
-    finds most of these.
+    finds most of these, and the mirror image of what is found the rest where anchors are nearly in one line or plane.
     """
     found: list[Minimum] = []
-    status = CONVERGED
+    status, starts = CONVERGED, [*_algebraic_starts(problem), *_central_starts(problem)]
     whitener, scale = problem.whitener if problem.weighted else np.eye(len(problem.tdoa)), problem.scale
     system = np.empty((len(problem.tdoa), problem.dims + 1))
-    for state in (*_algebraic_starts(problem), *_central_starts(problem)):
+    for state in starts:
         end, iterations = descend(problem.anchors, problem.tdoa, problem.kind, whitener, scale, system, state)
         status = end or status
         if end == CONVERGED and not any(_same(minimum.state, state, scale) for minimum in found):
+            if problem.kind != PLANE and not found and len(starts) < 9:  # singular minima do not go on without end
+                starts.append(_image(problem, state))
             found += _assess(problem, system, state, iterations)
     found.sort(key=lambda minimum: minimum.cost)
     return found, status
@@ -464,6 +456,14 @@ def _central_starts(problem: Problem) -> list[Array]:
     if problem.kind == FREE:
         return [np.array([x, y, z + off]), np.array([x, y, z - off])]
     return [np.array([x, y, problem.height if problem.kind == HEIGHT else off * off])]
+
+
+def _image(problem: Problem, state: Array) -> Array:
+    """The mirror image behind the anchors' line or plane of least squares; a given height stays."""
+    anchors, image = problem.anchors[:, : problem.dims], state.copy()
+    normal = np.linalg.svd(anchors - anchors.mean(axis=0))[2][-1]
+    image[: problem.dims] -= 2.0 * float(normal @ (state[: problem.dims] - anchors.mean(axis=0))) * normal
+    return image
 
 
 # Iterations
