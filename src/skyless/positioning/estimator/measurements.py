@@ -471,12 +471,8 @@ def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: f
 
 @step
 def _bound_changes(s: EstimatorState) -> None:
-    """Move changing parts that are below their bound onto it: the likeliest state where nothing is early by more.
-
-    x moves by P·h/(hᵀ·P·h) times what is missing; P, which a bound that holds narrows somewhat, stays.
-    """
-    change = layout(s.settings[0]["dim"], len(s.anchors)).change
-    x, P = s.x, s.P
+    """Move changing parts that are below their bound onto it: the likeliest state of all where nothing is earlier."""
+    x, P, change = s.x, s.P, layout(s.settings[0]["dim"], len(s.anchors)).change
     for anchor in range(len(s.anchors)):
         missing_m, m = s.settings[0]["earliest_m"] - x[change + anchor], change + anchor
         if missing_m > 0.0:

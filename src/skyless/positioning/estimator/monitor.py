@@ -73,8 +73,8 @@ RECEPTION_HUBER: Final = 1.5
 DIFFERENCE_HUBER: Final = 1.0
 """Number of standard deviations beyond which the innovations of ready-made differences have less weight."""
 
-MAX_CHANGE_STD_M: Final = 2.0
-"""Of the part of range errors that changes as the tag moves; larger ones are jumps."""
+MAX_CHANGE_STD_M: Final = 0.5
+"""Of the part of range errors that changes as the tag moves."""
 
 MOVED: Final = 1.0
 """Mean square of what a tag is away from where it was, over the variances, beyond which it counts as moving."""

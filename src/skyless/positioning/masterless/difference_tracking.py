@@ -32,7 +32,7 @@ DIFFERENCES: Final = EstimatorSettings(
     place_distance_m=0.5,
     place_time_s=30.0,
     change_memory_s=1.5,
-    earliest_m=-0.3,
+    earliest_m=-0.25,
     stationary_s=3.0,
 )
 """What recorded flights of DW1000s show (docs/recordings.md): reflections change within half a metre, and by how much
@@ -59,9 +59,6 @@ SHORT_SILENCE_S: Final = 0.1
 
 TRY_EVERY_S: Final = 0.1
 """Between two attempts at a start."""
-
-CONFIRMED_M: Final = 0.5
-"""A start with a rival is believed once the tag has moved by this, as the directions to the anchors have changed."""
 
 CONTRADICTED_CHI2: Final = 25.0
 """A start from later differences that is farther off (3-D: once in 60,000) begins again."""
@@ -177,7 +174,7 @@ class DifferenceTracking:
         if state.P[0, 0] + state.P[1, 1] > MAX_HORIZONTAL_STD_M**2:
             self.reason = NoFixReason.ACQUIRING
             return False
-        if dim == 3 and state.P[2, 2] > start.extent_m**2:
+        if dim == 3 and state.P[2, 2] > MAX_HORIZONTAL_STD_M**2:
             self.reason = NoFixReason.BAD_GEOMETRY
             return False
         return True
@@ -225,7 +222,7 @@ class DifferenceTracking:
             gap_m = position_m - start.position_m[:dim]
             both_m2 = covariance_m2[:dim] + start.covariance_m2[:dim, :dim]
             if start.is_doubtful or gap_m @ np.linalg.solve(both_m2, gap_m) < CONTRADICTED_CHI2:
-                has_moved = bool(np.linalg.norm(position_m - self._start.position_m[:dim]) > CONFIRMED_M)
+                has_moved = bool(np.linalg.norm(position_m - self._start.position_m[:dim]) > RIVAL_M)
                 self._is_confirmed = has_moved or not start.is_doubtful
                 self._estimator.withhold_levels(not self._is_confirmed)
                 window.clear()
@@ -246,11 +243,8 @@ class DifferenceTracking:
 # Start
 
 
-NEIGHBOURHOOD: Final = 1.5
-"""A tag farther from the anchors' centre than this part of their figure's diagonal, in x or y, is lost; ..."""
-
-VERTICAL_NEIGHBOURHOOD: Final = 0.5
-"""... and so is one farther above or below than this part."""
+NEIGHBOURHOOD: Final = (1.5, 1.5, 0.5)
+"""A tag farther from the anchors' centre than these parts of their figure's diagonal is lost."""
 
 LEAST_DIAGONAL_M: Final = 5.0
 
@@ -271,7 +265,7 @@ LATE_PENALTY: Final = 2.0
 
 MOST_LATE: Final = 2
 
-START_TAIL: Final = 1e-4
+START_TAIL: Final = 1e-2
 """Where residuals are larger than noise makes them this rarely, more anchors are late."""
 
 JOINING_STEPS: Final = 4
@@ -279,7 +273,7 @@ JOINING_STEPS: Final = 4
 
 RIVAL_WEIGHT: Final = 0.01
 RIVAL_M: Final = 0.5
-"""A rival has at least this probability and distance."""
+"""A rival has at least this probability and distance; when the tag has moved as far, anchors lie in other directions."""
 
 
 class Start(Struct, frozen=True):
@@ -293,16 +287,13 @@ class Start(Struct, frozen=True):
     """By how much each anchor is expected to be late, and the variance."""
     is_doubtful: bool
     """Whether another position fits nearly as well, or some anchor is late."""
-    low_m: Array
-    """Corner of the neighbourhood of the anchors, shape (3,); ..."""
-    high_m: Array
-    """... and the opposite one."""
-    extent_m: float
-    """Longest edge of the anchors' bounding box."""
+    corners_m: Array
+    """Opposite ones of the neighbourhood of the anchors, shape (2, 3)."""
 
     def holds(self, position_m: Array) -> bool:
         """Whether a position, of two or three coordinates, lies in the neighbourhood of the anchors."""
-        return all(self.low_m[axis] <= value <= self.high_m[axis] for axis, value in enumerate(position_m.tolist()))
+        low_m, high_m = self.corners_m[:, : len(position_m)]
+        return bool(np.all((low_m <= position_m) & (position_m <= high_m)))
 
 
 def find_start(
@@ -317,22 +308,27 @@ def find_start(
     Obstacles only lengthen ranges, so a hypothesis by which an anchor is early is none. Nobody is accused before a
     whole window with two degrees of freedom to spare.
     """
-    joined, dim = _joined(window, calibration), 3 if height_m is None else 2
-    if not joined.anchors:
+    grouped: dict[tuple[int, int], list[float]] = {}
+    for pair in window:
+        if np.isfinite(pair.tdoa_m) and pair.anchor_a != pair.anchor_b:
+            without_bias_m = pair.tdoa_m - calibration.constant_m(pair)
+            grouped.setdefault((pair.anchor_a, pair.anchor_b), []).append(without_bias_m)
+    if not grouped:
         return NoSolution(NoFixReason.TOO_FEW_ANCHORS, "no pair of anchors was heard")
-    anchors_m = np.array([positions_m[anchor] for anchor in joined.anchors])
+    anchors, tdoa_m, joined_m2 = joined_tdoas(list(grouped), [np.median(group) for group in grouped.values()])
+    dim, anchors_m = 3 if height_m is None else 2, np.array([positions_m[anchor] for anchor in anchors])
     low, high, count = anchors_m.min(axis=0), anchors_m.max(axis=0), len(anchors_m)
     if z_bounds_m is None and high[2] - low[2] > HEIGHT_MARGIN_M:
         z_bounds_m = (low[2] - HEIGHT_MARGIN_M, high[2] + HEIGHT_MARGIN_M)
     shares = np.vstack([-np.ones(count - 1), np.eye(count - 1)])  # of each anchor's error in the TDoAs
-    usual_m2 = joined.covariance_m2 + START_ANCHOR_STD_M**2 * shares.T @ shares
+    usual_m2 = joined_m2 + START_ANCHOR_STD_M**2 * shares.T @ shares
     most = min(MOST_LATE, count - dim - 3) if len(window) == WINDOW else 0
     scores, positions, covariances, lates = [], [], [], []
     reason = NoSolution(NoFixReason.RESIDUALS, "more anchors are late than can be told")
     for late in (some for size in range(most + 1) for some in combinations(range(count), size)):
         sigma_m2 = usual_m2 + START_LATE_STD_M**2 * shares[list(late)].T @ shares[list(late)]
         found = locate(
-            anchors_m, joined.tdoa_m, sigma_m2, height_m=height_m, z_bounds_m=z_bounds_m, residual_tail=START_TAIL
+            anchors_m, tdoa_m, sigma_m2, height_m=height_m, z_bounds_m=z_bounds_m, residual_tail=START_TAIL
         )
         if isinstance(found, NoSolution):
             reason = reason if late else found
@@ -354,91 +350,34 @@ def find_start(
     covariance_m2 = np.tensordot(weights, np.array(covariances) + off_m[:, :, None] * off_m[:, None, :], 1)
     best_m = positions[int(np.argmin(scores))]
     has_rival = np.any((np.linalg.norm(positions - best_m, axis=1) > RIVAL_M) & (weights > RIVAL_WEIGHT))
-    late_by = {anchor: (m, m2) for anchor, (m, m2) in zip(joined.anchors, np.tensordot(weights, lates, 1), strict=True)}
+    late_by = {anchor: (m, m2) for anchor, (m, m2) in zip(anchors, np.tensordot(weights, lates, 1), strict=True)}
     is_doubtful = bool(has_rival) or sum(variance for _, variance in late_by.values()) > 0.5 * START_LATE_STD_M**2
     diagonal_m = max(float(np.linalg.norm((high - low)[:2])), LEAST_DIAGONAL_M)
-    reach_m = diagonal_m * np.array([NEIGHBOURHOOD, NEIGHBOURHOOD, VERTICAL_NEIGHBOURHOOD])
-    centre_m = (low + high) / 2.0
-    corners = centre_m - reach_m, centre_m + reach_m
-    start = Start(position_m, covariance_m2, late_by, is_doubtful, *corners, float((high - low).max()))
+    reach_m = diagonal_m * np.array(NEIGHBOURHOOD)
+    corners_m = (low + high) / 2.0 + np.array([-reach_m, reach_m])
+    start = Start(position_m, covariance_m2, late_by, is_doubtful, corners_m)
     if not start.holds(position_m[:dim]):
         return NoSolution(NoFixReason.NOT_CONVERGED, "the position lies far from all anchors")
     return start
 
 
-class ReferencedTdoas(Struct, frozen=True, gc=False):
-    """What ``locate`` needs, from measurements of pairs; empty where there are none."""
+def joined_tdoas(
+    pairs: Sequence[tuple[int, int]], differences_m: ArrayLike
+) -> tuple[tuple[int, ...], Array, Array]:
+    """Best linear estimate of TDoAs against one anchor from measurements ``|p − b| − |p − a|`` of pairs (a, b).
 
-    anchors: tuple[int, ...]
-    """Identifiers of the anchors that are connected, the reference first: n + 1, or none."""
-    tdoa_m: Array
-    """|p − anchor i + 1| − |p − reference|, shape (n,)."""
-    covariance_m2: Array
-    """Shape (n, n)."""
-
-
-def against_reference(pairs: Sequence[tuple[int, int]], tdoa_m: ArrayLike, variances_m2: ArrayLike) -> ReferencedTdoas:
-    """Best linear estimate of all TDoAs against one anchor from measurements ``|p − b| − |p − a|`` of pairs (a, b).
-
-    ``tdoa_m`` and ``variances_m2``: shape (m,), errors independent. A pair may be measured more than once, in
-    either direction. Of a graph in several parts the largest is used, of equally large ones that with the most
-    information. The anchor of most information serves as the reference (with the full covariance the choice does not
-    change a position). Pairs of one anchor with itself, values that are not finite and variances that are not positive
-    are omitted.
+    Returns the anchors, the reference first, the TDoAs, and their covariance. Least squares are weighted again until
+    what does not fit the others counts by its absolute value. Of a graph in several parts the largest is used.
     """
-    measured, variances = np.array(tdoa_m, np.float64), np.array(variances_m2, np.float64)
-    if not (len(pairs),) == measured.shape == variances.shape:
-        raise ValueError(f"{len(pairs)} pairs, TDoAs {measured.shape}, variances {variances.shape}: expected one each")
-    usable = np.isfinite(measured) & np.isfinite(variances) & (variances > 0.0)
-    kept = [i for i, (a, b) in enumerate(pairs) if a != b and usable[i]]
-    information: dict[int, float] = {}
-    for i in kept:
-        for anchor in pairs[i]:
-            information[anchor] = information.get(anchor, 0.0) + float(1.0 / variances[i])
-    part = _largest_part([pairs[i] for i in kept], information)
-    if not part:
-        return ReferencedTdoas((), np.empty(0), np.empty((0, 0)))
-    reference = max(sorted(part), key=information.__getitem__)
-    anchors = (reference, *sorted(part - {reference}))
-    row = {anchor: i for i, anchor in enumerate(anchors)}
-    edges = [i for i in kept if pairs[i][0] in part]
-    sigma = np.sqrt(variances[edges])
-    H = np.zeros((len(edges), len(anchors)))
-    for k, i in enumerate(edges):
-        H[k, row[pairs[i][0]]], H[k, row[pairs[i][1]]] = -1.0 / sigma[k], 1.0 / sigma[k]
-    H = H[:, 1:]
-    covariance = np.linalg.inv(H.T @ H)
-    tdoa = covariance @ (H.T @ (measured[edges] / sigma))
-    return ReferencedTdoas(anchors, tdoa, 0.5 * (covariance + covariance.T))
-
-
-def _largest_part(pairs: Sequence[tuple[int, int]], information: dict[int, float]) -> set[int]:
-    """The connected part with most anchors, then with most information, then with the smallest identifier."""
-    part_of = {anchor: {anchor} for anchor in information}
-    for a, b in pairs:
-        joined, other = part_of[a], part_of[b]
-        if joined is not other:
-            joined |= other
-            for anchor in other:
-                part_of[anchor] = joined
-    return max(
-        part_of.values(),
-        key=lambda part: (len(part), sum(sorted(information[anchor] for anchor in part)), -min(part)),
-        default=set(),
-    )
-
-
-def _joined(window: Sequence[PairTdoa], calibration: DifferenceCalibration) -> ReferencedTdoas:
-    """TDoAs of the pairs' medians; a median that does not fit the other pairs counts less (least absolute values)."""
-    grouped: dict[tuple[int, int], list[float]] = {}
-    for pair in window:
-        without_bias_m = pair.tdoa_m - calibration.constant_m(pair)
-        grouped.setdefault((pair.anchor_a, pair.anchor_b), []).append(without_bias_m)
-    pairs, medians_m = list(grouped), np.array([np.median(group) for group in grouped.values()])
-    variances_m2 = np.full(len(pairs), START_DIFFERENCE_STD_M**2)
+    anchors, index = np.unique(pairs, return_inverse=True)
+    a, b = index.reshape(-1, 2).T
+    H = np.eye(len(anchors))[b] - np.eye(len(anchors))[a]
+    linked = np.linalg.matrix_power(H.T @ H != 0.0, len(anchors))
+    part = np.flatnonzero(linked[np.argmax(linked.sum(axis=1))])
+    used = H[:, part].any(axis=1)
+    H, measured_m, weights = H[np.ix_(used, part[1:])], np.array(differences_m, np.float64)[used], np.ones((used.sum(), 1))
     for _ in range(JOINING_STEPS):
-        joined = against_reference(pairs, medians_m, variances_m2)
-        tdoa_m = dict(zip(joined.anchors, (0.0, *joined.tdoa_m), strict=True)) if joined.anchors else {}
-        off_m = medians_m - [tdoa_m.get(b, np.nan) - tdoa_m.get(a, np.nan) for a, b in pairs]
-        variances_m2 = START_DIFFERENCE_STD_M * np.fmax(START_DIFFERENCE_STD_M, np.abs(off_m))
-    return joined
+        covariance = np.linalg.inv(H.T @ (weights * H))
+        tdoa_m = covariance @ H.T @ (weights[:, 0] * measured_m)
+        weights = (START_DIFFERENCE_STD_M / np.fmax(np.abs(measured_m - H @ tdoa_m), START_DIFFERENCE_STD_M))[:, None]
+    return tuple(anchors[part].tolist()), tdoa_m, START_DIFFERENCE_STD_M**2 * covariance
