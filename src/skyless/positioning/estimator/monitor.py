@@ -73,7 +73,7 @@ RECEPTION_HUBER: Final = 1.5
 DIFFERENCE_HUBER: Final = 1.0
 """Number of standard deviations beyond which the innovations of ready-made differences have less weight."""
 
-MAX_CHANGE_STD_M: Final = 0.5
+MAX_CHANGE_STD_M: Final = 1.0
 """Of the part of range errors that changes as the tag moves."""
 
 MOVED: Final = 1.0

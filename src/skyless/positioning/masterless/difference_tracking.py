@@ -273,7 +273,7 @@ JOINING_STEPS: Final = 4
 
 RIVAL_WEIGHT: Final = 0.01
 RIVAL_M: Final = 0.5
-"""A rival has at least this probability and distance; when the tag has moved as far, anchors lie in other directions."""
+"""A rival has at least this probability and distance; anchors lie elsewhere for a tag that has moved as far."""
 
 
 class Start(Struct, frozen=True):
@@ -283,7 +283,7 @@ class Start(Struct, frozen=True):
     """Shape (3,)."""
     covariance_m2: Array
     """Shape (3, 3), with the distances between all hypotheses in it."""
-    late: dict[int, tuple[float, float]]
+    late: dict[int, list[float]]
     """By how much each anchor is expected to be late, and the variance."""
     is_doubtful: bool
     """Whether another position fits nearly as well, or some anchor is late."""
@@ -305,8 +305,7 @@ def find_start(
 ) -> Start | NoSolution:
     """Mean and covariance of the position over all hypotheses of which anchors are late, by their probabilities.
 
-    Obstacles only lengthen ranges, so a hypothesis by which an anchor is early is none. Nobody is accused before a
-    whole window with two degrees of freedom to spare.
+    No anchor is early. None is accused before a whole window, with two degrees of freedom to spare.
     """
     grouped: dict[tuple[int, int], list[float]] = {}
     for pair in window:
@@ -320,27 +319,26 @@ def find_start(
     low, high, count = anchors_m.min(axis=0), anchors_m.max(axis=0), len(anchors_m)
     if z_bounds_m is None and high[2] - low[2] > HEIGHT_MARGIN_M:
         z_bounds_m = (low[2] - HEIGHT_MARGIN_M, high[2] + HEIGHT_MARGIN_M)
+    low_m, high_m = z_bounds_m if z_bounds_m and height_m is None else (-np.inf, np.inf)
     shares = np.vstack([-np.ones(count - 1), np.eye(count - 1)])  # of each anchor's error in the TDoAs
     usual_m2 = joined_m2 + START_ANCHOR_STD_M**2 * shares.T @ shares
-    most = min(MOST_LATE, count - dim - 3) if len(window) == WINDOW else 0
+    most = min(MOST_LATE, max(count - dim - 3, 0)) if len(window) == WINDOW else 0
     scores, positions, covariances, lates = [], [], [], []
     reason = NoSolution(NoFixReason.RESIDUALS, "more anchors are late than can be told")
-    for late in (some for size in range(most + 1) for some in combinations(range(count), size)):
-        sigma_m2 = usual_m2 + START_LATE_STD_M**2 * shares[list(late)].T @ shares[list(late)]
+    for some in (list(some) for size in range(most + 1) for some in combinations(range(count), size)):
+        sigma_m2 = usual_m2 + START_LATE_STD_M**2 * shares[some].T @ shares[some]
         found = locate(
             anchors_m, tdoa_m, sigma_m2, height_m=height_m, z_bounds_m=z_bounds_m, residual_tail=START_TAIL
         )
         if isinstance(found, NoSolution):
-            reason = reason if late else found
+            reason = reason if some else found
             continue
         late_m = START_LATE_STD_M**2 * shares @ np.linalg.solve(sigma_m2, found.residuals_m)
-        low_m, high_m = z_bounds_m or (-np.inf, np.inf)
-        if all(late_m[list(late)] > 0.0) and low_m <= found.position_m[2] <= high_m:
-            scores.append(found.chi2 + np.linalg.slogdet(sigma_m2)[1] + LATE_PENALTY * len(late))
+        if all(late_m[some] > 0.0) and low_m <= found.position_m[2] <= high_m:
+            scores.append(found.chi2 + np.linalg.slogdet(sigma_m2)[1] + LATE_PENALTY * len(some))
             positions.append(found.position_m)
             covariances.append(found.covariance_m2 * max(1.0, found.chi2 / max(found.dof, 1)))
-            is_late = np.isin(np.arange(count), late)
-            lates.append(np.column_stack([late_m, np.full(count, START_LATE_STD_M**2)]) * is_late[:, None])
+            lates.append(np.array([late_m, np.full(count, START_LATE_STD_M**2)]) * np.isin(np.arange(count), some))
     if not scores:
         return reason
     weights = np.exp(0.5 * (min(scores) - np.array(scores)))
@@ -350,12 +348,12 @@ def find_start(
     covariance_m2 = np.tensordot(weights, np.array(covariances) + off_m[:, :, None] * off_m[:, None, :], 1)
     best_m = positions[int(np.argmin(scores))]
     has_rival = np.any((np.linalg.norm(positions - best_m, axis=1) > RIVAL_M) & (weights > RIVAL_WEIGHT))
-    late_by = {anchor: (m, m2) for anchor, (m, m2) in zip(anchors, np.tensordot(weights, lates, 1), strict=True)}
-    is_doubtful = bool(has_rival) or sum(variance for _, variance in late_by.values()) > 0.5 * START_LATE_STD_M**2
+    late = dict(zip(anchors, np.tensordot(weights, lates, 1).T.tolist(), strict=True))
+    is_doubtful = bool(has_rival) or sum(variance for _, variance in late.values()) > 0.5 * START_LATE_STD_M**2
     diagonal_m = max(float(np.linalg.norm((high - low)[:2])), LEAST_DIAGONAL_M)
     reach_m = diagonal_m * np.array(NEIGHBOURHOOD)
     corners_m = (low + high) / 2.0 + np.array([-reach_m, reach_m])
-    start = Start(position_m, covariance_m2, late_by, is_doubtful, corners_m)
+    start = Start(position_m, covariance_m2, late, is_doubtful, corners_m)
     if not start.holds(position_m[:dim]):
         return NoSolution(NoFixReason.NOT_CONVERGED, "the position lies far from all anchors")
     return start
@@ -375,7 +373,7 @@ def joined_tdoas(
     linked = np.linalg.matrix_power(H.T @ H != 0.0, len(anchors))
     part = np.flatnonzero(linked[np.argmax(linked.sum(axis=1))])
     used = H[:, part].any(axis=1)
-    H, measured_m, weights = H[np.ix_(used, part[1:])], np.array(differences_m, np.float64)[used], np.ones((used.sum(), 1))
+    H, measured_m, weights = H[np.ix_(used, part[1:])], np.array(differences_m)[used], np.ones((used.sum(), 1))
     for _ in range(JOINING_STEPS):
         covariance = np.linalg.inv(H.T @ (weights * H))
         tdoa_m = covariance @ H.T @ (weights[:, 0] * measured_m)
