@@ -45,8 +45,8 @@ RIVAL_FAULT_CHI2: Final = 20.0
 MOST_FAULTS: Final = 2
 """Largest number of anchors that are selected."""
 
-EARLIEST_FAULT_M: Final = -0.3
-"""Obstacles make packets late, and nothing makes them earlier than this."""
+EARLY_WEIGHT: Final = 0.8
+"""Obstacles make packets late, not early; a fault that is early has to explain more by this."""
 
 JUMP_RISE: Final = 0.5
 """By this part of its full size a jump raises the process noise of all range errors."""
@@ -179,10 +179,9 @@ def _largest(s: EstimatorState, bank: int) -> float:
 
 @step
 def _explained_alone(s: EstimatorState, bank: int, anchor: int) -> float:
-    """How much the fault of an anchor explains, as far as it is not too early."""
-    y, M = s.evidence[bank, anchor], s.information[bank, anchor, anchor] + 1.0 / OPENED_STD_M**2
-    fault_m = max(y / M, EARLIEST_FAULT_M)
-    return float(fault_m * (2.0 * y - fault_m * M))
+    """How much the fault of an anchor explains; that it is early is less likely, and counts less."""
+    y, M = s.evidence[bank, anchor], s.information[bank, anchor, anchor]
+    return float((1.0 if y > 0.0 else EARLY_WEIGHT) * y * y / (M + 1.0 / OPENED_STD_M**2))
 
 
 @step

@@ -351,8 +351,7 @@ def find_start(
     late = dict(zip(anchors, np.tensordot(weights, lates, 1).T.tolist(), strict=True))
     is_doubtful = bool(has_rival) or sum(variance for _, variance in late.values()) > 0.5 * START_LATE_STD_M**2
     diagonal_m = max(float(np.linalg.norm((high - low)[:2])), LEAST_DIAGONAL_M)
-    reach_m = diagonal_m * np.array(NEIGHBOURHOOD)
-    corners_m = (low + high) / 2.0 + np.array([-reach_m, reach_m])
+    corners_m = (low + high) / 2.0 + diagonal_m * np.outer((-1.0, 1.0), NEIGHBOURHOOD)
     start = Start(position_m, covariance_m2, late, is_doubtful, corners_m)
     if not start.holds(position_m[:dim]):
         return NoSolution(NoFixReason.NOT_CONVERGED, "the position lies far from all anchors")
