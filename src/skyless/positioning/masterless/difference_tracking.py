@@ -323,29 +323,28 @@ def find_start(
     shares = np.vstack([-np.ones(count - 1), np.eye(count - 1)])  # of each anchor's error in the TDoAs
     usual_m2 = joined_m2 + START_ANCHOR_STD_M**2 * shares.T @ shares
     most = min(MOST_LATE, max(count - dim - 3, 0)) if len(window) == WINDOW else 0
-    scores, positions, covariances, lates = [], [], [], []
+    hypotheses: list[tuple[float, Array, Array, Array]] = []
     reason = NoSolution(NoFixReason.RESIDUALS, "more anchors are late than can be told")
     for some in (list(some) for size in range(most + 1) for some in combinations(range(count), size)):
         sigma_m2 = usual_m2 + START_LATE_STD_M**2 * shares[some].T @ shares[some]
-        found = locate(
-            anchors_m, tdoa_m, sigma_m2, height_m=height_m, z_bounds_m=z_bounds_m, residual_tail=START_TAIL
-        )
+        found = locate(anchors_m, tdoa_m, sigma_m2, height_m=height_m, z_bounds_m=z_bounds_m, residual_tail=START_TAIL)
         if isinstance(found, NoSolution):
             reason = reason if some else found
             continue
         late_m = START_LATE_STD_M**2 * shares @ np.linalg.solve(sigma_m2, found.residuals_m)
         if all(late_m[some] > 0.0) and low_m <= found.position_m[2] <= high_m:
-            scores.append(found.chi2 + np.linalg.slogdet(sigma_m2)[1] + LATE_PENALTY * len(some))
-            positions.append(found.position_m)
-            covariances.append(found.covariance_m2 * max(1.0, found.chi2 / max(found.dof, 1)))
-            lates.append(np.array([late_m, np.full(count, START_LATE_STD_M**2)]) * np.isin(np.arange(count), some))
-    if not scores:
+            score = found.chi2 + float(np.linalg.slogdet(sigma_m2)[1]) + LATE_PENALTY * len(some)
+            misfit = max(1.0, found.chi2 / max(found.dof, 1))
+            expected = np.array([late_m, np.full(count, START_LATE_STD_M**2)]) * np.isin(np.arange(count), some)
+            hypotheses.append((score, found.position_m, misfit * found.covariance_m2, expected))
+    if not hypotheses:
         return reason
-    weights = np.exp(0.5 * (min(scores) - np.array(scores)))
+    scores, positions, covariances, lates = (np.array(column) for column in zip(*hypotheses, strict=True))
+    weights = np.exp(0.5 * (scores.min() - scores))
     weights /= weights.sum()
-    position_m = weights @ np.array(positions)
-    off_m = np.array(positions) - position_m
-    covariance_m2 = np.tensordot(weights, np.array(covariances) + off_m[:, :, None] * off_m[:, None, :], 1)
+    position_m = weights @ positions
+    off_m = positions - position_m
+    covariance_m2 = np.tensordot(weights, covariances + off_m[:, :, None] * off_m[:, None, :], 1)
     best_m = positions[int(np.argmin(scores))]
     has_rival = np.any((np.linalg.norm(positions - best_m, axis=1) > RIVAL_M) & (weights > RIVAL_WEIGHT))
     late = dict(zip(anchors, np.tensordot(weights, lates, 1).T.tolist(), strict=True))
@@ -358,9 +357,7 @@ def find_start(
     return start
 
 
-def joined_tdoas(
-    pairs: Sequence[tuple[int, int]], differences_m: ArrayLike
-) -> tuple[tuple[int, ...], Array, Array]:
+def joined_tdoas(pairs: Sequence[tuple[int, int]], differences_m: ArrayLike) -> tuple[tuple[int, ...], Array, Array]:
     """Best linear estimate of TDoAs against one anchor from measurements ``|p − b| − |p − a|`` of pairs (a, b).
 
     Returns the anchors, the reference first, the TDoAs, and their covariance. Least squares are weighted again until
