@@ -8,9 +8,10 @@ to the antenna.
 
 Columns: fixes for each difference in the judged time (a difference that is refused makes none); RMSE; that of the plain
 filter (``plain_flight_filter.py``); their ratio; mean of the squared error over the claimed covariance (NEES) by degree
-of freedom; share of fixes beyond the 99.99 % ellipsoid of their covariance, and the largest error there; share of fixes
-that give a protection level, and share of these whose error exceeds it; seconds with an error above 1 m and above four
-times the claimed standard deviation, the root of the covariance's trace. ``--calibrated`` replays flights also with
+of freedom; share of fixes beyond the 99.99 % ellipsoid of their covariance, and the largest error there; fixes with a
+protection level, of all with a truth, and how many exceed it horizontally and vertically; fixes of the first seconds
+more than 0.5 m off that claim σ < 0.25 m or give a level; seconds with an error above 1 m and above four times the
+claimed standard deviation, the root of the covariance's trace. ``--calibrated`` replays flights also with
 what ``skyless calibrate`` finds on trial 1 of their constellation and system. The last table has recordings of packets,
 judged in 2-D: a tag at rest at a place that nobody documented (Kuipman), and anchors that play the tag, placed by their
 own two-way ranging (Avalue).
@@ -45,6 +46,9 @@ SETTLE_FLIGHT_S, SETTLE_REST_S = 3.0, 2.0
 """What ``skyless replay`` does not judge, with and without a table of truth."""
 
 INSIDE = 0.9999
+START_M, START_STD_M = 0.5, 0.25
+"""A start that is farther off should claim neither a smaller standard deviation nor a level."""
+
 BLUNDER_M = 1.0
 BLUNDER_STD = 4.0
 LONGEST_GAP_S = 1.0
@@ -85,8 +89,12 @@ class Score(msgspec.Struct, frozen=True):
     beyond: float | None
     beyond_max_m: float | None
     levels: int
-    exceeded: int
+    """Fixes with a level, from the first one on, ..."""
+    exceeded_horizontal: int
+    exceeded_vertical: int
     exceeded_unalerted: int
+    bad_starts: int
+    """Fixes of the first seconds that are too far off for what they claim."""
     blunders_s: float
 
 
@@ -145,36 +153,46 @@ class Fixes:
         return rows[:, :3], rows[:, 3:12].reshape(-1, 3, 3), rows[:, 12:], np.array(self._alerts, dtype=bool)
 
 
-def score(times_s, error_m, covariance_m2, levels_m, alerted):
-    """Judge fixes; errors are of shape (n, 2) where the height was given or is not known, else (n, 3)."""
-    count, dim = error_m.shape
-    if count == 0:
-        return Score(0, None, None, None, None, None, 0, 0, 0, 0.0)
+def score(times_s, error_m, covariance_m2, levels_m, alerted, here):
+    """Judge fixes; errors are of shape (n, 2) where the height was given or is not known, else (n, 3), NaN without truth.
+
+    Accuracy counts where ``here`` is true, levels from the first one on, as the worst starts are before that.
+    """
+    known, dim = np.isfinite(error_m[:, 0]), error_m.shape[1]
+    has_level = known & np.isfinite(levels_m[:, 0])
+    horizontal = has_level & (np.hypot(error_m[:, 0], error_m[:, 1]) > levels_m[:, 0])
+    vertical = has_level & (np.abs(error_m[:, 2]) > levels_m[:, 1]) if dim == 3 else np.zeros_like(has_level)
     covariance_m2 = covariance_m2[:, :dim, :dim]
+    claimed = has_level | (np.trace(covariance_m2, axis1=1, axis2=2) < START_STD_M**2)
+    is_start = known & (times_s < times_s[:1] + SETTLE_FLIGHT_S)
+    of_levels = {
+        "levels": int(has_level.sum()),
+        "exceeded_horizontal": int(horizontal.sum()),
+        "exceeded_vertical": int(vertical.sum()),
+        "exceeded_unalerted": int(((horizontal | vertical) & ~alerted).sum()),
+        "bad_starts": int((is_start & claimed & ((error_m**2).sum(axis=1) > START_M**2)).sum()),
+    }
+    times_s, error_m, covariance_m2 = times_s[here], error_m[here], covariance_m2[here]
+    count = len(error_m)
+    if count == 0:
+        return Score(0, None, None, None, None, None, **of_levels, blunders_s=0.0)
     squared_m2 = (error_m**2).sum(axis=1)
     told = np.isfinite(covariance_m2).all(axis=(1, 2))
     told[told] = np.linalg.det(covariance_m2[told]) > 0.0
     whitened = np.linalg.solve(covariance_m2[told], error_m[told][..., None])[..., 0]
     nees = (error_m[told] * whitened).sum(axis=1)
     beyond = nees > chi2.ppf(INSIDE, dim)
-    horizontal_m = np.hypot(error_m[:, 0], error_m[:, 1])
-    has_level = np.isfinite(levels_m[:, 0])
-    exceeded = has_level & (horizontal_m > levels_m[:, 0])
-    if dim == 3:
-        exceeded |= has_level & (np.abs(error_m[:, 2]) > levels_m[:, 1])
     hold_s = np.minimum(np.diff(times_s, append=times_s[-1]), LONGEST_HOLD_S)
     with np.errstate(invalid="ignore"):
         blunder = squared_m2 > np.maximum(BLUNDER_M**2, BLUNDER_STD**2 * np.trace(covariance_m2, axis1=1, axis2=2))
     return Score(
         fixes=count,
-        rmse_2d_m=float(np.sqrt(np.mean(horizontal_m**2))),
+        rmse_2d_m=float(np.sqrt(squared_m2.mean() - (error_m[:, 2:] ** 2).sum() / count)),
         rmse_3d_m=float(np.sqrt(squared_m2.mean())) if dim == 3 else None,
         nees_per_dof=float(nees.mean() / dim) if len(nees) else None,
         beyond=float(beyond.mean()) if len(nees) else None,
         beyond_max_m=float(np.sqrt(squared_m2[told][beyond].max())) if beyond.any() else None,
-        levels=int(has_level.sum()),
-        exceeded=int(exceeded.sum()),
-        exceeded_unalerted=int((exceeded & ~alerted).sum()),
+        **of_levels,
         blunders_s=float(hold_s[blunder].sum()),
     )
 
@@ -228,8 +246,8 @@ def judged(recording, calibration=None):
     )
     true_m, here = truth_at(truth, above_m, judge.times_s)
     here &= np.array(judge.since_s) >= SETTLE_FLIGHT_S
-    error_m = (position_m - true_m)[here, : 2 if height[0] is not None else 3]
-    return score(np.array(judge.times_s)[here], error_m, covariance_m2[here], levels_m[here], alerted[here])
+    error_m = (position_m - true_m)[:, : 2 if height[0] is not None else 3]
+    return score(np.array(judge.times_s), error_m, covariance_m2, levels_m, alerted, here)
 
 
 def plain_of(recording):
@@ -272,7 +290,8 @@ def summary(rows):
         told |= {f"{name}_above_{limit:.2f}": int((ratios > limit).sum()) for limit in WORSE}
     nees = [row.score.nees_per_dof for row in rows if row.score.nees_per_dof is not None]
     told |= {"nees_median": float(np.median(nees)) if nees else None, "nees_max": max(nees, default=None)}
-    for name in ("fixes", "levels", "exceeded", "exceeded_unalerted", "blunders_s"):
+    counts = "exceeded_horizontal", "exceeded_vertical", "exceeded_unalerted", "bad_starts", "blunders_s"
+    for name in ("fixes", "levels", *counts):
         told[name] = sum(getattr(row.score, name) for row in rows)
     return told
 
@@ -323,17 +342,16 @@ def packets_judged(one, measurements):
         one.path, one.anchors_m, judge, height, listener=one.listener, **options
     )
     here = np.array(judge.since_s) >= SETTLE_REST_S
-    error_m = position_m[here, :2] - one.true_m
-    scored = score(np.array(judge.times_s)[here], error_m, covariance_m2[here], levels_m[here], alerted[here])
+    scored = score(np.array(judge.times_s), position_m[:, :2] - one.true_m, covariance_m2, levels_m, alerted, here)
     told = {
         "name": one.name,
         "measurements": report.measurements,
         "reason": report.reason,
         **msgspec.to_builtins(scored),
     }
-    std_m = np.sqrt(np.trace(covariance_m2[here][:, :2, :2], axis1=1, axis2=2)) if len(error_m) else np.array([])
+    std_m = np.sqrt(np.trace(covariance_m2[here][:, :2, :2], axis1=1, axis2=2)) if here.any() else np.array([])
     return told | {
-        "median_m": np.median(position_m[here, :2], axis=0).tolist() if len(error_m) else None,
+        "median_m": np.median(position_m[here, :2], axis=0).tolist() if here.any() else None,
         "claimed_m": float(np.median(std_m)) if len(std_m) else None,
         "hpl_m": float(np.nanmedian(levels_m[here, 0])) if scored.levels else None,
     }
@@ -352,10 +370,6 @@ def number(value, form):
     return "–" if value is None else format(value, form)
 
 
-def share(part, whole):
-    return "–" if not whole else f"{100 * part / whole:.2f} %"
-
-
 def honesty(found):
     """Fields that all tables have."""
     beyond = "–" if found.beyond is None else f"{100 * found.beyond:.2f} %"
@@ -363,8 +377,9 @@ def honesty(found):
     return (
         number(found.nees_per_dof, ".2f"),
         beyond + worst,
-        share(found.levels, found.fixes),
-        share(found.exceeded, found.levels),
+        str(found.levels),
+        f"{found.exceeded_horizontal} / {found.exceeded_vertical}",
+        str(found.bad_starts),
         f"{found.blunders_s:.1f}",
     )
 
@@ -387,13 +402,14 @@ def show_summary(name, told):
     print(
         f"{name}: {told['recordings']} recordings; geometric mean ratio 2-D / 3-D {ratios} ({worse}; plain diverged on "
         f"{told['plain_diverged']}); NEES/dof median {number(told['nees_median'], '.2f')}, max "
-        f"{number(told['nees_max'], '.2f')}; levels in {told['levels']} of {told['fixes']} fixes, exceeded in "
-        f"{told['exceeded']}, {told['exceeded_unalerted']} of them without an alert; {told['blunders_s']:.1f} s with "
-        "an error above 1 m and 4σ"
+        f"{number(told['nees_max'], '.2f')}; {told['levels']} levels, exceeded horizontally in "
+        f"{told['exceeded_horizontal']}, vertically in {told['exceeded_vertical']}, without an alert in "
+        f"{told['exceeded_unalerted']}; {told['bad_starts']} fixes of bad starts; {told['blunders_s']:.1f} s with an "
+        "error above 1 m and 4σ"
     )
 
 
-HONESTY = ("NEES/dof", "beyond 99.99 %, max m", "levels", "exceeded", "s > 1 m, 4σ")
+HONESTY = ("NEES/dof", "beyond 99.99 %, max m", "levels", "exceeded h / v", "bad starts", "s > 1 m, 4σ")
 
 
 def tables(recordings, calibrated):

@@ -77,9 +77,6 @@ LOST_IN_ROW: Final = 8
 LOST_SHARE: Final = 0.5
 """... as does a larger share of them."""
 
-MISFIT_RANGE_STD_M: Final = 0.3
-"""Of the range error of an anchor that did not fit at the start."""
-
 MOST_RELAYS_REJECTED: Final = 4.0
 """Relays beyond the gate lately; fewer may be late ones."""
 
@@ -542,18 +539,19 @@ class Estimator:
             self._state = without_anchor(self._state, anchor)
             fit_plane(self._state)
 
-    def inflate_range_error(self, table_index: int) -> None:
-        """Expect that the ranges to an anchor are wrong by metres."""
+    def expect_late(self, table_index: int, late_m: float, variance_m2: float) -> None:
+        """Expect that an anchor is late by so much at the start, with this variance besides the usual one."""
         if self._state.index_of[table_index] < 0:
             self._resize(NEW_ANCHOR, table_index, 0)
         state = self._state
         anchor = int(state.index_of[table_index])
-        constant = layout(self.dim, len(state.anchors)).constant + anchor
-        state.P[constant, constant] = MISFIT_RANGE_STD_M**2
+        change = layout(self.dim, len(state.anchors)).change + anchor
+        state.anchors["change_variance_m2"][anchor] += variance_m2
+        state.x[change], state.P[change, change] = late_m, state.anchors["change_variance_m2"][anchor]
 
-    def withhold_levels(self) -> None:
-        """State no levels until a new start: the anchors' positions are known to be wrong."""
-        self._state.status["withholds_levels"] = 1
+    def withhold_levels(self, are_withheld: bool = True) -> None:
+        """State no levels: it is not sure yet where the tag is, or the anchors' positions are known to be wrong."""
+        self._state.status["withholds_levels"] = are_withheld
 
     def start(
         self,

@@ -556,11 +556,23 @@ def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: f
         subtract_fault_input(s, a)
         gather_evidence(s, innovation, innovation_variance * scale)
         update(s, innovation, innovation_variance * scale, 1.0, len(s.x))
+        _bound_changes(s)
         end_small_obstruction(s, a)
         end_small_obstruction(s, b)
         adapt_change_variance(s, a, a_elapsed_s)
         adapt_change_variance(s, b, b_elapsed_s)
     return int(scale > 0.0)
+
+
+@step
+def _bound_changes(s: EstimatorState) -> None:
+    """Move changing parts that are below their bound onto it: the likeliest state of all where nothing is earlier."""
+    x, P, change = s.x, s.P, layout(s.settings[0]["dim"], len(s.anchors)).change
+    for anchor in range(len(s.anchors)):
+        missing_m, m = s.settings[0]["earliest_m"] - x[change + anchor], change + anchor
+        if missing_m > 0.0:
+            for state in range(uncertain_states(s)):
+                x[state] += P[m, state] / P[m, m] * missing_m
 
 
 # The tag has a sensor of its height

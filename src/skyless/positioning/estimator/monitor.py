@@ -74,8 +74,8 @@ RECEPTION_HUBER: Final = 1.5
 DIFFERENCE_HUBER: Final = 1.0
 """Number of standard deviations beyond which the innovations of ready-made differences have less weight."""
 
-MAX_CHANGE_STD_M: Final = 0.5
-"""Of the part of range errors that changes as the tag moves; larger ones are jumps."""
+MAX_CHANGE_STD_M: Final = 1.0
+"""Of the part of range errors that changes as the tag moves."""
 
 PLACE_STEP_M: Final = 0.1
 """Distance walked after which range errors are compared, and after twice as much."""

@@ -81,6 +81,8 @@ class EstimatorSettings(Struct, frozen=True):
     """Time within which the size of each anchor's changing part is estimated again; 0 where it is ``place_std_m``."""
     least_change_std_m: float = 0.05
     """No changing part is estimated to be smaller."""
+    earliest_m: float = -np.inf
+    """No changing part is below this: obstacles only lengthen ranges."""
     difference_std_m: float = 0.12
     """Of what is new in each ready-made time difference."""
     stationary_s: float = 0.0

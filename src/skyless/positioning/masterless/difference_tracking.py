@@ -2,6 +2,7 @@
 
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from math import dist
 from typing import Final
 
@@ -18,7 +19,7 @@ from skyless.positioning.estimator.state import EstimatorSettings
 from skyless.positioning.fix import Fix, NoFixReason
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.positioning.masterless.anchor_errors import KNOWN_STD_M, DifferenceCalibration
-from skyless.positioning.methods.locate import NoSolution, Solution, locate
+from skyless.positioning.methods.locate import NoSolution, locate
 
 DIFFERENCES: Final = EstimatorSettings(
     gate=3.0,
@@ -31,16 +32,15 @@ DIFFERENCES: Final = EstimatorSettings(
     place_distance_m=0.5,
     place_time_s=30.0,
     change_memory_s=1.5,
+    earliest_m=-0.25,
     stationary_s=3.0,
 )
 """What recorded flights of DW1000s show (docs/recordings.md): reflections change within half a metre, and by how much
 differs from anchor to anchor."""
 
 WINDOW: Final = 60
-"""Differences that a start uses, the newest ones ..."""
-
-WINDOW_S: Final = 20.0
-"""... and none older than this."""
+WINDOW_S: Final = 1.0
+"""A start uses the newest differences: this number of them, or at least those of this time."""
 
 MAX_DIFFERENCE_SILENCE_S: Final = 10.0
 """After a longer silence the state is worse than a new start."""
@@ -57,12 +57,11 @@ MAX_HORIZONTAL_STD_M: Final = 3.0
 SHORT_SILENCE_S: Final = 0.1
 """Over shorter silences no state grows much wider."""
 
-TRY_EVERY: Final = 6
-"""Differences between two attempts at a start."""
+TRY_EVERY_S: Final = 0.1
+"""Between two attempts at a start."""
 
-DIFFERENCES_AFTER_LOSS: Final = 30
-WAIT_AFTER_LOSS_S: Final = 1.0
-"""After a state that was wrong, a new start waits for this number of differences, or for this time."""
+CONTRADICTED_CHI2: Final = 25.0
+"""A start from later differences that is farther off (3-D: once in 60,000) begins again."""
 
 
 class DifferenceTracking:
@@ -97,9 +96,9 @@ class DifferenceTracking:
         self._window: deque[PairTdoa] = deque(maxlen=WINDOW)
         self._begin_s = self._newest_s = 0.0
         self._received_s: dict[int, float] = {}
-        self._since_try = 0
+        self._tried_s = -np.inf
         self._start: Start | None = None
-        self._was_wrong = False
+        self._is_confirmed = False
 
     @property
     def estimator(self) -> Estimator:
@@ -133,9 +132,10 @@ class DifferenceTracking:
         if self._start is not None and self._is_out_of_reach(pair.time_s - self._newest_s):
             self._stop()
         self._newest_s = pair.time_s
+        begins = not self._is_confirmed and self._is_time_to_start(pair) and self._try_start()
         if self._start is None:
-            return self._try_start(pair)
-        used = self._process(pair)
+            return False
+        used = begins or self._process(pair)
         if used:
             self._received_s[pair.anchor_a] = self._received_s[pair.anchor_b] = pair.time_s
         else:
@@ -143,7 +143,6 @@ class DifferenceTracking:
             self.reason = NoFixReason.RESIDUALS
         if self._estimator.rejects_most:
             self._stop()
-            self._was_wrong = True
         return used
 
     def _process(self, pair: PairTdoa) -> bool:
@@ -175,7 +174,7 @@ class DifferenceTracking:
         if state.P[0, 0] + state.P[1, 1] > MAX_HORIZONTAL_STD_M**2:
             self.reason = NoFixReason.ACQUIRING
             return False
-        if dim == 3 and state.P[2, 2] > start.extent_m**2:
+        if dim == 3 and state.P[2, 2] > MAX_HORIZONTAL_STD_M**2:
             self.reason = NoFixReason.BAD_GEOMETRY
             return False
         return True
@@ -197,79 +196,104 @@ class DifferenceTracking:
         """Forget the state; a new start is looked for."""
         self.counters["restart"] += 1
         self._start = None
-        self._was_wrong = False
+        self._is_confirmed = False
         self._window.clear()
 
-    def _try_start(self, pair: PairTdoa) -> bool:
-        """Look for a start at every sixth difference; medians of each pair keep single outliers out of it."""
-        self._window.append(pair)
-        while pair.time_s - self._window[0].time_s > WINDOW_S:
-            self._window.popleft()
-        self._since_try += 1
-        if self._since_try < TRY_EVERY or (self._was_wrong and not self._is_enough_after_loss()):
-            return False
-        self._since_try = 0
-        start = find_start(
-            self._window, self._positions_m, self._calibration, self._settings.height_m, self._z_bounds_m
-        )
+    def _is_time_to_start(self, pair: PairTdoa) -> bool:
+        """Gather differences; whether they are enough for a start."""
+        window = self._window
+        while window and not 0.0 <= pair.time_s - window[0].time_s <= MAX_DIFFERENCE_SILENCE_S:
+            window.popleft()
+        window.append(pair)
+        is_enough = len(window) == WINDOW or pair.time_s - window[0].time_s >= WINDOW_S
+        every_s = TRY_EVERY_S if self._start is None else WINDOW_S
+        return is_enough and not 0.0 <= pair.time_s - self._tried_s < every_s
+
+    def _try_start(self) -> bool:
+        """Look for a start, or for one that confirms or contradicts that which there is; True if the filter begins."""
+        window, dim = self._window, self._estimator.dim
+        self._tried_s = self._newest_s
+        start = find_start(window, self._positions_m, self._calibration, self._settings.height_m, self._z_bounds_m)
         if isinstance(start, NoSolution):
             self.reason = start.reason
             return False
-        dim, solution = self._estimator.dim, start.solution
-        self._begin_s = pair.time_s
-        covariance = solution.covariance_m2[:dim, :dim]
-        self._estimator.start(0, solution.position_m[:dim], covariance, START_SPEED_STD_MPS**2)
+        if self._start is not None:
+            position_m, covariance_m2 = (array[..., :dim] for array in self._estimator.motion())
+            gap_m = position_m - start.position_m[:dim]
+            both_m2 = covariance_m2[:dim] + start.covariance_m2[:dim, :dim]
+            if start.is_doubtful or gap_m @ np.linalg.solve(both_m2, gap_m) < CONTRADICTED_CHI2:
+                has_moved = bool(np.linalg.norm(position_m - self._start.position_m[:dim]) > RIVAL_M)
+                self._is_confirmed = has_moved or not start.is_doubtful
+                self._estimator.withhold_levels(not self._is_confirmed)
+                window.clear()
+                return False
+            self.counters["restart"] += 1
+        self._begin_s, newest = self._newest_s, window[-1]
+        self._estimator.start(0, start.position_m[:dim], start.covariance_m2[:dim, :dim], START_SPEED_STD_MPS**2)
+        self._estimator.withhold_levels(True)
         self._start = start
-        if start.without is not None:
-            self._estimator.inflate_range_error(self._index(start.without))
-        self._received_s = {anchor: pair.time_s for kept in self._window for anchor in (kept.anchor_a, kept.anchor_b)}
+        for anchor, (late_m, variance_m2) in start.late.items():
+            self._estimator.expect_late(self._index(anchor), late_m, variance_m2)
+        self._received_s = {anchor: self._newest_s for kept in window for anchor in (kept.anchor_a, kept.anchor_b)}
         self.counters["start"] += 1
-        self._window.clear()
-        return self._process(pair)
-
-    def _is_enough_after_loss(self) -> bool:
-        return (
-            len(self._window) >= DIFFERENCES_AFTER_LOSS or self._newest_s - self._window[0].time_s >= WAIT_AFTER_LOSS_S
-        )
+        window.clear()
+        return self._process(newest)
 
 
 # Start
 
 
-NEIGHBOURHOOD: Final = 1.5
-"""A tag farther from the anchors' centre than this part of their figure's diagonal, in x or y, is lost; ..."""
-
-VERTICAL_NEIGHBOURHOOD: Final = 0.5
-"""... and so is one farther above or below than this part."""
+NEIGHBOURHOOD: Final = (1.5, 1.5, 0.5)
+"""A tag farther from the anchors' centre than these parts of their figure's diagonal is lost."""
 
 LEAST_DIAGONAL_M: Final = 5.0
 
-START_DIFFERENCE_STD_M: Final = 0.22
-"""Of a difference with all its errors, before any are estimated."""
+HEIGHT_MARGIN_M: Final = 1.0
+"""Starts lie no higher above or below anchors of different heights than this, unless bounds are given."""
 
-MISFIT: Final = 4.0
-"""A start whose chi² per degree of freedom is larger is tried without each anchor."""
+START_DIFFERENCE_STD_M: Final = 0.08
+"""Of the median of a pair's differences, ..."""
 
-REMAINING_MISFIT: Final = 0.1
-"""Without the wrong anchor no more than this part of the misfit is left."""
+START_ANCHOR_STD_M: Final = 0.14
+"""... and of the errors of each anchor, before any are estimated."""
+
+START_LATE_STD_M: Final = 1.0
+"""Of an anchor that is late: on the floor or behind metal one is often, and at times two."""
+
+LATE_PENALTY: Final = 2.0
+"""What each anchor that is late adds to chi² (odds of 1 to 3)."""
+
+MOST_LATE: Final = 2
+
+START_TAIL: Final = 1e-2
+"""Where residuals are larger than noise makes them this rarely, more anchors are late."""
+
+JOINING_STEPS: Final = 4
+"""Of least squares with the weights that the last one shows."""
+
+RIVAL_WEIGHT: Final = 0.01
+RIVAL_M: Final = 0.5
+"""A rival has at least this probability and distance; anchors lie elsewhere for a tag that has moved as far."""
 
 
 class Start(Struct, frozen=True):
     """Where a filter begins."""
 
-    solution: Solution
-    without: int | None
-    """The anchor that does not fit; None where all do."""
-    low_m: Array
-    """Corner of the neighbourhood of the anchors, shape (3,); ..."""
-    high_m: Array
-    """... and the opposite one."""
-    extent_m: float
-    """Longest edge of the anchors' bounding box."""
+    position_m: Array
+    """Shape (3,)."""
+    covariance_m2: Array
+    """Shape (3, 3), with the distances between all hypotheses in it."""
+    late: dict[int, list[float]]
+    """By how much each anchor is expected to be late, and the variance."""
+    is_doubtful: bool
+    """Whether another position fits nearly as well, or some anchor is late."""
+    corners_m: Array
+    """Opposite ones of the neighbourhood of the anchors, shape (2, 3)."""
 
     def holds(self, position_m: Array) -> bool:
         """Whether a position, of two or three coordinates, lies in the neighbourhood of the anchors."""
-        return all(self.low_m[axis] <= value <= self.high_m[axis] for axis, value in enumerate(position_m.tolist()))
+        low_m, high_m = self.corners_m[:, : len(position_m)]
+        return bool(np.all((low_m <= position_m) & (position_m <= high_m)))
 
 
 def find_start(
@@ -279,115 +303,75 @@ def find_start(
     height_m: float | None,
     z_bounds_m: tuple[float, float] | None,
 ) -> Start | NoSolution:
-    """Solve for the position; medians of each pair keep single outliers out of it.
+    """Mean and covariance of the position over all hypotheses of which anchors are late, by their probabilities.
 
-    Where the residuals are too large, each anchor is left out once: on the floor or behind metal one is often wrong.
+    No anchor is early. None is accused before a whole window, with two degrees of freedom to spare.
     """
     grouped: dict[tuple[int, int], list[float]] = {}
     for pair in window:
-        without_bias_m = pair.tdoa_m - calibration.constant_m(pair)
-        grouped.setdefault((pair.anchor_a, pair.anchor_b), []).append(without_bias_m)
-    medians = {pair: float(np.median(group)) for pair, group in grouped.items()}
-    anchors = sorted({anchor for pair in medians for anchor in pair})
-    found = _solve(medians, positions_m, height_m, z_bounds_m)
-    best, without = found, None
-    least = np.inf if isinstance(found, NoSolution) else REMAINING_MISFIT * found.chi2
-    dim = 3 if height_m is None else 2
-    if _is_suspect(found) and len(anchors) > dim + 2:
-        for anchor in anchors:
-            rest = {pair: median for pair, median in medians.items() if anchor not in pair}
-            other = _solve(rest, positions_m, height_m, z_bounds_m)
-            if isinstance(other, Solution) and other.dof > 0 and other.chi2 < least:
-                best, without, least = other, anchor, other.chi2
-    if isinstance(best, NoSolution):
-        return best
-    anchors_m = np.array([positions_m[anchor] for anchor in anchors])
-    low, high = anchors_m.min(axis=0), anchors_m.max(axis=0)
+        if np.isfinite(pair.tdoa_m) and pair.anchor_a != pair.anchor_b:
+            without_bias_m = pair.tdoa_m - calibration.constant_m(pair)
+            grouped.setdefault((pair.anchor_a, pair.anchor_b), []).append(without_bias_m)
+    if not grouped:
+        return NoSolution(NoFixReason.TOO_FEW_ANCHORS, "no pair of anchors was heard")
+    anchors, tdoa_m, joined_m2 = joined_tdoas(list(grouped), [np.median(group) for group in grouped.values()])
+    dim, anchors_m = 3 if height_m is None else 2, np.array([positions_m[anchor] for anchor in anchors])
+    low, high, count = anchors_m.min(axis=0), anchors_m.max(axis=0), len(anchors_m)
+    if z_bounds_m is None and high[2] - low[2] > HEIGHT_MARGIN_M:
+        z_bounds_m = (low[2] - HEIGHT_MARGIN_M, high[2] + HEIGHT_MARGIN_M)
+    low_m, high_m = z_bounds_m if z_bounds_m and height_m is None else (-np.inf, np.inf)
+    shares = np.vstack([-np.ones(count - 1), np.eye(count - 1)])  # of each anchor's error in the TDoAs
+    usual_m2 = joined_m2 + START_ANCHOR_STD_M**2 * shares.T @ shares
+    most = min(MOST_LATE, max(count - dim - 3, 0)) if len(window) == WINDOW else 0
+    hypotheses: list[tuple[float, Array, Array, Array]] = []
+    reason = NoSolution(NoFixReason.RESIDUALS, "more anchors are late than can be told")
+    for some in (list(some) for size in range(most + 1) for some in combinations(range(count), size)):
+        sigma_m2 = usual_m2 + START_LATE_STD_M**2 * shares[some].T @ shares[some]
+        found = locate(anchors_m, tdoa_m, sigma_m2, height_m=height_m, z_bounds_m=z_bounds_m, residual_tail=START_TAIL)
+        if isinstance(found, NoSolution):
+            reason = reason if some else found
+            continue
+        late_m = START_LATE_STD_M**2 * shares @ np.linalg.solve(sigma_m2, found.residuals_m)
+        if all(late_m[some] > 0.0) and low_m <= found.position_m[2] <= high_m:
+            score = found.chi2 + float(np.linalg.slogdet(sigma_m2)[1]) + LATE_PENALTY * len(some)
+            misfit = max(1.0, found.chi2 / max(found.dof, 1))
+            expected = np.array([late_m, np.full(count, START_LATE_STD_M**2)]) * np.isin(np.arange(count), some)
+            hypotheses.append((score, found.position_m, misfit * found.covariance_m2, expected))
+    if not hypotheses:
+        return reason
+    scores, positions, covariances, lates = (np.array(column) for column in zip(*hypotheses, strict=True))
+    weights = np.exp(0.5 * (scores.min() - scores))
+    weights /= weights.sum()
+    position_m = weights @ positions
+    off_m = positions - position_m
+    covariance_m2 = np.tensordot(weights, covariances + off_m[:, :, None] * off_m[:, None, :], 1)
+    best_m = positions[int(np.argmin(scores))]
+    has_rival = np.any((np.linalg.norm(positions - best_m, axis=1) > RIVAL_M) & (weights > RIVAL_WEIGHT))
+    late = dict(zip(anchors, np.tensordot(weights, lates, 1).T.tolist(), strict=True))
+    is_doubtful = bool(has_rival) or sum(variance for _, variance in late.values()) > 0.5 * START_LATE_STD_M**2
     diagonal_m = max(float(np.linalg.norm((high - low)[:2])), LEAST_DIAGONAL_M)
-    reach_m = diagonal_m * np.array([NEIGHBOURHOOD, NEIGHBOURHOOD, VERTICAL_NEIGHBOURHOOD])
-    centre_m = (low + high) / 2.0
-    start = Start(best, without, centre_m - reach_m, centre_m + reach_m, float((high - low).max()))
-    if not start.holds(best.position_m[:dim]):
+    corners_m = (low + high) / 2.0 + diagonal_m * np.outer((-1.0, 1.0), NEIGHBOURHOOD)
+    start = Start(position_m, covariance_m2, late, is_doubtful, corners_m)
+    if not start.holds(position_m[:dim]):
         return NoSolution(NoFixReason.NOT_CONVERGED, "the position lies far from all anchors")
     return start
 
 
-def _is_suspect(found: Solution | NoSolution) -> bool:
-    if isinstance(found, NoSolution):
-        return found.reason is NoFixReason.RESIDUALS
-    return found.dof > 0 and found.chi2 > MISFIT * found.dof
+def joined_tdoas(pairs: Sequence[tuple[int, int]], differences_m: ArrayLike) -> tuple[tuple[int, ...], Array, Array]:
+    """Best linear estimate of TDoAs against one anchor from measurements ``|p − b| − |p − a|`` of pairs (a, b).
 
-
-def _solve(
-    medians: Mapping[tuple[int, int], float],
-    positions_m: Mapping[int, Array],
-    height_m: float | None,
-    z_bounds_m: tuple[float, float] | None,
-) -> Solution | NoSolution:
-    joined = against_reference(list(medians), list(medians.values()), [START_DIFFERENCE_STD_M**2] * len(medians))
-    if not joined.anchors:
-        return NoSolution(NoFixReason.TOO_FEW_ANCHORS, "no pair of anchors was heard")
-    anchors_m = np.array([positions_m[anchor] for anchor in joined.anchors])
-    return locate(anchors_m, joined.tdoa_m, joined.covariance_m2, height_m=height_m, z_bounds_m=z_bounds_m)
-
-
-class ReferencedTdoas(Struct, frozen=True, gc=False):
-    """What ``locate`` needs, from measurements of pairs; empty where there are none."""
-
-    anchors: tuple[int, ...]
-    """Identifiers of the anchors that are connected, the reference first: n + 1, or none."""
-    tdoa_m: Array
-    """|p − anchor i + 1| − |p − reference|, shape (n,)."""
-    covariance_m2: Array
-    """Shape (n, n)."""
-
-
-def against_reference(pairs: Sequence[tuple[int, int]], tdoa_m: ArrayLike, variances_m2: ArrayLike) -> ReferencedTdoas:
-    """Best linear estimate of all TDoAs against one anchor from measurements ``|p − b| − |p − a|`` of pairs (a, b).
-
-    ``tdoa_m`` and ``variances_m2``: shape (m,), errors independent. A pair may be measured more than once, in
-    either direction. Of a graph in several parts the largest is used, of equally large ones that with the most
-    information. The anchor of most information serves as the reference (with the full covariance the choice does not
-    change a position). Pairs of one anchor with itself, values that are not finite and variances that are not positive
-    are omitted.
+    Returns the anchors, the reference first, the TDoAs, and their covariance. Least squares are weighted again until
+    what does not fit the others counts by its absolute value. Of a graph in several parts the largest is used.
     """
-    measured, variances = np.array(tdoa_m, np.float64), np.array(variances_m2, np.float64)
-    if not (len(pairs),) == measured.shape == variances.shape:
-        raise ValueError(f"{len(pairs)} pairs, TDoAs {measured.shape}, variances {variances.shape}: expected one each")
-    usable = np.isfinite(measured) & np.isfinite(variances) & (variances > 0.0)
-    kept = [i for i, (a, b) in enumerate(pairs) if a != b and usable[i]]
-    information: dict[int, float] = {}
-    for i in kept:
-        for anchor in pairs[i]:
-            information[anchor] = information.get(anchor, 0.0) + float(1.0 / variances[i])
-    part = _largest_part([pairs[i] for i in kept], information)
-    if not part:
-        return ReferencedTdoas((), np.empty(0), np.empty((0, 0)))
-    reference = max(sorted(part), key=information.__getitem__)
-    anchors = (reference, *sorted(part - {reference}))
-    row = {anchor: i for i, anchor in enumerate(anchors)}
-    edges = [i for i in kept if pairs[i][0] in part]
-    sigma = np.sqrt(variances[edges])
-    H = np.zeros((len(edges), len(anchors)))
-    for k, i in enumerate(edges):
-        H[k, row[pairs[i][0]]], H[k, row[pairs[i][1]]] = -1.0 / sigma[k], 1.0 / sigma[k]
-    H = H[:, 1:]
-    covariance = np.linalg.inv(H.T @ H)
-    tdoa = covariance @ (H.T @ (measured[edges] / sigma))
-    return ReferencedTdoas(anchors, tdoa, 0.5 * (covariance + covariance.T))
-
-
-def _largest_part(pairs: Sequence[tuple[int, int]], information: dict[int, float]) -> set[int]:
-    """The connected part with most anchors, then with most information, then with the smallest identifier."""
-    part_of = {anchor: {anchor} for anchor in information}
-    for a, b in pairs:
-        joined, other = part_of[a], part_of[b]
-        if joined is not other:
-            joined |= other
-            for anchor in other:
-                part_of[anchor] = joined
-    return max(
-        part_of.values(),
-        key=lambda part: (len(part), sum(sorted(information[anchor] for anchor in part)), -min(part)),
-        default=set(),
-    )
+    anchors, index = np.unique(pairs, return_inverse=True)
+    a, b = index.reshape(-1, 2).T
+    H = np.eye(len(anchors))[b] - np.eye(len(anchors))[a]
+    linked = np.linalg.matrix_power(H.T @ H != 0.0, len(anchors))
+    part = np.flatnonzero(linked[np.argmax(linked.sum(axis=1))])
+    used = H[:, part].any(axis=1)
+    H, measured_m, weights = H[np.ix_(used, part[1:])], np.array(differences_m)[used], np.ones((used.sum(), 1))
+    for _ in range(JOINING_STEPS):
+        covariance = np.linalg.inv(H.T @ (weights * H))
+        tdoa_m = covariance @ H.T @ (weights[:, 0] * measured_m)
+        weights = (START_DIFFERENCE_STD_M / np.fmax(np.abs(measured_m - H @ tdoa_m), START_DIFFERENCE_STD_M))[:, None]
+    return tuple(anchors[part].tolist()), tdoa_m, START_DIFFERENCE_STD_M**2 * covariance
