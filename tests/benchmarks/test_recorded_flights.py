@@ -112,7 +112,9 @@ def test_a_score_by_hand(bench):
     assert (found.beyond, found.beyond_max_m) == (0.4, 2.0)
     assert (found.levels, found.exceeded_horizontal, found.exceeded_vertical, found.exceeded_unalerted) == (4, 1, 1, 1)
     assert found.blunders_s == 0.0  # the last fix counts for no time
-    assert bench.score(times_s + 1.0, error_m[::-1], covariance_m2, levels_m, alerted, here).blunders_s == pytest.approx(0.04)
+    assert bench.score(
+        times_s + 1.0, error_m[::-1], covariance_m2, levels_m, alerted, here
+    ).blunders_s == pytest.approx(0.04)
     flat = bench.score(times_s, error_m[:, :2], covariance_m2, levels_m, alerted, here)
     assert flat.nees_per_dof == pytest.approx((1 + 1 + 0 + 25 + 0) / 10)
     assert (flat.rmse_3d_m, flat.exceeded_horizontal, flat.exceeded_vertical) == (None, 1, 0)

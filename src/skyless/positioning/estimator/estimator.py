@@ -62,32 +62,17 @@ from skyless.ticks import HALF_WRAP_TICKS, TICK_MASK
 REJECTED, ACCEPTED, JOINED, STALE, NEW_ANCHOR, SILENT_ANCHOR, RESTARTED_CLOCK = range(7)
 """What became of a packet; the last three require an anchor to join or leave, and for the packet again."""
 
+# Paths that seem longer than expected by more than this, for this number of packets in a row: a counter has jumped.
 RESTART_M: Final = 300.0
-"""A path that seems longer than expected by more than this is a counter that has jumped, ..."""
-
 RESTART_IN_ROW: Final = 3
-"""... if this is so for this number of packets in a row."""
-
-MAX_RATE_MPS: Final = 100e-6 * SPEED_OF_LIGHT_MPS
-"""Between two clocks that are still crystals."""
-
+MAX_RATE_MPS: Final = 100e-6 * SPEED_OF_LIGHT_MPS  # between two clocks that are still crystals
+# So many packets beyond the gate in a row, more than anchors can be blocked, or a larger share of all: a wrong state.
 LOST_IN_ROW: Final = 8
-"""This number of packets beyond the gate in a row, of more anchors than can all be blocked, is a wrong state, ..."""
-
 LOST_SHARE: Final = 0.5
-"""... as does a larger share of them."""
-
-MOST_RELAYS_REJECTED: Final = 4.0
-"""Relays beyond the gate lately; fewer may be late ones."""
-
-FITTING_CHI2: Final = 2.0
-"""Largest χ² for each anchor of range errors that are as the settings state them."""
-
-FADING: Final = 0.95
-"""What a packet leaves of the counts of relays lately."""
-
-MOST_PACKED: Final = 16
-"""Relays in a frame; 13 fit."""
+MOST_RELAYS_REJECTED: Final = 4.0  # relays beyond the gate lately; fewer may be late ones
+FITTING_CHI2: Final = 2.0  # largest χ² for each anchor of range errors that are as the settings state them
+FADING: Final = 0.95  # what a packet leaves of the counts of relays lately
+MOST_PACKED: Final = 16  # relays in a frame; 13 fit
 
 
 class Report(Struct, frozen=True, gc=False):
@@ -424,8 +409,7 @@ def fill_motion(s: EstimatorState, rows: Matrix) -> None:
         rows[POSITION, 2] = s.settings[0]["height_m"]
 
 
-MOST_ANCHORS_IN_TABLE: Final = 256
-"""With more, one that is not in the state is forgotten for each new one."""
+MOST_ANCHORS_IN_TABLE: Final = 256  # with more, one that is not in the state is forgotten for each new one
 
 
 class SavedEstimator(Struct, frozen=True):

@@ -27,32 +27,18 @@ from skyless.positioning.estimator.state import (
     uncertain_states,
 )
 
-RECENT_PACKETS: Final = 16.0
-"""Number of packets of each anchor over which a fault counts as recent."""
-
-OPENED_STD_M: Final = 1.0
-"""Standard deviation of a fault that is added to the state, before anything is known of it."""
-
+RECENT_PACKETS: Final = 16.0  # number of packets of each anchor over which a fault counts as recent
+OPENED_STD_M: Final = 1.0  # standard deviation of a fault that is added to the state, before anything is known of it
+# A test beyond this shows a lasting fault: χ² of eight degrees of freedom is larger with a probability of 4·10⁻⁸.
 SURE_CHI2: Final = 50.0
-"""A test beyond this shows a lasting fault: χ² of eight degrees of freedom is larger with a probability of 4·10⁻⁸."""
-
-EXPLAINED_CHI2: Final = 20.0
-"""Largest part of the test that the faults of the right anchors may leave unexplained."""
-
-RIVAL_FAULT_CHI2: Final = 20.0
-"""Least difference to what the faults of any other anchors explain."""
-
-MOST_FAULTS: Final = 2
-"""Largest number of anchors that are selected."""
-
+EXPLAINED_CHI2: Final = 20.0  # largest part of the test that the faults of the right anchors may leave unexplained
+RIVAL_FAULT_CHI2: Final = 20.0  # least difference to what the faults of any other anchors explain
+MOST_FAULTS: Final = 2  # largest number of anchors that are selected
+# Obstacles make packets late, not early; a fault that is early has to explain more by this.
 EARLY_WEIGHT: Final = 0.8
-"""Obstacles make packets late, not early; a fault that is early has to explain more by this."""
-
-JUMP_RISE: Final = 0.5
-"""By this part of its full size a jump raises the process noise of all range errors."""
-
+JUMP_RISE: Final = 0.5  # by this part of its full size a jump raises the process noise of all range errors
+# Factor on the process noise of a range error that has just jumped: it may still be changing.
 FIRST_CHANGE_SCALE: Final = 25.0
-"""Factor on the process noise of a range error that has just jumped: it may still be changing."""
 
 
 @step

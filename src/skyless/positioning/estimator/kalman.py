@@ -16,22 +16,16 @@ from skyless.kernels.covariance import (
 )
 from skyless.positioning.estimator.state import EstimatorState, layout, uncertain_states
 
+# Where range errors jump, those of all anchors change by OBSTRUCTED_STD_M within OBSTRUCTED_S. One that has jumped itself
+# wanders with the density OBSTRUCTED_WALK, m²/s, and returns to zero: else all would drift away together.
 OBSTRUCTED_STD_M: Final = 0.08
-"""Where range errors jump, those of all anchors change with this standard deviation, ..."""
-
 OBSTRUCTED_S: Final = 5.0
-"""... within this time, ..."""
-
 OBSTRUCTED_WALK: Final = 0.004
-"""... and one that has jumped wanders with this density, m²/s."""
-
 OBSTRUCTION_MEMORY_S: Final = 10.0
-
+# Learnt multipath of this standard deviation makes errors that would be taken for jumps.
 MULTIPATH_STD_M: Final = 0.06
-"""Learnt multipath of this standard deviation makes errors that would be taken for jumps."""
-
+# Part of the process noise of motion that is left for a stationary tag: 5 cm within half a minute.
 STATIONARY_NOISE_SHARE: Final = 2e-7
-"""Part of the process noise of motion that is left for a stationary tag: 5 cm within half a minute."""
 
 
 @step
@@ -46,9 +40,8 @@ def predict(s: EstimatorState, rx_ticks: int) -> None:
     dt = (rx_ticks - status["epoch_ticks"]) * TICK_S
     speed_squared = 0.0
     for axis in range(dim):
-        speed = where.velocity + axis
-        speed_squared += s.x[speed] ** 2 - s.P[speed, speed]  # less its noise, which moves no tag at rest
-    status["walked_m"] += np.sqrt(max(speed_squared, 0.0)) * dt
+        speed_squared += s.x[where.velocity + axis] ** 2
+    status["walked_m"] += np.sqrt(speed_squared) * dt
     if status["obstruction"] > 0.0:
         status["obstruction"] *= np.exp(-dt / OBSTRUCTION_MEMORY_S)
     _advance(s, where.velocity, dt)

@@ -22,8 +22,7 @@ from skyless.positioning.estimator.monitor import covariance_scale
 from skyless.positioning.estimator.state import LASTING_STD_M, EstimatorState
 from skyless.positioning.integrity import CONTRADICTED, HPL, OBSTRUCTED, SOUND, UNAVAILABLE, VPL
 
-RECENT_STD_M: Final = 0.08
-"""Of a fault that has begun lately without a jump that shows."""
+RECENT_STD_M: Final = 0.08  # of a fault that has begun lately without a jump that shows
 
 LASTING_CHI2, RECENT_CHI2 = 2, 3
 """What ``protect`` writes after ``HPL`` and ``VPL``."""
@@ -80,17 +79,13 @@ def protect(s: EstimatorState, levels: Vector) -> None:
 # Whether the anchors determine on which side of them the tag is
 
 
+# Least distance from the plane at which the two sides are compared; for a tag that is farther off it is its own.
 PROBE_M: Final = 1.0
-"""Least distance from the plane at which the two sides are compared; for a tag that is farther off it is its own."""
-
+# Of that distance: standard deviation of how far the best position on the other side may lie from the mirror image.
 SHIFT_PART: Final = 0.25
-"""Of that distance: standard deviation of how far the best position on the other side may lie from the mirror image."""
-
+# The sides differ where their ranges' squared differences, over the variance of range errors, sum to more.
 SIDES_CHI2: Final = 25.0
-"""The sides differ where their ranges' squared differences, over the variance of range errors, sum to more."""
-
-SENSOR_VALID_S: Final = 1.0
-"""Time for which a sensor's height resolves which side it is."""
+SENSOR_VALID_S: Final = 1.0  # time for which a sensor's height resolves which side it is
 
 
 def fit_plane(s: EstimatorState) -> None:
@@ -147,23 +142,18 @@ def is_side_open(s: EstimatorState) -> bool:
 # Whether a position can be relied on
 
 
-UNCOVERED_CHI2: Final = 240.0
-"""A test of faults beyond this shows one that the levels may not cover."""
-
-FIRST_PACKETS: Final = 3
-"""Of each anchor, before which there are no levels."""
+UNCOVERED_CHI2: Final = 240.0  # a test of faults beyond this shows one that the levels may not cover
+FIRST_PACKETS: Final = 3  # of each anchor, before which there are no levels
 
 
+# Part of the mean range; ranges are curved within positions of a larger standard deviation, which have no level.
 MAX_LEVEL_STD: Final = 0.05
-"""Part of the mean range; ranges are curved within positions of a larger standard deviation, which have no level."""
-
+# There is no level for this time after a start whose packets contradicted each other: where several anchors are late,
+# the others may agree on a wrong position, until the tag has moved enough to show it.
 CONTRADICTED_START_S: Final = 5.0
-"""There is no level for this time after a start whose packets contradicted each other: where several anchors are late,
-the others may agree on a wrong position, until the tag has moved enough to show it."""
-
+# The same where all range errors are open: then only the tag's motion determines its position, by directions that
+# change, and a filter that is linearised at a wrong position becomes too certain (errors of 5 standard deviations).
 MAX_OPEN_LEVEL_STD: Final = 0.02
-"""The same where all range errors are open: then only the tag's motion determines its position, by directions that
-change, and a filter that is linearised at a wrong position becomes too certain (errors of 5 standard deviations)."""
 
 
 @step

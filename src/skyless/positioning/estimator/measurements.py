@@ -56,60 +56,37 @@ from skyless.positioning.estimator.state import (
 )
 from skyless.ticks import TICK_MASK
 
+# Where the errors that grow with distance pass through zero, and by which range they change once (APS011).
 SLOPE_FROM_M: Final = 4.0
-"""Where the errors that grow with distance pass through zero, and by which range they change once (APS011)."""
-
+# A range is linearised at a held point of the tag, which moves onto the estimate when that is HELD_STEP_M away, or
+# HELD_SHARE of the range if that is less; but within HELD_STD standard deviations of the estimate, up to HELD_MOST_M, it
+# stays, as noise is no motion (``docs/maths.md`` section 6, Linearisation).
 HELD_STEP_M: Final = 0.15
 HELD_SHARE: Final = 0.1
-"""A range is linearised at a held point of the tag, which moves onto the estimate when that is this distance away, or
-this share of the range if that is less (``docs/maths.md`` section 6, Linearisation), ..."""
-
 HELD_STD: Final = 3.0
 HELD_MOST_M: Final = 0.4
-"""... but no sooner than at this number of standard deviations, up to this distance: an estimate's noise is no motion."""
-
-CURVATURE_SHARE: Final = 0.01
-"""Where ranges are so curved that it counts for more than this part of the stamps' variance, it is counted."""
-
-CLOCK_JUMP_RELAYS: Final = 4
-"""Relays of an anchor in a row beyond the gate, while its receptions jump, are a clock that has jumped."""
-
+CURVATURE_SHARE: Final = 0.01  # part of the stamps' variance from which the curvature of ranges counts
+CLOCK_JUMP_RELAYS: Final = (
+    4  # relays of an anchor in a row beyond the gate, while its receptions jump: its clock jumped
+)
+JOIN_VARIANCE_M2: Final = 1.0  # where packets are late often an anchor's first one may be so too
+# Pairs of anchors: PAIR_OUTLIERS relays in a row beyond the gate are another path between the two. After PAIR_RELAYS in
+# either direction their mean is a range; beyond PAIR_SUSPECT standard deviations it contradicts the survey. An anchor with
+# MISPLACED_PAIRS such ranges, more than the other end has, stands elsewhere by about MISPLACED_STD_M in each coordinate.
 PAIR_OUTLIERS: Final = 4
-"""Relays of a pair in a row beyond the gate are another path between the two."""
-
-JOIN_VARIANCE_M2: Final = 1.0
-"""Where packets are late often an anchor's first one may be so too."""
-
 PAIR_JUMP_M2: Final = 0.25
-
 PAIR_RELAYS: Final = 12
-"""Relays of a pair in either direction after which their mean is a measurement of its range."""
-
 PAIR_SUSPECT: Final = 3.0
-"""A range between two anchors beyond this number of standard deviations contradicts the survey, ..."""
-
 MISPLACED_PAIRS: Final = 2
-"""... and an anchor with this number of them, more than the other end has, stands elsewhere, ..."""
-
 MISPLACED_STD_M: Final = 0.3
-"""... by about so much in each coordinate."""
-
-REPORT_GAIN: Final = 1.25
-"""A report is used where the filter's own variance is larger by this factor."""
-
+REPORT_GAIN: Final = 1.25  # a report is used where the filter's own variance is larger by this factor
+# Of that of a pair of stamps: no anchor knows its clock better, whatever it reports.
 LEAST_REPORT_VARIANCE: Final = 0.1
-"""Of that of a pair of stamps: no anchor knows its clock better, whatever it reports."""
-
+# An anchor with this number of rejected packets in a row joins again: its first was late, so its rate is wrong.
 REJOIN_AFTER: Final = 20
-"""An anchor with this number of rejected packets in a row joins again: its first was late, so its rate is wrong."""
-
-STEADY_WALK_SCALE: Final = 4.0
-"""Reports of clocks whose random walk counts more than this are not used."""
-
+STEADY_WALK_SCALE: Final = 4.0  # reports of clocks whose random walk counts more than this are not used
 CLOCK_JUMPED: Final = 2
-
-STATIONARY_STD_MPS: Final = 0.01
-"""Of the velocity of a tag that stands still, each time a measurement is processed."""
+STATIONARY_STD_MPS: Final = 0.01  # of the velocity of a tag that stands still, each time a measurement is processed
 
 
 @step
@@ -445,7 +422,7 @@ def _survey_pair(s: EstimatorState, one: int, other: int) -> None:
 
 @step
 def _pair_range(s: EstimatorState, one: int, other: int) -> bool:
-    """Process the mean range between two anchors, |a + δa − a' − δa'| + constant; False if it contradicts the survey."""
+    """Process |a + δa − a' − δa'| + constant as two anchors measured it; False if it contradicts the survey."""
     dim, term, squared = s.settings[0]["dim"], 0, 0.0
     a, b = s.anchors[one], s.anchors[other]
     survey = layout(dim, len(s.anchors)).survey

@@ -15,113 +15,77 @@ from skyless.positioning.estimator.faults import begin_obstruction
 from skyless.positioning.estimator.kalman import jump_share
 from skyless.positioning.estimator.state import CHANGING_RANGE_ERRORS, EstimatorState, layout
 
+# All innovations: weight of the newest in the running means, about the last 50.
 FORGETTING: Final = 0.02
-"""Weight of the newest innovation in the running means, about the last 50."""
+INCONSISTENT_NIS: Final = 1.6  # mean normalised square beyond which the tag moves more than assumed (noise alone: 1)
 
-INCONSISTENT_NIS: Final = 1.6
-"""Mean of the normalised innovations squared beyond which the tag moves more than assumed (noise alone: 1)."""
-
+# A range error has jumped where IN_ROW innovations of an anchor lie beyond SUSPECT standard deviations, together beyond
+# TOGETHER (by chance once in some million packets), and agree within AGREEMENT standard deviations of two receptions.
 SUSPECT: Final = 3.0
-"""Innovations beyond this number of standard deviations, ..."""
-
 IN_ROW: Final = 2
-"""... this number of an anchor in a row, are a jump of its range error, ..."""
-
-IN_ROW_WHERE_LATE: Final = 5
-"""... or this number where single receptions are late often, ..."""
-
+IN_ROW_WHERE_LATE: Final = 5  # the same where more than LATE_OFTEN_SHARE of all receptions are late
 LATE_OFTEN_SHARE: Final = 0.02
-"""... which is a larger share of them than this, ..."""
-
 TOGETHER: Final = 7.0
-"""... together beyond this number (by chance once in some million packets), ..."""
-
+AGREEMENT: Final = 3.0
+# Where range errors have jumped recently, more jumps are to be expected and less evidence is enough (by chance once in
+# some thousand packets), while enough other anchors are clear: else the tag's clock, which all share, would open all.
 OBSTRUCTED_SUSPECT: Final = 2.2
 OBSTRUCTED_TOGETHER: Final = 5.0
-"""The same where range errors have jumped lately: more are to be expected there, so less evidence is enough (by chance
-once in some thousand packets), while enough other anchors are not obstructed:
-else what all of them share, as the tag's clock, would open one after another."""
 
-AGREEMENT: Final = 3.0
-"""... if they agree within this number of standard deviations of two receptions."""
-
+# After a jump: the error's standard deviation, unless it has jumped by more. Its process noise is scaled up by GROWTH
+# with each packet while the squared running mean of its innovations, 1 where it wanders as expected, exceeds LIMIT.
 JUMP_STD_M: Final = 0.2
-"""Of a range error that has jumped, beyond what it was, unless it has jumped by more."""
-
 CHANGE_GAIN: Final = 0.1
 CHANGE_LIMIT: Final = 4.0
-"""Of the square of the running mean of an obstructed anchor's innovations, 1 where its error wanders as expected."""
-
 CHANGE_GROWTH: Final = 1.2
 CHANGE_LOSS: Final = 0.97
-MOST_CHANGE_SCALE: Final = 250.0
-"""A range error that has jumped then changes by 1 m in a second at most."""
-
+MOST_CHANGE_SCALE: Final = 250.0  # then it changes by 1 m in a second at most
+# An obstruction has ended where the error is known to this, and within this number of standard deviations of 0.
 ENDED_STD_M: Final = 0.05
 ENDED: Final = 2.0
-"""An obstruction has ended where its error is known to this, and within this number of standard deviations of 0."""
+SETTLED_CHANGE_SCALE: Final = 2.0  # a range error whose process noise is raised by less does not change any more
 
-SETTLED_CHANGE_SCALE: Final = 2.0
-"""A range error whose process noise is raised by less does not change any more."""
-
+# Late receptions: density of their normalised innovations (a standard deviation of 5 cm, a metre late), and the number
+# of standard deviations beyond which innovations have less weight, of receptions where they are late often, of
+# differences always.
 LATE_FORGETTING: Final = 0.005
 LATE_PROBABILITY_DENSITY: Final = 0.05
-"""Probability density of a late reception's normalised innovation: a standard deviation of 5 cm, a metre late."""
-
 RECEPTION_HUBER: Final = 1.5
-"""Where receptions are late often, innovations beyond this number of standard deviations have less weight."""
-
 DIFFERENCE_HUBER: Final = 1.0
-"""Number of standard deviations beyond which the innovations of ready-made differences have less weight."""
 
-MAX_CHANGE_STD_M: Final = 1.0
-"""Of the part of range errors that changes as the tag moves."""
-
+# Multipath: range errors are compared after each step of the tag and after two. A comparison counts as PLACE_LIMIT
+# times their mean at most, as jumps are not multipath; PLACE_LIMITED_MEAN is then left of a normal mean square. PLACE_FIRST
+# comparisons stand for the stamps' noise beforehand; PLACE_SAMPLES are needed, and PLACE_MEMORY remembered.
 PLACE_STEP_M: Final = 0.1
-"""Distance walked after which range errors are compared, and after twice as much."""
-
-PLACE_FIRST: Final = 20
-"""Number of comparisons for which the stamps' noise stands at first."""
-
-PLACE_SAMPLES: Final = 100
-"""Comparisons, of all anchors together, before they count, ..."""
-
-PLACE_MEMORY: Final = 1000
-"""... and over which their mean is taken."""
-
 PLACE_LIMIT: Final = 2.0
 PLACE_LIMITED_MEAN: Final = 0.742
-"""No comparison counts as more than this number of times their mean, as jumps are not multipath; this is what remains
-of the mean square of normal differences."""
+PLACE_FIRST: Final = 20
+PLACE_SAMPLES: Final = 100
+PLACE_MEMORY: Final = 1000
+PLACE_MOVING: Final = 2.0  # standard deviations of a velocity beyond which a tag walks
+PLACE_LEAST_M2: Final = 12e-4  # mean square beyond the stamps' noise that is more than the site file states
+PLACE_LEAST_KEPT: Final = 0.1  # least and largest correlation after one step
+PLACE_MOST_KEPT: Final = 0.9
+MAX_CHANGE_STD_M: Final = 1.0  # largest standard deviation of the part of range errors that changes as the tag moves
 
-PLACE_LEAST_M2: Final = 12e-4
-"""Mean square beyond the stamps' noise from which the changes are larger than the site file states."""
-
-PLACE_LEAST_KEPT, PLACE_MOST_KEPT = 0.1, 0.9
-"""Bounds of the correlation after one step."""
-
+# Motion: a tag moves where the mean square of its way, over the variances, exceeds MOVED. Process noise grows while the
+# mean square of the innovations' running means along the axes, 1 where the filter is right, exceeds LAG_LIMIT.
 MOVED: Final = 1.0
-"""Mean square of what a tag is away from where it was, over the variances, beyond which it counts as moving."""
-
 LAG_GAIN: Final = 0.05
 LAG_FORGETTING: Final = 0.01
 LAG_LIMIT: Final = 2.6
-"""Of the mean square of the innovations' running means along the axes, 1 where the filter is right."""
-
 Q_SCALE_GAIN: Final = 1.05
 Q_SCALE_LOSS: Final = 0.99
 MAX_Q_SCALE: Final = 100.0
 
+# The tag's clock: limit of the squared running mean of all innovations. Where the newest of all anchors lie beyond
+# COMMON standard deviations on one side, it has left its rate: nothing else makes all late, or early, at once.
 COMMON_GAIN: Final = 0.05
 COMMON_LIMIT: Final = 9.0
-"""Of the square of the running mean of all innovations, 1 where the filter is right; those of the tag's clock."""
-
 COMMON: Final = 1.5
-"""Where the newest innovations of all anchors lie beyond this number of standard deviations on one side, the tag's
-clock has left its rate: nothing else makes all of them late, or early, at once."""
-
 WALK_GAIN: Final = 1.1
 WALK_LOSS: Final = 0.99
+# Each anchor's clock: limit of the squared running mean of what relays show of it.
 RELAY_GAIN: Final = 0.05
 RELAY_LIMIT: Final = 9.0
 RELAY_WALK_GAIN: Final = 1.2
@@ -285,9 +249,12 @@ def learn_place(s: EstimatorState, anchor: int, residual_m: float) -> None:
     a Gauss–Markov process of variance σ² with the correlation c over a step (a semivariogram, Matheron 1963).
     """
     settings, status, a = s.settings[0], s.status[0], s.anchors[anchor]
-    step_m = status["walked_m"] - a["place_walked_m"]
+    step_m, velocity = status["walked_m"] - a["place_walked_m"], layout(settings["dim"], len(s.anchors)).velocity
+    motion = 0.0  # beyond the estimate's noise
+    for state in range(velocity, velocity + settings["dim"]):
+        motion += s.x[state] ** 2 - PLACE_MOVING**2 * s.P[state, state]
     if step_m >= PLACE_STEP_M:
-        a["place_steps"] = a["place_steps"] + 1 if step_m < 2.0 * PLACE_STEP_M else 0
+        a["place_steps"] = a["place_steps"] + 1 if step_m < 2.0 * PLACE_STEP_M and motion > 0.0 else 0
         if a["place_steps"] >= 2:
             status["place_samples"] = min(status["place_samples"] + 1, PLACE_MEMORY)
             for lag in range(2):
@@ -300,12 +267,11 @@ def learn_place(s: EstimatorState, anchor: int, residual_m: float) -> None:
         a["place_walked_m"] = status["walked_m"]
         noise = settings["tx_variance_m2"] + settings["rx_variance_m2"]
         near, far = status["place_square_m2"][0] - noise, status["place_square_m2"][1] - noise
-        status["place_variance_m2"] = settings["place_std_m"] ** 2
-        status["place_distance_m"] = settings["place_distance_m"]
+        status["place_variance_m2"], status["place_distance_m"] = 0.0, settings["place_distance_m"]
         if status["place_samples"] >= PLACE_SAMPLES and near > PLACE_LEAST_M2:
             kept = min(max(far / near - 1.0, PLACE_LEAST_KEPT), PLACE_MOST_KEPT)
             variance = min(near / (1.0 - kept), MAX_CHANGE_STD_M**2)
-            if variance > status["place_variance_m2"]:
+            if variance > settings["place_std_m"] ** 2:
                 status["place_variance_m2"], status["place_distance_m"] = variance, -PLACE_STEP_M / np.log(kept)
 
 

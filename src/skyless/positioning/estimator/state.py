@@ -229,7 +229,10 @@ STATUS_DTYPE: Final = np.dtype(
         ("walk_scale", np.float64),  # factor on its random walk
         ("place_samples", np.int64),  # comparisons of range errors at places a step apart
         ("place_square_m2", np.float64, (2,)),  # half their mean square after one and two steps
-        ("place_variance_m2", np.float64),  # of the part of range errors that changes as the tag moves, as learnt ...
+        (
+            "place_variance_m2",
+            np.float64,
+        ),  # of what multipath changes in them, as learnt; 0 where it is not more than stated ...
         ("place_distance_m", np.float64),  # ... and the distance over which it changes
         ("obstruction", np.float64),  # 1 where range errors have jumped lately, 0 where they do not
         ("walked_m", np.float64),
@@ -373,7 +376,6 @@ def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors
     status["walk_scale"] = min(START_WALK_SCALE, settings.max_walk_scale)
     status["fault_std_m"] = LASTING_STD_M
     status["place_square_m2"] = settings.tx_variance_m2 + settings.rx_variance_m2
-    status["place_variance_m2"] = settings.place_std_m**2
     status["place_distance_m"] = settings.place_distance_m
     status["mean_square_m2"] = settings.tx_variance_m2 + settings.rx_variance_m2
     P = np.zeros((n, n))

@@ -38,30 +38,18 @@ DIFFERENCES: Final = EstimatorSettings(
 """What recorded flights of DW1000s show (docs/recordings.md): reflections change within half a metre, and by how much
 differs from anchor to anchor."""
 
+# A start uses the newest differences: this number of them, or at least those of this time.
 WINDOW: Final = 60
 WINDOW_S: Final = 1.0
-"""A start uses the newest differences: this number of them, or at least those of this time."""
-
-MAX_DIFFERENCE_SILENCE_S: Final = 10.0
-"""After a longer silence the state is worse than a new start."""
-
-START_SPEED_STD_MPS: Final = 1.0
-"""Of the velocity at the start."""
-
-DIFFERENCE_IN_USE_S: Final = 0.5
-"""An anchor counts as in use while its last accepted difference is younger."""
-
+MAX_DIFFERENCE_SILENCE_S: Final = 10.0  # after a longer silence the state is worse than a new start
+START_SPEED_STD_MPS: Final = 1.0  # of the velocity at the start
+DIFFERENCE_IN_USE_S: Final = 0.5  # an anchor counts as in use while its last accepted difference is younger
+# While the horizontal standard deviation is larger, there is no fix; a silence that makes it so means a new start.
 MAX_HORIZONTAL_STD_M: Final = 3.0
-"""While the horizontal standard deviation is larger, there is no fix; a silence that makes it so means a new start."""
-
-SHORT_SILENCE_S: Final = 0.1
-"""Over shorter silences no state grows much wider."""
-
-TRY_EVERY_S: Final = 0.1
-"""Between two attempts at a start."""
-
+SHORT_SILENCE_S: Final = 0.1  # over shorter silences no state grows much wider
+TRY_EVERY_S: Final = 0.1  # between two attempts at a start
+# A start from later differences that is farther off (3-D: once in 60,000) begins again.
 CONTRADICTED_CHI2: Final = 25.0
-"""A start from later differences that is farther off (3-D: once in 60,000) begins again."""
 
 
 class DifferenceTracking:
@@ -247,33 +235,20 @@ NEIGHBOURHOOD: Final = (1.5, 1.5, 0.5)
 """A tag farther from the anchors' centre than these parts of their figure's diagonal is lost."""
 
 LEAST_DIAGONAL_M: Final = 5.0
-
+# Starts lie no higher above or below anchors of different heights than this, unless bounds are given.
 HEIGHT_MARGIN_M: Final = 1.0
-"""Starts lie no higher above or below anchors of different heights than this, unless bounds are given."""
-
-START_DIFFERENCE_STD_M: Final = 0.08
-"""Of the median of a pair's differences, ..."""
-
-START_ANCHOR_STD_M: Final = 0.14
-"""... and of the errors of each anchor, before any are estimated."""
-
+START_DIFFERENCE_STD_M: Final = 0.08  # of the median of a pair's differences
+START_ANCHOR_STD_M: Final = 0.14  # of the errors of each anchor, before any are estimated
+# Of an anchor that is late: on the floor or behind metal one is often, and at times two.
 START_LATE_STD_M: Final = 1.0
-"""Of an anchor that is late: on the floor or behind metal one is often, and at times two."""
 
-LATE_PENALTY: Final = 2.0
-"""What each anchor that is late adds to chi² (odds of 1 to 3)."""
-
+LATE_PENALTY: Final = 2.0  # what each anchor that is late adds to chi² (odds of 1 to 3)
 MOST_LATE: Final = 2
-
-START_TAIL: Final = 1e-2
-"""Where residuals are larger than noise makes them this rarely, more anchors are late."""
-
-JOINING_STEPS: Final = 4
-"""Of least squares with the weights that the last one shows."""
-
+START_TAIL: Final = 1e-2  # where residuals are larger than noise makes them this rarely, more anchors are late
+JOINING_STEPS: Final = 4  # of least squares with the weights that the last one shows
+# A rival has at least this probability and distance; anchors lie elsewhere for a tag that has moved as far.
 RIVAL_WEIGHT: Final = 0.01
 RIVAL_M: Final = 0.5
-"""A rival has at least this probability and distance; anchors lie elsewhere for a tag that has moved as far."""
 
 
 class Start(Struct, frozen=True):

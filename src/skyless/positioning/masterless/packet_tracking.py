@@ -292,7 +292,7 @@ class PacketTracking:
         positions = np.array([anchor.position_m[:2] for anchor in self._anchors.values()])
         low, high = positions.min(axis=0), positions.max(axis=0)
         x_m, y_m = ((low + high) / 2.0).tolist()
-        self._area_m = (x_m, y_m, NEIGHBOURHOOD * max(float(np.linalg.norm(high - low)), 5.0))
+        self._area_m = (x_m, y_m, NEIGHBOURHOOD[0] * max(float(np.linalg.norm(high - low)), 5.0))
 
     def _relayed(self, listener: int, anchor: _Anchor, relay: Relay) -> int | str:
         """The anchor's reception of another's packet, unwrapped and without antenna delays, or why it cannot be had."""

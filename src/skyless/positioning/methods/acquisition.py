@@ -20,47 +20,36 @@ from skyless.positioning.fix import NoFixReason
 from skyless.positioning.methods.locate import RESIDUAL_TAIL, RIVAL_MINIMUM_CHI2, NoSolution, locate_pseudoranges
 from skyless.positioning.observation import Observation
 
+# Older messages are not used for the start, unless superframes are longer; and then only for the rate of the clock,
+# as the tag may be elsewhere by now.
 START_MAX_AGE_S: Final = 0.5
-"""Older messages are not used for the start, unless superframes are longer; and then only for the rate of the clock, as
-the tag may be elsewhere by now."""
-
+# With a standard deviation above this part of the mean range, ranges are not linear in the state: updates would make
+# the filter sure of a wrong position. It waits for more anchors: START_PATIENCE_S after the first such start, and four
+# times as long for one wider by four times.
 WIDE_START: Final = 0.05
-"""With a standard deviation above this part of the mean range, ranges are not linear in the state: updates would make
-the filter sure of a wrong position. It waits for more anchors, ..."""
-
 START_PATIENCE_S: Final = 0.5
-"""... for this time after the first such start, and four times as long for one wider by four times."""
 
 CONTRADICTIONS: Final = frozenset({NoFixReason.RESIDUALS, NoFixReason.BAD_GEOMETRY, NoFixReason.NOT_CONVERGED})
 """How a start fails with one faulty anchor; absurd pseudoranges count as bad geometry."""
 
+# Typical speed of a tag; it smears pseudoranges taken at different times and starts the velocity.
 TAG_SPEED_STD_MPS: Final = 1.0
-"""Typical speed of a tag; it smears pseudoranges taken at different times and starts the velocity."""
-
-MAX_SILENCE_S: Final = 5.0
-"""After a longer silence the state is worse than a new start."""
-
+MAX_SILENCE_S: Final = 5.0  # after a longer silence the state is worse than a new start
+# With a horizontal standard deviation above this part of the anchors' mean range, ranges are no longer linear in the
+# state: updates would make it confident of a wrong position, so a new start is better.
 MAX_RELATIVE_STD: Final = 0.05
-"""With a horizontal standard deviation above this part of the anchors' mean range, ranges are no longer linear in the
-state: updates would make it confident of a wrong position, so a new start is better."""
-
+# Accepted in longer superframes, where a new start takes seconds.
 SLOW_S: Final = 0.2
 SLOW_MAX_RELATIVE_STD: Final = 0.2
-"""Accepted in longer superframes, where a new start takes seconds."""
-
-SHORT_SILENCE_S: Final = 0.1
-"""Over shorter silences no state grows much wider."""
-
+SHORT_SILENCE_S: Final = 0.1  # over shorter silences no state grows much wider
+# A filter that is lost within this time of its start may have a tag that is faster than assumed: the next start assumes
+# a speed higher by this factor, up to this.
 EARLY_S: Final = 1.0
-"""A filter that is lost within this time of its start may have a tag that is faster than assumed; ..."""
-
 SPEED_STD_GROWTH: Final = 4.0
 MAX_SPEED_STD_MPS: Final = 32.0
-"""... the next start assumes a speed higher by this factor, up to this."""
 
 
-MAX_LINK_AGE_S: Final = 1.0
-"""Older links are forgotten."""
+MAX_LINK_AGE_S: Final = 1.0  # older links are forgotten
 
 
 class _Link(Struct, frozen=True):

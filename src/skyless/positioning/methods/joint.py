@@ -41,40 +41,29 @@ from skyless.positioning.methods.observations import FixTime
 from skyless.positioning.observation import Observation
 from skyless.ticks import TICK_MASK, from_seconds
 
+# Factor on the start's covariance, as the filter is then given the packets that it rests on.
 COVARIANCE_MARGIN: Final = 4.0
-"""Factor on the start's covariance, as the filter is then given the packets that it rests on."""
-
+# Faults that show within this time of a start, and whose anchors are not clear, have led to a wrong position.
 EARLY_FAULT_S: Final = 2.0
-"""Faults that show within this time of a start, and whose anchors are not clear, have led to a wrong position."""
-
-UNEXPLAINED_CHI2: Final = 30.0
-"""What faults of two anchors leave of the test where there are more."""
-
+UNEXPLAINED_CHI2: Final = 30.0  # what faults of two anchors leave of the test where there are more
+# Number of range errors that jump early, and mean NIS, beyond which the tag is faster than assumed.
 MANY_JUMPS: Final = 3
 EARLY_NIS: Final = 3.0
-"""Number of range errors that jump early, and mean NIS, beyond which the tag is faster than assumed."""
-
+# A sensor's height is not wrong by more standard deviations than this; where this number of them in a row do not fit,
+# the position is wrong.
 HEIGHT_SIGMAS: Final = 5.0
-"""A sensor's height is not wrong by more standard deviations than this, ..."""
-
 MAX_HEIGHTS_REJECTED: Final = 20
-"""... so if this number of them in a row do not fit, it is the position that is wrong."""
-
+# Range errors that have jumped more lately make faults of their own; a new start would not help.
 CALM_OBSTRUCTION: Final = 0.1
-"""Range errors that have jumped more lately make faults of their own; a new start would not help."""
-
+# In longer ones a tag may be metres away when it receives an anchor again: nothing is predicted over them, and each
+# round of packets is a start of its own.
 LONGEST_SUPERFRAME_S: Final = 2.0
-"""In longer ones a tag may be metres away when it receives an anchor again: nothing is predicted over them, and each
-round of packets is a start of its own."""
-
+# By then it is known how often packets are late; a start that was wrong for that reason is repeated.
 LATE_SHARE_KNOWN_S: Final = 0.5
-"""By then it is known how often packets are late; a start that was wrong for that reason is repeated."""
-
+# A start with open range errors is not repeated for this time; then it is, once they fit the settings.
 OPEN_START_HOLD_S: Final = 1.0
-"""A start with open range errors is not repeated for this time; then it is, without them, once they fit the settings."""
-
+# Packets that are older than the newest by less are late from the radio or the host; others mean another counter.
 REORDERED_S: Final = 0.1
-"""Packets that are older than the newest by less are late from the radio or the host; others mean another counter."""
 
 SURELY_IN_REACH_TICKS: Final = from_seconds(SHORT_SILENCE_S) - 1
 """Silences up to this need no check of the filter."""
@@ -443,8 +432,8 @@ def _nearest(start: Start, most: int) -> set[int]:
 # Anchors in use
 
 
+# An anchor counts as in use while its last accepted message is younger, or a superframe and a half.
 LEAST_IN_USE_S: Final = 0.1
-"""An anchor counts as in use while its last accepted message is younger, or a superframe and a half."""
 
 
 class AnchorsInUse:
@@ -504,11 +493,8 @@ class AnchorsInUse:
 # The master's own counter
 
 
-FARTHEST_LENGTHS: Final = 16
-"""Lines are extended by this number of times their length."""
-
-MISFIT_SUBTICKS: Final = 64
-"""By which a master's packets may lie off the line: roundings, extended that far."""
+FARTHEST_LENGTHS: Final = 16  # lines are extended by this number of times their length
+MISFIT_SUBTICKS: Final = 64  # by which a master's packets may lie off the line: roundings, extended that far
 
 SITE_TIME_MASK: Final = SUBTICKS * (TICK_MASK + 1) - 1
 
