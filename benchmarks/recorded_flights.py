@@ -154,7 +154,7 @@ class Fixes:
 
 
 def score(times_s, error_m, covariance_m2, levels_m, alerted, here):
-    """Judge fixes; errors are of shape (n, 2) where the height was given or is not known, else (n, 3), NaN without truth.
+    """Judge fixes; errors are of shape (n, 2) where the height was given or is unknown, else (n, 3); NaN: no truth.
 
     Accuracy counts where ``here`` is true, levels from the first one on, as the worst starts are before that.
     """

@@ -196,6 +196,11 @@ class Receiver:
         """The method in use where it is ``joint``, the only one that protocol 2 has."""
         return cast("Estimation | None", self._method) if self._options.method in FILTERS else None
 
+    @property
+    def multipath_m(self) -> tuple[float, float] | None:
+        """Standard deviation by which ranges change, and over which distance, where it exceeds what the site states."""
+        return None if self._joint is None else self._joint.estimator.multipath_m
+
     def hear(self, reception: Reception) -> Fix | None:
         """Process a frame from the air; a fix if it made one, else ``reason`` is set.
 

@@ -104,16 +104,15 @@ def dense(site, point, superframes, shift_m=0.0):
             h[:dim], h[dim + i], h[2 * half + i] = towards, 1.0, 1.0
             h[constant + i], h[change + i], h[slope] = 1.0, 1.0, np.clip((range_m - 4.0) / 4.0, -1.0, 1.0)
             h[survey + dim * i : survey + dim * (i + 1)] = -towards
-            measured = [(h, rx_var, len(P), shift_m * (site.anchors[i].id == 3))]
+            measured = [(h, rx_var, shift_m * (site.anchors[i].id == 3))]
             for r in range(relays.ends[k - 1] if k else 0, relays.ends[k]):
                 j, age = relays.sender[r], relays.age_s[r]
                 h = np.zeros(len(P))
                 h[dim + j], h[dim + i], h[2 * half + j] = 1.0, -1.0, 1.0
                 h[half + dim + j], h[half + dim + i] = -age, age
-                measured.append((h, rx_var + 2.0 * age * (white + walk * age**2 / 3.0), slope, 0.0))
-            for h, variance, updated, late in measured:
+                measured.append((h, rx_var + 2.0 * age * (white + walk * age**2 / 3.0), 0.0))
+            for h, variance, late in measured:
                 gain = P @ h / (h @ P @ h + variance)
-                gain[updated:] = 0.0
                 A = np.eye(len(P)) - np.outer(gain, h)
                 P, S = (A @ X @ A.T + variance * np.outer(gain, gain) for X in (P, S))
                 mean = mean + gain * (late - h @ mean)

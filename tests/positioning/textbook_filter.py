@@ -1,15 +1,16 @@
 """A textbook's extended Kalman filter with the estimator's states and measurements, in whole matrices; no monitor.
 
-F·P·Fᵀ + Q, Joseph's update, and gains of zero for what a relay only considers (Schmidt 1966). All anchors have their
-states from the beginning; an offset comes in by the Jacobian of the equation that makes it.
+F·P·Fᵀ + Q and Joseph's update; ranges are linearised at held points. All anchors have their states from the
+beginning; an offset comes in by the Jacobian of the equation that makes it.
 """
 
-from itertools import pairwise
+from itertools import pairwise, permutations
 
 import numpy as np
 
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.positioning.estimator.state import PAIR_STD_M
+from skyless.positioning.estimator.measurements import HELD_MOST_M, HELD_SHARE, HELD_STD, HELD_STEP_M, PAIR_RELAYS
+from skyless.positioning.estimator.state import OPEN_PAIR_STD_M
 
 
 class Newest:
@@ -36,10 +37,11 @@ class TextbookFilter:
         variances[self.height] = settings.height_std_m**2
         self.P = np.diag(variances)
         self.x[self.p], self.P[: self.dim, : self.dim] = position_m, covariance_m2
-        self.slope_range_m = {}
+        self.held_m = {}
         self.whole, self.newest, self.packets, self.relayed, self.walked_m = {}, {}, {}, set(), 0.0
-        pair_variance = PAIR_STD_M**2 if settings.range_std_m or settings.survey_std_m else 0.0
+        pair_variance = OPEN_PAIR_STD_M**2 if settings.range_std_m or settings.survey_std_m else 0.0
         self.pairs = {frozenset((i, j)): [0.0, pair_variance] for i in range(n) for j in range(i)}
+        self.relays = dict.fromkeys(permutations(range(n), 2), 0)
 
     def update(self, packet, q_scale, own_walk_scale, walk_scales):
         """``packet`` as ``Estimator.process`` takes it; what the process noise is multiplied by is told."""
@@ -83,18 +85,23 @@ class TextbookFilter:
     def _range(self, anchor, variance):
         """Jacobian of the range and its errors, the range, what it is longer by on average, and all that together."""
         h, survey = np.zeros(self.size), self.surveys[self.dim * anchor : self.dim * (anchor + 1)]
-        up_m = [] if self.dim == 3 else self.settings.height_m + self.x[self.height]
-        away = np.append(self.x[self.p], up_m) - self.anchors_m[anchor]
+        given_m = [] if self.dim == 3 else [self.settings.height_m]
+        place_m, trace = np.append(self.x[self.p], given_m), np.trace(self.P[: self.dim, : self.dim])
+        step_m = min(HELD_STEP_M, HELD_SHARE * np.linalg.norm(place_m - self.anchors_m[anchor]))
+        step_m = max(step_m, min(HELD_STD * trace**0.5, HELD_MOST_M))
+        if not np.linalg.norm(place_m - self.held_m.get(anchor, np.nan)) <= step_m:
+            self.held_m[anchor] = place_m
+        held_m = self.held_m[anchor] - self.anchors_m[anchor]
+        held_range_m = np.linalg.norm(held_m)
+        away = place_m - self.anchors_m[anchor]
         away[: self.dim] -= self.x[survey]
+        away[self.dim :] += self.x[self.height]
         range_m = float(np.linalg.norm(away))
-        direction = away[: self.dim] / range_m
-        if abs(range_m - self.slope_range_m.get(anchor, 0.0)) > 0.25:
-            self.slope_range_m[anchor] = range_m
-        far = (self.slope_range_m[anchor] - 4.0) / 4.0
+        direction = held_m[: self.dim] / held_range_m
         errors = [self.w[anchor], self.change[anchor], self.constant[anchor]]
-        h[errors], h[self.slope] = 1.0, np.clip(far, -1.0, 1.0)
+        h[errors], h[self.slope] = 1.0, np.clip((held_range_m - 4.0) / 4.0, -1.0, 1.0)
         expected = range_m + h @ self.x
-        h[self.p], h[survey], h[self.height] = direction, -direction, away[self.dim :] / range_m
+        h[self.p], h[survey], h[self.height] = direction, -direction, held_m[self.dim :] / held_range_m
         place = self.P[: self.dim, : self.dim]
         widest, curvature_m = np.trace(place) / range_m, (np.trace(place) - direction @ place @ direction) / range_m / 2
         if min(widest**2 / 2, 2 * curvature_m**2) < 0.01 * variance:
@@ -128,7 +135,7 @@ class TextbookFilter:
         )
         h[self.b[anchor]] = 1.0
         z = (rx - tx - self.whole[anchor]) * TICK_M
-        self._update(h, z - expected_m - self.x[self.b[anchor]], s.rx_variance_m2 + 2 * curvature_m**2, self.size)
+        self._update(h, z - expected_m - self.x[self.b[anchor]], s.rx_variance_m2 + 2 * curvature_m**2)
         self.newest[anchor] = Newest(tx, rx, self.walked_m, range_m, has_tx_noise)
 
     def _relay(self, listener, sender, tx, rx, stamp, walk_scale):
@@ -145,13 +152,22 @@ class TextbookFilter:
         z = (stamp - tx - self.whole[sender] + self.whole[listener]) * TICK_M
         innovation = z - way_m - pair[0] - h @ self.x
         share = pair[1] / (h @ self.P @ h + R + pair[1])
-        self._update(h, innovation, R + pair[1], self.slope[0])
+        self._update(h, innovation, R + pair[1])
         pair[0] += share * innovation
         pair[1] *= 1 - share
+        self.relays[listener, sender] += 1
+        if self.relays[listener, sender] == PAIR_RELAYS and self.relays[sender, listener] >= PAIR_RELAYS:
+            self._pair_range(listener, sender, *pair)
 
-    def _update(self, h, innovation, R, updated):
+    def _pair_range(self, one, other, longer_m, variance):
+        h, towards = np.zeros(self.size), self.anchors_m[one] - self.anchors_m[other]
+        towards = towards[: self.dim] / np.linalg.norm(towards)
+        for anchor, sign in ((one, 1.0), (other, -1.0)):
+            h[self.surveys[self.dim * anchor : self.dim * (anchor + 1)]] = sign * towards
+        self._update(h, longer_m - h @ self.x, variance + self.settings.pair_std_m**2)
+
+    def _update(self, h, innovation, R):
         gain = self.P @ h / (h @ self.P @ h + R)
-        gain[updated:] = 0.0
         keep = np.eye(self.size) - np.outer(gain, h)
         self.x = self.x + gain * innovation
         self.P = keep @ self.P @ keep.T + R * np.outer(gain, gain)

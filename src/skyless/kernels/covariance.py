@@ -74,16 +74,13 @@ def multiply_ph(P: Matrix, n: int, h: Vector, h_index: Indices, terms: int, ph: 
 
 
 @step
-def subtract_information(P: Matrix, n: int, updated: int, ph: Vector, innovation_variance: float) -> float:
-    """Measurement update of the first ``updated`` states: P ← P − u·uᵀ with u = P·h/√S, symmetric to the bit.
-
-    The other states are considered (Schmidt 1966): their own block stays. ``ph`` becomes u; returns √S.
-    """
+def subtract_information(P: Matrix, n: int, ph: Vector, innovation_variance: float) -> float:
+    """Measurement update: P ← P − u·uᵀ with u = P·h/√S, symmetric to the bit. ``ph`` becomes u; returns √S."""
     root = np.sqrt(innovation_variance)
     for state in range(n):
         ph[state] /= root
     for state in range(n):
         factor = ph[state]
-        for column in range(n if state < updated else updated):
+        for column in range(n):
             P[state, column] -= factor * ph[column]
     return float(root)

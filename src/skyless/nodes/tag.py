@@ -80,6 +80,7 @@ class TagNode:
         self._trusted = self._new_trusted()
         self._receiver = self.new_receiver()
         self._report = None if settings.trust is None else TagReport(radio.name, settings.trust.site, log)
+        self._log, self._has_told_multipath = log, False
         self._heard_s = 0.0
         """When the last reception was processed."""
         self.receptions = 0
@@ -148,8 +149,19 @@ class TagNode:
         return trusted.is_verified and self._clock() - self._heard_s < VERIFIED_S
 
     def check_reception(self, now_s: float) -> None:
-        """Log where to look if it receives nothing usable; ``now_s`` is the host's monotonic clock."""
+        """Log where to look if nothing usable comes, and, once, ranges that change more than the site file states.
+
+        ``now_s`` is the host's monotonic clock.
+        """
         self.monitor.check(now_s, self.receptions, self.receiver.counters["heard"], self.drops)
+        if not self._has_told_multipath and (found := self.receiver.multipath_m) is not None:
+            self._has_told_multipath = True
+            std_m, distance_m = found
+            self._log(
+                f"tag {self.name}: ranges change by {100 * std_m:.0f} cm within {100 * distance_m:.0f} cm walked, more"
+                f" than the site file states; place_std_m = {std_m:.2f} and place_distance_m = {distance_m:.2f} in its"
+                " [accuracy] would let all tags start with that"
+            )
 
     async def run(self) -> None:
         """Listen until cancelled."""

@@ -24,7 +24,6 @@ from skyless.planning.links import Scene, fill_dops
 from skyless.positioning.estimator.faults import compute_fault_input
 from skyless.positioning.estimator.kalman import (
     compute_ph,
-    dynamic_states,
     predict,
     relax_range_error,
     reset_state,
@@ -130,7 +129,7 @@ def _time_update(s: EstimatorState, now: int, impulses_ticks: int, superframe_s:
 @kernel
 def _own_reception(s: EstimatorState, anchor: int, rx_ticks: int, share: float, late_m: float) -> None:
     """The tag's reception of an anchor, of which this share arrives, late by ``late_m``."""
-    settings, a, n = s.settings[0], s.anchors[anchor], len(s.x)
+    settings, a, _n = s.settings[0], s.anchors[anchor], len(s.x)
     where = layout(settings["dim"], len(s.anchors))
     walls = 2 * len(s.anchors) + settings["dim"]
     if a["packets"] == 0:
@@ -143,7 +142,7 @@ def _own_reception(s: EstimatorState, anchor: int, rx_ticks: int, share: float, 
         variance = compute_ph(s, terms) + settings["rx_variance_m2"] / share
         compute_fault_input(s, terms, anchor)
         s.fault_input[walls] += late_m
-        update(s, 0.0, variance, 1.0, n)
+        update(s, 0.0, variance)
     a["rx_ticks"] = rx_ticks
     a["packets"] += 1
 
@@ -157,7 +156,7 @@ def _relay(s: EstimatorState, listener: int, sender: int, age_s: float, share: f
     compute_fault_input(s, terms, -1)
     if s.links[listener, sender]["variance_m2"] == 0.0:  # else the pair's constant takes the delay
         s.fault_input[2 * len(s.anchors) + s.settings[0]["dim"]] += late_m
-    update(s, 0.0, variance, 1.0, dynamic_states(s))
+    update(s, 0.0, variance)
 
 
 @threaded_kernel

@@ -396,7 +396,7 @@ def _update(m: _Model, P: Matrix, h: Vector, h_index: Indices, terms: int, ph: V
     """What the measurement in ``h`` leaves of the covariance."""
     n = len(P)
     innovation_variance = multiply_ph(P, n, h, h_index, terms, ph) + m.rx_variance_m2
-    subtract_information(P, n, n, ph, innovation_variance)
+    subtract_information(P, n, ph, innovation_variance)
 
 
 @kernel

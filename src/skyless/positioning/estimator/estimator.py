@@ -680,6 +680,13 @@ class Estimator:
         return bool(s.x[constants] @ np.linalg.solve(variances, s.x[constants]) < FITTING_CHI2 * count)
 
     @property
+    def multipath_m(self) -> tuple[float, float] | None:
+        """How far range errors change, and over which distance walked, where that is more than the settings state."""
+        status = self._state.status[0]
+        variance_m2, distance_m = float(status["place_variance_m2"]), float(status["place_distance_m"])
+        return (variance_m2**0.5, distance_m) if variance_m2 > 0.0 else None
+
+    @property
     def is_late_often(self) -> bool:
         """Whether single packets are late often."""
         return bool(self._state.status[0]["late_share"] > LATE_OFTEN_SHARE)

@@ -16,8 +16,8 @@ from skyless.kernels.covariance import (
 )
 from skyless.positioning.estimator.state import EstimatorState, layout, uncertain_states
 
-# Where range errors jump, those of all anchors change by OBSTRUCTED_STD_M within OBSTRUCTED_S. One that has jumped itself
-# wanders with the density OBSTRUCTED_WALK, m²/s, and returns to zero: else all would drift away together.
+# Where range errors jump, those of all anchors change by OBSTRUCTED_STD_M within OBSTRUCTED_S. One that has jumped
+# itself wanders with the density OBSTRUCTED_WALK, m²/s, and returns to zero: else all would drift away together.
 OBSTRUCTED_STD_M: Final = 0.08
 OBSTRUCTED_S: Final = 5.0
 OBSTRUCTED_WALK: Final = 0.004
@@ -142,24 +142,18 @@ def compute_ph(s: EstimatorState, terms: int) -> float:
 
 
 @step
-def update(s: EstimatorState, innovation: float, innovation_variance: float, gain_scale: float, updated: int) -> None:
-    """Scalar update of the first ``updated`` states by the measurement in ``h`` with P·h in ``ph``.
+def update(s: EstimatorState, innovation: float, innovation_variance: float, gain_scale: float = 1.0) -> None:
+    """Scalar update by the measurement in ``h`` with P·h in ``ph``.
 
     K = gain_scale·P·h/S. A scale of 1 is the Kalman gain; a measurement whose variance counts more has the S that
     follows, and 1. P changes by −u·uᵀ with u = P·h/√S, which is symmetric to the bit.
     """
     x, V, u, fault_input, n = s.x, s.V, s.ph, s.fault_input, uncertain_states(s)
-    root = subtract_information(s.P, n, updated, u, innovation_variance)
+    root = subtract_information(s.P, n, u, innovation_variance)
     step = gain_scale * innovation / root
-    for state in range(min(updated, n)):
+    for state in range(n):
         x[state] += u[state] * step
     for fault in range(V.shape[0]):
         gain = gain_scale * fault_input[fault] / root
-        for state in range(min(updated, n)):
+        for state in range(n):
             V[fault, state] += gain * u[state]
-
-
-@step
-def dynamic_states(s: EstimatorState) -> int:
-    """How many states all measurements update; those that follow only the tag's own receptions do."""
-    return layout(s.settings[0]["dim"], len(s.anchors)).slope

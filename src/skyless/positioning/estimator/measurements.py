@@ -25,7 +25,6 @@ from skyless.positioning.estimator.faults import (
 from skyless.positioning.estimator.kalman import (
     OBSTRUCTED_STD_M,
     compute_ph,
-    dynamic_states,
     jump_share,
     relax_range_error,
     reset_state,
@@ -59,8 +58,8 @@ from skyless.ticks import TICK_MASK
 # Where the errors that grow with distance pass through zero, and by which range they change once (APS011).
 SLOPE_FROM_M: Final = 4.0
 # A range is linearised at a held point of the tag, which moves onto the estimate when that is HELD_STEP_M away, or
-# HELD_SHARE of the range if that is less; but within HELD_STD standard deviations of the estimate, up to HELD_MOST_M, it
-# stays, as noise is no motion (``docs/maths.md`` section 6, Linearisation).
+# HELD_SHARE of the range if that is less; but within HELD_STD standard deviations of the estimate, up to HELD_MOST_M,
+# it stays, as noise is no motion (``docs/maths.md`` section 6, Linearisation).
 HELD_STEP_M: Final = 0.15
 HELD_SHARE: Final = 0.1
 HELD_STD: Final = 3.0
@@ -70,9 +69,10 @@ CLOCK_JUMP_RELAYS: Final = (
     4  # relays of an anchor in a row beyond the gate, while its receptions jump: its clock jumped
 )
 JOIN_VARIANCE_M2: Final = 1.0  # where packets are late often an anchor's first one may be so too
-# Pairs of anchors: PAIR_OUTLIERS relays in a row beyond the gate are another path between the two. After PAIR_RELAYS in
-# either direction their mean is a range; beyond PAIR_SUSPECT standard deviations it contradicts the survey. An anchor with
-# MISPLACED_PAIRS such ranges, more than the other end has, stands elsewhere by about MISPLACED_STD_M in each coordinate.
+# Pairs of anchors: PAIR_OUTLIERS relays in a row beyond the gate are another path between the two. After PAIR_RELAYS
+# in either direction their mean is a range; beyond PAIR_SUSPECT standard deviations it contradicts the survey. An
+# anchor with MISPLACED_PAIRS such ranges, more than the other end has, is off by about MISPLACED_STD_M in each
+# coordinate.
 PAIR_OUTLIERS: Final = 4
 PAIR_JUMP_M2: Final = 0.25
 PAIR_RELAYS: Final = 12
@@ -239,7 +239,7 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
         used_variance = innovation_variance * scale + (variance_factor - 1.0) * settings["rx_variance_m2"]
         compute_fault_input(s, terms, anchor)
         gather_evidence(s, innovation, used_variance)
-        update(s, innovation, used_variance, 1.0, len(s.x))
+        update(s, innovation, used_variance)
         adapt_change_variance(s, anchor, elapsed_s)
         steps = int(np.floor(s.x[offset] / TICK_M))
         a["offset_ticks"] += steps
@@ -384,7 +384,7 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
         link["variance_m2"] -= share * pair_variance
         compute_fault_input(s, term, -1)
         gather_evidence(s, innovation, innovation_variance)
-        update(s, innovation, innovation_variance, 1.0, dynamic_states(s))
+        update(s, innovation, innovation_variance)
         forth, back = s.links[listener, sender], s.links[sender, listener]
         forth["relays"] += 1
         if forth["relays"] == PAIR_RELAYS and back["relays"] >= PAIR_RELAYS:
@@ -439,7 +439,7 @@ def _pair_range(s: EstimatorState, one: int, other: int) -> bool:
     if fits:
         compute_fault_input(s, term, -1)
         gather_evidence(s, innovation, innovation_variance)
-        update(s, innovation, innovation_variance, 1.0, len(s.x))
+        update(s, innovation, innovation_variance)
     return bool(fits)
 
 
@@ -456,7 +456,7 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
     packet's TX stamp, modulo 2⁴⁸.
     """
     settings, a = s.settings[0], s.anchors[anchor]
-    dim, n = settings["dim"], dynamic_states(s)
+    dim = settings["dim"]
     variance = max(variance_m2, LEAST_REPORT_VARIANCE * (settings["tx_variance_m2"] + settings["rx_variance_m2"]))
     back_s = a["range_m"] / SPEED_OF_LIGHT_MPS
     where = layout(dim, len(s.anchors))
@@ -483,7 +483,7 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
         compute_fault_input(s, term, -1)
         # K = P_xd/P for x and V; for the covariance the factor is (P − q)/P², that of an S of P²/(P − q)
         whole_s = own_variance * own_variance / (own_variance - variance)
-        update(s, innovation, whole_s, whole_s / own_variance, n)
+        update(s, innovation, whole_s, whole_s / own_variance)
     s.status[0]["reports_used"] += int(is_news and fits)
     s.status[0]["reports_rejected"] += int(is_news and not fits)
 
@@ -532,7 +532,7 @@ def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: f
         compute_fault_input(s, terms, b)
         subtract_fault_input(s, a)
         gather_evidence(s, innovation, innovation_variance * scale)
-        update(s, innovation, innovation_variance * scale, 1.0, len(s.x))
+        update(s, innovation, innovation_variance * scale)
         _bound_changes(s)
         end_small_obstruction(s, a)
         end_small_obstruction(s, b)
@@ -571,7 +571,7 @@ def height(s: EstimatorState, height_m: float, std_m: float) -> int:
     if used:
         compute_fault_input(s, term, -1)
         gather_evidence(s, innovation, innovation_variance)
-        update(s, innovation, innovation_variance, 1.0, len(s.x))
+        update(s, innovation, innovation_variance)
         s.status[0]["height_ticks"] = s.status[0]["epoch_ticks"]
     return int(used)
 
@@ -589,4 +589,4 @@ def zero_velocity(s: EstimatorState) -> None:
         variance = compute_ph(s, term) + STATIONARY_STD_MPS**2
         innovation = -s.x[velocity + axis]
         compute_fault_input(s, term, -1)
-        update(s, innovation, variance, 1.0, len(s.x))
+        update(s, innovation, variance)

@@ -53,9 +53,10 @@ LATE_PROBABILITY_DENSITY: Final = 0.05
 RECEPTION_HUBER: Final = 1.5
 DIFFERENCE_HUBER: Final = 1.0
 
-# Multipath: range errors are compared after each step of the tag and after two. A comparison counts as PLACE_LIMIT
-# times their mean at most, as jumps are not multipath; PLACE_LIMITED_MEAN is then left of a normal mean square. PLACE_FIRST
-# comparisons stand for the stamps' noise beforehand; PLACE_SAMPLES are needed, and PLACE_MEMORY remembered.
+# Multipath: range errors are compared after each step of the tag and after two. As jumps are not multipath, a
+# comparison counts as PLACE_LIMIT times their mean at most, which leaves PLACE_LIMITED_MEAN of a normal mean square.
+# PLACE_FIRST comparisons stand for the stamps' noise beforehand; PLACE_SAMPLES are needed, and PLACE_MEMORY
+# remembered.
 PLACE_STEP_M: Final = 0.1
 PLACE_LIMIT: Final = 2.0
 PLACE_LIMITED_MEAN: Final = 0.742

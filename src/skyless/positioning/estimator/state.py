@@ -12,9 +12,6 @@ The state vector, all clocks against the tag's own counter, in metres and m/s:
     height      the tag's true height − the one that is given, in two dimensions
     surveys     for each anchor (dim) its true position − its position in the almanac
 
-Everything before ``slope`` is updated by all measurements; what follows is updated by the tag's own receptions only
-and is a consider parameter (Schmidt 1966) of the others, which have next to no information on it.
-
 Range errors and surveys stand last because many a site calls them exact. What is exact has no variance and no
 covariance, so ``uncertain_states`` leaves it out of all arithmetic, until a jump or a fault shows otherwise.
 """
@@ -31,11 +28,9 @@ from skyless.kernels.arrays import Array, Indices, Integers, Matrix, Records, Ve
 from skyless.kernels.compiled import jitted, step
 from skyless.positioning.integrity import RISK, limits_of
 
-MAX_CLOCK_RATE: Final = 50e-6
-"""Two crystals of ±20 ppm, and margin."""
-
+MAX_CLOCK_RATE: Final = 50e-6  # two crystals of ±20 ppm, and margin
+# Of the constant error of the range between two anchors, besides what their survey makes of it.
 PAIR_STD_M: Final = 0.02
-"""Of the constant of a pair of anchors besides what the survey makes of it (a line of sight of DW1000s: 5.4 cm)."""
 
 
 class EstimatorSettings(Struct, frozen=True):
@@ -134,11 +129,9 @@ SETTINGS_DTYPE: Final = np.dtype(
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
+# Packets of each anchor that are kept for relays to come; divides the range of sequence numbers.
 PACKETS_KEPT: Final = 16
-"""Packets of each anchor that are kept for relays to come; divides the range of sequence numbers."""
-
-LANES: Final = 8
-"""Numbers in the longest vectors of processors."""
+LANES: Final = 8  # numbers in the longest vectors of processors
 
 NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS, ALL_RANGE_ERRORS = range(3)
 """Which range errors are not known to be zero: none, those that change, or all of them, and surveys."""
@@ -303,7 +296,6 @@ class Layout(NamedTuple):
     change: int
     constant: int
     slope: int
-    """States before it are updated by all measurements."""
     height: int
     """In two dimensions; in three it is one of the position."""
     survey: int
@@ -402,21 +394,14 @@ def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors
     )
 
 
-START_WALK_SCALE: Final = 10.0
-"""Factor on the random walk of oscillators at first, as they may be warming up."""
-
-LASTING_STD_M: Final = 0.3
-"""Of a fault that has been there since the anchor joined, ..."""
-
+START_WALK_SCALE: Final = 10.0  # factor on the random walk of oscillators at first, as they may be warming up
+LASTING_STD_M: Final = 0.3  # of a fault that has been there since the anchor joined,
+# ... and where the packets that led to the start contradict each other, so that some are late by more.
 CONTRADICTED_STD_M: Final = 1.0
-"""... and where the packets that led to the start contradict each other, so that some are late by more."""
-
-OPEN_PAIR_STD_M: Final = 0.3
-"""Of the range between two anchors against the survey, before it is measured."""
-
+OPEN_PAIR_STD_M: Final = 0.3  # of the range between two anchors against the survey, before it is measured
+# What a start expects of ranges and survey that follows one which was contradicted.
 OPEN_RANGE_STD_M: Final = 1.0
 OPEN_SURVEY_STD_M: Final = 0.15
-"""What a start expects of ranges and survey that follows one which was contradicted."""
 
 
 def with_anchor(

@@ -346,7 +346,7 @@ def joined_tdoas(pairs: Sequence[tuple[int, int]], differences_m: ArrayLike) -> 
     used = H[:, part].any(axis=1)
     H, measured_m, weights = H[np.ix_(used, part[1:])], np.array(differences_m)[used], np.ones((used.sum(), 1))
     for _ in range(JOINING_STEPS):
-        covariance = np.linalg.inv(H.T @ (weights * H))
+        covariance: Array = np.asarray(np.linalg.inv(H.T @ (weights * H)), np.float64)
         tdoa_m = covariance @ H.T @ (weights[:, 0] * measured_m)
         weights = (START_DIFFERENCE_STD_M / np.fmax(np.abs(measured_m - H @ tdoa_m), START_DIFFERENCE_STD_M))[:, None]
     return tuple(anchors[part].tolist()), tdoa_m, START_DIFFERENCE_STD_M**2 * covariance

@@ -27,16 +27,12 @@ from skyless.kernels.compiled import kernel, part
 from skyless.kernels.linear_algebra import SINGULAR_PIVOT, factorise, solve
 from skyless.positioning.fix import NoFixReason
 
-RESIDUAL_TAIL: Final = 1e-9
-"""Residuals that noise exceeds this rarely are not noise."""
+RESIDUAL_TAIL: Final = 1e-9  # residuals that noise exceeds this rarely are not noise
+# A second minimum is a rival while its chi2 is less than this above the best one (a likelihood ratio of 90).
 RIVAL_MINIMUM_CHI2: Final = 9.0
-"""A second minimum is a rival while its chi2 is less than this above the best one (a likelihood ratio of 90)."""
-BOUND_SIGMAS: Final = 3.0
-"""A height may exceed the bounds by these sigmas if its mirror image exceeds them more."""
-IMPOSSIBLE_SIGMAS: Final = 6.0
-"""A TDoA that exceeds its anchors' distance by these sigmas belongs to no position."""
-LARGEST: Final = 1e9
-"""Metres (or m²); anything beyond is no site, and no number here overflows before it."""
+BOUND_SIGMAS: Final = 3.0  # a height may exceed the bounds by these sigmas if its mirror image exceeds them more
+IMPOSSIBLE_SIGMAS: Final = 6.0  # a TDoA that exceeds its anchors' distance by these sigmas belongs to no position
+LARGEST: Final = 1e9  # metres (or m²); anything beyond is no site, and no number here overflows before it
 
 
 class Solution(Struct, frozen=True, gc=False):
@@ -71,43 +67,34 @@ class NoSolution(Struct, frozen=True, gc=False):
     detail: str
 
 
-FREE: Final = 0
-"""Kind of problem: the state is (x, y, z)."""
-HEIGHT: Final = 1
-"""The state is (x, y); its third element is the given height."""
-PLANE: Final = 2
-"""All anchors have z = 0; the state is (x, y, s) with s = z², negative where noise makes it so."""
+FREE: Final = 0  # kind of problem: the state is (x, y, z)
+HEIGHT: Final = 1  # the state is (x, y); its third element is the given height
+PLANE: Final = 2  # all anchors have z = 0; the state is (x, y, s) with s = z², negative where noise makes it so
 
+# Anchors are in one line, or one point, if their figure's width is below this part of its length.
 COLLINEAR: Final = 1e-6
-"""Anchors are in one line, or one point, if their figure's width is below this part of its length."""
+# Anchors are in one plane if they leave it by less than this part of the smallest TDoA sigma.
 THIN_SIGMAS: Final = 0.1
-"""Anchors are in one plane if they leave it by less than this part of the smallest TDoA sigma."""
+# Equations of a start are not independent if their smallest singular value is below this part of the largest.
 DEPENDENT: Final = 1e-6
-"""Equations of a start are not independent if their smallest singular value is below this part of the largest."""
-
+# The unknowns are not determined where the iteration ended.
 CONVERGED: Final = 0
 UNDETERMINED: Final = 1
-"""The unknowns are not determined where the iteration ended."""
-DIVERGED: Final = 2
-"""The iteration left for infinity."""
-EXHAUSTED: Final = 3
-"""No end after MOST_ITERATIONS."""
-
+DIVERGED: Final = 2  # the iteration left for infinity
+EXHAUSTED: Final = 3  # no end after MOST_ITERATIONS
+# The iteration ends with a step below this part of the anchors' extent (1 nm in 10 m).
 MOST_ITERATIONS: Final = 200
 STEP_TOLERANCE: Final = 1e-10
-"""The iteration ends with a step below this part of the anchors' extent (1 nm in 10 m)."""
+# It also ends where a step promises to lower the cost by less than this part: steps of 10⁻⁷ sigma.
 GAIN_TOLERANCE: Final = 1e-13
-"""It also ends where a step promises to lower the cost by less than this part: steps of 10⁻⁷ sigma."""
-FAR_EXTENTS: Final = 1e4
-"""Nobody locates a tag at ten thousand times the anchors' extent."""
+FAR_EXTENTS: Final = 1e4  # nobody locates a tag at ten thousand times the anchors' extent
+# Smaller damping is none.
 FIRST_DAMPING: Final = 1e-2
 LEAST_DAMPING: Final = 1e-4
-"""Smaller damping is none."""
-
+# Two minima are distinct where one lies outside the 3-sigma ellipsoid of the other.
 DISTINCT_MINIMA_CHI2: Final = 9.0
-"""Two minima are distinct where one lies outside the 3-sigma ellipsoid of the other."""
+# Mirror images have merged while the square of their distance from the plane is within these sigmas of zero.
 MERGED_SIGMAS: Final = 2.0
-"""Mirror images have merged while the square of their distance from the plane is within these sigmas of zero."""
 
 
 class Problem(Struct, frozen=True, gc=False):
@@ -655,8 +642,8 @@ def mean_if_positive(mean: float, sigma: float) -> float:
 # Inverses of normal matrices
 
 
+# An unknown whose variance the others inflate by more is not determined: the difference is rounding noise.
 MOST_INFLATION: Final = 1e12
-"""An unknown whose variance the others inflate by more is not determined: the difference is rounding noise."""
 
 _RIDGE: Final = 1e-14
 """Part of the diagonal that is added to it, so that LAPACK meets no matrix that is exactly singular."""
