@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skyless import Request, fleet_of, lab_site
-from skyless.evaluation.scenarios import Room
+from skyless.evaluation.scenarios import Room, displacements
 from skyless.positioning.estimator.estimator import Estimator
 from skyless.positioning.estimator.measurements import difference_terms, reception_terms
-from skyless.positioning.estimator.state import EstimatorSettings
+from skyless.positioning.estimator.state import EstimatorSettings, layout
 from skyless.simulation.range_errors import RangeErrorModel
 
 ANCHORS_M = {
@@ -79,9 +79,9 @@ def estimator_after(request, duration_s):
 def test_multipath_is_learnt_from_the_way():
     """A field of 8 cm that changes within 10 cm; the site file states 5 mm within 1 m."""
     field = Room(ranges=RangeErrorModel(constant_m=0.05, slope_m=0.05, changing_m=0.08, correlation_m=0.1))
-    std_m, distance_m = estimator_after(Request(site=lab_site(), seed=5, room=field), 30.0).multipath_m
-    assert std_m == pytest.approx(0.08, rel=0.25)
-    assert 0.05 < distance_m < 0.2
+    std_m, distance_m = estimator_after(Request(site=lab_site(), seed=5, room=field), 40.0).multipath_m
+    assert std_m == pytest.approx(0.08, rel=0.3)
+    assert 0.04 < distance_m < 0.25
 
 
 def test_no_multipath_is_learnt_in_a_room_without_any():
@@ -92,9 +92,6 @@ def test_a_misplaced_anchor_is_found_by_its_ranges_to_the_others():
     room = Room(off_anchors=1, off_m=0.3)
     request = Request(site=lab_site(), seed=2, room=room)
     estimator = estimator_after(request, 6.0)
-    from skyless.evaluation.scenarios import displacements
-    from skyless.positioning.estimator.state import layout
-
     true_m = {one.anchor: (one.x_m, one.y_m) for one in displacements(room, request.site, request.seed)}
     s = estimator.state
     survey = layout(2, len(s.anchors)).survey

@@ -65,6 +65,7 @@ PLACE_SAMPLES: Final = 100
 PLACE_MEMORY: Final = 1000
 PLACE_MOVING: Final = 2.0  # standard deviations of a velocity beyond which a tag walks
 PLACE_LEAST_M2: Final = 12e-4  # mean square beyond the stamps' noise that is more than the site file states
+PLACE_ABSORBED: Final = 1.3  # factor for what position and clock absorb of it (simulated, six anchors)
 PLACE_LEAST_KEPT: Final = 0.1  # least and largest correlation after one step
 PLACE_MOST_KEPT: Final = 0.9
 MAX_CHANGE_STD_M: Final = 1.0  # largest standard deviation of the part of range errors that changes as the tag moves
@@ -271,7 +272,7 @@ def learn_place(s: EstimatorState, anchor: int, residual_m: float) -> None:
         status["place_variance_m2"], status["place_distance_m"] = 0.0, settings["place_distance_m"]
         if status["place_samples"] >= PLACE_SAMPLES and near > PLACE_LEAST_M2:
             kept = min(max(far / near - 1.0, PLACE_LEAST_KEPT), PLACE_MOST_KEPT)
-            variance = min(near / (1.0 - kept), MAX_CHANGE_STD_M**2)
+            variance = min(PLACE_ABSORBED * near / (1.0 - kept), MAX_CHANGE_STD_M**2)
             if variance > settings["place_std_m"] ** 2:
                 status["place_variance_m2"], status["place_distance_m"] = variance, -PLACE_STEP_M / np.log(kept)
 

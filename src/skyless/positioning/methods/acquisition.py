@@ -27,6 +27,7 @@ START_MAX_AGE_S: Final = 0.5
 # the filter sure of a wrong position. It waits for more anchors: START_PATIENCE_S after the first such start, and four
 # times as long for one wider by four times.
 WIDE_START: Final = 0.05
+WIDEST_START: Final = 1.0  # wider ones are not used at all: they would be tens of metres off
 START_PATIENCE_S: Final = 0.5
 
 CONTRADICTIONS: Final = frozenset({NoFixReason.RESIDUALS, NoFixReason.BAD_GEOMETRY, NoFixReason.NOT_CONVERGED})
@@ -228,7 +229,7 @@ class Acquisition(Struct):
             if relative_std > WIDE_START and self._speed_std_mps <= TAG_SPEED_STD_MPS
             else 0.0
         )
-        return start if waited_s >= patience_s else NoFixReason.ACQUIRING
+        return start if waited_s >= patience_s and relative_std < WIDEST_START else NoFixReason.ACQUIRING
 
     def _solve_without_one(self, pairs: list[list[Observation]], now: int) -> Start | NoFixReason:
         """Where one anchor alone contradicts all others, do without it; they must still be able to contradict.
