@@ -97,7 +97,7 @@ def test_a_start_tells_which_two_anchors_are_late_or_doubts_and_claims_no_more_t
     places = {anchor: np.array(place) for anchor, place in ANCHORS_M.items()}
     start = find_start(window, places, DifferenceCalibration({}), None, None)
     assert isinstance(start, Start)
-    assert start.is_doubtful
+    assert start.is_ambiguous
     off_m = start.position_m - tag_m
     assert off_m @ np.linalg.solve(start.covariance_m2, off_m) < 21.0  # χ² of three, 1e-4
     assert np.linalg.norm(off_m) < 0.5 or np.trace(start.covariance_m2) > 0.25**2

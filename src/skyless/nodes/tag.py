@@ -80,7 +80,7 @@ class TagNode:
         self._trusted = self._new_trusted()
         self._receiver = self.new_receiver()
         self._report = None if settings.trust is None else TagReport(radio.name, settings.trust.site, log)
-        self._log, self._has_told_multipath = log, False
+        self._log, self._has_logged_multipath = log, False
         self._heard_s = 0.0
         """When the last reception was processed."""
         self.receptions = 0
@@ -154,8 +154,8 @@ class TagNode:
         ``now_s`` is the host's monotonic clock.
         """
         self.monitor.check(now_s, self.receptions, self.receiver.counters["heard"], self.drops)
-        if not self._has_told_multipath and (found := self.receiver.multipath_m) is not None:
-            self._has_told_multipath = True
+        if not self._has_logged_multipath and (found := self.receiver.multipath_m) is not None:
+            self._has_logged_multipath = True
             std_m, distance_m = found
             self._log(
                 f"tag {self.name}: ranges change by {100 * std_m:.0f} cm within {100 * distance_m:.0f} cm walked, more"

@@ -209,9 +209,9 @@ class DifferenceTracking:
             position_m, covariance_m2 = (array[..., :dim] for array in self._estimator.motion())
             gap_m = position_m - start.position_m[:dim]
             both_m2 = covariance_m2[:dim] + start.covariance_m2[:dim, :dim]
-            if start.is_doubtful or gap_m @ np.linalg.solve(both_m2, gap_m) < CONTRADICTED_CHI2:
+            if start.is_ambiguous or gap_m @ np.linalg.solve(both_m2, gap_m) < CONTRADICTED_CHI2:
                 has_moved = bool(np.linalg.norm(position_m - self._start.position_m[:dim]) > RIVAL_M)
-                self._is_confirmed = has_moved or not start.is_doubtful
+                self._is_confirmed = has_moved or not start.is_ambiguous
                 self._estimator.withhold_levels(not self._is_confirmed)
                 window.clear()
                 return False
@@ -260,7 +260,7 @@ class Start(Struct, frozen=True):
     """Shape (3, 3), with the distances between all hypotheses in it."""
     late: dict[int, list[float]]
     """By how much each anchor is expected to be late, and the variance."""
-    is_doubtful: bool
+    is_ambiguous: bool
     """Whether another position fits nearly as well, or some anchor is late."""
     corners_m: Array
     """Opposite ones of the neighbourhood of the anchors, shape (2, 3)."""
@@ -299,7 +299,7 @@ def find_start(
     usual_m2 = joined_m2 + START_ANCHOR_STD_M**2 * shares.T @ shares
     most = min(MOST_LATE, max(count - dim - 3, 0)) if len(window) == WINDOW else 0
     hypotheses: list[tuple[float, Array, Array, Array]] = []
-    reason = NoSolution(NoFixReason.RESIDUALS, "more anchors are late than can be told")
+    reason = NoSolution(NoFixReason.RESIDUALS, "more anchors are late than the others can show")
     for some in (list(some) for size in range(most + 1) for some in combinations(range(count), size)):
         sigma_m2 = usual_m2 + START_LATE_STD_M**2 * shares[some].T @ shares[some]
         found = locate(anchors_m, tdoa_m, sigma_m2, height_m=height_m, z_bounds_m=z_bounds_m, residual_tail=START_TAIL)
@@ -323,10 +323,10 @@ def find_start(
     best_m = positions[int(np.argmin(scores))]
     has_rival = np.any((np.linalg.norm(positions - best_m, axis=1) > RIVAL_M) & (weights > RIVAL_WEIGHT))
     late = dict(zip(anchors, np.tensordot(weights, lates, 1).T.tolist(), strict=True))
-    is_doubtful = bool(has_rival) or sum(variance for _, variance in late.values()) > 0.5 * START_LATE_STD_M**2
+    is_ambiguous = bool(has_rival) or sum(variance for _, variance in late.values()) > 0.5 * START_LATE_STD_M**2
     diagonal_m = max(float(np.linalg.norm((high - low)[:2])), LEAST_DIAGONAL_M)
     corners_m = (low + high) / 2.0 + diagonal_m * np.outer((-1.0, 1.0), NEIGHBOURHOOD)
-    start = Start(position_m, covariance_m2, late, is_doubtful, corners_m)
+    start = Start(position_m, covariance_m2, late, is_ambiguous, corners_m)
     if not start.holds(position_m[:dim]):
         return NoSolution(NoFixReason.NOT_CONVERGED, "the position lies far from all anchors")
     return start
