@@ -84,7 +84,7 @@ REPORT_GAIN: Final = 1.25  # a report is used where the filter's own variance is
 LEAST_REPORT_VARIANCE: Final = 0.1
 # An anchor with this number of rejected packets in a row joins again: its first was late, so its rate is wrong.
 REJOIN_AFTER: Final = 20
-STEADY_WALK_SCALE: Final = 10.0  # reports of clocks whose random walk counts more than this are not used
+STEADY_WALK_SCALE: Final = 4.0  # reports of clocks whose random walk counts more than this are not used
 CLOCK_JUMPED: Final = 2
 STATIONARY_STD_MPS: Final = 0.01  # of the velocity of a tag that stands still, each time a measurement is processed
 

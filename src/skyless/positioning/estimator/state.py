@@ -394,7 +394,7 @@ def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors
     )
 
 
-START_WALK_SCALE: Final = 10.0  # factor on the random walk of oscillators at first, as they may be warming up
+START_WALK_SCALE: Final = 100.0  # of the tag's oscillator, which warms up after it was switched on
 LASTING_STD_M: Final = 0.3  # of a fault that has been there since the anchor joined,
 # ... and where the packets that led to the start contradict each other, so that some are late by more.
 CONTRADICTED_STD_M: Final = 1.0
@@ -417,7 +417,7 @@ def with_anchor(
     last["table_index"], last["position_m"] = table_index, position_m
     last["tx_ticks"] = last["rx_ticks"] = NEVER
     last["held_m"] = np.nan
-    last["walk_scale"] = START_WALK_SCALE
+    last["walk_scale"] = 1.0
     last["change_variance_m2"] = settings["place_std_m"] ** 2
     grown.packets[count] = (NEVER, NEVER, NEVER)
     pair_variance = 0.0
