@@ -46,7 +46,8 @@ def follow(one, packets, other, other_packets, before=None):
         if len(one.state.anchors) == len(other.state.anchors):
             for name in ("q_scale", "walk_scale", "common_mean", "lag", "lag_square"):
                 other.state.status[name] = one.state.status[name]
-            other.state.anchors["walk_scale"] = one.state.anchors["walk_scale"]
+            for name in ("walk_scale", "held_m", "held_range_m"):
+                other.state.anchors[name] = one.state.anchors[name]
         assert one.process(*ours) == other.process(*theirs)
         for estimator in (one, other):  # constants of pairs are beside the filter, and in no sensitivity
             estimator.state.links["variance_m2"] = 0.0

@@ -330,7 +330,7 @@ def fill(s, random):
     s.P[:] = root + root.T
     for record in (s.anchors, s.links, s.packets):
         for name in set(record.dtype.names) - {"table_index", "position_m"}:
-            record[name] = random.integers(1, 1000, record.shape)
+            record[name] = random.integers(1, 1000, record[name].shape)
 
 
 STEPS = st.lists(st.tuples(st.booleans(), st.integers(0, 7)), max_size=40)

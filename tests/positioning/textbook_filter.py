@@ -89,6 +89,8 @@ class TextbookFilter:
         place_m, trace = np.append(self.x[self.p], given_m), np.trace(self.P[: self.dim, : self.dim])
         step_m = min(HELD_STEP_M, HELD_SHARE * np.linalg.norm(place_m - self.anchors_m[anchor]))
         step_m = max(step_m, min(HELD_STD * trace**0.5, HELD_MOST_M))
+        if not any((self.settings.survey_std_m, self.settings.range_std_m, self.settings.height_std_m)):
+            step_m = 0.0  # exact ranges leave nothing open
         if not np.linalg.norm(place_m - self.held_m.get(anchor, np.nan)) <= step_m:
             self.held_m[anchor] = place_m
         held_m = self.held_m[anchor] - self.anchors_m[anchor]

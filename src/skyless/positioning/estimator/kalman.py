@@ -87,8 +87,10 @@ def _advance(s: EstimatorState, values: int, dt: float) -> None:
 @step
 def jump_share(s: EstimatorState) -> float:
     """1 where range errors have jumped lately, 0 where they do not, or where learnt multipath is as large as jumps."""
-    share = min(s.status[0]["obstruction"], 1.0)
-    return float(share) if s.status[0]["place_variance_m2"] < MULTIPATH_STD_M**2 else 0.0
+    share, status = 1.0, s.status[0]
+    if status["place_variance_m2"] >= MULTIPATH_STD_M**2:
+        share = 0.0
+    return float(share * min(status["obstruction"], 1.0))
 
 
 @step

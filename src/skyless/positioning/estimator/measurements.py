@@ -48,6 +48,7 @@ from skyless.positioning.estimator.monitor import (
 )
 from skyless.positioning.estimator.state import (
     ALL_RANGE_ERRORS,
+    NO_RANGE_ERRORS,
     EstimatorState,
     direction_terms,
     layout,
@@ -94,17 +95,21 @@ def _hold_direction(s: EstimatorState, anchor: int) -> None:
     """Move the point at which ranges to an anchor are linearised onto the estimate, once that is far enough away."""
     dim, a = s.settings[0]["dim"], s.anchors[anchor]
     moved_m, squared, variance = 0.0, 0.0, 0.0
+    if dim == 2:
+        squared += (s.settings[0]["height_m"] - a["position_m"][2]) ** 2
     for axis in range(dim):
+        moved_m += (s.x[axis] - a["held_m"][axis]) ** 2
+        squared += (s.x[axis] - a["position_m"][axis]) ** 2
         variance += s.P[axis, axis]
-    for axis in range(3):
-        given_m = s.settings[0]["height_m"] if axis >= dim else s.x[axis]
-        moved_m += (given_m - a["held_m"][axis]) ** 2
-        squared += (given_m - a["position_m"][axis]) ** 2
     noise = min(HELD_STD**2 * variance, HELD_MOST_M**2)
-    if not moved_m <= max(noise, min(HELD_STEP_M**2, HELD_SHARE**2 * squared)):
-        a["held_range_m"] = max(np.sqrt(squared), 1e-6)
-        for axis in range(3):
-            a["held_m"][axis] = s.settings[0]["height_m"] if axis >= dim else s.x[axis]
+    step = max(noise, min(HELD_STEP_M**2, HELD_SHARE**2 * squared))
+    if s.status[0]["range_errors"] == NO_RANGE_ERRORS:
+        step = 0.0  # ranges leave nothing open that noise could seem to measure
+    moves = not moved_m <= step  # true at first, for NaN
+    for axis in range(dim):
+        if moves:
+            a["held_m"][axis] = s.x[axis]
+    s.anchors[anchor]["held_range_m"] = max(np.sqrt(squared), 1e-6) if moves else a["held_range_m"]
 
 
 @step
@@ -395,34 +400,30 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
 @step
 def _survey_pair(s: EstimatorState, one: int, other: int) -> None:
     """Use the range between two anchors for their survey; anchors that contradict most of theirs are misplaced."""
-    count, dim = len(s.anchors), s.settings[0]["dim"]
-    link = s.links[min(one, other), max(one, other)]
-    link["contradicts"] = 0
-    if not _pair_range(s, one, other):
-        link["contradicts"] = 1
-        contradicted, rival = 0, 0
-        for anchor in range(count):
-            contradicted += s.links[min(one, anchor), max(one, anchor)]["contradicts"]
-            rival += s.links[min(other, anchor), max(other, anchor)]["contradicts"]
-        misplaced = one if contradicted > rival else other
-        if max(contradicted, rival) >= MISPLACED_PAIRS and contradicted != rival:
-            survey = layout(dim, count).survey + dim * misplaced
-            s.status[0]["range_errors"] = ALL_RANGE_ERRORS
-            if s.anchors[misplaced]["is_obstructed"]:  # what seemed to be an obstacle
-                change = layout(dim, count).change + misplaced
-                reset_state(s, change, s.anchors[misplaced]["change_variance_m2"])
-                s.anchors[misplaced]["is_obstructed"] = 0
-            for axis in range(dim):
-                s.P[survey + axis, survey + axis] += MISPLACED_STD_M**2
-            for anchor in range(count):
-                pair = s.links[min(misplaced, anchor), max(misplaced, anchor)]
-                if pair["contradicts"] and _pair_range(s, misplaced, anchor):
-                    pair["contradicts"] = 0
+    count, dim, status = len(s.anchors), s.settings[0]["dim"], s.status[0]
+    _pair_range(s, one, other)
+    contradicted, rival = 0, 0
+    for anchor in range(count):
+        contradicted += s.links[min(one, anchor), max(one, anchor)]["contradicts"]
+        rival += s.links[min(other, anchor), max(other, anchor)]["contradicts"]
+    misplaced, where = one if contradicted > rival else other, layout(dim, count)
+    is_misplaced = contradicted != rival and max(contradicted, rival) >= MISPLACED_PAIRS
+    is_misplaced = is_misplaced and s.links[min(one, other), max(one, other)]["contradicts"] != 0
+    status["range_errors"] = ALL_RANGE_ERRORS if is_misplaced else status["range_errors"]
+    if is_misplaced and s.anchors[misplaced]["is_obstructed"]:  # what seemed to be an obstacle
+        reset_state(s, where.change + misplaced, s.anchors[misplaced]["change_variance_m2"])
+        s.anchors[misplaced]["is_obstructed"] = 0
+    for axis in range(dim if is_misplaced else 0):
+        survey = where.survey + dim * misplaced + axis
+        s.P[survey, survey] += MISPLACED_STD_M**2
+    for anchor in range(count if is_misplaced else 0):
+        if s.links[min(misplaced, anchor), max(misplaced, anchor)]["contradicts"]:
+            _pair_range(s, misplaced, anchor)
 
 
 @step
-def _pair_range(s: EstimatorState, one: int, other: int) -> bool:
-    """Process |a + δa − a' − δa'| + constant as two anchors measured it; False if it contradicts the survey."""
+def _pair_range(s: EstimatorState, one: int, other: int) -> None:
+    """Process |a + δa − a' − δa'| + constant as two anchors measured it, unless it contradicts the survey."""
     dim, term, squared = s.settings[0]["dim"], 0, 0.0
     a, b = s.anchors[one], s.anchors[other]
     survey = layout(dim, len(s.anchors)).survey
@@ -440,7 +441,7 @@ def _pair_range(s: EstimatorState, one: int, other: int) -> bool:
         compute_fault_input(s, term, -1)
         gather_evidence(s, innovation, innovation_variance)
         update(s, innovation, innovation_variance)
-    return bool(fits)
+    s.links[min(one, other), max(one, other)]["contradicts"] = 0 if fits else 1
 
 
 # An anchor reports what its clock reads against the master's

@@ -116,7 +116,7 @@ def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_var
     free = 0
     for other in range(len(s.anchors)):
         free += 0 if s.anchors[other]["is_obstructed"] else 1
-    share = jump_share(s) if free > s.settings[0]["dim"] + 1 else 0.0
+    share = jump_share(s) * (1.0 if free > s.settings[0]["dim"] + 1 else 0.0)
     suspect = SUSPECT + share * (OBSTRUCTED_SUSPECT - SUSPECT)
     together = TOGETHER + share * (OBSTRUCTED_TOGETHER - TOGETHER)
     if innovation * innovation <= suspect * suspect * innovation_variance:
