@@ -106,13 +106,14 @@ def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float
     obstructed = share * dt / OBSTRUCTED_S
     if s.anchors[anchor]["is_obstructed"]:
         variance = 0.5 * OBSTRUCTION_MEMORY_S * OBSTRUCTED_WALK * s.anchors[anchor]["change_scale"]
-        _decay(s, change, np.exp(-dt / OBSTRUCTION_MEMORY_S), variance)
+        kept = np.exp(-dt / OBSTRUCTION_MEMORY_S)
     else:
         place_variance = max(s.anchors[anchor]["change_variance_m2"], status["place_variance_m2"])
         variance = place_variance + share * OBSTRUCTED_STD_M**2
         usual = dt / settings["place_time_s"] + walked_m / status["place_distance_m"]
-        if variance > 0.0:
-            _decay(s, change, np.exp(-obstructed - (1.0 - share) * usual), variance)
+        kept = np.exp(-obstructed - (1.0 - share) * usual)
+    if variance > 0.0:
+        _decay(s, change, kept, variance)
     if obstructed > 1e-6 and settings["range_std_m"] > 0.0:
         _decay(s, constant, np.exp(-obstructed), settings["range_std_m"] ** 2)
 

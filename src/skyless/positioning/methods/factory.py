@@ -23,8 +23,8 @@ DROP_S: Final = 2.0
 CELL_DROP_S: Final = 1.0
 """The same at a site of protocol 2, where tags move from cell to cell."""
 
-LEAST_RANDOM_WALK_FM: Final = 3e-9
-"""Random walk of an oscillator's frequency, 1/√s, where a site states less: crystals in rooms are warmed and cooled."""
+RANDOM_WALK_MARGIN: Final = 3.0
+"""Factor on the random walk of oscillators that a site states: crystals in rooms are warmed and cooled."""
 
 RELAY_AGE_S: Final = 1.0
 RELAY_SUPERFRAMES: Final = 2.5
@@ -90,7 +90,7 @@ def estimator_settings(
 ) -> EstimatorSettings:
     """What the estimator assumes at a site with this noise and accuracy; of its integrity and the tag the defaults."""
     tx_variance, rx_variance = _stamp_variances(noise)
-    own = clock_noise(noise.white_fm, max(noise.random_walk_fm, LEAST_RANDOM_WALK_FM), clocks=1)
+    own = clock_noise(noise.white_fm, RANDOM_WALK_MARGIN * noise.random_walk_fm, clocks=1)
     return EstimatorSettings(
         qa=qa,
         white=own.white,
