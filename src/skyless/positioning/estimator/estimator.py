@@ -66,12 +66,12 @@ REJECTED, ACCEPTED, JOINED, STALE, NEW_ANCHOR, SILENT_ANCHOR, RESTARTED_CLOCK = 
 RESTART_M: Final = 300.0
 RESTART_IN_ROW: Final = 3
 MAX_RATE_MPS: Final = 100e-6 * SPEED_OF_LIGHT_MPS  # between two clocks that are still crystals
-# So many packets beyond the gate in a row, more than anchors can be blocked, or a larger share of all: a wrong state.
+# The state is wrong where this number of packets in a row, or a larger share of all, lies beyond the gate.
 LOST_IN_ROW: Final = 8
 LOST_SHARE: Final = 0.5
-MOST_RELAYS_REJECTED: Final = 4.0  # relays beyond the gate lately; fewer may be late ones
+MOST_RELAYS_REJECTED: Final = 4.0  # recent relays beyond the gate; fewer may be late ones
 FITTING_CHI2: Final = 2.0  # largest χ² for each anchor of range errors that are as the settings state them
-FADING: Final = 0.95  # what a packet leaves of the counts of relays lately
+FADING: Final = 0.95  # factor on the counts of recent relays with each packet
 MOST_PACKED: Final = 16  # relays in a frame; 13 fit
 
 

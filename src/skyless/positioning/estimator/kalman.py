@@ -86,7 +86,7 @@ def _advance(s: EstimatorState, values: int, dt: float) -> None:
 
 @step
 def jump_share(s: EstimatorState) -> float:
-    """1 where range errors have jumped lately, 0 where they do not, or where learnt multipath is as large as jumps."""
+    """1 where range errors have jumped recently, 0 where none has or learnt multipath is as large."""
     share, status = 1.0, s.status[0]
     if status["place_variance_m2"] >= MULTIPATH_STD_M**2:
         share = 0.0

@@ -22,7 +22,7 @@ from skyless.positioning.estimator.monitor import covariance_scale
 from skyless.positioning.estimator.state import LASTING_STD_M, EstimatorState
 from skyless.positioning.integrity import CONTRADICTED, HPL, OBSTRUCTED, SOUND, UNAVAILABLE, VPL
 
-RECENT_STD_M: Final = 0.08  # of a fault that has begun lately without a jump that shows
+RECENT_STD_M: Final = 0.08  # of a fault that has begun recently without a visible jump
 
 LASTING_CHI2, RECENT_CHI2 = 2, 3
 """What ``protect`` writes after ``HPL`` and ``VPL``."""

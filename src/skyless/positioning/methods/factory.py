@@ -23,9 +23,6 @@ DROP_S: Final = 2.0
 CELL_DROP_S: Final = 1.0
 """The same at a site of protocol 2, where tags move from cell to cell."""
 
-RANDOM_WALK_MARGIN: Final = 3.0
-"""Factor on the random walk of oscillators that a site states: crystals in rooms are warmed and cooled."""
-
 RELAY_AGE_S: Final = 1.0
 RELAY_SUPERFRAMES: Final = 2.5
 """Relays of packets that are older than the one, or than this number of superframes, are not used."""
@@ -90,7 +87,7 @@ def estimator_settings(
 ) -> EstimatorSettings:
     """What the estimator assumes at a site with this noise and accuracy; of its integrity and the tag the defaults."""
     tx_variance, rx_variance = _stamp_variances(noise)
-    own = clock_noise(noise.white_fm, RANDOM_WALK_MARGIN * noise.random_walk_fm, clocks=1)
+    own = clock_noise(noise.white_fm, noise.random_walk_fm, clocks=1)
     return EstimatorSettings(
         qa=qa,
         white=own.white,

@@ -53,7 +53,7 @@ EARLY_NIS: Final = 3.0
 # the position is wrong.
 HEIGHT_SIGMAS: Final = 5.0
 MAX_HEIGHTS_REJECTED: Final = 20
-# Range errors that have jumped more lately make faults of their own; a new start would not help.
+# Range errors that have jumped more recently cause faults themselves; a new start would not help.
 CALM_OBSTRUCTION: Final = 0.1
 # In longer ones a tag may be metres away when it receives an anchor again: nothing is predicted over them, and each
 # round of packets is a start of its own.
