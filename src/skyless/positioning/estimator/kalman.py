@@ -98,7 +98,7 @@ def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float
     """Time update of an anchor's range errors over what has passed and was walked since its newest packet.
 
     The changing part is a Gauss–Markov process of walked distance and of time. Where range errors jump, both parts
-    forget within seconds; one that has jumped itself wanders from where it is.
+    forget within seconds; one that has jumped itself wanders and returns to zero.
     """
     status, settings = s.status[0], s.settings[0]
     where, share = layout(settings["dim"], len(s.anchors)), jump_share(s)
