@@ -125,15 +125,15 @@ def _add_direction(s: EstimatorState, term: int, anchor: int, sign: float) -> fl
     _hold_direction(s, anchor)
     survey = where.survey + dim * anchor
     squared = 0.0
+    if dim == 2:
+        up_m = s.settings[0]["height_m"] - a["position_m"][2]
+        squared += (up_m + x[where.height]) ** 2
+        s.h[term + 2 * dim], s.h_index[term + 2 * dim] = sign * up_m / a["held_range_m"], where.height
     for axis in range(dim):
         squared += (x[axis] - a["position_m"][axis] - x[survey + axis]) ** 2
         towards = sign * (a["held_m"][axis] - a["position_m"][axis]) / a["held_range_m"]
         s.h[term + axis], s.h_index[term + axis] = towards, axis
         s.h[term + dim + axis], s.h_index[term + dim + axis] = -towards, survey + axis
-    if dim == 2:
-        up_m = s.settings[0]["height_m"] - a["position_m"][2]
-        squared += (up_m + x[where.height]) ** 2
-        s.h[term + 2 * dim], s.h_index[term + 2 * dim] = sign * up_m / a["held_range_m"], where.height
     return float(max(np.sqrt(squared), 1e-6))
 
 
