@@ -13,19 +13,30 @@ import time
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from msgspec.structs import replace
 
 import synthetic_recordings as synthetic
 from skyless.cli.main import main
 from skyless.cli.replay import FIXES_COLUMNS
 from skyless.site.lab import lab_site
+from skyless.site.model import AnchorSite, TagsSite
 from skyless.site.template import site_template
 
 ROWS = 1500
+LEAST_FIXES = ROWS - 60 - 10
+"""A start from ready-made differences takes 60 of them."""
 DL_TDOA = ("uci-binary", "uci-text", "dl-tdoa-json")
 TEXTS = {"anchor_ids", "hpl_m", "vpl_m", "integrity_risk", "alert"}
 """Columns that hold no number, or none here: pairs of time differences come without protection levels."""
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256))
 COMMAND = [sys.executable, "-m", "skyless.cli.main", "replay"]
+
+
+def site_of_six():
+    """A site with six of the recordings' anchors."""
+    places = list(synthetic.ANCHORS_M.items())[:6]
+    anchors = tuple(AnchorSite(id=number, x_m=x, y_m=y, z_m=z) for number, (x, y, z) in places)
+    return replace(lab_site(), anchors=anchors, tags=TagsSite(height_m=1.2))
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +45,7 @@ def room(tmp_path_factory):
     folder = tmp_path_factory.mktemp("room")
     (folder / "anchors.csv").write_text(synthetic.anchors_csv())
     (folder / "truth.csv").write_text(synthetic.truth_csv(ROWS * 0.005 + 1.0))
-    (folder / "lab.toml").write_text(site_template(lab_site()))
+    (folder / "six.toml").write_text(site_template(site_of_six()))
     for name in synthetic.MAKERS:
         synthetic.write(folder / name, name, ROWS)
     return folder
@@ -63,10 +74,11 @@ def test_every_format_gives_fixes_at_the_truth(run, name):
     told = report(run(name, *options, *synthetic.LISTENER.get(name, [])))
     assert told["format"] == name
     assert told["receptions"] == ROWS
-    assert told["fixes"] > 0.98 * ROWS
+    assert told["fixes"] > LEAST_FIXES
     assert told["rmse_2d_m"] < 0.05  # 100 ps of a stamp are 3 cm, differences of the table have 10 cm
     assert told["rmse_3d_m"] is None or told["rmse_3d_m"] < 0.1
-    assert told["rate_hz"] == pytest.approx(200.0 if name == "miluv" else 500.0, rel=0.02)
+    # fixes over the recording's whole time, that of the start included
+    assert told["rate_hz"] == pytest.approx(200.0 if name == "miluv" else 500.0, rel=0.05)
     assert told["dropped"] == sum(told["drops"].values()) < 0.02 * ROWS * 8
 
 
@@ -107,9 +119,9 @@ def test_heights(run):
 
 
 def test_a_site_file_serves_as_anchors(run):
-    told = report(run("tdoa-table", "--site", "lab.toml", "--json"))
+    told = report(run("tdoa-table", "--site", "six.toml", "--json"))
     assert told["height_note"] == "from the site file"
-    assert told["drops"]["unknown-anchor"] > 0  # the lab has six anchors, the recording eight
+    assert told["drops"]["unknown-anchor"] > 0  # the site has six anchors, the recording eight
 
 
 def test_pictures(run, tmp_path):
@@ -147,7 +159,7 @@ def test_what_is_left_of_a_damaged_recording_is_used(run, room, tmp_path):
     assert told["fixes"] > 300
     assert told["drops"]["compressed-stream-cut-off"] == 1
     told = report(run(tmp_path / "holes.csv", "--anchors", "anchors.csv", "--json"))
-    assert told["fixes"] > 0.98 * ROWS
+    assert told["fixes"] > LEAST_FIXES
     assert told["drops"].items() >= {"not-finite": 2, "malformed-number": 1, "anchor-against-itself": 1}.items()
 
 
@@ -231,7 +243,7 @@ A, T = ["--anchors", "anchors.csv"], ["--truth", "truth.csv"]
         (["tdoa-table", "--anchors", "{bad}/ragged.csv"], ["line 2", "4 columns"]),
         (["tdoa-table", "--site", "missing.toml"], ["missing.toml", "readable site file"]),
         (["tdoa-table", "--site", "anchors.csv"], ["anchors.csv"]),
-        (["tdoa-table", *A, "--site", "lab.toml"], ["--anchors", "--site", "not both"]),
+        (["tdoa-table", *A, "--site", "six.toml"], ["--anchors", "--site", "not both"]),
         (["tdoa-table", *A, "--truth", "missing.csv"], ["missing.csv", "No such file"]),
         (["tdoa-table", *A, "--truth", "{bad}/late.csv"], ["late.csv", "t_s", "1000.000 to 1001.000", "recording"]),
         (["tdoa-table", *A, "--truth", "{bad}/backwards.csv"], ["backwards.csv", "t_s", "at least 2"]),
@@ -267,7 +279,7 @@ def test_a_mistake_is_told_in_one_line(run, room, tmp_path, arguments, said):
     for part in said:
         assert part in err
     assert sorted(entry.name for entry in room.iterdir()) == sorted(
-        {*synthetic.MAKERS, "anchors.csv", "truth.csv", "lab.toml"}
+        {*synthetic.MAKERS, "anchors.csv", "truth.csv", "six.toml"}
     )
 
 

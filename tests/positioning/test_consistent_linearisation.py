@@ -89,13 +89,15 @@ def test_no_multipath_is_learnt_in_a_room_without_any():
 
 
 def test_a_misplaced_anchor_is_found_by_its_ranges_to_the_others():
-    room = Room(off_anchors=1, off_m=0.3)
-    request = Request(site=lab_site(), seed=2, room=room)
-    estimator = estimator_after(request, 6.0)
-    true_m = {one.anchor: (one.x_m, one.y_m) for one in displacements(room, request.site, request.seed)}
-    s = estimator.state
-    survey = layout(2, len(s.anchors)).survey
-    found_m = dict(zip(estimator.anchors, s.x[survey : survey + 2 * len(s.anchors)].reshape(-1, 2), strict=True))
-    off = max(true_m, key=lambda anchor: np.hypot(*true_m[anchor]))
-    assert np.hypot(*(found_m[off] - true_m[off])) < 0.1
-    assert all(np.hypot(*found_m[anchor]) < 0.1 for anchor in found_m if anchor != off)
+    left_m, room = [], Room(off_anchors=1, off_m=0.3)
+    for seed in range(1, 5):
+        request = Request(site=lab_site(), seed=seed, room=room)
+        estimator = estimator_after(request, 6.0)
+        true_m = {one.anchor: (one.x_m, one.y_m) for one in displacements(room, request.site, request.seed)}
+        s = estimator.state
+        survey = layout(2, len(s.anchors)).survey
+        found_m = dict(zip(estimator.anchors, s.x[survey : survey + 2 * len(s.anchors)].reshape(-1, 2), strict=True))
+        off = max(true_m, key=lambda anchor: np.hypot(*true_m[anchor]))
+        left_m.append(np.hypot(*(found_m[off] - true_m[off])))
+        assert all(np.hypot(*found_m[anchor]) < 0.1 for anchor in found_m if anchor != off)
+    assert np.sqrt(np.mean(np.square(left_m))) < 0.1

@@ -151,7 +151,7 @@ def replay(file: Path, /, *, asked: ReplayOptions = ReplayOptions()) -> int:
 
 _REASONS: Final = {
     "no-beacons": "the recording holds no reception that can be used",
-    "no-almanac": "no reception is of an anchor in the table of --anchors; are these the anchors of this recording?",
+    "no-almanac": "no reception is of an anchor in the table of --anchors or the site file; are these the anchors of this recording?",
     "too-few-anchors": "too few anchors were received at a time: three at a known height, four without",
     "bad-geometry": "the anchors lie too flat to determine the position; --tag-height gives the height",
     "mirror-ambiguity": "the anchors leave two positions that fit as well; --tag-height gives the height",
@@ -164,7 +164,7 @@ _REASONS: Final = {
 def _likely_reason(report: "ReplayReport", asked: ReplayOptions) -> str:
     if report.receptions == 0:
         found = "the recording holds no reception that can be used"
-    elif asked.anchors is None and report.reason == "no-almanac":
+    elif asked.anchors is None and asked.site is None and report.reason == "no-almanac":
         found = "no message of the recording says where its anchors are"
     else:
         found = _REASONS.get(report.reason or "", report.reason or "unknown")

@@ -398,7 +398,7 @@ START_WALK_SCALE: Final = 100.0  # of the tag's oscillator, which warms up after
 LASTING_STD_M: Final = 0.3  # of a fault that has been there since the anchor joined,
 # ... and where the packets that led to the start contradict each other, so that some are late by more.
 CONTRADICTED_STD_M: Final = 1.0
-OPEN_PAIR_STD_M: Final = 0.3  # of the range between two anchors against the survey, before it is measured
+OPEN_PAIR_STD_M: Final = 0.1  # of the range between two anchors against the survey, before it is measured
 # What a start expects of ranges and survey that follows one which was contradicted.
 OPEN_RANGE_STD_M: Final = 1.0
 OPEN_SURVEY_STD_M: Final = 0.15
