@@ -133,6 +133,13 @@ def test_without_a_broker_nothing_else_is_judged(hall):
         ({"anchors": {"missed_share": 0.7}}, {"anchors": {}}, "bad", "slow", "this computer is too slow: 6 anchors"),
         ({"used_share": 0.98}, {"used_share": 0.9}, "warning", "busy", "this computer is fully busy: 98 % of its"),
         ({"lag_s": 0.6}, {"lag_s": 0.0}, "warning", "slow", "the page's server was delayed by 0.6 s"),
+        (
+            {"tags": {"t2": {"multipath_std_m": 0.08, "multipath_distance_m": 0.12}}},
+            {"tags": {}},
+            "warning",
+            "multipath",
+            "tag t2 finds that ranges change by 8 cm within 12 cm",
+        ),
         ({"alert": "detected-excluded"}, {"alert": None}, "warning", "alert", "tags t1 and t2: a faulty anchor is"),
         ({"alert": "alert-limit-exceeded"}, {"alert": "none"}, "bad", "limit", "above the alert limit"),
         (

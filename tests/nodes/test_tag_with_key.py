@@ -42,7 +42,7 @@ class Bench:
     def health(self):
         log = self.node.fix_log
         fields = {"method": "joint", "receptions": 1, "reason": self.node.reason, "counters": self.node.drops}
-        return self.node.with_trust(log.health(**fields, mqtt=Counters(0, 0, 0), cpu=0.0, memory_bytes=0))
+        return self.node.complete(log.health(**fields, mqtt=Counters(0, 0, 0), cpu=0.0, memory_bytes=0))
 
 
 def are_right(fixes):

@@ -151,7 +151,7 @@ def replay(file: Path, /, *, asked: ReplayOptions = ReplayOptions()) -> int:
 
 _REASONS: Final = {
     "no-beacons": "the recording holds no reception that can be used",
-    "no-almanac": "no reception is of an anchor in the table of --anchors or the site file; are these the anchors of this recording?",
+    "no-almanac": "no reception is of an anchor in the table or site file; are these this recording's anchors?",
     "too-few-anchors": "too few anchors were received at a time: three at a known height, four without",
     "bad-geometry": "the anchors lie too flat to determine the position; --tag-height gives the height",
     "mirror-ambiguity": "the anchors leave two positions that fit as well; --tag-height gives the height",

@@ -23,6 +23,7 @@ from skyless.dashboard.reasons import (
     fix_reasons,
     late_reason,
     master_reason,
+    multipath_reason,
     rank,
     slow_reason,
     watch_reasons,
@@ -115,6 +116,7 @@ class ConditionMonitor:
             busy_reason(evidence, used_share) if evidence.nodes else None,
             late_reason(evidence, ages),
             master_reason(evidence, now_s),
+            multipath_reason(evidence, now_s),
         ):
             if reason is not None:
                 yield reason

@@ -28,6 +28,9 @@ BUSY_SHARE: Final = 0.95
 LAG_S: Final = 0.25
 """Delay of the page's server itself that counts as too slow."""
 
+MULTIPATH_RATIO: Final = 1.3
+"""Multipath that exceeds what the site file states by less is within what a tag can learn."""
+
 START_S: Final = 20.0
 """Where no anchor has been online yet, all of them may be offline for this long: the site is being started."""
 
@@ -280,6 +283,30 @@ def _is_idle(health: AnchorHealth) -> bool:
     return not health.synchronised and health.role not in {"master", "root"} and health.uptime_s > GRACE_S
 
 
+def multipath_reason(evidence: Evidence, now_s: float) -> Reason | None:
+    """Ranges change more with the tag's way than the site file states."""
+    site = evidence.site
+    stated_m = 0.0 if site is None else site.accuracy.place_std_m
+    found = {
+        name: (tag.health.multipath_std_m, tag.health.multipath_distance_m or 0.0)
+        for name, tag in evidence.of("tag")
+        if tag.reports(now_s) and isinstance(tag.health, TagHealth) and tag.health.multipath_std_m is not None
+    }
+    more = [name for name, (std_m, _) in found.items() if std_m > MULTIPATH_RATIO * stated_m]
+    if not more:
+        return None
+    std_m, distance_m = max(found[name] for name in more)
+    text = (
+        f"{listed('tag', more)} {verb(more, 'finds', 'find')} that ranges change by {100.0 * std_m:.0f} cm within"
+        f" {100.0 * distance_m:.0f} cm of the way, more than the site file states"
+    )
+    advice = (
+        f"Set place_std_m = {std_m:.2f} and place_distance_m = {distance_m:.2f} under [accuracy] of the site file:"
+        " tags then start with that instead of learning it."
+    )
+    return Reason("multipath", "warning", text, advice, names_of("tag", more))
+
+
 def master_reason(evidence: Evidence, now_s: float) -> Reason | None:
     """The master, or the root of the slot time, changes often."""
     count = sum(now_s - time_s < OFTEN_S for time_s in evidence.leader.changes_s)
@@ -313,7 +340,7 @@ def watch_reasons(watch: WatchMessage | None, age_s: float | None) -> Iterable[R
 _ORDER: Final = (
     *("broker", "slow", "busy", "late", "forged", "clock", "chain-ended", "codes", "not-verified", "no-fixes", "limit"),
     *("moved", "anchors", "master", "no-fix", "alert", "keys", "not-synchronised", "silent-anchors", "silent", "watch"),
-    "chain",
+    *("multipath", "chain"),
 )
 """Causes before their effects."""
 

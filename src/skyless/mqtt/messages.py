@@ -154,6 +154,10 @@ class TagHealth(Struct, frozen=True):
     (``skyless.authentication.fault.Fault``)."""
     clock_error_s: float | None = None
     """How far the host's clock is ahead of the site's where that is more than the bound; None where all is well."""
+    multipath_std_m: float | None = None
+    """Standard deviation by which ranges change as the tag moves, where that is more than the site file states."""
+    multipath_distance_m: float | None = None
+    """The distance walked within which they do."""
 
 
 class AnchorHealth(Struct, frozen=True):

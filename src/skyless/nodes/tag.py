@@ -123,9 +123,11 @@ class TagNode:
         is_given = trusted is None or trusted.trust.trust is Trust.OPEN
         return (None if is_given or trusted is None else trust_reason(trusted)) or str(self.receiver.reason)
 
-    def with_trust(self, health: TagHealth) -> TagHealth:
-        """A tag's state with what it knows of verified beacons."""
+    def complete(self, health: TagHealth) -> TagHealth:
+        """A tag's state with what it knows of multipath and of verified beacons."""
         trusted = self._trusted
+        if (multipath := self.receiver.multipath_m) is not None:
+            health = replace(health, multipath_std_m=multipath[0], multipath_distance_m=multipath[1])
         if trusted is None:
             return health
         return replace(
@@ -294,7 +296,7 @@ class Tag:
             phases=node.phases.last,
             late_in_link=self._late_before + (0 if self.link is None else self.link.late),
         )
-        health = node.with_trust(counted)
+        health = node.complete(counted)
         if self._on_health is not None:
             self._on_health(health, node.receiver)
         if self.link is not None:
