@@ -71,6 +71,8 @@ LOST_IN_ROW: Final = 8
 LOST_SHARE: Final = 0.5
 MOST_RELAYS_REJECTED: Final = 4.0  # recent relays beyond the gate; fewer may be late ones
 FITTING_CHI2: Final = 2.0  # largest χ² for each anchor of range errors that are as the settings state them
+STAYING_SHARE: Final = 0.2  # of an anchor's lateness at the start: its mean part that stays, ...
+STAYING_STD: Final = 0.5  # ... and the standard deviation of that
 FADING: Final = 0.95  # factor on the counts of recent relays with each packet
 MOST_PACKED: Final = 16  # relays in a frame; 13 fit
 
@@ -524,14 +526,15 @@ class Estimator:
             fit_plane(self._state)
 
     def expect_late(self, table_index: int, late_m: float, variance_m2: float) -> None:
-        """Expect that an anchor is late by so much at the start, with this variance besides the usual one."""
+        """Expect that an anchor is late by so much at the start, with this variance: for the time being, or for good."""
         if self._state.index_of[table_index] < 0:
             self._resize(NEW_ANCHOR, table_index, 0)
-        state = self._state
+        state, where = self._state, layout(self.dim, len(self._state.anchors))
         anchor = int(state.index_of[table_index])
-        change = layout(self.dim, len(state.anchors)).change + anchor
-        state.anchors["change_variance_m2"][anchor] += variance_m2
-        state.x[change], state.P[change, change] = late_m, state.anchors["change_variance_m2"][anchor]
+        change, constant = where.change + anchor, where.constant + anchor
+        state.x[change], state.x[constant] = (1.0 - STAYING_SHARE) * late_m, STAYING_SHARE * late_m
+        state.P[change, change] += variance_m2
+        state.P[constant, constant] += (STAYING_STD * late_m) ** 2
 
     def withhold_levels(self, are_withheld: bool = True) -> None:
         """State no levels: it is not sure yet where the tag is, or the anchors' positions are known to be wrong."""

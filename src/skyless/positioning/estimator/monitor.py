@@ -68,7 +68,7 @@ PLACE_LEAST_M2: Final = 12e-4  # mean square beyond the stamps' noise that is mo
 PLACE_ABSORBED: Final = 1.3  # factor for what position and clock absorb of it (simulated, six anchors)
 PLACE_LEAST_KEPT: Final = 0.1  # least and largest correlation after one step
 PLACE_MOST_KEPT: Final = 0.9
-MAX_CHANGE_STD_M: Final = 1.0  # largest standard deviation of the part of range errors that changes as the tag moves
+MAX_CHANGE_STD_M: Final = 0.5  # largest standard deviation of the part of range errors that changes as the tag moves
 
 # Motion: a tag moves where the mean square of its way, over the variances, exceeds MOVED. Process noise grows while the
 # mean square of the innovations' running means along the axes, 1 where the filter is right, exceeds LAG_LIMIT.
@@ -283,12 +283,14 @@ def update_stationary(s: EstimatorState, dt: float) -> None:
     status, dim = s.status[0], s.settings[0]["dim"]
     square = 0.0
     for axis in range(dim):
-        square += (s.x[axis] - status["stationary_m"][axis]) ** 2 / s.P[axis, axis]
+        square += (s.x[axis] - status["stationary_m"][axis]) ** 2 / status["stationary_m2"][axis]
     status["stationary_s"] += dt
-    if square > MOVED * dim or status["lag_square"] > LAG_LIMIT or status["rejected_in_row"] > 1:
+    moved = not square <= MOVED * dim or status["lag_square"] > LAG_LIMIT or status["rejected_in_row"] > 1
+    if moved:
         status["stationary_s"] = 0.0
-        for axis in range(dim):
-            status["stationary_m"][axis] = s.x[axis]
+    for axis in range(dim):  # a place that is known better than when the tag came to rest is compared with anew
+        if moved or s.P[axis, axis] < 0.5 * status["stationary_m2"][axis]:
+            status["stationary_m"][axis], status["stationary_m2"][axis] = s.x[axis], s.P[axis, axis]
 
 
 @step

@@ -230,7 +230,8 @@ STATUS_DTYPE: Final = np.dtype(
         ("obstruction", np.float64),  # 1 where range errors have jumped lately, 0 where they do not
         ("walked_m", np.float64),
         ("stationary_s", np.float64),  # since the tag last showed motion ...
-        ("stationary_m", np.float64, (3,)),  # ... and where it was then
+        ("stationary_m", np.float64, (3,)),  # ... and where it was then, ...
+        ("stationary_m2", np.float64, (3,)),  # ... with that variance on each axis
         ("withholds_levels", np.int64),  # whether the anchors' positions are known to be wrong
         ("height_ticks", np.int64),  # the tag's reading when a sensor's height was used last
         ("plane_m", np.float64, (3,)),  # a point of the plane that lies closest to the anchors, ...

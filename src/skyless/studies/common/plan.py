@@ -234,12 +234,16 @@ class Row(Struct, frozen=True):
 
 
 def with_limits(row: Row, limits: Sequence[Limit]) -> Row:
-    """The row with its limits and the figures that miss them; one without a fix misses all."""
+    """The row with its limits and the figures that miss them; without a fix all but that no level is given."""
     if row.limit is not None:
         limits = (*limits, Limit("ratio", most=row.limit))
     if not limits:
         return row
-    missed = tuple(limit.figure for limit in limits if row.fixes == 0 or not _holds(row, limit))
+    missed = tuple(
+        limit.figure
+        for limit in limits
+        if not _holds(row, limit) or (row.fixes == 0 and limit.figure not in {"level", "exceeded"})
+    )
     return replace(row, limits=tuple(limits), missed=missed, passed=not missed)
 
 
