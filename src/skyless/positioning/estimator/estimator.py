@@ -525,16 +525,17 @@ class Estimator:
             self._state = without_anchor(self._state, anchor)
             fit_plane(self._state)
 
-    def expect_late(self, table_index: int, late_m: float, variance_m2: float) -> None:
-        """Expect that an anchor is late by so much at the start, with this variance: for the time being, or for good."""
+    def expect_late(self, table_index: int, late_m: float, variance_m2: float, may_stay: bool) -> None:
+        """Expect that an anchor is late by so much at the start, with this variance; ``may_stay``: perhaps for good."""
         if self._state.index_of[table_index] < 0:
             self._resize(NEW_ANCHOR, table_index, 0)
         state, where = self._state, layout(self.dim, len(self._state.anchors))
         anchor = int(state.index_of[table_index])
         change, constant = where.change + anchor, where.constant + anchor
-        state.x[change], state.x[constant] = (1.0 - STAYING_SHARE) * late_m, STAYING_SHARE * late_m
+        staying_m = late_m if may_stay else 0.0
+        state.x[change], state.x[constant] = late_m - STAYING_SHARE * staying_m, STAYING_SHARE * staying_m
         state.P[change, change] += variance_m2
-        state.P[constant, constant] += (STAYING_STD * late_m) ** 2
+        state.P[constant, constant] += (STAYING_STD * staying_m) ** 2
 
     def withhold_levels(self, are_withheld: bool = True) -> None:
         """State no levels: it is not sure yet where the tag is, or the anchors' positions are known to be wrong."""

@@ -73,6 +73,7 @@ MAX_CHANGE_STD_M: Final = 0.5  # largest standard deviation of the part of range
 # Motion: a tag moves where the mean square of its way, over the variances, exceeds MOVED. Process noise grows while the
 # mean square of the innovations' running means along the axes, 1 where the filter is right, exceeds LAG_LIMIT.
 MOVED: Final = 1.0
+BETTER_KNOWN: Final = 0.8  # part of the variance of a place from which it is compared with anew
 LAG_GAIN: Final = 0.05
 LAG_FORGETTING: Final = 0.01
 LAG_LIMIT: Final = 2.6
@@ -283,13 +284,13 @@ def update_stationary(s: EstimatorState, dt: float) -> None:
     status, dim = s.status[0], s.settings[0]["dim"]
     square = 0.0
     for axis in range(dim):
-        square += (s.x[axis] - status["stationary_m"][axis]) ** 2 / status["stationary_m2"][axis]
+        square += (s.x[axis] - status["stationary_m"][axis]) ** 2 / s.P[axis, axis]
     status["stationary_s"] += dt
-    moved = not square <= MOVED * dim or status["lag_square"] > LAG_LIMIT or status["rejected_in_row"] > 1
+    moved = square > MOVED * dim or status["lag_square"] > LAG_LIMIT or status["rejected_in_row"] > 1
     if moved:
         status["stationary_s"] = 0.0
-    for axis in range(dim):  # a place that is known better than when the tag came to rest is compared with anew
-        if moved or s.P[axis, axis] < 0.5 * status["stationary_m2"][axis]:
+    for axis in range(dim):  # a place that has become known better moves as well
+        if moved or s.P[axis, axis] < BETTER_KNOWN * status["stationary_m2"][axis]:
             status["stationary_m"][axis], status["stationary_m2"][axis] = s.x[axis], s.P[axis, axis]
 
 

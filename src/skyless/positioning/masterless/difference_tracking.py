@@ -221,7 +221,8 @@ class DifferenceTracking:
         self._estimator.withhold_levels(True)
         self._start = start
         for anchor, (late_m, variance_m2) in start.late.items():
-            self._estimator.expect_late(self._index(anchor), late_m, variance_m2)
+            may_stay = anchor not in self._calibration.anchors  # else it was not late then
+            self._estimator.expect_late(self._index(anchor), late_m, variance_m2, may_stay)
         self._received_s = {anchor: self._newest_s for kept in window for anchor in (kept.anchor_a, kept.anchor_b)}
         self.counters["start"] += 1
         window.clear()
