@@ -73,7 +73,7 @@ MAX_CHANGE_STD_M: Final = 0.5  # largest standard deviation of the part of range
 # Motion: a tag moves where the mean square of its way, over the variances, exceeds MOVED. Process noise grows while the
 # mean square of the innovations' running means along the axes, 1 where the filter is right, exceeds LAG_LIMIT.
 MOVED: Final = 1.0
-BETTER_KNOWN: Final = 0.8  # part of the variance of a place from which it is compared with anew
+BETTER_KNOWN: Final = 0.8  # part of the variance of a place below which the newest estimate replaces it
 LAG_GAIN: Final = 0.05
 LAG_FORGETTING: Final = 0.01
 LAG_LIMIT: Final = 2.6
