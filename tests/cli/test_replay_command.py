@@ -197,7 +197,7 @@ def test_no_fix_at_all_is_exit_code_1_with_the_likely_reason(run, room, tmp_path
     code, out, err = run("tdoa-table", "--anchors", others, "--json")
     told = json.loads(out)
     assert (code, told["fixes"], told["reason"], told["median_m"], told["rate_hz"]) == (1, 0, "no-almanac", None, None)
-    assert err.startswith("skyless: no fix: no reception is of an anchor in the table of --anchors")
+    assert err.startswith("skyless: no fix: no reception is of an anchor in the table or site file")
     code, out, err = run("tdoa-table", "--anchors", others)
     assert (code, err.count("\n")) == (1, 1)
     assert "none: no-almanac" in out
