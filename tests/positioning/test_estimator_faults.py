@@ -251,7 +251,8 @@ def test_innocent_anchors_are_opened_only_with_the_faulty_one():
 def test_levels_hold_with_anchors_that_are_late_from_the_start(late_anchors, errors, late_m):
     """One is found within 3 s, and no other blamed; with two the level covers the error, or there is none.
 
-    A fault is sure from some seven standard deviations of an anchor's range errors on, here 0.3 m of 0.045 m.
+    A fault is sure from some seven standard deviations of an anchor's range errors on. With range errors these are
+    0.045 m, so 0.3 m is not enough.
     """
     for seed in range(2):
         episode = episode_of(AGILE, 300, seed)
