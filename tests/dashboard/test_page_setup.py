@@ -375,6 +375,7 @@ def test_the_survey_is_saved(site):
     here.open(4)
     page.set_input_files("#plan-file", picture())
     until(page, PLAN)
+    until(page, "skyless.state.survey.serial === 2")  # where the plan lies has been sent, which makes a new result
     here.open(6)
     what = page.locator("#save-what")
     until(page, "document.getElementById('save-what').textContent.includes('hall.png')")
