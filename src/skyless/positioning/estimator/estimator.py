@@ -12,20 +12,17 @@ from numpy.typing import NDArray
 
 from skyless.air.beacon import HEARD
 from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.kernels.arrays import Array, Indices, Integers, Matrix, Records, Vector
+from skyless.kernels.arrays import Indices, Integers, Matrix, Records, Vector
 from skyless.kernels.compiled import kernel, step, threaded_kernel
 from skyless.positioning.estimator.faults import (
     explained_chi2,
-    fade_recent_faults,
-    fault_chi2,
+    fade_faults,
     open_faults,
 )
 from skyless.positioning.estimator.kalman import is_stationary, predict
 from skyless.positioning.estimator.levels import (
-    LASTING_CHI2,
+    CHI2,
     LEVELS,
-    RECENT_CHI2,
-    RECENT_STD_M,
     fit_plane,
     integrity_state,
     protect,
@@ -42,6 +39,7 @@ from skyless.positioning.estimator.measurements import (
 )
 from skyless.positioning.estimator.monitor import LATE_OFTEN_SHARE, covariance_scale, update_stationary
 from skyless.positioning.estimator.state import (
+    LASTING,
     LASTING_STD_M,
     NEVER,
     PACKETS_KEPT,
@@ -149,7 +147,7 @@ def _process(
     if joins or was_known:
         status["stale_in_row"] = 0
         predict(s, rx_ticks)
-        fade_recent_faults(s)
+        fade_faults(s)
         if joins:
             first_reception(s, anchor, rx_ticks, tx_ticks)
         else:
@@ -179,7 +177,7 @@ def _check_motion_and_faults(s: EstimatorState, elapsed_s: float) -> None:
         if is_stationary(s):
             zero_velocity(s)
     if s.status[0]["packets"] % len(s.anchors) == 0:
-        open_faults(s, fault_chi2(s, 0, s.status[0]["fault_std_m"]), fault_chi2(s, 1, RECENT_STD_M))
+        open_faults(s)
 
 
 @step
@@ -275,8 +273,8 @@ def _process_frame(
     x: Vector,
     P: Matrix,
     V: Matrix,
-    information: Array,
-    evidence: Matrix,
+    information: Matrix,
+    evidence: Vector,
     anchors: Records,
     packets: Records,
     links: Records,
@@ -327,19 +325,9 @@ def _process_frame(
                 count += 1
                 break
     outcome = _process(
-        s,
-        table_index,
-        sequence,
-        rx_ticks,
-        tx_ticks,
-        listed,
-        0,
-        count,
-        master,
-        subticks,
-        report_variance_m2,
+        s, table_index, sequence, rx_ticks, tx_ticks, listed, 0, count, master, subticks, report_variance_m2,
         variance_factor,
-    )
+    )  # fmt: skip
     if outcome >= NEW_ANCHOR:
         return outcome
     _fill_rows(s, levels, rows)
@@ -352,7 +340,7 @@ def _fill_rows(s: EstimatorState, levels: Vector, rows: Matrix) -> None:
     fill_motion(s, rows)
     rows[QUALITY, 0], rows[QUALITY, 1] = s.status[0]["mean_nis"], s.status[0]["mean_square_m2"]
     protect(s, levels)
-    rows[QUALITY, 2] = max(levels[LASTING_CHI2], levels[RECENT_CHI2])
+    rows[QUALITY, 2] = levels[CHI2:].max()
     rows[PROTECTION, 0], rows[PROTECTION, 1], rows[PROTECTION, 2] = levels[HPL], levels[VPL], integrity_state(s, levels)
 
 
@@ -377,7 +365,7 @@ def _process_difference(
     status["stale_in_row"] = 0
     elapsed_s = (rx_ticks - status["epoch_ticks"]) * TICK_S
     predict(s, rx_ticks)
-    fade_recent_faults(s)
+    fade_faults(s)
     outcome = ACCEPTED if difference(s, a, b, rx_ticks, difference_m) == 1 else REJECTED
     status["packets"] += 1
     for anchor in (a, b):
@@ -560,12 +548,12 @@ class Estimator:
         settings, dim = self.settings, self.dim
         state = new_state(settings, len(self._table_m), open_range_errors=open_range_errors)
         state.status["late_share"] = self._state.status["late_share"]
-        state.status["fault_std_m"] = fault_std_m
+        state.status["fault_std_m"][0, LASTING] = fault_std_m
         self._misfits = frozenset(misfitting)
         state.x[:dim] = position_m
         state.P[:dim, :dim] = covariance_m2
         state.P[range(dim, 2 * dim), range(dim, 2 * dim)] = speed_variance
-        state.status["epoch_ticks"] = state.status["start_ticks"] = rx_ticks
+        state.status["epoch_ticks"] = state.status["start_ticks"] = state.status["faded_ticks"] = rx_ticks
         self._state = state
 
     def process(
@@ -666,14 +654,14 @@ class Estimator:
     @property
     def fault_test(self) -> float:
         """The larger test of faults, χ² with as many degrees of freedom as there are anchors if there are none."""
-        return float(max(self._levels[LASTING_CHI2], self._levels[RECENT_CHI2]))
+        return float(self._levels[CHI2:].max())
 
     @property
     def unexplained_test(self) -> float:
         """What the faults of any two anchors leave of the test of lasting ones."""
         s = self._state
         pairs = ((one, other) for one in range(len(s.anchors)) for other in range(one + 1))
-        return float(self._levels[LASTING_CHI2]) - max(explained_chi2(s, one, other) for one, other in pairs)
+        return float(self._levels[CHI2 + LASTING]) - max(explained_chi2(s, one, other) for one, other in pairs)
 
     @property
     def fits_settings(self) -> bool:

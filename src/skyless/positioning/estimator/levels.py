@@ -5,9 +5,9 @@ faults b̂ and their sensitivities V (``faults``) the estimate under the hypothe
 
     x + V·b̂        P + V·(M + I/σ_f²)⁻¹·Vᵀ
 
-so the error exceeds |V·b̂| + k·σ with the stated risk only, whichever anchors are at fault. Two kinds are considered:
-constants since an anchor joined, and what has begun lately. What is larger than σ_f shows, as a jump or in
-yᵀ·(M + I/σ_f²)⁻¹·y, which is χ² without faults; then there is no number.
+so the error exceeds |V·b̂| + k·σ with the stated risk only, whichever anchors are at fault. Three kinds are considered:
+constants since an anchor joined, what has begun lately, and what grows for seconds. What is larger than σ_f shows, as
+a jump or in yᵀ·(M + I/σ_f²)⁻¹·y, which is χ² without faults; then there is no number.
 """
 
 from typing import Final
@@ -17,17 +17,14 @@ import numpy as np
 from skyless.constants import TICK_S
 from skyless.kernels.arrays import Vector
 from skyless.kernels.compiled import step
-from skyless.positioning.estimator.faults import SURE_CHI2, whiten
+from skyless.positioning.estimator.faults import SURE_CHI2, fault_chi2, whiten
 from skyless.positioning.estimator.monitor import covariance_scale
-from skyless.positioning.estimator.state import LASTING_STD_M, EstimatorState
+from skyless.positioning.estimator.state import KINDS, LASTING, LASTING_STD_M, EstimatorState
 from skyless.positioning.integrity import CONTRADICTED, HPL, OBSTRUCTED, SOUND, UNAVAILABLE, VPL
 
-RECENT_STD_M: Final = 0.08  # of a fault that has begun recently without a visible jump
-
-LASTING_CHI2, RECENT_CHI2 = 2, 3
-"""What ``protect`` writes after ``HPL`` and ``VPL``."""
-
-LEVELS: Final = 4
+CHI2: Final = 2
+"""Where ``protect`` writes the tests of all kinds of faults, after ``HPL`` and ``VPL``."""
+LEVELS: Final = CHI2 + KINDS
 
 
 @step
@@ -37,22 +34,12 @@ def protect(s: EstimatorState, levels: Vector) -> None:
     dim, count = settings["dim"], len(s.anchors)
     scale = covariance_scale(s)
     levels[HPL] = levels[VPL] = 0.0
-    for bank in range(2):
-        std_m = s.status[0]["fault_std_m"] if bank == 0 else RECENT_STD_M
-        begin = bank * count
-        for one in range(count):
-            for other in range(count):
-                s.work[one, other] = s.information[bank, one, other]
-            s.work[one, one] += 1.0 / (std_m * std_m)
-            s.work[count, one] = s.evidence[bank, one]
-            for axis in range(dim):
-                s.work[count + 1 + axis, one] = s.V[begin + one, axis]
-        whiten(s.work, count, 1 + dim)
-        chi2, shift_x, shift_y, shift_z = 0.0, 0.0, 0.0, 0.0
+    for kind in range(KINDS):
+        levels[CHI2 + kind] = fault_chi2(s, kind, dim)
+        shift_x, shift_y, shift_z = 0.0, 0.0, 0.0
         xx, xy, yy, zz = scale * s.P[0, 0], scale * s.P[0, 1], scale * s.P[1, 1], 0.0
         for one in range(count):
             fault, vx, vy = s.work[count, one], s.work[count + 1, one], s.work[count + 2, one]
-            chi2 += fault * fault
             shift_x += vx * fault
             shift_y += vy * fault
             xx += vx * vx
@@ -66,9 +53,8 @@ def protect(s: EstimatorState, levels: Vector) -> None:
         levels[HPL] = max(levels[HPL], np.hypot(shift_x, shift_y) + settings["horizontal_k"] * np.sqrt(largest))
         if dim == 3:
             levels[VPL] = max(levels[VPL], abs(shift_z) + settings["vertical_k"] * np.sqrt(scale * s.P[2, 2] + zz))
-        levels[LASTING_CHI2 + bank] = chi2
     squared, up = 0.0, 0.0
-    for column in range(2 * count, 2 * count + dim):
+    for column in range(KINDS * count, KINDS * count + dim):
         squared += s.V[column, 0] ** 2 + s.V[column, 1] ** 2
         if dim == 3:
             up += s.V[column, 2] ** 2
@@ -165,10 +151,10 @@ def integrity_state(s: EstimatorState, levels: Vector) -> int:
         range_m += s.anchors[anchor]["range_m"] / count
         if s.anchors[anchor]["is_obstructed"] or s.anchors[anchor]["has_fault"]:
             state = OBSTRUCTED
-    was_contradicted = status["fault_std_m"] > LASTING_STD_M  # then none are selected
+    was_contradicted = status["fault_std_m"][LASTING] > LASTING_STD_M  # then none are selected
     limit = SURE_CHI2 if was_contradicted else UNCOVERED_CHI2
     share = np.sqrt(s.P[0, 0] + s.P[1, 1]) / max(range_m, 1e-6)  # levels are of first order in it
-    if status["withholds_levels"] or max(levels[LASTING_CHI2], levels[RECENT_CHI2]) > limit:
+    if status["withholds_levels"] or levels[CHI2:].max() > limit:
         state = CONTRADICTED
     if was_contradicted and (status["epoch_ticks"] - status["start_ticks"]) * TICK_S < CONTRADICTED_START_S:
         state = CONTRADICTED

@@ -66,9 +66,8 @@ HELD_SHARE: Final = 0.1
 HELD_STD: Final = 3.0
 HELD_MOST_M: Final = 0.4
 CURVATURE_SHARE: Final = 0.01  # part of the stamps' variance from which the curvature of ranges counts
-CLOCK_JUMP_RELAYS: Final = (
-    4  # relays of an anchor in a row beyond the gate, while its receptions jump: its clock jumped
-)
+# Relays of an anchor in a row beyond the gate, while its receptions jump: its clock has jumped.
+CLOCK_JUMP_RELAYS: Final = 4
 JOIN_VARIANCE_M2: Final = 1.0  # where packets are late often an anchor's first one may be so too
 # Pairs of anchors: PAIR_OUTLIERS relays in a row beyond the gate are another path between the two. After PAIR_RELAYS
 # in either direction their mean is a range; beyond PAIR_SUSPECT standard deviations it contradicts the survey. An
@@ -223,7 +222,8 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
     innovation_variance = compute_ph(s, terms) + rx_variance
     a["range_m"] = range_m
     a["innovation"] = innovation / np.sqrt(innovation_variance)
-    learn_place(s, anchor, innovation + s.x[where.change + anchor])
+    if status["late_share"] <= LATE_OFTEN_SHARE:  # late packets are no multipath
+        learn_place(s, anchor, innovation + s.x[where.change + anchor])
     clock_jumped = False
     if is_warm(s) and abs(a["innovation"]) > COMMON and is_common(s, a["innovation"]):
         status["walk_scale"] = settings["max_walk_scale"]

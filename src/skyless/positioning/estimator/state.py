@@ -24,7 +24,7 @@ from msgspec import Struct, structs
 from numpy.typing import NDArray
 
 from skyless.constants import SPEED_OF_LIGHT_MPS
-from skyless.kernels.arrays import Array, Indices, Integers, Matrix, Records, Vector
+from skyless.kernels.arrays import Indices, Integers, Matrix, Records, Vector
 from skyless.kernels.compiled import jitted, step
 from skyless.positioning.integrity import RISK, limits_of
 
@@ -189,10 +189,15 @@ LINK_DTYPE: Final = np.dtype(
 )
 """A pair of anchors, listener and sender."""
 
+LASTING, RECENT, CREEPING = range(3)
+"""Kinds of faults: there since an anchor joined, begun within its last packets, or growing for seconds."""
+KINDS: Final = 3
+
 STATUS_DTYPE: Final = np.dtype(
     [
         ("epoch_ticks", np.int64),  # the tag's reading at the newest packet, ...
         ("start_ticks", np.int64),  # ... and at the start
+        ("faded_ticks", np.int64),  # ... and when faults that are not lasting have faded last
         ("outcome", np.int64),  # what became of it
         ("packets", np.int64),
         ("accepted", np.int64),
@@ -222,10 +227,7 @@ STATUS_DTYPE: Final = np.dtype(
         ("walk_scale", np.float64),  # factor on its random walk
         ("place_samples", np.int64),  # comparisons of range errors at places a step apart
         ("place_square_m2", np.float64, (2,)),  # half their mean square after one and two steps
-        (
-            "place_variance_m2",
-            np.float64,
-        ),  # of what multipath changes in them, as learnt; 0 where it is not more than stated ...
+        ("place_variance_m2", np.float64),  # of what multipath changes in them, 0 where not more than stated, ...
         ("place_distance_m", np.float64),  # ... and the distance over which it changes
         ("obstruction", np.float64),  # 1 where range errors have jumped lately, 0 where they do not
         ("walked_m", np.float64),
@@ -237,11 +239,8 @@ STATUS_DTYPE: Final = np.dtype(
         ("plane_m", np.float64, (3,)),  # a point of the plane that lies closest to the anchors, ...
         ("plane_normal", np.float64, (3,)),  # ... and its normal
         ("open_range_errors", np.int64),  # whether anchors join with range errors beyond those of the settings
-        (
-            "range_errors",
-            np.int64,
-        ),  # which of them there are: NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS or ALL_RANGE_ERRORS
-        ("fault_std_m", np.float64),  # of lasting faults, beforehand
+        ("range_errors", np.int64),  # NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS or ALL_RANGE_ERRORS
+        ("fault_std_m", np.float64, (KINDS,)),  # of each kind of faults, beforehand
     ],
     align=True,
 )
@@ -256,13 +255,12 @@ class EstimatorState(NamedTuple):
     P: Matrix
     """Shape (n, n), symmetric to the bit."""
     V: Matrix
-    """What faults do to x, shape (2·anchors + dim, n): for each metre by which the tag's receptions of an anchor have
-    been late since it joined, the same lately, and for each m/s² of acceleration along an axis."""
-    information: Array
-    """Of both kinds of faults of all anchors in the innovations, and of lasting (row) with recent ones (column), shape
-    (3, anchors, anchors)."""
-    evidence: Matrix
-    """What innovations show of them, shape (2, anchors)."""
+    """What faults do to x, shape (KINDS·anchors + dim, n): of each kind for each metre by which the tag's receptions of
+    an anchor are late, then for each m/s² of acceleration along an axis."""
+    information: Matrix
+    """Of all kinds of faults of all anchors in the innovations, shape (KINDS·anchors, KINDS·anchors)."""
+    evidence: Vector
+    """What innovations show of them, shape (KINDS·anchors,)."""
     anchors: Records
     """``ANCHOR_DTYPE``, shape (anchors,)."""
     packets: Records
@@ -338,13 +336,8 @@ def uncertain_states(s: EstimatorState) -> int:
     A multiple of ``LANES``.
     """
     where, range_errors = layout(s.settings[0]["dim"], len(s.anchors)), s.status[0]["range_errors"]
-    end = (
-        where.end
-        if range_errors == ALL_RANGE_ERRORS
-        else where.constant
-        if range_errors == CHANGING_RANGE_ERRORS
-        else where.change
-    )
+    end = where.constant if range_errors == CHANGING_RANGE_ERRORS else where.change
+    end = where.end if range_errors == ALL_RANGE_ERRORS else end
     return int(-(-end // LANES) * LANES)
 
 
@@ -367,7 +360,7 @@ def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors
     status["q_scale"] = status["mean_nis"] = 1.0
     status["height_ticks"] = NEVER
     status["walk_scale"] = min(START_WALK_SCALE, settings.max_walk_scale)
-    status["fault_std_m"] = LASTING_STD_M
+    status["fault_std_m"] = (LASTING_STD_M, RECENT_STD_M, CREEPING_STD_M)
     status["place_square_m2"] = settings.tx_variance_m2 + settings.rx_variance_m2
     status["place_distance_m"] = settings.place_distance_m
     status["mean_square_m2"] = settings.tx_variance_m2 + settings.rx_variance_m2
@@ -379,8 +372,8 @@ def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors
         x=np.zeros(n),
         P=P,
         V=np.zeros((dim, n)),
-        information=np.zeros((3, 0, 0)),
-        evidence=np.zeros((2, 0)),
+        information=np.zeros((0, 0)),
+        evidence=np.zeros(0),
         anchors=np.zeros(0, ANCHOR_DTYPE),
         packets=np.zeros((0, PACKETS_KEPT), PACKET_DTYPE),
         links=np.zeros((0, 0), LINK_DTYPE),
@@ -399,6 +392,8 @@ START_WALK_SCALE: Final = 100.0  # of the tag's oscillator, which warms up after
 LASTING_STD_M: Final = 0.3  # of a fault that has been there since the anchor joined,
 # ... and where the packets that led to the start contradict each other, so that some are late by more.
 CONTRADICTED_STD_M: Final = 1.0
+RECENT_STD_M: Final = 0.08  # of a fault that has begun recently without a visible jump
+CREEPING_STD_M: Final = 0.2  # of one that grows for seconds
 OPEN_PAIR_STD_M: Final = 0.1  # of the range between two anchors against the survey, before it is measured
 # What a start expects of ranges and survey that follows one which was contradicted.
 OPEN_RANGE_STD_M: Final = 1.0
@@ -500,21 +495,23 @@ def _selected(s: EstimatorState, kept: list[int]) -> EstimatorState:
         first = was.survey + dim * anchor
         states += [-1] * dim if anchor < 0 else range(first, first + dim)
     states += [-1] * (layout(dim, new).room - len(states))
-    faults = [*kept, *(old + anchor if anchor >= 0 else -1 for anchor in kept), *range(2 * old, 2 * old + dim)]
-    n, of_states, of_anchors = len(states), np.array(states), np.array(kept, np.int64)
+    faults = [kind * old + anchor if anchor >= 0 else -1 for kind in range(KINDS) for anchor in kept]
+    n, of_states = len(states), np.array(states)
+    of_anchors, of_faults = np.array(kept, np.int64), np.array(faults, np.int64)
+    inputs = np.append(of_faults, range(KINDS * old, KINDS * old + dim))
     index_of = np.full_like(s.index_of, -1)
     result = s._replace(
         x=_select(s.x, of_states),
         P=_select(s.P, of_states, of_states),
-        V=_select(s.V, np.array(faults), of_states),
-        information=_select(s.information, np.arange(3), of_anchors, of_anchors),
-        evidence=_select(s.evidence, np.arange(2), of_anchors),
+        V=_select(s.V, inputs, of_states),
+        information=_select(s.information, of_faults, of_faults),
+        evidence=_select(s.evidence, of_faults),
         anchors=_select(s.anchors, of_anchors),
         packets=_select(s.packets, of_anchors),
         links=_select(s.links, of_anchors, of_anchors),
         index_of=index_of,
         ph=np.zeros(n),
-        fault_input=np.zeros(2 * new + dim),
+        fault_input=np.zeros(len(inputs)),
         work=np.zeros((new + 1 + dim, new)),
     )
     there = of_anchors >= 0

@@ -283,9 +283,7 @@ class Estimation:
     def _is_contradicted(self, rx_ticks: int) -> bool:
         """Whether a new start is needed, as relays or faults contradict this one; decides what that has to expect."""
         if self._start_was_contradicted and self._estimator.is_late_often:
-            self._open_range_errors = self._start_was_contradicted = (
-                False  # the start was contradicted by single late packets
-            )
+            self._open_range_errors = self._start_was_contradicted = False  # it was by single late packets
             return True
         age_s = (rx_ticks - self._started_ticks) * TICK_S
         if self._is_open and age_s > OPEN_START_HOLD_S and self._estimator.fits_settings:
@@ -294,11 +292,8 @@ class Estimation:
         if self._estimator.rows.item(QUALITY, 2) > SURE_CHI2:
             limit = SURE_CHI2 if age_s < EARLY_FAULT_S or self._start_was_contradicted else UNCOVERED_CHI2
             calm = self._estimator.obstruction < CALM_OBSTRUCTION
-            if (
-                not self._start_was_contradicted
-                and age_s < EARLY_FAULT_S
-                and self._estimator.unexplained_test < UNEXPLAINED_CHI2
-            ):
+            is_new = not self._start_was_contradicted and age_s < EARLY_FAULT_S
+            if is_new and self._estimator.unexplained_test < UNEXPLAINED_CHI2:
                 limit = UNCOVERED_CHI2  # one or two anchors, which the estimator will find
             if calm and self._estimator.fault_test > limit and (not self._is_open or age_s > OPEN_START_HOLD_S):
                 self._open_range_errors = not self._estimator.is_late_often
