@@ -36,11 +36,11 @@ from skyless.positioning.estimator.faults import (
     open_faults,
     whiten,
 )
-from skyless.positioning.estimator.levels import CHI2, LEVELS, protect
+from skyless.positioning.estimator.levels import FIRST_TEST, LEVELS, protect
 from skyless.positioning.estimator.state import (
     ALL_RANGE_ERRORS,
     CREEPING_STD_M,
-    KINDS,
+    FAULT_KINDS,
     LASTING,
     LASTING_STD_M,
     RECENT_STD_M,
@@ -111,7 +111,7 @@ def test_sensitivities_to_acceleration_are_what_it_does():
     one, other = (begun(episode, settings_of(MESH, **OPEN), off=0.0) for _ in range(2))
     follow(one, episode.packets, other, late(episode.packets, flights_m[1] - flights_m[0]))
     behind_m = other.state.x[:2] - step_m[-1, :2] - one.state.x[:2]
-    expected = one.state.V[KINDS * len(LAB_M), :2]
+    expected = one.state.V[FAULT_KINDS * len(LAB_M), :2]
     assert np.linalg.norm(expected) > 0.002
     np.testing.assert_allclose(behind_m / acceleration, expected, atol=0.2 * np.linalg.norm(expected))
 
@@ -201,7 +201,7 @@ def test_opening_a_fault_is_a_filter_that_had_it_open_from_the_beginning(late_m,
     assert np.array_equal(ours.P, ours.P.T)
 
 
-@pytest.mark.parametrize("kind", range(KINDS), ids=["lasting", "recent", "creeping"])
+@pytest.mark.parametrize("kind", range(FAULT_KINDS), ids=["lasting", "recent", "creeping"])
 def test_other_faults_are_conditioned_on_one_that_is_opened(kind):
     """Schur's complement of all 18 faults' information."""
     s = tracked(begun(episode := episode_of(MESH, 20), settings_of(MESH)), episode.packets).estimator.state
@@ -365,7 +365,7 @@ def test_levels_are_the_ellipse_and_the_shift_of_all_faults():
         spread = s.P[:3, :3] + V.T @ np.linalg.solve(information, V)
         hpl.append(np.linalg.norm(shift[:2]) + k[0] * np.linalg.eigvalsh(spread[:2, :2])[-1] ** 0.5)
         vpl.append(abs(shift[2]) + k[1] * spread[2, 2] ** 0.5)
-        assert levels[CHI2 + kind] == pytest.approx(evidence @ np.linalg.solve(information, evidence))
+        assert levels[FIRST_TEST + kind] == pytest.approx(evidence @ np.linalg.solve(information, evidence))
     assert levels[:2] == pytest.approx([max(hpl), max(vpl)])
 
 

@@ -38,9 +38,9 @@ from skyless.air.beacon import HEARD
 from skyless.constants import TICK_RATE_HZ, TICK_S
 from skyless.positioning.estimator.estimator import JOINED, REJECTED, STALE, Estimator, Packets
 from skyless.positioning.estimator.kalman import predict
-from skyless.positioning.estimator.levels import CHI2
+from skyless.positioning.estimator.levels import FIRST_TEST
 from skyless.positioning.estimator.state import (
-    KINDS,
+    FAULT_KINDS,
     LASTING,
     EstimatorSettings,
     layout,
@@ -276,7 +276,7 @@ def test_at_rest_nothing_is_learnt_of_how_range_errors_grow():
     slope = where(estimator).slope
     assert abs(estimator.state.x[slope]) < estimator.state.P[slope, slope] ** 0.5
     assert estimator.state.status["faults_opened"] == 0
-    assert run.levels[:, CHI2 + LASTING].max() < 25.0  # with 6 degrees of freedom, over 100 s
+    assert run.levels[:, FIRST_TEST + LASTING].max() < 25.0  # with 6 degrees of freedom, over 100 s
     assert nees(run.motions[:, :2] - [3.0, 4.0], run.covariances) < 1.0
 
 
@@ -321,7 +321,7 @@ def states_of(dim, anchors):
 
 def faults_of(dim, anchors):
     """Name of each fault."""
-    return [(kind, a) for kind in range(KINDS) for a in anchors] + [("axis", k) for k in range(dim)]
+    return [(kind, a) for kind in range(FAULT_KINDS) for a in anchors] + [("axis", k) for k in range(dim)]
 
 
 def both(old, new):

@@ -30,7 +30,14 @@ from skyless.positioning.estimator.kalman import (
     update,
 )
 from skyless.positioning.estimator.measurements import first_reception, reception_terms, relay_terms, relay_variance
-from skyless.positioning.estimator.state import KINDS, EstimatorSettings, EstimatorState, layout, new_state, with_anchor
+from skyless.positioning.estimator.state import (
+    FAULT_KINDS,
+    EstimatorSettings,
+    EstimatorState,
+    layout,
+    new_state,
+    with_anchor,
+)
 
 RARELY: Final = 0.1
 """An anchor of whose frames fewer arrive does not help the tag."""
@@ -88,7 +95,7 @@ def _superframe(
     they do to the position are added to ``motion``.
     """
     dim, count, now = s.settings[0]["dim"], len(s.anchors), begin_ticks
-    walls = KINDS * count + dim
+    walls = FAULT_KINDS * count + dim
     row[SIGMA_X : SIGMA_Z + 1], row[FIX_SHARE], row[BIAS] = 0.0, 0.0, 0.0
     for k in range(len(clocks.sender)):
         now += round(clocks.gap_s[k] / TICK_S)
@@ -122,7 +129,7 @@ def _time_update(s: EstimatorState, now: int, impulses_ticks: int, superframe_s:
         moment = impulses_ticks + round((impulse + 0.5) / IMPULSES * superframe_s / TICK_S)
         if before < moment <= now:
             for axis in range(dim):
-                row = KINDS * count + dim + 1 + dim * impulse + axis
+                row = FAULT_KINDS * count + dim + 1 + dim * impulse + axis
                 s.V[row, axis], s.V[row, velocity + axis] = (now - moment) * TICK_S, 1.0
 
 
@@ -131,7 +138,7 @@ def _own_reception(s: EstimatorState, anchor: int, rx_ticks: int, share: float, 
     """The tag's reception of an anchor, of which this share arrives, late by ``late_m``."""
     settings, a, _n = s.settings[0], s.anchors[anchor], len(s.x)
     where = layout(settings["dim"], len(s.anchors))
-    walls = KINDS * len(s.anchors) + settings["dim"]
+    walls = FAULT_KINDS * len(s.anchors) + settings["dim"]
     if a["packets"] == 0:
         first_reception(s, anchor, rx_ticks, rx_ticks)
         s.V[walls, where.offset + anchor] += late_m
@@ -155,7 +162,7 @@ def _relay(s: EstimatorState, listener: int, sender: int, age_s: float, share: f
     variance += compute_ph(s, terms)
     compute_fault_input(s, terms, -1)
     if s.links[listener, sender]["variance_m2"] == 0.0:  # else the pair's constant takes the delay
-        s.fault_input[KINDS * len(s.anchors) + s.settings[0]["dim"]] += late_m
+        s.fault_input[FAULT_KINDS * len(s.anchors) + s.settings[0]["dim"]] += late_m
     update(s, 0.0, variance)
 
 

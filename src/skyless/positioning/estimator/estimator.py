@@ -21,7 +21,7 @@ from skyless.positioning.estimator.faults import (
 )
 from skyless.positioning.estimator.kalman import is_stationary, predict
 from skyless.positioning.estimator.levels import (
-    CHI2,
+    FIRST_TEST,
     LEVELS,
     fit_plane,
     integrity_state,
@@ -340,7 +340,7 @@ def _fill_rows(s: EstimatorState, levels: Vector, rows: Matrix) -> None:
     fill_motion(s, rows)
     rows[QUALITY, 0], rows[QUALITY, 1] = s.status[0]["mean_nis"], s.status[0]["mean_square_m2"]
     protect(s, levels)
-    rows[QUALITY, 2] = levels[CHI2:].max()
+    rows[QUALITY, 2] = levels[FIRST_TEST:].max()
     rows[PROTECTION, 0], rows[PROTECTION, 1], rows[PROTECTION, 2] = levels[HPL], levels[VPL], integrity_state(s, levels)
 
 
@@ -654,14 +654,14 @@ class Estimator:
     @property
     def fault_test(self) -> float:
         """The larger test of faults, χ² with as many degrees of freedom as there are anchors if there are none."""
-        return float(self._levels[CHI2:].max())
+        return float(self._levels[FIRST_TEST:].max())
 
     @property
     def unexplained_test(self) -> float:
         """What the faults of any two anchors leave of the test of lasting ones."""
         s = self._state
         pairs = ((one, other) for one in range(len(s.anchors)) for other in range(one + 1))
-        return float(self._levels[CHI2 + LASTING]) - max(explained_chi2(s, one, other) for one, other in pairs)
+        return float(self._levels[FIRST_TEST + LASTING]) - max(explained_chi2(s, one, other) for one, other in pairs)
 
     @property
     def fits_settings(self) -> bool:

@@ -24,7 +24,7 @@ from skyless.positioning.estimator.state import (
     ALL_RANGE_ERRORS,
     CHANGING_RANGE_ERRORS,
     CREEPING,
-    KINDS,
+    FAULT_KINDS,
     LASTING,
     LASTING_STD_M,
     RECENT,
@@ -57,14 +57,14 @@ def compute_fault_input(s: EstimatorState, terms: int, own: int) -> None:
         for term in range(terms):
             total -= h[term] * V[fault, h_index[term]]
         fault_input[fault] = total
-    for kind in range(KINDS if own >= 0 else 0):
+    for kind in range(FAULT_KINDS if own >= 0 else 0):
         fault_input[kind * len(s.anchors) + own] += 1.0
 
 
 @step
 def subtract_fault_input(s: EstimatorState, anchor: int) -> None:
     """Of an anchor with whose reception a difference begins: its faults count with the opposite sign."""
-    for kind in range(KINDS):
+    for kind in range(FAULT_KINDS):
         s.fault_input[kind * len(s.anchors) + anchor] -= 1.0
 
 
@@ -86,13 +86,13 @@ def fade_faults(s: EstimatorState) -> None:
     is_round = status["packets"] % count == 0
     elapsed_s = (status["epoch_ticks"] - status["faded_ticks"]) * TICK_S
     status["faded_ticks"] = status["epoch_ticks"] if is_round else status["faded_ticks"]
-    for fault in range(count, KINDS * count if is_round else count):
+    for fault in range(count, FAULT_KINDS * count if is_round else count):
         begin = fault - fault % count
         kept = 1.0 - 1.0 / RECENT_PACKETS if begin == RECENT * count else np.exp(-elapsed_s / CREEPING_S)
         s.evidence[fault] *= kept
         for state in range(n):
             s.V[fault, state] *= kept
-        for other in range(KINDS * count):
+        for other in range(FAULT_KINDS * count):
             s.information[fault, other] *= kept
             s.information[other, fault] *= 1.0 if begin <= other < begin + count else kept
 
@@ -269,18 +269,18 @@ def _open_fault(s: EstimatorState, kind: int, anchor: int) -> None:
         x[row] += opened[row] * fault_m
         for other in range(n):
             P[row, other] += opened[row] * opened[other] * variance
-    for one in range(KINDS * count):
+    for one in range(FAULT_KINDS * count):
         column[one] = information[one, chosen]
     column[chosen] = 0.0
-    for one in range(KINDS * count):
+    for one in range(FAULT_KINDS * count):
         share = gain * column[one]
         evidence[one] -= share * evidence[chosen]
-        for other in range(KINDS * count):
+        for other in range(FAULT_KINDS * count):
             information[one, other] -= share * column[other]
         for state in range(n):
             V[one, state] += share * opened[state]
     evidence[chosen] = 0.0
-    for one in range(KINDS * count):
+    for one in range(FAULT_KINDS * count):
         information[one, chosen] = 0.0
         information[chosen, one] = 0.0
     for state in range(n):

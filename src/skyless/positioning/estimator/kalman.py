@@ -14,7 +14,7 @@ from skyless.kernels.covariance import (
     reset_covariance,
     subtract_information,
 )
-from skyless.positioning.estimator.state import KINDS, EstimatorState, layout, uncertain_states
+from skyless.positioning.estimator.state import FAULT_KINDS, EstimatorState, layout, uncertain_states
 
 # Where range errors jump, those of all anchors change by OBSTRUCTED_STD_M within OBSTRUCTED_S. One that has jumped
 # itself wanders with the density OBSTRUCTED_WALK, m²/s, and returns to zero: else all would drift away together.
@@ -50,8 +50,8 @@ def predict(s: EstimatorState, rx_ticks: int) -> None:
         motion *= STATIONARY_NOISE_SHARE
     for axis in range(dim):
         add_process_noise(s.P, axis, where.velocity + axis, axis, where.velocity + axis, dt, 0.0, motion)
-        s.V[KINDS * count + axis, axis] -= 0.5 * dt * dt  # an acceleration that the filter does not know of
-        s.V[KINDS * count + axis, where.velocity + axis] -= dt
+        s.V[FAULT_KINDS * count + axis, axis] -= 0.5 * dt * dt  # an acceleration that the filter does not know of
+        s.V[FAULT_KINDS * count + axis, where.velocity + axis] -= dt
     walk = settings["walk"]
     for anchor in range(count):
         offset, rate = where.offset + anchor, where.rate + anchor

@@ -19,12 +19,12 @@ from skyless.kernels.arrays import Vector
 from skyless.kernels.compiled import step
 from skyless.positioning.estimator.faults import SURE_CHI2, fault_chi2, whiten
 from skyless.positioning.estimator.monitor import covariance_scale
-from skyless.positioning.estimator.state import KINDS, LASTING, LASTING_STD_M, EstimatorState
+from skyless.positioning.estimator.state import FAULT_KINDS, LASTING, LASTING_STD_M, EstimatorState
 from skyless.positioning.integrity import CONTRADICTED, HPL, OBSTRUCTED, SOUND, UNAVAILABLE, VPL
 
-CHI2: Final = 2
+FIRST_TEST: Final = 2
 """Where ``protect`` writes the tests of all kinds of faults, after ``HPL`` and ``VPL``."""
-LEVELS: Final = CHI2 + KINDS
+LEVELS: Final = FIRST_TEST + FAULT_KINDS
 
 
 @step
@@ -34,8 +34,8 @@ def protect(s: EstimatorState, levels: Vector) -> None:
     dim, count = settings["dim"], len(s.anchors)
     scale = covariance_scale(s)
     levels[HPL] = levels[VPL] = 0.0
-    for kind in range(KINDS):
-        levels[CHI2 + kind] = fault_chi2(s, kind, dim)
+    for kind in range(FAULT_KINDS):
+        levels[FIRST_TEST + kind] = fault_chi2(s, kind, dim)
         shift_x, shift_y, shift_z = 0.0, 0.0, 0.0
         xx, xy, yy, zz = scale * s.P[0, 0], scale * s.P[0, 1], scale * s.P[1, 1], 0.0
         for one in range(count):
@@ -54,7 +54,7 @@ def protect(s: EstimatorState, levels: Vector) -> None:
         if dim == 3:
             levels[VPL] = max(levels[VPL], abs(shift_z) + settings["vertical_k"] * np.sqrt(scale * s.P[2, 2] + zz))
     squared, up = 0.0, 0.0
-    for column in range(KINDS * count, KINDS * count + dim):
+    for column in range(FAULT_KINDS * count, FAULT_KINDS * count + dim):
         squared += s.V[column, 0] ** 2 + s.V[column, 1] ** 2
         if dim == 3:
             up += s.V[column, 2] ** 2
@@ -154,7 +154,7 @@ def integrity_state(s: EstimatorState, levels: Vector) -> int:
     was_contradicted = status["fault_std_m"][LASTING] > LASTING_STD_M  # then none are selected
     limit = SURE_CHI2 if was_contradicted else UNCOVERED_CHI2
     share = np.sqrt(s.P[0, 0] + s.P[1, 1]) / max(range_m, 1e-6)  # levels are of first order in it
-    if status["withholds_levels"] or levels[CHI2:].max() > limit:
+    if status["withholds_levels"] or levels[FIRST_TEST:].max() > limit:
         state = CONTRADICTED
     if was_contradicted and (status["epoch_ticks"] - status["start_ticks"]) * TICK_S < CONTRADICTED_START_S:
         state = CONTRADICTED

@@ -191,7 +191,7 @@ LINK_DTYPE: Final = np.dtype(
 
 LASTING, RECENT, CREEPING = range(3)
 """Kinds of faults: there since an anchor joined, begun within its last packets, or growing for seconds."""
-KINDS: Final = 3
+FAULT_KINDS: Final = 3
 
 STATUS_DTYPE: Final = np.dtype(
     [
@@ -240,7 +240,7 @@ STATUS_DTYPE: Final = np.dtype(
         ("plane_normal", np.float64, (3,)),  # ... and its normal
         ("open_range_errors", np.int64),  # whether anchors join with range errors beyond those of the settings
         ("range_errors", np.int64),  # NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS or ALL_RANGE_ERRORS
-        ("fault_std_m", np.float64, (KINDS,)),  # of each kind of faults, beforehand
+        ("fault_std_m", np.float64, (FAULT_KINDS,)),  # of each kind of faults, beforehand
     ],
     align=True,
 )
@@ -255,12 +255,12 @@ class EstimatorState(NamedTuple):
     P: Matrix
     """Shape (n, n), symmetric to the bit."""
     V: Matrix
-    """What faults do to x, shape (KINDS·anchors + dim, n): of each kind for each metre by which the tag's receptions of
-    an anchor are late, then for each m/s² of acceleration along an axis."""
+    """What faults do to x, shape (FAULT_KINDS·anchors + dim, n): of each kind for each metre by which the tag's receptions
+    of an anchor are late, then for each m/s² of acceleration along an axis."""
     information: Matrix
-    """Of all kinds of faults of all anchors in the innovations, shape (KINDS·anchors, KINDS·anchors)."""
+    """Of all kinds of faults of all anchors in the innovations, shape (FAULT_KINDS·anchors, FAULT_KINDS·anchors)."""
     evidence: Vector
-    """What innovations show of them, shape (KINDS·anchors,)."""
+    """What innovations show of them, shape (FAULT_KINDS·anchors,)."""
     anchors: Records
     """``ANCHOR_DTYPE``, shape (anchors,)."""
     packets: Records
@@ -495,10 +495,10 @@ def _selected(s: EstimatorState, kept: list[int]) -> EstimatorState:
         first = was.survey + dim * anchor
         states += [-1] * dim if anchor < 0 else range(first, first + dim)
     states += [-1] * (layout(dim, new).room - len(states))
-    faults = [kind * old + anchor if anchor >= 0 else -1 for kind in range(KINDS) for anchor in kept]
+    faults = [kind * old + anchor if anchor >= 0 else -1 for kind in range(FAULT_KINDS) for anchor in kept]
     n, of_states = len(states), np.array(states)
     of_anchors, of_faults = np.array(kept, np.int64), np.array(faults, np.int64)
-    inputs = np.append(of_faults, range(KINDS * old, KINDS * old + dim))
+    inputs = np.append(of_faults, range(FAULT_KINDS * old, FAULT_KINDS * old + dim))
     index_of = np.full_like(s.index_of, -1)
     result = s._replace(
         x=_select(s.x, of_states),
