@@ -255,8 +255,8 @@ class EstimatorState(NamedTuple):
     P: Matrix
     """Shape (n, n), symmetric to the bit."""
     V: Matrix
-    """What faults do to x, shape (FAULT_KINDS·anchors + dim, n): of each kind for each metre by which the tag's receptions
-    of an anchor are late, then for each m/s² of acceleration along an axis."""
+    """What faults do to x, shape (FAULT_KINDS·anchors + dim, n): of each kind for each metre by which receptions of an
+    anchor are late, then for each m/s² of acceleration along an axis."""
     information: Matrix
     """Of all kinds of faults of all anchors in the innovations, shape (FAULT_KINDS·anchors, FAULT_KINDS·anchors)."""
     evidence: Vector
