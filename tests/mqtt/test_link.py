@@ -221,6 +221,7 @@ def test_after_a_broker_s_death_it_reconnects_and_logs_what_was_dropped(make_bro
         tag = tag_link(broker.address)
         tag.on_state.append(states.append)
         async with running(broker, tag):
+            await until(lambda: tag.counters.published == 1)  # its status, acknowledged
             await broker.kill()
             await until(lambda: not tag.connected)
             for number in range(100):

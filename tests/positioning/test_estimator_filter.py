@@ -156,7 +156,7 @@ def test_prediction_is_its_closed_form(dim):
     np.testing.assert_allclose(s.P, F @ P @ F.T + Q, rtol=1e-12, atol=1e-12)
     V = V @ F.T
     for axis in range(dim):
-        V[2 * n + axis, [axis, place.velocity + axis]] -= dt**2 / 2, dt
+        V[FAULT_KINDS * n + axis, [axis, place.velocity + axis]] -= dt**2 / 2, dt
     np.testing.assert_allclose(s.V, V, rtol=1e-12, atol=1e-12)
     assert np.array_equal(s.P, s.P.T)
 
