@@ -17,11 +17,13 @@ from skyless.kernels.covariance import (
 from skyless.positioning.estimator.state import FAULT_KINDS, EstimatorState, layout, uncertain_states
 
 # Where range errors jump, those of all anchors change by OBSTRUCTED_STD_M within OBSTRUCTED_S. One that has jumped
-# itself wanders with the density OBSTRUCTED_WALK, m²/s, and returns to zero: else all would drift away together.
+# itself wanders with the density OBSTRUCTED_WALK, m²/s, and returns to zero within OBSTRUCTION_MEMORY_S, else all would
+# drift away together; one beyond OBSTRUCTION_RETURN_M returns no faster than that one, as it is no less likely to stay.
 OBSTRUCTED_STD_M: Final = 0.08
 OBSTRUCTED_S: Final = 5.0
 OBSTRUCTED_WALK: Final = 0.004
 OBSTRUCTION_MEMORY_S: Final = 10.0
+OBSTRUCTION_RETURN_M: Final = 0.2
 # Learnt multipath of this standard deviation makes errors that would be taken for jumps.
 MULTIPATH_STD_M: Final = 0.06
 # Part of the process noise of motion that is left for a stationary tag: 5 cm within half a minute.
@@ -105,9 +107,9 @@ def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float
     change, constant = where.change + anchor, where.constant + anchor
     obstructed = share * dt / OBSTRUCTED_S
     if s.anchors[anchor]["is_obstructed"]:
-        wandered = 0.5 * OBSTRUCTION_MEMORY_S * OBSTRUCTED_WALK * s.anchors[anchor]["change_scale"]
-        variance = max(wandered, s.x[change] ** 2)  # a large one is no less likely to stay
-        kept = np.exp(-dt / OBSTRUCTION_MEMORY_S)
+        memory_s = OBSTRUCTION_MEMORY_S * max(1.0, abs(s.x[change]) / OBSTRUCTION_RETURN_M)
+        variance = 0.5 * memory_s * OBSTRUCTED_WALK * s.anchors[anchor]["change_scale"]
+        kept = np.exp(-dt / memory_s)
     else:
         place_variance = max(s.anchors[anchor]["change_variance_m2"], status["place_variance_m2"])
         variance = place_variance + share * OBSTRUCTED_STD_M**2
