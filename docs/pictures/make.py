@@ -143,8 +143,8 @@ def room_study() -> Figure:
     bounded = [(point[3], height) for point, height in zip(points, heights, strict=True) if point[3] is not None]
     axes.plot(*zip(*bounded, strict=True), "|", color=INK, ms=13, mew=2.2, label="bound", ls="none")
     axes.set_yticks(heights, [point[0] for point in points])
-    axes.set(xlabel="cm (simulated)", xscale="log", xlim=(1.3, 30))
-    axes.set_xticks([2, 3, 5, 10, 20, 30], ["2", "3", "5", "10", "20", "30"])
+    axes.set(xlabel="cm (simulated)", xscale="log", xlim=(1.2, 150))
+    axes.set_xticks([2, 5, 10, 20, 50, 100], ["2", "5", "10", "20", "50", "100"])
     axes.minorticks_off()
     axes.grid(axis="x", color=GRID, lw=0.7)
     axes.tick_params(axis="y", length=0)
