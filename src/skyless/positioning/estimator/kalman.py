@@ -124,21 +124,19 @@ def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float
 @step
 def _decay(s: EstimatorState, state: int, kept: float, variance: float) -> None:
     """A state decays towards zero and keeps, in the long run, that variance."""
-    x, V = s.x, s.V
-    x[state] *= kept
+    s.x[state] *= kept
     decay_state(s.P, uncertain_states(s), state, kept, variance)
-    for fault in range(V.shape[0]):
-        V[fault, state] *= kept
+    for fault in range(len(s.fault_input)):
+        s.V[fault, state] *= kept
 
 
 @step
 def reset_state(s: EstimatorState, state: int, variance: float) -> None:
     """Forget a state: zero, uncorrelated, with that variance."""
-    x, V = s.x, s.V
-    x[state] = 0.0
+    s.x[state] = 0.0
     reset_covariance(s.P, uncertain_states(s), state, variance)
-    for fault in range(V.shape[0]):
-        V[fault, state] = 0.0
+    for fault in range(len(s.fault_input)):
+        s.V[fault, state] = 0.0
 
 
 @step
