@@ -131,6 +131,8 @@ def test_a_lost_broker_or_connection_is_not_green(hall):
     assert not page.locator("#panel-anchors section:has(.nodes)").is_visible()
     page.click("#panel-anchors button:text-is('3')")
     page.wait_for_selector("#panel-anchors .detail dd:has-text('health unknown')")
+    server.mute = server.refuse = False
+    until(page, "skyless.state.connection.phase === 'open'", timeout_s=15.0)
     visit.problems.clear()  # the browser's own lines about the refused sockets
 
 

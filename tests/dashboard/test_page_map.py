@@ -472,6 +472,8 @@ def test_the_map_is_saved_as_a_picture_with_its_legend(hall):
     heading = next(one for one in page.evaluate(words) if "simulated" in one)
     assert "last known state, connection lost" in heading
     assert f" {at[:2]}:" in heading
+    server.refuse = False
+    until(page, "skyless.state.connection.phase === 'open'", timeout_s=15.0)
     visit.problems.clear()  # the browser's own lines about the refused sockets
 
 
