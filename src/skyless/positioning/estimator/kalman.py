@@ -18,7 +18,7 @@ from skyless.positioning.estimator.state import FAULT_KINDS, EstimatorState, lay
 
 # Where range errors jump, those of all anchors change by OBSTRUCTED_STD_M within OBSTRUCTED_S. One that has jumped
 # itself wanders with the density OBSTRUCTED_WALK, m²/s, and returns to zero within OBSTRUCTION_MEMORY_S, else all would
-# drift away together; one beyond OBSTRUCTION_RETURN_M returns no faster than that one, as it is no less likely to stay.
+# drift away together; by OBSTRUCTION_RETURN_M in that time at most, as long delays are no less likely to stay.
 OBSTRUCTED_STD_M: Final = 0.08
 OBSTRUCTED_S: Final = 5.0
 OBSTRUCTED_WALK: Final = 0.004
