@@ -13,7 +13,7 @@ le40() { le32 $(($1 & 4294967295)); printf '%02x' $(($1 >> 32)); }
 sha256() { printf '%s' "$1" | bytes | openssl dgst -sha256 -binary | hex; }
 hmac() { printf '%s' "$2" | bytes | openssl dgst -sha256 -mac HMAC -macopt "hexkey:$1" -binary | hex; }
 
-site=42 serial=3 interval_ms=100 lag=3
+site=42 serial=3 interval_ms=100 lag=5
 section=2197265                          # it begins on 2027-01-15
 first=$(((section - 1) << 13 | 77))      # the chain began within the section before
 interval=$((section << 13 | 8189))       # the third but last of the section

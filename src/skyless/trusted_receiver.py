@@ -1,8 +1,9 @@
 """``TrustedReceiver``: a tag that verifies beacons with its site's public key. Like ``Receiver`` it does no I/O.
 
-It runs the same ``Receiver`` on frames that have been verified, which is 0.2 to 0.4 s behind. Where that is all that
-is wanted (trust ``verified``), its fixes are given. Else (``open``) a second one processes each frame at once; when a
-frame that it used turns out to be forged, it continues from the state of the first one.
+It runs the same ``Receiver`` on frames that have been verified, which is 0.4 to 0.6 s behind. Where that is all that
+is wanted (trust ``verified``), its fixes are given. Else (``open``) a second one processes each plausible frame at
+once, and its fixes are given. When a frame that it used turns out to be forged, it continues from the state of the
+first one, at once if these are few, else when they have become few; until then fixes are those of verified frames.
 """
 
 import copy
@@ -20,7 +21,7 @@ from skyless.air.frames import decode_any
 from skyless.air.reception import Reception
 from skyless.authentication.certificate import public_key
 from skyless.authentication.fault import Fault
-from skyless.authentication.verifier import LONGEST_WAIT_TICKS, Verifier
+from skyless.authentication.verifier import LONGEST_WAIT_TICKS, ReceivedFrame, Verifier
 from skyless.constants import TICK_S
 from skyless.positioning.fix import Fix
 from skyless.positioning.methods.observations import FixTime
@@ -31,19 +32,25 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 SHARE_TICKS: Final = from_seconds(1.0)
-"""Of the beacons received within this time a fix states the share that is not verified."""
+"""Shares are of the beacons received within this time."""
 
 MOST_IN_SHARE: Final = 4096
 """More frames than a radio receives in that time."""
+
+MOST_FORGED: Final = 0.1
+"""Plausible frames that turned out to be forged, for each genuine one of the same time: where there are more, fixes are
+those of verified frames. Fewer are what gates and consistency checks of the estimator are for."""
+
+_NOT_FORGED: Final = (Fault.NO_KEY, Fault.FIRST)
 
 
 class Trust(StrEnum):
     """Which fixes a tag gives."""
 
     OPEN = "open"
-    """Each at once; it states how far it is verified."""
+    """Each at once, unless frames are forged; it states how far it is verified."""
     VERIFIED = "verified"
-    """Only those of verified beacons, 0.2 to 0.4 s later."""
+    """Only those of verified beacons, 0.4 to 0.6 s later."""
 
 
 class SiteTrust(Struct, frozen=True):
@@ -90,12 +97,17 @@ class TrustedReceiver:
         )
         self._verified = new_receiver()
         self._live = new_receiver() if trust.trust is Trust.OPEN else None
+        """None after forged frames as well."""
+        self._forged_ticks: deque[int] = deque(maxlen=MOST_IN_SHARE)
+        """When plausible frames of the last seconds were received that turned out to be forged."""
         self._genuine_ticks: deque[int] = deque(maxlen=MOST_IN_SHARE)
         """When the verified frames of the last second were received."""
         self._verified_ticks: int | None = None
         """When the newest verified frame was received."""
-        self._used: deque[int] = deque()
-        """When the frames that wait and that the live receiver has used were received."""
+        self._used = 0
+        """Number of the frames that wait and that the live receiver has used."""
+        self._live_ticks: int | None = None
+        """When the last one of these was received."""
         self._given_ticks: int | None = None
         self._first_time: FixTime | None = None
         """From where times of fixes count."""
@@ -127,15 +139,11 @@ class TrustedReceiver:
         if not isinstance(beacon, Beacon2) or beacon.site != self.trust.site:
             self.counters["foreign-site"] += 1
             return []
-        given = []
-        rx_ticks = self.verifier.add(beacon, reception, unix_s)
-        if self._live is not None and rx_ticks is not None and not self.verifier.is_suspect(beacon.anchor):
-            self._used.append(rx_ticks)
-            fix = self._live.hear_beacon(beacon, reception)
-            if fix is not None:
-                self._first_time = self._first_time or copy.copy(self._live.state().time)
-                given.append((rx_ticks, GivenFix(self._with_trust(fix, rx_ticks), reception)))
-        return [one for ticks, one in self._verify() + given if self._is_next(ticks)]
+        frame = self.verifier.add(beacon, reception, unix_s)
+        given = self._verify()
+        if frame is not None:
+            given += self._use(frame)
+        return [one for ticks, one in given if self._is_next(ticks)]
 
     def _is_next(self, rx_ticks: int) -> bool:
         """Whether a fix is later than those that were given."""
@@ -144,17 +152,29 @@ class TrustedReceiver:
         self._given_ticks = rx_ticks
         return True
 
+    def _use(self, frame: ReceivedFrame) -> list[tuple[int, GivenFix]]:
+        """Let the live receiver process a frame that is plausible and that it has not processed yet; its fix."""
+        if self._live is None or not frame.is_plausible or frame.rx_ticks == self._live_ticks:
+            return []
+        self._used += 1
+        self._live_ticks = frame.rx_ticks
+        fix = self._live.hear_beacon(frame.beacon, frame.reception)
+        if fix is None:
+            return []
+        self._first_time = self._first_time or copy.copy(self._live.state().time)
+        return [(frame.rx_ticks, GivenFix(self._with_trust(fix, frame.rx_ticks), frame.reception))]
+
     def _verify(self) -> list[tuple[int, GivenFix]]:
-        """Process the frames that are decided; fixes of the genuine ones."""
-        given, was_deceived = [], False
-        for one, is_genuine in self.verifier.decided():
-            was_used = bool(self._used) and self._used[0] == one.rx_ticks
-            if was_used:
-                self._used.popleft()
-            if not is_genuine:
-                was_deceived |= was_used
+        """Process the frames that are decided; fixes of the genuine ones, and those of a live receiver that returns."""
+        given, is_other = [], False
+        for one, fault in self.verifier.decided():
+            if self._live is not None and one.is_plausible:
+                self._used -= 1
+            is_other |= one.is_plausible is not (fault is None)
+            if fault is not None:
+                if one.is_plausible and fault not in _NOT_FORGED:
+                    self._forged_ticks.append(one.rx_ticks)
                 continue
-            was_deceived |= not was_used
             if self._verified_ticks is None:
                 self._begin_verified()
             self._verified_ticks = one.rx_ticks
@@ -162,8 +182,11 @@ class TrustedReceiver:
             fix = self._verified.hear_beacon(one.beacon, one.reception)
             if fix is not None:
                 given.append((one.rx_ticks, GivenFix(self._with_trust(fix, one.rx_ticks), one.reception)))
-        if was_deceived and self._live is not None:
-            self._return_to_verified()
+        if self.trust.trust is Trust.OPEN:
+            if self._is_attacked():
+                self._leave_live()
+            elif self._live is None or is_other:
+                given += self._return_live()
         return given
 
     def _begin_verified(self) -> None:
@@ -174,27 +197,36 @@ class TrustedReceiver:
         state = replace(state, time=self._first_time, own_ticks=copy.copy(live.own_ticks))
         self._verified = Receiver.from_state(state)
 
-    def _return_to_verified(self) -> None:
-        """Let the live receiver continue from the verified one with the frames that wait and look right."""
-        assert self._live is not None
-        counters = self._live.counters
-        live = Receiver.from_state(copy.deepcopy(self._verified.state()))
-        self._used.clear()
-        for one in self.verifier.waiting():
-            if not self.verifier.is_suspect(one.beacon.anchor):
-                self._used.append(one.rx_ticks)
-                live.hear_beacon(one.beacon, one.reception)
-        live.counters.clear()
-        live.counters.update(counters)
-        self._live = live
+    def _is_attacked(self) -> bool:
+        """Whether many of the plausible frames of the last seconds have turned out to be forged."""
+        oldest_ticks = self.verifier.newest_ticks - SHARE_TICKS
+        return _since(oldest_ticks, self._forged_ticks) > MOST_FORGED * _since(oldest_ticks, self._genuine_ticks)
+
+    def _leave_live(self) -> None:
+        """Give fixes of verified frames only: the live receiver has used forged ones, or would have."""
+        if self._live is not None:
+            self._begin_verified()
+            self._verified.counters |= self._live.counters  # what is reported must not go back
+        self._live, self._used = None, 0
+
+    def _return_live(self) -> list[tuple[int, GivenFix]]:
+        """Let the live receiver continue from the verified one with the plausible frames that wait; its fixes."""
+        self._live = Receiver.from_state(copy.deepcopy(self._verified.state()))
+        self._used, self._live_ticks = 0, None
+        return [given for one in self.verifier.waiting() for given in self._use(one)]
 
     def _with_trust(self, fix: Fix, rx_ticks: int) -> Fix:
         """The fix with how far it is verified."""
-        genuine, until_ticks = self._genuine_ticks, self._verified_ticks
+        until_ticks = self._verified_ticks
         if until_ticks is None:
             return fix
-        while genuine and genuine[0] < rx_ticks - SHARE_TICKS:
-            genuine.popleft()
-        unverified = len(self._used) if rx_ticks > until_ticks else 0
-        share = unverified / max(unverified + len(genuine), 1)
+        unverified = self._used if rx_ticks > until_ticks else 0
+        share = unverified / max(unverified + _since(rx_ticks - SHARE_TICKS, self._genuine_ticks), 1)
         return replace(fix, verified_until_s=fix.time_s - max(rx_ticks - until_ticks, 0) * TICK_S, unverified=share)
+
+
+def _since(oldest_ticks: int, ticks: deque[int]) -> int:
+    """Number of receptions since a time; earlier ones are forgotten."""
+    while ticks and ticks[0] < oldest_ticks:
+        ticks.popleft()
+    return len(ticks)

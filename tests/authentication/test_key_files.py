@@ -79,7 +79,7 @@ def test_what_is_written_is_read(folder):
 @given(
     serial=st.integers(1, 0xFFFF),
     interval_ms=st.integers(10, 10_000),
-    lag=st.integers(2, 255),
+    lag=st.integers(4, 255),
     first=st.integers(0, (1 << 40) - 1),
     signatures=st.lists(st.binary(min_size=64, max_size=64), min_size=1, max_size=5),
 )
@@ -91,6 +91,13 @@ def test_any_chain_is_read_as_it_was_written(tmp_path_factory, serial, interval_
     if (first >> SECTION_BITS) + len(signatures) <= 1 << 32:
         assert read_chain_public(folder, serial, SITE) == chain
     chain_public_file(folder, serial).unlink()
+
+
+def test_keys_of_0_2_are_refused_with_what_to_do(tmp_path):
+    chain = replace(CHAINS[0], timing=ChainTiming(100, 3))
+    chain_public_file(tmp_path, chain.serial).write_bytes(chain_public_bytes(chain))
+    with pytest.raises(SkylessError, match=r"lag.*3.*should be 4 or more: make new keys \(skyless site keys new\)"):
+        read_chain_public(tmp_path, chain.serial, SITE)
 
 
 @given(st.builds(SitePublic, st.integers(0, 0xFFFF), st.binary(min_size=32, max_size=32), st.integers(0, 0xFFFF)))

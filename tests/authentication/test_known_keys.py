@@ -70,7 +70,7 @@ def test_certificates_of_other_sites_and_owners_are_forged():
 def test_keys_are_accepted_in_any_order_and_give_those_between(offsets):
     made, newest = known(), -1
     for offset in offsets:
-        use = made.on_key(KEYS.key(FIRST + offset), FIRST + offset, at_s(FIRST + offset))
+        use = made.on_key(KEYS.key(FIRST + offset), FIRST + offset, at_s(FIRST + offset), 1)
         assert use is (KeyUse.NEW if offset > newest else KeyUse.KNOWN)
         newest = max(newest, offset)
     assert made.newest == FIRST + newest
@@ -82,15 +82,15 @@ def test_keys_are_accepted_in_any_order_and_give_those_between(offsets):
 @given(st.integers(-3, 300), st.binary(min_size=16, max_size=16))
 def test_a_forged_key_changes_nothing(offset, key):
     made = known()
-    made.on_key(KEYS.key(FIRST + 10), FIRST + 10, at_s(FIRST))
-    assert made.on_key(key, FIRST + offset, at_s(FIRST)) in {KeyUse.FORGED, KeyUse.KNOWN}
+    made.on_key(KEYS.key(FIRST + 10), FIRST + 10, at_s(FIRST), 1)
+    assert made.on_key(key, FIRST + offset, at_s(FIRST), 1) in {KeyUse.FORGED, KeyUse.KNOWN}
     assert made.newest == FIRST + 10
     assert made.mac_key(FIRST + 10) == KEYS.mac_key(FIRST + 10)
 
 
 def test_a_key_of_another_interval_is_forged():
     made = known()
-    assert made.on_key(KEYS.key(FIRST + 11), FIRST + 10, at_s(FIRST)) is KeyUse.FORGED
+    assert made.on_key(KEYS.key(FIRST + 11), FIRST + 10, at_s(FIRST), 1) is KeyUse.FORGED
 
 
 def test_forged_keys_far_ahead_cost_a_bounded_number_of_steps(monkeypatch):
@@ -104,10 +104,18 @@ def test_forged_keys_far_ahead_cost_a_bounded_number_of_steps(monkeypatch):
     monkeypatch.setattr(known_keys, "earlier_key", counted)
     made, interval = known(), FIRST + SECTION_INTERVALS - 1
     for number in range(1000):  # within a second
-        made.on_key(secrets.token_bytes(16), interval, at_s(FIRST) + 1e-3 * number)
+        made.on_key(secrets.token_bytes(16), interval, at_s(FIRST) + 1e-3 * number, 1)
     assert steps <= known_keys.MOST_STEPS + known_keys.STEPS_PER_S
     steps = 0
-    assert made.on_key(KEYS.key(FIRST + 3), FIRST + 3, at_s(FIRST) + 1.0) is KeyUse.NEW  # the expected ones are free
+    assert made.on_key(KEYS.key(FIRST + 3), FIRST + 3, at_s(FIRST) + 1.0, 1) is KeyUse.NEW  # the expected ones are free
+
+
+def test_many_forged_keys_do_not_keep_a_right_one_waiting_that_two_anchors_sent():
+    made, interval = known(), FIRST + 4000
+    for number in range(1000):
+        assert made.on_key(secrets.token_bytes(16), interval, at_s(interval), number) is not KeyUse.NEW
+    assert made.on_key(KEYS.key(interval), interval, at_s(interval), 1) is KeyUse.KNOWN
+    assert made.on_key(KEYS.key(interval), interval, at_s(interval), 2) is KeyUse.NEW
 
 
 def test_forged_certificates_cost_a_bounded_number_of_checks():
@@ -124,14 +132,14 @@ def test_the_next_section_and_the_next_chain_go_on():
     made, last = known(), FIRST + SECTION_INTERVALS - 1
     assert made.on_certificate(KEYS.certificate(last + 1), at_s(last)) is CertificateUse.NEW
     for interval in (last, last + 1, last + 5):
-        assert made.on_key(KEYS.key(interval), interval, at_s(last)) is KeyUse.NEW
+        assert made.on_key(KEYS.key(interval), interval, at_s(last), 1) is KeyUse.NEW
         assert made.mac_key(interval) == KEYS.mac_key(interval)
     second = ChainKeys(chain(serial=2, first=last + 100, sections=2))
     assert made.on_certificate(second.certificate(last + 100), at_s(last)) is CertificateUse.NEW
     assert made.serial == 1  # it does not count yet
-    assert made.on_key(KEYS.key(last + 99), last + 99, at_s(last)) is KeyUse.NEW
-    assert made.on_key(KEYS.key(last + 100), last + 100, at_s(last)) is KeyUse.FORGED
-    assert made.on_key(second.key(last + 101), last + 101, at_s(last)) is KeyUse.NEW
+    assert made.on_key(KEYS.key(last + 99), last + 99, at_s(last), 1) is KeyUse.NEW
+    assert made.on_key(KEYS.key(last + 100), last + 100, at_s(last), 1) is KeyUse.FORGED
+    assert made.on_key(second.key(last + 101), last + 101, at_s(last), 1) is KeyUse.NEW
     assert made.mac_key(last + 100) == second.mac_key(last + 100)
     assert made.mac_key(last + 99) == KEYS.mac_key(last + 99)
     assert made.serial == 2
@@ -146,7 +154,7 @@ def test_old_certificates_make_way():
         assert made.on_certificate(long.certificate(interval), at_s(interval)) is CertificateUse.NEW
         assert len(made.certificates) <= known_keys.MOST_CERTIFICATES
         assert read_certificate(SITE, made.certificates[-1])[0].name.section == SECTION + section
-        assert made.on_key(long.key(interval), interval, at_s(interval)) is KeyUse.NEW
+        assert made.on_key(long.key(interval), interval, at_s(interval), 1) is KeyUse.NEW
 
 
 @pytest.mark.parametrize(

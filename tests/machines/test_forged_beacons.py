@@ -23,7 +23,7 @@ from skyless.evaluation.adversary import FORGERIES, Adversary, any_forgery
 from skyless.evaluation.attacked_air import Attack, AttackedAir, Received, delayed
 from skyless.evaluation.scenarios import Request
 from skyless.evaluation.trusted_air import START_UNIX_S, made_keys
-from skyless.evaluation.trusted_fixes import compare, errors_m, run_tag
+from skyless.evaluation.trusted_fixes import compare, errors_m, key_of, run_tag
 from skyless.site.model import ScheduleSite
 from skyless.ticks import from_seconds, wrap
 from skyless.trusted_receiver import SiteTrust, Trust
@@ -40,6 +40,8 @@ OPEN = replace(VERIFIED, trust=Trust.OPEN)
 ATTACK_FROM_S = 0.7
 SWITCHED_ON_S = 0.8
 SECONDS = 1.8
+OPEN_SECONDS = 2.4
+"""Fixes of a tag with trust open may come 0.6 s late in an attack."""
 REPEATED = ("repeated-at-once", "repeated-soon")
 """The only forgeries of which a tag may accept some: genuine frames that it lost, a little later."""
 
@@ -64,11 +66,11 @@ RIGHT_REASONS = {
 
 
 @lru_cache(maxsize=64)
-def air_of(mode, forgery=None, rate_hz=477.0, is_noise=False):
+def air_of(mode, forgery=None, rate_hz=477.0, is_noise=False, until_s=SECONDS):
     """What the tag receives, and the anchors, after an attack."""
     attack = None if forgery is None else Attack(forgery, rate_hz, ATTACK_FROM_S, is_noise)
     air = AttackedAir(Request(SITES[mode]), KEYS, attack)
-    return tuple(air.run(SECONDS)), air
+    return tuple(air.run(until_s)), air
 
 
 def genuine_of(tape):
@@ -112,15 +114,33 @@ def test_a_tag_that_is_switched_on_in_an_attack(mode, name):
 
 
 @pytest.mark.parametrize("mode", SITES)
-@pytest.mark.parametrize("rate_hz", [95.0, 952.0])
+@pytest.mark.parametrize("rate_hz", [20.0, 477.0])
 def test_an_open_tag_is_soon_back(mode, rate_hz):
-    """Up to a key, which comes at most 0.4 s later, forged frames may count; then the anchors named are not used."""
-    tape, _ = air_of(mode, FORGERIES["false-measurement"], rate_hz)
-    noise, _ = air_of(mode, FORGERIES["false-measurement"], rate_hz, is_noise=True)
+    """Up to a key, which comes at most 0.6 s later, forged frames count; then few do, or verified ones only."""
+    tape, _ = air_of(mode, FORGERIES["false-measurement"], rate_hz, False, OPEN_SECONDS)
+    noise, _ = air_of(mode, FORGERIES["false-measurement"], rate_hz, True, OPEN_SECONDS)
     found, expected = errors_m(run_tag(tape, OPEN), tape), errors_m(run_tag(noise, OPEN), noise)
-    after = found[found[:, 0] > ATTACK_FROM_S + 0.6]
+    after = found[found[:, 0] > ATTACK_FROM_S + 0.8]
     assert len(after) > 50
     assert after[:, 1].max() < expected[expected[:, 0] > 0.4][:, 1].max() + 0.2
+
+
+@pytest.mark.parametrize("mode", SITES)
+@pytest.mark.parametrize(
+    ("name", "rate_hz"), [("false-measurement", 20.0), ("no-code", 20.0), ("false-measurement", 477.0)]
+)
+def test_forged_frames_cost_an_open_tag_hardly_more_fixes_than_noise(mode, name, rate_hz):
+    """A fix may come later than with noise, so those of the last moments are left out: their keys are still to come."""
+    fixes = []
+    for attack in ((None, 0.0, False), (FORGERIES[name], rate_hz, True), (FORGERIES[name], rate_hz, False)):
+        tape, _ = air_of(mode, *attack, OPEN_SECONDS)
+        received_s = {key_of(one.reception): one.reception.host_s for one in tape}
+        given_s = [received_s[one.key] for one in run_tag(tape, OPEN).given]
+        assert given_s == sorted(set(given_s))
+        fixes.append(sum(ATTACK_FROM_S < each_s < OPEN_SECONDS - 0.6 for each_s in given_s))
+    clean, noise, forged = fixes
+    assert clean > 100
+    assert clean - forged <= 1.5 * (clean - noise) + 1
 
 
 @lru_cache(maxsize=1)
@@ -182,7 +202,7 @@ def test_any_mix_gives_the_fixes_of_the_genuine_frames(seed, losses, additions):
 
 
 @settings(max_examples=10, deadline=None)
-@given(later_s=st.floats(0.41, 5.0), every=st.integers(1, 7))
+@given(later_s=st.floats(0.61, 5.0), every=st.integers(1, 7))
 def test_frames_that_come_when_their_key_is_known_are_refused(later_s, every):
     tape = genuine_tape()
     chosen = {one.reception.frame for one in tape[::every]}

@@ -26,8 +26,6 @@ CERTIFICATE_EVERY: Final = (8, 16, 32)
 fourth certificate is that of what comes next."""
 _SUCCESSOR_EVERY: Final = 4
 
-_WRONG: Final = (Fault.BAD_CODE, Fault.LATE, Fault.EARLY)
-
 FAR_S: Final = 10.0
 """Codes of intervals farther from the present are not checked: anybody can state any, and their keys take long."""
 
@@ -76,11 +74,11 @@ class _Offset(Struct):
         self.present_s = min(self.present_s, offset_s)
         self.frames += 1
 
-    def is_far(self, timing: ChainTiming, most_s: float) -> bool:
-        """Whether the clocks differ by more than this, whatever the instants at which that anchor sends."""
+    def is_far(self, timing: ChainTiming) -> bool:
+        """Whether the clocks are too far apart, whatever the instants at which that anchor sends."""
         least_s = min(self.present_s, self.before_s)
         latest_s = min(SPACINGS / self.frames_before, timing.interval_s) if self.frames_before else timing.interval_s
-        return least_s < -most_s or least_s > most_s + latest_s
+        return least_s < -timing.anchors_apart_s or least_s > timing.anchors_apart_s + latest_s
 
 
 class BeaconAuthentication:
@@ -96,8 +94,6 @@ class BeaconAuthentication:
         self._now: tuple[int, float] | None = None
         self._offsets: dict[int, _Offset] = {}
         self._no_keys_s, self._no_keys_until_s = no_keys_s, 0.0
-        self._refused_s: dict[int, float] = {}
-        """When the last beacon in the name of each other anchor came whose time or code was wrong."""
 
     def set_chains(self, chains: Iterable[Chain]) -> None:
         """Use these chains from now on: a successor, or one instead of a revoked one."""
@@ -107,7 +103,7 @@ class BeaconAuthentication:
         """The own counter (40 bits) and the host's clock at the same moment; needed every few seconds."""
         timing = self._ring.timing
         step_s = math.inf if self._now is None else abs(unix_s - self._unix_s(now_ticks))
-        if timing is not None and step_s > timing.most_clock_error_s:
+        if timing is not None and step_s > timing.anchors_apart_s:
             self._no_keys_until_s = unix_s + self._no_keys_s
         self._now = (now_ticks, unix_s)
 
@@ -160,8 +156,6 @@ class BeaconAuthentication:
         fault = self._fault_of(beacon, reception.frame, unix_s, timing)
         if fault is not None:
             self.faults[beacon.anchor] = (fault, unix_s)
-        if fault in _WRONG:
-            self._refused_s[beacon.anchor] = unix_s
         return fault
 
     def _fault_of(self, beacon: Beacon2, frame: bytes, unix_s: float, timing: ChainTiming) -> Fault | None:
@@ -180,9 +174,9 @@ class BeaconAuthentication:
         if not is_mac(signed, stated.mac, keys.mac_key(interval)):
             return self._code_fault(signed, stated.mac, interval)
         self._note_offset(beacon.anchor, unix_s, offset_s)
-        if offset_s >= timing.interval_s * timing.lag:
+        if offset_s + timing.anchors_apart_s + timing.anchor_lead_s >= timing.interval_s * timing.lag:
             return Fault.LATE
-        return Fault.EARLY if offset_s < -timing.most_clock_error_s else None
+        return Fault.EARLY if offset_s < -timing.anchors_apart_s else None
 
     def _code_fault(self, signed: bytes, mac: bytes, interval: int) -> Fault:
         revoked: tuple[ChainKeys, ...] = self._ring.revoked(interval)
@@ -198,21 +192,18 @@ class BeaconAuthentication:
     def _clocks(self, timing: ChainTiming, unix_s: float) -> tuple[int, int]:
         """How many of the other anchors' clocks are far from the own one, and how many near."""
         recent = [one for one in self._offsets.values() if abs(unix_s - one.since_s) <= RECENT_S]
-        far = sum(one.is_far(timing, 0.5 * timing.most_clock_error_s) for one in recent)
+        far = sum(one.is_far(timing) for one in recent)
         return far, len(recent) - far
 
     def _may_disclose(self, timing: ChainTiming) -> bool:
-        """Whether nothing speaks against the own clock: a key that is disclosed too early lets anybody make codes.
+        """Whether other anchors confirm the own clock: a key that is disclosed too early lets anybody make codes.
 
         Without keys of this anchor nobody lacks any, as others disclose the same ones.
         """
         assert self._now is not None
         unix_s = self._now[1]
-        if unix_s < self._no_keys_until_s:
-            return False
         far, near = self._clocks(timing, unix_s)
-        refused = sum(abs(unix_s - when_s) <= RECENT_S for when_s in self._refused_s.values())
-        return far <= near and (near > 0 or refused < LEAST_OTHERS)
+        return unix_s >= self._no_keys_until_s and near > 0 and near >= far
 
     def _has_certificate(self, sequence: int, anchor: int) -> bool:
         return (sequence - anchor) % self._certificate_every == 0

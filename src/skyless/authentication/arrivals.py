@@ -50,6 +50,17 @@ class Arrivals:
     def __init__(self) -> None:
         self._references: dict[int, _Reference] = {}
 
+    def is_plausible(self, one: Stamps) -> bool:
+        """Whether a frame that is not verified yet arrived when a frame of its anchor with this stamp would.
+
+        So is any before the first genuine frame of all.
+        """
+        last = self._references.get(one.anchor)
+        if last is None:
+            return not self._references
+        elapsed = one.rx_ticks - last.rx_ticks
+        return abs(difference(wrap(last.tx_ticks + elapsed), one.tx_ticks)) <= SLACK_TICKS + MAX_DRIFT * abs(elapsed)
+
     def of(self, frames: Sequence[Stamps]) -> list[Arrival]:
         """How genuine frames came that are known together, in the order of their reception.
 

@@ -11,6 +11,9 @@ from skyless.authentication.key_chain import SECTION_BITS, SectionName
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
+LEAST_LAG: Final = 4
+"""With shorter lags nothing is left for the clocks of tags."""
+
 CERTIFICATE_SIGNATURE_BYTES: Final = 64
 PUBLIC_KEY_BYTES: Final = 32
 
@@ -21,12 +24,17 @@ assert _STATEMENT.size + CERTIFICATE_SIGNATURE_BYTES == CERTIFICATE_BYTES
 
 
 class ChainTiming(Struct, frozen=True, gc=False):
-    """When keys hold and are disclosed."""
+    """When keys hold and are disclosed, and the budget of clock errors that follows from it.
+
+    A frame is sent up to the end of its interval, T, by a clock that may be behind by ``anchors_apart_s``. A tag must
+    have received it before any anchor discloses its key, whose clock may be ahead by ``anchor_lead_s``, and knows the
+    time to ± B. So every genuine frame is accepted, and no other, where lag · T >= T + apart + lead + 2 B.
+    """
 
     interval_ms: int = 100
     """Length of an interval, 10 to 10000."""
-    lag: int = 3
-    """A key is disclosed this number of intervals after its own, 2 to 255."""
+    lag: int = 5
+    """A key is disclosed this number of intervals after its own, 4 to 255."""
 
     @property
     def interval_s(self) -> float:
@@ -34,12 +42,22 @@ class ChainTiming(Struct, frozen=True, gc=False):
         return self.interval_ms * 1e-3
 
     @property
-    def most_clock_error_s(self) -> float:
-        """How far a tag's clock may be off without a frame being refused: half of what lies between interval and key.
+    def anchors_apart_s(self) -> float:
+        """How far two anchors' clocks may be apart. Beyond it the one that is ahead is reported and left out."""
+        return 0.5 * self.interval_s
 
-        A frame is sent up to the end of its interval, by a clock that may be late by as much as the tag's is early.
+    @property
+    def anchor_lead_s(self) -> float:
+        """How far an anchor may be ahead of others and still disclose keys.
+
+        It finds that out beyond ``anchors_apart_s``, and knows to an interval only when the others sent their frames.
         """
-        return 0.5 * (self.lag - 1) * self.interval_s
+        return self.anchors_apart_s + self.interval_s
+
+    @property
+    def most_clock_error_s(self) -> float:
+        """How far a tag's clock may be off without a genuine frame being refused: B of the budget."""
+        return 0.5 * ((self.lag - 1) * self.interval_s - self.anchor_lead_s - self.anchors_apart_s)
 
     def interval_at(self, unix_s: float) -> int:
         """Number of the interval at a Unix time."""
@@ -51,11 +69,11 @@ class ChainTiming(Struct, frozen=True, gc=False):
 
     def is_possible(self) -> bool:
         """Whether a chain may have this timing."""
-        return 10 <= self.interval_ms <= 10_000 and 2 <= self.lag <= 255
+        return 10 <= self.interval_ms <= 10_000 and LEAST_LAG <= self.lag <= 255
 
 
 USUAL_TIMING: Final = ChainTiming()
-"""A key is known 0.3 to 0.4 s after a frame, and clocks may be off by 0.1 s."""
+"""A key is known 0.4 to 0.6 s after a frame. Clocks of tags may be off by 0.1 s, those of anchors by 25 ms."""
 
 
 class Certificate(Struct, frozen=True, gc=False):

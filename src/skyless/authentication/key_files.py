@@ -22,6 +22,7 @@ from msgspec.structs import replace
 
 from skyless.authentication.certificate import (
     CERTIFICATE_SIGNATURE_BYTES,
+    LEAST_LAG,
     PUBLIC_KEY_BYTES,
     Certificate,
     ChainTiming,
@@ -200,6 +201,11 @@ def read_chain_public(folder: Path, serial: int, site: int) -> Chain:
             f"{file} is chain {found_serial} of site {found_site}; it should be chain {serial} of site {site}"
         )
     sections = rest // CERTIFICATE_SIGNATURE_BYTES
+    if interval_ms and lag < LEAST_LAG:
+        right = (
+            f"{LEAST_LAG} or more: make new keys (skyless site keys new); those of version 0.2 leave no room for clocks"
+        )
+        raise ConfigurationError(file, "lag", lag, right)
     if not timing.is_possible() or first >= 1 << 40 or (first >> SECTION_BITS) + sections > 1 << 32:
         raise ConfigurationError(file, "", None, "a key chain; its timing is impossible")
     return Chain(site, serial, timing, first, body[_HEADER.size :], b"")

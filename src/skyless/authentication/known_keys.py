@@ -18,10 +18,13 @@ KEPT_KEYS: Final = 256
 MOST_CERTIFICATES: Final = 6
 
 NEAR_STEPS: Final = 16
-"""Keys that follow within this number of intervals on a verified one are hashed at once, others as far as the allowance
-for long ones goes: whoever sends forged keys must not keep the processor busy."""
-STEPS_PER_S: Final = 100_000.0
+"""Keys that follow within this number of intervals on a verified one are hashed at once, others as far as an allowance
+for long ones goes: whoever sends forged keys must not keep the processor busy. Keys that two anchors sent have an
+allowance of their own, so that many different forged ones do not keep the right one waiting."""
+STEPS_PER_S: Final = 50_000.0
 MOST_STEPS: Final = 40_000.0
+MOST_SENDERS: Final = 4096
+"""Far keys whose first sender is remembered."""
 
 CHECKS_PER_S: Final = 100.0
 MOST_CHECKS: Final = 100.0
@@ -77,7 +80,11 @@ class KnownKeys:
         self._mac_keys: dict[int, bytes] = {}
         """By interval, of the chain that counts there."""
         self._present = 0
-        self._steps, self._checks, self._refilled_s = MOST_STEPS, MOST_CHECKS, 0.0
+        self._steps = {False: MOST_STEPS, True: MOST_STEPS}
+        """Allowances, by whether two anchors sent a key."""
+        self._checks, self._refilled_s = MOST_CHECKS, 0.0
+        self._senders: dict[bytes, int] = {}
+        """By far key, the anchor that sent it first."""
 
     @property
     def certificates(self) -> tuple[bytes, ...]:
@@ -111,8 +118,11 @@ class KnownKeys:
         self._add(certificate, sent)
         return CertificateUse.NEW
 
-    def on_key(self, key: bytes, interval: int, now_s: float, *, is_expected: bool = True) -> KeyUse:
-        """Process the key of an interval, as somebody disclosed it at a time, which may not be the expected one."""
+    def on_key(self, key: bytes, interval: int, now_s: float, anchor: int, *, is_expected: bool = True) -> KeyUse:
+        """Process the key of an interval, as somebody disclosed it in an anchor's name at a time.
+
+        ``is_expected``: whether it is disclosed at about that time.
+        """
         if (interval, key) == self._newest_key:
             return KeyUse.KNOWN
         section = self._section_of(interval)
@@ -124,9 +134,12 @@ class KnownKeys:
             return KeyUse.FORGED if known is not None and not compare_digest(known, key) else KeyUse.KNOWN
         if steps > NEAR_STEPS or not is_expected:
             self._refill(now_s)
-            if self._steps < SECTION_INTERVALS:
+            if len(self._senders) >= MOST_SENDERS:
+                self._senders.clear()
+            by_two = self._senders.setdefault(key, anchor) != anchor
+            if self._steps[by_two] < SECTION_INTERVALS:
                 return KeyUse.KNOWN
-            self._steps -= SECTION_INTERVALS  # whatever it takes, so that short ones do not displace long ones
+            self._steps[by_two] -= SECTION_INTERVALS  # whatever it takes, so that short ones do not displace long ones
         name = section.certificate.name
         between = {interval: key}
         oldest = max(section.newest + 1, interval - KEPT_KEYS + 1)
@@ -190,5 +203,6 @@ class KnownKeys:
         """Renew the allowances by the time that has passed."""
         elapsed_s = min(max(now_s - self._refilled_s, 0.0), 1.0)
         self._refilled_s = now_s
-        self._steps = min(self._steps + elapsed_s * STEPS_PER_S, MOST_STEPS)
+        for by_two, steps in self._steps.items():
+            self._steps[by_two] = min(steps + elapsed_s * STEPS_PER_S, MOST_STEPS)
         self._checks = min(self._checks + elapsed_s * CHECKS_PER_S, MOST_CHECKS)

@@ -1,5 +1,6 @@
-"""What a listener knows of the site's time: between which bounds it lies, and whether its own clock is right."""
+"""What a listener knows of the site's time: how late it may be, and whether its own clock is right."""
 
+import math
 from collections import deque
 from typing import Final
 
@@ -12,6 +13,9 @@ from skyless.constants import TICK_S
 DRIFT: Final = 50e-6
 """How much the own counter's rate may be off."""
 
+KEY_WAIT_INTERVALS: Final = 2
+"""The newest key is known to have been disclosed within this number of intervals, by the quickest of those before."""
+
 RECENT_KEYS: Final = 10
 """Of this number of keys the one that came soonest after its disclosure shows how far the host's clock is off."""
 
@@ -20,21 +24,20 @@ RESTART_S: Final = 1.0
 
 
 class SiteClock(Struct):
-    """Bounds of the site's time in Unix seconds.
+    """Bounds of the site's time, which is that of the anchor whose clock is furthest ahead, in Unix seconds.
 
-    They come from the host's clock and its stated bound. Once a key has been verified they are carried on by the own
-    counter, and the host's clock narrows them. One that is set back does no harm. One that is ahead of the upper bound
-    counts, as a bound that is too early would let forged frames pass.
+    Only keys prove a lower bound, which the own counter carries on. The upper bound comes from the host's clock and
+    its stated bound. A host's clock that is set or dragged back lowers it no farther than to shortly after the lower
+    bound. One that is ahead raises it for as long as it is ahead: then frames are refused as late, and nothing of that
+    remains afterwards.
     """
 
     bound_s: float
-    """How far the host's clock may be from the clocks of anchors."""
-    lower_s: float = 0.0
-    upper_s: float = 0.0
+    """How far the host's clock may be off."""
+    lower_s: float = -math.inf
+    """Lower bound; none before the first key, and after a restart of the counter."""
     rx_ticks: int | None = None
-    """Own counter, unwrapped, to which they refer."""
-    is_verified: bool = False
-    """Whether a key has been verified since the counter started."""
+    """Own counter, unwrapped, to which the lower bound refers."""
     is_late: bool = False
     """Whether a verified key showed that the site's time is beyond the upper bound: nothing can be verified then."""
     host_s: float = 0.0
@@ -47,23 +50,21 @@ class SiteClock(Struct):
     def advance(self, rx_ticks: int, unix_s: float) -> None:
         """A frame was received: own counter, unwrapped, and the host's clock."""
         self.host_s = unix_s
-        low, high = unix_s - self.bound_s, unix_s + self.bound_s
-        before = self.rx_ticks
-        elapsed_s = 0.0 if before is None else (rx_ticks - before) * TICK_S
-        if before is None or not self.is_verified or elapsed_s < -RESTART_S:
-            self.lower_s, self.upper_s, self.is_verified = low, high, False
-        elif elapsed_s >= 0.0:
-            self.lower_s += elapsed_s * (1.0 - DRIFT)
-            self.upper_s += elapsed_s * (1.0 + DRIFT)
-            if (
-                low > self.upper_s
-            ):  # the counter, or the host's monotonic clock, stood still, or the host's clock is wrong
-                self.lower_s, self.upper_s, self.is_verified = low, high, False
-            elif high >= self.lower_s:
-                self.lower_s, self.upper_s = max(self.lower_s, low), min(self.upper_s, high)
-        else:
+        elapsed_s = 0.0 if self.rx_ticks is None else (rx_ticks - self.rx_ticks) * TICK_S
+        if elapsed_s < -RESTART_S:
+            self.lower_s = -math.inf
+        elif elapsed_s < 0.0:
             return  # out of order
+        self.lower_s += elapsed_s * (1.0 - DRIFT)
         self.rx_ticks = rx_ticks
+
+    def upper_s(self, timing: ChainTiming) -> float:
+        """Upper bound of the site's time."""
+        return max(self.upper_at(self.host_s, timing), self.lower_s + KEY_WAIT_INTERVALS * timing.interval_s)
+
+    def upper_at(self, unix_s: float, timing: ChainTiming) -> float:
+        """Upper bound that follows from the host's clock alone, when it showed this."""
+        return unix_s + self.bound_s + timing.anchor_lead_s
 
     def on_key(self, interval: int, timing: ChainTiming) -> None:
         """A key was verified for the first time: the site's time is at least that of its disclosure."""
@@ -71,11 +72,9 @@ class SiteClock(Struct):
         self.offsets_s.append(self.host_s - disclosed_s)
         if len(self.offsets_s) > RECENT_KEYS:
             self.offsets_s.popleft()
-        if disclosed_s > self.upper_s:
-            self.is_late, self.is_verified = True, False
-            return
-        self.is_late, self.is_verified = False, True
-        self.lower_s = max(self.lower_s, disclosed_s)
+        self.is_late = disclosed_s > self.upper_s(timing)
+        if not self.is_late:
+            self.lower_s = max(self.lower_s, disclosed_s)
 
     def on_section(self, section: int, timing: ChainTiming) -> None:
         """A certificate was received that anchors send during this section or the one before it."""
@@ -84,9 +83,14 @@ class SiteClock(Struct):
         self.section_offset_s = 0.0 if -length_s - self.bound_s <= offset_s <= length_s + self.bound_s else offset_s
 
     @property
+    def is_verified(self) -> bool:
+        """Whether a key has been verified since the counter started."""
+        return self.lower_s > -math.inf
+
+    @property
     def present_s(self) -> float:
-        """The middle of the bounds."""
-        return 0.5 * (self.lower_s + self.upper_s)
+        """The host's clock, but no earlier than the lower bound."""
+        return max(self.host_s, self.lower_s)
 
     @property
     def error_s(self) -> float | None:

@@ -41,6 +41,8 @@ CODES_KEPT: Final = 2048
 MOST_FAULTY_ANCHORS: Final = 64
 """Anchors with faults that are remembered: forged frames can name any."""
 
+_ARRIVAL_FAULTS: Final = {Arrival.IN_TIME: None, Arrival.FIRST: Fault.FIRST, Arrival.LATE: Fault.LATE}
+
 
 class ReceivedFrame(Struct, frozen=True, gc=False):
     """A frame with a code, which waits for its key or is decided."""
@@ -50,10 +52,12 @@ class ReceivedFrame(Struct, frozen=True, gc=False):
     reception: Reception
     rx_ticks: int
     """Own counter, unwrapped."""
-    upper_s: float
-    """Upper bound of the site's time when it was received."""
+    unix_s: float
+    """The host's clock when it was received."""
     interval: int | None
     """Number of the interval; None where no certificate was known yet: the frame's time is still to be checked."""
+    is_plausible: bool
+    """Whether its stamps continue those of genuine frames of its anchor, or no frame is known to be genuine yet."""
 
 
 class _AnchorFault(Struct, frozen=True, gc=False):
@@ -106,21 +110,10 @@ class Verifier:
         oldest = self.newest_ticks - FAULT_TICKS
         return {anchor: one.fault for anchor, one in self._faults.items() if one.rx_ticks > oldest}
 
-    def is_suspect(self, anchor: int) -> bool:
-        """Whether frames of an anchor are to be verified before they are used.
-
-        That is so when some in its name were not accepted within the last seconds, and, once there are genuine frames,
-        while there are none of it.
-        """
-        if self._anchors and anchor not in self._anchors:
-            return True
-        known = self._faults.get(anchor)
-        return known is not None and self.newest_ticks - known.rx_ticks < FAULT_TICKS
-
-    def add(self, beacon: Beacon2, reception: Reception, unix_s: float) -> int | None:
+    def add(self, beacon: Beacon2, reception: Reception, unix_s: float) -> ReceivedFrame | None:
         """Process a beacon of the site, received at this time of the host's clock.
 
-        Returns the own counter, unwrapped, if the frame now waits for its key, None if it was refused.
+        Returns the frame if it now waits for its key, None if it was refused.
         """
         rx_ticks = self._own_ticks.unwrap(reception.rx_ticks, reception.host_s)
         self.newest_ticks = rx_ticks
@@ -134,11 +127,13 @@ class Verifier:
             return None
         timing, interval = self.keys.timing, None
         if timing is not None:
-            present = timing.interval_at(clock.upper_s)
+            present = timing.interval_at(clock.upper_s(timing))
             interval = nearest(stated.interval, present, INTERVAL_BITS)
             fault = _time_fault(interval, present, timing.lag)
             if isinstance(beacon.page, KeyPage):
-                self._on_key(beacon.page.key, interval - timing.lag, timing, is_early=fault is Fault.EARLY)
+                self._on_key(
+                    beacon.page.key, interval - timing.lag, beacon.anchor, timing, is_early=fault is Fault.EARLY
+                )
             if fault is None and interval <= self.keys.newest:
                 fault = Fault.LATE
             if fault is not None:
@@ -147,12 +142,17 @@ class Verifier:
         if len(self._waiting) >= MOST_UNDECIDED:
             self._counters[Fault.TOO_MANY] += 1
             return None
-        self._waiting.append(ReceivedFrame(beacon, stated, reception, rx_ticks, clock.upper_s, interval))
-        return rx_ticks
+        is_plausible = self._arrivals.is_plausible(Stamps(beacon.anchor, rx_ticks, beacon.tx_ticks))
+        frame = ReceivedFrame(beacon, stated, reception, rx_ticks, unix_s, interval, is_plausible)
+        self._waiting.append(frame)
+        return frame
 
-    def decided(self) -> list[tuple[ReceivedFrame, bool]]:
-        """Frames of which it is known by now whether they are genuine; in the order of reception, each once."""
-        decided: list[tuple[ReceivedFrame, bool]] = []
+    def decided(self) -> list[tuple[ReceivedFrame, Fault | None]]:
+        """Frames of which it is known by now whether they are genuine; in the order of reception, each once.
+
+        None with a genuine one, else why it is not accepted. ``NO_KEY`` and ``FIRST`` do not mean that it was forged.
+        """
+        decided: list[tuple[ReceivedFrame, Fault | None]] = []
         waiting = self._waiting
         oldest = self.newest_ticks - LONGEST_WAIT_TICKS
         if not self._has_new_key and (not waiting or waiting[0].rx_ticks > oldest):
@@ -165,32 +165,36 @@ class Verifier:
             if fault is Fault.NO_KEY and one.rx_ticks > oldest and not self._is_key_lost(one):
                 break
             waiting.popleft()
-            decided.append((one, fault is None))
+            decided.append((one, fault))
             if fault is Fault.NO_KEY:
                 self._counters[fault] += 1
             elif fault is not None:
                 self._refuse(one.beacon.anchor, fault, one.rx_ticks)
         return self._without_delayed(decided)
 
-    def _without_delayed(self, decided: list[tuple[ReceivedFrame, bool]]) -> list[tuple[ReceivedFrame, bool]]:
+    def _without_delayed(
+        self, decided: list[tuple[ReceivedFrame, Fault | None]]
+    ) -> list[tuple[ReceivedFrame, Fault | None]]:
         """The same, where genuine frames that came late by the counters are not accepted either."""
-        genuine = [one for one, is_genuine in decided if is_genuine]
+        genuine = [one for one, fault in decided if fault is None]
         arrivals = self._arrivals.of([Stamps(one.beacon.anchor, one.rx_ticks, one.beacon.tx_ticks) for one in genuine])
         if all(arrival is Arrival.IN_TIME for arrival in arrivals):
             return decided
+        faults = []
         for one, arrival in zip(genuine, arrivals, strict=True):
+            faults.append(_ARRIVAL_FAULTS[arrival])
             if arrival is Arrival.LATE:
                 self._refuse(one.beacon.anchor, Fault.LATE, one.rx_ticks)
             elif arrival is Arrival.FIRST:
                 self._counters[Fault.FIRST] += 1
-        answers = iter(arrivals)
-        return [(one, is_genuine and next(answers) is Arrival.IN_TIME) for one, is_genuine in decided]
+        answers = iter(faults)
+        return [(one, next(answers) if fault is None else fault) for one, fault in decided]
 
     def _fault(self, one: ReceivedFrame, timing: ChainTiming) -> Fault | None:
         """What is wrong with a frame; ``NO_KEY`` while the key of its interval is not known."""
         interval = one.interval
         if interval is None:
-            present = timing.interval_at(one.upper_s)
+            present = timing.interval_at(self.clock.upper_at(one.unix_s, timing))
             interval = nearest(one.authentication.interval, present, INTERVAL_BITS)
             fault = _time_fault(interval, present, timing.lag)
             if fault is not None:
@@ -224,9 +228,9 @@ class Verifier:
         elif use is not CertificateUse.IGNORED and timing is not None:
             self.clock.on_section(section_of(sent), timing)
 
-    def _on_key(self, key: bytes, interval: int, timing: ChainTiming, *, is_early: bool) -> None:
+    def _on_key(self, key: bytes, interval: int, anchor: int, timing: ChainTiming, *, is_early: bool) -> None:
         newest = self.keys.newest
-        use = self.keys.on_key(key, interval, self.clock.present_s, is_expected=not is_early)
+        use = self.keys.on_key(key, interval, self.clock.present_s, anchor, is_expected=not is_early)
         if use is KeyUse.NEW:
             self._has_new_key = True
             if interval > newest:

@@ -11,6 +11,10 @@ from skyless.mqtt.messages import AnchorHealth, EtherHealth, TagHealth, WatchMes
 
 LATE_S: Final = 0.25
 VERY_LATE_S: Final = 1.0
+
+KEYS_S: Final = 0.6
+"""A tag with the site's public key may wait this long for keys before it gives a fix."""
+
 """Age of positions on arrival."""
 
 MISSED_SHARE: Final = 0.1
@@ -86,7 +90,7 @@ def broker_reason() -> Reason:
 
 def late_reason(evidence: Evidence, ages: Mapping[str, tuple[float, float]]) -> Reason | None:
     """Positions arrive late; ``ages`` as of ``FixAges.least_ages_s``."""
-    late = sorted(name for name, (age_s, _) in ages.items() if age_s > LATE_S)
+    late = sorted(name for name, (age_s, _) in ages.items() if age_s > LATE_S + _key_wait_s(evidence, name))
     if not late:
         return None
     worst = max(late, key=lambda name: ages[name][0])
@@ -105,6 +109,12 @@ def late_reason(evidence: Evidence, ages: Mapping[str, tuple[float, float]]) -> 
             )
     text = f"{whose} are {age_s:.1f} s behind: {why}"
     return Reason("late", "bad" if age_s > VERY_LATE_S else "warning", text, advice, names_of("tag", late))
+
+
+def _key_wait_s(evidence: Evidence, tag: str) -> float:
+    node = evidence.nodes.get(("tag", tag))
+    health = None if node is None else node.health
+    return KEYS_S if isinstance(health, TagHealth) and health.trust is not None else 0.0
 
 
 def slow_reason(evidence: Evidence, now_s: float, lag_s: float) -> Reason | None:
