@@ -12,7 +12,7 @@ from skyless.mqtt.messages import AnchorHealth, EtherHealth, TagHealth, WatchMes
 LATE_S: Final = 0.25
 VERY_LATE_S: Final = 1.0
 
-KEYS_S: Final = 0.6
+KEY_WAIT_S: Final = 0.6
 """A tag with the site's public key may wait this long for keys before it gives a fix."""
 
 """Age of positions on arrival."""
@@ -114,7 +114,7 @@ def late_reason(evidence: Evidence, ages: Mapping[str, tuple[float, float]]) -> 
 def _key_wait_s(evidence: Evidence, tag: str) -> float:
     node = evidence.nodes.get(("tag", tag))
     health = None if node is None else node.health
-    return KEYS_S if isinstance(health, TagHealth) and health.trust is not None else 0.0
+    return KEY_WAIT_S if isinstance(health, TagHealth) and health.trust is not None else 0.0
 
 
 def slow_reason(evidence: Evidence, now_s: float, lag_s: float) -> Reason | None:
