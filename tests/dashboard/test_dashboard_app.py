@@ -21,6 +21,7 @@ from skyless.dashboard.live import (
 )
 from skyless.dashboard.overlays import Overlays
 from skyless.dashboard.playback import Playback
+from skyless.dashboard.sites import LiveSites
 from skyless.mqtt import topics
 from skyless.site.earth import geodetic
 from skyless.site.model import GeoreferenceSite
@@ -44,7 +45,7 @@ def page(tmp_path):
 
 def client(live, page, rules=None, base_url=HERE):
     return TestClient(
-        make_app(Services(live, Overlays(), Playback(None)), rules or AccessRules(), page), base_url=base_url
+        make_app(Services(LiveSites(live), Overlays(), Playback(None)), rules or AccessRules(), page), base_url=base_url
     )
 
 

@@ -21,6 +21,7 @@ from skyless.dashboard.guard import AccessRules
 from skyless.dashboard.live import IDLE_S, MAX_PAGES_PER_ADDRESS
 from skyless.dashboard.overlays import Overlays
 from skyless.dashboard.playback import Playback
+from skyless.dashboard.sites import LiveSites
 from skyless.mqtt import topics
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import ZonesMessage
@@ -210,7 +211,7 @@ def test_without_a_broker_the_page_opens_and_shows_it():
 
 def test_idle_connections_shut_nobody_out_and_a_page_too_many_gets_the_reason(live, times):
     async def check():
-        services = Services(live, Overlays(), Playback(None))
+        services = Services(LiveSites(live), Overlays(), Playback(None))
         with socket.socket() as sock:
             sock.bind(("127.0.0.1", 0))
             config = uvicorn.Config(make_app(services, AccessRules()), ws="websockets-sansio", log_config=None)

@@ -13,6 +13,7 @@ from skyless.dashboard.guard import AccessRules
 from skyless.dashboard.live import LiveSite
 from skyless.dashboard.overlays import Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
+from skyless.dashboard.sites import LiveSites
 from skyless.mqtt import topics
 from skyless.mqtt.messages import WatchFinding, WatchMessage, ZonesMessage
 from skyless.recordings.mcap.recorder import McapFile, McapRecorder
@@ -150,7 +151,7 @@ def test_a_recording_replaced_by_another_is_read_again(folder):
 def test_the_server_gives_recordings(folder):
     live = LiveSite("here", "mqtt://broker:1")
     live.attach(Wire(), SITE_ID)
-    app = make_app(Services(live, Overlays(), Playback(folder)), AccessRules())
+    app = make_app(Services(LiveSites(live), Overlays(), Playback(folder)), AccessRules())
     browser = TestClient(app, base_url="http://localhost")
     (listed,) = browser.get("/api/recordings").json()
     assert listed.keys() == {"name", "bytes", "start_unix_s", "duration_s", "complete", "site", "tags", "fixes"}
@@ -171,7 +172,9 @@ def test_the_server_gives_recordings(folder):
 
 def test_a_recording_is_downloaded_with_its_name_as_far_as_it_is_written(folder):
     record(folder / "old hall (1).mcap", seconds=1.0)
-    app = make_app(Services(LiveSite("here", "mqtt://broker:1"), Overlays(), Playback(folder)), AccessRules())
+    app = make_app(
+        Services(LiveSites(LiveSite("here", "mqtt://broker:1")), Overlays(), Playback(folder)), AccessRules()
+    )
     browser = TestClient(app, base_url="http://localhost")
     answer = browser.get("/api/recordings/old%20hall%20(1).mcap/file")
     assert answer.content == (folder / "old hall (1).mcap").read_bytes()
@@ -186,7 +189,7 @@ def test_a_recording_is_downloaded_with_its_name_as_far_as_it_is_written(folder)
 
 def test_a_download_needs_the_token_as_everything_does(folder):
     rules = AccessRules("correct-horse-battery", remote=True)
-    app = make_app(Services(LiveSite("here", "mqtt://broker:1"), Overlays(), Playback(folder)), rules)
+    app = make_app(Services(LiveSites(LiveSite("here", "mqtt://broker:1")), Overlays(), Playback(folder)), rules)
     stranger = TestClient(app, base_url="http://192.168.1.5:8080")
     assert stranger.get("/api/recordings/first.mcap/file").status_code == 401
     elsewhere = {"origin": "http://evil.example", "authorization": "Bearer correct-horse-battery"}

@@ -17,6 +17,7 @@ from skyless.dashboard.guard import AccessRules
 from skyless.dashboard.overlays import NoOverlayError, Overlays, overlay_task
 from skyless.dashboard.playback import Playback
 from skyless.dashboard.site_survey import SiteSurvey
+from skyless.dashboard.sites import LiveSites
 from skyless.mqtt import topics
 from skyless.mqtt.messages import SurveyFactsMessage, SurveyMessage, WatchFinding, WatchMessage
 from skyless.mqtt.survey_facts import BadFactsError
@@ -50,7 +51,7 @@ def live(live):
 
 @pytest.fixture
 def browser(live, tmp_path):
-    app = make_app(Services(live, Overlays(), Playback(None)), AccessRules(), tmp_path)
+    app = make_app(Services(LiveSites(live), Overlays(), Playback(None)), AccessRules(), tmp_path)
     return TestClient(app, base_url=HERE)
 
 

@@ -149,6 +149,35 @@ def test_a_second_broker_of_the_same_user_gets_a_folder_of_its_own(tmp_path, mon
     asyncio.run(check())
 
 
+def test_temporary_data_last_while_the_broker_is_started_again_and_end_with_it(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+
+    async def check():
+        broker = await start_broker(BrokerSettings(temporary=True))
+        (broker.data / "kept").touch()
+        await broker.stop(to_restart=True)
+        async with await start_broker(BrokerSettings(data=broker.data)) as again:
+            assert (again.data / "kept").exists()
+        assert list(tmp_path.iterdir()) == []
+
+    asyncio.run(check())
+
+
+def test_data_of_a_broker_that_was_killed_with_its_owner_are_deleted_by_the_next(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    abandoned = tmp_path / "skyless-broker-dead"
+    (abandoned / "jetstream").mkdir(parents=True)
+    os.utime(abandoned, (0.0, 0.0))
+
+    async def check():
+        async with await start_broker(BrokerSettings(temporary=True)) as running:
+            os.utime(running.data, (0.0, 0.0))
+            async with await start_broker(BrokerSettings(temporary=True)) as other:
+                assert {*tmp_path.iterdir()} == {running.data, other.data}
+
+    asyncio.run(check())
+
+
 def test_a_home_that_cannot_be_written_costs_nothing(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("in the way", encoding="utf-8")
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "file"))

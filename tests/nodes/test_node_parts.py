@@ -18,9 +18,11 @@ from skyless.air.beacon2 import Beacon2, SlotTime
 from skyless.air.codec import decode
 from skyless.air.codec2 import encode_2
 from skyless.errors import SkylessError
+from skyless.mqtt.address import MqttAddress
 from skyless.nodes.fix_log import Latencies, PhaseLog
 from skyless.nodes.process import Usage, data_folder, every, new_recording, recordings_folder, resident_bytes, together
-from skyless.nodes.record import _own_name
+from skyless.nodes.record import RecorderNode, _client_key, _own_name
+from skyless.recordings.mcap.recorder import McapFile
 
 # Latencies and phases
 
@@ -263,3 +265,27 @@ time.sleep(60)
         assert process.stdout.readline() == "running\n"
         process.kill()
         assert process.stdout.read() == "cleaned up\n"  # the pipe ends with the last process that holds it
+
+
+def test_recorders_of_one_user_have_one_random_key_which_only_the_user_reads(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "mine"))
+    key = _client_key()
+    file = tmp_path / "mine" / "skyless" / "recorder_key"
+    assert (len(key), file.stat().st_mode & 0o777, [*file.parent.iterdir()]) == (32, 0o600, [file])
+    assert _client_key() == key
+    file.write_text("", encoding="ascii")  # the disk was full
+    other = _client_key()
+    assert other == _client_key() != key
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "other user"))
+    assert _client_key() not in {key, other}
+
+
+def test_a_stranger_cannot_know_the_name_under_which_a_recorder_s_session_is_kept(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    file = McapFile(tmp_path / "walk.mcap")
+    recorder = RecorderNode(file, MqttAddress("127.0.0.1", 1), 7, print)
+    client = recorder.link._introduction().client
+    recorder._lock.close()
+    file.close()
+    assert client.endswith(f"-{_client_key()}")
+    assert recorder.link._introduction().persistent

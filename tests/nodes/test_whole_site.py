@@ -4,6 +4,7 @@ import asyncio
 
 import pytest
 
+from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.topics import preparation_topic
 from skyless.nodes import demo
@@ -65,3 +66,19 @@ def test_a_compilation_that_is_cut_off_is_no_longer_shown(link, tmp_path, monkey
     assert [(of, retain) for of, _, retain in link.sent] == [(topic, True), (topic, True)]
     assert link.sent[0][1].done == 37
     assert link.sent[1][1] == b""
+
+
+def test_the_demo_s_own_broker_keeps_nothing_after_its_end(link, tmp_path, monkeypatch):
+    settings = []
+
+    async def start(asked):
+        settings.append(asked)
+        raise SkylessError("enough is known")
+
+    monkeypatch.setattr(demo, "start_broker", start)
+    asked = SiteRun(
+        lab_site(), "lab", 1, 1.0, None, 1, "joint", IntegrityRequirement(), None, None, 1.0, False, tmp_path
+    )
+    with pytest.raises(SkylessError, match="enough"):
+        asyncio.run(WholeSite(asked, print).run())
+    assert [asked.temporary for asked in settings] == [True]

@@ -47,7 +47,7 @@ def dashboard(
     site
         Site file, or lab; by default the one that the broker has retained, which comes before this.
     site_id
-        Number of the site; by default the first that the broker has.
+        Number of the site; by default one whose programs are online, and the page lets choose among several.
     listen
         Where programs connect, here browsers, HOST:PORT; by default 127.0.0.1:8080, or the next free port.
     recordings
@@ -58,6 +58,7 @@ def dashboard(
         Write one JSON object with the page's address instead of a table.
     """
     import asyncio
+    from functools import partial
 
     from skyless.dashboard.app import Services
     from skyless.dashboard.live import LiveSite
@@ -65,6 +66,7 @@ def dashboard(
     from skyless.dashboard.playback import Playback
     from skyless.dashboard.processors import ProcessorUse
     from skyless.dashboard.serve import bind, serve
+    from skyless.dashboard.sites import LiveSites
 
     address = broker.address()
     if address is None:
@@ -79,7 +81,8 @@ def dashboard(
     sock = bind(listening)
     port = sock.getsockname()[1]
     rules = _rules(sock.getsockname()[0], listening.host, port, token)
-    live = LiveSite(_client_name(port), str(address), known, used_share=ProcessorUse().share)
+    make = partial(LiveSite, _client_name(port), str(address), used_share=ProcessorUse().share)
+    live = make(known)
     live.floor_plan = image
     page = _address(listening.host, port, rules)
     if json:
@@ -87,7 +90,7 @@ def dashboard(
         sys.stdout.flush()
     else:
         print(f"page    {page}\nbroker  {address}", flush=True)
-    services = Services(live, Overlays(), Playback(recordings))
+    services = Services(LiveSites(live, make), Overlays(), Playback(recordings))
     with contextlib.suppress(KeyboardInterrupt):
         asyncio.run(serve(services, rules, sock, address, known.site.id if known is not None else site_id))
 

@@ -24,6 +24,7 @@ from skyless.dashboard.live import LiveSite, NoBrokerError, NoSiteError, TooMany
 from skyless.dashboard.overlays import KINDS, NoOverlayError, Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
 from skyless.dashboard.site_survey import NoResultError
+from skyless.dashboard.sites import LiveSites
 from skyless.errors import SkylessError
 from skyless.mqtt.survey_facts import BadFactsError
 from skyless.site.image import image_size
@@ -54,7 +55,7 @@ _STATUSES: Final[dict[type[Exception], int]] = {
 class Services(Struct, frozen=True):
     """What the server serves."""
 
-    live: LiveSite
+    sites: LiveSites
     overlays: Overlays
     playback: Playback
 
@@ -125,16 +126,21 @@ def _services(request: Request | WebSocket) -> Services:
     return services
 
 
+def _live_of(request: Request) -> LiveSite:
+    """The site that ``?site=NUMBER`` names. Raises NoSiteError."""
+    return _services(request).sites.of(request.query_params.get("site"))
+
+
 async def _fixes(request: Request) -> Response:
     try:
-        features = _services(request).live.features()
+        features = _live_of(request).features()
     except SkylessError as error:
         raise HTTPException(409, str(error)) from None
     return Response(features, media_type=MEDIA_TYPE, headers={"Cache-Control": "no-store"})
 
 
 async def _floor_plan(request: Request) -> Response:
-    return _image(_services(request).live.floor_plan)
+    return _image(_live_of(request).floor_plan)
 
 
 def _image(image: bytes | None) -> Response:
@@ -152,7 +158,7 @@ def _image_type(image: bytes) -> str | None:
 
 
 async def _overlay(request: Request) -> Response:
-    overlays, live = _services(request).overlays, _services(request).live
+    overlays, live = _services(request).overlays, _live_of(request)
     kind = request.query_params.get("kind", "pdop")
     if kind not in KINDS:
         raise HTTPException(400, f"kind is {kind!r}; it should be one of {', '.join(KINDS)}")
@@ -177,19 +183,19 @@ async def _put_floor_plan(request: Request) -> Response:
     image = await _body(request, MAX_FLOOR_PLAN_BYTES, f"the image is larger than {MAX_FLOOR_PLAN_BYTES // 10**6} MB")
     if _image_type(image) is None or image_size(image) is None:
         raise HTTPException(400, "this is no image that can be read; it should be a PNG or JPEG")
-    _services(request).live.store_floor_plan(image)
+    _live_of(request).store_floor_plan(image)
     return _json({"bytes": len(image)})
 
 
 async def _put_facts(request: Request) -> Response:
-    live = _services(request).live
+    live = _live_of(request)
     message = live.survey.facts_message(await _body(request, _MAX_BODY_BYTES, "too many facts"))
     live.publish_survey(message)
     return _json(message)
 
 
 async def _save_survey(request: Request) -> Response:
-    live = _services(request).live
+    live = _live_of(request)
     message = live.survey.save_message(await _body(request, _MAX_BODY_BYTES, "the request is too long"))
     live.publish_survey(message)
     return _json(message)
@@ -207,7 +213,7 @@ async def _body(request: Request, most_bytes: int, fault: str) -> bytes:
 
 async def _put_zones(request: Request) -> Response:
     body = await _body(request, _MAX_BODY_BYTES, "too many zones")
-    live = _services(request).live
+    live = _live_of(request)
     message = read_zones(body)
     live.store_zones(message.zones, message.site)
     return _json({"zones": live.monitor.zones})
@@ -250,7 +256,11 @@ async def _recorded_states(request: Request) -> Response:
 
 
 async def _live(socket: WebSocket) -> None:
-    live = _services(socket).live
+    sites = _services(socket).sites
+    try:
+        live = sites.of(socket.query_params.get("site"))
+    except NoSiteError:  # a page that was open before the server's start, of a site that is gone
+        live = sites.of(None)
     await socket.accept()  # a browser does not show a page why its socket was refused, only why it was closed
     try:
         page = live.open_page(socket.client.host if socket.client is not None else "")

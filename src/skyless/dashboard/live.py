@@ -25,7 +25,6 @@ from skyless.dashboard.evidence import Evidence
 from skyless.dashboard.geojson import OLDEST_S, features
 from skyless.dashboard.site_survey import SiteSurvey, topic_of
 from skyless.dashboard.state import SiteState, encode
-from skyless.dashboard.wire import WrongMessageError, read_message
 from skyless.dashboard.zone_events import MAX_EVENTS, EventQueue, publisher_rank
 from skyless.errors import ConfigurationError
 from skyless.mqtt import topics
@@ -40,9 +39,11 @@ from skyless.mqtt.messages import (
     SurveySaveMessage,
     TagHealth,
     TruthMessage,
+    WrongMessageError,
     Zone,
     ZoneEvent,
     ZonesMessage,
+    read_message,
 )
 from skyless.site.check import check_site
 from skyless.zones.monitor import ZoneMonitor
@@ -198,6 +199,7 @@ class LiveSite:
         self._lag_s = 0.0
         self._used_share = used_share
         self._preparation_s = 0.0
+        self._sites: bytes | None = None
 
     # MQTT
 
@@ -229,6 +231,13 @@ class LiveSite:
             self._evaluate(self._clock())
             self.survey.expect_kept()
             self._broadcast("mqtt", self._connection())
+
+    def set_sites(self, sites: list[tuple[int, str, bool]]) -> None:
+        """Update which sites the broker carries: number, name, and whether programs of it are online."""
+        message = encode("sites", {"shown": self._site_id, "sites": sites})
+        if message != self._sites:
+            self._sites = message
+            self._broadcast("sites", message)
 
     def _counting(self, kind: str, handler: Callable[[str, bytes], None]) -> Callable[[str, bytes], None]:
         def handle(topic: str, payload: bytes) -> None:
@@ -452,6 +461,8 @@ class LiveSite:
             page.replace("preparation", self._preparation_message())
         if self.floor_plan is not None:
             page.replace("floor_plan", self._floor_plan_message())
+        if self._sites is not None:
+            page.replace("sites", self._sites)
         for kind, message in self.survey.messages().items():
             page.replace(kind, message)
         self.pages.add(page)

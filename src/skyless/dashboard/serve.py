@@ -1,4 +1,4 @@
-"""Running the dashboard: its socket, its link to the broker, and its shutdown."""
+"""Running the dashboard: its socket, its work, and its shutdown."""
 
 import asyncio
 import contextlib
@@ -15,8 +15,6 @@ from skyless.dashboard.app import PAGE_TIMEOUT_S, Services, make_app
 from skyless.dashboard.guard import AccessRules
 from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.link import Link
-from skyless.nodes.find_site import find_site
 from skyless.nodes.ports import claim
 from skyless.nodes.process import ending_signals
 
@@ -104,18 +102,17 @@ async def serve(
         timeout_graceful_shutdown=1,
     )
     server = _Server(config)
-    work = [asyncio.create_task(_run_link(services, address, site_id)), asyncio.create_task(services.live.run())]
+    work = asyncio.create_task(services.sites.run(address, site_id))
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, *ending_signals()):
         loop.add_signal_handler(number, _stop, server, services)
     serving = asyncio.create_task(server.serve(sockets=[sock]))
     try:
-        await asyncio.wait([serving, *work], return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait([serving, work], return_when=asyncio.FIRST_COMPLETED)
     finally:
         _stop(server, services)
-        for task in work:
-            task.cancel()
-        ended = await asyncio.gather(serving, *work, return_exceptions=True)
+        work.cancel()
+        ended = await asyncio.gather(serving, work, return_exceptions=True)
     for result in ended:
         if isinstance(result, Exception):
             raise result
@@ -125,7 +122,8 @@ def _stop(server: "_Server", services: Services) -> None:
     """Shut down soon, whatever pages do."""
     if not server.should_exit:
         server.should_exit = True
-        services.live.close()
+        for live in services.sites.all:
+            live.close()
         services.playback.stop()
         services.overlays.stop()
         asyncio.get_running_loop().call_later(_GRACE_S, server.drop_connections)
@@ -145,14 +143,3 @@ class _Server(uvicorn.Server):
             transport = getattr(connection, "transport", None)
             if transport is not None:
                 transport.abort()
-
-
-async def _run_link(services: Services, address: MqttAddress, site_id: int | None) -> None:
-    """Connect to the broker and stay connected."""
-    live = services.live
-    if site_id is None:
-        site_id = await find_site(address, live.on_connection)
-    link = Link(address, live.name, site=site_id, kind="dashboard")
-    link.on_state.append(live.on_connection)
-    live.attach(link, site_id)
-    await link.run()

@@ -10,8 +10,7 @@ import msgspec
 from msgspec.structs import replace
 
 from skyless.dashboard.state import encode
-from skyless.dashboard.wire import read_message
-from skyless.mqtt.messages import SurveyFactsMessage, SurveyMessage, SurveySaveMessage, WatchMessage
+from skyless.mqtt.messages import SurveyFactsMessage, SurveyMessage, SurveySaveMessage, WatchMessage, read_message
 from skyless.mqtt.survey_facts import BadFactsError, check_facts
 from skyless.mqtt.topics import survey_facts_topic, survey_save_topic, survey_topic, watch_topic
 

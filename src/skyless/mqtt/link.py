@@ -64,12 +64,14 @@ class Link:
         site: int | str,
         kind: str,
         persistent: bool = False,
+        client_key: str = "",
         keepalive_s: int = 10,
         limits: Limits | None = None,
     ) -> None:
         """``persistent`` lets the broker keep messages of QoS 1 for this name while it is away, until it is stopped.
 
-        Two persistent links of one name would end each other's connection.
+        Two persistent links of one name would end each other's connection, and so would a stranger who knows it:
+        ``client_key``, which nobody else knows, is part of the client identifier then.
 
         Raises:
             SkylessError: the address names a file of certificates that cannot be used.
@@ -82,7 +84,8 @@ class Link:
         """Called with ``connected`` whenever it changes."""
         self._tls = address.tls_context()
         self._keepalive_s = keepalive_s
-        self._client = f"skyless-{site}-{kind}-{name}" + ("" if persistent else f"-{secrets.token_hex(4)}")
+        key = client_key if persistent else secrets.token_hex(4)
+        self._client = f"skyless-{site}-{kind}-{name}" + (f"-{key}" if key else "")
         self._persistent = persistent
         self._status_topic = status_topic(site, kind, name)
         self._offline = StatusMessage(online=False, kind=kind, name=str(name))

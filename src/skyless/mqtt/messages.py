@@ -4,14 +4,16 @@ SI units. ``unix_s`` is seconds since 1970 by the sender's clock. Fields may be 
 those that they do not know.
 """
 
-from typing import Literal
+from typing import Literal, TypeVar
 
+import msgspec
 from msgspec import Struct
 
 from skyless.site.model import FloorPlanSite, Site
 from skyless.survey.facts import Facts
 from skyless.survey.result import Survey
 
+_T = TypeVar("_T")
 Vector = tuple[float, float, float]
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
 """3 × 3, row by row."""
@@ -471,3 +473,15 @@ class WatchMessage(Struct, frozen=True):
     findings: tuple[WatchFinding, ...]
     pairs: int
     """Pairs of anchors that are watched."""
+
+
+class WrongMessageError(ValueError):
+    """A message that does not fit its topic."""
+
+
+def read_message(payload: bytes, kind: type[_T]) -> _T:
+    """A message from JSON. Raises WrongMessageError."""
+    try:
+        return msgspec.json.decode(payload, type=kind)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise WrongMessageError(str(error)) from None

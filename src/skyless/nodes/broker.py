@@ -10,6 +10,7 @@ import socket
 import ssl
 import sysconfig
 import tempfile
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -38,6 +39,9 @@ _MOST_STORED: Final = 4 * 1024**3
 _SEND_AGAIN: Final = "3s"
 """When a message that a dying subscriber has not acknowledged is sent again; 30 s by default."""
 
+_ABANDONED_S: Final = 10.0
+"""A temporary folder of this age that no broker has locked was left by one that was killed."""
+
 _START_S: Final = 20.0
 _POLL_S: Final = 0.02
 
@@ -59,6 +63,8 @@ class BrokerSettings(Struct, frozen=True):
     """The passwords of the roles, each of which may do what ``ACCESS`` says, instead of one user for everything."""
     strangers_read: bool = False
     """Whether clients without user and password have the stranger's role; otherwise they are refused."""
+    temporary: bool = False
+    """Whether its data end with it: they are in a temporary folder."""
 
     def check(self) -> None:
         """Check the options for access.
@@ -144,11 +150,22 @@ def _locked_folder(settings: BrokerSettings) -> tuple[Path, IO[str]]:
             raise SkylessError(f"--data is {str(settings.data)!r}, which another broker uses") from None
         except OSError as error:
             raise SkylessError(f"--data is {str(settings.data)!r}, which cannot be used: {error.strerror}") from None
-    with contextlib.suppress(OSError):
-        usual = data_folder() / "broker"
-        return usual, _lock(usual)
+    if not settings.temporary:
+        with contextlib.suppress(OSError):
+            usual = data_folder() / "broker"
+            return usual, _lock(usual)
+    _remove_abandoned()
     temporary = Path(tempfile.mkdtemp(prefix=_TEMPORARY))
     return temporary, _lock(temporary)
+
+
+def _remove_abandoned() -> None:
+    """Delete the temporary folders of brokers that were killed together with the programs that had started them."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{_TEMPORARY}*"):
+        with contextlib.suppress(OSError):
+            if time.time() - folder.stat().st_mtime > _ABANDONED_S:  # another may be about to lock its own
+                with locked(folder / "lock"):
+                    shutil.rmtree(folder)
 
 
 def _lock(folder: Path) -> IO[str]:
@@ -229,13 +246,15 @@ class Broker:
         """Until it ends; its exit code."""
         return await self._process.wait()
 
-    async def stop(self) -> None:
-        """End it; its data stay."""
+    async def stop(self, *, to_restart: bool = False) -> None:
+        """End it; its data stay, except for temporary ones unless another broker is to continue with them."""
         if self._stated is not None:
             self._stated.withdraw()
         await end(self._process)
+        if to_restart:
+            os.utime(self.data)  # it is not abandoned
         self._claim.close()
-        _release(self.data, self._lock)
+        _release(self.data, self._lock, keep=to_restart)
 
     async def __aenter__(self) -> Self:
         return self
@@ -339,11 +358,11 @@ async def _failure(process: asyncio.subprocess.Process, data: Path) -> Exception
     return SkylessError(f"nats-server does not start: {faults[-1] if faults else f'exit code {process.returncode}'}")
 
 
-def _release(data: Path, lock: IO[str]) -> None:
-    """Unlock the folder for the next broker; a temporary one is deleted."""
-    lock.close()
-    if data.name.startswith(_TEMPORARY):
+def _release(data: Path, lock: IO[str], *, keep: bool = False) -> None:
+    """Unlock the folder for the next broker; a temporary one is deleted unless it is kept for that."""
+    if not keep and data.name.startswith(_TEMPORARY):
         shutil.rmtree(data, ignore_errors=True)
+    lock.close()
 
 
 def _program() -> Path:

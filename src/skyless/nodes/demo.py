@@ -87,7 +87,7 @@ class WholeSite:
             if self._asked.broker is not None:
                 await self._run_with(self._asked.broker, None)
             else:
-                broker = await start_broker()
+                broker = await start_broker(BrokerSettings(temporary=True))
                 await self._run_with(broker.address, broker)
 
     async def _run_with(self, address: MqttAddress, broker: Broker | None) -> None:
@@ -126,7 +126,7 @@ class WholeSite:
             while True:
                 code = await broker.wait()
                 self._log(f"broker ended (exit code {code}); started again")
-                await broker.stop()
+                await broker.stop(to_restart=True)
                 await asyncio.sleep(_BROKER_RESTART_S)
                 broker = await start_broker(settings)
         finally:

@@ -2,7 +2,9 @@
 
 import asyncio
 import contextlib
+import os
 import re
+import secrets
 import socket
 import tempfile
 import time
@@ -16,7 +18,7 @@ from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import ReceptionsMessage, RequestMessage, StatusMessage
 from skyless.mqtt.topics import request_topic, site_topic
-from skyless.nodes.process import Log, every, locked
+from skyless.nodes.process import Log, data_folder, every, locked
 from skyless.recordings.mcap.reception_log import EVERY_TAG
 from skyless.recordings.mcap.recorder import McapFile, McapRecorder
 
@@ -57,7 +59,7 @@ class RecorderNode:
         self.recorder = McapRecorder(file)
         self._name, self._lock = _own_name(site)
         # the broker keeps what this name has subscribed to while it is away, so that its restart loses nothing
-        self.link = Link(address, self._name, site=site, kind="recorder", persistent=True)
+        self.link = Link(address, self._name, site=site, kind="recorder", persistent=True, client_key=_client_key())
         self.receptions = 0
         self._site = site
         self._log = log
@@ -168,6 +170,30 @@ def _own_name(site: int) -> tuple[str, IO[str]]:
         with contextlib.suppress(OSError):
             return f"{host}-{number}", locked(folder / f"skyless-record-{site}-{number}.lock")
     raise SkylessError(f"no name is left for a recorder: {folder}/skyless-record-{site}-*.lock cannot be locked")
+
+
+def _client_key() -> str:
+    """Random, and the same for all recorders of this user on this machine, so that a later one has the same session.
+
+    Where it cannot be kept it is new each time: then the session of a recorder that was killed stays at the broker.
+    """
+    key = secrets.token_hex(16)
+    with contextlib.suppress(OSError, UnicodeError):
+        file = data_folder() / "recorder_key"
+        draft = file.with_name(f"{file.name}-{key}")
+        with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as out:
+            out.write(key)
+        try:
+            with contextlib.suppress(FileExistsError):
+                os.link(draft, file)
+            kept = file.read_text(encoding="ascii")
+            if not re.fullmatch("[0-9a-f]{32}", kept):
+                draft.replace(file)
+                return key
+            return kept
+        finally:
+            draft.unlink(missing_ok=True)
+    return key
 
 
 def _temporary_folder() -> Path:

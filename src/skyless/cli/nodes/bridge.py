@@ -48,7 +48,7 @@ def bridge(
     broker.mqtt
         Broker to bridge the site of.
     site_id
-        Number of the site; by default the first that the broker has.
+        Number of the site; by default the one whose programs are online.
     json
         Write one JSON object at the end instead of text.
     """
@@ -79,7 +79,7 @@ async def _bridge(hub: Hub, address: "MqttAddress", site_id: int | None, nodes: 
     from skyless.nodes.bridge.broker_bridge import BridgeNode
     from skyless.nodes.find_site import find_site
 
-    site = await find_site(address, lambda _: None) if site_id is None else site_id
+    site = await find_site(address) if site_id is None else site_id
     node = BridgeNode(hub, address, site, log)
     nodes.append(node)
     log(f"bridging site {site} of {address} to {', '.join(route.target.text for route in hub.routes)}; Ctrl-C ends")

@@ -46,7 +46,7 @@ def record(
     broker.mqtt
         Broker to record the site of.
     site_id
-        Number of the site; by default the first that the broker has.
+        Number of the site; by default the one whose programs are online.
     duration
         Seconds to record; by default until Ctrl-C.
     limit_mb
@@ -67,6 +67,10 @@ def record(
     with contextlib.suppress(KeyboardInterrupt, TimeoutError):
         try:
             run(_record(out, address, site_id, duration, found))
+        except SkylessError:
+            if not found:
+                path.unlink()  # nothing was recorded
+            raise
         finally:
             out.close()
     _report(path, found[0].state() if found else None, json=json)
@@ -86,7 +90,7 @@ async def _record(
     end_s = None if duration_s is None else time.monotonic() + duration_s
     if site_id is None:
         async with asyncio.timeout(duration_s):
-            site_id = await find_site(address, lambda _: None)
+            site_id = await find_site(address)
     node = RecorderNode(file, address, site_id, log)
     found.append(node)
     screen = asyncio.ensure_future(_status(node)) if sys.stderr.isatty() else None
@@ -124,7 +128,7 @@ def _report(path: Path, state: "RecorderState | None", *, json: bool) -> None:
     if json:
         print_json({"file": path, **({} if state is None else msgspec.to_builtins(state))})
     elif state is None:
-        print(f"{path}: nothing was recorded, as the broker has no site")
+        print(f"{path}: nothing was recorded, as no program of a site was online")
     else:
         print(f"{path}: {state.seconds:.1f} s, {state.bytes / 1e6:.2f} MB, {sum(state.messages.values())} messages")
         for kind, number in sorted(state.messages.items()):

@@ -37,7 +37,7 @@ class LiveOptions:
     radio_name: str = "survey"
     """Name of that listener on an ether: that of one of its bodies, such as tag1."""
     site_id: SiteId | None = None
-    """Number of the site; by default that of --site, or the first that the broker has."""
+    """Number of the site; by default that of --site, or the one whose programs are online."""
     duration: Positive | None = None
     """Seconds to listen before the survey; 30 by default."""
     serve: bool = False
@@ -137,7 +137,7 @@ async def _node(asked: LiveOptions, known: FactOptions, *, serves: bool) -> "Sur
         raise SkylessError(f"--site-id is {site_id}; the site of {known.site} is number {site.id}")
     if site_id is None:
         assert address is not None  # a radio needs a site file
-        site_id = await find_site(address, lambda _: None)
+        site_id = await find_site(address)
     radio: Radio | None = None if asked.radio is None else open_radios(asked.radio, "tag", (asked.radio_name,))[0]
     settings = SurveySettings(site_id, site, known.site, not asked.no_watch, serves)
     return SurveyNode(settings, lambda one: _facts(known, one), run_survey, address, _log, radio)

@@ -1,5 +1,13 @@
 /** Requests to the server, relative to the page's own address. */
 
+import { state } from "./store.js";
+
+/** The query of what belongs to the live site: it names the one that the page shows, whichever others there are. */
+function ofSite(query = "") {
+  const named = state.liveId === null ? query : `site=${state.liveId}&${query}`;
+  return named && `?${named}`;
+}
+
 /** Fetch JSON; throws an Error with the server's message. */
 async function fetchJson(path, options = {}) {
   let answer;
@@ -23,31 +31,31 @@ async function fetchJson(path, options = {}) {
 export async function putZones(zones, site) {
   const body = JSON.stringify({ zones, site });
   const headers = { "content-type": "application/json" };
-  return (await fetchJson("api/zones", { method: "PUT", headers, body })).zones;
+  return (await fetchJson(`api/zones${ofSite()}`, { method: "PUT", headers, body })).zones;
 }
 
 /** Give the survey program all that the user knows; throws an Error that names the field that is wrong. */
 export function putFacts(facts, floor_plan) {
   const body = JSON.stringify({ facts, floor_plan });
   const headers = { "content-type": "application/json" };
-  return fetchJson("api/survey/facts", { method: "PUT", headers, body });
+  return fetchJson(`api/survey/facts${ofSite()}`, { method: "PUT", headers, body });
 }
 
 /** Have the survey program save the result of a number. */
 export function saveSurvey(serial) {
   const body = JSON.stringify({ serial });
   const headers = { "content-type": "application/json" };
-  return fetchJson("api/survey/save", { method: "POST", headers, body });
+  return fetchJson(`api/survey/save${ofSite()}`, { method: "POST", headers, body });
 }
 
 /** Store the image of the floor, a PNG or JPEG. @param {Blob} image */
 export function putFloorPlan(image) {
-  return fetchJson("api/floor_plan", { method: "PUT", headers: { "content-type": image.type }, body: image });
+  return fetchJson(`api/floor_plan${ofSite()}`, { method: "PUT", headers: { "content-type": image.type }, body: image });
 }
 
 /** The values of an overlay on a grid. */
 export function overlay(kind, step_m) {
-  return fetchJson(`api/overlay?kind=${encodeURIComponent(kind)}&step_m=${step_m}`);
+  return fetchJson(`api/overlay${ofSite(`kind=${encodeURIComponent(kind)}&step_m=${step_m}`)}`);
 }
 
 /** All recordings, newest first. */
@@ -72,7 +80,7 @@ export function fileOf(name) {
 
 /** Address of the floor plan's image: of a recording, or with null of the live site, whose digest differs by image. */
 export function floorPlanOf(name, digest) {
-  const path = name === null ? `api/floor_plan?digest=${digest}` : `api/recordings/${encodeURIComponent(name)}/floor_plan`;
+  const path = name === null ? `api/floor_plan${ofSite(`digest=${digest}`)}` : `api/recordings/${encodeURIComponent(name)}/floor_plan`;
   return new URL(path, document.baseURI).href;
 }
 

@@ -4,6 +4,7 @@ import { changed, state } from "./store.js";
 import { live, now_s, resetOffset, updateOffset } from "./clock.js";
 import { toast } from "./dom.js";
 import { addHealth, clearHistory } from "./history.js";
+import { chosenSite } from "./sites.js";
 import { receiveSurvey, receiveWatch, restart } from "./survey/model.js";
 
 const FIRST_RETRY_MS = 500;
@@ -50,6 +51,7 @@ export function retryNow() {
 
 function connect() {
   const address = new URL("live", document.baseURI);
+  if (chosenSite() !== null) address.searchParams.set("site", String(chosenSite()));
   address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
   const old = socket;
   const mine = (socket = new WebSocket(address));
@@ -128,12 +130,14 @@ const handlers = {
     state.log = [];
     state.condition = null;
     changed("connection", "events", "log", "condition");
+    handlers.sites({ shown: null, sites: [] });
     handlers.preparation({ preparation: null });
     handlers.zones(message);
     handlers.site(message);
   },
   site(message) {
     site = message.site ?? null;
+    state.liveId = site?.site.id ?? null;
     forgetOtherSite();
     if (state.mode === "live") showSite();
   },
@@ -185,6 +189,12 @@ const handlers = {
   },
   watch(message) {
     receiveWatch(message.watch, message.age_s);
+  },
+  sites({ shown, sites }) {
+    state.sites = sites;
+    changed("sites");
+    const chosen = chosenSite();
+    if (chosen !== null && chosen !== shown && sites.some(([id]) => id === chosen)) connect(); // it was not known before
   },
   preparation(message) {
     state.preparation = message.preparation;

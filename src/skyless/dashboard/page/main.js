@@ -7,6 +7,7 @@ import * as live from "./live.js";
 import * as map from "./map/map.js";
 import * as preparation from "./preparation.js";
 import * as replay from "./replay_bar.js";
+import * as sites from "./sites.js";
 import * as summary from "./summary.js";
 import * as tabs from "./tabs.js";
 import * as theme from "./theme.js";
@@ -31,6 +32,7 @@ replay.start();
 banner.start();
 preparation.start();
 watch.start();
+sites.start();
 summary.start();
 on(["site"], () => {
   text(byId("site-name"), state.site?.name ?? "");

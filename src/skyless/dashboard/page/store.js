@@ -2,7 +2,7 @@
  * The one state of the page. Modules change it and notify the topics; callbacks run at most once a frame.
  *
  * Topics: connection, site, zones, events, health, tags, mode, player, recordings, selection, options, overlay, editor,
- * theme, survey, watch, setup, picking, plan, condition, log, read, preparation.
+ * theme, survey, watch, setup, picking, plan, condition, log, read, preparation, sites.
  */
 
 /** @type {Map<string, Set<() => void>>} */
@@ -22,6 +22,10 @@ export const state = {
   /** @type {any} the site message's `site` */
   site: null,
   simulated: false,
+  /** Number of the live site, also while a recording is replayed. @type {number|null} */
+  liveId: null,
+  /** The sites of the broker: number, name, whether programs are online. @type {Array<[number, string, boolean]>} */
+  sites: [],
   /** @type {{done: number, total: number, left_s: number}|null} while kernels are compiled */
   preparation: null,
   /** @type {"live"|"replay"} */
