@@ -184,7 +184,7 @@ const handlers = {
     receiveSurvey(message.survey, message.age_s);
   },
   watch(message) {
-    receiveWatch(message.watch, message.age_s);
+    receiveWatch(message.watch);
   },
   preparation(message) {
     state.preparation = message.preparation;
