@@ -17,6 +17,8 @@ import { summaryFacts } from "./summary.js";
 let kept = false;
 let over = false;
 let said = "";
+/** Level and width of the window for which the sentence's line has its height. */
+let lineOf = "";
 /** The list behind the pill: its parts stay, so that a figure that changes takes neither a click nor the focus away. */
 let list = null;
 
@@ -67,6 +69,10 @@ function show() {
   text(byId("pill-words"), word);
   pill.setAttribute("aria-label", `${word}: ${words}`);
   const line = byId("condition-line");
+  // The map below must not change its size with every figure: the line becomes lower only with another level.
+  const key = `${condition.level} ${innerWidth}`;
+  line.style.minHeight = key === lineOf ? `${line.offsetHeight}px` : "";
+  lineOf = key;
   if (line.className !== condition.level) line.className = condition.level;
   text(byId("condition-words"), words);
   const further = condition.reasons.length - 1;
