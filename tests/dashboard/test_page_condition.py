@@ -20,22 +20,32 @@ def pill_is(page, level):
     until(page, "level => document.getElementById('pill').className === `pill ${level}`", arg=level)
 
 
-def test_the_pill_has_the_level_and_the_first_reason_and_so_has_the_browsers_tab(hall):
+def header(page):
+    """The pill's word and the sentence below the header."""
+    return page.locator("#pill").inner_text(), page.locator("#condition-words").inner_text()
+
+
+def test_the_pill_has_the_level_the_line_below_it_the_first_reason_and_the_browsers_tab_a_mark(hall):
     server, visit = hall
     page = visit.page
     pill_is(page, "good")
-    assert (page.locator("#pill").inner_text(), page.title()) == ("Live", "● Hall 7 · Skyless")
+    assert header(page) == ("Live", "All is well: nothing speaks against the positions shown.")
+    assert page.title() == "● Hall 7 · Skyless"
     server.condition = made_up.condition(OFFLINE)
     pill_is(page, "warning")
-    assert page.locator("#pill").inner_text() == "Anchor 8 of 8 is offline"
+    assert header(page) == ("Warning", "Anchor 8 of 8 is offline.")
+    assert page.locator("#condition-more").inner_text() == "What to do"
     assert page.title().startswith("▲ ")
-    assert page.locator("#condition-said").inner_text() == "Warning. Anchor 8 of 8 is offline"
+    assert page.locator("#condition-said").inner_text() == "Warning. Anchor 8 of 8 is offline."
     server.condition = made_up.condition(SLOW, OFFLINE)
     pill_is(page, "bad")
+    assert header(page)[0] == "Fault"
+    assert page.locator("#condition-more").inner_text() == "and 1 more"
     assert page.title().startswith("✕ ")
     server.condition = made_up.condition(level="waiting", text="no tag is online")
     pill_is(page, "waiting")
-    assert (page.locator("#pill").inner_text(), page.title()[0]) == ("No tag is online", "○")
+    assert (*header(page), page.title()[0]) == ("Waiting", "No tag is online.", "○")
+    assert page.locator("#condition-more").is_hidden()
 
 
 def test_all_reasons_are_listed_on_a_click_by_the_pointer_and_by_keys(hall):
@@ -70,6 +80,10 @@ def test_all_reasons_are_listed_on_a_click_by_the_pointer_and_by_keys(hall):
     page.wait_for_selector("#panel-anchors tr.selected:has-text('8')")
     page.keyboard.press("Escape")
     panel.wait_for(state="hidden")
+    page.click("#condition-more")
+    panel.wait_for()
+    page.click("#condition-more")
+    panel.wait_for(state="hidden")
     page.mouse.click(400, 400)
     page.focus("#theme")
     page.keyboard.press("Shift+Tab")
@@ -87,7 +101,7 @@ def test_without_a_judgement_or_with_an_old_one_the_page_is_not_green(serve, vis
     pill_is(page, "good")
     server.condition = None  # positions still come
     pill_is(page, "waiting")
-    assert page.locator("#pill").inner_text() == "The server is silent"
+    assert header(page) == ("Waiting", "The server is silent.")
     assert page.evaluate("skyless.state.connection.phase") == "open"
 
 
@@ -98,7 +112,7 @@ def test_a_page_that_is_behind_is_not_green(hall):
     server.answers_pings = False
     page.evaluate("skyless.state.ping = { sentMs: performance.now() - 2300, tripMs: 0 }")
     pill_is(page, "warning")
-    assert page.locator("#pill").inner_text().startswith("This page is ")
+    assert header(page)[1].startswith("This page is ")
     server.condition = made_up.condition(SLOW)
     pill_is(page, "bad")
     page.click("#pill")
@@ -123,6 +137,8 @@ def test_a_lost_broker_or_connection_is_not_green(hall):
     server.mute = server.refuse = True  # one that took a new connection would be live for a moment
     until(page, "!document.getElementById('pill').className.includes('good')", timeout_s=8.0)
     pill_is(page, "lost")
+    assert page.locator("#pill").inner_text() == "Disconnected"
+    assert page.locator("#condition-line").is_hidden()  # the banner says it
     assert page.locator("#summary").inner_text().count("–") >= 3  # no figures of before
     page.click("#tab-anchors")
     page.wait_for_selector("#panel-anchors tr.unknown:has-text('3')")
@@ -222,15 +238,37 @@ def test_events_are_listed_filtered_and_counted(hall):
     page.wait_for_selector("#panel-anchors tr.selected:has-text('8')")
 
 
-def test_on_a_phone_the_pill_has_two_whole_lines_and_the_open_tab_is_in_view(serve, visit):
+LEAST_ROOM = """() => {
+  const line = document.getElementById("condition-line");
+  const [words, more, whole] = ["condition-words", "condition-more", "condition-line"].map((id) =>
+    document.getElementById(id).getBoundingClientRect());
+  return Math.min(
+    line.clientHeight - line.scrollHeight, line.clientWidth - line.scrollWidth,
+    words.left - whole.left, whole.right - words.right, words.top - whole.top, whole.bottom - words.bottom,
+    whole.right - more.right, whole.bottom - more.bottom,
+    whole.top - document.querySelector("header").getBoundingClientRect().bottom,
+    document.getElementById("map").getBoundingClientRect().top - whole.bottom,
+  );
+}"""
+"""By how many pixels the sentence and its button are within their line, and this between header and map."""
+
+
+@pytest.mark.parametrize("size", [(1440, 900), (390, 844)])
+def test_a_long_sentence_is_shown_whole_below_one_word(serve, visit, size):
     server = serve()
-    server.condition = made_up.condition(SLOW)
-    page = visit(server, viewport={"width": 390, "height": 844}).page
+    server.site_name = "Distribution centre north, hall 7"
+    words = "; ".join(f"computer host-{n} is too slow: tag{n} dropped 12 % of its receptions" for n in range(5))
+    server.condition = made_up.condition(made_up.reason("slow", "bad", words), OFFLINE)
+    page = visit(server, viewport=dict(zip(("width", "height"), size, strict=True))).page
     pill_is(page, "bad")
-    lines = "getComputedStyle(document.getElementById('pill-words'))"
-    until(page, "document.getElementById('pill-words').getClientRects()[0].height > 20")
-    assert page.evaluate(f"[{lines}.webkitLineClamp, {lines}.overflow]") == ["2", "hidden"]
+    assert header(page) == ("Fault", f"{words[0].upper()}{words[1:]}.")
+    until(page, f"({LEAST_ROOM})() >= 0")
+    assert page.evaluate("document.getElementById('pill-words').getBoundingClientRect().height < 24")
     assert page.evaluate("document.querySelector('header').scrollWidth <= innerWidth")
+
+
+def test_on_a_phone_the_open_tab_is_in_view(serve, visit):
+    page = visit(serve(), viewport={"width": 390, "height": 844}).page
     page.focus("#tab-tags")
     page.keyboard.press("End")
     box = page.locator("#tab-recordings").bounding_box()

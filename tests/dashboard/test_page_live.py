@@ -115,7 +115,7 @@ def test_a_cut_connection_is_told_and_comes_back(hall):
     server.cut()
     until(page, SHOWN)
     assert "Connection lost" in page.locator("#banner").inner_text()
-    assert page.locator("#pill").inner_text() == "Connection lost"
+    assert page.locator("#pill").inner_text() == "Disconnected"
     sockets = """async () => {
       const { retryNow } = await import("/page/live.js");
       const made = [];

@@ -39,8 +39,10 @@ def pixels(page, canvas):
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGBA"))
 
 
-def send_site(server, page, **changes):
+def send_site(server, page, outline_m=None, **changes):
     message = made_up.site_message(time.time())
+    if outline_m:
+        message["outline_m"] = outline_m
     message["site"] |= changes
     server.send({"type": "site", "site": message})
     until(page, "name => skyless.state.site.name === name", message["site"]["name"])
@@ -67,6 +69,36 @@ def test_without_walls_the_area_of_the_anchors_is_named_as_such(hall):
     assert "area of the anchors, 22.0 m × 12.0 m" in words
     assert {"x in m", "y in m"} <= set(words)
     assert any(word.endswith(" m") and word[0].isdigit() for word in words)  # the scale's bar
+
+
+def test_the_outline_of_the_site_is_the_room_and_in_view(hall):
+    server, seen = hall
+    corners = [[-3, 0], [27, 0], [27, 9], [12, 14], [-3, 14]]
+    send_site(server, seen.page, corners, name="Outlined", walls=[])
+    outline = seen.page.evaluate(modules(["map/room"], "return room.roomOutline();"))
+    assert (outline["kind"], outline["corners"]) == ("room", corners)
+    assert "room, 30.0 m × 14.0 m" in written(seen.page)
+    fits = "return [view.toX(-3, 0), view.view.width - view.toX(27, 0)];"
+    assert min(seen.page.evaluate(modules(["map/view"], fits))) > 0
+
+
+def test_the_scale_does_not_cover_the_size_of_the_room(serve, visit):
+    server = serve()
+    seen = visit(server, viewport={"width": 390, "height": 844})
+    send_site(server, seen.page, name="Narrow", walls=[])
+    script = """
+      const { left, top, height } = floor.scaleBox();
+      const context = document.createElement("canvas").getContext("2d");
+      const found = [];
+      for (let y = top - 60; y < top + height; y += 2) {
+        view.pan(0, y - view.toY(1, 1)); // the lower edge of the area of the anchors
+        context.fillText = (words, x, at) => found.push([x + context.measureText(words).width, at]);
+        room.drawRoom(context, [], 0);
+      }
+      return [found.length, found.filter(([right, at]) => right > left && at + 11 > top && at < top + height).length];
+    """
+    count, covered = seen.page.evaluate(modules(["map/floor", "map/room", "map/view"], script))
+    assert (count > 20, covered) == (True, 0)
 
 
 def written(page):

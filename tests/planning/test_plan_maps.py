@@ -15,12 +15,13 @@ from msgspec.structs import replace
 from skyless.errors import ConfigurationError
 from skyless.planning import maps
 from skyless.planning.columns import ANCHORS_IN_VIEW, PDOP, PLAN_COLUMNS, SIGMA
-from skyless.planning.floor import Mounts, area, distance_outside, floor_of, inside, points_along, sides
+from skyless.planning.floor import Mounts, floor_of, points_along, sides
 from skyless.planning.maps import csv_lines, geojson_lines, grid_of, plan_map, summary_of
 from skyless.planning.predict import PlanSettings, Predictor
 from skyless.site.georeference import to_wgs84
 from skyless.site.lab import ideal_lab_site
 from skyless.site.model import AnchorSite, GeoreferenceSite, WallSite
+from skyless.site.outline import area, distance_outside, inside
 
 L_SHAPE = np.array([(0, 0), (12, 0), (12, 4), (5, 4), (5, 9), (0, 9)], dtype=float)
 LAB = ideal_lab_site()

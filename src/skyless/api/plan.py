@@ -26,7 +26,6 @@ from skyless.kernels.arrays import Array, Matrix
 from skyless.method_names import DEFAULT_METHOD, METHODS
 from skyless.planning.columns import ANCHORS_IN_VIEW, PLAN_COLUMNS, RMSE, SIGMA
 from skyless.planning.floor import (
-    Box,
     check_anchor_count,
     fewest_anchors,
     floor_of,
@@ -41,6 +40,7 @@ from skyless.planning.report import described, plan_report
 from skyless.planning.verify import Verification, random_points, verify
 from skyless.simulation.channel import ChannelModel
 from skyless.site.model import Site
+from skyless.site.outline import Box
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -162,7 +162,8 @@ def plan(
         step_m: Spacing of the map's points; by default some ten thousand points.
         tag_heights_m: Heights of the tags, for sites that estimate the height (3-D); by default three.
         region_m: Region of interest, x1, y1, x2, y2; by default the whole floor.
-        outline_m: Corners of the floor, shape (k, 2); by default the floor plan, or the box of the anchors.
+        outline_m: Corners of the floor, shape (k, 2); by default the site's outline, the floor plan, or the
+            box of the anchors.
         target_m: Standard deviation to be met.
         optimise: Replace the anchors by this many, placed on the walls where they serve best.
         anchor_heights_m: Heights at which anchors may hang; by default the lowest and highest of the site's.

@@ -11,12 +11,13 @@ from skyless.api.floor_result import FloorResult
 from skyless.api.result import data_frame
 from skyless.errors import SkylessError
 from skyless.kernels.arrays import Array, Matrix
-from skyless.planning.floor import Box, floor_of
+from skyless.planning.floor import floor_of
 from skyless.planning.links import with_range
 from skyless.planning.slot_plan import RateMap, rate_map
 from skyless.planning.slot_report import described_slots, slot_report, with_planned_slots
 from skyless.simulation.channel import ChannelModel
 from skyless.site.model import Site
+from skyless.site.outline import Box
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

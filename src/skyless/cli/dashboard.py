@@ -107,11 +107,11 @@ def _load(name: str) -> "tuple[SiteMessage, bytes | None]":
     """The site and the image of its floor. Raises SkylessError."""
     import time
 
-    from skyless.mqtt.messages import SiteMessage
+    from skyless.mqtt.messages import site_message
 
     site = site_named(name)
     image = None if site.floor_plan is None else (Path(name).parent / site.floor_plan.image).read_bytes()
-    return SiteMessage(site, simulated=False, unix_s=time.time()), image
+    return site_message(site, simulated=False, unix_s=time.time()), image
 
 
 def _listening(listen: str | None) -> "ListenAddress":

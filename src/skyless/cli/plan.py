@@ -26,13 +26,14 @@ from skyless.method_names import DEFAULT_METHOD, Dynamics
 
 if TYPE_CHECKING:
     from skyless.kernels.arrays import Matrix
-    from skyless.planning.floor import Box, Floor, Mounts
+    from skyless.planning.floor import Floor, Mounts
     from skyless.planning.maps import PlanMap
     from skyless.planning.optimise import Optimised
     from skyless.planning.predict import PlanSettings, Predictor
     from skyless.planning.slot_plan import RateMap
     from skyless.planning.verify import Verification
     from skyless.site.model import Site
+    from skyless.site.outline import Box
 
 app = App(name="plan", help_epilogue="Example: skyless plan hall.toml --method joint --plot hall.png --target 5")
 
@@ -58,7 +59,8 @@ class PlanOptions:
     region: str | None = None
     """Region of interest, x1,y1,x2,y2 in metres; by default the whole floor."""
     outline: str | None = None
-    """Corners of the floor, "x1,y1 x2,y2 x3,y3 ..." in metres; by default the floor plan, or the box of the anchors."""
+    """Corners of the floor, "x1,y1 x2,y2 x3,y3 ..." in metres; by default the site's outline, the floor plan, or the
+    box of the anchors."""
     target: Positive | None = None
     """Standard deviation to be met, in centimetres."""
     plot: Path | None = None

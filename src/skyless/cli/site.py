@@ -86,7 +86,7 @@ def new(
     from skyless.simulation.channel import ChannelModel
     from skyless.site.check import check_site
     from skyless.site.lab import lab_site
-    from skyless.site.template import rectangular_site, site_template, unplaced_site
+    from skyless.site.template import rectangle, rectangular_site, site_template, unplaced_site
 
     if file.is_dir():
         raise SkylessError(f"{file} is a folder; it should be the name of a file to write")
@@ -105,7 +105,7 @@ def new(
         check_site(room, file)
         site = with_best_master(room, ChannelModel())
     elif (*sizes, tag_height) == (None,) * 5:
-        site = lab_site()
+        site = msgspec.structs.replace(lab_site(), outline_m=rectangle(6.0, 8.0))
     else:
         raise SkylessError("a room needs both --width and --depth; without them the lab is written")
     site = msgspec.structs.replace(site, name=name or file.stem, id=_new_id() if site_id is None else site_id)

@@ -165,7 +165,7 @@ async def _overlay(request: Request) -> Response:
     step_m = _number(request, "step_m", 0.25, 0.01, 100.0)
     if live.site is None:
         raise HTTPException(404, "no site is known yet")
-    return _json(await overlays.get(live.site.site, live.floor_plan, live.state.methods(), kind, step_m))
+    return _json(await overlays.get(live.site.whole_site, live.floor_plan, live.state.methods(), kind, step_m))
 
 
 def _number(request: Request, name: str, default: float, least: float, most: float) -> float:

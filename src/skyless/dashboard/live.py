@@ -252,7 +252,7 @@ class LiveSite:
 
     def _on_site(self, _topic: str, payload: bytes) -> None:
         message = read_message(payload, SiteMessage)
-        check_site(message.site, Path("the site on MQTT"))
+        check_site(message.whole_site, Path("the site on MQTT"))
         if message.site.id != self._site_id:
             raise WrongMessageError(f"it is of site {message.site.id}")
         self.site = message

@@ -6,7 +6,7 @@ from collections import Counter, OrderedDict
 from typing import Any, Final, Literal
 
 import msgspec
-from msgspec import Struct
+from msgspec import UNSET, Struct
 from msgspec.structs import replace
 
 from skyless.method_names import DEFAULT_METHOD
@@ -126,6 +126,9 @@ def _box(site: Site, floor_plan: bytes | None) -> Box:
     if plan is not None and size is not None:
         xs += [plan.x_m, plan.x_m + plan.width_m]
         ys += [plan.y_m, plan.y_m + plan.width_m * size[1] / size[0]]
+    for x, y in () if site.outline_m is UNSET else site.outline_m:
+        xs.append(x)
+        ys.append(y)
     return min(xs), min(ys), max(xs), max(ys)
 
 

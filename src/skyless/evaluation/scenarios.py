@@ -34,6 +34,7 @@ from skyless.simulation.range_errors import RangeErrorModel
 from skyless.simulation.streams import stream
 from skyless.simulation.trajectory import Roaming, Static, Trajectory, Waypoints
 from skyless.site.model import Site
+from skyless.site.outline import rectangle_of
 
 WALL_MARGIN_M: Final = 0.5
 """Walking tags keep this distance from the box around the anchors."""
@@ -322,6 +323,9 @@ def _smooth_path(points: Sequence[ArrayLike], speed_mps: float, *, loop: bool = 
 def _walkable_box(site: Site) -> tuple[Array, Array]:
     points_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
     low, high = points_m.min(axis=0), points_m.max(axis=0)
+    room = rectangle_of(site)  # in a room of another shape the box around it would be partly outside
+    if room is not None:
+        low[:2], high[:2] = room[:2], room[2:]
     margin = np.minimum(WALL_MARGIN_M, (high - low) / 4.0)
     lacking = np.maximum((LEAST_WALK_M, LEAST_WALK_M, 0.0) - (high - low - 2.0 * margin), 0.0) / 2.0
     low, high = low + margin - lacking, high - margin + lacking

@@ -7,9 +7,10 @@ those that they do not know.
 from typing import Literal, TypeVar
 
 import msgspec
-from msgspec import Struct
+from msgspec import UNSET, Struct, UnsetType
+from msgspec.structs import replace
 
-from skyless.site.model import FloorPlanSite, Site
+from skyless.site.model import FloorPlanSite, Outline, Site
 from skyless.survey.facts import Facts
 from skyless.survey.result import Survey
 
@@ -23,9 +24,22 @@ class SiteMessage(Struct, frozen=True):
     """The site as in its file, retained, so that a new tag or page has it at once."""
 
     site: Site
+    """Without its outline, which earlier versions refuse in it."""
     simulated: bool
     """True when its radios are emulated."""
     unix_s: float
+    outline_m: Outline | UnsetType = UNSET
+    """The room's corners, where the site's file has them."""
+
+    @property
+    def whole_site(self) -> Site:
+        """The site as in its file."""
+        return replace(self.site, outline_m=self.outline_m)
+
+
+def site_message(site: Site, *, simulated: bool, unix_s: float) -> SiteMessage:
+    """The message of a site: its outline stands beside it."""
+    return SiteMessage(replace(site, outline_m=UNSET), simulated, unix_s, site.outline_m)
 
 
 class StatusMessage(Struct, frozen=True):

@@ -19,7 +19,7 @@ from typing import IO, Any, Final
 
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Link
-from skyless.mqtt.messages import SiteMessage
+from skyless.mqtt.messages import site_message
 from skyless.mqtt.topics import floor_plan_topic, site_topic
 from skyless.site.model import Site
 
@@ -189,7 +189,7 @@ class SitePublisher:
         if self._simulated is self._published:
             return
         self._published = self._simulated
-        message = SiteMessage(self._site, self._simulated, time.time())
+        message = site_message(self._site, simulated=self._simulated, unix_s=time.time())
         link.publish(site_topic(self._site.id), message, qos=1, retain=True)
         if self._floor_plan is not None and not self._has_floor_plan:
             self._has_floor_plan = True

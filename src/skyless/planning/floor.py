@@ -1,21 +1,16 @@
 """The floor of a site: its outline, points inside it, and the walls on which anchors may hang."""
 
 from pathlib import Path
-from typing import Final
 
 import numpy as np
-from msgspec import Struct
+from msgspec import UNSET, Struct
 
 from skyless.errors import ConfigurationError
-from skyless.kernels.arrays import Integers, Mask, Matrix, Vector
+from skyless.kernels.arrays import Integers, Matrix, Vector
 from skyless.site.image import image_size
 from skyless.site.model import Site
 from skyless.site.near import anchor_positions
-
-Box = tuple[float, float, float, float]
-
-_OUTSIDE_M: Final = 0.5
-"""Anchors hang on walls, whose thickness a plan may leave out: this far outside the outline they are accepted."""
+from skyless.site.outline import OUTSIDE_M, Box, area, distance_outside, inside, outline_of
 
 
 class Floor(Struct, frozen=True):
@@ -39,25 +34,37 @@ def floor_plan_box(site: Site, file: Path) -> Box | None:
 
 
 def floor_of(site: Site, file: Path, outline_m: Matrix | None, region_m: Box | None) -> Floor:
-    """The floor: the given outline, or the floor plan, or the box around the anchors.
+    """The floor: the given outline, or the site's, or the floor plan, or the box around the anchors.
 
     Raises:
-        ConfigurationError: an anchor lies outside the floor, or the floor has no area.
+        ConfigurationError: an anchor lies outside the floor, or the floor has no area. Anchors outside the site's own
+            outline are accepted, as ``skyless site check`` warns of them.
     """
-    plan = floor_plan_box(site, file)
+    floor_m = outline_of(site) if outline_m is None else outline_m
+    if floor_m is None:
+        floor_m = _guessed(site, file)
+    if abs(area(floor_m)) < 1e-6:
+        right = "anchors that are not all in one line, or a floor plan; outline_m or --outline gives the room else"
+        raise ConfigurationError(file, "anchors", f"{len(site.anchors)} in one line", right)
+    if outline_m is not None or site.outline_m is UNSET:
+        _check_inside(site, file, floor_m)
+    low, high = floor_m.min(axis=0), floor_m.max(axis=0)
+    return Floor(floor_m, region_m or (*low.tolist(), *high.tolist()))
+
+
+def _guessed(site: Site, file: Path) -> Matrix:
+    """The floor plan, or the box around the anchors."""
     anchors = anchor_positions(site)[:, :2]
-    if outline_m is None:
-        low, high = anchors.min(axis=0), anchors.max(axis=0)
-        x1, y1, x2, y2 = plan or (*low.tolist(), *high.tolist())
-        outline_m = np.array([(x1, y1), (x2, y1), (x2, y2), (x1, y2)])
-    if abs(area(outline_m)) < 1e-6:
-        right = "anchors that are not all in one line, or a floor plan; --outline gives the room else"
-        raise ConfigurationError(file, "anchors", f"{len(anchors)} in one line", right)
+    low, high = anchors.min(axis=0), anchors.max(axis=0)
+    x1, y1, x2, y2 = floor_plan_box(site, file) or (*low.tolist(), *high.tolist())
+    return np.array([(x1, y1), (x2, y1), (x2, y2), (x1, y2)])
+
+
+def _check_inside(site: Site, file: Path, outline_m: Matrix) -> None:
+    anchors = anchor_positions(site)[:, :2]
     for index in np.flatnonzero(~inside(anchors, outline_m)).tolist():
-        if distance_outside(anchors[index], outline_m) > _OUTSIDE_M:
+        if distance_outside(anchors[index], outline_m) > OUTSIDE_M:
             raise _outside(site, file, index, outline_m)
-    low, high = outline_m.min(axis=0), outline_m.max(axis=0)
-    return Floor(outline_m, region_m or (*low.tolist(), *high.tolist()))
 
 
 def _outside(site: Site, file: Path, index: int, outline_m: Matrix) -> ConfigurationError:
@@ -66,33 +73,6 @@ def _outside(site: Site, file: Path, index: int, outline_m: Matrix) -> Configura
     key = f"anchors[{index}] (anchor {anchor.id})"
     right = f"on the floor, which reaches from ({x1:g}, {y1:g}) to ({x2:g}, {y2:g}) m"
     return ConfigurationError(file, key, f"at ({anchor.x_m:g}, {anchor.y_m:g})", right)
-
-
-def area(outline_m: Matrix) -> float:
-    """Signed area of a polygon."""
-    x, y = outline_m.T
-    return float(0.5 * np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
-
-
-def inside(points_m: Matrix, outline_m: Matrix) -> Mask:
-    """Which points, shape (m, 2), lie inside a polygon (even-odd rule)."""
-    x, y = points_m[:, 0], points_m[:, 1]
-    within = np.zeros(len(points_m), dtype=np.bool_)
-    for (x1, y1), (x2, y2) in zip(outline_m, np.roll(outline_m, -1, axis=0), strict=True):
-        if y1 != y2:
-            within ^= ((y1 > y) != (y2 > y)) & (x < (x2 - x1) * (y - y1) / (y2 - y1) + x1)
-    return within
-
-
-def distance_outside(point_m: Vector, outline_m: Matrix) -> float:
-    """How far a point, shape (2,), lies outside a polygon; 0 inside."""
-    if inside(point_m[None], outline_m)[0]:
-        return 0.0
-    starts, ends = outline_m, np.roll(outline_m, -1, axis=0)
-    along = ends - starts
-    lengths2 = np.maximum((along * along).sum(axis=1), 1e-12)
-    share = np.clip(((point_m - starts) * along).sum(axis=1) / lengths2, 0.0, 1.0)
-    return float(np.linalg.norm(starts + share[:, None] * along - point_m, axis=1).min())
 
 
 def sides(outline_m: Matrix) -> Matrix:

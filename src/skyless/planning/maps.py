@@ -25,10 +25,11 @@ from skyless.planning.columns import (
     SIGMA_Y,
     SIGMA_Z,
 )
-from skyless.planning.floor import Floor, inside
+from skyless.planning.floor import Floor
 from skyless.planning.predict import Predictor
 from skyless.site.georeference import to_wgs84
 from skyless.site.model import GeoreferenceSite
+from skyless.site.outline import inside
 
 _MOST_POINTS: Final = 5_000_000
 _NICE_POINTS: Final = 12_000

@@ -16,9 +16,10 @@ from msgspec import Struct
 from skyless.kernels.arrays import Array
 from skyless.planning.colours import COLOUR_STOPS, round_values, scale_of
 from skyless.planning.columns import ANCHORS_IN_VIEW, FIX_SHARE, HDOP, PDOP, RMSE, SIGMA, VDOP
-from skyless.planning.floor import Box, Floor, floor_plan_box
+from skyless.planning.floor import Floor, floor_plan_box
 from skyless.planning.maps import Grid, PlanMap
 from skyless.site.model import Site
+from skyless.site.outline import Box
 
 _NO_FIX: Final = "#d9d9d9"
 _EDGE: Final = "black"

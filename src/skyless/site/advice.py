@@ -12,6 +12,7 @@ from skyless.air.ieee802154 import air_time_s
 from skyless.kernels.arrays import Array, Integers
 from skyless.site.model import ScheduleSite, Site
 from skyless.site.near import anchor_positions, pairs_within
+from skyless.site.outline import OUTSIDE_M, distance_outside, inside, outline_of
 
 _FLATTEST: Final = 0.05
 """Extent across the best plane (or line) over the whole extent, below which anchors count as in it."""
@@ -28,7 +29,8 @@ _SHORTEST_GUARD_S: Final = 0.35e-3
 
 def warnings_of(site: Site) -> list[str]:
     """Soft problems of a valid site, each a sentence; empty when there is none."""
-    general = [*_count(site), *_geometry(site), *_height(site), *_guard(site), *_accuracy(site), *_without_effect(site)]
+    general = [*_count(site), *_geometry(site), *_height(site), *_outline(site), *_guard(site), *_accuracy(site)]
+    general += _without_effect(site)
     if site.schedule.needs_master:
         return general
     return [*general, *_neighbours(site), *(_unplaced(site) if site.schedule.mode == "slots" else _load(site))]
@@ -102,6 +104,23 @@ def _height(site: Site) -> list[str]:
         return []
     reach = f"{RADIO_REACH_M:.0f} m, the range in the open"
     return [f"tags.height_m is {height_m:g}: no anchor is within {reach}, of that height"]
+
+
+def _outline(site: Site) -> list[str]:
+    """Anchors farther outside the room than on its walls."""
+    outline_m = outline_of(site)
+    if outline_m is None:
+        return []
+    points = anchor_positions(site)[:, :2]
+    far = {
+        site.anchors[row].id: distance_m
+        for row in np.flatnonzero(~inside(points, outline_m)).tolist()
+        if (distance_m := distance_outside(points[row], outline_m)) > OUTSIDE_M
+    }
+    if not far:
+        return []
+    distance = f"{'up to ' if len(far) > 1 else ''}{max(far.values()):.2f} m"
+    return [f"{_named(list(far))}: {distance} outside the room that outline_m gives; see which of the two is wrong"]
 
 
 def _without_effect(site: Site) -> list[str]:

@@ -10,7 +10,8 @@ from itertools import combinations
 from pathlib import Path
 from typing import Final
 
-from msgspec import Struct
+from msgspec import UNSET, Struct
+from msgspec.structs import replace
 
 from skyless.air.codec import MAX_FRAME_BYTES
 from skyless.air.ieee802154 import air_time_s
@@ -116,12 +117,16 @@ PROTOCOL_2_LIMITS: Final = {
 }
 """Those that are narrower in protocol 2."""
 
+_FEWEST_CORNERS: Final = 3
+_MOST_CORNERS: Final = 1000
+
 _OTHERS: Final = {
     "schedule.mode": 'one of "master", "slots" and "free"',
     "schedule.site_time": "true or false",
     "name": "a text",
     "anchors": "a list of [[anchors]] tables, one for each anchor",
     "walls": "a list of [[walls]] tables",
+    "outline_m": f"the room's {_FEWEST_CORNERS} to {_MOST_CORNERS} corners in order, [x, y] each in metres",
     "floor_plan.image": "the path of a PNG or JPEG file, relative to the site file",
 }
 
@@ -152,12 +157,13 @@ def check_site(site: Site, file: Path, *, slots_given: bool = True) -> None:
     if not site.name.strip():
         raise ConfigurationError(file, "name", site.name, "a text of at least one character")
     limits = SITE_LIMITS if site.schedule.needs_master else {**SITE_LIMITS, **PROTOCOL_2_LIMITS}
-    for key, row, value in _numbers(site):
+    for key, row, value in _numbers(replace(site, outline_m=UNSET)):
         name, _, field = key.partition(".")
         limit = limits[f"anchors.{field}" if name == "unplaced" else key]
         if not limit.contains(value):
             path = key if row is None else f"{name}[{row}].{field}"
             raise ConfigurationError(file, _with_anchor(path, site), value, str(limit))
+    _check_outline(site, file)
     _check_anchors(site, file)
     if site.schedule.needs_master:
         _check_slots(site, file)
@@ -218,6 +224,34 @@ def _numbers(value: object, path: str = "", row: int | None = None) -> Iterator[
             yield from _numbers(entry, path, index)
     elif isinstance(value, int | float) and not isinstance(value, bool):
         yield path, row, value
+
+
+def _check_outline(site: Site, file: Path) -> None:
+    """Check that the outline is a polygon with an area, whose sides do not cross."""
+    if site.outline_m is UNSET:
+        return
+    corners = site.outline_m
+    if not _FEWEST_CORNERS <= len(corners) <= _MOST_CORNERS:
+        raise ConfigurationError(file, "outline_m", f"{len(corners)} corners", expected("outline_m"))
+    for number, corner in enumerate(corners):
+        for axis, value in enumerate(corner):
+            if not _COORDINATE.contains(value):
+                raise ConfigurationError(file, f"outline_m[{number}][{axis}]", value, str(_COORDINATE))
+        if math.dist(corner, corners[number - 1]) < _CLOSEST_M:
+            right = "elsewhere than the corner before it; the last side leads back to the first corner by itself"
+            raise ConfigurationError(file, f"outline_m[{number}]", list(corner), right)
+    import numpy as np  # noqa: PLC0415 - most sites need none of it
+
+    from skyless.site.outline import area, sides_that_meet  # noqa: PLC0415
+
+    outline_m = np.array(corners)
+    meeting = sides_that_meet(outline_m)
+    if meeting is not None:
+        one, other = (f"{list(corners[side])}–{list(corners[(side + 1) % len(corners)])}" for side in meeting)
+        right = "corners in their order along the walls, so that no two sides meet but neighbours"
+        raise ConfigurationError(file, "outline_m", f"sides {one} and {other}", right)
+    if abs(area(outline_m)) < _CLOSEST_M:
+        raise ConfigurationError(file, "outline_m", "corners in one line", expected("outline_m"))
 
 
 def _check_anchors(site: Site, file: Path) -> None:

@@ -2,12 +2,16 @@
 
 from typing import Final, Literal
 
-from msgspec import Struct
+from msgspec import UNSET, Struct, UnsetType
 
 from skyless.constants import DEFAULT_ANTENNA_DELAY_TICKS
 
 ScheduleMode = Literal["master", "slots", "free"]
 """How the anchors of a site share the air; ``slots`` and ``free`` are protocol 2, which needs no master."""
+
+
+Outline = tuple[tuple[float, float], ...]
+"""Corners of a room in order, x and y in metres."""
 
 
 class AnchorSite(Struct, frozen=True, forbid_unknown_fields=True):
@@ -162,6 +166,8 @@ class Site(Struct, frozen=True, forbid_unknown_fields=True):
     georeference: GeoreferenceSite | None = None
     unplaced: tuple[UnplacedAnchor, ...] = ()
     """Those whose positions are not known yet, in protocol 2."""
+    outline_m: Outline | UnsetType = UNSET
+    """The room, where the file has it. Messages carry it beside the site: earlier versions refuse a site with it."""
 
     @property
     def all_anchors(self) -> tuple[AnchorSite | UnplacedAnchor, ...]:

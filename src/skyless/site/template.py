@@ -3,9 +3,18 @@
 import json
 from typing import Final
 
-from msgspec import structs
+from msgspec import UNSET, structs
 
-from skyless.site.model import AnchorSite, FloorPlanSite, GeoreferenceSite, ScheduleSite, Site, TagsSite, UnplacedAnchor
+from skyless.site.model import (
+    AnchorSite,
+    FloorPlanSite,
+    GeoreferenceSite,
+    Outline,
+    ScheduleSite,
+    Site,
+    TagsSite,
+    UnplacedAnchor,
+)
 
 _HEAD = """\
 # A Skyless site. Lengths are metres in the site's own frame: x and y on the floor, z up.
@@ -14,6 +23,8 @@ _HEAD = """\
 name = {name}
 id = {id}                          # of the site on the air, 0 to 65533; neighbouring sites need different ones
 {no_master}master = {master}                      # its clock is the site's time; best in the middle, in range of all
+# The room: its corners in order, [x, y] each; for the map, planning and simulation.
+{no_outline}outline_m = {outline}
 
 [schedule]                      # who sends when
 # "master": all anchors hear one master and send in turn. "slots": no master, any size; anchors far apart share a slot,
@@ -124,6 +135,7 @@ _GEOREFERENCE = """
 {off}heading_deg = {heading_deg}             # azimuth of the y axis, clockwise from true north
 """
 
+_EXAMPLE_OUTLINE: Final = ((0.0, 0.0), (12.0, 0.0), (12.0, 8.0), (0.0, 8.0))
 _EXAMPLE_PLAN = FloorPlanSite(image="floor.png", width_m=6.0)
 _EXAMPLE_GEOREFERENCE = GeoreferenceSite(latitude_deg=47.3769, longitude_deg=8.5417, height_m=408.0)
 
@@ -149,6 +161,8 @@ def site_template(site: Site) -> str:
         reuse_m=schedule.reuse_m,
         site_time=str(schedule.site_time).lower(),
         rate_hz=schedule.rate_hz,
+        outline=[list(corner) for corner in (_EXAMPLE_OUTLINE if site.outline_m is UNSET else site.outline_m)],
+        no_outline=_off(site.outline_m is not UNSET),
         no_master=_off(schedule.needs_master),
         no_slots=_off(schedule.slots is not None),
         master_mode=_off(not schedule.needs_master),
@@ -190,6 +204,11 @@ def _tail(site: Site) -> str:
     )
 
 
+def rectangle(width_m: float, depth_m: float) -> Outline:
+    """The outline of a rectangular room from the corner (0, 0) on."""
+    return (0.0, 0.0), (width_m, 0.0), (width_m, depth_m), (0.0, depth_m)
+
+
 def rectangular_site(width_m: float, depth_m: float, anchors: int, height_m: float, tag_height_m: float | None) -> Site:
     """A rectangular room with anchors evenly along its walls, from the corner (0, 0) on.
 
@@ -209,6 +228,7 @@ def rectangular_site(width_m: float, depth_m: float, anchors: int, height_m: flo
         ),
         schedule=ScheduleSite(slot_s=2.5e-3),
         tags=TagsSite(height_m=tag_height_m),
+        outline_m=rectangle(width_m, depth_m),
     )
 
 

@@ -1,6 +1,7 @@
 /**
- * The condition of the site: a pill in the header with the first reason, the list of all reasons behind it, the mark in
- * the browser's tab; and a banner, with a button to reconnect, where the connection is lost.
+ * The condition of the site: a pill in the header with one word, below the header the worst reason as a whole sentence,
+ * the list of all reasons behind both, and the mark in the browser's tab. Where the connection or the broker is lost, a
+ * banner replaces the sentence.
  */
 
 import { on, select, state } from "./store.js";
@@ -12,10 +13,12 @@ import { retryNow } from "./live.js";
 import { open as openTab } from "./tabs.js";
 import { summaryFacts } from "./summary.js";
 
-/** Pointer or focus on the pill show the list; a click keeps it. */
+/** Pointer or focus on the pill show the list; a click on the pill or next to the sentence keeps it. */
 let kept = false;
 let over = false;
 let said = "";
+/** Level and width of the window for which the sentence's line has its height. */
+let lineOf = "";
 /** The list behind the pill: its parts stay, so that a figure that changes takes neither a click nor the focus away. */
 let list = null;
 
@@ -29,17 +32,21 @@ export function start() {
   byId("banner-button").addEventListener("click", retryNow);
   const box = byId("condition");
   buildList();
-  byId("pill").addEventListener("click", () => {
-    kept = !kept;
-    over &&= kept;
-    show();
-  });
+  for (const id of ["pill", "condition-more"]) byId(id).addEventListener("click", toggle);
   box.addEventListener("pointerenter", (event) => event.pointerType === "mouse" && hover(true));
   box.addEventListener("pointerleave", () => hover(false));
   byId("pill").addEventListener("focus", (event) => event.target.matches(":focus-visible") && hover(true));
   box.addEventListener("focusout", ({ relatedTarget }) => relatedTarget && !box.contains(relatedTarget) && close());
   box.addEventListener("keydown", (event) => event.key === "Escape" && close());
-  addEventListener("pointerdown", (event) => box.contains(/** @type {Node} */ (event.target)) || close());
+  addEventListener("pointerdown", ({ target }) => {
+    if (![box, byId("condition-more")].some((part) => part.contains(/** @type {Node} */ (target)))) close();
+  });
+  show();
+}
+
+function toggle() {
+  kept = !kept;
+  over &&= kept;
   show();
 }
 
@@ -56,12 +63,22 @@ function close() {
 function show() {
   const condition = shownCondition();
   const { word, mark } = LEVELS[condition.level];
-  const words = condition.text ? sentence(condition.text).slice(0, -1) : word;
+  const words = statement(condition, word);
   const pill = byId("pill");
   if (pill.className !== `pill ${condition.level}`) pill.className = `pill ${condition.level}`;
-  text(byId("pill-words"), words);
-  pill.setAttribute("aria-label", condition.text ? `${word}: ${words}` : words);
-  showList(condition, word);
+  text(byId("pill-words"), word);
+  pill.setAttribute("aria-label", `${word}: ${words}`);
+  const line = byId("condition-line");
+  // The map below must not change its size with every figure: the line becomes lower only with another level.
+  const key = `${condition.level} ${innerWidth}`;
+  line.style.minHeight = key === lineOf ? `${line.offsetHeight}px` : "";
+  lineOf = key;
+  if (line.className !== condition.level) line.className = condition.level;
+  text(byId("condition-words"), words);
+  const further = condition.reasons.length - 1;
+  byId("condition-more").hidden = further < 0;
+  text(byId("condition-more"), further > 0 ? `and ${further} more` : "What to do");
+  showList(condition, words);
   say(condition, `${word}. ${words}`);
   text(document.head.querySelector("title"), `${mark} ${state.site ? `${state.site.name} · ` : ""}Skyless`);
   showBanner();
@@ -84,12 +101,13 @@ function buildList() {
   list = { heading, reasons: new Rows(reasons, makeReason), figures: new Rows(figures, makeFigure) };
 }
 
-function showList({ level, text: first, reasons }, word) {
+function showList({ reasons }, words) {
   const open = kept || over;
   byId("condition-list").hidden = !open;
-  byId("pill").setAttribute("aria-expanded", String(open));
+  for (const id of ["pill", "condition-more"]) byId(id).setAttribute("aria-expanded", String(open));
   if (!open) return;
-  text(list.heading, headline(level, first, reasons, word));
+  const count = reasons.length;
+  text(list.heading, count ? (count === 1 ? "One thing is wrong:" : `${count} things are wrong:`) : words);
   list.reasons.show(reasons.map((reason) => [reason.kind, reason]));
   list.figures.show(summaryFacts());
 }
@@ -121,11 +139,11 @@ function makeFigure(name) {
   return { element: h("div", {}, h("dt", {}, name), value), update: (words) => text(value, words) };
 }
 
-function headline(level, first, reasons, word) {
+/** The condition as a sentence: the worst reason, or what is so without one. */
+function statement({ level, text: words }, word) {
   if (level === "good") return "All is well: nothing speaks against the positions shown.";
   if (level === "replay") return "A recording is shown, not the live site.";
-  if (!reasons.length) return sentence(first || word);
-  return reasons.length === 1 ? "One thing is wrong:" : `${reasons.length} things are wrong:`;
+  return sentence(words || word);
 }
 
 function showBanner() {
@@ -135,6 +153,7 @@ function showBanner() {
   const banner = byId("banner");
   banner.hidden = !words;
   banner.className = phase === "lost" ? "lost" : "broker";
+  byId("condition-line").hidden = !banner.hidden;
   byId("banner-button").hidden = phase !== "lost";
   text(byId("banner-text"), words);
   text(byId("banner-age"), phase === "lost" ? age(since) : "");

@@ -13,7 +13,7 @@ export const LEVELS = {
   warning: { word: "Warning", mark: "▲" },
   bad: { word: "Fault", mark: "✕" },
   waiting: { word: "Waiting", mark: "○" },
-  lost: { word: "Connection lost", mark: "✕" },
+  lost: { word: "Disconnected", mark: "✕" },
   replay: { word: "Replay", mark: "▶" },
   connecting: { word: "Connecting", mark: "○" },
 };

@@ -1,6 +1,6 @@
 /** The live connection: reads the server's messages into the state, notices a loss, and reconnects. */
 
-import { changed, state } from "./store.js";
+import { changed, siteOf, state } from "./store.js";
 import { live, now_s, resetOffset, updateOffset } from "./clock.js";
 import { toast } from "./dom.js";
 import { addHealth, clearHistory } from "./history.js";
@@ -188,7 +188,7 @@ const handlers = {
     receiveSurvey(message.survey, message.age_s);
   },
   watch(message) {
-    receiveWatch(message.watch, message.age_s);
+    receiveWatch(message.watch);
   },
   sites({ shown, sites }) {
     state.sites = sites;
@@ -236,7 +236,7 @@ function forgetOtherSite() {
 }
 
 function showSite() {
-  state.site = site?.site ?? null;
+  state.site = siteOf(site);
   state.simulated = site?.simulated ?? false;
   changed("site");
 }

@@ -12,7 +12,6 @@ import * as summary from "./summary.js";
 import * as tabs from "./tabs.js";
 import * as theme from "./theme.js";
 import * as tools from "./map/tools.js";
-import * as watch from "./watch_banner.js";
 import { live as liveTracks, replayed, shown_s } from "./clock.js";
 import { byId, text } from "./dom.js";
 
@@ -31,7 +30,6 @@ tabs.start();
 replay.start();
 banner.start();
 preparation.start();
-watch.start();
 sites.start();
 summary.start();
 on(["site"], () => {

@@ -1,6 +1,6 @@
 /** Plays a recording: fetches its states ahead of time, and moves the shown moment. */
 
-import { changed, on, select, state } from "./store.js";
+import { changed, on, select, siteOf, state } from "./store.js";
 import { recordedEvents, recordedStates, recording } from "./api.js";
 import { replayed } from "./clock.js";
 import { backToLive } from "./live.js";
@@ -41,7 +41,7 @@ export async function open(name) {
   const player = { name, start_unix_s: found.start_unix_s, duration_s, fixes, at_s: 0, playing: true, speed: 1 };
   state.player = { ...player, waiting: true, error: fixes.length ? "" : "There are no fixes in it.", events: null };
   state.mode = "replay";
-  state.site = found.site?.site ?? null;
+  state.site = siteOf(found.site);
   state.simulated = found.site?.simulated ?? false;
   state.zones = found.zones ?? [];
   replayed.clear();

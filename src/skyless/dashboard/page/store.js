@@ -104,6 +104,11 @@ export function healthAge_s(kind, name) {
   return age === undefined ? Infinity : age + (performance.now() - state.health.atMs) / 1e3;
 }
 
+/** The site of a message, with the outline that stands beside it there; null without one. */
+export function siteOf(message) {
+  return message ? { ...message.site, outline_m: message.outline_m } : null;
+}
+
 /** Select one tag, anchor or zone, or with null none; its tab opens, also where it is selected already. */
 export function select(kind, id) {
   const next = { tag: null, anchor: null, zone: null };

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import msgspec
-from msgspec import Struct
+from msgspec import UNSET, Struct
 from msgspec.structs import replace
 
 from skyless.air.reception import Reception
@@ -444,7 +444,7 @@ class SurveyNode:
         if old is not None and site_digest(old.site) == site_digest(before):
             earlier = (old.before, *old.earlier)[:_EARLIER_KEPT]
         unix_s = time.time()
-        self._placement = PlacementMessage(unix_s, site_digest(before), saved.site, earlier)
+        self._placement = PlacementMessage(unix_s, site_digest(before), replace(saved.site, outline_m=UNSET), earlier)
         if self.link is not None:
             self.link.publish(placement_topic(self._settings.site_id), self._placement, qos=1, retain=True)
         self._running = None  # until the anchors publish it

@@ -7,7 +7,7 @@ import { metres } from "../format.js";
 import { surveyShown } from "../survey/model.js";
 import { height_m, moving, plan } from "../survey/plan.js";
 import { groundHeight } from "./floors.js";
-import { drawInMetres, px, py, roundLength, toSite, toX, toY, view } from "./view.js";
+import { drawInMetres, isNarrow, px, py, roundLength, toSite, toX, toY, view } from "./view.js";
 
 /** @type {{image: HTMLImageElement, x_m: number, y_m: number, width_m: number, height_m: number}|null} */
 export let floor = null;
@@ -157,15 +157,22 @@ export function drawWalls(context, ground_m) {
   context.lineCap = "butt";
 }
 
-/** Draw the scale bar, lower right. */
+/** The box of the scale bar, lower right. */
+export function scaleBox() {
+  const width = roundLength(isNarrow() ? 100 : 130) * view.scale + 20;
+  return { left: view.width - 6 - width, top: view.height - 48, width, height: 32 };
+}
+
+/** Draw the scale bar. */
 export function drawScale(context) {
-  const length_m = roundLength(130);
-  const width = length_m * view.scale;
+  const box = scaleBox();
+  const width = box.width - 20;
+  const length_m = width / view.scale;
   const right = view.width - 16;
   const y = view.height - 26;
-  const label = length_m >= 1 ? `${length_m} m` : `${Math.round(length_m * 100)} cm`;
+  const label = length_m >= 1 ? `${Math.round(length_m)} m` : `${Math.round(length_m * 100)} cm`;
   context.fillStyle = faint(palette.surface, 0.85);
-  context.fillRect(right - width - 10, y - 22, width + 20, 32);
+  context.fillRect(box.left, box.top, box.width, box.height);
   context.strokeStyle = palette.text;
   context.lineWidth = 1.5;
   context.beginPath();

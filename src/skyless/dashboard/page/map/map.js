@@ -113,7 +113,7 @@ export function start() {
   let shown = null;
   on(["site", "mode"], () => {
     loadFloor(() => (view.touched ? redraw() : fitAll()));
-    const key = JSON.stringify([state.mode, state.site?.name, state.site?.anchors]);
+    const key = JSON.stringify([state.mode, state.site?.name, state.site?.anchors, state.site?.outline_m]);
     if (key === shown || (state.mode === "live" && !state.site)) return; // no site yet: after a reconnect the same may come
     shown = key;
     fitAll();

@@ -1,8 +1,9 @@
-/** The outline of the room: walls that close, else the floor plan, else the area between the anchors; named as what it is. */
+/** The outline of the room: the site's, else walls that close, the floor plan, or the area between the anchors; named as what it is. */
 
 import { state } from "../store.js";
 import { faint, palette } from "../theme.js";
 import { label } from "./anchors.js";
+import { scaleBox } from "./floor.js";
 import { surveyShown } from "../survey/model.js";
 import { toX, toY, view } from "./view.js";
 
@@ -22,7 +23,7 @@ export function roomOutline(plan = []) {
 }
 
 function find(plan) {
-  const walls = closedWalls(state.site?.walls ?? []);
+  const walls = state.site?.outline_m ?? closedWalls(state.site?.walls ?? []);
   if (walls) return { kind: "room", name: "room", corners: walls };
   if (plan.length === 2) {
     const [[x1, y1], [x2, y2]] = plan;
@@ -134,6 +135,10 @@ export function drawRoom(context, plan, ground_m) {
   context.font = "11px system-ui, sans-serif";
   context.textAlign = "left";
   context.textBaseline = "top";
-  const [left, bottom] = [toX(Math.min(...xs), Math.min(...ys)), toY(Math.min(...xs), Math.min(...ys))];
-  label(context, `${outline.name}, ${size.join(" × ")}`, left, bottom + below, palette.muted);
+  const words = `${outline.name}, ${size.join(" × ")}`;
+  const scale = scaleBox();
+  const top = toY(Math.min(...xs), Math.min(...ys)) + below;
+  const covered = top + 14 > scale.top && top < scale.top + scale.height;
+  const last = (covered ? scale.left : view.width) - context.measureText(words).width - 6;
+  label(context, words, Math.max(4, Math.min(toX(Math.min(...xs), Math.min(...ys)), last)), top, palette.muted);
 }

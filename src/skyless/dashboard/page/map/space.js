@@ -11,6 +11,8 @@ import { foreshortening, isNarrow, toX, toY, view } from "./view.js";
 /** About how many lines of the grid cross the longer side, and how many heights are named. */
 const LINES = 12;
 const HEIGHTS = 3;
+/** Pixels from one name on the scale of heights to the next, at least. */
+const NAME_HEIGHT = 12;
 /** Above the highest anchor the scale of heights goes on this far. */
 const ABOVE_M = 0.5;
 
@@ -94,7 +96,8 @@ function heights(context, corners) {
   if (foreshortening().height < 0.1) return;
   const [x, y] = corners.reduce((best, corner) => (toX(...corner) < toX(...best) ? corner : best));
   const top = highest();
-  const step = roundStep(top / HEIGHTS) || 1;
+  const apart_m = NAME_HEIGHT / (foreshortening().height * view.scale);
+  const step = Math.max(roundStep(top / HEIGHTS) || 1, roundStep(2.5 * apart_m)); // 1, 2, 5: at least apart_m
   const left = toX(x, y);
   context.strokeStyle = palette.wall;
   context.lineWidth = 1.25;

@@ -123,6 +123,7 @@ export function fit(site, zones, further, scaleShown = true, replayed = false) {
   const corners = [...zones.flatMap((zone) => zone.polygon_m), ...further];
   for (const anchor of site?.anchors ?? []) corners.push([anchor.x_m, anchor.y_m, anchor.z_m]);
   for (const wall of site?.walls ?? []) corners.push([wall.x1_m, wall.y1_m], [wall.x2_m, wall.y2_m]);
+  corners.push(...(site?.outline_m ?? []));
   if (!corners.length) corners.push([-5, -4], [5, 4]);
   Object.assign(view, { x_m: 0, y_m: 0, scale: 1 });
   const [middle_x, middle_y] = [view.width / 2, view.height / 2];

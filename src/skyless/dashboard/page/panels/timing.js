@@ -29,7 +29,7 @@ export function start(panel) {
   const picture = h("div", { id: "phases" });
   const empty = h("p", { class: "empty" });
   const caption = h("p", { class: "count" });
-  const ether = facts(["Transmissions", "Missed now", "Late", "Stalls", "Overruns", "Simulated time"]);
+  const ether = facts(["Transmissions", "Missed now", "Missed in all", "Behind real time", "Receptions lost", "Simulated time"]);
   const etherBox = h("section", { hidden: true }, h("h2", {}, "Emulated radio channel"), ether.element);
   parts = { picture, empty, caption, ether, etherBox };
   panel.append(h("h2", {}, "Superframe and positioning phases"), caption, picture, empty, about, etherBox);
@@ -148,9 +148,9 @@ function showEther() {
   parts.ether.show({
     Transmissions: number(ether.transmissions),
     "Missed now": `${number(100 * (ether.missed_share ?? 0), 1)} %`,
-    Late: number(ether.late),
-    Stalls: number(ether.stalls),
-    Overruns: number(ether.overruns),
+    "Missed in all": number(ether.late),
+    "Behind real time": `${number(ether.stalls)} times`,
+    "Receptions lost": number(ether.overruns),
     "Simulated time": duration(ether.simulated_s),
   });
 }

@@ -30,9 +30,8 @@ const NO_FACTS = {
   gauge: null,
 };
 
-/** When the last messages came, less their age then, by `performance.now()`. */
+/** When the survey program's last message came, less its age then, by `performance.now()`. */
 let surveyMs = 0;
-let watchMs = 0;
 /** @type {{facts: any, sinceMs: number}|null} facts given here that no message shows yet */
 let given = null;
 /** @type {any} where the floor plan lies, as far as this page's user has said so */
@@ -53,9 +52,8 @@ export function receiveSurvey(message, old_s) {
   changed("survey");
 }
 
-/** Keep a message of the watch, which was so old when the server sent it. */
-export function receiveWatch(message, old_s) {
-  watchMs = performance.now() - 1e3 * (old_s ?? 0);
+/** Keep a message of the watch. */
+export function receiveWatch(message) {
   state.watch = message;
   changed("watch");
 }
@@ -63,11 +61,6 @@ export function receiveWatch(message, old_s) {
 /** Age of the survey program's last message; null without one. */
 export function age_s() {
   return state.survey ? (performance.now() - surveyMs) / 1e3 : null;
-}
-
-/** Age of the watch's last message; null without one. */
-export function watchAge_s() {
-  return state.watch ? (performance.now() - watchMs) / 1e3 : null;
 }
 
 /** Whether the survey program is there: "fresh", "old", or "none". */

@@ -2,20 +2,12 @@
 
 import { state } from "../store.js";
 import { length, sentence, timeOfDay } from "../format.js";
-import { watchAge_s } from "./model.js";
 
-/** After this long without a message the watch is not running. */
-const MAX_AGE_S = 60;
 const MARKS = { moved: "moved", delay: "delay changed", link: "link blocked", check: "check" };
 
 /** The findings on the live site; none in a recording. */
 export function findings() {
   return state.mode === "live" ? (state.watch?.findings ?? []) : [];
-}
-
-/** Whether the findings are old, as the watch does not report any more. */
-export function outdated() {
-  return (watchAge_s() ?? 0) > MAX_AGE_S;
 }
 
 /** The finding that concerns an anchor most; undefined without one. */
