@@ -13,6 +13,7 @@ from msgspec import Struct
 
 from skyless.dashboard.app import PAGE_TIMEOUT_S, Services, make_app
 from skyless.dashboard.guard import AccessRules
+from skyless.dashboard.wanted import MAX_REQUEST_BYTES
 from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Link
@@ -23,7 +24,6 @@ from skyless.nodes.process import ending_signals
 PORT: Final = 8080
 _MORE_PORTS: Final = 50
 _PING_S: Final = 5.0
-_MAX_PING_BYTES: Final = 1024
 _GRACE_S: Final = 0.4
 _SEND_BUFFER_BYTES: Final = 262_144
 """Data for a slow page that waits in the kernel and is sent before anything newer."""
@@ -100,7 +100,7 @@ async def serve(
         ws_per_message_deflate=False,  # on the same machine it would only cost time
         ws_ping_interval=_PING_S,
         ws_ping_timeout=PAGE_TIMEOUT_S,
-        ws_max_size=_MAX_PING_BYTES,
+        ws_max_size=MAX_REQUEST_BYTES,
         timeout_graceful_shutdown=1,
     )
     server = _Server(config)
