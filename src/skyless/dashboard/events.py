@@ -38,13 +38,17 @@ class Event(Struct, frozen=True):
     """One line of the list."""
 
     serial: int
-    """Counts the events from 1."""
+    """Counts the events from 1; of a line of several the last."""
     unix_s: float
     kind: Kind
     level: Severity
     name: str
     """What it is about, such as ``tag/t1``, ``anchor/3`` or ``recorder/demo``; empty for the site."""
     text: str
+    count: int = 1
+    """Consecutive changes of the master are one line, with their number and the last of them."""
+    first: int = 0
+    """Serial of the first event of the line."""
 
 
 class _Alert:
@@ -80,8 +84,8 @@ class EventLog:
 
     def since(self, serial: int = 0) -> list[Event]:
         """Events after a serial, the oldest first."""
-        new = self.serial - serial
-        return [] if new <= 0 else list(self._events)[-new:]
+        new = min(self.serial - serial, len(self._events))
+        return [] if new <= 0 else [event for event in list(self._events)[-new:] if event.serial > serial]
 
     # Nodes
 
@@ -227,7 +231,11 @@ class EventLog:
 
     def _add(self, now_s: float, kind: Kind, level: Severity, name: str, text: str) -> None:
         self.serial += 1
-        self._events.append(Event(self.serial, now_s + self.unix_offset_s, kind, level, name, text))
+        count, first = 1, self.serial
+        if kind == "master" and self._events and self._events[-1].kind == kind:
+            last = self._events.pop()
+            count, first = last.count + 1, last.first
+        self._events.append(Event(self.serial, now_s + self.unix_offset_s, kind, level, name, text, count, first))
 
 
 def _first(condition: Condition) -> tuple[str, str]:

@@ -186,7 +186,9 @@ const handlers = {
   },
   log({ events }) {
     const last = state.log.at(-1)?.serial ?? 0;
-    state.log = [...state.log, ...events.filter((event) => event.serial > last)].slice(-MAX_LOGGED);
+    const newer = events.filter((event) => event.serial > last);
+    const replaced = new Set(newer.filter(({ count }) => count > 1).map(({ first }) => first));
+    state.log = [...state.log.filter(({ first }) => !replaced.has(first)), ...newer].slice(-MAX_LOGGED);
     changed("log");
   },
   health({ whole, anchors, tags, ether, nodes, ages, conditions, waiting }) {
