@@ -25,6 +25,8 @@ PORT: Final = 8080
 _MORE_PORTS: Final = 50
 _PING_S: Final = 5.0
 _GRACE_S: Final = 0.4
+REQUEST_TIMEOUT_S: Final = 10.0
+"""A connection that has not sent the head of its first request by then is ended; uvicorn knows no such limit."""
 _SEND_BUFFER_BYTES: Final = 262_144
 """Data for a slow page that waits in the kernel and is sent before anything newer."""
 
@@ -104,7 +106,8 @@ async def serve(
         timeout_graceful_shutdown=1,
     )
     server = _Server(config)
-    work = [asyncio.create_task(_run_link(services, address, site_id)), asyncio.create_task(services.live.run())]
+    jobs = (_run_link(services, address, site_id), services.live.run(), server.end_unfinished())
+    work = [asyncio.create_task(job) for job in jobs]
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, *ending_signals()):
         loop.add_signal_handler(number, _stop, server, services)
@@ -137,6 +140,21 @@ class _Server(uvicorn.Server):
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
         yield
+
+    async def end_unfinished(self, timeout_s: float = REQUEST_TIMEOUT_S) -> None:
+        """End connections without a request, until cancelled."""
+        seen_s: dict[object, float] = {}
+        while True:
+            await asyncio.sleep(timeout_s / 4)
+            now_s = asyncio.get_running_loop().time()
+            connections = list(self.server_state.connections)
+            seen_s = {one: seen_s.get(one, now_s) for one in connections}
+            for connection in connections:
+                transport = getattr(connection, "transport", None)
+                # A connection of HTTP has no cycle before its first request; one of a WebSocket is of another class.
+                unfinished = getattr(connection, "cycle", self) is None
+                if unfinished and transport is not None and now_s - seen_s[connection] >= timeout_s:
+                    transport.abort()
 
     def drop_connections(self) -> None:
         """Close connections that have not ended."""
