@@ -63,6 +63,8 @@ class Times:
 class Wire:
     """In the place of a link: keeps what is published, and echoes it as a broker does."""
 
+    unread_s = 0.0
+
     def __init__(self):
         self.published = []
         self.forgotten = []

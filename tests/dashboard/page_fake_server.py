@@ -21,6 +21,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocketDisconnect
 
 import skyless
+from skyless.dashboard.state import SILENT_S
 
 PAGE = Path(skyless.__file__).parent / "dashboard" / "page"
 RECORDED_S = 90.0
@@ -275,7 +276,13 @@ class FakeServer:
         ages = {"anchors": {str(n): 20.0 if n == 8 and old else 0.1 for n in range(1, 9)}, "ether": {"air": 0.1},
                 "tags": dict.fromkeys(made_up.names(self.tags), 0.1)}  # fmt: skip
         nodes = made_up.nodes()
-        return {"type": "health", "anchors": anchors, "tags": tags, "ether": ether, "nodes": nodes, "ages": ages}
+        conditions = {}
+        for health in anchors:
+            name = str(health["anchor"])
+            here = health["synchronised"] or health["role"] == "master"
+            conditions[name] = "bad" if ages["anchors"][name] > SILENT_S else "good" if here else "warn"
+        known = {"anchors": anchors, "tags": tags, "ether": ether, "nodes": nodes, "ages": ages}
+        return {"type": "health", "whole": True, "conditions": conditions, "waiting": [], **known}
 
     async def _pongs(self, websocket, lock):
         while True:

@@ -102,6 +102,28 @@ def test_a_takeover_names_both_masters():
     assert texts(log) == ["anchor 2 is the master now, after anchor 1"]
 
 
+def test_changes_of_the_master_in_a_row_are_one_line_with_their_number():
+    log, read = EventLog(), []
+    for k in range(400):
+        before = log.serial
+        master = 1 + k % 3
+        for anchor in (1, 2, 3):
+            log.on_health("anchor", str(anchor), anchor_health(anchor, NOW, master, k), NOW + k)
+        read += log.since(before)
+    (event,) = log.since()
+    assert (event.count, event.first, event.serial, event.unix_s) == (399, 1, 399, NOW + 399)
+    assert event.text == "anchor 1 is the master now, after anchor 3"
+    assert (read[-1], {one.first for one in read}) == (event, {1}), "readers replace the line by its first serial"
+    log.on_status(status("tag", "t1", unix_s=NOW + 400), NOW + 400)
+    for anchor in (1, 2, 3):
+        log.on_health("anchor", str(anchor), anchor_health(anchor, NOW, 2, 401), NOW + 401)
+    assert [(one.kind, one.count, one.first) for one in log.since()] == [
+        ("master", 399, 1),
+        ("tag", 1, 400),
+        ("master", 1, 401),
+    ]
+
+
 def test_alerts_begin_and_end_and_are_not_repeated_often():
     log = EventLog()
     for k in range(40):

@@ -4,8 +4,12 @@ import json
 
 import pytest
 from dashboard_builders import fix, status, truth
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
 
-from skyless.dashboard.state import EXPIRY_S, MAX_NAMES, SiteState
+from skyless.dashboard.state import EXPIRY_S, GONE_S, SiteState
+from skyless.dashboard.wanted import MAX_HEALTHS, Sent, Wanted
 from skyless.mqtt.messages import AnchorHealth, Counters, EtherHealth
 
 POSITION = ("name", "x_m", "y_m", "z_m", "vx", "vy")
@@ -152,14 +156,21 @@ def anchor_health(anchor):
     )
 
 
+def health(state, sent=None):
+    return json.loads(state.new_health(sent or Sent()))
+
+
 def test_health_holds_the_newest_of_every_node():
     state = SiteState()
-    assert json.loads(state.health_message({}, 1.0)) == {
+    assert health(state) == {
         "type": "health",
+        "whole": True,
         "anchors": [],
         "tags": [],
         "ether": None,
         "nodes": [],
+        "conditions": {},
+        "waiting": [],
         "dropped": {},
         "ages": {"anchors": {}, "tags": {}, "ether": {}},
     }
@@ -168,7 +179,9 @@ def test_health_holds_the_newest_of_every_node():
     state.add_health("air", EtherHealth(0.0, 1.0, 5, 0, {}, {}, 0, 0), 1.0)
     state.add_status(status())
     state.add_status(status(online=False))
-    message = json.loads(state.health_message({"fix": 3}, 3.5))
+    state.dropped["fix"] = 3
+    state.now_s = 3.5
+    message = health(state)
     assert [anchor["anchor"] for anchor in message["anchors"]] == [2]
     assert message["ether"]["transmissions"] == 5
     assert [(node["name"], node["online"]) for node in message["nodes"]] == [("t1", False)]
@@ -176,15 +189,102 @@ def test_health_holds_the_newest_of_every_node():
     assert message["ages"] == {"anchors": {"2": 2.5}, "tags": {}, "ether": {"air": 2.5}}
 
 
-def test_old_messages_expire_and_invented_names_do_not_fill_the_memory():
+def test_old_messages_expire():
     state = SiteState()
     state.add_fix(fix("old"), 0.0, 1000.0)
     state.add_health("1", anchor_health(1), 0.0)
-    for k in range(MAX_NAMES + 50):
-        state.add_fix(fix(f"t{k}"), 1.0, 1000.0)
-        state.add_status(status(name=f"t{k}"))
-    assert len(rows(state)) == MAX_NAMES
-    assert len(state.statuses) == MAX_NAMES
+    state.add_fix(fix("new"), 1.0, 1000.0)
     state.expire(EXPIRY_S + 0.5)
-    assert "old" not in {row["name"] for row in rows(state)}
-    assert json.loads(state.health_message({}, 1.0))["anchors"] == []
+    assert {row["name"] for row in rows(state)} == {"new"}
+    assert health(state)["anchors"] == []
+
+
+def test_a_page_gets_the_health_that_is_new_to_it():
+    state, sent = SiteState(), Sent()
+    for name in ("1", "2"):
+        state.add_health(name, anchor_health(int(name)), 1.0)
+        state.add_status(status("anchor", name))
+    state.judge(1.0, blind=False)
+    first = health(state, sent)
+    assert (first["whole"], len(first["anchors"]), len(first["nodes"])) == (True, 2, 2)
+    assert first["conditions"] == {"1": "good", "2": "good"}
+    state.add_health("2", anchor_health(2), 4.0)
+    state.add_status(status("anchor", "1", online=False))
+    state.judge(4.0, blind=False)
+    then = health(state, sent)
+    assert (then["whole"], [one["anchor"] for one in then["anchors"]]) == (False, [2])
+    assert ([node["name"] for node in then["nodes"]], then["conditions"]) == (["1"], {"1": "bad"})
+    state.judge(4.0, blind=False)
+    nothing = health(state, sent)
+    assert (nothing["anchors"], nothing["nodes"], nothing["conditions"], nothing["ages"]["anchors"]) == ([], [], {}, {})
+
+
+def test_silence_makes_an_anchor_offline_only_while_the_server_can_hear():
+    state = SiteState()
+    state.add_health("1", anchor_health(1), 0.0)
+    for now_s, blind, kind in ((3.0, False, "good"), (9.0, True, "good"), (9.5, False, "bad"), (10.0, True, "bad")):
+        state.judge(now_s, blind=blind)
+        assert health(state)["conditions"] == {"1": kind}
+
+
+def test_of_many_anchors_a_page_gets_all_conditions_and_the_healths_that_it_names():
+    state, sent = SiteState(), Sent()
+    for n in range(MAX_HEALTHS + 1):
+        state.add_health(str(n), replace(anchor_health(n), role="master" if n == 7 else "anchor"), 0.0)
+    state.judge(0.0, blind=False)
+    first = health(state, sent)
+    assert len(first["conditions"]) == MAX_HEALTHS + 1
+    assert [one["anchor"] for one in first["anchors"]] == [7]
+    sent.wanted = Wanted(anchors=("9", "no such"))
+    assert [one["anchor"] for one in health(state, sent)["anchors"]] == [9]
+    assert health(state, sent)["anchors"] == []
+    state.add_health("9", anchor_health(9), 1.0)
+    state.add_health("8", anchor_health(8), 1.0)
+    assert [one["anchor"] for one in health(state, sent)["anchors"]] == [9]
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.lists(st.tuples(st.integers(0, 11), st.integers(0, 9)), max_size=8),
+            st.none() | st.tuples(st.integers(0, 9), st.integers(0, 9)),
+            st.sets(st.integers(0, 14), max_size=3),
+            st.sampled_from(["", "t1", "x"]),
+            st.integers(1, 12),
+        ),
+        max_size=12,
+    )
+)
+def test_a_page_always_has_the_newest_fix_of_just_the_tags_that_it_was_given(steps):
+    """Whatever moves, and whatever it asks for; those that it names come first, and others only from its view."""
+    state, sent = SiteState(), Sent()
+    newest, shown = {}, {}
+    for serial, (moves, view, named, text, rows_wanted) in enumerate(steps):
+        state.now_s = float(serial)
+        for tag, x in moves:
+            state.add_fix(fix(f"t{tag}", position_m=(float(x), 0.0, 1.0)), state.now_s, 1000.0)
+            newest[f"t{tag}"] = float(x), state.now_s
+        sent.wanted = Wanted(
+            None if view is None else (min(view), -1.0, max(view), 1.0),
+            text,
+            tuple(f"t{n}" for n in named),
+            (),
+            rows_wanted,
+        )
+        message = json.loads(state.new_state(sent) or '{"tags": []}')
+        for name in message.get("left", []):
+            shown.pop(name, None)
+        shown |= {row[0]: row[1] for row in message["tags"]}
+        assert shown == {name: newest[name][0] for name in shown}
+        if len(newest) <= rows_wanted:
+            assert shown.keys() == newest.keys()
+            continue
+        assert len(shown) <= rows_wanted
+        wished = {f"t{n}" for n in named} & newest.keys()
+        assert wished <= shown.keys() or len(shown) == rows_wanted
+        low, high = (0.0, 9.0) if view is None else (min(view), max(view))
+        for name in shown.keys() - wished:
+            assert low <= newest[name][0] <= high or (text and text in name)
+        if message["tags"]:
+            inside = [x for x, now_s in newest.values() if low <= x <= high and state.now_s - now_s < GONE_S]
+            assert (message["of"], message["inside"]) == (len(newest), len(inside))

@@ -195,8 +195,7 @@ def test_a_dead_anchor_has_no_figures(hall):
     condition = """async () => {
       const { condition } = await import("/page/map/anchors.js");
       const { health } = skyless.state;
-      health.nodes.push({ kind: "anchor", name: "8", online: true });
-      health.anchors.delete(8); // as the server drops what is old
+      health.conditions.delete(8); // as the server drops what is old
       return condition(8);
     }"""
     assert page.evaluate(condition) == "unknown"

@@ -25,6 +25,7 @@ from skyless.dashboard.overlays import KINDS, NoOverlayError, Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
 from skyless.dashboard.site_survey import NoResultError
 from skyless.dashboard.sites import LiveSites
+from skyless.dashboard.wanted import Wanted
 from skyless.errors import SkylessError
 from skyless.mqtt.survey_facts import BadFactsError
 from skyless.site.image import image_size
@@ -268,11 +269,15 @@ async def _live(socket: WebSocket) -> None:
         await socket.close(_TRY_LATER, str(error))
         return
 
-    def pong() -> None:
+    def receive(text: str) -> None:
         live.keep_page(page)
-        page.replace("pong", b'{"type":"pong"}')
+        wanted = None if text == "ping" else Wanted.read(text)
+        if text == "ping":
+            page.replace("pong", b'{"type":"pong"}')
+        elif wanted is not None:
+            page.ask(wanted)
 
-    reading = asyncio.create_task(_read(socket, page.close, pong))
+    reading = asyncio.create_task(_read(socket, page.close, receive))
     try:
         while not page.closed:
             messages = await page.drain(live.state)
@@ -287,11 +292,10 @@ async def _live(socket: WebSocket) -> None:
         reading.cancel()
 
 
-async def _read(socket: WebSocket, close: Callable[[], None], pong: Callable[[], None]) -> None:
-    """Answer pings until the page closes."""
+async def _read(socket: WebSocket, close: Callable[[], None], receive: Callable[[str], None]) -> None:
+    """Hand over what the page sends until it closes."""
     try:
         while True:
-            if await socket.receive_text() == "ping":
-                pong()
+            receive(await socket.receive_text())
     except (WebSocketDisconnect, KeyError, RuntimeError):
         close()

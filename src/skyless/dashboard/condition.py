@@ -18,10 +18,12 @@ from skyless.dashboard.reasons import (
     Reason,
     alert_reasons,
     anchor_reasons,
+    behind_reason,
     broker_reason,
     busy_reason,
     fix_reasons,
     late_reason,
+    left_out_reason,
     master_reason,
     multipath_reason,
     rank,
@@ -48,6 +50,11 @@ class Condition(Struct, frozen=True):
     latency_p50_s: float | None
     latency_p99_s: float | None
     """From a frame's end to the arrival of its fix at the page's server, of all tags in the last ten seconds."""
+    tags: int = 0
+    """How many are known."""
+    tags_with_fix: int = 0
+    anchors: int = 0
+    """Of the site, and others that report."""
 
 
 class ConditionMonitor:
@@ -68,11 +75,13 @@ class ConditionMonitor:
         watch: WatchMessage | None = None,
         watch_age_s: float | None = None,
         used_share: float | None = None,
+        unread_s: float = 0.0,
     ) -> Condition:
         """The condition now.
 
         ``lag_s`` is by how much the server's own work was delayed since the last evaluation, ``used_share`` the share
-        of its computer's processors that is in use, None where it is not known.
+        of its computer's processors that is in use, None where it is not known; ``unread_s`` is for how long messages
+        have waited in its own queue.
         """
         evidence = self.evidence
         ages = evidence.ages.least_ages_s()
@@ -83,18 +92,20 @@ class ConditionMonitor:
                 return Condition("waiting", "waiting for the broker", (), None, None)
             reason = broker_reason()
             return Condition(reason.level, reason.text, (reason,), None, None)
-        for reason in (*self._find(ages, now_s, lag_s, used_share), *watch_reasons(watch, watch_age_s)):
+        for reason in (*self._find(ages, now_s, lag_s, used_share, unread_s), *watch_reasons(watch, watch_age_s)):
             self._hold(reason, now_s)
         self._held = {kind: held for kind, held in self._held.items() if now_s - held[0] < HOLD_S}
         tags = evidence.of("tag")
         for _, tag in tags:
             tag.alert = None
         reasons = tuple(sorted((reason for _, reason in self._held.values()), key=rank))
+        with_fix = sum(tag.has_fix(now_s) for _, tag in tags)
+        figures = *latencies, len(tags), with_fix, evidence.roster.size("anchor")
         if reasons:
-            return Condition(reasons[0].level, reasons[0].text, reasons, *latencies)
-        if any(tag.has_fix(now_s) for _, tag in tags):
-            return Condition("good", "", (), *latencies)
-        return Condition("waiting", self._awaited(), (), *latencies)
+            return Condition(reasons[0].level, reasons[0].text, reasons, *figures)
+        if with_fix:
+            return Condition("good", "", (), *figures)
+        return Condition("waiting", self._awaited(), (), *figures)
 
     def is_blind(self, now_s: float) -> bool:
         """Whether messages may be missing: the broker is not connected, or the server itself was delayed."""
@@ -108,13 +119,21 @@ class ConditionMonitor:
         self._held[reason.kind] = now_s, reason
 
     def _find(
-        self, ages: dict[str, tuple[float, float]], now_s: float, lag_s: float, used_share: float | None
+        self,
+        ages: dict[str, tuple[float, float]],
+        now_s: float,
+        lag_s: float,
+        used_share: float | None,
+        unread_s: float,
     ) -> Iterable[Reason]:
         evidence = self.evidence
+        behind = behind_reason(ages, unread_s)
         for reason in (
+            behind,
             slow_reason(evidence, now_s, lag_s),
             busy_reason(evidence, used_share) if evidence.nodes else None,
-            late_reason(evidence, ages),
+            late_reason(evidence, ages) if behind is None else None,
+            left_out_reason(evidence, now_s),
             master_reason(evidence, now_s),
             multipath_reason(evidence, now_s),
         ):
@@ -122,7 +141,7 @@ class ConditionMonitor:
                 yield reason
         yield from alert_reasons(evidence)
         yield from authentication_reasons(evidence, now_s)
-        if lag_s > LAG_S:
+        if lag_s > LAG_S or behind is not None:
             self._blind_until_s = now_s + 2 * EVALUATION_S  # what has arrived meanwhile is still to be read
         if not self.is_blind(now_s):
             yield from fix_reasons(evidence, now_s)

@@ -12,14 +12,11 @@ from msgspec import Struct
 from skyless.dashboard.condition import Condition
 from skyless.dashboard.evidence import ALERT_WORDS, ALERTS, Health
 from skyless.dashboard.leader import LeaderTracker
-from skyless.dashboard.state import MAX_NAMES
+from skyless.dashboard.state import SILENT_S
 from skyless.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, SurveyMessage, WatchMessage
 
 MAX_LOGGED: Final = 500
 """Events that are kept; the oldest are dropped."""
-
-SILENT_S: Final = 3.5
-"""A node that reported once a second and has not for this long is offline, whatever its status says."""
 
 ALERT_END_S: Final = 1.0
 """An alert has ended when no fix has had it for this long."""
@@ -41,13 +38,17 @@ class Event(Struct, frozen=True):
     """One line of the list."""
 
     serial: int
-    """Counts the events from 1."""
+    """Counts the events from 1; of a line of several the last."""
     unix_s: float
     kind: Kind
     level: Severity
     name: str
     """What it is about, such as ``tag/t1``, ``anchor/3`` or ``recorder/demo``; empty for the site."""
     text: str
+    count: int = 1
+    """Consecutive changes of the master are one line, with their number and the last of them."""
+    first: int = 0
+    """Serial of the first event of the line."""
 
 
 class _Alert:
@@ -83,8 +84,8 @@ class EventLog:
 
     def since(self, serial: int = 0) -> list[Event]:
         """Events after a serial, the oldest first."""
-        new = self.serial - serial
-        return [] if new <= 0 else list(self._events)[-new:]
+        new = min(self.serial - serial, len(self._events))
+        return [] if new <= 0 else [event for event in list(self._events)[-new:] if event.serial > serial]
 
     # Nodes
 
@@ -92,8 +93,6 @@ class EventLog:
         """A node has come online or gone."""
         key = status.kind, status.name
         before = self._statuses.get(key)
-        if before is None and len(self._statuses) >= MAX_NAMES:
-            return
         self._statuses[key] = status
         kept = now_s + self.unix_offset_s - status.unix_s >= _KEPT_S
         changed = before is not None and (
@@ -119,8 +118,7 @@ class EventLog:
         if key in self._silent:
             self._silent.discard(key)
             self._add_presence(key, True, now_s, "reports again")
-        if key in self._reported or len(self._reported) < MAX_NAMES:
-            self._reported[key] = now_s
+        self._reported[key] = now_s
         if isinstance(health, AnchorHealth):
             before = self._leader.leader
             leader = self._leader.update(health, now_s)
@@ -167,8 +165,6 @@ class EventLog:
         if ALERTS.get(fix.alert, 0) == 0:
             return
         if alert is None:
-            if len(self._alerts) >= MAX_NAMES:
-                return
             alert = self._alerts[fix.tag] = _Alert()
         alert.seen_s = now_s
         if alert.alert is not None and ALERTS[fix.alert] <= ALERTS[alert.alert]:
@@ -235,7 +231,11 @@ class EventLog:
 
     def _add(self, now_s: float, kind: Kind, level: Severity, name: str, text: str) -> None:
         self.serial += 1
-        self._events.append(Event(self.serial, now_s + self.unix_offset_s, kind, level, name, text))
+        count, first = 1, self.serial
+        if kind == "master" and self._events and self._events[-1].kind == kind:
+            last = self._events.pop()
+            count, first = last.count + 1, last.first
+        self._events.append(Event(self.serial, now_s + self.unix_offset_s, kind, level, name, text, count, first))
 
 
 def _first(condition: Condition) -> tuple[str, str]:

@@ -7,7 +7,7 @@ from typing import Final
 
 from skyless.dashboard.lateness import FixAges
 from skyless.dashboard.leader import LeaderTracker
-from skyless.dashboard.state import MAX_NAMES
+from skyless.dashboard.roster import Roster
 from skyless.mqtt.messages import AnchorHealth, EtherHealth, FixMessage, StatusMessage, TagHealth
 from skyless.site.model import Site
 
@@ -85,6 +85,8 @@ class Evidence:
         self.site: Site | None = None
         self.nodes: dict[tuple[str, str], Node] = {}
         """By kind and name."""
+        self.roster = Roster()
+        self._sorted: dict[str, list[tuple[str, Node]]] = {}
         self.ages = FixAges()
         self.leader = LeaderTracker()
 
@@ -98,6 +100,13 @@ class Evidence:
         if self.site is None:
             self.ready_s = now_s
         self.site = site
+        self.site_anchors()
+
+    def site_anchors(self) -> list[str]:
+        """The names of the site's anchors that are taken in."""
+        site = self.site
+        ids = [] if site is None else [*(a.id for a in site.anchors), *(a.id for a in site.unplaced)]
+        return [name for name in map(str, ids) if self.roster.admits("anchor", name)]
 
     def add_status(self, status: StatusMessage, now_s: float) -> None:
         """Whether a node is online."""
@@ -144,8 +153,11 @@ class Evidence:
 
     def of(self, kind: str) -> list[tuple[str, Node]]:
         """Names and nodes of a kind, in their natural order."""
-        found = [(name, node) for (of_kind, name), node in self.nodes.items() if of_kind == kind]
-        return sorted(found, key=lambda item: (len(item[0]) if item[0].isdecimal() else 1 << 30, item[0]))
+        if kind not in self._sorted:
+            found = [(name, node) for (of_kind, name), node in self.nodes.items() if of_kind == kind]
+            found.sort(key=lambda item: (len(item[0]) if item[0].isdecimal() else 1 << 30, item[0]))
+            self._sorted[kind] = found
+        return self._sorted[kind]
 
     def in_grace(self, now_s: float, node: Node | None = None) -> bool:
         """Whether the connection, or a node, is too young to be complete."""
@@ -158,6 +170,7 @@ class Evidence:
 
     def _node(self, kind: str, name: str) -> Node | None:
         node = self.nodes.get((kind, name))
-        if node is None and len(self.nodes) < 2 * MAX_NAMES:
+        if node is None and self.roster.admits(kind, name):
             node = self.nodes[kind, name] = Node()
+            self._sorted.pop(kind, None)
         return node

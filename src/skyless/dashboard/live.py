@@ -9,7 +9,7 @@ import logging
 import platform
 import time
 import zlib
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Protocol
@@ -25,6 +25,7 @@ from skyless.dashboard.evidence import Evidence
 from skyless.dashboard.geojson import OLDEST_S, features
 from skyless.dashboard.site_survey import SiteSurvey, topic_of
 from skyless.dashboard.state import SiteState, encode
+from skyless.dashboard.wanted import Sent, Wanted
 from skyless.dashboard.zone_events import MAX_EVENTS, EventQueue, publisher_rank
 from skyless.errors import ConfigurationError
 from skyless.mqtt import topics
@@ -51,6 +52,9 @@ from skyless.zones.zone_list import BadZonesError, check_zones, read_zones, zone
 
 _STATE_PERIOD_S: Final = 0.05
 _HEALTH_PERIOD_S: Final = 1.0
+_EVALUATION_SHARE: Final = 5.0
+"""An evaluation is followed by at least so many times its duration without one."""
+
 _PREPARATION_EXPIRY_S: Final = 5.0
 """A preparation of which nothing has come for this time has ended without saying so."""
 
@@ -78,6 +82,10 @@ class MqttLink(Protocol):
     def forget(self, topic: str) -> None:
         """Stop repeating a retained message."""
 
+    @property
+    def unread_s(self) -> float:
+        """For how long messages have waited without a break to be read."""
+
 
 class NoBrokerError(Exception):
     """Nothing can be published now."""
@@ -103,8 +111,8 @@ class PageQueue:
         self._latest: dict[str, bytes] = {"hello": hello}
         self._events: deque[bytes] = deque(maxlen=MAX_EVENTS)
         self._logged: deque[bytes] = deque(maxlen=MAX_LOGGED)
-        self._sent_serial = 0
-        self._state_due = True
+        self._sent = Sent()
+        self._state_due = self._health_due = True
         self._wake = asyncio.Event()
         self._wake.set()
 
@@ -123,10 +131,16 @@ class PageQueue:
         self._logged.append(message)
         self._wake.set()
 
-    def request_state(self) -> None:
-        """Send the state with the next messages if there is anything new."""
+    def request_state(self, *, health: bool = False) -> None:
+        """Send the state, or also the healths, with the next messages if there is anything new."""
         self._state_due = True
+        self._health_due |= health
         self._wake.set()
+
+    def ask(self, wanted: Wanted) -> None:
+        """Send from now on what the page asks for."""
+        self._sent.wanted = wanted
+        self.request_state(health=True)
 
     def close(self, reason: str = "") -> None:
         """End the page's connection."""
@@ -141,10 +155,12 @@ class PageQueue:
         self._latest.clear()
         self._events.clear()
         self._logged.clear()
-        if self._state_due and state.serial > self._sent_serial:
-            messages.append(state.state_since(self._sent_serial))
-            self._sent_serial = state.serial
-        self._state_due = False
+        if self._health_due:
+            messages.append(state.new_health(self._sent))
+        new = state.new_state(self._sent) if self._state_due else None
+        if new is not None:
+            messages.append(new)
+        self._state_due = self._health_due = False
         return [message.decode() for message in messages]
 
 
@@ -176,8 +192,7 @@ class LiveSite:
         self.events = EventQueue()
         self.pages: set[PageQueue] = set()
         self.survey = SiteSurvey(name, self._broadcast, clock, wall_clock)
-        self.dropped: Counter[str] = Counter()
-        """Wrong messages by kind."""
+        self.dropped = self.state.dropped
         self._clock, self._wall_clock = clock, wall_clock
         self._link: MqttLink | None = None
         self._site_id: int | None = None
@@ -280,6 +295,8 @@ class LiveSite:
     def _on_fix(self, topic: str, payload: bytes) -> None:
         fix = read_message(payload, FixMessage)
         _check_name(fix.tag, topic)
+        if not self.evidence.roster.admits("tag", fix.tag):
+            return
         now_s = self._clock()
         unix_s = self._wall_clock()
         self.state.add_fix(fix, now_s, unix_s - self.evidence.add_fix(fix, now_s))
@@ -291,6 +308,8 @@ class LiveSite:
             return  # a retained status was cleared
         status = read_message(payload, StatusMessage)
         _check_name(status.name, topic)
+        if not self.evidence.roster.admits(status.kind, status.name):
+            return
         self.state.add_status(status)
         self.evidence.add_status(status, self._clock())
         self.log.on_status(status, self._clock())
@@ -299,7 +318,7 @@ class LiveSite:
 
     def _on_health(self, topic: str, payload: bytes) -> None:
         _, kind, name, _ = topic.rsplit("/", 3)
-        if kind in _HEALTHS:
+        if kind in _HEALTHS and self.evidence.roster.admits(kind, name):
             health: TagHealth | AnchorHealth | EtherHealth = read_message(payload, _HEALTHS[kind])  # type: ignore[assignment]
             now_s, unix_s = self._clock(), self._wall_clock()
             self.state.add_health(name, health, now_s)
@@ -454,7 +473,7 @@ class LiveSite:
         }
         page = PageQueue(encode("hello", hello), address, self._clock())
         page.replace("mqtt", self._connection())
-        page.replace("health", self.state.health_message(self.dropped, self._clock()))
+        self.state.now_s = self._clock()
         page.replace("condition", self._condition_message())
         page.replace("log", encode("log", {"events": self.log.since()}))
         if self.preparation is not None:
@@ -495,9 +514,10 @@ class LiveSite:
         """Do what is due; to be called 20 times a second. ``lag_s`` is by how much this call is late."""
         self._lag_s = max(self._lag_s, lag_s)
         now_s, unix_s = self._clock(), self._wall_clock()
-        self.state.unix_s = unix_s
+        self.state.now_s, self.state.unix_s = now_s, unix_s
         self.log.unix_offset_s = unix_s - now_s
-        self._schedule(self.monitor.expire_tags(now_s, unix_s))
+        if now_s >= self._health_due_s:
+            self._schedule(self.monitor.expire_tags(now_s, unix_s))
         self._publish_events(now_s)
         if self.state.serial != self._sent_serial:
             self._sent_serial = self.state.serial
@@ -508,8 +528,8 @@ class LiveSite:
         if now_s >= self._health_due_s:
             self._health_due_s = now_s + _HEALTH_PERIOD_S
             self.state.expire(now_s)
-            if self.pages:
-                self._broadcast("health", self.state.health_message(self.dropped, now_s))
+            for page in self.pages:
+                page.request_state(health=True)
             for page in [page for page in self.pages if now_s - page.active_s > GONE_S]:
                 self._close_idle(page)
         if now_s >= self._condition_due_s:
@@ -517,18 +537,21 @@ class LiveSite:
         self._send_logged()
 
     def _evaluate(self, now_s: float) -> None:
-        self._condition_due_s = now_s + EVALUATION_S
         watch = self.survey.watch
+        unread_s = 0.0 if self._link is None else self._link.unread_s
         used_share = None if self._used_share is None or self.preparation is not None else self._used_share(now_s)
         self.condition = self._condition_monitor.evaluate(
-            now_s, self._lag_s, watch, self.survey.watch_age_s, used_share
+            now_s, self._lag_s, watch, self.survey.watch_age_s, used_share, unread_s
         )
         self._lag_s = 0.0
+        self.state.judge(now_s, blind=self._condition_monitor.is_blind(now_s))
         self.log.on_watch(watch, now_s)
         self.log.on_survey(self.survey.survey, now_s)
         self.log.on_condition(self.condition, now_s)
         (self.log.pause if self._condition_monitor.is_blind(now_s) else self.log.tick)(now_s)
         self._broadcast("condition", self._condition_message())
+        # Of very many tags it takes longer, and the messages are to be read as well.
+        self._condition_due_s = now_s + max(EVALUATION_S, _EVALUATION_SHARE * (self._clock() - now_s))
 
     def _condition_message(self) -> bytes:
         """Its time gives pages the server's clock where no tag moves."""

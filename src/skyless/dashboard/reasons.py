@@ -7,6 +7,7 @@ from typing import Final, Literal
 from msgspec import Struct
 
 from skyless.dashboard.evidence import ALERT_WORDS, ALERTS, FRESH_S, GRACE_S, Evidence, Node
+from skyless.dashboard.roster import MAX_NAMES
 from skyless.mqtt.messages import AnchorHealth, EtherHealth, TagHealth, WatchMessage
 
 LATE_S: Final = 0.25
@@ -44,6 +45,9 @@ OFTEN_S: Final = 60.0
 
 WATCH_AGE_S: Final = 60.0
 """A watch that has not reported for longer is not running."""
+
+UNREAD_S: Final = 0.5
+"""Messages that have waited unread at the page's server for this long show that it does not keep up."""
 
 _MIN_ANCHORS: Final = 3
 """Fewer on the air give no position."""
@@ -129,6 +133,30 @@ def slow_reason(evidence: Evidence, now_s: float, lag_s: float) -> Reason | None
     advice = "End other programs there, run fewer tags and anchors, or move some to another computer."
     worst = max(share for _, share, _ in signs)
     return Reason("slow", "bad" if worst > VERY_SLOW_SHARE else "warning", text, advice)
+
+
+def behind_reason(ages: Mapping[str, tuple[float, float]], unread_s: float) -> Reason | None:
+    """The page's server does not keep up with the messages, which wait in its own queue for ``unread_s``."""
+    if unread_s < UNREAD_S:
+        return None
+    age_s = max((age_s for age_s, _ in ages.values()), default=0.0)
+    by = f" by {age_s:.1f} s" if age_s > LATE_S else ""
+    advice = "It gets more messages than its computer can process: end other programs there, or lower the tags' rates."
+    return Reason("behind", "bad" if age_s > VERY_LATE_S else "warning", f"the page's server is behind{by}", advice)
+
+
+def left_out_reason(evidence: Evidence, now_s: float) -> Reason | None:
+    """Tags or anchors beyond the number that is taken in."""
+    counts = {kind: evidence.roster.left_out(kind, now_s) for kind in MAX_NAMES}
+    words = [f"{count} {kind}{'s' if count > 1 else ''}" for kind, count in counts.items() if count]
+    if not words:
+        return None
+    text = f"{' and '.join(words)} {'is' if sum(counts.values()) == 1 else 'are'} not shown"
+    limits = " and ".join(f"{most} {kind}s" for kind, most in MAX_NAMES.items())
+    advice = (
+        f"This page takes in at most {limits}, and judges no others: divide the site, or end names that are made up."
+    )
+    return Reason("not-shown", "warning", text, advice)
 
 
 def busy_reason(evidence: Evidence, used_share: float | None) -> Reason | None:
@@ -252,8 +280,7 @@ def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
     """Anchors of the site that are offline, only cut off from the broker, or not synchronised."""
     if evidence.site is None:
         return
-    site = evidence.site
-    names = [str(anchor.id) for anchor in site.anchors] + [str(anchor.id) for anchor in site.unplaced]
+    names = evidence.site_anchors()
     offline: list[str] = []
     cut_off: list[str] = []
     idle: list[str] = []
@@ -348,7 +375,21 @@ def watch_reasons(watch: WatchMessage | None, age_s: float | None) -> Iterable[R
 
 
 _ORDER: Final = (
-    *("broker", "slow", "busy", "late", "forged", "clock", "chain-ended", "codes", "not-verified", "no-fixes", "limit"),
+    *(
+        "broker",
+        "behind",
+        "slow",
+        "busy",
+        "late",
+        "not-shown",
+        "forged",
+        "clock",
+        "chain-ended",
+        "codes",
+        "not-verified",
+        "no-fixes",
+        "limit",
+    ),
     *("moved", "anchors", "master", "no-fix", "alert", "keys", "not-synchronised", "silent-anchors", "silent", "watch"),
     *("multipath", "chain"),
 )

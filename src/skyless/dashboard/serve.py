@@ -13,6 +13,7 @@ from msgspec import Struct
 
 from skyless.dashboard.app import PAGE_TIMEOUT_S, Services, make_app
 from skyless.dashboard.guard import AccessRules
+from skyless.dashboard.wanted import MAX_REQUEST_BYTES
 from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
 from skyless.nodes.ports import claim
@@ -21,8 +22,9 @@ from skyless.nodes.process import ending_signals
 PORT: Final = 8080
 _MORE_PORTS: Final = 50
 _PING_S: Final = 5.0
-_MAX_PING_BYTES: Final = 1024
 _GRACE_S: Final = 0.4
+REQUEST_TIMEOUT_S: Final = 10.0
+"""A connection that has not sent the head of its first request by then is ended; uvicorn knows no such limit."""
 _SEND_BUFFER_BYTES: Final = 262_144
 """Data for a slow page that waits in the kernel and is sent before anything newer."""
 
@@ -98,21 +100,23 @@ async def serve(
         ws_per_message_deflate=False,  # on the same machine it would only cost time
         ws_ping_interval=_PING_S,
         ws_ping_timeout=PAGE_TIMEOUT_S,
-        ws_max_size=_MAX_PING_BYTES,
+        ws_max_size=MAX_REQUEST_BYTES,
         timeout_graceful_shutdown=1,
     )
     server = _Server(config)
-    work = asyncio.create_task(services.sites.run(address, site_id))
+    jobs = (services.sites.run(address, site_id), server.end_unfinished())
+    work = [asyncio.create_task(job) for job in jobs]
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, *ending_signals()):
         loop.add_signal_handler(number, _stop, server, services)
     serving = asyncio.create_task(server.serve(sockets=[sock]))
     try:
-        await asyncio.wait([serving, work], return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait([serving, *work], return_when=asyncio.FIRST_COMPLETED)
     finally:
         _stop(server, services)
-        work.cancel()
-        ended = await asyncio.gather(serving, work, return_exceptions=True)
+        for task in work:
+            task.cancel()
+        ended = await asyncio.gather(serving, *work, return_exceptions=True)
     for result in ended:
         if isinstance(result, Exception):
             raise result
@@ -135,6 +139,21 @@ class _Server(uvicorn.Server):
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
         yield
+
+    async def end_unfinished(self, timeout_s: float = REQUEST_TIMEOUT_S) -> None:
+        """End connections without a request, until cancelled."""
+        seen_s: dict[object, float] = {}
+        while True:
+            await asyncio.sleep(timeout_s / 4)
+            now_s = asyncio.get_running_loop().time()
+            connections = list(self.server_state.connections)
+            seen_s = {one: seen_s.get(one, now_s) for one in connections}
+            for connection in connections:
+                transport = getattr(connection, "transport", None)
+                # A connection of HTTP has no cycle before its first request; one of a WebSocket is of another class.
+                unfinished = getattr(connection, "cycle", self) is None
+                if unfinished and transport is not None and now_s - seen_s[connection] >= timeout_s:
+                    transport.abort()
 
     def drop_connections(self) -> None:
         """Close connections that have not ended."""

@@ -1,11 +1,14 @@
 """The state of the site as pages show it, gathered from messages. No I/O; the time is passed in."""
 
 import math
-from collections.abc import Mapping
-from typing import Any, Final
+from collections import Counter
+from collections.abc import Iterable
+from itertools import islice
+from typing import Any, Final, NamedTuple
 
 import msgspec
 
+from skyless.dashboard.wanted import MAX_HEALTHS, Sent
 from skyless.mqtt.messages import (
     AnchorHealth,
     EtherHealth,
@@ -17,9 +20,6 @@ from skyless.mqtt.messages import (
 )
 from skyless.mqtt.truth_buffer import TruthBuffer
 
-MAX_NAMES: Final = 2000
-"""Tags, and nodes, that are kept; a broker that invents names cannot fill the memory."""
-
 EXPIRY_S: Final = 600.0
 """Fixes and health messages older than this are dropped."""
 
@@ -27,7 +27,16 @@ MAX_CLOCK_ERROR_S: Final = 0.5
 """The time of a fix by its tag's clock is replaced where it is wrong by more than this."""
 
 _MAX_ENCODED: Final = 16
-_AGES: Final = {"AnchorHealth": "anchors", "TagHealth": "tags", "EtherHealth": "ether"}
+_KINDS: Final[dict[type, str]] = {AnchorHealth: "anchors", TagHealth: "tags", EtherHealth: "ether"}
+
+CHOICE_S: Final = 0.5
+"""Interval at which the tags for a page are chosen again."""
+
+GONE_S: Final = 10.0
+"""A tag without a fix for this long is not on the map any more; as in ``page/clock.js``."""
+
+SILENT_S: Final = 3.5
+"""A node that reported once a second and has not for this long is offline, whatever its status says."""
 
 
 class _Tag:
@@ -40,6 +49,14 @@ class _Tag:
         self.row: list[Any] | None = None
 
 
+class _Health(NamedTuple):
+    """The last health of a node."""
+
+    serial: int
+    received_s: float
+    health: TagHealth | AnchorHealth | EtherHealth
+
+
 class SiteState:
     """The newest fix, health and status by name."""
 
@@ -48,11 +65,23 @@ class SiteState:
         """Counts fixes; a reader that has the state at one serial requests what came since."""
         self.statuses: dict[tuple[str, str], StatusMessage] = {}
         """By kind and name."""
-        self.unix_s = 0.0
-        """Time of the next ``state`` message; set by the owner."""
+        self.now_s = self.unix_s = 0.0
+        """Times of the next messages: by the clock of ``expire``, and of the day; set by the owner."""
+        self.dropped: Counter[str] = Counter()
+        """Wrong messages by kind."""
         self._tags: dict[str, _Tag] = {}
         self._truths = TruthBuffer()
-        self._healths: dict[tuple[str, str], tuple[float, TagHealth | AnchorHealth | EtherHealth]] = {}
+        self._healths: dict[str, dict[str, _Health]] = {kind: {} for kind in _KINDS.values()}
+        """By kind and name."""
+        self._health_serial = 0
+        self._status_serial = 0
+        self._status_serials: dict[tuple[str, str], int] = {}
+        self._leaders: set[str] = set()
+        """Anchors that lead the site's time."""
+        self._conditions: dict[str, str] = {}
+        """Of anchors."""
+        self._waiting: list[str] = []
+        """Tags that report and have no position yet."""
         self._encoded: dict[tuple[int, int], bytes] = {}
 
     def add_fix(self, fix: FixMessage, now_s: float, unix_s: float) -> None:
@@ -60,8 +89,6 @@ class SiteState:
 
         ``unix_s`` is the time of the fix, the end of its last frame, by the owner's clock of the day.
         """
-        if fix.tag not in self._tags and len(self._tags) >= MAX_NAMES:
-            return
         self.serial += 1
         self._tags[fix.tag] = _Tag(fix, self.serial, now_s, unix_s)
 
@@ -72,22 +99,24 @@ class SiteState:
     def add_status(self, status: StatusMessage) -> None:
         """Update whether a node is online."""
         key = status.kind, status.name
-        if key in self.statuses or len(self.statuses) < MAX_NAMES:
-            self.statuses[key] = status
+        self._status_serial += 1
+        self.statuses[key], self._status_serials[key] = status, self._status_serial
 
     def add_health(self, name: str, health: TagHealth | AnchorHealth | EtherHealth, now_s: float) -> None:
         """Update a node's health."""
-        key = type(health).__name__, name
-        if key in self._healths or len(self._healths) < MAX_NAMES:
-            self._healths[key] = now_s, health
+        self._health_serial += 1
+        self._healths[_KINDS[type(health)]][name] = _Health(self._health_serial, now_s, health)
+        if isinstance(health, AnchorHealth):
+            (self._leaders.add if health.role in {"master", "root"} else self._leaders.discard)(name)
 
     def expire(self, now_s: float) -> None:
         """Drop what is older than ``EXPIRY_S``."""
         self._encoded.clear()
         for name in [name for name, tag in self._tags.items() if now_s - tag.received_s > EXPIRY_S]:
             del self._tags[name]
-        for key in [key for key, (received_s, _) in self._healths.items() if now_s - received_s > EXPIRY_S]:
-            del self._healths[key]
+        for healths in self._healths.values():
+            for name in [name for name, known in healths.items() if now_s - known.received_s > EXPIRY_S]:
+                del healths[name]
 
     def fixes_since(self, now_s: float, longest_s: float) -> list[tuple[FixMessage, float]]:
         """The newest fix of each tag that came within the last ``longest_s``, and when it ended, by ``unix_s``."""
@@ -96,7 +125,9 @@ class SiteState:
 
     def methods(self) -> list[str]:
         """The positioning method of each tag whose health is known."""
-        return [health.method for _, health in self._healths.values() if isinstance(health, TagHealth)]
+        return [known.health.method for known in self._healths["tags"].values() if isinstance(known.health, TagHealth)]
+
+    # Fixes
 
     def state_since(self, serial: int) -> bytes:
         """The ``state`` message with all tags that have a fix since; readers at the same serial share its bytes."""
@@ -109,28 +140,110 @@ class SiteState:
 
     def rows_since(self, serial: int) -> list[list[Any]]:
         """Rows of the ``state`` message, the fields of each in the order of ``page/tracks.js``."""
-        rows = []
-        for tag in self._tags.values():
-            if tag.serial > serial:
-                if tag.row is None:
-                    tag.row = _row(tag.fix, self._truths.at(tag.fix.tag, tag.fix.unix_s), tag.ended_unix_s)
-                rows.append(tag.row)
-        return rows
+        return [self._row(tag) for tag in self._tags.values() if tag.serial > serial]
 
-    def health_message(self, dropped: Mapping[str, int], now_s: float) -> bytes:
-        """The ``health`` message; ``dropped`` counts wrong messages by kind, and ``ages`` are since each arrived."""
-        healths = [health for _, health in self._healths.values()]
-        ages: dict[str, dict[str, float]] = {"anchors": {}, "tags": {}, "ether": {}}
-        for (kind, name), (received_s, _) in self._healths.items():
-            ages[_AGES[kind]][name] = round(now_s - received_s, 2)
+    def _row(self, tag: _Tag) -> list[Any]:
+        if tag.row is None:
+            tag.row = _row(tag.fix, self._truths.at(tag.fix.tag, tag.fix.unix_s), tag.ended_unix_s)
+        return tag.row
+
+    def new_state(self, sent: Sent) -> bytes | None:
+        """The ``state`` message with what is new to a page; None where nothing is.
+
+        Of a large site the page is sent a part of the tags; ``left`` are those that no longer belong to it, ``of`` is
+        how many there are, and ``inside`` how many are in the page's view.
+        """
+        if len(self._tags) <= sent.wanted.rows:
+            if sent.fixes == self.serial and sent.tags is None:
+                return None
+            since, sent.fixes = 0 if sent.tags is not None else sent.fixes, self.serial
+            sent.tags = None
+            return self.state_since(since)
+        before = sent.tags if sent.tags is not None else dict.fromkeys(self._tags if sent.fixes else ())
+        if sent.tags is None or self.now_s - sent.chosen_s >= CHOICE_S:
+            sent.chosen_s = self.now_s
+            sent.tags = self._choose(sent, before)
+        chosen = {name: self._tags[name] for name in sent.tags if name in self._tags}
+        rows = [self._row(tag) for name, tag in chosen.items() if tag.serial > sent.fixes or name not in before]
+        left = [name for name in before if name not in sent.tags] if before is not sent.tags else []
+        sent.fixes = self.serial
+        if not rows and not left:
+            return None
+        fields = {"tags": rows, "left": left, "of": len(self._tags), "inside": sent.inside}
+        return encode("state", {"unix_s": round(self.unix_s, 3), **fields})
+
+    def _choose(self, sent: Sent, before: dict[str, None]) -> dict[str, None]:
+        """The tags for a page: those that it names, that it looks for, and those in its view, first those it has."""
+        wanted, text = sent.wanted, sent.wanted.find.lower()
+        x1, y1, x2, y2 = wanted.view or (-math.inf, -math.inf, math.inf, math.inf)
+        inside = []
+        for name, tag in self._tags.items():
+            x, y, _ = tag.fix.position_m
+            if x1 <= x <= x2 and y1 <= y <= y2 and self.now_s - tag.received_s < GONE_S:
+                inside.append(name)
+        sent.inside = len(inside)
+        named = [name for name in wanted.tags if name in self._tags]
+        found = [name for name in self._tags if text in name.lower()] if text else []
+        names = dict.fromkeys([*named, *found, *(name for name in inside if name in before), *inside])
+        return dict.fromkeys(list(names)[: wanted.rows])
+
+    # Healths and statuses
+
+    def judge(self, now_s: float, *, blind: bool) -> None:
+        """Find the condition of each anchor: ``good``, ``warn`` (not synchronised) or ``bad`` (offline).
+
+        While the owner is blind, since messages may be missing, silence does not make an anchor ``bad``.
+        """
+        self._waiting = list(islice((name for name in self._healths["tags"] if name not in self._tags), MAX_HEALTHS))
+        found = {}
+        for name, known in self._healths["anchors"].items():
+            if isinstance(known.health, AnchorHealth):
+                health = known.health
+                found[name] = "good" if health.synchronised or health.role == "master" else "warn"
+                if now_s - known.received_s > SILENT_S and not (blind and self._conditions.get(name) != "bad"):
+                    found[name] = "bad"
+        for (kind, name), status in self.statuses.items():
+            if kind == "anchor" and not status.online:
+                found[name] = "bad"
+        self._conditions = found
+
+    def new_health(self, sent: Sent) -> bytes:
+        """The ``health`` message with what is new to a page; the first one is ``whole``.
+
+        Of many tags or anchors it holds the health of those only that the page names, and of anchors that lead.
+        ``ages`` are since each arrived; ``waiting`` are tags that report and have no position yet.
+        """
+        whole, since = sent.healths is None, sent.healths or 0
+        named = {"tags": {*sent.wanted.tags}, "anchors": {*sent.wanted.anchors, *self._leaders}}
+        new: dict[str, list[Any]] = {}
+        ages: dict[str, dict[str, float]] = {}
+        for kind, healths in self._healths.items():
+            names: Iterable[str] = healths
+            if len(healths) > MAX_HEALTHS:
+                names = [name for name in named[kind] if name in healths]
+            fresh = [n for n in names if healths[n].serial > since or n in named.get(kind, set()) - sent.named[kind]]
+            new[kind] = [healths[name].health for name in fresh]
+            ages[kind] = {name: round(self.now_s - healths[name].received_s, 2) for name in fresh}
+        nodes = []
+        if sent.statuses < self._status_serial:
+            nodes = [self.statuses[key] for key, serial in self._status_serials.items() if serial > sent.statuses]
+        if len(self.statuses) > MAX_HEALTHS:  # of many, pages list the other programs
+            nodes = [node for node in nodes if node.kind not in {"tag", "anchor"}]
+        changed = {name: kind for name, kind in self._conditions.items() if sent.conditions.get(name) != kind}
+        changed |= dict.fromkeys(sent.conditions.keys() - self._conditions.keys(), "unknown")
+        sent.healths, sent.named = self._health_serial, named | {"ether": set()}
+        sent.statuses, sent.conditions = self._status_serial, self._conditions
         return encode(
             "health",
             {
-                "anchors": [health for health in healths if isinstance(health, AnchorHealth)],
-                "tags": [health for health in healths if isinstance(health, TagHealth)],
-                "ether": next((health for health in healths if isinstance(health, EtherHealth)), None),
-                "nodes": list(self.statuses.values()),
-                "dropped": dict(dropped),
+                "whole": whole,
+                "anchors": new["anchors"],
+                "tags": new["tags"],
+                "ether": new["ether"][-1] if new["ether"] else None,
+                "nodes": nodes,
+                "conditions": changed,
+                "waiting": self._waiting,
+                "dropped": self.dropped,
                 "ages": ages,
             },
         )

@@ -88,6 +88,8 @@ class Connection:
         self.lost = asyncio.Event()
         self.reason = "the broker has closed the connection"
         """Why it was lost."""
+        self.unread_since_s: float | None = None
+        """Since when messages of the broker have waited to be read, by the loop's clock; None while none do."""
         self._address = address
         self._keepalive_s = who.keepalive_s
         self._react = react
@@ -198,6 +200,10 @@ class Connection:
             if not _decrypted(self._socket) and (left <= 0 or self._messages == seen):
                 break
         self._reading = False
+        if left > 0:
+            self.unread_since_s = None
+        elif self.unread_since_s is None:
+            self.unread_since_s = self._loop.time()
         if self._socket is not None and _QUICK_ACK is not None:
             self._socket.setsockopt(socket.IPPROTO_TCP, _QUICK_ACK, 1)
         # paho's on_publish would also come for each message of QoS 0, whose number may be that of another in flight.

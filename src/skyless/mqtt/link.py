@@ -113,6 +113,12 @@ class Link:
         return self._outbox.late
 
     @property
+    def unread_s(self) -> float:
+        """For how long messages of the broker have waited without a break to be read; 0 while none do."""
+        since_s = None if self._connection is None else self._connection.unread_since_s
+        return 0.0 if since_s is None else asyncio.get_running_loop().time() - since_s
+
+    @property
     def unacknowledged(self) -> int:
         """Messages of QoS 1, and retained ones, that the broker does not have for certain."""
         return self._outbox.unacknowledged

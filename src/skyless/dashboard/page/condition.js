@@ -1,6 +1,7 @@
 /** The condition of the site as this page can vouch for it: never better than what the server has just said. */
 
 import { state } from "./store.js";
+import { stall_s } from "./pace.js";
 
 /** The server judges twice a second; a judgement older than this is worth nothing. */
 const MAX_AGE_MS = 3000;
@@ -27,8 +28,10 @@ export function shownCondition() {
   if (phase === "lost") return { level: "lost", text: "", reasons: [lostReason(reason)] };
   if (state.mode === "replay") return { level: "replay", text: "", reasons: [] };
   if (phase !== "open") return { level: "connecting", text: "", reasons: [] };
+  const stall = stall_s();
+  if (stall) return withWarning(judged(), slowReason(stall));
   const behind = behind_s();
-  return behind > MAX_BEHIND_S ? withDelay(judged(), behind) : judged();
+  return behind > MAX_BEHIND_S ? withWarning(judged(), behindReason(behind)) : judged();
 }
 
 /** The server's judgement while it is fresh, otherwise null. */
@@ -57,12 +60,20 @@ function behind_s() {
 }
 
 /** At least a warning: whatever the server says arrives too late. */
-function withDelay({ level, text, reasons }, behind) {
+function withWarning({ level, text, reasons }, reason) {
+  if (level === "bad") return { level, text, reasons: [...reasons, reason] };
+  return { level: "warning", text: reason.text, reasons: [reason, ...reasons] };
+}
+
+function behindReason(behind) {
   const words = `this page is ${behind.toFixed(1)} s behind`;
-  const advice = "The network or this browser is too slow.";
-  const late = { kind: "behind", level: "warning", text: words, advice, names: [] };
-  if (level === "bad") return { level, text, reasons: [...reasons, late] };
-  return { level: "warning", text: words, reasons: [late, ...reasons] };
+  return { kind: "page-behind", level: "warning", text: words, advice: "The network is too slow.", names: [] };
+}
+
+function slowReason(stall) {
+  const words = `this browser is too slow: it was busy for ${stall.toFixed(1)} s without a break`;
+  const advice = "The page now asks for fewer tags. Zoom in, close the list or other pages, or use a quicker computer.";
+  return { kind: "slow-browser", level: "warning", text: words, advice, names: [] };
 }
 
 function lostReason(words) {

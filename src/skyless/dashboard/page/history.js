@@ -17,11 +17,11 @@ export function clearHistory() {
   tagHistory.clear();
 }
 
-/** Add the health of one second, of all that the server has a health of; the others lose their history. */
-export function addHealth(anchors, tags) {
+/** Add healths that are new; what is not in the maps of all that are known loses its history. */
+export function addHealth(anchors, tags, allAnchors, allTags) {
   for (const health of anchors) add(anchorHistory, health.anchor, health.unix_s, (past) => clockOf(past, health));
-  keepOnly(anchorHistory, new Set(anchors.map(({ anchor }) => anchor)));
-  keepOnly(tagHistory, new Set(tags.map(({ tag }) => tag)));
+  keepOnly(anchorHistory, allAnchors);
+  keepOnly(tagHistory, allTags);
   for (const health of tags) add(tagHistory, health.tag, health.unix_s, () => ({ rate: health.updates_per_s }));
 }
 

@@ -1,21 +1,26 @@
 /** The live connection: reads the server's messages into the state, notices a loss, and reconnects. */
 
-import { changed, siteOf, state } from "./store.js";
+import { changed, healthAge_s, siteOf, state } from "./store.js";
 import { live, now_s, resetOffset, updateOffset } from "./clock.js";
 import { toast } from "./dom.js";
 import { addHealth, clearHistory } from "./history.js";
 import { chosenSite } from "./sites.js";
 import { receiveSurvey, receiveWatch, restart } from "./survey/model.js";
+import { noteGap, rowLimit } from "./pace.js";
+import { seenBox } from "./map/view.js";
 
 const FIRST_RETRY_MS = 500;
 const LAST_RETRY_MS = 3000;
 const PING_MS = 2000;
+const CHECK_MS = 250;
 /** The connection is lost after this time without a message: while tags move, and otherwise (every ping is answered). */
 const MOVING_TIMEOUT_MS = 3000;
 const IDLE_TIMEOUT_MS = 9000;
 /** The server drops a tag, too, that it has received nothing of for so long. */
 const EXPIRY_S = 600;
 const MAX_EVENTS = 50;
+/** The server accepts no more names of each kind. */
+const MAX_NAMED = 200;
 const MAX_LOGGED = 500;
 /** Close code of a server that has too many pages open. */
 const TRY_LATER = 1013;
@@ -28,6 +33,10 @@ let retryTimer = 0;
 let lastMessage = 0;
 let lastMotion = 0;
 let lastPing = 0;
+let lastCheck = 0;
+/** For how long the connection has been silent while this page was running. */
+let silence = 0;
+let asked = "";
 /** The live site's message and zones, also while a recording is replayed. */
 let site = null;
 let zones = [];
@@ -37,7 +46,7 @@ let keptOf = "";
 /** Connect, and stay connected. */
 export function start() {
   connect();
-  setInterval(checkConnection, 250);
+  setInterval(checkConnection, CHECK_MS);
   addEventListener("online", retryNow);
   document.addEventListener("visibilitychange", () => document.visibilityState === "visible" && retryNow());
 }
@@ -56,7 +65,9 @@ function connect() {
   const old = socket;
   const mine = (socket = new WebSocket(address));
   old?.close(); // one that was still connecting
-  lastMessage = lastPing = performance.now();
+  lastMessage = lastPing = lastCheck = performance.now();
+  silence = 0;
+  asked = "";
   state.ping = { sentMs: null, tripMs: 0 };
   mine.onmessage = (event) => mine === socket && process(event.data);
   mine.onclose = ({ code, reason }) => {
@@ -91,14 +102,19 @@ async function explain(connection) {
 
 function checkConnection() {
   if (state.connection.phase === "lost") changed("connection");
-  if (!socket) return;
   const now = performance.now();
-  const silence = now - lastMessage;
+  const gap = now - lastCheck;
+  lastCheck = now;
+  noteGap(gap - CHECK_MS);
+  if (!socket) return;
+  // What came while the browser was busy has yet to be read: it is no silence of the server.
+  silence += document.hidden ? gap : Math.min(gap, 2 * CHECK_MS);
   const moved = lastMessage - lastMotion < 2000;
   const open = state.connection.phase === "open";
   if (silence > (moved || !open ? MOVING_TIMEOUT_MS : IDLE_TIMEOUT_MS)) {
     return lost(`no message for ${(silence / 1e3).toFixed(0)} s`);
   }
+  if (open && state.mode === "live") ask();
   // Pongs have no number: only one is under way at a time.
   if (now - lastPing > PING_MS && state.ping.sentMs === null && socket.readyState === WebSocket.OPEN) {
     socket.send("ping");
@@ -106,8 +122,21 @@ function checkConnection() {
   }
 }
 
+/** Send the server what this page shows of a large site, so that it sends that part only. */
+function ask() {
+  const tags = [state.selection.tag, state.followed, ...state.listed.tags].filter((name) => name !== null);
+  const anchors = [state.selection.anchor, ...state.listed.anchors].filter((id) => id !== null).map(String);
+  const limit = (names) => [...new Set(names)].slice(0, MAX_NAMED);
+  const wanted = { view: seenBox(), find: state.find, tags: limit(tags), anchors: limit(anchors), rows: rowLimit() };
+  const words = JSON.stringify(wanted);
+  if (words === asked || socket.readyState !== WebSocket.OPEN) return;
+  asked = words;
+  socket.send(words);
+}
+
 function process(text) {
   lastMessage = performance.now();
+  silence = 0;
   let message;
   try {
     message = JSON.parse(text);
@@ -144,8 +173,10 @@ const handlers = {
   state(message) {
     updateOffset(message.unix_s);
     lastMotion = lastMessage;
+    if (message.left?.length) live.remove(message.left);
     live.add(message.tags);
-    if (message.tags.length) changed("tags");
+    state.part = message.of === undefined ? null : { of: message.of, inside: message.inside };
+    changed("tags");
   },
   pong() {
     const { sentMs } = state.ping;
@@ -159,21 +190,31 @@ const handlers = {
   },
   log({ events }) {
     const last = state.log.at(-1)?.serial ?? 0;
-    state.log = [...state.log, ...events.filter((event) => event.serial > last)].slice(-MAX_LOGGED);
+    const newer = events.filter((event) => event.serial > last);
+    const replaced = new Set(newer.filter(({ count }) => count > 1).map(({ first }) => first));
+    state.log = [...state.log.filter(({ first }) => !replaced.has(first)), ...newer].slice(-MAX_LOGGED);
     changed("log");
   },
-  health({ anchors = [], tags = [], ether = null, nodes = [], ages = {} }) {
-    state.health = {
-      anchors: new Map(anchors.map((health) => [health.anchor, health])),
-      tags: new Map(tags.map((health) => [health.tag, health])),
-      ether,
-      nodes,
-      ages,
-      atMs: performance.now(),
-    };
-    live.addNames([...state.health.tags.keys()]);
-    live.expire(now_s() - EXPIRY_S, state.health.tags);
-    addHealth(anchors, tags);
+  health({ whole, anchors, tags, ether, nodes, ages, conditions, waiting }) {
+    const { health } = state;
+    if (whole) for (const known of [health.anchors, health.tags, health.nodes, health.conditions]) known.clear();
+    if (whole) health.ether = null;
+    for (const one of anchors) health.anchors.set(one.anchor, one);
+    for (const one of tags) health.tags.set(one.tag, one);
+    for (const node of nodes) health.nodes.set(`${node.kind}/${node.name}`, node);
+    for (const [id, kind] of Object.entries(conditions)) health.conditions.set(Number(id), kind);
+    health.ether = ether ?? health.ether;
+    const now = performance.now();
+    for (const kind of ["anchors", "tags", "ether"]) {
+      if (whole) health.heardMs[kind].clear();
+      for (const [name, age_s] of Object.entries(ages[kind] ?? {})) health.heardMs[kind].set(name, now - 1e3 * age_s);
+    }
+    for (const id of health.anchors.keys()) if (healthAge_s("anchors", id) > EXPIRY_S) health.anchors.delete(id);
+    for (const name of health.tags.keys()) if (healthAge_s("tags", name) > EXPIRY_S) health.tags.delete(name);
+    const named = state.part ? waiting : [...health.tags.keys(), ...waiting];
+    live.addNames(named);
+    live.expire(now_s() - EXPIRY_S, new Set(named));
+    addHealth(anchors, tags, health.anchors, health.tags);
     changed("health");
   },
   zones(message) {

@@ -5,6 +5,7 @@ import * as banner from "./banner.js";
 import * as legend from "./legend.js";
 import * as live from "./live.js";
 import * as map from "./map/map.js";
+import * as partNote from "./part_note.js";
 import * as preparation from "./preparation.js";
 import * as replay from "./replay_bar.js";
 import * as sites from "./sites.js";
@@ -30,6 +31,7 @@ tabs.start();
 replay.start();
 banner.start();
 preparation.start();
+partNote.start();
 sites.start();
 summary.start();
 on(["site"], () => {

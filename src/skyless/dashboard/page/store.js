@@ -43,7 +43,25 @@ export const state = {
   /** @type {any} the server's newest judgement of the live site, and when it came; `condition.js` says what it is worth */
   condition: null,
   conditionMs: 0,
-  health: { anchors: new Map(), tags: new Map(), ether: null, nodes: [], ages: {}, atMs: 0 },
+  /**
+   * Healths and statuses by name, when each health was made by `performance.now()`, and the conditions of all anchors;
+   * of a large site the healths of those that the page names only.
+   */
+  health: {
+    anchors: new Map(),
+    tags: new Map(),
+    ether: null,
+    nodes: new Map(),
+    conditions: new Map(),
+    heardMs: { anchors: new Map(), tags: new Map(), ether: new Map() },
+  },
+  /** Where the server sends a part of the tags: how many there are, and how many in this page's view. @type {any} */
+  part: null,
+  /** What the page asks the server for besides its view: rows in sight in the lists, a search, the followed tag. */
+  listed: { tags: [], anchors: [] },
+  find: "",
+  /** @type {string|null} */
+  followed: null,
   /** @type {any} the newest message of the survey program; `survey/model.js` says how old it is */
   survey: null,
   /** @type {any} the newest message of the watch of the anchors */
@@ -100,8 +118,8 @@ export const MAX_AGE_S = 3.5;
  * @param {"anchors"|"tags"|"ether"} kind
  */
 export function healthAge_s(kind, name) {
-  const age = state.health.ages[kind]?.[name];
-  return age === undefined ? Infinity : age + (performance.now() - state.health.atMs) / 1e3;
+  const heard = state.health.heardMs[kind].get(String(name));
+  return heard === undefined ? Infinity : (performance.now() - heard) / 1e3;
 }
 
 /** The site of a message, with the outline that stands beside it there; null without one. */

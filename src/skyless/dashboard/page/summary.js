@@ -56,14 +56,15 @@ export function summaryFacts() {
     fresh.error.push(row[ERROR]);
     fresh.level.push(row[HPL]);
   }
+  const { tags_with_fix, tags } = (state.mode === "live" && state.part && freshCondition()) || {};
   const facts = [
-    ["Tags", lost ? DASH : `${count}/${all.length}`],
+    ["Tags", lost ? DASH : tags ? `${tags_with_fix}/${tags}` : `${count}/${all.length}`],
     ["σ", length(median(fresh.std))],
   ];
   if (state.simulated) facts.push(["Error", length(median(fresh.error))]);
   if (fresh.level.some(Number.isFinite)) {
     const levels = fresh.level.filter(Number.isFinite);
-    facts.push(["Protection level", `${length(median(levels))}, largest ${length(Math.max(...levels))}`]);
+    facts.push(["Protection level", `${length(median(levels))}, largest ${length(levels.reduce((a, b) => Math.max(a, b)))}`]);
   }
   if (state.mode === "live") facts.push(...liveFacts(lost));
   if (state.site) facts.push(["Site", `${state.site.name}, number ${state.site.id}`]);

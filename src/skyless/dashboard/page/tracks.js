@@ -47,6 +47,8 @@ export const ALERTS = {
 };
 const ALERT_NAMES = Object.keys(ALERTS);
 
+const collator = new Intl.Collator("en", { numeric: true });
+
 export class Track {
   /** @param {string} name */
   constructor(name) {
@@ -157,6 +159,12 @@ export class Tracks {
     if (this.all.size !== before) this.sort();
   }
 
+  /** Remove tags by name. */
+  remove(names) {
+    for (const name of names) this.all.delete(name);
+    this.sort();
+  }
+
   /** Remove all tags. */
   clear() {
     this.all.clear();
@@ -170,6 +178,6 @@ export class Tracks {
   }
 
   sort() {
-    this.sorted = [...this.all.values()].sort((a, b) => a.name.localeCompare(b.name, "en", { numeric: true }));
+    this.sorted = [...this.all.values()].sort((a, b) => collator.compare(a.name, b.name));
   }
 }

@@ -1,13 +1,23 @@
 /** Anchors: their health as a colour and a shape, and their marks on the map. */
 
 import { s } from "../dom.js";
-import { MAX_AGE_S, healthAge_s, state } from "../store.js";
+import { on, state } from "../store.js";
 import { surveyShown } from "../survey/model.js";
 import { palette } from "../theme.js";
 import { groundHeight, otherFloor } from "./floors.js";
-import { toX, toY, view } from "./view.js";
+import { isSeen, toX, toY, view } from "./view.js";
 
 const MARK = 7;
+/** Height of a name, and with more names than this they are written only where they fit. */
+const NAME = 18;
+const CROWDED = 200;
+/** A point of each cell of the grid that may hold something nearer than its size. */
+const AROUND = [0, -MARK, MARK].flatMap((right) => [0, -MARK, MARK].map((down) => [right, down]));
+/** Half of a sprite's side, and the sprites by their look: a path costs ten times as much. */
+const HALF = 10;
+/** @type {Map<string, HTMLCanvasElement>} */
+const sprites = new Map();
+on(["theme"], () => sprites.clear());
 /** Opacity of what is on another floor than the chosen one. */
 export const DIMMED = 0.22;
 
@@ -19,15 +29,10 @@ export const CONDITIONS = {
   unknown: { colour: "muted", words: "health unknown", shape: "M-.86-.86H.86V.86H-.86Z" },
 };
 
-/** Condition of an anchor: good, warn, bad or unknown, as always in a recording and without a connection. */
+/** Condition of an anchor as the server finds it: good, warn, bad or unknown, as in a recording and without a connection. */
 export function condition(id) {
   if (state.mode === "replay" || state.connection.phase === "lost") return "unknown";
-  const health = state.health.anchors.get(id);
-  const status = state.health.nodes.find((node) => node.kind === "anchor" && String(node.name) === String(id));
-  if (status && !status.online) return "bad";
-  if (!health) return "unknown"; // not yet, or silent for so long that the server has dropped it
-  if (healthAge_s("anchors", id) > MAX_AGE_S) return "bad";
-  return health.synchronised || health.role === "master" ? "good" : "warn";
+  return state.health.conditions.get(id) ?? "unknown";
 }
 
 /** How the site's anchors share the air: master, slots or free. */
@@ -40,9 +45,9 @@ export function wordsOf(kind) {
   return kind === "good" && siteMode() === "free" ? "on the air" : CONDITIONS[kind].words;
 }
 
-/** What the anchor leads: "master" of the site, "root" of a slot time (islands have one each), or "". */
-export function leads(id) {
-  if (siteMode() === "master") return id === masterNow() ? "master" : "";
+/** What the anchor leads: "master" of the site, "root" of a slot time (islands have one each), or ""; `master` if known. */
+export function leads(id, master = undefined) {
+  if (siteMode() === "master") return id === (master ?? masterNow()) ? "master" : "";
   const root = state.mode === "live" && state.health.anchors.get(id)?.role === "root";
   return root && !["bad", "unknown"].includes(condition(id)) ? "root" : "";
 }
@@ -75,17 +80,19 @@ export function drawAnchors(context) {
   context.textAlign = "center";
   context.textBaseline = "top";
   const names = [];
+  const master = masterNow();
   for (const anchor of state.site?.anchors ?? []) {
     const x = toX(anchor.x_m, anchor.y_m);
     const y = toY(anchor.x_m, anchor.y_m, anchor.z_m);
+    if (!isSeen(x, y) && !view.spatial) continue;
     drawnAnchors.push({ id: anchor.id, x, y });
     const alpha = other(anchor.z_m, anchor.floor ?? 0) ? DIMMED : 1;
     context.globalAlpha = alpha;
     if (view.spatial) dropLine(context, anchor.x_m, anchor.y_m, y, palette.muted);
     const kind = condition(anchor.id);
     const colour = palette[CONDITIONS[kind].colour];
-    mark(context, kind, x, y, colour);
-    const leading = leads(anchor.id);
+    drawSprite(context, kind, x, y, colour);
+    const leading = leads(anchor.id, master);
     if (leading) {
       context.strokeStyle = colour;
       context.lineWidth = 1.5;
@@ -94,22 +101,48 @@ export function drawAnchors(context) {
     if (anchor.id === state.selection.anchor) ring(context, x, y, MARK + 9);
     const words = leading ? `${anchor.id} ${leading}` : String(anchor.id);
     const height = view.spatial ? ` · ${Number(anchor.z_m.toFixed(2))} m` : "";
-    names.push({ words: words + height, x, y, alpha, below: anchor.id === state.selection.anchor ? 12 : 7 });
+    const chosen = anchor.id === state.selection.anchor;
+    names.push({ words: words + height, x, y, alpha, below: chosen ? 12 : 7, leading: chosen || leading !== "" });
   }
-  for (const { words, x, y, alpha, below } of joined(names)) {
+  const lines = joined(names);
+  const shown = lines.length > CROWDED ? lines.filter(fits()) : lines;
+  for (const { words, x, y, alpha, below } of shown) {
     context.globalAlpha = alpha;
     label(context, words, x, y + MARK + below);
   }
   context.globalAlpha = 1;
 }
 
+/** A test for each name in turn whether it has room between the marks and the names before it, by cells of a grid. */
+function fits() {
+  const cells = new Set(drawnAnchors.map(({ x, y }) => cellOf(x, y, NAME)));
+  if (cells.size < drawnAnchors.length) return ({ leading }) => leading; // marks that touch leave no room at all
+  return ({ words, x, y, leading }) => {
+    const at = cellOf(x, y + MARK + NAME, NAME);
+    const beside = words.length > 4 ? cellOf(x + NAME, y + MARK + NAME, NAME) : at;
+    if (!leading && (cells.has(at) || cells.has(beside))) return false;
+    cells.add(at).add(beside);
+    return true;
+  };
+}
+
+function cellOf(x, y, size) {
+  return `${Math.floor(x / size)} ${Math.floor(y / size)}`;
+}
+
 /** One line of names for anchors above each other, of the chosen floor where one of them is on it. */
 function joined(names) {
   const lines = [];
+  const cells = new Map();
   for (const name of names.toSorted((a, b) => b.alpha - a.alpha)) {
-    const line = lines.find(({ x, y }) => Math.hypot(x - name.x, y - name.y) < MARK);
-    if (!line) lines.push({ ...name });
-    else if (line.alpha === name.alpha) {
+    const near = AROUND.flatMap(([right, down]) => cells.get(cellOf(name.x + right, name.y + down, MARK)) ?? []);
+    const line = near.find(({ x, y }) => Math.hypot(x - name.x, y - name.y) < MARK);
+    if (!line) {
+      const made = { ...name };
+      lines.push(made);
+      const cell = cellOf(name.x, name.y, MARK);
+      cells.has(cell) ? cells.get(cell).push(made) : cells.set(cell, [made]);
+    } else if (line.alpha === name.alpha) {
       line.words += `, ${name.words}`;
       line.below = Math.max(line.below, name.below);
     }
@@ -131,6 +164,20 @@ export function dropLine(context, x_m, y_m, y, colour) {
   context.setLineDash([]);
   context.fillStyle = colour;
   context.fillRect(x - 1.5, ground - 1, 3, 2);
+}
+
+function drawSprite(context, kind, x, y, colour) {
+  const key = `${kind} ${view.ratio}`;
+  let sprite = sprites.get(key);
+  if (!sprite) {
+    sprite = document.createElement("canvas");
+    sprite.width = sprite.height = Math.ceil(2 * HALF * view.ratio);
+    const painted = sprite.getContext("2d");
+    painted.scale(view.ratio, view.ratio);
+    mark(painted, kind, HALF, HALF, colour);
+    sprites.set(key, sprite);
+  }
+  context.drawImage(sprite, x - HALF, y - HALF, 2 * HALF, 2 * HALF);
 }
 
 function mark(context, kind, x, y, colour) {

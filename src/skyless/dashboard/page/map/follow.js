@@ -46,6 +46,7 @@ export function centre(seen) {
 }
 
 function show() {
+  state.followed = followed;
   byId("following").hidden = followed === null;
   byId("follow").setAttribute("aria-pressed", String(followed !== null));
   describe();

@@ -12,7 +12,7 @@ import { listen } from "./input.js";
 import { drawRoom, fillRoom } from "./room.js";
 import { drawGround, spaceCorners } from "./space.js";
 import { drawSurvey, surveyCorners, surveyOutOfSight } from "./survey.js";
-import { drawTags, visibleTags } from "./tags.js";
+import { RICH, drawTags, visibleTags } from "./tags.js";
 import { drawTrails, due } from "./trails.js";
 import { fit, prepare, setSpatial, view } from "./view.js";
 import { drawDraft, drawZones, flash } from "./zones.js";
@@ -52,7 +52,7 @@ function frame() {
     if (still || due(performance.now() - trailsDrawn, now.seen.length)) {
       trailsDrawn = performance.now();
       const context = prepare(byId("trails"));
-      if (state.options.trails) drawTrails(context, now.seen, now.shown, state.options.trails);
+      if (state.options.trails) drawTrails(context, richOf(now.seen), now.shown, state.options.trails);
     }
     const context = prepare(byId("moving"));
     drawTags(context, now);
@@ -61,6 +61,10 @@ function frame() {
     if (now.moving) redraw(false);
     else if (now.ageing) later = setTimeout(redraw, 250, false);
   }
+}
+
+function richOf(seen) {
+  return seen.length <= RICH ? seen : seen.filter(({ selected }) => selected);
 }
 
 function drawStill() {

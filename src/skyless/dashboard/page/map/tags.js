@@ -9,10 +9,14 @@ import { otherFloor } from "./floors.js";
 import { drawMark, tagStyle } from "./marks.js";
 import { drawNames } from "./names.js";
 import { drawStub } from "./trails.js";
-import { foreshortening, halfAxes, seenCovariance, toX, toY, view } from "./view.js";
+import { foreshortening, halfAxes, isSeen, seenCovariance, toX, toY, view } from "./view.js";
 
 /** With more tags than this only the selected one is named. */
 export const NAMED = 40;
+/** With more tags than this only the selected one has a trail and its true position. */
+export const RICH = 300;
+/** Tags that are so far outside the picture are not drawn, pixels. */
+const MARGIN = 60;
 const MARK = 5;
 const row = new Float64Array(COLUMNS);
 
@@ -29,15 +33,17 @@ export function visibleTags() {
   let moving = false;
   let ageing = false;
   list.forEach((track, index) => {
+    const selected = track.name === state.selection.tag;
     const fresh = freshness(track, now, shown);
     if (fresh === "gone" || fresh === "never" || !track.at(shown, row, !stillMotion.matches)) return;
     if (state.mode === "live") {
       moving ||= track.lastTime > shown;
       ageing ||= now - track.lastTime < GONE_S + 1;
     }
+    const [x, y] = [toX(row[X], row[Y]), toY(row[X], row[Y], row[Z])];
+    if (!isSeen(x, y, MARGIN) && !selected && track.name !== state.followed) return;
     const style = tagStyle(index, list.length);
     const colour = fresh === "fresh" ? style.colour : palette.muted;
-    const selected = track.name === state.selection.tag;
     seen.push({ track, colour, shape: style.shape, fresh, row: row.slice(), selected, other: other(row[Z]), x: 0, y: 0 });
   });
   return { seen, shown, moving, ageing };
@@ -52,11 +58,12 @@ export function drawTags(context, { seen, shown }) {
     one.y = toY(one.row[X], one.row[Y], one.row[Z]);
   }
   const here = seen.filter((one) => !one.other);
-  if (options.trails) for (const one of here) drawStub(context, one, shown);
+  const rich = seen.length <= RICH ? here : here.filter(({ selected }) => selected);
+  if (options.trails) for (const one of rich) drawStub(context, one, shown);
   if (view.spatial) for (const one of here) dropLine(context, one.row[X], one.row[Y], one.y, faint(one.colour, 0.7));
   if (options.ellipses) for (const one of here) ellipse(context, one);
   if (options.levels) for (const one of here) if (seen.length <= NAMED || one.selected) level(context, one);
-  if (options.truth && state.simulated) for (const one of here) truth(context, one);
+  if (options.truth && state.simulated) for (const one of rich) truth(context, one);
   for (const one of seen) mark(context, one);
   if (options.names) names(context, here);
 }

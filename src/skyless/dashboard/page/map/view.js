@@ -6,9 +6,12 @@
 
 import { roundStep } from "../format.js";
 
-/** Limits of the scale, pixels in a metre. */
-const MIN_SCALE = 2;
+/** The largest scale, pixels in a metre, and the smallest of a site that is small. */
 const MAX_SCALE = 2000;
+const SMALL_SCALE = 2;
+/** The smallest scale: a site that is larger is seen whole, and half as large again. */
+let min_scale = SMALL_SCALE;
+const MARGIN = 20;
 /** Limits of the 3-D view's elevation above the floor, and where it begins. */
 const MIN_ELEVATION = Math.PI / 18;
 const MAX_ELEVATION = Math.PI / 2;
@@ -89,7 +92,7 @@ export function pan(dx, dy) {
 /** Zoom about a pixel. */
 export function zoom(factor, x = view.width / 2, y = view.height / 2) {
   const [x_m, y_m] = toSite(x, y);
-  view.scale = Math.min(Math.max(view.scale * factor, MIN_SCALE), MAX_SCALE);
+  view.scale = Math.min(Math.max(view.scale * factor, min_scale), MAX_SCALE);
   const [now_x_m, now_y_m] = toSite(x, y);
   view.x_m += x_m - now_x_m;
   view.y_m += y_m - now_y_m;
@@ -117,6 +120,24 @@ function turn(azimuth, elevation) {
   turned.height = view.spatial ? Math.cos(turned.elevation) : 0;
 }
 
+/** The least and the largest of any number of values. */
+function extent(values) {
+  return values.reduce(([low, high], value) => [Math.min(low, value), Math.max(high, value)], [Infinity, -Infinity]);
+}
+
+/** Whether a pixel is in the picture, or nearer to it than a margin. */
+export function isSeen(x, y, margin = 20) {
+  return x > -margin && y > -margin && x < view.width + margin && y < view.height + margin;
+}
+
+/** The part of the floor that is in the picture, with a margin: least x and y, largest x and y; in 3-D all of it. */
+export function seenBox() {
+  if (view.spatial) return null;
+  const [x1, y1] = toSite(-MARGIN, view.height + MARGIN);
+  const [x2, y2] = toSite(view.width + MARGIN, -MARGIN);
+  return [x1, y1, x2, y2].map((value) => Number(value.toFixed(1)));
+}
+
 /** Show the whole site and some further corners, [x, y] or [x, y, z], clear of the buttons, of a scale of colours and of a replay's mark. */
 export function fit(site, zones, further, scaleShown = true, replayed = false) {
   view.touched = false;
@@ -129,14 +150,15 @@ export function fit(site, zones, further, scaleShown = true, replayed = false) {
   const [middle_x, middle_y] = [view.width / 2, view.height / 2];
   const across = corners.map(([x, y]) => toX(x, y) - middle_x);
   const up = corners.map(([x, y, z]) => middle_y - toY(x, y, z));
-  const [left, right] = [Math.min(...across), Math.max(...across)];
-  const [bottom, top] = [Math.min(...up), Math.max(...up)];
+  const [left, right] = extent(across);
+  const [bottom, top] = extent(up);
   const edge = isNarrow()
     ? { left: 34, right: 30, top: replayed ? 86 : 62, bottom: scaleShown ? 150 : Math.min(Math.max(0.23 * view.height, 66), 90) }
     : { left: 48, right: 64, top: replayed ? 54 : 32, bottom: scaleShown ? 168 : 104 };
   const wide = (view.width - edge.left - edge.right) / Math.max(right - left, 1);
   const high = (view.height - edge.top - edge.bottom) / Math.max(top - bottom, 1);
-  view.scale = Math.min(Math.max(Math.min(wide, high), MIN_SCALE), MAX_SCALE);
+  view.scale = Math.min(wide, high, MAX_SCALE);
+  min_scale = Math.min(SMALL_SCALE, view.scale / 2);
   const x = middle_x + ((left + right) / 2) * view.scale + (edge.right - edge.left) / 2;
   const y = middle_y - ((bottom + top) / 2) * view.scale - (edge.top - edge.bottom) / 2;
   [view.x_m, view.y_m] = toSite(x, y);

@@ -44,11 +44,11 @@ export function show() {
   parts.found.show(findings().map((finding) => [JSON.stringify(finding), finding]));
   const ids = new Set((state.site?.anchors ?? []).map((anchor) => anchor.id));
   for (const { id } of state.site?.unplaced ?? []) ids.add(id);
-  if (live) for (const id of state.health.anchors.keys()) ids.add(id);
+  if (live) for (const id of state.health.conditions.keys()) ids.add(id);
   parts.rows.show([...ids].map((id) => [id, id]));
   parts.detail.show(state.selection.anchor);
   split(parts.panel, parts.box, !parts.detail.element.hidden);
-  parts.nodes.show([...state.health.nodes].sort(onlineFirst).map((node) => [`${node.kind}/${node.name}`, node]));
+  parts.nodes.show([...state.health.nodes.values()].sort(onlineFirst).map((node) => [`${node.kind}/${node.name}`, node]));
 }
 
 function onlineFirst(a, b) {

@@ -88,7 +88,8 @@ function isIn(name, { kind, level }) {
   return GROUPS[name].kinds?.includes(kind) ?? true;
 }
 
-function makeEvent(_key, { unix_s, level, name, text: words }) {
+function makeEvent(_key, { unix_s, level, name, text: only, count }) {
+  const words = count > 1 ? `${only} (the last of ${count} changes in a row)` : only;
   const element = h(
     "li",
     { class: level },

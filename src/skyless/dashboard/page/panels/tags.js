@@ -83,8 +83,10 @@ export function start(panel) {
 /** Bring the tab up to date. */
 export function show() {
   const list = tracks().sorted;
-  const searched = list.length > SEARCHED;
+  const all = state.mode === "live" && state.part ? state.part.of : list.length;
+  const searched = all > SEARCHED;
   const wanted = searched ? parts.search.value.trim().toLowerCase() : "";
+  state.find = wanted;
   const key = [state.mode, state.selection.tag, wanted, list.length].join(" ");
   const now = performance.now();
   if (list.length > MANY && key === shown.key && now - shown.at < MANY_MS) return;
@@ -98,9 +100,16 @@ export function show() {
   parts.empty.hidden = found.length > 0;
   text(parts.empty, list.length ? "No tag of this name." : "No tags yet.");
   const fresh = list.filter((track) => freshness(track) === "fresh").length;
-  text(parts.count, list.length ? `${fresh} of ${list.length} with a fix` : "");
+  text(parts.count, countWords(fresh, list.length, all));
   parts.detail.show(tracks().all.get(state.selection.tag) ?? null);
   split(parts.panel, parts.box, !parts.detail.element.hidden);
+}
+
+/** How many tags have a fix; of a large site also that only a part of them is listed. */
+function countWords(fresh, listed, all) {
+  if (!listed && !all) return "";
+  if (listed >= all) return `${fresh} of ${listed} with a fix`;
+  return `${number(listed)} of ${number(all)} tags: those on the map, ${number(fresh)} with a fix. Find others by name.`;
 }
 
 function describe(name, { track, style: look }) {
@@ -113,8 +122,8 @@ function describe(name, { track, style: look }) {
   const unverified = isUnverified(health);
   return {
     condition: alert?.grade ? `${condition} alert-${alert.grade}` : condition,
-    words: unverified ? `${WORDS[condition]}, not verified` : WORDS[condition],
-    key: `${condition} ${unverified} ${look.colour} ${look.shape}`,
+    words: [WORDS[condition], unverified && "not verified", alert?.grade && alert.words].filter(Boolean).join(", "),
+    key: `${condition} ${unverified} ${row[ALERT]} ${look.colour} ${look.shape}`,
     mark: () => (condition === "fresh" ? tagMark(look) : h("span", { "aria-hidden": "true" }, MARKS[condition])),
     name: unverified ? `${name} not verified` : name,
     figures: [

@@ -141,7 +141,7 @@ function trace(health, top, at, end_s) {
 }
 
 function showEther() {
-  const age = Math.min(...Object.keys(state.health.ages.ether ?? {}).map((name) => healthAge_s("ether", name)));
+  const age = Math.min(...[...state.health.heardMs.ether.keys()].map((name) => healthAge_s("ether", name)));
   const ether = state.mode === "live" && age < MAX_AGE_S ? state.health.ether : null;
   parts.etherBox.hidden = !ether;
   if (!ether) return;

@@ -65,7 +65,7 @@ export function age_s() {
 
 /** Whether the survey program is there: "fresh", "old", or "none". */
 export function presence() {
-  const programs = state.health.nodes.filter((node) => node.kind === "survey");
+  const programs = [...state.health.nodes.values()].filter((node) => node.kind === "survey");
   const age = age_s();
   if (age === null || (programs.length && !programs.some((node) => node.online))) return "none";
   const interval_s = state.survey.pairs.length / PAIRS_PER_S;

@@ -1,0 +1,122 @@
+"""Large sites: nothing is called good, offline or shown that was not counted."""
+
+import json
+
+import msgspec
+import pytest
+from dashboard_builders import SITE, SITE_ID, fix, status
+from msgspec.structs import replace
+from test_dashboard_condition import anchor_health
+from test_dashboard_live import drained, of
+
+from skyless.dashboard import roster
+from skyless.dashboard.wanted import MAX_ROWS, Wanted
+from skyless.mqtt import topics
+
+SPACING_M = 4.0
+FREE = replace(SITE.site.schedule, mode="free")
+
+
+def large(live, wire, times, tags, anchors):
+    """Run a healthy site for three seconds, in which each program reports once a second."""
+    first = SITE.site.anchors[0]
+    placed = tuple(
+        replace(first, id=n, x_m=SPACING_M * (n % 100), y_m=SPACING_M * (n // 100)) for n in range(1, anchors + 1)
+    )
+    wire.deliver(
+        topics.site_topic(SITE_ID), replace(SITE, site=replace(SITE.site, anchors=placed, master=1, schedule=FREE))
+    )
+    live.on_connection(connected=True)
+    names = [f"t{n}" for n in range(tags)]
+    for second in range(7):
+        for n in range(1, anchors + 1):
+            if not second:
+                live._on_status(topics.status_topic(SITE_ID, "anchor", str(n)), encoded(status("anchor", str(n))))
+            live._on_health(topics.health_topic(SITE_ID, "anchor", str(n)), encoded(anchor_health(n, times.unix_s)))
+        for n, name in enumerate(names):
+            if second in {5, 6}:
+                made = fix(name, times.unix_s, (n % 400, n // 400, 1.0), latency_s=0.0)
+                live._on_fix(topics.fix_topic(SITE_ID, name), encoded(made))
+        times.move(1.0)
+        live.tick()
+    return live.condition
+
+
+encoded = msgspec.json.encode
+
+
+@pytest.mark.parametrize(("tags", "anchors"), [(3, 3000), (3000, 8)])
+def test_a_healthy_large_site_is_good_and_says_how_many_are_shown(live, wire, times, tags, anchors):
+    condition = large(live, wire, times, tags, anchors)
+    assert (condition.level, condition.text) == ("good", "")
+    assert (condition.tags, condition.tags_with_fix, condition.anchors) == (tags, tags, anchors)
+    page = live.open_page()
+    messages = drained(live, page)
+    assert set(of("health", messages)[0]["conditions"].values()) == {"good"}
+    assert len(of("health", messages)[0]["conditions"]) == anchors
+    (state,) = of("state", messages)
+    assert (len(state["tags"]), state.get("of")) == (min(tags, MAX_ROWS), tags if tags > MAX_ROWS else None)
+
+
+def test_what_is_not_taken_in_is_counted_and_not_judged(live, wire, times, monkeypatch):
+    monkeypatch.setattr(roster, "MAX_NAMES", {"tag": 5, "anchor": 6})
+    condition = large(live, wire, times, 8, 9)
+    assert condition.level == "warning"
+    assert [(reason.kind, reason.text) for reason in condition.reasons] == [
+        ("not-shown", "3 tags and 3 anchors are not shown")
+    ]
+    assert (condition.tags, condition.anchors) == (5, 6)
+    messages = drained(live, live.open_page())
+    assert len(of("state", messages)[0]["tags"]) == 5
+    assert len(of("health", messages)[0]["conditions"]) == 6
+    assert [event.text for event in live.log.since() if event.name in {"anchor/7", "anchor/8", "anchor/9"}] == []
+
+
+def test_invented_kinds_and_names_do_not_fill_the_memory(live, wire, monkeypatch):
+    monkeypatch.setattr(roster, "MAX_OTHERS", 3)
+    for n in range(9):
+        wire.deliver(topics.status_topic(SITE_ID, f"kind{n}", "a"), status(f"kind{n}", "a"))
+        wire.deliver(topics.health_topic(SITE_ID, "ether", f"air{n}"), b'{"unix_s":1,"simulated_s":1,"transmissions":1,"late":0,"at_anchors":{},"at_tags":{},"stalls":0,"overruns":0}')  # fmt: skip  # noqa: E501
+    assert len(live.state.statuses) + len(live.evidence.nodes) <= 6
+
+
+def test_a_server_that_does_not_keep_up_says_so_and_calls_no_anchor_offline(live, wire, times):
+    large(live, wire, times, 2, 8)
+    page = live.open_page()
+    drained(live, page)
+    wire.unread_s = 1.0
+    times.move(3.0)
+    for _ in range(10):  # nothing of the anchors can be read, and positions are old when they are
+        times.move(1.0)
+        wire.deliver(topics.fix_topic(SITE_ID, "t1"), fix("t1", times.unix_s - 3.0, latency_s=0.0))
+        wire.deliver(topics.fix_topic(SITE_ID, "t0"), fix("t0", times.unix_s - 3.0, latency_s=0.0))
+        live.tick()
+    assert [reason.text for reason in live.condition.reasons] == ["the page's server is behind by 3.0 s"]
+    assert live.condition.level == "bad"
+    assert of("health", drained(live, page))[0]["conditions"] == {}
+    wire.unread_s = 0.0
+    for _ in range(6):
+        times.move(1.0)
+        wire.deliver(topics.fix_topic(SITE_ID, "t1"), fix("t1", times.unix_s, latency_s=0.0))
+        live.tick()
+    assert "anchors" in [reason.kind for reason in live.condition.reasons]
+
+
+def test_a_page_gets_the_tags_of_its_view_and_those_that_it_names_or_looks_for(live, wire, times):
+    large(live, wire, times, 3000, 8)
+    page = live.open_page()
+    first = of("state", drained(live, page))[0]
+    page.ask(Wanted((0.0, 0.0, 9.5, 1.5), "t29", ("t2500",)))
+    times.move(1.0)
+    live.tick()
+    state = of("state", drained(live, page))[0]
+    kept = {row[0] for row in first["tags"]} - set(state["left"]) | {row[0] for row in state["tags"]}
+    near = {f"t{n}" for n in (*range(10), *range(400, 410))}
+    assert kept == near | {"t29", *(f"t29{n}" for n in range(10)), *(f"t29{n:02}" for n in range(100)), "t2500"}
+    assert (state["of"], state["inside"]) == (3000, len(near))
+
+
+@pytest.mark.parametrize("text", ["", "pong", "[]", '{"view": 3}', '{"rows": 0}', '{"tags": "t1"}', "[" * 5000])
+def test_a_request_that_is_none_changes_nothing(text):
+    assert Wanted.read(text) is None
+    assert Wanted.read(json.dumps({"rows": 5, "view": [0, 1, 2, 3]})) == Wanted((0.0, 1.0, 2.0, 3.0), rows=5)
