@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skyless.authentication.fault import Fault
-from skyless.dashboard.authentication_reasons import authentication_reasons
-from skyless.dashboard.evidence import Evidence
+from skyless.dashboard.condition.authentication_reasons import authentication_reasons
+from skyless.dashboard.condition.evidence import Evidence
 from skyless.mqtt.messages import AnchorHealth, Counters, TagHealth
 
 DAY_S = 86400.0

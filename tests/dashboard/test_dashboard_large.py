@@ -10,7 +10,7 @@ from test_dashboard_condition import anchor_health
 from test_dashboard_live import drained, of
 
 from skyless.dashboard import roster
-from skyless.dashboard.wanted import MAX_ROWS, Wanted
+from skyless.dashboard.wanted import MAX_ROWS, PageRequest
 from skyless.mqtt import topics
 
 SPACING_M = 4.0
@@ -106,7 +106,7 @@ def test_a_page_gets_the_tags_of_its_view_and_those_that_it_names_or_looks_for(l
     large(live, wire, times, 3000, 8)
     page = live.open_page()
     first = of("state", drained(live, page))[0]
-    page.ask(Wanted((0.0, 0.0, 9.5, 1.5), "t29", ("t2500",)))
+    page.ask(PageRequest((0.0, 0.0, 9.5, 1.5), "t29", ("t2500",)))
     times.move(1.0)
     live.tick()
     state = of("state", drained(live, page))[0]
@@ -118,5 +118,5 @@ def test_a_page_gets_the_tags_of_its_view_and_those_that_it_names_or_looks_for(l
 
 @pytest.mark.parametrize("text", ["", "pong", "[]", '{"view": 3}', '{"rows": 0}', '{"tags": "t1"}', "[" * 5000])
 def test_a_request_that_is_none_changes_nothing(text):
-    assert Wanted.read(text) is None
-    assert Wanted.read(json.dumps({"rows": 5, "view": [0, 1, 2, 3]})) == Wanted((0.0, 1.0, 2.0, 3.0), rows=5)
+    assert PageRequest.read(text) is None
+    assert PageRequest.read(json.dumps({"rows": 5, "view": [0, 1, 2, 3]})) == PageRequest((0.0, 1.0, 2.0, 3.0), rows=5)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from skyless.dashboard.lateness import FixAges
+from skyless.dashboard.condition.lateness import FixAges
 
 UNIX_S = 1e9
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skyless.dashboard.state import EXPIRY_S, GONE_S, SiteState
-from skyless.dashboard.wanted import MAX_HEALTHS, Sent, Wanted
+from skyless.dashboard.wanted import MAX_HEALTHS, PageRequest, Sent
 from skyless.mqtt.messages import AnchorHealth, Counters, EtherHealth
 
 POSITION = ("name", "x_m", "y_m", "z_m", "vx", "vy")
@@ -235,7 +235,7 @@ def test_of_many_anchors_a_page_gets_all_conditions_and_the_healths_that_it_name
     first = health(state, sent)
     assert len(first["conditions"]) == MAX_HEALTHS + 1
     assert [one["anchor"] for one in first["anchors"]] == [7]
-    sent.wanted = Wanted(anchors=("9", "no such"))
+    sent.wanted = PageRequest(anchors=("9", "no such"))
     assert [one["anchor"] for one in health(state, sent)["anchors"]] == [9]
     assert health(state, sent)["anchors"] == []
     state.add_health("9", anchor_health(9), 1.0)
@@ -264,7 +264,7 @@ def test_a_page_always_has_the_newest_fix_of_just_the_tags_that_it_was_given(ste
         for tag, x in moves:
             state.add_fix(fix(f"t{tag}", position_m=(float(x), 0.0, 1.0)), state.now_s, 1000.0)
             newest[f"t{tag}"] = float(x), state.now_s
-        sent.wanted = Wanted(
+        sent.wanted = PageRequest(
             None if view is None else (min(view), -1.0, max(view), 1.0),
             text,
             tuple(f"t{n}" for n in named),

@@ -70,8 +70,9 @@ def test_offsets_continue_over_the_wrap_of_the_counter(page):
     got = page.evaluate(
         """async (given) => {
           const { addHealth, anchorHistory } = await import("/page/history.js");
+          const add = (health) => addHealth([health], [], new Set([99]), new Set());
           const more = { rate_ppm: 3, offset_std_m: 0.01 };
-          for (const [unix_s, offset_s] of given) addHealth([{ anchor: 99, unix_s, offset_s, ...more }], []);
+          for (const [unix_s, offset_s] of given) add({ anchor: 99, unix_s, offset_s, ...more });
           return anchorHistory.get(99).offset_us;
         }""",
         given,
@@ -84,10 +85,11 @@ def test_no_line_of_a_chart_crosses_a_restart_a_silence_or_another_master(page):
     offsets, rates = page.evaluate(
         """async (given) => {
           const { addHealth, anchorHistory } = await import("/page/history.js");
+          const add = (health) => addHealth([health], [], new Set([99]), new Set());
           for (const [unix_s, uptime_s, master, offset_s] of given)
-            addHealth([{ anchor: 99, role: "anchor", unix_s, uptime_s, master, offset_s, rate_ppm: 3 }], []);
+            add({ anchor: 99, role: "anchor", unix_s, uptime_s, master, offset_s, rate_ppm: 3 });
           const clock = { anchor: 99, role: "master", master: 99, unix_s: 24, uptime_s: 5, offset_s: 0, rate_ppm: 0 };
-          addHealth([{ ...clock, offset_std_m: 0 }], []);
+          add({ ...clock, offset_std_m: 0 });
           const { offset_us, rate_ppm } = anchorHistory.get(99);
           return [offset_us, rate_ppm];
         }""",

@@ -25,7 +25,7 @@ from skyless.dashboard.overlays import KINDS, NoOverlayError, Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
 from skyless.dashboard.site_survey import NoResultError
 from skyless.dashboard.sites import LiveSites
-from skyless.dashboard.wanted import Wanted
+from skyless.dashboard.wanted import PageRequest
 from skyless.errors import SkylessError
 from skyless.mqtt.survey_facts import BadFactsError
 from skyless.site.image import image_size
@@ -271,7 +271,7 @@ async def _live(socket: WebSocket) -> None:
 
     def receive(text: str) -> None:
         live.keep_page(page)
-        wanted = None if text == "ping" else Wanted.read(text)
+        wanted = None if text == "ping" else PageRequest.read(text)
         if text == "ping":
             page.replace("pong", b'{"type":"pong"}')
         elif wanted is not None:

@@ -9,9 +9,9 @@ from typing import Final, Literal
 
 from msgspec import Struct
 
-from skyless.dashboard.condition import Condition
-from skyless.dashboard.evidence import ALERT_WORDS, ALERTS, Health
-from skyless.dashboard.leader import LeaderTracker
+from skyless.dashboard.condition.evidence import ALERT_WORDS, ALERTS, Health
+from skyless.dashboard.condition.leader import LeaderTracker
+from skyless.dashboard.condition.monitor import Condition
 from skyless.dashboard.state import SILENT_S
 from skyless.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, SurveyMessage, WatchMessage
 

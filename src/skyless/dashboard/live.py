@@ -19,13 +19,13 @@ from msgspec import Struct
 
 import skyless
 from skyless.bridges.feed import bridged_site
-from skyless.dashboard.condition import EVALUATION_S, Condition, ConditionMonitor
+from skyless.dashboard.condition.evidence import Evidence
+from skyless.dashboard.condition.monitor import EVALUATION_S, Condition, ConditionMonitor
 from skyless.dashboard.events import MAX_LOGGED, EventLog
-from skyless.dashboard.evidence import Evidence
 from skyless.dashboard.geojson import OLDEST_S, features
 from skyless.dashboard.site_survey import SiteSurvey, topic_of
 from skyless.dashboard.state import SiteState, encode
-from skyless.dashboard.wanted import Sent, Wanted
+from skyless.dashboard.wanted import PageRequest, Sent
 from skyless.dashboard.zone_events import MAX_EVENTS, EventQueue, publisher_rank
 from skyless.errors import ConfigurationError
 from skyless.mqtt import topics
@@ -137,7 +137,7 @@ class PageQueue:
         self._health_due |= health
         self._wake.set()
 
-    def ask(self, wanted: Wanted) -> None:
+    def ask(self, wanted: PageRequest) -> None:
         """Send from now on what the page asks for."""
         self._sent.wanted = wanted
         self.request_state(health=True)

@@ -32,7 +32,7 @@ _KINDS: Final[dict[type, str]] = {AnchorHealth: "anchors", TagHealth: "tags", Et
 CHOICE_S: Final = 0.5
 """Interval at which the tags for a page are chosen again."""
 
-GONE_S: Final = 10.0
+UNHEARD_S: Final = 10.0
 """A tag without a fix for this long is not on the map any more; as in ``page/clock.js``."""
 
 SILENT_S: Final = 3.5
@@ -179,7 +179,7 @@ class SiteState:
         inside = []
         for name, tag in self._tags.items():
             x, y, _ = tag.fix.position_m
-            if x1 <= x <= x2 and y1 <= y <= y2 and self.now_s - tag.received_s < GONE_S:
+            if x1 <= x <= x2 and y1 <= y <= y2 and self.now_s - tag.received_s < UNHEARD_S:
                 inside.append(name)
         sent.inside = len(inside)
         named = [name for name in wanted.tags if name in self._tags]

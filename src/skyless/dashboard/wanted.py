@@ -15,7 +15,7 @@ MAX_REQUEST_BYTES: Final = 16_384
 _MAX_NAMED: Final = 200
 
 
-class Wanted(Struct, frozen=True):
+class PageRequest(Struct, frozen=True):
     """What one page shows."""
 
     view: tuple[float, float, float, float] | None = None
@@ -29,7 +29,7 @@ class Wanted(Struct, frozen=True):
     """Tags that its browser can draw in time."""
 
     @classmethod
-    def read(cls, text: str) -> "Wanted | None":
+    def read(cls, text: str) -> "PageRequest | None":
         """A page's request; None for a text that is none."""
         try:
             return msgspec.json.decode(text, type=cls)
@@ -41,7 +41,7 @@ class Sent:
     """What a page has been sent of the state, so that it is sent only what is new."""
 
     def __init__(self) -> None:
-        self.wanted = Wanted()
+        self.wanted = PageRequest()
         self.fixes = 0
         """Serial of the last fix."""
         self.tags: dict[str, None] | None = None

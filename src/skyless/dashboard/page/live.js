@@ -7,7 +7,6 @@ import { addHealth, clearHistory } from "./history.js";
 import { chosenSite } from "./sites.js";
 import { receiveSurvey, receiveWatch, restart } from "./survey/model.js";
 import { noteGap, rowLimit } from "./pace.js";
-import { seenBox } from "./map/view.js";
 
 const FIRST_RETRY_MS = 500;
 const LAST_RETRY_MS = 3000;
@@ -127,7 +126,7 @@ function ask() {
   const tags = [state.selection.tag, state.followed, ...state.listed.tags].filter((name) => name !== null);
   const anchors = [state.selection.anchor, ...state.listed.anchors].filter((id) => id !== null).map(String);
   const limit = (names) => [...new Set(names)].slice(0, MAX_NAMED);
-  const wanted = { view: seenBox(), find: state.find, tags: limit(tags), anchors: limit(anchors), rows: rowLimit() };
+  const wanted = { view: state.seenBox(), find: state.find, tags: limit(tags), anchors: limit(anchors), rows: rowLimit() };
   const words = JSON.stringify(wanted);
   if (words === asked || socket.readyState !== WebSocket.OPEN) return;
   asked = words;

@@ -57,6 +57,8 @@ export const state = {
   },
   /** Where the server sends a part of the tags: how many there are, and how many in this page's view. @type {any} */
   part: null,
+  /** The part of the site that the map shows, [x1, y1, x2, y2]; null: all of it. @type {() => number[]|null} */
+  seenBox: () => null,
   /** What the page asks the server for besides its view: rows in sight in the lists, a search, the followed tag. */
   listed: { tags: [], anchors: [] },
   find: "",

@@ -14,7 +14,7 @@ import { drawGround, spaceCorners } from "./space.js";
 import { drawSurvey, surveyCorners, surveyOutOfSight } from "./survey.js";
 import { RICH, drawTags, visibleTags } from "./tags.js";
 import { drawTrails, due } from "./trails.js";
-import { fit, prepare, setSpatial, view } from "./view.js";
+import { fit, prepare, seenBox, setSpatial, view } from "./view.js";
 import { drawDraft, drawZones, flash } from "./zones.js";
 
 /** Frames drawn so far, for tests and measurements. */
@@ -106,6 +106,7 @@ export function showSpatial(spatial) {
 /** Start drawing. */
 export function start() {
   const box = byId("map");
+  state.seenBox = seenBox;
   new ResizeObserver(() => {
     view.width = box.clientWidth;
     view.height = box.clientHeight;

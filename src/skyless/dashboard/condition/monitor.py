@@ -11,9 +11,9 @@ from typing import Final, Literal
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.dashboard.authentication_reasons import authentication_reasons
-from skyless.dashboard.evidence import FRESH_S, Evidence
-from skyless.dashboard.reasons import (
+from skyless.dashboard.condition.authentication_reasons import authentication_reasons
+from skyless.dashboard.condition.evidence import FRESH_S, Evidence
+from skyless.dashboard.condition.reasons import (
     LAG_S,
     Reason,
     alert_reasons,

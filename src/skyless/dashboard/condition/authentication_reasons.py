@@ -8,8 +8,8 @@ from collections.abc import Iterable, Mapping
 from typing import Final, Literal
 
 from skyless.authentication.fault import Fault
-from skyless.dashboard.evidence import GRACE_S, Evidence, Node
-from skyless.dashboard.reasons import Reason, alike, counted, listed, names_of, verb
+from skyless.dashboard.condition.evidence import GRACE_S, Evidence, Node
+from skyless.dashboard.condition.reasons import Reason, alike, counted, listed, names_of, verb
 from skyless.mqtt.messages import AnchorHealth, TagHealth
 
 CHAIN_ENDS_S: Final = 60 * 86400.0

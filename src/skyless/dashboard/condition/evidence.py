@@ -5,9 +5,9 @@
 
 from typing import Final
 
-from skyless.dashboard.lateness import FixAges
-from skyless.dashboard.leader import LeaderTracker
-from skyless.dashboard.roster import Roster
+from skyless.dashboard.condition.lateness import FixAges
+from skyless.dashboard.condition.leader import LeaderTracker
+from skyless.dashboard.condition.roster import Roster
 from skyless.mqtt.messages import AnchorHealth, EtherHealth, FixMessage, StatusMessage, TagHealth
 from skyless.site.model import Site
 

@@ -6,8 +6,8 @@ from typing import Final, Literal
 
 from msgspec import Struct
 
-from skyless.dashboard.evidence import ALERT_WORDS, ALERTS, FRESH_S, GRACE_S, Evidence, Node
-from skyless.dashboard.roster import MAX_NAMES
+from skyless.dashboard.condition.evidence import ALERT_WORDS, ALERTS, FRESH_S, GRACE_S, Evidence, Node
+from skyless.dashboard.condition.roster import MAX_NAMES
 from skyless.mqtt.messages import AnchorHealth, EtherHealth, TagHealth, WatchMessage
 
 LATE_S: Final = 0.25
