@@ -3,6 +3,7 @@
 import msgspec
 from paho.mqtt.client import topic_matches_sub
 
+from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.messages import FixMessage, SiteMessage, StatusMessage, TruthMessage, Zone
 from skyless.site.lab import lab_site
 
@@ -64,6 +65,7 @@ class Wire:
     """In the place of a link: keeps what is published, and echoes it as a broker does."""
 
     def __init__(self):
+        self.address = MqttAddress("broker", 1)
         self.published = []
         self.forgotten = []
         self.handlers = {}

@@ -50,7 +50,8 @@ def test_the_demo_starts_without_a_profile_and_the_site_brings_its_own_services(
         assert service["cap_drop"] == ["ALL"], name
 
 
-ROLES = {"anchor": Role.ANCHORS, "tag": Role.TAGS} | dict.fromkeys(("dashboard", "record", "survey"), Role.PAGE)
+ROLES = {"anchor": Role.ANCHORS, "tag": Role.TAGS} | dict.fromkeys(("dashboard", "record"), Role.PAGE)
+ROLES |= {"survey": Role.SURVEY}
 """Of each program that uses the broker."""
 
 
