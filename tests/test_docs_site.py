@@ -34,6 +34,7 @@ OTHER_PROGRAMS = {
     "--nworkers",
     "--chiperase",
     "--no-dev",
+    "--no-editable",
     "--compile-bytecode",
     "--help",
     "--home-dir",

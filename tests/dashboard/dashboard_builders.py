@@ -3,6 +3,7 @@
 import msgspec
 from paho.mqtt.client import topic_matches_sub
 
+from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.messages import FixMessage, SiteMessage, StatusMessage, TruthMessage, Zone
 from skyless.site.lab import lab_site
 
@@ -66,6 +67,7 @@ class Wire:
     unread_s = 0.0
 
     def __init__(self):
+        self.address = MqttAddress("broker", 1)
         self.published = []
         self.forgotten = []
         self.handlers = {}

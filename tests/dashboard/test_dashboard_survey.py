@@ -19,6 +19,8 @@ from skyless.dashboard.playback import Playback
 from skyless.dashboard.site_survey import SiteSurvey
 from skyless.dashboard.sites import LiveSites
 from skyless.mqtt import topics
+from skyless.mqtt.access import Role
+from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.messages import SurveyFactsMessage, SurveyMessage, WatchFinding, WatchMessage
 from skyless.mqtt.survey_facts import BadFactsError
 from skyless.site.model import FloorPlanSite, UnplacedAnchor
@@ -168,6 +170,19 @@ def test_a_result_is_saved_by_its_number(browser, wire):
     assert (topic, json.loads(payload), qos, retain) == (
         topics.survey_save_topic(SITE_ID), {"by": "here", "serial": 2}, 1, False,
     )  # fmt: skip
+
+
+def test_a_page_whose_role_may_not_set_up_a_site_says_so(browser, wire):
+    """The broker would acknowledge what it drops."""
+    wire.address = MqttAddress("broker", 1, user=str(Role.PAGE))
+    wire.deliver(SURVEY, survey_message())
+    for answer in (
+        browser.post("/api/survey/save", content=b'{"serial": 3}'),
+        browser.put("/api/survey/facts", content=msgspec.json.encode(FACTS)),
+    ):
+        assert answer.status_code == 403
+        assert "start this page with the user survey" in answer.json()["error"]
+    assert wire.published == []
 
 
 def test_a_floor_plan_is_retained_and_shown(browser, wire, live):

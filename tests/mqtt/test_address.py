@@ -3,6 +3,7 @@
 import contextlib
 from pathlib import Path
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -25,6 +26,8 @@ def no_password(monkeypatch):
         ("mqtts://hall.example", MqttAddress("hall.example", 8883, True)),
         ("mqtts://ann@hall.example:1", MqttAddress("hall.example", 1, True, "ann")),
         ("mqtts://a%40b:p%2Fw%3A@h:1", MqttAddress("h", 1, True, "a@b", "p/w:")),
+        ("mqtt://a,b:2,[::1]:3/", MqttAddress("a", 1883, others=(("b", 2), ("::1", 3)))),
+        ("mqtts://ann:p,w@a:1,b", MqttAddress("a", 1, True, "ann", "p,w", others=(("b", 8883),))),
     ],
 )
 def test_urls(url, expected):
@@ -54,6 +57,9 @@ def test_the_password_may_stand_in_the_environment(monkeypatch):
         ("mqtt://h:x", "a port between 1 and 65535"),
         ("mqtt://h/skyless", "nothing after the port"),
         ("mqtt://:word@h", "a user's name"),
+        ("mqtt://a,,b", "a host name"),
+        ("mqtt://a,b:x", "a port between 1 and 65535"),
+        ("mqtt://a,mqtt://b", "mqtt|host|port"),
     ],
 )
 def test_a_wrong_url_is_reported_with_what_would_be_right(url, right):
@@ -61,10 +67,24 @@ def test_a_wrong_url_is_reported_with_what_would_be_right(url, right):
         mqtt_address(url)
 
 
+def test_several_brokers_are_one_address_and_its_text():
+    address = mqtt_address("mqtts://ann:word@a,b:2,[::1]", Path("x.pem"))
+    assert str(address) == "mqtts://ann@a:8883,b:2,[::1]:8883"
+    assert [(one.host, one.port, one.others) for one in address.brokers] == [
+        ("a", 8883, ()),
+        ("b", 2, ()),
+        ("::1", 8883, ()),
+    ]
+    assert {(one.user, one.password, one.ca, one.tls) for one in address.brokers} == {
+        ("ann", "word", Path("x.pem"), True)
+    }
+    assert msgspec.structs.replace(mqtt_address(str(address)), password="word", ca=Path("x.pem")) == address
+
+
 SECRET = "S3cretWord"
 
 
-@pytest.mark.parametrize("rest", ["h:99999", "h/x", "a b", "", "h:x", "[::1"])
+@pytest.mark.parametrize("rest", ["h:99999", "a,b:x", "h/x", "a b", "", "h:x", "[::1"])
 @pytest.mark.parametrize("scheme", ["mqtt://", "mqtts://", "http://", "mqtt:/", ""])
 @pytest.mark.parametrize("user", ["ann", "", "a%40b"])
 def test_no_error_shows_the_password(scheme, user, rest):
@@ -105,3 +125,4 @@ def test_trusted_certificates(tmp_path):
 )
 def test_which_brokers_are_on_this_machine(host, here):
     assert MqttAddress(host, 1).loopback is here
+    assert not MqttAddress(host, 1, others=(("10.0.0.1", 1),)).loopback

@@ -13,6 +13,7 @@ from mqtt_brokers import free_port, running, stopped, until
 
 from skyless.errors import SkylessError
 from skyless.mqtt import connection
+from skyless.mqtt import link as link_module
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.connection import check_broker
 from skyless.mqtt.link import Link
@@ -153,7 +154,7 @@ def test_a_stopped_link_logs_it_and_sends_what_waits(make_broker):
         tag = tag_link(broker.address)
         async with running(broker, inbox.link, tag) as (_, task):
             await until(lambda: inbox.online("tag", "t1"))
-            for number in range(500):
+            for number in range(100):
                 tag.publish(receptions_topic(7, "t1"), b"%d" % number, qos=1)
             await stopped(task)
             assert not tag.connected
@@ -494,5 +495,74 @@ def test_a_handler_that_fails_costs_the_others_nothing(make_broker, caplog):
             await until(lambda: set(inbox.of(fix_topic(7, "t1"))) == {b"1", b"2"})
             assert inbox.link.counters.reconnects == 0
             assert "a bad handler" in caplog.text
+
+    asyncio.run(check())
+
+
+def test_a_message_costs_no_more_with_many_filters_and_more_topics_than_are_kept():
+    """Counted in calls of functions: 11,000 topics in turn, 100 filters."""
+    link, seen = tag_link(MqttAddress("127.0.0.1", 1)), []
+    for number in range(100):
+        link.subscribe(f"skyless/v1/{number}/tag/+/fix", lambda topic, _payload: seen.append(topic))
+    link.subscribe("skyless/#", lambda topic, _payload: seen.append(topic))
+    receive, calls = link._subscriptions.receive, 0
+
+    def count(_frame, event, _argument):
+        nonlocal calls
+        calls += event == "call"
+
+    topics = [f"skyless/v1/7/tag/t{number}/fix" for number in range(11_000)]
+    sys.setprofile(count)
+    try:
+        for topic in topics:
+            receive(topic, b"")
+    finally:
+        sys.setprofile(None)
+    assert seen == [topic for topic in topics for _ in range(2)]
+    assert calls < 60 * len(topics)
+
+
+@pytest.mark.parametrize("first", ["gone", "mute"])
+def test_a_link_goes_on_to_the_next_broker(make_broker, first, monkeypatch, caplog):
+    """After a refusal, or without an answer; and when the one in use has died."""
+    monkeypatch.setattr(connection, "BROKER_ANSWER_S", 1.0)
+
+    async def check():
+        one, other = make_broker("one"), make_broker("other")
+        mute = await asyncio.start_server(lambda *_: asyncio.sleep(30), "127.0.0.1", 0)
+        port = mute.sockets[0].getsockname()[1] if first == "mute" else free_port()
+        others = ((one.address.host, one.address.port), (other.address.host, other.address.port))
+        address = MqttAddress("127.0.0.1", port, others=others)
+        tag, inbox = tag_link(address), Inbox(other.address, zones_topic(7), status_topic(7, "tag", "+"))
+        tag.publish(zones_topic(7), ZONES, qos=1, retain=True)
+        async with running(one, tag):
+            await until(lambda: tag.connected and not tag.unacknowledged)
+            assert f"127.0.0.1:{port}" in caplog.text
+            await check_broker(address)
+            await other.start()
+            reader = asyncio.ensure_future(inbox.link.run())
+            await until(lambda: inbox.link.connected)
+            await one.kill()
+            await until(lambda: inbox.of(zones_topic(7)) and inbox.online("tag", "t1"))
+            await stopped(reader)
+            await other.stop()
+        mute.close()
+
+    asyncio.run(check())
+
+
+def test_a_status_is_published_again_and_again(make_broker, monkeypatch):
+    """A broker that was reached over another one may have missed it, while the own connection stayed."""
+    monkeypatch.setattr(link_module, "RESEND_S", 0.2)
+
+    async def check():
+        broker = make_broker()
+        tag, inbox = tag_link(broker.address), Inbox(broker.address, status_topic(7, "tag", "+"))
+        async with running(broker, inbox.link), asyncio.TaskGroup() as tasks:
+            task = tasks.create_task(tag.run())
+            await until(lambda: len(inbox.messages) > 3)
+            assert len(set(inbox.messages)) == 1
+            await stopped(task)
+            await until(lambda: inbox.online("tag", "t1") is False)
 
     asyncio.run(check())

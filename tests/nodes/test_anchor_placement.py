@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import itertools
 import time
 
 import msgspec
@@ -11,6 +12,7 @@ from node_stage import LAB, FakeRadio, play, receptions
 
 from skyless.air.codec import decode
 from skyless.mqtt.messages import PlacementMessage, RequestMessage
+from skyless.nodes import process
 from skyless.nodes.anchor import AnchorNode
 from skyless.nodes.process import SitePublisher
 from skyless.radios.interface import Restarted
@@ -157,3 +159,21 @@ def test_the_site_is_published_again_after_a_placement():
     publisher.place(surveyed())
     publisher.publish(FakeLink())
     assert [message.site for _, message in published] == [LAB, surveyed()]
+
+
+def test_the_site_is_published_again_and_again(monkeypatch):
+    published, now_s = [], 0.0
+
+    class FakeLink:
+        def publish(self, _topic, message, **_):
+            published.append((now_s, message))
+
+    monkeypatch.setattr(process.time, "monotonic", lambda: now_s)
+    publisher = SitePublisher(LAB, lambda: True)
+    for second in range(300):
+        now_s = float(second)
+        publisher.publish(FakeLink())
+    assert len({message.unix_s for _, message in published}) == 1
+    times = [moment for moment, _ in published]
+    assert all(14 <= later - earlier <= 31 for earlier, later in itertools.pairwise(times))
+    assert times[-1] > 265

@@ -1,9 +1,11 @@
 """The anchor's program with keys: codes on the air, files that change while it runs, and what it logs."""
 
 import asyncio
+import re
 
 import pytest
 from keyed_site import FIRST, FREE, KEYS, OTHER_KEYS, SECOND, put
+from msgspec.structs import replace
 from node_stage import FakeRadio, play
 
 from skyless.air.codec2 import decode_2
@@ -16,12 +18,14 @@ from skyless.cli.main import main
 from skyless.constants import TICK_S
 from skyless.errors import SkylessError
 from skyless.evaluation.trusted_air import START_UNIX_S
-from skyless.mqtt.messages import Counters
-from skyless.nodes.anchor import Anchors, health_of
+from skyless.mqtt.messages import Counters, PlacementMessage
+from skyless.nodes.anchor import AnchorNode, Anchors, health_of
 from skyless.nodes.keys.anchor_keys import AnchorKeys
 from skyless.nodes.keys.anchor_report import AnchorReport
 from skyless.nodes.keys.faults import CALM_S, LASTING_S, MOST_NAMED, FaultLines
 from skyless.radios.interface import Restarted
+from skyless.site.digest import site_digest
+from skyless.site.model import UnplacedAnchor
 from skyless.ticks import difference
 
 BEGIN_S = 1000.0
@@ -276,3 +280,53 @@ def test_stamps_of_beacons_that_are_not_accepted_are_not_kept(tmp_path, clock):
                 assert (2 in stage.node.heard_s) is is_kept
 
     play(check())
+
+
+def moved(site, x_m=0.0, ticks=0):
+    """The site with one anchor elsewhere, or with another delay."""
+    first = site.anchors[0]
+    first = replace(first, x_m=first.x_m + x_m, tx_antenna_delay_ticks=first.tx_antenna_delay_ticks + ticks)
+    return replace(site, anchors=(first, *site.anchors[1:]))
+
+
+def placement(before, after):
+    return PlacementMessage(0.0, site_digest(before), after)
+
+
+def keyed_node(folder, said, site=FREE, **options):
+    put(folder, FIRST)
+    return AnchorNode(site, 1, FakeRadio("1"), said.append, AnchorKeys(folder, site.id, said.append, {}), **options)
+
+
+@pytest.mark.parametrize(("x_m", "ticks", "far"), [(3.0, 0, "3.00"), (-0.51, 0, "0.51"), (0.0, 200, "0.94")])
+def test_a_placement_far_from_the_site_file_moves_no_anchor_with_keys(tmp_path, x_m, ticks, far):
+    """Its codes would vouch for what anybody with the password of a survey sends."""
+    said = []
+    node, message = keyed_node(tmp_path, said), placement(FREE, moved(FREE, x_m, ticks))
+    assert not node.place(message)
+    assert not node.place(message)
+    assert node.site is FREE
+    assert node.refused == {"placement-refused": 2}
+    assert len(said) == 1
+    assert re.search(f"ignored: they differ from the site file by {far} m.*0.5 m.*--allow-placement", said[0])
+    assert keyed_node(tmp_path, said, allow_placement=True).place(message)
+    assert AnchorNode(FREE, 1, FakeRadio("1"), said.append).place(message)
+
+
+def test_many_small_placements_do_not_add_up(tmp_path):
+    node = keyed_node(tmp_path, [])
+    assert node.place(placement(FREE, moved(FREE, 0.4)))
+    assert not node.place(placement(node.site, moved(node.site, 0.4)))
+    assert node.place(placement(node.site, moved(node.site, -0.4)))
+    assert node.refused == {"placement-refused": 1}
+
+
+def test_an_anchor_with_keys_and_no_position_is_placed_only_where_that_is_allowed(tmp_path):
+    first = FREE.anchors[0]
+    site = replace(
+        FREE,
+        anchors=FREE.anchors[1:],
+        unplaced=(UnplacedAnchor(first.id, first.slot, first.tx_antenna_delay_ticks, first.rx_antenna_delay_ticks),),
+    )
+    assert not keyed_node(tmp_path, [], site).place(placement(site, FREE))
+    assert keyed_node(tmp_path, [], site, allow_placement=True).place(placement(site, FREE))

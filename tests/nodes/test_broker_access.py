@@ -156,7 +156,7 @@ def test_each_role_receives_exactly_what_the_table_says(make_access):
 def test_no_role_but_the_operator_subscribes_to_more_than_it_may(make_access):
     access = make_access(strangers_read=True)
     page = {"skyless/#", "skyless/v1/#", "skyless/v1/+/#", "skyless/v1/7/tag/#"}
-    granted = {Role.PAGE: page, Role.OPERATOR: page | {"#", "+/#"}}
+    granted = {Role.PAGE: page, Role.SURVEY: page, Role.OPERATOR: page | {"#", "+/#"}}
     for role in Role:
         assert access.client(role).subscribe(BROAD) - {"$JS/#", "$SYS/#"} == granted.get(role, set()), role
         if role is not Role.OPERATOR:
@@ -169,7 +169,9 @@ def test_the_dangerous_pairs_by_hand():
     operator = Role.OPERATOR
     assert writers["skyless/v1/7/site"] == {operator, Role.ANCHORS}
     assert writers["skyless/v1/7/tag/n1/fix"] == {operator, Role.TAGS}
-    assert writers["skyless/v1/7/survey/placement"] == writers["skyless/v1/7/request"] == {operator, Role.PAGE}
+    assert writers["skyless/v1/7/request"] == {operator, Role.PAGE, Role.SURVEY}
+    for what in ("placement", "save", "facts", "state"):
+        assert writers[f"skyless/v1/7/survey/{what}"] == {operator, Role.SURVEY}
     assert not any(Role.STRANGER in roles for roles in writers.values())
     assert all(operator in roles for roles in writers.values())
     assert {name for name in TOPICS if matches(ACCESS[Role.STRANGER].subscribe, name)} == {

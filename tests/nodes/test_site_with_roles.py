@@ -81,14 +81,14 @@ def test_the_programs_of_a_site_may_do_all_that_they_do(broker, tmp_path):
 
     async def check():
         site, air = ("--site", site_file(tmp_path)), f"127.0.0.1:{free_port()}"
-        mqtts = ("--mqtt", f"mqtts://page@127.0.0.1:{broker.address.port}")
+        mqtts = ("--mqtt", f"mqtts://survey@127.0.0.1:{broker.address.port}")
         programs = [
             program(Role.ANCHORS, "ether", *site, "--tags", 1, "--listen", air),
             program(Role.ANCHORS, "anchor", *range(1, 8), *site, "--radio", f"ether:{air}"),
             program(Role.TAGS, "tag", "tag1", "--radio", f"ether:{air}"),
             program(Role.PAGE, "dashboard", "--listen", f"127.0.0.1:{free_port()}"),
             program(Role.PAGE, "record", tmp_path / "walk.mcap"),
-            program(Role.PAGE, "survey", "--serve", *mqtts, "--mqtt-ca", tmp_path / "certificate.pem"),
+            program(Role.SURVEY, "survey", "--serve", *mqtts, "--mqtt-ca", tmp_path / "certificate.pem"),
             program(Role.PAGE, "bridge", f"jsonl+tcp://127.0.0.1:{free_port()}"),
         ]
         await broker.start()

@@ -20,7 +20,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyless.dashboard.geojson import MEDIA_TYPE
 from skyless.dashboard.guard import AccessRules, Guard
-from skyless.dashboard.live import LiveSite, NoBrokerError, NoSiteError, TooManyPagesError
+from skyless.dashboard.live import LiveSite, NoBrokerError, NoSiteError, NotAllowedError, TooManyPagesError
 from skyless.dashboard.overlays import KINDS, NoOverlayError, Overlays
 from skyless.dashboard.playback import NoRecordingError, Playback
 from skyless.dashboard.site_survey import NoResultError
@@ -49,6 +49,7 @@ _STATUSES: Final[dict[type[Exception], int]] = {
     NoSiteError: 404,
     NoResultError: 409,
     NoOverlayError: 422,
+    NotAllowedError: 403,
     NoBrokerError: 503,
 }
 

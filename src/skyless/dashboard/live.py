@@ -29,6 +29,8 @@ from skyless.dashboard.wanted import PageRequest, Sent
 from skyless.dashboard.zone_events import MAX_EVENTS, EventQueue, publisher_rank
 from skyless.errors import ConfigurationError
 from skyless.mqtt import topics
+from skyless.mqtt.access import Role
+from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.messages import (
     AnchorHealth,
     EtherHealth,
@@ -73,6 +75,8 @@ GONE_S: Final = 180.0
 class MqttLink(Protocol):
     """The part of ``skyless.mqtt.link.Link`` that is used."""
 
+    address: MqttAddress
+
     def publish(self, topic: str, message: Struct | bytes, *, qos: int = 0, retain: bool = False) -> None:
         """Queue a message; returns at once."""
 
@@ -85,6 +89,10 @@ class MqttLink(Protocol):
     @property
     def unread_s(self) -> float:
         """For how long messages have waited without a break to be read."""
+
+
+class NotAllowedError(Exception):
+    """The broker would drop the message: the role of this page may not publish it."""
 
 
 class NoBrokerError(Exception):
@@ -430,8 +438,10 @@ class LiveSite:
     # Survey
 
     def publish_survey(self, message: SurveyFactsMessage | SurveySaveMessage) -> None:
-        """Give the survey program facts or the request to save. Raises NoBrokerError."""
+        """Give the survey program facts or the request to save. Raises NoBrokerError and NotAllowedError."""
         link, site_id = self._connected()
+        if link.address.user == Role.PAGE:  # the broker would drop it without an answer
+            raise NotAllowedError("the role page may not set up a site; start this page with the user survey instead")
         link.publish(topic_of(message, site_id), message, qos=1)
 
     def store_floor_plan(self, image: bytes) -> None:

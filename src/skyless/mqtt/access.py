@@ -16,7 +16,9 @@ class Role(StrEnum):
     """Anchors, and the emulated air."""
     TAGS = "tags"
     PAGE = "page"
-    """What shows, records, surveys and passes on: dashboard, record, survey, bridge; also Home Assistant itself."""
+    """What shows, records and passes on: dashboard, record, bridge; also Home Assistant itself."""
+    SURVEY = "survey"
+    """What moves anchors: survey, and a dashboard whose users set up the site."""
     OPERATOR = "operator"
     """A person, and programs that are all of a site in one: the demo, tags in a system without Skyless's anchors."""
     STRANGER = "stranger"
@@ -40,6 +42,16 @@ def _status(*kinds: str) -> tuple[str, ...]:
 def _health(*kinds: str) -> tuple[str, ...]:
     return tuple(topics.health_topic(EVERY_SITE, kind, EVERY_NODE) for kind in kinds)
 
+
+_SHOWN: Final = (
+    topics.request_topic(EVERY_SITE),
+    topics.floor_plan_topic(EVERY_SITE),
+    topics.zones_topic(EVERY_SITE),
+    topics.zone_event_topic(EVERY_SITE, "+"),
+    topics.tag_zones_topic(EVERY_SITE, EVERY_NODE),
+    topics.tag_position_topic(EVERY_SITE, EVERY_NODE),
+)
+"""What the page publishes, whether its users may set up the site or not."""
 
 ACCESS: Final = {
     Role.ANCHORS: Access(
@@ -65,22 +77,24 @@ ACCESS: Final = {
     ),
     Role.PAGE: Access(
         publish=(
-            topics.request_topic(EVERY_SITE),
-            topics.floor_plan_topic(EVERY_SITE),
-            topics.zones_topic(EVERY_SITE),
-            topics.zone_event_topic(EVERY_SITE, "+"),
-            topics.tag_zones_topic(EVERY_SITE, EVERY_NODE),
-            topics.tag_position_topic(EVERY_SITE, EVERY_NODE),
+            *_SHOWN,
+            *_status("dashboard", "recorder", "bridge", "homeassistant"),
+            "homeassistant/device/+/config",
+            "homeassistant/status",
+        ),
+        subscribe=("skyless/#", "homeassistant/#"),
+    ),
+    Role.SURVEY: Access(
+        publish=(
+            *_SHOWN,
             topics.survey_topic(EVERY_SITE),
             topics.survey_facts_topic(EVERY_SITE),
             topics.survey_save_topic(EVERY_SITE),
             topics.placement_topic(EVERY_SITE),
             topics.watch_topic(EVERY_SITE),
-            *_status("dashboard", "recorder", "survey", "bridge", "homeassistant"),
-            "homeassistant/device/+/config",
-            "homeassistant/status",
+            *_status("dashboard", "survey"),
         ),
-        subscribe=("skyless/#", "homeassistant/#"),
+        subscribe=("skyless/#",),
     ),
     Role.OPERATOR: Access(publish=(EVERYTHING,), subscribe=(EVERYTHING,)),
     Role.STRANGER: Access(

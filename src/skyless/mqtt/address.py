@@ -1,4 +1,4 @@
-"""Address of an MQTT broker, with user, password and certificates."""
+"""Address of an MQTT broker, or of several of a cluster, with user, password and certificates."""
 
 import os
 import re
@@ -8,6 +8,7 @@ from typing import Final
 from urllib.parse import SplitResult, unquote, urlsplit
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from skyless.errors import SkylessError
 
@@ -26,19 +27,30 @@ class MqttAddress(Struct, frozen=True):
     password: str | None = None
     ca: Path | None = None
     """Certificates to trust instead of the system's."""
+    others: tuple[tuple[str, int], ...] = ()
+    """Hosts and ports of further brokers with the same messages, users and certificates."""
 
     def __str__(self) -> str:
-        host = f"[{self.host}]" if ":" in self.host else self.host
         user = f"{self.user}@" if self.user is not None else ""
-        return f"mqtt{'s' if self.tls else ''}://{user}{host}:{self.port}"
+        hosts = ",".join(f"[{host}]:{port}" if ":" in host else f"{host}:{port}" for host, port in self._hosts)
+        return f"mqtt{'s' if self.tls else ''}://{user}{hosts}"
 
     def __repr__(self) -> str:
         return f"MqttAddress({str(self)!r})"
 
     @property
     def loopback(self) -> bool:
-        """Whether the broker is on this machine."""
-        return bool(_LOOPBACK.fullmatch(self.host))
+        """Whether the broker, and each of several, is on this machine."""
+        return all(_LOOPBACK.fullmatch(host) for host, _ in self._hosts)
+
+    @property
+    def brokers(self) -> "tuple[MqttAddress, ...]":
+        """Each broker by itself."""
+        return tuple(replace(self, host=host, port=port, others=()) for host, port in self._hosts)
+
+    @property
+    def _hosts(self) -> tuple[tuple[str, int], ...]:
+        return ((self.host, self.port), *self.others)
 
     def tls_context(self) -> ssl.SSLContext | None:
         """The checks of the broker's certificate; None without TLS.
@@ -56,18 +68,28 @@ class MqttAddress(Struct, frozen=True):
 
 
 def mqtt_address(url: str, ca: Path | None = None) -> MqttAddress:
-    """The broker of a URL; its password may also be in ``SKYLESS_MQTT_PASSWORD``.
+    """The broker of a URL, or the brokers; the password may also be in ``SKYLESS_MQTT_PASSWORD``.
+
+    Several are separated by commas: ``mqtts://ann@a,b:8884,c``.
 
     Raises:
         SkylessError: with what would be right; it never shows the password.
     """
+    several = re.fullmatch(r"([^:/?#]*://(?:[^/?#]*@)?)([^/?#@]*)(.*)", url, re.DOTALL)
+    before, hosts, after = several.groups() if several else ("", url, "")
+    first, *others = (_broker(url, f"{before}{host}{after}", ca) for host in hosts.split(","))
+    return replace(first, others=tuple((other.host, other.port) for other in others))
+
+
+def _broker(url: str, single: str, ca: Path | None) -> MqttAddress:
+    """The broker of a URL with one host; errors show the whole URL."""
     try:
-        parts = urlsplit(url)
+        parts = urlsplit(single)
         port = parts.port
     except ValueError:
         raise _wrong(url, "a port between 1 and 65535 after the host") from None
     if parts.scheme not in _PORTS:
-        raise _wrong(url, "mqtt://HOST[:PORT] or mqtts://[USER@]HOST[:PORT]")
+        raise _wrong(url, "mqtt://HOST[:PORT] or mqtts://[USER@]HOST[:PORT], several hosts with commas between them")
     if not _is_host(parts.hostname):
         raise _wrong(url, f"a host name or address after {parts.scheme}://")
     if port == 0:

@@ -18,7 +18,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
 
-BROKER_ANSWER_S: Final = 5.0
+BROKER_ANSWER_S: Final = 3.0
 """How long a broker may take to accept a connection."""
 
 _LEAVE_S: Final = 1.0
@@ -308,12 +308,22 @@ def _decrypted(sock: socket.socket) -> int:
 async def open_connection(
     address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, react: Reactions | None = None
 ) -> Connection:
-    """A connection that the broker has accepted.
+    """A connection that the broker has accepted; of several brokers, the first that does.
 
     Raises:
-        RefusedError: it refuses this client.
+        RefusedError: it, or the last of several, refuses this client.
         OSError: it cannot be reached, or does not answer (TimeoutError).
     """
+    *others, last = address.brokers
+    for broker in others:
+        with contextlib.suppress(OSError, RefusedError):
+            return await _open(broker, tls, who, react)
+    return await _open(last, tls, who, react)
+
+
+async def _open(
+    address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, react: Reactions | None
+) -> Connection:
     connection = Connection(address, tls, who, react or Reactions())
     await connection.open()
     return connection

@@ -13,7 +13,7 @@ from typing import Final
 
 import msgspec
 from msgspec import Struct
-from paho.mqtt.client import topic_matches_sub
+from paho.mqtt.matcher import MQTTMatcher
 
 import skyless
 from skyless.mqtt.address import MqttAddress
@@ -44,6 +44,8 @@ _LEAVE_S: Final = 1.0
 _SAME_TROUBLE_S: Final = 30.0
 _ECHO_S: Final = 5.0
 """When a broker should have returned a link's own status."""
+RESEND_S: Final = 30.0
+"""The longest time between two repetitions of a status or a site: a broker elsewhere may have missed or lost it."""
 _QUICK_START_S: Final = 0.5
 """A first connection that takes no longer is not logged."""
 
@@ -51,9 +53,10 @@ _QUICK_START_S: Final = 0.5
 class Link:
     """One MQTT connection of a node, made again for as long as ``run`` runs.
 
-    It publishes the node's status, retained and with a last will. Messages wait in an ``Outbox`` while the broker is
-    slow or away. All of it belongs to one event loop. Subscribers may get a message of QoS 1 twice, when a connection
-    broke at the wrong moment.
+    Where a broker of its address refuses it or does not answer, it goes on to the next. It publishes the
+    node's status, retained and with a last will. Messages wait in an ``Outbox`` while the broker is slow or away. All
+    of it belongs to one event loop. Subscribers may get a message of QoS 1 twice, when a connection broke at the wrong
+    moment.
     """
 
     def __init__(
@@ -93,6 +96,8 @@ class Link:
         self._subscriptions = _Subscriptions()
         self._reactions = Reactions(self._subscriptions.receive, self._acknowledged, self._pump)
         self._connection: Connection | None = None
+        self._brokers = address.brokers
+        """Those of the address in turn, the present one first."""
         self._reconnects = -1
         self._reported_dropped = 0
         self._away_since_s = time.monotonic()
@@ -162,9 +167,11 @@ class Link:
         try:
             while True:
                 begin_s = time.monotonic()
-                if await self._one_connection() and time.monotonic() - begin_s > _LONGEST_WAIT_S:
+                if not await self._one_connection():
+                    self._brokers = self._brokers[1:] + self._brokers[:1]
+                elif time.monotonic() - begin_s > _LONGEST_WAIT_S:
                     failures = 0
-                await asyncio.sleep(self._wait_s(failures))
+                await asyncio.sleep(self._wait_s(failures // len(self._brokers)))
                 failures += 1
         finally:
             self._down("stopped")
@@ -173,10 +180,11 @@ class Link:
 
     async def _one_connection(self) -> bool:
         """Whether it came about; returns when it is lost."""
+        broker = self._brokers[0]
         try:
-            connection = await open_connection(self.address, self._tls, self._introduction(), self._reactions)
+            connection = await open_connection(broker, self._tls, self._introduction(), self._reactions)
         except (OSError, RefusedError) as error:
-            self._log_trouble(trouble_with(self.address, error))
+            self._log_trouble(trouble_with(broker, error))
             return False
         self._up(connection)
         try:
@@ -185,7 +193,7 @@ class Link:
             await self._leave(connection)
             raise
         self._down(connection.reason)
-        _log.warning("lost the broker %s: %s", self.address, connection.reason)
+        _log.warning("lost the broker %s: %s", broker, connection.reason)
         return True
 
     def _introduction(self) -> Introduction:
@@ -204,6 +212,7 @@ class Link:
         self._set_state(connected=True, trouble=None)
         self._pump()
         asyncio.get_running_loop().call_later(_ECHO_S, self._check_echo, connection)
+        self._repeat_later(connection)
 
     def _down(self, reason: str) -> None:
         self._connection = None
@@ -229,6 +238,16 @@ class Link:
         self._online = _encode(status)
         self.publish(self._status_topic, self._online, qos=1, retain=True)
 
+    def _repeat_later(self, connection: Connection) -> None:
+        """Repeat the status while a connection lasts, at random times: many links connect at the same moment."""
+        wait_s = RESEND_S * random.uniform(0.5, 1.0)
+        asyncio.get_running_loop().call_later(wait_s, self._repeat_status, connection)
+
+    def _repeat_status(self, connection: Connection) -> None:
+        if self._connection is connection and not self._stopping:
+            self.publish(self._status_topic, self._online, qos=1, retain=True)
+            self._repeat_later(connection)
+
     def _correct_status(self, _topic: str, payload: bytes) -> None:
         """Publish the status again after a late last will, of a connection that the broker held open."""
         self._has_echo = self._has_echo or payload == self._online
@@ -240,7 +259,7 @@ class Link:
         if self._connection is connection and not self._has_echo and not self.unacknowledged:
             _log.warning(
                 "the broker %s has not returned %s: its user may not publish it, or not read it",
-                self.address,
+                self._brokers[0],
                 self._status_topic,
             )
 
@@ -293,18 +312,18 @@ class Link:
         dropped = self._outbox.dropped - self._reported_dropped
         away_s = time.monotonic() - self._away_since_s
         if self._reconnects or (dropped and away_s > _QUICK_START_S):
-            _log.warning("connected to %s after %.1f s; %d messages were dropped", self.address, away_s, dropped)
+            _log.warning("connected to %s after %.1f s; %d messages were dropped", self._brokers[0], away_s, dropped)
         self._reported_dropped += dropped
         self._logged = ("", 0.0)
 
 
 class _Subscriptions:
-    """The handlers of one link; those of each topic are searched once."""
+    """The handlers of one link: a tree of the levels of their filters, and those found for the newest topics."""
 
     def __init__(self) -> None:
         self.filters: dict[str, int] = {}
         """Topic filters, each with its QoS."""
-        self._handlers: dict[str, Handler] = {}
+        self._handlers = MQTTMatcher()  # type: ignore[no-untyped-call]
         self._found: dict[str, tuple[Handler, ...]] = {}
 
     def add(self, topic_filter: str, handler: Handler, qos: int) -> None:
@@ -326,6 +345,6 @@ class _Subscriptions:
     def _find(self, topic: str) -> tuple[Handler, ...]:
         if len(self._found) >= _MOST_TOPICS:
             self._found.clear()
-        found = tuple(handler for name, handler in self._handlers.items() if topic_matches_sub(name, topic))
+        found: tuple[Handler, ...] = tuple(self._handlers.iter_match(topic))  # type: ignore[no-untyped-call]
         self._found[topic] = found
         return found

@@ -24,7 +24,7 @@ from skyless.master_election import Role
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.link import Link
 from skyless.mqtt.messages import AnchorHealth, Counters, PlacementMessage, RequestMessage
-from skyless.mqtt.topics import health_topic, placement_topic, request_topic, stamps_topic
+from skyless.mqtt.topics import health_topic, placement_topic, request_topic, site_topic, stamps_topic
 from skyless.nodes.keys.anchor_keys import KEYS_S, AnchorKeys
 from skyless.nodes.keys.anchor_report import AnchorReport, recent_faults
 from skyless.nodes.process import HEALTH_S, Log, SitePublisher, every, keep, link_of, together
@@ -32,11 +32,14 @@ from skyless.nodes.radio_monitor import RadioMonitor
 from skyless.nodes.stamp_log import StampLog
 from skyless.radios.interface import Gone, Late, Radio, RadioEvent, Restarted, Sent
 from skyless.site.check import check_site
-from skyless.site.digest import is_same_but_placed, site_digest
+from skyless.site.digest import is_same_but_placed, largest_change_m, site_digest
 from skyless.site.model import Site
 from skyless.site.slots import superframe_ticks_of
 from skyless.slot_claims import SlotRole
 from skyless.ticks import difference
+
+MAX_MOVE_M: Final = 0.5
+"""How far a survey may move an anchor with keys from its place in the site file: its codes vouch for the new place."""
 
 MAX_LEAD_S: Final = 8e-3
 LEAD_GAIN: Final = 1.25
@@ -70,11 +73,24 @@ _ROLES: Final[dict[Role | SlotRole, Literal["master", "root", "anchor", "listeni
 class AnchorNode:
     """Runs the machine of an anchor on a radio."""
 
-    def __init__(self, site: Site, anchor_id: int, radio: Radio, log: Log, keys: AnchorKeys | None = None) -> None:
-        """``keys``: of its site; None for an anchor that sends without codes."""
+    def __init__(
+        self,
+        site: Site,
+        anchor_id: int,
+        radio: Radio,
+        log: Log,
+        keys: AnchorKeys | None = None,
+        *,
+        allow_placement: bool = False,
+    ) -> None:
+        """``keys``: of its site; None for an anchor that sends without codes, which a survey may move anywhere.
+
+        ``allow_placement``: so it may one with keys.
+        """
         self.site, self.id, self.radio = site, anchor_id, radio
         self._radio_site, self._log = site, log
         """The radio is configured with the antenna delays of this site, and keeps them."""
+        self._may_move = keys is None or allow_placement
         self._keys, self._report = keys, AnchorReport(anchor_id, log)
         self.authentication: BeaconAuthentication | None = None
         self.machine = self._new_machine()
@@ -116,6 +132,11 @@ class AnchorNode:
             fault = f"they are for site file {message.before}, not {present}"
         elif not is_same_but_placed(self.site, message.site):
             fault = "its anchors, slots or schedule are not those of the site file"
+        elif not self._may_move and (change_m := largest_change_m(self._radio_site, message.site)) > MAX_MOVE_M:
+            fault = (
+                f"they differ from the site file by {change_m:.2f} m, and anchors with keys adopt up to "
+                f"{MAX_MOVE_M:g} m; put the new site file here, or start with --allow-placement"
+            )
         else:
             try:
                 check_site(message.site, Path("placement"))
@@ -270,11 +291,14 @@ class Anchors:
         simulated: Callable[[], bool],
         floor_plan: Path | None = None,
         keys: AnchorKeys | None = None,
+        allow_placement: bool = False,
     ) -> None:
         """``simulated`` is asked again when a radio has restarted: its port may lead to another device."""
         self._site, self._log, self._keys = site, log, keys
         self._site_publisher = SitePublisher(site, simulated, floor_plan)
-        self.nodes = tuple(AnchorNode(site, int(radio.name), radio, log, keys) for radio in radios)
+        self.nodes = tuple(
+            AnchorNode(site, int(radio.name), radio, log, keys, allow_placement=allow_placement) for radio in radios
+        )
         self._links = tuple(self._link(node, address) for node in self.nodes)
 
     def _link(self, node: AnchorNode, address: MqttAddress | None) -> Link | None:
@@ -334,6 +358,8 @@ class Anchors:
             if link is not None:
                 if leads(node.machine, is_first=node is self.nodes[0]):
                     self._site_publisher.publish(link)
+                else:  # another one does; what this one knows may become old
+                    link.forget(site_topic(self._site.id))
                 health = health_of(node, link.counters, unix_s, now_s)
                 link.publish(health_topic(self._site.id, "anchor", node.id), health)
 

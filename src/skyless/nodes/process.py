@@ -6,6 +6,7 @@ import ctypes
 import fcntl
 import gc
 import os
+import random
 import resource
 import select
 import selectors
@@ -18,8 +19,8 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.link import Link
-from skyless.mqtt.messages import site_message
+from skyless.mqtt.link import RESEND_S, Link
+from skyless.mqtt.messages import SiteMessage, site_message
 from skyless.mqtt.topics import floor_plan_topic, site_topic
 from skyless.site.model import Site
 
@@ -165,13 +166,18 @@ async def keep(link: Link, log: Log) -> None:
 
 
 class SitePublisher:
-    """Publishes a site, retained, and again when its radios turn out to be simulated or not."""
+    """Publishes a site, retained: again when its radios turn out to be simulated or not, and repeatedly.
+
+    A broker that others read may have missed it, or lost it.
+    """
 
     def __init__(self, site: Site, is_simulated: Callable[[], bool], floor_plan: Path | None = None) -> None:
         self._site, self._is_simulated, self._floor_plan = site, is_simulated, floor_plan
         self._restarts: int | None = None
         self._simulated = False
-        self._published: bool | None = None
+        self._published: SiteMessage | None = None
+        self._repeat_s = 0.0
+        """When it is published again, by the host's monotonic clock."""
         self._has_floor_plan = False
 
     def place(self, site: Site) -> None:
@@ -185,12 +191,14 @@ class SitePublisher:
             self._restarts, self._simulated = restarts, self._is_simulated()
 
     def publish(self, link: Link) -> None:
-        """Publish the site unless that has been done; retained, so that later subscribers get it at once."""
-        if self._simulated is self._published:
+        """Publish the site if it is new or due; retained, so that later subscribers get it at once."""
+        now_s = time.monotonic()
+        if self._published is None or self._published.simulated is not self._simulated:
+            self._published = site_message(self._site, simulated=self._simulated, unix_s=time.time())
+        elif now_s < self._repeat_s:
             return
-        self._published = self._simulated
-        message = site_message(self._site, simulated=self._simulated, unix_s=time.time())
-        link.publish(site_topic(self._site.id), message, qos=1, retain=True)
+        self._repeat_s = now_s + RESEND_S * random.uniform(0.5, 1.0)
+        link.publish(site_topic(self._site.id), self._published, qos=1, retain=True)
         if self._floor_plan is not None and not self._has_floor_plan:
             self._has_floor_plan = True
             link.publish(floor_plan_topic(self._site.id), self._floor_plan.read_bytes(), qos=1, retain=True)

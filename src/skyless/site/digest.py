@@ -1,11 +1,13 @@
-"""A short name for what a survey changes in a site, by which programs see whether they mean the same."""
+"""What a survey changes in a site: a short name, by which programs see whether they mean the same, and how much."""
 
+import math
 from hashlib import sha256
 from typing import Final
 
 import msgspec
 
-from skyless.site.model import AnchorSite, Site
+from skyless.constants import TICK_M
+from skyless.site.model import AnchorSite, Site, UnplacedAnchor
 
 _DIGITS: Final = 16
 
@@ -31,6 +33,28 @@ def site_digest(site: Site) -> str:
 def is_same_but_placed(one: Site, other: Site) -> bool:
     """Whether two sites have the same number, anchors, slots and schedule, so that only positions and delays differ."""
     return _frame_of(one) == _frame_of(other)
+
+
+def largest_change_m(one: Site, other: Site) -> float:
+    """The largest displacement of an anchor between two sites, or change of one of its delays as a distance.
+
+    Both have the same anchors. One that has a position in the second site alone has an infinite change.
+    """
+    others = {anchor.id: anchor for anchor in other.all_anchors}
+    return max(max(_changes_m(anchor, others[anchor.id])) for anchor in one.all_anchors)
+
+
+def _changes_m(one: AnchorSite | UnplacedAnchor, other: AnchorSite | UnplacedAnchor) -> tuple[float, float, float]:
+    moved_m = 0.0
+    if isinstance(other, AnchorSite):
+        moved_m = math.inf
+        if isinstance(one, AnchorSite):
+            moved_m = math.dist((one.x_m, one.y_m, one.z_m), (other.x_m, other.y_m, other.z_m))
+    return (
+        moved_m,
+        abs(other.tx_antenna_delay_ticks - one.tx_antenna_delay_ticks) * TICK_M,
+        abs(other.rx_antenna_delay_ticks - one.rx_antenna_delay_ticks) * TICK_M,
+    )
 
 
 def _frame_of(site: Site) -> object:

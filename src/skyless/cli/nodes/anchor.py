@@ -21,6 +21,7 @@ def anchor(
     site: str = "lab",
     radio: str = DEFAULT_RADIO,
     keys: Annotated[Path | None, Parameter(env_var="SKYLESS_KEYS")] = None,
+    allow_placement: Annotated[bool, Parameter(negative=())] = False,
     broker: MqttOptions = MqttOptions(),
 ) -> None:
     """Run anchors of a site until Ctrl-C.
@@ -41,6 +42,9 @@ def anchor(
         Folder of the site's keys, so that beacons carry codes (modes slots and free): site.public, chain-N.public and
         chain-N.seed of skyless site keys. Files that change are used without a restart. SKYLESS_CHAIN_SEEDS, as
         "1:HEX 2:HEX", may hold the seeds instead.
+    allow_placement
+        With keys: adopt whatever a survey saves, as while a site is set up. Otherwise an anchor with keys adopts
+        positions and delays up to 0.5 m from those of its site file.
     broker.mqtt
         Broker to publish health and site to, or none.
     """
@@ -74,6 +78,13 @@ def anchor(
         compile_kernels(WEIGHTED)
     with contextlib.suppress(KeyboardInterrupt):
         anchors = Anchors(
-            plan, radios, address, log, simulated=lambda: is_simulated(radio), floor_plan=image, keys=chains
+            plan,
+            radios,
+            address,
+            log,
+            simulated=lambda: is_simulated(radio),
+            floor_plan=image,
+            keys=chains,
+            allow_placement=allow_placement,
         )
         run(anchors.run(), punctual=True)
