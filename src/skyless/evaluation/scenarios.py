@@ -71,18 +71,16 @@ class Room(Struct, frozen=True):
     The sizes are those that recordings of DW1000s show after a survey and a calibration by hand (``docs/studies.md``).
     """
 
-    axis_std_m: float | None = 0.02
-    """Of the stated positions of the anchors: each coordinate has a normal error; the height where it is used.
-
-    None: as the site states, of each anchor.
-    """
+    axis_std_m: float = 0.02
+    """Of the stated positions of the anchors: each coordinate has a normal error; the height where it is used."""
     off_anchors: int = 0
     """Number of anchors, drawn by chance, that are off by ``off_m`` more, each in a random horizontal direction."""
     off_m: float = 0.0
     ranges: RangeErrorModel = RangeErrorModel(constant_m=0.05, slope_m=0.05)
     """Errors of the ranges at tags."""
-    wandering: bool = True
-    """Whether tags without a given motion accelerate at random; else they walk as in exact air."""
+    is_stated: bool = False
+    """Whether these are the errors that the site's file states: anchors with their own ``std_m`` have that, and tags
+    without a given motion walk as in exact air; else they accelerate at random."""
 
 
 class Request(Struct, frozen=True):
@@ -139,7 +137,7 @@ def stated_room(site: Site, *, slope_m: float, at_rest: bool) -> Room:
         correlation_s=accuracy.place_time_s if at_rest else None,
         correlation_m=None if at_rest else accuracy.place_distance_m,
     )
-    return Room(axis_std_m=None, ranges=ranges, wandering=False)
+    return Room(axis_std_m=accuracy.survey_std_m, ranges=ranges, is_stated=True)
 
 
 def room_of(site: Site, seed: int, *, is_named_room: bool, at_rest: bool) -> Room | None:
@@ -156,7 +154,7 @@ def errors_words(site: Site, room: Room | None) -> str:
     """Which errors a simulation draws, for people."""
     if room is None:
         return "none: positions and ranges are exact"
-    if room.axis_std_m is not None:
+    if not room.is_stated:
         ranges = f"ranges up to {100.0 * room.ranges.constant_m:g} cm and a slope"
         return f"positions {100.0 * room.axis_std_m:g} cm (σ), {ranges}"
     stated = site.accuracy
@@ -312,7 +310,7 @@ def trajectories_of(request: Request) -> list[Trajectory]:
     height_m = request.site.tags.height_m or 0.0
     given: list[Trajectory] = [Static(*_with_height(point, height_m)) for point in request.positions_m]
     given += [_path([_with_height(p, height_m) for p in path], request.speed_mps) for path in request.paths_m]
-    if given or request.room is None or not request.room.wandering:
+    if given or request.room is None or request.room.is_stated:
         return given or [_walk(request, index) for index in range(request.tags)]
     return wanderers(request.site, request.tags, request.seed)
 
@@ -340,7 +338,7 @@ def displacements(room: Room, site: Site, seed: int) -> tuple[AnchorDisplacement
 
 def _axis_stds_m(room: Room, site: Site) -> Array:
     """Standard deviations of the anchors' positions per axis, shape (anchors,)."""
-    return np.array(position_stds_m(site) if room.axis_std_m is None else [room.axis_std_m] * len(site.anchors))
+    return np.array(position_stds_m(site) if room.is_stated else [room.axis_std_m] * len(site.anchors))
 
 
 def wanderer(low_m: Array, high_m: Array, seed: int, tag: int) -> Roaming:
