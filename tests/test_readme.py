@@ -5,6 +5,7 @@ line that is none of these is run, unless it is of a program that runs until Ctr
 """
 
 import ast
+import json
 import re
 import shlex
 from pathlib import Path
@@ -219,6 +220,27 @@ def test_the_commands_of_a_page_run(page, walk, tmp_path, monkeypatch, capsys):
     if page != README:
         for example in blocks(page, "python"):
             exec(compile(example, name_of(page), "exec"), {})
+
+
+def test_what_the_first_tutorial_says_of_its_simulations_is_so(tmp_path, monkeypatch, capsys):
+    """Errors as large as the fixes state, nearly all within their levels, and larger with faults."""
+    page = ROOT / "docs" / "tutorials" / "first_site.md"
+    text = " ".join(page.read_text(encoding="utf-8").split())
+    assert "It should be about as large" in text
+    assert "The error grows, and the predicted σ grows with it." in text
+    monkeypatch.chdir(tmp_path)
+    told = []
+    for command in commands(page):
+        if command.startswith(("skyless site new hall", "skyless simulate ")):
+            assert main([*arguments_of(command), *(["--json"] if "simulate" in command else [])]) == 0
+            told.append(capsys.readouterr().out)
+    plain, broken = map(json.loads, told[-2:])
+    for one in (plain, broken):
+        assert 2 / 3 < one["rmse_m"] / one["sigma_m"] < 3 / 2
+        assert one["levels"]["misleading"] <= 0.001 * one["fixes"]
+        assert one["errors_drawn"]["ranges"]["constant_m"] > 0.0
+    assert broken["rmse_m"] > plain["rmse_m"]
+    assert broken["sigma_m"] > plain["sigma_m"]
 
 
 def test_every_entry_is_of_a_line_and_names_a_test():

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from skyless.anchor import Anchor
     from skyless.api.calibrate import CalibrationResult, calibrate
     from skyless.api.plan import PlanResult, plan
+    from skyless.api.recording import open_recording
     from skyless.api.replay import ReplayResult, replay
     from skyless.api.simulate import SimulationResult, simulate
     from skyless.api.slot_plan import SlotPlanResult
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from skyless.positioning.fix import Fix, NoFixReason
     from skyless.positioning.methods.locate import locate
     from skyless.receiver import Receiver
-    from skyless.recordings.foreign.formats import open_recording
     from skyless.site.lab import lab_site
     from skyless.site.load import load_site
     from skyless.site.model import Site
@@ -58,7 +58,7 @@ _MODULES: Final = {
     "lab_site": "skyless.site.lab",
     "load_site": "skyless.site.load",
     "locate": "skyless.positioning.methods.locate",
-    "open_recording": "skyless.recordings.foreign.formats",
+    "open_recording": "skyless.api.recording",
     "plan": "skyless.api.plan",
     "replay": "skyless.api.replay",
     "simulate": "skyless.api.simulate",

@@ -8,11 +8,19 @@ from msgspec.structs import replace
 from scipy.stats import chi2
 
 from skyless.evaluation.fleet import report
-from skyless.evaluation.scenarios import Request, Room, displacements, fleet_of, impairments_of, trajectories_of
+from skyless.evaluation.scenarios import (
+    Request,
+    Room,
+    displacements,
+    fleet_of,
+    impairments_of,
+    room_of,
+    trajectories_of,
+)
 from skyless.simulation.range_errors import RangeErrorModel
 from skyless.simulation.trajectory import Roaming, Static
 from skyless.site.lab import lab_site
-from skyless.site.model import TagsSite
+from skyless.site.model import EXACT, TagsSite
 
 LAB = lab_site()
 
@@ -78,3 +86,20 @@ def test_the_room_costs_accuracy_and_is_the_same_for_every_method():
     common = told[1][1].keys() & told[2][1].keys()
     assert len(common) > 1000  # of about 66 fixes for each tag and second
     assert all(told[1][1][fix] == told[2][1][fix] for fix in common)
+
+
+def test_a_sites_own_errors_are_those_of_its_file_and_tags_walk_as_in_exact_air():
+    anchors = tuple(replace(anchor, std_m=0.1 if anchor.id == 2 else None) for anchor in LAB.anchors)
+    site = replace(LAB, anchors=anchors, accuracy=replace(LAB.accuracy, survey_std_m=0.01, range_std_m=0.04))
+    rooms = [room_of(site, seed, is_named_room=False, at_rest=False) for seed in range(200)]
+    drawn = np.concatenate([shifts_m(room, [seed], site) for seed, room in enumerate(rooms)])
+    stds_m = np.std(drawn[..., :2], axis=(0, 2))
+    assert stds_m == pytest.approx(
+        [0.1 if anchor.id == 2 else 0.01 for anchor in anchors], rel=4.0 / math.sqrt(2.0 * 400)
+    )
+    assert {room.ranges.constant_m for room in rooms} == {math.sqrt(3.0) * 0.04}  # uniform with that deviation
+    assert np.std([room.ranges.slope_m for room in rooms]) == pytest.approx(0.05, rel=4.0 / math.sqrt(2.0 * 200))
+    exact, drawn_in = (trajectories_of(Request(site, room=room, seed=3)) for room in (None, rooms[0]))
+    assert exact[0].position(7.0).tolist() == drawn_in[0].position(7.0).tolist()
+    assert room_of(replace(LAB, accuracy=EXACT), 1, is_named_room=False, at_rest=True) is None
+    assert room_of(replace(site, accuracy=EXACT), 1, is_named_room=False, at_rest=True) is not None

@@ -15,7 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from live_site import PLACES, SITE, UNIX_S, messages, record
+from mcap.writer import CompressionType, Writer
 
+import skyless
 from skyless.errors import SkylessError
 from skyless.foxglove.messages import ellipse_of
 from skyless.foxglove.schemas import schema_of
@@ -54,6 +56,27 @@ def test_the_official_reader_reads_all_of_it(whole):
     for schema in schemas.values():
         assert schema.encoding == "jsonschema"
         check_schema(json.loads(schema.data))
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_the_front_door_opens_it_however_its_chunks_are_compressed(whole, tmp_path, compression):
+    path = tmp_path / "again.mcap"
+    with whole.open("rb") as stream, path.open("wb") as out:
+        writer = Writer(out, compression=compression)
+        writer.start("skyless")
+        known = {}
+        for _, channel, message in mcap.reader.make_reader(stream).iter_messages(log_time_order=False):
+            if channel.id not in known:
+                known[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, schema_id=0)
+            writer.add_message(known[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    with skyless.open_recording(whole) as first, skyless.open_recording(path) as second:
+        fixes = list(first.fixes())
+        assert len(fixes) > 100
+        assert list(second.fixes()) == fixes
+        assert second.summary().raw_tags == first.summary().raw_tags == tuple(sorted(PLACES))
+    with pytest.raises(SkylessError, match="it should be left out"):
+        skyless.open_recording(path, listener="4")
 
 
 def check_schema(schema):

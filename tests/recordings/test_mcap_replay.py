@@ -262,6 +262,8 @@ def test_mistakes_are_told_in_one_line(tmp_path, capsys):
     record(path, messages(1.0, ("a", "b")))
     bare = tmp_path / "bare.mcap"
     record(bare, messages(1.0, join_s=9.0))
+    at_once = tmp_path / "at_once.mcap"
+    at_once.write_bytes(path.read_bytes()[:45])  # what a recorder leaves that is killed before it writes a chunk
     for arguments, words in (
         ([str(path), "--tag", "x"], "one of a, b"),
         ([str(path), "--plot", str(tmp_path / "x.png")], "--tag"),
@@ -271,6 +273,7 @@ def test_mistakes_are_told_in_one_line(tmp_path, capsys):
         ([str(path), "--alert-limit-m", "0"], "--alert-limit-m"),
         ([str(path), "--max-acceleration", "-1"], "--max-acceleration"),
         ([str(bare)], "raw receptions is missing"),
+        ([str(at_once)], 'the recording is "empty'),
     ):
         assert main(["replay", *arguments]) == 2
         told = capsys.readouterr().err

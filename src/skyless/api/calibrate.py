@@ -12,7 +12,8 @@ from skyless.api.result import Result, cm, data_frame, figures
 from skyless.arguments import check_number, check_point, check_whole, existing_file, named_as_arguments, wrong
 from skyless.errors import SkylessError
 from skyless.kernels.arrays import Integers, Vector
-from skyless.replays.inputs import flight_height, is_mcap
+from skyless.recordings.mcap.recording import is_mcap
+from skyless.replays.inputs import flight_height
 from skyless.survey_inputs.report import calibration_report, corrected_text
 from skyless.survey_inputs.run import Calibrated, CalibrationRequest, calibrate_capture, calibrate_site
 from skyless.survey_inputs.samples import First, Stay

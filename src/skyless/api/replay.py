@@ -25,11 +25,11 @@ from skyless.evaluation.judge import Judge, antenna_truth
 from skyless.method_names import METHODS
 from skyless.positioning.fix import Fix
 from skyless.recordings.anchor_table import read_anchors, read_calibration
-from skyless.recordings.mcap.recording import McapRecording
+from skyless.recordings.mcap.recording import McapRecording, is_mcap
 from skyless.recordings.truth import Truth
 from skyless.replays.capture_run import CaptureRequest, CaptureRun
 from skyless.replays.captures import ReplayReport
-from skyless.replays.inputs import HEIGHT_WORDS, anchors_of_site, is_mcap, known_truth
+from skyless.replays.inputs import HEIGHT_WORDS, anchors_of_site, known_truth
 from skyless.replays.site import Replayed, SiteReplay, summary_of
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from skyless.arguments import (
 from skyless.errors import SkylessError
 from skyless.evaluation.fleet import FleetReport, JudgedFix, report
 from skyless.evaluation.fleet_run import end_s, run_fleet
-from skyless.evaluation.scenarios import Request, Room, check_can_be_simulated, fleet_of_any_size
+from skyless.evaluation.scenarios import Request, Room, check_can_be_simulated, errors_words, fleet_of_any_size, room_of
 from skyless.method_names import DEFAULT_METHOD
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.simulation.impairments import AnchorBias, AnchorOutage, DelayError, Outage
@@ -48,6 +48,8 @@ class SimulationResult(Result, frozen=True, eq=False):
     seed: int
     settle_s: float
     noise_ps: float | None
+    room: Room | None
+    """Errors of positions and ranges that were drawn; None where all is exact."""
     report: FleetReport
     """Figures over one fix of each tag and superframe after ``settle_s``."""
     fixes: Fixes
@@ -62,9 +64,10 @@ class SimulationResult(Result, frozen=True, eq=False):
     def summary(self) -> dict[str, Any]:
         """The object that ``skyless simulate --json`` writes, in SI units, but for the version."""
         settings = {
-            "seed": self.seed, "noise_ps": self.noise_ps, "warmup_s": self.settle_s, "site": self.site.name
+            "seed": self.seed, "noise_ps": self.noise_ps, "warmup_s": self.settle_s, "site": self.site.name,
+            "errors_drawn": self.room,
         }  # fmt: skip
-        return {**msgspec.to_builtins(self.report), **settings}
+        return {**msgspec.to_builtins(self.report), **msgspec.to_builtins(settings)}
 
     def to_dataframe(self) -> "DataFrame":
         """See ``Fixes.to_dataframe``."""
@@ -87,6 +90,7 @@ class SimulationResult(Result, frozen=True, eq=False):
     def _facts(self) -> Iterator[tuple[str, str]]:
         found = self.report
         yield "tags", f"{found.tags}"
+        yield "errors drawn", errors_words(self.site, self.room)
         yield "simulated time", f"{found.simulated_s:.1f} s"
         yield "fixes judged", f"{found.fixes}"
         yield "updates", f"{found.updates_per_s:.1f} per second and tag"
@@ -133,7 +137,8 @@ def simulate(
     """Run a site faster than real time and report the errors of its tags, as ``skyless simulate`` does.
 
     Args:
-        site: A site, or the path of its file, instead of a scenario.
+        site: A site, or the path of its file, instead of a scenario. Positions of anchors and ranges are wrong by
+            chance as its accuracy states; ``skyless.site.model.EXACT`` is the accuracy of exact ones.
         scenario: ``lab`` (six anchors on the walls of 6 m × 8 m, 2-D), the default; ``room`` (the lab with the errors
             of real rooms).
         method: One of ``skyless.METHODS``.
@@ -176,8 +181,11 @@ def simulate(
     with named_as_arguments({}):
         noise = process_noise(qa, dynamics)
     _check_motion(positions_m, paths_m, tags, speed_mps, scenario)
+    simulated = _site(site, scenario)
+    at_rest = bool(len(positions_m)) and not len(paths_m)
     request = Request(
-        site=_site(site, scenario),
+        site=simulated,
+        room=room_of(simulated, seed, is_named_room=scenario == "room", at_rest=at_rest),
         method=method,
         seed=seed,
         noise_ps=noise_ps,
@@ -198,7 +206,6 @@ def simulate(
         outages=_faults("outages", outages, AnchorOutage),
         delay_errors=_faults("delay_errors", delay_errors, DelayError),
         silences=_faults("silences", silences, Outage),
-        room=Room() if scenario == "room" else None,
     )
     until_s = end_s(duration_s, fixes)
     if settle_s >= until_s:
@@ -221,7 +228,7 @@ def simulate(
     run_fleet(fleet, request, until_s, on_fix, report_progress)
     report_progress(1.0)
     found = report(fleet, method, started_s)
-    return SimulationResult(request.site, seed, settle_s, noise_ps, found, recorder.fixes())
+    return SimulationResult(request.site, seed, settle_s, noise_ps, request.room, found, recorder.fixes())
 
 
 def tag_names(count: int) -> tuple[str, ...]:

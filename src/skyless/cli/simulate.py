@@ -71,7 +71,8 @@ class SimulateOptions:
     """A named site: lab (six anchors on the walls of 6 m × 8 m, 2-D), the default; room (the lab as real rooms are:
     anchors 2 cm off per axis, ranges 5 cm off, and more with the distance, tags with random acceleration)."""
     site: Path | None = None
-    """Site file instead of a named site."""
+    """Site file instead of a named site. Positions of anchors and ranges are wrong by chance, as its [accuracy]
+    states; all its deviations 0: exact."""
     method: str = DEFAULT_METHOD
     """How positions are computed: literal, literal-delayed, weighted, bracketed or joint.
     Fixes of all but joint hold at the master's message that they refer to, but are judged when made."""
@@ -165,21 +166,24 @@ def simulate(*, asked: SimulateOptions = SimulateOptions()) -> None:
         import msgspec
 
         settings = {
-            "seed": asked.seed, "noise_ps": asked.noise_ps, "warmup_s": asked.settle, "site": request.site.name
+            "seed": asked.seed, "noise_ps": asked.noise_ps, "warmup_s": asked.settle, "site": request.site.name,
+            "errors_drawn": request.room,
         }  # fmt: skip
         print_json({**msgspec.to_builtins(result), **settings})
     else:
-        _show(result)
+        _show(result, request)
 
 
 # What is simulated
 
 
 def _request(asked: SimulateOptions) -> "Request":
-    from skyless.evaluation.scenarios import Request, Room
+    from skyless.evaluation.scenarios import Request, room_of
 
+    site, at_rest = _site(asked), bool(asked.position) and not asked.waypoints
     return Request(
-        site=_site(asked),
+        site=site,
+        room=room_of(site, asked.seed, is_named_room=asked.scenario == _ROOM, at_rest=at_rest),
         method=asked.method,
         seed=asked.seed,
         noise_ps=asked.noise_ps,
@@ -200,7 +204,6 @@ def _request(asked: SimulateOptions) -> "Request":
         outages=tuple(map(_outage, asked.outage or ())),
         delay_errors=_delay_errors(asked.delay_error or []),
         silences=tuple(map(_silence, asked.silence or ())),
-        room=Room() if asked.scenario == _ROOM else None,
     )
 
 
@@ -352,8 +355,11 @@ def _without_fix(result: "FleetReport") -> list[tuple[str, str]]:
     return [("tags without a fix", f"{without} of {result.tags}")] if without else []
 
 
-def _show(result: "FleetReport") -> None:
+def _show(result: "FleetReport", request: "Request") -> None:
+    from skyless.evaluation.scenarios import errors_words
+
     facts = [
+        ("errors drawn", f"{errors_words(request.site, request.room)}; seed {request.seed}"),
         ("simulated time", f"{result.simulated_s:.1f} s in {result.wall_s:.1f} s ({result.speed:.1f} × real time)"),
         ("messages at tags", f"{result.messages} ({result.dropped} dropped)"),
         ("fixes judged", f"{result.fixes}"),

@@ -79,6 +79,9 @@ class Room(Struct, frozen=True):
     off_m: float = 0.0
     ranges: RangeErrorModel = RangeErrorModel(constant_m=0.05, slope_m=0.05)
     """Errors of the ranges at tags."""
+    is_stated: bool = False
+    """Whether these are the errors that the site's file states: anchors with their own ``std_m`` have that, and tags
+    without a given motion walk as in exact air; else they accelerate at random."""
 
 
 class Request(Struct, frozen=True):
@@ -116,10 +119,60 @@ class Request(Struct, frozen=True):
     silences: tuple[Outage, ...] = ()
     """When no tag's radio receives; their counters go on."""
     room: Room | None = None
-    """Errors of survey and ranges; None for anchors at the site file's positions and ranges without errors."""
+    """Errors of survey and ranges (``room_of``); None for anchors at the site's positions and exact ranges."""
     body: Body | None = None
     warm_ups: tuple[WarmUp, ...] = ()
     walls_between_anchors: bool = True
+
+
+def stated_room(site: Site, *, slope_m: float, at_rest: bool) -> Room:
+    """Errors of survey and ranges as large as the site's file states them.
+
+    Multipath changes with time for tags at rest, else with the distance moved.
+    """
+    accuracy = site.accuracy
+    ranges = RangeErrorModel(
+        constant_m=math.sqrt(3.0) * accuracy.range_std_m,
+        slope_m=slope_m,
+        changing_m=accuracy.place_std_m,
+        correlation_s=accuracy.place_time_s if at_rest else None,
+        correlation_m=None if at_rest else accuracy.place_distance_m,
+    )
+    return Room(axis_std_m=accuracy.survey_std_m, ranges=ranges, is_stated=True)
+
+
+def room_of(site: Site, seed: int, *, is_named_room: bool, at_rest: bool) -> Room | None:
+    """What is wrong in a simulation: that of the named room, else what the site states; None where that is nothing."""
+    if is_named_room:
+        return Room()
+    if site.accuracy.is_exact and not any(anchor.std_m for anchor in site.anchors):
+        return None
+    slope_m = site.accuracy.slope_std_m * float(stream(seed, _ROOM_KEY, 1).standard_normal())
+    return stated_room(site, slope_m=slope_m, at_rest=at_rest)
+
+
+def errors_words(site: Site, room: Room | None) -> str:
+    """Which errors a simulation draws, for people."""
+    if room is None:
+        return "none: positions and ranges are exact"
+    if not room.is_stated:
+        ranges = f"ranges up to {100.0 * room.ranges.constant_m:g} cm and a slope"
+        return f"positions {100.0 * room.axis_std_m:g} cm (σ), {ranges}"
+    stated = site.accuracy
+    of_anchors = position_stds_m(site)
+    stds_m = {
+        "positions": sorted({min(of_anchors), max(of_anchors)}),
+        "ranges": [stated.range_std_m],
+        "slope": [stated.slope_std_m],
+        "multipath": [stated.place_std_m],
+    }
+    each = (f"{what} {' to '.join(f'{100.0 * one:.3g}' for one in found)}" for what, found in stds_m.items())
+    return f"as the site states (σ in cm): {', '.join(each)}"
+
+
+def position_stds_m(site: Site) -> list[float]:
+    """How well each anchor's position is known, per axis."""
+    return [site.accuracy.survey_std_m if anchor.std_m is None else anchor.std_m for anchor in site.anchors]
 
 
 def check_request(request: Request) -> None:
@@ -211,7 +264,7 @@ def fleet_of_any_size(request: Request) -> TagFleet:
         replace(faults, anchor_displacements=()),
         request.seed,
         _settings(request),
-        survey_std_m=0.0 if room is None else room.axis_std_m,
+        survey_std_m=0.0 if room is None else float(np.sqrt(np.mean(np.square(_axis_stds_m(room, site))))),
     )
 
 
@@ -258,7 +311,7 @@ def trajectories_of(request: Request) -> list[Trajectory]:
     height_m = request.site.tags.height_m or 0.0
     given: list[Trajectory] = [Static(*_with_height(point, height_m)) for point in request.positions_m]
     given += [_path([_with_height(p, height_m) for p in path], request.speed_mps) for path in request.paths_m]
-    if given or request.room is None:
+    if given or request.room is None or request.room.is_stated:
         return given or [_walk(request, index) for index in range(request.tags)]
     return wanderers(request.site, request.tags, request.seed)
 
@@ -273,7 +326,7 @@ def displacements(room: Room, site: Site, seed: int) -> tuple[AnchorDisplacement
     """True positions of the anchors less the stated ones; the first draws are the same for all rooms of a seed."""
     draw = stream(seed, _ROOM_KEY, 0)
     count = len(site.anchors)
-    shifts_m = room.axis_std_m * draw.standard_normal((count, 3))
+    shifts_m = _axis_stds_m(room, site)[:, None] * draw.standard_normal((count, 3))
     if site.tags.height_m is not None:
         shifts_m[:, 2] = 0.0
     off, directions = draw.permutation(count)[: room.off_anchors], draw.uniform(0.0, 2.0 * math.pi, count)
@@ -282,6 +335,11 @@ def displacements(room: Room, site: Site, seed: int) -> tuple[AnchorDisplacement
     return tuple(
         AnchorDisplacement(anchor.id, *shift) for anchor, shift in zip(site.anchors, shifts_m.tolist(), strict=True)
     )
+
+
+def _axis_stds_m(room: Room, site: Site) -> Array:
+    """Standard deviations of the anchors' positions per axis, shape (anchors,)."""
+    return np.array(position_stds_m(site) if room.is_stated else [room.axis_std_m] * len(site.anchors))
 
 
 def wanderer(low_m: Array, high_m: Array, seed: int, tag: int) -> Roaming:

@@ -4,7 +4,6 @@ Where the method is ``joint`` and the site's survey and ranges have errors, ther
 errors, and what is compared is the RMSE over all of them.
 """
 
-import math
 from collections.abc import Callable
 from typing import Final
 
@@ -13,15 +12,13 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.evaluation.fleet import Fleet, FleetSettings
-from skyless.evaluation.scenarios import Request, Room, impairments_of
+from skyless.evaluation.scenarios import Request, impairments_of, stated_room
 from skyless.kernels.arrays import Matrix
 from skyless.method_names import FILTERS
 from skyless.planning.columns import CLAIMED, FIX_SHARE, RMSE, SIGMA
 from skyless.planning.maps import PlanMap
 from skyless.planning.predict import Predictor
-from skyless.simulation.range_errors import RangeErrorModel
 from skyless.simulation.trajectory import Static
-from skyless.site.model import AccuracySite
 from skyless.site.slots import schedule_of
 
 _WARM_UP_S: Final = 3.0
@@ -123,7 +120,8 @@ def verify(
     batches = [_Batches() for _ in still]
     end_s = warm_up_s + rounds * superframe_s
     for world in range(worlds):
-        room = None if worlds == 1 else _room(site.accuracy, world)
+        slope_m = site.accuracy.slope_std_m * (-1.0) ** world  # one for all ranges: with both signs in turn
+        room = None if worlds == 1 else stated_room(site, slope_m=slope_m, at_rest=True)
         request = Request(site=site, seed=seed + world, room=room)
         impairments = replace(impairments_of(request, site), channel=settings.channel)
         fleet = Fleet(site, still, impairments, request.seed, FleetSettings(settings.method, settings.qa, warm_up_s))
@@ -144,17 +142,6 @@ def verify(
         for point, row, batch in zip(points_m, rows, batches, strict=True)
     ]
     return _summary(settings.method, seed, worlds * end_s, checks)
-
-
-def _room(accuracy: AccuracySite, world: int) -> Room:
-    """Errors with the site's standard deviations; the slope, one for all, has them with both signs in turn."""
-    ranges = RangeErrorModel(
-        constant_m=math.sqrt(3.0) * accuracy.range_std_m,
-        slope_m=accuracy.slope_std_m * (-1.0) ** world,
-        changing_m=accuracy.place_std_m,
-        correlation_s=accuracy.place_time_s,
-    )
-    return Room(axis_std_m=accuracy.survey_std_m, ranges=ranges)
 
 
 def _check(point: Matrix, row: Matrix, batch: _Batches, possible: int, *, has_range_errors: bool) -> PointCheck:

@@ -10,7 +10,6 @@ from skyless.evaluation.judge import Triple, antenna_truth
 from skyless.evaluation.observability import FLIGHT_M, GUESSED_STD_M, flies, plane_height_m
 from skyless.recordings.anchor_table import read_anchors
 from skyless.recordings.foreign.formats import format_of
-from skyless.recordings.mcap.recording import MAGIC
 from skyless.recordings.truth import Truth, read_truth
 from skyless.site.load import load_site
 from skyless.site.model import Site
@@ -20,17 +19,6 @@ HEIGHT_WORDS = ("truth", "free", "auto")
 
 TOO_FLAT = "the anchors' mean: they lie too flat to determine the height"
 """Where a height is from that nobody gave."""
-
-
-def is_mcap(file: Path) -> bool:
-    """Whether a file's content is an MCAP; one that cannot be opened, or would lose what is read here, is none."""
-    try:
-        if file.is_fifo():
-            return False
-        with file.open("rb") as stream:
-            return stream.read(len(MAGIC)) == MAGIC
-    except OSError:
-        return False
 
 
 def anchors_of_site(site: Site) -> tuple[dict[int, Point], float | None]:

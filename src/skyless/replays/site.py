@@ -20,7 +20,7 @@ from skyless.positioning.integrity import RISK, IntegrityRequirement
 from skyless.receiver import NOT_DROPS, Receiver
 from skyless.recordings.mcap.checkpoint import RefusedError, load
 from skyless.recordings.mcap.host_clock import HostClock
-from skyless.recordings.mcap.recording import McapRecording, Recorded
+from skyless.recordings.mcap.recording import McapRecording, Recorded, tags_to_replay
 from skyless.recordings.source import Drops
 from skyless.recordings.truth import Truth
 from skyless.replays.antenna_delays import DelayChange, delay_changes, with_delays
@@ -336,11 +336,10 @@ class SiteReplay:
             ConfigurationError: the recording has no raw receptions, none of such a tag, or is of another site.
         """
         summary = recording.summary()
-        if not summary.raw_tags:
-            raise ConfigurationError(summary.path, "raw receptions", None, "a recording that skyless record made")
+        raw_tags = tags_to_replay(summary)
         for tag in tags or ():
-            if tag not in summary.raw_tags:
-                raise ConfigurationError(summary.path, "tag", tag, f"one of {', '.join(summary.raw_tags)}")
+            if tag not in raw_tags:
+                raise ConfigurationError(summary.path, "tag", tag, f"one of {', '.join(raw_tags)}")
         self._recording = recording
         self._settle_s = settle_s
         site = recording.site

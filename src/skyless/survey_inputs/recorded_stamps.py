@@ -4,7 +4,6 @@ import math
 import os
 from collections import Counter, OrderedDict
 from collections.abc import Callable
-from gzip import GzipFile
 from os import PathLike
 from pathlib import Path
 from typing import Final, cast
@@ -19,7 +18,7 @@ from skyless.errors import ConfigurationError
 from skyless.mqtt.messages import ReceptionsMessage, StampsMessage
 from skyless.recordings.foreign import avalue
 from skyless.recordings.foreign.formats import FORMATS, format_of, open_recording
-from skyless.recordings.mcap.recording import MAGIC, McapRecording, Recorded
+from skyless.recordings.mcap.recording import McapRecording, Recorded, is_mcap
 from skyless.recordings.source import Drops, open_source
 from skyless.replays.site import SITE_FORMAT, recorded_site
 from skyless.site.model import Site
@@ -68,7 +67,7 @@ def ranges_of(
     Raises:
         ConfigurationError: the file cannot be read, or its format has no stamps of anchors.
     """
-    if format_name == SITE_FORMAT or (format_name is None and _is_mcap(path)):
+    if format_name == SITE_FORMAT or (format_name is None and is_mcap(path)):
         part = _Part(PairRanger(TICK_BITS, block_s, on_block=on_block), from_s, to_s, on_progress)
         return _of_site(path, identifier, part)
     known = format_of(path, format_name)
@@ -78,12 +77,6 @@ def ranges_of(
     part = _Part(PairRanger(known.tx_bits, block_s, on_block=on_block), from_s, to_s, on_progress)
     drops = _add_receptions(path, part) if known.name == "avalue" else _add_packets(path, known.name, part)
     return RecordedRanges(part.finish(), known.name, None, dict(drops + part.drops()))
-
-
-def _is_mcap(path: str | PathLike[str]) -> bool:
-    """Whether a file is an MCAP as it is, not compressed. Raises ConfigurationError."""
-    with open_source(path) as stream:
-        return not isinstance(stream, GzipFile) and stream.read(len(MAGIC)) == MAGIC
 
 
 class _Part:

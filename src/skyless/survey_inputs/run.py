@@ -18,7 +18,7 @@ from skyless.constants import TICK_M
 from skyless.errors import ConfigurationError, SkylessError
 from skyless.evaluation.judge import Judge
 from skyless.recordings.foreign.formats import open_recording
-from skyless.recordings.mcap.recording import McapRecording
+from skyless.recordings.mcap.recording import McapRecording, tags_to_replay
 from skyless.recordings.truth import Truth
 from skyless.replays.site import SITE_FORMAT, recorded_site, recorded_truth
 from skyless.site.check import SITE_LIMITS
@@ -165,9 +165,7 @@ def _at_known_positions(
 
 
 def _tags(recording: McapRecording, request: CalibrationRequest) -> tuple[str, ...]:
-    raw = recording.summary().raw_tags
-    if not raw:
-        raise ConfigurationError(request.path, "raw receptions", None, "a recording that skyless record made")
+    raw = tags_to_replay(recording.summary())
     names = ", ".join(raw)
     if request.tag is not None:
         if request.tag not in raw:

@@ -7,7 +7,7 @@ from skyless.cli.common.options import height_number, metres
 
 def is_mcap(file: Path) -> bool:
     """Whether a file's content is an MCAP; one that cannot be opened, or would lose what is read here, is none."""
-    from skyless.replays.inputs import is_mcap
+    from skyless.recordings.mcap.recording import is_mcap
 
     return is_mcap(file)
 

@@ -10,6 +10,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Final, cast
 
+import lz4.frame
 import msgspec
 import zstandard
 from msgspec import Struct
@@ -45,6 +46,18 @@ _CHUNK_HEAD: Final = struct.Struct("<QQQI")
 _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 _INDEX_HEAD: Final = struct.Struct("<HI")
 _INDEX_ENTRY_BYTES: Final = 16
+
+
+def is_mcap(path: str | PathLike[str]) -> bool:
+    """Whether a file's content is an MCAP; one that cannot be opened, or would lose what is read here, is none."""
+    try:
+        file = Path(path)
+        if file.is_fifo():
+            return False
+        with file.open("rb") as stream:
+            return stream.read(len(MAGIC)) == MAGIC
+    except OSError:
+        return False
 
 
 class ChunkIndex(Struct):
@@ -204,12 +217,14 @@ class McapScan:
 
 def _decompressed(name: bytes, data: bytes, size: int) -> bytes | None:
     """The content, of which no more is made than it should have; None if it is damaged or of another compression."""
-    if name != b"zstd":
-        return data if not name else None
     try:
-        return zstandard.ZstdDecompressor().stream_reader(data).read(size + 1)
-    except zstandard.ZstdError:
+        if name == b"zstd":
+            return zstandard.ZstdDecompressor().stream_reader(data).read(size + 1)
+        if name == b"lz4":
+            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
+    except (zstandard.ZstdError, RuntimeError):
         return None
+    return None if name else data
 
 
 # ``McapRecording``: what was recorded of a running site, by kind and time; also while it is being recorded.
@@ -237,6 +252,17 @@ class RecordingSummary(Struct, frozen=True):
     messages: dict[str, int]
     """By kind."""
     drops: dict[str, int]
+
+
+def tags_to_replay(summary: RecordingSummary) -> tuple[str, ...]:
+    """Tags whose receptions a recording holds. Raises ConfigurationError where there is none."""
+    if summary.start_s is None:
+        beyond = f", and {summary.unread_bytes} bytes that are not whole" if summary.unread_bytes else ""
+        held = f"empty: no message in it{beyond}"
+        raise ConfigurationError(summary.path, "the recording", held, "one whose recorder ran for a second or more")
+    if not summary.raw_tags:
+        raise ConfigurationError(summary.path, "raw receptions", None, "a recording that skyless record made")
+    return summary.raw_tags
 
 
 class Recorded(Struct, frozen=True):
