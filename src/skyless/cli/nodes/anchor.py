@@ -1,11 +1,13 @@
 """``skyless anchor``: anchors as a program."""
 
 import contextlib
+import time
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import App, Parameter
 
+from skyless.cli.common.output import print_json
 from skyless.cli.common.progress import loading_kernels
 from skyless.cli.nodes.options import MqttOptions, log, site_named
 from skyless.errors import SkylessError
@@ -22,6 +24,7 @@ def anchor(
     radio: str = DEFAULT_RADIO,
     keys: Annotated[Path | None, Parameter(env_var="SKYLESS_KEYS")] = None,
     broker: MqttOptions = MqttOptions(),
+    json: bool = False,
 ) -> None:
     """Run anchors of a site until Ctrl-C.
 
@@ -43,6 +46,8 @@ def anchor(
         "1:HEX 2:HEX", may hold the seeds instead.
     broker.mqtt
         Broker to publish health and site to, or none.
+    json
+        Write one JSON object at the end: the last health of each anchor.
     """
     from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.nodes.anchor import Anchors
@@ -72,8 +77,8 @@ def anchor(
     image = None if plan.floor_plan is None else Path(site).parent / plan.floor_plan.image
     with loading_kernels(SIMULATED):
         compile_kernels(WEIGHTED)
+    anchors = Anchors(plan, radios, address, log, simulated=lambda: is_simulated(radio), floor_plan=image, keys=chains)
     with contextlib.suppress(KeyboardInterrupt):
-        anchors = Anchors(
-            plan, radios, address, log, simulated=lambda: is_simulated(radio), floor_plan=image, keys=chains
-        )
         run(anchors.run(), punctual=True)
+    if json:
+        print_json({"anchors": anchors.healths(time.time(), time.monotonic())})

@@ -22,7 +22,7 @@ export const state = {
   /** @type {any} the site message's `site` */
   site: null,
   simulated: false,
-  /** @type {{done: number, total: number, left_s: number}|null} while kernels are compiled */
+  /** @type {{done: number, total: number, left_s: number|null}|null} while kernels are compiled */
   preparation: null,
   /** @type {"live"|"replay"} */
   mode: "live",
