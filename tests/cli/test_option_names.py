@@ -75,6 +75,10 @@ def test_a_name_has_one_meaning(options):
     assert wrong == {}
 
 
+def test_every_command_has_json():
+    assert {path for path, arguments in commands(program()) if "--json" not in {one.name for one in arguments}} == set()
+
+
 def test_every_option_has_help(options):
     assert [
         (name, command) for name, uses in options.items() for command, (_, words) in uses.items() if not words

@@ -68,6 +68,20 @@ def report(result):
     return json.loads(out)
 
 
+@pytest.mark.parametrize("json_asked", [[], ["--json"]])
+def test_a_table_that_knows_the_lesser_part_of_a_recording_is_warned_of(run, tmp_path, json_asked):
+    head, *rows = synthetic.anchors_csv().splitlines(keepends=True)
+    few = tmp_path / "few.csv"
+    few.write_text(head + "".join(rows[:5]))
+    code, out, err = run("tdoa-table", "--anchors", few, *json_asked)
+    assert code == 0
+    (warning,) = err.splitlines()
+    count = int(re.fullmatch(r"skyless: warning: (\d+) of 1500 receptions \(\d+%\) are of anchors that .*", warning)[1])
+    assert 0.5 * ROWS <= count < ROWS
+    assert json_asked == [] or json.loads(out)["drops"]["unknown-anchor"] == count
+    assert run("tdoa-table", "--anchors", "anchors.csv", *json_asked)[2] == ""
+
+
 @pytest.mark.parametrize("name", synthetic.MAKERS)
 def test_every_format_gives_fixes_at_the_truth(run, name):
     options = ["--anchors", "anchors.csv", "--truth", "truth.csv", "--settle", "1", "--json"]

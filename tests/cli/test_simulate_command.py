@@ -323,7 +323,36 @@ def test_a_site_too_large_for_real_time_is_warned_of(tmp_path, capsys):
         assert ("140 anchors send 4200 beacons/s" in capsys.readouterr().err) is warned
 
 
-def test_tags_without_a_fix_are_counted(run):
-    code, out, _ = run("--position", "3,4", "--silence", "0", "--duration", "3")
-    assert code == 0
-    assert re.search("tags without a fix +│ 1 of 1", out)
+THREE_3D = 'name = "hall"\nid = 1\n[schedule]\nmode = "free"\n' + "".join(
+    f"[[anchors]]\nid = {k + 1}\nx_m = {x}\ny_m = {y}\nz_m = {k}\n" for k, (x, y) in enumerate(((0, 0), (9, 0), (0, 9)))
+)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["--position", "3,4", "--silence", "0"], "the tags' radios were off all the time (--silence)"),
+        (["--position", "3,4", "--silence", "0", "--json"], "the tags' radios were off all the time (--silence)"),
+        (["--position", "3,900"], "the tags heard nothing: no anchor within 31 m"),
+        (["--position", "3,4", "--silence", "1.5"], "all came before --settle, 2 s"),
+        (["--site", "three.toml"], "3 anchors give no position: one with its height needs 4"),
+        (["--position", "3,4", *(w for k in range(2, 6) for w in ("--outage", f"{k}:0"))], "too-few-anchors"),
+    ],
+)
+def test_a_run_without_a_fix_fails_with_its_reason(run, tmp_path, arguments, reason):
+    (tmp_path / "three.toml").write_text(THREE_3D)
+    code, out, err = run(*arguments, "--duration", "3")
+    assert code == 1
+    assert err.startswith("skyless: no fix: ")
+    assert reason in err
+    if "--json" in arguments:
+        assert json.loads(out)["fixes"] == 0
+    elif "settle" not in reason:
+        assert re.search("tags without a fix +│ 1 of 1", out)
+
+
+@pytest.mark.parametrize(("scenario", "said"), [("lab", "2-D"), ("room", "2-D")])
+def test_figures_say_of_how_many_dimensions_they_are(run, scenario, said):
+    _, out, _ = run("--scenario", scenario, "--duration", "3")
+    for name in ("RMSE", "predicted σ", "95 %", "largest"):
+        assert f" {name} {said} " in out

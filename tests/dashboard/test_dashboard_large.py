@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from test_dashboard_condition import anchor_health
 from test_dashboard_live import drained, of
 
-from skyless.dashboard import roster
+from skyless.dashboard.condition import roster
 from skyless.dashboard.wanted import MAX_ROWS, PageRequest
 from skyless.mqtt import topics
 

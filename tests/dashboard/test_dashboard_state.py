@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.dashboard.state import EXPIRY_S, GONE_S, SiteState
+from skyless.dashboard.state import EXPIRY_S, UNHEARD_S, SiteState
 from skyless.dashboard.wanted import MAX_HEALTHS, PageRequest, Sent
 from skyless.mqtt.messages import AnchorHealth, Counters, EtherHealth
 
@@ -286,5 +286,5 @@ def test_a_page_always_has_the_newest_fix_of_just_the_tags_that_it_was_given(ste
         for name in shown.keys() - wished:
             assert low <= newest[name][0] <= high or (text and text in name)
         if message["tags"]:
-            inside = [x for x, now_s in newest.values() if low <= x <= high and state.now_s - now_s < GONE_S]
+            inside = [x for x, now_s in newest.values() if low <= x <= high and state.now_s - now_s < UNHEARD_S]
             assert (message["of"], message["inside"]) == (len(newest), len(inside))

@@ -10,6 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 
 from skyless.kernels.cache import KernelFolder
@@ -59,11 +60,26 @@ def test_parts_are_compiled_once_and_counted(folder):
     assert missing(parts) == ()
     assert reports[0].done == 0
     assert all(earlier.done <= later.done for earlier, later in pairwise(reports))
-    assert all(report.left_s >= 0.0 for report in reports)
+    assert all(report.left_s is None or report.left_s >= 0.0 for report in reports)
     assert len(list((folder.path.parent / "kernels").rglob("*.nbi"))) == 2
     again = []
     asyncio.run(compile_parts(parts, again.append))
     assert again == []
+
+
+def test_a_slow_machine_is_promised_nothing_before_it_is_measured_and_little_that_is_wrong_after():
+    """Fourteen times slower than typical, one core: the first forecast may not be that of a fast machine."""
+    begun, waiting = (processes._Progress(part.typical_s, part.timeline, total=100) for part in LAB)
+    whole_s, waiting_s = 14.0 * begun.typical_s, 14.0 * waiting.typical_s
+    begun.begun_s = 0.0
+    for share in np.linspace(0.0, 0.99, 100):
+        begun.done = int(np.interp(share, begun.timeline, np.linspace(0.0, 100.0, len(begun.timeline))))
+        told_s = processes._time_left_s([begun, waiting], share * whole_s, 1)
+        if share < 0.25:
+            assert told_s is None
+        elif share > 0.3:
+            assert told_s == pytest.approx((1.0 - share) * whole_s + waiting_s, rel=0.25)
+    assert processes._time_left_s([waiting], 0.0, 1) is None
 
 
 def test_a_part_that_fails_is_reported_and_the_others_are_compiled(folder):

@@ -15,6 +15,7 @@ from skyless.mqtt.messages import ReceptionsMessage
 from skyless.positioning.integrity import Alert, IntegrityRequirement
 from skyless.recordings.mcap.recording import McapRecording
 from skyless.replays.site import SiteReplay
+from skyless.simulation.channel import ChannelModel
 
 
 def replayed(path, **options):
@@ -279,6 +280,18 @@ def test_mistakes_are_told_in_one_line(tmp_path, capsys):
         told = capsys.readouterr().err
         assert words in told
         assert told.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("loss", "method", "warned"), [(0.3, "weighted", True), (0.0, "weighted", False), (0.3, "joint", False)]
+)
+def test_snapshots_of_few_members_are_warned_of(tmp_path, capsys, loss, method, warned):
+    path = tmp_path / "live.mcap"
+    record(path, messages(3.0, channel=ChannelModel(loss_probability=loss)))
+    assert main(["replay", str(path), "--method", method]) == 0
+    told = capsys.readouterr()
+    assert ("a: weighted had " in told.err) is warned
+    assert "95 % 2-D" in told.out
 
 
 def test_a_recording_without_receptions_says_so(tmp_path):

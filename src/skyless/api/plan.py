@@ -110,9 +110,10 @@ class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
         yield "points", f"{found['points']}, {found['step_m']:g} m apart"
         yield "covered", f"{found['covered_share']:.1%} of the region"
         yield "fewest anchors in view", f"{found['fewest_anchors']}"
-        yield "mean σ", cm(found["mean_sigma_m"])
-        yield "95 % σ", cm(found["p95_sigma_m"])
-        yield "worst σ", cm(found["worst_sigma_m"])
+        dimensions = f"{found['dimensions']}-D"
+        yield f"mean σ {dimensions}", cm(found["mean_sigma_m"])
+        yield f"95 % σ {dimensions}", cm(found["p95_sigma_m"])
+        yield f"worst σ {dimensions}", cm(found["worst_sigma_m"])
         if found["walls_bias"]:
             yield "mean RMSE with the walls' delays", cm(found["mean_rmse_m"])
         if found["target_share"] is not None:

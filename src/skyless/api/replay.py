@@ -22,6 +22,7 @@ from skyless.arguments import (
 )
 from skyless.errors import SkylessError
 from skyless.evaluation.judge import Judge, antenna_truth
+from skyless.evaluation.statistics import dimensions
 from skyless.method_names import METHODS
 from skyless.positioning.fix import Fix
 from skyless.recordings.anchor_table import read_anchors, read_calibration
@@ -93,8 +94,9 @@ class ReplayResult(Result, frozen=True, eq=False):
             yield f"{of_tag}height", self.height_note
             yield f"{of_tag}RMSE 2-D", cm(report.rmse_2d_m)
             yield f"{of_tag}RMSE 3-D", cm(report.rmse_3d_m)
-            yield f"{of_tag}95 %", cm(report.p95_m)
-            yield f"{of_tag}largest error", cm(report.max_m)
+            of_all = dimensions(planar=report.rmse_3d_m is None)
+            yield f"{of_tag}95 % {of_all}", cm(report.p95_m)
+            yield f"{of_tag}largest error {of_all}", cm(report.max_m)
 
 
 def replay(

@@ -23,6 +23,7 @@ from skyless.errors import SkylessError
 from skyless.evaluation.fleet import FleetReport, JudgedFix, report
 from skyless.evaluation.fleet_run import end_s, run_fleet
 from skyless.evaluation.scenarios import Request, Room, check_can_be_simulated, errors_words, fleet_of_any_size, room_of
+from skyless.evaluation.statistics import dimensions
 from skyless.method_names import DEFAULT_METHOD
 from skyless.positioning.integrity import IntegrityRequirement
 from skyless.simulation.impairments import AnchorBias, AnchorOutage, DelayError, Outage
@@ -96,10 +97,11 @@ class SimulationResult(Result, frozen=True, eq=False):
         yield "updates", f"{found.updates_per_s:.1f} per second and tag"
         if found.tags_without_fix:
             yield "tags without a fix", f"{found.tags_without_fix}"
-        yield "RMSE", cm(found.rmse_m)
-        yield "predicted σ", cm(found.sigma_m)
-        yield "95 %", cm(found.p95_m)
-        yield "largest error", cm(found.max_m)
+        of_all = dimensions(planar=self.site.tags.height_m is not None)
+        yield f"RMSE {of_all}", cm(found.rmse_m)
+        yield f"predicted σ {of_all}", cm(found.sigma_m)
+        yield f"95 % {of_all}", cm(found.p95_m)
+        yield f"largest error {of_all}", cm(found.max_m)
         if found.levels is not None:
             yield "median protection level", cm(found.levels.hpl_m)
 

@@ -31,14 +31,15 @@ _NOTES: Final = (
 
 def _facts(result: dict[str, Any]) -> dict[str, str]:
     """The numbers for people."""
-    worst_at = result["worst_at_m"]
+    worst_at, dimensions = result["worst_at_m"], f"{result['dimensions']}-D"
     where = "" if worst_at is None else " at ({:.2f}, {:.2f}, {:.2f}) m".format(*worst_at)
     facts = {
         "anchors": f"{len(result['anchors'])}, master {result['master']}, range {result['range_m']:.0f} m in the open",
         "map": _map_line(result),
         "covered": f"{result['covered_share']:.1%} of the region; fewest anchors in view: {result['fewest_anchors']}",
-        "standard deviation": f"mean {cm(result['mean_sigma_m'])}, median {cm(result['median_sigma_m'])}, "
-        f"95 % {cm(result['p95_sigma_m'])}, worst {cm(result['worst_sigma_m'])}{where}",
+        f"standard deviation {dimensions}": f"mean {cm(result['mean_sigma_m'])}, "
+        f"median {cm(result['median_sigma_m'])}, 95 % {cm(result['p95_sigma_m'])}, "
+        f"worst {cm(result['worst_sigma_m'])}{where}",
     }
     if result["walls_bias"]:
         facts["with the walls' delays"] = f"RMSE mean {cm(result['mean_rmse_m'])}, worst {cm(result['worst_rmse_m'])}"

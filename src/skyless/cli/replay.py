@@ -22,11 +22,11 @@ from skyless.cli.common.options import (
     check_picture,
     options,
 )
-from skyless.cli.common.output import new_table, number, print_facts, print_json, print_warnings
+from skyless.cli.common.output import NO_FIX, new_table, number, print_facts, print_json, print_warnings
 from skyless.cli.common.progress import loading_kernels, progress_bar
 from skyless.cli.common.recording_inputs import is_mcap, lever_arm, wished_height
 from skyless.errors import SkylessError
-from skyless.method_names import DEFAULT_METHOD, Dynamics
+from skyless.method_names import DEFAULT_METHOD, SNAPSHOTS, Dynamics
 
 if TYPE_CHECKING:
     from skyless.evaluation.judge import Judge
@@ -42,8 +42,11 @@ FIXES_COLUMNS: Final = (
 )
 """Columns of the file that --fixes-csv writes."""
 
-NO_FIX: Final = 1
-"""Exit code of a replay without any fix."""
+_MANY_UNKNOWN: Final = 0.5
+"""Share of a recording from unknown anchors that is warned of."""
+
+_FEW_MEMBERS: Final = 0.8
+"""Mean number of a snapshot's anchors over the largest, below which it is warned of."""
 
 _MOST_DROPS: Final = 3
 """Reasons for drops that are named when there is no fix."""
@@ -143,6 +146,8 @@ def replay(file: Path, /, *, asked: ReplayOptions = ReplayOptions()) -> int:
     check_output("plot", asked.plot, file, asked.anchors, asked.site, asked.truth, asked.fixes_csv)
     check_picture(asked.plot)
     reports: Sequence[ReplayReport] = _replay_site(file, asked) if is_mcap(file) else [_replay_foreign(file, asked)]
+    for report in reports:
+        _warn_of_unknown(report)
     if any(report.fixes for report in reports):
         return 0
     print(f"skyless: no fix: {_likely_reason(reports[0], asked)}", file=sys.stderr)
@@ -159,6 +164,28 @@ _REASONS: Final = {
     "acquiring": "the recording is too short, or its receptions contradict the anchors' positions; is the table right?",
 }
 """Why a recording gives no fix, by the reason that the filter gave last."""
+
+
+def _warn_of_unknown(report: "ReplayReport") -> None:
+    """Warn where fixes are of the lesser part of a recording."""
+    unknown = report.drops.get("unknown-anchor", 0)
+    if report.fixes and unknown >= _MANY_UNKNOWN * report.receptions:
+        share = f"{unknown} of {report.receptions} receptions ({unknown / report.receptions:.0%})"
+        _warn(f"{share} are of anchors that the table or site file does not have; is it that of this recording?")
+
+
+def _warn_of_few_members(report: "TagReport") -> None:
+    """Warn where a method that needs whole superframes was given parts of them."""
+    mean, most = report.mean_anchors, report.most_anchors
+    if report.method in SNAPSHOTS and mean is not None and mean < _FEW_MEMBERS * most:
+        _warn(
+            f"{report.tag}: {report.method} had {mean:.1f} anchors of a superframe on average, of {most} at best, as "
+            "beacons are missing; errors are larger for it. joint (--method joint) uses every beacon that was received"
+        )
+
+
+def _warn(text: str) -> None:
+    print(f"skyless: warning: {text}", file=sys.stderr)
 
 
 def _likely_reason(report: "ReplayReport", asked: ReplayOptions) -> str:
@@ -265,6 +292,8 @@ def _replay_site(file: Path, asked: ReplayOptions) -> "list[TagReport]":
         reports = _run_site(run, span_s, asked)
     if asked.plot is not None:
         _draw_track(asked.plot, run.judges[reports[0].tag], reports[0])
+    for report in reports:
+        _warn_of_few_members(report)
     if asked.json:
         print_json(summary_of(reports))
     else:
@@ -353,7 +382,10 @@ def _draw_track(path: Path, judge: "Judge", report: "ReplayReport") -> None:
 
 def _show(report: "ReplayReport", note: str, distances: dict[str, float], more: Sequence[tuple[str, str]] = ()) -> None:
     """Show a replay as a table; ``note`` says where the height is from, ``more`` comes first."""
+    from skyless.evaluation.statistics import dimensions
+
     fixes = str(report.fixes) if report.reason is None else f"none: {report.reason}"
+    of_all = dimensions(planar=report.rmse_3d_m is None)
     truth_known = any(pair.against_truth for pair in report.pairs)
     facts = [
         *more,
@@ -367,8 +399,8 @@ def _show(report: "ReplayReport", note: str, distances: dict[str, float], more: 
         ("noise of a difference" if truth_known else "scatter of a difference", _metres(report.tdoa_noise_m)),
         ("RMSE 2-D", _metres(report.rmse_2d_m)),
         ("RMSE 3-D", _metres(report.rmse_3d_m)),
-        ("95 %", _metres(report.p95_m)),
-        ("largest error", _metres(report.max_m)),
+        (f"95 % {of_all}", _metres(report.p95_m)),
+        (f"largest error {of_all}", _metres(report.max_m)),
         ("speed", f"{report.receptions_per_s:,.0f} receptions/s"),
     ]
     facts += [(f"dropped: {reason}", str(count)) for reason, count in report.drops.items()]

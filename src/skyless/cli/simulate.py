@@ -1,6 +1,7 @@
 """``skyless simulate``: a site in the simulated world, judged against the truth."""
 
 import csv
+import sys
 import time
 from collections.abc import Sequence
 from itertools import pairwise
@@ -23,7 +24,7 @@ from skyless.cli.common.options import (
     finite_numbers,
     options,
 )
-from skyless.cli.common.output import cm, new_table, print_facts, print_json
+from skyless.cli.common.output import NO_FIX, cm, new_table, print_facts, print_json
 from skyless.cli.common.progress import loading_kernels, progress_bar
 from skyless.cli.common.simulated_site import check_simulated
 from skyless.errors import SkylessError
@@ -149,10 +150,12 @@ class SimulateOptions:
 
 
 @app.default
-def simulate(*, asked: SimulateOptions = SimulateOptions()) -> None:
+def simulate(*, asked: SimulateOptions = SimulateOptions()) -> int:
     """Run a site faster than real time and report the errors of its tags.
 
     Anchors and tags are the machines that would run on radios; clocks, noise, air and motion are simulated.
+
+    Ends with exit code 1 if no fix was judged, and names the reason.
     """
     check_method(asked.method)
     request = _request(asked)
@@ -161,7 +164,7 @@ def simulate(*, asked: SimulateOptions = SimulateOptions()) -> None:
         raise SkylessError(
             f"--settle is {asked.settle:g}; a run of {asked.until_s:g} s (--duration) ends before any fix is judged"
         )
-    result = _run(request, asked)
+    result, reason = _run(request, asked)
     if asked.json:
         import msgspec
 
@@ -172,6 +175,28 @@ def simulate(*, asked: SimulateOptions = SimulateOptions()) -> None:
         print_json({**msgspec.to_builtins(result), **settings})
     else:
         _show(result, request)
+    if result.fixes:
+        return 0
+    print(f"skyless: no fix: {_why_none(result, reason, request, asked)}", file=sys.stderr)
+    return NO_FIX
+
+
+def _why_none(result: "FleetReport", reason: str, request: "Request", asked: SimulateOptions) -> str:
+    """Why no fix was judged; ``reason`` is that of the first tag's receiver."""
+    from skyless.site.advice import RADIO_REACH_M, too_few_anchors
+
+    if result.tags_without_fix < result.tags:
+        return f"all came before --settle, {asked.settle:g} s; the run should last longer (--duration)"
+    if too_few := too_few_anchors(request.site):
+        return too_few
+    if result.messages == 0:
+        reach = f"no anchor within {RADIO_REACH_M:.0f} m, the range in the open, or none that is on (--outage)"
+        return f"the tags heard nothing: {reach}"
+    if result.drops.get("radio-off") == result.messages:
+        return f"the tags' radios were off all the time (--silence); {result.messages} messages were lost on them"
+    most = sorted(result.drops.items(), key=lambda item: -item[1])[:3]
+    drops = f"; dropped: {', '.join(f'{count} × {name}' for name, count in most)}" if most else ""
+    return f"tags heard {result.messages} messages in {result.simulated_s:g} s, and had no position: {reason}{drops}"
 
 
 # What is simulated
@@ -302,7 +327,8 @@ def _whole(option: str, text: str, anchor: float) -> int:
 # The run
 
 
-def _run(request: "Request", asked: SimulateOptions) -> "FleetReport":
+def _run(request: "Request", asked: SimulateOptions) -> "tuple[FleetReport, str]":
+    """The report, and why the first tag had no fix last."""
     from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.evaluation.fleet import report
     from skyless.evaluation.scenarios import fleet_of_any_size
@@ -320,7 +346,7 @@ def _run(request: "Request", asked: SimulateOptions) -> "FleetReport":
     else:
         with new_table(asked.fixes_csv) as file:
             _advance(fleet, request, asked.until_s, file)
-    return report(fleet, request.method, started_s)
+    return report(fleet, request.method, started_s), str(fleet.receivers[0].reason)
 
 
 def _advance(fleet: "TagFleet", request: "Request", until_s: float, file: TextIO | None) -> None:
@@ -357,7 +383,9 @@ def _without_fix(result: "FleetReport") -> list[tuple[str, str]]:
 
 def _show(result: "FleetReport", request: "Request") -> None:
     from skyless.evaluation.scenarios import errors_words
+    from skyless.evaluation.statistics import dimensions
 
+    of_all = dimensions(planar=request.site.tags.height_m is not None)
     facts = [
         ("errors drawn", f"{errors_words(request.site, request.room)}; seed {request.seed}"),
         ("simulated time", f"{result.simulated_s:.1f} s in {result.wall_s:.1f} s ({result.speed:.1f} × real time)"),
@@ -366,10 +394,10 @@ def _show(result: "FleetReport", request: "Request") -> None:
         ("updates", f"{result.updates_per_s:.1f} per second and tag"),
         *_without_fix(result),
         ("first fix", "none" if result.first_fix_s is None else f"{result.first_fix_s:.3f} s after power-on"),
-        ("RMSE", cm(result.rmse_m)),
-        ("predicted σ", cm(result.sigma_m)),
-        ("95 %", cm(result.p95_m)),
-        ("largest", cm(result.max_m)),
+        (f"RMSE {of_all}", cm(result.rmse_m)),
+        (f"predicted σ {of_all}", cm(result.sigma_m)),
+        (f"95 % {of_all}", cm(result.p95_m)),
+        (f"largest {of_all}", cm(result.max_m)),
     ]
     if (levels := result.levels) is not None:
         alerts = ", ".join(f"{alert} {count}" for alert, count in levels.alerts.items() if alert != "none")

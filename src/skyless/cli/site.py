@@ -46,6 +46,7 @@ def new(
     tag_height: str | None = None,
     site_id: SiteId | None = None,
     force: bool = False,
+    json: bool = False,
 ) -> None:
     """Write a commented site file to start from: the lab, with --width and --depth a room, with --spacing a large hall.
 
@@ -81,6 +82,8 @@ def new(
         Number of the site on the air, which neighbouring sites must not share; by default a random one.
     force
         Overwrite what is there, if the file exists.
+    json
+        Write one JSON object instead of a line.
     """
     from skyless.planning.reception import with_best_master
     from skyless.simulation.channel import ChannelModel
@@ -113,7 +116,10 @@ def new(
     if file.exists() and not force:
         raise SkylessError(f"{file} exists; --force overwrites it")
     write_file(file, site_template(site).encode())
-    console().print(f"wrote {file}; next: skyless site check {file}", markup=False)
+    if json:
+        print_json({"file": file, "name": site.name, "id": site.id, "anchors": len(site.all_anchors)})
+    else:
+        console().print(f"wrote {file}; next: skyless site check {file}", markup=False)
 
 
 def _new_id() -> int:

@@ -1,6 +1,7 @@
 """``skyless site keys``: make, replace and show the keys of a site, with which its beacons are verified."""
 
 import time
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -37,7 +38,9 @@ app = App(
 
 
 @app.command(help_epilogue='Example: skyless site keys new site.toml --starts "2030-01-31 06:00"')
-def new(site: str, /, *, keys: Path | None = None, years: _Years = 2.0, starts: str | None = None) -> None:
+def new(
+    site: str, /, *, keys: Path | None = None, years: _Years = 2.0, starts: str | None = None, json: bool = False
+) -> None:
     """Make the keys of a site: its key pair and its first key chain. Nothing that is there is overwritten.
 
     Two years take five minutes of one processor; all are used.
@@ -53,6 +56,8 @@ def new(site: str, /, *, keys: Path | None = None, years: _Years = 2.0, starts: 
     starts
         When the chain begins to count: ISO date and time, local where no zone is given; by default at once. Until then
         anchors with keys send without codes, so that all of them can get their keys before.
+    json
+        Write one JSON object instead of what is to be done next.
     """
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
@@ -74,6 +79,9 @@ def new(site: str, /, *, keys: Path | None = None, years: _Years = 2.0, starts: 
     chain = _made(public, 1, starts_s, years, private.private_bytes_raw())
     files = {folder / SITE_PRIVATE: private_bytes(private), folder / SITE_PUBLIC: public_bytes(public)}
     _write(folder, chain, files)
+    if json:
+        _print_json(site, keys)
+        return
     console().print(
         f"{_written(folder, chain)}; fingerprint of the public key: {public.fingerprint}\n"
         f"next: 1. keep {SITE_PRIVATE} where only you can read it; no anchor and no tag needs it\n"
@@ -86,7 +94,9 @@ def new(site: str, /, *, keys: Path | None = None, years: _Years = 2.0, starts: 
 
 
 @app.command(help_epilogue='Example: skyless site keys rotate site.toml --starts "2030-01-31 06:00"')
-def rotate(site: str, /, *, keys: Path | None = None, years: _Years = 2.0, starts: str | None = None) -> None:
+def rotate(
+    site: str, /, *, keys: Path | None = None, years: _Years = 2.0, starts: str | None = None, json: bool = False
+) -> None:
     """Make the next key chain of a site, which counts from a planned time on; until then the present one does.
 
     Parameters
@@ -100,6 +110,8 @@ def rotate(site: str, /, *, keys: Path | None = None, years: _Years = 2.0, start
     starts
         When the chain begins to count: ISO date and time, local where no zone is given; by default in a day. All
         anchors should have its files before.
+    json
+        Write one JSON object instead of what is to be done next.
     """
     folder, public, chains = _present(site, keys)
     starts_s = time.time() + _DAY_S if starts is None else _planned(starts)
@@ -110,6 +122,9 @@ def rotate(site: str, /, *, keys: Path | None = None, years: _Years = 2.0, start
     ends_s = _ends_s(last)
     if ends_s < starts_s:
         warnings.append(f"chain {last.serial} ends {_when(ends_s)}: until {_when(starts_s)} beacons carry no codes")
+    if json:
+        _print_json(site, keys, warnings)
+        return
     console().print(
         f"{_written(folder, chain)}\n"
         f"next: copy chain-{chain.serial}.public and chain-{chain.serial}.seed to each host of anchors before it "
@@ -121,7 +136,7 @@ def rotate(site: str, /, *, keys: Path | None = None, years: _Years = 2.0, start
 
 
 @app.command(help_epilogue="Example: skyless site keys revoke site.toml --years 0.1")
-def revoke(site: str, /, *, keys: Path | None = None, years: _Years = 2.0) -> None:
+def revoke(site: str, /, *, keys: Path | None = None, years: _Years = 2.0, json: bool = False) -> None:
     """Replace all key chains of a site at once, as a seed was stolen or an anchor's host lost.
 
     Parameters
@@ -132,6 +147,8 @@ def revoke(site: str, /, *, keys: Path | None = None, years: _Years = 2.0) -> No
         Folder of the site's keys; by default keys in that of the site file.
     years
         How long the new chain lasts; a short one is made sooner.
+    json
+        Write one JSON object instead of what is to be done next.
     """
     from msgspec.structs import replace
 
@@ -141,6 +158,9 @@ def revoke(site: str, /, *, keys: Path | None = None, years: _Years = 2.0) -> No
     chain = _successor(folder, public, chains, time.time() - _OVERLAP_S, years)
     raised = replace(public, least_serial=chain.serial)
     _write(folder, chain, {folder / SITE_PUBLIC: site_public_bytes(raised)})
+    if json:
+        _print_json(site, keys)
+        return
     console().print(
         f"{_written(folder, chain)}; chains before it are revoked\n"
         f"next: 1. copy chain-{chain.serial}.public and chain-{chain.serial}.seed at once to each host of anchors that "
@@ -179,6 +199,12 @@ def show(site: str, /, *, keys: Path | None = None, json: bool = False) -> None:
     rows.append(("left", f"{report['days_left']:.0f} days"))
     print_facts(f"keys of site {public.site} ({folder})", rows)
     print_warnings(report["warnings"])
+
+
+def _print_json(site: str, keys: Path | None, warnings: Sequence[str] = ()) -> None:
+    """The report of ``show`` on what is there now."""
+    report = _report(*_present(site, keys), time.time())
+    print_json({**report, "warnings": [*warnings, *report["warnings"]]})
 
 
 def _report(folder: Path, public: "SitePublic", chains: "list[Chain]", now_s: float) -> dict[str, Any]:

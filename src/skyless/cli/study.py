@@ -341,6 +341,8 @@ def _table(study: "Study", plan: "Plan", rows: "Sequence[Row]") -> "Table":
     )
     cells = [_cells(row) for row in rows]
     used = [column for column in range(len(heads)) if any(line[column] for line in cells)]
+    if "95 %" in {heads[column] for column in used}:
+        table.caption = "RMSE, 95 %, max and σ: 2-D where the tags' height is given, else 3-D"
     for column in used:
         table.add_column(heads[column], justify="left" if column == 0 else "right")
     for line in cells:

@@ -71,6 +71,11 @@ class EvenSample:
         return np.array(self._store).reshape(-1, self._columns)
 
 
+def dimensions(*, planar: bool) -> str:
+    """What percentiles and the like are of, for people: of the horizontal error where the height was given."""
+    return "2-D" if planar else "3-D"
+
+
 class ErrorSummary(Struct, frozen=True):
     """Errors of a run in metres; None where there were none to judge."""
 

@@ -61,8 +61,8 @@ class PreparationMessage(Struct, frozen=True):
     done: int
     total: int
     """0 while it is not known yet."""
-    left_s: float
-    """Estimated."""
+    left_s: float | None
+    """Estimated from what has been done; None while that is too little."""
     unix_s: float
 
 

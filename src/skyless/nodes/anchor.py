@@ -348,6 +348,13 @@ class Anchors:
             if link is not None and message is not None:
                 link.publish(stamps_topic(self._site.id, node.id), message, qos=1)
 
+    def healths(self, unix_s: float, now_s: float) -> list[AnchorHealth]:
+        """State of all anchors since their last one; ``now_s`` is the host's monotonic clock."""
+        pairs = zip(self.nodes, self._links, strict=True)
+        return [
+            health_of(node, Counters(0, 0, 0) if link is None else link.counters, unix_s, now_s) for node, link in pairs
+        ]
+
     def _publish_health(self) -> None:
         """Health of all anchors, and the site by its master or root, or by the first anchor of each process."""
         unix_s, now_s = time.time(), time.monotonic()

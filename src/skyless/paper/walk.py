@@ -97,7 +97,7 @@ def section(plan: Plan, results: Results) -> Section:
     tracks: dict[str, Track] = results["walk"]
     pieces = along_path(tracks["literal"])
     verdict, reason = judge(pieces.pdop_correlation, pieces.predicted_correlation)
-    rows = [("method", "RMSE in cm", "95 % in cm", "largest in cm", "fixes")]
+    rows = [("method", "RMSE 2-D in cm", "95 % 2-D in cm", "largest in cm", "fixes")]
     numbers = []
     for method, track in tracks.items():
         radial = np.linalg.norm(track.error_m, axis=1)

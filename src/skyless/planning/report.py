@@ -36,6 +36,7 @@ def plan_report(
         "range_m": range_of(settings.channel),
         "superframe_s": 1.0 / schedule_of(site).superframe_rate_hz,
         "master": site.master,
+        "dimensions": 3 if site.tags.height_m is None else 2,
         "heights_m": heights,
         "region_m": floor.region_m,
         "outline_m": floor.outline_m,

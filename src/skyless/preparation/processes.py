@@ -19,8 +19,8 @@ from skyless.preparation.parts import Part
 
 _WAIT_S: Final = 0.25
 _REPORT_S: Final = 0.25
-_SURE_SHARE: Final = 0.1
-"""From here on the time left follows from the time spent."""
+_SURE_SHARE: Final = 0.25
+"""From here on the time left of a part follows from the time spent; before, nothing is promised."""
 
 
 class Preparation(Struct, frozen=True):
@@ -28,8 +28,8 @@ class Preparation(Struct, frozen=True):
 
     done: int
     total: int
-    left_s: float
-    """Estimated."""
+    left_s: float | None
+    """Estimated from what has been done; None while that is too little."""
 
 
 Report = Callable[[Preparation], None]
@@ -65,16 +65,19 @@ class _Progress(Struct):
     done: int = 0
     total: int = 0
     begun_s: float | None = None
-    ended: bool = False
+    ended_s: float | None = None
 
-    def left_s(self, now_s: float) -> float:
-        if self.ended:
-            return 0.0
-        spent_s = 0.0 if self.begun_s is None else now_s - self.begun_s
-        share = self._share()
-        if share < _SURE_SHARE:
-            return max(self.typical_s - spent_s, 0.5 * self.typical_s)
-        return spent_s * (1.0 - share) / share
+    @property
+    def ended(self) -> bool:
+        return self.ended_s is not None
+
+    def whole_s(self, now_s: float) -> float | None:
+        """Time from begin to end as the share done shows it; None while that is too little."""
+        if self.begun_s is None:
+            return None
+        share = 1.0 if self.ended else self._share()
+        end_s = now_s if self.ended_s is None else self.ended_s
+        return None if share < _SURE_SHARE else (end_s - self.begun_s) / share
 
     def _share(self) -> float:
         """Of its time that is over, by its kernels."""
@@ -117,7 +120,7 @@ class _Run:
                 problem = await self._run_worker(part, progress)
             except OSError as error:  # a full disk, or too many processes
                 problem = str(error)
-        progress.done, progress.ended = progress.total, True
+        progress.done, progress.ended_s = progress.total, time.monotonic()
         self._ended[part.name].set()
         if problem:
             self._failures.append(f"the kernels of {part.name} could not be compiled: {problem}")
@@ -147,11 +150,31 @@ class _Run:
             await asyncio.sleep(_REPORT_S)
 
     def _now(self) -> Preparation:
-        now_s = time.monotonic()
-        left = [progress.left_s(now_s) for progress in self._progress.values()]
-        left_s = max(max(left, default=0.0), sum(left) / cores())
         progress = self._progress.values()
+        left_s = _time_left_s(progress, time.monotonic(), cores())
         return Preparation(sum(one.done for one in progress), sum(one.total for one in progress), left_s)
+
+
+def _time_left_s(parts: Iterable[_Progress], now_s: float, at_once: int) -> float | None:
+    """Time until all parts have ended, of which so many run at once; None where too little is known.
+
+    Parts that wait take as much longer than is typical as those that were begun.
+    """
+    wholes_s = [(part, part.whole_s(now_s)) for part in parts]
+    if any(whole_s is None for part, whole_s in wholes_s if part.begun_s is not None):
+        return None
+    slowness = [whole_s / part.typical_s for part, whole_s in wholes_s if whole_s is not None]
+    if not slowness:
+        return None
+    left_s = [
+        part.typical_s * max(slowness)
+        if whole_s is None or part.begun_s is None
+        else 0.0
+        if part.ended
+        else max(whole_s - (now_s - part.begun_s), 0.0)
+        for part, whole_s in wholes_s
+    ]
+    return max(*left_s, sum(left_s) / at_once)
 
 
 @contextlib.asynccontextmanager

@@ -312,6 +312,9 @@ class TagReport(ReplayReport, frozen=True, kw_only=True):
     """Runs of receptions without a gap."""
     cold_starts: int
     """How many of them did not begin where the tag's receiver was."""
+    mean_anchors: float | None
+    """Number of anchors in a fix."""
+    most_anchors: int
 
 
 class SiteReplay:
@@ -356,6 +359,8 @@ class SiteReplay:
         }
         self._spans: dict[str, tuple[float, float]] = {}
         """First and last fix of each tag, Unix time."""
+        self._anchors: dict[str, Counter[int]] = {tag: Counter() for tag in self.tags}
+        """How many fixes of each tag are of that many anchors."""
 
     def run(
         self, on_fix: Callable[[str, Replayed], None] | None, on_progress: Callable[[float], None]
@@ -387,13 +392,14 @@ class SiteReplay:
         for made in fixes:
             first_s, _ = self._spans.get(tag, (made.unix_s, 0.0))
             self._spans[tag] = (first_s, made.unix_s)
+            self._anchors[tag][len(made.fix.anchors)] += 1
             x, y, z = made.fix.position_m.tolist()
             self.judges[tag].add(made.unix_s, made.unix_s - (replay.begun_s or 0.0), (x, y, z))
             if on_fix is not None:
                 on_fix(tag, made)
 
     def _report(self, tag: str, wall_s: float) -> TagReport:
-        replay = self.tags[tag]
+        replay, anchors = self.tags[tag], self._anchors[tag]
         first_s, last_s = self._spans.get(tag, (0.0, 0.0))
         return TagReport(
             format=SITE_FORMAT,
@@ -407,6 +413,10 @@ class SiteReplay:
             identical=replay.identical,
             segments=replay.segments,
             cold_starts=replay.cold_starts,
+            mean_anchors=sum(count * fixes for count, fixes in anchors.items()) / replay.fixes
+            if replay.fixes
+            else None,
+            most_anchors=max(anchors, default=0),
         )
 
 

@@ -36,16 +36,28 @@ def warnings_of(site: Site) -> list[str]:
     return [*general, *_neighbours(site), *(_unplaced(site) if site.schedule.mode == "slots" else _load(site))]
 
 
-def _count(site: Site) -> list[str]:
-    flat = site.tags.height_m is not None
-    needed = 3 if flat else 4
+def too_few_anchors(site: Site) -> str | None:
+    """Say that the placed anchors give no position; None where they are enough."""
+    needed, what = _needed(site)
     count = len(site.anchors)
-    what = "at a known height" if flat else "with its height"
-    if count < needed and site.unplaced:
+    if count >= needed:
+        return None
+    if site.unplaced:
         without = f"{len(site.unplaced)} of {len(site.all_anchors)} anchors have no position yet"
-        return [f"{without}: a tag's position {what} needs {needed} that have"]
-    if count < needed:
-        return [f"{count} anchors give no position: one {what} needs {needed}"]
+        return f"{without}: a tag's position {what} needs {needed} that have"
+    return f"{count} anchor{'s give' if count > 1 else ' gives'} no position: one {what} needs {needed}"
+
+
+def _needed(site: Site) -> tuple[int, str]:
+    """How many anchors a position needs, and which position."""
+    return (4, "with its height") if site.tags.height_m is None else (3, "at a known height")
+
+
+def _count(site: Site) -> list[str]:
+    needed, what = _needed(site)
+    count = len(site.anchors)
+    if too_few := too_few_anchors(site):
+        return [too_few]
     if count == needed:
         return [f"{count} anchors are the fewest for a position {what}: none may fail, and no outlier can be detected"]
     return []

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, Final, TextIO
 
 import msgspec
 
@@ -14,6 +14,10 @@ from skyless.whole_files import whole_file, write_whole
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+
+NO_FIX: Final = 1
+"""Exit code of a simulation or replay without any fix."""
 
 
 def print_json(value: object) -> None:

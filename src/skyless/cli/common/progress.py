@@ -121,6 +121,7 @@ class CountLine:
         self._next_s = 0.0
         self._width = 0
         self._lines = 0
+        self._begun = False
 
     def __enter__(self) -> Self:
         return self
@@ -132,6 +133,11 @@ class CountLine:
         """Show a count, if the last one has been there for long enough."""
         if sys.stderr is None or time.monotonic() < self._next_s:
             return
+        if not self._begun:
+            _print_line(
+                "compiling what this command needs and was not compiled before; skyless warm compiles everything"
+            )
+            self._begun = True
         self._next_s = time.monotonic() + (_COUNT_S if self._on_terminal else _LINE_S)
         text = f"skyless: {count_text(now)}"
         if not self._on_terminal:
@@ -154,7 +160,8 @@ class CountLine:
 def count_text(now: "Preparation") -> str:
     """What a person reads while kernels are compiled."""
     counted = f": {now.done} of {now.total}" if now.total else ""
-    return f"compiling kernels, at the first start only{counted}, about {max(1, round(now.left_s))} s left"
+    left = "" if now.left_s is None else f", about {max(1, round(now.left_s))} s left"
+    return f"compiling kernels{counted}{left}"
 
 
 def _print_line(text: str) -> None:

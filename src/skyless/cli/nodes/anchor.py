@@ -1,11 +1,13 @@
 """``skyless anchor``: anchors as a program."""
 
 import contextlib
+import time
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import App, Parameter
 
+from skyless.cli.common.output import print_json
 from skyless.cli.common.progress import loading_kernels
 from skyless.cli.nodes.options import MqttOptions, log, site_named
 from skyless.errors import SkylessError
@@ -23,6 +25,7 @@ def anchor(
     keys: Annotated[Path | None, Parameter(env_var="SKYLESS_KEYS")] = None,
     allow_placement: Annotated[bool, Parameter(negative=())] = False,
     broker: MqttOptions = MqttOptions(),
+    json: bool = False,
 ) -> None:
     """Run anchors of a site until Ctrl-C.
 
@@ -47,6 +50,8 @@ def anchor(
         positions and delays up to 0.5 m from those of its site file.
     broker.mqtt
         Broker to publish health and site to, or none.
+    json
+        Write one JSON object at the end: the last health of each anchor.
     """
     from skyless.evaluation.compile_ahead import compile_kernels
     from skyless.nodes.anchor import Anchors
@@ -76,15 +81,17 @@ def anchor(
     image = None if plan.floor_plan is None else Path(site).parent / plan.floor_plan.image
     with loading_kernels(SIMULATED):
         compile_kernels(WEIGHTED)
+    anchors = Anchors(
+        plan,
+        radios,
+        address,
+        log,
+        simulated=lambda: is_simulated(radio),
+        floor_plan=image,
+        keys=chains,
+        allow_placement=allow_placement,
+    )
     with contextlib.suppress(KeyboardInterrupt):
-        anchors = Anchors(
-            plan,
-            radios,
-            address,
-            log,
-            simulated=lambda: is_simulated(radio),
-            floor_plan=image,
-            keys=chains,
-            allow_placement=allow_placement,
-        )
         run(anchors.run(), punctual=True)
+    if json:
+        print_json({"anchors": anchors.healths(time.time(), time.monotonic())})

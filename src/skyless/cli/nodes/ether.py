@@ -1,6 +1,7 @@
 """``skyless ether``: the emulated air."""
 
 import contextlib
+import time
 from collections.abc import Iterable
 from errno import EADDRINUSE
 from functools import partial
@@ -11,6 +12,7 @@ from cyclopts.validators import Number
 from msgspec.structs import replace
 
 from skyless.cli.common.options import Picoseconds, Seed, finite_numbers, options
+from skyless.cli.common.output import print_json
 from skyless.cli.common.progress import loading_kernels
 from skyless.cli.common.simulated_site import check_live
 from skyless.cli.nodes.options import MqttOptions, WalkingSpeed, listen_address, log, site_named
@@ -50,6 +52,8 @@ class EtherOptions:
     """Same seed, same crystals and noise; what processes do in real time is never the same."""
     listen: str = f"127.0.0.1:{DEFAULT_PORT}"
     """Where programs connect, HOST:PORT."""
+    json: bool = False
+    """Write one JSON object at the end: what the air has carried."""
 
 
 @app.default
@@ -91,6 +95,10 @@ def ether(*, asked: EtherOptions = EtherOptions(), broker: MqttOptions = MqttOpt
                 f"another port, and the same one to anchors and tags (--radio ether:{host}:PORT)"
             ) from None
         raise SkylessError(f"--listen is {asked.listen!r}, which cannot be used: {error.strerror or error}") from None
+    if asked.json:
+        import msgspec
+
+        print_json(msgspec.to_builtins(emulated.health(time.time())))
 
 
 def _move(text: str, anchors: Iterable[int]) -> "AnchorDisplacement":

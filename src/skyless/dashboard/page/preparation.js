@@ -17,6 +17,6 @@ export function start() {
     text(count, now.total ? `Compiling ${now.done} of ${now.total} kernels` : "Compiling the kernels");
     if (now.total) bar.value = now.done / now.total;
     else bar.removeAttribute("value");
-    text(left, `About ${Math.max(1, Math.round(now.left_s))} s left. At the first start only; then tags appear here.`);
+    text(left, `${now.left_s === null ? "" : `About ${Math.max(1, Math.round(now.left_s))} s left. `}At the first start only; then tags appear here.`);
   });
 }

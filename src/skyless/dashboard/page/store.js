@@ -26,7 +26,7 @@ export const state = {
   liveId: null,
   /** The sites of the broker: number, name, whether programs are online. @type {Array<[number, string, boolean]>} */
   sites: [],
-  /** @type {{done: number, total: number, left_s: number}|null} while kernels are compiled */
+  /** @type {{done: number, total: number, left_s: number|null}|null} while kernels are compiled */
   preparation: null,
   /** @type {"live"|"replay"} */
   mode: "live",
