@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from importlib.metadata import version
 from pathlib import Path
 
@@ -124,6 +125,42 @@ def test_a_terminal_without_unicode(lab):
     done = skyless("site", "check", lab, env={**os.environ, "PYTHONIOENCODING": "ascii"})
     assert done.returncode == 0
     assert "315 \\xb5s" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "worker"),
+    [(["warm"], "skyless.preparation.worker"), (["paper", "--quick", "--out", "report"], "multiprocessing.spawn")],
+)
+def test_sigterm_ends_a_command_with_all_its_processes(tmp_path, arguments, worker):
+    kernels = {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")} if arguments == ["warm"] else {}
+    options = {"env": {**os.environ, **kernels}, "cwd": tmp_path, "stderr": subprocess.PIPE, "start_new_session": True}
+    process = subprocess.Popen([*SKYLESS, *arguments], **options)
+    workers = until(lambda: [pid for pid in children(process.pid) if worker in words_of(pid)], 120.0)
+    process.terminate()
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 143
+    assert b"Traceback" not in told
+    until(lambda: not any(worker in words_of(pid) for pid in workers))
+    assert not (tmp_path / "report").exists()
+
+
+def children(pid):
+    return Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+
+
+def words_of(pid):
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_text()
+    except OSError:
+        return ""
+
+
+def until(found, wait_s=60.0):
+    end_s = time.monotonic() + wait_s
+    while not (result := found()):
+        assert time.monotonic() < end_s
+        time.sleep(0.05)
+    return result
 
 
 def test_json_is_the_last_line(lab):
