@@ -11,6 +11,7 @@ process sends it what the real one would. The figure is the processor time of th
 import argparse
 import asyncio
 import contextlib
+import itertools
 import json
 import socket
 import sys
@@ -31,6 +32,7 @@ from test_dashboard_condition import anchor_health, tag_health
 from skyless.dashboard.app import Services, make_app
 from skyless.dashboard.guard import AccessRules
 from skyless.dashboard.live import LiveSite
+from skyless.dashboard.sites import LiveSites
 from skyless.mqtt import topics
 
 SERVER = ((1_900, 8), (3_000, 8), (10_000, 8), (100_000, 8), (3, 1_000), (3, 3_000), (3, 10_000), (250_000, 8))
@@ -63,18 +65,20 @@ class Site:
         self.live._on_site("", encode(message))
         self.live.on_connection(connected=True)
 
-    def move(self, first, count):
+    def move(self, first, count, moving=None):
+        """Fixes of ``count`` tags, of all or of a number that are spread over the site."""
         unix_s = self.wall_clock()
         columns = max(round(self.tags**0.5), 1)
         for n in range(first, first + count):
-            k = n % self.tags
+            k = n * max(self.tags // (moving or self.tags), 1) % self.tags
             x, y = self.side_m * (k % columns + unix_s % 1) / columns, self.side_m * (k // columns) / columns
             made = fix(f"t{k}", unix_s, (x, y, 1.0), latency_s=0.0)
             self.live._on_fix(topics.fix_topic(SITE_ID, f"t{k}"), encode(made))
 
-    def report(self, tags):
+    def report(self, tags, part=0, parts=1):
+        """What anchors, or each of ``parts`` in turn, and some tags report of themselves."""
         unix_s = self.wall_clock()
-        for n in range(1, self.anchors + 1):
+        for n in range(1 + part, self.anchors + 1, parts):
             self.live._on_health(topics.health_topic(SITE_ID, "anchor", str(n)), encode(anchor_health(n, unix_s)))
         for k in range(tags):
             self.live._on_health(topics.health_topic(SITE_ID, "tag", f"t{k}"), encode(tag_health(f"t{k}", unix_s)))
@@ -110,19 +114,15 @@ def served(tags, anchors):
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     site = Site(tags, anchors, time.monotonic, time.time)
-    app = make_app(Services(site.live, None, None), AccessRules())
+    app = make_app(Services(LiveSites(site.live), None, None), AccessRules())
     server = uvicorn.Server(uvicorn.Config(app, port=port, log_level="error", ws="websockets-sansio", lifespan="off"))
 
     async def feed():
         site.move(0, tags)
         site.report(min(tags, 2_000))
-        done, second = 0, 0.0
-        while True:
-            site.move(done, MOVING // 10)
-            done += MOVING // 10
-            if time.monotonic() - second > 2.0 and anchors <= 1_000:
-                site.report(min(tags, 1_000))
-                second = time.monotonic()
+        for done in itertools.count():
+            site.move(done * MOVING // 10, MOVING // 10, MOVING)
+            site.report(0 if done % 20 else min(tags, 1_000), done % 20, 20)
             site.live.evidence.nodes and site.live.tick()
             await asyncio.sleep(0.1)
 

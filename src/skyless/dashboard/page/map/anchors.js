@@ -11,6 +11,8 @@ const MARK = 7;
 /** Height of a name, and with more names than this they are written only where they fit. */
 const NAME = 18;
 const CROWDED = 200;
+/** Marks that touch are drawn this much smaller. */
+const SMALL = 0.5;
 /** A point of each cell of the grid that may hold something nearer than its size. */
 const AROUND = [0, -MARK, MARK].flatMap((right) => [0, -MARK, MARK].map((down) => [right, down]));
 /** Half of a sprite's side, and the sprites by their look: a path costs ten times as much. */
@@ -81,17 +83,23 @@ export function drawAnchors(context) {
   context.textBaseline = "top";
   const names = [];
   const master = masterNow();
+  const seen = [];
   for (const anchor of state.site?.anchors ?? []) {
     const x = toX(anchor.x_m, anchor.y_m);
     const y = toY(anchor.x_m, anchor.y_m, anchor.z_m);
     if (!isSeen(x, y) && !view.spatial) continue;
     drawnAnchors.push({ id: anchor.id, x, y });
+    seen.push({ anchor, x, y });
+  }
+  const small = touching();
+  for (const { anchor, x, y } of seen) {
     const alpha = other(anchor.z_m, anchor.floor ?? 0) ? DIMMED : 1;
     context.globalAlpha = alpha;
     if (view.spatial) dropLine(context, anchor.x_m, anchor.y_m, y, palette.muted);
     const kind = condition(anchor.id);
     const colour = palette[CONDITIONS[kind].colour];
-    drawSprite(context, kind, x, y, colour);
+    if (small && kind === "good") drawDot(context, x, y, colour);
+    else drawSprite(context, kind, x, y, colour, small ? SMALL * HALF : HALF);
     const leading = leads(anchor.id, master);
     if (leading) {
       context.strokeStyle = colour;
@@ -104,7 +112,7 @@ export function drawAnchors(context) {
     const chosen = anchor.id === state.selection.anchor;
     names.push({ words: words + height, x, y, alpha, below: chosen ? 12 : 7, leading: chosen || leading !== "" });
   }
-  const lines = joined(names);
+  const lines = joined(small ? names.filter(({ leading }) => leading) : names);
   const shown = lines.length > CROWDED ? lines.filter(fits()) : lines;
   for (const { words, x, y, alpha, below } of shown) {
     context.globalAlpha = alpha;
@@ -113,10 +121,15 @@ export function drawAnchors(context) {
   context.globalAlpha = 1;
 }
 
+/** Whether there are many marks and so close that names have no room at all. */
+function touching() {
+  if (drawnAnchors.length < CROWDED) return false;
+  return new Set(drawnAnchors.map(({ x, y }) => cellOf(x, y, NAME))).size < drawnAnchors.length / 2;
+}
+
 /** A test for each name in turn whether it has room between the marks and the names before it, by cells of a grid. */
 function fits() {
   const cells = new Set(drawnAnchors.map(({ x, y }) => cellOf(x, y, NAME)));
-  if (cells.size < drawnAnchors.length) return ({ leading }) => leading; // marks that touch leave no room at all
   return ({ words, x, y, leading }) => {
     const at = cellOf(x, y + MARK + NAME, NAME);
     const beside = words.length > 4 ? cellOf(x + NAME, y + MARK + NAME, NAME) : at;
@@ -166,7 +179,13 @@ export function dropLine(context, x_m, y_m, y, colour) {
   context.fillRect(x - 1.5, ground - 1, 3, 2);
 }
 
-function drawSprite(context, kind, x, y, colour) {
+/** A small mark of an anchor that is well: a sixth of a sprite's time. */
+function drawDot(context, x, y, colour) {
+  if (context.fillStyle !== colour) context.fillStyle = colour;
+  context.fillRect(x - 2, y - 2, 4, 4);
+}
+
+function drawSprite(context, kind, x, y, colour, half) {
   const key = `${kind} ${view.ratio}`;
   let sprite = sprites.get(key);
   if (!sprite) {
@@ -177,7 +196,7 @@ function drawSprite(context, kind, x, y, colour) {
     mark(painted, kind, HALF, HALF, colour);
     sprites.set(key, sprite);
   }
-  context.drawImage(sprite, x - HALF, y - HALF, 2 * HALF, 2 * HALF);
+  context.drawImage(sprite, x - half, y - half, 2 * half, 2 * half);
 }
 
 function mark(context, kind, x, y, colour) {
