@@ -17,8 +17,10 @@ import pytest
 
 from skyless.cli.main import main
 from skyless.mqtt.address import mqtt_address
+from skyless.mqtt.connection import Introduction, Reactions, open_connection
 from skyless.mqtt.link import Link
 from skyless.mqtt.topics import fix_topic, health_topic
+from skyless.nodes.broker import BrokerSettings, start_broker
 
 COMMAND = [sys.executable, "-m", "skyless.cli.main", "demo"]
 START_S = 120.0
@@ -204,13 +206,32 @@ def test_a_demo_that_is_killed_leaves_no_program_behind(tmp_path):
     demo.end(signal.SIGKILL)
 
 
-def test_ctrl_c_while_it_starts_ends_all_too(tmp_path):
-    demo = Demo(tmp_path, "--json")
-    demo.wait_for(lambda: len(demo.children()) >= 3)
-    code, out = demo.end(signal.SIGINT)
+def test_ctrl_c_while_it_starts_ends_all_and_leaves_nothing_at_a_broker_of_others(tmp_path):
+    async def start_and_end():
+        async with await start_broker(BrokerSettings(temporary=True)) as broker:
+            demo = Demo(tmp_path, "--json", "--mqtt", str(broker.address))
+            demo.wait_for(lambda: len(demo.children()) >= 2)
+            while not await retained(broker.address):
+                assert demo.process.poll() is None
+            code, out = demo.end(signal.SIGINT)
+            return demo.said, code, out, await retained(broker.address)
+
+    said, code, out, left = asyncio.run(start_and_end())
     assert code == 0
-    assert "Traceback" not in demo.said
+    assert "Traceback" not in said
     assert json.loads(out)["rmse_m"] is None
+    assert not left
+
+
+async def retained(address):
+    """Topics of what the broker keeps."""
+    topics = set()
+    react = Reactions(message=lambda topic, payload: topics.add(topic))
+    connection = await open_connection(address, None, Introduction("", 10), react)
+    connection.subscribe({"#": 0})
+    await asyncio.sleep(0.5)
+    await connection.leave()
+    return topics
 
 
 def test_on_a_terminal_the_picture_is_drawn_again_and_again_until_ctrl_c(tmp_path):

@@ -12,9 +12,10 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.mqtt.address import MqttAddress
+from skyless.mqtt.connection import Introduction, Reactions, RefusedError, open_connection, trouble_with
 from skyless.mqtt.link import Link
-from skyless.mqtt.messages import PreparationMessage
-from skyless.mqtt.topics import preparation_topic
+from skyless.mqtt.messages import PreparationMessage, StatusMessage, read_message
+from skyless.mqtt.topics import preparation_topic, site_topic, status_topic, survey_topic, watch_topic
 from skyless.nodes.broker import Broker, BrokerSettings, start_broker
 from skyless.nodes.children import Child, Program
 from skyless.nodes.ports import claim_next, hold_any
@@ -29,6 +30,10 @@ _HOST: Final = "127.0.0.1"
 _PAGE_PORT: Final = 8080
 _TAGS_PER_PROCESS: Final = 25
 _BROKER_RESTART_S: Final = 0.2
+_KEEPALIVE_S: Final = 10
+_CLEAR_S: Final = 0.5
+"""Retained messages have come by then."""
+
 _SURVEY_DELAY_S: Final = 4.0
 """Nothing else waits for the survey; started with the others it would delay the first fix by a second on two cores."""
 
@@ -85,7 +90,8 @@ class WholeSite:
         """
         with self._ether_held, self._page_claim:
             if self._asked.broker is not None:
-                await self._run_with(self._asked.broker, None)
+                whole = self._run_with(self._asked.broker, None)
+                await outlasting(_forgotten(self._asked.broker, self._asked.site.id, self._log), whole)
             else:
                 broker = await start_broker(BrokerSettings(temporary=True))
                 await self._run_with(broker.address, broker)
@@ -172,6 +178,34 @@ class WholeSite:
                 Program("recorder", ("record", str(asked.record), *mqtt, *limit, "--site-id", str(asked.site.id)), 1)
             )
         return programs
+
+
+async def _forgotten(address: MqttAddress, site: int, log: Log) -> None:
+    """Wait until cancelled; then clear what the site's programs, which have ended, have left retained at the broker."""
+    try:
+        await asyncio.Event().wait()
+    finally:
+        try:
+            await asyncio.shield(_clear(address, site))
+        except (OSError, RefusedError) as error:
+            log(f"{trouble_with(address, error)}: the demo's site stays there")
+
+
+async def _clear(address: MqttAddress, site: int) -> None:
+    left: set[str] = set()
+
+    def note(topic: str, payload: bytes) -> None:
+        if payload and not (topic.endswith("/status") and read_message(payload, StatusMessage).online):
+            left.add(topic)
+
+    who = Introduction("", _KEEPALIVE_S)
+    connection = await open_connection(address, address.tls_context(), who, Reactions(message=note))
+    own = (site_topic(site), survey_topic(site), watch_topic(site), status_topic(site, "+", "+"))
+    connection.subscribe(dict.fromkeys(own, 1))
+    await asyncio.sleep(_CLEAR_S)
+    for topic in left:
+        connection.publish(topic, b"", 1, retain=True)
+    await connection.leave()
 
 
 def _mqtt(address: MqttAddress) -> tuple[str, ...]:
