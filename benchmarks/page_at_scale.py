@@ -122,7 +122,7 @@ def served(tags, anchors):
         site.report(min(tags, 2_000))
         for done in itertools.count():
             site.move(done * MOVING // 10, MOVING // 10, MOVING)
-            site.report(0 if done % 20 else min(tags, 1_000), done % 20, 20)
+            site.report(0 if done % 10 else min(tags, 1_000), done % 10, 10)
             site.live.evidence.nodes and site.live.tick()
             await asyncio.sleep(0.1)
 

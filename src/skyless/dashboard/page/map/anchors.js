@@ -11,6 +11,8 @@ const MARK = 7;
 /** Height of a name, and with more names than this they are written only where they fit. */
 const NAME = 18;
 const CROWDED = 200;
+/** Names of anchors that are closer than half of this would be in each other's way. */
+const ROOM = 50;
 /** Marks that touch are drawn this much smaller. */
 const SMALL = 0.5;
 /** A point of each cell of the grid that may hold something nearer than its size. */
@@ -91,7 +93,7 @@ export function drawAnchors(context) {
     drawnAnchors.push({ id: anchor.id, x, y });
     seen.push({ anchor, x, y });
   }
-  const small = touching();
+  const small = crowded(NAME);
   for (const { anchor, x, y } of seen) {
     const alpha = other(anchor.z_m, anchor.floor ?? 0) ? DIMMED : 1;
     context.globalAlpha = alpha;
@@ -112,7 +114,7 @@ export function drawAnchors(context) {
     const chosen = anchor.id === state.selection.anchor;
     names.push({ words: words + height, x, y, alpha, below: chosen ? 12 : 7, leading: chosen || leading !== "" });
   }
-  const lines = joined(small ? names.filter(({ leading }) => leading) : names);
+  const lines = joined(crowded(ROOM) ? names.filter(({ leading }) => leading) : names);
   const shown = lines.length > CROWDED ? lines.filter(fits()) : lines;
   for (const { words, x, y, alpha, below } of shown) {
     context.globalAlpha = alpha;
@@ -121,10 +123,10 @@ export function drawAnchors(context) {
   context.globalAlpha = 1;
 }
 
-/** Whether there are many marks and so close that names have no room at all. */
-function touching() {
+/** Whether there are many marks, and more than two in each cell of this size. */
+function crowded(size) {
   if (drawnAnchors.length < CROWDED) return false;
-  return new Set(drawnAnchors.map(({ x, y }) => cellOf(x, y, NAME))).size < drawnAnchors.length / 2;
+  return new Set(drawnAnchors.map(({ x, y }) => cellOf(x, y, size))).size < drawnAnchors.length / 2;
 }
 
 /** A test for each name in turn whether it has room between the marks and the names before it, by cells of a grid. */
