@@ -151,7 +151,7 @@ ELSEWHERE = {
 NEVER_RUN = (
     "docker ",
     "ANCHOR_1=",
-    "useradd ",
+    "UV_PROJECT_ENVIRONMENT=",
     "python3 -m venv /opt",
     "mkdir ",
     "cp packaging",
