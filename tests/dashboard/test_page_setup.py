@@ -225,6 +225,7 @@ def picture():
     return {"name": "hall.png", "mimeType": "image/png", "buffer": file.getvalue()}
 
 
+ON_THE_FLOOR = "no heights are given: all anchors are taken to be on the floor."
 PLAN = "import('/page/survey/plan.js').then(({ plan }) => plan && [plan.x_m, plan.y_m, plan.width_m])"
 
 
@@ -321,6 +322,7 @@ def test_the_reasons_are_listed_and_the_verdict_is_good_only_where_nothing_speak
     for change, words in (
         ({"notes": ("Point of anchor 3 does not fit.",)}, "Point of anchor 3 does not fit."),
         ({"missing": (7,)}, "1 anchor has not been received: 7."),
+        ({"assumed_heights": ON_THE_FLOOR}, "No heights are given: all anchors are taken to be on the floor."),
         ({"unchecked": "Nothing checks this survey."}, "Nothing checks this survey."),
         ({"ambiguous": True}, "1 other result fits"),
         ({"undetermined": (5,)}, "Anchor 5 is not determined."),
@@ -332,8 +334,30 @@ def test_the_reasons_are_listed_and_the_verdict_is_good_only_where_nothing_speak
         here.says(words)
         assert not here.page.evaluate(good)
     shown = here.page.locator("#why").inner_text()
-    for words in ("does not fit", "Nothing checks", "further to the right", "It is linked to one other anchor only."):
+    for words in (
+        "does not fit",
+        "Nothing checks",
+        "on the floor",
+        "further to the right",
+        "It is linked to one other anchor only.",
+    ):
         assert words in shown
+
+
+def test_without_heights_the_set_up_is_amber_and_saving_asks(site):
+    survey = FakeSurvey()
+    survey.assumed_heights = ON_THE_FLOOR
+    here = site(survey)
+    page = here.page
+    here.says("all anchors are taken to be on the floor")
+    assert page.locator("#verdict").get_attribute("class") == "verdict warn"
+    here.open(6)
+    page.wait_for_selector("#save-warning:has-text('on the floor')")
+    assert page.locator("#save").is_disabled()
+    page.check("#save-sure")
+    page.click("#save")
+    page.wait_for_selector("#save-state.good")
+    assert len(survey.saves) == 1
 
 
 def test_an_old_message_is_reported_as_old(site):

@@ -84,19 +84,19 @@ def survey(recording: Path | None = None, /, *, asked: SurveyOptions = SurveyOpt
         return 0
     given = _inputs(recording, asked)
     site, ranges = given.site, _with_all_anchors(given.ranges, given.site)
-    facts, warnings = facts_of(asked.known, ranges.anchors, site, is_foreign=given.is_foreign)
+    facts = facts_of(asked.known, ranges.anchors, site, is_foreign=given.is_foreign)
     facts = replace(facts, tags=_walks(recording, asked, site))
     from skyless.survey.count import count
 
     counted = count(ranges, facts)
-    warnings += [] if counted.warning is None else [counted.warning]
+    warnings = () if counted.warning is None else (counted.warning,)
     if not asked.json:
         console().print(counted.sentence, markup=False)
     with status("surveying"):
         from skyless.survey.solve import run_survey
 
         result = run_survey(ranges, facts)
-    report = SurveyReport(result, counted, tuple(warnings), given.drops)
+    report = SurveyReport(result, counted, warnings, given.drops)
     if asked.out is not None and report.usable:
         report = _written(report, ranges, site, asked, asked.out)
     if asked.plot is not None:

@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import structs
 
 from skyless.kernels.arrays import Array, Mask
-from skyless.survey.build import Measured, as_array, levels, own_delays, usable
+from skyless.survey.build import Measured, as_array, assumed_heights, levels, own_delays, usable
 from skyless.survey.facts import Facts
 from skyless.survey.findings import (
     advised_tapes,
@@ -42,8 +42,13 @@ def run_survey(ranges: PairRanges, facts: Facts) -> Survey:
     What is not determined has no figures. Ranges and facts that do not suffice or do not fit raise nothing:
     ``not_determined`` and ``notes`` name them.
     """
-    survey = _survey(usable(ranges, facts))
-    return structs.replace(survey, notes=(*survey.notes, *unlikely_delays(survey.anchors, facts)))
+    measured = usable(ranges, facts)
+    survey = _survey(measured)
+    return structs.replace(
+        survey,
+        notes=(*survey.notes, *unlikely_delays(survey.anchors, facts)),
+        assumed_heights=assumed_heights(measured),
+    )
 
 
 def _survey(measured: Measured) -> Survey:

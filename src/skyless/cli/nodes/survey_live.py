@@ -144,10 +144,7 @@ async def _node(asked: LiveOptions, known: FactOptions, *, serves: bool) -> "Sur
 
 
 def _facts(known: FactOptions, site: "Site") -> "Facts":
-    facts, warnings = facts_of(known, (anchor.id for anchor in site.all_anchors), site)
-    for warning in warnings:
-        _log(f"survey: {warning}")
-    return facts
+    return facts_of(known, (anchor.id for anchor in site.all_anchors), site)
 
 
 def _log(line: str) -> None:

@@ -452,6 +452,8 @@ class SurveyNode:
         live.place(saved.site, saved.record, serial, time.monotonic(), unix_s)
         written = "".join(f", {path} written" for path in saved.written)
         self._log(f"survey: saved{written}")
+        if saved.record.survey.assumed_heights is not None:
+            self._log(f"survey: {saved.record.survey.assumed_heights}")
 
     def _floor(self) -> FloorImage | None:
         plan = None if self._given is None else self._given.floor_plan

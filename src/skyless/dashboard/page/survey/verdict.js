@@ -63,6 +63,7 @@ function weak() {
     return warn("Ambiguous", `${others} the ranges as well. Step 5 says which.`);
   }
   if (survey.unchecked) return warn("Unchecked", sentence(survey.unchecked));
+  if (survey.assumed_heights) return warn("Heights", `${sentence(survey.assumed_heights)} Step 3 asks for them.`);
   if (missing.length) {
     return warn("Incomplete", `${count(missing.length, "anchor has", "anchors have")} not been received: ${list(missing)}.`);
   }
