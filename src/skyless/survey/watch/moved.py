@@ -27,7 +27,7 @@ _LEAST_STEPS: Final = 4
 """In fewer, a change and the scatter of ranges look the same."""
 
 _FALSE_ALARM: Final = 1e-3
-"""Probability that the scatter of all ranges and splits alone makes one of them differ; several must, and be explained."""
+"""Probability that the scatter of all ranges and splits alone makes one of them differ, where several have to."""
 
 _LEAST_PAIRS: Final = 2
 """Of one anchor, whose ranges differ."""
