@@ -345,7 +345,7 @@ def test_what_the_user_can_mend_is_named(hall, capsys, arguments, words):
 def test_facts_from_options(hall):
     site = load_site(hall / "site.toml")
     everybody = tuple(range(1, 13))
-    facts, warnings = facts_of(
+    facts = facts_of(
         FactOptions(
             anchor_height=["2.5", "3=2.4"], distance=["1-4=7.21", "0x1-5=8±0.01", "2-3=4+-0.02"],
             point=["7=1,-2,3", "8=0,0"],
@@ -354,28 +354,41 @@ def test_facts_from_options(hall):
         everybody,
         site,
     )  # fmt: skip
-    assert warnings == []
     assert facts.heights_m == {**dict.fromkeys(everybody, 2.5), 3: 2.4, 7: 3.0}
     assert facts.tapes == (Tape(1, 4, 7.21), Tape(1, 5, 8.0, 0.01), Tape(2, 3, 4.0, 0.02))
     assert facts.points == {7: (1.0, -2.0, 3.0), 8: (0.0, 0.0, None)}
     assert facts.sketch_m[12] == (site.anchors[11].x_m, site.anchors[11].y_m, site.anchors[11].z_m)
     assert (facts.sketch_std_m, facts.delay_std_m, facts.pair_std_m) == (0.3, 0.15, 0.0)
     assert facts.gauge == Gauge(1, 4)
-    assert facts_of(FactOptions(), everybody, None) == (Facts(), [])
-    bare, _ = facts_of(FactOptions(no_sketch=True, delays_known=True), everybody, site)
+    assert facts_of(FactOptions(), everybody, None) == Facts()
+    bare = facts_of(FactOptions(no_sketch=True, delays_known=True), everybody, site)
     assert (bare.sketch_m, bare.delay_std_m, bare.heights_m[1]) == ({}, 0.0, site.anchors[0].z_m)
-    kept, _ = facts_of(FactOptions(keep_positions=True), everybody, site)
+    kept = facts_of(FactOptions(keep_positions=True), everybody, site)
     assert (kept.keep_positions, kept.sketch_std_m) == (True, pytest.approx(site.accuracy.survey_std_m))
-    free, _ = facts_of(
+    free = facts_of(
         FactOptions(dimensions=3, anchor_heights=hall / "heights.csv", anchor_height_std=0.1), (1, 2, 99), site
     )
     assert (free.dimensions, sorted(free.heights_m), free.height_std_m) == (3, [1, 2], 0.1)
 
 
-def test_missing_heights_are_those_of_the_others(hall):
-    facts, warnings = facts_of(FactOptions(anchor_height=["1=2", "2=3", "3=7"]), (1, 2, 3, 4), None)
-    assert facts.heights_m == {1: 2.0, 2: 3.0, 3: 7.0, 4: 3.0}
-    assert "anchor 4; 3 m is assumed" in warnings[0]
+def test_missing_heights_are_those_of_the_others_and_said(hall, capsys):
+    """They are neither typed nor measured, so the reader of the result has to know."""
+    heights = [part for k in range(1, 11) for part in ("--anchor-height", f"{k}={3 if k < 10 else 5}")]
+    report = run(capsys, "--ranges", hall / "ranges.csv", *heights)
+    assert report["assumed_heights"] == "no height is given for anchor 11: 3 m is assumed, the median of the others"
+    assert report["anchors"][10]["z_m"] == 3.0
+    report = run(capsys, "--ranges", hall / "ranges.csv")
+    assert {one["z_m"] for one in report["anchors"]} == {0.0}
+    assert "no heights are given: all anchors are taken to be on the floor" in report["assumed_heights"]
+    assert main(["survey", "--ranges", str(hall / "ranges.csv")]) == 0
+    assert "all anchors are taken to be on the floor" in " ".join(capsys.readouterr().out.split())
+    whole = ("--ranges", hall / "ranges.csv", "--anchor-heights", hall / "heights.csv")
+    assert run(capsys, *whole)["assumed_heights"] is None
+    estimated = run(capsys, "--ranges", hall / "ranges.csv", "--dimensions", 3, code=1)
+    assert estimated["assumed_heights"] is None
+
+
+def test_a_height_of_no_anchor_is_refused():
     with pytest.raises(SkylessError, match="no anchor 9"):
         facts_of(FactOptions(anchor_height=["9=2"]), (1, 2), None)
 

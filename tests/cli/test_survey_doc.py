@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from skyless.cli.main import main, program
+from skyless.site.load import load_site
 from skyless.site.model import AnchorSite, ScheduleSite, Site
 from skyless.site.template import site_template
 
@@ -16,6 +17,29 @@ COMMANDS = [
     for line in DOCUMENT.read_text(encoding="utf-8").splitlines()
     if line.startswith("    skyless ")
 ]
+
+
+SETUP = DOCUMENT.with_name("setup.md")
+
+
+def test_the_files_of_the_walk_without_radios_are_of_one_site(tmp_path, monkeypatch):
+    """Else the page compares no fix with the truth, which the air publishes under its own number."""
+    monkeypatch.chdir(tmp_path)
+    walk = SETUP.read_text(encoding="utf-8").split("## Try it without radios")[1]
+    files = re.findall(r"^    skyless (site new .*)$", walk, re.MULTILINE)
+    for command in files:
+        assert main(command.split()) == 0
+    truth, fresh = (load_site(Path(command.split()[2])) for command in files)
+    assert truth.id == fresh.id
+    assert {anchor.id for anchor in truth.anchors} == {anchor.id for anchor in fresh.unplaced}
+    at = {anchor.id: anchor for anchor in truth.anchors}
+    height_m = float(re.search(r"are ([\d.]+) m high", walk)[1])
+    assert {anchor.z_m for anchor in truth.anchors} == {height_m}
+    origin, along, left = map(
+        int, re.search(r"anchor (\d+) the\s+origin, (\d+) on the x axis and (\d+) on", walk).groups()
+    )
+    assert (at[origin].x_m, at[origin].y_m, at[along].y_m) == (0.0, 0.0, 0.0)
+    assert at[left].y_m > 0.0
 
 
 @pytest.fixture

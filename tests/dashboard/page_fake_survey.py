@@ -27,6 +27,7 @@ class FakeSurvey:
         self.excluded = ()
         self.ambiguous = False
         self.unchecked = None
+        self.assumed_heights = None
         self.notes = ()
         self.error = None
         self.saves = []
@@ -124,6 +125,7 @@ class FakeSurvey:
                                        {"a": 3, "b": 6, "std_before_m": 0.004, "std_after_m": 0.003}],
             "frame": "anchor 1 is the origin" if self.facts["gauge"] else "nothing names the axes",
             "gauge": self.facts["gauge"], "notes": list(self.notes),
+            "assumed_heights": self.assumed_heights,
         }  # fmt: skip
 
 

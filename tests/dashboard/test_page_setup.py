@@ -225,6 +225,7 @@ def picture():
     return {"name": "hall.png", "mimeType": "image/png", "buffer": file.getvalue()}
 
 
+ON_THE_FLOOR = "no heights are given: all anchors are taken to be on the floor."
 PLAN = "import('/page/survey/plan.js').then(({ plan }) => plan && [plan.x_m, plan.y_m, plan.width_m])"
 
 
@@ -321,6 +322,7 @@ def test_the_reasons_are_listed_and_the_verdict_is_good_only_where_nothing_speak
     for change, words in (
         ({"notes": ("Point of anchor 3 does not fit.",)}, "Point of anchor 3 does not fit."),
         ({"missing": (7,)}, "1 anchor has not been received: 7."),
+        ({"assumed_heights": ON_THE_FLOOR}, "No heights are given: all anchors are taken to be on the floor."),
         ({"unchecked": "Nothing checks this survey."}, "Nothing checks this survey."),
         ({"ambiguous": True}, "1 other result fits"),
         ({"undetermined": (5,)}, "Anchor 5 is not determined."),
@@ -332,8 +334,56 @@ def test_the_reasons_are_listed_and_the_verdict_is_good_only_where_nothing_speak
         here.says(words)
         assert not here.page.evaluate(good)
     shown = here.page.locator("#why").inner_text()
-    for words in ("does not fit", "Nothing checks", "further to the right", "It is linked to one other anchor only."):
+    for words in (
+        "does not fit",
+        "Nothing checks",
+        "on the floor",
+        "further to the right",
+        "It is linked to one other anchor only.",
+    ):
         assert words in shown
+
+
+def test_a_site_in_use_that_nobody_sets_up_has_no_fault(serve, visit):
+    """What another survey would leave open is none, until somebody begins one; saving it asks all the same."""
+    survey = FakeSurvey()
+    survey.unchecked, survey.undetermined = "Nothing checks this survey.", (6,)
+    page = visit(serve(tags=0, zones=(), mode="slots", survey=survey)).page
+    until(page, "skyless.state.survey !== null")
+    page.click("#tab-setup")
+    page.wait_for_selector("#verdict.note:has-text('In use. All anchors have positions.')")
+    page.click("#step-5 > summary")
+    page.wait_for_selector("#why:has-text('Nothing checks this survey.')")
+    page.click("#step-6 > summary")
+    page.wait_for_selector("#save-warning:has-text('Anchor 6 is not determined.')")
+    assert page.locator("#save").is_disabled()
+    page.click("#step-2 > summary")
+    page.get_by_label("Origin", exact=True).select_option("1")
+    page.get_by_label("On the x axis").select_option("3")
+    page.wait_for_selector("#verdict.bad:has-text('Anchor 6 is not determined.')")
+
+
+def test_a_site_in_use_without_a_survey_program_has_no_fault(serve, visit):
+    page = visit(serve(tags=0, zones=(), mode="slots")).page
+    page.click("#tab-setup")
+    page.wait_for_selector("#verdict.note:has-text('start the survey program')")
+    assert "skyless survey" in page.locator(".command code").inner_text()
+
+
+def test_without_heights_the_set_up_is_amber_and_saving_asks(site):
+    survey = FakeSurvey()
+    survey.assumed_heights = ON_THE_FLOOR
+    here = site(survey)
+    page = here.page
+    here.says("all anchors are taken to be on the floor")
+    assert page.locator("#verdict").get_attribute("class") == "verdict warn"
+    here.open(6)
+    page.wait_for_selector("#save-warning:has-text('on the floor')")
+    assert page.locator("#save").is_disabled()
+    page.check("#save-sure")
+    page.click("#save")
+    page.wait_for_selector("#save-state.good")
+    assert len(survey.saves) == 1
 
 
 def test_an_old_message_is_reported_as_old(site):

@@ -27,9 +27,12 @@ from skyless.cli.survey_report import SurveyReport, print_report, show_report
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from skyless.site.model import Site
     from skyless.survey.ranges import PairRanges
     from skyless.survey.result import Survey
+    from skyless.survey.stamps.pair_ranger import PairRanger
     from skyless.survey.tags.epochs import TagEpochs
 
 NOTHING_DETERMINED: Final = 1
@@ -83,20 +86,23 @@ def survey(recording: Path | None = None, /, *, asked: SurveyOptions = SurveyOpt
         serve_live(asked.live, asked.known)
         return 0
     given = _inputs(recording, asked)
-    site, ranges = given.site, _with_all_anchors(given.ranges, given.site)
-    facts, warnings = facts_of(asked.known, ranges.anchors, site, is_foreign=given.is_foreign)
+    site, ranges = given.site, _with_all_anchors(given.ranges(), given.site)
+    facts = facts_of(asked.known, ranges.anchors, site, is_foreign=given.is_foreign)
     facts = replace(facts, tags=_walks(recording, asked, site))
     from skyless.survey.count import count
+    from skyless.survey.solve import run_survey
+    from skyless.survey.watch.moved import drop_moved, with_changes
 
+    changes = () if given.ranger is None else drop_moved(given.ranger, facts, run_survey)
+    if changes:
+        ranges = _with_all_anchors(given.ranges(), site)
     counted = count(ranges, facts)
-    warnings += [] if counted.warning is None else [counted.warning]
+    warnings = () if counted.warning is None else (counted.warning,)
     if not asked.json:
         console().print(counted.sentence, markup=False)
     with status("surveying"):
-        from skyless.survey.solve import run_survey
-
-        result = run_survey(ranges, facts)
-    report = SurveyReport(result, counted, tuple(warnings), given.drops)
+        result = with_changes(run_survey(ranges, facts), changes, ranges.duration_s)
+    report = SurveyReport(result, counted, warnings, given.drops)
     if asked.out is not None and report.usable:
         report = _written(report, ranges, site, asked, asked.out)
     if asked.plot is not None:
@@ -144,7 +150,10 @@ class _Inputs(Struct, frozen=True):
 
     site: "Site | None"
     """The site of --site, else that of the recording."""
-    ranges: "PairRanges"
+    ranges: "Callable[[], PairRanges]"
+    """With the antenna delays of the site."""
+    ranger: "PairRanger | None" = None
+    """What makes the ranges, where their times are known."""
     drops: tuple[str, ...] = ()
     """What could not be used of a recording, by reason."""
     is_foreign: bool = False
@@ -162,7 +171,8 @@ def _inputs(recording: Path | None, asked: SurveyOptions) -> _Inputs:
         from skyless.recordings.range_table import read_ranges
 
         with status("reading ranges"):
-            return _Inputs(site, read_ranges(asked.ranges))
+            table = read_ranges(asked.ranges)
+            return _Inputs(site, lambda: table)
     if recording is None:
         raise SkylessError("a survey needs a recording or --ranges")
     from skyless.survey.surveyed_site import with_delays_of
@@ -171,9 +181,10 @@ def _inputs(recording: Path | None, asked: SurveyOptions) -> _Inputs:
     with status("reading stamps"):
         found = ranges_of(recording, asked.format, identifier=None if site is None else site.id)
     warnings = tuple(f"left out: {number} × {reason}" for reason, number in found.drops.items())
-    if site is None or found.site is None:
-        return _Inputs(site or found.site, found.ranges, warnings, found.site is None)
-    return _Inputs(site, with_delays_of(found.ranges, found.site, site), warnings)
+    recorded, ranger = found.site, found.ranger
+    if site is None or recorded is None:
+        return _Inputs(site or recorded, ranger.ranges, ranger, warnings, recorded is None)
+    return _Inputs(site, lambda: with_delays_of(ranger.ranges(), recorded, site), ranger, warnings)
 
 
 def _walks(recording: Path | None, asked: SurveyOptions, site: "Site | None") -> "tuple[TagEpochs, ...]":

@@ -68,6 +68,7 @@ def show_report(report: SurveyReport) -> None:
             *report.warnings,
             *(f"ambiguous: {one.sentence}" for one in survey.ambiguities),
             *([] if survey.unchecked is None else [survey.unchecked]),
+            *([] if survey.assumed_heights is None else [f"{survey.assumed_heights} (--anchor-height)"]),
             *survey.not_determined,
         ]
     )

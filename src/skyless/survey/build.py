@@ -11,6 +11,7 @@ from skyless.kernels.arrays import Array, Integers, Mask
 from skyless.survey.facts import Facts, Point, Tape
 from skyless.survey.fit.problem import Problem
 from skyless.survey.ranges import PairRange, PairRanges
+from skyless.survey.sentences import anchors_named
 
 LEAST_RANGE_STD_M: Final = 1e-5
 _UNKNOWN_DELAY_STD_M: Final = 1e3
@@ -110,14 +111,34 @@ def _finite(points: dict[int, Point]) -> dict[int, Point]:
 
 
 def fixed_heights_m(measured: Measured) -> Array:
-    """Z of all anchors in two dimensions, shape (n,): given ones, else the middle one of these, else 0."""
-    facts = measured.facts
+    """Z of all anchors in two dimensions, shape (n,): given ones, else the median of these, else 0."""
+    given_m = _given_heights_m(measured.facts)
+    common_m = _common_height_m(given_m)
+    return np.array([given_m.get(anchor, common_m) for anchor in measured.anchors])
+
+
+def assumed_heights(measured: Measured) -> str | None:
+    """A sentence about anchors whose heights ``fixed_heights_m`` assumes; None where it assumes none."""
+    if measured.facts.dimensions == 3 and not measured.facts.keep_positions:
+        return None
+    given_m = _given_heights_m(measured.facts)
+    missing = [anchor for anchor in measured.anchors if anchor not in given_m]
+    if not missing:
+        return None
+    if not given_m:
+        return "no heights are given: all anchors are taken to be on the floor, at z = 0 m"
+    common = f"{_common_height_m(given_m):g} m is assumed, the median of the others"
+    return f"no height is given for {anchors_named(missing)}: {common}"
+
+
+def _given_heights_m(facts: Facts) -> dict[int, float]:
     given = {anchor: point[2] for source in (facts.sketch_m, facts.points) for anchor, point in source.items()}
     given.update(facts.heights_m)
-    known = [z for z in given.values() if z is not None]
-    common = float(np.median(known)) if known else 0.0
-    heights = [given.get(anchor) for anchor in measured.anchors]
-    return np.array([common if z is None else z for z in heights])
+    return {anchor: z for anchor, z in given.items() if z is not None}
+
+
+def _common_height_m(given_m: dict[int, float]) -> float:
+    return float(np.median(list(given_m.values()))) if given_m else 0.0
 
 
 def levels(measured: Measured) -> bool:

@@ -182,8 +182,9 @@ def held_by_expected_delays(fitted: Fitted, framed: Framed) -> tuple[str, ...]:
     mending = mending_tapes(surveyed, position, covariance, fitted.core)
     pairs = [(fitted.anchors[item.first], fitted.anchors[item.second]) for item in mending]
     return (
-        f"delays of {anchors_named(anchors)} against {against} are not determined by the ranges: only the expected "
-        f"delays (±{expected:.2f} m) limit them" + (f"; {_advised(pairs)}" if pairs else ""),
+        f"ranges alone do not separate the antenna delays of {anchors_named(anchors)} from {against}: longer delays "
+        f"look like anchors farther apart, and only the usual size of delays (±{expected:.2f} m) limits the error"
+        + (f"; {_advised(pairs)}" if pairs else ""),
     )
 
 
@@ -232,16 +233,16 @@ def _axis(fitted: Fitted, framed: Framed, directions: list[determination.Directi
     shift = np.concatenate([direction.shift_m @ framed.motion.rotation.T for direction in directions])
     values, vectors = np.linalg.eigh(shift.T @ shift)
     if values[-1] < _ONE_AXIS * values.sum():
-        return "positions"
+        return "the anchors' positions"
     along = vectors[:, -1]
     axis = int(np.argmax(np.abs(along)))
     if along[axis] ** 2 > _AXIS_PART:
-        return "xyz"[axis]
+        return f"positions along {'xyz'[axis]}"
     first, second = np.triu_indices(int(fitted.core.sum()), 1)
     core = np.flatnonzero(fitted.core)
     apart = framed.position_m[core[first]] - framed.position_m[core[second]]
     best = int(np.argmax(np.abs(apart @ along) / np.maximum(np.linalg.norm(apart, axis=1), 1e-9)))
-    return f"the direction from {fitted.anchors[core[first[best]]]} to {fitted.anchors[core[second[best]]]}"
+    return f"positions along the line from {fitted.anchors[core[first[best]]]} to {fitted.anchors[core[second[best]]]}"
 
 
 def unchecked(fitted: Fitted) -> str | None:

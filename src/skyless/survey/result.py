@@ -78,3 +78,5 @@ class Survey(Struct, frozen=True):
     gauge: Gauge | None
     notes: tuple[str, ...]
     """Sentences about facts that do not fit, and the like."""
+    assumed_heights: str | None = None
+    """A sentence where heights are assumed, as they are neither given nor estimated; None otherwise."""

@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 from msgspec import structs
 
-from skyless.kernels.arrays import Array, Mask
-from skyless.survey.build import Measured, as_array, levels, own_delays, usable
+from skyless.kernels.arrays import Array, Integers, Mask
+from skyless.survey.build import Measured, as_array, assumed_heights, levels, own_delays, usable
 from skyless.survey.facts import Facts
 from skyless.survey.findings import (
     advised_tapes,
@@ -35,6 +35,19 @@ from skyless.survey.tagged import with_tags
 _MOVED_M: Final = 0.1
 """An anchor whose position differs less in another result is at the same position."""
 
+_ELSEWHERE: Final = 0.3
+"""Of the largest distance of an anchor between two results: with more of it an anchor is elsewhere, with less it only
+follows those that are."""
+
+_SAME_M: Final = 0.5
+"""Two other results whose anchors elsewhere are as near to each other are the same."""
+
+_MOST_NAMED: Final = 3
+"""Anchors whose places are named."""
+
+_DECIDES: Final = 0.7
+"""Of the largest difference of a distance between two results: among distances with more of it the shortest decides."""
+
 
 def run_survey(ranges: PairRanges, facts: Facts) -> Survey:
     """Positions and delays, or, where there are none, why.
@@ -42,8 +55,13 @@ def run_survey(ranges: PairRanges, facts: Facts) -> Survey:
     What is not determined has no figures. Ranges and facts that do not suffice or do not fit raise nothing:
     ``not_determined`` and ``notes`` name them.
     """
-    survey = _survey(usable(ranges, facts))
-    return structs.replace(survey, notes=(*survey.notes, *unlikely_delays(survey.anchors, facts)))
+    measured = usable(ranges, facts)
+    survey = _survey(measured)
+    return structs.replace(
+        survey,
+        notes=(*survey.notes, *unlikely_delays(survey.anchors, facts)),
+        assumed_heights=assumed_heights(measured),
+    )
 
 
 def _survey(measured: Measured) -> Survey:
@@ -140,24 +158,63 @@ def _pair(measured: Measured, fitted: Fitted | None, pair: PairRange, index: int
 
 
 def _ambiguities(fitted: Fitted, framed: Framed, others: tuple[OtherFit, ...]) -> tuple[Ambiguity, ...]:
-    found = []
+    """Each other place once: results that differ only in what else came late are the same to a user."""
+    found: list[Ambiguity] = []
     for other in others:
-        position = framed.motion.moved(other.position_m)
-        distance = np.linalg.norm(position - framed.position_m, axis=1)
-        moved: Mask = (distance > _MOVED_M) & fitted.core
-        if not moved.any():
+        position_m = framed.motion.moved(other.position_m)
+        distance_m = np.where(fitted.core, np.linalg.norm(position_m - framed.position_m, axis=1), 0.0)
+        if distance_m.max() <= _MOVED_M:
             continue
-        anchors = tuple(anchor for anchor, is_one in zip(fitted.anchors, moved, strict=True) if is_one)
-        positions = {anchor: _xyz(position[fitted.anchors.index(anchor)]) for anchor in anchors}
-        size = f"by up to {distance[moved].max():.2f} m"
-        sentence = f"{anchors_named(anchors)} may be elsewhere, {size}, {_reason(fitted, other.used)}"
-        found.append(Ambiguity(sentence, anchors, positions))
+        elsewhere = np.flatnonzero(distance_m > max(_MOVED_M, _ELSEWHERE * distance_m.max()))
+        positions = {fitted.anchors[index]: _xyz(position_m[index]) for index in elsewhere.tolist()}
+        if any(_is_same(positions, known.positions_m) for known in found):
+            continue
+        sentence = _sentence(fitted, framed, other, position_m, distance_m, elsewhere)
+        found.append(Ambiguity(sentence, tuple(positions), positions))
     return tuple(found)
 
 
-def _reason(fitted: Fitted, used: Mask) -> str:
+def _is_same(one: dict[int, tuple[float, float, float]], other: dict[int, tuple[float, float, float]]) -> bool:
+    return one.keys() == other.keys() and all(math.dist(one[anchor], other[anchor]) < _SAME_M for anchor in one)
+
+
+def _sentence(
+    fitted: Fitted, framed: Framed, other: OtherFit, position_m: Array, distance_m: Array, elsewhere: Integers
+) -> str:
+    """Which anchors are elsewhere, where, by how much the rest differs, and which tape decides."""
+    case, here_m = _case(fitted, other.used), framed.position_m
+    if len(elsewhere) > _MOST_NAMED:
+        anchors = anchors_named([fitted.anchors[index] for index in elsewhere])
+        sentence = f"{case}, {anchors} are elsewhere, by up to {distance_m.max():.2f} m"
+    else:
+        axes = fitted.measured.facts.dimensions
+        places = [
+            f"anchor {fitted.anchors[index]} is not at {_place(here_m[index, :axes])} but {distance_m[index]:.2f} m "
+            f"away at {_place(position_m[index, :axes])}"
+            for index in elsewhere.tolist()
+        ]
+        rest_m = float(np.delete(distance_m, elsewhere).max(initial=0.0))
+        stays = f"by {100.0 * rest_m:.0f} cm at most" if rest_m >= 0.005 else "not at all"
+        sentence = f"{case}, {joined(places)}; the other anchors differ {stays}"
+    one = int(np.argmax(distance_m))
+    rest = np.setdiff1d(np.flatnonzero(fitted.core), elsewhere)
+    if not rest.size:
+        return sentence
+    first_m, second_m = (np.linalg.norm(at_m[rest] - at_m[one], axis=1) for at_m in (here_m, position_m))
+    apart_m = np.abs(first_m - second_m)
+    longest_m = np.where(apart_m >= _DECIDES * apart_m.max(), np.maximum(first_m, second_m), np.inf)
+    best = int(np.argmin(longest_m))
+    a, b = sorted((fitted.anchors[one], fitted.anchors[int(rest[best])]))
+    return f"{sentence}; the distance {a}–{b} decides: {first_m[best]:.2f} m, or {second_m[best]:.2f} m there"
+
+
+def _place(position_m: Array) -> str:
+    return f"({', '.join(f'{round(value, 2) + 0.0:.2f}' for value in position_m.tolist())})"
+
+
+def _case(fitted: Fitted, used: Mask) -> str:
     late = [f"{fitted.pairs[index].a}–{fitted.pairs[index].b}" for index in np.flatnonzero(fitted.used & ~used)]
-    return f"if {joined(late)} came late" if late else "the ranges fit there as well, as in a mirror"
+    return f"if {joined(late)} came late" if late else "in a mirror image that fits as well"
 
 
 def _xyz(position_m: Array) -> tuple[float, float, float]:

@@ -38,6 +38,8 @@ class RecordedRanges(Struct, frozen=True):
     """Ranges out of a recording, and what could not be used."""
 
     ranges: PairRanges
+    ranger: PairRanger
+    """What made the ranges, and can drop those of before an anchor was moved."""
     format: str
     site: Site | None
     """As recorded; None for recordings of other systems."""
@@ -76,7 +78,7 @@ def ranges_of(
         raise ConfigurationError(path, "format", known.name, f"one with stamps of anchors: {SITE_FORMAT}, {stamped}")
     part = _Part(PairRanger(known.tx_bits, block_s, on_block=on_block), from_s, to_s, on_progress)
     drops = _add_receptions(path, part) if known.name == "avalue" else _add_packets(path, known.name, part)
-    return RecordedRanges(part.finish(), known.name, None, dict(drops + part.drops()))
+    return RecordedRanges(part.finish(), part.ranger, known.name, None, dict(drops + part.drops()))
 
 
 class _Part:
@@ -153,7 +155,9 @@ def _of_site(path: str | PathLike[str], identifier: int | None, part: _Part) -> 
         damage = _damage(recording)
     for collector in collectors.values():
         drops += _drops(collector.counters)
-    return RecordedRanges(part.finish(), SITE_FORMAT, site, dict(damage + drops + part.drops()), dict(damage))
+    return RecordedRanges(
+        part.finish(), part.ranger, SITE_FORMAT, site, dict(damage + drops + part.drops()), dict(damage)
+    )
 
 
 def _damage(recording: McapRecording) -> Counter[str]:

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from cyclopts import Parameter
@@ -74,10 +73,8 @@ class FactOptions:
     """An anchor on the left of the x axis (y > 0)."""
 
 
-def facts_of(
-    asked: FactOptions, anchors: Iterable[int], site: "Site | None", *, is_foreign: bool = False
-) -> "tuple[Facts, list[str]]":
-    """The facts, and warnings about them; ``site``: of --site or of the recording. Raises SkylessError.
+def facts_of(asked: FactOptions, anchors: Iterable[int], site: "Site | None", *, is_foreign: bool = False) -> "Facts":
+    """The facts; ``site``: of --site or of the recording. Raises SkylessError.
 
     ``is_foreign``: of a recording of another system.
     """
@@ -94,14 +91,13 @@ def facts_of(
     sketch = _positions(site) if site is not None and not asked.no_sketch else {}
     dimensions = asked.dimensions or 2
     given = _heights(asked, known) | {anchor: point[2] for anchor, point in points.items() if point[2] is not None}
-    warnings: list[str] = []
     if dimensions == 2:
         from_file = {} if site is None else {anchor.id: anchor.z_m for anchor in site.anchors}
-        given = _completed(from_file | given, known, warnings)
+        given = from_file | given
     usual = Facts()
     if is_foreign:
         usual = replace(usual, delay_std_m=_FOREIGN_DELAY_STD_M, common_delay_std_m=_FOREIGN_COMMON_DELAY_STD_M)
-    facts = Facts(
+    return Facts(
         dimensions=dimensions,
         heights_m=given,
         height_std_m=asked.anchor_height_std or usual.height_std_m,
@@ -116,7 +112,6 @@ def facts_of(
         pair_std_m=usual.pair_std_m if asked.pair_std is None else asked.pair_std,
         gauge=_gauge(asked, known),
     )
-    return facts, warnings
 
 
 def _check(asked: FactOptions, site: "Site | None") -> None:
@@ -176,19 +171,6 @@ def _heights(asked: FactOptions, known: set[int]) -> dict[int, float]:
         if known.isdisjoint(table):
             raise ConfigurationError(asked.anchor_heights, "column id", _names(table), f"anchors among {_names(known)}")
     return of_all | {anchor: z_m for anchor, z_m in table.items() if anchor in known} | single
-
-
-def _completed(heights_m: dict[int, float], known: set[int], warnings: list[str]) -> dict[int, float]:
-    """A height for every anchor, where any has one: the median of the others."""
-    missing = sorted(known - heights_m.keys())
-    if not heights_m or not missing:
-        return heights_m
-    middle_m = median(heights_m.values())
-    names = ", ".join(map(str, missing))
-    warnings.append(
-        f"no height is given for anchor {names}; {middle_m:g} m is assumed, as of the others (--anchor-height)"
-    )
-    return heights_m | dict.fromkeys(missing, middle_m)
 
 
 def _tapes(texts: Iterable[str], known: set[int]) -> "tuple[Tape, ...]":

@@ -12,11 +12,14 @@ from skyless.cli.nodes.options import MqttCa, SiteId, log
 from skyless.errors import SkylessError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from skyless.nodes.survey.program import SurveyNode
     from skyless.radios.interface import Radio
     from skyless.site.model import Site
     from skyless.survey.facts import Facts
     from skyless.survey.ranges import PairRanges
+    from skyless.survey.stamps.pair_ranger import PairRanger
 
 _USUAL_S = 30.0
 _STATUS_S = 0.5
@@ -69,8 +72,8 @@ class LiveOptions:
             raise SkylessError("--no-watch is for --serve: nothing else watches")
 
 
-def gather_live(asked: LiveOptions, known: FactOptions) -> "tuple[Site, PairRanges]":
-    """The site and the ranges between its anchors after some seconds at the running site. Raises SkylessError."""
+def gather_live(asked: LiveOptions, known: FactOptions) -> "tuple[Site, Callable[[], PairRanges], PairRanger]":
+    """The site, the ranges between its anchors after some seconds, and what makes them. Raises SkylessError."""
     from skyless.nodes.process import run
 
     found: list[SurveyNode] = []
@@ -78,13 +81,12 @@ def gather_live(asked: LiveOptions, known: FactOptions) -> "tuple[Site, PairRang
     live = found[0].live if found else None
     if live is None:
         raise SkylessError(f"no site was found at {asked.mqtt}: its anchors are not there, or have not begun yet")
-    ranges = found[0].final_ranges()
-    if not ranges.pairs:
+    if not found[0].final_ranges().pairs:
         where = asked.mqtt or asked.radio
         raise SkylessError(
             f"the anchors of site {live.site.name!r} have no ranges at {where} yet; they should be running"
         )
-    return live.site, ranges
+    return live.site, found[0].final_ranges, live.finish()
 
 
 def serve_live(asked: LiveOptions, known: FactOptions) -> None:
@@ -144,10 +146,7 @@ async def _node(asked: LiveOptions, known: FactOptions, *, serves: bool) -> "Sur
 
 
 def _facts(known: FactOptions, site: "Site") -> "Facts":
-    facts, warnings = facts_of(known, (anchor.id for anchor in site.all_anchors), site)
-    for warning in warnings:
-        _log(f"survey: {warning}")
-    return facts
+    return facts_of(known, (anchor.id for anchor in site.all_anchors), site)
 
 
 def _log(line: str) -> None:

@@ -18,8 +18,10 @@ from skyless.survey.record import SurveyRecord, baseline
 from skyless.survey.result import Survey
 from skyless.survey.stamps.legs import AnchorLeg
 from skyless.survey.stamps.pair_ranger import PairRanger
+from skyless.survey.stamps.steps import StepTable
 from skyless.survey.watch.finding import Finding
 from skyless.survey.watch.monitor import AnchorWatch
+from skyless.survey.watch.moved import Change, with_changes
 
 NO_DATA_S: Final = 5.0
 """Without stamps for this time a result is out of date."""
@@ -70,6 +72,8 @@ class LiveSurvey:
         """The ranges in messages, and when they were made."""
         self._watch: _Watched | None = None
         self._results: dict[int, tuple[Survey, PairRanges]] = {}
+        self._changes: tuple[Change, ...] = ()
+        """While ranges were gathered."""
         self._runs: dict[int, str] = {}
         self._heard_s: dict[int, float] = {}
         self._lags: dict[int, _Lag] = {}
@@ -121,14 +125,26 @@ class LiveSurvey:
         found = self._ranger.ranges()
         return replace(found, anchors=tuple(sorted(self._known)))
 
-    def finish(self) -> None:
-        """Nothing more comes: what has come since the last full second counts as well."""
+    def finish(self) -> PairRanger:
+        """Nothing more comes: what has come since the last full second counts as well. What makes the ranges."""
         self._ranger.finish()
+        return self._ranger
+
+    def steps(self) -> StepTable:
+        """The ranges in the order of time, for ``change_of``."""
+        return self._ranger.steps.table()
+
+    def use_since(self, change: Change) -> None:
+        """Forget the ranges of before a change, and the results that were made of them."""
+        self._ranger.drop_before(change.since_s)
+        self._changes += (change,)
+        self._shown = None
+        self._results.clear()
 
     def add_result(self, survey: Survey, ranges: PairRanges) -> None:
         """Keep a result of the present ranges; the oldest of many is dropped."""
         self.serial += 1
-        self._results[self.serial] = (survey, ranges)
+        self._results[self.serial] = (with_changes(survey, self._changes, ranges.duration_s), ranges)
         if len(self._results) > _RESULTS_KEPT:
             del self._results[next(iter(self._results))]
 
@@ -244,6 +260,7 @@ class LiveSurvey:
         self._identifiers = {anchor.id for anchor in self.site.all_anchors}
         self._ranger = PairRanger(on_block=self._on_block)
         self._shown = None
+        self._changes = ()
         self._results.clear()
 
     def _begin_watch(self, record: SurveyRecord | None) -> None:

@@ -53,6 +53,7 @@ from skyless.survey.ranges import PairRanges
 from skyless.survey.result import Survey
 from skyless.survey.stamps.legs import LegCollector
 from skyless.survey.surveyed_site import with_delays_of
+from skyless.survey.watch.moved import change_of
 
 NAME: Final = "survey"
 """On MQTT: one site has one survey program."""
@@ -294,7 +295,7 @@ class SurveyNode:
     # Results
 
     def final_ranges(self) -> PairRanges:
-        """All ranges when nothing more comes, as the antenna delays of the site to be surveyed would give them.
+        """The ranges when nothing more comes, as the antenna delays of the site to be surveyed would give them.
 
         The anchors may run with others. Only once the site is known.
         """
@@ -331,6 +332,11 @@ class SurveyNode:
             return
         begin_s = time.monotonic()
         try:
+            change = await asyncio.to_thread(change_of, live.steps(), facts, self._solve)
+            if change is not None and live.begun == begun:
+                self._log(f"survey: {change.sentence}; only ranges since then are used")
+                live.use_since(change)
+                ranges = live.ranges()
             survey = await asyncio.to_thread(self._solve, ranges, facts)
         except SkylessError as error:
             live.error = str(error)
@@ -452,6 +458,8 @@ class SurveyNode:
         live.place(saved.site, saved.record, serial, time.monotonic(), unix_s)
         written = "".join(f", {path} written" for path in saved.written)
         self._log(f"survey: saved{written}")
+        if saved.record.survey.assumed_heights is not None:
+            self._log(f"survey: {saved.record.survey.assumed_heights}")
 
     def _floor(self) -> FloorImage | None:
         plan = None if self._given is None else self._given.floor_plan

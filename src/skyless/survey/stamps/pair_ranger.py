@@ -18,6 +18,7 @@ from skyless.kernels.arrays import Array, Integers, Mask
 from skyless.survey.ranges import PairBlock, PairRange, PairRanges
 from skyless.survey.stamps.brackets import Flights, Legs, flights_of
 from skyless.survey.stamps.clusters import earliest_cluster
+from skyless.survey.stamps.steps import RangeSteps
 from skyless.ticks import Unwrapper
 
 _KEPT_S: Final = 5.0
@@ -80,6 +81,8 @@ class PairRanger:
         """Number of the open block since time 0."""
         self._first_s = self._last_s = math.nan
         self._duration_s = 0.0
+        self.steps = RangeSteps()
+        """The ranges in the order of time."""
 
     def add(self, sender: int, receiver: int, tx_ticks: int, rx_ticks: int, t_s: float) -> None:
         """Add one reception. ``t_s``: of any clock that all legs share, good to a second, and to a quarter of a wrap.
@@ -113,9 +116,17 @@ class PairRanger:
         self._open = [leg for leg in self._open if leg[0] not in set(numbers)]
         self._kept = self._kept.part(~np.isin(self._kept.pair, numbers))
 
+    def drop_before(self, t_s: float) -> None:
+        """Forget the ranges of before a time, in which an anchor hung elsewhere."""
+        self.steps.drop_before(t_s)
+        for history in self._histories:
+            history.drop_before(t_s)
+        self._duration_s = max(min(self._duration_s, self._last_s - t_s), 0.0)
+
     def finish(self) -> None:
         """Close the block that is open, at the end of the data."""
         self._close_block()
+        self.steps.finish()
 
     @property
     def tx_stamp_std_m(self) -> float:
@@ -203,13 +214,15 @@ class PairRanger:
                 history.squares_m2 += 4.0 * float(squares_m2[number])
                 history.freedom += float(freedom[number])
             history.add(t_s, float(mean_m[number]), 2.0 / float(one_each[number]), self._leg_variance_m2)
-        if self._on_block is not None:
-            pairs, site_m2 = list(self._number), self._leg_variance_m2()
-            for number in np.flatnonzero(n).tolist():
-                variance_m2 = self._histories[number].leg_variance_m2(site_m2) * float(one_each[number]) / 4.0
-                exchanges = max(1, round(2.0 / float(one_each[number])))
-                a, b = pairs[number]
-                self._on_block(PairBlock(a, b, t_s, float(mean_m[number]), math.sqrt(variance_m2), exchanges))
+        pairs, site_m2 = list(self._number), self._leg_variance_m2()
+        for number in np.flatnonzero(n).tolist():
+            variance_m2 = self._histories[number].leg_variance_m2(site_m2) * float(one_each[number]) / 4.0
+            exchanges = max(1, round(2.0 / float(one_each[number])))
+            a, b = pairs[number]
+            block = PairBlock(a, b, t_s, float(mean_m[number]), math.sqrt(variance_m2), exchanges)
+            self.steps.add(block)
+            if self._on_block is not None:
+                self._on_block(block)
 
     def _share(self, legs: Legs, leg: Integers, residual_m: Array, n: Integers) -> None:
         """Add up the products of residuals of two pairs that were bracketed with the same frame of an anchor."""
@@ -267,6 +280,11 @@ class _History:
         self.blocks.append((t_s, range_m, exchanges))
         if len(self.blocks) > _MOST_BLOCKS:
             self._merge(self.leg_variance_m2(site_m2()))
+
+    def drop_before(self, t_s: float) -> None:
+        """Forget the blocks of before a time."""
+        self.blocks = [block for block in self.blocks if block[0] >= t_s]
+        self._early = self._late = 0.0
 
     def mean(self, leg_m2: float) -> _Mean:
         """The mean of the earliest cluster; ``leg_m2`` is the noise of a leg."""

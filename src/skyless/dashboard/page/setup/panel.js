@@ -5,7 +5,7 @@ import { h, s, text, toast } from "../dom.js";
 import { presence } from "../survey/model.js";
 import { setMoving } from "../survey/plan.js";
 import { stopPicking } from "../survey/picking.js";
-import { command, verdict } from "../survey/verdict.js";
+import { command, headline } from "../survey/verdict.js";
 import * as axes from "./axes.js";
 import * as heard from "./heard.js";
 import * as measures from "./measures.js";
@@ -87,7 +87,7 @@ export function show() {
   parts.box.hidden = parts.list.hidden = !live;
   parts.starting.hidden = !live || presence() !== "none" || state.connection.phase !== "open";
   if (!live) return;
-  const now = verdict();
+  const now = headline();
   if (parts.kind !== now.kind) {
     parts.kind = now.kind;
     parts.box.className = `verdict ${now.kind}`;

@@ -42,6 +42,7 @@ function reasons(survey) {
     ...undetermined.map((anchor) => ["bad", `Anchor ${anchor.id}:`, sentence(anchor.reason)]),
     ...survey.ambiguities.map((other) => ["warn", "Ambiguous:", sentence(other.sentence)]),
     ...(survey.unchecked ? [["warn", "Unchecked:", sentence(survey.unchecked)]] : []),
+    ...(survey.assumed_heights ? [["warn", "Heights:", sentence(survey.assumed_heights)]] : []),
     ...survey.notes.map((words) => ["note", "Note:", sentence(words)]),
   ];
 }

@@ -36,6 +36,8 @@ let surveyMs = 0;
 let given = null;
 /** @type {any} where the floor plan lies, as far as this page's user has said so */
 let floorPlan = null;
+/** Whether this page's user has given anything. */
+let hasGiven = false;
 
 /** Expect the messages of a new connection. */
 export function restart() {
@@ -90,6 +92,7 @@ export function pending() {
 
 /** Change some facts: all are sent, as they replace those before. Resolves to whether they were accepted. */
 export async function changeFacts(change) {
+  hasGiven = true;
   const before = given;
   const next = { ...facts(), ...change };
   const mine = { facts: next, sinceMs: performance.now() };
@@ -115,6 +118,13 @@ export function placeFloorPlan(plan) {
 /** Whether the map shows the survey's picture: during the set-up, and at a site that has no positions yet. */
 export function surveyShown() {
   return state.mode === "live" && state.survey !== null && (state.setup.open || !state.site?.anchors.length);
+}
+
+/** Whether all anchors have positions, and nobody has named axes or measured anything for a survey. */
+export function isInUse() {
+  if (hasGiven || !state.site?.anchors.length || state.site.unplaced?.length) return false;
+  const { gauge, tapes, points } = facts();
+  return gauge === null && !tapes.length && !Object.keys(points).length;
 }
 
 /** Anchors that are known from anywhere, in ascending order. */

@@ -2,16 +2,29 @@
 
 import { state } from "../store.js";
 import { length, sentence } from "../format.js";
-import { age_s, noData, pending, presence } from "./model.js";
+import { age_s, isInUse, noData, pending, presence } from "./model.js";
 
 /** Start of the survey program; `ADDRESS` is the broker's. */
 export function command() {
   return `skyless survey --mqtt ${state.mqtt?.broker || "ADDRESS"} --site site.toml --serve`;
 }
 
-/** @returns {{kind: "good"|"note"|"warn"|"bad", title: string, words: string}} */
+/**
+ * What the newest result is worth.
+ * @returns {{kind: "good"|"note"|"warn"|"bad", title: string, words: string}}
+ */
 export function verdict() {
-  return absent() ?? unfinished() ?? weak() ?? good();
+  return absent() ?? unstarted() ?? unfinished() ?? open() ?? weak() ?? good();
+}
+
+/** The same, but at a site that is in use and that nobody sets up, what another survey would leave open is no fault. */
+export function headline() {
+  if (!isInUse()) return verdict();
+  const again = "All anchors have positions. To survey them again, ";
+  const inUse = (words) => ({ kind: "note", title: "In use", words: again + words });
+  if (!absent() && unstarted()) return inUse("start the survey program with the command below.");
+  const words = "go through the steps; step 5 says what their ranges leave open.";
+  return absent() ?? unfinished() ?? ((open() ?? weak()) ? inUse(words) : good());
 }
 
 /** What keeps the newest result from being shown at all. */
@@ -22,18 +35,20 @@ function absent() {
   if (state.mqtt && !state.mqtt.connected) {
     return bad("No broker", "The server has lost its broker: nothing new arrives from the survey program.");
   }
-  const how = presence();
-  if (how === "none") {
-    return bad("No survey program", "Nothing is surveyed now. Start the survey program with the command below.");
-  }
-  if (how === "old") {
+  if (presence() === "old") {
     const old = Math.floor(age_s());
     return bad("Old", `The survey program has sent nothing for ${old} s. What is shown here may have changed since.`);
   }
   return null;
 }
 
-/** Why there is no complete result. */
+/** That there is no survey program. */
+function unstarted() {
+  if (presence() !== "none") return null;
+  return bad("No survey program", "Nothing is surveyed now. Start the survey program with the command below.");
+}
+
+/** Why there is no result. */
 function unfinished() {
   const { survey, error, anchors } = state.survey;
   if (noData()) return bad("No data", sentence(error ?? "the survey program receives nothing of the anchors"));
@@ -46,9 +61,15 @@ function unfinished() {
     const heard = anchors.length === 1 ? "1 anchor has" : `${anchors.length} anchors have`;
     return { kind: "note", title: "Gathering", words: `${heard} been received; too few pairs for a result yet.` };
   }
-  const open = survey.anchors.filter((anchor) => !anchor.determined).map((anchor) => anchor.id);
-  if (open.length) {
-    const words = open.length === 1 ? `Anchor ${open[0]} is not determined.` : `${open.length} anchors are not determined: ${list(open)}.`;
+  return null;
+}
+
+/** What the result does not determine. */
+function open() {
+  const { survey } = state.survey;
+  const ids = survey.anchors.filter((anchor) => !anchor.determined).map((anchor) => anchor.id);
+  if (ids.length) {
+    const words = ids.length === 1 ? `Anchor ${ids[0]} is not determined.` : `${ids.length} anchors are not determined: ${list(ids)}.`;
     return bad("Not determined", words);
   }
   if (survey.not_determined.length) return bad("Not fully determined", sentence(survey.not_determined[0]));
@@ -63,6 +84,7 @@ function weak() {
     return warn("Ambiguous", `${others} the ranges as well. Step 5 says which.`);
   }
   if (survey.unchecked) return warn("Unchecked", sentence(survey.unchecked));
+  if (survey.assumed_heights) return warn("Heights", `${sentence(survey.assumed_heights)} Step 3 asks for them.`);
   if (missing.length) {
     return warn("Incomplete", `${count(missing.length, "anchor has", "anchors have")} not been received: ${list(missing)}.`);
   }
