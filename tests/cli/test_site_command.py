@@ -4,6 +4,7 @@ import json
 import os
 
 import pytest
+from msgspec.structs import replace
 
 from skyless.cli.main import main
 from skyless.site.lab import lab_site
@@ -13,7 +14,7 @@ from skyless.site.load import load_site
 def test_new_writes_the_lab(tmp_path):
     path = tmp_path / "lab.toml"
     assert main(["site", "new", str(path), "--site-id", "1"]) == 0
-    assert load_site(path) == lab_site()
+    assert load_site(path) == replace(lab_site(), outline_m=((0, 0), (6, 0), (6, 8), (0, 8)))
     assert list(tmp_path.iterdir()) == [path]  # nothing left beside it
     umask = os.umask(0)
     os.umask(umask)
@@ -83,7 +84,8 @@ def test_new_overwrites_only_by_force(tmp_path, capsys):
             ["--width", "3", "--depth", "3", "--tag-height", "nan"],
             "--tag-height is 'nan'; it should be metres, or free",
         ),
-        (["--width", "0.001", "--depth", "0.001", "--anchor-count", "20"], "elsewhere"),
+        (["--width", "0.001", "--depth", "0.001", "--anchor-count", "20"], '"0.001" for --width. Must be >= 0.1'),
+        (["--width", "3", "--depth", "0.09"], '"0.09" for --depth. Must be >= 0.1'),
     ],
 )
 def test_new_refuses(tmp_path, capsys, options, said):

@@ -154,7 +154,7 @@ def test_a_stopped_link_logs_it_and_sends_what_waits(make_broker):
         tag = tag_link(broker.address)
         async with running(broker, inbox.link, tag) as (_, task):
             await until(lambda: inbox.online("tag", "t1"))
-            for number in range(100):
+            for number in range(500):
                 tag.publish(receptions_topic(7, "t1"), b"%d" % number, qos=1)
             await stopped(task)
             assert not tag.connected

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from skyless.site.model import Site
 
 _Metres = Annotated[float, Parameter(validator=Number(gt=0, lte=10_000))]
+_RoomMetres = Annotated[float, Parameter(validator=Number(gte=0.1, lte=10_000))]
+"""Of a room's side, along whose walls even 255 anchors stand apart."""
 _GRID_HEIGHT_M: Final = 4.0
 _TAGS_BELOW_A_GRID_M: Final = 1.2
 _LONGEST_TABLE: Final = 40
@@ -36,8 +38,8 @@ def new(
     /,
     *,
     name: str | None = None,
-    width: _Metres | None = None,
-    depth: _Metres | None = None,
+    width: _RoomMetres | None = None,
+    depth: _RoomMetres | None = None,
     anchor_count: _Count | None = None,
     height: _Metres | None = None,
     spacing: _Metres | None = None,
