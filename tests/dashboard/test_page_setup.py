@@ -377,6 +377,7 @@ def test_without_heights_the_set_up_is_amber_and_saving_asks(site):
     page = here.page
     here.says("all anchors are taken to be on the floor")
     assert page.locator("#verdict").get_attribute("class") == "verdict warn"
+    assert "heights are missing" in page.locator("#step-3 > summary").inner_text()
     here.open(6)
     page.wait_for_selector("#save-warning:has-text('on the floor')")
     assert page.locator("#save").is_disabled()
@@ -407,6 +408,8 @@ def test_without_a_survey_program_the_page_shows_how_to_start_it(serve, visit):
     page.wait_for_selector("#verdict:has-text('No survey program')")
     server.send({"type": "mqtt", "connected": True, "broker": "mqtt://hall:1883"})
     page.wait_for_selector(".command code:text-is('skyless survey --mqtt mqtt://hall:1883 --site site.toml --serve')")
+    page.evaluate("skyless.state.site.name = 'hall'")  # a site is named after its file
+    page.wait_for_selector(".command code:text-is('skyless survey --mqtt mqtt://hall:1883 --site hall.toml --serve')")
     server.send({"type": "mqtt", "connected": False, "broker": "mqtt://hall:1883"})
     page.wait_for_selector("#verdict:has-text('No broker')")
 

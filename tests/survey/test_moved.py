@@ -1,12 +1,16 @@
 """An anchor that was moved while ranges were gathered is named, and only ranges since then count; rest stays rest."""
 
+import asyncio
+import json
 import math
 
 import numpy as np
 import pytest
 
+from skyless.cli.main import main
 from skyless.constants import TICK_M, TICK_RATE_HZ
 from skyless.nodes.survey.live_survey import LiveSurvey
+from skyless.nodes.survey.program import SurveyNode, SurveySettings
 from skyless.site.lab import lab_site
 from skyless.survey.facts import Facts, Gauge
 from skyless.survey.ranges import PairBlock
@@ -138,6 +142,25 @@ def test_a_live_survey_goes_on_with_the_time_since_the_motion():
     note = live.result(2)[0].notes[0]
     assert note.startswith("during the survey anchor 4 has moved by about")
     assert "s of ranges since then are used" in note
+
+
+def test_the_program_and_the_command_use_the_time_since_the_motion(monkeypatch, capsys):
+    ranger, site, lines = PairRanger(), lab_site(), []
+    node = SurveyNode(SurveySettings(site.id, site), lambda _: Facts(), run_survey, None, lines.append)
+    live = node.live = LiveSurvey(site, Facts(heights_m=dict.fromkeys(LAB, 0.0)), watches=False)
+    for sender, receiver, tx_ticks, rx_ticks, t_s in legs(LAB, 30.0, hung_elsewhere):
+        live._add(sender, receiver, tx_ticks, rx_ticks, t_s, t_s)
+        ranger.add(sender, receiver, tx_ticks, rx_ticks, t_s)
+    live.finish()
+    asyncio.run(node._make_result(live))
+    assert live.result(live.serial)[0].notes[0].startswith("during the survey anchor 4 has moved by about")
+    assert any("anchor 4 has moved by about" in line for line in lines)
+
+    ranger.finish()
+    monkeypatch.setattr("skyless.cli.survey.gather_live", lambda *_: (site, ranger.ranges, ranger))
+    assert main(["survey", "--mqtt", "mqtt://127.0.0.1", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["notes"][0].startswith("during the survey anchor 4 has moved by about")
 
 
 def _worst_m(survey, places):

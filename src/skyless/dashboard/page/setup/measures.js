@@ -30,7 +30,7 @@ export function start(body) {
   const points = makePoints();
   const choices = makeChoices();
   parts = { tapes, heights, points, choices };
-  body.append(tapes.element, heights.element, points.element, choices.element);
+  body.append(heights.element, tapes.element, points.element, choices.element);
 }
 
 /** How it stands. */
@@ -42,7 +42,8 @@ export function summary() {
     [Object.keys(points).length, "point", "points"],
   ];
   const words = given.filter(([count]) => count).map(([count, one, more]) => `${count} ${count === 1 ? one : more}`);
-  return words.join(", ") || (state.survey?.survey?.tapes.length ? "a tape is asked for" : "");
+  const asked = state.survey?.survey?.assumed_heights ? "heights are missing" : state.survey?.survey?.tapes.length ? "a tape is asked for" : "";
+  return words.join(", ") || asked;
 }
 
 /** Bring the step up to date. */

@@ -4,9 +4,11 @@ import { state } from "../store.js";
 import { length, sentence } from "../format.js";
 import { age_s, isInUse, noData, pending, presence } from "./model.js";
 
-/** Start of the survey program; `ADDRESS` is the broker's. */
+/** Start of the survey program; `ADDRESS` is the broker's. A site is named after its file unless somebody renamed it. */
 export function command() {
-  return `skyless survey --mqtt ${state.mqtt?.broker || "ADDRESS"} --site site.toml --serve`;
+  const name = state.site?.name ?? "";
+  const file = /^[\w.-]+$/.test(name) ? name : "site";
+  return `skyless survey --mqtt ${state.mqtt?.broker || "ADDRESS"} --site ${file}.toml --serve`;
 }
 
 /**
