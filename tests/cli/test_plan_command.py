@@ -70,6 +70,7 @@ def test_people_get_a_table(lab, capsys):
     out = capsys.readouterr().out
     assert "standard deviation" in out
     assert "one more anchor" in out
+    assert not re.search(r"one more anchor.* cm", out), "a second mean and worst, of other points than the map's"
 
 
 def test_an_optimised_site_is_a_site(lab, tmp_path, capsys):

@@ -72,6 +72,47 @@ def test_same_seed_same_places():
     assert places[0] == places[1]
 
 
+class SlowSearch(Search):
+    """Each point of a prediction takes 10 ms on a clock of its own; Ctrl-C at an evaluation."""
+
+    now_s, interrupt_at = 0.0, None
+
+    def _sigma(self, site, sample):
+        SlowSearch.now_s += 0.01 * len(sample[1])
+        if self.evaluations == self.interrupt_at:
+            self.interrupt_at = None
+            raise KeyboardInterrupt
+        return super()._sigma(site, sample)
+
+
+@pytest.fixture
+def slow_search(monkeypatch):
+    monkeypatch.setattr("skyless.planning.optimise.time.monotonic", lambda: SlowSearch.now_s)
+    site = rectangular_site(10.0, 6.0, 4, 3.0, 1.2)
+    floor = floor_of(site, FILE, None, None)
+    mounts = Mounts(sides(floor.outline_m), (2.5,))
+    return lambda seconds: SlowSearch(site, BRACKETED, floor, mounts, (1.2,), 4, 1, seconds)
+
+
+@pytest.mark.parametrize("seconds", [20.0, 60.0, 200.0])
+def test_a_search_holds_its_time_where_predictions_are_slow(slow_search, seconds):
+    begin_s = SlowSearch.now_s
+    found = slow_search(seconds).run()
+    assert not found.finished
+    assert SlowSearch.now_s - begin_s < seconds + 3.0  # two evaluations
+    assert found.best.mean_sigma_m <= found.even.mean_sigma_m
+
+
+@pytest.mark.parametrize("at", [40, 60])
+def test_ctrl_c_keeps_the_best_that_was_found(slow_search, at):
+    search = slow_search(1e6)
+    search.interrupt_at = at
+    found = search.run()
+    assert not found.finished
+    assert search.evaluations < at + 4
+    assert found.best.mean_sigma_m < found.even.mean_sigma_m
+
+
 def test_exchange_finds_what_trying_all_finds():
     """Four anchors on twelve places: the exchange against all 495 choices."""
     from itertools import combinations

@@ -1,8 +1,11 @@
 """The program ``skyless``: its table of commands, and what all of them share at their start and end."""
 
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from errno import EDQUOT, EFBIG, EIO, ENOSPC
 from io import TextIOWrapper
 from typing import TYPE_CHECKING, Final
@@ -78,6 +81,7 @@ _RENAMED_IN_SURVEY: Final = {
 }
 
 _INTERRUPTED = 130
+_TERMINATED = 143
 _BROKEN_PIPE = 1
 _CANNOT_WRITE = (ENOSPC, EDQUOT, EFBIG, EIO)
 _USER_ERROR = 2
@@ -124,13 +128,14 @@ def program() -> App:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return the exit code: 0, 2 for a user's error, 130 after Ctrl-C.
+    """Run one command and return the exit code: 0, 2 for a user's error, 130 after Ctrl-C, 143 after SIGTERM.
 
     A command's own exit code is what it returns, None meaning 0.
     """
     _write_any_character()
     try:
-        result = program()(arguments)
+        with _ended_by_sigterm():
+            result = program()(arguments)
         if sys.stdout is not None:
             sys.stdout.flush()
     except SkylessError as error:
@@ -148,6 +153,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"skyless: {_trouble(error)}", file=sys.stderr)
         return _USER_ERROR
     return result if isinstance(result, int) else 0
+
+
+@contextmanager
+def _ended_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM end the command in the block with the processes that it has started, unless it is handled already."""
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+        yield
+        return
+
+    def end(*_: object) -> None:
+        raise SystemExit(_TERMINATED)
+
+    signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _trouble(error: OSError) -> str:

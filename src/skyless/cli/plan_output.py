@@ -71,18 +71,17 @@ def _one_more(more: "OneMore") -> str:
 
 
 def _change(before_m: float, after_m: float) -> str:
-    return f"{cm(before_m)} → {cm(after_m)} ({after_m / before_m - 1.0:+.0%})"
+    """A change as a share only: the facts' own mean and worst are those of the map, at other points."""
+    return f"{after_m / before_m - 1.0:+.0%}"
 
 
 def _against_even(found: dict[str, Any]) -> str:
     best, even = found["best"], found["even"]
-    text = (
-        f"mean {cm(best['mean_sigma_m'])}, worst {cm(best['worst_sigma_m'])}; evenly along the walls "
-        f"{cm(even['mean_sigma_m'])} and {cm(even['worst_sigma_m'])}"
-    )
+    mean, worst = (_change(even[name], best[name]) for name in ("mean_sigma_m", "worst_sigma_m"))
+    text = f"mean {mean}, worst {worst} against as many anchors evenly along the walls"
     if found["target_met"] is not None:
         text += "; the target is met everywhere" if found["target_met"] else "; the target is not met everywhere"
-    return text if found["finished"] else text + "; the time ran out before the search ended"
+    return text if found["finished"] else text + "; the search was ended before it was complete"
 
 
 def _verified(checked: "Verification") -> str:

@@ -163,12 +163,24 @@ def relative_score(mean: float, worst: float, mean_reference: float, worst_refer
     return 0.5 * (a + b) + _PENALTY * (max(a - _CLEARLY_SMALLER, 0.0) + max(b - _CLEARLY_SMALLER, 0.0))
 
 
-def exchange(chosen: Integers, fixed: int, lattice: Lattice, reference: tuple[float, float], passes: int) -> float:
-    """Move one anchor after the other to its best candidate until none moves; the first ``fixed`` stay. The score."""
+def exchange(
+    chosen: Integers,
+    fixed: int,
+    lattice: Lattice,
+    reference: tuple[float, float],
+    passes: int,
+    late: Callable[[], bool] = lambda: False,
+) -> float:
+    """Move one anchor after the other to its best candidate until none moves; the first ``fixed`` stay. The score.
+
+    Ends between two anchors once it is ``late``.
+    """
     score = relative_score(*mean_and_worst(chosen, lattice), *reference)
     for _ in range(passes):
         before = chosen.copy()
         for k in range(fixed, len(chosen)):
+            if late():
+                return score
             best = chosen[k]
             others = np.delete(chosen, k)
             free = (lattice.apart_m[:, others] >= _CLOSEST_M).all(axis=1)
@@ -202,7 +214,7 @@ class Optimised(Struct, frozen=True):
     even: Scored
     evaluations: int
     finished: bool
-    """Whether the search came to its end before the time did."""
+    """Whether the search came to its end before the time did, or Ctrl-C."""
     target_met: bool | None
 
 
@@ -223,27 +235,57 @@ class Search:
         self._site, self._settings, self._mounts, self._anchors = site, settings, mounts, anchors
         self._budget, self._walls = link_budget(settings.channel), pack_walls(site.walls)
         self._points = sample_points(floor, heights_m, _SEARCH_POINTS)
-        self._judge_points = sample_points(floor, heights_m, _JUDGE_POINTS)
+        self._floor, self._heights_m = floor, heights_m
         self._random = np.random.default_rng([seed, anchors])
         self._begin_s, self._seconds = time.monotonic(), seconds
         self._cap_m = float(np.linalg.norm(np.ptp(mounts.segments_m.reshape(-1, 2), axis=0)))
+        self._found: list[tuple[float, Layout]] = []
+        """The best layout of each start that was refined, with its score."""
         self.evaluations = 0
 
     def run(self, target_m: float | None = None, progress: Callable[[float], None] | None = None) -> Optimised:
-        """Search until nothing improves or the time is up; ``progress`` gets the share of the time."""
+        """Search until nothing improves, the time is up, or Ctrl-C: the best of what has been found by then.
+
+        ``progress`` gets the share of the time.
+        """
         self._progress = progress
         even = even_layout(self._mounts, self._anchors)
-        starts = [even, *self._lattice_starts(even)]
-        reference = self._score(even)
-        improved = [self._refine(start, reference) for start in starts[:_REFINED]]
-        judged = [self._judge(layout) for layout in [even, *improved]]
-        first = judged[0]
+        reference = self._score(even)  # at the first time it loads kernels, too
+        thorough = self._plan_judging(even)
+        first = self._judge(even)
+        judged, finished = [first], False
+        try:
+            for start in [even, *self._lattice_starts(even)][:_REFINED]:
+                self._refine(start, reference)
+            finished = thorough and not self._late()
+            judged += [self._judge(layout) for _, layout in self._found]
+        except KeyboardInterrupt:
+            if self._found:
+                judged.append(self._judge(min(self._found, key=lambda found: found[0])[1]))
         best = min(judged, key=lambda s: _against(s, first))
         met = None if target_m is None else best.covered_share == 1.0 and best.worst_sigma_m <= target_m
-        return Optimised(best, first, self.evaluations, not self._late(), met)
+        return Optimised(best, first, self.evaluations, finished, met)
+
+    def _plan_judging(self, layout: Layout) -> bool:
+        """Choose at how many points and with how many masters layouts are judged, so that it takes half of the time.
+
+        Returns whether it is at all of them.
+        """
+        begin_s = time.monotonic()
+        self._score(layout)
+        score_s = time.monotonic() - begin_s
+        for masters, points in ((3, _JUDGE_POINTS), (3, 4 * _SEARCH_POINTS), (1, 2 * _SEARCH_POINTS), (1, 0)):
+            sample = sample_points(self._floor, self._heights_m, points) if points else self._points
+            judging_s = score_s * masters * len(sample[1]) / len(self._points[1])
+            if (_REFINED + 1) * judging_s < 0.5 * self._seconds:
+                break
+        self._masters, self._judge_points = masters, sample
+        self._search_s = max(self._seconds - _REFINED * (judging_s + score_s), 0.1 * self._seconds)
+        return masters > 1 and points == _JUDGE_POINTS
 
     def _late(self) -> bool:
-        passed = (time.monotonic() - self._begin_s) / self._seconds
+        """Whether the search has to end, so that what it found can be judged in time."""
+        passed = (time.monotonic() - self._begin_s) / self._search_s
         if self._progress is not None:
             self._progress(min(passed, 1.0))
         return passed >= 1.0
@@ -264,7 +306,7 @@ class Search:
             chosen = (
                 snapped.copy() if number == 0 else self._random.choice(len(candidates_m), self._anchors, replace=False)
             )
-            score = exchange(chosen, 0, lattice, reference, _MOST_PASSES)
+            score = exchange(chosen, 0, lattice, reference, _MOST_PASSES, self._late)
             found.append((score, Layout(all_along_m[chosen], all_levels[chosen])))
             if self._late():
                 break
@@ -290,10 +332,11 @@ class Search:
         mean, worst, _ = self._sigma(self._site_of(layout), self._points)
         return mean, worst
 
-    def _refine(self, start: Layout, reference: tuple[float, float]) -> Layout:
+    def _refine(self, start: Layout, reference: tuple[float, float]) -> None:
         """Shift one anchor after the other along the walls, by less and less, and between the heights."""
         layout, step = start, self._mounts.length_m / (2.0 * self._anchors)
         score = relative_score(*self._score(layout), *reference)
+        self._found.append((score, layout))
         while step >= _FINEST_M and not self._late():
             better = False
             for k in self._random.permutation(self._anchors):
@@ -303,10 +346,10 @@ class Search:
                     value = relative_score(*self._score(trial), *reference)
                     if value < score * (1.0 - 1e-4):
                         layout, score, better = trial, value, True
+                        self._found[-1] = score, layout
                         break
             if not better:
                 step /= 2.0
-        return layout
 
     def _moves(self, layout: Layout, k: int, step: float) -> list[Layout]:
         """Layouts with one anchor elsewhere, a step away or anywhere, far enough from all others."""
@@ -330,7 +373,7 @@ class Search:
     def _judge(self, layout: Layout) -> Scored:
         """Score on many more points, with the best of the masters that are heard about equally well."""
         scored = []
-        for rank in range(min(3, self._anchors)):
+        for rank in range(min(self._masters, self._anchors)):
             site = self._site_of(layout, rank)
             scored.append(Scored(site, *self._sigma(site, self._judge_points)))
         return min(scored, key=lambda s: s.mean_sigma_m * s.worst_sigma_m)
