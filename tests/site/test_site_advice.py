@@ -64,6 +64,7 @@ def test_one_line_on_the_floor(turn, shift):
     line = [(0, 0, 0), (5, 0.1, 0), (9, 0, 0), (12, -0.1, 0)]
     (warning,) = warnings_of(site_of(rotated(line, (turn, 0)) + shift, height_m=shift))
     assert "one line" in warning
+    assert warning.endswith("hang one anchor away from it")
 
 
 def test_one_plane_does_not_matter_at_a_known_height():

@@ -75,7 +75,7 @@ def _geometry(site: Site) -> list[str]:
         return []
     mirror = "the mirror image of a tag's position fits its beacons as well"
     if flat:
-        return [f"{which} lie nearly in one line: {mirror}"]
+        return [f"{which} lie nearly in one line: {mirror}; hang one anchor away from it"]
     return [
         f"{which} lie nearly in one plane: {mirror}, "
         "and the direction across is poor; alternate the anchors' heights, or set tags.height_m if it is known"
