@@ -9,6 +9,7 @@ import { findingAt, markWords } from "../survey/watch.js";
 
 export const title = "Anchors";
 
+const NONE = "No anchor has been received yet. Anchors that have power appear here by themselves.";
 let parts = null;
 
 /** Build the step. */
@@ -18,7 +19,7 @@ export function start(body) {
   head.cells[3].title = "Standard deviation of the position, per axis";
   const rows = h("tbody", {});
   const table = h("table", { class: "list setup-anchors", id: "setup-anchors" }, h("thead", {}, head), rows);
-  const none = h("p", { class: "empty" }, "No anchor has been received yet. Anchors that have power appear here by themselves.");
+  const none = h("p", { class: "empty" });
   const missing = h("p", { class: "reason" });
   const since = h("p", { class: "fine" });
   parts = { none, missing, since, table, rows: new Rows(rows, makeRow) };
@@ -36,6 +37,7 @@ export function summary() {
 export function show() {
   const { anchors = [], missing = [], pairs = [], duration_s = 0 } = state.survey ?? {};
   parts.none.hidden = anchors.length > 0 || missing.length > 0;
+  text(parts.none, state.survey ? NONE : "Anchors appear here once the survey program runs.");
   parts.table.hidden = !parts.none.hidden;
   parts.rows.show([
     ...anchors.map((id) => [id, { id, mine: pairs.filter((pair) => pair.a === id || pair.b === id) }]),
