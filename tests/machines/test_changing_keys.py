@@ -89,8 +89,8 @@ def test_an_open_tag_gives_each_fix_at_once_and_states_how_far_it_is_verified():
     unverified = [one.fix for at_s, one in given if at_s < 0.3]
     assert {(fix.verified_until_s, fix.unverified) for fix in unverified} == {(None, 1.0)}
     later = [one.fix for at_s, one in given if at_s > 1.5]
-    assert all(0.2 <= fix.time_s - fix.verified_until_s < 0.4 for fix in later)  # (lag - 1) intervals and more
-    assert all(0.1 < fix.unverified < 0.4 for fix in later)
+    assert all(0.4 <= fix.time_s - fix.verified_until_s < 0.6 for fix in later)  # (lag - 1) intervals and more
+    assert all(0.3 < fix.unverified < 0.7 for fix in later)
 
 
 @pytest.mark.parametrize("certificates", [False, True])
@@ -113,7 +113,7 @@ def test_a_new_chain_takes_over_without_a_gap():
     plain = Receiver(site=FREE.id)
     expected = [reception.host_s for reception in received if plain.hear(reception) is not None]
     assert [one.reception.host_s for _, one in given] == expected[: len(given)]
-    assert given[-1][1].reception.host_s > 2.5
+    assert given[-1][1].reception.host_s > 2.35
     assert not receiver.counters
     assert receiver.verifier.keys.serial == 2
     for machine in machines.values():
@@ -193,7 +193,7 @@ def test_a_tag_with_a_wrong_clock_notices(error_s):
     receiver = tag(KEYS.public)
     given = fixes_of(receiver, usual_tape(), error_s)
     assert receiver.verifier.clock.error_s == pytest.approx(error_s, abs=0.05 if abs(error_s) < 1000.0 else 900.0)
-    if abs(error_s) > 0.3 or error_s < 0.0:
+    if abs(error_s) > 0.3:
         assert not given
 
 
@@ -220,7 +220,7 @@ def test_a_host_clock_that_is_set_while_the_tag_is_on(error_s):
         assert not receiver.counters
         assert receiver.verifier.clock.error_s == pytest.approx(error_s, abs=0.1)
     else:
-        assert receiver.verifier.clock.error_s is not None
+        assert receiver.verifier.clock.error_s == pytest.approx(error_s, abs=1.0)
 
 
 @pytest.mark.parametrize("error_s", [-3.0, -0.2, 0.2, 3.0])

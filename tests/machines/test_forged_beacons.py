@@ -42,6 +42,8 @@ SWITCHED_ON_S = 0.8
 SECONDS = 1.8
 OPEN_SECONDS = 2.4
 """Fixes of a tag with trust open may come 0.6 s late in an attack."""
+AHEAD_S = 0.25
+"""How far ahead of the site a frame's interval may be, as far as a tag's clock tells: those behind it wait for its key."""
 REPEATED = ("repeated-at-once", "repeated-soon")
 """The only forgeries of which a tag may accept some: genuine frames that it lost, a little later."""
 
@@ -84,10 +86,11 @@ def test_no_forged_frame_moves_a_verified_fix_or_an_anchor(mode, name):
     noise, _ = air_of(mode, FORGERIES[name], is_noise=True)
     run, expected = run_tag(tape, VERIFIED), run_tag(noise, VERIFIED)
     found = compare(run, tape, FREE.id)
-    assert found.fixes > 300
+    in_time = [one for one in expected.given if one.given_s < SECONDS - AHEAD_S]
+    assert len(in_time) > 200
     assert (found.moved, found.most_moved_m, found.refused) == (0, 0.0, 0)
     assert found.forged == 0 or name in REPEATED
-    assert len(expected.given) - found.fixes <= 0.1 * len(expected.given)
+    assert found.fixes >= 0.9 * len(in_time)
     assert {reason for reason, count in run.counters.items() if count > 10} >= RIGHT_REASONS[name]
     sent = [one.reception for one in genuine_of(tape)]
     assert sent == [one.reception for one in genuine_of(noise)]
@@ -106,8 +109,8 @@ def test_a_tag_that_is_switched_on_in_an_attack(mode, name):
     later = [one for one in tape if one.reception.host_s > SWITCHED_ON_S]
     run = run_tag(later, VERIFIED)
     found = compare(run, later, FREE.id)
-    assert found.fixes > 100
-    assert run.given[0].given_s < SWITCHED_ON_S + 0.8
+    assert found.fixes > 40
+    assert run.given[0].given_s < SWITCHED_ON_S + 0.7 + AHEAD_S  # two intervals and the lag
     assert (found.moved, found.forged) == (0, 0)
     sent = {one.frame for one in air.adversary.recent}
     assert {frame for _, frame in run.accepted} <= sent

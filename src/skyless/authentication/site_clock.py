@@ -19,6 +19,9 @@ KEY_WAIT_INTERVALS: Final = 2
 RECENT_KEYS: Final = 10
 """Of this number of keys the one that came soonest after its disclosure shows how far the host's clock is off."""
 
+AHEAD_S: Final = 1.0
+"""A host's clock that is farther ahead of the lower bound was set: without new keys that falls behind by 0.2 s an hour."""
+
 RESTART_S: Final = 1.0
 """A counter that goes back farther has restarted."""
 
@@ -101,6 +104,9 @@ class SiteClock(Struct):
         """
         if not self.is_verified and self.section_offset_s:
             return self.section_offset_s
+        ahead_s = self.host_s - self.lower_s
+        if self.is_verified and ahead_s > self.bound_s + AHEAD_S:
+            return ahead_s
         if not self.offsets_s:
             return None
         offset_s = min(self.offsets_s)
