@@ -54,6 +54,8 @@ export class Track {
   constructor(name) {
     this.name = name;
     this.rows = new Float64Array(FIRST_CAPACITY * COLUMNS);
+    /** The columns that the map shows now. */
+    this.shown = new Float64Array(COLUMNS);
     this.capacity = FIRST_CAPACITY;
     this.start = 0;
     this.count = 0;
