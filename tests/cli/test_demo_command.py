@@ -19,7 +19,7 @@ from skyless.cli.main import main
 from skyless.mqtt.address import mqtt_address
 from skyless.mqtt.connection import Introduction, Reactions, open_connection
 from skyless.mqtt.link import Link
-from skyless.mqtt.topics import fix_topic, health_topic
+from skyless.mqtt.topics import fix_topic, health_topic, status_topic
 from skyless.nodes.broker import BrokerSettings, start_broker
 
 COMMAND = [sys.executable, "-m", "skyless.cli.main", "demo"]
@@ -207,11 +207,16 @@ def test_a_demo_that_is_killed_leaves_no_program_behind(tmp_path):
 
 
 def test_ctrl_c_while_it_starts_ends_all_and_leaves_nothing_at_a_broker_of_others(tmp_path):
+    foreign = status_topic(1, "tag", "foreign")
+
     async def start_and_end():
         async with await start_broker(BrokerSettings(temporary=True)) as broker:
             demo = Demo(tmp_path, "--json", "--mqtt", str(broker.address))
             demo.wait_for(lambda: len(demo.children()) >= 2)
-            while not await retained(broker.address):
+            connection = await open_connection(broker.address, None, Introduction("", 10))
+            connection.publish(foreign, b"not a status", 1, retain=True)
+            await connection.leave()
+            while len(await retained(broker.address)) < 2:
                 assert demo.process.poll() is None
             code, out = demo.end(signal.SIGINT)
             return demo.said, code, out, await retained(broker.address)
@@ -220,7 +225,7 @@ def test_ctrl_c_while_it_starts_ends_all_and_leaves_nothing_at_a_broker_of_other
     assert code == 0
     assert "Traceback" not in said
     assert json.loads(out)["rmse_m"] is None
-    assert not left
+    assert left == {foreign}
 
 
 async def retained(address):

@@ -193,7 +193,7 @@ def test_a_tag_with_a_wrong_clock_notices(error_s):
     receiver = tag(KEYS.public)
     given = fixes_of(receiver, usual_tape(), error_s)
     assert receiver.verifier.clock.error_s == pytest.approx(error_s, abs=0.05 if abs(error_s) < 1000.0 else 900.0)
-    if abs(error_s) > 0.3:
+    if abs(error_s) > 0.3:  # up to the bound and an anchor's lead, 0.25 s, an anchor that is ahead would look the same
         assert not given
 
 

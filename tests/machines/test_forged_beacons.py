@@ -43,7 +43,7 @@ SECONDS = 1.8
 OPEN_SECONDS = 2.4
 """Fixes of a tag with trust open may come 0.6 s late in an attack."""
 AHEAD_S = 0.25
-"""How far ahead of the site a frame's interval may be, as far as a tag's clock tells: those behind it wait for its key."""
+"""How far ahead of the site an accepted frame's interval may be; frames received after it wait for its key."""
 REPEATED = ("repeated-at-once", "repeated-soon")
 """The only forgeries of which a tag may accept some: genuine frames that it lost, a little later."""
 

@@ -19,7 +19,7 @@ MOST_CERTIFICATES: Final = 6
 
 NEAR_STEPS: Final = 16
 """Keys that follow within this number of intervals on a verified one are hashed at once, others as far as an allowance
-for long ones goes: whoever sends forged keys must not keep the processor busy. Keys that two anchors sent have an
+for long ones goes: somebody who sends forged keys must not keep the processor busy. Keys that two anchors sent have an
 allowance of their own, so that many different forged ones do not keep the right one waiting."""
 STEPS_PER_S: Final = 50_000.0
 MOST_STEPS: Final = 40_000.0

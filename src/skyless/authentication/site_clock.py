@@ -20,7 +20,7 @@ RECENT_KEYS: Final = 10
 """Of this number of keys the one that came soonest after its disclosure shows how far the host's clock is off."""
 
 AHEAD_S: Final = 1.0
-"""A host's clock that is farther ahead of the lower bound was set: without new keys that falls behind by 0.2 s an hour."""
+"""A host's clock that is farther ahead of the lower bound has been set; without keys that bound loses 0.2 s an hour."""
 
 RESTART_S: Final = 1.0
 """A counter that goes back farther has restarted."""

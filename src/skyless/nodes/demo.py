@@ -4,6 +4,7 @@ Broker and page are up first and show how far the kernels are compiled, where th
 """
 
 import asyncio
+import contextlib
 import time
 from pathlib import Path
 from typing import Final
@@ -14,7 +15,7 @@ from msgspec.structs import replace
 from skyless.mqtt.address import MqttAddress
 from skyless.mqtt.connection import Introduction, Reactions, RefusedError, open_connection, trouble_with
 from skyless.mqtt.link import Link
-from skyless.mqtt.messages import PreparationMessage, StatusMessage, read_message
+from skyless.mqtt.messages import PreparationMessage, StatusMessage, WrongMessageError, read_message
 from skyless.mqtt.topics import preparation_topic, site_topic, status_topic, survey_topic, watch_topic
 from skyless.nodes.broker import Broker, BrokerSettings, start_broker
 from skyless.nodes.children import Child, Program
@@ -91,7 +92,7 @@ class WholeSite:
         with self._ether_held, self._page_claim:
             if self._asked.broker is not None:
                 whole = self._run_with(self._asked.broker, None)
-                await outlasting(_forgotten(self._asked.broker, self._asked.site.id, self._log), whole)
+                await outlasting(_cleared_at_the_end(self._asked.broker, self._asked.site.id, self._log), whole)
             else:
                 broker = await start_broker(BrokerSettings(temporary=True))
                 await self._run_with(broker.address, broker)
@@ -180,23 +181,24 @@ class WholeSite:
         return programs
 
 
-async def _forgotten(address: MqttAddress, site: int, log: Log) -> None:
+async def _cleared_at_the_end(address: MqttAddress, site: int, log: Log) -> None:
     """Wait until cancelled; then clear what the site's programs, which have ended, have left retained at the broker."""
     try:
         await asyncio.Event().wait()
     finally:
         try:
-            await asyncio.shield(_clear(address, site))
+            await asyncio.shield(_clear_retained(address, site))
         except (OSError, RefusedError) as error:
             log(f"{trouble_with(address, error)}: the demo's site stays there")
 
 
-async def _clear(address: MqttAddress, site: int) -> None:
+async def _clear_retained(address: MqttAddress, site: int) -> None:
     left: set[str] = set()
 
     def note(topic: str, payload: bytes) -> None:
-        if payload and not (topic.endswith("/status") and read_message(payload, StatusMessage).online):
-            left.add(topic)
+        with contextlib.suppress(WrongMessageError):  # of another program than the demo's
+            if payload and not (topic.endswith("/status") and read_message(payload, StatusMessage).online):
+                left.add(topic)
 
     who = Introduction("", _KEEPALIVE_S)
     connection = await open_connection(address, address.tls_context(), who, Reactions(message=note))

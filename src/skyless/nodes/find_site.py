@@ -1,4 +1,4 @@
-"""Which sites a broker carries, and how many of their programs are online: for whoever has not been given a site.
+"""Which sites a broker carries, and how many of their programs are online: to choose one where none is named.
 
 A broker keeps the last state of every site that ever ran on it. A site counts as alive while a program of its own, an
 anchor, a tag or the emulated air, states that it is online. Programs that only observe a site do not count.

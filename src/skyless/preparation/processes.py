@@ -156,7 +156,7 @@ class _Run:
 
 
 def _time_left_s(parts: Iterable[_Progress], now_s: float, at_once: int) -> float | None:
-    """Time until all parts have ended, of which so many run at once; None where too little is known.
+    """Time until all parts are compiled, with a number of them running at once; None where too little is known.
 
     Parts that wait take as much longer than is typical as those that were begun.
     """

@@ -39,7 +39,7 @@ class RecordedRanges(Struct, frozen=True):
 
     ranges: PairRanges
     ranger: PairRanger
-    """What made the ranges, and can drop those of before an anchor was moved."""
+    """What made the ranges, and can drop those from before an anchor was moved."""
     format: str
     site: Site | None
     """As recorded; None for recordings of other systems."""

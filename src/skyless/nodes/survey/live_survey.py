@@ -135,7 +135,7 @@ class LiveSurvey:
         return self._ranger.steps.table()
 
     def use_since(self, change: Change) -> None:
-        """Forget the ranges of before a change, and the results that were made of them."""
+        """Drop the ranges from before a change, and the results computed from them."""
         self._ranger.drop_before(change.since_s)
         self._changes += (change,)
         self._shown = None

@@ -387,7 +387,7 @@ class SurveyNode:
             self._said_state = state
 
     def _log_findings(self, live: LiveSurvey, watch: WatchMessage) -> None:
-        """Log what is new; an anchor that has moved makes the ranges of before useless for another survey."""
+        """Log what is new; an anchor that has moved makes the earlier ranges useless for another survey."""
         lines, has_moved = self._findings_log.update(watch.findings)
         for line in lines:
             self._log(f"watch: {line}")

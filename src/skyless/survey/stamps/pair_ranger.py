@@ -117,7 +117,7 @@ class PairRanger:
         self._kept = self._kept.part(~np.isin(self._kept.pair, numbers))
 
     def drop_before(self, t_s: float) -> None:
-        """Forget the ranges of before a time, in which an anchor hung elsewhere."""
+        """Drop the ranges from before a time, because an anchor was elsewhere then."""
         self.steps.drop_before(t_s)
         for history in self._histories:
             history.drop_before(t_s)
@@ -282,7 +282,7 @@ class _History:
             self._merge(self.leg_variance_m2(site_m2()))
 
     def drop_before(self, t_s: float) -> None:
-        """Forget the blocks of before a time."""
+        """Drop the blocks from before a time."""
         self.blocks = [block for block in self.blocks if block[0] >= t_s]
         self._early = self._late = 0.0
 

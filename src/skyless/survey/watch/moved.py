@@ -1,4 +1,4 @@
-"""Whether an anchor was moved while its ranges were gathered: ranges of before and since cannot be used together.
+"""Whether an anchor was moved while its ranges were gathered: ranges from before and after it cannot be used together.
 
 All splits of the time are compared. Ranges that differ by more than their own scatter explains, for two pairs of one
 anchor or more, are explained as the watch of the anchors does: a link that was blocked for a while is no motion.
@@ -49,7 +49,7 @@ class Change(Struct, frozen=True):
 
 
 def change_of(table: StepTable, facts: Facts, solve: Solve) -> Change | None:
-    """The largest change of anchors between the ranges of before and since; None where there is none."""
+    """The largest change of anchors between earlier and later ranges; None where there is none."""
     steps = len(table.start_s)
     if steps < _LEAST_STEPS:
         return None
@@ -72,7 +72,7 @@ def change_of(table: StepTable, facts: Facts, solve: Solve) -> Change | None:
 
 
 def drop_moved(ranger: PairRanger, facts: Facts, solve: Solve) -> tuple[Change, ...]:
-    """Forget the ranges of before each change, until those that are left agree; what has changed."""
+    """Drop the ranges from before each change until the rest agree. Returns the changes."""
     found: list[Change] = []
     while (change := change_of(ranger.steps.table(), facts, solve)) is not None:
         ranger.drop_before(change.since_s)
