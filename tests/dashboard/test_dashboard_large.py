@@ -10,7 +10,7 @@ from test_dashboard_condition import anchor_health
 from test_dashboard_live import drained, of
 
 from skyless.dashboard.condition import roster
-from skyless.dashboard.wanted import MAX_ROWS, PageRequest
+from skyless.dashboard.page_request import MAX_ROWS, PageRequest
 from skyless.mqtt import topics
 
 SPACING_M = 4.0

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from skyless.dashboard.page_request import MAX_HEALTHS, PageRequest, Sent
 from skyless.dashboard.state import EXPIRY_S, UNHEARD_S, SiteState
-from skyless.dashboard.wanted import MAX_HEALTHS, PageRequest, Sent
 from skyless.mqtt.messages import AnchorHealth, Counters, EtherHealth
 
 POSITION = ("name", "x_m", "y_m", "z_m", "vx", "vy")

@@ -22,10 +22,10 @@ from skyless.dashboard.geojson import MEDIA_TYPE
 from skyless.dashboard.guard import AccessRules, Guard
 from skyless.dashboard.live import LiveSite, NoBrokerError, NoSiteError, NotAllowedError, TooManyPagesError
 from skyless.dashboard.overlays import KINDS, NoOverlayError, Overlays
+from skyless.dashboard.page_request import PageRequest
 from skyless.dashboard.playback import NoRecordingError, Playback
 from skyless.dashboard.site_survey import NoResultError
 from skyless.dashboard.sites import LiveSites
-from skyless.dashboard.wanted import PageRequest
 from skyless.errors import SkylessError
 from skyless.mqtt.survey_facts import BadFactsError
 from skyless.site.image import image_size

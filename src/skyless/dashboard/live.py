@@ -23,9 +23,9 @@ from skyless.dashboard.condition.evidence import Evidence
 from skyless.dashboard.condition.monitor import EVALUATION_S, Condition, ConditionMonitor
 from skyless.dashboard.events import MAX_LOGGED, EventLog
 from skyless.dashboard.geojson import OLDEST_S, features
+from skyless.dashboard.page_request import PageRequest, Sent
 from skyless.dashboard.site_survey import SiteSurvey, topic_of
 from skyless.dashboard.state import SiteState, encode
-from skyless.dashboard.wanted import PageRequest, Sent
 from skyless.dashboard.zone_events import MAX_EVENTS, EventQueue, publisher_rank
 from skyless.errors import ConfigurationError
 from skyless.mqtt import topics

@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from skyless.dashboard.app import PAGE_TIMEOUT_S, Services, make_app
 from skyless.dashboard.guard import AccessRules
-from skyless.dashboard.wanted import MAX_REQUEST_BYTES
+from skyless.dashboard.page_request import MAX_REQUEST_BYTES
 from skyless.errors import SkylessError
 from skyless.mqtt.address import MqttAddress
 from skyless.nodes.ports import claim

@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
-from skyless.dashboard.wanted import MAX_HEALTHS, Sent
+from skyless.dashboard.page_request import MAX_HEALTHS, Sent
 from skyless.mqtt.messages import (
     AnchorHealth,
     EtherHealth,
