@@ -1,4 +1,4 @@
-"""What antenna delays are off after a calibration: by the tag alone, by ranges alone, by both (docs/calibration.md).
+"""What antenna delays are off after a calibration: by ranges alone, and by these and a tag (docs/calibration.md).
 
     python benchmarks/calibrated_delays.py [--seeds 6] [--seconds 6]
 
@@ -12,29 +12,26 @@ from functools import partial
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.anchor import Anchor
-from skyless.constants import TICK_M
-from skyless.evaluation.scenarios import Request, impairments_of
-from skyless.mqtt.messages import RawReception, ReceptionsMessage
-from skyless.simulation.impairments import AnchorDisplacement, DelayError, PairError
-from skyless.simulation.range_errors import RangeErrorModel
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
-from skyless.site.lab import ideal_lab_site
-from skyless.site.model import EXACT
-from skyless.site.template import rectangular_site
-from skyless.survey.facts import Facts
-from skyless.survey.solve import run_survey
-from skyless.survey.stamps.legs import LegCollector
-from skyless.survey.stamps.pair_ranger import PairRanger
-from skyless.survey.tags.epochs import EpochCollector
-from skyless.survey.tags.estimate import estimate
-from skyless.survey.tags.relayed import RelayedDifferences
-from skyless.survey_inputs.samples import First, SiteListener, Stay, gather, joined, position_of_stays
-from skyless.survey_inputs.walk import at_positions
+from skyless.core.constants import TICK_M
+from skyless.core.protocol1.anchor import Anchor
+from skyless.core.site import EXACT
+from skyless.research.calibration.tags import at_positions
+from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.impairments import AnchorDisplacement, DelayError, PairError
+from skyless.sim.lab import paper_lab_site
+from skyless.sim.range_errors import RangeErrorModel
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Static
+from skyless.sim.world import World
+from skyless.site.file.template import rectangular_site
+from skyless.site.survey.facts import Facts
+from skyless.site.survey.relayed import RelayedDifferences
+from skyless.site.survey.solve import run_survey
+from skyless.site.survey.stamps.legs import LegCollector
+from skyless.site.survey.stamps.pair_ranger import PairRanger
+from skyless.site.survey.walk import EpochCollector
 
-LAB = ideal_lab_site()
+LAB = paper_lab_site()
 ROOM = replace(rectangular_site(8.0, 6.0, 8, 3.0, None), accuracy=EXACT)
 CASES = (
     ("lab, one point", LAB, ((3.0, 4.0, 0.0),)),
@@ -65,43 +62,30 @@ def world_of(site, stays, seed, at_tag_m, of_pairs_m, by_hand_m):
 
 
 def trial(site, stays, seconds, seed, errors):
-    """Errors of 2h without the master and stated standard deviations, of the three ways, shape (3, 2)."""
+    """Errors of 2h without the master and stated standard deviations, of both ways, shape (2, 2)."""
     world, true_m = world_of(site, stays, seed, *errors)
     legs, ranger = LegCollector(site.id), PairRanger()
     differences = [RelayedDifferences(site.id) for _ in stays]
     collectors = [EpochCollector(relayed=True) for _ in stays]
-    raw = [[] for _ in stays]
     for broadcast in world.run(seconds):
         for tag, reception, _ in broadcast.receptions():
             if reception.host_s < 1.0:  # clocks start
                 continue
-            raw[tag].append(RawReception(frame=reception.frame, rx_ticks=reception.rx_ticks, host_s=reception.host_s))
             for one in differences[tag].add(reception):
                 collectors[tag].add(reception.host_s - one.age_s, one.first, one.second, one.difference_m)
             for leg in legs.add(reception) if tag == 0 else ():
                 ranger.add(leg.sender, leg.receiver, leg.tx_ticks, leg.rx_ticks, leg.t_s)
     ranger.finish()
     positions_m = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
-    samples = []
-    for number, stay in enumerate(stays):
-        message = ReceptionsMessage(f"tag{number}", "run", 0, 0.0, tuple(raw[number]))
-        known = partial(position_of_stays, [Stay(*stay)], None)
-        samples.append(gather(SiteListener(site.id).process(message), positions_m, known, First()))
-    together = joined(samples)
-    master = int(together.differences.anchor_a[0])
-    alone = {
-        one.anchor: (one.bias_m, one.std_m)
-        for one in estimate(together.differences, zero=master, slope=False).anchors
-        if one.bias_m is not None
-    }
+    master = site.master
     epochs = tuple(
-        at_positions(one.epochs(), lambda _, stay=stay: stay, 0.02, 0.03)
+        at_positions(one.epochs(), "a tag", lambda _, stay=stay: stay)
         for one, stay in zip(collectors, stays, strict=True)
     )
     facts = Facts(
         dimensions=3, sketch_m=positions_m, sketch_std_m=errors[2] or 1e-4, keep_positions=True, delay_std_m=0.15
     )
-    found = [alone]
+    found = []
     for tags in ((), epochs):
         survey = run_survey(ranger.ranges(), replace(facts, tags=tags))
         found.append({one.id: (2.0 * one.delay_m, 2.0 * one.delay_std_m) for one in survey.anchors})
@@ -114,7 +98,7 @@ def main():
     parser.add_argument("--seeds", type=int, default=6)
     parser.add_argument("--seconds", type=float, default=6.0)
     asked = parser.parse_args()
-    print(f"{'':56}{'tag alone':>14}{'ranges':>14}{'both':>14}")
+    print(f"{'':56}{'ranges':>14}{'both':>14}")
     for name, site, stays in CASES:
         for what, *errors in ERRORS:
             trials = [trial(site, stays, asked.seconds, seed, errors) for seed in range(asked.seeds)]

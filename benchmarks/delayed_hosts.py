@@ -13,18 +13,18 @@ from emulator.site.host_programs import HostLatency, Process
 from emulator.site.site_air import NodeAir
 from numpy.typing import NDArray
 
-from skyless.air.reception import Diagnostics, Reception
-from skyless.anchor import Anchor
-from skyless.constants import TICK_S
-from skyless.method_names import DEFAULT_METHOD
-from skyless.nodes.anchor import ASK_AGAIN_S, LEAD_GAIN, LEAD_LOSS, MAX_LEAD_S
-from skyless.radios.dw1000.radio import SPI_LEAD_S, ChipSession
-from skyless.radios.interface import AntennaDelays, Late, RadioEvent, Sent
-from skyless.receiver import Receiver
-from skyless.simulation.dw1000.chip import Chip, ModelBus
-from skyless.simulation.medium import Medium
-from skyless.site.model import Site
-from skyless.ticks import difference
+from skyless.core.air.reception import Diagnostics, Reception
+from skyless.core.constants import TICK_S
+from skyless.core.method_names import DEFAULT_METHOD
+from skyless.core.protocol1.anchor import Anchor
+from skyless.core.site import Site
+from skyless.core.tag.any_receiver import AnyReceiver
+from skyless.core.ticks import difference
+from skyless.radio.dw1000.radio import SPI_LEAD_S, ChipSession
+from skyless.radio.interface import AntennaDelays, Late, RadioEvent, Sent
+from skyless.run.anchor import ASK_AGAIN_S, LEAD_GAIN, LEAD_LOSS, MAX_LEAD_S
+from skyless.sim.dw1000.chip import Chip, ModelBus
+from skyless.sim.medium import Medium
 
 _POLL_S: Final = 20e-3
 _COMING: Final = 64
@@ -98,7 +98,7 @@ class Host:
 
 
 class AnchorHost(Host):
-    """An anchor's, which does what ``nodes/anchor.py`` does: hands frames over earlier after a late one."""
+    """An anchor's, which does what ``run/anchor.py`` does: hands frames over earlier after a late one."""
 
     def __init__(
         self,
@@ -172,7 +172,7 @@ class TagHost(Host):
     def __init__(
         self, medium: Medium[Any], node: int, latency: HostLatency, generator: random.Random, qa: float
     ) -> None:
-        self.receiver = Receiver(DEFAULT_METHOD, qa=qa)
+        self.receiver = AnyReceiver(DEFAULT_METHOD, qa=qa)
         self.errors_m2: list[tuple[int, float]] = []
         """Slot and squared error of every fix."""
         super().__init__(medium, node, latency, generator)

@@ -21,20 +21,20 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.air.uci import UciReader
-from skyless.constants import TICK_BITS
-from skyless.evaluation.fleet import world_of
-from skyless.evaluation.scenarios import Request, Room, impairments_of
-from skyless.nodes.uci_board import UciProtocol
-from skyless.planning.anchor_clocks import AnchorClocks, Relays, relays_of
-from skyless.planning.columns import PLAN_COLUMNS, RMSE
-from skyless.planning.joint_sigma import fill_joint_sigma
-from skyless.planning.predict import PlanSettings, Predictor
-from skyless.positioning.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, PacketTracking
-from skyless.recordings.foreign.fira import DtTag
-from skyless.simulation.range_errors import RangeErrorModel
-from skyless.simulation.trajectory import Static
-from skyless.site.lab import lab_site
+from skyless.core.constants import TICK_BITS
+from skyless.radio.foreign.fira import DtTag
+from skyless.radio.uci.uci import UciReader
+from skyless.research.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, PacketTracking
+from skyless.run.board import UciProtocol
+from skyless.sim.evaluation.fleet import world_of
+from skyless.sim.evaluation.scenarios import Request, Room, impairments_of
+from skyless.sim.lab import lab_site
+from skyless.sim.range_errors import RangeErrorModel
+from skyless.sim.trajectory import Static
+from skyless.site.planning.anchor_clocks import AnchorClocks, Relays, relays_of
+from skyless.site.planning.joint_sigma import fill_joint_sigma
+from skyless.site.planning.links import PLAN_COLUMNS, RMSE
+from skyless.site.planning.predict import PlanSettings, Predictor
 
 POINTS_M = np.array([(2.0, 3.0), (1.0, 1.0), (4.5, 6.0), (3.0, 4.0), (5.0, 2.0), (0.7, 7.0)])
 PLACES_M = np.column_stack([POINTS_M, np.zeros(len(POINTS_M))])

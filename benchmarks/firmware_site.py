@@ -31,13 +31,13 @@ from emulator.site.repeated_site import RepeatedSite
 from emulator.site.serial_wire import WireSettings
 from msgspec.structs import replace
 
-from skyless.errors import SkylessError
-from skyless.evaluation.compile_ahead import compile_kernels
-from skyless.evaluation.scenarios import Request, Room, trajectories_of
-from skyless.nodes import anchor
-from skyless.site.check import check_site
-from skyless.site.lab import ideal_lab_site, lab_site
-from skyless.site.model import AnchorSite, ScheduleSite, Site
+from skyless.core.errors import SkylessError
+from skyless.core.site import AnchorSite, ScheduleSite, Site
+from skyless.research.compile_ahead import compile_kernels
+from skyless.run import anchor
+from skyless.sim.evaluation.scenarios import Request, Room, trajectories_of
+from skyless.sim.lab import lab_site, paper_lab_site
+from skyless.site.file.check import check_site
 
 _WARMUP_S = 1.0
 
@@ -65,7 +65,7 @@ def fixed_lead(*, fixed: bool) -> Iterator[None]:
 
 def lab_of(slot_ms: float, anchors: int, *, in_room: bool) -> Site:
     """The lab with this slot length and number of anchors."""
-    lab = lab_site() if in_room else ideal_lab_site()
+    lab = lab_site() if in_room else paper_lab_site()
     return replace(
         lab, anchors=(*lab.anchors, AnchorSite(7, 3.0, 0.0))[:anchors], schedule=ScheduleSite(slot_s=1e-3 * slot_ms)
     )

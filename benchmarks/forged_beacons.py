@@ -1,6 +1,6 @@
 """Forged beacons at a site with keys: whether any moves a verified fix, and what they cost. Simulated.
 
-    python benchmarks/forged_beacons.py [--mode free slots] [--attack NAME ...] [--rate HZ ...] [--seconds 8] [--seed 1]
+    python benchmarks/forged_beacons.py [--attack NAME ...] [--rate HZ ...] [--seconds 8] [--seed 1]
         [--room] [--json]
 
 An attacker with its own radios receives everything and knows all but the keys that are not disclosed yet. From the
@@ -23,19 +23,20 @@ import json
 import sys
 import time
 from itertools import pairwise
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from msgspec import Struct, to_builtins
 from msgspec.structs import replace
 
-from skyless.evaluation.adversary import FORGERIES, Forgery, any_forgery
-from skyless.evaluation.attacked_air import Attack, AttackedAir, Received
-from skyless.evaluation.compile_ahead import compile_kernels
-from skyless.evaluation.scenarios import Request, Room
-from skyless.evaluation.trusted_air import made_keys
-from skyless.evaluation.trusted_fixes import compare, errors_m, run_tag
-from skyless.site.lab import ideal_lab_site, lab_site
-from skyless.site.model import ScheduleSite, Site
-from skyless.trusted_receiver import SiteTrust, Trust
+from skyless.core.site import ScheduleSite, Site
+from skyless.core.tag.trusted_receiver import SiteTrust, Trust
+from skyless.research.compile_ahead import compile_kernels
+from skyless.sim.evaluation.scenarios import Request, Room
+from skyless.sim.lab import lab_site, paper_lab_site
+from support.adversary import FORGERIES, Forgery, any_forgery
+from support.keyed_air import Attack, AttackedAir, Received, compare, errors_m, made_keys, run_tag
 
 ATTACK_FROM_S = 2.0
 SWITCHED_ON_S = 3.0
@@ -44,7 +45,6 @@ KEYS_BEGIN_S = -60.0
 """Chains of a site in use have begun long before."""
 
 RATES_HZ = {
-    "false-master": (2.2, 240.0),
     "false-page": (95.0, 476.0, 952.0, 1428.0),
     "false-measurement": (476.0, 952.0, 1906.0),
     "restarted-counter": (240.0,),
@@ -56,7 +56,6 @@ EVERY: dict[str, Forgery] = {**FORGERIES, "any": any_forgery}
 class Row(Struct, frozen=True):
     """What an attack did."""
 
-    mode: str
     attack: str
     rate_hz: float
     fixes: int
@@ -77,13 +76,10 @@ class Row(Struct, frozen=True):
     faults: dict[str, int]
 
 
-def site_of(mode: str, *, in_room: bool) -> Site:
+def site_of(*, in_room: bool) -> Site:
     """The lab without a master."""
-    lab = lab_site() if in_room else ideal_lab_site()
-    if mode == "free":
-        return replace(lab, schedule=ScheduleSite(mode="free", rate_hz=60.0))
-    anchors = tuple(replace(anchor, slot=slot) for slot, anchor in enumerate(lab.anchors))
-    return replace(lab, anchors=anchors, schedule=ScheduleSite(mode="slots", slots=len(anchors)))
+    lab = lab_site() if in_room else paper_lab_site()
+    return replace(lab, schedule=ScheduleSite(mode="free", rate_hz=60.0))
 
 
 def worst_open(tape: list[Received], noise: list[Received], trust: SiteTrust) -> tuple[float, float, float]:
@@ -98,9 +94,9 @@ def worst_open(tape: list[Received], noise: list[Received], trust: SiteTrust) ->
     return float(found[:, 1].max()), float(expected[:, 1].max()), longest_s
 
 
-def row_of(mode: str, attack: str, rate_hz: float, asked: argparse.Namespace) -> Row:
+def row_of(attack: str, rate_hz: float, asked: argparse.Namespace) -> Row:
     """Run an attack."""
-    site = site_of(mode, in_room=asked.room)
+    site = site_of(in_room=asked.room)
     keys = made_keys(site.id, KEYS_BEGIN_S)
     request = Request(site, seed=asked.seed, room=Room() if asked.room else None)
     tapes = []
@@ -121,7 +117,7 @@ def row_of(mode: str, attack: str, rate_hz: float, asked: argparse.Namespace) ->
     open_m, open_noise_m, worse_s = worst_open(tape, noise, replace(trust, trust=Trust.OPEN))
     after = compare(cold, later, site.id)
     return Row(
-        mode, attack, rate_hz, found.fixes, found.moved, found.most_moved_m, found.forged, genuine[0] == genuine[1],
+        attack, rate_hz, found.fixes, found.moved, found.most_moved_m, found.forged, genuine[0] == genuine[1],
         1.0 - found.fixes / len(runs[1].given), cold.given[0].given_s - SWITCHED_ON_S if cold.given else None,
         after.moved, after.most_moved_m, open_m, open_noise_m, worse_s, *costs_us, dict(runs[0].counters),
     )  # fmt: skip
@@ -134,7 +130,7 @@ def line_of(row: Row) -> str:
     anchors = "same" if row.same_anchors else "other"
     moved = f"{row.moved} ({1000 * row.most_moved_m:.1f} mm), {row.cold_moved} ({1000 * row.cold_most_moved_m:.1f} mm)"
     return (
-        f"| {row.mode} | {row.attack} | {row.rate_hz:g} | {row.fixes} | {moved} | {row.forged} | {anchors} "
+        f"| {row.attack} | {row.rate_hz:g} | {row.fixes} | {moved} | {row.forged} | {anchors} "
         f"| {100 * row.lost:.1f} % | {first} | {row.open_m:.2f} m ({row.open_noise_m:.2f}), {row.open_worse_s:.2f} s "
         f"| {row.cost_us:.0f} ({row.noise_cost_us:.0f}) | {faults} |"
     )
@@ -143,7 +139,6 @@ def line_of(row: Row) -> str:
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--mode", choices=("free", "slots"), nargs="+", default=["free", "slots"])
     parser.add_argument("--attack", choices=tuple(EVERY), nargs="+", default=list(EVERY))
     parser.add_argument("--rate", type=float, nargs="+", help="forged frames a second; by default some for each attack")
     parser.add_argument("--seconds", type=float, default=8.0)
@@ -158,18 +153,17 @@ def main() -> None:
     compile_kernels()
     run_tag_once()
     if not asked.json:
-        heads = "mode | attack | rate/s | fixes | moved | forged | anchors | lost | first | open | µs | counted"
+        heads = "attack | rate/s | fixes | moved | forged | anchors | lost | first | open | µs | counted"
         print(f"| {heads} |\n{'|---' * (heads.count('|') + 1)}|", flush=True)
-    for mode in asked.mode:
-        for attack in asked.attack:
-            for rate_hz in asked.rate or RATES_HZ.get(attack, (USUAL_RATE_HZ,)):
-                row = row_of(mode, attack, rate_hz, asked)
-                print(json.dumps(to_builtins(row)) if asked.json else line_of(row), flush=True)
+    for attack in asked.attack:
+        for rate_hz in asked.rate or RATES_HZ.get(attack, (USUAL_RATE_HZ,)):
+            row = row_of(attack, rate_hz, asked)
+            print(json.dumps(to_builtins(row)) if asked.json else line_of(row), flush=True)
 
 
 def run_tag_once() -> None:
     """Load what the first fixes load, so that it is not measured."""
-    site = site_of("free", in_room=False)
+    site = site_of(in_room=False)
     keys = made_keys(site.id, KEYS_BEGIN_S)
     run_tag(list(AttackedAir(Request(site), keys).run(1.0)), SiteTrust(site.id, keys.public))
 

@@ -1,11 +1,11 @@
 """Millions of forged and altered frames at a tag that verifies beacons, and at an anchor: none may count.
 
-    python benchmarks/forged_frames.py [--frames 1e7] [--mode free] [--seed 1] [--seconds 4]
+    python benchmarks/forged_frames.py [--frames 1e7] [--seed 1] [--seconds 4]
 
-Frames of all kinds are made from what a simulated site sends (``evaluation/adversary.py``), further altered by random
-bits and bytes, with a right check sequence, and processed between the genuine frames, over and over again with other
-draws. Prints how many were refused for which reason. Exit status 1 if one moved a verified fix or an anchor admitted
-one.
+Frames of all kinds are made from what a simulated site sends (``tests/support/adversary.py``), further altered by
+random bits and bytes, with a right check sequence, and processed between the genuine frames, over and over again with
+other draws. Prints how many were refused for which reason. Exit status 1 if one moved a verified fix or an anchor
+admitted one.
 """
 
 import argparse
@@ -14,24 +14,25 @@ import time
 from bisect import bisect_right
 from collections import Counter
 from itertools import pairwise
+from pathlib import Path
 from random import Random
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from forged_beacons import KEYS_BEGIN_S, site_of
 from msgspec.structs import replace
 
-from skyless.air.ieee802154 import fcs
-from skyless.air.reception import Reception
-from skyless.anchors.authentication import BeaconAuthentication
-from skyless.anchors.neighbours import Neighbours
-from skyless.evaluation.adversary import FORGERIES
-from skyless.evaluation.attacked_air import AttackedAir, Received
-from skyless.evaluation.compile_ahead import compile_kernels
-from skyless.evaluation.scenarios import Request
-from skyless.evaluation.trusted_air import START_UNIX_S, MadeKeys, made_keys
-from skyless.evaluation.trusted_fixes import compare, run_tag
-from skyless.site.model import Site
-from skyless.ticks import from_seconds, wrap
-from skyless.trusted_receiver import SiteTrust, Trust
+from skyless.core.air.ieee802154 import fcs
+from skyless.core.air.reception import Reception
+from skyless.core.anchor.anchor import Anchor
+from skyless.core.anchor.authentication import BeaconAuthentication
+from skyless.core.site import Site
+from skyless.core.tag.trusted_receiver import SiteTrust, Trust
+from skyless.core.ticks import from_seconds, wrap
+from skyless.research.compile_ahead import compile_kernels
+from skyless.sim.evaluation.scenarios import Request
+from support.adversary import FORGERIES
+from support.keyed_air import START_UNIX_S, AttackedAir, MadeKeys, Received, compare, made_keys, run_tag
 
 FORGED_EACH = 2
 """Of each kind, for a genuine frame; each is used several times, altered in other ways."""
@@ -101,14 +102,17 @@ def admitted_by_anchor(
     site: Site, keys: MadeKeys, mixed: list[Received], sent: set[bytes], counters: Counter[str]
 ) -> tuple[int, int]:
     """Forged frames that an anchor admits, and repetitions of genuine ones."""
-    authentication = BeaconAuthentication(site, keys.chains)
-    neighbours = Neighbours(site, site.anchors[0].id, counters, authentication)
+    authentication = BeaconAuthentication(keys.chains)
+    anchor = Anchor(site, site.anchors[0].id, authentication=authentication)
     forged = repeated = 0
     for one in mixed:
         authentication.set_time(one.reception.rx_ticks, START_UNIX_S + (one.reception.host_s or 0.0))
-        if neighbours.admit(one.reception) is not None and not one.is_genuine:
+        heard = anchor.counters["heard"]
+        anchor.hear(one.reception)
+        if anchor.counters["heard"] > heard and not one.is_genuine:
             forged += one.reception.frame not in sent
             repeated += one.reception.frame in sent
+    counters.update(anchor.counters)
     return forged, repeated
 
 
@@ -116,14 +120,13 @@ def main() -> int:
     """Print the counts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=float, default=1e7)
-    parser.add_argument("--mode", choices=("free", "slots"), default="free")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=4.0, help="of air, which is used over and over again")
     asked = parser.parse_args()
     if not asked.frames >= 1000 or not asked.seconds >= 1.0:
         parser.error("argument --frames should be 1000 or more, --seconds 1 or more")
     compile_kernels()
-    site = site_of(asked.mode, in_room=False)
+    site = site_of(in_room=False)
     keys = made_keys(site.id, KEYS_BEGIN_S)
     trust = SiteTrust(site.id, keys.public, trust=Trust.VERIFIED)
     tape, times_s, forged, sent = recorded(site, keys, asked.seconds, asked.seed)

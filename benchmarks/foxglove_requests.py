@@ -8,7 +8,7 @@ import random
 import sys
 from collections import Counter
 
-from skyless.bridges.foxglove.protocol import decode_request
+from skyless.bridges.foxglove import decode_request
 
 REQUESTS = 1_000_000
 VALID = [

@@ -3,7 +3,7 @@
 python benchmarks/host_latency.py [SECONDS [SEEDS [SLOT_MS ...]]] [--lead-ms 1.8 ...]
 
 A site whose anchors and tag are DW1000s on the SPI of slow hosts. Hosts run the driver
-(``skyless.radios.dw1000.driver``) on the register model; every transfer costs time, in which the air and the other
+(``skyless.radio.dw1000.driver``) on the register model; every transfer costs time, in which the air and the other
 hosts go on. Frames that come too late are skipped, and cost their slots. ``--lead-ms``: anchors keep to this lead
 instead of adapting theirs.
 """
@@ -21,17 +21,17 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from skyless.air.beacon import Beacon
-from skyless.air.codec import decode_cached
-from skyless.air.reception import Reception
-from skyless.evaluation.scenarios import Request, impairments_of, trajectories_of
-from skyless.simulation.medium import Delivery, Medium
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.world import diagnostics_of
-from skyless.site.lab import ideal_lab_site
-from skyless.site.model import ScheduleSite, Site
-from skyless.ticks import wrap
-from skyless.uncertainty.bounds import bound_settings, received_bound
+from skyless.core.air.reception import Reception
+from skyless.core.protocol1.beacon import Beacon
+from skyless.core.protocol1.codec import decode_cached
+from skyless.core.site import ScheduleSite, Site
+from skyless.core.ticks import wrap
+from skyless.research.uncertainty.bounds import BoundSettings, received_bound
+from skyless.sim.evaluation.scenarios import Request, impairments_of, trajectories_of
+from skyless.sim.lab import paper_lab_site
+from skyless.sim.medium import Delivery, Medium
+from skyless.sim.stations import TagSpec
+from skyless.sim.world import diagnostics_of
 
 _SLOTS_MS: Final = (1.05, 2.1, 2.5, 5.0, 10.0)
 _QA: Final = 0.3
@@ -75,7 +75,7 @@ class LatencyWorld:
     """The lab with another slot length on such hosts, deterministic by its seed."""
 
     def __init__(self, slot_s: float, latency: HostLatency, seed: int, lead_s: float | None) -> None:
-        lab = ideal_lab_site()
+        lab = paper_lab_site()
         self.site = replace(lab, schedule=ScheduleSite(slot_s=slot_s))
         request = Request(self.site, seed=seed)
         self.trajectory = trajectories_of(request)[0]
@@ -164,7 +164,7 @@ def _bound(site: Site, world: LatencyWorld, heard: NDArray[np.bool_], first: int
     known[:, :-1] &= ~of_others[:, None] | heard[:, -1:]
     begun_s = min(time_s - (slot - first) * slot_s for slot, time_s, _ in world.sent_frames if slot >= first)
     path_m = np.array([world.trajectory.position(begun_s + slot * slot_s) for slot in range(len(heard))])
-    settings = bound_settings(
+    settings = BoundSettings(
         noise.rx_stamp_ps * 1e-12,
         white_fm=noise.white_fm,
         random_walk_fm=noise.random_walk_fm,

@@ -19,29 +19,29 @@ from functools import lru_cache
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.evaluation.cell_fleet import CellFleet
-from skyless.evaluation.fleet import FleetSettings
-from skyless.simulation.impairments import Impairments
-from skyless.simulation.trajectory import Roaming
-from skyless.site.grid import grid_site
-from skyless.site.model import EXACT
-from skyless.studies.common.plan import Cell
-from skyless.studies.common.runner import run_cells, run_cells_on_dask
+from skyless.core.site import EXACT
+from skyless.research.studies.common.plan import Cell
+from skyless.research.studies.common.runner import run_cells, run_cells_on_dask
+from skyless.sim.evaluation.cell_fleet import CellFleet
+from skyless.sim.evaluation.fleet import FleetSettings
+from skyless.sim.impairments import Impairments
+from skyless.sim.trajectory import Roaming
+from skyless.site.file.template import grid_site
 
 SPACING_M = 15.0
 WARM_S = 1.0
 
 
 @lru_cache(maxsize=1)
-def site_of(anchors, mode):
+def site_of(anchors):
     side_m = round(anchors**0.5) * SPACING_M
-    return replace(grid_site(side_m, side_m, SPACING_M, 4.0, 1.0, mode), accuracy=EXACT), side_m
+    return replace(grid_site(side_m, side_m, SPACING_M, 4.0, 1.0), accuracy=EXACT), side_m
 
 
 def run_tags(work):
     """Some of the tags: digest of the fixes of each, squared errors, seconds of a core and of the wall, memory."""
-    anchors, mode, tags, own, seconds, seed = work
-    site, side_m = site_of(anchors, mode)
+    anchors, tags, own, seconds, seed = work
+    site, side_m = site_of(anchors)
     draw = np.random.default_rng(seed)
     middles_m = draw.uniform(50.0, side_m - 50.0, (tags, 2))
     paths = [Roaming((x_m, y_m, 1.0), (6.0, 6.0, 0.0), seed=tag) for tag, (x_m, y_m) in enumerate(middles_m.tolist())]
@@ -64,11 +64,9 @@ def run_tags(work):
     )
 
 
-def measure(asked, mode, workers):
+def measure(asked, workers):
     shares = [list(range(first, asked.tags, workers)) for first in range(workers)]
-    cells = [
-        Cell("tags", run_tags, (asked.anchors, mode, asked.tags, own, asked.seconds, asked.seed), 1.0) for own in shares
-    ]
+    cells = [Cell("tags", run_tags, (asked.anchors, asked.tags, own, asked.seconds, asked.seed), 1.0) for own in shares]
     if asked.scheduler is None:
         results = run_cells(cells, lambda _: None, workers)
     else:
@@ -76,7 +74,6 @@ def measure(asked, mode, workers):
     digests = {tag: digest for result in results for tag, digest in result[0].items()}
     whole = hashlib.sha256("".join(digests[tag] for tag in range(asked.tags)).encode()).hexdigest()
     return {
-        "mode": mode,
         "workers": workers,
         "rmse_m": (sum(result[1] for result in results) / sum(result[2] for result in results)) ** 0.5,
         "cpu_s_per_s": sum(result[3] for result in results) / asked.seconds,
@@ -93,14 +90,12 @@ def main():
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--mode", choices=["slots", "free"], nargs="+", default=["slots", "free"])
     parser.add_argument("--scheduler")
     asked = parser.parse_args()
-    for mode in asked.mode:
-        rows = [measure(asked, mode, workers) for workers in asked.workers]
-        for row in rows:
-            efficiency = rows[0]["wall_s_per_s"] * rows[0]["workers"] / (row["wall_s_per_s"] * row["workers"])
-            print(json.dumps({**row, "efficiency": round(efficiency, 3)}))
+    rows = [measure(asked, workers) for workers in asked.workers]
+    for row in rows:
+        efficiency = rows[0]["wall_s_per_s"] * rows[0]["workers"] / (row["wall_s_per_s"] * row["workers"])
+        print(json.dumps({**row, "efficiency": round(efficiency, 3)}))
 
 
 if __name__ == "__main__":

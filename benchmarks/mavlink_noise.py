@@ -8,10 +8,9 @@ import random
 import sys
 import time
 
-from skyless.bridges.feed import BridgedSite
 from skyless.bridges.mavlink.encoder import MavlinkEncoder
-from skyless.bridges.mavlink.frames import MAGIC_1, MAGIC_2, frame
-from skyless.bridges.mavlink.messages import CRC_EXTRAS
+from skyless.bridges.mavlink.messages import CRC_EXTRAS, MAGIC_1, MAGIC_2, frame
+from skyless.bridges.target import BridgedSite
 
 
 def noise(rng: random.Random) -> bytes:

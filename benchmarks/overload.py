@@ -28,14 +28,14 @@ from pathlib import Path
 
 import msgspec
 
-from skyless.mqtt.address import mqtt_address
-from skyless.mqtt.link import Link
-from skyless.mqtt.messages import AnchorHealth, EtherHealth, FixMessage, TagHealth
-from skyless.mqtt.topics import fix_topic, health_topic
-from skyless.nodes.children import end
-from skyless.nodes.lateness import MOST_AGE_S
-from skyless.nodes.process import end_with_parent
-from skyless.site.lab import lab_site
+from skyless.run.children import end
+from skyless.run.fix_log import MAX_AGE_S
+from skyless.run.mqtt.address import mqtt_address
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.messages import AnchorHealth, EtherHealth, FixMessage, TagHealth
+from skyless.run.mqtt.topics import fix_topic, health_topic
+from skyless.run.process import end_with_parent
+from skyless.sim.lab import lab_site
 
 START_S = 300.0
 SETTLE_S = 10.0
@@ -118,8 +118,8 @@ class Subscriber:
             "age_ms": quantiles(self.ages_s),
             "age_less_own_ms": quantiles(self.site_s),
             "latency_ms": quantiles(self.latencies_s),
-            "over_100_ms": sum(age_s > MOST_AGE_S for age_s in self.ages_s),
-            "over_100_ms_less_own": sum(age_s > MOST_AGE_S for age_s in self.site_s),
+            "over_100_ms": sum(age_s > MAX_AGE_S for age_s in self.ages_s),
+            "over_100_ms_less_own": sum(age_s > MAX_AGE_S for age_s in self.site_s),
             "missed_share": {
                 where: {"mean": round(sum(shares) / len(shares), 3), "max": round(max(shares), 3)}
                 for where, shares in self.shares.items()

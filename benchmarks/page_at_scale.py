@@ -29,11 +29,11 @@ from dashboard_builders import SITE, SITE_ID, Times, Wire, fix
 from page_browser import CHROMIUM, FLAGS, until
 from test_dashboard_condition import anchor_health, tag_health
 
-from skyless.dashboard.app import Services, make_app
-from skyless.dashboard.guard import AccessRules
-from skyless.dashboard.live import LiveSite
-from skyless.dashboard.sites import LiveSites
-from skyless.mqtt import topics
+from skyless.page.app import Services, make_app
+from skyless.page.guard import AccessRules
+from skyless.page.live import LiveSite
+from skyless.page.sites import LiveSites
+from skyless.run.mqtt import topics
 
 SERVER = ((1_900, 8), (3_000, 8), (10_000, 8), (100_000, 8), (3, 1_000), (3, 3_000), (3, 10_000), (250_000, 8))
 PAGE = ((1_000, 1_000), (100_000, 10_000))

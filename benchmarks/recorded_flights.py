@@ -12,7 +12,7 @@ of freedom; share of fixes beyond the 99.99 % ellipsoid of their covariance, and
 protection level, of all with a truth, and how many exceed it horizontally and vertically; fixes of the first seconds
 more than 0.5 m off that claim σ < 0.25 m or give a level; seconds with an error above 1 m and above four times the
 claimed standard deviation, the root of the covariance's trace. ``--calibrated`` replays flights also with
-what ``skyless calibrate`` finds on trial 1 of their constellation and system. The last table has recordings of packets,
+what ``skyless survey`` finds on trial 1 of their constellation and system. The last table has recordings of packets,
 judged in 2-D: a tag at rest at a place that nobody documented (Kuipman), and anchors that play the tag, placed by their
 own two-way ranging (Avalue).
 """
@@ -29,12 +29,14 @@ import numpy as np
 from plain_flight_filter import plain_positions
 from scipy.stats import chi2
 
-from skyless.evaluation.judge import Judge
-from skyless.recordings.foreign.avalue import anchor_distances_m
-from skyless.recordings.foreign.formats import format_of, open_recording
-from skyless.replays.captures import Replay, ReplayRequest
-from skyless.replays.inputs import flight_height, height_to_hold, known_anchors, known_truth
-from skyless.survey_inputs.run import CalibrationRequest, calibrate_capture
+from skyless.research.calibration.biases import biases_of
+from skyless.research.calibration.options import SurveyOptions
+from skyless.research.foreign.avalue import anchor_distances_m
+from skyless.research.foreign.formats import format_of, open_recording
+from skyless.research.replays.captures import CaptureReplay
+from skyless.research.replays.inputs import flight_height, height_to_hold, known_anchors, known_truth
+from skyless.research.replays.options import ReplayOptions
+from skyless.sim.evaluation.judge import Judge
 
 LEVER_ARM = (-0.01245, 0.00127, 0.0908)
 """Of the antenna in the body of the UTIL drone, metres."""
@@ -212,18 +214,27 @@ def recordings_in(folder):
     return found
 
 
-def replayed(path, anchors_m, judge, height, **options):
-    """Replay as the command does; the report, and everything that fixes said."""
-    fixes = Fixes()
-    height_m, height_std_m = height
-    request = ReplayRequest(path, anchors_m, height_m=height_m, height_std_m=height_std_m, **options)
-    return Replay(request, judge).run(fixes.add, lambda _: None), fixes.arrays()
+def replayed(asked, calibration=None):
+    """Replay as the command does; the judge, the report, and everything that fixes said."""
+    fixes, run = Fixes(), CaptureReplay(asked, calibration, Keeper)
+    return run.judge, run.run(fixes.add, lambda _: None), fixes.arrays()
+
+
+def options_of(recording):
+    """A replay of a flight or log with its truth."""
+    return ReplayOptions(
+        recording.tdoa,
+        anchors=known_anchors(recording.anchors, None)[0],
+        truth=recording.truth,
+        lever_arm_m=LEVER_ARM,
+        settle_s=SETTLE_FLIGHT_S,
+    )
 
 
 def known(recording):
     """Anchors, truth, height that is given (or None) with its σ, and height above which it is judged."""
     places, _ = known_anchors(recording.anchors, None)
-    truth = known_truth(recording.tdoa, recording.truth, LEVER_ARM, None, None)
+    truth = known_truth(recording.tdoa, options_of(recording))
     *height, _ = height_to_hold("auto", places, None, truth, format_of(recording.tdoa).name)
     return places, truth, height, flight_height(None, truth)
 
@@ -239,11 +250,8 @@ def truth_at(truth, above_m, times_s):
 
 def judged(recording, calibration=None):
     """Score of a recording's replay."""
-    places, truth, height, above_m = known(recording)
-    judge = Keeper(truth, planar=height[0] is not None, settle_s=SETTLE_FLIGHT_S, above_m=above_m)
-    _, (position_m, covariance_m2, levels_m, alerted) = replayed(
-        recording.tdoa, places, judge, height, calibration=calibration
-    )
+    _, truth, height, above_m = known(recording)
+    judge, _, (position_m, covariance_m2, levels_m, alerted) = replayed(options_of(recording), calibration)
     true_m, here = truth_at(truth, above_m, judge.times_s)
     here &= np.array(judge.since_s) >= SETTLE_FLIGHT_S
     error_m = (position_m - true_m)[:, : 2 if height[0] is not None else 3]
@@ -268,15 +276,14 @@ def plain_of(recording):
 
 
 def calibrations_of(recordings):
-    """What ``skyless calibrate`` finds on trial 1, by ``trained_by``; and the names of those trials."""
+    """What ``skyless survey`` finds on trial 1, by ``trained_by``; and the names of those trials."""
     found, trained_on = {}, set()
     for recording in recordings:
         if recording.trained_by and recording.trained_by not in found and "-trial1-" in f"{recording.name}-":
-            places, truth, height, above_m = known(recording)
-            request = CalibrationRequest(
-                recording.tdoa, truth=truth, above_m=above_m, anchors_m=places, height_m=height[0]
-            )
-            found[recording.trained_by] = calibrate_capture(request).estimate.calibration()
+            places, truth, _, above_m = known(recording)
+            rows = np.column_stack([truth.t_s, truth.position_m])
+            asked = SurveyOptions(recording=recording.tdoa, truth=rows, above_m=above_m, anchors=places)
+            found[recording.trained_by] = biases_of(asked).estimate.calibration()
             trained_on.add(recording.name)
     return found, trained_on
 
@@ -303,7 +310,7 @@ class Packets(msgspec.Struct, frozen=True):
     path: Path
     anchors_m: dict[int, tuple[float, float, float]]
     true_m: tuple[float, float]
-    height: str = "auto"
+    height: float | str = "auto"
     listener: str | None = None
 
 
@@ -317,7 +324,7 @@ def packets_in(folder):
         for tag, (x_m, y_m, z_m) in places.items():
             others = {anchor: place for anchor, place in places.items() if anchor != tag}
             name = f"{path.parent.name} {tag & 0xFF:X}"
-            yield Packets(name, path, others, (x_m, y_m), repr(z_m), f"{tag:X}")
+            yield Packets(name, path, others, (x_m, y_m), z_m, f"{tag:X}")
 
 
 def placed(distances_m):
@@ -335,12 +342,15 @@ def placed(distances_m):
 
 def packets_judged(one, measurements):
     """Score of a recording of packets, the report, and the mean error."""
-    *height, _ = height_to_hold(one.height, one.anchors_m, None, None, format_of(one.path).name)
-    judge = Keeper(None, planar=height[0] is not None, settle_s=SETTLE_REST_S)
-    options = {} if measurements is None else {"measurements": measurements}
-    report, (position_m, covariance_m2, levels_m, alerted) = replayed(
-        one.path, one.anchors_m, judge, height, listener=one.listener, **options
+    asked = ReplayOptions(
+        one.path,
+        anchors=one.anchors_m,
+        tag_height_m=one.height,
+        settle_s=SETTLE_REST_S,
+        measurements=measurements,
+        listener=one.listener,
     )
+    judge, report, (position_m, covariance_m2, levels_m, alerted) = replayed(asked)
     here = np.array(judge.since_s) >= SETTLE_REST_S
     scored = score(np.array(judge.times_s), position_m[:, :2] - one.true_m, covariance_m2, levels_m, alerted, here)
     told = {

@@ -1,6 +1,6 @@
 """Genuine beacons that somebody disturbs and repeats a little later: how far verified fixes go. Simulated.
 
-    python benchmarks/relayed_beacons.py [--mode free slots] [--room] [--speed 0.25] [--seconds 12] [--seeds 4] [--json]
+    python benchmarks/relayed_beacons.py [--room] [--speed 0.25] [--seconds 12] [--seeds 4] [--json]
 
 Codes show who made a frame, not by which way it came. From the second second on a device near the tag delays the frames
 of some anchors, each by its own delay that grows by ``--speed``: of one, of three, or of all, at random speeds up to
@@ -16,21 +16,22 @@ import argparse
 import json
 import sys
 from collections.abc import Callable
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 import numpy as np
 from forged_beacons import KEYS_BEGIN_S, site_of
 from msgspec import Struct, to_builtins
 
-from skyless.constants import SPEED_OF_LIGHT_MPS
-from skyless.evaluation.attacked_air import AttackedAir, Received, delayed
-from skyless.evaluation.compile_ahead import compile_kernels
-from skyless.evaluation.scenarios import Request, Room
-from skyless.evaluation.trusted_air import made_keys
-from skyless.evaluation.trusted_fixes import TagRun, key_of, run_tag
-from skyless.positioning.alert import Alert
-from skyless.simulation.streams import stream
-from skyless.site.model import Site
-from skyless.trusted_receiver import SiteTrust, Trust
+from skyless.core.alert import Alert
+from skyless.core.constants import SPEED_OF_LIGHT_MPS
+from skyless.core.site import Site
+from skyless.core.tag.trusted_receiver import SiteTrust, Trust
+from skyless.research.compile_ahead import compile_kernels
+from skyless.sim.evaluation.scenarios import Request, Room
+from skyless.sim.streams import stream
+from support.keyed_air import AttackedAir, Received, TagRun, delayed, key_of, made_keys, run_tag
 
 FROM_S = 2.0
 LATER_S = (1.0, 3.0, 10.0)
@@ -96,7 +97,7 @@ def judged(run: TagRun, received: list[Received]) -> Trial:
     )
 
 
-def line_of(mode: str, case: str, trials: list[Trial], baseline: list[Trial]) -> str:
+def line_of(case: str, trials: list[Trial], baseline: list[Trial]) -> str:
     """A line of the table."""
     errors, plain = (np.array([one.errors_m for one in each]).max(axis=0) for each in (trials, baseline))
     cells = " | ".join(f"{one:.2f} m ({other:.2f})" for one, other in zip(errors, plain, strict=True))
@@ -105,12 +106,12 @@ def line_of(mode: str, case: str, trials: list[Trial], baseline: list[Trial]) ->
     noticed = [one.noticed_s for one in trials if one.noticed_s is not None]
     after = f", {np.median(noticed):.1f} s" if noticed else ""
     return (
-        f"| {mode} | {case} | {cells} | {np.median([one.std_m for one in trials]):.3f} m | {level} "
+        f"| {case} | {cells} | {np.median([one.std_m for one in trials]):.3f} m | {level} "
         f"| {100 * np.mean([one.missed for one in trials]):.0f} % | {len(noticed)} of {len(trials)}{after} |"
     )
 
 
-def constant_lines(mode: str, tape: list[Received], trust: SiteTrust) -> list[str]:
+def constant_lines(tape: list[Received], trust: SiteTrust) -> list[str]:
     """What a constant delay of all frames does."""
     lines = []
     for constant_s in CONSTANT_S:
@@ -127,14 +128,13 @@ def constant_lines(mode: str, tape: list[Received], trust: SiteTrust) -> list[st
             frames = sum((one.reception.host_s or 0.0) > begins_s + constant_s for one in later)
             used = sum((truth[key].reception.host_s or 0.0) > begins_s + constant_s for key in run.accepted)
             cells.append(f"{100 * used / frames:.0f} %, {'no fix' if error is None else f'{error:.2f} m'}")
-        lines.append(f"| {mode} | {1e3 * constant_s:g} ms | {' | '.join(cells)} |")
+        lines.append(f"| {1e3 * constant_s:g} ms | {' | '.join(cells)} |")
     return lines
 
 
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--mode", choices=("free", "slots"), nargs="+", default=["free", "slots"])
     parser.add_argument("--room", action="store_true", help="with a real room's errors of survey and ranges")
     parser.add_argument("--speed", type=float, default=0.25, help="growth of the delays in m/s")
     parser.add_argument("--seconds", type=float, default=12.5)
@@ -145,31 +145,28 @@ def main() -> None:
         parser.error(f"argument --seeds should be 1 or more, --seconds {FROM_S + LATER_S[-1] + 0.5:g} or more")
     compile_kernels()
     if not asked.json:
-        heads = "mode | delayed | " + " | ".join(f"{one:g} s later" for one in LATER_S)
+        heads = "delayed | " + " | ".join(f"{one:g} s later" for one in LATER_S)
         heads += " | stated std | level | missed | noticed"
         print(f"| {heads} |\n{'|---' * (heads.count('|') + 1)}|", flush=True)
-    constant = []
-    for mode in asked.mode:
-        site = site_of(mode, in_room=asked.room)
-        keys = made_keys(site.id, KEYS_BEGIN_S)
-        trust = SiteTrust(site.id, keys.public, trust=Trust.VERIFIED)
-        trials: dict[str, list[Trial]] = {case: [] for case in CASES}
-        for seed in range(1, asked.seeds + 1):
-            request = Request(site, seed=seed, room=Room() if asked.room else None)
-            tape = list(AttackedAir(request, keys).run(asked.seconds))
-            for case in CASES:
-                later = delayed(tape, delay_of(case, site, asked.speed, seed))
-                trial = judged(run_tag(later, trust), later)
-                trials[case].append(trial)
-                if asked.json:
-                    print(json.dumps({"mode": mode, "case": case, "seed": seed} | to_builtins(trial)), flush=True)
-        if not asked.json:
-            for case in CASES[1:]:
-                print(line_of(mode, case, trials[case], trials["none"]), flush=True)
-        constant += constant_lines(mode, tape, trust)
+    site = site_of(in_room=asked.room)
+    keys = made_keys(site.id, KEYS_BEGIN_S)
+    trust = SiteTrust(site.id, keys.public, trust=Trust.VERIFIED)
+    trials: dict[str, list[Trial]] = {case: [] for case in CASES}
+    for seed in range(1, asked.seeds + 1):
+        request = Request(site, seed=seed, room=Room() if asked.room else None)
+        tape = list(AttackedAir(request, keys).run(asked.seconds))
+        for case in CASES:
+            later = delayed(tape, delay_of(case, site, asked.speed, seed))
+            trial = judged(run_tag(later, trust), later)
+            trials[case].append(trial)
+            if asked.json:
+                print(json.dumps({"case": case, "seed": seed} | to_builtins(trial)), flush=True)
     if not asked.json:
-        print("\n| mode | all frames later by | frames used, largest error: on | switched on |\n|---|---|---|---|")
-        print("\n".join(constant))
+        for case in CASES[1:]:
+            print(line_of(case, trials[case], trials["none"]), flush=True)
+    if not asked.json:
+        print("\n| all frames later by | frames used, largest error: on | switched on |\n|---|---|---|")
+        print("\n".join(constant_lines(tape, trust)))
 
 
 if __name__ == "__main__":

@@ -18,13 +18,13 @@ from pathlib import Path
 
 import msgspec
 
-from skyless.mqtt.link import Link
-from skyless.mqtt.messages import AnchorHealth, EtherHealth, TagHealth
-from skyless.mqtt.topics import health_topic
-from skyless.nodes.broker import BrokerSettings, start_broker
-from skyless.nodes.children import Child, Program
-from skyless.nodes.ports import hold_any
-from skyless.site.lab import lab_site
+from skyless.run.broker import BrokerSettings, start_broker
+from skyless.run.children import Child, Program
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.messages import AnchorHealth, EtherHealth, TagHealth
+from skyless.run.mqtt.topics import health_topic
+from skyless.run.process import hold_any
+from skyless.sim.lab import lab_site
 
 START_S = 120.0
 SETTLE_S = 3.0

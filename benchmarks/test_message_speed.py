@@ -4,15 +4,15 @@ from itertools import cycle
 
 import pytest
 
-from skyless.air.codec import decode, encode
-from skyless.anchor import Anchor
-from skyless.method_names import METHODS
-from skyless.receiver import Receiver
-from skyless.simulation.impairments import lab_impairments
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
-from skyless.site.lab import lab_site
+from skyless.core.method_names import METHODS
+from skyless.core.protocol1.anchor import Anchor
+from skyless.core.protocol1.codec import decode, encode
+from skyless.core.tag.any_receiver import AnyReceiver
+from skyless.sim.impairments import lab_impairments
+from skyless.sim.lab import lab_site
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Static
+from skyless.sim.world import World
 
 DURATION_S = 12.0
 
@@ -44,7 +44,7 @@ def test_receiver(benchmark, receptions, method):
     warm, measured = receptions[:800], receptions[800:4400]
 
     def settled():
-        receiver = Receiver(method)
+        receiver = AnyReceiver(method)
         for reception in warm:
             receiver.hear(reception)
         return (receiver,), {}

@@ -7,8 +7,8 @@ import pytest
 from plain_filter import PlainFilter
 
 import synthetic_recordings as synthetic
-from skyless.evaluation.judge import Judge
-from skyless.replays.captures import Replay, ReplayRequest
+from skyless.research.replays.captures import CaptureReplay
+from skyless.research.replays.options import ReplayOptions
 
 ROWS = {"tdoa-table": 100_000, "miluv": 20_000, "avalue": 10_000}
 PACKETS = 20_000
@@ -33,10 +33,10 @@ def test_replay(benchmark, tmp_path, plain_per_s, name):
     rows = ROWS.get(name, PACKETS)
     path = synthetic.write(tmp_path / "recording", name, rows)
     listener = synthetic.LISTENER.get(name, [None])[-1]
-    request = ReplayRequest(path=path, anchors_m=synthetic.ANCHORS_M, listener=listener)
+    asked = ReplayOptions(path, anchors=synthetic.ANCHORS_M, tag_height_m="free", listener=listener)
 
     def replay():
-        return Replay(request, Judge(None, planar=False)).run(None, lambda _: None)
+        return CaptureReplay(asked).run(None, lambda _: None)
 
     report = benchmark.pedantic(replay, rounds=5, warmup_rounds=1)
     assert report.fixes > 0.98 * rows

@@ -1,6 +1,6 @@
 """What authentication costs where nobody attacks: accuracy, time to the first verified fix, processor time. Simulated.
 
-    python benchmarks/trusted_site.py [--mode free slots] [--room] [--seeds 6] [--seconds 8] [--json]
+    python benchmarks/trusted_site.py [--room] [--seeds 6] [--seconds 8] [--json]
 
 The lab with keys and without, the same tag that walks, several seeds: root mean square of the horizontal errors after
 the first second, and the ratio. Codes make frames longer, certificates take the place of relays. The receiver is the
@@ -14,23 +14,24 @@ import json
 import sys
 import time
 from collections import Counter
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 import numpy as np
 from forged_beacons import KEYS_BEGIN_S, site_of
 from msgspec.structs import replace
 
-from skyless.air.beacon2 import Beacon2
-from skyless.air.codec2 import decode_2
-from skyless.authentication.certificate import public_key
-from skyless.authentication.verifier import Verifier
-from skyless.evaluation.attacked_air import AttackedAir, Received
-from skyless.evaluation.compile_ahead import compile_kernels
-from skyless.evaluation.scenarios import Request, Room
-from skyless.evaluation.trusted_air import START_UNIX_S, MadeKeys, made_keys
-from skyless.evaluation.trusted_fixes import run_tag
-from skyless.receiver import Receiver
-from skyless.site.model import ScheduleSite, Site
-from skyless.trusted_receiver import SiteTrust, Trust
+from skyless.core.air.beacon import Beacon
+from skyless.core.air.codec import decode
+from skyless.core.keys.key_chain import public_key
+from skyless.core.keys.verifier import Verifier
+from skyless.core.site import ScheduleSite, Site
+from skyless.core.tag.any_receiver import AnyReceiver
+from skyless.core.tag.trusted_receiver import SiteTrust, Trust
+from skyless.research.compile_ahead import compile_kernels
+from skyless.sim.evaluation.scenarios import Request, Room
+from support.keyed_air import START_UNIX_S, AttackedAir, MadeKeys, Received, made_keys, run_tag
 
 WARMUP_S = 1.0
 STARTS = 12
@@ -40,7 +41,7 @@ NOISE_OF_TIMES = 5
 
 def rms_m(received: list[Received], site: int) -> float:
     """Of the plain receiver's fixes."""
-    receiver, squares = Receiver(site=site), []
+    receiver, squares = AnyReceiver(site=site), []
     for one in received:
         fix = receiver.hear(one.reception)
         if fix is not None and (one.reception.host_s or 0.0) > WARMUP_S:
@@ -58,7 +59,7 @@ def first_fixes_s(site: Site, keys: MadeKeys, request: Request, *, warm: bool) -
     """From switching on to the first verified fix, from several instants on."""
     tape = list(AttackedAir(request, keys).run(16.0))
     trust = SiteTrust(site.id, keys.public, trust=Trust.VERIFIED)
-    beacons = [beacon for one in tape if isinstance(beacon := decode_2(one.reception.frame), Beacon2)]
+    beacons = [beacon for one in tape if isinstance(beacon := decode(one.reception.frame), Beacon)]
     certificates = tuple({one.certificate: None for one in beacons if one.certificate is not None}) if warm else ()
     found: list[float | None] = []
     for start_s in np.linspace(1.0, 8.0, STARTS).tolist():
@@ -73,11 +74,11 @@ def costs_us(tape: list[Received], site: int, public: bytes) -> tuple[float, flo
     decoding, verifying = [], []
     for _ in range(NOISE_OF_TIMES):
         begun_s = time.process_time()
-        beacons = [decode_2(one.reception.frame) for one in tape]
+        beacons = [decode(one.reception.frame) for one in tape]
         decoding.append(time.process_time() - begun_s)
         verifier = Verifier(site, public_key(public), 0.1, Counter())
         pairs = [
-            (beacon, one.reception) for beacon, one in zip(beacons, tape, strict=True) if isinstance(beacon, Beacon2)
+            (beacon, one.reception) for beacon, one in zip(beacons, tape, strict=True) if isinstance(beacon, Beacon)
         ]
         begun_s = time.process_time()
         for beacon, reception in pairs:
@@ -97,7 +98,6 @@ def described(times_s: list[float | None]) -> str:
 def main() -> None:
     """Print all of it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--mode", choices=("free", "slots"), nargs="+", default=["free", "slots"])
     parser.add_argument("--room", action="store_true", help="with a real room's errors of survey and ranges")
     parser.add_argument("--seeds", type=int, default=6)
     parser.add_argument("--seconds", type=float, default=8.0)
@@ -107,40 +107,37 @@ def main() -> None:
         parser.error(f"argument --seeds should be 1 or more, --seconds more than {WARMUP_S:g}")
     compile_kernels()
     room = Room() if asked.room else None
-    for mode in asked.mode:
-        site = site_of(mode, in_room=asked.room)
-        keys = made_keys(site.id, KEYS_BEGIN_S)
-        pairs, tape = [], []
-        for seed in range(1, asked.seeds + 1):
-            request = Request(site, seed=seed, room=room)
-            without = list(AttackedAir(request, NO_KEYS).run(asked.seconds))
-            tape = list(AttackedAir(request, keys).run(asked.seconds))
-            pairs.append((rms_m(tape, site.id), rms_m(without, site.id)))
-        errors = np.sqrt(np.mean(np.square(pairs), axis=0))
-        ratios = [one / other for one, other in pairs]
-        decoding_us, verifying_us = costs_us(tape, site.id, keys.public)
-        show(
-            asked.json,
-            f"{mode}: {100 * errors[0]:.2f} cm with keys, {100 * errors[1]:.2f} cm without, ratio "
-            f"{errors[0] / errors[1]:.3f} (seeds {min(ratios):.3f} to {max(ratios):.3f}); a beacon is decoded in "
-            f"{decoding_us:.1f} µs and verified in {verifying_us:.1f} µs",
-            mode=mode, rms_m=errors[0], rms_without_m=errors[1], ratios=ratios, decoding_us=decoding_us,
-            verifying_us=verifying_us,
-        )  # fmt: skip
-        for name, each, request in (
-            (mode, site, Request(site, seed=1, room=room)),
-            ("sparse", sparse_site(), Request(sparse_site(), seed=1, loss=0.5)),
-        ):
-            if name == "sparse" and mode != asked.mode[0]:
-                continue
-            for warm in (False, True):
-                times_s = first_fixes_s(each, keys, request, warm=warm)
-                with_or_without = "with certificates of an earlier run" if warm else "without any certificate"
-                show(
-                    asked.json,
-                    f"{name}: first verified fix {with_or_without} after {described(times_s)} (median, largest)",
-                    site=name, warm=warm, first_s=times_s,
-                )  # fmt: skip
+    site = site_of(in_room=asked.room)
+    keys = made_keys(site.id, KEYS_BEGIN_S)
+    pairs, tape = [], []
+    for seed in range(1, asked.seeds + 1):
+        request = Request(site, seed=seed, room=room)
+        without = list(AttackedAir(request, NO_KEYS).run(asked.seconds))
+        tape = list(AttackedAir(request, keys).run(asked.seconds))
+        pairs.append((rms_m(tape, site.id), rms_m(without, site.id)))
+    errors = np.sqrt(np.mean(np.square(pairs), axis=0))
+    ratios = [one / other for one, other in pairs]
+    decoding_us, verifying_us = costs_us(tape, site.id, keys.public)
+    show(
+        asked.json,
+        f"lab: {100 * errors[0]:.2f} cm with keys, {100 * errors[1]:.2f} cm without, ratio "
+        f"{errors[0] / errors[1]:.3f} (seeds {min(ratios):.3f} to {max(ratios):.3f}); a beacon is decoded in "
+        f"{decoding_us:.1f} µs and verified in {verifying_us:.1f} µs",
+        rms_m=errors[0], rms_without_m=errors[1], ratios=ratios, decoding_us=decoding_us,
+        verifying_us=verifying_us,
+    )  # fmt: skip
+    for name, each, request in (
+        ("lab", site, Request(site, seed=1, room=room)),
+        ("sparse", sparse_site(), Request(sparse_site(), seed=1, loss=0.5)),
+    ):
+        for warm in (False, True):
+            times_s = first_fixes_s(each, keys, request, warm=warm)
+            with_or_without = "with certificates of an earlier run" if warm else "without any certificate"
+            show(
+                asked.json,
+                f"{name}: first verified fix {with_or_without} after {described(times_s)} (median, largest)",
+                site=name, warm=warm, first_s=times_s,
+            )  # fmt: skip
 
 
 def show(as_json: bool, line: str, **values: object) -> None:

@@ -31,9 +31,9 @@ done
 root=$key
 mac_key=$(sha256 "$(ascii 'skyless mac')$name$interval_key" | cut -c1-32)
 
-# The beacon of docs/protocol2.md with flag 0x10, and after it the interval.
-beacon=4188392a00ffff2c0153b21fa4420330a7197740e201000c1100030000000402982e02fcc402735bffa00f0014ff07
-beacon+=80fb00900022002b010c60450328a74b01c85e470318a706040000ba90002601b004000000000000
+# The beacon of docs/protocol2.md with flag 0x04, and after it the interval.
+beacon=4188392a00ffff2c0153b207a4420330a719771efcc402735bffa00f0014ff0722002b010c60450328a74b01c85e470318a7
+beacon+=060400000000000001b004000000000000
 signed=$beacon$(le16 $((interval & 65535)))
 mac=$(hmac "$mac_key" "$signed" | cut -c1-16)
 

@@ -4,15 +4,15 @@
 stamps of the radio's own 40-bit counter, and asks an anchor when its next frame is due. `OwnRadio` stands for your
 hardware: a counter that nobody has set, and a position from which light takes its time. Replace its two methods by
 your driver's, and `main` by your event loop. Programs that are to run as `skyless anchor` and `skyless tag` implement
-`skyless.radios.interface.Radio` instead, which adds what a running site needs: restarts, lost connections, MQTT.
+`skyless.radio.interface.Radio` instead, which adds what a running site needs: restarts, lost connections, MQTT.
 """
 
 import random
 from math import dist
 
 from skyless import Anchor, Receiver, Reception, lab_site
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
-from skyless.ticks import difference, wrap
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
+from skyless.core.ticks import difference, wrap
 
 STAMP_NOISE_S = 100e-12
 """A DW1000's stamps scatter by about as much."""

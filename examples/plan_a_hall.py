@@ -7,7 +7,7 @@ Picture: ``python plan_a_hall.py hall.png``.
 import sys
 
 import skyless
-from skyless.site.template import rectangular_site
+from skyless.site.file.template import rectangular_site
 
 hall = rectangular_site(24.0, 14.0, 6, 5.0, 1.2)  # width, depth, anchors, their greatest height; tags 1.2 m high
 now = skyless.plan(hall, method="weighted", step_m=1.0, target_m=0.1)

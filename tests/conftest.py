@@ -8,8 +8,7 @@ import pytest
 from hypothesis import settings
 
 from skyless.cli.common.progress import compile_with_counts
-from skyless.preparation.parts import EVERY_PART
-from skyless.preparation.processes import missing
+from skyless.core.kernels.processes import EVERY_PART, missing
 
 settings.register_profile("skyless", deadline=None)  # the first call of a kernel compiles it
 settings.load_profile("skyless")

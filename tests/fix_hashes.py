@@ -25,7 +25,7 @@ from msgspec.structs import replace
 
 from skyless import METHODS, Request, fleet_of, lab_site
 from skyless.cli.main import main as skyless
-from skyless.evaluation.scenarios import Room
+from skyless.sim.evaluation.scenarios import Room
 
 MACHINE = f"{llvmlite.binding.get_host_cpu_name()}, numba {numba.__version__}, numpy {np.__version__}"
 """On what hashes depend."""

@@ -11,9 +11,9 @@ from math import cos, dist, sin
 import numpy as np
 
 from recordings.capture_makers import binary_record, tdoa2, tdoa3
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
-from skyless.simulation.oscillator import OscillatorModel, advance, make_clocks
-from skyless.simulation.streams import Streams
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
+from skyless.sim.oscillator import OscillatorModel, advance, make_clocks
+from skyless.sim.streams import Streams
 
 ANCHORS_M = dict(enumerate(product((0.0, 9.0), (0.0, 7.0), (0.3, 2.7))))
 TAG = 8

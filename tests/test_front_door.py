@@ -40,10 +40,10 @@ def test_the_machines_classes_load_no_compiler():
 def test_a_value_loads_no_estimator():
     """Value types and the interface of methods need neither the compiler nor what computes them."""
     modules = "fix, integrity, observation"
-    script = f"import sys; from skyless import Fix; from skyless.positioning import {modules}; print(*sys.modules)"
+    script = f"import sys; from skyless import Fix; from skyless.core import {modules}; print(*sys.modules)"
     loaded = subprocess.check_output([sys.executable, "-c", script], text=True).split()
     assert "numba" not in loaded
-    below = ("skyless.positioning.estimator", "skyless.positioning.methods", "skyless.positioning.masterless")
+    below = ("skyless.core.estimator", "skyless.core.tag", "skyless.research.masterless")
     assert [name for name in loaded if name.startswith(below)] == []
 
 

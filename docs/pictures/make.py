@@ -19,9 +19,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Rectangle
 
-from skyless.air.ieee802154 import air_time_s
-from skyless.evaluation.figures import BLUE, GREEN, GRID, INK, MUTED, ORANGE
-from skyless.site.lab import lab_site
+from skyless.core.air.ieee802154 import air_time_s
+from skyless.sim.lab import lab_site
+from skyless.site.report.figures import BLUE, GREEN, GRID, INK, MUTED, ORANGE
 
 FOLDER = Path(__file__).parent
 ROOT = FOLDER.parents[1]

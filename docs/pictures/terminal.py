@@ -14,13 +14,13 @@ from rich.terminal_theme import MONOKAI
 from rich.text import Text
 
 WIDTH: Final = 100
-_MOST_LINES: Final = 40
+_MAX_LINES: Final = 40
 
 
 def terminal_svg(text: str, title: str, width: int = WIDTH) -> str:
     """The text with its colours, if it has any, in a window with a title; the fonts are the reader's own."""
     console = Console(record=True, width=width, file=StringIO(), legacy_windows=False)
-    for line in text.rstrip().splitlines()[:_MOST_LINES]:
+    for line in text.rstrip().splitlines()[:_MAX_LINES]:
         console.print(Text.from_ansi(line), soft_wrap=False, overflow="fold")
     svg = console.export_svg(title=title, theme=MONOKAI, unique_id="terminal")
     return re.sub(r"@font-face \{.*?\}\s*", "", svg, flags=re.DOTALL).replace("Fira Code, ", "")

@@ -11,9 +11,6 @@ void host_board_init(struct board *board, const struct hardware *hardware, const
                      uint8_t reset_cause);
 struct dw1000 *host_board_chip(struct board *board);
 uint32_t host_board_stage(const struct board *board);
-uint32_t host_chip_state(const struct dw1000 *chip);
-uint64_t host_chip_number(const struct dw1000 *chip, uint32_t which);
-const uint8_t *host_chip_frame(const struct dw1000 *chip);
 const uint8_t *host_writer_line(const struct link_writer *writer);
 uint32_t host_writer_length(const struct link_writer *writer);
 const uint8_t *host_reader_record(const struct link_reader *reader);
@@ -56,37 +53,6 @@ struct dw1000 *host_board_chip(struct board *board)
 uint32_t host_board_stage(const struct board *board)
 {
     return (uint32_t)board->stage;
-}
-
-uint32_t host_chip_state(const struct dw1000 *chip)
-{
-    return (uint32_t)chip->state;
-}
-
-/* Numbers that a test asks for, in the order of its list. */
-uint64_t host_chip_number(const struct dw1000 *chip, uint32_t which)
-{
-    const uint64_t numbers[] = {
-        chip->received,
-        chip->errors,
-        chip->sent,
-        chip->late,
-        chip->rx_ticks,
-        chip->tx_ticks,
-        chip->frame_bytes,
-        (uint64_t)(int64_t)chip->rx_power_cdbm,
-        (uint64_t)(int64_t)chip->first_path_cdbm,
-        (uint64_t)(int64_t)chip->offset_ppb,
-        (uint64_t)(int64_t)chip->temperature_cc,
-        chip->millivolts,
-    };
-
-    return numbers[which];
-}
-
-const uint8_t *host_chip_frame(const struct dw1000 *chip)
-{
-    return chip->frame;
 }
 
 const uint8_t *host_writer_line(const struct link_writer *writer)

@@ -16,7 +16,7 @@
 #include "board.h"
 #include "dw1000_registers.h"
 
-#define MOST_FRAMES 64u
+#define MAX_FRAMES 64u
 
 static uint64_t state = 1u;
 static uint64_t line_bytes;
@@ -27,8 +27,8 @@ static bool is_sound;     /* the chip works */
 static uint8_t pending[512]; /* what the line brings next */
 static uint32_t pending_bytes;
 static uint32_t pending_at;
-static uint8_t known_frames[MOST_FRAMES][DW1000_MAX_PSDU_BYTES];
-static uint32_t known_bytes[MOST_FRAMES];
+static uint8_t known_frames[MAX_FRAMES][DW1000_MAX_PSDU_BYTES];
+static uint32_t known_bytes[MAX_FRAMES];
 static uint32_t known_count;
 static uint8_t tx_buffer[256];
 static uint64_t written;
@@ -180,13 +180,13 @@ static uint32_t put_record(uint8_t *out, const uint8_t *record, uint32_t size)
 
 static void know(const uint8_t *frame, uint32_t size)
 {
-    uint32_t at = known_count % MOST_FRAMES;
+    uint32_t at = known_count % MAX_FRAMES;
 
-    if (known_count >= MOST_FRAMES) {
-        at = any(MOST_FRAMES - 1u); /* the last one may wait to be sent */
-        (void)memmove(&known_frames[at], &known_frames[at + 1u], sizeof known_frames[0] * (MOST_FRAMES - 1u - at));
-        (void)memmove(&known_bytes[at], &known_bytes[at + 1u], sizeof known_bytes[0] * (MOST_FRAMES - 1u - at));
-        at = MOST_FRAMES - 1u;
+    if (known_count >= MAX_FRAMES) {
+        at = any(MAX_FRAMES - 1u); /* the last one may wait to be sent */
+        (void)memmove(&known_frames[at], &known_frames[at + 1u], sizeof known_frames[0] * (MAX_FRAMES - 1u - at));
+        (void)memmove(&known_bytes[at], &known_bytes[at + 1u], sizeof known_bytes[0] * (MAX_FRAMES - 1u - at));
+        at = MAX_FRAMES - 1u;
     } else {
         known_count++;
     }

@@ -1,7 +1,7 @@
 /* The serial link between a board and its host, to the byte (docs/serial.md): framing, check, records.
  *
  * A record is kind | number | body | CRC-16, made free of zeros (COBS) and ended by a 0 byte. The host's end is
- * src/skyless/radios/serial/link.py; a test compares both.
+ * src/skyless/radio/serial/link.py; a test compares both.
  */
 #ifndef LINK_H
 #define LINK_H

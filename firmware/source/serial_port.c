@@ -5,7 +5,7 @@
 #include "nrf52832.h"
 #include "pins.h"
 
-#define IN_BYTES UARTE_MOST_BYTES
+#define IN_BYTES UARTE_MAX_BYTES
 #define OUT_BYTES 1024u /* eight receptions with 100 bytes: 10 ms of the line */
 #define WAIT_TURNS 2000u /* loops of some 0.1 us: longer than the five bytes that a receiver needs to stop */
 
@@ -113,8 +113,8 @@ void serial_port_pump(void)
     if (out_held > 0u) {
         to_end = OUT_BYTES - out_at;
         out_sending = (out_held < to_end) ? out_held : to_end;
-        if (out_sending > UARTE_MOST_BYTES) {
-            out_sending = UARTE_MOST_BYTES;
+        if (out_sending > UARTE_MAX_BYTES) {
+            out_sending = UARTE_MAX_BYTES;
         }
         UARTE_TXD_PTR = (uint32_t)&out_ring[out_at];
         UARTE_TXD_MAXCNT = out_sending;

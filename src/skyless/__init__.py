@@ -9,70 +9,71 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from skyless.air.reception import Reception, Transmission
-    from skyless.anchor import Anchor
-    from skyless.api.calibrate import CalibrationResult, calibrate
-    from skyless.api.plan import PlanResult, plan
-    from skyless.api.recording import open_recording
-    from skyless.api.replay import ReplayResult, replay
-    from skyless.api.simulate import SimulationResult, simulate
-    from skyless.api.slot_plan import SlotPlanResult
-    from skyless.api.study import StudyResult, study
-    from skyless.errors import SkylessError
-    from skyless.evaluation.fleet import Fleet
-    from skyless.evaluation.scenarios import Request, fleet_of
-    from skyless.method_names import METHODS
-    from skyless.positioning.fix import Fix, NoFixReason
-    from skyless.positioning.methods.locate import locate
-    from skyless.receiver import Receiver
-    from skyless.site.lab import lab_site
-    from skyless.site.load import load_site
-    from skyless.site.model import Site
-    from skyless.trusted_receiver import SiteTrust, Trust, TrustedReceiver
+    from skyless.cli.api.plan import PlanResult, plan
+    from skyless.cli.api.rate_plan import RatePlanResult
+    from skyless.cli.api.replay import ReplayResult, open_recording, replay
+    from skyless.cli.api.simulate import SimulationResult, simulate
+    from skyless.cli.api.study import StudyResult, study
+    from skyless.cli.api.survey import BiasResult, SurveyResult, survey_site
+    from skyless.core.air.reception import Reception, Transmission
+    from skyless.core.anchor.anchor import Anchor
+    from skyless.core.errors import SkylessError
+    from skyless.core.fix import Fix, NoFixReason
+    from skyless.core.method_names import METHODS
+    from skyless.core.site import Site
+    from skyless.core.tag.locate import locate
+    from skyless.core.tag.receiver import Receiver
+    from skyless.core.tag.trusted_receiver import SiteTrust, Trust, TrustedReceiver
+    from skyless.sim.evaluation.fleet import Fleet
+    from skyless.sim.evaluation.scenarios import Request, fleet_of
+    from skyless.sim.lab import lab_site
+    from skyless.site.file.load import load_site
 
     __version__: str
 
 _MODULES: Final = {
-    "METHODS": "skyless.method_names",
-    "Anchor": "skyless.anchor",
-    "CalibrationResult": "skyless.api.calibrate",
-    "Fix": "skyless.positioning.fix",
-    "Fleet": "skyless.evaluation.fleet",
-    "NoFixReason": "skyless.positioning.fix",
-    "PlanResult": "skyless.api.plan",
-    "Receiver": "skyless.receiver",
-    "Reception": "skyless.air.reception",
-    "ReplayResult": "skyless.api.replay",
-    "Request": "skyless.evaluation.scenarios",
-    "SimulationResult": "skyless.api.simulate",
-    "Site": "skyless.site.model",
-    "SkylessError": "skyless.errors",
-    "SiteTrust": "skyless.trusted_receiver",
-    "SlotPlanResult": "skyless.api.slot_plan",
-    "StudyResult": "skyless.api.study",
-    "Transmission": "skyless.air.reception",
-    "Trust": "skyless.trusted_receiver",
-    "TrustedReceiver": "skyless.trusted_receiver",
-    "calibrate": "skyless.api.calibrate",
-    "fleet_of": "skyless.evaluation.scenarios",
-    "lab_site": "skyless.site.lab",
-    "load_site": "skyless.site.load",
-    "locate": "skyless.positioning.methods.locate",
-    "open_recording": "skyless.api.recording",
-    "plan": "skyless.api.plan",
-    "replay": "skyless.api.replay",
-    "simulate": "skyless.api.simulate",
-    "study": "skyless.api.study",
+    "METHODS": "skyless.core.method_names",
+    "Anchor": "skyless.core.anchor.anchor",
+    "BiasResult": "skyless.cli.api.survey",
+    "Fix": "skyless.core.fix",
+    "Fleet": "skyless.sim.evaluation.fleet",
+    "NoFixReason": "skyless.core.fix",
+    "PlanResult": "skyless.cli.api.plan",
+    "RatePlanResult": "skyless.cli.api.rate_plan",
+    "Receiver": "skyless.core.tag.receiver",
+    "Reception": "skyless.core.air.reception",
+    "ReplayResult": "skyless.cli.api.replay",
+    "Request": "skyless.sim.evaluation.scenarios",
+    "SimulationResult": "skyless.cli.api.simulate",
+    "Site": "skyless.core.site",
+    "SkylessError": "skyless.core.errors",
+    "SiteTrust": "skyless.core.tag.trusted_receiver",
+    "StudyResult": "skyless.cli.api.study",
+    "SurveyResult": "skyless.cli.api.survey",
+    "Transmission": "skyless.core.air.reception",
+    "Trust": "skyless.core.tag.trusted_receiver",
+    "TrustedReceiver": "skyless.core.tag.trusted_receiver",
+    "fleet_of": "skyless.sim.evaluation.scenarios",
+    "lab_site": "skyless.sim.lab",
+    "load_site": "skyless.site.file.load",
+    "locate": "skyless.core.tag.locate",
+    "open_recording": "skyless.cli.api.replay",
+    "plan": "skyless.cli.api.plan",
+    "replay": "skyless.cli.api.replay",
+    "simulate": "skyless.cli.api.simulate",
+    "study": "skyless.cli.api.study",
+    "survey_site": "skyless.cli.api.survey",
 }
 
 __all__ = [
     "METHODS",
     "Anchor",
-    "CalibrationResult",
+    "BiasResult",
     "Fix",
     "Fleet",
     "NoFixReason",
     "PlanResult",
+    "RatePlanResult",
     "Receiver",
     "Reception",
     "ReplayResult",
@@ -81,12 +82,11 @@ __all__ = [
     "Site",
     "SiteTrust",
     "SkylessError",
-    "SlotPlanResult",
     "StudyResult",
+    "SurveyResult",
     "Transmission",
     "Trust",
     "TrustedReceiver",
-    "calibrate",
     "fleet_of",
     "lab_site",
     "load_site",
@@ -96,6 +96,7 @@ __all__ = [
     "replay",
     "simulate",
     "study",
+    "survey_site",
 ]
 
 

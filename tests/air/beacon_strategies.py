@@ -1,99 +1,65 @@
-"""Beacons over the whole range of every field, on the grid of what the wire can say."""
+"""Beacons of protocol 2 over the whole range of every field, on the grid of what the wire can say."""
 
 from hypothesis import strategies as st
+from protocol1_strategies import accuracy_pages, coordinates_m, georeference_pages, noise_pages, unsigned
 
-from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
-from skyless.air.beacon import Beacon, Heard, MasterTime
-from skyless.air.codec import heard_capacity
-from skyless.air.page_codec import MAX_NOISE, MAX_SUPERFRAME_TICKS
-
-
-def unsigned(bits):
-    return st.integers(0, (1 << bits) - 1)
+from skyless.core.air.almanac import KeyPage, SitePage
+from skyless.core.air.beacon import Authentication, Beacon, StatedPosition
+from skyless.core.air.codec import heard_capacity
+from skyless.core.air.frame import Heard
+from skyless.core.air.instants import LONGEST_PERIOD_CODE
 
 
-def on_grid(low, high, steps_per_unit):
-    return st.integers(low * steps_per_unit, high * steps_per_unit).map(lambda step: step / steps_per_unit)
+def signed_steps(bits, steps_per_unit):
+    most = (1 << bits - 1) - 1
+    return st.integers(-most, most).map(lambda step: step / steps_per_unit)
 
 
-coordinates_m = on_grid(-1_000_000, 1_000_000, 1000)
-
-anchor_pages = st.builds(AnchorPage, unsigned(16), coordinates_m, coordinates_m, coordinates_m, unsigned(8))
-noises = st.floats(0.0, MAX_NOISE, width=32)
-noise_pages = st.builds(NoisePage, noises, noises, noises, noises)
-georeference_pages = st.builds(
-    GeoreferencePage,
-    on_grid(-90, 90, 10**7),
-    on_grid(-180, 180, 10**7),
-    coordinates_m,
-    st.integers(0, 3_599_999_999).map(lambda step: step / 1e7),
+stated_m = signed_steps(24, 1000)
+positions = st.builds(
+    StatedPosition,
+    stated_m, stated_m, stated_m, unsigned(8).map(lambda step: step / 1000), st.integers(-128, 127), unsigned(8),
+)  # fmt: skip
+site_pages = st.builds(SitePage, st.integers(1, 255), st.none() | coordinates_m)
+pages = st.one_of(
+    st.builds(KeyPage, st.binary(min_size=16, max_size=16)), site_pages, noise_pages, georeference_pages, accuracy_pages
 )
-stds_m = unsigned(16).map(lambda step: step / 10_000)
-accuracy_pages = st.builds(
-    AccuracyPage,
-    stds_m,
-    stds_m,
-    stds_m,
-    stds_m,
-    st.integers(1, 0xFFFF).map(lambda step: step / 100),
-    st.integers(1, 0xFFFF).map(lambda step: step / 10),
-)
-
-
-@st.composite
-def schedule_pages(draw):
-    slots = draw(st.integers(1, 255))
-    slot_ticks = draw(st.integers(1, min(2**32 - 1, MAX_SUPERFRAME_TICKS // slots)))
-    frames_per_node = draw(st.integers(1, slots))
-    anchors = draw(st.integers(1, slots // frames_per_node))
-    height_m = draw(st.none() | coordinates_m)
-    return SchedulePage(slot_ticks, slots, frames_per_node, draw(unsigned(16)), anchors, height_m)
-
-
-pages = st.one_of(anchor_pages, schedule_pages(), noise_pages, georeference_pages, accuracy_pages)
-master_times = st.builds(MasterTime, unsigned(48), unsigned(16).map(lambda step: step / 64))
 
 
 @st.composite
 def beacons(draw):
-    master_time, page = draw(st.none() | master_times), draw(st.none() | pages)
-    ids = draw(st.lists(unsigned(16), min_size=2, max_size=12, unique=True))
-    anchor, master, *others = ids
-    master_heard = draw(st.none() | st.builds(Heard, st.just(master), unsigned(8), unsigned(40)))
-    if draw(st.booleans()):
-        master, master_heard = anchor, None
-    fit = heard_capacity(master_heard is not None, master_time is not None, page is not None)
-    heard = tuple(Heard(other, draw(unsigned(8)), draw(unsigned(40))) for other in others[:fit])
+    certificate = draw(st.none() | st.binary(min_size=94, max_size=94))
+    position = page = None
+    if certificate is None:
+        position, page = draw(st.none() | positions), draw(st.none() | pages)
+    fit = heard_capacity(position=position is not None, page=page is not None, certificate=certificate is not None)
+    anchor, *others = draw(st.lists(unsigned(16), min_size=1, max_size=1 + fit, unique=True))
     return Beacon(
         site=draw(unsigned(16)),
         anchor=anchor,
         sequence=draw(unsigned(8)),
-        superframe=draw(unsigned(32)),
-        slot=draw(unsigned(8)),
         tx_ticks=draw(unsigned(40)),
-        almanac_issue=draw(unsigned(8)),
-        master=master,
-        term=draw(unsigned(8)),
-        master_heard=master_heard,
-        master_time=master_time,
-        heard=heard,
+        almanac_issue=draw(unsigned(16)),
+        period_code=draw(st.integers(0, LONGEST_PERIOD_CODE)),
+        position=position,
+        heard=tuple(Heard(other, draw(unsigned(8)), draw(unsigned(40))) for other in others),
+        weak=draw(st.integers(0, (1 << len(others)) - 1)),
         page=page,
+        certificate=certificate,
+        authentication=draw(st.none() | st.builds(Authentication, unsigned(16), st.binary(min_size=8, max_size=8))),
     )
 
 
 FULL = Beacon(
     site=42,
-    anchor=3,
+    anchor=3000,
     sequence=200,
-    superframe=1_000_000,
-    slot=2,
     tx_ticks=0xAB_CDEF_0123,
-    almanac_issue=119,
-    master=1,
-    term=254,
-    master_heard=Heard(1, 198, 0xAB_BDEE_FEDC),
-    master_time=MasterTime(0x1234_5678_9ABC, 3.5),
+    almanac_issue=0x7719,
+    period_code=0x1E,
+    position=StatedPosition(-1006.0, 4004.125, 2.5, 0.02, -1, 7),
     heard=(Heard(2, 199, 0xAB_C5EF_0001), Heard(6, 41, 7), Heard(5, 40, 8), Heard(4, 39, 9)),
-    page=AnchorPage(4, 6.0, 4.125, 2.5, 3),
+    weak=0b0010,
+    page=SitePage(4, 1.2),
 )
-"""A beacon with every part."""
+"""A beacon with every part that goes with others."""

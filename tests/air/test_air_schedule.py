@@ -2,10 +2,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.air.almanac import SchedulePage
-from skyless.constants import TICK_S
-from skyless.site.model import AnchorSite, ScheduleSite, Site
-from skyless.site.slots import Schedule, first_slots, schedule_from_page, schedule_of
+from skyless.core.air.almanac import SchedulePage
+from skyless.core.constants import TICK_S
+from skyless.core.protocol1.schedule import Schedule, first_slots, schedule_from_page, schedule_of
+from skyless.core.site import AnchorSite, ScheduleSite, Site
 
 
 def site(first=(None,) * 7, master=11, **schedule):

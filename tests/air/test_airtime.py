@@ -1,6 +1,6 @@
 import pytest
 
-from skyless.air.ieee802154 import (
+from skyless.core.air.ieee802154 import (
     DATA_SYMBOL_S,
     HEADER_SYMBOL_S,
     PREAMBLE_SYMBOL_S,

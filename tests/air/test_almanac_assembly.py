@@ -1,9 +1,9 @@
 import msgspec
 import pytest
 
-from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
-from skyless.site.almanac_pages import AlmanacAssembly
-from skyless.site.model import AccuracySite
+from skyless.core.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
+from skyless.core.protocol1.almanac import AlmanacAssembly
+from skyless.core.site import AccuracySite
 
 SCHEDULE = SchedulePage(2**27, 3, 1, 1, 3, 1.2)
 NOISE = NoisePage(1e-10, 1e-10, 2e-11, 1e-9)

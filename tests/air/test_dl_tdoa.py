@@ -7,12 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.air.dl_tdoa import MOST_ANCHORS_KEPT, MOST_ROUNDS_AT_ONCE, DtMessage, DtRounds, host_time_s
-from skyless.air.masterless_packets import Packet, Relay
-from skyless.air.uci_measurements import (
+from skyless.core.air.masterless_packets import Packet, Relay
+from skyless.core.constants import TICK_M, TICK_RATE_HZ
+from skyless.radio.uci.dl_tdoa import MAX_ANCHORS_KEPT, MAX_ROUNDS_AT_ONCE, DtMessage, DtRounds, host_time_s
+from skyless.radio.uci.uci import (
     DtMessageType,
 )
-from skyless.constants import TICK_M, TICK_RATE_HZ
 
 PLACES_M = {1: (0.0, 0.0, 2.0), 2: (6.0, 0.0, 2.0), 3: (6.0, 8.0, 2.0)}
 POLL = DtMessage(None, 1, DtMessageType.POLL, 7, 0, 2**40 - 500, 1000, False)
@@ -82,7 +82,7 @@ def test_messages_of_no_use_have_a_reason(messages, reason):
 
 def test_addresses_that_change_for_ever_hide_no_newer_position():
     rounds = DtRounds()
-    for address in range(3 * MOST_ANCHORS_KEPT):
+    for address in range(3 * MAX_ANCHORS_KEPT):
         rounds.on_message(replace(POLL, address=address, common_time=True, position_m=PLACES_M[1]))
     response = replace(RESPONSE, address=2**16, common_time=True, position_m=PLACES_M[2])
     assert isinstance(rounds.on_message(response), Packet)
@@ -126,7 +126,7 @@ def test_any_messages_in_any_order(messages):
 
 def test_what_is_kept_of_rounds_is_bounded():
     rounds = DtRounds()
-    for number in range(3 * MOST_ROUNDS_AT_ONCE):
+    for number in range(3 * MAX_ROUNDS_AT_ONCE):
         rounds.on_message(replace(POLL, round=number))
-    assert isinstance(rounds.on_message(replace(RESPONSE, round=3 * MOST_ROUNDS_AT_ONCE - 1)), Packet)
+    assert isinstance(rounds.on_message(replace(RESPONSE, round=3 * MAX_ROUNDS_AT_ONCE - 1)), Packet)
     assert rounds.on_message(replace(RESPONSE, round=0)) == "message-without-poll"

@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.air.ieee802154 import fcs, is_intact
+from skyless.core.air.ieee802154 import fcs, is_intact
 
 
 def test_check_value_of_the_catalogue():

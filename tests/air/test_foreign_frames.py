@@ -3,11 +3,11 @@
 import struct
 
 import pytest
-from beacon_strategies import FULL
+from protocol1_strategies import FULL
 
-from skyless.air.beacon import Malformed
-from skyless.air.codec import decode, encode
-from skyless.air.ieee802154 import fcs
+from skyless.core.air.frame import Malformed
+from skyless.core.air.ieee802154 import fcs
+from skyless.core.protocol1.codec import decode, encode
 
 LONG_ADDRESSES = 0xDC41
 SHORT_ADDRESSES = 0x8841

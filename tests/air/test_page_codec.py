@@ -2,13 +2,13 @@ import math
 import struct
 
 import pytest
-from beacon_strategies import pages
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from protocol1_strategies import pages
 
-from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
-from skyless.air.beacon import Malformed
-from skyless.air.page_codec import decode_page, encode_page
+from skyless.core.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
+from skyless.core.air.frame import Malformed
+from skyless.core.air.page_codec import decode_page, encode_page
 
 metres = st.floats(-1e6, 1e6)
 EARTH_RADIUS_M = 6_378_137.0

@@ -7,16 +7,17 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from skyless.air.beacon2 import Beacon2
-from skyless.air.codec2 import decode_2, encode_2, heard_capacity_2
-from skyless.air.ieee802154 import air_time_s
-from skyless.positioning.methods.selection import MOST_ANCHORS_IN_USE
-from skyless.site.local_almanac import LEAST_ANCHORS, MOST_ISSUES, MOST_PAGES, MOST_POSITIONS
+from skyless.core.air.beacon import Beacon
+from skyless.core.air.codec import decode, encode, heard_capacity
+from skyless.core.air.ieee802154 import air_time_s
+from skyless.core.air.instants import LONGEST_PERIOD_CODE, OFFERED_HZ, SHORTEST_PERIOD_S, period_ticks
+from skyless.core.air.local_almanac import MAX_ISSUE_PAGES, MAX_ISSUES, MAX_POSITIONS, MIN_ANCHORS
+from skyless.core.tag.selection import MAX_ANCHORS_IN_USE
+from skyless.core.ticks import to_seconds
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "protocol2.md").read_text(encoding="utf-8")
-SIGNED = {"rate", "x_m", "y_m", "z_m", "floor", "residual_ticks", "tag_height_m"}
-STEPS = {"rate": 2**36, "x_m": 1e3, "y_m": 1e3, "z_m": 1e3, "std_m": 1e3, "residual_ticks": 256, "std_ticks": 64}
-STEPS |= {"tag_height_m": 1e3}
+SIGNED = {"x_m", "y_m", "z_m", "floor", "tag_height_m"}
+STEPS = {"x_m": 1e3, "y_m": 1e3, "z_m": 1e3, "std_m": 1e3, "tag_height_m": 1e3}
 
 
 def block(language):
@@ -29,9 +30,9 @@ ROWS = re.findall(r"^\| (\d+) \| `([0-9a-f ]+)` \| (.+?) \| (-?\w+) \|$", DOCUME
 
 
 def test_example_decodes_to_the_stated_beacon():
-    stated = msgspec.convert(STATED, Beacon2)
-    assert decode_2(FRAME) == stated
-    assert encode_2(stated) == FRAME
+    stated = msgspec.convert(STATED, Beacon)
+    assert decode(FRAME) == stated
+    assert encode(stated) == FRAME
 
 
 def test_rows_of_the_example_are_the_frame():
@@ -58,17 +59,22 @@ def test_rows_give_the_same_values_as_the_beacon():
         if isinstance(stated, int | float):
             assert stated * STEPS.get(path[-1], 1) == pytest.approx(int(value, 0), abs=1e-6), field
             compared += 1
-    assert compared == 30
+    assert compared == 20
 
 
-@pytest.mark.parametrize(
-    ("slot_time", "site_time", "bare", "entries"), [(False, False, 52, 8), (True, False, 68, 6), (True, True, 73, 5)]
-)
-def test_lengths_and_air_times_of_the_table(slot_time, site_time, bare, entries):
-    assert heard_capacity_2(slot_time=slot_time, position=True, site_time=site_time) == entries
-    longest = bare + 8 * entries
-    assert f"| {bare} | {entries} | {longest} | {1e6 * air_time_s(longest):.0f} µs |" in DOCUMENT
+def test_length_and_air_time_of_the_table():
+    entries = heard_capacity(position=True)
+    longest = 53 + 8 * entries
+    assert f"| 53 | {entries} | {longest} | {1e6 * air_time_s(longest):.0f} µs |" in DOCUMENT
+
+
+def test_periods_of_the_document():
+    assert round(OFFERED_HZ) == 476
+    assert "476 beacons a second" in DOCUMENT
+    assert to_seconds(period_ticks(STATED["period_code"])) == pytest.approx(SHORTEST_PERIOD_S) == 0.015
+    assert [round(1e3 * to_seconds(period_ticks(code))) for code in (0, LONGEST_PERIOD_CODE)] == [4, 3968]
+    assert "0x9F" in DOCUMENT
 
 
 def test_bounds_of_the_document():
-    assert (MOST_ANCHORS_IN_USE, MOST_POSITIONS, MOST_ISSUES, MOST_PAGES, LEAST_ANCHORS) == (24, 64, 4, 4, 3)
+    assert (MAX_ANCHORS_IN_USE, MAX_POSITIONS, MAX_ISSUES, MAX_ISSUE_PAGES, MIN_ANCHORS) == (24, 64, 4, 4, 3)

@@ -7,11 +7,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from skyless.air.almanac import AnchorPage
-from skyless.air.beacon import Beacon, Malformed
-from skyless.air.codec import decode, encode
-from skyless.site.almanac_pages import page_for, pages_of
-from skyless.site.model import AnchorSite, Site
+from skyless.core.air.almanac import AnchorPage
+from skyless.core.air.frame import Malformed
+from skyless.core.protocol1.almanac import page_for, pages_of
+from skyless.core.protocol1.beacon import Beacon
+from skyless.core.protocol1.codec import decode, encode
+from skyless.core.site import AnchorSite, Site
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text(encoding="utf-8")
 
@@ -65,7 +66,7 @@ def test_example_carries_the_page_of_its_turn():
     assert page_for(pages, STATED["superframe"], STATED["slot"]) == AnchorPage(4, 6.0, 4.125, 2.5, 3) == pages[6]
 
 
-@pytest.mark.parametrize("reason", Malformed)
+@pytest.mark.parametrize("reason", sorted({*Malformed} - {Malformed.BAD_PERIOD}))
 def test_every_reason_is_listed(reason):
     assert f"| `{reason}` |" in DOCUMENT
 

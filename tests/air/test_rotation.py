@@ -6,11 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
-from skyless.air.page_codec import decode_page, encode_page
-from skyless.site.almanac_pages import almanac_issue, page_for, pages_of
-from skyless.site.check import SITE_LIMITS
-from skyless.site.model import (
+from skyless.core.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
+from skyless.core.air.page_codec import decode_page, encode_page
+from skyless.core.protocol1.almanac import almanac_issue, page_for, pages_of
+from skyless.core.site import (
     EXACT,
     AccuracySite,
     AnchorSite,
@@ -20,6 +19,7 @@ from skyless.site.model import (
     Site,
     TagsSite,
 )
+from skyless.site.file.check import SITE_LIMITS
 
 
 def site(anchors=7, **changes):

@@ -1,10 +1,10 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.air.site_choice import MOST_SITES, SITE_SILENCE_TICKS, TRIAL_TICKS, SiteChoice, SiteKey, SiteUse
-from skyless.ticks import from_seconds
+from skyless.core.air.site_choice import MAX_SITES, SITE_SILENCE_TICKS, TRIAL_TICKS, SiteChoice, SiteUse
+from skyless.core.ticks import from_seconds
 
-HOME, OTHER = SiteKey(1, 2), SiteKey(77, 2)
+HOME, OTHER = 1, 77
 STEP = from_seconds(0.01)
 
 
@@ -23,7 +23,7 @@ def test_until_there_are_fixes_the_site_with_more_anchors_is_used():
     assert uses == [
         SiteUse.CHANGED, SiteUse.USED, SiteUse.FOREIGN, SiteUse.FOREIGN, SiteUse.CHANGED, SiteUse.FOREIGN,
     ]  # fmt: skip
-    assert choice.key == HOME
+    assert choice.site == HOME
 
 
 def test_a_site_with_fixes_stays_until_it_is_silent():
@@ -43,10 +43,6 @@ def test_a_site_that_gives_no_fixes_any_more_is_left_for_one_with_more_anchors()
     assert received(choice, (HOME, 1), (OTHER, 1), (OTHER, 2), start=late)[-1] is SiteUse.CHANGED
 
 
-def test_another_version_is_another_site():
-    assert received(SiteChoice(), (HOME, 1), (SiteKey(1, 1), 1))[-1] is SiteUse.FOREIGN
-
-
 def test_only_the_configured_site_is_used():
     choice = SiteChoice(77)
     assert received(choice, (HOME, 1), (HOME, 2), (OTHER, 1)) == [SiteUse.FOREIGN, SiteUse.FOREIGN, SiteUse.CHANGED]
@@ -55,12 +51,12 @@ def test_only_the_configured_site_is_used():
 @given(st.lists(st.tuples(st.integers(0, 200), st.integers(0, 300)), max_size=400))
 def test_memory_is_bounded_and_the_site_in_use_is_kept(rows):
     choice = SiteChoice()
-    received(choice, *((SiteKey(site, 2), anchor) for site, anchor in rows))
-    assert len(choice.anchors) <= MOST_SITES
+    received(choice, *rows)
+    assert len(choice.anchors) <= MAX_SITES
     assert all(len(anchors) <= 32 for anchors in choice.anchors.values())
     if rows:
-        assert choice.key is not None
-        assert choice.key.site << 8 | 2 in choice.anchors
+        assert choice.site is not None
+        assert choice.site in choice.anchors
 
 
 def sites_used(choice, rows, start=0):
@@ -69,7 +65,7 @@ def sites_used(choice, rows, start=0):
     for number, (key, anchor) in enumerate(rows):
         if choice.on_beacon(key, anchor, start + number * STEP) is not SiteUse.FOREIGN:
             choice.heard_ticks = start + number * STEP
-        used.append(choice.key)
+        used.append(choice.site)
     return used
 
 

@@ -15,24 +15,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.air.uci import UciPacket, UciReader, UciType, encode_packet
-from skyless.air.uci_location import (
-    GeodeticPoint,
-    decode_relative,
-    decode_wgs84,
-    encode_relative,
-    encode_wgs84,
-    location_of,
-)
-from skyless.air.uci_measurements import (
+from skyless.radio.uci.uci import (
     LOCATION_BYTES,
     NO_LOCATION,
     RELATIVE_LOCATION,
     WGS84_LOCATION,
     DtMeasurement,
+    GeodeticPoint,
     SessionInfo,
+    UciPacket,
+    UciReader,
+    UciType,
+    decode_relative,
     decode_session_info,
+    decode_wgs84,
+    encode_packet,
+    encode_relative,
     encode_session_info,
+    encode_wgs84,
+    location_of,
 )
 
 INPUTS = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "20000"))
@@ -59,22 +60,14 @@ def notification(kind, count, measurements, wide=0):
 
 def test_published_measurements_of_version_1():
     info = decode_session_info(notification(2, 2, AOSP_1))
-    assert (info.version, info.sequence, info.session, info.interval_ms) == (1, 1, 2, 200)
-    for one, location, rounds in zip(
-        info.measurements,
-        ("07090709050709 0a0102", "07090709 05070 90a01020102".replace(" ", "")),
-        (10, 10),
-        strict=True,
-    ):
+    assert (info.version, info.sequence, info.session) == (1, 1, 2)
+    for one, location in zip(info.measurements, ("07090709050709 0a0102", "070907090507090a01020102"), strict=True):
         assert (one.address, one.status, one.message, one.block, one.round) == (0x010A, 0x33, 5, 0x0502, 7)
-        assert (one.nlos, one.azimuth_deg * 128, one.azimuth_fom) == (9, 0x010A, 2)
-        assert (one.elevation_deg * 128, one.elevation_fom, one.rssi_dbm) == (0x0705, 9, -5.0)
         assert (one.tx_ticks, one.tx_bytes) == (0x02010A0907050201, 8)
         assert (one.rx_ticks_tag, one.rx_bytes) == (0x0705090705, 5)
-        assert (one.anchor_cfo_ppm * 1024, one.cfo_ppm * 1024) == (0x0A09, 0x0201)
         assert (one.initiator_reply_ticks, one.responder_reply_ticks) == (0x05090705, 0x010A0907)
         assert one.flight_ticks == 0x0502
-        assert (one.common_time, len(one.active_rounds)) == (True, rounds)
+        assert one.common_time
         assert one.location == bytes.fromhex(location)
     assert [one.location_kind for one in info.measurements] == [RELATIVE_LOCATION, WGS84_LOCATION]
 
@@ -84,25 +77,22 @@ def test_published_measurements_of_version_2(kind):
     info = decode_session_info(notification(kind, 2, AOSP_2))
     one, two = info.measurements
     assert info.version == 2
-    assert (one.address, one.status, one.message, one.block, one.round, one.nlos) == (0x010A, 0, 5, 0x0502, 7, 9)
-    assert (one.azimuth_deg * 128, one.azimuth_fom, one.elevation_deg * 128, one.elevation_fom) == (0x10A, 2, 0x705, 9)
-    assert (one.rssi_dbm, one.rx_ticks_tag, one.tx_ticks) == (-5.0, 0x0504030201, 0x0807060504030201)
-    assert (one.active_rounds, one.location, one.supercluster) == (b"\x11\x22", b"\xaa\xbb\xcc", 0x55)
+    assert (one.address, one.status, one.message, one.block, one.round) == (0x010A, 0, 5, 0x0502, 7)
+    assert (one.rx_ticks_tag, one.tx_ticks, one.location) == (0x0504030201, 0x0807060504030201, b"\xaa\xbb\xcc")
     assert location_of(one) is None
-    assert (two.address, two.status, two.block, two.round, two.nlos) == (0x020B, 1, 0x0306, 8, 1)
+    assert (two.address, two.status, two.block, two.round) == (0x020B, 1, 0x0306, 8)
     assert (two.rx_ticks_tag, two.rx_bytes, two.tx_ticks, two.tx_bytes) == (0x05040302, 4, 0x070605040302, 6)
-    assert (two.active_rounds, two.location, two.supercluster) == (b"\x33", b"", None)
+    assert two.location == b""
     (short,) = decode_session_info(notification(kind, 1, AOSP_2_SHORT)).measurements
-    assert (short.rx_ticks_tag, short.tx_bytes, short.active_rounds, short.location) == (0x05040302, 0, b"", b"")
-    assert short.supercluster == 0x77
+    assert (short.rx_ticks_tag, short.tx_bytes, short.location) == (0x05040302, 0, b"")
 
 
 @pytest.mark.parametrize("wide", [False, True])
 def test_published_notifications_without_measurements(wide):
-    body = bytes.fromhex("62000019 00020304 05060708 00 0a020101 02 00") + bytes((wide, *bytes(9)))
+    body = bytes.fromhex("62000019 00020304 05060708 00 00000000 02 00") + bytes((wide, *bytes(9)))
     (packet,) = UciReader(Counter()).feed(body)
     info = decode_session_info(packet)
-    assert info == SessionInfo(0x04030200, 0x08070605, 1, (), wide, 0x0101020A)
+    assert info == SessionInfo(0x04030200, 0x08070605, 1, (), wide)
     assert encode_packet(encode_session_info(info)) == body
 
 
@@ -133,19 +123,12 @@ def whole(bits):
     return st.integers(0, (1 << bits) - 1)
 
 
-cfo = st.none() | st.integers(-32767, 32767).map(lambda steps: steps / 1024)
-angle = st.integers(-32768, 32767).map(lambda steps: steps / 128)
 FIELDS = {
-    **{name: whole(8) for name in ("message", "round", "status", "nlos", "azimuth_fom", "elevation_fom")},
+    **{name: whole(8) for name in ("message", "round", "status")},
     **{name: whole(32) for name in ("initiator_reply_ticks", "responder_reply_ticks")},
     "block": whole(16),
     "flight_ticks": whole(16),
     "common_time": st.booleans(),
-    "azimuth_deg": angle,
-    "elevation_deg": angle,
-    "rssi_dbm": whole(8).map(lambda steps: -steps / 2),
-    "anchor_cfo_ppm": cfo,
-    "cfo_ppm": cfo,
 }
 
 
@@ -156,10 +139,9 @@ def measurements(draw, version, wide):
     if version == 1:
         kind = draw(st.sampled_from((NO_LOCATION, WGS84_LOCATION, RELATIVE_LOCATION)))
         size = LOCATION_BYTES[kind]
-        location, rounds, supercluster = draw(st.binary(min_size=size, max_size=size)), st.binary(max_size=15), None
+        location = draw(st.binary(min_size=size, max_size=size))
     else:
-        kind, location, rounds = NO_LOCATION, draw(st.binary(max_size=30)), st.binary(max_size=20)
-        supercluster = draw(st.none() | whole(8))
+        kind, location = NO_LOCATION, draw(st.binary(max_size=30))
     return DtMeasurement(
         address=draw(whole(64 if wide else 16)),
         tx_ticks=draw(whole(8 * tx_bytes)),
@@ -168,8 +150,6 @@ def measurements(draw, version, wide):
         rx_bytes=rx_bytes,
         location_kind=kind,
         location=location,
-        active_rounds=draw(rounds),
-        supercluster=supercluster,
         **{name: draw(strategy) for name, strategy in FIELDS.items()},
     )
 
@@ -180,7 +160,7 @@ def notifications(draw):
     found = draw(st.lists(measurements(version, wide), max_size=8))
     if not found:
         version = 1  # which no byte shows without a measurement
-    return SessionInfo(draw(whole(32)), draw(whole(32)), version, tuple(found), wide, draw(whole(32)))
+    return SessionInfo(draw(whole(32)), draw(whole(32)), version, tuple(found), wide)
 
 
 @given(notifications(), st.lists(st.integers(1, 300), max_size=20))
@@ -227,24 +207,16 @@ def test_a_control_of_16_bits_is_accepted_where_the_size_shows_it():
     del body[39:41]
     body[0] -= 2
     (one,) = decode_session_info(notification(6, 1, bytes(body))).measurements
-    assert (one.tx_ticks, one.active_rounds, one.supercluster) == (0x0807060504030201, b"\x11\x22", 0x55)
-
-
-def test_offsets_beyond_32_ppm_are_unknown():
-    one = DtMeasurement(1, 0, 0, 0, 0, 0, cfo_ppm=38.0, anchor_cfo_ppm=-31.5)
-    (again,) = decode_session_info(encode_session_info(SessionInfo(0, 0, 1, (one,)))).measurements
-    assert (again.cfo_ppm, again.anchor_cfo_ppm) == (None, -31.5)
+    assert (one.tx_ticks, one.location) == (0x0807060504030201, b"\xaa\xbb\xcc")
 
 
 @pytest.mark.parametrize(
     ("version", "changes"),
     [
         (1, {"tx_bytes": 6}),
-        (1, {"active_rounds": bytes(16)}),
         (1, {"location": b"12"}),
         (1, {"tx_ticks": 1 << 40}),
         (2, {"rx_bytes": 9}),
-        (2, {"supercluster": 256}),
         (1, {"address": 1 << 16}),
         (1, {"block": 1 << 16}),
     ],

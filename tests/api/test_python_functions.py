@@ -1,4 +1,4 @@
-"""``skyless.simulate``, ``replay``, ``plan``, ``calibrate``, ``study``: the commands' figures, arrays, tables."""
+"""``skyless.simulate``, ``replay``, ``plan``, ``survey_site``, ``study``: the commands' figures, arrays, tables."""
 
 import json
 import sys
@@ -13,20 +13,20 @@ from msgspec.structs import replace
 import skyless
 import synthetic_recordings as synthetic
 from recordings import live_site
-from skyless.air.page_codec import MAX_COORDINATE_M
 from skyless.cli.common.output import to_json
 from skyless.cli.main import main
-from skyless.planning.columns import PLAN_COLUMNS
-from skyless.simulation.impairments import AnchorBias
-from skyless.site.grid import grid_site
-from skyless.site.lab import lab_site
-from skyless.site.load import load_site
-from skyless.site.template import site_template
-from skyless.studies import motion
-from skyless.studies.catalogue import STUDIES, _of_worlds
-from skyless.studies.common.picture import Look
-from skyless.studies.common.plan import MEASURED
-from skyless.survey_inputs.samples import Stay
+from skyless.core.air.page_codec import MAX_COORDINATE_M
+from skyless.core.site import AccuracySite
+from skyless.research.calibration.options import Stay
+from skyless.research.studies import motion
+from skyless.research.studies.catalogue import STUDIES, _of_worlds
+from skyless.research.studies.common.picture import Look
+from skyless.research.studies.common.plan import MEASURED
+from skyless.sim.impairments import AnchorBias
+from skyless.sim.lab import paper_lab_site
+from skyless.site.file.load import load_site
+from skyless.site.file.template import grid_site, site_template
+from skyless.site.planning.links import PLAN_COLUMNS
 
 MEASURED_TIMES = {"skyless_version", "wall_s", "speed", "receptions_per_s", *MEASURED}
 ROWS = 600
@@ -38,7 +38,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("functions")
     (folder / "anchors.csv").write_text(synthetic.anchors_csv())
     (folder / "truth.csv").write_text(synthetic.truth_csv(ROWS * 0.002 + 1.0))
-    (folder / "lab.toml").write_text(site_template(lab_site()))
+    (folder / "lab.toml").write_text(site_template(paper_lab_site(accuracy=AccuracySite())))
     synthetic.write(folder / "tdoa-table", "tdoa-table", ROWS)
     live_site.record(folder / "stay.mcap", live_site.messages(3.0, join_s=0.0))
     return folder
@@ -62,8 +62,8 @@ def results(folder):
         replay=skyless.replay(folder / "tdoa-table", anchors=anchors, truth=truth, settle_s=0.5),
         recorded=skyless.replay(folder / "stay.mcap"),
         plan=skyless.plan(folder / "lab.toml", method="weighted", step_m=1.0, target_m=0.1),
-        calibrate=skyless.calibrate(folder / "tdoa-table", anchors=anchors, truth=truth),
-        delays=skyless.calibrate(folder / "stay.mcap", site=folder / "lab.toml", at_m=(3.0, 4.0)),
+        biases=skyless.survey_site(recording=folder / "tdoa-table", anchors=anchors, truth=truth),
+        delays=skyless.survey_site(recording=folder / "stay.mcap", site=folder / "lab.toml", stays=((3.0, 4.0),)),
         study=skyless.study("motion", quick=True, method="weighted", worlds=2, seconds=1.0, processes=1),
     )
 
@@ -73,8 +73,8 @@ COMMANDS = {
     "replay": "replay tdoa-table --anchors anchors.csv --truth truth.csv --settle 0.5",
     "recorded": "replay stay.mcap",
     "plan": "plan lab.toml --method weighted --step 1 --target 10",
-    "calibrate": "calibrate tdoa-table --anchors anchors.csv --truth truth.csv",
-    "delays": "calibrate stay.mcap --site lab.toml --at 3,4",
+    "biases": "survey --recording tdoa-table --anchors anchors.csv --truth truth.csv",
+    "delays": "survey --recording stay.mcap --site lab.toml --at 3,4",
     "study": "study motion --quick --method weighted --worlds 2 --seconds 1 --processes 1",
 }
 """What each result is compared with."""
@@ -83,7 +83,9 @@ COMMANDS = {
 def repeatable(value):
     """A tree without what is measured and different each time."""
     if isinstance(value, dict):
-        return {key: repeatable(one) for key, one in value.items() if key not in MEASURED_TIMES | {"written"}}
+        return {
+            key: repeatable(one) for key, one in value.items() if key not in MEASURED_TIMES | {"written", "unchanged"}
+        }
     return [repeatable(one) for one in value] if isinstance(value, list) else value
 
 
@@ -100,7 +102,7 @@ def test_functions_print_nothing_and_report_progress(folder, capsys):
     shares = {"simulate": [], "replay": [], "plan": []}
     skyless.simulate(duration_s=2.5, method="weighted", progress=shares["simulate"].append)
     skyless.replay(folder / "tdoa-table", anchors=folder / "anchors.csv", progress=shares["replay"].append)
-    skyless.plan(lab_site(), method="weighted", step_m=1.0, progress=shares["plan"].append)
+    skyless.plan(paper_lab_site(accuracy=AccuracySite()), method="weighted", step_m=1.0, progress=shares["plan"].append)
     assert capsys.readouterr() == ("", "")
     for name, reached in shares.items():
         assert reached == sorted(reached), name
@@ -160,14 +162,20 @@ def test_arrays_of_a_plan(results):
 
 def test_an_optimised_plan_has_other_anchors():
     plan = skyless.plan(
-        lab_site(), method="weighted", step_m=2.0, optimise=4, search_s=0.5, verify_points=1, verify_rounds=100
+        paper_lab_site(accuracy=AccuracySite()),
+        method="weighted",
+        step_m=2.0,
+        optimise=4,
+        search_s=0.5,
+        verify_points=1,
+        verify_rounds=100,
     )
     assert len(plan.site.anchors) == 4
     assert plan.summary["optimised"]["best"]["mean_sigma_m"] > 0.0
     assert plan.summary["verification"].points
 
 
-def test_a_plan_of_slots(tmp_path, capsys):
+def test_a_plan_of_beacons(tmp_path, capsys):
     site = grid_site(30.0, 20.0, 10.0, 4.0, 1.2)
     file = tmp_path / "grid.toml"
     file.write_text(site_template(site))
@@ -176,7 +184,7 @@ def test_a_plan_of_slots(tmp_path, capsys):
     shown = json.loads(capsys.readouterr().out)
     ours = json.loads(to_json(plan.summary))
     assert {key for key in ours if ours[key] != shown[key]} <= {"wall_s", "warnings"}
-    assert isinstance(plan, skyless.SlotPlanResult)
+    assert isinstance(plan, skyless.RatePlanResult)
     assert plan.beacons_per_s.shape == (len(plan.heights_m), len(plan.y_m), len(plan.x_m))
     assert list(plan.to_dataframe().columns) == ["x_m", "y_m", "z_m", "beacons_per_s"]
     assert len(plan.to_dataframe()) == plan.summary["points"]
@@ -184,19 +192,20 @@ def test_a_plan_of_slots(tmp_path, capsys):
     assert "beacons/s" in plan._repr_html_()
 
 
-def test_arrays_and_file_of_a_calibration(results, folder, tmp_path, capsys):
-    found = results.calibrate
+def test_arrays_and_files_of_surveys(results, folder, tmp_path, capsys):
+    found = results.biases
     assert found.anchors.tolist() == sorted(synthetic.ANCHORS_M)
-    assert found.bias_m.shape == found.std_m.shape == found.noise_m.shape == found.delay_m.shape == (8,)
+    assert found.bias_m.shape == found.std_m.shape == (8,)
     assert abs(found.bias_m).max() < 0.1
-    assert np.isnan(found.delay_m).all()
-    assert found.tx_delays_ticks == {}
     delays = results.delays
     assert np.isfinite(delays.delay_m).any()
-    assert set(delays.tx_delays_ticks) <= set(delays.anchors.tolist())
+    assert delays.anchors.tolist() == [1, 2, 3, 4, 5, 6]
     out = tmp_path / "out.csv"
     recording, table, truth = (str(folder / name) for name in ("tdoa-table", "anchors.csv", "truth.csv"))
-    assert main(["calibrate", recording, "--anchors", table, "--truth", truth, "--out", str(out)]) in {None, 0}
+    assert main(["survey", "--recording", recording, "--anchors", table, "--truth", truth, "--out", str(out)]) in {
+        None,
+        0,
+    }
     assert found.corrected_file() == out.read_text()
     assert "tx_antenna_delay_ticks" in delays.corrected_file()
 
@@ -229,8 +238,8 @@ def test_tables_of_the_others(results):
     plan = results.plan.to_dataframe()
     assert tuple(plan.columns) == ("x_m", "y_m", "z_m", *PLAN_COLUMNS)
     assert len(plan) == results.plan.summary["points"]
-    calibration = results.calibrate.to_dataframe()
-    assert list(calibration.columns) == ["anchor", "bias_m", "std_m", "noise_m", "count", "delay_m", "delay_std_m"]
+    assert list(results.biases.to_dataframe().columns) == ["anchor", "bias_m", "std_m", "noise_m", "count"]
+    assert {"id", "x_m", "delay_m", "delay_std_m"} <= set(results.delays.to_dataframe().columns)
     study = results.study.to_dataframe()
     assert study["case"].tolist() == list(results.study.cases)
     assert study["rmse_m"].dtype == np.float64
@@ -286,7 +295,11 @@ def test_a_notebook_shows_the_figures(results, name):
 
 
 def test_a_notebook_shows_names_as_they_are():
-    result = skyless.simulate(site=replace(lab_site(), name="<b>hall</b> & yard"), duration_s=2.2, method="weighted")
+    result = skyless.simulate(
+        site=replace(paper_lab_site(accuracy=AccuracySite()), name="<b>hall</b> & yard"),
+        duration_s=2.2,
+        method="weighted",
+    )
     assert "&lt;b&gt;hall&lt;/b&gt; &amp; yard" in result._repr_html_()
     assert "<b>" not in result._repr_html_()
 
@@ -314,12 +327,12 @@ SIMULATE = [
     ({"qa": float("inf")}, "qa is inf; it should be a number, above 0"),
     ({"qa": 1.0, "dynamics": "robot"}, "^qa and dynamics both set the process noise; give either"),
     ({"dynamics": "car"}, "^dynamics is 'car'; it should be one of walk, robot, drone"),
-    ({"biases": ((1, 2),)}, r"biases\[0\] is \(1, 2\); it should be a skyless.simulation.impairments.AnchorBias"),
+    ({"biases": ((1, 2),)}, r"biases\[0\] is \(1, 2\); it should be a skyless.sim.impairments.AnchorBias"),
     ({"biases": (AnchorBias(99, 1.0),)}, "99"),
     ({"site": "no.toml"}, "site is 'no.toml'; it should be a file"),
     ({"site": 3}, "site is 3; it should be a path to a file"),
-    ({"site": replace(lab_site(), master=9)}, "site: master is 9; it should be"),
-    ({"site": lab_site(), "scenario": "lab"}, "give either scenario or site"),
+    ({"site": replace(paper_lab_site(accuracy=AccuracySite()), master=9)}, "site: master is 9; it should be"),
+    ({"site": paper_lab_site(accuracy=AccuracySite()), "scenario": "lab"}, "give either scenario or site"),
     ({"scenario": "moon"}, "scenario is 'moon'; it should be one of lab, room"),
     ({"scenario": "room", "speed_mps": 2.0}, "speed_mps is for tags that walk from point to point"),
     ({"duration_s": 1}, "settle_s is 2; it should be less than duration_s, which is 1"),
@@ -338,9 +351,9 @@ def test_mistakes_of_a_simulation_are_named(arguments, right):
 
 def test_a_request_that_cannot_be_simulated_is_refused_as_well():
     with pytest.raises(skyless.SkylessError, match=r"positions_m\[0\] is \(3,\)"):
-        skyless.fleet_of(skyless.Request(lab_site(), positions_m=((3,),)))
+        skyless.fleet_of(skyless.Request(paper_lab_site(accuracy=AccuracySite()), positions_m=((3,),)))
     with pytest.raises(skyless.SkylessError, match="noise_ps is nan"):
-        skyless.fleet_of(skyless.Request(lab_site(), noise_ps=float("nan")))
+        skyless.fleet_of(skyless.Request(paper_lab_site(accuracy=AccuracySite()), noise_ps=float("nan")))
 
 
 REPLAY = [
@@ -348,7 +361,7 @@ REPLAY = [
     ({"anchors": "none.csv"}, "anchors is 'none.csv'; it should be a file"),
     ({"anchors": {1: (0, 0)}}, r"anchors\[1\] is \(0, 0\); it should be 3 finite numbers"),
     ({"anchors": {"a": (0, 0, 0)}}, "anchors is 'a'; it should be positions by identifiers"),
-    ({"site": lab_site()}, "give either anchors or site"),
+    ({"site": paper_lab_site(accuracy=AccuracySite())}, "give either anchors or site"),
     ({"truth": [[0, 1, 2]]}, r"truth is an array of shape \(1, 3\); it should be an array of shape \(n, 4\)"),
     ({"truth": [[0, 1, 2, float("nan")]]}, "all finite"),
     (
@@ -357,7 +370,7 @@ REPLAY = [
     ),
     ({"lever_arm_m": (1, 2)}, r"lever_arm_m is \(1, 2\); it should be 3 finite numbers"),
     ({"lever_arm_m": (1, 2, 3)}, "lever_arm_m moves the truth, which truth must give"),
-    ({"tag_height_m": "high"}, "tag_height_m is 'high'; it should be metres, or truth, free, auto"),
+    ({"tag_height_m": "high"}, "tag_height_m is 'high'; it should be metres, truth, free or auto"),
     ({"tag_height_m": float("nan")}, "tag_height_m is nan"),
     ({"tag_height_m": "free", "tag_height_std_m": 0.1}, "tag_height_std_m is 0.1; it should be left out"),
     ({"measurements": "ranges"}, "measurements is 'ranges'; it should be one of"),
@@ -379,7 +392,7 @@ PLAN = [
     ({"site": "no.toml"}, "site is 'no.toml'; it should be a file"),
     ({"noise_ps": float("nan")}, "noise_ps is nan"),
     ({"region_m": (1, 2, 3)}, r"region_m is \(1, 2, 3\); it should be 4 finite numbers"),
-    ({"region_m": (3, 2, 1, 4)}, "x1, y1, x2, y2 with x1 < x2"),
+    ({"region_m": (3, 2, 1, 4)}, "x1,y1,x2,y2 with x1 < x2"),
     ({"region_m": (50, 50, 60, 60)}, "no map"),
     ({"outline_m": ((0, 0), (1, 1))}, "outline_m is .* three or more corners"),
     ({"outline_m": ((20, 20), (30, 20), (30, 30))}, "on the floor"),
@@ -387,7 +400,7 @@ PLAN = [
     ({"mounts_m": ((0, 0, 0, 0),)}, "with two different ends"),
     ({"optimise": 2}, "optimise is 2; it should be a whole number, at least 3, at most 60"),
     ({"step_m": 1e-9}, "no map"),
-    ({"exponent": 2.0}, "exponent is not for this site"),
+    ({"exponent": 2.0}, "exponent is 2; it should be left out: this site is in mode master"),
 ]
 
 
@@ -405,45 +418,45 @@ PLAN = [
     ids=str,
 )
 def test_what_has_no_effect_on_a_plan_of_slots_is_refused(arguments):
-    with pytest.raises(skyless.SkylessError, match=f"{next(iter(arguments))} is not for this site, which is in mode"):
+    with pytest.raises(skyless.SkylessError, match=f"{next(iter(arguments))} is .*; it should be left out: errors are"):
         skyless.plan(grid_site(30.0, 20.0, 10.0, 4.0, 1.2), **arguments)
 
 
 @pytest.mark.parametrize(("arguments", "right"), PLAN, ids=[str(sorted(given)) for given, _ in PLAN])
 def test_mistakes_of_a_plan_are_named(arguments, right):
     with pytest.raises(skyless.SkylessError, match=right) as found:
-        skyless.plan(**{"site": lab_site(), "method": "weighted", **arguments})
+        skyless.plan(**{"site": paper_lab_site(accuracy=AccuracySite()), "method": "weighted", **arguments})
     assert "\n" not in str(found.value)
     assert "--" not in str(found.value)
 
 
-CALIBRATE = [
-    ({"at_m": (1,)}, r"at_m is \(1,\); it should be 2 or 3 finite numbers"),
-    ({"at_m": (1, 2)}, "lacks its height"),
-    ({"stays": ((1, 2, 3),)}, r"stays\[0\] is \(1, 2, 3\); it should be a skyless.survey_inputs.samples.Stay"),
+SURVEY = [
+    ({"stays": ((1,),)}, r"stays\[0\] is \(1,\); it should be 2 or 3 finite numbers"),
+    ({"stays": ((1, 2),)}, "lacks its height"),
     ({"stays": (Stay(1.0, 2.0, 3.0, 5.0, 4.0),)}, r"stays\[0\].to_s is 4.0; it should be above from_s"),
-    ({"at_m": (1, 2, 3), "truth": [[0, 1, 2, 3]]}, "at_m and stays say where the antenna was"),
-    ({"first_s": 1.0, "first_share": 0.5}, "give one of first_s, first_count and first_share"),
-    ({"first_share": 2.0}, "first_share is 2.0; it should be a number, above 0, at most 1"),
-    ({}, "truth or at, and anchors or site where the anchors are|no time difference"),
-    ({"tag": "tag1"}, "tag is 'tag1'; it should be left out"),
+    ({"stays": ((1, 2, 3),), "truth": [[0, 1, 2, 3]]}, "stays says where the antenna was"),
+    ({"stays": ((1, 2, 3),), "first": "200%"}, "first is '200%'; it should be a number of differences"),
+    ({}, "one with stamps of anchors"),
+    ({"stays": ((1, 2, 3),), "tag": "tag1"}, "tag is 'tag1'; it should be left out"),
+    ({"recording": None}, r"anchors is .*; it should be left out: it is for recordings"),
+    ({"distances": ((1, 2, 3.0),)}, r"distances\[0\] is \(1, 2, 3.0\); it should be a skyless.site.survey.facts.Tape"),
+    ({"points_m": {3: (1.0,)}}, r"points_m\[3\] is \(1.0,\); it should be 2 or 3 finite numbers"),
 ]
 
 
-@pytest.mark.parametrize(("arguments", "right"), CALIBRATE, ids=[str(sorted(given)) for given, _ in CALIBRATE])
-def test_mistakes_of_a_calibration_are_named(folder, arguments, right):
+@pytest.mark.parametrize(("arguments", "right"), SURVEY, ids=[str(sorted(given)) for given, _ in SURVEY])
+def test_mistakes_of_a_survey_are_named(folder, arguments, right):
     with pytest.raises(skyless.SkylessError, match=right) as found:
-        skyless.calibrate(**{"file": folder / "tdoa-table", "anchors": synthetic.ANCHORS_M, **arguments})
+        skyless.survey_site(**{"recording": folder / "tdoa-table", "anchors": synthetic.ANCHORS_M, **arguments})
     assert "\n" not in str(found.value)
     assert "--" not in str(found.value)
 
 
 def test_a_lever_arm_without_a_truth_to_move_is_refused(folder, capsys):
-    right = "lever_arm_m is .*; it should be left out: a recording of skyless record brings its own"
-    with pytest.raises(skyless.SkylessError, match=right):
-        skyless.calibrate(folder / "stay.mcap", lever_arm_m=(0.0, 0.0, 0.1))
-    assert main(["calibrate", str(folder / "stay.mcap"), "--lever-arm", "0,0,0.1"]) == 2
-    assert "--lever-arm is '0,0,0.1'; it should be left out" in capsys.readouterr().err
+    with pytest.raises(skyless.SkylessError, match=r"lever_arm_m is .*; it should be left out: it moves the truth"):
+        skyless.survey_site(recording=folder / "stay.mcap", recorded_truth=True, lever_arm_m=(0.0, 0.0, 0.1))
+    assert main(["survey", "--recording", str(folder / "stay.mcap"), "--recorded-truth", "--lever-arm", "0,0,0.1"]) == 2
+    assert "--lever-arm is (0.0, 0.0, 0.1); it should be left out" in capsys.readouterr().err
 
 
 STUDY = [

@@ -6,17 +6,17 @@ from collections import Counter
 import pytest
 from test_known_keys import CHAIN, FIRST, KEYS, PUBLIC, SITE, TIMING
 
-from skyless.air.almanac import KeyPage
-from skyless.air.beacon2 import Beacon2
-from skyless.air.codec2 import authenticate_2, decode_2, encode_2
-from skyless.air.reception import Reception
-from skyless.anchors.authentication import NO_KEYS_S, BeaconAuthentication
-from skyless.authentication import chain, known_keys
-from skyless.authentication.fault import Fault
-from skyless.authentication.key_chain import SECTION_INTERVALS, earlier_key, mac_of
-from skyless.authentication.verifier import Verifier
-from skyless.site.lab import lab_site
-from skyless.ticks import from_seconds, wrap
+from skyless.core.air.almanac import KeyPage
+from skyless.core.air.beacon import Beacon
+from skyless.core.air.codec import decode, encode, with_authentication
+from skyless.core.air.reception import Reception
+from skyless.core.anchor.authentication import NO_KEYS_S, BeaconAuthentication
+from skyless.core.keys import chain, known_keys
+from skyless.core.keys.fault import Fault
+from skyless.core.keys.key_chain import SECTION_INTERVALS, earlier_key, mac_of
+from skyless.core.keys.verifier import Verifier
+from skyless.core.ticks import from_seconds, wrap
+from skyless.sim.lab import lab_site
 
 SITE_FILE = lab_site()
 OWN = 4
@@ -25,24 +25,24 @@ START_S = TIMING.start_s(FIRST + SECTION_INTERVALS // 2) + 0.02
 
 def beacon(anchor, sequence, at_s, key=None):
     page = None if key is None else KeyPage(key)
-    return Beacon2(SITE, anchor, sequence & 0xFF, wrap(from_seconds(at_s)), 0, None, None, None, (), 0, page)
+    return Beacon(SITE, anchor, sequence & 0xFF, wrap(from_seconds(at_s)), 0, 0x20, None, (), 0, page)
 
 
 def frame(anchor, sequence, at_s, interval, *, key=None, keys=KEYS):
     """A frame of an interval; without ``keys`` its code is wrong."""
     code = (lambda _: bytes(8)) if keys is None else (lambda signed: mac_of(signed, keys.mac_key(interval)))
-    return authenticate_2(encode_2(beacon(anchor, sequence, at_s, key)), interval & 0xFFFF, code)
+    return with_authentication(encode(beacon(anchor, sequence, at_s, key)), interval & 0xFFFF, code)
 
 
 def received(sent, at_s):
-    return decode_2(sent), Reception(sent, wrap(from_seconds(at_s)), at_s)
+    return decode(sent), Reception(sent, wrap(from_seconds(at_s)), at_s)
 
 
 class OneAnchor:
     """An anchor whose clock is ahead, and what it would send."""
 
     def __init__(self, **fields):
-        self.authentication = BeaconAuthentication(SITE_FILE, [CHAIN], **fields)
+        self.authentication = BeaconAuthentication([CHAIN], **fields)
         self.frames = 0
 
     def at(self, at_s, ahead_s=0.0):
@@ -54,7 +54,7 @@ class OneAnchor:
     def contents(self, at_s):
         """Of a frame that may disclose a key."""
         self.frames += 2
-        return self.authentication.contents(wrap(from_seconds(at_s)), self.frames | 1, OWN)
+        return self.authentication.contents(wrap(from_seconds(at_s)), self.frames | 1, OWN, 1 / 30)
 
     def hear_others(self, at_s, ahead_s=0.0, others=(1, 2, 3)):
         for other in others:
@@ -126,13 +126,13 @@ def test_frames_of_far_intervals_cost_an_anchor_no_keys(monkeypatch):
 
     anchor = OneAnchor()
     anchor.at(0.0)
-    anchor.authentication.seal(encode_2(beacon(OWN, 0, 0.0)), anchor.contents(0.0).interval)
+    anchor.authentication.seal(encode(beacon(OWN, 0, 0.0)), anchor.contents(0.0).interval)
     monkeypatch.setattr(chain, "earlier_key", counted)
     for number in range(200):
         at_s = 0.1 * number
         anchor.at(at_s)
         before = steps
-        anchor.authentication.seal(encode_2(beacon(OWN, number, at_s)), anchor.contents(at_s).interval)
+        anchor.authentication.seal(encode(beacon(OWN, number, at_s)), anchor.contents(at_s).interval)
         assert steps - before <= chain.STEPS_AHEAD
         before = steps
         far = TIMING.interval_at(START_S + at_s) + (number % 7 - 3) * SECTION_INTERVALS
@@ -203,7 +203,7 @@ def test_forged_keys_cost_a_bounded_number_of_steps_in_any_section(monkeypatch):
         interval = FIRST + (number * 37) % (2 * SECTION_INTERVALS)
         forged = frame(9, number, at_s, interval, key=secrets.token_bytes(16), keys=None)
         tested.hear(forged, at_s, START_S + at_s)
-    assert steps <= known_keys.MOST_STEPS + known_keys.STEPS_PER_S + 1000 * known_keys.NEAR_STEPS
+    assert steps <= known_keys.MAX_STEPS + known_keys.STEPS_PER_S + 1000 * known_keys.NEAR_STEPS
 
 
 def test_old_keys_and_certificates_are_no_error_of_the_clock():

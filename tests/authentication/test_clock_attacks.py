@@ -9,13 +9,13 @@ from collections import Counter
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_attacks_on_state import SITE_FILE, START_S, frame, received
+from test_attacks_on_state import START_S, frame, received
 from test_known_keys import CHAIN, FIRST, KEYS, PUBLIC, SITE, TIMING
 
-from skyless.anchors.authentication import BeaconAuthentication
-from skyless.authentication.fault import Fault
-from skyless.authentication.key_chain import SECTION_INTERVALS
-from skyless.authentication.verifier import Verifier
+from skyless.core.anchor.authentication import BeaconAuthentication
+from skyless.core.keys.fault import Fault
+from skyless.core.keys.key_chain import SECTION_INTERVALS
+from skyless.core.keys.verifier import Verifier
 
 BOUND_S = TIMING.most_clock_error_s
 ANCHOR_S = 0.5 * TIMING.anchors_apart_s
@@ -105,7 +105,7 @@ def test_a_host_clock_that_is_dragged_back_lets_no_old_key_in(rate):
 
 @pytest.mark.parametrize("ahead_s", [0.06, 0.08, 0.14])
 def test_an_anchor_that_is_ahead_is_reported_by_the_others(ahead_s):
-    authentication = BeaconAuthentication(SITE_FILE, [CHAIN], no_keys_s=0.0)
+    authentication = BeaconAuthentication([CHAIN], no_keys_s=0.0)
     found = set()
     for number in range(40):
         for anchor, error_s in ((1, 0.0), (2, 0.0), (3, ahead_s)):
@@ -119,7 +119,7 @@ def test_an_anchor_that_is_ahead_is_reported_by_the_others(ahead_s):
 
 @pytest.mark.parametrize("late_s", [0.31, 0.36, 0.49])
 def test_an_anchor_refuses_frames_whose_key_another_one_may_have_disclosed(late_s):
-    authentication = BeaconAuthentication(SITE_FILE, [CHAIN], no_keys_s=0.0)
+    authentication = BeaconAuthentication([CHAIN], no_keys_s=0.0)
     start_s = TIMING.start_s(TIMING.interval_at(START_S))
     authentication.set_time(received(b"", late_s)[1].rx_ticks, start_s + late_s)
     sent = frame(1, 1, 0.0, TIMING.interval_at(START_S))

@@ -11,11 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.authentication.certificate import ChainTiming
-from skyless.authentication.chain import Chain
-from skyless.authentication.chain_maker import new_chain
-from skyless.authentication.key_chain import SECTION_BITS
-from skyless.authentication.key_files import (
+from skyless.core.errors import SkylessError
+from skyless.core.keys.chain import Chain, new_chain
+from skyless.core.keys.key_chain import SECTION_BITS, ChainTiming
+from skyless.run.keys.key_files import (
     SEEDS_VARIABLE,
     SITE_PRIVATE,
     SITE_PUBLIC,
@@ -33,7 +32,6 @@ from skyless.authentication.key_files import (
     serials_in,
     site_public_bytes,
 )
-from skyless.errors import SkylessError
 
 SITE = 300
 PRIVATE = Ed25519PrivateKey.generate()

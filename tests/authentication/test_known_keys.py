@@ -7,11 +7,17 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyless.authentication import known_keys
-from skyless.authentication.certificate import ChainTiming, public_key, read_certificate
-from skyless.authentication.chain import Chain, ChainKeys, section_signatures
-from skyless.authentication.key_chain import SECTION_BITS, SECTION_INTERVALS, earlier_key
-from skyless.authentication.known_keys import CertificateUse, KeyUse, KnownKeys
+from skyless.core.keys import known_keys
+from skyless.core.keys.chain import Chain, ChainKeys, section_signatures
+from skyless.core.keys.key_chain import (
+    SECTION_BITS,
+    SECTION_INTERVALS,
+    ChainTiming,
+    earlier_key,
+    public_key,
+    read_certificate,
+)
+from skyless.core.keys.known_keys import CertificateUse, KeyUse, KnownKeys
 
 SITE = 42
 TIMING = ChainTiming()
@@ -105,7 +111,7 @@ def test_forged_keys_far_ahead_cost_a_bounded_number_of_steps(monkeypatch):
     made, interval = known(), FIRST + SECTION_INTERVALS - 1
     for number in range(1000):  # within a second
         made.on_key(secrets.token_bytes(16), interval, at_s(FIRST) + 1e-3 * number, 1)
-    assert steps <= known_keys.MOST_STEPS + known_keys.STEPS_PER_S
+    assert steps <= known_keys.MAX_STEPS + known_keys.STEPS_PER_S
     steps = 0
     assert made.on_key(KEYS.key(FIRST + 3), FIRST + 3, at_s(FIRST) + 1.0, 1) is KeyUse.NEW  # the expected ones are free
 
@@ -123,7 +129,7 @@ def test_forged_certificates_cost_a_bounded_number_of_checks():
     for number in range(400):
         sent = SENT[:-2] + number.to_bytes(2, "big")
         uses.append(made.on_certificate(sent, at_s(FIRST) + 1e-3 * number))
-    assert uses.count(CertificateUse.FORGED) <= known_keys.MOST_CHECKS + 0.4 * known_keys.CHECKS_PER_S
+    assert uses.count(CertificateUse.FORGED) <= known_keys.MAX_CHECKS + 0.4 * known_keys.CHECKS_PER_S
     assert uses[-1] is CertificateUse.IGNORED
     assert made.on_certificate(SENT, at_s(FIRST) + 2.0) is CertificateUse.NEW
 
@@ -152,7 +158,7 @@ def test_old_certificates_make_way():
     for section in range(12):
         interval = FIRST + section * SECTION_INTERVALS
         assert made.on_certificate(long.certificate(interval), at_s(interval)) is CertificateUse.NEW
-        assert len(made.certificates) <= known_keys.MOST_CERTIFICATES
+        assert len(made.certificates) <= known_keys.MAX_CERTIFICATES
         assert read_certificate(SITE, made.certificates[-1])[0].name.section == SECTION + section
         assert made.on_key(long.key(interval), interval, at_s(interval), 1) is KeyUse.NEW
 

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.authentication.certificate import ChainTiming
-from skyless.authentication.site_clock import DRIFT, RECENT_KEYS, SiteClock
-from skyless.ticks import from_seconds
+from skyless.core.keys.key_chain import ChainTiming
+from skyless.core.keys.site_clock import DRIFT, RECENT_KEYS, SiteClock
+from skyless.core.ticks import from_seconds
 
 BOUND_S = 0.1
 TIMING = ChainTiming()

@@ -6,10 +6,23 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from skyless.air.codec2 import authenticate_2, decode_2, signed_bytes_2
-from skyless.authentication.certificate import Certificate, ChainTiming, is_signed, public_key, read_certificate, sign
-from skyless.authentication.chain import Chain, ChainKeys, section_signatures
-from skyless.authentication.key_chain import SectionName, earlier_key, is_mac, last_key, mac_key, mac_of, root_of
+from skyless.core.air.codec import decode, signed_bytes, with_authentication
+from skyless.core.keys.chain import Chain, ChainKeys, section_signatures
+from skyless.core.keys.key_chain import (
+    Certificate,
+    ChainTiming,
+    SectionName,
+    earlier_key,
+    is_mac,
+    is_signed,
+    last_key,
+    mac_key,
+    mac_of,
+    public_key,
+    read_certificate,
+    root_of,
+    sign,
+)
 
 DOCS = Path(__file__).parents[2] / "docs"
 VECTORS = json.loads((DOCS / "authentication_vectors.json").read_text())
@@ -38,10 +51,10 @@ def test_code_of_a_beacon():
 
 def test_the_beacon_of_the_document_with_its_code():
     unsigned = bytearray(raw("signed_bytes")[:-2])
-    unsigned[11] &= ~0x10
-    frame = authenticate_2(bytes(unsigned) + bytes(2), VECTORS["interval"] & 0xFFFF, lambda _: raw("mac"))
-    assert signed_bytes_2(frame) == raw("signed_bytes")
-    decoded = decode_2(frame)
+    unsigned[11] &= ~0x04
+    frame = with_authentication(bytes(unsigned) + bytes(2), VECTORS["interval"] & 0xFFFF, lambda _: raw("mac"))
+    assert signed_bytes(frame) == raw("signed_bytes")
+    decoded = decode(frame)
     assert decoded.authentication.mac == raw("mac")
     assert decoded.authentication.interval == VECTORS["interval"] & 0xFFFF
     assert (decoded.site, decoded.anchor, decoded.sequence) == (42, 300, 57)

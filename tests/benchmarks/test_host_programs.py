@@ -3,8 +3,8 @@
 import pytest
 from emulator.site.host_programs import Process
 
-from skyless.simulation.medium import Timeline
-from skyless.ticks import from_seconds, to_seconds
+from skyless.core.ticks import from_seconds, to_seconds
+from skyless.sim.medium import Timeline
 
 
 def test_programs_take_turns_in_the_order_of_true_time():

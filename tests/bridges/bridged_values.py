@@ -2,9 +2,9 @@
 
 from hypothesis import strategies as st
 
-from skyless.bridges.feed import BridgedSite
-from skyless.mqtt.messages import Counters, FixMessage, TagHealth
-from skyless.site.model import GeoreferenceSite
+from skyless.bridges.target import BridgedSite
+from skyless.core.site import GeoreferenceSite
+from skyless.run.mqtt.messages import Counters, FixMessage, TagHealth
 
 BERLIN = GeoreferenceSite(latitude_deg=52.512345678, longitude_deg=13.326, height_m=34.5, heading_deg=30.0)
 SITE = BridgedSite(7, "hall", True, {1: (0.0, 0.0, 2.5), 2: (6.0, 0.0, 2.5)}, BERLIN)

@@ -14,14 +14,20 @@ from test_nmea import FIX, HALL
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
-from skyless.bridges.feed import BridgedSite
-from skyless.bridges.foxglove import session, target
-from skyless.bridges.foxglove.protocol import SUBPROTOCOLS, Subscribe, Subscription, Unsubscribe, decode_request
-from skyless.bridges.foxglove.target import FoxgloveTarget
-from skyless.errors import SkylessError
-from skyless.mqtt.messages import Zone
-from skyless.site.earth import geodetic
-from skyless.site.model import WallSite
+from skyless.bridges import foxglove
+from skyless.bridges.foxglove import (
+    SUBPROTOCOLS,
+    FoxgloveTarget,
+    Subscribe,
+    Subscription,
+    Unsubscribe,
+    decode_request,
+)
+from skyless.bridges.target import BridgedSite
+from skyless.core.earth import geodetic
+from skyless.core.errors import SkylessError
+from skyless.core.site import WallSite
+from skyless.run.mqtt.messages import Zone
 
 SITE = BridgedSite(
     1, "hall", simulated=False, anchors_m={1: (0.0, 0.0, 2.0), 2: (6.0, 0.0, 2.0)}, georeference=HALL, master=1,
@@ -208,7 +214,7 @@ def test_figures_that_no_tag_publishes_are_dropped():
 
 
 def test_a_client_that_never_reads_is_disconnected_and_others_get_every_fix(monkeypatch):
-    monkeypatch.setattr(session, "STUCK_S", 0.2)
+    monkeypatch.setattr(foxglove, "STUCK_S", 0.2)
     fixes = 6000
 
     async def run():
@@ -264,7 +270,7 @@ async def stuck_socket(port, channels):
 
 
 def test_more_clients_than_it_serves_are_closed(monkeypatch):
-    monkeypatch.setattr(target, "MOST_CLIENTS", 1)
+    monkeypatch.setattr(foxglove, "MAX_CLIENTS", 1)
 
     async def run():
         async with served() as server, client_of(server) as first:

@@ -13,13 +13,12 @@ import numpy as np
 import pytest
 
 import skyless
-from skyless.bridges.feed import BridgedSite, floored
 from skyless.bridges.hub import Hub
-from skyless.bridges.target import BridgeContext
+from skyless.bridges.target import BridgeContext, BridgedSite, floored
 from skyless.bridges.targets import open_route
-from skyless.mqtt.messages import FixMessage
-from skyless.site.earth import geodetic, rotated
-from skyless.site.model import GeoreferenceSite
+from skyless.core.earth import geodetic, rotated
+from skyless.core.site import GeoreferenceSite
+from skyless.run.mqtt.messages import FixMessage
 
 GPSD = shutil.which("gpsd") or shutil.which("gpsd", path="/usr/sbin")
 pytestmark = pytest.mark.skipif(GPSD is None, reason="gpsd is not installed: apt-get install gpsd")

@@ -11,16 +11,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.bridges.home_assistant.announcer import MOST_ANNOUNCED, STALE_S, Announcer
-from skyless.bridges.home_assistant.discovery import document, platforms
-from skyless.bridges.home_assistant.target import SETTLE_S, make_target
-from skyless.bridges.target import BridgeContext
-from skyless.bridges.target_url import TargetUrl
+from skyless.bridges.home_assistant import (
+    MAX_ANNOUNCED,
+    SETTLE_S,
+    STALE_S,
+    Announcer,
+    document,
+    make_target,
+    platforms,
+)
+from skyless.bridges.target import BridgeContext, TargetUrl
 from skyless.bridges.targets import open_route
-from skyless.errors import SkylessError
-from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.messages import TagPosition, TagZones, Zone
-from skyless.site.earth import geodetic
+from skyless.core.earth import geodetic
+from skyless.core.errors import SkylessError
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.messages import TagPosition, TagZones, Zone
 
 WEST = Zone("z1", "West", ((0.0, 0.0), (3.0, 0.0), (3.0, 8.0), (0.0, 8.0)))
 EAST = Zone("z2", "East", ((3.0, 0.0), (6.0, 0.0), (6.0, 8.0), (3.0, 8.0)))
@@ -219,10 +224,10 @@ def test_the_link_keeps_all_that_is_sent_of_as_many_tags_as_there_may_be():
     target.on_site(replace(HALL, zones=zones))
     for second in range(SETTLE_S):
         target.on_second(float(second))
-    for number in range(MOST_ANNOUNCED + 1):
+    for number in range(MAX_ANNOUNCED + 1):
         target.on_fix(at(1e5, tag=f"tag{number}"))
     assert target._link.counters.dropped == 0
-    assert target._link.unacknowledged == 3 * MOST_ANNOUNCED
+    assert target._link.unacknowledged == 3 * MAX_ANNOUNCED
     assert target.dropped == {"too-many-tags": 1}
 
 
@@ -318,7 +323,7 @@ def test_templates_hold_nothing_of_what_users_name(broker):
 
 def test_the_broker_is_the_sites_or_the_one_of_the_address(broker):
     def address(text, context=CONTEXT):
-        return make_target(TargetUrl(text), context)._settings.address
+        return make_target(TargetUrl(text), context)._address
 
     assert address("homeassistant:") == CONTEXT.mqtt
     assert address("homeassistant://ha.local") == MqttAddress("ha.local", 1883)

@@ -8,13 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
-from skyless.bridges.feed import MIN_STD_M, bridged_site, floored, is_usable, require_georeference
 from skyless.bridges.hub import Hub, Route, open_hub
-from skyless.bridges.target import Target
-from skyless.errors import SkylessError
-from skyless.mqtt.messages import StatusMessage
-from skyless.positioning.integrity import Alert
-from skyless.site.lab import lab_site
+from skyless.bridges.target import MIN_STD_M, Target, bridged_site, floored, is_usable, require_georeference
+from skyless.core.errors import SkylessError
+from skyless.core.integrity import Alert
+from skyless.run.mqtt.messages import StatusMessage
+from skyless.sim.lab import lab_site
 
 
 class Recorded(Target):

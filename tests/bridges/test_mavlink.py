@@ -14,9 +14,9 @@ from msgspec import structs
 
 from skyless.bridges.hub import open_hub
 from skyless.bridges.mavlink.encoder import MavlinkEncoder
-from skyless.bridges.mavlink.frames import FrameReader, frame
 from skyless.bridges.mavlink.messages import (
     CRC_EXTRAS,
+    FrameReader,
     GpsGlobalOrigin,
     GpsInput,
     Heartbeat,
@@ -26,12 +26,13 @@ from skyless.bridges.mavlink.messages import (
     VisionPositionEstimate,
     decoded,
     encoded,
+    frame,
 )
 from skyless.bridges.mavlink.profiles import gps_input, gps_time, no_gps_fix, odometry, vision_position_estimate
 from skyless.bridges.target import BridgeContext
 from skyless.bridges.targets import open_route
-from skyless.errors import SkylessError
-from skyless.site.earth import geodetic
+from skyless.core.earth import geodetic
+from skyless.core.errors import SkylessError
 
 pymavlink = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")
 pymavlink_1 = pytest.importorskip("pymavlink.dialects.v10.ardupilotmega")

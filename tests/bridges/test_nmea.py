@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pynmeagps import VALCKSUM, NMEAReader
 
-from skyless.bridges.feed import BridgedSite, floored
 from skyless.bridges.nmea import NmeaEncoder, epoch, epoch_without_fix
-from skyless.errors import SkylessError
-from skyless.mqtt.messages import FixMessage
-from skyless.site.earth import geodetic, rotated
-from skyless.site.model import GeoreferenceSite
+from skyless.bridges.target import BridgedSite, floored
+from skyless.core.earth import geodetic, rotated
+from skyless.core.errors import SkylessError
+from skyless.core.site import GeoreferenceSite
+from skyless.run.mqtt.messages import FixMessage
 
 HALL = GeoreferenceSite(latitude_deg=52.5, longitude_deg=13.4, height_m=40.0, heading_deg=30.0)
 DEGREE_M = 111_320.0

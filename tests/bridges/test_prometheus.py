@@ -16,14 +16,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from prometheus_client.parser import text_string_to_metric_families
 
-from skyless.bridges.prometheus import target as prometheus_target
-from skyless.bridges.prometheus.exposition import CONTENT_TYPE, family, histograms
-from skyless.bridges.prometheus.metrics import GAUGE_AGE_S, LATENCY_BOUNDS_S, Rising, SiteMetrics
-from skyless.bridges.prometheus.target import make_target
-from skyless.bridges.target import BridgeContext
-from skyless.bridges.target_url import TargetUrl
-from skyless.errors import SkylessError
-from skyless.mqtt.messages import AnchorHealth, Counters, StatusMessage, TagHealth
+from skyless.bridges import prometheus as prometheus_target
+from skyless.bridges.prometheus import (
+    CONTENT_TYPE,
+    GAUGE_AGE_S,
+    LATENCY_BOUNDS_S,
+    Rising,
+    SiteMetrics,
+    family,
+    histograms,
+    make_target,
+)
+from skyless.bridges.target import BridgeContext, TargetUrl
+from skyless.core.errors import SkylessError
+from skyless.run.mqtt.messages import AnchorHealth, Counters, StatusMessage, TagHealth
 
 NO_LINK = Counters(0, 0, 0)
 CONTEXT = BridgeContext(print)
@@ -82,7 +88,7 @@ def of_tag(name, tag="tag1", **labels):
 @pytest.fixture
 def metrics():
     metrics = SiteMetrics(positions=True)
-    metrics.on_site(SITE)
+    metrics.site = SITE
     metrics.on_fix(a_fix(serial=200, latency_s=0.004, hpl_m=0.3, verified_until_s=11.7, unverified=0.25), 100.0)
     trust = {"trust": "open", "is_verified": True, "clock_error_s": -0.5, "faults": {"2": "bad-code", "3": "bad-code"}}
     metrics.on_health(tag_health(fixes=190, counters={"foreign": 2}, mqtt=Counters(50, 4, 1), **trust), 100.0)

@@ -10,11 +10,10 @@ from contextlib import asynccontextmanager
 import pytest
 from bridged_values import BARE_SITE, SITE, a_fix
 
-from skyless.bridges.ros2.messages import POSE, RosSettings
-from skyless.bridges.ros2.target import Ros2Target, make_target
-from skyless.bridges.target import BridgeContext
-from skyless.bridges.target_url import TargetUrl
-from skyless.errors import SkylessError
+from skyless.bridges.ros2.messages import MARKERS, POSE, RosSettings
+from skyless.bridges.ros2.target import DdsTypes, Ros2Target, make_target
+from skyless.bridges.target import BridgeContext, TargetUrl
+from skyless.core.errors import SkylessError
 
 pytest.importorskip("cyclonedds", reason="Cyclone DDS has no wheel here")
 
@@ -24,7 +23,7 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
-from skyless.bridges.ros2.idl import TYPES
+DDS_TYPES = DdsTypes()
 
 WAIT_S = 30.0
 """As long as a busy machine may take; it is usually some milliseconds."""
@@ -53,7 +52,7 @@ async def running(target):
 def reader_of(participant, topic, kind, durability=Policy.Durability.Volatile):
     """As a subscriber of ROS asks for it by default."""
     quality = Qos(Policy.Reliability.Reliable(max_blocking_time=0), Policy.History.KeepLast(100), durability)
-    return DataReader(participant, Topic(participant, topic, TYPES[kind.name]), qos=quality)
+    return DataReader(participant, Topic(participant, topic, DDS_TYPES.type(kind)), qos=quality)
 
 
 async def until(condition):
@@ -111,10 +110,8 @@ def test_anchors_last_and_writers_name_their_types_hash(domain):
             await until(all_known)
             pose = known["rt/hall/tag1/pose"]
             assert pose.type_name == "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_"
-            assert pose.qos[Policy.Userdata].data == f"typehash={POSE.digest};".encode()
+            assert pose.qos[Policy.Userdata].data == f"typehash={DDS_TYPES.hash(POSE)};".encode()
             assert pose.qos[Policy.Durability] == Policy.Durability.Volatile
-            from skyless.bridges.ros2.messages import MARKERS
-
             late = reader_of(participant, "rt/hall/anchors", MARKERS, Policy.Durability.TransientLocal)
             read = []
             await until(lambda: read.extend(late.take(10)) or read)

@@ -8,9 +8,9 @@ import stat
 import pytest
 
 from skyless.bridges.jsonl import JsonLines
-from skyless.bridges.senders import MOST_READERS, PtySender, SerialSender, TcpServer, UdpSender
-from skyless.errors import SkylessError
-from skyless.radios.serial.pseudo_terminal import Pty
+from skyless.bridges.senders import MAX_READERS, PtySender, SerialSender, TcpServer, UdpSender
+from skyless.core.errors import SkylessError
+from skyless.radio.serial.pseudo_terminal import Pty
 
 
 @contextlib.asynccontextmanager
@@ -81,11 +81,11 @@ def test_more_connections_than_allowed_are_closed_at_once():
     async def work():
         async with running(TcpServer("t:", "127.0.0.1", 0, list)) as server:
             port = await listening(server)
-            held = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MOST_READERS)]
+            held = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MAX_READERS)]
             reader, _ = await asyncio.open_connection("127.0.0.1", port)
             with contextlib.suppress(ConnectionResetError):
                 assert await reader.read() == b""
-            assert len(server._readers) == MOST_READERS
+            assert len(server._readers) == MAX_READERS
             assert server.dropped == {"too-many-readers": 1}
             del held
 

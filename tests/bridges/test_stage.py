@@ -12,11 +12,9 @@ from msgspec import structs
 from pythonosc.osc_message import OscMessage
 
 from skyless.bridges.osc import OscEncoder, make_encoder
-from skyless.bridges.psn import MOST_PACKET_BYTES, PsnFrames
-from skyless.bridges.stage_axes import turned
-from skyless.bridges.target import BridgeContext
-from skyless.bridges.target_url import TargetUrl
-from skyless.errors import SkylessError
+from skyless.bridges.psn import MAX_PACKET_BYTES, PsnFrames
+from skyless.bridges.target import BridgeContext, TargetUrl, turned
+from skyless.core.errors import SkylessError
 
 START_UNIX_S = 1_795_000_000.0
 CONTEXT = BridgeContext(print)
@@ -120,7 +118,7 @@ def test_pypsn_reads_a_fix(position_m, velocity_mps, age_s):
 def test_pypsn_reads_the_names_of_all_trackers_and_no_packet_is_too_long(tags):
     made = frames([a_fix(tag=tag) for tag in tags])
     info, data = made.info_packets(START_UNIX_S), made.data_packets(START_UNIX_S)
-    assert max(map(len, info + data)) <= MOST_PACKET_BYTES
+    assert max(map(len, info + data)) <= MAX_PACKET_BYTES
     named, placed = {}, []
     for packet in map(pypsn.parse_psn_packet, info):
         assert packet.name == b"hall"

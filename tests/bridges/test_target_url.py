@@ -4,10 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.bridges.target import BridgeContext
-from skyless.bridges.target_url import TargetUrl
+from skyless.bridges.target import BridgeContext, TargetUrl
 from skyless.bridges.targets import TARGET_KINDS, open_route
-from skyless.errors import SkylessError
+from skyless.core.errors import SkylessError
 
 CONTEXT = BridgeContext(log=lambda _line: None)
 

@@ -16,7 +16,7 @@ from pythonosc.osc_message import OscMessage
 from skyless.bridges.mavlink.profiles import gps_input, odometry, vision_position_estimate
 from skyless.bridges.target import BridgeContext
 from skyless.bridges.targets import open_route
-from skyless.radios.serial.pseudo_terminal import Pty
+from skyless.radio.serial.pseudo_terminal import Pty
 
 pymavlink = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")
 HEADING_DEG = SITE.georeference.heading_deg

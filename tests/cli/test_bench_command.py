@@ -3,8 +3,8 @@
 import functools
 import json
 
-from skyless.bench import measure, monte_carlo_speed
 from skyless.cli.main import main
+from skyless.research.bench import measure, monte_carlo_speed
 
 
 def test_it_measures_everything_next_to_its_baselines_and_the_table_names_every_way(capsys, monkeypatch):

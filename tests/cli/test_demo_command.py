@@ -16,11 +16,11 @@ from pathlib import Path
 import pytest
 
 from skyless.cli.main import main
-from skyless.mqtt.address import mqtt_address
-from skyless.mqtt.connection import Introduction, Reactions, open_connection
-from skyless.mqtt.link import Link
-from skyless.mqtt.topics import fix_topic, health_topic, status_topic
-from skyless.nodes.broker import BrokerSettings, start_broker
+from skyless.run.broker import BrokerSettings, start_broker
+from skyless.run.mqtt.address import mqtt_address
+from skyless.run.mqtt.connection import Introduction, Reactions, open_connection
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.topics import fix_topic, health_topic, status_topic
 
 COMMAND = [sys.executable, "-m", "skyless.cli.main", "demo"]
 START_S = 120.0

@@ -8,10 +8,10 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from skyless.cli.nodes.demo import ALERT_SHOWN_S, MOST_ALERTS, Screen, _either
-from skyless.mqtt.messages import AnchorHealth, Counters, FixMessage, TagHealth
-from skyless.nodes.watch import Watch
-from skyless.positioning.integrity import Alert
+from skyless.cli.nodes.demo import ALERT_SHOWN_S, MAX_ALERTS, Screen, _either
+from skyless.cli.watch import Watch
+from skyless.core.integrity import Alert
+from skyless.run.mqtt.messages import AnchorHealth, Counters, FixMessage, TagHealth
 
 UNIT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -97,7 +97,7 @@ def test_many_alerts_take_no_more_than_four_lines(stage, alert):
     console = Console(width=80, record=True, file=open("/dev/null", "w"))  # noqa: SIM115, PTH123
     console.print(*screen.alerts())
     text = console.export_text()
-    assert text.count(alert) == MOST_ALERTS + 1
+    assert text.count(alert) == MAX_ALERTS + 1
     assert "200 of 200 tags now" in " ".join(text.split())
     assert text.count("\n") <= 4
 

@@ -2,8 +2,6 @@
 
 import json
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -11,8 +9,9 @@ import pytest
 import skyless
 from skyless.cli.main import main
 from skyless.cli.nodes.demo import _subscriber
-from skyless.mqtt.address import MqttAddress
-from skyless.nodes.ports import hold_any
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.process import hold_any
+from support.processes import SKYLESS, started
 
 
 @pytest.mark.parametrize(
@@ -92,8 +91,7 @@ def test_a_recorder_that_found_no_site_says_so_with_its_exit_code(tmp_path, caps
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_program_that_is_asked_to_end_does_so_as_planned(number):
-    command = (sys.executable, "-m", "skyless.cli.main", "ether", "--mqtt", "none", "--listen", "0")
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as program:
+    with started(*SKYLESS, "ether", "--mqtt", "none", "--listen", "0") as program:
         assert "ether at" in program.stderr.readline()
         program.send_signal(number)
         assert program.wait(timeout=10) == 0
@@ -109,10 +107,8 @@ def test_an_anchor_has_no_board_that_only_listens(speaks, capsys):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_board_tells_where_it_is_and_takes_its_link_with_it(number, tmp_path):
     place = tmp_path / "board"
-    command = (sys.executable, "-m", "skyless.cli.main", "board", "tag1", "--radio", "ether:127.0.0.1:1", "--json")
-    with subprocess.Popen(
-        (*command, "--link", place), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as program:
+    command = ("board", "tag1", "--radio", "ether:127.0.0.1:1", "--json", "--link", place)
+    with started(*SKYLESS, *command) as program:
         told = json.loads(program.stdout.readline())
         assert told.pop("skyless_version") == skyless.__version__
         assert told == {"board": "tag1", "path": str(place), "format": "link", "radio": f"serial:{place}"}

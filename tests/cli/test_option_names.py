@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Union, get_args, get_origin
 
 import pytest
 
-from skyless.cli.main import _RENAMED, _RENAMED_IN_SURVEY, main, program
+from skyless.cli.main import main, program
 
 WORDS = 2
 """First words of the help that all commands share; what differs follows."""
@@ -85,20 +85,6 @@ def test_every_option_has_help(options):
     ] == []
 
 
-@pytest.mark.parametrize(
-    ("command", "former", "present"),
-    [
-        *((command, old, new) for old, (new, users) in _RENAMED.items() for command in users),
-        *(("survey", old, new) for old, new in _RENAMED_IN_SURVEY.items()),
-    ],
-)
-def test_a_former_name_is_answered_with_the_present_one(options, capsys, command, former, present):
-    assert command in options[present]
-    assert command not in options.get(former, {})
-    assert main([*command.split(), "x", former, "1"]) == 2
-    assert capsys.readouterr().err == f"skyless: {former} of skyless {command} is called {present} now\n"
-
-
 def test_a_number_that_is_none_is_refused_by_every_option(options, capsys):
     """Before the command begins: NaN, and infinities."""
     numbers = [(name, command) for name, uses in options.items() for command, (one, _) in uses.items() if one is float]
@@ -110,6 +96,6 @@ def test_a_number_that_is_none_is_refused_by_every_option(options, capsys):
             assert (err.count("\n"), name in err, "Traceback" in err) == (1, True, False), err
 
 
-_POSITIONAL = dict.fromkeys(("plan", "replay", "calibrate", "site new", "site check", "board"), ("x",))
+_POSITIONAL = dict.fromkeys(("plan", "replay", "site new", "site check", "board"), (__file__,))
 _POSITIONAL |= dict.fromkeys(("site keys new", "site keys rotate", "site keys revoke"), ("x",))
 _POSITIONAL["study"] = ("loss",)

@@ -45,6 +45,6 @@ def test_simulate_spares_its_site(tmp_path, capsys):
     site = tmp_path / "site.toml"
     assert main(["site", "new", str(site)]) == 0
     before = site.read_bytes()
-    assert main(["simulate", "--site", str(site), "--duration", "1", "--fixes-csv", str(site)]) == 2
+    assert main(["simulate", "--site", str(site), "--duration", "3", "--fixes-csv", str(site)]) == 2
     assert "site.toml" in capsys.readouterr().err
     assert site.read_bytes() == before

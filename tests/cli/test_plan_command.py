@@ -8,9 +8,10 @@ import pytest
 from matplotlib.image import imread, imsave
 
 from skyless.cli.main import main
-from skyless.site.lab import lab_site
-from skyless.site.load import load_site
-from skyless.site.template import site_template
+from skyless.core.site import AccuracySite
+from skyless.sim.lab import paper_lab_site
+from skyless.site.file.load import load_site
+from skyless.site.file.template import site_template
 
 EXTRAS = """
 [[walls]]
@@ -33,7 +34,7 @@ longitude_deg = 7.0
 @pytest.fixture
 def lab(tmp_path):
     path = tmp_path / "lab.toml"
-    path.write_text(site_template(lab_site()) + EXTRAS)
+    path.write_text(site_template(paper_lab_site(accuracy=AccuracySite())) + EXTRAS)
     imsave(tmp_path / "floor.png", np.linspace(0, 1, 80 * 60).reshape(80, 60))
     return path
 

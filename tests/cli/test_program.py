@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from skyless.cli.main import main
-from skyless.site.lab import lab_site
-from skyless.site.template import site_template
+from skyless.sim.lab import lab_site
+from skyless.site.file.template import site_template
 
 SKYLESS = [sys.executable, "-m", "skyless.cli.main"]
 
@@ -129,7 +129,7 @@ def test_a_terminal_without_unicode(lab):
 
 @pytest.mark.parametrize(
     ("arguments", "worker"),
-    [(["warm"], "skyless.preparation.worker"), (["paper", "--quick", "--out", "report"], "multiprocessing.spawn")],
+    [(["warm"], "skyless.core.kernels.worker"), (["paper", "--quick", "--out", "report"], "multiprocessing.spawn")],
 )
 def test_sigterm_ends_a_command_with_all_its_processes(tmp_path, arguments, worker):
     kernels = {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")} if arguments == ["warm"] else {}
@@ -167,7 +167,7 @@ def test_json_is_the_last_line(lab):
     done = skyless("site", "check", lab, "--json")
     report = json.loads(done.stdout.splitlines()[-1])
     assert (done.returncode, done.stderr, done.stdout.count("\n")) == (0, "", 1)
-    assert report["superframes_per_s"] == pytest.approx(1 / 0.015, rel=1e-5)
+    assert report["beacons_per_s_of_each_anchor"] == pytest.approx(1 / 0.015, rel=1e-5)
     assert report["messages_per_s"] == pytest.approx(400, rel=1e-5)
     assert report["longest_frame_s"] == pytest.approx(315e-6, abs=0.5e-6)  # docs/radio.md
     assert report["occupancy"] == pytest.approx(0.315 / 2.5, rel=1e-3)

@@ -7,8 +7,8 @@ import sys
 import threading
 
 from skyless.cli.common import progress
-from skyless.preparation import processes
-from skyless.preparation.parts import LAB
+from skyless.core.kernels import processes
+from skyless.core.kernels.processes import LAB
 
 WORK = """
 from skyless.cli.common import progress
@@ -54,7 +54,7 @@ def test_short_work_on_a_terminal():
 
 COUNTS = """
 from skyless.cli.common.progress import CountLine
-from skyless.preparation.processes import Preparation
+from skyless.core.kernels.processes import Preparation
 with CountLine() as line:
     line.show(Preparation(0, 0, None))
     line._next_s = 0.0

@@ -13,9 +13,9 @@ import pytest
 
 import synthetic_recordings as synthetic
 from skyless.cli.main import main
-from skyless.recordings.mcap.recorder import McapFile
-from skyless.site.lab import lab_site
-from skyless.site.template import site_template
+from skyless.run.recordings.recorder import McapFile
+from skyless.sim.lab import lab_site
+from skyless.site.file.template import site_template
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 8
 
@@ -59,7 +59,6 @@ MISTAKES = {
     "a command with a slip": (["simulat"], 'Did you mean "simulate"?'),
     "a command of a group with a slip": (["site", "chekc", "lab.toml"], 'Did you mean "check"?'),
     "an option with a slip": (["simulate", "--noise-p", "100"], "Did you mean --noise-ps?"),
-    "an option's former name": (["replay", *F, "--fixes", "x.csv"], "is called --fixes-csv now"),
     "no file": (["replay"], "FILE requires an argument"),
     "a word instead of a number": (["simulate", "--tags", "many"], "--tags: unable to convert"),
     "no number": (["simulate", "--noise-ps", "nan"], "--noise-ps"),
@@ -102,8 +101,8 @@ MISTAKES = {
         ".csv",
     ),
     "a survey of nothing": (["survey"], "a survey needs a recording"),
-    "nowhere to calibrate": (["calibrate", *F, "--at", "1"], "--at is '1'"),
-    "a study that is none": (["study", "everything"], "Choose from:"),
+    "a tag at no point": (["survey", "--recording", *F, "--at", "1"], "--at is '1'"),
+    "a study that is none": (["study", "everything"], "NAME is 'everything'; it should be one of efficiency"),
     "a broker that is none": (["record", "--mqtt", "none"], "it should be the broker of the site to record"),
     "a broker's address that is none": (["tag", "one", "--mqtt", "localhost"], "mqtt://HOST[:PORT]"),
     "a radio that is none": (["tag", "one", "--radio", "bluetooth", "--mqtt", "none"], "bluetooth"),

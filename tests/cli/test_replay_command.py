@@ -18,12 +18,12 @@ from msgspec.structs import replace
 import synthetic_recordings as synthetic
 from skyless.cli.main import main
 from skyless.cli.replay import FIXES_COLUMNS
-from skyless.site.lab import lab_site
-from skyless.site.model import AnchorSite, TagsSite
-from skyless.site.template import site_template
+from skyless.core.site import AnchorSite, TagsSite
+from skyless.sim.lab import lab_site
+from skyless.site.file.template import site_template
 
 ROWS = 1500
-LEAST_FIXES = ROWS - 60 - 10
+MIN_FIXES = ROWS - 60 - 10
 """A start from ready-made differences takes 60 of them."""
 DL_TDOA = ("uci-binary", "uci-text", "dl-tdoa-json")
 TEXTS = {"anchor_ids", "hpl_m", "vpl_m", "integrity_risk", "alert"}
@@ -88,7 +88,7 @@ def test_every_format_gives_fixes_at_the_truth(run, name):
     told = report(run(name, *options, *synthetic.LISTENER.get(name, [])))
     assert told["format"] == name
     assert told["receptions"] == ROWS
-    assert told["fixes"] > LEAST_FIXES
+    assert told["fixes"] > MIN_FIXES
     assert told["rmse_2d_m"] < 0.05  # 100 ps of a stamp are 3 cm, differences of the table have 10 cm
     assert told["rmse_3d_m"] is None or told["rmse_3d_m"] < 0.1
     # fixes over the recording's whole time, that of the start included
@@ -173,13 +173,13 @@ def test_what_is_left_of_a_damaged_recording_is_used(run, room, tmp_path):
     assert told["fixes"] > 300
     assert told["drops"]["compressed-stream-cut-off"] == 1
     told = report(run(tmp_path / "holes.csv", "--anchors", "anchors.csv", "--json"))
-    assert told["fixes"] > LEAST_FIXES
+    assert told["fixes"] > MIN_FIXES
     assert told["drops"].items() >= {"not-finite": 2, "malformed-number": 1, "anchor-against-itself": 1}.items()
 
 
 @pytest.mark.parametrize("name", [name for name in synthetic.MAKERS if name not in {"avalue", "miluv", *DL_TDOA}])
 def test_missing_anchors_are_named_before_the_recording_is_read(run, name, monkeypatch):
-    monkeypatch.setattr("skyless.replays.captures.Replay.run", lambda *_: pytest.fail("it was read"))
+    monkeypatch.setattr("skyless.research.replays.captures.CaptureReplay.run", lambda *_: pytest.fail("it was read"))
     code, out, err = run(name)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert "--anchors is missing" in err
@@ -236,8 +236,8 @@ A, T = ["--anchors", "anchors.csv"], ["--truth", "truth.csv"]
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["missing.csv"], ["missing.csv", "No such file"]),
-        (["."], ["Is a directory"]),
+        (["missing.csv"], ["missing.csv", "there is none"]),
+        (["."], ["there is none"]),
         (["{bad}/empty"], ["empty", "one of the formats", "tdoa-table"]),
         (["{bad}/picture"], ["PNG", "one of the formats"]),
         (["{bad}/letter"], ["Dear reader", "one of the formats"]),
@@ -246,8 +246,8 @@ A, T = ["--anchors", "anchors.csv"], ["--truth", "truth.csv"]
         (["avalue", "--listener", "tag"], ["listener", "tag", "hexadecimal"]),
         (["avalue", "--listener", "77"], ["listener", "77", "that the recording names"]),
         (["miluv", "--listener", "77"], ["listener", "77", "that the recording names"]),
-        (["tdoa-table", "--anchors", "missing.csv"], ["missing.csv", "No such file"]),
-        (["tdoa-table", "--anchors", "."], ["Is a directory"]),
+        (["tdoa-table", "--anchors", "missing.csv"], ["missing.csv", "there is none"]),
+        (["tdoa-table", "--anchors", "."], ["there is none"]),
         (["tdoa-table", "--anchors", "{bad}/picture"], ["picture", "line 1", "id,x_m,y_m,z_m"]),
         (["tdoa-table", "--anchors", "{bad}/empty"], ["empty", "line 1", "id,x_m,y_m,z_m"]),
         (["tdoa-table", "--anchors", "{bad}/bad-number.csv"], ["line 2", "z_m", "far", "finite number"]),
@@ -255,10 +255,10 @@ A, T = ["--anchors", "anchors.csv"], ["--truth", "truth.csv"]
         (["tdoa-table", "--anchors", "{bad}/twice.csv"], ["line 3", "id is 1", "only once"]),
         (["tdoa-table", "--anchors", "{bad}/no-z.csv"], ["line 1", "id,x_m,y_m,z_m"]),
         (["tdoa-table", "--anchors", "{bad}/ragged.csv"], ["line 2", "4 columns"]),
-        (["tdoa-table", "--site", "missing.toml"], ["missing.toml", "readable site file"]),
+        (["tdoa-table", "--site", "missing.toml"], ["missing.toml", "there is none"]),
         (["tdoa-table", "--site", "anchors.csv"], ["anchors.csv"]),
         (["tdoa-table", *A, "--site", "six.toml"], ["--anchors", "--site", "not both"]),
-        (["tdoa-table", *A, "--truth", "missing.csv"], ["missing.csv", "No such file"]),
+        (["tdoa-table", *A, "--truth", "missing.csv"], ["missing.csv", "there is none"]),
         (["tdoa-table", *A, "--truth", "{bad}/late.csv"], ["late.csv", "t_s", "1000.000 to 1001.000", "recording"]),
         (["tdoa-table", *A, "--truth", "{bad}/backwards.csv"], ["backwards.csv", "t_s", "at least 2"]),
         (["tdoa-table", *A, "--truth", "{bad}/cut.csv.gz"], ["cut.csv.gz", "whole file"]),

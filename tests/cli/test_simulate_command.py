@@ -13,11 +13,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from skyless.cli.common.simulated_site import check_live
 from skyless.cli.main import main
+from skyless.cli.nodes.options import check_live
 from skyless.cli.simulate import FIXES_CSV_COLUMNS
-from skyless.site.lab import lab_site
-from skyless.site.load import load_site
+from skyless.sim.lab import lab_site
+from skyless.site.file.load import load_site
 
 C = 299_792_458.0
 COMMAND = [sys.executable, "-m", "skyless.cli.main", "simulate"]
@@ -194,7 +194,7 @@ def test_a_table_for_people_has_no_control_characters(run):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--scenario", "moon"], ["--scenario", "moon", "lab or room"]),
+        (["--scenario", "moon"], ["--scenario", "moon", "one of lab, room"]),
         (["--scenario", "room", "--site", "lab.toml"], ["--scenario", "--site", "not both"]),
         (["--scenario", "room", "--speed", "2"], ["--speed", "--scenario room", "--waypoints"]),
         (["--scenario", "lab", "--site", "lab.toml"], ["--scenario", "--site", "not both"]),
@@ -209,13 +209,13 @@ def test_a_table_for_people_has_no_control_characters(run):
         (["--qa", "1", "--dynamics", "robot"], ["--qa", "--dynamics", "either"]),
         (["--dynamics", "car"], ["--dynamics", "car", "drone"]),
         (["--waypoints", "1,1;5,1", "--tags", "2"], ["--waypoints", "--tags", "either"]),
-        (["--waypoints", "1,1"], ["--waypoints", "'1,1'", "two or more", "quotes"]),
+        (["--waypoints", "1,1"], ["--waypoints", "(1.0, 1.0)", "two or more points"]),
         (["--waypoints", "1,1;5"], ["--waypoints", "'5'", "2 or 3"]),
-        (["--waypoints", "1,1;5,1,2"], ["--waypoints", "1,1;5,1,2", "all of its points"]),
-        (["--waypoints", "1,1;2e6,1"], ["--waypoints", "1,1;2e6,1", "within 1e+06 m"]),
-        (["--waypoints", "1,1;5,1;5,1"], ["--waypoints", "1,1;5,1;5,1", "0.01 m or more"]),
-        (["--site", "missing.toml"], ["missing.toml", "readable site file"]),
-        (["--site", "."], ["readable site file"]),
+        (["--waypoints", "1,1;5,1,2"], ["--waypoints", "(5.0, 1.0, 2.0)", "all have a height, or none"]),
+        (["--waypoints", "1,1;2e6,1"], ["--waypoints", "(2000000.0, 1.0)", "at most 1e+06"]),
+        (["--waypoints", "1,1;5,1;5,1"], ["--waypoints", "(5.0, 1.0), (5.0, 1.0)", "0.01 m or more"]),
+        (["--site", "missing.toml"], ["--site is 'missing.toml'", "a file"]),
+        (["--site", "."], ["--site is '.'", "a file"]),
         (["--method", "magic"], ["method", "magic", "joint", "literal"]),
         (["--method", "tracker"], ["method", "tracker", "joint", "literal"]),
         (["--position", "3"], ["--position", "'3'", "2 or 3"]),
@@ -224,9 +224,9 @@ def test_a_table_for_people_has_no_control_characters(run):
         (["--position", "1,2,3,4"], ["--position", "1,2,3,4"]),
         (["--duration", "-1"], ["--duration", "-1"]),
         (["--duration", "0"], ["--duration", "0"]),
-        (["--duration", "1"], ["--settle is 2", "1 s", "--duration", "before any fix is judged"]),
-        (["--duration", "2", "--fixes", "5"], ["--settle is 2", "2 s", "before any fix is judged"]),
-        (["--settle", "60", "--duration", "60"], ["--settle is 60", "60 s", "before any fix is judged"]),
+        (["--duration", "1"], ["--settle is 2", "--duration, which is 1", "no fix would be judged"]),
+        (["--duration", "2", "--fixes", "5"], ["--settle is 2", "which is 2", "no fix would be judged"]),
+        (["--settle", "60", "--duration", "60"], ["--settle is 60", "which is 60", "no fix would be judged"]),
         (["--duration", "inf"], ["--duration", "inf"]),
         (["--fixes", "0"], ["--fixes", "0"]),
         (["--noise-ps", "1e7"], ["--noise-ps", "10000000"]),
@@ -240,20 +240,20 @@ def test_a_table_for_people_has_no_control_characters(run):
         (["--bias", "99:1"], ["99", "1, 2, 3, 4, 5, 6"]),
         (["--bias", "2"], ["--bias", "'2'", "2 or 3"]),
         (["--bias", "2.5:1"], ["--bias", "2.5:1", "whole number"]),
-        (["--bias", "2:1:0"], ["--bias", "2:1:0", "longer than 0 s"]),
+        (["--bias", "2:1:0"], ["--bias[0].burst_s is 0.0", "above 0"]),
         (["--outage", "99:1"], ["99", "1, 2, 3, 4, 5, 6"]),
-        (["--outage", "2:3:1"], ["--outage", "2:3:1", "come back after"]),
-        (["--outage", "2:-3"], ["--outage", "2:-3", "0 s or later"]),
-        (["--outage", "2:1e300"], ["--outage", "1e300", "at most"]),
+        (["--outage", "2:3:1"], ["--outage", "from 3 s to 1 s", "the later one ends it"]),
+        (["--outage", "2:-3"], ["--outage", "from -3 s", "from 0 s"]),
+        (["--outage", "2:1e300"], ["--outage", "1e+300 s", "to 1e+08 s"]),
         (["--delay-error", "99:1:1"], ["99", "1, 2, 3, 4, 5, 6"]),
         (["--delay-error", "2:1"], ["--delay-error", "2:1", "3 numbers"]),
         (["--delay-error", "2.5:1:1"], ["--delay-error", "2.5:1:1", "whole number"]),
         (["--delay-error", "2:1:1e4"], ["--delay-error", "2:1:1e4", "within 1000 ns"]),
-        (["--delay-error", "2:1:1", "--delay-error", "2:0:1"], ["--delay-error", "2:0:1", "already"]),
+        (["--delay-error", "2:1:1", "--delay-error", "2:0:1"], ["--delay-error", "anchor 2", "once"]),
         (["--silence", "now"], ["--silence", "now", "1 or 2"]),
-        (["--silence", "3:3"], ["--silence", "3:3", "end after"]),
-        (["--silence", "-1:3"], ["--silence", "-1:3"]),
-        (["--silence", "1e300"], ["--silence", "1e300", "at most"]),
+        (["--silence", "3:3"], ["--silence", "from 3 s to 3 s", "the later one ends it"]),
+        (["--silence", "-1:3"], ["--silence", "from -1 s to 3 s"]),
+        (["--silence", "1e300"], ["--silence", "1e+300 s", "to 1e+08 s"]),
         (["--speed", "1e300"], ["--speed", "1e+300"]),
         (["--fixes-csv", "no/fixes.csv"], ["no/fixes.csv", "cannot be written"]),
         (["--fixes-csv", "."], ["cannot be written"]),

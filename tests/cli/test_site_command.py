@@ -7,8 +7,8 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.cli.main import main
-from skyless.site.lab import lab_site
-from skyless.site.load import load_site
+from skyless.sim.lab import lab_site
+from skyless.site.file.load import load_site
 
 
 def test_new_writes_the_lab(tmp_path):
@@ -40,7 +40,7 @@ def test_two_new_sites_have_different_numbers(tmp_path):
 def test_a_new_hall_has_the_master_that_a_plan_asks_for(tmp_path, capsys):
     """The hall of the README: from its corner one anchor received 9 % of the master."""
     path = tmp_path / "hall.toml"
-    hall = ["--width", "30", "--depth", "20", "--anchor-count", "8", "--height", "4"]
+    hall = ["--width", "30", "--depth", "20", "--anchor-count", "8", "--height", "4", "--paper"]
     assert main(["site", "new", str(path), *hall]) == 0
     assert load_site(path).master == 2
     capsys.readouterr()
@@ -82,10 +82,13 @@ def test_new_overwrites_only_by_force(tmp_path, capsys):
         (["--tag-height", "0"], "both --width and --depth"),
         (
             ["--width", "3", "--depth", "3", "--tag-height", "nan"],
-            "--tag-height is 'nan'; it should be metres, or free",
+            "--tag-height is 'nan'; it should be metres or free",
         ),
-        (["--width", "0.001", "--depth", "0.001", "--anchor-count", "20"], '"0.001" for --width. Must be >= 0.1'),
-        (["--width", "3", "--depth", "0.09"], '"0.09" for --depth. Must be >= 0.1'),
+        (
+            ["--width", "0.001", "--depth", "0.001", "--anchor-count", "20"],
+            "--width is 0.001; it should be a number, at least 0.1",
+        ),
+        (["--width", "3", "--depth", "0.09"], "--depth is 0.09; it should be a number, at least 0.1"),
     ],
 )
 def test_new_refuses(tmp_path, capsys, options, said):
@@ -108,7 +111,7 @@ def test_new_where_nothing_can_be_written(tmp_path, capsys):
 
 def test_check_shows_the_site(tmp_path, capsys):
     path = tmp_path / "[red]lab.toml"  # no markup of the terminal library's
-    main(["site", "new", str(path)])
+    main(["site", "new", str(path), "--paper"])
     assert main(["site", "check", str(path)]) == 0
     shown = capsys.readouterr().out
     for part in ("1 (master)", "66.7 superframes/s", "400 messages/s", "315 µs", "the site file is valid"):
@@ -129,8 +132,8 @@ def test_new_writes_anchors_without_positions(tmp_path, capsys):
     path = tmp_path / "blank.toml"
     assert main(["site", "new", str(path), "--unplaced", "7", "--tag-height", "1.1"]) == 0
     site = load_site(path)
-    assert (site.anchors, site.schedule.mode, site.schedule.slots, site.tags.height_m) == ((), "slots", 7, 1.1)
-    assert [(anchor.id, anchor.slot) for anchor in site.unplaced] == [(k, k - 1) for k in range(1, 8)]
+    assert (site.anchors, site.schedule.mode, site.tags.height_m) == ((), "free", 1.1)
+    assert [anchor.id for anchor in site.unplaced] == [1, 2, 3, 4, 5, 6, 7]
     assert main(["site", "check", str(path)]) == 0
     assert main(["site", "new", str(path), "--unplaced", "7", "--width", "3", "--force"]) == 2
     assert "--unplaced is 7; it takes no sizes" in capsys.readouterr().err

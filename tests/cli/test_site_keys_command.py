@@ -9,9 +9,9 @@ import time
 
 import pytest
 
-from skyless.authentication.key_files import read_keys, read_private, read_site_public
 from skyless.cli.main import main
-from skyless.whole_files import replace_files
+from skyless.core.whole_files import replace_files
+from skyless.run.keys.key_files import read_keys, read_private, read_site_public
 
 SHORT = ("--years", "0.0001")
 
@@ -132,8 +132,8 @@ def test_a_wrong_time_is_refused_before_anything_is_made(site, keys, capsys, sta
 
 def test_wrong_input_is_one_line(site, keys, tmp_path, capsys):
     lab = tmp_path / "lab.toml"
-    assert main(["site", "new", str(lab)]) == 0
-    refused(["new", lab], capsys, 'schedule.mode is "master", whose beacons carry no codes; it should be slots or free')
+    assert main(["site", "new", str(lab), "--paper"]) == 0
+    refused(["new", lab], capsys, 'schedule.mode is "master", whose beacons carry no codes; it should be free')
     refused(["show", site, "--keys", tmp_path / "none"], capsys, "none is no folder")
     refused(["new", site, "--keys", lab], capsys, "is no folder; --keys should name a folder to make")
     refused(["new", tmp_path / "missing.toml"], capsys, "missing.toml")

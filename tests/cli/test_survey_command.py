@@ -12,21 +12,19 @@ import pytest
 
 from machines.bench import LAB
 from recordings import live_site
-from skyless.cli.common.survey_facts import FactOptions, facts_of
 from skyless.cli.main import main
-from skyless.constants import TICK_M
-from skyless.errors import SkylessError
-from skyless.recordings.anchor_table import read_anchors, read_calibration
-from skyless.recordings.range_table import read_ranges
-from skyless.simulation.impairments import DelayError
-from skyless.site.lab import lab_site
-from skyless.site.load import load_site
-from skyless.site.model import AnchorSite, ScheduleSite, Site
-from skyless.site.template import site_template
-from skyless.survey.count import count
-from skyless.survey.facts import Facts, Gauge, KnownDelay, Tape
-from skyless.survey.record import read_record
-from skyless.survey.result import Survey
+from skyless.core.constants import TICK_M
+from skyless.core.errors import SkylessError
+from skyless.core.site import AnchorSite, ScheduleSite, Site
+from skyless.research.calibration.facts import facts_of
+from skyless.research.calibration.options import SurveyOptions
+from skyless.sim.impairments import DelayError
+from skyless.sim.lab import lab_site
+from skyless.site.file.load import load_site
+from skyless.site.file.template import site_template
+from skyless.site.survey.facts import Facts, Gauge, KnownDelay, Tape, count
+from skyless.site.survey.result import Survey, read_record
+from skyless.site.tables import read_anchors, read_calibration, read_ranges
 
 DRAW = np.random.default_rng(12)
 HALL_M = np.column_stack(
@@ -63,8 +61,8 @@ def hall(tmp_path_factory):
     (folder / "heights.csv").write_text("id,z_m\n" + heights)
     rough_m = HALL_M.copy()
     rough_m[:, :2] += np.random.default_rng(8).normal(0.0, 0.1, (12, 2))
-    anchors = tuple(AnchorSite(k + 1, *np.round(rough_m[k], 3).tolist(), slot=k) for k in range(12))
-    site = Site("hall", 3, 1, anchors, ScheduleSite(mode="slots", slots=12, slot_s=2.5e-3))
+    anchors = tuple(AnchorSite(k + 1, *np.round(rough_m[k], 3).tolist()) for k in range(12))
+    site = Site("hall", 3, 1, anchors, ScheduleSite(mode="free"))
     (folder / "site.toml").write_text(site_template(site))
     (folder / "elsewhere.csv").write_text("id,z_m\n77,2\n78,2\n")
     (folder / "folder.csv").mkdir()
@@ -234,7 +232,9 @@ def test_delays_from_a_recording_and_twice_is_once(capsys, tmp_path):
     (tmp_path / "site.toml").write_text(site_template(LAB))
     exact = ("--keep-positions", "--sketch-std", "0.0005", "--delay-std", "0.5", "--pair-std", "0")
     first, second = tmp_path / "first.toml", tmp_path / "second.toml"
-    report = run(capsys, tmp_path / "stay.mcap", "--site", tmp_path / "site.toml", *exact, "--out", first)
+    report = run(
+        capsys, "--recording", tmp_path / "stay.mcap", "--site", tmp_path / "site.toml", *exact, "--out", first
+    )
     assert report["excluded_pairs"] == []
     before = {anchor.id: anchor.tx_antenna_delay_ticks for anchor in LAB.anchors}
     after = {anchor.id: anchor.tx_antenna_delay_ticks for anchor in load_site(first).anchors}
@@ -243,10 +243,10 @@ def test_delays_from_a_recording_and_twice_is_once(capsys, tmp_path):
         tolerance = 1.0 + 10.0 * one["delay_std_m"] / TICK_M
         assert after[one["id"]] - before[one["id"]] == pytest.approx(wanted[one["id"]], abs=tolerance)
         assert one["delay_std_m"] < 0.002
-    run(capsys, tmp_path / "stay.mcap", "--site", first, *exact, "--out", second)
+    run(capsys, "--recording", tmp_path / "stay.mcap", "--site", first, *exact, "--out", second)
     again = {anchor.id: anchor.tx_antenna_delay_ticks for anchor in load_site(second).anchors}
     assert all(abs(again[anchor] - after[anchor]) <= 1 for anchor in after)
-    whole = run(capsys, tmp_path / "stay.mcap", "--delays-known", "--pair-std", "0.1")
+    whole = run(capsys, "--recording", tmp_path / "stay.mcap", "--delays-known", "--pair-std", "0.1")
     assert len(whole["anchors"]) == len(LAB.anchors)
     assert whole["drops"] == []
 
@@ -256,11 +256,11 @@ def test_damage_of_a_recording_is_reported(capsys, tmp_path):
     live_site.record(stay, live_site.messages(5.0, join_s=0.0))
     whole = bytearray(stay.read_bytes())
     stay.write_bytes(whole[: len(whole) // 2])
-    report = run(capsys, stay)
+    report = run(capsys, "--recording", stay)
     assert report["drops"] == ["left out: 1 × unfinished-record"]
     whole[len(whole) // 2] ^= 0xFF
     stay.write_bytes(whole)
-    report = run(capsys, stay)
+    report = run(capsys, "--recording", stay)
     assert "left out: 1 × damaged-chunk" in report["drops"]
     assert len(report["anchors"]) == len(LAB.anchors)
 
@@ -277,16 +277,19 @@ def test_damage_of_a_recording_is_reported(capsys, tmp_path):
 def test_walks_that_cannot_be_used(capsys, tmp_path, walks, words):
     stay = tmp_path / "stay.mcap"
     live_site.record(stay, live_site.messages(2.0, join_s=0.0))
-    assert words in complaint(capsys, stay, *(part for walk in walks for part in ("--walk", walk)))
+    assert words in complaint(capsys, "--recording", stay, *(part for walk in walks for part in ("--walk", walk)))
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         ((), "needs a recording"),
-        (("{hall}/ranges.csv",), "it should be that of a recording of skyless record, or of one of the formats"),
-        (("{hall}/none.mcap",), "a file that can be read"),
-        (("{hall}/pipe",), "a pipe"),
+        (
+            ("--recording", "{hall}/ranges.csv"),
+            "it should be that of a recording of skyless record, or of one of the formats",
+        ),
+        (("--recording", "{hall}/none.mcap"), "it should be a file, and there is none"),
+        (("--recording", "{hall}/pipe"), "a pipe"),
         (("--ranges", "{hall}/heights.csv"), "a header with anchor_a,anchor_b,range_m"),
         (("--ranges", "{hall}/ranges.csv", "--anchor-heights", "{hall}/ranges.csv"), "a header with id,z_m"),
         (("--out", "a.toml"), "a site file needs --site"),
@@ -336,7 +339,7 @@ def test_walks_that_cannot_be_used(capsys, tmp_path, walks, words):
 )
 def test_what_the_user_can_mend_is_named(hall, capsys, arguments, words):
     given = [one.format(hall=hall) for one in arguments]
-    if given and given[0].startswith("--") and given[0] != "--ranges":
+    if given and given[0].startswith("--") and given[0] not in {"--ranges", "--recording"}:
         given = ["--ranges", str(hall / "ranges.csv"), *given]
     assert words in complaint(capsys, *given)
     assert (hall / "ranges.csv").read_text().startswith("anchor_a")
@@ -346,10 +349,11 @@ def test_facts_from_options(hall):
     site = load_site(hall / "site.toml")
     everybody = tuple(range(1, 13))
     facts = facts_of(
-        FactOptions(
-            anchor_height=["2.5", "3=2.4"], distance=["1-4=7.21", "0x1-5=8±0.01", "2-3=4+-0.02"],
-            point=["7=1,-2,3", "8=0,0"],
-            delay_std=0.15, pair_std=0.0, origin=1, x_axis=4,
+        SurveyOptions(
+            anchor_height_m={None: 2.5, 3: 2.4},
+            distances=(Tape(1, 4, 7.21), Tape(1, 5, 8.0, 0.01), Tape(2, 3, 4.0, 0.02)),
+            points_m={7: (1, -2, 3), 8: (0, 0)},
+            delay_std_m=0.15, pair_std_m=0.0, origin=1, x_axis=4,
         ),
         everybody,
         site,
@@ -360,13 +364,13 @@ def test_facts_from_options(hall):
     assert facts.sketch_m[12] == (site.anchors[11].x_m, site.anchors[11].y_m, site.anchors[11].z_m)
     assert (facts.sketch_std_m, facts.delay_std_m, facts.pair_std_m) == (0.3, 0.15, 0.0)
     assert facts.gauge == Gauge(1, 4)
-    assert facts_of(FactOptions(), everybody, None) == Facts()
-    bare = facts_of(FactOptions(no_sketch=True, delays_known=True), everybody, site)
+    assert facts_of(SurveyOptions(), everybody, None) == Facts()
+    bare = facts_of(SurveyOptions(no_sketch=True, delays_known=True), everybody, site)
     assert (bare.sketch_m, bare.delay_std_m, bare.heights_m[1]) == ({}, 0.0, site.anchors[0].z_m)
-    kept = facts_of(FactOptions(keep_positions=True), everybody, site)
+    kept = facts_of(SurveyOptions(keep_positions=True), everybody, site)
     assert (kept.keep_positions, kept.sketch_std_m) == (True, pytest.approx(site.accuracy.survey_std_m))
     free = facts_of(
-        FactOptions(dimensions=3, anchor_heights=hall / "heights.csv", anchor_height_std=0.1), (1, 2, 99), site
+        SurveyOptions(dimensions=3, anchor_heights=hall / "heights.csv", anchor_height_std_m=0.1), (1, 2, 99), site
     )
     assert (free.dimensions, sorted(free.heights_m), free.height_std_m) == (3, [1, 2], 0.1)
 
@@ -390,7 +394,7 @@ def test_missing_heights_are_those_of_the_others_and_said(hall, capsys):
 
 def test_a_height_of_no_anchor_is_refused():
     with pytest.raises(SkylessError, match="no anchor 9"):
-        facts_of(FactOptions(anchor_height=["9=2"]), (1, 2), None)
+        facts_of(SurveyOptions(anchor_height_m={9: 2.0}), (1, 2), None)
 
 
 def test_ranges_are_counted_before(hall):
@@ -410,7 +414,7 @@ def test_ranges_are_counted_before(hall):
 
 
 def _complete(n):
-    from skyless.survey.ranges import PairRange, PairRanges
+    from skyless.site.survey.facts import PairRange, PairRanges
 
     pairs = tuple(PairRange(a, b, 1.0, 0.01, 1) for b in range(1, n + 1) for a in range(1, b))
     return PairRanges(pairs, tuple(range(1, n + 1)))

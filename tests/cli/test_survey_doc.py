@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from skyless.cli.main import main, program
-from skyless.site.load import load_site
-from skyless.site.model import AnchorSite, ScheduleSite, Site
-from skyless.site.template import site_template
+from skyless.core.site import AnchorSite, ScheduleSite, Site
+from skyless.site.file.load import load_site
+from skyless.site.file.template import site_template
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "survey.md"
 COMMANDS = [
@@ -57,8 +57,8 @@ def hall(tmp_path, monkeypatch):
     ]
     Path("ranges.csv").write_text("\n".join(["anchor_a,anchor_b,range_m", *rows, ""]))
     Path("heights.csv").write_text("id,z_m\n" + "".join(f"{k + 1},{at_m[k, 2]:.2f}\n" for k in range(12)))
-    anchors = tuple(AnchorSite(k + 1, *np.round(at_m[k], 2).tolist(), slot=k) for k in range(12))
-    site = Site("hall", 3, 1, anchors, ScheduleSite(mode="slots", slots=12, slot_s=2.5e-3))
+    anchors = tuple(AnchorSite(k + 1, *np.round(at_m[k], 2).tolist()) for k in range(12))
+    site = Site("hall", 3, 1, anchors, ScheduleSite(mode="free"))
     Path("site.toml").write_text(site_template(site))
 
 

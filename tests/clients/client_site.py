@@ -12,7 +12,7 @@ import time
 import paho.mqtt.publish
 import paho.mqtt.subscribe
 
-from skyless.nodes.process import end_with_parent
+from skyless.run.process import end_with_parent
 
 START_S = 120.0
 """A first start compiles the kernels."""

@@ -9,12 +9,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from skyless.bridges.feed import BridgedSite
-from skyless.bridges.foxglove.target import FoxgloveTarget
+from skyless.bridges.foxglove import FoxgloveTarget
 from skyless.bridges.hub import Hub, Route
-from skyless.mqtt.messages import Counters, FixMessage, TagHealth
-from skyless.site.earth import geodetic
-from skyless.site.model import GeoreferenceSite, WallSite
+from skyless.bridges.target import BridgedSite
+from skyless.core.earth import geodetic
+from skyless.core.site import GeoreferenceSite, WallSite
+from skyless.run.mqtt.messages import Counters, FixMessage, TagHealth
 
 ROOT = Path(__file__).parents[2]
 CLIENT = Path(__file__).with_name("foxglove_client.cjs")

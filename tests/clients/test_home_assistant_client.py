@@ -13,7 +13,7 @@ import msgspec
 import pytest
 from client_site import ORIGIN, ClientSite, Process, free_port, until
 
-from skyless.mqtt.messages import FixMessage, Zone, ZonesMessage
+from skyless.run.mqtt.messages import FixMessage, Zone, ZonesMessage
 
 ENVIRONMENT = Path(__file__).parents[2] / ".venv-clients" / "homeassistant"
 PACKAGES = ("homeassistant==2025.4.4", "home-assistant-frontend==20250411.0", "paho-mqtt==2.1.0")

@@ -15,7 +15,7 @@ import pytest
 from client_site import ClientSite, Process, free_port, until
 from paho.mqtt.enums import CallbackAPIVersion
 
-from skyless.mqtt.messages import TagHealth
+from skyless.run.mqtt.messages import TagHealth
 
 CONFIGURATION = """
 global:

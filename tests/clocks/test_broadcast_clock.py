@@ -4,7 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 
-from skyless.clocks.broadcast import (
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
+from skyless.core.tag.broadcast import (
     ACCELERATION_M2PS3,
     BROADCAST_WALK_FM,
     RESTART_AFTER,
@@ -12,7 +13,6 @@ from skyless.clocks.broadcast import (
     WHITE_FM,
     BroadcastClock,
 )
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
 
 SECOND = 63_897_600_000
 PERIOD = SECOND // 50

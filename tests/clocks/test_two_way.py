@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.clocks.two_way import Leg, TwoWayRanging, bracketed_flight_ticks
-from skyless.recordings.foreign.avalue import anchor_distances_m
+from skyless.research.foreign.avalue import anchor_distances_m
+from skyless.site.survey.two_way import Leg, TwoWayRanging, bracketed_flight_ticks
 
 SECOND = 63_897_600_000
 wrapped = st.integers(0, 2**40 - 1)

@@ -1,6 +1,8 @@
 """What the dashboard's tests share: a live site, one browser, servers of a made-up site, visits nothing may fail in."""
 
+import asyncio
 import contextlib
+from asyncio import events
 from pathlib import Path
 
 import pytest
@@ -8,7 +10,7 @@ from dashboard_builders import SITE_ID, Times, Wire
 from page_browser import CHROMIUM, FLAGS, Visit
 from page_fake_server import FakeServer
 
-from skyless.dashboard.live import LiveSite
+from skyless.page.live import LiveSite
 
 
 @pytest.fixture
@@ -29,14 +31,18 @@ def live(times, wire):
     return live
 
 
-@pytest.fixture(scope="module")  # while it lives its event loop runs, and no other module's test may run its own
+@pytest.fixture(scope="session")
 def chromium():
+    """One browser for all tests of a worker: Chromium and Playwright's event loop, which counts as running."""
     sync_api = pytest.importorskip("playwright.sync_api")
     if not Path(CHROMIUM).exists():
         pytest.skip(f"no Chromium at {CHROMIUM}: apt install chromium")
     with sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield browser
+        loop = asyncio.get_running_loop()
+        events._set_running_loop(None)  # between visits other tests run loops of their own
+        yield browser, loop
+        events._set_running_loop(loop)
         browser.close()
 
 
@@ -50,16 +56,28 @@ def serve():
 @pytest.fixture
 def visit(chromium):
     """Open the page; in the end, it has reported no problem and sent requests to its server only."""
+    browser, loop = chromium
     visits = []
 
     def open_page(server, **context):
-        visits.append(Visit(chromium, server.address, **context))
+        visits.append(Visit(browser, server.address, **context))
         visits[-1].host = server.address.split("/")[2]
         return visits[-1]
 
-    yield open_page
-    for one in visits:
-        one.context.close()
+    events._set_running_loop(loop)
+    try:
+        yield open_page
+        for one in visits:
+            one.close()
+    finally:
+        events._set_running_loop(None)
     for one in visits:
         assert one.problems == []
         assert one.hosts <= {one.host}
+
+
+@pytest.fixture
+def hall(serve, visit):
+    """A server with three tags, and a visit to it."""
+    server = serve()
+    return server, visit(server)

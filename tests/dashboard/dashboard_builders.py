@@ -1,11 +1,17 @@
-"""Messages of a small site, and an MQTT that only remembers."""
+"""Messages of a small site, an MQTT that only remembers, and a client of the server."""
 
 import msgspec
 from paho.mqtt.client import topic_matches_sub
+from starlette.testclient import TestClient
 
-from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.messages import FixMessage, SiteMessage, StatusMessage, TruthMessage, Zone
-from skyless.site.lab import lab_site
+from skyless.page.app import Services, make_app
+from skyless.page.guard import AccessRules
+from skyless.page.overlays import Overlays
+from skyless.page.playback import Playback
+from skyless.page.sites import LiveSites
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.messages import FixMessage, SiteMessage, StatusMessage, TruthMessage, Zone
+from skyless.sim.lab import lab_site
 
 SITE = SiteMessage(lab_site(100.0), simulated=True, unix_s=1000.0)
 SITE_ID = SITE.site.id
@@ -89,3 +95,13 @@ class Wire:
 
     def topics(self):
         return [topic for topic, *_ in self.published]
+
+
+HERE = "http://localhost:8080"
+
+
+def browser_of(live, recordings=None, *, page=None, rules=None, base_url=HERE):
+    """A client of a server that shows one live site, or several, and the recordings of a folder."""
+    sites = live if isinstance(live, LiveSites) else LiveSites(live)
+    services = Services(sites, Overlays(), Playback(recordings))
+    return TestClient(make_app(services, rules or AccessRules(), **({"page": page} if page else {})), base_url=base_url)

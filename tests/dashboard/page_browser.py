@@ -3,6 +3,7 @@
 import time
 
 CHROMIUM = "/usr/bin/chromium"
+WINDOW = {"width": 1280, "height": 800}
 FLAGS = [
     "--no-sandbox",
     "--disable-gpu",
@@ -29,10 +30,17 @@ THREE_FRAMES = """() => new Promise((done) => {
 
 
 class Visit:
-    """A page that is open, and what went wrong in it."""
+    """A page that is open, and what went wrong in it.
+
+    Pages of the usual window share a context, and so the browser's cache of the page's modules.
+    """
+
+    _shared = None
 
     def __init__(self, browser, address, **context):
-        self.context = browser.new_context(**{"viewport": {"width": 1280, "height": 800}, **context})
+        if Visit._shared is None:
+            Visit._shared = browser.new_context(viewport=WINDOW)
+        self.context = browser.new_context(**{"viewport": WINDOW, **context}) if context else Visit._shared
         self.page = self.context.new_page()
         self.problems, self.hosts = [], set()
         self.page.on("pageerror", lambda error: self.problems.append(str(error)))
@@ -41,6 +49,14 @@ class Visit:
         self.page.goto(address)
         until(self.page, "window.skyless?.state.connection.phase === 'open'")
         self.page.evaluate(THREE_FRAMES)  # the map is fitted to the site in the frame after its message
+
+    def close(self):
+        """End the visit, without a trace in the next one."""
+        if self.context is not Visit._shared:
+            self.context.close()
+        else:
+            self.page.evaluate("localStorage.clear(), sessionStorage.clear()")
+            self.page.close()
 
     def _note(self, text):
         self.problems.append(text)

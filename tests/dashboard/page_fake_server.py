@@ -1,6 +1,6 @@
 """A server of a made-up site for the page's tests and for work on the page.
 
-By hand: ``.venv/bin/python tests/dashboard/page_fake_server.py [tags]``, then open the address that it prints.
+By hand: ``PYTHONPATH=tests .venv/bin/python tests/dashboard/page_fake_server.py [tags]``, then open what it prints.
 """
 
 import asyncio
@@ -21,7 +21,8 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocketDisconnect
 
 import skyless
-from skyless.dashboard.state import SILENT_S
+from skyless.page.state import SILENT_S
+from support.processes import free_port
 
 PAGE = Path(skyless.__file__).parent / "dashboard" / "page"
 RECORDED_S = 90.0
@@ -63,7 +64,7 @@ class FakeServer:
         self.zone_events = []
         self.started = time.time()
         self.sockets = {}
-        self.port = _free_port()
+        self.port = _usual_port()
         self._loop = None
         self._server = None
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -193,7 +194,7 @@ class FakeServer:
                 Route("/api/recordings/{name}/states", states),
                 Route("/api/recordings/{name}/floor_plan", recorded_plan),
                 WebSocketRoute("/live", self._live),
-                Mount("/page", StaticFiles(directory=PAGE)),
+                Mount("/page", _Modules(directory=PAGE)),
             ]
         )
 
@@ -290,6 +291,15 @@ class FakeServer:
                 await _send(websocket, lock, {"type": "pong"})
 
 
+class _Modules(StaticFiles):
+    """Files that a browser keeps for all tests, which have servers at one port, one after the other."""
+
+    def file_response(self, *args, **kwargs):
+        response = super().file_response(*args, **kwargs)
+        response.headers["cache-control"] = "max-age=3600, immutable"
+        return response
+
+
 async def _send(websocket, lock, message):
     async with lock:
         await websocket.send_json(message)
@@ -312,10 +322,18 @@ def _guarded(response):
     return response
 
 
-def _free_port():
+_port = free_port()
+
+
+def _usual_port():
+    """The same one for all servers of this process, unless it is in use."""
     with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", _port))
+        except OSError:
+            return free_port()
+    return _port
 
 
 if __name__ == "__main__":

@@ -3,31 +3,25 @@
 import asyncio
 
 import pytest
-from dashboard_builders import SITE, SITE_ID, SQUARE, fix
+from dashboard_builders import HERE, SITE, SITE_ID, SQUARE, browser_of, fix
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
-from skyless.dashboard.app import Services, make_app
-from skyless.dashboard.guard import AccessRules, Guard
-from skyless.dashboard.live import (
+from skyless.core.earth import geodetic
+from skyless.core.site import GeoreferenceSite
+from skyless.page.guard import AccessRules, Guard
+from skyless.page.live import (
     GONE_S,
     IDLE_S,
     MAX_PAGES,
     MAX_PAGES_PER_ADDRESS,
     TooManyPagesError,
 )
-from skyless.dashboard.overlays import Overlays
-from skyless.dashboard.playback import Playback
-from skyless.dashboard.sites import LiveSites
-from skyless.mqtt import topics
-from skyless.site.earth import geodetic
-from skyless.site.model import GeoreferenceSite
+from skyless.run.mqtt import topics
 
 TOKEN = "correct-horse-battery"
-HERE = "http://localhost:8080"
 SOCKET = "ws://localhost:8080/live"
 STRANGE_SOCKET = "ws://192.168.1.5:8080/live"
 
@@ -43,22 +37,16 @@ def page(tmp_path):
     return folder
 
 
-def client(live, page, rules=None, base_url=HERE):
-    return TestClient(
-        make_app(Services(LiveSites(live), Overlays(), Playback(None)), rules or AccessRules(), page), base_url=base_url
-    )
-
-
 @pytest.fixture
 def browser(live, page):
-    return client(live, page)
+    return browser_of(live, page=page)
 
 
 @pytest.fixture
 def stranger(live, page):
     """Somebody on another machine."""
     rules = AccessRules(TOKEN, frozenset({"hall.example"}), remote=True, cookie="skyless-8080")
-    return client(live, page, rules, "http://192.168.1.5:8080")
+    return browser_of(live, page=page, rules=rules, base_url="http://192.168.1.5:8080")
 
 
 def test_the_page_and_its_modules(browser):

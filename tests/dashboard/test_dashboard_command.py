@@ -1,16 +1,22 @@
-"""``skyless dashboard`` before it serves: its options and its port."""
+"""``skyless dashboard``: its options, its port, and connections that never finish their first request."""
 
+import asyncio
 import socket
 import subprocess
 import sys
 
 import pytest
+import uvicorn
+from starlette.applications import Starlette
+from starlette.responses import PlainTextResponse
+from starlette.routing import Route
 
 from skyless.cli.dashboard import _address, _listening, _rules
 from skyless.cli.main import main
-from skyless.dashboard.serve import PORT, ListenAddress, bind
-from skyless.errors import SkylessError
-from skyless.nodes.ports import claim
+from skyless.core.errors import SkylessError
+from skyless.page.serve import PORT, ListenAddress, _Server, bind
+from skyless.run.process import reserve
+from support.processes import free_port
 
 
 @pytest.mark.parametrize(
@@ -53,7 +59,7 @@ def test_the_next_free_port_is_taken_when_none_was_asked_for():
 def test_a_port_that_a_demo_has_named_is_left_to_its_page():
     with bind(ListenAddress("127.0.0.1", None)) as first:
         port = first.getsockname()[1]
-        claimed = claim("127.0.0.1", port)
+        claimed = reserve("127.0.0.1", port)
     assert claimed is not None
     with claimed, bind(ListenAddress("127.0.0.1", None)) as second:
         assert second.getsockname()[1] != port
@@ -113,7 +119,41 @@ def test_the_site_file_and_the_number_must_agree(capsys, tmp_path):
 
 def test_the_server_loads_nothing_heavy():
     """Overlays have a process of their own; NumPy and Numba in this one would cost its start a second and 150 MB."""
-    look = "import skyless.dashboard.serve, skyless.dashboard.playback, sys; print(*sys.modules)"
+    look = "import skyless.page.serve, skyless.page.playback, sys; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True).stdout.split()
-    assert "skyless.dashboard.app" in loaded
+    assert "skyless.page.app" in loaded
     assert not {"numpy", "numba", "scipy", "matplotlib"} & set(loaded)
+
+
+@pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nHost: localhost\r\n"])
+def test_a_request_that_is_never_finished_is_ended(sent):
+    async def slow(_request):
+        await asyncio.sleep(1.0)
+        return PlainTextResponse("done")
+
+    async def run():
+        port = free_port()
+        config = uvicorn.Config(Starlette(routes=[Route("/", slow)]), port=port, log_config=None, lifespan="off")
+        server = _Server(config)
+        serving = asyncio.create_task(server.serve())
+        while not server.started:
+            await asyncio.sleep(0.01)
+        ending = asyncio.create_task(server.end_unfinished(0.2))
+        idle_reader, idle_writer = await asyncio.open_connection("127.0.0.1", port, family=socket.AF_INET)
+        idle_writer.write(sent)
+        reader, writer = await asyncio.open_connection("127.0.0.1", port, family=socket.AF_INET)
+        writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+        async with asyncio.timeout(20.0):
+            try:
+                ended = await idle_reader.read()
+            except ConnectionResetError:
+                ended = b""
+            answer = await reader.read()
+        ending.cancel()
+        server.should_exit = True
+        await serving
+        return ended, answer
+
+    ended, answer = asyncio.run(run())
+    assert ended == b""
+    assert answer.endswith(b"done")

@@ -6,10 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.dashboard.condition.evidence import FRESH_S, GRACE_S, Evidence
-from skyless.dashboard.condition.monitor import EVALUATION_S, HOLD_S, ConditionMonitor
-from skyless.dashboard.condition.reasons import START_S, alert_reasons
-from skyless.mqtt.messages import AnchorHealth, Counters, EtherHealth, TagHealth, WatchFinding, WatchMessage
+from skyless.page.condition.evidence import FRESH_S, GRACE_S, Evidence
+from skyless.page.condition.monitor import EVALUATION_S, HOLD_S, ConditionMonitor
+from skyless.page.condition.reasons import START_S, alert_reasons
+from skyless.run.mqtt.messages import AnchorHealth, Counters, EtherHealth, TagHealth, WatchFinding, WatchMessage
 
 IDS = [anchor.id for anchor in SITE.site.anchors]
 MQTT = Counters(0, 0, 0)

@@ -5,7 +5,6 @@ import contextlib
 import json
 import signal
 import socket
-import sys
 import time
 
 import httpx2 as httpx
@@ -16,37 +15,28 @@ import websockets
 from dashboard_builders import SITE, SITE_ID, SQUARE, fix, truth
 from websockets.protocol import State
 
-from skyless.dashboard.app import Services, make_app
-from skyless.dashboard.guard import AccessRules
-from skyless.dashboard.live import IDLE_S, MAX_PAGES_PER_ADDRESS
-from skyless.dashboard.overlays import Overlays
-from skyless.dashboard.playback import Playback
-from skyless.dashboard.sites import LiveSites
-from skyless.mqtt import topics
-from skyless.mqtt.link import Link
-from skyless.mqtt.messages import ZonesMessage
-from skyless.nodes.broker import BrokerSettings, start_broker
+from skyless.page.app import Services, make_app
+from skyless.page.guard import AccessRules
+from skyless.page.live import IDLE_S, MAX_PAGES_PER_ADDRESS
+from skyless.page.overlays import Overlays
+from skyless.page.playback import Playback
+from skyless.page.sites import LiveSites
+from skyless.run.broker import BrokerSettings, start_broker
+from skyless.run.mqtt import topics
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.messages import ZonesMessage
+from support.loops import in_loop
+from support.processes import SKYLESS, free_port, running_program
 
-COMMAND = [sys.executable, "-m", "skyless.cli.main", "dashboard", "--json"]
 PATIENCE_S = 20.0
-
-
-def free_port():
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return sock.getsockname()[1]
 
 
 @contextlib.asynccontextmanager
 async def dashboard(*arguments):
     """A running dashboard, and what it has printed."""
-    process = await asyncio.create_subprocess_exec(*COMMAND, *arguments, stdout=asyncio.subprocess.PIPE)
-    try:
+    command = (*SKYLESS, "dashboard", "--json", *arguments)
+    async with running_program(*command, stdout=asyncio.subprocess.PIPE) as process:
         yield json.loads(await asyncio.wait_for(process.stdout.readline(), PATIENCE_S)), process
-    finally:
-        if process.returncode is None:
-            process.kill()
-        await process.wait()
 
 
 @contextlib.asynccontextmanager
@@ -99,11 +89,8 @@ async def settled(condition):
             await asyncio.sleep(0.01)
 
 
-def test_a_site_is_found_shown_and_watched(tmp_path):
-    asyncio.run(a_site_is_found_shown_and_watched(tmp_path))
-
-
-async def a_site_is_found_shown_and_watched(tmp_path):
+@in_loop
+async def test_a_site_is_found_shown_and_watched(tmp_path):
     where = BrokerSettings(port=free_port(), data=tmp_path / "broker")
     broker = await start_broker(where)
     events, zones = [], []
@@ -148,11 +135,8 @@ async def a_site_is_found_shown_and_watched(tmp_path):
     await broker.stop()
 
 
-def test_a_page_that_does_not_read_delays_no_other(tmp_path):
-    asyncio.run(a_page_that_does_not_read_delays_no_other(tmp_path))
-
-
-async def a_page_that_does_not_read_delays_no_other(tmp_path):
+@in_loop
+async def test_a_page_that_does_not_read_delays_no_other(tmp_path):
     settings = BrokerSettings(port=free_port(), data=tmp_path / "broker")
     async with (
         await start_broker(settings) as broker,
@@ -197,16 +181,14 @@ async def never_read(port):
     return sock
 
 
-def test_without_a_broker_the_page_opens_and_shows_it():
-    async def check():
-        nobody = f"mqtt://127.0.0.1:{free_port()}"
-        async with dashboard("--mqtt", nobody) as (output, _), live_page(output) as page:
-            assert output["mqtt"] == nobody
-            hello = await next_of(page, "hello")
-            assert (hello["mqtt"], hello["site"]) == (False, None)
-            assert await next_of(page, "mqtt") == {"type": "mqtt", "connected": False, "broker": nobody}
-
-    asyncio.run(check())
+@in_loop
+async def test_without_a_broker_the_page_opens_and_shows_it():
+    nobody = f"mqtt://127.0.0.1:{free_port()}"
+    async with dashboard("--mqtt", nobody) as (output, _), live_page(output) as page:
+        assert output["mqtt"] == nobody
+        hello = await next_of(page, "hello")
+        assert (hello["mqtt"], hello["site"]) == (False, None)
+        assert await next_of(page, "mqtt") == {"type": "mqtt", "connected": False, "broker": nobody}
 
 
 def test_idle_connections_shut_nobody_out_and_a_page_too_many_gets_the_reason(live, times):
@@ -237,16 +219,14 @@ def test_idle_connections_shut_nobody_out_and_a_page_too_many_gets_the_reason(li
     asyncio.run(asyncio.wait_for(check(), 60.0))
 
 
-def test_other_machines_need_the_token_that_is_printed():
-    async def check():
-        async with dashboard("--listen", f"0.0.0.0:{free_port()}") as (output, _):
-            address = httpx.URL(output["page"])
-            assert output["page"].endswith(f"?token={output['token']}")
-            assert len(output["token"]) >= 20
-            async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{address.port}") as http:
-                assert (await http.get("/api/recordings")).status_code == 401
-                assert (await http.get("/api/recordings", params={"token": output["token"]})).status_code == 200
-                assert (await http.get("/api/recordings")).status_code == 200, "by the cookie"
-                assert (await http.get("/", headers={"host": "evil.example"})).status_code == 421
-
-    asyncio.run(check())
+@in_loop
+async def test_other_machines_need_the_token_that_is_printed():
+    async with dashboard("--listen", f"0.0.0.0:{free_port()}") as (output, _):
+        address = httpx.URL(output["page"])
+        assert output["page"].endswith(f"?token={output['token']}")
+        assert len(output["token"]) >= 20
+        async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{address.port}") as http:
+            assert (await http.get("/api/recordings")).status_code == 401
+            assert (await http.get("/api/recordings", params={"token": output["token"]})).status_code == 200
+            assert (await http.get("/api/recordings")).status_code == 200, "by the cookie"
+            assert (await http.get("/", headers={"host": "evil.example"})).status_code == 421

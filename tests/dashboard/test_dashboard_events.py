@@ -6,11 +6,11 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from test_dashboard_condition import anchor_health, tag_health
 
-from skyless.dashboard.condition.monitor import Condition
-from skyless.dashboard.condition.reasons import Reason
-from skyless.dashboard.events import ALERT_INTERVAL_S, MAX_LOGGED, SILENT_S, EventLog
-from skyless.mqtt.messages import SurveyMessage, WatchFinding, WatchMessage
-from skyless.survey.facts import Facts
+from skyless.page.condition.monitor import Condition
+from skyless.page.condition.reasons import Reason
+from skyless.page.events import ALERT_INTERVAL_S, MAX_LOGGED, SILENT_S, EventLog
+from skyless.run.mqtt.messages import SurveyMessage, WatchFinding, WatchMessage
+from skyless.site.survey.facts import Facts
 
 NOW = 1000.0
 

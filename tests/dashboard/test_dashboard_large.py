@@ -9,9 +9,9 @@ from msgspec.structs import replace
 from test_dashboard_condition import anchor_health
 from test_dashboard_live import drained, of
 
-from skyless.dashboard.condition import roster
-from skyless.dashboard.page_request import MAX_ROWS, PageRequest
-from skyless.mqtt import topics
+from skyless.page.condition import evidence
+from skyless.page.state import MAX_ROWS, PageRequest
+from skyless.run.mqtt import topics
 
 SPACING_M = 4.0
 FREE = replace(SITE.site.schedule, mode="free")
@@ -59,7 +59,7 @@ def test_a_healthy_large_site_is_good_and_says_how_many_are_shown(live, wire, ti
 
 
 def test_what_is_not_taken_in_is_counted_and_not_judged(live, wire, times, monkeypatch):
-    monkeypatch.setattr(roster, "MAX_NAMES", {"tag": 5, "anchor": 6})
+    monkeypatch.setattr(evidence, "MAX_NAMES", {"tag": 5, "anchor": 6})
     condition = large(live, wire, times, 8, 9)
     assert condition.level == "warning"
     assert [(reason.kind, reason.text) for reason in condition.reasons] == [
@@ -73,7 +73,7 @@ def test_what_is_not_taken_in_is_counted_and_not_judged(live, wire, times, monke
 
 
 def test_invented_kinds_and_names_do_not_fill_the_memory(live, wire, monkeypatch):
-    monkeypatch.setattr(roster, "MAX_OTHERS", 3)
+    monkeypatch.setattr(evidence, "MAX_OTHERS", 3)
     for n in range(9):
         wire.deliver(topics.status_topic(SITE_ID, f"kind{n}", "a"), status(f"kind{n}", "a"))
         wire.deliver(topics.health_topic(SITE_ID, "ether", f"air{n}"), b'{"unix_s":1,"simulated_s":1,"transmissions":1,"late":0,"at_anchors":{},"at_tags":{},"stalls":0,"overruns":0}')  # fmt: skip  # noqa: E501

@@ -9,13 +9,12 @@ from dashboard_builders import SITE, SITE_ID, SQUARE, fix, status, truth
 from msgspec.structs import replace
 from test_dashboard_condition import anchor_health
 
-from skyless.dashboard.events import SILENT_S
-from skyless.dashboard.live import LiveSite
-from skyless.dashboard.zone_events import MAX_EVENTS
-from skyless.mqtt import topics
-from skyless.mqtt.messages import PreparationMessage, SiteZones, ZoneEvent, ZonesMessage
-from skyless.zones.monitor import TAG_TIMEOUT_S
-from skyless.zones.zone_list import BadZonesError
+from skyless.page.events import MAX_EVENTS, SILENT_S
+from skyless.page.live import LiveSite
+from skyless.run.mqtt import topics
+from skyless.run.mqtt.messages import PreparationMessage, SiteZones, ZoneEvent, ZonesMessage
+from skyless.run.zones.monitor import TAG_TIMEOUT_S
+from skyless.run.zones.zone_list import BadZonesError
 
 FIX = topics.fix_topic(SITE_ID, "t1")
 ZONES = topics.zones_topic(SITE_ID)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.dashboard.overlay_process import overlay_grids
-from skyless.dashboard.overlays import MAX_CELLS, NoOverlayError, Overlays, overlay_task
-from skyless.method_names import DEFAULT_METHOD, METHODS
-from skyless.planning.colours import COLOUR_STOPS
-from skyless.planning.columns import HDOP, PDOP, SIGMA
-from skyless.planning.predict import PlanSettings, Predictor
-from skyless.site.lab import lab_site
-from skyless.site.model import AnchorSite, FloorPlanSite, TagsSite
+from skyless.core.method_names import DEFAULT_METHOD, METHODS
+from skyless.core.site import AnchorSite, FloorPlanSite, TagsSite
+from skyless.page.overlay_process import overlay_grids
+from skyless.page.overlays import MAX_CELLS, NoOverlayError, Overlays, overlay_task
+from skyless.sim.lab import lab_site
+from skyless.site.planning.colours import COLOUR_STOPS
+from skyless.site.planning.links import HDOP, PDOP, SIGMA
+from skyless.site.planning.predict import PlanSettings, Predictor
 
 LAB = lab_site(100.0)
 PNG_2_BY_1 = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\x0dIHDR" + (200).to_bytes(4, "big") + (100).to_bytes(4, "big")

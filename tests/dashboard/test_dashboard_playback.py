@@ -5,18 +5,14 @@ import json
 import msgspec
 import page_fake_site as made_up
 import pytest
-from dashboard_builders import SITE, SITE_ID, SQUARE, Wire, fix, truth
-from starlette.testclient import TestClient
+from dashboard_builders import SITE, SITE_ID, SQUARE, Wire, browser_of, fix, truth
 
-from skyless.dashboard.app import Services, make_app
-from skyless.dashboard.guard import AccessRules
-from skyless.dashboard.live import LiveSite
-from skyless.dashboard.overlays import Overlays
-from skyless.dashboard.playback import NoRecordingError, Playback
-from skyless.dashboard.sites import LiveSites
-from skyless.mqtt import topics
-from skyless.mqtt.messages import WatchFinding, WatchMessage, ZonesMessage
-from skyless.recordings.mcap.recorder import McapFile, McapRecorder
+from skyless.page.guard import AccessRules
+from skyless.page.live import LiveSite
+from skyless.page.playback import NoRecordingError, Playback
+from skyless.run.mqtt import topics
+from skyless.run.mqtt.messages import WatchFinding, WatchMessage, ZonesMessage
+from skyless.run.recordings.recorder import McapFile, McapRecorder
 
 START_S = 1_700_000_000.0
 PLAN = b"\x89PNG\r\n\x1a\nplan"
@@ -151,8 +147,7 @@ def test_a_recording_replaced_by_another_is_read_again(folder):
 def test_the_server_gives_recordings(folder):
     live = LiveSite("here", "mqtt://broker:1")
     live.attach(Wire(), SITE_ID)
-    app = make_app(Services(LiveSites(live), Overlays(), Playback(folder)), AccessRules())
-    browser = TestClient(app, base_url="http://localhost")
+    browser = browser_of(live, folder)
     (listed,) = browser.get("/api/recordings").json()
     assert listed.keys() == {"name", "bytes", "start_unix_s", "duration_s", "complete", "site", "tags", "fixes"}
     assert (listed["site"], listed["tags"], listed["fixes"]) == (SITE.site.name, 1, 101)
@@ -172,10 +167,7 @@ def test_the_server_gives_recordings(folder):
 
 def test_a_recording_is_downloaded_with_its_name_as_far_as_it_is_written(folder):
     record(folder / "old hall (1).mcap", seconds=1.0)
-    app = make_app(
-        Services(LiveSites(LiveSite("here", "mqtt://broker:1")), Overlays(), Playback(folder)), AccessRules()
-    )
-    browser = TestClient(app, base_url="http://localhost")
+    browser = browser_of(LiveSite("here", "mqtt://broker:1"), folder)
     answer = browser.get("/api/recordings/old%20hall%20(1).mcap/file")
     assert answer.content == (folder / "old hall (1).mcap").read_bytes()
     assert answer.headers["content-disposition"] == "attachment; filename*=utf-8''old%20hall%20%281%29.mcap"
@@ -189,8 +181,8 @@ def test_a_recording_is_downloaded_with_its_name_as_far_as_it_is_written(folder)
 
 def test_a_download_needs_the_token_as_everything_does(folder):
     rules = AccessRules("correct-horse-battery", remote=True)
-    app = make_app(Services(LiveSites(LiveSite("here", "mqtt://broker:1")), Overlays(), Playback(folder)), rules)
-    stranger = TestClient(app, base_url="http://192.168.1.5:8080")
+    live = LiveSite("here", "mqtt://broker:1")
+    stranger = browser_of(live, folder, rules=rules, base_url="http://192.168.1.5:8080")
     assert stranger.get("/api/recordings/first.mcap/file").status_code == 401
     elsewhere = {"origin": "http://evil.example", "authorization": "Bearer correct-horse-battery"}
     assert stranger.get("/api/recordings/first.mcap/file", headers=elsewhere).status_code == 403

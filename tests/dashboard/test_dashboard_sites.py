@@ -5,17 +5,12 @@ import json
 
 import msgspec
 import pytest
-from dashboard_builders import SITE, Times, Wire
-from starlette.testclient import TestClient
+from dashboard_builders import SITE, Times, Wire, browser_of
 
-from skyless.dashboard.app import Services, make_app
-from skyless.dashboard.guard import AccessRules
-from skyless.dashboard.live import LiveSite, NoSiteError
-from skyless.dashboard.overlays import Overlays
-from skyless.dashboard.playback import Playback
-from skyless.dashboard.sites import LiveSites
-from skyless.mqtt import topics
-from skyless.nodes.find_site import SiteOnBroker
+from skyless.page.live import LiveSite, NoSiteError
+from skyless.page.sites import LiveSites
+from skyless.run.find_site import SiteOnBroker
+from skyless.run.mqtt import topics
 
 
 class Stage:
@@ -39,8 +34,7 @@ class Stage:
         self.sites.on_sites([SiteOnBroker(int(name[1:]), name, count) for name, count in online.items()])
 
     def client(self):
-        app = make_app(Services(self.sites, Overlays(), Playback(None)), AccessRules())
-        return TestClient(app, base_url="http://localhost")
+        return browser_of(self.sites, base_url="http://localhost")
 
 
 @pytest.fixture

@@ -8,25 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.dashboard.page_request import MAX_HEALTHS, PageRequest, Sent
-from skyless.dashboard.state import EXPIRY_S, UNHEARD_S, SiteState
-from skyless.mqtt.messages import AnchorHealth, Counters, EtherHealth
+from skyless.page.state import EXPIRY_S, MAX_HEALTHS, UNHEARD_S, PageRequest, Sent, SiteState
+from skyless.run.mqtt.messages import AnchorHealth, Counters, EtherHealth
 
 POSITION = ("name", "x_m", "y_m", "z_m", "vx", "vy")
-ERRORS = ("cov_xx", "cov_xy", "cov_yy", "std_m", "error_m", "true_x", "true_y")
-FIELDS = (
-    *POSITION,
-    *ERRORS,
-    "anchors_used",
-    "chi2",
-    "fix_unix_s",
-    "hpl_m",
-    "alert",
-    "height_given",
-    "std_z_m",
-    "verified_age_s",
-    "unverified",
-)
+ERRORS = ("cov_xx", "cov_xy", "cov_yy", "std_m", "error_m", "true_x", "true_y", "anchors_used", "chi2", "fix_unix_s")
+LEVELS = ("hpl_m", "alert", "height_given", "std_z_m", "verified_age_s", "unverified")
+FIELDS = POSITION + ERRORS + LEVELS
 
 
 def rows(state, since=0):
@@ -43,55 +31,34 @@ def test_a_row_has_the_fields_in_order():
     message = json.loads(state.state_since(0))
     assert message["type"] == "state"
     assert message["unix_s"] == pytest.approx(1000.0625, abs=1e-3)
-    expected = (
-        "t1",
-        1.25,
-        2.5,
-        0.75,
-        0.5,
-        -0.25,
-        4e-4,
-        1e-4,
-        2e-4,
-        0.01,
-        None,
-        None,
-        None,
-        4,
-        2.5,
-        1000.0,
-        None,
-        None,
-        1,
-        None,
-        None,
-        None,
-    )
-    assert message["tags"] == [list(expected)]
+    position, errors = ("t1", 1.25, 2.5, 0.75, 0.5, -0.25), (4e-4, 1e-4, 2e-4, 0.01, None, None, None)
+    assert message["tags"] == [[*position, *errors, 4, 2.5, 1000.0, None, None, 1, None, None, None]]
     state.add_fix(fix(velocity_mps=None), 0.0, 1000.0)
     assert rows(state)[0]["vx"] is None
 
 
-def test_rows_hold_levels_and_alerts():
+HEIGHT = {"covariance_m2": (4e-4, 0.0, 0.0, 0.0, 4e-4, 0.0, 0.0, 0.0, 9e-4)}
+VERIFIED = {"time_s": 1000.0, "unverified": 0.1789}
+
+
+@pytest.mark.parametrize(
+    ("given_fields", "shown"),
+    [
+        *(
+            ({"hpl_m": 0.123456, "alert": one}, {"hpl_m": 0.1235, "alert": one})
+            for one in ("none", "unavailable", None)
+        ),
+        (HEIGHT | {"height_known": True}, {"height_given": 1, "std_z_m": None}),
+        (HEIGHT | {"height_known": False}, {"height_given": 0, "std_z_m": 0.03}),
+        (VERIFIED | {"verified_until_s": None}, {"verified_age_s": None, "unverified": None}),
+        (VERIFIED | {"verified_until_s": 999.7}, {"verified_age_s": 0.3, "unverified": 0.179}),
+        (VERIFIED | {"verified_until_s": 1000.0}, {"verified_age_s": 0.0, "unverified": 0.179}),
+    ],
+)
+def test_rows_hold_levels_alerts_heights_and_how_far_a_fix_is_verified(given_fields, shown):
     state = SiteState()
-    for alert in ("none", "detected-excluded", None):
-        state.add_fix(fix(hpl_m=0.123456, alert=alert), 0.0, 1000.0)
-        assert (rows(state)[0]["hpl_m"], rows(state)[0]["alert"]) == (0.1235, alert)
-
-
-def test_rows_say_whether_the_height_was_given():
-    state = SiteState()
-    covariance = (4e-4, 0.0, 0.0, 0.0, 4e-4, 0.0, 0.0, 0.0, 9e-4)
-    for known, std_z_m in ((True, None), (False, 0.03)):
-        state.add_fix(fix(covariance_m2=covariance, height_known=known), 0.0, 1000.0)
-        assert (rows(state)[0]["height_given"], rows(state)[0]["std_z_m"]) == (int(known), std_z_m)
-
-
-def test_rows_say_how_far_a_fix_is_verified():
-    state = SiteState()
-    for until_s, shown in ((None, (None, None)), (999.7, (0.3, 0.179)), (1000.0, (0.0, 0.179))):
-        state.add_fix(fix(time_s=1000.0, verified_until_s=until_s, unverified=0.1789), 0.0, 1000.0)
-        assert (rows(state)[0]["verified_age_s"], rows(state)[0]["unverified"]) == shown
+    state.add_fix(fix(**given_fields), 0.0, 1000.0)
+    assert {name: rows(state)[0][name] for name in shown} == shown
 
 
 @pytest.mark.parametrize(("unix_s", "shown_unix_s"), [(1000.4, 1000.4), (1000.6, 1000.0), (4600.0, 1000.0)])

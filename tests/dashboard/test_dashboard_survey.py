@@ -6,30 +6,25 @@ import struct
 
 import msgspec
 import pytest
-from dashboard_builders import SITE, SITE_ID
+from dashboard_builders import SITE, SITE_ID, browser_of
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from starlette.testclient import TestClient
 
-from skyless.dashboard.app import MAX_FLOOR_PLAN_BYTES, Services, make_app
-from skyless.dashboard.guard import AccessRules
-from skyless.dashboard.overlays import NoOverlayError, Overlays, overlay_task
-from skyless.dashboard.playback import Playback
-from skyless.dashboard.site_survey import SiteSurvey
-from skyless.dashboard.sites import LiveSites
-from skyless.mqtt import topics
-from skyless.mqtt.access import Role
-from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.messages import SurveyFactsMessage, SurveyMessage, WatchFinding, WatchMessage
-from skyless.mqtt.survey_facts import BadFactsError
-from skyless.site.model import FloorPlanSite, UnplacedAnchor
-from skyless.survey.facts import Facts, Gauge, Tape
-from skyless.survey.result import Survey, SurveyedAnchor, TapeAdvice
+from skyless.core.site import FloorPlanSite, UnplacedAnchor
+from skyless.page.app import MAX_FLOOR_PLAN_BYTES
+from skyless.page.overlays import NoOverlayError, overlay_task
+from skyless.page.site_survey import SiteSurvey
+from skyless.run.mqtt import topics
+from skyless.run.mqtt.access import Role
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.messages import SurveyFactsMessage, SurveyMessage, WatchFinding, WatchMessage
+from skyless.run.mqtt.survey_facts import BadFactsError
+from skyless.site.survey.facts import Facts, Gauge, Tape
+from skyless.site.survey.result import Survey, SurveyedAnchor, TapeAdvice
 
 SURVEY, WATCH = topics.survey_topic(SITE_ID), topics.watch_topic(SITE_ID)
 FLOOR = topics.floor_plan_topic(SITE_ID)
-HERE = "http://localhost:8080"
 IMAGE = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 40, 30) + bytes(9)
 
 
@@ -52,9 +47,8 @@ def live(live):
 
 
 @pytest.fixture
-def browser(live, tmp_path):
-    app = make_app(Services(LiveSites(live), Overlays(), Playback(None)), AccessRules(), tmp_path)
-    return TestClient(app, base_url=HERE)
+def browser(live):
+    return browser_of(live)
 
 
 def drained(live, page, kind):
@@ -64,25 +58,16 @@ def drained(live, page, kind):
 
 def test_the_survey_and_the_watch_reach_pages(live, wire):
     page = live.open_page()
-    assert drained(live, page, "survey") == drained_nothing(live, page) == []
+    assert drained(live, page, "survey") == []
     wire.deliver(SURVEY, survey_message())
     wire.deliver(WATCH, watch_message())
-    survey, watch = json.loads(page_messages(live, page)["survey"]), json.loads(live.survey.messages()["watch"])
+    (survey,), watch = drained(live, page, "survey"), json.loads(live.survey.messages()["watch"])
     assert survey["survey"] == json.loads(msgspec.json.encode(survey_message()))
     assert watch["watch"]["findings"][0]["sentence"] == "anchor 4 has moved by about 11 cm"
     later = live.open_page()
     assert drained(live, later, "survey")[0]["survey"]["serial"] == 3
     wire.deliver(SURVEY, b"")  # the program has ended
     assert drained(live, page, "survey")[-1]["survey"] is None
-
-
-def drained_nothing(live, page):
-    page.replace("pong", b'{"type":"pong"}')
-    return drained(live, page, "survey")
-
-
-def page_messages(live, page):
-    return {message["type"]: json.dumps(message) for message in drained(live, page, "survey")}
 
 
 def test_a_message_that_the_broker_kept_is_as_old_as_it_says(live, wire, times):

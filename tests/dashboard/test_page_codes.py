@@ -5,7 +5,7 @@ import time
 import pytest
 from page_browser import until
 
-from skyless.authentication.fault import Fault
+from skyless.core.keys.fault import Fault
 
 DAY_S = 86400.0
 

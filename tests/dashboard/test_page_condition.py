@@ -5,15 +5,10 @@ import time
 import page_fake_site as made_up
 import pytest
 from page_browser import until
+from page_fake_survey import moved, watch
 
 OFFLINE = made_up.reason("anchors", "warning", "anchor 8 of 8 is offline", "See its power.", ["anchor/8"])
 SLOW = made_up.reason("slow", "bad", "this computer is too slow: the emulated air missed 41 % of the transmissions")
-
-
-@pytest.fixture
-def hall(serve, visit):
-    server = serve()
-    return server, visit(server)
 
 
 def pill_is(page, level):
@@ -237,7 +232,7 @@ def test_events_are_listed_filtered_and_counted(hall):
     page.wait_for_selector("#panel-anchors tr.selected:has-text('8')")
 
 
-LEAST_ROOM = """() => {
+MIN_ROOM = """() => {
   const line = document.getElementById("condition-line");
   const [words, more, whole] = ["condition-words", "condition-more", "condition-line"].map((id) =>
     document.getElementById(id).getBoundingClientRect());
@@ -261,7 +256,7 @@ def test_a_long_sentence_is_shown_whole_below_one_word(serve, visit, size):
     page = visit(server, viewport=dict(zip(("width", "height"), size, strict=True))).page
     pill_is(page, "bad")
     assert header(page) == ("Fault", f"{words[0].upper()}{words[1:]}.")
-    until(page, f"({LEAST_ROOM})() >= 0")
+    until(page, f"({MIN_ROOM})() >= 0")
     assert page.evaluate("document.getElementById('pill-words').getBoundingClientRect().height < 24")
     assert page.evaluate("document.querySelector('header').scrollWidth <= innerWidth")
 
@@ -272,3 +267,57 @@ def test_on_a_phone_the_open_tab_is_in_view(serve, visit):
     page.keyboard.press("End")
     box = page.locator("#tab-recordings").bounding_box()
     assert box["x"] + box["width"] <= 391
+
+
+# What the watch of the anchors finds
+
+
+def drawn_words(page):
+    return page.evaluate("""async () => {
+      const { drawFindings } = await import("/page/map/findings.js");
+      const context = document.createElement("canvas").getContext("2d");
+      const words = [];
+      context.fillText = (text) => words.push(text);
+      drawFindings(context);
+      return words;
+    }""")
+
+
+@pytest.fixture
+def empty_hall(serve, visit):
+    server = serve(tags=0)
+    return server, visit(server)
+
+
+def test_an_anchor_that_has_moved_is_shown_and_goes(empty_hall):
+    server, visit = empty_hall
+    page = visit.page
+    server.send(watch(moved(4)))
+    page.click("#tab-anchors")
+    page.wait_for_selector("#panel-anchors .findings li:has-text('Anchor 4 has moved by about 11 cm, since ')")
+    page.wait_for_selector("#panel-anchors tr.bad:has-text('4 moved 11 cm')")
+    assert drawn_words(page) == ["moved 11 cm"]
+    server.send(watch())
+    page.locator("#panel-anchors .findings").wait_for(state="hidden")
+    assert drawn_words(page) == []
+
+
+def test_several_findings(empty_hall):
+    server, visit = empty_hall
+    page = visit.page
+    link = {**moved(1), "kind": "link", "anchors": [1, 5], "sentence": "The link 1–5 is blocked, by about 35 cm."}
+    check = {**moved(6), "kind": "check", "anchors": [6, 7], "sentence": "Something has changed at anchors 6 and 7."}
+    server.send(watch(moved(4), link, check))
+    page.click("#tab-anchors")
+    until(page, "document.querySelectorAll('#panel-anchors .findings li').length === 3")
+    assert drawn_words(page) == ["moved 11 cm", "link blocked", "check"]
+
+
+def test_the_findings_fit_a_phone(serve, visit):
+    server = serve(tags=0)
+    page = visit(server, viewport={"width": 390, "height": 844}).page
+    server.send(watch(moved(4), moved(5)))
+    page.click("#tab-anchors")
+    page.wait_for_selector("#panel-anchors .findings li")
+    wide = "[...document.querySelectorAll('html, body, #panels')].some((e) => e.scrollWidth > e.clientWidth + 1)"
+    assert not page.evaluate(wide)

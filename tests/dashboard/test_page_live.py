@@ -4,19 +4,12 @@ import io
 import time
 
 import page_fake_site as made_up
-import pytest
 from page_browser import THREE_FRAMES, until
 from PIL import Image
 
-from skyless.positioning.integrity import Alert
+from skyless.core.integrity import Alert
 
 SHOWN = "document.getElementById('banner').hidden === false"
-
-
-@pytest.fixture
-def hall(serve, visit):
-    server = serve()
-    return server, visit(server)
 
 
 def picture(page):

@@ -3,26 +3,25 @@
 import pytest
 from msgspec.structs import replace
 
-from skyless.air.codec2 import encode_2
-from skyless.evaluation.cell_fleet import MOST_MACHINES, CellFleet, SiteBeacons
-from skyless.evaluation.fleet import Fleet, FleetSettings
-from skyless.evaluation.scenarios import Request, fleet_of_any_size
-from skyless.receiver import Receiver
-from skyless.simulation.impairments import Impairments
-from skyless.simulation.trajectory import Roaming
-from skyless.site.grid import grid_site
-from skyless.site.model import EXACT
+from skyless.core.air.codec import encode
+from skyless.core.site import EXACT
+from skyless.core.tag.any_receiver import AnyReceiver
+from skyless.sim.evaluation.cell_fleet import MAX_MACHINES, CellFleet, SiteBeacons
+from skyless.sim.evaluation.fleet import Fleet, FleetSettings
+from skyless.sim.evaluation.scenarios import Request, fleet_of_any_size
+from skyless.sim.impairments import Impairments
+from skyless.sim.trajectory import Roaming
+from skyless.site.file.template import grid_site
 
-GRID = {mode: replace(grid_site(240.0, 240.0, 15.0, 4.0, 1.0, mode), accuracy=EXACT) for mode in ("slots", "free")}
+GRID = replace(grid_site(240.0, 240.0, 15.0, 4.0, 1.0), accuracy=EXACT)
 
 
 def tags(count):
     return [Roaming((100.0 + 10.0 * n, 120.0, 1.0), (6.0, 6.0, 0.0), seed=n) for n in range(count)]
 
 
-@pytest.mark.parametrize("mode", ["slots", "free"])
-def test_tags_are_as_accurate_as_their_fixes_say(mode):
-    fleet = CellFleet(GRID[mode], tags(3), Impairments(), 7, FleetSettings())
+def test_tags_are_as_accurate_as_their_fixes_say():
+    fleet = CellFleet(GRID, tags(3), Impairments(), 7, FleetSettings())
     assert all(judged.fix.std_m < 0.5 for judged in fleet.run(4.0))
     assert fleet.now_s == 4.0
     assert fleet.errors.summary().rmse_2d_m < 0.04
@@ -31,11 +30,11 @@ def test_tags_are_as_accurate_as_their_fixes_say(mode):
 
 
 def test_the_bytes_of_the_frames_make_the_same_fixes():
-    fleet = CellFleet(GRID["free"], tags(1), Impairments(), 8, FleetSettings())
-    decoded, from_bytes, fixes = Receiver(), Receiver(), 0
-    for beacon, reception, _ in SiteBeacons(GRID["free"]).received(fleet.cells.receptions(0, 0.5, 2.0)):
+    fleet = CellFleet(GRID, tags(1), Impairments(), 8, FleetSettings())
+    decoded, from_bytes, fixes = AnyReceiver(), AnyReceiver(), 0
+    for beacon, reception, _ in SiteBeacons(GRID).received(fleet.cells.receptions(0, 0.5, 2.0)):
         fix = decoded.hear_beacon(beacon, reception)
-        again = from_bytes.hear(replace(reception, frame=encode_2(beacon)))
+        again = from_bytes.hear(replace(reception, frame=encode(beacon)))
         assert (fix is None) == (again is None)
         if fix is not None:
             assert fix.rows == again.rows
@@ -44,8 +43,8 @@ def test_the_bytes_of_the_frames_make_the_same_fixes():
 
 
 def test_sites_with_more_anchors_than_machines_are_simulated_on_demand():
-    assert len(GRID["slots"].anchors) > MOST_MACHINES
-    assert isinstance(fleet_of_any_size(Request(GRID["slots"])), CellFleet)
+    assert len(GRID.anchors) > MAX_MACHINES
+    assert isinstance(fleet_of_any_size(Request(GRID)), CellFleet)
     small = grid_site(60.0, 60.0, 15.0, 4.0, 1.0)
     assert isinstance(fleet_of_any_size(Request(small)), Fleet)
 
@@ -56,4 +55,4 @@ def test_sites_with_more_anchors_than_machines_are_simulated_on_demand():
 )
 def test_what_is_not_modelled_there_is_named(fault, name):
     with pytest.raises(ValueError, match=f"{name}: not modelled"):
-        fleet_of_any_size(Request(GRID["slots"], **fault))
+        fleet_of_any_size(Request(GRID, **fault))

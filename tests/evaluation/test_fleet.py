@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from msgspec.structs import asdict, replace
 
-from skyless.errors import SkylessError
-from skyless.evaluation.fleet import report
-from skyless.evaluation.scenarios import Request, fleet_of, trajectories_of
-from skyless.simulation.impairments import AnchorOutage, Outage
-from skyless.site.lab import ideal_lab_site
+from skyless.core.errors import SkylessError
+from skyless.sim.evaluation.fleet import report
+from skyless.sim.evaluation.scenarios import Request, fleet_of, trajectories_of
+from skyless.sim.impairments import AnchorOutage, Outage
+from skyless.sim.lab import paper_lab_site
 
-LAB = ideal_lab_site()
+LAB = paper_lab_site()
 P1 = (3.0, 4.0)
 SEEDS = (1, 2, 3)
 C = 299_792_458.0
@@ -23,7 +23,7 @@ def run(until_s, **request):
     """A fleet that ran, its report, and everything it judged after the warm-up."""
     asked = Request(LAB, **({"positions_m": (P1,)} | request))
     fleet = fleet_of(asked)
-    judged = [one for one in fleet.run(until_s) if one.time_s >= asked.warmup_s]
+    judged = [one for one in fleet.run(until_s) if one.time_s >= asked.settle_s]
     return fleet, report(fleet, asked.method, 0.0), judged
 
 
@@ -62,7 +62,7 @@ def theory(delayed, weighted):
 )
 def test_snapshots_err_as_the_propagated_covariance_says(method, delayed, weighted):
     """3000 fixes at 100 ps. Neighbouring fixes share a frame of each node; their squared errors correlate by < 0.1."""
-    runs = [run(16.0, method=method, seed=seed, warmup_s=1.0) for seed in SEEDS]
+    runs = [run(16.0, method=method, seed=seed, settle_s=1.0) for seed in SEEDS]
     judged = [one for _, _, ones in runs for one in ones]
     assert len(judged) >= 2990
     rmse_m = math.sqrt(np.mean([np.sum(one.error_m**2) for one in judged]))
@@ -81,7 +81,7 @@ def test_snapshots_err_as_the_propagated_covariance_says(method, delayed, weight
 
 def test_chi2_of_weighted_fixes_is_chi2():
     """Mean over degrees of freedom (3 each); one sigma of 1000 correlated fixes is √(2·1.2/3000) = 0.028."""
-    judged = run(16.0, method="weighted", seed=4, warmup_s=1.0)[2]
+    judged = run(16.0, method="weighted", seed=4, settle_s=1.0)[2]
     assert {one.fix.dof for one in judged} == {3}
     assert np.mean([one.fix.chi2 / one.fix.dof for one in judged]) == pytest.approx(1.0, abs=4 * 0.028)
 
@@ -192,4 +192,4 @@ def test_paths_without_heights_lie_at_the_height_of_the_tags():
 def test_a_position_has_two_or_three_coordinates(point):
     for wrong in ({"positions_m": (point,)}, {"paths_m": (((1.0, 1.0), point),)}):
         with pytest.raises(SkylessError, match=r"(positions|paths)_m\["):
-            fleet_of(Request(ideal_lab_site(), **wrong))
+            fleet_of(Request(paper_lab_site(), **wrong))

@@ -6,8 +6,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from skyless.evaluation.judge import Judge, antenna_truth
-from skyless.recordings.truth import Truth
+from skyless.sim.evaluation.judge import Judge, antenna_truth
+from skyless.site.tables import Truth
 
 numbers = st.floats(-10, 10)
 triples = st.tuples(numbers, numbers, numbers)

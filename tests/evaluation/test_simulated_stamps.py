@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from skyless.evaluation.anchor_stamps import stamps_of
-from skyless.simulation.impairments import lab_impairments
-from skyless.site.lab import lab_site
+from skyless.research.surveys.anchor_stamps import stamps_of
+from skyless.sim.impairments import lab_impairments
+from skyless.sim.lab import lab_site
 
 LAB = lab_site()
 

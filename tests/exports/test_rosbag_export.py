@@ -10,10 +10,10 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from recordings import live_site
-from skyless.bridges.feed import floored
+from skyless.bridges.target import floored
 from skyless.cli.main import main
-from skyless.recordings.mcap.recording import McapRecording
-from skyless.site.earth import geodetic
+from skyless.core.earth import geodetic
+from skyless.run.recordings.recording import McapRecording
 
 KILTED = get_typestore(Stores.ROS2_KILTED)
 TAGS = ("a", "b")

@@ -9,13 +9,13 @@ from cobs import cobs
 from emulator.board_library import CBoard
 from emulator.build import HAS_HOST_COMPILER
 
-from skyless.air.ieee802154 import after_rmarker_s, fcs
-from skyless.air.reception import Diagnostics
-from skyless.constants import TICK_RATE_HZ
-from skyless.radios.interface import AntennaDelays
-from skyless.radios.serial.link_records import decode
-from skyless.simulation.dw1000.chip import Chip
-from skyless.ticks import from_seconds, wrap
+from skyless.core.air.ieee802154 import after_rmarker_s, fcs
+from skyless.core.air.reception import Diagnostics
+from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.ticks import from_seconds, wrap
+from skyless.radio.interface import AntennaDelays
+from skyless.radio.serial.link import decode
+from skyless.sim.dw1000.chip import Chip
 
 DELAYS = AntennaDelays(16_500, 16_300)
 TICKS_PER_US = TICK_RATE_HZ / 1e6

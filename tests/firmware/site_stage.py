@@ -12,11 +12,11 @@ from emulator.site.serial_wire import WireSettings
 from emulator.site.virtual_time import run_on
 from msgspec.structs import replace
 
-from skyless.evaluation.scenarios import Request, trajectories_of
-from skyless.site.lab import ideal_lab_site
-from skyless.site.model import ScheduleSite
+from skyless.core.site import ScheduleSite
+from skyless.sim.evaluation.scenarios import Request, trajectories_of
+from skyless.sim.lab import paper_lab_site
 
-LAB = ideal_lab_site()
+LAB = paper_lab_site()
 
 HAS_ARM = HAS_ARM_COMPILER and find_spec("unicorn") is not None
 HOST = pytest.param("host", marks=pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed"))

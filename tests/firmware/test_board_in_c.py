@@ -1,5 +1,6 @@
 """The firmware's loop on the chip's model: what it answers, when it sends, what it does when something fails."""
 
+import ctypes
 import random
 
 import pytest
@@ -15,11 +16,13 @@ from board_stage import (
     line_of,
     needs_compiler,
 )
+from emulator.board_library import library
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyless.radios.serial.link_records import Done, Heard, Hello, NotDone, Status, TooLate
-from skyless.ticks import difference, wrap
+from skyless.core.ticks import difference, wrap
+from skyless.radio.dw1000 import driver as dw1000
+from skyless.radio.serial.link import Done, Heard, Hello, NotDone, Status, TooLate
 
 pytestmark = needs_compiler
 
@@ -32,6 +35,10 @@ SETTING, MALFORMED, RADIO = 1, 2, 3
 
 def kinds(reports):
     return [type(one) for one in reports]
+
+
+def test_python_knows_all_fields_of_the_chip_in_c():
+    assert library().host_chip_bytes() == ctypes.sizeof(dw1000.DW1000)
 
 
 # What it answers
@@ -82,7 +89,7 @@ def test_what_it_cannot_do_is_refused(kind, body, reason):
     stage.bus.to_board += line_of(kind, body)
     stage.turn(5)
     assert stage.reports() == [NotDone(kind, reason)]
-    assert stage.board.chip.state == "LISTENING"
+    assert stage.board.chip.state == dw1000.LISTENING
 
 
 def test_a_later_version_may_append_fields_and_add_kinds():
@@ -107,7 +114,7 @@ def test_receptions_are_reported_with_the_chips_own_stamp(size):
     assert (heard.frame, heard.rx_ticks) == (frame_of(range(size)), stamp)
     assert heard.diagnostics.rx_power_dbm == pytest.approx(-80.0, abs=0.03)
     assert heard.diagnostics.carrier_offset_ppm == pytest.approx(1.0, abs=0.002)
-    assert stage.board.chip.state == "LISTENING"
+    assert stage.board.chip.state == dw1000.LISTENING
 
 
 def test_errors_are_counted_and_it_listens_on():
@@ -139,7 +146,7 @@ def test_frames_leave_at_their_tick_and_the_receiver_is_off_no_longer_than_neede
         stage.pass_us(ahead_us - 5000)
     for _ in range(round((min(ahead_us, 5000) + 1000) / step_us)):
         stage.turn(1, step_us)
-        off_us += step_us * (stage.board.chip.state != "LISTENING")
+        off_us += step_us * (stage.board.chip.state != dw1000.LISTENING)
         reports += stage.reports()
     dx_ticks = wrap(tx_ticks - DELAYS.tx_ticks)
     (done,) = reports
@@ -147,7 +154,7 @@ def test_frames_leave_at_their_tick_and_the_receiver_is_off_no_longer_than_neede
     assert (done.dx_ticks & ~0x1FF, done.tx_ticks) == (dx_ticks, tx_ticks)
     assert [(one.frame, one.tx_ticks) for one in stage.air.sent] == [(SHORT, tx_ticks)]
     assert off_us <= LEAD_US + CLOSE_US + 200 + 3 * step_us
-    assert stage.board.chip.state == "LISTENING"
+    assert stage.board.chip.state == dw1000.LISTENING
     assert not +stage.chip.misuse
 
 
@@ -159,7 +166,7 @@ def test_what_comes_too_late_is_reported_and_never_sent(ahead_us):
     (late,) = stage.reports()
     assert (type(late), late.reason) == (TooLate, FOR_RADIO)
     assert stage.air.sent == []
-    assert stage.board.chip.state == "LISTENING"
+    assert stage.board.chip.state == dw1000.LISTENING
 
 
 def test_every_frame_is_answered_once_and_one_is_held_at_a_time():
@@ -198,7 +205,7 @@ def test_a_frame_whose_end_the_chip_never_reports_is_cancelled():
     stage.pass_us(9000)
     (late,) = stage.reports()
     assert (type(late), late.reason) == (TooLate, FOR_RADIO)
-    assert stage.board.chip.state == "LISTENING"
+    assert stage.board.chip.state == dw1000.LISTENING
     assert stage.air.sent == []
 
 
@@ -260,7 +267,7 @@ def test_a_board_without_a_chip_says_so_and_goes_on():
     assert stage.bus.lights & 8
     stage.bus.present = True
     stage.ready()
-    assert stage.board.chip.state == "LISTENING"
+    assert stage.board.chip.state == dw1000.LISTENING
     assert not stage.bus.lights & 8
 
 

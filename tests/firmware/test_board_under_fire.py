@@ -19,8 +19,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from skyless.radios.serial.link_records import Done, Heard, Status, TooLate
-from skyless.ticks import wrap
+from skyless.core.ticks import wrap
+from skyless.radio.serial.link import Done, Heard, Status, TooLate
 
 FAULTS = st.sampled_from([None, None, None, "header", "parity", "delimiter", "first-path"])
 

@@ -9,11 +9,11 @@ from cobs import cobs
 from emulator.build import FIRMWARE, build
 from processor_stage import build_program, needs_processor
 
-from skyless.air.ieee802154 import after_rmarker_s, fcs
-from skyless.air.reception import Diagnostics
-from skyless.radios.serial.link_records import decode
-from skyless.simulation.dw1000 import registers as r
-from skyless.ticks import from_seconds, wrap
+from skyless.core.air.ieee802154 import after_rmarker_s, fcs
+from skyless.core.air.reception import Diagnostics
+from skyless.core.ticks import from_seconds, wrap
+from skyless.radio.serial.link import decode
+from skyless.sim.dw1000 import registers as r
 
 pytest.importorskip("unicorn")
 

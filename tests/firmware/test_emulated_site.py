@@ -7,7 +7,7 @@ import pytest
 from emulator.site.repeated_site import RepeatedSite
 from site_stage import KINDS, site_of
 
-from skyless.evaluation.compile_ahead import compile_kernels
+from skyless.research.compile_ahead import compile_kernels
 
 SECONDS = {"host": 2.0, "image": 1.2}
 WARMUP_S = 0.6

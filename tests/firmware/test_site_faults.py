@@ -6,8 +6,8 @@ import random
 import pytest
 from site_stage import HOST, IMAGE, play, site_of, until
 
-from skyless.evaluation.compile_ahead import compile_kernels
-from skyless.simulation.trajectory import Static
+from skyless.research.compile_ahead import compile_kernels
+from skyless.sim.trajectory import Static
 
 SLOT_MS = 5.0
 PLACES = [Static(2.0, 3.0, 0.0)]

@@ -8,9 +8,9 @@ import tty
 import pytest
 from emulator.site.virtual_time import UNIX_S, run_on, wake
 
-from skyless.constants import TICK_S
-from skyless.simulation.medium import Timeline
-from skyless.ticks import from_seconds
+from skyless.core.constants import TICK_S
+from skyless.core.ticks import from_seconds
+from skyless.sim.medium import Timeline
 
 
 def play(program):

@@ -11,8 +11,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from skyless.kernels import cache
-from skyless.kernels.cache import KernelFolder, choose_folder
+from skyless.core.kernels import cache
+from skyless.core.kernels.cache import KernelFolder, choose_folder
 
 KEY = "abc"
 
@@ -73,8 +73,8 @@ def test_where_nothing_can_be_written_there_is_still_an_answer(monkeypatch):
 TWICE = """
 import json, sys, tempfile
 tempfile.tempdir = sys.argv[1]
-from skyless.kernels.cache import kernel_folder
-from skyless.kernels.compiled import kernel
+from skyless.core.kernels.cache import kernel_folder
+from skyless.core.kernels.compiled import kernel
 
 @kernel
 def twice(value: float) -> float:
@@ -131,25 +131,27 @@ def test_the_folder_is_another_one_after_a_change_of_anything_that_a_kernel_may_
     package = Path(cache.__file__).parents[1]
     read = {file: file.read_bytes() for file in package.rglob("*.py")}
     of = {cache._module(file, package): text for file, text in read.items()}
-    wanted = {name for name, text in of.items() if b"skyless.kernels.compiled" in text}
+    wanted = {name for name, text in of.items() if b"skyless.core.kernels.compiled" in text}
     seen = set()
     while wanted:
         name = wanted.pop()
         seen.add(name)
         wanted |= imported(name, of) - seen
-    assert {"skyless.clocks.filter", "skyless.positioning.fix", "skyless.ticks", "skyless.constants"} <= seen
+    assert {"skyless.core.kernels.filter", "skyless.core.fix", "skyless.core.ticks", "skyless.core.constants"} <= seen
     hashed = []
     monkeypatch.setattr(cache.hashlib, "sha1", lambda **_: SimpleNamespace(update=hashed.append, hexdigest=str))
     cache.digest(package)
     assert {name for name in seen if of[name] not in hashed} == set()
-    assert of["skyless.dashboard.live"] not in hashed
+    assert of["skyless.page.live"] not in hashed
 
 
-@pytest.mark.parametrize("line", ["from skyless.ticks import PER_S", "from skyless import (\n    air,\n    ticks,\n)"])
+@pytest.mark.parametrize(
+    "line", ["from skyless.core.ticks import PER_S", "from skyless import (\n    air,\n    ticks,\n)"]
+)
 def test_a_constant_from_another_module_belongs_to_the_kernels(tmp_path, line):
     package = tmp_path / "skyless"
     package.mkdir()
-    (package / "air.py").write_text(f"from skyless.kernels.compiled import kernel\n{line}\n")
+    (package / "air.py").write_text(f"from skyless.core.kernels.compiled import kernel\n{line}\n")
     (package / "other.py").write_text("")
     (package / "ticks.py").write_text("PER_S = 1\n")
     first = cache.digest(package)

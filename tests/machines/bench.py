@@ -6,20 +6,20 @@ from functools import lru_cache
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.air.beacon import Beacon
-from skyless.air.codec import decode, encode
-from skyless.air.reception import Reception
-from skyless.anchor import Anchor
-from skyless.evaluation.scenarios import Request, impairments_of
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
-from skyless.site.lab import ideal_lab_site
-from skyless.site.model import EXACT, Site
-from skyless.site.template import rectangular_site
+from skyless.core.air.reception import Reception
+from skyless.core.protocol1.anchor import Anchor
+from skyless.core.protocol1.beacon import Beacon
+from skyless.core.protocol1.codec import decode, encode
+from skyless.core.site import EXACT, Site
+from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.lab import paper_lab_site
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Static
+from skyless.sim.world import World
+from skyless.site.file.template import rectangular_site
 
-LAB = ideal_lab_site()
-ROOM = replace(rectangular_site(8.0, 6.0, 8, 3.0, None), accuracy=EXACT)
+LAB = paper_lab_site()
+ROOM = replace(rectangular_site(8.0, 6.0, 8, 3.0, None), accuracy=EXACT, schedule=LAB.schedule)
 """Eight anchors at alternating heights: the height is to be estimated."""
 LOFT = replace(ROOM, anchors=tuple(replace(anchor, z_m=5.0) for anchor in ROOM.anchors))
 """All anchors in one plane, so that every position has a mirror image above it."""

@@ -5,13 +5,13 @@ from functools import lru_cache
 from msgspec.structs import replace
 
 from bench import LAB, Heard
-from skyless.air.beacon2 import Beacon2
-from skyless.air.codec2 import decode_2, encode_2
-from skyless.anchors.factory import new_anchor
-from skyless.evaluation.scenarios import Request, impairments_of
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
+from skyless.core.air.beacon import Beacon
+from skyless.core.air.codec import decode, encode
+from skyless.core.protocols import new_anchor
+from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Static
+from skyless.sim.world import World
 
 FREE = replace(LAB, schedule=replace(LAB.schedule, mode="free", rate_hz=60.0))
 """The lab's seven anchors, each at random instants."""
@@ -34,13 +34,13 @@ def free_tape(site=FREE, seconds=2.0, seed=1, position=(3.0, 4.0, 0.0)) -> tuple
     )
 
 
-def beacon_of(heard: Heard) -> Beacon2:
-    beacon = decode_2(heard.frame)
-    assert isinstance(beacon, Beacon2)
+def beacon_of(heard: Heard) -> Beacon:
+    beacon = decode(heard.frame)
+    assert isinstance(beacon, Beacon)
     return beacon
 
 
 def with_beacon(received: Heard, /, **fields) -> Heard:
     """The same reception of a beacon with other contents."""
-    frame = encode_2(replace(beacon_of(received), **fields))
+    frame = encode(replace(beacon_of(received), **fields))
     return Heard(received.anchor, frame, received.rx_ticks, received.host_s, received.truth_m)

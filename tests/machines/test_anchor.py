@@ -7,16 +7,17 @@ import pytest
 from msgspec.structs import replace
 
 from bench import LAB, PAIRS, Stage, changed
-from skyless.air.beacon import Beacon, Heard, MasterTime
-from skyless.air.codec import decode, encode
-from skyless.air.page_codec import decode_page, encode_page
-from skyless.air.reception import Reception
-from skyless.anchor import MAX_OFFSET_STD_M, Anchor
-from skyless.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.simulation.impairments import AnchorOutage, Outage
-from skyless.site.almanac_pages import page_for, pages_of
-from skyless.site.slots import first_slots, schedule_of
-from skyless.ticks import difference, wrap
+from skyless.core.air.frame import Heard
+from skyless.core.air.page_codec import decode_page, encode_page
+from skyless.core.air.reception import Reception
+from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ, TICK_S
+from skyless.core.protocol1.almanac import page_for, pages_of
+from skyless.core.protocol1.anchor import MAX_OFFSET_STD_M, Anchor
+from skyless.core.protocol1.beacon import Beacon, MasterTime
+from skyless.core.protocol1.codec import decode, encode
+from skyless.core.protocol1.schedule import first_slots, schedule_of
+from skyless.core.ticks import difference, wrap
+from skyless.sim.impairments import AnchorOutage, Outage
 
 RANGE_TICKS = {anchor.id: math.hypot(anchor.x_m, anchor.y_m) / TICK_M for anchor in LAB.anchors}
 
@@ -88,7 +89,7 @@ def test_anchors_join_from_silence_by_listening_only():
         assert silent_s == pytest.approx(0.045 if anchor.id == 1 else 0.5 + (anchor.id - 2) * 0.25, abs=5.1e-3)
     first = {}
     for broadcast, beacon in beacons(stage, 0.2):
-        first.setdefault(beacon.anchor, (broadcast.end_s, stage.machines[beacon.anchor].synchronisation.beacons))
+        first.setdefault(beacon.anchor, (broadcast.end_s, stage.machines[beacon.anchor].clock(None).beacons))
     assert sorted(first) == [1, 2, 3, 4, 5, 6]
     assert all(heard >= 2 for anchor, (_, heard) in first.items() if anchor != 1)
     assert max(end_s for end_s, _ in first.values()) < (3 + 1 + 3) * 15e-3
@@ -360,12 +361,12 @@ def test_pages_rotate_with_the_number_on_the_air_beyond_two_years(ahead):
 def test_an_anchor_tells_its_own_counter_less_the_sites_time():
     """Against the world's own clocks; the master's offset is nought, the others' are theirs against the master's."""
     stage = Stage(LAB, 4)
-    assert all(anchor.site_time(0) is None for anchor in (Anchor(LAB, 1), Anchor(LAB, 2)))
+    assert all(anchor.clock(0).offset_s is None for anchor in (Anchor(LAB, 1), Anchor(LAB, 2)))
     *_, (broadcast, _) = beacons(stage, 3.0)
     medium = stage.world.medium
     counters = {anchor: medium.read_counter(node) for anchor, node in medium.node_of.items()}
     for anchor, machine in stage.machines.items():
-        offset_s, superframe = machine.site_time(wrap(counters[anchor]))
+        state = machine.clock(wrap(counters[anchor]))
         truth_s = difference(wrap(counters[anchor]), wrap(counters[1])) * TICK_S
-        assert offset_s == pytest.approx(truth_s, abs=2e-9)
-        assert superframe in {int(broadcast.end_s / 0.015) - k for k in range(5)}
+        assert state.offset_s == pytest.approx(truth_s, abs=2e-9)
+        assert state.superframe in {int(broadcast.end_s / 0.015) - k for k in range(5)}

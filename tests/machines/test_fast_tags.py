@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.evaluation.fleet import Fleet, FleetSettings
-from skyless.evaluation.scenarios import Request, impairments_of
-from skyless.positioning.estimator.monitor import INCONSISTENT_NIS
-from skyless.simulation.trajectory import Waypoints
-from skyless.site.lab import ideal_lab_site
-from skyless.site.model import EXACT
-from skyless.site.template import rectangular_site
+from skyless.core.estimator.monitor import INCONSISTENT_NIS
+from skyless.core.site import EXACT
+from skyless.sim.evaluation.fleet import Fleet, FleetSettings
+from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.lab import paper_lab_site
+from skyless.sim.trajectory import Waypoints
+from skyless.site.file.template import rectangular_site
 
 
 @pytest.mark.parametrize("tag_height_m", [1.2, None])
@@ -32,7 +32,7 @@ def test_a_vehicle_at_20_metres_a_second(tag_height_m, seed):
 
 def test_fixes_know_what_hard_turns_cost_them():
     """Round corners in 0.2 s at 3 m/s, 21 m/s²: the filter lags behind."""
-    site, normalised = ideal_lab_site(), []
+    site, normalised = paper_lab_site(), []
     path = Waypoints([(1.5, 2.0), (4.5, 2.0), (4.5, 6.0), (1.5, 6.0)], 3.0, loop=True, corner_s=0.2)
     for seed in (1, 2):
         fleet = Fleet(site, [path], impairments_of(Request(site), site), seed, FleetSettings())

@@ -12,29 +12,31 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.air.beacon import Malformed
-from skyless.air.codec2 import decode_2
-from skyless.air.reception import Reception
-from skyless.anchors.authentication import BeaconAuthentication
-from skyless.anchors.neighbours import Neighbours
-from skyless.authentication.fault import Fault
-from skyless.constants import SPEED_OF_LIGHT_MPS
-from skyless.evaluation.adversary import FORGERIES, Adversary, any_forgery
-from skyless.evaluation.attacked_air import Attack, AttackedAir, Received, delayed
-from skyless.evaluation.scenarios import Request
-from skyless.evaluation.trusted_air import START_UNIX_S, made_keys
-from skyless.evaluation.trusted_fixes import compare, errors_m, key_of, run_tag
-from skyless.site.model import ScheduleSite
-from skyless.ticks import from_seconds, wrap
-from skyless.trusted_receiver import SiteTrust, Trust
+from skyless.core.air.codec import decode
+from skyless.core.air.frame import Malformed
+from skyless.core.air.reception import Reception
+from skyless.core.anchor.anchor import Anchor
+from skyless.core.anchor.authentication import BeaconAuthentication
+from skyless.core.constants import SPEED_OF_LIGHT_MPS
+from skyless.core.keys.fault import Fault
+from skyless.core.tag.trusted_receiver import SiteTrust, Trust
+from skyless.core.ticks import from_seconds, wrap
+from skyless.sim.evaluation.scenarios import Request
+from support.adversary import FORGERIES, Adversary, any_forgery
+from support.keyed_air import (
+    START_UNIX_S,
+    Attack,
+    AttackedAir,
+    Received,
+    compare,
+    delayed,
+    errors_m,
+    key_of,
+    made_keys,
+    run_tag,
+)
 
 KEYS = made_keys(FREE.id, -60.0)
-SLOTS = replace(
-    FREE,
-    anchors=tuple(replace(anchor, slot=slot) for slot, anchor in enumerate(FREE.anchors)),
-    schedule=ScheduleSite(mode="slots", slots=len(FREE.anchors)),
-)
-SITES = {"free": FREE, "slots": SLOTS}
 VERIFIED = SiteTrust(FREE.id, KEYS.public, trust=Trust.VERIFIED)
 OPEN = replace(VERIFIED, trust=Trust.OPEN)
 ATTACK_FROM_S = 0.7
@@ -48,7 +50,6 @@ REPEATED = ("repeated-at-once", "repeated-soon")
 """The only forgeries of which a tag may accept some: genuine frames that it lost, a little later."""
 
 RIGHT_REASONS = {
-    "false-master": {Fault.BAD_CODE},
     "false-page": {Fault.BAD_CODE},
     "false-measurement": {Fault.BAD_CODE},
     "restarted-counter": {Fault.BAD_CODE},
@@ -68,10 +69,10 @@ RIGHT_REASONS = {
 
 
 @lru_cache(maxsize=64)
-def air_of(mode, forgery=None, rate_hz=477.0, is_noise=False, until_s=SECONDS):
+def air_of(forgery=None, rate_hz=477.0, is_noise=False, until_s=SECONDS):
     """What the tag receives, and the anchors, after an attack."""
     attack = None if forgery is None else Attack(forgery, rate_hz, ATTACK_FROM_S, is_noise)
-    air = AttackedAir(Request(SITES[mode]), KEYS, attack)
+    air = AttackedAir(Request(FREE), KEYS, attack)
     return tuple(air.run(until_s)), air
 
 
@@ -79,11 +80,10 @@ def genuine_of(tape):
     return [one for one in tape if one.is_genuine]
 
 
-@pytest.mark.parametrize("mode", SITES)
 @pytest.mark.parametrize("name", FORGERIES)
-def test_no_forged_frame_moves_a_verified_fix_or_an_anchor(mode, name):
-    tape, air = air_of(mode, FORGERIES[name])
-    noise, _ = air_of(mode, FORGERIES[name], is_noise=True)
+def test_no_forged_frame_moves_a_verified_fix_or_an_anchor(name):
+    tape, air = air_of(FORGERIES[name])
+    noise, _ = air_of(FORGERIES[name], is_noise=True)
     run, expected = run_tag(tape, VERIFIED), run_tag(noise, VERIFIED)
     found = compare(run, tape, FREE.id)
     in_time = [one for one in expected.given if one.given_s < SECONDS - AHEAD_S]
@@ -100,12 +100,11 @@ def test_no_forged_frame_moves_a_verified_fix_or_an_anchor(mode, name):
     assert counted.total() > counted["sent"] + counted["heard"] + 500
 
 
-@pytest.mark.parametrize("mode", SITES)
 @pytest.mark.parametrize("name", [*FORGERIES, "any"])
-def test_a_tag_that_is_switched_on_in_an_attack(mode, name):
+def test_a_tag_that_is_switched_on_in_an_attack(name):
     """Not even repetitions of frames that it lost disturb its first fixes, before it knows the anchors' counters."""
     forgery = FORGERIES.get(name, any_forgery)
-    tape, air = air_of(mode, forgery)
+    tape, air = air_of(forgery)
     later = [one for one in tape if one.reception.host_s > SWITCHED_ON_S]
     run = run_tag(later, VERIFIED)
     found = compare(run, later, FREE.id)
@@ -116,27 +115,25 @@ def test_a_tag_that_is_switched_on_in_an_attack(mode, name):
     assert {frame for _, frame in run.accepted} <= sent
 
 
-@pytest.mark.parametrize("mode", SITES)
 @pytest.mark.parametrize("rate_hz", [20.0, 477.0])
-def test_an_open_tag_is_soon_back(mode, rate_hz):
+def test_an_open_tag_is_soon_back(rate_hz):
     """Up to a key, which comes at most 0.6 s later, forged frames count; then few do, or verified ones only."""
-    tape, _ = air_of(mode, FORGERIES["false-measurement"], rate_hz, False, OPEN_SECONDS)
-    noise, _ = air_of(mode, FORGERIES["false-measurement"], rate_hz, True, OPEN_SECONDS)
+    tape, _ = air_of(FORGERIES["false-measurement"], rate_hz, False, OPEN_SECONDS)
+    noise, _ = air_of(FORGERIES["false-measurement"], rate_hz, True, OPEN_SECONDS)
     found, expected = errors_m(run_tag(tape, OPEN), tape), errors_m(run_tag(noise, OPEN), noise)
     after = found[found[:, 0] > ATTACK_FROM_S + 0.8]
     assert len(after) > 50
     assert after[:, 1].max() < expected[expected[:, 0] > 0.4][:, 1].max() + 0.2
 
 
-@pytest.mark.parametrize("mode", SITES)
 @pytest.mark.parametrize(
     ("name", "rate_hz"), [("false-measurement", 20.0), ("no-code", 20.0), ("false-measurement", 477.0)]
 )
-def test_forged_frames_cost_an_open_tag_hardly_more_fixes_than_noise(mode, name, rate_hz):
+def test_forged_frames_cost_an_open_tag_hardly_more_fixes_than_noise(name, rate_hz):
     """A fix may come later than with noise, so those of the last moments are left out: their keys are still to come."""
     fixes = []
     for attack in ((None, 0.0, False), (FORGERIES[name], rate_hz, True), (FORGERIES[name], rate_hz, False)):
-        tape, _ = air_of(mode, *attack, OPEN_SECONDS)
+        tape, _ = air_of(*attack, OPEN_SECONDS)
         received_s = {key_of(one.reception): one.reception.host_s for one in tape}
         given_s = [received_s[one.key] for one in run_tag(tape, OPEN).given]
         assert given_s == sorted(set(given_s))
@@ -148,7 +145,7 @@ def test_forged_frames_cost_an_open_tag_hardly_more_fixes_than_noise(mode, name,
 
 @lru_cache(maxsize=1)
 def genuine_tape():
-    return air_of("free")[0]
+    return air_of()[0]
 
 
 @lru_cache(maxsize=1)
@@ -182,7 +179,7 @@ def test_any_mix_gives_the_fixes_of_the_genuine_frames(seed, losses, additions):
     draw = Random(seed)
     lost = set(draw.sample(range(len(genuine_tape())), losses))
     kept = [one for number, one in enumerate(genuine_tape()) if number not in lost]
-    sent = {one.frame for one in air_of("free")[1].adversary.recent}
+    sent = {one.frame for one in air_of()[1].adversary.recent}
     mixed = list(kept)
     for _ in range(additions):
         at = draw.randrange(len(kept))
@@ -230,20 +227,21 @@ def test_anchors_admit_no_forged_frame():
     """At an anchor, which knows all keys, only repetitions get past the code, and their stamps are impossible."""
     tape = genuine_tape()
     own = FREE.anchors[0].id
-    counters = Counter()
-    authentication = BeaconAuthentication(FREE, KEYS.chains)
-    neighbours = Neighbours(FREE, own, counters, authentication)
+    authentication = BeaconAuthentication(KEYS.chains)
+    anchor = Anchor(FREE, own, authentication=authentication)
+    counters = anchor.counters
     forged = iter(forged_frames())
     next_s, frame = next(forged)
     admitted, genuine_frames = 0, {one.reception.frame for one in tape}
     for one in tape:
         host_s = one.reception.host_s
         authentication.set_time(one.reception.rx_ticks, START_UNIX_S + host_s)
-        neighbours.admit(one.reception)
+        anchor.hear(one.reception)
         while next_s is not None and next_s <= host_s + 1e-3:
-            beacon = neighbours.admit(received_at(frame, one, max(next_s, host_s + 1e-6)).reception)
-            admitted += beacon is not None
-            assert beacon is None or frame in genuine_frames
+            heard = counters["heard"]
+            anchor.hear(received_at(frame, one, max(next_s, host_s + 1e-6)).reception)
+            admitted += counters["heard"] - heard
+            assert counters["heard"] == heard or frame in genuine_frames
             next_s, frame = next(forged, (None, b""))
     assert counters["heard"] > 300
     assert admitted == 0
@@ -252,7 +250,7 @@ def test_anchors_admit_no_forged_frame():
 
 def test_the_attacker_knows_only_what_was_disclosed():
     """Else the attacks would be none: it learns keys from the air alone, each when its lag has passed."""
-    tape, air = genuine_tape(), air_of("free")[1]
+    tape, air = genuine_tape(), air_of()[1]
     adversary = Adversary(START_UNIX_S, 1, np.zeros(3))
     for one in tape:
         adversary.overhear(one.reception.frame, one.reception.host_s)
@@ -260,4 +258,4 @@ def test_the_attacker_knows_only_what_was_disclosed():
         assert max(adversary.keys, default=0) <= present - adversary.timing.lag
     assert len(adversary.keys) > 10
     assert air.adversary.keys.keys() >= adversary.keys.keys()
-    assert all(decode_2(frame) is not None for _, frame in forged_frames())
+    assert all(decode(frame) is not None for _, frame in forged_frames())

@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from bench import LAB, LOFT, tape
-from skyless.positioning.fix import Fix
-from skyless.positioning.integrity import Alert
-from skyless.receiver import Receiver
+from skyless.core.fix import Fix
+from skyless.core.integrity import Alert
+from skyless.core.tag.any_receiver import AnyReceiver
 
 STD_M = 0.03
 
 
 def heard_with_heights(position, height_of, seconds=6.0):
     """The last fixes of a tag whose sensor speaks after every packet, and whether what it said was used."""
-    receiver, fixes, used = Receiver(), [], []
+    receiver, fixes, used = AnyReceiver(), [], []
     for one in tape(LOFT, seconds, position=position):
         fix = receiver.hear(one.reception)
         if isinstance(fix, Fix):
@@ -46,7 +46,7 @@ def test_single_wild_heights_are_left_out():
 
 def test_a_sensor_that_never_fits_leads_to_a_new_start():
     """The side of the plane was wrong, as the owner had said that it could only be the lower one."""
-    receiver, places = Receiver(z_bounds_m=(0.0, 5.0)), []
+    receiver, places = AnyReceiver(z_bounds_m=(0.0, 5.0)), []
     for k, one in enumerate(tape(LOFT, 6.0, position=(3.0, 4.0, 6.5))):
         fix = receiver.hear(one.reception)
         if isinstance(fix, Fix):
@@ -61,11 +61,11 @@ def test_a_sensor_that_never_fits_leads_to_a_new_start():
 @pytest.mark.parametrize(("height_m", "std_m"), [(np.nan, 1.0), (1.0, 0.0), (1.0, np.inf), (1.0, -1.0)])
 def test_what_is_no_height_is_refused(height_m, std_m):
     with pytest.raises(ValueError, match="height"):
-        Receiver().hear_height(height_m, std_m)
+        AnyReceiver().hear_height(height_m, std_m)
 
 
 def test_a_method_without_states_has_no_use_for_it():
-    receiver = Receiver("literal")
+    receiver = AnyReceiver("literal")
     assert not receiver.hear_height(1.0, 0.1)
     for one in tape(LAB, 1.0):
         receiver.hear(one.reception)

@@ -9,12 +9,12 @@ import os
 from msgspec.structs import replace
 
 from bench import LAB
-from skyless.anchor import Anchor
-from skyless.evaluation.fleet import Fleet, FleetSettings
-from skyless.evaluation.scenarios import Request, impairments_of
-from skyless.simulation.oscillator import OscillatorModel
-from skyless.simulation.trajectory import Static
-from skyless.ticks import WRAP_TICKS
+from skyless.core.protocol1.anchor import Anchor
+from skyless.core.ticks import WRAP_TICKS
+from skyless.sim.evaluation.fleet import Fleet, FleetSettings
+from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.oscillator import OscillatorModel
+from skyless.sim.trajectory import Static
 
 HOURS = 24.0 if os.environ.get("SKYLESS_LONG") == "1" else 0.5
 SLOW = replace(

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.anchors.factory import new_anchor
-from skyless.receiver import Receiver
-from skyless.simulation.impairments import DelayError, lab_impairments
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
-from skyless.site.lab import lab_site
-from skyless.site.model import ScheduleSite, UnplacedAnchor
+from skyless.core.protocols import new_anchor
+from skyless.core.site import ScheduleSite, UnplacedAnchor
+from skyless.core.tag.any_receiver import AnyReceiver
+from skyless.sim.impairments import DelayError, lab_impairments
+from skyless.sim.lab import lab_site
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Static
+from skyless.sim.world import World
 
 TAG_M = np.array((2.0, 3.0))
 DELAY_TICKS = {1: 40, 2: -30, 3: 20, 4: 60, 5: -60, 6: 10}
@@ -24,9 +24,6 @@ SHIFT_M = np.array((1.0, -2.0))
 
 def site_of(mode):
     lab = lab_site()
-    if mode == "slots":
-        slotted = tuple(replace(anchor, slot=slot) for slot, anchor in enumerate(lab.anchors))
-        return replace(lab, anchors=slotted, schedule=ScheduleSite(mode="slots", slot_s=2.5e-3, slots=6))
     return lab if mode == "master" else replace(lab, schedule=ScheduleSite(mode="free", rate_hz=50.0))
 
 
@@ -47,7 +44,7 @@ def surveyed(site):
 
 def run(site, before, seed, stagger_s, seconds=4.0, after=None, delays_ticks=DELAY_TICKS):
     """Times and positions of a tag's fixes, times of each anchor's frames, and the tag."""
-    machines, receiver, fixes, sent = {}, Receiver(), [], {anchor.id: [] for anchor in site.anchors}
+    machines, receiver, fixes, sent = {}, AnyReceiver(), [], {anchor.id: [] for anchor in site.anchors}
 
     def make(anchor_id):
         machines[anchor_id] = new_anchor(before, anchor_id)
@@ -72,7 +69,7 @@ def longest_gap_s(times_s, since_s):
 
 
 @pytest.mark.parametrize("stagger_s", [0.0, 0.1])
-@pytest.mark.parametrize(("mode", "without_fixes_s"), [("master", 0.3), ("slots", 0.7), ("free", 0.7)])
+@pytest.mark.parametrize(("mode", "without_fixes_s"), [("master", 0.3), ("free", 0.7)])
 def test_tags_go_over_to_the_new_positions_and_never_mix_them_with_the_old(mode, without_fixes_s, stagger_s):
     site = site_of(mode)
     fixes, sent, receiver = run(site, replace(site, anchors=tuple(map(turned, site.anchors))), 1, stagger_s)
@@ -87,7 +84,7 @@ def test_tags_go_over_to_the_new_positions_and_never_mix_them_with_the_old(mode,
     assert receiver.counters["site-change"] == receiver.counters["anchor-restart"] == 0
 
 
-@pytest.mark.parametrize("mode", ["master", "slots", "free"])
+@pytest.mark.parametrize("mode", ["master", "free"])
 def test_no_fix_mixes_positions_where_anchors_take_seconds_to_adopt_them(mode):
     site = site_of(mode)
     before = replace(site, anchors=tuple(map(turned, site.anchors)))
@@ -100,10 +97,9 @@ def test_no_fix_mixes_positions_where_anchors_take_seconds_to_adopt_them(mode):
         assert longest_gap_s(fixes[:, 0], PLACED_S) < 2.5
 
 
-@pytest.mark.parametrize("mode", ["slots", "free"])
-def test_a_tag_without_fixes_gets_them_when_anchors_get_positions(mode):
-    site = site_of(mode)
-    unplaced = tuple(UnplacedAnchor(anchor.id, anchor.slot) for anchor in site.anchors)
+def test_a_tag_without_fixes_gets_them_when_anchors_get_positions():
+    site = site_of("free")
+    unplaced = tuple(UnplacedAnchor(anchor.id) for anchor in site.anchors)
     fixes, _, receiver = run(site, replace(site, anchors=(), unplaced=unplaced), 2, 0.0, 3.0)
     assert fixes[0, 0] > PLACED_S
     assert fixes[0, 0] < PLACED_S + 0.2
@@ -112,7 +108,7 @@ def test_a_tag_without_fixes_gets_them_when_anchors_get_positions(mode):
 
 
 def test_others_go_on_while_one_anchor_has_moved():
-    site = site_of("slots")
+    site = site_of("free")
     before = replace(site, anchors=(*site.anchors[:5], replace(site.anchors[5], x_m=0.5)))
     fixes, _, receiver = run(site, before, 3, 0.0, after=site, delays_ticks={})
     assert receiver.counters["moved-anchor"] > 10
@@ -122,7 +118,7 @@ def test_others_go_on_while_one_anchor_has_moved():
 
 
 def test_one_anchor_that_has_moved_joins_again():
-    site = site_of("slots")
+    site = site_of("free")
     before = replace(site, anchors=(*site.anchors[:5], replace(site.anchors[5], x_m=0.5)))
     fixes, _, receiver = run(site, before, 3, 0.0, PLACED_S + 10.5, after=site, delays_ticks={})
     assert 6 in receiver.method.estimator.anchors

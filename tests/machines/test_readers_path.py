@@ -6,12 +6,12 @@ from pathlib import Path
 
 import skyless
 from skyless import Request, fleet_of, lab_site
-from skyless.air.codec import decode_cached
+from skyless.core.protocol1.codec import decode_cached
 
 SOURCE = str(Path(skyless.__file__).parent) + "/"
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "architecture.md").read_text(encoding="utf-8")
 PATH = re.findall(r"^\| \d \| `([\w/]+\.py)`", DOCUMENT, re.MULTILINE)
-APART = {"air/ieee802154.py", "air/frames.py", "air/site_choice.py"}
+APART = {"core/air/ieee802154.py", "air/frames.py", "core/air/site_choice.py"}
 """The checksum, the version of the frame, and which of several sites it is: a line of each."""
 WARM_S = 4.0
 

@@ -7,17 +7,17 @@ import pytest
 from msgspec.structs import replace
 
 from bench import EVERY_METHOD, LAB, LOFT, PAIRS, ROOM, Heard, Stage, assert_honest, changed, listen, tape
-from skyless.air.almanac import AccuracyPage, AnchorPage, NoisePage, SchedulePage
-from skyless.air.beacon import MasterTime
-from skyless.air.codec import decode
-from skyless.anchor import Anchor
-from skyless.constants import TICK_RATE_HZ
-from skyless.method_names import DEFAULT_METHOD, FILTERS, METHODS
-from skyless.positioning.fix import NoFixReason
-from skyless.positioning.methods.snapshots import SnapshotMethod
-from skyless.receiver import Receiver
-from skyless.simulation.impairments import AnchorOutage, Outage
-from skyless.ticks import wrap
+from skyless.core.air.almanac import AccuracyPage, AnchorPage, NoisePage, SchedulePage
+from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.fix import NoFixReason
+from skyless.core.method_names import DEFAULT_METHOD, FILTERS, METHODS
+from skyless.core.protocol1.anchor import Anchor
+from skyless.core.protocol1.beacon import MasterTime
+from skyless.core.protocol1.codec import decode
+from skyless.core.protocol1.receiver import Receiver
+from skyless.core.protocol1.snapshots import SnapshotMethod
+from skyless.core.ticks import wrap
+from skyless.sim.impairments import AnchorOutage, Outage
 
 SUPERFRAME_S = 15e-3
 P1 = (3.0, 4.0, 0.0)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.evaluation.scenarios import Request, fleet_of
-from skyless.positioning.estimator.estimator import Estimator
-from skyless.positioning.estimator.kalman import predict
-from skyless.positioning.estimator.state import EstimatorSettings
-from skyless.site.lab import ideal_lab_site
-from skyless.site.model import EXACT
-from skyless.site.template import rectangular_site
-from skyless.ticks import from_seconds
+from skyless.core.estimator.estimator import Estimator
+from skyless.core.estimator.kalman import predict
+from skyless.core.estimator.state import EstimatorSettings
+from skyless.core.site import EXACT
+from skyless.core.ticks import from_seconds
+from skyless.sim.evaluation.scenarios import Request, fleet_of
+from skyless.sim.lab import paper_lab_site
+from skyless.site.file.template import rectangular_site
 
 LISTENING_S = 3.0
 
@@ -21,7 +21,7 @@ LISTENING_S = 3.0
 HALL = replace(rectangular_site(30.0, 20.0, 8, 4.0, None), accuracy=EXACT)
 
 
-@pytest.mark.parametrize("site", [ideal_lab_site(), HALL], ids=lambda site: site.name)
+@pytest.mark.parametrize("site", [paper_lab_site(), HALL], ids=lambda site: site.name)
 @pytest.mark.parametrize("silence_s", [2.0, 3.0, 4.5])
 def test_fixes_after_a_silence_know_their_error(site, silence_s):
     """Errors of a normal variable in 2 or 3 axes exceed five of its radial sigmas once in 10⁶ and more."""
@@ -55,7 +55,7 @@ def test_the_spread_ahead_is_that_of_the_prediction():
 
 def test_superframes_of_seconds_are_silences():
     """255 slots of 15.7 ms, of which six are used: 94 ms of beacons every 4 s."""
-    lab = ideal_lab_site()
+    lab = paper_lab_site()
     slow = replace(lab, schedule=replace(lab.schedule, slot_s=15.7e-3, slots=255))
     fleet = fleet_of(Request(slow, tags=4))
     judged = list(fleet.run(60.0))

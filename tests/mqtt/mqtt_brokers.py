@@ -12,8 +12,8 @@ import time
 import weakref
 from pathlib import Path
 
-from skyless.mqtt.address import MqttAddress
-from skyless.nodes.broker import BrokerSettings, start_broker
+from skyless.run.broker import BrokerSettings, start_broker
+from skyless.run.mqtt.address import MqttAddress
 
 MOSQUITTO = shutil.which("mosquitto", path=os.environ.get("PATH", "") + ":/usr/sbin")
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.errors import SkylessError
-from skyless.mqtt.address import MqttAddress, hide_password, mqtt_address
+from skyless.core.errors import SkylessError
+from skyless.run.mqtt.address import MqttAddress, hide_password, mqtt_address
 
 
 @pytest.fixture(autouse=True)

@@ -5,9 +5,9 @@ import contextlib
 
 import pytest
 
-from skyless.errors import SkylessError
-from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.connection import Introduction, check_broker, open_connection
+from skyless.core.errors import SkylessError
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.connection import Introduction, check_broker, open_connection
 
 
 @contextlib.asynccontextmanager

@@ -11,14 +11,14 @@ import msgspec
 import pytest
 from mqtt_brokers import free_port, running, stopped, until
 
-from skyless.errors import SkylessError
-from skyless.mqtt import connection
-from skyless.mqtt import link as link_module
-from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.connection import check_broker
-from skyless.mqtt.link import Link
-from skyless.mqtt.messages import StatusMessage, Zone, ZonesMessage
-from skyless.mqtt.topics import fix_topic, receptions_topic, status_topic, zones_topic
+from skyless.core.errors import SkylessError
+from skyless.run.mqtt import connection
+from skyless.run.mqtt import link as link_module
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.connection import check_broker
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.messages import StatusMessage, Zone, ZonesMessage
+from skyless.run.mqtt.topics import fix_topic, receptions_topic, status_topic, zones_topic
 
 ZONES = ZonesMessage((Zone("z1", "door", ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0))),))
 
@@ -101,8 +101,8 @@ def test_what_the_broker_has_kept_comes_before_what_replaces_it(make_broker):
 
 NODE = """
 import asyncio, sys
-from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.link import Link
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.link import Link
 link = Link(MqttAddress("127.0.0.1", int(sys.argv[1])), "t1", site=7, kind="tag", keepalive_s=1)
 asyncio.run(link.run())
 """
@@ -214,7 +214,7 @@ def test_a_will_that_comes_late_does_not_show_a_running_node_as_offline(make_bro
 
 
 def test_after_a_broker_s_death_it_reconnects_and_logs_what_was_dropped(make_broker, caplog):
-    caplog.set_level(logging.WARNING, "skyless.mqtt")
+    caplog.set_level(logging.WARNING, "skyless.run.mqtt")
 
     async def check():
         broker = make_broker()

@@ -1,6 +1,17 @@
-"""The brokers of ``tests/outputs`` serve here too."""
+"""The brokers of ``tests/mqtt`` serve here too."""
 
 import sys
 from pathlib import Path
 
+import pytest
+
 sys.path.append(str(Path(__file__).parents[1] / "mqtt"))
+
+
+@pytest.fixture
+def links(monkeypatch):
+    """Links of ``node_stage.FakeLink``, in the order in which they were made."""
+    from node_stage import FakeLink
+
+    monkeypatch.setattr(FakeLink, "made", [])
+    return FakeLink.made

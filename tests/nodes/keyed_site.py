@@ -5,7 +5,8 @@ from functools import lru_cache
 from msgspec.structs import replace
 from node_stage import LAB, PLACE_M
 
-from skyless.authentication.key_files import (
+from skyless.core.site import ScheduleSite
+from skyless.run.keys.key_files import (
     SITE_PUBLIC,
     SitePublic,
     chain_public_bytes,
@@ -14,12 +15,11 @@ from skyless.authentication.key_files import (
     seed_bytes,
     site_public_bytes,
 )
-from skyless.evaluation.scenarios import Request, impairments_of
-from skyless.evaluation.trusted_air import anchors_with_keys, made_keys
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
-from skyless.site.model import ScheduleSite
+from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Static
+from skyless.sim.world import World
+from support.keyed_air import anchors_with_keys, made_keys
 
 FREE = replace(LAB, schedule=ScheduleSite(mode="free", rate_hz=50.0))
 KEYS = made_keys(FREE.id, 0.0, 30.0)

@@ -5,18 +5,18 @@ import contextlib
 
 import numpy as np
 
-from skyless.evaluation.scenarios import Request, impairments_of
-from skyless.nodes.anchor import AnchorNode
-from skyless.nodes.board import Board
-from skyless.nodes.ether import Ether
-from skyless.nodes.open_radio import open_radios, open_sniffers
-from skyless.nodes.packet_tags import PacketTagNode, PacketTagSettings
-from skyless.nodes.tag import TagNode, TagSettings
-from skyless.radios.interface import AntennaDelays
-from skyless.simulation.trajectory import Static
-from skyless.site.lab import ideal_lab_site
+from skyless.radio.interface import AntennaDelays
+from skyless.research.live.packet_tags import PacketTagNode, PacketTagSettings
+from skyless.run.anchor import AnchorNode
+from skyless.run.board import Board
+from skyless.run.ether import Ether
+from skyless.run.open_radio import open_radios, open_sniffers
+from skyless.run.tag import TagNode, TagSettings
+from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.lab import paper_lab_site
+from skyless.sim.trajectory import Static
 
-LAB = ideal_lab_site()
+LAB = paper_lab_site()
 PLACE_M = (2.0, 3.0, LAB.tags.height_m)
 PLACES = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in LAB.anchors}
 TAGS = ("tag1", "tag2", "tag3", "tag4")

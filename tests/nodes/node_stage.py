@@ -1,23 +1,29 @@
 """Nodes without processes: a radio that the test plays, and an event loop whose time jumps from timer to timer."""
 
 import asyncio
+import contextlib
+import functools
 import selectors
 from collections import Counter
+from typing import ClassVar
 
+import msgspec
 from msgspec.structs import replace
 
-from skyless.air.reception import Reception
-from skyless.anchor import Anchor
-from skyless.constants import TICK_RATE_HZ
-from skyless.evaluation.scenarios import Request, impairments_of
-from skyless.radios.interface import Sent
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
-from skyless.site.lab import ideal_lab_site
-from skyless.ticks import difference, wrap
+from skyless.core.air.reception import Reception
+from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.protocol1.anchor import Anchor
+from skyless.core.ticks import difference, wrap
+from skyless.radio.interface import Restarted, Sent
+from skyless.run.anchor import AnchorNode
+from skyless.run.mqtt.messages import Counters
+from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.lab import paper_lab_site
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Static
+from skyless.sim.world import World
 
-LAB = ideal_lab_site()
+LAB = paper_lab_site()
 PLACE_M = (2.0, 3.0, 0.0)
 
 
@@ -39,10 +45,66 @@ class JumpingLoop(asyncio.SelectorEventLoop):
         return self.now_s
 
 
-def play(main):
-    """Run a test in a loop that jumps."""
-    with asyncio.Runner(loop_factory=JumpingLoop) as runner:
-        runner.run(main)
+def played(test):
+    """Run a coroutine of a test in a loop that jumps."""
+
+    @functools.wraps(test)
+    def run(*arguments, **fixtures):
+        with asyncio.Runner(loop_factory=JumpingLoop) as runner:
+            runner.run(test(*arguments, **fixtures))
+
+    return run
+
+
+@contextlib.asynccontextmanager
+async def running(*parts):
+    """Coroutines that run beside a test and end with it, however that ends."""
+    tasks = [asyncio.ensure_future(part) for part in parts]
+    await asyncio.sleep(0)
+    try:
+        yield tasks
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+class FakeLink:
+    """A link to no broker: a test calls its handlers, and reads what was published."""
+
+    made: ClassVar = []
+    """All links since the fixture ``links`` began."""
+
+    def __init__(self, address=None, name=None, *, site=None, kind=None, **_):
+        self.address, self.name, self.site, self.kind = address, name, site, kind
+        self.counters, self.late, self.state = Counters(0, 0, 0), 0, "made"
+        self.handlers, self.published, self.forgotten, self.on_state = {}, [], [], []
+        FakeLink.made.append(self)
+
+    def subscribe(self, topic, handler, qos=0):
+        self.handlers[topic] = handler
+
+    def publish(self, topic, message, **options):
+        self.published.append((topic, message, options))
+
+    def forget(self, topic):
+        self.forgotten.append(topic)
+
+    async def run(self):
+        self.state = "running"
+        try:
+            await asyncio.Event().wait()
+        finally:
+            self.state = "left"
+
+    def receive(self, topic, message):
+        """A message comes, of a topic or of the end of one that is subscribed to."""
+        payload = message if isinstance(message, bytes) else msgspec.json.encode(message)
+        (handler,) = [handler for name, handler in self.handlers.items() if name.endswith(topic)]
+        handler(topic, payload)
+
+    def newest(self, kind):
+        return next((message for _, message, _ in reversed(self.published) if isinstance(message, kind)), None)
 
 
 LEAD_S = 1.8e-3
@@ -106,3 +168,15 @@ def receptions_of(site_id, seconds, *, later_s=0.0, seed=1):
     heard = [reception for broadcast in world.run(seconds) for _, reception, _ in broadcast.receptions()]
     later_ticks = round(later_s * TICK_RATE_HZ)
     return [Reception(r.frame, wrap(r.rx_ticks + later_ticks), r.host_s + later_s, r.diagnostics) for r in heard]
+
+
+@contextlib.asynccontextmanager
+async def running_anchor(site=LAB, anchor=1, seconds=0.0, *, sends=True):
+    """An anchor that receives nobody, some time after its radio became ready: node, radio and what it logged."""
+    radio, logged = FakeRadio(str(anchor)), []
+    radio.sends = sends
+    node = AnchorNode(site, anchor, radio, logged.append)
+    async with running(node.run()):
+        node.on_event(Restarted())
+        await asyncio.sleep(seconds)
+        yield node, radio, logged

@@ -8,10 +8,10 @@ from collections import defaultdict, deque
 
 import msgspec
 
-from skyless.evaluation.scenarios import COMFORT_MPS2
-from skyless.mqtt.link import Link
-from skyless.mqtt.messages import AnchorHealth, EtherHealth, FixMessage, StatusMessage, TagHealth, TruthMessage
-from skyless.mqtt.topics import fix_topic, health_topic, status_topic, truth_topic
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.messages import AnchorHealth, EtherHealth, FixMessage, StatusMessage, TagHealth, TruthMessage
+from skyless.run.mqtt.topics import fix_topic, health_topic, status_topic, truth_topic
+from skyless.sim.evaluation.scenarios import COMFORT_MPS2
 
 NEAR_S = 0.06
 """A truth is known from a message so near in time; an ether sends one every 50 ms."""

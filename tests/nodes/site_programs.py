@@ -3,13 +3,12 @@
 import asyncio
 import contextlib
 import signal
-import sys
 import time
 
 from mqtt_brokers import Mosquitto, free_port
 
-from skyless.evaluation.compile_ahead import compile_kernels
-from skyless.nodes.process import end_with_parent
+from skyless.research.compile_ahead import compile_kernels
+from support.processes import SKYLESS, usual_signals
 
 START_S = 120.0
 """A first start compiles the kernels."""
@@ -52,15 +51,13 @@ class Program:
     async def start(self):
         self.said.clear()
         self.process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            "-m",
-            "skyless.cli.main",
+            *SKYLESS,
             *self.arguments,
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.STDOUT,
             env=self.environment,
-            preexec_fn=end_with_parent(),
+            preexec_fn=usual_signals(),
         )
         self._reader = asyncio.ensure_future(self._read(self.process))
 

@@ -6,27 +6,24 @@ import re
 import pytest
 from keyed_site import FIRST, FREE, KEYS, OTHER_KEYS, SECOND, put
 from msgspec.structs import replace
-from node_stage import FakeRadio, play
+from node_stage import FakeRadio, played
 
-from skyless.air.codec2 import decode_2
-from skyless.air.reception import Reception
-from skyless.anchors.authentication import BeaconAuthentication
-from skyless.anchors.free import FreeAnchor
-from skyless.authentication.fault import Fault
-from skyless.authentication.key_files import SEEDS_VARIABLE, chain_public_file, chain_seed_file, seed_bytes
 from skyless.cli.main import main
-from skyless.constants import TICK_S
-from skyless.errors import SkylessError
-from skyless.evaluation.trusted_air import START_UNIX_S
-from skyless.mqtt.messages import Counters, PlacementMessage
-from skyless.nodes.anchor import AnchorNode, Anchors, health_of
-from skyless.nodes.keys.anchor_keys import AnchorKeys
-from skyless.nodes.keys.anchor_report import AnchorReport
-from skyless.nodes.keys.faults import CALM_S, LASTING_S, MOST_NAMED, FaultLines
-from skyless.radios.interface import Restarted
-from skyless.site.digest import site_digest
-from skyless.site.model import UnplacedAnchor
-from skyless.ticks import difference
+from skyless.core.air.codec import decode
+from skyless.core.air.reception import Reception
+from skyless.core.anchor.anchor import Anchor
+from skyless.core.anchor.authentication import BeaconAuthentication
+from skyless.core.constants import TICK_S
+from skyless.core.errors import SkylessError
+from skyless.core.keys.fault import Fault
+from skyless.core.site import UnplacedAnchor, site_digest
+from skyless.core.ticks import difference
+from skyless.radio.interface import Restarted
+from skyless.run.anchor import AnchorNode, Anchors, health_of
+from skyless.run.keys.anchor_and_tag_keys import CALM_S, LASTING_S, MAX_NAMED, AnchorKeys, AnchorReport, FaultLines
+from skyless.run.keys.key_files import SEEDS_VARIABLE, chain_public_file, chain_seed_file, seed_bytes
+from skyless.run.mqtt.messages import Counters, PlacementMessage
+from support.keyed_air import START_UNIX_S
 
 BEGIN_S = 1000.0
 """The first instant of the loop, at which ``START_UNIX_S`` is the time."""
@@ -66,76 +63,70 @@ class Stage:
         await asyncio.wait([self._task])
 
     def frames(self):
-        return [decode_2(transmission.frame) for _, transmission in self.radios[0].transmissions]
+        return [decode(transmission.frame) for _, transmission in self.radios[0].transmissions]
 
     def health(self):
         now_s = asyncio.get_running_loop().time() - BEGIN_S
         return health_of(self.node, Counters(0, 0, 0), START_UNIX_S + now_s, now_s)
 
 
-def test_frames_carry_codes_and_other_chains_are_used_without_a_restart(tmp_path, clock):
+@played
+async def test_frames_carry_codes_and_other_chains_are_used_without_a_restart(tmp_path, clock):
     put(tmp_path, FIRST)
 
-    async def check():
-        async with Stage(tmp_path) as stage:
-            await asyncio.sleep(5.0)
-            assert all(frame.authentication is not None for frame in stage.frames())
-            health = stage.health()
-            assert (health.chain, health.code_fault, health.faults) == (1, None, {})
-            ends_s = health.chain_ends_unix_s
-            put(tmp_path, SECOND)
-            await asyncio.sleep(10.0)
-            assert stage.health().chain == 1
-            assert stage.health().chain_ends_unix_s >= ends_s
-            await asyncio.sleep(20.0)
-            assert (stage.health().chain, stage.health().code_fault) == (2, None)
-            assert all(frame.authentication is not None for frame in stage.frames())
-            codes = [line for line in stage.said if "codes" in line]
-            assert codes == [f"anchor 1: beacons carry codes of key chain {serial}" for serial in (1, 2)]
-            other, faults = BeaconAuthentication(FREE, KEYS.chains), set()
-            for sent_s, transmission in stage.radios[0].transmissions:
-                ahead_s = difference(transmission.tx_ticks, stage.radios[0].ticks_at(sent_s)) * TICK_S
-                other.set_time(transmission.tx_ticks, START_UNIX_S + sent_s - BEGIN_S + ahead_s)
-                beacon = decode_2(transmission.frame)
-                faults.add(other.fault_of(beacon, Reception(transmission.frame, transmission.tx_ticks)))
-            assert faults == {None}
-
-    play(check())
+    async with Stage(tmp_path) as stage:
+        await asyncio.sleep(5.0)
+        assert all(frame.authentication is not None for frame in stage.frames())
+        health = stage.health()
+        assert (health.chain, health.code_fault, health.faults) == (1, None, {})
+        ends_s = health.chain_ends_unix_s
+        put(tmp_path, SECOND)
+        await asyncio.sleep(10.0)
+        assert stage.health().chain == 1
+        assert stage.health().chain_ends_unix_s >= ends_s
+        await asyncio.sleep(20.0)
+        assert (stage.health().chain, stage.health().code_fault) == (2, None)
+        assert all(frame.authentication is not None for frame in stage.frames())
+        codes = [line for line in stage.said if "codes" in line]
+        assert codes == [f"anchor 1: beacons carry codes of key chain {serial}" for serial in (1, 2)]
+        other, faults = BeaconAuthentication(KEYS.chains), set()
+        for sent_s, transmission in stage.radios[0].transmissions:
+            ahead_s = difference(transmission.tx_ticks, stage.radios[0].ticks_at(sent_s)) * TICK_S
+            other.set_time(transmission.tx_ticks, START_UNIX_S + sent_s - BEGIN_S + ahead_s)
+            beacon = decode(transmission.frame)
+            faults.add(other.fault_of(beacon, Reception(transmission.frame, transmission.tx_ticks)))
+        assert faults == {None}
 
 
-def test_several_anchors_share_the_files(tmp_path, clock):
+@played
+async def test_several_anchors_share_the_files(tmp_path, clock):
     put(tmp_path, FIRST)
 
-    async def check():
-        async with Stage(tmp_path, "1", "2", "3") as stage:
-            await asyncio.sleep(1.5)
-            assert {node.authentication.fault() for node in stage.anchors.nodes} == {None}
-            assert len({id(node.authentication) for node in stage.anchors.nodes}) == 3
-
-    play(check())
+    async with Stage(tmp_path, "1", "2", "3") as stage:
+        await asyncio.sleep(1.5)
+        assert {node.authentication.fault() for node in stage.anchors.nodes} == {None}
+        assert len({id(node.authentication) for node in stage.anchors.nodes}) == 3
 
 
-def test_files_that_are_copied_at_the_moment_change_nothing(tmp_path, clock):
+@played
+async def test_files_that_are_copied_at_the_moment_change_nothing(tmp_path, clock):
     put(tmp_path, FIRST)
 
-    async def check():
-        async with Stage(tmp_path) as stage:
-            await asyncio.sleep(4.0)
-            put(tmp_path, SECOND)
-            file = chain_public_file(tmp_path, 2)
-            whole = file.read_bytes()
-            file.write_bytes(whole[:-9])
-            await asyncio.sleep(10.0)
-            said = [line for line in stage.said if line.startswith("keys: the former ones stay in use:")]
-            assert len(said) == 1
-            assert "chain-2.public" in said[0]
-            assert [chain.serial for chain in stage.anchors._keys.chains] == [1]
-            file.write_bytes(whole)
-            await asyncio.sleep(4.0)
-            assert [chain.serial for chain in stage.anchors._keys.chains] == [1, 2]
-            assert stage.health().code_fault is None
-
-    play(check())
+    async with Stage(tmp_path) as stage:
+        await asyncio.sleep(4.0)
+        put(tmp_path, SECOND)
+        file = chain_public_file(tmp_path, 2)
+        whole = file.read_bytes()
+        file.write_bytes(whole[:-9])
+        await asyncio.sleep(10.0)
+        said = [line for line in stage.said if line.startswith("keys: the former ones stay in use:")]
+        assert len(said) == 1
+        assert "chain-2.public" in said[0]
+        assert [chain.serial for chain in stage.anchors._keys.chains] == [1]
+        file.write_bytes(whole)
+        await asyncio.sleep(4.0)
+        assert [chain.serial for chain in stage.anchors._keys.chains] == [1, 2]
+        assert stage.health().code_fault is None
 
 
 def test_a_chain_whose_seed_is_still_to_come_is_named(tmp_path):
@@ -174,23 +165,21 @@ def test_the_end_of_the_last_chain_is_logged_once_a_day(tmp_path):
     assert all(words in line for words, line in zip(what, said, strict=True))
 
 
-def test_an_anchor_whose_chain_has_not_begun_says_so_and_sends_without_codes(tmp_path, clock):
+@played
+async def test_an_anchor_whose_chain_has_not_begun_says_so_and_sends_without_codes(tmp_path, clock):
     put(tmp_path, SECOND)
 
-    async def check():
-        async with Stage(tmp_path) as stage:
-            await asyncio.sleep(3.0)
-            assert {frame.authentication for frame in stage.frames()} == {None}
-            assert (stage.health().chain, stage.health().code_fault) == (None, "no-chain")
-            assert "anchor 1: beacons carry no codes: no key chain counts now (skyless site keys show)" in stage.said
-
-    play(check())
+    async with Stage(tmp_path) as stage:
+        await asyncio.sleep(3.0)
+        assert {frame.authentication for frame in stage.frames()} == {None}
+        assert (stage.health().chain, stage.health().code_fault) == (None, "no-chain")
+        assert "anchor 1: beacons carry no codes: no key chain counts now (skyless site keys show)" in stage.said
 
 
 def reported(faults, accepted_s=float("-inf")):
     """Lines of an anchor whose others have these faults for ten seconds."""
     said = []
-    authentication = BeaconAuthentication(FREE, KEYS.chains)
+    authentication = BeaconAuthentication(KEYS.chains)
     report = AnchorReport(1, said.append)
     for now_s in range(10):
         unix_s = START_UNIX_S + now_s
@@ -217,12 +206,12 @@ def test_lines_of_faults_come_once_and_are_few():
     lines = FaultLines("x", said.append)
     for now_s in range(60):
         lines.update(dict.fromkeys(range(100), Fault.BAD_CODE) if now_s < 20 else {}, float(now_s))
-    assert len(said) == 2 * MOST_NAMED
-    assert sum("was refused for" in line for line in said) == MOST_NAMED
+    assert len(said) == 2 * MAX_NAMED
+    assert sum("was refused for" in line for line in said) == MAX_NAMED
     lines.update({1: Fault.LATE}, 100.0)
     lines.update({}, 100.0 + LASTING_S)
     lines.update({}, 100.0 + 2.0 * CALM_S)
-    assert len(said) == 2 * MOST_NAMED
+    assert len(said) == 2 * MAX_NAMED
 
 
 @pytest.mark.parametrize(
@@ -265,21 +254,19 @@ def test_wrong_options_of_a_tag_are_refused(tmp_path, capsys, arguments, words):
     assert error.count("\n") == 1
 
 
-def test_stamps_of_beacons_that_are_not_accepted_are_not_kept(tmp_path, clock):
+@played
+async def test_stamps_of_beacons_that_are_not_accepted_are_not_kept(tmp_path, clock):
     """A survey would use them."""
     put(tmp_path, FIRST)
 
-    async def check():
-        async with Stage(tmp_path) as stage:
-            await asyncio.sleep(1.0)
-            for chains, is_kept in ((OTHER_KEYS.chains, False), ((), False), (KEYS.chains, True)):
-                now_ticks = stage.radios[0].now_ticks()
-                sender = FreeAnchor(FREE, 2, authentication=BeaconAuthentication(FREE, chains))
-                sender.authentication.set_time(now_ticks, START_UNIX_S + 1.0)
-                stage.node.on_event(Reception(sender.transmission(now_ticks).frame, now_ticks))
-                assert (2 in stage.node.heard_s) is is_kept
-
-    play(check())
+    async with Stage(tmp_path) as stage:
+        await asyncio.sleep(1.0)
+        for chains, is_kept in ((OTHER_KEYS.chains, False), ((), False), (KEYS.chains, True)):
+            now_ticks = stage.radios[0].now_ticks()
+            sender = Anchor(FREE, 2, authentication=BeaconAuthentication(chains))
+            sender.authentication.set_time(now_ticks, START_UNIX_S + 1.0)
+            stage.node.on_event(Reception(sender.transmission(now_ticks).frame, now_ticks))
+            assert (2 in stage.node.heard_s) is is_kept
 
 
 def moved(site, x_m=0.0, ticks=0):

@@ -5,23 +5,24 @@ from collections import Counter
 
 import pytest
 
-from skyless.air.beacon import Beacon, Heard
-from skyless.air.codec import encode
-from skyless.air.ieee802154 import fcs
-from skyless.air.masterless_packets import Packet, Relay
-from skyless.air.reception import Reception, Transmission
-from skyless.anchor import Anchor
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
-from skyless.nodes.board import LinkProtocol, SnifferProtocol
-from skyless.radios.interface import Late, Restarted, Sent
-from skyless.radios.serial import link
-from skyless.radios.serial.foreign_radios import SnifferStream
-from skyless.radios.serial.link_records import Done, Hello, NotDone, Status, TooLate, decode
-from skyless.simulation.impairments import lab_impairments
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
-from skyless.site.lab import ideal_lab_site
+from skyless.core.air.frame import Heard
+from skyless.core.air.ieee802154 import fcs
+from skyless.core.air.masterless_packets import Packet, Relay
+from skyless.core.air.reception import Reception, Transmission
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
+from skyless.core.protocol1.anchor import Anchor
+from skyless.core.protocol1.beacon import Beacon
+from skyless.core.protocol1.codec import encode
+from skyless.radio.foreign.foreign_radios import SnifferStream
+from skyless.radio.interface import Late, Restarted, Sent
+from skyless.radio.serial import link
+from skyless.radio.serial.link import Done, Hello, NotDone, Status, TooLate, decode
+from skyless.run.board import LinkProtocol, SnifferProtocol
+from skyless.sim.impairments import lab_impairments
+from skyless.sim.lab import paper_lab_site
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Static
+from skyless.sim.world import World
 
 DELAY = 16_450
 
@@ -147,7 +148,7 @@ def test_garbage_from_the_host_is_counted_and_hurts_nothing():
     assert host.radio.transmissions == []
 
 
-LAB = ideal_lab_site()
+LAB = paper_lab_site()
 
 
 def frames():

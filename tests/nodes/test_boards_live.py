@@ -6,7 +6,7 @@ import time
 import pytest
 from live_nodes import PLACES, LiveSite, are_right
 
-from skyless.evaluation.compile_ahead import compile_kernels, compile_packet_kernels
+from skyless.research.compile_ahead import compile_kernels, compile_packet_kernels
 
 
 @pytest.fixture(scope="module", autouse=True)

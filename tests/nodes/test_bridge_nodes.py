@@ -4,27 +4,27 @@ import asyncio
 import contextlib
 import json
 import signal
-import sys
 from types import SimpleNamespace
 
 import pytest
 from mqtt_brokers import Embedded, free_port, until
 from msgspec import structs
+from node_stage import running
 
 from bridges.bridged_values import BERLIN, a_fix, tag_health
 from machines.bench import LAB, tape
-from skyless.air.almanac import GeoreferencePage
-from skyless.air.reception import Reception
 from skyless.bridges.hub import Hub, Route
+from skyless.bridges.program import BridgeNode, TagBridge, heard_site, run_route
 from skyless.bridges.target import Target
-from skyless.errors import SkylessError
-from skyless.mqtt.link import Link
-from skyless.mqtt.messages import SiteMessage, StatusMessage, Zone, ZonesMessage
-from skyless.mqtt.topics import EVERY_NODE, fix_topic, health_topic, site_topic, status_topic, zones_topic
-from skyless.nodes.bridge.broker_bridge import BridgeNode, run_route
-from skyless.nodes.bridge.tag_bridge import TagBridge, heard_site
-from skyless.nodes.process import end_with_parent
-from skyless.receiver import Receiver
+from skyless.core.air.almanac import GeoreferencePage
+from skyless.core.air.reception import Reception
+from skyless.core.errors import SkylessError
+from skyless.core.tag.any_receiver import AnyReceiver
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.messages import SiteMessage, StatusMessage, Zone, ZonesMessage
+from skyless.run.mqtt.topics import EVERY_NODE, fix_topic, health_topic, site_topic, status_topic, zones_topic
+from support.loops import in_loop
+from support.processes import SKYLESS, running_program
 
 ZONE = Zone("dock", "Dock", ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0)))
 
@@ -57,17 +57,6 @@ class Recorded(Target):
 
 
 @contextlib.asynccontextmanager
-async def running(*parts):
-    tasks = [asyncio.ensure_future(part) for part in parts]
-    try:
-        yield tasks
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-
-
-@contextlib.asynccontextmanager
 async def brokered(folder):
     """A broker, and a link that plays the site's programs."""
     broker = Embedded(folder)
@@ -81,57 +70,49 @@ async def brokered(folder):
         await broker.stop()
 
 
-def test_all_that_targets_need_comes_from_the_broker_and_nonsense_is_counted(tmp_path):
-    async def main():
-        target, said = Recorded(), []
-        async with brokered(tmp_path) as (broker, programs):
-            programs.publish(zones_topic(LAB.id), ZonesMessage((ZONE,)), retain=True)
-            programs.publish(site_topic(LAB.id), SiteMessage(LAB, True, 0.0), retain=True)
-            hub = Hub([Route(target, None, 50.0)], said.append)
-            node = BridgeNode(hub, broker.address, LAB.id, said.append)
-            async with running(node.run()):
-                await until(lambda: target.sites and target.sites[-1].zones)
-                programs.publish(fix_topic(LAB.id, "tag1"), b"{not json")
-                programs.publish(fix_topic(LAB.id, "tag1"), b'{"tag":"tag1"}')
-                programs.publish(site_topic(LAB.id), b"")
-                programs.publish(status_topic(LAB.id, "tag", "tag9"), StatusMessage(True, "tag", "tag9"))
-                programs.publish(health_topic(LAB.id, "tag", "tag1"), tag_health("tag1"))
-                programs.publish(fix_topic(LAB.id, "tag1"), a_fix())
-                await until(lambda: target.fixes and target.health and target.status)
-                assert target.fixes == [a_fix()]
-                assert target.sites[-1].name == LAB.name
-                assert target.sites[-1].simulated
-                assert "tag9" in {status.name for status in target.status}
-                await until(lambda: target.none)
-                state = node.state()
-                assert (state.fixes, state.malformed, state.dropped) == (1, 2, {"test:": {}})
-
-    asyncio.run(main())
+@in_loop
+async def test_all_that_targets_need_comes_from_the_broker_and_nonsense_is_counted(tmp_path):
+    target, said = Recorded(), []
+    async with brokered(tmp_path) as (broker, programs):
+        programs.publish(zones_topic(LAB.id), ZonesMessage((ZONE,)), retain=True)
+        programs.publish(site_topic(LAB.id), SiteMessage(LAB, True, 0.0), retain=True)
+        hub = Hub([Route(target, None, 50.0)], said.append)
+        node = BridgeNode(hub, broker.address, LAB.id, said.append)
+        async with running(node.run()):
+            await until(lambda: target.sites and target.sites[-1].zones)
+            programs.publish(fix_topic(LAB.id, "tag1"), b"{not json")
+            programs.publish(fix_topic(LAB.id, "tag1"), b'{"tag":"tag1"}')
+            programs.publish(site_topic(LAB.id), b"")
+            programs.publish(status_topic(LAB.id, "tag", "tag9"), StatusMessage(True, "tag", "tag9"))
+            programs.publish(health_topic(LAB.id, "tag", "tag1"), tag_health("tag1"))
+            programs.publish(fix_topic(LAB.id, "tag1"), a_fix())
+            await until(lambda: target.fixes and target.health and target.status)
+            assert target.fixes == [a_fix()]
+            assert target.sites[-1].name == LAB.name
+            assert target.sites[-1].simulated
+            assert "tag9" in {status.name for status in target.status}
+            await until(lambda: target.none)
+            state = node.state()
+            assert (state.fixes, state.malformed, state.dropped) == (1, 2, {"test:": {}})
 
 
-def test_a_site_that_lacks_what_the_only_target_needs_ends_the_bridge_with_the_reason(tmp_path):
-    async def main():
-        async with brokered(tmp_path) as (broker, programs):
-            programs.publish(site_topic(LAB.id), SiteMessage(LAB, True, 0.0), retain=True)
-            node = BridgeNode(Hub([Route(Recorded(refuses=True), None, 50.0)], print), broker.address, LAB.id, print)
-            with pytest.raises(SkylessError, match="test: needs more"):
-                await asyncio.wait_for(node.run(), 30)
-
-    asyncio.run(main())
+@in_loop
+async def test_a_site_that_lacks_what_the_only_target_needs_ends_the_bridge_with_the_reason(tmp_path):
+    async with brokered(tmp_path) as (broker, programs):
+        programs.publish(site_topic(LAB.id), SiteMessage(LAB, True, 0.0), retain=True)
+        node = BridgeNode(Hub([Route(Recorded(refuses=True), None, 50.0)], print), broker.address, LAB.id, print)
+        with pytest.raises(SkylessError, match="test: needs more"):
+            await asyncio.wait_for(node.run(), 30)
 
 
 def test_the_command_serves_readers_until_ctrl_c_and_then_says_what_it_did(tmp_path):
     async def main():
         port = free_port()
-        async with brokered(tmp_path) as (broker, programs):
+        async with contextlib.AsyncExitStack() as stack, brokered(tmp_path) as (broker, programs):
             programs.publish(site_topic(LAB.id), SiteMessage(LAB, True, 0.0), retain=True)
             command = ("bridge", f"jsonl+tcp://:{port}?tag=tag1", "--mqtt", str(broker.address), "--json")
-            process = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-m", "skyless.cli.main", *command),
-                stdout=asyncio.subprocess.PIPE,
-                stderr=asyncio.subprocess.PIPE,
-                preexec_fn=end_with_parent(),
-            )
+            pipes = {"stdout": asyncio.subprocess.PIPE, "stderr": asyncio.subprocess.PIPE}
+            process = await stack.enter_async_context(running_program(*SKYLESS, *command, **pipes))
             while b"bridging site" not in await asyncio.wait_for(process.stderr.readline(), 60):
                 pass
             lines, connection = await reader_of(port)
@@ -168,7 +149,7 @@ def test_a_tag_learns_its_site_from_the_air_with_the_georeference_where_one_is_s
     site = structs.replace(LAB, georeference=georeference)
     target, said = Recorded(), []
     bridge = TagBridge(Hub([Route(target, None, 50.0)], said.append), lambda: True, said.append)
-    receiver = Receiver()
+    receiver = AnyReceiver()
     for heard in tape(site, 2.0, 1, (3.0, 4.0, 0.0)):
         receiver.hear(Reception(heard.frame, heard.rx_ticks, heard.host_s))
     bridge.on_health(tag_health("tag1"), receiver)
@@ -256,32 +237,28 @@ def test_that_no_target_can_serve_a_growing_site_is_logged_once():
     assert said == ["test: needs more"]
 
 
-def test_a_target_that_has_ended_gets_nothing_more():
-    async def main():
-        target, said = Recorded(), []
-        route = Route(target, None, 1e3)
-        hub = Hub([route], said.append)
-        hub.on_site(heard_site(5, {1: (0.0, 0.0, 2.0)}, simulated=False))
-        async with running(run_route(route, said.append)):
-            await asyncio.sleep(0)
-            hub.on_fix(a_fix(), 1.0)
-        hub.on_fix(a_fix(serial=2), 2.0)
-        hub.on_tick(9.0, 9.0)
-        assert (len(target.fixes), target.none, said) == (1, [], [])
-
-    asyncio.run(main())
+@in_loop
+async def test_a_target_that_has_ended_gets_nothing_more():
+    target, said = Recorded(), []
+    route = Route(target, None, 1e3)
+    hub = Hub([route], said.append)
+    hub.on_site(heard_site(5, {1: (0.0, 0.0, 2.0)}, simulated=False))
+    async with running(run_route(route, said.append)):
+        await asyncio.sleep(0)
+        hub.on_fix(a_fix(), 1.0)
+    hub.on_fix(a_fix(serial=2), 2.0)
+    hub.on_tick(9.0, 9.0)
+    assert (len(target.fixes), target.none, said) == (1, [], [])
 
 
-def test_a_bridge_that_is_started_again_leaves_no_second_status_on_the_broker(tmp_path):
-    async def main():
-        async with brokered(tmp_path) as (broker, programs):
-            statuses = {}
-            programs.subscribe(status_topic(LAB.id, "bridge", EVERY_NODE), statuses.__setitem__)
-            for _ in range(2):
-                node = BridgeNode(Hub([Route(Recorded(), None, 1.0)], print), broker.address, LAB.id, print)
-                async with running(node.run()):
-                    await until(lambda: any(b'"online":true' in status for status in statuses.values()))
-                await until(lambda: all(b'"online":false' in status for status in statuses.values()))
-            assert len(statuses) == 1
-
-    asyncio.run(main())
+@in_loop
+async def test_a_bridge_that_is_started_again_leaves_no_second_status_on_the_broker(tmp_path):
+    async with brokered(tmp_path) as (broker, programs):
+        statuses = {}
+        programs.subscribe(status_topic(LAB.id, "bridge", EVERY_NODE), statuses.__setitem__)
+        for _ in range(2):
+            node = BridgeNode(Hub([Route(Recorded(), None, 1.0)], print), broker.address, LAB.id, print)
+            async with running(node.run()):
+                await until(lambda: any(b'"online":true' in status for status in statuses.values()))
+            await until(lambda: all(b'"online":false' in status for status in statuses.values()))
+        assert len(statuses) == 1

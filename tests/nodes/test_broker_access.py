@@ -10,13 +10,12 @@ from paho.mqtt import client as paho
 from paho.mqtt.enums import CallbackAPIVersion
 
 from skyless.cli.main import main
-from skyless.errors import SkylessError
-from skyless.mqtt import topics
-from skyless.mqtt.access import ACCESS, Role
-from skyless.mqtt.access_files import USERS, create_access, read_access
-from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.connection import check_broker
-from skyless.mqtt.link import Link
+from skyless.core.errors import SkylessError
+from skyless.run.mqtt import topics
+from skyless.run.mqtt.access import ACCESS, USERS, Role, create_access, read_access
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.connection import check_broker
+from skyless.run.mqtt.link import Link
 
 KINDS = ("tag", "anchor", "ether", "dashboard", "recorder", "survey", "bridge", "homeassistant", "watch")
 NODES = {
@@ -237,8 +236,9 @@ def test_strangers_and_wrong_passwords_are_refused(make_access):
 
 
 @pytest.mark.parametrize("role", [Role.ANCHORS, Role.PAGE])
-def test_a_program_of_the_wrong_role_is_warned(role, make_access, caplog):
+def test_a_program_of_the_wrong_role_is_warned(role, make_access, caplog, monkeypatch):
     """Anchors may not read a tag's status; the page may, but what it publishes there never comes back."""
+    monkeypatch.setattr("skyless.run.mqtt.link._ECHO_S", 0.5)
     access = make_access()
     access.client(Role.TAGS).publish('{"online":true}', ["skyless/v1/7/tag/n1/status"], retain=True)
 

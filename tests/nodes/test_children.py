@@ -9,8 +9,9 @@ import sys
 import pytest
 from mqtt_brokers import free_port, until
 
-from skyless.nodes import children
-from skyless.nodes.children import Child, Program, end
+from skyless.run import children
+from skyless.run.children import Child, Program, end
+from support.loops import in_loop
 
 
 def alive(pid):
@@ -26,50 +27,46 @@ async def stop(task):
     await asyncio.wait([task])
 
 
-def test_a_program_that_is_killed_is_started_again_and_logged():
-    async def main():
-        said = []
-        child = Child(Program("air", ("ether", "--mqtt", "none", "--listen", f"127.0.0.1:{free_port()}")), said.append)
-        task = asyncio.ensure_future(child.run())
-        await until(lambda: child.pid is not None)
-        first = child.pid
-        os.kill(first, signal.SIGKILL)
-        await until(lambda: child.pid is not None and child.pid != first)
-        second = child.pid
-        assert child.starts == 2
-        assert said == ["air ended (signal 9); it wrote no message; started again"]
-        assert not alive(first)
-        assert alive(second)
-        await stop(task)
-        assert not alive(second)
-        assert child.pid is None
-
-    asyncio.run(main())
+@in_loop
+async def test_a_program_that_is_killed_is_started_again_and_logged():
+    said = []
+    child = Child(Program("air", ("ether", "--mqtt", "none", "--listen", f"127.0.0.1:{free_port()}")), said.append)
+    task = asyncio.ensure_future(child.run())
+    await until(lambda: child.pid is not None)
+    first = child.pid
+    os.kill(first, signal.SIGKILL)
+    await until(lambda: child.pid is not None and child.pid != first)
+    second = child.pid
+    assert child.starts == 2
+    assert said == ["air ended (signal 9); it wrote no message; started again"]
+    assert not alive(first)
+    assert alive(second)
+    await stop(task)
+    assert not alive(second)
+    assert child.pid is None
 
 
-def test_a_program_that_cannot_live_is_tried_ever_more_seldom_and_its_last_lines_are_reported(monkeypatch):
+@in_loop
+async def test_a_program_that_cannot_live_is_tried_ever_more_seldom_and_its_last_lines_are_reported(monkeypatch):
     waits = []
 
-    async def main():
-        said = []
-        child = Child(Program("air", ("ether", "--site", "/nowhere.toml")), said.append)
-        sleep = asyncio.sleep
+    said = []
+    child = Child(Program("air", ("ether", "--site", "/nowhere.toml")), said.append)
+    sleep = asyncio.sleep
 
-        async def note(seconds):
-            waits.append(seconds)
-            await sleep(0)
+    async def note(seconds):
+        waits.append(seconds)
+        await sleep(0)
 
-        monkeypatch.setattr(children.asyncio, "sleep", note)
-        task = asyncio.ensure_future(child.run())
-        for _ in range(3000):
-            if len(waits) >= 3:
-                break
-            await sleep(0.01)
-        await stop(task)
-        expected = r'air ended \(exit code 2\); its last message: "skyless: .*/nowhere.toml.*"; started again'
-        assert all(re.fullmatch(expected, line) for line in said)
-
-    asyncio.run(main())
+    monkeypatch.setattr(children.asyncio, "sleep", note)
+    task = asyncio.ensure_future(child.run())
+    for _ in range(3000):
+        if len(waits) >= 3:
+            break
+        await sleep(0.01)
+    await stop(task)
+    expected = r'air ended \(exit code 2\); its last message: "skyless: .*/nowhere.toml.*"; started again'
+    assert all(re.fullmatch(expected, line) for line in said)
     assert waits[:3] == sorted(set(waits[:3]))
     assert waits[0] >= 0.2
 
@@ -84,83 +81,71 @@ def test_a_program_that_cannot_live_is_tried_ever_more_seldom_and_its_last_lines
     ],
 )
 @pytest.mark.parametrize("is_held", [False, True])
-def test_what_a_killed_program_wrote_last_is_not_taken_for_why_it_ended(monkeypatch, code, message, is_held):
+@in_loop
+async def test_what_a_killed_program_wrote_last_is_not_taken_for_why_it_ended(monkeypatch, code, message, is_held):
     """Also where it dies in the middle of a line, or its own child holds its standard error open."""
-
-    async def main():
-        said = []
-        hold = "import subprocess; subprocess.Popen(['sleep', '5'])" if is_held else "pass"
-        end = "sys.stderr.flush(); os.kill(os.getpid(), 9)"
-        monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", f"import os, sys; {hold}; {code}; {end}"))
-        task = asyncio.ensure_future(Child(Program("tag 2", ()), said.append).run())
-        await until(lambda: said, 10)
-        assert said[0] == f"tag 2 ended (signal 9); {message}; started again"
-        await stop(task)
-
-    asyncio.run(main())
+    said = []
+    hold = "import subprocess; subprocess.Popen(['sleep', '5'])" if is_held else "pass"
+    end = "sys.stderr.flush(); os.kill(os.getpid(), 9)"
+    monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", f"import os, sys; {hold}; {code}; {end}"))
+    task = asyncio.ensure_future(Child(Program("tag 2", ()), said.append).run())
+    await until(lambda: said, 10)
+    assert said[0] == f"tag 2 ended (signal 9); {message}; started again"
+    await stop(task)
 
 
-def test_a_program_whose_own_child_holds_its_pipe_is_still_seen_to_die(monkeypatch):
+@in_loop
+async def test_a_program_whose_own_child_holds_its_pipe_is_still_seen_to_die(monkeypatch):
     """A grandchild keeps the pipe of standard error open; the program's death must not go unnoticed."""
-
-    async def main():
-        said = []
-        command = "import subprocess, sys; subprocess.Popen(['sleep', '30']); print('gone', file=sys.stderr)"
-        monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", command))
-        child = Child(Program("page", ()), said.append)
-        task = asyncio.ensure_future(child.run())
-        await until(lambda: said, 10)
-        assert said[0] == 'page ended (exit code 0); its last message: "gone"; started again'
-        await stop(task)
-
-    asyncio.run(main())
+    said = []
+    command = "import subprocess, sys; subprocess.Popen(['sleep', '30']); print('gone', file=sys.stderr)"
+    monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", command))
+    child = Child(Program("page", ()), said.append)
+    task = asyncio.ensure_future(child.run())
+    await until(lambda: said, 10)
+    assert said[0] == 'page ended (exit code 0); its last message: "gone"; started again'
+    await stop(task)
 
 
-def test_a_program_that_will_not_end_is_made_to(monkeypatch):
+@in_loop
+async def test_a_program_that_will_not_end_is_made_to(monkeypatch):
     monkeypatch.setattr(children, "_STOP_S", 0.2)
 
-    async def main():
-        process = await asyncio.create_subprocess_exec(
-            "sh", "-c", "trap '' TERM; echo ready; while :; do sleep 1; done", stdout=asyncio.subprocess.PIPE
-        )
-        await process.stdout.readline()
-        await end(process)
-        assert process.returncode == -signal.SIGKILL
-        await end(process)  # once more does nothing
-
-    asyncio.run(main())
+    process = await asyncio.create_subprocess_exec(
+        "sh", "-c", "trap '' TERM; echo ready; while :; do sleep 1; done", stdout=asyncio.subprocess.PIPE
+    )
+    await process.stdout.readline()
+    await end(process)
+    assert process.returncode == -signal.SIGKILL
+    await end(process)  # once more does nothing
 
 
-def test_a_very_long_line_of_a_program_s_does_not_end_its_keeper(monkeypatch):
-    async def main():
-        said = []
-        command = "import sys; sys.stderr.write('x' * 1_000_000)"
-        monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", command))
-        child = Child(Program("page", ()), said.append)
-        task = asyncio.ensure_future(child.run())
-        await until(lambda: said or task.done(), 10)
-        assert said
-        assert 500 < len(said[0]) < 1100
-        await stop(task)
-
-    asyncio.run(main())
+@in_loop
+async def test_a_very_long_line_of_a_program_s_does_not_end_its_keeper(monkeypatch):
+    said = []
+    command = "import sys; sys.stderr.write('x' * 1_000_000)"
+    monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", command))
+    child = Child(Program("page", ()), said.append)
+    task = asyncio.ensure_future(child.run())
+    await until(lambda: said or task.done(), 10)
+    assert said
+    assert 500 < len(said[0]) < 1100
+    await stop(task)
 
 
-def test_a_program_with_a_new_file_gets_another_at_every_start_and_ends_when_it_logs_it(monkeypatch, tmp_path):
+@in_loop
+async def test_a_program_with_a_new_file_gets_another_at_every_start_and_ends_when_it_logs_it(monkeypatch, tmp_path):
     program = Program("recorder", ("record", str(tmp_path / "a.mcap"), "--x"), 1)
     assert program.start(1) == program.arguments
     assert program.start(3) == ("record", str(tmp_path / "a-3.mcap"), "--x")
 
-    async def main():
-        said = []
-        monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", "raise SystemExit(1)"))
-        child = Child(program, said.append)
-        await asyncio.wait_for(child.run(), 10)
-        assert child.starts == 1
-        assert len(said) == 1
-        monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"))
-        task = asyncio.ensure_future(child.run())
-        await until(lambda: child.starts >= 3, 10)
-        await stop(task)
-
-    asyncio.run(main())
+    said = []
+    monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", "raise SystemExit(1)"))
+    child = Child(program, said.append)
+    await asyncio.wait_for(child.run(), 10)
+    assert child.starts == 1
+    assert len(said) == 1
+    monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"))
+    task = asyncio.ensure_future(child.run())
+    await until(lambda: child.starts >= 3, 10)
+    await stop(task)

@@ -15,7 +15,7 @@ from node_stage import LAB, PLACE_M, FakeRadio, receptions
 from skyless.cli.main import main
 from skyless.cli.nodes import tag as command
 from skyless.cli.nodes.fix_lines import CSV_COLUMNS, FixLines, csv_row, line_for_people
-from skyless.mqtt.messages import FixMessage
+from skyless.run.mqtt.messages import FixMessage
 
 TAG = ["tag", "one", "--mqtt", "none", "--publish-hz", "1000"]
 

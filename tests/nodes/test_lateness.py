@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from node_stage import PLACE_M, FakeRadio, receptions
 
-from skyless.air.reception import Diagnostics, Reception
-from skyless.mqtt.messages import Counters, RequestMessage
-from skyless.nodes.lateness import FIX_LEAVES_S, MOST_AGE_S, OLDEST_RECEPTION_S, Lateness
-from skyless.nodes.tag import TagNode, TagSettings
-from skyless.receiver import Receiver
-from skyless.recordings.mcap.reception_log import ReceptionLog, receiver_settings
+from skyless.core.air.reception import Diagnostics, Reception
+from skyless.core.tag.any_receiver import AnyReceiver
+from skyless.run.fix_log import FIX_LEAVES_S, MAX_AGE_S, MAX_RECEPTION_AGE_S, Lateness
+from skyless.run.mqtt.messages import Counters, RequestMessage
+from skyless.run.recordings.reception_log import ReceptionLog, receiver_settings
+from skyless.run.tag import TagNode, TagSettings
 
 HEARD = receptions(1.5)
 UNIX_S = 1e9
@@ -86,7 +86,7 @@ def test_no_fix_that_is_given_is_too_old_and_the_counts_add_up(pauses, each_us):
     assert health["receptions"] == len(HEARD) == len(host.processed) + late["late-reception"]
     assert health["fixes"] == len(host.published) + late["late-fix"]
     assert health["late"] == sum(late.values())
-    assert (health["lateness_s"] > OLDEST_RECEPTION_S) >= bool(health["late"])
+    assert (health["lateness_s"] > MAX_RECEPTION_AGE_S) >= bool(health["late"])
     assert host.health().lateness_s == 0.0
 
 
@@ -101,7 +101,7 @@ def test_a_recording_of_a_slow_tag_gives_its_fixes_again_bit_for_bit(pauses, eac
     recorded = []
     while (message := host.log.collect(1e3 + len(recorded), UNIX_S)) is not None:
         recorded += message.receptions
-    again = Receiver(host.tag_settings.method)
+    again = AnyReceiver(host.tag_settings.method)
     fixes = [
         fix
         for raw in recorded
@@ -146,8 +146,8 @@ def test_a_program_that_is_always_too_slow_goes_from_backlog_to_backlog():
     runs = 1 + sum(after - before > 1 for before, after in itertools.pairwise(numbers))
     assert 0.4 < len(numbers) / len(HEARD) < 0.6
     assert len(numbers) / runs > 6  # a superframe and more
-    assert max(host.ages_s) < OLDEST_RECEPTION_S + 2.0 * work_s
-    assert host.published[-1].unix_s > UNIX_S + HEARD[-1].host_s - MOST_AGE_S
+    assert max(host.ages_s) < MAX_RECEPTION_AGE_S + 2.0 * work_s
+    assert host.published[-1].unix_s > UNIX_S + HEARD[-1].host_s - MAX_AGE_S
 
 
 def test_a_tag_whose_receptions_are_all_old_logs_why():
@@ -181,7 +181,7 @@ def test_whatever_the_times_an_old_reception_is_never_admitted_and_the_end_of_a_
     for pass_s, age_s in times:
         now_s += pass_s
         admitted = lateness.admits(now_s - age_s, now_s)
-        assert not (admitted and now_s - (now_s - age_s) > OLDEST_RECEPTION_S)
+        assert not (admitted and now_s - (now_s - age_s) > MAX_RECEPTION_AGE_S)
         oldest_s = max(oldest_s, now_s - (now_s - age_s))
     assert math.isclose(lateness.drain(), oldest_s)
     assert lateness.admits(now_s + 1e-3, now_s + 1e-3)

@@ -13,10 +13,10 @@ import pytest
 from mqtt_brokers import MOSQUITTO, Mosquitto, free_port, until
 from site_programs import Program
 
-from skyless.evaluation.compile_ahead import compile_kernels
-from skyless.mqtt import topics
-from skyless.mqtt.link import Link
-from skyless.mqtt.messages import (
+from skyless.research.compile_ahead import compile_kernels
+from skyless.run.mqtt import topics
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.messages import (
     FixMessage,
     SiteMessage,
     StatusMessage,
@@ -26,8 +26,8 @@ from skyless.mqtt.messages import (
     TruthMessage,
     WatchMessage,
 )
-from skyless.site.load import load_site
-from skyless.survey.facts import Facts, Gauge
+from skyless.site.file.load import load_site
+from skyless.site.survey.facts import Facts, Gauge
 
 _log = logging.getLogger(__name__)
 
@@ -40,13 +40,14 @@ PATIENCE_S = 120.0
 
 def site_text(positions, *, protocol, delays=None):
     """A site file; without a position an anchor has none."""
-    lines = ['name = "fresh"', f"id = {SITE}", "[tags]", "height_m = 0.0", "[schedule]", "slot_s = 0.0025"]
+    lines = ['name = "fresh"', f"id = {SITE}", "[tags]", "height_m = 0.0", "[schedule]"]
     if protocol == 2:
-        lines += ['mode = "slots"', f"slots = {len(TRUE_M)}"]
+        lines.append('mode = "free"')
     else:
+        lines.append("slot_s = 0.0025")
         lines.insert(2, "master = 1")
-    for slot, anchor in enumerate(TRUE_M):
-        lines += ["[[anchors]]", f"id = {anchor}", f"slot = {slot}"]
+    for anchor in TRUE_M:
+        lines += ["[[anchors]]", f"id = {anchor}"]
         if positions is not None:
             lines += [f"x_m = {positions[anchor][0]!r}", f"y_m = {positions[anchor][1]!r}"]
         if delays is not None:

@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from node_stage import LAB
 
-from skyless.evaluation.scenarios import Request, impairments_of
-from skyless.nodes import process
-from skyless.nodes.ether import Ether
-from skyless.radios.emulated import ClockShift
-from skyless.radios.ether_wire import Join, Joined, Refused, Unpacker, from_ether, pack
-from skyless.simulation.trajectory import Static
+from skyless.radio.emulated import ClockShift
+from skyless.radio.ether_wire import Join, Joined, Refused, Unpacker, from_ether, pack
+from skyless.run import process
+from skyless.run.ether import Ether
+from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.trajectory import Static
 
 MANY = 1150
 HOST = "127.0.0.1"

@@ -14,11 +14,11 @@ from mcap.reader import make_reader
 from mqtt_brokers import Embedded, free_port, until
 from site_programs import START_S, Program
 
-from skyless.authentication.chain import ChainKeys
-from skyless.authentication.key_files import read_keys
 from skyless.cli.main import main
-from skyless.evaluation.compile_ahead import compile_kernels
-from skyless.mqtt.link import Link
+from skyless.core.keys.chain import ChainKeys
+from skyless.research.compile_ahead import compile_kernels
+from skyless.run.keys.key_files import read_keys
+from skyless.run.mqtt.link import Link
 
 SITE = 300
 TOPICS = f"skyless/v1/{SITE}/"

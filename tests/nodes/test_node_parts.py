@@ -3,26 +3,37 @@
 import asyncio
 import mmap
 import signal
-import subprocess
+import socket
 import sys
 import time
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from node_stage import receptions
 
-from skyless.air.beacon2 import Beacon2, SlotTime
-from skyless.air.codec import decode
-from skyless.air.codec2 import encode_2
-from skyless.errors import SkylessError
-from skyless.mqtt.address import MqttAddress
-from skyless.nodes.fix_log import Latencies, PhaseLog
-from skyless.nodes.process import Usage, data_folder, every, new_recording, recordings_folder, resident_bytes, together
-from skyless.nodes.record import RecorderNode, _client_key, _own_name
-from skyless.recordings.mcap.recorder import McapFile
+from skyless.core.errors import SkylessError
+from skyless.core.protocol1.codec import decode
+from skyless.run.fix_log import Latencies, PhaseLog
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.process import (
+    Usage,
+    data_folder,
+    every,
+    hold_any,
+    is_free,
+    new_recording,
+    recordings_folder,
+    reserve,
+    reserve_next,
+    resident_bytes,
+    together,
+)
+from skyless.run.record import RecorderNode, _client_key, _own_name
+from skyless.run.recordings.recorder import McapFile
+from support.loops import in_loop
+from support.processes import started
 
 # Latencies and phases
 
@@ -71,17 +82,6 @@ def test_the_book_of_phases_shows_the_last_whole_superframe():
         assert phase.heard_s == pytest.approx(reception.host_s - inside[0].host_s)
         assert phase.done_s == pytest.approx(phase.heard_s + 1e-4)
     assert {phase.fix for phase in phases.last} == {True, False}
-
-
-def test_frames_of_protocol_2_have_phases_where_they_have_slots():
-    phases, free = PhaseLog(), Beacon2(1, 7, 0, 0, 0, None, None, None, (), 0, None)
-    for superframe in (5, 6, 7):
-        for slot in (0, 3):
-            slot_time = SlotTime(superframe, slot, 1, 0, 0, 0, 0.0)
-            frame = encode_2(msgspec.structs.replace(free, anchor=10 + slot, slot_time=slot_time))
-            phases.add(frame, superframe + 0.1 * slot, superframe + 0.1 * slot + 0.01, made_fix=True)
-            phases.add(encode_2(free), superframe + 0.1 * slot + 0.05, superframe + 0.1 * slot + 0.06, made_fix=True)
-    assert [(phase.superframe, phase.slot, phase.anchor) for phase in phases.last] == [(6, 0, 10), (6, 3, 13)]
 
 
 def test_the_phase_log_does_not_grow_while_one_superframe_goes_on_for_ever():
@@ -180,54 +180,107 @@ def test_a_recorder_passes_over_names_that_others_have(tmp_path, monkeypatch):
         _own_name(1)
 
 
+# Ports
+
+HOST = "127.0.0.1"
+
+
+def any_port(host):
+    """A port that is free at this moment."""
+    port, held = hold_any(host)
+    held.close()
+    return port
+
+
+def test_a_port_that_is_taken_is_passed_over():
+    with socket.socket() as one:
+        one.bind((HOST, 0))
+        port = one.getsockname()[1]
+        one.listen()
+        assert not is_free(HOST, port)
+        found, held = reserve_next(HOST, port)
+        with held:
+            assert found > port
+        assert any_port(HOST) != port
+
+
+def test_a_port_that_was_just_left_is_free():
+    with socket.create_server((HOST, 0)) as server:
+        port = server.getsockname()[1]
+        with socket.create_connection((HOST, port)):
+            served, _ = server.accept()
+            served.close()  # the server's side closes first and waits in TIME_WAIT
+    assert is_free(HOST, port)
+
+
+def test_two_that_look_at_once_get_two_ports_and_a_reservation_that_ends_frees_its_own():
+    port = any_port(HOST)
+    first, held = reserve_next(HOST, port)
+    second, other = reserve_next(HOST, port)
+    assert second > first
+    assert reserve(HOST, first) is None
+    held.close()
+    other.close()
+    again = reserve(HOST, first)
+    assert again is not None
+    again.close()
+
+
+def test_a_held_port_is_given_to_nobody_but_to_who_asks_for_it():
+    port, held = hold_any(HOST)
+    with held, socket.create_server((HOST, port)) as server, socket.create_connection((HOST, port)) as caller:
+        assert server.accept()[1] == caller.getsockname()
+
+
+def test_an_address_of_another_machine_is_never_free():
+    with pytest.raises(OSError, match="assign"):
+        is_free("192.0.2.200", 4711)
+
+
 # Running together
 
 
-def test_parts_stand_and_fall_together():
-    async def main():
-        ended = []
+@in_loop
+async def test_parts_stand_and_fall_together():
+    ended = []
 
-        async def lasting(name):
-            try:
-                await asyncio.Event().wait()
-            finally:
-                ended.append(name)
+    async def lasting(name):
+        try:
+            await asyncio.Event().wait()
+        finally:
+            ended.append(name)
 
-        async def failing():
-            await asyncio.sleep(0.01)
-            raise ValueError("broken")
+    async def failing():
+        await asyncio.sleep(0.01)
+        raise ValueError("broken")
 
-        with pytest.raises(ValueError, match="broken"):
-            await together(lasting("a"), failing(), lasting("b"))
-        assert sorted(ended) == ["a", "b"]
-        task = asyncio.ensure_future(together(lasting("c")))
-        await asyncio.sleep(0)
-        await asyncio.sleep(0)
-        task.cancel()
-        await asyncio.wait([task])
-        assert task.cancelled()
-        assert ended[2:] == ["c"]
-
-    asyncio.run(main())
+    with pytest.raises(ValueError, match="broken"):
+        await together(lasting("a"), failing(), lasting("b"))
+    assert sorted(ended) == ["a", "b"]
+    task = asyncio.ensure_future(together(lasting("c")))
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    task.cancel()
+    await asyncio.wait([task])
+    assert task.cancelled()
+    assert ended[2:] == ["c"]
 
 
-def test_something_is_done_again_and_again():
-    async def main():
-        done = []
-        task = asyncio.ensure_future(every(0.01, lambda: done.append(1)))
-        while len(done) < 3:
-            await asyncio.sleep(0.001)
-        task.cancel()
-        await asyncio.wait([task])
-
-    asyncio.run(main())
+@in_loop
+async def test_something_is_done_again_and_again():
+    done = []
+    task = asyncio.ensure_future(every(0.01, lambda: done.append(1)))
+    while len(done) < 3:
+        await asyncio.sleep(0.001)
+    task.cancel()
+    await asyncio.wait([task])
 
 
 # The loop of a program
 
 PROGRAM = """
 import asyncio, sys
-from skyless.nodes.process import run
+from skyless.run.process import run
 async def main():
     try:
         print("running", flush=True)
@@ -241,13 +294,9 @@ except KeyboardInterrupt:
 """
 
 
-def start(program):
-    return subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
 def test_a_program_ends_cleanly_when_it_is_asked_to(number, code):
-    with start(PROGRAM) as process:
+    with started(sys.executable, "-c", PROGRAM) as process:
         assert process.stdout.readline() == "running\n"
         process.send_signal(number)
         out, err = process.communicate(timeout=20)
@@ -257,11 +306,11 @@ def test_a_program_ends_cleanly_when_it_is_asked_to(number, code):
 def test_a_program_ends_with_the_one_that_started_it_however_that_ends():
     parent = f"""
 import subprocess, sys, time
-from skyless.nodes.process import end_with_parent
+from skyless.run.process import end_with_parent
 child = subprocess.Popen([sys.executable, "-c", {PROGRAM!r}], preexec_fn=end_with_parent())
 time.sleep(60)
 """
-    with start(parent) as process:
+    with started(sys.executable, "-c", parent) as process:
         assert process.stdout.readline() == "running\n"
         process.kill()
         assert process.stdout.read() == "cleaned up\n"  # the pipe ends with the last process that holds it

@@ -1,19 +1,18 @@
 """Tags on sniffers: packets of a simulated TDoA3 system in, fixes and health out."""
 
-import math
-
 import msgspec
 import numpy as np
 import pytest
+from node_stage import FakeLink
 
 import masterless_world as hall
-from skyless.air.masterless_packets import Packet
-from skyless.mqtt.messages import Counters, FixMessage, SiteMessage, TagHealth
-from skyless.nodes import packet_tags
-from skyless.nodes.open_radio import is_simulated, open_sniffers
-from skyless.nodes.packet_tags import PacketTagNode, PacketTags, PacketTagSettings
-from skyless.radios.interface import Gone, Restarted
-from skyless.recordings.foreign.bitcraze import decode_payload
+from skyless.core.air.masterless_packets import Packet
+from skyless.radio.foreign.bitcraze import decode_payload
+from skyless.radio.interface import Gone, Restarted
+from skyless.research.live import packet_tags
+from skyless.research.live.packet_tags import PacketTagNode, PacketTags, PacketTagSettings
+from skyless.run.mqtt.messages import FixMessage, SiteMessage, TagHealth
+from skyless.run.open_radio import is_simulated, open_sniffers
 
 SETTINGS = PacketTagSettings(hall.ANCHORS_M, site=7, publish_hz=1e5)
 
@@ -55,28 +54,8 @@ def test_packets_become_fixes_and_a_sniffer_that_comes_back_begins_again(packets
     assert said == ["tag drone: listening", "tag drone: pulled out; still looking for it", "tag drone: listening again"]
 
 
-class Link:
-    """Takes what is published."""
-
-    def __init__(self):
-        self.counters = Counters(1, 2, 3)
-        self.told = []
-        self.late = 0
-
-    def publish(self, topic, message, qos=0, retain=False, until_s=math.inf):
-        assert retain is isinstance(message, SiteMessage)
-        self.told.append((topic, message))
-
-
-def test_fixes_and_health_go_out_under_the_site_that_was_given(packets, monkeypatch):
-    links = []
-
-    def link_of(address, name, *, site, kind):
-        links.append(Link())
-        assert (name, site, kind) == (("one", "two")[len(links) - 1], 7, "tag")
-        return links[-1]
-
-    monkeypatch.setattr(packet_tags, "link_of", link_of)
+def test_fixes_and_health_go_out_under_the_site_that_was_given(packets, monkeypatch, links):
+    monkeypatch.setattr(packet_tags, "link_of", FakeLink)
     tags = PacketTags(
         SETTINGS, open_sniffers("sniffer:/dev/a,/dev/b", ("one", "two")), None, print, simulated=lambda: False
     )
@@ -86,7 +65,9 @@ def test_fixes_and_health_go_out_under_the_site_that_was_given(packets, monkeypa
     for packet in packets:
         one.on_event(msgspec.structs.replace(packet, host_s=None))
     tags._publish_health()
-    (fix_topic, fix), *_, (site_topic, told), (health_topic, health) = links[0].told
+    assert [(link.name, link.site, link.kind) for link in links] == [("one", 7, "tag"), ("two", 7, "tag")]
+    (fix_topic, fix, _), *_, (site_topic, told, retained), (health_topic, health, _) = links[0].published
+    assert retained["retain"]
     assert (site_topic, told.site.id, told.simulated) == ("skyless/v1/7/site", 7, False)
     assert {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in told.site.anchors} == hall.ANCHORS_M
     assert (fix_topic, health_topic) == ("skyless/v1/7/tag/one/fix", "skyless/v1/7/tag/one/health")
@@ -100,13 +81,13 @@ def test_fixes_and_health_go_out_under_the_site_that_was_given(packets, monkeypa
     assert again.reason is None
     assert again.counters["malformed-line"] == 3
     assert again.counters["unknown-anchor"] == 1
-    ((topic, silent),) = links[1].told  # the site is told once
+    ((topic, silent, _),) = links[1].published  # the site is told once
     assert (topic, silent.reason, silent.fixes) == ("skyless/v1/7/tag/two/health", "no-beacons", 0)
 
 
-def test_a_sniffer_that_turns_out_to_be_emulated_when_it_comes_is_reported_as_such(monkeypatch, tmp_path):
-    links, path = [], tmp_path / "sniffer"
-    monkeypatch.setattr(packet_tags, "link_of", lambda *_, **__: links.append(Link()) or links[-1])
+def test_a_sniffer_that_turns_out_to_be_emulated_when_it_comes_is_reported_as_such(monkeypatch, tmp_path, links):
+    path = tmp_path / "sniffer"
+    monkeypatch.setattr(packet_tags, "link_of", FakeLink)
     spec = f"sniffer:{path}"
     tags = PacketTags(SETTINGS, open_sniffers(spec, ("one",)), None, print, simulated=lambda: is_simulated(spec))
     tags._publish_health()  # nothing is plugged in yet
@@ -119,7 +100,7 @@ def test_a_sniffer_that_turns_out_to_be_emulated_when_it_comes_is_reported_as_su
     tags.nodes[0].on_event(Gone("pulled out"))
     tags.nodes[0].on_event(Restarted())
     tags._publish_health()
-    sites = [message for _, message in links[0].told if isinstance(message, SiteMessage)]
+    sites = [message for _, message, _ in links[0].published if isinstance(message, SiteMessage)]
     assert [site.simulated for site in sites] == [False, True, False]
 
 

@@ -7,13 +7,13 @@ from msgspec.structs import replace
 from node_stage import LAB, FakeRadio, receptions, undated
 
 import masterless_world as hall
-from skyless.air.masterless_packets import Packet
-from skyless.nodes.anchor import AnchorNode
-from skyless.nodes.packet_tags import PacketTagNode, PacketTagSettings
-from skyless.nodes.radio_monitor import REPEAT_S, UNUSABLE_S, RadioMonitor
-from skyless.nodes.tag import TagNode, TagSettings
-from skyless.radios.interface import Gone, Restarted
-from skyless.radios.serial.foreign_radios import ListenerRadio, SnifferRadio
+from skyless.core.air.masterless_packets import Packet
+from skyless.radio.foreign.foreign_radios import ListenerRadio, SnifferRadio
+from skyless.radio.interface import Gone, Restarted
+from skyless.research.live.packet_tags import PacketTagNode, PacketTagSettings
+from skyless.run.anchor import AnchorNode
+from skyless.run.radio_monitor import REPEAT_S, UNUSABLE_S, RadioMonitor
+from skyless.run.tag import TagNode, TagSettings
 
 HEARD = undated(receptions(1.0))
 

@@ -6,26 +6,30 @@ import json
 import os
 import resource
 import signal
-import sys
 import time
 from collections import Counter
 
+import msgspec
 import pytest
 from mqtt_brokers import MOSQUITTO, Embedded, Mosquitto, until
 
 from machines.bench import LAB, tape
-from skyless.air.reception import Reception
 from skyless.cli.main import main
-from skyless.evaluation.compile_ahead import compile_kernels
-from skyless.mqtt.link import Link
-from skyless.mqtt.messages import SiteMessage
-from skyless.mqtt.topics import site_topic
-from skyless.nodes.process import end_with_parent
-from skyless.nodes.tag import Tags, TagSettings
-from skyless.recordings.mcap.recording import McapRecording
-from skyless.replays.site import SiteReplay
+from skyless.core.air.reception import Reception
+from skyless.research.compile_ahead import compile_kernels
+from skyless.research.replays.site import SiteReplay
+from skyless.run import record
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.messages import RawReception, ReceptionsMessage, SegmentStart, SiteMessage, StatusMessage
+from skyless.run.mqtt.topics import receptions_topic, site_topic, status_topic
+from skyless.run.record import RecorderNode
+from skyless.run.recordings.recorder import McapFile
+from skyless.run.recordings.recording import McapRecording
+from skyless.run.tag import Tags, TagSettings
+from support.processes import SKYLESS, usual_signals
 
-SECONDS = 30.0
+SECONDS = 20.0
 PLACES = ((3.0, 4.0, 0.0), (2.0, 2.0, 0.0))
 
 
@@ -61,13 +65,12 @@ class Recorder:
 
     def __init__(self, address, path, *arguments, limit_bytes=None):
         self.path = path
-        self._command = [sys.executable, "-m", "skyless.cli.main", "record", path, "--mqtt", str(address), *arguments]
-        self._limit = limit_bytes
-        self._end_with_test = end_with_parent()
+        self._command = [*SKYLESS, "record", path, "--mqtt", str(address), *arguments]
+        self._limit, self._usual_signals = limit_bytes, usual_signals()
         self.process = None
 
     def _prepare(self):
-        self._end_with_test()
+        self._usual_signals()
         if self._limit:
             resource.setrlimit(resource.RLIMIT_FSIZE, (self._limit, self._limit))
 
@@ -127,13 +130,18 @@ def run(scenario, broker):
     return asyncio.run(staged())
 
 
-@pytest.fixture(params=["embedded", "mosquitto"])
+@pytest.fixture
 def broker(request, tmp_path):
+    """The embedded one, unless a test asks for another."""
     folder = tmp_path / "broker"
     folder.mkdir()
-    if request.param == "mosquitto" and MOSQUITTO is None:
+    kind = getattr(request, "param", Embedded)
+    if kind is Mosquitto and MOSQUITTO is None:
         pytest.skip("mosquitto is not installed")
-    return Embedded(folder) if request.param == "embedded" else Mosquitto(folder)
+    return kind(folder)
+
+
+both = pytest.mark.parametrize("broker", [Embedded, Mosquitto], indirect=True)
 
 
 def replayed(path):
@@ -166,6 +174,7 @@ def test_a_recording_replays_bit_by_bit_and_ctrl_c_closes_it(broker, tmp_path):
         assert report.cold_starts == 0
 
 
+@both
 def test_a_broker_that_dies_and_returns_costs_no_reception_that_it_kept(broker, tmp_path):
     recorder = Recorder(broker.address, tmp_path / "restart.mcap", "--site-id", str(LAB.id), "--json")
 
@@ -194,6 +203,7 @@ def test_a_broker_that_dies_and_returns_costs_no_reception_that_it_kept(broker, 
     assert min(spans_s) > 1.5
 
 
+@both
 def test_a_killed_recorder_leaves_all_but_the_last_second_and_another_one_goes_on(broker, tmp_path):
     first = Recorder(broker.address, tmp_path / "killed.mcap")
     second = Recorder(broker.address, tmp_path / "second.mcap", "--duration", "2", "--json")
@@ -245,3 +255,68 @@ def test_mistakes_are_reported_in_one_line(tmp_path, capsys):
         assert words in told
         assert told.count("\n") == 1
     assert path.read_text() == "precious"
+
+
+# When the recorder asks the tags
+
+
+ONE = RawReception(b"frame", 5, 1.0)
+START = SegmentStart(0, {"method": "joint"}, None)
+
+
+@pytest.fixture
+def node(tmp_path, monkeypatch):
+    node = RecorderNode(McapFile(tmp_path / "x.mcap"), MqttAddress("127.0.0.1", 1), LAB.id, lambda _: None)
+    node.asked = []
+    monkeypatch.setattr(node.link, "publish", lambda topic, message, **_: node.asked.append(message.by))
+    node.now_s = 1000.0
+    monkeypatch.setattr(record.time, "monotonic", lambda: node.now_s)
+    return node
+
+
+def hear(node, segment, first, count, start=None, tag="a"):
+    message = ReceptionsMessage(tag, segment, first, 0.0, (ONE,) * count, start)
+    node._on_message(receptions_topic(LAB.id, tag), msgspec.json.encode(message))
+
+
+def test_whole_runs_and_repetitions_ask_for_nothing(node):
+    hear(node, "s-1", 0, 10, START)
+    hear(node, "s-1", 10, 5)
+    hear(node, "s-1", 10, 5)  # twice, after a broken connection
+    hear(node, "s-1", 0, 10, START)
+    hear(node, "s-1", 15, 5)
+    hear(node, "s-2", 0, 5, START)
+    hear(node, "s-1", 0, 5, START, tag="b")
+    assert node.asked == []
+    assert node.recorder.drops == {}
+
+
+def test_a_gap_is_counted_and_asked_about_under_another_name_but_not_in_a_rush(node):
+    hear(node, "s-1", 0, 10, START)
+    hear(node, "s-1", 20, 5)
+    hear(node, "s-1", 30, 5)
+    assert node.recorder.drops == {"gap-in-receptions": 2}
+    assert len(node.asked) == 1
+    node.now_s += 2.0
+    hear(node, "s-1", 40, 5)
+    assert len(set(node.asked)) == 2
+
+
+def test_a_run_without_its_beginning_is_asked_about(node):
+    hear(node, "s-1", 400, 10)
+    assert len(node.asked) == 1
+
+
+def test_a_tag_that_comes_is_asked_at_once(node):
+    status = StatusMessage(True, "tag", "a", unix_s=1.0)
+    node._on_message(status_topic(LAB.id, "tag", "a"), msgspec.json.encode(status))
+    node._on_message(
+        status_topic(LAB.id, "tag", "a"), msgspec.json.encode(msgspec.structs.replace(status, online=False))
+    )
+    node._on_message(status_topic(LAB.id, "anchor", 1), msgspec.json.encode(StatusMessage(True, "anchor", "1")))
+    assert len(node.asked) == 1
+
+
+def test_two_recorders_of_one_machine_have_two_names(node, tmp_path):
+    other = RecorderNode(McapFile(tmp_path / "y.mcap"), MqttAddress("127.0.0.1", 1), LAB.id, lambda _: None)
+    assert other._name != node._name

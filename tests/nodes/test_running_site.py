@@ -18,8 +18,8 @@ from mqtt_brokers import MOSQUITTO, until
 from site_observer import Observer
 from site_programs import ANCHORS, SITE, TAGS, SevenAnchors
 
-from skyless.mqtt.link import Link
-from skyless.mqtt.topics import zone_event_topic
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.topics import zone_event_topic
 
 _log = logging.getLogger(__name__)
 

@@ -13,13 +13,13 @@ import pytest
 from mqtt_brokers import Embedded, free_port, until
 from site_programs import START_S, Program, site_file
 
-from skyless.errors import SkylessError
-from skyless.evaluation.compile_ahead import compile_kernels
-from skyless.mqtt.access import Role
-from skyless.mqtt.access_files import create_access, read_access
-from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.connection import check_broker
-from skyless.mqtt.link import Link
+from skyless.core.errors import SkylessError
+from skyless.research.compile_ahead import compile_kernels
+from skyless.run.mqtt.access import Role, create_access, read_access
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.connection import check_broker
+from skyless.run.mqtt.link import Link
+from support.loops import in_loop
 
 HOWTO = Path(__file__).parents[2] / "docs" / "howto" / "secure_a_site.md"
 SITE = "skyless/v1/77/"
@@ -51,16 +51,14 @@ def address_of(broker, role, ca):
     return msgspec.structs.replace(broker.address, user=str(role), password=password, ca=ca)
 
 
-def test_a_broker_with_another_certificate_gets_no_password(broker, tmp_path):
-    async def check():
-        await broker.start()
-        await check_broker(address_of(broker, Role.TAGS, tmp_path / "certificate.pem"))
-        other, _ = make_certificate(tmp_path / "other")
-        with pytest.raises(SkylessError, match=r"certificate of the broker mqtts://tags@.* is not trusted"):
-            await check_broker(address_of(broker, Role.TAGS, other))
-        await broker.stop()
-
-    asyncio.run(check())
+@in_loop
+async def test_a_broker_with_another_certificate_gets_no_password(broker, tmp_path):
+    await broker.start()
+    await check_broker(address_of(broker, Role.TAGS, tmp_path / "certificate.pem"))
+    other, _ = make_certificate(tmp_path / "other")
+    with pytest.raises(SkylessError, match=r"certificate of the broker mqtts://tags@.* is not trusted"):
+        await check_broker(address_of(broker, Role.TAGS, other))
+    await broker.stop()
 
 
 def test_a_shell_reads_the_file_of_a_role(broker, tmp_path):

@@ -7,16 +7,18 @@ from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
-import msgspec
 import pytest
 from msgspec.structs import replace
+from node_stage import FakeLink, running
 
-from skyless.air.codec2 import decode_2
-from skyless.anchors.slots import SlotsAnchor
-from skyless.errors import SkylessError
-from skyless.mqtt import topics
-from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.messages import (
+from skyless.core.air.codec import decode
+from skyless.core.errors import SkylessError
+from skyless.core.protocols import new_anchor
+from skyless.core.site import FloorPlanSite, ScheduleSite, UnplacedAnchor, site_digest
+from skyless.run.anchor import StampLog
+from skyless.run.mqtt import topics
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.messages import (
     PlacementMessage,
     RequestMessage,
     SiteMessage,
@@ -27,34 +29,27 @@ from skyless.mqtt.messages import (
     WatchFinding,
     WatchMessage,
 )
-from skyless.nodes.stamp_log import StampLog
-from skyless.nodes.survey import program as program_module
-from skyless.nodes.survey.files import FloorImage, is_record_of, save_survey
-from skyless.nodes.survey.live_survey import ADOPTION_S, NO_DATA_S, LiveSurvey
-from skyless.nodes.survey.program import SurveyNode, SurveySettings
-from skyless.simulation.impairments import DelayError, lab_impairments
-from skyless.simulation.world import World
-from skyless.site.digest import site_digest
-from skyless.site.image import image_size
-from skyless.site.lab import lab_site
-from skyless.site.load import load_site
-from skyless.site.model import FloorPlanSite, ScheduleSite, UnplacedAnchor
-from skyless.survey.facts import Facts, Gauge, Tape
-from skyless.survey.ranges import PairRanges
-from skyless.survey.record import read_record, record_path
-from skyless.survey.result import Survey, SurveyedAnchor
+from skyless.run.survey import program as program_module
+from skyless.run.survey.files import FloorImage, is_record_of, save_survey
+from skyless.run.survey.live_survey import ADOPTION_S, NO_DATA_S, LiveSurvey
+from skyless.run.survey.program import SurveyNode, SurveySettings
+from skyless.sim.impairments import DelayError, lab_impairments
+from skyless.sim.lab import lab_site
+from skyless.sim.world import World
+from skyless.site.file.check import image_size
+from skyless.site.file.load import load_site
+from skyless.site.survey.facts import Facts, Gauge, PairRanges, Tape
+from skyless.site.survey.result import Survey, SurveyedAnchor, read_record, record_path
+from support.loops import in_loop
 
 POSITIONS_M = {1: (0.0, 0.0), 2: (6.0, 0.0), 3: (6.5, 4.0), 4: (6.0, 8.0), 5: (0.0, 8.0), 6: (-1.0, 3.5)}
-SCHEDULE = ScheduleSite(mode="slots", slot_s=2.5e-3, slots=6)
+SCHEDULE = ScheduleSite(mode="free")
 SITE = replace(
     lab_site(),
-    anchors=tuple(
-        replace(one, x_m=POSITIONS_M[one.id][0], y_m=POSITIONS_M[one.id][1], slot=slot)
-        for slot, one in enumerate(lab_site().anchors)
-    ),
+    anchors=tuple(replace(one, x_m=POSITIONS_M[one.id][0], y_m=POSITIONS_M[one.id][1]) for one in lab_site().anchors),
     schedule=SCHEDULE,
 )
-FRESH = replace(SITE, anchors=(), unplaced=tuple(UnplacedAnchor(one.id, one.slot) for one in SITE.anchors))
+FRESH = replace(SITE, anchors=(), unplaced=tuple(UnplacedAnchor(one.id) for one in SITE.anchors))
 TEXT = "\n".join(
     [
         'name = "lab"',
@@ -62,11 +57,9 @@ TEXT = "\n".join(
         "[tags]",
         "height_m = 0.0",
         "[schedule]",
-        'mode = "slots"',
-        "slot_s = 0.0025",
-        "slots = 6",
+        'mode = "free"',
     ]
-    + [line for one in SITE.anchors for line in ("[[anchors]]", f"id = {one.id}", f"slot = {one.slot}")]
+    + [line for one in SITE.anchors for line in ("[[anchors]]", f"id = {one.id}")]
 )
 DELAY_TICKS = {anchor: 20 * anchor - 60 for anchor in POSITIONS_M}
 PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR" + (640).to_bytes(4, "big") + (480).to_bytes(4, "big")
@@ -77,14 +70,14 @@ class Collecting:
     """An anchor's machine that keeps the stamps of what it receives, as the anchor's program does."""
 
     def __init__(self, anchor):
-        self.machine, self.log = SlotsAnchor(FRESH, anchor), StampLog(anchor, "run1")
+        self.machine, self.log = new_anchor(FRESH, anchor), StampLog(anchor, "run1")
         self.id, self.next_transmission_ticks = anchor, self.machine.next_transmission_ticks
         self.transmission = self.machine.transmission
         self.log.request(RequestMessage("test", (), 60.0, True), 0.0)
 
     def hear(self, reception):
         self.machine.hear(reception)
-        beacon = decode_2(reception.frame)
+        beacon = decode(reception.frame)
         self.log.add(beacon.anchor, beacon.tx_ticks, reception.rx_ticks)
 
 
@@ -182,34 +175,6 @@ def test_facts_of_other_anchors_are_dropped():
     assert live.facts == replace(facts, heights_m={1: 2.0}, tapes=(Tape(1, 2, 6.0),), gauge=None)
 
 
-class FakeLink:
-    """A link to no broker: the test calls the handlers, and reads what is published."""
-
-    def __init__(self, *_, **__):
-        self.handlers, self.published, self.forgotten, self.on_state = {}, [], [], []
-
-    def subscribe(self, topic, handler, qos=0):
-        self.handlers[topic] = handler
-
-    def publish(self, topic, message, **options):
-        self.published.append((topic, message, options))
-
-    def forget(self, topic):
-        self.forgotten.append(topic)
-
-    async def run(self):
-        await asyncio.Event().wait()
-
-    def receive(self, topic, message):
-        for name, handler in self.handlers.items():
-            if name == topic or (name.endswith("/stamps") and topic.endswith("/stamps")):
-                handler(topic, msgspec.json.encode(message))
-
-    def newest(self, kind):
-        found = [message for _, message, _ in self.published if isinstance(message, kind)]
-        return found[-1] if found else None
-
-
 class Stage:
     """The program with a fake link, a clock that the test sets, and a solver that knows the truth."""
 
@@ -235,7 +200,7 @@ class Stage:
         for t_s, message in messages():
             if from_s < t_s <= until_s:
                 self.now_s = BEGIN_S + t_s
-                self.link.receive(topics.stamps_topic(1, message.anchor), message)
+                self.link.receive(topics.stamps_topic(1, "+"), message)
                 if t_s >= next_s + 1.0:
                     next_s = t_s
                     await self.step()
@@ -249,66 +214,62 @@ class Stage:
         self.now_s += 0.001
 
 
-def test_results_are_published_and_saved_and_anchors_get_their_placement(monkeypatch, tmp_path):
-    async def main():
-        file = tmp_path / "lab.toml"
-        file.write_text(TEXT, encoding="utf-8")
-        site = load_site(file)
-        stage = Stage(monkeypatch, site=site, file=file)
-        facts = Facts(gauge=Gauge(1, 2, 4))
-        plan = FloorPlanSite("", 12.0, -1.0, -2.0)
-        stage.link.receive(topics.survey_facts_topic(1), SurveyFactsMessage(facts, plan, "page"))
-        stage.link.handlers[topics.floor_plan_topic(1)]("", PNG)
-        await stage.play()
-        message = stage.link.newest(SurveyMessage)
-        assert message.survey == true_survey()
-        assert message.facts == facts
-        assert message.file == str(file)
-        assert stage.link.newest(WatchMessage) is None  # anchors have no positions yet
-        stage.link.receive(topics.site_topic(1), SiteMessage(site, True, 0.0))
-        stage.link.receive(topics.survey_save_topic(1), SurveySaveMessage("page", message.serial))
-        assert stage.link.newest(SurveyMessage).error is None
-        assert stage.link.newest(SurveyMessage).saved_serial == message.serial
+@in_loop
+async def test_results_are_published_and_saved_and_anchors_get_their_placement(monkeypatch, tmp_path):
+    file = tmp_path / "lab.toml"
+    file.write_text(TEXT, encoding="utf-8")
+    site = load_site(file)
+    stage = Stage(monkeypatch, site=site, file=file)
+    facts = Facts(gauge=Gauge(1, 2, 4))
+    plan = FloorPlanSite("", 12.0, -1.0, -2.0)
+    stage.link.receive(topics.survey_facts_topic(1), SurveyFactsMessage(facts, plan, "page"))
+    stage.link.handlers[topics.floor_plan_topic(1)]("", PNG)
+    await stage.play()
+    message = stage.link.newest(SurveyMessage)
+    assert message.survey == true_survey()
+    assert message.facts == facts
+    assert message.file == str(file)
+    assert stage.link.newest(WatchMessage) is None  # anchors have no positions yet
+    stage.link.receive(topics.site_topic(1), SiteMessage(site, True, 0.0))
+    stage.link.receive(topics.survey_save_topic(1), SurveySaveMessage("page", message.serial))
+    assert stage.link.newest(SurveyMessage).error is None
+    assert stage.link.newest(SurveyMessage).saved_serial == message.serial
 
-        saved, placement = load_site(file), stage.link.newest(PlacementMessage)
-        assert placement.site == saved
-        assert placement.before == site_digest(site)
-        assert [(one.x_m, one.y_m) for one in saved.anchors] == list(POSITIONS_M.values())
-        usual = FRESH.unplaced[0].tx_antenna_delay_ticks
-        assert [one.tx_antenna_delay_ticks - usual for one in saved.anchors] == list(DELAY_TICKS.values())
-        assert (tmp_path / "lab.before-survey-1.toml").read_text(encoding="utf-8") == TEXT
-        assert (tmp_path / saved.floor_plan.image).read_bytes() == PNG
-        assert image_size(PNG) is not None
-        assert (saved.floor_plan.width_m, saved.floor_plan.x_m, saved.floor_plan.y_m) == (12.0, -1.0, -2.0)
-        record = read_record(record_path(file))
-        assert is_record_of(record, saved)
-        assert record.delay_changes_ticks == DELAY_TICKS
+    saved, placement = load_site(file), stage.link.newest(PlacementMessage)
+    assert placement.site == saved
+    assert placement.before == site_digest(site)
+    assert [(one.x_m, one.y_m) for one in saved.anchors] == list(POSITIONS_M.values())
+    usual = FRESH.unplaced[0].tx_antenna_delay_ticks
+    assert [one.tx_antenna_delay_ticks - usual for one in saved.anchors] == list(DELAY_TICKS.values())
+    assert (tmp_path / "lab.before-survey-1.toml").read_text(encoding="utf-8") == TEXT
+    assert (tmp_path / saved.floor_plan.image).read_bytes() == PNG
+    assert image_size(PNG) is not None
+    assert (saved.floor_plan.width_m, saved.floor_plan.x_m, saved.floor_plan.y_m) == (12.0, -1.0, -2.0)
+    record = read_record(record_path(file))
+    assert is_record_of(record, saved)
+    assert record.delay_changes_ticks == DELAY_TICKS
 
-        # stamps from while anchors adopt it are not used; then the watch has all pairs
-        count = len(stage.asked)
-        await stage.play(4.0, 4.0 + 0.9 * ADOPTION_S)
-        assert len(stage.asked) == count
-        assert stage.node.live.ranges().pairs == ()
-        await stage.play(6.0, 8.0)
-        assert len(stage.asked) > count
-        assert stage.link.newest(WatchMessage).findings == ()
-
-    asyncio.run(main())
+    # stamps from while anchors adopt it are not used; then the watch has all pairs
+    count = len(stage.asked)
+    await stage.play(4.0, 4.0 + 0.9 * ADOPTION_S)
+    assert len(stage.asked) == count
+    assert stage.node.live.ranges().pairs == ()
+    await stage.play(6.0, 8.0)
+    assert len(stage.asked) > count
+    assert stage.link.newest(WatchMessage).findings == ()
 
 
-def test_a_second_survey_names_the_sites_before_it(monkeypatch):
-    async def main():
-        stage = Stage(monkeypatch, site=SITE)
-        first = replace(SITE, anchors=(replace(SITE.anchors[0], x_m=0.5), *SITE.anchors[1:]))
-        stage.link.receive(topics.placement_topic(1), PlacementMessage(0.0, site_digest(first), SITE, ("ab",)))
-        await stage.play()
-        stage.node.save()
-        placement = stage.link.newest(PlacementMessage)
-        assert placement.before == site_digest(SITE)
-        assert placement.earlier == (site_digest(first), "ab")
-        assert stage.node.saved.written == ()  # there is no file
-
-    asyncio.run(main())
+@in_loop
+async def test_a_second_survey_names_the_sites_before_it(monkeypatch):
+    stage = Stage(monkeypatch, site=SITE)
+    first = replace(SITE, anchors=(replace(SITE.anchors[0], x_m=0.5), *SITE.anchors[1:]))
+    stage.link.receive(topics.placement_topic(1), PlacementMessage(0.0, site_digest(first), SITE, ("ab",)))
+    await stage.play()
+    stage.node.save()
+    placement = stage.link.newest(PlacementMessage)
+    assert placement.before == site_digest(SITE)
+    assert placement.earlier == (site_digest(first), "ab")
+    assert stage.node.saved.written == ()  # there is no file
 
 
 def test_what_cannot_be_saved_is_said_and_changes_nothing(monkeypatch, tmp_path):
@@ -331,7 +292,7 @@ def test_what_cannot_be_saved_is_said_and_changes_nothing(monkeypatch, tmp_path)
         stage.link.receive(topics.site_topic(1), SiteMessage(SITE, True, 0.0))
         assert "another site" in refused(stage.node.live.serial)
         stage.link.receive(topics.site_topic(1), SiteMessage(load_site(file), True, 0.0))
-        file.write_text(TEXT.replace("slot_s = 0.0025", "slot_s = 0.003"), encoding="utf-8")
+        file.write_text(TEXT.replace('mode = "free"', 'mode = "free"\nrate_hz = 20.0'), encoding="utf-8")
         changed = file.read_text(encoding="utf-8")
         assert "has been changed" in refused(stage.node.live.serial)
         assert file.read_text(encoding="utf-8") == changed
@@ -341,91 +302,76 @@ def test_what_cannot_be_saved_is_said_and_changes_nothing(monkeypatch, tmp_path)
     asyncio.run(main())
 
 
-def test_a_solver_that_fails_is_reported_and_asked_again(monkeypatch):
-    async def main():
-        stage = Stage(monkeypatch, site=SITE)
-        for until_s, error in ((3.0, SkylessError("too few ranges")), (6.0, ZeroDivisionError("no"))):
-            stage.found = error
-            await stage.play(until_s - 3.0, until_s)
-            stage.now_s += 1.0
-            await stage.step()
-            assert str(error.args[0]) in stage.link.newest(SurveyMessage).error
-            assert stage.node.live.serial == 0
-        stage.found = true_survey()
-        await stage.play(7.0, 10.0)
-        assert stage.link.newest(SurveyMessage).error is None
-
-    asyncio.run(main())
-
-
-def test_the_site_on_mqtt_does_where_there_is_no_file_and_bad_messages_are_counted(monkeypatch):
-    async def main():
-        stage = Stage(monkeypatch)
+@in_loop
+async def test_a_solver_that_fails_is_reported_and_asked_again(monkeypatch):
+    stage = Stage(monkeypatch, site=SITE)
+    for until_s, error in ((3.0, SkylessError("too few ranges")), (6.0, ZeroDivisionError("no"))):
+        stage.found = error
+        await stage.play(until_s - 3.0, until_s)
+        stage.now_s += 1.0
         await stage.step()
-        assert stage.node.live is None
-        with pytest.raises(SkylessError, match="not known"):
-            stage.node.save()
-        stage.link.receive(topics.site_topic(1), SiteMessage(SITE, True, 0.0))
-        await stage.play(0.0, 2.0)
-        assert stage.node.live.serial > 0
-        other = replace(SITE, anchors=(replace(SITE.anchors[0], x_m=0.5), *SITE.anchors[1:]))
-        stage.link.receive(topics.site_topic(1), SiteMessage(other, True, 0.0))
-        assert stage.node.live.site == other
+        assert str(error.args[0]) in stage.link.newest(SurveyMessage).error
         assert stage.node.live.serial == 0
-        for topic in (topics.survey_facts_topic(1), topics.survey_save_topic(1), topics.site_topic(1)):
-            stage.link.handlers[topic](topic, json.dumps({"x": 1}).encode())
-        assert stage.node.problems == 3
-
-    asyncio.run(main())
+    stage.found = true_survey()
+    await stage.play(7.0, 10.0)
+    assert stage.link.newest(SurveyMessage).error is None
 
 
-def test_what_is_retained_and_the_lease_end_with_the_program(monkeypatch):
-    async def main():
-        stage = Stage(monkeypatch, site=SITE)
-        task = asyncio.ensure_future(stage.node.run())
-        await asyncio.sleep(0)
+@in_loop
+async def test_the_site_on_mqtt_does_where_there_is_no_file_and_bad_messages_are_counted(monkeypatch):
+    stage = Stage(monkeypatch)
+    await stage.step()
+    assert stage.node.live is None
+    with pytest.raises(SkylessError, match="not known"):
+        stage.node.save()
+    stage.link.receive(topics.site_topic(1), SiteMessage(SITE, True, 0.0))
+    await stage.play(0.0, 2.0)
+    assert stage.node.live.serial > 0
+    other = replace(SITE, anchors=(replace(SITE.anchors[0], x_m=0.5), *SITE.anchors[1:]))
+    stage.link.receive(topics.site_topic(1), SiteMessage(other, True, 0.0))
+    assert stage.node.live.site == other
+    assert stage.node.live.serial == 0
+    for topic in (topics.survey_facts_topic(1), topics.survey_save_topic(1), topics.site_topic(1)):
+        stage.link.handlers[topic](topic, json.dumps({"x": 1}).encode())
+    assert stage.node.problems == 3
+
+
+@in_loop
+async def test_what_is_retained_and_the_lease_end_with_the_program(monkeypatch):
+    stage = Stage(monkeypatch, site=SITE)
+    async with running(stage.node.run()):
         for callback in stage.link.on_state:
             callback(True)
-        request = stage.link.newest(RequestMessage)
-        assert request.stamps
+        assert stage.link.newest(RequestMessage).stamps
         await asyncio.sleep(0.01)
-        task.cancel()
-        await asyncio.wait([task])
-        cleared = {topic for topic, message, options in stage.link.published if message == b"" and options["retain"]}
-        assert cleared == {topics.survey_topic(1), topics.watch_topic(1)}
-        assert not stage.link.newest(RequestMessage).stamps
-
-    asyncio.run(main())
+    cleared = {topic for topic, message, options in stage.link.published if message == b"" and options["retain"]}
+    assert cleared == {topics.survey_topic(1), topics.watch_topic(1)}
+    assert not stage.link.newest(RequestMessage).stamps
 
 
-def test_one_that_gathers_computes_and_publishes_nothing_but_its_request(monkeypatch):
-    async def main():
-        stage = Stage(monkeypatch, site=SITE, serves=False)
-        await stage.play(0.0, 3.0)
-        assert not stage.asked
-        assert len(stage.node.live.ranges().pairs) == 15
-        assert {type(message) for _, message, _ in stage.link.published} <= {RequestMessage}
-
-    asyncio.run(main())
+@in_loop
+async def test_one_that_gathers_computes_and_publishes_nothing_but_its_request(monkeypatch):
+    stage = Stage(monkeypatch, site=SITE, serves=False)
+    await stage.play(0.0, 3.0)
+    assert not stage.asked
+    assert len(stage.node.live.ranges().pairs) == 15
+    assert {type(message) for _, message, _ in stage.link.published} <= {RequestMessage}
 
 
-def test_a_result_that_was_begun_before_it_was_saved_is_dropped(monkeypatch):
+@in_loop
+async def test_a_result_that_was_begun_before_it_was_saved_is_dropped(monkeypatch):
     """Its delays are those against the site before: with them, every delay would be corrected twice."""
-
-    async def main():
-        stage = Stage(monkeypatch, site=SITE)
-        await stage.play()
-        live, serial = stage.node.live, stage.node.live.serial
-        begun = asyncio.ensure_future(stage.node._make_result(live))
-        await asyncio.sleep(0)
+    stage = Stage(monkeypatch, site=SITE)
+    await stage.play()
+    live, serial = stage.node.live, stage.node.live.serial
+    begun = asyncio.ensure_future(stage.node._make_result(live))
+    await asyncio.sleep(0)
+    stage.node.save()
+    await begun
+    assert live.serial == serial
+    assert live.result(serial) is None
+    with pytest.raises(SkylessError, match="not there"):
         stage.node.save()
-        await begun
-        assert live.serial == serial
-        assert live.result(serial) is None
-        with pytest.raises(SkylessError, match="not there"):
-            stage.node.save()
-
-    asyncio.run(main())
 
 
 @pytest.mark.parametrize("step_s", [-30.0, -3600.0, 30.0, 3600.0])
@@ -453,52 +399,46 @@ def test_ranges_go_on_when_the_clock_of_an_anchors_host_is_set(step_s):
         Facts(gauge=Gauge(1, 1)),
     ],
 )
-def test_facts_that_cannot_be_computed_with_are_counted_and_ignored(monkeypatch, facts):
-    async def main():
-        stage = Stage(monkeypatch, site=SITE)
-        stage.link.receive(topics.survey_facts_topic(1), SurveyFactsMessage(facts))
-        await stage.play(0.0, 2.0)
-        assert stage.node.problems == 1
-        assert stage.link.newest(SurveyMessage).facts == Facts()
-
-    asyncio.run(main())
+@in_loop
+async def test_facts_that_cannot_be_computed_with_are_counted_and_ignored(monkeypatch, facts):
+    stage = Stage(monkeypatch, site=SITE)
+    stage.link.receive(topics.survey_facts_topic(1), SurveyFactsMessage(facts))
+    await stage.play(0.0, 2.0)
+    assert stage.node.problems == 1
+    assert stage.link.newest(SurveyMessage).facts == Facts()
 
 
-def test_numbers_that_are_no_stamps_spoil_nothing(monkeypatch):
-    async def main():
-        stage = Stage(monkeypatch, site=SITE)
-        await stage.play(0.0, 2.0)
-        wrong = [[2, 1 << 64, -5], [2, -(1 << 63), 1 << 40], [1, 5, 5], [77, 5, 5]]
-        for unix_s in (0.0, 1e300, -1e300):
-            body = {"anchor": 1, "run": "run1", "unix_s": unix_s, "stamps": wrong}
-            stage.link.handlers[topics.stamps_topic(1, "+")]("", json.dumps(body).encode())
-        await stage.play(2.0, 8.0)
-        assert len(stage.asked[-1][0].pairs) == 15
-
-    asyncio.run(main())
+@in_loop
+async def test_numbers_that_are_no_stamps_spoil_nothing(monkeypatch):
+    stage = Stage(monkeypatch, site=SITE)
+    await stage.play(0.0, 2.0)
+    wrong = [[2, 1 << 64, -5], [2, -(1 << 63), 1 << 40], [1, 5, 5], [77, 5, 5]]
+    for unix_s in (0.0, 1e300, -1e300):
+        body = {"anchor": 1, "run": "run1", "unix_s": unix_s, "stamps": wrong}
+        stage.link.handlers[topics.stamps_topic(1, "+")]("", json.dumps(body).encode())
+    await stage.play(2.0, 8.0)
+    assert len(stage.asked[-1][0].pairs) == 15
 
 
-def test_of_two_programs_at_one_site_the_later_one_waits_until_the_other_has_ended(monkeypatch):
-    async def main():
-        stage = Stage(monkeypatch, site=SITE)
-        await stage.play(0.0, 2.0)
-        own = stage.link.newest(SurveyMessage)
-        for unix_s in (1.0, 2.0):  # a later one, which waits itself
-            stage.link.receive(topics.survey_topic(1), replace(own, by=own.by + "0", unix_s=unix_s))
-        stage.link.receive(topics.survey_topic(1), replace(own, by="0", unix_s=1.0))  # one that the broker has kept
-        await stage.play(2.0, 3.0)
-        assert not stage.node._waits()
-        stage.link.receive(topics.survey_topic(1), replace(own, by="0", unix_s=2.0))
-        count = len(stage.link.published)
-        await stage.play(3.0, 5.0)
-        stage.link.receive(topics.survey_save_topic(1), SurveySaveMessage("page", stage.node.live.serial))
-        assert len(stage.link.published) == count
-        stage.now_s += 31.0
-        await stage.step()
-        assert isinstance(stage.link.published[-1][1], SurveyMessage | WatchMessage)
-        assert sum("another survey program" in line for line in stage.said) == 1
-
-    asyncio.run(main())
+@in_loop
+async def test_of_two_programs_at_one_site_the_later_one_waits_until_the_other_has_ended(monkeypatch):
+    stage = Stage(monkeypatch, site=SITE)
+    await stage.play(0.0, 2.0)
+    own = stage.link.newest(SurveyMessage)
+    for unix_s in (1.0, 2.0):  # a later one, which waits itself
+        stage.link.receive(topics.survey_topic(1), replace(own, by=own.by + "0", unix_s=unix_s))
+    stage.link.receive(topics.survey_topic(1), replace(own, by="0", unix_s=1.0))  # one that the broker has kept
+    await stage.play(2.0, 3.0)
+    assert not stage.node._waits()
+    stage.link.receive(topics.survey_topic(1), replace(own, by="0", unix_s=2.0))
+    count = len(stage.link.published)
+    await stage.play(3.0, 5.0)
+    stage.link.receive(topics.survey_save_topic(1), SurveySaveMessage("page", stage.node.live.serial))
+    assert len(stage.link.published) == count
+    stage.now_s += 31.0
+    await stage.step()
+    assert isinstance(stage.link.published[-1][1], SurveyMessage | WatchMessage)
+    assert sum("another survey program" in line for line in stage.said) == 1
 
 
 @pytest.mark.parametrize("failing", [1, 2, 3, 4])
@@ -524,7 +464,8 @@ def test_where_not_all_files_can_be_written_none_is(tmp_path, monkeypatch, faili
     assert file.read_text(encoding="utf-8") == TEXT
 
 
-def test_a_finding_is_logged_once_although_its_size_wavers():
+@in_loop
+async def test_a_finding_is_logged_once_although_its_size_wavers():
     said, again = [], []
     node = SurveyNode(SurveySettings(1), lambda _: Facts(), None, None, said.append)
     found = []
@@ -535,14 +476,11 @@ def test_a_finding_is_logged_once_although_its_size_wavers():
         advance_watch=lambda _: None,
     )
 
-    async def main():
-        for size_m in (0.31, 0.32, 0.31, 0.32, 0.9):
-            found[:] = [WatchFinding("moved", (4,), size_m, 0.01, 0.0, f"anchor 4 has moved by about {size_m:g} m")]
-            node.update()
-        found.clear()
+    for size_m in (0.31, 0.32, 0.31, 0.32, 0.9):
+        found[:] = [WatchFinding("moved", (4,), size_m, 0.01, 0.0, f"anchor 4 has moved by about {size_m:g} m")]
         node.update()
-
-    asyncio.run(main())
+    found.clear()
+    node.update()
     assert said == [
         "watch: anchor 4 has moved by about 0.31 m",
         "watch: anchor 4 has moved by about 0.9 m",

@@ -1,4 +1,4 @@
-"""The tag's program on receptions of the simulated lab."""
+"""The tag's program on receptions of the simulated lab, and its link, which tells fixes to the site where it is."""
 
 import asyncio
 import bisect
@@ -6,12 +6,16 @@ import bisect
 import msgspec
 import numpy as np
 import pytest
-from node_stage import PLACE_M, FakeRadio, receptions
+from node_stage import LAB, PLACE_M, FakeLink, FakeRadio, receptions, receptions_of, running, undated
 
-from skyless.air.reception import Reception
-from skyless.mqtt.messages import FixMessage
-from skyless.nodes.tag import TagNode, TagSettings
-from skyless.radios.interface import Gone, Restarted
+from skyless.core.air.reception import Reception
+from skyless.radio.interface import Gone, Restarted
+from skyless.run import anchor, process
+from skyless.run import tag as tag_module
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.messages import FixMessage, SiteMessage, TagHealth
+from skyless.run.tag import Tag, TagNode, TagSettings
+from support.loops import in_loop
 
 HEARD = receptions(6.0)
 
@@ -129,16 +133,112 @@ def test_without_the_host_s_time_a_frame_counts_from_when_it_came():
     assert all(fix.latency_s == 0.0 for fix in bench.published)
 
 
-def test_it_listens_until_it_is_cancelled():
-    async def main():
-        bench = Bench()
-        task = asyncio.ensure_future(bench.node.run())
-        await asyncio.sleep(0)
+@in_loop
+async def test_it_listens_until_it_is_cancelled():
+    bench = Bench()
+    async with running(bench.node.run()):
         for reception in HEARD[:50]:
             bench.now_s = reception.host_s
             bench.node.radio.listener(reception)
-        task.cancel()
-        await asyncio.wait([task])
-        assert bench.node.receptions == 50
+    assert bench.node.receptions == 50
 
-    asyncio.run(main())
+
+# Links
+
+
+def test_anchors_behind_a_port_that_leads_elsewhere_publish_again_whether_they_are_simulated(monkeypatch, links):
+    answers = [False, True]
+    monkeypatch.setattr(anchor, "link_of", FakeLink)
+    radio = FakeRadio(str(LAB.master))
+    radio.ready = False
+    anchors = anchor.Anchors(LAB, [radio], None, print, simulated=lambda: answers.pop(0))
+    (node,) = anchors.nodes
+    node._wait = lambda seconds, then: None  # it has no loop
+
+    class Leading:
+        is_master = True
+
+    monkeypatch.setattr(anchor, "health_of", lambda *_: None)
+    node._new_machine = Leading
+    node._schedule = lambda: None
+    node.check_reception = lambda now_s: None
+    node.machine = Leading()
+    anchors._publish_health()
+    anchors._publish_health()
+    node.on_event(Restarted())
+    anchors._publish_health()
+    anchors._publish_health()
+    told = [message.simulated for _, message, _ in links[0].published if isinstance(message, SiteMessage)]
+    assert told == [False, True]
+    assert answers == []  # asked once for each start
+
+
+async def settled():
+    for _ in range(5):
+        await asyncio.sleep(0)
+
+
+@in_loop
+async def test_the_link_comes_with_the_site_and_goes_with_it(monkeypatch, links):
+    monkeypatch.setattr(tag_module, "Link", FakeLink)
+
+    said = []
+    tag = Tag(TagSettings(), FakeRadio("t1"), MqttAddress("127.0.0.1", 1883), said.append)
+    async with running(tag.run()):
+        await settled()
+        tag.publish_health(0.1, 1)
+        assert links == []  # nobody to tell it to
+        for reception in undated(receptions_of(LAB.id, 2.0)):
+            tag.node.on_event(reception)
+        await settled()
+        (first,) = links
+        assert (first.name, first.site, first.kind, first.state) == ("t1", 1, "tag", "running")
+        assert {topic for topic, _, _ in first.published} == {"skyless/v1/1/tag/t1/fix"}
+        assert all(isinstance(message, FixMessage) for _, message, _ in first.published)
+        for reception in undated(receptions_of(9, 2.0, later_s=10.0)):
+            tag.node.on_event(reception)
+        await settled()
+        first, second = links
+        assert (first.state, second.state, second.site) == ("left", "running", 9)
+        assert {topic for topic, _, _ in second.published} == {"skyless/v1/9/tag/t1/fix"}
+        tag.node.on_event(Restarted())  # a new receiver knows no site yet, but the link stays
+        tag.publish_health(0.1, 1)
+        await settled()
+        assert len(links) == 2
+        topic, health, _ = second.published[-1]
+        assert topic == "skyless/v1/9/tag/t1/health"
+        assert isinstance(health, TagHealth)
+    assert second.state == "left"
+
+
+@in_loop
+async def test_without_a_broker_it_works_and_publishes_nothing(monkeypatch, links):
+    monkeypatch.setattr(tag_module, "Link", FakeLink)
+
+    tag = Tag(TagSettings(), FakeRadio("t1"), None, lambda line: None)
+    for reception in undated(receptions_of(LAB.id, 2.0)):
+        tag.node.on_event(reception)
+    tag.publish_health(0.1, 1)
+    tag.publish_receptions()
+    assert tag.node.fix_log.serial > 100
+    assert links == []
+
+
+@in_loop
+async def test_a_link_that_fails_is_reported_of_and_started_again(monkeypatch):
+    monkeypatch.setattr(process, "HEALTH_S", 0.01)
+    said = []
+
+    class Faulty:
+        address = "mqtt://nowhere"
+        runs = 0
+
+        async def run(self):
+            self.runs += 1
+            raise RuntimeError("a fault")
+
+    link = Faulty()
+    async with running(process.keep(link, said.append)):
+        while link.runs < 3:
+            await asyncio.sleep(0.005)
+    assert "a fault" in said[0]

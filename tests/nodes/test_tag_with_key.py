@@ -6,15 +6,14 @@ from keyed_site import FIRST, FREE, KEYS, OTHER_KEYS, tape
 from msgspec.structs import replace
 from node_stage import PLACE_M, FakeRadio
 
-from skyless.air.codec2 import decode_2
-from skyless.air.reception import Reception
-from skyless.evaluation.trusted_air import START_UNIX_S
-from skyless.mqtt.messages import Counters
-from skyless.nodes.keys.tag_memory import Remembered, TagMemory
-from skyless.nodes.keys.tag_report import PATIENCE_S
-from skyless.nodes.tag import TagNode, TagSettings
-from skyless.radios.interface import Restarted
-from skyless.trusted_receiver import SiteTrust, Trust
+from skyless.core.air.codec import decode
+from skyless.core.air.reception import Reception
+from skyless.core.tag.trusted_receiver import SiteTrust, Trust
+from skyless.radio.interface import Restarted
+from skyless.run.keys.anchor_and_tag_keys import UNVERIFIED_S, Remembered, TagMemory
+from skyless.run.mqtt.messages import Counters
+from skyless.run.tag import TagNode, TagSettings
+from support.keyed_air import START_UNIX_S
 
 SITE_TRUST = SiteTrust(FREE.id, KEYS.public, 1, Trust.VERIFIED)
 
@@ -77,7 +76,7 @@ def test_open_fixes_come_at_once_and_state_how_far_they_are_verified():
 
 
 def test_an_anchor_that_is_refused_for_long_is_named_once():
-    forged = [one for one in tape(12.0, OTHER_KEYS.chains) if decode_2(one.frame).anchor == 3 and one.host_s > 2.0]
+    forged = [one for one in tape(12.0, OTHER_KEYS.chains) if decode(one.frame).anchor == 3 and one.host_s > 2.0]
     bench = Bench().hear(sorted((*tape(12.0), *forged), key=lambda one: one.host_s))
     assert bench.health().faults == {"3": "bad-code"}
     assert are_right(bench.published)
@@ -108,7 +107,7 @@ def test_why_nothing_is_verified_is_said_once(case, reason, words):
     trust = replace(SITE_TRUST, public=OTHER_KEYS.public) if case == "other key" else SITE_TRUST
     ahead_s = {"ahead": 5.0, "behind": -5.0}.get(case, 0.0)
     bench = Bench(trust, ahead_s=ahead_s)
-    bench.hear(tape(PATIENCE_S + 3.0, () if case == "no codes" else (FIRST,)))
+    bench.hear(tape(UNVERIFIED_S + 3.0, () if case == "no codes" else (FIRST,)))
     assert bench.published == []
     health = bench.health()
     assert (health.reason, health.is_verified) == (reason, False)

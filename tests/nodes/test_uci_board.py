@@ -4,30 +4,31 @@ from collections import Counter
 
 import pytest
 
-from skyless.air.beacon import Beacon, Heard
-from skyless.air.codec import encode
-from skyless.air.masterless_packets import Packet
-from skyless.air.reception import Diagnostics, Reception
-from skyless.air.uci import UciReader
-from skyless.air.uci_location import location_of
-from skyless.air.uci_measurements import (
+from skyless.core.air.frame import Heard
+from skyless.core.air.masterless_packets import Packet
+from skyless.core.air.reception import Diagnostics, Reception
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ
+from skyless.core.protocol1.anchor import Anchor
+from skyless.core.protocol1.beacon import Beacon
+from skyless.core.protocol1.codec import encode
+from skyless.radio.foreign.fira import AnchorFrame
+from skyless.radio.foreign.foreign_radios import UciRadio
+from skyless.radio.interface import Restarted
+from skyless.radio.uci.uci import (
+    UciReader,
     decode_session_info,
+    location_of,
 )
-from skyless.anchor import Anchor
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ
-from skyless.nodes.open_radio import open_sniffers
-from skyless.nodes.packet_tags import PacketTagNode, PacketTagSettings
-from skyless.nodes.uci_board import UciProtocol
-from skyless.radios.interface import Restarted
-from skyless.radios.serial.foreign_radios import UciRadio
-from skyless.recordings.foreign.anchor_frame import AnchorFrame
-from skyless.simulation.impairments import lab_impairments
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
-from skyless.site.lab import ideal_lab_site
+from skyless.research.live.packet_tags import PacketTagNode, PacketTagSettings
+from skyless.run.board import UciProtocol
+from skyless.run.open_radio import open_sniffers
+from skyless.sim.impairments import lab_impairments
+from skyless.sim.lab import paper_lab_site
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Static
+from skyless.sim.world import World
 
-LAB = ideal_lab_site()
+LAB = paper_lab_site()
 
 
 class Board:
@@ -72,7 +73,7 @@ def test_rounds_are_sent_when_they_are_whole_or_with_the_next_poll():
     (late,) = board.said()
     (response,) = late.measurements
     assert (response.responder_reply_ticks, response.rx_ticks_tag, response.flight_ticks) == (500, 2**40 - 1, 0)
-    assert (response.rssi_dbm, response.cfo_ppm, response.block) == (-80.0, 3.0, 9)
+    assert response.block == 9
     board.hear(beacon(1, 10, 5000, sequence=8))
     assert not board.said()
     board.hear(beacon(2, 10, 9000, Heard(1, 8, 8000)))
@@ -102,7 +103,7 @@ def test_the_master_s_second_frame_ends_the_round_and_tells_when_it_heard_the_re
 @pytest.mark.parametrize(("x_m", "ticks"), [(300.0, round(300.0 / TICK_M)), (310.0, 0)])
 def test_a_flight_that_the_line_has_no_bits_for_is_unknown(x_m, ticks):
     board = Board(1)
-    board.speech._position_m = {1: (0.0, 0.0, 2.0), 2: (x_m, 0.0, 2.0)}.get
+    board.speech._almanac._anchors_m = {1: (0.0, 0.0, 2.0), 2: (x_m, 0.0, 2.0)}
     board.hear(beacon(1, 9, 1000))
     board.hear(beacon(2, 9, 9000, Heard(1, 7, 8000)))
     *_, info = board.said()

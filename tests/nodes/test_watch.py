@@ -2,28 +2,14 @@
 
 import time
 
-import msgspec
 import pytest
+from node_stage import FakeLink
 
-from skyless.mqtt.messages import Counters, EtherHealth, FixMessage, TagHealth, TrueMotion, TruthMessage
-from skyless.nodes.watch import Watch
+from skyless.cli.watch import Watch
+from skyless.run.mqtt.messages import Counters, EtherHealth, FixMessage, TagHealth, TrueMotion, TruthMessage
 
 NOW_S = time.time()
 UNIT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-
-
-class FakeLink:
-    def __init__(self):
-        self.handlers = {}
-
-    def subscribe(self, topic, handler, qos=0):
-        self.handlers[topic] = handler
-
-    def send(self, end, message):
-        payload = message if isinstance(message, bytes) else msgspec.json.encode(message)
-        handlers = [handler for topic, handler in self.handlers.items() if topic.endswith(end)]
-        assert len(handlers) == 1
-        handlers[0]("a topic", payload)
 
 
 def fix(tag="t1", serial=1, unix_s=NOW_S, position_m=(1.0, 2.0, 0.0), std_m=0.1, height_known=True, latency_s=1e-3):
@@ -51,42 +37,42 @@ def site():
 
 def test_a_fix_is_judged_beside_the_truth_at_its_own_time(site):
     link, watch = site
-    link.send("truth", truth(NOW_S, (1.0, 2.0, 0.0), (1.0, 0.0, 0.0)))
-    link.send("/fix", fix(unix_s=NOW_S + 0.04, position_m=(1.04, 2.03, 5.0)))
+    link.receive("truth", truth(NOW_S, (1.0, 2.0, 0.0), (1.0, 0.0, 0.0)))
+    link.receive("/fix", fix(unix_s=NOW_S + 0.04, position_m=(1.04, 2.03, 5.0)))
     assert watch.tags["t1"].error_m == pytest.approx(0.03)  # a known height does not count
-    link.send("/fix", fix(unix_s=NOW_S + 0.04, position_m=(1.04, 2.0, 0.05), height_known=False))
+    link.receive("/fix", fix(unix_s=NOW_S + 0.04, position_m=(1.04, 2.0, 0.05), height_known=False))
     assert watch.tags["t1"].error_m == pytest.approx(0.05)
 
 
 def test_no_truth_no_error(site):
     link, watch = site
-    link.send("/fix", fix())
+    link.receive("/fix", fix())
     assert watch.tags["t1"].error_m is None
-    link.send("truth", truth(NOW_S, (1.0, 2.0, 0.0)))
-    link.send("/fix", fix(unix_s=NOW_S + 0.5))  # it is too old
+    link.receive("truth", truth(NOW_S, (1.0, 2.0, 0.0)))
+    link.receive("/fix", fix(unix_s=NOW_S + 0.5))  # it is too old
     assert watch.tags["t1"].error_m is None
-    link.send("truth", truth(NOW_S + 0.6, (1.0, 2.0, 0.0), tag="another"))
-    link.send("/fix", fix(unix_s=NOW_S + 0.6))
+    link.receive("truth", truth(NOW_S + 0.6, (1.0, 2.0, 0.0), tag="another"))
+    link.receive("/fix", fix(unix_s=NOW_S + 0.6))
     assert watch.tags["t1"].error_m is None
     assert watch.judged == 0
 
 
 def test_a_truth_from_before_a_restart_of_the_ether_is_forgotten(site):
     link, watch = site
-    link.send("truth", truth(NOW_S + 100.0, (9.0, 9.0, 0.0)))
-    link.send("truth", truth(NOW_S, (1.0, 2.0, 0.0)))
-    link.send("/fix", fix(unix_s=NOW_S))
+    link.receive("truth", truth(NOW_S + 100.0, (9.0, 9.0, 0.0)))
+    link.receive("truth", truth(NOW_S, (1.0, 2.0, 0.0)))
+    link.receive("/fix", fix(unix_s=NOW_S))
     assert watch.tags["t1"].error_m == pytest.approx(0.0)
-    link.send("/fix", fix(unix_s=NOW_S + 100.0))
+    link.receive("/fix", fix(unix_s=NOW_S + 100.0))
     assert watch.tags["t1"].error_m is None
 
 
 def test_errors_count_from_a_second_after_a_tag_s_first_fix(site):
     link, watch = site
     for number in range(30):
-        link.send("truth", truth(NOW_S + number * 0.1, (1.0, 2.0, 0.0)))
+        link.receive("truth", truth(NOW_S + number * 0.1, (1.0, 2.0, 0.0)))
         off_m = 1.0 if number < 10 else 0.03
-        link.send("/fix", fix(serial=number, unix_s=NOW_S + number * 0.1, position_m=(1.0 + off_m, 2.0, 0.0)))
+        link.receive("/fix", fix(serial=number, unix_s=NOW_S + number * 0.1, position_m=(1.0 + off_m, 2.0, 0.0)))
     found = watch.errors.summary()
     assert watch.judged == 20
     assert found.rmse_2d_m == pytest.approx(0.03)
@@ -95,35 +81,35 @@ def test_errors_count_from_a_second_after_a_tag_s_first_fix(site):
 
 def test_the_rate_counts_between_health_messages_and_again_after_a_tag_s_restart(site):
     link, watch = site
-    link.send("tag/+/health", health(NOW_S, 100))  # before its first fix was heard it is unknown
+    link.receive("tag/+/health", health(NOW_S, 100))  # before its first fix was heard it is unknown
     assert watch.tags == {}
-    link.send("/fix", fix())
+    link.receive("/fix", fix())
     assert watch.tags["t1"].updates_per_s is None
     for second in range(4):
-        link.send("tag/+/health", health(NOW_S + second, 100 + 400 * second))
+        link.receive("tag/+/health", health(NOW_S + second, 100 + 400 * second))
     assert watch.tags["t1"].updates_per_s == pytest.approx(400.0)
-    link.send("tag/+/health", health(NOW_S + 10.0, 50))
+    link.receive("tag/+/health", health(NOW_S + 10.0, 50))
     assert watch.tags["t1"].updates_per_s is None
-    link.send("tag/+/health", health(NOW_S + 11.0, 350))
+    link.receive("tag/+/health", health(NOW_S + 11.0, 350))
     assert watch.tags["t1"].updates_per_s == pytest.approx(300.0)
 
 
 def test_latencies_are_those_of_the_tag_and_those_to_here(site):
     link, watch = site
     for latency_s in (1e-3, 2e-3, 3e-3):
-        link.send("/fix", fix(unix_s=time.time() - 0.5, latency_s=latency_s))
+        link.receive("/fix", fix(unix_s=time.time() - 0.5, latency_s=latency_s))
     assert watch.latencies.drain()[0] == pytest.approx(2e-3)
     median_s, _, number = watch.arrivals.drain()
     assert number == 3
     assert 0.5 <= median_s < 5.0
 
 
-@pytest.mark.parametrize("wrong", [b"", b"{}", b"[1]", b"\xff\xfe", b'{"tag": 5}', b"9" * 5000])
+@pytest.mark.parametrize("wrong", [b"{}", b"[1]", b"\xff\xfe", b'{"tag": 5}', b"9" * 5000])
 def test_what_makes_no_sense_is_counted_and_nothing_else(site, wrong):
     link, watch = site
     for end in ("/fix", "truth", "tag/+/health", "anchor/+/health", "ether/+/health"):
-        link.send(end, wrong)
+        link.receive(end, wrong)
     assert watch.wrong == 5
     assert (watch.tags, watch.anchors, watch.ether) == ({}, {}, None)
-    link.send("ether/+/health", EtherHealth(NOW_S, 1.0, 5, 0, {}, {}, 0, 0))
+    link.receive("ether/+/health", EtherHealth(NOW_S, 1.0, 5, 0, {}, {}, 0, 0))
     assert watch.ether.transmissions == 5

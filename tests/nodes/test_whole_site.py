@@ -4,14 +4,14 @@ import asyncio
 
 import pytest
 
-from skyless.errors import SkylessError
-from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.topics import preparation_topic
-from skyless.nodes import demo
-from skyless.nodes.demo import SiteRun, WholeSite
-from skyless.positioning.integrity import IntegrityRequirement
-from skyless.preparation.processes import Preparation
-from skyless.site.lab import lab_site
+from skyless.cli import demo
+from skyless.cli.demo import SiteRun, WholeSite
+from skyless.core.errors import SkylessError
+from skyless.core.integrity import IntegrityRequirement
+from skyless.core.kernels.processes import Preparation
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.topics import preparation_topic
+from skyless.sim.lab import lab_site
 
 ADDRESS = MqttAddress("127.0.0.1", 1)
 

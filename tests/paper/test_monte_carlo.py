@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from skyless.bench.monte_carlo_speed import bench_chain, numpy_draw, numpy_loop
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.paper.monte_carlo import (
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
+from skyless.research.bench.monte_carlo_speed import bench_chain, numpy_draw, numpy_loop
+from skyless.research.paper.monte_carlo import (
     CHUNK_DRAWS,
     Quantity,
     draw_lambdas,
@@ -14,7 +14,7 @@ from skyless.paper.monte_carlo import (
     noise_batches,
     readings_of,
 )
-from skyless.uncertainty.chain import CORRECTED, Chain, Reference, chain_covariance
+from skyless.research.uncertainty.chain import CORRECTED, Chain, Reference, chain_covariance
 
 SHARING = list(Reference)
 

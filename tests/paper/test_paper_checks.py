@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from skyless.paper.checks import CHECKED_ANCHORS, NOISES, QUANTITY_NAMES, paper_chain, paper_checks
-from skyless.paper.distributions import lambda_distributions
+from skyless.research.paper.checks import CHECKED_ANCHORS, NOISES, QUANTITY_NAMES, paper_chain, paper_checks
+from skyless.research.paper.distributions import lambda_distributions
 
 DRAWS = 2_000_000
 PRINTED_PCT = {

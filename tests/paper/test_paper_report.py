@@ -8,10 +8,10 @@ from xml.etree import ElementTree
 import pytest
 
 from skyless.cli.main import main
-from skyless.paper import plan as plans
-from skyless.paper import run
-from skyless.paper.checks import QUANTITY_NAMES
-from skyless.paper.plan import Plan
+from skyless.research.paper import plan as plans
+from skyless.research.paper import run
+from skyless.research.paper.checks import QUANTITY_NAMES
+from skyless.research.paper.plan import Plan
 
 TINY = Plan(
     seed=3, quick=True, fixes=600, noises_ps=(50.0, 100.0, 150.0), laps=1, fleet_sizes=(1, 3), rate_s=1.0, draws=20_000

@@ -6,24 +6,13 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.evaluation.report_page import inline_svg
-from skyless.evaluation.scenarios import Request, fleet_of
-from skyless.paper import (
-    checks,
-    claim,
-    distributions,
-    dop_map,
-    rate,
-    scale,
-    scenario,
-    static,
-    timeline,
-    walk,
-)
-from skyless.paper.checks import PaperCheck
-from skyless.paper.distributions import LambdaDistribution
-from skyless.paper.plan import P1, P2, Verdict, plan_of
-from skyless.site.lab import lab_site
+from skyless.research.paper import checks, claim, distributions, dop_map, rate, scale, scenario, static, timeline, walk
+from skyless.research.paper.checks import PaperCheck
+from skyless.research.paper.distributions import LambdaDistribution
+from skyless.research.paper.plan import P1, P2, Verdict, plan_of
+from skyless.sim.evaluation.scenarios import Request, fleet_of
+from skyless.sim.lab import lab_site
+from skyless.site.report.report_page import inline_svg
 
 HOLDS, CORRECTED, FAILS = Verdict.HOLDS, Verdict.CORRECTED, Verdict.FAILS
 
@@ -157,7 +146,7 @@ def test_antenna_delays_move_the_least_squares_by_the_normal_equations():
 def test_the_command_beside_a_figure_makes_its_number_again():
     """Several methods and tags in one world hear what ``skyless simulate`` lets one tag hear."""
     tracks = static.run_world(lambda share: None, "noise", 9, 60)
-    fleet = fleet_of(Request(lab_site(), "literal", seed=9, noise_ps=100.0, positions_m=(P1,), most_fixes=60))
+    fleet = fleet_of(Request(lab_site(), method="literal", seed=9, noise_ps=100.0, positions_m=(P1,), fixes=60))
     for _ in fleet.run(3.2):
         pass
     error_m = tracks[0]["literal"].error_m

@@ -5,19 +5,28 @@ import pytest
 from msgspec.structs import replace
 from scipy.stats import binom
 
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.planning.anchor_clocks import anchor_clocks, relays_of, stamp_variances
-from skyless.planning.columns import BIAS, CLAIMED, FIX_SHARE, RMSE, SIGMA, SIGMA_X, SIGMA_Z
-from skyless.planning.links import anchor_links, link_budget
-from skyless.planning.predict import PlanSettings, Predictor
-from skyless.simulation.channel import ChannelModel, pack_walls
-from skyless.site.lab import ideal_lab_site, lab_site
-from skyless.site.model import EXACT, AnchorSite, Site, TagsSite, WallSite
-from skyless.site.near import anchor_positions
-from skyless.site.slots import schedule_of
-from skyless.uncertainty.bounds import bound_settings, tracking_bound
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
+from skyless.core.geometry import anchor_positions
+from skyless.core.protocol1.schedule import schedule_of
+from skyless.core.site import EXACT, AnchorSite, Site, TagsSite, WallSite
+from skyless.research.uncertainty.bounds import BoundSettings, tracking_bound
+from skyless.sim.lab import lab_site, paper_lab_site
+from skyless.site.channel import ChannelModel, pack_walls
+from skyless.site.planning.anchor_clocks import anchor_clocks, relays_of, stamp_variances
+from skyless.site.planning.links import (
+    BIAS,
+    CLAIMED,
+    FIX_SHARE,
+    RMSE,
+    SIGMA,
+    SIGMA_X,
+    SIGMA_Z,
+    anchor_links,
+    link_budget,
+)
+from skyless.site.planning.predict import PlanSettings, Predictor
 
-LAB = ideal_lab_site(100.0)
+LAB = paper_lab_site(100.0)
 PLACES = ((0, 0, 0.2), (4, 0, 2.9), (8, 0, 0.4), (8, 5, 2.7), (8, 10, 0.2), (4, 10, 2.9), (0, 10, 0.5), (0, 5, 2.6))
 ROOM = Site("room", 2, 1, tuple(AnchorSite(k + 1, *place) for k, place in enumerate(PLACES)), accuracy=EXACT)
 QA = 0.3
@@ -41,7 +50,7 @@ def test_the_filter_claims_the_bound_of_what_has_come_in(site, point):
     anchors, superframes = anchor_positions(site), 400
     noise, slot_s = site.noise, schedule_of(site).slot_ticks * TICK_S
     flat = site.tags.height_m is not None
-    settings = bound_settings(
+    settings = BoundSettings(
         noise.tx_stamp_ps * 1e-12,
         white_fm=noise.white_fm,
         random_walk_fm=noise.random_walk_fm,

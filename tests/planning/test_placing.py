@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.planning.advice import plan_warnings
-from skyless.planning.columns import FIX_SHARE
-from skyless.planning.floor import Mounts, floor_of, sample_points, sides
-from skyless.planning.links import anchor_links, link_budget, with_range
-from skyless.planning.maps import grid_of, plan_map, summary_of
-from skyless.planning.optimise import (
+from skyless.core.site import EXACT, AnchorSite, Site, TagsSite, WallSite
+from skyless.research.verify import random_points, verify
+from skyless.sim.lab import lab_site, paper_lab_site
+from skyless.site.channel import ChannelModel, pack_walls
+from skyless.site.file.template import rectangular_site
+from skyless.site.planning.floor import Mounts, floor_of, sample_points, sides
+from skyless.site.planning.links import FIX_SHARE, anchor_links, link_budget, with_range
+from skyless.site.planning.maps import grid_of, plan_map, summary_of
+from skyless.site.planning.optimise import (
     Search,
     even_layout,
     exchange,
@@ -21,12 +24,8 @@ from skyless.planning.optimise import (
     site_with,
     site_with_one_more,
 )
-from skyless.planning.predict import PlanSettings, Predictor
-from skyless.planning.verify import random_points, verify
-from skyless.simulation.channel import ChannelModel, pack_walls
-from skyless.site.lab import ideal_lab_site, lab_site
-from skyless.site.model import EXACT, AnchorSite, Site, TagsSite, WallSite
-from skyless.site.template import rectangular_site
+from skyless.site.planning.predict import PlanSettings, Predictor
+from skyless.site.planning.report import plan_warnings
 
 FILE = Path("site.toml")
 BRACKETED = PlanSettings("bracketed")
@@ -87,7 +86,7 @@ class SlowSearch(Search):
 
 @pytest.fixture
 def slow_search(monkeypatch):
-    monkeypatch.setattr("skyless.planning.optimise.time.monotonic", lambda: SlowSearch.now_s)
+    monkeypatch.setattr("skyless.site.planning.optimise.time.monotonic", lambda: SlowSearch.now_s)
     site = rectangular_site(10.0, 6.0, 4, 3.0, 1.2)
     floor = floor_of(site, FILE, None, None)
     mounts = Mounts(sides(floor.outline_m), (2.5,))
@@ -195,15 +194,15 @@ def test_mirrors_are_told_by_the_solver():
 
 
 SITES = {
-    "2-D": ideal_lab_site(),
+    "2-D": paper_lab_site(),
     "3-D": replace(
-        ideal_lab_site(),
+        paper_lab_site(),
         tags=TagsSite(),
         anchors=tuple(
-            replace(a, z_m=z) for a, z in zip(ideal_lab_site().anchors, (0.3, 2.8, 0.4, 2.7, 0.3, 2.9), strict=True)
+            replace(a, z_m=z) for a, z in zip(paper_lab_site().anchors, (0.3, 2.8, 0.4, 2.7, 0.3, 2.9), strict=True)
         ),
     ),
-    "wall": replace(ideal_lab_site(), walls=(WallSite(3.0, 0.0, 3.0, 5.0, loss_db=8.0, delay_m=0.0),)),
+    "wall": replace(paper_lab_site(), walls=(WallSite(3.0, 0.0, 3.0, 5.0, loss_db=8.0, delay_m=0.0),)),
     "half-heard": replace(
         Site("wide", 1, 1, tuple(AnchorSite(k + 1, 20.0 * (k % 3), 18.0 * (k // 3)) for k in range(6))),
         tags=TagsSite(0.0),
@@ -229,7 +228,7 @@ def test_prediction_and_simulation_agree(monkeypatch, name, method, rounds):
 
     Three points at once; their mean is held to a tighter bound.
     """
-    monkeypatch.setattr("skyless.planning.verify._WORLDS", 8)
+    monkeypatch.setattr("skyless.research.verify._WORLDS", 8)
     site = lab_site() if name == "range errors" else SITES[name]
     floor = floor_of(site, FILE, None, None)
     predictor = Predictor(site, PlanSettings(method))

@@ -12,19 +12,18 @@ from hypothesis import strategies as st
 from matplotlib.path import Path as Polygon
 from msgspec.structs import replace
 
-from skyless.errors import ConfigurationError
-from skyless.planning import maps
-from skyless.planning.columns import ANCHORS_IN_VIEW, PDOP, PLAN_COLUMNS, SIGMA
-from skyless.planning.floor import Mounts, floor_of, points_along, sides
-from skyless.planning.maps import csv_lines, geojson_lines, grid_of, plan_map, summary_of
-from skyless.planning.predict import PlanSettings, Predictor
-from skyless.site.georeference import to_wgs84
-from skyless.site.lab import ideal_lab_site
-from skyless.site.model import AnchorSite, GeoreferenceSite, WallSite
-from skyless.site.outline import area, distance_outside, inside
+from skyless.core.errors import ConfigurationError
+from skyless.core.geometry import area, distance_outside, inside
+from skyless.core.site import AnchorSite, GeoreferenceSite, WallSite
+from skyless.sim.lab import paper_lab_site
+from skyless.site.planning import maps
+from skyless.site.planning.floor import Mounts, floor_of, points_along, sides
+from skyless.site.planning.links import ANCHORS_IN_VIEW, PDOP, PLAN_COLUMNS, SIGMA
+from skyless.site.planning.maps import csv_lines, geojson_lines, grid_of, plan_map, summary_of, to_wgs84
+from skyless.site.planning.predict import PlanSettings, Predictor
 
 L_SHAPE = np.array([(0, 0), (12, 0), (12, 4), (5, 4), (5, 9), (0, 9)], dtype=float)
-LAB = ideal_lab_site()
+LAB = paper_lab_site()
 
 
 def lab_map(step=0.5, method="bracketed", site=LAB):

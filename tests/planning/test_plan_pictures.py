@@ -8,14 +8,14 @@ import pytest
 from matplotlib.text import Annotation
 from msgspec.structs import replace
 
-from skyless.planning.columns import ANCHORS_IN_VIEW, PLAN_COLUMNS, SIGMA
-from skyless.planning.floor import floor_of
-from skyless.planning.maps import PlanMap, grid_of
-from skyless.planning.picture import RMSE_LAYER, SIGMA_LAYER, Background, Layer, draw_layer
-from skyless.site.lab import ideal_lab_site
-from skyless.site.model import AnchorSite, TagsSite, WallSite
+from skyless.core.site import AnchorSite, TagsSite, WallSite
+from skyless.sim.lab import paper_lab_site
+from skyless.site.planning.floor import floor_of
+from skyless.site.planning.links import ANCHORS_IN_VIEW, PLAN_COLUMNS, SIGMA
+from skyless.site.planning.maps import PlanMap, grid_of
+from skyless.site.planning.picture import RMSE_LAYER, SIGMA_LAYER, Background, Layer, draw_layer
 
-LAB = ideal_lab_site()
+LAB = paper_lab_site()
 IN_VIEW = Layer(ANCHORS_IN_VIEW, "anchors in view", "", more_is_better=True)
 
 

@@ -6,10 +6,21 @@ from msgspec.structs import replace
 from scipy.linalg import solve_discrete_are
 
 from dense_covariance import position_covariance
-from skyless.clocks.filter import ClockNoise, clock_noise
-from skyless.method_names import FILTERS
-from skyless.planning.anchor_clocks import offset_variances, stamp_variances
-from skyless.planning.columns import (
+from skyless.core.dop import dops_at
+from skyless.core.geometry import anchor_positions
+from skyless.core.kernels.filter import ClockNoise, clock_noise
+from skyless.core.method_names import FILTERS
+from skyless.core.protocol1.snapshots import (
+    SnapshotMethod,
+    bracketed_covariance,
+    literal_covariance,
+    literal_delayed_covariance,
+)
+from skyless.core.site import AnchorSite, NoiseSite, Site, TagsSite, WallSite
+from skyless.sim.lab import paper_lab_site
+from skyless.site.channel import ChannelModel, pack_walls
+from skyless.site.planning.anchor_clocks import offset_variances, stamp_variances
+from skyless.site.planning.links import (
     CLAIMED,
     FIX_SHARE,
     GDOP,
@@ -20,23 +31,15 @@ from skyless.planning.columns import (
     SIGMA_Y,
     SIGMA_Z,
     TDOP,
+    link,
+    link_budget,
+    range_of,
+    with_range,
 )
-from skyless.planning.links import link, link_budget, range_of, with_range
-from skyless.planning.predict import PlanSettings, Predictor, with_noise
-from skyless.planning.snapshot_sigma import delays, phase_covariance
-from skyless.positioning.methods.snapshots import (
-    SnapshotMethod,
-    bracketed_covariance,
-    literal_covariance,
-    literal_delayed_covariance,
-)
-from skyless.simulation.channel import ChannelModel, pack_walls
-from skyless.site.lab import ideal_lab_site
-from skyless.site.model import AnchorSite, NoiseSite, Site, TagsSite, WallSite
-from skyless.site.near import anchor_positions
-from skyless.uncertainty.dop import dops_at
+from skyless.site.planning.predict import PlanSettings, Predictor, with_noise
+from skyless.site.planning.snapshot_sigma import delays, phase_covariance
 
-LAB = ideal_lab_site(100.0)
+LAB = paper_lab_site(100.0)
 QUIET = replace(LAB, noise=NoiseSite(100.0, 100.0, 1e-15, 1e-15))
 """The lab with crystals so good that only stamps count."""
 

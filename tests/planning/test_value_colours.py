@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from matplotlib import colormaps
 from matplotlib.colors import LogNorm
 
-from skyless.planning.colours import round_values, scale_of
-from skyless.planning.picture import value_colours
+from skyless.site.planning.colours import round_values, scale_of
+from skyless.site.planning.picture import value_colours
 from value_colours import colour_at, colour_of
 
 POSITIVE = st.floats(1e-4, 1e4)

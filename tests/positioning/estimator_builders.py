@@ -9,15 +9,15 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M
-from skyless.positioning.estimator.estimator import LEVELS, Estimator, Packets
-from skyless.positioning.estimator.state import EstimatorSettings, layout
-from skyless.positioning.observation import Observation
-from skyless.site.lab import ideal_lab_site
-from skyless.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM, random_path
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M
+from skyless.core.estimator.estimator import LEVELS, Estimator, Packets
+from skyless.core.estimator.state import EstimatorSettings, layout
+from skyless.core.observation import Observation
+from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM, random_path
+from skyless.sim.lab import paper_lab_site
 
-SLOT_S = ideal_lab_site().schedule.slot_s
-LAB_M = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in ideal_lab_site().anchors])
+SLOT_S = paper_lab_site().schedule.slot_s
+LAB_M = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in paper_lab_site().anchors])
 CORNERS_M = [(0, 0), (4, 0), (8, 0), (8, 3), (8, 6), (4, 6), (0, 6), (0, 3)]
 ROOM_M = np.array([(x, y, 2.5 if k % 2 else 0.5) for k, (x, y) in enumerate(CORNERS_M)], float)
 """Eight anchors at alternating heights."""

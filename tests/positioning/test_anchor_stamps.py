@@ -4,15 +4,15 @@ from collections import Counter
 
 import pytest
 
-from skyless.air.beacon2 import Beacon2
-from skyless.positioning.methods.observations import MOST_TRACKS, RESTART_SILENCE_SUPERFRAMES, AnchorStamps
-from skyless.ticks import from_seconds, wrap
+from skyless.core.air.beacon import Beacon
+from skyless.core.tag.observations import MAX_TRACKS, RESTART_SILENCE_PERIODS, AnchorStamps
+from skyless.core.ticks import from_seconds, wrap
 
 HALF_S = from_seconds(0.5)
 
 
 def beacon(anchor, tx_ticks, sequence=0):
-    return Beacon2(1, anchor, sequence & 0xFF, wrap(tx_ticks), 0, None, None, None, (), 0, None)
+    return Beacon(1, anchor, sequence & 0xFF, wrap(tx_ticks), 0, None, None, None, (), 0, None)
 
 
 @pytest.mark.parametrize("superframe_ticks", [0, HALF_S])
@@ -44,7 +44,7 @@ def test_a_counter_that_restarts_counts_again_after_a_few_superframes():
         assert stamps.unwrap(beacon(1, n * HALF_S, n), n * HALF_S, HALF_S) is not None
     again = [stamps.unwrap(beacon(1, n * HALF_S + 10**11, n), n * HALF_S, HALF_S) for n in range(4, 20)]
     accepted = next(n for n, ticks in enumerate(again) if ticks is not None)
-    assert accepted <= RESTART_SILENCE_SUPERFRAMES + 1
+    assert accepted <= RESTART_SILENCE_PERIODS + 1
     assert None not in again[accepted:]
 
 
@@ -52,7 +52,7 @@ def test_strangers_of_a_single_frame_do_not_displace_an_anchor():
     stamps = AnchorStamps(Counter())
     for n in range(2):
         stamps.unwrap(beacon(1, n * 1000, n), n * 1000)
-    for n in range(2 * MOST_TRACKS):
+    for n in range(2 * MAX_TRACKS):
         stamps.unwrap(beacon(1000 + n, 5 * n), 2000 + n)
-    assert len(stamps.tracks.of_anchor) == MOST_TRACKS
+    assert len(stamps.tracks.of_anchor) == MAX_TRACKS
     assert stamps.unwrap(beacon(1, 10**10, 3), 4000) is None

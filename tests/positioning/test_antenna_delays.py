@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.positioning.masterless.anchor_errors import ANTENNA_DELAY_STD_M, BLOCKED_M, EXCESS_STD_M, antenna_delays_m
+from skyless.site.survey.anchor_errors import ANTENNA_DELAY_STD_M, BLOCKED_M, EXCESS_STD_M, antenna_delays_m
 
 delays = st.lists(st.floats(-0.2, 0.2), min_size=2, max_size=9)
 

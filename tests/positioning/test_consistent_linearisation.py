@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skyless import Request, fleet_of, lab_site
-from skyless.evaluation.scenarios import Room, displacements
-from skyless.positioning.estimator.estimator import Estimator
-from skyless.positioning.estimator.measurements import difference_terms, reception_terms
-from skyless.positioning.estimator.state import EstimatorSettings, layout
-from skyless.simulation.range_errors import RangeErrorModel
+from skyless.core.estimator.estimator import Estimator
+from skyless.core.estimator.measurements import difference_terms, reception_terms
+from skyless.core.estimator.state import EstimatorSettings, layout
+from skyless.sim.evaluation.scenarios import Room, displacements
+from skyless.sim.range_errors import RangeErrorModel
 
 ANCHORS_M = {
     2: np.array([[0, 0, 0], [6, 0, 0], [6, 4, 0], [6, 8, 0], [0, 8, 0], [0, 4, 0]], float),

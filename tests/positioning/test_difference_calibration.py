@@ -5,9 +5,9 @@ from math import dist, log
 import numpy as np
 import pytest
 
-from skyless.air.masterless_packets import PairTdoa
-from skyless.positioning.masterless.anchor_errors import AnchorCalibration, DifferenceCalibration
-from skyless.positioning.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
+from skyless.core.air.masterless_packets import PairTdoa
+from skyless.research.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
+from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
 
 PLACES = {k: (6.0 * (k % 2), 8.0 * (k // 2 % 2), 0.2 + 2.5 * ((k + k // 4) % 2)) for k in range(8)}
 PLACES |= {k: (x + 3.0, y - 4.0, z) for k, (x, y, z) in PLACES.items() if k > 3}

@@ -8,17 +8,17 @@ from math import dist
 import numpy as np
 import pytest
 
-from skyless.air.masterless_packets import PairTdoa
-from skyless.positioning.estimator.kalman import is_stationary
-from skyless.positioning.estimator.state import layout
-from skyless.positioning.masterless.anchor_errors import DifferenceCalibration
-from skyless.positioning.masterless.difference_tracking import (
+from skyless.core.air.masterless_packets import PairTdoa
+from skyless.core.estimator.kalman import is_stationary
+from skyless.core.estimator.state import layout
+from skyless.research.masterless.difference_tracking import (
     DIFFERENCES,
     WINDOW,
     DifferenceTracking,
     Start,
     find_start,
 )
+from skyless.site.survey.anchor_errors import DifferenceCalibration
 
 ANCHORS_M = {n: (8.0 * (n & 1), 6.0 * (n >> 1 & 1), 0.3 + 2.4 * ((n ^ n >> 1 ^ n >> 2) & 1)) for n in range(4)}
 ANCHORS_M |= {4 + n: (8.0 * (n & 1), 6.0 * (n >> 1 & 1), 2.7 - ANCHORS_M[n][2] + 0.3) for n in range(4)}

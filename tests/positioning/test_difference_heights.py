@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.air.masterless_packets import PairTdoa
-from skyless.positioning.fix import NoFixReason
-from skyless.positioning.integrity import Alert
-from skyless.positioning.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
+from skyless.core.air.masterless_packets import PairTdoa
+from skyless.core.fix import NoFixReason
+from skyless.core.integrity import Alert
+from skyless.research.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
 
 SEEN_FROM_ABOVE = ((0.0, 0.0), (8.0, 0.0), (8.0, 6.0), (0.0, 6.0), (4.0, 0.0), (4.0, 6.0))
 

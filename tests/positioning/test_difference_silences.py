@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from skyless.air.masterless_packets import PairTdoa
-from skyless.positioning.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
+from skyless.core.air.masterless_packets import PairTdoa
+from skyless.research.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
 
 ANCHORS_M = {n: (8.0 * (n & 1), 6.0 * (n >> 1 & 1), 0.3 + 2.4 * (n >> 2)) for n in range(8)}
 STD_M = 0.1

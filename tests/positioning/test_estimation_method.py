@@ -19,13 +19,12 @@ from estimator_builders import (
 )
 from msgspec.structs import replace
 
-from skyless.air.master_term import MasterTerm
-from skyless.constants import SUBTICKS, TICK_M, TICK_RATE_HZ
-from skyless.positioning.fix import Fix, NoFixReason
-from skyless.positioning.integrity import Alert
-from skyless.positioning.methods.joint import Estimation, MasterScale
-from skyless.positioning.observation import Observation
-from skyless.ticks import TICK_MASK
+from skyless.core.constants import SUBTICKS, TICK_M, TICK_RATE_HZ
+from skyless.core.fix import Fix, NoFixReason
+from skyless.core.integrity import Alert
+from skyless.core.observation import MasterTerm, Observation
+from skyless.core.tag.joint import Estimation, MasterScale
+from skyless.core.ticks import TICK_MASK
 
 CALM = Case(qa=0.02)
 MODULO = SUBTICKS * (TICK_MASK + 1)

@@ -7,7 +7,7 @@ import sys
 
 SCRIPT = """
 from estimator_builders import MESH, begun, episode_of, settings_of
-from skyless.positioning.estimator import estimator
+from skyless.core.estimator import estimator
 episode = episode_of(MESH, 4)
 begun(episode, settings_of(MESH)).track(episode.packets)
 print(estimator._process.inspect_llvm(estimator._process.signatures[0]))

@@ -23,9 +23,9 @@ from estimator_builders import (
 from msgspec.structs import replace
 from scipy.stats import binom, chi2
 
-from skyless.constants import TICK_M, TICK_S
-from skyless.positioning.estimator import faults
-from skyless.positioning.estimator.faults import (
+from skyless.core.constants import TICK_M, TICK_S
+from skyless.core.estimator import faults
+from skyless.core.estimator.faults import (
     CREEPING_S,
     OPENED_STD_M,
     RECENT_PACKETS,
@@ -36,8 +36,8 @@ from skyless.positioning.estimator.faults import (
     open_faults,
     whiten,
 )
-from skyless.positioning.estimator.levels import FIRST_TEST, LEVELS, protect
-from skyless.positioning.estimator.state import (
+from skyless.core.estimator.levels import FIRST_TEST, LEVELS, protect
+from skyless.core.estimator.state import (
     ALL_RANGE_ERRORS,
     CREEPING_STD_M,
     FAULT_KINDS,
@@ -46,7 +46,7 @@ from skyless.positioning.estimator.state import (
     RECENT_STD_M,
     with_anchor,
 )
-from skyless.positioning.integrity import CONTRADICTED, HPL, Alert, IntegrityRequirement, integrity_of, limits_of
+from skyless.core.integrity import CONTRADICTED, HPL, Alert, IntegrityRequirement, integrity_of, limits_of
 
 RISK = 1e-4
 LATE_M = 4 * TICK_M

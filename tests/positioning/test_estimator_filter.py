@@ -34,12 +34,12 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from textbook_filter import TextbookFilter
 
-from skyless.air.beacon import HEARD
-from skyless.constants import TICK_RATE_HZ, TICK_S
-from skyless.positioning.estimator.estimator import JOINED, REJECTED, STALE, Estimator, Packets
-from skyless.positioning.estimator.kalman import predict
-from skyless.positioning.estimator.levels import FIRST_TEST
-from skyless.positioning.estimator.state import (
+from skyless.core.air.frame import HEARD
+from skyless.core.constants import TICK_RATE_HZ, TICK_S
+from skyless.core.estimator.estimator import JOINED, REJECTED, STALE, Estimator, Packets
+from skyless.core.estimator.kalman import predict
+from skyless.core.estimator.levels import FIRST_TEST
+from skyless.core.estimator.state import (
     FAULT_KINDS,
     LASTING,
     EstimatorSettings,
@@ -48,8 +48,8 @@ from skyless.positioning.estimator.state import (
     with_anchor,
     without_anchor,
 )
-from skyless.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM
-from skyless.uncertainty.bounds import bound_settings, tracking_bound
+from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM
+from skyless.research.uncertainty.bounds import BoundSettings, tracking_bound
 
 BIASED = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
 """Errors of survey and ranges that a real room has."""
@@ -110,7 +110,7 @@ def test_the_covariance_is_the_bound_of_what_has_come_in(case):
     episode = episode_of(case, 100)
     run = tracked(begun(episode, settings_of(case)), episode.packets)
     noise = {"white_fm": WHITE_FM, "random_walk_fm": case.random_walk_fm, "qa": case.qa}
-    stage = bound_settings(
+    stage = BoundSettings(
         case.noise_ps * 1e-12,
         **noise,
         slot_s=SLOT_S,

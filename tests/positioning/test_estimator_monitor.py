@@ -23,13 +23,13 @@ from estimator_builders import (
 )
 from msgspec.structs import replace
 
-from skyless.clocks.filter import ClockFilter, clock_noise
-from skyless.constants import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_S
-from skyless.positioning.estimator.estimator import ACCEPTED, REJECTED, Report
-from skyless.positioning.estimator.measurements import REPORT_GAIN
-from skyless.positioning.estimator.monitor import gate_of
-from skyless.studies.episodes import WHITE_FM
-from skyless.ticks import TICK_MASK
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_S
+from skyless.core.estimator.estimator import ACCEPTED, REJECTED, Report
+from skyless.core.estimator.measurements import REPORT_GAIN
+from skyless.core.estimator.monitor import gate_of
+from skyless.core.kernels.filter import ClockFilter, clock_noise
+from skyless.core.ticks import TICK_MASK
+from skyless.research.studies.episodes import WHITE_FM
 
 ROOM_ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
 AGILE = Case(qa=0.3)

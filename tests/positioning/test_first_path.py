@@ -7,17 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.air.reception import Diagnostics
-from skyless.anchor import Anchor
-from skyless.positioning.fix import Fix
-from skyless.positioning.methods.observations import MAX_VARIANCE_FACTOR, variance_factor
-from skyless.receiver import Receiver
-from skyless.simulation.channel import ChannelModel, first_path_loss_db
-from skyless.simulation.impairments import AnchorBias, Impairments
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
-from skyless.site.lab import ideal_lab_site
+from skyless.core.air.reception import Diagnostics
+from skyless.core.fix import Fix
+from skyless.core.protocol1.anchor import Anchor
+from skyless.core.tag.any_receiver import AnyReceiver
+from skyless.core.tag.observations import MAX_VARIANCE_FACTOR, variance_factor
+from skyless.sim.impairments import AnchorBias, Impairments
+from skyless.sim.lab import paper_lab_site
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Static
+from skyless.sim.world import World
+from skyless.site.channel import ChannelModel, first_path_loss_db
 
 POWERS = st.floats(-150.0, 0.0)
 
@@ -58,12 +58,12 @@ def test_emulated_paths_show_what_real_ones_do(extra_m, least_db, most_db):
 
 def _squared(method, diagnostics, told, *, bias_m=0.0, nlos=0.0):
     """Squared and normalised errors of a tag that lies still, shape (fixes,), and all fixes as bytes."""
-    site = ideal_lab_site(100.0)
+    site = paper_lab_site(100.0)
     biases = (AnchorBias(2, bias_m),) if bias_m else ()
     channel = ChannelModel(nlos_probability=nlos)
     faults = Impairments(anchor_biases=biases, channel=channel, diagnostics=diagnostics)
     world = World(site, lambda anchor: Anchor(site, anchor), [TagSpec(Static(2.0, 3.0))], faults, 5)
-    receiver, squared, normalised, seen = Receiver(method), [], [], []
+    receiver, squared, normalised, seen = AnyReceiver(method), [], [], []
     for broadcast in world.run(4.0):
         for _, reception, truth_m in broadcast.receptions():
             heard = reception if told else type(reception)(reception.frame, reception.rx_ticks, reception.host_s)
@@ -94,9 +94,9 @@ def test_blocked_paths_that_show_cost_less(fault, least_gain):
 
 
 def test_radios_that_tell_nonsense_are_believed_as_those_that_tell_nothing():
-    site = ideal_lab_site(100.0)
+    site = paper_lab_site(100.0)
     world = World(site, lambda anchor: Anchor(site, anchor), [TagSpec(Static(2.0, 3.0))], Impairments(), 5)
-    plain, odd = Receiver("joint"), Receiver("joint")
+    plain, odd = AnyReceiver("joint"), AnyReceiver("joint")
     told = [
         Diagnostics(math.nan, -90.0),
         Diagnostics(None, -90.0),

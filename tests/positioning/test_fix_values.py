@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from skyless.positioning.fix import PROTECTED_ROWS, PROTECTION, QUALITY, Fix
-from skyless.positioning.integrity import CONTRADICTED, Alert, IntegrityRequirement
+from skyless.core.fix import PROTECTED_ROWS, PROTECTION, QUALITY, Fix
+from skyless.core.integrity import CONTRADICTED, Alert, IntegrityRequirement
 
 ANCHORS_M = np.eye(4, 3)
 

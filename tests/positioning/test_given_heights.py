@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from estimator_builders import MESH, ROOM_M, begun, episode_of, settings_of, tracked
 
-from skyless.positioning.integrity import HPL
+from skyless.core.integrity import HPL
 
 HEIGHT_STD_M = 0.3
 EPISODES = 40

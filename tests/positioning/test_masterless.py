@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import structs
 
-from skyless.air.masterless_packets import Packet, Relay
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
-from skyless.positioning.masterless.pair_engine import MOST_ANCHORS, PairEngine
+from skyless.core.air.masterless_packets import Packet, Relay
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
+from skyless.research.masterless.pair_engine import MAX_ANCHORS, PairEngine
 
 ANCHORS_M = {1: (0.0, 0.0, 1.0), 2: (0.0, 4.5, 1.0), 3: (4.5, 0.0, 1.2), 4: (4.5, 4.5, 1.5)}
 DELAY_TICKS = 16_475
@@ -196,7 +196,7 @@ def test_duplicates_and_stale_relays_are_counted():
 
 def test_the_engine_holds_a_bounded_number_of_anchors():
     engine = PairEngine()
-    for anchor in range(MOST_ANCHORS + 50):
+    for anchor in range(MAX_ANCHORS + 50):
         engine.on_packet(Packet(None, anchor, 1, 1, anchor * 1000, ()))
     assert engine.drops == {"too-many-anchors": 50}
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from estimator_builders import LAB_M, MESH, ROOM_M, begun, episode_of, settings_of, tracked
 
-from skyless.positioning.estimator.levels import is_side_open
-from skyless.positioning.fix import NoFixReason
-from skyless.positioning.integrity import SOUND, UNAVAILABLE
-from skyless.positioning.methods.locate import NoSolution, locate_pseudoranges
+from skyless.core.estimator.levels import is_side_open
+from skyless.core.fix import NoFixReason
+from skyless.core.integrity import SOUND, UNAVAILABLE
+from skyless.core.tag.locate import NoSolution, locate_pseudoranges
 
 ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03}
 

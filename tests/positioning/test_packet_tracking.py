@@ -8,10 +8,10 @@ import pytest
 from msgspec import structs
 
 import masterless_world as hall
-from skyless.positioning.fix import NoFixReason
-from skyless.positioning.masterless.anchor_errors import AnchorCalibration, DifferenceCalibration
-from skyless.positioning.masterless.packet_tracking import MASTERLESS, PacketTracking
-from skyless.recordings.foreign.bitcraze import decode_payload
+from skyless.core.fix import NoFixReason
+from skyless.radio.foreign.bitcraze import decode_payload
+from skyless.research.masterless.packet_tracking import MASTERLESS, PacketTracking
+from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
 
 SECONDS = 6.0
 SPEED_MPS = 1.0
@@ -98,7 +98,7 @@ def test_the_anchors_own_antenna_delays_are_found():
 
 
 def test_a_calibration_is_taken_off_instead():
-    """Biases as ``skyless calibrate`` finds them: half of an anchor's TX and RX delay, and more with the range."""
+    """Biases as ``skyless survey`` finds them: half of an anchor's TX and RX delay, and more with the range."""
     room, timed = capture("tdoa3", delay_scatter_ticks=60.0)
     halves_m = room.delays[: hall.TAG].sum(axis=1) / 2.0 * hall.SPEED_OF_LIGHT_MPS / hall.TICK_RATE_HZ
     known = {anchor: AnchorCalibration(float(halves_m[anchor] - halves_m.mean())) for anchor in hall.ANCHORS_M}

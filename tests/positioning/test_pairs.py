@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.positioning.masterless.difference_tracking import START_DIFFERENCE_STD_M, joined_tdoas
-from skyless.positioning.methods.locate import Solution, locate
+from skyless.core.tag.locate import Solution, locate
+from skyless.research.masterless.difference_tracking import START_DIFFERENCE_STD_M, joined_tdoas
 
 
 def _tdoas(anchors, p, pairs):

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.constants import TICK_M, TICK_RATE_HZ
-from skyless.positioning.methods.snapshots import (
+from skyless.core.constants import TICK_M, TICK_RATE_HZ
+from skyless.core.protocol1.snapshots import (
     bracketed_covariance,
     bracketed_tdoa,
     literal_covariance,

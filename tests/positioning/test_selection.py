@@ -1,16 +1,16 @@
 import pytest
 
-from skyless.air.beacon import HEARD
-from skyless.positioning.methods.selection import (
+from skyless.core.air.frame import HEARD
+from skyless.core.tag.selection import (
     BETTER_DB,
-    MOST_ANCHORS_IN_USE,
-    MOST_KEPT,
+    MAX_ANCHORS_IN_USE,
+    MAX_KEPT,
     RELAYED_TICKS,
     AnchorSelection,
     fitting_relays,
     is_full,
 )
-from skyless.ticks import from_seconds, wrap
+from skyless.core.ticks import from_seconds, wrap
 
 
 def relays(*anchors):
@@ -69,10 +69,10 @@ def test_memory_is_bounded():
         selection.add_relays(relays(anchor), anchor)
         selection.add_power(anchor, -80.0)
     state = selection.state()
-    assert len(state.relayed_ticks) == len(state.power_dbm) == MOST_KEPT
-    assert min(state.relayed_ticks) == 2000 - MOST_KEPT
+    assert len(state.relayed_ticks) == len(state.power_dbm) == MAX_KEPT
+    assert min(state.relayed_ticks) == 2000 - MAX_KEPT
 
 
 def test_full_with_24():
-    assert not is_full(range(MOST_ANCHORS_IN_USE - 1))
-    assert is_full(range(MOST_ANCHORS_IN_USE))
+    assert not is_full(range(MAX_ANCHORS_IN_USE - 1))
+    assert is_full(range(MAX_ANCHORS_IN_USE))

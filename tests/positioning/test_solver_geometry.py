@@ -11,8 +11,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from skyless.positioning.fix import NoFixReason
-from skyless.positioning.methods.locate import (
+from skyless.core.dop import dilution_of_precision
+from skyless.core.fix import NoFixReason
+from skyless.core.tag.locate import (
     GAIN_TOLERANCE,
     NoSolution,
     PseudorangeSolution,
@@ -21,7 +22,6 @@ from skyless.positioning.methods.locate import (
     locate_pseudoranges,
     mean_if_positive,
 )
-from skyless.uncertainty.dop import dilution_of_precision
 
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -326,7 +326,7 @@ def test_a_singular_covariance_is_refused():
 
 
 def test_iterations_that_do_not_settle_are_told(monkeypatch):
-    from skyless.positioning.methods import locate as minima
+    from skyless.core.tag import locate as minima
 
     monkeypatch.setattr(minima, "descend", lambda *_: (minima.EXHAUSTED, 100))
     refused(locate(LAB, np.zeros(5), sigma(5), height_m=0), NoFixReason.NOT_CONVERGED)
@@ -379,8 +379,8 @@ WITHOUT_COMPILER = """
 import sys, warnings
 warnings.simplefilter("error")
 import numpy as np
-from skyless.positioning.methods.locate import locate, NoSolution
-from skyless.uncertainty.dop import dops_at
+from skyless.core.tag.locate import locate, NoSolution
+from skyless.core.dop import dops_at
 draw = np.random.default_rng(9)
 anchors = draw.uniform(0, 8, (7, 3))
 for kind in range(4):

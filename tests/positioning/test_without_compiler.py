@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from skyless.evaluation.scenarios import Request, fleet_of
-from skyless.site.lab import ideal_lab_site
+from skyless.sim.evaluation.scenarios import Request, fleet_of
+from skyless.sim.lab import paper_lab_site
 
 
 def positions(until_s=0.25):
     """All positions of a tag by three methods, through anchors, ether and receiver."""
     found = {}
     for method in ("literal", "bracketed", "joint"):
-        fleet = fleet_of(Request(ideal_lab_site(), method=method, positions_m=((3.0, 4.0),)))
+        fleet = fleet_of(Request(paper_lab_site(), method=method, positions_m=((3.0, 4.0),)))
         found[method] = [judged.fix.position_m.tolist() for judged in fleet.run(until_s)]
     return found
 

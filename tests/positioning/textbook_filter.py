@@ -8,9 +8,9 @@ from itertools import pairwise, permutations
 
 import numpy as np
 
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.positioning.estimator.measurements import HELD_MOST_M, HELD_SHARE, HELD_STD, HELD_STEP_M, PAIR_RELAYS
-from skyless.positioning.estimator.state import OPEN_PAIR_STD_M
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.core.estimator.measurements import HELD_MAX_M, HELD_SHARE, HELD_STD, HELD_STEP_M, PAIR_RELAYS
+from skyless.core.estimator.state import OPEN_PAIR_STD_M
 
 
 class Newest:
@@ -88,7 +88,7 @@ class TextbookFilter:
         given_m = [] if self.dim == 3 else [self.settings.height_m]
         place_m, trace = np.append(self.x[self.p], given_m), np.trace(self.P[: self.dim, : self.dim])
         step_m = min(HELD_STEP_M, HELD_SHARE * np.linalg.norm(place_m - self.anchors_m[anchor]))
-        step_m = max(step_m, min(HELD_STD * trace**0.5, HELD_MOST_M))
+        step_m = max(step_m, min(HELD_STD * trace**0.5, HELD_MAX_M))
         if not any((self.settings.survey_std_m, self.settings.range_std_m, self.settings.height_std_m)):
             step_m = 0.0  # exact ranges leave nothing open
         if not np.linalg.norm(place_m - self.held_m.get(anchor, np.nan)) <= step_m:

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from skyless.cli import small_runs
+from skyless.cli import warm
 from skyless.cli.main import program
-from skyless.mqtt.access import Role
+from skyless.run.mqtt.access import Role
 
 ROOT = Path(__file__).parents[2]
 COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text(encoding="utf-8"))
@@ -30,7 +30,7 @@ def commands():
         )
         line = re.sub(r"\$\{\w*LIMIT\w*}", "1000", re.sub(r"%i", "1", line))
         yield pytest.param(shlex.split(line), id=unit.name)
-    for name, lines in small_runs._RUNS.items():
+    for name, lines in warm.RUNS.items():
         yield from (pytest.param(shlex.split(line), id=f"warm {name}: {line}") for line in lines)
     yield pytest.param(json.loads(re.findall(r"^CMD (.*)$", DOCKERFILE, re.MULTILINE)[0]), id="image")
     yield pytest.param(

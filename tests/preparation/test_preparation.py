@@ -13,13 +13,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from skyless.kernels.cache import KernelFolder
-from skyless.preparation import processes
-from skyless.preparation.parts import LAB, SIMULATED, Part, parts_of
-from skyless.preparation.processes import Preparation, compile_parts, missing
+from skyless.core.kernels import processes
+from skyless.core.kernels.cache import KernelFolder
+from skyless.core.kernels.processes import LAB, SIMULATED, Part, Preparation, compile_parts, missing, parts_of
 
 TINY = """
-from skyless.kernels.compiled import kernel
+from skyless.core.kernels.compiled import kernel
 
 @kernel
 def first(value: float) -> float:
@@ -159,7 +158,7 @@ NOTHING_NEW = """
 import json
 from numba.core import event
 from skyless.cli.common.progress import loading_kernels
-from skyless.preparation.parts import LAB, parts_of
+from skyless.core.kernels.processes import LAB, parts_of
 
 compiled = []
 
@@ -172,8 +171,8 @@ class Listener(event.Listener):
 
 with loading_kernels(*LAB):
     event.register("numba:compile", Listener())
-    from skyless.evaluation.compile_ahead import compile_kernels
-    from skyless.method_names import METHODS
+    from skyless.research.compile_ahead import compile_kernels
+    from skyless.core.method_names import METHODS
 
     for method in METHODS:
         compile_kernels(method)

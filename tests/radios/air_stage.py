@@ -2,13 +2,13 @@
 
 import asyncio
 
-from skyless.constants import TICK_RATE_HZ
-from skyless.evaluation.scenarios import Request, impairments_of
-from skyless.nodes.ether import Ether
-from skyless.radios.ether_wire import Join, Joined, Send
-from skyless.simulation.trajectory import Static
-from skyless.site.lab import lab_site
-from skyless.ticks import wrap
+from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.ticks import wrap
+from skyless.radio.ether_wire import Join, Joined, Send
+from skyless.run.ether import Ether
+from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.lab import lab_site
+from skyless.sim.trajectory import Static
 
 LAB = lab_site()
 TAGS = {"tag1": Static(2.0, 3.0), "tag2": Static(4.0, 5.0)}

@@ -2,12 +2,12 @@
 
 from collections import Counter
 
-from skyless.air.reception import Diagnostics, Reception, Transmission
-from skyless.constants import TICK_S
-from skyless.radios.dw1000.radio import ChipSession
-from skyless.radios.interface import AntennaDelays, Sent
-from skyless.simulation.dw1000.chip import Chip, ModelBus
-from skyless.ticks import wrap
+from skyless.core.air.reception import Diagnostics, Reception, Transmission
+from skyless.core.constants import TICK_S
+from skyless.core.ticks import wrap
+from skyless.radio.dw1000.radio import ChipSession
+from skyless.radio.interface import AntennaDelays, Sent
+from skyless.sim.dw1000.chip import Chip, ModelBus
 
 DELAYS = AntennaDelays()
 

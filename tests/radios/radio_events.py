@@ -1,7 +1,9 @@
-"""Radios that run, and all that they tell."""
+"""Radios that run, all that they tell, and the fixes that come of it."""
 
 import asyncio
 import contextlib
+
+from skyless.core.tag.any_receiver import AnyReceiver
 
 
 class RadioEvents:
@@ -33,3 +35,17 @@ async def radio_events(radio):
         yield node
     finally:
         await node.stop()
+
+
+def fixes_of(heard, method="joint"):
+    """All that a receiver says of each reception, to the last bit, and its counters."""
+    receiver = AnyReceiver(method)
+    return [_bits(fix) for fix in map(receiver.hear, heard)], receiver.counters
+
+
+def _bits(fix):
+    if fix is None:
+        return None
+    arrays = (fix.position_m, fix.covariance_m2, fix.velocity_mps, fix.velocity_covariance)
+    rest = (fix.time_s, fix.std_m, fix.dops, fix.anchors, fix.chi2, fix.dof, fix.hpl_m, fix.vpl_m, fix.alert)
+    return tuple(None if array is None else array.tobytes() for array in arrays), rest

@@ -5,11 +5,11 @@ from collections import Counter
 
 from radio_events import radio_events
 
-from skyless.nodes.board import LinkProtocol
-from skyless.radios.interface import Restarted
-from skyless.radios.serial.link_records import from_steps, to_steps
-from skyless.radios.serial.pseudo_terminal import Pty
-from skyless.radios.serial.serial_radio import SerialRadio
+from skyless.radio.interface import Restarted
+from skyless.radio.serial.link import from_steps, to_steps
+from skyless.radio.serial.pseudo_terminal import Pty
+from skyless.radio.serial.serial_radio import SerialRadio
+from skyless.run.board import LinkProtocol
 
 
 def quantised(diagnostics):

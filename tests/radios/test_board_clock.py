@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from skyless.constants import TICK_RATE_HZ
-from skyless.radios.serial.serial_port import MAX_BOARD_DRIFT, BoardClock
-from skyless.ticks import difference, wrap
+from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.ticks import difference, wrap
+from skyless.radio.serial.serial_port import MAX_BOARD_DRIFT, BoardClock
 
 
 @pytest.mark.parametrize("drift_ppm", [-45.0, 0.0, 45.0])

@@ -5,12 +5,12 @@ from hypothesis import event, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from skyless.air.ieee802154 import after_rmarker_s, fcs
-from skyless.air.reception import Diagnostics, Reception, Transmission
-from skyless.radios.dw1000 import driver as dw1000
-from skyless.radios.interface import AntennaDelays, Late, Sent
-from skyless.simulation.dw1000 import registers as r
-from skyless.ticks import from_seconds, wrap
+from skyless.core.air.ieee802154 import after_rmarker_s, fcs
+from skyless.core.air.reception import Diagnostics, Reception, Transmission
+from skyless.core.ticks import from_seconds, wrap
+from skyless.radio.dw1000 import driver as dw1000
+from skyless.radio.interface import AntennaDelays, Late, Sent
+from skyless.sim.dw1000 import registers as r
 
 DELAYS = AntennaDelays(16_500, 16_300)
 FAULTS = st.sampled_from([None, None, None, "header", "parity", "delimiter", "first-path", "fcs"])

@@ -12,18 +12,18 @@ from air_stage import LAB, make_ether
 from chip_stage import HandClock, TimedNode
 from radio_events import radio_events
 
-from skyless.air.ieee802154 import fcs
-from skyless.air.reception import Diagnostics, Reception, Transmission
-from skyless.constants import TICK_RATE_HZ
-from skyless.errors import SkylessError
-from skyless.evaluation.compile_ahead import compile_kernels
-from skyless.nodes.open_radio import is_simulated, open_radios
-from skyless.radios.dw1000 import spi
-from skyless.radios.dw1000.radio import Dw1000Radio
-from skyless.radios.dw1000.spi import SpiPort
-from skyless.radios.interface import AntennaDelays, Gone, Hint, Late, Restarted, Sent
-from skyless.simulation.dw1000.chip import ModelBus
-from skyless.ticks import difference, wrap
+from skyless.core.air.ieee802154 import fcs
+from skyless.core.air.reception import Diagnostics, Reception, Transmission
+from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.errors import SkylessError
+from skyless.core.ticks import difference, wrap
+from skyless.radio.dw1000 import spi
+from skyless.radio.dw1000.radio import Dw1000Radio
+from skyless.radio.dw1000.spi import SpiPort
+from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Restarted, Sent
+from skyless.research.compile_ahead import compile_kernels
+from skyless.run.open_radio import is_simulated, open_radios
+from skyless.sim.dw1000.chip import ModelBus
 
 
 @pytest.fixture(scope="module")
@@ -32,36 +32,33 @@ def compiled():
 
 
 @pytest.mark.usefixtures("compiled")
-def test_frames_fly_between_models_on_the_emulated_air_and_late_ones_do_not():
-    async def play():
-        ether = make_ether(asyncio.get_running_loop().time)
-        server = await ether.serve("127.0.0.1", 0)
-        place = f"model:127.0.0.1:{server.sockets[0].getsockname()[1]}"
-        (anchor,) = open_radios(place, "anchor", (str(LAB.anchors[0].id),), [AntennaDelays()])
-        (tag,) = open_radios(place, "tag", ("tag1",))
-        async with radio_events(anchor) as sender, radio_events(tag) as listener:
-            await sender.until(Restarted)
-            await listener.until(Restarted)
-            for number in range(20):
-                now_ticks = anchor.now_ticks()
-                tx_ticks = wrap((now_ticks + round(0.02 * TICK_RATE_HZ)) & ~0x1FF) + 16_436
-                body = b"frame %d  " % number
-                anchor.transmit(Transmission(body, wrap(tx_ticks)))
-                async with asyncio.timeout(10):
-                    while len(sender.of(Sent)) + len(sender.of(Late)) <= number:
-                        await asyncio.sleep(0.002)
-            assert len(sender.of(Sent)) > 5
-            await listener.until(Reception)
-            assert listener.of(Reception)[0].frame.startswith(b"frame ")
-            late = len(sender.of(Late))
-            anchor.transmit(Transmission(b"too late", anchor.now_ticks()))
-            assert len(sender.of(Late)) == late + 1
-            assert not +tag._port.chip.misuse
-            assert not +anchor._port.chip.misuse
-        server.close()
-        ether._timer.cancel()
-
-    asyncio.run(play())
+async def test_frames_fly_between_models_on_the_emulated_air_and_late_ones_do_not():
+    ether = make_ether(asyncio.get_running_loop().time)
+    server = await ether.serve("127.0.0.1", 0)
+    place = f"model:127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    (anchor,) = open_radios(place, "anchor", (str(LAB.anchors[0].id),), [AntennaDelays()])
+    (tag,) = open_radios(place, "tag", ("tag1",))
+    async with radio_events(anchor) as sender, radio_events(tag) as listener:
+        await sender.until(Restarted)
+        await listener.until(Restarted)
+        for number in range(20):
+            now_ticks = anchor.now_ticks()
+            tx_ticks = wrap((now_ticks + round(0.02 * TICK_RATE_HZ)) & ~0x1FF) + 16_436
+            body = b"frame %d  " % number
+            anchor.transmit(Transmission(body, wrap(tx_ticks)))
+            async with asyncio.timeout(10):
+                while len(sender.of(Sent)) + len(sender.of(Late)) <= number:
+                    await asyncio.sleep(0.002)
+        assert len(sender.of(Sent)) > 5
+        await listener.until(Reception)
+        assert listener.of(Reception)[0].frame.startswith(b"frame ")
+        late = len(sender.of(Late))
+        anchor.transmit(Transmission(b"too late", anchor.now_ticks()))
+        assert len(sender.of(Late)) == late + 1
+        assert not +tag._port.chip.misuse
+        assert not +anchor._port.chip.misuse
+    server.close()
+    ether._timer.cancel()
 
 
 class PlayedSpi(ModelBus):
@@ -94,80 +91,62 @@ def spi_radio(monkeypatch, bus=PlayedSpi):
     return Dw1000Radio(SpiPort("/dev/spidev0.0", open_bus), "tag1", AntennaDelays()), node, buses
 
 
-def test_a_chip_on_spi_is_asked_where_it_has_no_interrupt_line_and_found_again(monkeypatch):
+async def test_a_chip_on_spi_is_asked_where_it_has_no_interrupt_line_and_found_again(monkeypatch):
     radio, node, buses = spi_radio(monkeypatch)
-
-    async def play():
-        async with radio_events(radio) as host:
-            await host.until(Restarted)
-            assert abs(difference(radio.now_ticks(), node.air.now_ticks())) < 512
-            node.air.pass_s(1e-3)
-            node.chip.receive(b"\x01\x02\x03\x2a\x14", node.air.now_ticks(), Diagnostics(-80.0))
-            buses[0].broken = True
-            assert "Input/output error" in (await host.until(Gone)).reason
-            assert radio.now_ticks() is None
-            radio.transmit(Transmission(b"frame", 1))
-            assert host.events[-1] == Late(1)
-            await host.until(Restarted, 2)
-            assert buses[0].closed
-        assert buses[-1].closed
-
-    asyncio.run(play())
+    async with radio_events(radio) as host:
+        await host.until(Restarted)
+        assert abs(difference(radio.now_ticks(), node.air.now_ticks())) < 512
+        node.air.pass_s(1e-3)
+        node.chip.receive(b"\x01\x02\x03\x2a\x14", node.air.now_ticks(), Diagnostics(-80.0))
+        buses[0].broken = True
+        assert "Input/output error" in (await host.until(Gone)).reason
+        assert radio.now_ticks() is None
+        radio.transmit(Transmission(b"frame", 1))
+        assert host.events[-1] == Late(1)
+        await host.until(Restarted, 2)
+        assert buses[0].closed
+    assert buses[-1].closed
 
 
-def test_a_chip_whose_supply_failed_is_started_again_even_where_it_logs_nothing(monkeypatch):
+async def test_a_chip_whose_supply_failed_is_started_again_even_where_it_logs_nothing(monkeypatch):
     radio, node, _ = spi_radio(monkeypatch)
-    monkeypatch.setattr("skyless.radios.dw1000.radio.CHECK_S", 0.01)
-
-    async def play():
-        async with radio_events(radio) as host:
-            for time_s in (1, 2):
-                await host.until(Restarted, time_s)
-                if time_s == 1:
-                    node.chip.pull_reset()
-                    node.air.pass_s(1e-3)
-            assert "lost its configuration" in host.of(Gone)[0].reason
-            assert radio.counters["chip-lost"] == 1
-
-    asyncio.run(play())
+    monkeypatch.setattr("skyless.radio.dw1000.radio.CHECK_S", 0.01)
+    async with radio_events(radio) as host:
+        for time_s in (1, 2):
+            await host.until(Restarted, time_s)
+            if time_s == 1:
+                node.chip.pull_reset()
+                node.air.pass_s(1e-3)
+        assert "lost its configuration" in host.of(Gone)[0].reason
+        assert radio.counters["chip-lost"] == 1
 
 
-def test_a_chip_that_is_missed_by_the_looks_after_it_is_found_again(monkeypatch):
+async def test_a_chip_that_is_missed_by_the_looks_after_it_is_found_again(monkeypatch):
     radio, _, buses = spi_radio(monkeypatch)
-    monkeypatch.setattr("skyless.radios.dw1000.radio.CHECK_S", 0.01)
+    monkeypatch.setattr("skyless.radio.dw1000.radio.CHECK_S", 0.01)
     monkeypatch.setattr(spi, "CHIP_POLL_S", 0.2)  # so that the look after it comes first
-
-    async def play():
-        async with radio_events(radio) as host:
-            await host.until(Restarted)
-            buses[0].broken = True
-            await host.until(Restarted, 2)
-            assert [gone.reason for gone in host.of(Gone)] == ["/dev/spidev0.0: [Errno 5] Input/output error"]
-            assert buses[0].closed
-
-    asyncio.run(play())
+    async with radio_events(radio) as host:
+        await host.until(Restarted)
+        buses[0].broken = True
+        await host.until(Restarted, 2)
+        assert [gone.reason for gone in host.of(Gone)] == ["/dev/spidev0.0: [Errno 5] Input/output error"]
+        assert buses[0].closed
 
 
-def test_a_bus_that_fails_while_a_frame_is_overdue_is_opened_again(monkeypatch):
+async def test_a_bus_that_fails_while_a_frame_is_overdue_is_opened_again(monkeypatch):
     radio, node, _ = spi_radio(monkeypatch)
     faults = []
-
-    async def play():
-        asyncio.get_running_loop().set_exception_handler(lambda _loop, context: faults.append(context))
-        async with radio_events(radio) as host:
-            await host.until(Restarted)
-            session = radio._session
-            radio.transmit(Transmission(b"frame", wrap((node.air.now_ticks() + (1 << 26) & ~0x1FF) + 16_436)))
-            monkeypatch.setattr(
-                session, "cancel_overdue", lambda: (_ for _ in ()).throw(OSError(5, "Input/output error"))
-            )
-            node.air.pass_s(5e-3)
-            radio._on_overdue(session)
-            await host.until(Restarted, 2)
-            assert len(host.of(Gone)) == 1
-        assert not faults
-
-    asyncio.run(play())
+    asyncio.get_running_loop().set_exception_handler(lambda _loop, context: faults.append(context))
+    async with radio_events(radio) as host:
+        await host.until(Restarted)
+        session = radio._session
+        radio.transmit(Transmission(b"frame", wrap((node.air.now_ticks() + (1 << 26) & ~0x1FF) + 16_436)))
+        monkeypatch.setattr(session, "cancel_overdue", lambda: (_ for _ in ()).throw(OSError(5, "Input/output error")))
+        node.air.pass_s(5e-3)
+        radio._on_overdue(session)
+        await host.until(Restarted, 2)
+        assert len(host.of(Gone)) == 1
+    assert not faults
 
 
 class LinedSpi(PlayedSpi):
@@ -209,82 +188,66 @@ def hear(node, data):
     node.chip.receive(data + fcs(data), node.air.now_ticks(), Diagnostics(-80.0))
 
 
-def test_an_interrupt_line_that_is_stuck_is_reported_once_and_the_chip_is_asked_at_intervals(monkeypatch):
+async def test_an_interrupt_line_that_is_stuck_is_reported_once_and_the_chip_is_asked_at_intervals(monkeypatch):
     """Without a bound every turn of the loop asks the chip: thousands of times in these 0.2 s."""
     radio, node, buses = spi_radio(monkeypatch, LinedSpi)
     monkeypatch.setattr(spi, "CHIP_POLL_S", 0.02)
-
-    async def play():
-        async with radio_events(radio) as host:
-            await host.until(Restarted)
-            buses[0].stuck = True
-            hint = await host.until(Hint)
-            assert "the interrupt line of /dev/spidev0.0 rises though" in hint.text
-            looks, begun_s = buses[0].looks, time.monotonic()
-            await asyncio.sleep(0.2)
-            assert buses[0].looks - looks <= (time.monotonic() - begun_s) / 0.02 + 1
-            hear(node, b"it is heard all the same")
-            assert (await host.until(Reception)).frame.startswith(b"it is heard")
-            buses[0].stuck = False
-            looks = buses[0].looks
-            async with asyncio.timeout(30):
-                while buses[0].looks < looks + 3:  # back to waiting for the line
-                    await asyncio.sleep(0.002)
-            buses[0].stuck = True
-            async with asyncio.timeout(30):
-                while radio.counters["irq-in-vain"] < 2:
-                    await asyncio.sleep(0.002)
-            assert len(host.of(Hint)) == 1
-            assert len(host.of(Restarted)) == 1
-
-    asyncio.run(play())
+    async with radio_events(radio) as host:
+        await host.until(Restarted)
+        buses[0].stuck = True
+        hint = await host.until(Hint)
+        assert "the interrupt line of /dev/spidev0.0 rises though" in hint.text
+        looks, begun_s = buses[0].looks, time.monotonic()
+        await asyncio.sleep(0.2)
+        assert buses[0].looks - looks <= (time.monotonic() - begun_s) / 0.02 + 1
+        hear(node, b"it is heard all the same")
+        assert (await host.until(Reception)).frame.startswith(b"it is heard")
+        buses[0].stuck = False
+        looks = buses[0].looks
+        async with asyncio.timeout(30):
+            while buses[0].looks < looks + 3:  # back to waiting for the line
+                await asyncio.sleep(0.002)
+        buses[0].stuck = True
+        async with asyncio.timeout(30):
+            while radio.counters["irq-in-vain"] < 2:
+                await asyncio.sleep(0.002)
+        assert len(host.of(Hint)) == 1
+        assert len(host.of(Restarted)) == 1
 
 
-def test_an_interrupt_line_that_picks_up_noise_is_reported_and_does_not_make_the_program_spin(monkeypatch):
+async def test_an_interrupt_line_that_picks_up_noise_is_reported_and_does_not_make_the_program_spin(monkeypatch):
     radio, _, buses = spi_radio(monkeypatch, LinedSpi)
     monkeypatch.setattr(spi, "CHIP_POLL_S", 0.02)
-
-    async def play():
-        async with radio_events(radio) as host:
-            await host.until(Restarted)
-            buses[0].noisy = True
-            buses[0].rise()
-            await host.until(Hint)
-            looks, begun_s = buses[0].looks, time.monotonic()
-            await asyncio.sleep(0.2)
-            assert buses[0].looks - looks <= (time.monotonic() - begun_s) / 0.02 + 1
-            assert radio.counters["irq-in-vain"] == 1
-
-    asyncio.run(play())
+    async with radio_events(radio) as host:
+        await host.until(Restarted)
+        buses[0].noisy = True
+        buses[0].rise()
+        await host.until(Hint)
+        looks, begun_s = buses[0].looks, time.monotonic()
+        await asyncio.sleep(0.2)
+        assert buses[0].looks - looks <= (time.monotonic() - begun_s) / 0.02 + 1
+        assert radio.counters["irq-in-vain"] == 1
 
 
-def test_an_interrupt_line_that_is_high_for_good_reason_is_not_called_stuck(monkeypatch):
+async def test_an_interrupt_line_that_is_high_for_good_reason_is_not_called_stuck(monkeypatch):
     radio, node, buses = spi_radio(monkeypatch, LinedSpi)
-
-    async def play():
-        async with radio_events(radio) as host:
-            await host.until(Restarted)
-            for number in range(3 * spi.MOST_VAIN_INTERRUPTS):
-                hear(node, b"frame %d" % number)
-                buses[0].rise()
-                await host.until(Reception, number + 1)
-            assert not +radio.counters
-            assert host.of(Hint) == []
-
-    asyncio.run(play())
+    async with radio_events(radio) as host:
+        await host.until(Restarted)
+        for number in range(3 * spi.MAX_VAIN_INTERRUPTS):
+            hear(node, b"frame %d" % number)
+            buses[0].rise()
+            await host.until(Reception, number + 1)
+        assert not +radio.counters
+        assert host.of(Hint) == []
 
 
-def test_what_answers_but_is_no_dw1000_is_reported_in_words(monkeypatch):
+async def test_what_answers_but_is_no_dw1000_is_reported_in_words(monkeypatch):
     radio, node, _ = spi_radio(monkeypatch)
     monkeypatch.setattr(node.chip, "transfer", lambda out, _hz: b"\xff" * len(out))
-
-    async def play():
-        async with radio_events(radio) as host:
-            assert "/dev/spidev0.0" in (await host.until(Gone)).reason
-            await asyncio.sleep(0.05)
-            assert len(host.events) == 1
-
-    asyncio.run(play())
+    async with radio_events(radio) as host:
+        assert "/dev/spidev0.0" in (await host.until(Gone)).reason
+        await asyncio.sleep(0.05)
+        assert len(host.events) == 1
 
 
 @pytest.mark.parametrize(
@@ -371,7 +334,7 @@ def test_a_device_file_that_may_not_be_opened_is_reported_at_the_start(monkeypat
         open_radios("spi:0.0,irq=25", "tag", ("tag1",))
 
 
-def test_what_fails_once_it_has_started_is_tried_again(monkeypatch):
+async def test_what_fails_once_it_has_started_is_tried_again(monkeypatch):
     radio, _, buses = spi_radio(monkeypatch)
     whole, failures = radio._port._open_bus, []
 
@@ -382,13 +345,9 @@ def test_what_fails_once_it_has_started_is_tried_again(monkeypatch):
         return whole()
 
     radio._port._open_bus = open_bus
-
-    async def play():
-        async with radio_events(radio) as host:
-            await host.until(Restarted)
-            assert (len(host.of(Gone)), len(failures), len(buses)) == (1, 3, 1)
-
-    asyncio.run(play())
+    async with radio_events(radio) as host:
+        await host.until(Restarted)
+        assert (len(host.of(Gone)), len(failures), len(buses)) == (1, 3, 1)
 
 
 @pytest.mark.usefixtures("pi")

@@ -9,14 +9,14 @@ import pytest
 from air_stage import make_ether
 from radio_events import radio_events
 
-from skyless.air.reception import Reception, Transmission
-from skyless.constants import TICK_RATE_HZ
-from skyless.errors import SkylessError
-from skyless.nodes.ether import Client
-from skyless.nodes.open_radio import host_and_port, is_simulated, open_radios
-from skyless.radios.ether_wire import Join, Joined, Refused, Send, Unpacker, from_ether, pack
-from skyless.radios.interface import Gone, Late, Restarted, Sent
-from skyless.ticks import difference, wrap
+from skyless.core.air.reception import Reception, Transmission
+from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.errors import SkylessError
+from skyless.core.ticks import difference, wrap
+from skyless.radio.ether_wire import Join, Joined, Refused, Send, Unpacker, from_ether, pack
+from skyless.radio.interface import Gone, Late, Restarted, Sent
+from skyless.run.ether import Client
+from skyless.run.open_radio import host_and_port, is_simulated, open_radios
 
 HOST = "127.0.0.1"
 WORD = b"a frame" * 10
@@ -88,123 +88,102 @@ async def speak(node, listener):
     raise AssertionError("no frame was in time")
 
 
-def test_frames_go_from_radio_to_radio_with_stamps_diagnostics_and_the_time_of_the_host():
-    async def play():
-        async with (
-            OpenAir() as air,
-            nodes(air.port, "anchor", "1") as (anchor,),
-            nodes(air.port, "tag", "tag1") as (tag,),
-        ):
-            assert anchor.radio.now_ticks() is None
+async def test_frames_go_from_radio_to_radio_with_stamps_diagnostics_and_the_time_of_the_host():
+    async with (
+        OpenAir() as air,
+        nodes(air.port, "anchor", "1") as (anchor,),
+        nodes(air.port, "tag", "tag1") as (tag,),
+    ):
+        assert anchor.radio.now_ticks() is None
+        await anchor.until(Restarted)
+        await tag.until(Restarted)
+        await speak(anchor, tag)
+        reception = tag.of(Reception)[-1]
+        before_s, now_ticks, after_s = time.monotonic(), tag.radio.now_ticks(), time.monotonic()
+        assert reception.frame == WORD
+        assert 0.0 <= before_s - reception.host_s < 10.0
+        # the stamp and the counter belong together: the RMARKER was 0.1 ms before the frame's end
+        since_s = difference(now_ticks, reception.rx_ticks) / TICK_RATE_HZ
+        assert before_s - reception.host_s - 5e-3 < since_s < after_s - reception.host_s + 5e-3
+        measured = reception.diagnostics
+        assert -110.0 < measured.first_path_power_dbm <= measured.rx_power_dbm < -40.0
+        assert 0.0 < abs(measured.carrier_offset_ppm) < 50.0
+
+
+async def test_a_counter_goes_with_its_crystal():
+    async with OpenAir() as air, nodes(air.port, "anchor", "1") as (anchor,):
+        await anchor.until(Restarted)
+        begins_s, begin = [time.monotonic()], anchor.radio.now_ticks()
+        begins_s.append(time.monotonic())
+        await asyncio.sleep(0.5)
+        ends_s, end = [time.monotonic()], anchor.radio.now_ticks()
+        ends_s.append(time.monotonic())
+        passed_s = difference(end, begin) / TICK_RATE_HZ
+        assert ends_s[0] - begins_s[1] - 1e-3 < passed_s < ends_s[1] - begins_s[0] + 1e-3
+
+
+async def test_a_late_frame_is_reported_late_and_the_radio_goes_on():
+    async with anchor_and_tag("1") as (air, anchor, tag):
+        tx_ticks = ahead(anchor.radio, -1e-3)
+        anchor.radio.transmit(Transmission(WORD, tx_ticks))
+        assert await anchor.until(Late) == Late(tx_ticks)
+        await speak(anchor, tag)
+        assert air.ether.health(0.0).late >= 1
+
+
+async def test_radios_of_one_process_share_a_connection():
+    async with OpenAir() as air, nodes(air.port, "anchor", "3", "1") as (three, one):
+        await three.until(Restarted)
+        await one.until(Restarted)
+        assert len(air.clients) == 1
+        assert three.radio.now_ticks() != one.radio.now_ticks()
+        await speak(three, one)
+        assert one.of(Sent) == three.of(Reception) == []
+
+
+async def test_a_radio_finds_an_ether_that_starts_late_and_one_that_starts_again():
+    async with OpenAir() as air:
+        port = air.port
+    async with nodes(port, "anchor", "1") as (anchor,), nodes(port, "tag", "tag1") as (tag,):
+        gone = await anchor.until(Gone)
+        assert str(port) in gone.reason
+        anchor.radio.transmit(Transmission(WORD, 5))
+        assert anchor.events[-1] == Late(5)  # without an ether everything is late
+        async with OpenAir(port):
             await anchor.until(Restarted)
             await tag.until(Restarted)
             await speak(anchor, tag)
-            reception = tag.of(Reception)[-1]
-            before_s, now_ticks, after_s = time.monotonic(), tag.radio.now_ticks(), time.monotonic()
-            assert reception.frame == WORD
-            assert 0.0 <= before_s - reception.host_s < 10.0
-            # the stamp and the counter belong together: the RMARKER was 0.1 ms before the frame's end
-            since_s = difference(now_ticks, reception.rx_ticks) / TICK_RATE_HZ
-            assert before_s - reception.host_s - 5e-3 < since_s < after_s - reception.host_s + 5e-3
-            measured = reception.diagnostics
-            assert -110.0 < measured.first_path_power_dbm <= measured.rx_power_dbm < -40.0
-            assert 0.0 < abs(measured.carrier_offset_ppm) < 50.0
-
-    asyncio.run(play())
-
-
-def test_a_counter_goes_with_its_crystal():
-    async def play():
-        async with OpenAir() as air, nodes(air.port, "anchor", "1") as (anchor,):
-            await anchor.until(Restarted)
-            begins_s, begin = [time.monotonic()], anchor.radio.now_ticks()
-            begins_s.append(time.monotonic())
-            await asyncio.sleep(0.5)
-            ends_s, end = [time.monotonic()], anchor.radio.now_ticks()
-            ends_s.append(time.monotonic())
-            passed_s = difference(end, begin) / TICK_RATE_HZ
-            assert ends_s[0] - begins_s[1] - 1e-3 < passed_s < ends_s[1] - begins_s[0] + 1e-3
-
-    asyncio.run(play())
-
-
-def test_a_late_frame_is_reported_late_and_the_radio_goes_on():
-    async def play():
-        async with anchor_and_tag("1") as (air, anchor, tag):
-            tx_ticks = ahead(anchor.radio, -1e-3)
-            anchor.radio.transmit(Transmission(WORD, tx_ticks))
-            assert await anchor.until(Late) == Late(tx_ticks)
+        await anchor.until(Gone, 2)
+        assert anchor.radio.now_ticks() is None
+        async with OpenAir(port):
+            await anchor.until(Restarted, 2)
+            await tag.until(Restarted, 2)
             await speak(anchor, tag)
-            assert air.ether.health(0.0).late >= 1
-
-    asyncio.run(play())
-
-
-def test_radios_of_one_process_share_a_connection():
-    async def play():
-        async with OpenAir() as air, nodes(air.port, "anchor", "3", "1") as (three, one):
-            await three.until(Restarted)
-            await one.until(Restarted)
-            assert len(air.clients) == 1
-            assert three.radio.now_ticks() != one.radio.now_ticks()
-            await speak(three, one)
-            assert one.of(Sent) == three.of(Reception) == []
-
-    asyncio.run(play())
+        await asyncio.sleep(0.7)
+        told = [event.reason for event in anchor.of(Gone)]
+        assert len(told) <= 5  # each reason once, however often it is tried
+        assert all(one != other for one, other in itertools.pairwise(told))
 
 
-def test_a_radio_finds_an_ether_that_starts_late_and_one_that_starts_again():
-    async def play():
-        async with OpenAir() as air:
-            port = air.port
-        async with nodes(port, "anchor", "1") as (anchor,), nodes(port, "tag", "tag1") as (tag,):
-            gone = await anchor.until(Gone)
-            assert str(port) in gone.reason
-            anchor.radio.transmit(Transmission(WORD, 5))
-            assert anchor.events[-1] == Late(5)  # without an ether everything is late
-            async with OpenAir(port):
-                await anchor.until(Restarted)
-                await tag.until(Restarted)
-                await speak(anchor, tag)
-            await anchor.until(Gone, 2)
-            assert anchor.radio.now_ticks() is None
-            async with OpenAir(port):
-                await anchor.until(Restarted, 2)
-                await tag.until(Restarted, 2)
-                await speak(anchor, tag)
-            await asyncio.sleep(0.7)
-            told = [event.reason for event in anchor.of(Gone)]
-            assert len(told) <= 5  # each reason once, however often it is tried
-            assert all(one != other for one, other in itertools.pairwise(told))
-
-    asyncio.run(play())
+async def test_a_cancelled_radio_leaves_the_air():
+    async with OpenAir() as air:
+        async with nodes(air.port, "tag", "tag1") as (tag,):
+            await tag.until(Restarted)
+            assert set(air.ether.truth(0.0).tags) == {"tag1"}
+        async with asyncio.timeout(20):
+            while air.ether.truth(0.0).tags:
+                await asyncio.sleep(0.005)
 
 
-def test_a_cancelled_radio_leaves_the_air():
-    async def play():
-        async with OpenAir() as air:
-            async with nodes(air.port, "tag", "tag1") as (tag,):
-                await tag.until(Restarted)
-                assert set(air.ether.truth(0.0).tags) == {"tag1"}
-            async with asyncio.timeout(20):
-                while air.ether.truth(0.0).tags:
-                    await asyncio.sleep(0.005)
-
-    asyncio.run(play())
-
-
-def test_a_name_that_the_ether_has_not_or_that_is_taken_is_reported_and_asked_for_again():
-    async def play():
-        async with OpenAir() as air, nodes(air.port, "tag", "tag1") as (first,):
-            await first.until(Restarted)
-            async with nodes(air.port, "tag", "tag1") as (second,), nodes(air.port, "tag", "nobody") as (nobody,):
-                assert "on the air already" in (await second.until(Gone)).reason
-                assert "it has: tag1, tag2" in (await nobody.until(Gone)).reason
-                await first.stop()
-                await second.until(Restarted)  # the place is free
-                assert nobody.of(Restarted) == []
-
-    asyncio.run(play())
+async def test_a_name_that_the_ether_has_not_or_that_is_taken_is_reported_and_asked_for_again():
+    async with OpenAir() as air, nodes(air.port, "tag", "tag1") as (first,):
+        await first.until(Restarted)
+        async with nodes(air.port, "tag", "tag1") as (second,), nodes(air.port, "tag", "nobody") as (nobody,):
+            assert "on the air already" in (await second.until(Gone)).reason
+            assert "it has: tag1, tag2" in (await nobody.until(Gone)).reason
+            await first.stop()
+            await second.until(Restarted)  # the place is free
+            assert nobody.of(Restarted) == []
 
 
 HTTP = b"GET / HTTP/1.1\r\nHost: ether\r\n\r\n"
@@ -228,94 +207,79 @@ JOIN = pack(Join("anchor", ("1",)))
         b"\xff\xff\xff\xff",
     ],
 )
-def test_a_stranger_is_sent_away_and_the_others_do_not_notice(said):
-    async def play():
-        async with anchor_and_tag("2") as (air, anchor, tag):
-            reader, writer = await asyncio.open_connection(HOST, air.port)
-            writer.write(said)
-            async with asyncio.timeout(20):
-                answer = await reader.read()
-            writer.close()
-            last = from_ether.decode(list(Unpacker().feed(answer))[-1])
-            assert isinstance(last, Refused)
-            assert last.reason.startswith("not understood")
-            await speak(anchor, tag)
-            assert len(tag.of(Restarted)) == len(anchor.of(Restarted)) == 1
-            async with nodes(air.port, "anchor", "1") as (freed,):
-                await freed.until(Restarted)
-
-    asyncio.run(play())
+async def test_a_stranger_is_sent_away_and_the_others_do_not_notice(said):
+    async with anchor_and_tag("2") as (air, anchor, tag):
+        reader, writer = await asyncio.open_connection(HOST, air.port)
+        writer.write(said)
+        async with asyncio.timeout(20):
+            answer = await reader.read()
+        writer.close()
+        last = from_ether.decode(list(Unpacker().feed(answer))[-1])
+        assert isinstance(last, Refused)
+        assert last.reason.startswith("not understood")
+        await speak(anchor, tag)
+        assert len(tag.of(Restarted)) == len(anchor.of(Restarted)) == 1
+        async with nodes(air.port, "anchor", "1") as (freed,):
+            await freed.until(Restarted)
 
 
 @pytest.mark.parametrize("ticks", [-1, -(2**63), 2**40, 2**63, 2**64 - 1])
-def test_a_stamp_that_no_radio_has_hurts_nobody(ticks):
-    async def play():
-        async with anchor_and_tag("2") as (air, anchor, tag):
-            _, writer = await asyncio.open_connection(HOST, air.port)
-            writer.write(JOIN + pack(Send(0, ticks, b"")))
-            await asyncio.sleep(0.05)
+async def test_a_stamp_that_no_radio_has_hurts_nobody(ticks):
+    async with anchor_and_tag("2") as (air, anchor, tag):
+        _, writer = await asyncio.open_connection(HOST, air.port)
+        writer.write(JOIN + pack(Send(0, ticks, b"")))
+        await asyncio.sleep(0.05)
+        await speak(anchor, tag)
+        writer.close()
+
+
+async def test_a_process_that_does_not_read_loses_frames_which_are_counted_and_the_others_none():
+    async with anchor_and_tag("2") as (air, anchor, tag):
+        loop = asyncio.get_running_loop()
+        reader, writer = await asyncio.open_connection(HOST, air.port, limit=1)
+        writer.write(pack(Join("tag", ("tag2",))))
+        await asyncio.sleep(0.05)
+        reader._transport.pause_reading()
+        deaf = air.clients[-1]
+        filled_s = loop.time() + 20.0
+        while deaf._transport.get_write_buffer_size() <= 1 << 16 and loop.time() < filled_s:
+            deaf._transport.write(pack(Refused("x" * 60_000)))  # as many frames would, in a minute
+        for _ in range(3):
             await speak(anchor, tag)
-            writer.close()
-
-    asyncio.run(play())
-
-
-def test_a_process_that_does_not_read_loses_frames_which_are_counted_and_the_others_none():
-    async def play():
-        async with anchor_and_tag("2") as (air, anchor, tag):
-            loop = asyncio.get_running_loop()
-            reader, writer = await asyncio.open_connection(HOST, air.port, limit=1)
-            writer.write(pack(Join("tag", ("tag2",))))
-            await asyncio.sleep(0.05)
-            reader._transport.pause_reading()
-            deaf = air.clients[-1]
-            filled_s = loop.time() + 20.0
-            while deaf._transport.get_write_buffer_size() <= 1 << 16 and loop.time() < filled_s:
-                deaf._transport.write(pack(Refused("x" * 60_000)))  # as many frames would, in a minute
-            for _ in range(3):
-                await speak(anchor, tag)
-            assert air.ether.health(0.0).overruns >= 3
-            assert air.ether.health(0.0).overruns <= air.ether.health(0.0).transmissions
-            assert len(tag.of(Reception)) == air.ether.health(0.0).transmissions
-            writer.transport.abort()
-
-    asyncio.run(play())
+        assert air.ether.health(0.0).overruns >= 3
+        assert air.ether.health(0.0).overruns <= air.ether.health(0.0).transmissions
+        assert len(tag.of(Reception)) == air.ether.health(0.0).transmissions
+        writer.transport.abort()
 
 
 @pytest.mark.parametrize(
     "answer", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\xff\xff\xff\xff", b"\x01\x00\x00\x00\xc1", b""]
 )
-def test_a_radio_reports_that_what_answers_is_no_ether(answer):
-    async def play():
-        async def serve(reader, writer):
-            await reader.read(4)
-            writer.write(answer)
-            await writer.drain()
-            writer.close()
+async def test_a_radio_reports_that_what_answers_is_no_ether(answer):
+    async def serve(reader, writer):
+        await reader.read(4)
+        writer.write(answer)
+        await writer.drain()
+        writer.close()
 
-        server = await asyncio.start_server(serve, HOST, 0)
-        async with nodes(server.sockets[0].getsockname()[1], "tag", "tag1") as (tag,):
-            gone = await tag.until(Gone)
-            assert gone.reason.startswith("what answers is no ether" if answer else "the ether has gone")
-            assert tag.of(Restarted) == []
-        server.close()
-
-    asyncio.run(play())
+    server = await asyncio.start_server(serve, HOST, 0)
+    async with nodes(server.sockets[0].getsockname()[1], "tag", "tag1") as (tag,):
+        gone = await tag.until(Gone)
+        assert gone.reason.startswith("what answers is no ether" if answer else "the ether has gone")
+        assert tag.of(Restarted) == []
+    server.close()
 
 
-def test_of_another_machine_s_ether_the_clock_is_shifted_to_this_one(monkeypatch):
-    async def play():
-        async with OpenAir() as air:
-            air.ether.machine = "another"
-            air.ether._origin_s -= 1000.0
-            air.ether._clock = lambda: time.monotonic() - 1000.0
-            async with nodes(air.port, "anchor", "1") as (anchor,), nodes(air.port, "tag", "tag1") as (tag,):
-                await anchor.until(Restarted)
-                await tag.until(Restarted)
-                await speak(anchor, tag)
-                assert 0.0 <= time.monotonic() - tag.of(Reception)[-1].host_s < 10.0
-
-    asyncio.run(play())
+async def test_of_another_machine_s_ether_the_clock_is_shifted_to_this_one(monkeypatch):
+    async with OpenAir() as air:
+        air.ether.machine = "another"
+        air.ether._origin_s -= 1000.0
+        air.ether._clock = lambda: time.monotonic() - 1000.0
+        async with nodes(air.port, "anchor", "1") as (anchor,), nodes(air.port, "tag", "tag1") as (tag,):
+            await anchor.until(Restarted)
+            await tag.until(Restarted)
+            await speak(anchor, tag)
+            assert 0.0 <= time.monotonic() - tag.of(Reception)[-1].host_s < 10.0
 
 
 @pytest.mark.parametrize(

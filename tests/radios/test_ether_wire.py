@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.radios import ether_wire
-from skyless.radios.ether_wire import (
+from skyless.radio import ether_wire
+from skyless.radio.ether_wire import (
     MAX_MESSAGE_BYTES,
     Arrival,
     Clocks,
@@ -47,20 +47,13 @@ def pieces_of(stream, cuts):
     return [stream[begin:end] for begin, end in itertools.pairwise(places)]
 
 
-@given(st.lists(TO_ETHER, max_size=8), st.lists(st.integers(0, 10_000), max_size=30))
-def test_what_processes_say_arrives_however_the_stream_is_cut(messages, cuts):
-    unpacker = Unpacker()
+@pytest.mark.parametrize(("said", "decoder"), [(TO_ETHER, to_ether), (FROM_ETHER, from_ether)])
+@given(st.data(), st.lists(st.integers(0, 10_000), max_size=30))
+def test_what_is_said_arrives_however_the_stream_is_cut(said, decoder, data, cuts):
+    messages, unpacker = data.draw(st.lists(said, max_size=8)), Unpacker()
     stream = b"".join(pack(message) for message in messages)
     bodies = [body for piece in pieces_of(stream, cuts) for body in unpacker.feed(piece)]
-    assert [to_ether.decode(body) for body in bodies] == messages
-
-
-@given(st.lists(FROM_ETHER, max_size=8), st.lists(st.integers(0, 10_000), max_size=30))
-def test_what_the_ether_sends_arrives_however_the_stream_is_cut(messages, cuts):
-    unpacker = Unpacker()
-    stream = b"".join(pack(message) for message in messages)
-    bodies = [body for piece in pieces_of(stream, cuts) for body in unpacker.feed(piece)]
-    assert [from_ether.decode(body) for body in bodies] == messages
+    assert [decoder.decode(body) for body in bodies] == messages
 
 
 @given(st.binary(max_size=400), st.lists(st.integers(0, 400), max_size=10))

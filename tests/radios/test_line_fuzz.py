@@ -15,17 +15,17 @@ from collections import Counter
 import pytest
 
 from recordings.capture_makers import binary_record, tdoa3, text_line
-from skyless.air.uci import encode_packet
-from skyless.air.uci_measurements import (
+from skyless.radio.foreign.fira import AnchorFrame
+from skyless.radio.foreign.foreign_radios import ListenerRadio, SnifferStream, UciRadio
+from skyless.radio.interface import AntennaDelays
+from skyless.radio.serial import link
+from skyless.radio.serial.serial_radio import LinkSession
+from skyless.radio.uci.uci import (
     DtMeasurement,
     SessionInfo,
+    encode_packet,
     encode_session_info,
 )
-from skyless.radios.interface import AntennaDelays
-from skyless.radios.serial import link
-from skyless.radios.serial.foreign_radios import ListenerRadio, SnifferStream, UciRadio
-from skyless.radios.serial.serial_radio import LinkSession
-from skyless.recordings.foreign.anchor_frame import AnchorFrame
 
 BYTES = int(os.environ.get("SKYLESS_FUZZ_BYTES", "300000"))
 ALPHABETS = (

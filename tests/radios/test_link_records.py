@@ -11,8 +11,8 @@ from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.radios.serial import link
-from skyless.radios.serial.link_records import Hello, Status, decode
+from skyless.radio.serial import link
+from skyless.radio.serial.link import Hello, Status, decode
 
 TICKS = st.integers(0, 2**40 - 1)
 SIXTEEN = st.integers(-0x8000, 0x7FFF)

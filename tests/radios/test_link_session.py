@@ -6,10 +6,10 @@ from collections import Counter
 import pytest
 from serial_stage import quantised
 
-from skyless.air.reception import Diagnostics, Reception, Transmission
-from skyless.radios.interface import AntennaDelays, Gone, Hint, Late, Restarted, Sent
-from skyless.radios.serial import link
-from skyless.radios.serial.serial_radio import BOARD_SILENCE_S, MOST_PENDING_FRAMES, STATUS_S, LinkSession
+from skyless.core.air.reception import Diagnostics, Reception, Transmission
+from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Restarted, Sent
+from skyless.radio.serial import link
+from skyless.radio.serial.serial_radio import BOARD_SILENCE_S, MAX_PENDING_FRAMES, STATUS_S, LinkSession
 
 DELAYS = AntennaDelays(16_450, 16_500)
 COUNTS = [7, 1, 3, 2, 0, 5]
@@ -222,7 +222,7 @@ def test_frames_whose_answer_was_lost_on_the_line_are_not_kept_for_ever():
     talk = Talk().ready()
     for number in range(1000):
         talk.session.transmit(Transmission(b"frame", (number << 9) + DELAYS.tx_ticks))
-    assert len(talk.session._pending) == MOST_PENDING_FRAMES
+    assert len(talk.session._pending) == MAX_PENDING_FRAMES
     told = len(talk.events)
     talk.hear(talk.board.tx_done(999 << 9, (999 << 9) + DELAYS.tx_ticks))
     assert talk.events[told:] == [Sent((999 << 9) + DELAYS.tx_ticks)]

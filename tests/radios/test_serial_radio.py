@@ -9,26 +9,25 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from radio_events import radio_events
+from radio_events import fixes_of, radio_events
 from serial_stage import PlayedBoard, linked, quantised
 
-from skyless.air.ieee802154 import fcs
-from skyless.air.reception import Diagnostics, Reception, Transmission
-from skyless.anchor import Anchor
-from skyless.errors import SkylessError
-from skyless.evaluation.scenarios import Request, impairments_of
-from skyless.nodes.board import ListenerProtocol
-from skyless.nodes.open_radio import is_simulated, open_radios, open_sniffers
-from skyless.radios.interface import AntennaDelays, Gone, Late, Restarted, Sent
-from skyless.radios.serial import link
-from skyless.radios.serial.foreign_radios import ListenerRadio
-from skyless.radios.serial.pseudo_terminal import Pty
-from skyless.radios.serial.serial_radio import SerialRadio
-from skyless.receiver import Receiver
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
-from skyless.site.lab import lab_site
+from skyless.core.air.ieee802154 import fcs
+from skyless.core.air.reception import Diagnostics, Reception, Transmission
+from skyless.core.errors import SkylessError
+from skyless.core.protocol1.anchor import Anchor
+from skyless.radio.foreign.foreign_radios import ListenerRadio
+from skyless.radio.interface import AntennaDelays, Gone, Late, Restarted, Sent
+from skyless.radio.serial import link
+from skyless.radio.serial.pseudo_terminal import Pty
+from skyless.radio.serial.serial_radio import SerialRadio
+from skyless.run.board import ListenerProtocol
+from skyless.run.open_radio import is_simulated, open_radios, open_sniffers
+from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.lab import lab_site
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Static
+from skyless.sim.world import World
 
 LAB = lab_site()
 
@@ -48,36 +47,6 @@ def receptions(seconds):
 HEARD = receptions(4.0)
 
 
-def fixes_of(heard, method):
-    """All that the receiver says of each reception, to the last bit."""
-    receiver = Receiver(method)
-    fixes = [receiver.hear(reception) for reception in heard]
-    return [repr(fix) if fix is None else fix_bits(fix) for fix in fixes], receiver.counters
-
-
-def fix_bits(fix):
-    arrays = (fix.position_m, fix.covariance_m2, fix.velocity_mps, fix.velocity_covariance)
-    rest = (fix.time_s, fix.std_m, fix.dops, fix.anchors, fix.chi2, fix.dof, fix.hpl_m, fix.vpl_m, fix.alert)
-    return tuple(None if array is None else array.tobytes() for array in arrays), rest
-
-
-async def over_the_line(heard, make):
-    """The same receptions behind a board and a serial port."""
-    board, radio = make()
-    async with board, radio_events(radio) as host:
-        await host.until(Restarted)
-        for at in range(0, len(heard), 20):
-            for reception in heard[at : at + 20]:
-                board.hear(reception)
-            await host.until(Reception, min(at + 20, len(heard)))
-        return host.of(Reception), radio.counters
-
-
-def link_pair():
-    board = PlayedBoard()
-    return board, SerialRadio(board.pty.name, 1_000_000, "tag1")
-
-
 class ListenerBoard(PlayedBoard):
     def __init__(self):
         super().__init__()
@@ -89,188 +58,161 @@ def listener_pair():
     return board, ListenerRadio(board.pty.name, 115_200, "tag1")
 
 
-@pytest.mark.parametrize("method", ["joint", "bracketed"])
-@pytest.mark.parametrize("pair", [link_pair, listener_pair])
-def test_fixes_over_a_serial_port_are_those_of_the_radio_itself_bit_for_bit(pair, method):
-    arrived, counters = asyncio.run(over_the_line(HEARD, pair))
+def test_fixes_over_a_listener_are_those_of_the_radio_itself_bit_for_bit():
+    """Those over the serial link: ``test_three_radios.py``."""
+
+    async def play():
+        board, radio = listener_pair()
+        async with board, radio_events(radio) as host:
+            await host.until(Restarted)
+            for at in range(0, len(HEARD), 20):
+                for reception in HEARD[at : at + 20]:
+                    board.hear(reception)
+                await host.until(Reception, min(at + 20, len(HEARD)))
+            return host.of(Reception), radio.counters
+
+    arrived, counters = asyncio.run(play())
     assert [(one.frame, one.rx_ticks) for one in arrived] == [(one.frame, one.rx_ticks) for one in HEARD]
-    if pair is link_pair:
-        assert [one.diagnostics for one in arrived] == [one.diagnostics for one in HEARD]
     assert not +counters
-    there, here = fixes_of(arrived, method), fixes_of(HEARD, method)
-    assert there == here
-    assert sum(fix != "None" for fix in here[0]) > 100
+    here = fixes_of(HEARD)
+    assert fixes_of(arrived) == here
+    assert sum(fix is not None for fix in here[0]) > 100
 
 
-def test_frames_are_sent_at_their_tick_and_their_end_is_reported():
-    async def play():
-        async with linked() as (board, host):
-            ticks = 512 * 10**6 + AntennaDelays().tx_ticks
-            for event in (Sent, Late):
-                host.radio.transmit(Transmission(frame_of(b"a frame"), ticks))
-                while not board.radio.transmissions:
-                    await asyncio.sleep(0.001)
-                assert board.radio.transmissions.pop() == Transmission(frame_of(b"a frame"), ticks)
-                board.protocol.on_radio_event(event(ticks))
-                assert await host.until(event) == event(ticks)
-            host.radio.transmit(Transmission(frame_of(b"one"), ticks))
-            host.radio.transmit(Transmission(frame_of(b"two"), ticks + 512))  # there is room for one
-            assert await host.until(Late, 2) == Late(ticks + 512)
-            async with asyncio.timeout(20):
-                while (host.radio._session.status.sent, host.radio._session.status.late) != (1, 2):
-                    await asyncio.sleep(0.02)  # it is asked for now and then
-            assert host.radio._session.status.garbled == 0
-
-    asyncio.run(play())
+async def test_frames_are_sent_at_their_tick_and_their_end_is_reported():
+    async with linked() as (board, host):
+        ticks = 512 * 10**6 + AntennaDelays().tx_ticks
+        for event in (Sent, Late):
+            host.radio.transmit(Transmission(frame_of(b"a frame"), ticks))
+            while not board.radio.transmissions:
+                await asyncio.sleep(0.001)
+            assert board.radio.transmissions.pop() == Transmission(frame_of(b"a frame"), ticks)
+            board.protocol.on_radio_event(event(ticks))
+            assert await host.until(event) == event(ticks)
+        host.radio.transmit(Transmission(frame_of(b"one"), ticks))
+        host.radio.transmit(Transmission(frame_of(b"two"), ticks + 512))  # there is room for one
+        assert await host.until(Late, 2) == Late(ticks + 512)
+        async with asyncio.timeout(20):
+            while (host.radio._session.status.sent, host.radio._session.status.late) != (1, 2):
+                await asyncio.sleep(0.02)  # it is asked for now and then
+        assert host.radio._session.status.garbled == 0
 
 
-def test_a_board_that_only_listens_sends_nothing():
-    async def play():
-        async with linked(can_transmit=False) as (board, host):
-            host.radio.transmit(Transmission(frame_of(b"one"), 77 * 512))
-            assert await host.until(Late) == Late(77 * 512)
-            assert board.radio.transmissions == []
-
-    asyncio.run(play())
+async def test_a_board_that_only_listens_sends_nothing():
+    async with linked(can_transmit=False) as (board, host):
+        host.radio.transmit(Transmission(frame_of(b"one"), 77 * 512))
+        assert await host.until(Late) == Late(77 * 512)
+        assert board.radio.transmissions == []
 
 
-def test_the_counter_is_that_of_the_board():
-    async def play():
-        async with linked() as (board, host):
-            assert 5 <= host.radio.now_ticks() < 5 + 10 * 63_897_600_000
-            board.radio.ticks = 2**39
-            async with asyncio.timeout(10):
-                while not 0 <= host.radio.now_ticks() - 2**39 < 10 * 63_897_600_000:
-                    await asyncio.sleep(0.05)
-
-    asyncio.run(play())
+async def test_the_counter_is_that_of_the_board():
+    async with linked() as (board, host):
+        assert 5 <= host.radio.now_ticks() < 5 + 10 * 63_897_600_000
+        board.radio.ticks = 2**39
+        async with asyncio.timeout(10):
+            while not 0 <= host.radio.now_ticks() - 2**39 < 10 * 63_897_600_000:
+                await asyncio.sleep(0.05)
 
 
-def test_a_board_that_is_pulled_out_and_plugged_in_is_found_again(tmp_path):
+async def test_a_board_that_is_pulled_out_and_plugged_in_is_found_again(tmp_path):
     place = tmp_path / "board"
-
-    async def play():
-        async with radio_events(SerialRadio(str(place), 1_000_000, "tag1")) as host:
-            assert f"there is no {place}" in (await host.until(Gone)).reason
-            for time_s in (1, 2, 3):
-                async with PlayedBoard(place) as board:
-                    await host.until(Restarted, time_s)
-                    board.hear(Reception(b"%d" % time_s, time_s))
-                    assert (await host.until(Reception, time_s)).frame == b"%d" % time_s
-                await host.until(Gone, 2 * time_s)
-                assert f"{place} was unplugged" in [event.reason for event in host.of(Gone)]
-                assert host.radio.now_ticks() is None
-                host.radio.transmit(Transmission(b"x", 9))
-                assert host.events[-1] == Late(9)
-            assert len(host.of(Gone)) <= 8  # each reason once, however often it is tried
-
-    asyncio.run(play())
-
-
-def test_a_board_that_starts_again_behind_an_open_port_is_set_up_again():
-    async def play():
-        async with linked() as (board, host):
-            board.protocol.on_radio_event(Restarted())
-            await host.until(Restarted, 2)
-            board.hear(Reception(b"again", 7))
-            assert (await host.until(Reception)).frame == b"again"
-            assert host.of(Gone) == []
-
-    asyncio.run(play())
-
-
-def test_noise_on_the_line_costs_what_it_hits_and_is_counted():
-    async def play():
-        async with linked() as (board, host):
-            noise, heard = random.Random(3), 0
-            for number in range(300):
-                if number % 3 == 0:
-                    board.pty.send(noise.randbytes(noise.randrange(1, 300)))
-                board.hear(Reception(b"frame %d" % number, number))
-                heard += number % 3 != 0
-                if number % 30 == 0:
-                    await asyncio.sleep(0.005)
-            await host.until(Reception, heard)
-            frames = {one.frame for one in host.of(Reception)}
-            assert frames >= {b"frame %d" % number for number in range(300) if number % 3}
-            assert host.radio.counters["garbled-record"] >= 90
-            assert len(host.of(Restarted)) == 1
-
-    asyncio.run(play())
-
-
-def test_a_board_of_another_version_is_refused_in_words():
-    async def play():
-        board = PlayedBoard()
-        writer = link.Writer()
-
-        def answer(data):
-            board.pty.send(writer.record(link.HELLO, bytes([7, 3])))
-
-        board.protocol.on_host_data = answer
-        async with board, radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1")) as host:
-            assert "has version 7.3 of the serial link, this program 1.1" in (await host.until(Gone)).reason
-            await asyncio.sleep(1.2)
-            assert len(host.events) == 1
+    async with radio_events(SerialRadio(str(place), 1_000_000, "tag1")) as host:
+        assert f"there is no {place}" in (await host.until(Gone)).reason
+        for time_s in (1, 2, 3):
+            async with PlayedBoard(place) as board:
+                await host.until(Restarted, time_s)
+                board.hear(Reception(b"%d" % time_s, time_s))
+                assert (await host.until(Reception, time_s)).frame == b"%d" % time_s
+            await host.until(Gone, 2 * time_s)
+            assert f"{place} was unplugged" in [event.reason for event in host.of(Gone)]
             assert host.radio.now_ticks() is None
+            host.radio.transmit(Transmission(b"x", 9))
+            assert host.events[-1] == Late(9)
+        assert len(host.of(Gone)) <= 8  # each reason once, however often it is tried
 
-    asyncio.run(play())
+
+async def test_a_board_that_starts_again_behind_an_open_port_is_set_up_again():
+    async with linked() as (board, host):
+        board.protocol.on_radio_event(Restarted())
+        await host.until(Restarted, 2)
+        board.hear(Reception(b"again", 7))
+        assert (await host.until(Reception)).frame == b"again"
+        assert host.of(Gone) == []
 
 
-def test_a_port_that_is_taken_or_no_port_is_reported_in_words():
-    async def play():
-        async with linked() as (board, _), radio_events(SerialRadio(board.pty.name, 1_000_000, "tag2")) as second:
-            assert "is used by another program" in (await second.until(Gone)).reason
-        async with radio_events(SerialRadio("/dev/null", 1_000_000, "tag2")) as null:
-            assert "/dev/null is no serial port" in (await null.until(Gone)).reason
+async def test_noise_on_the_line_costs_what_it_hits_and_is_counted():
+    async with linked() as (board, host):
+        noise, heard = random.Random(3), 0
+        for number in range(300):
+            if number % 3 == 0:
+                board.pty.send(noise.randbytes(noise.randrange(1, 300)))
+            board.hear(Reception(b"frame %d" % number, number))
+            heard += number % 3 != 0
+            if number % 30 == 0:
+                await asyncio.sleep(0.005)
+        await host.until(Reception, heard)
+        frames = {one.frame for one in host.of(Reception)}
+        assert frames >= {b"frame %d" % number for number in range(300) if number % 3}
+        assert host.radio.counters["garbled-record"] >= 90
+        assert len(host.of(Restarted)) == 1
 
-    asyncio.run(play())
+
+async def test_a_board_of_another_version_is_refused_in_words():
+    board = PlayedBoard()
+    writer = link.Writer()
+
+    def answer(data):
+        board.pty.send(writer.record(link.HELLO, bytes([7, 3])))
+
+    board.protocol.on_host_data = answer
+    async with board, radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1")) as host:
+        assert "has version 7.3 of the serial link, this program 1.1" in (await host.until(Gone)).reason
+        await asyncio.sleep(1.2)
+        assert len(host.events) == 1
+        assert host.radio.now_ticks() is None
+
+
+async def test_a_port_that_is_taken_or_no_port_is_reported_in_words():
+    async with linked() as (board, _), radio_events(SerialRadio(board.pty.name, 1_000_000, "tag2")) as second:
+        assert "is used by another program" in (await second.until(Gone)).reason
+    async with radio_events(SerialRadio("/dev/null", 1_000_000, "tag2")) as null:
+        assert "/dev/null is no serial port" in (await null.until(Gone)).reason
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may open everything")
-def test_a_port_that_may_not_be_opened_is_reported_in_words():
-    async def play():
-        async with PlayedBoard() as board:
-            Path(board.pty.path).chmod(0)
-            async with radio_events(SerialRadio(board.pty.path, 1_000_000, "tag1")) as host:
-                assert "dialout" in (await host.until(Gone)).reason
-
-    asyncio.run(play())
+async def test_a_port_that_may_not_be_opened_is_reported_in_words():
+    async with PlayedBoard() as board:
+        Path(board.pty.path).chmod(0)
+        async with radio_events(SerialRadio(board.pty.path, 1_000_000, "tag1")) as host:
+            assert "dialout" in (await host.until(Gone)).reason
 
 
-def test_what_nobody_fetches_is_dropped_and_who_comes_later_receives_the_present():
-    async def play():
-        async with PlayedBoard() as board:
-            board.protocol._configured = board.protocol._receiving = True
-            for number in range(2000):
-                board.hear(Reception(bytes(100), number))
-            assert board.pty.overruns >= 1
-            assert board.protocol.counts["unsent"] == board.pty.overruns
-            async with radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1")) as host:
-                await host.until(Restarted)
-                board.hear(Reception(b"now", 5000))
-                assert [one.frame for one in [await host.until(Reception)]] == [b"now"]
-
-    asyncio.run(play())
+async def test_what_nobody_fetches_is_dropped_and_who_comes_later_receives_the_present():
+    async with PlayedBoard() as board:
+        board.protocol._configured = board.protocol._receiving = True
+        for number in range(2000):
+            board.hear(Reception(bytes(100), number))
+        assert board.pty.overruns >= 1
+        assert board.protocol.counts["unsent"] == board.pty.overruns
+        async with radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1")) as host:
+            await host.until(Restarted)
+            board.hear(Reception(b"now", 5000))
+            assert [one.frame for one in [await host.until(Reception)]] == [b"now"]
 
 
-def test_a_link_keeps_its_name_and_goes_with_the_board(tmp_path):
+async def test_a_link_keeps_its_name_and_goes_with_the_board(tmp_path):
     place = tmp_path / "board"
-
-    async def play():
-        first = Pty(place)
-        second = Pty(place)
-        first.close()
-        assert place.readlink() == Path(second.path)
-        second.close()
-        assert not place.is_symlink()
-        place.write_text("a file")
-        with pytest.raises(SkylessError, match="this path exists"):
-            Pty(place)
-        with pytest.raises(SkylessError, match="cannot be made"):
-            Pty(tmp_path / "nowhere" / "board")
-
-    asyncio.run(play())
+    first = Pty(place)
+    second = Pty(place)
+    first.close()
+    assert place.readlink() == Path(second.path)
+    second.close()
+    assert not place.is_symlink()
+    place.write_text("a file")
+    with pytest.raises(SkylessError, match="this path exists"):
+        Pty(place)
+    with pytest.raises(SkylessError, match="cannot be made"):
+        Pty(tmp_path / "nowhere" / "board")
 
 
 @pytest.mark.parametrize(
@@ -338,23 +280,20 @@ def test_names_of_ports():
     assert is_simulated("serial:/dev/pts/7@1000000")
 
 
-def test_a_listener_receives_whole_lines_only_and_transmits_nothing():
-    async def play():
-        board, radio = listener_pair()
-        async with board, radio_events(radio) as host:
-            await host.until(Restarted)
-            assert radio.now_ticks() is None
-            board.pty.send(b'"dlen":2,"d":"abcd"}\r\n')  # what was on its way when the port was opened
-            board.hear(Reception(b"a frame", 2**40 - 1, None, Diagnostics(-81.25)))
-            board.pty.send(b'{"utime":1,"ts":3,"dlen":3,"d":"abcd"}\r\n{"ts":[]}\r\n\r\n')
-            board.pty.send(b'{"ts":-1,"dlen":1,"d":"ab"}\n{"ts":1099511627777,"dlen":1,"d":"ab","x":{}}\n')
-            assert (await host.until(Reception, 2)).rx_ticks == 1
-            first = host.of(Reception)[0]
-            assert (first.frame, first.rx_ticks, first.diagnostics) == (b"a frame", 2**40 - 1, Diagnostics(-81.2))
-            assert abs(first.host_s - time.monotonic()) < 30.0
-            assert radio.counters == Counter({"wrong-length": 1, "malformed-line": 1, "impossible-stamp": 1})
-            radio.transmit(Transmission(b"x", 3))
-            assert host.events[-1] == Late(3)
-            assert radio.now_ticks() is not None
-
-    asyncio.run(play())
+async def test_a_listener_receives_whole_lines_only_and_transmits_nothing():
+    board, radio = listener_pair()
+    async with board, radio_events(radio) as host:
+        await host.until(Restarted)
+        assert radio.now_ticks() is None
+        board.pty.send(b'"dlen":2,"d":"abcd"}\r\n')  # what was on its way when the port was opened
+        board.hear(Reception(b"a frame", 2**40 - 1, None, Diagnostics(-81.25)))
+        board.pty.send(b'{"utime":1,"ts":3,"dlen":3,"d":"abcd"}\r\n{"ts":[]}\r\n\r\n')
+        board.pty.send(b'{"ts":-1,"dlen":1,"d":"ab"}\n{"ts":1099511627777,"dlen":1,"d":"ab","x":{}}\n')
+        assert (await host.until(Reception, 2)).rx_ticks == 1
+        first = host.of(Reception)[0]
+        assert (first.frame, first.rx_ticks, first.diagnostics) == (b"a frame", 2**40 - 1, Diagnostics(-81.2))
+        assert abs(first.host_s - time.monotonic()) < 30.0
+        assert radio.counters == Counter({"wrong-length": 1, "malformed-line": 1, "impossible-stamp": 1})
+        radio.transmit(Transmission(b"x", 3))
+        assert host.events[-1] == Late(3)
+        assert radio.now_ticks() is not None

@@ -6,9 +6,11 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from skyless.errors import SkylessError
-from skyless.radios.dw1000 import driver as dw1000
-from skyless.radios.dw1000.spi import SpiBus
+from skyless.core.errors import SkylessError
+from skyless.radio.dw1000 import driver as dw1000
+from skyless.radio.dw1000.spi import SpiBus
+
+DEVICE_ID = b"\x30\x01\xca\xde"
 
 
 class Value(enum.Enum):
@@ -33,7 +35,7 @@ class PlayedSpi:
     def xfer2(self, values):
         assert isinstance(values, list)
         self.log.append(("xfer2", *values))
-        return [0, *dw1000.DEVICE_ID] if values[0] == 0 else [0x55] * len(values)
+        return [0, *DEVICE_ID] if values[0] == 0 else [0x55] * len(values)
 
     def close(self):
         self.log.append(("close",))
@@ -88,12 +90,12 @@ def request(log, chip, config, consumer):
 def test_transactions_are_whole_and_at_the_right_speed(log):
     bus = SpiBus(0, 1, fast_hz=16_000_000)
     read = bus.transfer(bytes(5))
-    bus.fast()
+    bus.set_spi_fast(True)
     bus.transfer(b"\x8d\x40")
-    bus.slow()
+    bus.set_spi_fast(False)
     bus.close()
     bus.close()
-    assert read[1:] == dw1000.DEVICE_ID
+    assert read[1:] == DEVICE_ID
     assert log == [
         ("open", 0, 1), ("mode", 0), ("max_speed_hz", 2_000_000), ("xfer2", 0, 0, 0, 0, 0),
         ("max_speed_hz", 16_000_000), ("xfer2", 0x8D, 0x40), ("max_speed_hz", 2_000_000), ("close",),
@@ -103,12 +105,14 @@ def test_transactions_are_whole_and_at_the_right_speed(log):
 def test_the_reset_line_is_never_driven_high(log):
     bus = SpiBus(0, 0, reset_pin=24)
     floating = {24: {"direction": "in", "bias": "none"}}
-    assert bus.reset()
+    bus.reset_chip()
     assert ("skyless reset", "/dev/gpiochip0", floating) in log
     assert [entry[1] for entry in log if entry[0] == "reconfigure"] == [
         {24: {"direction": "out", "output_value": Value.INACTIVE}}, floating,
     ]  # fmt: skip
-    assert not SpiBus(0, 0).reset()
+    entries = len(log)
+    SpiBus(0, 0).reset_chip()
+    assert "reconfigure" not in [entry[0] for entry in log[entries:]]
 
 
 def test_the_interrupt_line_can_be_waited_for(log):

@@ -9,18 +9,17 @@ import asyncio
 import msgspec
 import pytest
 from chip_stage import ChipAnchor, TimedNode, WorldAir
-from radio_events import radio_events
+from radio_events import fixes_of, radio_events
 from serial_stage import PlayedBoard
 
-from skyless.anchor import Anchor
-from skyless.evaluation.scenarios import Request, impairments_of
-from skyless.radios.interface import Reception, Restarted
-from skyless.radios.serial.serial_radio import SerialRadio
-from skyless.receiver import Receiver
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
-from skyless.site.lab import lab_site
+from skyless.core.protocol1.anchor import Anchor
+from skyless.radio.interface import Reception, Restarted
+from skyless.radio.serial.serial_radio import SerialRadio
+from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.lab import lab_site
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Static
+from skyless.sim.world import World
 
 LAB = lab_site()
 SECONDS = 4.0
@@ -68,19 +67,6 @@ async def over_the_line(heard):
                 board.hear(reception)
             await host.until(Reception, min(at + 20, len(heard)))
         return host.of(Reception)
-
-
-def fixes_of(heard, method):
-    receiver = Receiver(method)
-    return [fix_bits(fix) for fix in map(receiver.hear, heard)], receiver.counters
-
-
-def fix_bits(fix):
-    if fix is None:
-        return None
-    arrays = (fix.position_m, fix.covariance_m2, fix.velocity_mps, fix.velocity_covariance)
-    rest = (fix.time_s, fix.std_m, fix.dops, fix.anchors, fix.chi2, fix.dof, fix.hpl_m, fix.vpl_m, fix.alert)
-    return tuple(None if array is None else array.tobytes() for array in arrays), rest
 
 
 @pytest.fixture(scope="module")

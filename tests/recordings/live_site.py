@@ -4,14 +4,13 @@ import msgspec
 from msgspec.structs import replace
 
 from machines.bench import LAB, tape
-from skyless.mqtt import topics
-from skyless.mqtt.fix_message import fix_message
-from skyless.mqtt.messages import RequestMessage, SiteMessage, TrueMotion, TruthMessage
-from skyless.positioning.integrity import IntegrityRequirement
-from skyless.receiver import Receiver
-from skyless.recordings.mcap.reception_log import ReceptionLog, receiver_settings
-from skyless.recordings.mcap.recorder import McapFile, McapRecorder
-from skyless.site.model import GeoreferenceSite
+from skyless.core.integrity import IntegrityRequirement
+from skyless.core.site import GeoreferenceSite
+from skyless.core.tag.any_receiver import AnyReceiver
+from skyless.run.mqtt import topics
+from skyless.run.mqtt.messages import RequestMessage, SiteMessage, TrueMotion, TruthMessage, fix_message
+from skyless.run.recordings.reception_log import ReceptionLog, receiver_settings
+from skyless.run.recordings.recorder import McapFile, McapRecorder
 
 SITE = replace(LAB, georeference=GeoreferenceSite(52.5, 13.4, 34.0, 30.0))
 UNIX_S = 1.8e9
@@ -35,7 +34,7 @@ def messages(seconds=2.0, tags=("a",), method="joint", join_s=0.5, publish_every
 
 def _of_tag(tag, seconds, method, join_s, publish_every, integrity, faults):
     log = ReceptionLog(tag, receiver_settings(method, integrity=integrity), "run")
-    receiver, serial = Receiver(method, integrity=integrity), 0
+    receiver, serial = AnyReceiver(method, integrity=integrity), 0
     for one in tape(LAB, seconds, 1, PLACES[tag], **faults):
         host_s = one.host_s
         if host_s >= join_s:

@@ -3,8 +3,8 @@ from capture_makers import tdoa2, tdoa3
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.air.masterless_packets import Packet, Relay
-from skyless.recordings.foreign.bitcraze import decode_payload
+from skyless.core.air.masterless_packets import Packet, Relay
+from skyless.radio.foreign.bitcraze import decode_payload
 
 byte = st.integers(0, 255)
 seven_bits = st.integers(0, 127)

@@ -2,9 +2,9 @@
 
 import pytest
 
-from skyless.errors import ConfigurationError
-from skyless.positioning.masterless.anchor_errors import AnchorCalibration, DifferenceCalibration
-from skyless.recordings.anchor_table import calibrated_table, new_table, read_anchors, read_calibration
+from skyless.core.errors import ConfigurationError
+from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
+from skyless.site.tables import calibrated_table, new_table, read_anchors, read_calibration
 
 KNOWN = DifferenceCalibration({1: AnchorCalibration(0.1234, 0.08, 0.061), 16: AnchorCalibration(-0.1)})
 TABLE = 'name,id,x_m,y_m,z_m\n"door, left",1,0.10,0,2.5000\n\nwindow,0x10,6,0,2\nfar,3,6,8,2\n'
@@ -42,7 +42,7 @@ def test_anchors_that_stood_in_no_table_get_one(tmp_path):
 @pytest.mark.parametrize(
     ("field", "message"),
     [("far,,", "column bias_m is \"far\""), ("inf,,", "column bias_m"), ("0,nan,", "column bias_slope_m"),
-     ("0,0,-1", "column noise_m is -1")],
+     ("0,0,-1", "column noise_m is \"-1\"")],
 )  # fmt: skip
 def test_what_cannot_be_is_named(tmp_path, field, message):
     path = tmp_path / "anchors.csv"

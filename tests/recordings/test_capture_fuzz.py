@@ -7,9 +7,9 @@ from math import isfinite
 import pytest
 
 import synthetic_recordings as synthetic
-from skyless.errors import ConfigurationError
-from skyless.evaluation.judge import Judge
-from skyless.replays.captures import Replay, ReplayRequest
+from skyless.core.errors import ConfigurationError
+from skyless.research.replays.captures import CaptureReplay
+from skyless.research.replays.options import ReplayOptions
 
 MUTATIONS = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "20000"))
 PER_FILE = 100
@@ -44,14 +44,14 @@ def mutate(data, rng, count):
 
 def replay(path, name, rng):
     """The report, None for a refusal; the format is named or found by content, the height free or given."""
-    request = ReplayRequest(
-        path=path,
-        anchors_m=synthetic.ANCHORS_M,
+    asked = ReplayOptions(
+        path,
+        anchors=synthetic.ANCHORS_M,
         format=rng.choice([name, name, None]),
-        height_m=rng.choice([None, 1.2]),
+        tag_height_m=rng.choice(["free", 1.2]),
     )
     try:
-        return Replay(request, Judge(None, planar=False)).run(check, lambda read: None)
+        return CaptureReplay(asked).run(check, lambda read: None)
     except ConfigurationError:
         return None
 

@@ -13,20 +13,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import synthetic_recordings as synthetic
-from skyless.air.masterless_packets import Packet
-from skyless.air.uci_location import GeodeticPoint, encode_wgs84
-from skyless.air.uci_measurements import (
+from skyless.core.air.masterless_packets import Packet
+from skyless.core.constants import TICK_M, TICK_RATE_HZ
+from skyless.core.earth import geodetic
+from skyless.core.site import GeoreferenceSite
+from skyless.radio.foreign import fira
+from skyless.radio.foreign.fira import AnchorFrame
+from skyless.radio.uci.uci import (
     DtMeasurement,
     DtMessageType,
+    GeodeticPoint,
     SessionInfo,
+    encode_wgs84,
 )
-from skyless.constants import TICK_M, TICK_RATE_HZ
-from skyless.recordings.foreign import fira, phones
-from skyless.recordings.foreign.anchor_frame import AnchorFrame
-from skyless.recordings.foreign.formats import open_recording
-from skyless.replays.capture_run import CaptureRequest, CaptureRun
-from skyless.site.earth import geodetic
-from skyless.site.model import GeoreferenceSite
+from skyless.research.foreign import phones
+from skyless.research.foreign.formats import open_recording
+from skyless.research.replays.captures import CaptureReplay
+from skyless.research.replays.options import ReplayOptions
 
 LINES = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "20000"))
 """SKYLESS_FUZZ_FRAMES=1000000 for a full run."""
@@ -261,9 +264,8 @@ def test_anchors_that_state_other_positions_later_are_where_they_state(tmp_path)
     for record in moved:
         record["anchorLocation"]["relativeLocation"]["x"] += 100_000
     path.write_bytes(b"".join(whole[:450]) + b"".join(json.dumps(record).encode() + b"\n" for record in moved))
-    run = CaptureRun(CaptureRequest(path, {}))
     found = []
-    run.replay.run(found.append, lambda _: None)
+    CaptureReplay(ReplayOptions(path)).run(found.append, lambda _: None)
     assert found[300].position_m[0] < 20.0
     assert found[-1].position_m[0] > 80.0
 

@@ -3,8 +3,8 @@ import gzip
 import pytest
 from capture_makers import binary_record, tdoa3, text_line, yaml_document
 
-from skyless.errors import ConfigurationError
-from skyless.recordings.foreign.formats import FORMATS, open_recording
+from skyless.core.errors import ConfigurationError
+from skyless.research.foreign.formats import FORMATS, open_recording
 from synthetic_recordings import phone_records, uci_binary, uci_text
 
 PACKET = (2, 12345, tdoa3(5, 6, [(1, 2, 3, 33000)]))

@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 from live_site import PLACES, SITE, UNIX_S, messages, record
 from msgspec.structs import replace
 
-from skyless.air.reception import Reception
-from skyless.constants import TICK_S
-from skyless.mqtt import topics
-from skyless.mqtt.messages import FixMessage, ReceptionsMessage, TrueMotion, TruthMessage
-from skyless.recordings.mcap.host_clock import HostClock
-from skyless.recordings.mcap.recording import McapRecording
-from skyless.replays.site import SiteReplay
+from skyless.core.air.reception import Reception
+from skyless.core.constants import TICK_S
+from skyless.research.replays.site import SiteReplay
+from skyless.run.mqtt import topics
+from skyless.run.mqtt.messages import FixMessage, ReceptionsMessage, TrueMotion, TruthMessage
+from skyless.run.recordings.host_clock import HostClock
+from skyless.run.recordings.recording import McapRecording
 
 _STEP_S = 0.02
 

@@ -6,7 +6,7 @@ import pytest
 
 import masterless_world as hall
 from skyless.cli.main import main
-from skyless.recordings.foreign.formats import open_recording
+from skyless.research.foreign.formats import open_recording
 
 SECONDS = 8.0
 

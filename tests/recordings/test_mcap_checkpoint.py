@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 from msgspec.structs import astuple, replace
 
 from machines.bench import LAB, PAIRS, ROOM, tape
-from skyless.air.codec import decode, encode
-from skyless.air.page_codec import encode_page
-from skyless.air.reception import Reception
-from skyless.method_names import METHODS
-from skyless.positioning.estimator.state import ANCHOR_DTYPE, KEPT_ARRAYS, STATUS_DTYPE
-from skyless.receiver import Receiver
-from skyless.recordings.mcap.checkpoint import RefusedError, load, save
+from skyless.core.air.page_codec import encode_page
+from skyless.core.air.reception import Reception
+from skyless.core.estimator.state import ANCHOR_DTYPE, KEPT_ARRAYS, STATUS_DTYPE
+from skyless.core.method_names import METHODS
+from skyless.core.protocol1.codec import decode, encode
+from skyless.core.tag.any_receiver import AnyReceiver
+from skyless.run.recordings.reception_log import RefusedError, load, save
 
 RNG = np.random.default_rng(20)
 
@@ -35,7 +35,7 @@ def bits(fix):
 def test_a_receiver_goes_on_with_the_same_bits(method, site):
     heard = [one.reception for one in tape(site, 2.5)]
     cuts = set(RNG.choice(len(heard), 25, replace=False)) | {0, 1}
-    straight, cut = Receiver(method), Receiver(method)
+    straight, cut = AnyReceiver(method), AnyReceiver(method)
     fixes = 0
     for number, reception in enumerate(heard):
         if number in cuts:
@@ -57,7 +57,7 @@ def test_a_receiver_in_trouble_goes_on_with_the_same_bits():
         Reception(r.frame, int(r.rx_ticks + rng.integers(0, 1 << 20)) % (1 << 40)) if rng.random() < 0.1 else r
         for r in noisy
     ]
-    straight, cut = Receiver(), Receiver()
+    straight, cut = AnyReceiver(), AnyReceiver()
     for number, reception in enumerate(noisy):
         if number % 11 == 0:
             cut = load(save(cut))
@@ -70,7 +70,7 @@ def test_a_receiver_that_has_heard_of_another_master_goes_on_with_the_same_bits(
     heard = [one.reception for one in tape(LAB, 2.5)]
     half = len(heard) // 2
     heard[half:] = [replace(r, frame=encode(replace(decode(r.frame), term=1))) for r in heard[half:]]
-    straight, cut = Receiver(), Receiver()
+    straight, cut = AnyReceiver(), AnyReceiver()
     fixes = 0
     for number, reception in enumerate(heard):
         if number % 11 == 0 or half <= number < half + 12:
@@ -99,7 +99,7 @@ def test_pickles_are_not_executed():
 
 
 def test_another_version_is_refused():
-    envelope = msgspec.msgpack.decode(save(Receiver()))
+    envelope = msgspec.msgpack.decode(save(AnyReceiver()))
     for change in ({"version": "0.0.1"}, {"format": 1}):
         assert refusal(msgspec.msgpack.encode(envelope | change)) == "checkpoint-of-another-version"
 
@@ -158,7 +158,7 @@ def saved_states():
     heard = [one.reception for one in tape(LAB, 1.0)]
     states = []
     for method, count in (("joint", 0), ("joint", 20), ("joint", 300), ("bracketed", 300)):
-        receiver = Receiver(method)
+        receiver = AnyReceiver(method)
         for reception in heard[:count]:
             receiver.hear(reception)
         states.append(save(receiver))
@@ -178,7 +178,7 @@ def test_damaged_bytes_are_refused_or_harmless(data):
         except RefusedError as error:
             assert error.reason.startswith("checkpoint-")
         else:
-            assert type(receiver) is Receiver
+            assert type(receiver) is AnyReceiver
             with contextlib.suppress(Exception):  # a replay counts whatever fails
                 for one in tape(LAB, 1.0)[300:310]:
                     receiver.hear(one.reception)
@@ -250,7 +250,7 @@ def pages_of(receiver):
 
 
 def joint_receiver():
-    receiver = Receiver("joint")
+    receiver = AnyReceiver("joint")
     for one in tape(LAB, 1.0):
         receiver.hear(one.reception)
     return receiver

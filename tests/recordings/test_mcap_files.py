@@ -18,14 +18,12 @@ from live_site import PLACES, SITE, UNIX_S, messages, record
 from mcap.writer import CompressionType, Writer
 
 import skyless
-from skyless.errors import SkylessError
-from skyless.foxglove.messages import ellipse_of
-from skyless.foxglove.schemas import schema_of
-from skyless.mqtt import messages as outputs
-from skyless.mqtt.messages import FixMessage
-from skyless.recordings.mcap.channels import channel_of
-from skyless.recordings.mcap.recorder import McapFile
-from skyless.recordings.mcap.recording import McapRecording
+from skyless.core.errors import SkylessError
+from skyless.run.foxglove.messages import ellipse_of, schema_of
+from skyless.run.mqtt import messages as outputs
+from skyless.run.mqtt.messages import FixMessage
+from skyless.run.recordings.recorder import McapFile
+from skyless.run.recordings.recording import McapRecording, channel_of
 
 PAYLOADS = (
     *(outputs.SiteMessage, outputs.FixMessage, outputs.ReceptionsMessage, outputs.TruthMessage, outputs.ZonesMessage),
@@ -254,8 +252,8 @@ WRITER = """
 import sys, time
 sys.path[:0] = [{tests!r}, {here!r}]
 from live_site import messages
-from skyless.recordings.mcap.recorder import McapFile
-from skyless.recordings.mcap.recorder import McapRecorder
+from skyless.run.recordings.recorder import McapFile
+from skyless.run.recordings.recorder import McapRecorder
 recorder = McapRecorder(McapFile(sys.argv[1]))
 for number, (s, topic, payload) in enumerate(messages(2.0)):
     recorder.add(topic, payload, s)

@@ -4,11 +4,10 @@ import msgspec
 import pytest
 
 from machines.bench import LAB, tape
-from skyless.air.reception import Diagnostics, Reception
-from skyless.mqtt.messages import RawReception, ReceptionsMessage, RequestMessage
-from skyless.receiver import Receiver
-from skyless.recordings.mcap.checkpoint import load
-from skyless.recordings.mcap.reception_log import MOST_PENDING_RECEPTIONS, ReceptionLog, raw, receiver_settings
+from skyless.core.air.reception import Diagnostics, Reception
+from skyless.core.tag.any_receiver import AnyReceiver
+from skyless.run.mqtt.messages import RawReception, ReceptionsMessage, RequestMessage
+from skyless.run.recordings.reception_log import MAX_PENDING_RECEPTIONS, ReceptionLog, load, raw, receiver_settings
 
 SETTINGS = receiver_settings("joint")
 HEARD = [one.reception for one in tape(LAB, 2.0)]
@@ -23,7 +22,7 @@ class Bench:
 
     def __init__(self):
         self.log = ReceptionLog("a", SETTINGS, "run")
-        self.receiver = Receiver()
+        self.receiver = AnyReceiver()
         self.serial = 0
         self.now_s = 100.0
         self.messages = []
@@ -108,11 +107,11 @@ def test_a_lease_that_ended_and_one_who_joins_begin_other_segments():
 
 
 def test_a_log_that_nobody_collects_takes_no_memory():
-    log, receiver = ReceptionLog("a", SETTINGS, "run"), Receiver()
+    log, receiver = ReceptionLog("a", SETTINGS, "run"), AnyReceiver()
     log.request(ask(lease_s=60.0), 0.0)
-    for _ in range(2 * MOST_PENDING_RECEPTIONS + 3):
+    for _ in range(2 * MAX_PENDING_RECEPTIONS + 3):
         log.add(receiver, HEARD[0], 0)
-    assert log.counters["not-collected"] == 2 * MOST_PENDING_RECEPTIONS
+    assert log.counters["not-collected"] == 2 * MAX_PENDING_RECEPTIONS
     message = log.collect(1.0, 0.0)
     assert message is not None
     assert len(message.receptions) == 3

@@ -9,13 +9,13 @@ from live_site import PLACES, UNIX_S, messages, record
 from msgspec.structs import replace
 
 from skyless.cli.main import main
-from skyless.errors import SkylessError
-from skyless.method_names import METHODS
-from skyless.mqtt.messages import ReceptionsMessage
-from skyless.positioning.integrity import Alert, IntegrityRequirement
-from skyless.recordings.mcap.recording import McapRecording
-from skyless.replays.site import SiteReplay
-from skyless.simulation.channel import ChannelModel
+from skyless.core.errors import SkylessError
+from skyless.core.integrity import Alert, IntegrityRequirement
+from skyless.core.method_names import METHODS
+from skyless.research.replays.site import SiteReplay
+from skyless.run.mqtt.messages import ReceptionsMessage
+from skyless.run.recordings.recording import McapRecording
+from skyless.site.channel import ChannelModel
 
 
 def replayed(path, **options):

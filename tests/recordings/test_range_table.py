@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.errors import ConfigurationError
-from skyless.recordings.range_table import read_heights, read_ranges
-from skyless.survey.stamps.repeats import mean_ranges
+from skyless.core.errors import ConfigurationError
+from skyless.site.survey.stamps.repeats import mean_ranges
+from skyless.site.tables import read_heights, read_ranges
 
 HEADER = "anchor_a,anchor_b,range_m\n"
 

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from skyless.positioning.masterless.pair_engine import PairEngine
-from skyless.recordings.anchor_table import read_anchors
-from skyless.recordings.foreign.formats import open_recording
-from skyless.recordings.truth import read_truth
+from skyless.research.foreign.formats import open_recording
+from skyless.research.masterless.pair_engine import PairEngine
+from skyless.site.tables import read_anchors, read_truth
 
 KUIPMAN = {
     "6af847e_testoutput2": (3309, 3295),

@@ -9,18 +9,18 @@ from capture_makers import tdoa3, text_line
 from live_site import SITE, UNIX_S, messages, record
 from msgspec.structs import replace
 
-from skyless.anchors.factory import new_anchor
 from skyless.cli.main import main
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
-from skyless.errors import ConfigurationError
-from skyless.evaluation.anchor_stamps import RecordedAnchor
-from skyless.mqtt.messages import SiteMessage, Stamp, StampsMessage
-from skyless.mqtt.topics import site_topic, stamps_topic
-from skyless.simulation.impairments import AnchorOutage, Outage, lab_impairments
-from skyless.simulation.world import World
-from skyless.survey.facts import Facts, Tape
-from skyless.survey.solve import run_survey
-from skyless.survey_inputs.recorded_stamps import ranges_of
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
+from skyless.core.errors import ConfigurationError
+from skyless.core.protocols import new_anchor
+from skyless.research.calibration.recorded_stamps import ranges_of
+from skyless.research.surveys.anchor_stamps import RecordedAnchor
+from skyless.run.mqtt.messages import SiteMessage, Stamp, StampsMessage
+from skyless.run.mqtt.topics import site_topic, stamps_topic
+from skyless.sim.impairments import AnchorOutage, Outage, lab_impairments
+from skyless.sim.world import World
+from skyless.site.survey.facts import Facts, Tape
+from skyless.site.survey.solve import run_survey
 
 POSITION_M = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in SITE.anchors}
 

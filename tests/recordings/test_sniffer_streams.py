@@ -9,14 +9,15 @@ from capture_makers import binary_record, tdoa2, tdoa3, text_line, yaml_document
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyless.air.masterless_packets import Packet
-from skyless.recordings.foreign import bitcraze
-from skyless.recordings.source import CHUNK_BYTES, open_source
+from skyless.core.air.masterless_packets import Packet
+from skyless.core.input_files import CHUNK_BYTES, open_source
+from skyless.radio.foreign import bitcraze
+from skyless.research.foreign import bitcraze_captures
 
 READERS = {
     "binary": (bitcraze.read_binary, binary_record),
     "text": (bitcraze.read_text, text_line),
-    "yaml": (bitcraze.read_yaml, yaml_document),
+    "yaml": (bitcraze_captures.read_yaml, yaml_document),
 }
 both = pytest.mark.parametrize("kind", READERS)
 

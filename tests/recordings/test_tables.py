@@ -8,11 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.air.masterless_packets import PairTdoa
-from skyless.errors import ConfigurationError
-from skyless.recordings.anchor_table import read_anchors
-from skyless.recordings.foreign.tdoa_tables import read_tdoas
-from skyless.recordings.truth import read_truth
+from skyless.core.air.masterless_packets import PairTdoa
+from skyless.core.errors import ConfigurationError
+from skyless.research.foreign.tdoa_tables import read_tdoas
+from skyless.site.tables import read_anchors, read_truth
 
 HEADER = b"t_s,idA,idB,tdoa_m\n"
 

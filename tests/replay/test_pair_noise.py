@@ -5,10 +5,10 @@ from math import dist
 import numpy as np
 import pytest
 
-from skyless.air.masterless_packets import PairTdoa
-from skyless.evaluation.judge import Judge
-from skyless.recordings.truth import Truth
-from skyless.replays.captures import MIN_PAIR_DIFFERENCES, MOST_PAIRS, ROWS_PER_PAIR, NoiseByPair
+from skyless.core.air.masterless_packets import PairTdoa
+from skyless.research.replays.captures import MAX_PAIRS, MIN_PAIR_DIFFERENCES, ROWS_PER_PAIR, NoiseByPair
+from skyless.sim.evaluation.judge import Judge
+from skyless.site.tables import Truth
 
 ANCHORS_M = {1: (0.0, 0.0, 0.0), 2: (8.0, 0.0, 1.0), 3: (0.0, 6.0, 2.0)}
 
@@ -66,8 +66,8 @@ def test_a_stream_of_any_length_and_of_any_identifiers_takes_bounded_memory():
     book = NoiseByPair(Judge(None, planar=False), {})
     for k in range(3 * ROWS_PER_PAIR):
         book.add(PairTdoa(0.0, 1, 2, float(k % 2)))
-    for k in range(100_000, 100_000 + 4 * MOST_PAIRS):
+    for k in range(100_000, 100_000 + 4 * MAX_PAIRS):
         book.add(PairTdoa(0.0, k, k + 1, 0.0))
     (pair,) = book.pairs()
     assert pair.count == 3 * ROWS_PER_PAIR
-    assert sum(len(sample.rows) for sample in book._samples.values()) <= ROWS_PER_PAIR + MOST_PAIRS
+    assert sum(len(sample.rows) for sample in book._samples.values()) <= ROWS_PER_PAIR + MAX_PAIRS

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from skyless.replays.plot import draw
+from skyless.research.replays.plot import track_figure
+from skyless.site.report.figures import save_figure
+
+
+def draw(path, rows, title):
+    save_figure(track_figure(rows, title), path)
 
 
 def rows(count, *, truth):

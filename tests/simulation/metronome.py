@@ -3,11 +3,11 @@
 import struct
 from dataclasses import dataclass, field
 
-from skyless.air.reception import Reception, Transmission
-from skyless.simulation.impairments import Impairments
-from skyless.simulation.oscillator import OscillatorModel
-from skyless.site.model import AnchorSite, Site
-from skyless.ticks import TICK_MASK, from_seconds
+from skyless.core.air.reception import Reception, Transmission
+from skyless.core.site import AnchorSite, Site
+from skyless.core.ticks import TICK_MASK, from_seconds
+from skyless.sim.impairments import Impairments
+from skyless.sim.oscillator import OscillatorModel
 
 DELAY_TICKS = 16_436
 QUIET_CRYSTALS = OscillatorModel(offset_ppm=0.0, white_fm=0.0, random_walk_fm=0.0)

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from metronome import IDEAL, Metronome, sent, staggered
 
-from skyless.constants import TICK_M
-from skyless.simulation.anchor_pairs import AnchorPairErrors
-from skyless.simulation.cells.medium import CellMedium
-from skyless.simulation.impairments import AnchorDisplacement, DelayError, PairError
-from skyless.simulation.world import World
-from skyless.site.lab import lab_site
-from skyless.ticks import difference
+from skyless.core.constants import TICK_M
+from skyless.core.ticks import difference
+from skyless.sim.anchor_pairs import AnchorPairErrors
+from skyless.sim.cells.medium import CellMedium
+from skyless.sim.impairments import AnchorDisplacement, DelayError, PairError
+from skyless.sim.lab import lab_site
+from skyless.sim.world import World
 
 LAB = lab_site()
 

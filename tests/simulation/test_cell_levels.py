@@ -2,22 +2,20 @@
 
 import numpy as np
 import pytest
-from beaconing import FRAME_BYTES, FreeAnchor, SlotAnchor, contents
+from beaconing import FRAME_BYTES, FreeAnchor, contents
 
-from skyless.simulation.cells.medium import CellMedium
-from skyless.simulation.cells.timetable import FreeSchedule
-from skyless.simulation.cells.world import CellWorld, anchors_of
-from skyless.simulation.channel import ChannelModel
-from skyless.simulation.impairments import Impairments
-from skyless.simulation.oscillator import OscillatorModel
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import Roaming, Static, Waypoints
-from skyless.simulation.world import World
-from skyless.site.free_access import free_window_ticks
-from skyless.site.model import AnchorSite, Site
-from skyless.ticks import from_seconds
+from skyless.core.air.instants import period_code, period_ticks
+from skyless.core.site import AnchorSite, Site
+from skyless.core.ticks import from_seconds, to_seconds
+from skyless.sim.cells.medium import CellMedium
+from skyless.sim.cells.world import CellWorld, anchors_of
+from skyless.sim.impairments import Impairments
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Roaming, Static, Waypoints
+from skyless.sim.world import World
+from skyless.site.channel import ChannelModel
 
-RATE_HZ = 30.0
+CODES = np.array([period_code(1.0 / rate_hz) for rate_hz in np.linspace(20.0, 40.0, 60)])
 UNTIL_S = 1.5
 IMPAIRMENTS = Impairments(channel=ChannelModel(loss_probability=0.05))
 SITE = Site(
@@ -78,9 +76,9 @@ def logs_of(received):
 
 @pytest.fixture(scope="module")
 def free():
-    window_ticks = free_window_ticks(RATE_HZ)
-    machines, frames, rows, world = machines_world(lambda anchor: FreeAnchor(anchor, window_ticks), IMPAIRMENTS)
-    kernels = CellWorld(anchors_of(SITE), FreeSchedule(RATE_HZ), tags(), IMPAIRMENTS, 3, frame_bytes=FRAME_BYTES)
+    codes = dict(zip((anchor.id for anchor in SITE.anchors), CODES.tolist(), strict=True))
+    machines, frames, rows, world = machines_world(lambda anchor: FreeAnchor(anchor, codes[anchor]), IMPAIRMENTS)
+    kernels = CellWorld(anchors_of(SITE), CODES, tags(), IMPAIRMENTS, 3, frame_bytes=FRAME_BYTES)
     return machines, frames, rows, world, kernels
 
 
@@ -88,7 +86,8 @@ def test_all_outcomes_occur(free):
     tally = free[3].tally
     assert min(tally.at_anchors.values()) > 0
     assert tally.late_transmissions == 0
-    assert len(free[1]) == pytest.approx(60 * RATE_HZ * UNTIL_S, abs=60)
+    rates_hz = [1.0 / to_seconds(period_ticks(code)) for code in CODES.tolist()]
+    assert len(free[1]) == pytest.approx(sum(rates_hz) * UNTIL_S, abs=60)
 
 
 def test_tags_receive_the_same_frames_with_the_same_stamps_and_relays(free):
@@ -111,29 +110,3 @@ def test_anchors_receive_the_same_frames_with_the_same_stamps(free):
         assert len(machine.log) - len(logs[anchor]) < 20, "received in the last 10 ms"
     columns = (received.anchor, received.sequence, received.tx_ticks)
     assert set(zip(*(column.tolist() for column in columns), strict=True)) <= set(frames)
-
-
-def test_frames_of_slots_that_machines_sent_are_received_alike():
-    """Slots shared by anchors 26 m apart and more, by clocks that part by up to 0.6 µs: early first paths occur."""
-    crystals = OscillatorModel(offset_ppm=0.2)
-    impairments = Impairments(oscillator=crystals)
-    slot_ticks, slots = from_seconds(1e-3), 12
-
-    def make(anchor):
-        column, row = (anchor - 100) // 3 % 10, (anchor - 100) // 30
-        return SlotAnchor(anchor, slots * slot_ticks, colour=column % 4 + 4 * (row % 3), slot_ticks=slot_ticks)
-
-    machines, _, rows, world = machines_world(make, impairments)
-    assert world.tally.late_transmissions == 0
-    senders, tx_ticks = zip(*((k, t) for k, one in enumerate(machines.values()) for t in one.sent), strict=True)
-    for first_path_db in (20.0, 10.0):
-        kernels = CellWorld(anchors_of(SITE), FreeSchedule(), tags(), impairments, 3, frame_bytes=FRAME_BYTES)
-        kernels._rules = kernels._rules._replace(first_path=10.0 ** (first_path_db / 10.0))
-        by_anchors, by_tags = kernels.receptions_of(np.array(senders), np.array(tx_ticks), 0.0, UNTIL_S)
-        computed, logs = [rows_of(one) for one in by_tags], logs_of(by_anchors)
-        alike = computed == rows
-        assert alike == (first_path_db == 20.0), "a narrower rule leaves stamps alone that another frame shifts"
-        for anchor, machine in machines.items():
-            received = logs.get(anchor, [])
-            assert [row[:2] for row in machine.log[: len(received)]] == [row[:2] for row in received]
-            assert not alike or machine.log[: len(received)] == received

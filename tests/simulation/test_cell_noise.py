@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
-from skyless.constants import TICK_RATE_HZ, TICK_S
-from skyless.simulation.cells.clocks import CHECKPOINT_KNOTS, KNOT_TICKS, CellClocks, own_time, true_time
-from skyless.simulation.cells.keyed import key_of, mixed, normal, normal_pair, purpose_key, uniform
-from skyless.simulation.oscillator import OscillatorModel, Temperature
+from skyless.core.constants import TICK_RATE_HZ, TICK_S
+from skyless.sim.cells.clocks import CHECKPOINT_KNOTS, KNOT_TICKS, CellClocks, own_time, true_time
+from skyless.sim.cells.keyed import key_of, mixed, normal, normal_pair, purpose_key, uniform
+from skyless.sim.oscillator import OscillatorModel, Temperature
 
 COUNT = 20_000
 Z = 5.0
@@ -123,12 +123,12 @@ def test_temperatures_are_refused():
 
 PLAIN = """
 import numpy as np
-from skyless.simulation.cells.timetable import FreeSchedule
-from skyless.simulation.cells.world import CellWorld, anchors_at
-from skyless.simulation.impairments import Impairments
-from skyless.simulation.trajectory import Static
+from skyless.core.air.instants import period_code
+from skyless.sim.cells.world import CellWorld, anchors_at
+from skyless.sim.impairments import Impairments
+from skyless.sim.trajectory import Static
 positions_m = np.array([(15.0 * x, 15.0 * y, 3.0) for y in range(3) for x in range(3)])
-world = CellWorld(anchors_at(positions_m), FreeSchedule(), [Static(12.0, 9.0, 1.0)], Impairments(), 5)
+world = CellWorld(anchors_at(positions_m), np.full(len(positions_m), period_code(1 / 30)), [Static(12.0, 9.0, 1.0)], Impairments(), 5)
 received = world.receptions(0, 0.1, 0.15)
 print(len(received), received.rx_ticks.tolist(), received.relay_rx_ticks.tolist())
 """

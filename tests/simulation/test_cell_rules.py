@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from metronome import IDEAL, Metronome, site_of
 
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.simulation.cells.medium import CellMedium
-from skyless.simulation.cells.reception import (
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S
+from skyless.core.site import WallSite
+from skyless.core.ticks import difference
+from skyless.sim.cells.medium import CellMedium
+from skyless.sim.cells.reception import (
     COLLISION,
     HALF_DUPLEX,
     PREAMBLE_TICKS,
@@ -18,8 +20,7 @@ from skyless.simulation.cells.reception import (
     disturb,
     rules_of,
 )
-from skyless.simulation.channel import ChannelModel
-from skyless.simulation.impairments import (
+from skyless.sim.impairments import (
     AnchorBias,
     AnchorDisplacement,
     AnchorOutage,
@@ -29,12 +30,11 @@ from skyless.simulation.impairments import (
     Outage,
     WarmUp,
 )
-from skyless.simulation.range_errors import RangeErrorModel
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
-from skyless.site.model import WallSite
-from skyless.ticks import difference
+from skyless.sim.range_errors import RangeErrorModel
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Static
+from skyless.sim.world import World
+from skyless.site.channel import ChannelModel
 
 RULES = rules_of(ChannelModel(), 0.0, 0.0, 1)
 AFTER_TICKS = 1.0e7

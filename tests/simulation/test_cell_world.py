@@ -6,19 +6,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
-from skyless.constants import TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.simulation.cells.clocks import KNOT_TICKS
-from skyless.simulation.cells.grid import anchors_within, list_neighbours, make_grid
-from skyless.simulation.cells.paths import TagPath
-from skyless.simulation.cells.reception import delivery_chance, rules_of
-from skyless.simulation.cells.receptions import KNOTS_A_LENGTH, PairErrors, changing_error
-from skyless.simulation.cells.timetable import FIRST_SLOT_TICKS, FreeSchedule, SlotSchedule
-from skyless.simulation.cells.world import CellAnchors, CellWorld, anchors_at
-from skyless.simulation.channel import ChannelModel
-from skyless.simulation.impairments import AnchorOutage, Impairments, Outage
-from skyless.simulation.oscillator import OscillatorModel
-from skyless.simulation.range_errors import RangeErrorModel
-from skyless.simulation.trajectory import RandomWalk, Roaming, Static, Waypoints
+from skyless.core.air.instants import period_code
+from skyless.core.constants import TICK_M, TICK_S
+from skyless.sim.cells.clocks import KNOT_TICKS
+from skyless.sim.cells.grid import anchors_within, list_neighbours, make_grid
+from skyless.sim.cells.paths import TagPath
+from skyless.sim.cells.reception import delivery_chance, rules_of
+from skyless.sim.cells.receptions import KNOTS_A_LENGTH, PairErrors, changing_error
+from skyless.sim.cells.world import CellAnchors, CellWorld, anchors_at
+from skyless.sim.impairments import AnchorOutage, Impairments, Outage
+from skyless.sim.oscillator import OscillatorModel
+from skyless.sim.range_errors import RangeErrorModel
+from skyless.sim.trajectory import RandomWalk, Roaming, Static, Waypoints
+from skyless.site.channel import ChannelModel
 
 POSITIONS_M = np.array([(15.0 * x, 15.0 * y, 3.0) for y in range(20) for x in range(20)])
 QUIET = OscillatorModel(offset_ppm=0.0, white_fm=0.0, random_walk_fm=0.0)
@@ -37,13 +37,7 @@ def paths():
     ]
 
 
-def colours():
-    """A square of 5 x 5 slots: anchors of one colour are 75 m apart."""
-    return np.array([x % 5 + 5 * (y % 5) for y in range(20) for x in range(20)])
-
-
-def slots(error_s=10e-9):
-    return SlotSchedule(colours(), 25, round(1e-3 * TICK_RATE_HZ / 512) * 512, error_s)
+CODES = np.full(400, period_code(1.0 / 30.0))
 
 
 def columns(parts):
@@ -85,11 +79,11 @@ def test_neighbours_are_all_within_the_audible_distance():
             assert chance == pytest.approx(delivery_chance(RULES, float(distance_m[one, other]) ** 2), rel=1e-9)
 
 
-@pytest.mark.parametrize("schedule", [FreeSchedule(), slots()], ids=["free", "slots"])
-def test_receptions_depend_neither_on_other_tags_nor_on_spans(schedule):
+@pytest.mark.parametrize("codes", [CODES, CODES + np.arange(400) % 30], ids=["one period", "several"])
+def test_receptions_depend_neither_on_other_tags_nor_on_spans(codes):
     """As between workers: one runs all tags in spans of 0.5 s, the other two of them in spans of 0.3 s."""
-    one = CellWorld(anchors_at(POSITIONS_M), schedule, paths(), ROOM, 4, survey_std_m=0.02)
-    other = CellWorld(anchors_at(POSITIONS_M), schedule, paths(), ROOM, 4, survey_std_m=0.02)
+    one = CellWorld(anchors_at(POSITIONS_M), codes, paths(), ROOM, 4, survey_std_m=0.02)
+    other = CellWorld(anchors_at(POSITIONS_M), codes, paths(), ROOM, 4, survey_std_m=0.02)
     whole = {tag: [] for tag in range(4)}
     for part in one.run(2.0):
         whole[part.tag].append(part)
@@ -105,29 +99,14 @@ def test_receptions_depend_neither_on_other_tags_nor_on_spans(schedule):
 
 
 def test_another_seed_is_another_world():
-    one, other = (CellWorld(anchors_at(POSITIONS_M), FreeSchedule(), paths(), ROOM, seed) for seed in (1, 2))
+    one, other = (CellWorld(anchors_at(POSITIONS_M), CODES, paths(), ROOM, seed) for seed in (1, 2))
     assert one.receptions(0, 0.5, 0.6).rx_ticks.tolist() != other.receptions(0, 0.5, 0.6).rx_ticks.tolist()
-
-
-def test_slots_begin_where_the_schedule_says():
-    """On the radio's grid at or before the start, which is off by the error: uniform over 512 ticks with 10 ns."""
-    schedule = slots(2e-9)
-    world = CellWorld(anchors_at(POSITIONS_M), schedule, [], Impairments(0.0, 0.0, QUIET), 1)
-    received = world.anchor_receptions(range(400), 0.5, 1.5)
-    since = received.emission_ticks - FIRST_SLOT_TICKS - colours()[received.anchor] * schedule.slot_ticks
-    frames, first = np.unique(received.anchor * 1000 + since // schedule.period_ticks, return_index=True)
-    assert len(frames) > 5000
-    off = (since[first] + 100_000) % schedule.period_ticks - 100_000
-    std_ticks = np.hypot(512 / np.sqrt(12), 2e-9 / TICK_S)
-    assert off.mean() == pytest.approx(-256.0, abs=Z * std_ticks / np.sqrt(len(frames)) + 1.0)
-    assert off.std() == pytest.approx(std_ticks, rel=Z / np.sqrt(2 * len(frames)))
-    assert (received.sequence == (since + 100_000) // schedule.period_ticks % 256).all()
 
 
 def test_dead_anchors_are_silent_and_others_go_on():
     dead = np.arange(400) % 3 == 0
-    faulty = CellWorld(anchors_at(POSITIONS_M), slots(), paths(), ROOM, 4, dead=dead.tolist())
-    sound = CellWorld(anchors_at(POSITIONS_M), slots(), paths(), ROOM, 4)
+    faulty = CellWorld(anchors_at(POSITIONS_M), CODES, paths(), ROOM, 4, dead=dead.tolist())
+    sound = CellWorld(anchors_at(POSITIONS_M), CODES, paths(), ROOM, 4)
     few, all_ = faulty.receptions(2, 0.5, 1.0), sound.receptions(2, 0.5, 1.0)
     assert not dead[few.anchor].any()
     assert not dead[few.relay_anchor[few.relay_anchor >= 0]].any()
@@ -144,7 +123,7 @@ def test_dead_anchors_are_silent_and_others_go_on():
 
 def ranging_world(tags, impairments):
     """A world without early first paths, so that ranges are true but for their errors."""
-    world = CellWorld(anchors_at(POSITIONS_M), FreeSchedule(), tags, impairments, 4)
+    world = CellWorld(anchors_at(POSITIONS_M), CODES, tags, impairments, 4)
     world._rules = world._rules._replace(first_path=world._rules.capture)
     return world
 
@@ -214,32 +193,26 @@ def test_a_path_is_as_long_as_it_is_wherever_one_begins():
 
 
 def test_surveyed_positions_are_off_by_their_std():
-    world = CellWorld(anchors_at(POSITIONS_M), FreeSchedule(), [], Impairments(), 4, survey_std_m=0.05)
+    world = CellWorld(anchors_at(POSITIONS_M), CODES, [], Impairments(), 4, survey_std_m=0.05)
     errors_m = (world.true_positions_m - POSITIONS_M).ravel()
     assert kstest(errors_m / 0.05, "norm").pvalue > 1e-6
-    assert (
-        CellWorld(anchors_at(POSITIONS_M), FreeSchedule(), [], Impairments(), 4).true_positions_m == POSITIONS_M
-    ).all()
+    assert (CellWorld(anchors_at(POSITIONS_M), CODES, [], Impairments(), 4).true_positions_m == POSITIONS_M).all()
 
 
-def test_positions_and_velocities_are_those_of_the_trajectory():
-    received = CellWorld(anchors_at(POSITIONS_M), FreeSchedule(), paths(), Impairments(), 4).receptions(0, 59.0, 59.5)
+def test_positions_are_those_of_the_trajectory():
+    received = CellWorld(anchors_at(POSITIONS_M), CODES, paths(), Impairments(), 4).receptions(0, 59.0, 59.5)
     assert len(received) > 30
-    for t_s, position_m, velocity_mps in zip(
-        received.emission_s, received.positions_m, received.velocities_mps, strict=True
-    ):
+    for t_s, position_m in zip(received.emission_s, received.positions_m, strict=True):
         assert position_m == pytest.approx(paths()[0].position(t_s))
-        assert velocity_mps == pytest.approx(paths()[0].velocity(t_s))
 
 
 def test_a_lone_tag_and_a_lone_anchor():
     far, near = (
-        CellWorld(anchors_at(np.zeros((1, 3))), FreeSchedule(), [Static(x, 0.0)], Impairments(), 1)
-        for x in (500.0, 5.0)
+        CellWorld(anchors_at(np.zeros((1, 3))), CODES[:1], [Static(x, 0.0)], Impairments(), 1) for x in (500.0, 5.0)
     )
     assert len(far.receptions(0, 0.0, 1.0)) == 0
     received = near.receptions(0, 0.0, 1.0)
-    assert len(received) in {29, 30, 31}
+    assert len(received) == pytest.approx(29, abs=6)
     assert not received.relays.any()
     assert len(near.anchor_receptions([0], 0.0, 1.0).anchor) == 0
 
@@ -248,13 +221,13 @@ def test_a_lone_tag_and_a_lone_anchor():
     ("options", "message"),
     [
         ({"dead": [True]}, "dead has 1 values"),
-        ({"schedule": SlotSchedule(np.zeros(3, dtype=np.int64), 2, 512)}, "3 colours"),
+        ({"period_codes": CODES[:3]}, "3 codes of periods"),
         ({"impairments": Impairments(diagnostics=True)}, "diagnostics"),
         ({"impairments": Impairments(anchor_outages=(AnchorOutage(1, Outage(1.0)),))}, "anchor_outages"),
     ],
 )
 def test_what_does_not_fit_is_refused_by_name(options, message):
-    given_ = {"anchors": anchors_at(POSITIONS_M), "schedule": FreeSchedule(), "impairments": Impairments()} | options
+    given_ = {"anchors": anchors_at(POSITIONS_M), "period_codes": CODES, "impairments": Impairments()} | options
     with pytest.raises(ValueError, match=message):
         CellWorld(tags=[], seed=1, **given_)
 
@@ -264,21 +237,5 @@ def test_wrong_arrays_and_spans_are_refused():
         CellAnchors(np.zeros(2, dtype=np.int64), np.zeros((2, 3)), np.zeros(2, dtype=np.int64))
     with pytest.raises(ValueError, match="positions_m of shape"):
         CellAnchors(np.arange(2), np.zeros((2, 2)), np.zeros(2, dtype=np.int64))
-    with pytest.raises(ValueError, match="colours are from 0 to 2"):
-        SlotSchedule(np.arange(3), 2, 512)
     with pytest.raises(ValueError, match="a span from 1 to 0"):
-        CellWorld(anchors_at(POSITIONS_M), FreeSchedule(), paths(), Impairments(), 1).receptions(0, 1.0, 0.0)
-
-
-@pytest.mark.parametrize("dead", [None, (np.arange(400) % 17 == 0).tolist()])
-def test_pairs_whose_frames_always_collide_are_left_out_without_a_change(dead):
-    def world():
-        return CellWorld(anchors_at(POSITIONS_M), slots(), paths(), ROOM, 5, dead=dead)
-
-    quick, plain = world(), world()
-    assert len(quick._in_slots.anchors) < len(plain._neighbours.anchors) / 4
-    plain._in_slots = plain._neighbours
-    found, expected = columns(list(quick.run(1.5))), columns(list(plain.run(1.5)))
-    assert len(found["anchor"]) > 500
-    for name, column in expected.items():
-        np.testing.assert_array_equal(found[name], column, err_msg=name)
+        CellWorld(anchors_at(POSITIONS_M), CODES, paths(), Impairments(), 1).receptions(0, 1.0, 0.0)

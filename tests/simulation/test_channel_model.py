@@ -7,7 +7,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from skyless.simulation.channel import (
+from skyless.core.site import WallSite
+from skyless.site.channel import (
     ChannelModel,
     cross_walls,
     delivery_probability,
@@ -16,7 +17,6 @@ from skyless.simulation.channel import (
     power_bias_m,
     received_power_dbm,
 )
-from skyless.site.model import WallSite
 
 APS011_CM = [-11.0, -10.5, -10.0, -9.3, -8.2, -6.9, -5.1, -2.7, 0, 2.1, 3.5, 4.2, 4.9, 6.2, 7.1, 7.6, 8.1, 8.6]
 

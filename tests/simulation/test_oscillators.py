@@ -9,8 +9,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import chi2
 
-from skyless.constants import TICK_RATE_HZ, TICK_S
-from skyless.simulation.oscillator import (
+from skyless.core.constants import TICK_RATE_HZ, TICK_S
+from skyless.sim.oscillator import (
     OscillatorModel,
     Temperature,
     advance,
@@ -20,7 +20,7 @@ from skyless.simulation.oscillator import (
     make_clocks,
     temperature_phase_s,
 )
-from skyless.simulation.streams import Streams, draw_normal, draw_uniform, stream
+from skyless.sim.streams import Streams, draw_normal, draw_uniform, stream
 
 
 def _nodes(model, count, seed=1):

@@ -13,17 +13,17 @@ import pytest
 from metronome import DELAY_TICKS, IDEAL, Metronome, sent, site_of, staggered
 from scipy.stats import binom, chi2, expon, kstest
 
-from skyless.anchor import Anchor
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.simulation.channel import ChannelModel, power_bias_m, received_power_dbm
-from skyless.simulation.impairments import AnchorBias, AnchorOutage, DelayError, Impairments, Outage, lab_impairments
-from skyless.simulation.oscillator import OscillatorModel
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import RandomWalk, Static, Waypoints
-from skyless.simulation.world import World
-from skyless.site.lab import lab_site
-from skyless.site.model import WallSite
-from skyless.ticks import Unwrapper, difference
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.core.protocol1.anchor import Anchor
+from skyless.core.site import WallSite
+from skyless.core.ticks import Unwrapper, difference
+from skyless.sim.impairments import AnchorBias, AnchorOutage, DelayError, Impairments, Outage, lab_impairments
+from skyless.sim.lab import lab_site
+from skyless.sim.oscillator import OscillatorModel
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import RandomWalk, Static, Waypoints
+from skyless.sim.world import World
+from skyless.site.channel import ChannelModel, power_bias_m, received_power_dbm
 
 LAB = lab_site()
 AT_P1 = TagSpec(Static(3.0, 4.0))

@@ -10,19 +10,19 @@ from metronome import IDEAL, Metronome, site_of, staggered
 from scipy.integrate import quad
 from scipy.stats import chi2, kstest, uniform
 
-from skyless.anchor import Anchor
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.simulation.channel import ChannelModel
-from skyless.simulation.impairments import AnchorBias, AnchorDisplacement, Body, Impairments, WarmUp, lab_impairments
-from skyless.simulation.oscillator import OscillatorModel, clock_rate, drift_phase_s, make_clocks, warm_up
-from skyless.simulation.range_errors import RangeErrorModel, RangeErrors, slope_error_m
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.streams import stream
-from skyless.simulation.trajectory import RandomWalk, Static, Waypoints
-from skyless.simulation.world import World
-from skyless.site.lab import lab_site
-from skyless.site.model import WallSite
-from skyless.ticks import difference
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S
+from skyless.core.protocol1.anchor import Anchor
+from skyless.core.site import WallSite
+from skyless.core.ticks import difference
+from skyless.sim.impairments import AnchorBias, AnchorDisplacement, Body, Impairments, WarmUp, lab_impairments
+from skyless.sim.lab import lab_site
+from skyless.sim.oscillator import OscillatorModel, clock_rate, drift_phase_s, make_clocks, warm_up
+from skyless.sim.range_errors import RangeErrorModel, RangeErrors, slope_error_m
+from skyless.sim.stations import TagSpec
+from skyless.sim.streams import stream
+from skyless.sim.trajectory import RandomWalk, Static, Waypoints
+from skyless.sim.world import World
+from skyless.site.channel import ChannelModel
 
 LAB = lab_site()
 PLACES_M = {anchor.id: np.array([anchor.x_m, anchor.y_m]) for anchor in LAB.anchors}

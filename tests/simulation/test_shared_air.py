@@ -5,10 +5,10 @@ import pytest
 from metronome import IDEAL, Metronome, site_of
 from scipy.stats import binom
 
-from skyless.air.ieee802154 import air_time_s
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import Static
-from skyless.simulation.world import World
+from skyless.core.air.ieee802154 import air_time_s
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Static
+from skyless.sim.world import World
 
 PERIODS_S = {1: 3.1e-3, 2: 2.3e-3 * 2**0.5}
 FRAME_BYTES = {1: 40, 2: 100}

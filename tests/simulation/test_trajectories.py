@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from skyless.simulation.trajectory import RandomWalk, Roaming, Static, Waypoints
+from skyless.sim.trajectory import RandomWalk, Roaming, Static, Waypoints
 
 SQUARE = [(0.0, 0.0), (4.0, 0.0), (4.0, 3.0), (0.0, 3.0)]
 

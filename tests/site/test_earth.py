@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from skyless.site.earth import east_north_up, east_north_up_of, geodetic, rotated
-from skyless.site.model import GeoreferenceSite
+from skyless.core.earth import east_north_up, east_north_up_of, geodetic, rotated
+from skyless.core.site import GeoreferenceSite
 
 A_M, F = 6_378_137.0, 1 / 298.257223563
 """WGS 84 (NIMA TR8350.2): semi-major axis and flattening."""

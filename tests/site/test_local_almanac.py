@@ -2,21 +2,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.air.almanac import AccuracyPage, NoisePage, SitePage
-from skyless.air.beacon2 import Beacon2, StatedPosition
-from skyless.site.lab import lab_site
-from skyless.site.local_almanac import (
-    MOST_ISSUES,
-    MOST_PAGES,
-    MOST_POSITIONS,
+from skyless.core.air.almanac import AccuracyPage, NoisePage, SitePage
+from skyless.core.air.beacon import Beacon, StatedPosition
+from skyless.core.air.local_almanac import (
+    MAX_ISSUE_PAGES,
+    MAX_ISSUES,
+    MAX_POSITIONS,
     PRESENT_TICKS,
     LocalAlmanac,
     site_issue,
     site_page_for,
     site_pages_of,
 )
-from skyless.site.model import GeoreferenceSite
-from skyless.ticks import from_seconds
+from skyless.core.site import GeoreferenceSite
+from skyless.core.ticks import from_seconds
+from skyless.sim.lab import lab_site
 
 SITE = replace(lab_site(), schedule=replace(lab_site().schedule, mode="free"))
 PAGES = site_pages_of(SITE)
@@ -28,7 +28,7 @@ HERE = StatedPosition(1.0, 2.0, 3.0)
 
 
 def beacon(anchor, page=None, issue=ISSUE, position=HERE):
-    return Beacon2(1, anchor, 0, 0, issue, None, position, None, (), 0, page)
+    return Beacon(1, anchor, 0, 0, issue, 0x20, position, (), 0, page)
 
 
 def rotation(count, anchors=(1, 2, 3), pages=PAGES):
@@ -127,8 +127,8 @@ def test_memory_is_bounded_whatever_comes_and_a_state_goes_on_the_same(rows):
         height = replace(PAGES[-1], tag_height_m=float(n)) if page == 2 else PAGES[page]
         almanac.on_beacon(beacon(anchor, height, issue % 9), n * STEP, is_confirmed)
     state = almanac.state()
-    assert len(state.anchors) <= MOST_POSITIONS
-    assert len(state.collected) <= MOST_ISSUES * 3 * MOST_PAGES
+    assert len(state.anchors) <= MAX_POSITIONS
+    assert len(state.collected) <= MAX_ISSUES * 3 * MAX_ISSUE_PAGES
     again.restore(state)
     assert again.state() == state
 
@@ -152,4 +152,4 @@ def test_strangers_do_not_displace_anchors_that_others_have_received():
     run(almanac, rotation(9), start=from_seconds(2.0))
     assert almanac.pages is not None
     assert almanac.issue == ISSUE
-    assert len(almanac.state().anchors) <= MOST_POSITIONS
+    assert len(almanac.state().anchors) <= MAX_POSITIONS

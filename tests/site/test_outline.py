@@ -12,19 +12,18 @@ from hypothesis import strategies as st
 from msgspec import UNSET
 from msgspec.structs import replace
 
-from skyless.errors import ConfigurationError
-from skyless.evaluation.scenarios import patrols, wanderers
-from skyless.mqtt.messages import SiteMessage, site_message
-from skyless.planning.floor import floor_of
-from skyless.site.advice import warnings_of
-from skyless.site.check import check_site
-from skyless.site.digest import site_digest
-from skyless.site.lab import lab_site
-from skyless.site.load import load_site
-from skyless.site.model import Site
-from skyless.site.outline import rectangle_of, sides_that_meet
-from skyless.site.rewrite import with_values
-from skyless.site.template import rectangle, rectangular_site, site_template
+from skyless.core.errors import ConfigurationError
+from skyless.core.geometry import rectangle_of, sides_that_meet
+from skyless.core.site import Site, site_digest
+from skyless.run.mqtt.messages import SiteMessage, site_message
+from skyless.sim.evaluation.scenarios import patrols, wanderers
+from skyless.sim.lab import lab_site
+from skyless.site.file.advice import warnings_of
+from skyless.site.file.check import check_site
+from skyless.site.file.load import load_site
+from skyless.site.file.rewrite import with_values
+from skyless.site.file.template import rectangle, rectangular_site, site_template
+from skyless.site.planning.floor import floor_of
 
 LAB = lab_site()
 ROOM = replace(LAB, outline_m=rectangle(6.0, 8.0))

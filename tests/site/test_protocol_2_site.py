@@ -1,4 +1,4 @@
-"""Site files of protocol 2: modes slots and free, anchors without a position, slots that anchors share."""
+"""Site files of protocol 2: mode free, anchors without a position, large sites."""
 
 import msgspec
 import numpy as np
@@ -6,16 +6,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.errors import ConfigurationError
-from skyless.site.advice import warnings_of
-from skyless.site.grid import grid_site
-from skyless.site.load import load_site
-from skyless.site.model import UnplacedAnchor
-from skyless.site.near import pairs_within, pairs_within_groups
-from skyless.site.slots import beacon_period_s, first_slots, schedule_of
-from skyless.site.template import site_template
+from skyless.core.air.instants import OFFERED_HZ, SHORTEST_PERIOD_S
+from skyless.core.errors import ConfigurationError
+from skyless.core.geometry import pairs_within
+from skyless.core.protocols import beacon_period_s
+from skyless.core.site import UnplacedAnchor
+from skyless.site.file.advice import warnings_of
+from skyless.site.file.load import load_site
+from skyless.site.file.template import grid_site, site_template
 
-SLOTS = 'name = "x"\nid = 1\n[schedule]\nmode = "slots"\nslots = 3\n'
 FREE = 'name = "x"\nid = 1\n[schedule]\nmode = "free"\n'
 
 
@@ -36,26 +35,21 @@ def load(tmp_path):
 
 def test_anchors_without_a_position_are_kept_apart_and_no_master_is_needed(load):
     site = load(
-        SLOTS
-        + "site_time = true\nreuse_m = 20.0\n"
-        + anchor(5, slot=2, tx_antenna_delay_ticks=16_500)
-        + anchor(6, 0, 0, slot=0, floor=-1, zone=7, std_m=0.004)
-        + anchor(7, 21, 0, slot=0)
+        FREE
+        + anchor(5, tx_antenna_delay_ticks=16_500)
+        + anchor(6, 0, 0, floor=-1, zone=7, std_m=0.004)
+        + anchor(7, 21, 0)
     )
     assert site.master == 5
-    assert site.unplaced == (UnplacedAnchor(5, 2, 16_500),)
+    assert site.unplaced == (UnplacedAnchor(5, tx_antenna_delay_ticks=16_500),)
     assert [(a.id, a.floor, a.zone, a.std_m) for a in site.anchors] == [(6, -1, 7, 0.004), (7, 0, 0, None)]
-    assert (site.schedule.site_time, site.schedule.rate_hz) == (True, 30.0)
-    assert first_slots(site) == {6: 0, 7: 0, 5: 2}
-    assert schedule_of(site).slots == 3
-    assert beacon_period_s(site) == pytest.approx(3 * site.schedule.slot_s, rel=1e-5)
 
 
-def test_a_free_site_has_no_schedule(load):
-    site = load(FREE + "rate_hz = 50\n" + anchor(1, 0, 0) + anchor(2))
-    assert beacon_period_s(site) == 0.02
-    with pytest.raises(ValueError, match="mode free"):
-        schedule_of(site)
+def test_the_rate_of_anchors_is_that_of_the_file_or_follows_from_how_many_are_in_reach(load):
+    anchors = anchor(1, 0, 0) + anchor(2)
+    assert beacon_period_s(load(FREE + "rate_hz = 50\n" + anchors)) == 0.02
+    assert beacon_period_s(load(FREE + anchors)) == SHORTEST_PERIOD_S
+    assert beacon_period_s(grid_site(475.0, 475.0, 15.0, 4.0)) == pytest.approx(13 / OFFERED_HZ)
 
 
 def test_a_site_may_begin_with_no_position_at_all(load):
@@ -64,30 +58,13 @@ def test_a_site_may_begin_with_no_position_at_all(load):
     assert "2 of 2 anchors have no position" in warnings_of(site)[0]
 
 
-def test_slots_need_not_be_given_to_the_planner(load):
-    site = load(SLOTS.replace("slots = 3", "") + anchor(1, 0, 0) + anchor(2, 1, 0, slot=200), slots_given=False)
-    with pytest.raises(ValueError, match=r"no schedule\.slots yet"):
-        schedule_of(site)
-
-
 @pytest.mark.parametrize(
     ("text", "key", "value", "right"),
     [
-        (SLOTS.replace('"slots"', '"slot"') + anchor(1, 0, 0), "schedule.mode", "slot", '"master", "slots" and "free"'),
-        (SLOTS + "site_time = 1\n" + anchor(1, 0, 0), "schedule.site_time", 1, "true or false"),
-        (SLOTS.replace("slots = 3", "") + anchor(1, 0, 0, slot=0), "schedule.slots", None, "to 255; skyless plan"),
-        (SLOTS + anchor(1, 0, 0), "anchors[0].slot (anchor 1)", None, "from 0 to 2; skyless plan"),
-        (SLOTS + anchor(9) + anchor(1, 0, 0, slot=0), "anchors[0].slot (anchor 9)", None, "from 0 to 2"),
-        (SLOTS + anchor(9, slot=0) + anchor(1, 0, 0, slot=3), "anchors[1].slot (anchor 1)", 3, "from 0 to 2"),
-        (
-            SLOTS + anchor(9, slot=0) + anchor(1, 0, 0, slot=1) + anchor(2, 0, 77.9, slot=1),
-            "anchors[2].slot (anchor 2)",
-            1,
-            "anchors 1 and 2 share it and are 77.9 m apart, less than schedule.reuse_m, 78 m; skyless plan",
-        ),
-        (SLOTS + "frames_per_node = 2\n" + anchor(1, 0, 0, slot=0), "schedule.frames_per_node", 2, "1 in mode slots"),
-        (SLOTS + "slot_s = 0.0008\n" + anchor(1, 0, 0, slot=0), "schedule.slot_s", 0.0008, "at least 0.000815"),
-        (SLOTS + "reuse_m = 0\n" + anchor(1, 0, 0, slot=0), "schedule.reuse_m", 0.0, "from 1 to 10000"),
+        (FREE.replace('"free"', '"fre"') + anchor(1, 0, 0), "schedule.mode", "fre", '"master" or "free"'),
+        (FREE.replace('"free"', '"slots"') + anchor(1, 0, 0, slot=0), "schedule.mode", "slots", '"free": without a'),
+        (FREE + "reuse_m = 78.0\n" + anchor(1, 0, 0), "schedule.reuse_m", 78.0, "left out"),
+        (FREE + "site_time = true\n" + anchor(1, 0, 0), "schedule.site_time", True, "left out"),
         (FREE + "rate_hz = 201\n" + anchor(1, 0, 0), "schedule.rate_hz", 201.0, "from 1 to 200"),
         (FREE + anchor(9) + anchor(1, 0, 8389), "anchors[1].y_m (anchor 1)", 8389.0, "from -8388 to 8388"),
         (FREE + anchor(9) + anchor(1, 0, 0, std_m=0.3), "anchors[1].std_m (anchor 1)", 0.3, "from 0 to 0.255"),
@@ -116,11 +93,10 @@ def test_a_mistake_is_named(load, text, key, value, right):
 
 
 def test_what_costs_accuracy_is_said(load):
-    far = SLOTS + "".join(anchor(k, 300 * (k // 3), 9 * (k % 3), slot=k % 3) for k in range(1, 7)) + anchor(7, slot=0)
+    far = FREE + "".join(anchor(k, 300 * (k // 3), 9 * (k % 3)) for k in range(1, 7))
     found = " / ".join(warnings_of(load(far)))
     assert "anchor 6: no other anchor within 31 m" in found
     assert "the anchors form 3 groups" in found
-    assert "anchor 7: shares its slot" in found
     crowded = FREE + "rate_hz = 100\n" + "".join(anchor(k, k % 4, k // 4) for k in range(16))
     assert "16 anchors in reach of one another send 1600 beacons/s" in warnings_of(load(crowded))[-1]
     assert not any("rate_hz" in warning for warning in warnings_of(load(crowded.replace("100", "59"))))
@@ -129,9 +105,8 @@ def test_what_costs_accuracy_is_said(load):
     assert "anchors 1, 2, 3: std_m has no effect" in warnings_of(load(stated))[-1]
 
 
-@pytest.mark.parametrize("mode", ["slots", "free"])
-def test_ten_thousand_anchors_are_written_and_loaded(load, mode):
-    site = grid_site(2000.0, 1125.0, 15.0, 4.0, 1.2, mode)
+def test_ten_thousand_anchors_are_written_and_loaded(load):
+    site = grid_site(2000.0, 1125.0, 15.0, 4.0, 1.2)
     assert len(site.anchors) == 9975
     assert load(site_template(site)) == site
     assert warnings_of(site) == []
@@ -139,9 +114,7 @@ def test_ten_thousand_anchors_are_written_and_loaded(load, mode):
 
 def test_anchors_without_a_position_are_written(load):
     site = grid_site(60.0, 40.0, 10.0, 4.0)
-    unplaced = (UnplacedAnchor(900, 24), UnplacedAnchor(901, 25))
-    schedule = msgspec.structs.replace(site.schedule, slots=26, site_time=True, reuse_m=70.0)
-    site = msgspec.structs.replace(site, unplaced=unplaced, schedule=schedule)
+    site = msgspec.structs.replace(site, unplaced=(UnplacedAnchor(900), UnplacedAnchor(901)))
     assert load(site_template(site)) == site
 
 
@@ -151,8 +124,8 @@ def test_grids():
     x_m = sorted({a.x_m for a in site.anchors})
     assert (x_m[0], x_m[-1]) == (5.0, 470.0)
     assert np.allclose(np.diff(x_m), 15.0)
-    assert grid_site(475.0, 475.0, 15.0, 4.0, 1.2, "free").schedule.rate_hz == 37.0
-    wide = grid_site(10_000.0, 10.0, 5.0, 4.0, mode="free")
+    assert site.schedule.rate_hz is None
+    wide = grid_site(10_000.0, 10.0, 5.0, 4.0)
     assert (wide.anchors[0].x_m, wide.anchors[-1].x_m) == (-4997.5, 4997.5)
     with pytest.raises(ValueError, match="444889 anchors are too many"):
         grid_site(10_000.0, 10_000.0, 15.0, 4.0)
@@ -161,9 +134,9 @@ def test_grids():
 TOML_VALUES = [
     "0", "-1", "1", "3", "70000", "1.5", "nan", "inf", "1e300", '"free"', '"slots"', '"master"', "true", "[]", "{}",
 ]  # fmt: skip
-WRITTEN = SLOTS + "reuse_m = 20.0\nsite_time = true\nrate_hz = 5\nslot_s = 1e-3\nframes_per_node = 1\n"
+WRITTEN = FREE + "rate_hz = 5\nslot_s = 1e-3\nframes_per_node = 1\nslots = 3\n"
 WRITTEN += anchor(1, 0.5, 0.5, slot=0, floor=1, zone=2, std_m=0.1) + anchor(2, slot=1)
-WRITTEN += anchor(3, 25.5, 0.5, slot=0) + anchor(4, slot=2)
+WRITTEN += anchor(3, 25.5, 0.5) + anchor(4)
 
 
 @given(st.integers(0, 60), st.sampled_from([*TOML_VALUES, None]))
@@ -192,11 +165,6 @@ def test_near_pairs_are_those_of_a_table_of_all(seed, count, distance_m, flat):
     assert len(found) == len(set(found))
     near = {(i, j) for i in range(count) for j in range(i + 1, count) if apart[i, j] < distance_m}
     assert set(found) == near
-    group = np.random.default_rng(seed).integers(-1, 4, count)
-    batches = pairs_within_groups(points, group, distance_m)
-    found = [pair for ones, others, _ in batches for pair in zip(ones.tolist(), others.tolist(), strict=True)]
-    assert len(found) == len(set(found))
-    assert set(found) == {(i, j) for i, j in near if group[i] == group[j] >= 0}
 
 
 CORNERS = anchor(1, 0, 0) + anchor(2, 9, 0) + anchor(3, 0, 9) + anchor(4, 9, 9)
@@ -204,8 +172,9 @@ FLAT = "[tags]\nheight_m = 1.0\n"
 
 
 def test_keys_that_mean_nothing_in_a_mode_are_warned_of(load):
-    (warning,) = warnings_of(load(FREE + "site_time = true\n" + FLAT + CORNERS))
-    assert warning == "schedule.site_time is true, which has no effect in mode free"
+    slots, slot = warnings_of(load(FREE + "slots = 8\n" + FLAT + CORNERS.replace("id = 3\n", "id = 3\nslot = 2\n")))
+    assert slots == "schedule.slots is 8, which has no effect in mode free"
+    assert slot == "anchor 3: slot has no effect in mode free"
     document = 'name = "x"\nid = 1\nmaster = 1\n[schedule]\nrate_hz = 50.0\n' + FLAT + CORNERS
     rate, floor = warnings_of(load(document.replace("id = 3\n", "id = 3\nfloor = 2\n")))
     assert rate == "schedule.rate_hz is 50.0, which has no effect in mode master"
@@ -232,10 +201,3 @@ def test_lines_are_judged_by_what_is_in_reach(load):
 def test_a_missing_coordinate_has_the_limits_of_the_mode(load):
     with pytest.raises(ConfigurationError, match="from -8388 to 8388"):
         load(FREE + anchor(1, 0))
-
-
-def test_slots_that_are_there_are_replaced_with_force(load):
-    with pytest.raises(ConfigurationError, match="plan --write colours"):
-        load(SLOTS.replace("slots = 3\n", "") + anchor(1, 0, 0) + anchor(2, 9, 0))
-    with pytest.raises(ConfigurationError, match="plan --write --force colours"):
-        load(SLOTS + anchor(1, 0, 0, slot=0) + anchor(2, 9, 0))

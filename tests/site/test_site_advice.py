@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.site.advice import warnings_of
-from skyless.site.lab import lab_site
-from skyless.site.model import EXACT, AccuracySite, AnchorSite, ScheduleSite, TagsSite
+from skyless.core.site import EXACT, AccuracySite, AnchorSite, ScheduleSite, TagsSite
+from skyless.sim.lab import lab_site
+from skyless.site.file.advice import warnings_of
 
 
 def site_of(points, height_m=None):

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from skyless.site.image import image_size
+from skyless.site.file.check import image_size
 
 
 def image(form, size, **options):

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.errors import ConfigurationError
-from skyless.site.check import SITE_LIMITS
-from skyless.site.lab import lab_site
-from skyless.site.load import load_site
-from skyless.site.model import AccuracySite
-from skyless.site.template import site_template
+from skyless.core.errors import ConfigurationError
+from skyless.core.site import AccuracySite
+from skyless.sim.lab import lab_site
+from skyless.site.file.check import SITE_LIMITS
+from skyless.site.file.load import load_site
+from skyless.site.file.template import site_template
 
 LAB = site_template(lab_site())
 HEAD = 'name = "x"\nid = 1\nmaster = 1\n'

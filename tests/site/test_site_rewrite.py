@@ -4,12 +4,12 @@ import tomllib
 
 import pytest
 
-from skyless.errors import ConfigurationError
-from skyless.site.lab import lab_site
-from skyless.site.load import load_site
-from skyless.site.model import AccuracySite
-from skyless.site.rewrite import with_slots_written, with_tx_delays
-from skyless.site.template import site_template
+from skyless.core.errors import ConfigurationError
+from skyless.core.site import AccuracySite
+from skyless.sim.lab import lab_site
+from skyless.site.file.load import load_site
+from skyless.site.file.rewrite import with_tx_delays
+from skyless.site.file.template import site_template
 
 TEXT = """\
 name = "hall"   # ours
@@ -76,14 +76,3 @@ def test_a_template_stays_a_valid_site(tmp_path):
 def test_what_cannot_be_followed_is_refused_and_not_guessed(text):
     with pytest.raises(ConfigurationError, match="one line for each key"):
         with_tx_delays(text, {1: 5}, "site.toml")
-
-
-def test_slots_are_written_and_the_rest_stays():
-    text = TEXT.replace("\n[tags]", 'slot = 3 # for now\n\n[schedule]\nmode = "slots"  # ours\n\n[tags]')
-    changed = with_slots_written(text, {1: 0, 2: 1}, 2, "site.toml")
-    assert changed == text.replace("y_m = 0.0\n", "y_m = 0.0\nslot = 0\n").replace("slot = 3 #", "slot = 1 #").replace(
-        "# ours\n\n[tags]", "# ours\nslots = 2\n\n[tags]"
-    )
-    assert with_slots_written(changed, {1: 0, 2: 1}, 2, "site.toml") == changed
-    with pytest.raises(ConfigurationError, match="so that the slots"):
-        with_slots_written('schedule = {mode = "slots"}\n[[anchors]]\nid = 1\nx_m = 1\n', {1: 0}, 1, "site.toml")

@@ -5,14 +5,14 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from skyless.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.kernels.processors import cores
-from skyless.site.lab import ideal_lab_site
-from skyless.studies.efficiency import run_chunk, summary
-from skyless.studies.episodes import Case, draw_episode
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.core.kernels.processors import cores
+from skyless.research.studies.efficiency import run_chunk, summary
+from skyless.research.studies.episodes import Case, draw_episode
+from skyless.sim.lab import paper_lab_site
 
-LAB_M = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in ideal_lab_site().anchors])
-SLOT_S = ideal_lab_site().schedule.slot_s
+LAB_M = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in paper_lab_site().anchors])
+SLOT_S = paper_lab_site().schedule.slot_s
 CASES = (Case(), Case(mesh=True), Case(mesh=True, at_once=True))
 
 

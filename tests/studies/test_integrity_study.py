@@ -4,15 +4,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from skyless.constants import TICK_M
-from skyless.errors import SkylessError
-from skyless.evaluation.figures import picture
-from skyless.site.lab import ideal_lab_site
-from skyless.studies.catalogue import STUDIES
-from skyless.studies.common.plan import plan_of
-from skyless.studies.common.summary import CLUSTER_FIXES, clustered_interval
-from skyless.studies.episodes import Case, draw_episode
-from skyless.studies.integrity import (
+from skyless.core.constants import TICK_M
+from skyless.core.errors import SkylessError
+from skyless.research.studies.catalogue import STUDIES
+from skyless.research.studies.common.plan import plan_of
+from skyless.research.studies.common.summary import CLUSTER_FIXES, clustered_interval
+from skyless.research.studies.episodes import Case, draw_episode
+from skyless.research.studies.integrity import (
     ALL_FAULTS,
     FAULT_BURST_S,
     FAULTS,
@@ -25,8 +23,10 @@ from skyless.studies.integrity import (
     rows,
     run_chunk,
 )
+from skyless.sim.lab import paper_lab_site
+from skyless.site.report.figures import picture
 
-SLOT_S = ideal_lab_site().schedule.slot_s
+SLOT_S = paper_lab_site().schedule.slot_s
 PLAN = plan_of("joint", 1, episodes=100)
 
 

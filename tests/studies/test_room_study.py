@@ -6,27 +6,30 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from skyless.cli.api.study import StudyResult
 from skyless.cli.study import print_rows
-from skyless.evaluation.figures import picture
-from skyless.evaluation.statistics import LevelCounts, LevelTally
-from skyless.positioning.integrity import Alert, Integrity
-from skyless.simulation.channel import cross_walls, pack_walls
-from skyless.simulation.impairments import Body
-from skyless.site.lab import lab_site
-from skyless.studies import room
-from skyless.studies.catalogue import STUDIES
-from skyless.studies.common.plan import Limit, Row, plan_of, with_limits
-from skyless.studies.common.summary import clustered_interval
-from skyless.studies.common.worlds import RunResult, box, run_world
-from skyless.studies.room import biases_of, bound_cells
-from skyless.uncertainty.bounds import Biases
+from skyless.core.integrity import Alert, Integrity
+from skyless.research.studies import room
+from skyless.research.studies.catalogue import STUDIES
+from skyless.research.studies.common.plan import Limit, plan_of, with_limits
+from skyless.research.studies.common.summary import clustered_interval
+from skyless.research.studies.common.worlds import RunResult, box, run_world
+from skyless.research.studies.room import biases_of, bound_cells
+from skyless.research.uncertainty.bounds import Biases
+from skyless.sim.evaluation.statistics import LevelCounts, LevelTally
+from skyless.sim.impairments import Body
+from skyless.sim.lab import lab_site
+from skyless.site.channel import cross_walls, pack_walls
+from skyless.site.report.figures import picture
 
 PLAN = plan_of("joint", 1, study="room")
 CASES = {case.name: case for case in room.cases(PLAN)}
 RESTS = ("at rest, unbiased air", "at rest", "at rest, 3-D room")
 FIELDS = ("multipath of 5 cm over 10 cm", "multipath of 10 cm over 10 cm")
 LONG = {*RESTS, *(f"{name}, later" for name in RESTS), *FIELDS, *(f"1 of 6 creeps 5 cm/s for {s} s" for s in (20, 60))}
-EMPTY = Row("room", "joint", "a", "s", None, True, 100.0, 2, 10, 0.03)
+EMPTY = room.LevelRow(
+    study="room", method="joint", case="a", series="s", mesh=True, noise_ps=100.0, runs=2, fixes=10, rmse_m=0.03
+)
 
 
 def test_the_room_has_a_hundred_tags_in_twenty_draws_and_the_rest_a_quarter():
@@ -314,7 +317,7 @@ def test_the_table_and_the_picture_show_levels_and_what_is_missed(capsys):
     plan = plan_of("joint", 1, study="room", worlds=2)
     counts = LevelCounts(*map(np.array, ([4.0, 5.0], [4.0, 2.0], [3.0, 0.0], [1.0, 0.0])), hpl_m=np.array([0.1, 0.4]))
     rows = room.rows(plan, _results(plan, counts))
-    print_rows(STUDIES["room"], plan, rows, 1.0, json=False)
+    print_rows(StudyResult("room", plan, tuple(rows), 1.0))
     out = capsys.readouterr().out
     for words in (
         "past a wall",
@@ -336,7 +339,7 @@ def test_the_bound_is_of_what_the_worlds_draw():
         pytest.approx(0.0289, rel=1e-2),
         0.05,
     )
-    assert (usual.changing_std_m, usual.pair_std_m) == (0.0, 0.0)
+    assert usual.changing_std_m == 0.0
     assert found["unbiased air"] == Biases()
     assert (found["each axis N(5 cm)"].survey_std_m, found["constants within 10 cm"].constant_std_m) == (
         0.05,
@@ -357,8 +360,7 @@ def test_the_bound_of_the_room():
     """What ``docs/maths.md`` says of it, from the first six of the hundred tags."""
     plan = replace(plan_of("joint", 11, study="room", worlds=2), tags=3)
     base, air = room.cases(plan)[:2]
-    pairs = replace(base, biases=replace(base.biases, pair_std_m=0.05))
-    for case, bound_m in ((base, 0.0240), (air, 0.0156), (pairs, 0.0253)):
+    for case, bound_m in ((base, 0.0240), (air, 0.0156)):
         variances_m2 = [cell.function(cell.argument) for cell in bound_cells([case])]
         assert math.sqrt(np.mean(variances_m2)) == pytest.approx(bound_m, rel=0.02)
 

@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.air.codec import decode_cached
-from skyless.anchor import Anchor
-from skyless.simulation.impairments import lab_impairments
-from skyless.simulation.world import World
-from skyless.site.check import check_site
-from skyless.site.lab import lab_site
-from skyless.studies import efficiency, loss, motion, nlos, room, scale, sync
-from skyless.studies.common.plan import Plan, plan_of, seed_of
-from skyless.studies.common.summary import Case, interval, jackknife, world_cells, world_rows
-from skyless.studies.common.worlds import RunResult, box, large_lab_site, run_world, walking, without_mesh
+from skyless.core.protocol1.anchor import Anchor
+from skyless.core.protocol1.codec import decode_cached
+from skyless.research.studies import efficiency, loss, motion, nlos, room, scale, sync
+from skyless.research.studies.common.plan import Plan, plan_of, seed_of
+from skyless.research.studies.common.summary import Case, interval, jackknife, world_cells, world_rows
+from skyless.research.studies.common.worlds import RunResult, box, large_lab_site, run_world, walking, without_mesh
+from skyless.sim.impairments import lab_impairments
+from skyless.sim.lab import lab_site
+from skyless.sim.world import World
+from skyless.site.file.check import check_site
 
 SMALL = Plan(method="joint", worlds=2, seconds=1.0, tags=1)
 RANDOM = np.random.default_rng(5)

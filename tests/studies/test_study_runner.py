@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from distributed import Client, LocalCluster
 
-from skyless.errors import SkylessError
-from skyless.studies import loss
-from skyless.studies.common.plan import MEASURED, Cell, Plan
-from skyless.studies.common.runner import run_cells, run_cells_on_dask
-from skyless.studies.common.summary import world_cells, world_rows
+from skyless.core.errors import SkylessError
+from skyless.research.studies import loss
+from skyless.research.studies.common.plan import MEASURED, Cell, Plan
+from skyless.research.studies.common.runner import run_cells, run_cells_on_dask
+from skyless.research.studies.common.summary import world_cells, world_rows
 
 PLAN = Plan(method="joint", seed=3, quick=True, worlds=2, seconds=1.0, tags=1)
 

@@ -3,9 +3,13 @@
 import numpy as np
 import pytest
 
-from skyless.constants import TICK_M
-from skyless.evaluation.surveys.layouts import survey_layouts
-from skyless.evaluation.surveys.rooms import (
+from skyless.core.constants import TICK_M
+from skyless.research.studies import survey_room as study
+from skyless.research.studies.catalogue import STUDIES
+from skyless.research.studies.common.plan import Plan
+from skyless.research.studies.survey_room import SURVEYED, TRUTH, Group, groups, limits_of
+from skyless.research.surveys.layouts import survey_layouts
+from skyless.research.surveys.rooms import (
     ROOM_RANGES,
     RoomErrors,
     air_of,
@@ -15,10 +19,6 @@ from skyless.evaluation.surveys.rooms import (
     surveyed_room,
     true_site,
 )
-from skyless.studies import survey_room as study
-from skyless.studies.catalogue import STUDIES
-from skyless.studies.common.plan import Plan
-from skyless.studies.survey_room import SURVEYED, TRUTH, Group, groups, limits_of
 
 ERRORS = RoomErrors(0.07, 0.02, ROOM_RANGES)
 

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from skyless.evaluation.figures import picture
-from skyless.evaluation.surveys.air import AirErrors, drawn_errors
-from skyless.evaluation.surveys.judge import aligned, tag_error_m
-from skyless.evaluation.surveys.layouts import survey_layouts
-from skyless.studies import survey as study
-from skyless.studies.catalogue import STUDIES
-from skyless.studies.common.plan import Plan
-from skyless.studies.survey import GROUPS, Group, Variant, limits_of
+from skyless.research.studies import survey as study
+from skyless.research.studies.catalogue import STUDIES
+from skyless.research.studies.common.plan import Plan
+from skyless.research.studies.survey import GROUPS, Group, Variant, limits_of
+from skyless.research.surveys.air import AirErrors, drawn_errors
+from skyless.research.surveys.judge import aligned, tag_error_m
+from skyless.research.surveys.layouts import survey_layouts
+from skyless.site.report.figures import picture
 
 SMALL = {
     "lab": (

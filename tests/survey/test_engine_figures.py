@@ -7,13 +7,13 @@ import pytest
 from msgspec import structs
 from scipy.stats import chi2
 
-from skyless.evaluation.surveys.layouts import drawn_ranges, survey_layouts
-from skyless.survey.build import build_problem, own_delays, usable
-from skyless.survey.facts import Facts, Tape
-from skyless.survey.fit import determined as determination
-from skyless.survey.fit.gauge import align
-from skyless.survey.fit.problem import solve_least_squares
-from skyless.survey.solve import run_survey
+from skyless.research.surveys.layouts import drawn_ranges, survey_layouts
+from skyless.site.survey.build import build_problem, own_delays, usable
+from skyless.site.survey.facts import Facts, Tape
+from skyless.site.survey.fit import determined as determination
+from skyless.site.survey.fit.problem import solve_least_squares
+from skyless.site.survey.frame import align
+from skyless.site.survey.solve import run_survey
 
 LAYOUTS = survey_layouts()
 RUNS = 60

@@ -8,11 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import structs
 
-from skyless.evaluation.surveys.layouts import SurveyLayout, drawn_ranges, survey_layouts
-from skyless.survey.facts import Facts, Gauge
-from skyless.survey.fit.gauge import align, axes_through
-from skyless.survey.ranges import PairRange, PairRanges
-from skyless.survey.solve import run_survey
+from skyless.research.surveys.layouts import SurveyLayout, drawn_ranges, survey_layouts
+from skyless.site.survey.facts import Facts, Gauge, PairRange, PairRanges
+from skyless.site.survey.frame import align, axes_through
+from skyless.site.survey.solve import run_survey
 
 LAB = survey_layouts()["lab"]
 ROOM = survey_layouts()["room"]

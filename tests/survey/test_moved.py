@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 
 from skyless.cli.main import main
-from skyless.constants import TICK_M, TICK_RATE_HZ
-from skyless.nodes.survey.live_survey import LiveSurvey
-from skyless.nodes.survey.program import SurveyNode, SurveySettings
-from skyless.site.lab import lab_site
-from skyless.survey.facts import Facts, Gauge
-from skyless.survey.ranges import PairBlock
-from skyless.survey.solve import run_survey
-from skyless.survey.stamps.pair_ranger import PairRanger
-from skyless.survey.stamps.steps import RangeSteps
-from skyless.survey.watch.moved import change_of, drop_moved
+from skyless.core.constants import TICK_M, TICK_RATE_HZ
+from skyless.run.survey.live_survey import LiveSurvey
+from skyless.run.survey.program import SurveyNode, SurveySettings
+from skyless.sim.lab import lab_site
+from skyless.site.survey.facts import Facts, Gauge, PairBlock
+from skyless.site.survey.solve import run_survey
+from skyless.site.survey.stamps.pair_ranger import PairRanger, RangeSteps
+from skyless.site.survey.watch.moved import change_of, drop_moved
 
 LAB = {anchor.id: (anchor.x_m, anchor.y_m) for anchor in lab_site().anchors}
 SMALL = {1: (0.0, 0.0), 2: (7.0, 0.0), 3: (6.0, 5.0), 4: (-1.0, 6.0)}

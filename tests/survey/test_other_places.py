@@ -6,9 +6,8 @@ import numpy as np
 from msgspec.structs import replace
 from random_sites import draw_plant
 
-from skyless.survey.facts import Facts, Tape
-from skyless.survey.ranges import PairRange, PairRanges
-from skyless.survey.solve import run_survey
+from skyless.site.survey.facts import Facts, PairRange, PairRanges, Tape
+from skyless.site.survey.solve import run_survey
 
 PLACES = re.compile(
     r"^(?P<case>.+), anchor (?P<anchor>\d+) is not at \((?P<here>[^)]+)\) but (?P<apart>[\d.]+) m away at "

@@ -9,11 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from skyless.clocks.two_way import Leg, bracketed_flight_ticks
-from skyless.constants import TICK_M, TICK_RATE_HZ
-from skyless.survey.stamps.brackets import Legs, flights_of
-from skyless.survey.stamps.clusters import earliest_cluster, half_sample_mode
-from skyless.survey.stamps.pair_ranger import PairRanger
+from skyless.core.constants import TICK_M, TICK_RATE_HZ
+from skyless.site.survey.stamps.pair_ranger import Legs, PairRanger, flights_of
+from skyless.site.survey.stamps.repeats import earliest_cluster, half_sample_mode
+from skyless.site.survey.two_way import Leg, bracketed_flight_ticks
 
 POSITION_M = {1: (0.0, 0.0), 2: (7.0, 0.0), 3: (6.0, 5.0), 4: (-1.0, 6.0)}
 SLOT_S = 2.5e-3

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from skyless.evaluation.surveys.layouts import drawn_ranges, survey_layouts
-from skyless.survey.facts import Facts, Tape
-from skyless.survey.ranges import PairRange, PairRanges
-from skyless.survey.solve import run_survey
+from skyless.research.surveys.layouts import drawn_ranges, survey_layouts
+from skyless.site.survey.facts import Facts, PairRange, PairRanges, Tape
+from skyless.site.survey.solve import run_survey
 
 LAB = survey_layouts()["lab"]
 RANGES = drawn_ranges(LAB, 10.0, np.random.default_rng(1))

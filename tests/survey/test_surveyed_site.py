@@ -9,18 +9,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.constants import TICK_M
-from skyless.errors import ConfigurationError, SkylessError
-from skyless.site.check import check_site
-from skyless.site.lab import lab_site
-from skyless.site.load import load_site
-from skyless.site.local_almanac import site_issue, site_pages_of
-from skyless.site.model import EXACT, ScheduleSite, UnplacedAnchor
-from skyless.site.template import site_template
-from skyless.survey.ranges import PairRange, PairRanges
-from skyless.survey.record import SurveyRecord, baseline, encode_record, read_record, record_path
-from skyless.survey.result import Survey, SurveyedAnchor
-from skyless.survey.surveyed_site import delay_changes_ticks, surveyed_site, surveyed_text, unchanged_anchors
+from skyless.core.air.local_almanac import site_issue, site_pages_of
+from skyless.core.constants import TICK_M
+from skyless.core.errors import ConfigurationError, SkylessError
+from skyless.core.site import EXACT, ScheduleSite, UnplacedAnchor
+from skyless.sim.lab import lab_site
+from skyless.site.file.check import check_site
+from skyless.site.file.load import load_site
+from skyless.site.file.template import site_template
+from skyless.site.survey.facts import PairRange, PairRanges
+from skyless.site.survey.result import (
+    Survey,
+    SurveyedAnchor,
+    SurveyRecord,
+    baseline,
+    encode_record,
+    read_record,
+    record_path,
+)
+from skyless.site.survey.surveyed_site import delay_changes_ticks, surveyed_site, surveyed_text, unchanged_anchors
 
 LAB = lab_site()
 
@@ -33,13 +40,10 @@ def found(identifier, x_m=1.0, y_m=2.0, z_m=0.5, std_m=0.0123, delay_m=0.1):
     return SurveyedAnchor(identifier, True, x_m, y_m, z_m, std_m, None, delay_m, 0.01)
 
 
-def slots_site(placed, unplaced):
-    """A site of protocol 2 with a slot for each anchor."""
-    count = len(LAB.anchors)
-    anchors = tuple(replace(anchor, slot=slot) for slot, anchor in enumerate(LAB.anchors[:placed]))
-    others = tuple(UnplacedAnchor(100 + k, placed + k) for k in range(unplaced))
-    assert placed <= count
-    schedule = ScheduleSite(mode="slots", slot_s=2.5e-3, slots=placed + unplaced)
+def free_site(placed, unplaced):
+    """A site of protocol 2."""
+    anchors, others = LAB.anchors[:placed], tuple(UnplacedAnchor(100 + k) for k in range(unplaced))
+    schedule = ScheduleSite(mode="free")
     return replace(LAB, anchors=anchors, unplaced=others, schedule=schedule, master=(*anchors, *others)[0].id)
 
 
@@ -58,7 +62,7 @@ anchors_found = st.builds(
 
 
 @given(
-    st.sampled_from([LAB, replace(LAB, accuracy=EXACT), slots_site(4, 2), slots_site(0, 5), slots_site(6, 0)]),
+    st.sampled_from([LAB, replace(LAB, accuracy=EXACT), free_site(4, 2), free_site(0, 5), free_site(6, 0)]),
     st.lists(anchors_found, min_size=6, max_size=6),
     st.floats(0.0, 0.2),
 )
@@ -95,7 +99,7 @@ def test_comments_and_layout_stay_and_only_what_has_changed_is_written(tmp_path)
 
 
 def test_delays_accuracy_and_anchors_that_are_not_determined():
-    site = slots_site(2, 2)
+    site = free_site(2, 2)
     a, b = site.anchors
     kept = site.unplaced[1]
     survey = survey_of(
@@ -110,7 +114,7 @@ def test_delays_accuracy_and_anchors_that_are_not_determined():
     assert new.anchors[0].std_m == 0.005
     assert new.anchors[1] == b
     assert (new.anchors[2].x_m, new.anchors[2].y_m, new.anchors[2].z_m) == (3.0, 0.0, 2.5)
-    assert (new.anchors[2].slot, new.anchors[2].std_m) == (site.unplaced[0].slot, 0.255)
+    assert (new.anchors[2].id, new.anchors[2].std_m) == (site.unplaced[0].id, 0.255)
     assert new.unplaced == (kept,)
     assert new.accuracy == replace(site.accuracy, range_std_m=0.0544)
     assert unchanged_anchors(site, survey) == (b.id, kept.id)
@@ -120,7 +124,7 @@ def test_delays_accuracy_and_anchors_that_are_not_determined():
 @pytest.mark.parametrize("range_std_m", [0.0, 0.03, 0.50003, 6.5])
 def test_tags_see_from_the_accuracy_that_delays_have_changed(range_std_m):
     """Positions that are kept do not change the almanac, and delays are not in it."""
-    site = replace(slots_site(6, 0), accuracy=replace(LAB.accuracy, range_std_m=range_std_m))
+    site = replace(free_site(6, 0), accuracy=replace(LAB.accuracy, range_std_m=range_std_m))
     kept = [found(one.id, one.x_m, one.y_m, one.z_m, one.std_m, 0.0) for one in site.anchors]
     assert surveyed_site(site, survey_of(*kept, range_std_m=0.0)).accuracy == site.accuracy
     changed = surveyed_site(site, survey_of(*kept[1:], replace(kept[0], delay_m=0.1), range_std_m=0.0))

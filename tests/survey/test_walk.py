@@ -8,18 +8,16 @@ import pytest
 from msgspec.structs import replace
 
 from machines.bench import LAB, ROOM
-from skyless.anchor import Anchor
-from skyless.constants import TICK_M
-from skyless.evaluation.scenarios import Request, impairments_of
-from skyless.simulation.impairments import DelayError
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import Waypoints
-from skyless.simulation.world import World
-from skyless.survey.fit.problem import Problem, solve_least_squares
-from skyless.survey.tags.epochs import EpochCollector, TagEpochs, tag_ranges
-from skyless.survey.tags.joint import fit_with_tag
-from skyless.survey.tags.relayed import RelayedDifferences
-from skyless.survey.tags.walk import TAG_STD_M, WalkRows
+from skyless.core.constants import TICK_M
+from skyless.core.protocol1.anchor import Anchor
+from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.impairments import DelayError
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Waypoints
+from skyless.sim.world import World
+from skyless.site.survey.fit.problem import Problem, solve_least_squares
+from skyless.site.survey.relayed import RelayedDifferences
+from skyless.site.survey.walk import TAG_STD_M, EpochCollector, TagEpochs, WalkRows, fit_with_tag, tag_ranges
 
 RANGE_STD_M, DELAY_STD_M = 0.03, 0.15
 LAB_M = np.array([(anchor.x_m, anchor.y_m, 0.0) for anchor in LAB.anchors])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skyless.survey.tags.estimate import Differences, estimate
+from skyless.site.survey.estimate import Differences, estimate
 
 ANCHORS_M = np.array([[x, y, z] for x, y in ((-3, -4), (3, -4), (3, 4), (-3, 4)) for z in (0.2, 2.7)])
 BIAS_M = np.array([-0.08, 0.33, 0.19, -0.15, -0.24, 0.07, 0.06, -0.18])

@@ -7,24 +7,23 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+import skyless
 from machines.bench import LAB, Heard
 from recordings import live_site
-from skyless.anchor import Anchor
 from skyless.cli.main import main
-from skyless.constants import TICK_M
-from skyless.errors import SkylessError
-from skyless.evaluation.scenarios import Request, impairments_of
-from skyless.recordings.mcap.recording import McapRecording
-from skyless.simulation.impairments import DelayError
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import Waypoints
-from skyless.simulation.world import World
-from skyless.survey.facts import Facts
-from skyless.survey.solve import run_survey
-from skyless.survey.tags.estimate import estimate
-from skyless.survey_inputs.recorded_stamps import ranges_of
-from skyless.survey_inputs.samples import First, gather
-from skyless.survey_inputs.walk import relayed_tdoas, walk_of
+from skyless.core.constants import TICK_M
+from skyless.core.errors import SkylessError
+from skyless.core.protocol1.anchor import Anchor
+from skyless.research.calibration.recorded_stamps import ranges_of
+from skyless.research.calibration.tags import walk_of
+from skyless.run.recordings.recording import McapRecording
+from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.impairments import DelayError
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Waypoints
+from skyless.sim.world import World
+from skyless.site.survey.facts import Facts
+from skyless.site.survey.solve import run_survey
 
 HEIGHT_M = 0.0
 WAY = [(1.0, 1.0, HEIGHT_M), (5.0, 7.0, HEIGHT_M), (5.0, 1.0, HEIGHT_M), (1.0, 7.0, HEIGHT_M), (3.0, 4.0, HEIGHT_M)]
@@ -89,21 +88,19 @@ def test_what_the_recording_lacks(walk, tag, span, words):
         walk_of(recording, LAB.id, tag, span)
 
 
-def test_where_there_is_no_site_time_relays_show_the_delays_but_for_what_all_share(walk):
-    ranges_m = {(pair.a, pair.b): pair.range_m for pair in ranges_of(walk).ranges.pairs}
-    anchors_m = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in LAB.anchors}
-    way = Waypoints(WAY, 1.0, loop=True, corner_s=0.5)
-    with McapRecording(walk) as recording:
-        tdoas = relayed_tdoas(recording, "a", LAB.id, ranges_m)
-        samples = gather(tdoas, anchors_m, lambda _: lambda t_s: tuple(way.position(t_s - live_site.UNIX_S)), First())
-    found = {one.anchor: one for one in estimate(samples.differences, slope=False).anchors}
-    mean_m = np.mean(list(DELAYS_M.values()))
-    for anchor, delay_m in DELAYS_M.items():
-        assert abs(found[anchor].bias_m - (delay_m - mean_m)) < 5.0 * found[anchor].std_m + 0.002
+def test_a_walk_whose_truth_is_known_shows_the_delays(walk):
+    survey = skyless.survey_site(recording=walk, recorded_truth=True).survey
+    assert any("a at known positions" in note for note in survey.notes)
+    for one in survey.anchors:
+        assert abs(one.delay_m - DELAYS_M[one.id]) < 3.0 * one.delay_std_m
+        assert one.delay_std_m < 0.04
 
 
 def test_the_command_uses_the_walk(walk, capsys):
-    assert main(["survey", str(walk), "--no-sketch", "--walk", "a@2:20", "--walk-height", "0", "--json"]) == 0
+    assert (
+        main(["survey", "--recording", str(walk), "--no-sketch", "--walk", "a@2:20", "--walk-height", "0", "--json"])
+        == 0
+    )
     report = json.loads(capsys.readouterr().out)
     assert any("of the walk of a were used" in note for note in report["notes"] + report.get("warnings", []))
 
@@ -118,5 +115,5 @@ def test_the_command_uses_the_walk(walk, capsys):
     ],
 )
 def test_what_the_command_does_not_take(walk, capsys, arguments, words):
-    assert main(["survey", str(walk), *arguments]) == 2
+    assert main(["survey", "--recording", str(walk), *arguments]) == 2
     assert words in capsys.readouterr().err

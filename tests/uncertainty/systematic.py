@@ -7,9 +7,9 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike
 
-from skyless.constants import SPEED_OF_LIGHT_MPS
-from skyless.kernels.arrays import Array
-from skyless.uncertainty.chain import Chain
+from skyless.core.constants import SPEED_OF_LIGHT_MPS
+from skyless.core.kernels.arrays import Array
+from skyless.research.uncertainty.chain import Chain
 
 
 def synchronisation_error_m(chain: Chain) -> Array:

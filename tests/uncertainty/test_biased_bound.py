@@ -7,15 +7,13 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.studies.episodes import random_path
-from skyless.uncertainty.bounds import (
+from skyless.research.studies.episodes import random_path
+from skyless.research.uncertainty.bounds import (
     OFFSET_STD_M,
     POSITION_STD_M,
     RATE_STD_MPS,
     Biases,
-    biased_bound,
-    bound_settings,
-    received_bound,
+    BoundSettings,
     tracking_bound,
 )
 
@@ -23,7 +21,7 @@ LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)
 RAISED = LAB + np.column_stack([np.zeros((6, 2)), [0.5, 2.5] * 3])
 SLOT_S = 2.5e-3
 ROOM = Biases(survey_std_m=0.02, constant_std_m=0.029, slope_std_m=0.05)
-ALL = replace(ROOM, changing_std_m=0.03, correlation_s=0.5, correlation_m=0.3, pair_std_m=0.05)
+ALL = replace(ROOM, changing_std_m=0.03, correlation_s=0.5, correlation_m=0.3)
 
 
 def settings_of(stamp_s=100e-12, **changes):
@@ -36,7 +34,7 @@ def settings_of(stamp_s=100e-12, **changes):
         "mesh": True,
         "at_once": False,
     }
-    return bound_settings(stamp_s, **(base | changes))
+    return BoundSettings(stamp_s, **(base | changes))
 
 
 def still(place, stamp_s, superframes):
@@ -52,17 +50,10 @@ def walk(superframes=40, height_m=0.0):
     return np.add(path, [0.0, 0.0, height_m])
 
 
-@pytest.mark.parametrize("changes", [{}, {"mesh": False}, {"at_once": True}, {"height_known": False}])
-def test_without_biases_it_is_the_bound_that_knows_of_none(changes):
-    anchors, path, settings = RAISED, walk(height_m=1.2), settings_of(**changes)
-    expected = tracking_bound(anchors, path, settings)
-    np.testing.assert_allclose(biased_bound(anchors, path, settings, Biases()), expected, rtol=1e-9)
-
-
 class Textbook:
     """The same model from what stamps hold, differentiated numerically, with clocks against true time.
 
-    States: [p, v, (offset, rate) of tag and anchors, surveys, constants, changes, slope, pairs].
+    States: [p, v, (offset, rate) of tag and anchors, surveys, constants, changes, slope].
     """
 
     def __init__(self, anchors, dims, biases):
@@ -72,8 +63,7 @@ class Textbook:
         self.constants = self.surveys + dims * self.n
         self.changes = self.constants + self.n
         self.slope = self.changes + self.n
-        self.pairs = [(i, j) for i in range(self.n) for j in range(i + 1, self.n)]
-        self.size = self.slope + 1 + len(self.pairs)
+        self.size = self.slope + 1
 
     def stamp_less_senders(self, x, place, sender, listener):
         """What a reception reads beyond what the TX stamp and the told distance of anchors say; None is the tag."""
@@ -90,8 +80,7 @@ class Textbook:
             late = x[self.constants + sender] + x[self.changes + sender] + x[self.slope] * shape
             return length + late + clocks[0] - clocks[1 + sender]
         length = np.linalg.norm(true[listener] - true[sender])
-        pair = self.slope + 1 + self.pairs.index((min(sender, listener), max(sender, listener)))
-        return length + x[pair] + clocks[1 + listener] - clocks[1 + sender]
+        return length + clocks[1 + listener] - clocks[1 + sender]
 
     def row(self, *reception):
         steps = 1e-4 * np.eye(self.size)
@@ -104,7 +93,7 @@ class Textbook:
         stds = [POSITION_STD_M] * dims + [settings.speed_std_mps] * dims
         stds += [OFFSET_STD_M, RATE_STD_MPS] + [0.0, 0.0] + [OFFSET_STD_M, RATE_STD_MPS] * (n - 1)
         stds += [b.survey_std_m] * dims * n + [b.constant_std_m] * n + [b.changing_std_m] * n
-        P = np.diag(np.square([*stds, b.slope_std_m, *[b.pair_std_m] * len(self.pairs)]))
+        P = np.diag(np.square([*stds, b.slope_std_m]))
         dt, found = settings.slot_s, []
         for frame, place in enumerate(path):
             if frame:
@@ -112,17 +101,17 @@ class Textbook:
             sender = frame % n
             listeners = [None, *(i for i in range(n) if i != sender)]
             H = np.array([self.row(place, sender, listener) for listener in listeners])
-            R = settings.rx_variance_m2 * np.eye(len(H)) + settings.tx_variance_m2
+            R = settings.model().rx_variance_m2 * (np.eye(len(H)) + 1.0)
             P = P - P @ H.T @ np.linalg.solve(H @ P @ H.T + R, H @ P)
             if sender == n - 1:
                 found.append(P[:dims, :dims].copy())
         return np.array(found)
 
     def predicted(self, P, dt, way_m, settings):
-        dims, b = self.dims, self.biases
+        dims, b, model = self.dims, self.biases, settings.model()
         F, Q = np.eye(self.size), np.zeros((self.size, self.size))
         pairs = [(axis, dims + axis, 0.0, settings.qa) for axis in range(dims)]
-        pairs += [(i, i + 1, settings.white, settings.walk) for i in range(self.clocks, self.surveys, 2)]
+        pairs += [(i, i + 1, model.white, model.walk) for i in range(self.clocks, self.surveys, 2)]
         for value, rate, w, q in pairs:
             F[value, rate] = dt
             Q[np.ix_([value, rate], [value, rate])] = [[w * dt + q * dt**3 / 3, q * dt**2 / 2], [q * dt**2 / 2, q * dt]]
@@ -138,7 +127,7 @@ def test_the_recursion_is_the_textbooks(dims):
     anchors, path = (LAB, walk()) if dims == 2 else (RAISED, walk(height_m=1.2))
     settings = settings_of(height_known=dims == 2, at_once=True)
     expected = Textbook(anchors, dims, ALL).bound(path, settings)
-    np.testing.assert_allclose(biased_bound(anchors, path, settings, ALL)[2:], expected[2:], rtol=1e-3, atol=1e-8)
+    np.testing.assert_allclose(tracking_bound(anchors, path, settings, ALL)[2:], expected[2:], rtol=1e-3, atol=1e-8)
 
 
 @pytest.mark.parametrize("place", [(3.0, 4.0), (1.2, 1.6), (5.0, 7.0)])
@@ -151,7 +140,7 @@ def test_constants_and_the_slope_leave_what_weighted_least_squares_of_one_snapsh
     g = np.clip((ranges - 4.0) / 4.0, -1.0, 1.0)
     R = 0.029**2 * np.eye(6) + 0.05**2 * np.outer(g, g)
     expected = np.linalg.inv(G.T @ np.linalg.solve(R, G))[:2, :2]
-    found = biased_bound(LAB, path, settings, Biases(constant_std_m=0.029, slope_std_m=0.05))[-1]
+    found = tracking_bound(LAB, path, settings, Biases(constant_std_m=0.029, slope_std_m=0.05))[-1]
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-8)
 
 
@@ -163,38 +152,25 @@ def test_displaced_anchors_that_measure_their_distances_leave_the_whole_site_dis
     x, y = np.array(place) - LAB[:, :2].mean(axis=0)
     across = np.array([-y, x])
     expected = 0.02**2 * (np.eye(2) / 6.0 + np.outer(across, across) / np.square(away).sum())
-    found = biased_bound(LAB, path, settings, Biases(survey_std_m=0.02))[-1]
+    found = tracking_bound(LAB, path, settings, Biases(survey_std_m=0.02))[-1]
     np.testing.assert_allclose(found, expected, rtol=5e-3, atol=1e-7)
-
-
-def test_an_anchor_whose_errors_are_huge_counts_as_one_that_the_tag_does_not_hear():
-    """Where each packet has another error; a constant one leaves what differences of its packets say of the rates."""
-    path, settings = walk(), settings_of(at_once=True)
-    known = np.ones((len(path), 7), np.bool_)
-    known[np.arange(len(path)), np.arange(len(path)) % 6] = False
-    clean = received_bound(LAB, path, settings, known)[5::6]
-    known[3::6, -1] = False
-    without = received_bound(LAB, path, settings, known)[5::6]
-    huge = (0.0, 0.0, 0.0, 1e3, 0.0, 0.0)
-    always_new = biased_bound(LAB, path, settings, Biases(changing_std_m=huge, correlation_s=1e-5))
-    np.testing.assert_allclose(always_new[2:], without[2:], rtol=1e-3, atol=1e-9)
-    constant = biased_bound(LAB, path, settings, Biases(constant_std_m=huge))
-    assert np.trace(clean[-1]) < np.trace(constant[-1]) < np.trace(without[-1])
 
 
 def test_a_part_that_never_changes_is_a_constant_and_one_that_changes_at_once_is_noise():
     path, settings = walk(), settings_of()
-    constant = biased_bound(LAB, path, settings, Biases(constant_std_m=0.03))
-    np.testing.assert_allclose(biased_bound(LAB, path, settings, Biases(changing_std_m=0.03)), constant, rtol=1e-6)
-    noisy = biased_bound(LAB, path, settings, Biases(changing_std_m=0.03, correlation_s=1e-5))
-    clean = biased_bound(LAB, path, settings, Biases())
+    constant = tracking_bound(LAB, path, settings, Biases(constant_std_m=0.03))
+    np.testing.assert_allclose(tracking_bound(LAB, path, settings, Biases(changing_std_m=0.03)), constant, rtol=1e-6)
+    noisy = tracking_bound(LAB, path, settings, Biases(changing_std_m=0.03, correlation_s=1e-5))
+    clean = tracking_bound(LAB, path, settings, Biases())
     assert np.trace(clean[-1]) < np.trace(noisy[-1]) < np.trace(constant[-1])
 
 
-@pytest.mark.parametrize("name", ["survey_std_m", "constant_std_m", "changing_std_m", "slope_std_m", "pair_std_m"])
+@pytest.mark.parametrize("name", ["survey_std_m", "constant_std_m", "changing_std_m", "slope_std_m"])
 def test_larger_biases_never_make_the_bound_smaller(name):
     path, settings = walk(), settings_of()
-    bounds = [biased_bound(LAB, path, settings, replace(ALL, **{name: std_m}))[-1] for std_m in (0.0, 0.02, 0.05, 0.2)]
+    bounds = [
+        tracking_bound(LAB, path, settings, replace(ALL, **{name: std_m}))[-1] for std_m in (0.0, 0.02, 0.05, 0.2)
+    ]
     for smaller, larger in pairwise(bounds):
         assert np.linalg.eigvalsh(larger - smaller).min() > -1e-12
         assert np.trace(larger) > np.trace(smaller)
@@ -202,6 +178,4 @@ def test_larger_biases_never_make_the_bound_smaller(name):
 
 def test_shapes_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="7 positions, no multiple of 6 anchors"):
-        biased_bound(LAB, np.zeros((7, 3)), settings_of(), Biases())
-    with pytest.raises(ValueError, match="survey_std_m has 2 values; it should be one number, or one for each of 6"):
-        biased_bound(LAB, np.zeros((6, 3)), settings_of(), Biases(survey_std_m=(0.1, 0.2)))
+        tracking_bound(LAB, np.zeros((7, 3)), settings_of(), Biases())

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from dense_covariance import position_covariance
-from skyless.constants import SPEED_OF_LIGHT_MPS
-from skyless.kernels.processors import cores
-from skyless.positioning.methods.snapshots import bracketed_covariance, literal_covariance
-from skyless.site.lab import ideal_lab_site
-from skyless.studies.episodes import EPISODE_SPEED_STD_MPS, EPISODE_SUPERFRAMES, WHITE_FM, random_path
-from skyless.uncertainty.bounds import (
+from skyless.core.constants import SPEED_OF_LIGHT_MPS
+from skyless.core.kernels.processors import cores
+from skyless.core.protocol1.snapshots import bracketed_covariance, literal_covariance
+from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, EPISODE_SUPERFRAMES, WHITE_FM, random_path
+from skyless.research.uncertainty.bounds import (
     OFFSET_STD_M,
     POSITION_STD_M,
     RATE_STD_MPS,
-    bound_settings,
+    BoundSettings,
     tracking_bound,
 )
+from skyless.sim.lab import paper_lab_site
 
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
 SLOT_S = 2.5e-3
@@ -45,10 +45,10 @@ def lab_tracking_bound_m(
     Tags start in the middle half of the room, each component of their velocity normal with 0.4 m/s, and accelerate
     at random (``qa``). ``mesh``: anchors also relay when they heard each other.
     """
-    site = ideal_lab_site()
+    site = paper_lab_site()
     anchors = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
     slot_s = site.schedule.slot_s
-    settings = bound_settings(
+    settings = BoundSettings(
         stamp_s,
         white_fm=WHITE_FM,
         random_walk_fm=random_walk_fm,
@@ -71,7 +71,7 @@ def lab_tracking_bound_m(
 
 def snapshot_bound(place, *, superframes=2, mesh=False):
     """Bound of a tag at rest from all raw stamps of these superframes; all clocks are unknown, straight lines."""
-    settings = bound_settings(
+    settings = BoundSettings(
         STAMP_S, white_fm=0.0, random_walk_fm=0.0, qa=0.0, slot_s=SLOT_S, speed_std_mps=0.0, mesh=mesh
     )
     return tracking_bound(LAB, np.tile(place, (superframes * len(LAB), 1)), settings)[-1]
@@ -132,7 +132,7 @@ def test_the_recursion_is_the_textbooks(mesh, dims):
     anchors = LAB if dims == 2 else LAB + np.column_stack([np.zeros((6, 2)), [0.5, 2.5] * 3])
     path = random_path(np.random.default_rng(5), np.array([3.0, 4.0]), np.array([1.0, 1.0]), SLOT_S, 30 * 6, 0.5)
     path += [0.0, 0.0, 0.0 if dims == 2 else 1.2]
-    settings = bound_settings(
+    settings = BoundSettings(
         STAMP_S,
         white_fm=2e-11,
         random_walk_fm=1e-9,
@@ -204,7 +204,7 @@ def test_more_information_never_makes_the_bound_worse():
             "mesh": False,
         }
         stamp_s = changes.pop("stamp_s", STAMP_S)
-        return tracking_bound(LAB, path, bound_settings(stamp_s, **(base | changes)))[-1]
+        return tracking_bound(LAB, path, BoundSettings(stamp_s, **(base | changes)))[-1]
 
     base = last()
     for better in ({"stamp_s": 50e-12}, {"mesh": True}, {"qa": 0.1}, {"random_walk_fm": 1e-10}):
@@ -212,7 +212,7 @@ def test_more_information_never_makes_the_bound_worse():
 
 
 def test_a_path_must_have_whole_superframes():
-    settings = bound_settings(
+    settings = BoundSettings(
         STAMP_S, white_fm=0.0, random_walk_fm=0.0, qa=0.0, slot_s=SLOT_S, speed_std_mps=0.0, mesh=False
     )
     with pytest.raises(ValueError, match="7 positions, no multiple of 6 anchors"):

@@ -3,17 +3,23 @@
 import numpy as np
 import pytest
 
-from skyless.site.lab import lab_site
-from skyless.studies import loss
-from skyless.studies.common.plan import Plan
-from skyless.uncertainty.bounds import Sendings, bound_settings, known_receptions, received_bound, tracking_bound
+from skyless.research.studies import loss
+from skyless.research.studies.common.plan import Plan
+from skyless.research.uncertainty.bounds import (
+    BoundSettings,
+    Sendings,
+    known_receptions,
+    received_bound,
+    tracking_bound,
+)
+from skyless.sim.lab import lab_site
 
 LAB_M = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in lab_site().anchors])
 PATH_M = np.tile([2.0, 3.0, 0.0], (600, 1))
 
 
 def settings(mesh):
-    return bound_settings(
+    return BoundSettings(
         1e-10, white_fm=2e-11, random_walk_fm=1e-9, qa=0.3, slot_s=2.5e-3, speed_std_mps=0.4, mesh=mesh
     )
 

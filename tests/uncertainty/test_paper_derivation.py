@@ -7,7 +7,7 @@ plus noise. Nothing of ``CORRECTED`` or of the errata enters before the comparis
 import pytest
 import sympy as sp
 
-from skyless.positioning.methods.snapshots import (
+from skyless.core.protocol1.snapshots import (
     averaged_offset,
     protocol_interval,
     relative_offset,
@@ -15,8 +15,8 @@ from skyless.positioning.methods.snapshots import (
     tag_rate,
     to_master,
 )
-from skyless.uncertainty import chain
-from skyless.uncertainty.chain import CORRECTED, PRINTED, Chain
+from skyless.research.uncertainty import chain
+from skyless.research.uncertainty.chain import CORRECTED, PRINTED, Chain
 
 POSITIVE = [
     "master_rate",

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from dense_covariance import position_covariance
-from skyless.clocks.filter import stamp_variance_m2
-from skyless.positioning.methods.locate import Solution, locate
-from skyless.positioning.methods.snapshots import bracketed_covariance, literal_covariance, literal_delayed_covariance
+from skyless.core.kernels.filter import stamp_variance_m2
+from skyless.core.protocol1.snapshots import bracketed_covariance, literal_covariance, literal_delayed_covariance
+from skyless.core.tag.locate import Solution, locate
 
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
 LAB_3D = LAB + np.column_stack([np.zeros((6, 2)), [0.5, 2.5] * 3])

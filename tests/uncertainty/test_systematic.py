@@ -11,11 +11,11 @@ from systematic import (
     synchronisation_error_m,
 )
 
-from skyless.bench.monte_carlo_speed import bench_chain
-from skyless.constants import TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.paper.monte_carlo import Quantity, ideal_values, readings_of
-from skyless.positioning.methods.snapshots import bracketed_tdoa, literal_tdoa
-from skyless.uncertainty.chain import Reference
+from skyless.core.constants import TICK_M, TICK_RATE_HZ, TICK_S
+from skyless.core.protocol1.snapshots import bracketed_tdoa, literal_tdoa
+from skyless.research.bench.monte_carlo_speed import bench_chain
+from skyless.research.paper.monte_carlo import Quantity, ideal_values, readings_of
+from skyless.research.uncertainty.chain import Reference
 
 MASTER, ANCHORS = np.array([0.0, 0.0, 0.5]), np.array([(6, 0, 2.5), (6, 8, 0.5), (0, 8, 2.5)], float)
 SPACING_S = 15e-3

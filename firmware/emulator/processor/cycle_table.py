@@ -13,10 +13,10 @@ from msgspec import Struct
 from emulator.processor.cycles import CPU_HZ
 from emulator.processor.lone_board import DELAYS, LoneBoard
 from emulator.processor.paths import BYTE, COMMAND, END_OF_TRANSMISSION, IDLE, POLL, RECEPTION, TRANSMISSION, PathCost
-from skyless.air.ieee802154 import after_rmarker_s, fcs
-from skyless.air.reception import Diagnostics
-from skyless.radios.serial.link import Writer
-from skyless.ticks import from_seconds, wrap
+from skyless.core.air.ieee802154 import after_rmarker_s, fcs
+from skyless.core.air.reception import Diagnostics
+from skyless.core.ticks import from_seconds, wrap
+from skyless.radio.serial.link import Writer
 
 FRAME: Final = bytes(range(98)) + fcs(bytes(range(98)))
 _MHZ: Final = CPU_HZ / 1e6

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Final
 
 from emulator.processor.nrf52832 import Image
-from skyless.constants import TICK_RATE_HZ
-from skyless.radios.interface import AntennaDelays
-from skyless.simulation.dw1000.chip import Chip
-from skyless.simulation.medium import Timeline
-from skyless.ticks import from_seconds, wrap
+from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.ticks import from_seconds, wrap
+from skyless.radio.interface import AntennaDelays
+from skyless.sim.dw1000.chip import Chip
+from skyless.sim.medium import Timeline
 
 DELAYS: Final = AntennaDelays(16_500, 16_300)
 IDENTITY: Final = b"identity"

@@ -20,10 +20,10 @@ from emulator.processor.cycles import CYCLES, spent_at
 from emulator.processor.paths import PathCost, Paths
 from emulator.processor.processors import TICKS_PER_CYCLE, Processors
 from emulator.processor.serial_peripherals import Spim, Uarte
-from skyless.constants import TICK_S
-from skyless.simulation.dw1000.chip import Chip
-from skyless.simulation.dw1000.registers import SYS_STATUS
-from skyless.simulation.medium import Timeline
+from skyless.core.constants import TICK_S
+from skyless.sim.dw1000.chip import Chip
+from skyless.sim.dw1000.registers import SYS_STATUS
+from skyless.sim.medium import Timeline
 
 WAKE_UP_CYCLES: Final = 3 * 64
 _LOCKUP_RESET_CYCLES: Final = 64

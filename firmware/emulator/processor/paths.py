@@ -9,8 +9,8 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.simulation.dw1000 import registers as r
-from skyless.simulation.dw1000.memory import decode_header
+from skyless.sim.dw1000 import registers as r
+from skyless.sim.dw1000.registers import decode_header
 
 IDLE: Final = "idle"
 """Neither the chip nor the host had anything."""
@@ -89,7 +89,7 @@ class Paths:
             work = RECEPTION
         elif access is not None and access.file == r.TX_BUFFER.file and access.is_write:
             work = TRANSMISSION
-        elif access is not None and access.file == r.TX_TIME.file and not access.is_write:
+        elif access is not None and access.file == r.TX_STAMP.file and not access.is_write:
             work = END_OF_TRANSMISSION
         self._work[work] += 1
 

@@ -11,12 +11,12 @@ from typing import Any, ClassVar, Final, Protocol
 from weakref import WeakKeyDictionary
 
 from emulator.processor.cycles import CPU_HZ
-from skyless.constants import TICK_RATE_HZ
-from skyless.simulation.medium import Timeline
+from skyless.core.constants import TICK_RATE_HZ
+from skyless.sim.medium import Timeline
 
 TICKS_PER_CYCLE: Final = TICK_RATE_HZ / CPU_HZ
 SLICE_TICKS: Final = round(2000 * TICKS_PER_CYCLE)
-_LEAST_TICKS: Final = round(TICKS_PER_CYCLE) + 1
+_MIN_TICKS: Final = round(TICKS_PER_CYCLE) + 1
 """A processor runs at least so far, lest several events at one instant stop time."""
 
 
@@ -86,4 +86,4 @@ class Processors:
         """The timeline's next event, where it comes before a horizon."""
         if self._timeline.next_ticks is not None:
             horizon = min(horizon, self._timeline.next_ticks)
-        return max(horizon, self._timeline.now_ticks + _LEAST_TICKS)
+        return max(horizon, self._timeline.now_ticks + _MIN_TICKS)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from emulator.processor.peripherals import Peripheral, System
-from skyless.simulation.dw1000.memory import decode_header
+from skyless.sim.dw1000.registers import decode_header
 
 
 class DataSystem(System, Protocol):

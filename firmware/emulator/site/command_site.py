@@ -13,9 +13,9 @@ from typing import Any
 from emulator.site.emulated_site import DIRECT_WIRE, EmulatedSite, MakeBoard, SiteNode
 from emulator.site.serial_wire import WireSettings
 from skyless.cli.main import program
-from skyless.nodes import process
-from skyless.simulation.trajectory import Trajectory
-from skyless.site.load import load_site
+from skyless.run import process
+from skyless.sim.trajectory import Trajectory
+from skyless.site.file.load import load_site
 
 
 def program_of(words: Sequence[str]) -> Coroutine[Any, Any, None]:

@@ -3,7 +3,7 @@
     site = EmulatedSite(plan, [trajectory], make_board, seed=1)
     site.run(5.0)
 
-Each board has a pseudo-terminal, which ``skyless.nodes`` opens as ``serial:PATH``. What happens depends on the seed
+Each board has a pseudo-terminal, which ``skyless.radio`` opens as ``serial:PATH``. What happens depends on the seed
 alone, however busy the machine is.
 """
 
@@ -23,22 +23,22 @@ from emulator.site.serial_wire import SerialWire, WireSettings
 from emulator.site.site_air import SITE_TURNAROUND_S, SiteAir
 from emulator.site.virtual_time import run_on
 from emulator.site.watched_radio import WatchedRadio
-from skyless.air.beacon import Beacon
-from skyless.air.codec import decode_cached
-from skyless.air.reception import Diagnostics
-from skyless.evaluation.scenarios import Request, Room, impairments_of
-from skyless.mqtt.messages import FixMessage
-from skyless.nodes.anchor import AnchorNode, Anchors
-from skyless.nodes.open_radio import open_radios
-from skyless.nodes.tag import TagNode, Tags, TagSettings
-from skyless.radios.interface import AntennaDelays, Radio
-from skyless.simulation.dw1000.chip import Chip
-from skyless.simulation.medium import Delivery, Medium, Timeline
-from skyless.simulation.stations import TagSpec
-from skyless.simulation.trajectory import Trajectory
-from skyless.simulation.world import diagnostics_of
-from skyless.site.model import Site
-from skyless.ticks import difference, wrap
+from skyless.core.air.reception import Diagnostics
+from skyless.core.protocol1.beacon import Beacon
+from skyless.core.protocol1.codec import decode_cached
+from skyless.core.site import Site
+from skyless.core.ticks import difference, wrap
+from skyless.radio.interface import AntennaDelays, Radio
+from skyless.run.anchor import AnchorNode, Anchors
+from skyless.run.mqtt.messages import FixMessage
+from skyless.run.open_radio import open_radios
+from skyless.run.tag import TagNode, Tags, TagSettings
+from skyless.sim.dw1000.chip import Chip
+from skyless.sim.evaluation.scenarios import Request, Room, impairments_of
+from skyless.sim.medium import Delivery, Medium, Timeline
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Trajectory
+from skyless.sim.world import diagnostics_of
 
 TAG_SETTINGS: Final = TagSettings(publish_hz=1000.0)
 """All fixes are kept."""

@@ -1,21 +1,33 @@
-"""The firmware's C, compiled for this computer, as a board."""
+"""The firmware's C, compiled for this computer, as a board in the timeline's time: its clock, line, bus and chip's pin.
+
+What the program computes takes no time; transfers, pauses and bytes on the line take theirs.
+"""
 
 from collections.abc import Callable
-from typing import Any, Final, TypeVar
+from functools import partial
+from typing import Any, Final
 
 from emulator.board_library import CBoard
-from emulator.site.program_board import ProgramBoard
-from skyless.simulation.dw1000.chip import Chip
-from skyless.simulation.medium import Timeline
+from emulator.site.host_programs import Process
+from skyless.core.constants import TICK_S
+from skyless.core.ticks import from_seconds
+from skyless.sim.dw1000.chip import Chip
+from skyless.sim.medium import Timeline
 
-Value = TypeVar("Value")
-
+BYTE_S: Final = 10e-6
+"""On the UART: ten bits at 1 Mbaud."""
+LINE_BYTES: Final = 1024
+"""Bytes that wait to be sent, or to be read."""
+SLOW_HZ: Final = 2_000_000
+FAST_HZ: Final = 8_000_000
+_TRANSFER_S: Final = 5e-6
+"""Of a transfer besides its bits: chip select and the start of the DMA (assumed)."""
 _TURN_S: Final = 5e-6
 """What a turn takes besides its transfers (assumed; the emulated processor counts it)."""
 
 
-class HostBoard(ProgramBoard):
-    """One board."""
+class HostBoard:
+    """One board; its program is run again after the supply failed."""
 
     def __init__(
         self,
@@ -26,67 +38,113 @@ class HostBoard(ProgramBoard):
         can_transmit: bool,
         identity: bytes,
     ) -> None:
+        self.chip = chip
         self._can_transmit, self._identity = can_transmit, identity
-        super().__init__(timeline, chip, send)
+        self.lights = 0
+        self._timeline, self._send = timeline, send
+        self._start()
 
     def program(self) -> None:
         """Run the board's loop, as the image's ``main`` does."""
-        hardware = _Guarded(self)
-        board = CBoard(hardware, can_transmit=self._can_transmit, device_id=self._identity)
+        board = CBoard(self, can_transmit=self._can_transmit, device_id=self._identity)
         board.begin()
         while True:
             wait_us = board.turn()
-            if hardware.failed is not None:
-                raise hardware.failed
-            self.pause_s(_TURN_S)
+            self.process.sleep(_TURN_S)
             if wait_us:
                 self.wait_s(1e-6 * wait_us)
 
+    def _start(self) -> None:
+        self._came = bytearray()
+        self._line_was_high = False
+        self._hz = SLOW_HZ
+        self._unsent_ticks = self._timeline.now_ticks
+        self._starts_ticks = self._timeline.now_ticks
+        self.process = Process(self._timeline, self.program)
 
-class _Guarded:
-    """The board's hardware for C, which knows no exceptions.
+    # What the site calls
 
-    One that is raised, as the end of the program, is kept until the C has returned, which until then reads zeros.
-    """
+    def notify(self) -> None:
+        """The chip's interrupt line may have changed; a rise wakes the program, and a line that stays high does not."""
+        is_high = self.chip.irq
+        if is_high and not self._line_was_high:
+            self.process.notify()
+        self._line_was_high = is_high
 
-    def __init__(self, board: HostBoard) -> None:
-        self.failed: BaseException | None = None
-        self._board = board
+    def receive(self, data: bytes) -> None:
+        """These bytes have come on the UART."""
+        if len(self._came) + len(data) <= LINE_BYTES:
+            self._came += data
+        self.process.notify()
 
-    def _call(self, call: Callable[..., Value], *values: object) -> Value | None:
-        if self.failed is None:
-            try:
-                return call(*values)
-            except BaseException as error:  # noqa: BLE001 - raised by HostBoard.program
-                self.failed = error
-        return None
+    def power_cycle(self) -> None:
+        """The supply failed and is back."""
+        self.process.close()
+        self._start()
 
-    def transfer(self, out: bytes) -> bytes:
-        return self._call(self._board.transfer, out) or bytes(len(out))
+    def close(self) -> None:
+        """End the program."""
+        self.process.close()
 
-    def set_spi_fast(self, fast: bool) -> None:
-        self._call(self._board.set_spi_fast, fast)
-
-    def reset_chip(self) -> None:
-        self._call(self._board.reset_chip)
-
-    def pause_us(self, microseconds: int) -> None:
-        self._call(self._board.pause_s, 1e-6 * microseconds)
+    # What the program calls
 
     def now_us(self) -> int:
-        return self._call(self._board.now_us) or 0
+        """Microseconds since the start."""
+        return int((self._timeline.now_ticks - self._starts_ticks) * TICK_S * 1e6)
+
+    def transfer(self, out: bytes) -> bytes:
+        """One SPI transaction; it reaches the chip when its time is over."""
+        self.process.sleep(_TRANSFER_S + 8 * len(out) / self._hz)
+        answer = self.chip.transfer(out, self._hz)
+        self.notify()
+        return answer
+
+    def set_spi_fast(self, fast: bool) -> None:
+        """Clock the SPI fast from now on, or slowly."""
+        self._hz = FAST_HZ if fast else SLOW_HZ
+
+    def reset_chip(self) -> None:
+        """Pull RSTn low for a moment."""
+        self.chip.pull_reset()
+
+    def pause_us(self, microseconds: int) -> None:
+        """Wait."""
+        self.process.sleep(1e-6 * microseconds)
 
     def interrupt_line(self) -> bool:
-        return self._call(lambda: self._board.chip.irq) or False
-
-    def read_line(self, size: int) -> bytes:
-        return self._call(self._board.read_line, size) or b""
-
-    def write_line(self, line: bytes) -> bool:
-        return self._call(self._board.write_line, line) or False
-
-    def restart_line(self) -> None:
-        self._call(self._board.restart_line)
+        """Whether the chip's line is high."""
+        return self.chip.irq
 
     def show(self, lights: int) -> None:
-        self._board.lights = lights
+        """Switch the lights."""
+        self.lights = lights
+
+    def wait_s(self, seconds: float) -> None:
+        """Wait, at most until the interrupt line rises or bytes come."""
+        if not self._came:
+            self.process.wait(seconds)
+
+    def read_line(self, size: int) -> bytes:
+        """What has come on the UART, at most ``size`` bytes."""
+        data = bytes(self._came[:size])
+        del self._came[:size]
+        return data
+
+    def write_line(self, data: bytes) -> bool:
+        """Send, now or when what waits is sent; False where it does not fit."""
+        now = self._timeline.now_ticks
+        begins = max(now, self._unsent_ticks)
+        if (begins - now) * TICK_S / BYTE_S + len(data) > LINE_BYTES:
+            return False
+        self._unsent_ticks = begins + from_seconds(len(data) * BYTE_S)
+        self._timeline.at(self._unsent_ticks, partial(self._deliver, data, self.process))
+        return True
+
+    def _deliver(self, data: bytes, sender: Process) -> None:
+        """The bytes have left the pin, unless the supply failed meanwhile."""
+        if sender is self.process:
+            self._send(data)
+
+    def restart_line(self) -> None:
+        """Discard all that has come."""
+        self._came.clear()

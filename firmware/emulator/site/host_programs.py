@@ -7,8 +7,8 @@ from typing import Any
 
 from msgspec import Struct
 
-from skyless.simulation.medium import Timeline
-from skyless.ticks import from_seconds
+from skyless.core.ticks import from_seconds
+from skyless.sim.medium import Timeline
 
 
 class HostLatency(Struct, frozen=True):

@@ -14,9 +14,9 @@ from collections import Counter
 from msgspec.structs import replace
 
 from emulator.site.emulated_site import Board, EmulatedSite, SiteNode
-from skyless.air.reception import Reception, Transmission
-from skyless.radios.interface import Late, Listener, Radio, RadioEvent
-from skyless.ticks import wrap
+from skyless.core.air.reception import Reception, Transmission
+from skyless.core.ticks import wrap
+from skyless.radio.interface import Late, Listener, Radio, RadioEvent
 
 
 class DivergedError(Exception):
@@ -24,7 +24,7 @@ class DivergedError(Exception):
 
 
 class RepeatingRadio:
-    """The emulated radio of one node with the instants of a board (``skyless.radios.interface.Radio``)."""
+    """The emulated radio of one node with the instants of a board (``skyless.radio.interface.Radio``)."""
 
     def __init__(self, node: SiteNode, before: SiteNode) -> None:
         """``before`` is the node in the run with boards."""

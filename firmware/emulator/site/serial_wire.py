@@ -14,8 +14,8 @@ from msgspec import Struct
 
 from emulator.site.host_programs import HostLatency
 from emulator.site.virtual_time import wake
-from skyless.simulation.medium import Timeline
-from skyless.ticks import from_seconds
+from skyless.core.ticks import from_seconds
+from skyless.sim.medium import Timeline
 
 BITS_A_BYTE: Final = 10
 

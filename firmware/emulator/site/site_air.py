@@ -10,11 +10,11 @@ from typing import Any, Final
 
 from msgspec import Struct
 
-from skyless.air.ieee802154 import preamble_s
-from skyless.air.reception import Transmission
-from skyless.simulation.medium import Medium
-from skyless.simulation.oscillator import clock_rate
-from skyless.ticks import difference, from_seconds, wrap
+from skyless.core.air.ieee802154 import preamble_s
+from skyless.core.air.reception import Transmission
+from skyless.core.ticks import difference, from_seconds, wrap
+from skyless.sim.medium import Medium
+from skyless.sim.oscillator import clock_rate
 
 SITE_TURNAROUND_S: Final = 4e-6
 """For the medium: a real chip sends what it gets until its preamble begins. Frames in slots never overlap."""
@@ -29,7 +29,7 @@ _EARLIER: Final = 2
 
 
 class NodeAir:
-    """A node of the simulated medium as the air of a chip (``skyless.simulation.dw1000.transceiver.Air``)."""
+    """A node of the simulated medium as the air of a chip (``skyless.sim.dw1000.transceiver.Air``)."""
 
     def __init__(self, medium: Medium[Any], node: int) -> None:
         self._medium, self.node = medium, node

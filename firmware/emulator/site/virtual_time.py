@@ -13,9 +13,9 @@ import time
 from collections.abc import Callable, Coroutine, Iterator
 from typing import Any, Final, TypeVar
 
-from skyless.constants import TICK_S
-from skyless.simulation.medium import Timeline
-from skyless.ticks import from_seconds
+from skyless.core.constants import TICK_S
+from skyless.core.ticks import from_seconds
+from skyless.sim.medium import Timeline
 
 UNIX_S: Final = 1_800_000_000.0
 """``time.time()`` at the timeline's beginning."""

@@ -6,10 +6,10 @@ from collections import Counter
 from msgspec import Struct
 
 from emulator.site.site_air import SiteAir
-from skyless.air.reception import Reception, Transmission
-from skyless.constants import TICK_S
-from skyless.radios.interface import Late, Listener, Radio, RadioEvent, Sent, ignore
-from skyless.ticks import difference
+from skyless.core.air.reception import Reception, Transmission
+from skyless.core.constants import TICK_S
+from skyless.core.ticks import difference
+from skyless.radio.interface import Late, Listener, Radio, RadioEvent, Sent, ignore
 
 
 class Instants(Struct):
@@ -21,7 +21,7 @@ class Instants(Struct):
 
 
 class WatchedRadio:
-    """One node's (``skyless.radios.interface.Radio``)."""
+    """One node's (``skyless.radio.interface.Radio``)."""
 
     def __init__(self, radio: Radio, air: SiteAir, lead_s: float | None = None) -> None:
         """``lead_s``: another one than the radio asks for."""

@@ -1,4 +1,1 @@
-"""A site's fixes for programs and devices of other kinds: each as its own bytes, over what it reads from.
-
-Public: feed, hub, target, target_url, targets.
-"""
+"""A site's fixes for programs and devices of other kinds: each as its own bytes, over what it reads from."""

@@ -9,11 +9,10 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.bridges.feed import BridgedSite, is_usable
-from skyless.bridges.target import Target
-from skyless.errors import SkylessError
-from skyless.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, TagHealth
-from skyless.rate_limit import RateLimit
+from skyless.bridges.target import BridgedSite, Target, is_usable
+from skyless.core.errors import SkylessError
+from skyless.run.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, TagHealth
+from skyless.run.rate_limit import RateLimit
 
 NO_FIX_S: Final = 1.0
 """A tag has no fix once its last usable one is older, ..."""

@@ -8,11 +8,9 @@ from typing import Final
 import msgspec
 from msgspec import Struct
 
-from skyless.bridges.feed import BridgedSite
-from skyless.bridges.target import BridgeContext, Encoder
-from skyless.bridges.target_url import TargetUrl
-from skyless.mqtt.messages import FixMessage, Vector
-from skyless.site.model import GeoreferenceSite
+from skyless.bridges.target import BridgeContext, BridgedSite, Encoder, TargetUrl
+from skyless.core.site import GeoreferenceSite
+from skyless.run.mqtt.messages import FixMessage, Vector
 
 _encode: Final = msgspec.json.Encoder().encode
 

@@ -11,13 +11,11 @@ from math import atan2, degrees, hypot, isfinite, sqrt
 from operator import xor
 from typing import Final
 
-from skyless.bridges.feed import BridgedSite, floored, require_georeference
-from skyless.bridges.target import BridgeContext, Encoder
-from skyless.bridges.target_url import TargetUrl
-from skyless.mqtt.messages import FixMessage
-from skyless.site.earth import east_north_up, geodetic, rotated
-from skyless.site.model import GeoreferenceSite
-from skyless.uncertainty.ellipse import horizontal_ellipse
+from skyless.bridges.target import BridgeContext, BridgedSite, Encoder, TargetUrl, floored, require_georeference
+from skyless.core.earth import east_north_up, geodetic, rotated
+from skyless.core.ellipse import horizontal_ellipse
+from skyless.core.site import GeoreferenceSite
+from skyless.run.mqtt.messages import FixMessage
 
 KNOT_MPS: Final = 1852.0 / 3600.0
 MINUTE_UNITS: Final = 10_000_000

@@ -7,10 +7,8 @@ import struct
 from collections import Counter
 from typing import cast
 
-from skyless.bridges.stage_axes import UPS, Up, turned
-from skyless.bridges.target import BridgeContext, Encoder
-from skyless.bridges.target_url import TargetUrl
-from skyless.mqtt.messages import FixMessage
+from skyless.bridges.target import UPS, BridgeContext, Encoder, TargetUrl, Up, turned
+from skyless.run.mqtt.messages import FixMessage
 
 
 class OscEncoder(Encoder):

@@ -13,12 +13,9 @@ from typing import Final, cast
 
 from msgspec import Struct
 
-from skyless.bridges.feed import BridgedSite
 from skyless.bridges.senders import UdpSender
-from skyless.bridges.stage_axes import UPS, Up, turned
-from skyless.bridges.target import BridgeContext, Target
-from skyless.bridges.target_url import TargetUrl
-from skyless.mqtt.messages import FixMessage, Vector
+from skyless.bridges.target import UPS, BridgeContext, BridgedSite, Target, TargetUrl, Up, turned
+from skyless.run.mqtt.messages import FixMessage, Vector
 
 GROUP: Final = "236.10.10.10"
 GROUP_PORT: Final = 56_565
@@ -41,11 +38,11 @@ TIMESTAMP: Final = 6
 _HOLDS_CHUNKS: Final = 0x8000
 _CHUNK_BYTES: Final = 4
 _HEADER_BYTES: Final = 12
-MOST_PACKET_BYTES: Final = 1472
+MAX_PACKET_BYTES: Final = 1472
 """A packet with its UDP and IP headers fits an Ethernet frame."""
-MOST_PACKETS: Final = 255
+MAX_PACKETS: Final = 255
 """Of one frame; a byte counts them."""
-MOST_TRACKERS: Final = 0xFFFF
+MAX_TRACKERS: Final = 0xFFFF
 
 _LAST_NUMBER: Final = re.compile(r"(\d{1,5})$")
 
@@ -116,13 +113,13 @@ class PsnFrames:
         tracker = self._trackers.get(tag)
         if tracker is None:
             used = {tracker.number for tracker in self._trackers.values()}
-            if len(used) >= MOST_TRACKERS:
+            if len(used) >= MAX_TRACKERS:
                 self.dropped["psn-trackers"] += 1
                 return None
             found = _LAST_NUMBER.search(tag)
             number = int(found[1]) if found else 0
-            if not 0 < number <= MOST_TRACKERS or number in used:
-                number = next(free for free in range(1, MOST_TRACKERS + 1) if free not in used)
+            if not 0 < number <= MAX_TRACKERS or number in used:
+                number = next(free for free in range(1, MAX_TRACKERS + 1) if free not in used)
             tracker = self._trackers[tag] = Tracker(number)
         return tracker
 
@@ -146,15 +143,15 @@ class PsnFrames:
         """Divide the trackers among packets that fit."""
         if not trackers:
             return []  # readers stumble over empty lists
-        space = MOST_PACKET_BYTES - 3 * _CHUNK_BYTES - _HEADER_BYTES - len(before)
+        space = MAX_PACKET_BYTES - 3 * _CHUNK_BYTES - _HEADER_BYTES - len(before)
         groups: list[list[bytes]] = [[]]
         for tracker in trackers:
             if groups[-1] and sum(map(len, groups[-1])) + len(tracker) > space:
                 groups.append([])
             groups[-1].append(tracker)
-        if len(groups) > MOST_PACKETS:
-            self.dropped["psn-packets"] += len(groups) - MOST_PACKETS
-            del groups[MOST_PACKETS:]
+        if len(groups) > MAX_PACKETS:
+            self.dropped["psn-packets"] += len(groups) - MAX_PACKETS
+            del groups[MAX_PACKETS:]
         stamp = struct.pack("<QBBBB", self._stamp_us(unix_s), *VERSION, self._frame, len(groups))
         return [
             _chunk(

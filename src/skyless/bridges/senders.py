@@ -14,17 +14,17 @@ from pathlib import Path
 from typing import Final
 
 from skyless.bridges.target import cannot_listen
-from skyless.errors import SkylessError
-from skyless.radios.serial.pseudo_terminal import Pty
-from skyless.radios.serial.serial_port import SerialPort
+from skyless.core.errors import SkylessError
+from skyless.radio.serial.pseudo_terminal import Pty
+from skyless.radio.serial.serial_port import SerialPort
 
-MOST_READERS: Final = 64
+MAX_READERS: Final = 64
 """Connections to one TCP server."""
 
 _WAITING_BYTES: Final = 1 << 15
 """Bytes that may wait for one reader in this process, or a single longer message; and as many in the system."""
 
-_MOST_DATAGRAM_BYTES: Final = 1 << 16
+_MAX_DATAGRAM_BYTES: Final = 1 << 16
 
 _STUCK_S: Final = 5.0
 """A TCP reader that has taken nothing for so long is disconnected."""
@@ -79,7 +79,7 @@ class _TcpReader(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Greet it, if there are not too many."""
         assert isinstance(transport, asyncio.Transport)
-        if len(self._readers) >= MOST_READERS:
+        if len(self._readers) >= MAX_READERS:
             self._dropped["too-many-readers"] += 1
             transport.abort()
             return
@@ -174,7 +174,7 @@ class UdpSender:
 
     def _read(self, received: Callable[[bytes], None]) -> None:
         with contextlib.suppress(OSError):  # nothing to read after all, or what was sent found nobody
-            received(self._socket.recv(_MOST_DATAGRAM_BYTES))
+            received(self._socket.recv(_MAX_DATAGRAM_BYTES))
 
 
 class PtySender:

@@ -1,20 +1,79 @@
-"""What a target is: a program or device of another kind that gets a site's fixes.
+"""What a target is: a program or device of another kind that gets a site's fixes, named by an address.
 
-A target whose readers get bytes consists of an ``Encoder``, which does no I/O, and a sender (``senders.py``).
+An address is ``SCHEME://HOST:PORT?KEY=VALUE`` or ``SCHEME:PATH?KEY=VALUE``. A target whose readers get bytes consists
+of an ``Encoder``, which does no I/O, and a sender (``senders.py``).
 """
 
 import os
-import time
+import re
 from collections import Counter
-from collections.abc import Callable, Iterable
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from math import isfinite
+from typing import Final, Literal
+from urllib.parse import parse_qsl, unquote, urlsplit
 
 from msgspec import Struct
 
-from skyless.bridges.feed import BridgedSite
-from skyless.errors import SkylessError
-from skyless.mqtt.address import MqttAddress
-from skyless.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, TagHealth
+from skyless.core.alert import Alert
+from skyless.core.errors import SkylessError
+from skyless.core.site import GeoreferenceSite, Site, WallSite
+from skyless.run.mqtt.address import MqttAddress, hide_password
+from skyless.run.mqtt.messages import AnchorHealth, FixMessage, Matrix, StatusMessage, TagHealth, Vector, Zone
+
+MIN_STD_M: Final = 0.01
+"""Least standard deviation of an axis that leaves: the gates of other programs reject fixes with honest millimetres."""
+
+_FORBIDDING: Final = (Alert.NOT_EXCLUDED, Alert.LIMIT)
+"""Alerts of fixes that nobody should navigate with."""
+
+
+class BridgedSite(Struct, frozen=True):
+    """What a bridge knows of the site."""
+
+    id: int
+    name: str
+    simulated: bool
+    """True where its radios are emulated."""
+    anchors_m: dict[int, Vector]
+    """Positions of those that are known, in the site's frame."""
+    georeference: GeoreferenceSite | None = None
+    zones: tuple[Zone, ...] = ()
+    master: int | None = None
+    """The anchor that is the master by the site file; None where there is none, or it is not known."""
+    walls: tuple[WallSite, ...] = ()
+    """A tag by itself knows none."""
+
+
+def bridged_site(site: Site, zones: tuple[Zone, ...] = (), *, simulated: bool) -> BridgedSite:
+    """The same of a whole site, as MQTT has it."""
+    anchors_m = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
+    return BridgedSite(site.id, site.name, simulated, anchors_m, site.georeference, zones, site.master, site.walls)
+
+
+def is_usable(fix: FixMessage) -> bool:
+    """Whether its position may be given: it is finite, and no alert forbids its use."""
+    return fix.alert not in _FORBIDDING and all(map(isfinite, (*fix.position_m, *fix.covariance_m2)))
+
+
+def floored(covariance_m2: Matrix) -> Matrix:
+    """The covariance of a position with a variance of at least ``MIN_STD_M`` squared in each axis."""
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = covariance_m2
+    least = MIN_STD_M**2
+    return max(xx, least), xy, xz, yx, max(yy, least), yz, zx, zy, max(zz, least)
+
+
+def require_georeference(site: BridgedSite, target: str) -> GeoreferenceSite:
+    """Where the site is on the Earth, for a target that speaks of nothing else.
+
+    Raises:
+        SkylessError: the site does not know it.
+    """
+    if site.georeference is None:
+        raise SkylessError(
+            f"{target} gives positions on the Earth, and site {site.id} ({site.name}) does not say where it is: its "
+            "site file should have [georeference] with latitude_deg, longitude_deg, height_m and heading_deg"
+        )
+    return site.georeference
 
 
 class BridgeContext(Struct, frozen=True):
@@ -97,58 +156,139 @@ class Encoder:
         return []
 
 
-class Sender(Protocol):
-    """What carries bytes to readers."""
-
-    dropped: Counter[str]
-    """What readers missed, by reason."""
-
-    def send(self, data: bytes) -> None:
-        """Send to all readers, or drop; returns at once."""
-
-    async def run(self) -> None:
-        """Serve until cancelled. Raises SkylessError where it cannot begin."""
-
-
-class StreamTarget(Target):
-    """Bytes of an encoder, carried by a sender."""
-
-    def __init__(self, text: str, encoder: Encoder, sender: Sender) -> None:
-        super().__init__(text)
-        self._encoder, self._sender = encoder, sender
-        self.one_tag = encoder.one_tag
-        self.dropped = encoder.dropped = sender.dropped
-
-    def on_site(self, site: BridgedSite) -> None:
-        """Let the encoder know it."""
-        self._send(self._encoder.on_site(site))
-
-    def on_fix(self, fix: FixMessage) -> None:
-        """Send it."""
-        self._send(self._encoder.on_fix(fix))
-
-    def on_no_fix(self, tag: str, unix_s: float, reason: str) -> None:
-        """Send that there is none."""
-        self._send(self._encoder.on_no_fix(tag, unix_s, reason))
-
-    def on_second(self, unix_s: float) -> None:
-        """Send what is due once a second."""
-        self._send(self._encoder.on_second(unix_s))
-
-    def on_bytes(self, data: bytes) -> None:
-        """Answer what a reader has just sent."""
-        self._send(self._encoder.on_bytes(data, time.time_ns()))
-
-    async def run(self) -> None:
-        """Serve until cancelled."""
-        await self._sender.run()
-
-    def _send(self, messages: Iterable[bytes]) -> None:
-        for message in messages:
-            self._sender.send(message)
-
-
 def cannot_listen(text: str, host: str, port: int, error: OSError) -> SkylessError:
     """What a server raises that cannot begin; asyncio's own words are longer and name the same."""
     reason = os.strerror(error.errno) if error.errno is not None and error.errno > 0 else error
     return SkylessError(f"the target {text!r} cannot listen on {host}:{port}: {reason}")
+
+
+TAG_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,32}")
+"""Names that tags may have."""
+
+_HOST: Final = "//HOST:PORT"
+_USER: Final = "USER@"
+_PATH: Final = "PATH"
+"""Parts of an address, as messages name them."""
+
+
+class TargetUrl:
+    """One address; each part is checked when it is read, and ``check_all_read`` refuses what nobody reads."""
+
+    def __init__(self, text: str) -> None:
+        """Raises SkylessError."""
+        self.text = hide_password(text)
+        """As it was given, for messages: without a password."""
+        scheme, colon, _ = text.partition(":")
+        try:
+            parts = urlsplit(text)
+            self._port = parts.port
+        except ValueError:
+            raise self.wrong("a port between 1 and 65535 after the host") from None
+        if not colon or not scheme:
+            raise self.wrong("SCHEME://HOST:PORT or SCHEME:PATH, as nmea+tcp://:10110")
+        self.scheme = scheme.lower()
+        self._netloc, self._host, self._path = parts.netloc, parts.hostname or "", unquote(parts.path)
+        if self._port == 0:
+            raise self.wrong("a port between 1 and 65535 after the host")
+        if parts.fragment:
+            raise self.wrong("without #")
+        pairs = parse_qsl(parts.query, keep_blank_values=True)
+        self._options = dict(pairs)
+        if len(self._options) < len(pairs):
+            raise self.wrong("each key once")
+        self._parts: set[str] = set()
+        """That have been read, and which keys."""
+        self._read: set[str] = set()
+
+    def host(self, default: str = "127.0.0.1") -> str:
+        """The host, ``default`` where none is given."""
+        self._parts.add(_HOST)
+        return self._host or default
+
+    def port(self, default: int) -> int:
+        """The port, ``default`` where none is given."""
+        return self._port or default
+
+    def netloc(self) -> str:
+        """``USER:PASSWORD@HOST:PORT``, as it was given; empty where there is none."""
+        self._parts |= {_HOST, _USER}
+        return self._netloc
+
+    def path(self) -> str:
+        """Of a port or a link; empty where there is none."""
+        self._parts.add(_PATH)
+        return self._path
+
+    def text_option(self, key: str, default: str = "") -> str:
+        """The value of a key, as it is."""
+        self._read.add(key)
+        return self._options.get(key, default)
+
+    def number(self, key: str, default: float, least: float, most: float) -> float:
+        """A number within limits. Raises SkylessError."""
+        text = self.text_option(key)
+        try:
+            value = float(text) if key in self._options else default
+        except ValueError:
+            value = float("nan")
+        if not isfinite(value) or not least <= value <= most:
+            raise self._wrong_value(key, f"a number from {least:g} to {most:g}")
+        return value
+
+    def whole_number(self, key: str, default: int, least: int, most: int) -> int:
+        """A number without a fraction, within limits. Raises SkylessError."""
+        value = self.number(key, default, least, most)
+        if value % 1:
+            raise self._wrong_value(key, f"a whole number from {least} to {most}")
+        return int(value)
+
+    def has(self, key: str) -> bool:
+        """Whether a key is given, even without a value."""
+        self._read.add(key)
+        return key in self._options
+
+    def choice(self, key: str, names: Sequence[str], default: str) -> str:
+        """One of several words. Raises SkylessError."""
+        value = self.text_option(key, default)
+        if value not in names:
+            raise self._wrong_value(key, f"{', '.join(names[:-1])} or {names[-1]}")
+        return value
+
+    def tag(self) -> str | None:
+        """The only tag that is wanted; None for all. Raises SkylessError."""
+        name = self.text_option("tag")
+        if "tag" in self._options and not TAG_NAME.fullmatch(name):
+            raise self._wrong_value("tag", "a tag's name: 1 to 32 letters, digits, - or _")
+        return name or None
+
+    def check_all_read(self) -> None:
+        """Refuse parts and keys that nobody has read. Raises SkylessError."""
+        given = {
+            _HOST: bool(self._host) or self._port is not None,
+            _USER: "@" in self._netloc,
+            _PATH: self._path not in ("", "/"),
+        }
+        if not self._parts.issuperset(part for part, is_given in given.items() if is_given):
+            raise self.wrong(f"{self.scheme}:{''.join(part for part in (_HOST, _PATH) if part in self._parts)}")
+        for key in self._options:
+            if key not in self._read:
+                known = ", ".join(sorted(self._read))
+                raise SkylessError(f"the target {self.text!r} has {key!r}; its keys are {known}")
+
+    def wrong(self, expected: str) -> SkylessError:
+        """What to raise where the address cannot be used."""
+        return SkylessError(f"the target is {self.text!r}; it should be {expected}")
+
+    def _wrong_value(self, key: str, expected: str) -> SkylessError:
+        given = f"{key}={self._options[key]}" if key in self._options else f"no {key}="
+        return SkylessError(f"the target {self.text!r} has {given}; it should be {expected}")
+
+
+Up = Literal["y", "z"]
+UPS: Final = ("y", "z")
+
+
+def turned(vector: Vector, up: Up) -> Vector:
+    """A vector of the site, whose z is up, in axes whose ``up`` is; both are right-handed and share x."""
+    x, y, z = vector
+    return (x, z, -y) if up == "y" else vector

@@ -1,5 +1,6 @@
 """The table of targets, and how one is opened by its address."""
 
+import time
 from collections.abc import Callable
 from importlib import import_module
 from typing import Final, cast
@@ -8,10 +9,13 @@ from msgspec import Struct
 
 from skyless.bridges.hub import Route
 from skyless.bridges.senders import PtySender, SerialSender, TcpServer, UdpSender
-from skyless.bridges.target import BridgeContext, Encoder, Sender, StreamTarget, Target
-from skyless.bridges.target_url import TargetUrl
+from skyless.bridges.target import BridgeContext, BridgedSite, Encoder, Target, TargetUrl
+from skyless.run.mqtt.messages import FixMessage
 
-MOST_HZ: Final = 1000.0
+MAX_HZ: Final = 1000.0
+
+
+Sender = TcpServer | UdpSender | PtySender | SerialSender
 
 
 class Kind(Struct, frozen=True):
@@ -21,32 +25,64 @@ class Kind(Struct, frozen=True):
     """Below ``skyless.bridges``; imported when it is used. A stream's has ``make_encoder``, others ``make_target``."""
     hz: float
     """Usual rate of fixes for each tag."""
-    most_hz: float
+    max_hz: float
     summary: str
     port: int = 0
     """Usual port of a stream; other targets know their own."""
 
 
 TARGET_KINDS: Final = {
-    "jsonl+tcp": Kind("jsonl", 50.0, MOST_HZ, "one JSON object to a line, for programs that connect", 7010),
-    "jsonl+udp": Kind("jsonl", 50.0, MOST_HZ, "one JSON object to a datagram", 7010),
+    "jsonl+tcp": Kind("jsonl", 50.0, MAX_HZ, "one JSON object to a line, for programs that connect", 7010),
+    "jsonl+udp": Kind("jsonl", 50.0, MAX_HZ, "one JSON object to a datagram", 7010),
     "nmea+tcp": Kind("nmea", 10.0, 50.0, "NMEA 0183 for programs that connect: gpsd, QGIS, OpenCPN", 10110),
     "nmea+udp": Kind("nmea", 10.0, 50.0, "NMEA 0183 as datagrams", 10110),
     "nmea+pty": Kind("nmea", 10.0, 50.0, "NMEA 0183 on a pseudo-terminal"),
     "nmea+serial": Kind("nmea", 10.0, 50.0, "NMEA 0183 on a serial port, as nmea+serial:/dev/ttyUSB0@115200"),
-    "ros2": Kind("ros2.target", 50.0, MOST_HZ, "topics of ROS 2, published by DDS without ROS being installed"),
+    "ros2": Kind("ros2.target", 50.0, MAX_HZ, "topics of ROS 2, published by DDS without ROS being installed"),
     "mavlink+udpout": Kind(
         "mavlink.encoder", 30.0, 100.0, "MAVLink 2 for an autopilot; ?profile= ardupilot, px4 or gps", 14550
     ),
     "mavlink+serial": Kind(
         "mavlink.encoder", 30.0, 100.0, "the same on a serial port, as mavlink+serial:/dev/ttyAMA0@921600"
     ),
-    "foxglove": Kind("foxglove.target", 20.0, MOST_HZ, "live pages of Foxglove and Lichtblick"),
-    "homeassistant": Kind("home_assistant.target", 10.0, 50.0, "tags as devices of Home Assistant, with their rooms"),
-    "prometheus": Kind("prometheus.target", 50.0, MOST_HZ, "figures for Prometheus at /metrics"),
-    "osc+udp": Kind("osc", 60.0, MOST_HZ, "Open Sound Control: TouchDesigner, Unreal, Max", 9000),
+    "foxglove": Kind("foxglove", 20.0, MAX_HZ, "live pages of Foxglove and Lichtblick"),
+    "homeassistant": Kind("home_assistant", 10.0, 50.0, "tags as devices of Home Assistant, with their rooms"),
+    "prometheus": Kind("prometheus", 50.0, MAX_HZ, "figures for Prometheus at /metrics"),
+    "osc+udp": Kind("osc", 60.0, MAX_HZ, "Open Sound Control: TouchDesigner, Unreal, Max", 9000),
     "psn": Kind("psn", 60.0, 200.0, "PosiStageNet: media servers, lighting consoles"),
 }
+
+
+class _StreamTarget(Target):
+    """Bytes of an encoder, carried by a sender."""
+
+    def __init__(self, text: str, encoder: Encoder, sender: Sender) -> None:
+        super().__init__(text)
+        self._encoder, self._sender = encoder, sender
+        self.one_tag = encoder.one_tag
+        self.dropped = encoder.dropped = sender.dropped
+
+    def on_site(self, site: BridgedSite) -> None:
+        self._send(self._encoder.on_site(site))
+
+    def on_fix(self, fix: FixMessage) -> None:
+        self._send(self._encoder.on_fix(fix))
+
+    def on_no_fix(self, tag: str, unix_s: float, reason: str) -> None:
+        self._send(self._encoder.on_no_fix(tag, unix_s, reason))
+
+    def on_second(self, unix_s: float) -> None:
+        self._send(self._encoder.on_second(unix_s))
+
+    def on_bytes(self, data: bytes) -> None:
+        self._send(self._encoder.on_bytes(data, time.time_ns()))
+
+    async def run(self) -> None:
+        await self._sender.run()
+
+    def _send(self, messages: list[bytes]) -> None:
+        for message in messages:
+            self._sender.send(message)
 
 
 def open_route(text: str, context: BridgeContext) -> Route:
@@ -56,7 +92,7 @@ def open_route(text: str, context: BridgeContext) -> Route:
     if kind is None:
         raise url.wrong(f"one of {', '.join(f'{scheme}:' for scheme in TARGET_KINDS)} as skyless bridge --help shows")
     tag = url.tag()
-    hz = url.number("hz", kind.hz, 0.1, kind.most_hz)
+    hz = url.number("hz", kind.hz, 0.1, kind.max_hz)
     module = import_module(f"skyless.bridges.{kind.module}")
     target: Target
     if "+" in url.scheme:
@@ -68,7 +104,7 @@ def open_route(text: str, context: BridgeContext) -> Route:
     return Route(target, tag, hz, others=tag is not None)
 
 
-def _stream(url: TargetUrl, kind: Kind, encoder: Encoder, context: BridgeContext) -> StreamTarget:
+def _stream(url: TargetUrl, kind: Kind, encoder: Encoder, context: BridgeContext) -> _StreamTarget:
     """An encoder and the sender that the scheme names after ``+``."""
     sender: Sender
     match url.scheme.partition("+")[2]:
@@ -83,7 +119,7 @@ def _stream(url: TargetUrl, kind: Kind, encoder: Encoder, context: BridgeContext
             sender = SerialSender(url.text, path, int(baud or 115_200), context.log)
         case _:
             sender = UdpSender(url.text, url.host(), url.port(kind.port), context.log)
-    target = StreamTarget(url.text, encoder, sender)
+    target = _StreamTarget(url.text, encoder, sender)
     if isinstance(sender, UdpSender | SerialSender):
         sender.received = target.on_bytes
     return target

@@ -1,1 +1,1 @@
-"""The command line: one program, ``skyless``, with a module for each command."""
+"""The command line."""

@@ -2,12 +2,14 @@
 
 from typing import TYPE_CHECKING, Annotated, Final
 
-from cyclopts import App, Parameter
-from cyclopts.validators import Number
+from cyclopts import App
+
+from skyless.cli.common.options import command
+from skyless.core.arguments import whole
 
 if TYPE_CHECKING:
-    from skyless.bench.measure import Speed
-    from skyless.bench.monte_carlo_speed import MonteCarloSpeed
+    from skyless.research.bench.measure import Speed
+    from skyless.research.bench.monte_carlo_speed import MonteCarloSpeed
 
 _QUICK_DRAWS: Final = 100_000
 
@@ -15,10 +17,11 @@ app = App(name="bench", help_epilogue="Example: skyless bench --json")
 
 
 @app.default
+@command
 def bench(
     *,
-    draws: Annotated[int, Parameter(validator=Number(gte=100, lte=10**9))] = 1_000_000,
-    anchor_count: Annotated[int, Parameter(validator=Number(gte=1, lte=1000))] = 10,
+    draws: Annotated[int, whole(100, 10**9)] = 1_000_000,
+    anchor_count: Annotated[int, whole(1, 1000)] = 10,
     quick: bool = False,
     json: bool = False,
 ) -> None:
@@ -37,10 +40,10 @@ def bench(
     json
         Write one JSON object instead of a table.
     """
-    from skyless.bench.measure import FULL_EFFORT, QUICK_EFFORT, measure_all
-    from skyless.bench.monte_carlo_speed import measure
     from skyless.cli.common.output import print_json
     from skyless.cli.common.progress import status
+    from skyless.research.bench.measure import FULL_EFFORT, QUICK_EFFORT, measure_all
+    from skyless.research.bench.monte_carlo_speed import measure
 
     draws = min(draws, _QUICK_DRAWS) if quick else draws
     with status("filters"):

@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
+from skyless.cli.common.options import command
 from skyless.cli.common.output import print_json
 from skyless.cli.nodes.options import MqttOptions, SiteId, listen_address, site_named
-from skyless.errors import SkylessError
+from skyless.core.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.dashboard.guard import AccessRules
-    from skyless.dashboard.serve import ListenAddress
-    from skyless.mqtt.messages import SiteMessage
+    from skyless.page.guard import AccessRules
+    from skyless.page.serve import ListenAddress
+    from skyless.run.mqtt.messages import SiteMessage
 
 _SHORTEST_TOKEN = 12
 
@@ -22,9 +23,10 @@ app = App(name="dashboard", help_epilogue="Example: skyless dashboard --mqtt mqt
 
 
 @app.default
+@command
 def dashboard(
     *,
-    broker: MqttOptions = MqttOptions(),
+    broker: MqttOptions,
     site: str | None = None,
     site_id: SiteId | None = None,
     listen: str | None = None,
@@ -39,11 +41,6 @@ def dashboard(
 
     Parameters
     ----------
-    broker.mqtt
-        Broker to show the site of, mqtt://HOST[:PORT] or mqtts://[USER@]HOST[:PORT]; the password is taken from
-        SKYLESS_MQTT_PASSWORD.
-    broker.mqtt_ca
-        Certificates (PEM) to trust for mqtts, instead of the system's.
     site
         Site file, or lab; by default the one that the broker has retained, which comes before this.
     site_id
@@ -60,13 +57,13 @@ def dashboard(
     import asyncio
     from functools import partial
 
-    from skyless.dashboard.app import Services
-    from skyless.dashboard.live import LiveSite
-    from skyless.dashboard.overlays import Overlays
-    from skyless.dashboard.playback import Playback
-    from skyless.dashboard.processors import ProcessorUse
-    from skyless.dashboard.serve import bind, serve
-    from skyless.dashboard.sites import LiveSites
+    from skyless.page.app import Services
+    from skyless.page.condition.evidence import ProcessorUse
+    from skyless.page.live import LiveSite
+    from skyless.page.overlays import Overlays
+    from skyless.page.playback import Playback
+    from skyless.page.serve import bind, serve
+    from skyless.page.sites import LiveSites
 
     address = broker.address()
     if address is None:
@@ -107,7 +104,7 @@ def _load(name: str) -> "tuple[SiteMessage, bytes | None]":
     """The site and the image of its floor. Raises SkylessError."""
     import time
 
-    from skyless.mqtt.messages import site_message
+    from skyless.run.mqtt.messages import site_message
 
     site = site_named(name)
     image = None if site.floor_plan is None else (Path(name).parent / site.floor_plan.image).read_bytes()
@@ -116,7 +113,7 @@ def _load(name: str) -> "tuple[SiteMessage, bytes | None]":
 
 def _listening(listen: str | None) -> "ListenAddress":
     """Where to listen. Raises SkylessError."""
-    from skyless.dashboard.serve import PORT, ListenAddress
+    from skyless.page.serve import PORT, ListenAddress
 
     if listen is None:
         return ListenAddress("127.0.0.1", None)
@@ -129,7 +126,7 @@ def _rules(bound: str, host: str, port: int, token: str | None) -> "AccessRules"
     import secrets
     import socket
 
-    from skyless.dashboard.guard import AccessRules
+    from skyless.page.guard import AccessRules
 
     if token is not None and len(token) < _SHORTEST_TOKEN:
         raise SkylessError(f"--token has {len(token)} characters; it should have {_SHORTEST_TOKEN} or more")

@@ -9,7 +9,7 @@ from skyless.cli.common.options import check_output
 from skyless.cli.common.output import console, print_json, print_warnings
 
 if TYPE_CHECKING:
-    from skyless.exports.rosbag import Bag
+    from skyless.bridges.exports.rosbag import Bag
 
 NO_FIX = 1
 """Exit code where the recording holds no fix of the tag."""
@@ -51,9 +51,9 @@ def export(
     json
         Write one JSON object instead of a table.
     """
+    from skyless.bridges.exports.rosbag import write_bag
     from skyless.bridges.ros2.messages import FRAME_NAME, FRAME_RULE, RosSettings
-    from skyless.errors import SkylessError
-    from skyless.exports.rosbag import write_bag
+    from skyless.core.errors import SkylessError
 
     check_output("to", to, file)
     if not FRAME_NAME.fullmatch(frame):

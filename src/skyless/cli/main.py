@@ -10,10 +10,10 @@ from errno import EDQUOT, EFBIG, EIO, ENOSPC
 from io import TextIOWrapper
 from typing import TYPE_CHECKING, Final
 
-from cyclopts import App, CycloptsError, Group, Parameter, UnknownOptionError
+from cyclopts import App, CycloptsError, Group, Parameter
 from cyclopts.help import DefaultFormatter
 
-from skyless.errors import SkylessError
+from skyless.core.errors import SkylessError
 
 if TYPE_CHECKING:
     from cyclopts.help import HelpPanel
@@ -32,9 +32,8 @@ _GROUPS: Final = {
         (
             "survey",
             "survey",
-            "Find where anchors hang and their antenna delays, from what they receive of others.",
+            "Find where anchors hang and their antenna delays, from recordings or a running site.",
         ),
-        ("calibrate", "calibrate", "Find wrong antenna delays from a tag whose position is known."),
     ),
     "Run a site": (
         ("broker", "nodes.broker", "Run the MQTT broker that comes with Skyless."),
@@ -59,26 +58,6 @@ _GROUPS: Final = {
     ),
 }
 """The commands, in the groups and in the order of the help."""
-
-_RENAMED: Final = {
-    "--fixes": ("--fixes-csv", ("replay",)),
-    "--anchors": ("--anchor-count", ("site new", "bench")),
-    "--height": ("--tag-height", ("replay", "tag")),
-    "--height-std": ("--tag-height-std", ("replay", "tag")),
-    "--grid": ("--spacing", ("site new",)),
-    "--format": ("--wire", ("board",)),
-    "--warmup": ("--settle", ("simulate",)),
-    "--seconds": ("--search-seconds", ("plan",)),
-}
-"""Options of version 0.1 that have another name in some commands, so that each name has one meaning."""
-
-_RENAMED_IN_SURVEY: Final = {
-    "--height": "--anchor-height",
-    "--height-std": "--anchor-height-std",
-    "--heights": "--anchor-heights",
-    "--listener": "--radio-name",
-    "--seconds": "--duration",
-}
 
 _INTERRUPTED = 130
 _TERMINATED = 143
@@ -142,7 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"skyless: {error}", file=sys.stderr)
         return _USER_ERROR
     except CycloptsError as error:
-        print(f"skyless: {_renamed(error) or ' '.join(str(error).split())}", file=sys.stderr)
+        print(f"skyless: {' '.join(str(error).split())}", file=sys.stderr)
         return _USER_ERROR
     except KeyboardInterrupt:
         return _INTERRUPTED
@@ -180,18 +159,6 @@ def _trouble(error: OSError) -> str:
         raise error
     _drop_output()
     return f"standard output cannot be written: {error.strerror}"
-
-
-def _renamed(error: CycloptsError) -> str | None:
-    """The message where an option's former name is given."""
-    if not isinstance(error, UnknownOptionError):
-        return None
-    command = " ".join(error.command_chain or ())
-    option = (error.token.keyword or error.token.value).partition("=")[0]
-    new, commands = _RENAMED.get(option, ("", ()))
-    if command == "survey":
-        new, commands = _RENAMED_IN_SURVEY.get(option, ""), (command,)
-    return f"{option} of skyless {command} is called {new} now" if new and command in commands else None
 
 
 def _version() -> str:

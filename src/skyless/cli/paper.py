@@ -7,17 +7,19 @@ from typing import TYPE_CHECKING
 
 from cyclopts import App
 
-from skyless.cli.common.options import Seed
+from skyless.cli.common.options import command
 from skyless.cli.common.output import console, json_form, print_json
 from skyless.cli.common.progress import loading_kernels, progress_bar
+from skyless.core.arguments import Seed
 
 if TYPE_CHECKING:
-    from skyless.paper.run import Report
+    from skyless.research.paper.run import Report
 
 app = App(name="paper", help_epilogue="Example: skyless paper --out report --seed 1")
 
 
 @app.default
+@command
 def paper(
     *,
     out: Path,
@@ -41,10 +43,10 @@ def paper(
     json
         Write one JSON object instead of the table.
     """
-    from skyless.evaluation.compile_ahead import compile_kernels
-    from skyless.paper.plan import plan_of
-    from skyless.paper.run import write_report
-    from skyless.preparation.parts import LAB
+    from skyless.core.kernels.processes import LAB
+    from skyless.research.compile_ahead import compile_kernels
+    from skyless.research.paper.plan import plan_of
+    from skyless.research.paper.run import write_report
 
     started_s = time.perf_counter()
     with loading_kernels(*LAB):

@@ -5,34 +5,36 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import msgspec
-from cyclopts import App, Parameter
-from cyclopts.validators import Number
+from cyclopts import App
 
-from skyless.cli.common.options import height_number
+from skyless.cli.common.options import command
 from skyless.cli.common.output import console, print_json, print_warnings, write_file
 from skyless.cli.nodes.options import SiteId
-from skyless.errors import SkylessError
+from skyless.core.arguments import number, read_height, whole
+from skyless.core.errors import SkylessError
 
 if TYPE_CHECKING:
     from rich.table import Table
     from rich.text import Text
 
-    from skyless.site.model import Site
+    from skyless.core.site import Site
 
-_Metres = Annotated[float, Parameter(validator=Number(gt=0, lte=10_000))]
-_RoomMetres = Annotated[float, Parameter(validator=Number(gte=0.1, lte=10_000))]
+_Metres = Annotated[float, number(above=0.0, most=10_000.0)]
+_RoomMetres = Annotated[float, number(least=0.1, most=10_000.0)]
 """Of a room's side, along whose walls even 255 anchors stand apart."""
 _GRID_HEIGHT_M: Final = 4.0
 _TAGS_BELOW_A_GRID_M: Final = 1.2
+_PAPER_SLOT_S: Final = 2.5e-3
 _LONGEST_TABLE: Final = 40
 """Anchors that are shown one a row; of more only a summary."""
-_Count = Annotated[int, Parameter(validator=Number(gte=1, lte=255))]
+_Count = Annotated[int, whole(1, 255)]
 
 app = App(name="site", help_epilogue="Example: skyless site check site.toml")
 app.command("skyless.cli.site_keys:app", name="keys", help="Make, replace and show the keys of a site.")
 
 
 @app.command(help_epilogue="Example: skyless site new hall.toml --width 30 --depth 20 --anchor-count 8 --height 4")
+@command
 def new(
     file: Path,
     /,
@@ -43,8 +45,8 @@ def new(
     anchor_count: _Count | None = None,
     height: _Metres | None = None,
     spacing: _Metres | None = None,
-    free: bool = False,
     unplaced: _Count | None = None,
+    paper: bool = False,
     tag_height: str | None = None,
     site_id: SiteId | None = None,
     force: bool = False,
@@ -65,18 +67,16 @@ def new(
     depth
         The room's depth along y in metres.
     anchor_count
-        How many anchors hang evenly along the room's walls; 6 by default. Their master is the one that the others
-        receive best.
+        How many anchors hang evenly along the room's walls; 6 by default.
     height
         The room's height in metres, 3 by default; the anchors alternate between floor and ceiling. With --spacing the
         height of all anchors, 4 by default.
     spacing
-        Spacing in metres of a square grid of anchors that needs no master (protocol 2) and may be of any size; they
-        get slots, which anchors far apart share.
-    free
-        With --spacing: anchors send at random instants (mode free) instead of in slots.
+        Spacing in metres of a square grid of anchors, which may be of any size.
     unplaced
-        How many anchors, 1 to this number, without positions, each with a slot of its own (protocol 2).
+        How many anchors, 1 to this number, without positions.
+    paper
+        Use the paper's protocol (mode master): the anchor that the others receive best is the master.
     tag_height
         The tags' height: metres, at which all of them move (2-D), or free, the default: estimated (3-D). With
         --spacing, whose anchors lie in one plane, the default is 1.2.
@@ -87,32 +87,37 @@ def new(
     json
         Write one JSON object instead of a line.
     """
-    from skyless.planning.reception import with_best_master
-    from skyless.simulation.channel import ChannelModel
-    from skyless.site.check import check_site
-    from skyless.site.lab import lab_site
-    from skyless.site.template import rectangle, rectangular_site, site_template, unplaced_site
+    from skyless.core.site import ScheduleSite
+    from skyless.sim.lab import lab_site
+    from skyless.site.channel import ChannelModel
+    from skyless.site.file.check import check_site
+    from skyless.site.file.template import rectangle, rectangular_site, site_template, unplaced_site
+    from skyless.site.planning.anchor_clocks import with_best_master
 
     if file.is_dir():
         raise SkylessError(f"{file} is a folder; it should be the name of a file to write")
     sizes = (width, depth, anchor_count, height)
     height_m = _tag_height(tag_height, spacing)
     if unplaced is not None:
-        if sizes != (None,) * 4 or spacing is not None or free:
+        if sizes != (None,) * 4 or spacing is not None:
             raise SkylessError(f"--unplaced is {unplaced}; it takes no sizes: anchors without positions fill no room")
         site = unplaced_site(unplaced, height_m)
     elif spacing is not None and width is not None and depth is not None and anchor_count is None:
-        site = _grid(width, depth, spacing, height, height_m, free)
-    elif spacing is not None or free:
+        site = _grid(width, depth, spacing, height, height_m)
+    elif spacing is not None:
         raise SkylessError("a grid needs --spacing, --width and --depth; how many --anchor-count follows from them")
     elif width is not None and depth is not None:
-        room = rectangular_site(width, depth, anchor_count or 6, height or 3.0, height_m)
-        check_site(room, file)
-        site = with_best_master(room, ChannelModel())
+        site = rectangular_site(width, depth, anchor_count or 6, height or 3.0, height_m)
+        check_site(site, file)
     elif (*sizes, tag_height) == (None,) * 5:
         site = msgspec.structs.replace(lab_site(), outline_m=rectangle(6.0, 8.0))
     else:
         raise SkylessError("a room needs both --width and --depth; without them the lab is written")
+    if paper:
+        if unplaced is not None or spacing is not None:
+            raise SkylessError("--paper is for one room; its anchors need positions, and all receive one master")
+        master = msgspec.structs.replace(site, schedule=ScheduleSite(slot_s=_PAPER_SLOT_S))
+        site = with_best_master(master, ChannelModel())
     site = msgspec.structs.replace(site, name=name or file.stem, id=_new_id() if site_id is None else site_id)
     check_site(site, file)
     if file.exists() and not force:
@@ -126,7 +131,7 @@ def new(
 
 def _new_id() -> int:
     """An identifier that a neighbouring site hardly has: any on the air but 0."""
-    from skyless.site.check import ANY_ADDRESS
+    from skyless.site.file.check import ANY_ADDRESS
 
     return 1 + secrets.randbelow(ANY_ADDRESS)
 
@@ -135,21 +140,21 @@ def _tag_height(text: str | None, spacing_m: float | None) -> float | None:
     """The tags' height in metres, None where it is estimated. Raises SkylessError."""
     if text is None:
         return None if spacing_m is None else _TAGS_BELOW_A_GRID_M
-    return None if text == "free" else height_number(text, "or free")
+    height_m = read_height("--tag-height", text, ("free",))
+    return None if isinstance(height_m, str) else height_m
 
 
-def _grid(
-    width_m: float, depth_m: float, spacing_m: float, height_m: float | None, tags_m: float | None, free: bool
-) -> "Site":
-    from skyless.site.grid import grid_site
+def _grid(width_m: float, depth_m: float, spacing_m: float, height_m: float | None, tags_m: float | None) -> "Site":
+    from skyless.site.file.template import grid_site
 
     try:
-        return grid_site(width_m, depth_m, spacing_m, height_m or _GRID_HEIGHT_M, tags_m, "free" if free else "slots")
+        return grid_site(width_m, depth_m, spacing_m, height_m or _GRID_HEIGHT_M, tags_m)
     except ValueError as error:
         raise SkylessError(f"no grid of {spacing_m:g} m: {error}") from None
 
 
 @app.command(help_epilogue="Example: skyless site check site.toml --json")
+@command
 def check(file: Path, /, *, json: bool = False) -> None:
     """Check a site file, and show what it makes: anchors, slots, rates, and what may cost accuracy.
 
@@ -162,7 +167,7 @@ def check(file: Path, /, *, json: bool = False) -> None:
     json
         Write one JSON object instead of the table.
     """
-    from skyless.site.load import load_site
+    from skyless.site.file.load import load_site
 
     site = load_site(file)
     report = _report(site)
@@ -174,12 +179,12 @@ def check(file: Path, /, *, json: bool = False) -> None:
 
 def _report(site: "Site") -> dict[str, Any]:
     """The report on a valid site, SI units."""
-    from skyless.air.codec import MAX_FRAME_BYTES
-    from skyless.air.ieee802154 import air_time_s
-    from skyless.planning.reception import master_warnings, reception_of
-    from skyless.simulation.channel import ChannelModel
-    from skyless.site.advice import warnings_of
-    from skyless.site.slots import beacon_period_s
+    from skyless.core.air.frame import MAX_FRAME_BYTES
+    from skyless.core.air.ieee802154 import air_time_s
+    from skyless.core.protocols import beacon_period_s
+    from skyless.site.channel import ChannelModel
+    from skyless.site.file.advice import warnings_of
+    from skyless.site.planning.anchor_clocks import master_warnings, reception_of
 
     report: dict[str, Any] = {
         "name": site.name,
@@ -188,14 +193,13 @@ def _report(site: "Site") -> dict[str, Any]:
         "master": site.master if site.schedule.needs_master else None,
         "tag_height_m": site.tags.height_m,
         "anchors": _anchors(site),
-        "unplaced": [{"id": anchor.id, "slots": _own_slots(anchor.slot)} for anchor in site.unplaced],
+        "unplaced": [{"id": anchor.id} for anchor in site.unplaced],
         "beacons_per_s_of_each_anchor": 1.0 / beacon_period_s(site),
         "longest_frame_s": air_time_s(MAX_FRAME_BYTES),
     }
-    if site.schedule.mode != "free":
-        report |= _superframe(site)
     warnings = warnings_of(site)
     if site.schedule.needs_master:
+        report |= _superframe(site)
         report["occupancy"] = report["messages_per_s"] * report["longest_frame_s"]
         received = reception_of(site, ChannelModel()).share.tolist()
         report["anchors"] = [
@@ -208,26 +212,23 @@ def _report(site: "Site") -> dict[str, Any]:
 
 
 def _anchors(site: "Site") -> list[dict[str, Any]]:
-    from skyless.site.slots import first_slots, schedule_of
+    from skyless.core.protocol1.schedule import first_slots, schedule_of
 
-    slots: dict[int, tuple[int, ...]] = {anchor.id: () for anchor in site.anchors}
-    if site.schedule.mode != "free":
+    slots: dict[int, tuple[int, ...]] = {}
+    if site.schedule.needs_master:
         schedule = schedule_of(site)
         slots = {number: schedule.slots_of(first) for number, first in first_slots(site).items()}
     return [
-        {"id": anchor.id, "x_m": anchor.x_m, "y_m": anchor.y_m, "z_m": anchor.z_m, "slots": slots[anchor.id]}
+        {"id": anchor.id, "x_m": anchor.x_m, "y_m": anchor.y_m, "z_m": anchor.z_m}
+        | ({"slots": slots[anchor.id]} if slots else {})
         for anchor in site.anchors
     ]
 
 
-def _own_slots(slot: int | None) -> tuple[int, ...]:
-    return () if slot is None else (slot,)
-
-
 def _superframe(site: "Site") -> dict[str, Any]:
     """What the slots make."""
-    from skyless.constants import TICK_S
-    from skyless.site.slots import schedule_of
+    from skyless.core.constants import TICK_S
+    from skyless.core.protocol1.schedule import schedule_of
 
     schedule = schedule_of(site)
     return {
@@ -243,8 +244,9 @@ def _in_reach(site: "Site") -> dict[str, Any]:
     """How many anchors are in reach of one another, and what they send."""
     import numpy as np
 
-    from skyless.site.advice import RADIO_REACH_M, anchors_in_reach, best_offered_hz
-    from skyless.site.slots import beacon_period_s
+    from skyless.core.air.instants import OFFERED_HZ
+    from skyless.core.geometry import RADIO_REACH_M, anchors_in_reach
+    from skyless.core.protocols import beacon_period_s
 
     in_reach = anchors_in_reach(site) if site.anchors else np.zeros(1)
     return {
@@ -253,7 +255,7 @@ def _in_reach(site: "Site") -> dict[str, Any]:
         "median_in_reach": float(np.median(in_reach)),
         "most_in_reach": int(in_reach.max()),
         "offered_in_reach_per_s": float(np.median(in_reach)) / beacon_period_s(site),
-        "best_offered_per_s": best_offered_hz() if site.schedule.mode == "free" else None,
+        "best_offered_per_s": OFFERED_HZ,
     }
 
 
@@ -275,25 +277,20 @@ def _rows(title: "Text", anchors: list[dict[str, Any]], report: dict[str, Any]) 
     """One row for each anchor."""
     from rich.table import Table
 
-    with_slots = report["mode"] != "free"
-    has_master = report["master"] is not None
-    more = [*(["slots"] if with_slots else []), *(["hears master"] if has_master else [])]
+    more = ["slots", "hears master"] if report["master"] is not None else []
     table = Table("anchor", "x / m", "y / m", "z / m", *more, title=title)
     for column in table.columns:
         column.justify = "right"
     for anchor in anchors:
         role = " (master)" if anchor["id"] == report["master"] else ""
         position = [f"{anchor[axis]:.3f}" if axis in anchor else "?" for axis in ("x_m", "y_m", "z_m")]
-        slots = [" ".join(map(str, anchor["slots"]))] if with_slots else []
-        hears = [f"{anchor['hears_master']:.0%}"] if has_master else []
-        table.add_row(f"{anchor['id']}{role}", *position, *slots, *hears)
+        heard = [" ".join(map(str, anchor["slots"])), f"{anchor['hears_master']:.0%}"] if more else []
+        table.add_row(f"{anchor['id']}{role}", *position, *heard)
     return table
 
 
 def _summary(title: "Text", report: dict[str, Any]) -> "Table":
     """Many anchors in a few lines."""
-    from collections import Counter
-
     from rich.table import Table
 
     anchors, unplaced = report["anchors"], report["unplaced"]
@@ -304,9 +301,6 @@ def _summary(title: "Text", report: dict[str, Any]) -> "Table":
     for axis in ("x_m", "y_m", "z_m") if anchors else ():
         values = [anchor[axis] for anchor in anchors]
         table.add_row(f"{axis[0]} / m", f"{min(values):.3f} … {max(values):.3f}")
-    if report["mode"] != "free":
-        users = Counter(slot for anchor in [*anchors, *unplaced] for slot in anchor["slots"])
-        table.add_row("anchors in a slot", f"{min(users.values())} … {max(users.values())}")
     if report["mode"] != "master":
         reach = f"within {report['reach_m']:.0f} m of an anchor"
         in_reach = (f"{report['fewest_in_reach']} … {report['most_in_reach']}", f"{report['median_in_reach']:.0f}")
@@ -327,8 +321,6 @@ def _schedule_lines(report: dict[str, Any]) -> str:
     slots = (
         f"{report['slots']} slots of {report['slot_s'] * 1e3:.3f} ms: {report['superframes_per_s']:.1f} superframes/s"
     )
-    if report["mode"] == "slots":
-        return f"mode slots: {slots}\n{rate}; {frame}"
     return (
         f"{slots}, {report['messages_per_s']:.0f} messages/s\n"
         f"{frame}; the air is occupied {report['occupancy']:.0%} of the time at most"

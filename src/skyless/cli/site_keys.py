@@ -6,18 +6,19 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from cyclopts import App, Parameter
-from cyclopts.validators import Number
+from cyclopts import App
 
+from skyless.cli.common.options import command
 from skyless.cli.common.output import console, print_facts, print_json, print_warnings
 from skyless.cli.common.progress import progress_bar
 from skyless.cli.nodes.options import site_named
-from skyless.errors import SkylessError
+from skyless.core.arguments import Options, number
+from skyless.core.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.authentication.chain import Chain
-    from skyless.authentication.key_files import SitePublic
-    from skyless.site.model import Site
+    from skyless.core.keys.chain import Chain
+    from skyless.core.site import Site
+    from skyless.run.keys.key_files import SitePublic
 
 _DAY_S: Final = 86_400.0
 _YEAR_S: Final = 365.25 * _DAY_S
@@ -28,7 +29,6 @@ _LITTLE_LEFT_S: Final = 60.0 * _DAY_S
 _OVERLAP_S: Final = 5.0
 """A chain that counts at once begins this long ago, as clocks of hosts differ."""
 
-_Years = Annotated[float, Parameter(validator=Number(gt=0, lte=10))]
 
 app = App(
     name="keys",
@@ -37,32 +37,42 @@ app = App(
 )
 
 
+class _Site(Options, frozen=True):
+    site: str
+    """Site file, of mode free."""
+
+
+class _KeysOptions(_Site, frozen=True, kw_only=True):
+    keys: Path | None = None
+    """Folder of the site's keys; by default keys in that of the site file."""
+    json: bool = False
+    """Write one JSON object instead of the table, or of what is to be done next."""
+
+
+class _ChainOptions(Options, frozen=True, kw_only=True):
+    years: Annotated[float, number(above=0.0, most=10.0)] = 2.0
+    """How long the chain lasts; a short one is made sooner."""
+
+
+class _StartOptions(_ChainOptions, frozen=True, kw_only=True):
+    starts: str | None = None
+    """When the chain begins to count: ISO date and time, local where no zone is given; by default at once for new keys,
+    else in a day. Until then anchors send without codes, or with those of the chain before, so that all of them can get
+    the files."""
+
+
 @app.command(help_epilogue='Example: skyless site keys new site.toml --starts "2030-01-31 06:00"')
-def new(
-    site: str, /, *, keys: Path | None = None, years: _Years = 2.0, starts: str | None = None, json: bool = False
-) -> None:
+@command
+def new(asked: _KeysOptions, made: _StartOptions) -> None:
     """Make the keys of a site: its key pair and its first key chain. Nothing that is there is overwritten.
 
     Two years take five minutes of one processor; all are used.
-
-    Parameters
-    ----------
-    site
-        Site file, of mode slots or free.
-    keys
-        Folder of the site's keys; by default keys in that of the site file.
-    years
-        How long the chain lasts.
-    starts
-        When the chain begins to count: ISO date and time, local where no zone is given; by default at once. Until then
-        anchors with keys send without codes, so that all of them can get their keys before.
-    json
-        Write one JSON object instead of what is to be done next.
     """
+    site, keys, years, starts = asked.site, asked.keys, made.years, made.starts
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-    from skyless.authentication.key_files import SITE_PRIVATE, SITE_PUBLIC, SitePublic, private_bytes, serials_in
-    from skyless.authentication.key_files import site_public_bytes as public_bytes
+    from skyless.run.keys.key_files import SITE_PRIVATE, SITE_PUBLIC, SitePublic, private_bytes, serials_in
+    from skyless.run.keys.key_files import site_public_bytes as public_bytes
 
     plan = _site_with_codes(site)
     folder = _folder(site, keys)
@@ -79,7 +89,7 @@ def new(
     chain = _made(public, 1, starts_s, years, private.private_bytes_raw())
     files = {folder / SITE_PRIVATE: private_bytes(private), folder / SITE_PUBLIC: public_bytes(public)}
     _write(folder, chain, files)
-    if json:
+    if asked.json:
         _print_json(site, keys)
         return
     console().print(
@@ -94,25 +104,10 @@ def new(
 
 
 @app.command(help_epilogue='Example: skyless site keys rotate site.toml --starts "2030-01-31 06:00"')
-def rotate(
-    site: str, /, *, keys: Path | None = None, years: _Years = 2.0, starts: str | None = None, json: bool = False
-) -> None:
-    """Make the next key chain of a site, which counts from a planned time on; until then the present one does.
-
-    Parameters
-    ----------
-    site
-        Site file, of mode slots or free.
-    keys
-        Folder of the site's keys; by default keys in that of the site file.
-    years
-        How long the chain lasts.
-    starts
-        When the chain begins to count: ISO date and time, local where no zone is given; by default in a day. All
-        anchors should have its files before.
-    json
-        Write one JSON object instead of what is to be done next.
-    """
+@command
+def rotate(asked: _KeysOptions, made: _StartOptions) -> None:
+    """Make the next key chain of a site, which counts from a planned time on; until then the present one does."""
+    site, keys, years, starts = asked.site, asked.keys, made.years, made.starts
     folder, public, chains = _present(site, keys)
     starts_s = time.time() + _DAY_S if starts is None else _planned(starts)
     chain = _successor(folder, public, chains, starts_s, years)
@@ -122,7 +117,7 @@ def rotate(
     ends_s = _ends_s(last)
     if ends_s < starts_s:
         warnings.append(f"chain {last.serial} ends {_when(ends_s)}: until {_when(starts_s)} beacons carry no codes")
-    if json:
+    if asked.json:
         _print_json(site, keys, warnings)
         return
     console().print(
@@ -136,29 +131,19 @@ def rotate(
 
 
 @app.command(help_epilogue="Example: skyless site keys revoke site.toml --years 0.1")
-def revoke(site: str, /, *, keys: Path | None = None, years: _Years = 2.0, json: bool = False) -> None:
-    """Replace all key chains of a site at once, as a seed was stolen or an anchor's host lost.
-
-    Parameters
-    ----------
-    site
-        Site file, of mode slots or free.
-    keys
-        Folder of the site's keys; by default keys in that of the site file.
-    years
-        How long the new chain lasts; a short one is made sooner.
-    json
-        Write one JSON object instead of what is to be done next.
-    """
+@command
+def revoke(asked: _KeysOptions, made: _ChainOptions) -> None:
+    """Replace all key chains of a site at once, as a seed was stolen or an anchor's host lost."""
+    site, keys, years = asked.site, asked.keys, made.years
     from msgspec.structs import replace
 
-    from skyless.authentication.key_files import SITE_PUBLIC, site_public_bytes
+    from skyless.run.keys.key_files import SITE_PUBLIC, site_public_bytes
 
     folder, public, chains = _present(site, keys)
     chain = _successor(folder, public, chains, time.time() - _OVERLAP_S, years)
     raised = replace(public, least_serial=chain.serial)
     _write(folder, chain, {folder / SITE_PUBLIC: site_public_bytes(raised)})
-    if json:
+    if asked.json:
         _print_json(site, keys)
         return
     console().print(
@@ -173,21 +158,13 @@ def revoke(site: str, /, *, keys: Path | None = None, years: _Years = 2.0, json:
 
 
 @app.command(help_epilogue="Example: skyless site keys show site.toml --json")
-def show(site: str, /, *, keys: Path | None = None, json: bool = False) -> None:
-    """Show the key chains of a site: from when to when, and which counts now. No secret is shown.
-
-    Parameters
-    ----------
-    site
-        Site file, of mode slots or free.
-    keys
-        Folder of the site's keys; by default keys in that of the site file.
-    json
-        Write one JSON object instead of the table.
-    """
+@command
+def show(asked: _KeysOptions) -> None:
+    """Show the key chains of a site: from when to when, and which counts now. No secret is shown."""
+    site, keys = asked.site, asked.keys
     folder, public, chains = _present(site, keys)
     report = _report(folder, public, chains, time.time())
-    if json:
+    if asked.json:
         print_json(report)
         return
     rows = [("site", str(public.site)), ("public key", public.fingerprint)]
@@ -209,8 +186,8 @@ def _print_json(site: str, keys: Path | None, warnings: Sequence[str] = ()) -> N
 
 def _report(folder: Path, public: "SitePublic", chains: "list[Chain]", now_s: float) -> dict[str, Any]:
     """What is to be said of the chains."""
-    from skyless.authentication.chain import ChainRing
-    from skyless.authentication.key_files import chain_seed_file
+    from skyless.core.keys.chain import ChainRing
+    from skyless.run.keys.key_files import chain_seed_file
 
     ring = ChainRing(chains)
     at = None if ring.timing is None else ring.at(ring.timing.interval_at(now_s))
@@ -251,9 +228,7 @@ def _site_with_codes(site: str) -> "Site":
     """The site, whose beacons can carry codes. Raises SkylessError."""
     plan = site_named(site)
     if plan.schedule.needs_master:
-        raise SkylessError(
-            f'{site}: schedule.mode is "master", whose beacons carry no codes; it should be slots or free'
-        )
+        raise SkylessError(f'{site}: schedule.mode is "master", whose beacons carry no codes; it should be free')
     return plan
 
 
@@ -263,7 +238,7 @@ def _folder(site: str, keys: Path | None) -> Path:
 
 def _present(site: str, keys: Path | None) -> "tuple[Path, SitePublic, list[Chain]]":
     """Folder, public key and chains, without their seeds, of a site that has keys. Raises SkylessError."""
-    from skyless.authentication.key_files import read_chain_public, read_folder_public, serials_in
+    from skyless.run.keys.key_files import read_chain_public, read_folder_public, serials_in
 
     plan, folder = _site_with_codes(site), _folder(site, keys)
     public = read_folder_public(folder, plan.id)
@@ -275,18 +250,18 @@ def _present(site: str, keys: Path | None) -> "tuple[Path, SitePublic, list[Chai
 
 def _successor(folder: Path, public: "SitePublic", chains: "list[Chain]", starts_s: float, years: float) -> "Chain":
     """The next chain of a site. Raises SkylessError."""
-    from skyless.authentication.key_files import MOST_SERIAL, read_private
+    from skyless.run.keys.key_files import MAX_SERIAL, read_private
 
     private = read_private(folder, public)
     serial = max(chains[-1].serial, public.least_serial) + 1
-    if serial > MOST_SERIAL:
-        raise SkylessError(f"{folder} holds chain {MOST_SERIAL}, the last one; skyless site keys new makes new keys")
+    if serial > MAX_SERIAL:
+        raise SkylessError(f"{folder} holds chain {MAX_SERIAL}, the last one; skyless site keys new makes new keys")
     return _made(public, serial, starts_s, years, private.private_bytes_raw())
 
 
 def _made(public: "SitePublic", serial: int, starts_s: float, years: float, private: bytes) -> "Chain":
     """A new chain, with a bar while it is made."""
-    from skyless.authentication.chain_maker import new_chain
+    from skyless.core.keys.chain import new_chain
 
     with progress_bar("making the key chain", 1.0) as bar:
         return new_chain(public.site, serial, starts_s, starts_s + years * _YEAR_S, private, bar.reach)
@@ -294,14 +269,14 @@ def _made(public: "SitePublic", serial: int, starts_s: float, years: float, priv
 
 def _write(folder: Path, chain: "Chain", more: dict[Path, bytes]) -> None:
     """Write the files of a chain and others. Raises SkylessError, and then none is there."""
-    from skyless.authentication.key_files import (
+    from skyless.core.whole_files import replace_files
+    from skyless.run.keys.key_files import (
         SITE_PRIVATE,
         chain_public_bytes,
         chain_public_file,
         chain_seed_file,
         seed_bytes,
     )
-    from skyless.whole_files import replace_files
 
     seed, chain_public = chain_seed_file(folder, chain.serial), chain_public_file(folder, chain.serial)
     for file in (seed, chain_public):

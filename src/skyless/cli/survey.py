@@ -1,64 +1,40 @@
 """``skyless survey``: positions and antenna delays of anchors, from what they receive of one another."""
 
 import time
-from math import inf
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from cyclopts import App
-from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.cli.common.options import (
-    Coordinate,
-    check_folder,
-    check_left_out,
-    check_output,
-    check_picture,
-    finite_numbers,
-    options,
-)
-from skyless.cli.common.output import console
-from skyless.cli.common.progress import status
-from skyless.cli.common.recording_inputs import is_mcap
-from skyless.cli.common.survey_facts import FactOptions, facts_of
+from skyless.cli.common.options import check_folder, check_output, check_picture, command
+from skyless.cli.common.output import cm, console, number, print_facts, print_json, print_warnings, write_file
+from skyless.cli.common.progress import progress_bar
 from skyless.cli.nodes.survey_live import LiveOptions, gather_live, serve_live
-from skyless.cli.survey_report import SurveyReport, print_report, show_report
-from skyless.errors import SkylessError
+from skyless.core.arguments import Options
+from skyless.core.errors import SkylessError
+from skyless.research.calibration.options import SurveyOptions
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from rich.table import Table
 
-    from skyless.site.model import Site
-    from skyless.survey.ranges import PairRanges
-    from skyless.survey.result import Survey
-    from skyless.survey.stamps.pair_ranger import PairRanger
-    from skyless.survey.tags.epochs import TagEpochs
+    from skyless.cli.api.survey import BiasResult, SurveyResult
+    from skyless.site.survey.result import Survey, SurveyedPair, TapeAdvice
 
 NOTHING_DETERMINED: Final = 1
 """Exit code of a survey without a position or a delay."""
 
+_WORST: Final = 8
+"""Pairs that are shown, those with the largest residuals."""
+
 app = App(
     name="survey",
-    help_epilogue="Example: skyless survey site.mcap --site site.toml --distance 1-5=8.94 --out surveyed.toml",
+    help_epilogue="Example: skyless survey --recording site.mcap --site site.toml --distance 1-5=8.94 --out new.toml",
 )
 
 
-@options
-class SurveyOptions:
-    """Options of ``skyless survey``."""
-
-    ranges: Path | None = None
-    """A table of ranges instead of a recording: anchor_a,anchor_b,range_m, each pair any number of times."""
-    format: str | None = None
-    """Name of the recording's format, if the content should not decide."""
-    walk: list[str] | None = None
-    """A tag of the recording that was carried around, and when in seconds since its first reception: tag1,
-    tag1@60:120. Several times for several tags. Used only where it fits the ranges."""
-    walk_height: Coordinate | None = None
-    """Height at which it was carried, metres, within some 0.1 m; by default it is free."""
-    live: LiveOptions = LiveOptions()
-    known: FactOptions = FactOptions()
+class _Output(Options, frozen=True, kw_only=True):
     out: Path | None = None
     """Write the result here: the site file of --site with the survey in it (.toml), or a table of anchors (.csv)."""
     force: bool = False
@@ -70,181 +46,100 @@ class SurveyOptions:
 
 
 @app.default
-def survey(recording: Path | None = None, /, *, asked: SurveyOptions = SurveyOptions()) -> int:
+@command
+def survey(*, asked: SurveyOptions, live: LiveOptions, output: _Output) -> int:
     """Find the anchors' positions and the errors of their antenna delays, and what the ranges cannot determine.
 
+    From a recording of skyless record, or of another system whose anchors relay their stamps; from a table of ranges;
+    or from a running site (--mqtt, --radio). With a tag at known positions (--at, --truth) only delays are found; in a
+    recording of another system it shows by how much each anchor seems late, which skyless replay then takes off.
+
     Ends with exit code 1 if no anchor is determined.
-
-    Parameters
-    ----------
-    recording
-        A recording of skyless record, or of another system whose anchors relay their stamps; --ranges takes a table
-        instead, --mqtt and --radio survey a running site.
     """
-    _check(recording, asked)
-    if asked.live.serve:
-        serve_live(asked.live, asked.known)
+    _check(asked, live, output)
+    if live.serve:
+        serve_live(live, asked)
         return 0
-    given = _inputs(recording, asked)
-    site, ranges = given.site, _with_all_anchors(given.ranges(), given.site)
-    facts = facts_of(asked.known, ranges.anchors, site, is_foreign=given.is_foreign)
-    facts = replace(facts, tags=_walks(recording, asked, site))
-    from skyless.survey.count import count
-    from skyless.survey.solve import run_survey
-    from skyless.survey.watch.moved import drop_moved, with_changes
+    from skyless.cli.api.survey import BiasResult, Gathered, gathered, is_of_biases, run_survey_site, surveyed
 
-    changes = () if given.ranger is None else drop_moved(given.ranger, facts, run_survey)
-    if changes:
-        ranges = _with_all_anchors(given.ranges(), site)
-    counted = count(ranges, facts)
-    warnings = () if counted.warning is None else (counted.warning,)
-    if not asked.json:
-        console().print(counted.sentence, markup=False)
-    with status("surveying"):
-        result = with_changes(run_survey(ranges, facts), changes, ranges.duration_s)
-    report = SurveyReport(result, counted, warnings, given.drops)
-    if asked.out is not None and report.usable:
-        report = _written(report, ranges, site, asked, asked.out)
-    if asked.plot is not None:
-        _draw(asked.plot, result)
-    if asked.json:
-        print_report(report)
+    if is_of_biases(asked):
+        _check_table(output)
+        with progress_bar("surveying", 1.0) as bar:
+            biases = run_survey_site(replace(asked, progress=bar.reach))
+        assert isinstance(biases, BiasResult)
+        _report_biases(biases, output)
+        return 0
+    with progress_bar("surveying", 1.0) as bar:
+        asked = replace(asked, progress=bar.reach)
+        given = Gathered(*gather_live(live, asked)) if live.is_live else gathered(asked)
+        found = surveyed(asked, given, lambda counted: None if output.json else console().print(counted.sentence))
+    written, more = ((), ()) if output.out is None or not found.usable else _written(found, output.out)
+    found = replace(found, warnings=(*found.warnings, *more))
+    if output.plot is not None:
+        _draw(found, output.plot)
+    if output.json:
+        unchanged = list(found.unchanged) if written else []
+        print_json({**found.summary, "unchanged": unchanged, "written": list(written)})
     else:
-        show_report(report)
-    return 0 if report.usable else NOTHING_DETERMINED
+        _show(found, written)
+    return 0 if found.usable else NOTHING_DETERMINED
 
 
-def _check(recording: Path | None, asked: SurveyOptions) -> None:
+def _check(asked: SurveyOptions, live: LiveOptions, output: _Output) -> None:
     """See that inputs and options fit one another and outputs can be written, before the work. Raises SkylessError."""
-    inputs = (recording, asked.ranges, asked.known.anchor_heights)
-    asked.live.check(asked.known)
-    if (recording is not None) + (asked.ranges is not None) + asked.live.given != 1:
+    if (asked.recording is not None) + (asked.ranges is not None) + live.is_live != 1:
         raise SkylessError(
-            "a survey needs a recording of skyless record, or else a table of ranges by --ranges, or else a running "
-            "site by --mqtt or --radio"
+            "a survey needs a recording (--recording), or else a table of ranges (--ranges), or else a running site "
+            "(--mqtt or --radio)"
         )
-    if recording is None:
-        check_left_out({"format": asked.format, "walk": asked.walk}, "it is for recordings")
-    if not asked.walk:
-        check_left_out({"walk-height": asked.walk_height}, "it is the height of a tag that --walk names")
-    check_output("out", asked.out, *inputs)
-    check_output("plot", asked.plot, *inputs, asked.known.site, asked.out)
-    check_picture(asked.plot)
-    out = asked.out
+    if live.radio is not None and asked.site is None:
+        raise SkylessError("--radio needs --site: the listener does not know which anchors there are")
+    inputs = [Path(str(one)) for one in (asked.recording, asked.ranges, asked.anchor_heights, asked.truth) if one]
+    site = [Path(str(asked.site))] if asked.site else []
+    out = output.out
+    check_output("out", out, *inputs)
+    check_output("plot", output.plot, *inputs, *site, out)
+    check_picture(output.plot)
     if out is None:
-        check_left_out({"force": asked.force or None}, "nothing is written without --out")
+        output.leave_out("force", why="nothing is written without --out")
         return
+    check_folder("out", out)
     if out.suffix.lower() not in {".toml", ".csv"}:
         raise SkylessError(f"--out is {str(out)!r}; its ending should be .toml for a site or .csv for a table")
-    if out.suffix.lower() == ".toml" and asked.known.site is None:
+    if out.suffix.lower() == ".toml" and asked.site is None:
         raise SkylessError(
             f"--out is {str(out)!r}; a site file needs --site to start from (skyless site new --unplaced makes one)"
         )
-    check_folder("out", out)
-    if out.exists() and not asked.force:
+    if out.exists() and not output.force:
         raise SkylessError(f"{out} exists; --force overwrites it")
 
 
-class _Inputs(Struct, frozen=True):
-    """What a survey starts from."""
-
-    site: "Site | None"
-    """The site of --site, else that of the recording."""
-    ranges: "Callable[[], PairRanges]"
-    """With the antenna delays of the site."""
-    ranger: "PairRanger | None" = None
-    """What makes the ranges, where their times are known."""
-    drops: tuple[str, ...] = ()
-    """What could not be used of a recording, by reason."""
-    is_foreign: bool = False
-    """Whether it is a recording of another system."""
+def _check_table(output: _Output) -> None:
+    if output.out is not None and output.out.suffix.lower() != ".csv":
+        raise SkylessError(
+            f"--out is {str(output.out)!r}; it should be a table, .csv: a site file holds antenna delays, which only a "
+            "recording of skyless record can correct"
+        )
 
 
-def _inputs(recording: Path | None, asked: SurveyOptions) -> _Inputs:
-    """The ranges, and the site if one is known. Raises SkylessError."""
-    from skyless.site.load import load_site
-
-    if asked.live.given:
-        return _Inputs(*gather_live(asked.live, asked.known))
-    site = None if asked.known.site is None else load_site(asked.known.site)
-    if asked.ranges is not None:
-        from skyless.recordings.range_table import read_ranges
-
-        with status("reading ranges"):
-            table = read_ranges(asked.ranges)
-            return _Inputs(site, lambda: table)
-    if recording is None:
-        raise SkylessError("a survey needs a recording or --ranges")
-    from skyless.survey.surveyed_site import with_delays_of
-    from skyless.survey_inputs.recorded_stamps import ranges_of
-
-    with status("reading stamps"):
-        found = ranges_of(recording, asked.format, identifier=None if site is None else site.id)
-    warnings = tuple(f"left out: {number} × {reason}" for reason, number in found.drops.items())
-    recorded, ranger = found.site, found.ranger
-    if site is None or recorded is None:
-        return _Inputs(site or recorded, ranger.ranges, ranger, warnings, recorded is None)
-    return _Inputs(site, lambda: with_delays_of(ranger.ranges(), recorded, site), ranger, warnings)
+# Files
 
 
-def _walks(recording: Path | None, asked: SurveyOptions, site: "Site | None") -> "tuple[TagEpochs, ...]":
-    """What the tags of --walk received while they were carried around. Raises SkylessError."""
-    if recording is None or not asked.walk:
-        return ()
-    if site is None or not is_mcap(recording):
-        raise SkylessError("--walk names a tag of a recording of skyless record")
-    from skyless.recordings.mcap.recording import McapRecording
-    from skyless.survey_inputs.walk import walk_of
-
-    walks: list[TagEpochs] = []
-    spans: list[tuple[str, float, float]] = []
-    with McapRecording(recording) as opened, status("reading the walk"):
-        for text in asked.walk:
-            tag, mark, span = text.partition("@")
-            from_s, to_s = finite_numbers("walk", text, (2,), ":", part=span) if mark else (0.0, inf)
-            if not 0.0 <= from_s < to_s:
-                raise SkylessError(f"--walk is {text!r}; what follows @ should be two times, the later one last")
-            if any(tag == other and from_s < end_s and begin_s < to_s for other, begin_s, end_s in spans):
-                raise SkylessError(f"--walk is {text!r}; a walk of {tag} given before covers the same time")
-            spans.append((tag, from_s, to_s))
-            epochs = walk_of(opened, site.id, tag, (from_s, to_s), asked.walk_height)
-            walks.append(replace(epochs, name=f"the walk of {tag}"))
-    return tuple(walks)
-
-
-def _with_all_anchors(ranges: "PairRanges", site: "Site | None") -> "PairRanges":
-    """The same ranges, with those anchors of the site added that have none: the survey reports them, too."""
-    of_site = set() if site is None else _identifiers(site)
-    return replace(ranges, anchors=tuple(sorted({*ranges.anchors, *of_site})))
-
-
-def _written(
-    report: SurveyReport, ranges: "PairRanges", site: "Site | None", asked: SurveyOptions, out: Path
-) -> SurveyReport:
-    """The report after --out was written. Raises SkylessError."""
+def _written(found: "SurveyResult", out: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The files that --out has written, and warnings of what is not in them. Raises SkylessError."""
     if out.suffix.lower() == ".csv":
-        return replace(report, written=_write(out, {out: _table(report.survey).encode()}))
-    from skyless.survey.record import SurveyRecord, encode_record, record_path
-    from skyless.survey.surveyed_site import delay_changes_ticks, surveyed_text, unchanged_anchors
+        return _write(out, {out: _table(found.survey).encode()}), ()
+    from skyless.site.survey.result import SurveyRecord, encode_record, record_path
+    from skyless.site.survey.surveyed_site import delay_changes_ticks
 
-    if site is None or asked.known.site is None:
-        raise SkylessError(f"--out is {str(out)!r}, and there is no --site")
-    result = report.survey
-    text = surveyed_text(asked.known.site.read_bytes().decode("utf-8-sig"), result, site, asked.known.site)
-    record = SurveyRecord(site.name, site.id, time.time(), ranges, result, delay_changes_ticks(site, result))
-    strangers = [one.id for one in result.anchors if one.determined and one.id not in _identifiers(site)]
-    more = [f"anchor {one} is not in {asked.known.site} and was not written" for one in strangers]
-    written = _write(out, {record_path(out): encode_record(record), out: text.encode()})
-    return replace(
-        report,
-        warnings=(*report.warnings, *more),
-        unchanged=unchanged_anchors(site, result),
-        written=written,
-    )
-
-
-def _identifiers(site: "Site") -> set[int]:
-    return {anchor.id for anchor in site.all_anchors}
+    site, text = found.site, found.corrected_file()
+    assert site is not None
+    changes = delay_changes_ticks(site, found.survey)
+    record = SurveyRecord(site.name, site.id, time.time(), found.ranges, found.survey, changes)
+    known = {anchor.id for anchor in site.all_anchors}
+    strangers = [one.id for one in found.survey.anchors if one.determined and one.id not in known]
+    more = tuple(f"anchor {one} is not in {found.file} and was not written" for one in strangers)
+    return _write(out, {record_path(out): encode_record(record), out: text.encode()}), more
 
 
 def _write(out: Path, files: dict[Path, bytes]) -> tuple[str, ...]:
@@ -252,8 +147,8 @@ def _write(out: Path, files: dict[Path, bytes]) -> tuple[str, ...]:
 
     The last one is named first. Raises SkylessError.
     """
-    from skyless.nodes.survey.files import kept_path
-    from skyless.whole_files import replace_files
+    from skyless.core.whole_files import replace_files
+    from skyless.run.survey.files import kept_path
 
     try:
         before = {kept_path(out): out.read_bytes()} if out.exists() else {}
@@ -265,8 +160,8 @@ def _write(out: Path, files: dict[Path, bytes]) -> tuple[str, ...]:
 
 def _table(result: "Survey") -> str:
     """A table of anchors with their delays as ``skyless replay --anchors`` uses them."""
-    from skyless.positioning.masterless.anchor_errors import AnchorCalibration, DifferenceCalibration
-    from skyless.recordings.anchor_table import new_table
+    from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
+    from skyless.site.tables import new_table
 
     found = [one for one in result.anchors if one.determined]
     positions_m = {
@@ -276,10 +171,110 @@ def _table(result: "Survey") -> str:
     return new_table(positions_m, DifferenceCalibration(delays))
 
 
-def _draw(path: Path, result: "Survey") -> None:
-    from skyless.cli.survey_picture import draw
+def _draw(found: "SurveyResult | BiasResult", plot: Path) -> None:
+    from skyless.site.report.figures import save_figure
 
     try:
-        draw(path, result)
+        save_figure(found.plot(), plot)
     except OSError as error:
-        raise SkylessError(f"{path} cannot be written: {error.strerror}") from None
+        raise SkylessError(f"{plot} cannot be written: {error.strerror}") from None
+
+
+# Reports
+
+
+def _report_biases(found: "BiasResult", output: _Output) -> None:
+    if output.out is not None:
+        write_file(output.out, found.corrected_file().encode())
+    if output.plot is not None:
+        _draw(found, output.plot)
+    if output.json:
+        print_json({**found.summary, "written": output.out})
+        return
+    print_facts(found.title(), found.facts())
+    if output.out is not None:
+        console().print(f"wrote {output.out}", markup=False)
+
+
+def _show(found: "SurveyResult", written: tuple[str, ...]) -> None:
+    """Show the survey: first warnings about what is uncertain, then tables and lines of text."""
+    survey, screen = found.survey, console()
+    print_warnings(
+        [
+            *found.warnings,
+            *(f"ambiguous: {one.sentence}" for one in survey.ambiguities),
+            *([] if survey.unchecked is None else [survey.unchecked]),
+            *([] if survey.assumed_heights is None else [f"{survey.assumed_heights} (--anchor-height)"]),
+            *survey.not_determined,
+        ]
+    )
+    for note in survey.notes:
+        screen.print(f"note: {note}", markup=False)
+    screen.print(_anchors(survey))
+    checked = [pair for pair in survey.pairs if pair.residual_m is not None]
+    if checked:
+        screen.print(_pairs(checked))
+    excluded = ", ".join(f"{pair.a}–{pair.b}{_late(pair)}" for pair in survey.pairs if pair.excluded)
+    lines = [
+        f"left out as late: {excluded or 'no pair'}",
+        f"constant error of a pair: {cm(survey.range_std_m)}; {_checks(survey.redundancy)}",
+        *_tapes(survey.tapes),
+        survey.frame,
+        *found.drops,
+    ]
+    if found.unchanged and written:
+        lines.append(f"unchanged in the file: anchor {', '.join(map(str, found.unchanged))}")
+    lines += [f"wrote {file}" for file in written]
+    lines += [f"next: start the anchors with {file}" for file in written[-2:-1] if file.endswith(".toml")]
+    for line in lines:
+        screen.print(line, markup=False)
+
+
+def _anchors(survey: "Survey") -> "Table":
+    from rich.table import Table
+
+    table = Table(title="anchors")
+    for name in ("anchor", "x / m", "y / m", "z / m", "± / cm", "delay / cm", "± / cm"):
+        table.add_column(name, justify="right")
+    table.add_column("")
+    for one in survey.anchors:
+        position = [number(value) for value in (one.x_m, one.y_m, one.z_m)]
+        others = [number(value, "{:.2f}", 100.0) for value in (one.std_m, one.delay_m, one.delay_std_m)]
+        table.add_row(str(one.id), *position, *others, "" if one.determined else "not determined")
+    return table
+
+
+def _pairs(checked: Sequence["SurveyedPair"]) -> "Table":
+    """Those whose ranges differ most from the result."""
+    from rich.table import Table
+
+    worst = sorted(checked, key=lambda pair: -abs(pair.residual_m or 0.0))[:_WORST]
+    shown = "all pairs" if len(worst) == len(checked) else f"the {len(worst)} of {len(checked)} pairs that fit worst"
+    table = Table(title=shown)
+    for name in ("pair", "range / m", "range − result / cm", "± / cm"):
+        table.add_column(name, justify="right")
+    table.add_column("")
+    for pair in worst:
+        figures = [number(pair.residual_m, "{:+.2f}", 100.0), number(pair.std_m, "{:.2f}", 100.0)]
+        table.add_row(f"{pair.a}–{pair.b}", number(pair.range_m), *figures, "left out" if pair.excluded else "")
+    return table
+
+
+def _late(pair: "SurveyedPair") -> str:
+    return "" if pair.residual_m is None else f" ({pair.residual_m:+.2f} m)"
+
+
+def _checks(redundancy: int) -> str:
+    if redundancy <= 0:
+        return "no range checks the result"
+    return "1 range checks the result" if redundancy == 1 else f"{redundancy} ranges check the result"
+
+
+def _tapes(tapes: Sequence["TapeAdvice"]) -> list[str]:
+    """Which distances to measure next, and how accurate the positions would be then."""
+    lines = []
+    for rank, tape in enumerate(tapes):
+        ask = "the tape that helps most" if rank == 0 else "then"
+        gain = f"{cm(tape.std_before_m)} → {cm(tape.std_after_m)}"
+        lines.append(f"{ask}: between {tape.a} and {tape.b}, {gain} (--distance {tape.a}-{tape.b}=METRES)")
+    return lines

@@ -1,18 +1,22 @@
 """``skyless warm``: compile all kernels ahead, for images and before a machine loses its network or its patience."""
 
+import contextlib
+import io
+import shlex
+import tempfile
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from cyclopts import App
 
-from skyless.cli.common.options import check_method
 from skyless.cli.common.output import print_json
 from skyless.cli.common.progress import compile_with_counts
-from skyless.cli.small_runs import RUNS
-from skyless.errors import SkylessError
+from skyless.core.arguments import check_choice
+from skyless.core.errors import SkylessError
+from skyless.core.method_names import METHODS
 
 if TYPE_CHECKING:
-    from skyless.preparation.parts import Part
+    from skyless.core.kernels.processes import Part
 
 app = App(name="warm", help_epilogue="Example: skyless warm --json")
 
@@ -33,8 +37,8 @@ def warm(*, method: str | None = None, json: bool = False) -> None:
     json
         Write one JSON object instead of a line.
     """
-    from skyless.kernels.cache import kernel_folder
-    from skyless.preparation.processes import missing
+    from skyless.core.kernels.cache import kernel_folder
+    from skyless.core.kernels.processes import missing
 
     parts = _parts(method)
     folder = kernel_folder()
@@ -55,11 +59,51 @@ def warm(*, method: str | None = None, json: bool = False) -> None:
 
 
 def _parts(method: str | None) -> "tuple[Part, ...]":
-    from skyless.preparation.parts import EVERY_PART, Part, parts_of
+    from skyless.core.kernels.processes import EVERY_PART, Part, parts_of
 
     if method is not None:
-        check_method(method)
+        check_choice("--method", method, METHODS)
         return parts_of(method)
     after = tuple(part.name for part in EVERY_PART)
-    runs = (Part(name, "skyless.cli.small_runs:run", (name,), after=after) for name in RUNS)
+    runs = (Part(name, "skyless.cli.warm:run", (name,), after=after) for name in RUNS)
     return (*EVERY_PART, *runs)
+
+
+_HALL: Final = "site new hall.toml --spacing 12 --width 48 --depth 36"
+RUNS: Final = {
+    "plan": (
+        "site new lab.toml",
+        "plan lab.toml --step 2 --json",
+        "plan lab.toml --step 2 --method weighted --json",
+        "plan lab.toml --step 2 --method weighted --optimise 4 --search-seconds 1 --json",
+    ),
+    "halls": (
+        _HALL,
+        "plan hall.toml --json",
+        "simulate --site hall.toml --tags 1 --duration 3 --json",
+        f"{_HALL.replace('hall', 'paper')} --paper",
+        "simulate --site paper.toml --tags 1 --duration 3 --json",
+        "simulate --scenario room --duration 3 --json",
+    ),
+    "studies": ("study efficiency --episodes 1 --processes 1 --json",),
+    "paper": ("paper --quick --out report --json",),
+    "bench": ("bench --quick --json",),
+}
+"""Small runs of the commands that compute with kernels of their own."""
+
+
+def run(name: str) -> None:
+    """Run the commands of a name in a folder that is removed afterwards, and drop what they print.
+
+    Raises:
+        SkylessError: a command failed.
+    """
+    from skyless.cli.main import main
+
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        for line in RUNS[name]:
+            problem = io.StringIO()
+            with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(problem):
+                code = main(shlex.split(line))
+            if code not in {0, 1}:  # 1: something that was simulated or planned is not good enough
+                raise SkylessError(f"skyless {line}: {problem.getvalue().strip() or f'exit code {code}'}")

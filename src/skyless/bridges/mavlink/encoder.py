@@ -5,11 +5,10 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Final, cast
 
-from skyless.bridges.feed import BridgedSite, require_georeference
-from skyless.bridges.mavlink.frames import FrameReader
 from skyless.bridges.mavlink.messages import (
     ARMED,
     CRC_EXTRAS,
+    FrameReader,
     GpsGlobalOrigin,
     Heartbeat,
     Message,
@@ -20,7 +19,7 @@ from skyless.bridges.mavlink.messages import (
 )
 from skyless.bridges.mavlink.profiles import (
     MAVLINK_PROFILES,
-    MOST_SATELLITES,
+    MAX_SATELLITES,
     Profile,
     global_origin,
     gps_input,
@@ -28,10 +27,9 @@ from skyless.bridges.mavlink.profiles import (
     odometry,
     vision_position_estimate,
 )
-from skyless.bridges.target import BridgeContext, Encoder
-from skyless.bridges.target_url import TargetUrl
-from skyless.errors import SkylessError
-from skyless.mqtt.messages import FixMessage
+from skyless.bridges.target import BridgeContext, BridgedSite, Encoder, TargetUrl, require_georeference
+from skyless.core.errors import SkylessError
+from skyless.run.mqtt.messages import FixMessage
 
 AUTOPILOT: Final = 1
 """Component of a vehicle's flight controller."""
@@ -232,7 +230,7 @@ def make_encoder(url: TargetUrl, context: BridgeContext) -> MavlinkEncoder:
         text=url.text,
         system=url.whole_number("system", 1, 1, 255),
         component=url.whole_number("component", VISUAL_POSITIONING, 1, 255),
-        satellites=url.whole_number("satellites", 0, 0, MOST_SATELLITES) if url.has("satellites") else None,
+        satellites=url.whole_number("satellites", 0, 0, MAX_SATELLITES) if url.has("satellites") else None,
         heading_deg=url.number("heading", 0.0, -360.0, 360.0) if url.has("heading") else None,
         log=context.log,
     )

@@ -7,22 +7,21 @@ and down of the site's origin.
 from math import floor, hypot, inf, isfinite, pi, sqrt
 from typing import Final, Literal
 
-from skyless.bridges.feed import floored
 from skyless.bridges.mavlink.messages import (
     ESTIMATOR_VISION,
     FIX_3D,
     LOCAL_NED,
     NAN,
-    NO_FIX,
     UNKNOWN_21,
     GpsInput,
     Odometry,
     SetGpsGlobalOrigin,
     VisionPositionEstimate,
 )
-from skyless.mqtt.messages import FixMessage, Matrix, Vector
-from skyless.site.earth import east_north_up, geodetic, rotated
-from skyless.site.model import GeoreferenceSite
+from skyless.bridges.target import floored
+from skyless.core.earth import east_north_up, geodetic, rotated
+from skyless.core.site import GeoreferenceSite
+from skyless.run.mqtt.messages import FixMessage, Matrix, Vector
 
 Profile = Literal["ardupilot", "px4", "gps"]
 MAVLINK_PROFILES: Final = ("ardupilot", "px4", "gps")
@@ -45,10 +44,9 @@ IGNORE_HORIZONTAL_VELOCITY: Final = 8
 IGNORE_VERTICAL_VELOCITY: Final = 16
 IGNORE_SPEED_ACCURACY: Final = 32
 _IGNORE_VELOCITY: Final = IGNORE_HORIZONTAL_VELOCITY | IGNORE_VERTICAL_VELOCITY | IGNORE_SPEED_ACCURACY
-IGNORE_ALL: Final = 255
 """GPS_INPUT_IGNORE_FLAGS."""
 
-MOST_SATELLITES: Final = 254
+MAX_SATELLITES: Final = 254
 """255 states that the count is not known."""
 
 
@@ -137,35 +135,15 @@ def gps_input(fix: FixMessage, origin: GeoreferenceSite, satellites: int | None 
         vertical_accuracy=UNKNOWN_HEIGHT_STD_M if fix.height_known else sqrt(dd),
         ignore_flags=ignore,
         time_week=week,
-        gps_id=0,
         fix_type=FIX_3D,
-        satellites_visible=min(count, MOST_SATELLITES),
-        yaw_cdeg=0,
+        satellites_visible=min(count, MAX_SATELLITES),
     )
 
 
 def no_gps_fix(unix_s: float) -> GpsInput:
     """A receiver that has no fix: nothing in it is to be used."""
     week, week_ms = gps_time(unix_s)
-    return GpsInput(
-        time_us=micros(unix_s),
-        time_week_ms=week_ms,
-        latitude_1e7=0,
-        longitude_1e7=0,
-        altitude=0.0,
-        hdop=0.0,
-        vdop=0.0,
-        velocity=(0.0, 0.0, 0.0),
-        speed_accuracy=0.0,
-        horizontal_accuracy=0.0,
-        vertical_accuracy=0.0,
-        ignore_flags=IGNORE_ALL,
-        time_week=week,
-        gps_id=0,
-        fix_type=NO_FIX,
-        satellites_visible=0,
-        yaw_cdeg=0,
-    )
+    return GpsInput(time_us=micros(unix_s), time_week_ms=week_ms, time_week=week)
 
 
 def global_origin(origin: GeoreferenceSite, target_system: int, unix_s: float) -> SetGpsGlobalOrigin:

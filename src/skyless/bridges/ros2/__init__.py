@@ -1,5 +1,1 @@
-"""ROS 2: fixes as its messages, and a target that publishes them by DDS without ROS being installed.
-
-Public: messages.
-Within the package: cdr, dds, idl, target.
-"""
+"""ROS 2: fixes as its messages, and a target that publishes them by DDS without ROS being installed."""

@@ -1,20 +1,21 @@
 """From fixes to messages of ROS 2: names of topics, types, and the bytes of each message.
 
 Definitions of the messages and the meaning of their fields: the packages ``common_interfaces`` and ``geometry2`` of
-ROS 2; names of topics: REP 144 and https://design.ros2.org/articles/topic_and_service_names.html. The bytes are CDR
-(``cdr.py``), the same in DDS and in a bag.
+ROS 2; names of topics: REP 144 and https://design.ros2.org/articles/topic_and_service_names.html. The bytes are little
+endian CDR (OMG DDSI-RTPS 2.5, section 10; DDS-XTypes 1.3, section 7.4.1, XCDR version 1 of final types), the same in
+DDS and in a bag.
 """
 
 import re
+import struct
 from math import floor, isfinite, nan
 from typing import Final
 
 from msgspec import Struct
 
-from skyless.bridges.feed import BridgedSite, floored
-from skyless.bridges.ros2.cdr import CdrWriter
-from skyless.mqtt.messages import AnchorHealth, FixMessage, Matrix, TagHealth, Vector
-from skyless.site.earth import geodetic, rotated
+from skyless.bridges.target import BridgedSite, floored
+from skyless.core.earth import geodetic, rotated
+from skyless.run.mqtt.messages import AnchorHealth, FixMessage, Matrix, TagHealth, Vector
 
 SITE_FRAME: Final = "site"
 NAMESPACE: Final = "skyless"
@@ -38,47 +39,24 @@ _COVARIANCE_UNKNOWN, _COVARIANCE_KNOWN = 0, 3
 _OK, _WARN, _ERROR = 0, 1, 2
 _CUBE, _TEXT_VIEW_FACING = 1, 9
 _ANCHOR_SIZE_M: Final = 0.15
+_LITTLE_ENDIAN: Final = b"\x00\x01\x00\x00"
 
 
-class RosType(Struct, frozen=True):
-    """A type of message."""
-
-    name: str
-    """``package/msg/Name``."""
-    digest: str
-    """What ROS since Iron compares to see that both ends mean the same: REP 2011's hash of the definition."""
-
-
-POSE: Final = RosType(
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",
-)
-TRUE_POSE: Final = RosType(
-    "geometry_msgs/msg/PoseStamped", "RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8"
-)
-TWIST: Final = RosType(
-    "geometry_msgs/msg/TwistWithCovarianceStamped",
-    "RIHS01_77b67434531e6529b7a0091357b186b6ebdb17fd9ffd3e0c7ce9d3fb11a44563",
-)
-NAV_SAT_FIX: Final = RosType(
-    "sensor_msgs/msg/NavSatFix", "RIHS01_62223ab3fe210a15976021da7afddc9e200dc9ec75231c1b6a557fc598a65404"
-)
-DIAGNOSTICS: Final = RosType(
-    "diagnostic_msgs/msg/DiagnosticArray", "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
-)
-TRANSFORMS: Final = RosType(
-    "tf2_msgs/msg/TFMessage", "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
-)
-MARKERS: Final = RosType(
-    "visualization_msgs/msg/MarkerArray", "RIHS01_86cb8800b6fb05b5eff1abd7a56f62a5641d3ae9a1c29e78e67e704f1d067dcf"
-)
+# Types of messages, ``package/msg/Name``.
+POSE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
+TRUE_POSE: Final = "geometry_msgs/msg/PoseStamped"
+TWIST: Final = "geometry_msgs/msg/TwistWithCovarianceStamped"
+NAV_SAT_FIX: Final = "sensor_msgs/msg/NavSatFix"
+DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
+TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
+MARKERS: Final = "visualization_msgs/msg/MarkerArray"
 
 
 class RosMessage(Struct, frozen=True):
     """One message on its topic."""
 
     topic: str
-    type: RosType
+    type: str
     data: bytes
     """CDR with its header of four bytes."""
     lasting: bool = False
@@ -141,7 +119,7 @@ class RosEncoder:
     def on_truth(self, tag: str, unix_s: float, position_m: Vector) -> list[RosMessage]:
         """Where a simulated tag truly was."""
         writer = _stamped(unix_s, self._settings.frame)
-        writer.add_doubles((*position_m, *_NO_TURN))
+        writer.add("d", *position_m, *_NO_TURN)
         return [RosMessage(self._topic(tag, "truth"), TRUE_POSE, writer.message())]
 
     def _topic(self, tag: str, what: str) -> str:
@@ -174,6 +152,29 @@ def stamp_of(unix_s: float) -> tuple[int, int]:
     return seconds + nanoseconds // 1_000_000_000, nanoseconds % 1_000_000_000
 
 
+class CdrWriter:
+    """Gathers the fields of one message in their order, each at a multiple of its own size after the header."""
+
+    def __init__(self) -> None:
+        self._data = bytearray()
+
+    def add(self, code: str, *values: float) -> None:
+        """Numbers of one of ``struct``'s types: ``B b H h I i f d``; ``?`` for flags. Raises struct.error."""
+        size = struct.calcsize(f"<{code}")
+        self._data += bytes(-len(self._data) % size)
+        self._data += struct.pack(f"<{len(values)}{code}", *values)
+
+    def add_text(self, text: str) -> None:
+        """A string: its length with the NUL that ends it, then both. Other NULs are left out."""
+        data = text.replace("\0", "").encode() + b"\0"
+        self.add("I", len(data))
+        self._data += data
+
+    def message(self) -> bytes:
+        """The whole message with its header."""
+        return _LITTLE_ENDIAN + bytes(self._data)
+
+
 def _stamped(unix_s: float, frame: str) -> CdrWriter:
     """A message that begins with ``std_msgs/Header``."""
     writer = CdrWriter()
@@ -191,8 +192,8 @@ def _add_header(writer: CdrWriter, unix_s: float, frame: str) -> None:
 def _pose(fix: FixMessage, covariance_m2: Matrix, frame: str) -> bytes:
     """``geometry_msgs/PoseWithCovarianceStamped``: 36 entries in the order x, y, z and rotations about them."""
     writer = _stamped(fix.unix_s, frame)
-    writer.add_doubles((*fix.position_m, *_NO_TURN))
-    writer.add_doubles(_with_angles(covariance_m2))
+    writer.add("d", *fix.position_m, *_NO_TURN)
+    writer.add("d", *_with_angles(covariance_m2))
     return writer.message()
 
 
@@ -203,8 +204,8 @@ def _velocity(fix: FixMessage, frame: str) -> bytes | None:
     if not all(map(isfinite, (*fix.velocity_mps, *fix.velocity_covariance))):
         return None
     writer = _stamped(fix.unix_s, frame)
-    writer.add_doubles((*fix.velocity_mps, *(0.0,) * _ANGLES))
-    writer.add_doubles(_with_angles(fix.velocity_covariance))
+    writer.add("d", *fix.velocity_mps, *(0.0,) * _ANGLES)
+    writer.add("d", *_with_angles(fix.velocity_covariance))
     return writer.message()
 
 
@@ -223,8 +224,8 @@ def _nav_sat_fix(frame: str, unix_s: float, earth: Vector | None, covariance_m2:
     writer = _stamped(unix_s, frame)
     writer.add("b", _STATUS_NO_FIX if earth is None else _STATUS_FIX)
     writer.add("H", _SERVICE_UNKNOWN)
-    writer.add_doubles((nan, nan, nan) if earth is None else earth)
-    writer.add_doubles((0.0,) * 9 if covariance_m2 is None else covariance_m2)
+    writer.add("d", *((nan, nan, nan) if earth is None else earth))
+    writer.add("d", *((0.0,) * 9 if covariance_m2 is None else covariance_m2))
     writer.add("B", _COVARIANCE_UNKNOWN if covariance_m2 is None else _COVARIANCE_KNOWN)
     return writer.message()
 
@@ -232,10 +233,10 @@ def _nav_sat_fix(frame: str, unix_s: float, earth: Vector | None, covariance_m2:
 def _transform(fix: FixMessage, frame: str, child: str) -> bytes:
     """``tf2_msgs/TFMessage`` with one transform."""
     writer = CdrWriter()
-    writer.add_length(1)
+    writer.add("I", 1)
     _add_header(writer, fix.unix_s, frame)
     writer.add_text(child)
-    writer.add_doubles((*fix.position_m, *_NO_TURN))
+    writer.add("d", *fix.position_m, *_NO_TURN)
     return writer.message()
 
 
@@ -260,11 +261,11 @@ def _diagnostics(health: TagHealth | AnchorHealth) -> bytes:
         values = {"master": health.master, "offset_std_m": health.offset_std_m, "sent": health.sent}
     values |= {f"dropped {reason}": count for reason, count in sorted(health.counters.items())}
     writer = _stamped(health.unix_s, "")
-    writer.add_length(1)
+    writer.add("I", 1)
     writer.add("B", level)
     for text in (f"skyless: {name}", message, name):
         writer.add_text(text)
-    writer.add_length(len(values))
+    writer.add("I", len(values))
     for key, value in values.items():
         writer.add_text(key)
         writer.add_text("" if value is None else str(value))
@@ -274,7 +275,7 @@ def _diagnostics(health: TagHealth | AnchorHealth) -> bytes:
 def _markers(site: BridgedSite, frame: str) -> bytes:
     """``visualization_msgs/MarkerArray``: a cube and its number for each anchor."""
     writer = CdrWriter()
-    writer.add_length(2 * len(site.anchors_m))
+    writer.add("I", 2 * len(site.anchors_m))
     for number, (x, y, z) in sorted(site.anchors_m.items()):
         above = (x, y, z + 2.0 * _ANCHOR_SIZE_M)
         _add_marker(writer, frame, "anchors", number, _CUBE, (x, y, z), "")
@@ -288,21 +289,21 @@ def _add_marker(
     _add_header(writer, 0.0, frame)
     writer.add_text(kind)
     writer.add("i", number, shape, 0)  # action 0: add or change
-    writer.add_doubles((*position_m, *_NO_TURN))
-    writer.add_doubles((_ANCHOR_SIZE_M,) * 3)
+    writer.add("d", *position_m, *_NO_TURN)
+    writer.add("d", *(_ANCHOR_SIZE_M,) * 3)
     writer.add("f", 1.0, 0.6, 0.0, 1.0)
     writer.add("i", 0)  # lifetime: for ever
     writer.add("I", 0)
     writer.add("?", True)  # follows its frame
-    writer.add_length(0)  # points
-    writer.add_length(0)  # colours
+    writer.add("I", 0)  # points
+    writer.add("I", 0)  # colours
     writer.add_text("")  # texture: name, and an image of none
     _add_header(writer, 0.0, "")
     writer.add_text("")
-    writer.add_length(0)
-    writer.add_length(0)  # texture coordinates
+    writer.add("I", 0)
+    writer.add("I", 0)  # texture coordinates
     writer.add_text(text)
     writer.add_text("")  # mesh: name, and a file of none
     writer.add_text("")
-    writer.add_length(0)
+    writer.add("I", 0)
     writer.add("?", False)

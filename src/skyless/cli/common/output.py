@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Final, TextIO
 
 import msgspec
 
-from skyless.errors import SkylessError
-from skyless.whole_files import whole_file, write_whole
+from skyless.core.errors import SkylessError
+from skyless.core.whole_files import whole_file, write_whole
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -25,9 +25,9 @@ def print_json(value: object) -> None:
 
     The first key is the version of Skyless, to which the names of the others belong (``CHANGELOG.md``).
     """
-    from skyless import __version__
+    from skyless.core.version import installed_version
 
-    print(f'{{"skyless_version":"{__version__}",{to_json(value)[1:]}')
+    print(f'{{"skyless_version":"{installed_version()}",{to_json(value)[1:]}')
 
 
 def to_json(value: object) -> str:

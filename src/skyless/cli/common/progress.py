@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Final, Self
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from skyless.preparation.parts import Part
-    from skyless.preparation.processes import Preparation
+    from skyless.core.kernels.processes import Part, Preparation
 
 _HIDDEN_S: Final = 1.5
 _REDRAW_S: Final = 0.1
@@ -79,7 +78,7 @@ def status(description: str) -> Iterator[None]:
 @contextmanager
 def loading_kernels(*parts: "Part") -> Iterator[None]:
     """Compile what is missing of the parts, on all cores and with counts; then a spinner while the block loads them."""
-    from skyless.preparation.processes import missing
+    from skyless.core.kernels.processes import missing
 
     if missing(parts):
         for failure in compile_with_counts(parts):
@@ -92,7 +91,7 @@ def compile_with_counts(parts: "Iterable[Part]") -> tuple[str, ...]:
     """Compile what is missing of the parts, saying how far it is; a sentence for each part that cannot be compiled."""
     import asyncio
 
-    from skyless.preparation.processes import compile_parts
+    from skyless.core.kernels.processes import compile_parts
 
     report_kernel_folder()
     with CountLine() as line:
@@ -101,7 +100,7 @@ def compile_with_counts(parts: "Iterable[Part]") -> tuple[str, ...]:
 
 def report_kernel_folder() -> None:
     """One line where the kernels that have to be compiled now cannot be kept for good."""
-    from skyless.kernels.cache import kernel_folder
+    from skyless.core.kernels.cache import kernel_folder
 
     folder = kernel_folder()
     if not folder.writable:

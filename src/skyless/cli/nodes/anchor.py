@@ -7,24 +7,26 @@ from typing import Annotated
 
 from cyclopts import App, Parameter
 
+from skyless.cli.common.options import command
 from skyless.cli.common.output import print_json
 from skyless.cli.common.progress import loading_kernels
 from skyless.cli.nodes.options import MqttOptions, log, site_named
-from skyless.errors import SkylessError
-from skyless.method_names import WEIGHTED
-from skyless.nodes.open_radio import DEFAULT_RADIO
+from skyless.core.errors import SkylessError
+from skyless.core.method_names import WEIGHTED
+from skyless.run.open_radio import DEFAULT_RADIO
 
 app = App(name="anchor", help_epilogue="Example: skyless anchor 3 --site site.toml")
 
 
 @app.default
+@command
 def anchor(
     *ids: Annotated[int, Parameter(name="IDS")],
     site: str = "lab",
     radio: str = DEFAULT_RADIO,
     keys: Annotated[Path | None, Parameter(env_var="SKYLESS_KEYS")] = None,
-    allow_placement: Annotated[bool, Parameter(negative=())] = False,
-    broker: MqttOptions = MqttOptions(),
+    allow_placement: bool = False,
+    broker: MqttOptions,
     json: bool = False,
 ) -> None:
     """Run anchors of a site until Ctrl-C.
@@ -42,24 +44,22 @@ def anchor(
         Radio of the anchors: ether:HOST:PORT is the emulated air of skyless ether, serial:PATH a board,
         spi:BUS.DEVICE,irq=PIN,reset=PIN a DW1000 on this computer's SPI, model:HOST:PORT a model of one on that air.
     keys
-        Folder of the site's keys, so that beacons carry codes (modes slots and free): site.public, chain-N.public and
+        Folder of the site's keys, so that beacons carry codes (mode free): site.public, chain-N.public and
         chain-N.seed of skyless site keys. Files that change are used without a restart. SKYLESS_CHAIN_SEEDS, as
         "1:HEX 2:HEX", may hold the seeds instead.
     allow_placement
         With keys: adopt whatever a survey saves, as while a site is set up. Otherwise an anchor with keys adopts
         positions and delays up to 0.5 m from those of its site file.
-    broker.mqtt
-        Broker to publish health and site to, or none.
     json
         Write one JSON object at the end: the last health of each anchor.
     """
-    from skyless.evaluation.compile_ahead import compile_kernels
-    from skyless.nodes.anchor import Anchors
-    from skyless.nodes.keys.anchor_keys import AnchorKeys
-    from skyless.nodes.open_radio import is_simulated, open_radios
-    from skyless.nodes.process import run
-    from skyless.preparation.parts import SIMULATED
-    from skyless.radios.interface import AntennaDelays
+    from skyless.core.kernels.processes import SIMULATED
+    from skyless.radio.interface import AntennaDelays
+    from skyless.research.compile_ahead import compile_kernels
+    from skyless.run.anchor import Anchors
+    from skyless.run.keys.anchor_and_tag_keys import AnchorKeys
+    from skyless.run.open_radio import is_simulated, open_radios
+    from skyless.run.process import run
 
     plan, address = site_named(site), broker.address()
     nodes = {node.id: node for node in plan.all_anchors}
@@ -75,7 +75,7 @@ def anchor(
         if plan.schedule.needs_master:
             raise SkylessError(
                 f'--keys is given, but {site} has schedule.mode "master", whose beacons carry no codes; it should be '
-                "slots or free"
+                "free"
             )
         chains = AnchorKeys(keys, plan.id, log)
     image = None if plan.floor_plan is None else Path(site).parent / plan.floor_plan.image

@@ -9,8 +9,8 @@ from cyclopts import App, Parameter
 
 from skyless.cli.common.output import print_json
 from skyless.cli.nodes.options import log
-from skyless.errors import SkylessError
-from skyless.nodes.open_radio import DEFAULT_RADIO
+from skyless.core.errors import SkylessError
+from skyless.run.open_radio import DEFAULT_RADIO
 
 app = App(name="board", help_epilogue="Example: skyless board tag1 --link /tmp/board")
 
@@ -44,9 +44,9 @@ def board(
     json
         Write one JSON object with path and format before it starts.
     """
-    from skyless.nodes.board import RADIO_OF, Board
-    from skyless.nodes.open_radio import is_ether, open_radios
-    from skyless.nodes.process import run
+    from skyless.run.board import RADIO_OF, Board
+    from skyless.run.open_radio import is_ether, open_radios
+    from skyless.run.process import run
 
     if not is_ether(radio):
         raise SkylessError(f"--radio is {radio!r}; it should be the emulated air, ether:HOST[:PORT]")

@@ -8,13 +8,14 @@ from cyclopts import App, Parameter
 from skyless.bridges.hub import Hub, open_hub
 from skyless.bridges.target import BridgeContext
 from skyless.bridges.targets import TARGET_KINDS, open_route
+from skyless.cli.common.options import command
 from skyless.cli.common.output import print_json
 from skyless.cli.nodes.options import MqttOptions, SiteId, log
-from skyless.errors import SkylessError
+from skyless.core.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.mqtt.address import MqttAddress
-    from skyless.nodes.bridge.broker_bridge import BridgeNode, BridgeState
+    from skyless.bridges.program import BridgeNode, BridgeState
+    from skyless.run.mqtt.address import MqttAddress
 
 _EXAMPLE = "Example: skyless bridge nmea+tcp://:10110, and then: gpsd -N -n tcp://127.0.0.1:10110"
 
@@ -30,9 +31,10 @@ app = App(name="bridge", help_epilogue=_targets())
 
 
 @app.default
+@command
 def bridge(
     *targets: Annotated[str, Parameter(name="TARGETS")],
-    broker: MqttOptions = MqttOptions(),
+    broker: MqttOptions,
     site_id: SiteId | None = None,
     json: bool = False,
 ) -> int:
@@ -45,14 +47,12 @@ def bridge(
     ----------
     targets
         Addresses of one or more targets, as listed below.
-    broker.mqtt
-        Broker to bridge the site of.
     site_id
         Number of the site; by default the one whose programs are online.
     json
         Write one JSON object at the end instead of text.
     """
-    from skyless.nodes.process import run
+    from skyless.run.process import run
 
     address = broker.address()
     if address is None:
@@ -76,8 +76,8 @@ def hub_of(targets: tuple[str, ...], address: "MqttAddress | None") -> Hub:
 
 
 async def _bridge(hub: Hub, address: "MqttAddress", site_id: int | None, nodes: "list[BridgeNode]") -> None:
-    from skyless.nodes.bridge.broker_bridge import BridgeNode
-    from skyless.nodes.find_site import find_site
+    from skyless.bridges.program import BridgeNode
+    from skyless.run.find_site import find_site
 
     site = await find_site(address) if site_id is None else site_id
     node = BridgeNode(hub, address, site, log)

@@ -7,23 +7,25 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
-from cyclopts.validators import Number
+from cyclopts import App
 
+from skyless.cli.common.options import command
 from skyless.cli.common.output import print_json
 from skyless.cli.nodes.options import listen_address, log
-from skyless.errors import SkylessError
+from skyless.core.arguments import whole
+from skyless.core.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.nodes.broker import BrokerSettings
+    from skyless.run.broker import BrokerSettings
 
 app = App(name="broker", help_epilogue="Example: skyless broker --port 1883")
 
 
 @app.default
+@command
 def broker(
     *,
-    port: Annotated[int | None, Parameter(validator=Number(gte=1, lte=65535))] = None,
+    port: Annotated[int | None, whole(1, 65535)] = None,
     listen: str = "127.0.0.1",
     data: Path | None = None,
     user: str | None = None,
@@ -58,9 +60,9 @@ def broker(
     json
         Write one JSON object instead of the address.
     """
-    from skyless.mqtt.access_files import read_access
-    from skyless.mqtt.address import PASSWORD_VARIABLE
-    from skyless.nodes.broker import FIRST_PORT, BrokerSettings
+    from skyless.run.broker import FIRST_PORT, BrokerSettings
+    from skyless.run.mqtt.access import read_access
+    from skyless.run.mqtt.address import PASSWORD_VARIABLE
 
     password = None if user is None else os.environ.get(PASSWORD_VARIABLE)
     host, listen_port = listen_address(listen, FIRST_PORT)
@@ -88,8 +90,8 @@ def create_passwords(folder: Path, /, *, mqtt: str = "mqtt://127.0.0.1:1883", js
     json
         Write one JSON object instead of the lines.
     """
-    from skyless.mqtt.access_files import create_access
-    from skyless.mqtt.address import mqtt_address
+    from skyless.run.mqtt.access import create_access
+    from skyless.run.mqtt.address import mqtt_address
 
     files = create_access(folder, mqtt_address(mqtt))
     if json:
@@ -101,8 +103,8 @@ def create_passwords(folder: Path, /, *, mqtt: str = "mqtt://127.0.0.1:1883", js
 
 
 async def _serve(settings: "BrokerSettings", *, json: bool) -> None:
-    from skyless.nodes.broker import start_broker
-    from skyless.nodes.process import ending_signals
+    from skyless.run.broker import start_broker
+    from skyless.run.process import ending_signals
 
     stop = asyncio.Event()
     for number in (signal.SIGINT, *ending_signals()):

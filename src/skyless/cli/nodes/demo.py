@@ -11,24 +11,17 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 
 from cyclopts import App, Parameter
-from cyclopts.validators import Number
 
-from skyless.cli.common.options import (
-    Picoseconds,
-    Positive,
-    ProtectionOptions,
-    Seed,
-    check_method,
-    options,
-)
+from skyless.cli.common.options import command
 from skyless.cli.common.output import console, number, print_json
 from skyless.cli.common.progress import CountLine, count_text, report_kernel_folder
-from skyless.cli.common.simulated_site import check_live
-from skyless.cli.nodes.options import MqttCa, WalkingSpeed, log, site_named
-from skyless.errors import SkylessError
-from skyless.method_names import DEFAULT_METHOD
-from skyless.mqtt.address import PASSWORD_VARIABLE
-from skyless.positioning.alert import Alert
+from skyless.cli.nodes.options import MqttCa, WalkingSpeed, check_live, log, site_named
+from skyless.core.alert import Alert
+from skyless.core.arguments import Method, Picoseconds, Positive, Seed, whole
+from skyless.core.errors import SkylessError
+from skyless.core.method_names import DEFAULT_METHOD
+from skyless.run.mqtt.address import PASSWORD_VARIABLE
+from skyless.sim.evaluation.request import ProtectionOptions
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -36,11 +29,11 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.live import Live
 
-    from skyless.mqtt.address import MqttAddress
-    from skyless.mqtt.messages import FixMessage
-    from skyless.nodes.demo import SiteRun, WholeSite
-    from skyless.nodes.watch import Watch, WatchedTag
-    from skyless.preparation.processes import Preparation
+    from skyless.cli.demo import SiteRun, WholeSite
+    from skyless.cli.watch import Watch, WatchedTag
+    from skyless.core.kernels.processes import Preparation
+    from skyless.run.mqtt.address import MqttAddress
+    from skyless.run.mqtt.messages import FixMessage
 
 _LONGEST_START_S: Final = 60.0
 """Programs that have not made a fix for every tag by then will not."""
@@ -49,7 +42,7 @@ _POLL_S: Final = 0.05
 _FRAME_S: Final = 0.25
 """Time between two drawings of the tables."""
 
-MOST_ALERTS: Final = 3
+MAX_ALERTS: Final = 3
 """Tags named in the line of alerts, so that the tables stay in view."""
 
 ALERT_SHOWN_S: Final = 1.0
@@ -64,13 +57,12 @@ _STYLES: Final = {Alert.EXCLUDED.value: "yellow", Alert.NOT_EXCLUDED.value: "red
 app = App(name="demo", help_epilogue="Example: skyless demo --duration 10 --json")
 
 
-@options
-class DemoOptions:
+class DemoOptions(ProtectionOptions, frozen=True, kw_only=True):
     """Options of ``skyless demo``."""
 
     duration: Positive | None = None
     """Seconds to run, from when all tags have a fix; by default until Ctrl-C."""
-    tags: Annotated[int, Parameter(validator=Number(gte=1, lte=200))] = 3
+    tags: Annotated[int, whole(1, 200)] = 3
     """How many tags walk."""
     speed: WalkingSpeed = 1.0
     """How fast they walk in m/s."""
@@ -80,9 +72,10 @@ class DemoOptions:
     """Same seed, same crystals and noise; what processes do in real time is never the same."""
     site: Path | None = None
     """Site file; by default the lab, six anchors on the walls of 6 m × 8 m."""
-    method: str = DEFAULT_METHOD
+    paper: bool = False
+    """Run the lab with the paper's protocol: one anchor is the master, and another takes over when it fails."""
+    method: Method = DEFAULT_METHOD
     """How positions are computed."""
-    protection: ProtectionOptions = ProtectionOptions()
     apart: bool = False
     """Run every anchor and every tag as a process of its own, to kill and to freeze."""
     mqtt: Annotated[str | None, Parameter(env_var="SKYLESS_MQTT")] = None
@@ -96,16 +89,16 @@ class DemoOptions:
 
 
 @app.default
-def demo(*, asked: DemoOptions = DemoOptions()) -> None:
+@command
+def demo(*, asked: DemoOptions) -> None:
     """Run a site with walking tags in real time; Ctrl-C stops.
 
     Anchors, tags, broker, page and recorder are the real programs, each a process; radios, clocks and motion are
     simulated. Watch it on the page, or with: mosquitto_sub -t 'skyless/#' -v
     """
-    from skyless.nodes.demo import WholeSite
-    from skyless.nodes.process import run
-    from skyless.preparation.parts import parts_of
-    from skyless.preparation.processes import missing
+    from skyless.cli.demo import WholeSite
+    from skyless.core.kernels.processes import missing, parts_of
+    from skyless.run.process import run
 
     settings = _settings(asked)
     if missing(parts_of(asked.method)):
@@ -119,16 +112,18 @@ def demo(*, asked: DemoOptions = DemoOptions()) -> None:
 
 
 def _settings(asked: DemoOptions) -> "SiteRun":
-    from skyless.mqtt.address import mqtt_address
-    from skyless.nodes.demo import SiteRun
-    from skyless.nodes.process import recordings_folder
+    from skyless.cli.demo import SiteRun
+    from skyless.run.mqtt.address import mqtt_address
+    from skyless.run.process import recordings_folder
 
-    check_method(asked.method)
     if asked.mqtt == "none":
         raise SkylessError("--mqtt is 'none'; the demo needs a broker, and brings one where --mqtt is not given")
     if asked.mqtt is None and asked.mqtt_ca is not None:
         raise SkylessError("--mqtt-ca is for another broker; give it together with --mqtt")
-    name = f"lab:{asked.noise_ps:g}" if asked.site is None else str(asked.site.absolute())
+    if asked.paper and asked.site is not None:
+        raise SkylessError("--paper is for the demo's own site; the mode of a site file stands in it (schedule.mode)")
+    lab = "paper" if asked.paper else "lab"
+    name = f"{lab}:{asked.noise_ps:g}" if asked.site is None else str(asked.site.absolute())
     site = site_named(name)
     check_live(site, asked.method)
     folder = recordings_folder()
@@ -140,7 +135,7 @@ def _settings(asked: DemoOptions) -> "SiteRun":
         noise_ps=asked.noise_ps,
         seed=asked.seed,
         method=asked.method,
-        integrity=asked.protection.requirement(asked.method),
+        integrity=asked.requirement(asked.method),
         broker=None if asked.mqtt is None else mqtt_address(asked.mqtt, asked.mqtt_ca),
         record=_recording(asked.record, folder),
         record_limit_mb=1000.0,
@@ -151,7 +146,7 @@ def _settings(asked: DemoOptions) -> "SiteRun":
 
 def _recording(asked: str | None, folder: Path) -> Path | None:
     """Where to record; None: nowhere. Raises SkylessError."""
-    from skyless.nodes.process import new_recording
+    from skyless.run.process import new_recording
 
     if asked == "none":
         return None
@@ -338,7 +333,7 @@ class Screen:
             return []
         line, since_s = Text("alerts: "), time.monotonic() - ALERT_SHOWN_S
         shown = [(name, tag.alerted) for name, tag in self._tags() if tag.alerted and tag.alerted_s >= since_s]
-        for name, fix in shown[:MOST_ALERTS]:
+        for name, fix in shown[:MAX_ALERTS]:
             without = self._without(fix)
             line.append(f"{name} {fix.alert}{without}", style=_STYLES.get(fix.alert or "", ""))
             line.append(", ")
@@ -360,26 +355,15 @@ class Screen:
         from rich.table import Table
 
         anchors = {} if self._watch is None else self._watch.anchors
-        modes = {health.mode for health in anchors.values()}
-        follows = {"slots": ("root", "term", "hop", "parents"), "free": ()}.get(
-            min(modes, default="master"), ("clock sigma cm",)
-        )
-        rate = () if modes == {"free"} else ("rate ppm",)
-        title = "anchors" if modes == {"free"} else "synchronisation"
-        table = Table("anchor", "role", "heard", *rate, *follows, "sent", "late", title=title)
+        has_master = any(health.mode == "master" for health in anchors.values())
+        clock = ("rate ppm", "clock sigma cm") if has_master else ()
+        title = "synchronisation" if has_master else "anchors"
+        table = Table("anchor", "role", "heard", *clock, "sent", "late", title=title)
         now_s = time.time()
         for anchor, health in sorted(anchors.items()):
             role = health.role if now_s - health.unix_s < _SENDING_S else "offline"
-            leads = role in {"master", "root"}
-            shown = {
-                "rate ppm": "–" if leads else number(health.rate_ppm, "{:+.4f}"),
-                "clock sigma cm": "–" if leads else number(health.offset_std_m, "{:.2f}", 100.0),
-                "root": number(health.root, "{:.0f}"),
-                "term": number(health.term, "{:.0f}"),
-                "hop": number(health.hop, "{:.0f}"),
-                "parents": " ".join(map(str, health.parents)) or "–",
-            }
-            cells = [shown[name] for name in (*rate, *follows)]
+            own = number(health.rate_ppm, "{:+.4f}"), number(health.offset_std_m, "{:.2f}", 100.0)
+            cells = (("–", "–") if role == "master" else own) if has_master else ()
             table.add_row(str(anchor), role, str(health.heard), *cells, str(health.sent), str(health.late))
         return table
 

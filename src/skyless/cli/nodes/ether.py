@@ -7,35 +7,33 @@ from errno import EADDRINUSE
 from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
-from cyclopts.validators import Number
+from cyclopts import App
 from msgspec.structs import replace
 
-from skyless.cli.common.options import Picoseconds, Seed, finite_numbers, options
+from skyless.cli.common.options import command
 from skyless.cli.common.output import print_json
 from skyless.cli.common.progress import loading_kernels
-from skyless.cli.common.simulated_site import check_live
-from skyless.cli.nodes.options import MqttOptions, WalkingSpeed, listen_address, log, site_named
-from skyless.errors import SkylessError
-from skyless.method_names import WEIGHTED
-from skyless.radios.ether_wire import DEFAULT_PORT
-from skyless.ticks import from_seconds
+from skyless.cli.nodes.options import MqttOptions, WalkingSpeed, check_live, listen_address, log, site_named
+from skyless.core.arguments import Options, Picoseconds, Seed, Text, number, read_numbers, whole
+from skyless.core.errors import SkylessError
+from skyless.core.method_names import WEIGHTED
+from skyless.core.ticks import from_seconds
+from skyless.radio.ether_wire import DEFAULT_PORT
 
 if TYPE_CHECKING:
-    from skyless.simulation.impairments import AnchorDisplacement
+    from skyless.sim.impairments import AnchorDisplacement
 
-_Share = Annotated[float, Parameter(validator=Number(gte=0, lte=1))]
+_Share = Annotated[float, number(least=0.0, below=1.0)]
 
 app = App(name="ether", help_epilogue="Example: skyless ether --site lab --tags 3")
 
 
-@options
-class EtherOptions:
+class EtherOptions(Options, frozen=True, kw_only=True):
     """Options of ``skyless ether``."""
 
     site: str = "lab"
     """Site file, or lab."""
-    tags: Annotated[int, Parameter(validator=Number(gte=0, lte=1000))] = 3
+    tags: Annotated[int, whole(0, 1000)] = 3
     """How many bodies walk about; programs connect as tag1, tag2 and so on."""
     speed: WalkingSpeed = 1.0
     """How fast they walk in m/s."""
@@ -45,7 +43,7 @@ class EtherOptions:
     """Probability that a message is lost."""
     nlos: _Share = 0.0
     """Probability that a message reaches a tag late, as an obstacle delays it."""
-    move: list[str] | None = None
+    move: Annotated[tuple[str, ...], Text(lambda _, text: text, "ANCHOR=DX,DY@SECONDS", many=True)] = ()
     """Move an anchor while the air runs, from its position in the site file, as if somebody had hung it elsewhere:
     4=0.3,0@60 by 0.3 m along x after 60 s; a third number is a height. Several times for several moves."""
     seed: Seed = 1
@@ -57,27 +55,23 @@ class EtherOptions:
 
 
 @app.default
-def ether(*, asked: EtherOptions = EtherOptions(), broker: MqttOptions = MqttOptions()) -> None:
+@command
+def ether(*, asked: EtherOptions, broker: MqttOptions) -> None:
     """Emulate a site's air in real time: anchors and tags in other processes hear each other through it.
 
     It is a simulation of radios, clocks and motion; nothing is transmitted.
-
-    Parameters
-    ----------
-    broker.mqtt
-        Broker to publish the truth about the tags and the air's health to, or none.
     """
-    from skyless.evaluation.compile_ahead import compile_kernels
-    from skyless.evaluation.scenarios import Request, impairments_of, patrols
-    from skyless.nodes.ether import Ether, EtherNode
-    from skyless.nodes.process import run
-    from skyless.preparation.parts import SIMULATED
+    from skyless.core.kernels.processes import SIMULATED
+    from skyless.research.compile_ahead import compile_kernels
+    from skyless.run.ether import Ether, EtherNode
+    from skyless.run.process import run
+    from skyless.sim.evaluation.scenarios import Request, impairments_of, patrols
 
     site, address = site_named(asked.site), broker.address()
     check_live(site)
     host, port = listen_address(asked.listen, DEFAULT_PORT)
     request = Request(site, noise_ps=asked.noise_ps, loss=asked.loss, nlos=asked.nlos, seed=asked.seed)
-    moves = tuple(_move(text, [anchor.id for anchor in site.anchors]) for text in asked.move or ())
+    moves = tuple(_move(text, [anchor.id for anchor in site.anchors]) for text in asked.move)
     with loading_kernels(SIMULATED):
         compile_kernels(WEIGHTED)
     bodies = {f"tag{number}": path for number, path in enumerate(patrols(site, asked.tags, asked.speed), start=1)}
@@ -103,7 +97,7 @@ def ether(*, asked: EtherOptions = EtherOptions(), broker: MqttOptions = MqttOpt
 
 def _move(text: str, anchors: Iterable[int]) -> "AnchorDisplacement":
     """An anchor, by how much it is moved, and when. Raises SkylessError."""
-    from skyless.simulation.impairments import AnchorDisplacement
+    from skyless.sim.impairments import AnchorDisplacement
 
     name, is_named, rest = text.partition("=")
     shift, is_timed, after = rest.partition("@")
@@ -112,8 +106,8 @@ def _move(text: str, anchors: Iterable[int]) -> "AnchorDisplacement":
     known = {str(anchor): anchor for anchor in anchors}
     if name not in known:
         raise SkylessError(f"--move is {text!r}; its anchor should be one of the site's: {', '.join(known)}")
-    x_m, y_m, z_m = (*finite_numbers("move", shift, (2, 3)), 0.0)[:3]
-    (from_s,) = finite_numbers("move", after, (1,))
+    x_m, y_m, z_m = (*read_numbers("--move", shift, (2, 3)), 0.0)[:3]
+    (from_s,) = read_numbers("--move", after, (1,))
     if not from_s > 0.0:
         raise SkylessError(f"--move is {text!r}; the time after @ should be more than 0 s")
     return AnchorDisplacement(known[name], x_m, y_m, z_m, from_s)

@@ -13,12 +13,12 @@ import time
 from collections.abc import Callable
 from typing import Final, TextIO
 
-from skyless.cli.common.options import options
 from skyless.cli.common.output import cm, to_json
-from skyless.errors import SkylessError
-from skyless.mqtt.messages import FixMessage
-from skyless.nodes.process import Log
-from skyless.positioning.alert import Alert
+from skyless.core.alert import Alert
+from skyless.core.arguments import Options
+from skyless.core.errors import SkylessError
+from skyless.run.mqtt.messages import FixMessage
+from skyless.run.process import Log
 
 CSV_COLUMNS: Final = (
     *("unix_s", "tag", "x_m", "y_m", "z_m", "std_m", "vx_mps", "vy_mps", "vz_mps"),
@@ -29,15 +29,14 @@ CSV_COLUMNS: Final = (
 _NO_ALERTS: Final = (None, Alert.NONE, Alert.UNAVAILABLE)
 """Those that are not shown to people: that there is no protection level is usual after a start."""
 
-_MOST_WAITING: Final = 1000
+_MAX_WAITING: Final = 1000
 """Lines that wait for the reader: twenty tags' for a second."""
 
 _CLOSE_S: Final = 1.0
 """How long the last lines may take."""
 
 
-@options
-class LineOptions:
+class LineOptions(Options, frozen=True, kw_only=True):
     """Which lines are written on standard output."""
 
     print: bool = False
@@ -90,7 +89,7 @@ class FixLines:
 
     def __init__(self, line: Callable[[FixMessage], str], header: str | None, log: Log) -> None:
         self._line, self._log = line, log
-        self._waiting: queue.Queue[str | None] = queue.Queue(_MOST_WAITING)
+        self._waiting: queue.Queue[str | None] = queue.Queue(_MAX_WAITING)
         self._ended = asyncio.Event()
         self._trouble: OSError | None = None
         self.dropped = 0

@@ -5,27 +5,31 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 from cyclopts import Parameter
-from cyclopts.validators import Number
 
-from skyless.cli.common.options import finite_numbers, options
-from skyless.errors import SkylessError
+from skyless.core.arguments import Options, number, read_numbers, whole
+from skyless.core.errors import SkylessError
+from skyless.core.method_names import DEFAULT_METHOD
 
 if TYPE_CHECKING:
-    from skyless.mqtt.address import MqttAddress
-    from skyless.site.model import Site
+    from skyless.core.site import Site
+    from skyless.run.mqtt.address import MqttAddress
 
 _DEFAULT_MQTT: Final = "mqtt://127.0.0.1:1883"
 
+_MAX_LIVE_HZ: Final = 4000.0
+"""Beacons per second above which the emulated air is expected to fall behind; two cores kept up with 1000."""
+
 MqttCa = Annotated[Path | None, Parameter(env_var="SKYLESS_MQTT_CA")]
-SiteId = Annotated[int, Parameter(validator=Number(gte=0, lt=0xFFFE))]
-WalkingSpeed = Annotated[float, Parameter(validator=Number(gt=0, lte=10))]
+SiteId = Annotated[int, whole(0, 0xFFFD)]
+WalkingSpeed = Annotated[float, number(above=0.0, most=10.0)]
 
 
-@options
-class MqttOptions:
-    """The broker of a running site. What a program uses it for stands in the help of its command."""
+class MqttOptions(Options, frozen=True, kw_only=True):
+    """The broker of a running site."""
 
     mqtt: Annotated[str | None, Parameter(env_var="SKYLESS_MQTT")] = None
+    """Broker to connect to, mqtt://HOST[:PORT] or mqtts://[USER@]HOST[:PORT], or none; by default the one on this
+    machine. The password is taken from SKYLESS_MQTT_PASSWORD."""
     mqtt_ca: MqttCa = None
     """Certificates (PEM) to trust for mqtts."""
 
@@ -34,8 +38,8 @@ class MqttOptions:
 
         By default it is that of the broker that runs on this machine, which is said in one line; else the usual one.
         """
-        from skyless.mqtt.address import mqtt_address
-        from skyless.nodes.broker_address import running_broker
+        from skyless.run.broker import running_broker
+        from skyless.run.mqtt.address import mqtt_address
 
         if self.mqtt is None and self.mqtt_ca is None:
             found = running_broker()
@@ -52,17 +56,23 @@ class MqttOptions:
 
 
 def site_named(site: str) -> "Site":
-    """The site in a file, or the built-in ``lab``, with other noise than 100 ps as ``lab:PS``. Raises SkylessError."""
-    from skyless.site.lab import lab_site
-    from skyless.site.load import load_site
+    """The site in a file, or a built-in one: ``lab``, or ``paper``, the same with the paper's protocol.
+
+    With other noise than 100 ps as ``lab:PS``. Raises SkylessError.
+    """
+    from skyless.core.site import AccuracySite
+    from skyless.sim.lab import lab_site, paper_lab_site
+    from skyless.site.file.load import load_site
 
     name, colon, noise_ps = site.partition(":")
-    if name != "lab":
+    if name not in {"lab", "paper"}:
         return load_site(Path(site))
     try:
-        return lab_site(finite_numbers("site", noise_ps, (1,))[0]) if colon else lab_site()
+        noise = read_numbers("--site", noise_ps, (1,))[0] if colon else 100.0
     except SkylessError:
-        raise SkylessError(f"--site is {site!r}; it should be a site file, lab, or lab:PICOSECONDS") from None
+        right = f"a site file, lab, paper, or {name}:PICOSECONDS"
+        raise SkylessError(f"--site is {site!r}; it should be {right}") from None
+    return lab_site(noise) if name == "lab" else paper_lab_site(noise, AccuracySite())
 
 
 def listen_address(text: str, usual_port: int) -> tuple[str, int | None]:
@@ -83,3 +93,29 @@ def listen_address(text: str, usual_port: int) -> tuple[str, int | None]:
 def log(line: str) -> None:
     """Show a line to a person, on standard error."""
     print(line, file=sys.stderr, flush=True)
+
+
+def name_unplaced(site: "Site") -> None:
+    """Name the anchors of a simulated site that take no part, on standard error."""
+    if site.unplaced:
+        names = ", ".join(str(anchor.id) for anchor in site.unplaced)
+        print(f"not simulated, as the site file has no position: anchor {names}", file=sys.stderr)
+
+
+def check_live(site: "Site", method: str = DEFAULT_METHOD) -> None:
+    """See that tags of an emulated site can have fixes, and warn of one that sends too much for real time.
+
+    Raises SkylessError.
+    """
+    from skyless.core.protocols import beacon_period_s
+    from skyless.sim.evaluation.scenarios import check_can_be_simulated
+
+    check_can_be_simulated(site, method)
+    name_unplaced(site)
+    sent_hz = len(site.anchors) / beacon_period_s(site)
+    if sent_hz > _MAX_LIVE_HZ:
+        print(
+            f"warning: {len(site.anchors)} anchors send {sent_hz:.0f} beacons/s, too many to emulate in real time: "
+            "fixes will be late or none; skyless simulate does not need real time",
+            file=sys.stderr,
+        )

@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING
 
 from cyclopts import App
 
-from skyless.cli.common.options import Positive
+from skyless.cli.common.options import command
 from skyless.cli.common.output import print_json
 from skyless.cli.nodes.options import MqttOptions, SiteId, log
-from skyless.errors import SkylessError
+from skyless.core.arguments import Positive
+from skyless.core.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.mqtt.address import MqttAddress
-    from skyless.nodes.record import RecorderNode, RecorderState
-    from skyless.recordings.mcap.recorder import McapFile
+    from skyless.run.mqtt.address import MqttAddress
+    from skyless.run.record import RecorderNode, RecorderState
+    from skyless.run.recordings.recorder import McapFile
 
 _STATUS_S = 0.5
 
@@ -25,11 +26,12 @@ app = App(name="record", help_epilogue="Example: skyless record walk.mcap --dura
 
 
 @app.default
+@command
 def record(
     file: Path | None = None,
     /,
     *,
-    broker: MqttOptions = MqttOptions(),
+    broker: MqttOptions,
     site_id: SiteId | None = None,
     duration: Positive | None = None,
     limit_mb: Positive | None = None,
@@ -43,8 +45,6 @@ def record(
     ----------
     file
         The recording, a new MCAP file; by default in this folder, named after the time.
-    broker.mqtt
-        Broker to record the site of.
     site_id
         Number of the site; by default the one whose programs are online.
     duration
@@ -54,8 +54,8 @@ def record(
     json
         Write one JSON object at the end instead of text.
     """
-    from skyless.nodes.process import run
-    from skyless.recordings.mcap.recorder import McapFile
+    from skyless.run.process import run
+    from skyless.run.recordings.recorder import McapFile
 
     address = broker.address()
     if address is None:
@@ -84,8 +84,8 @@ async def _record(
     duration_s: float | None,
     found: "list[RecorderNode]",
 ) -> None:
-    from skyless.nodes.find_site import find_site
-    from skyless.nodes.record import RecorderNode
+    from skyless.run.find_site import find_site
+    from skyless.run.record import RecorderNode
 
     end_s = None if duration_s is None else time.monotonic() + duration_s
     if site_id is None:

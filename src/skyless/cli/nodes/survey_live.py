@@ -4,22 +4,22 @@ import asyncio
 import contextlib
 import sys
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skyless.cli.common.options import Positive, check_left_out, options
-from skyless.cli.common.survey_facts import FactOptions, facts_of
 from skyless.cli.nodes.options import MqttCa, SiteId, log
-from skyless.errors import SkylessError
+from skyless.core.arguments import Options, Positive
+from skyless.core.errors import SkylessError
+from skyless.research.calibration.options import SurveyOptions
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from skyless.nodes.survey.program import SurveyNode
-    from skyless.radios.interface import Radio
-    from skyless.site.model import Site
-    from skyless.survey.facts import Facts
-    from skyless.survey.ranges import PairRanges
-    from skyless.survey.stamps.pair_ranger import PairRanger
+    from skyless.core.site import Site
+    from skyless.radio.interface import Radio
+    from skyless.run.survey.program import SurveyNode
+    from skyless.site.survey.facts import Facts, PairRanges
+    from skyless.site.survey.stamps.pair_ranger import PairRanger
 
 _USUAL_S = 30.0
 _STATUS_S = 0.5
@@ -27,8 +27,7 @@ _ERASED = "\r\x1b[2K"
 """Erases a terminal's line."""
 
 
-@options
-class LiveOptions:
+class LiveOptions(Options, frozen=True, kw_only=True):
     """Options of a survey at a running site."""
 
     mqtt: str | None = None
@@ -49,32 +48,24 @@ class LiveOptions:
     """Do not watch the anchors (--serve)."""
 
     @property
-    def given(self) -> bool:
+    def is_live(self) -> bool:
         """Whether a running site is to be surveyed."""
         return self.mqtt is not None or self.radio is not None
 
-    def check(self, known: FactOptions) -> None:
-        """Raises SkylessError."""
-        if not self.given:
-            others = {
-                "duration": self.duration,
-                "serve": self.serve or None,
-                "no-watch": self.no_watch or None,
-                "site-id": self.site_id,
-            }
-            check_left_out(others, "a running site is surveyed by --mqtt or --radio")
-            return
-        if self.radio is not None and known.site is None:
-            raise SkylessError("--radio needs --site: the listener does not know which anchors there are")
-        if self.serve and self.duration is not None:
-            raise SkylessError(f"--duration is {self.duration:g}; with --serve the survey does not end")
-        if self.no_watch and not self.serve:
+    def check(self) -> None:
+        """See that the options fit one another. Raises SkylessError."""
+        if not self.is_live:
+            why = "a running site is surveyed by --mqtt or --radio"
+            self.leave_out("duration", "serve", "no_watch", "site_id", why=why)
+        if self.serve:
+            self.leave_out("duration", why="with --serve the survey does not end")
+        elif self.no_watch:
             raise SkylessError("--no-watch is for --serve: nothing else watches")
 
 
-def gather_live(asked: LiveOptions, known: FactOptions) -> "tuple[Site, Callable[[], PairRanges], PairRanger]":
+def gather_live(asked: LiveOptions, known: SurveyOptions) -> "tuple[Site, Callable[[], PairRanges], PairRanger]":
     """The site, the ranges between its anchors after some seconds, and what makes them. Raises SkylessError."""
-    from skyless.nodes.process import run
+    from skyless.run.process import run
 
     found: list[SurveyNode] = []
     run(_gather(asked, known, found))
@@ -89,19 +80,19 @@ def gather_live(asked: LiveOptions, known: FactOptions) -> "tuple[Site, Callable
     return live.site, found[0].final_ranges, live.finish()
 
 
-def serve_live(asked: LiveOptions, known: FactOptions) -> None:
+def serve_live(asked: LiveOptions, known: SurveyOptions) -> None:
     """Be the survey program of a site until Ctrl-C. Raises SkylessError."""
-    from skyless.nodes.process import run
+    from skyless.run.process import run
 
     with contextlib.suppress(KeyboardInterrupt):
         run(_serve(asked, known))
 
 
-async def _serve(asked: LiveOptions, known: FactOptions) -> None:
+async def _serve(asked: LiveOptions, known: SurveyOptions) -> None:
     await _run(await _node(asked, known, serves=True), None)
 
 
-async def _gather(asked: LiveOptions, known: FactOptions, found: "list[SurveyNode]") -> None:
+async def _gather(asked: LiveOptions, known: SurveyOptions, found: "list[SurveyNode]") -> None:
     seconds = asked.duration or _USUAL_S
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(seconds + 1.0):  # a moment for the broker and the anchors to answer
@@ -121,17 +112,18 @@ async def _run(node: "SurveyNode", seconds: float | None) -> None:
             print(file=sys.stderr)
 
 
-async def _node(asked: LiveOptions, known: FactOptions, *, serves: bool) -> "SurveyNode":
+async def _node(asked: LiveOptions, known: SurveyOptions, *, serves: bool) -> "SurveyNode":
     """Raises SkylessError."""
-    from skyless.mqtt.address import mqtt_address
-    from skyless.nodes.find_site import find_site
-    from skyless.nodes.open_radio import open_radios
-    from skyless.nodes.survey.program import SurveyNode, SurveySettings
-    from skyless.site.load import load_site
-    from skyless.survey.solve import run_survey
+    from skyless.run.find_site import find_site
+    from skyless.run.mqtt.address import mqtt_address
+    from skyless.run.open_radio import open_radios
+    from skyless.run.survey.program import SurveyNode, SurveySettings
+    from skyless.site.file.load import load_site
+    from skyless.site.survey.solve import run_survey
 
     address = None if asked.mqtt is None else mqtt_address(asked.mqtt, asked.mqtt_ca)
-    site = None if known.site is None else load_site(known.site)
+    file = None if known.site is None else Path(str(known.site))
+    site = None if file is None else load_site(file)
     site_id = site.id if asked.site_id is None and site is not None else asked.site_id
     if site is not None:
         _facts(known, site)  # options that do not fit it are refused before the program serves
@@ -141,11 +133,13 @@ async def _node(asked: LiveOptions, known: FactOptions, *, serves: bool) -> "Sur
         assert address is not None  # a radio needs a site file
         site_id = await find_site(address)
     radio: Radio | None = None if asked.radio is None else open_radios(asked.radio, "tag", (asked.radio_name,))[0]
-    settings = SurveySettings(site_id, site, known.site, not asked.no_watch, serves)
+    settings = SurveySettings(site_id, site, file, not asked.no_watch, serves)
     return SurveyNode(settings, lambda one: _facts(known, one), run_survey, address, _log, radio)
 
 
-def _facts(known: FactOptions, site: "Site") -> "Facts":
+def _facts(known: SurveyOptions, site: "Site") -> "Facts":
+    from skyless.research.calibration.facts import facts_of
+
     return facts_of(known, (anchor.id for anchor in site.all_anchors), site)
 
 

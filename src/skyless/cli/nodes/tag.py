@@ -7,24 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from cyclopts import App, Parameter
-from cyclopts.validators import Number
 
-from skyless.arguments import process_noise
-from skyless.cli.common.options import (
-    NotNegative,
-    Positive,
-    ProtectionOptions,
-    check_height_std,
-    check_method,
-    height_number,
-    options,
-)
+from skyless.cli.common.options import command
 from skyless.cli.common.progress import loading_kernels
 from skyless.cli.nodes.fix_lines import FixLines, LineOptions
 from skyless.cli.nodes.options import MqttOptions, SiteId, log
-from skyless.errors import SkylessError
-from skyless.method_names import DEFAULT_METHOD, Dynamics
-from skyless.nodes.open_radio import (
+from skyless.core.arguments import Method, NotNegative, Positive, Text, number, process_noise, read_height
+from skyless.core.errors import SkylessError
+from skyless.core.method_names import DEFAULT_METHOD, Dynamics
+from skyless.run.open_radio import (
     DEFAULT_RADIO,
     hears_positions,
     is_simulated,
@@ -32,24 +23,24 @@ from skyless.nodes.open_radio import (
     open_sniffers,
     receives_packets,
 )
+from skyless.sim.evaluation.request import ProtectionOptions
 
 if TYPE_CHECKING:
-    from skyless.air.masterless_packets import Point
-    from skyless.mqtt.address import MqttAddress
-    from skyless.mqtt.messages import FixMessage
-    from skyless.nodes.bridge.tag_bridge import TagBridge
-    from skyless.nodes.fix_log import FixListener
-    from skyless.nodes.packet_tags import PacketTagSettings
-    from skyless.site.model import GeoreferenceSite
-    from skyless.trusted_receiver import SiteTrust
+    from skyless.bridges.program import TagBridge
+    from skyless.core.air.masterless_packets import Point
+    from skyless.core.site import GeoreferenceSite
+    from skyless.core.tag.trusted_receiver import SiteTrust
+    from skyless.research.live.packet_tags import PacketTagSettings
+    from skyless.run.fix_log import FixListener
+    from skyless.run.mqtt.address import MqttAddress
+    from skyless.run.mqtt.messages import FixMessage
 
 _TAG_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
 app = App(name="tag", help_epilogue="Example: skyless tag tag1 --print")
 
 
-@options
-class TagOptions:
+class TagOptions(ProtectionOptions, frozen=True, kw_only=True):
     """Options of ``skyless tag``."""
 
     radio: str = DEFAULT_RADIO
@@ -58,17 +49,16 @@ class TagOptions:
     listener:PATH: the listener of uwb-apps. sniffer:PATH: a Bitcraze sniffer, for TDoA2 and TDoA3 systems.
     uci:PATH: a FiRa board whose DL-TDoA session as a tag goes on.
     Several tags have several paths, with commas; PATH@BAUD gives another rate."""
-    method: str = DEFAULT_METHOD
+    method: Method = DEFAULT_METHOD
     """How positions are computed (sniffers and FiRa boards: always joint)."""
     qa: Positive | None = None
     """Process noise for the tags' motion: spectral density of the acceleration in m²/s³ (joint); by default 0.3."""
     dynamics: Dynamics | None = None
     """How tags move: walk (as people), robot or drone, which sets the process noise instead of --qa."""
-    protection: ProtectionOptions = ProtectionOptions()
     tag_height_std: NotNegative | None = None
     """Standard deviation of the tags' height from the one that is given, in metres, which fixes and levels then
     count (joint); 0 by default, for sniffers and FiRa boards 0.5 where the height is only taken for the anchors'."""
-    publish_hz: Annotated[float, Parameter(validator=Number(gt=0, lte=1000))] = 50.0
+    publish_hz: Annotated[float, number(above=0.0, most=1000.0)] = 50.0
     """Fixes a second and tag at most, on MQTT and on standard output; all of them count in the tag's health."""
     site_id: SiteId | None = None
     """Number of the site, the only one to listen to; by default the first one heard. For sniffers and FiRa boards what
@@ -76,7 +66,7 @@ class TagOptions:
     anchors: Path | None = None
     """Table of anchors of another system (sniffers and FiRa boards): id,x_m,y_m,z_m, as skyless replay and calibrate
     take it. FiRa boards need none where anchors state their positions."""
-    to: tuple[str, ...] = ()
+    to: Annotated[tuple[str, ...], Text(lambda _, text: text, many=True)] = ()
     """Where fixes go as well, without a broker: a program or device of another kind; may be given several times.
     skyless bridge --help lists the targets, as nmea+tcp://:10110."""
     site_key: Annotated[Path | None, Parameter(env_var="SKYLESS_SITE_KEY")] = None
@@ -85,7 +75,7 @@ class TagOptions:
     trust: Literal["open", "verified"] | None = None
     """Which fixes are given: open, the default, each at once, stating how far it is verified; verified, half a second
     later, only those of verified beacons (with --site-key)."""
-    clock_bound_ms: Annotated[float | None, Parameter(validator=Number(gt=0, lte=10_000))] = None
+    clock_bound_ms: Annotated[float | None, number(above=0.0, most=10_000.0)] = None
     """How far this computer's clock may be from those of the anchors, in ms; 100 by default (with --site-key)."""
     tag_height: str | None = None
     """The tags' height (sniffers and FiRa boards): metres, free (estimated) or auto, the default: estimated unless the
@@ -93,11 +83,12 @@ class TagOptions:
 
 
 @app.default
+@command
 def tag(
     *names: Annotated[str, Parameter(name="NAMES")],
-    asked: TagOptions = TagOptions(),
-    broker: MqttOptions = MqttOptions(),
-    shown: LineOptions = LineOptions(),
+    asked: TagOptions,
+    broker: MqttOptions,
+    shown: LineOptions,
 ) -> None:
     """Run listening tags until Ctrl-C.
 
@@ -109,10 +100,8 @@ def tag(
     ----------
     names
         Names of one or more tags: letters, digits, - and _.
-    broker.mqtt
-        Broker to publish fixes and health to, or none.
     """
-    from skyless.nodes.process import run, together
+    from skyless.run.process import run, together
 
     address, lines = broker.address(), shown.lines(log)
     if not names or len(set(names)) < len(names) or not all(map(_TAG_NAME.fullmatch, names)):
@@ -120,11 +109,10 @@ def tag(
         raise SkylessError(
             f"NAMES is {given}; it should be one or more names, each once, of 1 to 32 letters, digits, - or _"
         )
-    check_method(asked.method)
     if receives_packets(asked.radio):
         if (asked.site_key, asked.trust, asked.clock_bound_ms) != (None,) * 3:
             raise SkylessError("--site-key, --trust and --clock-bound-ms are not for sniffers and FiRa boards")
-        if asked.protection.given:
+        if asked.protection_given:
             raise SkylessError(
                 "--integrity-risk, --alert-limit-m and --max-acceleration are not for sniffers and FiRa boards"
             )
@@ -147,8 +135,8 @@ def _bridge(asked: TagOptions, address: "MqttAddress | None") -> "TagBridge | No
     """What gives fixes to --to; None where nobody gets them. Raises SkylessError."""
     if not asked.to:
         return None
+    from skyless.bridges.program import TagBridge
     from skyless.cli.nodes.bridge import hub_of
-    from skyless.nodes.bridge.tag_bridge import TagBridge
 
     return TagBridge(hub_of(asked.to, address), lambda: is_simulated(asked.radio), log)
 
@@ -174,11 +162,11 @@ def _on_radios(
     bridge: "TagBridge | None",
 ) -> "Coroutine[Any, Any, None]":
     """Tags that hear beacons."""
-    from skyless.evaluation.compile_ahead import compile_kernels
-    from skyless.nodes.tag import Tags, TagSettings
-    from skyless.preparation.parts import parts_of
+    from skyless.core.kernels.processes import parts_of
+    from skyless.research.compile_ahead import compile_kernels
+    from skyless.run.tag import Tags, TagSettings
 
-    required = asked.protection.requirement(asked.method, asked.tag_height_std)
+    required = asked.requirement(asked.method, asked.tag_height_std)
     trust = _site_trust(asked)
     settings = TagSettings(
         asked.method,
@@ -196,8 +184,8 @@ def _on_radios(
 
 def _site_trust(asked: TagOptions) -> "SiteTrust | None":
     """Which beacons and fixes are accepted; None without a public key. Raises SkylessError."""
-    from skyless.authentication.key_files import read_site_public
-    from skyless.trusted_receiver import SiteTrust, Trust
+    from skyless.core.tag.trusted_receiver import SiteTrust, Trust
+    from skyless.run.keys.key_files import read_site_public
 
     if asked.site_key is None:
         option = "--clock-bound-ms" if asked.trust is None else f"--trust {asked.trust}"
@@ -221,10 +209,10 @@ def _on_sniffers(
     """Tags that hear the packets of another system."""
     from msgspec import structs
 
-    from skyless.evaluation.compile_ahead import compile_packet_kernels
-    from skyless.nodes.bridge.tag_bridge import heard_site
-    from skyless.nodes.packet_tags import PacketTags
-    from skyless.preparation.parts import SNIFFERS
+    from skyless.bridges.program import heard_site
+    from skyless.core.kernels.processes import SNIFFERS
+    from skyless.research.compile_ahead import compile_packet_kernels
+    from skyless.research.live.packet_tags import PacketTags
 
     settings = _system(asked)
     radios = open_sniffers(asked.radio, names, settings.anchors_m)
@@ -253,9 +241,9 @@ def _on_sniffers(
 
 def _system(asked: TagOptions) -> "PacketTagSettings":
     """What sniffers cannot hear, and FiRa boards may not. Raises SkylessError."""
-    from skyless.evaluation.observability import GUESSED_STD_M, plane_height_m
-    from skyless.nodes.packet_tags import TDOA_SITE, PacketTagSettings
-    from skyless.recordings.anchor_table import read_anchors, read_calibration
+    from skyless.core.dop import GUESSED_STD_M, plane_height_m
+    from skyless.research.live.packet_tags import TDOA_SITE, PacketTagSettings
+    from skyless.site.tables import read_anchors, read_calibration
 
     if asked.anchors is None and not hears_positions(asked.radio):
         raise SkylessError("--anchors is missing; a sniffer needs a table of the system's anchors: id,x_m,y_m,z_m")
@@ -269,8 +257,10 @@ def _system(asked: TagOptions) -> "PacketTagSettings":
                 f"--tag-height {height_m:.2f}"
             )
     else:
-        height_m = None if asked.tag_height == "free" else height_number(str(asked.tag_height), "free or auto")
-    check_height_std(asked.tag_height_std, height_m)
+        wish = read_height("--tag-height", str(asked.tag_height), ("free", "auto"))
+        height_m = None if isinstance(wish, str) else wish
+    if height_m is None:
+        asked.leave_out("tag_height_std", why="the height is estimated")
     return PacketTagSettings(
         anchors_m,
         site=TDOA_SITE if asked.site_id is None else asked.site_id,

@@ -1,5 +1,0 @@
-"""How fast the program is on this machine.
-
-Public: measure, monte_carlo_speed.
-Within the package: baselines, runs.
-"""

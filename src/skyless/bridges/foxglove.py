@@ -1,0 +1,371 @@
+"""``foxglove://``: a server that Foxglove, Lichtblick and other clients of its WebSocket protocol, version 1, open.
+
+Source: https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md
+"""
+
+import asyncio
+import contextlib
+import logging
+import secrets
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from struct import Struct as Format
+from typing import Annotated, Any, Final
+
+import msgspec
+from msgspec import Meta, Struct
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+from websockets.typing import Subprotocol
+
+from skyless.bridges.target import BridgeContext, BridgedSite, Target, TargetUrl, cannot_listen, floored
+from skyless.run.foxglove.messages import (
+    SCENE_TOPIC,
+    ellipse,
+    foxglove_schema,
+    frame_transform,
+    location_fix,
+    pose_in_frame,
+    scene,
+    schema_of,
+)
+from skyless.run.mqtt.messages import AnchorHealth, FixMessage, TagHealth
+
+SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
+"""Names of the protocol, the newer first; what they share is all that is used here."""
+
+WARNING: Final = 1
+"""Level of a status."""
+
+_MESSAGE_DATA: Final = Format("<BIQ")
+"""Operation 1, subscription, time in ns; the payload follows."""
+
+_LAST_NS: Final = 2**64 - 1
+
+_MAX_IDS: Final = 1000
+"""Of one request."""
+
+Identifier = Annotated[int, Meta(ge=0, le=0xFFFFFFFF)]
+
+
+class Channel(Struct, frozen=True, rename="camel"):
+    """A topic that clients can subscribe."""
+
+    id: int
+    topic: str
+    schema_name: str
+    schema: str
+    encoding: str = "json"
+    schema_encoding: str = "jsonschema"
+
+
+class Subscription(Struct, frozen=True, rename="camel"):
+    """A client's own number for a channel that it wants."""
+
+    id: Identifier
+    channel_id: Identifier
+
+
+class Subscribe(Struct, frozen=True, tag_field="op", tag="subscribe"):
+    """The client wants these channels."""
+
+    subscriptions: Annotated[tuple[Subscription, ...], Meta(max_length=_MAX_IDS)]
+
+
+class Unsubscribe(Struct, frozen=True, tag_field="op", tag="unsubscribe", rename="camel"):
+    """The client does not want these any more."""
+
+    subscription_ids: Annotated[tuple[Identifier, ...], Meta(max_length=_MAX_IDS)]
+
+
+Request = Subscribe | Unsubscribe
+
+_decoder: Final[msgspec.json.Decoder[Subscribe | Unsubscribe]] = msgspec.json.Decoder(Request)
+
+
+def decode_request(data: str | bytes) -> Request | None:
+    """What a client asks for; None for anything that this server does not offer or understand."""
+    if isinstance(data, bytes):  # published data and calls of services
+        return None
+    try:
+        return _decoder.decode(data)
+    except (msgspec.MsgspecError, UnicodeError, RecursionError):
+        return None
+
+
+def server_info(name: str, session: str) -> str:
+    """The first message to a client; with another ``session`` it forgets what it had from this server."""
+    return _text(
+        {
+            "op": "serverInfo",
+            "name": name,
+            "capabilities": [],
+            "supportedEncodings": [],
+            "metadata": {},
+            "sessionId": session,
+        }
+    )
+
+
+def advertise(channels: Sequence[Channel]) -> str:
+    """These channels are there."""
+    return _text({"op": "advertise", "channels": channels})
+
+
+def status(level: int, message: str) -> str:
+    """A line for the person who uses the client."""
+    return _text({"op": "status", "level": level, "message": message})
+
+
+def message_data(subscription: int, unix_s: float, payload: bytes) -> bytes:
+    """A message of a subscribed channel. Raises ValueError or OverflowError: the time cannot be stated."""
+    time_ns = round(unix_s * 1e9)
+    if not 0 <= time_ns <= _LAST_NS:
+        raise OverflowError("the time is before 1970, or after what 64 bits can state")
+    return _MESSAGE_DATA.pack(1, subscription, time_ns) + payload
+
+
+def _text(value: dict[str, Any]) -> str:
+    return msgspec.json.encode(value).decode()
+
+
+_MAX_WAITING: Final = 500
+"""Messages for one client; beyond it the oldest is dropped."""
+
+STUCK_S: Final = 10.0
+"""A client that has accepted nothing for so long, while its messages were being dropped, is disconnected."""
+
+_MAX_TEXTS: Final = 2000
+"""Texts for one client, which are never dropped; a client with more of them waiting is disconnected."""
+
+
+class Session:
+    """One client. Nothing here waits, but ``run``."""
+
+    def __init__(self, connection: ServerConnection) -> None:
+        self._connection = connection
+        self._numbers: dict[int, int] = {}
+        """The client's numbers of its subscriptions, by channel."""
+        self._texts: deque[str] = deque()
+        self._data: deque[bytes] = deque(maxlen=_MAX_WAITING)
+        self._ready = asyncio.Event()
+        self._sent_s = asyncio.get_running_loop().time()
+
+    def wants(self, channel: int) -> bool:
+        """Whether it has subscribed a channel."""
+        return channel in self._numbers
+
+    def send_text(self, text: str) -> None:
+        """Send what must not be dropped."""
+        self._texts.append(text)
+        self._ready.set()
+        if len(self._texts) > _MAX_TEXTS:
+            self.end()
+
+    def send_data(self, channel: int, unix_s: float, payload: bytes) -> bool:
+        """Send a message of a channel that it wants; whether nothing was dropped for that."""
+        full = len(self._data) == self._data.maxlen
+        if not self._data and not self._texts:
+            self._sent_s = asyncio.get_running_loop().time()
+        elif full and asyncio.get_running_loop().time() - self._sent_s > STUCK_S:
+            self.end()
+        self._data.append(message_data(self._numbers[channel], unix_s, payload))
+        self._ready.set()
+        return not full
+
+    def on_request(self, data: str | bytes, channels: dict[int, Channel]) -> tuple[tuple[int, ...], int]:
+        """Do what the client asks for: which channels it has now subscribed, and how much could not be done."""
+        request = decode_request(data)
+        if request is None:
+            self.send_text(status(WARNING, "skyless bridge offers subscriptions only; this request does nothing"))
+            return (), 1
+        added: list[int] = []
+        wrong = 0
+        if isinstance(request, Subscribe):
+            for asked in request.subscriptions:
+                channel, number = asked.channel_id, asked.id
+                if channel not in channels or self.wants(channel) or number in self._numbers.values():
+                    wrong += 1
+                    self.send_text(status(WARNING, f"channel {channel} cannot be subscribed as {number}"))
+                    continue
+                self._numbers[channel] = number
+                added.append(channel)
+        else:
+            gone = set(request.subscription_ids)
+            self._numbers = {channel: number for channel, number in self._numbers.items() if number not in gone}
+        return tuple(added), wrong
+
+    async def run(self) -> None:
+        """Send what waits until the connection closes."""
+        loop = asyncio.get_running_loop()
+        while True:
+            await self._ready.wait()
+            self._ready.clear()
+            while self._texts or self._data:
+                await self._connection.send(self._texts.popleft() if self._texts else self._data.popleft())
+                self._sent_s = loop.time()
+
+    def end(self) -> None:
+        """Close the connection at once; what waits is dropped."""
+        self._connection.transport.abort()
+
+
+_PORT: Final = 8765
+MAX_CLIENTS: Final = 32
+MAX_CHANNELS: Final = 2000
+
+_MAX_REQUEST_BYTES: Final = 1 << 16
+_SEND_BUFFER_BYTES: Final = 1 << 16
+"""In the system, for each client: what is there is sent before anything newer."""
+
+_GOODBYE_S: Final = 0.5
+"""For clients to close their connections when the program ends."""
+
+_quiet = logging.getLogger("skyless.bridges.foxglove")
+_quiet.addHandler(logging.NullHandler())
+_quiet.propagate = False
+"""Clients that speak another protocol are no news."""
+
+
+class FoxgloveTarget(Target):
+    """Serves one site to any number of clients. A channel costs nothing while nobody has subscribed it."""
+
+    def __init__(self, text: str, host: str, port: int, unix_time: Callable[[], float] = time.time) -> None:
+        super().__init__(text)
+        self.port = port
+        """The one that is used, where 0 was asked for and the server runs."""
+        self._host, self._unix_time = host, unix_time
+        self._run = secrets.token_hex(4)
+        self._site: BridgedSite | None = None
+        self._channels: dict[int, Channel] = {}
+        self._numbers: dict[str, int] = {}
+        """Of channels, by topic."""
+        self._sessions: set[Session] = set()
+
+    def on_site(self, site: BridgedSite) -> None:
+        """Show its anchors, walls and zones."""
+        self._site = site
+        self._give(SCENE_TOPIC, foxglove_schema("foxglove.SceneUpdate"), self._unix_time(), self._scene)
+
+    def on_fix(self, fix: FixMessage) -> None:
+        """Give a fix in each of the forms that somebody has subscribed."""
+        site = self._site
+        if site is None:
+            return
+        shown = msgspec.structs.replace(fix, covariance_m2=floored(fix.covariance_m2))
+        topic = f"/tag/{fix.tag}"
+        self._give_fix(f"{topic}/fix", schema_of(FixMessage), fix, msgspec.json.encode)
+        self._give_foxglove("/tf", "foxglove.FrameTransform", fix, frame_transform)
+        self._give_foxglove(f"{topic}/pose", "foxglove.PoseInFrame", fix, lambda fix: pose_in_frame(fix, facing=False))
+        self._give_foxglove(f"{topic}/ellipse", "foxglove.SceneUpdate", shown, ellipse)
+        origin = site.georeference
+        if origin is not None:
+            self._give_foxglove(
+                f"{topic}/location", "foxglove.LocationFix", shown, lambda fix: location_fix(fix, origin)
+            )
+
+    def on_health(self, health: TagHealth | AnchorHealth) -> None:
+        """Give a tag's state, for its rates and reasons."""
+        if isinstance(health, TagHealth):
+            topic = f"/tag/{health.tag}/health"
+            self._give(topic, schema_of(TagHealth), health.unix_s, lambda: msgspec.json.encode(health))
+
+    async def run(self) -> None:
+        """Serve until cancelled. Raises SkylessError: it cannot listen there."""
+        try:
+            server = await serve(
+                self._serve,
+                self._host,
+                self.port,
+                subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
+                compression=None,
+                max_size=_MAX_REQUEST_BYTES,
+                write_limit=_SEND_BUFFER_BYTES,
+                close_timeout=_GOODBYE_S,
+                logger=_quiet,
+            )
+        except OSError as error:
+            raise cannot_listen(self.text, self._host, self.port, error) from None
+        async with server:
+            self.port = next(iter(server.sockets)).getsockname()[1]
+            await server.serve_forever()
+
+    async def _serve(self, connection: ServerConnection) -> None:
+        """Serve one client until it goes."""
+        if len(self._sessions) >= MAX_CLIENTS:
+            self.dropped["too-many-clients"] += 1
+            return
+        connection.transport.get_extra_info("socket").setsockopt(
+            socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES
+        )
+        session = Session(connection)
+        session.send_text(server_info("skyless", self._run))
+        if self._channels:
+            session.send_text(advertise(tuple(self._channels.values())))
+        self._sessions.add(session)
+        sending = asyncio.create_task(session.run())
+        try:
+            with contextlib.suppress(ConnectionClosed):
+                async for data in connection:
+                    self._on_request(session, data)
+        finally:
+            self._sessions.discard(session)
+            sending.cancel()
+            with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
+                await sending
+
+    def _on_request(self, session: Session, data: str | bytes) -> None:
+        added, wrong = session.on_request(data, self._channels)
+        if wrong:
+            self.dropped["request-not-understood"] += wrong
+        scene_channel = self._numbers.get(SCENE_TOPIC)
+        if scene_channel in added and scene_channel is not None:  # it does not change by itself
+            session.send_data(scene_channel, self._unix_time(), self._scene())
+
+    def _scene(self) -> bytes:
+        assert self._site is not None
+        site = self._site
+        return scene(self._unix_time(), site.anchors_m, site.master, site.walls, site.zones)
+
+    def _give_foxglove(self, topic: str, schema: str, fix: FixMessage, encode: Callable[[FixMessage], bytes]) -> None:
+        self._give_fix(topic, foxglove_schema(schema), fix, encode)
+
+    def _give_fix(
+        self, topic: str, schema: tuple[str, bytes], fix: FixMessage, encode: Callable[[FixMessage], bytes]
+    ) -> None:
+        self._give(topic, schema, fix.unix_s, lambda: encode(fix))
+
+    def _give(self, topic: str, schema: tuple[str, bytes], unix_s: float, encode: Callable[[], bytes]) -> None:
+        """Send a message to all who want its channel, which is advertised with its first message."""
+        channel = self._numbers.get(topic)
+        if channel is None:
+            self._advertise(topic, schema)
+            return
+        wanting = [session for session in self._sessions if session.wants(channel)]
+        if not wanting:
+            return
+        try:
+            payload = encode()
+            for session in wanting:
+                if not session.send_data(channel, unix_s, payload):
+                    self.dropped["slow-client"] += 1
+        except (ValueError, ArithmeticError):  # figures that no tag publishes
+            self.dropped["out-of-range"] += 1
+
+    def _advertise(self, topic: str, schema: tuple[str, bytes]) -> None:
+        if len(self._channels) >= MAX_CHANNELS:
+            self.dropped["too-many-channels"] += 1
+            return
+        number = len(self._channels) + 1
+        name, text = schema
+        self._numbers[topic] = number
+        self._channels[number] = channel = Channel(number, topic, name, text.decode())
+        for session in self._sessions:
+            session.send_text(advertise((channel,)))
+
+
+def make_target(url: TargetUrl, _context: BridgeContext) -> FoxgloveTarget:
+    """Of ``foxglove://HOST:PORT``."""
+    return FoxgloveTarget(url.text, url.host(), url.port(_PORT))

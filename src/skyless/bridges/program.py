@@ -1,0 +1,242 @@
+"""``skyless bridge`` and ``skyless tag --to``: fixes for programs and devices of other kinds.
+
+A bridge gets a site's fixes from its broker, a tag's program gives its own without a broker.
+"""
+
+import asyncio
+import platform
+import re
+import time
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Final
+from zlib import crc32
+
+from msgspec import Struct, structs
+
+from skyless.bridges.hub import SILENCE_CHECK_S, Hub, Route
+from skyless.bridges.target import BridgedSite, bridged_site
+from skyless.core.air.almanac import GeoreferencePage
+from skyless.core.air.masterless_packets import Point
+from skyless.core.errors import SkylessError
+from skyless.core.site import GeoreferenceSite
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.messages import AnchorHealth, FixMessage, SiteMessage, StatusMessage, TagHealth, ZonesMessage
+from skyless.run.mqtt.topics import EVERY_NODE, fix_topic, health_topic, site_topic, status_topic, zones_topic
+from skyless.run.process import HEALTH_S, Log, every, keep, reader, together
+from skyless.run.zones.zone_list import BadZonesError, read_zones, zones_of
+
+if TYPE_CHECKING:  # it compiles kernels, which a bridge of a broker does not need
+    from skyless.core.tag.beacon_receiver import TagReceiver
+
+_SILENT_S: Final = 5.0  # after so long without a fix a line says where to look
+
+_GEOREFERENCE_S: Final = 5.0
+"""Where a site sends its georeference, a tag has it this long after the rest: pages come in turn, and some are lost."""
+
+
+class BridgeState(Struct, frozen=True):
+    """What a bridge has done so far."""
+
+    seconds: float
+    fixes: int
+    """Usable fixes of all tags."""
+    dropped: dict[str, dict[str, int]]
+    """By target and reason: what its readers missed."""
+    malformed: int
+    """Messages of the broker that could not be read."""
+
+
+class BridgeNode:
+    """Bridges one site until cancelled."""
+
+    def __init__(self, hub: Hub, address: MqttAddress, site: int, log: Log) -> None:
+        self.hub = hub
+        self.link = Link(address, _name(hub), site=site, kind="bridge")
+        self._log = log
+        self._started_s = time.monotonic()
+        self._last_fix_s = self._started_s
+        self._is_silent = False
+        self._site: SiteMessage | None = None
+        self._zones = ZonesMessage(())
+        self._malformed = 0
+        self._refused: asyncio.Future[None] | None = None
+        self.link.subscribe(zones_topic(site), self._on_zones)
+        for topic, kind, act in (
+            (site_topic(site), SiteMessage, self._on_site),
+            (fix_topic(site, EVERY_NODE), FixMessage, self._on_fix),
+            (health_topic(site, "tag", EVERY_NODE), TagHealth, self._on_health),
+            (health_topic(site, "anchor", EVERY_NODE), AnchorHealth, self._on_health),
+            (status_topic(site, "tag", EVERY_NODE), StatusMessage, self.hub.on_status),
+            (status_topic(site, "anchor", EVERY_NODE), StatusMessage, self.hub.on_status),
+        ):
+            self.link.subscribe(topic, reader(kind, act, self._on_malformed))
+
+    async def run(self) -> None:
+        """Serve until cancelled. Raises SkylessError: a target cannot begin, or the site lacks what they need."""
+        self._refused = asyncio.get_running_loop().create_future()
+        targets = (run_route(route, self._log) for route in self.hub.routes)
+        await together(keep(self.link, self._log), self._refused, *targets, every(SILENCE_CHECK_S, self._on_tick))
+
+    def state(self) -> BridgeState:
+        """What it has done so far."""
+        return BridgeState(
+            seconds=time.monotonic() - self._started_s,
+            fixes=self.hub.fixes,
+            dropped={route.target.text: dict(route.target.dropped) for route in self.hub.routes},
+            malformed=self._malformed,
+        )
+
+    def _on_malformed(self) -> None:
+        self._malformed += 1
+
+    def _on_site(self, message: SiteMessage) -> None:
+        self._site = message
+        self._update_site()
+
+    def _on_zones(self, _topic: str, payload: bytes) -> None:
+        if not payload:
+            return
+        try:
+            self._zones = read_zones(payload)
+        except BadZonesError:
+            self._malformed += 1
+        else:
+            self._update_site()
+
+    def _update_site(self) -> None:
+        if self._site is None:
+            return
+        site = self._site.site
+        zones = zones_of(self._zones, site.name).zones
+        try:
+            self.hub.on_site(bridged_site(site, zones, simulated=self._site.simulated))
+        except SkylessError as error:
+            if self._refused is not None and not self._refused.done():
+                self._refused.set_exception(error)
+
+    def _on_fix(self, fix: FixMessage) -> None:
+        self._last_fix_s, self._is_silent = time.monotonic(), False
+        self.hub.on_fix(fix, self._last_fix_s)
+
+    def _on_health(self, health: TagHealth | AnchorHealth) -> None:
+        self.hub.on_health(health, time.monotonic())
+
+    def _on_tick(self) -> None:
+        now_s = time.monotonic()
+        self.hub.on_tick(now_s, time.time())
+        if not self.link.connected:
+            self._last_fix_s = now_s  # tags, too, need a moment to find a broker that is back
+        if not self._is_silent and now_s - self._last_fix_s > _SILENT_S:
+            self._is_silent = True
+            known = "no tag publishes fixes" if self._site is not None else "the site itself is not on the broker"
+            self._log(f"no fix for {_SILENT_S:g} s: {known}; skyless dashboard shows why")
+
+
+def _name(hub: Hub) -> str:
+    """The bridge's name on MQTT: always the same for its targets, as the broker keeps the status of each name."""
+    targets = " ".join(route.target.text for route in hub.routes).encode()
+    return f"{re.sub(r'[^A-Za-z0-9_-]', '-', platform.node())}-{crc32(targets):08x}"
+
+
+async def run_route(route: Route, log: Log) -> None:
+    """Run a route's target until cancelled. A fault in it is logged, and costs neither a fix nor another target.
+
+    Raises:
+        SkylessError: it cannot begin.
+    """
+    try:
+        while True:
+            try:
+                await route.target.run()
+            except SkylessError:
+                raise
+            except Exception as error:  # noqa: BLE001 - whatever it is, the others go on
+                log(f"{route.target.text} failed ({error!r}); started again")
+            await asyncio.sleep(HEALTH_S)
+    finally:
+        route.has_ended = True
+
+
+class TagBridge:
+    """What the tags of one process give away."""
+
+    def __init__(self, hub: Hub, is_simulated: Callable[[], bool], log: Log) -> None:
+        self._hub, self._is_simulated, self._log = hub, is_simulated, log
+        self._sites: dict[str, _HeardSite] = {}
+        self._receivers: dict[str, TagReceiver] = {}
+        self._refusal = ""  # why no target can serve the site, as it was logged
+
+    def on_fix(self, fix: FixMessage) -> None:
+        """A fix of one of them. It is dropped if the tag is at another site than the one known to the targets."""
+        if self._is_here(fix.tag):
+            self._hub.on_fix(fix, time.monotonic())
+
+    def on_health(self, health: TagHealth, receiver: "TagReceiver") -> None:
+        """State of one of them, once a second, and what it has learned of the site."""
+        now_s = time.monotonic()
+        self._receivers[health.tag] = receiver
+        heard = self._sites.setdefault(health.tag, _HeardSite())
+        site = heard.update(receiver, now_s, simulated=self._is_simulated())
+        if site is not None and (self._is_here(health.tag) or not any(map(self._is_here, self._receivers))):
+            self.on_site(site)
+        self._hub.on_health(health, now_s)
+
+    def on_system_health(self, health: TagHealth) -> None:
+        """State of a tag of another system, whose anchors are configured."""
+        self._hub.on_health(health, time.monotonic())
+
+    def on_site(self, site: BridgedSite) -> None:
+        """The site as one of them knows it: in a large one no tag receives all anchors."""
+        known = self._hub.site
+        if known is not None and known.id == site.id:
+            anchors_m, georeference = known.anchors_m | site.anchors_m, site.georeference or known.georeference
+            site = structs.replace(site, anchors_m=anchors_m, georeference=georeference)
+        try:
+            self._hub.on_site(site)
+        except SkylessError as error:  # positioning goes on
+            if str(error) != self._refusal:
+                self._refusal = str(error)
+                self._log(self._refusal)
+
+    def _is_here(self, tag: str) -> bool:
+        """Whether a tag is at the site known to the targets, if any. A sniffer's tag always is."""
+        receiver, known = self._receivers.get(tag), self._hub.site
+        return receiver is None or known is None or receiver.site == known.id
+
+    async def run(self) -> None:
+        """Serve until cancelled. Raises SkylessError: a target cannot begin."""
+        targets = (run_route(route, self._log) for route in self._hub.routes)
+        await together(*targets, every(SILENCE_CHECK_S, lambda: self._hub.on_tick(time.monotonic(), time.time())))
+
+
+class _HeardSite:
+    """The site of a receiver, once all of it is known."""
+
+    def __init__(self) -> None:
+        self._number: int | None = None
+        self._complete_s: float | None = None  # since when the rest is known
+
+    def update(self, receiver: "TagReceiver", now_s: float, *, simulated: bool) -> BridgedSite | None:
+        """The site, or None while it is not complete. ``now_s`` is the host's monotonic clock."""
+        number, heard = receiver.site, receiver.heard_site
+        if number != self._number:
+            self._number, self._complete_s = number, None
+        if number is None or heard is None:
+            self._complete_s = None
+            return None
+        if self._complete_s is None:
+            self._complete_s = now_s
+        if not heard.is_complete and now_s - self._complete_s < _GEOREFERENCE_S:
+            return None
+        return heard_site(number, heard.anchors_m, heard.georeference, simulated=simulated)
+
+
+def heard_site(
+    number: int, anchors_m: Mapping[int, Point], page: GeoreferencePage | None = None, *, simulated: bool
+) -> BridgedSite:
+    """A site whose name is not on the air."""
+    earth = None
+    if page is not None:
+        earth = GeoreferenceSite(page.latitude_deg, page.longitude_deg, page.height_m, page.heading_deg)
+    return BridgedSite(number, f"site {number}", simulated, dict(sorted(anchors_m.items())), earth)

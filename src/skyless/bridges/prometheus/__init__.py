@@ -1,4 +1,0 @@
-"""Figures of a site for Prometheus.
-
-Within the package: exposition, metrics, target.
-"""

@@ -1,0 +1,254 @@
+"""``skyless.plan``: what a site will give before anything is mounted, and where its anchors should hang."""
+
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from skyless.cli.api.floor_result import FloorResult
+from skyless.cli.api.options import PlanOptions
+from skyless.cli.api.rate_plan import RatePlanResult, plan_rates
+from skyless.cli.api.result import cm, data_frame
+from skyless.core.arguments import check_choice, check_whole, process_noise, python_function, wrong
+from skyless.core.errors import SkylessError
+from skyless.core.geometry import Box
+from skyless.core.kernels.arrays import Array, Matrix
+from skyless.core.method_names import DEFAULT_METHOD, FILTERS
+from skyless.core.site import Site
+from skyless.research.verify import random_points, verify
+from skyless.site.channel import ChannelModel
+from skyless.site.file.load import site_of
+from skyless.site.planning.floor import (
+    check_anchor_count,
+    fewest_anchors,
+    floor_of,
+    mounts_of,
+    usual_tag_heights,
+)
+from skyless.site.planning.links import ANCHORS_IN_VIEW, PLAN_COLUMNS, RMSE, SIGMA, with_range
+from skyless.site.planning.maps import PlanMap, grid_of, plan_map, rows_of, summary_of
+from skyless.site.planning.optimise import OneMore, Optimised, Search
+from skyless.site.planning.predict import MAX_PREDICTED, PlanSettings, Predictor
+from skyless.site.planning.report import Verification, described, plan_report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+
+class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
+    """Predicted errors over the floor of a site; ``map.table`` has all columns."""
+
+    @property
+    def sigma_m(self) -> Array:
+        """Shape (heights, ny, nx): predicted standard deviation; infinite without a fix, NaN outside the outline."""
+        return self.map.column(SIGMA)
+
+    @property
+    def rmse_m(self) -> Array:
+        """Shape (heights, ny, nx): the same with the delays of walls."""
+        return self.map.column(RMSE)
+
+    @property
+    def anchors_in_view(self) -> Array:
+        """Shape (heights, ny, nx): number of anchors."""
+        return self.map.column(ANCHORS_IN_VIEW)
+
+    def column(self, name: str) -> Array:
+        """Shape (heights, ny, nx): one of ``skyless.site.planning.links.PLAN_COLUMNS``. Raises SkylessError."""
+        check_choice("name", name, PLAN_COLUMNS)
+        return self.map.column(PLAN_COLUMNS.index(name))
+
+    def to_dataframe(self) -> "DataFrame":
+        """One row a point inside the outline: ``x_m``, ``y_m``, ``z_m`` and all of ``PLAN_COLUMNS``.
+
+        Raises:
+            SkylessError: pandas is not installed.
+        """
+        rows = rows_of(self.map)
+        columns = {name: rows[:, number] for number, name in enumerate(("x_m", "y_m", "z_m", *PLAN_COLUMNS))}
+        columns["anchors"] = columns["anchors"].astype(np.int64)
+        return data_frame(columns)
+
+    def plot(self, column: str | None = None) -> "Figure":
+        """The map of a column, by default of the predicted error, a slice for each height.
+
+        ``column``: ``sigma_m``, ``rmse_m``, ``anchors``, ``hdop``, ``vdop``, ``pdop`` or ``fix_share``, where it is
+        worth drawing.
+
+        Raises:
+            SkylessError: there is no map of that.
+        """
+        # Matplotlib is loaded where it draws.
+        from skyless.site.planning.picture import Background, draw_layer, layers_for, main_layer
+
+        layers = {PLAN_COLUMNS[layer.column]: layer for layer in layers_for(self.map)}
+        if column is not None:
+            check_choice("column", column, tuple(layers))
+        layer = main_layer(self.map) if column is None else layers[column]
+        return draw_layer(self.map, layer, Background(self.site, self.floor, self.file, described(self.summary)))
+
+    def title(self) -> str:
+        """What was planned."""
+        return f"plan of {self.site.name}, {described(self.summary)}"
+
+    def facts(self) -> Iterator[tuple[str, str]]:
+        """The figures that matter, each with its name and unit."""
+        found = self.summary
+        worst_at, dimensions = found["worst_at_m"], f"{found['dimensions']}-D"
+        where = "" if worst_at is None else " at ({:.2f}, {:.2f}, {:.2f}) m".format(*worst_at)
+        yield (
+            "anchors",
+            f"{len(found['anchors'])}, {_master(found)}, range {found['range_m']:.0f} m in the open",
+        )
+        yield "map", _map_line(found)
+        yield (
+            "covered",
+            f"{found['covered_share']:.1%} of the region; fewest anchors in view: {found['fewest_anchors']}",
+        )
+        yield (
+            f"standard deviation {dimensions}",
+            f"mean {cm(found['mean_sigma_m'])}, median {cm(found['median_sigma_m'])}, "
+            f"95 % {cm(found['p95_sigma_m'])}, worst {cm(found['worst_sigma_m'])}{where}",
+        )
+        if found["walls_bias"]:
+            rmse = f"RMSE mean {cm(found['mean_rmse_m'])}, worst {cm(found['worst_rmse_m'])}"
+            yield "with the walls' delays", rmse
+        if found["target_share"] is not None:
+            yield "target met", f"in {found['target_share']:.1%} of the region"
+        if found["one_more"] is not None:
+            yield "one more anchor", _one_more(found["one_more"])
+        if found["optimised"] is not None:
+            yield "optimised", _against_even(found["optimised"])
+        if found["verification"] is not None:
+            yield "simulated", _verified(found["verification"])
+
+
+def _master(result: dict[str, Any]) -> str:
+    return "no master" if result["master"] is None else f"master {result['master']}"
+
+
+def _map_line(result: dict[str, Any]) -> str:
+    line = f"{result['points']} points, {result['step_m']:g} m apart"
+    if result["computed_every_m"] > result["step_m"]:
+        line += f"; {result['method']} computed every {result['computed_every_m']:g} m and interpolated by the PDOP"
+    return line
+
+
+def _one_more(more: OneMore) -> str:
+    x, y, z = more.position_m
+    mean = _change(more.mean_before_m, more.mean_after_m)
+    worst = _change(more.worst_before_m, more.worst_after_m)
+    if not more.helps:
+        return f"none helps noticeably; with the best one mean {mean}, worst {worst}"
+    return f"helps most at ({x:.2f}, {y:.2f}, {z:.2f}) m: mean {mean}, worst {worst}"
+
+
+def _change(before_m: float, after_m: float) -> str:
+    """A change as a share only: the facts' own mean and worst are those of the map, at other points."""
+    return f"{after_m / before_m - 1.0:+.0%}"
+
+
+def _against_even(found: dict[str, Any]) -> str:
+    best, even = found["best"], found["even"]
+    mean, worst = (_change(even[name], best[name]) for name in ("mean_sigma_m", "worst_sigma_m"))
+    text = f"mean {mean}, worst {worst} against as many anchors evenly along the walls"
+    if found["target_met"] is not None:
+        text += "; the target is met everywhere" if found["target_met"] else "; the target is not met everywhere"
+    return text if found["finished"] else text + "; the search was ended before it was complete"
+
+
+def _verified(checked: Verification) -> str:
+    if checked.mean_ratio is None or checked.smallest_ratio is None or checked.largest_ratio is None:
+        return "no point with a fix in both"
+    return (
+        f"simulated over predicted at {len(checked.points)} points: mean {checked.mean_ratio:.3f}, from "
+        f"{checked.smallest_ratio:.3f} to {checked.largest_ratio:.3f}; each ± {checked.mean_ratio_error:.3f}"
+    )
+
+
+def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
+    """Predict the errors that tags at rest will have at a site, as ``skyless plan`` does.
+
+    With ``optimise`` the anchors are placed from the start, and the plan is of that site. A plan of a site
+    of more than 60 anchors without a master is of the beacons that reach tags, a ``RatePlanResult``; of the arguments below it takes ``range_m``,
+    ``step_m``, ``tag_heights_m``, ``region_m``, ``outline_m``, ``exponent``.
+    """
+    started_s = time.perf_counter()
+    site, file = site_of(asked.site)
+    if not site.schedule.needs_master and len(site.anchors) > MAX_PREDICTED:
+        asked.leave_out(
+            *("method", "noise_ps", "qa", "dynamics", "target_m", "optimise", "anchor_heights_m", "mounts_m"),
+            *("search_s", "verify_points", "verify_rounds", "seed"),
+            why=f"errors are predicted for sites of at most {MAX_PREDICTED} anchors, and this one has {len(site.anchors)}",
+        )
+        heights_m = heights_of(asked, site)
+        rates = plan_rates(
+            site,
+            file,
+            outline_of(asked),
+            region_of(asked),
+            heights_m,
+            asked.step_m,
+            asked.range_m,
+            asked.exponent or 2.0,
+        )
+        asked.progress(1.0)
+        return rates
+    asked.leave_out("exponent", why=f"it is for sites of more than {MAX_PREDICTED} anchors")
+    if not site.schedule.needs_master and asked.method not in FILTERS:
+        raise wrong("method", asked.method, f"{DEFAULT_METHOD}: this site has no master")
+    channel = ChannelModel() if asked.range_m is None else with_range(ChannelModel(), asked.range_m)
+    settings = PlanSettings(asked.method, asked.noise_ps, process_noise(asked.qa, asked.dynamics) or 0.3, channel)
+    if asked.optimise is None:
+        check_anchor_count(site, file)
+    else:
+        check_whole("--optimise", asked.optimise, least=fewest_anchors(site), most=60)
+    floor, heights_m = floor_of(site, file, outline_of(asked), region_of(asked)), heights_of(asked, site)
+    walls_m = None if asked.mounts_m is None else np.array(asked.mounts_m)
+    levels_m = None if asked.anchor_heights_m is None else tuple(asked.anchor_heights_m)
+    mounts = mounts_of(site, floor, walls_m, levels_m)
+    optimised: Optimised | None = None
+    if asked.optimise is not None:
+        search = Search(site, settings, floor, mounts, heights_m, asked.optimise, asked.seed, asked.search_s)
+        optimised = search.run(asked.target_m, asked.progress)
+        site = optimised.best.site
+    predictor = Predictor(site, settings)
+    try:
+        grid = grid_of(floor, heights_m, asked.step_m)
+    except ValueError as error:
+        raise SkylessError(f"no map: {error}") from None
+    mapped = plan_map(predictor, grid, asked.progress)
+    checked: Verification | None = None
+    if asked.verify_points is not None:
+        points_m = random_points(mapped, asked.verify_points, asked.seed)
+        checked = verify(predictor, points_m, asked.verify_rounds, asked.seed, asked.progress)
+    asked.progress(1.0)
+    found = plan_report(predictor, floor, mounts, mapped, summary_of(mapped, asked.target_m), optimised, checked)
+    return PlanResult(predictor.site, file, floor, mapped, {**found, "wall_s": time.perf_counter() - started_s})
+
+
+def heights_of(asked: PlanOptions, site: Site) -> tuple[float, ...]:
+    """Heights of the tags. Raises SkylessError when they are given at a site that knows its tags' height."""
+    if asked.tag_heights_m is None:
+        return usual_tag_heights(site) if site.anchors else (0.0,)
+    if site.tags.height_m is not None:
+        asked.leave_out("tag_heights_m", why=f"this site's tags are all at {site.tags.height_m:g} m")
+    return tuple(asked.tag_heights_m)
+
+
+def outline_of(asked: PlanOptions) -> Matrix | None:
+    """Corners of the floor, shape (n, 2), None where they are not given."""
+    return None if asked.outline_m is None else np.array(asked.outline_m)
+
+
+def region_of(asked: PlanOptions) -> Box | None:
+    """The region of interest, None where it is not given."""
+    if asked.region_m is None:
+        return None
+    x1_m, y1_m, x2_m, y2_m = asked.region_m
+    return x1_m, y1_m, x2_m, y2_m
+
+
+plan = python_function(PlanOptions, run_plan)

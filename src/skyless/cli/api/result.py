@@ -1,0 +1,62 @@
+"""What all results have: a short table in a notebook, one line elsewhere, a table for pandas."""
+
+from collections.abc import Iterator, Mapping
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.core.errors import SkylessError
+from skyless.core.kernels.arrays import Array
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+
+class Result(Struct, frozen=True, eq=False):
+    """A result; two are equal only if they are the same one, as their arrays have no single answer."""
+
+    def title(self) -> str:
+        """What the result is of."""
+        raise NotImplementedError
+
+    def facts(self) -> Iterator[tuple[str, str]]:
+        """The figures that matter, each with its name and unit."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        facts = "; ".join(f"{name} {value}" for name, value in self.facts())
+        return f"{type(self).__name__}({self.title()}: {facts})"
+
+    def _repr_html_(self) -> str:
+        """The figures as a table, for notebooks."""
+        rows = "".join(
+            f"<tr><th style='text-align:left'>{escape(name)}</th><td style='text-align:right'>{escape(value)}</td></tr>"
+            for name, value in self.facts()
+        )
+        return f"<table><caption>{escape(self.title())}</caption><tbody>{rows}</tbody></table>"
+
+
+def data_frame(columns: Mapping[str, Any]) -> "DataFrame":
+    """Columns as a table of pandas. Raises SkylessError where pandas is not installed."""
+    try:
+        from pandas import DataFrame
+    except ImportError:
+        raise SkylessError("to_dataframe needs the package pandas: pip install pandas") from None
+    return DataFrame(dict(columns))
+
+
+def axes_columns(prefix: str, values: Array, suffix: str = "") -> dict[str, Array]:
+    """An array of shape (n, 3) as columns x, y, z."""
+    return {f"{prefix}{axis}{suffix}": values[:, number] for number, axis in enumerate("xyz")}
+
+
+def figures(values: Any) -> Array:  # noqa: ANN401 - whatever has numbers and None
+    """Numbers as an array of floats, NaN for None."""
+    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+
+
+def cm(value_m: float | None) -> str:
+    """A length in centimetres for people; a dash where there is none."""
+    return "–" if value_m is None else f"{100.0 * value_m:.2f} cm"

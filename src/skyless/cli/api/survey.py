@@ -1,0 +1,299 @@
+"""``skyless.survey_site``: positions and antenna delays of anchors, from what they receive of one another."""
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+
+from skyless.cli.api.result import Result, cm, data_frame, figures
+from skyless.core.arguments import python_function
+from skyless.core.errors import SkylessError
+from skyless.core.kernels.arrays import Integers, Vector
+from skyless.core.site import Site
+from skyless.research.calibration.biases import Biases, biases_of
+from skyless.research.calibration.facts import facts_of
+from skyless.research.calibration.options import SurveyOptions
+from skyless.research.calibration.recorded_stamps import ranges_of
+from skyless.research.calibration.tags import known_tags, walks_of
+from skyless.research.foreign.formats import format_of
+from skyless.research.replays.inputs import known_truth
+from skyless.run.recordings.recording import McapRecording, is_mcap
+from skyless.site.file.load import site_of
+from skyless.site.survey.facts import Count, PairRanges, count
+from skyless.site.survey.result import Survey
+from skyless.site.survey.solve import run_survey
+from skyless.site.survey.stamps.pair_ranger import PairRanger
+from skyless.site.survey.surveyed_site import delay_differences_m, surveyed_text, unchanged_anchors
+from skyless.site.survey.watch.moved import drop_moved, with_changes
+from skyless.site.tables import read_ranges
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+
+class Gathered(Struct, frozen=True):
+    """What a survey starts from."""
+
+    site: Site | None
+    """That of --site, else that of the recording."""
+    ranges: Callable[[], PairRanges]
+    """With the antenna delays of the site."""
+    ranger: PairRanger | None = None
+    """What makes the ranges, where their times are known."""
+    drops: tuple[str, ...] = ()
+    """What could not be used of a recording, by reason."""
+    is_foreign: bool = False
+    """Whether it is a recording of another system."""
+    recorded: Site | None = None
+    """The site of the recording."""
+
+
+class SurveyResult(Result, frozen=True, eq=False):
+    """Positions and delays of n anchors."""
+
+    survey: Survey
+    """Everything that was found."""
+    count: Count
+    warnings: tuple[str, ...]
+    """About the inputs and the facts that were stated."""
+    drops: tuple[str, ...]
+    """What could not be used of the recording, by reason."""
+    site: Site | None
+    file: Path | None
+    """Of the site, where it is from one."""
+    ranges: PairRanges
+    """What was measured, with the antenna delays of the site."""
+
+    @property
+    def anchors(self) -> Integers:
+        """Shape (n,): identifiers."""
+        return np.array([one.id for one in self.survey.anchors], dtype=np.int64)
+
+    @property
+    def delay_m(self) -> Vector:
+        """Shape (n,): half of what TX and RX delay together are off; NaN where that is not determined."""
+        return figures(one.delay_m for one in self.survey.anchors)
+
+    @property
+    def usable(self) -> bool:
+        """Whether any anchor is determined, and by a range."""
+        found = any(anchor.determined for anchor in self.survey.anchors)
+        return found and any(pair.residual_m is not None for pair in self.survey.pairs)
+
+    @property
+    def unchanged(self) -> tuple[int, ...]:
+        """Anchors of the site that stay as they are."""
+        return () if self.site is None else unchanged_anchors(self.site, self.survey)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The object that ``skyless survey --json`` writes, in SI units, but for the version and the files written."""
+        survey: dict[str, Any] = msgspec.to_builtins(self.survey)
+        survey["ambiguous"] = survey.pop("ambiguities")
+        survey["excluded_pairs"] = [[pair.a, pair.b] for pair in self.survey.pairs if pair.excluded]
+        return survey | {
+            "usable": self.usable,
+            "count": msgspec.to_builtins(self.count),
+            "warnings": list(self.warnings),
+            "drops": list(self.drops),
+        }
+
+    def corrected_file(self) -> str:
+        """The site's file with the survey in it, as ``skyless survey --out`` writes it.
+
+        Raises:
+            SkylessError: no file of the site was given.
+        """
+        if self.site is None or self.file is None:
+            raise SkylessError("--site was no path; it should be that of the site file, which is then corrected")
+        return surveyed_text(self.file.read_bytes().decode("utf-8-sig"), self.survey, self.site, self.file)
+
+    def to_dataframe(self) -> "DataFrame":
+        """One row an anchor, with all fields of ``skyless.site.survey.result.SurveyedAnchor`` but the covariance.
+
+        Raises:
+            SkylessError: pandas is not installed.
+        """
+        names = [name for name in self.survey.anchors[0].__struct_fields__ if name != "covariance_m2"]
+        return data_frame({name: [getattr(one, name) for one in self.survey.anchors] for name in names})
+
+    def plot(self) -> "Figure":
+        """The anchors from above, with their ellipses."""
+        from skyless.cli.api.survey_picture import survey_figure
+
+        return survey_figure(self.survey)
+
+    def title(self) -> str:
+        """What was surveyed."""
+        return self.count.sentence
+
+    def facts(self) -> Iterator[tuple[str, str]]:
+        """The figures that matter, each with its name and unit."""
+        for one in self.survey.anchors:
+            delay = "" if one.delay_m is None else f", delay {cm(one.delay_m)} ± {cm(one.delay_std_m)}"
+            at = f"({one.x_m:.3f}, {one.y_m:.3f}, {one.z_m or 0.0:.3f}) m ± {cm(one.std_m)}" if one.determined else ""
+            yield f"anchor {one.id}", at + delay if one.determined else "not determined"
+        yield "constant error of a pair", cm(self.survey.range_std_m)
+        for warning in self.warnings:
+            yield "warning", warning
+
+
+class BiasResult(Result, frozen=True, eq=False):
+    """Constants of n anchors of another system, ordered by identifier; NaN where one is not determined."""
+
+    path: Path
+    found: Biases
+    """Everything that was estimated."""
+    table: Path | None
+    """The table of anchors that is to be corrected; None for a new one."""
+
+    @property
+    def anchors(self) -> Integers:
+        """Shape (n,): identifiers."""
+        return np.array([one.anchor for one in self.found.estimate.anchors], dtype=np.int64)
+
+    @property
+    def bias_m(self) -> Vector:
+        """Shape (n,): by how much the anchor's signals seem late; only differences count, the zero is their mean."""
+        return figures(one.bias_m for one in self.found.estimate.anchors)
+
+    @property
+    def std_m(self) -> Vector:
+        """Shape (n,): standard error of ``bias_m``."""
+        return figures(one.std_m for one in self.found.estimate.anchors)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The object that ``skyless survey --json`` writes, in SI units, but for the version and the file written."""
+        return self.found.report()
+
+    def corrected_file(self) -> str:
+        """The table of anchors with the biases in it, as ``skyless survey --out`` writes it. Raises SkylessError."""
+        return self.found.table(self.table)
+
+    def to_dataframe(self) -> "DataFrame":
+        """One row an anchor: ``anchor``, ``bias_m``, ``std_m``, ``noise_m``, ``count``.
+
+        Raises:
+            SkylessError: pandas is not installed.
+        """
+        found = self.found.estimate.anchors
+        columns = {"anchor": self.anchors, "bias_m": self.bias_m, "std_m": self.std_m}
+        return data_frame(
+            columns | {"noise_m": figures(one.noise_m for one in found), "count": [o.count for o in found]}
+        )
+
+    def plot(self) -> "Figure":
+        """The constants with their standard errors, one bar an anchor."""
+        from skyless.cli.api.survey_picture import bias_figure
+
+        return bias_figure(self.path.name, self.anchors, self.bias_m, self.std_m)
+
+    def title(self) -> str:
+        """What was found."""
+        found = self.found.estimate
+        return f"{self.found.format}: {found.used} differences used, {found.rejected} outliers"
+
+    def facts(self) -> Iterator[tuple[str, str]]:
+        """The figures that matter, each with its name and unit."""
+        found = self.found.estimate
+        for one in found.anchors:
+            value = "not determined" if one.bias_m is None else f"{cm(one.bias_m)} ± {cm(one.std_m)}"
+            yield f"anchor {one.anchor}", f"{value}; noise {cm(one.noise_m)}, {one.count} differences"
+        yield "zero", "of biases only differences can be seen; the zero is the mean of the constants"
+        yield "noise of a difference", f"{cm(found.noise_before_m)} before, {cm(found.noise_m)} after"
+        if found.slope_m is not None:
+            slope = f"{found.slope_m:.3f} ± {found.slope_std_m or 0.0:.3f} m while the range grows by the factor e"
+            yield "range bias (received power)", slope
+        for note in self.found.notes:
+            yield "note", note
+        for reason, number in self.found.samples.drops.items():
+            yield f"left out: {reason}", str(number)
+
+
+def is_of_biases(asked: SurveyOptions) -> bool:
+    """Whether the recording is another system's, whose anchors' biases a tag at known positions shows."""
+    if asked.recording is None or is_mcap(asked.recording):
+        return False
+    return asked.knows_tag or format_of(asked.recording, asked.format).name == "miluv"
+
+
+def gathered(asked: SurveyOptions) -> Gathered:
+    """The ranges of a table or recording, and the site if one is known. Raises SkylessError."""
+    site = None if asked.site is None else site_of(asked.site)[0]
+    if asked.ranges is not None:
+        table = read_ranges(asked.ranges)
+        return Gathered(site, lambda: table)
+    if asked.recording is None:
+        raise SkylessError("a survey needs a recording (--recording), or a table of ranges (--ranges)")
+    found = ranges_of(
+        asked.recording, asked.format, identifier=None if site is None else site.id, on_progress=asked.progress
+    )
+    drops = tuple(f"left out: {number} × {reason}" for reason, number in found.drops.items())
+    recorded, ranger = found.site, found.ranger
+    if site is None or recorded is None:
+        return Gathered(site or recorded, ranger.ranges, ranger, drops, recorded is None, recorded)
+    half_m = delay_differences_m(recorded, site)
+    return Gathered(site, lambda: ranger.ranges().without_delays(half_m), ranger, drops, recorded=recorded)
+
+
+def surveyed(asked: SurveyOptions, given: Gathered, on_count: Callable[[Count], None]) -> SurveyResult:
+    """The survey; ``on_count`` gets the numbers of measurements and unknowns before it. Raises SkylessError."""
+    site = given.site
+    ranges = _with_all_anchors(given.ranges(), site)
+    facts = facts_of(asked, ranges.anchors, site, is_foreign=given.is_foreign)
+    before_m: dict[int, float] = {}
+    if asked.recording is not None and (asked.walks or asked.knows_tag):
+        if given.recorded is None or site is None:
+            raise SkylessError("--walk, --at and --truth name a tag of a recording of skyless record")
+        with McapRecording(asked.recording) as recording:
+            if asked.truth is None:
+                asked.leave_out("lever_arm_m", why="it moves the truth, which --truth must give")
+            if asked.knows_tag:
+                before_m = delay_differences_m(given.recorded, site)
+                truth = None if asked.truth is None else known_truth(Path(asked.recording), asked)
+                facts = replace(facts, tags=known_tags(recording, given.recorded, asked, truth))
+            facts = replace(facts, tags=(*facts.tags, *walks_of(recording, site.id, asked)))
+    changes = () if given.ranger is None else drop_moved(given.ranger, facts, run_survey)
+    if changes:
+        ranges = _with_all_anchors(given.ranges(), site)
+    counted = count(ranges, facts)
+    on_count(counted)
+    # a tag's differences hold the delays of the recording: so must the ranges, and the delays count from these
+    result = run_survey(ranges.without_delays({anchor: -half_m for anchor, half_m in before_m.items()}), facts)
+    result = replace(result, anchors=tuple(_less(one, before_m.get(one.id, 0.0)) for one in result.anchors))
+    warnings = () if counted.warning is None else (counted.warning,)
+    file = Path(asked.site) if isinstance(asked.site, str | Path) else None
+    found = with_changes(result, changes, ranges.duration_s)
+    return SurveyResult(found, counted, warnings, given.drops, site, file, ranges)
+
+
+def _less(anchor: Any, half_m: float) -> Any:  # noqa: ANN401 - SurveyedAnchor
+    return anchor if anchor.delay_m is None or not half_m else replace(anchor, delay_m=anchor.delay_m - half_m)
+
+
+def _with_all_anchors(ranges: PairRanges, site: Site | None) -> PairRanges:
+    """The same ranges, with those anchors of the site added that have none: the survey reports them, too."""
+    of_site: Sequence[int] = () if site is None else [anchor.id for anchor in site.all_anchors]
+    return replace(ranges, anchors=tuple(sorted({*ranges.anchors, *of_site})))
+
+
+def run_survey_site(asked: SurveyOptions) -> SurveyResult | BiasResult:
+    """Find the anchors' positions and the errors of their antenna delays, as ``skyless survey`` does.
+
+    With a tag at known positions (``stays``, ``truth``, ``recorded_truth``) the anchors' positions are kept. In a
+    recording of another system such a tag shows by how much each anchor seems late, less a constant of all: a
+    ``BiasResult``.
+    """
+    if is_of_biases(asked):
+        table = Path(asked.anchors) if isinstance(asked.anchors, str | Path) else None
+        return BiasResult(Path(str(asked.recording)), biases_of(asked), table)
+    return surveyed(asked, gathered(asked), lambda _: None)
+
+
+survey_site = python_function(SurveyOptions, run_survey_site)

@@ -1,0 +1,1 @@
+"""Beacons, the almanac and their bytes, and what a radio reports of a frame."""

@@ -1,0 +1,251 @@
+"""Almanac pages and their 17 bytes: a type, then 16 bytes of contents (``docs/protocol.md``, "Pages")."""
+
+import struct
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Final, Literal
+
+from skyless.core.air.almanac import (
+    AccuracyPage,
+    AnchorPage,
+    GeoreferencePage,
+    KeyPage,
+    NoisePage,
+    Page,
+    SchedulePage,
+    SitePage,
+)
+from skyless.core.air.frame import Malformed
+
+PAGE_BYTES: Final = 17
+
+MAX_COORDINATE_M: Final = 1e6
+"""Coordinates and heights beyond 1000 km from the origin are errors; a page has 32-bit millimetres, ±2147 km."""
+MAX_NOISE: Final = 2.0**-19
+"""Stamp noise beyond 1.9 µs (572 m) and oscillator noise beyond 1.9 ppm are errors; float32 keeps the bound."""
+MAX_SUPERFRAME_TICKS: Final = (1 << 39) - 1
+"""A superframe is shorter than half a wrap of the counter (8.6 s), else stamps become ambiguous."""
+
+_ANCHOR: Final = struct.Struct("<BHiiiBx")
+_SCHEDULE: Final = struct.Struct("<BIBBHBBixx")
+_NOISE: Final = struct.Struct("<Bffff")
+_GEOREFERENCE: Final = struct.Struct("<BiiiI")
+_ACCURACY: Final = struct.Struct("<BHHHHHH4x")
+_SITE: Final = struct.Struct("<BB6xBi4x")
+
+_ANCHOR_TYPE: Final = 1
+_SCHEDULE_TYPE: Final = 2
+_NOISE_TYPE: Final = 3
+_GEOREFERENCE_TYPE: Final = 4
+_ACCURACY_TYPE: Final = 5
+_SITE_TYPE: Final = 6
+_KEY_TYPE: Final = 7
+
+_HEIGHT_GIVEN: Final = 0x01
+_MAX_COORDINATE_MM: Final = round(MAX_COORDINATE_M * 1000)
+_STD_STEPS_PER_M: Final = 10_000
+_DISTANCE_STEPS_PER_M: Final = 100
+_TIME_STEPS_PER_S: Final = 10
+_CIRCLE: Final = 3_600_000_000
+"""A whole turn in steps of 1e-7 degree."""
+
+
+@lru_cache(maxsize=1024)
+def encode_page(page: Page) -> bytes:  # noqa: PLR0911 - one for each type
+    """Return the 17 bytes of a page.
+
+    Coordinates are rounded to 1 mm, angles to 1e-7 degree (at most 5.6 mm on the ground), noise to float32.
+    Of accuracy, standard deviations are rounded to 0.1 mm, the distance to 1 cm and the time to 0.1 s; neither of
+    the latter two to 0.
+
+    Raises:
+        ValueError: a field is out of its range; the message names it.
+    """
+    match page:
+        case AnchorPage():
+            return _encode_anchor(page)
+        case SchedulePage():
+            return _encode_schedule(page)
+        case NoisePage():
+            return _encode_noise(page)
+        case GeoreferencePage():
+            return _encode_georeference(page)
+        case AccuracyPage():
+            return _encode_accuracy(page)
+        case SitePage():
+            return _encode_site(page)
+        case KeyPage():
+            return _encode_key(page)
+
+
+@lru_cache(maxsize=1024)
+def decode_page(data: bytes) -> Page | Literal[Malformed.BAD_PAGE] | None:
+    """Return the page in 17 bytes, ``BAD_PAGE`` where a value is impossible, None for a type not known here."""
+    decode = _DECODERS.get(data[0])
+    if decode is None:
+        return None
+    page = decode(data)
+    return Malformed.BAD_PAGE if page is None else page
+
+
+def _whole(name: str, value: int, low: int, high: int) -> int:
+    if not low <= value <= high or value != int(value):
+        raise ValueError(f"{name} is {value!r}; it must be a whole number from {low} to {high}")
+    return int(value)
+
+
+def _real(name: str, value: float, low: float, high: float) -> float:
+    if not low <= value <= high:
+        raise ValueError(f"{name} is {value!r}; it must be from {low:g} to {high:g}")
+    return value
+
+
+def _millimetres(name: str, value_m: float) -> int:
+    return round(_real(name, value_m, -MAX_COORDINATE_M, MAX_COORDINATE_M) * 1000)
+
+
+def _steps(name: str, value: float, per_unit: int, least: int = 0) -> int:
+    return max(least, round(_real(name, value, 0.0, 0xFFFF / per_unit) * per_unit))
+
+
+def _encode_anchor(page: AnchorPage) -> bytes:
+    return _ANCHOR.pack(
+        _ANCHOR_TYPE,
+        _whole("AnchorPage.anchor", page.anchor, 0, 0xFFFF),
+        _millimetres("AnchorPage.x_m", page.x_m),
+        _millimetres("AnchorPage.y_m", page.y_m),
+        _millimetres("AnchorPage.z_m", page.z_m),
+        _whole("AnchorPage.slot", page.slot, 0, 0xFF),
+    )
+
+
+def _encode_schedule(page: SchedulePage) -> bytes:
+    slots = _whole("SchedulePage.slots", page.slots, 1, 0xFF)
+    longest_slot_ticks = min(0xFFFFFFFF, MAX_SUPERFRAME_TICKS // slots)
+    frames_per_node = _whole("SchedulePage.frames_per_node", page.frames_per_node, 1, slots)
+    height_m = page.tag_height_m
+    return _SCHEDULE.pack(
+        _SCHEDULE_TYPE,
+        _whole("SchedulePage.slot_ticks", page.slot_ticks, 1, longest_slot_ticks),
+        slots,
+        frames_per_node,
+        _whole("SchedulePage.master", page.master, 0, 0xFFFF),
+        _whole("SchedulePage.anchors", page.anchors, 1, slots // frames_per_node),
+        0 if height_m is None else _HEIGHT_GIVEN,
+        0 if height_m is None else _millimetres("SchedulePage.tag_height_m", height_m),
+    )
+
+
+def _encode_noise(page: NoisePage) -> bytes:
+    return _NOISE.pack(
+        _NOISE_TYPE,
+        _real("NoisePage.tx_stamp_s", page.tx_stamp_s, 0.0, MAX_NOISE),
+        _real("NoisePage.rx_stamp_s", page.rx_stamp_s, 0.0, MAX_NOISE),
+        _real("NoisePage.white_fm", page.white_fm, 0.0, MAX_NOISE),
+        _real("NoisePage.random_walk_fm", page.random_walk_fm, 0.0, MAX_NOISE),
+    )
+
+
+def _encode_georeference(page: GeoreferencePage) -> bytes:
+    return _GEOREFERENCE.pack(
+        _GEOREFERENCE_TYPE,
+        round(_real("GeoreferencePage.latitude_deg", page.latitude_deg, -90.0, 90.0) * 1e7),
+        round(_real("GeoreferencePage.longitude_deg", page.longitude_deg, -180.0, 180.0) * 1e7),
+        _millimetres("GeoreferencePage.height_m", page.height_m),
+        round(_real("GeoreferencePage.heading_deg", page.heading_deg, 0.0, 360.0) * 1e7) % _CIRCLE,
+    )
+
+
+def _encode_accuracy(page: AccuracyPage) -> bytes:
+    return _ACCURACY.pack(
+        _ACCURACY_TYPE,
+        _steps("AccuracyPage.survey_std_m", page.survey_std_m, _STD_STEPS_PER_M),
+        _steps("AccuracyPage.range_std_m", page.range_std_m, _STD_STEPS_PER_M),
+        _steps("AccuracyPage.slope_std_m", page.slope_std_m, _STD_STEPS_PER_M),
+        _steps("AccuracyPage.place_std_m", page.place_std_m, _STD_STEPS_PER_M),
+        _steps("AccuracyPage.place_distance_m", page.place_distance_m, _DISTANCE_STEPS_PER_M, least=1),
+        _steps("AccuracyPage.place_time_s", page.place_time_s, _TIME_STEPS_PER_S, least=1),
+    )
+
+
+def _encode_site(page: SitePage) -> bytes:
+    height_m = page.tag_height_m
+    return _SITE.pack(
+        _SITE_TYPE,
+        _whole("SitePage.pages", page.pages, 1, 0xFF),
+        0 if height_m is None else _HEIGHT_GIVEN,
+        0 if height_m is None else _millimetres("SitePage.tag_height_m", height_m),
+    )
+
+
+def _encode_key(page: KeyPage) -> bytes:
+    if len(page.key) != PAGE_BYTES - 1:
+        raise ValueError(f"KeyPage.key has {len(page.key)} bytes; it must have {PAGE_BYTES - 1}")
+    return bytes((_KEY_TYPE,)) + page.key
+
+
+def _decode_anchor(data: bytes) -> AnchorPage | None:
+    _, anchor, x_mm, y_mm, z_mm, slot = _ANCHOR.unpack(data)
+    if max(abs(x_mm), abs(y_mm), abs(z_mm)) > _MAX_COORDINATE_MM:
+        return None
+    return AnchorPage(anchor, x_mm / 1000, y_mm / 1000, z_mm / 1000, slot)
+
+
+def _decode_schedule(data: bytes) -> SchedulePage | None:
+    _, slot_ticks, slots, frames_per_node, master, anchors, flags, height_mm = _SCHEDULE.unpack(data)
+    possible = (
+        slot_ticks > 0
+        and slot_ticks * slots <= MAX_SUPERFRAME_TICKS
+        and frames_per_node > 0
+        and 0 < anchors * frames_per_node <= slots
+        and abs(height_mm) <= _MAX_COORDINATE_MM
+    )
+    if not possible:
+        return None
+    height_m = height_mm / 1000 if flags & _HEIGHT_GIVEN else None
+    return SchedulePage(slot_ticks, slots, frames_per_node, master, anchors, height_m)
+
+
+def _decode_noise(data: bytes) -> NoisePage | None:
+    _, *figures = _NOISE.unpack(data)
+    return NoisePage(*figures) if all(0.0 <= figure <= MAX_NOISE for figure in figures) else None
+
+
+def _decode_georeference(data: bytes) -> GeoreferencePage | None:
+    _, latitude, longitude, height_mm, heading = _GEOREFERENCE.unpack(data)
+    on_earth = abs(latitude) <= _CIRCLE // 4 and abs(longitude) <= _CIRCLE // 2
+    if not on_earth or abs(height_mm) > _MAX_COORDINATE_MM or heading >= _CIRCLE:
+        return None
+    # Division by 1e7 gives back the very float of a configured angle of up to seven decimals.
+    return GeoreferencePage(latitude / 1e7, longitude / 1e7, height_mm / 1000, heading / 1e7)
+
+
+def _decode_accuracy(data: bytes) -> AccuracyPage | None:
+    _, *stds, distance, time = _ACCURACY.unpack(data)
+    if distance == 0 or time == 0:
+        return None
+    survey_m, range_m, slope_m, place_m = (std / _STD_STEPS_PER_M for std in stds)
+    distance_m, time_s = distance / _DISTANCE_STEPS_PER_M, time / _TIME_STEPS_PER_S
+    return AccuracyPage(survey_m, range_m, slope_m, place_m, distance_m, time_s)
+
+
+def _decode_site(data: bytes) -> SitePage | None:
+    _, pages, flags, height_mm = _SITE.unpack(data)
+    possible = pages > 0 and abs(height_mm) <= _MAX_COORDINATE_MM
+    height_m = height_mm / 1000 if flags & _HEIGHT_GIVEN else None
+    return SitePage(pages, height_m) if possible else None
+
+
+def _decode_key(data: bytes) -> KeyPage:
+    return KeyPage(data[1:])
+
+
+_DECODERS: Final[dict[int, Callable[[bytes], Page | None]]] = {
+    _ANCHOR_TYPE: _decode_anchor,
+    _SCHEDULE_TYPE: _decode_schedule,
+    _NOISE_TYPE: _decode_noise,
+    _GEOREFERENCE_TYPE: _decode_georeference,
+    _ACCURACY_TYPE: _decode_accuracy,
+    _SITE_TYPE: _decode_site,
+    _KEY_TYPE: _decode_key,
+}

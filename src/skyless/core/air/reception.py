@@ -1,0 +1,34 @@
+"""What passes between a radio and the protocol machines."""
+
+from msgspec import Struct
+
+
+class Diagnostics(Struct, frozen=True, gc=False):
+    """What a radio measured of one frame besides its time; a value is None where the radio does not report it.
+
+    Powers are those of the chip's formulas without corrections (``core/tag/observations.py``).
+    """
+
+    rx_power_dbm: float | None = None
+    first_path_power_dbm: float | None = None
+    carrier_offset_ppm: float | None = None
+
+
+class Reception(Struct, frozen=True, gc=False):
+    """One frame as a radio received it.
+
+    ``frame`` is the whole PSDU, FCS included. ``rx_ticks`` is the receiver's own 40-bit counter at the frame's
+    RMARKER, antenna delay already subtracted. ``host_s`` is the host's clock, needed only to bridge gaps over 8.6 s.
+    """
+
+    frame: bytes
+    rx_ticks: int
+    host_s: float | None = None
+    diagnostics: Diagnostics | None = None
+
+
+class Transmission(Struct, frozen=True, gc=False):
+    """One frame to be sent so that its RMARKER leaves the antenna at ``tx_ticks`` (40-bit, the sender's counter)."""
+
+    frame: bytes
+    tx_ticks: int

@@ -1,0 +1,1 @@
+"""The protocol machine of an anchor of protocol 2."""

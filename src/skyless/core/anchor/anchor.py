@@ -1,0 +1,191 @@
+"""``Anchor``: the protocol machine of one anchor. Bytes and ticks in, frames and ticks out; no I/O, no clock.
+
+A driver (simulator, program) hands it every reception, asks when its next frame is due, and fetches that frame as late
+as its radio allows, so that it carries the latest receptions.
+
+An anchor knows of no other time than its own counter. It sends at the instants of ``skyless.core.air.instants``, and the
+more anchors it receives, the more rarely, so that together they offer what the air carries best.
+"""
+
+from collections import Counter
+from typing import Final
+
+from skyless.core.air.beacon import Beacon, StatedPosition
+from skyless.core.air.codec import decode_cached, encode, heard_capacity
+from skyless.core.air.frame import Heard, Malformed
+from skyless.core.air.instants import PERIOD_CHANGES, gap_ticks, period_code, period_ticks, suitable_period_s
+from skyless.core.air.local_almanac import site_issue, site_pages_of, stated_position
+from skyless.core.air.reception import Reception, Transmission
+from skyless.core.anchor.authentication import BeaconAuthentication, contents_of, sealed
+from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS
+from skyless.core.site import AnchorSite, Site, UnplacedAnchor
+from skyless.core.tag.observations import AnchorStamps, is_weak_first_path
+from skyless.core.ticks import Unwrapper, from_seconds, to_seconds, wrap
+
+MAX_RELAY_AGE_TICKS: Final = from_seconds(1.0)
+"""Older stamps are not relayed: sequence numbers come around after 256 frames, and then name another frame."""
+
+PRESENT_PERIODS: Final = 8
+PRESENT_TICKS: Final = from_seconds(1.0)
+"""An anchor that was received within both the last second and this number of own periods is in reach."""
+
+MIN_CODE_STEPS: Final = 2
+"""A period that is off by less than this, 9 to 12 %, stays, so that beacons can be predicted for long."""
+
+
+class Anchor:
+    """One anchor of a site of protocol 2."""
+
+    def __init__(
+        self, site: Site, anchor_id: int, lead_s: float = 1e-3, authentication: BeaconAuthentication | None = None
+    ) -> None:
+        """``lead_s``: how long before its RMARKER a frame must be in the driver's hands.
+
+        ``authentication``: the keys; None for an anchor that sends without codes and accepts all frames. The radio is
+        configured with the antenna delays of ``site``, and keeps them.
+
+        Raises:
+            KeyError: the site has no such anchor.
+        """
+        self.id = anchor_id
+        self.counters: Counter[str] = Counter()
+        self.authentication = authentication
+        self._site = site
+        self._known = frozenset(anchor.id for anchor in site.all_anchors) - {anchor_id}
+        self._delay_ticks = anchor_of(site, anchor_id).tx_antenna_delay_ticks
+        self._correction_ticks = 0
+        """What frames state of their TX stamps beyond the radio's, as another site corrects its delays."""
+        self._lead_ticks = from_seconds(lead_s) + DELAYED_TX_GRANULARITY_TICKS
+        self._own_ticks = Unwrapper()
+        self._stamps = AnchorStamps(self.counters)
+        self._heard: dict[int, tuple[Heard, int, bool]] = {}
+        """Last reception of each, its unwrapped stamp, and whether its first path was weak; the newest last."""
+        self._sequence = 0
+        self._next_ticks: int | None = None
+        """Instant of the frame with that sequence number, own unwrapped counter."""
+        # At first all anchors of the site may be in reach: a site that is switched on must not choke its air.
+        self._period_code = period_code(suitable_period_s(len(site.all_anchors), site.schedule.rate_hz))
+        self.place(site)
+
+    def place(self, site: Site) -> None:
+        """Use other positions and antenna delays of the same anchors, and go on.
+
+        Own stamps stay as the radio makes them; frames state them corrected.
+        """
+        anchor = anchor_of(site, self.id)
+        self._position: StatedPosition | None = (
+            None if isinstance(anchor, UnplacedAnchor) else stated_position(site, anchor)
+        )
+        self._correction_ticks = delay_change_ticks(self._site, site, self.id)
+        self._pages = site_pages_of(site)
+        self._issue = site_issue(self._pages)
+
+    @property
+    def interval_ticks(self) -> float:
+        """0: its frames are at random instants."""
+        return 0.0
+
+    def clock(self, _now_ticks: int | None) -> None:
+        """None: it knows of no other time than its own counter."""
+        return
+
+    def hear(self, reception: Reception) -> None:
+        """Process a frame from the air; one that does not belong here is counted and dropped."""
+        beacon = decode_cached(reception.frame)
+        if isinstance(beacon, Malformed):
+            self.counters[beacon] += 1
+            return
+        if beacon.site != self._site.id or beacon.anchor not in self._known:
+            self.counters["foreign-site" if beacon.site != self._site.id else "unknown-anchor"] += 1
+            return
+        fault = None if self.authentication is None else self.authentication.fault_of(beacon, reception)
+        if fault is not None:
+            self.counters[fault] += 1
+            return
+        rx_ticks = self._own_ticks.unwrap(reception.rx_ticks, reception.host_s)
+        if self._stamps.unwrap(beacon, rx_ticks, period_ticks(beacon.period_code)) is None:
+            return
+        self.counters["heard"] += 1
+        measured = reception.diagnostics
+        weak = measured is not None and is_weak_first_path(measured.rx_power_dbm, measured.first_path_power_dbm)
+        self._heard.pop(beacon.anchor, None)
+        self._heard[beacon.anchor] = (Heard(beacon.anchor, beacon.sequence, reception.rx_ticks), rx_ticks, weak)
+
+    def next_transmission_ticks(self, now_ticks: int) -> int:
+        """TX stamp (40-bit, own counter) of the next frame that can still be made.
+
+        Frames that would have been due before have their sequence numbers, so that the later ones can be predicted.
+        """
+        earliest_ticks = self._own_ticks.unwrap(now_ticks) + self._lead_ticks
+        if self._next_ticks is None:
+            first_ticks = earliest_ticks + gap_ticks(self.id, 0xFF, self._period_code)
+            self._next_ticks = on_radio_grid(first_ticks, self._delay_ticks)
+        while self._next_ticks < earliest_ticks:
+            self._advance()
+        return wrap(self._next_ticks)
+
+    def transmission(self, tx_ticks: int) -> Transmission:
+        """The frame for the time that ``next_transmission_ticks`` gave last."""
+        assert self._next_ticks is not None
+        added = contents_of(
+            self.authentication, tx_ticks, self._sequence, self.id, to_seconds(period_ticks(self._period_code))
+        )
+        position = None if added.certificate else self._position
+        capacity = heard_capacity(position=position is not None, certificate=added.certificate is not None)
+        heard, weak = self._relayed(self._next_ticks, capacity)
+        beacon = Beacon(
+            self._site.id, self.id, self._sequence, wrap(tx_ticks + self._correction_ticks), self._issue,
+            self._period_code, position, heard, weak, added.page(self._pages, self._sequence, self.id),
+            added.certificate,
+        )  # fmt: skip
+        self._advance()
+        self.counters["sent"] += 1
+        return Transmission(sealed(self.authentication, encode(beacon), added), tx_ticks)
+
+    def _advance(self) -> None:
+        """Go on to the next frame, with another period where the number of anchors in reach requires it."""
+        assert self._next_ticks is not None
+        self._next_ticks += gap_ticks(self.id, self._sequence, self._period_code)
+        self._sequence = (self._sequence + 1) & 0xFF
+        if self._sequence % PERIOD_CHANGES == 0:
+            rate_hz = self._site.schedule.rate_hz
+            code = period_code(suitable_period_s(1 + self._in_reach(self._next_ticks), rate_hz))
+            if abs(code - self._period_code) >= MIN_CODE_STEPS:
+                self._period_code = code
+
+    def _in_reach(self, now_ticks: int) -> int:
+        """How many other anchors it receives."""
+        oldest_ticks = now_ticks - max(PRESENT_TICKS, PRESENT_PERIODS * period_ticks(self._period_code))
+        return sum(rx_ticks > oldest_ticks for _, rx_ticks, _ in self._heard.values())
+
+    def _relayed(self, tx_ticks: int, capacity: int) -> tuple[tuple[Heard, ...], int]:
+        """Receptions for a frame at that own time, the most recent first, and the bit mask of the weak ones."""
+        oldest_ticks = tx_ticks - MAX_RELAY_AGE_TICKS
+        recent = [(heard, weak) for heard, rx_ticks, weak in reversed(self._heard.values()) if rx_ticks > oldest_ticks]
+        recent = recent[:capacity]
+        return tuple(heard for heard, _ in recent), sum(weak << place for place, (_, weak) in enumerate(recent))
+
+
+def anchor_of(site: Site, anchor_id: int) -> AnchorSite | UnplacedAnchor:
+    """An anchor of a site by its identifier. Raises KeyError where the site has none of it."""
+    for anchor in site.all_anchors:
+        if anchor.id == anchor_id:
+            return anchor
+    raise KeyError(anchor_id)
+
+
+def delay_change_ticks(before: Site, after: Site, anchor_id: int) -> int:
+    """By how much later an anchor's frames leave than its radio states, if the delays of ``after`` are right.
+
+    The radio uses those of ``before``. Only TX and RX delay together can be observed, so a change of the latter counts
+    as one of the former. Raises KeyError where a site has no such anchor.
+    """
+    old, new = anchor_of(before, anchor_id), anchor_of(after, anchor_id)
+    change_ticks = new.tx_antenna_delay_ticks - old.tx_antenna_delay_ticks
+    return change_ticks + new.rx_antenna_delay_ticks - old.rx_antenna_delay_ticks
+
+
+def on_radio_grid(ticks_own: int, tx_antenna_delay_ticks: int) -> int:
+    """The radio starts on multiples of 512 of its raw counter; the antenna's delay comes on top."""
+    raw = ticks_own - tx_antenna_delay_ticks
+    return raw - raw % DELAYED_TX_GRANULARITY_TICKS + tx_antenna_delay_ticks

@@ -1,0 +1,170 @@
+"""What every positioning method returns."""
+
+from enum import StrEnum
+from math import sqrt
+from struct import Struct as Format
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.core.alert import Alert
+from skyless.core.integrity import Integrity, IntegrityRequirement, integrity_of
+from skyless.core.kernels.arrays import Array
+
+if TYPE_CHECKING:
+    from skyless.core.dop import Dops
+
+# What fixes carry: rows of three numbers in one array, which costs less than separate arrays.
+
+POSITION: Final = 0
+"""The position, then three rows of its covariance."""
+
+QUALITY: Final = 4
+"""Chi-square and mean squared residual in m²."""
+
+VELOCITY: Final = 5
+"""The velocity, then three rows of its covariance, for methods that know it."""
+
+PROTECTION: Final = 9
+"""The first three of the levels (``estimator/levels.py``), for methods that know some."""
+
+PROTECTED_ROWS: Final = 10
+
+
+class NoFixReason(StrEnum):
+    """Why there is no position; the values are what reports and counters show."""
+
+    NO_BEACONS = "no-beacons"
+    NO_ALMANAC = "no-almanac"
+    TOO_FEW_ANCHORS = "too-few-anchors"
+    BAD_GEOMETRY = "bad-geometry"
+    MIRROR = "mirror-ambiguity"
+    NOT_CONVERGED = "not-converged"
+    RESIDUALS = "residuals-too-large"
+    ACQUIRING = "acquiring"
+    NO_MASTER = "no-master"
+    """The method needs a master, and the site has none (protocol 2)."""
+
+
+class Fix(Struct, frozen=True, gc=False):
+    """One position with all that is known of its quality. SI units, site frame.
+
+    It keeps the rows as the method wrote them; arrays are read-only views, made when they are read.
+    """
+
+    time_s: float
+    """Master time at which the position holds, since the receiver's first fix; without a master the tag's own."""
+    rows: bytes
+    """Rows of float64 (``POSITION`` and the following), as far as the method knows them."""
+    anchors: tuple[int, ...]
+    """Identifiers of the anchors in use, the reference first."""
+    anchors_m: Array
+    """Their positions, shape (len(anchors), 3)."""
+    method: str
+    height_known: bool
+    """True for 2-D positioning at a given height."""
+    dof: int = 1
+    """Degrees of freedom of ``chi2``; 1 for the running mean of a filter."""
+    requirement: IntegrityRequirement | None = None
+    """What the protection levels answer; None for methods that know none."""
+    verified_until_s: float | None = None
+    """Up to this time, on the scale of ``time_s``, every beacon that counts is verified; None where none is."""
+    unverified: float = 1.0
+    """Share of the beacons of the last second that are not verified, or not yet."""
+
+    def __repr__(self) -> str:
+        return (
+            f"Fix(time_s={self.time_s}, position_m={self.position_m.tolist()}, std_m={self.std_m}, "
+            f"anchors={self.anchors}, method={self.method!r}, hpl_m={self.hpl_m}, alert={self.alert})"
+        )
+
+    @property
+    def position_m(self) -> Array:
+        """Shape (3,)."""
+        return _vector(self.rows, POSITION)
+
+    @property
+    def covariance_m2(self) -> Array:
+        """Of the position, shape (3, 3); a coordinate that was given (2-D, known height) has zeros."""
+        return _matrix(self.rows, POSITION + 1)
+
+    @property
+    def velocity_mps(self) -> Array | None:
+        """Shape (3,), None where the method knows none."""
+        return _vector(self.rows, VELOCITY) if len(self.rows) > VELOCITY * ROW_BYTES else None
+
+    @property
+    def velocity_covariance(self) -> Array | None:
+        """Shape (3, 3) in (m/s)²."""
+        return _matrix(self.rows, VELOCITY + 1) if len(self.rows) > VELOCITY * ROW_BYTES else None
+
+    @property
+    def chi2(self) -> float:
+        """Sum of squared normalised residuals (snapshots) or its running mean per message (filters)."""
+        return _row(self.rows, QUALITY)[0]
+
+    @property
+    def residual_rms_m(self) -> float:
+        """Root of the mean (filters: running mean) squared residual."""
+        return sqrt(_row(self.rows, QUALITY)[1])
+
+    @property
+    def integrity(self) -> Integrity | None:
+        """Protection levels, and whether they can be relied on; None for methods that know none."""
+        requirement = self.requirement
+        if requirement is None:
+            return None
+        return integrity_of(_row(self.rows, PROTECTION), requirement.risk, self.height_known, requirement.alert_limit_m)
+
+    @property
+    def hpl_m(self) -> float | None:
+        """Horizontal protection level: the error is larger with a probability of at most ``integrity_risk``."""
+        integrity = self.integrity
+        return None if integrity is None else integrity.hpl_m
+
+    @property
+    def vpl_m(self) -> float | None:
+        """Vertical protection level; None where the height is given."""
+        integrity = self.integrity
+        return None if integrity is None else integrity.vpl_m
+
+    @property
+    def integrity_risk(self) -> float | None:
+        """None for methods that know no protection levels."""
+        return None if self.requirement is None else self.requirement.risk
+
+    @property
+    def alert(self) -> Alert | None:
+        """Whether the levels can be relied on; None for methods without any."""
+        integrity = self.integrity
+        return None if integrity is None else integrity.alert
+
+    @property
+    def std_m(self) -> float:
+        """One-sigma radial error: the root of the covariance's trace."""
+        return float(np.sqrt(np.trace(self.covariance_m2)))
+
+    @property
+    def dops(self) -> "Dops":
+        """Dilutions of precision of the anchors in use, seen from the position."""
+        from skyless.core.dop import dilution_of_precision  # noqa: PLC0415 (a value needs no compiler)
+
+        return dilution_of_precision(self.anchors_m, self.position_m, height_known=self.height_known)
+
+
+_ROW: Final = Format("3d")
+
+ROW_BYTES: Final = _ROW.size
+
+
+def _row(rows: bytes, row: int) -> tuple[float, ...]:
+    return _ROW.unpack_from(rows, row * ROW_BYTES)
+
+
+def _vector(rows: bytes, row: int) -> Array:
+    return np.frombuffer(rows, count=3, offset=row * ROW_BYTES)
+
+
+def _matrix(rows: bytes, row: int) -> Array:
+    return np.frombuffer(rows, count=9, offset=row * ROW_BYTES).reshape(3, 3)

@@ -1,0 +1,88 @@
+"""Integrity of ``joint``'s fixes: fault tests, protection levels, alerts (``docs/maths.md`` section 8)."""
+
+from collections.abc import Sequence
+from statistics import NormalDist
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.core.alert import Alert
+from skyless.core.kernels.arrays import Array
+
+RISK: Final = 1e-4
+
+MARGIN: Final = 1.05
+"""On all standard deviations, for errors that are not quite Gaussian and figures that are not quite the filter's."""
+
+
+HPL, VPL, STATE = range(3)
+"""What a fix carries of its levels; the state is one of ..."""
+
+SOUND, OBSTRUCTED, CONTRADICTED, UNAVAILABLE = range(4)
+"""... a position without known faults, with anchors whose range error has jumped or was wrong from the start, with a
+fault that the levels may not cover, and one without levels."""
+
+_ALERTS: Final = (Alert.NONE, Alert.EXCLUDED, Alert.NOT_EXCLUDED, Alert.UNAVAILABLE)
+
+
+class Integrity(Struct, frozen=True, gc=False):
+    """How wrong a fix may be."""
+
+    hpl_m: float | None
+    """The horizontal error is larger with a probability of at most ``risk``; None if there is no level."""
+    vpl_m: float | None
+    """As well for the vertical error; None also where the height is given."""
+    risk: float
+    """For each fix and each of the two levels."""
+    alert: Alert
+
+
+class IntegrityRequirement(Struct, frozen=True):
+    """What an application requires of the levels.
+
+    Raises:
+        ValueError: the risk is not between 0 and 0.1, the limit or the height's is not a length, or the acceleration
+            none.
+    """
+
+    risk: float = RISK
+    """Probability, for each fix, that an error exceeds its protection level."""
+    alert_limit_m: float | None = None
+    """Fixes with a higher horizontal protection level have an alert."""
+    max_acceleration_mps2: float = 0.0
+    """The tag's largest acceleration, which the levels then cover beyond the process noise; 0 where it is not known."""
+    height_std_m: float = 0.0
+    """Standard deviation of the tag's height from the one that is given, which fixes then count."""
+
+    def __post_init__(self) -> None:
+        limits_of(self.risk)
+        if self.alert_limit_m is not None and not 0.0 < self.alert_limit_m < np.inf:
+            raise ValueError(f"alert_limit_m is {self.alert_limit_m!r}; it should be more than 0 m")
+        for name in ("max_acceleration_mps2", "height_std_m"):
+            if not 0.0 <= (value := getattr(self, name)) < np.inf:
+                raise ValueError(f"{name} is {value!r}; it should be a finite number from 0 on")
+
+
+def integrity_of(levels: Sequence[float], risk: float, height_known: bool, alert_limit_m: float | None) -> Integrity:
+    """The levels that ``protect`` has written, as values.
+
+    While an anchor's fault is in the fix the levels cover it, up to a size beyond which there is none.
+    """
+    state = int(levels[STATE])
+    if state >= CONTRADICTED:
+        return Integrity(None, None, risk, _ALERTS[state])
+    hpl_m, vpl_m = levels[HPL], None if height_known else levels[VPL]
+    exceeded = alert_limit_m is not None and hpl_m > alert_limit_m
+    return Integrity(hpl_m, vpl_m, risk, Alert.LIMIT if exceeded else _ALERTS[state])
+
+
+def limits_of(risk: float = RISK) -> Array:
+    """Multiples of the standard deviation, horizontal and vertical, that errors exceed with this risk, in a fix.
+
+    Raises:
+        ValueError: the probability is not between 0 and 0.1.
+    """
+    if not 0.0 < risk <= 0.1:
+        raise ValueError(f"risk is {risk!r}; it should be above 0 and at most 0.1")
+    return MARGIN * np.array([np.sqrt(-2.0 * np.log(risk)), -NormalDist().inv_cdf(risk / 2.0)])

@@ -1,0 +1,136 @@
+"""The two-state clock filter: an anchor's offset and rate against the master (``docs/maths.md`` section 6).
+
+The offset is kept in two parts, whole ticks in an integer and a remainder below one tick in metres of light, so that
+nothing is lost however long the filter runs. One update processes one master beacon.
+
+Plain Python: so little arithmetic takes no longer than the call of a kernel.
+"""
+
+import math
+from typing import Final
+
+from msgspec import Struct
+
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.core.kernels.two_state import TwoState, predict, predicted_value_variance, update
+
+MAX_RELATIVE_RATE: Final = 40e-6
+"""Two crystals of ±20 ppm each, the widest that IEEE 802.15.4 allows."""
+
+
+class ClockNoise(Struct, frozen=True, gc=False):
+    """Process noise of the difference of two clocks, in metres of light."""
+
+    white: float
+    """Of the offset, m²/s."""
+    walk: float
+    """Of the rate, m²/s³."""
+
+
+def clock_noise(white_fm: float, random_walk_fm: float, clocks: int = 2) -> ClockNoise:
+    """Process noise from oscillator figures: Allan deviation at 1 s, and 1/√s; summed over both clocks."""
+    scale = clocks * SPEED_OF_LIGHT_MPS**2
+    return ClockNoise(scale * white_fm**2, scale * random_walk_fm**2)
+
+
+def stamp_variance_m2(stamp_s: float, *, rounded: bool) -> float:
+    """Variance of a stamp in m²; rounding to whole ticks adds a twelfth of a tick squared."""
+    rounding = TICK_S**2 / 12.0 if rounded else 0.0
+    return SPEED_OF_LIGHT_MPS**2 * (stamp_s**2 + rounding)
+
+
+class ClockFilter:
+    """One anchor's clock against the master, beacon by beacon."""
+
+    def __init__(self, noise: ClockNoise, variance_m2: float, gate: float = 6.0) -> None:
+        self._noise = noise
+        self._variance_m2 = variance_m2
+        self._gate = gate
+        self._whole_offset = self._epoch_master = 0
+        """Offset in whole ticks, and the master's time of the last beacon."""
+        self._offset_m = self._rate_mps = 0.0
+        """The rest of the offset, and the rate, in metres of light."""
+        self.covariance: TwoState = (0.0, 0.0, 0.0)
+        """Of offset and rate."""
+        self.updates = 0
+        """Beacons processed since the last start."""
+        self.rejected = 0
+        """Beacons rejected in a row."""
+
+    @property
+    def rate(self) -> float:
+        """Fractional rate of the own clock against the master's."""
+        return self._rate_mps / SPEED_OF_LIGHT_MPS
+
+    @property
+    def offset_std_m(self) -> float:
+        """Standard deviation of the offset at the last beacon, in metres of light."""
+        return math.sqrt(self.covariance[0])
+
+    def update(self, tx_ticks_master: int, rx_ticks_own: int, range_m: float) -> float:
+        """Process a master beacon, both stamps unwrapped; return the normalised innovation squared (0 at the start).
+
+        The state is at the time at which the beacon arrives, so the rate acts on the flight time as it should
+        (``docs/maths.md`` section 4). An innovation beyond the gate changes nothing but the time.
+        """
+        if self.updates == 0:
+            self.restart(tx_ticks_master, rx_ticks_own, range_m)
+            return 0.0
+        dt_s = (tx_ticks_master - self._epoch_master) * TICK_S
+        offset_m = self._offset_m + self._rate_mps * dt_s
+        self.covariance = predict(self.covariance, dt_s, self._noise.white, self._noise.walk)
+        innovation = (rx_ticks_own - tx_ticks_master - self._whole_offset) * TICK_M - range_m - offset_m
+        nis = innovation * innovation / (self.covariance[0] + self._variance_m2)
+        if nis > self._gate * self._gate:
+            self.rejected += 1
+        else:
+            gain, rate_gain, self.covariance = update(self.covariance, self._variance_m2)
+            offset_m += gain * innovation
+            self._rate_mps += rate_gain * innovation
+            self.updates, self.rejected = self.updates + 1, 0
+        steps = math.floor(offset_m / TICK_M)
+        self._offset_m = offset_m - steps * TICK_M
+        self._whole_offset += steps
+        self._epoch_master = tx_ticks_master
+        return nis
+
+    def restart(
+        self,
+        tx_ticks_master: int,
+        rx_ticks_own: int,
+        range_m: float,
+        rate: float = 0.0,
+        rate_std: float = MAX_RELATIVE_RATE,
+    ) -> None:
+        """Forget all and begin with this beacon: offset known to the stamps' noise, rate to the crystals' tolerance.
+
+        A rate that is known better is given with its standard deviation, both fractional.
+        """
+        self._whole_offset, self._epoch_master = rx_ticks_own - tx_ticks_master, tx_ticks_master
+        self._offset_m, self._rate_mps = -range_m, rate * SPEED_OF_LIGHT_MPS
+        rate_std_mps = rate_std * SPEED_OF_LIGHT_MPS
+        self.covariance = (self._variance_m2, 0.0, rate_std_mps * rate_std_mps)
+        self.updates, self.rejected = 1, 0
+
+    def inflate_covariance(self, factor: float) -> None:
+        """Multiply the covariance: the clock that is tracked from now on may differ from the one before."""
+        variance, covariance, rate_variance = self.covariance
+        self.covariance = (variance * factor, covariance * factor, rate_variance * factor)
+
+    def add_offset_variance(self, variance_m2: float) -> None:
+        """Let the offset alone be uncertain: range or antenna delays have changed, the clocks have not."""
+        variance, covariance, rate_variance = self.covariance
+        self.covariance = (variance + variance_m2, covariance, rate_variance)
+
+    def to_master(self, ticks_own: int) -> tuple[int, float, float]:
+        """Own time on the master's scale: whole ticks, the fraction of a tick in [0, 1), and the variance in m²."""
+        elapsed_own = (ticks_own - self._whole_offset - self._epoch_master) - self._offset_m / TICK_M
+        elapsed = elapsed_own / (1.0 + self._rate_mps / SPEED_OF_LIGHT_MPS)
+        whole = math.floor(elapsed)
+        variance = predicted_value_variance(self.covariance, elapsed * TICK_S, self._noise.white, self._noise.walk)
+        return self._epoch_master + whole, elapsed - whole, variance
+
+    def from_master(self, ticks_master: int) -> int:
+        """Nearest own tick of a time on the master's scale."""
+        offset_m = self._offset_m + self._rate_mps * ((ticks_master - self._epoch_master) * TICK_S)
+        return ticks_master + self._whole_offset + round(offset_m / TICK_M)

@@ -1,0 +1,202 @@
+"""Certificates and keys of a site, as far as a listener knows them."""
+
+from collections.abc import Iterable
+from enum import Enum, auto
+from hmac import compare_digest
+from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct
+
+from skyless.core.keys.key_chain import (
+    SECTION_BITS,
+    SECTION_INTERVALS,
+    Certificate,
+    ChainTiming,
+    SectionName,
+    earlier_key,
+    is_signed,
+    mac_key,
+    read_certificate,
+)
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+KEPT_KEYS: Final = 256
+"""Of one section: frames wait for their key for seconds only."""
+MAX_CERTIFICATES: Final = 6
+
+NEAR_STEPS: Final = 16
+"""Keys that follow within this number of intervals on a verified one are hashed at once, others as far as an allowance
+for long ones goes: somebody who sends forged keys must not keep the processor busy. Keys that two anchors sent have an
+allowance of their own, so that many different forged ones do not keep the right one waiting."""
+STEPS_PER_S: Final = 50_000.0
+MAX_STEPS: Final = 40_000.0
+MAX_SENDERS: Final = 4096
+"""Far keys whose first sender is remembered."""
+
+CHECKS_PER_S: Final = 100.0
+MAX_CHECKS: Final = 100.0
+"""The same for signatures, of which each takes 0.1 to 0.4 ms."""
+
+
+class CertificateUse(Enum):
+    """What became of a certificate."""
+
+    KNOWN = auto()
+    NEW = auto()
+    FORGED = auto()
+    IGNORED = auto()
+    """There was no time to check it."""
+    REVOKED = auto()
+    """Signed by the site, but a later chain counts instead."""
+
+
+class KeyUse(Enum):
+    """What became of a disclosed key."""
+
+    KNOWN = auto()
+    """It was known, or nothing shows yet whether it is right."""
+    NEW = auto()
+    FORGED = auto()
+
+
+class _Section(Struct):
+    """What is known of one section."""
+
+    certificate: Certificate
+    sent: bytes
+    newest: int
+    """The newest interval whose key is known; that before the section's first for its root."""
+    keys: dict[int, bytes]
+    """Keys of the last intervals; the newest is the last entry."""
+
+
+class KnownKeys:
+    """All that is known of the chains of a site. Nothing that is forged stays in it."""
+
+    def __init__(self, site: int, public: "Ed25519PublicKey", least_serial: int = 0) -> None:
+        """``least_serial``: chains with lower serial numbers have been revoked."""
+        self._site, self._public = site, public
+        self.serial = least_serial
+        """The highest serial number of a chain that has been seen to count."""
+        self.timing: ChainTiming | None = None
+        """When keys hold; None before the first certificate."""
+        self.newest = -1
+        """The newest interval whose key is known."""
+        self._sections: dict[SectionName, _Section] = {}
+        self._present = 0
+        self._steps = {False: MAX_STEPS, True: MAX_STEPS}
+        """Allowances, by whether two anchors sent a key."""
+        self._checks, self._refilled_s = MAX_CHECKS, 0.0
+        self._senders: dict[bytes, int] = {}
+        """By far key, the anchor that sent it first."""
+
+    @property
+    def certificates(self) -> tuple[bytes, ...]:
+        """As they are sent: what lets a listener start at once the next time."""
+        return tuple(section.sent for section in self._sections.values())
+
+    def restore(self, certificates: Iterable[bytes]) -> None:
+        """Add certificates of an earlier run; signatures are checked again."""
+        for sent in certificates:
+            read = read_certificate(self._site, sent)
+            if read is not None and is_signed(*read, self._public):
+                self._add(read[0], sent)
+
+    def on_certificate(self, sent: bytes, now_s: float) -> CertificateUse:
+        """Process a certificate at a time, as far as that is known."""
+        if any(section.sent == sent for section in self._sections.values()):
+            return CertificateUse.REVOKED if self._is_revoked(sent, now_s) else CertificateUse.KNOWN
+        read = read_certificate(self._site, sent)
+        if read is None:
+            return CertificateUse.FORGED
+        self._refill(now_s)
+        if self._checks < 1.0:
+            return CertificateUse.IGNORED
+        self._checks -= 1.0
+        certificate, signature = read
+        if not is_signed(certificate, signature, self._public):
+            return CertificateUse.FORGED
+        if certificate.name.serial < self.serial:
+            return CertificateUse.REVOKED
+        self._present = certificate.timing.interval_at(now_s) >> SECTION_BITS
+        self._add(certificate, sent)
+        return CertificateUse.NEW
+
+    def on_key(self, key: bytes, interval: int, now_s: float, anchor: int, *, is_expected: bool = True) -> KeyUse:
+        """Process the key of an interval, as somebody disclosed it in an anchor's name at a time.
+
+        ``is_expected``: whether it is disclosed at about that time.
+        """
+        section = self._section_of(interval)
+        if section is None:
+            return KeyUse.KNOWN
+        steps = interval - section.newest
+        if steps <= 0:
+            known = section.keys.get(interval)
+            return KeyUse.FORGED if known is not None and not compare_digest(known, key) else KeyUse.KNOWN
+        if steps > NEAR_STEPS or not is_expected:
+            self._refill(now_s)
+            if len(self._senders) >= MAX_SENDERS:
+                self._senders.clear()
+            by_two = self._senders.setdefault(key, anchor) != anchor
+            if self._steps[by_two] < SECTION_INTERVALS:
+                return KeyUse.KNOWN
+            self._steps[by_two] -= SECTION_INTERVALS  # whatever it takes, so that short ones do not displace long ones
+        name = section.certificate.name
+        between = {interval: key}
+        oldest = max(section.newest + 1, interval - KEPT_KEYS + 1)
+        for earlier in range(interval - 1, oldest - 1, -1):
+            key = between[earlier] = earlier_key(key, name)
+        if not compare_digest(earlier_key(key, name, oldest - section.newest), section.keys[section.newest]):
+            return KeyUse.FORGED
+        for one in sorted(between):
+            section.keys[one] = between[one]
+        section.newest = interval
+        for old in list(section.keys)[:-KEPT_KEYS]:
+            del section.keys[old]
+        self.newest = max(self.newest, interval)
+        self.serial = max(self.serial, name.serial)
+        self._present = max(self._present, name.section)
+        return KeyUse.NEW
+
+    def mac_key(self, interval: int) -> bytes | None:
+        """What codes of an interval are made with; None while its key is not known."""
+        section = self._section_of(interval)
+        key = None if section is None else section.keys.get(interval)
+        return None if section is None or key is None else mac_key(key, section.certificate.name)
+
+    def _section_of(self, interval: int) -> _Section | None:
+        """The section of the chain that counts in an interval; None where its certificate is not known."""
+        serials = [one.certificate.name.serial for one in self._sections.values() if one.certificate.first <= interval]
+        serial = max(serials, default=0)
+        return self._sections.get(SectionName(self._site, serial, interval >> SECTION_BITS))
+
+    def _is_revoked(self, sent: bytes, now_s: float) -> bool:
+        """Whether a later chain counts at this time instead of that of a known certificate."""
+        own = next(one.certificate for one in self._sections.values() if one.sent == sent)
+        later = [one.certificate for one in self._sections.values() if one.certificate.name.serial > own.name.serial]
+        return any(one.first <= own.timing.interval_at(now_s) - own.timing.lag for one in later)
+
+    def _add(self, certificate: Certificate, sent: bytes) -> None:
+        name = certificate.name
+        if name in self._sections:
+            return
+        root_at = name.first_interval - 1
+        self._sections[name] = _Section(certificate, sent, root_at, {root_at: certificate.root})
+        while len(self._sections) > MAX_CERTIFICATES:
+            del self._sections[
+                min(self._sections, key=lambda one: (one.section >= self._present, one.serial, one.section))
+            ]
+        self.timing = self._sections[max(self._sections, key=lambda one: one.serial)].certificate.timing
+        counting = [one.newest for one in self._sections.values() if self._section_of(one.newest) is one]
+        self.newest = max(counting, default=-1)  # keys of a chain that was revoked show nothing any more
+
+    def _refill(self, now_s: float) -> None:
+        """Renew the allowances by the time that has passed."""
+        elapsed_s = min(max(now_s - self._refilled_s, 0.0), 1.0)
+        self._refilled_s = now_s
+        for by_two, steps in self._steps.items():
+            self._steps[by_two] = min(steps + elapsed_s * STEPS_PER_S, MAX_STEPS)
+        self._checks = min(self._checks + elapsed_s * CHECKS_PER_S, MAX_CHECKS)

@@ -1,0 +1,257 @@
+"""``Verifier``: what a listener with the site's public key does with beacons. Frames in, decisions about them out.
+
+A frame waits until the key of its interval is disclosed; then its code shows whether an anchor of the site made it. A
+frame counts only if it was received before any anchor can have disclosed that key: else anybody could have made it.
+"""
+
+from collections import Counter, deque
+from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct
+
+from skyless.core.air.almanac import KeyPage
+from skyless.core.air.beacon import Authentication, Beacon
+from skyless.core.air.codec import INTERVAL_BITS, signed_bytes
+from skyless.core.air.reception import Reception
+from skyless.core.keys.arrivals import Arrival, Arrivals, Stamps
+from skyless.core.keys.fault import Fault
+from skyless.core.keys.key_chain import ChainTiming, is_mac, section_of
+from skyless.core.keys.known_keys import CertificateUse, KeyUse, KnownKeys
+from skyless.core.keys.site_clock import SiteClock
+from skyless.core.ticks import Unwrapper, from_seconds, nearest
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+MAX_UNDECIDED: Final = 8192
+"""Frames that wait: more than a radio can receive before their keys come, one after the other, 0.1 ms each."""
+
+LONGEST_WAIT_TICKS: Final = from_seconds(2.0)
+"""A frame whose key has not come by then is dropped, so that fixes go on with later ones."""
+
+FAULT_TICKS: Final = from_seconds(2.0)
+"""A fault is reported for this time after it was seen last."""
+
+CODES_KEPT: Final = 2048
+"""So many codes at least are remembered: more than there are in the intervals whose frames are still accepted."""
+
+MAX_FAULTY_ANCHORS: Final = 64
+"""Anchors with faults that are remembered: forged frames can name any."""
+
+_ARRIVAL_FAULTS: Final = {Arrival.IN_TIME: None, Arrival.FIRST: Fault.FIRST, Arrival.LATE: Fault.LATE}
+
+
+class ReceivedFrame(Struct, frozen=True, gc=False):
+    """A frame with a code, which waits for its key or is decided."""
+
+    beacon: Beacon
+    authentication: Authentication
+    reception: Reception
+    rx_ticks: int
+    """Own counter, unwrapped."""
+    unix_s: float
+    """The host's clock when it was received."""
+    interval: int | None
+    """Number of the interval; None where no certificate was known yet: the frame's time is still to be checked."""
+    is_plausible: bool
+    """Whether its stamps continue those of genuine frames of its anchor, or no frame is known to be genuine yet."""
+
+
+class _AnchorFault(Struct, frozen=True, gc=False):
+    """The last fault of an anchor, or of frames that name it."""
+
+    fault: Fault
+    rx_ticks: int
+
+
+class Verifier:
+    """Verifies the beacons of one site. It does no I/O and reads no clock."""
+
+    def __init__(
+        self,
+        site: int,
+        public: "Ed25519PublicKey",
+        clock_bound_s: float,
+        counters: Counter[str],
+        *,
+        least_serial: int = 0,
+        certificates: "Iterable[bytes]" = (),
+    ) -> None:
+        """``clock_bound_s``: how far the host's clock may be from those of anchors.
+
+        ``certificates``: those of an earlier run.
+        """
+        self.keys = KnownKeys(site, public, least_serial)
+        self.keys.restore(certificates)
+        self.clock = SiteClock(clock_bound_s, offsets_s=deque())
+        self._counters = counters
+        self._own_ticks = Unwrapper()
+        self._waiting: deque[ReceivedFrame] = deque()
+        self._faults: dict[int, _AnchorFault] = {}
+        self._arrivals = Arrivals()
+        self._codes: set[bytes] = set()
+        self._codes_before: set[bytes] = set()
+        """Codes of the last genuine frames; a second frame with one of them is a repetition."""
+        self._anchors: set[int] = set()
+        """Anchors that have sent a genuine frame."""
+        self.newest_ticks = 0
+        """When the last frame of the site was received: own counter, unwrapped."""
+        self._has_new_key = False
+
+    def waiting(self) -> "Iterable[ReceivedFrame]":
+        """Frames that wait, in the order in which they were received; nothing shows yet whether they are genuine."""
+        return tuple(self._waiting)
+
+    def faults(self) -> dict[int, Fault]:
+        """Anchors with a fault within the last seconds."""
+        oldest = self.newest_ticks - FAULT_TICKS
+        return {anchor: one.fault for anchor, one in self._faults.items() if one.rx_ticks > oldest}
+
+    def add(self, beacon: Beacon, reception: Reception, unix_s: float) -> ReceivedFrame | None:
+        """Process a beacon of the site, received at this time of the host's clock.
+
+        Returns the frame if it now waits for its key, None if it was refused.
+        """
+        rx_ticks = self._own_ticks.unwrap(reception.rx_ticks, reception.host_s)
+        self.newest_ticks = rx_ticks
+        clock = self.clock
+        clock.advance(rx_ticks, unix_s)
+        if beacon.certificate is not None:
+            self._on_certificate(beacon.anchor, beacon.certificate, rx_ticks)
+        stated = beacon.authentication
+        if stated is None:
+            self._refuse(beacon.anchor, Fault.NO_CODE, rx_ticks)
+            return None
+        timing, interval = self.keys.timing, None
+        if timing is not None:
+            present = timing.interval_at(clock.upper_s(timing))
+            interval = nearest(stated.interval, present, INTERVAL_BITS)
+            fault = _time_fault(interval, present, timing.lag)
+            if isinstance(beacon.page, KeyPage):
+                self._on_key(
+                    beacon.page.key, interval - timing.lag, beacon.anchor, timing, is_early=fault is Fault.EARLY
+                )
+            if fault is None and interval <= self.keys.newest:
+                fault = Fault.LATE
+            if fault is not None:
+                self._refuse(beacon.anchor, fault, rx_ticks)
+                return None
+        if len(self._waiting) >= MAX_UNDECIDED:
+            self._counters[Fault.TOO_MANY] += 1
+            return None
+        is_plausible = self._arrivals.is_plausible(Stamps(beacon.anchor, rx_ticks, beacon.tx_ticks))
+        frame = ReceivedFrame(beacon, stated, reception, rx_ticks, unix_s, interval, is_plausible)
+        self._waiting.append(frame)
+        return frame
+
+    def decided(self) -> list[tuple[ReceivedFrame, Fault | None]]:
+        """Frames of which it is known by now whether they are genuine; in the order of reception, each once.
+
+        None with a genuine one, else why it is not accepted. ``NO_KEY`` and ``FIRST`` do not mean that it was forged.
+        """
+        decided: list[tuple[ReceivedFrame, Fault | None]] = []
+        waiting = self._waiting
+        oldest = self.newest_ticks - LONGEST_WAIT_TICKS
+        if not self._has_new_key and (not waiting or waiting[0].rx_ticks > oldest):
+            return decided
+        self._has_new_key, timing = False, self.keys.timing
+        can_decide = timing is not None and not self.clock.is_late
+        while waiting:
+            one = waiting[0]
+            fault = self._fault(one, timing) if can_decide and timing is not None else Fault.NO_KEY
+            if fault is Fault.NO_KEY and one.rx_ticks > oldest and not self._is_key_lost(one):
+                break
+            waiting.popleft()
+            decided.append((one, fault))
+            if fault is Fault.NO_KEY:
+                self._counters[fault] += 1
+            elif fault is not None:
+                self._refuse(one.beacon.anchor, fault, one.rx_ticks)
+        return self._without_delayed(decided)
+
+    def _without_delayed(
+        self, decided: list[tuple[ReceivedFrame, Fault | None]]
+    ) -> list[tuple[ReceivedFrame, Fault | None]]:
+        """The same, where genuine frames that came late by the counters are not accepted either."""
+        genuine = [one for one, fault in decided if fault is None]
+        arrivals = self._arrivals.of([Stamps(one.beacon.anchor, one.rx_ticks, one.beacon.tx_ticks) for one in genuine])
+        if all(arrival is Arrival.IN_TIME for arrival in arrivals):
+            return decided
+        faults = []
+        for one, arrival in zip(genuine, arrivals, strict=True):
+            faults.append(_ARRIVAL_FAULTS[arrival])
+            if arrival is Arrival.LATE:
+                self._refuse(one.beacon.anchor, Fault.LATE, one.rx_ticks)
+            elif arrival is Arrival.FIRST:
+                self._counters[Fault.FIRST] += 1
+        answers = iter(faults)
+        return [(one, next(answers) if fault is None else fault) for one, fault in decided]
+
+    def _fault(self, one: ReceivedFrame, timing: ChainTiming) -> Fault | None:
+        """What is wrong with a frame; ``NO_KEY`` while the key of its interval is not known."""
+        interval = one.interval
+        if interval is None:
+            present = timing.interval_at(self.clock.upper_at(one.unix_s, timing))
+            interval = nearest(one.authentication.interval, present, INTERVAL_BITS)
+            fault = _time_fault(interval, present, timing.lag)
+            if fault is not None:
+                return fault
+        key = self.keys.mac_key(interval)
+        if key is None:
+            return Fault.NO_KEY
+        mac = one.authentication.mac
+        if not is_mac(signed_bytes(one.reception.frame), mac, key):
+            return Fault.BAD_CODE
+        if mac in self._codes or mac in self._codes_before:
+            return Fault.REPEATED
+        self._codes.add(mac)
+        if len(self._codes) >= CODES_KEPT:
+            self._codes, self._codes_before = set(), self._codes
+        self._anchors.add(one.beacon.anchor)
+        return None
+
+    def _is_key_lost(self, one: ReceivedFrame) -> bool:
+        """Whether a frame's key is not known though a later one is: a section has ended, or begun, in between."""
+        return one.interval is not None and one.interval <= self.keys.newest and not self.clock.is_late
+
+    def _on_certificate(self, anchor: int, sent: bytes, rx_ticks: int) -> None:
+        use = self.keys.on_certificate(sent, self.clock.present_s)
+        if use is CertificateUse.FORGED:
+            self._counters["forged-certificate"] += 1
+            return
+        timing = self.keys.timing
+        if use is CertificateUse.REVOKED:
+            self._refuse(anchor, Fault.REVOKED_CHAIN, rx_ticks)
+        elif use is not CertificateUse.IGNORED and timing is not None:
+            self.clock.on_section(section_of(sent), timing)
+
+    def _on_key(self, key: bytes, interval: int, anchor: int, timing: ChainTiming, *, is_early: bool) -> None:
+        newest = self.keys.newest
+        use = self.keys.on_key(key, interval, self.clock.present_s, anchor, is_expected=not is_early)
+        if use is KeyUse.NEW:
+            self._has_new_key = True
+            if interval > newest:
+                self.clock.on_key(interval, timing)
+        elif use is KeyUse.FORGED:
+            self._counters["forged-key"] += 1
+
+    def _refuse(self, anchor: int, fault: Fault, rx_ticks: int) -> None:
+        """Count a frame that is not used, and remember its anchor's fault."""
+        self._counters[fault] += 1
+        before = self._faults.pop(anchor, None)
+        if before is not None and before.fault is Fault.REVOKED_CHAIN and rx_ticks - before.rx_ticks < FAULT_TICKS:
+            self._faults[anchor] = before if fault is not Fault.REVOKED_CHAIN else _AnchorFault(fault, rx_ticks)
+            return
+        if len(self._faults) >= MAX_FAULTY_ANCHORS:
+            strangers = (one for one in self._faults if one not in self._anchors)
+            del self._faults[next(strangers, next(iter(self._faults)))]
+        self._faults[anchor] = _AnchorFault(fault, rx_ticks)
+
+
+def _time_fault(interval: int, present: int, lag: int) -> Fault | None:
+    """What is wrong with a frame of an interval that was received in another, or before it."""
+    if interval + lag <= present:
+        return Fault.LATE
+    return Fault.EARLY if interval > present else None

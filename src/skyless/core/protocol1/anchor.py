@@ -1,0 +1,252 @@
+"""``Anchor``: the protocol machine of one anchor of protocol 1. Bytes and ticks in, frames and ticks out; no I/O, no clock.
+
+A driver (simulator, daemon) hands it every reception, asks when its next frame is due, at the latest every 5 ms while
+there is none, and fetches that frame as late as its radio allows, so that it carries the latest receptions.
+"""
+
+import math
+from collections import Counter
+from typing import Final
+
+from msgspec import Struct
+
+from skyless.core.air.almanac import Page
+from skyless.core.air.frame import Heard, Malformed
+from skyless.core.air.reception import Reception, Transmission
+from skyless.core.anchor.anchor import MAX_RELAY_AGE_TICKS, delay_change_ticks, on_radio_grid
+from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS, SUBTICKS, TICK_M, TICK_RATE_HZ, TICK_S
+from skyless.core.kernels.filter import ClockFilter, clock_noise, stamp_variance_m2
+from skyless.core.observation import MasterTerm
+from skyless.core.protocol1.almanac import almanac_issue, page_for, pages_of
+from skyless.core.protocol1.beacon import Beacon, MasterTime
+from skyless.core.protocol1.codec import decode_cached, encode, heard_capacity
+from skyless.core.protocol1.election import MasterElection, Role, Verdict
+from skyless.core.protocol1.schedule import first_slots, schedule_of
+from skyless.core.protocol1.site_clock import SiteClock
+from skyless.core.site import AnchorSite, Site
+from skyless.core.ticks import Unwrapper, difference, wrap
+
+MAX_OFFSET_STD_M: Final = 0.3
+"""An anchor sends only while its offset is known better than this (``docs/maths.md`` section 6)."""
+
+MAX_TAKEOVER_STD_M: Final = 3.0
+"""An anchor takes over the master's role only while its offset is known better than this, by which the site's time may
+then jump, on sites whose superframes last a second."""
+
+
+class SiteTimeState(Struct, frozen=True):
+    """How well an anchor knows the site's time, and whose."""
+
+    role: Role
+    master: int | None
+    """The present master, which may be the anchor itself; None before it has received one."""
+    term: int | None
+    """Counts the takeovers of the master's role, modulo 256."""
+    beacons: int
+    """Master beacons used since the clock filter's last start."""
+    is_known: bool
+    rate_ppm: float
+    offset_std_m: float
+    """After the last beacon, in metres of light; 0 for the master itself."""
+    offset_s: float | None
+    """Own counter less the site's time, modulo the wrap; None before it is known."""
+    superframe: int | None
+
+
+class Anchor:
+    """One anchor of a site."""
+
+    def __init__(self, site: Site, anchor_id: int, lead_s: float = 1e-3) -> None:
+        """``lead_s``: how long before its RMARKER a frame must be in the driver's hands.
+
+        The radio is configured with the antenna delays of ``site``, and keeps them.
+        """
+        self.id = anchor_id
+        self.counters: Counter[str] = Counter()
+        self._site = site
+        self._anchors = {anchor.id: anchor for anchor in site.anchors}
+        self._radio_delay_ticks = self._anchors[anchor_id].tx_antenna_delay_ticks
+        self._correction_ticks = 0
+        """What frames state of their TX stamps beyond the radio's, as another site corrects its delays."""
+        self._lead_ticks = round(lead_s * TICK_RATE_HZ)
+        self._schedule = schedule_of(site)
+        self._slots = self._schedule.slots_of(first_slots(site)[anchor_id])
+        self._pages: tuple[Page, ...] = pages_of(site)
+        self._issue = almanac_issue(self._pages)
+        self._own_ticks = Unwrapper()
+        self._election = MasterElection(site, anchor_id, self._schedule)
+        self._clock = SiteClock(_filter_of(site), self._schedule, self.counters)
+        self._master_heard: Heard | None = None
+        self._heard: dict[int, tuple[Heard, int]] = {}
+        self._pending: dict[int, tuple[int, int]] = {}
+        self._sequence = 0
+
+    def place(self, site: Site) -> None:
+        """Use other positions and antenna delays of the same anchors, with the same schedule, and go on.
+
+        Own stamps stay as the radio makes them; frames state them corrected.
+        """
+        self._anchors = {anchor.id: anchor for anchor in site.anchors}
+        self._correction_ticks = delay_change_ticks(self._site, site, self.id)
+        self._pages = pages_of(site)
+        self._issue = almanac_issue(self._pages)
+        master_term = self._election.master_term
+        if self._election.role is Role.FOLLOWER and master_term is not None:
+            self._clock.correct_range(_distance_m(self._anchors[self.id], self._anchors[master_term.master]))
+
+    @property
+    def is_master(self) -> bool:
+        """Whether this anchor keeps the site's time at present."""
+        return self._election.role is Role.MASTER
+
+    @property
+    def interval_ticks(self) -> float:
+        """Time between two frames."""
+        return self._schedule.superframe_ticks / self._schedule.frames_per_node
+
+    def clock(self, now_ticks: int | None) -> SiteTimeState:
+        """State of the own clock against the site's time; ``now_ticks``: the own counter, 40 bits."""
+        master_term, clock, role = self._election.master_term, self._clock, self._election.role
+        offset_s = superframe = None
+        if now_ticks is not None and clock.epoch_ticks is not None and (self.is_master or clock.updates > 1):
+            own_ticks = self._own_ticks.expect(now_ticks)
+            site_ticks, fraction = divmod(clock.subticks(own_ticks), SUBTICKS)
+            offset_s = (difference(wrap(own_ticks), wrap(site_ticks)) - fraction / SUBTICKS) * TICK_S
+            superframe = (site_ticks - clock.epoch_ticks) // self._schedule.superframe_ticks
+        return SiteTimeState(
+            role=role,
+            master=None if master_term is None else master_term.master,
+            term=None if master_term is None else master_term.term,
+            beacons=0 if self.is_master else clock.updates,
+            is_known=self.is_master or (role is Role.FOLLOWER and clock.updates > 1),
+            rate_ppm=clock.rate * 1e6,
+            offset_std_m=0.0 if self.is_master else clock.offset_std_m,
+            offset_s=offset_s,
+            superframe=superframe,
+        )
+
+    def hear(self, reception: Reception) -> None:
+        """Process a frame from the air; one that does not belong here is counted and dropped."""
+        beacon = decode_cached(reception.frame)
+        if isinstance(beacon, Malformed):
+            self.counters[beacon] += 1
+        elif beacon.site != self._site.id:
+            self.counters["foreign-site"] += 1
+        elif beacon.anchor == self.id or beacon.anchor not in self._anchors:
+            self.counters["unknown-anchor"] += 1
+        else:
+            self.counters["heard"] += 1
+            rx_ticks = self._own_ticks.unwrap(reception.rx_ticks, reception.host_s)
+            heard = Heard(beacon.anchor, beacon.sequence, reception.rx_ticks)
+            self._heard.pop(beacon.anchor, None)
+            self._heard[beacon.anchor] = (heard, rx_ticks)
+            self._update_master(beacon, heard, rx_ticks)
+
+    def _update_master(self, beacon: Beacon, heard: Heard, rx_ticks: int) -> None:
+        """Track which anchor is the master, and set the clock by the master's own beacons."""
+        verdict = self._election.on_beacon(beacon, rx_ticks)
+        if verdict in {Verdict.STALE, Verdict.UNKNOWN}:
+            self.counters[verdict] += 1
+        if verdict in {Verdict.FROM_NEW_MASTER, Verdict.FROM_FIRST_MASTER}:
+            self._master_heard = None
+            range_m = _distance_m(self._anchors[self.id], self._anchors[beacon.anchor])
+            self._clock.track_master(range_m, restart=verdict is Verdict.FROM_FIRST_MASTER)
+        elif verdict is not Verdict.FROM_MASTER:
+            return
+        if self._clock.on_master_beacon(beacon, rx_ticks):
+            self._master_heard = heard
+
+    def next_transmission_ticks(self, now_ticks: int) -> int | None:
+        """TX stamp (40-bit, own counter) of the next frame that can still be made; None while the clock is unknown."""
+        now = self._own_ticks.unwrap(now_ticks)
+        self._election.resign_if_silent(now)
+        self._take_over_if_due(now)
+        earliest = now + self._lead_ticks
+        epoch = self._clock.epoch_ticks
+        if epoch is None or not self._may_send(earliest):
+            return None
+        since_epoch = self._clock.subticks(earliest) // SUBTICKS - epoch
+        superframe, slot = self._schedule.next_slot(since_epoch + DELAYED_TX_GRANULARITY_TICKS, self._slots)
+        tx_ticks = on_radio_grid(
+            self._clock.ticks_own(epoch + self._schedule.slot_start_ticks(superframe, slot)), self._radio_delay_ticks
+        )
+        self._pending = {wrap(tx_ticks): (superframe, slot)}
+        return wrap(tx_ticks)
+
+    def transmission(self, tx_ticks: int) -> Transmission:
+        """The frame for a time that ``next_transmission_ticks`` gave.
+
+        Raises:
+            KeyError: the time is not the one that was given last.
+        """
+        superframe, slot = self._pending.pop(tx_ticks)
+        unwrapped = self._own_ticks.expect(tx_ticks)
+        self._take_over_if_due(unwrapped - self._lead_ticks)
+        beacon = self._beacon(tx_ticks, superframe, slot)
+        self._election.on_sent(unwrapped)
+        self._sequence = (self._sequence + 1) & 0xFF
+        self.counters["sent"] += 1
+        return Transmission(encode(beacon), tx_ticks)
+
+    def _take_over_if_due(self, now: int) -> None:
+        """Take the master's role if no anchor has it: the site's time goes on by the own clock."""
+        good = self._clock.updates > 1 and self._clock.variance_m2(now) < MAX_TAKEOVER_STD_M**2
+        if self._election.must_become_master(now, good):
+            self.counters["takeover"] += self._election.master_term is not None
+            self._election.become_master(now)
+            self._clock.become_master(now)
+            self._master_heard = None
+
+    def _beacon(self, tx_ticks: int, superframe: int, slot: int) -> Beacon:
+        superframe &= 0xFFFFFFFF  # as the frame shows it: its reader can compute the page
+        page = page_for(self._pages, superframe, slot)
+        master_term = self._election.master_term or MasterTerm(0, self.id)
+        capacity = heard_capacity(master_heard=self._master_heard is not None, master_time=True, page=True)
+        return Beacon(
+            site=self._site.id,
+            anchor=self.id,
+            sequence=self._sequence,
+            superframe=superframe,
+            slot=slot,
+            tx_ticks=wrap(tx_ticks + self._correction_ticks),
+            almanac_issue=self._issue,
+            master=master_term.master,
+            term=master_term.term,
+            master_heard=self._master_heard,
+            master_time=self._master_time(self._own_ticks.expect(tx_ticks) + self._correction_ticks),
+            heard=self._relayed(self._own_ticks.expect(tx_ticks), master_term.master)[:capacity],
+            page=page,
+        )
+
+    def _relayed(self, ticks_own: int, master: int) -> tuple[Heard, ...]:
+        """Recent receptions of the anchors other than the master, the most recent first."""
+        oldest = ticks_own - MAX_RELAY_AGE_TICKS
+        return tuple(
+            heard for heard, rx_ticks in reversed(self._heard.values()) if rx_ticks > oldest and heard.anchor != master
+        )
+
+    def _master_time(self, ticks_own: int) -> MasterTime | None:
+        """Site time of a frame; None for one that was due when its sender lost its master."""
+        role = self._election.role
+        if role is Role.LISTENING or (role is Role.FOLLOWER and self._clock.updates < 2):
+            return None
+        std_ticks = math.sqrt(self._clock.variance_m2(ticks_own)) / TICK_M
+        return MasterTime(wrap(self._clock.subticks(ticks_own), 48), std_ticks)
+
+    def _may_send(self, ticks_own: int) -> bool:
+        """Whether the own clock is known well enough."""
+        if self.is_master:
+            return True
+        following = self._election.role is Role.FOLLOWER and self._clock.updates > 1
+        return following and self._clock.variance_m2(ticks_own) < MAX_OFFSET_STD_M**2
+
+
+def _filter_of(site: Site) -> ClockFilter:
+    noise = site.noise
+    variance = stamp_variance_m2(noise.tx_stamp_ps * 1e-12, rounded=False)
+    variance += stamp_variance_m2(noise.rx_stamp_ps * 1e-12, rounded=True)
+    return ClockFilter(clock_noise(noise.white_fm, noise.random_walk_fm), variance)
+
+
+def _distance_m(one: AnchorSite, other: AnchorSite) -> float:
+    return math.dist((one.x_m, one.y_m, one.z_m), (other.x_m, other.y_m, other.z_m))

@@ -1,0 +1,212 @@
+"""``Receiver``: the protocol machine of one tag of protocol 1. Bytes and ticks in, fixes out; no I/O, no clock.
+
+It needs nothing but beacons: anchors, schedule and noise figures come from the almanac on the air.
+"""
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.core.air.frame import Malformed
+from skyless.core.air.reception import Reception
+from skyless.core.fix import Fix, NoFixReason
+from skyless.core.integrity import IntegrityRequirement
+from skyless.core.kernels.arrays import Array
+from skyless.core.method_names import DEFAULT_METHOD, FILTERS, METHODS
+from skyless.core.protocol1.almanac import AlmanacAssembly, AlmanacState
+from skyless.core.protocol1.beacon import Beacon
+from skyless.core.protocol1.codec import decode_cached
+from skyless.core.protocol1.master_term import FollowedMaster
+from skyless.core.protocol1.method import new_method
+from skyless.core.protocol1.observer import Observer
+from skyless.core.protocol1.schedule import schedule_from_page
+from skyless.core.protocol1.snapshots import Snapshots, SnapshotsState
+from skyless.core.tag.beacon_receiver import (
+    AdmissionState,
+    BeaconReceiver,
+    HeardSite,
+    MethodOptions,
+    variance_factor_of,
+)
+from skyless.core.tag.joint import Estimation, EstimationState
+
+
+class ReceiverState(Struct, frozen=True, tag="protocol-1"):
+    """All that a ``Receiver`` keeps."""
+
+    admission: AdmissionState
+    almanac: AlmanacState
+    followed: FollowedMaster
+    master: int | None
+    master_scale: tuple[int, int] | None
+    superframe_ticks: int
+    has_method_key: bool
+    """Whether a method has been looked for since stamps were forgotten."""
+    method: EstimationState | SnapshotsState | None
+
+
+class Receiver(BeaconReceiver[Beacon]):
+    """One listening tag of protocol 1."""
+
+    def __init__(
+        self,
+        method: str = DEFAULT_METHOD,
+        *,
+        site: int | None = None,
+        qa: float = 0.3,
+        z_bounds_m: tuple[float, float] | None = None,
+        integrity: IntegrityRequirement | None = None,
+    ) -> None:
+        """Make a tag that knows nothing yet.
+
+        ``method`` is one of ``METHODS``; the rest as of ``skyless.Receiver``, where ``qa`` and ``integrity`` serve
+        ``joint`` only.
+
+        Raises:
+            ValueError: there is no such method.
+        """
+        if method not in METHODS:
+            raise ValueError(f"method {method!r} is not one of {', '.join(METHODS)}")
+        super().__init__(MethodOptions(method, qa, z_bounds_m, integrity or IntegrityRequirement()), site)
+        self.almanac = AlmanacAssembly()
+        self._observer = Observer()
+        self._method: Estimation | Snapshots | None = None
+        self._method_key: object = None
+        self._superframe_ticks = 0
+        self._followed = FollowedMaster()
+        self._master: int | None = None
+        self._positions: dict[int, Array] = {}
+        self._positions_issue: int | None = None
+
+    def state(self) -> ReceiverState:
+        """All that it keeps, as it is now; to be used or encoded before its next frame, as parts are shared."""
+        return ReceiverState(
+            admission=self._admission_state(),
+            almanac=self.almanac.state(),
+            followed=self._followed,
+            master=self._master,
+            master_scale=self._observer.scale,
+            superframe_ticks=self._superframe_ticks,
+            has_method_key=self._method_key is not None,
+            method=None if self._method is None else self._method.state(),
+        )
+
+    @classmethod
+    def from_state(cls, state: ReceiverState) -> "Receiver":
+        """A receiver that continues with the same bits as the one with this state.
+
+        Raises:
+            ValueError: no receiver has such a state.
+        """
+        made = cls(state.admission.options.method)
+        made._restore_admission(state.admission)
+        made._superframe_ticks, made._followed = state.superframe_ticks, state.followed
+        made.almanac.restore(state.almanac)
+        made._read_positions()
+        made._master, made._observer.scale = state.master, state.master_scale
+        made._observer.set_master(state.master, made.almanac.slot_of(state.master) or 0)
+        if state.has_method_key:
+            made._choose_method()
+        match made._method, state.method:
+            case Estimation() as method, EstimationState() as saved:
+                method.restore(saved)
+            case Snapshots() as method, SnapshotsState() as saved:
+                method.restore(saved)
+            case None, None:
+                pass
+            case other, saved:
+                raise ValueError(f"{type(saved).__name__} is not a state of {type(other).__name__}")
+        return made
+
+    @property
+    def method(self) -> Estimation | Snapshots | None:
+        """The positioning method in use, None before the almanac is known."""
+        return self._method
+
+    @property
+    def _estimation(self) -> Estimation | None:
+        return self._method if isinstance(self._method, Estimation) else None
+
+    @property
+    def heard_site(self) -> HeardSite | None:
+        """Positions of the anchors and the georeference so far, once the almanac is complete."""
+        almanac = self.almanac
+        if not almanac.complete:
+            return None
+        return HeardSite(almanac.anchors_m, almanac.georeference, is_complete=almanac.georeference is not None)
+
+    def _decode(self, frame: bytes) -> Beacon | Malformed:
+        return decode_cached(frame)
+
+    def _period_ticks(self, beacon: Beacon) -> int:
+        return self._superframe_ticks
+
+    def _is_of_site(self, beacon: Beacon, rx_ticks: int) -> bool:
+        """Whether a beacon is of an anchor of the site in use."""
+        if not super()._is_of_site(beacon, rx_ticks):
+            return False
+        if beacon.anchor not in self._positions and self.almanac.complete:
+            self.counters["unknown-anchor"] += 1
+            return False
+        return True
+
+    def _admit(self, beacon: Beacon, rx_ticks: int) -> int | None:
+        """TX stamp, unwrapped, of a beacon that may be used, by the present master."""
+        tx_ticks = super()._admit(beacon, rx_ticks)
+        if tx_ticks is None or self._followed.on_beacon(beacon, rx_ticks, self._superframe_ticks):
+            return tx_ticks
+        self.counters["stale-master"] += 1
+        return None
+
+    def _process(self, beacon: Beacon, reception: Reception, rx_ticks: int, tx_ticks: int) -> Fix | NoFixReason:
+        self._read_almanac(beacon)
+        method, anchor_m = self._method, self._positions.get(beacon.anchor)
+        if method is None or anchor_m is None:
+            return NoFixReason.NO_ALMANAC
+        factor, master_term = variance_factor_of(reception), self._followed.master_term
+        return method.update(
+            self._observer.observe(reception.frame, beacon, anchor_m, rx_ticks, tx_ticks, factor, master_term)
+        )
+
+    def _forget_site(self) -> None:
+        self.almanac = AlmanacAssembly()
+        self._positions, self._superframe_ticks = {}, 0
+
+    def _forget_stamps(self) -> None:
+        self._observer.forget()
+        self._followed = FollowedMaster()
+        self._method = self._method_key = None
+
+    def _read_almanac(self, beacon: Beacon) -> None:
+        """Add the page; another issue, schedule, noise or accuracy replaces the method.
+
+        So does another master where the method uses the master's own stamps; filters continue.
+        """
+        almanac, master = self.almanac, self._followed.master
+        if almanac.add_page(beacon.almanac_issue, beacon.page):
+            before, issue = self._positions, self._positions_issue
+            self._read_positions()
+            if issue == almanac.issue and any(tuple(before[a]) != almanac.anchors_m.get(a) for a in before):
+                self._method_key = None  # other positions happen to have the same issue
+        elif self._method is not None and master == self._master:
+            return
+        self._master = master
+        self._observer.set_master(master, almanac.slot_of(master) or 0)
+        self._choose_method()
+
+    def _read_positions(self) -> None:
+        self._positions_issue = self.almanac.issue
+        self._positions = {anchor: np.array(point) for anchor, point in self.almanac.anchors_m.items()}
+
+    def _choose_method(self) -> None:
+        """Make the method that almanac and master require, unless it is in use already."""
+        almanac, options, master = self.almanac, self._options, self._master
+        method_master = None if options.method in FILTERS else master
+        schedule_page, noise, accuracy = almanac.schedule, almanac.noise, almanac.accuracy
+        method_key = (almanac.issue, schedule_page, noise, accuracy, method_master)
+        if method_key != self._method_key:
+            self._method_key, self._method = method_key, None
+            if master is not None and schedule_page is not None and noise is not None:
+                schedule = schedule_from_page(schedule_page)
+                self._superframe_ticks = schedule.superframe_ticks
+                self._method = new_method(options, master, schedule_page, noise, accuracy, self._time)
+                self._observer.set_method(self._method, schedule)

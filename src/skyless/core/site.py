@@ -1,0 +1,234 @@
+"""The values of a site file, already validated (``skyless.site.file.load`` makes them), and how two sites differ."""
+
+import math
+from hashlib import sha256
+from typing import Final, Literal
+
+import msgspec
+from msgspec import UNSET, Struct, UnsetType
+
+from skyless.core.constants import DEFAULT_ANTENNA_DELAY_TICKS, TICK_M
+
+ScheduleMode = Literal["master", "free"]
+"""How the anchors of a site share the air: in slots on a master's time (protocol 1), or at random instants (2)."""
+
+
+Outline = tuple[tuple[float, float], ...]
+"""Corners of a room in order, x and y in metres."""
+
+
+class AnchorSite(Struct, frozen=True, forbid_unknown_fields=True):
+    """One anchor: the position of its antenna and its slot."""
+
+    id: int
+    x_m: float
+    y_m: float
+    z_m: float = 0.0
+    slot: int | None = None
+    """Its first slot; by default in the order of the file, the master first."""
+    tx_antenna_delay_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
+    rx_antenna_delay_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
+    floor: int = 0
+    """Storey on which it hangs; sent with its position in protocol 2, as are the next two."""
+    zone: int = 0
+    """Zone of the site in which it hangs; 0 for none."""
+    std_m: float | None = None
+    """How well this position is known, per axis; by default ``AccuracySite.survey_std_m``."""
+
+
+class UnplacedAnchor(Struct, frozen=True, forbid_unknown_fields=True):
+    """An anchor of protocol 2 whose position is not known yet; it sends and relays."""
+
+    id: int
+    slot: int | None = None
+    tx_antenna_delay_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
+    rx_antenna_delay_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
+
+
+class ScheduleSite(Struct, frozen=True, forbid_unknown_fields=True):
+    """Who sends when."""
+
+    mode: ScheduleMode = "master"
+    """master: slots on the master's clock (protocol 1); free: every anchor sends at random instants (protocol 2)."""
+    slot_s: float = 2**27 / 63.8976e9
+    """Length of a slot; rounded to whole steps of the delayed transmission (8.013 ns)."""
+    slots: int | None = None
+    """Slots in a superframe; by default one for each frame of each anchor."""
+    frames_per_node: int = 1
+    """1: one frame per node and superframe; 2: the paper's pair in every superframe."""
+    guard_s: float = 0.5e-3
+    """Time at the end of each slot in which no frame may be on the air."""
+    rate_hz: float | None = None
+    """Mode free: beacons per second of each anchor; by default it follows from the number of anchors in reach."""
+
+    @property
+    def needs_master(self) -> bool:
+        """Whether the site speaks protocol 1."""
+        return self.mode == "master"
+
+
+class NoiseSite(Struct, frozen=True, forbid_unknown_fields=True):
+    """Noise figures that the filters assume (never under-tune: docs/maths.md section 5)."""
+
+    tx_stamp_ps: float = 100.0
+    rx_stamp_ps: float = 100.0
+    white_fm: float = 2e-11
+    random_walk_fm: float = 1e-9
+
+
+class AccuracySite(Struct, frozen=True, forbid_unknown_fields=True):
+    """Accuracy of the survey and of a tag's ranges, beyond the noise of single stamps; each std is one sigma."""
+
+    survey_std_m: float = 0.02
+    """How well each anchor's position was measured, per axis."""
+    range_std_m: float = 0.03
+    """Constant error of a tag's ranges, a different one for each anchor."""
+    slope_std_m: float = 0.05
+    """Range error that depends on the received power: it is a constant times clip((d - 4 m) / 4 m, -1, 1) at a
+    distance d, and this is the constant's standard deviation."""
+    place_std_m: float = 0.005
+    """Part of a range's error that changes as the tag moves (reflections)."""
+    place_distance_m: float = 1.0
+    """Distance moved over which that part changes."""
+    place_time_s: float = 100.0
+    """Time over which that part changes while the tag is at rest."""
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether survey and ranges are assumed exact."""
+        return self.survey_std_m == self.range_std_m == self.slope_std_m == self.place_std_m == 0.0
+
+
+EXACT: Final = AccuracySite(survey_std_m=0.0, range_std_m=0.0, slope_std_m=0.0, place_std_m=0.0)
+"""Survey and ranges without error, as in the simulated world without errors."""
+
+
+class TagsSite(Struct, frozen=True, forbid_unknown_fields=True):
+    """What is known about the tags."""
+
+    height_m: float | None = None
+    """All tags move at this height (2-D positioning); leave out to estimate the height."""
+
+
+class FloorPlanSite(Struct, frozen=True, forbid_unknown_fields=True):
+    """An image of the floor, and its position."""
+
+    image: str
+    """Path of a PNG or JPEG, relative to the site file."""
+    width_m: float
+    """Width on the floor that the image covers."""
+    x_m: float = 0.0
+    y_m: float = 0.0
+    """Site coordinates of the image's lower left corner."""
+
+
+class GeoreferenceSite(Struct, frozen=True, forbid_unknown_fields=True):
+    """Position of the site's origin on the Earth (WGS 84)."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float = 0.0
+    heading_deg: float = 0.0
+    """Azimuth of the site's y axis, clockwise from true north."""
+
+
+class WallSite(Struct, frozen=True, forbid_unknown_fields=True):
+    """A wall on the floor plan, full height, and what it does to a signal that crosses it."""
+
+    x1_m: float
+    y1_m: float
+    x2_m: float
+    y2_m: float
+    loss_db: float = 6.0
+    delay_m: float = 0.1
+
+
+class Site(Struct, frozen=True, forbid_unknown_fields=True):
+    """A whole site."""
+
+    name: str
+    id: int
+    """Identifier on the air, 16 bits."""
+    master: int
+    """The anchor that starts the site's time; when it fails the others take over in the order of the file.
+
+    In protocol 2 it means nothing, and is the first anchor where the file has none."""
+    anchors: tuple[AnchorSite, ...]
+    """Those whose positions are known; in protocol 1 all."""
+    schedule: ScheduleSite = ScheduleSite()
+    noise: NoiseSite = NoiseSite()
+    tags: TagsSite = TagsSite()
+    accuracy: AccuracySite = AccuracySite()
+    walls: tuple[WallSite, ...] = ()
+    floor_plan: FloorPlanSite | None = None
+    georeference: GeoreferenceSite | None = None
+    unplaced: tuple[UnplacedAnchor, ...] = ()
+    """Those whose positions are not known yet, in protocol 2."""
+    outline_m: Outline | UnsetType = UNSET
+    """The room, where the file has it. Messages carry it beside the site: earlier versions refuse a site with it."""
+
+    @property
+    def all_anchors(self) -> tuple[AnchorSite | UnplacedAnchor, ...]:
+        """All anchors, those with known positions first."""
+        return (*self.anchors, *self.unplaced)
+
+
+# What a survey changes
+
+
+_DIGITS: Final = 16
+
+
+def site_digest(site: Site) -> str:
+    """16 hexadecimal digits that depend on the site's name and number, and on its anchors, and on nothing else.
+
+    Of the anchors their identifiers, positions, slots and antenna delays count, whatever their order.
+    """
+    anchors = [
+        (
+            anchor.id,
+            (anchor.x_m, anchor.y_m, anchor.z_m) if isinstance(anchor, AnchorSite) else None,
+            anchor.slot,
+            anchor.tx_antenna_delay_ticks,
+            anchor.rx_antenna_delay_ticks,
+        )
+        for anchor in sorted(site.all_anchors, key=lambda one: one.id)
+    ]
+    return sha256(msgspec.json.encode((site.name, site.id, anchors))).hexdigest()[:_DIGITS]
+
+
+def is_same_but_placed(one: Site, other: Site) -> bool:
+    """Whether two sites have the same number, anchors, slots and schedule, so that only positions and delays differ."""
+    return _frame_of(one) == _frame_of(other)
+
+
+def largest_change_m(one: Site, other: Site) -> float:
+    """The largest displacement of an anchor between two sites, or change of one of its delays as a distance.
+
+    Both have the same anchors. One that has a position in the second site alone has an infinite change.
+    """
+    others = {anchor.id: anchor for anchor in other.all_anchors}
+    return max(max(_changes_m(anchor, others[anchor.id])) for anchor in one.all_anchors)
+
+
+def _changes_m(one: AnchorSite | UnplacedAnchor, other: AnchorSite | UnplacedAnchor) -> tuple[float, float, float]:
+    moved_m = 0.0
+    if isinstance(other, AnchorSite):
+        moved_m = math.inf
+        if isinstance(one, AnchorSite):
+            moved_m = math.dist((one.x_m, one.y_m, one.z_m), (other.x_m, other.y_m, other.z_m))
+    return (
+        moved_m,
+        abs(other.tx_antenna_delay_ticks - one.tx_antenna_delay_ticks) * TICK_M,
+        abs(other.rx_antenna_delay_ticks - one.rx_antenna_delay_ticks) * TICK_M,
+    )
+
+
+def _frame_of(site: Site) -> object:
+    slots = sorted((anchor.id, anchor.slot) for anchor in site.all_anchors)
+    return (
+        site.id,
+        site.schedule,
+        slots,
+        (site.master, [one.id for one in site.anchors]) if site.schedule.needs_master else None,
+    )

@@ -1,0 +1,549 @@
+"""``joint``: the estimator as a positioning method: cold start, packet by packet updates, new starts when lost."""
+
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import astuple, replace
+
+from skyless.core.constants import SUBTICKS, TICK_S
+from skyless.core.estimator.estimator import (
+    ACCEPTED,
+    NO_REPORT,
+    REJECTED,
+    STALE,
+    Estimator,
+    Report,
+    SavedEstimator,
+)
+from skyless.core.estimator.faults import SURE_CHI2
+from skyless.core.estimator.levels import UNCOVERED_CHI2
+from skyless.core.estimator.state import CONTRADICTED_STD_M, LASTING_STD_M, OPEN_RANGE_STD_M, EstimatorSettings
+from skyless.core.fix import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY, Fix, NoFixReason
+from skyless.core.integrity import UNAVAILABLE, IntegrityRequirement
+from skyless.core.kernels.arrays import Array
+from skyless.core.observation import MasterTerm, Observation
+from skyless.core.tag.acquisition import (
+    EARLY_S,
+    MAX_RELATIVE_STD,
+    MAX_SILENCE_S,
+    MAX_SPEED_STD_MPS,
+    SHORT_SILENCE_S,
+    SLOW_MAX_RELATIVE_STD,
+    SLOW_S,
+    SPEED_STD_GROWTH,
+    START_MAX_AGE_S,
+    TAG_SPEED_STD_MPS,
+    Acquisition,
+    Start,
+)
+from skyless.core.tag.observations import FixTime
+from skyless.core.ticks import TICK_MASK, from_seconds
+
+# Factor on the start's covariance, as the filter is then given the packets that it rests on.
+COVARIANCE_MARGIN: Final = 4.0
+# Faults that show within this time of a start, and whose anchors are not clear, have led to a wrong position.
+EARLY_FAULT_S: Final = 2.0
+UNEXPLAINED_CHI2: Final = 30.0  # what faults of two anchors leave of the test where there are more
+# Number of range errors that jump early, and mean NIS, beyond which the tag is faster than assumed.
+MANY_JUMPS: Final = 3
+EARLY_NIS: Final = 3.0
+# A sensor's height is not wrong by more standard deviations than this; where this number of them in a row do not fit,
+# the position is wrong.
+HEIGHT_SIGMAS: Final = 5.0
+MAX_HEIGHTS_REJECTED: Final = 20
+# Range errors that have jumped more recently cause faults themselves; a new start would not help.
+CALM_OBSTRUCTION: Final = 0.1
+# In longer ones a tag may be metres away when it receives an anchor again: nothing is predicted over them, and each
+# round of packets is a start of its own.
+LONGEST_SUPERFRAME_S: Final = 2.0
+# By then it is known how often packets are late; a start that was wrong for that reason is repeated.
+LATE_SHARE_KNOWN_S: Final = 0.5
+# A start with open range errors is not repeated for this time; then it is, once they fit the settings.
+OPEN_START_HOLD_S: Final = 1.0
+# Packets that are older than the newest by less are late from the radio or the host; others mean another counter.
+REORDERED_S: Final = 0.1
+
+SURELY_IN_REACH_TICKS: Final = from_seconds(SHORT_SILENCE_S) - 1
+"""Silences up to this need no check of the filter."""
+
+
+class AnchorsInUseState(Struct, frozen=True):
+    """What ``AnchorsInUse`` keeps."""
+
+    used: tuple[Observation, ...]
+    checked_ticks: int
+    anchors_m: tuple[tuple[float, float, float], ...]
+    extent_m: float
+
+
+class MasterScaleState(Struct, frozen=True):
+    """What a ``MasterScale`` keeps: of each packet site time and its lead, each in ticks and subticks."""
+
+    master_term: MasterTerm | None
+    points: tuple[tuple[int, int, int, int], ...]
+
+
+class EstimationState(Struct, frozen=True, tag="joint"):
+    """All that an ``Estimation`` keeps."""
+
+    estimator: SavedEstimator
+    start: Acquisition | None
+    in_use: AnchorsInUseState
+    master_scale: MasterScaleState
+    speed_std_mps: float
+    open_range_errors: bool
+    is_open: bool
+    start_was_contradicted: bool
+    relays_may_contradict: bool
+    master_less_tag_ticks: int
+    started_ticks: int
+    newest_ticks: int
+    heights_rejected: int
+
+
+class Estimation:
+    """One tag's estimator from the first beacon on."""
+
+    needs_relays = True
+
+    def __init__(
+        self,
+        settings: EstimatorSettings,
+        z_bounds_m: tuple[float, float] | None = None,
+        fix_time: FixTime | None = None,
+        superframe_s: float = 0.0,
+        most_anchors: int | None = None,
+    ) -> None:
+        """``fix_time``: the receiver's, where it outlives this method; ``superframe_s``: of slow sites.
+
+        ``most_anchors``: with which to begin, the nearest, and none that does not belong to the start; None: with all.
+        """
+        if z_bounds_m is not None:
+            settings = replace(settings, lowest_m=z_bounds_m[0], highest_m=z_bounds_m[1])
+        self._settings = settings
+        self._height_known = settings.height_m is not None
+        self._requirement = IntegrityRequirement(
+            settings.integrity_risk, settings.alert_limit_m, settings.max_acceleration_mps2, settings.height_std_m
+        )
+        self._superframe_s = superframe_s
+        self._most_anchors = most_anchors
+        self._max_relative_std = MAX_RELATIVE_STD if superframe_s < SLOW_S else SLOW_MAX_RELATIVE_STD
+        self._z_bounds_m = z_bounds_m
+        self._speed_std_mps = TAG_SPEED_STD_MPS
+        self._estimator = Estimator(settings)
+        self._start: Acquisition | None = self._new_start()
+        self._open_range_errors = False
+        self._is_open = self._start_was_contradicted = False
+        self._time = fix_time or FixTime()
+        self._in_use = AnchorsInUse(superframe_s)
+        self._master_less_tag_ticks = 0
+        self._started_ticks = 0
+        self._newest_ticks = 0
+        self._master_scale = MasterScale()
+        self._relays_may_contradict = True
+        self._heights_rejected = 0
+
+    def state(self) -> EstimationState:
+        """All that it keeps, as it is now."""
+        return EstimationState(
+            self._estimator.save(), self._start, self._in_use.state(), self._master_scale.state(),
+            self._speed_std_mps, self._open_range_errors, self._is_open, self._start_was_contradicted,
+            self._relays_may_contradict, self._master_less_tag_ticks, self._started_ticks, self._newest_ticks,
+            self._heights_rejected,
+        )  # fmt: skip
+
+    def restore(self, state: EstimationState) -> None:
+        """Continue from the state of one with the same settings.
+
+        Raises:
+            ValueError: the estimator's arrays are not sound.
+        """
+        self._start = state.start
+        self._estimator.restore(state.estimator)
+        self._in_use.restore(state.in_use)
+        self._master_scale.restore(state.master_scale)
+        (
+            self._speed_std_mps, self._open_range_errors, self._is_open, self._start_was_contradicted,
+            self._relays_may_contradict, self._master_less_tag_ticks, self._started_ticks, self._newest_ticks,
+            self._heights_rejected,
+        ) = astuple(state)[4:]  # fmt: skip
+
+    @property
+    def estimator(self) -> Estimator:
+        """The filter with all its states."""
+        return self._estimator
+
+    def remove_anchor(self, anchor: int) -> int:
+        """Use nothing more of what was received of an anchor; how many others remain, if a position is known."""
+        self._estimator.remove_anchor(anchor)
+        if self._start is None:
+            return len(self._estimator.anchors)
+        self._start.remove_anchor(anchor)
+        return 0
+
+    @property
+    def is_starting(self) -> bool:
+        """Whether no position is known yet."""
+        return self._start is not None
+
+    def clock(self, anchor: int) -> tuple[int, float, float] | None:
+        """The tag's clock less that of an anchor in the state: whole ticks, the rest in metres, rate in m/s."""
+        index = self._estimator.index_of.get(anchor)
+        return None if index is None else self._estimator.clock(index)
+
+    @property
+    def excluded(self) -> tuple[int, ...]:
+        """Anchors whose range error has jumped and not come back."""
+        return self._estimator.obstructed
+
+    def update(self, observation: Observation) -> Fix | NoFixReason:
+        """Process one observation; a fix for every accepted packet once started."""
+        ticks_master, rx_ticks, master_term = (
+            observation.tx_ticks_master,
+            observation.rx_ticks_tag,
+            observation.master_term,
+        )
+        if ticks_master is not None:
+            self._master_less_tag_ticks = ticks_master - rx_ticks
+            if master_term is not None and master_term.master == observation.anchor:
+                self._master_scale.update(observation)
+        if (
+            self._start is None
+            and not 0 <= rx_ticks - self._newest_ticks < SURELY_IN_REACH_TICKS
+            and self._is_out_of_reach(observation)
+        ):
+            self._start = self._new_start()
+        if self._start is not None:
+            return self._try_start(self._start, observation)
+        outcome = self._process(observation)
+        self._newest_ticks = max(self._newest_ticks, rx_ticks)
+        if outcome in {REJECTED, STALE}:
+            if self._estimator.is_lost:
+                self._restart(rx_ticks)
+            return NoFixReason.RESIDUALS
+        if self._is_too_fast(rx_ticks):
+            self._restart(rx_ticks)
+            return NoFixReason.ACQUIRING
+        if self._is_contradicted(rx_ticks):
+            self._start = self._new_start()
+            return NoFixReason.ACQUIRING
+        self._in_use.add(observation)
+        return self._fix(observation)
+
+    def _try_start(self, starting: Acquisition, observation: Observation) -> Fix | NoFixReason:
+        starting.add_relays(observation)
+        start = starting.add(observation)
+        if isinstance(start, NoFixReason):
+            return start
+        if self._most_anchors is not None and start.misfitting:
+            start = replace(start, is_contradicted=False, misfitting=())  # the others will do; it may join later
+        if start.is_contradicted and not start.misfitting and self._estimator.is_late_often:
+            return NoFixReason.RESIDUALS  # single packets are late: others will not be
+        if self._superframe_s > LONGEST_SUPERFRAME_S:
+            return self._fix_of(start, observation)
+        self._begin(start, starting.packets())
+        return self._fix(observation)
+
+    def update_height(self, height_m: float, std_m: float) -> bool:
+        """Process the tag's height as a sensor measures it, at the newest packet; True if it was used.
+
+        Before a start it bounds the heights of the search. Where many in a row do not fit, the start was wrong.
+        """
+        if self._start is not None:
+            margin_m = HEIGHT_SIGMAS * std_m
+            self._start.expect_height(height_m - margin_m, height_m + margin_m)
+            return False
+        used = self._estimator.process_height(height_m, std_m) == ACCEPTED
+        self._heights_rejected = 0 if used else self._heights_rejected + 1
+        if self._heights_rejected >= MAX_HEIGHTS_REJECTED and not self._height_known:
+            self._heights_rejected = 0
+            self._start = self._new_start()
+        return used
+
+    def coast(self, observation: Observation) -> Fix | NoFixReason:
+        """A fix when a packet came that was not used itself: by all others, and by what was relayed with it."""
+        return NoFixReason.RESIDUALS if self._start is not None else self._fix(observation)
+
+    def _restart(self, rx_ticks: int) -> None:
+        """Look for a new start; a filter that is lost early has a tag that is faster than assumed."""
+        early = (rx_ticks - self._started_ticks) * TICK_S < EARLY_S
+        faster = min(SPEED_STD_GROWTH * self._speed_std_mps, MAX_SPEED_STD_MPS)
+        self._speed_std_mps = faster if early else TAG_SPEED_STD_MPS
+        self._start = self._new_start()
+
+    def _is_too_fast(self, rx_ticks: int) -> bool:
+        """Whether the range errors of several anchors jump early, or nothing fits: it is the tag that has moved."""
+        if (rx_ticks - self._started_ticks) * TICK_S >= EARLY_S:
+            return False
+        several = self._estimator.jumps >= MANY_JUMPS or self._estimator.rows.item(QUALITY, 0) > EARLY_NIS
+        return several and self._speed_std_mps < MAX_SPEED_STD_MPS
+
+    def _is_contradicted(self, rx_ticks: int) -> bool:
+        """Whether a new start is needed, as relays or faults contradict this one; decides what that has to expect."""
+        if self._start_was_contradicted and self._estimator.is_late_often:
+            self._open_range_errors = self._start_was_contradicted = False  # it was by single late packets
+            return True
+        age_s = (rx_ticks - self._started_ticks) * TICK_S
+        if self._is_open and age_s > OPEN_START_HOLD_S and self._estimator.fits_settings:
+            self._open_range_errors = False
+            return True
+        if self._estimator.rows.item(QUALITY, 2) > SURE_CHI2:
+            limit = SURE_CHI2 if age_s < EARLY_FAULT_S or self._start_was_contradicted else UNCOVERED_CHI2
+            calm = self._estimator.obstruction < CALM_OBSTRUCTION
+            is_new = not self._start_was_contradicted and age_s < EARLY_FAULT_S
+            if is_new and self._estimator.unexplained_test < UNEXPLAINED_CHI2:
+                limit = UNCOVERED_CHI2  # one or two anchors, which the estimator will find
+            if calm and self._estimator.fault_test > limit and (not self._is_open or age_s > OPEN_START_HOLD_S):
+                self._open_range_errors = not self._estimator.is_late_often
+                return age_s > LATE_SHARE_KNOWN_S or self._open_range_errors
+        if not self._relays_may_contradict:
+            self._relays_may_contradict = self._estimator.relays_fit
+        elif self._estimator.is_contradicted:
+            self._relays_may_contradict = False  # if a new start does not help, the anchors are wrong, not the position
+            return True
+        return False
+
+    def _new_start(self) -> Acquisition:
+        settings = self._settings
+        max_age_s = max(START_MAX_AGE_S, 2.5 * self._superframe_s)
+        variance = settings.tx_variance_m2 + settings.rx_variance_m2
+        errors = settings.range_std_m**2 + settings.survey_std_m**2
+        if self._superframe_s > LONGEST_SUPERFRAME_S:
+            variance += errors
+        return Acquisition(settings.height_m, variance, self._z_bounds_m, max_age_s, self._speed_std_mps, errors)
+
+    def _is_out_of_reach(self, observation: Observation) -> bool:
+        """Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back."""
+        silent_s = (observation.rx_ticks_tag - self._newest_ticks) * TICK_S
+        if not -REORDERED_S <= silent_s <= MAX_SILENCE_S:
+            return True
+        if silent_s < SHORT_SILENCE_S:
+            return False
+        std_m = self._estimator.horizontal_variance_m2(silent_s) ** 0.5
+        position_m = self._estimator.state.x[: self._estimator.dim]
+        return bool(std_m > self._max_relative_std * self._in_use.mean_range_m(position_m))
+
+    def _begin(self, start: Start, packets: list[Observation]) -> None:
+        """Begin at the start's position, and process the packets that led there."""
+        self._start = None
+        if self._most_anchors is not None:
+            kept = _nearest(start, self._most_anchors)
+            packets = [packet for packet in packets if packet.anchor in kept]
+        self._newest_ticks = self._started_ticks = packets[-1].rx_ticks_tag
+        self._in_use.begin(start.used)
+        dim, begin_ticks = self._estimator.dim, packets[0].rx_ticks_tag
+        age_s = (start.rx_ticks_tag - begin_ticks) * TICK_S
+        is_contradicted = start.is_contradicted and not self._estimator.is_late_often
+        self._is_open = self._open_range_errors or (is_contradicted and not start.misfitting)
+        self._start_was_contradicted = self._is_open or is_contradicted
+        error = OPEN_RANGE_STD_M if self._start_was_contradicted else self._settings.range_std_m
+        inflation = 1.0 + error**2 / (self._settings.tx_variance_m2 + self._settings.rx_variance_m2)
+        if not self._start_was_contradicted:
+            inflation *= COVARIANCE_MARGIN
+        covariance = inflation * start.covariance[:dim, :dim] + age_s**2 * start.speed_variance * np.eye(dim)
+        self._estimator.start(
+            begin_ticks,
+            start.solution[:dim],
+            covariance,
+            start.speed_variance,
+            self._is_open,
+            CONTRADICTED_STD_M if self._start_was_contradicted else LASTING_STD_M,
+            [
+                self._estimator.anchor_index(packet.anchor, packet.anchor_m, packet.anchor_std_m)
+                for packet in packets
+                if is_contradicted and packet.anchor in start.misfitting
+            ],
+        )
+        for packet in packets:
+            self._process(packet)
+
+    def _process(self, observation: Observation) -> int:
+        return self._estimator.process(
+            self._estimator.anchor_index(observation.anchor, observation.anchor_m, observation.anchor_std_m),
+            observation.sequence,
+            observation.rx_ticks_tag,
+            observation.tx_ticks_anchor,
+            self._listed(observation) if observation.relays else (),
+            packed=observation.packed_relays,
+            report=self._report(observation),
+            variance_factor=observation.rx_variance_factor,
+        )
+
+    def _listed(self, observation: Observation) -> list[list[int]]:
+        """Relays of anchors that are known, in the form of the estimator."""
+        index_of, rows = self._estimator.index_of, []
+        for anchor, sequence, rx_ticks in observation.relays:
+            sender = index_of.get(anchor)
+            if sender is not None:
+                rows.append([index_of[observation.anchor], sender, sequence, rx_ticks])
+        return rows
+
+    def _report(self, observation: Observation) -> Report:
+        """What the anchor reports of its clock against the master's."""
+        master_term, variance_m2 = observation.master_term, observation.tx_variance_m2
+        if master_term is None or variance_m2 <= 0.0:
+            return NO_REPORT
+        master, subticks = self._estimator.index_of.get(master_term.master), self._master_scale.difference(observation)
+        return NO_REPORT if master is None or subticks is None else Report(master, subticks, variance_m2)
+
+    def _fix_of(self, start: Start, observation: Observation) -> Fix:
+        """What a start knows by itself: a position, and of the velocity that it is a tag's; no protection level."""
+        dim, rows = self._estimator.dim, np.zeros((PROTECTED_ROWS, 3))
+        rows[POSITION, :dim] = start.solution[:dim]
+        if self._settings.height_m is not None:
+            rows[POSITION, 2] = self._settings.height_m
+        rows[POSITION + 1 : POSITION + 1 + dim, :dim] = start.covariance[:dim, :dim]
+        rows[VELOCITY + 1 : VELOCITY + 1 + dim, :dim] = start.speed_variance * np.eye(dim)
+        rows[PROTECTION, 2] = UNAVAILABLE
+        self._in_use.begin(start.used)
+        rx_ticks, in_use = observation.rx_ticks_tag, self._in_use
+        time_s = self._time.time_s(rx_ticks + self._master_less_tag_ticks, rx_ticks)
+        return Fix(
+            time_s, rows.tobytes(), in_use.anchors, in_use.anchors_m, "joint", self._height_known, 1, self._requirement
+        )
+
+    def _fix(self, observation: Observation) -> Fix | NoFixReason:
+        in_use, estimator, known = self._in_use, self._estimator, self._height_known
+        if not known and estimator.state.P.item(2, 2) > in_use.extent_m**2:
+            return NoFixReason.BAD_GEOMETRY
+        rx_ticks = observation.rx_ticks_tag
+        time_s = self._time.time_s(rx_ticks + self._master_less_tag_ticks, rx_ticks)
+        # in the order of the fields: with their names it takes as long as all the rest
+        return Fix(
+            time_s, estimator.rows.tobytes(), in_use.anchors, in_use.anchors_m, "joint", known, 1, self._requirement
+        )
+
+
+def _nearest(start: Start, most: int) -> set[int]:
+    """The anchors of a start that are nearest to its position, and those that do not fit."""
+    dim = len(start.solution) - 1
+    away = [float(np.linalg.norm(one.anchor_m[:dim] - start.solution[:dim])) for one in start.used]
+    nearest = np.argsort(away, kind="stable")[:most]
+    return {start.used[index].anchor for index in nearest} | set(start.misfitting)
+
+
+# Anchors in use
+
+
+# An anchor counts as in use while its last accepted message is younger, or a superframe and a half.
+MIN_IN_USE_S: Final = 0.1
+
+
+class AnchorsInUse:
+    """The anchors whose messages were accepted lately; their list is made again only when it changes."""
+
+    def __init__(self, superframe_s: float) -> None:
+        self._in_use_s = max(MIN_IN_USE_S, 1.5 * superframe_s)
+        self._used: dict[int, Observation] = {}
+        self._checked_ticks = 0
+        self.anchors: tuple[int, ...] = ()
+        self.anchors_m: Array = np.empty((0, 3))
+        """Their positions, shape (len(anchors), 3)."""
+        self.extent_m = 0.0
+        """The largest span in x, y or z that anchors in use have had since the start."""
+
+    def state(self) -> AnchorsInUseState:
+        """All that it keeps."""
+        anchors_m = tuple((x, y, z) for x, y, z in self.anchors_m.tolist())
+        return AnchorsInUseState(tuple(self._used.values()), self._checked_ticks, anchors_m, self.extent_m)
+
+    def restore(self, state: AnchorsInUseState) -> None:
+        """Continue from a state."""
+        self._used = {observation.anchor: observation for observation in state.used}
+        self._checked_ticks, self.extent_m = state.checked_ticks, state.extent_m
+        self.anchors, self.anchors_m = tuple(self._used), np.array(state.anchors_m).reshape(len(self._used), 3)
+
+    def begin(self, observations: tuple[Observation, ...]) -> None:
+        """Forget all anchors but those of these observations."""
+        self._used.clear()
+        self.extent_m = 0.0
+        for observation in observations:
+            self.add(observation)
+
+    def add(self, observation: Observation) -> None:
+        """Add an accepted message."""
+        now = observation.rx_ticks_tag
+        before = self._used.get(observation.anchor)
+        changed = before is None or before.anchor_m is not observation.anchor_m
+        self._used[observation.anchor] = observation
+        if (now - self._checked_ticks) * TICK_S > self._in_use_s:
+            self._checked_ticks = now
+            stale = [a for a, o in self._used.items() if (now - o.rx_ticks_tag) * TICK_S > self._in_use_s]
+            changed = changed or bool(stale)
+            for anchor in stale:
+                del self._used[anchor]
+        if changed:
+            self.anchors = tuple(self._used)
+            self.anchors_m = np.array([o.anchor_m for o in self._used.values()])
+            self.extent_m = max(self.extent_m, float(np.ptp(self.anchors_m, axis=0).max()))
+
+    def mean_range_m(self, position_m: Array) -> float:
+        """From a position, shape (2,) or (3,), to the anchors."""
+        away = self.anchors_m[:, : len(position_m)] - position_m
+        return float(np.linalg.norm(away, axis=1).mean())
+
+
+# The master's own counter
+
+
+FARTHEST_LENGTHS: Final = 16  # lines are extended by this number of times their length
+MISFIT_SUBTICKS: Final = 64  # by which a master's packets may lie off the line: roundings, extended that far
+
+SITE_TIME_MASK: Final = SUBTICKS * (TICK_MASK + 1) - 1
+
+
+class MasterScale:
+    """The master's own counter against the site's time, which it may continue at another rate than its own."""
+
+    def __init__(self) -> None:
+        self._master_term: MasterTerm | None = None
+        self._points: tuple[tuple[int, int], ...] = ()
+        """Site time in subticks and its lead on the master's counter, of the first and the last packet of the term."""
+
+    def state(self) -> MasterScaleState:
+        """All that it keeps; in 64 bits, which subticks exceed."""
+        points = ((*divmod(site, SUBTICKS), *divmod(lead, SUBTICKS)) for site, lead in self._points)
+        return MasterScaleState(self._master_term, tuple(points))
+
+    def restore(self, state: MasterScaleState) -> None:
+        """Continue from a state."""
+        self._master_term = state.master_term
+        self._points = tuple((site * SUBTICKS + a, lead * SUBTICKS + b) for site, a, lead, b in state.points)
+
+    def update(self, observation: Observation) -> None:
+        """Process a packet of the master."""
+        master_term = observation.master_term
+        if master_term is None or observation.anchor != master_term.master:
+            return
+        site, lead = _site_time(observation)
+        if master_term != self._master_term:
+            self._master_term, self._points = master_term, ((site, lead),)
+        elif site > self._points[-1][0]:
+            expected = self._lead(site)
+            fits = len(self._points) < 2 or (expected is not None and abs(expected - lead) <= MISFIT_SUBTICKS)
+            self._points = (self._points[0], (site, lead)) if fits else ((site, lead),)
+
+    def difference(self, observation: Observation) -> int | None:
+        """The sender's reading less the master's at its TX stamp, in subticks modulo 2⁴⁸; None while not known."""
+        master_term, ticks = observation.master_term, observation.tx_ticks_master
+        if master_term is None or ticks is None or master_term != self._master_term:
+            return None
+        site = ticks * SUBTICKS + round(observation.tx_fraction_ticks * SUBTICKS)
+        lead = self._lead(site)
+        return None if lead is None else (lead - site + observation.tx_ticks_anchor * SUBTICKS) & SITE_TIME_MASK
+
+    def _lead(self, site: int) -> int | None:
+        """Lead of the site's time on the master's counter, on a straight line; None too far from what is known."""
+        if len(self._points) < 2:
+            return None
+        (first, before), (last, lead) = self._points
+        length, beyond = last - first, site - last
+        return lead + (lead - before) * beyond // length if 0 <= beyond <= FARTHEST_LENGTHS * length else None
+
+
+def _site_time(observation: Observation) -> tuple[int, int]:
+    """Site time in subticks, and by how much it is ahead of the sender's counter."""
+    assert observation.tx_ticks_master is not None
+    site = observation.tx_ticks_master * SUBTICKS + round(observation.tx_fraction_ticks * SUBTICKS)
+    return site, site - observation.tx_ticks_anchor * SUBTICKS

@@ -1,0 +1,233 @@
+"""``TrustedReceiver``: a tag that verifies beacons with its site's public key. Like ``Receiver`` it does no I/O.
+
+It runs the same ``Receiver`` on frames that have been verified, which is 0.4 to 0.6 s behind. Where that is all that
+is wanted (trust ``verified``), its fixes are given. Else (``open``) a second one processes each plausible frame at
+once, and its fixes are given. When a frame that it used turns out to be forged, it continues from the state of the
+first one, at once if these are few, else when they have become few; until then fixes are those of verified frames.
+"""
+
+import copy
+from collections import Counter, deque
+from collections.abc import Iterable
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from skyless.core.air.beacon import Beacon
+from skyless.core.air.frame import Malformed
+from skyless.core.air.reception import Reception
+from skyless.core.constants import TICK_S
+from skyless.core.fix import Fix
+from skyless.core.keys.fault import Fault
+from skyless.core.keys.key_chain import public_key
+from skyless.core.keys.verifier import LONGEST_WAIT_TICKS, ReceivedFrame, Verifier
+from skyless.core.protocols import decode_any
+from skyless.core.tag.observations import FixTime
+from skyless.core.tag.receiver import Receiver
+from skyless.core.ticks import from_seconds
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+SHARE_TICKS: Final = from_seconds(1.0)
+"""Shares are of the beacons received within this time."""
+
+MAX_IN_SHARE: Final = 4096
+"""More frames than a radio receives in that time."""
+
+MAX_FORGED: Final = 0.1
+"""Plausible frames that turned out to be forged, for each genuine one of the same time: where there are more, fixes are
+those of verified frames. Fewer are what gates and consistency checks of the estimator are for."""
+
+_NOT_FORGED: Final = (Fault.NO_KEY, Fault.FIRST)
+
+
+class Trust(StrEnum):
+    """Which fixes a tag gives."""
+
+    OPEN = "open"
+    """Each at once, unless frames are forged; it states how far it is verified."""
+    VERIFIED = "verified"
+    """Only those of verified beacons, 0.4 to 0.6 s later."""
+
+
+class SiteTrust(Struct, frozen=True):
+    """Which beacons a tag accepts."""
+
+    site: int
+    public: bytes
+    """The site's public key, 32 bytes."""
+    least_serial: int = 0
+    """Key chains with lower serial numbers have been revoked."""
+    trust: Trust = Trust.OPEN
+    clock_bound_s: float = 0.1
+    """How far the tag's clock may be from those of the anchors."""
+
+
+class GivenFix(Struct, frozen=True, gc=False):
+    """A fix, and the reception that made it: the last one that it contains."""
+
+    fix: Fix
+    reception: Reception
+
+
+class TrustedReceiver:
+    """One listening tag that knows its site's public key."""
+
+    def __init__(
+        self, trust: SiteTrust, new_receiver: "Callable[[], Receiver]", certificates: Iterable[bytes] = ()
+    ) -> None:
+        """``new_receiver`` makes a receiver that has heard nothing; ``certificates``: those of an earlier run.
+
+        Raises:
+            ValueError: the public key has not 32 bytes.
+        """
+        self.trust = trust
+        self.counters: Counter[str] = Counter()
+        """Frames that were refused, by the reason."""
+        self.verifier = Verifier(
+            trust.site,
+            public_key(trust.public),
+            trust.clock_bound_s,
+            self.counters,
+            least_serial=trust.least_serial,
+            certificates=certificates,
+        )
+        self._verified = new_receiver()
+        self._live = new_receiver() if trust.trust is Trust.OPEN else None
+        """None after forged frames as well."""
+        self._forged_ticks: deque[int] = deque(maxlen=MAX_IN_SHARE)
+        """When plausible frames of the last seconds were received that turned out to be forged."""
+        self._genuine_ticks: deque[int] = deque(maxlen=MAX_IN_SHARE)
+        """When the verified frames of the last second were received."""
+        self._verified_ticks: int | None = None
+        """When the newest verified frame was received."""
+        self._used = 0
+        """Number of the frames that wait and that the live receiver has used."""
+        self._live_ticks: int | None = None
+        """When the last one of these was received."""
+        self._given_ticks: int | None = None
+        self._first_time: FixTime | None = None
+        """From where times of fixes count."""
+
+    @property
+    def receiver(self) -> Receiver:
+        """The one whose fixes are given."""
+        return self._verified if self._live is None else self._live
+
+    @property
+    def is_verified(self) -> bool:
+        """Whether beacons have been verified that were among those of the last seconds."""
+        until_ticks = self._verified_ticks
+        return until_ticks is not None and self.verifier.newest_ticks - until_ticks < LONGEST_WAIT_TICKS
+
+    def faults(self) -> dict[int, Fault]:
+        """Anchors whose beacons, or beacons in whose name, were not accepted within the last seconds."""
+        return self.verifier.faults()
+
+    def hear(self, reception: Reception, unix_s: float) -> list[GivenFix]:
+        """Process a frame from the air, received at that time of the host's clock; the fixes that it makes possible.
+
+        They are in the order of their times. Nothing on the air raises.
+        """
+        beacon = decode_any(reception.frame)
+        if isinstance(beacon, Malformed):
+            self.counters[beacon] += 1
+            return []
+        if not isinstance(beacon, Beacon) or beacon.site != self.trust.site:
+            self.counters["foreign-site"] += 1
+            return []
+        frame = self.verifier.add(beacon, reception, unix_s)
+        given = self._verify()
+        if frame is not None:
+            given += self._use(frame)
+        return [one for ticks, one in given if self._is_next(ticks)]
+
+    def _is_next(self, rx_ticks: int) -> bool:
+        """Whether a fix is later than those that were given."""
+        if self._given_ticks is not None and rx_ticks <= self._given_ticks:
+            return False
+        self._given_ticks = rx_ticks
+        return True
+
+    def _use(self, frame: ReceivedFrame) -> list[tuple[int, GivenFix]]:
+        """Let the live receiver process a frame that is plausible and that it has not processed yet; its fix."""
+        if self._live is None or not frame.is_plausible or frame.rx_ticks == self._live_ticks:
+            return []
+        self._used += 1
+        self._live_ticks = frame.rx_ticks
+        fix = self._live.hear_beacon(frame.beacon, frame.reception)
+        if fix is None:
+            return []
+        self._first_time = self._first_time or copy.copy(self._live.state().admission.time)
+        return [(frame.rx_ticks, GivenFix(self._with_trust(fix, frame.rx_ticks), frame.reception))]
+
+    def _verify(self) -> list[tuple[int, GivenFix]]:
+        """Process the frames that are decided; fixes of the genuine ones, and those of a live receiver that returns."""
+        given, is_other = [], False
+        for one, fault in self.verifier.decided():
+            if self._live is not None and one.is_plausible:
+                self._used -= 1
+            is_other |= one.is_plausible is not (fault is None)
+            if fault is not None:
+                if one.is_plausible and fault not in _NOT_FORGED:
+                    self._forged_ticks.append(one.rx_ticks)
+                continue
+            if self._verified_ticks is None:
+                self._begin_verified()
+            self._verified_ticks = one.rx_ticks
+            self._genuine_ticks.append(one.rx_ticks)
+            fix = self._verified.hear_beacon(one.beacon, one.reception)
+            if fix is not None:
+                given.append((one.rx_ticks, GivenFix(self._with_trust(fix, one.rx_ticks), one.reception)))
+        if self.trust.trust is Trust.OPEN:
+            if self._is_attacked():
+                self._leave_live()
+            elif self._live is None or is_other:
+                given += self._return_live()
+        return given
+
+    def _begin_verified(self) -> None:
+        """Let the verified receiver count time from the first fix of the live one."""
+        if self._live is None or self._first_time is None or self._verified.counters["fixes"]:
+            return
+        state, live = self._verified.state(), self._live.state()
+        admission = replace(state.admission, time=self._first_time, own_ticks=copy.copy(live.admission.own_ticks))
+        state = replace(state, admission=admission)
+        self._verified = Receiver.from_state(state)
+
+    def _is_attacked(self) -> bool:
+        """Whether many of the plausible frames of the last seconds have turned out to be forged."""
+        oldest_ticks = self.verifier.newest_ticks - SHARE_TICKS
+        return _since(oldest_ticks, self._forged_ticks) > MAX_FORGED * _since(oldest_ticks, self._genuine_ticks)
+
+    def _leave_live(self) -> None:
+        """Give fixes of verified frames only: the live receiver has used forged ones, or would have."""
+        if self._live is not None:
+            self._begin_verified()
+            self._verified.counters |= self._live.counters  # what is reported must not go back
+        self._live, self._used = None, 0
+
+    def _return_live(self) -> list[tuple[int, GivenFix]]:
+        """Let the live receiver continue from the verified one with the plausible frames that wait; its fixes."""
+        self._live = Receiver.from_state(copy.deepcopy(self._verified.state()))
+        self._used, self._live_ticks = 0, None
+        return [given for one in self.verifier.waiting() for given in self._use(one)]
+
+    def _with_trust(self, fix: Fix, rx_ticks: int) -> Fix:
+        """The fix with how far it is verified."""
+        until_ticks = self._verified_ticks
+        if until_ticks is None:
+            return fix
+        unverified = self._used if rx_ticks > until_ticks else 0
+        share = unverified / max(unverified + _since(rx_ticks - SHARE_TICKS, self._genuine_ticks), 1)
+        return replace(fix, verified_until_s=fix.time_s - max(rx_ticks - until_ticks, 0) * TICK_S, unverified=share)
+
+
+def _since(oldest_ticks: int, ticks: deque[int]) -> int:
+    """Number of receptions since a time; earlier ones are forgotten."""
+    while ticks and ticks[0] < oldest_ticks:
+        ticks.popleft()
+    return len(ticks)

@@ -1,5 +1,0 @@
-"""How a site is: what its messages show, and the reasons why its page is green, amber or red.
-
-Public: evidence, leader, monitor.
-Within the package: authentication_reasons, lateness, reasons, roster.
-"""

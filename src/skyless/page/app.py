@@ -1,0 +1,297 @@
+"""The server's addresses: the page, its data, and the live stream."""
+
+import asyncio
+import mimetypes
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any, Final, TypeVar
+from urllib.parse import quote
+
+import msgspec
+from msgspec import Struct
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from skyless.core.errors import SkylessError
+from skyless.page.geojson import MEDIA_TYPE
+from skyless.page.guard import AccessRules, Guard
+from skyless.page.live import LiveSite, NoBrokerError, NoSiteError, NotAllowedError, TooManyPagesError
+from skyless.page.overlays import KINDS, NoOverlayError, Overlays
+from skyless.page.playback import NoRecordingError, Playback, RecordingFile
+from skyless.page.site_survey import NoResultError
+from skyless.page.sites import LiveSites
+from skyless.page.state import PageRequest
+from skyless.run.mqtt.survey_facts import BadFactsError
+from skyless.run.zones.zone_list import BadZonesError, read_zones
+from skyless.site.file.check import image_size
+
+_PAGE: Final = Path(__file__).parent / "browser"
+PAGE_TIMEOUT_S: Final = 10.0
+"""A page that accepts no message for this long is disconnected."""
+
+_MAX_STATES_S: Final = 60.01
+_MAX_BODY_BYTES: Final = 1_000_000
+MAX_FLOOR_PLAN_BYTES: Final = 8_000_000
+"""As on MQTT (``docs/mqtt.md``). The page's ``survey/plan.js`` has the same limit."""
+
+_T = TypeVar("_T")
+_Endpoint = Callable[[Request], Coroutine[Any, Any, Response]]
+
+_TRY_LATER: Final = 1013
+_GOING_AWAY: Final = 1001
+_STATUSES: Final[dict[type[Exception], int]] = {
+    BadZonesError: 400,
+    BadFactsError: 400,
+    NoRecordingError: 404,
+    NoSiteError: 404,
+    NoResultError: 409,
+    NoOverlayError: 422,
+    NotAllowedError: 403,
+    NoBrokerError: 503,
+}
+
+
+class Services(Struct, frozen=True):
+    """What the server serves."""
+
+    sites: LiveSites
+    overlays: Overlays
+    playback: Playback
+
+
+def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Starlette:
+    """The server's application."""
+    mimetypes.add_type("text/javascript", ".js")  # some systems map it otherwise, and browsers refuse the modules
+    mimetypes.add_type("text/javascript", ".mjs")
+
+    async def index(_request: Request) -> Response:
+        path = page / "index.html"
+        if not path.is_file():
+            raise HTTPException(404, "this installation has no page")
+        return FileResponse(path, headers={"Cache-Control": "no-cache"})
+
+    routes = [
+        Route("/", index),
+        Route("/fixes.geojson", _fixes),
+        Route("/api/floor_plan", _floor_plan),
+        Route("/api/floor_plan", _put_floor_plan, methods=["PUT"]),
+        Route("/api/overlay", _overlay),
+        Route("/api/zones", _put_zones, methods=["PUT"]),
+        Route("/api/survey/facts", _put_facts, methods=["PUT"]),
+        Route("/api/survey/save", _save_survey, methods=["POST"]),
+        Route("/api/recordings", _recordings),
+        Route("/api/recordings/{name}", _recorded(Playback.summary, _json)),
+        Route("/api/recordings/{name}/events", _recorded(Playback.events, _json)),
+        Route("/api/recordings/{name}/file", _recorded(Playback.open_file, _download)),
+        Route("/api/recordings/{name}/states", _recorded_states),
+        Route("/api/recordings/{name}/floor_plan", _recorded(Playback.floor_plan, _image)),
+        WebSocketRoute("/live", _live),
+        Mount("/page", _Files(directory=page, check_dir=False)),
+    ]
+    app = Starlette(
+        routes=routes,
+        middleware=[Middleware(Guard, rules=rules)],
+        exception_handlers=dict.fromkeys((HTTPException, *_STATUSES), _error),
+    )
+    app.state.services = services
+    return app
+
+
+class _Files(StaticFiles):
+    """Files that browsers check for changes each time."""
+
+    def file_response(self, *args: object, **kwargs: object) -> Response:
+        response = super().file_response(*args, **kwargs)  # type: ignore[arg-type]
+        response.headers["Cache-Control"] = "no-cache"
+        return response
+
+
+async def _error(_request: Request, error: Exception) -> Response:
+    if isinstance(error, HTTPException):
+        return JSONResponse({"error": error.detail}, status_code=error.status_code)
+    return JSONResponse({"error": str(error)}, status_code=_STATUSES[type(error)])
+
+
+def _json(value: object) -> Response:
+    return Response(msgspec.json.encode(value), media_type="application/json")
+
+
+def _services(request: Request | WebSocket) -> Services:
+    services: Services = request.app.state.services
+    return services
+
+
+def _live_of(request: Request) -> LiveSite:
+    """The site that ``?site=NUMBER`` names. Raises NoSiteError."""
+    return _services(request).sites.of(request.query_params.get("site"))
+
+
+async def _fixes(request: Request) -> Response:
+    try:
+        features = _live_of(request).features()
+    except SkylessError as error:
+        raise HTTPException(409, str(error)) from None
+    return Response(features, media_type=MEDIA_TYPE, headers={"Cache-Control": "no-store"})
+
+
+async def _floor_plan(request: Request) -> Response:
+    return _image(_live_of(request).floor_plan)
+
+
+def _image(image: bytes | None) -> Response:
+    kind = _image_type(image) if image is not None else None
+    if image is None or kind is None:
+        raise HTTPException(404, "no floor plan is known")
+    return Response(image, media_type=kind)
+
+
+def _image_type(image: bytes) -> str | None:
+    """Media type of a PNG or JPEG, or None for anything else, which is not served."""
+    if image.startswith(b"\x89PNG\r\n\x1a\n"):
+        return "image/png"
+    return "image/jpeg" if image.startswith(b"\xff\xd8\xff") else None
+
+
+async def _overlay(request: Request) -> Response:
+    overlays, live = _services(request).overlays, _live_of(request)
+    kind = request.query_params.get("kind", "pdop")
+    if kind not in KINDS:
+        raise HTTPException(400, f"kind is {kind!r}; it should be one of {', '.join(KINDS)}")
+    step_m = _number(request, "step_m", 0.25, 0.01, 100.0)
+    if live.site is None:
+        raise HTTPException(404, "no site is known yet")
+    return _json(await overlays.get(live.site.whole_site, live.floor_plan, live.state.methods(), kind, step_m))
+
+
+def _number(request: Request, name: str, default: float, least: float, most: float) -> float:
+    text = request.query_params.get(name)
+    try:
+        value = default if text is None else float(text)
+    except ValueError:
+        value = float("nan")
+    if not least <= value <= most:
+        raise HTTPException(400, f"{name} is {text!r}; it should be a number from {least:g} to {most:g}")
+    return value
+
+
+async def _put_floor_plan(request: Request) -> Response:
+    image = await _body(request, MAX_FLOOR_PLAN_BYTES, f"the image is larger than {MAX_FLOOR_PLAN_BYTES // 10**6} MB")
+    if _image_type(image) is None or image_size(image) is None:
+        raise HTTPException(400, "this is no image that can be read; it should be a PNG or JPEG")
+    _live_of(request).store_floor_plan(image)
+    return _json({"bytes": len(image)})
+
+
+async def _put_facts(request: Request) -> Response:
+    live = _live_of(request)
+    message = live.survey.facts_message(await _body(request, _MAX_BODY_BYTES, "too many facts"))
+    live.publish_survey(message)
+    return _json(message)
+
+
+async def _save_survey(request: Request) -> Response:
+    live = _live_of(request)
+    message = live.survey.save_message(await _body(request, _MAX_BODY_BYTES, "the request is too long"))
+    live.publish_survey(message)
+    return _json(message)
+
+
+async def _body(request: Request, most_bytes: int, fault: str) -> bytes:
+    """The request's body. One that is too long is answered with status 413 and the given words."""
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > most_bytes:
+            raise HTTPException(413, fault)
+    return bytes(body)
+
+
+async def _put_zones(request: Request) -> Response:
+    body = await _body(request, _MAX_BODY_BYTES, "too many zones")
+    live = _live_of(request)
+    message = read_zones(body)
+    live.store_zones(message.zones, message.site)
+    return _json({"zones": live.monitor.zones})
+
+
+async def _recordings(request: Request) -> Response:
+    return _json(await asyncio.to_thread(_services(request).playback.recordings))
+
+
+def _recorded(read: Callable[[Playback, str], _T], answer: Callable[[_T], Response]) -> _Endpoint:
+    """Answers with a part of a recording, which is read in a thread."""
+
+    async def respond(request: Request) -> Response:
+        return answer(await asyncio.to_thread(read, _services(request).playback, request.path_params["name"]))
+
+    return respond
+
+
+def _download(found: RecordingFile) -> Response:
+    headers = {
+        "Content-Disposition": f"attachment; filename*=utf-8''{quote(found.name, safe='')}",
+        "Content-Length": str(found.size_bytes),
+    }
+    return StreamingResponse(found.pieces(), media_type="application/octet-stream", headers=headers)
+
+
+async def _recorded_states(request: Request) -> Response:
+    begin_s = _number(request, "from_s", 0.0, 0.0, 1e9)
+    end_s = _number(request, "to_s", begin_s + 10.0, 0.0, 1e9)
+    rate_hz = _number(request, "rate_hz", 20.0, 0.1, 100.0)
+    if not begin_s <= end_s <= begin_s + _MAX_STATES_S:
+        raise HTTPException(400, f"to_s is {end_s:g}; it should be at most 60 s after from_s, which is {begin_s:g}")
+    playback, name = _services(request).playback, request.path_params["name"]
+    states = await asyncio.to_thread(playback.states, name, begin_s, end_s, rate_hz)
+    return Response(b'{"states":[' + b",".join(states) + b"]}", media_type="application/json")
+
+
+async def _live(socket: WebSocket) -> None:
+    sites = _services(socket).sites
+    try:
+        live = sites.of(socket.query_params.get("site"))
+    except NoSiteError:  # a page that was open before the server's start, of a site that is gone
+        live = sites.of(None)
+    await socket.accept()  # a browser does not show a page why its socket was refused, only why it was closed
+    try:
+        page = live.open_page(socket.client.host if socket.client is not None else "")
+    except TooManyPagesError as error:
+        await socket.close(_TRY_LATER, str(error))
+        return
+
+    def receive(text: str) -> None:
+        live.keep_page(page)
+        wanted = None if text == "ping" else PageRequest.read(text)
+        if text == "ping":
+            page.replace("pong", b'{"type":"pong"}')
+        elif wanted is not None:
+            page.ask(wanted)
+
+    reading = asyncio.create_task(_read(socket, page.close, receive))
+    try:
+        while not page.closed:
+            messages = await page.drain(live.state)
+            async with asyncio.timeout(PAGE_TIMEOUT_S):
+                for message in messages:
+                    await socket.send_text(message)
+        await socket.close(_GOING_AWAY, page.reason)
+    except (WebSocketDisconnect, RuntimeError, TimeoutError):
+        pass  # the page was closed meanwhile, or does not respond
+    finally:
+        live.pages.discard(page)
+        reading.cancel()
+
+
+async def _read(socket: WebSocket, close: Callable[[], None], receive: Callable[[str], None]) -> None:
+    """Hand over what the page sends until it closes."""
+    try:
+        while True:
+            receive(await socket.receive_text())
+    except (WebSocketDisconnect, KeyError, RuntimeError):
+        close()

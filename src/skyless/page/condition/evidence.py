@@ -1,0 +1,379 @@
+"""What is known of the live site's programs, and since when: the evidence of its condition. No I/O.
+
+``now_s`` is the page server's monotonic clock everywhere, ``unix_s`` its clock of the day.
+"""
+
+from collections import deque
+from pathlib import Path
+from typing import Final
+
+from skyless.core.site import Site
+from skyless.run.mqtt.messages import AnchorHealth, EtherHealth, FixMessage, StatusMessage, TagHealth
+
+Health = TagHealth | AnchorHealth | EtherHealth
+
+FRESH_S: Final = 2.5
+"""Fixes and health messages older than this are no evidence."""
+
+GRACE_S: Final = 5.0
+"""A tag that has just started may be without a fix for this long, and an anchor without a report."""
+
+ALERTS: Final[dict[str | None, int]] = {"detected-excluded": 1, "detected-not-excluded": 2, "alert-limit-exceeded": 2}
+"""Integrity alerts that are reported: 1 where the position is still sound, 2 where it may be wrong."""
+
+ALERT_WORDS: Final = {
+    "detected-excluded": "a faulty anchor is excluded",
+    "detected-not-excluded": "a fault is not excluded, so that the position may be wrong",
+    "alert-limit-exceeded": "the protection level is above the alert limit",
+}
+
+MAX_NAMES: Final = {"tag": 200_000, "anchor": 20_000}
+"""Names of a kind that are taken in."""
+
+MAX_OTHERS: Final = 2_000
+"""Names of all other kinds together."""
+
+_COUNT_S: Final = 10.0
+"""Names that were not taken in are counted again after this time, so that the count falls when they end."""
+
+_WINDOW_S: Final = 60.0
+_HEALTH_AGE_S: Final = 2.5  # the delay of a health message holds for this long
+
+_RECENT_S: Final = 10.0
+"""Percentiles are of the ages of this time, so that they are steady where tags have a fix a second."""
+
+_MAX_AGES: Final = 4096  # of more fixes the newest count
+
+_LEADER_AGE_S: Final = 3.5  # an anchor whose health is older does not count
+_MAX_CHANGES: Final = 100
+
+USE_WINDOW_S: Final = 2.0
+"""Time over which the use is averaged."""
+
+_IDLE, _IO_WAIT = 3, 4
+"""Columns of the first line of ``/proc/stat`` that count time in which a processor had nothing to do."""
+
+
+class Node:
+    """A tag, an anchor or the emulated air."""
+
+    __slots__ = ("alert", "codes_s", "fix_s", "health", "health_s", "host", "online", "previous", "since_s", "used_s")
+
+    def __init__(self) -> None:
+        self.online: bool | None = None  # by its status; None without one
+        self.host = ""  # name of its computer; empty where it is not known
+        self.health: Health | None = None
+        self.previous: Health | None = None  # the health before
+        self.since_s: float | None = None  # when it came online, or its first message came
+        self.health_s = float("-inf")  # when the last health came
+        self.fix_s = float("-inf")  # when the last fix came
+        self.used_s = float("-inf")  # when the last fix came that used it as an anchor
+        self.alert: str | None = None  # the worst of its fixes since the last evaluation
+        self.codes_s: float | None = None  # since when it states that its beacons have codes
+
+    def begin(self, now_s: float) -> None:
+        """It is there since now, unless it has been before."""
+        if self.since_s is None:
+            self.since_s = now_s
+
+    def reports(self, now_s: float) -> bool:
+        """Whether it is online and its health is fresh."""
+        return self.online is not False and now_s - self.health_s < FRESH_S
+
+    def has_fix(self, now_s: float) -> bool:
+        """Whether a fix has come recently."""
+        return now_s - self.fix_s < FRESH_S
+
+    def codes_for_s(self, now_s: float) -> float:
+        """For how long its beacons have had codes, as it states, or 0 where they have none."""
+        return 0.0 if self.codes_s is None else now_s - self.codes_s
+
+
+class Evidence:
+    """The newest of every node's messages, and when they came."""
+
+    def __init__(self, host: str, now_s: float) -> None:
+        """``host`` is this computer's name, as nodes state theirs."""
+        self.host = host
+        self.connected = False
+        self.ready_s = now_s  # when it began to wait for messages
+        self.site: Site | None = None
+        self.nodes: dict[tuple[str, str], Node] = {}  # by kind and name
+        self.roster = Roster()
+        self._sorted: dict[str, list[tuple[str, Node]]] = {}
+        self.ages = FixAges()
+        self.leader = LeaderTracker()
+
+    def set_connected(self, *, connected: bool, now_s: float) -> None:
+        """Whether the broker is connected."""
+        if connected != self.connected:
+            self.connected, self.ready_s = connected, now_s
+
+    def set_site(self, site: Site, now_s: float) -> None:
+        """Which anchors there should be."""
+        if self.site is None:
+            self.ready_s = now_s
+        self.site = site
+        self.site_anchors()
+
+    def site_anchors(self) -> list[str]:
+        """The names of the site's anchors that are taken in."""
+        site = self.site
+        ids = [] if site is None else [*(a.id for a in site.anchors), *(a.id for a in site.unplaced)]
+        return [name for name in map(str, ids) if self.roster.admits("anchor", name)]
+
+    def add_status(self, status: StatusMessage, now_s: float) -> None:
+        """Whether a node is online."""
+        node = self._node(status.kind, status.name)
+        if node is None:
+            return
+        if status.online and not node.online:
+            node.since_s = now_s
+        node.online, node.host = status.online, status.host or node.host
+        if not status.online:
+            node.alert, node.previous, node.codes_s = None, None, None
+            self.ages.remove(status.name)
+
+    def add_health(self, kind: str, name: str, health: Health, now_s: float, unix_s: float) -> None:
+        """A node's health."""
+        node = self._node(kind, name)
+        if node is None:
+            return
+        node.begin(now_s)
+        node.previous, node.health, node.health_s = node.health, health, now_s
+        if isinstance(health, AnchorHealth):
+            if health.chain is None or health.code_fault is not None:
+                node.codes_s = None
+            elif node.codes_s is None:
+                node.codes_s = now_s
+            self.leader.update(health, now_s)
+        elif isinstance(health, TagHealth) and node.host == self.host:
+            self.ages.add_health(name, unix_s - health.unix_s, now_s)
+
+    def add_fix(self, fix: FixMessage, now_s: float) -> float:
+        """A fix of a tag. Returns its age as ``FixAges`` has it, in s."""
+        node = self._node("tag", fix.tag)
+        if node is None:
+            return 0.0
+        node.begin(now_s)
+        node.fix_s = now_s
+        if ALERTS.get(fix.alert, 0) > ALERTS.get(node.alert, 0):
+            node.alert = fix.alert
+        for anchor in fix.anchors:
+            used = self._node("anchor", str(anchor))
+            if used is not None:
+                used.used_s = now_s
+        return self.ages.add_fix(fix.tag, fix.unix_s, fix.latency_s, now_s)
+
+    def of(self, kind: str) -> list[tuple[str, Node]]:
+        """Names and nodes of a kind, in their natural order."""
+        if kind not in self._sorted:
+            found = [(name, node) for (of_kind, name), node in self.nodes.items() if of_kind == kind]
+            found.sort(key=lambda item: (len(item[0]) if item[0].isdecimal() else 1 << 30, item[0]))
+            self._sorted[kind] = found
+        return self._sorted[kind]
+
+    def in_grace(self, now_s: float, node: Node | None = None) -> bool:
+        """Whether the connection, or a node, is too young to be complete."""
+        since_s = self.ready_s if node is None or node.since_s is None else max(node.since_s, self.ready_s)
+        return now_s - since_s < GRACE_S
+
+    def computer(self, host: str) -> str:
+        """Words for a computer. An unknown one counts as this one."""
+        return "this computer" if host in {"", self.host} else f"computer {host}"
+
+    def _node(self, kind: str, name: str) -> Node | None:
+        node = self.nodes.get((kind, name))
+        if node is None and self.roster.admits(kind, name):
+            node = self.nodes[kind, name] = Node()
+            self._sorted.pop(kind, None)
+        return node
+
+
+# Names that are taken in
+
+
+class Roster:
+    """The names of one site."""
+
+    def __init__(self) -> None:
+        self._names: dict[str, set[str]] = {}
+        self._left_out: dict[str, set[int]] = {}  # hashes of the names that were not taken in since the last count
+        self._counted: dict[str, int] = {}
+        self._counted_s = float("-inf")
+
+    def admits(self, kind: str, name: str) -> bool:
+        """Whether a name is taken in: the first ones are, for good."""
+        group, entry, most = kind, name, MAX_NAMES.get(kind)
+        if most is None:
+            group, entry, most = "", f"{kind}/{name}", MAX_OTHERS
+        names = self._names.setdefault(group, set())
+        if entry in names:
+            return True
+        if len(names) < most:
+            names.add(entry)
+            return True
+        left_out = self._left_out.setdefault(group, set())
+        if len(left_out) < most:
+            left_out.add(hash(entry))
+        return False
+
+    def size(self, kind: str) -> int:
+        """How many names of a kind are taken in."""
+        return len(self._names.get(kind, ()))
+
+    def left_out(self, kind: str, now_s: float) -> int:
+        """How many names of a kind, tag or anchor, were not taken in. At most as many as are taken in are counted."""
+        if now_s - self._counted_s >= _COUNT_S:
+            self._counted = {group: len(names) for group, names in self._left_out.items()}
+            self._left_out, self._counted_s = {}, now_s
+        return max(self._counted.get(kind, 0), len(self._left_out.get(kind, ())))
+
+
+# Ages of fixes
+
+
+class _Tag:
+    """Delays of one tag's messages: ``now_s`` of arrival less ``unix_s`` of sending, so with the clocks' difference."""
+
+    __slots__ = ("before_s", "begun_s", "delay_s", "delay_seen_s", "least_age_s", "least_s", "made_s", "unix_s")
+
+    def __init__(self, now_s: float) -> None:
+        self.begin(now_s)
+        self.unix_s = float("-inf")  # of the last fix
+        self.delay_s, self.delay_seen_s = 0.0, float("-inf")
+        """Of the last health message, where this computer sent it, and when it arrived."""
+        self.least_age_s: float | None = None  # of the fixes since the last ``least_ages_s``
+        self.made_s = 0.0  # its part until the fix was made
+
+    def begin(self, now_s: float) -> None:
+        """Begin the window. What was before does not count."""
+        self.begun_s = now_s
+        self.least_s = self.before_s = float("inf")  # the least in the window that has begun, and in the one before
+
+
+class FixAges:
+    """Ages of fixes on arrival, by the page server's monotonic clock: the least of each tag, and all of them together.
+
+    A fix was made ``latency_s`` after its last frame by one clock, the tag's, so that part is exact. How long its
+    message then travelled follows, for tags of this computer, from their health messages. For others it is measured
+    against the tag's quickest message in the last one to two minutes, so that clocks which differ, or are set, raise no
+    alarm. A delay that was the same from the first message on therefore looks like a clock that differs. A fix whose
+    time is before that of the fix before it shows that the clock was set back: then the minutes begin again.
+    """
+
+    def __init__(self) -> None:
+        self._tags: dict[str, _Tag] = {}
+        self._recent: deque[tuple[float, float]] = deque(maxlen=_MAX_AGES)  # when fixes arrived, and their ages
+
+    def add_fix(self, name: str, unix_s: float, latency_s: float, now_s: float) -> float:
+        """Add a fix whose last frame ended at ``unix_s`` by the tag's clock, and that arrives now. Returns its age."""
+        tag = self._tags.get(name)
+        if tag is None:
+            tag = self._tags[name] = _Tag(now_s)
+        if unix_s < tag.unix_s:
+            tag.begin(now_s)
+        elif now_s - tag.begun_s >= _WINDOW_S:
+            tag.begun_s, tag.before_s, tag.least_s = now_s, tag.least_s, float("inf")
+        made_s = max(latency_s, 0.0)
+        delay_s = now_s - unix_s - made_s
+        tag.unix_s, tag.least_s = unix_s, min(tag.least_s, delay_s)
+        if now_s - tag.delay_seen_s < _HEALTH_AGE_S:
+            travelled_s = tag.delay_s
+        else:
+            travelled_s = delay_s - min(tag.least_s, tag.before_s)
+        age_s = made_s + travelled_s
+        if tag.least_age_s is None or age_s < tag.least_age_s:
+            tag.least_age_s, tag.made_s = age_s, made_s
+        self._recent.append((now_s, age_s))
+        return age_s
+
+    def add_health(self, name: str, delay_s: float, now_s: float) -> None:
+        """Add how long a health message of a tag of this computer has travelled."""
+        if name in self._tags:
+            self._tags[name].delay_s, self._tags[name].delay_seen_s = max(delay_s, 0.0), now_s
+
+    def least_ages_s(self) -> dict[str, tuple[float, float]]:
+        """By tag: the least age of its fixes since the last call, and the part of it until the fix was made.
+
+        The least, so that a burst of messages that waited for this program for a moment counts as its youngest.
+        """
+        found = {}
+        for name, tag in self._tags.items():
+            if tag.least_age_s is not None:
+                found[name] = tag.least_age_s, tag.made_s
+                tag.least_age_s = None
+        return found
+
+    def percentiles_s(self, now_s: float) -> tuple[float | None, float | None]:
+        """Median and 99th percentile of all ages of the last ``_RECENT_S``, or None without any."""
+        while self._recent and now_s - self._recent[0][0] > _RECENT_S:
+            self._recent.popleft()
+        if not self._recent:
+            return None, None
+        ages = sorted(age_s for _, age_s in self._recent)
+        return ages[(len(ages) - 1) // 2], ages[round(0.99 * (len(ages) - 1))]
+
+    def remove(self, name: str) -> None:
+        """Forget a tag."""
+        self._tags.pop(name, None)
+
+
+# The leader of the site's time, and the processors
+
+
+class LeaderTracker:
+    """Watches the anchors' health. Of several that claim to lead, the newest term counts."""
+
+    def __init__(self) -> None:
+        self.leader: int | None = None
+        self.changes_s: deque[float] = deque(maxlen=_MAX_CHANGES)  # times of the changes, the newest last
+        self._claims: dict[int, tuple[float, int]] = {}  # by anchor that leads: when it last said so, and its term
+
+    def update(self, health: AnchorHealth, time_s: float) -> int | None:
+        """Process a health message. Returns the new leader if the leader has changed."""
+        if health.role in {"master", "root"}:
+            self._claims[health.anchor] = time_s, health.term or 0
+        else:
+            self._claims.pop(health.anchor, None)
+        fresh = {a: term for a, (seen_s, term) in self._claims.items() if abs(time_s - seen_s) <= _LEADER_AGE_S}
+        if not fresh:
+            return None
+        newest = max(fresh, key=lambda anchor: (fresh[anchor], anchor == self.leader, -anchor))
+        if newest == self.leader:
+            return None
+        first = self.leader is None
+        self.leader = newest
+        if first:
+            return None
+        self.changes_s.append(time_s)
+        return newest
+
+
+class ProcessorUse:
+    """Samples the counters of the system."""
+
+    def __init__(self, counters: Path = Path("/proc/stat")) -> None:
+        self._counters = counters
+        self._samples: deque[tuple[float, int, int]] = deque()
+        """Time of the sample, and ticks of all processors together: idle ones and all."""
+
+    def share(self, now_s: float) -> float | None:
+        """Share of all processors' time that was in use in the last ``USE_WINDOW_S``.
+
+        None at first, and where the system does not say.
+        """
+        try:
+            with self._counters.open(encoding="ascii") as counters:
+                ticks = [int(word) for word in counters.readline().split()[1:9]]
+            self._samples.append((now_s, ticks[_IDLE] + ticks[_IO_WAIT], sum(ticks)))
+        except (OSError, ValueError, IndexError):
+            self._samples.clear()
+            return None
+        while len(self._samples) > 1 and now_s - self._samples[1][0] >= USE_WINDOW_S:
+            self._samples.popleft()
+        then_s, idle_then, all_then = self._samples[0]
+        _, idle, all_ = self._samples[-1]
+        if now_s - then_s < USE_WINDOW_S or all_ <= all_then:
+            return None
+        return min(max(1.0 - (idle - idle_then) / (all_ - all_then), 0.0), 1.0)

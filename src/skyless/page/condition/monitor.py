@@ -1,0 +1,154 @@
+"""The condition of the live site, in one word and with reasons. No I/O: the time is passed in.
+
+A reason appears with the first evaluation that finds it and disappears when no evaluation has found it for ``HOLD_S``;
+its level, too, falls only after that time. The condition is good only on fresh evidence: the broker is connected, some
+tag has a fix that has just arrived, and nothing speaks against it. Where nothing is known it is "waiting".
+"""
+
+from collections.abc import Iterable
+from typing import Final, Literal
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from skyless.page.condition.evidence import FRESH_S, Evidence
+from skyless.page.condition.reasons import (
+    LAG_S,
+    Reason,
+    alert_reasons,
+    anchor_reasons,
+    authentication_reasons,
+    behind_reason,
+    broker_reason,
+    busy_reason,
+    fix_reasons,
+    late_reason,
+    left_out_reason,
+    master_reason,
+    multipath_reason,
+    rank,
+    slow_reason,
+    watch_reasons,
+)
+from skyless.run.mqtt.messages import WatchMessage
+
+EVALUATION_S: Final = 0.5
+"""Interval of the evaluations."""
+
+HOLD_S: Final = 3.0
+"""A reason stays for this long after it was last found, so that the page does not flicker."""
+
+
+class Condition(Struct, frozen=True):
+    """How the site is, and why."""
+
+    level: Literal["waiting", "good", "warning", "bad"]
+    text: str
+    """Text of the first reason, or what is being waited for. Empty where all is well."""
+    reasons: tuple[Reason, ...]
+    """The worst first."""
+    latency_p50_s: float | None
+    latency_p99_s: float | None
+    """From a frame's end to the arrival of its fix at the page's server, of all tags in the last ten seconds."""
+    tags: int = 0
+    """How many are known."""
+    tags_with_fix: int = 0
+    anchors: int = 0
+    """Anchors of the site, and others that report."""
+
+
+class ConditionMonitor:
+    """Evaluates evidence, and holds what it has found for a while."""
+
+    def __init__(self, evidence: Evidence) -> None:
+        self.evidence = evidence
+        self._held: dict[str, tuple[float, Reason]] = {}  # by kind: when the reason was last found
+        self._bad_s: dict[str, float] = {}  # by kind: when it was last found to be bad
+        self._blind_until_s = float("-inf")
+
+    def evaluate(
+        self,
+        now_s: float,
+        lag_s: float = 0.0,
+        watch: WatchMessage | None = None,
+        watch_age_s: float | None = None,
+        used_share: float | None = None,
+        unread_s: float = 0.0,
+    ) -> Condition:
+        """The condition now.
+
+        ``lag_s`` is by how much the server's own work was delayed since the last evaluation, ``used_share`` the share
+        of its computer's processors that is in use, None where it is not known; ``unread_s`` is for how long messages
+        have waited in its own queue.
+        """
+        evidence = self.evidence
+        ages = evidence.ages.least_ages_s()
+        latencies = evidence.ages.percentiles_s(now_s)
+        if not evidence.connected:
+            self._held.clear()
+            if not evidence.nodes and now_s - evidence.ready_s < FRESH_S:
+                return Condition("waiting", "waiting for the broker", (), None, None)
+            reason = broker_reason()
+            return Condition(reason.level, reason.text, (reason,), None, None)
+        for reason in (*self._find(ages, now_s, lag_s, used_share, unread_s), *watch_reasons(watch, watch_age_s)):
+            self._hold(reason, now_s)
+        self._held = {kind: held for kind, held in self._held.items() if now_s - held[0] < HOLD_S}
+        tags = evidence.of("tag")
+        for _, tag in tags:
+            tag.alert = None
+        reasons = tuple(sorted((reason for _, reason in self._held.values()), key=rank))
+        with_fix = sum(tag.has_fix(now_s) for _, tag in tags)
+        figures = *latencies, len(tags), with_fix, evidence.roster.size("anchor")
+        if reasons:
+            return Condition(reasons[0].level, reasons[0].text, reasons, *figures)
+        if with_fix:
+            return Condition("good", "", (), *figures)
+        return Condition("waiting", self._awaited(), (), *figures)
+
+    def is_blind(self, now_s: float) -> bool:
+        """Whether messages may be missing: the broker is not connected, or the server itself was delayed."""
+        return not self.evidence.connected or now_s < self._blind_until_s
+
+    def _hold(self, reason: Reason, now_s: float) -> None:
+        if reason.level == "bad":
+            self._bad_s[reason.kind] = now_s
+        elif now_s - self._bad_s.get(reason.kind, float("-inf")) < HOLD_S:
+            reason = replace(reason, level="bad")
+        self._held[reason.kind] = now_s, reason
+
+    def _find(
+        self,
+        ages: dict[str, tuple[float, float]],
+        now_s: float,
+        lag_s: float,
+        used_share: float | None,
+        unread_s: float,
+    ) -> Iterable[Reason]:
+        evidence = self.evidence
+        behind = behind_reason(ages, unread_s)
+        yield from filter(
+            None,
+            (
+                behind,
+                slow_reason(evidence, now_s, lag_s),
+                busy_reason(evidence, used_share) if evidence.nodes else None,
+                late_reason(evidence, ages) if behind is None else None,
+                left_out_reason(evidence, now_s),
+                master_reason(evidence, now_s),
+                multipath_reason(evidence, now_s),
+            ),
+        )
+        yield from alert_reasons(evidence)
+        yield from authentication_reasons(evidence, now_s)
+        if lag_s > LAG_S or behind is not None:
+            self._blind_until_s = now_s + 2 * EVALUATION_S  # what has arrived meanwhile is still to be read
+        if not self.is_blind(now_s):
+            yield from fix_reasons(evidence, now_s)
+            yield from anchor_reasons(evidence, now_s)
+
+    def _awaited(self) -> str:
+        if self.evidence.site is None:
+            return "waiting for the site's anchors"
+        if not any(tag.online for _, tag in self.evidence.of("tag")):
+            return "no tag is online"
+        return "waiting for the first position"

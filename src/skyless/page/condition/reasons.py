@@ -1,0 +1,644 @@
+"""What can be wrong with a live site: each function looks for one cause and gives its reason. No I/O."""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence, Sized
+from typing import Final, Literal
+
+from msgspec import Struct
+
+from skyless.core.keys.fault import Fault
+from skyless.page.condition.evidence import ALERT_WORDS, ALERTS, FRESH_S, GRACE_S, MAX_NAMES, Evidence, Node
+from skyless.run.mqtt.messages import AnchorHealth, EtherHealth, TagHealth, WatchMessage
+
+LATE_S: Final = 0.25
+VERY_LATE_S: Final = 1.0
+"""Age of positions on arrival."""
+
+KEY_WAIT_S: Final = 0.6
+"""A tag with the site's public key may wait this long for keys before it gives a fix."""
+
+MISSED_SHARE: Final = 0.1
+"""Share of transmissions missed in a second. A computer with little to do misses 1 to 4 % in most seconds."""
+
+DROPPED_SHARE: Final = 0.02
+"""Share of receptions dropped by a tag. On an idle computer it is 0."""
+
+VERY_SLOW_SHARE: Final = 0.5
+"""Share of either."""
+
+BUSY_SHARE: Final = 0.95
+"""Share of processor time in use. Above it each program waits for others, and positions may come late."""
+
+LAG_S: Final = 0.25
+"""Delay of the page's server itself that counts as too slow."""
+
+MULTIPATH_RATIO: Final = 1.3
+"""Multipath that exceeds what the site file states by less is within what a tag can learn."""
+
+START_S: Final = 20.0
+"""Where no anchor has been online yet, all of them may be offline for this long: the site is being started."""
+
+OFTEN: Final = 3
+OFTEN_S: Final = 60.0
+"""A master that changes this often within this time changes too often."""
+
+WATCH_AGE_S: Final = 60.0
+"""A watch that has not reported for longer is not running."""
+
+UNREAD_S: Final = 0.5
+"""Messages that have waited unread at the page's server for this long show that it does not keep up."""
+
+_MIN_ANCHORS: Final = 3  # fewer on the air give no position
+_MIN_DROPPED: Final = 3
+_MAX_NAMED: Final = 6
+
+_ADVICE_NO_FIX: Final = {
+    "no-beacons": "It receives no anchor: see whether anchors are on the air and its radio is connected.",
+    "no-almanac": "It does not have the anchors' positions yet; they are sent every few seconds.",
+    "too-few-anchors": "Too few anchors reach it: see which are offline, and what stands in the way.",
+    "bad-geometry": "The anchors that reach it lie almost on one line as seen from it: add one on another side.",
+    "mirror-ambiguity": "Two positions explain what it receives: give its height, or add an anchor off the plane.",
+    "not-converged": "What it receives is contradictory: check the anchors' positions and antenna delays.",
+    "residuals-too-large": "What it receives is contradictory: check the anchors' positions and antenna delays.",
+    "acquiring": "It still looks for its first position.",
+    "no-code": "Anchors send without codes: start them with the site's keys, or the tag with --trust open.",
+    "no-certificate": "No certificate of a key chain that holds now has come: see whether the tag has this site's key.",
+    "no-key": "No key of the site's key chain has come yet; the anchors send them all the time.",
+    "clock-wrong": "Synchronise the clock of its computer with those of the anchors' computers, as by NTP.",
+    "no-master": "Its method needs a master, and this site has none: use another method.",
+}
+CHAIN_ENDS_S: Final = 60 * 86400.0
+"""A key chain that ends within this time needs a successor soon."""
+
+_WHY_NO_CODES: Final[Mapping[str, str]] = {
+    Fault.NO_TIME: "its program does not know the time yet",
+    Fault.NO_CHAIN: "no key chain holds now",
+    Fault.CLOCK_WRONG: "its clock differs from those of the other anchors",
+}
+_ADVICE_NO_CODES: Final[Mapping[str, str]] = {
+    Fault.NO_TIME: "See the log of its program.",
+    Fault.NO_CHAIN: "See with skyless site keys show when a chain begins, and whether the anchor has its files.",
+    Fault.CLOCK_WRONG: "Synchronise the clock of its computer, as by NTP.",
+}
+_NOT_ACCEPTED: Final[Mapping[str, str]] = {
+    Fault.BAD_CODE: "have a wrong code: they are forged, or the anchor has another seed",
+    Fault.REPEATED: "come a second time: somebody repeats them",
+    Fault.NO_CODE: "have no code: somebody else sends them, or the anchor has no keys",
+    Fault.REVOKED_CHAIN: "are of a key chain that was replaced: the anchor, or somebody else, still uses it",
+    Fault.LATE: "come too late: somebody delays them, or a clock is wrong",
+    Fault.EARLY: "come too early: a clock is wrong, or they are forged",
+}
+_FORGED: Final[frozenset[str]] = frozenset({Fault.BAD_CODE, Fault.REPEATED, Fault.NO_CODE})
+"""Where tags do not verify beacons, these may be in their positions."""
+
+_Statements = dict[str, dict[tuple[str, str], str]]
+"""By anchor: the fault that each node, by kind and name, states of its beacons."""
+
+_Severity = Literal["warning", "bad"]
+
+
+class Reason(Struct, frozen=True):
+    """One thing that is wrong."""
+
+    kind: str
+    """Such as ``late`` or ``anchors``. There is one reason of each kind at a time."""
+    level: _Severity
+    text: str
+    """What is wrong, and why."""
+    advice: str
+    """What to do next."""
+    names: tuple[str, ...] = ()
+    """The tags or anchors concerned, as ``tag/t1`` or ``anchor/3``; of many only the first."""
+
+
+def of_tags(kind: str, level: _Severity, text: str, advice: str, names: Iterable[str]) -> Reason:
+    """A reason that concerns these tags."""
+    return Reason(kind, level, text, advice, tuple(f"tag/{name}" for name in list(names)[:_MAX_NAMED]))
+
+
+def of_anchors(kind: str, level: _Severity, text: str, advice: str, names: Iterable[str]) -> Reason:
+    """A reason that concerns these anchors."""
+    return Reason(kind, level, text, advice, tuple(f"anchor/{name}" for name in list(names)[:_MAX_NAMED]))
+
+
+def broker_reason() -> Reason:
+    """Nothing else can be known then."""
+    advice = "Start the broker again, or see whether its computer is reachable; the page connects by itself."
+    return Reason("broker", "bad", "the broker is not connected: nothing is updated", advice)
+
+
+def late_reason(evidence: Evidence, ages: Mapping[str, tuple[float, float]]) -> Reason | None:
+    """Positions arrive late. ``ages`` are those of ``FixAges.least_ages_s``."""
+    late = sorted(name for name, (age_s, _) in ages.items() if age_s > LATE_S + _key_wait_s(evidence, name))
+    if not late:
+        return None
+    worst = max(late, key=lambda name: ages[name][0])
+    age_s, made_s = ages[worst]
+    whose = "positions" if len(late) == len(ages) else f"positions of {listed('tag', late)}"
+    host = evidence.nodes["tag", worst].host if ("tag", worst) in evidence.nodes else ""
+    if made_s > 0.5 * age_s:
+        why = f"{evidence.computer(host)} does not keep up with the receptions"
+        advice = "End other programs there, or move tags to another computer."
+    else:
+        why = "the broker or the network delivers late"
+        advice = "See whether the broker's computer or the network is busy."
+        if host not in {"", evidence.host}:
+            advice += (
+                f" Measured against the quickest message from {host} in the last minutes, whatever its clock shows."
+            )
+    text = f"{whose} are {age_s:.1f} s behind: {why}"
+    return of_tags("late", "bad" if age_s > VERY_LATE_S else "warning", text, advice, late)
+
+
+def _key_wait_s(evidence: Evidence, tag: str) -> float:
+    node = evidence.nodes.get(("tag", tag))
+    health = None if node is None else node.health
+    return KEY_WAIT_S if isinstance(health, TagHealth) and health.trust is not None else 0.0
+
+
+def slow_reason(evidence: Evidence, now_s: float, lag_s: float) -> Reason | None:
+    """Computers do not keep up: one reason for all signs of it. ``lag_s`` is the delay of the page's server."""
+    signs = [*_lag(evidence, lag_s), *_missed(evidence, now_s), *_dropped(evidence, now_s)]
+    if not signs:
+        return None
+    computers: dict[str, list[str]] = {}
+    for host, _, words in signs:
+        computers.setdefault(evidence.computer(host), []).append(words)
+    text = "; ".join(f"{computer} is too slow: {', '.join(words)}" for computer, words in computers.items())
+    advice = "End other programs there, run fewer tags and anchors, or move some to another computer."
+    worst = max(share for _, share, _ in signs)
+    return Reason("slow", "bad" if worst > VERY_SLOW_SHARE else "warning", text, advice)
+
+
+def behind_reason(ages: Mapping[str, tuple[float, float]], unread_s: float) -> Reason | None:
+    """The page's server does not keep up with the messages, which wait in its own queue for ``unread_s``."""
+    if unread_s < UNREAD_S:
+        return None
+    age_s = max((age_s for age_s, _ in ages.values()), default=0.0)
+    by = f" by {age_s:.1f} s" if age_s > LATE_S else ""
+    advice = "It gets more messages than its computer can process: end other programs there, or lower the tags' rates."
+    return Reason("behind", "bad" if age_s > VERY_LATE_S else "warning", f"the page's server is behind{by}", advice)
+
+
+def left_out_reason(evidence: Evidence, now_s: float) -> Reason | None:
+    """Tags or anchors beyond the number that is taken in."""
+    counts = {kind: evidence.roster.left_out(kind, now_s) for kind in MAX_NAMES}
+    words = [f"{count} {kind}{'s' if count > 1 else ''}" for kind, count in counts.items() if count]
+    if not words:
+        return None
+    text = f"{' and '.join(words)} {'is' if sum(counts.values()) == 1 else 'are'} not shown"
+    limits = " and ".join(f"{most} {kind}s" for kind, most in MAX_NAMES.items())
+    advice = (
+        f"This page takes in at most {limits}, and judges no others: divide the site, or end names that are made up."
+    )
+    return Reason("not-shown", "warning", text, advice)
+
+
+def busy_reason(evidence: Evidence, used_share: float | None) -> Reason | None:
+    """All processors of the page's computer are in use, by any program."""
+    if used_share is None or used_share < BUSY_SHARE:
+        return None
+    text = f"{evidence.computer(evidence.host)} is fully busy: {100.0 * used_share:.0f} % of its processors are in use"
+    return Reason("busy", "warning", text, "End other programs there, or positions may come late or not at all.")
+
+
+_Sign = tuple[str, float, str]  # computer, share of what was lost, and words
+
+
+def _lag(evidence: Evidence, lag_s: float) -> Iterable[_Sign]:
+    if lag_s > LAG_S:
+        yield evidence.host, 0.0, f"the page's server was delayed by {lag_s:.1f} s"
+
+
+def _missed(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
+    """Transmissions of the emulated air, and of anchors."""
+    for _, air in evidence.of("ether"):
+        if air.reports(now_s) and isinstance(air.health, EtherHealth) and air.health.missed_share > MISSED_SHARE:
+            share = air.health.missed_share
+            yield air.host, share, f"the emulated air missed {100.0 * share:.0f} % of the transmissions"
+    shares: dict[str, dict[str, float]] = {}
+    for name, anchor in evidence.of("anchor"):
+        share = anchor.health.missed_share if isinstance(anchor.health, AnchorHealth) else 0.0
+        if anchor.reports(now_s) and share > MISSED_SHARE:
+            shares.setdefault(anchor.host, {})[name] = share
+    for host, late in shares.items():
+        worst = max(late.values())
+        yield host, worst, f"{counted('anchor', list(late))} missed up to {100.0 * worst:.0f} % of the transmissions"
+
+
+def _dropped(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
+    """Receptions and fixes that tags dropped between their last two health messages, as they were too old."""
+    found: dict[str, list[tuple[str, int, float]]] = {}
+    for name, tag in evidence.of("tag"):
+        now, before = tag.health, tag.previous
+        if not (tag.reports(now_s) and isinstance(now, TagHealth) and isinstance(before, TagHealth)):
+            continue
+        count = now.late - before.late
+        share = count / max(now.receptions - before.receptions, count, 1)
+        if count >= _MIN_DROPPED and share > DROPPED_SHARE:
+            found.setdefault(tag.host, []).append((name, count, share))
+    for host, drops in found.items():
+        names = [name for name, _, _ in drops]
+        count, worst = sum(count for _, count, _ in drops), max(share for _, _, share in drops)
+        yield host, worst, f"{counted('tag', names)} dropped {count} receptions or fixes that were too old"
+
+
+def fix_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
+    """Tags that are online and have no fix, with what they give as the cause, or without any word."""
+    online = [(name, tag) for name, tag in evidence.of("tag") if tag.online]
+    without = [(n, tag) for n, tag in online if not tag.has_fix(now_s) and not evidence.in_grace(now_s, tag)]
+    if not without:
+        return
+    silent = [name for name, tag in without if not tag.reports(now_s)]
+    causes = {name: _cause(tag) for name, tag in without if tag.reports(now_s)}
+    if len(without) == len(online):
+        though = "a tag is online" if len(online) == 1 else f"{len(online)} tags are online"
+        why, advice = _causes(causes, len(without))
+        if not causes:
+            why, advice = ": they do not report", "See whether their programs and computers still run."
+        yield of_tags("no-fixes", "bad", f"no positions, although {though}{why}", advice, [n for n, _ in without])
+        return
+    if causes:
+        why, advice = _causes(causes, len(causes))
+        text = f"{listed('tag', list(causes))} {verb(causes, 'has', 'have')} no fix{why}"
+        yield of_tags("no-fix", "warning", text, advice, causes)
+    if silent:
+        text = f"{listed('tag', silent)} {verb(silent, 'does', 'do')} not report any more"
+        advice = "Its program does not respond, or its computer is cut off: see there, and start it again."
+        yield of_tags("silent", "warning", text, advice, silent)
+
+
+def _cause(tag: Node) -> str:
+    return (tag.health.reason or "") if isinstance(tag.health, TagHealth) else ""
+
+
+def _causes(causes: Mapping[str, str], tags: int) -> tuple[str, str]:
+    """Why ``tags`` tags have no fix, with names where it is not the same for all, and what to do for most of them."""
+    groups = [(cause, names) for cause, names in alike(causes) if cause]
+    words = [cause.replace("-", " ") for cause, _ in groups]
+    common, most = groups[0] if groups else ("", [])
+    advice = _ADVICE_NO_FIX.get(common, "See whether fixes are published, and the log of the tag.")
+    if groups and len(most) < tags:
+        words = [f"{word} ({listed('tag', names)})" for word, (_, names) in zip(words, groups, strict=True)]
+        advice = f"For {listed('tag', most)}: {advice}"
+    return f": {'; '.join(words)}" if words else "", advice
+
+
+def alike(values: Mapping[str, str]) -> list[tuple[str, list[str]]]:
+    """Each value with the names that have it, the most common first."""
+    return [
+        (value, [name for name, of_name in values.items() if of_name == value])
+        for value, _ in Counter(values.values()).most_common()
+    ]
+
+
+_ALERT_REASONS: Final[tuple[tuple[str, int, _Severity, str], ...]] = (
+    ("limit", 2, "bad", "Do not rely on the position; see which anchors the tag uses and what blocks them."),
+    ("alert", 1, "warning", "The position is still sound; see what blocks an anchor, or whether one has moved."),
+)
+"""Kind of the reason, what the alerts count in ``ALERTS``, level and advice."""
+
+
+def alert_reasons(evidence: Evidence) -> Iterable[Reason]:
+    """Alerts of integrity in the fixes since the last evaluation."""
+    for kind, grade, level, advice in _ALERT_REASONS:
+        alerts = {name: str(tag.alert) for name, tag in evidence.of("tag") if ALERTS.get(tag.alert, 0) == grade}
+        if alerts:
+            text = "; ".join(f"{listed('tag', names)}: {ALERT_WORDS[alert]}" for alert, names in alike(alerts))
+            yield of_tags(kind, level, text, advice, alerts)
+
+
+def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
+    """Anchors of the site that are offline, only cut off from the broker, or not synchronised."""
+    if evidence.site is None:
+        return
+    names = evidence.site_anchors()
+    offline: list[str] = []
+    cut_off: list[str] = []
+    idle: list[str] = []
+    for name in names:
+        node = evidence.nodes.get(("anchor", name))
+        if node is not None and node.reports(now_s):
+            health = node.health
+            if isinstance(health, AnchorHealth) and _is_idle(health):
+                idle.append(name)
+        elif node is None or node.online is not False:
+            on_air = node is not None and now_s - node.used_s < FRESH_S
+            if not evidence.in_grace(now_s, node):
+                (cut_off if on_air else offline).append(name)
+        elif node.since_s is not None or not evidence.in_grace(now_s):  # else an old status, kept by the broker
+            offline.append(name)
+    unseen = len(offline) == len(names) and all(node.since_s is None for _, node in evidence.of("anchor"))
+    if offline and not (unseen and now_s - evidence.ready_s < START_S):
+        which = f"all {len(names)} anchors are" if len(offline) == len(names) else ""
+        which = which or f"{listed('anchor', offline)} of {len(names)} {verb(offline, 'is', 'are')}"
+        advice = "See whether power and program run there; positions are less accurate without them."
+        too_few = len(names) - len(offline) < _MIN_ANCHORS
+        yield of_anchors("anchors", "bad" if too_few else "warning", f"{which} offline", advice, offline)
+    if cut_off:
+        text = f"{listed('anchor', cut_off)} {verb(cut_off, 'does', 'do')} not report, though on the air"
+        advice = "The program has lost the broker, or the page lost its messages: see its log."
+        yield of_anchors("silent-anchors", "warning", text, advice, cut_off)
+    if idle:
+        text = f"{listed('anchor', idle)} {verb(idle, 'is', 'are')} not synchronised and sends nothing"
+        text = text if len(idle) == 1 else text.replace("sends", "send")
+        advice = "Too few messages of the others arrive there: see what blocks them."
+        yield of_anchors("not-synchronised", "warning", text, advice, idle)
+
+
+def _is_idle(health: AnchorHealth) -> bool:
+    return not health.synchronised and health.role not in {"master", "root"} and health.uptime_s > GRACE_S
+
+
+def multipath_reason(evidence: Evidence, now_s: float) -> Reason | None:
+    """Ranges change more with the tag's way than the site file states."""
+    site = evidence.site
+    stated_m = 0.0 if site is None else site.accuracy.place_std_m
+    found = {
+        name: (tag.health.multipath_std_m, tag.health.multipath_distance_m or 0.0)
+        for name, tag in evidence.of("tag")
+        if tag.reports(now_s) and isinstance(tag.health, TagHealth) and tag.health.multipath_std_m is not None
+    }
+    more = [name for name, (std_m, _) in found.items() if std_m > MULTIPATH_RATIO * stated_m]
+    if not more:
+        return None
+    std_m, distance_m = max(found[name] for name in more)
+    text = (
+        f"{listed('tag', more)} {verb(more, 'finds', 'find')} that ranges change by {100.0 * std_m:.0f} cm within"
+        f" {100.0 * distance_m:.0f} cm of the way, more than the site file states"
+    )
+    advice = (
+        f"Set place_std_m = {std_m:.2f} and place_distance_m = {distance_m:.2f} under [accuracy] of the site file:"
+        " tags then start with that instead of learning it."
+    )
+    return of_tags("multipath", "warning", text, advice, more)
+
+
+def master_reason(evidence: Evidence, now_s: float) -> Reason | None:
+    """The master, or the root of the slot time, changes often."""
+    count = sum(now_s - time_s < OFTEN_S for time_s in evidence.leader.changes_s)
+    if count < OFTEN:
+        return None
+    slots = evidence.site is not None and evidence.site.schedule.mode != "master"
+    leader = "root of the slot time" if slots else "master"
+    text = f"the {leader} has changed {count} times within a minute; now it is anchor {evidence.leader.leader}"
+    advice = "Anchors lose its messages: a computer is too slow, or something blocks it; move it, or name another."
+    return Reason("master", "warning", text, advice)
+
+
+def watch_reasons(watch: WatchMessage | None, age_s: float | None) -> Iterable[Reason]:
+    """What the watch of the anchors has found."""
+    ended = (age_s or 0.0) > WATCH_AGE_S
+    findings = () if watch is None else watch.findings
+    moved = [finding for finding in findings if finding.kind == "moved"]
+    other = [finding for finding in findings if finding.kind != "moved"]
+    for kind, chosen in (("moved", moved), ("watch", other)):
+        if not chosen:
+            continue
+        text = chosen[0].sentence.rstrip(".") + (f", and {len(chosen) - 1} more" if len(chosen) > 1 else "")
+        text += " (the watch does not report any more)" if ended else ""
+        advice = "Move it back, or survey again." if kind == "moved" else "See there; survey again where it stays so."
+        names = dict.fromkeys(str(anchor) for finding in chosen for anchor in finding.anchors)
+        yield of_anchors(kind, "bad" if kind == "moved" and not ended else "warning", text, advice, names)
+
+
+# Codes and keys: nothing is found at a site without keys and of tags without its public key
+
+
+def authentication_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
+    """All that is found."""
+    tags = {
+        name: node.health
+        for name, node in evidence.of("tag")
+        if node.reports(now_s) and isinstance(node.health, TagHealth) and node.health.trust is not None
+    }
+    anchors = {
+        name: node.health
+        for name, node in evidence.of("anchor")
+        if node.reports(now_s) and isinstance(node.health, AnchorHealth)
+    }
+    keyed = {name: health for name, health in anchors.items() if _has_keys(health)}
+    yield from _clock(tags)
+    yield from _not_verified(evidence, tags, now_s)
+    yield from _chains(keyed)
+    yield from _codes(evidence, keyed, now_s)
+    yield from _keys(evidence, keyed, anchors, now_s)
+    yield from _forged(evidence, tags, anchors, now_s)
+
+
+def _has_keys(health: AnchorHealth) -> bool:
+    return health.chain is not None or health.chain_ends_unix_s is not None or health.code_fault is not None
+
+
+def _left_s(health: AnchorHealth) -> float:
+    """Until its last key chain ends, by its own clock."""
+    return float("inf") if health.chain_ends_unix_s is None else health.chain_ends_unix_s - health.unix_s
+
+
+def _clock(tags: Mapping[str, TagHealth]) -> Iterable[Reason]:
+    """Clocks of tags that differ from the site's by more than the tags' bounds."""
+    errors_s = {name: health.clock_error_s for name, health in tags.items() if health.clock_error_s is not None}
+    if not errors_s:
+        return
+    worst_s = max(errors_s.values(), key=abs)
+    size = f"{abs(worst_s):.2f} s" if abs(worst_s) < 1.0 else f"{abs(worst_s):.1f} s"
+    if len(errors_s) == 1:
+        text = f"the clock of tag {next(iter(errors_s))} is {size} {'ahead of' if worst_s > 0 else 'behind'} the site's"
+    else:
+        text = f"the clocks of {listed('tag', list(errors_s))} differ from the site's by up to {size}"
+    advice = "Synchronise the clocks of its computer and of the anchors', as by NTP: they decide what came in time."
+    verified = all(tags[name].is_verified for name in errors_s)
+    yield of_tags("clock", "warning" if verified else "bad", text, advice, errors_s)
+
+
+def _not_verified(evidence: Evidence, tags: Mapping[str, TagHealth], now_s: float) -> Iterable[Reason]:
+    """Tags that receive beacons none of which is verified. Where their clock is wrong, that is another reason."""
+    found = {
+        name: health
+        for name, health in tags.items()
+        if not health.is_verified and health.clock_error_s is None and _receives(evidence.nodes["tag", name], now_s)
+    }
+    if not found:
+        return
+    common = Counter(fault for health in found.values() for fault in health.faults.values()).most_common(1)
+    text = f"nothing that {listed('tag', list(found))} {verb(found, 'receives', 'receive')} is verified"
+    text += f" ({common[0][0].replace('-', ' ')})" if common else ""
+    advice = (
+        "Its positions may be forged. See whether the anchors send codes, whether its clock is right, and whether "
+        "it has this site's public key."
+    )
+    yield of_tags("not-verified", "bad", text, advice, found)
+
+
+def _receives(tag: Node, now_s: float) -> bool:
+    """Whether a tag that has not just started has received beacons between its last two messages."""
+    now, before = tag.health, tag.previous
+    if not isinstance(now, TagHealth) or not isinstance(before, TagHealth) or tag.since_s is None:
+        return False
+    return now_s - tag.since_s > GRACE_S and now.receptions > before.receptions
+
+
+def _chains(keyed: Mapping[str, AnchorHealth]) -> Iterable[Reason]:
+    """Key chains that have ended or end soon."""
+    advice = "Make a successor with skyless site keys rotate, and give the anchors its files."
+    ended = [name for name, health in keyed.items() if _left_s(health) <= 0.0]
+    if ended:
+        text = (
+            f"the key chain of {_all_or_some(ended, keyed)} has ended: {verb(ended, 'it sends', 'they send')} no codes"
+        )
+        yield of_anchors("chain-ended", "bad", text, advice, ended)
+    soon = {name: _left_s(health) for name, health in keyed.items() if 0.0 < _left_s(health) < CHAIN_ENDS_S}
+    if soon:
+        least_s = min(soon.values())
+        left = f"{least_s // 86400.0:.0f} days" if least_s >= 2 * 86400.0 else f"{least_s // 3600.0:.0f} hours"
+        text = f"the key chain of {_all_or_some(list(soon), keyed)} ends in {left}"
+        yield of_anchors("chain", "warning", text, advice, soon)
+
+
+def _all_or_some(names: list[str], keyed: Mapping[str, AnchorHealth]) -> str:
+    return f"all {len(names)} anchors" if 1 < len(names) == len(keyed) else listed("anchor", names)
+
+
+def _codes(evidence: Evidence, keyed: Mapping[str, AnchorHealth], now_s: float) -> Iterable[Reason]:
+    """Anchors with keys that send without codes, and why."""
+    without = {
+        name: health.code_fault
+        for name, health in keyed.items()
+        if health.code_fault is not None
+        and _left_s(health) > 0.0
+        and not evidence.in_grace(now_s, evidence.nodes["anchor", name])
+    }
+    if not without:
+        return
+    groups = alike(without)
+    whys = [(_WHY_NO_CODES.get(fault, fault.replace("-", " ")), names) for fault, names in groups]
+    text = f"{listed('anchor', list(without))} {verb(without, 'sends', 'send')} no codes: "
+    text += "; ".join(why if len(groups) == 1 else f"{why} ({listed('anchor', names)})" for why, names in whys)
+    advice = _ADVICE_NO_CODES.get(groups[0][0], "See the log of its program.")
+    yield of_anchors("codes", "warning", text, advice, without)
+
+
+def _keys(
+    evidence: Evidence, keyed: Mapping[str, AnchorHealth], anchors: Mapping[str, AnchorHealth], now_s: float
+) -> Iterable[Reason]:
+    """Anchors without keys among others that have them."""
+    without = [
+        name for name in anchors if name not in keyed and not evidence.in_grace(now_s, evidence.nodes["anchor", name])
+    ]
+    if keyed and without:
+        others = f"{len(keyed)} other{verb(keyed, ' has', 's have')}"
+        text = f"{listed('anchor', without)} {verb(without, 'has', 'have')} no keys, though {others} them"
+        advice = "Start it with the site's keys (--keys): tags that verify beacons do not use it."
+        yield of_anchors("keys", "warning", text, advice, without)
+
+
+def _forged(
+    evidence: Evidence, tags: Mapping[str, TagHealth], anchors: Mapping[str, AnchorHealth], now_s: float
+) -> Iterable[Reason]:
+    """Anchors whose beacons, or beacons in whose name, tags and other anchors do not accept."""
+    statements = _that_count(_statements(evidence, tags, anchors, now_s))
+    if not statements:
+        return
+    faults = {name: Counter(by.values()).most_common(1)[0][0] for name, by in statements.items()}
+    parts = []
+    for fault, names in alike(faults):
+        words = _NOT_ACCEPTED.get(fault, f"are not accepted ({fault.replace('-', ' ')})")
+        finders = _finders(dict.fromkeys(node for name in names for node in statements[name]))
+        parts.append(f"beacons in the name of {listed('anchor', names)} {words} (found by {finders})")
+    advice = "Tags that verify beacons do not use these. See that anchor's log and keys, and who else transmits there."
+    without_key = [
+        name
+        for name, node in evidence.of("tag")
+        if node.has_fix(now_s) and isinstance(node.health, TagHealth) and node.health.trust is None
+    ]
+    level: _Severity = "warning"
+    if without_key and not _FORGED.isdisjoint(faults.values()):
+        level = "bad"
+        advice += (
+            f" Do not rely on {listed('tag', without_key)}: {verb(without_key, 'it verifies', 'they verify')} nothing."
+        )
+    yield of_anchors("forged", level, "; ".join(parts), advice, faults)
+
+
+def _statements(
+    evidence: Evidence, tags: Mapping[str, TagHealth], anchors: Mapping[str, AnchorHealth], now_s: float
+) -> _Statements:
+    """What nodes state of anchors, apart from what other reasons explain: a wrong clock, and anchors without codes."""
+    found: _Statements = {}
+
+    def add(node: tuple[str, str], faults: Mapping[str, str], *, is_clock_wrong: bool) -> None:
+        for anchor, fault in faults.items():
+            is_explained = fault in {Fault.LATE, Fault.EARLY} and is_clock_wrong
+            is_explained |= fault == Fault.NO_CODE and _may_be_without_codes(evidence, anchor, now_s)
+            if not is_explained:
+                found.setdefault(anchor, {})[node] = fault
+
+    for name, tag in tags.items():
+        add(("tag", name), tag.faults, is_clock_wrong=tag.clock_error_s is not None or not tag.is_verified)
+    for name, anchor in anchors.items():
+        add(("anchor", name), anchor.faults, is_clock_wrong=anchor.code_fault == Fault.CLOCK_WRONG)
+    return found
+
+
+def _may_be_without_codes(evidence: Evidence, anchor: str, now_s: float) -> bool:
+    """Whether an anchor has recently stated that it sends without codes, or has just started."""
+    node = evidence.nodes.get(("anchor", anchor))
+    if node is None:
+        return False
+    is_recent = now_s - node.health_s < GRACE_S
+    return evidence.in_grace(now_s, node) or (is_recent and node.codes_for_s(now_s) < GRACE_S)
+
+
+def _that_count(statements: _Statements) -> _Statements:
+    """Without statements by an anchor that more nodes fault: one with a wrong seed finds faults everywhere."""
+
+    def count(node: tuple[str, str]) -> int:
+        return len(statements.get(node[1], ())) if node[0] == "anchor" else 0
+
+    chosen = {
+        name: {node: fault for node, fault in by.items() if count(node) <= len(by)} for name, by in statements.items()
+    }
+    return {name: by for name, by in chosen.items() if by}
+
+
+def _finders(nodes: Iterable[tuple[str, str]]) -> str:
+    """``2 tags and anchor 3``."""
+    by_kind: dict[str, list[str]] = {}
+    for kind, name in nodes:
+        by_kind.setdefault(kind, []).append(name)
+    return " and ".join(counted(kind, names) for kind, names in by_kind.items())
+
+
+# Words, and the order of reasons
+
+_ORDER: Final = (
+    *("broker", "behind", "slow", "busy", "late", "not-shown", "forged", "clock", "chain-ended", "codes"),
+    *("not-verified", "no-fixes", "limit"),
+    *("moved", "anchors", "master", "no-fix", "alert", "keys", "not-synchronised", "silent-anchors", "silent", "watch"),
+    *("multipath", "chain"),
+)
+"""Causes before their effects."""
+
+
+def rank(reason: Reason) -> tuple[bool, int]:
+    """The key by which reasons are sorted, the worst first."""
+    return reason.level != "bad", _ORDER.index(reason.kind) if reason.kind in _ORDER else len(_ORDER)
+
+
+def listed(kind: str, names: Sequence[str]) -> str:
+    """``anchors 3, 5 and 8``, or only the first of many."""
+    if len(names) == 1:
+        return f"{kind} {names[0]}"
+    if len(names) > _MAX_NAMED:
+        return f"{kind}s {', '.join(names[:_MAX_NAMED])} and {len(names) - _MAX_NAMED} more"
+    return f"{kind}s {', '.join(names[:-1])} and {names[-1]}"
+
+
+def counted(kind: str, names: Sequence[str]) -> str:
+    """``anchor 3``, or ``5 anchors``."""
+    return f"{kind} {names[0]}" if len(names) == 1 else f"{len(names)} {kind}s"
+
+
+def verb(items: Sized, one: str, many: str) -> str:
+    """The verb's form for one item or for many."""
+    return one if len(items) == 1 else many

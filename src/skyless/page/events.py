@@ -1,0 +1,293 @@
+"""What has happened at a site, as a list of events: from the messages of MQTT or of a recording. No I/O.
+
+``now_s`` is the time of the list's owner: the page server's monotonic clock, so that a clock that is set ends nothing,
+or the recording's times.
+"""
+
+from collections import deque
+from typing import Final, Literal
+
+from msgspec import Struct
+
+from skyless.page.condition.evidence import ALERT_WORDS, ALERTS, Health, LeaderTracker
+from skyless.page.condition.monitor import Condition
+from skyless.page.state import SILENT_S
+from skyless.run.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, SurveyMessage, WatchMessage, ZoneEvent
+
+MAX_LOGGED: Final = 500
+"""Events that are kept. The oldest are dropped."""
+
+ALERT_END_S: Final = 1.0
+"""An alert has ended when no fix has had it for this long."""
+
+ALERT_INTERVAL_S: Final = 10.0
+"""Alerts of one tag that begin sooner than this after the last one are only counted."""
+
+_KEPT_S: Final = 5.0  # a first status that was made longer ago is one that the broker kept: nothing has happened now
+
+
+MAX_EVENTS: Final = 50
+"""Events of zones that are kept for pages."""
+
+TAKEOVER_S: Final = 1.0
+"""A dashboard waits this long for each one of a lower rank to publish an event that both have detected."""
+
+_SAME_EVENT_S: Final = 2.0
+
+_SUBJECTS: Final = {"ether": "the emulated air", "dashboard": "page server", "survey": "survey program"}
+
+Kind = Literal["anchor", "master", "watch", "alert", "tag", "program", "survey", "condition"]
+Severity = Literal["good", "note", "warning", "bad"]
+
+
+class Event(Struct, frozen=True):
+    """One line of the list."""
+
+    serial: int
+    """Number of the event, from 1. A line of several events has the number of the last."""
+    unix_s: float
+    kind: Kind
+    level: Severity
+    name: str
+    """What it is about, such as ``tag/t1``, ``anchor/3`` or ``recorder/demo``, or empty for the site."""
+    text: str
+    count: int = 1
+    """Consecutive changes of the master are one line, with their number and the last of them."""
+    first: int = 0
+    """Serial of the first event of the line."""
+
+
+class _Alert:
+    """The alert of one tag."""
+
+    def __init__(self) -> None:
+        self.seen_s = self.logged_s = float("-inf")
+        self.alert: str | None = None  # None where there is none now
+        self.logged = False  # whether the beginning of this one is in the list
+        self.skipped = 0
+
+
+class EventLog:
+    """Gathers events. Readers ask for what is new since a serial."""
+
+    def __init__(self, unix_offset_s: float = 0.0) -> None:
+        """``unix_offset_s`` is Unix time less the owner's time. It follows a clock that is set."""
+        self.unix_offset_s = unix_offset_s
+        self.serial = 0
+        self._events: deque[Event] = deque(maxlen=MAX_LOGGED)
+        self._statuses: dict[tuple[str, str], StatusMessage] = {}
+        self._reported: dict[tuple[str, str], float] = {}  # nodes whose health comes, and when it came last
+        self._silent: set[tuple[str, str]] = set()
+        self._leader = LeaderTracker()
+        self._alerts: dict[str, _Alert] = {}
+        self._findings: dict[tuple[str, tuple[int, ...]], str] = {}
+        self._saved: int | None = None
+        self._surveyed_by: str | None = None
+        self._condition: Condition | None = None
+
+    def since(self, serial: int = 0) -> list[Event]:
+        """Events after a serial, the oldest first."""
+        new = min(self.serial - serial, len(self._events))
+        return [] if new <= 0 else [event for event in list(self._events)[-new:] if event.serial > serial]
+
+    # Nodes
+
+    def on_status(self, status: StatusMessage, now_s: float) -> None:
+        """A node has come online or gone."""
+        key = status.kind, status.name
+        before = self._statuses.get(key)
+        self._statuses[key] = status
+        kept = now_s + self.unix_offset_s - status.unix_s >= _KEPT_S
+        changed = before is not None and (
+            before.online != status.online or (status.online and before.pid != status.pid)
+        )
+        happened = changed or (before is None and status.online and not kept)
+        if not status.online:
+            self._reported.pop(key, None)
+            self._end_alert(status.name, now_s) if status.kind == "tag" else None
+        if key in self._silent:
+            if status.online and kept and not changed:
+                return  # the broker has repeated it
+            self._silent.discard(key)
+            happened = status.online  # that it is gone stands in the list already
+        if happened:
+            was_online = status.online and before is not None and before.online
+            words = "" if not was_online else "started again" if changed else "reports again"
+            self._add_presence(key, status.online, now_s, words)
+
+    def on_health(self, kind: str, name: str, health: Health, now_s: float) -> None:
+        """A node reports."""
+        key = kind, name
+        if key in self._silent:
+            self._silent.discard(key)
+            self._add_presence(key, True, now_s, "reports again")
+        self._reported[key] = now_s
+        if isinstance(health, AnchorHealth):
+            before = self._leader.leader
+            leader = self._leader.update(health, now_s)
+            if leader is not None:
+                word = "master" if health.mode == "master" else "root of the slot time"
+                text = f"anchor {leader} is the {word} now, after anchor {before}"
+                self._add(now_s, "master", "warning", f"anchor/{leader}", text)
+
+    def tick(self, now_s: float) -> None:
+        """Look for what has ended. Call it once or twice a second."""
+        for key, reported_s in list(self._reported.items()):
+            if now_s - reported_s > SILENT_S:
+                del self._reported[key]
+                self._silent.add(key)
+                self._add_presence(key, False, now_s, "does not report any more")
+        for name, alert in self._alerts.items():
+            if alert.alert is not None and now_s - alert.seen_s > ALERT_END_S:
+                self._end_alert(name, now_s)
+
+    def pause(self, now_s: float) -> None:
+        """Instead of a tick while messages cannot arrive: silence does not mean that something has ended."""
+        self._reported = dict.fromkeys(self._reported, now_s)
+        for alert in self._alerts.values():
+            alert.seen_s = now_s
+
+    def _add_presence(self, key: tuple[str, str], online: bool, now_s: float, words: str) -> None:
+        kind, name = key
+        level: Severity = "note"
+        if kind in {"anchor", "tag", "ether"}:
+            level = "good" if online else "bad" if kind != "tag" else "warning"
+            words = words or ("is online" if online else "is offline")
+        else:
+            words = words or ("started" if online else "ended")
+        group: Kind = "anchor" if kind == "anchor" else "tag" if kind == "tag" else "program"
+        subject = _SUBJECTS.get(kind, kind)
+        subject += "" if kind in {name, "ether"} else f" {name}"
+        self._add(now_s, group, level, f"{kind}/{name}", f"{subject} {words}")
+
+    # Fixes
+
+    def on_fix(self, fix: FixMessage, now_s: float) -> None:
+        """A fix, with or without an integrity alert."""
+        alert = self._alerts.get(fix.tag)
+        if ALERTS.get(fix.alert, 0) == 0:
+            return
+        if alert is None:
+            alert = self._alerts[fix.tag] = _Alert()
+        alert.seen_s = now_s
+        if alert.alert is not None and ALERTS[fix.alert] <= ALERTS[alert.alert]:
+            return
+        worse = alert.alert is not None
+        alert.alert = fix.alert
+        if now_s - alert.logged_s < ALERT_INTERVAL_S and not worse:
+            alert.skipped += 1
+            return
+        more = f" ({alert.skipped} more since the last one)" if alert.skipped else ""
+        alert.logged, alert.logged_s, alert.skipped = True, now_s, 0
+        level: Severity = "bad" if ALERTS[fix.alert] > 1 else "warning"
+        self._add(now_s, "alert", level, f"tag/{fix.tag}", f"tag {fix.tag}: {ALERT_WORDS[fix.alert or '']}{more}")
+
+    def _end_alert(self, name: str, now_s: float) -> None:
+        alert = self._alerts.get(name)
+        if alert is None or alert.alert is None:
+            return
+        alert.alert = None
+        if alert.logged:
+            alert.logged = False
+            self._add(now_s, "alert", "good", f"tag/{name}", f"tag {name}: integrity alert ended")
+
+    # Survey and watch
+
+    def on_watch(self, watch: WatchMessage | None, now_s: float) -> None:
+        """What the watch of the anchors sees now, or None when it has ended."""
+        findings = () if watch is None else watch.findings
+        now = {(str(finding.kind), finding.anchors): finding.sentence.rstrip(".") for finding in findings}
+        before, self._findings = self._findings, now
+        for (kind, anchors), sentence in now.items():
+            if (kind, anchors) not in before:
+                level: Severity = "bad" if kind == "moved" else "warning"
+                self._add(now_s, "watch", level, f"anchor/{anchors[0]}" if anchors else "", sentence)
+        for kind, anchors in before.keys() - now.keys():
+            if watch is not None:
+                text = f"no longer found: {before[kind, anchors]}"
+                self._add(now_s, "watch", "good", f"anchor/{anchors[0]}" if anchors else "", text)
+
+    def on_survey(self, survey: SurveyMessage | None, now_s: float) -> None:
+        """The survey program's state. A saved result is an event."""
+        if survey is None:
+            return
+        same = survey.by == self._surveyed_by
+        if same and survey.saved_serial is not None and survey.saved_serial != self._saved:
+            where = f" to {survey.file}" if survey.file else ""
+            self._add(now_s, "survey", "note", "", f"survey result {survey.saved_serial} saved{where}")
+        self._surveyed_by, self._saved = survey.by, survey.saved_serial
+
+    # Condition
+
+    def on_condition(self, condition: Condition, now_s: float) -> None:
+        """The condition of the site. A change of its level, or of its first reason, is an event."""
+        before, self._condition = self._condition, condition
+        if before is not None and _first(before) == _first(condition):
+            return
+        if condition.level == "waiting" or (before is None and condition.level == "good"):
+            return
+        if condition.level == "good":
+            self._add(now_s, "condition", "good", "", "condition good")
+        else:
+            word = "fault" if condition.level == "bad" else "warning"
+            self._add(now_s, "condition", condition.level, "", f"{word}: {condition.text}")
+
+    def _add(self, now_s: float, kind: Kind, level: Severity, name: str, text: str) -> None:
+        self.serial += 1
+        count, first = 1, self.serial
+        if kind == "master" and self._events and self._events[-1].kind == kind:
+            last = self._events.pop()
+            count, first = last.count + 1, last.first
+        self._events.append(Event(self.serial, now_s + self.unix_offset_s, kind, level, name, text, count, first))
+
+
+def _first(condition: Condition) -> tuple[str, str]:
+    return condition.level, condition.reasons[0].kind if condition.reasons else ""
+
+
+# Tags that enter and leave zones
+
+
+def publisher_rank(name: str, dashboards: list[StatusMessage]) -> int:
+    """How many of the dashboards online came online before this one. The first publishes the events."""
+    online = sorted((status.unix_s, status.name) for status in dashboards if status.online)
+    names = [other for _, other in online]
+    return names.index(name) if name in names else 0
+
+
+class EventQueue:
+    """Events of zones that wait to be published, and the last that were.
+
+    Of several dashboards that all detect an event one publishes it.
+    """
+
+    def __init__(self) -> None:
+        self.recent: deque[ZoneEvent] = deque(maxlen=MAX_EVENTS)
+        self._waiting: list[tuple[float, ZoneEvent]] = []
+
+    def schedule(self, events: list[ZoneEvent], rank: int, now_s: float) -> None:
+        """Add events detected here, by a dashboard with this rank."""
+        self._waiting += [(now_s + rank * TAKEOVER_S, event) for event in events]
+
+    def pop_due(self, now_s: float) -> list[ZoneEvent]:
+        """Events that no other dashboard has published in time. They count as published."""
+        due = [event for at_s, event in self._waiting if at_s <= now_s]
+        if due:
+            self._waiting = [(at_s, event) for at_s, event in self._waiting if at_s > now_s]
+            self.recent.extend(due)
+        return due
+
+    def add_published(self, event: ZoneEvent) -> bool:
+        """Add an event from MQTT. False if it is the echo of an own event, or a repetition."""
+        if event in self.recent:
+            return False
+        for index, (_, waiting) in enumerate(self._waiting):
+            if _same(event, waiting):
+                del self._waiting[index]
+                break
+        self.recent.append(event)
+        return True
+
+
+def _same(a: ZoneEvent, b: ZoneEvent) -> bool:
+    return (a.zone, a.tag, a.kind) == (b.zone, b.tag, b.kind) and abs(a.unix_s - b.unix_s) < _SAME_EVENT_S

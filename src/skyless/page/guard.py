@@ -1,0 +1,138 @@
+"""Access control: requests of other sites' pages are refused, and those of other machines need the token."""
+
+import hmac
+import ipaddress
+import re
+from collections.abc import MutableMapping
+from hashlib import sha256
+from http.cookies import CookieError, SimpleCookie
+from typing import Any, Final
+from urllib.parse import parse_qs, urlsplit
+
+from msgspec import Struct
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import JSONResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+_HEADERS: Final = {
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+
+_HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::\d{1,5})?")
+_POLICY_VIOLATION: Final = 1008
+
+
+class AccessRules(Struct, frozen=True):
+    """What the guard checks."""
+
+    token: str | None = None
+    """What requests must carry, or None where only programs of this machine can reach the server."""
+    names: frozenset[str] = frozenset()
+    """Valid host names, in lower case, besides ``localhost``."""
+    remote: bool = False
+    """Whether other machines can reach the server: then any IP address is a valid host."""
+    cookie: str = "skyless"
+    """Name of the cookie: browsers keep one for all ports of a machine."""
+
+
+class Guard:
+    """ASGI middleware: checks Host, Origin and token of every request and WebSocket, and adds security headers.
+
+    DNS rebinding: a page of another site that points its own name to this address sends that name as Host: refused.
+    """
+
+    def __init__(self, app: ASGIApp, rules: AccessRules) -> None:
+        self._app, self._rules = app, rules
+        self._secret = sha256(rules.token.encode()).hexdigest() if rules.token is not None else None
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request to the application, or refuse it."""
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        fault = self._fault(scope, headers)
+        if fault is None:
+            await self._app(scope, receive, self._with_headers(scope, send))
+        elif scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": _POLICY_VIOLATION, "reason": fault[1]})
+        else:
+            answer = JSONResponse({"error": fault[1]}, status_code=fault[0])
+            await answer(scope, receive, self._with_headers(scope, send))
+
+    def _fault(self, scope: MutableMapping[str, Any], headers: Headers) -> tuple[int, str] | None:
+        hosts = headers.getlist("host")
+        host = hosts[0].lower() if len(hosts) == 1 else ""
+        if not self._is_own_host(host):
+            return 421, "unknown host name: open the address that the dashboard has printed"
+        origin = headers.get("origin")
+        if origin is not None and not _same_origin(origin, host):
+            return 403, "requests of other sites are refused"
+        if self._secret is not None and not self._has_token(scope, headers, self._secret):
+            return 401, "the token is missing or wrong: open the address that the dashboard has printed"
+        return None
+
+    def _is_own_host(self, host: str) -> bool:
+        match = _HOST.fullmatch(host)
+        if match is None:
+            return False
+        name = match["name"].strip("[]").removesuffix(".")
+        if name == "localhost" or name in self._rules.names:
+            return True
+        try:
+            address = ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        return self._rules.remote or address.is_loopback
+
+    def _has_token(self, scope: MutableMapping[str, Any], headers: Headers, secret: str) -> bool:
+        digests = [sha256(token.encode()).hexdigest() for token in _tokens(scope, headers)]
+        digests += _cookies(headers, self._rules.cookie)
+        return any(hmac.compare_digest(digest.encode(), secret.encode()) for digest in digests)
+
+    def _with_headers(self, scope: MutableMapping[str, Any], send: Send) -> Send:
+        async def sending(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in _HEADERS.items():
+                    headers[name] = value
+                headers.setdefault("Cache-Control", "no-store")
+                if self._secret is not None and message["status"] == 200 and b"token=" in scope["query_string"]:
+                    cookie = f"{self._rules.cookie}={self._secret}; Path=/; HttpOnly; SameSite=Strict"
+                    headers.append("Set-Cookie", cookie)
+            await send(message)
+
+        return sending
+
+
+def _same_origin(origin: str, host: str) -> bool:
+    try:
+        parts = urlsplit(origin.lower())
+    except ValueError:
+        return False
+    return parts.scheme in {"http", "https"} and parts.netloc == host
+
+
+def _tokens(scope: MutableMapping[str, Any], headers: Headers) -> list[str]:
+    """Tokens in the query or as a bearer token."""
+    query = scope["query_string"].decode("latin-1")
+    kind, _, bearer = headers.get("authorization", "").partition(" ")
+    try:
+        tokens = parse_qs(query, max_num_fields=20).get("token", [])[:1]
+    except ValueError:
+        tokens = []
+    return tokens + ([bearer.strip()] if kind.lower() == "bearer" else [])
+
+
+def _cookies(headers: Headers, name: str) -> list[str]:
+    try:
+        morsel = SimpleCookie(headers.get("cookie", "")).get(name)
+    except CookieError:
+        return []
+    return [] if morsel is None else [morsel.value]

@@ -1,0 +1,574 @@
+"""The live site: messages from MQTT update its state and its zones. Open pages are sent what is new, 20 times a second.
+
+Everything here belongs to one event loop. From the same messages ``condition`` finds what is wrong at the site, and
+``events.py`` lists what has happened.
+"""
+
+import asyncio
+import logging
+import platform
+import time
+import zlib
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import msgspec
+from msgspec import Struct
+
+from skyless.bridges.target import bridged_site
+from skyless.core.errors import ConfigurationError
+from skyless.core.version import installed_version
+from skyless.page.condition.evidence import Evidence
+from skyless.page.condition.monitor import EVALUATION_S, Condition, ConditionMonitor
+from skyless.page.events import MAX_EVENTS, MAX_LOGGED, EventLog, EventQueue, publisher_rank
+from skyless.page.geojson import OLDEST_S, features
+from skyless.page.site_survey import SiteSurvey
+from skyless.page.state import PageRequest, Sent, SiteState, encode
+from skyless.run.mqtt import topics
+from skyless.run.mqtt.access import Role
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.messages import (
+    AnchorHealth,
+    EtherHealth,
+    FixMessage,
+    PreparationMessage,
+    SiteMessage,
+    StatusMessage,
+    SurveyFactsMessage,
+    SurveySaveMessage,
+    TagHealth,
+    TruthMessage,
+    WrongMessageError,
+    Zone,
+    ZoneEvent,
+    ZonesMessage,
+    read_message,
+)
+from skyless.run.zones.monitor import ZoneMonitor
+from skyless.run.zones.zone_list import BadZonesError, check_zones, read_zones, zones_of
+from skyless.site.file.check import check_site
+
+_STATE_PERIOD_S: Final = 0.05
+_HEALTH_PERIOD_S: Final = 1.0
+_EVALUATION_SHARE: Final = 5.0  # evaluations take at most a sixth of the time
+
+_PREPARATION_EXPIRY_S: Final = 5.0  # a preparation of which nothing has come for this time has ended without saying so
+
+_HEALTHS: Final[dict[str, type[Struct]]] = {"tag": TagHealth, "anchor": AnchorHealth, "ether": EtherHealth}
+_log = logging.getLogger("skyless.page")
+
+MAX_PAGES: Final = 400
+MAX_PAGES_PER_ADDRESS: Final = 100
+IDLE_S: Final = 12.0
+"""A page that has sent nothing for this long makes room for another one. A visible page sends a ping every 2 s."""
+
+GONE_S: Final = 180.0
+"""A page that has sent nothing for this long is disconnected. Browsers let a hidden one send once a minute."""
+
+
+class NotAllowedError(Exception):
+    """The broker would drop the message: the role of this page may not publish it."""
+
+
+class NoBrokerError(Exception):
+    """Nothing can be published now."""
+
+
+class NoSiteError(Exception):
+    """No site is known yet."""
+
+
+class TooManyPagesError(Exception):
+    """No other page can be opened now."""
+
+
+class PageQueue:
+    """Messages that wait for one page: the newest of each kind, so that a slow page's queue stays short."""
+
+    def __init__(self, hello: bytes, address: str = "", now_s: float = 0.0) -> None:
+        """``address`` is its computer's."""
+        self.closed, self.reason = False, ""
+        """Whether its connection is to be ended, and why."""
+        self.address, self.active_s = address, now_s
+        """When it last sent something."""
+        self._latest: dict[str, bytes] = {"hello": hello}
+        self._events: deque[bytes] = deque(maxlen=MAX_EVENTS)
+        self._logged: deque[bytes] = deque(maxlen=MAX_LOGGED)
+        self._sent = Sent()
+        self._state_due = self._health_due = True
+        self._wake = asyncio.Event()
+        self._wake.set()
+
+    def replace(self, kind: str, message: bytes) -> None:
+        """Add a message. It replaces one of its kind that still waits."""
+        self._latest[kind] = message
+        self._wake.set()
+
+    def add_event(self, message: bytes) -> None:
+        """Add a message that replaces no other. The oldest is dropped beyond ``MAX_EVENTS``."""
+        self._events.append(message)
+        self._wake.set()
+
+    def add_logged(self, message: bytes) -> None:
+        """Add a line of the list of events. The oldest is dropped beyond ``MAX_LOGGED``."""
+        self._logged.append(message)
+        self._wake.set()
+
+    def request_state(self, *, health: bool = False) -> None:
+        """Send the state, or also the healths, with the next messages if there is anything new."""
+        self._state_due = True
+        self._health_due |= health
+        self._wake.set()
+
+    def ask(self, wanted: PageRequest) -> None:
+        """Send from now on what the page asks for."""
+        self._sent.wanted = wanted
+        self.request_state(health=True)
+
+    def close(self, reason: str = "") -> None:
+        """End the page's connection."""
+        self.closed, self.reason = True, reason
+        self._wake.set()
+
+    async def drain(self, state: SiteState) -> list[str]:
+        """Wait for messages and return them all, in the order in which the page needs them."""
+        await self._wake.wait()
+        self._wake.clear()
+        messages = [*self._latest.values(), *self._events, *self._logged]
+        self._latest.clear()
+        self._events.clear()
+        self._logged.clear()
+        if self._health_due:
+            messages.append(state.new_health(self._sent))
+        new = state.new_state(self._sent) if self._state_due else None
+        if new is not None:
+            messages.append(new)
+        self._state_due = self._health_due = False
+        return [message.decode() for message in messages]
+
+
+class LiveSite:
+    """The live site: its state, its zones, and the pages that are open."""
+
+    def __init__(
+        self,
+        name: str,
+        broker: str,
+        site: SiteMessage | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        wall_clock: Callable[[], float] = time.time,
+        host: str = platform.node(),
+        used_share: Callable[[float], float | None] | None = None,
+    ) -> None:
+        """``name`` is the dashboard's on MQTT, ``broker`` its address without a password, ``host`` this computer.
+
+        ``used_share`` gives the share of its processors in use at a time of ``clock``: ``ProcessorUse.share``.
+        """
+        self.name, self.broker = name, broker
+        self.site = site
+        self.floor_plan: bytes | None = None
+        self.preparation: PreparationMessage | None = None
+        """How far the kernels of a site that starts for the first time are compiled."""
+        self.connected = False
+        self.state = SiteState()
+        self.monitor = ZoneMonitor()
+        self.events = EventQueue()
+        self.pages: set[PageQueue] = set()
+        self.survey = SiteSurvey(name, self._broadcast, clock, wall_clock)
+        self.dropped = self.state.dropped
+        self._clock, self._wall_clock = clock, wall_clock
+        self._link: Link | None = None
+        self._site_id: int | None = None
+        self._zones = ZonesMessage(())
+        """As the broker keeps them or they were stored here last, including other sites' zones of this number."""
+        self._drawn: ZonesMessage | None = None  # zones stored here that have not come back from the broker
+        self._zones_fault: str | None = None  # why the zones that the broker keeps cannot be read
+        self._sent_serial = 0
+        self._health_due_s = self._condition_due_s = 0.0
+        self.evidence = Evidence(host, clock())
+        if site is not None:
+            self.evidence.set_site(site.site, clock())
+        self.log = EventLog(wall_clock() - clock())
+        self._condition_monitor = ConditionMonitor(self.evidence)
+        self.condition: Condition = self._condition_monitor.evaluate(clock())
+        self._logged_serial = 0
+        self._lag_s = 0.0
+        self._used_share = used_share
+        self._preparation_s = 0.0
+        self._sites: bytes | None = None
+
+    # MQTT
+
+    def attach(self, link: Link, site_id: int) -> None:
+        """Subscribe to a site's topics."""
+        self._link, self._site_id = link, site_id
+        handlers: dict[str, Callable[[str, bytes], None]] = {
+            topics.site_topic(site_id): self._on_site,
+            topics.floor_plan_topic(site_id): self._on_floor_plan,
+            topics.fix_topic(site_id, "+"): self._on_fix,
+            topics.status_topic(site_id, "+", "+"): self._on_status,
+            topics.health_topic(site_id, "+", "+"): self._on_health,
+            topics.truth_topic(site_id): self._on_truth,
+            topics.preparation_topic(site_id): self._on_preparation,
+            topics.zones_topic(site_id): self._on_zones,
+            topics.zone_event_topic(site_id, "+"): self._on_zone_event,
+            **self.survey.handlers(site_id),
+        }
+        for topic, handler in handlers.items():
+            link.subscribe(topic, self._counting(topic.rsplit("/", 1)[-1], handler), _qos(topic))
+        if self._drawn is not None:
+            link.publish(topics.zones_topic(site_id), self._drawn, qos=1, retain=True)
+
+    def on_connection(self, connected: bool) -> None:
+        """Update whether the broker is connected."""
+        if connected != self.connected:
+            self.connected = connected
+            self.evidence.set_connected(connected=connected, now_s=self._clock())
+            self._evaluate(self._clock())
+            self.survey.expect_kept()
+            self._broadcast("mqtt", self._connection())
+
+    def set_sites(self, sites: list[tuple[int, str, bool]]) -> None:
+        """Update which sites the broker carries: number, name, and whether programs of it are online."""
+        message = encode("sites", {"shown": self._site_id, "sites": sites})
+        if message != self._sites:
+            self._sites = message
+            self._broadcast("sites", message)
+
+    def _counting(self, kind: str, handler: Callable[[str, bytes], None]) -> Callable[[str, bytes], None]:
+        def handle(topic: str, payload: bytes) -> None:
+            try:
+                handler(topic, payload)
+            except (WrongMessageError, BadZonesError, ConfigurationError) as error:
+                self.dropped[kind] += 1
+                if self.dropped[kind] == 1:
+                    _log.warning("dropped a wrong message of %s: %s; there may be more", topic, error)
+
+        return handle
+
+    def _on_site(self, _topic: str, payload: bytes) -> None:
+        message = read_message(payload, SiteMessage)
+        check_site(message.whole_site, Path("the site on MQTT"))
+        if message.site.id != self._site_id:
+            raise WrongMessageError(f"it is of site {message.site.id}")
+        self.site = message
+        self.evidence.set_site(message.site, self._clock())
+        self._broadcast("site", encode("site", {"site": message}))
+        self._assign_zones()
+
+    def _on_floor_plan(self, topic: str, payload: bytes) -> None:
+        image = payload or None
+        if image != self.floor_plan:
+            if self._link is not None:
+                self._link.forget(topic)  # an image that was stored here must not come back after a reconnect
+            self._show_floor_plan(image)
+
+    def _show_floor_plan(self, image: bytes | None) -> None:
+        self.floor_plan = image
+        self._broadcast("floor_plan", self._floor_plan_message())
+
+    def _floor_plan_message(self) -> bytes:
+        """Lets pages load the image again when it is another one."""
+        digest = None if self.floor_plan is None else f"{zlib.crc32(self.floor_plan):08x}"
+        return encode("floor_plan", {"digest": digest})
+
+    def _on_fix(self, topic: str, payload: bytes) -> None:
+        fix = read_message(payload, FixMessage)
+        _check_name(fix.tag, topic)
+        if not self.evidence.roster.admits("tag", fix.tag):
+            return
+        now_s = self._clock()
+        unix_s = self._wall_clock()
+        self.state.add_fix(fix, now_s, unix_s - self.evidence.add_fix(fix, now_s))
+        self.log.on_fix(fix, now_s)
+        self._schedule(self.monitor.update(fix, now_s))
+
+    def _on_status(self, topic: str, payload: bytes) -> None:
+        if not payload:
+            return  # a retained status was cleared
+        status = read_message(payload, StatusMessage)
+        _check_name(status.name, topic)
+        if not self.evidence.roster.admits(status.kind, status.name):
+            return
+        self.state.add_status(status)
+        self.evidence.add_status(status, self._clock())
+        self.log.on_status(status, self._clock())
+        if status.kind == "tag" and not status.online:
+            self._schedule(self.monitor.remove_tag(status.name, self._wall_clock()))
+
+    def _on_health(self, topic: str, payload: bytes) -> None:
+        _, kind, name, _ = topic.rsplit("/", 3)
+        if kind in _HEALTHS and self.evidence.roster.admits(kind, name):
+            health: TagHealth | AnchorHealth | EtherHealth = read_message(payload, _HEALTHS[kind])  # type: ignore[assignment]
+            now_s, unix_s = self._clock(), self._wall_clock()
+            self.state.add_health(name, health, now_s)
+            self.evidence.add_health(kind, name, health, now_s, unix_s)
+            self.log.on_health(kind, name, health, now_s)
+
+    def _on_preparation(self, _topic: str, payload: bytes) -> None:
+        now = read_message(payload, PreparationMessage) if payload else None
+        if now is not None and self._wall_clock() - now.unix_s > _PREPARATION_EXPIRY_S:
+            return  # the broker has kept it, of a demo that was killed
+        self._preparation_s = self._clock()
+        self._show_preparation(now)
+
+    def _show_preparation(self, now: PreparationMessage | None) -> None:
+        if now is not None or self.preparation is not None:
+            self.preparation = now
+            self._broadcast("preparation", encode("preparation", {"preparation": self.preparation}))
+
+    def _on_truth(self, _topic: str, payload: bytes) -> None:
+        self.state.add_truth(read_message(payload, TruthMessage))
+
+    def _on_zones(self, topic: str, payload: bytes) -> None:
+        try:
+            message = read_zones(payload) if payload else ZonesMessage(())
+        except BadZonesError as error:
+            self._zones_fault = f"the zones that the broker keeps at {topic} cannot be read: {error}"
+            self._broadcast("zones", encode("zones", self._zone_fields()))
+            raise
+        if payload and not message.site and not message.others:  # of an older program, which knows of no other sites
+            message = ZonesMessage(message.zones, "", self._zones.others)
+        if self._drawn is not None:
+            if message != self._drawn:
+                return  # older than the zones stored here, which are on their way
+            self._drawn = None
+        elif message != self._zones and self._link is not None:
+            self._link.forget(topic)
+        fault, self._zones_fault = self._zones_fault, None
+        self._zones = message
+        self._assign_zones(changed=fault is not None)
+
+    def _on_zone_event(self, topic: str, payload: bytes) -> None:
+        event = read_message(payload, ZoneEvent)
+        _check_name(event.zone, topic)
+        if self.events.add_published(event):
+            self._broadcast_event(event)
+
+    # Zones
+
+    def store_zones(self, zones: tuple[Zone, ...], site: str = "") -> None:
+        """Store the zones that a page has drawn at the site of this name, by default at the site shown.
+
+        Raises BadZonesError; also where the broker keeps zones that cannot be read, which are not overwritten.
+        """
+        check_zones(zones)
+        shown = self._site_name
+        if site and site != shown:
+            raise BadZonesError(f"they are of the site {site[:100]!r}, but {shown[:100]!r} is shown now")
+        if self._zones_fault is not None:
+            raise BadZonesError(f"{self._zones_fault}; nothing was overwritten. Clear that topic to begin again")
+        self._store(ZonesMessage(zones, shown, zones_of(self._zones, shown).others))
+        self._assign_zones()
+
+    @property
+    def _site_name(self) -> str:
+        return "" if self.site is None else self.site.site.name
+
+    def _store(self, message: ZonesMessage) -> None:
+        self._zones = self._drawn = message
+        if self._link is not None and self._site_id is not None:
+            self._link.publish(topics.zones_topic(self._site_id), message, qos=1, retain=True)
+
+    def _assign_zones(self, *, changed: bool = False) -> None:
+        """Show the zones of the present site. Zones without a site become its own, for good."""
+        name = self._site_name
+        if name and not self._zones.site and self._zones.zones:
+            self._store(zones_of(self._zones, name))
+        is_foreign = not name and self._zones.site  # whose they are is known, but not whether that site is shown
+        zones = () if is_foreign else zones_of(self._zones, name).zones
+        if zones != self.monitor.zones:
+            self._schedule(self.monitor.set_zones(zones, self._wall_clock()))
+            changed = True
+        if changed:
+            self._broadcast("zones", encode("zones", self._zone_fields()))
+
+    def _zone_fields(self) -> dict[str, object]:
+        """The zones of the present site, those of others that have its number, and why they cannot be read."""
+        others = zones_of(self._zones, self._site_name).others
+        return {"zones": self.monitor.zones, "other_zones": others, "zones_fault": self._zones_fault}
+
+    def _schedule(self, events: list[ZoneEvent]) -> None:
+        if events:
+            dashboards = [status for (kind, _), status in self.state.statuses.items() if kind == "dashboard"]
+            self.events.schedule(events, publisher_rank(self.name, dashboards), self._clock())
+
+    def _publish_events(self, now_s: float) -> None:
+        for event in self.events.pop_due(now_s):
+            self._broadcast_event(event)
+            if self._link is not None and self._site_id is not None:
+                self._link.publish(topics.zone_event_topic(self._site_id, event.zone), event, qos=1)
+
+    # Survey
+
+    def publish_survey(self, message: SurveyFactsMessage | SurveySaveMessage) -> None:
+        """Give the survey program facts or the request to save. Raises NoBrokerError and NotAllowedError."""
+        link, site_id = self._connected()
+        if link.address.user == Role.PAGE:  # the broker would drop it without an answer
+            raise NotAllowedError("the role page may not set up a site; start this page with the user survey instead")
+        is_facts = isinstance(message, SurveyFactsMessage)
+        topic = topics.survey_facts_topic(site_id) if is_facts else topics.survey_save_topic(site_id)
+        link.publish(topic, message, qos=1)
+
+    def store_floor_plan(self, image: bytes) -> None:
+        """Store the image of the floor, a PNG or JPEG, at the broker. Raises NoBrokerError."""
+        link, site_id = self._connected()
+        link.publish(topics.floor_plan_topic(site_id), image, qos=1, retain=True)
+        self._show_floor_plan(image)
+
+    def _connected(self) -> tuple[Link, int]:
+        if self._link is None or self._site_id is None or not self.connected:
+            raise NoBrokerError(f"the broker {self.broker} is not connected; try again when it is")
+        return self._link, self._site_id
+
+    def features(self) -> bytes:
+        """The tags as GeoJSON.
+
+        Raises:
+            NoSiteError: no site is known yet.
+            SkylessError: it is not georeferenced.
+        """
+        if self.site is None:
+            raise NoSiteError("no site is known yet")
+        now_s, unix_s = self._clock(), self._wall_clock()
+        site = bridged_site(self.site.site, simulated=self.site.simulated)
+        return features(site, self.state.fixes_since(now_s, OLDEST_S), unix_s)
+
+    # Pages
+
+    def open_page(self, address: str = "") -> PageQueue:
+        """The queue of a new page of a computer, with what it needs first. Raises TooManyPagesError."""
+        self._make_room(address)
+        self._send_logged()
+        hello = {
+            "version": installed_version(),
+            "site": self.site,
+            **self._zone_fields(),
+            "events": list(self.events.recent),
+            "mqtt": self.connected,
+        }
+        page = PageQueue(encode("hello", hello), address, self._clock())
+        page.replace("mqtt", self._connection())
+        self.state.now_s = self._clock()
+        page.replace("condition", self._condition_message())
+        page.replace("log", encode("log", {"events": self.log.since()}))
+        if self.preparation is not None:
+            page.replace("preparation", encode("preparation", {"preparation": self.preparation}))
+        if self.floor_plan is not None:
+            page.replace("floor_plan", self._floor_plan_message())
+        if self._sites is not None:
+            page.replace("sites", self._sites)
+        for kind, message in self.survey.messages().items():
+            page.replace(kind, message)
+        self.pages.add(page)
+        return page
+
+    def _make_room(self, address: str) -> None:
+        """Close the page that is idle for longest where there are too many. Raises TooManyPagesError."""
+        mine = [page for page in self.pages if page.address == address]
+        if len(mine) < MAX_PAGES_PER_ADDRESS and len(self.pages) < MAX_PAGES:
+            return
+        oldest = min(mine if len(mine) >= MAX_PAGES_PER_ADDRESS else self.pages, key=lambda page: page.active_s)
+        if self._clock() - oldest.active_s < IDLE_S:
+            raise TooManyPagesError(f"too many pages are open: {len(mine)} of this computer, {len(self.pages)} in all")
+        self._close_idle(oldest)
+
+    def _close_idle(self, page: PageQueue) -> None:
+        self.pages.discard(page)
+        page.close("this page was idle")
+
+    def keep_page(self, page: PageQueue) -> None:
+        """A page has sent something."""
+        page.active_s = self._clock()
+
+    def close(self) -> None:
+        """Close all pages."""
+        for page in self.pages:
+            page.close()
+
+    def tick(self, lag_s: float = 0.0) -> None:
+        """Do what is due. Call it 20 times a second. ``lag_s`` is the delay of this call."""
+        self._lag_s = max(self._lag_s, lag_s)
+        now_s, unix_s = self._clock(), self._wall_clock()
+        self.state.now_s, self.state.unix_s = now_s, unix_s
+        self.log.unix_offset_s = unix_s - now_s
+        if now_s > self._preparation_s + _PREPARATION_EXPIRY_S:
+            self._show_preparation(None)
+        if self.state.serial != self._sent_serial:
+            self._sent_serial = self.state.serial
+            for page in self.pages:
+                page.request_state()
+        if now_s >= self._health_due_s:
+            self._health_due_s = now_s + _HEALTH_PERIOD_S
+            self._schedule(self.monitor.expire_tags(now_s, unix_s))
+            self.state.expire(now_s)
+            for page in self.pages:
+                page.request_state(health=True)
+            for page in [page for page in self.pages if now_s - page.active_s > GONE_S]:
+                self._close_idle(page)
+        self._publish_events(now_s)
+        if now_s >= self._condition_due_s:
+            self._evaluate(now_s)
+        self._send_logged()
+
+    def _evaluate(self, now_s: float) -> None:
+        watch = self.survey.watch
+        unread_s = 0.0 if self._link is None else self._link.unread_s
+        used_share = None if self._used_share is None or self.preparation is not None else self._used_share(now_s)
+        self.condition = self._condition_monitor.evaluate(
+            now_s, self._lag_s, watch, self.survey.watch_age_s, used_share, unread_s
+        )
+        self._lag_s = 0.0
+        self.state.judge(now_s, blind=self._condition_monitor.is_blind(now_s))
+        self.log.on_watch(watch, now_s)
+        self.log.on_survey(self.survey.survey, now_s)
+        self.log.on_condition(self.condition, now_s)
+        (self.log.pause if self._condition_monitor.is_blind(now_s) else self.log.tick)(now_s)
+        self._broadcast("condition", self._condition_message())
+        # Of very many tags it takes longer, and the messages are to be read as well.
+        self._condition_due_s = now_s + max(EVALUATION_S, _EVALUATION_SHARE * (self._clock() - now_s))
+
+    def _condition_message(self) -> bytes:
+        """Its time gives pages the server's clock where no tag moves."""
+        return encode("condition", {"unix_s": self._wall_clock(), **msgspec.structs.asdict(self.condition)})
+
+    def _send_logged(self) -> None:
+        events = self.log.since(self._logged_serial)
+        if events:
+            self._logged_serial = self.log.serial
+            message = encode("log", {"events": events})
+            for page in self.pages:
+                page.add_logged(message)
+
+    async def run(self) -> None:
+        """Tick until cancelled."""
+        due_s = self._clock()
+        while True:
+            self.tick(self._clock() - due_s)
+            due_s = max(due_s + _STATE_PERIOD_S, self._clock())
+            await asyncio.sleep(due_s - self._clock())
+
+    def _connection(self) -> bytes:
+        return encode("mqtt", {"connected": self.connected, "broker": self.broker})
+
+    def _broadcast(self, kind: str, message: bytes) -> None:
+        for page in self.pages:
+            page.replace(kind, message)
+
+    def _broadcast_event(self, event: ZoneEvent) -> None:
+        message = encode("zone_event", msgspec.structs.asdict(event))
+        for page in self.pages:
+            page.add_event(message)
+
+
+def _qos(topic: str) -> int:
+    """Messages that are sent once only must not be lost."""
+    return 1 if "/zone" in topic or "/survey/" in topic else 0
+
+
+def _check_name(name: str, topic: str) -> None:
+    """Raise WrongMessageError unless a message names the same node or zone as its topic."""
+    if name != topic.rsplit("/", 2)[-2]:
+        raise WrongMessageError(f"it is of {name[:40]!r}")

@@ -1,0 +1,333 @@
+"""The state of the site as pages show it, gathered from messages, and what of it each page is sent. No I/O."""
+
+import math
+from collections import Counter
+from collections.abc import Iterable
+from itertools import islice
+from typing import Annotated, Any, Final, NamedTuple
+
+import msgspec
+from msgspec import Meta, Struct
+
+from skyless.run.mqtt.messages import (
+    AnchorHealth,
+    EtherHealth,
+    FixMessage,
+    StatusMessage,
+    TagHealth,
+    TruthBuffer,
+    TruthMessage,
+    Vector,
+)
+
+EXPIRY_S: Final = 600.0
+"""Fixes and health messages older than this are dropped."""
+
+MAX_CLOCK_ERROR_S: Final = 0.5
+"""The time of a fix by its tag's clock is replaced where it is wrong by more than this."""
+
+MAX_ROWS: Final = 2_000
+"""Maximum number of tags sent to a page. Beyond it, tags on its map and tags that it names or searches are sent."""
+
+MAX_HEALTHS: Final = 200
+"""Beyond this number of tags, or anchors, a page is sent only the health of those that it names."""
+
+MAX_REQUEST_BYTES: Final = 16_384
+_MAX_NAMED: Final = 200
+
+_MAX_ENCODED: Final = 16
+_KINDS: Final[dict[type, str]] = {AnchorHealth: "anchors", TagHealth: "tags", EtherHealth: "ether"}
+
+CHOICE_S: Final = 0.5
+"""Interval at which the tags for a page are chosen again."""
+
+UNHEARD_S: Final = 10.0
+"""A tag without a fix for this long is no longer on the map, as in ``page/clock.js``."""
+
+SILENT_S: Final = 3.5
+"""A node that reported once a second and has not for this long is offline, whatever its status says."""
+
+
+class PageRequest(Struct, frozen=True):
+    """What one page shows."""
+
+    view: tuple[float, float, float, float] | None = None
+    """The visible part of the site, least x and y and largest x and y in m. None means all of it."""
+    find: Annotated[str, Meta(max_length=200)] = ""
+    """Tags with this in their names."""
+    tags: Annotated[tuple[str, ...], Meta(max_length=_MAX_NAMED)] = ()
+    """Selected tags and those in the visible part of a list, of which also the health is sent."""
+    anchors: Annotated[tuple[str, ...], Meta(max_length=_MAX_NAMED)] = ()
+    rows: Annotated[int, Meta(ge=1)] = MAX_ROWS
+    """Tags that its browser can draw in time."""
+
+    @classmethod
+    def read(cls, text: str) -> "PageRequest | None":
+        """A page's request, or None for a text that is none."""
+        try:
+            return msgspec.json.decode(text, type=cls)
+        except (msgspec.MsgspecError, ValueError, RecursionError):
+            return None
+
+
+class Sent:
+    """What a page has been sent of the state, so that it is sent only what is new."""
+
+    def __init__(self) -> None:
+        self.wanted = PageRequest()
+        self.fixes = 0  # serial of the last fix
+        self.tags: dict[str, None] | None = None  # tags that it has been sent; None: all
+        self.inside = 0  # tags in its view
+        self.chosen_s = float("-inf")  # when its tags were chosen
+        self.healths: int | None = None  # serial of the last health, None before the first message
+        self.named: dict[str, set[str]] = {"tags": set(), "anchors": set(), "ether": set()}
+        """By kind, the names whose health it was sent because it asked for them."""
+        self.statuses = 0  # serial of the last status
+        self.conditions: dict[str, str] = {}  # of anchors
+
+
+class _Tag:
+    """The last fix of a tag, and its row once one was requested."""
+
+    __slots__ = ("ended_unix_s", "fix", "received_s", "row", "serial")
+
+    def __init__(self, fix: FixMessage, serial: int, received_s: float, ended_unix_s: float) -> None:
+        self.fix, self.serial, self.received_s, self.ended_unix_s = fix, serial, received_s, ended_unix_s
+        self.row: list[Any] | None = None
+
+
+class _Health(NamedTuple):
+    """The last health of a node."""
+
+    serial: int
+    received_s: float
+    health: TagHealth | AnchorHealth | EtherHealth
+
+
+class SiteState:
+    """The newest fix, health and status by name."""
+
+    def __init__(self) -> None:
+        self.serial = 0  # counts fixes; a reader that has the state at one serial requests what came since
+        self.statuses: dict[tuple[str, str], StatusMessage] = {}  # by kind and name
+        self.now_s = self.unix_s = 0.0
+        """Times of the next messages, by the clock of ``expire`` and by Unix time. Set by the owner."""
+        self.dropped: Counter[str] = Counter()  # wrong messages by kind
+        self._tags: dict[str, _Tag] = {}
+        self._truths = TruthBuffer()
+        self._healths: dict[str, dict[str, _Health]] = {kind: {} for kind in _KINDS.values()}  # by kind and name
+        self._health_serial = 0
+        self._status_serial = 0
+        self._status_serials: dict[tuple[str, str], int] = {}
+        self._leaders: set[str] = set()  # anchors that lead the site's time
+        self._conditions: dict[str, str] = {}  # of anchors
+        self._waiting: list[str] = []  # tags that report and have no position yet
+        self._encoded: dict[tuple[int, int], bytes] = {}
+
+    def add_fix(self, fix: FixMessage, now_s: float, unix_s: float) -> None:
+        """Add a fix. ``now_s`` is its time of arrival, by the clock of ``expire``.
+
+        ``unix_s`` is the time of the fix, the end of its last frame, by the owner's clock of the day.
+        """
+        self.serial += 1
+        self._tags[fix.tag] = _Tag(fix, self.serial, now_s, unix_s)
+
+    def add_truth(self, truth: TruthMessage) -> None:
+        """Add true positions of simulated tags."""
+        self._truths.add(truth)
+
+    def add_status(self, status: StatusMessage) -> None:
+        """Update whether a node is online."""
+        key = status.kind, status.name
+        self._status_serial += 1
+        self.statuses[key], self._status_serials[key] = status, self._status_serial
+
+    def add_health(self, name: str, health: TagHealth | AnchorHealth | EtherHealth, now_s: float) -> None:
+        """Update a node's health."""
+        self._health_serial += 1
+        self._healths[_KINDS[type(health)]][name] = _Health(self._health_serial, now_s, health)
+        if isinstance(health, AnchorHealth):
+            (self._leaders.add if health.role in {"master", "root"} else self._leaders.discard)(name)
+
+    def expire(self, now_s: float) -> None:
+        """Drop what is older than ``EXPIRY_S``."""
+        self._encoded.clear()
+        for name in [name for name, tag in self._tags.items() if now_s - tag.received_s > EXPIRY_S]:
+            del self._tags[name]
+        for healths in self._healths.values():
+            for name in [name for name, known in healths.items() if now_s - known.received_s > EXPIRY_S]:
+                del healths[name]
+
+    def fixes_since(self, now_s: float, longest_s: float) -> list[tuple[FixMessage, float]]:
+        """The newest fix of each tag that came within the last ``longest_s``, and when it ended, by ``unix_s``."""
+        found = [tag for tag in self._tags.values() if now_s - tag.received_s <= longest_s]
+        return [(tag.fix, tag.ended_unix_s) for tag in found]
+
+    def methods(self) -> list[str]:
+        """The positioning method of each tag whose health is known."""
+        return [known.health.method for known in self._healths["tags"].values() if isinstance(known.health, TagHealth)]
+
+    # Fixes
+
+    def state_since(self, serial: int) -> bytes:
+        """The ``state`` message with all tags that have a fix since. Readers at the same serial share its bytes."""
+        key = serial, self.serial
+        if key not in self._encoded:
+            if len(self._encoded) >= _MAX_ENCODED:
+                self._encoded.clear()
+            self._encoded[key] = encode("state", {"unix_s": round(self.unix_s, 3), "tags": self.rows_since(serial)})
+        return self._encoded[key]
+
+    def rows_since(self, serial: int) -> list[list[Any]]:
+        """Rows of the ``state`` message, the fields of each in the order of ``page/tracks.js``."""
+        return [self._row(tag) for tag in self._tags.values() if tag.serial > serial]
+
+    def _row(self, tag: _Tag) -> list[Any]:
+        if tag.row is None:
+            tag.row = _row(tag.fix, self._truths.at(tag.fix.tag, tag.fix.unix_s), tag.ended_unix_s)
+        return tag.row
+
+    def new_state(self, sent: Sent) -> bytes | None:
+        """The ``state`` message with what is new to a page, or None where nothing is.
+
+        Of a large site the page is sent a part of the tags; ``left`` are those that no longer belong to it, ``of`` is
+        how many there are, and ``inside`` how many are in the page's view.
+        """
+        if len(self._tags) <= sent.wanted.rows:
+            if sent.fixes == self.serial and sent.tags is None:
+                return None
+            since, sent.fixes = 0 if sent.tags is not None else sent.fixes, self.serial
+            sent.tags = None
+            return self.state_since(since)
+        before = sent.tags if sent.tags is not None else dict.fromkeys(self._tags if sent.fixes else ())
+        if sent.tags is None or self.now_s - sent.chosen_s >= CHOICE_S:
+            sent.chosen_s = self.now_s
+            sent.tags = self._choose(sent, before)
+        chosen = {name: self._tags[name] for name in sent.tags if name in self._tags}
+        rows = [self._row(tag) for name, tag in chosen.items() if tag.serial > sent.fixes or name not in before]
+        left = [name for name in before if name not in sent.tags] if before is not sent.tags else []
+        sent.fixes = self.serial
+        if not rows and not left:
+            return None
+        fields = {"tags": rows, "left": left, "of": len(self._tags), "inside": sent.inside}
+        return encode("state", {"unix_s": round(self.unix_s, 3), **fields})
+
+    def _choose(self, sent: Sent, before: dict[str, None]) -> dict[str, None]:
+        """The tags for a page: those that it names, that it looks for, and those in its view, first those it has."""
+        wanted, text = sent.wanted, sent.wanted.find.lower()
+        x1, y1, x2, y2 = wanted.view or (-math.inf, -math.inf, math.inf, math.inf)
+        inside = []
+        for name, tag in self._tags.items():
+            x, y, _ = tag.fix.position_m
+            if x1 <= x <= x2 and y1 <= y <= y2 and self.now_s - tag.received_s < UNHEARD_S:
+                inside.append(name)
+        sent.inside = len(inside)
+        named = [name for name in wanted.tags if name in self._tags]
+        found = [name for name in self._tags if text in name.lower()] if text else []
+        names = dict.fromkeys([*named, *found, *(name for name in inside if name in before), *inside])
+        return dict.fromkeys(list(names)[: wanted.rows])
+
+    # Healths and statuses
+
+    def judge(self, now_s: float, *, blind: bool) -> None:
+        """Find the condition of each anchor: ``good``, ``warn`` (not synchronised) or ``bad`` (offline).
+
+        While the owner is blind, since messages may be missing, silence does not make an anchor ``bad``.
+        """
+        self._waiting = list(islice((name for name in self._healths["tags"] if name not in self._tags), MAX_HEALTHS))
+        found = {}
+        for name, known in self._healths["anchors"].items():
+            if isinstance(known.health, AnchorHealth):
+                health = known.health
+                found[name] = "good" if health.synchronised or health.role == "master" else "warn"
+                if now_s - known.received_s > SILENT_S and not (blind and self._conditions.get(name) != "bad"):
+                    found[name] = "bad"
+        for (kind, name), status in self.statuses.items():
+            if kind == "anchor" and not status.online:
+                found[name] = "bad"
+        self._conditions = found
+
+    def new_health(self, sent: Sent) -> bytes:
+        """The ``health`` message with what is new to a page. The first one is ``whole``.
+
+        Of many tags or anchors it holds the health of those only that the page names, and of anchors that lead.
+        ``ages`` are since each arrived; ``waiting`` are tags that report and have no position yet.
+        """
+        whole, since = sent.healths is None, sent.healths or 0
+        named = {"tags": {*sent.wanted.tags}, "anchors": {*sent.wanted.anchors, *self._leaders}}
+        new: dict[str, list[Any]] = {}
+        ages: dict[str, dict[str, float]] = {}
+        for kind, healths in self._healths.items():
+            names: Iterable[str] = healths
+            if len(healths) > MAX_HEALTHS:
+                names = [name for name in named[kind] if name in healths]
+            fresh = [n for n in names if healths[n].serial > since or n in named.get(kind, set()) - sent.named[kind]]
+            new[kind] = [healths[name].health for name in fresh]
+            ages[kind] = {name: round(self.now_s - healths[name].received_s, 2) for name in fresh}
+        nodes = []
+        if sent.statuses < self._status_serial:
+            nodes = [self.statuses[key] for key, serial in self._status_serials.items() if serial > sent.statuses]
+        if len(self.statuses) > MAX_HEALTHS:  # of many, pages list the other programs
+            nodes = [node for node in nodes if node.kind not in {"tag", "anchor"}]
+        changed = {name: kind for name, kind in self._conditions.items() if sent.conditions.get(name) != kind}
+        changed |= dict.fromkeys(sent.conditions.keys() - self._conditions.keys(), "unknown")
+        sent.healths, sent.named = self._health_serial, named | {"ether": set()}
+        sent.statuses, sent.conditions = self._status_serial, self._conditions
+        return encode(
+            "health",
+            {
+                "whole": whole,
+                "anchors": new["anchors"],
+                "tags": new["tags"],
+                "ether": new["ether"][-1] if new["ether"] else None,
+                "nodes": nodes,
+                "conditions": changed,
+                "waiting": self._waiting,
+                "dropped": self.dropped,
+                "ages": ages,
+            },
+        )
+
+
+def encode(kind: str, fields: dict[str, Any]) -> bytes:
+    """One message to the page."""
+    return msgspec.json.encode({"type": kind, **fields})
+
+
+def error_m(fix: FixMessage, true_m: Vector) -> float:
+    """Distance from the true position in the axes that the fix estimates, so without a given height."""
+    axes = 2 if fix.height_known else 3
+    return math.dist(fix.position_m[:axes], true_m[:axes])
+
+
+def _row(fix: FixMessage, true_m: Vector | None, ended_unix_s: float) -> list[Any]:
+    """One tag in a ``state``, rounded to what a page can show, which halves the bytes."""
+    unix_s = fix.unix_s if abs(fix.unix_s - ended_unix_s) <= MAX_CLOCK_ERROR_S else ended_unix_s
+    x, y, z = fix.position_m
+    xx, xy, _, _, yy = fix.covariance_m2[:5]
+    vx, vy, _ = fix.velocity_mps or (None, None, None)
+    verified_s = fix.verified_until_s
+    return [
+        fix.tag,
+        round(x, 4),
+        round(y, 4),
+        round(z, 4),
+        None if vx is None else round(vx, 3),
+        None if vy is None else round(vy, 3),
+        round(xx, 8),
+        round(xy, 8),
+        round(yy, 8),
+        round(fix.std_m, 5),
+        None if true_m is None else round(error_m(fix, true_m), 4),
+        None if true_m is None else round(true_m[0], 4),
+        None if true_m is None else round(true_m[1], 4),
+        len(fix.anchors),
+        round(fix.chi2, 3),
+        round(unix_s, 4),
+        None if fix.hpl_m is None else round(fix.hpl_m, 4),
+        fix.alert,
+        int(fix.height_known),
+        None if fix.height_known else round(math.sqrt(max(fix.covariance_m2[8], 0.0)), 5),
+        None if verified_s is None else round(fix.time_s - verified_s, 2),
+        None if verified_s is None else round(fix.unverified, 3),
+    ]

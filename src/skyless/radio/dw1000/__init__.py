@@ -1,0 +1,1 @@
+"""A DW1000 on SPI: the driver in C and its use from Python."""

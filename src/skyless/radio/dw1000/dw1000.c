@@ -1,0 +1,579 @@
+#include "dw1000.h"
+
+#include <string.h>
+
+#include "dw1000_registers.h"
+
+#define WRITE 0x80u
+
+struct setting {
+    uint8_t file;
+    uint16_t sub;
+    uint8_t octets;
+    uint32_t value;
+};
+
+/* Channel 5, PRF 64 MHz, 6.8 Mbit/s, preamble of 128 symbols with code 9. */
+static const struct setting CONFIGURATION[] = {
+    {0x04u, 0x0000u, 4u, 0x00001200u}, /* SYS_CFG: IRQ high, smart power; no second buffer, filter, RXAUTR (7.2.6) */
+    {0x1Fu, 0x0000u, 4u, CHAN_CTRL},
+    {0x08u, 0x0000u, 4u, TX_FCTRL},
+    {0x23u, 0x0004u, 2u, 0x889Bu},     /* AGC_TUNE1 (UM 7.2.36, Table 24) */
+    {0x23u, 0x000Cu, 4u, 0x2502A907u}, /* AGC_TUNE2 (Table 25) */
+    {0x23u, 0x0012u, 2u, 0x0035u},     /* AGC_TUNE3 (Table 26) */
+    {0x27u, 0x0002u, 2u, 0x0001u},     /* DRX_TUNE0b: 6.8 Mbit/s, standard SFD (UM 7.2.40.2, Table 30) */
+    {0x27u, 0x0004u, 2u, 0x008Du},     /* DRX_TUNE1a: PRF 64 (7.2.40.3, Table 31) */
+    {0x27u, 0x0006u, 2u, 0x0020u},     /* DRX_TUNE1b: preambles of 128 to 1024 (7.2.40.4, Table 32) */
+    {0x27u, 0x0008u, 4u, 0x313B006Bu}, /* DRX_TUNE2: PRF 64, PAC 8 (7.2.40.5, Tables 33, 6) */
+    {0x27u, 0x0020u, 2u, 129u},        /* DRX_SFDTOC: 128 + 1 + SFD 8 - PAC 8; never 0 (7.2.40.7) */
+    {0x27u, 0x0026u, 2u, 0x0028u},     /* DRX_TUNE4H: preambles from 128 (7.2.40.10, Table 34) */
+    {0x28u, 0x000Bu, 1u, 0xD8u},       /* RF_RXCTRLH: channel 5 (UM 7.2.41, Table 37) */
+    {0x28u, 0x000Cu, 4u, 0x001E3FE0u}, /* RF_TXCTRL: channel 5 (Table 38) */
+    {0x2Au, 0x000Bu, 1u, 0xC0u},       /* TC_PGDELAY: channel 5 (UM 7.2.43, Table 40) */
+    {0x2Bu, 0x0007u, 4u, 0x0800041Du}, /* FS_PLLCFG: channel 5 (UM 7.2.44, Table 43) */
+    {0x2Bu, 0x000Bu, 1u, 0xBEu},       /* FS_PLLTUNE: channel 5 (Table 44) */
+    {0x2Eu, 0x0806u, 1u, 0x6Du},       /* LDE_CFG1: PMULT 3, NTM 13 (UM 7.2.47.2, 2.5.5.4) */
+    {0x2Eu, 0x1806u, 2u, 0x0607u},     /* LDE_CFG2: PRF 64 (7.2.47.6, 2.5.5.5) */
+    {0x2Eu, 0x2804u, 2u, 0x28F4u},     /* LDE_REPC: code 9 (7.2.47.7) */
+};
+
+/* 100 000 log10(1 + i/32) */
+static const uint16_t LOG10_TABLE[33] = {
+    0u,     1336u,  2633u,  3892u,  5115u,  6305u,  7463u,  8591u,  9691u,  10763u, 11810u,
+    12832u, 13830u, 14806u, 15761u, 16695u, 17609u, 18505u, 19382u, 20242u, 21085u, 21913u,
+    22724u, 23521u, 24304u, 25072u, 25828u, 26570u, 27300u, 28018u, 28724u, 29419u, 30103u,
+};
+
+/* Arithmetic */
+
+/* Towards minus infinity; the divisor is positive. */
+static int32_t floor_divide(int32_t value, int32_t by)
+{
+    int32_t quotient = value / by;
+
+    return ((value % by) < 0) ? (quotient - 1) : quotient;
+}
+
+int32_t dw1000_log10(uint32_t value)
+{
+    int32_t exponent = 15;
+
+    while (value >= 0x10000u) {
+        value >>= 1;
+        exponent++;
+    }
+    while (value < 0x8000u) {
+        value <<= 1;
+        exponent--;
+    }
+
+    uint32_t at = (value - 0x8000u) >> 10;
+    uint32_t low = LOG10_TABLE[at];
+    uint32_t high = LOG10_TABLE[at + 1u];
+
+    return (exponent * LOG10_2) + (int32_t)(low + (((high - low) * (value & 0x3FFu)) >> 10));
+}
+
+int32_t dw1000_accumulated(uint32_t symbols)
+{
+    return (symbols > 0u) ? (POWER_A + (2 * dw1000_log10(symbols))) : 0;
+}
+
+/* UM 4.7.2 */
+int32_t dw1000_power_cdbm(uint32_t cir_power, int32_t level)
+{
+    if ((cir_power == 0u) || (level == 0)) {
+        return DW1000_NOT_MEASURED;
+    }
+    return floor_divide(dw1000_log10(cir_power) + (17 * LOG10_2) - level + 50, 100);
+}
+
+/* UM 4.7.1 */
+int32_t dw1000_first_path_cdbm(uint32_t f1, uint32_t f2, uint32_t f3, int32_t level)
+{
+    if (level == 0) {
+        return DW1000_NOT_MEASURED;
+    }
+    while ((f1 >= 0x4000u) || (f2 >= 0x4000u) || (f3 >= 0x4000u)) {
+        f1 >>= 1;
+        f2 >>= 1;
+        f3 >>= 1;
+        level -= 2 * LOG10_2;
+    }
+
+    uint32_t squares = (f1 * f1) + (f2 * f2) + (f3 * f3);
+
+    return (squares == 0u) ? DW1000_NOT_MEASURED : floor_divide(dw1000_log10(squares) - level + 50, 100);
+}
+
+/* One step of DRX_CAR_INT is -1e9 / (6.5 * 2**28) = -0.57311e-9 on channel 5 (UM p. 151, Table 35). */
+int32_t dw1000_carrier_offset_ppb(int32_t integrator)
+{
+    if ((integrator > 57170) || (integrator < -57170)) {
+        return DW1000_NOT_MEASURED;
+    }
+    return floor_divide(8192 - (integrator * 9390), 16384);
+}
+
+int32_t dw1000_micros_until(uint64_t now_ticks, uint64_t then_ticks)
+{
+    int32_t distance = (int32_t)(uint32_t)(((then_ticks >> 16) - (now_ticks >> 16)) & 0xFFFFFFu);
+
+    return (distance >= 0x800000) ? (distance - 0x1000000) : distance;
+}
+
+/* Transactions */
+
+static uint32_t sixteen(const uint8_t *data)
+{
+    return (uint32_t)data[0] | ((uint32_t)data[1] << 8);
+}
+
+static uint64_t forty(const uint8_t *data)
+{
+    uint64_t ticks = 0u;
+
+    for (uint32_t at = 5u; at > 0u; at--) {
+        ticks = (ticks << 8) | data[at - 1u];
+    }
+    return ticks;
+}
+
+/* Write the header of a transaction (UM 2.2.1.2); how many octets it has. */
+static uint32_t put_header(uint8_t *out, uint32_t first, uint32_t sub)
+{
+    if (sub == 0u) {
+        out[0] = (uint8_t)first;
+        return 1u;
+    }
+    out[0] = (uint8_t)(first | 0x40u);
+    if (sub < 0x80u) {
+        out[1] = (uint8_t)sub;
+        return 2u;
+    }
+    out[1] = (uint8_t)(0x80u | (sub & 0x7Fu));
+    out[2] = (uint8_t)(sub >> 7);
+    return 3u;
+}
+
+/* Read a register into a buffer, behind the header; where the data begin. */
+static const uint8_t *read_into(struct dw1000 *chip, uint8_t *into, uint32_t file, uint32_t sub, uint32_t octets)
+{
+    uint32_t head = put_header(chip->out, file, sub);
+
+    (void)memset(&chip->out[head], 0, octets);
+    chip->hardware->transfer(chip->out, into, head + octets);
+    return &into[head];
+}
+
+static const uint8_t *read_register(struct dw1000 *chip, uint32_t file, uint32_t sub, uint32_t octets)
+{
+    return read_into(chip, chip->into, file, sub, octets);
+}
+
+static void write_bytes(struct dw1000 *chip, uint32_t file, uint32_t sub, const uint8_t *data, uint32_t octets)
+{
+    uint32_t head = put_header(chip->out, WRITE | file, sub);
+
+    (void)memcpy(&chip->out[head], data, octets);
+    chip->hardware->transfer(chip->out, chip->into, head + octets);
+}
+
+static void write_register(struct dw1000 *chip, uint32_t file, uint32_t sub, uint32_t octets, uint64_t value)
+{
+    const uint8_t data[5] = {(uint8_t)value, (uint8_t)(value >> 8), (uint8_t)(value >> 16), (uint8_t)(value >> 24),
+                             (uint8_t)(value >> 32)};
+
+    write_bytes(chip, file, sub, data, octets);
+}
+
+static void read_status(struct dw1000 *chip)
+{
+    chip->status = forty(read_register(chip, 0x0Fu, 0u, STATUS_OCTETS));
+}
+
+static void clear_status(struct dw1000 *chip, uint64_t events)
+{
+    write_register(chip, 0x0Fu, 0u, STATUS_OCTETS, events);
+}
+
+/* Clear what the last reading of SYS_STATUS has shown; what came since stays. */
+static void clear_seen(struct dw1000 *chip)
+{
+    clear_status(chip, chip->status & CLEARED);
+}
+
+/* Turn the transceiver off and forget all events. */
+static void off_and_clear(struct dw1000 *chip)
+{
+    write_register(chip, 0x0Du, 0u, 1u, TRXOFF);
+    clear_status(chip, CLEARED);
+}
+
+/* Starting */
+
+static bool is_there(struct dw1000 *chip)
+{
+    const uint8_t *found = read_register(chip, 0x00u, 0u, 4u);
+
+    return (sixteen(found) | (sixteen(&found[2]) << 16)) == DEVICE_ID;
+}
+
+/* Crystal clock; nothing to be restored by the always-on block; SOFTRESET (UM 7.2.50.1, 7.2.45). */
+static void soft_reset(struct dw1000 *chip)
+{
+    write_register(chip, 0x36u, 0x00u, 2u, 0x0201u); /* PMSC_CTRL0: SYSCLKS 1 */
+    write_register(chip, 0x2Cu, 0x00u, 2u, 0u);      /* AON_WCFG */
+    write_register(chip, 0x2Cu, 0x06u, 1u, 0u);      /* AON_CFG0 */
+    write_register(chip, 0x2Cu, 0x02u, 1u, 0u);      /* AON_CTRL */
+    write_register(chip, 0x2Cu, 0x02u, 1u, 0x02u);   /* AON_CTRL: SAVE */
+    write_register(chip, 0x36u, 0x03u, 1u, 0x00u);
+    chip->hardware->pause_us(1000u);
+    write_register(chip, 0x36u, 0x03u, 1u, 0xF0u);
+    chip->hardware->pause_us(1000u);
+    write_register(chip, 0x36u, 0x00u, 2u, 0x0201u);
+}
+
+/* First octet of a word of the one-time programmable memory (UM 6.3.2, 7.2.46). */
+static uint32_t read_otp(struct dw1000 *chip, uint32_t address)
+{
+    write_register(chip, 0x2Du, 0x04u, 2u, address);
+    write_register(chip, 0x2Du, 0x06u, 1u, 0x03u); /* OTP_CTRL: OTPRDEN, OTPREAD */
+    write_register(chip, 0x2Du, 0x06u, 1u, 0x00u);
+    return read_register(chip, 0x2Du, 0x0Au, 4u)[0];
+}
+
+/* What was measured when the chip or module was made: supply, temperature, crystal (UM 2.5.5.11, 8.1, 6.4). */
+static void calibrate(struct dw1000 *chip)
+{
+    uint32_t trim;
+
+    write_register(chip, 0x24u, 0x00u, 4u, 0x04u); /* EC_CTRL: PLLLDT, or CPLOCK means nothing (UM 7.2.37.1) */
+    if (read_otp(chip, OTP_LDOTUNE) != 0u) {
+        write_register(chip, 0x2Du, 0x12u, 1u, 0x02u); /* OTP_SF: LDO_KICK */
+    }
+    chip->voltage_33 = read_otp(chip, OTP_VOLTAGE);
+    chip->temperature_23 = read_otp(chip, OTP_TEMPERATURE);
+    (void)read_otp(chip, OTP_PART_ID);
+    (void)read_otp(chip, OTP_LOT_ID);
+    trim = read_otp(chip, OTP_CRYSTAL_TRIM) & 0x1Fu;
+    if (trim == 0u) {
+        trim = 0x10u; /* not trimmed: mid-range */
+    }
+    write_register(chip, 0x2Bu, 0x0Eu, 1u, 0x60u | trim); /* FS_XTALT: upper bits 011 (UM 7.2.44.5) */
+}
+
+/* The leading-edge search, without which there are no RX stamps (UM 2.5.5.10, Table 4). */
+static void load_microcode(struct dw1000 *chip)
+{
+    write_register(chip, 0x36u, 0x00u, 2u, 0x0301u);
+    write_register(chip, 0x2Du, 0x06u, 2u, 0x8000u); /* OTP_CTRL: LDELOAD */
+    chip->hardware->pause_us(LDE_LOAD_US);
+}
+
+/* Let the PLL lock, without a transaction while the clock changes (UM 2.3.2). */
+static bool lock(struct dw1000 *chip)
+{
+    write_register(chip, 0x36u, 0x00u, 2u, 0x0200u); /* PMSC_CTRL0: clocks by themselves */
+    for (uint32_t tries = 0u; tries < LOCK_TRIES; tries++) {
+        chip->hardware->pause_us(100u);
+        read_status(chip);
+        if ((chip->status & CPLOCK) != 0u) {
+            return true;
+        }
+    }
+    return false;
+}
+
+void dw1000_init(struct dw1000 *chip, const struct hardware *hardware)
+{
+    (void)memset(chip, 0, sizeof *chip);
+    chip->hardware = hardware;
+    chip->state = DW1000_OFF;
+    chip->frame = &chip->frame_into[1];
+    chip->rx_power_cdbm = DW1000_NOT_MEASURED;
+    chip->first_path_cdbm = DW1000_NOT_MEASURED;
+    chip->offset_ppb = DW1000_NOT_MEASURED;
+    chip->temperature_cc = DW1000_NOT_MEASURED;
+}
+
+bool dw1000_start(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t rx_antenna_delay)
+{
+    chip->state = DW1000_OFF;
+    chip->is_listening = false;
+    chip->hardware->set_spi_fast(false);
+    chip->hardware->reset_chip();
+    chip->hardware->pause_us(RESET_US);
+    if (!is_there(chip)) {
+        return false;
+    }
+    soft_reset(chip);
+    calibrate(chip);
+    load_microcode(chip);
+    if (!lock(chip)) {
+        return false;
+    }
+    chip->hardware->set_spi_fast(true);
+    if (!is_there(chip)) {
+        return false;
+    }
+    for (uint32_t at = 0u; at < (sizeof CONFIGURATION / sizeof CONFIGURATION[0]); at++) {
+        const struct setting *setting = &CONFIGURATION[at];
+
+        write_register(chip, setting->file, setting->sub, setting->octets, setting->value);
+    }
+    write_register(chip, 0x1Eu, 0u, 4u, TX_POWER);
+    write_register(chip, 0x18u, 0u, 2u, tx_antenna_delay);      /* TX_ANTD (UM 7.2.26, p. 103) */
+    write_register(chip, 0x2Eu, 0x1804u, 2u, rx_antenna_delay); /* LDE_RXANTD (7.2.47.5) */
+    write_register(chip, 0x0Eu, 0u, 4u, SYS_MASK_EVENTS);
+    off_and_clear(chip);
+    chip->state = DW1000_IDLE;
+    return true;
+}
+
+/* Running */
+
+/* Listen, or be IDLE, after the receiver was turned off, perhaps in the middle of a frame: it must be reset then, or the
+ * next stamp may be wrong (UM 4.1.6, pp. 34-35). */
+static void listen_again(struct dw1000 *chip)
+{
+    if (chip->is_listening) {
+        write_register(chip, 0x36u, 3u, 1u, 0xE0u);
+        write_register(chip, 0x36u, 3u, 1u, 0xF0u);
+        write_register(chip, 0x0Du, 0u, 2u, RXENAB);
+        chip->state = DW1000_LISTENING;
+    } else {
+        chip->state = DW1000_IDLE;
+    }
+}
+
+static void resume(struct dw1000 *chip)
+{
+    off_and_clear(chip);
+    listen_again(chip);
+}
+
+void dw1000_receive(struct dw1000 *chip)
+{
+    if (chip->state != DW1000_OFF) {
+        chip->is_listening = true;
+        if (chip->state == DW1000_IDLE) {
+            resume(chip);
+        }
+    }
+}
+
+bool dw1000_cancel(struct dw1000 *chip)
+{
+    if (chip->state == DW1000_SENDING) {
+        write_register(chip, 0x0Du, 0u, 1u, TRXOFF);
+        read_status(chip);
+        if ((chip->status & TXFRS) != 0u) {
+            return false;
+        }
+        resume(chip);
+    }
+    return true;
+}
+
+/* Check whether the frame will be sent at its time, and cancel it if not (UM pp. 27, 91, 92). HPDWARN: its time has
+ * passed. TXPUTE: the transmitter had no time to power up. What is out when TRXOFF comes counts as sent. */
+static enum dw1000_queued was_in_time(struct dw1000 *chip)
+{
+    read_status(chip);
+    if (((chip->status & TXFRS) != 0u) || ((chip->status & (HPDWARN | TXPUTE)) == 0u) || !dw1000_cancel(chip)) {
+        return DW1000_QUEUED;
+    }
+    chip->late++;
+    return DW1000_LATE;
+}
+
+enum dw1000_queued dw1000_transmit_at(struct dw1000 *chip, uint64_t dx_ticks, const uint8_t *frame, uint32_t frame_bytes)
+{
+    if (chip->state == DW1000_OFF) {
+        return DW1000_NOT_READY;
+    }
+    if (chip->state == DW1000_SENDING) {
+        return DW1000_BUSY;
+    }
+
+    write_bytes(chip, 0x09u, 0u, frame, frame_bytes - 2u);
+    write_register(chip, 0x08u, 0u, 4u, TX_FCTRL | frame_bytes);
+    write_register(chip, 0x0Au, 0u, 5u, dx_ticks & ~(uint64_t)0x1FFu);
+    off_and_clear(chip);
+    write_register(chip, 0x0Du, 0u, 1u, TXSTRT_TXDLYS);
+    chip->state = DW1000_SENDING;
+    return was_in_time(chip);
+}
+
+static uint32_t finish_sending(struct dw1000 *chip)
+{
+    chip->tx_ticks = forty(read_register(chip, 0x17u, 0u, 5u));
+    chip->sent++;
+    clear_seen(chip);
+    listen_again(chip);
+    return DW1000_SENT;
+}
+
+/* Count an error and listen on. */
+static uint32_t recover(struct dw1000 *chip)
+{
+    chip->errors++;
+    resume(chip);
+    return DW1000_FAILED;
+}
+
+/* Powers and carrier offset (UM 4.7, 7.2.18, 7.2.20, 7.2.23, 7.2.40.11); `symbols` is RXPACC. */
+static void read_measured(struct dw1000 *chip, uint32_t symbols, uint32_t f1)
+{
+    const uint8_t *data = read_register(chip, 0x12u, 0u, 8u);
+    uint32_t f2 = sixteen(&data[2]);
+    uint32_t f3 = sixteen(&data[4]);
+    uint32_t cir_power = sixteen(&data[6]);
+
+    data = read_register(chip, 0x27u, 0x28u, 6u);
+
+    int32_t integrator = (int32_t)(sixteen(data) | (((uint32_t)data[2] & 0x1Fu) << 16));
+    if (symbols == sixteen(&data[4])) { /* not saturated: symbols of the SFD are counted, too */
+        symbols = (symbols > SFD_ACCUMULATED) ? (symbols - SFD_ACCUMULATED) : 0u;
+    }
+
+    int32_t level = dw1000_accumulated(symbols);
+
+    if (integrator >= 0x100000) {
+        integrator -= 0x200000;
+    }
+    chip->rx_power_cdbm = dw1000_power_cdbm(cir_power, level);
+    chip->first_path_cdbm = dw1000_first_path_cdbm(f1, f2, f3, level);
+    chip->offset_ppb = dw1000_carrier_offset_ppb(integrator);
+}
+
+/* Read a frame and all that was measured of it, and listen on. */
+static uint32_t read_frame(struct dw1000 *chip)
+{
+    uint32_t tries = LDE_TRIES;
+
+    while ((chip->status & LDEDONE) == 0u) {
+        if (tries == 0u) {
+            return recover(chip);
+        }
+        tries--;
+        chip->hardware->pause_us(20u);
+        read_status(chip);
+        if ((chip->status & LDEERR) != 0u) {
+            return recover(chip);
+        }
+    }
+
+    const uint8_t *info = read_register(chip, 0x10u, 0u, 4u);
+    uint32_t size = (uint32_t)info[0] & 0x7Fu;
+    uint32_t symbols = ((uint32_t)info[2] >> 4) | ((uint32_t)info[3] << 4);
+
+    if (size < DW1000_MIN_PSDU_BYTES) {
+        return recover(chip);
+    }
+    (void)read_into(chip, chip->frame_into, 0x11u, 0u, size);
+
+    const uint8_t *time = read_register(chip, 0x15u, 0u, 9u);
+
+    chip->rx_ticks = forty(time);
+    chip->frame_bytes = size;
+    read_measured(chip, symbols, sixteen(&time[7]));
+    chip->received++;
+    clear_seen(chip);
+    write_register(chip, 0x0Du, 0u, 2u, RXENAB);
+    return DW1000_RECEIVED;
+}
+
+uint32_t dw1000_poll(struct dw1000 *chip)
+{
+    uint32_t events = 0u;
+
+    if (chip->state == DW1000_OFF) {
+        return DW1000_LOST;
+    }
+    read_status(chip);
+
+    uint64_t seen = chip->status;
+
+    if ((((seen & CPLOCK) == 0u) || ((seen & (SLP2INIT | UNUSED)) != 0u)) && !dw1000_check(chip)) {
+        return DW1000_LOST;
+    }
+    if ((seen & CLKPLL_LL) != 0u) {
+        events = DW1000_CLOCK_SLIPPED;
+        clear_status(chip, CLKPLL_LL); /* alone: a frame may be coming in */
+    }
+    if (chip->state == DW1000_SENDING) {
+        if ((seen & TXFRS) != 0u) {
+            events |= finish_sending(chip);
+        }
+    } else if (chip->state == DW1000_LISTENING) {
+        if ((seen & RX_ERRORS) != 0u) {
+            events |= recover(chip);
+        } else if ((seen & RXFCG) != 0u) {
+            events |= read_frame(chip);
+        } else {
+            /* nothing has happened */
+        }
+    } else {
+        /* IDLE: nothing can happen */
+    }
+    return events;
+}
+
+bool dw1000_check(struct dw1000 *chip)
+{
+    if (chip->state != DW1000_OFF) {
+        const uint8_t *found = read_register(chip, 0x1Fu, 0u, 4u);
+
+        if ((sixteen(found) | (sixteen(&found[2]) << 16)) != CHAN_CTRL) {
+            chip->state = DW1000_OFF;
+            chip->is_listening = false;
+        }
+    }
+    return chip->state != DW1000_OFF;
+}
+
+uint64_t dw1000_now(struct dw1000 *chip)
+{
+    return forty(read_register(chip, 0x06u, 0u, 5u));
+}
+
+/* From the converter's readings; with typical values where the chip brought none of its own. */
+static void convert(struct dw1000 *chip, int32_t voltage, int32_t temperature)
+{
+    if (chip->temperature_23 != 0u) {
+        chip->temperature_cc = ((temperature - (int32_t)chip->temperature_23) * 114) + 2300;
+    } else {
+        chip->temperature_cc = (temperature * 113) - 11300;
+    }
+    if (chip->voltage_33 != 0u) {
+        chip->millivolts = (uint32_t)(floor_divide((voltage - (int32_t)chip->voltage_33) * 1000, 173) + 3300);
+    } else {
+        chip->millivolts = (uint32_t)(((voltage * 57) / 10) + 2300);
+    }
+}
+
+bool dw1000_measure(struct dw1000 *chip)
+{
+    if ((chip->state == DW1000_OFF) || (chip->state == DW1000_SENDING)) {
+        return false;
+    }
+    off_and_clear(chip);
+    write_register(chip, 0x28u, 0x11u, 1u, 0x80u); /* bias of the temperature sensor (UM 6.4, pp. 158-159) */
+    write_register(chip, 0x28u, 0x12u, 1u, 0x0Au); /* bias of the converter */
+    write_register(chip, 0x28u, 0x12u, 1u, 0x0Fu); /* outputs */
+    write_register(chip, 0x2Au, 0x00u, 1u, 0x00u); /* TC_SARC */
+    write_register(chip, 0x2Au, 0x00u, 1u, 0x01u);
+    chip->hardware->pause_us(1000u);
+
+    int32_t voltage = read_register(chip, 0x2Au, 0x03u, 1u)[0];
+    int32_t temperature = read_register(chip, 0x2Au, 0x04u, 1u)[0];
+
+    convert(chip, voltage, temperature);
+    write_register(chip, 0x2Au, 0x00u, 1u, 0x00u);
+    if (chip->is_listening) {
+        resume(chip);
+    }
+    return true;
+}

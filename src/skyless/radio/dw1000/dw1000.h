@@ -1,0 +1,108 @@
+/* Driver of the DW1000, integers only, for boards and for computers (driver.py, which has this struct's fields, too).
+ * Written from the DW1000 User Manual v2.12 ("UM"); docs/dw1000.md lists which value was compared with which other
+ * source. It has never run on a chip.
+ *
+ * States:
+ *   OFF        nothing is known of the chip. `dw1000_start` resets and configures it, and leaves it IDLE.
+ *   IDLE       the radio is off. `dw1000_receive` turns the receiver on.
+ *   LISTENING  the receiver is on, and stays on: after each frame, after each error, after each transmission.
+ *   SENDING    a frame waits for its time or is on its way; the receiver is off (one DX_TIME, one transceiver), so
+ *              `dw1000_transmit_at` is to be called as late as it safely can. Ends with DW1000_SENT from `dw1000_poll`,
+ *              or with `dw1000_cancel`, to be called if SENT does not come within 1 ms after the frame's time.
+ */
+#ifndef DW1000_H
+#define DW1000_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "hardware.h"
+
+enum dw1000_state { DW1000_OFF, DW1000_IDLE, DW1000_LISTENING, DW1000_SENDING };
+
+/* What `dw1000_poll` returns, as a sum. */
+#define DW1000_RECEIVED 0x01u
+#define DW1000_SENT 0x02u
+#define DW1000_FAILED 0x04u
+#define DW1000_CLOCK_SLIPPED 0x08u
+#define DW1000_LOST 0x10u
+
+/* What `dw1000_transmit_at` returns; the reasons have the link's numbers. */
+enum dw1000_queued { DW1000_QUEUED = 0, DW1000_LATE = 1, DW1000_BUSY = 2, DW1000_NOT_READY = 3 };
+
+#define DW1000_NOT_MEASURED (-32768)
+#define DW1000_MIN_PSDU_BYTES 3u
+#define DW1000_MAX_PSDU_BYTES 127u
+#define DW1000_MAX_TRANSFER_BYTES 132u
+
+struct dw1000 {
+    const struct hardware *hardware;
+    enum dw1000_state state;
+    bool is_listening;
+    uint32_t received;
+    uint32_t errors;
+    uint32_t sent;
+    uint32_t late;
+
+    /* Of the last frame that was received, until the next `dw1000_poll` */
+    uint64_t rx_ticks;
+    const uint8_t *frame;
+    uint32_t frame_bytes;
+    int32_t rx_power_cdbm;
+    int32_t first_path_cdbm;
+    int32_t offset_ppb;
+
+    /* Of the last frame that was sent */
+    uint64_t tx_ticks;
+
+    /* Of the last `dw1000_measure` */
+    int32_t temperature_cc;
+    uint32_t millivolts;
+
+    uint32_t temperature_23; /* from the one-time programmable memory, like the next */
+    uint32_t voltage_33;
+
+    uint64_t status; /* SYS_STATUS as it was read last */
+    uint8_t out[DW1000_MAX_TRANSFER_BYTES];
+    uint8_t into[DW1000_MAX_TRANSFER_BYTES];
+    uint8_t frame_into[DW1000_MAX_TRANSFER_BYTES];
+};
+
+void dw1000_init(struct dw1000 *chip, const struct hardware *hardware);
+
+/* Reset and configure the chip; antenna delays in ticks. False where no DW1000 answers, or its clock does not lock. */
+bool dw1000_start(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t rx_antenna_delay);
+
+/* Listen from now on; a frame that waits to be sent is sent before. */
+void dw1000_receive(struct dw1000 *chip);
+
+/* Send a PSDU of 3 to 127 bytes when the counter is at `dx_ticks`, whose low nine bits are ignored (UM p. 26); the chip
+ * makes the last two bytes, its FCS. Poll before, or a frame that has just come is lost. */
+enum dw1000_queued dw1000_transmit_at(struct dw1000 *chip, uint64_t dx_ticks, const uint8_t *frame, uint32_t frame_bytes);
+
+/* Cancel a frame that has not been sent; false where it has, which the next `dw1000_poll` returns. */
+bool dw1000_cancel(struct dw1000 *chip);
+
+/* What has happened since: to be called when the interrupt line is high, or periodically. */
+uint32_t dw1000_poll(struct dw1000 *chip);
+
+/* Whether the chip still has its configuration; if not it is OFF. */
+bool dw1000_check(struct dw1000 *chip);
+
+/* The counter now. */
+uint64_t dw1000_now(struct dw1000 *chip);
+
+/* Measure temperature and supply in some 1.1 ms, in which nothing is received; false where it cannot. */
+bool dw1000_measure(struct dw1000 *chip);
+
+/* From one reading of the counter to another in 65536 ticks (1.026 us), negative if it was before; at most 8.6 s. */
+int32_t dw1000_micros_until(uint64_t now_ticks, uint64_t then_ticks);
+
+/* The arithmetic, for tests. */
+int32_t dw1000_log10(uint32_t value);
+int32_t dw1000_accumulated(uint32_t symbols);
+int32_t dw1000_power_cdbm(uint32_t cir_power, int32_t level);
+int32_t dw1000_first_path_cdbm(uint32_t f1, uint32_t f2, uint32_t f3, int32_t level);
+int32_t dw1000_carrier_offset_ppb(int32_t integrator);
+
+#endif

@@ -1,0 +1,37 @@
+/* What a board needs of its processor. The portable files (link, dw1000, board) use nothing else. */
+#ifndef HARDWARE_H
+#define HARDWARE_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+/* Lights, as a sum in `show`. */
+#define LIGHT_READY 0x01u   /* on: receiving; blinking: waits for its host */
+#define LIGHT_RECEIVED 0x02u /* changes every 16 receptions */
+#define LIGHT_SENT 0x04u    /* changes every 4 frames sent */
+#define LIGHT_FAULT 0x08u   /* the chip does not answer, or its interrupt line does not follow its events */
+
+/* Only `transfer` and `pause_us` wait. The driver of the DW1000 uses the first four only. */
+struct hardware {
+    /* One SPI transaction (mode 0) in both directions, 2 to 132 bytes. */
+    void (*transfer)(const uint8_t *out, uint8_t *into, uint32_t size);
+    /* At most 3 MHz while the chip's PLL has no lock, or at most 20 MHz (UM 2.3.2). */
+    void (*set_spi_fast)(bool fast);
+    /* Pull RSTn low for a moment and let go; it is never driven high. */
+    void (*reset_chip)(void);
+    void (*pause_us)(uint32_t microseconds);
+    /* A clock that wraps at 32 bits. */
+    uint32_t (*now_us)(void);
+    /* Whether the chip's interrupt line is high. */
+    bool (*interrupt_line)(void);
+    /* Bytes that have come from the host, at most `size`; how many. */
+    uint32_t (*read_line)(uint8_t *into, uint32_t size);
+    /* Queue a line for the host; false where it does not fit as a whole, and nothing of it is sent. */
+    bool (*write_line)(const uint8_t *line, uint32_t size);
+    /* Start the receiver of the serial line again: it may have lost count. */
+    void (*restart_line)(void);
+    /* Switch the lights. */
+    void (*show)(uint32_t lights);
+};
+
+#endif

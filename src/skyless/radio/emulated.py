@@ -1,0 +1,244 @@
+"""Emulated radios: the nodes of one process on the air of ``skyless ether``, over one TCP connection."""
+
+import asyncio
+import math
+import os
+import socket
+import time
+from collections import Counter
+from typing import Final
+
+import msgspec
+
+from skyless.core.air.reception import Diagnostics, Reception, Transmission
+from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.ticks import wrap
+from skyless.radio import ether_wire as wire
+from skyless.radio.interface import Gone, Late, Listener, RadioEvent, Restarted, Sent, ignore
+
+_RECONNECT_S: Final = 0.2
+_SHIFT_S: Final = 15.0
+"""The shift to another machine's clock is measured again after this: clocks of computers drift by 0.1 ms a second."""
+_RECEIVE_BUFFER_BYTES: Final = 1 << 16
+"""A radio keeps few frames for a host that does not fetch them; so does this one, 0.2 s of them."""
+
+_LEAD_S: Final = 1.8e-3
+"""The preamble, the transfer to the ether, and a host's timers."""
+
+
+class EmulatedRadio:
+    """One node's radio (``skyless.radio.interface.Radio``)."""
+
+    def __init__(self, connection: "EtherConnection", node: int, name: str) -> None:
+        self.name = name
+        self.counters: Counter[str] = Counter()
+        self.lead_s = _LEAD_S
+        self._connection = connection
+        self._node = node
+        self._listener: Listener = ignore
+        self._ticks: int | None = None
+        self._ticks_s = 0.0
+
+    async def run(self, listener: Listener) -> None:
+        """Receive until cancelled; an ether that goes away is looked for."""
+        self._listener = listener
+        await self._connection.run()
+
+    def advice(self) -> str:
+        """Where to look when nothing comes."""
+        return "no frame on the emulated air: are anchors running?"
+
+    def now_ticks(self) -> int | None:
+        """The node's counter, extrapolated from the ether's newest reading."""
+        if self._ticks is None:
+            return None
+        return wrap(self._ticks + round((time.monotonic() - self._ticks_s) * TICK_RATE_HZ))
+
+    def transmit(self, transmission: Transmission) -> None:
+        """Send a frame; without an ether it is late."""
+        if not self._connection.send(wire.Send(self._node, transmission.tx_ticks, transmission.frame)):
+            self.notify(Late(transmission.tx_ticks))
+
+    def notify(self, event: RadioEvent) -> None:
+        """Call the node's listener."""
+        self._listener(event)
+
+    def set_clock(self, ticks: int | None, host_s: float) -> None:
+        """What the counter was at a moment of the host's monotonic clock."""
+        self._ticks, self._ticks_s = ticks, host_s
+
+
+class EtherConnection:
+    """The connection of one process; it is made again by itself."""
+
+    def __init__(self, host: str, port: int, join: wire.Join) -> None:
+        self._host, self._port, self._join = host, port, join
+        self.radios = tuple(EmulatedRadio(self, node, name) for node, name in enumerate(join.names))
+        self._transport: asyncio.Transport | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._users = 0
+
+    async def run(self) -> None:
+        """Stay connected until cancelled; all radios share one connection, which ends with the last of them."""
+        self._users += 1
+        if self._task is None:
+            self._task = asyncio.create_task(self._keep_connected())
+        task = self._task
+        try:
+            await asyncio.shield(task)
+        finally:
+            self._users -= 1
+            if not self._users:
+                self._task = None
+                task.cancel()
+
+    def send(self, message: wire.Send) -> bool:
+        """Whether the message could be handed to the connection."""
+        if self._transport is None:
+            return False
+        self._transport.write(wire.pack(message))
+        return True
+
+    async def _keep_connected(self) -> None:
+        loop = asyncio.get_running_loop()
+        reported = ""
+        while True:
+            try:
+                endpoint = _connect(self._host, self._port)
+                transport, protocol = await loop.create_connection(lambda: _Stream(self), sock=await endpoint)
+            except OSError as error:
+                reason = f"no ether at {self._host}:{self._port} ({_why(error)})"
+            else:
+                transport.write(wire.pack(self._join))
+                try:
+                    reason = await protocol.ended
+                finally:
+                    transport.abort()
+                    self._on_lost()
+            if reason != reported:
+                reported = reason
+                self._notify_all(Gone(reason))
+            await asyncio.sleep(_RECONNECT_S)
+
+    def on_joined(self, message: wire.Joined, shift_s: float, transport: asyncio.Transport) -> None:
+        """The nodes are on the air."""
+        self._transport = transport
+        self._set_clocks(message.host_s + shift_s, message.ticks)
+        self._notify_all(Restarted())
+
+    def _on_lost(self) -> None:
+        self._transport = None
+        for radio in self.radios:
+            radio.set_clock(None, 0.0)
+
+    def _notify_all(self, event: RadioEvent) -> None:
+        for radio in self.radios:
+            radio.notify(event)
+
+    def _set_clocks(self, host_s: float, ticks: tuple[int, ...]) -> None:
+        for radio, reading in zip(self.radios, ticks, strict=True):
+            radio.set_clock(reading, host_s)
+
+    def on_message(self, message: wire.Clocks | wire.Arrival | wire.Done, shift_s: float) -> None:
+        """Pass a message on to the radios; ``shift_s`` converts the ether's clock into this machine's."""
+        if isinstance(message, wire.Arrival):
+            host_s = message.host_s + shift_s
+            for row in message.rows:
+                measured = Diagnostics(row.rx_power_dbm, row.first_path_power_dbm, row.carrier_offset_ppm)
+                self.radios[row.node].notify(Reception(message.frame, row.rx_ticks, host_s, measured))
+        elif isinstance(message, wire.Done):
+            event = Late(message.tx_ticks) if message.late else Sent(message.tx_ticks)
+            self.radios[message.node].notify(event)
+        else:
+            self._set_clocks(message.host_s + shift_s, message.ticks)
+
+
+class ClockShift:
+    """What to add to another machine's clock to get this one's, from messages with the time when they were sent.
+
+    The quickest message of the last half minute or so decides: the clocks drift apart, and some messages are slow.
+    """
+
+    def __init__(self, shift_s: float) -> None:
+        self.shift_s = shift_s
+        self._least_s = self._least_before_s = shift_s
+        self._begun_s: float | None = None
+
+    def note(self, sent_s: float, now_s: float) -> None:
+        """A message has come that was sent at a time of the other's clock."""
+        if self._begun_s is None or now_s - self._begun_s > _SHIFT_S:
+            self._begun_s, self._least_before_s, self._least_s = now_s, self._least_s, math.inf
+        self._least_s = min(self._least_s, now_s - sent_s)
+        self.shift_s = min(self._least_s, self._least_before_s)
+
+
+class _Stream(asyncio.Protocol):
+    """The connection from its beginning until it ends; ``ended`` gives the reason."""
+
+    def __init__(self, connection: EtherConnection) -> None:
+        self._connection = connection
+        self._unpacker = wire.Unpacker()
+        self._transport: asyncio.Transport | None = None
+        self._shift: ClockShift | None = None
+        """Only of an ether on another machine."""
+        self.ended: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+
+    def data_received(self, data: bytes) -> None:
+        try:
+            for body in self._unpacker.feed(data):
+                self._process(body)
+        except (wire.WireError, msgspec.MsgspecError) as error:
+            self._end(f"what answers is no ether ({error})")
+
+    def _process(self, body: bytes) -> None:
+        message = wire.from_ether.decode(body)
+        if isinstance(message, wire.Refused):
+            self._end(message.reason)
+        elif isinstance(message, wire.Joined):
+            assert self._transport is not None
+            if message.machine != wire.this_machine():
+                self._shift = ClockShift(time.monotonic() - message.host_s)
+            self._connection.on_joined(message, self._shift_s, self._transport)
+        else:
+            if self._shift is not None and isinstance(message, wire.Clocks):
+                self._shift.note(message.host_s, time.monotonic())
+            self._connection.on_message(message, self._shift_s)
+
+    @property
+    def _shift_s(self) -> float:
+        return 0.0 if self._shift is None else self._shift.shift_s
+
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - the reason makes no difference
+        self._end("the ether has gone")
+
+    def _end(self, reason: str) -> None:
+        if not self.ended.done():
+            self.ended.set_result(reason)
+        if self._transport is not None:
+            self._transport.abort()
+
+
+def _why(error: OSError) -> str:
+    """The cause in words; asyncio's message repeats the address and leaves the cause out."""
+    known = error.errno is not None and error.errno > 0
+    return os.strerror(error.errno) if known else error.strerror or str(error)  # type: ignore[arg-type]
+
+
+async def _connect(host: str, port: int) -> socket.socket:
+    """A connected socket with a small receive buffer, which can only be set before it connects."""
+    loop = asyncio.get_running_loop()
+    family, kind, protocol, _, address = (await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM))[0]
+    endpoint = socket.socket(family, kind, protocol)
+    endpoint.setblocking(False)
+    endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
+    try:
+        await loop.sock_connect(endpoint, address)
+    except BaseException:
+        endpoint.close()
+        raise
+    endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return endpoint

@@ -1,0 +1,1 @@
+"""What devices of other makers send: Bitcraze's anchors and sniffers, and FiRa's UCI."""

@@ -1,0 +1,171 @@
+"""UCI of a DT-tag: notifications as packets, and logs of them, binary or as text with hexadecimal packets."""
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from io import BufferedIOBase
+from typing import Final
+
+from skyless.core.air.masterless_packets import Packet, Point
+from skyless.core.constants import TICK_BITS
+from skyless.core.earth import east_north_up_of
+from skyless.core.input_files import Drops, chunks, lines
+from skyless.core.site import GeoreferenceSite
+from skyless.core.ticks import difference, wrap
+from skyless.radio.uci.dl_tdoa import DtMessage, DtRounds, host_time_s
+from skyless.radio.uci.uci import (
+    CONTROL_HEADER_BYTES,
+    STATUS_OK,
+    DtMeasurement,
+    DtMessageType,
+    GeodeticPoint,
+    SessionInfo,
+    UciPacket,
+    UciReader,
+    decode_session_info,
+    location_of,
+)
+
+
+class AnchorFrame:
+    """The frame of one recording, or of the boards of one process."""
+
+    def __init__(self) -> None:
+        self.origin: GeodeticPoint | None = None
+        """The first point on the Earth, where positions are stated there."""
+        self._is_relative = False
+
+    def position_m(self, location: Point | GeodeticPoint | None) -> Point | None:
+        """A location in this frame; None for one of the other kind."""
+        if isinstance(location, GeodeticPoint):
+            if self._is_relative:
+                return None
+            self.origin = self.origin or location
+            origin = GeoreferenceSite(self.origin.latitude_deg, self.origin.longitude_deg, self.origin.height_m)
+            return east_north_up_of(location.latitude_deg, location.longitude_deg, location.height_m, origin)
+        if location is None or self.origin is not None:
+            return None
+        self._is_relative = True
+        return location
+
+
+_STAMP_BYTES: Final = TICK_BITS // 8
+_MESSAGES: Final = frozenset(map(int, DtMessageType))
+
+
+class DtTag:
+    """From a tag's notifications to packets; what is of no use is counted."""
+
+    def __init__(
+        self, drops: Drops, anchors_m: Mapping[int, Point] | None = None, frame: AnchorFrame | None = None
+    ) -> None:
+        """``anchors_m``: positions that replace all that anchors state; ``frame``: of those, where tags share it."""
+        self._drops = drops
+        self._rounds = DtRounds(anchors_m)
+        self._frame = None if anchors_m else frame or AnchorFrame()
+
+    def on_uci(self, packet: UciPacket, host_s: float | None = None) -> list[Packet]:
+        """Packets of a notification, in the order in which they were received; ``host_s``: when it came."""
+        info = decode_session_info(packet)
+        if isinstance(info, SessionInfo):
+            return self.on_info(info, host_s)
+        self._drops[info] += 1
+        return []
+
+    def on_info(self, info: SessionInfo, host_s: float | None = None) -> list[Packet]:
+        """Packets of a decoded notification."""
+        usable = []
+        for one in info.measurements:
+            reason = _unusable(one)
+            if reason is None:
+                usable.append(one)
+            else:
+                self._drops[reason] += 1
+        if len(usable) > 1:
+            first = usable[0].rx_ticks_tag
+            usable.sort(key=lambda one: difference(one.rx_ticks_tag, first))
+        packets = []
+        for one in usable:
+            packet = self._rounds.on_message(self._message(one, info.session, host_s))
+            if isinstance(packet, Packet):
+                packets.append(packet)
+            else:
+                self._drops[packet] += 1
+        return packets
+
+    def _message(self, one: DtMeasurement, session: int, host_s: float | None) -> DtMessage:
+        return DtMessage(
+            host_time_s(one.rx_ticks_tag) if host_s is None else host_s,
+            one.address,
+            DtMessageType(one.message),
+            one.block,
+            session << 8 | one.round,
+            wrap(one.tx_ticks),
+            wrap(one.rx_ticks_tag),
+            one.common_time,
+            one.responder_reply_ticks,
+            one.initiator_reply_ticks,
+            one.flight_ticks or None,
+            None if self._frame is None else self._frame.position_m(location_of(one)),
+        )
+
+
+def _unusable(one: DtMeasurement) -> str | None:
+    if one.status != STATUS_OK:
+        return "reception-failed"
+    if one.message not in _MESSAGES:
+        return "unknown-message"
+    return "stamp-missing" if min(one.tx_bytes, one.rx_bytes) < _STAMP_BYTES else None
+
+
+# Logs: bytes as they came, or lines of text with a packet each.
+
+_NOTIFICATION: Final = re.compile(rb"(?i)(?<![0-9a-f])(?:0x)?[67]2(?:([ :,-]|, |)(?:0x)?[0-9a-f]{2}){3,}(?![0-9a-f])")
+"""The beginning of SESSION_INFO as text, its bytes run together or with something between them."""
+_BYTE: Final = re.compile(rb"(?i)(?:0x)?([0-9a-f]{2})")
+
+
+def recognise_binary(head: bytes) -> bool:
+    """Whether a notification of DL-TDoA measurements stands near the beginning."""
+    return _has_measurements(UciReader(Counter()).feed(head))
+
+
+def recognise_text(head: bytes) -> bool:
+    """Whether lines near the beginning hold a notification of DL-TDoA measurements."""
+    reader = UciReader(Counter())
+    return any(_has_measurements(reader.feed(data)) for line in head.split(b"\n") for data in _packets_of_line(line))
+
+
+def _has_measurements(packets: list[UciPacket]) -> bool:
+    found = (decode_session_info(packet) for packet in packets)
+    return any(isinstance(info, SessionInfo) and info.measurements for info in found)
+
+
+def read_binary(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> Iterator[Packet]:
+    """Yield the packets of a binary log; ``anchors_m``: positions that replace all that anchors state."""
+    reader, tag = UciReader(drops), DtTag(drops, anchors_m)
+    for chunk in chunks(stream, drops):
+        for packet in reader.feed(chunk):
+            yield from tag.on_uci(packet)
+
+
+def read_text(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> Iterator[Packet]:
+    """Yield the packets of a log of lines as of a binary one; lines without a packet are counted."""
+    reader, tag = UciReader(drops), DtTag(drops, anchors_m)
+    for line in lines(stream, drops):
+        found = _packets_of_line(line)
+        if not found and line.strip():
+            drops["line-without-notification"] += 1
+        for data in found:
+            for packet in reader.feed(data):
+                yield from tag.on_uci(packet)
+
+
+def _packets_of_line(line: bytes) -> list[bytes]:
+    """Bytes of the first notification in a line whose length fits its header, whole or a segment; or none."""
+    for match in _NOTIFICATION.finditer(line):
+        data = bytes.fromhex(b"".join(_BYTE.findall(match.group())).decode())
+        size = CONTROL_HEADER_BYTES + data[3]
+        if data[1:3] == b"\0\0" and len(data) >= size:
+            return [data[:size]]
+    return []

@@ -1,0 +1,250 @@
+"""Boards with other firmware, which only listen: that of uwb-apps, the Bitcraze sniffer, and FiRa boards."""
+
+import time
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from typing import Final, Generic, TypeVar
+
+import msgspec
+from msgspec import structs
+
+from skyless.core.air.frame import MAX_FRAME_BYTES
+from skyless.core.air.masterless_packets import Packet, Point
+from skyless.core.air.reception import Diagnostics, Reception, Transmission
+from skyless.core.input_files import Drops, LineCutter
+from skyless.core.ticks import wrap
+from skyless.radio.foreign.bitcraze import BinaryCutter, packet_of_line, recognise_binary, recognise_text
+from skyless.radio.foreign.fira import AnchorFrame, DtTag
+from skyless.radio.interface import Gone, Late, RadioEvent, Restarted, ignore
+from skyless.radio.serial.serial_port import BoardClock, SerialPort, line_advice
+from skyless.radio.uci.uci import UciReader
+
+ASK_BINARY: Final = b"b"
+"""What makes a sniffer change from text to binary; one that cannot stays with text."""
+
+UNDECIDED_BYTES: Final = 4096
+"""Number of bytes without a packet after which the format is determined again."""
+
+_Event = TypeVar("_Event")
+
+
+class _ListeningBoard(ABC, Generic[_Event]):
+    """What all have in common: a serial port from which they read events."""
+
+    firmware = ""
+    """What runs on the board, in messages."""
+
+    def __init__(self, path: str, baud: int, name: str) -> None:
+        self.name = name
+        self.counters: Counter[str] = Counter()
+        self.lead_s = 0.0
+        self._port = SerialPort(path, baud, lambda reason: self._listener(Gone(reason)))
+        self._listener: Callable[[_Event | Restarted | Gone], None] = ignore
+        self._silent = True
+        """Whether no byte has come since the last event."""
+
+    async def run(self, listener: Callable[[_Event | Restarted | Gone], None]) -> None:
+        """Receive until cancelled; a board that is unplugged is looked for."""
+        self._listener = listener
+        await self._port.run(self)
+
+    def advice(self) -> str:
+        """Where to look when nothing comes: the line, or what is at its other end."""
+        return line_advice(self._port.path, self._port.baud, self.firmware, silent=self._silent)
+
+    @abstractmethod
+    def _start(self, send: Callable[[bytes], None]) -> None:
+        """Prepare for the stream of a port that has been opened."""
+
+    @abstractmethod
+    def _events(self, data: bytes, host_s: float) -> Iterator[_Event]:
+        """What is complete with this piece of the stream."""
+
+    # What the port calls
+
+    def on_open(self, send: Callable[[bytes], None]) -> None:
+        """Begin a new stream."""
+        self._start(send)
+        self._silent = True
+        self._port.clear_report()
+        self._listener(Restarted())
+
+    def on_data(self, data: bytes) -> None:
+        """Process a piece of the stream."""
+        host_s = time.monotonic()
+        self._silent = False
+        for event in self._events(data, host_s):
+            self._listener(event)
+            self._silent = True
+
+    def on_close(self) -> None:
+        """The board has gone."""
+
+
+class ListenerRadio(_ListeningBoard[RadioEvent]):
+    """A DWM1001 with the listener of uwb-apps: receptions as lines of JSON (``skyless.radio.interface.Radio``)."""
+
+    firmware = "the listener of uwb-apps"
+
+    def __init__(self, path: str, baud: int, name: str) -> None:
+        super().__init__(path, baud, name)
+        self._clock = BoardClock()
+        self._lines = LineCutter(self.counters)
+        self._is_whole = False
+        """Whether the next line is whole: the first one may be the end of a line."""
+
+    def now_ticks(self) -> int | None:
+        """The board's counter, extrapolated from its newest stamps; None before the first."""
+        return self._clock.read(time.monotonic())
+
+    def transmit(self, transmission: Transmission) -> None:
+        """It cannot: every frame is late."""
+        self._listener(Late(transmission.tx_ticks))
+
+    def _start(self, send: Callable[[bytes], None]) -> None:  # noqa: ARG002 - it takes no commands
+        self._clock.reset()
+        self._lines = LineCutter(self.counters)
+        self._is_whole = False
+
+    def _events(self, data: bytes, host_s: float) -> Iterator[Reception]:
+        for line in self._lines.feed(data):
+            drops = self.counters if self._is_whole else Counter()
+            self._is_whole = True
+            reception = reception_of(line, host_s, drops)
+            if reception is not None:
+                self._clock.update(reception.rx_ticks, host_s)
+                yield reception
+
+    def on_close(self) -> None:
+        """The board has gone."""
+        self._clock.reset()
+
+
+class SnifferRadio(_ListeningBoard[Packet]):
+    """A Bitcraze sniffer: packets of TDoA2 and TDoA3 systems, binary or text. It receives no beacons.
+
+    Packets carry the host's monotonic time of their arrival.
+    """
+
+    firmware = "a Bitcraze sniffer"
+
+    def __init__(self, path: str, baud: int, name: str) -> None:
+        super().__init__(path, baud, name)
+        self._stream = SnifferStream(self.counters)
+
+    def _start(self, send: Callable[[bytes], None]) -> None:
+        self._stream = SnifferStream(self.counters)
+        send(ASK_BINARY)
+
+    def _events(self, data: bytes, host_s: float) -> Iterator[Packet]:
+        for packet in self._stream.feed(data):
+            yield structs.replace(packet, host_s=host_s)
+
+
+class UciRadio(_ListeningBoard[Packet]):
+    """A FiRa board whose session as a DT-tag goes on: its notifications of DL-TDoA measurements, as packets.
+
+    Packets carry the host's monotonic time of their arrival. It is sent nothing: whoever has started the session set
+    it up.
+    """
+
+    firmware = "FiRa's UCI with a DL-TDoA session that goes on"
+
+    def __init__(self, path: str, baud: int, name: str, anchors_m: Mapping[int, Point], frame: AnchorFrame) -> None:
+        """``anchors_m``: positions that replace all that anchors state; ``frame``: of those, which tags share."""
+        super().__init__(path, baud, name)
+        self._anchors_m, self.frame = anchors_m, frame
+        self._reader, self._tag = UciReader(self.counters), DtTag(self.counters, anchors_m, frame)
+
+    def _start(self, send: Callable[[bytes], None]) -> None:  # noqa: ARG002 - it is sent nothing
+        self._reader, self._tag = UciReader(self.counters), DtTag(self.counters, self._anchors_m, self.frame)
+
+    def _events(self, data: bytes, host_s: float) -> Iterator[Packet]:
+        for packet in self._reader.feed(data):
+            yield from self._tag.on_uci(packet, host_s)
+
+
+class SnifferStream:
+    """Packets of a sniffer's stream, whose format is determined, and again when it changes."""
+
+    def __init__(self, drops: Counter[str]) -> None:
+        self._drops = drops
+        self._head = b""
+        self._unused_bytes = 0
+        """Since the last packet."""
+        self._lines = LineCutter(drops)
+        self._binary = BinaryCutter(drops)
+        self._is_text: bool | None = None
+
+    def feed(self, data: bytes) -> Iterator[Packet]:
+        """Packets that are complete with this piece."""
+        if self._is_text is None:
+            data = self._determine(data)
+        else:
+            self._unused_bytes += len(data)
+        for packet in self._packets(data):
+            self._unused_bytes = 0
+            yield packet
+        if self._unused_bytes > UNDECIDED_BYTES:
+            self._is_text, self._unused_bytes = None, 0
+
+    def _determine(self, data: bytes) -> bytes:
+        """All bytes that are to be read in the format found, or none while none is found."""
+        self._head += data
+        text, binary = recognise_text(self._head), recognise_binary(self._head)
+        if text or binary:
+            data, self._head = self._head, b""
+            self._is_text = text and not binary
+            self._lines = LineCutter(self._drops)
+            self._binary = BinaryCutter(self._drops)
+            return data
+        if len(self._head) > 2 * UNDECIDED_BYTES:
+            self._drops["bytes-of-no-record"] += 1
+            self._head = self._head[-UNDECIDED_BYTES:]
+        return b""
+
+    def _packets(self, data: bytes) -> Iterator[Packet]:
+        if not self._is_text:
+            yield from self._binary.feed(data)
+            return
+        for line in self._lines.feed(data):
+            packet = packet_of_line(line, self._drops)
+            if packet is not None:
+                yield packet
+
+
+# Lines of the uwb-apps listener (Mynewt): one JSON object for each frame, as it was received.
+#
+# Used keys: ``ts`` (RX stamp), ``rssi`` (dBm), ``d`` (the whole PSDU, hexadecimal) and ``dlen``, its length.
+
+
+class _Line(msgspec.Struct):
+    """What a line must hold; further keys are of no interest."""
+
+    ts: int
+    dlen: int
+    d: str
+    rssi: float | None = None
+
+
+_decode: Final = msgspec.json.Decoder(_Line).decode
+
+
+def reception_of(line: bytes, host_s: float, drops: Drops) -> Reception | None:
+    """Reception of a line that arrived then; None, and a count, for what is none."""
+    if not line:
+        return None
+    try:
+        found = _decode(line)
+        frame = bytes.fromhex(found.d)
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        drops["malformed-line"] += 1
+        return None
+    if len(frame) != found.dlen or not 1 <= len(frame) <= MAX_FRAME_BYTES:
+        drops["wrong-length"] += 1
+        return None
+    if found.ts < 0:
+        drops["impossible-stamp"] += 1
+        return None
+    return Reception(frame, wrap(found.ts), host_s, Diagnostics(rx_power_dbm=found.rssi))

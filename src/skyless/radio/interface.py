@@ -1,0 +1,82 @@
+"""The narrow interface between a program and its radio."""
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Protocol
+
+from msgspec import Struct
+
+from skyless.core.air.reception import Reception, Transmission
+from skyless.core.constants import DEFAULT_ANTENNA_DELAY_TICKS
+
+
+class AntennaDelays(Struct, frozen=True):
+    """What a radio subtracts from its stamps, in ticks."""
+
+    tx_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
+    rx_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
+
+
+class Sent(Struct, frozen=True, gc=False):
+    """The frame has left the antenna."""
+
+    tx_ticks: int
+
+
+class Late(Struct, frozen=True, gc=False):
+    """The frame came too late for its time, and was not sent."""
+
+    tx_ticks: int
+
+
+class Restarted(Struct, frozen=True, gc=False):
+    """The radio is ready, with a counter that has nothing to do with what it counted before."""
+
+
+class Gone(Struct, frozen=True, gc=False):
+    """The radio does not answer; it looks for it by itself."""
+
+    reason: str
+
+
+class Hint(Struct, frozen=True):
+    """The radio goes on, but a person should look at something."""
+
+    text: str
+
+
+RadioEvent = Reception | Sent | Late | Restarted | Gone | Hint
+Listener = Callable[[RadioEvent], None]
+"""Called from the event loop as soon as something happens; must return quickly and not raise."""
+
+
+def ignore(_event: object) -> None:
+    """The listener of a radio that does not run yet."""
+
+
+class Radio(Protocol):
+    """One radio. It is used from one event loop."""
+
+    @property
+    def name(self) -> str:
+        """Its name in messages."""
+
+    @property
+    def counters(self) -> Counter[str]:
+        """What was lost or could not be used on the way from the radio, by reason."""
+
+    @property
+    def lead_s(self) -> float:
+        """How long before its RMARKER a frame should be handed to ``transmit``, at first; 0 where it cannot send."""
+
+    async def run(self, listener: Listener) -> None:
+        """Configure the radio and receive until cancelled; a radio that has gone is looked for by itself."""
+
+    def advice(self) -> str:
+        """Where to look when nothing has come from it for some seconds; without numbers that change."""
+
+    def now_ticks(self) -> int | None:
+        """The radio's 40-bit counter now, to about 0.1 ms; None while the radio is not ready."""
+
+    def transmit(self, transmission: Transmission) -> None:
+        """Send a frame so that its RMARKER leaves at ``tx_ticks``; answered by ``Sent`` or ``Late``."""

@@ -1,0 +1,398 @@
+"""The serial link, to the byte (``docs/serial.md``): framing, check, records and their values.
+
+A record is ``kind | number | body | CRC-16``, made free of zeros (COBS) and ended by a 0 byte. The board's end is in C
+(``firmware/source/link.c``), with the same names for the same numbers. Both ends are here, for emulated boards write
+what real ones do. Ticks are numbers of 40 bits.
+"""
+
+import struct
+from binascii import crc_hqx
+from collections.abc import Sequence
+from typing import Final
+
+from msgspec import Struct
+
+from skyless.core.air.reception import Diagnostics
+
+MAJOR: Final = 1
+"""Ends with different major versions cannot work together."""
+MINOR: Final = 1
+"""Grows with fields that are appended and kinds that are added, which an older end ignores."""
+
+# From the board
+HELLO: Final = 0x01
+RX: Final = 0x02
+TX_DONE: Final = 0x03
+TX_LATE: Final = 0x04
+STATUS: Final = 0x05
+REFUSED: Final = 0x06
+
+# From the host
+ASK_HELLO: Final = 0x41
+CONFIG: Final = 0x42
+TX_AT: Final = 0x43
+RX_ON: Final = 0x44
+ASK_STATUS: Final = 0x45
+
+BODY_AT: Final = 2
+"""Where a record's body begins, after kind and number."""
+RX_FRAME_AT: Final = 13
+TX_FRAME_AT: Final = 7
+MAX_FRAME_BYTES: Final = 127
+
+HELLO_BYTES: Final = 21
+"""Length in version 1.0; a later one has the reset cause behind it."""
+STATUS_BYTES: Final = 36
+CONFIG_BYTES: Final = 13
+"""Lengths of whole records, kind and number included."""
+
+NOT_MEASURED: Final = -32768
+"""A measured value that the board does not have."""
+NO_VOLTAGE: Final = 0xFFFF
+
+CAN_TRANSMIT: Final = 0x01
+"""Capability in HELLO."""
+RESET_BY_PIN: Final = 0x01
+RESET_BY_WATCHDOG: Final = 0x02
+RESET_BY_SOFTWARE: Final = 0x04
+RESET_BY_LOCKUP: Final = 0x08
+RESET_BY_FAULT: Final = 0x80
+"""Bits of the reset cause in HELLO: the first four are those of the nRF52832's RESETREAS; a fault is one that the
+firmware noticed. None: power on, or a supply that was too low."""
+IS_CONFIGURED: Final = 0x01
+IS_RECEIVING: Final = 0x02
+HAS_FRAME_WAITING: Final = 0x04
+IS_POLLED: Final = 0x08
+"""Bits of the state in STATUS; polled: the chip's interrupt line does not follow its events."""
+
+LATE_FOR_RADIO: Final = 1
+LATE_BUSY: Final = 2
+LATE_NOT_READY: Final = 3
+"""Why a frame was not sent: it was too late, another one waits, or the radio is not configured."""
+
+REFUSED_SETTING: Final = 1
+REFUSED_MALFORMED: Final = 2
+REFUSED_RADIO: Final = 3
+"""Why a command was refused."""
+
+RATE_KHZ: Final = 63_897_600
+COUNTER_BITS: Final = 40
+COUNT_MASK: Final = 0x3FFF_FFFF
+"""Counts in STATUS wrap at 30 bits."""
+
+MAX_RECORD_BYTES: Final = 250
+"""With its check: one block of COBS, with space for later versions."""
+MAX_STUFFED_BYTES: Final = MAX_RECORD_BYTES + 2
+"""Length of what may stand before a 0; a record needs one less."""
+
+
+def crc16(data: bytes) -> int:
+    """CRC-16/IBM-3740: x¹⁶ + x¹² + x⁵ + 1 from 0xFFFF; 0 over what ends with its own, high byte first."""
+    return crc_hqx(data, 0xFFFF)
+
+
+def stuff(record: bytes) -> bytes:
+    """A record without zeros (COBS: Cheshire and Baker, 1999), and a 0 after it.
+
+    Raises:
+        ValueError: 255 bytes without a zero; no record is that long.
+    """
+    return b"".join([bytes((len(block) + 1,)) + block for block in record.split(b"\0")]) + b"\0"
+
+
+def unstuff(line: bytes) -> bytes | None:
+    """Inverse of ``stuff`` for at most ``MAX_STUFFED_BYTES`` without zeros; None where a block lacks its end."""
+    blocks, at = [], 0
+    while at < len(line):
+        end = at + line[at]
+        if end > len(line):
+            return None
+        blocks.append(line[at + 1 : end])
+        at = end
+    return b"\0".join(blocks)
+
+
+class Writer:
+    """Makes records, with numbers that count up; each method returns a line, ready to be sent.
+
+    Ticks are numbers from 0 to 2**40 - 1. What does not fit into its field raises struct.error or OverflowError.
+    """
+
+    def __init__(self) -> None:
+        self._number = 0
+
+    def record(self, kind: int, body: bytes = b"") -> bytes:
+        """A record of any kind."""
+        record = bytes((kind, self._number)) + body
+        self._number = (self._number + 1) & 0xFF
+        return stuff(record + crc16(record).to_bytes(2, "big"))
+
+    def hello(self, firmware: tuple[int, int, int], device_id: bytes, capabilities: int, reset_cause: int = 0) -> bytes:
+        """Identity of the board; ``device_id`` has 8 bytes."""
+        fixed = struct.pack("<5B8sIBB", MAJOR, MINOR, *firmware, device_id, RATE_KHZ, COUNTER_BITS, capabilities)
+        return self.record(HELLO, fixed + bytes((reset_cause,)))
+
+    def rx(self, rx_ticks: int, rx_power_cdbm: int, first_path_cdbm: int, offset_ppb: int, frame: bytes) -> bytes:
+        """A frame, its stamp, powers in 0.01 dBm, the sender's carrier offset in 1e-9."""
+        return self.record(
+            RX, _stamp(rx_ticks) + struct.pack("<3h", rx_power_cdbm, first_path_cdbm, offset_ppb) + frame
+        )
+
+    def tx_done(self, dx_ticks: int, tx_ticks: int) -> bytes:
+        """The frame of ``dx_ticks`` has left with this TX stamp."""
+        return self.record(TX_DONE, _stamp(dx_ticks) + _stamp(tx_ticks))
+
+    def tx_late(self, dx_ticks: int, reason: int) -> bytes:
+        """The frame of ``dx_ticks`` was not sent."""
+        return self.record(TX_LATE, _stamp(dx_ticks) + bytes((reason,)))
+
+    def status(
+        self,
+        ticks: int,
+        state: int,
+        counts: Sequence[int],
+        temperature_cc: int = NOT_MEASURED,
+        millivolts: int = NO_VOLTAGE,
+    ) -> bytes:
+        """Counter now, state, and six counts: received, errors, sent, late, garbled commands, records not sent."""
+        wrapped = (count & COUNT_MASK for count in counts)
+        return self.record(STATUS, _stamp(ticks) + struct.pack("<B6IhH", state, *wrapped, temperature_cc, millivolts))
+
+    def refused(self, kind: int, reason: int) -> bytes:
+        """A command of that kind was refused."""
+        return self.record(REFUSED, bytes((kind, reason)))
+
+    def ask_hello(self) -> bytes:
+        """Ask the board who it is; states our version."""
+        return self.record(ASK_HELLO, bytes((MAJOR, MINOR)))
+
+    def ask_status(self) -> bytes:
+        """Ask the board for its state."""
+        return self.record(ASK_STATUS)
+
+    def rx_on(self) -> bytes:
+        """Have the board receive."""
+        return self.record(RX_ON)
+
+    def config(self, tx_delay_ticks: int, rx_delay_ticks: int) -> bytes:
+        """Channel 5, 64 MHz PRF, 6.8 Mbit/s, preamble of 128 symbols with code 9; antenna delays."""
+        return self.record(CONFIG, struct.pack("<4B3HB", 5, 64, 2, 9, 128, tx_delay_ticks, rx_delay_ticks, 0))
+
+    def tx_at(self, dx_ticks: int, frame: bytes) -> bytes:
+        """Send ``frame`` so that its RMARKER leaves the radio at ``dx_ticks``."""
+        return self.record(TX_AT, _stamp(dx_ticks) + frame)
+
+
+def _stamp(ticks: int) -> bytes:
+    return ticks.to_bytes(5, "little")
+
+
+class Reader:
+    """Finds the records in a stream of bytes that may hold anything.
+
+    ``garbled`` counts stretches between two zeros that are no record, ``overlong`` those that no record can be.
+    """
+
+    def __init__(self) -> None:
+        self.garbled = 0
+        self.overlong = 0
+        self._line = b""
+        self._skipping = False
+
+    def read(self, data: bytes) -> list[bytes]:
+        """The records that end in ``data``, without their checks: kind at 0, body from ``BODY_AT``."""
+        *ended, rest = data.split(b"\0")
+        records = []
+        for piece in ended:
+            self._append(piece)
+            record = self._finish()
+            if record is not None:
+                records.append(record)
+        self._append(rest)
+        return records
+
+    def _append(self, piece: bytes) -> None:
+        if self._skipping:
+            return
+        self._line += piece
+        if len(self._line) > MAX_STUFFED_BYTES:
+            self.overlong += 1
+            self._skipping, self._line = True, b""
+
+    def _finish(self) -> bytes | None:
+        """The record that the bytes before a zero are, if they are one."""
+        line, self._line = self._line, b""
+        if self._skipping:
+            self._skipping = False
+            return None
+        if not line:
+            return None
+        record = unstuff(line)
+        if record is None or len(record) < BODY_AT + 2 or crc16(record) != 0:
+            self.garbled += 1
+            return None
+        return record[:-2]
+
+
+# Records as values, and the rounding of measured values to the link's units
+
+_STEPS: Final = (100, 100, 1000)
+"""Units of powers and carrier offset: steps per dB and per ppm."""
+_GREATEST: Final = 0x7FFF
+
+
+class Hello(Struct, frozen=True):
+    """The board's version and abilities."""
+
+    major: int
+    minor: int
+    firmware: tuple[int, int, int]
+    device_id: bytes
+    rate_khz: int
+    counter_bits: int
+    can_transmit: bool
+    reset_cause: int | None
+    """Why it has started, as bits (``RESET_BY_PIN`` …); None for a board of version 1.0."""
+
+
+class Heard(Struct, frozen=True, gc=False):
+    """A frame that the board received."""
+
+    rx_ticks: int
+    diagnostics: Diagnostics
+    frame: bytes
+
+
+class Done(Struct, frozen=True, gc=False):
+    """A frame was sent."""
+
+    dx_ticks: int
+    tx_ticks: int
+
+
+class TooLate(Struct, frozen=True, gc=False):
+    """A frame was not sent."""
+
+    dx_ticks: int
+    reason: int
+
+
+class Status(Struct, frozen=True):
+    """The board's state and counts."""
+
+    ticks: int
+    configured: bool
+    receiving: bool
+    polled: bool
+    """Whether the chip is polled because its interrupt line does not follow its events."""
+    received: int
+    errors: int
+    sent: int
+    late: int
+    garbled: int
+    unsent_records: int
+    temperature_c: float | None
+    supply_v: float | None
+
+
+class NotDone(Struct, frozen=True):
+    """The board has refused a command."""
+
+    command: int
+    reason: int
+
+
+Record = Hello | Heard | Done | TooLate | Status | NotDone
+
+
+def decode(record: bytes) -> Record | str:
+    """Value of a record from a board (without its CRC), or why there is none."""
+    try:
+        decoder = _DECODERS[record[0]]
+    except KeyError:
+        return "unknown-record"
+    return decoder(record) or "malformed-record"
+
+
+def to_steps(measured: Diagnostics) -> tuple[int, int, int]:
+    """Received and first-path power and carrier offset, rounded to the link's units."""
+    values = (measured.rx_power_dbm, measured.first_path_power_dbm, measured.carrier_offset_ppm)
+    whole = [None if value is None else round(value * per_unit) for value, per_unit in zip(values, _STEPS, strict=True)]
+    rx_power, first_path, offset = (NOT_MEASURED if n is None or abs(n) > _GREATEST else n for n in whole)
+    return rx_power, first_path, offset
+
+
+def from_steps(rx_power: int, first_path: int, offset: int) -> Diagnostics:
+    """The measured values of a record in the link's units."""
+    return Diagnostics(
+        *(_value(n, per_unit) for n, per_unit in zip((rx_power, first_path, offset), _STEPS, strict=True))
+    )
+
+
+def _value(steps: int, per_unit: int) -> float | None:
+    return None if steps == NOT_MEASURED else steps / per_unit
+
+
+def _ticks(record: bytes, at: int = BODY_AT) -> int:
+    return int.from_bytes(record[at : at + 5], "little")
+
+
+def _hello(record: bytes) -> Hello | None:
+    """Only the version is known where its major number is another."""
+    if len(record) < BODY_AT + 2:
+        return None
+    major, minor = record[2], record[3]
+    if major != MAJOR:
+        return Hello(major, minor, (0, 0, 0), b"", 0, 0, can_transmit=False, reset_cause=None)
+    if len(record) < HELLO_BYTES:
+        return None
+    *firmware, device_id, rate_khz, bits, abilities = struct.unpack_from("<3B8sIBB", record, 4)
+    can_transmit = bool(abilities & CAN_TRANSMIT)
+    reset_cause = record[HELLO_BYTES] if len(record) > HELLO_BYTES else None
+    return Hello(major, minor, tuple(firmware), device_id, rate_khz, bits, can_transmit, reset_cause)
+
+
+def _heard(record: bytes) -> Heard | None:
+    if not 1 <= len(record) - RX_FRAME_AT <= MAX_FRAME_BYTES:
+        return None
+    return Heard(_ticks(record), from_steps(*struct.unpack_from("<3h", record, 7)), record[RX_FRAME_AT:])
+
+
+def _done(record: bytes) -> Done | None:
+    return Done(_ticks(record), _ticks(record, 7)) if len(record) >= 12 else None
+
+
+def _late(record: bytes) -> TooLate | None:
+    return TooLate(_ticks(record), record[7]) if len(record) >= 8 else None
+
+
+def _status(record: bytes) -> Status | None:
+    if len(record) < STATUS_BYTES:
+        return None
+    state, received, errors, sent, late, garbled, unsent, centidegrees, millivolts = struct.unpack_from(
+        "<B6IhH", record, 7
+    )
+    supply_v = None if millivolts == NO_VOLTAGE else millivolts / 1000
+    return Status(
+        _ticks(record),
+        bool(state & IS_CONFIGURED),
+        bool(state & IS_RECEIVING),
+        bool(state & IS_POLLED),
+        *(received, errors, sent, late, garbled, unsent),
+        _value(centidegrees, 100),
+        supply_v,
+    )
+
+
+def _refused(record: bytes) -> NotDone | None:
+    return NotDone(record[2], record[3]) if len(record) >= 4 else None
+
+
+_DECODERS: Final = {
+    HELLO: _hello,
+    RX: _heard,
+    TX_DONE: _done,
+    TX_LATE: _late,
+    STATUS: _status,
+    REFUSED: _refused,
+}

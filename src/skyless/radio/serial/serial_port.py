@@ -1,0 +1,198 @@
+"""A serial port that is opened again whenever it was unplugged, and the clock of the board behind it."""
+
+import asyncio
+import contextlib
+import errno
+import termios
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, Protocol
+
+import serialx
+
+from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.errors import SkylessError
+from skyless.core.ticks import difference, wrap
+
+_REOPEN_S: Final = 0.2
+
+MAX_BOARD_DRIFT: Final = 100e-6
+"""Two crystals drift apart by less; the estimate loses as much between stamps with a short delay."""
+
+JUMP_TICKS: Final = round(TICK_RATE_HZ)
+"""A stamp that is wrong by more than a second means that the counter has restarted."""
+
+
+class PortUser(Protocol):
+    """What the port calls."""
+
+    def on_open(self, send: Callable[[bytes], None]) -> None:
+        """The port is open."""
+
+    def on_data(self, data: bytes) -> None:
+        """Bytes have come."""
+
+    def on_close(self) -> None:
+        """The port is closed."""
+
+
+class SerialPort:
+    """One port, by its path."""
+
+    def __init__(self, path: str, baud: int, gone: Callable[[str], None]) -> None:
+        """``gone`` is called with why there is no port, once for equal reasons in a row."""
+        self.path, self.baud = path, baud
+        self._gone = gone
+        self._reported = ""
+        self._connection: _Connection | None = None
+
+    async def run(self, user: PortUser) -> None:
+        """Stay open until cancelled."""
+        while True:
+            try:
+                transport, connection = await self._open(user)
+            except (OSError, termios.error, serialx.SerialException, ValueError) as error:
+                self._report(_trouble(self.path, error))
+            else:
+                self._connection = connection
+                try:
+                    self._report(await connection.ended or f"{self.path} was unplugged")
+                finally:
+                    self._connection = None
+                    user.on_close()
+                    transport.abort()
+                    with contextlib.suppress(TimeoutError):
+                        async with asyncio.timeout(_REOPEN_S):
+                            await transport.wait_closed()
+            await asyncio.sleep(_REOPEN_S)
+
+    async def _open(self, user: PortUser) -> "tuple[serialx.BaseSerialTransport, _Connection]":
+        connection = _Connection(user)
+
+        def protocol() -> asyncio.Protocol:
+            return connection
+
+        loop = asyncio.get_running_loop()
+        transport, _ = await serialx.create_serial_connection(loop, protocol, self.path, self.baud)
+        return transport, connection
+
+    def waiting_bytes(self) -> int:
+        """What the port has not accepted yet; 0 while it is not open."""
+        return 0 if self._connection is None else self._connection.waiting_bytes()
+
+    def reopen(self, reason: str) -> None:
+        """Close the port, if it is open, and open it again."""
+        if self._connection is not None:
+            self._connection.end(reason)
+
+    def _report(self, reason: str) -> None:
+        """Report why there is no port, unless that was the last report."""
+        if reason != self._reported:
+            self._reported = reason
+            self._gone(reason)
+
+    def clear_report(self) -> None:
+        """The board works: report the next reason, whatever it is."""
+        self._reported = ""
+
+
+class _Connection(asyncio.Protocol):
+    """The port from its opening until it ends; ``ended`` gives the reason, empty where it is unknown."""
+
+    def __init__(self, user: PortUser) -> None:
+        self._user = user
+        self.waiting_bytes: Callable[[], int] = int
+        self.ended: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.WriteTransport)
+        self.waiting_bytes = transport.get_write_buffer_size
+
+        def send(data: bytes) -> None:
+            if not self.ended.done() and not transport.is_closing():
+                transport.write(data)
+
+        self._user.on_open(send)
+
+    def data_received(self, data: bytes) -> None:
+        if not self.ended.done():
+            self._user.on_data(data)
+
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - the reason makes no difference
+        self.end("")
+
+    def end(self, reason: str) -> None:
+        if not self.ended.done():
+            self.ended.set_result(reason)
+
+
+def line_advice(path: str, baud: int, sender: str, *, silent: bool) -> str:
+    """Where to look when nothing usable comes from ``sender`` on a port that is open."""
+    if silent:
+        return f"nothing at all comes from {path} at {baud} baud: nothing on the air, another port, or not {sender}?"
+    return f"what comes from {path} at {baud} baud is not from {sender}: another rate or other firmware?"
+
+
+def check_path(spec: str, path: str) -> None:
+    """Check that a path could be a serial port; one that does not exist yet may appear later.
+
+    Raises:
+        SkylessError: it never will be one.
+    """
+    if "://" in path:
+        raise SkylessError(
+            f"--radio is {spec!r}; it should name a serial port of this computer, as /dev/ttyACM0, and {path} is an "
+            "address: run the program where the board is"
+        )
+    file = Path(path)
+    try:
+        kind = "a port" if not file.exists() or file.is_char_device() else "a folder" if file.is_dir() else "a file"
+    except OSError:  # not readable, or no valid name; opening it will fail with the reason
+        return
+    if kind != "a port":
+        raise SkylessError(f"--radio is {spec!r}; it should name a serial port, as /dev/ttyACM0, and {path} is {kind}")
+
+
+def _trouble(path: str, error: Exception) -> str:
+    """Why a port cannot be opened, and what to do."""
+    number = error.errno if isinstance(error, OSError) else error.args[0] if error.args else None
+    if number == errno.ENOENT:
+        there = ", ".join(
+            str(port) for pattern in ("ttyACM*", "ttyUSB*") for port in sorted(Path("/dev").glob(pattern))
+        )
+        return f"there is no {path} (serial ports here: {there or 'none'})"
+    if number in (errno.EACCES, errno.EPERM):
+        return f"{path} may not be opened: its group, usually dialout, must be one of yours (sudo usermod -aG ...)"
+    if number == errno.EBUSY:
+        return f"{path} is used by another program"
+    if number in (errno.ENOTTY, errno.EINVAL):
+        return f"{path} is no serial port, or does not have this baud rate"
+    why = error.strerror if isinstance(error, OSError) and error.strerror else error
+    return f"{path} cannot be opened ({why})"
+
+
+class BoardClock:
+    """A board's 40-bit counter, estimated from stamps that arrive late by an unknown time.
+
+    It uses the stamp with the shortest delay, so it lags by the shortest transfer.
+    """
+
+    def __init__(self) -> None:
+        self._ticks: int | None = None
+        self._host_s = 0.0
+
+    def update(self, ticks: int, host_s: float) -> None:
+        """Add a stamp of the counter that arrived at a moment of the host's monotonic clock."""
+        known = self.read(host_s, MAX_BOARD_DRIFT)
+        if known is None or difference(ticks, known) >= 0 or difference(ticks, known) < -JUMP_TICKS:
+            self._ticks, self._host_s = ticks, host_s
+
+    def read(self, host_s: float, drift: float = 0.0) -> int | None:
+        """The 40-bit counter at a moment of the host's clock; None before the first stamp."""
+        if self._ticks is None:
+            return None
+        return wrap(self._ticks + round((host_s - self._host_s) * (1.0 - drift) * TICK_RATE_HZ))
+
+    def reset(self) -> None:
+        """Forget all stamps: the board has gone."""
+        self._ticks = None

@@ -1,0 +1,382 @@
+"""A radio on a board that is connected by the serial link (``docs/serial.md``)."""
+
+import asyncio
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Final
+
+from skyless.core.air.reception import Reception, Transmission
+from skyless.core.ticks import wrap
+from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Listener, RadioEvent, Restarted, Sent, ignore
+from skyless.radio.serial import link
+from skyless.radio.serial.link import Done, Heard, Hello, NotDone, Record, Status, TooLate, decode
+from skyless.radio.serial.serial_port import BoardClock, SerialPort
+
+STATUS_S: Final = 0.5
+"""Interval at which a board is asked for its state."""
+BOARD_SILENCE_S: Final = 3.0
+"""A board that has sent nothing for this time has gone."""
+MAX_PENDING_FRAMES: Final = 16
+"""Frames whose end the board has not reported; a board holds one, so of older ones the answer was lost on the line."""
+
+_HELLO_ANSWER_S: Final = 1.0
+"""A HELLO that comes later than this after ASK_HELLO is no answer to it: the board has started."""
+_IDLE_S: Final = 5.0
+"""A board that has been configured for this time and does not receive will not."""
+_MAX_STARTS: Final = 3
+_MAX_STARTS_S: Final = 60.0
+"""A board that starts so often within this time does not start because somebody wants it to."""
+
+_LEAD_S: Final = 5.0e-3
+"""A command of 112 bytes on the line (1.1 ms), the lag of the estimate of the board's counter, which is the shortest
+transfer of a record (1.2 ms), the board (0.3 ms), and a USB bridge that passes on 64 bytes in a millisecond; without
+such a bridge 2.5 ms would do (``benchmarks/firmware_site.py``)."""
+
+_REASONS: Final = {
+    link.REFUSED_SETTING: "it has not these settings",
+    link.REFUSED_MALFORMED: "it did not understand it",
+    link.REFUSED_RADIO: "its radio does not answer or start",
+}
+_RESET_CAUSES: Final = {
+    link.RESET_BY_FAULT: "a fault that its firmware noticed",
+    link.RESET_BY_LOCKUP: "a lockup of its processor",
+    link.RESET_BY_WATCHDOG: "its watchdog",
+    link.RESET_BY_SOFTWARE: "its firmware",
+    link.RESET_BY_PIN: "its reset pin",
+}
+
+
+class LinkSession:
+    """The link to one board from the opening of its port. No I/O, no clock."""
+
+    def __init__(
+        self,
+        port: str,
+        delays: AntennaDelays,
+        send: Callable[[bytes], None],
+        listener: Listener,
+        counters: Counter[str],
+        *,
+        transmits: bool = False,
+    ) -> None:
+        """``port`` is its name in messages; ``transmits``: refuse a board that only listens."""
+        self.clock = BoardClock()
+        self.ready = False
+        self.hello: Hello | None = None
+        self.status: Status | None = None
+        """The newest one."""
+        self.counters = counters
+        self._port, self._delays, self._send, self._listener = port, delays, send, listener
+        self._transmits = transmits
+        self._reader, self._writer = link.Reader(), link.Writer()
+        self._expected: int | None = None
+        """Number of the next record."""
+        self._pending: dict[int, int] = {}
+        """dx and RMARKER of frames whose end the board has not reported."""
+        self._bytes = 0
+        self._refused = self._reported = ""
+        self._heard_s = self._asked_s = 0.0
+        self._starts: deque[float] = deque(maxlen=_MAX_STARTS)
+        self._reported_starts = self._reported_idle = self._reported_line = False
+        self._idle_polls = 0
+
+    def begin(self, host_s: float) -> None:
+        """Ask the board for its HELLO."""
+        self._heard_s = host_s
+        self._send(b"\0")
+        self._ask_hello(host_s)
+
+    def poll(self, host_s: float) -> str | None:
+        """To be called every ``STATUS_S``; the reason to reopen the port, None while there is none."""
+        if host_s - self._heard_s > BOARD_SILENCE_S:
+            return self._reason_of_silence()
+        if self.hello is None or self._refused:
+            self._ask_hello(host_s)
+        elif self.ready:
+            self._send(self._writer.ask_status())
+        else:
+            self._configure()
+            self._count_idle_poll()
+        return None
+
+    def _count_idle_poll(self) -> None:
+        """Report once that a board answers and yet does not receive, whatever it is sent."""
+        self._idle_polls += 1
+        if self._idle_polls * STATUS_S >= _IDLE_S and not self._reported_idle:
+            self._reported_idle = True
+            text = f"the board at {self._port} answers, but does not start to receive: does its radio work?"
+            self._listener(Hint(text))
+
+    def _ask_hello(self, host_s: float) -> None:
+        self._asked_s = host_s
+        self._send(self._writer.ask_hello())
+
+    def _reason_of_silence(self) -> str:
+        if self.hello is not None:
+            return f"the board at {self._port} has stopped answering"
+        if self._bytes:
+            return f"what comes from {self._port} is no serial link of Skyless ({self._bytes} bytes); wrong baud rate?"
+        return f"no board answers at {self._port}"
+
+    def transmit(self, transmission: Transmission) -> None:
+        """Have a frame sent; without a board that is ready it is late."""
+        if not self.ready:
+            self._listener(Late(transmission.tx_ticks))
+            return
+        dx_ticks = wrap(transmission.tx_ticks - self._delays.tx_ticks)
+        self._pending[dx_ticks] = transmission.tx_ticks
+        if len(self._pending) > MAX_PENDING_FRAMES:
+            del self._pending[next(iter(self._pending))]
+        self._send(self._writer.tx_at(dx_ticks, transmission.frame))
+
+    def on_data(self, data: bytes, host_s: float) -> None:
+        """Process bytes from the port."""
+        self._bytes += len(data)
+        reader = self._reader
+        before = reader.garbled + reader.overlong
+        for record in reader.read(data):
+            self._on_record(record, host_s)
+        self._count("garbled-record", reader.garbled + reader.overlong - before)
+
+    def _on_record(self, raw: bytes, host_s: float) -> None:
+        record = decode(raw)
+        if isinstance(record, Hello):
+            self._expected = None
+        elif self.hello is None:
+            return  # from before this session
+        if not self._is_next(raw[1]):
+            return
+        if isinstance(record, str):
+            self.counters[record] += 1
+            return
+        self._heard_s = host_s
+        self._process(record, host_s)
+
+    def _is_next(self, number: int) -> bool:
+        """Count what is missing before a record; False for a copy of the one before."""
+        missing = 0 if self._expected is None else (number - self._expected) & 0xFF
+        if missing == 0xFF:
+            self.counters["copied-record"] += 1
+            return False
+        self._expected = (number + 1) & 0xFF
+        self._count("lost-record", missing)
+        return True
+
+    def _count(self, reason: str, times: int) -> None:
+        if times:
+            self.counters[reason] += times
+
+    def _process(self, record: Record, host_s: float) -> None:
+        if isinstance(record, Heard):
+            if self.ready:
+                self.clock.update(record.rx_ticks, host_s)
+                self._listener(Reception(record.frame, record.rx_ticks, host_s, record.diagnostics))
+        elif isinstance(record, Done):
+            self._on_sent(record)
+        elif isinstance(record, TooLate):
+            tx_ticks = self._pending.pop(record.dx_ticks, None)
+            if tx_ticks is not None:
+                self._listener(Late(tx_ticks))
+        elif isinstance(record, Status):
+            self._on_status(record, host_s)
+        elif isinstance(record, Hello):
+            self._on_hello(record, host_s)
+        else:
+            self._on_refusal(record)
+
+    def _on_sent(self, record: Done) -> None:
+        tx_ticks = self._pending.pop(record.dx_ticks, None)
+        if tx_ticks is None:
+            return
+        if record.tx_ticks != tx_ticks:
+            self.counters["sent-at-another-time"] += 1
+        self._listener(Sent(tx_ticks))
+
+    def _on_hello(self, hello: Hello, host_s: float) -> None:
+        """Configure a board of this version; after a repeated HELLO its status shows whether it has restarted."""
+        if self.hello is not None and host_s - self._asked_s > _HELLO_ANSWER_S:
+            self._count_start(host_s, hello.reset_cause)
+        is_repeated, self.hello = self.hello is not None and not self._refused, hello
+        if hello.major != link.MAJOR:
+            self._refuse(
+                f"the board at {self._port} has version {hello.major}.{hello.minor} of the serial link, this "
+                f"program {link.MAJOR}.{link.MINOR}; bring the board's firmware and Skyless to the same release"
+            )
+        elif hello.rate_khz != link.RATE_KHZ or hello.counter_bits != link.COUNTER_BITS:
+            self._refuse(
+                f"the board at {self._port} counts {hello.rate_khz} kHz in {hello.counter_bits} bits, not "
+                f"{link.RATE_KHZ} in {link.COUNTER_BITS}: its radio is none that Skyless knows"
+            )
+        elif self._transmits and not hello.can_transmit:
+            self._refuse(f"the board at {self._port} only listens; an anchor needs one that can transmit")
+        else:
+            self._refused = ""
+            if is_repeated:
+                self._send(self._writer.ask_status())
+            else:
+                self._configure()
+
+    def _count_start(self, host_s: float, cause: int | None) -> None:
+        """Count that the board has restarted, and report once that it does so repeatedly.
+
+        ``cause`` is what the board said of it, None where it said nothing.
+        """
+        self.counters["board-restart"] += 1
+        self._idle_polls = 0
+        starts = self._starts
+        if starts and host_s - starts[-1] > _MAX_STARTS_S:
+            self._reported_starts = False
+        starts.append(host_s)
+        within_s = host_s - starts[0]
+        if len(starts) == _MAX_STARTS and within_s <= _MAX_STARTS_S and not self._reported_starts:
+            self._reported_starts = True
+            often = f"starts again and again ({_MAX_STARTS} times within {within_s:.0f} s{_last_cause(cause)})"
+            self._listener(Hint(f"the board at {self._port} {often}: is its supply good, does its firmware fail?"))
+
+    def _refuse(self, reason: str) -> None:
+        """Each reason is reported once until the board is ready, because a board that is asked again refuses again."""
+        self._reset()
+        self._refused = reason
+        if reason != self._reported:
+            self._reported = reason
+            self._listener(Gone(reason))
+
+    def _on_refusal(self, refusal: NotDone) -> None:
+        """A board that refuses its configuration cannot be used; other refusals are counted."""
+        if refusal.command == link.CONFIG:
+            why = _REASONS.get(refusal.reason, f"reason {refusal.reason}")
+            self._refuse(f"the board at {self._port} refuses its configuration: {why}")
+        else:
+            self.counters["refused-command"] += 1
+
+    def _configure(self) -> None:
+        self._send(self._writer.config(self._delays.tx_ticks, self._delays.rx_ticks))
+        self._send(self._writer.rx_on())
+
+    def _on_status(self, status: Status, host_s: float) -> None:
+        if self.status is not None:
+            self._count("rx-error", max(status.errors - self.status.errors, 0))
+        self._check_line(status, was_polled=self.status is not None and self.status.polled)
+        self.status = status
+        if self._refused:
+            return
+        if not status.receiving:
+            if self.ready:  # it has restarted
+                # count it, unless its HELLO did
+                if not self._starts or host_s - self._starts[-1] > _HELLO_ANSWER_S:
+                    self._count_start(host_s, None)
+                self._reset()
+                self._configure()
+            return
+        if not self.ready:
+            self.clock.reset()
+        self.clock.update(status.ticks, host_s)
+        if not self.ready:
+            self.ready, self._reported = True, ""
+            self._idle_polls, self._reported_idle = 0, False
+            self._listener(Restarted())
+
+    def _check_line(self, status: Status, *, was_polled: bool) -> None:
+        """Count when the board begins to poll its radio, and report it once."""
+        if not status.polled or was_polled:
+            return
+        self.counters["interrupt-line-stuck"] += 1
+        if not self._reported_line:
+            self._reported_line = True
+            self._listener(
+                Hint(
+                    f"the interrupt line of the radio on the board at {self._port} does not follow its events; the "
+                    "board polls it, and receptions may come late: is the module sound (on a DWM1001 its GPIO 19)?"
+                )
+            )
+
+    def _reset(self) -> None:
+        self.ready = False
+        self._pending.clear()
+        self.clock.reset()
+
+
+def _last_cause(cause: int | None) -> str:
+    """Why a board has started, for a message; empty where it did not say."""
+    if cause is None:
+        return ""
+    words = [text for bit, text in _RESET_CAUSES.items() if cause & bit]
+    if cause == 0:
+        words = ["power on or too low a supply"]
+    return f", at last by {' and '.join(words) or f'cause {cause:#04x}'}"
+
+
+class SerialRadio:
+    """One node's board (``skyless.radio.interface.Radio``)."""
+
+    def __init__(
+        self, path: str, baud: int, name: str, delays: AntennaDelays | None = None, *, transmits: bool = False
+    ) -> None:
+        """``transmits``: refuse a board that only listens."""
+        self.name = name
+        self.counters: Counter[str] = Counter()
+        self.lead_s = _LEAD_S
+        self._delays = AntennaDelays() if delays is None else delays
+        self._transmits = transmits
+        self._port = SerialPort(path, baud, lambda reason: self._listener(Gone(reason)))
+        self._listener: Listener = ignore
+        self._session: LinkSession | None = None
+
+    async def run(self, listener: Listener) -> None:
+        """Receive until cancelled; a board that is unplugged is looked for."""
+        self._listener = listener
+        poll = asyncio.ensure_future(self._poll())
+        try:
+            await self._port.run(self)
+        finally:
+            poll.cancel()
+            await asyncio.gather(poll, return_exceptions=True)
+
+    def advice(self) -> str:
+        """Where to look when nothing comes though the board answers."""
+        path = self._port.path
+        return f"the board at {path} answers, but receives no frame: are anchors on the air, is its antenna free?"
+
+    def now_ticks(self) -> int | None:
+        """The board's counter, extrapolated from its newest stamps; None while it is not ready."""
+        session = self._session
+        return session.clock.read(time.monotonic()) if session is not None and session.ready else None
+
+    def transmit(self, transmission: Transmission) -> None:
+        """Send a frame; without a board it is late."""
+        if self._session is None:
+            self._listener(Late(transmission.tx_ticks))
+        else:
+            self._session.transmit(transmission)
+
+    def _on_event(self, event: RadioEvent) -> None:
+        if isinstance(event, Restarted):
+            self._port.clear_report()
+        self._listener(event)
+
+    async def _poll(self) -> None:
+        while True:
+            await asyncio.sleep(STATUS_S)
+            if self._session is not None:
+                reason = self._session.poll(time.monotonic())
+                if reason is not None:
+                    self._port.reopen(reason)
+
+    # What the port calls
+
+    def on_open(self, send: Callable[[bytes], None]) -> None:
+        """Begin a session with the board."""
+        self._session = LinkSession(
+            self._port.path, self._delays, send, self._on_event, self.counters, transmits=self._transmits
+        )
+        self._session.begin(time.monotonic())
+
+    def on_data(self, data: bytes) -> None:
+        """Process bytes from the board."""
+        if self._session is not None:
+            self._session.on_data(data, time.monotonic())
+
+    def on_close(self) -> None:
+        """The board has gone."""
+        self._session = None

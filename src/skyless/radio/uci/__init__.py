@@ -1,0 +1,1 @@
+"""FiRa's UCI: packets and downlink TDoA measurements."""

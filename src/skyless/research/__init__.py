@@ -1,0 +1,1 @@
+"""Studies, figures of the paper, replays of recordings, benchmarks."""

@@ -1,0 +1,323 @@
+"""What is asked of a survey: options of ``skyless survey``, and arguments of ``skyless.survey_site``."""
+
+import re
+from collections.abc import Mapping, Sequence
+from math import inf
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+from msgspec import Struct
+
+from skyless.core.air.page_codec import MAX_COORDINATE_M
+from skyless.core.arguments import (
+    Option,
+    Rule,
+    Text,
+    check_number,
+    check_point,
+    existing_file,
+    number,
+    read_numbers,
+    sequence,
+    wrong,
+)
+from skyless.core.errors import SkylessError
+from skyless.research.replays.options import RecordingOptions
+from skyless.site.survey.facts import Tape
+
+if TYPE_CHECKING:
+    from skyless.core.site import Site
+
+_MAX_STD_M: Final = 100.0
+_Std = Annotated[float, number(above=0.0, most=_MAX_STD_M)]
+_StdOrZero = Annotated[float, number(least=0.0, most=_MAX_STD_M)]
+_TAPE: Final = re.compile(r"(?P<a>\w+)-(?P<b>\w+)=(?P<distance>[^±+]+)((±|\+-)(?P<std>.+))?")
+
+
+class Stay(Struct, frozen=True):
+    """A tag at rest at a known position."""
+
+    x_m: float
+    y_m: float
+    z_m: float | None = None
+    """None: at the height of the site's tags."""
+    from_s: float = -inf
+    """Since the first difference."""
+    to_s: float = inf
+
+
+class Walk(Struct, frozen=True):
+    """A tag that was carried around, and when, in seconds since its first reception."""
+
+    tag: str
+    from_s: float = 0.0
+    to_s: float = inf
+
+
+class First(Struct, frozen=True):
+    """Only the beginning of a recording: a number of differences, of seconds, or a part of its time."""
+
+    count: int | None = None
+    seconds: float | None = None
+    part: float | None = None
+
+
+def _metres(name: str, text: str, counts: tuple[int, ...], part: str | None = None) -> tuple[float, ...]:
+    """Coordinates or lengths within the range of the almanac. Raises SkylessError."""
+    values = read_numbers(name, text, counts, part=part)
+    if any(abs(one) > MAX_COORDINATE_M for one in values):
+        raise SkylessError(f"{name} is {text!r}; it should be metres, at most {MAX_COORDINATE_M:g}")
+    return values
+
+
+def _anchor(name: str, text: str, part: str) -> int:
+    """The anchor that a part of a text names. Raises SkylessError."""
+    try:
+        return int(part, 0) if part.strip().lower().startswith("0x") else int(part)
+    except ValueError:
+        raise SkylessError(f"{name} is {text!r}; {part!r} should be the identifier of an anchor") from None
+
+
+def _read_height(name: str, text: str) -> tuple[int | None, float]:
+    anchor, mark, value = text.rpartition("=")
+    (z_m,) = _metres(name, text, (1,), value if mark else None)
+    return (_anchor(name, text, anchor) if mark else None), z_m
+
+
+def _check_heights(name: str, given: Any) -> dict[int | None, float]:  # noqa: ANN401 - what a user gives
+    if isinstance(given, float | int):
+        given = {None: given}
+    heights_m: dict[int | None, float] = {}
+    for anchor, z_m in given.items() if isinstance(given, Mapping) else given:
+        if anchor in heights_m:
+            which = "all anchors" if anchor is None else f"anchor {anchor}"
+            raise SkylessError(f"{name} is given twice; the height of {which} should be given once")
+        heights_m[anchor] = check_number(f"{name}[{anchor}]", z_m, least=-MAX_COORDINATE_M, most=MAX_COORDINATE_M)
+    return heights_m
+
+
+def _read_tape(name: str, text: str) -> Tape:
+    match = _TAPE.fullmatch(text)
+    if match is None:
+        raise SkylessError(f"{name} is {text!r}; it should be like 1-4=7.21 or 1-4=7.21±0.01")
+    a, b = (_anchor(name, text, match[end]) for end in ("a", "b"))
+    (distance_m,) = _metres(name, text, (1,), match["distance"])
+    tape = Tape(a, b, distance_m)
+    return tape if match["std"] is None else Tape(a, b, distance_m, *_metres(name, text, (1,), match["std"]))
+
+
+def _check_tapes(name: str, given: Any) -> tuple[Tape, ...]:  # noqa: ANN401 - what a user gives
+    tapes = sequence(name, given, "values of skyless.site.survey.facts.Tape")
+    pairs = set()
+    for index, tape in enumerate(tapes):
+        if not isinstance(tape, Tape):
+            raise wrong(f"{name}[{index}]", tape, "a skyless.site.survey.facts.Tape")
+        shown = f"{tape.a}-{tape.b}={tape.distance_m:g}±{tape.std_m:g}"
+        if tape.a == tape.b or not (tape.distance_m > 0.0 and 0.0 <= tape.std_m <= _MAX_STD_M):
+            raise SkylessError(f"{name} is {shown!r}; it should be a positive distance between two anchors")
+        if frozenset((tape.a, tape.b)) in pairs:
+            raise SkylessError(f"{name} is {shown!r}; that between {tape.a} and {tape.b} should be given once")
+        pairs.add(frozenset((tape.a, tape.b)))
+    return tapes
+
+
+def _read_point(name: str, text: str) -> tuple[int, tuple[float, ...]]:
+    anchor, _, position = text.partition("=")
+    position_m = _metres(name, text, (2, 3), position)
+    return _anchor(name, text, anchor), position_m
+
+
+def _check_points(name: str, given: Any) -> dict[int, tuple[float, ...]]:  # noqa: ANN401 - what a user gives
+    points: dict[int, tuple[float, ...]] = {}
+    for anchor, position_m in given.items() if isinstance(given, Mapping) else given:
+        if anchor in points:
+            raise SkylessError(f"{name} is given twice; the position of anchor {anchor} should be given once")
+        points[anchor] = check_point(f"{name}[{anchor}]", position_m, (2, 3), MAX_COORDINATE_M)
+    return points
+
+
+def _read_stay(name: str, text: str) -> Stay:
+    position, mark, span = text.partition("@")
+    x_m, y_m, *z_m = _metres(name, text, (2, 3), position)
+    stay = Stay(x_m, y_m, *z_m)
+    if not mark:
+        return stay
+    from_s, to_s = _read_span(name, text, span)
+    return Stay(stay.x_m, stay.y_m, stay.z_m, from_s, to_s)
+
+
+def _read_span(name: str, text: str, span: str) -> tuple[float, float]:
+    from_s, to_s = read_numbers(name, text, (2,), ":", part=span)
+    if not 0.0 <= from_s < to_s:
+        raise SkylessError(f"{name} is {text!r}; what follows @ should be two times in seconds, the later one last")
+    return from_s, to_s
+
+
+def _check_stays(name: str, given: Any) -> tuple[Stay, ...]:  # noqa: ANN401 - what a user gives
+    stays = []
+    for index, one in enumerate(sequence(name, given, "points, x,y or x,y,z in metres each")):
+        of_one = f"{name}[{index}]"
+        stay = one if isinstance(one, Stay) else Stay(*check_point(of_one, one, (2, 3)))
+        check_point(of_one, (stay.x_m, stay.y_m, *(() if stay.z_m is None else (stay.z_m,))), (2, 3))
+        if not stay.from_s < stay.to_s:
+            raise wrong(f"{of_one}.to_s", stay.to_s, f"above from_s, which is {stay.from_s:g}")
+        stays.append(stay)
+    for stay in stays[:-1]:
+        if stay.to_s == inf:
+            shown = f"{stay.x_m:g},{stay.y_m:g}"
+            raise SkylessError(f"{name} is {shown!r}; before another {name} it should have its times, @FROM:TO")
+    return tuple(stays)
+
+
+def _read_walk(name: str, text: str) -> Walk:
+    tag, mark, span = text.partition("@")
+    return Walk(tag, *_read_span(name, text, span)) if mark else Walk(tag)
+
+
+def _check_walks(name: str, given: Any) -> tuple[Walk, ...]:  # noqa: ANN401 - what a user gives
+    walks: list[Walk] = []
+    for one in sequence(name, given, "names of tags"):
+        walk = Walk(one) if isinstance(one, str) else one
+        if any(walk.tag == other.tag and walk.from_s < other.to_s and other.from_s < walk.to_s for other in walks):
+            span = "" if (walk.from_s, walk.to_s) == (0.0, inf) else f"@{walk.from_s:g}:{walk.to_s:g}"
+            raise SkylessError(f"{name} is '{walk.tag}{span}'; a walk of {walk.tag} given before covers the same time")
+        walks.append(walk)
+    return tuple(walks)
+
+
+def _check_first(name: str, text: Any) -> First:  # noqa: ANN401 - what a user gives
+    if isinstance(text, First):
+        return text
+    digits = str(text).rstrip("s%")
+    unit = str(text)[len(digits) :]
+    try:
+        value = float(digits)
+    except ValueError:
+        value = 0.0
+    if 0.0 < value < 1e12:
+        if unit == "s":
+            return First(seconds=value)
+        if unit == "%" and value <= 100.0:
+            return First(part=value / 100.0)
+        if unit == "" and value == int(value):
+            return First(count=int(value))
+    raise wrong(name, text, "a number of differences, seconds (60s) or a part (50%)")
+
+
+class SurveyOptions(RecordingOptions, frozen=True, kw_only=True):
+    """Options of ``skyless survey``."""
+
+    recording: Annotated["str | Path | None", Path, Rule(existing_file)] = None
+    """The recording, plain or gzip: of skyless record, or of another system."""
+    ranges: Annotated["str | Path | None", Path, Rule(existing_file)] = None
+    """A table of ranges instead of a recording: anchor_a,anchor_b,range_m, each pair any number of times."""
+    walks: Annotated[
+        Sequence[str | Walk], Option("walk"), Text(_read_walk, "TAG or TAG@FROM:TO", many=True), Rule(_check_walks)
+    ] = ()
+    """A tag of the recording that was carried around, and when in seconds since its first reception. Used only where
+    it fits the ranges."""
+    walk_height_m: Annotated[
+        float | None, Option("walk-height"), number(least=-MAX_COORDINATE_M, most=MAX_COORDINATE_M)
+    ] = None
+    """Height at which it was carried, metres, within some 0.1 m; by default it is free."""
+    stays: Annotated[
+        Sequence[Stay | Sequence[float]],
+        Option("at"),
+        Text(_read_stay, "x,y,z or x,y,z@FROM:TO", many=True),
+        Rule(_check_stays),
+    ] = ()
+    """Where the tag stood still, in metres, x,y where the site knows its tags' height; its times in seconds since the
+    beginning, for several positions. The anchors' positions are then kept, and delays found."""
+    recorded_truth: bool = False
+    """Use where a simulated site's recording says its tags were, as --truth."""
+    first: Annotated[str | None, Rule(_check_first)] = None
+    """Of a tag at known positions use the beginning only: a number of differences (30), seconds (60s) or a part (50%).
+    """
+    site: Annotated["Site | str | Path | None", Path] = None
+    """Site file of the present: its anchors, heights, and rough positions; in Python also a site."""
+    no_sketch: bool = False
+    """Do not use the positions of --site, only its anchors and heights."""
+    sketch_std_m: Annotated[_Std | None, Option("sketch-std")] = None
+    """How well the positions of --site are known, metres per axis; 0.3 by default, with --keep-positions what the file
+    states."""
+    keep_positions: bool = False
+    """Keep the positions of --site, or of the recording, and find delays only."""
+    dimensions: Literal[2, 3] | None = None
+    """2 (default): heights are given; 3: heights are estimated."""
+    anchor_height_m: Annotated[
+        "float | Mapping[int | None, float] | None",
+        Option("anchor-height"),
+        Text(_read_height, "METRES or ANCHOR=METRES", many=True),
+        Rule(_check_heights),
+    ] = None
+    """Height of all anchors, or of one; in Python a number, or heights by anchor."""
+    anchor_heights: Annotated["str | Path | None", Path] = None
+    """Table of heights: id,z_m."""
+    anchor_height_std_m: Annotated[_Std | None, Option("anchor-height-std")] = None
+    """How well given heights are known, metres (--dimensions 3); 0.02 by default."""
+    distances: Annotated[
+        Sequence[Tape],
+        Option("distance"),
+        Text(_read_tape, "1-4=7.21 or 1-4=7.21±0.01", many=True),
+        Rule(_check_tapes),
+    ] = ()
+    """A distance between two anchors by tape or laser, metres; ±0.005 by default."""
+    points_m: Annotated[
+        Mapping[int, Sequence[float]],
+        Option("point"),
+        Text(_read_point, "3=0,4 or 3=0,4,2.5", many=True),
+        Rule(_check_points),
+    ] = {}
+    """An anchor whose position is known, metres."""
+    point_std_m: Annotated[_Std | None, Option("point-std")] = None
+    """How well such positions are known, metres per axis; 0.005 by default."""
+    delays_known: bool = False
+    """The antenna delays are right; do not estimate them."""
+    delay_std_m: Annotated[_Std | None, Option("delay-std")] = None
+    """How much antenna delays are expected to be off, each for itself, metres; 0.07 by default, 0.15 with a tag at
+    known positions, for boards that were never calibrated, 0.03 for recordings of other systems."""
+    common_delay_std_m: Annotated[_StdOrZero | None, Option("common-delay-std")] = None
+    """How much all of them are expected to be off together, more than that; 0.1 by default, 1 for recordings of other
+    systems, whose stamps may lack any correction."""
+    pair_std_m: Annotated[_StdOrZero | None, Option("pair-std")] = None
+    """Constant error expected of each pair's range, metres; 0.03 by default."""
+    origin: int | None = None
+    """The anchor at (0, 0)."""
+    x_axis: int | None = None
+    """An anchor on the positive x axis; best the farthest from --origin."""
+    left: int | None = None
+    """An anchor on the left of the x axis (y > 0)."""
+
+    @property
+    def knows_tag(self) -> bool:
+        """Whether it is stated where a tag of the recording was."""
+        return bool(self.stays or self.truth is not None or self.recorded_truth)
+
+    def check(self) -> None:
+        """See that the options fit one another. Raises SkylessError."""
+        if self.recording is None:
+            self.leave_out(
+                *("format", "walks", "stays", "truth", "recorded_truth", "first", "anchors", "listener", "tag"),
+                why="it is for recordings",
+            )
+        elif self.ranges is not None:
+            raise SkylessError("give either --recording or --ranges")
+        if not self.walks:
+            self.leave_out("walk_height_m", why="it is the height of a tag that --walk names")
+        if self.stays and (self.truth is not None or self.recorded_truth or self.lever_arm_m is not None):
+            raise SkylessError("--at says where the antenna was; it should be given without --truth and --lever-arm")
+        if self.delays_known:
+            self.leave_out("delay_std_m", "common_delay_std_m", why="--delays-known says that delays are right")
+        if self.anchor_height_std_m is not None and self.dimensions != 3:
+            self.leave_out("anchor_height_std_m", why="it is for --dimensions 3, else heights are exact")
+        if self.keep_positions and self.no_sketch:
+            raise SkylessError("--keep-positions keeps what --no-sketch would leave out; give either")
+        if (self.keep_positions or self.knows_tag) and self.delays_known:
+            raise SkylessError(
+                "--keep-positions finds delays, and --delays-known says that they are known; give either"
+            )
+        named = [anchor for anchor in (self.origin, self.x_axis, self.left) if anchor is not None]
+        if named and (self.origin is None or self.x_axis is None):
+            raise SkylessError("the axes need --origin and --x-axis, and --left where the side is not known otherwise")
+        if len(set(named)) < len(named):
+            raise SkylessError(f"--x-axis is {self.x_axis}; --origin, --x-axis and --left should be different anchors")

@@ -1,0 +1,212 @@
+"""The table of formats, and how a recording of any of them is opened."""
+
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from io import BufferedIOBase
+from os import PathLike, fspath
+from typing import Final
+
+from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
+from skyless.core.constants import TICK_BITS
+from skyless.core.errors import ConfigurationError
+from skyless.core.input_files import Drops, open_source, read_head
+from skyless.radio.foreign import bitcraze, fira
+from skyless.research.foreign import avalue, bitcraze_captures, phones, tdoa_tables
+
+Record = Packet | PairTdoa
+
+
+@dataclass(frozen=True)
+class Format:
+    """One format: how to recognise and how to read it."""
+
+    name: str
+    summary: str
+    recognise: Callable[[bytes], bool]
+    """From the first bytes, decompressed."""
+    read: Callable[..., Iterator[Record]]
+    """From an open stream and a counter of drops; with ``listener`` where ``any_listener``, and ``anchors_m`` where
+    ``is_dl_tdoa``."""
+    tx_bits: int | None
+    """Width of the anchors' stamps in its packets; None for a format of ready TDoAs."""
+    any_listener: bool = False
+    """One recording holds several listeners, one of which is chosen."""
+    hexadecimal: bool = False
+    """Identifiers are hexadecimal."""
+    is_dl_tdoa: bool = False
+    """FiRa's: packets may state where their senders are, and relay only initiators and those that answered them."""
+    delays_ticks: int = 0
+    """Antenna delays of a sender and a receiver together, where its stamps include them."""
+
+
+def _bitcraze(
+    kind: str, summary: str, recognise: Callable[[bytes], bool], read: Callable[..., Iterator[Record]]
+) -> Format:
+    summary = f"Bitcraze sniffer, {summary} (TDoA2, TDoA3)"
+    delays_ticks = bitcraze.ANTENNA_DELAYS_TICKS
+    return Format(f"bitcraze-{kind}", summary, recognise, read, bitcraze.STAMP_BITS, delays_ticks=delays_ticks)
+
+
+def _dl_tdoa(
+    name: str, summary: str, recognise: Callable[[bytes], bool], read: Callable[..., Iterator[Record]]
+) -> Format:
+    return Format(name, f"FiRa {summary}", recognise, read, TICK_BITS, is_dl_tdoa=True)
+
+
+FORMATS: Final = (
+    _bitcraze("yaml", "YAML documents with base64 payloads", captures.recognise_yaml, captures.read_yaml),
+    _bitcraze("text", "text lines 'From .. to .. @..: ..'", bitcraze.recognise_text, bitcraze.read_text),
+    Format(
+        "miluv",
+        "MILUV passive ticks: three-message exchanges overheard by a listener",
+        tdoa_tables.recognise_miluv,
+        tdoa_tables.read_miluv,
+        None,
+        any_listener=True,
+    ),
+    Format(
+        "avalue",
+        "Avalue anchors' receptions of each other (ccp.csv); one of them plays the tag",
+        avalue.recognise,
+        avalue.read,
+        TICK_BITS,
+        any_listener=True,
+        hexadecimal=True,
+    ),
+    _dl_tdoa(
+        "dl-tdoa-json",
+        "DL-TDoA records of phones, lines of JSON (iOS NIDLTDOAMeasurement, Android DlTdoaMeasurement)",
+        phones.recognise,
+        phones.read,
+    ),
+    _dl_tdoa(
+        "uci-text",
+        "UCI log, lines with hexadecimal packets (DL-TDoA measurements, versions 1 and 2)",
+        fira.recognise_text,
+        fira.read_text,
+    ),
+    Format("tdoa-table", "Table t_s,idA,idB,tdoa_m", tdoa_tables.recognise_tdoas, tdoa_tables.read_tdoas, None),
+    _bitcraze("binary", "binary records BC ..", bitcraze.recognise_binary, bitcraze.read_binary),
+    _dl_tdoa(
+        "uci-binary",
+        "UCI log, packets as they came over the line (DL-TDoA measurements, versions 1 and 2)",
+        fira.recognise_binary,
+        fira.read_binary,
+    ),
+)
+"""In the order in which they are tried: the more particular first."""
+
+
+@dataclass
+class Recording:
+    """An open recording: iterate over it once, and close it (or use ``with``)."""
+
+    format: Format
+    path: str
+    records: Iterator[Record]
+    stream: BufferedIOBase
+    drops: Drops = field(default_factory=Counter)
+    """What could not be used, by reason; complete once the records are exhausted."""
+
+    def __iter__(self) -> Iterator[Record]:
+        return self.records
+
+    def __enter__(self) -> "Recording":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def bytes_read(self) -> int:
+        """How far into the file the reading has come, compressed bytes where it is compressed."""
+        return os.lseek(self.stream.fileno(), 0, os.SEEK_CUR)
+
+    def close(self) -> None:
+        """Close the file."""
+        self.stream.close()
+
+
+def open_recording(
+    path: str | PathLike[str],
+    format_name: str | None = None,
+    listener: str | None = None,
+    anchors_m: Mapping[int, Point] | None = None,
+) -> Recording:
+    """Open a recording of a named format, or of the one that its first bytes show.
+
+    ``listener`` chooses one receiver where a recording holds several; by default that of the first row. ``anchors_m``:
+    positions that replace all that the anchors of a recording of DL-TDoA state.
+
+    Raises:
+        ConfigurationError: the file cannot be opened, its format is not known, or the listener makes no sense.
+    """
+    chosen = format_of(path, format_name)
+    read = _listening(path, chosen, listener)
+    if chosen.is_dl_tdoa:
+        read = partial(chosen.read, anchors_m=anchors_m)
+    stream = open_source(path)
+    drops: Drops = Counter()
+    return Recording(chosen, fspath(path), read(stream, drops), stream, drops)
+
+
+_MCAP: Final = b"\x89MCAP0"
+
+
+def format_of(path: str | PathLike[str], name: str | None = None) -> Format:
+    """Format of that name, or the one that the file's first bytes show.
+
+    Raises:
+        ConfigurationError: the file cannot be opened, or its format is not known.
+    """
+    return _recognised(path) if name is None else _named(path, name)
+
+
+def _named(path: str | PathLike[str], name: str) -> Format:
+    for known in FORMATS:
+        if known.name == name:
+            return known
+    raise ConfigurationError(path, "format", name, f"one of {_names()}")
+
+
+def _recognised(path: str | PathLike[str]) -> Format:
+    head = read_head(path)
+    for known in FORMATS:
+        if known.recognise(head):
+            return known
+    if not head:
+        raise ConfigurationError(path, "the file", "empty", f"a recording {_readable()}")
+    if head.startswith(_MCAP):
+        raise ConfigurationError(path, "the file", "a compressed MCAP", "unpacked first, as by gunzip")
+    if avalue.recognise_blinks(head):
+        expected = "ccp.csv of the same system: what tags send up to anchors cannot be replayed as a tag's receptions"
+        raise ConfigurationError(path, "the format", "tag blinks", expected)
+    start = head[:24].decode("ascii", "backslashreplace")
+    raise ConfigurationError(path, "the beginning", start, f"that of a recording {_readable()}")
+
+
+def _listening(
+    path: str | PathLike[str], chosen: Format, listener: str | None
+) -> Callable[[BufferedIOBase, Drops], Iterator[Record]]:
+    """Bind the reader to its listener."""
+    if listener is None:
+        return chosen.read
+    if not chosen.any_listener:
+        raise ConfigurationError(path, "listener", listener, f"left out: format {chosen.name} has one listener only")
+    try:
+        int(listener, 16 if chosen.hexadecimal else 10)
+    except ValueError as error:
+        kind = "hexadecimal" if chosen.hexadecimal else "decimal"
+        raise ConfigurationError(path, "listener", listener, f"a {kind} identifier") from error
+    return partial(chosen.read, listener=listener)
+
+
+def _readable() -> str:
+    return f"of skyless record, or of one of the formats {_names()}"
+
+
+def _names() -> str:
+    return ", ".join(known.name for known in FORMATS)

@@ -1,0 +1,252 @@
+"""DL-TDoA records of phones as lines of JSON: what an app wrote of each measurement that the system gave it.
+
+iOS, keys as the properties of ``NIDLTDOAMeasurement``: ``address``, ``measurementType`` (poll, response, final, or
+0, 1, 2), ``rawTransmitTime`` and ``rawReceiveTime`` (ticks of 15.65 ps, iOS 27) or ``transmitTime`` and
+``receiveTime`` (seconds), ``coordinates`` and ``coordinatesType`` (geodetic or 0: latitude, longitude, altitude;
+relative or 1: metres), ``clusterInitiatorAddress`` (iOS 27). There are no reply times: TX stamps are taken to be in
+the time of the cluster's initiator, without which nothing could be computed from them.
+
+Android, keys as the properties of ``android.ranging.DlTdoaMeasurement``: ``messageType`` (0, 1, 2), ``messageControl``
+(bit 0: TX stamps in the common time), ``blockIndex``, ``roundIndex``, ``txTimestamp`` and ``rxTimestamp`` (the bytes,
+lowest first: an array of numbers, hexadecimal, or a whole number of ticks), ``initiatorReplyTime``,
+``responderReplyTime``, ``initiatorResponderTof`` (ticks), ``anchorLocation`` with ``relativeLocation`` (``x``, ``y``,
+``z`` in millimetres) or ``wgs84Location`` (``latitude``, ``longitude``, ``altitude``, the last in kilometres as in the
+message: Android's documentation names either unit); and ``address``, which the app adds from the peer.
+
+An address is a number or hexadecimal text, with or without colons. Further keys are of no interest.
+"""
+
+from collections.abc import Iterator, Mapping
+from io import BufferedIOBase
+from math import isfinite
+from typing import Final
+
+import msgspec
+from msgspec import Struct
+
+from skyless.core.air.masterless_packets import Packet, Point
+from skyless.core.constants import TICK_BITS, TICK_RATE_HZ
+from skyless.core.input_files import Drops, lines
+from skyless.core.ticks import wrap
+from skyless.radio.foreign.fira import AnchorFrame
+from skyless.radio.uci.dl_tdoa import DtMessage, DtRounds, host_time_s
+from skyless.radio.uci.uci import (
+    DtMessageType,
+    GeodeticPoint,
+)
+
+_KINDS: Final = {"poll": DtMessageType.POLL, "response": DtMessageType.RESPONSE, "final": DtMessageType.FINAL}
+_STAMP_BYTES: Final = TICK_BITS // 8
+_MAX_STAMP_BYTES: Final = 8
+_LAST_ADDRESS: Final = (1 << 64) - 1
+_LAST_S: Final = 1e9
+_FARTHEST_M: Final = 1e6
+_COMMON_TIME: Final = 1
+_MAX_CLUSTERS: Final = 256
+_MAX_REPLY_TICKS: Final = (1 << 32) - 1
+
+
+class _Wgs84(Struct):
+    latitude: float
+    longitude: float
+    altitude: float = 0.0
+
+
+class _Relative(Struct):
+    x: float
+    y: float
+    z: float
+
+
+class _AnchorLocation(Struct, rename="camel"):
+    wgs84_location: _Wgs84 | None = None
+    relative_location: _Relative | None = None
+
+
+class _Record(Struct, rename="camel"):
+    """Of either system; which one shows by the key of the message's type."""
+
+    address: int | str
+    measurement_type: int | str | None = None
+    transmit_time: float | None = None
+    receive_time: float | None = None
+    raw_transmit_time: int | None = None
+    raw_receive_time: int | None = None
+    coordinates: tuple[float, float, float] | None = None
+    coordinates_type: int | str | None = None
+    cluster_initiator_address: int | str | None = None
+    message_type: int | None = None
+    message_control: int = 0
+    block_index: int = 0
+    round_index: int = 0
+    tx_timestamp: list[int] | str | int | None = None
+    rx_timestamp: list[int] | str | int | None = None
+    initiator_reply_time: int = 0
+    responder_reply_time: int = 0
+    initiator_responder_tof: int = 0
+    anchor_location: _AnchorLocation | None = None
+
+
+_decode: Final = msgspec.json.Decoder(_Record).decode
+
+
+def recognise(head: bytes) -> bool:
+    """Whether the first line is a record of either system."""
+    first = head.removeprefix(b"\xef\xbb\xbf").partition(b"\n")[0]
+    try:
+        record = _decode(first)
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        return False
+    return record.measurement_type is not None or record.message_type is not None
+
+
+def read(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> Iterator[Packet]:
+    """Yield the packets of a file of records; ``anchors_m``: positions that replace all that anchors state."""
+    phone = _Phone(anchors_m)
+    for line in lines(stream, drops):
+        if not line.strip():
+            continue
+        packet = phone.on_line(line)
+        if isinstance(packet, Packet):
+            yield packet
+        else:
+            drops[packet] += 1
+
+
+class _Phone:
+    """One phone's records, in their order."""
+
+    def __init__(self, anchors_m: Mapping[int, Point] | None) -> None:
+        self._rounds = DtRounds(anchors_m)
+        self._frame = None if anchors_m else AnchorFrame()
+        self._polls: dict[int, int] = {}
+        """How many each cluster has sent, by its initiator."""
+        self._newest_initiator: int | None = None
+
+    def on_line(self, line: bytes) -> Packet | str:
+        """The packet of a record, or the reason why it is of no use."""
+        try:
+            record = _decode(line.removeprefix(b"\xef\xbb\xbf"))
+        except (msgspec.MsgspecError, ValueError, RecursionError):
+            return "malformed-record"
+        message = self._android(record) if record.measurement_type is None else self._ios(record)
+        return message if isinstance(message, str) else self._rounds.on_message(message)
+
+    def _ios(self, record: _Record) -> DtMessage | str:
+        kind, address = _kind(record.measurement_type), _address(record.address)
+        if kind is None or address is None:
+            return "unknown-message" if kind is None else "impossible-address"
+        initiator = address if kind is not DtMessageType.RESPONSE else self._initiator(record)
+        tx_ticks = _ios_ticks(record.raw_transmit_time, record.transmit_time)
+        rx_ticks = _ios_ticks(record.raw_receive_time, record.receive_time)
+        if tx_ticks is None or rx_ticks is None:
+            return "stamp-missing"
+        if initiator is None:
+            return "message-without-poll"
+        if kind is DtMessageType.POLL:
+            if initiator not in self._polls and len(self._polls) >= _MAX_CLUSTERS:
+                return "too-many-clusters"
+            self._polls[initiator] = self._polls.get(initiator, 0) + 1
+            self._newest_initiator = initiator
+        return DtMessage(
+            host_s=host_time_s(rx_ticks),
+            address=address,
+            kind=kind,
+            block=self._polls.get(initiator, 0),
+            round=initiator,
+            tx_ticks=wrap(tx_ticks),
+            rx_ticks_tag=wrap(rx_ticks),
+            common_time=True,
+            position_m=self._position_m(_ios_location(record)),
+        )
+
+    def _initiator(self, record: _Record) -> int | None:
+        """Whose poll a response answers: that of its cluster, or the newest."""
+        stated = record.cluster_initiator_address
+        return self._newest_initiator if stated is None else _address(stated)
+
+    def _android(self, record: _Record) -> DtMessage | str:
+        kind, address = _kind(record.message_type), _address(record.address)
+        if kind is None or address is None:
+            return "unknown-message" if kind is None else "impossible-address"
+        tx_ticks, rx_ticks = _android_ticks(record.tx_timestamp), _android_ticks(record.rx_timestamp)
+        if tx_ticks is None or rx_ticks is None:
+            return "stamp-missing"
+        replies = record.responder_reply_time, record.initiator_reply_time, record.initiator_responder_tof
+        indices = record.block_index, record.round_index
+        if not all(0 <= value <= _MAX_REPLY_TICKS for value in (*replies, *indices)):
+            return "impossible-number"
+        return DtMessage(
+            host_time_s(rx_ticks),
+            address,
+            kind,
+            *indices,
+            wrap(tx_ticks),
+            wrap(rx_ticks),
+            bool(record.message_control & _COMMON_TIME),
+            replies[0],
+            replies[1],
+            float(replies[2]) or None,
+            self._position_m(_android_location(record.anchor_location)),
+        )
+
+    def _position_m(self, location: Point | GeodeticPoint | None) -> Point | None:
+        return None if self._frame is None else self._frame.position_m(location)
+
+
+def _kind(stated: int | str | None) -> DtMessageType | None:
+    if isinstance(stated, str):
+        return _KINDS.get(stated.lower())
+    return DtMessageType(stated) if stated in (0, 1, 2) else None
+
+
+def _address(stated: int | str) -> int | None:
+    try:
+        value = int(stated.replace(":", ""), 16) if isinstance(stated, str) else stated
+    except ValueError:
+        return None
+    return value if 0 <= value <= _LAST_ADDRESS else None
+
+
+def _ios_ticks(raw: int | None, seconds: float | None) -> int | None:
+    if raw is not None:
+        return raw if 0 <= raw < 1 << 8 * _MAX_STAMP_BYTES else None
+    return round(seconds * TICK_RATE_HZ) if seconds is not None and 0.0 <= seconds < _LAST_S else None
+
+
+def _ios_location(record: _Record) -> Point | GeodeticPoint | None:
+    given, kind = record.coordinates, record.coordinates_type
+    if given is None or kind is None or not all(map(isfinite, given)):
+        return None
+    if kind in (0, "geodetic"):
+        return _geodetic(*given)
+    return given if kind in (1, "relative") and max(map(abs, given)) < _FARTHEST_M else None
+
+
+def _android_ticks(stated: list[int] | str | int | None) -> int | None:
+    if isinstance(stated, int):
+        return stated if 0 <= stated < 1 << 8 * _MAX_STAMP_BYTES else None
+    try:
+        data = bytes.fromhex(stated) if isinstance(stated, str) else bytes(value & 0xFF for value in stated or ())
+    except ValueError:
+        return None
+    return int.from_bytes(data, "little") if _STAMP_BYTES <= len(data) <= _MAX_STAMP_BYTES else None
+
+
+def _android_location(stated: _AnchorLocation | None) -> Point | GeodeticPoint | None:
+    if stated is None:
+        return None
+    if stated.wgs84_location is not None:
+        one = stated.wgs84_location
+        return _geodetic(one.latitude, one.longitude, one.altitude * 1000.0)
+    if stated.relative_location is None:
+        return None
+    x_m, y_m, z_m = (value / 1000.0 for value in msgspec.structs.astuple(stated.relative_location))
+    sensible = all(isfinite(value) and abs(value) < _FARTHEST_M for value in (x_m, y_m, z_m))
+    return (x_m, y_m, z_m) if sensible else None
+
+
+def _geodetic(latitude_deg: float, longitude_deg: float, height_m: float) -> GeodeticPoint | None:
+    point = GeodeticPoint(latitude_deg, longitude_deg, height_m)
+    sensible = abs(latitude_deg) <= 90.0 and abs(longitude_deg) <= 180.0 and abs(height_m) < _FARTHEST_M
+    return point if sensible else None

@@ -1,0 +1,1 @@
+"""Positioning from packets of anchors that have no common time."""

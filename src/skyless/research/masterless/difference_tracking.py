@@ -1,0 +1,353 @@
+"""Fixes from ready-made time differences: a start from a window of them, then the estimator, and again when lost."""
+
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from math import dist
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+from numpy.typing import ArrayLike
+
+from skyless.core.air.masterless_packets import PairTdoa
+from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.estimator.estimator import ACCEPTED, Estimator
+from skyless.core.estimator.state import EstimatorSettings
+from skyless.core.fix import Fix, NoFixReason
+from skyless.core.integrity import IntegrityRequirement
+from skyless.core.kernels.arrays import Array
+from skyless.core.tag.locate import NoSolution, locate
+from skyless.site.survey.anchor_errors import KNOWN_STD_M, DifferenceCalibration
+
+DIFFERENCES: Final = EstimatorSettings(
+    gate=3.0,
+    white=0.0,
+    walk=0.0,
+    drop_s=30.0,
+    range_std_m=0.04,
+    slope_std_m=0.02,
+    place_std_m=0.12,
+    place_distance_m=0.5,
+    place_time_s=30.0,
+    change_memory_s=1.5,
+    earliest_m=-0.25,
+    stationary_s=3.0,
+)
+"""What recorded flights of DW1000s show (docs/recordings.md): reflections change within half a metre, and by how much
+differs from anchor to anchor."""
+
+# A start uses the newest differences: this number of them, or at least those of this time.
+WINDOW: Final = 60
+WINDOW_S: Final = 1.0
+MAX_DIFFERENCE_SILENCE_S: Final = 10.0  # after a longer silence the state is worse than a new start
+START_SPEED_STD_MPS: Final = 1.0  # of the velocity at the start
+DIFFERENCE_IN_USE_S: Final = 0.5  # an anchor counts as in use while its last accepted difference is younger
+# While the horizontal standard deviation is larger, there is no fix; a silence that makes it so means a new start.
+MAX_HORIZONTAL_STD_M: Final = 3.0
+SHORT_SILENCE_S: Final = 0.1  # over shorter silences no state grows much wider
+TRY_EVERY_S: Final = 0.1  # between two attempts at a start
+# A start from later differences that is farther off (3-D: once in 60,000) begins again.
+CONTRADICTED_CHI2: Final = 25.0
+
+
+class DifferenceTracking:
+    """One tag that is given differences of its ranges to pairs of anchors."""
+
+    def __init__(
+        self,
+        settings: EstimatorSettings,
+        anchors_m: dict[int, tuple[float, float, float]],
+        z_bounds_m: tuple[float, float] | None = None,
+        calibration: DifferenceCalibration | None = None,
+    ) -> None:
+        """``anchors_m``: the anchors' positions; a difference that carries positions needs none.
+
+        ``calibration`` is subtracted from every difference; anchors that are not in it are typical ones.
+        """
+        self._calibration = DifferenceCalibration({}) if calibration is None else calibration
+        self.counters: Counter[str] = Counter()
+        self.reason: NoFixReason = NoFixReason.NO_BEACONS
+        is_calibrated = bool(self._calibration.anchors)
+        self._settings = replace(
+            settings,
+            difference_std_m=self._calibration.difference_std_m(settings.difference_std_m),
+            range_std_m=min(settings.range_std_m, KNOWN_STD_M) if is_calibrated else settings.range_std_m,
+            lowest_m=settings.lowest_m if z_bounds_m is None else z_bounds_m[0],
+            highest_m=settings.highest_m if z_bounds_m is None else z_bounds_m[1],
+        )
+        self._asked = IntegrityRequirement(settings.integrity_risk, settings.alert_limit_m)
+        self._positions_m = {anchor: np.array(point) for anchor, point in anchors_m.items()}
+        self._z_bounds_m = z_bounds_m
+        self._estimator = Estimator(self._settings)
+        self._window: deque[PairTdoa] = deque(maxlen=WINDOW)
+        self._begin_s = self._newest_s = 0.0
+        self._received_s: dict[int, float] = {}
+        self._tried_s = -np.inf
+        self._start: Start | None = None
+        self._is_confirmed = False
+
+    @property
+    def estimator(self) -> Estimator:
+        """The filter with all its states."""
+        return self._estimator
+
+    def update(self, pairs: Sequence[PairTdoa]) -> bool:
+        """Process the differences of one reception, receptions in the order of time.
+
+        True if they made a fix, else ``reason`` states why not.
+        """
+        used = False
+        for pair in pairs:
+            if self._update_positions(pair):
+                used = self._add(pair) or used
+            else:
+                self.counters["unknown-anchor"] += 1
+                self.reason = NoFixReason.NO_ALMANAC
+        return used and self._start is not None and self._is_plausible()
+
+    def _update_positions(self, pair: PairTdoa) -> bool:
+        """Whether it is known where both anchors stand."""
+        positions_m = self._positions_m
+        if pair.a_m is not None:
+            positions_m[pair.anchor_a] = np.array(pair.a_m)
+        if pair.b_m is not None:
+            positions_m[pair.anchor_b] = np.array(pair.b_m)
+        return pair.anchor_a in positions_m and pair.anchor_b in positions_m
+
+    def _add(self, pair: PairTdoa) -> bool:
+        if self._start is not None and self._is_out_of_reach(pair.time_s - self._newest_s):
+            self._stop()
+        self._newest_s = pair.time_s
+        begins = not self._is_confirmed and self._is_time_to_start(pair) and self._try_start()
+        if self._start is None:
+            return False
+        used = begins or self._process(pair)
+        if used:
+            self._received_s[pair.anchor_a] = self._received_s[pair.anchor_b] = pair.time_s
+        else:
+            self.counters["outlier"] += 1
+            self.reason = NoFixReason.RESIDUALS
+        if self._estimator.rejects_most:
+            self._stop()
+        return used
+
+    def _process(self, pair: PairTdoa) -> bool:
+        """Process a difference by the filter, less the calibrated or typical errors of its anchors."""
+        position_m = self.position_m
+        error_m = self._calibration.error_m(pair.anchor_b, dist(position_m, self._positions_m[pair.anchor_b]))
+        error_m -= self._calibration.error_m(pair.anchor_a, dist(position_m, self._positions_m[pair.anchor_a]))
+        a, b = self._index(pair.anchor_a), self._index(pair.anchor_b)
+        ticks = round((pair.time_s - self._begin_s) * TICK_RATE_HZ)
+        return self._estimator.process_difference(a, b, ticks, pair.tdoa_m - error_m) == ACCEPTED
+
+    def _index(self, anchor: int) -> int:
+        """Index of an anchor in the estimator's table."""
+        return self._estimator.anchor_index(anchor, self._positions_m[anchor])
+
+    def _is_out_of_reach(self, silent_s: float) -> bool:
+        """Whether the filter cannot predict that far: too long a silence for it, or a clock that went back."""
+        if not 0.0 <= silent_s <= MAX_DIFFERENCE_SILENCE_S:
+            return True
+        return silent_s > SHORT_SILENCE_S and self._estimator.horizontal_variance_m2(silent_s) > MAX_HORIZONTAL_STD_M**2
+
+    def _is_plausible(self) -> bool:
+        """Whether the state is near the anchors, where differences have information, and known well enough."""
+        start, state, dim = self._start, self._estimator.state, self._estimator.dim
+        if start is None or not start.holds(state.x[:dim]):
+            self.reason = NoFixReason.NOT_CONVERGED
+            self._stop()
+            return False
+        if state.P[0, 0] + state.P[1, 1] > MAX_HORIZONTAL_STD_M**2:
+            self.reason = NoFixReason.ACQUIRING
+            return False
+        if dim == 3 and state.P[2, 2] > MAX_HORIZONTAL_STD_M**2:
+            self.reason = NoFixReason.BAD_GEOMETRY
+            return False
+        return True
+
+    @property
+    def position_m(self) -> tuple[float, float, float]:
+        """The newest position."""
+        x, y, *z = self._estimator.state.x[: self._estimator.dim].tolist()
+        return x, y, z[0] if z else self._settings.height_m or 0.0
+
+    def fix(self) -> Fix:
+        """The newest position with all that is known of it; only after an ``update`` that made one."""
+        used = [anchor for anchor, when_s in self._received_s.items() if self._newest_s - when_s <= DIFFERENCE_IN_USE_S]
+        anchors_m = np.array([self._positions_m[anchor] for anchor in used]).reshape(-1, 3)
+        rows, known = self._estimator.rows.tobytes(), self._settings.height_m is not None
+        return Fix(self._newest_s, rows, tuple(used), anchors_m, "joint", known, 1, self._asked)
+
+    def _stop(self) -> None:
+        """Forget the state; a new start is looked for."""
+        self.counters["restart"] += 1
+        self._start = None
+        self._is_confirmed = False
+        self._window.clear()
+
+    def _is_time_to_start(self, pair: PairTdoa) -> bool:
+        """Gather differences; whether they are enough for a start."""
+        window = self._window
+        while window and not 0.0 <= pair.time_s - window[0].time_s <= MAX_DIFFERENCE_SILENCE_S:
+            window.popleft()
+        window.append(pair)
+        is_enough = len(window) == WINDOW or pair.time_s - window[0].time_s >= WINDOW_S
+        every_s = TRY_EVERY_S if self._start is None else WINDOW_S
+        return is_enough and not 0.0 <= pair.time_s - self._tried_s < every_s
+
+    def _try_start(self) -> bool:
+        """Look for a start, or for one that confirms or contradicts that which there is; True if the filter begins."""
+        window, dim = self._window, self._estimator.dim
+        self._tried_s = self._newest_s
+        start = find_start(window, self._positions_m, self._calibration, self._settings.height_m, self._z_bounds_m)
+        if isinstance(start, NoSolution):
+            self.reason = start.reason
+            return False
+        if self._start is not None:
+            position_m, covariance_m2 = (array[..., :dim] for array in self._estimator.motion())
+            gap_m = position_m - start.position_m[:dim]
+            both_m2 = covariance_m2[:dim] + start.covariance_m2[:dim, :dim]
+            if start.is_ambiguous or gap_m @ np.linalg.solve(both_m2, gap_m) < CONTRADICTED_CHI2:
+                has_moved = bool(np.linalg.norm(position_m - self._start.position_m[:dim]) > RIVAL_M)
+                self._is_confirmed = has_moved or not start.is_ambiguous
+                self._estimator.withhold_levels(not self._is_confirmed)
+                window.clear()
+                return False
+            self.counters["restart"] += 1
+        self._begin_s, newest = self._newest_s, window[-1]
+        self._estimator.start(0, start.position_m[:dim], start.covariance_m2[:dim, :dim], START_SPEED_STD_MPS**2)
+        self._estimator.withhold_levels(True)
+        self._start = start
+        for anchor, (late_m, variance_m2) in start.late.items():
+            may_stay = anchor not in self._calibration.anchors  # else it was not late then
+            self._estimator.expect_late(self._index(anchor), late_m, variance_m2, may_stay)
+        self._received_s = {anchor: self._newest_s for kept in window for anchor in (kept.anchor_a, kept.anchor_b)}
+        self.counters["start"] += 1
+        window.clear()
+        return self._process(newest)
+
+
+# Start
+
+
+NEIGHBOURHOOD: Final = (1.5, 1.5, 0.5)
+"""A tag farther from the anchors' centre than these parts of their figure's diagonal is lost."""
+
+MIN_DIAGONAL_M: Final = 5.0
+# Starts lie no higher above or below anchors of different heights than this, unless bounds are given.
+HEIGHT_MARGIN_M: Final = 1.0
+START_DIFFERENCE_STD_M: Final = 0.08  # of the median of a pair's differences
+START_ANCHOR_STD_M: Final = 0.14  # of the errors of each anchor, before any are estimated
+# Of an anchor that is late: on the floor or behind metal one is often, and at times two.
+START_LATE_STD_M: Final = 1.0
+
+LATE_PENALTY: Final = 2.0  # what each anchor that is late adds to chi² (odds of 1 to 3)
+MAX_LATE: Final = 2
+START_TAIL: Final = 1e-2  # where residuals are larger than noise makes them this rarely, more anchors are late
+JOINING_STEPS: Final = 4  # of least squares with the weights that the last one shows
+# A rival has at least this probability and distance; anchors lie elsewhere for a tag that has moved as far.
+RIVAL_WEIGHT: Final = 0.01
+RIVAL_M: Final = 0.5
+
+
+class Start(Struct, frozen=True):
+    """Where a filter begins."""
+
+    position_m: Array
+    """Shape (3,)."""
+    covariance_m2: Array
+    """Shape (3, 3), with the distances between all hypotheses in it."""
+    late: dict[int, list[float]]
+    """By how much each anchor is expected to be late, and the variance."""
+    is_ambiguous: bool
+    """Whether another position fits nearly as well, or some anchor is late."""
+    corners_m: Array
+    """Opposite ones of the neighbourhood of the anchors, shape (2, 3)."""
+
+    def holds(self, position_m: Array) -> bool:
+        """Whether a position, of two or three coordinates, lies in the neighbourhood of the anchors."""
+        low_m, high_m = self.corners_m[:, : len(position_m)]
+        return bool(np.all((low_m <= position_m) & (position_m <= high_m)))
+
+
+def find_start(
+    window: Sequence[PairTdoa],
+    positions_m: Mapping[int, Array],
+    calibration: DifferenceCalibration,
+    height_m: float | None,
+    z_bounds_m: tuple[float, float] | None,
+) -> Start | NoSolution:
+    """Mean and covariance of the position over all hypotheses of which anchors are late, by their probabilities.
+
+    No anchor is early. None is accused before a whole window, with two degrees of freedom to spare.
+    """
+    grouped: dict[tuple[int, int], list[float]] = {}
+    for pair in window:
+        if np.isfinite(pair.tdoa_m) and pair.anchor_a != pair.anchor_b:
+            without_bias_m = pair.tdoa_m - calibration.constant_m(pair)
+            grouped.setdefault((pair.anchor_a, pair.anchor_b), []).append(without_bias_m)
+    if not grouped:
+        return NoSolution(NoFixReason.TOO_FEW_ANCHORS, "no pair of anchors was heard")
+    anchors, tdoa_m, joined_m2 = joined_tdoas(list(grouped), [np.median(group) for group in grouped.values()])
+    dim, anchors_m = 3 if height_m is None else 2, np.array([positions_m[anchor] for anchor in anchors])
+    low, high, count = anchors_m.min(axis=0), anchors_m.max(axis=0), len(anchors_m)
+    if z_bounds_m is None and high[2] - low[2] > HEIGHT_MARGIN_M:
+        z_bounds_m = (low[2] - HEIGHT_MARGIN_M, high[2] + HEIGHT_MARGIN_M)
+    low_m, high_m = z_bounds_m if z_bounds_m and height_m is None else (-np.inf, np.inf)
+    shares = np.vstack([-np.ones(count - 1), np.eye(count - 1)])  # of each anchor's error in the TDoAs
+    usual_m2 = joined_m2 + START_ANCHOR_STD_M**2 * shares.T @ shares
+    most = min(MAX_LATE, max(count - dim - 3, 0)) if len(window) == WINDOW else 0
+    hypotheses: list[tuple[float, Array, Array, Array]] = []
+    reason = NoSolution(NoFixReason.RESIDUALS, "more anchors are late than the others can show")
+    for some in (list(some) for size in range(most + 1) for some in combinations(range(count), size)):
+        sigma_m2 = usual_m2 + START_LATE_STD_M**2 * shares[some].T @ shares[some]
+        found = locate(anchors_m, tdoa_m, sigma_m2, height_m=height_m, z_bounds_m=z_bounds_m, residual_tail=START_TAIL)
+        if isinstance(found, NoSolution):
+            reason = reason if some else found
+            continue
+        late_m = START_LATE_STD_M**2 * shares @ np.linalg.solve(sigma_m2, found.residuals_m)
+        if all(late_m[some] > 0.0) and low_m <= found.position_m[2] <= high_m:
+            score = found.chi2 + float(np.linalg.slogdet(sigma_m2)[1]) + LATE_PENALTY * len(some)
+            misfit = max(1.0, found.chi2 / max(found.dof, 1))
+            expected = np.array([late_m, np.full(count, START_LATE_STD_M**2)]) * np.isin(np.arange(count), some)
+            hypotheses.append((score, found.position_m, misfit * found.covariance_m2, expected))
+    if not hypotheses:
+        return reason
+    scores, positions, covariances, lates = (np.array(column) for column in zip(*hypotheses, strict=True))
+    weights = np.exp(0.5 * (scores.min() - scores))
+    weights /= weights.sum()
+    position_m = weights @ positions
+    off_m = positions - position_m
+    covariance_m2 = np.tensordot(weights, covariances + off_m[:, :, None] * off_m[:, None, :], 1)
+    best_m = positions[int(np.argmin(scores))]
+    has_rival = np.any((np.linalg.norm(positions - best_m, axis=1) > RIVAL_M) & (weights > RIVAL_WEIGHT))
+    late = dict(zip(anchors, np.tensordot(weights, lates, 1).T.tolist(), strict=True))
+    is_ambiguous = bool(has_rival) or sum(variance for _, variance in late.values()) > 0.5 * START_LATE_STD_M**2
+    diagonal_m = max(float(np.linalg.norm((high - low)[:2])), MIN_DIAGONAL_M)
+    corners_m = (low + high) / 2.0 + diagonal_m * np.outer((-1.0, 1.0), NEIGHBOURHOOD)
+    start = Start(position_m, covariance_m2, late, is_ambiguous, corners_m)
+    if not start.holds(position_m[:dim]):
+        return NoSolution(NoFixReason.NOT_CONVERGED, "the position lies far from all anchors")
+    return start
+
+
+def joined_tdoas(pairs: Sequence[tuple[int, int]], differences_m: ArrayLike) -> tuple[tuple[int, ...], Array, Array]:
+    """Best linear estimate of TDoAs against one anchor from measurements ``|p − b| − |p − a|`` of pairs (a, b).
+
+    Returns the anchors, the reference first, the TDoAs, and their covariance. Least squares are weighted again until
+    what does not fit the others counts by its absolute value. Of a graph in several parts the largest is used.
+    """
+    anchors, index = np.unique(pairs, return_inverse=True)
+    a, b = index.reshape(-1, 2).T
+    H = np.eye(len(anchors))[b] - np.eye(len(anchors))[a]
+    linked = np.linalg.matrix_power(H.T @ H != 0.0, len(anchors))
+    part = np.flatnonzero(linked[np.argmax(linked.sum(axis=1))])
+    used = H[:, part].any(axis=1)
+    H, measured_m, weights = H[np.ix_(used, part[1:])], np.array(differences_m)[used], np.ones((used.sum(), 1))
+    for _ in range(JOINING_STEPS):
+        covariance: Array = np.asarray(np.linalg.inv(H.T @ (weights * H)), np.float64)
+        tdoa_m = covariance @ H.T @ (weights[:, 0] * measured_m)
+        weights = (START_DIFFERENCE_STD_M / np.fmax(np.abs(measured_m - H @ tdoa_m), START_DIFFERENCE_STD_M))[:, None]
+    return tuple(anchors[part].tolist()), tdoa_m, START_DIFFERENCE_STD_M**2 * covariance

@@ -1,0 +1,326 @@
+"""``joint`` for systems without a master: their packets as they are, instead of time differences made of them.
+
+Stamps are unwrapped along the tag's clock, antenna delays are subtracted from relayed receptions (``RelayDelays``), and
+what cannot be used is counted. The filter decides which measurements are used.
+"""
+
+from collections import Counter
+from collections.abc import Mapping
+from math import dist, log, sqrt
+from typing import Final
+
+import numpy as np
+from msgspec.structs import replace
+
+from skyless.core.air.masterless_packets import Packet, Point, Relay
+from skyless.core.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ
+from skyless.core.estimator.state import EstimatorSettings
+from skyless.core.fix import Fix, NoFixReason
+from skyless.core.observation import Observation
+from skyless.core.tag.joint import Estimation
+from skyless.core.tag.observations import NOISE_TICKS, FixTime
+from skyless.core.ticks import LAST_TICKS, Unwrapper, nearest
+from skyless.research.masterless.difference_tracking import DIFFERENCES, MAX_HORIZONTAL_STD_M, NEIGHBOURHOOD
+from skyless.research.masterless.pair_engine import MAX_ANCHORS, remember
+from skyless.site.survey.anchor_errors import NO_BIAS, SLOPE_NEAREST_M, DifferenceCalibration, RelayDelays
+
+MASTERLESS_RANDOM_WALK_FM: Final = 5e-9
+"""Of the oscillators, 1/√s. Between 1e-9 and 7e-9 on the captures of TDoA3 anchors; too much of it costs little."""
+
+MASTERLESS: Final = replace(
+    DIFFERENCES,
+    gate=4.0,
+    white=EstimatorSettings().white,
+    walk=(MASTERLESS_RANDOM_WALK_FM * SPEED_OF_LIGHT_MPS) ** 2,
+    max_walk_scale=1.0,
+    drop_s=EstimatorSettings().drop_s,
+    rx_variance_m2=2e-3,
+    slope_std_m=0.05,
+)
+"""Ranges err as those of differences do, and in those captures a reception is 4 cm off by itself."""
+
+DL_TDOA: Final = replace(EstimatorSettings(), qa=DIFFERENCES.qa)
+"""For FiRa's radios, of which there are no recordings yet: what is assumed of a site with typical errors, ..."""
+
+DL_TDOA_ONE_WAY: Final = replace(
+    DL_TDOA,
+    pair_std_m=0.0,
+    survey_std_m=0.0,
+    range_std_m=sqrt(DL_TDOA.range_std_m**2 + 3.0 * DL_TDOA.survey_std_m**2),
+)
+"""... and where only one anchor of each pair relays the other: the constant error of their range cannot be separated
+from their clocks then, and with the survey's it counts as one of the tag's range."""
+
+PERIOD_S: Final = 0.15
+"""Anchors send 6 to 60 times a second; the filter assumes the slowest."""
+
+RELAY_MAX_AGE_S: Final = 0.5
+"""How long ago a relayed packet may have been received; a 7-bit sequence number recurs."""
+
+RESTART_IN_ROW: Final = 3
+"""This number of impossible stamps of one anchor in a row mean that its counter has restarted; ..."""
+
+BACK_IN_ROW: Final = 8
+"""... this number of packets in a row from before the newest, that the tag's has."""
+
+
+class _Anchor:
+    """What the tag knows of one anchor: its position, its newest stamps, and when its latest packets were received."""
+
+    __slots__ = ("anchor_m", "heard", "impossible", "position_m", "rx_ticks", "tx_ticks")
+
+    def __init__(self, position_m: Point, tx_ticks: int, rx_ticks: int) -> None:
+        self.position_m = position_m
+        self.anchor_m = np.array(position_m)
+        self.tx_ticks, self.rx_ticks = tx_ticks, rx_ticks
+        self.impossible = 0
+        self.heard: dict[int, tuple[int, int]] = {}
+        """Sequence number → unwrapped (tx_ticks of the anchor, rx_ticks of the tag)."""
+
+    def update(self, tx_counter: int, rx_ticks: int, bits: int) -> bool:
+        """Process the stamps of another packet; False if no crystal went from the newest to these."""
+        elapsed = rx_ticks - self.rx_ticks
+        tx_ticks = nearest(tx_counter, self.tx_ticks + elapsed, bits)
+        if abs(tx_ticks - self.tx_ticks - elapsed) > MAX_DRIFT * elapsed + NOISE_TICKS:
+            self.impossible += 1
+            return False
+        self.tx_ticks, self.rx_ticks, self.impossible = tx_ticks, rx_ticks, 0
+        return True
+
+
+class PacketTracking:
+    """One tag that receives the packets of anchors without a master. No I/O; whatever is unusable is counted."""
+
+    def __init__(
+        self,
+        settings: EstimatorSettings,
+        anchors_m: Mapping[int, Point],
+        tx_bits: int = 32,
+        z_bounds_m: tuple[float, float] | None = None,
+        calibration: DifferenceCalibration | None = None,
+        one_way: EstimatorSettings | None = None,
+    ) -> None:
+        """``anchors_m``: the anchors' positions; where it has none, those that packets carry are used.
+
+        ``tx_bits``: width of the anchors' stamps. ``calibration`` is subtracted from the tag's receptions; without one
+        the anchors' antenna delays are estimated from how they range each other. ``one_way``: settings that hold until
+        two anchors have relayed each other.
+        """
+        self.reason = NoFixReason.NO_BEACONS
+        self.time_s = 0.0
+        """Of the newest fix, by the tag's clock since its first packet."""
+        self.position_m: Point | None = None
+        """Of the newest fix."""
+        self._tx_bits = tx_bits
+        self._half_wrap = 1 << (tx_bits - 1)
+        self._positions_m = dict(anchors_m)
+        self._surveyed = frozenset(anchors_m)
+        self._anchors: dict[int, _Anchor] = {}
+        self._delays = RelayDelays(self._positions_m, estimate=calibration is None)
+        self._calibration = calibration
+        self._tag_clock = Unwrapper(TICK_BITS)
+        self._newest_rx_ticks: int | None = None
+        self._back_in_row = 0
+        self._time = FixTime()
+        self._settings, self._z_bounds_m = settings if one_way is None else one_way, z_bounds_m
+        self._both_ways = settings
+        self._pairs: set[tuple[int, int]] | None = None if one_way is None else set()
+        """Listeners and senders of relays, until two have relayed each other."""
+        self._tracking = self._new_tracking()
+        self._area_m = (0.0, 0.0, 0.0)
+        self._drops: Counter[str] = Counter()
+        self._rejected_before = self._rejected_now = 0
+
+    @property
+    def tracking(self) -> Estimation:
+        """The filter behind."""
+        return self._tracking
+
+    @property
+    def anchors_m(self) -> Mapping[int, Point]:
+        """Positions that are known, surveyed or stated by packets."""
+        return self._positions_m
+
+    @property
+    def drops(self) -> Counter[str]:
+        """What was not used, by reason."""
+        self._count_relays()
+        return self._drops + Counter({"relay-outlier": self._rejected_before + self._rejected_now})
+
+    @property
+    def contradictions_m(self) -> Mapping[tuple[int, int], float]:
+        """Pairs of anchors whose own ranging contradicts the positions; fixes then have no protection level."""
+        return self._delays.contradictions_m
+
+    def on_packet(self, packet: Packet) -> Fix | None:
+        """Process one packet; a fix, or None, and ``reason`` states why.
+
+        A fix's ``time_s`` counts from the first packet, by the tag's clock.
+        """
+        anchor = self._unwrap(packet)
+        if anchor is None:
+            return None
+        relays = []
+        for relay in packet.relays:
+            rx_ticks = self._relayed(packet.anchor, anchor, relay)
+            if isinstance(rx_ticks, str):
+                self._drops[rx_ticks] += 1
+            else:
+                relays.append((relay.anchor, relay.sequence, rx_ticks))
+                if self._pairs is not None:
+                    self._look_both_ways(packet.anchor, relay.anchor)
+        rx_ticks = anchor.rx_ticks if self._calibration is None else self._calibrated(packet.anchor, anchor)
+        observation = Observation(
+            packet.anchor,
+            anchor.anchor_m,
+            0,
+            packet.sequence,
+            rx_ticks,
+            anchor.tx_ticks,
+            None,
+            None,
+            None,
+            0.0,
+            0.0,
+            tuple(relays),
+        )
+        if self._delays.contradictions_m:
+            self._tracking.estimator.withhold_levels()
+        fix = self._tracking.update(observation)
+        if not isinstance(fix, Fix):
+            self._count_relays()
+            if fix is NoFixReason.RESIDUALS:
+                self._drops["outlier"] += 1
+                if packet.anchor in self._tracking.excluded:
+                    fix = self._tracking.coast(observation)
+        return self._checked(fix)
+
+    def _look_both_ways(self, listener: int, sender: int) -> None:
+        """Begin again with the settings for pairs that relay each other, once there is one."""
+        assert self._pairs is not None
+        if (sender, listener) in self._pairs:
+            self._settings, self._pairs = self._both_ways, None
+            self._count_relays()
+            self._tracking = self._new_tracking()
+        else:
+            self._pairs.add((listener, sender))
+
+    def _new_tracking(self) -> Estimation:
+        return Estimation(self._settings, self._z_bounds_m, self._time, PERIOD_S)
+
+    def _checked(self, fix: Fix | NoFixReason) -> Fix | None:
+        """A fix near the anchors, beyond which time differences have no information, that is known well enough."""
+        if isinstance(fix, Fix):
+            x_m, y_m, z_m = fix.position_m.tolist()
+            self.position_m, self.time_s = (x_m, y_m, z_m), fix.time_s
+            middle_x_m, middle_y_m, reach_m = self._area_m
+            covariance = fix.covariance_m2
+            if abs(x_m - middle_x_m) > reach_m or abs(y_m - middle_y_m) > reach_m:
+                fix = NoFixReason.NOT_CONVERGED
+                self._tracking = self._new_tracking()
+            elif covariance.item(0) + covariance.item(4) > MAX_HORIZONTAL_STD_M**2:
+                fix = NoFixReason.ACQUIRING
+            else:
+                return fix
+        self.reason = fix
+        return None
+
+    def _unwrap(self, packet: Packet) -> _Anchor | None:
+        """Unwrap both stamps of a packet; None if it cannot be used."""
+        rx_ticks = self._tag_clock.unwrap(packet.rx_ticks, packet.host_s)
+        if abs(rx_ticks) > LAST_TICKS:
+            self._drops["impossible-host-time"] += 1
+            self._forget_clocks()
+            return None
+        if self._newest_rx_ticks is None:
+            self._time.time_s(rx_ticks, rx_ticks)
+        elif rx_ticks <= self._newest_rx_ticks and not self._has_new_counter(packet, rx_ticks):
+            return None
+        self._back_in_row = 0
+        position_m = self._position_of(packet)
+        anchor = self._anchors.get(packet.anchor)
+        if position_m is None or (anchor is None and len(self._anchors) >= MAX_ANCHORS):
+            self._drops["unknown-anchor" if position_m is None else "too-many-anchors"] += 1
+            self.reason = NoFixReason.NO_ALMANAC
+            return None
+        if anchor is not None and not anchor.update(packet.tx_ticks, rx_ticks, self._tx_bits):
+            self._drops["impossible-stamp"] += 1
+            if anchor.impossible < RESTART_IN_ROW:
+                return None
+            self._drops["clock-restarted"] += 1
+            self._delays.forget(packet.anchor)
+            anchor = None
+        if anchor is None:
+            anchor = self._anchors[packet.anchor] = _Anchor(position_m, packet.tx_ticks, rx_ticks)
+            self._update_area()
+        elif anchor.position_m != position_m:
+            anchor.position_m, anchor.anchor_m = position_m, np.array(position_m)
+            self._update_area()
+        self._newest_rx_ticks = rx_ticks
+        remember(anchor.heard, packet.sequence, anchor.tx_ticks, rx_ticks)
+        return anchor
+
+    def _has_new_counter(self, packet: Packet, rx_ticks: int) -> bool:
+        """Whether a packet from before the newest one is not late, but the tag's counter has restarted."""
+        anchor = self._anchors.get(packet.anchor)
+        known = None if anchor is None else anchor.heard.get(packet.sequence)
+        if known is not None and known[1] == rx_ticks:
+            self._drops["duplicate"] += 1
+            return False
+        self._drops["out-of-order"] += 1
+        self._back_in_row += 1
+        if self._back_in_row < BACK_IN_ROW:
+            return False
+        self._anchors.clear()
+        return True
+
+    def _forget_clocks(self) -> None:
+        self._tag_clock = Unwrapper(TICK_BITS)
+        self._newest_rx_ticks = None
+        self._anchors.clear()
+
+    def _position_of(self, packet: Packet) -> Point | None:
+        """The sender's position: as surveyed, else as stated, now or last."""
+        known = self._positions_m.get(packet.anchor)
+        stated_m = None if packet.anchor in self._surveyed else packet.position_m
+        if stated_m is None or (known is None and len(self._positions_m) >= MAX_ANCHORS):
+            return known
+        self._positions_m[packet.anchor] = stated_m
+        return stated_m
+
+    def _update_area(self) -> None:
+        positions = np.array([anchor.position_m[:2] for anchor in self._anchors.values()])
+        low, high = positions.min(axis=0), positions.max(axis=0)
+        x_m, y_m = ((low + high) / 2.0).tolist()
+        self._area_m = (x_m, y_m, NEIGHBOURHOOD[0] * max(float(np.linalg.norm(high - low)), 5.0))
+
+    def _relayed(self, listener: int, anchor: _Anchor, relay: Relay) -> int | str:
+        """The anchor's reception of another's packet, unwrapped and without antenna delays, or why it cannot be had."""
+        sender = self._anchors.get(relay.anchor)
+        heard = None if sender is None else sender.heard.get(relay.sequence)
+        if heard is None or sender is anchor:
+            return "relay-of-unheard-packet"
+        tx_ticks, rx_ticks_tag = heard
+        age = anchor.rx_ticks - rx_ticks_tag
+        if age > RELAY_MAX_AGE_S * TICK_RATE_HZ:
+            return "relay-too-old"
+        expected, half = anchor.tx_ticks - age, self._half_wrap
+        rx_ticks = expected + ((relay.rx_ticks - expected + half) & (2 * half - 1)) - half  # ``nearest`` in place
+        delay = self._delays.ticks(listener, relay.anchor, tx_ticks, rx_ticks, relay.tof_ticks)
+        return "time-of-flight-unknown" if delay is None else rx_ticks - delay
+
+    def _calibrated(self, name: int, anchor: _Anchor) -> int:
+        """The tag's stamp of an anchor's newest packet without the bias that a calibration found."""
+        assert self._calibration is not None
+        known = self._calibration.anchors.get(name, NO_BIAS)
+        bias_m = known.bias_m
+        if known.slope_m and self.position_m is not None:
+            bias_m += known.slope_m * log(max(dist(self.position_m, anchor.position_m), SLOPE_NEAREST_M))
+        return anchor.rx_ticks - round(bias_m / TICK_M)
+
+    def _count_relays(self) -> None:
+        """Add up what filters rejected: each start, before which there are packets without a fix, counts from zero."""
+        rejected = int(self._tracking.estimator.state.status[0]["relays_rejected"])
+        if rejected < self._rejected_now:
+            self._rejected_before += self._rejected_now
+        self._rejected_now = rejected

@@ -1,0 +1,171 @@
+"""Time differences without a master: any anchor that relays when it received another is a reference for it.
+
+Anchor b relays that it received anchor a's packet at ``r`` of its own clock. That packet left a one time of flight
+earlier, so had b sent at ``r - tof``, both packets would have left at once, and the interval in which the tag receives
+them is the time difference of arrival. The tag knows b's clock from b's packets (:mod:`skyless.core.tag.broadcast`), and
+with it when a packet that b sent at ``r - tof`` would have been received:
+
+    TDoA = c·[(rx_b + phase_b − rx_a) − (1 + rate_b)·(tof + tx_b − r)]
+
+This is the textbook formula, in which ``phase_b`` is zero, with the noise of ``rx_b`` filtered. As the rate holds
+the tag's own motion, the TDoA is that of the moment at which the tag received a.
+"""
+
+from collections import Counter
+from math import dist
+from typing import Final
+
+from skyless.core.air.masterless_packets import Packet, PairTdoa, Point, Relay
+from skyless.core.constants import TICK_BITS, TICK_M, TICK_RATE_HZ, TICK_S
+from skyless.core.tag.broadcast import BroadcastClock
+from skyless.core.ticks import Unwrapper
+from skyless.site.survey.anchor_errors import AnchorFlights, distance_ticks
+
+PAIR_RELAY_MAX_AGE_S: Final = 0.25
+"""Greatest age of a relayed packet. Older ones cost accuracy, and a 7-bit sequence number recurs."""
+
+MAX_ANCHORS: Final = 256
+"""Further identifiers are ignored, so that memory stays bounded whatever is on the air."""
+
+PAIR_PACKETS_KEPT: Final = 64
+"""Packets of one anchor that are kept for relays to come."""
+
+MARGIN_M: Final = 1.0
+"""By how much a TDoA may exceed the distance of its anchors."""
+
+LONGEST_M: Final = 1500.0
+"""Limit of a TDoA where the anchors' positions are unknown."""
+
+MAX_CLOCK_ERROR_M: Final = 0.15
+"""A clock is used once the error of its rate, over the time to be bridged, is smaller than this."""
+
+Pair = tuple[int, int]
+
+
+class _Anchor:
+    """What the tag knows of one anchor: its clock, and its latest packets by sequence number."""
+
+    __slots__ = ("clock", "packets")
+
+    def __init__(self, clock: BroadcastClock) -> None:
+        self.clock = clock
+        self.packets: dict[int, tuple[int, int]] = {}
+        """Sequence number → unwrapped (tx_ticks of the anchor, rx_ticks of the tag)."""
+
+
+def remember(packets: dict[int, tuple[int, int]], sequence: int, tx_ticks: int, rx_ticks: int) -> None:
+    """Keep an anchor's packet, by its sequence number, for relays to come."""
+    packets.pop(sequence, None)
+    if len(packets) >= PAIR_PACKETS_KEPT:
+        del packets[next(iter(packets))]
+    packets[sequence] = (tx_ticks, rx_ticks)
+
+
+class PairEngine:
+    """From the packets that one tag hears to TDoAs of pairs of anchors. No I/O; whatever is unusable is counted.
+
+    ``tx_bits`` is the width of the anchors' TX and relay stamps; the tag's have 40 bits. ``anchors_m``
+    (identifier → x, y, z) arms the physical gate; positions that packets carry serve where it has none.
+    """
+
+    def __init__(self, tx_bits: int = 32, anchors_m: dict[int, Point] | None = None) -> None:
+        self.drops: Counter[str] = Counter()
+        self._tx_bits = tx_bits
+        self._tag_clock = Unwrapper(TICK_BITS)
+        self._first_ticks: int | None = None
+        self._anchors: dict[int, _Anchor] = {}
+        self._carried_m: dict[int, Point] = {}
+        self._anchors_m = dict(anchors_m or {})
+        self._limits_m: dict[Pair, float] = {}
+        self._flights = AnchorFlights()
+
+    def on_packet(self, packet: Packet) -> list[PairTdoa]:
+        """Take one packet; return the TDoAs that it completes, in the order of its relays.
+
+        Their ``time_s`` is when the tag heard this packet; each holds for the moment of the relayed packet, at
+        most ``PAIR_RELAY_MAX_AGE_S`` before.
+        """
+        sender = self._anchors.get(packet.anchor)
+        if sender is None and len(self._anchors) >= MAX_ANCHORS:
+            self.drops["too-many-anchors"] += 1
+            return []
+        rx_ticks = self._tag_clock.unwrap(packet.rx_ticks, packet.host_s)
+        if self._first_ticks is None:
+            self._first_ticks = rx_ticks
+        if packet.position_m is not None:
+            self._keep_position(packet.anchor, packet.position_m)
+        if sender is None:
+            clock = BroadcastClock(self._tx_bits, packet.tx_ticks, rx_ticks)
+            sender = self._anchors[packet.anchor] = _Anchor(clock)
+        elif not self._update_clock(sender, packet, rx_ticks):
+            return []
+        remember(sender.packets, packet.sequence, sender.clock.tx_ticks, rx_ticks)
+        tdoas = []
+        time_s = (rx_ticks - self._first_ticks) * TICK_S
+        for relay in packet.relays:
+            tdoa_m = self._tdoa_m(packet.anchor, sender.clock, relay, rx_ticks)
+            if isinstance(tdoa_m, str):
+                self.drops[tdoa_m] += 1
+            else:
+                tdoas.append(PairTdoa(time_s, relay.anchor, packet.anchor, tdoa_m))
+        return tdoas
+
+    def _update_clock(self, sender: _Anchor, packet: Packet, rx_ticks: int) -> bool:
+        """Advance the sender's clock; False for a packet that cannot be used."""
+        known = sender.packets.get(packet.sequence)
+        if known is not None and known[1] == rx_ticks:
+            self.drops["duplicate"] += 1
+            return False
+        clock = sender.clock
+        restarts = clock.restarts
+        if clock.update(packet.tx_ticks, rx_ticks):
+            return True
+        self.drops["stamp-off-its-clock"] += 1
+        if clock.restarts != restarts:
+            self.drops["clock-restarted"] += 1
+            sender.packets.clear()
+            self._flights.forget(packet.anchor)
+            remember(sender.packets, packet.sequence, clock.tx_ticks, rx_ticks)
+        return False
+
+    def _tdoa_m(self, b: int, clock: BroadcastClock, relay: Relay, rx_b: int) -> float | str:
+        """One TDoA in metres, or the reason why it cannot be had."""
+        a = relay.anchor
+        anchor = self._anchors.get(a)
+        heard = None if anchor is None else anchor.packets.get(relay.sequence)
+        if heard is None or a == b:
+            return "relay-of-unheard-packet"
+        tx_a, rx_a = heard
+        between = rx_b - rx_a
+        if not 0 < between < PAIR_RELAY_MAX_AGE_S * TICK_RATE_HZ:
+            return "relay-too-old"
+        relayed = clock.unwrap(relay.rx_ticks, rx_a)
+        flight = self._flight_ticks(a, b, tx_a, relayed, relay.tof_ticks)
+        if flight is None:
+            return "time-of-flight-unknown"
+        reply = clock.tx_ticks - relayed
+        if clock.uncertainty_ticks(reply) * TICK_M > MAX_CLOCK_ERROR_M:
+            return "clock-unsettled"
+        tdoa_m = ((between - reply) + clock.phase - flight - clock.rate * (reply + flight)) * TICK_M
+        if abs(tdoa_m) > self._limit_m(a, b):
+            return "beyond-anchors"
+        return tdoa_m
+
+    def _flight_ticks(self, a: int, b: int, tx_a: int, rx_b: int, carried: float | None) -> float | None:
+        """Time of flight of a pair: as anchors state it, else what two-way ranging gave, else the known distance."""
+        flight = self._flights.update(a, b, tx_a, rx_b, carried)
+        return distance_ticks(self._anchors_m, a, b) if flight is None else flight
+
+    def _limit_m(self, a: int, b: int) -> float:
+        limit = self._limits_m.get((a, b))
+        if limit is None:
+            known = self._carried_m | self._anchors_m
+            limit = dist(known[a], known[b]) + MARGIN_M if a in known and b in known else LONGEST_M
+            self._limits_m[a, b] = limit
+        return limit
+
+    def _keep_position(self, anchor: int, position_m: Point) -> None:
+        """Keep the position that a packet carries; the limits of the anchor's pairs are computed again."""
+        if self._carried_m.get(anchor) != position_m:
+            self._carried_m[anchor] = position_m
+            self._limits_m = {pair: limit for pair, limit in self._limits_m.items() if anchor not in pair}

@@ -1,0 +1,236 @@
+"""Figure 10: what none of the paper's figures shows: one tag to ten thousand (sec:Intro, sec:conclusion)."""
+
+import hashlib
+import time
+from typing import Final
+
+import numpy as np
+from matplotlib.ticker import FuncFormatter
+from msgspec import Struct
+from numpy.typing import ArrayLike
+
+from skyless.core.kernels.arrays import Array, Integers
+from skyless.core.protocol1.receiver import Receiver
+from skyless.research.paper.plan import P1, RADIO_PS, Panel, Plan, Progress, Results, Section, Task, Verdict, grouped
+from skyless.sim.evaluation.fleet import world_of
+from skyless.sim.impairments import lab_impairments
+from skyless.sim.lab import paper_lab_site
+from skyless.sim.trajectory import Static
+from skyless.site.report.figures import BLUE, GREEN, INK, MUTED, ORANGE, panel
+
+_JUDGED_FROM_S: Final = 0.6
+_JUDGED_UNTIL_S: Final = 1.2
+"""The stretch of true time in which all fleets are judged: the anchors' noise in it is the same for all of them."""
+
+_RANGINGS_OF_TWR: Final = 6
+_MESSAGES_PER_RANGING: Final = 4
+"""Double-sided two-way ranging with each of six anchors, as the paper counts its messages."""
+
+
+_FRAMES_PER_MS: Final = 100.0
+"""Frames per second on the right axis for each millisecond on the left."""
+
+
+class FleetResult(Struct, frozen=True):
+    """A fleet of tags in the stretch of time that is judged."""
+
+    tags: int
+    seed: int
+    rmse_m: float
+    """Over all tags and fixes."""
+    rmse_standard_error_m: float | None
+    """From tag to tag."""
+    tag_rmse_m: tuple[float, float]
+    """5 % and 95 % of the single tags' RMSE."""
+    fixes_per_s: float
+    """Mean per tag."""
+    fewest_fixes_per_s: float
+    frames_per_s: float
+    """On the air, from all nodes together."""
+    first_tag: str
+    """Digest of all positions of the first tag."""
+    cpu_s_per_tag_s: float
+    """CPU time of one tag per second of true time, measured on this machine."""
+
+
+def tasks(plan: Plan) -> list[Task]:
+    """One world for each size."""
+    return [
+        Task(f"scale/{tags}", run_world, {"tags": tags, "seed": plan.seed}, 2.0 + tags * 8e-3)
+        for tags in plan.fleet_sizes
+    ]
+
+
+def run_world(progress: Progress, tags: int, seed: int) -> FleetResult:
+    """Tags at P1 with radios and clocks of their own; other positions would only mix geometry into the comparison."""
+    site = paper_lab_site(RADIO_PS)
+    world = world_of(site, [Static(*P1)] * tags, lab_impairments(RADIO_PS), seed)
+    receivers = [Receiver("joint") for _ in range(tags)]
+    squares_m2, fixes = np.zeros(tags), np.zeros(tags, dtype=np.int64)
+    digest, frames, cpu_s = hashlib.sha256(), 0, 0.0
+    for broadcast in world.run(_JUDGED_UNTIL_S):
+        judged = broadcast.end_s >= _JUDGED_FROM_S
+        frames += judged
+        begun_s = time.process_time()
+        for tag, reception, truth_m in broadcast.receptions():
+            fix = receivers[tag].hear(reception)
+            if fix is None:
+                continue
+            if tag == 0:
+                digest.update(fix.position_m.tobytes())
+            if judged:
+                error = fix.position_m - truth_m
+                squares_m2[tag] += float(error @ error)
+                fixes[tag] += 1
+        if judged:
+            cpu_s += time.process_time() - begun_s
+        progress(broadcast.end_s / _JUDGED_UNTIL_S)
+    return summarise(seed, squares_m2, fixes, frames, digest.hexdigest()[:16], cpu_s)
+
+
+def summarise(seed: int, squares_m2: Array, fixes: Integers, frames: int, digest: str, cpu_s: float) -> FleetResult:
+    """Sum a fleet up: squared errors and fixes of each tag, shape (tags,)."""
+    tags, span_s = len(fixes), _JUDGED_UNTIL_S - _JUDGED_FROM_S
+    own = np.sqrt(squares_m2 / np.maximum(fixes, 1))
+    rmse = float(np.sqrt(squares_m2.sum() / max(int(fixes.sum()), 1)))
+    mean_square_error = float((own**2).std(ddof=1)) / tags**0.5 if tags > 1 else None
+    low, high = np.percentile(own, (5, 95)).tolist()
+    return FleetResult(
+        tags=tags,
+        seed=seed,
+        rmse_m=rmse,
+        rmse_standard_error_m=None if mean_square_error is None else mean_square_error / (2.0 * rmse),
+        tag_rmse_m=(low, high),
+        fixes_per_s=float(fixes.mean()) / span_s,
+        fewest_fixes_per_s=float(fixes.min()) / span_s,
+        frames_per_s=frames / span_s,
+        first_tag=digest,
+        cpu_s_per_tag_s=cpu_s / tags / span_s,
+    )
+
+
+def judge(fleets: list[FleetResult]) -> tuple[Verdict, str]:
+    """Whether the first tag's fixes, the rate per tag and the load of the air are the same for all sizes."""
+    first, most = fleets[0], fleets[-1]
+    same_fixes = len({fleet.first_tag for fleet in fleets}) == 1
+    same_rate = all(fleet.fewest_fixes_per_s > 0.99 * first.fixes_per_s for fleet in fleets)
+    same_air = len({fleet.frames_per_s for fleet in fleets}) == 1
+    if same_fixes and same_rate and same_air:
+        return Verdict.HOLDS, (
+            f"With {grouped(most.tags)} tags the first one computes bit for bit what it computes alone, every tag "
+            f"has its {first.fixes_per_s:.0f} fixes a second, and the air carries the same {first.frames_per_s:.0f} "
+            "frames a second. That the simulated radios of listeners do not touch each other is built in, as it is "
+            "in the physics: they never send."
+        )
+    if same_air and same_fixes:
+        return Verdict.CORRECTED, "The accuracy stays, but some tags have fewer fixes."
+    return Verdict.FAILS, "More tags change what a tag computes, or what the air carries."
+
+
+def section(plan: Plan, results: Results) -> Section:
+    """The figure with its verdict."""
+    fleets: list[FleetResult] = [results[f"scale/{tags}"] for tags in plan.fleet_sizes]
+    verdict, reason = judge(fleets)
+    rows = [
+        (
+            "tags",
+            "RMSE in cm",
+            "single tags, 5–95 %",
+            "fixes per s and tag",
+            "frames per s on air",
+            "CPU per tag, measured here",
+        )
+    ]
+    for fleet in fleets:
+        error = "" if fleet.rmse_standard_error_m is None else f" ± {100 * fleet.rmse_standard_error_m:.2f}"
+        low, high = fleet.tag_rmse_m
+        rows.append(
+            (
+                grouped(fleet.tags),
+                f"{100 * fleet.rmse_m:.2f}{error}",
+                f"{100 * low:.2f}–{100 * high:.2f}" if fleet.tags > 1 else "",
+                f"{fleet.fixes_per_s:.1f}",
+                f"{fleet.frames_per_s:.0f}",
+                f"{1e3 * fleet.cpu_s_per_tag_s:.1f} ms per s",
+            )
+        )
+    return Section(
+        key="scaling",
+        title="From one tag to ten thousand" if plan.fleet_sizes[-1] >= 10_000 else "More and more tags",
+        label="abstract, sec:conclusion",
+        claim="Any number of tags can be tracked without a lower update rate; the paper shows it with three.",
+        simulated=(
+            f"Fleets of {', '.join(grouped(tags) for tags in plan.fleet_sizes)} tags, all at P1 with radios and "
+            f"clocks of their own, {RADIO_PS:g} ps, joint, from a cold start; judged from {_JUDGED_FROM_S:g} to "
+            f"{_JUDGED_UNTIL_S:g} s, so that the anchors' noise is the same for all sizes (a single short stretch: the "
+            "RMSE belongs to it, figure 4 has the long run). Every tag is the real receiver, every message is decoded "
+            "by every tag. The lines for uplink are arithmetic, not simulated."
+        ),
+        verdict=verdict,
+        reason=reason,
+        panels=(_accuracy(fleets), _rates(fleets), _cpu(fleets)),
+        table=tuple(rows),
+        numbers={"fleets": fleets},
+        command=f"skyless simulate --tags 1000 --duration 3 --seed {plan.seed}",
+    )
+
+
+def _logarithmic(title: str, fleets: list[FleetResult], height_in: float = 3.2) -> Panel:
+    figure, axes = panel(title, height_in)
+    axes.set_xscale("log")
+    axes.set_xticks([fleet.tags for fleet in fleets])
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda tags, _: grouped(round(tags))))
+    axes.minorticks_off()
+    axes.set_xlabel("tags")
+    return Panel("", "", figure)
+
+
+def _accuracy(fleets: list[FleetResult]) -> Panel:
+    figure = _logarithmic("Accuracy of a tag", fleets).figure
+    (axes,) = figure.axes
+    tags = [fleet.tags for fleet in fleets]
+    low, high = (100 * np.array([fleet.tag_rmse_m[k] for fleet in fleets]) for k in (0, 1))
+    axes.fill_between(tags, low, high, color=BLUE, alpha=0.2, linewidth=0, label="single tags, 5 to 95 %")
+    axes.plot(tags, [100 * fleet.rmse_m for fleet in fleets], "o-", color=BLUE, label="all tags together")
+    axes.set(ylabel="RMSE in cm", ylim=(0, 1.5 * float(high.max())))
+    axes.legend(loc="upper left")
+    return Panel("10-accuracy", "RMSE of joint by the number of tags, over the same 0.6 s.", figure)
+
+
+def _rates(fleets: list[FleetResult]) -> Panel:
+    figure = _logarithmic("Updates of each tag", fleets).figure
+    (axes,) = figure.axes
+    tags = np.array([fleet.tags for fleet in fleets], dtype=float)
+    slots_hz = 1.0 / (paper_lab_site().schedule.slot_s)
+    axes.set_yscale("log")
+    axes.plot(tags, [fleet.fixes_per_s for fleet in fleets], "o-", color=BLUE, label="downlink: simulated")
+    axes.plot(tags, slots_hz / tags, "--", color=ORANGE, label="uplink, one slot per blink")
+    ranging = slots_hz / (_RANGINGS_OF_TWR * _MESSAGES_PER_RANGING)
+    axes.plot(tags, ranging / tags, ":", color=MUTED, label="two-way ranging, 24 messages")
+    axes.set(ylabel="updates per second and tag", ylim=(None, 3 * slots_hz))
+    axes.legend(loc="lower left")
+    caption = f"Updates per tag. Downlink simulated; the other lines share the same {slots_hz:.0f} slots a second."
+    return Panel("10-rate", caption, figure)
+
+
+def _cpu(fleets: list[FleetResult]) -> Panel:
+    figure = _logarithmic("What a tag computes, what the air carries", fleets).figure
+    (axes,) = figure.axes
+    tags = [fleet.tags for fleet in fleets]
+    cpu_ms = [1e3 * fleet.cpu_s_per_tag_s for fleet in fleets]
+    frames = [fleet.frames_per_s / _FRAMES_PER_MS for fleet in fleets]
+    axes.plot(tags, cpu_ms, "s-", color=GREEN, label="CPU time of a tag (left), measured here")
+    axes.plot(tags, frames, "o--", color=INK, label="frames on the air (right)")
+    axes.set(ylabel="CPU time in ms per s", ylim=(0, 1.7 * max(*cpu_ms, *frames)))
+    right = axes.secondary_yaxis("right", functions=(_frames_of_ms, _ms_of_frames))
+    right.set_ylabel("frames per second")
+    axes.legend(loc="upper left")
+    return Panel("10-load", "CPU time of one tag per second (measured on this machine) and frames on the air.", figure)
+
+
+def _frames_of_ms(cpu_ms: ArrayLike) -> Array:
+    return _FRAMES_PER_MS * np.asarray(cpu_ms, np.float64)
+
+
+def _ms_of_frames(frames: ArrayLike) -> Array:
+    return np.asarray(frames, np.float64) / _FRAMES_PER_MS

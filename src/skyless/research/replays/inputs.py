@@ -1,0 +1,105 @@
+"""What a replay or a survey is given with a recording: anchors, truth and heights, as values."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from skyless.core.air.masterless_packets import Point
+from skyless.core.arguments import check_point, existing_file, wrong
+from skyless.core.dop import GUESSED_STD_M, plane_height_m
+from skyless.core.errors import SkylessError
+from skyless.core.site import Site
+from skyless.research.foreign.formats import format_of
+from skyless.research.replays.options import RecordingOptions
+from skyless.sim.evaluation.judge import FLIGHT_M, antenna_truth, flies
+from skyless.site.file.load import site_of
+from skyless.site.tables import Truth, read_anchors, read_truth
+
+Anchors = Mapping[int, tuple[float, float, float]] | str | Path
+"""Positions by identifier in metres, or the path of a table."""
+
+AnyTruth = ArrayLike | str | Path
+"""Rows of time and position, shape (n, 4), or the path of a table."""
+
+TOO_FLAT = "the anchors' mean: they lie too flat to determine the height"
+"""Where a height is from that nobody gave."""
+
+
+def known_anchors(anchors: Anchors | None, site: Site | str | Path | None) -> tuple[dict[int, Point], float | None]:
+    """Positions of the anchors, and the tags' height where a site states it. Raises SkylessError."""
+    if anchors is not None and site is not None:
+        raise SkylessError("give either --anchors or --site, not both")
+    if site is not None:
+        known = site_of(site)[0]
+        return {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in known.anchors}, known.tags.height_m
+    if anchors is None:
+        return {}, None
+    if not isinstance(anchors, Mapping):
+        return read_anchors(existing_file("--anchors", anchors)), None
+    anchors_m: dict[int, Point] = {}
+    for identifier, position_m in anchors.items():
+        if not isinstance(identifier, int) or identifier < 0:
+            raise wrong("--anchors", identifier, "positions by identifiers, which are whole numbers")
+        x_m, y_m, z_m = check_point(f"--anchors[{identifier}]", position_m, (3,))
+        anchors_m[identifier] = (x_m, y_m, z_m)
+    return anchors_m, None
+
+
+def known_truth(path: Path, asked: RecordingOptions) -> Truth | None:
+    """Where the antenna was, by an array, a table, or the recording itself. Raises SkylessError."""
+    truth, arm_m = asked.truth, asked.lever_arm_m
+    if truth is None and format_of(path, asked.format).name == "miluv":
+        truth = path
+    if truth is None:
+        if arm_m is not None:
+            raise SkylessError("--lever-arm moves the truth, which --truth must give")
+        return None
+    if isinstance(truth, str | Path):
+        known = read_truth(existing_file("--truth", truth), asked.listener)
+    else:
+        known = _truth_of(truth)
+    return known if arm_m is None else antenna_truth(known, arm_m)
+
+
+def _truth_of(given: ArrayLike) -> Truth:
+    right = "an array of shape (n, 4), n at least 1: time in s, which does not decrease, x, y, z in metres, all finite"
+    try:
+        rows = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise wrong("--truth", given, right) from None
+    is_table = rows.ndim == 2 and rows.shape[1] == 4 and len(rows) > 0
+    if not (is_table and np.isfinite(rows).all() and (np.diff(rows[:, 0]) >= 0.0).all()):
+        raise SkylessError(f"--truth is an array of shape {rows.shape}; it should be {right}")
+    return Truth(rows[:, 0], rows[:, 1:], None)
+
+
+def height_to_hold(
+    wish: float | str, anchors_m: dict[int, Point], site_m: float | None, truth: Truth | None, format_name: str
+) -> tuple[float | None, float, str]:
+    """Height to hold (None where it is estimated), its standard deviation, and where it is from.
+
+    ``wish``: metres, or one of ``HEIGHT_WORDS``. Raises SkylessError.
+    """
+    if not isinstance(wish, str):
+        return wish, 0.0, "given"
+    if wish == "free":
+        return None, 0.0, "estimated"
+    if wish == "truth" or (truth is not None and format_name == "miluv"):
+        if truth is None:
+            raise SkylessError("--tag-height truth takes the height from the truth, which --truth must give")
+        return float(np.median(truth.position_m[:, 2])), 0.0, "the truth's median"
+    if site_m is not None:
+        return site_m, 0.0, "from the site file"
+    plane_m = plane_height_m(anchors_m)
+    if plane_m is None:
+        return None, 0.0, "estimated"
+    return plane_m, GUESSED_STD_M, TOO_FLAT
+
+
+def flight_height(wish: float | None, truth: Truth | None) -> float | None:
+    """Height above which fixes are judged: the wish, or where the truth begins on the floor and rises well above it."""
+    if wish is not None or truth is None:
+        return wish
+    return FLIGHT_M if flies(truth) else None

@@ -1,0 +1,134 @@
+"""What is asked of a replay: options of ``skyless replay``, and what a survey of a recording shares with it."""
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+from skyless.core.air.page_codec import MAX_COORDINATE_M
+from skyless.core.arguments import (
+    ComputedOptions,
+    Method,
+    NotNegative,
+    Option,
+    Positive,
+    Rule,
+    Text,
+    check_number,
+    choice,
+    existing_file,
+    numbers,
+    point,
+    process_noise,
+    read_height,
+)
+from skyless.core.method_names import Dynamics
+from skyless.sim.evaluation.request import IntegrityRisk, ProtectionOptions
+
+if TYPE_CHECKING:
+    from skyless.core.integrity import IntegrityRequirement
+    from skyless.core.site import Site
+    from skyless.research.replays.inputs import Anchors, AnyTruth
+
+PACKETS, DIFFERENCES_MADE = "packets", "differences"
+MEASUREMENTS: Final = (PACKETS, DIFFERENCES_MADE)
+"""What the filter is given: anchors' packets as they are, or time differences made of them."""
+
+HEIGHT_WORDS: Final = ("truth", "free", "auto")
+"""What a tag's height may be instead of metres: the truth's median, estimated, or what suits."""
+
+
+_read_height = partial(read_height, words=HEIGHT_WORDS)
+
+
+def _check_height(name: str, value: Any) -> Any:  # noqa: ANN401 - a number or a word
+    if not isinstance(value, str):
+        return check_number(name, value)
+    return _read_height(name, value)
+
+
+class RecordingOptions(ComputedOptions, frozen=True, kw_only=True):
+    """What is known of a recording."""
+
+    anchors: Annotated["Anchors | None", Path] = None
+    """Table of anchors: id,x_m,y_m,z_m, with bias_m where skyless survey has found that; in Python also positions by
+    identifier."""
+    truth: Annotated["AnyTruth | None", Path] = None
+    """Table of true positions: t_s,x_m,y_m,z_m, with qx,qy,qz,qw if the body turns; t_s in the recording's time, in
+    Unix time for a recording of skyless record; in Python also an array of shape (n, 4). MILUV ticks bring theirs."""
+    lever_arm_m: Annotated[
+        "tuple[float, float, float] | None",
+        Option("lever-arm"),
+        numbers(3, form="x,y,z"),
+        point(3, farthest_m=MAX_COORDINATE_M),
+    ] = None
+    """The antenna in the body's frame, in metres, added to the truth."""
+    format: str | None = None
+    """Name of the format, if the content should not decide."""
+    listener: str | None = None
+    """Which receiver, in recordings with several."""
+    above_m: Annotated[float | None, Option("above")] = None
+    """Judge only while the true height exceeds this, in metres; by default 0.3 for a table of differences that starts
+    below it and later flies, as tags on the floor hear reflections only."""
+    tag: str | None = None
+    """Name of the tag, in recordings of skyless record; by default all."""
+
+
+class _Recording(RecordingOptions, frozen=True):
+    file: Annotated["str | Path", Path, Rule(existing_file)]
+    """The recording, plain or gzip."""
+
+
+class ReplayOptions(_Recording, frozen=True, kw_only=True):
+    """Options of ``skyless replay``."""
+
+    site: Annotated["Site | str | Path | None", Path] = None
+    """Site file instead of --anchors, for its anchors and its tags' height; in Python also a site. With a recording of
+    skyless record: replay as if its anchors had had the antenna delays of this site, as skyless survey writes them."""
+    tag_height_m: Annotated[
+        float | str, Option("tag-height"), Text(partial(read_height, words=HEIGHT_WORDS)), Rule(_check_height)
+    ] = "auto"
+    """The tags' height: metres, truth (its median), free (estimated), or auto: free where the anchors determine it."""
+    tag_height_std_m: Annotated[NotNegative | None, Option("tag-height-std")] = None
+    """Standard deviation of the tag's height from the one that is given, in metres, which fixes and levels then
+    count; by default 0.5 where the height is only taken for the anchors', else 0."""
+    settle_s: Annotated[NotNegative | None, Option("settle")] = None
+    """Seconds from the start that are not judged; by default 3 with a truth table, 2 without."""
+    qa: Positive | None = None
+    """Process noise that the filter assumes: spectral density of the acceleration, m²/s³."""
+    dynamics: Dynamics | None = None
+    """How tags move: walk (as people), robot or drone, which sets the process noise instead of --qa."""
+    tdoa_std_m: Annotated[Positive | None, Option("tdoa-std")] = None
+    """Noise of what is new in a time difference, metres."""
+    uncalibrated: bool = False
+    """Leave out the calibration that the table of anchors holds."""
+    method: Method | None = None
+    """How positions are computed, in recordings of skyless record; by default as the tag did."""
+    measurements: Annotated[str | None, choice(*MEASUREMENTS)] = None
+    """What the filter is given of other recordings: packets, as anchors sent them, which is the default for
+    Bitcraze's and FiRa's; or differences, which are made of them."""
+    integrity_risk: IntegrityRisk | None = None
+    """Probability, for each fix, that the error exceeds its protection level, in recordings of skyless record (joint);
+    by default the tag's own."""
+    alert_limit_m: Positive | None = None
+    """Fixes whose protection level exceeds this, in metres, carry an alert; by default the tag's own limit holds."""
+    max_acceleration_mps2: Annotated[NotNegative | None, Option("max-acceleration")] = None
+    """The largest acceleration of the tags in m/s²; by default what the tag assumed. With any of these, or
+    --tag-height-std, tags start from the beginning, as with another method, and those that are not given are as of
+    a tag of which nothing was asked."""
+
+    def check(self) -> None:
+        """See that the options fit one another. Raises SkylessError."""
+        process_noise(self.qa, self.dynamics)
+        _ = self.requirement
+
+    @property
+    def requirement(self) -> "IntegrityRequirement | None":
+        """What is required of the levels instead of what the tag did; None where nothing is."""
+        asked = ProtectionOptions(
+            integrity_risk=self.integrity_risk,
+            alert_limit_m=self.alert_limit_m,
+            max_acceleration_mps2=self.max_acceleration_mps2,
+        )
+        if not asked.protection_given and self.tag_height_std_m is None:
+            return None
+        return asked.requirement(self.method, self.tag_height_std_m)

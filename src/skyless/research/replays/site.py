@@ -1,0 +1,528 @@
+"""Replay of a running site: every tag's receptions once more, judged against the truth and the recorded fixes."""
+
+import time
+from collections import Counter, OrderedDict, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, Final, TypeVar, cast
+
+import msgspec
+import numpy as np
+from msgspec import Struct, structs
+
+from skyless.core.air import codec
+from skyless.core.air.beacon import Beacon
+from skyless.core.air.frame import Heard, Malformed
+from skyless.core.air.reception import Diagnostics, Reception
+from skyless.core.errors import ConfigurationError
+from skyless.core.fix import Fix
+from skyless.core.input_files import Drops
+from skyless.core.integrity import RISK, IntegrityRequirement
+from skyless.core.method_names import DEFAULT_METHOD, METHODS
+from skyless.core.protocol1 import codec as protocol1_codec
+from skyless.core.protocols import decode_any
+from skyless.core.site import Site
+from skyless.core.tag.any_receiver import AnyReceiver
+from skyless.core.tag.beacon_receiver import NOT_DROPS
+from skyless.core.ticks import WRAP_TICKS, wrap
+from skyless.research.replays.captures import ReplayReport, common_figures
+from skyless.run.mqtt.messages import FixMessage, RawReception, ReceptionsMessage, SegmentStart, fix_message
+from skyless.run.recordings.host_clock import HostClock
+from skyless.run.recordings.reception_log import RefusedError, load
+from skyless.run.recordings.recording import McapRecording, Recorded, tags_to_replay
+from skyless.sim.evaluation.judge import Judge
+from skyless.site.tables import Truth
+
+# Recorded fixes against those of a replay: whether they are the same, bit by bit.
+
+_T = TypeVar("_T")
+
+_MAX_WAITING: Final = 20_000
+"""Fixes that wait for their counterpart; those that the recording lacks never get one."""
+
+SAME_FIX_S: Final = 2.0
+"""Serial numbers begin again with the tag; fixes of one number that are farther apart are different ones."""
+
+
+class Identical(Struct, frozen=True):
+    """Recorded fixes against those of the replay, bit by bit."""
+
+    compared: int
+    different: int
+
+
+class Comparison:
+    """Pairs of a recorded and a replayed fix, matched by serial number and time, whichever comes first."""
+
+    def __init__(self, tag: str) -> None:
+        self._tag = tag
+        self._recorded: OrderedDict[int, FixMessage] = OrderedDict()
+        self._replayed: OrderedDict[int, tuple[Fix, float]] = OrderedDict()
+        self._compared = self._different = 0
+
+    def result(self) -> Identical:
+        """How they compare so far."""
+        return Identical(self._compared, self._different)
+
+    def recorded(self, message: FixMessage) -> None:
+        """Add a recorded fix."""
+        found = self._replayed.pop(message.serial, None)
+        if found is None or abs(found[1] - message.unix_s) > SAME_FIX_S:
+            _keep(self._recorded, message.serial, message)
+        else:
+            self._judge(found[0], message)
+
+    def replayed(self, serial: int, fix: Fix, unix_s: float) -> None:
+        """Add one of the replay."""
+        found = self._recorded.pop(serial, None)
+        if found is None or abs(found.unix_s - unix_s) > SAME_FIX_S:
+            _keep(self._replayed, serial, (fix, unix_s))
+        else:
+            self._judge(fix, found)
+
+    def _judge(self, fix: Fix, message: FixMessage) -> None:
+        again = fix_message(self._tag, message.serial, fix, message.unix_s, message.latency_s)
+        self._compared += 1
+        self._different += msgspec.json.encode(again) != msgspec.json.encode(message)
+
+
+def _keep(waiting: OrderedDict[int, _T], serial: int, value: _T) -> None:
+    waiting[serial] = value
+    if len(waiting) > _MAX_WAITING:
+        waiting.popitem(last=False)
+
+
+# A recorded site once more, as if its anchors had had other antenna delays.
+#
+# A node's TX stamp is what its counter shows plus its TX delay, its RX stamp the same less its RX delay. An anchor's
+# clock rests on its RX stamps of the master and on the master's TX stamps, so its site time moves with all three.
+
+_SITE_TIME_MASK: Final = (1 << 48) - 1
+
+
+class DelayChange(Struct, frozen=True):
+    """New less old antenna delays of one anchor, ticks."""
+
+    tx_ticks: int
+    rx_ticks: int
+
+
+_UNCHANGED: Final = DelayChange(0, 0)
+
+
+def delay_changes(recorded: Site, wanted: Site) -> dict[int, DelayChange]:
+    """Changes by anchor, of those that both sites have."""
+    old = {anchor.id: anchor for anchor in recorded.anchors}
+    return {
+        new.id: DelayChange(
+            new.tx_antenna_delay_ticks - old[new.id].tx_antenna_delay_ticks,
+            new.rx_antenna_delay_ticks - old[new.id].rx_antenna_delay_ticks,
+        )
+        for new in wanted.anchors
+        if new.id in old
+    }
+
+
+def with_delays(reception: Reception, changes: dict[int, DelayChange]) -> Reception:
+    """The reception of the same frame as its sender would have filled it."""
+    beacon = decode_any(reception.frame)
+    if isinstance(beacon, Malformed):
+        return reception
+    own = changes.get(beacon.anchor, _UNCHANGED)
+    heard = tuple(_relay(one, own) for one in beacon.heard)
+    tx_ticks = wrap(beacon.tx_ticks + own.tx_ticks)
+    if isinstance(beacon, Beacon):
+        frame = codec.encode(structs.replace(beacon, tx_ticks=tx_ticks, heard=heard))
+        return structs.replace(reception, frame=frame)
+    master = changes.get(beacon.master, _UNCHANGED)
+    later = master.tx_ticks if beacon.anchor == beacon.master else own.tx_ticks + own.rx_ticks + master.tx_ticks
+    time = beacon.master_time
+    if time is not None:
+        time = structs.replace(time, tx_subticks_master=(time.tx_subticks_master + 256 * later) & _SITE_TIME_MASK)
+    master_heard = None if beacon.master_heard is None else _relay(beacon.master_heard, own)
+    changed = structs.replace(beacon, tx_ticks=tx_ticks, master_time=time, master_heard=master_heard, heard=heard)
+    return structs.replace(reception, frame=protocol1_codec.encode(changed))
+
+
+def _relay(heard: Heard, own: DelayChange) -> Heard:
+    return structs.replace(heard, rx_ticks=wrap(heard.rx_ticks - own.rx_ticks))
+
+
+# One tag of a recording once more: its receptions through its receiver, bit by bit as it was.
+
+
+class _MadeFix(Struct, frozen=True):
+    """A fix whose time is not known yet, and its number where that is known."""
+
+    fix: Fix
+    serial: int | None
+
+
+class Replayed(Struct, frozen=True):
+    """A fix of the replay."""
+
+    fix: Fix
+    unix_s: float
+    """The end of its last frame, without the delays of the host."""
+
+
+class TagReplay:
+    """Processes the receptions of one tag in the order of the recording."""
+
+    def __init__(
+        self,
+        tag: str,
+        method: str | None = None,
+        delays: dict[int, DelayChange] | None = None,
+        integrity: IntegrityRequirement | None = None,
+    ) -> None:
+        """``method`` and ``integrity``: others than the tag's own; ``delays``: other antenna delays. All begin cold."""
+        self._delays = delays
+        self._integrity = integrity
+        self._is_as_it_was = method is None and delays is None and integrity is None
+        self.tag = tag
+        self.method = method
+        """As recorded, once known, or as asked for."""
+        self.receptions = self.fixes = self.segments = self.cold_starts = 0
+        self.begun_s: float | None = None
+        """Unix time of the first reception."""
+        self.drops: Drops = Counter()
+        self.reason = "no-beacons"
+        """Why there is no fix, as given last."""
+        self._asked = method
+        self._receiver: AnyReceiver | None = None
+        self._serial: int | None = None
+        """Of the last fix; None where it cannot be known, as the receiver did not go on where the tag's was."""
+        self._restored = False
+        self._segment = ""
+        self._next = 0
+        self._clock: HostClock[_MadeFix | None] = HostClock()
+        self._comparison = Comparison(tag)
+
+    def process(self, message: ReceptionsMessage) -> Iterator[Replayed]:
+        """Process a run of receptions; the fixes that they make, or that runs before have made."""
+        clock = self._clock
+        fresh = self._unheard(message)
+        if self._clock is not clock:
+            yield from self._timed(clock.rest())
+        for raw in fresh:
+            reception = reception_of(raw)
+            if reception is None:
+                self.drops["impossible-reception"] += 1
+                continue
+            self.receptions += 1
+            if self._delays is not None:
+                reception = with_delays(reception, self._delays)
+            made = self._made(reception)
+            yield from self._timed(self._clock.add(reception, message.unix_less_host_s, made))
+
+    def rest(self) -> Iterator[Replayed]:
+        """The last fixes, at the end of the recording."""
+        yield from self._timed(self._clock.rest())
+
+    def _made(self, reception: Reception) -> _MadeFix | None:
+        fix = self._fix(reception)
+        if fix is None:
+            return None
+        self.fixes += 1
+        if self._serial is not None:
+            self._serial += 1
+        return _MadeFix(fix, self._serial)
+
+    def _timed(self, found: list[tuple[_MadeFix | None, float]]) -> Iterator[Replayed]:
+        """Fixes of receptions whose Unix time is known now."""
+        for made, unix_s in found:
+            self.begun_s = unix_s if self.begun_s is None else self.begun_s
+            if made is None:
+                continue
+            if made.serial is not None:
+                self._comparison.replayed(made.serial, made.fix, unix_s)
+            yield Replayed(made.fix, unix_s)
+
+    def compare(self, recorded: FixMessage) -> None:
+        """Add a recorded fix."""
+        self._comparison.recorded(recorded)
+
+    @property
+    def identical(self) -> Identical | None:
+        """How the fixes compare; None with another method than the tag's own, or other antenna delays."""
+        return self._comparison.result() if self._is_as_it_was else None
+
+    def all_drops(self) -> dict[str, int]:
+        """What could not be used, by reason, the receiver's own included."""
+        own: Counter[str] = Counter() if self._receiver is None else self._receiver.counters
+        total = self.drops + Counter({reason: n for reason, n in own.items() if reason not in NOT_DROPS})
+        return {str(reason): number for reason, number in sorted(total.items()) if number}
+
+    def _unheard(self, message: ReceptionsMessage) -> tuple[RawReception, ...]:
+        """What a message has beyond those before it; it may come twice, or after a loss."""
+        if message.segment != self._segment:
+            if message.start is None:
+                self.drops["receptions-without-beginning"] += len(message.receptions)
+                return ()
+            self._begin(message.segment, message.start)
+        skip = self._next - message.first
+        if skip < 0:
+            self.drops["receptions-after-a-gap"] += len(message.receptions)
+            return ()
+        self._next = max(self._next, message.first + len(message.receptions))
+        return message.receptions[skip:]
+
+    def _begin(self, segment: str, start: SegmentStart) -> None:
+        self._segment, self._next = segment, 0
+        self.segments += 1
+        if not self._is_as_it_was:
+            if self._receiver is None:
+                self._start_cold(start)
+            return
+        self._clock = HostClock()
+        if start.state is None:
+            if start.serial:
+                self.drops["no-checkpoint"] += 1
+            self._start_cold(start)
+            self._serial = None if start.serial else 0
+            return
+        try:
+            self._receiver = load(start.state)
+        except RefusedError as refused:
+            self.drops[refused.reason] += 1
+            self._start_cold(start)
+            return
+        self.method = str(start.settings.get("method"))
+        self._serial, self._restored = start.serial, True
+        # what it had counted before belongs to no replay
+        self._receiver.counters.clear()
+
+    def _start_cold(self, start: SegmentStart) -> None:
+        self.cold_starts += 1
+        self._serial, self._restored = None, False
+        receiver = _receiver_of(start, self._asked, self._integrity)
+        if receiver is None:
+            self.drops["impossible-settings"] += 1
+            receiver = AnyReceiver(self._asked or DEFAULT_METHOD, integrity=self._integrity)
+        self._receiver = receiver
+        self.method = self._asked or str(start.settings.get("method"))
+
+    def _fix(self, reception: Reception) -> Fix | None:
+        assert self._receiver is not None
+        if not self._restored:
+            fix = self._receiver.hear(reception)
+        else:
+            try:
+                fix = self._receiver.hear(reception)
+            except Exception:  # noqa: BLE001 - a forged checkpoint can make a receiver that fails in any way
+                self.drops["checkpoint-damaged"] += 1
+                self._start_cold(SegmentStart(0, {"method": self.method}, None))
+                return None
+        self.reason = str(self._receiver.reason)
+        return fix
+
+
+def reception_of(raw: RawReception) -> Reception | None:
+    """A recorded reception; None for one that no radio gives."""
+    if not 0 <= raw.rx_ticks < WRAP_TICKS or (raw.host_s is not None and not abs(raw.host_s) < 1e12):
+        return None
+    diagnostics = Diagnostics(raw.rx_power_dbm, raw.first_path_power_dbm, raw.carrier_offset_ppm)
+    return Reception(raw.frame, raw.rx_ticks, raw.host_s, None if diagnostics == Diagnostics() else diagnostics)
+
+
+def _receiver_of(start: SegmentStart, method: str | None, integrity: IntegrityRequirement | None) -> AnyReceiver | None:
+    """A receiver that knows nothing, made as the tag's was; None where that makes no sense."""
+    settings = start.settings
+    name, site, qa = method or settings.get("method"), settings.get("site"), settings.get("qa", 0.3)
+    low_m, high_m = settings.get("z_low_m"), settings.get("z_high_m")
+    if not isinstance(name, str) or name not in METHODS or not isinstance(site, int | None):
+        return None
+    if not isinstance(qa, int | float) or not 0.0 < qa < 1e6:
+        return None
+    bounded = isinstance(low_m, int | float) and isinstance(high_m, int | float)
+    bounds_m = (float(low_m), float(high_m)) if bounded else None  # type: ignore[arg-type]
+    try:
+        asked = integrity or _integrity_of(start)
+    except (ValueError, TypeError):
+        return None
+    return AnyReceiver(name, site=site, qa=float(qa), z_bounds_m=bounds_m, integrity=asked)
+
+
+def _integrity_of(start: SegmentStart) -> IntegrityRequirement:
+    """What was asked of the tag's levels; the defaults where a recording does not hold it.
+
+    Raises:
+        ValueError, TypeError: it makes no sense.
+    """
+    return IntegrityRequirement(
+        start.settings.get("integrity_risk", RISK),  # type: ignore[arg-type]
+        start.settings.get("alert_limit_m"),  # type: ignore[arg-type]
+        start.settings.get("max_acceleration_mps2", 0.0),  # type: ignore[arg-type]
+        start.settings.get("height_std_m", 0.0),  # type: ignore[arg-type]
+    )
+
+
+# Replay of a running site: every tag's receptions once more, judged against the truth and the recorded fixes.
+
+SITE_FORMAT: Final = "skyless-mcap"
+
+
+class TagReport(ReplayReport, frozen=True, kw_only=True):
+    """What the replay of one tag came to; times are Unix seconds."""
+
+    tag: str
+    identical: Identical | None
+    """Against the fixes that the tag published; None with another method than its own."""
+    segments: int
+    """Runs of receptions without a gap."""
+    cold_starts: int
+    """How many of them did not begin where the tag's receiver was."""
+    mean_anchors: float | None
+    """Number of anchors in a fix."""
+    most_anchors: int
+
+
+class SiteReplay:
+    """All tags of a recording, or some of them."""
+
+    def __init__(
+        self,
+        recording: McapRecording,
+        tags: Iterable[str] | None = None,
+        method: str | None = None,
+        settle_s: float = 2.0,
+        above_m: float | None = None,
+        wanted: Site | None = None,
+        integrity: IntegrityRequirement | None = None,
+    ) -> None:
+        """Replay as the tags computed, or otherwise.
+
+        ``method`` and ``integrity`` are used instead of the tags' own, the antenna delays of ``wanted`` instead of the
+        anchors' own.
+
+        Raises:
+            ConfigurationError: the recording has no raw receptions, none of such a tag, or is of another site.
+        """
+        summary = recording.summary()
+        raw_tags = tags_to_replay(summary)
+        for tag in tags or ():
+            if tag not in raw_tags:
+                raise ConfigurationError(summary.path, "tag", tag, f"one of {', '.join(raw_tags)}")
+        self._recording = recording
+        self._settle_s = settle_s
+        site = recording.site
+        self.height_m = None if site is None else site.site.tags.height_m
+        self._begin_s = summary.start_s or 0.0
+        truth = recorded_truth(recording)
+        delays = None
+        if wanted is not None:
+            delays = delay_changes(recorded_site(recording, wanted.id), wanted)
+        self.tags = {tag: TagReplay(tag, method, delays, integrity) for tag in tags or summary.raw_tags}
+        self.judges = {
+            tag: Judge(truth.get(tag), planar=self.height_m is not None, settle_s=settle_s, above_m=above_m)
+            for tag in self.tags
+        }
+        self._spans: dict[str, tuple[float, float]] = {}
+        """First and last fix of each tag, Unix time."""
+        self._anchors: dict[str, Counter[int]] = {tag: Counter() for tag in self.tags}
+        """How many fixes of each tag are of that many anchors."""
+
+    def run(
+        self, on_fix: Callable[[str, Replayed], None] | None, on_progress: Callable[[float], None]
+    ) -> list[TagReport]:
+        """Replay all; ``on_progress`` gets now and then the recording's seconds done so far."""
+        begun_s = time.perf_counter()
+        for number, found in enumerate(self._recording.messages({"receptions", "fix"})):
+            if found.channel.name in self.tags:
+                self._process(found, on_fix)
+            if number % 256 == 0:
+                on_progress(found.time_s - self._begin_s)
+        for replay in self.tags.values():
+            self._add(replay, replay.rest(), on_fix)
+        wall_s = time.perf_counter() - begun_s
+        return [self._report(tag, wall_s) for tag in self.tags]
+
+    def _process(self, found: Recorded, on_fix: Callable[[str, Replayed], None] | None) -> None:
+        replay = self.tags[found.channel.name]
+        if found.channel.kind == "fix":
+            replay.compare(cast("FixMessage", found.message))
+        else:
+            self._add(replay, replay.process(cast("ReceptionsMessage", found.message)), on_fix)
+
+    def _add(
+        self, replay: TagReplay, fixes: Iterable[Replayed], on_fix: Callable[[str, Replayed], None] | None
+    ) -> None:
+        """Judge fixes of a tag."""
+        tag = replay.tag
+        for made in fixes:
+            first_s, _ = self._spans.get(tag, (made.unix_s, 0.0))
+            self._spans[tag] = (first_s, made.unix_s)
+            self._anchors[tag][len(made.fix.anchors)] += 1
+            x, y, z = made.fix.position_m.tolist()
+            self.judges[tag].add(made.unix_s, made.unix_s - (replay.begun_s or 0.0), (x, y, z))
+            if on_fix is not None:
+                on_fix(tag, made)
+
+    def _report(self, tag: str, wall_s: float) -> TagReport:
+        replay, anchors = self.tags[tag], self._anchors[tag]
+        first_s, last_s = self._spans.get(tag, (0.0, 0.0))
+        return TagReport(
+            format=SITE_FORMAT,
+            **common_figures(self.judges[tag].judgement(), replay.receptions, replay.fixes, replay.all_drops(), wall_s),
+            rate_hz=replay.fixes / (last_s - first_s) if last_s > first_s else None,
+            first_fix_s=first_s - replay.begun_s if replay.fixes and replay.begun_s is not None else None,
+            height_m=self.height_m,
+            reason=None if replay.fixes else replay.reason,
+            tag=tag,
+            method=replay.method,
+            identical=replay.identical,
+            segments=replay.segments,
+            cold_starts=replay.cold_starts,
+            mean_anchors=sum(count * fixes for count, fixes in anchors.items()) / replay.fixes
+            if replay.fixes
+            else None,
+            most_anchors=max(anchors, default=0),
+        )
+
+
+def summary_of(reports: Sequence[TagReport]) -> dict[str, Any]:
+    """One tag's report as that of any other recording; of several, their sums and the reports by tag."""
+    if len(reports) == 1:
+        return {**msgspec.to_builtins(reports[0]), "height_note": "from the site"}
+    compared = [report.identical for report in reports if report.identical is not None]
+    identical = {
+        "compared": sum(one.compared for one in compared),
+        "different": sum(one.different for one in compared),
+    }
+    return {
+        "format": reports[0].format,
+        "receptions": sum(report.receptions for report in reports),
+        "fixes": sum(report.fixes for report in reports),
+        "dropped": sum(report.dropped for report in reports),
+        "identical": identical if compared else None,
+        "wall_s": reports[0].wall_s,
+        "tags": {report.tag: msgspec.to_builtins(report) for report in reports},
+    }
+
+
+def recorded_site(recording: McapRecording, identifier: int | None = None) -> Site:
+    """The site of a recording.
+
+    Raises:
+        ConfigurationError: it does not hold its site, or another one than ``identifier`` is wanted.
+    """
+    found = recording.site
+    if found is None:
+        raise ConfigurationError(recording.summary().path, "the site", None, "in the recording")
+    if identifier is not None and found.site.id != identifier:
+        raise ConfigurationError(
+            recording.summary().path, "the site's id", found.site.id, f"{identifier}, as in --site"
+        )
+    return found.site
+
+
+def recorded_truth(recording: McapRecording) -> dict[str, Truth]:
+    """Where each tag truly was, by Unix time; times that go back are left out."""
+    rows: dict[str, list[tuple[float, ...]]] = defaultdict(list)
+    for moment in recording.truth():
+        for tag, motion in moment.tags.items():
+            known = rows[tag]
+            if not known or moment.unix_s > known[-1][0]:
+                known.append((moment.unix_s, *motion.position_m))
+    tables = {tag: np.array(known) for tag, known in rows.items()}
+    return {tag: Truth(table[:, 0], table[:, 1:], None) for tag, table in tables.items()}

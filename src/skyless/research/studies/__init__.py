@@ -1,0 +1,1 @@
+"""Studies: how accuracy depends on one quantity at a time, in simulation."""

@@ -1,0 +1,301 @@
+"""The picture of a study: a line of panels for each series, curves over numbers and bars for named cases."""
+
+from collections.abc import Callable, Sequence
+from itertools import groupby
+from typing import Any, Final, Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+from msgspec import Struct
+
+from skyless.core.kernels.arrays import Array
+from skyless.research.studies.common.plan import Row
+from skyless.site.report.figures import BLUE, GREEN, GRID, INK, MUTED, ORANGE, RED, report_style
+
+_WIDTH_IN: Final = 4.7
+_BAR_IN: Final = 0.24
+_CURVE_IN: Final = 2.6
+_WIDE_RATIO: Final = 15.0
+"""Values that lie farther apart are drawn on a logarithmic axis."""
+
+
+# Which side of a limit is the safe one
+
+_ALPHA: Final = 0.07
+_ROOM: Final = 1.25
+"""Both sides of the limit are in view: the axis reaches to at least this multiple of it, and to a part of it."""
+
+
+class Sides(Struct, frozen=True):
+    """What it means to be below and above a limit."""
+
+    below: str
+    above: str
+    safe: Literal["below", "above", "neither"] = "below"
+    """``neither``: far from the limit is bad on both sides."""
+
+
+CONFIDENCE: Final = Sides("errors smaller than reported: safe side", "errors larger than reported: too confident")
+"""Of squared errors over reported variances, whose limit is 1."""
+
+STATED_RISK: Final = Sides("rarer than stated: safe side", "more often than stated: too confident")
+"""Of the share of errors beyond a protection level, whose limit is the stated probability."""
+
+BOUND: Final = Sides("below the bound: by chance alone", "above the bound: information not used", "neither")
+"""Of errors over the smallest possible ones, whose limit is 1."""
+
+
+def shade_sides(axes: Axes, sides: Sides, limit: float, *, along: Literal["x", "y"]) -> None:
+    """Shade and name both sides of a limit on the axis ``along``; call it after everything else is drawn."""
+    low, high = sorted(axes.get_xlim() if along == "x" else axes.get_ylim())
+    logarithmic = (axes.get_xscale() if along == "x" else axes.get_yscale()) == "log"
+    high = max(high, limit * (_ROOM**3 if logarithmic else _ROOM))
+    low = min(low, limit / (_ROOM**3 if logarithmic else _ROOM))
+    span, set_limits = (axes.axvspan, axes.set_xlim) if along == "x" else (axes.axhspan, axes.set_ylim)
+    for start, end, side, words in ((low, limit, "below", sides.below), (limit, high, "above", sides.above)):
+        colour = INK if sides.safe == "neither" else GREEN if side == sides.safe else RED
+        if sides.safe != "neither":
+            span(start, end, color=colour, alpha=_ALPHA, linewidth=0.0, zorder=0.5)
+        _name(axes, words, colour, side, along)
+    set_limits(low, high)
+
+
+def name_sides(axes: Axes, sides: Sides, *, along: Literal["x", "y"]) -> None:
+    """Name both directions of an axis without a common limit."""
+    for side, words in (("below", sides.below), ("above", sides.above)):
+        _name(axes, words, GREEN if side == sides.safe else RED, side, along)
+
+
+def _name(axes: Axes, words: str, colour: str, side: str, along: Literal["x", "y"]) -> None:
+    """Words for a side: below the label of the axis x, at the upper or lower edge of the panel for y."""
+    if along == "x":
+        axes.set_xlabel(f"{axes.get_xlabel()}\n" + (f"◂ {words}" if side == "below" else f"{words} ▸"))
+    else:
+        y = 0.015 if side == "below" else 0.985
+        axes.text(
+            0.985, y, words, transform=axes.transAxes, ha="right", va="bottom" if side == "below" else "top",
+            fontsize=7.0, color=colour, zorder=5,
+        )  # fmt: skip
+
+
+# Panels
+
+
+class Look(Struct, frozen=True):
+    """How a study is drawn."""
+
+    title: str
+    panels: tuple[str, ...]
+    """Names of ``_PANELS``, side by side."""
+    x: str = ""
+    """What the numbers of a series mean; by default the series says it."""
+    log: bool = False
+
+
+class _Panel(Struct, frozen=True):
+    label: str
+    value: Callable[[Any], float | None]
+    """A figure of a study's row."""
+    error: Callable[[Row], float | None] = lambda _: None
+    target: float | None = None
+    """What a good receiver has; the values are then points about it, not lengths."""
+    limits: bool = False
+    """Whether limits on the ratio are drawn as limits on the RMSE."""
+    figure: str = ""
+    """Field of a row whose own limits are drawn, ``scale`` times as large."""
+    scale: float = 1.0
+    sides: Sides | None = None
+    """What the two sides of the target mean, or of the stated risk."""
+    log: bool | None = None
+    """Whether the axis of bars is logarithmic; None for where values lie far apart."""
+
+
+def centimetres(value_m: float | None) -> float | None:
+    """A length in centimetres."""
+    return None if value_m is None else 100.0 * value_m
+
+
+MIN_DRAWN_SHARE: Final = 1e-6
+"""Smaller shares of exceeded levels, and none, are drawn here."""
+
+
+def _exceeded(row: Any) -> float | None:  # noqa: ANN401 - a row with levels
+    return None if row.exceeded is None else 1e4 * max(row.exceeded, MIN_DRAWN_SHARE)
+
+
+_PANELS: Final = {
+    "rmse": _Panel(
+        "RMSE in cm",
+        lambda row: centimetres(row.rmse_m),
+        lambda row: centimetres(row.rmse_error_m),
+        limits=True,
+        figure="rmse_m",
+        scale=100.0,
+    ),
+    "ratio": _Panel("RMSE over bound", lambda row: row.ratio, lambda row: row.ratio_error, 1.0, sides=BOUND),
+    "nees": _Panel("NEES per dimension", lambda row: row.nees, target=1.0, figure="nees", sides=CONFIDENCE),
+    "level": _Panel(
+        "fixes with a level in %",
+        lambda row: None if row.level is None else 100.0 * row.level,
+        figure="level",
+        scale=100.0,
+        sides=Sides("fewer fixes with a level", "more: better, if they hold", "above"),
+        log=False,
+    ),
+    "exceeded": _Panel(
+        "levels exceeded in 10⁻⁴",
+        _exceeded,
+        figure="exceeded",
+        scale=1e4,
+        sides=STATED_RISK,
+        log=True,
+    ),
+    "found": _Panel(
+        "events found in %",
+        lambda row: None if row.found is None else 100.0 * row.found,
+        figure="found",
+        scale=100.0,
+        sides=Sides("events missed: unsafe", "events found: safe side", "above"),
+        log=False,
+    ),
+    "found_s": _Panel("seconds to the finding, 99 %", lambda row: row.found_s, log=True),
+    "cpu": _Panel("CPU in µs a message", lambda row: row.cpu_us_per_message),
+}
+
+
+def draw(look: Look, rows: Sequence[Row]) -> Figure:
+    """Draw the rows of a study; error bars are standard errors."""
+    with report_style():
+        series = [(name, list(group)) for name, group in groupby(rows, key=lambda row: row.series)]
+        series = [(name, group) for name, group in series if _has_values(group, look)] or series
+        heights = [_CURVE_IN if _is_curve(group) else 0.8 + _BAR_IN * len(group) for _, group in series]
+        figure = Figure(figsize=(_WIDTH_IN * len(look.panels), sum(heights) + 0.5), layout="constrained")
+        methods = ", ".join(dict.fromkeys(row.method for row in rows))
+        note = "; grey: where 99 % of consistent ones lie" if "nees" in look.panels else ""
+        figure.suptitle(f"{look.title}: {methods}, simulated{note}", x=0.01, ha="left", fontsize=11.0)
+        grid = figure.subplots(len(series), len(look.panels), squeeze=False, height_ratios=heights)
+        for line, (name, group) in zip(grid, series, strict=True):
+            for axes, panel in zip(line, look.panels, strict=True):
+                _fill(axes, _PANELS[panel], group, look)
+            for axes in line[1:]:
+                if not _is_curve(group):
+                    axes.set_yticklabels([])
+            line[0].set_title(name, loc="left")
+    return figure
+
+
+def _has_values(rows: Sequence[Row], look: Look) -> bool:
+    """Whether any panel shows something of these rows; cold starts, for one, have no errors."""
+    return any(_PANELS[panel].value(row) is not None for panel in look.panels for row in rows)
+
+
+def _is_curve(rows: Sequence[Row]) -> bool:
+    return all(row.x is not None for row in rows)
+
+
+def _fill(axes: Axes, panel: _Panel, rows: list[Row], look: Look) -> None:
+    values = np.array([_or_nan(panel.value(row)) for row in rows])
+    errors = np.nan_to_num(np.array([_or_nan(panel.error(row)) for row in rows]))
+    curve = _is_curve(rows)
+    if curve:
+        _curve(axes, np.array([row.x for row in rows], dtype=np.float64), values, errors, look, rows[0].series)
+        if panel.target is not None:
+            axes.set_ylim(top=max(axes.get_ylim()[1], 1.3 * panel.target))
+        axes.set(ylabel=panel.label)
+    else:
+        _named(axes, panel, rows, values, errors)
+        axes.set(xlabel=panel.label)
+    if panel.target is not None:
+        (axes.axhline if curve else axes.axvline)(panel.target, color=MUTED, linewidth=1.0, linestyle="--", zorder=1.5)
+    if panel is _PANELS["nees"]:
+        _intervals(axes, rows, curve=curve)
+    if panel.limits:
+        _limits(axes, rows)
+    if panel.figure and not curve:
+        _own_limits(axes, panel, rows)
+    if panel.sides is not None:
+        limit = panel.target
+        if limit is None:
+            name_sides(axes, panel.sides, along="y" if curve else "x")
+        else:
+            shade_sides(axes, panel.sides, limit, along="y" if curve else "x")
+
+
+def _or_nan(value: float | None) -> float:
+    return np.nan if value is None else value
+
+
+def _curve(axes: Axes, x: Array, values: Array, errors: Array, look: Look, series: str) -> None:
+    axes.errorbar(x, values, errors, fmt="o-", color=BLUE, markersize=4, capsize=2, zorder=3)
+    axes.set(xlabel=look.x or series)
+    if look.log:
+        axes.set_xscale("log")
+        axes.set_xticks(x, [f"{value:g}" for value in x])
+        axes.set_xticks([], minor=True)
+    highest = float(np.nanmax(values + errors, initial=0.0))
+    if highest > _WIDE_RATIO * float(np.nanmin(values, initial=np.inf)):
+        axes.set_yscale("log")
+        _plain_numbers(axes.yaxis)
+    else:
+        axes.set_ylim(0.0, 1.15 * max(highest, 1e-9))
+
+
+def _plain_numbers(axis: Axis, *, between: bool = True) -> None:
+    """Numbers at the powers of ten, and ``between`` them."""
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter("{x:g}" if between else NullFormatter())
+    axis.set_tick_params(which="minor", labelsize=6.0)
+
+
+def _named(axes: Axes, panel: _Panel, rows: list[Row], values: Array, errors: Array) -> None:
+    rows_y = np.arange(len(rows))
+    colours = [ORANGE if row.passed is False else BLUE for row in rows]
+    for row_y, value, error, colour in zip(rows_y, values, errors, colours, strict=True):
+        if panel.target is not None:
+            axes.errorbar(value, row_y, xerr=error, fmt="o", color=colour, markersize=5, capsize=2, zorder=3)
+        else:
+            axes.barh(row_y, value, xerr=error, color=colour, height=0.7, error_kw={"ecolor": INK, "elinewidth": 1.0})
+    wide = np.nanmax(values, initial=0.0) > _WIDE_RATIO * np.nanmin(values, initial=np.inf)
+    positive = values[values > 0.0]  # a logarithmic axis has no 0
+    if (wide if panel.log is None else panel.log) and len(positive):
+        axes.set_xscale("log")
+        axes.set_xlim(left=0.6 * float(positive.min()))
+        _plain_numbers(axes.xaxis, between=panel.log is None)
+    axes.set_yticks(rows_y, [row.case for row in rows])
+    axes.set_ylim(len(rows) - 0.4, -0.6)
+    axes.grid(visible=False, axis="y")
+
+
+def _intervals(axes: Axes, rows: list[Row], *, curve: bool) -> None:
+    for row_y, row in enumerate(rows):
+        if row.nees_interval is None:
+            continue
+        at = (row.x or 0.0) if curve else row_y
+        low, high = row.nees_interval
+        ends = ([at, at], [low, high]) if curve else ([low, high], [at, at])
+        axes.plot(*ends, color=GRID, linewidth=7.0, solid_capstyle="butt", zorder=1.2, scalex=False, scaley=False)
+
+
+def _limits(axes: Axes, rows: list[Row]) -> None:
+    """Mark the largest RMSE that is accepted."""
+    for row_y, row in enumerate(rows):
+        if row.limit is None or row.ratio is None or row.rmse_m is None:
+            continue
+        limit_cm = 100.0 * row.rmse_m / row.ratio * row.limit
+        x, y, mark = (limit_cm, row_y, "|") if row.x is None else (row.x, limit_cm, "_")
+        (line,) = axes.plot(x, y, mark, color=RED, markersize=14, markeredgewidth=1.6, linestyle="none", label="limit")
+        axes.legend(handles=[line])
+
+
+def _own_limits(axes: Axes, panel: _Panel, rows: list[Row]) -> None:
+    """Mark what a figure should be at least or at most."""
+    for row_y, row in enumerate(rows):
+        ends = [end for one in row.limits if one.figure == panel.figure for end in (one.least, one.most)]
+        values = [panel.scale * end for end in ends if end is not None]
+        if values:
+            rows_y = [float(row_y)] * len(values)
+            (line,) = axes.plot(values, rows_y, "|", color=RED, markersize=14, markeredgewidth=1.6, label="limit")
+            axes.legend(handles=[line])

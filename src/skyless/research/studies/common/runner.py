@@ -1,0 +1,168 @@
+"""Maps cells over all cores of this machine, or over a Dask cluster; the results are the same."""
+
+import logging
+import multiprocessing
+import os
+import re
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from typing import Any, Final
+
+from skyless.core.errors import SkylessError
+from skyless.core.kernels.processors import cores
+from skyless.research.studies.common.plan import Cell
+
+_POLL_S: Final = 0.2
+_CONNECT_S: Final = 10.0
+
+_ADDRESS: Final = re.compile(r"((tcp|tls|ws|wss)://)?[^\s/]+:\d{1,5}")
+
+Reached = Callable[[float], None]
+
+
+def run_cells(cells: Sequence[Cell], reached: Reached, processes: int | None = None) -> list[Any]:
+    """Results in the order of the cells, computed by ``processes`` processes, by default one for each core.
+
+    ``reached`` is called with the share of the work that is done. An interrupt ends all processes at once.
+
+    Raises:
+        SkylessError: a process died.
+    """
+    with _pool(min(processes or cores(), len(cells))) as pool:
+        try:
+            return _map(pool, cells, reached)
+        except BrokenProcessPool:
+            raise SkylessError(
+                "a process of the study died, killed from outside or for want of memory; nothing was written"
+            ) from None
+
+
+def run_cells_here(cells: Sequence[Cell], reached: Reached) -> list[Any]:
+    """As ``run_cells``, in this process and thread, one after the other."""
+    total_s, done_s, results = sum(cell.weight_s for cell in cells), 0.0, []
+    for cell in cells:
+        results.append(cell.function(cell.argument))
+        done_s += cell.weight_s
+        reached(done_s / total_s)
+    return results
+
+
+def run_cells_on_dask(cells: Sequence[Cell], reached: Reached, scheduler: str) -> list[Any]:
+    """As ``run_cells``, on the workers of a Dask scheduler, which need this version of Skyless.
+
+    Raises:
+        SkylessError: the scheduler cannot be reached, has no workers, or workers failed.
+    """
+    with _cluster(scheduler) as pool:
+        try:
+            return _map(pool, cells, reached)
+        except SkylessError:
+            raise
+        except (CancelledError, Exception) as error:  # noqa: BLE001 - whatever a worker raised, or the network
+            reason = (
+                "the scheduler has gone" if isinstance(error, CancelledError) else str(error) or type(error).__name__
+            )
+            raise SkylessError(
+                f"--scheduler {scheduler}: the cluster failed, nothing was written: {' '.join(reason.split())}"
+            ) from None
+
+
+def _map(pool: Executor, cells: Sequence[Cell], reached: Reached) -> list[Any]:
+    """The longest cells begin first."""
+    order = sorted(range(len(cells)), key=lambda number: -cells[number].weight_s)
+    with _uninterrupted():
+        futures: dict[Future[Any], int] = {
+            pool.submit(cells[number].function, cells[number].argument): number for number in order
+        }
+    total_s = sum(cell.weight_s for cell in cells)
+    done_s, waiting = 0.0, set(futures)
+    while waiting:
+        finished, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
+        for future in finished:
+            future.result()
+            done_s += cells[futures[future]].weight_s
+        reached(done_s / total_s)
+    results = {number: future.result() for future, number in futures.items()}
+    return [results[number] for number in range(len(cells))]
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Hold Ctrl-C back: processes started in the block never get it, only this one, after the block."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+@contextmanager
+def _pool(processes: int) -> Iterator[ProcessPoolExecutor]:
+    """Processes that end when the block is left by an exception, or this process is no more."""
+    context = multiprocessing.get_context("spawn")
+    reader, writer = context.Pipe(duplex=False)
+    pool = ProcessPoolExecutor(processes, context, _start_worker, (reader,))
+    try:
+        yield pool
+    except BaseException:
+        writer.close()
+        pool.shutdown(wait=True, cancel_futures=True)
+        raise
+    else:
+        pool.shutdown()
+    finally:
+        writer.close()
+        reader.close()
+
+
+def _start_worker(parent: Connection) -> None:
+    """End this process as soon as the other end of the pipe is closed, in the middle of a cell if need be."""
+
+    def watch() -> None:
+        try:
+            parent.recv_bytes()
+        except (EOFError, OSError):
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextmanager
+def _cluster(scheduler: str) -> Iterator[Executor]:
+    if not _ADDRESS.fullmatch(scheduler):
+        raise SkylessError(f"--scheduler is {scheduler!r}; it should be an address such as tcp://127.0.0.1:8786")
+    try:
+        from distributed import Client  # noqa: PLC0415 - an extra, and slow to import
+    except ImportError:
+        raise SkylessError("--scheduler needs the package distributed: pip install distributed") from None
+    logging.disable(logging.ERROR)  # what goes wrong is reported once, by an exception
+    try:
+        yield from _connected(Client, scheduler)
+    finally:
+        logging.disable(logging.NOTSET)
+
+
+def _connected(connect: Callable[..., Any], scheduler: str) -> Iterator[Executor]:
+    try:
+        client = connect(scheduler, timeout=_CONNECT_S, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise SkylessError(f"--scheduler is {scheduler!r}, where no Dask scheduler answers: {error}") from None
+    try:
+        if not client.scheduler_info(n_workers=-1)["workers"]:
+            raise SkylessError(f"--scheduler is {scheduler!r}, which has no workers; start some: dask worker _ADDRESS")
+        executor = client.get_executor(pure=False)
+        try:
+            yield executor
+        except BaseException:
+            executor.shutdown(wait=False)
+            raise
+    finally:
+        client.close()

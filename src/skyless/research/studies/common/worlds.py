@@ -1,0 +1,238 @@
+"""Worlds of the studies: a site on the simulated air, its tags judged against the truth; most are the lab.
+
+``run_world`` is the work of one cell; ``worlds`` makes the worlds of a case.
+"""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from itertools import compress
+from typing import Any, Final
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+from scipy.stats import chi2
+
+from skyless.core.air.frame import Malformed
+from skyless.core.fix import Fix
+from skyless.core.integrity import IntegrityRequirement
+from skyless.core.kernels.arrays import Array
+from skyless.core.protocol1.codec import decode_cached, encode
+from skyless.core.site import AnchorSite, Site
+from skyless.core.tag.any_receiver import AnyReceiver
+from skyless.research.studies.common.plan import Plan, seed_of
+from skyless.sim.evaluation.fleet import world_of
+from skyless.sim.evaluation.scenarios import WALL_MARGIN_M, Request, impairments_of, trajectories_of
+from skyless.sim.evaluation.statistics import EvenSample, FirstFixes, LevelCounts, LevelTally
+from skyless.sim.impairments import Impairments
+from skyless.sim.lab import paper_lab_site
+from skyless.sim.streams import stream
+from skyless.sim.trajectory import Trajectory
+
+LAB_WARMUP_S: Final = 4.0
+"""No fix is judged before; cold starts of the lab take a tenth of a second, those with 90 % loss some seconds."""
+
+_LARGE_LAB_SCALE: Final = 2.5
+
+_OUTSIDE: Final = 0.999
+"""Probability of the ellipse outside of which fixes are counted."""
+
+_SAMPLE_ROWS: Final = 1 << 13
+
+_LOSS_KEY: Final = 3
+"""Of the stream of random numbers, next to those of the simulated world."""
+
+
+class Run(Struct, frozen=True):
+    """A world, and how its tags compute."""
+
+    site: Site
+    trajectories: tuple[Trajectory, ...]
+    impairments: Impairments
+    seed: int
+    method: str
+    qa: float
+    mesh: bool
+    warmup_s: float
+    """True time before which no fix is judged."""
+    until_s: float
+    lost_at_tags: float = 0.0
+    """Probability that a tag does not hear a message which anchors may well hear."""
+    integrity: IntegrityRequirement = IntegrityRequirement()
+
+
+class RunResult(Struct, frozen=True):
+    """Sums over the judged fixes of a world: of each tag the first of every superframe."""
+
+    fixes: int
+    superframes: int
+    """Of all tags together, with a fix or without."""
+    squared_m2: float
+    """Sum of squared errors; as all of these horizontal where the height is given."""
+    variance_m2: float
+    """Sum of the traces of the fixes' covariances."""
+    nees: float
+    """Sum of the normalised errors squared over their degrees of freedom."""
+    outside: int
+    max_m: float
+    sample_m: Array
+    """Errors, an even sample of them."""
+    messages: int
+    """Heard by all tags."""
+    tag_s: float
+    """Seconds of all tags together."""
+    cpu_s: float
+    """That the tags took, measured."""
+    levels: LevelCounts | None = None
+    """None for methods that give no protection levels."""
+
+
+class _Tally:
+    """Sums over the judged fixes of a world."""
+
+    def __init__(self, run: Run) -> None:
+        tags = len(run.trajectories)
+        self._first_fixes = FirstFixes(run.site, tags)
+        self._from_s = run.warmup_s
+        self._dim = 2 if run.site.tags.height_m is not None else 3
+        self._outside_chi2 = float(chi2.ppf(_OUTSIDE, self._dim))
+        self._sums = np.zeros(4)
+        self._max_m = 0.0
+        self._sample = EvenSample(1, _SAMPLE_ROWS)
+        self._levels = LevelTally(tags, _SAMPLE_ROWS)
+        superframe_s = self._first_fixes.superframe_s
+        self._superframes = (math.ceil(run.until_s / superframe_s - 1e-3) - int(run.warmup_s / superframe_s)) * tags
+
+    def add(self, tag: int, time_s: float, fix: Fix, truth_m: Array) -> None:
+        if time_s < self._from_s or not self._first_fixes.is_first(tag, time_s):
+            return
+        error_m = fix.position_m - truth_m
+        self._levels.add(tag, fix, error_m)
+        error = error_m[: self._dim]
+        covariance = fix.covariance_m2[: self._dim, : self._dim]
+        squared = float(error @ error)
+        nees = float(error @ np.linalg.solve(covariance, error))
+        self._sums += (squared, float(np.trace(covariance)), nees / self._dim, nees > self._outside_chi2)
+        self._max_m = max(self._max_m, squared**0.5)
+        self._sample.add((squared**0.5,))
+
+    def result(self, messages: int, tag_s: float, cpu_s: float) -> RunResult:
+        squared_m2, variance_m2, nees, outside = self._sums.tolist()
+        return RunResult(
+            fixes=self._sample.seen,
+            superframes=self._superframes,
+            squared_m2=squared_m2,
+            variance_m2=variance_m2,
+            nees=nees,
+            outside=int(outside),
+            max_m=self._max_m,
+            sample_m=self._sample.rows[:, 0],
+            messages=messages,
+            tag_s=tag_s,
+            cpu_s=cpu_s,
+            levels=self._levels.counts(),
+        )
+
+
+def run_world(run: Run) -> RunResult:
+    """Run a world and judge its tags."""
+    world = world_of(run.site, run.trajectories, run.impairments, run.seed)
+    receivers = [AnyReceiver(run.method, qa=run.qa, integrity=run.integrity) for _ in run.trajectories]
+    tally, messages, cpu_s = _Tally(run), 0, 0.0
+    draw = stream(run.seed, _LOSS_KEY, 0)
+    for broadcast in world.run(run.until_s):
+        if not run.mesh:
+            broadcast.frame = without_mesh(broadcast.frame)
+        receptions = list(broadcast.receptions())
+        if run.lost_at_tags:
+            receptions = list(compress(receptions, draw.random(len(receptions)) >= run.lost_at_tags))
+        begun_s = time.thread_time()
+        fixes = [receivers[tag].hear(reception) for tag, reception, _ in receptions]
+        cpu_s += time.thread_time() - begun_s
+        messages += len(receptions)
+        for (tag, _, truth_m), fix in zip(receptions, fixes, strict=True):
+            if fix is not None:
+                tally.add(tag, broadcast.end_s, fix, truth_m)
+    return tally.result(messages, run.until_s * len(receivers), cpu_s)
+
+
+@lru_cache(64)
+def without_mesh(frame: bytes) -> bytes:
+    """The same beacon from an anchor that relays nothing but when it heard the master."""
+    beacon = decode_cached(frame)
+    return frame if isinstance(beacon, Malformed) else encode(replace(beacon, heard=()))
+
+
+def large_lab_site(noise_ps: float) -> Site:
+    """The lab at 15 m × 20 m: space for 5 m/s, and the same dilution of precision at the corresponding positions."""
+    lab = paper_lab_site(noise_ps)
+    anchors = tuple(replace(one, x_m=_LARGE_LAB_SCALE * one.x_m, y_m=_LARGE_LAB_SCALE * one.y_m) for one in lab.anchors)
+    return replace(lab, name="hall", anchors=anchors)
+
+
+def walking(plan: Plan, site: Site | None = None, **options: Any) -> tuple[Run, ...]:  # noqa: ANN401 - of ``worlds``
+    """Worlds of the lab, or another site, with tags that walk at 1 m/s from point to point."""
+    in_site = site or paper_lab_site(plan.noise_ps)
+
+    def paths(seed: int) -> Sequence[Trajectory]:
+        return trajectories_of(Request(in_site, seed=seed, tags=plan.tags))
+
+    return worlds(plan, in_site, paths, **options)
+
+
+def worlds(
+    plan: Plan,
+    site: Site,
+    paths: Callable[[int], Sequence[Trajectory]],
+    *,
+    assumed: Site | None = None,
+    change: Callable[[Impairments], Impairments] | None = None,
+    warmup_s: float = LAB_WARMUP_S,
+    seconds: float | None = None,
+    count: int | None = None,
+    lost_at_tags: float = 0.0,
+    integrity: IntegrityRequirement = IntegrityRequirement(),  # noqa: B008 - a frozen value
+    **faults: Any,  # noqa: ANN401 - of a Request
+) -> tuple[Run, ...]:
+    """Worlds of a case; those of the same number have the same seed in all cases of a study.
+
+    ``paths`` gets a world's seed. Crystals and stamps have the noise of ``site``; the filters assume that of
+    ``assumed``, where it is given. ``faults`` are fields of a ``Request``, or functions of the world's number that
+    return them; ``change`` is for impairments that a request has no field for.
+    """
+    runs = []
+    for number in range(count or plan.worlds):
+        seed = seed_of(plan.seed, number)
+        own = {name: fault(number) if callable(fault) else fault for name, fault in faults.items()}
+        impairments = impairments_of(Request(site, seed=seed, **own), site)
+        runs.append(
+            Run(
+                site=assumed or site,
+                trajectories=tuple(paths(seed)),
+                impairments=impairments if change is None else change(impairments),
+                seed=seed,
+                method=plan.method,
+                qa=plan.qa,
+                mesh=plan.mesh,
+                warmup_s=warmup_s,
+                until_s=warmup_s + (seconds or plan.seconds),
+                lost_at_tags=lost_at_tags,
+                integrity=integrity,
+            )
+        )
+    return tuple(runs)
+
+
+def box(site: Site) -> tuple[Array, Array]:
+    """Lowest and highest corner of the space in which tags move, shape (3,): half a metre within the anchors."""
+    anchors_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
+    low_m, high_m = anchors_m.min(axis=0) + WALL_MARGIN_M, anchors_m.max(axis=0) - WALL_MARGIN_M
+    low_m[2] = high_m[2] = site.tags.height_m or 0.0
+    return low_m, high_m
+
+
+def anchor_of(site: Site, number: int) -> AnchorSite:
+    """Another anchor for each world in turn, the master among them."""
+    return site.anchors[number % len(site.anchors)]

@@ -1,0 +1,400 @@
+"""The study ``integrity``: whether ``joint``'s protection levels hold while one anchor's packets are late.
+
+Matched episodes of the filter itself, as in ``efficiency``. In the middle of each, the tag's receptions of one anchor
+drawn by chance become late, at once or more and more, or wrong in other ways (``Fault``). Every fix from then on is an
+epoch. Misleading is an epoch whose error exceeds the level that the fix gives; available is one that gives a level.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from itertools import groupby
+from typing import Any, Final, Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from msgspec import Struct
+from msgspec.structs import replace
+from numpy.random import Generator, SeedSequence, default_rng
+from numpy.typing import NDArray
+
+from skyless.core.constants import TICK_M
+from skyless.core.errors import SkylessError
+from skyless.core.estimator.estimator import ACCEPTED, JOINED, Estimator, Packets
+from skyless.core.estimator.levels import LEVELS
+from skyless.core.integrity import CONTRADICTED, HPL, VPL
+from skyless.core.kernels.arrays import Array
+from skyless.research.studies.common.picture import (
+    MIN_DRAWN_SHARE,
+    STATED_RISK,
+    Sides,
+    centimetres,
+    name_sides,
+    shade_sides,
+)
+from skyless.research.studies.common.plan import Cell, Plan, Row
+from skyless.research.studies.common.summary import clustered_interval
+from skyless.research.studies.episodes import (
+    EPISODE_SPEED_STD_MPS,
+    EPISODE_SUPERFRAMES,
+    Case,
+    Episode,
+    draw_episode,
+    settings_of,
+)
+from skyless.sim.lab import paper_lab_site
+from skyless.site.report.figures import BLUE, GREEN, INK, MUTED, ORANGE, PURPLE, RED, report_style
+
+_ONSETS: Final = (40, 67)
+"""Superframes between which the fault begins; the filter has settled long before."""
+
+_START_STD_M: Final = 0.3
+_CHUNK_EPISODES: Final = 50
+_EPISODE_COST_S: Final = 0.008
+"""About what an episode takes."""
+
+_MIN_LARGEST: Final = 100
+"""A chunk returns at least this number of its largest errors, and ten times its epochs times the risk."""
+
+_OUTCOME, _SOUNDNESS = LEVELS, LEVELS + 1
+"""Columns after the levels: the outcome of a packet, and how sound the position is."""
+
+MAX_LEVEL_RATIO: Final = 1.5
+ALL_FAULTS: Final = "all faults"
+
+_CORNERS_M: Final = ((0, 0), (4, 0), (8, 0), (8, 3), (8, 6), (4, 6), (0, 6), (0, 3))
+
+Kind = Literal["step", "ramp", "early", "bursts", "delay"]
+
+_SIZES_M: Final = (0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0)
+_FEW_SIZES_M: Final = (0.1, 0.3, 1.5)
+
+_RAMP_S: Final = 1.0
+FAULT_BURST_S: Final = 0.25
+
+_WORDS: Final[dict[Kind, str]] = {
+    "step": "step",
+    "ramp": "ramp to",
+    "early": "early by",
+    "bursts": "bursts of",
+    "delay": "TX delay",
+}
+
+_WIDTH_IN: Final = 4.4
+_HEIGHT_IN: Final = 3.0
+_COLOURS: Final = (BLUE, ORANGE, GREEN, PURPLE, RED, INK)
+
+_LEVELS: Final = Sides("RMSE near or above the level: too confident", "level far above the RMSE: safe side", "above")
+
+
+class IntegrityRow(Row, frozen=True, kw_only=True):
+    """Results of the episodes of a fault."""
+
+    risk: float
+    """Stated probability that a fix's error exceeds its protection level."""
+    hmi: float
+    """Share of fixes whose horizontal error does, while they promise a level."""
+    hmi_interval: tuple[float, float]
+    """Where that share truly lies, with 99 %."""
+    hmi_vertical: float | None = None
+    hmi_vertical_interval: tuple[float, float] | None = None
+    hpl_m: float | None = None
+    """Horizontal level of the fixes that promise one: mean of the chunks' medians."""
+    vpl_m: float | None = None
+    smallest_m: float
+    """Horizontal error that the share ``risk`` of fixes exceeds, with or without a level."""
+
+
+_Values = Callable[[IntegrityRow], float | None]
+
+
+class Fault(Struct, frozen=True):
+    """What is wrong with one anchor in all episodes of a case: late or early messages, or wrong delays."""
+
+    scene: str
+    """``lab``, with the height given, or ``room``, where it is a state."""
+    size_m: float = 0.0
+    kind: Kind = "step"
+    """From the onset on the tag's receptions are late (step), more and more for a second (ramp), early, or late every
+    other quarter of a second (bursts); or all receptions of the anchor are, as its antenna delay is wrong (delay)."""
+
+    @property
+    def name(self) -> str:
+        """The name of its row."""
+        return f"{self.scene}, clean" if self.size_m == 0.0 else f"{self.scene}, {_WORDS[self.kind]} {self.size_m:g} m"
+
+    @property
+    def series(self) -> str:
+        """Faults that differ by nothing but their size."""
+        return f"{self.scene}, {_WORDS[self.kind].split()[0] if self.kind != 'delay' else 'TX delay'}"
+
+
+FAULTS: Final = tuple(
+    fault
+    for scene in ("lab", "room")
+    for fault in (
+        Fault(scene),
+        *(Fault(scene, size_m, kind) for kind in ("step", "ramp") for size_m in _SIZES_M),
+        *(Fault(scene, size_m, kind) for kind in ("early", "bursts", "delay") for size_m in _FEW_SIZES_M),
+    )
+)
+
+
+def faulty(episode: Episode, fault: Fault, anchor: int, onset: int, slot_s: float) -> Packets:
+    """The episode's packets with the anchor's fault, from the packet ``onset`` on."""
+    packets = episode.packets
+    size = fault.size_m / TICK_M
+    share = _share((np.arange(len(packets.anchors)) - onset) * slot_s, fault.kind)
+    late = np.where(packets.anchors == anchor, np.rint(size * share), 0.0).astype(np.int64)
+    relays = packets.relays
+    if fault.kind == "delay":
+        begun = packets.sequences[onset]  # an episode is shorter than sequence numbers take to come around
+        heard_late = (relays[:, 1] == anchor) & (relays[:, 2] >= begun)
+        relays = relays.copy()
+        relays[heard_late, 3] += round(size)
+    return replace(packets, rx_ticks=packets.rx_ticks + late, relays=relays)
+
+
+def _share(since_s: NDArray[np.floating[Any]], kind: Kind) -> Array:
+    """How much of the fault there is, from −1 to 1."""
+    if kind == "ramp":
+        return np.asarray(np.clip(since_s / _RAMP_S, 0.0, 1.0), np.float64)
+    on = since_s >= 0.0
+    if kind == "bursts":
+        on &= since_s % (2.0 * FAULT_BURST_S) < FAULT_BURST_S
+    return np.where(on, -1.0 if kind == "early" else 1.0, 0.0)
+
+
+class Setting(Struct, frozen=True):
+    """What all episodes of a row have in common."""
+
+    case: Case
+    fault: Fault
+    risk: float
+    alert_limit_m: float | None = None
+    """Fixes with a higher level count as not available."""
+
+
+class Chunk(Struct, frozen=True):
+    """Results of the episodes of a chunk."""
+
+    counts: Array
+    """Of each episode the fixes, those with a level, misleading ones (horizontal, vertical), shape (episodes, 4)."""
+    squared_m2: float
+    """Sum of the squared horizontal errors."""
+    medians_m: tuple[float, float] | None
+    """Of both levels; None where no fix has one."""
+    top: Array
+    """The largest horizontal errors over their levels."""
+    errors_m: Array
+    """The largest horizontal errors."""
+
+
+def anchors_of(scene: str) -> Array:
+    """Positions, shape (n, 3), in a frame in which tags walk at height 0."""
+    if scene == "lab":
+        return np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in paper_lab_site().anchors])
+    return np.array([(x, y, 1.3 if k % 2 else -0.7) for k, (x, y) in enumerate(_CORNERS_M)], float)
+
+
+def cells(plan: Plan) -> list[Cell]:
+    """Episodes in chunks.
+
+    Raises:
+        SkylessError: the method gives no protection levels.
+    """
+    if plan.method != "joint":
+        raise SkylessError(f"--method is {plan.method!r}; protection levels are given by joint")
+    case = Case(plan.noise_ps, qa=plan.qa, mesh=plan.mesh)
+    seeds = SeedSequence(plan.seed).spawn(len(FAULTS))
+    found = []
+    for fault, seed in zip(FAULTS, seeds, strict=True):
+        setting = Setting(case, fault, plan.integrity_risk, plan.alert_limit_m)
+        own = tuple(seed.spawn(plan.episodes))
+        parts = [own[first : first + _CHUNK_EPISODES] for first in range(0, plan.episodes, _CHUNK_EPISODES)]
+        found += [Cell(fault.name, run_chunk, (setting, part), _EPISODE_COST_S * len(part)) for part in parts]
+    return found
+
+
+def run_chunk(argument: tuple[Setting, tuple[SeedSequence, ...]]) -> Chunk:
+    """Run some episodes."""
+    setting, seeds = argument
+    episodes = [_run(setting, default_rng(seed)) for seed in seeds]
+    counts = [
+        (len(across), available.sum(), (available & (across > hpl)).sum(), (available & (above > vpl)).sum())
+        for across, above, hpl, vpl, available in episodes
+    ]
+    across, _, hpl, vpl, available = (np.concatenate(part) for part in zip(*episodes, strict=True))
+    most = max(_MIN_LARGEST, int(10.0 * setting.risk * len(across)))
+    return Chunk(
+        counts=np.array(counts, float),
+        squared_m2=float(across @ across),
+        medians_m=(float(np.median(hpl[available])), float(np.median(vpl[available]))) if available.any() else None,
+        top=np.sort(across[available] / hpl[available])[-most:],
+        errors_m=np.sort(across)[-most:],
+    )
+
+
+def _run(setting: Setting, draw: Generator) -> tuple[NDArray[Any], ...]:
+    """Horizontal and vertical errors, both levels, and whether they are available, of all fixes since the onset."""
+    anchors_m, slot_s = anchors_of(setting.fault.scene), paper_lab_site().schedule.slot_s
+    episode = draw_episode(draw, anchors_m, slot_s, setting.case, EPISODE_SUPERFRAMES)
+    onset = int(draw.integers(*_ONSETS)) * len(anchors_m)
+    packets = faulty(episode, setting.fault, int(draw.integers(len(anchors_m))), onset, slot_s)
+    motions, levels = _filtered(setting, anchors_m, packets, episode.path_m[0] + draw.normal(0.0, _START_STD_M, 3))
+    fixes = np.flatnonzero(np.isin(levels[onset:, _OUTCOME], (ACCEPTED, JOINED))) + onset
+    errors, given = np.zeros((len(fixes), 3)), levels[fixes]
+    dim = motions.shape[1] // 2
+    errors[:, :dim] = motions[fixes, :dim] - episode.path_m[fixes, :dim]
+    vpl = given[:, VPL] if dim == 3 else np.full(len(fixes), np.inf)
+    available = given[:, _SOUNDNESS] < CONTRADICTED
+    if setting.alert_limit_m is not None:
+        available &= given[:, HPL] <= setting.alert_limit_m
+    return np.hypot(errors[:, 0], errors[:, 1]), np.abs(errors[:, 2]), given[:, HPL], vpl, available
+
+
+def _filtered(setting: Setting, anchors_m: Array, packets: Packets, start_m: Array) -> tuple[Array, Array]:
+    """Motions and levels after every packet."""
+    height_m = 0.0 if setting.fault.scene == "lab" else None
+    settings = replace(settings_of(setting.case, height_m), integrity_risk=setting.risk)
+    estimator = Estimator(settings, anchors_m)
+    dim, n = estimator.dim, len(packets.anchors)
+    estimator.start(int(packets.rx_ticks[0]), start_m[:dim], _START_STD_M**2 * np.eye(dim), EPISODE_SPEED_STD_MPS**2)
+    motions, levels = np.empty((n, 2 * dim)), np.zeros((n, LEVELS + 2))
+    estimator.track(packets, motions, levels=levels)
+    return motions, levels
+
+
+def rows(plan: Plan, results: Sequence[Any]) -> list[IntegrityRow]:
+    """A row for each fault, and one for all together; the results stand in the order of ``cells``."""
+    each = -(-plan.episodes // _CHUNK_EPISODES)
+    parts = [results[each * number : each * (number + 1)] for number in range(len(FAULTS))]
+    single = [_row(plan, fault, chunks) for fault, chunks in zip(FAULTS, parts, strict=True)]
+    wrong = [chunk for fault, chunks in zip(FAULTS, parts, strict=True) if fault.size_m > 0.0 for chunk in chunks]
+    return [*single, _pooled(plan, ALL_FAULTS, ALL_FAULTS, None, wrong)]
+
+
+def _row(plan: Plan, fault: Fault, chunks: Sequence[Chunk]) -> IntegrityRow:
+    row = _pooled(plan, fault.name, fault.series, fault.size_m, chunks, vertical=fault.scene == "room")
+    if fault.size_m > 0.0:
+        return row
+    ratio = 1.0 / _quantile([chunk.top for chunk in chunks], plan.integrity_risk, row.fixes)
+    passed = bool(row.passed) and ratio <= MAX_LEVEL_RATIO
+    return replace(row, ratio=ratio, limit=MAX_LEVEL_RATIO, passed=passed)
+
+
+def _pooled(
+    plan: Plan, case: str, series: str, x: float | None, chunks: Sequence[Chunk], *, vertical: bool = False
+) -> IntegrityRow:
+    """A row of some chunks; it passes unless the risk lies below the interval."""
+    counts = np.concatenate([chunk.counts for chunk in chunks])
+    epochs, available = int(counts[:, 0].sum()), float(counts[:, 1].sum())
+    intervals = [clustered_interval(counts[:, column], epochs) for column in (2, 3)]
+    medians = np.array([chunk.medians_m for chunk in chunks if chunk.medians_m is not None])
+    hpl_m, vpl_m = medians.mean(axis=0).tolist() if len(medians) else (None, None)
+    return IntegrityRow(
+        study="integrity",
+        method=plan.method,
+        case=case,
+        series=series,
+        x=x,
+        mesh=plan.mesh,
+        noise_ps=plan.noise_ps,
+        runs=len(counts),
+        fixes=epochs,
+        rmse_m=float(np.sqrt(sum(chunk.squared_m2 for chunk in chunks) / epochs)),
+        max_m=float(max(chunk.errors_m[-1] for chunk in chunks)),
+        available=available / epochs,
+        passed=all(low <= plan.integrity_risk for low, _ in intervals),
+        risk=plan.integrity_risk,
+        hmi=float(counts[:, 2].sum()) / epochs,
+        hmi_interval=intervals[0],
+        hmi_vertical=float(counts[:, 3].sum()) / epochs if vertical else None,
+        hmi_vertical_interval=intervals[1] if vertical else None,
+        hpl_m=hpl_m,
+        vpl_m=vpl_m if vertical else None,
+        smallest_m=_quantile([chunk.errors_m for chunk in chunks], plan.integrity_risk, epochs),
+    )
+
+
+def _quantile(largest: Sequence[Array], risk: float, count: float) -> float:
+    """The value that the share ``risk`` of ``count`` values exceeds, from the largest of each chunk."""
+    values = np.sort(np.concatenate(largest))
+    return float(values[-max(int(np.ceil(risk * count)), 1)])
+
+
+def draw(rows: Sequence[IntegrityRow]) -> Figure:
+    """A line of panels for each scene, with a curve for each kind of fault."""
+    single = [row for row in rows if row.x is not None]
+    scenes = {scene: list(group) for scene, group in groupby(single, key=_scene)}
+    with report_style():
+        figure = Figure(figsize=(3.0 * _WIDTH_IN, _HEIGHT_IN * len(scenes) + 0.5), layout="constrained")
+        figure.suptitle("One faulty anchor: joint, simulated", x=0.01, ha="left", fontsize=11.0)
+        grid = figure.subplots(len(scenes), 3, squeeze=False)
+        for line, (scene, group) in zip(grid, scenes.items(), strict=True):
+            _fill(line, group)
+            line[0].set_title(scene, loc="left")
+        grid[0, 1].legend(loc="lower right")
+    return figure
+
+
+def _scene(row: IntegrityRow) -> str:
+    return row.case.partition(",")[0]
+
+
+def _fill(line: Sequence[Axes], rows: list[IntegrityRow]) -> None:
+    levels, available, misleading = line
+    faulty = [row for row in rows if row.x]
+    for colour, (series, group) in zip(_COLOURS, groupby(faulty, key=lambda row: row.series), strict=False):
+        of_kind = list(group)
+        name = series.partition(", ")[2]
+        _curve(levels, of_kind, lambda row: centimetres(row.hpl_m), colour, "-", name)
+        _curve(levels, of_kind, lambda row: centimetres(row.rmse_m), colour, ":", None)
+        _curve(available, of_kind, lambda row: 100.0 * (row.available or 0.0), colour, "-", name)
+        _shares(misleading, of_kind, colour)
+    for row in rows:
+        if not row.x and row.hpl_m is not None:
+            levels.axhline(100.0 * row.hpl_m, color=MUTED, linewidth=1.0, linestyle="--", zorder=1.5)
+    levels.set(ylabel="median HPL (—), RMSE (···) in cm; clean: - -", yscale="log")
+    levels.yaxis.set_major_formatter("{x:g}")
+    levels.yaxis.set_minor_formatter("{x:g}")
+    levels.tick_params(axis="y", which="minor", labelsize=6.0)
+    available.set(ylabel="fixes with a level, %", ylim=(0.0, 103.0))
+    misleading.axhline(rows[0].risk, color=MUTED, linewidth=1.0, linestyle="--", zorder=1.5)
+    misleading.set(
+        ylabel="misleading, with 99 % interval; stated risk: - -", yscale="log", ylim=(0.7 * MIN_DRAWN_SHARE, None)
+    )
+    for axes in line:
+        axes.set(xlabel="size of the fault in m", xscale="log")
+        axes.xaxis.set_major_formatter("{x:g}")
+    name_sides(levels, _LEVELS, along="y")
+    shade_sides(misleading, STATED_RISK, rows[0].risk, along="y")
+
+
+def _numbers(values: Iterable[float | None]) -> list[float]:
+    return [np.nan if value is None else value for value in values]
+
+
+def _curve(axes: Axes, rows: list[IntegrityRow], value: _Values, colour: str, line: str, name: str | None) -> None:
+    axes.plot(
+        _numbers(row.x for row in rows),
+        _numbers(map(value, rows)),
+        line,
+        marker="o",
+        markersize=3.5,
+        color=colour,
+        label=name,
+    )
+
+
+def _shares(axes: Axes, rows: list[IntegrityRow], colour: str) -> None:
+    for row in rows:
+        share, (low, high) = max(row.hmi, MIN_DRAWN_SHARE), row.hmi_interval
+        size_m = row.x or 0.0
+        axes.plot(
+            [size_m, size_m],
+            [max(low, MIN_DRAWN_SHARE), max(high, MIN_DRAWN_SHARE)],
+            color=colour,
+            linewidth=1.0,
+            alpha=0.6,
+        )
+        axes.plot(size_m, share, "o", color=colour, markersize=3.5)

@@ -1,0 +1,422 @@
+"""The study ``large``: tags that walk through a site of a thousand anchors without a master (protocol 2).
+
+What anchors send and receive is simulated on demand (``simulation/cells``); each tag gets the beacons that it receives,
+and nothing else. Nothing that keeps time for the site is on the air.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+
+from skyless.core.air.beacon import Beacon
+from skyless.core.air.reception import Reception
+from skyless.core.fix import Fix
+from skyless.core.kernels.arrays import Array, Integers, Mask
+from skyless.core.site import EXACT, AccuracySite, Site
+from skyless.core.tag.joint import Estimation
+from skyless.core.tag.receiver import Receiver
+from skyless.research.studies.common.plan import Cell, Limit, Plan, Row, seed_of, with_limits
+from skyless.research.studies.common.summary import interval, jackknife
+from skyless.research.uncertainty.bounds import Biases, BoundSettings, Sendings, received_bound
+from skyless.sim.cells.world import CellWorld, TagReceptions, anchors_of
+from skyless.sim.evaluation.cell_fleet import SiteBeacons, period_codes_of
+from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3, Room
+from skyless.sim.impairments import Impairments
+from skyless.sim.range_errors import RangeErrorModel
+from skyless.sim.trajectory import Roaming, Trajectory, Waypoints
+from skyless.site.channel import ChannelModel
+from skyless.site.file.template import grid_site
+
+_SIDE: Final = 32
+"""Anchors along each side of the square: 1,024 in all."""
+
+_HEIGHT_M: Final = 4.0
+_TAG_HEIGHT_M: Final = 1.0
+_WALK_MPS: Final = 1.4
+_EDGE_M: Final = 40.0
+"""Tags stay this far inside of the outermost anchors."""
+
+_LEG_M: Final = (40.0, 100.0)
+"""From point to point; tags that drive go farther."""
+
+_POINTS: Final = 40
+"""Of a path, after which a tag comes back to the first."""
+
+_CORNER_S: Final = 2.0
+_SETTLED_S: Final = 2.0
+"""After a tag's first fix, from when on it is judged."""
+
+_SPAN_S: Final = 0.5
+_ROAM_STD_M: Final = 6.0
+"""Of tags whose motion is that which the bound assumes, along each axis."""
+
+_BOUND_S: Final = 12.0
+_ROOM: Final = Room()
+
+_TAG_COST_S: Final = 0.02
+"""About what a second of a tag takes."""
+
+_PATH_KEY: Final = 41
+
+
+class LargeCase(Struct, frozen=True):
+    """One kind of site and of tags."""
+
+    name: str
+    series: str
+    spacing_m: float = 15.0
+    in_room: bool = False
+    bounded: bool = False
+    """Whether tags move as the bound assumes, and it is computed."""
+    speed_mps: float = _WALK_MPS
+    loss: float = 0.0
+    dead_share: float = 0.0
+    seconds: float | None = None
+    """None: as of the plan."""
+    starts: bool = False
+    """Whether only cold starts are judged."""
+    limits: tuple[Limit, ...] = ()
+
+
+def cases(plan: Plan) -> list[LargeCase]:
+    """Sites and tags; limits stand where the issue of protocol 2 has figures."""
+    errors = (Limit("rmse_m", most=0.027), Limit("nees", 0.6, 1.2), Limit("restarts", most=0.0))
+    walk = (*errors, Limit("beacons_per_s", least=140.0), Limit("gap_s", most=0.15))
+    roaming = 60.0 if plan.quick else 1100.0
+    start = (Limit("first_fix_s", most=0.3),)
+    return [
+        LargeCase("random instants", "walking", limits=walk),
+        LargeCase("7 m apart", "walking", spacing_m=7.0),
+        LargeCase("5 m/s through the whole site", "walking", speed_mps=5.0, seconds=roaming, limits=errors),
+        LargeCase("30 % lost", "walking", loss=0.3),
+        LargeCase("20 % of the anchors dead", "walking", dead_share=0.2),
+        LargeCase("exact ranges, bounded", "bounds", bounded=True),
+        LargeCase("room", "bounds", in_room=True, bounded=True, limits=(Limit("ratio", most=1.2),)),
+        LargeCase("cold starts", "cold starts", starts=True, limits=start),
+        LargeCase("cold starts, room", "cold starts", in_room=True, starts=True, limits=start),
+        LargeCase(
+            "cold starts, 7 m apart", "cold starts", spacing_m=7.0, starts=True,
+            limits=(Limit("first_fix_s", most=0.5),),
+        ),
+    ]  # fmt: skip
+
+
+class LargeRow(Row, frozen=True, kw_only=True):
+    """Results of the tags of a case."""
+
+    beacons_per_s: float | None = None
+    """That a tag receives."""
+    first_fix_s: float
+    """From a tag's first beacon to its first fix, which 95 % of the tags do not exceed."""
+    gap_s: float | None = None
+    """Longest time between two fixes."""
+    joins: int | None = None
+    """How often an anchor joined those in use."""
+    restarts: int | None = None
+    """How often a tag had to begin again."""
+
+
+class LargeRun(Struct, frozen=True):
+    """The tags of one cell."""
+
+    case: LargeCase
+    plan: Plan
+    number: int
+    tags: int
+
+
+class LargeResult(Struct, frozen=True):
+    """What they did; sums over fixes."""
+
+    fixes: int
+    squared_m2: float
+    nees: float
+    variance_m2: float
+    errors_m: Array
+    bound_m2: float
+    """Sum of the bound's variances at the same fixes; 0 where there is none."""
+    beacons: int
+    tag_s: float
+    gap_s: float
+    first_fix_s: tuple[float, ...]
+    """From each tag's first beacon to its first fix; infinite where there was none."""
+    joins: int
+    restarts: int
+
+
+@lru_cache(maxsize=4)
+def site_of(case: LargeCase) -> Site:
+    """A square of anchors under one ceiling, as its planner makes it."""
+    side_m = _SIDE * case.spacing_m
+    site = grid_site(side_m, side_m, case.spacing_m, _HEIGHT_M, _TAG_HEIGHT_M)
+    return replace(site, accuracy=AccuracySite() if case.in_room else EXACT)
+
+
+def paths(run: LargeRun) -> list[Trajectory]:
+    """Where the tags of a cell go."""
+    draw = np.random.default_rng(seed_of(run.plan.seed, _PATH_KEY, run.number))
+    side_m = _SIDE * run.case.spacing_m
+    low_m, high_m = min(_EDGE_M, side_m / 4.0), side_m - min(_EDGE_M, side_m / 4.0)
+    return [_path(run.case, draw, low_m, high_m) for _ in range(run.tags)]
+
+
+def _path(case: LargeCase, draw: np.random.Generator, low_m: float, high_m: float) -> Trajectory:
+    if case.bounded or case.starts:
+        middle_m = [*draw.uniform(low_m, high_m, 2), _TAG_HEIGHT_M]
+        std_m = (_ROAM_STD_M, _ROAM_STD_M, 0.0)
+        return Roaming(middle_m, std_m, qa_m2ps3=ROOM_QA_M2PS3, seed=int(draw.integers(2**62)))
+    points, longest_m = [draw.uniform(low_m, high_m, 2)], _LEG_M[1] if case.speed_mps <= _WALK_MPS else math.inf
+    while len(points) < _POINTS or np.linalg.norm(points[0] - points[-1]) < _LEG_M[0]:
+        point = draw.uniform(low_m, high_m, 2)
+        if _LEG_M[0] <= np.linalg.norm(point - points[-1]) <= longest_m:
+            points.append(point)
+    points_m = [(x_m, y_m, _TAG_HEIGHT_M) for x_m, y_m in points]
+    return Waypoints(points_m, case.speed_mps, loop=True, corner_s=_CORNER_S)
+
+
+def world_of_cells(run: LargeRun) -> CellWorld:
+    """The site on the air, and the tags of a cell in it."""
+    case, plan, site = run.case, run.plan, site_of(run.case)
+    draw = np.random.default_rng(seed_of(plan.seed, _PATH_KEY, run.number, 1))
+    impairments = Impairments(
+        tx_stamp_ps=plan.noise_ps,
+        rx_stamp_ps=plan.noise_ps,
+        channel=ChannelModel(loss_probability=case.loss),
+        range_errors=_ROOM.ranges if case.in_room else RangeErrorModel(),
+    )
+    return CellWorld(
+        anchors_of(site),
+        period_codes_of(site),
+        paths(run),
+        impairments,
+        seed_of(plan.seed, _PATH_KEY, run.number, 2) >> 1,
+        dead=(draw.random(len(site.anchors)) < case.dead_share).tolist(),
+        survey_std_m=_ROOM.axis_std_m if case.in_room else 0.0,
+    )
+
+
+def run_large(run: LargeRun) -> LargeResult:
+    """Simulate the tags of a cell, and judge their fixes."""
+    world, site = world_of_cells(run), site_of(run.case)
+    return _sum([_judge_tag(run, site, world, tag) for tag in range(run.tags)])
+
+
+def _judge_tag(run: LargeRun, site: Site, world: CellWorld, tag: int) -> LargeResult:
+    case, plan = run.case, run.plan
+    seconds = 1.0 if case.starts else _BOUND_S if case.bounded else case.seconds or plan.seconds
+    begin_s = float(np.random.default_rng(seed_of(plan.seed, run.number, tag)).uniform(1.0, 20.0))
+    log, beacons = _TagLog(Receiver(qa=plan.qa)), SiteBeacons(site)
+    spans: list[TagReceptions] = []
+    at_s = begin_s
+    while at_s < begin_s + seconds and not (case.starts and log.first_fix_s is not None):
+        received = world.receptions(tag, at_s, min(at_s + _SPAN_S, begin_s + seconds))
+        for beacon, reception, row in beacons.received(received):
+            log.add(beacon, reception, received, row)
+        if case.bounded:
+            spans.append(received)
+        at_s += _SPAN_S
+    bounds = _bound_m2(world, site, spans, case, plan) if case.bounded else np.zeros(0)
+    return log.result(seconds, bounds)
+
+
+class _TagLog:
+    """One tag, and what it did."""
+
+    def __init__(self, receiver: Receiver) -> None:
+        self._receiver = receiver
+        self._first_beacon_s: float | None = None
+        self.first_fix_s: float | None = None
+        self._last_fix_s = 0.0
+        self._gap_s = 0.0
+        self._beacons = self._joins = self._restarts = 0
+        self._judged: list[tuple[int, float, float, float]] = []
+        """Number of the beacon, squared error, its normalised square, variance."""
+
+    def add(self, beacon: Beacon, reception: Reception, received: TagReceptions, row: int) -> None:
+        """Let the tag process one beacon."""
+        at_s = float(received.emission_s[row]) if reception.host_s is None else reception.host_s
+        if self._first_beacon_s is None:
+            self._first_beacon_s = at_s
+        anchor, method = beacon.anchor, self._receiver.method
+        was_running = isinstance(method, Estimation) and not method.is_starting
+        was_in = isinstance(method, Estimation) and was_running and method.estimator.has_anchor(anchor)
+        fix = self._receiver.hear_beacon(beacon, reception)
+        method = self._receiver.method
+        if isinstance(method, Estimation) and was_running:
+            self._restarts += method.is_starting
+            self._joins += not method.is_starting and not was_in and method.estimator.has_anchor(anchor)
+        self._beacons += 1
+        if fix is not None:
+            self._judge(fix, at_s, received.positions_m[row])
+
+    def _judge(self, fix: Fix, at_s: float, truth_m: Array) -> None:
+        if self.first_fix_s is None:
+            self.first_fix_s = self._last_fix_s = at_s
+        self._gap_s = max(self._gap_s, at_s - self._last_fix_s)
+        self._last_fix_s = at_s
+        if at_s - self.first_fix_s < _SETTLED_S:
+            return
+        error, covariance = (fix.position_m - truth_m)[:2], fix.covariance_m2[:2, :2]
+        nees = float(error @ np.linalg.solve(covariance, error)) / 2.0
+        self._judged.append((self._beacons - 1, float(error @ error), nees, float(np.trace(covariance))))
+
+    def result(self, seconds: float, bounds_m2: Array) -> LargeResult:
+        """Sums over the fixes; ``bounds_m2``: of each beacon, or none."""
+        judged = np.array(self._judged).reshape(-1, 4)
+        first_s = math.inf
+        if self.first_fix_s is not None and self._first_beacon_s is not None:
+            first_s = self.first_fix_s - self._first_beacon_s
+        return LargeResult(
+            fixes=len(judged),
+            squared_m2=float(judged[:, 1].sum()),
+            nees=float(judged[:, 2].sum()),
+            variance_m2=float(judged[:, 3].sum()),
+            errors_m=np.sqrt(judged[:, 1]),
+            bound_m2=float(bounds_m2[judged[:, 0].astype(int)].sum()) if len(bounds_m2) else 0.0,
+            beacons=self._beacons,
+            tag_s=seconds,
+            gap_s=self._gap_s,
+            first_fix_s=(first_s,),
+            joins=self._joins,
+            restarts=self._restarts,
+        )
+
+
+def _sum(tags: Sequence[LargeResult]) -> LargeResult:
+    return LargeResult(
+        fixes=sum(one.fixes for one in tags),
+        squared_m2=sum(one.squared_m2 for one in tags),
+        nees=sum(one.nees for one in tags),
+        variance_m2=sum(one.variance_m2 for one in tags),
+        errors_m=np.concatenate([one.errors_m for one in tags]),
+        bound_m2=sum(one.bound_m2 for one in tags),
+        beacons=sum(one.beacons for one in tags),
+        tag_s=sum(one.tag_s for one in tags),
+        gap_s=max(one.gap_s for one in tags),
+        first_fix_s=tuple(first for one in tags for first in one.first_fix_s),
+        joins=sum(one.joins for one in tags),
+        restarts=sum(one.restarts for one in tags),
+    )
+
+
+# The bound
+
+
+def _bound_m2(world: CellWorld, site: Site, spans: Sequence[TagReceptions], case: LargeCase, plan: Plan) -> Array:
+    """Trace of the Cramér–Rao bound after each beacon of a tag, shape (beacons,): of all that these beacons state."""
+    anchor, sequence = (np.concatenate([getattr(one, name) for one in spans]) for name in ("anchor", "sequence"))
+    times_s = np.concatenate([one.emission_s for one in spans])
+    ids, senders = np.unique(anchor, return_inverse=True)
+    known = _known(spans, {identifier: index for index, identifier in enumerate(ids.tolist())}, senders, sequence)
+    row_of = {one.id: row for row, one in enumerate(site.anchors)}
+    anchors_m = world.true_positions_m[[row_of[identifier] for identifier in ids.tolist()]]
+    noise = site.noise
+    settings = BoundSettings(
+        plan.noise_ps * 1e-12,
+        white_fm=noise.white_fm,
+        random_walk_fm=noise.random_walk_fm,
+        qa=ROOM_QA_M2PS3,
+        slot_s=1.0,
+        speed_std_mps=1.0,
+        mesh=True,
+    )
+    biases = Biases()
+    if case.in_room:
+        ranges = _ROOM.ranges
+        biases = Biases(
+            survey_std_m=_ROOM.axis_std_m,
+            constant_std_m=ranges.constant_m / math.sqrt(3.0),
+            slope_std_m=ranges.slope_m,
+        )
+    path_m = np.concatenate([one.positions_m for one in spans])
+    bound = received_bound(anchors_m, path_m, settings, known, Sendings(senders, times_s), biases)
+    return np.asarray(np.trace(bound, axis1=1, axis2=2))
+
+
+def _known(spans: Sequence[TagReceptions], index_of: dict[int, int], senders: Integers, sequence: Integers) -> Mask:
+    """Which anchors' receptions of each beacon some beacon has relayed to the tag; its own are the last column."""
+    known = np.zeros((len(senders), len(index_of) + 1), np.bool_)
+    known[:, -1] = True
+    newest: dict[tuple[int, int], int] = {}
+    frame = 0
+    for span in spans:
+        for row in range(len(span)):
+            for number in range(int(span.relays[row])):
+                sender = index_of.get(int(span.relay_anchor[row, number]))
+                relayed = None if sender is None else newest.get((sender, int(span.relay_sequence[row, number])))
+                if relayed is not None:
+                    known[relayed, senders[frame]] = True
+            newest[int(senders[frame]), int(sequence[frame])] = frame
+            frame += 1
+    return known
+
+
+# Cells and rows
+
+
+def tag_runs(plan: Plan, case: LargeCase) -> list[LargeRun]:
+    """The cells of a case."""
+    tags = 12 if case.starts else 1
+    count = (8 if plan.quick else 16) if case.starts else min(plan.worlds, 2) if case.seconds else plan.worlds
+    return [LargeRun(case, plan, number, tags) for number in range(count)]
+
+
+def cells(plan: Plan) -> list[Cell]:
+    """One cell for each tag, or for some cold starts."""
+    return [
+        Cell(case.name, run_large, run, _TAG_COST_S * run.tags * (case.seconds or plan.seconds) + 1.0)
+        for case in cases(plan)
+        for run in tag_runs(plan, case)
+    ]
+
+
+def rows(plan: Plan, results: Sequence[LargeResult]) -> list[Row]:
+    """A row for each case; the results stand in the order of ``cells``."""
+    rest = iter(results)
+    return [
+        with_limits(row_of(plan, case, [next(rest) for _ in tag_runs(plan, case)]), case.limits) for case in cases(plan)
+    ]
+
+
+def row_of(plan: Plan, case: LargeCase, each: list[LargeResult]) -> Row:
+    """The results of a case, without its limits."""
+    whole = _sum(each)
+    row = LargeRow(
+        study="large",
+        method="joint",
+        case=case.name,
+        series=case.series,
+        mesh=True,
+        noise_ps=plan.noise_ps,
+        runs=len(each),
+        fixes=len(whole.first_fix_s) if case.starts else whole.fixes,
+        first_fix_s=float(np.percentile(whole.first_fix_s, 95, method="higher")),
+    )
+    if case.starts or whole.fixes == 0:
+        return row
+    sums = np.array([(one.fixes, one.squared_m2, one.nees, one.bound_m2) for one in each])
+    rmse_m, rmse_error_m = jackknife(sums, lambda part: math.sqrt(part[:, 1].sum() / part[:, 0].sum()))
+    nees, nees_error = jackknife(sums, lambda part: float(part[:, 2].sum() / part[:, 0].sum()))
+    row = replace(
+        row,
+        rmse_m=rmse_m,
+        rmse_error_m=rmse_error_m,
+        p95_m=float(np.percentile(whole.errors_m, 95)),
+        max_m=float(whole.errors_m.max()),
+        said_m=math.sqrt(whole.variance_m2 / whole.fixes),
+        nees=nees,
+        nees_interval=interval(nees_error, len(each)),
+        beacons_per_s=whole.beacons / whole.tag_s,
+        gap_s=whole.gap_s,
+        joins=whole.joins,
+        restarts=whole.restarts,
+    )
+    if not case.bounded:
+        return row
+    ratio, ratio_error = jackknife(sums, lambda part: math.sqrt(part[:, 1].sum() / part[:, 3].sum()))
+    return replace(row, bound_m=math.sqrt(whole.bound_m2 / whole.fixes), ratio=ratio, ratio_error=ratio_error)

@@ -1,0 +1,65 @@
+"""The study ``nlos``: messages that come late: single ones, or all of an anchor, always or in bursts."""
+
+from functools import partial
+from typing import Any, Final
+
+from skyless.research.studies.common.plan import Plan
+from skyless.research.studies.common.summary import Case
+from skyless.research.studies.common.worlds import anchor_of, walking
+from skyless.sim.impairments import AnchorBias
+from skyless.sim.lab import paper_lab_site
+
+_MAX_RATIO: Final = 1.3
+_BURST_S: Final = 5.0
+_MIN_S: Final = 3 * _BURST_S
+"""Judged time in which a burst fits wherever the judging begins."""
+
+_NOTHING_LATE: Final = "clean"
+_DIAGNOSTICS: Final = {"diagnostics": True}
+"""Radios that report powers: those of the emulated air, where late messages have a weak first path."""
+
+
+def cases(plan: Plan) -> list[Case]:
+    """Single messages, then anchors; in each world it is another anchor's turn, the master's among them."""
+    late: list[tuple[str, str, dict[str, Any], float | None]] = [
+        (_NOTHING_LATE, "single messages", {}, None),
+        ("5 % late by exp(1 m)", "single messages", {"nlos": 0.05}, None),
+        ("20 % late by exp(1 m)", "single messages", {"nlos": 0.2}, _MAX_RATIO),
+        ("40 % late by exp(1 m)", "single messages", {"nlos": 0.4}, None),
+        ("20 % late by exp(0.2 m)", "single messages", {"nlos": 0.2, "nlos_mean_m": 0.2}, None),
+        ("one anchor +0.1 m", "one anchor", {"biases": partial(_late, plan, 0.1, None)}, None),
+        ("one anchor +0.3 m", "one anchor", {"biases": partial(_late, plan, 0.3, None)}, _MAX_RATIO),
+        ("one anchor +1.5 m", "one anchor", {"biases": partial(_late, plan, 1.5, None)}, None),
+        ("one anchor +1.5 m in bursts", "one anchor", {"biases": partial(_late, plan, 1.5, _BURST_S)}, _MAX_RATIO),
+        ("20 % late by exp(1 m), reported", "reported by the first path", {"nlos": 0.2, **_DIAGNOSTICS}, None),
+        ("40 % late by exp(1 m), reported", "reported by the first path", {"nlos": 0.4, **_DIAGNOSTICS}, None),
+        (
+            "20 % late by exp(0.2 m), reported",
+            "reported by the first path",
+            {"nlos": 0.2, "nlos_mean_m": 0.2, **_DIAGNOSTICS},
+            None,
+        ),
+        (
+            "one anchor +1.5 m, reported",
+            "reported by the first path",
+            {"biases": partial(_late, plan, 1.5, None), **_DIAGNOSTICS},
+            None,
+        ),
+        (
+            "one anchor +0.3 m, reported",
+            "reported by the first path",
+            {"biases": partial(_late, plan, 0.3, None), **_DIAGNOSTICS},
+            None,
+        ),
+    ]
+    if plan.quick:
+        late = [case for case in late if case[0] == _NOTHING_LATE or case[3] is not None]
+    seconds = max(plan.seconds, _MIN_S)
+    return [
+        Case(name, series, None, walking(plan, seconds=seconds, **faults), _NOTHING_LATE, limit)
+        for name, series, faults, limit in late
+    ]
+
+
+def _late(plan: Plan, bias_m: float, burst_s: float | None, number: int) -> tuple[AnchorBias, ...]:
+    return (AnchorBias(anchor_of(paper_lab_site(plan.noise_ps), number).id, bias_m, burst_s),)

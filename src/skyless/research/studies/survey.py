@@ -1,0 +1,309 @@
+"""The study ``survey``: anchors that survey themselves through simulated air, against their bound.
+
+Each run is one site in the air: real machines of anchors, whose receptions of one another become ranges and these a
+survey. Delays, errors of pairs, late and missing pairs are drawn for each run and are in the air, not added afterwards.
+Several surveys with other facts may use the air of one run.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.core.kernels.arrays import Array
+from skyless.research.studies.common.plan import Cell, Limit, Plan, Row, seed_of, with_limits
+from skyless.research.surveys.air import AirErrors, drawn_errors, free_axes, ranges_in_air
+from skyless.research.surveys.judge import Outcome, judged, survey_bound_m, tag_error_m
+from skyless.research.surveys.layouts import SurveyLayout, survey_layouts
+from skyless.research.surveys.rooms import HAND_STD_M, SKETCH_STD_M, TAPE_STD_M
+from skyless.site.survey.facts import Facts, Point, Tape
+from skyless.site.survey.solve import run_survey
+
+NEAR_M: Final = 0.1
+"""A result whose anchors are farther off (rms) is wrong."""
+_WRONG_SIGMAS: Final = 4.0
+"""It should say so, if it is also farther off than this many of its own standard deviations."""
+
+_RUNS_IN_A_CELL: Final = 5
+_LATE_S: Final = 2.0
+"""Length of runs with late pairs, whose errors do not average out."""
+
+
+class Variant(Struct, frozen=True):
+    """One survey of a run's air."""
+
+    name: str
+    delay_std_m: float
+    """What the survey expects."""
+    tapes: int = 0
+    """Distances that the survey without them asked for."""
+    keeps: bool = False
+    """Positions by hand are kept."""
+    sketched: bool = False
+
+
+class Group(Struct, frozen=True):
+    """One kind of air, and the surveys that use it."""
+
+    name: str
+    variants: tuple[Variant, ...]
+    errors: AirErrors = AirErrors()
+    seconds: float | None = None
+
+
+_KNOWN: Final = Variant("delays known", 0.0)
+_EXACT: Final = (
+    Group("exact", (_KNOWN,)),
+    Group("1 s", (Variant("delays known, 1 s", 0.0),), seconds=1.0),
+)
+_DELAYS: Final = Group(
+    "delays",
+    (
+        Variant("delays 15 cm", 0.15),
+        Variant("delays 15 cm, a tape", 0.15, tapes=1),
+        Variant("delays 15 cm, 3 tapes", 0.15, tapes=3),
+        Variant("delays 15 cm, positions kept", 0.15, keeps=True),
+    ),
+    errors=AirErrors(delay_std_m=0.15),
+)
+_PAIRS: Final = Group(
+    "pairs", (Variant("pairs 2 cm, delays 7 cm", 0.07),), AirErrors(delay_std_m=0.07, pair_std_m=0.02)
+)
+_CLEAN: Final = Group("clean", (Variant("pairs 3 cm", 0.0),), AirErrors(pair_std_m=0.03), _LATE_S)
+_LATE: Final = Group("late", (Variant("10 % late", 0.0),), AirErrors(pair_std_m=0.03, late_share=0.1), _LATE_S)
+_LATE_HALL: Final = Group(
+    "late",
+    (Variant("10 % late, 25 % missing, delays 7 cm", 0.07),),
+    AirErrors(delay_std_m=0.07, pair_std_m=0.03, late_share=0.1, missing_share=0.25),
+    _LATE_S,
+)
+_VERY_LATE: Final = Group(
+    "very late", (Variant("30 % late", 0.0),), AirErrors(pair_std_m=0.03, late_share=0.3), _LATE_S
+)
+_VERY_LATE_HALL: Final = Group(
+    "very late",
+    (Variant("30 % late, 25 % missing", 0.0), Variant("30 % late, 25 % missing, sketch", 0.0, sketched=True)),
+    AirErrors(pair_std_m=0.03, late_share=0.3, missing_share=0.25),
+    _LATE_S,
+)
+GROUPS: Final = {
+    "lab": (*_EXACT, _DELAYS, _PAIRS, _CLEAN, _LATE, _VERY_LATE),
+    "room": (*_EXACT, _DELAYS, _PAIRS, _CLEAN, _LATE),
+    "hall": (*_EXACT, _DELAYS, _PAIRS, _CLEAN, _LATE_HALL, _VERY_LATE_HALL),
+}
+
+
+def limits_of(layout: str, case: str) -> tuple[Limit, ...]:
+    """Limits of issue 13 (``docs/survey.md``, "Figures")."""
+    of = {"lab": 0, "room": 1, "hall": 2}[layout]
+    honest = Limit("nees", 0.9, 1.1)
+    found: dict[str, tuple[Limit, ...]] = {
+        "delays known": (Limit("ratio", most=1.07), honest),
+        "delays known, 1 s": (Limit("ratio", most=1.07), honest),
+        "delays 15 cm": (
+            (Limit("undetermined", 1.0),) if layout == "lab" else (Limit("rmse_m", most=(0.0, 0.006, 0.0022)[of]),)
+        ),
+        "delays 15 cm, a tape": (Limit("rmse_m", most=0.0045),) if layout == "lab" else (),
+        "delays 15 cm, positions kept": (
+            Limit("delay_m", most=(0.016, 0.016, 0.014)[of]),
+            Limit("tag_m", most=(0.016, 0.024, 0.013)[of]),
+        ),
+        "pairs 2 cm, delays 7 cm": (
+            Limit("ratio", most=1.05),
+            honest,
+            Limit("tag_m", most=(0.020, 0.026, 0.012)[of]),
+        ),
+        "pairs 3 cm": (Limit("flagged", most=0.01),),
+        "10 % late": (*((Limit("near", 0.8),) if layout == "lab" else ()), Limit("wrong_flagged", 0.9)),
+        "30 % late": (Limit("wrong_flagged", 0.9),),
+        "10 % late, 25 % missing, delays 7 cm": (
+            Limit("near", 0.95),
+            Limit("excluded_wrongly", most=0.02),
+            Limit("wrong_flagged", 0.9),
+        ),
+        "30 % late, 25 % missing": (Limit("wrong_flagged", 0.9),),
+        "30 % late, 25 % missing, sketch": (Limit("near", 0.8), Limit("wrong_flagged", 0.9)),
+    }
+    return found.get(case, ())
+
+
+class SurveyRow(Row, frozen=True, kw_only=True):
+    """Results of the surveys of a variant."""
+
+    near: float
+    """Share of surveys whose anchors are less than 10 cm off, rms."""
+    undetermined: float
+    """Share of surveys that say something is not determined: an anchor, or delays against positions."""
+    flagged: float
+    """Share of surveys that say they are ambiguous or not checked, or leave an anchor without a position."""
+    wrong_runs: int
+    """Surveys of all anchors that are 10 cm and four of their own standard deviations off."""
+    wrong_flagged: float | None
+    """Share of these that say they are ambiguous or not checked."""
+    found_late: float | None
+    """Share of the late pairs that were left out."""
+    excluded_wrongly: float | None
+    """Share of the other pairs that were left out."""
+    delay_m: float | None
+    """Error of delays less their mean, rms."""
+    tag_m: float | None
+    """Systematic error of tags' positions, rms, by the survey."""
+    hand_tag_m: float | None
+    """The same by positions measured by hand to 2 cm per axis, with delays unknown."""
+
+
+class SurveyRuns(Struct, frozen=True):
+    """Runs of one group on one layout."""
+
+    layout: str
+    group: Group
+    seeds: tuple[int, ...]
+    seconds: float
+    noise_ps: float
+
+
+def cells(plan: Plan) -> list[Cell]:
+    """Some runs of one group on one layout each."""
+    return [Cell(f"{runs.layout}, {runs.group.name}", survey_runs, runs, _weight_s(runs)) for runs in _all_runs(plan)]
+
+
+def _all_runs(plan: Plan) -> list[SurveyRuns]:
+    found = []
+    for number, (layout, groups) in enumerate(GROUPS.items()):
+        for kind, group in enumerate(groups):
+            seeds = [seed_of(plan.seed, number, kind, world) for world in range(plan.worlds)]
+            seconds = plan.seconds if group.seconds is None else min(group.seconds, plan.seconds)
+            found += [
+                SurveyRuns(layout, group, tuple(seeds[first : first + _RUNS_IN_A_CELL]), seconds, plan.noise_ps)
+                for first in range(0, plan.worlds, _RUNS_IN_A_CELL)
+            ]
+    return found
+
+
+def _weight_s(runs: SurveyRuns) -> float:
+    return len(runs.seeds) * (0.06 * runs.seconds + 0.3 * len(runs.group.variants))
+
+
+def survey_runs(runs: SurveyRuns) -> tuple[tuple[Outcome, ...], ...]:
+    """Outcomes of each run, one for each variant."""
+    return tuple(_run(runs, survey_layouts()[runs.layout], seed) for seed in runs.seeds)
+
+
+def _run(runs: SurveyRuns, layout: SurveyLayout, seed: int) -> tuple[Outcome, ...]:
+    draw = np.random.default_rng(seed)
+    drawn = drawn_errors(runs.group.errors, layout, draw)
+    ranges = ranges_in_air(layout, drawn, runs.seconds, runs.noise_ps, int(draw.integers(1 << 60)))
+    hand_m = draw.normal(0.0, HAND_STD_M, layout.position_m.shape) * free_axes(layout)
+    sketch_m = draw.normal(0.0, SKETCH_STD_M, layout.position_m.shape) * free_axes(layout)
+    tape_m = draw.normal(0.0, TAPE_STD_M, 3)
+    hand_tag_m = tag_error_m(layout, layout.position_m + hand_m, np.zeros(len(hand_m)), drawn.delay_m)
+    outcomes, asked_for = [], tuple[tuple[int, int], ...]()
+    for variant in runs.group.variants:
+        facts = _facts(layout, runs.group, variant, asked_for[: variant.tapes], tape_m, (hand_m, sketch_m))
+        survey = run_survey(ranges, facts)
+        if not variant.tapes and not variant.keeps:
+            asked_for = tuple((tape.a, tape.b) for tape in survey.tapes)
+        bound_m = survey_bound_m(layout, ranges, facts, drawn, runs.seconds, runs.noise_ps)
+        outcomes.append(judged(layout, survey, drawn, Outcome(variant.name, bound_m, False, False, False, hand_tag_m)))
+    return tuple(outcomes)
+
+
+def _facts(
+    layout: SurveyLayout,
+    group: Group,
+    variant: Variant,
+    tapes: Sequence[tuple[int, int]],
+    tape_m: Array,
+    off_m: tuple[Array, Array],
+) -> Facts:
+    """What a survey is given; ``off_m``: errors of positions by hand and of a sketch."""
+    at_m = dict(zip(layout.anchors, layout.position_m, strict=True))
+    sketch: dict[int, Point] = {}
+    if variant.keeps or variant.sketched:
+        rough_m = layout.position_m + (off_m[0] if variant.keeps else off_m[1])
+        sketch = {anchor: (x, y, z) for anchor, (x, y, z) in zip(layout.anchors, rough_m.tolist(), strict=True)}
+    return Facts(
+        dimensions=layout.dimensions,
+        heights_m=layout.heights_m,
+        tapes=tuple(
+            Tape(a, b, float(np.linalg.norm(at_m[a] - at_m[b])) + float(error_m), TAPE_STD_M)
+            for (a, b), error_m in zip(tapes, tape_m, strict=False)
+        ),
+        sketch_m=sketch,
+        sketch_std_m=HAND_STD_M if variant.keeps else SKETCH_STD_M,
+        keep_positions=variant.keeps,
+        delay_std_m=variant.delay_std_m,
+        pair_std_m=group.errors.pair_std_m,
+    )
+
+
+def rows(plan: Plan, results: Sequence[Any]) -> list[Row]:
+    """A row for each layout and variant."""
+    found: dict[tuple[str, str], list[Outcome]] = {}
+    for runs, outcomes in zip(_all_runs(plan), results, strict=True):
+        for of_run in outcomes:
+            for outcome in of_run:
+                found.setdefault((runs.layout, outcome.variant), []).append(outcome)
+    return [_row(plan, layout, variant, outcomes) for (layout, variant), outcomes in found.items()]
+
+
+def _row(plan: Plan, layout: str, variant: str, outcomes: Sequence[Outcome]) -> Row:
+    whole = [one for one in outcomes if one.is_determined]
+    errors_m = np.array([one.error_m for one in whole], float)
+    bounds_m2 = np.array([one.bound_m**2 for one in whole])
+    wrong = [one for one in whole if _is_wrong(one)]
+    squares_m2 = errors_m**2
+    rmse_m = _root_mean(errors_m.tolist())
+    ratio = error = None
+    if rmse_m is not None and bounds_m2.sum() > 0.0:
+        ratio = math.sqrt(float(squares_m2.sum() / bounds_m2.sum()))
+        spread = float(np.std(squares_m2)) / math.sqrt(len(squares_m2))
+        error = spread / (2.0 * rmse_m)
+    late, direct = sum(one.late for one in outcomes), sum(one.direct for one in outcomes)
+    row = SurveyRow(
+        study="survey",
+        method=plan.method,
+        case=f"{layout}, {variant}",
+        series=layout,
+        noise_ps=plan.noise_ps,
+        runs=len(outcomes),
+        fixes=len(outcomes),
+        rmse_m=rmse_m,
+        rmse_error_m=error,
+        p95_m=float(np.quantile(errors_m, 0.95)) if whole else None,
+        max_m=float(errors_m.max()) if whole else None,
+        said_m=_root_mean([one.said_m for one in whole]),
+        nees=_mean([one.nees for one in whole]),
+        bound_m=_root_mean([one.bound_m for one in outcomes]),
+        ratio=ratio,
+        ratio_error=None if ratio is None or error is None or not rmse_m else ratio * error / rmse_m,
+        near=float(np.mean([one.error_m is not None and one.error_m < NEAR_M for one in outcomes])),
+        undetermined=float(np.mean([one.is_open for one in outcomes])),
+        flagged=float(np.mean([one.is_flagged for one in outcomes])),
+        wrong_runs=len(wrong),
+        wrong_flagged=float(np.mean([one.is_flagged for one in wrong])) if wrong else None,
+        found_late=sum(one.found for one in outcomes) / late if late else None,
+        excluded_wrongly=sum(one.excluded_wrongly for one in outcomes) / direct if direct else None,
+        delay_m=_root_mean([one.delay_m for one in whole]),
+        tag_m=_root_mean([one.tag_m for one in whole]),
+        hand_tag_m=_root_mean([one.hand_tag_m for one in outcomes]),
+    )
+    limits = [] if plan.quick else [one for one in limits_of(layout, variant) if one.figure != "wrong_flagged" or wrong]
+    return with_limits(row, limits)
+
+
+def _is_wrong(one: Outcome) -> bool:
+    """Whether a result is far off, and farther than it says."""
+    return one.error_m is not None and one.error_m > max(NEAR_M, _WRONG_SIGMAS * (one.said_m or 0.0))
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _root_mean(values: Sequence[float | None]) -> float | None:
+    known = [value**2 for value in values if value is not None]
+    return math.sqrt(float(np.mean(known))) if known else None

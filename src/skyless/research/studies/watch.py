@@ -1,0 +1,177 @@
+"""The study ``watch``: how surely and how fast it is found that anchors have moved, and what else is found.
+
+Ranges are drawn: noise of the stamps, and drift of each pair (a Gauss–Markov process) as real rooms have it. Events
+come one after another, each on another anchor or link, and end when they are found.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+
+from skyless.research.studies.common.plan import Cell, Limit, Plan, Row, missed_limits, seed_of
+from skyless.research.surveys.drawn_faults import (
+    Event,
+    WatchedLayout,
+    WatchResult,
+    WatchRun,
+    run_watch,
+    striking_windows,
+)
+from skyless.research.surveys.layouts import survey_layouts
+
+_LAYOUTS: Final = ("lab", "room", "hall")
+_EVENTS: Final = 50
+"""Of a world."""
+_QUIET_WINDOWS: Final = 1080
+"""Of 10 s, without an event, in a world: three hours."""
+_QUIET_DRIFTS_S: Final = (10.0, 60.0, 600.0)
+_REAL_DRIFT_M: Final = (0.008, 0.025)
+_LIVELY_M: Final = 0.09
+_NOISE_WINDOWS: Final = 1_000_000
+_NOISE_WINDOW_S: Final = 0.1
+_NOISE_ALARM: Final = 1e-7
+_NOISE_CASE: Final = "lab, 10⁶ windows of noise"
+
+_IN_TIME_S: Final = 30.0
+_DAY_S: Final = 86_400.0
+_EVENT_S: Final = 0.05
+"""About what an event takes to compute, and a window without one."""
+_WINDOW_S: Final = 1.5e-3
+
+
+class _Case(Struct, frozen=True):
+    name: str
+    series: str
+    layout: str
+    event: Event
+    size_m: float
+    drift_m: tuple[float, float] = (0.02, 0.02)
+    drift_s: float = 60.0
+    lively_m: float = 0.0
+    missing: float = 0.0
+    limits: tuple[Limit, ...] = ()
+
+
+class WatchRow(Row, frozen=True, kw_only=True):
+    """What the watch of the anchors found of the events of a case."""
+
+    found: float | None = None
+    """Share of events that were found in time."""
+    named: float | None = None
+    """Share of those found whose anchors or links were named, and no others."""
+    kind: float | None = None
+    """Share of those found of which it was right as well what had happened to them."""
+    wrong: float | None = None
+    """Share of events in which an anchor was said to have moved, or its delay to have changed, that has not."""
+    found_s: float | None = None
+    """From the event to the finding, which 99 % of those found do not exceed."""
+    alarms_per_day: float | None = None
+    """Findings while nothing happened."""
+    alarms: int | None = None
+    """How many of them there were, or how many windows struck."""
+
+
+class _Noise(Struct, frozen=True):
+    windows: int
+    seed: int
+
+
+def _cases() -> list[_Case]:
+    found = []
+    for layout in _LAYOUTS:
+        certain = (Limit("found", least=0.99),) if layout == "hall" else ()
+        never = (Limit("wrong", most=0.005),)
+        series = f"{layout}, drift 2 cm"
+        found += [
+            _Case(f"{layout}, moved 10 cm", series, layout, "moved", 0.1, limits=(*certain, *never)),
+            _Case(f"{layout}, moved 20 cm", series, layout, "moved", 0.2, limits=never),
+            _Case(f"{layout}, moved 2 m", series, layout, "moved", 2.0, limits=never),
+            _Case(f"{layout}, moved 30 cm, 30 % of pairs missing", series, layout, "moved", 0.3, missing=0.3),
+            _Case(f"{layout}, two moved 30 cm", series, layout, "two moved", 0.3),
+            _Case(f"{layout}, moved 30 cm at 1 mm/s", series, layout, "slow", 0.3),
+            _Case(f"{layout}, delay 10 cm", series, layout, "delay", 0.1),
+            _Case(f"{layout}, one link 35 cm late", series, layout, "link", 0.35, limits=never),
+            _Case(f"{layout}, a person on some links", series, layout, "door", 0.0),
+        ]
+    for layout in _LAYOUTS:
+        for drift_s in _QUIET_DRIFTS_S:
+            name = f"{layout}, nothing, drift of {drift_s:g} s"
+            series = "nothing happens, drift 0.8 to 2.5 cm, one pair 9 cm"
+            found.append(_Case(name, series, layout, "none", 0.0, _REAL_DRIFT_M, drift_s, _LIVELY_M))
+    return found
+
+
+def watched_layout(name: str) -> WatchedLayout:
+    """Of ``survey_layouts``."""
+    layout = survey_layouts()[name]
+    return WatchedLayout(layout.dimensions, tuple((x, y, z) for x, y, z in layout.position_m.tolist()))
+
+
+def cells(plan: Plan) -> list[Cell]:
+    """One for each case and world."""
+    worlds = []
+    for number, case in enumerate(_cases()):
+        events = _QUIET_WINDOWS if case.event == "none" else _EVENTS
+        for world in range(plan.worlds):
+            run = WatchRun(
+                watched_layout(case.layout),
+                case.event,
+                case.size_m,
+                case.drift_m,
+                case.drift_s,
+                case.lively_m,
+                case.missing,
+                events,
+                seed_of(plan.seed, number, world),
+            )
+            worlds.append(Cell(case.name, run_watch, run, events * (_WINDOW_S if case.event == "none" else _EVENT_S)))
+    windows = _NOISE_WINDOWS // plan.worlds
+    for world in range(plan.worlds):
+        noise = _Noise(windows, seed_of(plan.seed, len(_cases()), world))
+        worlds.append(Cell(_NOISE_CASE, _run_noise, noise, 4e-6 * windows))
+    return worlds
+
+
+def _run_noise(noise: _Noise) -> int:
+    return striking_windows(watched_layout("lab"), _NOISE_WINDOW_S, _NOISE_ALARM, noise.windows, noise.seed)
+
+
+def rows(plan: Plan, results: Sequence[Any]) -> Sequence[Row]:
+    """One for each case."""
+    of_case = [results[start : start + plan.worlds] for start in range(0, len(results), plan.worlds)]
+    *of_drawn, of_noise = of_case
+    found = [_row(plan, case, one) for case, one in zip(_cases(), of_drawn, strict=True)]
+    windows, limits = plan.worlds * (_NOISE_WINDOWS // plan.worlds), (Limit("alarms", most=1),)
+    noise = _judged(plan, _NOISE_CASE, "windows of 0.1 s, no drift", windows, limits, alarms=sum(of_noise))
+    return [noise, *found]
+
+
+def _row(plan: Plan, case: _Case, results: Sequence[WatchResult]) -> WatchRow:
+    tries = sum(one.tries for one in results)
+    alarms = sum(one.alarms for one in results)
+    windows = sum(one.windows for one in results)
+    if case.event == "none":
+        per_day = alarms / (windows * 10.0 / _DAY_S)
+        return _judged(plan, case.name, case.series, windows, (), alarms=alarms, alarms_per_day=per_day)
+    times_s = np.array([time_s for one in results for time_s in one.found_s])
+    in_time_s = np.inf if case.event == "slow" else _IN_TIME_S
+    found = max(sum(one.found for one in results), 1)
+    figures = {
+        "found": float((times_s <= in_time_s).sum() / tries),
+        "named": sum(one.named for one in results) / found,
+        "kind": sum(one.kind for one in results) / found,
+        "wrong": sum(one.wrong for one in results) / tries,
+        "found_s": float(np.quantile(times_s, 0.99)) if len(times_s) else None,
+    }
+    return _judged(plan, case.name, case.series, tries, case.limits, **figures)
+
+
+def _judged(plan: Plan, case: str, series: str, runs: int, limits: tuple[Limit, ...], **figures: Any) -> WatchRow:  # noqa: ANN401 - of the row
+    row = WatchRow(
+        study="watch", method=plan.method, case=case, series=series, noise_ps=plan.noise_ps, runs=runs, **figures
+    )
+    missed = missed_limits(row, limits)
+    return replace(row, limits=limits, missed=missed, passed=not missed if limits else None)

@@ -1,0 +1,1 @@
+"""Surveys in simulated rooms, and their errors."""

@@ -1,0 +1,85 @@
+"""Ranges of a site's anchors from simulated air: real machines, and what they receive of one another."""
+
+from collections.abc import Callable
+
+from skyless.core.air.frame import Malformed
+from skyless.core.air.reception import Reception, Transmission
+from skyless.core.protocols import AnchorMachine, decode_any, new_anchor
+from skyless.core.site import Site
+from skyless.sim.impairments import Impairments
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Static
+from skyless.sim.world import World
+from skyless.site.survey.stamps.legs import LegCollector
+from skyless.site.survey.stamps.pair_ranger import PairRanger
+
+OnLeg = Callable[[int, int, int, int, float], None]
+"""Sender, receiver, TX and RX ticks, true time: as ``PairRanger.add`` accepts them."""
+
+
+def stamps_of(
+    site: Site,
+    impairments: Impairments,
+    seconds: float,
+    seed: int,
+    *,
+    ranger: PairRanger | None = None,
+    listener_m: tuple[float, float, float] | None = None,
+    settle_s: float = 0.0,
+) -> PairRanger:
+    """Ranges of ``seconds`` of a site; ``ranger`` receives them, by default one with blocks of a second.
+
+    ``listener_m``: the legs are those that one listener there learns of the anchors' beacons; by default all that the
+    anchors receive. ``settle_s``: time that passes before the first leg. The last block is closed.
+    """
+    whole = PairRanger() if ranger is None else ranger
+    until_s = settle_s + seconds
+
+    def on_leg(sender: int, receiver: int, tx_ticks: int, rx_ticks: int, t_s: float) -> None:
+        if t_s >= settle_s:
+            whole.add(sender, receiver, tx_ticks, rx_ticks, t_s)
+
+    if listener_m is None:
+        for _ in World(site, _recorded(site, on_leg), (), impairments, seed).run(until_s):
+            pass
+    else:
+        collector = LegCollector(site.id)
+        tag = TagSpec(Static(*listener_m))
+        for broadcast in World(site, lambda anchor: new_anchor(site, anchor), (tag,), impairments, seed).run(until_s):
+            for _, reception, _ in broadcast.receptions():
+                for leg in collector.add(reception):
+                    on_leg(leg.sender, leg.receiver, leg.tx_ticks, leg.rx_ticks, leg.t_s)
+    whole.finish()
+    return whole
+
+
+def _recorded(site: Site, on_leg: OnLeg) -> Callable[[int], "RecordedAnchor"]:
+    return lambda anchor: RecordedAnchor(new_anchor(site, anchor), site.id, on_leg)
+
+
+class RecordedAnchor:
+    """An anchor whose receptions of its site are handed on as legs."""
+
+    def __init__(self, machine: AnchorMachine, site_id: int, on_leg: OnLeg) -> None:
+        self._machine, self._site_id, self._on_leg = machine, site_id, on_leg
+
+    @property
+    def id(self) -> int:
+        """Identifier of the anchor."""
+        return self._machine.id
+
+    def hear(self, reception: Reception) -> None:
+        """Process one frame, and hand on its leg."""
+        self._machine.hear(reception)
+        beacon = decode_any(reception.frame)
+        if not isinstance(beacon, Malformed) and beacon.site == self._site_id and beacon.anchor != self.id:
+            t_s = 0.0 if reception.host_s is None else reception.host_s
+            self._on_leg(beacon.anchor, self.id, beacon.tx_ticks, reception.rx_ticks, t_s)
+
+    def next_transmission_ticks(self, now_ticks: int) -> int | None:
+        """That of the wrapped machine."""
+        return self._machine.next_transmission_ticks(now_ticks)
+
+    def transmission(self, tx_ticks: int) -> Transmission:
+        """That of the wrapped machine."""
+        return self._machine.transmission(tx_ticks)

@@ -1,0 +1,260 @@
+"""Ranges of a site's anchors drawn with drift and noise, and events that change them, as input of the watch."""
+
+import math
+from typing import Final, Literal
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.core.constants import SPEED_OF_LIGHT_MPS
+from skyless.core.kernels.arrays import Array, Integers, Mask
+from skyless.site.survey.facts import PairBlock
+from skyless.site.survey.watch.explain import Finding, Kind, Pairs, is_significant, weight_of
+from skyless.site.survey.watch.monitor import GRACE_S, AnchorWatch
+
+Event = Literal["none", "moved", "delay", "link", "door", "two moved", "slow"]
+
+_WINDOW_S: Final = 10.0
+_SLOT_S: Final = 2.5e-3
+_STAMP_S: Final = 100e-12
+"""Noise of every TX and RX stamp."""
+
+LEARNING_WINDOWS: Final = 60
+_LASTS_WINDOWS: Final = 4
+"""For so long an event lasts at most; it ends when it is found."""
+_SLOW_MPS: Final = 1e-3
+_RETURN_WINDOWS: Final = 6
+"""After an event, until the next: its findings should end within them."""
+
+_DOOR_REACH_M: Final = 0.3
+_DOOR_LATE_M: Final = (0.1, 0.5)
+
+_CHUNK: Final = 20_000
+
+
+_Truth = set[tuple[Kind, tuple[int, ...]]]
+"""Kinds and anchors of true findings."""
+
+
+class WatchedLayout(Struct, frozen=True):
+    """Anchors 1 to n."""
+
+    dimensions: Literal[2, 3]
+    position_m: tuple[tuple[float, float, float], ...]
+
+
+class WatchRun(Struct, frozen=True):
+    """One site that is watched while one thing after another happens."""
+
+    layout: WatchedLayout
+    event: Event
+    size_m: float
+    """Of displacements, delays and lateness; the direction is drawn, and what happens to whom."""
+    drift_m: tuple[float, float]
+    """Standard deviations of the pairs' drift are drawn between these; 0 for none."""
+    drift_s: float
+    """Correlation time of the drift, a Gauss–Markov process."""
+    lively_m: float
+    """Drift of one pair more than the others; 0 for none."""
+    missing: float
+    """Share of pairs that have no ranges."""
+    events: int
+    """For the event ``none``: windows."""
+    seed: int
+
+
+class WatchResult(Struct, frozen=True):
+    """How many events of a run the watch found, and what else it reported."""
+
+    tries: int
+    found: int
+    """With any finding."""
+    named: int
+    """With the right anchor or link alone, whatever the kind."""
+    kind: int
+    """With the right kind as well."""
+    wrong: int
+    """With an anchor said to have moved, or its delay to have changed, that has not."""
+    ended: int
+    """Whose findings ended after it did."""
+    found_s: tuple[float, ...]
+    """From the event to its finding."""
+    alarms: int
+    """Findings while nothing happened."""
+    alarms_moved: int
+    """Those that say an anchor has moved or its delay has changed."""
+    windows: int
+
+
+class _Site:
+    """Ranges as they are at the moment."""
+
+    def __init__(self, run: WatchRun, draw: np.random.Generator) -> None:
+        self.layout = run.layout
+        self.position_m = np.array(run.layout.position_m)
+        self.draw = draw
+        n = len(self.position_m)
+        self.first, self.second = np.triu_indices(n, 1)
+        m = len(self.first)
+        self.late_m = np.zeros(m)
+        self.is_missing: Mask = np.zeros(m, np.bool_)
+        self.is_missing[draw.choice(m, round(run.missing * m), replace=False)] = True
+        self._drift_std_m = draw.uniform(*run.drift_m, m)
+        if run.lively_m > 0.0:
+            self._drift_std_m[draw.integers(m)] = run.lively_m
+        self._drift_m = self._drift_std_m * draw.standard_normal(m)
+        self._kept = math.exp(-_WINDOW_S / run.drift_s)
+        self._superframe_s = n * _SLOT_S
+        self._stamp_m = _STAMP_S * SPEED_OF_LIGHT_MPS
+        self.step = 0
+        positions = dict(enumerate(run.layout.position_m, start=1))
+        self.watch = AnchorWatch(positions, self.layout.dimensions)
+
+    def true_m(self) -> Array:
+        """Without drift and noise, shape (m,)."""
+        apart = self.position_m[self.first] - self.position_m[self.second]
+        return np.asarray(np.linalg.norm(apart, axis=1) + self.late_m)
+
+    def run_step(self) -> None:
+        """Give the watch the blocks of a window."""
+        draw, m = self.draw, len(self.first)
+        self._drift_m = self._kept * self._drift_m
+        self._drift_m += math.sqrt(1.0 - self._kept**2) * self._drift_std_m * draw.standard_normal(m)
+        start_s, end_s = self.step * _WINDOW_S, (self.step + 1) * _WINDOW_S
+        frames = max(int(end_s / self._superframe_s + 1e-9) - int(start_s / self._superframe_s + 1e-9), 1)
+        of_tx, of_rx = draw.standard_normal(len(self.position_m)), draw.standard_normal(m)
+        noise_m = of_rx * math.sqrt(0.5) + 0.5 * (of_tx[self.first] + of_tx[self.second])
+        range_m = self.true_m() + self._drift_m + noise_m * self._stamp_m / math.sqrt(frames)
+        for pair in np.flatnonzero(~self.is_missing).tolist():
+            a, b = int(self.first[pair]) + 1, int(self.second[pair]) + 1
+            std_m = self._stamp_m / math.sqrt(frames)
+            self.watch.add(PairBlock(a, b, 0.5 * (start_s + end_s), float(range_m[pair]), std_m, frames))
+        self.step += 1
+        self.watch.advance(self.step * _WINDOW_S + GRACE_S)
+
+
+def run_watch(run: WatchRun) -> WatchResult:
+    """Run the events one after another, and count what the watch finds."""
+    draw = np.random.default_rng(run.seed)
+    site = _Site(run, draw)
+    for _ in range(LEARNING_WINDOWS):
+        site.run_step()
+    if run.event == "none":
+        return _undisturbed(site, run.events)
+    found_s: list[float] = []
+    counts = dict.fromkeys(("found", "named", "kind", "wrong", "ended"), 0)
+    alarms = alarms_moved = windows = 0
+    for _ in range(run.events):
+        standing = site.watch.findings
+        alarms += len(standing)
+        alarms_moved += sum(one.kind in {"moved", "delay"} for one in standing)
+        if standing:  # so that what was wrong before is not counted for the next event
+            site.watch.accept()
+        truth, findings, passed_s, took = _happen(site, run, draw)
+        windows += took
+        if findings:
+            found_s.append(passed_s)
+        counts["found"] += bool(findings)
+        named = [one for one in findings if one.kind != "check"]
+        anchors = {one for _, one in truth}
+        counts["named"] += bool(findings) and all(one.anchors in anchors for one in findings)
+        counts["kind"] += bool(named) and all((one.kind, one.anchors) in truth for one in findings)
+        moved = {of for kind, of in truth if kind in {"moved", "delay"}}
+        counts["wrong"] += any(one.kind in {"moved", "delay"} and one.anchors not in moved for one in named)
+        for _ in range(_RETURN_WINDOWS):
+            site.run_step()
+            windows += 1
+        counts["ended"] += not site.watch.findings
+    return WatchResult(
+        tries=run.events, found_s=tuple(found_s), alarms=alarms, alarms_moved=alarms_moved, windows=windows, **counts
+    )
+
+
+def _undisturbed(site: _Site, windows: int) -> WatchResult:
+    """Findings while nothing happens; each counts once, when it appears."""
+    known: _Truth = set()
+    alarms = alarms_moved = 0
+    for _ in range(windows):
+        site.run_step()
+        now = {(one.kind, one.anchors) for one in site.watch.findings}
+        alarms += len(now - known)
+        alarms_moved += sum(kind in {"moved", "delay"} for kind, _ in now - known)
+        known = now
+    return WatchResult(0, 0, 0, 0, 0, 0, (), alarms, alarms_moved, windows)
+
+
+def _happen(site: _Site, run: WatchRun, draw: np.random.Generator) -> tuple[_Truth, tuple[Finding, ...], float, int]:
+    """One event, until it is found and for one window more; then all is as before. Also the number of steps."""
+    position_m = site.position_m.copy()
+    truth: _Truth = _begin(site, run, draw)
+    findings: tuple[Finding, ...] = ()
+    passed_s, took = 0.0, 0
+    most = _LASTS_WINDOWS
+    if run.event == "slow":
+        most = round(2.0 * run.size_m / _SLOW_MPS / _WINDOW_S)
+    apart_m = site.position_m - position_m
+    while took < most and not findings:
+        if run.event == "slow":
+            part = min((took + 1) * _WINDOW_S * _SLOW_MPS / run.size_m, 1.0)
+            site.position_m = position_m + part * apart_m
+        site.run_step()
+        took += 1
+        passed_s += _WINDOW_S
+        findings = site.watch.findings
+    if findings:  # what is said once all of it has been seen
+        site.run_step()
+        findings = site.watch.findings or findings
+    site.position_m = position_m
+    site.late_m[:] = 0.0
+    return truth, findings, passed_s, took
+
+
+def _begin(site: _Site, run: WatchRun, draw: np.random.Generator) -> _Truth:
+    """Change the site; what a perfect watch says of it."""
+    n = len(site.position_m)
+    if run.event in {"moved", "two moved", "slow"}:
+        movers = draw.choice(n, 2 if run.event == "two moved" else 1, replace=False).tolist()
+        for anchor in movers:
+            direction = draw.standard_normal(site.layout.dimensions)
+            site.position_m[anchor, : len(direction)] += run.size_m * direction / np.linalg.norm(direction)
+        return {("moved", (anchor + 1,)) for anchor in movers}
+    if run.event == "delay":
+        anchor = int(draw.integers(n))
+        site.late_m[(site.first == anchor) | (site.second == anchor)] = run.size_m
+        return {("delay", (anchor + 1,))}
+    if run.event == "link":
+        pairs: Integers = np.array([draw.choice(np.flatnonzero(~site.is_missing))])
+    else:
+        low, high = site.position_m[:, :2].min(axis=0), site.position_m[:, :2].max(axis=0)
+        pairs = _crossing(site, draw.uniform(low, high))
+        while not len(pairs):
+            pairs = _crossing(site, draw.uniform(low, high))
+    site.late_m[pairs] = run.size_m if run.event == "link" else draw.uniform(*_DOOR_LATE_M, len(pairs))
+    return {("link", (int(site.first[pair]) + 1, int(site.second[pair]) + 1)) for pair in pairs.tolist()}
+
+
+def _crossing(site: _Site, person_m: Array) -> Integers:
+    """Pairs whose line of sight passes by a person."""
+    start, end = site.position_m[site.first, :2], site.position_m[site.second, :2]
+    along = end - start
+    part = np.clip(np.einsum("pd,pd->p", person_m - start, along) / np.einsum("pd,pd->p", along, along), 0.0, 1.0)
+    return np.flatnonzero(np.linalg.norm(start + part[:, None] * along - person_m, axis=1) < _DOOR_REACH_M)
+
+
+def striking_windows(layout: WatchedLayout, window_s: float, alarm: float, windows: int, seed: int) -> int:
+    """How many windows of white noise alone strike."""
+    draw = np.random.default_rng(seed)
+    position_m = np.array(layout.position_m)
+    n = len(position_m)
+    first, second = np.triu_indices(n, 1)
+    m = len(first)
+    std_m = _STAMP_S * SPEED_OF_LIGHT_MPS / math.sqrt(window_s / (n * _SLOT_S))
+    weight = weight_of(first, second, n, np.full(m, std_m), np.zeros(m))
+    pairs = Pairs(position_m, first, second, layout.dimensions, weight)
+    found = 0
+    for start in range(0, windows, _CHUNK):
+        count = min(_CHUNK, windows - start)
+        of_tx = draw.standard_normal((count, n))
+        noise = math.sqrt(0.5) * draw.standard_normal((count, m)) + 0.5 * (of_tx[:, first] + of_tx[:, second])
+        found += int(is_significant(pairs, std_m * noise, alarm).sum())
+    return found

@@ -1,0 +1,92 @@
+"""Sites on which surveys of anchors are studied, and ranges drawn for them as their stamps' noise has them."""
+
+import math
+from collections.abc import Mapping
+from typing import Final, Literal
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M
+from skyless.core.kernels.arrays import Array
+from skyless.sim.lab import lab_site
+from skyless.site.survey.facts import PairRange, PairRanges
+
+SLOT_S: Final = 2.5e-3
+STAMP_PS: Final = 100.0
+_ROOM_M: Final = (
+    (0.0, 0.0, 0.4),
+    (8.0, 0.0, 2.6),
+    (8.0, 6.0, 0.4),
+    (0.0, 6.0, 2.6),
+    (4.0, 0.0, 2.6),
+    (8.0, 3.0, 0.4),
+    (4.0, 6.0, 2.6),
+    (0.0, 3.0, 0.4),
+)
+
+
+class SurveyLayout(Struct, frozen=True, eq=False):
+    """Anchors 1 to n."""
+
+    name: str
+    dimensions: Literal[2, 3]
+    position_m: Array
+    """Shape (n, 3)."""
+    tag_height_m: float
+
+    @property
+    def anchors(self) -> tuple[int, ...]:
+        """Identifiers, in the order of the positions."""
+        return tuple(range(1, len(self.position_m) + 1))
+
+    @property
+    def heights_m(self) -> dict[int, float]:
+        """What a survey in two dimensions is given; empty in three."""
+        heights = dict(zip(self.anchors, self.position_m[:, 2].tolist(), strict=True))
+        return heights if self.dimensions == 2 else {}
+
+
+def survey_layouts() -> dict[str, SurveyLayout]:
+    """``lab``: the reference site. ``room``: 8 m × 6 m in 3-D. ``hall``: 3 × 4 anchors, 12 m apart, at 6 m."""
+    lab = np.array([[anchor.x_m, anchor.y_m, 0.0] for anchor in lab_site().anchors])
+    room = np.array(_ROOM_M)
+    room += np.random.default_rng(7).uniform(-0.3, 0.3, room.shape)
+    hall = np.array([(12.0 * column, 12.0 * row, 6.0) for row in range(3) for column in range(4)])
+    hall[:, :2] += np.random.default_rng(8).uniform(-1.0, 1.0, (len(hall), 2))
+    return {
+        "lab": SurveyLayout("lab", 2, lab, 0.0),
+        "room": SurveyLayout("room", 3, room, 1.2),
+        "hall": SurveyLayout("hall", 2, hall, 1.2),
+    }
+
+
+def drawn_ranges(
+    layout: SurveyLayout,
+    duration_s: float,
+    rng: np.random.Generator,
+    *,
+    delays_m: Mapping[int, float] | None = None,
+    pair_std_m: float = 0.0,
+    extra_m: Mapping[tuple[int, int], float] | None = None,
+) -> PairRanges:
+    """Ranges as stamps of ±100 ps give them in so long a time (covariance in ``docs/maths.md`` section 9).
+
+    ``pair_std_m``: constant error of each pair. ``extra_m``: added to single pairs, named by identifiers a < b.
+    """
+    anchors = layout.anchors
+    n = len(anchors)
+    superframes = max(1.0, duration_s / (n * SLOT_S))
+    stamp_std_m = math.hypot(STAMP_PS * 1e-12 * SPEED_OF_LIGHT_MPS, TICK_M / math.sqrt(12.0))
+    range_std_m = stamp_std_m / math.sqrt(2.0 * superframes)
+    tx_std_m = stamp_std_m / (2.0 * math.sqrt(superframes))
+    delay_m = np.array([(delays_m or {}).get(anchor, 0.0) for anchor in anchors]) + rng.normal(0.0, tx_std_m, n)
+    pairs = []
+    for i in range(n):
+        for j in range(i + 1, n):
+            distance = float(np.linalg.norm(layout.position_m[i] - layout.position_m[j]))
+            noise = rng.normal(0.0, range_std_m) + rng.normal(0.0, pair_std_m)
+            extra = (extra_m or {}).get((anchors[i], anchors[j]), 0.0)
+            measured = distance + delay_m[i] + delay_m[j] + noise + extra
+            pairs.append(PairRange(anchors[i], anchors[j], float(measured), range_std_m, int(superframes)))
+    return PairRanges(tuple(pairs), anchors, dict.fromkeys(anchors, tx_std_m), duration_s)

@@ -1,0 +1,306 @@
+"""Cramér–Rao bounds: the least error that any unbiased estimator can have with the stamps of a schedule.
+
+With Gaussian noise the (posterior) bound is the covariance of a filter that is linearised at the truth: the estimator's
+own steps with the tag at its true position and innovations of zero. Relayed receptions count without age, and with what
+they say of the survey, both of which the estimator approximates. Equations: ``docs/maths.md`` section 7.
+"""
+
+import math
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+from numpy.random import Generator
+from numpy.typing import ArrayLike
+
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
+from skyless.core.estimator.kalman import compute_ph, predict, relax_range_error, reset_state, update
+from skyless.core.estimator.measurements import reception_terms, relay_terms
+from skyless.core.estimator.state import (
+    ALL_RANGE_ERRORS,
+    EstimatorSettings,
+    EstimatorState,
+    layout,
+    new_state,
+    with_anchor,
+)
+from skyless.core.kernels.arrays import Array, Integers, Mask, Vector
+from skyless.core.kernels.compiled import kernel, threaded_kernel
+
+# What is known before the first frame, almost nothing: 30 m, 33 µs, ±10 ppm.
+POSITION_STD_M: Final = 30.0
+OFFSET_STD_M: Final = 1e4
+RATE_STD_MPS: Final = 10e-6 * SPEED_OF_LIGHT_MPS
+
+
+class Biases(Struct, frozen=True):
+    """Standard deviations of errors that nobody knows, in metres; each has a normal prior with mean zero.
+
+    They are states behind the clocks, and every measurement updates all of them: what anchors receive of each other
+    informs about their positions as well. For priors that are not normal the bound is the least mean square error
+    of all linear estimators.
+    """
+
+    survey_std_m: float = 0.0
+    """True less configured, of each coordinate of an anchor that the position has (two where the height is known)."""
+    constant_std_m: float = 0.0
+    """Constant error of the tag's ranges to an anchor."""
+    changing_std_m: float = 0.0
+    """Part of that error that changes: Gauss–Markov along time, the tag's path, or both."""
+    slope_std_m: float = 0.0
+    """What ranges gain for each unit of clip((range − 4 m)/4 m, −1, 1)."""
+    correlation_s: float = math.inf
+    """Time in which the correlation of the part that changes falls to 1/e."""
+    correlation_m: float = math.inf
+    """Distance walked by the tag in which it does."""
+
+
+class BoundSettings(Struct, frozen=True):
+    """A schedule of one frame per anchor and superframe, and the noise."""
+
+    stamp_s: float
+    """Noise of every stamp, TX and RX alike."""
+    white_fm: float
+    """White frequency noise of each oscillator, σ_y(1 s)."""
+    random_walk_fm: float
+    """Random walk of each oscillator's frequency, 1/√s."""
+    qa: float
+    """Spectral density of the acceleration, m²/s³ per axis."""
+    slot_s: float
+    speed_std_mps: float
+    """Each component of the velocity, before the first frame."""
+    mesh: bool
+    """Whether anchors also relay when they received each other, not only the first anchor."""
+    height_known: bool = True
+    at_once: bool = True
+    """Whether anchors' receptions are known at once; else each comes with the listener's next frame, as on the air."""
+
+    def model(self, biases: Biases = Biases()) -> EstimatorSettings:  # noqa: B008 - a frozen value
+        """Settings of an estimator whose model is that of the bound."""
+        light2 = SPEED_OF_LIGHT_MPS**2
+        stamp = light2 * self.stamp_s**2
+        return EstimatorSettings(
+            qa=self.qa,
+            white=light2 * self.white_fm**2,
+            walk=light2 * self.random_walk_fm**2,
+            tx_variance_m2=stamp,
+            rx_variance_m2=stamp,
+            height_m=0.0 if self.height_known else None,
+            survey_std_m=biases.survey_std_m,
+            range_std_m=biases.constant_std_m,
+            slope_std_m=biases.slope_std_m,
+            place_std_m=biases.changing_std_m,
+            place_time_s=biases.correlation_s,
+            place_distance_m=biases.correlation_m,
+        )
+
+
+def tracking_bound(
+    anchors_m: ArrayLike,
+    path_m: ArrayLike,
+    settings: BoundSettings,
+    biases: Biases = Biases(),  # noqa: B008 - a frozen value
+) -> Array:
+    """Posterior bound of the position after every superframe, shape (superframes, dims, dims), in m².
+
+    ``anchors_m``: true positions, shape (n, 3), in the order of their slots, the reference first. ``path_m``: where the
+    tag is at each frame, shape (superframes·n, 3).
+
+    Raises:
+        ValueError: the path has no whole number of superframes.
+    """
+    anchors, path = np.asarray(anchors_m, np.float64), np.asarray(path_m, np.float64)
+    n, frames = len(anchors), len(path)
+    if frames % n:
+        raise ValueError(f"the path has {frames} positions, no multiple of {n} anchors")
+    senders = np.arange(frames) % n
+    known = np.ones((frames, n + 1), np.bool_)
+    known[:, :-1] = settings.mesh | (senders == 0)[:, None]
+    known[np.arange(frames), senders] = False
+    sendings = Sendings(senders, settings.slot_s * np.arange(frames, dtype=np.float64))
+    return _frame_bound(anchors, path, settings, known, sendings, biases, settings.at_once)[n - 1 :: n]
+
+
+class Sendings(Struct, frozen=True):
+    """Frames that do not come in the order of a superframe."""
+
+    senders: Integers
+    """Index of each frame's anchor, shape (frames,)."""
+    times_s: Array
+    """When they are sent, in order, shape (frames,)."""
+
+
+def received_bound(
+    anchors_m: ArrayLike,
+    path_m: ArrayLike,
+    settings: BoundSettings,
+    known: Mask,
+    sendings: Sendings | None = None,
+    biases: Biases = Biases(),  # noqa: B008 - a frozen value
+) -> Array:
+    """Posterior bound of the position after every frame, shape (frames, dims, dims), in m², where frames are lost.
+
+    ``anchors_m``: shape (n, 3), in the order of their slots, the reference first. ``path_m``: where the tag is at each
+    frame, shape (frames, 3). ``known``: as of ``known_receptions``, shape (frames, n + 1); it, not the settings, states
+    what of the mesh is known. ``sendings``: who sends when, if not one anchor after the other in equal slots.
+
+    Raises:
+        ValueError: there is not one row of ``known`` and one sending for each position.
+    """
+    anchors, path = np.asarray(anchors_m, np.float64), np.asarray(path_m, np.float64)
+    n, frames = len(anchors), len(path)
+    if known.shape != (frames, n + 1):
+        raise ValueError(f"known has shape {known.shape}; it should be {(frames, n + 1)}")
+    if sendings is None:
+        sendings = Sendings(np.arange(frames) % n, settings.slot_s * np.arange(frames, dtype=np.float64))
+    if not len(sendings.senders) == len(sendings.times_s) == frames:
+        raise ValueError(f"sendings has {len(sendings.senders)} frames; it should be {frames}")
+    return _frame_bound(anchors, path, settings, known, sendings, biases, True)
+
+
+def known_receptions(
+    draw: Generator, frames: int, anchors: int, *, lost_at_tags: float, lost_at_anchors: float, mesh: bool
+) -> Mask:
+    """Which receptions of each frame the tag gets to know, shape (frames, anchors + 1); its own are the last column.
+
+    Anchors send in turn, the reference first. The information is what there is on the air at most. What an anchor
+    receives of the reference is known at once, whatever the tag receives of that anchor, as its next beacon states its
+    clock, in which all of it is. Other receptions among anchors are known where the tag has received the packet itself,
+    without whose stamp they give no information, and receives the listener before that has received a newer one; they
+    are known at once as well, so that no receiver can do better.
+    """
+    senders = np.arange(frames) % anchors
+    heard = draw.random((frames, anchors + 1)) >= np.append(np.full(anchors, lost_at_anchors), lost_at_tags)
+    own = heard[:, -1]
+    relay_share = (1.0 - lost_at_tags) / max(1.0 - lost_at_tags * lost_at_anchors, 1e-12)
+    relayed = draw.random((frames, anchors)) < relay_share
+    others = relayed & own[:, None] if mesh else np.zeros_like(relayed)
+    others[senders == 0] = True
+    heard[:, :-1] &= others
+    heard[np.arange(frames), senders] = False
+    return heard
+
+
+def _frame_bound(
+    anchors: Array,
+    path: Array,
+    settings: BoundSettings,
+    known: Mask,
+    sendings: Sendings,
+    biases: Biases,
+    at_once: bool,
+) -> Array:
+    """Bound after every frame; where receptions are not known at once it holds at the end of a superframe."""
+    s = _prior(anchors, settings, biases)
+    ticks = np.rint(sendings.times_s / TICK_S).astype(np.int64)
+    s.status["epoch_ticks"] = ticks[0]
+    walked_m = np.cumsum(np.linalg.norm(np.diff(path, axis=0, prepend=path[:1]), axis=1))
+    dims = settings.model().dim
+    bound, newest = np.empty((len(path), dims, dims)), np.zeros((2, len(anchors)), np.int64)
+    present = s._replace(P=s.P.copy(), status=s.status.copy())
+    senders = sendings.senders.astype(np.int64)
+    _run(s, present, np.ascontiguousarray(path), ticks, walked_m, senders, known, at_once, newest, bound)
+    return bound
+
+
+def _prior(anchors: Array, settings: BoundSettings, biases: Biases) -> EstimatorState:
+    """State before the first frame, with clocks known to ``OFFSET_STD_M`` and ``RATE_STD_MPS`` of the first anchor's.
+
+    Its offsets are the tag's clock against each anchor's, so that the tag's own prior is in all of them.
+    """
+    s = new_state(settings.model(biases), len(anchors))
+    s.status["walk_scale"] = 1.0
+    for row, position_m in enumerate(anchors):
+        s = with_anchor(s, row, position_m)
+    dim, n = settings.model().dim, len(anchors)
+    where = layout(dim, n)
+    P = s.P
+    for first, std in ((0, POSITION_STD_M), (where.velocity, settings.speed_std_mps)):
+        P[first : first + dim, first : first + dim] = std**2 * np.eye(dim)
+    shared = 1.0 + np.diag([0.0] + [1.0] * (n - 1))
+    for first, std in ((where.offset, OFFSET_STD_M), (where.rate, RATE_STD_MPS)):
+        P[first : first + n, first : first + n] = std**2 * shared
+    return s
+
+
+@threaded_kernel
+def _run(
+    s: EstimatorState,
+    present: EstimatorState,
+    path: Array,
+    ticks: Integers,
+    walked_m: Vector,
+    senders: Integers,
+    known: Mask,
+    at_once: bool,
+    newest: Integers,
+    bound: Array,
+) -> None:
+    """Process frame by frame; ``newest`` has the newest frame that the tag received of each anchor, shape (2, n).
+
+    Where receptions are not known at once, those by anchors whose turn is earlier in the superframe come with the next
+    superframe: they are left out of ``present``, from which the superframe's own bound is.
+    """
+    n, dim = len(s.anchors), s.settings[0]["dim"]
+    for frame in range(len(path)):
+        if not at_once and frame % n == 0:
+            present.P[:] = s.P
+            present.status[0]["epoch_ticks"] = s.status[0]["epoch_ticks"]
+            newest[1] = newest[0]
+            for own in range(frame, frame + n):
+                _process_frame(present, path, ticks, walked_m, senders, known, own, False, newest[1])
+                bound[own] = present.P[:dim, :dim]
+        _process_frame(s, path, ticks, walked_m, senders, known, frame, True, newest[0])
+        if at_once:
+            bound[frame] = s.P[:dim, :dim]
+
+
+@kernel
+def _process_frame(
+    s: EstimatorState,
+    path: Array,
+    ticks: Integers,
+    walked_m: Vector,
+    senders: Integers,
+    known: Mask,
+    frame: int,
+    at_once: bool,
+    newest: Integers,
+) -> None:
+    """Process the receptions of a frame: the tag's, and those of anchors that are relayed."""
+    settings, n, sender = s.settings[0], len(s.anchors), senders[frame]
+    dim = settings["dim"]
+    where = layout(dim, n)
+    predict(s, ticks[frame])
+    s.x[:dim] = path[frame, :dim]
+    if dim == 2:
+        s.settings[0]["height_m"] = path[frame, 2]
+    reset_state(s, where.tx_noise + sender, settings["tx_variance_m2"])
+    if known[frame, n]:
+        before = newest[sender]
+        relax_range_error(s, sender, (ticks[frame] - ticks[before]) * TICK_S, walked_m[frame] - walked_m[before])
+        newest[sender] = frame
+        s.anchors[sender]["held_m"][0] = np.nan  # linearise here, not at a held point
+        terms, _ = reception_terms(s, sender, 1)
+        update(s, 0.0, compute_ph(s, terms) + settings["rx_variance_m2"])
+    for listener in range(n):
+        if known[frame, listener] and (at_once or listener > sender):
+            terms = _relay_terms(s, listener, sender)
+            update(s, 0.0, compute_ph(s, terms) + settings["rx_variance_m2"])
+
+
+@kernel
+def _relay_terms(s: EstimatorState, listener: int, sender: int) -> int:
+    """As ``relay_terms`` at the moment of the reception, with the displacements of both anchors; number of terms."""
+    term = relay_terms(s, listener, sender, 0.0, True)
+    if s.status[0]["range_errors"] == ALL_RANGE_ERRORS:
+        dim, here, there = s.settings[0]["dim"], s.anchors[sender]["position_m"], s.anchors[listener]["position_m"]
+        survey, squared = layout(dim, len(s.anchors)).survey, 0.0
+        for axis in range(3):
+            squared += (there[axis] - here[axis]) ** 2
+        for axis in range(dim):
+            towards = (there[axis] - here[axis]) / math.sqrt(squared)
+            s.h[term], s.h_index[term] = towards, survey + dim * listener + axis
+            s.h[term + 1], s.h_index[term + 1] = -towards, survey + dim * sender + axis
+            term += 2
+    return term

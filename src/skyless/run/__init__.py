@@ -1,0 +1,1 @@
+"""The programs of a site: anchors, tags, broker, recordings, live survey."""

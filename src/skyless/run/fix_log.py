@@ -1,0 +1,209 @@
+"""What a tag's program keeps of its fixes: numbers, latencies, Unix times, and which are too old to be given.
+
+A fix is worth nothing when it is old, and what waits in front of a slow program makes everything behind it old as well.
+So a reception that is too old at its turn is dropped with all that wait at that moment: positioning goes on with what
+comes next, and the receptions that it gets follow one another without gaps between such pauses.
+"""
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from skyless.core.fix import Fix
+from skyless.core.protocol1.beacon import Beacon as Protocol1Beacon
+from skyless.core.protocols import decode_any
+from skyless.run.mqtt.messages import Counters, FixMessage, Phase, TagHealth, fix_message
+from skyless.run.process import HEALTH_S
+from skyless.run.rate_limit import RateLimit
+
+FixListener = Callable[[FixMessage], None]
+
+MAX_AGE_S: Final = 0.1
+"""No fix reaches a subscriber later than this after the end of its last frame, as far as its sender can see to it."""
+
+FIX_LEAVES_S: Final = 0.6 * MAX_AGE_S
+"""A fix that is older is not given: the broker and the subscriber need the rest where a computer is busy."""
+
+MAX_RECEPTION_AGE_S: Final = 0.5 * MAX_AGE_S
+"""A reception that is older at its turn is dropped, so that time is left for its fix."""
+
+_MAX_LATENCIES: Final = 4096
+_MAX_PHASES: Final = 64
+
+
+class FixLog:
+    """Numbers, times and publishes the fixes of one tag, across restarts of its radio."""
+
+    def __init__(
+        self, tag: str, publish: FixListener, publish_hz: float, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """``publish`` is called at most ``publish_hz`` times a second, and not with too old fixes. All are counted.
+
+        ``clock`` gives the host's monotonic time in s.
+        """
+        self.tag, self._clock = tag, clock
+        self.started_s = clock()
+        self.unix_less_host_s = 0.0
+        self.update_clock_offset()
+        self.serial = 0  # number of the newest fix, which is the number of fixes so far
+        self.first_fix_s: float | None = None  # since the start
+        self.last_fix_s: float | None = None  # when the last fix was made, by the host's monotonic clock
+        self.due_s = 0.0
+        """When the last frame had ended without which the newest fix could not be made: its own, except for a verified
+        fix, which needs a key that comes later."""
+        self.latencies = Latencies()
+        self.lateness = Lateness()  # which receptions and fixes are too old
+        self._reported_serial = 0
+        self._publish, self._rate = publish, RateLimit(publish_hz)
+
+    def update_clock_offset(self) -> None:
+        """Measure again how far Unix time is from the host's monotonic clock: it is set now and then."""
+        self.unix_less_host_s = time.time() - self._clock()
+
+    def add(self, fix: Fix, ended_s: float, done_s: float, due_s: float | None = None) -> None:
+        """Add a fix: when its last frame ended, and when it was made, by the host's monotonic clock.
+
+        ``due_s``: when it could be made, where that is not at its last frame; its age counts from then.
+        """
+        self.serial += 1
+        self.due_s = ended_s if due_s is None else due_s
+        self.last_fix_s = done_s
+        self.latencies.add(done_s - ended_s)
+        if self.first_fix_s is None:
+            self.first_fix_s = done_s - self.started_s
+        if self.lateness.gives(self.due_s, done_s) and self._rate.is_due(ended_s):
+            unix_s = ended_s + self.unix_less_host_s
+            self._publish(fix_message(self.tag, self.serial, fix, unix_s, done_s - ended_s))
+
+    def health(
+        self,
+        *,
+        method: str,
+        receptions: int,
+        reason: str,
+        counters: Mapping[str, int],
+        mqtt: Counters,
+        cpu: float,
+        memory_bytes: int,
+        phases: tuple[Phase, ...] = (),
+        late_in_link: int = 0,
+    ) -> TagHealth:
+        """The tag's state since the last call. ``reason`` says why there is no fix, if there is none.
+
+        ``late_in_link``: fixes that became too old while they waited for the broker.
+        """
+        now_s = self._clock()
+        median_s, late_s, _ = self.latencies.drain()
+        fixes, self._reported_serial = self.serial - self._reported_serial, self.serial
+        is_silent = self.last_fix_s is None or now_s - self.last_fix_s > HEALTH_S
+        late_fixes = self.lateness.withheld + late_in_link
+        return TagHealth(
+            tag=self.tag,
+            unix_s=time.time(),
+            uptime_s=now_s - self.started_s,
+            method=method,
+            receptions=receptions,
+            fixes=self.serial,
+            updates_per_s=fixes / HEALTH_S,
+            reason=reason if is_silent else None,
+            first_fix_s=self.first_fix_s,
+            latency_p50_s=median_s,
+            latency_p99_s=late_s,
+            counters=dict(counters) | ({"late-fix": late_fixes} if late_fixes else {}),
+            mqtt=mqtt,
+            cpu=cpu,
+            memory_bytes=memory_bytes,
+            phases=phases,
+            late=self.lateness.dropped + late_fixes,
+            lateness_s=self.lateness.drain(),
+        )
+
+
+class Lateness:
+    """Ages of one tag's receptions and fixes. Times are of the host's monotonic clock, in s."""
+
+    def __init__(self) -> None:
+        self.dropped = 0  # receptions that were too old at their turn
+        self.withheld = 0  # fixes that were too old to be given
+        self._largest_s = 0.0
+        self._present_s = float("-inf")  # when the newest backlog was noticed: what had ended by then is dropped
+
+    def admits(self, ended_s: float, now_s: float) -> bool:
+        """Whether to process a reception whose frame ended at ``ended_s``. If not, it is counted."""
+        self._note(now_s - ended_s)
+        if now_s - ended_s > MAX_RECEPTION_AGE_S:
+            self._present_s = now_s
+        if ended_s <= self._present_s:
+            self.dropped += 1
+            return False
+        return True
+
+    def gives(self, ended_s: float, now_s: float) -> bool:
+        """Whether to give a fix made now, whose last frame ended at ``ended_s``. If not, it is counted."""
+        self._note(now_s - ended_s)
+        if now_s - ended_s > FIX_LEAVES_S:
+            self.withheld += 1
+            return False
+        return True
+
+    @property
+    def drops(self) -> Counter[str]:
+        """Dropped receptions as a counter."""
+        return +Counter({"late-reception": self.dropped})
+
+    def drain(self) -> float:
+        """The largest age since the last call, or 0 if there was nothing."""
+        largest_s, self._largest_s = self._largest_s, 0.0
+        return largest_s
+
+    def _note(self, age_s: float) -> None:
+        self._largest_s = max(self._largest_s, age_s)
+
+
+class Latencies:
+    """Latencies since they were last read, in s."""
+
+    def __init__(self) -> None:
+        self._values: deque[float] = deque(maxlen=_MAX_LATENCIES)
+
+    def add(self, latency_s: float) -> None:
+        """Count one fix."""
+        self._values.append(latency_s)
+
+    def drain(self) -> tuple[float | None, float | None, int]:
+        """Median, 99th percentile and number of the latencies, which are then forgotten."""
+        ordered = sorted(self._values)
+        self._values.clear()
+        if not ordered:
+            return None, None, 0
+        return ordered[len(ordered) // 2], ordered[min(len(ordered) - 1, (99 * len(ordered)) // 100)], len(ordered)
+
+
+class PhaseLog:
+    """When the frames of the present superframe and of the last whole one ended and were processed."""
+
+    def __init__(self) -> None:
+        self._superframe: int | None = None
+        self._begin_s = 0.0
+        self._present: list[Phase] = []
+        self.last: tuple[Phase, ...] = ()
+
+    def add(self, frame: bytes, ended_s: float, done_s: float, *, made_fix: bool) -> None:
+        """Add one frame: when it ended, and when its processing did, by the host's monotonic clock.
+
+        Frames without slots, of anchors that send at random instants, are left out.
+        """
+        beacon = decode_any(frame)
+        if not isinstance(beacon, Protocol1Beacon):
+            return
+        if beacon.superframe != self._superframe:
+            self.last = tuple(self._present)
+            self._present.clear()
+            self._superframe, self._begin_s = beacon.superframe, ended_s
+        if len(self._present) >= _MAX_PHASES:
+            return
+        begin_s = self._begin_s
+        self._present.append(
+            Phase(beacon.superframe, beacon.slot, beacon.anchor, ended_s - begin_s, done_s - begin_s, made_fix)
+        )

@@ -1,0 +1,1 @@
+"""Keys of anchors and tags on disk."""

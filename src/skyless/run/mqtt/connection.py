@@ -1,0 +1,421 @@
+"""One connection to a broker, from its beginning until it breaks: paho's client, driven by our event loop."""
+
+import asyncio
+import contextlib
+import logging
+import secrets
+import socket
+import ssl
+from collections.abc import Callable, Iterable, Mapping
+from threading import Thread
+from typing import Final, cast
+
+from msgspec import Struct
+from paho.mqtt import client as paho
+from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
+from paho.mqtt.reasoncodes import ReasonCode
+
+from skyless.core.errors import SkylessError
+from skyless.run.mqtt.address import MqttAddress
+
+BROKER_ANSWER_S: Final = 3.0
+"""How long a broker may take to accept a connection."""
+
+_LEAVE_S: Final = 1.0
+
+_SEND_BUFFER: Final = 262_144
+"""Bytes that wait in the kernel, and as many in the process: what is older than the newest fix should not be many."""
+
+_MAX_PACKETS: Final = 100
+"""Read at once, before the event loop continues with other work."""
+
+_QUICK_ACK: Final = getattr(socket, "TCP_QUICKACK", None)
+"""Linux resets it after each use. mosquitto holds a message back until the one before is acknowledged, which
+TCP otherwise delays by 40 ms."""
+
+_REFUSALS: Final = {
+    "Bad user name or password": "wrong user name or password",
+    "Not authorized": "wrong user name or password, or no permission",
+}
+
+_log = logging.getLogger("skyless.run.mqtt")
+
+
+class Will(Struct, frozen=True):
+    """What the broker publishes, retained and at QoS 1, when the client goes without disconnecting."""
+
+    topic: str
+    payload: bytes
+
+
+class Introduction(Struct, frozen=True):
+    """What a client sends the broker about itself."""
+
+    client: str
+    """Its name; a new one where it is empty."""
+    keepalive_s: int
+    """The connection is given up when the broker has been silent for this time."""
+    persistent: bool = False
+    """The broker keeps subscriptions, and messages of QoS 1, for this name."""
+    will: Will | None = None
+
+
+class Reactions(Struct, frozen=True):
+    """Functions that the event loop calls."""
+
+    message: Callable[[str, bytes], None] = lambda _topic, _payload: None
+    acknowledged: Callable[[int], None] = lambda _number: None
+    """The broker has the message of QoS 1 that ``publish`` gave this number."""
+    writable: Callable[[], None] = lambda: None
+    """The connection accepts more again."""
+
+
+class RefusedError(Exception):
+    """The broker refuses this client; the text says why."""
+
+
+class Connection:
+    """A client of paho for one connection: a broken one is discarded, and nothing waits here for the next one.
+
+    paho writes at once (it would wait for a turn of the event loop if it had ``on_socket_register_write``). What the
+    socket does not accept waits in paho until the socket is writable, and what is published while paho reads, until it
+    has read.
+    """
+
+    def __init__(self, address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, react: Reactions) -> None:
+        self.writable = False
+        """Whether the connection accepts more; false while a slow broker has its buffers full, and once it is lost."""
+        self.lost = asyncio.Event()
+        self.reason = "the broker has closed the connection"
+        """Why it was lost."""
+        self.unread_since_s: float | None = None
+        """Since when messages of the broker have waited to be read, by the loop's clock; None while none do."""
+        self._address = address
+        self._keepalive_s = who.keepalive_s
+        self._react = react
+        self._loop = asyncio.get_running_loop()
+        self._client = _make_client(address, tls, who, BROKER_ANSWER_S)
+        self._accepted: asyncio.Future[None] = self._loop.create_future()
+        self._socket: socket.socket | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._has_answered = False
+        self._messages = 0
+        self._reading = self._awaits_socket = False
+        self._waiting_bytes = 0
+        self._flying: dict[int, paho.MQTTMessageInfo] = {}
+        self._asked: dict[int, tuple[str, ...]] = {}
+
+    async def open(self) -> None:
+        """Connect, and wait until the broker accepts.
+
+        Raises:
+            RefusedError: it does not.
+            OSError: it cannot be reached, or does not answer (TimeoutError).
+        """
+        try:
+            async with asyncio.timeout(BROKER_ANSWER_S):
+                await _connect(self._client, self._address, max(1, self._keepalive_s // 2))
+                self._begin()
+                await self._accepted
+        except BaseException as error:
+            self.abort("gave up")
+            if isinstance(error, TimeoutError) and not error.args:
+                raise TimeoutError(self._no_answer()) from None
+            raise
+        self.writable = not self.lost.is_set()
+        self._keep_alive()
+
+    def publish(self, topic: str, payload: bytes, qos: int, *, retain: bool) -> int:
+        """Send a message, or let it wait for the socket; never blocks. Its number until it is acknowledged."""
+        info = self._client.publish(topic, payload, qos, retain)
+        while info.rc == MQTTErrorCode.MQTT_ERR_QUEUE_SIZE:  # its number is still in use, 65 535 messages later
+            info = self._client.publish(topic, payload, qos, retain)
+        if qos and not info.rc:
+            self._flying[info.mid] = info
+        if self._client.want_write():
+            self._waiting_bytes += len(topic) + len(payload)
+            self.writable = self.writable and self._waiting_bytes < _SEND_BUFFER
+            self._await_socket()
+        return info.mid
+
+    def subscribe(self, filters: Mapping[str, int]) -> None:
+        """Subscribe to topic filters, each with its QoS."""
+        _, number = self._client.subscribe(list(filters.items()))
+        if number is not None:
+            self._asked[number] = tuple(filters)
+        self._await_socket()
+
+    def unsubscribe(self, filters: Iterable[str]) -> None:
+        """End subscriptions."""
+        self._client.unsubscribe(list(filters))
+        self._await_socket()
+
+    def abort(self, reason: str) -> None:
+        """Drop the connection at once."""
+        if not self.lost.is_set():
+            self._lose(reason)
+        if self._socket is not None:
+            sock = self._socket
+            self._client.on_socket_close = None
+            self._leave_loop()
+            sock.close()
+
+    async def leave(self) -> None:
+        """Disconnect and close when all is sent, or after a second."""
+        self.writable = False
+        if not self.lost.is_set():
+            self._client.disconnect()
+            self._await_socket()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_LEAVE_S):
+                await self.lost.wait()
+        self.abort("left")
+
+    # What the event loop calls
+
+    def _begin(self) -> None:
+        """Keep buffers small, so that nothing old piles up in them, and watch the socket."""
+        self._socket = cast(socket.socket | None, self._client.socket())
+        if self._socket is None:
+            raise ConnectionError(self.reason)
+        self._client.on_connect = self._on_connect
+        self._client.on_disconnect = self._on_disconnect
+        self._client.on_socket_close = self._on_socket_close
+        self._client.on_message = self._on_message
+        self._client.on_subscribe = self._on_subscribe
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+        self._loop.add_reader(self._socket, self._read)
+        self._await_socket()
+
+    def _read(self) -> None:
+        """Read all that has come, packet by packet."""
+        self._has_answered = self._reading = True
+        left = _MAX_PACKETS
+        while self._socket is not None:
+            seen = self._messages
+            self._client.loop_read()
+            left -= 1
+            # The socket does not announce what TLS has decrypted already.
+            if not _decrypted(self._socket) and (left <= 0 or self._messages == seen):
+                break
+        self._reading = False
+        if left > 0:
+            self.unread_since_s = None
+        elif self.unread_since_s is None:
+            self.unread_since_s = self._loop.time()
+        if self._socket is not None and _QUICK_ACK is not None:
+            self._socket.setsockopt(socket.IPPROTO_TCP, _QUICK_ACK, 1)
+        # paho's on_publish would also come for each message of QoS 0, whose number may be that of another in flight.
+        for number in [number for number, info in self._flying.items() if info.is_published()]:
+            del self._flying[number]
+            self._react.acknowledged(number)
+        self._write()
+
+    def _write(self) -> None:
+        """Write what waits, and accept more when nothing waits."""
+        if self._client.want_write():
+            self._client.loop_write()
+        if not self._client.want_write():
+            self._waiting_bytes = 0
+            if not self.writable and self._accepted.done() and not self.lost.is_set():
+                self.writable = True
+                self._react.writable()
+        self._await_socket()
+
+    def _await_socket(self) -> None:
+        """Watch whether the socket accepts more while paho has more for it."""
+        wanted = self._client.want_write() and self._socket is not None
+        if self._reading or self._socket is None or wanted == self._awaits_socket:
+            return
+        self._awaits_socket = wanted
+        if wanted:
+            self._loop.add_writer(self._socket, self._write)
+        else:
+            self._loop.remove_writer(self._socket)
+
+    def _keep_alive(self) -> None:
+        """Let paho ping the broker after half the keepalive time, and give up after the other half."""
+        self._client.loop_misc()
+        self._await_socket()
+        if self._socket is not None:
+            self._timer = self._loop.call_later(self._keepalive_s / 20, self._keep_alive)
+
+    def _leave_loop(self) -> None:
+        if self._socket is not None:
+            self._loop.remove_reader(self._socket)
+            self._loop.remove_writer(self._socket)
+            self._socket = None
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def _lose(self, reason: str) -> None:
+        self.reason = reason
+        self.writable = False
+        if not self._accepted.done():
+            self._accepted.set_exception(ConnectionError(reason))
+            self._accepted.exception()  # retrieved, in case nothing awaits it
+        self.lost.set()
+
+    def _no_answer(self) -> str:
+        return "its answer is not MQTT" if self._has_answered else f"no answer within {BROKER_ANSWER_S:g} s"
+
+    # What paho calls
+
+    def _on_connect(self, _client: object, _data: object, _flags: object, code: ReasonCode, _more: object) -> None:
+        if self._accepted.done():
+            return
+        if code.is_failure:
+            self._accepted.set_exception(RefusedError(_REFUSALS.get(str(code), str(code))))
+        else:
+            self._accepted.set_result(None)
+
+    def _on_disconnect(self, _client: object, _data: object, _flags: object, code: ReasonCode, _more: object) -> None:
+        if self.lost.is_set():
+            return
+        if code == "Keep alive timeout":
+            self._lose(f"the broker has been silent for {self._keepalive_s} s")
+        elif code == "Protocol error":
+            self._lose("its answer is not MQTT")
+        else:
+            self._lose(self.reason)
+
+    def _on_socket_close(self, _client: object, _data: object, _socket: object) -> None:
+        self._leave_loop()
+
+    def _on_message(self, _client: object, _data: object, message: paho.MQTTMessage) -> None:
+        self._messages += 1
+        try:
+            topic = message.topic
+        except UnicodeDecodeError:
+            self.abort("its answer is not MQTT: a topic that is not UTF-8")
+            return
+        self._react.message(topic, bytes(message.payload))
+
+    def _on_subscribe(
+        self, _client: object, _data: object, number: int, codes: list[ReasonCode], _more: object
+    ) -> None:
+        for name, code in zip(self._asked.pop(number, ()), codes, strict=False):
+            if code.is_failure:
+                _log.warning("the broker %s does not let this user subscribe to %s", self._address, name)
+
+
+def _decrypted(sock: socket.socket) -> int:
+    """Bytes that wait in TLS."""
+    return sock.pending() if isinstance(sock, ssl.SSLSocket) else 0
+
+
+async def open_connection(
+    address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, react: Reactions | None = None
+) -> Connection:
+    """A connection that the broker has accepted; of several brokers, the first that does.
+
+    Raises:
+        RefusedError: it, or the last of several, refuses this client.
+        OSError: it cannot be reached, or does not answer (TimeoutError).
+    """
+    *others, last = address.brokers
+    for broker in others:
+        with contextlib.suppress(OSError, RefusedError):
+            return await _open(broker, tls, who, react)
+    return await _open(last, tls, who, react)
+
+
+async def _open(
+    address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, react: Reactions | None
+) -> Connection:
+    connection = Connection(address, tls, who, react or Reactions())
+    await connection.open()
+    return connection
+
+
+async def check_broker(address: MqttAddress, tls: ssl.SSLContext | None = None) -> None:
+    """Check that a broker accepts this client; ``tls`` replaces the address's own checks of its certificate.
+
+    Raises:
+        SkylessError: it does not; the message says why.
+    """
+    try:
+        connection = await open_connection(address, tls or address.tls_context(), Introduction("", 60))
+    except (OSError, RefusedError) as error:
+        raise SkylessError(trouble_with(address, error)) from None
+    await connection.leave()
+
+
+def trouble_with(address: MqttAddress, error: OSError | RefusedError) -> str:
+    """One line for a person about a connection that cannot be made."""
+    if isinstance(error, RefusedError):
+        hint = ""
+        if "user" in str(error):
+            place = "the password goes in SKYLESS_MQTT_PASSWORD or after the user's name"
+            hint = f"; {place}" if address.user is not None else "; the address has no user: it should be USER@HOST"
+        return f"the broker {address} refuses: {error}{hint}"
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return (
+            f"the certificate of the broker {address} is not trusted: {error.verify_message}; --mqtt-ca names another"
+        )
+    if isinstance(error, ssl.SSLError):
+        return f"the broker {address} does not use TLS as expected: {error.reason or error}"
+    return f"the broker {address} cannot be reached: {error.strerror or error}"
+
+
+def _make_client(address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, timeout_s: float) -> paho.Client:
+    """A client that neither bounds the messages in flight nor connects again; a link does both."""
+    client = paho.Client(
+        CallbackAPIVersion.VERSION2,
+        who.client or f"skyless-{secrets.token_hex(4)}",
+        clean_session=not who.persistent,
+        reconnect_on_failure=False,
+    )
+    client.connect_timeout = timeout_s
+    client.max_inflight_messages_set(0)
+    client.username_pw_set(address.user, address.password)
+    if who.will is not None:
+        client.will_set(who.will.topic, who.will.payload, qos=1, retain=True)
+    if tls is not None:
+        client.tls_set_context(tls)
+        client.tls_insecure_set(not tls.check_hostname)  # else paho compares the names itself
+    return client
+
+
+async def _connect(client: paho.Client, address: MqttAddress, keepalive_s: int) -> None:
+    """Let paho connect, which blocks, in a thread that nothing waits for, not even the end of the program.
+
+    Raises:
+        OSError: it cannot be reached.
+    """
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[None] = loop.create_future()
+
+    def finish(error: BaseException | None) -> None:
+        if done.cancelled():
+            _close(client)
+        elif error is None:
+            done.set_result(None)
+        else:
+            done.set_exception(error)
+
+    def work() -> None:
+        error: BaseException | None = None
+        try:
+            client.connect(address.host, address.port, keepalive_s)
+        except Exception as caught:  # noqa: BLE001 - raised where it is awaited
+            error = caught
+        try:
+            loop.call_soon_threadsafe(finish, error)
+        except RuntimeError:  # the event loop has ended meanwhile
+            _close(client)
+
+    Thread(target=work, name="MQTT connect", daemon=True).start()
+    try:
+        await done
+    except asyncio.CancelledError:
+        if not done.cancelled():  # it connected at the same moment
+            _close(client)
+        raise
+
+
+def _close(client: paho.Client) -> None:
+    sock = client.socket()
+    if sock is not None:
+        sock.close()

@@ -1,0 +1,611 @@
+"""The messages on MQTT, version 1: JSON objects, one struct for each topic of ``run/mqtt/topics.py`` (``docs/mqtt.md``).
+
+SI units. ``unix_s`` is seconds since 1970 by the sender's clock. Fields may be added within a version; readers ignore
+those that they do not know.
+"""
+
+from collections import deque
+from typing import TYPE_CHECKING, Final, Literal, TypeVar
+
+import msgspec
+from msgspec import UNSET, Struct, UnsetType
+from msgspec.structs import replace
+
+from skyless.core.site import FloorPlanSite, Outline, Site
+from skyless.site.survey.facts import Facts
+from skyless.site.survey.result import Survey
+
+if TYPE_CHECKING:
+    from skyless.core.fix import Fix
+
+_T = TypeVar("_T")
+Vector = tuple[float, float, float]
+Matrix = tuple[float, float, float, float, float, float, float, float, float]
+"""3 × 3, row by row."""
+
+MAX_LEASES: Final = 64
+MAX_LEASE_S: Final = 60.0
+
+
+class SiteMessage(Struct, frozen=True):
+    """The site as in its file, retained, so that a new tag or page has it at once."""
+
+    site: Site
+    """Without its outline, which earlier versions refuse in it."""
+    simulated: bool
+    """True when its radios are emulated."""
+    unix_s: float
+    outline_m: Outline | UnsetType = UNSET
+    """The room's corners, where the site's file has them."""
+
+    @property
+    def whole_site(self) -> Site:
+        """The site as in its file."""
+        return replace(self.site, outline_m=self.outline_m)
+
+
+def site_message(site: Site, *, simulated: bool, unix_s: float) -> SiteMessage:
+    """The message of a site: its outline stands beside it."""
+    return SiteMessage(replace(site, outline_m=UNSET), simulated, unix_s, site.outline_m)
+
+
+class StatusMessage(Struct, frozen=True):
+    """Whether a node is online; retained, and the broker itself publishes ``online: false`` as its last will."""
+
+    online: bool
+    kind: str
+    name: str
+    version: str = ""
+    host: str = ""
+    pid: int = 0
+    unix_s: float = 0.0
+    """When it came online; 0 in a last will."""
+
+
+class PreparationMessage(Struct, frozen=True):
+    """How far the compilation of the kernels is, before a site's programs start for the first time; retained."""
+
+    done: int
+    total: int
+    """0 while it is not known yet."""
+    left_s: float | None
+    """Estimated from what has been done; None while that is too little."""
+    unix_s: float
+
+
+class FixMessage(Struct, frozen=True):
+    """One fix of one tag. A tag publishes at its configured rate; ``serial`` counts all fixes that it made."""
+
+    tag: str
+    serial: int
+    """Number of the fix since the tag's start."""
+    unix_s: float
+    """When the last frame of the fix ended, by the clock of the tag's host."""
+    time_s: float
+    """Master time at which the position holds, since the receiver's first fix."""
+    position_m: Vector
+    covariance_m2: Matrix
+    velocity_mps: Vector | None
+    velocity_covariance: Matrix | None
+    std_m: float
+    """One-sigma radial error."""
+    gdop: float | None
+    pdop: float | None
+    hdop: float | None
+    vdop: float | None
+    anchors: tuple[int, ...]
+    chi2: float
+    dof: int
+    residual_rms_m: float
+    method: str
+    height_known: bool
+    latency_s: float
+    """From the end of the last frame to the computed fix."""
+    hpl_m: float | None = None
+    """Horizontal protection level; None where there is no guarantee, or the method has none."""
+    vpl_m: float | None = None
+    integrity_risk: float | None = None
+    """Probability, for each fix, that the error exceeds its level."""
+    alert: str | None = None
+    """A value of ``skyless.core.alert.Alert``."""
+    verified_until_s: float | None = None
+    """Up to this time, on the scale of ``time_s``, all beacons that count are verified; None where none is."""
+    unverified: float = 1.0
+    """Share of the beacons of the last second that are not verified, or not yet."""
+
+
+class Counters(Struct, frozen=True):
+    """Counts of a node's MQTT link."""
+
+    published: int
+    dropped: int
+    """Messages dropped because the broker was away or slow."""
+    reconnects: int
+
+
+class Phase(Struct, frozen=True, array_like=True):
+    """One message of a tag's last superframe, times in s since that superframe's first message was heard."""
+
+    superframe: int
+    slot: int
+    anchor: int
+    heard_s: float
+    """The frame's end."""
+    done_s: float
+    """The end of its processing."""
+    fix: bool
+
+
+class TagHealth(Struct, frozen=True):
+    """A tag's state, once a second."""
+
+    tag: str
+    unix_s: float
+    uptime_s: float
+    method: str
+    receptions: int
+    fixes: int
+    updates_per_s: float
+    """Fixes in the last second."""
+    reason: str | None
+    """Why there is no fix; None where there is one."""
+    first_fix_s: float | None
+    """From the start to the first fix."""
+    latency_p50_s: float | None
+    latency_p99_s: float | None
+    """From a frame's end to its fix, over the last second."""
+    counters: dict[str, int]
+    """Dropped frames by reason."""
+    mqtt: Counters
+    cpu: float
+    """Share of a core that the process uses; a process with several tags divides it among them."""
+    memory_bytes: int
+    """Resident memory of the process."""
+    phases: tuple[Phase, ...]
+    """The messages of the last whole superframe."""
+    late: int = 0
+    """Receptions dropped because they were too old at their turn, and fixes not given because they were: ``counters``
+    has them as ``late-reception`` and ``late-fix``."""
+    lateness_s: float = 0.0
+    """Largest age of a reception at its turn, or of a fix when it was made, in the last second."""
+    trust: Literal["open", "verified"] | None = None
+    """Which fixes a tag gives that verifies beacons; None for one without the site's public key."""
+    is_verified: bool = False
+    """Whether beacons have been verified within the last seconds."""
+    faults: dict[str, str] = {}
+    """Anchors whose beacons, or beacons in whose name, were not accepted within the last seconds, and why
+    (``skyless.core.keys.fault.Fault``)."""
+    clock_error_s: float | None = None
+    """How far the host's clock is ahead of the site's where that is more than the bound; None where all is well."""
+    multipath_std_m: float | None = None
+    """Standard deviation by which ranges change as the tag moves, where that is more than the site file states."""
+    multipath_distance_m: float | None = None
+    """The distance walked within which they do."""
+
+
+class AnchorHealth(Struct, frozen=True):
+    """An anchor's state, once a second."""
+
+    anchor: int
+    unix_s: float
+    uptime_s: float
+    role: Literal["master", "anchor", "listening"]
+    master: int | None
+    """The anchor whose time it uses; None in protocol 2, which has no master."""
+    term: int | None
+    """Of the master, or of the claim on the slot time; None in mode free."""
+    synchronised: bool
+    """Whether it may send; always in mode free."""
+    offset_s: float | None
+    """Own counter less the master's scale, or the slot time, modulo the wrap, in (-8.6, 8.6]."""
+    rate_ppm: float | None
+    """Own rate against the same."""
+    offset_std_m: float | None
+    sent: int
+    late: int
+    """Transmissions that came too late and were skipped."""
+    heard: int
+    superframe: int | None
+    heard_age_s: dict[str, float]
+    """Time since each other anchor was last heard."""
+    counters: dict[str, int]
+    mqtt: Counters
+    mode: Literal["master", "free"] = "master"
+    """Of the site's schedule."""
+    missed_share: float = 0.0
+    """Share of its transmissions of the last second that came too late."""
+    chain: int | None = None
+    """Serial number of the key chain that it uses; None for an anchor without keys."""
+    chain_ends_unix_s: float | None = None
+    """When the last of its key chains ends."""
+    code_fault: str | None = None
+    """Why an anchor with keys sends without codes (``skyless.core.keys.fault.Fault``); None where it has them."""
+    faults: dict[str, str] = {}
+    """Other anchors whose beacons, or beacons in whose name, were not accepted within the last seconds, and why."""
+
+
+class EtherHealth(Struct, frozen=True):
+    """What the emulated air has carried."""
+
+    unix_s: float
+    simulated_s: float
+    transmissions: int
+    late: int
+    at_anchors: dict[str, int]
+    at_tags: dict[str, int]
+    stalls: int
+    """How often the ether fell behind real time."""
+    overruns: int
+    """Receptions lost because a process did not read."""
+    missed_share: float = 0.0
+    """Share of the last second's transmissions that were missed because this computer was too slow."""
+
+
+class TrueMotion(Struct, frozen=True, array_like=True):
+    """True position and velocity of a simulated tag."""
+
+    position_m: Vector
+    velocity_mps: Vector
+
+
+class TruthMessage(Struct, frozen=True):
+    """True motion of all simulated tags at one moment."""
+
+    unix_s: float
+    tags: dict[str, TrueMotion]
+
+
+class RequestMessage(Struct, frozen=True):
+    """A request for raw receptions; to be repeated before the lease ends."""
+
+    by: str
+    receptions: tuple[str, ...]
+    """Names of tags; ``*`` means all of them. Empty ends the request."""
+    lease_s: float
+    stamps: bool = False
+    """Whether anchors are to publish their stamps (``StampsMessage``)."""
+
+
+class Leases:
+    """Who has requested something that costs work or bandwidth, and until when. The caller passes in the time."""
+
+    def __init__(self) -> None:
+        self._until_s: dict[str, float] = {}
+
+    @property
+    def are_held(self) -> bool:
+        """Whether anybody holds one, as of the last call with a time."""
+        return bool(self._until_s)
+
+    def holds(self, by: str) -> bool:
+        """Whether this one does."""
+        return by in self._until_s
+
+    def grant(self, by: str, lease_s: float, now_s: float) -> bool:
+        """Begin or extend a lease; False where too many hold one."""
+        self.expire(now_s)
+        if by not in self._until_s and len(self._until_s) >= MAX_LEASES:
+            return False
+        self._until_s[by] = now_s + min(max(lease_s, 0.0), MAX_LEASE_S)
+        return True
+
+    def end(self, by: str) -> None:
+        """Its holder does not want it any more."""
+        self._until_s.pop(by, None)
+
+    def expire(self, now_s: float) -> None:
+        """End those whose time is over."""
+        for by in [by for by, until_s in self._until_s.items() if until_s <= now_s]:
+            del self._until_s[by]
+
+
+class RawReception(Struct, frozen=True, array_like=True):
+    """One reception as the radio gave it; bytes as base64 in JSON."""
+
+    frame: bytes
+    rx_ticks: int
+    host_s: float | None
+    rx_power_dbm: float | None = None
+    first_path_power_dbm: float | None = None
+    carrier_offset_ppm: float | None = None
+
+
+class ReceptionsMessage(Struct, frozen=True):
+    """A run of receptions of one tag, none missing within a segment."""
+
+    tag: str
+    segment: str
+    """Another one begins when a run is interrupted; each begins with ``start``."""
+    first: int
+    """Number of the first reception within the segment; the next message continues where this one ends."""
+    unix_less_host_s: float
+    """What to add to ``host_s`` to get ``unix_s``."""
+    receptions: tuple[RawReception, ...]
+    start: "SegmentStart | None" = None
+    """Only in the first message of a segment."""
+
+
+class SegmentStart(Struct, frozen=True):
+    """The receiver's state when a segment began."""
+
+    serial: int
+    """Number of fixes made before."""
+    settings: dict[str, str | float | int | None]
+    """Arguments of the receiver."""
+    state: bytes | None
+    """Its state (``skyless.run.recordings.reception_log``); None for a receiver that had heard nothing yet."""
+
+
+class Zone(Struct, frozen=True):
+    """A polygon on the floor."""
+
+    id: str
+    name: str
+    polygon_m: tuple[tuple[float, float], ...]
+    colour: str | None = None
+
+
+class SiteZones(Struct, frozen=True):
+    """The zones of one site."""
+
+    site: str
+    """The site's name."""
+    zones: tuple[Zone, ...]
+
+
+class ZonesMessage(Struct, frozen=True):
+    """All zones of a site, retained."""
+
+    zones: tuple[Zone, ...]
+    site: str = ""
+    """Name of the site that they were drawn at: another site may have the same number. Empty: not known."""
+    others: tuple[SiteZones, ...] = ()
+    """Zones of other sites that had this number before, kept until those return."""
+
+
+class ZoneEvent(Struct, frozen=True):
+    """A tag has entered or left a zone."""
+
+    zone: str
+    name: str
+    tag: str
+    kind: Literal["enter", "leave"]
+    unix_s: float
+    position_m: Vector
+
+
+class TagZones(Struct, frozen=True):
+    """The zones that a tag is in at present; retained, by what announces tags to Home Assistant."""
+
+    tag: str
+    unix_s: float
+    """Of the fix with which this became so."""
+    usable: bool
+    """Whether the tag has fixes that may be used; without, it is in no zone."""
+    zone: str | None = None
+    """The id of the smallest of them."""
+    name: str | None = None
+    """Its name."""
+    zones: tuple[str, ...] = ()
+    """The ids of all, the smallest first."""
+    by: str = ""
+    """Name of the bridge that says so."""
+
+
+class TagPosition(Struct, frozen=True):
+    """Where a tag is, at most once a second and only when that has changed; retained, for programs that keep each."""
+
+    tag: str
+    unix_s: float
+    """Of the fix."""
+    position_m: Vector
+    std_m: float
+    """One-sigma radial error, at least 1 cm in each axis."""
+    horizontal_std_m: float
+    """The same on the floor."""
+    latitude_deg: float | None = None
+    """WGS 84; None where the site does not say where it is."""
+    longitude_deg: float | None = None
+    height_m: float | None = None
+    """Above the ellipsoid."""
+
+
+class Stamp(Struct, frozen=True, array_like=True):
+    """One reception of an anchor by another."""
+
+    anchor: int
+    """Which was received."""
+    tx_ticks: int
+    """Its TX stamp, as its frame states it, 40 bits."""
+    rx_ticks: int
+    """The publishing anchor's RX stamp, 40 bits."""
+
+
+class StampsMessage(Struct, frozen=True):
+    """What an anchor has received of the others since its last message, in order."""
+
+    anchor: int
+    run: str
+    """Changes when its counter has restarted."""
+    unix_s: float
+    stamps: tuple[Stamp, ...]
+    missed: int = 0
+    """Stamps that were dropped before these, as nobody collected them in time."""
+
+
+class SurveyFactsMessage(Struct, frozen=True):
+    """What a user knows of a site; replaces what was given before."""
+
+    facts: Facts
+    floor_plan: FloorPlanSite | None = None
+    """Where the image of the floor lies; ``image`` is empty for the one on MQTT."""
+    by: str = ""
+
+
+class SurveySaveMessage(Struct, frozen=True):
+    """Use the result of this number: write the site file, and let the anchors adopt it."""
+
+    by: str
+    serial: int
+
+
+class SurveyProgress(Struct, frozen=True):
+    """Of one pair of anchors."""
+
+    a: int
+    b: int
+    exchanges: int
+    range_m: float
+    std_m: float
+
+
+class SurveyMessage(Struct, frozen=True):
+    """State of the survey program."""
+
+    unix_s: float
+    serial: int
+    """Of the result; ``SurveySaveMessage`` names it."""
+    anchors: tuple[int, ...]
+    """Those that have been received."""
+    missing: tuple[int, ...]
+    """Those of the site file that have not."""
+    duration_s: float
+    pairs: tuple[SurveyProgress, ...]
+    facts: Facts
+    survey: Survey | None
+    """None while too few pairs are known."""
+    error: str | None = None
+    """A sentence: why there is no result, or why the last one could not be saved."""
+    saved_serial: int | None = None
+    """Of the result that was saved last, by this run of the program."""
+    saved_unix_s: float | None = None
+    """When that was."""
+    file: str | None = None
+    """The site file that it writes."""
+    state: Literal["collecting", "surveyed", "no data"] = "collecting"
+    """``no data``: no stamps have come for 5 s, so that ``survey``, if there is one, is of before."""
+    by: str = ""
+    """Names this run of the program: two of them at one site notice each other."""
+
+
+class PlacementMessage(Struct, frozen=True):
+    """The site after a survey. An anchor adopts it if its own site is the one before, and ignores it otherwise."""
+
+    unix_s: float
+    before: str
+    """Digest of the site before the survey (``site/digest.py``)."""
+    site: Site
+    earlier: tuple[str, ...] = ()
+    """Digests of the sites before that, the newest first: an anchor with an older file adopts it, too."""
+
+
+class WatchFinding(Struct, frozen=True):
+    """Something at the anchors has changed since the survey."""
+
+    kind: Literal["moved", "delay", "link", "check"]
+    """An anchor has moved; its delay has changed; one link is blocked; something has changed, unclear what."""
+    anchors: tuple[int, ...]
+    """The anchor, or both ends of the link; for ``check`` those in question."""
+    size_m: float
+    std_m: float | None
+    since_unix_s: float
+    sentence: str
+
+
+class WatchMessage(Struct, frozen=True):
+    """What the watch of the anchors sees at present."""
+
+    unix_s: float
+    state: Literal["learning", "watching", "no data"]
+    findings: tuple[WatchFinding, ...]
+    pairs: int
+    """Pairs of anchors that are watched."""
+
+
+class WrongMessageError(ValueError):
+    """A message that does not fit its topic."""
+
+
+def read_message(payload: bytes, kind: type[_T]) -> _T:
+    """A message from JSON. Raises WrongMessageError."""
+    try:
+        return msgspec.json.decode(payload, type=kind)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise WrongMessageError(str(error)) from None
+
+
+def fix_message(tag: str, serial: int, fix: "Fix", unix_s: float, latency_s: float) -> FixMessage:
+    """The message of a fix; ``unix_s`` is the end of its last frame."""
+    dops = fix.dops
+    moving = fix.velocity_mps is not None and fix.velocity_covariance is not None
+    return FixMessage(
+        tag=tag,
+        serial=serial,
+        unix_s=unix_s,
+        time_s=fix.time_s,
+        position_m=_vector(fix.position_m.tolist()),
+        covariance_m2=_matrix(fix.covariance_m2.ravel().tolist()),
+        velocity_mps=_vector(fix.velocity_mps.tolist()) if moving else None,  # type: ignore[union-attr]
+        velocity_covariance=_matrix(fix.velocity_covariance.ravel().tolist()) if moving else None,  # type: ignore[union-attr]
+        std_m=fix.std_m,
+        gdop=dops.gdop,
+        pdop=dops.pdop,
+        hdop=dops.hdop,
+        vdop=dops.vdop,
+        anchors=fix.anchors,
+        chi2=fix.chi2,
+        dof=fix.dof,
+        residual_rms_m=fix.residual_rms_m,
+        method=fix.method,
+        height_known=fix.height_known,
+        latency_s=latency_s,
+        hpl_m=fix.hpl_m,
+        vpl_m=fix.vpl_m,
+        integrity_risk=fix.integrity_risk,
+        alert=None if fix.alert is None else fix.alert.value,
+        verified_until_s=fix.verified_until_s,
+        unverified=fix.unverified,
+    )
+
+
+def _vector(values: list[float]) -> Vector:
+    x, y, z = values
+    return x, y, z
+
+
+def _matrix(values: list[float]) -> Matrix:
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = values
+    return xx, xy, xz, yx, yy, yz, zx, zy, zz
+
+
+REACH_S: Final = 0.25
+"""A message holds for this time before and after it, along a straight line; a turning tag leaves the line by then."""
+
+_MAX_MESSAGES: Final = 64
+
+
+class TruthBuffer:
+    """The newest messages of an ether."""
+
+    def __init__(self) -> None:
+        self._truths: deque[TruthMessage] = deque(maxlen=_MAX_MESSAGES)
+
+    def add(self, truth: TruthMessage) -> None:
+        """Add a message; one older than the last (a restarted ether) replaces all before it."""
+        if self._truths and truth.unix_s < self._truths[-1].unix_s:
+            self._truths.clear()
+        self._truths.append(truth)
+
+    def at(self, tag: str, unix_s: float) -> Vector | None:
+        """True position of a tag: from the message nearest in time, along its velocity; None if none is near."""
+        best, ahead_s = None, REACH_S
+        for truth in reversed(self._truths):
+            gap_s = unix_s - truth.unix_s
+            if abs(gap_s) <= abs(ahead_s) and tag in truth.tags:
+                best, ahead_s = truth.tags[tag], gap_s
+            if gap_s > 0.0:
+                break
+        if best is None:
+            return None
+        (x, y, z), (vx, vy, vz) = best.position_m, best.velocity_mps
+        return x + ahead_s * vx, y + ahead_s * vy, z + ahead_s * vz

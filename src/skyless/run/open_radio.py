@@ -1,0 +1,176 @@
+"""Radios by their names in ``--radio``."""
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Final, Literal
+
+from skyless.core.air.masterless_packets import Point
+from skyless.core.errors import SkylessError
+from skyless.radio.dw1000.radio import Dw1000Radio
+from skyless.radio.dw1000.spi import DEFAULT_CHIP, DEFAULT_FAST_HZ, MAX_FAST_HZ, START_HZ, SpiBus, SpiPort, check_spi
+from skyless.radio.emulated import EtherConnection
+from skyless.radio.ether_wire import DEFAULT_PORT, Join
+from skyless.radio.foreign.fira import AnchorFrame
+from skyless.radio.foreign.foreign_radios import ListenerRadio, SnifferRadio, UciRadio
+from skyless.radio.interface import AntennaDelays, Radio
+from skyless.radio.serial.serial_port import check_path
+from skyless.radio.serial.serial_radio import SerialRadio
+from skyless.run.dw1000_model import ModelPort
+
+DEFAULT_RADIO: Final = f"ether:127.0.0.1:{DEFAULT_PORT}"
+_SERIAL_BAUD: Final = 1_000_000
+_SNIFFER_BAUD: Final = 115_200
+"""Any rate serves on a real sniffer's USB port."""
+_LISTENER_BAUD: Final = 115_200
+_UCI_BAUD: Final = 115_200
+_EXPECTED: Final = (
+    "ether:HOST[:PORT], serial:PATH[@BAUD], spi:BUS.DEVICE[,irq=PIN][,reset=PIN], model:HOST[:PORT], "
+    "listener:PATH[@BAUD], sniffer:PATH[@BAUD] or uci:PATH[@BAUD]"
+)
+
+
+def is_simulated(spec: str) -> bool:
+    """Whether a radio of that name is simulated: emulated, a model, or behind a pseudo-terminal.
+
+    To be asked again when a radio has restarted: the path may lead to another device.
+    """
+    port = spec.partition(":")[2].partition(",")[0].partition("@")[0]
+    return spec.split(":", 1)[0] in ("ether", "model") or os.path.realpath(port).startswith("/dev/pts/")
+
+
+def is_ether(spec: str) -> bool:
+    """Whether a radio of that name is one of the emulated air."""
+    return spec.split(":", 1)[0] == "ether"
+
+
+def receives_packets(spec: str) -> bool:
+    """Whether a radio of that name receives packets of another system, and not beacons."""
+    return spec.split(":", 1)[0] in ("sniffer", "uci")
+
+
+def hears_positions(spec: str) -> bool:
+    """Whether what a radio of that name receives may state where anchors are."""
+    return spec.split(":", 1)[0] == "uci"
+
+
+def open_radios(
+    spec: str,
+    kind: Literal["anchor", "tag"],
+    names: tuple[str, ...],
+    delays: Sequence[AntennaDelays] | None = None,
+) -> tuple[Radio, ...]:
+    """Radios for the nodes of one process, in the order of their names; nothing is connected yet.
+
+    ``delays`` are the nodes' antenna delays, which their radios are set to.
+
+    Raises:
+        SkylessError: there is no such radio; the message says what would be right.
+    """
+    driver, _, where = spec.partition(":")
+    join = Join(kind, names, tuple(one.tx_ticks for one in delays or ()))
+    if driver == "ether":
+        host, port = host_and_port(spec, where, DEFAULT_PORT)
+        return EtherConnection(host, port, join).radios
+    settings = delays or [AntennaDelays()] * len(names)
+    if driver == "model":
+        host, port = host_and_port(spec, where, DEFAULT_PORT)
+        nodes = EtherConnection(host, port, join).radios
+        return tuple(
+            Dw1000Radio(ModelPort(node, own), node.name, own) for node, own in zip(nodes, settings, strict=True)
+        )
+    if driver == "spi":
+        if len(names) != 1:
+            raise SkylessError(f"--radio is {spec!r}; a chip on SPI carries one node, not {len(names)}")
+        return (Dw1000Radio(spi_port(spec, where), names[0], settings[0]),)
+    if driver == "serial":
+        ports = _ports(spec, where, _SERIAL_BAUD, names)
+        transmits = kind == "anchor"
+        return tuple(SerialRadio(*ports[i], name, settings[i], transmits=transmits) for i, name in enumerate(names))
+    if driver in ("listener", "sniffer", "uci") and kind == "anchor":
+        raise SkylessError(f"--radio is {spec!r}; it should be one that can transmit: a {driver} only listens")
+    if driver == "listener":
+        ports = _ports(spec, where, _LISTENER_BAUD, names)
+        return tuple(ListenerRadio(*port, name) for port, name in zip(ports, names, strict=True))
+    raise SkylessError(f"--radio is {spec!r}; it should be {_EXPECTED}")
+
+
+def open_sniffers(
+    spec: str, names: tuple[str, ...], anchors_m: Mapping[int, Point] | None = None
+) -> tuple[SnifferRadio | UciRadio, ...]:
+    """Sniffers or FiRa boards for the tags of one process, in the order of their names.
+
+    ``anchors_m``: positions of the system's anchors, as far as they are known. Raises SkylessError.
+    """
+    driver, _, where = spec.partition(":")
+    ports = zip(_ports(spec, where, _SNIFFER_BAUD if driver == "sniffer" else _UCI_BAUD, names), names, strict=True)
+    if driver == "sniffer":
+        return tuple(SnifferRadio(*port, name) for port, name in ports)
+    frame = AnchorFrame()  # one for all, as their tags are of one site
+    return tuple(UciRadio(*port, name, anchors_m or {}, frame) for port, name in ports)
+
+
+def _ports(spec: str, where: str, usual_baud: int, names: tuple[str, ...]) -> list[tuple[str, int]]:
+    """Path and baud rate of each node's port, from PATH[@BAUD],PATH[@BAUD] and so on. Raises SkylessError."""
+    parts = where.split(",")
+    if len(parts) != len(names) or not all(parts):
+        wanted = "one port" if len(names) == 1 else f"{len(names)} ports, one for each node, with commas"
+        raise SkylessError(f"--radio is {spec!r}; it should name {wanted}, as {spec.partition(':')[0]}:/dev/ttyACM0")
+    ports = [_port(spec, part, usual_baud) for part in parts]
+    if len({path for path, _ in ports}) < len(ports):
+        raise SkylessError(f"--radio is {spec!r}; it should name each port once")
+    for path, _ in ports:
+        check_path(spec, path)
+    return ports
+
+
+def spi_port(spec: str, where: str) -> SpiPort:
+    """The chip of BUS.DEVICE[,irq=PIN][,reset=PIN][,hz=RATE][,chip=PATH], if it could be there. Raises SkylessError."""
+    wires, _, rest = where.partition(",")
+    bus, dot, device = wires.partition(".")
+    options = [part.partition("=")[::2] for part in rest.split(",") if part]
+    given = dict(options)
+    for key in given:
+        if sum(key == other for other, _ in options) > 1:
+            raise SkylessError(f"--radio is {spec!r}; it should give {key} once")
+    chip = given.pop("chip", DEFAULT_CHIP)
+    numbers = {key: int(value) if value.isdecimal() and len(value) < 10 else -1 for key, value in given.items()}
+    right = dot and bus.isdecimal() and device.isdecimal() and chip.startswith("/")
+    if not right or not numbers.keys() <= {"irq", "reset", "hz"} or min(numbers.values(), default=0) < 0:
+        raise SkylessError(f"--radio is {spec!r}; it should be spi:BUS.DEVICE, as spi:0.0,irq=25,reset=24,hz=8000000")
+    if not START_HZ <= numbers.get("hz", DEFAULT_FAST_HZ) <= MAX_FAST_HZ:
+        raise SkylessError(f"--radio is {spec!r}; it should have hz from {START_HZ} to {MAX_FAST_HZ}")
+    has_lines = not numbers.keys().isdisjoint({"irq", "reset"})
+    check_spi(spec, int(bus), int(device), chip if has_lines else None)
+    return SpiPort(
+        f"/dev/spidev{bus}.{device}",
+        lambda: SpiBus(
+            int(bus),
+            int(device),
+            irq_pin=numbers.get("irq"),
+            reset_pin=numbers.get("reset"),
+            fast_hz=numbers.get("hz", DEFAULT_FAST_HZ),
+            gpio_chip=chip,
+        ),
+    )
+
+
+def _port(spec: str, part: str, usual_baud: int) -> tuple[str, int]:
+    path, at, digits = part.rpartition("@")
+    if not at:
+        return part, usual_baud
+    if not path or not digits.isdecimal() or len(digits) > 8 or int(digits) < 300:
+        raise SkylessError(f"--radio is {spec!r}; it should be PATH@BAUD with a rate from 300, as /dev/ttyACM0@1000000")
+    return path, int(digits)
+
+
+def host_and_port(spec: str, where: str, default_port: int) -> tuple[str, int]:
+    """HOST[:PORT] of a radio's name, the host 127.0.0.1 where none is given. Raises SkylessError."""
+    host, colon, digits = where.rpartition(":") if where.count(":") != 0 else (where, "", "")
+    port = int(digits) if digits.isdecimal() and len(digits) < 6 else 0
+    if colon and not 0 < port < 65_536:
+        driver = spec.partition(":")[0]
+        raise SkylessError(f"--radio is {spec!r}; it should be {driver}:HOST[:PORT] with a port from 1 to 65535")
+    if "/" in host:
+        driver = spec.partition(":")[0]
+        raise SkylessError(f"--radio is {spec!r}; it should be {driver}:HOST[:PORT], and {host} is no host")
+    return host.strip("[]") or "127.0.0.1", port or default_port

@@ -1,0 +1,364 @@
+"""What the programs of a running site share: event loop, tasks, links, folders, ports, use of the machine."""
+
+import asyncio
+import contextlib
+import ctypes
+import errno
+import fcntl
+import gc
+import os
+import random
+import resource
+import select
+import selectors
+import signal
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Awaitable, Callable, Coroutine
+from pathlib import Path
+from typing import IO, Any, Final
+
+from msgspec import Struct
+
+from skyless.core.site import Site
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.link import RESEND_S, Handler, Link
+from skyless.run.mqtt.messages import SiteMessage, WrongMessageError, read_message, site_message
+from skyless.run.mqtt.topics import floor_plan_topic, site_topic
+
+HEALTH_S: Final = 1.0
+"""Interval of the health messages."""
+
+Log = Callable[[str], None]
+"""Called with one line for a person to read."""
+
+_PR_SET_PDEATHSIG: Final = 1
+
+_RESERVED: Final = "\0skyless-{}:{}"
+"""Linux's abstract sockets have one owner each, in the same namespace as its ports, and end with their process."""
+
+_MAX_FILES: Final = 65_536
+"""More are not asked for: some systems allow billions, and some libraries go through all that could be open."""
+
+_RADIO_NICE: Final = -10
+"""Priority of programs that serve a radio, where the system allows it (root, or a limit in limits.conf)."""
+
+
+# The event loop
+
+
+def run(main: Coroutine[Any, Any, None], *, punctual: bool = False) -> None:
+    """Run a program until it ends or is cancelled by SIGTERM, SIGHUP or Ctrl-C.
+
+    ``punctual``: ask the system for a higher priority, because a radio's slots do not wait.
+
+    Raises:
+        KeyboardInterrupt: it was Ctrl-C.
+    """
+    if punctual:
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, 0, _RADIO_NICE)
+    gc.collect()
+    gc.freeze()
+    with asyncio.Runner(loop_factory=_new_loop) as runner, contextlib.suppress(asyncio.CancelledError):
+        runner.run(_until_terminated(main))
+
+
+def _new_loop() -> asyncio.AbstractEventLoop:
+    """A loop for any number of connections, whose timers are exact to microseconds."""
+    return asyncio.SelectorEventLoop(PunctualSelector() if hasattr(selectors, "EpollSelector") else None)
+
+
+if hasattr(selectors, "EpollSelector"):
+
+    class PunctualSelector(selectors.EpollSelector):
+        """epoll(), whose own timeouts end up to a millisecond late, woken by select(), which is exact.
+
+        select() takes no file beyond number 1023. So it waits for one file alone, epoll()'s own, which can be read as
+        soon as any of the others is ready.
+        """
+
+        def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+            """The files that are ready. Waits for one at most ``timeout`` s, without limit where it is None."""
+            if timeout is None:
+                return super().select()
+            if timeout > 0.0:
+                select.select([self.fileno()], [], [], timeout)
+            return super().select(0)
+
+
+async def _until_terminated(main: Coroutine[Any, Any, None]) -> None:
+    task = asyncio.ensure_future(main)
+    with contextlib.suppress(NotImplementedError):
+        for number in ending_signals():
+            asyncio.get_running_loop().add_signal_handler(number, task.cancel)
+    await task
+
+
+def ending_signals() -> tuple[signal.Signals, ...]:
+    """Signals besides Ctrl-C that end a program: SIGTERM and, except under ``nohup``, SIGHUP of a closed terminal."""
+    is_ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return (signal.SIGTERM,) if is_ignored else (signal.SIGTERM, signal.SIGHUP)
+
+
+def end_with_parent(number: signal.Signals = signal.SIGTERM) -> Callable[[], None] | None:
+    """The ``preexec_fn`` of a child process that is to end with its parent, however the parent ends. Linux only."""
+    if not sys.platform.startswith("linux"):
+        return None
+    prctl = ctypes.CDLL(None).prctl
+    parent = os.getpid()
+
+    def request_signal() -> None:
+        prctl(_PR_SET_PDEATHSIG, number, 0, 0, 0)
+        if os.getppid() != parent:  # the parent died before the request
+            os._exit(1)
+
+    return request_signal
+
+
+# Tasks
+
+
+async def together(*parts: Awaitable[None]) -> None:
+    """Run until one part fails or all are cancelled. A failure cancels the others and is raised as itself."""
+    tasks = [asyncio.ensure_future(part) for part in parts]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+        for task in done:
+            task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def every(seconds: float, act: Callable[[], None]) -> None:
+    """Call a function at an interval until cancelled."""
+    while True:
+        await asyncio.sleep(seconds)
+        act()
+
+
+async def outlasting(lasting: Coroutine[Any, Any, None], others: Coroutine[Any, Any, None]) -> None:
+    """Run both until one ends or all is cancelled. ``lasting`` is cancelled when the others have ended."""
+    last, first = asyncio.ensure_future(lasting), asyncio.ensure_future(others)
+    try:
+        done, _ = await asyncio.wait((last, first), return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in (first, last):
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+
+# Links
+
+
+def link_of(address: MqttAddress | None, name: int | str, *, site: int, kind: str) -> Link | None:
+    """The node's connection to the broker, or None without one."""
+    return None if address is None else Link(address, name, site=site, kind=kind)
+
+
+async def keep(link: Link, log: Log) -> None:
+    """Run a link until cancelled. A fault in it is logged, and costs neither a fix nor a beacon."""
+    while True:
+        try:
+            await link.run()
+        except Exception as error:  # noqa: BLE001 - whatever it is, positioning goes on
+            log(f"the link to {link.address} failed ({error!r}); started again")
+        await asyncio.sleep(HEALTH_S)
+
+
+def reader(kind: type[Struct], act: Callable[[Any], None], on_wrong: Callable[[], None]) -> Handler:
+    """A handler that decodes messages of a kind. ``on_wrong`` is called for those that cannot be read.
+
+    An empty payload is a retained message that was withdrawn, and is skipped.
+    """
+
+    def read(_topic: str, payload: bytes) -> None:
+        if not payload:
+            return
+        try:
+            message = read_message(payload, kind)
+        except WrongMessageError:
+            on_wrong()
+        else:
+            act(message)
+
+    return read
+
+
+class SitePublisher:
+    """Publishes a site, retained: again when its radios turn out to be simulated or not, and repeatedly.
+
+    A broker that others read may have missed it, or lost it.
+    """
+
+    def __init__(self, site: Site, is_simulated: Callable[[], bool], floor_plan: Path | None = None) -> None:
+        self._site, self._is_simulated, self._floor_plan = site, is_simulated, floor_plan
+        self._restarts: int | None = None
+        self._simulated = False
+        self._published: SiteMessage | None = None
+        self._repeat_s = 0.0  # when it is published again, by the host's monotonic clock
+        self._has_floor_plan = False
+
+    def place(self, site: Site) -> None:
+        """Publish the site of a survey from now on."""
+        if site != self._site:
+            self._site, self._published = site, None
+
+    def update(self, restarts: int) -> None:
+        """Call ``is_simulated`` after each restart of a radio: its port may lead to another device."""
+        if restarts != self._restarts:
+            self._restarts, self._simulated = restarts, self._is_simulated()
+
+    def publish(self, link: Link) -> None:
+        """Publish the site if it is new or due, retained for later subscribers."""
+        now_s = time.monotonic()
+        if self._published is None or self._published.simulated is not self._simulated:
+            self._published = site_message(self._site, simulated=self._simulated, unix_s=time.time())
+        elif now_s < self._repeat_s:
+            return
+        self._repeat_s = now_s + RESEND_S * random.uniform(0.5, 1.0)
+        link.publish(site_topic(self._site.id), self._published, qos=1, retain=True)
+        if self._floor_plan is not None and not self._has_floor_plan:
+            self._has_floor_plan = True
+            link.publish(floor_plan_topic(self._site.id), self._floor_plan.read_bytes(), qos=1, retain=True)
+
+
+# Folders and files
+
+
+def data_folder() -> Path:
+    """``skyless`` in the user's data folder (XDG), or a temporary folder where that cannot be written."""
+    shared = os.environ.get("XDG_DATA_HOME")
+    try:
+        home = Path(shared) if shared and Path(shared).is_absolute() else Path("~/.local/share").expanduser()
+        folder = home / "skyless"
+        if home == Path("/.local/share"):
+            raise PermissionError("HOME is empty")
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError("it cannot be written")
+    except (OSError, RuntimeError):  # RuntimeError: a user without a home
+        folder = Path(tempfile.gettempdir()) / f"skyless-{os.getuid()}"
+        folder.mkdir(mode=0o700, exist_ok=True)
+    return folder
+
+
+def recordings_folder() -> Path:
+    """Folder of the recordings that the page shows. It is created if missing."""
+    folder = data_folder() / "recordings"
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+def new_recording(folder: Path, kind: str) -> Path:
+    """File name for a recording that begins at this moment."""
+    return folder / f"{kind}-{time.strftime('%Y%m%d-%H%M%S')}.mcap"
+
+
+def locked(file: Path) -> IO[str]:
+    """The file, locked for this process until it is closed. Raises OSError."""
+    lock = file.open("a", encoding="utf-8")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        lock.close()
+        raise
+    return lock
+
+
+# Ports
+
+
+def is_free(host: str, port: int) -> bool:
+    """Whether a program could listen there.
+
+    Raises:
+        OSError: none could: no address of this machine, or a port that only the system may use.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                return False
+            raise
+    return True
+
+
+def reserve(host: str, port: int) -> socket.socket | None:
+    """A socket that reserves a port among the programs of Skyless while it is open, or None if one of them has it."""
+    held = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    if sys.platform.startswith("linux"):
+        try:
+            held.bind(_RESERVED.format(host, port))
+        except OSError:
+            held.close()
+            return None
+    return held
+
+
+def reserve_next(host: str, first: int) -> tuple[int, socket.socket]:
+    """The first free port from this one on that no program of Skyless has reserved, and the socket that holds it."""
+    port = first
+    while True:
+        held = reserve(host, port)
+        if held is not None:
+            if is_free(host, port):
+                return port, held
+            held.close()
+        port += 1
+
+
+def hold_any(host: str) -> tuple[int, socket.socket]:
+    """A free port and its socket: while that is open, the system assigns the port to no program by itself."""
+    held = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    held.bind((host, 0))
+    return int(held.getsockname()[1]), held
+
+
+# Use of the machine
+
+
+def most_files() -> int:
+    """How many files and connections this process may have open: as many as the system lets it have, from now on."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == hard:
+        return soft
+    most = min(hard, _MAX_FILES) if hard != resource.RLIM_INFINITY else _MAX_FILES
+    with contextlib.suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max(most, soft), hard))
+    return resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+
+
+class Usage:
+    """Share of a core that this process uses, and its resident memory."""
+
+    def __init__(self) -> None:
+        self._wall_s = time.monotonic()
+        self._cpu_s = time.process_time()
+
+    def sample(self) -> tuple[float, int]:
+        """Share of a core since the last call, and resident memory in bytes."""
+        wall_s, cpu_s = time.monotonic(), time.process_time()
+        share = (cpu_s - self._cpu_s) / max(wall_s - self._wall_s, 1e-9)
+        self._wall_s, self._cpu_s = wall_s, cpu_s
+        return share, resident_bytes()
+
+
+def resident_bytes() -> int:
+    """Resident memory of this process, or its peak where the system does not report the present value."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    except (OSError, IndexError, ValueError):
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak if sys.platform == "darwin" else peak * 1024
+    return pages * os.sysconf("SC_PAGE_SIZE")

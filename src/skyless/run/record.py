@@ -1,0 +1,199 @@
+"""``skyless record``: requests the receptions of a site's tags and writes all its messages into a file."""
+
+import asyncio
+import contextlib
+import os
+import re
+import secrets
+import socket
+import tempfile
+import time
+from pathlib import Path
+from typing import IO, Final
+
+from msgspec import Struct
+
+from skyless.core.errors import SkylessError
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.messages import ReceptionsMessage, RequestMessage, StatusMessage
+from skyless.run.mqtt.topics import request_topic, site_topic
+from skyless.run.process import Log, data_folder, every, locked
+from skyless.run.recordings.reception_log import EVERY_TAG
+from skyless.run.recordings.recorder import McapFile, McapRecorder
+
+_LEASE_S: Final = 15.0
+_REQUEST_S: Final = 5.0  # each request for receptions is repeated at this interval, before its lease ends
+
+_FLUSH_S: Final = 0.8  # a recorder that is killed loses what came since: less than a second with the delay of a message
+
+_MAX_RECORDERS: Final = 1000
+
+_NEW_RUN_S: Final = 1.0  # after a loss; not more often than this, as each new run begins with a checkpoint
+
+
+class RecorderState(Struct, frozen=True):
+    """Progress of a recording."""
+
+    seconds: float
+    messages: dict[str, int]
+    receptions: int
+    tags: int
+    bytes: int
+    lost: int
+    drops: dict[str, int]
+    trouble: str | None
+    """Why there is no broker, or None while there is one."""
+    ended: str | None
+    """Why the file is not written any more, or None while it is."""
+
+
+class RecorderNode:
+    """Records one site until cancelled, or until the file cannot be written any more."""
+
+    def __init__(self, file: McapFile, address: MqttAddress, site: int, log: Log) -> None:
+        self.file = file
+        self.recorder = McapRecorder(file)
+        self._name, self._lock = _own_name(site)
+        # the broker keeps what this name has subscribed to while it is away, so that its restart loses nothing
+        self.link = Link(address, self._name, site=site, kind="recorder", persistent=True, client_key=_client_key())
+        self.receptions = 0
+        self._site = site
+        self._log = log
+        self._started_s = time.monotonic()
+        self._runs = 0
+        self._new_run_s = 0.0
+        self._next: dict[str, tuple[str, int]] = {}  # for each tag: the segment, and the number of its next reception
+        self.link.subscribe(f"{site_topic(site).removesuffix('site')}#", self._on_message, qos=1)
+        self.link.on_state.append(self._on_state)
+
+    async def run(self, duration_s: float | None = None) -> None:
+        """Record. Finally the request is withdrawn and the file closed."""
+        link = asyncio.ensure_future(self.link.run())
+        work = [asyncio.ensure_future(every(_REQUEST_S, self._request)), asyncio.ensure_future(self._write())]
+        try:
+            await asyncio.wait([link, *work], timeout=duration_s, return_when=asyncio.FIRST_COMPLETED)
+            for task in (link, *work):
+                if task.done():
+                    task.result()
+        finally:
+            self.link.publish(request_topic(self._site), RequestMessage(self._by, (), 0.0), qos=1)
+            for task in (link, *work):
+                task.cancel()
+            await asyncio.gather(link, *work, return_exceptions=True)
+            self.file.close()
+            self._lock.close()
+
+    def state(self) -> RecorderState:
+        """Progress so far."""
+        return RecorderState(
+            seconds=time.monotonic() - self._started_s,
+            messages=dict(self.recorder.kinds),
+            receptions=self.receptions,
+            tags=len(self._next),
+            bytes=self.file.written_bytes,
+            lost=self.file.lost,
+            drops=dict(self.recorder.drops),
+            trouble=self.link.trouble,
+            ended=self.file.ended,
+        )
+
+    @property
+    def _by(self) -> str:
+        return f"{self._name}-{self._started_s:.3f}-{self._runs}"
+
+    def _request(self) -> None:
+        self.link.publish(request_topic(self._site), RequestMessage(self._by, (EVERY_TAG,), _LEASE_S), qos=1)
+
+    def _on_state(self, connected: bool) -> None:
+        if connected:
+            self._request()
+
+    def _begin_new_run(self) -> None:
+        """After a loss: request under another name, so that the tags begin another run with its checkpoint."""
+        now_s = time.monotonic()
+        if now_s - self._new_run_s >= _NEW_RUN_S:
+            self._new_run_s = now_s
+            self._runs += 1
+            self._request()
+
+    def _on_message(self, topic: str, payload: bytes) -> None:
+        message = self.recorder.add(topic, payload, time.time())
+        if isinstance(message, ReceptionsMessage):
+            self._check_sequence(message)
+        elif isinstance(message, StatusMessage) and message.kind == "tag" and message.online:
+            self._request()
+
+    def _check_sequence(self, message: ReceptionsMessage) -> None:
+        """Check that no reception is missing. A message may come twice after a broken connection."""
+        self.receptions += len(message.receptions)
+        segment, following = self._next.get(message.tag, ("", 0))
+        end = message.first + len(message.receptions)
+        if message.segment == segment:
+            lost = message.first > following
+            end = max(end, following)
+        else:
+            lost = message.start is None
+        self._next[message.tag] = (message.segment, end)
+        if lost:
+            self.recorder.drops["gap-in-receptions"] += 1
+            self._begin_new_run()
+
+    async def _write(self) -> None:
+        """Close a chunk at intervals and sync it to the disk, until nothing can be written any more."""
+        while True:
+            await asyncio.sleep(_FLUSH_S)
+            self.file.flush()
+            if self.file.ended is None:
+                await asyncio.to_thread(self.file.sync)
+            if self.file.ended is not None:
+                self._log(f"the recording has ended: {self.file.ended}")
+                return
+
+
+def _own_name(site: int) -> tuple[str, IO[str]]:
+    """A name on MQTT that no other running recorder of this machine has. An earlier one may have had it.
+
+    A recorder that was killed has left a session that the broker fills; the next one takes it over and ends it. A lock
+    that another user has made cannot be opened, and its name is skipped.
+
+    Raises:
+        SkylessError: there is no folder for temporary files, or too many recorders run.
+    """
+    host = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname())
+    folder = _temporary_folder()
+    for number in range(1, _MAX_RECORDERS + 1):
+        with contextlib.suppress(OSError):
+            return f"{host}-{number}", locked(folder / f"skyless-record-{site}-{number}.lock")
+    raise SkylessError(f"no name is left for a recorder: {folder}/skyless-record-{site}-*.lock cannot be locked")
+
+
+def _client_key() -> str:
+    """Random, and the same for all recorders of this user on this machine, so that a later one has the same session.
+
+    Where it cannot be kept it is new each time: then the session of a recorder that was killed stays at the broker.
+    """
+    key = secrets.token_hex(16)
+    with contextlib.suppress(OSError, UnicodeError):
+        file = data_folder() / "recorder_key"
+        draft = file.with_name(f"{file.name}-{key}")
+        with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as out:
+            out.write(key)
+        try:
+            with contextlib.suppress(FileExistsError):
+                os.link(draft, file)
+            kept = file.read_text(encoding="ascii")
+            if not re.fullmatch("[0-9a-f]{32}", kept):
+                draft.replace(file)
+                return key
+            return kept
+        finally:
+            draft.unlink(missing_ok=True)
+    return key
+
+
+def _temporary_folder() -> Path:
+    try:
+        return Path(tempfile.gettempdir())
+    except OSError as error:
+        raise SkylessError(f"a recorder needs a folder for temporary files: {error.strerror}") from None

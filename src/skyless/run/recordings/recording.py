@@ -1,0 +1,495 @@
+"""Recordings of a running site as they are read, also while they are written or where they were cut off.
+
+A recording holds MQTT's topics and payloads, with their schemas.
+"""
+
+import math
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
+from io import BufferedReader
+from os import PathLike
+from pathlib import Path
+from typing import Final, cast
+
+import lz4.frame
+import msgspec
+import zstandard
+from msgspec import Struct
+
+from skyless.core.errors import ConfigurationError
+from skyless.core.input_files import Drops
+from skyless.run.mqtt import messages
+from skyless.run.mqtt.messages import (
+    FixMessage,
+    ReceptionsMessage,
+    SiteMessage,
+    TruthMessage,
+    ZonesMessage,
+)
+from skyless.run.mqtt.topics import ROOT
+
+PROFILE: Final = "skyless"
+JSON: Final = "json"
+JSON_SCHEMA: Final = "jsonschema"
+
+_SITE_WIDE: Final[dict[str, type[Struct]]] = {
+    "site": messages.SiteMessage,
+    "request": messages.RequestMessage,
+    "truth": messages.TruthMessage,
+    "zones": messages.ZonesMessage,
+    "survey/watch": messages.WatchMessage,
+}
+_HEALTH: Final[dict[str, type[Struct]]] = {
+    "tag": messages.TagHealth,
+    "anchor": messages.AnchorHealth,
+    "ether": messages.EtherHealth,
+}
+_OF_A_NODE: Final[dict[str, type[Struct]]] = {
+    "fix": messages.FixMessage,
+    "receptions": messages.ReceptionsMessage,
+    "stamps": messages.StampsMessage,
+    "status": messages.StatusMessage,
+    "event": messages.ZoneEvent,
+}
+FLOOR_PLAN: Final = "floor_plan"
+"""An image, which has no schema; it is kept as an attachment."""
+
+RETAINED_KINDS: Final = frozenset({"site", "zones", "status", "watch", FLOOR_PLAN})
+"""Kinds that are retained: a repetition adds nothing."""
+
+
+class Channel(Struct, frozen=True):
+    """What a topic means."""
+
+    site: str
+    kind: str
+    """``fix``, ``receptions``, ``stamps``, ``status``, ``health``, ``event``, ``site``, ``zones``, ``watch`` ..."""
+    name: str = ""
+    """Of the tag, anchor or zone."""
+    payload: type[Struct] | None = None
+
+
+@lru_cache(maxsize=10_000)
+def channel_of(topic: str) -> Channel | None:
+    """What a topic means; None for one that is not of version 1."""
+    if not topic.startswith(f"{ROOT}/"):
+        return None
+    site, _, rest = topic.removeprefix(f"{ROOT}/").partition("/")
+    if rest in _SITE_WIDE:
+        return Channel(site, rest.rpartition("/")[2], "", _SITE_WIDE[rest])
+    match rest.split("/"):
+        case ["floor_plan"]:
+            return Channel(site, FLOOR_PLAN)
+        case [who, name, "health"] if who in _HEALTH:
+            return Channel(site, "health", name, _HEALTH[who])
+        case [_, name, kind] if kind in _OF_A_NODE:
+            return Channel(site, kind, name, _OF_A_NODE[kind])
+    return None
+
+
+@lru_cache(maxsize=64)
+def decoder_of(payload: type[Struct]) -> msgspec.json.Decoder[Struct]:
+    """What reads a payload."""
+    return msgspec.json.Decoder(payload)
+
+
+# The chunks of an MCAP file, found by walking over its records: it need not have an index, nor an end.
+#
+# Reading goes as far as whole records reach, so a file that was cut off, or is being written now, gives all its whole
+# chunks (https://mcap.dev/spec).
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+MAX_CHUNK_BYTES: Final = 1 << 28
+"""Decompressed; more is taken for damage."""
+
+MAX_ATTACHMENT_BYTES: Final = 1 << 26
+
+_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _ATTACHMENT = 3, 4, 5, 6, 7, 9
+_DATA_END: Final = 15
+_RECORD: Final = struct.Struct("<BQ")
+_CHUNK_HEAD: Final = struct.Struct("<QQQI")
+_MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
+_INDEX_HEAD: Final = struct.Struct("<HI")
+_INDEX_ENTRY_BYTES: Final = 16
+
+
+def is_mcap(path: str | PathLike[str]) -> bool:
+    """Whether a file's content is an MCAP; one that cannot be opened, or would lose what is read here, is none."""
+    try:
+        file = Path(path)
+        if file.is_fifo():
+            return False
+        with file.open("rb") as stream:
+            return stream.read(len(MAGIC)) == MAGIC
+    except OSError:
+        return False
+
+
+class ChunkIndex(Struct):
+    """Where a chunk is in the file, and its index."""
+
+    offset: int
+    """Of its content in the file."""
+    length: int
+    start_ns: int
+    end_ns: int
+    counts: dict[int, int]
+    """Messages of each channel, as far as its index was found."""
+    indexed: bool = False
+    """Whether that is all of it."""
+
+
+class McapScan:
+    """Walks over a file; ``walk`` goes on where it stopped, for files that grow."""
+
+    def __init__(self, path: str | PathLike[str]) -> None:
+        """Open the file. Raises ConfigurationError: it cannot be opened, or is no MCAP."""
+        self.path = Path(path)
+        self.drops: Drops = Counter()
+        self.chunks: list[ChunkIndex] = []
+        self.attachments: dict[str, tuple[int, int]] = {}
+        """Where each one's record lies: offset and length."""
+        self.topics: dict[int, str] = {}
+        """Of channels."""
+        self.finished = False
+        self._next = len(MAGIC)
+        try:
+            self._file: BufferedReader = self.path.open("rb")
+        except OSError as error:
+            raise ConfigurationError(path, "", None, f"a file that can be read ({error.strerror})") from error
+        start = self._file.read(len(MAGIC))
+        if start != MAGIC:
+            self._file.close()
+            raise ConfigurationError(
+                path, "the beginning", start.decode("ascii", "backslashreplace"), "that of an MCAP"
+            )
+        self.walk()
+
+    def walk(self) -> None:
+        """Read what has been written since."""
+        size = self._file.seek(0, 2)
+        while not self.finished and self._next + _RECORD.size <= size:
+            self._file.seek(self._next)
+            kind, length = _RECORD.unpack(self._file.read(_RECORD.size))
+            content = self._next + _RECORD.size
+            if content + length > size:
+                return
+            self._index_record(kind, content, length)
+            self._next = content + length
+
+    @property
+    def unread_bytes(self) -> int:
+        """What the file has beyond the last whole record."""
+        return 0 if self.finished else self._file.seek(0, 2) - self._next
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _index_record(self, kind: int, content: int, length: int) -> None:
+        if kind != _MESSAGE_INDEX and self.chunks:
+            self._complete_index(self.chunks[-1])
+            self._file.seek(content)
+        if kind == _CHUNK and length >= _CHUNK_HEAD.size:
+            start_ns, end_ns, _, _ = _CHUNK_HEAD.unpack(self._file.read(_CHUNK_HEAD.size))
+            self.chunks.append(ChunkIndex(content, length, start_ns, end_ns, {}))
+        elif kind == _MESSAGE_INDEX and length >= _INDEX_HEAD.size and self.chunks:
+            channel, entries = _INDEX_HEAD.unpack(self._file.read(_INDEX_HEAD.size))
+            self.chunks[-1].counts[channel] = entries // _INDEX_ENTRY_BYTES
+        elif kind == _ATTACHMENT:
+            self._index_attachment(content, length)
+        elif kind == _MESSAGE:
+            self.drops["message-outside-chunks"] += 1
+        elif kind == _DATA_END:
+            self.finished = True
+
+    def _complete_index(self, chunk: ChunkIndex) -> None:
+        """The chunk's index is complete; read the chunk if that names a channel that is not known yet."""
+        if not chunk.indexed and chunk.counts:
+            chunk.indexed = True
+            if not chunk.counts.keys() <= self.topics.keys():
+                for _ in self.messages(chunk):
+                    pass
+
+    def _index_attachment(self, content: int, length: int) -> None:
+        head = self._file.read(min(length, 1 << 12))
+        (name_bytes,) = struct.unpack_from("<I", head.ljust(20, b"\0"), 16)
+        self.attachments[head[20 : 20 + name_bytes].decode("utf-8", "replace")] = (content, length)
+
+    def attachment(self, name: str) -> bytes | None:
+        """Content of the last attachment of that name."""
+        offset, length = self.attachments.get(name, (0, 0))
+        if not 0 < length <= MAX_ATTACHMENT_BYTES:
+            return None
+        self._file.seek(offset)
+        record = self._file.read(length)
+        try:
+            at = 16
+            for _ in range(2):  # name and media type
+                at += 4 + int.from_bytes(record[at : at + 4], "little")
+            size = int.from_bytes(record[at : at + 8], "little")
+        except IndexError:
+            size, at = -1, 0
+        data = record[at + 8 : at + 8 + size]
+        if size < 0 or len(data) != size:
+            self.drops["damaged-attachment"] += 1
+            return None
+        return data
+
+    def messages(self, chunk: ChunkIndex) -> Iterator[tuple[int, int, bytes]]:
+        """Channel, log time and payload of each message of a chunk, as written; none of a damaged chunk."""
+        data = self._content(chunk)
+        if data is None:
+            self.drops["damaged-chunk"] += 1
+            return
+        at, end = 0, len(data)
+        while at + _RECORD.size <= end:
+            kind, length = _RECORD.unpack_from(data, at)
+            at += _RECORD.size
+            if at + length > end:
+                self.drops["damaged-chunk"] += 1
+                return
+            if kind == _MESSAGE and length >= _MESSAGE_HEAD.size:
+                channel, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(data, at)
+                yield channel, log_ns, data[at + _MESSAGE_HEAD.size : at + length]
+            elif kind == _CHANNEL:
+                self._index_channel(data[at : at + length])
+            at += length
+
+    def _index_channel(self, record: bytes) -> None:
+        if len(record) >= 8:
+            channel, _, size = struct.unpack_from("<HHI", record)
+            self.topics[channel] = record[8 : 8 + size].decode("utf-8", "replace")
+
+    def _content(self, chunk: ChunkIndex) -> bytes | None:
+        self._file.seek(chunk.offset)
+        record = self._file.read(chunk.length)
+        _, _, size, crc = _CHUNK_HEAD.unpack_from(record)
+        at = _CHUNK_HEAD.size + 4
+        name_bytes = int.from_bytes(record[at - 4 : at], "little")
+        name, data = record[at : at + name_bytes], record[at + name_bytes + 8 :]
+        if size > MAX_CHUNK_BYTES:
+            return None
+        content = _decompressed(name, data, size)
+        if content is None or len(content) != size or (crc and zlib.crc32(content) != crc):
+            return None
+        return content
+
+
+def _decompressed(name: bytes, data: bytes, size: int) -> bytes | None:
+    """The content, of which no more is made than it should have; None if it is damaged or of another compression."""
+    try:
+        if name == b"zstd":
+            return zstandard.ZstdDecompressor().stream_reader(data).read(size + 1)
+        if name == b"lz4":
+            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
+    except (zstandard.ZstdError, RuntimeError):
+        return None
+    return None if name else data
+
+
+# ``McapRecording``: what was recorded of a running site, by kind and time; also while it is being recorded.
+
+NS: Final = 1_000_000_000
+
+
+class RecordingSummary(Struct, frozen=True):
+    """What a recording holds. Times are Unix seconds by the recorder's clock, None while nothing is in it."""
+
+    path: str
+    site: int | None
+    name: str | None
+    simulated: bool | None
+    start_s: float | None
+    end_s: float | None
+    finished: bool
+    """False for one that is being written, or was never closed."""
+    unread_bytes: int
+    """Of a last chunk that is not whole."""
+    tags: tuple[str, ...]
+    """Tags with fixes or receptions."""
+    raw_tags: tuple[str, ...]
+    """Tags with raw receptions, which can be replayed."""
+    messages: dict[str, int]
+    """By kind."""
+    drops: dict[str, int]
+
+
+def tags_to_replay(summary: RecordingSummary) -> tuple[str, ...]:
+    """Tags whose receptions a recording holds. Raises ConfigurationError where there is none."""
+    if summary.start_s is None:
+        beyond = f", and {summary.unread_bytes} bytes that are not whole" if summary.unread_bytes else ""
+        held = f"empty: no message in it{beyond}"
+        raise ConfigurationError(summary.path, "the recording", held, "one whose recorder ran for a second or more")
+    if not summary.raw_tags:
+        raise ConfigurationError(summary.path, "raw receptions", None, "a recording that skyless record made")
+    return summary.raw_tags
+
+
+class Recorded(Struct, frozen=True):
+    """One message: when it was recorded, on which topic, and its contents."""
+
+    time_s: float
+    channel: Channel
+    topic: str
+    message: Struct
+
+
+class McapRecording:
+    """A recording; ``refresh`` reads what has been written since it was opened."""
+
+    def __init__(self, path: str | PathLike[str]) -> None:
+        """Open it and read where its chunks are. Raises ConfigurationError: it cannot be opened, or is no MCAP."""
+        self._scan = McapScan(path)
+        self._lasting: dict[str, Struct] = {}
+        self._lasting_chunks = 0
+        self.drops: Drops = Counter()
+
+    def __enter__(self) -> "McapRecording":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._scan.close()
+
+    def refresh(self) -> None:
+        """Read what has been written since."""
+        self._scan.walk()
+
+    @property
+    def site(self) -> SiteMessage | None:
+        """The site, as recorded last."""
+        return cast("SiteMessage | None", self._last("site"))
+
+    @property
+    def zones(self) -> ZonesMessage | None:
+        """The site's zones, as recorded last."""
+        return cast("ZonesMessage | None", self._last("zones"))
+
+    @property
+    def floor_plan(self) -> bytes | None:
+        """The image of the floor."""
+        return self._scan.attachment(FLOOR_PLAN)
+
+    def summary(self) -> RecordingSummary:
+        """What it holds; quick, as only indexes are read."""
+        counts: Counter[str] = Counter()
+        tags: set[str] = set()
+        raw_tags: set[str] = set()
+        site = self.site
+        for topic, count in self._counts().items():
+            channel = channel_of(topic)
+            if channel is None:
+                continue
+            counts[channel.kind] += count
+            if channel.kind in ("fix", "receptions"):
+                tags.add(channel.name)
+            if channel.kind == "receptions":
+                raw_tags.add(channel.name)
+        chunks = self._scan.chunks
+        return RecordingSummary(
+            path=str(self._scan.path),
+            site=None if site is None else site.site.id,
+            name=None if site is None else site.site.name,
+            simulated=None if site is None else site.simulated,
+            start_s=min(chunk.start_ns for chunk in chunks) / NS if chunks else None,
+            end_s=max(chunk.end_ns for chunk in chunks) / NS if chunks else None,
+            finished=self._scan.finished,
+            unread_bytes=self._scan.unread_bytes,
+            tags=tuple(sorted(tags)),
+            raw_tags=tuple(sorted(raw_tags)),
+            messages=dict(sorted(counts.items())),
+            drops=dict(self._scan.drops + self.drops),
+        )
+
+    def fixes(
+        self, from_s: float = -math.inf, to_s: float = math.inf, tags: Iterable[str] | None = None
+    ) -> Iterator[FixMessage]:
+        """Fixes recorded from ``from_s`` on and before ``to_s`` (Unix time), in the order of recording."""
+        wanted = None if tags is None else frozenset(tags)
+        for found in self.messages({"fix"}, from_s, to_s):
+            if wanted is None or found.channel.name in wanted:
+                yield cast("FixMessage", found.message)
+
+    def truth(self, from_s: float = -math.inf, to_s: float = math.inf) -> Iterator[TruthMessage]:
+        """Where the tags truly were."""
+        return (cast("TruthMessage", found.message) for found in self.messages({"truth"}, from_s, to_s))
+
+    def receptions(self, tag: str | None = None) -> Iterator[ReceptionsMessage]:
+        """Raw receptions of one tag, or of all."""
+        for found in self.messages({"receptions"}):
+            if tag is None or found.channel.name == tag:
+                yield cast("ReceptionsMessage", found.message)
+
+    def messages(self, kinds: set[str], from_s: float = -math.inf, to_s: float = math.inf) -> Iterator[Recorded]:
+        """Messages of these kinds by time of recording; chunks without any are not even read."""
+        for chunk in list(self._scan.chunks):
+            if chunk.end_ns / NS >= from_s and chunk.start_ns / NS < to_s and self._may_hold(chunk, kinds):
+                yield from self._of(chunk, kinds, from_s, to_s)
+
+    def spans(self, kinds: set[str], gap_s: float) -> list[tuple[float, float]]:
+        """When there are messages of these kinds: begins and ends in Unix time, in order, by the times of chunks.
+
+        Gaps of up to ``gap_s`` are no gaps. Only indexes are read, so a span may begin and end a chunk too wide.
+        """
+        found: list[tuple[float, float]] = []
+        for chunk in self._scan.chunks:
+            if self._holds(chunk, kinds):
+                begin_s, end_s = chunk.start_ns / NS, chunk.end_ns / NS
+                if found and begin_s - found[-1][1] <= gap_s:
+                    found[-1] = (found[-1][0], max(end_s, found[-1][1]))
+                else:
+                    found.append((begin_s, end_s))
+        return found
+
+    def _holds(self, chunk: ChunkIndex, kinds: set[str]) -> bool:
+        """Whether a chunk holds messages of these kinds; one without a whole index is read."""
+        if chunk.indexed:
+            return self._may_hold(chunk, kinds)
+        return any(True for _ in self._of(chunk, kinds, -math.inf, math.inf))
+
+    def _of(self, chunk: ChunkIndex, kinds: set[str], from_s: float, to_s: float) -> Iterator[Recorded]:
+        for channel_id, log_ns, payload in self._scan.messages(chunk):
+            topic = self._scan.topics.get(channel_id, "")
+            channel = channel_of(topic)
+            time_s = log_ns / NS
+            if channel is None or channel.payload is None or channel.kind not in kinds or not from_s <= time_s < to_s:
+                continue
+            try:
+                message = decoder_of(channel.payload).decode(payload)
+            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+                self.drops["malformed-message"] += 1
+                continue
+            yield Recorded(time_s, channel, topic, message)
+
+    def _may_hold(self, chunk: ChunkIndex, kinds: set[str]) -> bool:
+        """Whether the index does not rule it out."""
+        if not chunk.indexed:
+            return True
+        channels = (channel_of(self._scan.topics.get(number, "")) for number in chunk.counts)
+        return any(channel is not None and channel.kind in kinds for channel in channels)
+
+    def _last(self, kind: str) -> Struct | None:
+        """The newest message of a kind that lasts."""
+        chunks = self._scan.chunks
+        kinds = {"site", "zones"}
+        for chunk in chunks[self._lasting_chunks :]:
+            if self._may_hold(chunk, kinds):
+                for found in self._of(chunk, kinds, -math.inf, math.inf):
+                    self._lasting[found.channel.kind] = found.message
+        self._lasting_chunks = len(chunks)
+        return self._lasting.get(kind)
+
+    def _counts(self) -> Counter[str]:
+        """Messages by topic; a chunk without a whole index is read."""
+        counts: Counter[str] = Counter()
+        for chunk in self._scan.chunks:
+            found = chunk.counts if chunk.indexed else Counter(channel for channel, _, _ in self._scan.messages(chunk))
+            counts.update({self._scan.topics.get(channel, ""): count for channel, count in found.items()})
+        return counts

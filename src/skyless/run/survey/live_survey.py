@@ -1,0 +1,280 @@
+"""A survey while stamps come in: what is known so far, its newest results, and the watch once the site is surveyed.
+
+No I/O and no clock: times are passed in, ``now_s`` by one clock that does not go back.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from typing import Final, Literal
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from skyless.core.site import Site
+from skyless.run.mqtt.messages import StampsMessage, SurveyMessage, SurveyProgress, WatchFinding, WatchMessage
+from skyless.site.survey.facts import Facts, PairBlock, PairRanges
+from skyless.site.survey.result import Survey, SurveyRecord, baseline
+from skyless.site.survey.stamps.legs import AnchorLeg
+from skyless.site.survey.stamps.pair_ranger import PairRanger, StepTable
+from skyless.site.survey.watch.explain import Finding
+from skyless.site.survey.watch.monitor import AnchorWatch
+from skyless.site.survey.watch.moved import Change, with_changes
+
+NO_DATA_S: Final = 5.0
+"""Without stamps for this time a result is out of date."""
+
+PRESENT_S: Final = 10.0
+"""An anchor of which nothing came for longer is missing."""
+
+ADOPTION_S: Final = 2.0
+"""Stamps of this time after a placement are not used: anchors adopt it one after the other."""
+
+_RESULTS_KEPT: Final = 64  # a user saves the result that is on the page, while newer ones are made
+
+_MAX_BACKLOG_S: Final = 60.0
+"""A message that is later than this against others of its sender shows that a clock was set, not that it waited."""
+
+_SHOWN_PAIRS_PER_S: Final = 200
+
+_LAG_S: Final = 30.0
+"""For up to twice this time the quickest message counts: a host's clock that was set back is noticed after it."""
+
+_MAX_WAITING_BLOCKS: Final = 100_000  # a minute of a site with 50 anchors
+
+FactsOf = Callable[[Site], Facts]
+"""What is known of a site without a user's help."""
+
+State = Literal["collecting", "surveyed", "no data"]
+
+
+class LiveSurvey:
+    """One site's survey."""
+
+    def __init__(self, site: Site, facts: Facts, record: SurveyRecord | None = None, *, watches: bool = True) -> None:
+        """``record``: the survey that gave the site its positions. Without it the watch learns the usual ranges."""
+        self.site, self.facts = site, facts
+        self.serial = 0  # of the newest result
+        self.error: str | None = None
+        self.saved_serial: int | None = None
+        self.saved_unix_s: float | None = None
+        self.missed = 0  # stamps that anchors had to drop
+        self.begun = 0  # how often ranges have begun again: a result of ranges from before does not count
+        self._watches = watches
+        self._shown: tuple[PairRanges, float] | None = None  # the ranges in messages, and when they were made
+        self._watch: _Watched | None = None
+        self._results: dict[int, tuple[Survey, PairRanges]] = {}
+        self._changes: tuple[Change, ...] = ()  # while ranges were gathered
+        self._runs: dict[int, str] = {}
+        self._heard_s: dict[int, float] = {}
+        self._lags: dict[int, _Lag] = {}
+        self._newest_s: float | None = None
+        self._pause_until_s = float("-inf")
+        self.restart_ranges()
+        self._begin_watch(record)
+
+    # What comes in
+
+    def add_stamps(self, message: StampsMessage, now_s: float) -> None:
+        """Process what an anchor has received of others. Stamps of anchors that the site has not are dropped."""
+        if message.anchor not in self._known or now_s < self._pause_until_s:
+            return
+        self.missed += message.missed
+        if self._runs.setdefault(message.anchor, message.run) != message.run:
+            self._runs[message.anchor] = message.run
+            self._ranger.forget(message.anchor)
+        t_s = self._sent_s(message.anchor, message.unix_s, now_s)
+        for stamp in message.stamps:
+            if stamp.anchor in self._known:
+                self._add(stamp.anchor, message.anchor, stamp.tx_ticks, stamp.rx_ticks, t_s, now_s)
+
+    def add_leg(self, leg: AnchorLeg, now_s: float) -> None:
+        """Process a reception that was relayed."""
+        if leg.sender in self._known and leg.receiver in self._known and not now_s < self._pause_until_s:
+            self._add(leg.sender, leg.receiver, leg.tx_ticks, leg.rx_ticks, leg.t_s, now_s)
+
+    def set_facts(self, facts: Facts) -> None:
+        """Replace what is known. Facts of anchors that the site has not are dropped."""
+        known = self._known
+        gauge = facts.gauge
+        named = set() if gauge is None else {gauge.origin, gauge.x_axis, gauge.left} - {None}
+        self.facts = replace(
+            facts,
+            heights_m={anchor: one for anchor, one in facts.heights_m.items() if anchor in known},
+            tapes=tuple(one for one in facts.tapes if {one.a, one.b} <= known and one.a != one.b),
+            points={anchor: one for anchor, one in facts.points.items() if anchor in known},
+            sketch_m={anchor: one for anchor, one in facts.sketch_m.items() if anchor in known},
+            delays=tuple(one for one in facts.delays if one.anchor in known),
+            gauge=gauge if named <= known else None,
+        )
+
+    # Results
+
+    def ranges(self) -> PairRanges:
+        """All ranges so far, with all anchors of the site."""
+        found = self._ranger.ranges()
+        return replace(found, anchors=tuple(sorted(self._known)))
+
+    def finish(self) -> PairRanger:
+        """Nothing more comes: what has come since the last full second counts as well. What makes the ranges."""
+        self._ranger.finish()
+        return self._ranger
+
+    def steps(self) -> StepTable:
+        """The ranges in the order of time, for ``change_of``."""
+        return self._ranger.steps.table()
+
+    def use_since(self, change: Change) -> None:
+        """Drop the ranges from before a change, and the results computed from them."""
+        self._ranger.drop_before(change.since_s)
+        self._changes += (change,)
+        self._shown = None
+        self._results.clear()
+
+    def add_result(self, survey: Survey, ranges: PairRanges) -> None:
+        """Keep a result of the present ranges. The oldest of many is dropped."""
+        self.serial += 1
+        self._results[self.serial] = (with_changes(survey, self._changes, ranges.duration_s), ranges)
+        if len(self._results) > _RESULTS_KEPT:
+            del self._results[next(iter(self._results))]
+
+    def result(self, serial: int) -> tuple[Survey, PairRanges] | None:
+        """A result by its number, with the ranges that it was made of, or None if it is no longer kept."""
+        return self._results.get(serial)
+
+    def place(self, site: Site, record: SurveyRecord, serial: int, now_s: float, unix_s: float) -> None:
+        """The site is that of a result from now on: ranges begin again, as antenna delays are others."""
+        self.site, self.saved_serial, self.saved_unix_s, self.error = site, serial, unix_s, None
+        if self.facts.sketch_m:
+            sketch = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
+            self.facts = replace(self.facts, sketch_m=sketch)
+        self._pause_until_s = now_s + ADOPTION_S
+        self.restart_ranges()
+        self._begin_watch(record)
+
+    # What goes out
+
+    def state(self, now_s: float) -> State:
+        """Whether stamps come, and whether there is a result."""
+        if self._newest_s is None or now_s - self._newest_s > NO_DATA_S:
+            return "no data"
+        return "surveyed" if self._results else "collecting"
+
+    def message(self, now_s: float, unix_s: float, file: str | None) -> SurveyMessage:
+        """All of it for those who watch."""
+        newest, state = self._results.get(self.serial), self.state(now_s)
+        present = {anchor for anchor, heard_s in self._heard_s.items() if now_s - heard_s <= PRESENT_S}
+        ranges = self._shown_ranges(now_s)
+        error = self.error
+        if error is None and state == "no data":
+            ago = "yet" if self._newest_s is None else f"for {now_s - self._newest_s:.0f} s"
+            error = f"no stamps have come from the anchors {ago}"
+        return SurveyMessage(
+            unix_s=unix_s,
+            serial=self.serial,
+            anchors=tuple(sorted(present)),
+            missing=tuple(sorted(self._known - present)),
+            duration_s=ranges.duration_s,
+            pairs=tuple(SurveyProgress(one.a, one.b, one.exchanges, one.range_m, one.std_m) for one in ranges.pairs),
+            facts=self.facts,
+            survey=None if newest is None else newest[0],
+            error=error,
+            saved_serial=self.saved_serial,
+            saved_unix_s=self.saved_unix_s,
+            file=file,
+            state=state,
+        )
+
+    def watch_message(self, now_s: float, unix_s: float) -> WatchMessage | None:
+        """What the watch saw when it was last advanced, or None if too few anchors have positions for a watch."""
+        watched = self._watch
+        if watched is None:
+            return None
+        state, found, pairs = watched.seen
+        findings = tuple(
+            WatchFinding(one.kind, one.anchors, one.size_m, one.std_m, one.since_s + unix_s - now_s, one.sentence)
+            for one in found
+        )
+        has_data = self.state(now_s) != "no data"
+        return WatchMessage(unix_s, state if has_data else "no data", findings, pairs)
+
+    def advance_watch(self, now_s: float) -> None:
+        """Let the watch look at the ranges that have come. A striking window of a large site takes it a second.
+
+        It may run in a thread while all else is called, but not twice at once.
+        """
+        if self._watch is not None:
+            self._watch.advance(now_s)
+
+    def restart_ranges(self) -> None:
+        """Forget all ranges and results: an anchor is where it was not before, or antenna delays are others."""
+        self.begun += 1
+        self._known = {anchor.id for anchor in self.site.all_anchors}
+        self._ranger = PairRanger(on_block=self._on_block)
+        self._shown = None
+        self._changes = ()
+        self._results.clear()
+
+    # Within
+
+    def _shown_ranges(self, now_s: float) -> PairRanges:
+        """Ranges for a message: those of 1225 pairs take half a second, and are made again every six."""
+        if self._shown is None or not 0.0 <= now_s - self._shown[1] < len(self._shown[0].pairs) / _SHOWN_PAIRS_PER_S:
+            self._shown = self._ranger.ranges(), now_s
+        return self._shown[0]
+
+    def _add(self, sender: int, receiver: int, tx_ticks: int, rx_ticks: int, t_s: float, now_s: float) -> None:
+        self._newest_s = self._heard_s[sender] = self._heard_s[receiver] = now_s
+        self._ranger.add(sender, receiver, tx_ticks, rx_ticks, t_s)
+
+    def _sent_s(self, anchor: int, unix_s: float, now_s: float) -> float:
+        """When a message was sent: by its sender's clock, less what the quickest of its messages shows that to be off.
+
+        A message may have waited behind others, and hosts' clocks differ.
+        """
+        lag_s = now_s - unix_s
+        lag = self._lags.get(anchor)
+        if lag is None or not 0.0 <= lag_s - lag.least_s < _MAX_BACKLOG_S:
+            lag = self._lags[anchor] = _Lag(now_s, lag_s, lag_s)
+        elif now_s - lag.begun_s >= _LAG_S:
+            lag = self._lags[anchor] = _Lag(now_s, lag_s, lag.newest_s)
+        lag.newest_s = min(lag.newest_s, lag_s)
+        return now_s - (lag_s - min(lag.least_s, lag.newest_s))
+
+    def _begin_watch(self, record: SurveyRecord | None) -> None:
+        """Watch the anchors that have positions, if these are enough to say anything."""
+        placed = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in self.site.anchors}
+        self._watch = None
+        if self._watches and len(placed) > 2:
+            known = None if record is None else {(one.a, one.b): one.range_m for one in baseline(record).pairs}
+            self._watch = _Watched(AnchorWatch(placed, self.facts.dimensions, known))
+
+    def _on_block(self, block: PairBlock) -> None:
+        if self._watch is not None:
+            self._watch.waiting.append(block)
+
+
+class _Lag(Struct):
+    """Least difference between one sender's message times and the own clock, over the last half minute to minute."""
+
+    begun_s: float
+    newest_s: float
+    """Since then."""
+    least_s: float
+    """In the time before."""
+
+
+class _Watched:
+    """A watch, the ranges that it has not looked at yet, and what it saw last."""
+
+    def __init__(self, watch: AnchorWatch) -> None:
+        self.waiting: deque[PairBlock] = deque(maxlen=_MAX_WAITING_BLOCKS)
+        self.seen: tuple[Literal["learning", "watching", "no data"], tuple[Finding, ...], int] = ("no data", (), 0)
+        self._watch = watch
+
+    def advance(self, now_s: float) -> None:
+        """Look at what is waiting."""
+        watch = self._watch
+        while self.waiting:
+            watch.add(self.waiting.popleft())
+        watch.advance(now_s)
+        self.seen = watch.state, watch.findings, watch.pairs

@@ -1,0 +1,330 @@
+"""``skyless tag``: one process with one or several tags, each with its own radio and its own MQTT connection."""
+
+import asyncio
+import secrets
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from skyless.core.air.reception import Reception
+from skyless.core.integrity import IntegrityRequirement
+from skyless.core.method_names import DEFAULT_METHOD
+from skyless.core.tag.any_receiver import AnyReceiver
+from skyless.core.tag.beacon_receiver import NOT_DROPS, TagReceiver
+from skyless.core.tag.receiver import Receiver
+from skyless.core.tag.trusted_receiver import GivenFix, SiteTrust, Trust, TrustedReceiver
+from skyless.radio.interface import Gone, Hint, Radio, RadioEvent, Restarted
+from skyless.run.fix_log import FIX_LEAVES_S, FixListener, FixLog, PhaseLog
+from skyless.run.keys.anchor_and_tag_keys import Remembered, TagMemory, TagReport, trust_reason
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.messages import Counters, FixMessage, RequestMessage, TagHealth
+from skyless.run.mqtt.topics import fix_topic, health_topic, receptions_topic, request_topic
+from skyless.run.process import HEALTH_S, Log, Usage, data_folder, every, keep, reader, together
+from skyless.run.radio_monitor import RadioMonitor
+from skyless.run.recordings.reception_log import ReceptionLog, receiver_settings
+
+RECEPTIONS_S: Final = 0.05
+"""Interval of the messages with raw receptions."""
+
+VERIFIED_S: Final = 2.0
+"""Beacons that were received before this time do not count as verified any more."""
+
+HealthListener = Callable[[TagHealth, TagReceiver], None]
+"""Called with a tag's state, and with its receiver, which knows the site."""
+
+
+class TagSettings(Struct, frozen=True):
+    """How a tag computes and what it publishes."""
+
+    method: str = DEFAULT_METHOD
+    qa: float = 0.3
+    site: int | None = None
+    """The only site to listen to, or None for the first that is heard."""
+    integrity: IntegrityRequirement = IntegrityRequirement()
+    publish_hz: float = 50.0
+    """Largest rate of fixes on MQTT. All of them count."""
+    trust: SiteTrust | None = None
+    """Which beacons and fixes are accepted, or None for a tag that does not know the site's public key."""
+
+
+class TagNode:
+    """Runs a receiver on a radio. ``publish`` is called with the fixes that are to be published."""
+
+    def __init__(
+        self,
+        settings: TagSettings,
+        radio: Radio,
+        publish: FixListener,
+        log: Log,
+        before: Callable[[TagReceiver, Reception, int], None] | None = None,
+        clock: Callable[[], float] | None = None,
+        memory: TagMemory | None = None,
+    ) -> None:
+        """``before`` is called before each reception that is processed: with receiver, reception and number of fixes.
+
+        ``clock`` gives the host's monotonic time in s, as ``host_s`` of the receptions; None for ``time.monotonic``.
+        ``memory``: what is known of the site's keys from earlier runs.
+        """
+        self.settings, self.radio = settings, radio
+        self._before, self._clock = before, time.monotonic if clock is None else clock
+        self.name = radio.name
+        self._memory = memory
+        self._trusted = self._new_trusted()
+        self._receiver = self.new_receiver()
+        self._report = None if settings.trust is None else TagReport(radio.name, settings.trust.site, log)
+        self._log, self._has_logged_multipath = log, False
+        self._heard_s = 0.0  # when the last reception was processed
+        self.receptions = 0  # including those that were too old at their turn
+        self.fix_log = FixLog(self.name, publish, settings.publish_hz, self._clock)
+        self.phases = PhaseLog()
+        self.monitor = RadioMonitor(f"tag {self.name}", "listening", log, radio.advice)
+
+    def new_receiver(self) -> AnyReceiver:
+        """A receiver that has heard nothing yet."""
+        asked = self.settings
+        return AnyReceiver(asked.method, site=asked.site, qa=asked.qa, integrity=asked.integrity)
+
+    def _new_verified_receiver(self) -> Receiver:
+        """A receiver for verified beacons, which only protocol 2 has."""
+        asked = self.settings
+        return Receiver(site=asked.site, qa=asked.qa, integrity=asked.integrity)
+
+    def _new_trusted(self) -> TrustedReceiver | None:
+        """What verifies beacons, with all that is remembered of the site's keys, or None without a public key."""
+        trust = self.settings.trust
+        if trust is None:
+            return None
+        known = Remembered() if self._memory is None else self._memory.remembered
+        newest = replace(trust, least_serial=max(trust.least_serial, known.serial))
+        return TrustedReceiver(newest, self._new_verified_receiver, known.certificates)
+
+    @property
+    def receiver(self) -> TagReceiver:
+        """The one whose fixes are given."""
+        return self._receiver if self._trusted is None else self._trusted.receiver
+
+    @property
+    def drops(self) -> Counter[str]:
+        """What could not be used, by reason."""
+        counters = self.receiver.counters.items()
+        dropped = Counter({reason: count for reason, count in counters if reason not in NOT_DROPS})
+        refused = Counter[str]() if self._trusted is None else self._trusted.counters
+        return dropped + refused + self.radio.counters + self.fix_log.lateness.drops
+
+    @property
+    def reason(self) -> str:
+        """Why there is no fix, where there is none."""
+        trusted = self._trusted
+        needs_trust = trusted is not None and trusted.trust.trust is not Trust.OPEN
+        return (trust_reason(trusted) if trusted and needs_trust else None) or str(self.receiver.reason)
+
+    def complete(self, health: TagHealth) -> TagHealth:
+        """A tag's state with what it knows of multipath and of verified beacons."""
+        trusted = self._trusted
+        if (multipath := self.receiver.multipath_m) is not None:
+            health = replace(health, multipath_std_m=multipath[0], multipath_distance_m=multipath[1])
+        if trusted is None:
+            return health
+        return replace(
+            health,
+            trust=trusted.trust.trust.value,
+            is_verified=self._is_verified(trusted),
+            faults={str(anchor): str(fault) for anchor, fault in sorted(trusted.faults().items())},
+            clock_error_s=trusted.verifier.clock.error_s,
+        )
+
+    def check_trust(self) -> None:
+        """Log what has changed of verified beacons, and remember what is known of the site's keys."""
+        trusted = self._trusted
+        if trusted is None or self._report is None:
+            return
+        self._report.update(trusted, self._clock(), is_verified=self._is_verified(trusted))
+        if self._memory is not None:
+            self._memory.keep(trusted.verifier.keys.serial, trusted.verifier.keys.certificates)
+
+    def _is_verified(self, trusted: TrustedReceiver) -> bool:
+        return trusted.is_verified and self._clock() - self._heard_s < VERIFIED_S
+
+    def check_reception(self, now_s: float) -> None:
+        """Log where to look if nothing usable comes, and, once, ranges that change more than the site file states.
+
+        ``now_s`` is the host's monotonic clock.
+        """
+        self.monitor.check(now_s, self.receptions, self.receiver.counters["heard"], self.drops)
+        if not self._has_logged_multipath and (found := self.receiver.multipath_m) is not None:
+            self._has_logged_multipath = True
+            std_m, distance_m = found
+            self._log(
+                f"tag {self.name}: ranges change by {100 * std_m:.0f} cm within {100 * distance_m:.0f} cm walked, more"
+                f" than the site file states; place_std_m = {std_m:.2f} and place_distance_m = {distance_m:.2f} in its"
+                " [accuracy] would let all tags start with that"
+            )
+
+    async def run(self) -> None:
+        """Listen until cancelled."""
+        await self.radio.run(self.on_event)
+
+    def on_event(self, event: RadioEvent) -> None:
+        """Process an event of the radio."""
+        if isinstance(event, Reception):
+            self._receive(event)
+        elif isinstance(event, Restarted | Gone | Hint):
+            self.monitor.on_event(event)
+            if isinstance(event, Restarted) and self.receptions:
+                self.check_trust()
+                self._receiver, self._trusted = self.new_receiver(), self._new_trusted()
+
+    def _receive(self, reception: Reception) -> None:
+        self.receptions += 1
+        if reception.host_s is not None and not self.fix_log.lateness.admits(reception.host_s, self._clock()):
+            return
+        if self._before is not None:
+            self._before(self.receiver, reception, self.fix_log.serial)
+        given = self._fixes_of(reception)
+        done_s = self._heard_s = self._clock()
+        due_s = done_s if reception.host_s is None else reception.host_s
+        self.phases.add(reception.frame, due_s, done_s, made_fix=bool(given))
+        for one in given:
+            ended_s = one.reception.host_s
+            self.fix_log.add(one.fix, due_s if ended_s is None else ended_s, done_s, due_s)
+
+    def _fixes_of(self, reception: Reception) -> list[GivenFix]:
+        """The fixes that a reception makes possible."""
+        if self._trusted is not None:
+            host_s = reception.host_s
+            unix_s = time.time() if host_s is None else host_s + self.fix_log.unix_less_host_s
+            return self._trusted.hear(reception, unix_s)
+        fix = self._receiver.hear(reception)
+        return [] if fix is None else [GivenFix(fix, reception)]
+
+
+class Tag:
+    """A tag and its link, which is made once the tag's site is known, and again in another site."""
+
+    def __init__(
+        self,
+        settings: TagSettings,
+        radio: Radio,
+        address: MqttAddress | None,
+        log: Log,
+        on_fix: FixListener | None = None,
+        on_health: HealthListener | None = None,
+    ) -> None:
+        """``on_fix`` and ``on_health`` are called with all that is to be published, with or without a broker."""
+        self._address, self._log, self._on_fix, self._on_health = address, log, on_fix, on_health
+        self.link: Link | None = None
+        self._site: int | None = None
+        self._late_before = 0  # fixes that became too old in links to other sites
+        self._link_tasks: list[asyncio.Task[None]] = []
+        self._fix_topic = self._health_topic = self._receptions_topic = ""
+        asked = receiver_settings(settings.method, settings.site, settings.qa, integrity=settings.integrity)
+        self.reception_log = ReceptionLog(radio.name, asked, secrets.token_hex(4))
+        memory = None if settings.trust is None else TagMemory(settings.trust, data_folder())
+        self.node = TagNode(settings, radio, self._publish, log, self.reception_log.add, memory=memory)
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        try:
+            await self.node.run()
+        finally:
+            for task in self._link_tasks:
+                task.cancel()
+            await asyncio.gather(*self._link_tasks, return_exceptions=True)
+
+    def _publish(self, message: FixMessage) -> None:
+        if self._on_fix is not None:
+            self._on_fix(message)
+        self._connect()
+        if self.link is not None:
+            self.link.publish(self._fix_topic, message, until_s=self.node.fix_log.due_s + FIX_LEAVES_S)
+
+    def _connect(self) -> None:
+        """Make the link to the site to which the tag listens."""
+        site = self.node.receiver.site
+        if self._address is None or site is None or site == self._site:
+            return
+        for task in self._link_tasks:
+            task.cancel()  # it publishes its end to the site that was left
+        self._link_tasks = [task for task in self._link_tasks if not task.done()]
+        self._site = site
+        self._late_before += 0 if self.link is None else self.link.late
+        self.link = Link(self._address, self.node.name, site=site, kind="tag")
+        self._fix_topic = fix_topic(site, self.node.name)
+        self._health_topic = health_topic(site, "tag", self.node.name)
+        self._receptions_topic = receptions_topic(site, self.node.name)
+        self.link.subscribe(request_topic(site), reader(RequestMessage, self._on_request, self._on_bad_request), qos=1)
+        self._link_tasks.append(asyncio.ensure_future(keep(self.link, self._log)))
+
+    def _on_request(self, request: RequestMessage) -> None:
+        self.reception_log.request(request, time.monotonic())
+
+    def _on_bad_request(self) -> None:
+        self.reception_log.counters["bad-request"] += 1
+
+    def publish_receptions(self) -> None:
+        """Publish the raw receptions that were requested and are due."""
+        if self.link is None:
+            return
+        unix_less_host_s = self.node.fix_log.unix_less_host_s
+        while (message := self.reception_log.collect(time.monotonic(), unix_less_host_s)) is not None:
+            self.link.publish(self._receptions_topic, message, qos=1)
+
+    def publish_health(self, cpu: float, memory_bytes: int) -> None:
+        """Publish the tag's state."""
+        node = self.node
+        node.fix_log.update_clock_offset()
+        self._connect()
+        node.check_reception(time.monotonic())
+        node.check_trust()
+        counted = node.fix_log.health(
+            method=node.settings.method,
+            receptions=node.receptions,
+            reason=node.reason,
+            counters=node.drops | self.reception_log.counters,
+            mqtt=Counters(0, 0, 0) if self.link is None else self.link.counters,
+            cpu=cpu,
+            memory_bytes=memory_bytes,
+            phases=node.phases.last,
+            late_in_link=self._late_before + (0 if self.link is None else self.link.late),
+        )
+        health = node.complete(counted)
+        if self._on_health is not None:
+            self._on_health(health, node.receiver)
+        if self.link is not None:
+            self.link.publish(self._health_topic, health)
+
+
+class Tags:
+    """The tags of one process."""
+
+    def __init__(
+        self,
+        settings: TagSettings,
+        radios: Sequence[Radio],
+        address: MqttAddress | None,
+        log: Log,
+        on_fix: FixListener | None = None,
+        on_health: HealthListener | None = None,
+    ) -> None:
+        """``on_fix`` and ``on_health`` as in ``Tag``."""
+        self.tags = tuple(Tag(settings, radio, address, log, on_fix, on_health) for radio in radios)
+        self._usage = Usage()
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        parts = [tag.run() for tag in self.tags]
+        await together(*parts, every(HEALTH_S, self._publish_health), every(RECEPTIONS_S, self._publish_receptions))
+
+    def _publish_health(self) -> None:
+        share, memory_bytes = self._usage.sample()
+        for tag in self.tags:
+            tag.publish_health(share / len(self.tags), memory_bytes)
+
+    def _publish_receptions(self) -> None:
+        for tag in self.tags:
+            tag.publish_receptions()

@@ -1,0 +1,1 @@
+"""Zones: where tags enter and leave."""

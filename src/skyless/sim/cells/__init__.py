@@ -1,0 +1,1 @@
+"""Sites of thousands of anchors, simulated cell by cell."""

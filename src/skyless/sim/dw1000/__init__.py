@@ -1,0 +1,1 @@
+"""A model of the DW1000: registers, transceiver, clocks."""

@@ -1,0 +1,308 @@
+"""A register-level model of the DW1000 behind its SPI, on the emulated air (DW1000 User Manual v2.12).
+
+Here: the chip as its host sees it, with its clocks, reset, microcode, one-time memory and sensors, and a driver's bus.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Final
+
+from msgspec import Struct
+
+from skyless.core.air.reception import Diagnostics
+from skyless.core.ticks import wrap
+from skyless.sim.dw1000 import registers as r
+from skyless.sim.dw1000.registers import Access, Memory, decode_header
+from skyless.sim.dw1000.transceiver import Air, Fault, Transceiver
+
+_STEP_MASK: Final = ~0x1FF
+"""SYS_TIME steps by 512 ticks (UM 7.2.8)."""
+
+_SLOW_HZ: Final = 2_000_000
+_FAST_HZ: Final = 16_000_000
+"""Rates at which the bus clocks the SPI."""
+
+_LOCK_S: Final = 15e-6
+"""Until the PLL has locked after a reset; the manual states no guaranteed figure, drivers wait for CPLOCK."""
+_LOAD_S: Final = 150e-6
+"""Until the microcode is loaded (UM 2.5.5.10: table 4)."""
+_MAX_CRYSTAL_HZ: Final = 3_000_000
+"""Fastest SPI while the chip runs on the crystal (UM 2.3.2: INIT)."""
+_MAX_PLL_HZ: Final = 20_000_000
+
+_TEMPERATURE_STEP_C: Final = 1.14
+_REFERENCE_C: Final = 23.0
+_STEPS_PER_V: Final = 173.0
+_REFERENCE_V: Final = 3.3
+"""UM pp. 158-159; the readings at these references are in the OTP."""
+
+
+class Sensors(Struct, frozen=True):
+    """Temperature and supply of a chip, and its factory calibration."""
+
+    temperature_c: float = 31.0
+    supply_v: float = 3.3
+    reading_at_23_c: int = 0x7E
+    reading_at_3_3_v: int = 0x6C
+    crystal_trim: int = 0x11
+    part: int = 0x10205EAD
+
+    def readings(self) -> tuple[int, int]:
+        """SAR_LVBAT and SAR_LTEMP (UM 7.2.43.2)."""
+        volts = round((self.supply_v - _REFERENCE_V) * _STEPS_PER_V) + self.reading_at_3_3_v
+        kelvins = round((self.temperature_c - _REFERENCE_C) / _TEMPERATURE_STEP_C) + self.reading_at_23_c
+        return min(max(volts, 0), 255), min(max(kelvins, 0), 255)
+
+    def otp(self) -> dict[int, int]:
+        """Words of the one-time programmable memory that are not 0 (UM 6.3.1)."""
+        return {
+            0x006: self.part,
+            0x007: 0x4C4F5431,
+            0x008: self.reading_at_3_3_v | 0xB0 << 8,
+            0x009: self.reading_at_23_c | 0x8E << 8,
+            0x01E: self.crystal_trim,
+        }
+
+
+class Clocking:
+    """What must have happened before the chip can send or receive. ``seconds`` is any clock that runs on."""
+
+    def __init__(self, memory: Memory, misuse: Counter[str], seconds: Callable[[], float], sensors: Sensors) -> None:
+        self._memory, self._misuse, self._seconds, self._sensors = memory, misuse, seconds, sensors
+        self._lock_s = seconds() + _LOCK_S
+        self._loaded_s: float | None = None
+        self.in_reset = False
+
+    def restart(self) -> None:
+        """As after power-on or a reset: nothing is loaded, the PLL begins to lock."""
+        self._loaded_s = None
+        self._lock_s = self._seconds() + _LOCK_S
+
+    @property
+    def locked(self) -> bool:
+        """Whether the chip runs on its PLL."""
+        forced = self._memory.get(r.PMSC_CTRL0) & r.SYSCLKS == r.SYSCLKS_XTI
+        return not forced and self.pll_has_locked
+
+    @property
+    def pll_has_locked(self) -> bool:
+        """CPLOCK: the PLL may have locked while the crystal is still forced."""
+        return not self.in_reset and self._seconds() >= self._lock_s
+
+    @property
+    def microcode_loaded(self) -> bool:
+        """Whether the leading edge is searched for."""
+        return self._loaded_s is not None and self._seconds() >= self._loaded_s
+
+    def accepts(self, hz: int) -> bool:
+        """Whether a transfer at that rate arrives unspoilt."""
+        return hz <= (_MAX_PLL_HZ if self.locked else _MAX_CRYSTAL_HZ)
+
+    def on_pmsc_written(self) -> int | None:
+        """Apply PMSC_CTRL0; returns SOFTRESET where it resets something."""
+        kind = self._memory.get(r.PMSC_CTRL0) >> r.SOFTRESET_SHIFT
+        if kind == r.SOFTRESET_ALL and not self.in_reset:
+            if self._memory.get(r.PMSC_CTRL0) & r.SYSCLKS != r.SYSCLKS_XTI:
+                self._misuse["reset-not-on-crystal"] += 1  # UM 7.2.50.1
+            self.in_reset = True
+            return kind
+        if kind == r.SOFTRESET_NONE and self.in_reset:
+            self.in_reset = False
+            self.restart()
+        return kind if kind == r.SOFTRESET_RX else None
+
+    def on_otp_written(self) -> None:
+        """Apply OTP_CTRL: read a word, or load the microcode (UM 6.3.2, 2.5.5.10)."""
+        control = self._memory.get(r.OTP_CTRL)
+        if control & r.OTPREAD:
+            address = self._memory.get(r.OTP_ADDR) & 0x7FF
+            self._memory.set(r.OTP_RDAT, self._sensors.otp().get(address, 0))
+        if control & r.LDELOAD:
+            if self._memory.get(r.PMSC_CTRL0) & 0xFFFF == r.PMSC_FOR_LDE:
+                self._loaded_s = self._seconds() + _LOAD_S
+            else:
+                self._misuse["microcode-without-its-clock"] += 1
+        self._memory.set(r.OTP_CTRL, control & ~(r.OTPREAD | r.LDELOAD))  # they clear themselves
+
+    def on_sensor_written(self) -> None:
+        """Apply TC_SARC: its bit 0 lets the converter sample (UM 6.4, 7.2.43.1)."""
+        memory = self._memory
+        ready = memory.get(r.RF_SENSOR_1) == 0x80 and memory.get(r.RF_SENSOR_2) == 0x0F
+        if memory.get(r.TC_SARC) & 1 and ready:
+            volts, kelvins = self._sensors.readings()
+            memory.set(r.TC_SARL, volts | kelvins << 8)
+
+
+class Chip:
+    """One DW1000 with its antenna in an air. ``seconds`` is a clock for what has nothing to do with the air."""
+
+    def __init__(
+        self,
+        air: Air,
+        tx_delay_ticks: int,
+        rx_delay_ticks: int,
+        seconds: Callable[[], float],
+        sensors: Sensors | None = None,
+    ) -> None:
+        """The delays are the true ones between chip and antenna, whatever the host sets."""
+        self.misuse: Counter[str] = Counter()
+        """Violations of the manual by the host."""
+        self.arrivals: Counter[str] = Counter()
+        """What became of the frames that reached the antenna."""
+        self._air, self._rx_delay_ticks = air, rx_delay_ticks
+        self.memory = Memory(self.misuse)
+        self.clocking = Clocking(self.memory, self.misuse, seconds, sensors or Sensors())
+        self.transceiver = Transceiver(self.memory, air, tx_delay_ticks, self.misuse)
+        self.transfers = 0
+        self.pull_reset()
+
+    # Pins
+
+    def pull_reset(self) -> None:
+        """RSTn was low for a moment; as after power-on."""
+        self.transceiver.reset()
+        self.memory.reset()
+        self.clocking.in_reset = False
+        self.clocking.restart()
+        self._lock_shown = False
+        self.memory.set(r.SYS_STATUS, r.SLP2INIT)
+
+    @property
+    def irq(self) -> bool:
+        """The interrupt line: an event that SYS_MASK lets through, with the polarity of SYS_CFG."""
+        self._update()
+        return self._is_pending() == bool(self.memory.get(r.SYS_CFG) & r.HIRQ_POL)
+
+    def _is_pending(self) -> bool:
+        return bool(self.memory.get(r.SYS_STATUS) & self.memory.get(r.SYS_MASK) & ~r.IRQS)
+
+    # SPI
+
+    def transfer(self, out: bytes, hz: int) -> bytes:
+        """One transaction: the octets that the chip sends while it receives ``out``, as many."""
+        self.transfers += 1
+        access = decode_header(out)
+        if access is None:
+            self.misuse["transaction-without-header"] += 1
+            return bytes(len(out))
+        if not self.clocking.accepts(hz):
+            self.misuse["spi-too-fast"] += 1
+            return self._garbled(access, len(out))
+        self._update()
+        body = out[access.octets :]
+        if access.is_write:
+            self._write(access, body)
+            return bytes(len(out))
+        return bytes(access.octets) + self._read(access, len(body))
+
+    def _garbled(self, access: Access, length: int) -> bytes:
+        """Bits are lost: what is read is shifted by one, what is written does not arrive."""
+        if access.is_write:
+            return bytes(length)
+        right = int.from_bytes(self.memory.read(access.file, access.sub, length - access.octets), "big")
+        return (right << 1 | 1).to_bytes(length + 1, "big")[1:]
+
+    def _update(self) -> None:
+        """Show in the registers what has happened up to now."""
+        if self.clocking.in_reset:
+            return
+        self.transceiver.update()
+        if self.clocking.pll_has_locked and not self._lock_shown:
+            self._lock_shown = True
+            self.transceiver.raise_bits(r.CPLOCK)
+
+    def _read(self, access: Access, length: int) -> bytes:
+        if access.file == r.SYS_TIME.file:
+            self.memory.set(r.SYS_TIME, self._air.now_ticks() & _STEP_MASK)
+        elif access.file == r.SYS_STATUS.file:
+            status = self.memory.get(r.SYS_STATUS) & ~r.IRQS
+            self.memory.set(r.SYS_STATUS, status | (r.IRQS if self._is_pending() else 0))
+        elif access.file == r.TX_BUFFER.file:
+            self.misuse["tx-buffer-read"] += 1  # UM p. 77
+            return bytes(length)
+        elif access.file == r.SYS_CTRL.file:
+            return bytes(length)  # its bits clear themselves
+        return self.memory.read(access.file, access.sub, length)
+
+    def _write(self, access: Access, data: bytes) -> None:
+        if self.clocking.in_reset and access.file != r.PMSC.file:
+            self.misuse["write-in-reset"] += 1
+        elif access.file == r.SYS_STATUS.file:
+            value = int.from_bytes(data, "little") << 8 * access.sub
+            self.transceiver.drop_bits(value & ~r.READ_ONLY)
+        elif access.file == r.SYS_CTRL.file:
+            self._command(int.from_bytes(data, "little") << 8 * access.sub)
+        else:
+            self.memory.write(access.file, access.sub, data)
+            self._apply_written(access, len(data))
+
+    def _command(self, control: int) -> None:
+        if control & (r.TXSTRT | r.RXENAB) and not self.clocking.locked:
+            self.misuse["radio-without-pll"] += 1
+        else:
+            self.transceiver.command(control)
+
+    def _apply_written(self, access: Access, length: int) -> None:
+        """Perform what writing these registers starts."""
+        if access.file == r.PMSC.file and access.sub < 4:
+            kind = self.clocking.on_pmsc_written()
+            if kind == r.SOFTRESET_ALL:
+                self._soft_reset()
+            elif kind == r.SOFTRESET_RX:
+                self.transceiver.listening_since = None
+                self.transceiver.suspect = False
+        elif access.file == r.OTP_IF.file and access.sub < r.OTP_CTRL.sub + 2 and access.sub + length > r.OTP_CTRL.sub:
+            self.clocking.on_otp_written()
+        elif access.file == r.TX_CAL.file and access.sub == 0:
+            self.clocking.on_sensor_written()
+
+    def _soft_reset(self) -> None:
+        """All registers but the bits that hold the chip in reset (UM 7.2.50.1)."""
+        self.transceiver.reset()
+        self.memory.reset()
+        self.memory.set(r.PMSC_CTRL0, r.PMSC_CTRL0.reset & ~(0xF << r.SOFTRESET_SHIFT))
+        self.memory.set(r.SYS_STATUS, r.SLP2INIT)
+        self._lock_shown = False
+
+    # The air
+
+    def receive(self, frame: bytes, rx_ticks: int, diagnostics: Diagnostics, fault: Fault | None = None) -> str:
+        """A frame has ended whose RMARKER reached the antenna at ``rx_ticks`` of the counter; what became of it."""
+        self._update()
+        ticks, microcode = wrap(rx_ticks + self._rx_delay_ticks), self.clocking.microcode_loaded
+        outcome = self.transceiver.receive(frame, ticks, diagnostics, microcode=microcode, fault=fault)
+        self.arrivals[outcome] += 1
+        return outcome
+
+
+class ModelBus:
+    """A driver's bus to a model of the chip (``skyless.radio.dw1000.driver.Bus``).
+
+    ``spend`` lets the host's time pass; a transfer reaches the chip when its time is over.
+    """
+
+    def __init__(
+        self, chip: Chip, spend: Callable[[float], None] | None = None, latency_s: Callable[[], float] | None = None
+    ) -> None:
+        self.chip = chip
+        self._spend, self._latency_s = spend, latency_s
+        self._hz = _SLOW_HZ
+
+    def transfer(self, out: bytes) -> bytes:
+        """One transaction in both directions."""
+        if self._spend is not None:
+            self._spend((0.0 if self._latency_s is None else self._latency_s()) + 8 * len(out) / self._hz)
+        return self.chip.transfer(out, self._hz)
+
+    def set_spi_fast(self, fast: bool) -> None:
+        """Clock fast or slowly from now on."""
+        self._hz = _FAST_HZ if fast else _SLOW_HZ
+
+    def reset_chip(self) -> None:
+        """Pull RSTn low for a moment."""
+        self.chip.pull_reset()
+
+    def pause_us(self, microseconds: int) -> None:
+        """Wait."""
+        if self._spend is not None:
+            self._spend(1e-6 * microseconds)

@@ -1,0 +1,1 @@
+"""Fleets of tags in the simulated world, and how their fixes are judged."""

@@ -1,0 +1,277 @@
+"""A site in the simulated world with tags that compute, and their errors against the truth."""
+
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.core.air.reception import Reception
+from skyless.core.fix import Fix
+from skyless.core.integrity import IntegrityRequirement
+from skyless.core.kernels.arrays import Array
+from skyless.core.method_names import DEFAULT_METHOD
+from skyless.core.protocols import AnchorMachine, new_anchor
+from skyless.core.site import Site
+from skyless.core.tag.any_receiver import AnyReceiver
+from skyless.core.tag.beacon_receiver import NOT_DROPS
+from skyless.sim.evaluation.statistics import ErrorStatistics, ErrorSummary, FirstFixes, LevelReport, LevelTally
+from skyless.sim.impairments import Impairments, Outage
+from skyless.sim.medium import Tally
+from skyless.sim.stations import TagSpec
+from skyless.sim.trajectory import Trajectory
+from skyless.sim.world import World
+
+_LEVEL_ROWS: Final = 1 << 16
+"""Protection levels kept, of which the median is reported."""
+
+
+class JudgedFix(Struct, frozen=True, gc=False):
+    """A fix and the truth at the moment it was made."""
+
+    tag: int
+    time_s: float
+    """True time at which the last frame of the fix ended."""
+    fix: Fix
+    truth_m: Array
+    """Where the tag truly was when that frame was sent, shape (3,)."""
+
+    @property
+    def error_m(self) -> Array:
+        """Position less truth, shape (3,)."""
+        return self.fix.position_m - self.truth_m
+
+
+class FleetSettings(Struct, frozen=True):
+    """How the tags compute, and from when on they are judged."""
+
+    method: str = DEFAULT_METHOD
+    qa: float = 0.3
+    warmup_s: float = 2.0
+    """True time before which no fix counts for the errors; ``first_fix_s`` reports cold starts."""
+    most_fixes: int | None = None
+    """Judged fixes per tag after which no more are judged."""
+    integrity: IntegrityRequirement = IntegrityRequirement()
+    silences: tuple[Outage, ...] = ()
+    """True times in which no tag's radio receives."""
+
+
+class ReceiverWithOutages(AnyReceiver):
+    """Counts as dropped what arrives while its radio is off; unlike after a loss of power, its counter has gone on."""
+
+    def __init__(
+        self, method: str, *, qa: float, integrity: IntegrityRequirement, silences: tuple[Outage, ...]
+    ) -> None:
+        """``silences`` are in the time of the host, which in the simulated world is the true one.
+
+        Raises:
+            ValueError: there is no such method.
+        """
+        super().__init__(method, qa=qa, integrity=integrity)
+        self._silences = silences
+
+    def hear(self, reception: Reception) -> Fix | None:
+        """See ``AnyReceiver``."""
+        host_s = reception.host_s
+        if host_s is not None and any(silence.off_s <= host_s < silence.on_s for silence in self._silences):
+            self.counters["radio-off"] += 1
+            return None
+        return super().hear(reception)
+
+
+class TagRecord(Struct):
+    """What one tag has done."""
+
+    messages: int = 0
+    fixes: int = 0
+    judged: int = 0
+    first_fix_s: float | None = None
+    last: JudgedFix | None = None
+
+
+def world_of(site: Site, trajectories: Sequence[Trajectory], impairments: Impairments, seed: int) -> World:
+    """A world of the site's anchors, as they run on their hosts, and of tags on the trajectories."""
+    tags = [TagSpec(trajectory) for trajectory in trajectories]
+    return World(site, lambda anchor: new_anchor(site, anchor), tags, impairments, seed)
+
+
+class TagFleet:
+    """Tags that compute, and their errors; how they receive is the matter of ``Fleet`` and ``CellFleet``."""
+
+    step_s = 0.25
+    """True time in which it is best to run."""
+
+    def __init__(self, site: Site, tags: int, settings: FleetSettings) -> None:
+        self._settings = settings
+        self.site = site
+        self.receivers = [self._new_receiver() for _ in range(tags)]
+        self.records = [TagRecord() for _ in range(tags)]
+        self._first_fixes = FirstFixes(site, tags)
+        self.errors = ErrorStatistics(planar=site.tags.height_m is not None)
+        self.sigma_squared_sum = 0.0
+        self.levels = LevelTally(tags, _LEVEL_ROWS)
+
+    @property
+    def now_s(self) -> float:
+        """True time that has passed."""
+        raise NotImplementedError
+
+    @property
+    def tally(self) -> Tally:
+        """What was on the air."""
+        raise NotImplementedError
+
+    def run(self, until_s: float) -> Iterator[JudgedFix]:
+        """Let true time pass; every fix of every tag, with the truth."""
+        raise NotImplementedError
+
+    def _new_receiver(self) -> AnyReceiver:
+        asked = self._settings
+        if asked.silences:
+            return ReceiverWithOutages(asked.method, qa=asked.qa, integrity=asked.integrity, silences=asked.silences)
+        return AnyReceiver(asked.method, qa=asked.qa, integrity=asked.integrity)
+
+    def add(self, tag: int, fix: Fix | None, truth_m: Array, at_s: float) -> JudgedFix | None:
+        """Count a frame that a tag has processed, which ended at that true time, and judge the fix if it made one."""
+        record = self.records[tag]
+        record.messages += 1
+        if fix is None:
+            return None
+        record.fixes += 1
+        if record.first_fix_s is None:
+            record.first_fix_s = at_s
+        judged = JudgedFix(tag, at_s, fix, truth_m)
+        record.last = judged
+        if at_s >= self._settings.warmup_s:
+            self._judge(judged)
+        return judged
+
+    def _judge(self, judged: JudgedFix) -> None:
+        record = self.records[judged.tag]
+        if record.judged == self._settings.most_fixes or not self._first_fixes.is_first(judged.tag, judged.time_s):
+            return
+        record.judged += 1
+        error = judged.error_m
+        self.levels.add(judged.tag, judged.fix, error)
+        self.errors.add(float(error[0]), float(error[1]), float(error[2]))
+        self.sigma_squared_sum += float(np.trace(judged.fix.covariance_m2))
+
+    @property
+    def drops(self) -> dict[str, int]:
+        """Frames that the tags did not use, by reason."""
+        total: Counter[str] = Counter()
+        for receiver in self.receivers:
+            total.update(receiver.counters)
+        return {reason: count for reason, count in sorted(total.items()) if reason not in NOT_DROPS}
+
+
+class Fleet(TagFleet):
+    """Tags listening in a world; each frame on the air becomes fixes."""
+
+    def __init__(
+        self,
+        site: Site,
+        trajectories: Sequence[Trajectory],
+        impairments: Impairments,
+        seed: int,
+        settings: FleetSettings,
+    ) -> None:
+        super().__init__(site, len(trajectories), settings)
+        self.anchors: dict[int, AnchorMachine] = {}
+        specs = [TagSpec(trajectory) for trajectory in trajectories]
+        self.world = World(site, self._new_anchor, specs, impairments, seed)
+
+    def _new_anchor(self, anchor: int) -> AnchorMachine:
+        self.anchors[anchor] = new_anchor(self.site, anchor)
+        return self.anchors[anchor]
+
+    @property
+    def now_s(self) -> float:
+        """See ``TagFleet``."""
+        return self.world.now_s
+
+    @property
+    def tally(self) -> Tally:
+        """See ``TagFleet``."""
+        return self.world.tally
+
+    def run(self, until_s: float) -> Iterator[JudgedFix]:
+        """See ``TagFleet``."""
+        for broadcast in self.world.run(until_s):
+            for tag, reception, truth_m in broadcast.receptions():
+                judged = self.add(tag, self.receivers[tag].hear(reception), truth_m, broadcast.end_s)
+                if judged is not None:
+                    yield judged
+
+
+class FleetReport(Struct, frozen=True):
+    """Results of a run; errors in metres, over one fix per tag and superframe after the warm-up."""
+
+    method: str
+    tags: int
+    messages: int
+    fixes: int
+    """Fixes that were judged."""
+    rmse_m: float | None
+    p95_m: float | None
+    max_m: float | None
+    updates_per_s: float
+    """Fixes per second and tag, all of them."""
+    dropped: int
+    std_m: float | None
+    """Root mean square error about the mean error."""
+    sigma_m: float | None
+    """Predicted by the fixes: the root of the mean trace of their covariances."""
+    bias_m: tuple[float, float, float] | None
+    first_fix_s: float | None
+    """Median over the tags of the true time of the first fix, from a cold start of the whole site."""
+    tags_without_fix: int
+    levels: LevelReport | None
+    """None for methods that give no protection levels."""
+    drops: dict[str, int]
+    air: Tally
+    simulated_s: float
+    wall_s: float
+    speed: float
+    """Simulated seconds per second."""
+
+
+def report(fleet: TagFleet, method: str, started_s: float) -> FleetReport:
+    """Sum a run up; ``started_s`` is ``time.perf_counter()`` at its start."""
+    wall_s = time.perf_counter() - started_s
+    summary = fleet.errors.summary()
+    simulated_s = fleet.now_s
+    firsts = [record.first_fix_s for record in fleet.records if record.first_fix_s is not None]
+    fixes = sum(record.fixes for record in fleet.records)
+    listening_s = sum(simulated_s - first for first in firsts)
+    rmse_m = summary.rmse_2d_m if fleet.site.tags.height_m is not None else summary.rmse_3d_m
+    return FleetReport(
+        method=method,
+        tags=len(fleet.records),
+        messages=sum(record.messages for record in fleet.records),
+        fixes=summary.count,
+        rmse_m=rmse_m,
+        p95_m=summary.p95_m,
+        max_m=summary.max_m,
+        updates_per_s=fixes / listening_s if listening_s > 0.0 else 0.0,
+        dropped=sum(fleet.drops.values()),
+        std_m=_std_m(rmse_m, summary),
+        sigma_m=(fleet.sigma_squared_sum / summary.count) ** 0.5 if summary.count else None,
+        bias_m=summary.bias_m,
+        first_fix_s=float(np.median(firsts)) if firsts else None,
+        tags_without_fix=len(fleet.records) - len(firsts),
+        levels=fleet.levels.report(),
+        drops=fleet.drops,
+        air=fleet.tally,
+        simulated_s=simulated_s,
+        wall_s=wall_s,
+        speed=simulated_s / wall_s if wall_s > 0.0 else 0.0,
+    )
+
+
+def _std_m(rmse_m: float | None, summary: ErrorSummary) -> float | None:
+    if rmse_m is None or summary.bias_m is None:
+        return None
+    return float(np.sqrt(max(rmse_m**2 - sum(value * value for value in summary.bias_m), 0.0)))

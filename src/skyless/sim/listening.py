@@ -1,0 +1,271 @@
+"""Which nodes receive a frame, with which stamp, and why others do not: one compiled step over all nodes.
+
+A node that sends receives nothing meanwhile (half duplex). Frames that overlap at a listener destroy each other,
+unless one is stronger than every other by the capture margin; real receivers that locked on the weaker one first
+would lose both, which is not modelled.
+"""
+
+import math
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.core.kernels.arrays import Array, Integers, Records
+from skyless.core.kernels.compiled import kernel, part
+from skyless.core.ticks import TICK_MASK
+from skyless.sim.oscillator import advance, clock_rate
+from skyless.sim.range_errors import slope_error_m
+from skyless.sim.stations import body_m, coordinate_m, velocity_mps
+from skyless.sim.streams import draw_normal, draw_uniform
+from skyless.site.channel import (
+    cross_walls,
+    delivery_probability,
+    first_path_loss_db,
+    power_bias_m,
+    received_power_dbm,
+)
+
+
+class Outcome(StrEnum):
+    """What became of a frame at a listener; the values are shown in reports."""
+
+    HEARD = "heard"
+    WEAK = "below-sensitivity"
+    HALF_DUPLEX = "half-duplex"
+    COLLISION = "collision"
+    LOST = "message-loss"
+
+
+OUTCOMES: Final = tuple(Outcome)
+_HEARD: Final = OUTCOMES.index(Outcome.HEARD)
+_WEAK: Final = OUTCOMES.index(Outcome.WEAK)
+_HALF_DUPLEX: Final = OUTCOMES.index(Outcome.HALF_DUPLEX)
+_COLLISION: Final = OUTCOMES.index(Outcome.COLLISION)
+_LOST: Final = OUTCOMES.index(Outcome.LOST)
+
+RECEPTION_RECORD: Final = np.dtype(
+    [
+        ("node", np.int64),
+        ("rx_ticks", np.int64),  # the listener's 40-bit counter
+        ("position_m", np.float64, (3,)),
+        ("velocity_mps", np.float64, (3,)),
+        ("rx_power_dbm", np.float64),
+        ("first_path_power_dbm", np.float64),
+        ("carrier_offset_ppm", np.float64),
+    ],
+    align=True,
+)
+"""One frame at one node that received it; position and velocity are the true ones at the frame's emission."""
+
+
+@kernel
+def link(
+    stations: Records,
+    channel: Records,
+    walls: Array,
+    sender: int,
+    listener: int,
+    t_s: float,
+) -> tuple[float, float, float, float]:
+    """Distance, walls' delay (m), power (dBm) and range rate (m/s) between two nodes at a true time."""
+    squared_m2, product = 0.0, 0.0
+    for axis in range(3):
+        step_m = coordinate_m(stations, listener, axis, t_s) - coordinate_m(stations, sender, axis, t_s)
+        squared_m2 += step_m * step_m
+        product += step_m * (velocity_mps(stations, listener, axis, t_s) - velocity_mps(stations, sender, axis, t_s))
+    distance_m = math.sqrt(squared_m2)
+    loss_db, delay_m = 0.0, 0.0
+    if walls.shape[0] > 0:
+        loss_db, delay_m = cross_walls(
+            walls,
+            coordinate_m(stations, sender, 0, t_s),
+            coordinate_m(stations, sender, 1, t_s),
+            coordinate_m(stations, listener, 0, t_s),
+            coordinate_m(stations, listener, 1, t_s),
+        )
+        if stations[listener]["is_tag"] == 0 and channel[0]["walls_between_anchors"] == 0.0:
+            delay_m = 0.0
+    power_dbm = received_power_dbm(channel[0]["tx_power_dbm"], distance_m, loss_db)
+    return distance_m, delay_m, power_dbm, product / max(distance_m, 1e-9)
+
+
+@part
+def overlap_outcome(
+    stations: Records,
+    channel: Records,
+    walls: Array,
+    others: Array,
+    listener: int,
+    t_s: float,
+    arrival_s: tuple[float, float],
+    power_dbm: float,
+) -> int:
+    """Outcome at a listener of the frames that overlap: heard, half duplex or collision.
+
+    ``arrival_s`` is when the frame begins and ends at the listener, from its RMARKER's emission.
+    """
+    outcome = _HEARD
+    for k in range(others.shape[0]):
+        sender = int(others[k, 0])
+        if sender == listener:
+            if others[k, 1] < arrival_s[1] and others[k, 2] > arrival_s[0]:
+                return _HALF_DUPLEX
+            continue
+        distance_m, delay_m, other_dbm, _ = link(stations, channel, walls, sender, listener, t_s)
+        flight_s = (distance_m + delay_m) / SPEED_OF_LIGHT_MPS
+        overlap = others[k, 1] + flight_s < arrival_s[1] and others[k, 2] + flight_s > arrival_s[0]
+        if overlap and power_dbm - other_dbm < channel[0]["capture_db"]:
+            outcome = _COLLISION
+    return outcome
+
+
+@part
+def reception_outcome(channel: Records, normals: Array, cursors: Integers, node: int, power_dbm: float) -> int:
+    """Outcome at a listener of power and chance: heard, weak or lost. Draws only where chance decides."""
+    sensitivity_dbm, width_db = channel[0]["sensitivity_dbm"], channel[0]["sensitivity_width_db"]
+    margin = (power_dbm - sensitivity_dbm) / width_db
+    if margin < -30.0:
+        return _WEAK
+    if margin < 30.0:
+        probability = delivery_probability(power_dbm, sensitivity_dbm, width_db)
+        if draw_uniform(normals, cursors, node) > probability:
+            return _WEAK
+    loss = channel[0]["loss_probability"]
+    if loss > 0.0 and draw_uniform(normals, cursors, node) < loss:
+        return _LOST
+    return _HEARD
+
+
+@part
+def extra_path_m(
+    stations: Records,
+    channel: Records,
+    normals: Array,
+    cursors: Integers,
+    node: int,
+    bias_m: float,
+) -> float:
+    """Extra path of a message: the sender's present bias (tags only) and, by chance, an exponential delay."""
+    is_tag = stations[node]["is_tag"] != 0
+    extra_m = bias_m if is_tag else 0.0
+    probability = channel[0]["nlos_probability"]
+    affected = is_tag or channel[0]["nlos_between_anchors"] != 0.0
+    if affected and probability > 0.0 and draw_uniform(normals, cursors, node) < probability:
+        extra_m -= channel[0]["nlos_mean_m"] * math.log(draw_uniform(normals, cursors, node))
+    return extra_m
+
+
+@part
+def stamp(
+    clocks: Records,
+    normals: Array,
+    cursors: Integers,
+    stations: Records,
+    node: int,
+    emission_ticks: int,
+    arrival_ticks: float,
+    error_ticks: float,
+) -> int:
+    """RX stamp of a node, rounded to ticks; ``arrival_ticks`` is counted from ``emission_ticks``."""
+    carry = math.floor(arrival_ticks)
+    advance(clocks, normals, cursors, node, emission_ticks + int(carry), arrival_ticks - carry)
+    noise_ticks = stations[node]["rx_noise_ticks"] * draw_normal(normals, cursors, node)
+    fraction = clocks[node]["local_fraction"] + error_ticks + noise_ticks
+    rx_ticks: int = (clocks[node]["local_ticks"] + math.floor(fraction + 0.5)) & TICK_MASK
+    return rx_ticks
+
+
+@part
+def fill_truth(stations: Records, node: int, t_s: float, row: np.void) -> None:
+    """Fill in the true position and velocity of a listener."""
+    row["node"] = node
+    for axis in range(3):
+        row["position_m"][axis] = coordinate_m(stations, node, axis, t_s)
+        row["velocity_mps"][axis] = velocity_mps(stations, node, axis, t_s)
+
+
+@part
+def measure(
+    clocks: Records,
+    channel: Records,
+    normals: Array,
+    cursors: Integers,
+    sender: int,
+    node: int,
+    observed: tuple[float, float, float],
+    row: np.void,
+) -> None:
+    """Fill in the diagnostics of a reception from (power in dBm, extra path in m, range rate in m/s)."""
+    power_dbm, extra_m, range_rate_mps = observed
+    row["rx_power_dbm"] = power_dbm + channel[0]["power_noise_db"] * draw_normal(normals, cursors, node)
+    row["first_path_power_dbm"] = row["rx_power_dbm"] - first_path_loss_db(extra_m)
+    offset = clock_rate(clocks, sender) - clock_rate(clocks, node) - range_rate_mps / SPEED_OF_LIGHT_MPS
+    noise_ppm = channel[0]["carrier_noise_ppm"] * draw_normal(normals, cursors, node)
+    row["carrier_offset_ppm"] = 1e6 * offset + noise_ppm
+
+
+@kernel
+def receive_frame(
+    clocks: Records,
+    normals: Array,
+    cursors: Integers,
+    stations: Records,
+    channel: Records,
+    walls: Array,
+    others: Array,
+    sender: int,
+    emission_ticks: int,
+    emission_fraction: float,
+    span_s: tuple[float, float],
+    bias_m: float,
+    range_errors_m: Array,
+    slope_m: float,
+    diagnostics: bool,
+    heard: Records,
+    tally: Integers,
+) -> tuple[int, int, int]:
+    """Let every node that is on receive one frame, or lose it.
+
+    ``span_s`` is the frame's begin and end from its RMARKER, ``others`` as from ``OnAir.others``, ``range_errors_m``
+    has shape (nodes, anchors), with infinity for a listener that the sender does not reach, and ``slope_m`` is that of
+    ``RangeErrorModel``. Fills ``heard`` (``RECEPTION_RECORD``, one row a node that received it) and counts into
+    ``tally``, shape (2, outcomes), for anchors and tags. Returns how many anchors and how many nodes received it, and
+    the highest cursor.
+    """
+    t_s = (emission_ticks + emission_fraction) * TICK_S
+    anchors, count, highest = 0, 0, 0
+    for node in range(stations.shape[0]):
+        station = stations[node]
+        if node == sender or station["on"] == 0:
+            continue
+        distance_m, extra_m, power_dbm, range_rate_mps = link(stations, channel, walls, sender, node, t_s)
+        flight_s = (distance_m + extra_m) / SPEED_OF_LIGHT_MPS
+        arrival_s = (span_s[0] + flight_s, span_s[1] + flight_s)
+        outcome = overlap_outcome(stations, channel, walls, others, node, t_s, arrival_s, power_dbm)
+        if outcome == _HEARD and range_errors_m[node, sender] == math.inf:
+            outcome = _WEAK
+        elif outcome == _HEARD:
+            outcome = reception_outcome(channel, normals, cursors, node, power_dbm)
+        tally[station["is_tag"], outcome] += 1
+        if outcome == _HEARD:
+            row = heard[count]
+            fill_truth(stations, node, t_s, row)
+            extra_m += extra_path_m(stations, channel, normals, cursors, node, bias_m) + body_m(
+                stations, sender, node, t_s
+            )
+            error_m = range_errors_m[node, sender]
+            if station["is_tag"] != 0:
+                error_m += slope_error_m(slope_m, distance_m)
+            arrival_ticks = emission_fraction + (distance_m + extra_m + error_m) / TICK_M
+            if diagnostics:
+                measure(clocks, channel, normals, cursors, sender, node, (power_dbm, extra_m, range_rate_mps), row)
+            error_ticks = station["rx_error_ticks"] + channel[0]["power_bias"] * power_bias_m(power_dbm) / TICK_M
+            row["rx_ticks"] = stamp(
+                clocks, normals, cursors, stations, node, emission_ticks, arrival_ticks, error_ticks
+            )
+            count += 1
+            anchors += 1 - station["is_tag"]
+        highest = max(highest, cursors[node])
+    return anchors, count, highest

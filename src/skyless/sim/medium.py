@@ -1,0 +1,394 @@
+"""The medium: true time, the nodes' clocks and radios, and the frames between them.
+
+A frame has two events: its RMARKER leaves, and it ends, when the listeners get it. The emulated radio clears the low
+nine bits of DX = TX stamp - configured antenna delay, as the DW1000 does, so a node that ignores the granularity
+sends with a wrong stamp. Who sends what and when is decided by the medium's owner.
+"""
+
+import heapq
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Final, Generic, TypeVar
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.core.air.ieee802154 import after_rmarker_s, preamble_s
+from skyless.core.air.reception import Transmission
+from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ, TICK_S
+from skyless.core.kernels.arrays import Array, Records
+from skyless.core.site import Site
+from skyless.core.ticks import difference, from_seconds, wrap
+from skyless.sim.anchor_pairs import AnchorPairErrors
+from skyless.sim.impairments import Impairments
+from skyless.sim.listening import OUTCOMES, RECEPTION_RECORD, receive_frame
+from skyless.sim.oscillator import advance, emit, foresee, make_clocks, restart_counter, warm_up
+from skyless.sim.range_errors import RangeErrors
+from skyless.sim.stations import TagSpec, displace, make_stations, set_delays, set_piece
+from skyless.sim.streams import ANCHOR_KEY, TAG_KEY, Streams, stream
+from skyless.site.channel import pack_channel, pack_walls
+
+TURNAROUND_S: Final = 0.2e-3
+"""What a host needs to hand a frame to its radio; a preamble that should begin earlier is too late (HPDWARN).
+
+Longer than any frame after its RMARKER (177 µs), so that all frames that overlap it are known when the RMARKER leaves.
+"""
+
+_PREAMBLE_TICKS: Final = from_seconds(preamble_s())
+_DX_MASK: Final = ~(DELAYED_TX_GRANULARITY_TICKS - 1)
+
+_NO_OTHERS: Final = np.empty((0, 3))
+_KEPT_TICKS: Final = round(2e-3 * TICK_RATE_HZ)
+_FARTHEST_TICKS: Final = round(10e-6 * TICK_RATE_HZ)
+"""Flight times up to 10 µs (3 km) may turn neighbours on the air into an overlap."""
+
+Result = TypeVar("Result")
+
+
+class Timeline(Generic[Result]):
+    """Events in the order of true time (whole ideal ticks); those of one tick in the order of their planning."""
+
+    def __init__(self) -> None:
+        self.now_ticks = 0
+        self._serial = self._until_ticks = 0
+        self._events: list[tuple[int, int, Callable[[], Result | None]]] = []
+
+    @property
+    def next_ticks(self) -> int | None:
+        """When the next event happens; None while nothing is planned."""
+        return self._events[0][0] if self._events else None
+
+    @property
+    def until_ticks(self) -> int:
+        """Where the present ``run`` ends."""
+        return self._until_ticks
+
+    def at(self, ticks: int, happen: Callable[[], Result | None]) -> None:
+        """Plan an event; one in the past happens now."""
+        self._serial += 1
+        heapq.heappush(self._events, (max(ticks, self.now_ticks), self._serial, happen))
+
+    def pass_to(self, ticks: int) -> bool:
+        """Let time pass up to ``ticks`` at once if no event and no end of ``run`` lies before; whether it did."""
+        if ticks > self._until_ticks or (self._events and self._events[0][0] <= ticks):
+            return False
+        self.now_ticks = max(self.now_ticks, ticks)
+        return True
+
+    def run(self, until_ticks: int) -> Iterator[Result]:
+        """Run all events up to a time, and yield their results."""
+        self._until_ticks = until_ticks
+        while self._events and self._events[0][0] <= until_ticks:
+            self.now_ticks, _, happen = heapq.heappop(self._events)
+            result = happen()
+            if result is not None:
+                yield result
+        self.now_ticks = max(self.now_ticks, until_ticks)
+
+
+@dataclass(slots=True, eq=False)
+class Flight:
+    """One frame on its way; times are true time in whole ticks."""
+
+    sender: int
+    """Node that sends."""
+    boot: int
+    """How often the sender had been switched on, so that a frame from before a restart is not sent."""
+    frame: bytes
+    marker_local_ticks: int
+    """Sender's unwrapped counter when the RMARKER leaves, noise and delay error apart."""
+    begin_ticks: int
+    """Start of the preamble."""
+    marker_ticks: int
+    end_ticks: int
+    emission_ticks: int = 0
+    emission_fraction: float = 0.0
+    """With ``emission_ticks``: when the RMARKER really left."""
+
+
+class OnAir:
+    """The frames that are, were lately, or will soon be on the air."""
+
+    def __init__(self) -> None:
+        self._flights: deque[Flight] = deque()
+
+    def add(self, flight: Flight, now_ticks: int) -> None:
+        """Add a frame; those that ended long ago are removed."""
+        while self._flights and self._flights[0].end_ticks < now_ticks - _KEPT_TICKS:
+            self._flights.popleft()
+        self._flights.append(flight)
+
+    def withdraw(self, flight: Flight) -> None:
+        """Remove a frame that will not be sent."""
+        self._flights.remove(flight)
+
+    def between(self, from_ticks: int, until_ticks: int) -> list[Flight]:
+        """Frames whose RMARKER leaves after a time and before another."""
+        return [flight for flight in self._flights if from_ticks < flight.marker_ticks < until_ticks]
+
+    def others(self, flight: Flight) -> Array:
+        """Frames that may overlap this one, shape (n, 3): sending node, begin and end in s from this RMARKER."""
+        first, last = flight.begin_ticks - _FARTHEST_TICKS, flight.end_ticks + _FARTHEST_TICKS
+        rows = [
+            (
+                other.sender,
+                (other.begin_ticks - flight.marker_ticks) * TICK_S,
+                (other.end_ticks - flight.marker_ticks) * TICK_S,
+            )
+            for other in self._flights
+            if other is not flight and other.begin_ticks <= last and other.end_ticks >= first
+        ]
+        return np.array(rows) if rows else _NO_OTHERS
+
+
+class Tally(Struct, frozen=True):
+    """Counts of a world so far."""
+
+    transmissions: int
+    late_transmissions: int
+    """Frames that were too late and not sent."""
+    at_anchors: dict[str, int]
+    """Outcomes (``Outcome``) of frames at anchors that were on."""
+    at_tags: dict[str, int]
+
+
+@dataclass(slots=True, eq=False)
+class Delivery:
+    """A frame that has just ended, and the rows (``RECEPTION_RECORD``) of the nodes that received it."""
+
+    flight: Flight
+    by_anchors: Records
+    by_tags: Records
+
+
+class MediumBase(Generic[Result]):
+    """What every medium of a site has: true time, nodes and their power, the tags' motion, counts.
+
+    Nodes are numbered: the site's anchors in the order of its file, then the tags; all are off at first.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        tags: Sequence[TagSpec],
+        impairments: Impairments,
+        deliver: Callable[[Delivery], Result | None],
+    ) -> None:
+        self._anchors, self._tags = site.anchors, tuple(tags)
+        self.node_of = {anchor.id: node for node, anchor in enumerate(site.anchors)}
+        """Nodes of the anchors, by their identifiers."""
+        self.stations = make_stations(site.anchors, self._tags, impairments)
+        self._piece_ends_s = np.full(len(self._tags), -math.inf)
+        self.boots = [0] * len(self.stations)
+        """How often each node was switched off."""
+        self._counts = np.zeros((2, len(OUTCOMES)), dtype=np.int64)
+        self._transmissions = self._late = 0
+        self._deliver = deliver
+        self.timeline: Timeline[Result] = Timeline()
+
+    @property
+    def tally(self) -> Tally:
+        """What was sent, heard and lost so far, by reason."""
+        names = [str(outcome) for outcome in OUTCOMES]
+        at_anchors, at_tags = (dict(zip(names, row, strict=True)) for row in self._counts.tolist())
+        return Tally(self._transmissions, self._late, at_anchors, at_tags)
+
+    @property
+    def now_s(self) -> float:
+        """True time that has passed."""
+        return self.timeline.now_ticks * TICK_S
+
+    def run(self, until_s: float) -> Iterator[Result]:
+        """Let true time pass up to ``until_s``. Can be called again."""
+        return self.timeline.run(from_seconds(until_s))
+
+    def switch_off(self, node: int) -> None:
+        """Switch a node off; its frame is not sent if the RMARKER has not left."""
+        self.stations[node]["on"] = 0
+        self.boots[node] += 1
+
+    def switch_on(self, node: int) -> None:
+        """Switch a node on, with a new counter except at time 0."""
+        self.stations[node]["on"] = 1
+        if self.timeline.now_ticks > 0:
+            self._restart_counter(node)
+
+    def _restart_counter(self, node: int) -> None:
+        raise NotImplementedError
+
+    def _move_tags(self, t_s: float) -> None:
+        """Set the next piece of every trajectory whose present one has ended."""
+        for tag in np.flatnonzero(self._piece_ends_s <= t_s).tolist():
+            piece = self._tags[tag].trajectory.piece(t_s)
+            set_piece(self.stations, len(self._anchors) + tag, piece)
+            self._piece_ends_s[tag] = piece.end_s
+
+
+class Medium(MediumBase[Result]):
+    """A site's air, deterministic by its seed; memory stays flat however long it runs.
+
+    A node's noise depends on the seed and on its own key alone: more tags do not change what the others receive.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        tags: Sequence[TagSpec],
+        impairments: Impairments,
+        seed: int,
+        deliver: Callable[[Delivery], Result | None],
+        turnaround_s: float = TURNAROUND_S,
+    ) -> None:
+        """``deliver`` is called with every frame when it ends; ``run`` yields what it returns.
+
+        ``turnaround_s`` is for a smaller one than usual, where frames keep to slots that never overlap.
+
+        Raises ValueError when an impairment names an anchor that the site has not.
+        """
+        super().__init__(site, tags, impairments, deliver)
+        self._impairments = impairments
+        self._least_ahead_ticks = _PREAMBLE_TICKS + from_seconds(turnaround_s)
+        _check_names(impairments, self.node_of)
+        keys = [(ANCHOR_KEY, anchor.id) for anchor in site.anchors] + [(TAG_KEY, tag) for tag in range(len(tags))]
+        self._setups = [stream(seed, *key, purpose=1) for key in keys]
+        self._streams = Streams([stream(seed, *key) for key in keys])
+        self.clocks = make_clocks(impairments.oscillator, self._setups)
+        self._warm_up()
+        self.range_errors = RangeErrors(
+            impairments.range_errors, [tag.range_errors_m for tag in self._tags], len(site.anchors), seed
+        )
+        self._pair_errors = AnchorPairErrors(impairments.anchor_pair_errors, self.node_of, seed)
+        self._plan_changes()
+        self._channel, self._walls = pack_channel(impairments.channel), pack_walls(site.walls)
+        self._air = OnAir()
+        self._missed_ticks = 0
+        """Frames that should have left before are not sent."""
+        self._received = np.zeros(len(keys), dtype=RECEPTION_RECORD)
+
+    # Clocks
+
+    def _restart_counter(self, node: int) -> None:
+        restart_counter(self.clocks, node, self._setups[node])
+
+    def _warm_up(self) -> None:
+        """Let crystals warm up, those of all tags where no anchor is named."""
+        every_tag = range(len(self._anchors), len(self.clocks))
+        for one in self._impairments.warm_ups:
+            for node in every_tag if one.anchor is None else (self.node_of[one.anchor],):
+                warm_up(self.clocks, node, one.ppm, one.start_s, one.tau_s)
+
+    def read_counter(self, node: int) -> int:
+        """Bring a node to the present and return its unwrapped counter."""
+        cursors = self._streams.cursors
+        advance(self.clocks, self._streams.normals, cursors, node, self.timeline.now_ticks, 0.0)
+        self._streams.refill(int(cursors[node]))
+        return int(self.clocks[node]["local_ticks"])
+
+    def foresee(self, node: int, local_ticks: int) -> int:
+        """True time in whole ticks at which a node's unwrapped counter will show a value."""
+        return foresee(self.clocks, node, local_ticks)
+
+    # Anchors
+
+    def _plan_changes(self) -> None:
+        """Plan the displacements and errors of delays that begin later."""
+        for shift in self._impairments.anchor_displacements:
+            if shift.from_s > 0.0:
+                node = self.node_of[shift.anchor]
+                happen = partial(displace, self.stations, node, self._anchors[node], shift)
+                self.timeline.at(from_seconds(shift.from_s), happen)
+        for error in self._impairments.delay_errors:
+            if error.from_s > 0.0:
+                happen = partial(set_delays, self.stations, self.node_of[error.anchor], error)
+                self.timeline.at(from_seconds(error.from_s), happen)
+
+    # Transmissions
+
+    def transmit(self, node: int, transmission: Transmission) -> bool:
+        """Plan the flight of a frame; False, and a count, if it comes too late."""
+        local_ticks = self.read_counter(node)
+        delay_ticks = self._anchors[node].tx_antenna_delay_ticks
+        leaves = wrap(((transmission.tx_ticks - delay_ticks) & _DX_MASK) + delay_ticks)
+        ahead = difference(leaves, wrap(local_ticks))
+        if ahead < self._least_ahead_ticks:
+            self._late += 1
+            return False
+        marker = self.foresee(node, local_ticks + ahead)
+        end = marker + from_seconds(after_rmarker_s(len(transmission.frame)))
+        begin = marker - _PREAMBLE_TICKS
+        flight = Flight(node, self.boots[node], transmission.frame, local_ticks + ahead, begin, marker, end)
+        self._air.add(flight, self.timeline.now_ticks)
+        self.timeline.at(marker, partial(self._radiate, flight))
+        return True
+
+    def miss(self, until_s: float) -> tuple[int, ...]:
+        """Withdraw all frames whose RMARKER would leave before ``until_s``: whoever lets time pass came too late.
+
+        Returns the nodes that planned them.
+        """
+        self._missed_ticks = from_seconds(until_s)
+        missed = self._air.between(self.timeline.now_ticks, self._missed_ticks)
+        return tuple(flight.sender for flight in missed if flight.boot == self.boots[flight.sender])
+
+    def _radiate(self, flight: Flight) -> None:
+        """Let the RMARKER leave, and every node that can receive the frame stamp it."""
+        node, streams = flight.sender, self._streams
+        if flight.marker_ticks < self._missed_ticks or flight.boot != self.boots[node]:
+            self._air.withdraw(flight)
+            return
+        normals, cursors = streams.normals, streams.cursors
+        local_ticks, noise_ticks = flight.marker_local_ticks, float(self.stations[node]["tx_noise_ticks"])
+        error_ticks = float(self.stations[node]["tx_error_ticks"])
+        ticks, fraction = emit(self.clocks, normals, cursors, node, local_ticks, noise_ticks, error_ticks)
+        streams.refill(int(cursors[node]))
+        flight.emission_ticks, flight.emission_fraction = ticks, fraction
+        t_s = ticks * TICK_S
+        self._move_tags(t_s)
+        self.range_errors.advance_to(t_s, self.stations)
+        self._pair_errors.set_present(t_s, self.range_errors.present_m)
+        anchors, count, highest = receive_frame(
+            self.clocks,
+            normals,
+            cursors,
+            self.stations,
+            self._channel,
+            self._walls,
+            self._air.others(flight),
+            node,
+            ticks,
+            fraction,
+            ((flight.begin_ticks - flight.marker_ticks) * TICK_S, (flight.end_ticks - flight.marker_ticks) * TICK_S),
+            self._bias_m(node, t_s),
+            self.range_errors.present_m,
+            self._impairments.range_errors.slope_m,
+            self._impairments.diagnostics,
+            self._received,
+            self._counts,
+        )
+        streams.refill(highest)
+        self._transmissions += 1
+        delivery = Delivery(flight, self._received[:anchors].copy(), self._received[anchors:count].copy())
+        self.timeline.at(flight.end_ticks, partial(self._deliver, delivery))
+
+    def _bias_m(self, node: int, t_s: float) -> float:
+        anchor = self._anchors[node].id
+        return sum((b.active_m(t_s) for b in self._impairments.anchor_biases if b.anchor == anchor), 0.0)
+
+
+def _check_names(faults: Impairments, node_of: dict[int, int]) -> None:
+    named: dict[str, list[int | None]] = {
+        "anchor_biases": [one.anchor for one in faults.anchor_biases],
+        "delay_errors": [one.anchor for one in faults.delay_errors],
+        "anchor_outages": [one.anchor for one in faults.anchor_outages],
+        "anchor_displacements": [one.anchor for one in faults.anchor_displacements],
+        "warm_ups": [one.anchor for one in faults.warm_ups],
+        "anchor_pair_errors": [end for one in faults.anchor_pair_errors for end in (one.a, one.b)],
+    }
+    for name, anchors in named.items():
+        unknown = {anchor for anchor in anchors if anchor is not None} - node_of.keys()
+        if unknown:
+            known = ", ".join(map(str, node_of))
+            raise ValueError(f"{name} names anchor {min(unknown)}; it should be one of the site's: {known}")

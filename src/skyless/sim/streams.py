@@ -1,0 +1,63 @@
+"""Random numbers for many nodes: every node draws from its own stream.
+
+The stream of a node depends on the seed and on the node's own key alone, so that another tag, or another
+anchor, does not change what the others draw.
+"""
+
+import math
+from typing import Final
+
+import numpy as np
+
+from skyless.core.kernels.arrays import Array, Integers
+from skyless.core.kernels.compiled import part
+
+BLOCK: Final = 1024
+"""Normals drawn ahead for each node."""
+
+MAX_DRAWS: Final = 16
+"""Most numbers that one step of a node may draw; a rest of a block below that is discarded."""
+
+ANCHOR_KEY: Final = 0
+TAG_KEY: Final = 1
+PAIR_KEY: Final = 2
+
+
+def stream(seed: int, kind: int, number: int, purpose: int = 0) -> np.random.Generator:
+    """Return the generator of one node (or of one purpose of it), independent of all other keys."""
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(kind, number, purpose))))
+
+
+class Streams:
+    """Standard normals of every node, shape (nodes, BLOCK), with a cursor each; kernels move the cursors."""
+
+    def __init__(self, generators: list[np.random.Generator]) -> None:
+        self._generators = generators
+        self.normals: Array = np.empty((len(generators), BLOCK))
+        self.cursors: Integers = np.zeros(len(generators), dtype=np.int64)
+        for node in range(len(generators)):
+            self._refill(node)
+
+    def refill(self, highest_cursor: int) -> None:
+        """Renew the blocks that are nearly used up; pass the highest cursor that the last step left behind."""
+        if highest_cursor > BLOCK - MAX_DRAWS:
+            for node in np.flatnonzero(self.cursors > BLOCK - MAX_DRAWS):
+                self._refill(int(node))
+
+    def _refill(self, node: int) -> None:
+        self._generators[node].standard_normal(out=self.normals[node])
+        self.cursors[node] = 0
+
+
+@part
+def draw_normal(normals: Array, cursors: Integers, node: int) -> float:
+    """Next standard normal of the node."""
+    value: float = normals[node, cursors[node]]
+    cursors[node] += 1
+    return value
+
+
+@part
+def draw_uniform(normals: Array, cursors: Integers, node: int) -> float:
+    """Next uniform number of the node in (0, 1): a normal through its own distribution function."""
+    return 0.5 * math.erfc(-draw_normal(normals, cursors, node) / math.sqrt(2.0))

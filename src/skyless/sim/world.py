@@ -1,0 +1,250 @@
+"""The world: anchors' machines on the simulated medium, tags that listen, and true time.
+
+Three events make a transmission: its frame is fetched (the lead time before its RMARKER), the RMARKER leaves, and
+the frame ends, when the listeners get it.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Final, Protocol
+
+import numpy as np
+
+from skyless.core.air.reception import Diagnostics, Reception, Transmission
+from skyless.core.constants import TICK_S
+from skyless.core.kernels.arrays import Array, Integers
+from skyless.core.site import Site
+from skyless.core.ticks import difference, from_seconds, wrap
+from skyless.sim.impairments import Impairments
+from skyless.sim.medium import Delivery, Medium, Tally, Timeline
+from skyless.sim.stations import TagSpec
+
+_RETRY_TICKS: Final = from_seconds(5e-3)
+
+
+class AnchorMachine(Protocol):
+    """An anchor as its radio uses it (``skyless.core.anchor.anchor.Anchor`` is one)."""
+
+    @property
+    def id(self) -> int:
+        """Identifier of the anchor, 16 bits."""
+
+    def hear(self, reception: Reception) -> None:
+        """Process one frame from the air; never raises."""
+
+    def next_transmission_ticks(self, now_ticks: int) -> int | None:
+        """TX stamp (own 40-bit counter) of the next frame, at least a lead time after now; None: ask later."""
+
+    def transmission(self, tx_ticks: int) -> Transmission:
+        """The frame for that slot, made as late as possible so that it carries the latest receptions."""
+
+
+AnchorFactory = Callable[[int], AnchorMachine]
+"""Makes a machine for an anchor's identifier; called again when that anchor restarts."""
+
+
+@dataclass(slots=True, eq=False)
+class Broadcast:
+    """One frame, at the moment that its end arrived, with the tags that received it and their true motion."""
+
+    anchor: int
+    """Identifier of the sender."""
+    frame: bytes
+    emission_ticks: int
+    """True time at which the RMARKER left the antenna, in ideal ticks since the start; and its fraction."""
+    emission_fraction: float
+    end_s: float
+    """True time of the frame's end, which the receptions carry as the host's time."""
+    tags: Integers
+    """Indices of the tags that received it, shape (n,)."""
+    rx_ticks: Integers
+    """Their RX stamps, 40 bits, shape (n,)."""
+    positions_m: Array
+    """Their true positions at the emission, shape (n, 3)."""
+    velocities_mps: Array
+    """Their true velocities, shape (n, 3)."""
+    diagnostics: tuple[Diagnostics, ...] | None
+    """What their radios measured, where the impairments ask for it."""
+
+    @property
+    def emission_s(self) -> float:
+        """True time of the RMARKER's emission in seconds since the start."""
+        return (self.emission_ticks + self.emission_fraction) * TICK_S
+
+    def receptions(self) -> Iterator[tuple[int, Reception, Array]]:
+        """Tag index, reception and true position, shape (3,), of every tag that received the frame."""
+        frame, host_s = self.frame, self.end_s
+        measured = self.diagnostics or (None,) * len(self.tags)
+        rows = zip(self.tags.tolist(), self.rx_ticks.tolist(), self.positions_m, measured, strict=True)
+        for tag, rx_ticks, position_m, diagnostics in rows:
+            yield tag, Reception(frame, rx_ticks, host_s, diagnostics), position_m
+
+
+class Air(Protocol):
+    """A medium as a world uses it (``Medium``, ``CellMedium``); its methods are described in ``Medium``."""
+
+    node_of: dict[int, int]
+    boots: list[int]
+    timeline: Timeline[Broadcast]
+
+    @property
+    def tally(self) -> Tally:
+        """What was sent, heard and lost so far, by reason."""
+
+    @property
+    def now_s(self) -> float:
+        """True time that has passed."""
+
+    def run(self, until_s: float) -> Iterator[Broadcast]:
+        """Let true time pass."""
+
+    def switch_off(self, node: int) -> None:
+        """Switch a node off."""
+
+    def switch_on(self, node: int) -> None:
+        """Switch a node on."""
+
+    def read_counter(self, node: int) -> int:
+        """A node's unwrapped counter at present."""
+
+    def foresee(self, node: int, local_ticks: int) -> int:
+        """True time in whole ticks at which a node's unwrapped counter will show a value."""
+
+    def transmit(self, node: int, transmission: Transmission) -> bool:
+        """Plan the flight of a frame; False if it comes too late."""
+
+
+AirMaker = Callable[[Site, Sequence[TagSpec], Impairments, int, Callable[[Delivery], Broadcast | None]], Air]
+"""Makes the medium of a world: a class such as ``Medium``."""
+
+
+def diagnostics_of(row: np.void) -> Diagnostics:
+    """Diagnostics in a row (``RECEPTION_RECORD``) of a node."""
+    return Diagnostics(float(row["rx_power_dbm"]), float(row["first_path_power_dbm"]), float(row["carrier_offset_ppm"]))
+
+
+class World:
+    """A site on the air, deterministic by its seed; memory stays flat however long it runs."""
+
+    def __init__(
+        self,
+        site: Site,
+        anchor_factory: AnchorFactory,
+        tags: Sequence[TagSpec],
+        impairments: Impairments,
+        seed: int,
+        *,
+        lead_s: float = 1e-3,
+        on_tag_restart: Callable[[int], None] | None = None,
+        medium: AirMaker = Medium,
+    ) -> None:
+        """``lead_s``: how long before its RMARKER a frame is fetched; ``on_tag_restart`` is given a tag's index.
+
+        ``medium``: ``Medium``, or ``CellMedium`` for sites of several cells. Raises ValueError when an impairment names
+        an anchor that the site has not, or is not modelled by the medium.
+        """
+        self._anchors, self._tags, self._impairments = site.anchors, tuple(tags), impairments
+        self._factory, self._on_tag_restart = anchor_factory, on_tag_restart
+        self.medium = medium(site, self._tags, impairments, seed, self._deliver)
+        self._timeline = self.medium.timeline
+        self._lead_ticks = from_seconds(lead_s)
+        nodes = len(self._anchors) + len(self._tags)
+        self._machines: list[AnchorMachine | None] = [None] * nodes
+        self._reasons_off = [1] * nodes
+        self._plan_power()
+
+    @property
+    def tally(self) -> Tally:
+        """What was sent, heard and lost so far, by reason."""
+        return self.medium.tally
+
+    @property
+    def now_s(self) -> float:
+        """True time that has passed."""
+        return self.medium.now_s
+
+    def run(self, until_s: float) -> Iterator[Broadcast]:
+        """Let true time pass up to ``until_s``; yields every frame when it ended, in order. Can be called again."""
+        return self.medium.run(until_s)
+
+    # Power
+
+    def _plan_power(self) -> None:
+        node_of = self.medium.node_of
+        outages = [(node_of[planned.anchor], planned.outage) for planned in self._impairments.anchor_outages]
+        for index, tag in enumerate(self._tags):
+            outages += [(len(self._anchors) + index, outage) for outage in tag.outages]
+        for node, outage in outages:
+            self._timeline.at(from_seconds(outage.off_s), partial(self._switch_off, node))
+            if math.isfinite(outage.on_s):
+                self._timeline.at(from_seconds(outage.on_s), partial(self._switch_on, node))
+        for node in range(len(self._machines)):
+            self._timeline.at(0, partial(self._switch_on, node))
+
+    def _switch_off(self, node: int) -> None:
+        self._reasons_off[node] += 1
+        self.medium.switch_off(node)
+        self._machines[node] = None
+
+    def _switch_on(self, node: int) -> None:
+        """Start a node, with a new counter and a new machine if it ran before."""
+        self._reasons_off[node] -= 1
+        if self._reasons_off[node] > 0:
+            return
+        self.medium.switch_on(node)
+        tag = node - len(self._anchors)
+        if tag < 0:
+            self._machines[node] = self._factory(self._anchors[node].id)
+            self._timeline.at(self._timeline.now_ticks, partial(self._ask, node, self.medium.boots[node]))
+        elif self._timeline.now_ticks > 0 and self._on_tag_restart is not None:
+            self._on_tag_restart(tag)
+
+    # Transmissions
+
+    def _ask(self, node: int, boot: int) -> None:
+        """Ask an anchor's machine for the time of its next frame."""
+        machine, medium = self._machines[node], self.medium
+        if machine is None or boot != medium.boots[node]:
+            return
+        local_ticks = medium.read_counter(node)
+        tx_ticks = machine.next_transmission_ticks(wrap(local_ticks))
+        if tx_ticks is None:
+            self._timeline.at(self._timeline.now_ticks + _RETRY_TICKS, partial(self._ask, node, boot))
+            return
+        ahead = difference(tx_ticks, wrap(local_ticks))
+        fetch_ticks = medium.foresee(node, local_ticks + ahead - self._lead_ticks)
+        self._timeline.at(fetch_ticks, partial(self._fetch, node, boot, tx_ticks))
+
+    def _fetch(self, node: int, boot: int, tx_ticks: int) -> None:
+        """Fetch a frame from its machine and plan its flight, unless it is too late."""
+        machine = self._machines[node]
+        if machine is None or boot != self.medium.boots[node]:
+            return
+        if not self.medium.transmit(node, machine.transmission(tx_ticks)):
+            self._timeline.at(self._timeline.now_ticks + _RETRY_TICKS, partial(self._ask, node, boot))
+
+    def _deliver(self, delivery: Delivery) -> Broadcast:
+        """Pass the frame to the anchors that received it; returns the receptions of the tags."""
+        flight, by_anchors, by_tags = delivery.flight, delivery.by_anchors, delivery.by_tags
+        end_s, diagnostics = self.now_s, self._impairments.diagnostics
+        rows = zip(by_anchors, by_anchors["node"].tolist(), by_anchors["rx_ticks"].tolist(), strict=True)
+        for row, node, rx_ticks in rows:
+            machine = self._machines[node]
+            if machine is not None:
+                measured = diagnostics_of(row) if diagnostics else None
+                machine.hear(Reception(flight.frame, rx_ticks, end_s, measured))
+        self._timeline.at(self._timeline.now_ticks, partial(self._ask, flight.sender, flight.boot))
+        return Broadcast(
+            self._anchors[flight.sender].id,
+            flight.frame,
+            flight.emission_ticks,
+            flight.emission_fraction,
+            end_s,
+            by_tags["node"] - len(self._anchors),
+            by_tags["rx_ticks"],
+            by_tags["position_m"],
+            by_tags["velocity_mps"],
+            tuple(diagnostics_of(row) for row in by_tags) if diagnostics else None,
+        )

@@ -1,0 +1,1 @@
+"""The site file: read, checked, written, and advice about it."""

@@ -1,0 +1,224 @@
+"""From a TOML file to a validated site."""
+
+import difflib
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+from msgspec import Struct
+
+from skyless.core.arguments import existing_file, wrong
+from skyless.core.errors import ConfigurationError
+from skyless.core.site import (
+    AccuracySite,
+    AnchorSite,
+    FloorPlanSite,
+    GeoreferenceSite,
+    NoiseSite,
+    ScheduleSite,
+    Site,
+    TagsSite,
+    UnplacedAnchor,
+    WallSite,
+)
+from skyless.site.file.check import check_floor_plan, check_site, expected, with_anchor
+
+_MAX_BYTES: Final = 1 << 24  # devices do not end
+_TOO_DEEP: Final = re.compile(rb"(?:[\w-]+[ \t]*\.[ \t]*){64}")
+"""A dotted key of more than 64 parts; a site file needs two. The time to read a key grows with their square."""
+
+_TABLES: Final[dict[str, type[Struct]]] = {
+    "schedule": ScheduleSite,
+    "noise": NoiseSite,
+    "accuracy": AccuracySite,
+    "tags": TagsSite,
+    "floor_plan": FloorPlanSite,
+    "georeference": GeoreferenceSite,
+}
+_LISTS: Final[dict[str, type[Struct]]] = {"anchors": AnchorSite, "walls": WallSite}
+
+_NOT_IN_FILES: Final = {"unplaced", "site_time"}
+
+_FINDING = re.compile(r"(?P<finding>.*?)(?: - at `\$\.?(?P<path>.*)`)?", re.DOTALL)
+_MISSING = re.compile(r"Object missing required field `(?P<name>\w+)`")
+
+
+def load_site(path: Path | str) -> Site:
+    """The site that a TOML file describes.
+
+    Raises:
+        ConfigurationError: naming the file, the key, its value and what would be right.
+    """
+    path = Path(path)
+    document = _parse(path)
+    _refuse_mode_slots(path, document)
+    _refuse_unknown_keys(path, document)
+    rows = _separate_unplaced(path, document)
+    try:
+        site = _converted(path, document)
+        check_site(site, path)
+    except ConfigurationError as error:
+        key, right = _in_file(error.key, rows), _in_file(error.expected, rows)
+        raise ConfigurationError(path, key, error.value, right) from None
+    check_floor_plan(site, path)
+    return site
+
+
+def _refuse_mode_slots(path: Path, document: dict[str, Any]) -> None:
+    """Say what a file of version 0.2 without a master needs instead."""
+    schedule = document.get("schedule")
+    if isinstance(schedule, dict) and schedule.get("mode") == "slots":
+        right = (
+            '"free": without a master anchors send at random instants; '
+            "leave out slot_s, guard_s, slots, reuse_m, site_time and the anchors' slot"
+        )
+        raise ConfigurationError(path, "schedule.mode", "slots", right)
+
+
+def _converted(path: Path, document: dict[str, Any]) -> Site:
+    try:
+        return msgspec.convert(document, Site)
+    except msgspec.ValidationError as error:
+        raise _wrong_type(path, document, str(error)) from None
+
+
+class _Rows(Struct):
+    """Where the anchors stand in the file's list: those with a position, and those without."""
+
+    anchors: list[int]
+    unplaced: list[int]
+
+
+def _separate_unplaced(path: Path, document: dict[str, Any]) -> _Rows | None:
+    """Move a protocol 2 document's anchors without a position to a list of their own; name a master if it has none.
+
+    Returns None for protocol 1, and for a document that the conversion will refuse.
+    """
+    schedule, entries = document.get("schedule"), document.get("anchors")
+    mode = schedule.get("mode") if isinstance(schedule, dict) else None
+    if mode != "free":
+        return None
+    if "anchors" not in document:
+        raise ConfigurationError(path, "anchors", None, expected("anchors"))
+    if not isinstance(entries, list):
+        document.setdefault("master", 0)
+        return None
+    if entries and isinstance(entries[0], dict) and "id" in entries[0]:
+        document.setdefault("master", entries[0]["id"])
+    rows = _Rows([], [])
+    for row, entry in enumerate(entries):
+        unplaced = isinstance(entry, dict) and "x_m" not in entry and "y_m" not in entry
+        (rows.unplaced if unplaced else rows.anchors).append(row)
+        if unplaced:
+            _refuse_without_position(path, f"anchors[{row}]", entry)
+    document["anchors"] = [entries[row] for row in rows.anchors]
+    document["unplaced"] = [entries[row] for row in rows.unplaced]
+    return rows
+
+
+def _refuse_without_position(path: Path, row: str, entry: dict[str, Any]) -> None:
+    """Refuse what only an anchor with a position may have."""
+    for key, value in entry.items():
+        if key not in UnplacedAnchor.__struct_fields__:
+            right = "left out, or given with x_m and y_m: this anchor has no position"
+            raise ConfigurationError(path, f"{row}.{key} (anchor {entry.get('id')})", value, right)
+
+
+def _in_file(text: str, rows: _Rows | None) -> str:
+    """A text with the rows of separate lists of anchors changed to those of the file's one list."""
+    if rows is None:
+        return text
+
+    def row_in_file(match: re.Match[str]) -> str:
+        in_file: list[int] = getattr(rows, match[1])
+        return f"anchors[{in_file[int(match[2])]}]"
+
+    return re.sub(r"\b(anchors|unplaced)\[(\d+)\]", row_in_file, text)
+
+
+def _parse(path: Path) -> dict[str, Any]:
+    try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise ConfigurationError(path, "", None, "a site file, not a pipe or a device")
+        with path.open("rb") as file:
+            text = file.read(_MAX_BYTES + 1)
+        if len(text) > _MAX_BYTES:
+            raise ConfigurationError(path, "", None, f"a site file, {_MAX_BYTES >> 20} MiB at most")
+        if _TOO_DEEP.search(text):
+            raise ConfigurationError(path, "", None, "a site file; this one nests or counts too far")
+        return tomllib.loads(text.decode("utf-8-sig"))  # editors of Windows put a byte order mark before it
+    except OSError as error:
+        raise ConfigurationError(path, "", None, f"a readable site file ({error.strerror})") from None
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(path, f"byte {error.start}", "not UTF-8", "a TOML file in UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigurationError(path, "", None, f"valid TOML: {error}") from None
+    except (RecursionError, ValueError):  # brackets nested thousands deep, numbers of thousands of digits
+        raise ConfigurationError(path, "", None, "a site file; this one nests or counts too far") from None
+
+
+def _refuse_unknown_keys(path: Path, document: dict[str, Any]) -> None:
+    _refuse_unknown(path, document, "", document, Site)
+    for name, struct in _TABLES.items():
+        _refuse_unknown(path, document, f"{name}.", document.get(name), struct)
+    for name, struct in _LISTS.items():
+        entries = document.get(name)
+        for index, entry in enumerate(entries if isinstance(entries, list) else ()):
+            _refuse_unknown(path, document, f"{name}[{index}].", entry, struct)
+
+
+def _refuse_unknown(path: Path, document: dict[str, Any], prefix: str, table: object, struct: type[Struct]) -> None:
+    """Refuse keys that are no field of a struct, and fields that the file does not have."""
+    if not isinstance(table, dict):
+        return  # a wrong type, which the conversion reports
+    known = [name for name in struct.__struct_fields__ if name not in _NOT_IN_FILES]
+    for key, value in table.items():
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=2)
+            right = f"called {' or '.join(near)}" if near else f"left out; the keys here are {', '.join(known)}"
+            raise ConfigurationError(path, _named(document, prefix + key), value, right)
+
+
+def _wrong_type(path: Path, document: dict[str, Any], message: str) -> ConfigurationError:
+    """The error that msgspec's message means: which key of the file, its value, and what would be right."""
+    match = _FINDING.fullmatch(message)
+    key_path = match["path"] or "" if match else ""
+    missing = _MISSING.match(message)
+    if missing:
+        key_path = f"{key_path}.{missing['name']}".lstrip(".")
+    key = re.sub(r"\[\d+\]", "", key_path).replace("unplaced.", "anchors.")
+    value = None if missing else _value_at(document, key_path)
+    return ConfigurationError(path, _named(document, key_path), value, expected(key, protocol_2="unplaced" in document))
+
+
+def _named(document: dict[str, Any], key_path: str) -> str:
+    anchors, unplaced = document.get("anchors"), document.get("unplaced", [])
+    return with_anchor(key_path, anchors, unplaced) if isinstance(anchors, list) else key_path
+
+
+def _value_at(document: object, key_path: str) -> object:
+    for step in re.findall(r"\w+", key_path):
+        if isinstance(document, list):
+            document = document[int(step)]
+        elif isinstance(document, dict):
+            document = document[step]
+    return document
+
+
+def site_of(site: Site | str | Path) -> tuple[Site, Path]:
+    """A site, and the file that errors name and next to which its image lies; a value without a file is ``site``.
+
+    Raises:
+        SkylessError: there is no such file, or the site has a value that cannot be used.
+    """
+    if isinstance(site, Site):
+        file = Path("site")
+        check_site(site, file)
+        if site.floor_plan is not None and not Path(site.floor_plan.image).is_file():
+            right = "an image in the working folder; or give the path of the site's file, next to which it lies"
+            raise wrong("site.floor_plan.image", site.floor_plan.image, right)
+        return site, file
+    file = existing_file("--site", site)
+    return load_site(file), file

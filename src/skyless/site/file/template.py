@@ -1,0 +1,289 @@
+"""Sites to start from, and their files with a comment on every key."""
+
+import json
+from itertools import product
+from typing import Final
+
+from msgspec import UNSET, structs
+
+from skyless.core.site import (
+    AnchorSite,
+    FloorPlanSite,
+    GeoreferenceSite,
+    Outline,
+    ScheduleSite,
+    Site,
+    TagsSite,
+    UnplacedAnchor,
+)
+from skyless.site.file.check import ANY_ADDRESS
+
+_HEAD = """\
+# A Skyless site. Lengths are metres in the site's own frame: x and y on the floor, z up.
+# `skyless site check FILE` checks it.
+
+name = {name}
+id = {id}                          # of the site on the air, 0 to 65533; neighbouring sites need different ones
+{no_master}master = {master}                      # its clock is the site's time; best in the middle, in range of all
+# The room: its corners in order, [x, y] each; for the map, planning and simulation.
+{no_outline}outline_m = {outline}
+
+[schedule]                      # who sends when
+# "master": all anchors hear one master and send in turn, in slots. "free": no master, any size; random instants.
+{master_mode}mode = "{mode}"
+{no_slot_s}slot_s = {slot_s}                 # mode master: length of a slot in seconds; all slots make a superframe
+{no_slot_s}guard_s = {guard_s}                # mode master: silence at the end of each slot, to prepare a frame
+{no_slot_s}frames_per_node = {frames}             # mode master: frames of each anchor in a superframe
+{no_slots}slots = {slots}                     # mode master: slots in a superframe; by default one for each frame
+{no_rate}rate_hz = {rate_hz}                # mode free: beacons per second of each anchor; by default as many as fit on the air
+
+[noise]                         # what the filters assume; too small costs more than too large
+tx_stamp_ps = {tx_ps}             # standard deviation of a transmit stamp in picoseconds
+rx_stamp_ps = {rx_ps}             # of a receive stamp; a DW1000 has 100 to 150
+white_fm = {white}                # crystals' white frequency noise: Allan deviation at 1 s
+random_walk_fm = {walk}          # crystals' random-walk frequency noise in 1/√s
+
+# Errors that do not average out, as standard deviations; 0 means exact. Too small: tags report
+# standard deviations that are too small. Too large: the fixes are less accurate.
+[accuracy]
+survey_std_m = {survey_std_m}             # how well each anchor's position was measured, in each of x, y and z
+range_std_m = {range_std_m}              # constant error of the distances to an anchor, a different one for each anchor
+slope_std_m = {slope_std_m}              # error that grows with the distance: none at 4 m, this much from 8 m on
+place_std_m = {place_std_m}              # error of the distances that changes as a tag moves (reflections)
+place_distance_m = {place_distance_m}          # how far a tag moves until that error is a different one
+place_time_s = {place_time_s}            # after how many seconds it is a different one while the tag is at rest
+"""
+
+_KNOWN_HEIGHT = """
+[tags]
+height_m = {height}                  # all tags move at this height (2-D); leave the key out to estimate the height
+"""
+
+_ESTIMATED_HEIGHT = """
+[tags]
+# height_m = 1.2                # for tags that all move at one height (2-D); without it the height is estimated
+"""
+
+_ANCHORS = """
+# The anchors: positions of the antennas. Optional keys, with their defaults:
+#   slot = 0                         mode master: first slot; otherwise the master sends first, the others as listed
+#   tx_antenna_delay_ticks = 16436   antenna delays in ticks of 15.65 ps
+#   rx_antenna_delay_ticks = 16436
+# In mode free an anchor states its position itself. It may also be listed without x_m, y_m and z_m: it then
+# sends and relays, and tags do not use it. Further keys:
+#   floor = 0                        storey
+#   zone = 0                         zone of the site, 0 to 255; 0 for none
+#   std_m = 0.02                     how well its position is known; by default survey_std_m
+"""
+
+_ANCHOR = """
+[[anchors]]
+id = {id}
+x_m = {x}
+y_m = {y}
+z_m = {z}
+"""
+
+_UNPLACED = """
+[[anchors]]
+id = {id}
+"""
+
+_SLOT = "slot = {slot}\n"
+
+_NO_WALLS = """
+# Walls, full height, for planning and simulation; one table for each.
+# [[walls]]
+# x1_m = 2.0
+# y1_m = 0.0
+# x2_m = 2.0
+# y2_m = 3.5
+# loss_db = 6.0                 # what a signal loses on its way through
+# delay_m = 0.1                 # by how much it comes late, as a length
+"""
+
+_WALLS = """
+# Walls, full height, for planning and simulation: what a signal loses on its way through, and how late it comes.
+"""
+
+_WALL = """
+[[walls]]
+x1_m = {x1_m}
+y1_m = {y1_m}
+x2_m = {x2_m}
+y2_m = {y2_m}
+loss_db = {loss_db}
+delay_m = {delay_m}
+"""
+
+_FLOOR_PLAN = """
+# An image of the floor behind the map.
+{off}[floor_plan]
+{off}image = {image}           # PNG or JPEG, relative to this file
+{off}width_m = {width_m}                 # what the image's width measures on the floor
+{off}x_m = {x_m}                     # position of its lower left corner
+{off}y_m = {y_m}
+"""
+
+_GEOREFERENCE = """
+# Position of the site's origin on the Earth (WGS 84).
+{off}[georeference]
+{off}latitude_deg = {latitude_deg}
+{off}longitude_deg = {longitude_deg}
+{off}height_m = {height_m}
+{off}heading_deg = {heading_deg}             # azimuth of the y axis, clockwise from true north
+"""
+
+_EXAMPLE_OUTLINE: Final = ((0.0, 0.0), (12.0, 0.0), (12.0, 8.0), (0.0, 8.0))
+_EXAMPLE_RATE_HZ: Final = 30.0
+_EXAMPLE_PLAN = FloorPlanSite(image="floor.png", width_m=6.0)
+_EXAMPLE_GEOREFERENCE = GeoreferenceSite(latitude_deg=47.3769, longitude_deg=8.5417, height_m=408.0)
+
+
+_FROM_FLOOR_AND_CEILING_M: Final = 0.5
+_FARTHEST_M: Final = 8388.0  # distance from the origin along each axis that an anchor can state
+
+
+def site_template(site: Site) -> str:
+    """Site file, with a comment on every key, of a site whose anchors have no keys but position and slot.
+
+    Walls, floor plan and georeference that the site has not are commented examples.
+    """
+    schedule, noise = site.schedule, site.noise
+    head = _HEAD.format(
+        name=json.dumps(site.name, ensure_ascii=False),
+        id=site.id,
+        master=site.master,
+        slot_s=schedule.slot_s,
+        guard_s=schedule.guard_s,
+        frames=schedule.frames_per_node,
+        slots=schedule.slots or len(site.all_anchors) * schedule.frames_per_node,
+        mode="free" if schedule.needs_master else schedule.mode,
+        rate_hz=schedule.rate_hz or _EXAMPLE_RATE_HZ,
+        outline=[list(corner) for corner in (_EXAMPLE_OUTLINE if site.outline_m is UNSET else site.outline_m)],
+        no_outline=_off(site.outline_m is not UNSET),
+        no_master=_off(schedule.needs_master),
+        no_slots=_off(schedule.slots is not None),
+        master_mode=_off(not schedule.needs_master),
+        no_slot_s=_off(schedule.needs_master),
+        no_rate=_off(schedule.rate_hz is not None),
+        tx_ps=noise.tx_stamp_ps,
+        rx_ps=noise.rx_stamp_ps,
+        white=noise.white_fm,
+        walk=noise.random_walk_fm,
+        **structs.asdict(site.accuracy),
+    )
+    height = site.tags.height_m
+    tags = _ESTIMATED_HEIGHT if height is None else _KNOWN_HEIGHT.format(height=height)
+    return head + tags + _ANCHORS + "".join(map(_anchor, site.all_anchors)) + _tail(site)
+
+
+def _off(given: bool) -> str:
+    return "" if given else "# "
+
+
+def _anchor(anchor: AnchorSite | UnplacedAnchor) -> str:
+    slot = "" if anchor.slot is None else _SLOT.format(slot=anchor.slot)
+    if isinstance(anchor, UnplacedAnchor):
+        return _UNPLACED.format(id=anchor.id) + slot
+    return _ANCHOR.format(id=anchor.id, x=anchor.x_m, y=anchor.y_m, z=anchor.z_m) + slot
+
+
+def _tail(site: Site) -> str:
+    walls = "".join(_WALL.format(**structs.asdict(wall)) for wall in site.walls)
+    plan, earth = site.floor_plan or _EXAMPLE_PLAN, site.georeference or _EXAMPLE_GEOREFERENCE
+    image = json.dumps(plan.image, ensure_ascii=False)
+    return (
+        (_WALLS + walls if walls else _NO_WALLS)
+        + _FLOOR_PLAN.format(**{**structs.asdict(plan), "image": image}, off=_off(site.floor_plan is not None))
+        + _GEOREFERENCE.format(**structs.asdict(earth), off=_off(site.georeference is not None))
+    )
+
+
+def rectangle(width_m: float, depth_m: float) -> Outline:
+    """The outline of a rectangular room from the corner (0, 0) on."""
+    return (0.0, 0.0), (width_m, 0.0), (width_m, depth_m), (0.0, depth_m)
+
+
+def rectangular_site(width_m: float, depth_m: float, anchors: int, height_m: float, tag_height_m: float | None) -> Site:
+    """A rectangular room with anchors evenly along its walls, from the corner (0, 0) on.
+
+    They alternate between half a metre above the floor and half a metre below the ceiling, so that heights can
+    be estimated; with a known ``tag_height_m`` all are below the ceiling.
+    """
+    high = round(max(height_m - _FROM_FLOOR_AND_CEILING_M, 0.0), 3)
+    low = high if tag_height_m is not None else min(_FROM_FLOOR_AND_CEILING_M, high)
+    points = [_along_walls(index / anchors, width_m, depth_m) for index in range(anchors)]
+    return Site(
+        name="room",
+        id=1,
+        master=1,
+        anchors=tuple(
+            AnchorSite(id=number, x_m=x, y_m=y, z_m=high if number % 2 else low)
+            for number, (x, y) in enumerate(points, start=1)
+        ),
+        schedule=ScheduleSite(mode="free"),
+        tags=TagsSite(height_m=tag_height_m),
+        outline_m=rectangle(width_m, depth_m),
+    )
+
+
+def unplaced_site(anchors: int, tag_height_m: float | None) -> Site:
+    """Anchors 1 to ``anchors`` whose positions are not known yet."""
+    return Site(
+        name="site",
+        id=1,
+        master=1,
+        anchors=(),
+        schedule=ScheduleSite(mode="free"),
+        tags=TagsSite(height_m=tag_height_m),
+        unplaced=tuple(UnplacedAnchor(id=number) for number in range(1, anchors + 1)),
+    )
+
+
+def grid_site(
+    width_m: float, depth_m: float, spacing_m: float, height_m: float, tag_height_m: float | None = None
+) -> Site:
+    """A hall from the corner (0, 0) on, its anchors on a square grid, half a spacing or so from the walls.
+
+    A side too long for positions on the air is centred on the
+    origin.
+
+    Raises:
+        ValueError: there are more anchors than identifiers.
+    """
+    x_m, y_m = _along_side(width_m, spacing_m), _along_side(depth_m, spacing_m)
+    count = len(x_m) * len(y_m)
+    if count > ANY_ADDRESS:
+        raise ValueError(f"{count} anchors are too many: a site has identifiers for {ANY_ADDRESS}")
+    points = enumerate(product(x_m, y_m), start=1)
+    return Site(
+        name="grid",
+        id=1,
+        master=1,
+        anchors=tuple(AnchorSite(id=number, x_m=x, y_m=y, z_m=height_m) for number, (x, y) in points),
+        schedule=ScheduleSite(mode="free"),
+        tags=TagsSite(height_m=tag_height_m),
+    )
+
+
+def _along_side(length_m: float, spacing_m: float) -> list[float]:
+    """Coordinates along one side, to the millimetre, as far from one end as from the other."""
+    count = max(1, round(length_m / spacing_m))
+    first_m = (length_m - (count - 1) * spacing_m) / 2.0
+    origin_m = 0.0 if length_m <= _FARTHEST_M else length_m / 2.0
+    return [round(first_m + number * spacing_m - origin_m, 3) for number in range(count)]
+
+
+def _along_walls(share: float, width_m: float, depth_m: float) -> tuple[float, float]:
+    """The point at a share of the way around the walls, to the millimetre."""
+    way_m = share * 2 * (width_m + depth_m)
+    if way_m <= width_m:
+        x, y = way_m, 0.0
+    elif way_m <= width_m + depth_m:
+        x, y = width_m, way_m - width_m
+    elif way_m <= 2 * width_m + depth_m:
+        x, y = 2 * width_m + depth_m - way_m, depth_m
+    else:
+        x, y = 0.0, 2 * (width_m + depth_m) - way_m
+    return round(x, 3), round(y, 3)

@@ -1,0 +1,1 @@
+"""Predicted errors, ranges and places of anchors."""

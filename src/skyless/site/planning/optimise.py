@@ -1,0 +1,439 @@
+"""Where anchors should hang: the best of several starts, first on a lattice, then by the method's own prediction.
+
+A quick search exchanges anchors on a lattice of mounts. The error that counts there is that of (HᵀWH)⁻¹ with each
+anchor weighted by the share of its frames that arrives: independent of the method. What it finds is judged, and
+improved, by the method's own prediction. The evenly spaced layout is one of the starts, so the result is never worse
+than it. Mean and worst error over the region count alike, relative to that layout's. Same seed, same result, unless
+the time runs out before the search ends.
+"""
+
+import math
+import time
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+
+from skyless.core.kernels.arrays import Integers, Matrix, Vector
+from skyless.core.kernels.compiled import kernel, threaded_kernel
+from skyless.core.kernels.linear_algebra import factorise, invert
+from skyless.core.site import AnchorSite, Site
+from skyless.site.channel import pack_walls
+from skyless.site.planning.anchor_clocks import stamp_variances
+from skyless.site.planning.floor import Floor, Mounts, sample_points
+from skyless.site.planning.links import FIX_SHARE, SIGMA, link_budget, links, masters_by_links
+from skyless.site.planning.predict import PlanSettings, Predictor, with_noise
+
+_SEARCH_POINTS: Final = 140
+_JUDGE_POINTS: Final = 1500
+_MAX_CANDIDATES: Final = 220
+_STARTS: Final = 16
+_REFINED: Final = 4  # starts that the method's own prediction improves further, the even layout among them
+_FINEST_M: Final = 0.05
+
+_MAX_PASSES: Final = 12  # of an exchange on the lattice
+_CLOSEST_M: Final = 0.3  # anchors nearer to each other than this are not considered
+_MIN_HEARD: Final = 0.5  # share of the master's frames below which an anchor loses weight
+_PENALTY: Final = 10.0
+"""Cost of a mean or a worst error that is not clearly smaller than the reference's, against a gain elsewhere."""
+
+_CLEARLY_SMALLER: Final = 0.95
+
+_NOTICEABLE: Final = 0.05  # share of an error by which one more anchor should lower it to be worth its mounting
+
+
+# Layouts
+
+
+class Layout(Struct, frozen=True):
+    """Anchors on mounts."""
+
+    along_m: Vector
+    """Distance of each one along the walls."""
+    levels: Integers
+    """Index of each one's height."""
+
+
+def even_layout(mounts: Mounts, anchors: int) -> Layout:
+    """Anchors evenly along the walls from their beginning, heights in turn."""
+    return Layout(np.arange(anchors) * mounts.length_m / anchors, np.arange(anchors) % len(mounts.heights_m))
+
+
+def site_with(site: Site, anchors_m: Matrix, master: int) -> Site:
+    """The site with other anchors, shape (n, 3), numbered from 1; ``master`` is a row."""
+    anchors = tuple(AnchorSite(k + 1, *position) for k, position in enumerate(anchors_m.tolist()))
+    schedule = replace(site.schedule, slots=None)
+    return replace(site, anchors=anchors, master=master + 1, schedule=schedule)
+
+
+def site_with_one_more(site: Site, position_m: Vector) -> Site:
+    """The site with one more anchor; its superframe grows by one slot for each frame of the anchor."""
+    number = max(anchor.id for anchor in site.anchors) + 1
+    slots, schedule = site.schedule.slots, site.schedule
+    if slots is not None and slots < (len(site.anchors) + 1) * schedule.frames_per_node:
+        schedule = replace(schedule, slots=None)
+    x, y, z = position_m.tolist()
+    return replace(site, anchors=(*site.anchors, AnchorSite(number, x, y, z)), schedule=schedule)
+
+
+# The quick search on a lattice
+
+
+class Lattice(NamedTuple):
+    """What candidates for anchors' positions contribute to the points."""
+
+    apart_m: Matrix
+    """Distances between candidates; shape (candidates, candidates)."""
+    rows: Matrix
+    """Weighted rows [1, unit vector] of H; shape (candidates, points, 1 + dim)."""
+    heard: Matrix
+    """Share of each candidate's frames that reach each other one; shape (candidates, candidates)."""
+    weights: Vector
+    """Weights of the points in a mean, of sum 1."""
+    cap_m: float
+    """Error that stands for "no position"."""
+
+
+def lattice_of(
+    candidates_m: Matrix,
+    points_m: Matrix,
+    weights: Vector,
+    budget: Vector,
+    walls: Matrix,
+    dim: int,
+    sigma_m: float,
+    *,
+    has_master: bool = True,
+) -> Lattice:
+    """Candidates, shape (c, 3), for points, shape (m, 3); ``sigma_m`` is a pseudorange's noise."""
+    share, _ = links(points_m, candidates_m, budget, walls)
+    heard, _ = links(candidates_m, candidates_m, budget, walls) if has_master else (np.ones((len(share),) * 2), None)
+    np.fill_diagonal(heard, 1.0)
+    away = points_m - candidates_m[:, None]
+    unit = away / np.maximum(np.linalg.norm(away, axis=2, keepdims=True), 1e-3)
+    rows = np.concatenate([np.ones((*share.shape, 1)), unit[..., :dim]], axis=2) * (np.sqrt(share) / sigma_m)[..., None]
+    apart_m = np.linalg.norm(candidates_m[:, None] - candidates_m, axis=2)
+    cap_m = float(np.linalg.norm(np.ptp(np.concatenate([candidates_m, points_m]), axis=0)))
+    return Lattice(apart_m, rows, heard, weights, cap_m)
+
+
+@threaded_kernel
+def mean_and_worst(chosen: Integers, lattice: Lattice) -> tuple[float, float]:
+    """Mean and largest error over the points for these candidates, the best heard of them being the master."""
+    rows, heard = lattice.rows, lattice.heard
+    size = rows.shape[2]
+    normal, inverse = np.zeros((size, size)), np.zeros((size, size))
+    best, master = -1.0, 0
+    for i in chosen:
+        total = 0.0
+        for j in chosen:
+            total += min(heard[i, j], 0.9)
+        if total > best:
+            best, master = total, i
+    mean, worst = 0.0, 0.0
+    for m in range(rows.shape[1]):
+        normal[:] = 0.0
+        for i in chosen:
+            factor = min(heard[i, master] / _MIN_HEARD, 1.0)
+            for a in range(size):
+                for b in range(a + 1):
+                    normal[a, b] += factor * rows[i, m, a] * rows[i, m, b]
+        error = lattice.cap_m
+        if factorise(normal, size):
+            invert(normal, size, inverse)
+            trace = 0.0
+            for a in range(1, size):
+                trace += inverse[a, a]
+            error = min(math.sqrt(trace), error)
+        mean += lattice.weights[m] * error
+        worst = max(worst, error)
+    return mean, worst
+
+
+@kernel
+def relative_score(mean: float, worst: float, mean_reference: float, worst_reference: float) -> float:
+    """Mean and worst error against a reference's; costly where either is not clearly smaller."""
+    a, b = mean / mean_reference, worst / worst_reference
+    return 0.5 * (a + b) + _PENALTY * (max(a - _CLEARLY_SMALLER, 0.0) + max(b - _CLEARLY_SMALLER, 0.0))
+
+
+def exchange(
+    chosen: Integers,
+    fixed: int,
+    lattice: Lattice,
+    reference: tuple[float, float],
+    passes: int,
+    late: Callable[[], bool] = lambda: False,
+) -> float:
+    """Move one anchor after the other to its best candidate until none moves; the first ``fixed`` stay. The score.
+
+    Ends between two anchors once it is ``late``.
+    """
+    score = relative_score(*mean_and_worst(chosen, lattice), *reference)
+    for _ in range(passes):
+        before = chosen.copy()
+        for k in range(fixed, len(chosen)):
+            if late():
+                return score
+            best = chosen[k]
+            others = np.delete(chosen, k)
+            free = (lattice.apart_m[:, others] >= _CLOSEST_M).all(axis=1)
+            for candidate in np.flatnonzero(free):
+                chosen[k] = candidate
+                trial = relative_score(*mean_and_worst(chosen, lattice), *reference)
+                if trial < score * (1.0 - 1e-9):
+                    score, best = trial, candidate
+            chosen[k] = best
+        if (chosen == before).all():
+            break
+    return score
+
+
+# The search by the method's own prediction
+
+
+class Scored(Struct, frozen=True):
+    """A layout as a site, and its predicted standard deviation over the region, metres."""
+
+    site: Site
+    mean_sigma_m: float
+    worst_sigma_m: float
+    covered_share: float
+
+
+class Optimised(Struct, frozen=True):
+    """The result and the even layout of as many anchors."""
+
+    best: Scored
+    even: Scored
+    evaluations: int
+    finished: bool
+    """Whether the search came to its end before the time did, or Ctrl-C."""
+    target_met: bool | None
+
+
+class Search:
+    """One optimisation: what is searched for, and its state."""
+
+    def __init__(
+        self,
+        site: Site,
+        settings: PlanSettings,
+        floor: Floor,
+        mounts: Mounts,
+        heights_m: tuple[float, ...],
+        anchors: int,
+        seed: int,
+        seconds: float,
+    ) -> None:
+        self._site, self._settings, self._mounts, self._anchors = site, settings, mounts, anchors
+        self._budget, self._walls = link_budget(settings.channel), pack_walls(site.walls)
+        self._points = sample_points(floor, heights_m, _SEARCH_POINTS)
+        self._floor, self._heights_m = floor, heights_m
+        self._random = np.random.default_rng([seed, anchors])
+        self._begin_s, self._seconds = time.monotonic(), seconds
+        self._cap_m = float(np.linalg.norm(np.ptp(mounts.segments_m.reshape(-1, 2), axis=0)))
+        self._found: list[tuple[float, Layout]] = []
+        """The best layout of each start that was refined, with its score."""
+        self.evaluations = 0
+
+    def run(self, target_m: float | None = None, progress: Callable[[float], None] | None = None) -> Optimised:
+        """Search until nothing improves, the time is up, or Ctrl-C: the best of what has been found by then.
+
+        ``progress`` gets the share of the time.
+        """
+        self._progress = progress
+        even = even_layout(self._mounts, self._anchors)
+        reference = self._score(even)  # at the first time it loads kernels, too
+        thorough = self._plan_judging(even)
+        first = self._judge(even)
+        judged, finished = [first], False
+        try:
+            for start in [even, *self._lattice_starts(even)][:_REFINED]:
+                self._refine(start, reference)
+            finished = thorough and not self._late()
+            judged += [self._judge(layout) for _, layout in self._found]
+        except KeyboardInterrupt:
+            if self._found:
+                judged.append(self._judge(min(self._found, key=lambda found: found[0])[1]))
+        best = min(judged, key=lambda s: _against(s, first))
+        met = None if target_m is None else best.covered_share == 1.0 and best.worst_sigma_m <= target_m
+        return Optimised(best, first, self.evaluations, finished, met)
+
+    def _plan_judging(self, layout: Layout) -> bool:
+        """Choose at how many points and with how many masters layouts are judged, so that it takes half of the time.
+
+        Returns whether it is at all of them.
+        """
+        begin_s = time.monotonic()
+        self._score(layout)
+        score_s = time.monotonic() - begin_s
+        for masters, points in ((3, _JUDGE_POINTS), (3, 4 * _SEARCH_POINTS), (1, 2 * _SEARCH_POINTS), (1, 0)):
+            sample = sample_points(self._floor, self._heights_m, points) if points else self._points
+            judging_s = score_s * masters * len(sample[1]) / len(self._points[1])
+            if (_REFINED + 1) * judging_s < 0.5 * self._seconds:
+                break
+        self._masters, self._judge_points = masters, sample
+        self._search_s = max(self._seconds - _REFINED * (judging_s + score_s), 0.1 * self._seconds)
+        return masters > 1 and points == _JUDGE_POINTS
+
+    def _late(self) -> bool:
+        """Whether the search has to end, so that what it found can be judged in time."""
+        passed = (time.monotonic() - self._begin_s) / self._search_s
+        if self._progress is not None:
+            self._progress(min(passed, 1.0))
+        return passed >= 1.0
+
+    # On the lattice
+
+    def _lattice_starts(self, even: Layout) -> list[Layout]:
+        all_along_m, all_levels = _candidates(self._mounts, _MAX_CANDIDATES, 2 * self._anchors)
+        dim = 3 if self._site.tags.height_m is None else 2
+        noise_m = sum(stamp_variances(with_noise(self._site, self._settings.noise_ps))) ** 0.5
+        candidates_m = self._mounts.at(all_along_m, all_levels)
+        has_master = self._site.schedule.needs_master
+        lattice = lattice_of(
+            candidates_m, *self._points, self._budget, self._walls, dim, noise_m, has_master=has_master
+        )
+        even_m = self._mounts.at(even.along_m, even.levels)
+        snapped = np.array([np.argmin(np.linalg.norm(candidates_m - anchor_m, axis=1)) for anchor_m in even_m])
+        reference = mean_and_worst(snapped, lattice)
+        found = []
+        for number in range(_STARTS):
+            chosen = (
+                snapped.copy() if number == 0 else self._random.choice(len(candidates_m), self._anchors, replace=False)
+            )
+            score = exchange(chosen, 0, lattice, reference, _MAX_PASSES, self._late)
+            found.append((score, Layout(all_along_m[chosen], all_levels[chosen])))
+            if self._late():
+                break
+        found.sort(key=lambda pair: pair[0])
+        return [layout for _, layout in found]
+
+    # By the method's own prediction
+
+    def _site_of(self, layout: Layout, rank: int = 0) -> Site:
+        anchors_m = self._mounts.at(layout.along_m, layout.levels)
+        master = int(masters_by_links(anchors_m, self._budget, self._walls)[rank])
+        return site_with(self._site, anchors_m, master)
+
+    def _sigma(self, site: Site, sample: tuple[Matrix, Vector]) -> tuple[float, float, float]:
+        """Mean and worst over the points, those without a fix counting as lost; and the share with one."""
+        self.evaluations += 1
+        rows = Predictor(site, self._settings).at(sample[0])
+        covered = rows[:, FIX_SHARE] >= 0.5
+        sigma = np.where(covered, np.minimum(rows[:, SIGMA], self._cap_m), self._cap_m)
+        return float(sample[1] @ sigma), float(sigma.max()), float(covered.mean())
+
+    def _score(self, layout: Layout) -> tuple[float, float]:
+        mean, worst, _ = self._sigma(self._site_of(layout), self._points)
+        return mean, worst
+
+    def _refine(self, start: Layout, reference: tuple[float, float]) -> None:
+        """Shift one anchor after the other along the walls, by less and less, and between the heights."""
+        layout, step = start, self._mounts.length_m / (2.0 * self._anchors)
+        score = relative_score(*self._score(layout), *reference)
+        self._found.append((score, layout))
+        while step >= _FINEST_M and not self._late():
+            better = False
+            for k in self._random.permutation(self._anchors):
+                for trial in self._moves(layout, int(k), step):
+                    if self._late():
+                        break
+                    value = relative_score(*self._score(trial), *reference)
+                    if value < score * (1.0 - 1e-4):
+                        layout, score, better = trial, value, True
+                        self._found[-1] = score, layout
+                        break
+            if not better:
+                step /= 2.0
+
+    def _moves(self, layout: Layout, k: int, step: float) -> list[Layout]:
+        """Layouts with one anchor elsewhere, a step away or anywhere, far enough from all others."""
+        moves = []
+        for shift in (step, -step, self._random.uniform(step, self._mounts.length_m - step)):
+            along_m = layout.along_m.copy()
+            along_m[k] = (along_m[k] + shift) % self._mounts.length_m
+            moves.append(Layout(along_m, layout.levels))
+        for level in range(len(self._mounts.heights_m)):
+            if level != layout.levels[k]:
+                levels = layout.levels.copy()
+                levels[k] = level
+                moves.append(Layout(layout.along_m, levels))
+        return [move for move in moves if self._apart(move, k)]
+
+    def _apart(self, layout: Layout, k: int) -> bool:
+        anchors_m = self._mounts.at(layout.along_m, layout.levels)
+        distances = np.linalg.norm(np.delete(anchors_m, k, axis=0) - anchors_m[k], axis=1)
+        return bool(distances.min(initial=np.inf) >= _CLOSEST_M)
+
+    def _judge(self, layout: Layout) -> Scored:
+        """Score on many more points, with the best of the masters that are heard about equally well."""
+        scored = []
+        for rank in range(min(self._masters, self._anchors)):
+            site = self._site_of(layout, rank)
+            scored.append(Scored(site, *self._sigma(site, self._judge_points)))
+        return min(scored, key=lambda s: s.mean_sigma_m * s.worst_sigma_m)
+
+
+def _against(scored: Scored, even: Scored) -> float:
+    return relative_score(scored.mean_sigma_m, scored.worst_sigma_m, even.mean_sigma_m, even.worst_sigma_m)
+
+
+def _candidates(mounts: Mounts, most: int, least: int = 1) -> tuple[Vector, Integers]:
+    """Distances along the walls and levels of some candidates, evenly spaced at every height."""
+    levels = len(mounts.heights_m)
+    count = max(most // levels, least)
+    return np.repeat(np.arange(count) * mounts.length_m / count, levels), np.tile(np.arange(levels), count)
+
+
+class OneMore(Struct, frozen=True):
+    """Where one more anchor helps most, and how much: means and worst over the region, metres."""
+
+    position_m: tuple[float, float, float]
+    mean_before_m: float
+    mean_after_m: float
+    worst_before_m: float
+    worst_after_m: float
+    helps: bool
+    """Whether it lowers the mean or the worst noticeably, and raises neither by as much."""
+
+
+def one_more(
+    site: Site, settings: PlanSettings, floor: Floor, mounts: Mounts, heights_m: tuple[float, ...]
+) -> OneMore | None:
+    """Try one more anchor at a hundred positions; None where none is free.
+
+    The position follows from the quick search on the lattice, its gain from the method's own prediction.
+    """
+    before = Predictor(site, settings)
+    points, weights = sample_points(floor, heights_m, _SEARCH_POINTS)
+    free = mounts.at(*_candidates(mounts, _MAX_CANDIDATES // 2))
+    candidates_m = np.concatenate([before.anchors_m, free])
+    noise_m = sum(stamp_variances(before.site)) ** 0.5
+    lattice = lattice_of(
+        candidates_m, points, weights, before.budget, before.walls, before.dim, noise_m,
+        has_master=before.master is not None,
+    )  # fmt: skip
+    n = len(before.anchors_m)
+    gaps = np.linalg.norm(free[:, None] - before.anchors_m[None], axis=2).min(axis=1)
+    if not (gaps >= _CLOSEST_M).any():
+        return None
+    chosen = np.append(np.arange(n), n + int(np.argmax(gaps)))
+    exchange(chosen, n, lattice, mean_and_worst(np.arange(n), lattice), _MAX_PASSES)
+    position_m = candidates_m[chosen[n]]
+    after = Predictor(site_with_one_more(site, position_m), settings)
+    (mean_before, worst_before), (mean_after, worst_after) = (
+        _mean_and_worst(predictor.at(points)[:, SIGMA], weights, lattice.cap_m) for predictor in (before, after)
+    )
+    x, y, z = position_m.tolist()
+    changes = mean_after / mean_before - 1.0, worst_after / worst_before - 1.0
+    helps = min(changes) <= -_NOTICEABLE and max(changes) < _NOTICEABLE
+    return OneMore((x, y, z), mean_before, mean_after, worst_before, worst_after, helps)
+
+
+def _mean_and_worst(sigma: Vector, weights: Vector, cap_m: float) -> tuple[float, float]:
+    capped = np.minimum(sigma, cap_m)
+    return float(weights @ capped), float(capped.max())

@@ -1,0 +1,237 @@
+"""Beacons a second that reach tags at a site of protocol 2, whose anchors send at random instants.
+
+A frame arrives if its power is above the sensitivity and, of all frames on the air with it, exceeds each by the
+capture margin.
+"""
+
+import math
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+
+from skyless.core.air.frame import MAX_FRAME_BYTES
+from skyless.core.air.ieee802154 import air_time_s
+from skyless.core.geometry import anchor_positions
+from skyless.core.kernels.arrays import Array, Integers, Matrix, Vector
+from skyless.core.kernels.compiled import threaded_kernel
+from skyless.core.protocols import beacon_period_s
+from skyless.core.site import Site
+from skyless.site.channel import (
+    FREE_SPACE_LOSS_1_M_DB,
+    ChannelModel,
+    cross_walls,
+    delivery_probability,
+    pack_walls,
+    received_power_dbm,
+)
+from skyless.site.file.advice import warnings_of
+from skyless.site.planning.floor import Floor
+from skyless.site.planning.links import IN_VIEW, range_of
+from skyless.site.planning.maps import Grid, grid_of
+
+RECEIVED_HZ: Final = 2.0
+"""An anchor received more rarely than this is of no use to a tag, whose estimator forgets it after a second."""
+
+FEWEST_ANCHORS: Final = 5
+"""With fewer in the worst twentieth of the positions a plan warns: one more than a position with its height needs."""
+
+_ENOUGH_ANCHORS: Final = 7
+_CERTAIN_LOSS_WIDTHS: Final = 10.0  # steps of the sensitivity's width below it at which a frame counts as lost
+_POINTS: Final = 3000
+_PLASTIC: Final = np.array([0.7548776662, 0.5698402910])  # multiples of these, modulo 1, fill a square evenly
+
+
+class TagRates(Struct, frozen=True):
+    """What a tag receives at points; shape (points,) each."""
+
+    beacons_per_s: Vector
+    in_reach: Integers
+    """Anchors of whose frames at least half would arrive if nobody else sent."""
+    received: Integers
+    """Anchors of which at least ``RECEIVED_HZ`` beacons a second arrive."""
+
+
+def tag_rates(site: Site, points_m: Matrix, channel: ChannelModel, exponent: float = 2.0) -> TagRates:
+    """Return what tags at points, shape (m, 3), receive; anchors without a position are left out.
+
+    ``exponent``: of the path loss; the power falls by ten times this many decibels for each factor of ten in distance.
+    """
+    anchors_m, period_s = anchor_positions(site), beacon_period_s(site)
+    order = np.argsort(anchors_m[:, 0], kind="stable")
+    weakest_dbm = channel.sensitivity_dbm - _CERTAIN_LOSS_WIDTHS * channel.sensitivity_width_db - channel.capture_db
+    budget_db = channel.tx_power_dbm - FREE_SPACE_LOSS_1_M_DB - weakest_dbm
+    settings = np.array(
+        [
+            channel.tx_power_dbm,
+            channel.sensitivity_dbm,
+            channel.sensitivity_width_db,
+            channel.capture_db,
+            1.0 - channel.loss_probability,
+            exponent,
+            10.0 ** (budget_db / (10.0 * exponent)),
+            2.0 * air_time_s(MAX_FRAME_BYTES) / period_s,
+            RECEIVED_HZ * period_s,
+        ]
+    )
+    table = np.zeros((len(points_m), 3))
+    _fill_rates(np.ascontiguousarray(points_m), anchors_m[order], settings, pack_walls(site.walls), table)
+    return TagRates(table[:, 0] / period_s, table[:, 1].astype(np.int64), table[:, 2].astype(np.int64))
+
+
+@threaded_kernel
+def _fill_rates(points_m: Matrix, anchors_m: Matrix, settings: Vector, walls: Matrix, table: Matrix) -> None:
+    """Fill beacons per period, anchors in reach and anchors received; anchors in the order of x.
+
+    ``settings``: power sent, sensitivity, its width, capture margin, share not lost by chance, exponent, distance
+    beyond which nothing matters, the share of the time in which another anchor's frame would overlap, and the share
+    of an anchor's frames that make it received.
+    """
+    tx_dbm, sensitivity_dbm, width_db, capture_db = settings[0], settings[1], settings[2], settings[3]
+    kept, exponent, farthest_m, overlap, useful = settings[4], settings[5], settings[6], settings[7], settings[8]
+    power_dbm = np.empty(len(anchors_m))
+    for i in range(len(points_m)):
+        x, y, z = points_m[i, 0], points_m[i, 1], points_m[i, 2]
+        count = 0
+        start, end = np.searchsorted(anchors_m[:, 0], x - farthest_m), np.searchsorted(anchors_m[:, 0], x + farthest_m)
+        for j in range(start, end):
+            dx, dy, dz = anchors_m[j, 0] - x, anchors_m[j, 1] - y, anchors_m[j, 2] - z
+            distance_m = math.sqrt(dx * dx + dy * dy + dz * dz)
+            if distance_m > farthest_m:
+                continue
+            loss_db = 10.0 * (exponent - 2.0) * math.log10(max(distance_m, 1.0))
+            if walls.shape[0] > 0:
+                loss_db += cross_walls(walls, anchors_m[j, 0], anchors_m[j, 1], x, y)[0]
+            power_dbm[count] = received_power_dbm(tx_dbm, distance_m, loss_db)
+            count += 1
+        for k in range(count):
+            delivered = kept * delivery_probability(power_dbm[k], sensitivity_dbm, width_db)
+            if delivered < 1e-6:
+                continue
+            rivals = 0
+            for other in range(count):
+                rivals += other != k and power_dbm[k] - power_dbm[other] < capture_db
+            arrives = delivered * math.exp(-overlap * rivals)
+            table[i, 0] += arrives
+            table[i, 1] += delivered >= IN_VIEW * kept
+            table[i, 2] += arrives >= useful
+
+
+class Distribution(Struct, frozen=True):
+    """A quantity over the region's positions."""
+
+    median: float
+    worst_5_percent: float
+    """What all but the worst twentieth of the positions have at least."""
+    least: float
+
+
+class Reception(Struct, frozen=True):
+    """What tags receive over the region."""
+
+    beacons_per_s: Distribution
+    anchors_in_reach: Distribution
+    """If one anchor sent at a time."""
+    anchors_received: Distribution
+    """With all that are on the air at once."""
+
+
+class RateMap(Struct, frozen=True):
+    """Beacons per second at one point of each cell of a grid."""
+
+    grid: Grid
+    beacons_per_s: Array
+    """Shape (heights, ny, nx); NaN outside the outline."""
+    reception: Reception
+
+
+def rate_map(
+    site: Site, floor: Floor, heights_m: tuple[float, ...], step_m: float | None, channel: ChannelModel, exponent: float
+) -> RateMap:
+    """Return what reaches tags over the region; without a step, at some three thousand points.
+
+    Raises:
+        ValueError: the region has no area or no point inside the outline, or there would be too many points.
+    """
+    x1, y1, x2, y2 = floor.region_m
+    grid = grid_of(floor, heights_m, step_m or math.sqrt(max((x2 - x1) * (y2 - y1), 1e-6) * len(heights_m) / _POINTS))
+    flat = _points_in_cells(grid)
+    points = np.concatenate([np.column_stack([flat, np.full(len(flat), height)]) for height in grid.heights_m])
+    rates = tag_rates(site, points, channel, exponent)
+    values = np.full((len(grid.heights_m), *grid.within.shape), np.nan)
+    values[:, grid.within] = rates.beacons_per_s.reshape(len(grid.heights_m), -1)
+    return RateMap(grid, values, _reception(rates))
+
+
+def _points_in_cells(grid: Grid) -> Matrix:
+    """A point in each cell within the outline, shape (m, 2), each elsewhere in its cell.
+
+    On the cells' centres a grid of anchors would be met at the same few positions between its anchors only.
+    """
+    centres = np.stack(np.meshgrid(grid.x_m, grid.y_m), axis=-1)[grid.within]
+    shares = np.arange(1, len(centres) + 1)[:, None] * _PLASTIC % 1.0 - 0.5
+    cell_m = [np.diff(axis_m).min(initial=grid.step_m) for axis_m in (grid.x_m, grid.y_m)]
+    points: Matrix = centres + shares * cell_m
+    return points
+
+
+def _reception(rates: TagRates) -> Reception:
+    return Reception(_distribution(rates.beacons_per_s), _distribution(rates.in_reach), _distribution(rates.received))
+
+
+def _distribution(values: Vector | Integers) -> Distribution:
+    worst = np.percentile(values, 5.0, method="lower")
+    return Distribution(float(np.median(values)), float(worst), float(values.min()))
+
+
+def rate_report(
+    site: Site, floor: Floor | None, mapped: RateMap | None, channel: ChannelModel, exponent: float
+) -> dict[str, Any]:
+    """The whole report, SI units; without anchors with positions there is neither floor nor map."""
+    return {
+        "site": site.name,
+        "mode": site.schedule.mode,
+        "exponent": exponent,
+        "range_m": range_of(channel, exponent),
+        "beacons_per_s_of_each_anchor": 1.0 / beacon_period_s(site),
+        "outline_m": None if floor is None else floor.outline_m,
+        "region_m": None if floor is None else floor.region_m,
+        "heights_m": None if mapped is None else mapped.grid.heights_m,
+        "step_m": None if mapped is None else mapped.grid.step_m,
+        "points": None if mapped is None else mapped.grid.points,
+        "reception": None if mapped is None else msgspec.to_builtins(mapped.reception),
+        "accuracy": None,
+        "anchors": [
+            {"id": anchor.id, "x_m": anchor.x_m, "y_m": anchor.y_m, "z_m": anchor.z_m} for anchor in site.anchors
+        ],
+        "unplaced": [{"id": anchor.id} for anchor in site.unplaced],
+        "warnings": [
+            *warnings_of(site),
+            *([] if mapped is None else _reception_warnings(site, mapped.reception, channel, exponent)),
+        ],
+    }
+
+
+def described_rates(result: dict[str, Any]) -> str:
+    """Who sends how often, in one line."""
+    return f"mode {result['mode']}, {result['beacons_per_s_of_each_anchor']:.1f} beacons/s of each anchor"
+
+
+def _reception_warnings(site: Site, found: Reception, channel: ChannelModel, exponent: float) -> list[str]:
+    in_reach, received = found.anchors_in_reach.worst_5_percent, found.anchors_received.worst_5_percent
+    if in_reach < FEWEST_ANCHORS:
+        share = math.sqrt(max(in_reach, 1.0) / _ENOUGH_ANCHORS)
+        return [
+            f"at the worst 5 % of the positions only {in_reach:.0f} anchors are in reach "
+            f"({range_of(channel, exponent):.0f} m in the open with a path loss of exponent {exponent:g}), and "
+            f"positions need {FEWEST_ANCHORS} or more: hang anchors at {100.0 * share:.0f} % of their distances, or "
+            "more where walls are between"
+        ]
+    if received < FEWEST_ANCHORS:
+        return [
+            f"at the worst 5 % of the positions beacons of only {received:.0f} anchors arrive, though {in_reach:.0f} "
+            "are in reach: others are on the air at once; "
+            f"another schedule.rate_hz than {site.schedule.rate_hz:g} may suit these anchors better"
+        ]
+    return []

@@ -1,0 +1,241 @@
+"""The report of a plan: everything that it found as one tree of plain values, warnings included."""
+
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+
+from skyless.core.fix import NoFixReason
+from skyless.core.kernels.arrays import Array, Mask
+from skyless.core.method_names import FILTERS
+from skyless.core.protocol1.snapshots import literal_covariance
+from skyless.core.protocols import superframe_s
+from skyless.core.tag.locate import NoSolution, locate
+from skyless.site.file.advice import warnings_of
+from skyless.site.planning.anchor_clocks import master_warnings, stamp_variances
+from skyless.site.planning.floor import Floor, Mounts, sample_points
+from skyless.site.planning.links import BIAS, FIX_SHARE, IN_VIEW, SIGMA, range_of
+from skyless.site.planning.maps import MapSummary, PlanMap
+from skyless.site.planning.optimise import Optimised, Scored, one_more
+from skyless.site.planning.predict import Predictor
+from skyless.site.planning.snapshot_sigma import delays
+
+
+class PointCheck(Struct, frozen=True):
+    """One point: prediction and simulation, metres; None where either has no fix."""
+
+    position_m: tuple[float, float, float]
+    predicted_sigma_m: float | None
+    simulated_sigma_m: float | None
+    ratio: float | None
+    """Simulated over predicted standard deviation; over RMSE where survey and ranges have errors."""
+    ratio_error: float | None
+    """Standard error of the ratio, from the scatter of the batches."""
+    predicted_rmse_m: float | None
+    simulated_rmse_m: float | None
+    predicted_claim_m: float | None
+    predicted_fix_share: float
+    simulated_fix_share: float
+    """Share of the rounds (snapshots) or messages (filters) after the warm-up."""
+    fixes: int
+
+
+class Verification(Struct, frozen=True):
+    """All points, and how far the ratios lie from one."""
+
+    method: str
+    seed: int
+    simulated_s: float
+    points: tuple[PointCheck, ...]
+    mean_ratio: float | None
+    smallest_ratio: float | None
+    largest_ratio: float | None
+    mean_ratio_error: float | None
+
+
+def plan_report(
+    predictor: Predictor,
+    floor: Floor,
+    mounts: Mounts,
+    mapped: PlanMap,
+    summary: MapSummary,
+    optimised: Optimised | None,
+    checked: Verification | None,
+) -> dict[str, Any]:
+    """The whole report, SI units."""
+    site, settings = predictor.site, predictor.settings
+    heights = tuple(mapped.grid.heights_m.tolist())
+    more = one_more(site, settings, floor, mounts, heights) if len(site.anchors) < 200 else None
+    return {
+        "site": site.name,
+        "method": settings.method,
+        "tx_stamp_ps": site.noise.tx_stamp_ps,
+        "rx_stamp_ps": site.noise.rx_stamp_ps,
+        "qa": settings.qa,
+        "range_m": range_of(settings.channel),
+        "superframe_s": superframe_s(site),
+        "master": site.master if site.schedule.needs_master else None,
+        "dimensions": 3 if site.tags.height_m is None else 2,
+        "heights_m": heights,
+        "region_m": floor.region_m,
+        "outline_m": floor.outline_m,
+        "step_m": mapped.grid.step_m,
+        "computed_every_m": mapped.computed_every_m,
+        **msgspec.to_builtins(summary),
+        "walls_bias": mapped.has_bias,
+        "anchors": [
+            {
+                "id": anchor.id,
+                "x_m": anchor.x_m,
+                "y_m": anchor.y_m,
+                "z_m": anchor.z_m,
+                "hears_master": None if predictor.master is None else float(predictor.links.share[row]),
+                "sends": bool(predictor.clocks.sends[row]),
+            }
+            for row, anchor in enumerate(site.anchors)
+        ],
+        "warnings": plan_warnings(predictor, floor, mapped),
+        "one_more": more,
+        "optimised": None if optimised is None else _optimised(optimised),
+        "verification": checked,
+    }
+
+
+def _optimised(found: Optimised) -> dict[str, Any]:
+    return {
+        "best": _scored(found.best),
+        "even": _scored(found.even),
+        "mean_ratio": found.best.mean_sigma_m / found.even.mean_sigma_m,
+        "worst_ratio": found.best.worst_sigma_m / found.even.worst_sigma_m,
+        "target_met": found.target_met,
+        "evaluations": found.evaluations,
+        "finished": found.finished,
+    }
+
+
+def _scored(scored: Scored) -> dict[str, Any]:
+    return {
+        "mean_sigma_m": scored.mean_sigma_m,
+        "worst_sigma_m": scored.worst_sigma_m,
+        "covered_share": scored.covered_share,
+        "master": scored.site.master if scored.site.schedule.needs_master else None,
+        "anchors": [(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in scored.site.anchors],
+    }
+
+
+def described(result: dict[str, Any]) -> str:
+    """Method, noise and schedule in one line."""
+    tx_ps, rx_ps = result["tx_stamp_ps"], result["rx_stamp_ps"]
+    noise = f"{tx_ps:g} ps" if tx_ps == rx_ps else f"{tx_ps:g} ps (TX) and {rx_ps:g} ps (RX)"
+    process_noise = f" with qa {result['qa']:g} m²/s³" if result["method"] == "joint" else ""
+    return (
+        f"predicted for {result['method']}{process_noise}, stamps of {noise}, "
+        f"{'periods' if result['master'] is None else 'superframes'} of {1e3 * result['superframe_s']:.1f} ms, "
+        "tags at rest"
+    )
+
+
+_WEAK_RATIO: Final = 2.0  # a position is weak where the error exceeds this multiple of the median
+_MIRROR_POINTS: Final = 150
+
+
+def plan_warnings(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str]:
+    """All that may cost accuracy or the fix, from the site alone and from its map."""
+    return [
+        *warnings_of(predictor.site),
+        *master_warnings(predictor.site, predictor.settings.channel),
+        *_order(predictor),
+        *_mirrors(predictor, floor, plan),
+        *_holes(plan),
+        *_weak(plan),
+        *_walls(predictor, plan),
+    ]
+
+
+def _order(predictor: Predictor) -> list[str]:
+    if predictor.settings.method in FILTERS:
+        return []
+    kappa, _ = delays(predictor.site)
+    early = [anchor.id for anchor, delay in zip(predictor.site.anchors, kappa, strict=True) if delay < 0.0]
+    if not early:
+        return []
+    numbers = ", ".join(map(str, early))
+    return [f"anchor {numbers}: sends before the master in a round, and {predictor.settings.method} cannot use it"]
+
+
+def _mirrors(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str]:
+    """Ask the solver itself, with TDoAs that are exact, whether a position has a mirror image that fits as well."""
+    points, _ = sample_points(floor, tuple(plan.grid.heights_m.tolist()), _MIRROR_POINTS)
+    tx_var, rx_var = stamp_variances(predictor.site)
+    height = predictor.site.tags.height_m
+    share, _ = predictor.scene.heard_at(points)
+    ambiguous = [
+        point
+        for point, seen in zip(points, share >= IN_VIEW, strict=True)
+        if _has_mirror(predictor.anchors_m[seen], point, height, tx_var, rx_var)
+    ]
+    if not ambiguous:
+        return []
+    x, y, z = ambiguous[len(ambiguous) // 2]
+    return [
+        f"{len(ambiguous) / len(points):.0%} of the region has a mirror image that explains the measurements as well, "
+        f"for one around ({x:.1f}, {y:.1f}, {z:.1f}): vary the anchors' heights, or set tags.height_m if it is known"
+    ]
+
+
+def _has_mirror(anchors: Array, point: Array, height_m: float | None, tx_var: float, rx_var: float) -> bool:
+    """Whether the anchors in view, shape (n, 3), leave two positions."""
+    if len(anchors) < (4 if height_m is None else 3):
+        return False
+    ranges = np.linalg.norm(anchors - point, axis=1)
+    covariance = literal_covariance(np.full(len(anchors) - 1, 0.5), tx_var, rx_var)
+    solution = locate(anchors, ranges[1:] - ranges[0], covariance, height_m=height_m)
+    return isinstance(solution, NoSolution) and solution.reason is NoFixReason.MIRROR
+
+
+def _holes(plan: PlanMap) -> list[str]:
+    share = np.where(plan.grid.within, plan.column(FIX_SHARE), np.nan)
+    missing = share < 0.5
+    if not missing.any():
+        return []
+    part = missing.sum() / (plan.grid.points)
+    x, y, z = _central(plan, missing)
+    return [f"{part:.1%} of the region has no fix most of the time, as around ({x:.1f}, {y:.1f}, {z:.1f})"]
+
+
+def _weak(plan: PlanMap) -> list[str]:
+    sigma = np.where(plan.column(FIX_SHARE) >= 0.5, plan.column(SIGMA), np.nan)
+    if not np.isfinite(sigma).any():
+        return []
+    median, worst = float(np.nanmedian(sigma)), float(np.nanmax(sigma))
+    if worst < _WEAK_RATIO * median:
+        return []
+    part = float(np.nansum(sigma > _WEAK_RATIO * median)) / plan.grid.points
+    x, y, z = _central(plan, sigma == worst)
+    return [
+        f"weak corner at ({x:.1f}, {y:.1f}, {z:.1f}): {100 * worst:.1f} cm, {worst / median:.1f} times the median; "
+        f"{part:.1%} of the region is worse than {_WEAK_RATIO:g} times the median"
+    ]
+
+
+def _walls(predictor: Predictor, plan: PlanMap) -> list[str]:
+    bias, sigma = plan.column(BIAS), plan.column(SIGMA)
+    known = np.isfinite(bias) & np.isfinite(sigma)
+    worse = known & (bias > sigma)
+    if not worse.any():
+        return []
+    largest = float(bias[known].max())
+    # its monitors are not in the prediction (docs/planning.md)
+    monitors = "; joint may take delays for faults of anchors there, and err more than predicted"
+    return [
+        f"walls' delays shift positions by more than their standard deviation in {worse.sum() / known.sum():.0%} of "
+        f"the region, by {100 * largest:.0f} cm at most{monitors if predictor.settings.method == 'joint' else ''}"
+    ]
+
+
+def _central(plan: PlanMap, where: Mask) -> tuple[float, float, float]:
+    k, y, x = np.nonzero(where)
+    points = np.column_stack([plan.grid.x_m[x], plan.grid.y_m[y], plan.grid.heights_m[k]])
+    nearest = points[np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1))]
+    return float(nearest[0]), float(nearest[1]), float(nearest[2])

@@ -1,0 +1,330 @@
+"""One constant for each anchor from time differences at known positions, robustly, with honest standard errors.
+
+A difference measures |p − b| − |p − a| + bias_b − bias_a (+ slope·ln(|p − b| / |p − a|)) + noise. With p known the
+biases follow by linear regression: Huber's weights, and nothing beyond four standard deviations. Only differences of
+constants can be seen; the zero is their mean, or one anchor.
+"""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.core.kernels.arrays import Array, Integers, Mask, Vector
+from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
+
+# The robust regression behind a calibration: constants of anchors, and a slope, from differences at known positions.
+
+_HUBER: Final = 1.345
+"""Standard deviations up to which a residual has full weight: 95 % of the efficiency on Gaussian noise."""
+
+_REJECT: Final = 4.0
+
+_BLOCK_S: Final = 5.0
+"""Reflections change while a walker or a drone goes a metre or two: errors within such a time count as one."""
+
+_FEWEST_BLOCKS: Final = 10
+
+_MIN_MOTION: Final = 0.05
+"""How much the logarithms of the ratios must change beyond what constants explain for a slope to be looked for."""
+
+
+class Differences(Struct, frozen=True):
+    """Time differences at known positions, n of them."""
+
+    t_s: Vector
+    """Shape (n,), not decreasing."""
+    anchor_a: Integers
+    anchor_b: Integers
+    excess_m: Vector
+    """Measured less what follows from the geometry."""
+    log_ratio: Vector
+    """ln(range to b / range to a)."""
+
+    def select(self, rows: Mask | Integers) -> "Differences":
+        """These rows."""
+        a, b = self.anchor_a[rows], self.anchor_b[rows]
+        return Differences(self.t_s[rows], a, b, self.excess_m[rows], self.log_ratio[rows])
+
+
+class Fit(Struct, frozen=True):
+    """A regression: m anchors, n differences."""
+
+    anchors: Integers
+    bias_m: Vector
+    """Shape (m,), sum 0."""
+    covariance_m2: Array
+    """Shape (m, m), or (m + 1, m + 1) with the slope."""
+    slope_m: float | None
+    residual_m: Vector
+    used: Mask
+    scale_m: float
+    a: Integers
+    b: Integers
+    counts: Integers
+
+
+def fit(data: Differences, anchors: Integers, *, slope: bool) -> Fit:
+    """Fit one constant for each of the anchors, all of them tied together by the differences, perhaps with a slope."""
+    a, b = np.searchsorted(anchors, data.anchor_a), np.searchsorted(anchors, data.anchor_b)
+    x = data.log_ratio if slope else np.zeros(len(a))
+    y = _pair_medians(a, b, data.excess_m, len(anchors))
+    weights = np.ones(len(a))
+    for step in range(50):
+        before = weights
+        solution = _solve(_normal(a, b, x, weights, len(anchors)), _right(a, b, x, weights * y, len(anchors)))
+        residual_m = data.excess_m - _model(solution, a, b, x)
+        scale_m = max(1.4826 * float(np.median(np.abs(residual_m))), 1e-6)
+        share = np.abs(residual_m) / scale_m
+        weights = np.where(share <= _REJECT, np.minimum(1.0, _HUBER / np.maximum(share, _HUBER)), 0.0)
+        y = data.excess_m
+        if step and np.abs(weights - before).max() < 1e-6:
+            break
+    used = share <= _REJECT
+    counts = np.bincount(a[used], minlength=len(anchors)) + np.bincount(b[used], minlength=len(anchors))
+    covariance = _covariance(data.t_s, a, b, x, residual_m, scale_m, len(anchors))
+    if not slope:
+        covariance = covariance[:-1, :-1]
+    bias = solution[:-1]
+    return Fit(
+        anchors, bias, covariance, float(solution[-1]) if slope else None, residual_m, used, scale_m, a, b, counts
+    )
+
+
+def moves(data: Differences, found: Fit) -> bool:
+    """Whether the ranges change enough; at one position a slope looks like constants."""
+    a, b, count, still = found.a, found.b, len(found.anchors), np.zeros(len(found.a))
+    alike = _solve(_normal(a, b, still, still + 1.0, count), _right(a, b, still, data.log_ratio, count))
+    change = data.log_ratio - _model(alike, a, b, still)
+    return float(np.sqrt(np.mean(change**2))) > _MIN_MOTION
+
+
+def _pair_medians(a: Integers, b: Integers, excess_m: Vector, count: int) -> Vector:
+    """Each difference replaced by the median of its pair: a start that outliers do not touch."""
+    start = np.empty_like(excess_m)
+    pair = a * count + b
+    for one in np.unique(pair):
+        of_pair = pair == one
+        start[of_pair] = np.median(excess_m[of_pair])
+    return start
+
+
+def _solve(normal: Array, right: Vector) -> Vector:
+    solution: Vector = np.linalg.solve(normal, right).astype(np.float64)
+    return solution
+
+
+def _model(solution: Vector, a: Integers, b: Integers, x: Vector) -> Vector:
+    values: Vector = solution[b] - solution[a] + solution[-1] * x
+    return values
+
+
+def _right(a: Integers, b: Integers, x: Vector, values: Vector, count: int) -> Vector:
+    """Hᵀ times values; the slope is the last column."""
+    right: Vector = (np.bincount(b, values, count + 1) - np.bincount(a, values, count + 1)).astype(np.float64)
+    right[-1] = x @ values
+    return right
+
+
+def _normal(a: Integers, b: Integers, x: Vector, weights: Vector, count: int) -> Array:
+    """Hᵀ W H; the sum of the constants is held at zero, and the slope where nothing determines it."""
+    normal = np.zeros((count + 1, count + 1))
+    flat = normal.reshape(-1)
+    for row, column, sign in ((a, a, 1.0), (b, b, 1.0), (a, b, -1.0), (b, a, -1.0)):
+        flat += sign * np.bincount(row * (count + 1) + column, weights, flat.size)
+    cross = np.bincount(b, weights * x, count + 1) - np.bincount(a, weights * x, count + 1)
+    normal[-1, :] += cross
+    normal[:, -1] += cross
+    normal[-1, -1] = weights @ (x * x)
+    typical = max(float(np.trace(normal[:-1, :-1])) / count, 1e-9)
+    normal[:-1, :-1] += typical / count
+    normal[-1, -1] += 1e-9 * typical
+    return normal
+
+
+def _covariance(
+    t_s: Vector, a: Integers, b: Integers, x: Vector, residual_m: Vector, scale_m: float, count: int
+) -> Array:
+    """Errors within a block of time taken as one (sandwich); never less than independent ones would make it."""
+    share = np.abs(residual_m) / scale_m
+    influence = np.where(share <= _REJECT, np.clip(residual_m, -_HUBER * scale_m, _HUBER * scale_m), 0.0)
+    bread = np.linalg.inv(_normal(a, b, x, (share < _HUBER).astype(np.float64), count))
+    block_s = min(_BLOCK_S, (t_s[-1] - t_s[0]) / _FEWEST_BLOCKS)
+    block = ((t_s - t_s[0]) / max(block_s, 1e-9)).astype(np.int64)
+    blocks = [_right(a[here], b[here], x[here], influence[here], count) for here in map(block.__eq__, np.unique(block))]
+    meat = np.array(blocks).T @ np.array(blocks) * len(blocks) / max(len(blocks) - 1, 1)
+    white = _normal(a, b, x, influence**2, count)
+    together, apart = bread @ meat @ bread, bread @ white @ bread
+    grow = np.sqrt(np.maximum(np.diag(apart) / np.maximum(np.diag(together), 1e-30), 1.0))
+    result: Array = together * np.outer(grow, grow)
+    return result
+
+
+# The estimate: which constants are determined, their zero and their standard errors.
+
+_FEWEST: Final = 3  # accepted differences below which an anchor's constant is not determined
+_MAX_STD_M: Final = 0.1  # a constant that is known worse does more harm than good
+_STEEPEST_M: Final = 0.12
+"""Decawave's table (APS011) is nowhere steeper than 12 mm/dB, 0.105 m while the range grows by the factor e."""
+
+_SURE: Final = 3.0  # the slope is used if it is at least this number of its standard errors
+_MAD_ERROR: Final = 1.17  # relative standard error of a 1.4826 MAD of n Gaussian values, times √n
+_ALIKE: Final = "not used: the positions are too much alike to determine it"
+
+
+class AnchorEstimate(Struct, frozen=True):
+    """What was found out about one anchor, metres."""
+
+    anchor: int
+    count: int
+    """Differences that were used."""
+    bias_m: float | None
+    """None where it is not determined."""
+    std_m: float | None
+    """Standard error; 0 for the anchor that is the zero."""
+    noise_m: float | None
+    reason: str | None
+    """Why the constant is not determined."""
+
+
+class CalibrationEstimate(Struct, frozen=True):
+    """All that a calibration found, metres."""
+
+    anchors: tuple[AnchorEstimate, ...]
+    zero: str
+    """"mean" of the determined anchors, or "anchor N"."""
+    slope_m: float | None
+    """Growth of every bias while the range grows by the factor e; None where it is not used."""
+    slope_std_m: float | None
+    slope_note: str
+    noise_m: float | None
+    """Noise of a difference once the calibration is off (1.4826 MAD)."""
+    noise_before_m: float | None
+    """The same about zero before."""
+    loop_m: float | None
+    """What constants cannot explain: root mean square over the pairs of their median residual."""
+    used: int
+    rejected: int
+
+    def calibration(self) -> DifferenceCalibration:
+        """As a receiver applies it."""
+        slope_m = self.slope_m or 0.0
+        return DifferenceCalibration(
+            {
+                anchor.anchor: AnchorCalibration(anchor.bias_m, slope_m, _at_most(anchor))
+                for anchor in self.anchors
+                if anchor.bias_m is not None
+            }
+        )
+
+
+def _at_most(anchor: AnchorEstimate) -> float | None:
+    """The noise that it has at most, as far as its differences can show (twice the error of a 1.4826 MAD)."""
+    return None if anchor.noise_m is None else anchor.noise_m * (1.0 + 2.0 * _MAD_ERROR / anchor.count**0.5)
+
+
+def estimate(differences: Differences, *, zero: int | None = None, slope: bool = True) -> CalibrationEstimate:
+    """Estimate the anchors' constants; ``zero``: the anchor whose constant is 0, by default their mean is.
+
+    With ``slope`` the growth with the range is estimated too, and used if it differs from zero and is one that
+    the radio can have.
+    """
+    found = np.unique(np.concatenate([differences.anchor_a, differences.anchor_b]))
+    kept, reasons = _connected(differences, found.tolist(), zero)
+    data = differences.select(np.isin(differences.anchor_a, kept))
+    plain = fit(data, np.array(kept, dtype=np.int64), slope=False)
+    steep = fit(data, plain.anchors, slope=True) if slope and moves(data, plain) else None
+    note = _ALIKE if slope else "not asked for"
+    if steep is not None:
+        note = _slope_note(steep)
+    chosen = steep if steep is not None and not note else plain
+    for anchor, count in zip(chosen.anchors.tolist(), chosen.counts.tolist(), strict=True):
+        if count < _FEWEST:
+            reasons[anchor] = f"only {count} differences that can be used; {_FEWEST} are needed"
+    return _estimate(differences, chosen, steep, note or "used", reasons, zero)
+
+
+def _connected(differences: Differences, anchors: Sequence[int], zero: int | None) -> tuple[list[int], dict[int, str]]:
+    """Anchors of the part that holds the zero, or else of the part with most anchors; and why others are not."""
+    part_of = {anchor: {anchor} for anchor in anchors}
+    pairs = np.unique(np.stack([differences.anchor_a, differences.anchor_b], 1), axis=0)
+    for a, b in pairs.tolist():
+        joined, other = part_of[a], part_of[b]
+        if joined is not other:
+            joined |= other
+            part_of.update(dict.fromkeys(other, joined))
+    chosen = part_of[zero] if zero in part_of else max(part_of.values(), key=lambda part: (len(part), -min(part)))
+    kept = sorted(chosen)
+    lost = [anchor for anchor in anchors if anchor not in chosen]
+    return kept, dict.fromkeys(lost, "no chain of differences ties it to the others")
+
+
+def _slope_note(found: Fit) -> str:
+    slope_m, std_m = found.slope_m or 0.0, float(np.sqrt(found.covariance_m2[-1, -1]))
+    if std_m > _STEEPEST_M / _SURE:
+        return _ALIKE
+    if slope_m < _SURE * std_m:
+        return "not used: it does not differ from zero"
+    if slope_m > _STEEPEST_M:
+        return "not used: no radio has such a slope, so it has another cause"
+    return ""
+
+
+def _estimate(
+    differences: Differences,
+    found: Fit,
+    steep: Fit | None,
+    note: str,
+    reasons: dict[int, str],
+    zero: int | None,
+) -> CalibrationEstimate:
+    count = len(found.anchors)
+    good = np.array([anchor not in reasons for anchor in found.anchors.tolist()])
+    bias_m, std_m = _in_gauge(found, good, zero)
+    for row in np.flatnonzero(good & (std_m > _MAX_STD_M)):
+        reasons[int(found.anchors[row])] = f"its standard error would be {std_m[row]:.2f} m"
+    rows = {anchor: row for row, anchor in enumerate(found.anchors.tolist())}
+    anchors = []
+    differences_used = int(found.used.sum())
+    for anchor in np.unique(np.concatenate([differences.anchor_a, differences.anchor_b])).tolist():
+        own_row = rows.get(anchor)
+        used = 0 if own_row is None else int(found.counts[own_row])
+        if own_row is None or anchor in reasons:
+            anchors.append(AnchorEstimate(anchor, used, None, None, None, reasons[anchor]))
+            continue
+        of_anchor = np.abs(found.residual_m[found.used & ((found.a == own_row) | (found.b == own_row))])
+        noise_m = 1.4826 * float(np.median(of_anchor)) * _spent(differences_used, len(found.anchors))
+        anchors.append(AnchorEstimate(anchor, used, float(bias_m[own_row]), float(std_m[own_row]), noise_m, None))
+    pair = found.a * count + found.b
+    medians = [float(np.median(found.residual_m[here])) for here in map(pair.__eq__, np.unique(pair[found.used]))]
+    return CalibrationEstimate(
+        anchors=tuple(anchors),
+        zero="mean" if zero is None else f"anchor {zero}",
+        slope_m=found.slope_m,
+        slope_std_m=None if steep is None else float(np.sqrt(steep.covariance_m2[-1, -1])),
+        slope_note=note,
+        noise_m=found.scale_m * _spent(differences_used, len(found.anchors)),
+        noise_before_m=1.4826 * float(np.median(np.abs(differences.excess_m))),
+        loop_m=float(np.sqrt(np.mean(np.square(medians)))),
+        used=differences_used,
+        rejected=len(differences.t_s) - differences_used,
+    )
+
+
+def _spent(differences: int, anchors: int) -> float:
+    """Residuals are smaller than the noise by what the estimated constants took out of them."""
+    return float(np.sqrt(differences / max(differences - anchors + 1, 1)))
+
+
+def _in_gauge(found: Fit, good: Mask, zero: int | None) -> tuple[Vector, Vector]:
+    """Constants and their standard errors with the zero where it should be, each of shape (m,)."""
+    count = len(found.anchors)
+    zero_weights = np.zeros(count)
+    if zero is not None:
+        zero_weights[found.anchors == zero] = 1.0
+    else:
+        zero_weights[good] = 1.0 / max(int(good.sum()), 1)
+    shift = np.eye(count) - zero_weights
+    covariance = shift @ found.covariance_m2[:count, :count] @ shift.T
+    return shift @ found.bias_m, np.sqrt(np.maximum(np.diag(covariance), 0.0))

@@ -1,0 +1,1 @@
+"""Fit of positions to ranges."""

@@ -1,0 +1,656 @@
+"""A fit that late ranges do not spoil, and the other results that fit the ranges as well.
+
+Radio may take a longer way, never a shorter one: a range counts as wrong if it comes 3 σ later than the positions say,
+or 6 σ earlier. The weighted squares, each cut off there, have many minima; graduated non-convexity (Yang and others,
+2020) leads from plain least squares to a good one, from several starts. The best is improved until no result close to
+it is better: with an anchor elsewhere, or with one or two ranges fewer. Those nearly as good make it ambiguous.
+"""
+
+from itertools import combinations
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import astuple, replace
+
+from skyless.core.kernels.arrays import Array, Integers, Mask
+from skyless.site.survey.fit.determined import aligned_covariance
+from skyless.site.survey.fit.problem import (
+    Problem,
+    Solution,
+    Solutions,
+    adjacency,
+    jacobian,
+    residuals_m,
+    solve_least_squares,
+    solve_many,
+    superimposed,
+    unknown_columns,
+)
+
+LATE_CUTOFF: Final = 3.0
+EARLY_CUTOFF: Final = 6.0
+"""In standard deviations of a range."""
+
+_LATE_BEND: Final = 0.5
+_EARLY_BEND: Final = 3.0
+"""Where Huber's cost becomes linear, in standard deviations: absolute values on the late side, nearly."""
+
+_HUBER_ROUNDS: Final = 12
+_STEPS_A_ROUND: Final = 2
+_GROWTH: Final = 1.4
+_FAST_GROWTH: Final = 2.0
+_MANY_UNKNOWNS: Final = 100
+_AGREEING_STARTS: Final = 3
+"""Large sites have ranges to spare: larger steps lead to the same minimum, and where the first starts agree the others
+are left out."""
+
+_LAST_CONTROL: Final = 30.0  # where the graduated cost is as good as cut off
+_MAX_CHANGES: Final = 10  # of the set of used ranges, until it no longer changes
+_MIN_CHECKS: Final = 4.0
+_SIGNIFICANT: Final = 2.6
+"""Standard deviations by which squares of residuals must exceed what is expected if no range was left out."""
+
+_MIN_LEFT: Final = 1.0
+"""Ranges more than unknowns that must remain after some were left out: with less, any range can be left out, and what
+remains fits exactly, even if folded."""
+
+_LARGEST_SQUARES: Final = 6.6
+_WIDEST: Final = 2.0
+"""Weighted squares of one range too many in 99 % of sites, and the part by which standard deviations may be too small
+before a range must be late even so."""
+
+_EXCESS_WEIGHT: Final = 15.0
+_MIN_EVIDENCE: Final = 20.0
+"""For a larger error: twice the logarithm of likelihoods, and these standard deviations times a weight. Late ranges
+that were left out say nothing of the error of the others; so likelihoods alone mistake many late ranges for it."""
+
+_FIRST_WIDTH: Final = 4.0  # in expected errors
+_MAX_WIDENINGS: Final = 20
+_SAME_WIDTH: Final = 0.03
+_MIN_STD_M: Final = 0.005
+_LARGEST_STD_M: Final = 0.3
+
+_MAX_IMPROVEMENTS: Final = 8
+_MIN_GAIN: Final = 0.01  # fall of the cost by a better result nearby
+_SAME_M: Final = 0.005  # residuals that differ by less belong to one minimum
+
+
+class RobustFit(Struct, frozen=True, eq=False):
+    """The best fit found."""
+
+    problem: Problem
+    """With the variances that were used."""
+    solution: Solution
+    """With the weights below."""
+    weight: Array
+    """Shape (m,), of ranges: 1 and 0, or less than 1 for those that come late where errors are larger than expected."""
+    used: Mask
+    """Shape (m,): ranges in use; the others are late."""
+    cost: float
+    """All weighted squares, each range's cut off."""
+    range_std_m: float
+    """Constant error of a pair that the fit assumes."""
+    others: "Minima"
+    """Minima found near this one, for the search of ambiguities."""
+
+
+class Minima(Struct, frozen=True, eq=False):
+    """Minima of the cut-off cost, the best first."""
+
+    position_m: Array
+    delay_m: Array
+    """Shapes (b, n, 3) and (b, n)."""
+    used: Mask
+    """Shape (b, m)."""
+    cost: Array
+    """Shape (b,)."""
+
+
+def fit_robustly(problem: Problem, starts: list[Array], pair_std_m: float = 0.0) -> RobustFit:
+    """Fit positions and delays to the ranges that agree, from several starts of shape (n, 3).
+
+    ``pair_std_m``: the part of the ranges' standard deviations that is a pair's constant error. Where the residuals
+    show that it is larger, the larger one is used.
+    """
+    start_m = np.stack(starts)
+    narrow = _best_near(problem, _from_starts(problem, start_m), pair_std_m)
+    whole = None if narrow.used.all() else _with_all_ranges(narrow, start_m)
+    if whole is not None:
+        return whole
+    checks = redundancy(problem, narrow.solution, narrow.used)
+    excess = _excess(_squares(problem, narrow.solution, narrow.used), checks)
+    if checks < _MIN_CHECKS or (narrow.used.all() and excess < _SIGNIFICANT):
+        return narrow
+    std_m = _shown_std_m(narrow)
+    if std_m <= pair_std_m:
+        return narrow
+    wider = replace(problem, variance_m2=problem.variance_m2 - pair_std_m**2 + std_m**2)
+    wide = _best_near(wider, _from_starts(wider, start_m), std_m)
+    # Twice the logarithm of how much likelier the ranges are: a larger error makes each range in use less likely.
+    in_use = wide.used
+    width = np.mean(np.log(wider.variance_m2 / problem.variance_m2)[in_use])
+    likelier = narrow.cost - wide.cost - redundancy(wider, wide.solution, in_use) * width
+    return _softened(wide) if likelier + _EXCESS_WEIGHT * excess > _MIN_EVIDENCE else narrow
+
+
+def _with_all_ranges(fit: RobustFit, start_m: Array) -> RobustFit | None:
+    """The fit with all ranges, if nothing checks that some of them are late and all agree within larger errors."""
+    if redundancy(fit.problem, fit.solution, fit.used) >= _MIN_LEFT:
+        return None
+    everything = np.ones(len(fit.used), dtype=np.bool_)
+    plain = _plain(fit.problem, start_m)
+    position_m, delay_m = plain.position_m[0], plain.delay_m[0]
+    solution = solve_least_squares(fit.problem, position_m)
+    checks = redundancy(fit.problem, solution, everything)
+    ratio = float(np.sqrt(_squares(fit.problem, solution, everything) / (_LARGEST_SQUARES * max(checks, 1.0))))
+    if ratio > _WIDEST:
+        return None
+    std_m = max(ratio, 1.0) * fit.range_std_m
+    wider = replace(fit.problem, variance_m2=fit.problem.variance_m2 - fit.range_std_m**2 + std_m**2)
+    minima = cut_off(wider, position_m[None], delay_m[None], everything[None])
+    solution = solve_least_squares(wider, position_m)
+    return RobustFit(
+        wider, solution, everything.astype(np.float64), everything, solution.cost, std_m, _joined(minima, fit.others)
+    )
+
+
+def _softened(fit: RobustFit) -> RobustFit:
+    """The fit with late ranges bent instead of cut off.
+
+    Where ranges scatter more than is expected, no gap parts late ranges from the others, and cutting some of them off
+    depends on chance: one-sided absolute values are a quarter more accurate on drawn plants.
+    """
+    problem = fit.problem
+    start = Solutions(
+        fit.solution.position_m[None], fit.solution.delay_m[None], fit.solution.residual_m[None], np.array([fit.cost])
+    )
+    bent = _huber(problem, start)
+    weight = _bent_weight(problem, bent.residual_m)[0]
+    solution = solve_least_squares(problem, bent.position_m[0], weight)
+    return replace(fit, solution=solution, weight=weight, used=_in_cutoffs(problem, solution.residual_m) < 1.0)
+
+
+def _best_near(problem: Problem, minima: Minima, pair_std_m: float) -> RobustFit:
+    """The best of some minima, or a better one that is found from there."""
+    presence = Presence(problem, minima.position_m[0])
+    best_whole = np.inf
+    fit: RobustFit | None = None
+    for _ in range(_MAX_IMPROVEMENTS):
+        whole = minima.cost + presence.cost(minima.position_m)
+        if fit is not None and (not len(whole) or whole.min() > best_whole - _MIN_GAIN):
+            break
+        best = int(np.argmin(whole))
+        best_whole, used = float(whole[best]), minima.used[best]
+        solution = solve_least_squares(problem, minima.position_m[best], used.astype(np.float64))
+        cost = float(minima.cost[best])
+        minima = _joined(_near(problem, solution, used), minima)
+        fit = RobustFit(problem, solution, used.astype(np.float64), used, cost, pair_std_m, minima)
+    assert fit is not None
+    return fit
+
+
+def _shown_std_m(fit: RobustFit) -> float:
+    """The constant error of a pair that residuals of ranges in use show, if it is more than the fit assumes.
+
+    Few ranges too many can be made to agree by leaving out those that do not, whatever their error: so the search
+    begins with a larger error, and goes on to what the residuals show until both agree.
+    """
+    least_m, problem = fit.range_std_m, fit.problem
+    position_m, delay_m = fit.solution.position_m[None], fit.solution.delay_m[None]
+    std_m = _FIRST_WIDTH * max(least_m, _MIN_STD_M)
+    for _ in range(_MAX_WIDENINGS):
+        wider = replace(problem, variance_m2=problem.variance_m2 - least_m**2 + std_m**2)
+        near = graduated(wider, position_m, delay_m, np.full(1, 0.1))
+        position_m, delay_m, used = near.position_m, near.delay_m, near.used[0]
+        solution = solve_least_squares(wider, position_m[0], used.astype(np.float64))
+        checks = redundancy(wider, solution, used)
+        if checks < _MIN_CHECKS:
+            return least_m
+        before_m = std_m
+        ratio = np.sqrt(_squares(wider, solution, used) / checks)
+        std_m = float(np.clip(std_m * np.clip(ratio, 0.5, 1.5), least_m, _LARGEST_STD_M))
+        if abs(std_m - before_m) <= _SAME_WIDTH * before_m:
+            break
+    return std_m
+
+
+def _squares(problem: Problem, solution: Solution, used: Mask) -> float:
+    return float(np.sum(used * solution.residual_m**2 / problem.variance_m2))
+
+
+def _excess(squares: float, checks: float) -> float:
+    """Standard deviations by which weighted squares exceed what is expected: their cube root is nearly normal."""
+    variance = 2.0 / (9.0 * max(checks, 1e-6))
+    return float((np.cbrt(squares / max(checks, 1e-6)) - 1.0 + variance) / np.sqrt(variance))
+
+
+def _near(problem: Problem, solution: Solution, used: Mask) -> Minima:
+    """Minima with an anchor elsewhere, or with one or two ranges fewer."""
+    start_m = relocated(problem, solution.position_m, solution.delay_m)
+    delay_m = np.tile(solution.delay_m, (len(start_m), 1))
+    elsewhere = graduated(problem, start_m, delay_m, np.full(len(start_m), 0.3))
+    sets = without_ranges(problem, solution, used)
+    position_m, delay_m = np.tile(solution.position_m, (len(sets), 1, 1)), np.tile(solution.delay_m, (len(sets), 1))
+    fewer = cut_off(problem, position_m, delay_m, sets)
+    return _joined(elsewhere, fewer)
+
+
+def _joined(some: Minima, more: Minima) -> Minima:
+    both = [np.concatenate(parts) for parts in zip(astuple(some), astuple(more), strict=True)]
+    order = np.argsort(both[3], kind="stable")
+    return Minima(*(part[order] for part in both))
+
+
+def redundancy(problem: Problem, solution: Solution, used: Mask) -> float:
+    """Ranges in use less the unknowns that they determine; what is expected of delays and coordinates counts, too."""
+    in_use = np.flatnonzero(used)
+    derivative = jacobian(problem, solution.position_m)[np.ix_(in_use, unknown_columns(problem))]
+    influence = np.linalg.solve(regular(solution.information), derivative.T)
+    return float(len(in_use) - np.einsum("ij,ji->", derivative, influence))
+
+
+def _from_starts(problem: Problem, start_m: Array) -> Minima:
+    """Minima that plain and one-sided least squares and graduated non-convexity reach."""
+    plain = _plain(problem, start_m[:_AGREEING_STARTS] if _is_large(problem) else start_m)
+    if _is_large(problem) and len(plain.cost) > 1:
+        plain = _plain(problem, start_m)
+    bent = _distinct(_huber(problem, plain))
+    position_m = np.concatenate([plain.position_m, bent.position_m, bent.position_m])
+    delay_m = np.concatenate([plain.delay_m, bent.delay_m, bent.delay_m])
+    # a bent start comes twice: from the convex cost, and from one that trusts it.
+    nearly_cut = np.arange(len(position_m)) >= len(plain.position_m) + len(bent.position_m)
+    return graduated(problem, position_m, delay_m, np.where(nearly_cut, 0.3, 0.0))
+
+
+def _plain(problem: Problem, start_m: Array) -> Solutions:
+    everything = np.ones((len(start_m), len(problem.range_m)))
+    return _distinct(solve_many(problem, start_m, everything, most_steps=15))
+
+
+def _is_large(problem: Problem) -> bool:
+    return int(np.count_nonzero(problem.is_free)) + len(problem.delay_m) > _MANY_UNKNOWNS
+
+
+def _huber(problem: Problem, start: Solutions) -> Solutions:
+    """Least squares with late residuals by their absolute value."""
+    fit = start
+    for _ in range(_HUBER_ROUNDS):
+        weight = _bent_weight(problem, fit.residual_m)
+        fit = solve_many(problem, fit.position_m, weight, fit.delay_m, _STEPS_A_ROUND)
+    return fit
+
+
+def _bent_weight(problem: Problem, residual_m: Array) -> Array:
+    """Weights that make squares absolute values, far on the early and soon on the late side; shape as given."""
+    scaled = residual_m / np.sqrt(problem.variance_m2)
+    bend = np.where(scaled > 0.0, _LATE_BEND, _EARLY_BEND)
+    return np.asarray(bend / np.maximum(np.abs(scaled), bend))
+
+
+def graduated(problem: Problem, position_m: Array, delay_m: Array, least_control: Array) -> Minima:
+    """Graduated non-convexity from ``b`` starts: controls of 0 begin with a convex cost, of 1 near the cut-off one."""
+    scaled = _in_cutoffs(problem, residuals_m(problem, position_m, delay_m))
+    convex = 1.0 / np.maximum(2.0 * np.max(scaled, axis=1, initial=0.0) - 1.0, 1.0 / _LAST_CONTROL)
+    control = np.maximum(convex, least_control)
+    growth = _FAST_GROWTH if _is_large(problem) else _GROWTH
+    while np.any(control < _LAST_CONTROL):
+        mu = control[:, None]
+        weight = np.sqrt(mu * (mu + 1.0) / np.maximum(scaled, 1e-12)) - mu
+        weight = np.clip(weight, 0.0, 1.0)
+        fit = solve_many(problem, position_m, weight, delay_m, _STEPS_A_ROUND)
+        position_m, delay_m = fit.position_m, fit.delay_m
+        scaled = _in_cutoffs(problem, fit.residual_m)
+        control = control * growth
+    return cut_off(problem, position_m, delay_m)
+
+
+def cut_off(problem: Problem, position_m: Array, delay_m: Array, used: Mask | None = None) -> Minima:
+    """Minima of the cut-off cost near ``b`` positions, where least squares and the set of used ranges agree.
+
+    ``used``: shape (b, m), the first set; by default what the positions' residuals say.
+    """
+    nearby = _in_cutoffs(problem, residuals_m(problem, position_m, delay_m)) < 1.0
+    used = nearby if used is None else used.copy()
+    position_m, delay_m = position_m.copy(), delay_m.copy()
+    cost = np.full(len(position_m), np.inf)
+    found = used.copy()
+    busy = np.arange(len(position_m))
+    for _ in range(_MAX_CHANGES):
+        weight = used[busy].astype(np.float64)
+        fit = solve_many(problem, position_m[busy], weight, delay_m[busy])
+        scaled = _in_cutoffs(problem, fit.residual_m)
+        new = scaled < 1.0
+        # Squares of all ranges, those that are out by what leaving them out costs.
+        squares = fit.residual_m**2 / problem.variance_m2
+        limit = np.where(fit.residual_m > 0.0, LATE_CUTOFF**2, EARLY_CUTOFF**2)
+        whole = fit.cost + np.sum(np.where(new, squares, limit) - weight * squares, axis=1)
+        better = whole < cost[busy]
+        chosen = busy[better]
+        cost[chosen], position_m[chosen], delay_m[chosen] = whole[better], fit.position_m[better], fit.delay_m[better]
+        found[chosen] = new[better]
+        changed = better & np.any(new != used[busy], axis=1)
+        used[busy] = new
+        busy = busy[changed]
+        if not busy.size:
+            break
+    order = np.argsort(cost, kind="stable")
+    return Minima(position_m[order], delay_m[order], found[order], cost[order])
+
+
+def _in_cutoffs(problem: Problem, residual_m: Array) -> Array:
+    """Squares of residuals, 1 where they are cut off; shape as given."""
+    cutoff = np.where(residual_m > 0.0, LATE_CUTOFF, EARLY_CUTOFF)
+    return np.asarray(residual_m**2 / (problem.variance_m2 * cutoff**2))
+
+
+def _distinct(fits: Solutions) -> Solutions:
+    """One of each minimum, by residuals, the cheapest first: these do not see how a site is turned."""
+    kept: list[int] = []
+    for index in np.argsort(fits.cost, kind="stable"):
+        apart = np.abs(fits.residual_m[kept] - fits.residual_m[index])
+        if not kept or np.all(np.max(apart, axis=1, initial=0.0) > _SAME_M):
+            kept.append(int(index))
+    return Solutions(fits.position_m[kept], fits.delay_m[kept], fits.residual_m[kept], fits.cost[kept])
+
+
+# Other results close to one
+
+
+_MAX_NEIGHBOURS: Final = 12  # anchors whose ranges give an anchor's other positions
+_MAX_RELOCATIONS: Final = 3  # per anchor
+_LOOSE_STD_M: Final = 0.05  # added to a range's standard deviation while all other anchors stay
+_LOOSE_COST: Final = 40.0  # a relocation may be worse by this while all other anchors stay
+_APART_M: Final = 0.25
+"""Positions of an anchor that differ by less are the same: leaving ranges out leads from one to the other."""
+
+_MIN_LATE: Final = 1.5
+"""Standard deviations by which a range is late if it is left out, by a linear prediction that errs."""
+
+_MIN_MOTION_M: Final = 0.03  # motion that leaving ranges out must cause, by the same prediction
+_UNCONTROLLED: Final = 0.02  # a share of redundancy below which ranges are not checked by others
+_MIN_REFITS: Final = 10
+_MAX_REFITS: Final = 600
+_REFIT_WORK: Final = 6e5  # refits times squared unknowns
+
+
+def relocated(problem: Problem, position_m: Array, delay_m: Array) -> Array:
+    """Starts with one anchor where circles (spheres) of two (three) of its ranges meet, shape (b, n, 3)."""
+    axes = np.flatnonzero(problem.is_free.all(axis=0))
+    found: list[tuple[float, int, Array]] = []
+    for anchor in range(len(position_m)):
+        for worse, other_m in _other_positions(problem, position_m, delay_m, anchor, axes):
+            found.append((worse, anchor, other_m))
+    found.sort(key=lambda item: item[:2])
+    unknowns = int(np.count_nonzero(problem.is_free)) + len(position_m)
+    starts = []
+    for _, anchor, other_m in found[: _most_refits(unknowns)]:
+        start_m = position_m.copy()
+        start_m[anchor] = other_m
+        starts.append(start_m)
+    return np.array(starts).reshape(-1, *position_m.shape)
+
+
+def _most_refits(unknowns: int) -> int:
+    """As many as large sites allow in little time."""
+    return int(np.clip(_REFIT_WORK / unknowns**2, _MIN_REFITS, _MAX_REFITS))
+
+
+def _other_positions(
+    problem: Problem, position_m: Array, delay_m: Array, anchor: int, axes: Integers
+) -> list[tuple[float, Array]]:
+    """Where one anchor may be as well, the best first, while all others stay; and by how much worse that fits."""
+    own = np.flatnonzero((problem.first == anchor) | (problem.second == anchor))
+    neighbour = problem.first[own] + problem.second[own] - anchor
+    if len(own) < len(axes) or len(axes) < 2:
+        return []
+    length_m = problem.range_m[own] - delay_m[neighbour] - delay_m[anchor]
+    others = np.setdiff1d(np.arange(3), axes)
+    across = np.sum((position_m[neighbour][:, others] - position_m[anchor, others]) ** 2, axis=1)
+    along_m = np.sqrt(np.maximum(length_m**2 - across, 0.0))
+    chosen = np.unique(np.linspace(0, len(own) - 1, min(len(own), _MAX_NEIGHBOURS)).astype(np.int64))
+    sets = np.array(list(combinations(chosen, len(axes))))
+    meeting_m = _meeting_points(position_m[neighbour][:, axes][sets], along_m[sets])
+    candidate_m = np.tile(position_m[anchor], (len(meeting_m) + 1, 1))
+    candidate_m[1:, axes] = meeting_m
+    distance = np.linalg.norm(candidate_m[:, None] - position_m[neighbour], axis=2)
+    variance = problem.variance_m2[own] + _LOOSE_STD_M**2 + np.minimum(problem.delay_variance_m2[anchor], 0.1**2)
+    residual_m = length_m - distance
+    cutoff = np.where(residual_m > 0.0, 9.0, 36.0)
+    known = np.where(problem.is_free[anchor], candidate_m - np.nan_to_num(problem.coordinate_m[anchor]), 0.0)
+    cost = np.minimum(residual_m**2 / variance, cutoff).sum(axis=1)
+    cost = cost + np.sum(known**2 / np.maximum(problem.coordinate_variance_m2[anchor], 1e-10), axis=1)
+    kept, worse = [position_m[anchor]], [0.0]
+    for index in np.argsort(cost, kind="stable"):
+        if cost[index] > cost[0] + _LOOSE_COST or len(kept) > _MAX_RELOCATIONS:
+            break
+        if np.linalg.norm(np.array(kept) - candidate_m[index], axis=1).min() > _APART_M:
+            kept.append(candidate_m[index])
+            worse.append(float(cost[index] - cost[0]))
+    return list(zip(worse, kept, strict=True))[1:]
+
+
+def _meeting_points(centre_m: Array, radius_m: Array) -> Array:
+    """Both points where circles, or spheres, meet: centres (c, d, d), radii (c, d); shape (2 c, d)."""
+    origin_m, side_m = centre_m[:, 0], centre_m[:, 1:] - centre_m[:, :1]
+    right = 0.5 * (radius_m[:, :1] ** 2 - radius_m[:, 1:] ** 2 + np.sum(side_m**2, axis=2))
+    foot_m = np.einsum("cij,cj->ci", np.linalg.pinv(side_m, rcond=1e-6), right)
+    if side_m.shape[2] == 2:
+        normal = np.stack([-side_m[:, 0, 1], side_m[:, 0, 0]], axis=1)
+    else:
+        normal = np.cross(side_m[:, 0], side_m[:, 1])
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=1), 1e-9)[:, None]
+    height_m = np.sqrt(np.maximum(radius_m[:, 0] ** 2 - np.sum(foot_m**2, axis=1), 0.0))[:, None]
+    return np.concatenate([origin_m + foot_m + height_m * normal, origin_m + foot_m - height_m * normal])
+
+
+def without_ranges(problem: Problem, solution: Solution, used: Mask) -> Mask:
+    """Sets of used ranges with one or two fewer that would then be late and let anchors move, shape (b, m).
+
+    What leaving out would do is predicted with the equations of the solution, so that only few sets need a refit.
+    """
+    in_use = np.flatnonzero(used)
+    if not in_use.size:
+        return np.zeros((0, len(used)), dtype=np.bool_)
+    std_m = np.sqrt(problem.variance_m2[in_use])
+    derivative = jacobian(problem, solution.position_m)[np.ix_(in_use, unknown_columns(problem))]
+    influence = np.linalg.solve(regular(solution.information), derivative.T)
+    redundancy = np.eye(len(in_use)) - derivative @ influence
+    residual = solution.residual_m[in_use] / std_m
+    own = np.maximum(np.diag(redundancy), 1e-6)
+    # Residuals of two ranges predicted without these, from the inverse of their part of the redundancy.
+    determinant = own[:, None] * own - redundancy**2
+    np.fill_diagonal(determinant, 1.0)
+    safe = np.maximum(determinant, 1e-6)
+    first = (own[None, :] * residual[:, None] - redundancy * residual[None, :]) / safe
+    np.fill_diagonal(first, residual / own)
+    second = first.T
+    free = determinant < _UNCONTROLLED
+    np.fill_diagonal(free, own < _UNCONTROLLED)
+    late = np.minimum(first, second) > _MIN_LATE
+    rows, columns = np.nonzero(np.triu(late | free))
+    gain = first[rows, columns] * residual[rows]
+    gain += np.where(rows == columns, 0.0, second[rows, columns] * residual[columns])
+    order = np.argsort(9.0 * (1.0 + (rows != columns)) - gain, kind="stable")[:20_000]
+    rows, columns = rows[order], columns[order]
+    change = influence[:, rows] * first[rows, columns] + np.where(
+        rows == columns, 0.0, influence[:, columns] * second[rows, columns]
+    )
+    coordinates = np.count_nonzero(problem.is_free)
+    motion = np.abs(change[:coordinates]).max(axis=0, initial=0.0)
+    moves = (motion > _MIN_MOTION_M) | free[rows, columns]
+    most = _most_refits(len(solution.information))
+    rows, columns = rows[moves][:most], columns[moves][:most]
+    sets = np.tile(used, (len(rows), 1))
+    sets[np.arange(len(rows)), in_use[rows]] = False
+    sets[np.arange(len(rows)), in_use[columns]] = False
+    return sets
+
+
+def regular(information: Array) -> Array:
+    """With a little of information on everything, a hundredth of a metre's, so that it can be inverted."""
+    return np.asarray(information + 1e-4 * np.eye(len(information)))
+
+
+def mirrored(problem: Problem, position_m: Array) -> Array:
+    """Starts with parts reflected in the line (plane) through the two (three) anchors they hang on, shape (b, n, 3).
+
+    Single anchors are among those of ``relocated``.
+    """
+    axes = np.flatnonzero(problem.is_free.all(axis=0))
+    n = len(position_m)
+    joined = adjacency(n, problem.first, problem.second) | adjacency(n, problem.tape_first, problem.tape_second)
+    starts = []
+    for part in _hanging_parts(joined, len(axes)):
+        hinge = joined[part].any(axis=0) & ~part
+        start_m = position_m.copy()
+        start_m[np.ix_(part, axes)] = _reflection(position_m[part][:, axes], position_m[hinge][:, axes])
+        starts.append(start_m)
+    return np.array(starts).reshape(-1, n, 3)
+
+
+def _hanging_parts(joined: Mask, dimensions: int) -> list[Mask]:
+    """Pairs of anchors that hang on no more others than there are dimensions; each shape (n,)."""
+    n = len(joined)
+    parts = []
+    for pair in combinations(range(n), 2):
+        part = np.isin(np.arange(n), pair)
+        if np.count_nonzero(joined[part].any(axis=0) & ~part) <= dimensions < n - 2:
+            parts.append(part)
+    return parts
+
+
+def _reflection(position_m: Array, hinge_m: Array) -> Array:
+    """Positions, shape (k, d), reflected in the line or plane that fits the hinge best, shape (h, d)."""
+    if not len(hinge_m):
+        return position_m
+    centre = hinge_m.mean(axis=0)
+    normal = np.linalg.svd(np.concatenate([hinge_m - centre, np.zeros(position_m.shape[1:])[None]]))[2][-1]
+    return np.asarray(position_m - 2.0 * np.outer((position_m - centre) @ normal, normal))
+
+
+# Which pairs have a range
+
+
+_PRESENCE_STEPS: Final = 12
+_MIN_PRESENCE_EVIDENCE: Final = 30.0
+"""Twice the logarithm of likelihoods by which distance must explain which pairs have a range, else it says nothing."""
+
+_PRESENCE_WEIGHT: Final = 0.5  # pairs behind one wall are missing together
+_SURE: Final = 1e-3  # probability that a pair at any distance has, or lacks, a range for another reason
+
+
+class Presence:
+    """A logistic curve of the share of pairs with a range over distance, fitted to one result of a problem."""
+
+    def __init__(self, problem: Problem, position_m: Array) -> None:
+        """``position_m``: shape (n, 3)."""
+        n = len(position_m)
+        self._first, self._second = np.triu_indices(n, 1)
+        self._is_present = adjacency(n, problem.first, problem.second)[self._first, self._second]
+        share = float(np.mean(self._is_present)) if self._is_present.size else 1.0
+        self._curve: Array | None = None
+        if not 0.0 < share < 1.0:
+            return
+        distance = self._distances(position_m[None])[0]
+        rows = np.stack([np.ones_like(distance), distance], axis=1)
+        curve = np.array([np.log(share / (1.0 - share)), 0.0])
+        for _ in range(_PRESENCE_STEPS):
+            expected = 1.0 / (1.0 + np.exp(-np.clip(rows @ curve, -30.0, 30.0)))
+            information = (rows * (expected * (1.0 - expected))[:, None]).T @ rows + 1e-3 * np.eye(2)
+            curve = curve + np.linalg.solve(information, rows.T @ (self._is_present - expected) - 1e-3 * curve)
+        level = -2.0 * np.sum(np.where(self._is_present, np.log(share), np.log1p(-share)))
+        if curve[1] < 0.0 and level - self._surprise(distance, curve) > _MIN_PRESENCE_EVIDENCE:
+            self._curve = curve
+
+    def cost(self, position_m: Array) -> Array:
+        """What is to be added to the weighted squares of results, shape (b, n, 3); shape (b,)."""
+        if self._curve is None:
+            return np.zeros(len(position_m))
+        return np.asarray(_PRESENCE_WEIGHT * self._surprise(self._distances(position_m), self._curve))
+
+    def _distances(self, position_m: Array) -> Array:
+        return np.asarray(np.linalg.norm(position_m[:, self._first] - position_m[:, self._second], axis=2))
+
+    def _surprise(self, distance_m: Array, curve: Array) -> Array:
+        """Twice the negative logarithm of the likelihood of the pairs that have a range, over the last axis."""
+        share = 1.0 / (1.0 + np.exp(-np.clip(curve[0] + curve[1] * distance_m, -30.0, 30.0)))
+        share = _SURE + (1.0 - 2.0 * _SURE) * share
+        return np.asarray(-2.0 * np.sum(np.log(np.where(self._is_present, share, 1.0 - share)), axis=-1))
+
+
+# Ambiguities
+
+
+_MIRROR_AS_GOOD: Final = 16.0  # weighted squares by which a result that uses the same ranges may fit worse
+_OTHERS_AS_GOOD: Final = 12.0  # the same for a result that takes other ranges for late
+_LATE_GAIN: Final = 16.0
+"""Weighted squares that leaving ranges out must save; below, no range is late and no other result takes any for it."""
+
+_MOVED_STDS: Final = 3.0
+_MOVED_M: Final = 0.1  # motion of an anchor that makes two results different
+_MAX_OTHERS: Final = 4  # reported results
+
+
+class OtherFit(Struct, frozen=True, eq=False):
+    """Another result that fits as well."""
+
+    position_m: Array
+    """Shape (n, 3), moved rigidly onto the best fit's."""
+    used: Mask
+    """Shape (m,)."""
+    anchors: tuple[int, ...]
+    """Indices of those that are elsewhere."""
+
+
+def find_ambiguities(fit: RobustFit) -> tuple[OtherFit, ...]:
+    """Results that fit nearly as well and have anchors elsewhere, the best first."""
+    problem = fit.problem
+    starts = mirrored(problem, fit.solution.position_m)
+    delay_m = np.tile(fit.solution.delay_m, (len(starts), 1))
+    by_mirror = cut_off(problem, starts, delay_m)
+    std_m = aligned_std_m(fit)
+    is_late = solve_least_squares(problem, fit.solution.position_m).cost > fit.cost + _LATE_GAIN
+    others: list[tuple[float, OtherFit]] = []
+    for minima in (by_mirror, fit.others):
+        for index in np.flatnonzero(minima.cost < fit.cost + _MIRROR_AS_GOOD):
+            same = not np.any(fit.used & ~minima.used[index])
+            if not same and not (is_late and minima.cost[index] < fit.cost + _OTHERS_AS_GOOD):
+                continue
+            position_m = aligned_to(problem, minima.position_m[index], fit.solution.position_m)
+            motion_m = np.linalg.norm(position_m - fit.solution.position_m, axis=1)
+            elsewhere = np.flatnonzero((motion_m > _MOVED_M) & (motion_m > _MOVED_STDS * std_m))
+            if elsewhere.size:
+                used = minima.used[index]
+                other = OtherFit(position_m, used, tuple(elsewhere.tolist()))
+                others.append((float(minima.cost[index]), other))
+    others.sort(key=lambda item: item[0])
+    kept: list[OtherFit] = []
+    for _, other in others:
+        apart = [np.linalg.norm(other.position_m - known.position_m, axis=1).max() for known in kept]
+        if len(kept) < _MAX_OTHERS and min(apart, default=np.inf) > _MOVED_M:
+            kept.append(other)
+    return tuple(kept)
+
+
+def aligned_to(problem: Problem, position_m: Array, target_m: Array) -> Array:
+    """Moved rigidly, or reflected, along the free axes so that it fits the target best; both shape (n, 3).
+
+    Anchors that are elsewhere must not pull the others along: the alignment follows those that fit.
+    """
+    axes = np.flatnonzero(problem.is_free.any(axis=0))
+    weight = np.ones(len(position_m))
+    moved_m = position_m.copy()
+    for _ in range(5):
+        moved_m[:, axes] = superimposed(position_m[:, axes], target_m[:, axes], weight)
+        weight = 1.0 / np.maximum(np.linalg.norm(moved_m - target_m, axis=1), 0.01)
+    return moved_m
+
+
+def aligned_std_m(fit: RobustFit) -> Array:
+    """Standard deviation of each anchor's distance from the truth after the best rigid alignment, shape (n,)."""
+    position_m, n = fit.solution.position_m, len(fit.solution.position_m)
+    rows = jacobian(fit.problem, position_m, fit.weight)
+    covariance_m2 = aligned_covariance(fit.problem, rows, position_m, np.ones(n, bool))
+    variance = np.diag(covariance_m2)[: 3 * n].reshape(n, 3).sum(axis=1)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

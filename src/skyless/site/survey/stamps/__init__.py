@@ -1,0 +1,1 @@
+"""From stamps of anchors to ranges."""

@@ -1,0 +1,544 @@
+"""Ranges of all pairs of anchors as their stamps arrive: brackets, means of blocks, the earliest cluster of blocks.
+
+Two kinds of noise are in a pair's mean (``docs/survey.md``): RX stamps, each pair's own, and TX stamps, which all
+pairs of an anchor share. Two pairs that were bracketed with the same frame of an anchor show the part that is shared.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import astuple, replace
+
+from skyless.core.constants import TICK_BITS, TICK_M, TICK_RATE_HZ
+from skyless.core.kernels.arrays import Array, Integers, Mask
+from skyless.core.ticks import Unwrapper
+from skyless.site.survey.facts import PairBlock, PairRange, PairRanges
+from skyless.site.survey.stamps.repeats import earliest_cluster
+from skyless.site.survey.two_way import MAX_BRACKET_RATE, MAX_FLIGHT_TICKS
+
+_KEPT_S: Final = 5.0  # legs wait so long for the other direction, which another anchor may publish later
+_LARGEST_TICKS: Final = 1 << 62  # stamps are computed with 64 bits
+_MAX_BLOCKS: Final = 256
+_MAX_PAIRS: Final = 1 << 16
+_MAX_OPEN_LEGS: Final = 1 << 18  # a block with more legs is closed before its time
+_OUTLIER_SIGMAS: Final = 5.0
+_MAD_STD: Final = 1.4826
+"""Standard deviation of normally distributed values over the median of their distances from the median."""
+
+_PRIOR_WEIGHT: Final = 500.0  # weight of the site's noise in a pair's, in flights
+_PRIOR_PRODUCTS: Final = 200.0
+"""Weight of the assumption that TX and RX stamps are equally good, in products of two pairs."""
+
+_MIN_BATCHES: Final = 6
+_MIN_OWN_SHARE: Final = 0.2  # share of a mean's variance that is the pair's own
+
+
+# Brackets: times of flight of many pairs at once, as ``bracketed_flight_ticks`` in ``site/survey/two_way.py``
+
+
+class Legs(Struct, frozen=True, eq=False):
+    """Legs of many pairs, each array of shape (n,)."""
+
+    pair: Integers
+    """Number of the pair."""
+    a_ticks: Integers
+    b_ticks: Integers
+    """Stamps on the counters of its two anchors, unwrapped."""
+    is_back: Mask
+    """Whether it went from b to a."""
+    is_used: Mask
+    """Whether its time of flight has been computed before."""
+    t_s: Array
+
+    def part(self, index: Integers | Mask) -> "Legs":
+        """Some of the rows."""
+        return Legs(*(column[index] for column in astuple(self)))
+
+
+class Flights(Struct, frozen=True, eq=False):
+    """Times of flight, each array of shape (k,)."""
+
+    leg: Integers
+    """Index of the bracketed leg."""
+    ticks: Array
+    part: Array
+    """Where it lies between the two legs that bracket it, 0 to 1."""
+
+
+def flights_of(legs: Legs, longest_ticks: int) -> tuple[Flights, Legs, int]:
+    """Times of flight of all legs that were not used before and are bracketed within ``longest_ticks``.
+
+    Returns them (they index ``legs``), the legs that later ones need, and the number of brackets that cannot be of one
+    pair of counters.
+    """
+    legs_a = _bracketed(legs, legs.a_ticks, legs.b_ticks, legs.is_back, longest_ticks)
+    legs_b = _bracketed(legs, legs.b_ticks, legs.a_ticks, ~legs.is_back, longest_ticks)
+    used = legs.is_used.copy()
+    used[legs_a.seen] = True
+    used[legs_b.seen] = True
+    flights = Flights(*map(np.concatenate, zip(astuple(legs_a.flights), astuple(legs_b.flights), strict=True)))
+    needed = legs_a.is_needed | legs_b.is_needed
+    kept = replace(legs, is_used=used).part(needed)
+    return flights, kept, legs_a.impossible + legs_b.impossible
+
+
+class _OneWay(Struct, frozen=True, eq=False):
+    flights: Flights
+    seen: Integers
+    """Legs that were bracketed, whatever came of it."""
+    is_needed: Mask
+    impossible: int
+
+
+def _bracketed(legs: Legs, x_ticks: Integers, y_ticks: Integers, is_reply: Mask, longest_ticks: int) -> _OneWay:
+    """Replies y → x between two legs x → y, in the order of x's counter."""
+    order = np.lexsort((x_ticks, legs.pair))
+    order = order[_first_of_equals(legs.pair[order], x_ticks[order], is_reply[order])]
+    pair, reply = legs.pair[order], is_reply[order]
+    row, n = np.arange(len(order)), len(order)
+    before = np.maximum.accumulate(np.where(reply, -1, row)) if n else row
+    after = np.minimum.accumulate(np.where(reply, n, row)[::-1])[::-1] if n else row
+    has_before = (before >= 0) & (pair[np.maximum(before, 0)] == pair)
+    has_after = (after < n) & (pair[np.minimum(after, n - 1)] == pair) if n else row > 0
+    new = np.flatnonzero(reply & has_before & has_after & ~legs.is_used[order])
+    middle, first, last = order[new], order[before[new]], order[after[new]]
+    span = (x_ticks[last] - x_ticks[first]).astype(np.float64)
+    until = (x_ticks[middle] - x_ticks[first]).astype(np.float64)
+    gained = (y_ticks[last] - y_ticks[first]).astype(np.float64) - span
+    reply_ticks = until - (y_ticks[middle] - y_ticks[first]).astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rate = gained / span
+        ticks, part = (reply_ticks + rate * until) / 2.0, until / span
+    in_time = (span > 0.0) & (span <= longest_ticks)
+    good = in_time & (until > 0.0) & (until < span) & (np.abs(rate) <= MAX_BRACKET_RATE)
+    good &= np.abs(ticks) < MAX_FLIGHT_TICKS
+    # a later reply comes after the pair's last reply, so all before the leg that precedes that one has served.
+    needed = np.ones(len(legs.pair), dtype=bool)
+    replies = np.flatnonzero(reply)
+    if len(replies):
+        last_of_pair = replies[np.append(pair[replies][1:] != pair[replies][:-1], True)]
+        cut = np.zeros(int(pair.max()) + 1, dtype=np.int64)
+        cut[pair[last_of_pair]] = np.where(has_before[last_of_pair], before[last_of_pair], last_of_pair)
+        needed[:] = False
+        needed[order[row >= cut[pair]]] = True
+    return _OneWay(Flights(middle[good], ticks[good], part[good]), middle, needed, int(np.sum(in_time & ~good)))
+
+
+def _first_of_equals(pair: Integers, ticks: Integers, reply: Mask) -> Mask:
+    """Rows that do not repeat the one before."""
+    first = np.ones(len(pair), dtype=bool)
+    first[1:] = (pair[1:] != pair[:-1]) | (ticks[1:] != ticks[:-1]) | (reply[1:] != reply[:-1])
+    return first
+
+
+# Steps: ranges in the order of time, from which it shows whether they stayed the same
+
+
+STEP_S: Final = 3.0
+_MAX_STEPS: Final = 64  # beyond them the older half is joined two by two
+_MEDIAN_VARIANCE: Final = math.pi / 2.0
+
+
+class StepTable(Struct, frozen=True, eq=False):
+    """``k`` steps of ``m`` pairs, in the order of time."""
+
+    start_s: Array
+    """Shape (k,)."""
+    pairs: tuple[tuple[int, int], ...]
+    range_m: Array
+    """Shape (k, m), NaN where a pair has no range."""
+    variance_m2: Array
+    """Shape (k, m), of stamps' noise."""
+
+
+class _Step(Struct, frozen=True):
+    start_s: float
+    ranges: dict[tuple[int, int], tuple[float, float]]
+    """Median and variance, by pair."""
+
+
+class RangeSteps:
+    """Gathers blocks; memory does not grow with time."""
+
+    def __init__(self) -> None:
+        self._steps: list[_Step] = []
+        self._open: list[PairBlock] = []
+
+    def add(self, block: PairBlock) -> None:
+        """Add a block, in the order of time; a clock that was set back begins the steps again."""
+        step = math.floor(block.t_s / STEP_S)
+        if self._open:
+            now = math.floor(self._open[0].t_s / STEP_S)
+            if step < now:
+                self._steps, self._open = [], []
+            elif step > now:
+                self.finish()
+        self._open.append(block)
+
+    def finish(self) -> None:
+        """Close the step that is open."""
+        if not self._open:
+            return
+        gathered: dict[tuple[int, int], list[PairBlock]] = {}
+        for block in self._open:
+            gathered.setdefault((block.a, block.b), []).append(block)
+        ranges = {
+            pair: (
+                float(np.median([one.mean_m for one in blocks])),
+                _MEDIAN_VARIANCE * float(np.mean([one.std_m**2 for one in blocks])) / len(blocks),
+            )
+            for pair, blocks in gathered.items()
+        }
+        self._steps.append(_Step(STEP_S * math.floor(self._open[0].t_s / STEP_S), ranges))
+        self._open = []
+        if len(self._steps) > _MAX_STEPS:
+            old, new = self._steps[: _MAX_STEPS // 2], self._steps[_MAX_STEPS // 2 :]
+            self._steps = [_joined_steps(*old[index : index + 2]) for index in range(0, len(old), 2)] + new
+
+    def drop_before(self, t_s: float) -> None:
+        """Forget the steps that began earlier."""
+        self._steps = [one for one in self._steps if one.start_s >= t_s]
+
+    def table(self) -> StepTable:
+        """The steps that are closed."""
+        pairs = tuple(sorted({pair for one in self._steps for pair in one.ranges}))
+        nothing = (math.nan, math.nan)
+        both = np.array([[one.ranges.get(pair, nothing) for pair in pairs] for one in self._steps])
+        both = both.reshape(len(self._steps), len(pairs), 2)
+        return StepTable(np.array([one.start_s for one in self._steps]), pairs, both[..., 0], both[..., 1])
+
+
+def _joined_steps(one: _Step, other: _Step) -> _Step:
+    ranges = one.ranges | other.ranges
+    for pair in one.ranges.keys() & other.ranges.keys():
+        (a_m, a_m2), (b_m, b_m2) = one.ranges[pair], other.ranges[pair]
+        ranges[pair] = 0.5 * (a_m + b_m), 0.25 * (a_m2 + b_m2)
+    return _Step(one.start_s, ranges)
+
+
+# Ranges as legs arrive
+
+
+class PairRanger:
+    """Gathers directed legs between anchors; memory does not grow with time.
+
+    ``counters``: ``legs``, and what was dropped: ``impossible`` (brackets that cannot be of one pair of counters),
+    ``unusable`` (legs from an anchor to itself, without a finite time, or with stamps that no counter has),
+    ``too-many-pairs``.
+    """
+
+    def __init__(
+        self,
+        bits: int = TICK_BITS,
+        block_s: float = 1.0,
+        longest_bracket_s: float = 0.5,
+        on_block: Callable[[PairBlock], None] | None = None,
+    ) -> None:
+        """``bits``: of the counters; ``block_s``: length of a block.
+
+        ``longest_bracket_s``: between two frames of an anchor that bracket one of another; four superframes are good,
+        and it is at most half a wrap. ``on_block`` is given every block of every pair when its time is over, late ones
+        too, and the blocks of one time directly after one another.
+        """
+        self.counters: Counter[str] = Counter()
+        self._bits, self._block_s, self._on_block = bits, block_s, on_block
+        self._longest_ticks = min(round(longest_bracket_s * TICK_RATE_HZ), (1 << (bits - 1)) - 1)
+        self._clocks: dict[int, Unwrapper] = {}
+        self._number: dict[tuple[int, int], int] = {}
+        self._open: list[tuple[int, int, int, bool, float]] = []
+        self._kept = _legs_of([])
+        self._histories: list[_History] = []
+        self._shared_m2 = self._products = 0.0
+        """Sum of the products of two pairs that share an anchor's frame, and their number."""
+        self._block: int | None = None
+        """Number of the open block since time 0."""
+        self._first_s = self._last_s = math.nan
+        self._duration_s = 0.0
+        self.steps = RangeSteps()
+        """The ranges in the order of time."""
+
+    def add(self, sender: int, receiver: int, tx_ticks: int, rx_ticks: int, t_s: float) -> None:
+        """Add one reception. ``t_s``: of any clock that all legs share, good to a second, and to a quarter of a wrap.
+
+        Order matters little: directions of a pair may come one after the other, seconds late.
+        """
+        if sender == receiver or not math.isfinite(t_s) or max(abs(tx_ticks), abs(rx_ticks)) > _LARGEST_TICKS:
+            self.counters["unusable"] += 1
+            return
+        pair = (sender, receiver) if sender < receiver else (receiver, sender)
+        number = self._number.get(pair)
+        if number is None:
+            if len(self._number) >= _MAX_PAIRS:
+                self.counters["too-many-pairs"] += 1
+                return
+            number = self._number[pair] = len(self._number)
+            self._histories.append(_History())
+        self._pass_to(t_s)
+        tx = self._clock(sender).unwrap(tx_ticks, t_s)
+        rx = self._clock(receiver).unwrap(rx_ticks, t_s)
+        self.counters["legs"] += 1
+        is_back = sender > receiver
+        self._open.append((number, rx, tx, True, t_s) if is_back else (number, tx, rx, False, t_s))
+        if len(self._open) >= _MAX_OPEN_LEGS:
+            self._close_block()
+
+    def forget(self, anchor: int) -> None:
+        """Drop the open legs of an anchor whose counter has restarted; its ranges stay."""
+        self._clocks.pop(anchor, None)
+        numbers = [number for pair, number in self._number.items() if anchor in pair]
+        self._open = [leg for leg in self._open if leg[0] not in set(numbers)]
+        self._kept = self._kept.part(~np.isin(self._kept.pair, numbers))
+
+    def drop_before(self, t_s: float) -> None:
+        """Drop the ranges from before a time, because an anchor was elsewhere then."""
+        self.steps.drop_before(t_s)
+        for history in self._histories:
+            history.drop_before(t_s)
+        self._duration_s = max(min(self._duration_s, self._last_s - t_s), 0.0)
+
+    def finish(self) -> None:
+        """Close the block that is open, at the end of the data."""
+        self._close_block()
+        self.steps.finish()
+
+    @property
+    def tx_stamp_std_m(self) -> float:
+        """Noise of one TX stamp, as far as it can be separated from that of RX stamps; 0 before the first block.
+
+        The means of two pairs that share an anchor have the covariance ``tx_stamp_std_m²/(4·exchanges)``.
+        """
+        assumed_m2 = self._leg_variance_m2() / 2.0
+        shared_m2 = 4.0 * self._shared_m2 + _PRIOR_PRODUCTS * assumed_m2
+        variance_m2 = shared_m2 / (self._products + _PRIOR_PRODUCTS)
+        return math.sqrt(min(max(variance_m2, 0.0), 2.0 * assumed_m2))
+
+    def ranges(self) -> PairRanges:
+        """The ranges from all closed blocks."""
+        site_m2, means = self._leg_variance_m2(), []
+        for (a, b), number in sorted(self._number.items()):
+            history = self._histories[number]
+            if history.blocks:
+                means.append((a, b, history.mean(history.leg_variance_m2(site_m2))))
+        anchors = tuple(sorted({anchor for pair in self._number for anchor in pair}))
+        tx_std_m = {}
+        for anchor in anchors:
+            exchanges = [mean.exchanges for a, b, mean in means if anchor in {a, b}]
+            if exchanges:
+                tx_std_m[anchor] = self.tx_stamp_std_m / (2.0 * math.sqrt(float(np.median(exchanges))))
+        pairs = []
+        for a, b, mean in means:
+            own_m2 = mean.noise_m2 - tx_std_m[a] ** 2 - tx_std_m[b] ** 2
+            std_m = math.sqrt(max(own_m2, _MIN_OWN_SHARE * mean.noise_m2) + mean.wander_m2)
+            pairs.append(PairRange(a, b, mean.range_m, std_m, max(1, round(mean.exchanges)), mean.late_share))
+        return PairRanges(tuple(pairs), anchors, tx_std_m, self._duration_s)
+
+    def _clock(self, anchor: int) -> Unwrapper:
+        clock = self._clocks.get(anchor)
+        if clock is None:
+            clock = self._clocks[anchor] = Unwrapper(self._bits)
+        return clock
+
+    def _pass_to(self, t_s: float) -> None:
+        """Close the open block if its time is over; a clock that was set starts the blocks again."""
+        block, number = self._block, math.floor(t_s / self._block_s)
+        if block is None or number > block or t_s < block * self._block_s - _KEPT_S:
+            if block is not None:
+                self._close_block()
+            if block is None or not -_KEPT_S < t_s - self._last_s < _KEPT_S:
+                self._kept, self._clocks, self._first_s = _legs_of([]), {}, t_s
+            self._block = number
+            self._last_s = t_s
+        self._last_s = max(self._last_s, t_s)
+
+    # Blocks
+
+    def _close_block(self) -> None:
+        if not self._open or self._block is None:
+            return
+        legs = _joined(self._kept, _legs_of(self._open))
+        self._open = []
+        flights, kept, impossible = flights_of(legs, self._longest_ticks)
+        self._kept = kept.part(kept.t_s > self._last_s - _KEPT_S)
+        self._duration_s += self._last_s - self._first_s
+        self._first_s = self._last_s
+        self.counters["impossible"] += impossible
+        if len(flights.leg):
+            self._add_block(legs, flights, (self._block + 0.5) * self._block_s)
+
+    def _add_block(self, legs: Legs, flights: Flights, t_s: float) -> None:
+        """Means of the pairs' flights without outliers, and what their scatter says of the stamps' noise."""
+        pair, range_m = legs.pair[flights.leg], flights.ticks * TICK_M
+        good = _inliers(pair, range_m)
+        leg, pair, range_m, part = flights.leg[good], pair[good], range_m[good], flights.part[good]
+        count = len(self._histories)
+        n = np.bincount(pair, minlength=count)
+        back = np.bincount(pair, legs.is_back[leg], minlength=count)
+        one_each = 1.0 / np.maximum(back, 1.0) + 1.0 / np.maximum(n - back, 1.0)
+        mean_m = np.bincount(pair, range_m, minlength=count) / np.maximum(n, 1)
+        residual_m = range_m - mean_m[pair]
+        squares_m2 = np.bincount(pair, residual_m**2, minlength=count)
+        # a flight is half of one leg and of the legs before and after it, with weights 1 - part and part.
+        flight_weight = np.bincount(pair, 1.0 + part**2 + (1.0 - part) ** 2, minlength=count)
+        freedom = flight_weight - n * one_each
+        self._share(legs, leg, residual_m, n)
+        for number in np.flatnonzero(n).tolist():
+            history = self._histories[number]
+            if freedom[number] > 0.0 and n[number] > 2:
+                history.squares_m2 += 4.0 * float(squares_m2[number])
+                history.freedom += float(freedom[number])
+            history.add(t_s, float(mean_m[number]), 2.0 / float(one_each[number]), self._leg_variance_m2)
+        pairs, site_m2 = list(self._number), self._leg_variance_m2()
+        for number in np.flatnonzero(n).tolist():
+            variance_m2 = self._histories[number].leg_variance_m2(site_m2) * float(one_each[number]) / 4.0
+            exchanges = max(1, round(2.0 / float(one_each[number])))
+            a, b = pairs[number]
+            block = PairBlock(a, b, t_s, float(mean_m[number]), math.sqrt(variance_m2), exchanges)
+            self.steps.add(block)
+            if self._on_block is not None:
+                self._on_block(block)
+
+    def _share(self, legs: Legs, leg: Integers, residual_m: Array, n: Integers) -> None:
+        """Add up the products of residuals of two pairs that were bracketed with the same frame of an anchor."""
+        anchors = np.array(list(self._number), dtype=np.int64).reshape(-1, 2)
+        pair, is_back = legs.pair[leg], legs.is_back[leg]
+        sender = np.where(is_back, anchors[pair, 1], anchors[pair, 0])
+        tx_ticks = np.where(is_back, legs.b_ticks[leg], legs.a_ticks[leg])
+        order = np.lexsort((tx_ticks, sender))
+        first = np.ones(len(order), dtype=bool)
+        first[1:] = (np.diff(sender[order]) != 0) | (np.diff(tx_ticks[order]) != 0)
+        group = np.cumsum(first) - 1
+        total_m = np.bincount(group, residual_m[order])
+        squares_m2 = np.bincount(group, residual_m[order] ** 2)
+        size = np.bincount(group)
+        # The pairs' means have been subtracted, and share 2/n of that covariance.
+        freedom = 1.0 - 2.0 * float(np.mean(1.0 / np.maximum(n[pair], 2)))
+        self._shared_m2 += float(np.sum(total_m**2 - squares_m2))
+        self._products += float(np.sum(size * (size - 1))) * max(freedom, 0.0)
+
+    def _leg_variance_m2(self) -> float:
+        """Noise of one TX and one RX stamp together: the median over the pairs."""
+        known = [one.squares_m2 / one.freedom for one in self._histories if one.freedom > 0.0]
+        return float(np.median(known)) if known else 0.0
+
+
+class _Mean(Struct, frozen=True):
+    range_m: float
+    noise_m2: float
+    """Variance of the mean from stamps' noise."""
+    wander_m2: float
+    """What the scatter between the blocks shows beyond that."""
+    exchanges: float
+    late_share: float
+
+
+class _History:
+    """The blocks of one pair, in the order of time; neighbours are merged when there are too many."""
+
+    def __init__(self) -> None:
+        self.blocks: list[tuple[float, float, float]] = []
+        """Middle, mean range in metres, exchanges."""
+        self.squares_m2 = self.freedom = 0.0
+        """Their ratio is the noise of a TX and an RX stamp together."""
+        self._early = self._late = 0.0
+        """Exchanges of blocks outside the cluster that were dropped."""
+
+    def leg_variance_m2(self, site_m2: float) -> float:
+        """Noise of one TX and one RX stamp together; that of the site counts as much as some hundred flights."""
+        return (self.squares_m2 + _PRIOR_WEIGHT * site_m2) / (self.freedom + _PRIOR_WEIGHT)
+
+    def add(self, t_s: float, range_m: float, exchanges: float, site_m2: Callable[[], float]) -> None:
+        """Add a block; ``site_m2`` gives the noise of a leg at the site."""
+        self.blocks.append((t_s, range_m, exchanges))
+        if len(self.blocks) > _MAX_BLOCKS:
+            self._merge(self.leg_variance_m2(site_m2()))
+
+    def drop_before(self, t_s: float) -> None:
+        """Drop the blocks from before a time."""
+        self.blocks = [block for block in self.blocks if block[0] >= t_s]
+        self._early = self._late = 0.0
+
+    def mean(self, leg_m2: float) -> _Mean:
+        """The mean of the earliest cluster; ``leg_m2`` is the noise of a leg."""
+        blocks = np.array(self.blocks)
+        inside, late, total = self._cluster(blocks, leg_m2)
+        range_m, exchanges = blocks[inside, 1], blocks[inside, 2]
+        noise_m2 = 0.5 * leg_m2 / float(np.sum(exchanges))
+        wander_m2 = _wander_m2(range_m, exchanges, noise_m2)
+        mean_m = float(np.average(range_m, weights=exchanges))
+        return _Mean(mean_m, noise_m2, wander_m2, float(np.sum(exchanges)), late / total)
+
+    def _cluster(self, blocks: Array, leg_m2: float) -> tuple[Mask, float, float]:
+        """The blocks inside the earliest cluster, exchanges that are later, and all exchanges."""
+        range_m, exchanges = blocks[:, 1], blocks[:, 2]
+        total = self._early + self._late + float(np.sum(exchanges))
+        std_m = math.sqrt(0.5 * leg_m2 / float(np.median(exchanges)))
+        inside = earliest_cluster(range_m, exchanges, std_m, total)
+        is_late = ~inside & (range_m > np.mean(range_m[inside]))
+        return inside, self._late + float(np.sum(exchanges[is_late])), total
+
+    def _merge(self, leg_m2: float) -> None:
+        """Drop what is outside the cluster, and join neighbours of the rest."""
+        blocks = np.array(self.blocks)
+        inside, self._late, total = self._cluster(blocks, leg_m2)
+        self._early = total - self._late - float(np.sum(blocks[inside, 2]))
+        rest, merged = blocks[inside].tolist(), []
+        for index in range(0, len(rest) - 1, 2):
+            (t_s, range_m, exchanges), (next_s, next_m, more) = rest[index], rest[index + 1]
+            part = more / (exchanges + more)
+            merged.append((t_s + part * (next_s - t_s), range_m + part * (next_m - range_m), exchanges + more))
+        self.blocks = merged + [tuple(row) for row in rest[len(rest) // 2 * 2 :]]
+
+
+def _wander_m2(range_m: Array, exchanges: Array, noise_m2: float) -> float:
+    """Variance of the mean beyond stamps' noise: the scatter of blocks, joined until errors that persist show.
+
+    Only what chance does not explain counts, so that a pair without such errors keeps the variance of its noise.
+    """
+    wander_m2, value, weight = 0.0, range_m, exchanges
+    while len(value) >= _MIN_BATCHES:
+        freedom = len(value) - 1
+        deviation = value - np.average(value, weights=weight)
+        scatter_m2 = float(np.sum(weight * deviation**2)) / (freedom * float(np.sum(weight)))
+        if scatter_m2 > noise_m2 * (1.0 + 4.0 * math.sqrt(2.0 / freedom)):
+            wander_m2 = max(wander_m2, scatter_m2 - noise_m2)
+        even = len(value) // 2 * 2
+        joined = weight[:even].reshape(-1, 2)
+        value = np.sum(value[:even].reshape(-1, 2) * joined, axis=1) / np.sum(joined, axis=1)
+        weight = np.sum(joined, axis=1)
+    return wander_m2
+
+
+def _inliers(pair: Integers, value: Array) -> Mask:
+    """Flights near the median of their pair, shape (n,): within 5 sigma, by the pair's or the site's scatter."""
+    order = np.lexsort((value, pair))
+    begin = np.flatnonzero(np.append(True, np.diff(pair[order]) != 0))
+    size = np.diff(np.append(begin, len(order)))
+    median = np.zeros(int(pair.max()) + 1)
+    median[pair[order[begin]]] = value[order[begin + size // 2]]
+    distance = np.abs(value - median[pair])
+    order = np.lexsort((distance, pair))
+    scatter = np.zeros(len(median))
+    scatter[pair[order[begin]]] = distance[order[begin + size // 2]]
+    scatter = _MAD_STD * np.maximum(scatter, np.median(distance))
+    return np.asarray(distance <= _OUTLIER_SIGMAS * scatter[pair] + TICK_M)
+
+
+def _legs_of(rows: list[tuple[int, int, int, bool, float]]) -> Legs:
+    pair, a_ticks, b_ticks, is_back, t_s = zip(*rows, strict=True) if rows else ((),) * 5
+    whole = np.int64
+    return Legs(
+        np.array(pair, whole),
+        np.array(a_ticks, whole),
+        np.array(b_ticks, whole),
+        np.array(is_back, bool),
+        np.zeros(len(rows), bool),
+        np.array(t_s, np.float64),
+    )
+
+
+def _joined(one: Legs, other: Legs) -> Legs:
+    return Legs(*map(np.concatenate, zip(astuple(one), astuple(other), strict=True)))

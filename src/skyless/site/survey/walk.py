@@ -1,0 +1,532 @@
+"""What a tag that is carried around, or stands at known positions, adds to a survey (``docs/survey.md``).
+
+In epoch k the range to anchor j is ``|p_k − a_j| + h_j + o_j + s·ln(|p_k − a_j| / 3 m) + c_k``. The tag's position p_k
+and clock c_k are free in every epoch; the anchor's own constant o_j and the slope s, both from the strength of signals,
+are the same in all. What remains once these are eliminated (Schur complement) constrains the anchors' positions and
+delays h.
+"""
+
+from array import array
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.special import chdtri
+
+from skyless.core.kernels.arrays import Array, Integers, Mask, Vector
+from skyless.site.survey.facts import TagReceived
+from skyless.site.survey.fit.problem import Problem, Solution, distances_m, solve_least_squares, unknown_columns
+from skyless.site.survey.fit.robust import LATE_CUTOFF
+
+# Differences, averaged over epochs of half a second
+
+
+EPOCH_S: Final = 0.5
+"""Reflections change while a tag is carried for half a second: the errors of two epochs count as independent."""
+
+WALK_OFFSET_STD_M: Final = 0.07
+"""Constant by which a tag's ranges to an anchor differ from what the anchors' own ranges say of its delay: stamps of
+strong signals are early (APS011), and signals are stronger or weaker between anchors than at a tag."""
+
+_MAX_SAMPLES: Final = 2_000_000  # twenty minutes of a site with 12 anchors; what comes later is not used
+_LONE_STD_M: Final = 0.07  # of a single difference, for its weight against the velocity's prior
+_FLOOR_COUNT: Final = 20
+"""With more samples of a pair in one epoch the errors that they share exceed their noise: the weight grows no more."""
+
+_SPEED_STD_MPS: Final = 1.5
+_REJECT: Final = 4.0
+_HUBER_M: Final = 0.1
+_HUBER_ROUNDS: Final = 4
+
+
+class TagEpochs(TagReceived, frozen=True, eq=False):
+    """Differences of one tag, ``r`` means over an epoch and a pair of anchors, in ``k`` epochs; ``n`` anchors.
+
+    A difference is the range to ``second`` less that to ``first``, both with their delays h. If it is ``relayed``, the
+    range of the pair, as the anchors measure it, is in it as well: ``second`` has received ``first`` and sent its own
+    stamp of it. That range is to be taken off with all its errors, for they are the same.
+    """
+
+    anchors: tuple[int, ...]
+    """In ascending order."""
+    t_s: Vector
+    """Shape (k,): the middle of each epoch."""
+    epoch: Integers
+    first: Integers
+    second: Integers
+    """Shape (r,): indices."""
+    difference_m: Vector
+    since_s: Vector
+    """Shape (r,): mean time of a difference's samples since the middle of its epoch."""
+    count: Integers
+    """Shape (r,): samples in the mean."""
+    relayed: bool
+    known_m: Array
+    """Shape (k, 3): the tag's coordinates where they are known, NaN elsewhere."""
+    known_std_m: tuple[float, float, float] = (0.01, 0.01, 0.01)
+    offset_std_m: float = WALK_OFFSET_STD_M
+    """Standard deviation of each anchor's own constant at the tag, apart from its delay."""
+    name: str = "the walk"
+    """For sentences."""
+
+
+class EpochCollector:
+    """Gathers a tag's differences as they come."""
+
+    def __init__(self, *, relayed: bool) -> None:
+        self._relayed = relayed
+        self._times, self._values = array("d"), array("d")
+        self._firsts, self._seconds = array("q"), array("q")
+
+    def add(self, t_s: float, first: int, second: int, difference_m: float) -> None:
+        """Add the range to ``second`` less that to ``first`` at a time."""
+        if len(self._times) < _MAX_SAMPLES:
+            self._times.append(t_s)
+            self._firsts.append(first)
+            self._seconds.append(second)
+            self._values.append(difference_m)
+
+    def epochs(self) -> TagEpochs:
+        """All that was gathered; samples that are far from the median of their pair and epoch are left out."""
+        t_s, value_m = np.array(self._times), np.array(self._values)
+        ids = np.array([self._firsts, self._seconds], dtype=np.int64).reshape(2, -1)
+        anchors = np.unique(ids)
+        first, second = np.searchsorted(anchors, ids)
+        number = np.floor((t_s - t_s.min(initial=np.inf)) / EPOCH_S).astype(np.int64) if len(t_s) else ids[0]
+        numbers, epoch = np.unique(number, return_inverse=True)
+        middle_s = t_s.min(initial=np.inf) + (numbers + 0.5) * EPOCH_S if len(t_s) else t_s
+        n = max(len(anchors), 1)
+        group, group_of = np.unique((epoch * n + first) * n + second, return_inverse=True)
+        median = _group_medians(group_of, value_m, len(group))
+        away = np.abs(value_m - median[group_of])
+        scale = np.maximum(1.4826 * _group_medians(group_of, away, len(group)), 0.02)
+        kept = away <= _REJECT * scale[group_of]
+        group_of, value_m, since_s = group_of[kept], value_m[kept], (t_s - middle_s[epoch])[kept]
+        count = np.bincount(group_of, minlength=len(group))
+        sums = (np.bincount(group_of, one, len(group)) for one in (value_m, since_s))
+        mean_m, mean_s = (total / np.maximum(count, 1) for total in sums)
+        return TagEpochs(
+            tuple(anchors.tolist()),
+            middle_s,
+            group // (n * n),
+            group // n % n,
+            group % n,
+            mean_m,
+            mean_s,
+            count,
+            self._relayed,
+            np.full((len(middle_s), 3), np.nan),
+        )
+
+
+def _group_medians(group_of: Integers, values: Vector, groups: int) -> Vector:
+    """Lower median of each group, shape (groups,); every group has a value."""
+    order = np.lexsort((values, group_of))
+    size = np.bincount(group_of, minlength=groups)
+    begin = np.cumsum(size) - size
+    return np.asarray(values[order][begin + (size - 1) // 2] if groups else values)
+
+
+def tag_ranges(epochs: TagEpochs, pair_ranges_m: Mapping[tuple[int, int], float]) -> Array:
+    """Ranges to all anchors in each epoch up to one constant, shape (k, n); NaN where there are none.
+
+    ``pair_ranges_m``: of the anchors, by identifiers in ascending order. A relayed difference whose pair is missing
+    there is not used. Anchors that an epoch's differences do not tie to most others are NaN.
+    """
+    k, n = len(epochs.t_s), len(epochs.anchors)
+    epoch, first, second, value_m = epochs.epoch, epochs.first, epochs.second, epochs.difference_m
+    since_s, count = epochs.since_s, epochs.count
+    if epochs.relayed:
+        of_pair = np.full((n, n), np.nan)
+        for i, a in enumerate(epochs.anchors):
+            for j, b in enumerate(epochs.anchors):
+                of_pair[i, j] = pair_ranges_m.get((min(a, b), max(a, b)), np.nan)
+        value_m = value_m - of_pair[first, second]
+        known = np.isfinite(value_m)
+        epoch, first, second, value_m = epoch[known], first[known], second[known], value_m[known]
+        since_s, count = since_s[known], count[known]
+    joined = _largest_part(epoch * n + first, epoch * n + second, k, n)
+    strength = np.minimum(count, _FLOOR_COUNT) / _LONE_STD_M**2
+    columns = np.stack([first, second, n + first, n + second], axis=1)
+    factors = np.stack([-np.ones(len(first)), np.ones(len(first)), -since_s, since_s], axis=1)
+    solution: Array = np.zeros((k, 2 * n))
+    weight = strength
+    for _ in range(_HUBER_ROUNDS):
+        normal = np.zeros((k, 2 * n, 2 * n))
+        diagonal = np.arange(2 * n)
+        normal[:, diagonal[:n], diagonal[:n]] = 1e-4
+        normal[:, diagonal[n:], diagonal[n:]] = 1.0 / _SPEED_STD_MPS**2
+        right = np.zeros((k, 2 * n))
+        for i in range(4):
+            np.add.at(right, (epoch, columns[:, i]), weight * factors[:, i] * value_m)
+            for j in range(4):
+                np.add.at(normal, (epoch, columns[:, i], columns[:, j]), weight * factors[:, i] * factors[:, j])
+        solution = np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0])
+        model_m = (factors * np.take_along_axis(solution[epoch], columns, axis=1)).sum(axis=1)
+        away = np.abs(value_m - model_m)
+        weight = strength * np.minimum(1.0, _HUBER_M / np.maximum(away, _HUBER_M))
+    return np.where(joined, solution[:, :n], np.nan)
+
+
+def _largest_part(first: Integers, second: Integers, k: int, n: int) -> Array:
+    """Whether each anchor is in its epoch's largest part that differences tie together, shape (k, n), truth values."""
+    edges = coo_array((np.ones(len(first)), (first, second)), shape=(k * n, k * n))
+    label = connected_components(edges, directed=False)[1]
+    size = np.bincount(label, minlength=k * n)
+    of_node = size[label].reshape(k, n)
+    most = of_node.max(axis=1, initial=0, keepdims=True)
+    chosen = np.where(of_node == most, label.reshape(k, n), k * n).min(axis=1, initial=k * n, keepdims=True)
+    return np.asarray((label.reshape(k, n) == chosen) & (most > 1))
+
+
+# Rows of the fit
+
+
+TAG_STD_M: Final = 0.1
+"""Standard deviation of a range in one epoch. Noise and reflections make 0.07 m, but some reflections return with each
+round through a room: with 0.07 m, flights of four minutes spoil a room's horizontal positions by a fifth."""
+
+_MIN_SCALE_M: Final = 0.05  # of residuals, when ranges that do not fit are looked for
+_MIN_FREE: Final = 0.05  # least part of a range's error that is assumed to show in its residual
+_SLOPE_M: Final = 0.025
+_SLOPE_STD_M: Final = 0.03  # between none, and 0.05 m of a typical DW1000 (docs/calibration.md)
+_SLOPE_RANGE_M: Final = 3.0
+_NEAREST_M: Final = 0.3
+_INNER_STEPS: Final = 30
+_SMALLEST_CHANGE: Final = 1e-9
+_LONGEST_STEP_M: Final = 2.0
+_SINGULAR: Final = 1e-9
+_GRID: Final = 9  # positions along each horizontal axis from which an epoch may start
+_ELSEWHERE_M: Final = 2.0
+"""If an anchor has moved by more since the last evaluation, it is another result: the tag's positions start again."""
+
+_LEVELS: Final = 5  # heights from which a walk may start; all of its epochs start at one
+
+
+class WalkRows:
+    """A tag's ranges as rows of a problem; the tag's positions are the start of the next evaluation."""
+
+    def __init__(self, epochs: TagEpochs, range_m: Array, position_m: Array) -> None:
+        """``range_m``: of ``tag_ranges`` with the problem's anchors as columns, shape (k, n); NaN where none.
+
+        ``position_m``: of the anchors, shape (n, 3), as a start.
+        """
+        self._known_m = epochs.known_m
+        self._prior = np.where(np.isfinite(epochs.known_m), 1.0 / np.array(epochs.known_std_m) ** 2, 0.0)
+        self._fewest = 2 + (self._prior == 0.0).sum(axis=1)
+        self.measured = self._with_enough(np.isfinite(range_m))
+        self.used: Mask = self.measured
+        self._range_m = np.where(self.used, range_m, 0.0)
+        self._offset_std_m = epochs.offset_std_m
+        self._offset_m, self._slope_m = np.zeros(range_m.shape[1]), _SLOPE_M
+        self._clock_m = np.zeros(len(range_m))
+        self.tag_m = self._start(position_m)
+        self.cost = 0.0
+        self._latest: tuple[Array, Array, Mask, tuple[Array, Array]] | None = None
+        """Positions, delays and ranges in use of the latest rows, and these."""
+
+    @property
+    def epochs(self) -> int:
+        """Number of epochs in use."""
+        return int(self.used.any(axis=1).sum())
+
+    @property
+    def excluded_share(self) -> float:
+        """Part of the ranges that is not in use."""
+        return 1.0 - float(self.used.sum()) / max(int(self.measured.sum()), 1)
+
+    @property
+    def freedom(self) -> int:
+        """Ranges in use less the unknowns of the tag."""
+        busy = self.used.any(axis=1)
+        return int(self.used.sum() - (self._fewest[busy] - 1).sum())
+
+    def residuals_m(self, position_m: Array, delay_m: Array) -> Array:
+        """Measured less modelled ranges with the latest positions of the tag, shape (k, n); 0 where none was made."""
+        distance = self._distances(position_m)
+        model = distance + delay_m + self._offset_m + self._slope_m * np.log(distance / _SLOPE_RANGE_M)
+        return np.asarray(np.where(self.measured, self._range_m - model - self._clock_m[:, None], 0.0))
+
+    def exclude_beyond(self, position_m: Array, delay_m: Array, limit: float) -> None:
+        """Exclude of each epoch the range that fits worst, if it is off by more than ``limit`` standard deviations.
+
+        Residuals are scaled up by what the tag's free position and clock take out of them.
+        """
+        local, _, residual = self._derivatives(position_m, delay_m)
+        inverse = self._inverse_local(local)
+        leverage = np.einsum("kjl,klm,kjm->kj", local, inverse, local) / TAG_STD_M**2
+        away = np.abs(residual) / np.sqrt(np.maximum(1.0 - leverage, _MIN_FREE))
+        typical = 1.4826 * float(np.median(away[self.used])) if self.used.any() else 0.0
+        worst = (away == away.max(axis=1, initial=0.0, keepdims=True)) & (away > limit * max(_MIN_SCALE_M, typical))
+        if (worst & self.used).any():
+            self.used = self._with_enough(self.used & ~worst)
+
+    def rows(self, position_m: Array, delay_m: Array) -> tuple[Array, Array]:
+        """Jacobian and residuals as ``MoreRows`` has them; the last residual is what no position changes."""
+        if self._latest is not None:
+            before_m, before_delay_m, used, rows = self._latest
+            if used is self.used and np.array_equal(before_m, position_m) and np.array_equal(before_delay_m, delay_m):
+                return rows
+            if np.abs(before_m - position_m).max() > _ELSEWHERE_M:
+                self.tag_m = self._start(position_m)
+        rows = self._rows(position_m, delay_m)
+        self._latest = position_m.copy(), delay_m.copy(), self.used, rows
+        return rows
+
+    def _rows(self, position_m: Array, delay_m: Array) -> tuple[Array, Array]:
+        n = len(position_m)
+        self._locate_tag(position_m, delay_m)
+        local, constants, residual = self._derivatives(position_m, delay_m)
+        anchors = np.zeros((*residual.shape, 4 * n))
+        column = np.arange(n)
+        for axis in range(3):
+            anchors[:, column, 3 * column + axis] = -local[:, :, axis]
+        anchors[:, column, 3 * n + column] = 1.0
+        normal, gradient, _ = self._eliminated(local, np.concatenate([anchors, constants], axis=2), residual)
+        prior, missing_m = self._constants_prior()
+        normal[4 * n :, 4 * n :] += np.diag(prior)
+        gradient[4 * n :] += prior * missing_m
+        gain = np.linalg.solve(normal[4 * n :, 4 * n :], normal[4 * n :, : 4 * n])
+        information = normal[: 4 * n, : 4 * n] - normal[: 4 * n, 4 * n :] @ gain
+        self.cost = self._cost(residual)
+        return _square_root(information, gradient[: 4 * n] - gain.T @ gradient[4 * n :], self.cost)
+
+    def _locate_tag(self, position_m: Array, delay_m: Array) -> None:
+        """Gauss–Newton for the tag's positions, clocks and constants while the anchors stay."""
+        before = np.inf
+        for _ in range(_INNER_STEPS):
+            local, constants, residual = self._derivatives(position_m, delay_m)
+            normal, gradient, (inverse, cross, right) = self._eliminated(local, constants, residual)
+            prior, missing_m = self._constants_prior()
+            common = np.linalg.solve(normal + np.diag(prior), gradient + prior * missing_m)
+            step = np.einsum("klm,km->kl", inverse, right - cross @ common)
+            length = np.sqrt((step[:, :3] ** 2).sum(axis=1))
+            step *= np.minimum(1.0, _LONGEST_STEP_M / np.maximum(length, 1e-12))[:, None]
+            self.tag_m += step[:, :3]
+            self._clock_m += step[:, 3]
+            self._offset_m = self._offset_m + common[:-1]
+            self._slope_m += float(common[-1])
+            cost = self._cost(self.residuals_m(position_m, delay_m) * self.used)
+            if abs(before - cost) <= _SMALLEST_CHANGE * (1.0 + cost):
+                return
+            before = cost
+
+    def _derivatives(self, position_m: Array, delay_m: Array) -> tuple[Array, Array, Array]:
+        """By tag and clock, (k, n, 4); by constants and slope, (k, n, n + 1); residuals, (k, n), 0 where not in use."""
+        k, n = self.used.shape
+        distance = self._distances(position_m)
+        growth = (1.0 + self._slope_m / distance) / distance
+        local = np.ones((k, n, 4))
+        local[:, :, :3] = (self.tag_m[:, None, :] - position_m[None, :, :]) * growth[:, :, None]
+        constants = np.zeros((k, n, n + 1))
+        constants[:, np.arange(n), np.arange(n)] = 1.0
+        constants[:, :, n] = np.log(distance / _SLOPE_RANGE_M)
+        return local, constants, self.residuals_m(position_m, delay_m) * self.used
+
+    def _eliminated(
+        self, local: Array, whole: Array, residual: Array
+    ) -> tuple[Array, Array, tuple[Array, Array, Array]]:
+        """Normal matrix and gradient of ``whole``'s g columns without tag and clocks; and what gives these back."""
+        weight = self.used / TAG_STD_M**2
+        inverse = self._inverse_local(local)
+        right = np.einsum("kjl,kj->kl", local, weight * residual)
+        right[:, :3] += self._prior * np.where(self._prior > 0.0, self._known_m - self.tag_m, 0.0)
+        weighted = whole * weight[:, :, None]
+        cross = np.swapaxes(local, 1, 2) @ weighted
+        inner = inverse @ cross
+        columns = whole.shape[2]
+        flat = whole.reshape(-1, columns)
+        normal = weighted.reshape(-1, columns).T @ flat - cross.reshape(-1, columns).T @ inner.reshape(-1, columns)
+        gradient = weighted.reshape(-1, columns).T @ residual.ravel() - np.einsum("klg,kl->g", inner, right)
+        return normal, gradient, (inverse, cross, right)
+
+    def _inverse_local(self, local: Array) -> Array:
+        """Covariance of tag and clock in each epoch while all else is known, shape (k, 4, 4)."""
+        normal = np.einsum("kjl,kj,kjm->klm", local, self.used / TAG_STD_M**2, local)
+        diagonal = np.arange(3)
+        normal[:, diagonal, diagonal] += self._prior
+        return np.asarray(np.linalg.pinv(normal, rcond=_SINGULAR, hermitian=True))
+
+    def _constants_prior(self) -> tuple[Array, Array]:
+        """Information on constants and slope, and how far they are from what is expected, each (n + 1,)."""
+        prior = np.append(np.full(len(self._offset_m), self._offset_std_m**-2), _SLOPE_STD_M**-2)
+        return prior, np.append(-self._offset_m, _SLOPE_M - self._slope_m)
+
+    def _cost(self, residual: Array) -> float:
+        prior, missing_m = self._constants_prior()
+        known = self._prior * np.where(self._prior > 0.0, self._known_m - self.tag_m, 0.0) ** 2
+        return float((residual**2).sum() / TAG_STD_M**2 + known.sum() + prior @ missing_m**2)
+
+    def _distances(self, position_m: Array) -> Array:
+        apart = self.tag_m[:, None, :] - position_m[None, :, :]
+        return np.asarray(np.maximum(np.sqrt(np.einsum("kja,kja->kj", apart, apart)), _NEAREST_M))
+
+    def _with_enough(self, usable: Mask) -> Mask:
+        """Without epochs that have no more ranges than unknowns."""
+        return np.asarray(usable & (usable.sum(axis=1) >= self._fewest)[:, None])
+
+    def _start(self, position_m: Array) -> Array:
+        """The tag in each epoch, shape (k, 3): the best of a grid, all epochs on that level which fits best."""
+        low, high = position_m.min(axis=0), position_m.max(axis=0)
+        size = float((high - low)[:2].max())
+        across = [np.linspace(low[axis] - 0.1 * size, high[axis] + 0.1 * size, _GRID) for axis in (0, 1)]
+        levels = np.linspace(low[2] - 0.5 * size, high[2] + 0.5 * size, _LEVELS)
+        count = np.maximum(self.used.sum(axis=1), 1)
+        best_cost, best = np.inf, np.zeros((len(self.used), 3))
+        for z_m in levels:
+            chosen, chosen_cost = np.zeros_like(best), np.full(len(best), np.inf)
+            for x_m, y_m in ((x_m, y_m) for x_m in across[0] for y_m in across[1]):
+                self.tag_m = np.where(self._prior > 0.0, self._known_m, np.array([x_m, y_m, z_m]))
+                short_m = np.where(self.used, self._range_m - self._distances(position_m), 0.0)
+                away = np.where(self.used, short_m - (short_m.sum(axis=1) / count)[:, None], 0.0)
+                cost = (away**2).sum(axis=1)
+                better = cost < chosen_cost
+                chosen[better], chosen_cost[better] = self.tag_m[better], cost[better]
+            if chosen_cost.sum() < best_cost:
+                best_cost, best = float(chosen_cost.sum()), chosen
+        self.tag_m = best
+        short_m = np.where(self.used, self._range_m - self._distances(position_m), 0.0)
+        self._clock_m = short_m.sum(axis=1) / count
+        return best
+
+
+def _square_root(information: Array, gradient: Array, cost: float) -> tuple[Array, Array]:
+    """Rows whose normal equations these are, and whose squared residuals sum up to the cost."""
+    values, vectors = np.linalg.eigh(information)
+    kept = values > _SINGULAR * values.max(initial=0.0)
+    root = np.sqrt(values[kept])
+    jacobian = root[:, None] * vectors[:, kept].T
+    residual = (vectors[:, kept].T @ gradient) / root
+    rest = np.sqrt(max(cost - float(residual @ residual), 0.0))
+    return np.vstack([jacobian, np.zeros((1, len(information)))]), np.append(residual, rest)
+
+
+# Ranges of anchors and of a tag in one fit
+
+
+_FEWEST_EPOCHS: Final = 10
+_LIMIT: Final = 4.0  # standard deviations beyond which a range of the tag is not used
+_MAX_EXCLUDED: Final = 0.2
+_FALSE_ALARM: Final = 1e-4  # probability that the chi-squared tests reject a walk that fits
+_RANGES_PER_INDEPENDENT: Final = 4.0
+"""The residuals of a walk are tested as if only every fourth range were independent: reflections outlast an epoch."""
+
+_CLEARLY: Final = 16.0  # a result whose cost is higher by this is not the right one
+_EXCLUSION_ROUNDS: Final = 6
+
+
+class JointFit(Struct, frozen=True, eq=False):
+    """What came of a walk."""
+
+    solution: Solution | None
+    """With the walk; None if it was not used."""
+    chosen: int
+    """Which of the starts led to it."""
+    possible: tuple[int, ...]
+    """Starts whose results the walk does not rule out, ``chosen`` among them; all of them if it was not used."""
+    sentence: str
+    """What was done with it and why."""
+    rows: WalkRows | None
+    """For fits that go on from ``solution``: ``replace(problem, more=(*problem.more, rows))``."""
+
+
+class _Trial(Struct, frozen=True, eq=False):
+    solution: Solution
+    rows: WalkRows
+    cost: float
+    """With what ranges that are not used cost at the limit, those of the tag and those of anchors."""
+
+
+def fit_with_tag(
+    problem: Problem,
+    anchors: Sequence[int],
+    alone: Sequence[Solution],
+    epochs: TagEpochs,
+    pair_ranges_m: Mapping[tuple[int, int], float],
+    used: Sequence[Mask] = (),
+) -> JointFit:
+    """Fit ranges and tag together, from each of the results of the ranges ``alone``, of which the first is the best.
+
+    The first remains, unless the tag contradicts it clearly. ``anchors``: identifiers in the problem's order.
+    ``pair_ranges_m``: see ``tag_ranges``. ``used``: ranges in use, of each result; by default all.
+    """
+    everything, name = tuple(range(len(alone))), epochs.name
+    range_m = _of_anchors(tag_ranges(epochs, pair_ranges_m), epochs.anchors, anchors)
+    in_use = used or [np.ones(len(problem.range_m), dtype=bool)] * len(alone)
+    trials = [
+        _trial(problem, start.position_m, epochs, range_m, mask) for start, mask in zip(alone, in_use, strict=True)
+    ]
+    least = min(trial.cost for trial in trials)
+    possible = tuple(number for number in everything if trials[number].cost <= least + _CLEARLY)
+    chosen = 0 if 0 in possible else min(possible, key=lambda number: trials[number].cost)
+    best = trials[chosen]
+    reason = _unfit(problem, alone[chosen], best)
+    if reason is not None:
+        return JointFit(None, 0, everything, f"what {name} received was not used: {reason}", None)
+    apart = [number for number in possible if number == chosen or not _same(best.solution, trials[number].solution)]
+    seconds, excluded = best.rows.epochs * EPOCH_S, best.rows.excluded_share
+    sentence = f"{seconds:g} s of {name} were used" + (
+        f"; {excluded:.0%} of its ranges were left out" if excluded else ""
+    )
+    return JointFit(best.solution, chosen, tuple(apart), sentence, best.rows)
+
+
+def _of_anchors(range_m: Array, have: Sequence[int], wanted: Sequence[int]) -> Array:
+    """Columns of the wanted anchors; NaN where there is none."""
+    column = {anchor: number for number, anchor in enumerate(have)}
+    found = np.full((len(range_m), len(wanted)), np.nan)
+    for number, anchor in enumerate(wanted):
+        if anchor in column:
+            found[:, number] = range_m[:, column[anchor]]
+    return found
+
+
+def _trial(problem: Problem, start_m: Array, epochs: TagEpochs, range_m: Array, used: Mask) -> _Trial:
+    rows = WalkRows(epochs, range_m, start_m)
+    both = replace(problem, more=(*problem.more, rows))
+    weight = used.astype(np.float64)
+    solution = solve_least_squares(both, start_m, weight)
+    for _ in range(_EXCLUSION_ROUNDS):
+        before = rows.used
+        rows.exclude_beyond(solution.position_m, solution.delay_m, _LIMIT)
+        if rows.used is before:
+            break
+        solution = solve_least_squares(both, solution.position_m, weight)
+    excluded = int(rows.measured.sum() - rows.used.sum())
+    return _Trial(solution, rows, solution.cost + _LIMIT**2 * excluded + LATE_CUTOFF**2 * int((~used).sum()))
+
+
+def _unfit(problem: Problem, alone: Solution, trial: _Trial) -> str | None:
+    """Why ranges and walk are not to be used together."""
+    rows, solution = trial.rows, trial.solution
+    if rows.epochs < _FEWEST_EPOCHS:
+        return f"only {rows.epochs} epochs of half a second have enough anchors; {_FEWEST_EPOCHS} are needed"
+    if rows.excluded_share > _MAX_EXCLUDED:
+        return f"{rows.excluded_share:.0%} of its ranges do not fit, as where anchors are not in sight"
+    jacobian, _ = rows.rows(solution.position_m, solution.delay_m)
+    independent = rows.freedom / _RANGES_PER_INDEPENDENT
+    excess = rows.cost / max(rows.freedom, 1)
+    if excess > chdtri(independent, _FALSE_ALARM) / independent:
+        return f"its residuals are {np.sqrt(excess):.1f} times what they should be"
+    n = len(solution.delay_m)
+    unknown = unknown_columns(problem)
+    of_walk = jacobian[:, unknown].T @ jacobian[:, unknown]
+    of_ranges = solution.information - of_walk
+    taken = np.linalg.matrix_rank(of_ranges, hermitian=True) - float(
+        np.trace(np.linalg.pinv(solution.information, rcond=1e-12, hermitian=True) @ of_ranges)
+    )
+    rise = solution.cost - rows.cost - alone.cost
+    checks = int(alone.residual_m.size + n - np.linalg.matrix_rank(of_ranges, hermitian=True))
+    usual = max(1.0, alone.cost / checks) if checks > 0 else 1.0
+    if rise > usual * chdtri(max(taken, 1.0), _FALSE_ALARM):
+        return "it contradicts the ranges between the anchors"
+    return None
+
+
+def _same(one: Solution, other: Solution) -> bool:
+    """Whether two results have the same distances, within 2 cm."""
+    return bool(np.abs(distances_m(one.position_m) - distances_m(other.position_m)).max() < 0.02)

@@ -1,0 +1,1 @@
+"""Anchors that moved, or changed otherwise, since their survey."""

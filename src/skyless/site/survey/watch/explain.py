@@ -1,0 +1,477 @@
+"""Which causes explain the changes of a window, and which others would as well.
+
+A cause is an anchor's displacement (its ranges change by the projection on their directions), an anchor's delay (they
+all change by as much), or one late link. Its evidence is by how much chi-squared falls when it is allowed for. Causes
+are numbered: displacements of the ``n`` anchors, their delays, then the ``m`` links.
+
+Sets of causes grow one by one, a few best sets side by side. Each cause must be worth more than chance among all causes
+gives, so that one displacement is preferred to two late links, but not to one that explains as much. What every set
+within a margin of the best has in common is certain; where they differ, the anchors are in question.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Final, Literal
+
+import numpy as np
+from msgspec import Struct
+from scipy.special import chdtri
+
+from skyless.core.kernels.arrays import Array, Integers, Mask
+
+# Findings
+
+
+Kind = Literal["moved", "delay", "link", "check"]
+
+
+class Finding(Struct, frozen=True):
+    """Something at the anchors has changed."""
+
+    kind: Kind
+    """An anchor has moved; its delay has changed; one link is blocked; something has changed, unclear what."""
+    anchors: tuple[int, ...]
+    """The anchor, or both ends of the link; for ``check`` those in question, in ascending order."""
+    size_m: float
+    """How far it has moved, or by how much its delay h or the link's range has grown; 0 for a link that is silent."""
+    std_m: float | None
+    since_s: float
+    """When the first window in which it was seen began, on the clock of the blocks."""
+    sentence: str
+
+
+_SILENT: Final = "anchors {} and {} no longer receive each other"
+
+
+def silent_link(a: int, b: int, since_s: float) -> Finding:
+    """A pair without ranges while both anchors have them with others."""
+    return Finding("link", (a, b), 0.0, None, since_s, _SILENT.format(a, b))
+
+
+def sentence_of(kind: Kind, anchors: tuple[int, ...], size_m: float, *, or_else: Kind | None = None) -> str:
+    """One sentence without a full stop. ``or_else``: what the same anchor may have done as well."""
+    if kind == "moved":
+        sentence = f"anchor {anchors[0]} has moved by about {_length(size_m)}"
+        return f"{sentence}, or its delay has changed" if or_else else sentence
+    if kind == "delay":
+        more = "more" if size_m > 0.0 else "less"
+        sentence = f"the delay of anchor {anchors[0]} has changed: {_length(abs(size_m))} {more}"
+        return f"{sentence}, or it has moved" if or_else else sentence
+    if kind == "link":
+        a, b = anchors
+        if size_m < 0.0:
+            return f"the link between {a} and {b} is {_length(-size_m)} shorter: it was blocked before"
+        return f"the link between {a} and {b} is blocked: {_length(size_m)} late"
+    if len(anchors) == 1:
+        return f"something has changed at anchor {anchors[0]}: check"
+    *others, last = map(str, anchors)
+    return f"something has changed at anchors {', '.join(others)} or {last}: check"
+
+
+def _length(size_m: float) -> str:
+    return f"{size_m:.1f} m" if size_m >= 0.995 else f"{max(round(100.0 * size_m), 1)} cm"
+
+
+# Evidence for single causes
+
+
+_MIN_INFORMATION_PER_M2: Final = 4.0
+"""A displacement in a direction in which its standard deviation exceeds half a metre is not seen."""
+
+_SHARED: Final = 0.25  # correlation of two pairs that share an anchor, as TX noise makes up half of a range's variance
+_STEPS: Final = 8
+_SMALLEST_STEP_M: Final = 1e-4
+
+
+class Pairs(Struct, frozen=True, eq=False):
+    """What is compared in a window: ``m`` pairs of ``n`` anchors."""
+
+    position_m: Array
+    """Shape (n, 3), where the anchors should be."""
+    first: Integers
+    second: Integers
+    """Shape (m,): indices of each pair's anchors."""
+    dimensions: int
+    weight: Array
+    """Shape (m, m): inverse covariance of the pairs' changes."""
+
+    @property
+    def anchors(self) -> int:
+        """Number of anchors."""
+        return len(self.position_m)
+
+    @property
+    def causes(self) -> int:
+        """Number of causes."""
+        return 2 * len(self.position_m) + len(self.first)
+
+
+class Fit(Struct, frozen=True, eq=False):
+    """Changes explained by a set of causes."""
+
+    chi2: float
+    """That is left."""
+    residual_m: Array
+    """Shape (m,)."""
+    parameter_m: tuple[Array, ...]
+    """The displacement, delay or lateness of each cause."""
+    covariance_m2: tuple[Array, ...]
+    columns: Array
+    """Shape (m, k): derivatives of the changes with respect to all parameters, at the solution."""
+
+
+def weight_of(first: Integers, second: Integers, anchors: int, white_m: Array, drift_m: Array) -> Array:
+    """Inverse covariance, shape (m, m), of changes with white noise of stamps and drift, each shape (m,)."""
+    rows = np.arange(len(first))
+    shared = np.zeros((len(first), anchors))  # what an anchor's TX noise does to its pairs
+    shared[rows, first] = shared[rows, second] = math.sqrt(_SHARED) * white_m
+    own = 1.0 / ((1.0 - 2.0 * _SHARED) * white_m**2 + drift_m**2)
+    weighted = own[:, None] * shared
+    inner = np.linalg.inv(np.eye(anchors) + shared.T @ weighted)  # of anchors, not of pairs: the matrix inversion lemma
+    weight: Array = -(weighted @ inner) @ weighted.T
+    weight[rows, rows] += own
+    return weight
+
+
+def evidence(pairs: Pairs, weight: Array, weighted_m: Array) -> tuple[Array, Integers]:
+    """Fall of chi-squared by each cause alone, shape (..., causes), and its degrees of freedom, shape (causes,).
+
+    ``weight``: shape (m, m), with what other causes explain already taken out. ``weighted_m``: ``weight`` times the
+    changes, shape (..., m).
+    """
+    n, dim, m = pairs.anchors, pairs.dimensions, len(pairs.first)
+    moved = _moved_columns(pairs, pairs.position_m).reshape(m, n * dim)
+    delayed = _delay_columns(pairs)
+    products = (weight @ moved).reshape(m, n, dim)
+    information, directions = np.linalg.eigh(np.einsum("pid,pie->ide", moved.reshape(m, n, dim), products))
+    is_seen = information > _MIN_INFORMATION_PER_M2
+    along = np.einsum("ide,...id->...ie", directions, (weighted_m @ moved).reshape(*weighted_m.shape[:-1], n, dim))
+    of_moved = np.where(is_seen, along**2 / np.where(is_seen, information, 1.0), 0.0).sum(axis=-1)
+    of_delay, delay_seen = _scalar(weighted_m @ delayed, np.einsum("pi,pi->i", delayed, weight @ delayed))
+    of_link, link_seen = _scalar(weighted_m, np.diagonal(weight))
+    return (
+        np.concatenate([of_moved, of_delay, of_link], axis=-1),
+        np.concatenate([is_seen.sum(axis=-1), delay_seen, link_seen]).astype(np.int64),
+    )
+
+
+def _scalar(along: Array, information: Array) -> tuple[Array, Mask]:
+    is_seen = information > _MIN_INFORMATION_PER_M2
+    return np.asarray(np.where(is_seen, along**2 / np.where(is_seen, information, 1.0), 0.0)), is_seen
+
+
+def thresholds(dof: Integers, probability: float) -> Array:
+    """What chi-squared exceeds by chance with that probability, in any of the causes; infinite without a freedom."""
+    found = np.full(len(dof), np.inf)
+    seen = dof > 0
+    found[seen] = chdtri(dof[seen], probability / max(int(seen.sum()), 1))
+    return found
+
+
+def fit(pairs: Pairs, change_m: Array, causes: Sequence[int], scratch: Fit | None = None) -> Fit:
+    """Least squares of these causes together; displacements may be as large as they like.
+
+    ``change_m``: shape (m,). ``scratch``: the fit of all but the last cause, where to begin.
+    """
+    sizes = [pairs.dimensions if cause < pairs.anchors else 1 for cause in causes]
+    ends = np.cumsum(sizes, dtype=np.int64)
+    parameter = np.zeros(int(ends[-1]) if sizes else 0)
+    if scratch is not None and scratch.parameter_m:
+        start = np.concatenate(scratch.parameter_m)
+        parameter[: len(start)] = start
+    columns, predicted = _model(pairs, causes, ends, parameter)
+    moves = any(cause < pairs.anchors for cause in causes)
+    for _ in range(_STEPS if moves else 1):
+        residual = change_m - predicted
+        step = _inverse(columns.T @ pairs.weight @ columns) @ (columns.T @ (pairs.weight @ residual))
+        parameter = parameter + step
+        columns, predicted = _model(pairs, causes, ends, parameter)
+        if not len(step) or np.abs(step).max() < _SMALLEST_STEP_M:
+            break
+    residual = change_m - predicted
+    covariance = _inverse(columns.T @ pairs.weight @ columns)
+    spans = [slice(end - size, end) for size, end in zip(sizes, ends.tolist(), strict=True)]
+    return Fit(
+        float(residual @ pairs.weight @ residual),
+        residual,
+        tuple(parameter[span] for span in spans),
+        tuple(covariance[span, span] for span in spans),
+        columns,
+    )
+
+
+def weight_without(pairs: Pairs, found: Fit) -> Array:
+    """The weight of what the causes of a fit leave unexplained."""
+    if not found.columns.shape[1]:
+        return pairs.weight
+    weighted = pairs.weight @ found.columns
+    return np.asarray(pairs.weight - weighted @ _inverse(found.columns.T @ weighted) @ weighted.T)
+
+
+def _inverse(information: Array) -> Array:
+    """Without the directions that are not seen."""
+    values, vectors = np.linalg.eigh(information)
+    is_seen = values > _MIN_INFORMATION_PER_M2
+    return np.asarray((vectors * np.where(is_seen, 1.0 / np.where(is_seen, values, 1.0), 0.0)) @ vectors.T)
+
+
+def _moved_columns(pairs: Pairs, position_m: Array) -> Array:
+    """Shape (m, n, dim): by how much each pair's distance grows when an anchor moves."""
+    apart = (position_m[pairs.first] - position_m[pairs.second])[:, : pairs.dimensions]
+    distance = np.linalg.norm(position_m[pairs.first] - position_m[pairs.second], axis=1)
+    unit = apart / np.maximum(distance, 1e-6)[:, None]
+    columns = np.zeros((len(pairs.first), pairs.anchors, pairs.dimensions))
+    rows = np.arange(len(pairs.first))
+    columns[rows, pairs.first] = unit
+    columns[rows, pairs.second] = -unit
+    return columns
+
+
+def _delay_columns(pairs: Pairs) -> Array:
+    """Shape (m, n)."""
+    columns = np.zeros((len(pairs.first), pairs.anchors))
+    rows = np.arange(len(pairs.first))
+    columns[rows, pairs.first] = columns[rows, pairs.second] = 1.0
+    return columns
+
+
+def _model(pairs: Pairs, causes: Sequence[int], ends: Integers, parameter: Array) -> tuple[Array, Array]:
+    """Derivatives, shape (m, k), and the changes that these parameters make, shape (m,)."""
+    n, m, dim = pairs.anchors, len(pairs.first), pairs.dimensions
+    position_m = pairs.position_m.copy()
+    for cause, end in zip(causes, ends.tolist(), strict=True):
+        if cause < n:
+            position_m[cause, :dim] += parameter[end - dim : end]
+    apart_m = np.linalg.norm(position_m[pairs.first] - position_m[pairs.second], axis=1)
+    before_m = np.linalg.norm(pairs.position_m[pairs.first] - pairs.position_m[pairs.second], axis=1)
+    predicted = apart_m - before_m
+    columns = np.zeros((m, len(parameter)))
+    moved, delayed = _moved_columns(pairs, position_m), _delay_columns(pairs)
+    for cause, end in zip(causes, ends.tolist(), strict=True):
+        if cause < n:
+            columns[:, end - dim : end] = moved[:, cause]
+            continue
+        if cause < 2 * n:
+            columns[:, end - 1] = delayed[:, cause - n]
+        else:
+            columns[cause - 2 * n, end - 1] = 1.0
+        predicted = predicted + columns[:, end - 1] * parameter[end - 1]
+    return columns, predicted
+
+
+# Sets of causes
+
+
+_ADDED: Final = 1e-4  # probability that chance adds a cause to a set
+_MARGIN: Final = 9.0  # twice the logarithm of the odds up to which two sets are both possible: 1 to 90
+_BEAM: Final = 5
+_BRANCHES: Final = 8
+_MAX_CAUSES: Final = 5
+
+_FURTHER_LINK: Final = 9.0
+"""By how much less evidence every late link after the first needs in comparisons of sets: one body blocks several."""
+_LATE: Final = 3.0  # standard deviations from which on a link counts as late
+
+
+class Part(Struct, frozen=True):
+    """Something that has changed in a window."""
+
+    kind: Kind
+    anchors: tuple[int, ...]
+    """Indices, in ascending order."""
+    size_m: float
+    std_m: float | None
+    or_else: Kind | None = None
+    """What the same anchor may have done as well."""
+
+
+class Explanation(Struct, frozen=True, eq=False):
+    """What has changed in a window, and what is left when that is allowed for."""
+
+    parts: tuple[Part, ...]
+    weight: Array
+    """Shape (m, m)."""
+    weighted_m: Array
+    """Shape (m,): the weight times the changes that are left."""
+
+
+class _Set(Struct, frozen=True, eq=False):
+    causes: tuple[int, ...]
+    fit: Fit
+    score: float
+    is_complete: bool = False
+    """Whether no further cause is worth adding."""
+
+
+def is_significant(pairs: Pairs, change_m: Array, false_alarm: float) -> Array:
+    """Whether any cause has more evidence than chance gives with probability ``false_alarm``.
+
+    ``change_m``: shape (..., m); result of shape (...).
+    """
+    found, dof = evidence(pairs, pairs.weight, change_m @ pairs.weight)
+    return np.asarray((found > thresholds(dof, false_alarm)).any(axis=-1))
+
+
+def nothing(pairs: Pairs, change_m: Array) -> Explanation:
+    """Explanation of a window that noise and drift explain."""
+    return Explanation((), pairs.weight, change_m @ pairs.weight)
+
+
+def explain(pairs: Pairs, change_m: Array) -> Explanation:
+    """Explanation of a window with a significant change. ``change_m``: shape (m,)."""
+    sets = _grown(pairs, change_m)
+    sets += _blocked(pairs, change_m, max(sets, key=lambda one: one.score))
+    best = max(sets, key=lambda one: one.score)
+    if not best.causes:
+        return nothing(pairs, change_m)
+    if best.is_complete:
+        rivals = [one for one in sets if one is not best and one.score > best.score - _MARGIN]
+        parts = _parts(pairs, best, rivals)
+    else:
+        parts = [_check(pairs, [best.causes], best)]
+    return Explanation(tuple(parts), weight_without(pairs, best.fit), pairs.weight @ best.fit.residual_m)
+
+
+def _grown(pairs: Pairs, change_m: Array) -> list[_Set]:
+    empty = fit(pairs, change_m, ())
+    beam = [_Set((), empty, 0.0)]
+    known: dict[frozenset[int], _Set] = {}
+    worth: Array | None = None
+    for size in range(_MAX_CAUSES + 1):
+        candidates: list[tuple[float, _Set, int]] = []
+        for one in beam:
+            weight = weight_without(pairs, one.fit) if one.causes else pairs.weight
+            gained, dof = evidence(_displaced(pairs, one), weight, one.fit.residual_m @ pairs.weight)
+            if worth is None:
+                worth = thresholds(dof, _ADDED)
+            gained[list(one.causes)] = 0.0
+            value = gained - worth
+            if not (value > 0.0).any():
+                known[frozenset(one.causes)] = _Set(one.causes, one.fit, one.score, is_complete=True)
+                continue
+            known[frozenset(one.causes)] = one
+            best = np.argsort(-value)[:_BRANCHES]
+            candidates += [(one.score + float(value[of]), one, of) for of in best[value[best] > -_MARGIN].tolist()]
+        if size == _MAX_CAUSES or not candidates or worth is None:
+            break
+        beam = _best_sets(pairs, change_m, candidates, known, worth, empty.chi2)
+    return list(known.values())
+
+
+def _best_sets(
+    pairs: Pairs,
+    change_m: Array,
+    candidates: list[tuple[float, _Set, int]],
+    known: dict[frozenset[int], _Set],
+    worth: Array,
+    whole: float,
+) -> list[_Set]:
+    """The sets with one more cause that explain most. ``whole``: chi-squared without any cause."""
+    grown: dict[frozenset[int], _Set] = {}
+    for _, one, cause in sorted(candidates, key=lambda candidate: -candidate[0])[: _BEAM * _BRANCHES]:
+        key = frozenset((*one.causes, cause))
+        if key in grown or key in known:
+            continue
+        causes = (*one.causes, cause)
+        found = fit(pairs, change_m, causes, one.fit)
+        grown[key] = _Set(causes, found, whole - found.chi2 - _cost(pairs, causes, worth))
+    ordered = sorted(grown.values(), key=lambda one: -one.score)
+    for one in ordered[_BEAM:]:
+        known[frozenset(one.causes)] = one
+    return ordered[:_BEAM]
+
+
+def _cost(pairs: Pairs, causes: tuple[int, ...], worth: Array) -> float:
+    links = sum(cause >= 2 * pairs.anchors for cause in causes)
+    return float(worth[list(causes)].sum()) - _FURTHER_LINK * max(links - 1, 0)
+
+
+def _blocked(pairs: Pairs, change_m: Array, best: _Set) -> list[_Set]:
+    """For each displaced or delayed anchor, the set in which its late links are blocked instead."""
+    n = pairs.anchors
+    whole = float(change_m @ pairs.weight @ change_m)
+    _, dof = evidence(pairs, pairs.weight, change_m @ pairs.weight)
+    worth = thresholds(dof, _ADDED)
+    found = []
+    for cause in best.causes:
+        if cause >= 2 * n:
+            continue
+        others = tuple(one for one in best.causes if one != cause)
+        residual_m = fit(pairs, change_m, others).residual_m
+        is_late = (pairs.first == cause % n) | (pairs.second == cause % n)
+        is_late &= residual_m > _LATE / np.sqrt(np.diagonal(pairs.weight))
+        causes = (*others, *(link for link in (2 * n + np.flatnonzero(is_late)).tolist() if link not in others))
+        instead = fit(pairs, change_m, causes)
+        found.append(_Set(causes, instead, whole - instead.chi2 - _cost(pairs, causes, worth), is_complete=True))
+    return found
+
+
+def _displaced(pairs: Pairs, one: _Set) -> Pairs:
+    moved = [(cause, of) for cause, of in zip(one.causes, one.fit.parameter_m, strict=True) if cause < pairs.anchors]
+    if not moved:
+        return pairs
+    position_m = pairs.position_m.copy()
+    for cause, parameter in moved:
+        position_m[cause, : pairs.dimensions] += parameter
+    return Pairs(position_m, pairs.first, pairs.second, pairs.dimensions, pairs.weight)
+
+
+def _parts(pairs: Pairs, best: _Set, rivals: list[_Set]) -> list[Part]:
+    """Each cause of the best set as certain as the rivals leave it."""
+    differences = [frozenset(best.causes) ^ frozenset(rival.causes) for rival in rivals]
+    uncertain: list[tuple[int, ...]] = []
+    parts = []
+    for number, cause in enumerate(best.causes):
+        against = [one for one in differences if cause in one]
+        elsewhere = [one for one in against if len({_anchors(pairs, other) for other in one}) > 1]
+        if elsewhere:
+            uncertain += [tuple(one) for one in elsewhere]
+        elif not _is_checked(pairs, best, cause, or_else=bool(against)):
+            uncertain.append((cause,))
+        else:
+            parts.append(_part(pairs, best, number, or_else=bool(against)))
+    if uncertain:
+        parts.append(_check(pairs, uncertain, best))
+    return parts
+
+
+def _is_checked(pairs: Pairs, best: _Set, cause: int, *, or_else: bool) -> bool:
+    """Whether a range is left over that checks a displacement or a delay, and the other ``or_else``."""
+    n = pairs.anchors
+    if cause >= 2 * n:
+        return True
+    anchor = cause % n
+    late = [other - 2 * n for other in best.causes if other >= 2 * n]
+    ranged = np.flatnonzero((pairs.first == anchor) | (pairs.second == anchor))
+    ranged = ranged[~np.isin(ranged, late)]
+    return len(ranged) > (pairs.dimensions if cause < n or or_else else 1)
+
+
+def _anchors(pairs: Pairs, cause: int) -> tuple[int, ...]:
+    n = pairs.anchors
+    if cause < 2 * n:
+        return (cause % n,)
+    return (int(pairs.first[cause - 2 * n]), int(pairs.second[cause - 2 * n]))
+
+
+def _part(pairs: Pairs, best: _Set, number: int, *, or_else: bool) -> Part:
+    cause, parameter, covariance = best.causes[number], best.fit.parameter_m[number], best.fit.covariance_m2[number]
+    anchors = _anchors(pairs, cause)
+    if cause >= pairs.anchors:
+        kind: Kind = "delay" if cause < 2 * pairs.anchors else "link"
+        return Part(kind, anchors, float(parameter[0]), float(covariance[0, 0] ** 0.5), "moved" if or_else else None)
+    size_m = float(np.linalg.norm(parameter))
+    along = parameter / max(size_m, 1e-9)
+    return Part("moved", anchors, size_m, float((along @ covariance @ along) ** 0.5), "delay" if or_else else None)
+
+
+def _check(pairs: Pairs, sets: list[tuple[int, ...]], best: _Set) -> Part:
+    """All anchors in question; of many, those that most causes share."""
+    named = [anchor for one in sets for cause in one for anchor in _anchors(pairs, cause)]
+    counts: Integers = np.bincount(named, minlength=pairs.anchors)
+    anchors = np.flatnonzero(counts > 0)
+    if len(anchors) > 3 and counts.max() > 1:
+        shared = np.flatnonzero(counts == counts.max())
+        anchors = shared if len(shared) <= 3 else anchors
+    sizes = [float(np.linalg.norm(parameter)) for parameter in best.fit.parameter_m]
+    return Part("check", tuple(anchors.tolist()), max(sizes), None)

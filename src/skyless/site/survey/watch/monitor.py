@@ -1,0 +1,494 @@
+"""The watch of a site's anchors: windows of ranges, what has changed in each, and what is found in two of three."""
+
+import math
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping
+from typing import Final, Literal
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+from scipy.special import chdtri
+
+from skyless.core.kernels.arrays import Array, Integers, Mask
+from skyless.site.survey.facts import PairBlock
+from skyless.site.survey.watch.explain import (
+    Explanation,
+    Finding,
+    Pairs,
+    Part,
+    evidence,
+    explain,
+    is_significant,
+    nothing,
+    sentence_of,
+    silent_link,
+    weight_of,
+)
+
+_GAUSSIAN: Final = 1.4826  # from a median of magnitudes to a standard deviation
+_USUAL_WINDOWS: Final = 60  # windows of which the usual range is the median
+_DRIFT_WINDOWS: Final = 360
+_MIN_DRIFT_M: Final = 0.02
+_GIVEN_WINDOWS: Final = 30  # windows as which a given range counts
+_PRIOR_DIFFERENCES: Final = 4
+_PRIOR_DRIFT_M: Final = 0.03  # expected drift of a pair, which counts as _PRIOR_DIFFERENCES observed differences
+_MIN_LAGS: Final = 6  # known windows over the distance of those compared, at least
+_NOISE_MEMORY: Final = 2000.0  # exchanges after which the estimate of their noise forgets
+_NOISE_JUMP: Final = 9.0  # by how much one block can be noisier than the blocks before
+_PRESENCE_MEMORY: Final = 60.0  # windows after which it is forgotten how regularly a pair's ranges came
+
+
+class RangeHistory:
+    """Usual range, drift and noise of all pairs; a pair's row is its number."""
+
+    def __init__(self) -> None:
+        self._usual = np.full((0, _USUAL_WINDOWS), np.nan)
+        self._used = np.zeros(0, np.int64)
+        """Windows that have gone into each row of ``_usual``."""
+        self._values = np.full((0, _DRIFT_WINDOWS), np.nan)
+        self._windows = 0
+        self._usual_m = np.zeros(0)
+        self._noise_m2 = np.zeros(0)
+        self._noise_exchanges = np.zeros(0)
+        self.first_m = np.zeros(0)
+        """Shape (m,): the range that was given, or the first median over ``usual_windows``; NaN before."""
+        self.presence = np.zeros(0)
+        """Shape (m,): share of the windows with both anchors in which the pair had a range."""
+
+    def __len__(self) -> int:
+        return len(self._usual)
+
+    @property
+    def usual_m(self) -> Array:
+        """Shape (m,): the usual range; NaN where it is not known."""
+        return self._usual_m
+
+    @property
+    def windows(self) -> Array:
+        """Shape (m,): windows that the usual range is made of."""
+        return np.minimum(self._used, _USUAL_WINDOWS).astype(np.float64)
+
+    @property
+    def noise_m2(self) -> Array:
+        """Shape (m,): variance of one exchange."""
+        return self._noise_m2
+
+    def add_pair(self, given_m: float | None = None) -> int:
+        """The number of another pair. ``given_m``: its range by the survey."""
+        row = np.full((1, _USUAL_WINDOWS), np.nan)
+        used = 0
+        if given_m is not None:
+            used = _GIVEN_WINDOWS
+            row[0, :used] = given_m
+        first_m = np.nan if given_m is None else given_m
+        self._usual = np.concatenate([self._usual, row])
+        self._used = np.append(self._used, used)
+        self._values = np.concatenate([self._values, np.full((1, _DRIFT_WINDOWS), np.nan)])
+        self._usual_m = np.append(self._usual_m, first_m)
+        self._noise_m2 = np.append(self._noise_m2, 0.0)
+        self._noise_exchanges = np.append(self._noise_exchanges, 0.0)
+        self.first_m = np.append(self.first_m, first_m)
+        self.presence = np.append(self.presence, 1.0)
+        return len(self._usual) - 1
+
+    def add_noise(self, pair: int, variance_m2: float, exchanges: int) -> None:
+        """Count the noise of a block: variance of one exchange."""
+        known = self._noise_exchanges[pair]
+        if known > 0.0:
+            variance_m2 = min(variance_m2, _NOISE_JUMP * self._noise_m2[pair])
+        total = known + exchanges
+        self._noise_m2[pair] += (variance_m2 - self._noise_m2[pair]) * exchanges / total
+        self._noise_exchanges[pair] = min(total, _NOISE_MEMORY)
+
+    def add_window(self, range_m: Array, is_usable: Mask, is_drifting: Mask, is_expected: Mask) -> None:
+        """Add the ranges of a window, shape (m,), NaN where there is none.
+
+        ``is_usable``: where nothing has changed, so that the usual range may follow it. ``is_drifting``: where changes
+        may count as drift. ``is_expected``: where a missing range counts for ``presence``.
+        """
+        self._values[:, self._windows % _DRIFT_WINDOWS] = np.where(is_drifting, range_m, np.nan)
+        self._windows += 1
+        is_present = np.isfinite(range_m)
+        rows = np.flatnonzero(is_present & is_usable)
+        self._usual[rows, self._used[rows] % _USUAL_WINDOWS] = range_m[rows]
+        self._used[rows] += 1
+        if len(rows):
+            self._usual_m[rows] = np.nanmedian(self._usual[rows], axis=1)
+        is_full = np.isnan(self.first_m) & (self._used >= _USUAL_WINDOWS)
+        self.first_m[is_full] = self._usual_m[is_full]
+        self.presence[is_expected] += (is_present[is_expected] - self.presence[is_expected]) / _PRESENCE_MEMORY
+
+    def drift_m(self) -> Array:
+        """Standard deviation of each pair's drift about its usual range, shape (m,).
+
+        From differences of windows up to half the median's length apart: a step spoils few of them, and drift that is
+        slower than the median is left to the median.
+        """
+        length = _DRIFT_WINDOWS
+        known = min(self._windows, length)
+        lag = max(min(_USUAL_WINDOWS // 2, known // _MIN_LAGS), 1)
+        newest = np.arange(self._windows - known + lag, self._windows)
+        apart = np.abs(self._values[:, newest % length] - self._values[:, (newest - lag) % length])
+        count = np.isfinite(apart).sum(axis=1)
+        scale_m2 = np.zeros(len(self))
+        rows = np.flatnonzero(count)
+        if len(rows):
+            scale_m2[rows] = (_GAUSSIAN * np.nanmedian(apart[rows], axis=1)) ** 2 / 2.0
+        learned_m2 = (count * scale_m2 + _PRIOR_DIFFERENCES * _PRIOR_DRIFT_M**2) / (count + _PRIOR_DIFFERENCES)
+        return np.asarray(np.sqrt(np.maximum(learned_m2, _MIN_DRIFT_M**2)))
+
+    def restart(self, pairs: Mask) -> None:
+        """Forget the usual ranges of these pairs, which are learned from the start."""
+        self._used[pairs] = 0
+        self._usual[pairs] = np.nan
+        self._usual_m[pairs] = self.first_m[pairs] = np.nan
+        self._values[pairs] = np.nan
+
+
+_LASTING: Final = 1e-3  # a finding lasts while what it says has more evidence than chance gives with this probability
+_SLOW_DRIFT: Final = 2.0
+"""Drift of the usual range from the first one, as a multiple of that of one window from the usual range."""
+
+_REGULAR: Final = 0.8  # share of windows in which a pair must have had ranges for their absence to be a finding
+_KNOWN_WINDOWS: Final = 12
+
+_FARTHEST_M: Final = 1e5  # longest range, delays included
+_MEDIAN_BLOCKS: Final = 3  # blocks from which on their median counts, which short obstacles do not change
+_MEDIAN_VARIANCE: Final = math.pi / 2.0
+
+_JUMP_WINDOWS: Final = 1000  # blocks that are older than that many windows show that the clock was set back
+
+
+GRACE_S: Final = 3.0
+"""How long after its end a window waits for blocks."""
+_NEEDED: Final = 2
+_OF: Final = 3  # something is found when it is seen in ``_NEEDED`` of the last ``_OF`` windows
+_FALSE_ALARM: Final = 1e-6  # probability that noise and drift alone make the changes of a window significant
+_SILENT_WINDOWS: Final = 3  # windows without a range after which a link is blocked
+
+
+class _Held(Struct):
+    """A finding, and whether the last windows support it."""
+
+    finding: Finding
+    or_else: str | None
+    lost: deque[bool]
+
+
+class _Window(Struct, frozen=True):
+    start_s: float
+    parts: tuple[Part, ...]
+
+
+class AnchorWatch:
+    """Compares the ranges between anchors with what they usually are.
+
+    It reads no clock: ``t_s`` of the blocks and ``advance`` are on one clock, whichever. What cannot be used is counted
+    in ``counters``: ``unknown-anchor``, ``impossible-block``, ``late-block``.
+    """
+
+    def __init__(
+        self,
+        position_m: Mapping[int, tuple[float, float, float]],
+        dimensions: Literal[2, 3] = 2,
+        baseline_m: Mapping[tuple[int, int], float] | None = None,
+        *,
+        window_s: float = 10.0,
+        learning_windows: int = 12,
+    ) -> None:
+        """Watch these anchors.
+
+        ``position_m``: of each anchor. ``dimensions``: 2 where anchors can only move horizontally, or heights cannot
+        be seen. ``baseline_m``: ranges with delays when the site was surveyed, by pairs; where they are missing they
+        are learned in ``learning_windows``, before which the watch of a pair does not begin.
+        """
+        self.counters: Counter[str] = Counter()
+        self._window_s, self._learning_windows = window_s, learning_windows
+        self._ids = sorted(position_m)
+        self._number = {anchor: number for number, anchor in enumerate(self._ids)}
+        self._position_m = np.array([position_m[anchor] for anchor in self._ids], np.float64).reshape(-1, 3)
+        self._dimensions = dimensions
+        self._history = RangeHistory()
+        self._row: dict[tuple[int, int], int] = {}
+        self._first: list[int] = []
+        self._second: list[int] = []
+        self._silent: list[int] = []
+        """Windows without a range since each pair's last one, while both anchors had others."""
+        self._pending: dict[int, dict[int, list[PairBlock]]] = {}
+        self._open: int | None = None
+        """Number of the oldest window that is not done."""
+        self._windows: deque[_Window] = deque(maxlen=_OF)
+        self._held: list[_Held] = []
+        self._blocked: dict[int, float] = {}
+        """Pairs that are silent, and since when."""
+        self._has_data = False
+        for (a, b), range_m in (baseline_m or {}).items():
+            if a in self._number and b in self._number and a != b and math.isfinite(range_m):
+                self._pair_row(min(a, b), max(a, b), range_m)
+
+    @property
+    def state(self) -> Literal["learning", "watching", "no data"]:
+        """``learning`` until some pair's usual range is known well enough."""
+        if not self._has_data:
+            return "no data"
+        return "watching" if bool(self._is_known().any()) else "learning"
+
+    @property
+    def pairs(self) -> int:
+        """Number of pairs that are compared."""
+        return int(self._is_known().sum())
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What has changed and still is; the largest first, silent links last."""
+        held = sorted((one.finding for one in self._held), key=lambda one: (one.kind == "check", -abs(one.size_m)))
+        silent = [
+            silent_link(self._ids[self._first[row]], self._ids[self._second[row]], since_s)
+            for row, since_s in sorted(self._blocked.items())
+        ]
+        return (*held, *silent)
+
+    def add(self, block: PairBlock) -> None:
+        """Add the ranges of a pair, in any order within ``grace_s``."""
+        if block.a not in self._number or block.b not in self._number or block.a == block.b:
+            self.counters["unknown-anchor"] += 1
+            return
+        is_possible = abs(block.mean_m) < _FARTHEST_M and 0.0 <= block.std_m < _FARTHEST_M and block.exchanges > 0
+        if not is_possible or not math.isfinite(block.t_s):
+            self.counters["impossible-block"] += 1
+            return
+        window = math.floor(block.t_s / self._window_s)
+        if self._open is None or window < self._open - _JUMP_WINDOWS:
+            self._open = window
+            self._pending.clear()
+        if window < self._open:
+            self.counters["late-block"] += 1
+            return
+        row = self._pair_row(min(block.a, block.b), max(block.a, block.b))
+        if block.exchanges > 1 and block.std_m > 0.0:
+            self._history.add_noise(row, block.std_m**2 * block.exchanges, block.exchanges)
+        self._pending.setdefault(window, {}).setdefault(row, []).append(block)
+        self.advance(block.t_s)
+
+    def advance(self, now_s: float) -> None:
+        """Conclude the windows that are over."""
+        if self._open is None or not math.isfinite(now_s):
+            return
+        last = math.floor((now_s - GRACE_S) / self._window_s) - 1
+        while self._open <= last:
+            waiting = min(self._pending, default=None)
+            if waiting is None or waiting > self._open + 2:
+                self._has_data = False
+                self._open = last + 1 if waiting is None else min(waiting, last + 1)
+                continue
+            self._conclude(self._open, self._pending.pop(self._open, {}))
+            self._open += 1
+
+    def accept(self, anchors: Iterable[int] | None = None) -> None:
+        """Learn again what is usual: for all pairs, or for those of some anchors. Their findings end.
+
+        A site that was surveyed again gets a new watch instead, as positions differ.
+        """
+        chosen = set(self._ids if anchors is None else anchors)
+        rows = np.array([self._ids[a] in chosen or self._ids[b] in chosen for a, b in self._ends()], dtype=np.bool_)
+        self._history.restart(rows)
+        self._held = [one for one in self._held if not chosen & set(one.finding.anchors)]
+        self._windows.clear()
+        for row in [row for row in self._blocked if rows[row]]:
+            del self._blocked[row]
+            self._history.presence[row] = 0.0
+
+    def _ends(self) -> list[tuple[int, int]]:
+        return list(zip(self._first, self._second, strict=True))
+
+    def _pair_row(self, a: int, b: int, given_m: float | None = None) -> int:
+        row = self._row.get((a, b))
+        if row is None:
+            row = self._row[a, b] = self._history.add_pair(given_m)
+            self._first.append(self._number[a])
+            self._second.append(self._number[b])
+            self._silent.append(0)
+        return row
+
+    def _is_known(self) -> Mask:
+        return np.asarray(self._history.windows >= min(self._learning_windows, _USUAL_WINDOWS // 2))
+
+    def _conclude(self, window: int, blocks: dict[int, list[PairBlock]]) -> None:
+        """See what has changed in a window."""
+        self._has_data = bool(blocks)
+        start_s = window * self._window_s
+        range_m, exchanges = self._ranges(blocks)
+        is_present = np.isfinite(range_m)
+        is_held = self._touched(one.finding for one in self._held)
+        is_touched = is_held.copy()
+        known = np.flatnonzero(is_present & self._is_known())
+        if len(known):
+            drift_m = self._history.drift_m()
+            seen = self._compare(known, range_m, exchanges, drift_m)
+            slow = self._compare_slowly(known, drift_m)
+            parts = [self._named(part) for part in seen.parts]
+            covered = {anchor for part in parts for anchor in part.anchors}
+            parts += [part for part in map(self._named, slow) if not covered & set(part.anchors)]
+            is_touched |= self._touched(map(self._named, seen.parts))
+            self._windows.append(_Window(start_s, tuple(parts)))
+            self._update(known, seen, {self._ids[end] for row in known.tolist() for end in self._ends()[row]})
+        is_expected = self._note_silence(is_present, start_s)
+        is_displaced = self._touched(one.finding for one in self._held if one.finding.kind != "link")
+        self._history.add_window(range_m, ~is_touched, ~is_displaced, is_expected)
+
+    def _ranges(self, gathered: dict[int, list[PairBlock]]) -> tuple[Array, Array]:
+        """The window's range of each pair, NaN where there is none, and its exchanges as far as they make the noise."""
+        range_m, exchanges = np.full(len(self._row), np.nan), np.zeros(len(self._row))
+        for row, blocks in gathered.items():
+            count = sum(block.exchanges for block in blocks)
+            if len(blocks) >= _MEDIAN_BLOCKS:
+                range_m[row] = float(np.median([block.mean_m for block in blocks]))
+                exchanges[row] = count / _MEDIAN_VARIANCE
+            else:
+                range_m[row] = sum(block.mean_m * block.exchanges for block in blocks) / count
+                exchanges[row] = count
+        return range_m, exchanges
+
+    def _compare(self, known: Integers, range_m: Array, exchanges: Array, drift_m: Array) -> Explanation:
+        history = self._history
+        reference = 1.0 + np.minimum(1.0 / history.windows[known], 1.0)  # its noise, too, is in the change
+        white_m = np.sqrt(np.maximum(history.noise_m2[known], 1e-8) / exchanges[known] * reference)
+        pairs = self._pairs(known, white_m, drift_m[known] * np.sqrt(reference))
+        change_m = range_m[known] - history.usual_m[known]
+        if bool(is_significant(pairs, change_m, _FALSE_ALARM)):
+            return explain(pairs, change_m)
+        return nothing(pairs, change_m)
+
+    def _compare_slowly(self, known: Integers, drift_m: Array) -> tuple[Part, ...]:
+        """The usual ranges against the first ones: what has changed too slowly to be seen in a window."""
+        change_m = self._history.usual_m[known] - self._history.first_m[known]
+        is_old = np.isfinite(change_m)
+        if not is_old.any():
+            return ()
+        rows = known[is_old]
+        pairs = self._pairs(rows, np.full(len(rows), 1e-4), _SLOW_DRIFT * drift_m[rows])
+        if not bool(is_significant(pairs, change_m[is_old], _FALSE_ALARM)):
+            return ()
+        return explain(pairs, change_m[is_old]).parts
+
+    def _pairs(self, rows: Integers, white_m: Array, drift_m: Array) -> Pairs:
+        first, second = np.array(self._first)[rows], np.array(self._second)[rows]
+        weight = weight_of(first, second, len(self._ids), white_m, drift_m)
+        return Pairs(self._position_m, first, second, self._dimensions, weight)
+
+    def _named(self, part: Part) -> Part:
+        return replace(part, anchors=tuple(self._ids[number] for number in part.anchors))
+
+    def _touched(self, found: Iterable[Finding | Part]) -> Mask:
+        """Pairs that one of these concerns, whose usual range stays as it is."""
+        rows = np.zeros(len(self._row), np.bool_)
+        for one in found:
+            for pair, row in self._row.items():
+                is_link = one.kind == "link"
+                rows[row] |= pair == one.anchors if is_link else bool(set(pair) & set(one.anchors))
+        return rows
+
+    def _update(self, known: Integers, seen: Explanation, present: set[int]) -> None:
+        """Find what was seen in enough windows, and end what is not seen any more."""
+        newest = self._windows[-1]
+        for part in newest.parts:
+            found = self._confirmed(part)
+            if found is not None:
+                self._hold(found)
+        for one in self._held:
+            if not present & set(one.finding.anchors):
+                continue
+            supported = any(set(part.anchors) & set(one.finding.anchors) for part in newest.parts)
+            one.lost.append(not (supported or self._lasts(one.finding, known, seen)))
+        self._held = [one for one in self._held if sum(one.lost) < _NEEDED]
+
+    def _confirmed(self, part: Part) -> _Held | None:
+        """The part as a finding, if enough of the last windows have the same, or something at the same anchors."""
+        windows = list(self._windows)
+        same = [one for one in windows if any(_key(other) == _key(part) for other in one.parts)]
+        if len(same) < _NEEDED:
+            common, same = set(part.anchors), [windows[-1]]
+            kinds: set[str] = {part.kind}
+            for window in reversed(windows[:-1]):
+                for other in window.parts:
+                    if common & set(other.anchors) and len(same) < _NEEDED:
+                        common &= set(other.anchors)
+                        kinds.add(other.kind)
+                        same.append(window)
+                        break
+            if len(same) < _NEEDED:
+                return None
+            part = _compromise(part, common, kinds)
+        since_s = min(window.start_s for window in same)
+        sentence = sentence_of(part.kind, part.anchors, part.size_m, or_else=part.or_else)
+        finding = Finding(part.kind, part.anchors, part.size_m, part.std_m, since_s, sentence)
+        return _Held(finding, part.or_else, deque(maxlen=_OF))
+
+    def _hold(self, found: _Held) -> None:
+        """Add a finding, or bring one at the same anchors up to date."""
+        new = found.finding
+        for number, one in enumerate(self._held):
+            old = one.finding
+            if not set(old.anchors) & set(new.anchors):
+                continue
+            if _key(old) == _key(new) or old.kind == "check":
+                self._held[number] = _Held(replace(new, since_s=min(old.since_s, new.since_s)), found.or_else, one.lost)
+                return
+            if new.kind == "check":
+                return
+            if {old.kind, new.kind} == {"moved", "delay"} and old.anchors == new.anchors:
+                if found.or_else is None or new.kind == "moved":
+                    self._held[number] = _Held(replace(new, since_s=old.since_s), found.or_else, one.lost)
+                return
+        self._held.append(found)
+
+    def _lasts(self, finding: Finding, known: Integers, seen: Explanation) -> bool:
+        """Whether there is still evidence for a finding in what else was seen leaves unexplained."""
+        first, second = np.array(self._first)[known], np.array(self._second)[known]
+        pairs = Pairs(self._position_m, first, second, self._dimensions, seen.weight)
+        found, dof = evidence(pairs, seen.weight, seen.weighted_m)
+        n = len(self._ids)
+        numbers = [self._number[anchor] for anchor in finding.anchors]
+        ends = np.isin(first, numbers).astype(np.int64) + np.isin(second, numbers)
+        links = (2 * n + np.flatnonzero(ends == len(numbers) if finding.kind == "link" else ends)).tolist()
+        causes = {
+            "moved": numbers,
+            "delay": [n + number for number in numbers],
+            "link": links,
+            "check": [*numbers, *(n + number for number in numbers), *links],
+        }[finding.kind]
+        causes = [cause for cause in causes if dof[cause] > 0]
+        return any(found[cause] > chdtri(dof[cause], _LASTING / len(causes)) for cause in causes)
+
+    def _note_silence(self, is_present: Mask, start_s: float) -> Mask:
+        """Find links that are silent while both anchors are received by others; returns where ranges are expected."""
+        heard = {end for row in np.flatnonzero(is_present).tolist() for end in self._ends()[row]}
+        expected = np.zeros(len(is_present), np.bool_)
+        for row, (a, b) in enumerate(self._ends()):
+            if is_present[row]:
+                self._silent[row] = 0
+                self._blocked.pop(row, None)
+                expected[row] = True
+            elif a in heard and b in heard:
+                self._silent[row] += 1
+                expected[row] = row not in self._blocked
+                is_regular = self._history.presence[row] >= _REGULAR and self._history.windows[row] >= _KNOWN_WINDOWS
+                if self._silent[row] == _SILENT_WINDOWS and is_regular:
+                    self._blocked[row] = start_s - (self._silent[row] - 1) * self._window_s
+            else:
+                self._silent[row] = 0  # an anchor that is away blocks no link
+        return expected
+
+
+def _key(one: Part | Finding) -> tuple[str, tuple[int, ...]]:
+    return one.kind, one.anchors
+
+
+def _compromise(part: Part, anchors: set[int], kinds: set[str]) -> Part:
+    """What windows that differ have in common."""
+    if len(anchors) == 1 and kinds == {"moved", "delay"}:
+        if part.kind == "moved":
+            return replace(part, or_else="delay")
+        return replace(part, or_else="moved")
+    return Part("check", tuple(sorted(anchors)), part.size_m, None)

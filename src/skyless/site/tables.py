@@ -1,0 +1,227 @@
+"""Tables of comma-separated values that users bring: anchors, truth, ranges, heights. Other columns are ignored.
+
+Anchors: ``id,x_m,y_m,z_m``, perhaps with a calibration. Truth: ``t_s,x_m,y_m,z_m`` and, where measured, the attitude
+``qx,qy,qz,qw``; the positions of the listener in a table of MILUV passive ticks (``gt_L_…``) serve as well. Ranges of
+a survey: ``anchor_a,anchor_b,range_m``, one row for each range in either direction. Heights: ``id,z_m``.
+All functions raise ConfigurationError, which names file, line, column and value of what cannot be used.
+"""
+
+import csv
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from io import StringIO
+from math import inf
+from os import PathLike
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.core.air.masterless_packets import Point
+from skyless.core.air.page_codec import MAX_COORDINATE_M
+from skyless.core.errors import ConfigurationError
+from skyless.core.input_files import finite, read_lines
+from skyless.core.kernels.arrays import Array
+from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
+from skyless.site.survey.facts import PairRanges
+from skyless.site.survey.stamps.repeats import mean_ranges
+
+ANCHOR_COLUMNS: Final = ("id", "x_m", "y_m", "z_m")
+BIAS, SLOPE, NOISE = CALIBRATION_COLUMNS = ("bias_m", "bias_slope_m", "noise_m")
+"""What ``skyless calibrate`` adds. A blank field means that nothing is known."""
+
+POSITION_COLUMNS: Final = ("t_s", "x_m", "y_m", "z_m")
+LISTENER_COLUMNS: Final = ("t_s", "gt_L_x_m", "gt_L_y_m", "gt_L_z_m")
+QUATERNION_COLUMNS: Final = ("qx", "qy", "qz", "qw")
+RANGE_COLUMNS: Final = ("anchor_a", "anchor_b", "range_m")
+HEIGHT_COLUMNS: Final = ("id", "z_m")
+
+_MAX_EARTH_M: Final = 1e8
+"""Coordinates of any frame on Earth are smaller."""
+
+_MAX_RANGE_M: Final = 20_000.0
+"""Farther than any radio of this kind reaches. Delays that are not configured can make ranges negative."""
+
+
+class _Row(Struct, frozen=True, gc=False):
+    """A row that is not blank, with its place in the file."""
+
+    path: str | PathLike[str]
+    line: int
+    fields: dict[str, str]
+    """By column."""
+
+    def number(self, column: str, limit_m: float = inf) -> float:
+        """A finite number, within ± ``limit_m``."""
+        value = finite(self.fields[column], self.path, self.line, column)
+        if abs(value) > limit_m:
+            raise self.wrong(column, f"metres, at most {limit_m:g}")
+        return value
+
+    def identifier(self, column: str = "id") -> int:
+        """An anchor, decimal or hexadecimal after 0x."""
+        field = self.fields[column]
+        try:
+            identifier = int(field, 0) if field.lower().startswith("0x") else int(field)
+        except ValueError:
+            identifier = -1
+        if identifier < 0:
+            raise self.wrong(column, "a whole number, or a hexadecimal one after 0x")
+        return identifier
+
+    def wrong(self, column: str, expected: str) -> ConfigurationError:
+        return ConfigurationError(self.path, f"line {self.line}, column {column}", self.fields[column], expected)
+
+
+def _rows(path: str | PathLike[str], *headers: Sequence[str]) -> Iterator[_Row]:
+    """The rows of a table that has all columns of one of the headers."""
+    try:
+        table = list(csv.reader(read_lines(path)))
+    except csv.Error as error:
+        raise ConfigurationError(path, "", None, f"a table of comma-separated values ({error})") from None
+    names = [name.strip() for name in table[0]] if table else []
+    wanted = next((header for header in headers if set(header) <= set(names)), None)
+    if wanted is None:
+        raise ConfigurationError(path, "line 1", ",".join(names), f"a header with {','.join(headers[0])}")
+    if any(names.count(name) > 1 for name in wanted):
+        raise ConfigurationError(path, "line 1", ",".join(names), "a header with different names")
+    for line, row in enumerate(table[1:], start=2):
+        if not any(field.strip() for field in row):
+            continue
+        if len(row) != len(names):
+            raise ConfigurationError(path, f"line {line}", ",".join(row), f"{len(names)} columns as in the header")
+        yield _Row(path, line, {name: field.strip() for name, field in zip(names, row, strict=True)})
+
+
+def _empty(path: str | PathLike[str], what: str) -> ConfigurationError:
+    return ConfigurationError(path, "the table", "empty", f"at least one {what} below the header")
+
+
+# Truth
+
+
+class Truth(Struct, frozen=True):
+    """Positions over time, n of them, times never decreasing."""
+
+    t_s: Array
+    """Shape (n,), in the time of the recording."""
+    position_m: Array
+    """Shape (n, 3)."""
+    quaternion: Array | None
+    """Shape (n, 4), x, y, z, w, body to site; None where the table has none."""
+
+
+def read_truth(path: str | PathLike[str], listener: str | None = None) -> Truth:
+    """Read a table of truth. Of MILUV ticks it reads the rows of one listener, by default of the first row."""
+    values: list[list[float]] = []
+    columns: tuple[str, ...] = ()
+    for row in _rows(path, POSITION_COLUMNS, LISTENER_COLUMNS):
+        if not columns:
+            columns = POSITION_COLUMNS if set(POSITION_COLUMNS) <= row.fields.keys() else LISTENER_COLUMNS
+            if columns is POSITION_COLUMNS and set(QUATERNION_COLUMNS) <= row.fields.keys():
+                columns += QUATERNION_COLUMNS
+        if columns is LISTENER_COLUMNS:
+            listener = listener or row.fields.get("listener")
+            if row.fields.get("listener", listener) != listener:
+                continue
+        values.append([row.number(name, _MAX_EARTH_M if name in columns[1:4] else inf) for name in columns])
+    if not values and listener is not None and columns is LISTENER_COLUMNS:
+        raise ConfigurationError(path, "listener", listener, "one that the recording names")
+    if not values:
+        raise _empty(path, "row")
+    table = np.array(values, dtype=np.float64)
+    times = table[:, 0]
+    backwards = np.flatnonzero(np.diff(times) < 0.0)
+    if len(backwards):
+        before_s, after_s = (float(value) for value in times[backwards[0] : backwards[0] + 2])
+        raise ConfigurationError(path, "column t_s", after_s, f"at least {before_s}, the time before it")
+    return Truth(times, table[:, 1:4], table[:, 4:8] if len(columns) == 8 else None)
+
+
+# Anchors and their calibration
+
+
+def read_anchors(path: str | PathLike[str]) -> dict[int, Point]:
+    """Positions by identifier, in metres."""
+    anchors: dict[int, Point] = {}
+    for row in _rows(path, ANCHOR_COLUMNS):
+        identifier = row.identifier()
+        if identifier in anchors:
+            raise row.wrong("id", "an id that occurs only once")
+        anchors[identifier] = (row.number("x_m"), row.number("y_m"), row.number("z_m"))
+    if not anchors:
+        raise _empty(path, "anchor")
+    return anchors
+
+
+def read_calibration(path: str | PathLike[str]) -> DifferenceCalibration | None:
+    """Calibration that a table of anchors holds; None for a table without ``bias_m``."""
+    anchors: dict[int, AnchorCalibration] = {}
+    for row in _rows(path, ANCHOR_COLUMNS):
+        known = {column: row.number(column) for column in CALIBRATION_COLUMNS if row.fields.get(column)}
+        if known.get(NOISE, 0.0) < 0.0:
+            raise row.wrong(NOISE, "a number that is not negative")
+        if BIAS in known:
+            anchors[row.identifier()] = AnchorCalibration(known[BIAS], known.get(SLOPE, 0.0), known.get(NOISE))
+    return DifferenceCalibration(anchors) if anchors else None
+
+
+def calibrated_table(path: str | PathLike[str], calibration: DifferenceCalibration) -> str:
+    """The table with another calibration; everything else stays as it is."""
+    lines = read_lines(path)
+    names = [name.strip() for name in next(csv.reader(lines))]
+    identifiers = {row.line: row.identifier() for row in _rows(path, ANCHOR_COLUMNS)}
+    out = StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    for number, row in enumerate(csv.reader(lines), start=1):
+        kept = [field for name, field in zip(names, row, strict=False) if name not in CALIBRATION_COLUMNS]
+        if number == 1:
+            writer.writerow([*kept, *CALIBRATION_COLUMNS])
+        elif number in identifiers:
+            writer.writerow([*kept, *_fields(calibration.anchors.get(identifiers[number]))])
+        else:
+            writer.writerow([])
+    return out.getvalue()
+
+
+def new_table(anchors_m: Mapping[int, Point], calibration: DifferenceCalibration) -> str:
+    """A table of anchors that stood in none."""
+    rows = [",".join((*ANCHOR_COLUMNS, *CALIBRATION_COLUMNS))]
+    for anchor, position_m in sorted(anchors_m.items()):
+        rows.append(",".join((str(anchor), *map(str, position_m), *_fields(calibration.anchors.get(anchor)))))
+    return "\n".join(rows) + "\n"
+
+
+def _fields(known: AnchorCalibration | None) -> tuple[str, str, str]:
+    if known is None:
+        return "", "", ""
+    return f"{known.bias_m:.4f}", f"{known.slope_m:.4f}", "" if known.noise_m is None else f"{known.noise_m:.4f}"
+
+
+# What a survey is given
+
+
+def read_ranges(path: str | PathLike[str]) -> PairRanges:
+    """One range of each pair of anchors, from all of its rows."""
+    ranges_m: dict[tuple[int, int], list[float]] = defaultdict(list)
+    for row in _rows(path, RANGE_COLUMNS):
+        a, b = row.identifier("anchor_a"), row.identifier("anchor_b")
+        if a == b:
+            raise row.wrong("anchor_b", "another anchor than a")
+        ranges_m[min(a, b), max(a, b)].append(row.number("range_m", _MAX_RANGE_M))
+    if not ranges_m:
+        raise _empty(path, "range")
+    return mean_ranges(ranges_m)
+
+
+def read_heights(path: str | PathLike[str]) -> dict[int, float]:
+    """Heights by anchor, metres."""
+    heights_m: dict[int, float] = {}
+    for row in _rows(path, HEIGHT_COLUMNS):
+        anchor = row.identifier()
+        if anchor in heights_m:
+            raise row.wrong("id", "an id that occurs only once")
+        heights_m[anchor] = row.number("z_m", MAX_COORDINATE_M)
+    if not heights_m:
+        raise _empty(path, "height")
+    return heights_m

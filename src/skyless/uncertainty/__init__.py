@@ -1,4 +1,0 @@
-"""How well positions are known: geometry (DOPs), propagated covariances, bounds.
-
-Public: bounds, chain, dop, ellipse.
-"""

@@ -1,0 +1,218 @@
+import pytest
+from beacon_strategies import FULL, beacons
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from skyless.core.air.almanac import SitePage
+from skyless.core.air.beacon import Authentication, Beacon, StatedPosition
+from skyless.core.air.codec import decode, encode, heard_capacity, packed_relays, signed_bytes, with_authentication
+from skyless.core.air.frame import HEARD, Heard, Malformed
+from skyless.core.air.ieee802154 import air_time_s, fcs
+from skyless.core.air.instants import LONGEST_PERIOD_CODE
+from skyless.core.air.page_codec import encode_page
+from skyless.core.protocol1 import codec as protocol1_codec
+from skyless.core.protocols import decode_any
+
+FLAGS_AT, PERIOD_AT = 11, 19
+
+
+def with_fcs(body):
+    return bytes(body) + fcs(bytes(body))
+
+
+def changed(frame, at, value):
+    body = bytearray(frame[:-2])
+    body[at] = value
+    return with_fcs(body)
+
+
+@given(beacons())
+@settings(max_examples=300)
+def test_round_trip_over_all_ranges(beacon):
+    frame = encode(beacon)
+    assert decode(frame) == beacon
+    assert decode_any(frame) == beacon
+    assert protocol1_codec.decode(frame) is Malformed.UNKNOWN_VERSION
+    assert len(frame) <= 127 - (10 if beacon.authentication is None else 0)
+
+
+@given(beacons())
+@settings(max_examples=25, deadline=None)
+def test_every_single_bit_flip_is_noticed(beacon):
+    frame = encode(beacon)
+    value = int.from_bytes(frame, "little")
+    for bit in range(8 * len(frame)):
+        assert decode((value ^ 1 << bit).to_bytes(len(frame), "little")) is Malformed.BAD_FCS
+
+
+@given(beacons(), st.data())
+@settings(max_examples=100, deadline=None)
+def test_cut_frames_with_a_right_checksum_are_dropped(beacon, data):
+    body = encode(beacon)[:-2]
+    cut = data.draw(st.integers(0, len(body) - 1))
+    assert isinstance(decode(with_fcs(body[:cut])), Malformed)
+
+
+@given(st.binary(max_size=140))
+@settings(max_examples=300)
+def test_any_bytes_are_a_beacon_or_a_reason(data):
+    assert isinstance(decode(data), Malformed)
+    assert isinstance(decode(with_fcs(data)), Malformed | Beacon)
+
+
+@given(beacons(), st.data())
+@settings(max_examples=300)
+def test_any_changed_byte_with_a_right_checksum_is_a_beacon_that_encodes_again_or_a_reason(beacon, data):
+    frame = encode(beacon)
+    at = data.draw(st.integers(0, len(frame) - 3))
+    decoded = decode(changed(frame, at, data.draw(st.integers(0, 255))))
+    if isinstance(decoded, Beacon):
+        assert decode(encode(decoded)) == decoded
+
+
+def test_length_and_air_time_of_the_document():
+    bare = replace(FULL, position=None, heard=(), weak=0, page=None)
+    assert len(encode(bare)) == 24
+    usual = replace(bare, position=FULL.position, page=FULL.page)
+    assert len(encode(usual)) == 24 + 12 + 17
+    longest = replace(usual, heard=tuple(Heard(other, 0, 0) for other in range(8)))
+    assert len(encode(longest)) == 117
+    assert air_time_s(117) == pytest.approx(298.40e-6, abs=0.005e-6)
+
+
+@pytest.mark.parametrize(
+    ("position", "page", "entries"), [(True, True, 8), (False, True, 9), (True, False, 10), (False, False, 11)]
+)
+def test_capacity_leaves_space_for_authentication(position, page, entries):
+    assert heard_capacity(position=position, page=page) == entries
+
+
+def test_authentication_follows_all_that_it_covers():
+    frame = encode(FULL)
+    signed = []
+    authentic = with_authentication(frame, 0xABCD, lambda data: signed.append(data) or bytes(range(8)))
+    body = bytearray(frame[:-2] + b"\xcd\xab")
+    body[FLAGS_AT] |= 0x04
+    assert signed == [bytes(body)] == [signed_bytes(authentic)]
+    assert authentic == with_fcs(body + bytes(range(8)))
+    decoded = decode(authentic)
+    assert decoded.authentication == Authentication(0xABCD, bytes(range(8)))
+    assert replace(decoded, authentication=None) == decode(frame)
+
+
+def test_a_certificate_fills_a_frame():
+    alone = replace(FULL, position=None, heard=(), weak=0, page=None, certificate=bytes(range(94)))
+    frame = with_authentication(encode(alone), 1, lambda _: bytes(8))
+    assert len(frame) == 126
+    assert decode(frame).certificate == bytes(range(94))
+    for part in ("position", "page"):
+        with pytest.raises(ValueError, match="certificate has neither"):
+            encode(replace(alone, **{part: getattr(FULL, part)}))
+    with pytest.raises(ValueError, match="93 bytes; it must have 94"):
+        encode(replace(alone, certificate=bytes(93)))
+
+
+@pytest.mark.parametrize("flag", [0x01, 0x02])
+def test_a_certificate_comes_alone(flag):
+    body = bytearray(encode(FULL)[:-2])
+    body[FLAGS_AT] = 0x08 | flag
+    assert decode(with_fcs(body)) is Malformed.BAD_FLAGS
+
+
+@pytest.mark.parametrize(
+    ("authentication", "named"),
+    [(Authentication(1 << 16, bytes(8)), "interval"), (Authentication(-1, bytes(8)), "interval"),
+     (Authentication(0, bytes(7)), "mac has 7 bytes")],
+)  # fmt: skip
+def test_impossible_authentication_is_named(authentication, named):
+    with pytest.raises(ValueError, match=named):
+        encode(replace(FULL, heard=(), weak=0, authentication=authentication))
+
+
+def test_pages_of_types_not_known_are_passed_over():
+    frame = encode(FULL)
+    body = bytearray(frame[:-2])
+    body[-17] = 200
+    decoded = decode(with_fcs(body))
+    assert isinstance(decoded, Beacon)
+    assert decoded.page is None
+
+
+def test_an_impossible_page_drops_the_frame():
+    frame = encode(FULL)
+    body = bytearray(frame[:-2])
+    body[-16] = 0  # no pages
+    assert decode(with_fcs(body)) is Malformed.BAD_PAGE
+
+
+@pytest.mark.parametrize("flag", [0x10, 0x20, 0x40, 0x80])
+def test_reserved_flags_drop_the_frame(flag):
+    frame = encode(FULL)
+    assert decode(changed(frame, FLAGS_AT, frame[FLAGS_AT] | flag)) is Malformed.BAD_FLAGS
+
+
+def test_periods_that_no_anchor_has_drop_the_frame():
+    frame = encode(FULL)
+    assert decode(changed(frame, PERIOD_AT, LONGEST_PERIOD_CODE)).period_code == LONGEST_PERIOD_CODE
+    assert decode(changed(frame, PERIOD_AT, LONGEST_PERIOD_CODE + 1)) is Malformed.BAD_PERIOD
+
+
+@pytest.mark.parametrize("others", [(3000,), (5, 5)])
+def test_impossible_relays_drop_the_frame(others):
+    sound = replace(FULL, heard=tuple(Heard(7 + k, 1, 2) for k in range(len(others))), weak=0, page=None)
+    body = bytearray(encode(sound)[:-2])
+    for number, other in enumerate(reversed(others)):
+        at = len(body) - HEARD.size * (number + 1)
+        body[at : at + 2] = other.to_bytes(2, "little")
+    assert decode(with_fcs(body)) is Malformed.BAD_HEARD
+
+
+def test_weak_flags_beyond_the_entries_drop_the_frame():
+    sound = replace(FULL, page=None)
+    body = bytearray(encode(sound)[:-2])
+    at = len(body) - 4 * HEARD.size - 2
+    body[at : at + 2] = (4 | 1 << 4 + 4).to_bytes(2, "little")
+    assert decode(with_fcs(body)) is Malformed.BAD_HEARD
+
+
+def test_relays_with_a_weak_first_path_are_left_out():
+    decoded = decode(encode(FULL))
+    kept = [FULL.heard[0], *FULL.heard[2:]]
+    assert list(HEARD.iter_unpack(packed_relays(decoded))) == [
+        (one.anchor, one.sequence, one.rx_ticks & 0xFFFFFFFF, one.rx_ticks >> 32) for one in kept
+    ]
+
+
+@pytest.mark.parametrize(("std_m", "stated_m"), [(0.0201, 0.021), (0.02, 0.02), (3.0, 0.255)])
+def test_standard_deviations_are_rounded_up_and_saturate(std_m, stated_m):
+    decoded = decode(encode(replace(FULL, position=StatedPosition(0, 0, 0, std_m))))
+    assert decoded.position.std_m == stated_m
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"anchor": 1 << 16}, "anchor is 65536"),
+        ({"tx_ticks": -1}, "tx_ticks is -1"),
+        ({"almanac_issue": 1.5}, "almanac_issue is 1.5"),
+        ({"period_code": LONGEST_PERIOD_CODE + 1}, "period_code is 160"),
+        ({"position": StatedPosition(8389.0, 0.0, 0.0)}, r"position\.x_m is 8389"),
+        ({"position": StatedPosition(float("nan"), 0.0, 0.0)}, r"position\.x_m is nan"),
+        ({"position": StatedPosition(0.0, 0.0, 0.0, floor=128)}, r"position\.floor is 128"),
+        ({"position": StatedPosition(0.0, 0.0, 0.0, std_m=-1.0)}, r"position\.std_m"),
+        ({"heard": (Heard(3000, 0, 0),)}, "heard has the sender 3000"),
+        ({"heard": (Heard(1, 0, 0), Heard(1, 0, 0))}, "an anchor twice"),
+        ({"heard": (Heard(1, 0, 1 << 40),), "weak": 0}, r"heard\[0\]\.rx_ticks"),
+        ({"heard": tuple(Heard(k, 0, 0) for k in range(9))}, "9 entries; 8 fit"),
+        ({"weak": 1 << 4}, "weak is 16"),
+        ({"page": SitePage(0, None)}, r"SitePage\.pages"),
+    ],
+)
+def test_what_does_not_fit_is_named(change, message):
+    with pytest.raises(ValueError, match=message):
+        encode(replace(FULL, **change))
+
+
+def test_a_site_page_has_its_17_bytes():
+    assert encode_page(SitePage(4, 1.2)).hex() == "0604" + "00" * 6 + "01" + "b0040000" + "00" * 4

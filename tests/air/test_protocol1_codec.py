@@ -1,0 +1,187 @@
+import math
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from protocol1_strategies import FULL, beacons
+
+from skyless.core.air.almanac import AnchorPage, NoisePage
+from skyless.core.air.frame import Heard, Malformed
+from skyless.core.air.ieee802154 import fcs
+from skyless.core.protocol1.beacon import Beacon, MasterTime
+from skyless.core.protocol1.codec import decode, decode_cached, encode, heard_capacity
+
+BARE = msgspec.structs.replace(FULL, master_heard=None, master_time=None, heard=(), page=None)
+PAYLOAD_AT, VERSION_AT, FLAGS_AT, COUNT_AT = 9, 10, 11, 40
+
+
+def changed(frame, at, value):
+    """The frame with one byte changed and its FCS made good."""
+    body = bytearray(frame[:-2])
+    body[at] = value
+    return bytes(body) + fcs(bytes(body))
+
+
+def with_body(body):
+    return bytes(body) + fcs(bytes(body))
+
+
+@given(beacons())
+@settings(max_examples=500)
+def test_round_trip_over_all_ranges(beacon):
+    frame = encode(beacon)
+    assert decode(frame) == beacon
+    assert decode_cached(frame) == beacon
+    assert len(frame) <= 127 - 16
+
+
+@given(beacons())
+@settings(max_examples=25, deadline=None)
+def test_every_single_bit_flip_is_noticed(beacon):
+    frame = encode(beacon)
+    value = int.from_bytes(frame, "little")
+    for bit in range(8 * len(frame)):
+        assert decode((value ^ 1 << bit).to_bytes(len(frame), "little")) is Malformed.BAD_FCS
+
+
+@given(beacons())
+@settings(max_examples=50, deadline=None)
+def test_truncated_frames_are_dropped(beacon):
+    frame = encode(beacon)
+    for length in range(len(frame)):
+        assert isinstance(decode(frame[:length]), Malformed)
+
+
+def test_truncated_frames_with_a_good_fcs_are_dropped_by_reason():
+    body = encode(FULL)[:-2]
+    reasons = [decode(with_body(body[:length])) for length in range(len(body))]
+    assert reasons[:3] == [Malformed.TOO_SHORT] * 3
+    assert reasons[3:11] == [Malformed.NOT_A_BEACON] * 8
+    assert reasons[11:27] == [Malformed.TOO_SHORT] * 16
+    assert reasons[27:] == [Malformed.BAD_LENGTH] * (len(body) - 27)
+
+
+def test_surplus_bytes_are_dropped():
+    body = encode(FULL)[:-2]
+    assert decode(with_body(body + bytes(1))) is Malformed.BAD_LENGTH
+    assert decode(with_body(body + bytes(8))) is Malformed.BAD_LENGTH
+    assert decode(with_body(body + bytes(40))) is Malformed.TOO_LONG
+
+
+def test_version_flags_and_foreign_headers():
+    frame = encode(FULL)
+    assert decode(changed(frame, VERSION_AT, 0xB2)) is Malformed.UNKNOWN_VERSION
+    assert decode(changed(frame, VERSION_AT, 0xA1)) is Malformed.NOT_A_BEACON
+    assert decode(changed(frame, PAYLOAD_AT, 0x30)) is Malformed.NOT_A_BEACON
+    assert decode(changed(frame, 5, 0x07)) is Malformed.NOT_A_BEACON
+    assert decode(changed(frame, 0, 0x61)) is Malformed.NOT_A_BEACON
+    for flag in (0x10, 0x20, 0x40, 0x80):
+        assert decode(changed(frame, FLAGS_AT, frame[FLAGS_AT] | flag)) is Malformed.BAD_FLAGS
+    assert decode(changed(frame, COUNT_AT, 3)) is Malformed.BAD_LENGTH
+
+
+@given(beacons(), st.binary(min_size=16, max_size=16))
+def test_authentication_trailer_is_skipped(beacon, trailer):
+    body = bytearray(encode(beacon)[:-2]) + trailer
+    body[FLAGS_AT] |= 0x08
+    assert decode(with_body(body)) == beacon
+
+
+def test_unknown_page_type_leaves_the_rest_usable():
+    frame = encode(FULL)
+    page_at = len(frame) - 2 - 17
+    assert decode(changed(frame, page_at, 200)) == msgspec.structs.replace(FULL, page=None)
+
+
+@pytest.mark.parametrize("other", [FULL.anchor, FULL.master, FULL.heard[1].anchor])
+def test_impossible_stamps_are_refused_and_dropped(other):
+    heard = (Heard(other, 1, 2), *FULL.heard[1:])
+    with pytest.raises(ValueError, match=f"heard.*anchor {other}"):
+        encode(msgspec.structs.replace(FULL, heard=heard))
+    assert decode(changed(encode(FULL), COUNT_AT + 1, other)) is Malformed.BAD_HEARD
+
+
+def test_master_does_not_hear_itself():
+    master = msgspec.structs.replace(FULL, anchor=FULL.master)
+    with pytest.raises(ValueError, match="master_heard"):
+        encode(master)
+    assert decode(changed(encode(FULL), 7, FULL.master)) is Malformed.BAD_HEARD
+    wrong = msgspec.structs.replace(FULL, master_heard=Heard(9, 1, 2))
+    with pytest.raises(ValueError, match="master_heard is of anchor 9"):
+        encode(wrong)
+
+
+@pytest.mark.parametrize("parts", [(h, t, p) for h in (False, True) for t in (False, True) for p in (False, True)])
+def test_capacity_keeps_room_for_authentication(parts):
+    master_heard, master_time, page = parts
+    entries = tuple(Heard(100 + number, number, number) for number in range(20))
+    fit = heard_capacity(*parts)
+
+    def beacon(count):
+        return msgspec.structs.replace(
+            FULL,
+            master_heard=FULL.master_heard if master_heard else None,
+            master_time=FULL.master_time if master_time else None,
+            page=FULL.page if page else None,
+            heard=entries[:count],
+        )
+
+    room = 127 - 16 - len(encode(beacon(fit)))
+    assert 0 <= room < 8
+    with pytest.raises(ValueError, match=rf"heard has {fit + 1} entries; {fit} fit"):
+        encode(beacon(fit + 1))
+
+
+def test_capacity_of_the_fullest_frame():
+    assert heard_capacity(True, True, True) == 6
+
+
+@pytest.mark.parametrize(
+    ("field", "bits"),
+    [
+        ("site", 16),
+        ("anchor", 16),
+        ("sequence", 8),
+        ("superframe", 32),
+        ("slot", 8),
+        ("tx_ticks", 40),
+        ("almanac_issue", 8),
+        ("master", 16),
+    ],
+)
+@pytest.mark.parametrize("wrong", ["below", "above", 1.5, None])
+def test_errors_name_the_field(field, bits, wrong):
+    value = {"below": -1, "above": 1 << bits}.get(wrong, wrong)
+    with pytest.raises(ValueError, match=rf"^{field} is {value}; .* {bits} bits"):
+        encode(msgspec.structs.replace(BARE, **{field: value}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"heard": (Heard(9, 256, 0),)}, r"heard\[0\].sequence is 256"),
+        ({"heard": (Heard(9, 0, 0), Heard(8, 0, 1 << 40))}, r"heard\[1\].rx_ticks is 1099511627776"),
+        ({"heard": (Heard(65536, 0, 0),)}, r"heard\[0\].anchor is 65536"),
+        ({"master_heard": Heard(1, 0, -1)}, "master_heard.rx_ticks is -1"),
+        ({"master_time": MasterTime(1 << 48, 0.0)}, "master_time.tx_subticks_master is 281474976710656"),
+        ({"master_time": MasterTime(0, -0.1)}, "master_time.std_ticks is -0.1"),
+        ({"master_time": MasterTime(0, math.nan)}, "master_time.std_ticks is nan"),
+        ({"page": AnchorPage(1, math.inf, 0.0, 0.0, 0)}, "AnchorPage.x_m is inf"),
+        ({"page": NoisePage(1e-10, 1e-10, math.nan, 1e-9)}, "NoisePage.white_fm is nan"),
+    ],
+)
+def test_errors_name_the_field_of_a_part(changes, named):
+    with pytest.raises(ValueError, match=named):
+        encode(msgspec.structs.replace(BARE, **changes))
+
+
+@given(st.floats(0.0, allow_nan=False))
+def test_standard_deviation_is_rounded_up_and_saturates(std_ticks):
+    decoded = decode(encode(msgspec.structs.replace(BARE, master_time=MasterTime(5, std_ticks))))
+    assert isinstance(decoded, Beacon)
+    sent = decoded.master_time.std_ticks
+    if std_ticks > 65535 / 64:
+        assert sent == 65535 / 64
+    else:
+        assert 0.0 <= sent - std_ticks <= 1 / 64

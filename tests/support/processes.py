@@ -1,0 +1,59 @@
+"""Child processes of tests: they start with the usual signals, and none outlasts its test."""
+
+import asyncio
+import contextlib
+import signal
+import socket
+import subprocess
+import sys
+import threading
+
+from skyless.run.process import end_with_parent
+
+SKYLESS = (sys.executable, "-m", "skyless.cli.main")
+LIMIT_S = 60.0
+
+
+def usual_signals():
+    """A ``preexec_fn``: the child ends with the test run, and ignores no signal although that may (``nohup``)."""
+    request_end = end_with_parent()
+
+    def prepare():
+        for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
+            signal.signal(number, signal.SIG_DFL)
+        request_end()
+
+    return prepare
+
+
+def free_port():
+    """A port of loopback where nobody listens at this moment."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@contextlib.contextmanager
+def started(*command, limit_s=LIMIT_S, **options):
+    """A process with pipes of text; killed at the end, or after a time, so that no read of a pipe waits for ever."""
+    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, preexec_fn=usual_signals(), **pipes | options) as process:  # noqa: PLW1509
+        limit = threading.Timer(limit_s, process.kill)
+        limit.start()
+        try:
+            yield process
+        finally:
+            limit.cancel()
+            process.kill()
+
+
+@contextlib.asynccontextmanager
+async def running_program(*command, **options):
+    """The same for a test with an event loop; pipes are those that are asked for."""
+    process = await asyncio.create_subprocess_exec(*command, preexec_fn=usual_signals(), **options)
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        await process.wait()
