@@ -14,11 +14,11 @@ from emulator.site.site_air import NodeAir
 from numpy.typing import NDArray
 
 from skyless.core.air.reception import Diagnostics, Reception
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.constants import TICK_S
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.site import Site
-from skyless.core.tag.any_receiver import AnyReceiver
 from skyless.core.ticks import difference
 from skyless.radio.dw1000.radio import SPI_LEAD_S, ChipSession
 from skyless.radio.interface import AntennaDelays, Late, RadioEvent, Sent

@@ -27,8 +27,8 @@ from skyless.core.air.reception import Reception
 from skyless.core.anchor.anchor import Anchor
 from skyless.core.anchor.authentication import BeaconAuthentication
 from skyless.core.site import Site
-from skyless.core.tag.trusted_receiver import SiteTrust, Trust
 from skyless.core.ticks import from_seconds, wrap
+from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.research.compile_ahead import compile_kernels
 from skyless.sim.evaluation.scenarios import Request
 from support.adversary import FORGERIES

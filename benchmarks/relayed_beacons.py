@@ -27,7 +27,7 @@ from msgspec import Struct, to_builtins
 from skyless.core.alert import Alert
 from skyless.core.constants import SPEED_OF_LIGHT_MPS
 from skyless.core.site import Site
-from skyless.core.tag.trusted_receiver import SiteTrust, Trust
+from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.research.compile_ahead import compile_kernels
 from skyless.sim.evaluation.scenarios import Request, Room
 from skyless.sim.streams import stream

@@ -24,11 +24,11 @@ from msgspec.structs import replace
 
 from skyless.core.air.beacon import Beacon
 from skyless.core.air.codec import decode
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.keys.key_chain import public_key
 from skyless.core.keys.verifier import Verifier
 from skyless.core.site import ScheduleSite, Site
-from skyless.core.tag.any_receiver import AnyReceiver
-from skyless.core.tag.trusted_receiver import SiteTrust, Trust
+from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.research.compile_ahead import compile_kernels
 from skyless.sim.evaluation.scenarios import Request, Room
 from support.keyed_air import START_UNIX_S, AttackedAir, MadeKeys, Received, made_keys, run_tag

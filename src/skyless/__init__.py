@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from skyless.core.site import Site
     from skyless.core.tag.locate import locate
     from skyless.core.tag.receiver import Receiver
-    from skyless.core.tag.trusted_receiver import SiteTrust, Trust, TrustedReceiver
+    from skyless.core.trusted_receiver import SiteTrust, Trust, TrustedReceiver
     from skyless.sim.evaluation.fleet import Fleet
     from skyless.sim.evaluation.scenarios import Request, fleet_of
     from skyless.sim.lab import lab_site
@@ -47,12 +47,12 @@ _MODULES: Final = {
     "SimulationResult": "skyless.cli.api.simulate",
     "Site": "skyless.core.site",
     "SkylessError": "skyless.core.errors",
-    "SiteTrust": "skyless.core.tag.trusted_receiver",
+    "SiteTrust": "skyless.core.trusted_receiver",
     "StudyResult": "skyless.cli.api.study",
     "SurveyResult": "skyless.cli.api.survey",
     "Transmission": "skyless.core.air.reception",
-    "Trust": "skyless.core.tag.trusted_receiver",
-    "TrustedReceiver": "skyless.core.tag.trusted_receiver",
+    "Trust": "skyless.core.trusted_receiver",
+    "TrustedReceiver": "skyless.core.trusted_receiver",
     "fleet_of": "skyless.sim.evaluation.scenarios",
     "lab_site": "skyless.sim.lab",
     "load_site": "skyless.site.file.load",

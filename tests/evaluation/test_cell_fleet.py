@@ -4,8 +4,8 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.core.air.codec import encode
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.site import EXACT
-from skyless.core.tag.any_receiver import AnyReceiver
 from skyless.sim.evaluation.cell_fleet import MAX_MACHINES, CellFleet, SiteBeacons
 from skyless.sim.evaluation.fleet import Fleet, FleetSettings
 from skyless.sim.evaluation.scenarios import Request, fleet_of_any_size

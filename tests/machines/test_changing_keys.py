@@ -8,11 +8,11 @@ import pytest
 from free_site import FREE
 from msgspec.structs import replace
 
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.keys.chain import Chain
 from skyless.core.keys.fault import Fault
-from skyless.core.tag.any_receiver import AnyReceiver
-from skyless.core.tag.trusted_receiver import SiteTrust, Trust, TrustedReceiver
 from skyless.core.ticks import from_seconds, wrap
+from skyless.core.trusted_receiver import SiteTrust, Trust, TrustedReceiver
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Static

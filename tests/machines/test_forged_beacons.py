@@ -19,8 +19,8 @@ from skyless.core.anchor.anchor import Anchor
 from skyless.core.anchor.authentication import BeaconAuthentication
 from skyless.core.constants import SPEED_OF_LIGHT_MPS
 from skyless.core.keys.fault import Fault
-from skyless.core.tag.trusted_receiver import SiteTrust, Trust
 from skyless.core.ticks import from_seconds, wrap
+from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.sim.evaluation.scenarios import Request
 from support.adversary import FORGERIES, Adversary, any_forgery
 from support.keyed_air import (

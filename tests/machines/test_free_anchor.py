@@ -9,13 +9,13 @@ from msgspec.structs import replace
 from bench import LAB, Stage
 from skyless.core.air.beacon import Beacon
 from skyless.core.air.codec import decode, encode
+from skyless.core.air.first_path import BLOCKED_DB, CLEAR_DB
 from skyless.core.air.instants import OFFERED_HZ, gap_ticks, period_code, period_ticks, suitable_period_s, ticks_ahead
 from skyless.core.air.reception import Diagnostics, Reception
 from skyless.core.anchor.anchor import Anchor
 from skyless.core.protocol1.anchor import Anchor as Protocol1Anchor
 from skyless.core.protocols import new_anchor
 from skyless.core.site import AnchorSite, ScheduleSite, Site, UnplacedAnchor
-from skyless.core.tag.observations import BLOCKED_DB, CLEAR_DB
 from skyless.core.ticks import Unwrapper, difference, from_seconds, to_seconds, wrap
 from skyless.sim.impairments import AnchorOutage, Outage
 
@@ -58,7 +58,7 @@ def test_anchors_send_at_the_rate_of_the_site_file_at_instants_that_anybody_can_
 
 
 def test_a_tag_knows_when_an_anchor_sends_next_whatever_it_has_lost():
-    """Predicted within the error of two clocks from one beacon alone, also over losses and over a host that was late."""
+    """Predicted within the error of two clocks from a single beacon, also after losses and after a late host."""
     stage = Stage(site_of(3, 2, 6.0), tags=[(3.0, 4.0, 0.0)], make=new_anchor)
     heard = {}
     unwrapper, predicted = Unwrapper(), 0

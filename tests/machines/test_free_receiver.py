@@ -14,8 +14,8 @@ from skyless.core.air.codec import encode
 from skyless.core.air.frame import Heard as Relay
 from skyless.core.air.instants import period_code
 from skyless.core.air.local_almanac import site_issue, site_page_for, site_pages_of
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.site import GeoreferenceSite
-from skyless.core.tag.any_receiver import AnyReceiver
 from skyless.core.tag.beacon_receiver import NOT_DROPS
 from skyless.core.tag.receiver import Receiver
 from skyless.core.ticks import from_seconds, wrap

@@ -18,11 +18,11 @@ from skyless.core.air.codec import decode
 from skyless.core.air.frame import MAX_FRAME_BYTES
 from skyless.core.air.ieee802154 import fcs
 from skyless.core.air.reception import Reception
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.constants import TICK_RATE_HZ
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.protocols import new_anchor
 from skyless.core.site import AnchorSite, ScheduleSite, UnplacedAnchor
-from skyless.core.tag.any_receiver import AnyReceiver
 from skyless.core.ticks import wrap
 
 FRAMES = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "20000"))

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from bench import LAB, LOFT, tape
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.fix import Fix
 from skyless.core.integrity import Alert
-from skyless.core.tag.any_receiver import AnyReceiver
 
 STD_M = 0.03
 

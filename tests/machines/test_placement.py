@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.protocols import new_anchor
 from skyless.core.site import ScheduleSite, UnplacedAnchor
-from skyless.core.tag.any_receiver import AnyReceiver
 from skyless.sim.impairments import DelayError, lab_impairments
 from skyless.sim.lab import lab_site
 from skyless.sim.stations import TagSpec

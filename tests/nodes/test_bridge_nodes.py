@@ -18,8 +18,8 @@ from skyless.bridges.program import BridgeNode, TagBridge, heard_site, run_route
 from skyless.bridges.target import Target
 from skyless.core.air.almanac import GeoreferencePage
 from skyless.core.air.reception import Reception
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.errors import SkylessError
-from skyless.core.tag.any_receiver import AnyReceiver
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import SiteMessage, StatusMessage, Zone, ZonesMessage
 from skyless.run.mqtt.topics import EVERY_NODE, fix_topic, health_topic, site_topic, status_topic, zones_topic

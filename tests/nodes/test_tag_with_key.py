@@ -8,7 +8,7 @@ from node_stage import PLACE_M, FakeRadio
 
 from skyless.core.air.codec import decode
 from skyless.core.air.reception import Reception
-from skyless.core.tag.trusted_receiver import SiteTrust, Trust
+from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.radio.interface import Restarted
 from skyless.run.keys.anchor_and_tag_keys import UNVERIFIED_S, Remembered, TagMemory
 from skyless.run.mqtt.messages import Counters

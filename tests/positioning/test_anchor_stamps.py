@@ -4,8 +4,8 @@ from collections import Counter
 
 import pytest
 
+from skyless.core.air.anchor_stamps import MAX_TRACKS, RESTART_SILENCE_PERIODS, AnchorStamps
 from skyless.core.air.beacon import Beacon
-from skyless.core.tag.observations import MAX_TRACKS, RESTART_SILENCE_PERIODS, AnchorStamps
 from skyless.core.ticks import from_seconds, wrap
 
 HALF_S = from_seconds(0.5)

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skyless.core.air.first_path import MAX_VARIANCE_FACTOR, variance_factor
 from skyless.core.air.reception import Diagnostics
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.fix import Fix
 from skyless.core.protocol1.anchor import Anchor
-from skyless.core.tag.any_receiver import AnyReceiver
-from skyless.core.tag.observations import MAX_VARIANCE_FACTOR, variance_factor
 from skyless.sim.impairments import AnchorBias, Impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.stations import TagSpec

@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 
-from skyless.core.tag.any_receiver import AnyReceiver
+from skyless.core.any_receiver import AnyReceiver
 
 
 class RadioEvents:

@@ -4,9 +4,9 @@ import msgspec
 from msgspec.structs import replace
 
 from machines.bench import LAB, tape
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.site import GeoreferenceSite
-from skyless.core.tag.any_receiver import AnyReceiver
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import RequestMessage, SiteMessage, TrueMotion, TruthMessage, fix_message
 from skyless.run.recordings.reception_log import ReceptionLog, receiver_settings

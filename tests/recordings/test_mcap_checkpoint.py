@@ -15,10 +15,10 @@ from msgspec.structs import astuple, replace
 from machines.bench import LAB, PAIRS, ROOM, tape
 from skyless.core.air.page_codec import encode_page
 from skyless.core.air.reception import Reception
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.estimator.state import ANCHOR_DTYPE, KEPT_ARRAYS, STATUS_DTYPE
 from skyless.core.method_names import METHODS
 from skyless.core.protocol1.codec import decode, encode
-from skyless.core.tag.any_receiver import AnyReceiver
 from skyless.run.recordings.reception_log import RefusedError, load, save
 
 RNG = np.random.default_rng(20)

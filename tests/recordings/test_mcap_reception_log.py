@@ -5,7 +5,7 @@ import pytest
 
 from machines.bench import LAB, tape
 from skyless.core.air.reception import Diagnostics, Reception
-from skyless.core.tag.any_receiver import AnyReceiver
+from skyless.core.any_receiver import AnyReceiver
 from skyless.run.mqtt.messages import RawReception, ReceptionsMessage, RequestMessage
 from skyless.run.recordings.reception_log import MAX_PENDING_RECEPTIONS, ReceptionLog, load, raw, receiver_settings
 

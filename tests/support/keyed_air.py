@@ -18,6 +18,7 @@ from msgspec.structs import replace
 from skyless.core.air.frame import Malformed
 from skyless.core.air.reception import Reception, Transmission
 from skyless.core.anchor.authentication import BeaconAuthentication
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.constants import TICK_RATE_HZ, TICK_S
 from skyless.core.fix import Fix
 from skyless.core.kernels.arrays import Array
@@ -25,9 +26,8 @@ from skyless.core.keys.chain import Chain, section_signatures
 from skyless.core.keys.key_chain import SECTION_BITS, SEED_BYTES, USUAL_TIMING, ChainTiming
 from skyless.core.protocols import AnchorMachine, SiteBeacon, decode_any, new_anchor
 from skyless.core.site import AnchorSite, Site
-from skyless.core.tag.any_receiver import AnyReceiver
-from skyless.core.tag.trusted_receiver import GivenFix, SiteTrust, Trust, TrustedReceiver
 from skyless.core.ticks import Unwrapper, difference, from_seconds, wrap
+from skyless.core.trusted_receiver import GivenFix, SiteTrust, Trust, TrustedReceiver
 from skyless.sim.evaluation.scenarios import Request, impairments_of, trajectories_of
 from skyless.sim.stations import TagSpec
 from skyless.sim.world import World

@@ -87,15 +87,14 @@ def new(
     json
         Write one JSON object instead of a line.
     """
-    from skyless.core.site import ScheduleSite
     from skyless.sim.lab import lab_site
-    from skyless.site.channel import ChannelModel
     from skyless.site.file.check import check_site
     from skyless.site.file.template import rectangle, rectangular_site, site_template, unplaced_site
-    from skyless.site.planning.anchor_clocks import with_best_master
 
     if file.is_dir():
         raise SkylessError(f"{file} is a folder; it should be the name of a file to write")
+    if paper and (unplaced is not None or spacing is not None):
+        raise SkylessError("--paper is for one room; its anchors need positions, and all receive one master")
     sizes = (width, depth, anchor_count, height)
     height_m = _tag_height(tag_height, spacing)
     if unplaced is not None:
@@ -114,10 +113,7 @@ def new(
     else:
         raise SkylessError("a room needs both --width and --depth; without them the lab is written")
     if paper:
-        if unplaced is not None or spacing is not None:
-            raise SkylessError("--paper is for one room; its anchors need positions, and all receive one master")
-        master = msgspec.structs.replace(site, schedule=ScheduleSite(slot_s=_PAPER_SLOT_S))
-        site = with_best_master(master, ChannelModel())
+        site = _with_the_papers_schedule(site)
     site = msgspec.structs.replace(site, name=name or file.stem, id=_new_id() if site_id is None else site_id)
     check_site(site, file)
     if file.exists() and not force:
@@ -127,6 +123,16 @@ def new(
         print_json({"file": file, "name": site.name, "id": site.id, "anchors": len(site.all_anchors)})
     else:
         console().print(f"wrote {file}; next: skyless site check {file}", markup=False)
+
+
+def _with_the_papers_schedule(site: "Site") -> "Site":
+    """The same site on the paper's protocol; the anchor that the others receive best is the master."""
+    from skyless.core.site import ScheduleSite
+    from skyless.site.channel import ChannelModel
+    from skyless.site.planning.anchor_clocks import with_best_master
+
+    master = msgspec.structs.replace(site, schedule=ScheduleSite(slot_s=_PAPER_SLOT_S))
+    return with_best_master(master, ChannelModel())
 
 
 def _new_id() -> int:

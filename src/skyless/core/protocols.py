@@ -76,7 +76,7 @@ def new_anchor(
 
 
 def beacon_period_s(site: Site) -> float:
-    """Return the mean time between two beacons of one anchor of a validated site, in seconds; where they differ the median.
+    """Return the mean time between two beacons of one anchor of a validated site, in seconds (median over anchors).
 
     Anchors of protocol 2 are supposed to receive the others within the range in the open.
     """
@@ -88,5 +88,5 @@ def beacon_period_s(site: Site) -> float:
 
 
 def superframe_s(site: Site) -> float:
-    """Return the time in seconds in which each anchor has sent: the superframe, or the mean time between two beacons."""
+    """Return the seconds in which each anchor sends once: the superframe, or the mean time between two beacons."""
     return 1.0 / schedule_of(site).superframe_rate_hz if site.schedule.needs_master else beacon_period_s(site)

@@ -11,12 +11,12 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.air.reception import Reception
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD
-from skyless.core.tag.any_receiver import AnyReceiver
 from skyless.core.tag.beacon_receiver import NOT_DROPS, TagReceiver
 from skyless.core.tag.receiver import Receiver
-from skyless.core.tag.trusted_receiver import GivenFix, SiteTrust, Trust, TrustedReceiver
+from skyless.core.trusted_receiver import GivenFix, SiteTrust, Trust, TrustedReceiver
 from skyless.radio.interface import Gone, Hint, Radio, RadioEvent, Restarted
 from skyless.run.fix_log import FIX_LEAVES_S, FixListener, FixLog, PhaseLog
 from skyless.run.keys.anchor_and_tag_keys import Remembered, TagMemory, TagReport, trust_reason

@@ -161,7 +161,7 @@ class PlanOptions(_Planned, frozen=True, kw_only=True):
     ] = None
     """Walls on which anchors may hang, x1, y1, x2, y2 in metres each; by default the outline."""
     exponent: Annotated[float | None, number(least=1.5, most=6.0)] = None
-    """Sites of more than 60 anchors: exponent of the path loss; 2 by default (free space), 2.5 to 3 among metal racks."""
+    """Exponent of the path loss at sites of more than 60 anchors: 2 by default (free space), 2.5 to 3 among racks."""
     search_s: Annotated[Positive, Option("search-seconds")] = 60.0
     """Time after which the search for positions ends in any case, in seconds."""
     verify_points: Annotated[int | None, Option("verify"), whole(1, 200)] = None

@@ -171,9 +171,9 @@ def _verified(checked: Verification) -> str:
 def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
     """Predict the errors that tags at rest will have at a site, as ``skyless plan`` does.
 
-    With ``optimise`` the anchors are placed from the start, and the plan is of that site. A plan of a site
-    of more than 60 anchors without a master is of the beacons that reach tags, a ``RatePlanResult``; of the arguments below it takes ``range_m``,
-    ``step_m``, ``tag_heights_m``, ``region_m``, ``outline_m``, ``exponent``.
+    With ``optimise`` the anchors are placed from the start, and the plan is of that site. For a site of more than 60
+    anchors without a master the plan is of the beacons that reach tags (``RatePlanResult``). It then uses only
+    ``range_m``, ``step_m``, ``tag_heights_m``, ``region_m``, ``outline_m`` and ``exponent`` of the arguments below.
     """
     started_s = time.perf_counter()
     site, file = site_of(asked.site)
@@ -181,7 +181,7 @@ def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
         asked.leave_out(
             *("method", "noise_ps", "qa", "dynamics", "target_m", "optimise", "anchor_heights_m", "mounts_m"),
             *("search_s", "verify_points", "verify_rounds", "seed"),
-            why=f"errors are predicted for sites of at most {MAX_PREDICTED} anchors, and this one has {len(site.anchors)}",
+            why=f"errors are predicted for sites of at most {MAX_PREDICTED} anchors; this one has {len(site.anchors)}",
         )
         heights_m = heights_of(asked, site)
         rates = plan_rates(

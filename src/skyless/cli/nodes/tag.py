@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from skyless.bridges.program import TagBridge
     from skyless.core.air.masterless_packets import Point
     from skyless.core.site import GeoreferenceSite
-    from skyless.core.tag.trusted_receiver import SiteTrust
+    from skyless.core.trusted_receiver import SiteTrust
     from skyless.research.live.packet_tags import PacketTagSettings
     from skyless.run.fix_log import FixListener
     from skyless.run.mqtt.address import MqttAddress
@@ -184,7 +184,7 @@ def _on_radios(
 
 def _site_trust(asked: TagOptions) -> "SiteTrust | None":
     """Which beacons and fixes are accepted; None without a public key. Raises SkylessError."""
-    from skyless.core.tag.trusted_receiver import SiteTrust, Trust
+    from skyless.core.trusted_receiver import SiteTrust, Trust
     from skyless.run.keys.key_files import read_site_public
 
     if asked.site_key is None:

@@ -3,15 +3,17 @@
 A driver (simulator, program) hands it every reception, asks when its next frame is due, and fetches that frame as late
 as its radio allows, so that it carries the latest receptions.
 
-An anchor knows of no other time than its own counter. It sends at the instants of ``skyless.core.air.instants``, and the
-more anchors it receives, the more rarely, so that together they offer what the air carries best.
+An anchor knows no time other than its own counter. It sends at the instants of ``skyless.core.air.instants``. The more
+anchors it receives, the less often it sends, so that together they offer what the air carries best.
 """
 
 from collections import Counter
 from typing import Final
 
+from skyless.core.air.anchor_stamps import AnchorStamps
 from skyless.core.air.beacon import Beacon, StatedPosition
 from skyless.core.air.codec import decode_cached, encode, heard_capacity
+from skyless.core.air.first_path import is_weak_first_path
 from skyless.core.air.frame import Heard, Malformed
 from skyless.core.air.instants import PERIOD_CHANGES, gap_ticks, period_code, period_ticks, suitable_period_s
 from skyless.core.air.local_almanac import site_issue, site_pages_of, stated_position
@@ -19,7 +21,6 @@ from skyless.core.air.reception import Reception, Transmission
 from skyless.core.anchor.authentication import BeaconAuthentication, contents_of, sealed
 from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS
 from skyless.core.site import AnchorSite, Site, UnplacedAnchor
-from skyless.core.tag.observations import AnchorStamps, is_weak_first_path
 from skyless.core.ticks import Unwrapper, from_seconds, to_seconds, wrap
 
 MAX_RELAY_AGE_TICKS: Final = from_seconds(1.0)

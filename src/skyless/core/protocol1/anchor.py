@@ -1,4 +1,4 @@
-"""``Anchor``: the protocol machine of one anchor of protocol 1. Bytes and ticks in, frames and ticks out; no I/O, no clock.
+"""``Anchor``: the protocol machine of one anchor of protocol 1. Bytes and ticks in, frames and ticks out; no I/O.
 
 A driver (simulator, daemon) hands it every reception, asks when its next frame is due, at the latest every 5 ms while
 there is none, and fetches that frame as late as its radio allows, so that it carries the latest receptions.

@@ -137,7 +137,7 @@ class Receiver(BeaconReceiver[Beacon]):
     def _decode(self, frame: bytes) -> Beacon | Malformed:
         return decode_cached(frame)
 
-    def _period_ticks(self, beacon: Beacon) -> int:
+    def _period_ticks(self, beacon: Beacon) -> int:  # noqa: ARG002 (the same for all anchors)
         return self._superframe_ticks
 
     def _is_of_site(self, beacon: Beacon, rx_ticks: int) -> bool:

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
 from msgspec import Struct
 
 from skyless.core.air.almanac import GeoreferencePage
+from skyless.core.air.anchor_stamps import AnchorStamps, StampTracks
+from skyless.core.air.first_path import variance_factor
 from skyless.core.air.frame import AnyBeacon, Malformed
 from skyless.core.air.reception import Reception
 from skyless.core.air.site_choice import SiteChoice, SiteUse
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.tag.observations import AnchorStamps, FixTime, StampTracks, variance_factor
+from skyless.core.tag.observations import FixTime
 from skyless.core.ticks import LAST_TICKS, Unwrapper, from_seconds
 
 if TYPE_CHECKING:

@@ -57,7 +57,9 @@ def _dl_tdoa(
 
 
 FORMATS: Final = (
-    _bitcraze("yaml", "YAML documents with base64 payloads", captures.recognise_yaml, captures.read_yaml),
+    _bitcraze(
+        "yaml", "YAML documents with base64 payloads", bitcraze_captures.recognise_yaml, bitcraze_captures.read_yaml
+    ),
     _bitcraze("text", "text lines 'From .. to .. @..: ..'", bitcraze.recognise_text, bitcraze.read_text),
     Format(
         "miluv",

@@ -12,13 +12,14 @@ from typing import Final
 import numpy as np
 from msgspec.structs import replace
 
+from skyless.core.air.anchor_stamps import NOISE_TICKS
 from skyless.core.air.masterless_packets import Packet, Point, Relay
 from skyless.core.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ
 from skyless.core.estimator.state import EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.observation import Observation
 from skyless.core.tag.joint import Estimation
-from skyless.core.tag.observations import NOISE_TICKS, FixTime
+from skyless.core.tag.observations import FixTime
 from skyless.core.ticks import LAST_TICKS, Unwrapper, nearest
 from skyless.research.masterless.difference_tracking import DIFFERENCES, MAX_HORIZONTAL_STD_M, NEIGHBOURHOOD
 from skyless.research.masterless.pair_engine import MAX_ANCHORS, remember

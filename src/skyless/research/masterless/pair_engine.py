@@ -2,8 +2,8 @@
 
 Anchor b relays that it received anchor a's packet at ``r`` of its own clock. That packet left a one time of flight
 earlier, so had b sent at ``r - tof``, both packets would have left at once, and the interval in which the tag receives
-them is the time difference of arrival. The tag knows b's clock from b's packets (:mod:`skyless.core.tag.broadcast`), and
-with it when a packet that b sent at ``r - tof`` would have been received:
+them is the time difference of arrival. The tag knows b's clock from b's packets
+(:mod:`skyless.core.tag.broadcast`), and with it when a packet that b sent at ``r - tof`` would have been received:
 
     TDoA = c·[(rx_b + phase_b − rx_a) − (1 + rate_b)·(tof + tx_b − r)]
 

@@ -13,6 +13,7 @@ from skyless.core.air import codec
 from skyless.core.air.beacon import Beacon
 from skyless.core.air.frame import Heard, Malformed
 from skyless.core.air.reception import Diagnostics, Reception
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.errors import ConfigurationError
 from skyless.core.fix import Fix
 from skyless.core.input_files import Drops
@@ -21,7 +22,6 @@ from skyless.core.method_names import DEFAULT_METHOD, METHODS
 from skyless.core.protocol1 import codec as protocol1_codec
 from skyless.core.protocols import decode_any
 from skyless.core.site import Site
-from skyless.core.tag.any_receiver import AnyReceiver
 from skyless.core.tag.beacon_receiver import NOT_DROPS
 from skyless.core.ticks import WRAP_TICKS, wrap
 from skyless.research.replays.captures import ReplayReport, common_figures

@@ -16,7 +16,7 @@ from skyless.core.anchor.authentication import BeaconAuthentication
 from skyless.core.errors import SkylessError
 from skyless.core.keys.chain import Chain, ChainRing
 from skyless.core.keys.fault import Fault
-from skyless.core.tag.trusted_receiver import SiteTrust, TrustedReceiver
+from skyless.core.trusted_receiver import SiteTrust, TrustedReceiver
 from skyless.core.whole_files import write_whole
 from skyless.run.keys.key_files import MAX_SERIAL, SEEDS_VARIABLE, SiteKeys, parse_seeds, read_keys
 from skyless.run.process import Log

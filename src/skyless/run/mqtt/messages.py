@@ -1,4 +1,4 @@
-"""The messages on MQTT, version 1: JSON objects, one struct for each topic of ``run/mqtt/topics.py`` (``docs/mqtt.md``).
+"""The messages on MQTT, version 1: JSON objects, one struct for each topic of ``topics.py`` (``docs/mqtt.md``).
 
 SI units. ``unix_s`` is seconds since 1970 by the sender's clock. Fields may be added within a version; readers ignore
 those that they do not know.

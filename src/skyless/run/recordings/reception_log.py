@@ -14,9 +14,9 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.air.reception import Reception
+from skyless.core.any_receiver import AnyReceiver, AnyReceiverState
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.kernels.arrays import Array
-from skyless.core.tag.any_receiver import AnyReceiver, AnyReceiverState
 from skyless.core.tag.beacon_receiver import TagReceiver
 from skyless.core.tag.receiver_state import ReceiverState
 from skyless.run.mqtt.messages import Leases, RawReception, ReceptionsMessage, RequestMessage, SegmentStart

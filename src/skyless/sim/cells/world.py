@@ -179,7 +179,9 @@ class CellWorld:
         frame_bytes: int = FRAME_BYTES,
         lead_s: float = 1e-3,
     ) -> None:
-        """``period_codes``: of the anchors' mean periods (``skyless.core.air.instants``), shape (n,). ``dead``: which anchors neither send nor receive; ``survey_std_m``: true less configured positions, per axis.
+        """``period_codes``: codes of the anchors' mean periods (``skyless.core.air.instants``), shape (n,).
+
+        ``dead``: which anchors neither send nor receive. ``survey_std_m``: true less configured positions, per axis.
 
         ``lead_s``: how long before its RMARKER a frame's relays are fixed, as of ``World``. Of the impairments those of
         stamps, oscillators, channel and range errors are modelled. Raises ValueError, which names the key, for others,

@@ -9,13 +9,13 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.air.reception import Reception
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.fix import Fix
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.kernels.arrays import Array
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.protocols import AnchorMachine, new_anchor
 from skyless.core.site import Site
-from skyless.core.tag.any_receiver import AnyReceiver
 from skyless.core.tag.beacon_receiver import NOT_DROPS
 from skyless.sim.evaluation.statistics import ErrorStatistics, ErrorSummary, FirstFixes, LevelReport, LevelTally
 from skyless.sim.impairments import Impairments, Outage

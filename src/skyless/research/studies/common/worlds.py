@@ -16,12 +16,12 @@ from msgspec.structs import replace
 from scipy.stats import chi2
 
 from skyless.core.air.frame import Malformed
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.fix import Fix
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.kernels.arrays import Array
 from skyless.core.protocol1.codec import decode_cached, encode
 from skyless.core.site import AnchorSite, Site
-from skyless.core.tag.any_receiver import AnyReceiver
 from skyless.research.studies.common.plan import Plan, seed_of
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.scenarios import WALL_MARGIN_M, Request, impairments_of, trajectories_of
