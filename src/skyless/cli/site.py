@@ -91,8 +91,7 @@ def new(
     from skyless.site.file.check import check_site
     from skyless.site.file.template import rectangle, rectangular_site, site_template, unplaced_site
 
-    if file.is_dir():
-        raise SkylessError(f"{file} is a folder; it should be the name of a file to write")
+    _check_free(file, force=force)
     if paper and (unplaced is not None or spacing is not None):
         raise SkylessError("--paper is for one room; its anchors need positions, and all receive one master")
     sizes = (width, depth, anchor_count, height)
@@ -116,13 +115,19 @@ def new(
         site = _with_the_papers_schedule(site)
     site = msgspec.structs.replace(site, name=name or file.stem, id=_new_id() if site_id is None else site_id)
     check_site(site, file)
-    if file.exists() and not force:
-        raise SkylessError(f"{file} exists; --force overwrites it")
     write_file(file, site_template(site).encode())
     if json:
         print_json({"file": file, "name": site.name, "id": site.id, "anchors": len(site.all_anchors)})
     else:
         console().print(f"wrote {file}; next: skyless site check {file}", markup=False)
+
+
+def _check_free(file: Path, *, force: bool) -> None:
+    """Raise SkylessError if the file cannot be written without loss."""
+    if file.is_dir():
+        raise SkylessError(f"{file} is a folder; it should be the name of a file to write")
+    if file.exists() and not force:
+        raise SkylessError(f"{file} exists; --force overwrites it")
 
 
 def _with_the_papers_schedule(site: "Site") -> "Site":

@@ -50,7 +50,7 @@ def anchors_in_reach(site: Site) -> Integers:
 
 
 def links_in_reach(site: Site) -> tuple[Integers, Integers]:
-    """Return the pairs of anchors within radio reach of each other: indices of one and of the other end of each link."""
+    """Return the links between anchors within radio reach of each other: the indices of their two ends."""
     pairs = [(one, other) for one, other, _ in pairs_within(anchor_positions(site), RADIO_REACH_M)]
     nothing = np.empty(0, np.int64)
     ones, others = zip(*pairs, strict=True) if pairs else ((nothing,), (nothing,))

@@ -278,8 +278,9 @@ class UciProtocol(_BeaconTranslator):
     """A FiRa board: a site's beacons as the rounds of a DL-TDoA session, in notifications of UCI.
 
     Only a site with a master has rounds. Every superframe is one. The master's beacon is the poll. Those of the other
-    anchors are the responses, as each holds when its sender received the master's. Where anchors have two frames in a superframe, the master's second one
-    is the final message, which holds when it received the responses; what comes after it belongs to no round.
+    anchors are the responses, as each holds when its sender received the master's. Where anchors have two frames in a
+    superframe, the master's second one is the final message, which holds when it received the responses; what comes
+    after it belongs to no round.
 
     The board sends a round as soon as it holds all messages that the one before had, or with the next poll.
 

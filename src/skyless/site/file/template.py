@@ -35,7 +35,7 @@ id = {id}                          # of the site on the air, 0 to 65533; neighbo
 {no_slot_s}guard_s = {guard_s}                # mode master: silence at the end of each slot, to prepare a frame
 {no_slot_s}frames_per_node = {frames}             # mode master: frames of each anchor in a superframe
 {no_slots}slots = {slots}                     # mode master: slots in a superframe; by default one for each frame
-{no_rate}rate_hz = {rate_hz}                # mode free: beacons per second of each anchor; by default what the air carries
+{no_rate}rate_hz = {rate_hz}                # mode free: beacons per second of each anchor; as many as fit by default
 
 [noise]                         # what the filters assume; too small costs more than too large
 tx_stamp_ps = {tx_ps}             # standard deviation of a transmit stamp in picoseconds
