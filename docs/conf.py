@@ -21,12 +21,14 @@ import reference
 
 NAVIGATION = {
     "Tutorials": [
+        "docs/start_here",
         "docs/tutorials/first_site",
         "docs/tutorials/first_replay",
         "docs/tutorials/own_radio",
         "examples/README",
     ],
     "How to": [
+        "docs/faq",
         "docs/howto/run_a_site",
         "docs/howto/secure_a_site",
         "docs/howto/secure_the_air",
@@ -41,6 +43,7 @@ NAVIGATION = {
         "docs/howto/container",
         "docs/hardware",
         "firmware/README",
+        "docs/extend",
         "CONTRIBUTING",
         "SECURITY",
     ],

@@ -54,7 +54,7 @@ PLAN = "tests/cli/test_plan_command.py::"
 REPLAY = "tests/cli/test_replay_command.py::"
 ELSEWHERE = {
     "scripts/run": DEMO + "test_a_pipe_gets_the_places_and_the_tables_once_also_when_it_is_terminated",
-    "scripts/test": "the run that this test is part of",
+    "scripts/test unit": "the run that this test is part of",
     "scripts/run --version": "tests/cli/test_program.py::test_version",
     'export PATH="$PWD/.venv/bin:$PATH"': "the run that this test is part of",
     "skyless demo --duration 20 --record walk.mcap": (

@@ -1,15 +1,15 @@
 """The pictures of the documents, made again: ``.venv/bin/python docs/pictures/make.py``.
 
-Numbers come from the tables of the documents, the layers from ``tests/test_layers.py``, the lab from its site file, so
+Numbers come from the tables of the documents, the rooms from ``pyproject.toml``, the lab from its site file, so
 that a picture never says something else than the text. The SVGs are part of the repository.
 
 ``.venv/bin/python docs/pictures/make.py page`` records the page's animation for the README (``page.py``): the demo in
 Debian's Chromium, for half a minute, on a machine that has nothing else to do.
 """
 
-import ast
 import re
 import sys
+import tomllib
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Rectangle
 
 from skyless.core.air.ieee802154 import air_time_s
-from skyless.sim.lab import lab_site
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.report.figures import BLUE, GREEN, GRID, INK, MUTED, ORANGE
 
 FOLDER = Path(__file__).parent
@@ -84,10 +84,9 @@ def lab() -> Figure:
     figure, axes = axes_of(3.6, 4.2)
     axes.add_patch(Rectangle((0, 0), 6, 8, fc=SOFT, ec=MUTED))
     for number, anchor in enumerate(lab_site().anchors, 1):
-        master = number == 1
-        axes.plot(anchor.x_m, anchor.y_m, "^", color=ORANGE if master else BLUE, ms=10, clip_on=False)
+        axes.plot(anchor.x_m, anchor.y_m, "^", color=BLUE, ms=10, clip_on=False)
         inwards = 1 if anchor.x_m < 3 else -1
-        axes.annotate(f"{number}, master" if master else str(number), (anchor.x_m, anchor.y_m), (9 * inwards, 5),
+        axes.annotate(str(number), (anchor.x_m, anchor.y_m), (9 * inwards, 5),
                       textcoords="offset points", ha="left" if inwards > 0 else "right", size=9, color=INK)  # fmt: skip
     for x, y in ((3.0, 4.0), (1.2, 1.6)):
         axes.plot(x, y, "x", color=GREEN, ms=8, mew=2)
@@ -100,7 +99,7 @@ def lab() -> Figure:
 
 def superframe() -> Figure:
     """Two superframes of the lab: who is on the air when."""
-    schedule = lab_site().schedule
+    schedule = paper_lab_site().schedule
     slot_ms, slots = schedule.slot_s * 1e3, 6
     frame_ms = air_time_s(100) * 1e3
     figure, axes = axes_of(7.2, 2.5)
@@ -185,27 +184,18 @@ def replayed_flights() -> Figure:
     return figure
 
 
-def layer_names() -> list[list[str]]:
-    """The packages of each layer, from the lowest, as the test of the layers has them."""
-    tree = ast.parse((ROOT / "tests" / "test_layers.py").read_text(encoding="utf-8"))
-    for node in tree.body:
-        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "LAYERS":
-            return [sorted(names) for names in ast.literal_eval(node.value)]
-    raise LookupError("tests/test_layers.py has no LAYERS")
-
-
 def layers() -> Figure:
-    """The layers of the code, each importing only those below it."""
-    rows = layer_names()
-    figure, axes = axes_of(7.2, 0.36 * len(rows) + 0.3, bare=True)
+    """The rooms of the code, each importing only those below it, as the contract in ``pyproject.toml`` has them."""
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]["contracts"]
+    rows = [line.replace("skyless.", "").split(" | ") for line in reversed(contracts[0]["layers"])]
+    figure, axes = axes_of(7.2, 0.5 * len(rows) + 0.2, bare=True)
     axes.set(xlim=(0, 10), ylim=(0, len(rows)))
     for number, names in enumerate(rows):
-        colour = SOFT_GREEN if number < 5 else SOFT_BLUE if number < 8 else SOFT_ORANGE if number < 11 else SOFT
-        width = 9.3 / len(names)
+        colour = SOFT_GREEN if number == 0 else SOFT_BLUE if number < 3 else SOFT_ORANGE
+        width = 9.5 / len(names)
         for place, name in enumerate(names):
-            box(axes, 0.65 + place * width + 0.04, number + 0.1, width - 0.08, 0.8, name, colour)
-        axes.text(0.3, number + 0.5, str(number), size=9, color=MUTED, ha="center", va="center")
-    axes.annotate("", (0.08, 0.1), (0.08, len(rows) - 0.1), arrowprops={"arrowstyle": "-|>", "color": MUTED, "lw": 1.2})
+            box(axes, 0.5 + place * width + 0.04, number + 0.1, width - 0.08, 0.8, name, colour, 11)
+    axes.annotate("", (0.2, 0.1), (0.2, len(rows) - 0.1), arrowprops={"arrowstyle": "-|>", "color": MUTED, "lw": 1.2})
     return figure
 
 
@@ -213,7 +203,7 @@ STAGES: Sequence[tuple[str, str, str]] = (
     ("radio", "frame of a beacon, RX stamp, diagnostics", SOFT_ORANGE),
     ("Receiver.hear", "decode the frame, unwrap the stamps, keep the almanac page", SOFT_BLUE),
     ("Observation", "one beacon with every stamp unwrapped on its own clock", SOFT),
-    ("positioning method", "a snapshot of a superframe, or the filter joint (cold start first)", SOFT_BLUE),
+    ("positioning method", "the filter joint, after a cold start", SOFT_BLUE),
     ("Estimator", "time update · own reception · relays · report · faults · levels", SOFT_BLUE),
     ("Fix", "position, velocity, covariance, protection level, alert", SOFT_GREEN),
     ("outputs", "MQTT, page, recording, CSV", SOFT_ORANGE),
