@@ -1,6 +1,7 @@
 """What all tests share."""
 
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,17 +14,62 @@ from skyless.core.kernels.processes import EVERY_PART, missing
 settings.register_profile("skyless", deadline=None)  # the first call of a kernel compiles it
 settings.load_profile("skyless")
 
+TIERS = {
+    "unit": "no process, and no simulated site for longer than a second; the tier of tests without a marker",
+    "site": "simulates a site, or runs a command or a program in the test's own process",
+    "live": "processes in real time, one test after the other",
+    "statistical": "Monte Carlo, long fuzzing, heavy clients",
+}
+_TIER_OF_FILE = re.compile(r"^pytestmark = pytest\.mark\.(\w+)$", re.MULTILINE)
 
-def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile all kernels once, before the workers: programs that start in tests then do not report it."""
-    if not hasattr(session.config, "workerinput") and not session.config.option.collectonly:
-        compile_with_counts(missing(EVERY_PART))
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--tiers", default="", help=f"run only the tests of these tiers: {', '.join(TIERS)}")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    for name, meaning in TIERS.items():
+        config.addinivalue_line("markers", f"{name}: {meaning}")
+    if set(_tiers(config)) - set(TIERS):
+        raise pytest.UsageError(f"--tiers is {config.option.tiers}; it should be some of {', '.join(TIERS)}")
+
+
+def _tiers(config: pytest.Config) -> list[str]:
+    return [tier for tier in config.option.tiers.split(",") if tier]
+
+
+def _tier(item: pytest.Item) -> str:
+    return next((mark.name for mark in item.iter_markers() if mark.name in TIERS), "unit")
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Clients that need environments of their own run only when they are asked for: ``scripts/test clients``."""
-    asked = any("clients" in argument for argument in config.args)
-    return True if collection_path.name == "clients" and not asked else None
+    """Clients that need environments of their own run only when they are asked for: ``scripts/test clients``.
+
+    A file is not even imported if all its tests are of another tier than those asked for.
+    """
+    if collection_path.name == "clients":
+        return True if not any("clients" in argument for argument in config.args) else None
+    if not _tiers(config) or collection_path.suffix != ".py":
+        return None
+    tier = _TIER_OF_FILE.search(collection_path.read_text(encoding="utf-8"))
+    return True if tier and tier[1] not in _tiers(config) else None
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if tiers := _tiers(config):
+        config.hook.pytest_deselected(items=[item for item in items if _tier(item) not in tiers])
+        items[:] = [item for item in items if _tier(item) in tiers]
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Compile all kernels once, before the tests that start programs: these would report it.
+
+    Unit tests compile what they call, when they call it.
+    """
+    if not hasattr(session.config, "workerinput") and not session.config.option.collectonly:
+        tiers = {_tier(item) for item in session.items} or set(_tiers(session.config) or TIERS)  # xdist: no items here
+        if tiers != {"unit"}:
+            compile_with_counts(missing(EVERY_PART))
 
 
 @pytest.fixture(scope="session", autouse=True)
