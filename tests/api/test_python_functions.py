@@ -176,7 +176,7 @@ def test_an_optimised_plan_has_other_anchors():
 
 
 def test_a_plan_of_beacons(tmp_path, capsys):
-    site = grid_site(30.0, 20.0, 10.0, 4.0, 1.2)
+    site = grid_site(100.0, 90.0, 10.0, 4.0, 1.2)
     file = tmp_path / "grid.toml"
     file.write_text(site_template(site))
     plan = skyless.plan(file)
@@ -417,9 +417,9 @@ PLAN = [
     ],
     ids=str,
 )
-def test_what_has_no_effect_on_a_plan_of_slots_is_refused(arguments):
+def test_what_has_no_effect_on_a_plan_of_beacons_is_refused(arguments):
     with pytest.raises(skyless.SkylessError, match=f"{next(iter(arguments))} is .*; it should be left out: errors are"):
-        skyless.plan(grid_site(30.0, 20.0, 10.0, 4.0, 1.2), **arguments)
+        skyless.plan(grid_site(100.0, 90.0, 10.0, 4.0, 1.2), **arguments)
 
 
 @pytest.mark.parametrize(("arguments", "right"), PLAN, ids=[str(sorted(given)) for given, _ in PLAN])
