@@ -22,13 +22,14 @@ import numpy as np
 from msgspec.structs import replace
 
 from skyless.core.constants import TICK_BITS
+from skyless.core.site import AccuracySite
 from skyless.radio.foreign.fira import DtTag
 from skyless.radio.uci.uci import UciReader
 from skyless.research.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, PacketTracking
 from skyless.run.board import UciProtocol
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of
-from skyless.sim.lab import lab_site
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.range_errors import RangeErrorModel
 from skyless.sim.trajectory import Static
 from skyless.site.planning.anchor_clocks import AnchorClocks, Relays, relays_of
@@ -79,7 +80,7 @@ def round_planned_m(site, settings):
         ends.append(len(kept))
     gaps_s = clocks.gap_s[:messages].copy()
     gaps_s[0] += clocks.gap_s[messages:].sum()
-    clocks = AnchorClocks(clocks.sends, clocks.sender[:messages], gaps_s)
+    clocks = AnchorClocks(clocks.sends, clocks.sender[:messages], gaps_s, clocks.kept)
     rest = (column[kept].copy() for column in relays[1:])
     table = np.zeros((len(PLACES_M), len(PLAN_COLUMNS)))
     fill_joint_sigma(
@@ -90,7 +91,7 @@ def round_planned_m(site, settings):
 
 def site_with(frames):
     """The lab, with that many frames of each node in a superframe."""
-    site = lab_site()
+    site = paper_lab_site(accuracy=AccuracySite())
     return replace(site, schedule=replace(site.schedule, frames_per_node=frames))
 
 

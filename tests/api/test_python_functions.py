@@ -400,7 +400,7 @@ PLAN = [
     ({"mounts_m": ((0, 0, 0, 0),)}, "with two different ends"),
     ({"optimise": 2}, "optimise is 2; it should be a whole number, at least 3, at most 60"),
     ({"step_m": 1e-9}, "no map"),
-    ({"exponent": 2.0}, "exponent is 2; it should be left out: this site is in mode master"),
+    ({"exponent": 2.0}, "exponent is 2; it should be left out: it is for sites of more than 60 anchors"),
 ]
 
 

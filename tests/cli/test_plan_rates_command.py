@@ -94,7 +94,7 @@ def test_a_plan_shows_and_draws_what_reaches_tags(hall, tmp_path, capsys):
     assert [anchor["id"] for anchor in result["unplaced"]] == [99]
     assert result["reception"]["beacons_per_s"]["median"] > 100.0
     shown = run(capsys, "plan", hall, "--exponent", "2.5", "--range", "40")
-    assert "40 m (path loss exponent 2.5)" in shown
+    assert "40 m (path loss exponent 2.5)" in " ".join(shown.split())
     assert "beacons/s at a tag" in shown
 
 

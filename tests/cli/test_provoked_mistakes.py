@@ -14,7 +14,7 @@ import pytest
 import synthetic_recordings as synthetic
 from skyless.cli.main import main
 from skyless.run.recordings.recorder import McapFile
-from skyless.sim.lab import lab_site
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.file.template import site_template
 
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 8
@@ -24,13 +24,13 @@ PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 8
 def room(tmp_path, monkeypatch):
     """A folder with good files and bad ones, where the commands run."""
     monkeypatch.chdir(tmp_path)
-    lab = site_template(lab_site())
+    lab, paper = site_template(lab_site()), site_template(paper_lab_site())
     files = {
         "lab.toml": lab.encode(),
         "picture.toml": PNG,
         "latin.toml": b'name = "S\xfcd"\n',
-        "no-master.toml": lab.replace("\nmaster = 1", "\nmaster = 77").encode(),
-        "typo.toml": lab.replace("slot_s =", "slots_s =").encode(),
+        "no-master.toml": paper.replace("\nmaster = 1", "\nmaster = 77").encode(),
+        "typo.toml": paper.replace("slot_s =", "slots_s =").encode(),
         "one-anchor.toml": lab.split("[[anchors]]", 2)[0].encode() + b"[[anchors]]\nid = 1\nx_m = 0.0\ny_m = 0.0\n",
         "anchors.csv": synthetic.anchors_csv().encode(),
         "nan.csv": b"id,x_m,y_m,z_m\n1,nan,0,0\n",

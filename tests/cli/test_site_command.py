@@ -114,7 +114,7 @@ def test_check_shows_the_site(tmp_path, capsys):
     main(["site", "new", str(path), "--paper"])
     assert main(["site", "check", str(path)]) == 0
     shown = capsys.readouterr().out
-    for part in ("1 (master)", "66.7 superframes/s", "400 messages/s", "315 µs", "the site file is valid"):
+    for part in ("3 (master)", "66.7 superframes/s", "400 messages/s", "315 µs", "the site file is valid"):
         assert part in shown
 
 

@@ -73,7 +73,7 @@ class DemoOptions(ProtectionOptions, frozen=True, kw_only=True):
     site: Path | None = None
     """Site file; by default the lab, six anchors on the walls of 6 m × 8 m."""
     paper: bool = False
-    """Run the lab with the paper's protocol: one anchor is the master, and another takes over when it fails."""
+    """Use the paper's protocol for the lab: one anchor is the master, and another takes over when it fails."""
     method: Method = DEFAULT_METHOD
     """How positions are computed."""
     apart: bool = False
