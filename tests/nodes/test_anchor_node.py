@@ -136,7 +136,7 @@ async def test_an_anchor_that_knows_no_time_does_not_transmit():
         radio.ready = False  # nor stumbles over a radio that is not ready
         await asyncio.sleep(0.02)
         assert radio.transmissions == []
-        assert node.machine.synchronisation.beacons == 0
+        assert node.machine.clock(None).beacons == 0
 
 
 @played

@@ -217,7 +217,7 @@ def test_lines_of_faults_come_once_and_are_few():
 @pytest.mark.parametrize(
     ("case", "words"),
     [
-        ("master", 'has schedule.mode "master", whose beacons carry no codes; it should be slots or free'),
+        ("master", 'has schedule.mode "master", whose beacons carry no codes; it should be free'),
         ("foreign", "is of site 1; it should be of site 300"),
         ("none", "is no folder"),
     ],
@@ -225,7 +225,7 @@ def test_lines_of_faults_come_once_and_are_few():
 def test_wrong_keys_are_refused_before_anything_runs(tmp_path, capsys, case, words):
     site = tmp_path / "hall.toml"
     size = ["--width", "20", "--depth", "20", "--site-id", "300"]
-    assert main(["site", "new", str(site), *size, *(() if case == "master" else ("--spacing", "10"))]) == 0
+    assert main(["site", "new", str(site), *size, *(("--paper",) if case == "master" else ())]) == 0
     put(tmp_path, FIRST)
     folder = tmp_path / "none" if case == "none" else tmp_path
     capsys.readouterr()
@@ -265,7 +265,8 @@ async def test_stamps_of_beacons_that_are_not_accepted_are_not_kept(tmp_path, cl
             now_ticks = stage.radios[0].now_ticks()
             sender = Anchor(FREE, 2, authentication=BeaconAuthentication(chains))
             sender.authentication.set_time(now_ticks, START_UNIX_S + 1.0)
-            stage.node.on_event(Reception(sender.transmission(now_ticks).frame, now_ticks))
+            tx_ticks = sender.next_transmission_ticks(now_ticks)
+            stage.node.on_event(Reception(sender.transmission(tx_ticks).frame, now_ticks))
             assert (2 in stage.node.heard_s) is is_kept
 
 

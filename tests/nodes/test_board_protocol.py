@@ -178,7 +178,7 @@ def test_a_beacon_becomes_a_packet_of_a_tdoa3_system(knows_binary):
         squared = sum((a - b) ** 2 for a, b in zip(places[2], places[other], strict=True))
         return round(squared**0.5 / SPEED_OF_LIGHT_MPS * TICK_RATE_HZ)
 
-    relays = (Relay(1, 130 % 128, 9, flight(1)), Relay(3, 250 % 128, 7, flight(3)))
+    relays = (Relay(3, 250 % 128, 7, flight(3)), Relay(1, 130 % 128, 9, flight(1)))
     assert packet == Packet(None, 2, 200 % 128, 2**32 - 5, 2**40 - 1, relays)
     assert speech.drops == {"not-translated": 1}
     assert not drops

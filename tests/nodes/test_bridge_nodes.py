@@ -20,6 +20,7 @@ from skyless.core.air.almanac import GeoreferencePage
 from skyless.core.air.reception import Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.errors import SkylessError
+from skyless.core.tag.beacon_receiver import HeardSite
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import SiteMessage, StatusMessage, Zone, ZonesMessage
 from skyless.run.mqtt.topics import EVERY_NODE, fix_topic, health_topic, site_topic, status_topic, zones_topic
@@ -181,8 +182,7 @@ def test_tags_that_know_different_anchors_of_a_large_site_make_one_site():
 def heard_by(site, latitude_deg=50.0):
     """What a tag's receiver knows of a site, which may be changed."""
     page = None if latitude_deg is None else GeoreferencePage(latitude_deg, 8.0, 100.0, 0.0)
-    almanac = SimpleNamespace(complete=True, anchors_m={1: (0.0, 0.0, 2.0)}, georeference=page)
-    return SimpleNamespace(site=site, almanac=almanac, local_almanac=SimpleNamespace(pages=None))
+    return SimpleNamespace(site=site, heard_site=HeardSite({1: (0.0, 0.0, 2.0)}, page, is_complete=page is not None))
 
 
 def test_no_fix_of_another_site_than_the_one_that_targets_know_is_given():
@@ -224,7 +224,7 @@ def test_after_a_change_of_site_the_page_about_the_earth_is_awaited_again():
     receiver = heard_by(5)
     bridge.on_health(tag_health("tag1"), receiver)
     bridge._sites["tag1"]._complete_s -= 10.0
-    receiver.site, receiver.almanac = 6, heard_by(6, None).almanac
+    receiver.site, receiver.heard_site = 6, heard_by(6, None).heard_site
     bridge.on_health(tag_health("tag1"), receiver)
     assert [site.id for site in target.sites] == [5]
 

@@ -63,7 +63,7 @@ def recorded(file):
 @pytest.fixture
 def site(tmp_path):
     file = tmp_path / "hall.toml"
-    size = ["--width", "20", "--depth", "20", "--spacing", "10", "--free", "--site-id", str(SITE)]
+    size = ["--width", "20", "--depth", "20", "--spacing", "10", "--site-id", str(SITE)]
     assert main(["site", "new", str(file), *size]) == 0
     assert main(["site", "keys", "new", str(file), "--years", "0.0001"]) == 0
     return file

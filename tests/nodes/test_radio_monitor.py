@@ -120,7 +120,7 @@ def test_a_tag_that_receives_nothing_asks_its_radio_where_to_look():
     [
         ({"site": LAB.id + 1}, lambda frame: frame, "foreign-site"),
         ({}, lambda frame: frame[:-1] + bytes([frame[-1] ^ 1]), "bad-fcs"),
-        ({}, lambda frame: b"\x02\x00\x07", "too-short"),
+        ({}, lambda frame: b"\x02\x00", "too-short"),
     ],
 )
 def test_a_tag_whose_frames_are_all_dropped_logs_why(settings, spoil, reason):

@@ -156,7 +156,8 @@ def test_anchors_behind_a_port_that_leads_elsewhere_publish_again_whether_they_a
     node._wait = lambda seconds, then: None  # it has no loop
 
     class Leading:
-        is_master = True
+        def clock(self, now_ticks):
+            return None
 
     monkeypatch.setattr(anchor, "health_of", lambda *_: None)
     node._new_machine = Leading
