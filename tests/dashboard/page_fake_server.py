@@ -72,6 +72,7 @@ class FakeServer:
     def __enter__(self):
         self._thread.start()
         while not (self._server and self._server.started):
+            assert self._thread.is_alive(), f"no server on port {self.port}"
             time.sleep(0.01)
         return self
 

@@ -15,17 +15,17 @@ from scipy.stats import binom, chi2, expon, kstest
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.core.protocol1.anchor import Anchor
-from skyless.core.site import WallSite
+from skyless.core.site import AccuracySite, WallSite
 from skyless.core.ticks import Unwrapper, difference
 from skyless.sim.impairments import AnchorBias, AnchorOutage, DelayError, Impairments, Outage, lab_impairments
-from skyless.sim.lab import lab_site
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.oscillator import OscillatorModel
 from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import RandomWalk, Static, Waypoints
 from skyless.sim.world import World
 from skyless.site.channel import ChannelModel, power_bias_m, received_power_dbm
 
-LAB = lab_site()
+LAB = paper_lab_site(accuracy=AccuracySite())
 AT_P1 = TagSpec(Static(3.0, 4.0))
 
 
