@@ -19,6 +19,14 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import reference
 
+from skyless.core import integrity
+from skyless.sim import impairments
+from skyless.sim.evaluation import request
+
+# autodoc evaluates annotations; the module imports these names for type checkers only.
+vars(request).update({name: value for module in (impairments, integrity) for name, value in vars(module).items()
+                      if isinstance(value, type) and name not in vars(request)})  # fmt: skip
+
 NAVIGATION = {
     "Tutorials": [
         "docs/start_here",

@@ -186,7 +186,9 @@ def replayed_flights() -> Figure:
 
 def layers() -> Figure:
     """The rooms of the code, each importing only those below it, as the contract in ``pyproject.toml`` has them."""
-    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]["contracts"]
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"][
+        "contracts"
+    ]
     rows = [line.replace("skyless.", "").split(" | ") for line in reversed(contracts[0]["layers"])]
     figure, axes = axes_of(7.2, 0.5 * len(rows) + 0.2, bare=True)
     axes.set(xlim=(0, 10), ylim=(0, len(rows)))

@@ -93,7 +93,7 @@ def _anchor_and_more(name: str, text: str, counts: tuple[int, ...]) -> tuple[int
 
 
 def _read_bias(name: str, text: str) -> "AnchorBias":
-    from skyless.sim.impairments import AnchorBias  # noqa: PLC0415 - help needs no SciPy
+    from skyless.sim.impairments import AnchorBias  # noqa: PLC0415
 
     anchor, more = _anchor_and_more(name, text, (2, 3))
     return AnchorBias(anchor, *more)
