@@ -252,7 +252,7 @@ A, T = ["--anchors", "anchors.csv"], ["--truth", "truth.csv"]
         (["tdoa-table", "--anchors", "{bad}/empty"], ["empty", "line 1", "id,x_m,y_m,z_m"]),
         (["tdoa-table", "--anchors", "{bad}/bad-number.csv"], ["line 2", "z_m", "far", "finite number"]),
         (["tdoa-table", "--anchors", "{bad}/nan.csv"], ["line 2", "y_m", "nan", "finite number"]),
-        (["tdoa-table", "--anchors", "{bad}/twice.csv"], ["line 3", "id is 1", "only once"]),
+        (["tdoa-table", "--anchors", "{bad}/twice.csv"], ["line 3", 'id is "1"', "only once"]),
         (["tdoa-table", "--anchors", "{bad}/no-z.csv"], ["line 1", "id,x_m,y_m,z_m"]),
         (["tdoa-table", "--anchors", "{bad}/ragged.csv"], ["line 2", "4 columns"]),
         (["tdoa-table", "--site", "missing.toml"], ["missing.toml", "there is none"]),

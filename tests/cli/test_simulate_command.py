@@ -322,7 +322,7 @@ def test_a_site_too_large_for_real_time_is_warned_of(tmp_path, capsys):
     large = "".join(f"[[anchors]]\nid = {k}\nx_m = {15 * k}\ny_m = 0\n" for k in range(140))
     for anchors, warned in ((large, True), (CORNERS, False)):
         check_live(load_site(protocol_2(tmp_path, anchors)))
-        assert ("140 anchors send 4200 beacons/s" in capsys.readouterr().err) is warned
+        assert ("140 anchors send 9333 beacons/s" in capsys.readouterr().err) is warned
 
 
 THREE_3D = 'name = "hall"\nid = 1\n[schedule]\nmode = "free"\n' + "".join(
@@ -356,5 +356,5 @@ def test_a_run_without_a_fix_fails_with_its_reason(run, tmp_path, arguments, rea
 @pytest.mark.parametrize(("scenario", "said"), [("lab", "2-D"), ("room", "2-D")])
 def test_figures_say_of_how_many_dimensions_they_are(run, scenario, said):
     _, out, _ = run("--scenario", scenario, "--duration", "3")
-    for name in ("RMSE", "predicted σ", "95 %", "largest"):
+    for name in ("RMSE", "predicted σ", "95 %", "largest error"):
         assert f" {name} {said} " in out

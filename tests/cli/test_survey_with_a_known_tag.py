@@ -178,7 +178,7 @@ def test_a_wrong_place_is_noticed(stay, capsys):
         (("--at", "1,2,x"), "--at is"),
         (("--at", "1,2,x@0:9"), "--at is '1,2,x@0:9'; '1,2,x' should be 2 or 3 numbers"),
         (("--at", "1,2,1e300"), "metres, at most 1e+06"),
-        (("--truth", "{folder}/far.csv"), "line 2, column x_m is 1e+300; it should be metres, at most"),
+        (("--truth", "{folder}/far.csv"), 'line 2, column x_m is "1e300"; it should be metres, at most'),
         (
             ("--truth", "{folder}/near.csv", "--lever-arm", "1e300,0,0"),
             "--lever-arm is (1e+300, 0.0, 0.0); it should be",

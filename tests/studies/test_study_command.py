@@ -111,7 +111,7 @@ def test_every_study_can_be_drawn(name, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["lost"], 'Choose from: "efficiency", "loss"'),
+        (["lost"], "NAME is 'lost'; it should be one of efficiency, loss"),
         (["loss", "--episodes", "5"], "--episodes is for the stud"),
         (["room", "--episodes", "5"], "room takes --worlds and --seconds"),
         (["room", "--integrity-risk", "1e-3"], "are for the study integrity"),

@@ -2,10 +2,10 @@
 
 import time
 from collections.abc import Iterator
+from operator import methodcaller
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-import numpy as np
 
 from skyless.cli.api.options import StudyOptions
 from skyless.cli.api.result import Result, cm, data_frame, figures
@@ -57,7 +57,7 @@ class StudyResult(Result, frozen=True, eq=False):
     @property
     def summary(self) -> dict[str, Any]:
         """The object that ``skyless study --json`` writes, in SI units, but for the version."""
-        rows = msgspec.to_builtins(self.rows, enc_hook=np.ndarray.tolist)
+        rows = msgspec.to_builtins(self.rows, enc_hook=methodcaller("tolist"))
         return {
             "study": self.name, "simulated": True, **msgspec.to_builtins(self.plan), "wall_s": self.wall_s,
             "rows": rows,
