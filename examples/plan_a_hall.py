@@ -1,6 +1,5 @@
 """A hall before anything is mounted: what six anchors would give, and what eight placed by the planner would.
 
-Predicted for the method ``weighted``, as it is quick; searching positions for ``joint``, the default, takes a minute.
 Picture: ``python plan_a_hall.py hall.png``.
 """
 
@@ -10,8 +9,8 @@ import skyless
 from skyless.site.file.template import rectangular_site
 
 hall = rectangular_site(24.0, 14.0, 6, 5.0, 1.2)  # width, depth, anchors, their greatest height; tags 1.2 m high
-now = skyless.plan(hall, method="weighted", step_m=1.0, target_m=0.1)
-better = skyless.plan(hall, method="weighted", step_m=1.0, target_m=0.1, optimise=8, search_s=2.0)
+now = skyless.plan(hall, step_m=2.0, target_m=0.1)
+better = skyless.plan(hall, step_m=2.0, target_m=0.1, optimise=8, search_s=2.0)
 
 for name, result in (("six anchors", now), ("eight, placed", better)):
     found = result.summary

@@ -25,7 +25,10 @@ from msgspec.structs import replace
 
 from skyless import METHODS, Request, fleet_of, lab_site
 from skyless.cli.main import main as skyless
+from skyless.core.method_names import DEFAULT_METHOD
+from skyless.core.site import AccuracySite
 from skyless.sim.evaluation.scenarios import Room
+from skyless.sim.lab import paper_lab_site
 
 MACHINE = f"{llvmlite.binding.get_host_cpu_name()}, numba {numba.__version__}, numpy {np.__version__}"
 """On what hashes depend."""
@@ -66,7 +69,7 @@ def fix_values(judged):
 
 def conditions(seed):
     """Simulations: the lab alone; lost and late frames and warm air; errors of a room; anchors at several heights."""
-    site = lab_site()
+    site = paper_lab_site(accuracy=AccuracySite())
     lifted = tuple(replace(anchor, z_m=2.5 * (index % 2)) for index, anchor in enumerate(site.anchors))
     free = replace(site, anchors=lifted, tags=replace(site.tags, height_m=None))
     yield "lab", Request(site=site, seed=seed, tags=2)
@@ -75,9 +78,16 @@ def conditions(seed):
     yield "free-height", Request(site=free, seed=seed, tags=1)
 
 
+def conditions_at_random_instants(seed):
+    """The same without a master, for ``joint``."""
+    for name, request in conditions(seed):
+        yield f"random-instants-{name}", replace(request, site=replace(request.site, schedule=lab_site().schedule))
+
+
 def simulated(method, condition, seed):
     """Hash, number of fixes and mean position of one simulation."""
-    request = replace(dict(conditions(seed))[condition], method=method)
+    asked = {**dict(conditions(seed)), **dict(conditions_at_random_instants(seed))}
+    request = replace(asked[condition], method=method)
     digest, positions = hashlib.sha256(), []
     for judged in fleet_of(request).run(DURATION_S):
         digest.update(fix_values(judged).tobytes())
@@ -102,6 +112,9 @@ def all_cases():
     for method, seed in product(METHODS, SEEDS):
         for condition, _ in conditions(seed):
             yield f"{method} {condition} {seed}", lambda m=method, c=condition, s=seed: simulated(m, c, s)
+    for seed in SEEDS:
+        for condition, _ in conditions_at_random_instants(seed):
+            yield f"{DEFAULT_METHOD} {condition} {seed}", lambda c=condition, s=seed: simulated(DEFAULT_METHOD, c, s)
     if DATA.is_dir():
         for name in REPLAYS:
             yield f"replay {name}", lambda n=name: replayed(n)

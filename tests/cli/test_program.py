@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from skyless.cli.main import main
-from skyless.sim.lab import lab_site
+from skyless.core.site import AccuracySite
+from skyless.sim.lab import paper_lab_site
 from skyless.site.file.template import site_template
 
 SKYLESS = [sys.executable, "-m", "skyless.cli.main"]
@@ -24,7 +25,7 @@ def skyless(*arguments, **options):
 @pytest.fixture
 def lab(tmp_path):
     path = tmp_path / "lab.toml"
-    path.write_text(site_template(lab_site()), encoding="utf-8")
+    path.write_text(site_template(paper_lab_site(accuracy=AccuracySite())), encoding="utf-8")
     return path
 
 

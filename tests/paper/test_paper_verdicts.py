@@ -11,7 +11,7 @@ from skyless.research.paper.checks import PaperCheck
 from skyless.research.paper.distributions import LambdaDistribution
 from skyless.research.paper.plan import P1, P2, Verdict, plan_of
 from skyless.sim.evaluation.scenarios import Request, fleet_of
-from skyless.sim.lab import lab_site
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.report.report_page import inline_svg
 
 HOLDS, CORRECTED, FAILS = Verdict.HOLDS, Verdict.CORRECTED, Verdict.FAILS
@@ -146,7 +146,7 @@ def test_antenna_delays_move_the_least_squares_by_the_normal_equations():
 def test_the_command_beside_a_figure_makes_its_number_again():
     """Several methods and tags in one world hear what ``skyless simulate`` lets one tag hear."""
     tracks = static.run_world(lambda share: None, "noise", 9, 60)
-    fleet = fleet_of(Request(lab_site(), method="literal", seed=9, noise_ps=100.0, positions_m=(P1,), fixes=60))
+    fleet = fleet_of(Request(paper_lab_site(), method="literal", seed=9, noise_ps=100.0, positions_m=(P1,), fixes=60))
     for _ in fleet.run(3.2):
         pass
     error_m = tracks[0]["literal"].error_m

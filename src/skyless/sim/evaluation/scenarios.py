@@ -147,9 +147,11 @@ def fleet_of(request: Request) -> Fleet:
     """Make the world and its tags; the anchors are the machines that would run on radios.
 
     Raises:
-        ValueError: an anchor that is to fail does not exist.
+        ValueError: an anchor that is to fail does not exist, or the method needs a master and the site has none.
     """
     site = request.site
+    if request.method in SNAPSHOTS and not site.schedule.needs_master:
+        raise ValueError(f"the method {request.method} needs a master, and site {site.name} has none")
     if request.noise_ps is not None:
         noise = replace(site.noise, tx_stamp_ps=request.noise_ps, rx_stamp_ps=request.noise_ps)
         site = replace(site, noise=noise)
