@@ -1,12 +1,10 @@
 """One beacon as the positioning methods see it: every stamp unwrapped on its own clock."""
 
 from collections.abc import Iterator
-from typing import Protocol
 
 from msgspec import Struct
 
 from skyless.core.air.frame import HEARD
-from skyless.core.fix import Fix, NoFixReason
 from skyless.core.kernels.arrays import Array
 from skyless.core.ticks import nearest
 
@@ -55,14 +53,3 @@ class Observation(Struct, frozen=True, gc=False):
         yield from self.relays
         for anchor, sequence, low, high in HEARD.iter_unpack(self.packed_relays):
             yield anchor, sequence, nearest(low | high << 32, self.tx_ticks_anchor)
-
-
-class Method(Protocol):
-    """A positioning method: observations in, fixes out."""
-
-    needs_relays: bool
-    """Whether observations carry relays and the master's term, instead of rounds and stamps of the master's frames."""
-
-    def update(self, observation: Observation) -> Fix | NoFixReason:
-        """Process one observation; a fix, or why there is none yet."""
-        ...

@@ -24,9 +24,8 @@ from skyless.core.keys.fault import Fault
 from skyless.core.keys.key_chain import public_key
 from skyless.core.keys.verifier import LONGEST_WAIT_TICKS, ReceivedFrame, Verifier
 from skyless.core.protocols import decode_any
-from skyless.core.tag.observations import FixTime
 from skyless.core.tag.receiver import Receiver
-from skyless.core.ticks import from_seconds
+from skyless.core.ticks import FixTime, from_seconds
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -1,15 +1,14 @@
 """Observations out of beacons of protocol 1: rounds, and the master's time along the tag's own."""
 
 from skyless.core.air.frame import Heard
-from skyless.core.constants import MAX_DRIFT, TICK_M
+from skyless.core.constants import TICK_M
 from skyless.core.kernels.arrays import Array
-from skyless.core.observation import MasterTerm, Method, Observation
+from skyless.core.observation import MasterTerm, Observation
 from skyless.core.protocol1.beacon import Beacon
 from skyless.core.protocol1.codec import packed_relays
 from skyless.core.protocol1.master_term import master_term_of
 from skyless.core.protocol1.schedule import Schedule
-from skyless.core.tag.observations import FLIGHT_SLACK_TICKS
-from skyless.core.ticks import HALF_WRAP_TICKS, TICK_MASK, nearest
+from skyless.core.ticks import FLIGHT_SLACK_TICKS, may_elapse, nearest
 
 
 class Observer:
@@ -31,10 +30,9 @@ class Observer:
         """Refer rounds to this master, whose first slot in the superframe is given."""
         self._master, self._master_slot = master, master_slot
 
-    def set_method(self, method: Method, schedule: Schedule) -> None:
-        """Make observations with what this method needs."""
-        self._schedule = schedule
-        self._needs_relays = method.needs_relays
+    def set_method(self, schedule: Schedule, *, needs_relays: bool) -> None:
+        """Make observations with relays and the master's term, or with rounds and stamps of the master's frames."""
+        self._schedule, self._needs_relays = schedule, needs_relays
 
     def observe(
         self,
@@ -87,10 +85,8 @@ class Observer:
         updates = scale is None or beacon.anchor == self._master
         if scale is not None:
             elapsed = rx_ticks - scale[1]
-            expected = scale[0] + elapsed
-            least = expected - HALF_WRAP_TICKS
-            whole = least + ((whole - least) & TICK_MASK)
-            updates = updates or abs(whole - expected) <= MAX_DRIFT * elapsed + FLIGHT_SLACK_TICKS
+            whole = nearest(whole, scale[0] + elapsed)
+            updates = updates or may_elapse(whole - scale[0], elapsed, FLIGHT_SLACK_TICKS)
         if updates:
             self.scale = (whole, rx_ticks)
         return whole, (subticks & 0xFF) / 256.0, (time.std_ticks * TICK_M) ** 2

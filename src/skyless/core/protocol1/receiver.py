@@ -6,6 +6,7 @@ It needs nothing but beacons: anchors, schedule and noise figures come from the 
 import numpy as np
 from msgspec import Struct
 
+from skyless.core.air.almanac import AccuracyPage, NoisePage, SchedulePage
 from skyless.core.air.frame import Malformed
 from skyless.core.air.reception import Reception
 from skyless.core.fix import Fix, NoFixReason
@@ -16,10 +17,9 @@ from skyless.core.protocol1.almanac import AlmanacAssembly, AlmanacState
 from skyless.core.protocol1.beacon import Beacon
 from skyless.core.protocol1.codec import decode_cached
 from skyless.core.protocol1.master_term import FollowedMaster
-from skyless.core.protocol1.method import new_method
 from skyless.core.protocol1.observer import Observer
 from skyless.core.protocol1.schedule import schedule_from_page
-from skyless.core.protocol1.snapshots import Snapshots, SnapshotsState
+from skyless.core.protocol1.snapshots import SnapshotMethod, Snapshots, SnapshotSettings, SnapshotsState
 from skyless.core.tag.beacon_receiver import (
     AdmissionState,
     BeaconReceiver,
@@ -27,7 +27,9 @@ from skyless.core.tag.beacon_receiver import (
     MethodOptions,
     variance_factor_of,
 )
+from skyless.core.tag.factory import as_required, estimator_settings, stamp_variances
 from skyless.core.tag.joint import Estimation, EstimationState
+from skyless.core.ticks import to_seconds
 
 
 class ReceiverState(Struct, frozen=True, tag="protocol-1"):
@@ -208,5 +210,18 @@ class Receiver(BeaconReceiver[Beacon]):
             if master is not None and schedule_page is not None and noise is not None:
                 schedule = schedule_from_page(schedule_page)
                 self._superframe_ticks = schedule.superframe_ticks
-                self._method = new_method(options, master, schedule_page, noise, accuracy, self._time)
-                self._observer.set_method(self._method, schedule)
+                self._method = self._new_method(master, schedule_page, noise, accuracy)
+                self._observer.set_method(schedule, needs_relays=options.method in FILTERS)
+
+    def _new_method(
+        self, master: int, schedule: SchedulePage, noise: NoisePage, accuracy: AccuracyPage
+    ) -> Estimation | Snapshots:
+        """Make the method for a site with this schedule and noise, where that anchor is the master."""
+        options, height_m = self._options, schedule.tag_height_m
+        if options.method not in FILTERS:
+            variances = stamp_variances(noise)
+            settings = SnapshotSettings(master, schedule.anchors, *variances, height_m, options.z_bounds_m)
+            return Snapshots(SnapshotMethod(options.method), settings, self._time)
+        superframe_s = to_seconds(self._superframe_ticks)
+        assumed = estimator_settings(options.qa, height_m, noise, accuracy, superframe_s)
+        return Estimation(as_required(assumed, options), options.z_bounds_m, self._time, superframe_s)

@@ -11,13 +11,13 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.constants import MAX_DRIFT, TICK_M
+from skyless.core.constants import TICK_M
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.kernels.arrays import Array, Matrix, Vector
 from skyless.core.kernels.compiled import kernel, part
 from skyless.core.observation import Observation
 from skyless.core.tag.locate import NoSolution, Solution, locate
-from skyless.core.tag.observations import FLIGHT_SLACK_TICKS, FixTime
+from skyless.core.ticks import FLIGHT_SLACK_TICKS, FixTime, may_elapse
 
 
 class SnapshotMethod(StrEnum):
@@ -194,8 +194,6 @@ class SnapshotsState(Struct, frozen=True, tag="snapshots"):
 class Snapshots:
     """Collects two rounds of beacons and solves them."""
 
-    needs_relays = False
-
     def __init__(self, method: SnapshotMethod, settings: SnapshotSettings, fix_time: FixTime | None = None) -> None:
         """``fix_time``: the receiver's, where it outlives this method."""
         self._method = method
@@ -309,7 +307,7 @@ def _synchronised(first: Observation, second: Observation, reference: tuple[Obse
 def _is_plausible_interval(elapsed_ticks: int, first: Observation, second: Observation) -> bool:
     """Whether an interval on an anchor's clock can be the one that the tag measured between two receptions."""
     elapsed = second.rx_ticks_tag - first.rx_ticks_tag
-    return elapsed > 0 and abs(elapsed_ticks - elapsed) <= MAX_DRIFT * elapsed + FLIGHT_SLACK_TICKS
+    return elapsed > 0 and may_elapse(elapsed_ticks, elapsed, FLIGHT_SLACK_TICKS)
 
 
 def _kappa(first: Observation, second: Observation) -> float:

@@ -18,8 +18,7 @@ from skyless.core.air.reception import Reception
 from skyless.core.air.site_choice import SiteChoice, SiteUse
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.tag.observations import FixTime
-from skyless.core.ticks import LAST_TICKS, Unwrapper, from_seconds
+from skyless.core.ticks import LAST_TICKS, FixTime, Unwrapper, from_seconds
 
 if TYPE_CHECKING:
     # It loads Numba and all kernels: only who makes a receiver waits for that, not who imports its class.

@@ -10,9 +10,8 @@ from skyless.core.estimator.state import EstimatorSettings
 from skyless.core.kernels.filter import clock_noise, stamp_variance_m2
 from skyless.core.tag.beacon_receiver import MethodOptions
 from skyless.core.tag.joint import Estimation
-from skyless.core.tag.observations import FixTime
 from skyless.core.tag.selection import MAX_ANCHORS_IN_USE
-from skyless.core.ticks import to_seconds
+from skyless.core.ticks import FixTime, to_seconds
 
 DROP_S: Final = 2.0
 """An anchor that is silent for longer, or for four superframes, is out of view (``joint``)."""

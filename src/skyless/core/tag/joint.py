@@ -37,8 +37,7 @@ from skyless.core.tag.acquisition import (
     Acquisition,
     Start,
 )
-from skyless.core.tag.observations import FixTime
-from skyless.core.ticks import TICK_MASK, from_seconds
+from skyless.core.ticks import TICK_MASK, FixTime, from_seconds
 
 # Factor on the start's covariance, as the filter is then given the packets that it rests on.
 COVARIANCE_MARGIN: Final = 4.0
@@ -104,8 +103,6 @@ class EstimationState(Struct, frozen=True, tag="joint"):
 
 class Estimation:
     """One tag's estimator from the first beacon on."""
-
-    needs_relays = True
 
     def __init__(
         self,

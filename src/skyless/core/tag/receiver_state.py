@@ -6,7 +6,7 @@ from skyless.core.air.local_almanac import LocalAlmanacState
 from skyless.core.observation import Observation
 from skyless.core.tag.beacon_receiver import AdmissionState
 from skyless.core.tag.joint import EstimationState
-from skyless.core.tag.selection import AnchorSelectionState
+from skyless.core.tag.selection import AnchorSelection
 
 
 class ReceiverState(Struct, frozen=True, tag="protocol-2"):
@@ -16,7 +16,7 @@ class ReceiverState(Struct, frozen=True, tag="protocol-2"):
     almanac: LocalAlmanacState
     method_period_ticks: int
     method: EstimationState | None
-    selection: AnchorSelectionState
+    selection: AnchorSelection
     waiting: tuple[Observation, ...]
     moved_ticks: dict[int, int]
     uses_moved: bool

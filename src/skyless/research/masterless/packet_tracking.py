@@ -12,15 +12,13 @@ from typing import Final
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.core.air.anchor_stamps import NOISE_TICKS
 from skyless.core.air.masterless_packets import Packet, Point, Relay
-from skyless.core.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ
 from skyless.core.estimator.state import EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.observation import Observation
 from skyless.core.tag.joint import Estimation
-from skyless.core.tag.observations import FixTime
-from skyless.core.ticks import LAST_TICKS, Unwrapper, nearest
+from skyless.core.ticks import LAST_TICKS, FixTime, Unwrapper, continued, nearest
 from skyless.research.masterless.difference_tracking import DIFFERENCES, MAX_HORIZONTAL_STD_M, NEIGHBOURHOOD
 from skyless.research.masterless.pair_engine import MAX_ANCHORS, remember
 from skyless.site.survey.anchor_errors import NO_BIAS, SLOPE_NEAREST_M, DifferenceCalibration, RelayDelays
@@ -80,9 +78,8 @@ class _Anchor:
 
     def update(self, tx_counter: int, rx_ticks: int, bits: int) -> bool:
         """Process the stamps of another packet; False if no crystal went from the newest to these."""
-        elapsed = rx_ticks - self.rx_ticks
-        tx_ticks = nearest(tx_counter, self.tx_ticks + elapsed, bits)
-        if abs(tx_ticks - self.tx_ticks - elapsed) > MAX_DRIFT * elapsed + NOISE_TICKS:
+        tx_ticks = continued(tx_counter, self.tx_ticks, rx_ticks - self.rx_ticks, bits)
+        if tx_ticks is None:
             self.impossible += 1
             return False
         self.tx_ticks, self.rx_ticks, self.impossible = tx_ticks, rx_ticks, 0
@@ -113,7 +110,6 @@ class PacketTracking:
         self.position_m: Point | None = None
         """Of the newest fix."""
         self._tx_bits = tx_bits
-        self._half_wrap = 1 << (tx_bits - 1)
         self._positions_m = dict(anchors_m)
         self._surveyed = frozenset(anchors_m)
         self._anchors: dict[int, _Anchor] = {}
@@ -305,8 +301,7 @@ class PacketTracking:
         age = anchor.rx_ticks - rx_ticks_tag
         if age > RELAY_MAX_AGE_S * TICK_RATE_HZ:
             return "relay-too-old"
-        expected, half = anchor.tx_ticks - age, self._half_wrap
-        rx_ticks = expected + ((relay.rx_ticks - expected + half) & (2 * half - 1)) - half  # ``nearest`` in place
+        rx_ticks = nearest(relay.rx_ticks, anchor.tx_ticks - age, self._tx_bits)
         delay = self._delays.ticks(listener, relay.anchor, tx_ticks, rx_ticks, relay.tof_ticks)
         return "time-of-flight-unknown" if delay is None else rx_ticks - delay
 
