@@ -133,7 +133,7 @@ def bracketed_tdoa(
 
 
 def literal_covariance(kappa: Vector, tx_var_m2: float, rx_var_m2: float) -> Matrix:
-    """Of ``eq:GPSTDoA`` for the first messages, whose reference is one of the two sync messages; shape (n, n).
+    """Covariance of the first messages by ``eq:GPSTDoA``: their reference is one of the two sync messages.
 
     There the master's noise and the rate error β cancel exactly: Q_i + 1 stamps of the tag and of the anchor remain,
     Q = (1 + κ)² + κ².
@@ -142,12 +142,12 @@ def literal_covariance(kappa: Vector, tx_var_m2: float, rx_var_m2: float) -> Mat
 
 
 def literal_delayed_covariance(kappa: Vector, tx_var_m2: float, rx_var_m2: float) -> Matrix:
-    """Of ``eq:GPSTDoA`` for the delayed messages: the anchor's pair encloses the reference, Q = (1 - κ)² + κ²."""
+    """Covariance of the delayed messages: the anchor's pair encloses the reference, Q = (1 - κ)² + κ²."""
     return _shared_reference((1.0 - kappa) ** 2 + kappa**2, tx_var_m2, rx_var_m2)
 
 
 def bracketed_covariance(kappa: Vector, tx_var_m2: float, rx_var_m2: float) -> Matrix:
-    """Of the bracketed TDoAs; the same stamps with the same weights as the delayed messages, so the same variance."""
+    """Covariance of the bracketed TDoAs: their stamps and weights are those of the delayed messages."""
     return literal_delayed_covariance(kappa, tx_var_m2, rx_var_m2)
 
 

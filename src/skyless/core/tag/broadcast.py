@@ -8,8 +8,7 @@ Everything is in ticks, integers as long as they are large.
 from typing import Final
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.core.kernels.filter import MAX_RELATIVE_RATE
-from skyless.core.kernels.two_state import TwoState, predict, update
+from skyless.core.kernels.filter import MAX_RELATIVE_RATE, TwoState, predict, update
 from skyless.core.ticks import difference, nearest
 
 STAMP_TICKS: Final = 150e-12 / TICK_S

@@ -423,12 +423,12 @@ def _nearest(start: Start, most: int) -> set[int]:
 # Anchors in use
 
 
-# An anchor counts as in use while its last accepted message is younger, or a superframe and a half.
+# An anchor counts as in use while its last accepted message is younger than this, or than 1.5 superframes.
 MIN_IN_USE_S: Final = 0.1
 
 
 class AnchorsInUse:
-    """The anchors whose messages were accepted lately; their list is made again only when it changes."""
+    """The anchors whose messages were accepted recently. Their list is made again only when it changes."""
 
     def __init__(self, superframe_s: float) -> None:
         self._in_use_s = max(MIN_IN_USE_S, 1.5 * superframe_s)
@@ -452,7 +452,7 @@ class AnchorsInUse:
         self.anchors, self.anchors_m = tuple(self._used), np.array(state.anchors_m).reshape(len(self._used), 3)
 
     def begin(self, observations: tuple[Observation, ...]) -> None:
-        """Forget all anchors but those of these observations."""
+        """Keep only the anchors of these observations."""
         self._used.clear()
         self.extent_m = 0.0
         for observation in observations:

@@ -24,8 +24,8 @@ from skyless.core.ticks import from_seconds
 
 if TYPE_CHECKING:
     # These load Numba and all kernels: only who makes a receiver waits for that, not who imports its class.
+    from skyless.core.tag.factory import ReceiverState
     from skyless.core.tag.joint import Estimation
-    from skyless.core.tag.receiver_state import ReceiverState
 
 MAX_WAITING: Final = 128
 """Beacons that are kept while the site's pages are not complete."""
@@ -70,7 +70,7 @@ class Receiver(BeaconReceiver[Beacon]):
 
     def state(self) -> "ReceiverState":
         """All that it keeps, as it is now; to be used or encoded before its next frame, as parts are shared."""
-        from skyless.core.tag.receiver_state import ReceiverState  # noqa: PLC0415 - its types load the kernels
+        from skyless.core.tag.factory import ReceiverState  # noqa: PLC0415 - its types load the kernels
 
         return ReceiverState(
             admission=self._admission_state(),

@@ -1,4 +1,4 @@
-"""Which anchors of a large site a tag uses: those that others receive as well, and of these the strongest."""
+"""Which anchors of a large site a tag uses: the strongest of those that other anchors receive too."""
 
 import math
 from collections.abc import Callable, Collection
@@ -22,13 +22,13 @@ MIN_FITTING: Final = 2
 """An anchor that relays this number of receptions of anchors in use, and they fit, is there."""
 
 MAX_KEPT: Final = 256
-"""Identifiers kept: more than there are in reach, so that forged ones use no memory."""
+"""Identifiers kept: more than there are in reach. Forged ones cannot use more memory."""
 
 POWER_GAIN: Final = 0.1
-"""Of the running mean of an anchor's received power."""
+"""Weight of the newest value in the running mean of an anchor's received power."""
 
 NOMINAL_POWER_DBM: Final = -63.0
-"""At 1 m: what is assumed of an anchor where the radio reports no power, so that nearer ones count as stronger."""
+"""Assumed power at 1 m where the radio reports none, so that nearer anchors count as stronger."""
 
 
 Value = TypeVar("Value")
@@ -67,20 +67,20 @@ class AnchorSelection(Struct):
         _keep(self.own_relays_ticks, anchor, rx_ticks)
 
     def is_confirmed_by_others(self, anchor: int, rx_ticks: int, *, in_use: bool) -> bool:
-        """Whether others have lately received an anchor, or had when it came into use.
+        """Whether others have recently received an anchor, or had when it came into use.
 
         Only then its pages take part in the majority, and its relays confirm others.
         """
         return _is_recent(self.relayed_ticks, anchor, rx_ticks) or (in_use and anchor not in self.own_relays_ticks)
 
     def is_confirmed(self, anchor: int, rx_ticks: int) -> bool:
-        """Whether an anchor has lately been received by another one, or its own relays have fitted."""
+        """Whether another anchor has recently received this one, or its own relays have fitted."""
         return _is_recent(self.relayed_ticks, anchor, rx_ticks) or _is_recent(self.own_relays_ticks, anchor, rx_ticks)
 
     def replaced_by(self, anchor: int, ranges_m: dict[int, float]) -> int | None:
-        """The anchor that should leave for another one, None where that is too weak.
+        """The anchor in use that ``anchor`` should replace, None if ``anchor`` is too weak.
 
-        ``ranges_m``: ranges of this anchor and of all that are in use.
+        ``ranges_m``: ranges of ``anchor`` and of all anchors in use.
         """
         powers = {one: self.power_dbm.get(one, _nominal_dbm(range_m)) for one, range_m in ranges_m.items()}
         own_dbm = powers.pop(anchor)

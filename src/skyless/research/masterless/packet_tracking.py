@@ -24,7 +24,7 @@ from skyless.research.masterless.pair_engine import MAX_ANCHORS, remember
 from skyless.site.survey.anchor_errors import NO_BIAS, SLOPE_NEAREST_M, DifferenceCalibration, RelayDelays
 
 MASTERLESS_RANDOM_WALK_FM: Final = 5e-9
-"""Of the oscillators, 1/√s. Between 1e-9 and 7e-9 on the captures of TDoA3 anchors; too much of it costs little."""
+"""Random walk of the oscillators, 1/√s. Captures of TDoA3 anchors show 1e-9 to 7e-9; too much costs little."""
 
 MASTERLESS: Final = replace(
     DIFFERENCES,
@@ -36,10 +36,10 @@ MASTERLESS: Final = replace(
     rx_variance_m2=2e-3,
     slope_std_m=0.05,
 )
-"""Ranges err as those of differences do, and in those captures a reception is 4 cm off by itself."""
+"""Ranges err as in ``DIFFERENCES``. In captures of TDoA3 anchors a reception is 4 cm off by itself."""
 
 DL_TDOA: Final = replace(EstimatorSettings(), qa=DIFFERENCES.qa)
-"""For FiRa's radios, of which there are no recordings yet: what is assumed of a site with typical errors, ..."""
+"""For FiRa's radios, of which there are no recordings yet: a site with typical errors is assumed."""
 
 DL_TDOA_ONE_WAY: Final = replace(
     DL_TDOA,
@@ -47,8 +47,8 @@ DL_TDOA_ONE_WAY: Final = replace(
     survey_std_m=0.0,
     range_std_m=sqrt(DL_TDOA.range_std_m**2 + 3.0 * DL_TDOA.survey_std_m**2),
 )
-"""... and where only one anchor of each pair relays the other: the constant error of their range cannot be separated
-from their clocks then, and with the survey's it counts as one of the tag's range."""
+"""The same where only one anchor of each pair relays the other. The constant error of their range cannot be separated
+from their clocks then, so it counts, with the survey's, as an error of the tag's range."""
 
 PERIOD_S: Final = 0.15
 """Anchors send 6 to 60 times a second; the filter assumes the slowest."""
@@ -57,10 +57,10 @@ RELAY_MAX_AGE_S: Final = 0.5
 """How long ago a relayed packet may have been received; a 7-bit sequence number recurs."""
 
 RESTART_IN_ROW: Final = 3
-"""This number of impossible stamps of one anchor in a row mean that its counter has restarted; ..."""
+"""This number of impossible stamps of one anchor in a row mean that its counter has restarted."""
 
 BACK_IN_ROW: Final = 8
-"""... this number of packets in a row from before the newest, that the tag's has."""
+"""This number of packets in a row from before the newest mean that the tag's counter has restarted."""
 
 
 class _Anchor:
@@ -87,7 +87,7 @@ class _Anchor:
 
 
 class PacketTracking:
-    """One tag that receives the packets of anchors without a master. No I/O; whatever is unusable is counted."""
+    """One tag that receives the packets of anchors without a master. No I/O; what cannot be used is counted."""
 
     def __init__(
         self,
@@ -106,9 +106,9 @@ class PacketTracking:
         """
         self.reason = NoFixReason.NO_BEACONS
         self.time_s = 0.0
-        """Of the newest fix, by the tag's clock since its first packet."""
+        """Time of the newest fix, by the tag's clock since its first packet."""
         self.position_m: Point | None = None
-        """Of the newest fix."""
+        """Position of the newest fix."""
         self._tx_bits = tx_bits
         self._positions_m = dict(anchors_m)
         self._surveyed = frozenset(anchors_m)

@@ -25,7 +25,7 @@ PAIR_RELAY_MAX_AGE_S: Final = 0.25
 """Greatest age of a relayed packet. Older ones cost accuracy, and a 7-bit sequence number recurs."""
 
 MAX_ANCHORS: Final = 256
-"""Further identifiers are ignored, so that memory stays bounded whatever is on the air."""
+"""Further identifiers are ignored, so that memory stays bounded."""
 
 PAIR_PACKETS_KEPT: Final = 64
 """Packets of one anchor that are kept for relays to come."""
@@ -62,7 +62,7 @@ def remember(packets: dict[int, tuple[int, int]], sequence: int, tx_ticks: int, 
 
 
 class PairEngine:
-    """From the packets that one tag hears to TDoAs of pairs of anchors. No I/O; whatever is unusable is counted.
+    """From the packets that one tag hears to TDoAs of pairs of anchors. No I/O; what cannot be used is counted.
 
     ``tx_bits`` is the width of the anchors' TX and relay stamps; the tag's have 40 bits. ``anchors_m``
     (identifier → x, y, z) arms the physical gate; positions that packets carry serve where it has none.
