@@ -183,12 +183,12 @@ class SnapshotSettings(Struct, frozen=True):
     z_bounds_m: tuple[float, float] | None = None
 
 
-class SnapshotsState(Struct, frozen=True, tag="snapshots"):
-    """What ``Snapshots`` keeps."""
+class SnapshotsState(Struct, tag="snapshots"):
+    """What ``Snapshots`` keeps: the observations of two rounds, by anchor."""
 
-    round: int | None
-    previous: dict[int, Observation]
-    current: dict[int, Observation]
+    round: int | None = None
+    previous: dict[int, Observation] = {}
+    current: dict[int, Observation] = {}
 
 
 class Snapshots:
@@ -198,44 +198,43 @@ class Snapshots:
         """``fix_time``: the receiver's, where it outlives this method."""
         self._method = method
         self._settings = settings
-        self._previous: dict[int, Observation] = {}
-        self._current: dict[int, Observation] = {}
-        self._round: int | None = None
+        self._kept = SnapshotsState()
         self._time = fix_time or FixTime()
 
     def state(self) -> SnapshotsState:
         """All that it keeps, as it is now."""
-        return SnapshotsState(self._round, self._previous, self._current)
+        return self._kept
 
     def restore(self, state: SnapshotsState) -> None:
         """Continue from a state."""
-        self._round, self._previous, self._current = state.round, state.previous, state.current
+        self._kept = state
 
     def update(self, observation: Observation) -> Fix | NoFixReason:
         """Process one observation; a fix when it completes its round or is the first of the next one."""
         result: Fix | NoFixReason = NoFixReason.ACQUIRING
-        if observation.round != self._round:
-            if self._current:
+        kept = self._kept
+        if observation.round != kept.round:
+            if kept.current:
                 result = self._solve()
-            consecutive = self._round is not None and observation.round == self._round + 1
-            self._previous = (self._current or self._previous) if consecutive else {}
-            self._current = {}
-            self._round = observation.round
-        self._current[observation.anchor] = observation
-        if len(self._current) == self._settings.anchors:
+            consecutive = kept.round is not None and observation.round == kept.round + 1
+            kept.previous = (kept.current or kept.previous) if consecutive else {}
+            kept.current = {}
+            kept.round = observation.round
+        kept.current[observation.anchor] = observation
+        if len(kept.current) == self._settings.anchors:
             result = self._solve()
-            self._previous, self._current = self._current, {}
+            kept.previous, kept.current = kept.current, {}
         return result
 
     def _solve(self) -> Fix | NoFixReason:
-        master = self._settings.master
-        if master not in self._current or master not in self._previous:
+        master, previous, current = self._settings.master, self._kept.previous, self._kept.current
+        if master not in current or master not in previous:
             return NoFixReason.TOO_FEW_ANCHORS
-        reference = (self._previous[master], self._current[master])
+        reference = (previous[master], current[master])
         pairs = [
             (first, second)
-            for anchor, second in self._current.items()
-            if (first := self._previous.get(anchor)) is not None and _synchronised(first, second, reference)
+            for anchor, second in current.items()
+            if (first := previous.get(anchor)) is not None and _synchronised(first, second, reference)
         ]
         if not pairs:
             return NoFixReason.TOO_FEW_ANCHORS
