@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.core.tag.broadcast import (
+from skyless.research.masterless.pair_engine import (
     ACCELERATION_M2PS3,
     BROADCAST_WALK_FM,
     RESTART_AFTER,

@@ -1,15 +1,15 @@
 """What tests of the protocol machines share: sites, a world with its anchors, and what a tag hears, to tamper with."""
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.air.reception import Reception
-from skyless.core.protocol1.anchor import Anchor
 from skyless.core.protocol1.beacon import Beacon
 from skyless.core.protocol1.codec import decode, encode
+from skyless.core.protocols import new_anchor
 from skyless.core.site import EXACT, Site
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.lab import paper_lab_site
@@ -35,7 +35,7 @@ class Stage:
     ``make`` makes the machines.
     """
 
-    def __init__(self, site: Site, seed=1, tags=(), site_of_anchor=None, make=Anchor, **faults):
+    def __init__(self, site: Site, seed=1, tags=(), site_of_anchor=None, make=new_anchor, **faults):
         self.site, self.machines, self.made = site, {}, []
         sites = site_of_anchor or {}
 
@@ -48,8 +48,7 @@ class Stage:
         self.world = World(site, factory, [TagSpec(Static(*tag)) for tag in tags], impairments, seed)
 
 
-@dataclass(frozen=True)
-class Heard:
+class Heard(Struct, frozen=True):
     """One frame at the tag."""
 
     anchor: int

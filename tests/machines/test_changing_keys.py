@@ -8,9 +8,9 @@ import pytest
 from free_site import FREE
 from msgspec.structs import replace
 
-from skyless.core.any_receiver import AnyReceiver
 from skyless.core.keys.chain import Chain
 from skyless.core.keys.fault import Fault
+from skyless.core.tag.receiver import Receiver
 from skyless.core.ticks import from_seconds, wrap
 from skyless.core.trusted_receiver import SiteTrust, Trust, TrustedReceiver
 from skyless.sim.evaluation.scenarios import Request, impairments_of
@@ -45,7 +45,7 @@ def usual_tape(seconds=3.0):
 
 
 def tag(public, trust=Trust.VERIFIED, **fields):
-    return TrustedReceiver(SiteTrust(FREE.id, public, trust=trust, **fields), lambda: AnyReceiver(site=FREE.id))
+    return TrustedReceiver(SiteTrust(FREE.id, public, trust=trust, **fields), lambda: Receiver(site=FREE.id))
 
 
 def fixes_of(receiver, received, error_s=0.0):
@@ -67,7 +67,7 @@ def longest_gap_s(given):
 
 def test_verified_fixes_are_those_of_a_plain_tag():
     received = usual_tape()
-    plain, receiver = AnyReceiver(site=FREE.id), tag(KEYS.public)
+    plain, receiver = Receiver(site=FREE.id), tag(KEYS.public)
     expected = [fix for reception in received if (fix := plain.hear(reception)) is not None]
     given = fixes_of(receiver, received)
     assert len(given) > 600
@@ -81,7 +81,7 @@ def test_verified_fixes_are_those_of_a_plain_tag():
 
 def test_an_open_tag_gives_each_fix_at_once_and_states_how_far_it_is_verified():
     received = usual_tape()
-    plain, receiver = AnyReceiver(site=FREE.id), tag(KEYS.public, Trust.OPEN)
+    plain, receiver = Receiver(site=FREE.id), tag(KEYS.public, Trust.OPEN)
     expected = [fix for reception in received if (fix := plain.hear(reception)) is not None]
     given = fixes_of(receiver, received)
     assert [one.fix.rows for _, one in given] == [fix.rows for fix in expected]
@@ -100,7 +100,7 @@ def test_first_verified_fix(certificates):
     fixes_of(before, received)
     known = before.verifier.keys.certificates if certificates else ()
     after = TrustedReceiver(
-        SiteTrust(FREE.id, KEYS.public, trust=Trust.VERIFIED), lambda: AnyReceiver(site=FREE.id), known
+        SiteTrust(FREE.id, KEYS.public, trust=Trust.VERIFIED), lambda: Receiver(site=FREE.id), known
     )
     first_s = fixes_of(after, received)[0][0] - received[0].host_s
     assert first_s < (1.0 if certificates else 3.0)
@@ -110,7 +110,7 @@ def test_a_new_chain_takes_over_without_a_gap():
     received, machines = on_air(ROTATED, 3.0)
     receiver = tag(ROTATED.public)
     given = fixes_of(receiver, received)
-    plain = AnyReceiver(site=FREE.id)
+    plain = Receiver(site=FREE.id)
     expected = [reception.host_s for reception in received if plain.hear(reception) is not None]
     assert [one.reception.host_s for _, one in given] == expected[: len(given)]
     assert given[-1][1].reception.host_s > 2.35

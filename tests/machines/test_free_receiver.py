@@ -7,7 +7,7 @@ import pytest
 from free_site import FREE, beacon_of, free_tape, with_beacon
 from msgspec.structs import replace
 
-from bench import assert_honest, tape
+from bench import Heard, assert_honest, tape
 from skyless.core.air.almanac import NoisePage, SitePage
 from skyless.core.air.beacon import StatedPosition
 from skyless.core.air.codec import encode
@@ -49,12 +49,8 @@ def false_frames(rate_hz, make, seconds=2.0, first_s=0.0):
             continue  # the two would collide
         ticks = from_seconds(at_s - tag.host_s)
         beacon = make(n, wrap(12345 + from_seconds(at_s)))
-        falses.append(replace_heard(tag, beacon.anchor, encode(beacon), wrap(tag.rx_ticks + ticks), at_s))
+        falses.append(Heard(beacon.anchor, encode(beacon), wrap(tag.rx_ticks + ticks), at_s, tag.truth_m))
     return falses
-
-
-def replace_heard(heard, anchor, frame, rx_ticks, host_s):
-    return type(heard)(anchor, frame, rx_ticks, host_s, heard.truth_m)
 
 
 def merged(*parts):
@@ -112,9 +108,7 @@ def test_a_tag_without_fixes_tries_the_other_protocol():
     assert len(made) > 500
     last = paper[-1]
     later = [
-        replace_heard(
-            one, one.anchor, one.frame, wrap(one.rx_ticks + last.rx_ticks + from_seconds(1.0)), one.host_s + 4.0
-        )
+        replace(one, rx_ticks=wrap(one.rx_ticks + last.rx_ticks + from_seconds(1.0)), host_s=one.host_s + 4.0)
         for one in free_tape()
     ]
     assert len(fixes_of(receiver, later)) > 100
@@ -309,11 +303,7 @@ def test_a_tag_comes_to_anchors_that_none_of_its_own_has_received(pause_s):
     others = replace(FREE, anchors=tuple(replace(anchor, id=anchor.id + 100) for anchor in FREE.anchors))
     first, then = free_tape(), free_tape(others, seed=2, seconds=4.0 + pause_s)
     zero = wrap(first[0].rx_ticks - from_seconds(first[0].host_s) - then[0].rx_ticks + from_seconds(then[0].host_s))
-    moved = [
-        replace_heard(one, one.anchor, one.frame, wrap(one.rx_ticks + zero), one.host_s)
-        for one in then
-        if one.host_s > 2.0 + pause_s
-    ]
+    moved = [replace(one, rx_ticks=wrap(one.rx_ticks + zero)) for one in then if one.host_s > 2.0 + pause_s]
     receiver, latest_s = Receiver(), []
     for one in (*first, *moved):
         fix = receiver.hear(one.reception)
@@ -329,9 +319,9 @@ def test_a_foreign_site_of_more_anchors_delays_the_first_fix_but_does_not_hold_t
     """It gives no fix: its anchors do not receive each other."""
     heard = free_tape(seconds=6.0)
     falses = [
-        replace_heard(one, 0, encode(a_beacon(
+        Heard(0, encode(a_beacon(
             site=77, anchor=200 + n % 9, sequence=n // 9 & 0xFF, tx_ticks=wrap(from_seconds(one.host_s))
-        )), wrap(one.rx_ticks + from_seconds(0.9e-3)), one.host_s + 0.9e-3)
+        )), wrap(one.rx_ticks + from_seconds(0.9e-3)), one.host_s + 0.9e-3, one.truth_m)
         for n, one in enumerate(heard)
     ]  # fmt: skip
     receiver = Receiver()

@@ -26,11 +26,7 @@ P1 = (3.0, 4.0, 0.0)
 def later(heard: Heard, seconds: float) -> Heard:
     """The same bytes, heard later."""
     rx_ticks = wrap(heard.rx_ticks + round(seconds * TICK_RATE_HZ))
-    return replace_heard(heard, rx_ticks=rx_ticks, host_s=heard.host_s + seconds)
-
-
-def replace_heard(heard, **fields):
-    return Heard(**{name: fields.get(name, getattr(heard, name)) for name in Heard.__dataclass_fields__})
+    return replace(heard, rx_ticks=rx_ticks, host_s=heard.host_s + seconds)
 
 
 def tampered(heard, anchor, **changes):
@@ -41,7 +37,7 @@ def tampered(heard, anchor, **changes):
             beacon = decode(one.frame)
             fields = {name: value(beacon) if callable(value) else value for name, value in changes.items()}
             if None not in fields.values():
-                result.append(replace_heard(one, frame=changed(one.frame, **fields)))
+                result.append(replace(one, frame=changed(one.frame, **fields)))
                 continue
         result.append(one)
     return result
@@ -122,7 +118,7 @@ def test_a_mirror_is_told_and_decided_by_the_height(method):
     assert listen(blind, heard) == []
     assert blind.reason in {NoFixReason.MIRROR, NoFixReason.ACQUIRING}
     for bounds, z in (((0.0, 5.0), 1.0), ((5.0, 10.0), 9.0)):
-        image = [replace_heard(one, truth_m=np.array([3.0, 4.0, z])) for one in heard]
+        image = [replace(one, truth_m=np.array([3.0, 4.0, z])) for one in heard]
         fixes = listen(Receiver(method, z_bounds_m=bounds), image)
         assert len(fixes) > 60
         assert abs(np.mean([fix.position_m[2] for fix in fixes[-40:]]) - z) < 0.15
@@ -206,7 +202,7 @@ def test_one_stamp_of_the_tag_from_the_future_costs_one_fix(seconds):
     heard = tape()
     middle = len(heard) // 2
     spoiled = [later(one, seconds) if number == middle else one for number, one in enumerate(heard)]
-    spoiled[middle] = replace_heard(spoiled[middle], host_s=heard[middle].host_s)
+    spoiled[middle] = replace(spoiled[middle], host_s=heard[middle].host_s)
     clean, receiver = listen(Receiver(), heard), Receiver()
     fixes = listen(receiver, spoiled)
     assert drops(receiver) == {"impossible-stamp": 1}
@@ -221,7 +217,7 @@ def test_bit_flips_are_counted_by_the_fcs():
         if generator.random() < 0.3:
             frame[generator.integers(len(frame))] ^= 1 << generator.integers(8)
             flipped += 1
-        fix = receiver.hear(replace_heard(one, frame=bytes(frame)).reception)
+        fix = receiver.hear(replace(one, frame=bytes(frame)).reception)
         if fix is not None:
             assert_honest(fix, one.truth_m)
             fixes += 1
@@ -323,7 +319,7 @@ def test_a_page_may_change_under_the_same_issue():
         if one.host_s > 2.0:
             other = decode(one.frame).page
             frame = changed(one.frame, page=page) if isinstance(other, AnchorPage) and other.anchor == 3 else one.frame
-            receiver.hear(replace_heard(one, frame=frame).reception)
+            receiver.hear(replace(one, frame=frame).reception)
     assert receiver.almanac.anchors_m[3] == (6.25, 4.0, 0.0)
 
 
@@ -339,7 +335,7 @@ def test_only_another_accuracy_than_the_rooms_makes_the_method_anew():
         if one.host_s > 2.0:
             other = decode(one.frame).page
             frame = changed(one.frame, page=page) if isinstance(other, AccuracyPage) else one.frame
-            receiver.hear(replace_heard(one, frame=frame).reception)
+            receiver.hear(replace(one, frame=frame).reception)
     assert receiver.almanac.accuracy == page
     assert receiver.method is not None
     assert receiver.method not in methods
@@ -362,7 +358,7 @@ def test_gaps_with_host_time(method, gap_s):
             time = time and replace(time, tx_subticks_master=wrap(time.tx_subticks_master + (ticks << 8), 48))
             fields = {"tx_ticks": wrap(beacon.tx_ticks + ticks), "master_time": time, "master_heard": heard_ticks}
             fields["superframe"] = beacon.superframe + round(gap_s / SUPERFRAME_S)
-            return replace_heard(later(one, gap_s), frame=changed(one.frame, **fields))
+            return replace(later(one, gap_s), frame=changed(one.frame, **fields))
 
         heard = [one for one in heard if one.host_s < 1.0] + [on(one) for one in heard if one.host_s > 1.0]
     else:
@@ -383,7 +379,7 @@ def test_gaps_without_host_time(method, gap_s):
     heard = [one for one in tape(LAB, 22.5) if not 1.0 < one.host_s < 1.0 + gap_s]
     receiver, fixes = Receiver(method), []
     for one in heard:
-        fix = receiver.hear(replace_heard(one, host_s=None).reception)
+        fix = receiver.hear(replace(one, host_s=None).reception)
         if fix is not None:
             assert_honest(fix, one.truth_m)
             fixes.append((one.host_s, fix.time_s))
@@ -399,7 +395,7 @@ def test_the_hosts_clock_is_set(method, host_s):
     receiver, times, late = Receiver(method), [], 0
     for one in heard:
         step_s = host_s if one.host_s > 1.5 else 0.0
-        fix = receiver.hear(replace_heard(one, host_s=one.host_s + step_s).reception)
+        fix = receiver.hear(replace(one, host_s=one.host_s + step_s).reception)
         if fix is not None:
             assert_honest(fix, one.truth_m)
             times.append(fix.time_s)
@@ -414,7 +410,7 @@ def test_the_tags_own_counter_starts_anew(method):
     times = []
     for one in tape(LAB, 3.0):
         jump = 2**39 - 10**9 if one.host_s < 1.5 else 0
-        fix = receiver.hear(replace_heard(one, rx_ticks=wrap(one.rx_ticks + jump), host_s=None).reception)
+        fix = receiver.hear(replace(one, rx_ticks=wrap(one.rx_ticks + jump), host_s=None).reception)
         if fix is not None:
             assert_honest(fix, one.truth_m)
             times.append(fix.time_s)
@@ -428,7 +424,7 @@ def test_the_tags_own_counter_starts_anew(method):
 
 
 def foreign(one, site=9):
-    return replace_heard(one, frame=changed(one.frame, site=site))
+    return replace(one, frame=changed(one.frame, site=site))
 
 
 @pytest.mark.parametrize("method", EVERY_METHOD)
@@ -444,7 +440,7 @@ def test_two_sites_on_one_channel(method):
     for one in both:
         seconds = one.host_s - first.host_s
         rx_ticks = one.rx_ticks if decode(one.frame).site == 1 else wrap(first.rx_ticks + round(seconds * TICK_RATE_HZ))
-        mixed.hear(replace_heard(one, rx_ticks=rx_ticks).reception)
+        mixed.hear(replace(one, rx_ticks=rx_ticks).reception)
     assert mixed.counters["fixes"] == len(fixes)
     assert drops(mixed) == {"foreign-site": len(far)}
 
@@ -534,7 +530,7 @@ def test_forged_anchors_take_no_memory():
                 page = AnchorPage(forged, 1.0, 2.0, 3.0, 0)
                 frame = changed(one.frame, anchor=forged, master_heard=None, heard=(), page=page)
                 rx_ticks = wrap(one.rx_ticks + 10**6 * (k + 1))
-                receiver.hear(replace_heard(one, frame=frame, rx_ticks=rx_ticks).reception)
+                receiver.hear(replace(one, frame=frame, rx_ticks=rx_ticks).reception)
     assert len(receiver.almanac.anchors_m) <= 255
     assert len(receiver._stamps.tracks.of_anchor) <= 256
     assert receiver.counters["unknown-anchor"] > 20_000

@@ -14,7 +14,7 @@ from skyless.core.protocol1.anchor import Anchor
 from skyless.core.protocol1.codec import decode
 from skyless.core.protocol1.election import Role
 from skyless.core.protocol1.master_term import is_newer
-from skyless.core.protocol1.site_clock import continued
+from skyless.core.protocol1.site_clock import SiteTime
 from skyless.core.protocol1.watch import MAX_CHANCE, MasterWatch
 from skyless.core.ticks import Unwrapper
 from skyless.sim.evaluation.scenarios import Request, impairments_of
@@ -447,7 +447,7 @@ def test_a_takeover_past_term_255():
 def test_site_time_is_carried_on_for_a_year_without_loss():
     """In integers: a thousandth of a tick after a year, where float64 alone would lose a hundred ticks."""
     rate, year = 12.3456789e-6, round(3.15e7 / TICK_S)
-    led = continued(10**15 + 7, 3 * 10**14 + 1, 0.25, rate)
+    led = SiteTime.onwards(10**15 + 7, 3 * 10**14 + 1, 0.25, rate)
     exact = (3 * 10**14 + 1 + Fraction(1, 4) + Fraction(year) / (1 + Fraction(rate))) * 256
     told = led.subticks(10**15 + 7 + year)
     assert abs(told - exact) < 256 * year * 2e-16

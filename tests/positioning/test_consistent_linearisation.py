@@ -6,11 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless import Request, fleet_of, lab_site
+from skyless import Request, fleet_of
 from skyless.core.estimator.estimator import Estimator
 from skyless.core.estimator.measurements import difference_terms, reception_terms
 from skyless.core.estimator.state import EstimatorSettings, layout
 from skyless.sim.evaluation.scenarios import Room, displacements
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.range_errors import RangeErrorModel
 
 ANCHORS_M = {
@@ -62,7 +63,7 @@ def rmse_m(judged, from_s, to_s):
 
 @pytest.mark.parametrize("room", [None, Room()], ids=("right air", "room"))
 def test_a_tag_at_rest_stays_where_it_is(room):
-    site = lab_site()
+    site = paper_lab_site()
     site = replace(site, schedule=replace(site.schedule, slot_s=10e-3))
     request = Request(site=site, seed=3, room=room, positions_m=((1.0, 1.0), (5.0, 6.5), (3.0, 4.0)))
     judged = list(fleet_of(request).run(100.0))
@@ -79,19 +80,19 @@ def estimator_after(request, duration_s):
 def test_multipath_is_learnt_from_the_way():
     """A field of 8 cm that changes within 10 cm; the site file states 5 mm within 1 m."""
     field = Room(ranges=RangeErrorModel(constant_m=0.05, slope_m=0.05, changing_m=0.08, correlation_m=0.1))
-    std_m, distance_m = estimator_after(Request(site=lab_site(), seed=5, room=field), 40.0).multipath_m
+    std_m, distance_m = estimator_after(Request(site=paper_lab_site(), seed=5, room=field), 40.0).multipath_m
     assert std_m == pytest.approx(0.08, rel=0.3)
     assert 0.04 < distance_m < 0.25
 
 
 def test_no_multipath_is_learnt_in_a_room_without_any():
-    assert estimator_after(Request(site=lab_site(), seed=5, room=Room()), 20.0).multipath_m is None
+    assert estimator_after(Request(site=paper_lab_site(), seed=5, room=Room()), 20.0).multipath_m is None
 
 
 def test_a_misplaced_anchor_is_found_by_its_ranges_to_the_others():
     left_m, room = [], Room(off_anchors=1, off_m=0.3)
     for seed in range(1, 5):
-        request = Request(site=lab_site(), seed=seed, room=room)
+        request = Request(site=paper_lab_site(), seed=seed, room=room)
         estimator = estimator_after(request, 6.0)
         true_m = {one.anchor: (one.x_m, one.y_m) for one in displacements(room, request.site, request.seed)}
         s = estimator.state

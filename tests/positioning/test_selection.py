@@ -48,7 +48,7 @@ def test_powers_are_averaged_and_impossible_ones_passed_over():
     selection.add_power(1, -80.0)
     selection.add_power(1, float("nan"))
     selection.add_power(1, -70.0)
-    assert selection.state().power_dbm[1] == pytest.approx(-79.0)
+    assert selection.power_dbm[1] == pytest.approx(-79.0)
 
 
 @pytest.mark.parametrize(
@@ -68,9 +68,8 @@ def test_memory_is_bounded():
     for anchor in range(2000):
         selection.add_relays(relays(anchor), anchor)
         selection.add_power(anchor, -80.0)
-    state = selection.state()
-    assert len(state.relayed_ticks) == len(state.power_dbm) == MAX_KEPT
-    assert min(state.relayed_ticks) == 2000 - MAX_KEPT
+    assert len(selection.relayed_ticks) == len(selection.power_dbm) == MAX_KEPT
+    assert min(selection.relayed_ticks) == 2000 - MAX_KEPT
 
 
 def test_full_with_24():

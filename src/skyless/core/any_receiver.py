@@ -17,9 +17,9 @@ from skyless.core.protocol1 import receiver as protocol1
 from skyless.core.protocol1.snapshots import Snapshots
 from skyless.core.protocols import SiteBeacon, decode_any
 from skyless.core.tag.beacon_receiver import HeardSite
+from skyless.core.tag.factory import ReceiverState
 from skyless.core.tag.joint import Estimation
 from skyless.core.tag.receiver import Receiver
-from skyless.core.tag.receiver_state import ReceiverState
 
 
 class AnyReceiverState(Struct, frozen=True, tag="any"):

@@ -23,13 +23,13 @@ class Dops(Struct, frozen=True, gc=False):
     """Standard deviations for pseudoranges of unit noise; infinite where the geometry is singular."""
 
     gdop: float
-    """Of position and clock together."""
+    """Dilution of position and clock together."""
     pdop: float
     hdop: float
     vdop: float
     """0 for a known height."""
     tdop: float
-    """Of the receiver's clock, in metres."""
+    """Dilution of the receiver's clock, in metres."""
 
 
 def dilution_of_precision(anchors_m: ArrayLike, position_m: ArrayLike, *, height_known: bool) -> Dops:

@@ -86,7 +86,7 @@ class Fix(Struct, frozen=True, gc=False):
 
     @property
     def covariance_m2(self) -> Array:
-        """Of the position, shape (3, 3); a coordinate that was given (2-D, known height) has zeros."""
+        """Covariance of the position, shape (3, 3). A given coordinate (2-D, known height) has zeros."""
         return _matrix(self.rows, POSITION + 1)
 
     @property

@@ -13,15 +13,15 @@ from skyless.core.kernels.arrays import Array
 RISK: Final = 1e-4
 
 MARGIN: Final = 1.05
-"""On all standard deviations, for errors that are not quite Gaussian and figures that are not quite the filter's."""
+"""Factor on all standard deviations, as errors are not quite Gaussian and figures not quite the filter's."""
 
 
 HPL, VPL, STATE = range(3)
-"""What a fix carries of its levels; the state is one of ..."""
+"""Rows of what a fix carries of its levels."""
 
 SOUND, OBSTRUCTED, CONTRADICTED, UNAVAILABLE = range(4)
-"""... a position without known faults, with anchors whose range error has jumped or was wrong from the start, with a
-fault that the levels may not cover, and one without levels."""
+"""States: a position without known faults, with anchors whose range error has jumped or was wrong from the start, with
+a fault that the levels may not cover, and without levels."""
 
 _ALERTS: Final = (Alert.NONE, Alert.EXCLUDED, Alert.NOT_EXCLUDED, Alert.UNAVAILABLE)
 
@@ -32,7 +32,7 @@ class Integrity(Struct, frozen=True, gc=False):
     hpl_m: float | None
     """The horizontal error is larger with a probability of at most ``risk``; None if there is no level."""
     vpl_m: float | None
-    """As well for the vertical error; None also where the height is given."""
+    """The same for the vertical error. None also if the height is given."""
     risk: float
     """For each fix and each of the two levels."""
     alert: Alert

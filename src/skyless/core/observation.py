@@ -1,12 +1,10 @@
 """One beacon as the positioning methods see it: every stamp unwrapped on its own clock."""
 
 from collections.abc import Iterator
-from typing import Protocol
 
 from msgspec import Struct
 
 from skyless.core.air.frame import HEARD
-from skyless.core.fix import Fix, NoFixReason
 from skyless.core.kernels.arrays import Array
 from skyless.core.ticks import nearest
 
@@ -25,15 +23,16 @@ class Observation(Struct, frozen=True, gc=False):
     anchor_m: Array
     """Shape (3,)."""
     round: int
-    """Counts the frames that each node sends: the superframe, or a fraction of it with several frames per node; for
-    snapshots only, as are ..."""
+    """Counts the frames that each node sends: the superframe, or a fraction of it with several frames per node.
+
+    For snapshots only, like the stamps of the master's beacon."""
     sequence: int
     rx_ticks_tag: int
     tx_ticks_anchor: int
     master_sequence: int | None
-    """... the sequence number of the last master beacon that the anchor received, ..."""
+    """Sequence number of the last master beacon that the anchor received."""
     master_rx_ticks_anchor: int | None
-    """... and the anchor's RX stamp of it."""
+    """The anchor's RX stamp of that beacon."""
     tx_ticks_master: int | None
     """TX time on the master's scale, whole ticks; None while the anchor does not know it."""
     tx_fraction_ticks: float
@@ -46,23 +45,12 @@ class Observation(Struct, frozen=True, gc=False):
     rx_variance_factor: float = 1.0
     """On the variance of this reception, at least 1: from the radio's diagnostics (``variance_factor``)."""
     packed_relays: bytes = b""
-    """Relays besides ``relays``, as frames carry them (``codec.packed_relays``)."""
+    """More relays, as frames carry them (``codec.packed_relays``)."""
     anchor_std_m: float | None = None
-    """Standard deviation of each coordinate of the anchor; None for that of the site; for ``joint`` only."""
+    """Standard deviation of each coordinate of the anchor; None to use the site's; for ``joint`` only."""
 
     def all_relays(self) -> Iterator[tuple[int, int, int]]:
         """``relays`` and ``packed_relays``."""
         yield from self.relays
         for anchor, sequence, low, high in HEARD.iter_unpack(self.packed_relays):
             yield anchor, sequence, nearest(low | high << 32, self.tx_ticks_anchor)
-
-
-class Method(Protocol):
-    """A positioning method: observations in, fixes out."""
-
-    needs_relays: bool
-    """Whether observations carry relays and the master's term, instead of rounds and stamps of the master's frames."""
-
-    def update(self, observation: Observation) -> Fix | NoFixReason:
-        """Process one observation; a fix, or why there is none yet."""
-        ...

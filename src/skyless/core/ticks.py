@@ -8,7 +8,7 @@ from typing import Annotated, Final
 
 from msgspec import Meta, Struct
 
-from skyless.core.constants import TICK_BITS, TICK_RATE_HZ, TICK_S
+from skyless.core.constants import MAX_DRIFT, TICK_BITS, TICK_RATE_HZ, TICK_S
 
 WRAP_TICKS: Final = 1 << TICK_BITS
 HALF_WRAP_TICKS: Final = WRAP_TICKS // 2
@@ -48,6 +48,24 @@ def from_seconds(seconds: float) -> int:
     return round(seconds * TICK_RATE_HZ)
 
 
+FLIGHT_SLACK_TICKS: Final = round(1e-6 * TICK_RATE_HZ)
+"""Flight times differ between anchors by less than this (300 m)."""
+
+NOISE_TICKS: Final = 64
+"""0.3 m allow for the noise of two stamps of one anchor."""
+
+
+def may_elapse(counter_ticks: int, elapsed_ticks: int, slack_ticks: float) -> bool:
+    """Whether one crystal's counter may go by ``counter_ticks`` while another's goes by ``elapsed_ticks``."""
+    return abs(counter_ticks - elapsed_ticks) <= MAX_DRIFT * elapsed_ticks + slack_ticks
+
+
+def continued(counter: int, last_ticks: int, elapsed_ticks: int, bits: int = TICK_BITS) -> int | None:
+    """Unwrapped stamp of a counter ``elapsed_ticks`` after its last one; None if no crystal went from that to this."""
+    ticks = nearest(counter, last_ticks + elapsed_ticks, bits)
+    return ticks if may_elapse(ticks - last_ticks, elapsed_ticks, NOISE_TICKS) else None
+
+
 class Unwrapper(Struct):
     """Turns one counter's wrapped stamps into int64 ticks that never wrap.
 
@@ -81,3 +99,22 @@ class Unwrapper(Struct):
     def expect(self, counter: int) -> int:
         """Unwrapped ticks of a counter value near the last stamp; it does not count as a stamp."""
         return counter if self.last_ticks is None else nearest(counter, self.last_ticks, self.bits)
+
+
+class FixTime(Struct):
+    """Counts from the first fix of a receiver and never goes back, even if the master or the method changes."""
+
+    first_ticks_master: int | None = None
+    last_ticks_master: int = 0
+    last_rx_ticks_tag: int = 0
+
+    def time_s(self, ticks_master: int, rx_ticks_tag: int) -> float:
+        """Time in seconds of a fix that holds at this master time, given the tag's reading for it, both unwrapped."""
+        if self.first_ticks_master is None:
+            self.first_ticks_master = ticks_master
+        else:
+            elapsed, gone = rx_ticks_tag - self.last_rx_ticks_tag, ticks_master - self.last_ticks_master
+            if elapsed <= 0 or not may_elapse(gone, elapsed, FLIGHT_SLACK_TICKS):
+                self.first_ticks_master += gone - max(elapsed, 1)
+        self.last_ticks_master, self.last_rx_ticks_tag = ticks_master, rx_ticks_tag
+        return (ticks_master - self.first_ticks_master) * TICK_S

@@ -1,9 +1,9 @@
 """``TrustedReceiver``: a tag that verifies beacons with its site's public key. Like ``Receiver`` it does no I/O.
 
-It runs the same ``Receiver`` on frames that have been verified, which is 0.4 to 0.6 s behind. Where that is all that
-is wanted (trust ``verified``), its fixes are given. Else (``open``) a second one processes each plausible frame at
-once, and its fixes are given. When a frame that it used turns out to be forged, it continues from the state of the
-first one, at once if these are few, else when they have become few; until then fixes are those of verified frames.
+It runs a ``Receiver`` on verified frames, which is 0.4 to 0.6 s behind. With trust ``verified``, the fixes are those of
+this receiver. With trust ``open``, a second, live receiver processes each plausible frame at once and gives the fixes.
+When a frame that it used turns out to be forged, it continues from the state of the first receiver: at once if forged
+frames are few, else once they have become few. Until then the fixes are those of verified frames.
 """
 
 import copy
@@ -24,9 +24,8 @@ from skyless.core.keys.fault import Fault
 from skyless.core.keys.key_chain import public_key
 from skyless.core.keys.verifier import LONGEST_WAIT_TICKS, ReceivedFrame, Verifier
 from skyless.core.protocols import decode_any
-from skyless.core.tag.observations import FixTime
 from skyless.core.tag.receiver import Receiver
-from skyless.core.ticks import from_seconds
+from skyless.core.ticks import FixTime, from_seconds
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -97,7 +96,7 @@ class TrustedReceiver:
         )
         self._verified = new_receiver()
         self._live = new_receiver() if trust.trust is Trust.OPEN else None
-        """None after forged frames as well."""
+        """None with trust ``verified``, and after forged frames."""
         self._forged_ticks: deque[int] = deque(maxlen=MAX_IN_SHARE)
         """When plausible frames of the last seconds were received that turned out to be forged."""
         self._genuine_ticks: deque[int] = deque(maxlen=MAX_IN_SHARE)
@@ -119,7 +118,7 @@ class TrustedReceiver:
 
     @property
     def is_verified(self) -> bool:
-        """Whether beacons have been verified that were among those of the last seconds."""
+        """Whether any beacon of the last seconds has been verified."""
         until_ticks = self._verified_ticks
         return until_ticks is not None and self.verifier.newest_ticks - until_ticks < LONGEST_WAIT_TICKS
 

@@ -6,8 +6,7 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.core.air.frame import AnyBeacon
-from skyless.core.constants import MAX_DRIFT
-from skyless.core.ticks import HALF_WRAP_TICKS, TICK_MASK, difference, from_seconds, wrap
+from skyless.core.ticks import continued, from_seconds, wrap
 
 STAMPS_BEFORE_RESTART: Final = 3
 """This number of impossible stamps of one anchor in a row mean that its counter has restarted, ..."""
@@ -19,9 +18,6 @@ RESTART_SILENCE_PERIODS: Final = 4
 MAX_TRACKS: Final = 256
 """More anchors than there are in reach; with more identifiers on the air, that received longest ago is forgotten, those
 of a single stamp first."""
-
-NOISE_TICKS: Final = 64
-"""0.3 m allow for the noise of two stamps."""
 
 
 class _Track(Struct):
@@ -73,15 +69,13 @@ class AnchorStamps:
             tracks.newest_rx_ticks = rx_ticks
             return self._begin(beacon, rx_ticks)
         elapsed = rx_ticks - track.rx_ticks_tag
-        least = track.tx_ticks + elapsed - HALF_WRAP_TICKS
-        off = ((beacon.tx_ticks - least) & TICK_MASK) - HALF_WRAP_TICKS
-        if abs(off) > MAX_DRIFT * elapsed + NOISE_TICKS:
+        tx_ticks = continued(beacon.tx_ticks, track.tx_ticks, elapsed)
+        if tx_ticks is None:
             silence_ticks = max(RESTART_SILENCE_TICKS, RESTART_SILENCE_PERIODS * period_ticks)
             self._reject(beacon, track, rx_ticks, is_silent=elapsed > silence_ticks)
             return None
         track.rx_ticks_tag = tracks.newest_rx_ticks = rx_ticks
-        track.tx_ticks = tx_ticks = least + HALF_WRAP_TICKS + off
-        track.sequence, track.impossible, track.is_single = beacon.sequence, 0, False
+        track.tx_ticks, track.sequence, track.impossible, track.is_single = tx_ticks, beacon.sequence, 0, False
         return tx_ticks
 
     def _begin(self, beacon: AnyBeacon, rx_ticks: int) -> int:
@@ -101,19 +95,14 @@ class AnchorStamps:
             return
         self._counters["impossible-stamp"] += 1
         track.impossible += 1
-        if track.is_single and track.rival is not None and _fits(*track.rival, rx_ticks, beacon.tx_ticks):
+        fits = track.rival and continued(beacon.tx_ticks, track.rival[1], rx_ticks - track.rival[0]) is not None
+        if track.is_single and fits:
             self.tracks.of_anchor[beacon.anchor] = _Track(rx_ticks, beacon.tx_ticks, beacon.sequence, is_single=False)
             return
         track.rival = (rx_ticks, beacon.tx_ticks)
         if track.impossible >= STAMPS_BEFORE_RESTART and is_silent:
             del self.tracks.of_anchor[beacon.anchor]
             self._counters["anchor-restart"] += 1
-
-
-def _fits(before_rx_ticks: int, before_tx_ticks: int, rx_ticks: int, tx_ticks: int) -> bool:
-    """Whether a counter may have gone from one stamp (40 bits) to the next by the time on the tag's."""
-    elapsed = rx_ticks - before_rx_ticks
-    return abs(difference(tx_ticks, wrap(before_tx_ticks + elapsed))) <= MAX_DRIFT * elapsed + NOISE_TICKS
 
 
 def _is_repeated(beacon: AnyBeacon, track: _Track) -> bool:

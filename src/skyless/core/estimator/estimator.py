@@ -69,8 +69,9 @@ LOST_IN_ROW: Final = 8
 LOST_SHARE: Final = 0.5
 MAX_RELAYS_REJECTED: Final = 4.0  # recent relays beyond the gate; fewer may be late ones
 FITTING_CHI2: Final = 2.0  # largest χ² for each anchor of range errors that are as the settings state them
-STAYING_SHARE: Final = 0.2  # of an anchor's lateness at the start: its mean part that stays, ...
-STAYING_STD: Final = 0.5  # ... and the standard deviation of that
+# Part of an anchor's lateness at the start that stays: mean and standard deviation.
+STAYING_SHARE: Final = 0.2
+STAYING_STD: Final = 0.5
 FADING: Final = 0.95  # factor on the counts of recent relays with each packet
 MAX_PACKED: Final = 16  # relays in a frame; 13 fit
 
@@ -99,7 +100,7 @@ class Packets(Struct, frozen=True):
     tx_ticks: Integers
     """The anchors' own."""
     relays: Integers
-    """[the anchor that received, the one that was received, sequence, RX stamp of the former], shape (relays, 4)."""
+    """[listener, sender, sequence number, RX stamp of the listener], shape (relays, 4)."""
     ends: Integers
     """Where the relays of each packet end."""
 
@@ -690,7 +691,7 @@ class Estimator:
 
     @property
     def obstruction(self) -> float:
-        """1 where range errors have jumped lately, 0 where they do not."""
+        """1 where range errors have jumped recently, 0 where they do not."""
         return float(self._state.status[0]["obstruction"])
 
     @property

@@ -1,6 +1,6 @@
 """Faults that the state does not hold: what they do to it, what innovations show of them, and adding them to it.
 
-Where all that the tag receives of anchor j is late by b metres, the estimate errs by V_j·b besides, and the
+Where all that the tag receives of anchor j is late by b metres, the estimate errs by V_j·b, and the
 innovation of a measurement h holds s_j·b (Friedland 1969):
 
     s = [own reception of j] − h·V        V ← F·V  (time)        V ← V + K·s  (update)
@@ -63,7 +63,7 @@ def compute_fault_input(s: EstimatorState, terms: int, own: int) -> None:
 
 @step
 def subtract_fault_input(s: EstimatorState, anchor: int) -> None:
-    """Of an anchor with whose reception a difference begins: its faults count with the opposite sign."""
+    """Subtract the reception of the first anchor of a difference: its faults count with the opposite sign."""
     for kind in range(FAULT_KINDS):
         s.fault_input[kind * len(s.anchors) + anchor] -= 1.0
 
@@ -138,7 +138,7 @@ def fault_chi2(s: EstimatorState, kind: int, axes: int) -> float:
 
 @step
 def explained_chi2(s: EstimatorState, one: int, other: int) -> float:
-    """How much of the test of all lasting faults those of two anchors explain, or of one where both are the same."""
+    """How much of the test of all lasting faults one anchor or two explain; for one, both arguments are the same."""
     y, M, weight = s.evidence, s.information, 1.0 / OPENED_STD_M**2
     a, b, both = M[one, one] + weight, M[other, other] + weight, M[one, other]
     if one == other:

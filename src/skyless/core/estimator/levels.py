@@ -1,4 +1,4 @@
-"""Protection levels: how wrong a position may be, whatever is late (``docs/maths.md`` section 8).
+"""Protection levels: how wrong a position may be, even if receptions are late (``docs/maths.md`` section 8).
 
 Hypothesis: the tag's receptions of every anchor are late (or early) by a constant of its own, all at once. With the
 faults b̂ and their sensitivities V (``faults``) the estimate under the hypothesis and its covariance are
@@ -6,7 +6,7 @@ faults b̂ and their sensitivities V (``faults``) the estimate under the hypothe
     x + V·b̂        P + V·(M + I/σ_f²)⁻¹·Vᵀ
 
 so the error exceeds |V·b̂| + k·σ with the stated risk only, whichever anchors are at fault. Three kinds are considered:
-constants since an anchor joined, what has begun lately, and what grows for seconds. What is larger than σ_f shows, as
+constants since an anchor joined, what has begun recently, and what grows for seconds. What is larger than σ_f shows, as
 a jump or in yᵀ·(M + I/σ_f²)⁻¹·y, which is χ² without faults; then there is no number.
 """
 
@@ -67,7 +67,7 @@ def protect(s: EstimatorState, levels: Vector) -> None:
 
 # Least distance from the plane at which the two sides are compared; for a tag that is farther off it is its own.
 PROBE_M: Final = 1.0
-# Of that distance: standard deviation of how far the best position on the other side may lie from the mirror image.
+# Standard deviation of how far the best position on the other side lies from the mirror image, over that distance.
 SHIFT_PART: Final = 0.25
 # The sides differ where their ranges' squared differences, over the variance of range errors, sum to more.
 SIDES_CHI2: Final = 25.0

@@ -80,7 +80,7 @@ PAIR_SUSPECT: Final = 3.0
 MISPLACED_PAIRS: Final = 2
 MISPLACED_STD_M: Final = 0.3
 REPORT_GAIN: Final = 1.25  # a report is used where the filter's own variance is larger by this factor
-# Of that of a pair of stamps: no anchor knows its clock better, whatever it reports.
+# Least variance of a report over that of a pair of stamps: no anchor knows its clock better.
 MIN_REPORT_VARIANCE: Final = 0.1
 # An anchor with this number of rejected packets in a row joins again: its first was late, so its rate is wrong.
 REJOIN_AFTER: Final = 20
@@ -287,7 +287,7 @@ def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_vari
 def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int) -> None:
     """Initialise an anchor's clock: the limit of an update of an offset of which nothing was known.
 
-    Whatever is wrong with the position and with the range is then in the offset.
+    All errors of the position and of the range are then in the offset.
     """
     settings, a, P = s.settings[0], s.anchors[anchor], s.P
     dim, n = settings["dim"], uncertain_states(s)
@@ -333,7 +333,7 @@ def relay_terms(s: EstimatorState, listener: int, sender: int, age_s: float, has
 
 @step
 def relay_variance(s: EstimatorState, listener: int, sender: int, age_s: float) -> float:
-    """Of such a reception: its RX stamp's, and what two oscillators have done since."""
+    """Variance of such a reception: of its RX stamp, and of what two oscillators have done since."""
     settings, i, j = s.settings[0], s.anchors[listener], s.anchors[sender]
     walk = settings["walk"] * max(i["walk_scale"], j["walk_scale"])
     return float(settings["rx_variance_m2"] + 2.0 * age_s * (settings["white"] + walk * age_s * age_s / 3.0))

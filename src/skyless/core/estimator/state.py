@@ -29,7 +29,7 @@ from skyless.core.kernels.arrays import Indices, Integers, Matrix, Records, Vect
 from skyless.core.kernels.compiled import jitted, step
 
 MAX_CLOCK_RATE: Final = 50e-6  # two crystals of ±20 ppm, and margin
-# Of the constant error of the range between two anchors, besides what their survey makes of it.
+# Standard deviation of the constant error of the range between two anchors, without that of their survey.
 PAIR_STD_M: Final = 0.02
 
 
@@ -44,34 +44,36 @@ class EstimatorSettings(Struct, frozen=True):
     """Random walk of each oscillator's rate, m²/s³."""
     tx_variance_m2: float = 9e-4
     rx_variance_m2: float = 9e-4
-    """Of one stamp each."""
+    """Variances of one stamp each."""
     gate: float = 4.0
     """Innovations beyond this number of standard deviations are not used."""
     height_m: float | None = None
     """Height of the tag where it is given; None to estimate it."""
     height_std_m: float = 0.0
-    """Of the given one."""
+    """Standard deviation of the given height."""
     lowest_m: float = -np.inf
     highest_m: float = np.inf
-    """Between which the tag's height is known to be."""
+    """Bounds of the tag's height."""
     drop_s: float = 2.0
     """Anchors that are silent for longer leave the state."""
     relay_age_s: float = 1.0
     """Older packets are not relayed, as sequence numbers come around."""
     survey_std_m: float = 0.02
-    """Of each coordinate of an anchor."""
+    """Standard deviation of each coordinate of an anchor."""
     range_std_m: float = 0.03
-    """Of the constant error of a tag's ranges to one anchor."""
+    """Standard deviation of the constant error of a tag's ranges to one anchor."""
     pair_std_m: float = PAIR_STD_M
-    """Of the constant error of the range between two anchors; not used where survey and ranges are exact."""
+    """Standard deviation of the constant error of the range between two anchors.
+
+    It is not used where survey and ranges are exact."""
     slope_std_m: float = 0.05
     """By how much ranges lengthen for each unit of clip((range − 4 m)/4 m, −1, 1)."""
     place_std_m: float = 0.005
-    """Of the part of a range's error that changes as the tag moves (the site file's name)."""
+    """Standard deviation of the part of a range's error that changes as the tag moves (the site file's name)."""
     place_distance_m: float = 1.0
-    """Distance over which that part changes, ..."""
+    """Distance over which that part changes."""
     place_time_s: float = 100.0
-    """... and time over which it changes while the tag is stationary."""
+    """Time over which that part changes while the tag is stationary."""
     change_memory_s: float = 0.0
     """Time within which the size of each anchor's changing part is estimated again; 0 where it is ``place_std_m``."""
     least_change_std_m: float = 0.05
@@ -79,7 +81,7 @@ class EstimatorSettings(Struct, frozen=True):
     earliest_m: float = -np.inf
     """No changing part is below this: obstacles only lengthen ranges."""
     difference_std_m: float = 0.12
-    """Of what is new in each ready-made time difference."""
+    """Standard deviation of each ready-made time difference."""
     stationary_s: float = 0.0
     """A tag that has not shown any motion for this time counts as stationary; 0: never."""
     max_acceleration_mps2: float = 0.0
@@ -143,12 +145,12 @@ ANCHOR_DTYPE: Final = np.dtype(
     [
         ("table_index", np.int64),
         ("position_m", np.float64, (3,)),
-        ("tx_ticks", np.int64),  # newest packet: its own clock, ...
-        ("rx_ticks", np.int64),  # ... and the tag's
+        ("tx_ticks", np.int64),  # newest packet, by its own clock
+        ("rx_ticks", np.int64),  # newest packet, by the tag's clock
         ("offset_ticks", np.int64),  # whole ticks of the offset
         ("range_m", np.float64),  # at its newest packet
-        ("held_m", np.float64, (3,)),  # the tag's position at which ranges to it are linearised, ...
-        ("held_range_m", np.float64),  # ... and its distance from there
+        ("held_m", np.float64, (3,)),  # the tag's position at which ranges to it are linearised
+        ("held_range_m", np.float64),  # distance of that point
         ("walked_m", np.float64),  # the tag's walked distance at its newest packet
         ("is_relayed", np.int64),  # whether others relay its packets
         ("has_tx_noise", np.int64),  # whether its newest packet's TX noise is a state
@@ -171,7 +173,7 @@ ANCHOR_DTYPE: Final = np.dtype(
     ],
     align=True,
 )
-"""What is kept of an anchor besides its states."""
+"""What is kept of an anchor in addition to its states."""
 
 PACKET_DTYPE: Final = np.dtype([("sequence", np.int64), ("tx_ticks", np.int64), ("rx_ticks", np.int64)], align=True)
 """A packet that others may relay."""
@@ -179,8 +181,8 @@ PACKET_DTYPE: Final = np.dtype([("sequence", np.int64), ("tx_ticks", np.int64), 
 LINK_DTYPE: Final = np.dtype(
     [
         ("tx_ticks", np.int64),  # newest packet of the sender whose reception by the listener was processed
-        ("constant_m", np.float64),  # of the pair, in the row of the lower index; its estimate ...
-        ("variance_m2", np.float64),  # ... and variance
+        ("constant_m", np.float64),  # estimated constant of the pair, in the row of the lower index
+        ("variance_m2", np.float64),  # variance of that
         ("outliers_in_row", np.int64),
         ("relays", np.int64),  # used in this direction
         ("contradicts", np.int64),  # whether its range contradicts the survey
@@ -195,9 +197,9 @@ FAULT_KINDS: Final = 3
 
 STATUS_DTYPE: Final = np.dtype(
     [
-        ("epoch_ticks", np.int64),  # the tag's reading at the newest packet, ...
-        ("start_ticks", np.int64),  # ... and at the start
-        ("faded_ticks", np.int64),  # ... and when faults that are not lasting have faded last
+        ("epoch_ticks", np.int64),  # the tag's reading at the newest packet
+        ("start_ticks", np.int64),  # the tag's reading at the start
+        ("faded_ticks", np.int64),  # the tag's reading when faults that are not lasting last faded
         ("outcome", np.int64),  # what became of it
         ("packets", np.int64),
         ("accepted", np.int64),
@@ -218,7 +220,7 @@ STATUS_DTYPE: Final = np.dtype(
         ("mean_square_m2", np.float64),  # of innovations
         ("rejected_share", np.float64),
         ("late_share", np.float64),
-        ("relays_lately_accepted", np.float64),  # lately, older ones counting less
+        ("relays_lately_accepted", np.float64),  # running counts that fade
         ("relays_lately_rejected", np.float64),
         ("lag", np.float64, (3,)),  # running mean of innovations along each axis
         ("lag_square", np.float64),
@@ -227,17 +229,17 @@ STATUS_DTYPE: Final = np.dtype(
         ("walk_scale", np.float64),  # factor on its random walk
         ("place_samples", np.int64),  # comparisons of range errors at places a step apart
         ("place_square_m2", np.float64, (2,)),  # half their mean square after one and two steps
-        ("place_variance_m2", np.float64),  # of what multipath changes in them, 0 where not more than stated, ...
-        ("place_distance_m", np.float64),  # ... and the distance over which it changes
-        ("obstruction", np.float64),  # 1 where range errors have jumped lately, 0 where they do not
+        ("place_variance_m2", np.float64),  # of what multipath changes in them, 0 where not more than stated
+        ("place_distance_m", np.float64),  # distance over which multipath changes
+        ("obstruction", np.float64),  # 1 where range errors have jumped recently, 0 where they do not
         ("walked_m", np.float64),
-        ("stationary_s", np.float64),  # since the tag last showed motion ...
-        ("stationary_m", np.float64, (3,)),  # ... and where it was then, ...
-        ("stationary_m2", np.float64, (3,)),  # ... with that variance on each axis
+        ("stationary_s", np.float64),  # since the tag last showed motion
+        ("stationary_m", np.float64, (3,)),  # where it was then
+        ("stationary_m2", np.float64, (3,)),  # variance of that on each axis
         ("withholds_levels", np.int64),  # whether the anchors' positions are known to be wrong
         ("height_ticks", np.int64),  # the tag's reading when a sensor's height was used last
-        ("plane_m", np.float64, (3,)),  # a point of the plane that lies closest to the anchors, ...
-        ("plane_normal", np.float64, (3,)),  # ... and its normal
+        ("plane_m", np.float64, (3,)),  # a point of the plane that lies closest to the anchors
+        ("plane_normal", np.float64, (3,)),  # normal of that plane
         ("open_range_errors", np.int64),  # whether anchors join with range errors beyond those of the settings
         ("range_errors", np.int64),  # NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS or ALL_RANGE_ERRORS
         ("fault_std_m", np.float64, (FAULT_KINDS,)),  # of each kind of faults, beforehand
@@ -258,7 +260,7 @@ class EstimatorState(NamedTuple):
     """What faults do to x, shape (FAULT_KINDS·anchors + dim, n): of each kind for each metre by which receptions of an
     anchor are late, then for each m/s² of acceleration along an axis."""
     information: Matrix
-    """Of all kinds of faults of all anchors in the innovations, shape (FAULT_KINDS·anchors, FAULT_KINDS·anchors)."""
+    """Information of the innovations on all faults, shape (FAULT_KINDS·anchors, FAULT_KINDS·anchors)."""
     evidence: Vector
     """What innovations show of them, shape (FAULT_KINDS·anchors,)."""
     anchors: Records
@@ -279,7 +281,7 @@ class EstimatorState(NamedTuple):
     ph: Vector
     """P·h of the measurement at hand, shape (n,)."""
     fault_input: Vector
-    """By how much each fault is in the innovation at hand, shape (2·anchors + dim,)."""
+    """By how much each fault is in the present innovation, shape (2·anchors + dim,)."""
     work: Matrix
     """Scratch for systems of equations of all faults of one kind, shape (anchors + 1 + dim, anchors)."""
 
@@ -288,7 +290,7 @@ class Layout(NamedTuple):
     """Where the states of n anchors stand."""
 
     offset: int
-    """Of the first anchor's offset; the others' follow, as in all blocks."""
+    """Index of the first anchor's offset. The others' follow, as in all blocks."""
     velocity: int
     rate: int
     tx_noise: int
@@ -320,12 +322,12 @@ def layout(dim: int, anchors: int) -> Layout:
 
 @jitted
 def direction_terms(dim: int) -> int:
-    """Of a distance: the position, the anchor's survey error and, in two dimensions, the height's error."""
+    """Terms of a distance: the position, the anchor's survey error and, in two dimensions, the height's error."""
     return dim + 3
 
 
 def most_terms(dim: int) -> int:
-    """Of a measurement: those of a difference of two distances."""
+    """Most terms of a measurement: a difference of two distances has the most."""
     return 2 * direction_terms(dim) + 8
 
 
@@ -389,8 +391,8 @@ def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors
 
 
 START_WALK_SCALE: Final = 100.0  # of the tag's oscillator, which warms up after it was switched on
-LASTING_STD_M: Final = 0.3  # of a fault that has been there since the anchor joined,
-# ... and where the packets that led to the start contradict each other, so that some are late by more.
+LASTING_STD_M: Final = 0.3  # of a fault that has been there since the anchor joined
+# The same after a start from packets that contradict each other, of which some are late by more.
 CONTRADICTED_STD_M: Final = 1.0
 RECENT_STD_M: Final = 0.08  # of a fault that has begun recently without a visible jump
 CREEPING_STD_M: Final = 0.2  # of one that grows for seconds
@@ -403,7 +405,7 @@ OPEN_SURVEY_STD_M: Final = 0.15
 def with_anchor(
     s: EstimatorState, table_index: int, position_m: Vector, is_open: bool = False, std_m: float | None = None
 ) -> EstimatorState:
-    """The state with one more anchor, nothing known of its clock; if it is open, next to nothing of its range error.
+    """The state with one more anchor, of whose clock and, if it is open, range error nothing is known.
 
     ``std_m``: of each coordinate of this anchor; None for that of the settings.
     """

@@ -1,16 +1,16 @@
-"""Types of arrays. Docstrings state the shape; a name that states it as well is used where it helps."""
+"""Types of arrays. Docstrings state the shape; some names state it too."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-"""Of any shape."""
+"""An array of any shape."""
 
 Vector = NDArray[np.float64]
-"""With one dimension."""
+"""An array with one dimension."""
 
 Matrix = NDArray[np.float64]
-"""With two dimensions."""
+"""An array with two dimensions."""
 
 Integers = NDArray[np.int64]
 
@@ -20,4 +20,4 @@ Indices = NDArray[np.uint32]
 Mask = NDArray[np.bool_]
 
 Records = NDArray[np.void]
-"""Of a structured type."""
+"""An array of a structured type."""

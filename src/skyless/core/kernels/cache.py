@@ -119,7 +119,7 @@ def _temporary_folder(name: str, key: str) -> KernelFolder:
 
 
 def digest(package: Path) -> str:
-    """Of the files of the package ``skyless`` that hold kernels, and of all that these import."""
+    """Digest of the files of the package ``skyless`` that hold kernels, and of all that these import."""
     texts = {_module(file, package): file.read_bytes() for file in sorted(package.rglob("*.py"))}
     wanted = [name for name, text in texts.items() if b"skyless.core.kernels.compiled" in text or ".kernels." in name]
     used: set[str] = set()

@@ -2,7 +2,7 @@
 
 Each step works on the leading n × n block of a symmetric matrix P; what stands behind it stays as it is. They change
 the covariance only. The filter of two states, value and rate, which plain Python runs as well, is
-``core/kernels/two_state.py``.
+``core/kernels/filter.py``.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""The two-state clock filter: an anchor's offset and rate against the master (``docs/maths.md`` section 6).
+"""The clock filter of two states: an anchor's offset and rate against the master (``docs/maths.md`` section 6).
 
 The offset is kept in two parts, whole ticks in an integer and a remainder below one tick in metres of light, so that
 nothing is lost however long the filter runs. One update processes one master beacon.
@@ -12,19 +12,62 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.core.kernels.two_state import TwoState, predict, predicted_value_variance, update
 
 MAX_RELATIVE_RATE: Final = 40e-6
 """Two crystals of ±20 ppm each, the widest that IEEE 802.15.4 allows."""
+
+
+# The covariance of a value and its rate, in any units that fit each other. For clocks the value is an offset with white
+# frequency noise, and the rate walks.
+
+TwoState = tuple[float, float, float]
+"""Variance of the value, covariance, variance of the rate."""
+
+
+def predicted_value_variance(P: TwoState, dt: float, white: float, walk: float) -> float:
+    """Variance of the value ``dt`` later, or earlier: the process noise grows both ways."""
+    variance, covariance, rate_variance = P
+    span = abs(dt)
+    variance += dt * (2.0 * covariance + dt * rate_variance)
+    return variance + span * (white + walk * span * span / 3.0)
+
+
+def predict(P: TwoState, dt: float, white: float, walk: float) -> TwoState:
+    """Time update F·P·Fᵀ + Q over ``dt``, 0 or later."""
+    variance, covariance, rate_variance = P
+    variance += dt * (2.0 * covariance + dt * rate_variance)
+    variance += dt * (white + walk * dt * dt / 3.0)
+    return variance, covariance + dt * (rate_variance + walk * dt / 2.0), rate_variance + walk * dt
+
+
+def update(P: TwoState, noise: float) -> tuple[float, float, TwoState]:
+    """Measure the value with that variance: the gains of value and rate, and P.
+
+    Joseph form, which keeps P positive in spite of rounding.
+    """
+    variance, covariance, rate_variance = P
+    innovation_variance = variance + noise
+    gain = variance / innovation_variance
+    rate_gain = covariance / innovation_variance
+    keep = 1.0 - gain
+    updated = (
+        keep * keep * variance + gain * gain * noise,
+        keep * (covariance - rate_gain * variance) + gain * rate_gain * noise,
+        rate_variance + rate_gain * (rate_gain * (variance + noise) - 2.0 * covariance),
+    )
+    return gain, rate_gain, updated
+
+
+# Clocks
 
 
 class ClockNoise(Struct, frozen=True, gc=False):
     """Process noise of the difference of two clocks, in metres of light."""
 
     white: float
-    """Of the offset, m²/s."""
+    """White noise of the offset, m²/s."""
     walk: float
-    """Of the rate, m²/s³."""
+    """Random walk of the rate, m²/s³."""
 
 
 def clock_noise(white_fm: float, random_walk_fm: float, clocks: int = 2) -> ClockNoise:
@@ -51,7 +94,7 @@ class ClockFilter:
         self._offset_m = self._rate_mps = 0.0
         """The rest of the offset, and the rate, in metres of light."""
         self.covariance: TwoState = (0.0, 0.0, 0.0)
-        """Of offset and rate."""
+        """Covariance of offset and rate."""
         self.updates = 0
         """Beacons processed since the last start."""
         self.rejected = 0

@@ -30,7 +30,7 @@ class Part(Struct, frozen=True):
     """``module:function`` to call."""
     arguments: tuple[str, ...] = ()
     only: tuple[str, ...] = ()
-    """Packages whose kernels are compiled; those with a minus are left out; empty: those of all."""
+    """Packages whose kernels are compiled; those with a minus are left out. If empty, the kernels of all packages."""
     after: tuple[str, ...] = ()
     """Parts that have to be compiled first, because this one is made of them."""
     typical_s: float = 15.0
@@ -49,7 +49,7 @@ ESTIMATOR: Final = Part(
     "estimator", _LAB, FILTERS, (_ESTIMATOR, "skyless.core.kernels"), typical_s=60.0, timeline=_ESTIMATOR_TIMELINE
 )
 SIMULATED: Final = Part("air", _LAB, SNAPSHOTS, (f"-{_ESTIMATOR}",), typical_s=12.0, timeline=_AIR_TIMELINE)
-"""The simulated radio world, anchors, and positions from snapshots, from which the estimator starts, too."""
+"""The simulated radio world, anchors, and positions from snapshots, from which the estimator starts."""
 
 PAIRS: Final = Part("pairs", "skyless.research.compile_ahead:compile_pair_kernels", typical_s=20.0)
 """Differences of ranges, as some recordings hold them."""
@@ -110,7 +110,7 @@ async def compile_parts(parts: Iterable[Part], report: Report) -> tuple[str, ...
 
 
 class _Progress(Struct):
-    """Of one part."""
+    """How far one part is."""
 
     typical_s: float
     timeline: tuple[float, ...]
@@ -132,7 +132,7 @@ class _Progress(Struct):
         return None if share < _SURE_SHARE else (end_s - self.begun_s) / share
 
     def _share(self) -> float:
-        """Of its time that is over, by its kernels."""
+        """Share of its time that is over, by its kernels."""
         if not self.total:
             return 0.0
         at = self.done / self.total * (len(self.timeline) - 1)

@@ -108,7 +108,8 @@ class AlmanacAssembly:
     """
 
     def __init__(self) -> None:
-        self._issue: int | None = None
+        self.issue: int | None = None
+        """Issue of the almanac held, None before the first beacon."""
         self._next_issue: int | None = None
         self._next_frames = 0
         self._next_pages: list[Page] = []
@@ -117,11 +118,13 @@ class AlmanacAssembly:
     def _clear(self) -> None:
         self._pages: dict[object, Page] = {}
         self._unconfirmed: dict[object, Page] = {}
-        self._anchors_m: dict[int, tuple[float, float, float]] = {}
-        self._schedule: SchedulePage | None = None
-        self._noise: NoisePage | None = None
-        self._accuracy = _ASSUMED_ACCURACY
-        self._georeference: GeoreferencePage | None = None
+        self.anchors_m: dict[int, tuple[float, float, float]] = {}
+        """Position of each anchor known so far: another dict whenever one changes, never changed in place."""
+        self.schedule: SchedulePage | None = None
+        self.noise: NoisePage | None = None
+        self.accuracy = _ASSUMED_ACCURACY
+        """How good survey and ranges are. Some sites never send it."""
+        self.georeference: GeoreferencePage | None = None
 
     def state(self) -> AlmanacState:
         """All that it holds."""
@@ -129,7 +132,7 @@ class AlmanacAssembly:
             tuple(map(encode_page, group))
             for group in (self._pages.values(), self._unconfirmed.values(), self._next_pages)
         )
-        return AlmanacState(self._issue, pages, unconfirmed, self._next_issue, self._next_frames, next_pages)
+        return AlmanacState(self.issue, pages, unconfirmed, self._next_issue, self._next_frames, next_pages)
 
     def restore(self, state: AlmanacState) -> None:
         """Continue from a state.
@@ -141,38 +144,8 @@ class AlmanacAssembly:
         for page in _decoded(state.pages):
             self._add(_page_key(page), page)
         self._unconfirmed = {_page_key(page): page for page in _decoded(state.unconfirmed)}
-        self._issue, self._next_issue, self._next_frames = state.issue, state.next_issue, state.next_frames
+        self.issue, self._next_issue, self._next_frames = state.issue, state.next_issue, state.next_frames
         self._next_pages = _decoded(state.next_pages)
-
-    @property
-    def issue(self) -> int | None:
-        """Issue of the almanac held, None before the first beacon."""
-        return self._issue
-
-    @property
-    def anchors_m(self) -> dict[int, tuple[float, float, float]]:
-        """Position of each anchor known so far; another dict whenever one changes, never changed in place."""
-        return self._anchors_m
-
-    @property
-    def schedule(self) -> SchedulePage | None:
-        """The superframe and the tags' height, once heard."""
-        return self._schedule
-
-    @property
-    def noise(self) -> NoisePage | None:
-        """The site's noise figures, once heard."""
-        return self._noise
-
-    @property
-    def accuracy(self) -> AccuracyPage:
-        """How good survey and ranges are; the defaults of ``AccuracySite`` until it is heard, for some sites never."""
-        return self._accuracy
-
-    @property
-    def georeference(self) -> GeoreferencePage | None:
-        """Position of the site on the Earth, once heard; many sites send none."""
-        return self._georeference
 
     def slot_of(self, anchor: int | None) -> int | None:
         """First slot of an anchor, once its page was heard."""
@@ -182,15 +155,15 @@ class AlmanacAssembly:
     @property
     def complete(self) -> bool:
         """Whether schedule, noise and all anchors are known."""
-        schedule = self._schedule
-        return schedule is not None and self._noise is not None and len(self._anchors_m) >= schedule.anchors
+        schedule = self.schedule
+        return schedule is not None and self.noise is not None and len(self.anchors_m) >= schedule.anchors
 
     def add_page(self, issue: int, page: Page | None) -> bool:
         """Process the issue and the page (if any) of one beacon; return whether the almanac changed."""
-        if issue != self._issue:
-            if self._issue is not None:
+        if issue != self.issue:
+            if self.issue is not None:
                 return self._add_to_next_issue(issue, page)
-            self._issue = issue
+            self.issue = issue
         self._next_issue = None
         if page is None:
             return False
@@ -208,7 +181,7 @@ class AlmanacAssembly:
         if self._next_frames < _CONFIRMATIONS:
             return False
         self._clear()
-        self._issue, self._next_issue = issue, None
+        self.issue, self._next_issue = issue, None
         for next_page in self._next_pages:
             self._add(_page_key(next_page), next_page)
         return True
@@ -224,21 +197,21 @@ class AlmanacAssembly:
         if held is not None and self._unconfirmed.get(key) != page:
             self._unconfirmed[key] = page
             return False
-        if held is None and isinstance(page, AnchorPage) and len(self._anchors_m) >= _MAX_ANCHORS:
+        if held is None and isinstance(page, AnchorPage) and len(self.anchors_m) >= _MAX_ANCHORS:
             return False
         self._unconfirmed.pop(key, None)
         self._pages[key] = page
         match page:
             case AnchorPage():
-                self._anchors_m = self._anchors_m | {page.anchor: (page.x_m, page.y_m, page.z_m)}
+                self.anchors_m = self.anchors_m | {page.anchor: (page.x_m, page.y_m, page.z_m)}
             case SchedulePage():
-                self._schedule = page
+                self.schedule = page
             case NoisePage():
-                self._noise = page
+                self.noise = page
             case AccuracyPage():
-                self._accuracy = page
+                self.accuracy = page
             case GeoreferencePage():
-                self._georeference = page
+                self.georeference = page
         return True
 
 

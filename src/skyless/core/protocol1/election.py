@@ -41,9 +41,9 @@ class Verdict(StrEnum):
     """What a beacon is to the anchor that received it."""
 
     FROM_MASTER = "from-master"
-    """Of the present master."""
+    """It is from the present master."""
     FROM_NEW_MASTER = "from-new-master"
-    """Of an anchor that is the master from now on; the clock may go on."""
+    """It is from an anchor that is the master from now on. The clock may go on."""
     FROM_FIRST_MASTER = "from-first-master"
     """The same, but what was known of the site's time no longer counts."""
     STALE = "stale-master"

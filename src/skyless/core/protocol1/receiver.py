@@ -6,20 +6,21 @@ It needs nothing but beacons: anchors, schedule and noise figures come from the 
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.air.frame import Malformed
+from skyless.core.air.almanac import AccuracyPage, NoisePage, SchedulePage
+from skyless.core.air.frame import Heard, Malformed
 from skyless.core.air.reception import Reception
+from skyless.core.constants import SUBTICKS, TICK_M
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.kernels.arrays import Array
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, METHODS
+from skyless.core.observation import Observation
 from skyless.core.protocol1.almanac import AlmanacAssembly, AlmanacState
 from skyless.core.protocol1.beacon import Beacon
-from skyless.core.protocol1.codec import decode_cached
-from skyless.core.protocol1.master_term import FollowedMaster
-from skyless.core.protocol1.method import new_method
-from skyless.core.protocol1.observer import Observer
-from skyless.core.protocol1.schedule import schedule_from_page
-from skyless.core.protocol1.snapshots import Snapshots, SnapshotsState
+from skyless.core.protocol1.codec import decode_cached, packed_relays
+from skyless.core.protocol1.master_term import FollowedMaster, master_term_of
+from skyless.core.protocol1.schedule import Schedule, schedule_from_page
+from skyless.core.protocol1.snapshots import SnapshotMethod, Snapshots, SnapshotSettings, SnapshotsState
 from skyless.core.tag.beacon_receiver import (
     AdmissionState,
     BeaconReceiver,
@@ -27,7 +28,9 @@ from skyless.core.tag.beacon_receiver import (
     MethodOptions,
     variance_factor_of,
 )
+from skyless.core.tag.factory import as_required, estimator_settings, stamp_variances
 from skyless.core.tag.joint import Estimation, EstimationState
+from skyless.core.ticks import FLIGHT_SLACK_TICKS, may_elapse, nearest, to_seconds
 
 
 class ReceiverState(Struct, frozen=True, tag="protocol-1"):
@@ -68,7 +71,9 @@ class Receiver(BeaconReceiver[Beacon]):
             raise ValueError(f"method {method!r} is not one of {', '.join(METHODS)}")
         super().__init__(MethodOptions(method, qa, z_bounds_m, integrity or IntegrityRequirement()), site)
         self.almanac = AlmanacAssembly()
-        self._observer = Observer()
+        self._schedule: Schedule | None = None
+        self._scale: tuple[int, int] | None = None
+        """The master's time and the tag's, both unwrapped, when they were last compared."""
         self._method: Estimation | Snapshots | None = None
         self._method_key: object = None
         self._superframe_ticks = 0
@@ -84,7 +89,7 @@ class Receiver(BeaconReceiver[Beacon]):
             almanac=self.almanac.state(),
             followed=self._followed,
             master=self._master,
-            master_scale=self._observer.scale,
+            master_scale=self._scale,
             superframe_ticks=self._superframe_ticks,
             has_method_key=self._method_key is not None,
             method=None if self._method is None else self._method.state(),
@@ -102,8 +107,7 @@ class Receiver(BeaconReceiver[Beacon]):
         made._superframe_ticks, made._followed = state.superframe_ticks, state.followed
         made.almanac.restore(state.almanac)
         made._read_positions()
-        made._master, made._observer.scale = state.master, state.master_scale
-        made._observer.set_master(state.master, made.almanac.slot_of(state.master) or 0)
+        made._master, made._scale = state.master, state.master_scale
         if state.has_method_key:
             made._choose_method()
         match made._method, state.method:
@@ -162,17 +166,65 @@ class Receiver(BeaconReceiver[Beacon]):
         method, anchor_m = self._method, self._positions.get(beacon.anchor)
         if method is None or anchor_m is None:
             return NoFixReason.NO_ALMANAC
-        factor, master_term = variance_factor_of(reception), self._followed.master_term
-        return method.update(
-            self._observer.observe(reception.frame, beacon, anchor_m, rx_ticks, tx_ticks, factor, master_term)
-        )
+        return method.update(self._observation(beacon, reception, anchor_m, rx_ticks, tx_ticks))
+
+    def _observation(
+        self, beacon: Beacon, reception: Reception, anchor_m: Array, rx_ticks: int, tx_ticks: int
+    ) -> Observation:
+        """A beacon with relays and the master's term, or with its round and the stamp of the master's frame."""
+        ticks_master, fraction, variance_m2 = self._master_time(beacon, rx_ticks)
+        factor = variance_factor_of(reception)
+        if self._options.method not in FILTERS:
+            heard = beacon.master_heard if beacon.master == self._master else None
+            master_sequence, master_rx_ticks = _stamp_of(heard, tx_ticks)
+            return Observation(
+                beacon.anchor, anchor_m, self._round(beacon), beacon.sequence, rx_ticks, tx_ticks, master_sequence,
+                master_rx_ticks, ticks_master, fraction, variance_m2, (), None, factor,
+            )  # fmt: skip
+        master_term = self._followed.master_term
+        if ticks_master is None:
+            master_term = None
+        elif master_term is None or master_term.master != beacon.master or master_term.term != beacon.term:
+            master_term = master_term_of(beacon)
+        return Observation(
+            beacon.anchor, anchor_m, 0, beacon.sequence, rx_ticks, tx_ticks, None, None, ticks_master, fraction,
+            variance_m2, (), master_term, factor, packed_relays(reception.frame, beacon),
+        )  # fmt: skip
+
+    def _round(self, beacon: Beacon) -> int:
+        """Round of a frame, counted from the master's slot: what follows a frame of the master refers to it."""
+        schedule = self._schedule
+        assert schedule is not None
+        superframe, slot = beacon.superframe, beacon.slot - (self.almanac.slot_of(self._master) or 0)
+        if not 0 <= slot < schedule.slots:
+            steps, slot = divmod(slot, schedule.slots)
+            superframe += steps
+        return superframe if schedule.frames_per_node == 1 else schedule.round_of(superframe, slot)
+
+    def _master_time(self, beacon: Beacon, rx_ticks: int) -> tuple[int | None, float, float]:
+        """TX time on the master's scale: unwrapped whole ticks, fraction, variance in m².
+
+        Only the master, and anchors that agree with what was received before, continue the scale.
+        """
+        time, scale = beacon.master_time, self._scale
+        if time is None:
+            return None, 0.0, 0.0
+        whole, subticks = divmod(time.tx_subticks_master, SUBTICKS)
+        updates = scale is None or beacon.anchor == self._master
+        if scale is not None:
+            elapsed = rx_ticks - scale[1]
+            whole = nearest(whole, scale[0] + elapsed)
+            updates = updates or may_elapse(whole - scale[0], elapsed, FLIGHT_SLACK_TICKS)
+        if updates:
+            self._scale = (whole, rx_ticks)
+        return whole, subticks / SUBTICKS, (time.std_ticks * TICK_M) ** 2
 
     def _forget_site(self) -> None:
         self.almanac = AlmanacAssembly()
         self._positions, self._superframe_ticks = {}, 0
 
     def _forget_stamps(self) -> None:
-        self._observer.forget()
+        self._scale = None
         self._followed = FollowedMaster()
         self._method = self._method_key = None
 
@@ -190,7 +242,6 @@ class Receiver(BeaconReceiver[Beacon]):
         elif self._method is not None and master == self._master:
             return
         self._master = master
-        self._observer.set_master(master, almanac.slot_of(master) or 0)
         self._choose_method()
 
     def _read_positions(self) -> None:
@@ -206,7 +257,24 @@ class Receiver(BeaconReceiver[Beacon]):
         if method_key != self._method_key:
             self._method_key, self._method = method_key, None
             if master is not None and schedule_page is not None and noise is not None:
-                schedule = schedule_from_page(schedule_page)
-                self._superframe_ticks = schedule.superframe_ticks
-                self._method = new_method(options, master, schedule_page, noise, accuracy, self._time)
-                self._observer.set_method(self._method, schedule)
+                self._schedule = schedule_from_page(schedule_page)
+                self._superframe_ticks = self._schedule.superframe_ticks
+                self._method = self._new_method(master, schedule_page, noise, accuracy)
+
+    def _new_method(
+        self, master: int, schedule: SchedulePage, noise: NoisePage, accuracy: AccuracyPage
+    ) -> Estimation | Snapshots:
+        """Make the method for a site with this schedule and noise, where that anchor is the master."""
+        options, height_m = self._options, schedule.tag_height_m
+        if options.method not in FILTERS:
+            variances = stamp_variances(noise)
+            settings = SnapshotSettings(master, schedule.anchors, *variances, height_m, options.z_bounds_m)
+            return Snapshots(SnapshotMethod(options.method), settings, self._time)
+        superframe_s = to_seconds(self._superframe_ticks)
+        assumed = estimator_settings(options.qa, height_m, noise, accuracy, superframe_s)
+        return Estimation(as_required(assumed, options), options.z_bounds_m, self._time, superframe_s)
+
+
+def _stamp_of(heard: Heard | None, tx_ticks: int) -> tuple[int, int] | tuple[None, None]:
+    """Sequence number and unwrapped RX stamp of what the sender of a beacon received before that."""
+    return (None, None) if heard is None else (heard.sequence, nearest(heard.rx_ticks, tx_ticks))

@@ -5,16 +5,14 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS, MAX_DRIFT, SUBTICKS, TICK_M
+from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS, SUBTICKS, TICK_M
 from skyless.core.kernels.filter import ClockFilter
 from skyless.core.protocol1.beacon import Beacon
 from skyless.core.protocol1.schedule import Schedule
-from skyless.core.ticks import nearest, wrap
+from skyless.core.ticks import continued, nearest
 
 MISFITS_BEFORE_RESTART: Final = 3
 """If this number of master beacons in a row do not fit, the site's time, or the own clock, has jumped."""
-
-STAMP_SLACK_TICKS: Final = 64
 
 GRID_SLACK_TICKS: Final = 8 * DELAYED_TX_GRANULARITY_TICKS
 """By how much a master's frames, which lie on its radio's grid, may be off their slots."""
@@ -77,9 +75,11 @@ class SiteClock:
         """Become the master: the site's time goes on from here as far as it is known, else the own counter is it."""
         if self._own_site_time is None:
             if self.updates > 1:
-                self._own_site_time = continued(ticks_own, *self._clock.to_master(ticks_own)[:2], self._clock.rate)
+                self._own_site_time = SiteTime.onwards(
+                    ticks_own, *self._clock.to_master(ticks_own)[:2], self._clock.rate
+                )
             else:
-                self._own_site_time, self.epoch_ticks = own_counter(), None
+                self._own_site_time, self.epoch_ticks = OWN_COUNTER, None
         if self.epoch_ticks is None:
             self.epoch_ticks = self._own_site_time.subticks(ticks_own) // SUBTICKS
 
@@ -155,10 +155,7 @@ class SiteClock:
 def _unwrapped(counter: int, last_ticks: int, last_rx_ticks: int, rx_ticks: int) -> int | None:
     """The unwrapped time of a 40-bit counter that ran on by the own clock since the last one; None if it did not."""
     elapsed = rx_ticks - last_rx_ticks
-    ticks = nearest(wrap(counter), last_ticks + elapsed)
-    if elapsed <= 0 or abs(ticks - last_ticks - elapsed) > MAX_DRIFT * elapsed + STAMP_SLACK_TICKS:
-        return None
-    return ticks
+    return continued(counter, last_ticks, elapsed) if elapsed > 0 else None
 
 
 _RATE_BITS: Final = 64
@@ -187,13 +184,12 @@ class SiteTime(Struct, frozen=True):
         """Fractional rate of the own counter against the site's time."""
         return (SUBTICKS << _RATE_BITS) / self.subticks_per_tick - 1.0
 
+    @classmethod
+    def onwards(cls, ticks_own: int, ticks_site: int, fraction_ticks: float, rate: float) -> "SiteTime":
+        """The map that goes on from a reading and the site time known for it; ``rate`` is the own clock's."""
+        subticks_per_tick = int(SUBTICKS / (1.0 + rate) * 2.0**_RATE_BITS)
+        return cls(ticks_own, ticks_site * SUBTICKS + round(fraction_ticks * SUBTICKS), subticks_per_tick)
 
-def own_counter() -> SiteTime:
-    """Return the time of a site that its first master starts: the master's own counter."""
-    return SiteTime(0, 0, SUBTICKS << _RATE_BITS)
 
-
-def continued(ticks_own: int, ticks_site: int, fraction_ticks: float, rate: float) -> SiteTime:
-    """Return the map that goes on from a reading and the site time known for it; ``rate`` is the own clock's."""
-    subticks_per_tick = int(SUBTICKS / (1.0 + rate) * 2.0**_RATE_BITS)
-    return SiteTime(ticks_own, ticks_site * SUBTICKS + round(fraction_ticks * SUBTICKS), subticks_per_tick)
+OWN_COUNTER: Final = SiteTime(0, 0, SUBTICKS << _RATE_BITS)
+"""The time of a site that its first master starts is the master's own counter."""

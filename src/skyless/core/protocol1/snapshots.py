@@ -11,13 +11,13 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.constants import MAX_DRIFT, TICK_M
+from skyless.core.constants import TICK_M
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.kernels.arrays import Array, Matrix, Vector
 from skyless.core.kernels.compiled import kernel, part
 from skyless.core.observation import Observation
 from skyless.core.tag.locate import NoSolution, Solution, locate
-from skyless.core.tag.observations import FLIGHT_SLACK_TICKS, FixTime
+from skyless.core.ticks import FLIGHT_SLACK_TICKS, FixTime, may_elapse
 
 
 class SnapshotMethod(StrEnum):
@@ -133,7 +133,7 @@ def bracketed_tdoa(
 
 
 def literal_covariance(kappa: Vector, tx_var_m2: float, rx_var_m2: float) -> Matrix:
-    """Of ``eq:GPSTDoA`` for the first messages, whose reference is one of the two sync messages; shape (n, n).
+    """Covariance of the first messages by ``eq:GPSTDoA``: their reference is one of the two sync messages.
 
     There the master's noise and the rate error β cancel exactly: Q_i + 1 stamps of the tag and of the anchor remain,
     Q = (1 + κ)² + κ².
@@ -142,12 +142,12 @@ def literal_covariance(kappa: Vector, tx_var_m2: float, rx_var_m2: float) -> Mat
 
 
 def literal_delayed_covariance(kappa: Vector, tx_var_m2: float, rx_var_m2: float) -> Matrix:
-    """Of ``eq:GPSTDoA`` for the delayed messages: the anchor's pair encloses the reference, Q = (1 - κ)² + κ²."""
+    """Covariance of the delayed messages: the anchor's pair encloses the reference, Q = (1 - κ)² + κ²."""
     return _shared_reference((1.0 - kappa) ** 2 + kappa**2, tx_var_m2, rx_var_m2)
 
 
 def bracketed_covariance(kappa: Vector, tx_var_m2: float, rx_var_m2: float) -> Matrix:
-    """Of the bracketed TDoAs; the same stamps with the same weights as the delayed messages, so the same variance."""
+    """Covariance of the bracketed TDoAs: their stamps and weights are those of the delayed messages."""
     return literal_delayed_covariance(kappa, tx_var_m2, rx_var_m2)
 
 
@@ -183,61 +183,58 @@ class SnapshotSettings(Struct, frozen=True):
     z_bounds_m: tuple[float, float] | None = None
 
 
-class SnapshotsState(Struct, frozen=True, tag="snapshots"):
-    """What ``Snapshots`` keeps."""
+class SnapshotsState(Struct, tag="snapshots"):
+    """What ``Snapshots`` keeps: the observations of two rounds, by anchor."""
 
-    round: int | None
-    previous: dict[int, Observation]
-    current: dict[int, Observation]
+    round: int | None = None
+    previous: dict[int, Observation] = {}
+    current: dict[int, Observation] = {}
 
 
 class Snapshots:
     """Collects two rounds of beacons and solves them."""
 
-    needs_relays = False
-
     def __init__(self, method: SnapshotMethod, settings: SnapshotSettings, fix_time: FixTime | None = None) -> None:
         """``fix_time``: the receiver's, where it outlives this method."""
         self._method = method
         self._settings = settings
-        self._previous: dict[int, Observation] = {}
-        self._current: dict[int, Observation] = {}
-        self._round: int | None = None
+        self._kept = SnapshotsState()
         self._time = fix_time or FixTime()
 
     def state(self) -> SnapshotsState:
         """All that it keeps, as it is now."""
-        return SnapshotsState(self._round, self._previous, self._current)
+        return self._kept
 
     def restore(self, state: SnapshotsState) -> None:
         """Continue from a state."""
-        self._round, self._previous, self._current = state.round, state.previous, state.current
+        self._kept = state
 
     def update(self, observation: Observation) -> Fix | NoFixReason:
         """Process one observation; a fix when it completes its round or is the first of the next one."""
         result: Fix | NoFixReason = NoFixReason.ACQUIRING
-        if observation.round != self._round:
-            if self._current:
+        kept = self._kept
+        if observation.round != kept.round:
+            if kept.current:
                 result = self._solve()
-            consecutive = self._round is not None and observation.round == self._round + 1
-            self._previous = (self._current or self._previous) if consecutive else {}
-            self._current = {}
-            self._round = observation.round
-        self._current[observation.anchor] = observation
-        if len(self._current) == self._settings.anchors:
+            consecutive = kept.round is not None and observation.round == kept.round + 1
+            kept.previous = (kept.current or kept.previous) if consecutive else {}
+            kept.current = {}
+            kept.round = observation.round
+        kept.current[observation.anchor] = observation
+        if len(kept.current) == self._settings.anchors:
             result = self._solve()
-            self._previous, self._current = self._current, {}
+            kept.previous, kept.current = kept.current, {}
         return result
 
     def _solve(self) -> Fix | NoFixReason:
-        master = self._settings.master
-        if master not in self._current or master not in self._previous:
+        master, previous, current = self._settings.master, self._kept.previous, self._kept.current
+        if master not in current or master not in previous:
             return NoFixReason.TOO_FEW_ANCHORS
-        reference = (self._previous[master], self._current[master])
+        reference = (previous[master], current[master])
         pairs = [
             (first, second)
-            for anchor, second in self._current.items()
-            if (first := self._previous.get(anchor)) is not None and _synchronised(first, second, reference)
+            for anchor, second in current.items()
+            if (first := previous.get(anchor)) is not None and _synchronised(first, second, reference)
         ]
         if not pairs:
             return NoFixReason.TOO_FEW_ANCHORS
@@ -309,7 +306,7 @@ def _synchronised(first: Observation, second: Observation, reference: tuple[Obse
 def _is_plausible_interval(elapsed_ticks: int, first: Observation, second: Observation) -> bool:
     """Whether an interval on an anchor's clock can be the one that the tag measured between two receptions."""
     elapsed = second.rx_ticks_tag - first.rx_ticks_tag
-    return elapsed > 0 and abs(elapsed_ticks - elapsed) <= MAX_DRIFT * elapsed + FLIGHT_SLACK_TICKS
+    return elapsed > 0 and may_elapse(elapsed_ticks, elapsed, FLIGHT_SLACK_TICKS)
 
 
 def _kappa(first: Observation, second: Observation) -> float:

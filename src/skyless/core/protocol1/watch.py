@@ -1,7 +1,7 @@
 """Whether the master still lives, from its own beacons and from what others relay of them.
 
 Every listener estimates how often each link brings news of the master. A silent master is declared dead once its
-silence is next to impossible on those links; lost frames alone do not replace a master.
+silence is almost impossible on those links; lost frames alone do not replace a master.
 """
 
 import math
@@ -25,7 +25,7 @@ class _Link(Struct):
     """A source of news of the master: itself, or an anchor that receives it."""
 
     sequence: int
-    """Of the master's last beacon that it reported."""
+    """Sequence number of the master's last beacon that it reported."""
     turns: int = 0
     share: float = 0.5
     """Part of the master's turns that it reports before the next one."""

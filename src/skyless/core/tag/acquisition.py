@@ -1,7 +1,7 @@
 """The cold start: where the tag is, from packets alone and without a guess.
 
-Wherever anchor i relays when it received a packet of anchor j that the tag received as well, the difference of their
-clocks at that moment is known but for noise. Along such links all TX times are carried to the clock of one anchor,
+When anchor i relays its reception of a packet of anchor j that the tag received too, the difference of their clocks at
+that moment is known but for noise. Along such links all TX times are carried to the clock of one anchor,
 unless more anchors state theirs on the master's. The tag's clock runs up to 20 ppm off, so pseudoranges of one
 superframe drift by tens of metres. Two messages of the same anchor give the drift; then all anchors' newest
 pseudoranges are carried to one time and solved in closed form.
@@ -82,9 +82,9 @@ class Start(Struct, frozen=True):
     covariance: Array
     speed_variance: float
     is_contradicted: bool = False
-    """Whether the messages of all anchors contradict each other, ..."""
+    """Whether the messages of all anchors contradict each other."""
     misfitting: tuple[int, ...] = ()
-    """... but not without these, which are not in ``used``."""
+    """Anchors that are not in ``used``: without them there is no contradiction."""
 
 
 class Acquisition(Struct):
@@ -92,13 +92,13 @@ class Acquisition(Struct):
 
     _height_m: float | None
     _variance_m2: float
-    """Of a TX and an RX stamp."""
+    """Variance of a TX and an RX stamp together."""
     _z_bounds_m: tuple[float, float] | None
     _max_age_s: float
     _speed_std_mps: float
-    """Of a tag that is assumed to be fast this makes a start wide, and more anchors do not help."""
+    """Assumed speed of the tag. A fast tag makes a start wide, and more anchors do not help."""
     _error_variance_m2: float = 0.0
-    """Of survey and ranges: rivals differ by more than these errors, too, lest a start takes a mirror image."""
+    """Variance of survey and ranges. Rivals must differ by more, so that no mirror image is chosen."""
     _heard: dict[int, list[Observation]] = {}
     _possible_ticks: int | None = None
     """When a start was first possible."""
@@ -113,7 +113,7 @@ class Acquisition(Struct):
         self._z_bounds_m = low_m, high_m
 
     def remove_anchor(self, anchor: int) -> None:
-        """Forget what was received of an anchor, because its position was another one."""
+        """Forget what was received of an anchor, because its position has changed."""
         self._heard.pop(anchor, None)
         self._links = {ends: link for ends, link in self._links.items() if anchor not in ends}
 
@@ -232,9 +232,9 @@ class Acquisition(Struct):
         return start if waited_s >= patience_s and relative_std < WIDEST_START else NoFixReason.ACQUIRING
 
     def _solve_without_one(self, pairs: list[list[Observation]], now: int) -> Start | NoFixReason:
-        """Where one anchor alone contradicts all others, do without it; they must still be able to contradict.
+        """If exactly one anchor contradicts all others, leave it out. The others must still be able to contradict.
 
-        Where no single one does for half a second, start from all of them as they are.
+        If there is no such anchor for half a second, start from all of them as they are.
         """
         if self._contradicted_ticks is None:
             self._contradicted_ticks = now
@@ -298,7 +298,7 @@ def _clock_rate(first: Observation, second: Observation) -> float:
 
 
 def _possible(first: Observation, second: Observation) -> bool:
-    """Whether two messages of one anchor are on one scale, that of a crystal."""
+    """Whether a crystal can have sent both messages of an anchor."""
     if second.rx_ticks_tag <= first.rx_ticks_tag:
         return False
     return abs(_clock_rate(first, second)) <= MAX_DRIFT * SPEED_OF_LIGHT_MPS

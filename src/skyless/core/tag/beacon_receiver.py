@@ -1,4 +1,4 @@
-"""What the receivers of both protocols have in common: which beacons are admitted, whatever they make known.
+"""What the receivers of both protocols have in common: which beacons are admitted.
 
 A beacon is admitted if it is of the site in use, and its stamps are possible on its sender's and the tag's counter.
 """
@@ -18,8 +18,7 @@ from skyless.core.air.reception import Reception
 from skyless.core.air.site_choice import SiteChoice, SiteUse
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.tag.observations import FixTime
-from skyless.core.ticks import LAST_TICKS, Unwrapper, from_seconds
+from skyless.core.ticks import LAST_TICKS, FixTime, Unwrapper, from_seconds
 
 if TYPE_CHECKING:
     # It loads Numba and all kernels: only who makes a receiver waits for that, not who imports its class.
@@ -135,7 +134,7 @@ class BeaconReceiver(ABC, Generic[B]):
     def hear_height(self, height_m: float, std_m: float) -> bool:
         """Process a reading of the tag's height sensor, above the site's origin, at the present; True if it was used.
 
-        Only ``joint`` uses it. Before the first fix it limits the heights at which a position is sought. Recordings do
+        Only ``joint`` uses it. Before the first fix it bounds the heights of the search. Recordings do
         not hold these readings, so a replay lacks them.
 
         Raises:
@@ -223,7 +222,7 @@ class BeaconReceiver(ABC, Generic[B]):
         return False
 
     def _is_of_site(self, beacon: B, rx_ticks: int) -> bool:
-        """Whether a beacon is of the site in use, which may be another one from now on."""
+        """Whether a beacon is of the site in use, which may have changed."""
         had_site = self._choice.site is not None
         use = self._choice.on_beacon(beacon.site, beacon.anchor, rx_ticks)
         if use is SiteUse.FOREIGN:

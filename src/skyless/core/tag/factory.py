@@ -1,28 +1,29 @@
-"""A tag's positioning method as the almanac configures it."""
+"""What a tag needs kernels for: its positioning method as the almanac configures it, and its state as values."""
 
 from typing import Final
 
+from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.air.almanac import AccuracyPage, NoisePage
-from skyless.core.air.local_almanac import CommonPages
+from skyless.core.air.local_almanac import CommonPages, LocalAlmanacState
 from skyless.core.estimator.state import EstimatorSettings
 from skyless.core.kernels.filter import clock_noise, stamp_variance_m2
-from skyless.core.tag.beacon_receiver import MethodOptions
-from skyless.core.tag.joint import Estimation
-from skyless.core.tag.observations import FixTime
-from skyless.core.tag.selection import MAX_ANCHORS_IN_USE
-from skyless.core.ticks import to_seconds
+from skyless.core.observation import Observation
+from skyless.core.tag.beacon_receiver import AdmissionState, MethodOptions
+from skyless.core.tag.joint import Estimation, EstimationState
+from skyless.core.tag.selection import MAX_ANCHORS_IN_USE, AnchorSelection
+from skyless.core.ticks import FixTime, to_seconds
 
 DROP_S: Final = 2.0
-"""An anchor that is silent for longer, or for four superframes, is out of view (``joint``)."""
+"""An anchor that is silent for longer, or for four superframes, leaves the estimator."""
 
 CELL_DROP_S: Final = 1.0
-"""The same at a site of protocol 2, where tags move from cell to cell."""
+"""Replaces ``DROP_S`` at a site of protocol 2, where tags move from cell to cell."""
 
+# Relays of packets that are older than both are not used.
 RELAY_AGE_S: Final = 1.0
 RELAY_SUPERFRAMES: Final = 2.5
-"""Relays of packets that are older than the one, or than this number of superframes, are not used."""
 
 
 def new_method(options: MethodOptions, pages: CommonPages, period_ticks: int, time: FixTime) -> Estimation:
@@ -45,14 +46,14 @@ def as_required(settings: EstimatorSettings, options: MethodOptions) -> Estimato
 
 
 def stamp_variances(noise: NoisePage) -> tuple[float, float]:
-    """Of a TX and of an RX stamp, m²."""
+    """Variances of a TX and of an RX stamp, m²."""
     return stamp_variance_m2(noise.tx_stamp_s, rounded=False), stamp_variance_m2(noise.rx_stamp_s, rounded=True)
 
 
 def estimator_settings(
     qa: float, height_m: float | None, noise: NoisePage, accuracy: AccuracyPage, superframe_s: float
 ) -> EstimatorSettings:
-    """What the estimator assumes at a site with this noise and accuracy; of its integrity and the tag the defaults."""
+    """What the estimator assumes at a site with this noise and accuracy."""
     tx_variance, rx_variance = stamp_variances(noise)
     own = clock_noise(noise.white_fm, noise.random_walk_fm, clocks=1)
     return EstimatorSettings(
@@ -71,3 +72,16 @@ def estimator_settings(
         place_distance_m=accuracy.place_distance_m,
         place_time_s=accuracy.place_time_s,
     )
+
+
+class ReceiverState(Struct, frozen=True, tag="protocol-2"):
+    """All that a ``Receiver`` keeps; to be used or encoded before its next frame, as they share some parts."""
+
+    admission: AdmissionState
+    almanac: LocalAlmanacState
+    method_period_ticks: int
+    method: EstimationState | None
+    selection: AnchorSelection
+    waiting: tuple[Observation, ...]
+    moved_ticks: dict[int, int]
+    uses_moved: bool

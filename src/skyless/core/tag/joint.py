@@ -4,7 +4,7 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from msgspec.structs import astuple, replace
+from msgspec.structs import replace
 
 from skyless.core.constants import SUBTICKS, TICK_S
 from skyless.core.estimator.estimator import (
@@ -37,8 +37,7 @@ from skyless.core.tag.acquisition import (
     Acquisition,
     Start,
 )
-from skyless.core.tag.observations import FixTime
-from skyless.core.ticks import TICK_MASK, from_seconds
+from skyless.core.ticks import TICK_MASK, FixTime, from_seconds
 
 # Factor on the start's covariance, as the filter is then given the packets that it rests on.
 COVARIANCE_MARGIN: Final = 4.0
@@ -73,7 +72,6 @@ class AnchorsInUseState(Struct, frozen=True):
 
     used: tuple[Observation, ...]
     checked_ticks: int
-    anchors_m: tuple[tuple[float, float, float], ...]
     extent_m: float
 
 
@@ -84,6 +82,22 @@ class MasterScaleState(Struct, frozen=True):
     points: tuple[tuple[int, int, int, int], ...]
 
 
+class _Course(Struct):
+    """What has become of the starts so far."""
+
+    speed_std_mps: float = TAG_SPEED_STD_MPS
+    open_range_errors: bool = False
+    """Whether the next start expects larger range errors than the settings state."""
+    is_open: bool = False
+    """Whether the last start did."""
+    start_was_contradicted: bool = False
+    relays_may_contradict: bool = True
+    master_less_tag_ticks: int = 0
+    started_ticks: int = 0
+    newest_ticks: int = 0
+    heights_rejected: int = 0
+
+
 class EstimationState(Struct, frozen=True, tag="joint"):
     """All that an ``Estimation`` keeps."""
 
@@ -91,21 +105,11 @@ class EstimationState(Struct, frozen=True, tag="joint"):
     start: Acquisition | None
     in_use: AnchorsInUseState
     master_scale: MasterScaleState
-    speed_std_mps: float
-    open_range_errors: bool
-    is_open: bool
-    start_was_contradicted: bool
-    relays_may_contradict: bool
-    master_less_tag_ticks: int
-    started_ticks: int
-    newest_ticks: int
-    heights_rejected: int
+    course: _Course
 
 
 class Estimation:
     """One tag's estimator from the first beacon on."""
-
-    needs_relays = True
 
     def __init__(
         self,
@@ -130,28 +134,18 @@ class Estimation:
         self._most_anchors = most_anchors
         self._max_relative_std = MAX_RELATIVE_STD if superframe_s < SLOW_S else SLOW_MAX_RELATIVE_STD
         self._z_bounds_m = z_bounds_m
-        self._speed_std_mps = TAG_SPEED_STD_MPS
+        self._course = _Course()
         self._estimator = Estimator(settings)
         self._start: Acquisition | None = self._new_start()
-        self._open_range_errors = False
-        self._is_open = self._start_was_contradicted = False
         self._time = fix_time or FixTime()
         self._in_use = AnchorsInUse(superframe_s)
-        self._master_less_tag_ticks = 0
-        self._started_ticks = 0
-        self._newest_ticks = 0
         self._master_scale = MasterScale()
-        self._relays_may_contradict = True
-        self._heights_rejected = 0
 
     def state(self) -> EstimationState:
         """All that it keeps, as it is now."""
         return EstimationState(
-            self._estimator.save(), self._start, self._in_use.state(), self._master_scale.state(),
-            self._speed_std_mps, self._open_range_errors, self._is_open, self._start_was_contradicted,
-            self._relays_may_contradict, self._master_less_tag_ticks, self._started_ticks, self._newest_ticks,
-            self._heights_rejected,
-        )  # fmt: skip
+            self._estimator.save(), self._start, self._in_use.state(), self._master_scale.state(), self._course
+        )
 
     def restore(self, state: EstimationState) -> None:
         """Continue from the state of one with the same settings.
@@ -163,11 +157,7 @@ class Estimation:
         self._estimator.restore(state.estimator)
         self._in_use.restore(state.in_use)
         self._master_scale.restore(state.master_scale)
-        (
-            self._speed_std_mps, self._open_range_errors, self._is_open, self._start_was_contradicted,
-            self._relays_may_contradict, self._master_less_tag_ticks, self._started_ticks, self._newest_ticks,
-            self._heights_rejected,
-        ) = astuple(state)[4:]  # fmt: skip
+        self._course = state.course
 
     @property
     def estimator(self) -> Estimator:
@@ -205,19 +195,19 @@ class Estimation:
             observation.master_term,
         )
         if ticks_master is not None:
-            self._master_less_tag_ticks = ticks_master - rx_ticks
+            self._course.master_less_tag_ticks = ticks_master - rx_ticks
             if master_term is not None and master_term.master == observation.anchor:
                 self._master_scale.update(observation)
         if (
             self._start is None
-            and not 0 <= rx_ticks - self._newest_ticks < SURELY_IN_REACH_TICKS
+            and not 0 <= rx_ticks - self._course.newest_ticks < SURELY_IN_REACH_TICKS
             and self._is_out_of_reach(observation)
         ):
             self._start = self._new_start()
         if self._start is not None:
             return self._try_start(self._start, observation)
         outcome = self._process(observation)
-        self._newest_ticks = max(self._newest_ticks, rx_ticks)
+        self._course.newest_ticks = max(self._course.newest_ticks, rx_ticks)
         if outcome in {REJECTED, STALE}:
             if self._estimator.is_lost:
                 self._restart(rx_ticks)
@@ -255,9 +245,9 @@ class Estimation:
             self._start.expect_height(height_m - margin_m, height_m + margin_m)
             return False
         used = self._estimator.process_height(height_m, std_m) == ACCEPTED
-        self._heights_rejected = 0 if used else self._heights_rejected + 1
-        if self._heights_rejected >= MAX_HEIGHTS_REJECTED and not self._height_known:
-            self._heights_rejected = 0
+        self._course.heights_rejected = 0 if used else self._course.heights_rejected + 1
+        if self._course.heights_rejected >= MAX_HEIGHTS_REJECTED and not self._height_known:
+            self._course.heights_rejected = 0
             self._start = self._new_start()
         return used
 
@@ -267,40 +257,44 @@ class Estimation:
 
     def _restart(self, rx_ticks: int) -> None:
         """Look for a new start; a filter that is lost early has a tag that is faster than assumed."""
-        early = (rx_ticks - self._started_ticks) * TICK_S < EARLY_S
-        faster = min(SPEED_STD_GROWTH * self._speed_std_mps, MAX_SPEED_STD_MPS)
-        self._speed_std_mps = faster if early else TAG_SPEED_STD_MPS
+        early = (rx_ticks - self._course.started_ticks) * TICK_S < EARLY_S
+        faster = min(SPEED_STD_GROWTH * self._course.speed_std_mps, MAX_SPEED_STD_MPS)
+        self._course.speed_std_mps = faster if early else TAG_SPEED_STD_MPS
         self._start = self._new_start()
 
     def _is_too_fast(self, rx_ticks: int) -> bool:
         """Whether the range errors of several anchors jump early, or nothing fits: it is the tag that has moved."""
-        if (rx_ticks - self._started_ticks) * TICK_S >= EARLY_S:
+        if (rx_ticks - self._course.started_ticks) * TICK_S >= EARLY_S:
             return False
         several = self._estimator.jumps >= MANY_JUMPS or self._estimator.rows.item(QUALITY, 0) > EARLY_NIS
-        return several and self._speed_std_mps < MAX_SPEED_STD_MPS
+        return several and self._course.speed_std_mps < MAX_SPEED_STD_MPS
 
     def _is_contradicted(self, rx_ticks: int) -> bool:
         """Whether a new start is needed, as relays or faults contradict this one; decides what that has to expect."""
-        if self._start_was_contradicted and self._estimator.is_late_often:
-            self._open_range_errors = self._start_was_contradicted = False  # it was by single late packets
+        if self._course.start_was_contradicted and self._estimator.is_late_often:
+            self._course.open_range_errors = self._course.start_was_contradicted = (
+                False  # it was by single late packets
+            )
             return True
-        age_s = (rx_ticks - self._started_ticks) * TICK_S
-        if self._is_open and age_s > OPEN_START_HOLD_S and self._estimator.fits_settings:
-            self._open_range_errors = False
+        age_s = (rx_ticks - self._course.started_ticks) * TICK_S
+        if self._course.is_open and age_s > OPEN_START_HOLD_S and self._estimator.fits_settings:
+            self._course.open_range_errors = False
             return True
         if self._estimator.rows.item(QUALITY, 2) > SURE_CHI2:
-            limit = SURE_CHI2 if age_s < EARLY_FAULT_S or self._start_was_contradicted else UNCOVERED_CHI2
+            limit = SURE_CHI2 if age_s < EARLY_FAULT_S or self._course.start_was_contradicted else UNCOVERED_CHI2
             calm = self._estimator.obstruction < CALM_OBSTRUCTION
-            is_new = not self._start_was_contradicted and age_s < EARLY_FAULT_S
+            is_new = not self._course.start_was_contradicted and age_s < EARLY_FAULT_S
             if is_new and self._estimator.unexplained_test < UNEXPLAINED_CHI2:
                 limit = UNCOVERED_CHI2  # one or two anchors, which the estimator will find
-            if calm and self._estimator.fault_test > limit and (not self._is_open or age_s > OPEN_START_HOLD_S):
-                self._open_range_errors = not self._estimator.is_late_often
-                return age_s > LATE_SHARE_KNOWN_S or self._open_range_errors
-        if not self._relays_may_contradict:
-            self._relays_may_contradict = self._estimator.relays_fit
+            if calm and self._estimator.fault_test > limit and (not self._course.is_open or age_s > OPEN_START_HOLD_S):
+                self._course.open_range_errors = not self._estimator.is_late_often
+                return age_s > LATE_SHARE_KNOWN_S or self._course.open_range_errors
+        if not self._course.relays_may_contradict:
+            self._course.relays_may_contradict = self._estimator.relays_fit
         elif self._estimator.is_contradicted:
-            self._relays_may_contradict = False  # if a new start does not help, the anchors are wrong, not the position
+            self._course.relays_may_contradict = (
+                False  # if a new start does not help, the anchors are wrong, not the position
+            )
             return True
         return False
 
@@ -311,11 +305,11 @@ class Estimation:
         errors = settings.range_std_m**2 + settings.survey_std_m**2
         if self._superframe_s > LONGEST_SUPERFRAME_S:
             variance += errors
-        return Acquisition(settings.height_m, variance, self._z_bounds_m, max_age_s, self._speed_std_mps, errors)
+        return Acquisition(settings.height_m, variance, self._z_bounds_m, max_age_s, self._course.speed_std_mps, errors)
 
     def _is_out_of_reach(self, observation: Observation) -> bool:
         """Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back."""
-        silent_s = (observation.rx_ticks_tag - self._newest_ticks) * TICK_S
+        silent_s = (observation.rx_ticks_tag - self._course.newest_ticks) * TICK_S
         if not -REORDERED_S <= silent_s <= MAX_SILENCE_S:
             return True
         if silent_s < SHORT_SILENCE_S:
@@ -330,16 +324,16 @@ class Estimation:
         if self._most_anchors is not None:
             kept = _nearest(start, self._most_anchors)
             packets = [packet for packet in packets if packet.anchor in kept]
-        self._newest_ticks = self._started_ticks = packets[-1].rx_ticks_tag
+        self._course.newest_ticks = self._course.started_ticks = packets[-1].rx_ticks_tag
         self._in_use.begin(start.used)
         dim, begin_ticks = self._estimator.dim, packets[0].rx_ticks_tag
         age_s = (start.rx_ticks_tag - begin_ticks) * TICK_S
         is_contradicted = start.is_contradicted and not self._estimator.is_late_often
-        self._is_open = self._open_range_errors or (is_contradicted and not start.misfitting)
-        self._start_was_contradicted = self._is_open or is_contradicted
-        error = OPEN_RANGE_STD_M if self._start_was_contradicted else self._settings.range_std_m
+        self._course.is_open = self._course.open_range_errors or (is_contradicted and not start.misfitting)
+        self._course.start_was_contradicted = self._course.is_open or is_contradicted
+        error = OPEN_RANGE_STD_M if self._course.start_was_contradicted else self._settings.range_std_m
         inflation = 1.0 + error**2 / (self._settings.tx_variance_m2 + self._settings.rx_variance_m2)
-        if not self._start_was_contradicted:
+        if not self._course.start_was_contradicted:
             inflation *= COVARIANCE_MARGIN
         covariance = inflation * start.covariance[:dim, :dim] + age_s**2 * start.speed_variance * np.eye(dim)
         self._estimator.start(
@@ -347,8 +341,8 @@ class Estimation:
             start.solution[:dim],
             covariance,
             start.speed_variance,
-            self._is_open,
-            CONTRADICTED_STD_M if self._start_was_contradicted else LASTING_STD_M,
+            self._course.is_open,
+            CONTRADICTED_STD_M if self._course.start_was_contradicted else LASTING_STD_M,
             [
                 self._estimator.anchor_index(packet.anchor, packet.anchor_m, packet.anchor_std_m)
                 for packet in packets
@@ -398,7 +392,7 @@ class Estimation:
         rows[PROTECTION, 2] = UNAVAILABLE
         self._in_use.begin(start.used)
         rx_ticks, in_use = observation.rx_ticks_tag, self._in_use
-        time_s = self._time.time_s(rx_ticks + self._master_less_tag_ticks, rx_ticks)
+        time_s = self._time.time_s(rx_ticks + self._course.master_less_tag_ticks, rx_ticks)
         return Fix(
             time_s, rows.tobytes(), in_use.anchors, in_use.anchors_m, "joint", self._height_known, 1, self._requirement
         )
@@ -408,7 +402,7 @@ class Estimation:
         if not known and estimator.state.P.item(2, 2) > in_use.extent_m**2:
             return NoFixReason.BAD_GEOMETRY
         rx_ticks = observation.rx_ticks_tag
-        time_s = self._time.time_s(rx_ticks + self._master_less_tag_ticks, rx_ticks)
+        time_s = self._time.time_s(rx_ticks + self._course.master_less_tag_ticks, rx_ticks)
         # in the order of the fields: with their names it takes as long as all the rest
         return Fix(
             time_s, estimator.rows.tobytes(), in_use.anchors, in_use.anchors_m, "joint", known, 1, self._requirement
@@ -426,12 +420,12 @@ def _nearest(start: Start, most: int) -> set[int]:
 # Anchors in use
 
 
-# An anchor counts as in use while its last accepted message is younger, or a superframe and a half.
+# An anchor counts as in use while its last accepted message is younger than this, or than 1.5 superframes.
 MIN_IN_USE_S: Final = 0.1
 
 
 class AnchorsInUse:
-    """The anchors whose messages were accepted lately; their list is made again only when it changes."""
+    """The anchors whose messages were accepted recently. Their list is made again only when it changes."""
 
     def __init__(self, superframe_s: float) -> None:
         self._in_use_s = max(MIN_IN_USE_S, 1.5 * superframe_s)
@@ -445,17 +439,16 @@ class AnchorsInUse:
 
     def state(self) -> AnchorsInUseState:
         """All that it keeps."""
-        anchors_m = tuple((x, y, z) for x, y, z in self.anchors_m.tolist())
-        return AnchorsInUseState(tuple(self._used.values()), self._checked_ticks, anchors_m, self.extent_m)
+        return AnchorsInUseState(tuple(self._used.values()), self._checked_ticks, self.extent_m)
 
     def restore(self, state: AnchorsInUseState) -> None:
         """Continue from a state."""
         self._used = {observation.anchor: observation for observation in state.used}
         self._checked_ticks, self.extent_m = state.checked_ticks, state.extent_m
-        self.anchors, self.anchors_m = tuple(self._used), np.array(state.anchors_m).reshape(len(self._used), 3)
+        self._list()
 
     def begin(self, observations: tuple[Observation, ...]) -> None:
-        """Forget all anchors but those of these observations."""
+        """Keep only the anchors of these observations."""
         self._used.clear()
         self.extent_m = 0.0
         for observation in observations:
@@ -474,9 +467,12 @@ class AnchorsInUse:
             for anchor in stale:
                 del self._used[anchor]
         if changed:
-            self.anchors = tuple(self._used)
-            self.anchors_m = np.array([o.anchor_m for o in self._used.values()])
+            self._list()
             self.extent_m = max(self.extent_m, float(np.ptp(self.anchors_m, axis=0).max()))
+
+    def _list(self) -> None:
+        self.anchors = tuple(self._used)
+        self.anchors_m = np.array([o.anchor_m for o in self._used.values()]).reshape(-1, 3)
 
     def mean_range_m(self, position_m: Array) -> float:
         """From a position, shape (2,) or (3,), to the anchors."""

@@ -45,7 +45,7 @@ class Solution(Struct, frozen=True, gc=False):
     residuals_m: Array
     """Measured minus predicted TDoAs, shape (n,)."""
     chi2: float
-    """rᵀΣ⁻¹r, whatever the estimate's weights."""
+    """rᵀΣ⁻¹r, also where the estimate is not weighted by Σ⁻¹."""
     dof: int
     mirror_m: Array | None
     """The position that fits as well and that the height's bounds ruled out, shape (3,)."""
@@ -57,7 +57,7 @@ class PseudorangeSolution(Solution, frozen=True, gc=False):
 
     bias_m: float
     covariance_joint_m2: Array
-    """Of (x, y, z, bias), shape (4, 4), or of (x, y, bias), shape (3, 3), where the height is given."""
+    """Covariance of (x, y, z, bias), shape (4, 4); with a given height of (x, y, bias), shape (3, 3)."""
 
 
 class NoSolution(Struct, frozen=True, gc=False):
@@ -343,7 +343,7 @@ def _decide(problem: Problem, minima: list[Minimum], z_bounds_m: tuple[float, fl
 
 
 def _by_height(positions: list[Array], covariances: list[Array], z_bounds_m: tuple[float, float] | None) -> int | None:
-    """The only position within the bounds, or else the one that exceeds them least and by little."""
+    """The only position within the bounds, else the position that exceeds them least and by little."""
     if z_bounds_m is None:
         return None
     low, high = z_bounds_m

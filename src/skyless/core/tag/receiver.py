@@ -19,14 +19,13 @@ from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.observation import Observation
 from skyless.core.tag.beacon_receiver import BeaconReceiver, HeardSite, MethodOptions, variance_factor_of
-from skyless.core.tag.observations import observation_of
 from skyless.core.tag.selection import MIN_FITTING, AnchorSelection, fitting_relays, is_full
 from skyless.core.ticks import from_seconds
 
 if TYPE_CHECKING:
     # These load Numba and all kernels: only who makes a receiver waits for that, not who imports its class.
+    from skyless.core.tag.factory import ReceiverState
     from skyless.core.tag.joint import Estimation
-    from skyless.core.tag.receiver_state import ReceiverState
 
 MAX_WAITING: Final = 128
 """Beacons that are kept while the site's pages are not complete."""
@@ -71,14 +70,14 @@ class Receiver(BeaconReceiver[Beacon]):
 
     def state(self) -> "ReceiverState":
         """All that it keeps, as it is now; to be used or encoded before its next frame, as parts are shared."""
-        from skyless.core.tag.receiver_state import ReceiverState  # noqa: PLC0415 - its types load the kernels
+        from skyless.core.tag.factory import ReceiverState  # noqa: PLC0415 - its types load the kernels
 
         return ReceiverState(
             admission=self._admission_state(),
             method_period_ticks=self._method_period_ticks,
             method=None if self._method is None else self._method.state(),
             almanac=self.almanac.state(),
-            selection=self._selection.state(),
+            selection=self._selection,
             waiting=tuple(self._waiting),
             moved_ticks=dict(self._moved_ticks),
             uses_moved=self._uses_moved,
@@ -94,7 +93,7 @@ class Receiver(BeaconReceiver[Beacon]):
         made = cls()
         made._restore_admission(state.admission)
         made.almanac.restore(state.almanac)
-        made._selection.restore(state.selection)
+        made._selection = state.selection
         made._waiting = list(state.waiting)
         made._moved_ticks, made._uses_moved = dict(state.moved_ticks), state.uses_moved
         if state.method is not None:
@@ -145,8 +144,10 @@ class Receiver(BeaconReceiver[Beacon]):
         if anchor_m is None:
             self.counters["no-position"] += 1
             return NoFixReason.NO_ALMANAC
-        std_m, factor = self.almanac.std_m(anchor), variance_factor_of(reception)
-        observation = observation_of(beacon, relays, anchor_m, std_m, rx_ticks, tx_ticks, factor)
+        observation = Observation(
+            anchor, anchor_m, 0, beacon.sequence, rx_ticks, tx_ticks, None, None, None, 0.0, 0.0, (), None,
+            variance_factor_of(reception), relays, self.almanac.std_m(anchor),
+        )  # fmt: skip
         method = self._method
         if method is None:
             self._waiting = [*self._waiting[1 - MAX_WAITING :], observation]

@@ -1,4 +1,4 @@
-"""Which anchors of a large site a tag uses: those that others receive as well, and of these the strongest."""
+"""Which anchors of a large site a tag uses: the strongest of those that other anchors receive too."""
 
 import math
 from collections.abc import Callable, Collection
@@ -7,9 +7,7 @@ from typing import Final, TypeVar
 from msgspec import Struct
 
 from skyless.core.air.frame import HEARD
-from skyless.core.constants import MAX_DRIFT
-from skyless.core.tag.observations import FLIGHT_SLACK_TICKS
-from skyless.core.ticks import difference, from_seconds, wrap
+from skyless.core.ticks import FLIGHT_SLACK_TICKS, from_seconds, may_elapse, nearest
 
 MAX_ANCHORS_IN_USE: Final = 24
 """In the estimator's state; more cost accuracy, as each then sends less, and time."""
@@ -24,85 +22,67 @@ MIN_FITTING: Final = 2
 """An anchor that relays this number of receptions of anchors in use, and they fit, is there."""
 
 MAX_KEPT: Final = 256
-"""Identifiers kept: more than there are in reach, so that forged ones use no memory."""
+"""Identifiers kept: more than there are in reach. Forged ones cannot use more memory."""
 
 POWER_GAIN: Final = 0.1
-"""Of the running mean of an anchor's received power."""
+"""Weight of the newest value in the running mean of an anchor's received power."""
 
 NOMINAL_POWER_DBM: Final = -63.0
-"""At 1 m: what is assumed of an anchor where the radio reports no power, so that nearer ones count as stronger."""
+"""Assumed power at 1 m where the radio reports none, so that nearer anchors count as stronger."""
 
 
 Value = TypeVar("Value")
 
 
-class AnchorSelectionState(Struct, frozen=True):
-    """What an ``AnchorSelection`` keeps."""
-
-    relayed_ticks: dict[int, int]
-    own_relays_ticks: dict[int, int]
-    power_dbm: dict[int, float]
-
-
-class AnchorSelection:
+class AnchorSelection(Struct):
     """Which anchors have been received by others, and with which power by the tag."""
 
-    def __init__(self) -> None:
-        self._relayed_ticks: dict[int, int] = {}
-        """The tag's reading when a reception of the anchor by another one was relayed last."""
-        self._own_relays_ticks: dict[int, int] = {}
-        """The same when its own relays fitted last, of those that no other one has relayed since."""
-        self._power_dbm: dict[int, float] = {}
-
-    def state(self) -> AnchorSelectionState:
-        """All that it keeps."""
-        return AnchorSelectionState(dict(self._relayed_ticks), dict(self._own_relays_ticks), dict(self._power_dbm))
-
-    def restore(self, state: AnchorSelectionState) -> None:
-        """Continue from a state."""
-        self._relayed_ticks, self._own_relays_ticks = dict(state.relayed_ticks), dict(state.own_relays_ticks)
-        self._power_dbm = dict(state.power_dbm)
+    relayed_ticks: dict[int, int] = {}
+    """The tag's reading when another anchor last relayed that it had received this one."""
+    own_relays_ticks: dict[int, int] = {}
+    """The tag's reading when the anchor's own relays last fitted, for anchors that no other has relayed since."""
+    power_dbm: dict[int, float] = {}
 
     def forget_times(self) -> None:
         """The tag's counter has restarted."""
-        self._relayed_ticks = {}
-        self._own_relays_ticks = {}
+        self.relayed_ticks = {}
+        self.own_relays_ticks = {}
 
     def add_power(self, anchor: int, power_dbm: float) -> None:
         """Process the power of a beacon."""
         if math.isfinite(power_dbm):
-            mean = self._power_dbm.pop(anchor, power_dbm)
-            _keep(self._power_dbm, anchor, mean + POWER_GAIN * (power_dbm - mean))
+            mean = self.power_dbm.pop(anchor, power_dbm)
+            _keep(self.power_dbm, anchor, mean + POWER_GAIN * (power_dbm - mean))
 
     def add_relays(self, relays: bytes, rx_ticks: int) -> None:
         """Process what an anchor relays (``packed_relays_2``), so that it confirms others."""
         for anchor, _, _, _ in HEARD.iter_unpack(relays):
-            self._own_relays_ticks.pop(anchor, None)
-            self._relayed_ticks.pop(anchor, None)
-            _keep(self._relayed_ticks, anchor, rx_ticks)
+            self.own_relays_ticks.pop(anchor, None)
+            self.relayed_ticks.pop(anchor, None)
+            _keep(self.relayed_ticks, anchor, rx_ticks)
 
     def confirm_by_own_relays(self, anchor: int, rx_ticks: int) -> None:
         """An anchor is there, as what it relays fits (``fitting_relays``), but no other has received it."""
-        self._own_relays_ticks.pop(anchor, None)
-        _keep(self._own_relays_ticks, anchor, rx_ticks)
+        self.own_relays_ticks.pop(anchor, None)
+        _keep(self.own_relays_ticks, anchor, rx_ticks)
 
     def is_confirmed_by_others(self, anchor: int, rx_ticks: int, *, in_use: bool) -> bool:
-        """Whether others have lately received an anchor, or had when it came into use.
+        """Whether others have recently received an anchor, or had when it came into use.
 
         Only then its pages take part in the majority, and its relays confirm others.
         """
-        return _is_recent(self._relayed_ticks, anchor, rx_ticks) or (in_use and anchor not in self._own_relays_ticks)
+        return _is_recent(self.relayed_ticks, anchor, rx_ticks) or (in_use and anchor not in self.own_relays_ticks)
 
     def is_confirmed(self, anchor: int, rx_ticks: int) -> bool:
-        """Whether an anchor has lately been received by another one, or its own relays have fitted."""
-        return _is_recent(self._relayed_ticks, anchor, rx_ticks) or _is_recent(self._own_relays_ticks, anchor, rx_ticks)
+        """Whether another anchor has recently received this one, or its own relays have fitted."""
+        return _is_recent(self.relayed_ticks, anchor, rx_ticks) or _is_recent(self.own_relays_ticks, anchor, rx_ticks)
 
     def replaced_by(self, anchor: int, ranges_m: dict[int, float]) -> int | None:
-        """The anchor that should leave for another one, None where that is too weak.
+        """The anchor in use that ``anchor`` should replace, None if ``anchor`` is too weak.
 
-        ``ranges_m``: ranges of this anchor and of all that are in use.
+        ``ranges_m``: ranges of ``anchor`` and of all anchors in use.
         """
-        powers = {one: self._power_dbm.get(one, _nominal_dbm(range_m)) for one, range_m in ranges_m.items()}
+        powers = {one: self.power_dbm.get(one, _nominal_dbm(range_m)) for one, range_m in ranges_m.items()}
         own_dbm = powers.pop(anchor)
         weakest = min(powers, key=lambda one: powers[one])
         return weakest if own_dbm > powers[weakest] + BETTER_DB else None
@@ -122,8 +102,8 @@ def fitting_relays(
         packet = packets(anchor)
         if packet is not None and packet[0] == sequence:
             elapsed = rx_ticks_tag - packet[1]
-            off = difference(low | high << 32, wrap(tx_ticks_anchor - elapsed))
-            fitting += abs(off) <= FLIGHT_SLACK_TICKS + MAX_DRIFT * elapsed
+            received_ticks = nearest(low | high << 32, tx_ticks_anchor - elapsed)
+            fitting += may_elapse(tx_ticks_anchor - received_ticks, elapsed, FLIGHT_SLACK_TICKS)
     return fitting
 
 

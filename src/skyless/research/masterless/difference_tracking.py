@@ -240,7 +240,7 @@ MIN_DIAGONAL_M: Final = 5.0
 HEIGHT_MARGIN_M: Final = 1.0
 START_DIFFERENCE_STD_M: Final = 0.08  # of the median of a pair's differences
 START_ANCHOR_STD_M: Final = 0.14  # of the errors of each anchor, before any are estimated
-# Of an anchor that is late: on the floor or behind metal one is often, and at times two.
+# By how much an anchor may be late. On the floor or behind metal one often is, and at times two.
 START_LATE_STD_M: Final = 1.0
 
 LATE_PENALTY: Final = 2.0  # what each anchor that is late adds to chi² (odds of 1 to 3)

@@ -12,21 +12,19 @@ from typing import Final
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.core.air.anchor_stamps import NOISE_TICKS
 from skyless.core.air.masterless_packets import Packet, Point, Relay
-from skyless.core.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ
 from skyless.core.estimator.state import EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.observation import Observation
 from skyless.core.tag.joint import Estimation
-from skyless.core.tag.observations import FixTime
-from skyless.core.ticks import LAST_TICKS, Unwrapper, nearest
+from skyless.core.ticks import LAST_TICKS, FixTime, Unwrapper, continued, nearest
 from skyless.research.masterless.difference_tracking import DIFFERENCES, MAX_HORIZONTAL_STD_M, NEIGHBOURHOOD
 from skyless.research.masterless.pair_engine import MAX_ANCHORS, remember
 from skyless.site.survey.anchor_errors import NO_BIAS, SLOPE_NEAREST_M, DifferenceCalibration, RelayDelays
 
 MASTERLESS_RANDOM_WALK_FM: Final = 5e-9
-"""Of the oscillators, 1/√s. Between 1e-9 and 7e-9 on the captures of TDoA3 anchors; too much of it costs little."""
+"""Random walk of the oscillators, 1/√s. Captures of TDoA3 anchors show 1e-9 to 7e-9; too much costs little."""
 
 MASTERLESS: Final = replace(
     DIFFERENCES,
@@ -38,10 +36,10 @@ MASTERLESS: Final = replace(
     rx_variance_m2=2e-3,
     slope_std_m=0.05,
 )
-"""Ranges err as those of differences do, and in those captures a reception is 4 cm off by itself."""
+"""Ranges err as in ``DIFFERENCES``. In captures of TDoA3 anchors a reception is 4 cm off by itself."""
 
 DL_TDOA: Final = replace(EstimatorSettings(), qa=DIFFERENCES.qa)
-"""For FiRa's radios, of which there are no recordings yet: what is assumed of a site with typical errors, ..."""
+"""For FiRa's radios, of which there are no recordings yet: a site with typical errors is assumed."""
 
 DL_TDOA_ONE_WAY: Final = replace(
     DL_TDOA,
@@ -49,8 +47,8 @@ DL_TDOA_ONE_WAY: Final = replace(
     survey_std_m=0.0,
     range_std_m=sqrt(DL_TDOA.range_std_m**2 + 3.0 * DL_TDOA.survey_std_m**2),
 )
-"""... and where only one anchor of each pair relays the other: the constant error of their range cannot be separated
-from their clocks then, and with the survey's it counts as one of the tag's range."""
+"""The same where only one anchor of each pair relays the other. The constant error of their range cannot be separated
+from their clocks then, so it counts, with the survey's, as an error of the tag's range."""
 
 PERIOD_S: Final = 0.15
 """Anchors send 6 to 60 times a second; the filter assumes the slowest."""
@@ -59,10 +57,10 @@ RELAY_MAX_AGE_S: Final = 0.5
 """How long ago a relayed packet may have been received; a 7-bit sequence number recurs."""
 
 RESTART_IN_ROW: Final = 3
-"""This number of impossible stamps of one anchor in a row mean that its counter has restarted; ..."""
+"""This number of impossible stamps of one anchor in a row mean that its counter has restarted."""
 
 BACK_IN_ROW: Final = 8
-"""... this number of packets in a row from before the newest, that the tag's has."""
+"""This number of packets in a row from before the newest mean that the tag's counter has restarted."""
 
 
 class _Anchor:
@@ -80,9 +78,8 @@ class _Anchor:
 
     def update(self, tx_counter: int, rx_ticks: int, bits: int) -> bool:
         """Process the stamps of another packet; False if no crystal went from the newest to these."""
-        elapsed = rx_ticks - self.rx_ticks
-        tx_ticks = nearest(tx_counter, self.tx_ticks + elapsed, bits)
-        if abs(tx_ticks - self.tx_ticks - elapsed) > MAX_DRIFT * elapsed + NOISE_TICKS:
+        tx_ticks = continued(tx_counter, self.tx_ticks, rx_ticks - self.rx_ticks, bits)
+        if tx_ticks is None:
             self.impossible += 1
             return False
         self.tx_ticks, self.rx_ticks, self.impossible = tx_ticks, rx_ticks, 0
@@ -90,7 +87,7 @@ class _Anchor:
 
 
 class PacketTracking:
-    """One tag that receives the packets of anchors without a master. No I/O; whatever is unusable is counted."""
+    """One tag that receives the packets of anchors without a master. No I/O; what cannot be used is counted."""
 
     def __init__(
         self,
@@ -109,11 +106,10 @@ class PacketTracking:
         """
         self.reason = NoFixReason.NO_BEACONS
         self.time_s = 0.0
-        """Of the newest fix, by the tag's clock since its first packet."""
+        """Time of the newest fix, by the tag's clock since its first packet."""
         self.position_m: Point | None = None
-        """Of the newest fix."""
+        """Position of the newest fix."""
         self._tx_bits = tx_bits
-        self._half_wrap = 1 << (tx_bits - 1)
         self._positions_m = dict(anchors_m)
         self._surveyed = frozenset(anchors_m)
         self._anchors: dict[int, _Anchor] = {}
@@ -305,8 +301,7 @@ class PacketTracking:
         age = anchor.rx_ticks - rx_ticks_tag
         if age > RELAY_MAX_AGE_S * TICK_RATE_HZ:
             return "relay-too-old"
-        expected, half = anchor.tx_ticks - age, self._half_wrap
-        rx_ticks = expected + ((relay.rx_ticks - expected + half) & (2 * half - 1)) - half  # ``nearest`` in place
+        rx_ticks = nearest(relay.rx_ticks, anchor.tx_ticks - age, self._tx_bits)
         delay = self._delays.ticks(listener, relay.anchor, tx_ticks, rx_ticks, relay.tof_ticks)
         return "time-of-flight-unknown" if delay is None else rx_ticks - delay
 

@@ -18,7 +18,7 @@ from skyless.core.any_receiver import AnyReceiver, AnyReceiverState
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.kernels.arrays import Array
 from skyless.core.tag.beacon_receiver import TagReceiver
-from skyless.core.tag.receiver_state import ReceiverState
+from skyless.core.tag.factory import ReceiverState
 from skyless.run.mqtt.messages import Leases, RawReception, ReceptionsMessage, RequestMessage, SegmentStart
 
 _FORMAT: Final = 18

@@ -19,8 +19,7 @@ from skyless.core.constants import TICK_S
 from skyless.core.geometry import anchor_positions, anchors_in_reach
 from skyless.core.kernels.arrays import Integers, Mask, Matrix, Vector
 from skyless.core.kernels.compiled import jitted, kernel
-from skyless.core.kernels.filter import clock_noise, stamp_variance_m2
-from skyless.core.kernels.two_state import predict, update
+from skyless.core.kernels.filter import clock_noise, predict, stamp_variance_m2, update
 from skyless.core.protocol1 import codec as protocol1_codec
 from skyless.core.protocol1.anchor import MAX_OFFSET_STD_M
 from skyless.core.protocol1.schedule import first_slots, schedule_of

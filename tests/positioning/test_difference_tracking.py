@@ -1,16 +1,20 @@
-"""Anchors of pairs that are late for seconds, off for good, or wrong from the start; tags at rest; honest covariances.
+"""Fixes from time differences of pairs: anchors late, off or calibrated; tags at rest, in silence and in their plane.
 
-All simulated: a tag goes round in a room of eight anchors and hears one difference every 2.5 ms.
+All simulated: most tags go round in a room of eight anchors and hear one difference every 2.5 ms.
 """
 
-from math import dist
+from collections import Counter
+from math import dist, log
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.estimator.kalman import is_stationary
 from skyless.core.estimator.state import layout
+from skyless.core.fix import NoFixReason
+from skyless.core.integrity import Alert
 from skyless.research.masterless.difference_tracking import (
     DIFFERENCES,
     WINDOW,
@@ -18,7 +22,7 @@ from skyless.research.masterless.difference_tracking import (
     Start,
     find_start,
 )
-from skyless.site.survey.anchor_errors import DifferenceCalibration
+from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
 
 ANCHORS_M = {n: (8.0 * (n & 1), 6.0 * (n >> 1 & 1), 0.3 + 2.4 * ((n ^ n >> 1 ^ n >> 2) & 1)) for n in range(4)}
 ANCHORS_M |= {4 + n: (8.0 * (n & 1), 6.0 * (n >> 1 & 1), 2.7 - ANCHORS_M[n][2] + 0.3) for n in range(4)}
@@ -158,3 +162,115 @@ def test_many_anchors():
     assert len(rows) > 0.95 * 4.0 / STEP_S
     assert rmse_m(rows) < 0.15
     assert tracking.counters["restart"] == 0
+
+
+# Calibration
+
+
+PLACES = {k: (6.0 * (k % 2), 8.0 * (k // 2 % 2), 0.2 + 2.5 * ((k + k // 4) % 2)) for k in range(8)}
+PLACES |= {k: (x + 3.0, y - 4.0, z) for k, (x, y, z) in PLACES.items() if k > 3}
+BIAS_M = (-0.2, 0.3, 0.0, -0.25, 0.15, 0.1, -0.3, 0.2)
+KNOWN = DifferenceCalibration({k: AnchorCalibration(b, 0.08, 0.05) for k, b in enumerate(BIAS_M)})
+
+
+def heard(calibration, tag_m, count=3000, seed=1, noise_m=0.05, late_m=0.0):
+    """Mean position over the second half; anchors are off as ``KNOWN`` says, anchor 2 by ``late_m`` more at the end."""
+    rng = np.random.default_rng(seed)
+    tracking = DifferenceTracking(DIFFERENCES, dict(PLACES), calibration=calibration)
+    places = []
+    for k in range(count):
+        a, b = rng.choice(8, 2, replace=False).tolist()
+        clean = PairTdoa(0.005 * k, a, b, dist(tag_m, PLACES[b]) - dist(tag_m, PLACES[a]))
+        off_m = KNOWN.constant_m(clean) + 0.08 * log(dist(tag_m, PLACES[b]) / dist(tag_m, PLACES[a]))
+        off_m += rng.normal(0.0, noise_m)
+        off_m += late_m * ((b == 2) - (a == 2)) * (k > count // 2)
+        if tracking.update((PairTdoa(clean.time_s, a, b, clean.tdoa_m + off_m),)) and k > count // 2:
+            places.append(tracking.position_m)
+    return np.array(places), tracking
+
+
+@pytest.mark.parametrize("tag_m", [(1.0, 2.0, 1.2), (4.5, 6.0, 0.8)])
+def test_a_calibration_takes_constants_and_slope_off(tag_m):
+    raw, _ = heard(None, tag_m)
+    calibrated, tracking = heard(KNOWN, tag_m)
+    assert np.linalg.norm(raw.mean(axis=0) - tag_m) > 0.15
+    assert np.linalg.norm(calibrated.mean(axis=0) - tag_m) < 0.05
+    assert tracking.counters["restart"] == 0
+
+
+def test_anchors_that_are_not_in_it_are_taken_as_they_are():
+    nothing, _ = heard(DifferenceCalibration({}), (1.0, 2.0, 1.2), count=600)
+    raw, _ = heard(None, (1.0, 2.0, 1.2), count=600)
+    assert np.array_equal(nothing, raw)
+
+
+def test_a_blocked_anchor_harms_less_where_the_others_are_known():
+    """0.8 m late: more than a calibrated anchor can be."""
+    tag_m = (2.0, 3.0, 1.2)
+    errors = [np.linalg.norm(heard(known, tag_m, late_m=0.8)[0][-500:].mean(axis=0) - tag_m) for known in (None, KNOWN)]
+    assert errors[0] > 0.15
+    assert errors[1] < 0.05
+
+
+def test_a_wrong_calibration_ends_in_worse_fixes_and_not_in_none():
+    wrong = DifferenceCalibration({k: AnchorCalibration(-one.bias_m, 0.0, 0.01) for k, one in KNOWN.anchors.items()})
+    places, _ = heard(wrong, (2.0, 3.0, 1.2), count=2000)
+    assert len(places) > 300
+
+
+# Tag and anchors in one plane
+
+
+SEEN_FROM_ABOVE = ((0.0, 0.0), (8.0, 0.0), (8.0, 6.0), (0.0, 6.0), (4.0, 0.0), (4.0, 6.0))
+
+
+@pytest.mark.parametrize("height_m", [None, 2.0])
+def test_no_level_where_the_anchors_do_not_tell_the_height(height_m):
+    """To first order the height is in no difference."""
+    generator, reasons, std_m = np.random.default_rng(1), Counter(), []
+    anchors_m = {n: (x, y, 2.0) for n, (x, y) in enumerate(SEEN_FROM_ABOVE)}
+    tracking, place = DifferenceTracking(replace(DIFFERENCES, height_m=height_m), anchors_m), np.array([3.0, 2.0, 2.0])
+    for k in range(12_000):
+        a, b = k % 6, (k + 1 + k // 6 % 5) % 6
+        true_m = np.linalg.norm(place - anchors_m[b]) - np.linalg.norm(place - anchors_m[a])
+        if tracking.update([PairTdoa(k / 400.0, a, b, float(true_m + generator.normal(0.0, 0.1)))]):
+            fix = tracking.fix()
+            std_m.append(fix.covariance_m2[2, 2] ** 0.5)
+            assert np.linalg.norm(fix.position_m - place) < 5.0 * fix.std_m
+        elif k > 1000:
+            reasons[tracking.reason] += 1
+    if height_m is None:
+        assert max(std_m) > 0.5
+        assert tracking.fix().alert == Alert.UNAVAILABLE
+        assert tracking.fix().vpl_m is None
+    else:
+        assert tracking.fix().hpl_m is not None
+        assert len(std_m) > 11_000
+        assert set(reasons) <= {NoFixReason.RESIDUALS}
+
+
+# Silences
+
+
+CORNERS_M = {n: (8.0 * (n & 1), 6.0 * (n >> 1 & 1), 0.3 + 2.4 * (n >> 2)) for n in range(8)}
+
+
+def test_a_tag_that_moved_on_in_silence_is_found_again():
+    """Round and round at 1 m/s, heard for 3 s and then not for 8 s; the noise is half of what the filter assumes."""
+    generator = np.random.default_rng(4)
+    tracking = DifferenceTracking(DIFFERENCES, CORNERS_M)
+    errors_m, sigmas_m = [], []
+    for k in range(60_000):
+        time_s = k / 400.0
+        if time_s % 11.0 > 3.0:
+            continue
+        place = np.array([4.0 + 2.5 * np.cos(time_s / 2.5), 3.0 + 2.5 * np.sin(time_s / 2.5), 1.2])
+        a, b = k % 8, (k + 1 + k // 8 % 7) % 8
+        true_m = np.linalg.norm(place - CORNERS_M[b]) - np.linalg.norm(place - CORNERS_M[a])
+        if tracking.update([PairTdoa(time_s, a, b, float(true_m + generator.normal(0.0, 0.1)))]):
+            fix = tracking.fix()
+            errors_m.append(float(np.linalg.norm(fix.position_m - place)))
+            sigmas_m.append(fix.std_m)
+    assert len(errors_m) > 0.9 * 60_000 * 3 / 11
+    assert max(np.array(errors_m) / np.array(sigmas_m)) < 5.0
+    assert max(errors_m) < 1.5
