@@ -10,7 +10,6 @@ from metronome import IDEAL, Metronome, sent, staggered
 from skyless.core.constants import TICK_M
 from skyless.core.ticks import difference
 from skyless.sim.anchor_pairs import AnchorPairErrors
-from skyless.sim.cells.medium import CellMedium
 from skyless.sim.impairments import AnchorDisplacement, DelayError, PairError
 from skyless.sim.lab import lab_site
 from skyless.sim.world import World
@@ -122,9 +121,3 @@ def test_what_makes_no_sense_is_refused():
         PairError(1, 1)
     with pytest.raises(ValueError, match="anchor_pair_errors names anchor 9; it should be one of the site's"):
         World(LAB, Metronome, [], _with(anchor_pair_errors=(PairError(1, 9),)), 1)
-    with pytest.raises(ValueError, match=r"anchor_pair_errors is .*: several cells do not model it"):
-        World(LAB, Metronome, [], _with(anchor_pair_errors=(PairError(1, 2),)), 1, medium=CellMedium)
-    with pytest.raises(ValueError, match="has from_s 3; it should be 0"):
-        World(
-            LAB, Metronome, [], _with(anchor_displacements=(AnchorDisplacement(1, from_s=3.0),)), 1, medium=CellMedium
-        )

@@ -21,7 +21,7 @@ from skyless.sim.impairments import AnchorBias, AnchorOutage, DelayError, Impair
 from skyless.sim.lab import lab_site
 from skyless.sim.oscillator import OscillatorModel
 from skyless.sim.stations import TagSpec
-from skyless.sim.trajectory import RandomWalk, Static, Waypoints
+from skyless.sim.trajectory import Roaming, Static, Waypoints
 from skyless.sim.world import World
 from skyless.site.channel import ChannelModel, power_bias_m, received_power_dbm
 
@@ -157,7 +157,7 @@ def _busy_world(seed, tags=2):
         anchor_outages=(AnchorOutage(3, Outage(0.1, 0.3)),),
         diagnostics=True,
     )
-    specs = [TagSpec(RandomWalk((3, 4, 0), (0, 0, 0), (6, 8, 0), seed=k)) for k in range(tags)]
+    specs = [TagSpec(Roaming((3, 4, 0), (1, 1.3, 0), seed=k)) for k in range(tags)]
     return World(LAB, staggered(), specs, faults, seed)
 
 
@@ -336,7 +336,6 @@ def test_moving_tags_are_where_their_path_says():
     for broadcast in world.run(8.0):
         at = broadcast.tags.tolist().index(1)
         assert broadcast.positions_m[at] == pytest.approx(path.position(broadcast.emission_s), abs=1e-9)
-        assert broadcast.velocities_mps[at] == pytest.approx(path.velocity(broadcast.emission_s), abs=1e-9)
 
 
 def test_a_restarted_anchor_is_a_new_machine_with_a_new_counter():

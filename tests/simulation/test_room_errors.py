@@ -20,7 +20,7 @@ from skyless.sim.oscillator import OscillatorModel, clock_rate, drift_phase_s, m
 from skyless.sim.range_errors import RangeErrorModel, RangeErrors, slope_error_m
 from skyless.sim.stations import TagSpec
 from skyless.sim.streams import stream
-from skyless.sim.trajectory import RandomWalk, Static, Waypoints
+from skyless.sim.trajectory import Roaming, Static, Waypoints
 from skyless.sim.world import World
 from skyless.site.channel import ChannelModel
 
@@ -284,7 +284,7 @@ def _room(seed, tags=2, **changes):
         warm_ups=(WarmUp(1.0, 20.0), WarmUp(1.0, 20.0, anchor=2)),
         anchor_biases=(AnchorBias(5, 0.3, from_s=0.1, to_s=0.2),),
     )
-    specs = [TagSpec(RandomWalk((3, 4, 0), (0, 0, 0), (6, 8, 0), seed=k)) for k in range(tags)]
+    specs = [TagSpec(Roaming((3, 4, 0), (1, 1.3, 0), seed=k)) for k in range(tags)]
     return World(LAB, lambda a: Anchor(LAB, a), specs, msgspec.structs.replace(impairments, **changes), seed)
 
 

@@ -277,38 +277,6 @@ def fill_relays(
 
 
 @kernel
-def receive_at_anchors(
-    scene: Scene,
-    listeners: Integers,
-    from_ticks: int,
-    to_ticks: int,
-    spare: int,
-    rows: tuple[Integers, Integers, Integers, Integers],
-) -> tuple[int, int]:
-    """All receptions of anchors of frames emitted in [from, to), anchor by anchor, each newest first.
-
-    Fills listeners, senders, columns of the table and RX stamps, shape (most,) each, until fewer than ``spare`` rows
-    are left before a listener. Returns how many listeners are done, and how many rows are filled.
-    """
-    listening, senders, columns, rx_ticks = rows
-    done, count = 0, 0
-    while done < listeners.shape[0] and count + spare <= listening.shape[0]:
-        listener, until = listeners[done], to_ticks - 1
-        while until >= from_ticks:
-            since = max(until - _STRIDE_TICKS, from_ticks - 1)
-            found = candidates(scene, listener, since, until, senders[count:], columns[count:], senders[:0])
-            for i in range(count, count + found):
-                sender, k = senders[i], columns[i]
-                stamp = stamp_at_anchor(scene, listener, sender, k)
-                if stamp >= 0:
-                    listening[count], senders[count], columns[count], rx_ticks[count] = listener, sender, k, stamp
-                    count += 1
-            until = since
-        done += 1
-    return done, count
-
-
-@kernel
 def changing_error(errors: PairErrors, tag_key: int, anchor_key: int, knot: int) -> float:
     """A range error's changing part at a knot, standard normal: exponential weights over keyed normals."""
     kept = math.exp(-1.0 / KNOTS_A_LENGTH)
