@@ -160,8 +160,8 @@ class Roaming(Trajectory):
     """A random walk about a point: a random acceleration every ``step_s``, without abrupt turns.
 
     The velocity gains variance qa per second and axis, the process noise that a constant-velocity filter assumes.
-    Damping and a spring hold the walk. From the start on each coordinate is normal about the middle, with ``std_m``, and
-    its velocity has a standard deviation of √(qa·damping_s/2). An axis whose ``std_m`` is 0 does not move.
+    Damping and a spring hold the walk. From the start on each coordinate is normal about the middle, with ``std_m``,
+    and its velocity has a standard deviation of √(qa·damping_s/2). An axis whose ``std_m`` is 0 does not move.
     """
 
     def __init__(
