@@ -37,7 +37,7 @@ from skyless.sim.cells.reception import (
     squared_m2,
 )
 from skyless.sim.impairments import Impairments
-from skyless.sim.listening import RECEPTION_RECORD, fill_truth
+from skyless.sim.listening import RECEPTION_RECORD
 from skyless.sim.medium import TURNAROUND_S, Delivery, Flight, Medium
 from skyless.sim.stations import TagSpec, coordinate_m
 from skyless.sim.world import World
@@ -96,7 +96,8 @@ def receive_in_cells(
             if outcome == RECEIVED:
                 arrival_ticks = fraction + np.sqrt(square_m2) / TICK_M - early_ticks
                 row = rows[count]
-                fill_truth(stations, node, t_s, row)
+                row["node"] = node
+                row["position_m"][0], row["position_m"][1], row["position_m"][2] = x_m, y_m, z_m
                 row["rx_ticks"] = rx_stamp(rules, knots, node, (keys[node], keys[sender], number), ticks, arrival_ticks)
                 count += 1
                 anchors += 1 - stations[node]["is_tag"]

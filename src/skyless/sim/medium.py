@@ -204,9 +204,7 @@ class Medium(Generic[Result]):
         self._streams = Streams([stream(seed, *key) for key in keys])
         self.clocks = make_clocks(impairments.oscillator, self._setups)
         self._warm_up()
-        self.range_errors = RangeErrors(
-            impairments.range_errors, [tag.range_errors_m for tag in self._tags], len(site.anchors), seed
-        )
+        self.range_errors = RangeErrors(impairments.range_errors, len(tags), len(site.anchors), seed)
         self._pair_errors = AnchorPairErrors(impairments.anchor_pair_errors, self.node_of, seed)
         self._plan_changes()
         self._channel, self._walls = pack_channel(impairments.channel), pack_walls(site.walls)

@@ -77,16 +77,15 @@ class World:
         seed: int,
         *,
         lead_s: float = 1e-3,
-        on_tag_restart: Callable[[int], None] | None = None,
     ) -> None:
         """``anchor_factory`` makes a machine for an anchor's identifier, again when that anchor restarts.
 
-        ``lead_s``: how long before its RMARKER a frame is fetched. ``on_tag_restart`` is given a tag's index.
+        ``lead_s``: how long before its RMARKER a frame is fetched.
 
         Raises ValueError when an impairment names an anchor that the site has not.
         """
         self._anchors, self._tags, self._impairments = site.anchors, tuple(tags), impairments
-        self._factory, self._on_tag_restart = anchor_factory, on_tag_restart
+        self._factory = anchor_factory
         self.medium: Medium[Broadcast] = Medium(site, self._tags, impairments, seed, self._deliver)
         self._timeline = self.medium.timeline
         self._lead_ticks = from_seconds(lead_s)
@@ -134,12 +133,9 @@ class World:
         if self._reasons_off[node] > 0:
             return
         self.medium.switch_on(node)
-        tag = node - len(self._anchors)
-        if tag < 0:
+        if node < len(self._anchors):
             self._machines[node] = self._factory(self._anchors[node].id)
             self._timeline.at(self._timeline.now_ticks, partial(self._ask, node, self.medium.boots[node]))
-        elif self._timeline.now_ticks > 0 and self._on_tag_restart is not None:
-            self._on_tag_restart(tag)
 
     # Transmissions
 

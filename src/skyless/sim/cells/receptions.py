@@ -30,7 +30,7 @@ from skyless.sim.cells.reception import (
 )
 from skyless.sim.cells.timetable import BIN_BITS, Buckets, Table, latest
 from skyless.sim.range_errors import slope_error_m
-from skyless.sim.stations import coordinate_m, velocity_mps
+from skyless.sim.stations import coordinate_m
 
 RELAY_AGE_TICKS: Final = round(1.0 * TICK_RATE_HZ)
 """Older receptions are not relayed, as in ``skyless.core.anchor.anchor``."""
@@ -300,12 +300,12 @@ def receive_at_tag(
     senders: Integers,
     columns: Integers,
     rx_ticks: Integers,
-    motion: Array,
+    points_m: Array,
 ) -> int:
     """All receptions of a tag of frames emitted in [from, to), sender by sender; returns their number.
 
     ``near`` are the anchors that it may receive. Fills senders, columns of the table, RX stamps, shape (most,) each,
-    and true position and velocity at the emission, shape (most, 6).
+    and true positions at the emission, shape (most, 3).
     """
     table, rules = scene.table, scene.rules
     key = scene.keys[node]
@@ -357,8 +357,6 @@ def receive_at_tag(
             rx_ticks[count] = rx_stamp(
                 rules, scene.knots, node, (key, scene.keys[sender], number), ticks, arrival_ticks
             )
-            motion[count, 0], motion[count, 1], motion[count, 2] = x_m, y_m, z_m
-            for axis in range(3):
-                motion[count, 3 + axis] = velocity_mps(path.pieces, piece, axis, t_s)
+            points_m[count, 0], points_m[count, 1], points_m[count, 2] = x_m, y_m, z_m
             count += 1
     return count

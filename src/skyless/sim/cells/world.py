@@ -271,17 +271,17 @@ class CellWorld:
     def _receive(
         self, scene: Scene, tag: int, near: Integers, path: Path, from_ticks: int, to_ticks: int
     ) -> tuple[Integers, Integers, Integers, Array]:
-        """Senders, columns of the table, RX stamps, and motion, in the order of emission."""
+        """Senders, columns of the table, RX stamps, and true positions, in the order of emission."""
         most = int(scene.table.used[near].sum())
         senders, columns, rx_ticks = (np.empty(most, dtype=np.int64) for _ in range(3))
-        motion = np.empty((most, 6))
+        points_m = np.empty((most, 3))
         node = len(self.anchors.ids) + tag
         count = receive_at_tag(
-            scene, node, near, path, self._errors, from_ticks, to_ticks, senders, columns, rx_ticks, motion
+            scene, node, near, path, self._errors, from_ticks, to_ticks, senders, columns, rx_ticks, points_m
         )
         senders, columns = senders[:count], columns[:count]
         order = np.argsort(scene.table.ticks[senders, columns], kind="stable")
-        return senders[order], columns[order], rx_ticks[:count][order], motion[:count][order]
+        return senders[order], columns[order], rx_ticks[:count][order], points_m[:count][order]
 
     def _with_relays(
         self,
@@ -291,7 +291,7 @@ class CellWorld:
         senders: Integers,
         columns: Integers,
         rx_ticks: Integers,
-        motion: Array,
+        points_m: Array,
     ) -> TagReceptions:
         table, ids = scene.table, self.anchors.ids
         counts = np.zeros(len(senders), dtype=np.int64)
@@ -308,7 +308,7 @@ class CellWorld:
             rx_ticks,
             table.ticks[senders, columns],
             table.fraction[senders, columns],
-            motion[:, :3],
+            points_m,
             counts,
             np.where(anchors >= 0, ids[anchors], -1),
             sequences,
