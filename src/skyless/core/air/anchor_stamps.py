@@ -7,14 +7,13 @@ from msgspec import Struct
 
 from skyless.core.air.frame import AnyBeacon
 from skyless.core.constants import MAX_DRIFT
-from skyless.core.ticks import HALF_WRAP_TICKS, TICK_MASK, difference, from_seconds, wrap
+from skyless.core.ticks import difference, from_seconds, wrap
 
+# A counter has restarted once this number of stamps in a row were impossible and none has fitted for both of these
+# times: forged frames in between do not replace an anchor that still sends.
 STAMPS_BEFORE_RESTART: Final = 3
-"""This number of impossible stamps of one anchor in a row mean that its counter has restarted, ..."""
-
 RESTART_SILENCE_TICKS: Final = from_seconds(0.2)
 RESTART_SILENCE_PERIODS: Final = 4
-"""... if none has fitted for both of these: forged frames in between do not replace an anchor that still sends."""
 
 MAX_TRACKS: Final = 256
 """More anchors than there are in reach; with more identifiers on the air, that received longest ago is forgotten, those
@@ -73,14 +72,13 @@ class AnchorStamps:
             tracks.newest_rx_ticks = rx_ticks
             return self._begin(beacon, rx_ticks)
         elapsed = rx_ticks - track.rx_ticks_tag
-        least = track.tx_ticks + elapsed - HALF_WRAP_TICKS
-        off = ((beacon.tx_ticks - least) & TICK_MASK) - HALF_WRAP_TICKS
-        if abs(off) > MAX_DRIFT * elapsed + NOISE_TICKS:
+        off = _lead_ticks(track.rx_ticks_tag, track.tx_ticks, rx_ticks, beacon.tx_ticks)
+        if off is None:
             silence_ticks = max(RESTART_SILENCE_TICKS, RESTART_SILENCE_PERIODS * period_ticks)
             self._reject(beacon, track, rx_ticks, is_silent=elapsed > silence_ticks)
             return None
         track.rx_ticks_tag = tracks.newest_rx_ticks = rx_ticks
-        track.tx_ticks = tx_ticks = least + HALF_WRAP_TICKS + off
+        track.tx_ticks = tx_ticks = track.tx_ticks + elapsed + off
         track.sequence, track.impossible, track.is_single = beacon.sequence, 0, False
         return tx_ticks
 
@@ -101,7 +99,7 @@ class AnchorStamps:
             return
         self._counters["impossible-stamp"] += 1
         track.impossible += 1
-        if track.is_single and track.rival is not None and _fits(*track.rival, rx_ticks, beacon.tx_ticks):
+        if track.is_single and track.rival and _lead_ticks(*track.rival, rx_ticks, beacon.tx_ticks) is not None:
             self.tracks.of_anchor[beacon.anchor] = _Track(rx_ticks, beacon.tx_ticks, beacon.sequence, is_single=False)
             return
         track.rival = (rx_ticks, beacon.tx_ticks)
@@ -110,10 +108,11 @@ class AnchorStamps:
             self._counters["anchor-restart"] += 1
 
 
-def _fits(before_rx_ticks: int, before_tx_ticks: int, rx_ticks: int, tx_ticks: int) -> bool:
-    """Whether a counter may have gone from one stamp (40 bits) to the next by the time on the tag's."""
+def _lead_ticks(before_rx_ticks: int, before_tx_ticks: int, rx_ticks: int, tx_ticks: int) -> int | None:
+    """How far a counter has got ahead of the tag's between two stamps; None where crystals cannot drift so far."""
     elapsed = rx_ticks - before_rx_ticks
-    return abs(difference(tx_ticks, wrap(before_tx_ticks + elapsed))) <= MAX_DRIFT * elapsed + NOISE_TICKS
+    lead = difference(tx_ticks, before_tx_ticks + elapsed)
+    return lead if abs(lead) <= MAX_DRIFT * elapsed + NOISE_TICKS else None
 
 
 def _is_repeated(beacon: AnyBeacon, track: _Track) -> bool:
