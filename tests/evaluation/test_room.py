@@ -18,7 +18,7 @@ from skyless.sim.evaluation.scenarios import (
     room_of,
     trajectories_of,
 )
-from skyless.sim.lab import lab_site
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.range_errors import RangeErrorModel
 from skyless.sim.trajectory import Roaming, Static
 
@@ -76,7 +76,7 @@ def test_the_room_costs_accuracy_and_is_the_same_for_every_method():
     """``joint`` has about 5 cm where it has 2 in clean air."""
     told = []
     for room, method in ((None, "joint"), (Room(), "joint"), (Room(), "literal")):
-        asked = Request(LAB, method=method, seed=2, tags=4, room=room, settle_s=1.5)
+        asked = Request(paper_lab_site(), method=method, seed=2, tags=4, room=room, settle_s=1.5)
         fleet = fleet_of(asked)
         truths = {(one.tag, one.time_s): one.truth_m.tolist() for one in fleet.run(6.0)}
         told.append((report(fleet, method, 0.0), truths))

@@ -18,14 +18,14 @@ from skyless.core.protocol1.anchor import Anchor
 from skyless.core.site import WallSite
 from skyless.core.ticks import Unwrapper, difference
 from skyless.sim.impairments import AnchorBias, AnchorOutage, DelayError, Impairments, Outage, lab_impairments
-from skyless.sim.lab import lab_site
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.oscillator import OscillatorModel
 from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Roaming, Static, Waypoints
 from skyless.sim.world import World
 from skyless.site.channel import ChannelModel, power_bias_m, received_power_dbm
 
-LAB = lab_site()
+LAB = paper_lab_site()
 AT_P1 = TagSpec(Static(3.0, 4.0))
 
 

@@ -15,7 +15,7 @@ from skyless.core.protocol1.anchor import Anchor
 from skyless.core.site import WallSite
 from skyless.core.ticks import difference
 from skyless.sim.impairments import AnchorBias, AnchorDisplacement, Body, Impairments, WarmUp, lab_impairments
-from skyless.sim.lab import lab_site
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.oscillator import OscillatorModel, clock_rate, drift_phase_s, make_clocks, warm_up
 from skyless.sim.range_errors import RangeErrorModel, RangeErrors, slope_error_m
 from skyless.sim.stations import TagSpec
@@ -24,7 +24,7 @@ from skyless.sim.trajectory import Roaming, Static, Waypoints
 from skyless.sim.world import World
 from skyless.site.channel import ChannelModel
 
-LAB = lab_site()
+LAB = paper_lab_site()
 PLACES_M = {anchor.id: np.array([anchor.x_m, anchor.y_m]) for anchor in LAB.anchors}
 MIDDLE = Static(3.0, 4.0)
 AT_REST = TagSpec(MIDDLE)
