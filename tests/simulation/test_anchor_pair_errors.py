@@ -115,9 +115,5 @@ def test_an_anchor_moves_and_its_delays_change_at_their_times():
 
 
 def test_what_makes_no_sense_is_refused():
-    with pytest.raises(ValueError, match="drift_time_s 0; it should be more than 0 s"):
-        PairError(1, 2, drift_std_m=0.1, drift_time_s=0.0)
-    with pytest.raises(ValueError, match="it should be two"):
-        PairError(1, 1)
     with pytest.raises(ValueError, match="anchor_pair_errors names anchor 9; it should be one of the site's"):
         World(LAB, Metronome, [], _with(anchor_pair_errors=(PairError(1, 9),)), 1)

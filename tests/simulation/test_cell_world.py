@@ -222,8 +222,6 @@ def test_a_lone_tag_and_a_lone_anchor():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"dead": [True]}, "dead has 1 values"),
-        ({"period_codes": CODES[:3]}, "3 codes of periods"),
         ({"impairments": Impairments(diagnostics=True)}, "diagnostics"),
         ({"impairments": Impairments(anchor_outages=(AnchorOutage(1, Outage(1.0)),))}, "anchor_outages"),
     ],
@@ -232,12 +230,3 @@ def test_what_does_not_fit_is_refused_by_name(options, message):
     given_ = {"anchors": anchors_at(POSITIONS_M), "period_codes": CODES, "impairments": Impairments()} | options
     with pytest.raises(ValueError, match=message):
         CellWorld(tags=[], seed=1, **given_)
-
-
-def test_wrong_arrays_and_spans_are_refused():
-    with pytest.raises(ValueError, match="different identifiers"):
-        CellAnchors(np.zeros(2, dtype=np.int64), np.zeros((2, 3)), np.zeros(2, dtype=np.int64))
-    with pytest.raises(ValueError, match="positions_m of shape"):
-        CellAnchors(np.arange(2), np.zeros((2, 2)), np.zeros(2, dtype=np.int64))
-    with pytest.raises(ValueError, match="a span from 1 to 0"):
-        CellWorld(anchors_at(POSITIONS_M), CODES, paths(), Impairments(), 1).receptions(0, 1.0, 0.0)

@@ -299,7 +299,6 @@ def test_the_lab_is_what_it_was():
         (lambda: RangeErrorModel(changing_m=0.03), "either correlation_s or correlation_m"),
         (lambda: RangeErrorModel(correlation_s=1.0, correlation_m=1.0), "either correlation_s or correlation_m"),
         (lambda: RangeErrorModel(changing_m=0.03, correlation_m=0.0), "more than 0"),
-        (lambda: WarmUp(1.0, 0.0), "tau_s 0; it should be more than 0 s"),
         (
             lambda: World(LAB, Metronome, [], _with(warm_ups=(WarmUp(1.0, 1.0, anchor=9),)), 1),
             "warm_ups names anchor 9",

@@ -68,11 +68,7 @@ _CELL_M: Final = 100.0
 
 
 class CellAnchors(Struct, frozen=True):
-    """Anchors as arrays, so that 10,000 need no site file.
-
-    Raises:
-        ValueError: arrays of different lengths, or identifiers that are not unique.
-    """
+    """Anchors as arrays, so that 10,000 need no site file."""
 
     ids: Integers
     """Identifiers, shape (n,)."""
@@ -80,18 +76,6 @@ class CellAnchors(Struct, frozen=True):
     """As configured, shape (n, 3)."""
     tx_delays_ticks: Integers
     """Configured antenna delays, shape (n,)."""
-
-    def __post_init__(self) -> None:
-        count = len(self.ids)
-        if self.positions_m.shape != (count, 3) or self.tx_delays_ticks.shape != (count,):
-            raise ValueError(
-                f"{count} anchors have positions_m of shape {self.positions_m.shape} and tx_delays_ticks of "
-                f"{self.tx_delays_ticks.shape}; they should be ({count}, 3) and ({count},)"
-            )
-        if count == 0 or len(np.unique(self.ids)) < count:
-            raise ValueError(
-                f"{count} anchors with {len(np.unique(self.ids))} different identifiers; all should differ"
-            )
 
 
 def anchors_of(site: Site) -> CellAnchors:
@@ -159,19 +143,14 @@ class CellWorld:
 
         ``dead``: which anchors neither send nor receive. ``survey_std_m``: true less configured positions, per axis.
 
-        ``lead_s``: how long before its RMARKER a frame's relays are fixed, as of ``World``. Of the impairments those of
-        stamps, oscillators, channel and range errors are modelled. Raises ValueError, which names the key, for others,
-        and for arrays that do not fit the anchors.
+        ``lead_s``: how long before its RMARKER a frame's relays are fixed, as in ``World``. Of the impairments those of
+        stamps, oscillators, channel and range errors are modelled. Raises ValueError, which names the key, for others.
         """
         plain = Impairments()
         for name in _NOT_MODELLED:
             if getattr(impairments, name) != getattr(plain, name):
                 raise ValueError(f"impairments.{name} is {getattr(impairments, name)!r}: several cells do not model it")
         count = len(anchors.ids)
-        if dead is not None and len(dead) != count:
-            raise ValueError(f"dead has {len(dead)} values; it should have one for each of {count} anchors")
-        if len(period_codes) != count:
-            raise ValueError(f"{len(period_codes)} codes of periods; there should be one for each of {count} anchors")
         self.anchors, self.tags = anchors, tuple(tags)
         self._longest_period_ticks = max(map(period_ticks, period_codes.tolist()))
         self._lead_ticks, self._after_ticks = from_seconds(lead_s), from_seconds(after_rmarker_s(frame_bytes))
@@ -216,12 +195,11 @@ class CellWorld:
                 yield self.receptions(tag, begin_s, end_s)
 
     def receptions(self, tag: int, from_s: float, to_s: float) -> TagReceptions:
-        """What a tag receives of the frames emitted in [from_s, to_s); cheapest in the order of time, all tags a span.
+        """What a tag receives of the frames emitted in [from_s, to_s).
 
-        Raises:
-            ValueError: the span ends before it begins, or begins before 0.
+        Cheapest in the order of time, all tags of a span one after the other.
         """
-        from_ticks, to_ticks = _span_ticks(from_s, to_s)
+        from_ticks, to_ticks = from_seconds(from_s), from_seconds(to_s)
         scene = self._prepared(from_ticks, to_ticks)
         path = self._paths[tag].cover(from_ticks, to_ticks)
         near = self._near(path, from_ticks, to_ticks)
@@ -314,12 +292,6 @@ class CellWorld:
             sequences,
             relay_rx,
         )
-
-
-def _span_ticks(from_s: float, to_s: float) -> tuple[int, int]:
-    if not 0.0 <= from_s <= to_s:
-        raise ValueError(f"a span from {from_s:g} to {to_s:g} s; it should begin at 0 or later and not end before")
-    return from_seconds(from_s), from_seconds(to_s)
 
 
 @kernel
