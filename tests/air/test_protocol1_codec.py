@@ -53,6 +53,26 @@ def test_truncated_frames_are_dropped(beacon):
         assert isinstance(decode(frame[:length]), Malformed)
 
 
+@given(beacons(), st.data())
+@settings(max_examples=300)
+def test_any_changed_bytes_with_a_good_fcs_are_a_beacon_that_encodes_again_or_a_reason(beacon, data):
+    body = bytearray(encode(beacon)[:-2])
+    at = data.draw(st.integers(0, len(body)))
+    body[at : at + data.draw(st.integers(0, 8))] = data.draw(st.binary(max_size=8))
+    decoded = decode(with_body(body))
+    if isinstance(decoded, Malformed):
+        return
+    parts = (decoded.master_heard is not None, decoded.master_time is not None, decoded.page is not None)
+    if len(decoded.heard) <= heard_capacity(*parts):
+        assert decode(encode(decoded)) == decoded
+
+
+@given(st.binary(max_size=140))
+def test_any_bytes_are_a_beacon_or_a_reason(data):
+    assert isinstance(decode(data), Malformed)
+    assert isinstance(decode(with_body(data)), Malformed | Beacon)
+
+
 def test_truncated_frames_with_a_good_fcs_are_dropped_by_reason():
     body = encode(FULL)[:-2]
     reasons = [decode(with_body(body[:length])) for length in range(len(body))]

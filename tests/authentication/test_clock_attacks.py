@@ -17,7 +17,8 @@ from skyless.core.keys.fault import Fault
 from skyless.core.keys.key_chain import SECTION_INTERVALS
 from skyless.core.keys.verifier import Verifier
 
-BOUND_S = TIMING.most_clock_error_s
+BOUND_S = 0.5 * ((TIMING.lag - 1) * TIMING.interval_s - TIMING.anchor_lead_s - TIMING.anchors_apart_s)
+"""How far a tag's clock may be off without a genuine frame being refused."""
 ANCHOR_S = 0.5 * TIMING.anchors_apart_s
 """How far an anchor's clock may be off."""
 BACK_S = 1.0

@@ -19,13 +19,13 @@ from skyless.radio.serial.serial_radio import LinkSession
 from skyless.research.compile_ahead import compile_kernels
 from skyless.sim.dw1000.chip import Chip
 from skyless.sim.evaluation.scenarios import Request, impairments_of
-from skyless.sim.lab import lab_site
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.medium import Timeline
 from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.sim.world import World
 
-LAB = lab_site()
+LAB = paper_lab_site()
 SECONDS = 1.5
 SEED = 7
 STARTS_S = 0.1

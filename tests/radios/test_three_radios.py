@@ -16,12 +16,12 @@ from skyless.core.protocol1.anchor import Anchor
 from skyless.radio.interface import Reception, Restarted
 from skyless.radio.serial.serial_radio import SerialRadio
 from skyless.sim.evaluation.scenarios import Request, impairments_of
-from skyless.sim.lab import lab_site
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.sim.world import World
 
-LAB = lab_site()
+LAB = paper_lab_site()
 SECONDS = 4.0
 SEED = 7
 FAULTS = msgspec.structs.replace(impairments_of(Request(LAB, nlos=0.1), LAB), diagnostics=True)

@@ -124,12 +124,13 @@ def test_temperatures_are_refused():
 PLAIN = """
 import numpy as np
 from skyless.core.air.instants import period_code
-from skyless.sim.cells.world import CellWorld, anchors_at
+from skyless.sim.cells.world import CellAnchors, CellWorld
 from skyless.sim.impairments import Impairments
 from skyless.sim.trajectory import Static
 positions_m = np.array([(15.0 * x, 15.0 * y, 3.0) for y in range(3) for x in range(3)])
 codes = np.full(len(positions_m), period_code(1 / 30))
-world = CellWorld(anchors_at(positions_m), codes, [Static(12.0, 9.0, 1.0)], Impairments(), 5)
+anchors = CellAnchors(np.arange(9), positions_m, np.full(9, 16_436))
+world = CellWorld(anchors, codes, [Static(12.0, 9.0, 1.0)], Impairments(), 5)
 received = world.receptions(0, 0.1, 0.15)
 print(len(received), received.rx_ticks.tolist(), received.relay_rx_ticks.tolist())
 """

@@ -1,4 +1,4 @@
-"""Receptions among several cells by hand: capture, half duplex, early first paths; and what is refused."""
+"""Receptions among several cells by hand: capture, half duplex, early first paths."""
 
 import math
 
@@ -7,9 +7,7 @@ import pytest
 from metronome import IDEAL, Metronome, site_of
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.core.site import WallSite
 from skyless.core.ticks import difference
-from skyless.sim.cells.medium import CellMedium
 from skyless.sim.cells.reception import (
     COLLISION,
     HALF_DUPLEX,
@@ -21,20 +19,15 @@ from skyless.sim.cells.reception import (
     rules_of,
 )
 from skyless.sim.impairments import (
-    AnchorBias,
     AnchorDisplacement,
     AnchorOutage,
-    Body,
-    DelayError,
     Impairments,
     Outage,
-    WarmUp,
 )
-from skyless.sim.range_errors import RangeErrorModel
 from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Static
-from skyless.sim.world import World
 from skyless.site.channel import ChannelModel
+from support.cell_medium import cell_world
 
 RULES = rules_of(ChannelModel(), 0.0, 0.0, 1)
 AFTER_TICKS = 1.0e7
@@ -115,14 +108,14 @@ def test_power_follows_free_space():
     assert RULES.reach_m == pytest.approx(RULES.audible_m * math.sqrt(10.0))
 
 
-def world_of(other_m, first_s, impairments=IDEAL, **options):
+def world_of(other_m, first_s, impairments=IDEAL):
     """Anchor 1 sends every 15 ms and anchor 2 once, near the second frame of anchor 1; one tag."""
 
     def make(anchor):
         return Metronome(anchor) if anchor == 1 else Metronome(anchor, first_s=first_s, period_s=1.0)
 
     site = site_of((WANTED_M, 0), (0, other_m))
-    return World(site, make, [TagSpec(Static(0.0, 0.0))], impairments, 1, medium=CellMedium, **options)
+    return cell_world(site, make, [TagSpec(Static(0.0, 0.0))], impairments, 1)
 
 
 def stamps(world, until_s):
@@ -166,30 +159,3 @@ def test_a_restarted_node_has_a_new_counter_and_sends_no_old_frame():
     received, emitted = stamps(world_of(40.0, 0.5, Impairments(anchor_outages=outages)), 0.06)
     assert [round(1e3 * t_s) for t_s in emitted[1]] == [5, 31, 46]
     assert None not in received
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("anchor_biases", (AnchorBias(1, 1.0),)),
-        ("delay_errors", (DelayError(1, 1.0),)),
-        ("body", Body()),
-        ("warm_ups", (WarmUp(1.0, 10.0),)),
-        ("diagnostics", True),
-        ("range_errors", RangeErrorModel(constant_m=0.1)),
-        ("nlos_probability", ChannelModel(nlos_probability=0.1)),
-        ("power_bias", ChannelModel(power_bias=True)),
-        ("anchor 9", (AnchorOutage(9, Outage(1.0)),)),
-    ],
-)
-def test_what_is_not_modelled_is_refused_by_name(name, value):
-    key = "channel" if isinstance(value, ChannelModel) else "anchor_outages" if name == "anchor 9" else name
-    with pytest.raises(ValueError, match=name):
-        world_of(40.0, 0.5, Impairments(**{key: value}))
-
-
-def test_walls_and_errors_of_tags_are_refused():
-    with pytest.raises(ValueError, match="1 walls"):
-        World(site_of((0, 0), walls=[WallSite(0, 0, 1, 1)]), Metronome, [], IDEAL, 1, medium=CellMedium)
-    with pytest.raises(ValueError, match="tag 0"):
-        World(site_of((0, 0)), Metronome, [TagSpec(Static(0, 0), 1.0)], IDEAL, 1, medium=CellMedium)

@@ -21,7 +21,7 @@ from skyless.sim.impairments import AnchorBias, AnchorOutage, DelayError, Impair
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.oscillator import OscillatorModel
 from skyless.sim.stations import TagSpec
-from skyless.sim.trajectory import RandomWalk, Static, Waypoints
+from skyless.sim.trajectory import Roaming, Static, Waypoints
 from skyless.sim.world import World
 from skyless.site.channel import ChannelModel, power_bias_m, received_power_dbm
 
@@ -157,7 +157,7 @@ def _busy_world(seed, tags=2):
         anchor_outages=(AnchorOutage(3, Outage(0.1, 0.3)),),
         diagnostics=True,
     )
-    specs = [TagSpec(RandomWalk((3, 4, 0), (0, 0, 0), (6, 8, 0), seed=k)) for k in range(tags)]
+    specs = [TagSpec(Roaming((3, 4, 0), (1, 1.3, 0), seed=k)) for k in range(tags)]
     return World(LAB, staggered(), specs, faults, seed)
 
 
@@ -297,9 +297,6 @@ def test_antenna_delay_errors_shift_their_stamps():
     extra = _excess_m(_with(delay_errors=errors), 0.2)
     assert extra[2][:, 1] == pytest.approx(np.full(len(extra[2]), 70.0 * TICK_M), abs=TICK_M)
     assert np.abs(extra[3][:, 1]).max() == 0.0
-    worlds = [World(LAB, staggered(), [TagSpec(Static(3, 4), rx_delay_error_ticks=e)], IDEAL, 1) for e in (0.0, -40.0)]
-    plain, early = (next(iter(w.run(1.0))) for w in worlds)
-    assert difference(int(early.rx_ticks[0]), int(plain.rx_ticks[0])) == -40
 
 
 def test_diagnostics_tell_power_offset_and_doppler():
@@ -336,7 +333,6 @@ def test_moving_tags_are_where_their_path_says():
     for broadcast in world.run(8.0):
         at = broadcast.tags.tolist().index(1)
         assert broadcast.positions_m[at] == pytest.approx(path.position(broadcast.emission_s), abs=1e-9)
-        assert broadcast.velocities_mps[at] == pytest.approx(path.velocity(broadcast.emission_s), abs=1e-9)
 
 
 def test_a_restarted_anchor_is_a_new_machine_with_a_new_counter():
@@ -364,12 +360,10 @@ def test_a_restarted_anchor_is_a_new_machine_with_a_new_counter():
     assert rows[1] == _receptions(undisturbed, 1.0)[1]
 
 
-def test_a_restarted_tag_has_a_new_counter_and_its_owner_is_told():
-    told = []
+def test_a_restarted_tag_has_a_new_counter():
     tag = TagSpec(Static(3, 4), outages=(Outage(0.2, 0.4), Outage(0.6)))
-    world = World(LAB, staggered(), [AT_P1, tag], IDEAL, 9, on_tag_restart=told.append)
+    world = World(LAB, staggered(), [AT_P1, tag], IDEAL, 9)
     rows = _receptions(world, 1.0, tag=1)[1]
-    assert told == [1]
     times = np.array([true for _, _, true, _ in rows]) * TICK_S
     assert not ((times > 0.2) & (times < 0.4)).any()
     assert times.max() < 0.6

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from skyless.sim.trajectory import RandomWalk, Roaming, Static, Waypoints
+from skyless.sim.trajectory import Roaming, Static, Waypoints
 
 SQUARE = [(0.0, 0.0), (4.0, 0.0), (4.0, 3.0), (0.0, 3.0)]
 
@@ -62,57 +62,6 @@ def test_pieces_hold_the_time_they_are_asked_for(t_s, loop, corner_s):
 def test_paths_that_cannot_be_walked_are_refused(points, options):
     with pytest.raises(ValueError, match=r"should|need"):
         Waypoints(points, 1.0, **options)
-    with pytest.raises(ValueError, match="inside its box"):
-        RandomWalk((9, 0, 0), (0, 0, 0), (1, 1, 0))
-
-
-def _walk(seed, **options):
-    return RandomWalk((3.0, 4.0, 0.0), (0.0, 0.0, 0.0), (6.0, 8.0, 0.0), seed=seed, **options)
-
-
-@settings(max_examples=15, deadline=None)
-@given(seed=st.integers(0, 10**6), qa=st.sampled_from([0.5, 20.0]))
-def test_random_walk_stays_in_its_room_without_jumps(seed, qa):
-    walk = _walk(seed, qa_m2ps3=qa)
-    times = np.arange(0.0, 30.0, 0.01)
-    track = np.array([walk.position(t) for t in times])
-    speed = np.array([np.linalg.norm(walk.velocity(t)) for t in times])
-    assert (track >= 0.0).all()
-    assert (track <= [6.0, 8.0, 0.0]).all()
-    most_m = 0.01 * (np.maximum(speed[1:], speed[:-1]) + 0.01 * 10 * math.sqrt(qa * 0.1) / 0.1)
-    assert (np.linalg.norm(np.diff(track, axis=0), axis=1) <= most_m).all()
-
-
-def test_random_walk_is_a_function_of_time():
-    walk, again = _walk(7, start_s=1.0), _walk(7, start_s=1.0)
-    times = [12.0, 3.5, 0.2, 30.0, 12.0]
-    assert walk.position(0.5).tolist() == [3.0, 4.0, 0.0]
-    assert [walk.position(t).tolist() for t in times] == [again.position(t).tolist() for t in times]
-    assert walk.position(12.0).tolist() == _walk(7, start_s=1.0).position(12.0).tolist()
-    assert walk.position(12.0).tolist() != _walk(8, start_s=1.0).position(12.0).tolist()
-
-
-def test_random_walk_gains_velocity_and_position_as_a_constant_velocity_model():
-    count, steps, step_s, qa = 500, 20, 0.1, 0.5
-    ends = []
-    for seed in range(count):
-        walk = RandomWalk((0, 0, 0), (-1e3,) * 3, (1e3,) * 3, qa_m2ps3=qa, step_s=step_s, seed=seed)
-        ends.append([walk.position(steps * step_s), walk.velocity(steps * step_s)])
-    position, velocity = np.array(ends).swapaxes(0, 1)
-    low, high = chi2.ppf([1e-4, 1 - 1e-4], 3 * count) / (3 * count)
-    assert low < np.mean(velocity**2) / (qa * steps * step_s) < high
-    # kicks of variance qa·step_s, each acting evenly over its step: Σ (j + 1/2)² = n³/3 − n/12
-    assert low < np.mean(position**2) / (qa * step_s**3 * (steps**3 / 3 - steps / 12)) < high
-
-
-def test_damped_walk_settles_at_its_speed():
-    count, qa, damping_s = 300, 0.5, 2.0
-    speeds = []
-    for seed in range(count):
-        walk = RandomWalk((0, 0, 0), (-1e3,) * 3, (1e3,) * 3, qa_m2ps3=qa, damping_s=damping_s, seed=seed)
-        speeds.append(walk.velocity(20.0))
-    low, high = chi2.ppf([1e-4, 1 - 1e-4], 3 * count) / (3 * count)
-    assert low < np.mean(np.square(speeds)) / (qa * damping_s / 2.0) < high
 
 
 def test_roaming_keeps_its_spread_and_speed_from_the_start_on():

@@ -31,14 +31,27 @@ def decode_any(frame: bytes) -> SiteBeacon | Malformed:
     return decode_cached(frame)
 
 
-class AnchorMachine(Protocol):
-    """The protocol machine of an anchor: bytes and ticks in, frames and ticks out; no I/O, no clock."""
-
-    counters: Counter[str]
+class BeaconSender(Protocol):
+    """An anchor as its radio uses it: bytes and ticks in, frames and ticks out; no I/O, no clock."""
 
     @property
     def id(self) -> int:
         """Identifier of the anchor."""
+
+    def hear(self, reception: Reception) -> None:
+        """Process a frame from the air; one that does not belong here is counted and dropped."""
+
+    def next_transmission_ticks(self, now_ticks: int) -> int | None:
+        """TX stamp (40-bit, own counter) of the next frame that can still be made; None while that is not known."""
+
+    def transmission(self, tx_ticks: int) -> Transmission:
+        """The frame for the time that ``next_transmission_ticks`` gave last."""
+
+
+class AnchorMachine(BeaconSender, Protocol):
+    """The protocol machine of an anchor, as its program uses it."""
+
+    counters: Counter[str]
 
     @property
     def interval_ticks(self) -> float:
@@ -49,15 +62,6 @@ class AnchorMachine(Protocol):
 
     def place(self, site: Site) -> None:
         """Use other positions and antenna delays of the same anchors, and go on."""
-
-    def hear(self, reception: Reception) -> None:
-        """Process a frame from the air; one that does not belong here is counted and dropped."""
-
-    def next_transmission_ticks(self, now_ticks: int) -> int | None:
-        """TX stamp (40-bit, own counter) of the next frame that can still be made; None while that is not known."""
-
-    def transmission(self, tx_ticks: int) -> Transmission:
-        """The frame for the time that ``next_transmission_ticks`` gave last."""
 
 
 def new_anchor(

@@ -50,14 +50,13 @@ RECEPTION_RECORD: Final = np.dtype(
         ("node", np.int64),
         ("rx_ticks", np.int64),  # the listener's 40-bit counter
         ("position_m", np.float64, (3,)),
-        ("velocity_mps", np.float64, (3,)),
         ("rx_power_dbm", np.float64),
         ("first_path_power_dbm", np.float64),
         ("carrier_offset_ppm", np.float64),
     ],
     align=True,
 )
-"""One frame at one node that received it; position and velocity are the true ones at the frame's emission."""
+"""One frame at one node that received it; the position is the true one at the frame's emission."""
 
 
 @kernel
@@ -178,15 +177,6 @@ def stamp(
 
 
 @part
-def fill_truth(stations: Records, node: int, t_s: float, row: np.void) -> None:
-    """Fill in the true position and velocity of a listener."""
-    row["node"] = node
-    for axis in range(3):
-        row["position_m"][axis] = coordinate_m(stations, node, axis, t_s)
-        row["velocity_mps"][axis] = velocity_mps(stations, node, axis, t_s)
-
-
-@part
 def measure(
     clocks: Records,
     channel: Records,
@@ -251,7 +241,9 @@ def receive_frame(
         tally[station["is_tag"], outcome] += 1
         if outcome == _HEARD:
             row = heard[count]
-            fill_truth(stations, node, t_s, row)
+            row["node"] = node
+            for axis in range(3):
+                row["position_m"][axis] = coordinate_m(stations, node, axis, t_s)
             extra_m += extra_path_m(stations, channel, normals, cursors, node, bias_m) + body_m(
                 stations, sender, node, t_s
             )

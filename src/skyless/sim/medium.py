@@ -164,10 +164,11 @@ class Delivery:
     by_tags: Records
 
 
-class MediumBase(Generic[Result]):
-    """What every medium of a site has: true time, nodes and their power, the tags' motion, counts.
+class Medium(Generic[Result]):
+    """A site's air, deterministic by its seed; memory stays flat however long it runs.
 
-    Nodes are numbered: the site's anchors in the order of its file, then the tags; all are off at first.
+    Nodes are numbered: the site's anchors in the order of its file, then the tags; all are off at first. A node's noise
+    depends on the seed and on its own key alone: more tags do not change what the others receive.
     """
 
     def __init__(
@@ -175,9 +176,17 @@ class MediumBase(Generic[Result]):
         site: Site,
         tags: Sequence[TagSpec],
         impairments: Impairments,
+        seed: int,
         deliver: Callable[[Delivery], Result | None],
+        turnaround_s: float = TURNAROUND_S,
     ) -> None:
-        self._anchors, self._tags = site.anchors, tuple(tags)
+        """``deliver`` is called with every frame when it ends; ``run`` yields what it returns.
+
+        ``turnaround_s``: how long before its preamble a frame must come.
+
+        Raises ValueError when an impairment names an anchor that the site has not.
+        """
+        self._anchors, self._tags, self._impairments = site.anchors, tuple(tags), impairments
         self.node_of = {anchor.id: node for node, anchor in enumerate(site.anchors)}
         """Nodes of the anchors, by their identifiers."""
         self.stations = make_stations(site.anchors, self._tags, impairments)
@@ -188,6 +197,21 @@ class MediumBase(Generic[Result]):
         self._transmissions = self._late = 0
         self._deliver = deliver
         self.timeline: Timeline[Result] = Timeline()
+        self._least_ahead_ticks = _PREAMBLE_TICKS + from_seconds(turnaround_s)
+        _check_names(impairments, self.node_of)
+        keys = [(ANCHOR_KEY, anchor.id) for anchor in site.anchors] + [(TAG_KEY, tag) for tag in range(len(tags))]
+        self._setups = [stream(seed, *key, purpose=1) for key in keys]
+        self._streams = Streams([stream(seed, *key) for key in keys])
+        self.clocks = make_clocks(impairments.oscillator, self._setups)
+        self._warm_up()
+        self.range_errors = RangeErrors(impairments.range_errors, len(tags), len(site.anchors), seed)
+        self._pair_errors = AnchorPairErrors(impairments.anchor_pair_errors, self.node_of, seed)
+        self._plan_changes()
+        self._channel, self._walls = pack_channel(impairments.channel), pack_walls(site.walls)
+        self._air = OnAir()
+        self._missed_ticks = 0
+        """Frames that should have left before are not sent."""
+        self._received = np.zeros(len(keys), dtype=RECEPTION_RECORD)
 
     @property
     def tally(self) -> Tally:
@@ -215,58 +239,6 @@ class MediumBase(Generic[Result]):
         self.stations[node]["on"] = 1
         if self.timeline.now_ticks > 0:
             self._restart_counter(node)
-
-    def _restart_counter(self, node: int) -> None:
-        raise NotImplementedError
-
-    def _move_tags(self, t_s: float) -> None:
-        """Set the next piece of every trajectory whose present one has ended."""
-        for tag in np.flatnonzero(self._piece_ends_s <= t_s).tolist():
-            piece = self._tags[tag].trajectory.piece(t_s)
-            set_piece(self.stations, len(self._anchors) + tag, piece)
-            self._piece_ends_s[tag] = piece.end_s
-
-
-class Medium(MediumBase[Result]):
-    """A site's air, deterministic by its seed; memory stays flat however long it runs.
-
-    A node's noise depends on the seed and on its own key alone: more tags do not change what the others receive.
-    """
-
-    def __init__(
-        self,
-        site: Site,
-        tags: Sequence[TagSpec],
-        impairments: Impairments,
-        seed: int,
-        deliver: Callable[[Delivery], Result | None],
-        turnaround_s: float = TURNAROUND_S,
-    ) -> None:
-        """``deliver`` is called with every frame when it ends; ``run`` yields what it returns.
-
-        ``turnaround_s`` is for a smaller one than usual, where frames keep to slots that never overlap.
-
-        Raises ValueError when an impairment names an anchor that the site has not.
-        """
-        super().__init__(site, tags, impairments, deliver)
-        self._impairments = impairments
-        self._least_ahead_ticks = _PREAMBLE_TICKS + from_seconds(turnaround_s)
-        _check_names(impairments, self.node_of)
-        keys = [(ANCHOR_KEY, anchor.id) for anchor in site.anchors] + [(TAG_KEY, tag) for tag in range(len(tags))]
-        self._setups = [stream(seed, *key, purpose=1) for key in keys]
-        self._streams = Streams([stream(seed, *key) for key in keys])
-        self.clocks = make_clocks(impairments.oscillator, self._setups)
-        self._warm_up()
-        self.range_errors = RangeErrors(
-            impairments.range_errors, [tag.range_errors_m for tag in self._tags], len(site.anchors), seed
-        )
-        self._pair_errors = AnchorPairErrors(impairments.anchor_pair_errors, self.node_of, seed)
-        self._plan_changes()
-        self._channel, self._walls = pack_channel(impairments.channel), pack_walls(site.walls)
-        self._air = OnAir()
-        self._missed_ticks = 0
-        """Frames that should have left before are not sent."""
-        self._received = np.zeros(len(keys), dtype=RECEPTION_RECORD)
 
     # Clocks
 
@@ -372,6 +344,13 @@ class Medium(MediumBase[Result]):
         self._transmissions += 1
         delivery = Delivery(flight, self._received[:anchors].copy(), self._received[anchors:count].copy())
         self.timeline.at(flight.end_ticks, partial(self._deliver, delivery))
+
+    def _move_tags(self, t_s: float) -> None:
+        """Set the next piece of every trajectory whose present one has ended."""
+        for tag in np.flatnonzero(self._piece_ends_s <= t_s).tolist():
+            piece = self._tags[tag].trajectory.piece(t_s)
+            set_piece(self.stations, len(self._anchors) + tag, piece)
+            self._piece_ends_s[tag] = piece.end_s
 
     def _bias_m(self, node: int, t_s: float) -> float:
         anchor = self._anchors[node].id

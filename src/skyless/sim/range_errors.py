@@ -5,7 +5,6 @@ processes (exponential correlation) along time or along the path of a tag, drawn
 """
 
 import math
-from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -59,20 +58,13 @@ def slope_error_m(slope_m: float, distance_m: float) -> float:
 
 
 class RangeErrors:
-    """The present errors of all pairs; those of a tag depend on the seed, its number and its path alone."""
+    """The present errors of all pairs. Those of a tag depend on the seed, its number and its path alone."""
 
-    def __init__(self, model: RangeErrorModel, own_m: Sequence[tuple[float, ...]], anchors: int, seed: int) -> None:
-        """``own_m`` holds each tag's given constants, one for each anchor or none.
-
-        Raises ValueError where there are some, but not one for each anchor.
-        """
-        tags = len(own_m)
-        if any(len(given) not in {0, anchors} for given in own_m):
-            raise ValueError(f"range_errors_m of a tag should have {anchors} values, one for each anchor, or none")
+    def __init__(self, model: RangeErrorModel, tags: int, anchors: int, seed: int) -> None:
         self.present_m: Array = np.zeros((anchors + tags, anchors))
         """Shape (nodes, anchors) as the kernels count them, without the slope's part; zeros for anchors."""
         self._model, self._anchors = model, anchors
-        self._constant_m = np.array([given or (0.0,) * anchors for given in own_m]).reshape(tags, anchors)
+        self._constant_m = np.zeros((tags, anchors))
         self._step = (model.correlation_s or model.correlation_m or math.inf) / _KNOTS
         self._travelled = np.zeros(tags)
         """Time or path length of each tag so far."""
@@ -83,7 +75,7 @@ class RangeErrors:
         if model.constant_m > 0.0 or model.changing_m > 0.0:
             self._draws = [stream(seed, TAG_KEY, tag, _PURPOSE) for tag in range(tags)]
         for tag, draw in enumerate(self._draws):
-            self._constant_m[tag] += draw.uniform(-model.constant_m, model.constant_m, anchors)
+            self._constant_m[tag] = draw.uniform(-model.constant_m, model.constant_m, anchors)
             self._before_m[tag] = model.changing_m * draw.standard_normal(anchors)
             self._after_m[tag] = self._next(tag)
         self.present_m[anchors:] = self._constant_m

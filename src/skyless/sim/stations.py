@@ -19,11 +19,7 @@ class TagSpec(Struct, frozen=True):
     """A tag of a world, without what it computes."""
 
     trajectory: Trajectory
-    rx_delay_error_ticks: float = 0.0
-    """True minus configured antenna delay."""
     outages: tuple[Outage, ...] = ()
-    range_errors_m: tuple[float, ...] = ()
-    """Constant range error to each anchor (positive: late), in the order of the site file; () for none."""
 
 
 STATION: Final = np.dtype(
@@ -53,7 +49,6 @@ def make_stations(anchors: Sequence[AnchorSite], tags: Sequence[TagSpec], impair
     stations["tx_noise_ticks"] = impairments.tx_stamp_ps * 1e-12 / TICK_S
     stations["rx_noise_ticks"] = impairments.rx_stamp_ps * 1e-12 / TICK_S
     stations["is_tag"][len(anchors) :] = 1
-    stations["rx_error_ticks"][len(anchors) :] = [tag.rx_delay_error_ticks for tag in tags]
     body = impairments.body
     if body is not None:
         carried = stations[len(anchors) :]

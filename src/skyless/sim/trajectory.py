@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 from skyless.core.kernels.arrays import Array
 from skyless.sim.streams import stream
 
-_WALK_KEY: Final = 2
 _ROAM_KEY: Final = 5
 
 
@@ -157,92 +156,12 @@ def _as_points(points_m: ArrayLike) -> Array:
     return np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
 
 
-class RandomWalk(Trajectory):
-    """A random walk in a box: a random acceleration every ``step_s``, and walls that reflect.
-
-    The velocity gains variance qa per second and axis (the process noise that a constant-velocity filter
-    assumes); with ``damping_s`` it also decays with that time constant (Ornstein–Uhlenbeck), towards a standard
-    deviation of √(qa·damping_s/2). An axis whose low and high are equal does not move.
-    """
-
-    def __init__(
-        self,
-        start_m: ArrayLike,
-        low_m: ArrayLike,
-        high_m: ArrayLike,
-        *,
-        qa_m2ps3: float = 0.5,
-        velocity_mps: ArrayLike = (0.0, 0.0, 0.0),
-        damping_s: float = math.inf,
-        step_s: float = 0.1,
-        start_s: float = 0.0,
-        seed: int = 0,
-    ) -> None:
-        """``start_m``, ``low_m``, ``high_m``, ``velocity_mps`` have shape (3,). Raises ValueError outside the box."""
-        self._start_m = np.array(start_m, dtype=np.float64)
-        self._low_m, self._high_m = np.array(low_m, dtype=np.float64), np.array(high_m, dtype=np.float64)
-        if not np.all((self._low_m <= self._start_m) & (self._start_m <= self._high_m)):
-            raise ValueError("a random walk should start inside its box, with low_m ≤ start_m ≤ high_m")
-        self._free = self._low_m < self._high_m
-        self._start_mps = np.where(self._free, np.array(velocity_mps, dtype=np.float64), 0.0)
-        self._step_s, self._start_s, self._seed = step_s, start_s, seed
-        self._kept = math.exp(-step_s / damping_s)
-        gained = step_s if math.isinf(damping_s) else 0.5 * damping_s * (1.0 - self._kept**2)
-        self._kick_mps = math.sqrt(qa_m2ps3 * gained)
-        self._begin()
-
-    def piece(self, t_s: float) -> Piece:
-        """See ``Trajectory``; going back in time starts again."""
-        if t_s < self._start_s:
-            return _rest(self._start_m, end_s=self._start_s)
-        if t_s < self._piece.start_s:
-            self._begin()
-        while t_s >= self._piece.end_s:
-            self._continue()
-        return self._piece
-
-    def _begin(self) -> None:
-        self._generator = stream(self._seed, _WALK_KEY, 0)
-        self._steps = 0
-        begin_s = self._start_s
-        self._piece = Piece(begin_s, begin_s, begin_s, self._start_m, self._start_mps, np.zeros(3))
-
-    def _continue(self) -> None:
-        """Append the next piece: a new step with a new acceleration, or the rest of a step after a wall."""
-        last = self._piece
-        now_s, dt_s = last.end_s, last.end_s - last.origin_s
-        position = last.position_m + dt_s * (last.velocity_mps + 0.5 * dt_s * last.acceleration_mps2)
-        velocity = last.velocity_mps + dt_s * last.acceleration_mps2
-        if now_s >= self._start_s + self._steps * self._step_s:
-            self._steps += 1
-            kicks = np.where(self._free, self._kick_mps * self._generator.standard_normal(3), 0.0)
-            acceleration = ((self._kept - 1.0) * velocity + kicks) / self._step_s
-        else:
-            mirror = np.ones(3)
-            mirror[self._next_wall(last)[0]] = -1.0
-            velocity, acceleration = mirror * velocity, mirror * last.acceleration_mps2
-        step_end_s = self._start_s + self._steps * self._step_s
-        position = np.clip(position, self._low_m, self._high_m)
-        moving = Piece(now_s, step_end_s, now_s, position, velocity, acceleration)
-        self._piece = moving._replace(end_s=min(step_end_s, now_s + self._next_wall(moving)[1]))
-
-    def _next_wall(self, piece: Piece) -> tuple[int, float]:
-        """Axis and time from the piece's origin of the first wall that its motion runs into."""
-        axis_hit, first_s = 0, math.inf
-        for axis in range(3):
-            x, v, a = (float(vector[axis]) for vector in piece[3:])
-            for gap_m, outwards in ((self._high_m[axis] - x, 1.0), (x - self._low_m[axis], -1.0)):
-                hit_s = _time_to_wall(float(gap_m), outwards * v, outwards * a) if self._free[axis] else math.inf
-                if hit_s < first_s:
-                    axis_hit, first_s = axis, hit_s
-        return axis_hit, first_s
-
-
 class Roaming(Trajectory):
-    """A random walk about a point: random accelerations as of ``RandomWalk``, without abrupt turns.
+    """A random walk about a point: a random acceleration every ``step_s``, without abrupt turns.
 
-    Damping and a spring hold it: each coordinate is normal about the middle, with ``std_m``, and its velocity with a
-    standard deviation of √(qa·damping_s/2), from the start on. An axis whose ``std_m`` is 0 does not move.
+    The velocity gains variance qa per second and axis, the process noise that a constant-velocity filter assumes.
+    Damping and a spring hold the walk. From the start on each coordinate is normal about the middle, with ``std_m``,
+    and its velocity has a standard deviation of √(qa·damping_s/2). An axis whose ``std_m`` is 0 does not move.
     """
 
     def __init__(
@@ -289,16 +208,3 @@ class Roaming(Trajectory):
         start_s = self._steps * self._step_s
         self._steps += 1
         self._piece = Piece(start_s, self._steps * self._step_s, start_s, position_m, velocity_mps, push)
-
-
-def _time_to_wall(gap_m: float, speed_mps: float, acceleration_mps2: float) -> float:
-    """Time until a motion crosses a wall outwards from ``gap_m`` inside; infinite when it never does."""
-    discriminant = speed_mps * speed_mps + 2.0 * acceleration_mps2 * gap_m
-    if discriminant < 0.0:
-        return math.inf
-    root = math.sqrt(discriminant)
-    if speed_mps >= 0.0:
-        if speed_mps + root > 0.0:
-            return 2.0 * gap_m / (speed_mps + root)
-        return 0.0 if acceleration_mps2 > 0.0 else math.inf
-    return (root - speed_mps) / acceleration_mps2 if acceleration_mps2 > 0.0 else math.inf

@@ -8,41 +8,21 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
-from skyless.core.air.reception import Diagnostics, Reception, Transmission
+from skyless.core.air.reception import Diagnostics, Reception
 from skyless.core.constants import TICK_S
 from skyless.core.kernels.arrays import Array, Integers
+from skyless.core.protocols import BeaconSender
 from skyless.core.site import Site
 from skyless.core.ticks import difference, from_seconds, wrap
 from skyless.sim.impairments import Impairments
-from skyless.sim.medium import Delivery, Medium, Tally, Timeline
+from skyless.sim.medium import Delivery, Medium, Tally
 from skyless.sim.stations import TagSpec
 
 _RETRY_TICKS: Final = from_seconds(5e-3)
-
-
-class AnchorMachine(Protocol):
-    """An anchor as its radio uses it (``skyless.core.anchor.anchor.Anchor`` is one)."""
-
-    @property
-    def id(self) -> int:
-        """Identifier of the anchor, 16 bits."""
-
-    def hear(self, reception: Reception) -> None:
-        """Process one frame from the air; never raises."""
-
-    def next_transmission_ticks(self, now_ticks: int) -> int | None:
-        """TX stamp (own 40-bit counter) of the next frame, at least a lead time after now; None: ask later."""
-
-    def transmission(self, tx_ticks: int) -> Transmission:
-        """The frame for that slot, made as late as possible so that it carries the latest receptions."""
-
-
-AnchorFactory = Callable[[int], AnchorMachine]
-"""Makes a machine for an anchor's identifier; called again when that anchor restarts."""
 
 
 @dataclass(slots=True, eq=False)
@@ -63,8 +43,6 @@ class Broadcast:
     """Their RX stamps, 40 bits, shape (n,)."""
     positions_m: Array
     """Their true positions at the emission, shape (n, 3)."""
-    velocities_mps: Array
-    """Their true velocities, shape (n, 3)."""
     diagnostics: tuple[Diagnostics, ...] | None
     """What their radios measured, where the impairments ask for it."""
 
@@ -82,44 +60,6 @@ class Broadcast:
             yield tag, Reception(frame, rx_ticks, host_s, diagnostics), position_m
 
 
-class Air(Protocol):
-    """A medium as a world uses it (``Medium``, ``CellMedium``); its methods are described in ``Medium``."""
-
-    node_of: dict[int, int]
-    boots: list[int]
-    timeline: Timeline[Broadcast]
-
-    @property
-    def tally(self) -> Tally:
-        """What was sent, heard and lost so far, by reason."""
-
-    @property
-    def now_s(self) -> float:
-        """True time that has passed."""
-
-    def run(self, until_s: float) -> Iterator[Broadcast]:
-        """Let true time pass."""
-
-    def switch_off(self, node: int) -> None:
-        """Switch a node off."""
-
-    def switch_on(self, node: int) -> None:
-        """Switch a node on."""
-
-    def read_counter(self, node: int) -> int:
-        """A node's unwrapped counter at present."""
-
-    def foresee(self, node: int, local_ticks: int) -> int:
-        """True time in whole ticks at which a node's unwrapped counter will show a value."""
-
-    def transmit(self, node: int, transmission: Transmission) -> bool:
-        """Plan the flight of a frame; False if it comes too late."""
-
-
-AirMaker = Callable[[Site, Sequence[TagSpec], Impairments, int, Callable[[Delivery], Broadcast | None]], Air]
-"""Makes the medium of a world: a class such as ``Medium``."""
-
-
 def diagnostics_of(row: np.void) -> Diagnostics:
     """Diagnostics in a row (``RECEPTION_RECORD``) of a node."""
     return Diagnostics(float(row["rx_power_dbm"]), float(row["first_path_power_dbm"]), float(row["carrier_offset_ppm"]))
@@ -131,27 +71,26 @@ class World:
     def __init__(
         self,
         site: Site,
-        anchor_factory: AnchorFactory,
+        anchor_factory: Callable[[int], BeaconSender],
         tags: Sequence[TagSpec],
         impairments: Impairments,
         seed: int,
         *,
         lead_s: float = 1e-3,
-        on_tag_restart: Callable[[int], None] | None = None,
-        medium: AirMaker = Medium,
     ) -> None:
-        """``lead_s``: how long before its RMARKER a frame is fetched; ``on_tag_restart`` is given a tag's index.
+        """``anchor_factory`` makes a machine for an anchor's identifier, again when that anchor restarts.
 
-        ``medium``: ``Medium``, or ``CellMedium`` for sites of several cells. Raises ValueError when an impairment names
-        an anchor that the site has not, or is not modelled by the medium.
+        ``lead_s``: how long before its RMARKER a frame is fetched.
+
+        Raises ValueError when an impairment names an anchor that the site has not.
         """
         self._anchors, self._tags, self._impairments = site.anchors, tuple(tags), impairments
-        self._factory, self._on_tag_restart = anchor_factory, on_tag_restart
-        self.medium = medium(site, self._tags, impairments, seed, self._deliver)
+        self._factory = anchor_factory
+        self.medium: Medium[Broadcast] = Medium(site, self._tags, impairments, seed, self._deliver)
         self._timeline = self.medium.timeline
         self._lead_ticks = from_seconds(lead_s)
         nodes = len(self._anchors) + len(self._tags)
-        self._machines: list[AnchorMachine | None] = [None] * nodes
+        self._machines: list[BeaconSender | None] = [None] * nodes
         self._reasons_off = [1] * nodes
         self._plan_power()
 
@@ -194,12 +133,9 @@ class World:
         if self._reasons_off[node] > 0:
             return
         self.medium.switch_on(node)
-        tag = node - len(self._anchors)
-        if tag < 0:
+        if node < len(self._anchors):
             self._machines[node] = self._factory(self._anchors[node].id)
             self._timeline.at(self._timeline.now_ticks, partial(self._ask, node, self.medium.boots[node]))
-        elif self._timeline.now_ticks > 0 and self._on_tag_restart is not None:
-            self._on_tag_restart(tag)
 
     # Transmissions
 
@@ -245,6 +181,5 @@ class World:
             by_tags["node"] - len(self._anchors),
             by_tags["rx_ticks"],
             by_tags["position_m"],
-            by_tags["velocity_mps"],
             tuple(diagnostics_of(row) for row in by_tags) if diagnostics else None,
         )

@@ -8,12 +8,11 @@ from msgspec import Struct
 from skyless.core.air.frame import AnyBeacon
 from skyless.core.ticks import continued, from_seconds, wrap
 
+# A counter has restarted once this number of stamps in a row were impossible and none has fitted for both of these
+# times: forged frames in between do not replace an anchor that still sends.
 STAMPS_BEFORE_RESTART: Final = 3
-"""This number of impossible stamps of one anchor in a row mean that its counter has restarted, ..."""
-
 RESTART_SILENCE_TICKS: Final = from_seconds(0.2)
 RESTART_SILENCE_PERIODS: Final = 4
-"""... if none has fitted for both of these: forged frames in between do not replace an anchor that still sends."""
 
 MAX_TRACKS: Final = 256
 """More anchors than there are in reach; with more identifiers on the air, that received longest ago is forgotten, those

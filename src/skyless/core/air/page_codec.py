@@ -3,7 +3,7 @@
 import struct
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from skyless.core.air.almanac import (
     AccuracyPage,
@@ -51,31 +51,17 @@ _CIRCLE: Final = 3_600_000_000
 
 
 @lru_cache(maxsize=1024)
-def encode_page(page: Page) -> bytes:  # noqa: PLR0911 - one for each type
+def encode_page(page: Page) -> bytes:
     """Return the 17 bytes of a page.
 
     Coordinates are rounded to 1 mm, angles to 1e-7 degree (at most 5.6 mm on the ground), noise to float32.
-    Of accuracy, standard deviations are rounded to 0.1 mm, the distance to 1 cm and the time to 0.1 s; neither of
-    the latter two to 0.
+    In an accuracy page standard deviations are rounded to 0.1 mm, the distance to 1 cm and the time to 0.1 s; neither
+    of the latter two to 0.
 
     Raises:
         ValueError: a field is out of its range; the message names it.
     """
-    match page:
-        case AnchorPage():
-            return _encode_anchor(page)
-        case SchedulePage():
-            return _encode_schedule(page)
-        case NoisePage():
-            return _encode_noise(page)
-        case GeoreferencePage():
-            return _encode_georeference(page)
-        case AccuracyPage():
-            return _encode_accuracy(page)
-        case SitePage():
-            return _encode_site(page)
-        case KeyPage():
-            return _encode_key(page)
+    return _ENCODERS[type(page)](page)
 
 
 @lru_cache(maxsize=1024)
@@ -236,10 +222,15 @@ def _decode_site(data: bytes) -> SitePage | None:
     return SitePage(pages, height_m) if possible else None
 
 
-def _decode_key(data: bytes) -> KeyPage:
-    return KeyPage(data[1:])
-
-
+_ENCODERS: Final[dict[type, Callable[[Any], bytes]]] = {
+    AnchorPage: _encode_anchor,
+    SchedulePage: _encode_schedule,
+    NoisePage: _encode_noise,
+    GeoreferencePage: _encode_georeference,
+    AccuracyPage: _encode_accuracy,
+    SitePage: _encode_site,
+    KeyPage: _encode_key,
+}
 _DECODERS: Final[dict[int, Callable[[bytes], Page | None]]] = {
     _ANCHOR_TYPE: _decode_anchor,
     _SCHEDULE_TYPE: _decode_schedule,
@@ -247,5 +238,5 @@ _DECODERS: Final[dict[int, Callable[[bytes], Page | None]]] = {
     _GEOREFERENCE_TYPE: _decode_georeference,
     _ACCURACY_TYPE: _decode_accuracy,
     _SITE_TYPE: _decode_site,
-    _KEY_TYPE: _decode_key,
+    _KEY_TYPE: lambda data: KeyPage(data[1:]),
 }

@@ -18,7 +18,7 @@ from skyless.core.air.frame import Heard, Malformed
 from skyless.core.air.instants import PERIOD_CHANGES, gap_ticks, period_code, period_ticks, suitable_period_s
 from skyless.core.air.local_almanac import site_issue, site_pages_of, stated_position
 from skyless.core.air.reception import Reception, Transmission
-from skyless.core.anchor.authentication import BeaconAuthentication, contents_of, sealed
+from skyless.core.anchor.authentication import BeaconAuthentication, Contents
 from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS
 from skyless.core.site import AnchorSite, Site, UnplacedAnchor
 from skyless.core.ticks import Unwrapper, from_seconds, to_seconds, wrap
@@ -128,9 +128,8 @@ class Anchor:
     def transmission(self, tx_ticks: int) -> Transmission:
         """The frame for the time that ``next_transmission_ticks`` gave last."""
         assert self._next_ticks is not None
-        added = contents_of(
-            self.authentication, tx_ticks, self._sequence, self.id, to_seconds(period_ticks(self._period_code))
-        )
+        keys, period_s = self.authentication, to_seconds(period_ticks(self._period_code))
+        added = Contents() if keys is None else keys.contents(tx_ticks, self._sequence, self.id, period_s)
         position = None if added.certificate else self._position
         capacity = heard_capacity(position=position is not None, certificate=added.certificate is not None)
         heard, weak = self._relayed(self._next_ticks, capacity)
@@ -141,7 +140,8 @@ class Anchor:
         )  # fmt: skip
         self._advance()
         self.counters["sent"] += 1
-        return Transmission(sealed(self.authentication, encode(beacon), added), tx_ticks)
+        frame = encode(beacon)
+        return Transmission(frame if keys is None else keys.seal(frame, added.interval), tx_ticks)
 
     def _advance(self) -> None:
         """Go on to the next frame, with another period where the number of anchors in reach requires it."""

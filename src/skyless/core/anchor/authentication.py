@@ -203,15 +203,3 @@ class BeaconAuthentication:
     def _unix_s(self, ticks: int) -> float:
         assert self._now is not None
         return self._now[1] + difference(ticks, self._now[0]) * TICK_S
-
-
-def contents_of(
-    authentication: BeaconAuthentication | None, tx_ticks: int, sequence: int, anchor: int, period_s: float
-) -> Contents:
-    """What authentication puts in a frame; nothing without keys."""
-    return Contents() if authentication is None else authentication.contents(tx_ticks, sequence, anchor, period_s)
-
-
-def sealed(authentication: BeaconAuthentication | None, frame: bytes, contents: Contents) -> bytes:
-    """A frame with these contents, with its code where the anchor has keys."""
-    return frame if authentication is None else authentication.seal(frame, contents.interval)

@@ -7,7 +7,7 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.core.constants import MAX_DRIFT
-from skyless.core.ticks import difference, from_seconds, wrap
+from skyless.core.ticks import difference, from_seconds
 
 SLACK_TICKS: Final = from_seconds(1e-6)
 """A frame cannot be received whole and sent again in less than 100 times that."""
@@ -17,7 +17,7 @@ SILENCE_TICKS: Final = from_seconds(1.0)
 
 
 class Stamps(Struct, frozen=True, gc=False):
-    """Of one genuine frame."""
+    """Stamps of one genuine frame."""
 
     anchor: int
     rx_ticks: int
@@ -58,8 +58,7 @@ class Arrivals:
         last = self._references.get(one.anchor)
         if last is None:
             return not self._references
-        elapsed = one.rx_ticks - last.rx_ticks
-        return abs(difference(wrap(last.tx_ticks + elapsed), one.tx_ticks)) <= SLACK_TICKS + MAX_DRIFT * abs(elapsed)
+        return not _delay_ticks(last, one)
 
     def of(self, frames: Sequence[Stamps]) -> list[Arrival]:
         """How genuine frames came that are known together, in the order of their reception.
@@ -72,13 +71,11 @@ class Arrivals:
             if last is None:
                 references[one.anchor] = _Reference(one.rx_ticks, one.tx_ticks, 1)
                 continue
-            elapsed = one.rx_ticks - last.rx_ticks
-            delay_ticks = difference(wrap(last.tx_ticks + elapsed), one.tx_ticks)
-            limit_ticks = SLACK_TICKS + MAX_DRIFT * abs(elapsed)
-            if abs(delay_ticks) <= limit_ticks:
+            delay_ticks = _delay_ticks(last, one)
+            if not delay_ticks:
                 last.frames += 1
                 last.rx_ticks, last.tx_ticks = one.rx_ticks, one.tx_ticks
-            elif delay_ticks > 0 and elapsed <= SILENCE_TICKS:
+            elif delay_ticks > 0 and one.rx_ticks - last.rx_ticks <= SILENCE_TICKS:
                 late.add(number)
             else:
                 late.update(before for before in range(number) if frames[before].anchor == one.anchor)
@@ -87,3 +84,10 @@ class Arrivals:
             return [Arrival.IN_TIME] * len(frames)
         known = [Arrival.IN_TIME if references[one.anchor].frames > 1 else Arrival.FIRST for one in frames]
         return [Arrival.LATE if number in late else arrival for number, arrival in enumerate(known)]
+
+
+def _delay_ticks(last: _Reference, one: Stamps) -> int:
+    """How much later than due a frame has come; 0 where crystals and noise explain it."""
+    elapsed = one.rx_ticks - last.rx_ticks
+    delay_ticks = difference(last.tx_ticks + elapsed, one.tx_ticks)
+    return 0 if abs(delay_ticks) <= SLACK_TICKS + MAX_DRIFT * abs(elapsed) else delay_ticks

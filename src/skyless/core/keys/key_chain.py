@@ -126,11 +126,6 @@ class ChainTiming(Struct, frozen=True, gc=False):
         """
         return self.anchors_apart_s + self.interval_s
 
-    @property
-    def most_clock_error_s(self) -> float:
-        """How far a tag's clock may be off without a genuine frame being refused: B of the budget."""
-        return 0.5 * ((self.lag - 1) * self.interval_s - self.anchor_lead_s - self.anchors_apart_s)
-
     def interval_at(self, unix_s: float) -> int:
         """Number of the interval at a Unix time."""
         return int(unix_s * 1000.0) // self.interval_ms

@@ -30,7 +30,7 @@ from skyless.sim.cells.reception import (
 )
 from skyless.sim.cells.timetable import BIN_BITS, Buckets, Table, latest
 from skyless.sim.range_errors import slope_error_m
-from skyless.sim.stations import coordinate_m, velocity_mps
+from skyless.sim.stations import coordinate_m
 
 RELAY_AGE_TICKS: Final = round(1.0 * TICK_RATE_HZ)
 """Older receptions are not relayed, as in ``skyless.core.anchor.anchor``."""
@@ -277,38 +277,6 @@ def fill_relays(
 
 
 @kernel
-def receive_at_anchors(
-    scene: Scene,
-    listeners: Integers,
-    from_ticks: int,
-    to_ticks: int,
-    spare: int,
-    rows: tuple[Integers, Integers, Integers, Integers],
-) -> tuple[int, int]:
-    """All receptions of anchors of frames emitted in [from, to), anchor by anchor, each newest first.
-
-    Fills listeners, senders, columns of the table and RX stamps, shape (most,) each, until fewer than ``spare`` rows
-    are left before a listener. Returns how many listeners are done, and how many rows are filled.
-    """
-    listening, senders, columns, rx_ticks = rows
-    done, count = 0, 0
-    while done < listeners.shape[0] and count + spare <= listening.shape[0]:
-        listener, until = listeners[done], to_ticks - 1
-        while until >= from_ticks:
-            since = max(until - _STRIDE_TICKS, from_ticks - 1)
-            found = candidates(scene, listener, since, until, senders[count:], columns[count:], senders[:0])
-            for i in range(count, count + found):
-                sender, k = senders[i], columns[i]
-                stamp = stamp_at_anchor(scene, listener, sender, k)
-                if stamp >= 0:
-                    listening[count], senders[count], columns[count], rx_ticks[count] = listener, sender, k, stamp
-                    count += 1
-            until = since
-        done += 1
-    return done, count
-
-
-@kernel
 def changing_error(errors: PairErrors, tag_key: int, anchor_key: int, knot: int) -> float:
     """A range error's changing part at a knot, standard normal: exponential weights over keyed normals."""
     kept = math.exp(-1.0 / KNOTS_A_LENGTH)
@@ -332,12 +300,12 @@ def receive_at_tag(
     senders: Integers,
     columns: Integers,
     rx_ticks: Integers,
-    motion: Array,
+    points_m: Array,
 ) -> int:
     """All receptions of a tag of frames emitted in [from, to), sender by sender; returns their number.
 
     ``near`` are the anchors that it may receive. Fills senders, columns of the table, RX stamps, shape (most,) each,
-    and true position and velocity at the emission, shape (most, 6).
+    and true positions at the emission, shape (most, 3).
     """
     table, rules = scene.table, scene.rules
     key = scene.keys[node]
@@ -389,8 +357,6 @@ def receive_at_tag(
             rx_ticks[count] = rx_stamp(
                 rules, scene.knots, node, (key, scene.keys[sender], number), ticks, arrival_ticks
             )
-            motion[count, 0], motion[count, 1], motion[count, 2] = x_m, y_m, z_m
-            for axis in range(3):
-                motion[count, 3 + axis] = velocity_mps(path.pieces, piece, axis, t_s)
+            points_m[count, 0], points_m[count, 1], points_m[count, 2] = x_m, y_m, z_m
             count += 1
     return count

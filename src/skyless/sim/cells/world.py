@@ -15,7 +15,7 @@ from msgspec import Struct
 
 from skyless.core.air.ieee802154 import after_rmarker_s
 from skyless.core.air.instants import period_ticks
-from skyless.core.constants import DEFAULT_ANTENNA_DELAY_TICKS, TICK_S
+from skyless.core.constants import TICK_S
 from skyless.core.kernels.arrays import Array, Integers
 from skyless.core.kernels.compiled import kernel
 from skyless.core.site import Site
@@ -31,7 +31,6 @@ from skyless.sim.cells.keyed import (
     normal,
     purpose_key,
 )
-from skyless.sim.cells.medium import refuse_unmodelled
 from skyless.sim.cells.paths import TagPath
 from skyless.sim.cells.reception import PREAMBLE_TICKS, rules_of
 from skyless.sim.cells.receptions import (
@@ -41,7 +40,6 @@ from skyless.sim.cells.receptions import (
     Path,
     Scene,
     fill_relays,
-    receive_at_anchors,
     receive_at_tag,
 )
 from skyless.sim.cells.timetable import (
@@ -60,19 +58,17 @@ MAX_RELAYS: Final = 6
 FRAME_BYTES: Final = 123
 """Length of every frame: a beacon of protocol 2 with six relays and a page."""
 
-_CHUNK_ROWS: Final = 1 << 18
-"""Receptions of anchors are computed in chunks of this many."""
+_NOT_MODELLED: Final = (
+    "anchor_biases", "delay_errors", "anchor_outages", "anchor_displacements", "anchor_pair_errors", "body", "warm_ups",
+    "diagnostics",
+)  # fmt: skip
 
 _CELL_M: Final = 100.0
 """Width of the cells in which interferers are looked for; the reach of a frame is 193 m."""
 
 
 class CellAnchors(Struct, frozen=True):
-    """Anchors as arrays, so that 10,000 need no site file.
-
-    Raises:
-        ValueError: arrays of different lengths, or identifiers that are not unique.
-    """
+    """Anchors as arrays, so that 10,000 need no site file."""
 
     ids: Integers
     """Identifiers, shape (n,)."""
@@ -80,25 +76,6 @@ class CellAnchors(Struct, frozen=True):
     """As configured, shape (n, 3)."""
     tx_delays_ticks: Integers
     """Configured antenna delays, shape (n,)."""
-
-    def __post_init__(self) -> None:
-        count = len(self.ids)
-        if self.positions_m.shape != (count, 3) or self.tx_delays_ticks.shape != (count,):
-            raise ValueError(
-                f"{count} anchors have positions_m of shape {self.positions_m.shape} and tx_delays_ticks of "
-                f"{self.tx_delays_ticks.shape}; they should be ({count}, 3) and ({count},)"
-            )
-        if count == 0 or len(np.unique(self.ids)) < count:
-            raise ValueError(
-                f"{count} anchors with {len(np.unique(self.ids))} different identifiers; all should differ"
-            )
-
-
-def anchors_at(positions_m: Array) -> CellAnchors:
-    """Anchors 0, 1, ... at positions, shape (n, 3), with the common antenna delay."""
-    count = len(positions_m)
-    delays = np.full(count, DEFAULT_ANTENNA_DELAY_TICKS, dtype=np.int64)
-    return CellAnchors(np.arange(count), np.ascontiguousarray(positions_m, dtype=np.float64), delays)
 
 
 def anchors_of(site: Site) -> CellAnchors:
@@ -146,22 +123,6 @@ class TagReceptions:
         return np.asarray((self.emission_ticks + self.emission_fraction) * TICK_S)
 
 
-@dataclass(slots=True, eq=False)
-class AnchorReceptions:
-    """What anchors received in a span, one reception a row: by listener (as indexed), each in the order of emission."""
-
-    listener: Integers
-    """Identifiers of the listeners, shape (n,)."""
-    anchor: Integers
-    """Identifiers of the senders."""
-    sequence: Integers
-    tx_ticks: Integers
-    """The senders' TX stamps, 40 bits."""
-    rx_ticks: Integers
-    """The listeners' RX stamps, 40 bits."""
-    emission_ticks: Integers
-
-
 class CellWorld:
     """Many anchors, and tags that listen; deterministic by its seed."""
 
@@ -175,7 +136,6 @@ class CellWorld:
         *,
         dead: Sequence[bool] | None = None,
         survey_std_m: float = 0.0,
-        most_relays: int = MAX_RELAYS,
         frame_bytes: int = FRAME_BYTES,
         lead_s: float = 1e-3,
     ) -> None:
@@ -183,21 +143,15 @@ class CellWorld:
 
         ``dead``: which anchors neither send nor receive. ``survey_std_m``: true less configured positions, per axis.
 
-        ``lead_s``: how long before its RMARKER a frame's relays are fixed, as of ``World``. Of the impairments those of
-        stamps, oscillators, channel and range errors are modelled. Raises ValueError, which names the key, for others,
-        and for arrays that do not fit the anchors.
+        ``lead_s``: how long before its RMARKER a frame's relays are fixed, as in ``World``. Of the impairments those of
+        stamps, oscillators, channel and range errors are modelled. Raises ValueError, which names the key, for others.
         """
-        refuse_unmodelled(impairments, range_errors=True)
-        for name in ("anchor_outages", "anchor_displacements"):
-            if getattr(impairments, name):
-                raise ValueError(f"impairments.{name} is not empty; it should be: give dead or survey_std_m instead")
+        plain = Impairments()
+        for name in _NOT_MODELLED:
+            if getattr(impairments, name) != getattr(plain, name):
+                raise ValueError(f"impairments.{name} is {getattr(impairments, name)!r}: several cells do not model it")
         count = len(anchors.ids)
-        if dead is not None and len(dead) != count:
-            raise ValueError(f"dead has {len(dead)} values; it should have one for each of {count} anchors")
-        if len(period_codes) != count:
-            raise ValueError(f"{len(period_codes)} codes of periods; there should be one for each of {count} anchors")
         self.anchors, self.tags = anchors, tuple(tags)
-        self._most_relays = most_relays
         self._longest_period_ticks = max(map(period_ticks, period_codes.tolist()))
         self._lead_ticks, self._after_ticks = from_seconds(lead_s), from_seconds(after_rmarker_s(frame_bytes))
         keys = np.concatenate((anchors.ids, TAG_NODES + np.arange(len(self.tags)))).astype(np.int64)
@@ -241,26 +195,16 @@ class CellWorld:
                 yield self.receptions(tag, begin_s, end_s)
 
     def receptions(self, tag: int, from_s: float, to_s: float) -> TagReceptions:
-        """What a tag receives of the frames emitted in [from_s, to_s); cheapest in the order of time, all tags a span.
+        """What a tag receives of the frames emitted in [from_s, to_s).
 
-        Raises:
-            ValueError: the span ends before it begins, or begins before 0.
+        Cheapest in the order of time, all tags of a span one after the other.
         """
-        from_ticks, to_ticks = _span_ticks(from_s, to_s)
+        from_ticks, to_ticks = from_seconds(from_s), from_seconds(to_s)
         scene = self._prepared(from_ticks, to_ticks)
         path = self._paths[tag].cover(from_ticks, to_ticks)
         near = self._near(path, from_ticks, to_ticks)
         found = self._receive(scene, tag, near, path, from_ticks, to_ticks)
         return self._with_relays(scene, tag, (from_s, to_s), *found)
-
-    def anchor_receptions(self, anchors: Sequence[int], from_s: float, to_s: float) -> AnchorReceptions:
-        """All receptions of anchors (indices) of the frames emitted in [from_s, to_s).
-
-        Raises:
-            ValueError: the span ends before it begins, or begins before 0.
-        """
-        from_ticks, to_ticks = _span_ticks(from_s, to_s)
-        return self._at_anchors(self._prepared(from_ticks, to_ticks), anchors, from_ticks, to_ticks)
 
     # Scenes
 
@@ -305,17 +249,17 @@ class CellWorld:
     def _receive(
         self, scene: Scene, tag: int, near: Integers, path: Path, from_ticks: int, to_ticks: int
     ) -> tuple[Integers, Integers, Integers, Array]:
-        """Senders, columns of the table, RX stamps, and motion, in the order of emission."""
+        """Senders, columns of the table, RX stamps, and true positions, in the order of emission."""
         most = int(scene.table.used[near].sum())
         senders, columns, rx_ticks = (np.empty(most, dtype=np.int64) for _ in range(3))
-        motion = np.empty((most, 6))
+        points_m = np.empty((most, 3))
         node = len(self.anchors.ids) + tag
         count = receive_at_tag(
-            scene, node, near, path, self._errors, from_ticks, to_ticks, senders, columns, rx_ticks, motion
+            scene, node, near, path, self._errors, from_ticks, to_ticks, senders, columns, rx_ticks, points_m
         )
         senders, columns = senders[:count], columns[:count]
         order = np.argsort(scene.table.ticks[senders, columns], kind="stable")
-        return senders[order], columns[order], rx_ticks[:count][order], motion[:count][order]
+        return senders[order], columns[order], rx_ticks[:count][order], points_m[:count][order]
 
     def _with_relays(
         self,
@@ -325,13 +269,11 @@ class CellWorld:
         senders: Integers,
         columns: Integers,
         rx_ticks: Integers,
-        motion: Array,
+        points_m: Array,
     ) -> TagReceptions:
         table, ids = scene.table, self.anchors.ids
         counts = np.zeros(len(senders), dtype=np.int64)
-        anchors, sequences, relay_rx = (
-            np.full((len(senders), self._most_relays), -1, dtype=np.int64) for _ in range(3)
-        )
+        anchors, sequences, relay_rx = (np.full((len(senders), MAX_RELAYS), -1, dtype=np.int64) for _ in range(3))
         tx_ticks = table.tx_ticks[senders, columns]
         most = max(self._most_neighbours, 1) * table.ticks.shape[1]
         fill_relays(scene, senders, tx_ticks, self._lead_ticks, most, counts, anchors, sequences, relay_rx)
@@ -344,43 +286,12 @@ class CellWorld:
             rx_ticks,
             table.ticks[senders, columns],
             table.fraction[senders, columns],
-            motion[:, :3],
+            points_m,
             counts,
             np.where(anchors >= 0, ids[anchors], -1),
             sequences,
             relay_rx,
         )
-
-    # Anchors
-
-    def _at_anchors(self, scene: Scene, anchors: Sequence[int], from_ticks: int, to_ticks: int) -> AnchorReceptions:
-        table, ids = scene.table, self.anchors.ids
-        listening = np.array([one for one in anchors if not self._senders.dead[one]], dtype=np.int64)
-        spare = max(self._most_neighbours, 1) * table.ticks.shape[1]
-        free = np.empty((4, max(_CHUNK_ROWS, spare)), dtype=np.int64)
-        parts = [np.empty((4, 0), dtype=np.int64)]
-        while len(listening):
-            rows = (free[0], free[1], free[2], free[3])
-            done, count = receive_at_anchors(scene, listening, from_ticks, to_ticks, spare, rows)
-            parts.append(free[:, :count].copy())
-            listening = listening[done:]
-        listeners, senders, columns, rx_ticks = np.concatenate(parts, axis=1)
-        order = np.lexsort((table.ticks[senders, columns], listeners))
-        listeners, senders, columns, rx_ticks = (one[order] for one in (listeners, senders, columns, rx_ticks))
-        return AnchorReceptions(
-            ids[listeners],
-            ids[senders],
-            (table.first_number[senders] + columns) & 0xFF,
-            table.tx_ticks[senders, columns] & TICK_MASK,
-            rx_ticks,
-            table.ticks[senders, columns],
-        )
-
-
-def _span_ticks(from_s: float, to_s: float) -> tuple[int, int]:
-    if not 0.0 <= from_s <= to_s:
-        raise ValueError(f"a span from {from_s:g} to {to_s:g} s; it should begin at 0 or later and not end before")
-    return from_seconds(from_s), from_seconds(to_s)
 
 
 @kernel

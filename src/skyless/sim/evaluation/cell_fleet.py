@@ -1,4 +1,4 @@
-"""Tags that compute at a site of protocol 2 of any size, whose anchors are simulated on demand (``simulation/cells``).
+"""Tags that compute at a site of protocol 2 of any size, whose anchors are simulated on demand (``sim/cells``).
 
 Anchors have no machines here: they send when their schedule says, and relay what they have received. A tag gets the
 beacons that it receives, as decoded from their frames, and nothing else.

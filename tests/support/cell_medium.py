@@ -1,8 +1,7 @@
-"""``CellMedium``: the air of up to a few hundred anchors with their real machines, by the rules of several cells.
+"""``CellMedium``: the air of up to a few hundred real machines, by the rules of several cells.
 
-It stands in for ``sim/medium.py``'s ``Medium`` where a ``World`` is made, and gives bit for bit what the kernels
-of ``cells/world.py`` compute for the same frames: all noise is keyed, clocks are functions of true time, and one set of
-functions decides receptions.
+It gives bit for bit what the kernels of ``skyless.sim.cells.world`` compute for the same frames. All noise is keyed,
+clocks are functions of true time, and one set of functions decides receptions.
 """
 
 from collections import deque
@@ -10,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Final, TypeVar
+from unittest.mock import patch
 
 import numpy as np
 
@@ -37,9 +37,10 @@ from skyless.sim.cells.reception import (
     squared_m2,
 )
 from skyless.sim.impairments import Impairments
-from skyless.sim.listening import RECEPTION_RECORD, fill_truth
-from skyless.sim.medium import TURNAROUND_S, Delivery, Flight, MediumBase
+from skyless.sim.listening import RECEPTION_RECORD
+from skyless.sim.medium import TURNAROUND_S, Delivery, Flight, Medium
 from skyless.sim.stations import TagSpec, coordinate_m
+from skyless.sim.world import World
 
 _TURNAROUND_TICKS: Final = from_seconds(TURNAROUND_S)
 _KEPT_TICKS: Final = from_seconds(2e-3)
@@ -95,7 +96,8 @@ def receive_in_cells(
             if outcome == RECEIVED:
                 arrival_ticks = fraction + np.sqrt(square_m2) / TICK_M - early_ticks
                 row = rows[count]
-                fill_truth(stations, node, t_s, row)
+                row["node"] = node
+                row["position_m"][0], row["position_m"][1], row["position_m"][2] = x_m, y_m, z_m
                 row["rx_ticks"] = rx_stamp(rules, knots, node, (keys[node], keys[sender], number), ticks, arrival_ticks)
                 count += 1
                 anchors += 1 - stations[node]["is_tag"]
@@ -112,11 +114,8 @@ class NumberedFlight(Flight):
     """Length after its RMARKER."""
 
 
-class CellMedium(MediumBase[Result]):
-    """A site's air by the rules of several cells, with the interface of ``Medium`` as a ``World`` uses it.
-
-    Nodes are numbered as there. Free space only: impairments that several cells do not model are refused.
-    """
+class CellMedium(Medium[Result]):
+    """A site's air by the rules of several cells. Only noise, losses, outages and displacements are modelled."""
 
     def __init__(
         self,
@@ -126,23 +125,7 @@ class CellMedium(MediumBase[Result]):
         seed: int,
         deliver: Callable[[Delivery], Result | None],
     ) -> None:
-        """``deliver`` is called with every frame when it ends; ``run`` yields what it returns.
-
-        Raises ValueError, which names the key, for what is not modelled: walls, bodies, errors of ranges and antenna
-        delays, late messages, temperatures, diagnostics; and for impairments of anchors that the site has not.
-        """
-        refuse_unmodelled(impairments, range_errors=False)
-        _refuse_unmodelled_site(site, tags)
-        super().__init__(site, tags, impairments, deliver)
-        moving = next((one for one in impairments.anchor_displacements if one.from_s > 0.0), None)
-        if moving is not None:
-            text = f"anchor_displacements has from_s {moving.from_s:g}; it should be 0"
-            raise ValueError(f"{text}: anchors of several cells do not move")
-        named = {one.anchor for one in impairments.anchor_outages}
-        unknown = named.union(one.anchor for one in impairments.anchor_displacements) - self.node_of.keys()
-        if unknown:
-            known = ", ".join(map(str, self.node_of))
-            raise ValueError(f"impairments name anchor {min(unknown)}; it should be one of the site's: {known}")
+        super().__init__(site, tags, impairments, seed, deliver)
         keys = [*self.node_of, *(TAG_NODES + tag for tag in range(len(tags)))]
         self._keys = np.array(keys, dtype=np.int64)
         self._start_key = np.uint64(purpose_key(seed, START))
@@ -232,23 +215,7 @@ class CellMedium(MediumBase[Result]):
         self.timeline.at(flight.end_ticks, partial(self._deliver, delivery))
 
 
-def refuse_unmodelled(impairments: Impairments, *, range_errors: bool) -> None:
-    """Refuse impairments that the simulation of several cells has no model of; ``range_errors``: whether it has those.
-
-    Raises:
-        ValueError: names the key, its value and what it should be.
-    """
-    plain = Impairments()
-    names = ["anchor_biases", "delay_errors", "anchor_pair_errors", "body", "warm_ups", "diagnostics"]
-    for name in names if range_errors else [*names, "range_errors"]:
-        value, wanted = getattr(impairments, name), getattr(plain, name)
-        if value != wanted:
-            raise ValueError(f"impairments.{name} is {value!r}; it should be {wanted!r}: several cells do not model it")
-
-
-def _refuse_unmodelled_site(site: Site, tags: Sequence[TagSpec]) -> None:
-    if site.walls:
-        raise ValueError(f"the site has {len(site.walls)} walls; it should have none: several cells do not model them")
-    for number, tag in enumerate(tags):
-        if tag.rx_delay_error_ticks or any(tag.range_errors_m):
-            raise ValueError(f"tag {number} has errors of its delay or ranges; several cells do not model them")
+def cell_world(*arguments, **options) -> World:
+    """A ``World`` whose air is a ``CellMedium``."""
+    with patch("skyless.sim.world.Medium", CellMedium):
+        return World(*arguments, **options)

@@ -1,8 +1,44 @@
+"""Check sequence and air time of frames of IEEE 802.15.4."""
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.core.air.ieee802154 import fcs, is_intact
+from skyless.core.air.ieee802154 import (
+    DATA_SYMBOL_S,
+    HEADER_SYMBOL_S,
+    PREAMBLE_SYMBOL_S,
+    after_rmarker_s,
+    air_time_s,
+    fcs,
+    is_intact,
+    preamble_s,
+)
+
+
+def test_symbols_as_tabled_in_the_standard():
+    # IEEE 802.15.4-2015, clause 16.2: mean PRF 62.4 MHz, in nanoseconds to two decimals.
+    assert abs(PREAMBLE_SYMBOL_S * 1e9 - 1017.63) < 0.005
+    assert abs(HEADER_SYMBOL_S * 1e9 - 1025.64) < 0.005
+    assert abs(DATA_SYMBOL_S * 1e9 - 128.21) < 0.005
+
+
+@pytest.mark.parametrize(("psdu_bytes", "tabled_us"), [(12, 178), (24, 191), (40, 207), (64, 238), (127, 315)])
+def test_air_time_of_tabled_lengths(psdu_bytes, tabled_us):
+    assert air_time_s(psdu_bytes) * 1e6 == pytest.approx(tabled_us, abs=0.5)
+
+
+def test_preamble_lies_before_the_rmarker():
+    assert preamble_s() * 1e6 == pytest.approx(138.4, abs=0.05)
+    assert preamble_s(1024, 8) * 1e6 == pytest.approx(1032 * 1.01763, abs=0.05)
+    assert preamble_s(64) + after_rmarker_s(40) == air_time_s(40, preamble_symbols=64)
+
+
+def test_parity_comes_by_blocks_of_330_bits():
+    # 41 bytes are 328 bits and fill one block, 42 bytes need another 48 bits of parity.
+    step_s = after_rmarker_s(42) - after_rmarker_s(41)
+    assert step_s == pytest.approx((8 + 48) * 64 / 499.2e6)
+    assert after_rmarker_s(41) - after_rmarker_s(40) == pytest.approx(8 * 64 / 499.2e6)
 
 
 def test_check_value_of_the_catalogue():
