@@ -136,7 +136,7 @@ def walk_of(
     if tag not in names:
         wanted = f"one of {', '.join(names)}" if names else "of a tag whose receptions were recorded"
         raise ConfigurationError(recording.summary().path, "tag", tag, wanted)
-    collector = EpochCollector(relayed=True)
+    collector = EpochCollector()
     receptions, differences = NewReceptions(), RelayedDifferences(site)
     begin_s: float | None = None
     for found in recording.messages({"receptions"}):

@@ -14,6 +14,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.constants import TICK_M
+from skyless.core.geometry import anchor_positions
 from skyless.core.kernels.arrays import Array
 from skyless.core.site import EXACT, AccuracySite, AnchorSite, Site, TagsSite
 from skyless.research.surveys.air import free_axes
@@ -102,7 +103,7 @@ def site_at(layout: SurveyLayout, position_m: Array, noise_ps: float) -> Site:
 
 def air_of(room: DrawnRoom, site: Site) -> Impairments:
     """What is wrong in a room's air against what a site file states."""
-    stated_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
+    stated_m = anchor_positions(site)
     usual = AnchorSite(0, 0.0, 0.0)
     return replace(
         lab_impairments(room.noise_ps),
@@ -191,7 +192,7 @@ def _written(room: DrawnRoom, rough_m: Array, survey: Survey, accuracy: Accuracy
 
 def _aligned(room: DrawnRoom, site: Site) -> Site:
     """The site with its positions moved to the frame of the truth."""
-    stated_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
+    stated_m = anchor_positions(site)
     moved_m = aligned(stated_m, room.layout.position_m, room.layout.dimensions)
     anchors = tuple(
         replace(anchor, x_m=x_m, y_m=y_m, z_m=z_m)

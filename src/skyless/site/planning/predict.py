@@ -19,7 +19,7 @@ from skyless.core.protocols import superframe_s
 from skyless.core.site import Site
 from skyless.core.tag.factory import estimator_settings
 from skyless.site.channel import ChannelModel, pack_walls
-from skyless.site.planning.anchor_clocks import anchor_clocks, relays_of
+from skyless.site.planning.anchor_clocks import anchor_clocks, relays_of, row_of_master
 from skyless.site.planning.joint_sigma import fill_joint_sigma
 from skyless.site.planning.links import (
     PLAN_COLUMNS,
@@ -62,7 +62,7 @@ class Predictor:
         self.settings = settings
         self.dim = 3 if site.tags.height_m is None else 2
         self.anchors_m = anchor_positions(site)
-        self.master = [anchor.id for anchor in site.anchors].index(site.master) if site.schedule.needs_master else None
+        self.master = row_of_master(site) if site.schedule.needs_master else None
         """Row of the master; None where there is none."""
         self.budget, self.walls = link_budget(settings.channel), pack_walls(site.walls)
         self.links: AnchorLinks = (

@@ -23,16 +23,16 @@ from skyless.core.constants import TICK_M
 from skyless.core.errors import SkylessError
 from skyless.core.site import AccuracySite, AnchorSite, Site, UnplacedAnchor
 from skyless.site.file.check import SITE_LIMITS, check_site
-from skyless.site.file.rewrite import DELAY_KEY, with_values
+from skyless.site.file.rewrite import with_values
 from skyless.site.survey.facts import PairRanges
 from skyless.site.survey.result import Survey, SurveyedAnchor
 
-_DELAY: Final = SITE_LIMITS[f"anchors.{DELAY_KEY}"]
+_DELAY: Final = SITE_LIMITS["anchors.tx_antenna_delay_ticks"]
 _MAX_STATED_M: Final = SITE_LIMITS["anchors.std_m"].high
 _RANGE_STD: Final = SITE_LIMITS["accuracy.range_std_m"]
 _STD_STEPS_PER_M: Final = 1e4
 _POSITION_DIGITS: Final = 4
-_KEYS: Final = ("x_m", "y_m", "z_m", DELAY_KEY, "std_m")
+_KEYS: Final = ("x_m", "y_m", "z_m", "tx_antenna_delay_ticks", "std_m")
 
 
 def surveyed_site(site: Site, survey: Survey) -> Site:
