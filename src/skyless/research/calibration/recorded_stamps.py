@@ -42,7 +42,7 @@ class RecordedRanges(Struct, frozen=True):
     """What made the ranges, and can drop those from before an anchor was moved."""
     format: str
     site: Site | None
-    """As recorded; None for recordings of other systems."""
+    """The recorded site. None for recordings of other systems."""
     drops: dict[str, int]
     """What could not be used, by reason."""
     damage: dict[str, int] = {}

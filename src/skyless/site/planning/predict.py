@@ -35,10 +35,10 @@ from skyless.site.planning.snapshot_sigma import fill_snapshot_sigma, rounds_of
 
 Fill = Callable[[Matrix, Matrix], None]
 
-# Points that a thread computes at a time; the filter's take longer.
 MAX_PREDICTED: Final = 60
-"""Of sites without a master that have more anchors, a plan is of the beacons that reach tags (``rates``)."""
+"""Larger sites of protocol 2 are planned by the beacons that reach tags (``rates``)."""
 
+# Points that a thread computes at a time. The filter takes longer for each.
 _SNAPSHOT_CHUNK: Final = 2000
 _FILTER_CHUNK: Final = 100
 
@@ -103,7 +103,7 @@ class Predictor:
         return in_threads(self._fill, np.ascontiguousarray(points_m, np.float64), self._chunk, progress)
 
     def geometry_at(self, points_m: Matrix) -> Matrix:
-        """The same table with anchors in view and DOPs only; with the weighted PDOP in the column ``sigma_m``."""
+        """A table with anchors in view and DOPs only. Its column ``sigma_m`` is the weighted PDOP."""
         return in_threads(self._geometry, np.ascontiguousarray(points_m, np.float64), _SNAPSHOT_CHUNK)
 
     def _geometry(self, points: Matrix, table: Matrix) -> None:

@@ -40,7 +40,7 @@ class Rounds(Struct, frozen=True):
     """Variance of each TDoA that the method assumes, beyond the common part; m², shape (n,)."""
     assumed_common: float
     true_own: Vector
-    """The same with the crystals' part."""
+    """``assumed_own`` plus the variance from the crystals' noise."""
     common: Matrix
     """Errors that several TDoAs share: their covariance is common·commonᵀ; shape (n, k), metres."""
 

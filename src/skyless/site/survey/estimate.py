@@ -202,14 +202,14 @@ class CalibrationEstimate(Struct, frozen=True):
     noise_m: float | None
     """Noise of a difference once the calibration is off (1.4826 MAD)."""
     noise_before_m: float | None
-    """The same about zero before."""
+    """Noise of a difference before the calibration (1.4826 MAD about zero)."""
     loop_m: float | None
     """What constants cannot explain: root mean square over the pairs of their median residual."""
     used: int
     rejected: int
 
     def calibration(self) -> DifferenceCalibration:
-        """As a receiver applies it."""
+        """The calibration that a receiver applies."""
         slope_m = self.slope_m or 0.0
         return DifferenceCalibration(
             {

@@ -87,7 +87,7 @@ def flights_of(legs: Legs, longest_ticks: int) -> tuple[Flights, Legs, int]:
 class _OneWay(Struct, frozen=True, eq=False):
     flights: Flights
     seen: Integers
-    """Legs that were bracketed, whatever came of it."""
+    """Legs that were bracketed, with or without a time of flight."""
     is_needed: Mask
     impossible: int
 
