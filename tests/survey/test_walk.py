@@ -155,7 +155,7 @@ def test_the_stated_errors_are_true():
         path_m = path_of(rng, ROOM_M, 60, 1.2)
         epochs = epochs_of(rng, ROOM_M, delay_m + offset_m, path_m, noise_m=TAG_STD_M, reflection_m=0.0)
         alone = solve_least_squares(problem, ROOM_M)
-        joint = fit_with_tag(problem, range(8), [alone], epochs, {}).solution
+        joint = fit_with_tag(problem, range(8), [alone], epochs, NONE_BETWEEN).solution
         covariance = np.linalg.pinv(joint.information, rcond=1e-10, hermitian=True)
         direction = np.append(np.zeros(24), np.eye(8)[seed % 8] - np.eye(8)[(seed + 3) % 8])
         error = direction[24:] @ (joint.delay_m - delay_m)
