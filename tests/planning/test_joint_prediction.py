@@ -8,7 +8,7 @@ from scipy.stats import binom
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.core.geometry import anchor_positions
 from skyless.core.protocol1.schedule import schedule_of
-from skyless.core.site import EXACT, AnchorSite, Site, TagsSite, WallSite
+from skyless.core.site import EXACT, AccuracySite, AnchorSite, Site, TagsSite, WallSite
 from skyless.research.uncertainty.bounds import BoundSettings, tracking_bound
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.channel import ChannelModel, pack_walls
@@ -134,7 +134,11 @@ def dense(site, point, superframes, shift_m=0.0):
 
 @pytest.mark.parametrize(
     ("site", "point", "motion"),
-    [(LAB, (2.0, 5.5, 0.0), 0.93), (ROOM, (6.0, 3.0, 1.0), 0.93), (lab_site(), (1.2, 1.6, 0.0), 0.99)],
+    [
+        (LAB, (2.0, 5.5, 0.0), 0.93),
+        (ROOM, (6.0, 3.0, 1.0), 0.93),
+        (paper_lab_site(accuracy=AccuracySite()), (1.2, 1.6, 0.0), 0.99),
+    ],
     ids=("lab", "3-D", "range errors"),
 )
 def test_the_true_error_is_that_of_a_dense_recursion(site, point, motion):

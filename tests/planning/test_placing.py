@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.core.site import EXACT, AnchorSite, Site, TagsSite, WallSite
+from skyless.core.site import EXACT, AccuracySite, AnchorSite, ScheduleSite, Site, TagsSite, WallSite
 from skyless.research.verify import random_points, verify
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.channel import ChannelModel, pack_walls
@@ -31,6 +31,11 @@ FILE = Path("site.toml")
 BRACKETED = PlanSettings("bracketed")
 
 
+def with_master(*room):
+    """A rectangular site whose anchors share the air by slots, as ``bracketed`` needs."""
+    return replace(rectangular_site(*room), schedule=ScheduleSite())
+
+
 def searched(site, outline, anchors, heights, tag_heights, settings=BRACKETED, seed=1):
     floor = floor_of(site, FILE, outline, None)
     mounts = Mounts(sides(floor.outline_m), heights)
@@ -40,15 +45,15 @@ def searched(site, outline, anchors, heights, tag_heights, settings=BRACKETED, s
 @pytest.mark.parametrize(
     ("site", "outline", "anchors", "heights", "tag_heights"),
     [
-        (rectangular_site(20.0, 5.0, 6, 3.0, 1.2), None, 6, (2.5,), (1.2,)),
+        (with_master(20.0, 5.0, 6, 3.0, 1.2), None, 6, (2.5,), (1.2,)),
         (
-            rectangular_site(12.0, 9.0, 4, 3.0, 1.2),
+            with_master(12.0, 9.0, 4, 3.0, 1.2),
             np.array([(0, 0), (12, 0), (12, 4), (5, 4), (5, 9), (0, 9)], float),
             5,
             (2.5,),
             (1.2,),
         ),
-        (rectangular_site(8.0, 6.0, 6, 3.0, None), None, 6, (0.3, 2.7), (1.0, 1.8)),
+        (with_master(8.0, 6.0, 6, 3.0, None), None, 6, (0.3, 2.7), (1.0, 1.8)),
     ],
     ids=("corridor", "L", "3-D"),
 )
@@ -66,7 +71,7 @@ def test_the_optimiser_beats_the_even_layout(site, outline, anchors, heights, ta
 
 
 def test_same_seed_same_places():
-    site = rectangular_site(10.0, 6.0, 4, 3.0, 1.2)
+    site = with_master(10.0, 6.0, 4, 3.0, 1.2)
     places = [searched(site, None, 4, (2.5,), (1.2,))[1].best.site.anchors for _ in range(2)]
     assert places[0] == places[1]
 
@@ -87,7 +92,7 @@ class SlowSearch(Search):
 @pytest.fixture
 def slow_search(monkeypatch):
     monkeypatch.setattr("skyless.site.planning.optimise.time.monotonic", lambda: SlowSearch.now_s)
-    site = rectangular_site(10.0, 6.0, 4, 3.0, 1.2)
+    site = with_master(10.0, 6.0, 4, 3.0, 1.2)
     floor = floor_of(site, FILE, None, None)
     mounts = Mounts(sides(floor.outline_m), (2.5,))
     return lambda seconds: SlowSearch(site, BRACKETED, floor, mounts, (1.2,), 4, 1, seconds)
@@ -120,7 +125,7 @@ def test_exchange_finds_what_trying_all_finds():
         np.array([[0.0, 0.0, 6.0, 0.0], [6.0, 0.0, 6.0, 8.0], [6.0, 8.0, 0.0, 8.0], [0.0, 8.0, 0.0, 0.0]]), (2.0,)
     )
     places = mounts.at(np.arange(12) * mounts.length_m / 12, np.zeros(12, np.int64))
-    floor = floor_of(lab_site(), FILE, None, None)
+    floor = floor_of(paper_lab_site(), FILE, None, None)
     points, weights = sample_points(floor, (0.0,), 60)
     lattice = lattice_of(places, points, weights, link_budget(ChannelModel()), pack_walls(()), 2, 0.04)
 
@@ -145,8 +150,8 @@ def test_the_even_layout_goes_around_with_heights_in_turn():
 
 def test_one_more_anchor_helps_where_one_is_missing():
     """The lab without its two anchors on the right: the new one belongs there."""
-    anchors = tuple(a for a in lab_site().anchors if a.id not in {3, 4})
-    site = replace(lab_site(), anchors=anchors)
+    anchors = tuple(a for a in paper_lab_site().anchors if a.id not in {3, 4})
+    site = replace(paper_lab_site(), anchors=anchors)
     floor = floor_of(site, FILE, np.array([(0, 0), (6, 0), (6, 8), (0, 8)], float), None)
     more = one_more(site, BRACKETED, floor, Mounts(sides(floor.outline_m), (0.0,)), (0.0,))
     assert more.position_m[0] == pytest.approx(6.0, abs=0.5)
@@ -160,7 +165,7 @@ def test_one_more_anchor_helps_where_one_is_missing():
 
 def test_one_more_anchor_helps_nobody_where_it_only_lengthens_the_superframe():
     ring = Mounts(sides(np.array([(0, 0), (6, 0), (6, 8), (0, 8)], float)), (0.0,))
-    site = site_with(lab_site(), ring.at(even_layout(ring, 16).along_m, np.zeros(16, np.int64)), 1)
+    site = site_with(paper_lab_site(), ring.at(even_layout(ring, 16).along_m, np.zeros(16, np.int64)), 1)
     floor = floor_of(site, FILE, None, (2.0, 2.0, 4.0, 6.0))
     more = one_more(site, BRACKETED, floor, ring, (0.0,))
     assert not more.helps
@@ -169,7 +174,9 @@ def test_one_more_anchor_helps_nobody_where_it_only_lengthens_the_superframe():
 
 def test_warnings_name_what_is_wrong():
     wall = WallSite(3.0, -1.0, 3.0, 9.0, loss_db=25.0, delay_m=0.3)
-    site = replace(lab_site(), walls=(wall,), anchors=tuple(replace(a, slot=a.id % 6) for a in lab_site().anchors))
+    site = replace(
+        paper_lab_site(), walls=(wall,), anchors=tuple(replace(a, slot=a.id % 6) for a in paper_lab_site().anchors)
+    )
     floor = floor_of(site, FILE, None, None)
     predictor = Predictor(site, BRACKETED)
     text = "\n".join(plan_warnings(predictor, floor, plan_map(predictor, grid_of(floor, (0.0,), 0.5))))
@@ -182,7 +189,7 @@ def test_warnings_name_what_is_wrong():
 
 
 def test_mirrors_are_told_by_the_solver():
-    flat = Site("flat", 1, 1, tuple(replace(a, z_m=2.5) for a in lab_site().anchors), tags=TagsSite())
+    flat = Site("flat", 1, 1, tuple(replace(a, z_m=2.5) for a in paper_lab_site().anchors), tags=TagsSite())
     floor = floor_of(flat, FILE, None, None)
     predictor = Predictor(flat, BRACKETED)
     warnings = plan_warnings(predictor, floor, plan_map(predictor, grid_of(floor, (1.0,), 1.0)))
@@ -229,7 +236,7 @@ def test_prediction_and_simulation_agree(monkeypatch, name, method, rounds):
     Three points at once; their mean is held to a tighter bound.
     """
     monkeypatch.setattr("skyless.research.verify._WORLDS", 8)
-    site = lab_site() if name == "range errors" else SITES[name]
+    site = paper_lab_site(accuracy=AccuracySite()) if name == "range errors" else SITES[name]
     floor = floor_of(site, FILE, None, None)
     predictor = Predictor(site, PlanSettings(method))
     heights = (1.0, 2.0) if name == "3-D" else (0.0,)
@@ -254,7 +261,9 @@ def test_anchors_that_hear_the_master_through_walls_are_late():
 
 
 def test_a_site_from_places_keeps_the_rest():
-    site = replace(lab_site(), walls=(WallSite(0.0, 0.0, 1.0, 1.0),), schedule=replace(lab_site().schedule, slots=9))
+    site = replace(
+        paper_lab_site(), walls=(WallSite(0.0, 0.0, 1.0, 1.0),), schedule=replace(paper_lab_site().schedule, slots=9)
+    )
     made = site_with(site, np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]), 2)
     assert made.master == 3
     assert made.walls == site.walls

@@ -9,6 +9,7 @@ from msgspec.structs import replace
 from skyless.core.air.frame import MAX_FRAME_BYTES
 from skyless.core.air.ieee802154 import air_time_s
 from skyless.core.geometry import RADIO_REACH_M
+from skyless.core.protocols import beacon_period_s
 from skyless.core.site import AnchorSite, ScheduleSite, Site, TagsSite, WallSite
 from skyless.sim.cells.world import CellWorld, anchors_of
 from skyless.sim.evaluation.cell_fleet import period_codes_of
@@ -76,7 +77,7 @@ def test_against_a_plain_loop():
     site = grid_site(240.0, 200.0, 13.0, 4.0, 1.2)
     points = np.random.default_rng(5).uniform((0.0, 0.0, 0.0), (240.0, 200.0, 3.0), (40, 3))
     rates = tag_rates(site, points, ChannelModel(), 2.2)
-    rate_hz = site.schedule.rate_hz
+    rate_hz = 1.0 / beacon_period_s(site)
     for k, point in enumerate(points):
         apart_m = [math.dist(point, (a.x_m, a.y_m, a.z_m)) for a in site.anchors]
         power = [received_power_dbm(-14.3, d, 2.0 * math.log10(max(d, 1.0))) for d in apart_m]

@@ -74,14 +74,14 @@ def test_heights(tmp_path):
 def test_the_earliest_cluster_that_is_large_enough():
     draw = np.random.default_rng(5)
     direct, late, one_early = draw.normal(7.0, 0.03, 12), draw.normal(8.1, 0.03, 80), [3.0]
-    ranges = mean_ranges({(1, 2): [*late, *direct, *one_early], (1, 3): draw.normal(4.0, 0.03, 25).tolist()}, [9])
+    ranges = mean_ranges({(1, 2): [*late, *direct, *one_early], (1, 3): draw.normal(4.0, 0.03, 25).tolist()})
     first, second = ranges.pairs
     assert first.range_m == pytest.approx(7.0, abs=4 * 0.03 / np.sqrt(12))
     assert first.late_share == pytest.approx(80 / 93)
     assert second.range_m == pytest.approx(4.0, abs=4 * 0.03 / 5)
     assert second.std_m == pytest.approx(0.03 / 5, rel=0.5)
     assert second.late_share == 0.0
-    assert ranges.anchors == (1, 2, 3, 9)
+    assert ranges.anchors == (1, 2, 3)
 
 
 def test_few_ranges_have_the_noise_of_the_others():

@@ -8,7 +8,7 @@ from skyless.core.errors import ConfigurationError
 from skyless.core.site import AccuracySite
 from skyless.sim.lab import lab_site
 from skyless.site.file.load import load_site
-from skyless.site.file.rewrite import with_tx_delays
+from skyless.site.file.rewrite import with_values
 from skyless.site.file.template import site_template
 
 TEXT = """\
@@ -30,6 +30,11 @@ y_m = 1.0    # taped
 [tags]
 height_m = 1.2
 """
+
+
+def with_tx_delays(text, delays_ticks, path):
+    of_anchors = {anchor: {"tx_antenna_delay_ticks": ticks} for anchor, ticks in delays_ticks.items()}
+    return with_values(text, of_anchors, {}, path, "the delays")
 
 
 def test_values_change_where_they_stand_and_are_added_where_they_do_not():

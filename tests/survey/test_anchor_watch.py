@@ -99,7 +99,7 @@ def test_what_is_accepted_is_the_new_state():
     site.run(40)
     site.position_m[3] = site.position_m[3] + np.array([0.0, 0.5, 0.0])
     assert site.run(4) == [("moved", (3,))]
-    site.watch.accept([3])
+    site.watch.accept()
     assert site.watch.findings == ()
     assert site.run(40) == []
     site.position_m[3] = np.array(SQUARE[3])

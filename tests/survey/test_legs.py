@@ -13,15 +13,15 @@ from skyless.core.protocols import new_anchor
 from skyless.core.ticks import from_seconds, wrap
 from skyless.research.surveys.anchor_stamps import RecordedAnchor
 from skyless.sim.impairments import AnchorOutage, Outage, lab_impairments
-from skyless.sim.lab import lab_site
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.sim.world import World
 from skyless.site.channel import ChannelModel
 from skyless.site.survey.stamps.legs import LegCollector, RelayMatcher
 
-LAB = lab_site()
-FREE = msgspec.structs.replace(LAB, schedule=msgspec.structs.replace(LAB.schedule, mode="free"))
+LAB = paper_lab_site()
+FREE = lab_site()
 
 
 def _world(site, seconds, **changes):

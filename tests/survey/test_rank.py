@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from skyless.research.surveys.layouts import drawn_ranges, survey_layouts
+from skyless.research.surveys.layouts import survey_layouts
 from skyless.site.survey.facts import Facts, PairRange, PairRanges, Tape
 from skyless.site.survey.solve import run_survey
+from support.drawn_ranges import drawn_ranges
 
 LAB = survey_layouts()["lab"]
 RANGES = drawn_ranges(LAB, 10.0, np.random.default_rng(1))

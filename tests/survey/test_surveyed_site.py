@@ -12,8 +12,8 @@ from msgspec.structs import replace
 from skyless.core.air.local_almanac import site_issue, site_pages_of
 from skyless.core.constants import TICK_M
 from skyless.core.errors import ConfigurationError, SkylessError
-from skyless.core.site import EXACT, ScheduleSite, UnplacedAnchor
-from skyless.sim.lab import lab_site
+from skyless.core.site import EXACT, AccuracySite, ScheduleSite, UnplacedAnchor
+from skyless.sim.lab import paper_lab_site
 from skyless.site.file.check import check_site
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template
@@ -29,7 +29,7 @@ from skyless.site.survey.result import (
 )
 from skyless.site.survey.surveyed_site import delay_changes_ticks, surveyed_site, surveyed_text, unchanged_anchors
 
-LAB = lab_site()
+LAB = paper_lab_site(accuracy=AccuracySite())
 
 
 def survey_of(*anchors, range_std_m=0.03):

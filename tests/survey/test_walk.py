@@ -2,6 +2,7 @@
 
 import gzip
 from functools import partial
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -56,6 +57,10 @@ def path_of(rng, positions_m, epochs, height_m):
     )
 
 
+NONE_BETWEEN = dict.fromkeys(combinations(range(12), 2), 0.0)
+"""Pair ranges of differences that hold none."""
+
+
 def epochs_of(rng, positions_m, delay_m, path_m, known_height=False, noise_m=0.046, reflection_m=0.05):
     """Differences to the first anchor; their noise is that of ranges, whose clock is another in every epoch."""
     k, n = len(path_m), len(positions_m)
@@ -74,7 +79,6 @@ def epochs_of(rng, positions_m, delay_m, path_m, known_height=False, noise_m=0.0
         (ranges_m[:, 1:] - ranges_m[:, :1]).ravel(),
         np.zeros(k * (n - 1)),
         np.full(k * (n - 1), 20),
-        relayed=False,
         known_m=known_m,
     )
 
@@ -92,7 +96,7 @@ def test_rows_have_the_cost_and_its_slope():
     rng = np.random.default_rng(1)
     epochs = epochs_of(rng, ROOM_M, np.zeros(8), path_of(rng, ROOM_M, 20, 1.2))
     at_m, delay_m = ROOM_M + rng.normal(0.0, 0.05, ROOM_M.shape), rng.normal(0.0, 0.05, 8)
-    rows = WalkRows(epochs, tag_ranges(epochs, {}), ROOM_M)
+    rows = WalkRows(epochs, tag_ranges(epochs, NONE_BETWEEN), ROOM_M)
     jacobian, residual = rows.rows(at_m, delay_m)
     assert residual @ residual == pytest.approx(rows.cost, rel=1e-9)
     unknown = np.concatenate([at_m.ravel(), delay_m])
@@ -109,7 +113,7 @@ def test_rows_have_the_cost_and_its_slope():
 def test_rows_say_nothing_about_rigid_motion():
     rng = np.random.default_rng(2)
     epochs = epochs_of(rng, ROOM_M, np.zeros(8), path_of(rng, ROOM_M, 40, 1.2))
-    jacobian, _ = WalkRows(epochs, tag_ranges(epochs, {}), ROOM_M).rows(ROOM_M, np.zeros(8))
+    jacobian, _ = WalkRows(epochs, tag_ranges(epochs, NONE_BETWEEN), ROOM_M).rows(ROOM_M, np.zeros(8))
     shift = np.concatenate([np.tile([1.0, 2.0, -1.0], 8), np.zeros(8)])
     turned = np.concatenate([np.cross([0.3, -0.2, 1.0], ROOM_M).ravel(), np.zeros(8)])
     common = np.concatenate([np.zeros(24), np.ones(8)])
@@ -131,7 +135,7 @@ def test_a_minute_of_walking(positions_m, planar, height_m, xy, z):
         start_m = positions_m + rng.normal(0.0, 0.1, positions_m.shape) * [1.0, 1.0, 0.0 if planar else 1.0]
         alone = solve_least_squares(problem, start_m)
         epochs = epochs_of(rng, positions_m, delay_m, path_of(rng, positions_m, 120, height_m), known_height=planar)
-        joint = fit_with_tag(problem, range(len(positions_m)), [alone], epochs, {})
+        joint = fit_with_tag(problem, range(len(positions_m)), [alone], epochs, NONE_BETWEEN)
         assert joint.solution is not None, joint.sentence
         alone_m.append(errors_m(alone.position_m, positions_m))
         joint_m.append(errors_m(joint.solution.position_m, positions_m))
@@ -151,7 +155,7 @@ def test_the_stated_errors_are_true():
         path_m = path_of(rng, ROOM_M, 60, 1.2)
         epochs = epochs_of(rng, ROOM_M, delay_m + offset_m, path_m, noise_m=TAG_STD_M, reflection_m=0.0)
         alone = solve_least_squares(problem, ROOM_M)
-        joint = fit_with_tag(problem, range(8), [alone], epochs, {}).solution
+        joint = fit_with_tag(problem, range(8), [alone], epochs, NONE_BETWEEN).solution
         covariance = np.linalg.pinv(joint.information, rcond=1e-10, hermitian=True)
         direction = np.append(np.zeros(24), np.eye(8)[seed % 8] - np.eye(8)[(seed + 3) % 8])
         error = direction[24:] @ (joint.delay_m - delay_m)
@@ -177,13 +181,15 @@ def test_a_walk_chooses_between_results_that_the_ranges_cannot_tell_apart():
     both = [solve_least_squares(problem, one) for one in (mirrored_m, positions_m)]
     assert abs(both[0].cost - both[1].cost) < 4.0
     path_m = path_of(rng, positions_m, 60, 0.0)
-    joint = fit_with_tag(problem, range(6), both, epochs_of(rng, positions_m, delay_m, path_m, known_height=True), {})
+    joint = fit_with_tag(
+        problem, range(6), both, epochs_of(rng, positions_m, delay_m, path_m, known_height=True), NONE_BETWEEN
+    )
     assert (joint.chosen, joint.possible) == (1, (1,))
 
 
 @pytest.mark.parametrize(
     ("fault", "words"),
-    [("noise", "not used"), ("moved", "not used"), ("short", "10 are needed"), ("relayed", "10 are needed")],
+    [("noise", "not used"), ("moved", "not used"), ("short", "10 are needed"), ("no pairs", "10 are needed")],
 )
 def test_a_walk_that_does_not_fit_is_not_used(fault, words):
     rng = np.random.default_rng(4)
@@ -191,10 +197,8 @@ def test_a_walk_that_does_not_fit_is_not_used(fault, words):
     path_m = path_of(rng, ROOM_M, 5 if fault == "short" else 100, 1.2)
     at_m = ROOM_M + (np.eye(8, 3) * 1.5 if fault == "moved" else 0.0)
     epochs = epochs_of(rng, at_m, delay_m, path_m, noise_m=0.5 if fault == "noise" else 0.05)
-    if fault == "relayed":
-        epochs = replace(epochs, relayed=True)
     alone = solve_least_squares(problem, ROOM_M)
-    joint = fit_with_tag(problem, range(8), [alone], epochs, {})
+    joint = fit_with_tag(problem, range(8), [alone], epochs, {} if fault == "no pairs" else NONE_BETWEEN)
     assert joint.solution is None
     assert words in joint.sentence
 
@@ -207,14 +211,14 @@ def test_late_receptions_are_left_out():
     late = (epochs.epoch % 10 == 0) & (epochs.second == 1 + epochs.epoch // 10 % 7)
     spoilt = replace(epochs, difference_m=epochs.difference_m + 0.6 * late)
     alone = solve_least_squares(problem, ROOM_M)
-    clean, joint = (fit_with_tag(problem, range(8), [alone], one, {}) for one in (epochs, spoilt))
+    clean, joint = (fit_with_tag(problem, range(8), [alone], one, NONE_BETWEEN) for one in (epochs, spoilt))
     assert joint.rows.excluded_share > 0.5 * late.sum() / (8 * 120)
     assert np.abs(clean.solution.position_m - joint.solution.position_m).max() < 0.03
 
 
 def test_epochs_are_means_without_outliers_and_ranges_follow():
     rng = np.random.default_rng(6)
-    collector = EpochCollector(relayed=True)
+    collector = EpochCollector()
     ranges_m, mutual_m = np.array([3.0, 5.0, 4.0]), {(2, 7): 6.0, (2, 9): 7.0, (7, 9): 8.0}
     ids, speed = (2, 7, 9), np.array([0.5, -0.3, 0.0])
     for k in range(400):
@@ -234,7 +238,7 @@ def test_epochs_are_means_without_outliers_and_ranges_follow():
 
 
 def test_nothing_received_is_no_epoch():
-    epochs = EpochCollector(relayed=True).epochs()
+    epochs = EpochCollector().epochs()
     assert len(epochs.t_s) == 0
     assert tag_ranges(epochs, {}).shape == (0, 0)
 
@@ -247,7 +251,7 @@ def test_differences_of_simulated_air_are_free_of_delays_and_clocks(site):
     track = Waypoints([(1, 1, 1.2), (4, 5, 1.2), (5, 2, 1.2)], 1.0, loop=True, corner_s=0.5)
     faults = replace(impairments_of(Request(site), site), delay_errors=errors)
     world = World(site, partial(Anchor, site), [TagSpec(track)], faults, 1)
-    collector, differences = EpochCollector(relayed=True), RelayedDifferences(site.id)
+    collector, differences = EpochCollector(), RelayedDifferences(site.id)
     times_s, truth_m = [], []
     for broadcast in world.run(5.0):
         for _, reception, at_m in broadcast.receptions():
@@ -279,7 +283,7 @@ def flight_of(folder, trial):
         rows = np.loadtxt(table, delimiter=",", skiprows=1)
     with gzip.open(folder / f"const1-trial{trial}-tdoa2_pose.csv.gz") as table:
         pose = np.loadtxt(table, delimiter=",", skiprows=1)
-    collector = EpochCollector(relayed=False)
+    collector = EpochCollector()
     for row in rows[np.interp(rows[:, 0], pose[:, 0], pose[:, 3]) > 0.3]:
         collector.add(row[0], int(row[1]), int(row[2]), row[3])
     return collector.epochs()
@@ -300,7 +304,7 @@ def test_flights_mend_the_heights_of_a_room(recordings):
         problem, _ = problem_of(rng, positions_m, planar=False, range_std_m=0.055, delay_std_m=0.0)
         alone = solve_least_squares(problem, positions_m + rng.normal(0.0, 0.3, positions_m.shape))
         for epochs in flights:
-            joint = fit_with_tag(problem, range(8), [alone], epochs, {})
+            joint = fit_with_tag(problem, range(8), [alone], epochs, NONE_BETWEEN)
             assert joint.solution is not None, joint.sentence
             alone_m.append(errors_m(alone.position_m, positions_m))
             joint_m.append(errors_m(joint.solution.position_m, positions_m))

@@ -49,9 +49,7 @@ def test_constants_are_recovered_within_their_standard_errors(outliers):
 def test_the_error_is_that_of_least_squares_on_clean_data():
     """Of 6000 differences each anchor has 1500: σ·√(1/1500) times the share of a complete graph, and Huber's 5 %."""
     truth_m = BIAS_M - BIAS_M.mean()
-    errors = [
-        constants(estimate(measured(np.random.default_rng(seed)), slope=False))[0] - truth_m for seed in range(40)
-    ]
+    errors = [constants(estimate(measured(np.random.default_rng(seed))))[0] - truth_m for seed in range(40)]
     expected_m = 0.06 / np.sqrt(6000 * 2 / 7) * np.sqrt(7 / 8)  # eigenvalue of HᵀH but zero: 2·6000/7
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(expected_m / np.sqrt(0.95), rel=0.15)
 
@@ -65,7 +63,7 @@ def test_errors_that_last_widen_the_standard_errors():
         block = (data.t_s / 5.0).astype(int)
         lasting = rng.normal(0.0, 0.1, (block.max() + 1, 8))
         excess = data.excess_m + lasting[block, data.anchor_b] - lasting[block, data.anchor_a]
-        found = estimate(Differences(data.t_s, data.anchor_a, data.anchor_b, excess, data.log_ratio), slope=False)
+        found = estimate(Differences(data.t_s, data.anchor_a, data.anchor_b, excess, data.log_ratio))
         bias, std = constants(found)
         squares.append(np.mean(((bias - BIAS_M + BIAS_M.mean()) / std) ** 2))
     assert 0.6 < np.mean(squares) < 1.7  # as if independent: some 100
@@ -109,14 +107,6 @@ def test_half_of_an_anchors_differences_far_off_do_not_move_its_constant():
     assert found.rejected >= late.sum()
 
 
-def test_one_anchor_as_the_zero():
-    found = estimate(measured(np.random.default_rng(6)), zero=4)
-    bias, std = constants(found)
-    assert (bias[4], std[4]) == (0.0, pytest.approx(0.0, abs=1e-9))
-    assert bias == pytest.approx(BIAS_M - BIAS_M[4], abs=0.02)
-    assert found.zero == "anchor 4"
-
-
 def test_anchors_that_no_chain_ties_to_the_others_are_not_determined():
     data = measured(np.random.default_rng(7))
     keep = (data.anchor_a < 5) == (data.anchor_b < 5)
@@ -124,7 +114,6 @@ def test_anchors_that_no_chain_ties_to_the_others_are_not_determined():
     found = estimate(part)
     assert [one.bias_m is None for one in found.anchors] == [False] * 5 + [True] * 3
     assert all("no chain" in one.reason for one in found.anchors[5:])
-    assert estimate(part, zero=6).anchors[0].bias_m is None
 
 
 def test_an_anchor_with_two_differences_is_not_determined_and_does_not_move_the_zero():

@@ -18,10 +18,10 @@ from skyless.core.method_names import DEFAULT_METHOD, FILTERS
 from skyless.core.site import Site
 from skyless.research.verify import random_points, verify
 from skyless.site.channel import ChannelModel
+from skyless.site.file.advice import anchors_needed
 from skyless.site.file.load import site_of
 from skyless.site.planning.floor import (
     check_anchor_count,
-    fewest_anchors,
     floor_of,
     mounts_of,
     usual_tag_heights,
@@ -204,7 +204,7 @@ def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
     if asked.optimise is None:
         check_anchor_count(site, file)
     else:
-        check_whole("--optimise", asked.optimise, least=fewest_anchors(site), most=60)
+        check_whole("--optimise", asked.optimise, least=anchors_needed(site)[0], most=60)
     floor, heights_m = floor_of(site, file, outline_of(asked), region_of(asked)), heights_of(asked, site)
     walls_m = None if asked.mounts_m is None else np.array(asked.mounts_m)
     levels_m = None if asked.anchor_heights_m is None else tuple(asked.anchor_heights_m)

@@ -105,7 +105,7 @@ def biases_of(asked: SurveyOptions) -> Biases:
 
 
 def tdoas_of(recording: Recording, anchors_m: Mapping[int, Point]) -> Iterator[PairTdoa]:
-    """All time differences of a recording, whatever its format."""
+    """All time differences of a recording in any format."""
     bits = recording.format.tx_bits
     engine = None if bits is None else PairEngine(bits, anchors_m=dict(anchors_m))
     for record in recording:

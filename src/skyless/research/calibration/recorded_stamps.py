@@ -24,7 +24,7 @@ from skyless.research.replays.site import SITE_FORMAT, recorded_site
 from skyless.run.mqtt.messages import ReceptionsMessage, StampsMessage
 from skyless.run.recordings.recording import McapRecording, Recorded, is_mcap
 from skyless.site.survey.facts import PairBlock, PairRanges
-from skyless.site.survey.stamps.legs import AnchorLeg, LegCollector, Relayed, RelayMatcher
+from skyless.site.survey.stamps.legs import AnchorLeg, LegCollector, RelayMatcher
 from skyless.site.survey.stamps.pair_ranger import PairRanger
 
 _REPORT_EVERY: Final = 1000
@@ -42,7 +42,7 @@ class RecordedRanges(Struct, frozen=True):
     """What made the ranges, and can drop those from before an anchor was moved."""
     format: str
     site: Site | None
-    """As recorded; None for recordings of other systems."""
+    """The recorded site. None for recordings of other systems."""
     drops: dict[str, int]
     """What could not be used, by reason."""
     damage: dict[str, int] = {}
@@ -203,9 +203,8 @@ def _add_packets(path: str | PathLike[str], format_name: str, part: _Part) -> Co
             if not isinstance(packet, Packet):
                 continue
             now_ticks = ticks.unwrap(packet.rx_ticks, packet.host_s)
-            relays = [Relayed(relay.anchor, relay.sequence, relay.rx_ticks) for relay in packet.relays]
             t_s = to_seconds(now_ticks)
-            for leg in matcher.add(packet.anchor, packet.sequence, packet.tx_ticks, relays, now_ticks, t_s):
+            for leg in matcher.add(packet.anchor, packet.sequence, packet.tx_ticks, packet.relays, now_ticks, t_s):
                 part.add(replace(leg, rx_ticks=leg.rx_ticks - recording.format.delays_ticks))
         return recording.drops + _drops(matcher.counters)
 

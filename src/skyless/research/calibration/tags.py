@@ -136,7 +136,7 @@ def walk_of(
     if tag not in names:
         wanted = f"one of {', '.join(names)}" if names else "of a tag whose receptions were recorded"
         raise ConfigurationError(recording.summary().path, "tag", tag, wanted)
-    collector = EpochCollector(relayed=True)
+    collector = EpochCollector()
     receptions, differences = NewReceptions(), RelayedDifferences(site)
     begin_s: float | None = None
     for found in recording.messages({"receptions"}):
@@ -161,7 +161,7 @@ def walk_of(
 
 
 def at_positions(epochs: TagEpochs, tag: str, position_at: PositionAt) -> TagEpochs:
-    """The same with known positions; epochs without one are left out."""
+    """The epochs with known positions. Epochs without one are left out."""
     known = [position_at(t_s) for t_s in epochs.t_s.tolist()]
     is_known = np.array([one is not None for one in known], dtype=bool)
     rows = is_known[epochs.epoch]

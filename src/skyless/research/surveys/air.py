@@ -20,7 +20,7 @@ LATE_M: Final = (0.2, 1.0)
 _SENSITIVITY_DBM: Final = -105.0
 """All anchors receive one another."""
 _SETTLE_S: Final = 1.0
-"""Until anchors without a master keep their slots."""
+"""Until anchors of protocol 2 send regularly."""
 
 
 class AirErrors(Struct, frozen=True):
@@ -31,7 +31,7 @@ class AirErrors(Struct, frozen=True):
     """Constant error of each pair."""
     late_share: float = 0.0
     missing_share: float = 0.0
-    """Of all pairs."""
+    """Shares of all pairs that are late, and that have no ranges."""
 
 
 class DrawnErrors(Struct, frozen=True, eq=False):

@@ -23,16 +23,15 @@ def stamps_of(
     seconds: float,
     seed: int,
     *,
-    ranger: PairRanger | None = None,
     listener_m: tuple[float, float, float] | None = None,
     settle_s: float = 0.0,
 ) -> PairRanger:
-    """Ranges of ``seconds`` of a site; ``ranger`` receives them, by default one with blocks of a second.
+    """Ranges of ``seconds`` of a site.
 
     ``listener_m``: the legs are those that one listener there learns of the anchors' beacons; by default all that the
     anchors receive. ``settle_s``: time that passes before the first leg. The last block is closed.
     """
-    whole = PairRanger() if ranger is None else ranger
+    whole = PairRanger()
     until_s = settle_s + seconds
 
     def on_leg(sender: int, receiver: int, tx_ticks: int, rx_ticks: int, t_s: float) -> None:

@@ -49,7 +49,7 @@ class WatchRun(Struct, frozen=True):
     layout: WatchedLayout
     event: Event
     size_m: float
-    """Of displacements, delays and lateness; the direction is drawn, and what happens to whom."""
+    """Size of displacements, delays and lateness. Directions and anchors are drawn."""
     drift_m: tuple[float, float]
     """Standard deviations of the pairs' drift are drawn between these; 0 for none."""
     drift_s: float
@@ -70,7 +70,7 @@ class WatchResult(Struct, frozen=True):
     found: int
     """With any finding."""
     named: int
-    """With the right anchor or link alone, whatever the kind."""
+    """With the right anchor or link alone, of any kind."""
     kind: int
     """With the right kind as well."""
     wrong: int

@@ -29,7 +29,7 @@ class Outcome(Struct, frozen=True):
     is_determined: bool
     """All anchors; the figures below are None otherwise."""
     is_open: bool
-    """Whether it says that something is not determined, be it delays against positions."""
+    """Whether it says that something is not determined, even if only delays against positions."""
     is_flagged: bool
     """Whether it says that it is ambiguous, that nothing checks it, or that an anchor is not determined."""
     hand_tag_m: float
@@ -38,9 +38,9 @@ class Outcome(Struct, frozen=True):
     said_m: float | None = None
     nees: float | None = None
     delay_m: float | None = None
-    """Of delays less their mean."""
+    """Error of delays less their mean."""
     tag_m: float | None = None
-    """As ``hand_tag_m``, by the survey."""
+    """Error of a tag's position, rms, by the survey."""
     late: int = 0
     found: int = 0
     """Late pairs that were left out."""

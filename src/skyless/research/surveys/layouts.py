@@ -1,19 +1,14 @@
-"""Sites on which surveys of anchors are studied, and ranges drawn for them as their stamps' noise has them."""
+"""Sites on which surveys of anchors are studied."""
 
-import math
-from collections.abc import Mapping
 from typing import Final, Literal
 
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.core.kernels.arrays import Array
 from skyless.sim.lab import lab_site
-from skyless.site.survey.facts import PairRange, PairRanges
 
 SLOT_S: Final = 2.5e-3
-STAMP_PS: Final = 100.0
 _ROOM_M: Final = (
     (0.0, 0.0, 0.4),
     (8.0, 0.0, 2.6),
@@ -59,34 +54,3 @@ def survey_layouts() -> dict[str, SurveyLayout]:
         "room": SurveyLayout("room", 3, room, 1.2),
         "hall": SurveyLayout("hall", 2, hall, 1.2),
     }
-
-
-def drawn_ranges(
-    layout: SurveyLayout,
-    duration_s: float,
-    rng: np.random.Generator,
-    *,
-    delays_m: Mapping[int, float] | None = None,
-    pair_std_m: float = 0.0,
-    extra_m: Mapping[tuple[int, int], float] | None = None,
-) -> PairRanges:
-    """Ranges as stamps of ±100 ps give them in so long a time (covariance in ``docs/maths.md`` section 9).
-
-    ``pair_std_m``: constant error of each pair. ``extra_m``: added to single pairs, named by identifiers a < b.
-    """
-    anchors = layout.anchors
-    n = len(anchors)
-    superframes = max(1.0, duration_s / (n * SLOT_S))
-    stamp_std_m = math.hypot(STAMP_PS * 1e-12 * SPEED_OF_LIGHT_MPS, TICK_M / math.sqrt(12.0))
-    range_std_m = stamp_std_m / math.sqrt(2.0 * superframes)
-    tx_std_m = stamp_std_m / (2.0 * math.sqrt(superframes))
-    delay_m = np.array([(delays_m or {}).get(anchor, 0.0) for anchor in anchors]) + rng.normal(0.0, tx_std_m, n)
-    pairs = []
-    for i in range(n):
-        for j in range(i + 1, n):
-            distance = float(np.linalg.norm(layout.position_m[i] - layout.position_m[j]))
-            noise = rng.normal(0.0, range_std_m) + rng.normal(0.0, pair_std_m)
-            extra = (extra_m or {}).get((anchors[i], anchors[j]), 0.0)
-            measured = distance + delay_m[i] + delay_m[j] + noise + extra
-            pairs.append(PairRange(anchors[i], anchors[j], float(measured), range_std_m, int(superframes)))
-    return PairRanges(tuple(pairs), anchors, dict.fromkeys(anchors, tx_std_m), duration_s)

@@ -4,7 +4,7 @@ In the air are: antenna delays that are off, errors of the pairs of anchors, and
 the scenario ``room`` has. The truth of a room does not depend on who writes its file.
 
 A file's positions are moved to the true frame by the best rigid alignment of all anchors: which way the axes point is
-no error of the site's shape, and tags then walk the same ways whatever the file.
+no error of the site's shape, and tags then walk the same ways for every file.
 """
 
 from typing import Final
@@ -14,6 +14,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.constants import TICK_M
+from skyless.core.geometry import anchor_positions
 from skyless.core.kernels.arrays import Array
 from skyless.core.site import EXACT, AccuracySite, AnchorSite, Site, TagsSite
 from skyless.research.surveys.air import free_axes
@@ -30,7 +31,7 @@ from skyless.site.survey.solve import run_survey
 from skyless.site.survey.surveyed_site import surveyed_site
 
 HAND_STD_M: Final = 0.02
-"""Of positions measured by hand, per axis."""
+"""Error of positions measured by hand, per axis."""
 SKETCH_STD_M: Final = 0.3
 ROOM_RANGES: Final = Room().ranges
 """Errors of ranges at tags in the scenario ``room``."""
@@ -41,7 +42,7 @@ class RoomErrors(Struct, frozen=True):
     """How the errors of a room are drawn."""
 
     delay_std_m: float = 0.0
-    """Of h, half of what TX and RX delay of an anchor are off together, and of half their difference."""
+    """Standard deviation of h, half of the sum of an anchor's TX and RX delay errors, and of half their difference."""
     pair_std_m: float = 0.0
     """Constant error of each pair of anchors."""
     ranges: RangeErrorModel = RangeErrorModel()
@@ -58,14 +59,14 @@ class DrawnRoom(Struct, frozen=True, eq=False):
     pairs: tuple[PairError, ...]
     ranges: RangeErrorModel
     hand_m: Array
-    """Errors of positions measured by hand, shape (n, 3), ..."""
+    """Errors of positions measured by hand, shape (n, 3)."""
     sketch_m: Array
-    """... and of a sketch."""
+    """Errors of a sketch, shape (n, 3)."""
     tape_m: float
     """Error of a taped distance."""
     noise_ps: float
     seed: int
-    """Of the air."""
+    """Seed of the air."""
 
 
 def drawn_room(layout: SurveyLayout, errors: RoomErrors, noise_ps: float, seed: int) -> DrawnRoom:
@@ -102,7 +103,7 @@ def site_at(layout: SurveyLayout, position_m: Array, noise_ps: float) -> Site:
 
 def air_of(room: DrawnRoom, site: Site) -> Impairments:
     """What is wrong in a room's air against what a site file states."""
-    stated_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
+    stated_m = anchor_positions(site)
     usual = AnchorSite(0, 0.0, 0.0)
     return replace(
         lab_impairments(room.noise_ps),
@@ -135,7 +136,7 @@ def true_site(room: DrawnRoom) -> Site:
 
 
 def exact_site(room: DrawnRoom) -> Site:
-    """The same, which also states that ranges are right."""
+    """The true site, which also states that ranges are right."""
     return replace(true_site(room), accuracy=EXACT)
 
 
@@ -191,7 +192,7 @@ def _written(room: DrawnRoom, rough_m: Array, survey: Survey, accuracy: Accuracy
 
 def _aligned(room: DrawnRoom, site: Site) -> Site:
     """The site with its positions moved to the frame of the truth."""
-    stated_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
+    stated_m = anchor_positions(site)
     moved_m = aligned(stated_m, room.layout.position_m, room.layout.dimensions)
     anchors = tuple(
         replace(anchor, x_m=x_m, y_m=y_m, z_m=z_m)

@@ -48,7 +48,7 @@ from skyless.site.file.load import load_site
 from skyless.site.survey.facts import Facts, PairRanges
 from skyless.site.survey.result import Survey
 from skyless.site.survey.stamps.legs import LegCollector
-from skyless.site.survey.surveyed_site import with_delays_of
+from skyless.site.survey.surveyed_site import delay_differences_m
 from skyless.site.survey.watch.moved import change_of
 
 NAME: Final = "survey"
@@ -280,7 +280,9 @@ class SurveyNode:
         assert self.live is not None
         self.live.finish()
         ranges = self.live.ranges()
-        return ranges if self._running is None else with_delays_of(ranges, self._running, self.live.site)
+        if self._running is None:
+            return ranges
+        return ranges.without_delays(delay_differences_m(self._running, self.live.site))
 
     def update(self) -> None:
         """Begin another result if it is time, and publish what is due."""

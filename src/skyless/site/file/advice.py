@@ -43,7 +43,7 @@ def warnings_of(site: Site) -> list[str]:
 
 def too_few_anchors(site: Site) -> str | None:
     """Say that the placed anchors give no position; None where they are enough."""
-    needed, what = _needed(site)
+    needed, what = anchors_needed(site)
     count = len(site.anchors)
     if count >= needed:
         return None
@@ -53,12 +53,13 @@ def too_few_anchors(site: Site) -> str | None:
     return f"{count} anchor{'s give' if count > 1 else ' gives'} no position: one {what} needs {needed}"
 
 
-def _needed(site: Site) -> tuple[int, str]:
+def anchors_needed(site: Site) -> tuple[int, str]:
+    """How many anchors a position at this site needs, and which kind of position it is."""
     return (4, "with its height") if site.tags.height_m is None else (3, "at a known height")
 
 
 def _count(site: Site) -> list[str]:
-    needed, what = _needed(site)
+    needed, what = anchors_needed(site)
     count = len(site.anchors)
     if too_few := too_few_anchors(site):
         return [too_few]

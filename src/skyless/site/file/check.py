@@ -252,7 +252,7 @@ def _check_anchors(site: Site, file: Path) -> None:
         identifiers = ", ".join(map(str, sorted(rows)[:_MAX_LISTED]))
         right = f"the id of an anchor: {identifiers}{', …' if len(rows) > _MAX_LISTED else ''}"
         raise ConfigurationError(file, "master", site.master, right)
-    same_point = min(((i, j) for i, j, _ in _near(site, _CLOSEST_M)), key=lambda pair: pair[1], default=None)
+    same_point = min(_at_one_point(site), key=lambda pair: pair[1], default=None)
     if same_point is not None:
         one, other = (site.anchors[row] for row in same_point)
         key = _with_anchor(f"anchors[{same_point[1]}]", site)
@@ -267,19 +267,17 @@ def _rows(site: Site) -> Iterator[tuple[str, AnchorSite | UnplacedAnchor]]:
         yield f"anchors[{index}]" if placed else f"unplaced[{index - len(site.anchors)}]", anchor
 
 
-def _near(site: Site, distance_m: float) -> Iterator[tuple[int, int, float]]:
-    """Rows of placed anchors closer than a distance, and their distance."""
+def _at_one_point(site: Site) -> Iterator[tuple[int, int]]:
+    """Rows of placed anchors that are at the same point."""
     if len(site.anchors) <= _MAX_BY_PAIRS:
         points = [(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors]
-        for one, other in combinations(range(len(points)), 2):
-            apart_m = math.dist(points[one], points[other])
-            if apart_m < distance_m:
-                yield one, other, apart_m
+        pairs = combinations(range(len(points)), 2)
+        yield from ((one, other) for one, other in pairs if math.dist(points[one], points[other]) < _CLOSEST_M)
         return
     from skyless.core.geometry import anchor_positions, pairs_within  # noqa: PLC0415 - only large sites need NumPy
 
-    for ones, others, apart in pairs_within(anchor_positions(site), distance_m):
-        yield from zip(ones.tolist(), others.tolist(), apart.tolist(), strict=True)
+    for ones, others, _ in pairs_within(anchor_positions(site), _CLOSEST_M):
+        yield from zip(ones.tolist(), others.tolist(), strict=True)
 
 
 def _check_protocol_2(site: Site, file: Path) -> None:

@@ -39,8 +39,6 @@ _TABLES: Final[dict[str, type[Struct]]] = {
 }
 _LISTS: Final[dict[str, type[Struct]]] = {"anchors": AnchorSite, "walls": WallSite}
 
-_NOT_IN_FILES: Final = {"unplaced", "site_time"}
-
 _FINDING = re.compile(r"(?P<finding>.*?)(?: - at `\$\.?(?P<path>.*)`)?", re.DOTALL)
 _MISSING = re.compile(r"Object missing required field `(?P<name>\w+)`")
 
@@ -173,7 +171,7 @@ def _refuse_unknown(path: Path, document: dict[str, Any], prefix: str, table: ob
     """Refuse keys that are no field of a struct, and fields that the file does not have."""
     if not isinstance(table, dict):
         return  # a wrong type, which the conversion reports
-    known = [name for name in struct.__struct_fields__ if name not in _NOT_IN_FILES]
+    known = [name for name in struct.__struct_fields__ if name != "unplaced"]
     for key, value in table.items():
         if key not in known:
             near = difflib.get_close_matches(key, known, n=2)

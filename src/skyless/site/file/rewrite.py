@@ -6,11 +6,9 @@ import tomllib
 from collections.abc import Mapping
 from itertools import pairwise
 from os import PathLike
-from typing import Any, Final
+from typing import Any
 
 from skyless.core.errors import ConfigurationError
-
-DELAY_KEY: Final = "tx_antenna_delay_ticks"
 
 OfAnchors = Mapping[int, Mapping[str, float]]
 """Values by anchor and key."""
@@ -22,16 +20,6 @@ _ANCHOR = re.compile(r"\s*\[\[\s*anchors\s*\]\]")
 _SECTION = re.compile(r"\s*\[\s*([\w-]+)\s*\]")
 _ID = re.compile(r"\s*id\s*=\s*(\d+)\s*(#.*)?$")
 _ASSIGNMENT = re.compile(r"(\s*)[\w-]+\s*=.*?(\r?\n)?$", re.DOTALL)
-
-
-def with_tx_delays(text: str, delays_ticks: Mapping[int, int], path: str | PathLike[str]) -> str:
-    """The text with the TX antenna delays of some anchors changed, or added where the key is missing.
-
-    Raises:
-        ConfigurationError: the anchors are written in a form that this cannot edit, such as inline tables.
-    """
-    of_anchors = {identifier: {DELAY_KEY: ticks} for identifier, ticks in delays_ticks.items()}
-    return with_values(text, of_anchors, {}, path, "the delays")
 
 
 def with_values(text: str, of_anchors: OfAnchors, of_sections: OfSections, path: str | PathLike[str], what: str) -> str:

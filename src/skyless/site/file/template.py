@@ -158,7 +158,7 @@ def site_template(site: Site) -> str:
         guard_s=schedule.guard_s,
         frames=schedule.frames_per_node,
         slots=schedule.slots or len(site.all_anchors) * schedule.frames_per_node,
-        mode="free" if schedule.needs_master else schedule.mode,
+        mode="free",
         rate_hz=schedule.rate_hz or _EXAMPLE_RATE_HZ,
         outline=[list(corner) for corner in (_EXAMPLE_OUTLINE if site.outline_m is UNSET else site.outline_m)],
         no_outline=_off(site.outline_m is not UNSET),

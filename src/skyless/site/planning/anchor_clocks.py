@@ -73,10 +73,15 @@ def anchor_clocks(site: Site, share: Vector) -> AnchorClocks:
     return AnchorClocks(sends, sender, gap_s, 1.0)
 
 
+def row_of_master(site: Site) -> int:
+    """Index of the master among the anchors."""
+    return [anchor.id for anchor in site.anchors].index(site.master)
+
+
 def offset_variances(site: Site, share: Vector) -> Vector:
     """Variance of its sender's clock that each message states in the steady state, m²; 0 of the master's."""
     noise = clock_noise(site.noise.white_fm, site.noise.random_walk_fm)
-    master = [anchor.id for anchor in site.anchors].index(site.master)
+    master = row_of_master(site)
     sender, time_s, superframe_s = _messages(site)
     variance, reported = sum(stamp_variances(site)), {}
     for part in set(share[share >= MIN_SYNC].tolist()):
@@ -223,7 +228,7 @@ class MasterReception(Struct, frozen=True):
 
 def reception_of(site: Site, channel: ChannelModel) -> MasterReception:
     """Predict how the anchors receive their master, with the losses of the site's walls."""
-    anchors_m, master = anchor_positions(site), _row_of_master(site)
+    anchors_m, master = anchor_positions(site), row_of_master(site)
     share = anchor_links(anchors_m, master, link_budget(channel), pack_walls(site.walls)).share
     return MasterReception(
         np.linalg.norm(anchors_m - anchors_m[master], axis=1), share, anchor_clocks(site, share).sends
@@ -282,7 +287,3 @@ def _named(site: Site, found: MasterReception, rows: Integers, do: str, does: st
 def _masters(site: Site, channel: ChannelModel) -> Integers:
     anchors_m: Matrix = anchor_positions(site)
     return masters_by_links(anchors_m, link_budget(channel), pack_walls(site.walls))
-
-
-def _row_of_master(site: Site) -> int:
-    return [anchor.id for anchor in site.anchors].index(site.master)

@@ -9,6 +9,7 @@ from skyless.core.errors import ConfigurationError
 from skyless.core.geometry import OUTSIDE_M, Box, anchor_positions, area, distance_outside, inside, outline_of
 from skyless.core.kernels.arrays import Integers, Matrix, Vector
 from skyless.core.site import Site
+from skyless.site.file.advice import anchors_needed
 from skyless.site.file.check import image_size
 
 
@@ -121,14 +122,9 @@ def mounts_of(site: Site, floor: Floor, walls_m: Matrix | None, heights_m: tuple
     return Mounts(sides(floor.outline_m) if walls_m is None else walls_m, tuple(dict.fromkeys(levels_m)))
 
 
-def fewest_anchors(site: Site) -> int:
-    """How many anchors a position at this site needs."""
-    return 4 if site.tags.height_m is None else 3
-
-
 def check_anchor_count(site: Site, file: Path) -> None:
     """See that the site has anchors enough for a position. Raises ConfigurationError."""
-    needed, what = fewest_anchors(site), "with its height" if site.tags.height_m is None else "at a known height"
+    needed, what = anchors_needed(site)
     if len(site.anchors) < needed:
         right = f"at least {needed}, which a position {what} needs"
         raise ConfigurationError(file, "anchors", f"a list of {len(site.anchors)}", right)

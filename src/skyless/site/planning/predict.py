@@ -19,7 +19,7 @@ from skyless.core.protocols import superframe_s
 from skyless.core.site import Site
 from skyless.core.tag.factory import estimator_settings
 from skyless.site.channel import ChannelModel, pack_walls
-from skyless.site.planning.anchor_clocks import anchor_clocks, relays_of
+from skyless.site.planning.anchor_clocks import anchor_clocks, relays_of, row_of_master
 from skyless.site.planning.joint_sigma import fill_joint_sigma
 from skyless.site.planning.links import (
     PLAN_COLUMNS,
@@ -35,10 +35,10 @@ from skyless.site.planning.snapshot_sigma import fill_snapshot_sigma, rounds_of
 
 Fill = Callable[[Matrix, Matrix], None]
 
-# Points that a thread computes at a time; the filter's take longer.
 MAX_PREDICTED: Final = 60
-"""Of sites without a master that have more anchors, a plan is of the beacons that reach tags (``rates``)."""
+"""Larger sites of protocol 2 are planned by the beacons that reach tags (``rates``)."""
 
+# Points that a thread computes at a time. The filter takes longer for each.
 _SNAPSHOT_CHUNK: Final = 2000
 _FILTER_CHUNK: Final = 100
 
@@ -62,7 +62,7 @@ class Predictor:
         self.settings = settings
         self.dim = 3 if site.tags.height_m is None else 2
         self.anchors_m = anchor_positions(site)
-        self.master = [anchor.id for anchor in site.anchors].index(site.master) if site.schedule.needs_master else None
+        self.master = row_of_master(site) if site.schedule.needs_master else None
         """Row of the master; None where there is none."""
         self.budget, self.walls = link_budget(settings.channel), pack_walls(site.walls)
         self.links: AnchorLinks = (
@@ -103,7 +103,7 @@ class Predictor:
         return in_threads(self._fill, np.ascontiguousarray(points_m, np.float64), self._chunk, progress)
 
     def geometry_at(self, points_m: Matrix) -> Matrix:
-        """The same table with anchors in view and DOPs only; with the weighted PDOP in the column ``sigma_m``."""
+        """A table with anchors in view and DOPs only. Its column ``sigma_m`` is the weighted PDOP."""
         return in_threads(self._geometry, np.ascontiguousarray(points_m, np.float64), _SNAPSHOT_CHUNK)
 
     def _geometry(self, points: Matrix, table: Matrix) -> None:

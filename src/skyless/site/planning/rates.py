@@ -232,6 +232,6 @@ def _reception_warnings(site: Site, found: Reception, channel: ChannelModel, exp
         return [
             f"at the worst 5 % of the positions beacons of only {received:.0f} anchors arrive, though {in_reach:.0f} "
             "are in reach: others are on the air at once; "
-            f"another schedule.rate_hz than {site.schedule.rate_hz:g} may suit these anchors better"
+            f"another schedule.rate_hz than {1.0 / beacon_period_s(site):.3g} may suit these anchors better"
         ]
     return []

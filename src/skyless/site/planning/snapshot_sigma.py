@@ -23,7 +23,7 @@ from skyless.core.protocol1.schedule import first_slots, schedule_of
 from skyless.core.protocol1.snapshots import SnapshotMethod, bracketed_covariance, literal_covariance
 from skyless.core.site import Site
 from skyless.core.tag.locate import inverse_of
-from skyless.site.planning.anchor_clocks import stamp_variances
+from skyless.site.planning.anchor_clocks import row_of_master, stamp_variances
 from skyless.site.planning.links import FIX_SHARE, SIGMA, AnchorLinks, Scene, fill_dops, fill_errors
 
 _MAX_UNCERTAIN: Final = 4  # anchors whose presence and absence are both gone through
@@ -40,7 +40,7 @@ class Rounds(Struct, frozen=True):
     """Variance of each TDoA that the method assumes, beyond the common part; m², shape (n,)."""
     assumed_common: float
     true_own: Vector
-    """The same with the crystals' part."""
+    """``assumed_own`` plus the variance from the crystals' noise."""
     common: Matrix
     """Errors that several TDoAs share: their covariance is common·commonᵀ; shape (n, k), metres."""
 
@@ -72,7 +72,7 @@ def delays(site: Site) -> tuple[Vector, float]:
     first = first_slots(site)
     spacing = schedule.slots // schedule.frames_per_node
     slots = np.array([first[anchor.id] % spacing for anchor in site.anchors])
-    master = slots[[anchor.id for anchor in site.anchors].index(site.master)]
+    master = slots[row_of_master(site)]
     return (slots - master) / spacing, spacing * schedule.slot_ticks * TICK_S
 
 

@@ -22,11 +22,11 @@ SHARED_NOISE_SCALE: Final = 1.5
 """Factor: successive differences share receptions and reflections, which the filter counts as new in each."""
 
 TYPICAL_SLOPE_M: Final = 0.05
-"""Of a DW1000 that nobody has calibrated: APS011 gives 0.03 to 0.10 m, recorded flights 0.03 to 0.08 m."""
+"""Slope of an uncalibrated DW1000: APS011 gives 0.03 to 0.10 m, recorded flights 0.03 to 0.08 m."""
 
 KNOWN_STD_M: Final = 0.02
-"""Of a constant that was calibrated, without the error of the survey: with it, constants of the same anchors differ by
-3 cm between recordings."""
+"""Standard deviation of a calibrated constant, without the error of the survey. With that error, constants of the same
+anchors differ by 3 cm between recordings."""
 
 
 class AnchorCalibration(Struct, frozen=True):
@@ -62,7 +62,7 @@ class DifferenceCalibration(Struct, frozen=True):
         return self.of(pair.anchor_b).bias_m - self.of(pair.anchor_a).bias_m
 
     def difference_std_m(self, otherwise_m: float) -> float:
-        """Of a difference, by the median of what was measured at the anchors, where that is less than otherwise."""
+        """Standard deviation of a difference: from the median of the anchors' noise, at most ``otherwise_m``."""
         known = [anchor.noise_m for anchor in self.anchors.values() if anchor.noise_m is not None]
         return (
             min(SHARED_NOISE_SCALE * max(float(np.median(known)), MIN_NOISE_M), otherwise_m) if known else otherwise_m
@@ -79,7 +79,7 @@ Pair = tuple[int, int]
 
 
 class AnchorFlights:
-    """Median of the flights that either anchor of a pair stated lately; of exchanges, where neither states any."""
+    """Median of the flights that either anchor of a pair stated recently, or of exchanges where neither states any."""
 
     def __init__(self) -> None:
         self._stated: dict[Pair, RunningMedian] = {}

@@ -2,17 +2,18 @@
 
 A difference measures |p − b| − |p − a| + bias_b − bias_a (+ slope·ln(|p − b| / |p − a|)) + noise. With p known the
 biases follow by linear regression: Huber's weights, and nothing beyond four standard deviations. Only differences of
-constants can be seen; the zero is their mean, or one anchor.
+constants can be seen. The zero is their mean.
 """
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from msgspec import Struct
 
 from skyless.core.kernels.arrays import Array, Integers, Mask, Vector
 from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
+from skyless.site.survey.stamps.repeats import STD_OVER_MAD
 
 # The robust regression behind a calibration: constants of anchors, and a slope, from differences at known positions.
 
@@ -75,7 +76,7 @@ def fit(data: Differences, anchors: Integers, *, slope: bool) -> Fit:
         before = weights
         solution = _solve(_normal(a, b, x, weights, len(anchors)), _right(a, b, x, weights * y, len(anchors)))
         residual_m = data.excess_m - _model(solution, a, b, x)
-        scale_m = max(1.4826 * float(np.median(np.abs(residual_m))), 1e-6)
+        scale_m = max(STD_OVER_MAD * float(np.median(np.abs(residual_m))), 1e-6)
         share = np.abs(residual_m) / scale_m
         weights = np.where(share <= _REJECT, np.minimum(1.0, _HUBER / np.maximum(share, _HUBER)), 0.0)
         y = data.excess_m
@@ -182,7 +183,7 @@ class AnchorEstimate(Struct, frozen=True):
     bias_m: float | None
     """None where it is not determined."""
     std_m: float | None
-    """Standard error; 0 for the anchor that is the zero."""
+    """Standard error."""
     noise_m: float | None
     reason: str | None
     """Why the constant is not determined."""
@@ -192,8 +193,8 @@ class CalibrationEstimate(Struct, frozen=True):
     """All that a calibration found, metres."""
 
     anchors: tuple[AnchorEstimate, ...]
-    zero: str
-    """"mean" of the determined anchors, or "anchor N"."""
+    zero: Literal["mean"]
+    """The mean of the determined anchors."""
     slope_m: float | None
     """Growth of every bias while the range grows by the factor e; None where it is not used."""
     slope_std_m: float | None
@@ -201,14 +202,14 @@ class CalibrationEstimate(Struct, frozen=True):
     noise_m: float | None
     """Noise of a difference once the calibration is off (1.4826 MAD)."""
     noise_before_m: float | None
-    """The same about zero before."""
+    """Noise of a difference before the calibration (1.4826 MAD about zero)."""
     loop_m: float | None
     """What constants cannot explain: root mean square over the pairs of their median residual."""
     used: int
     rejected: int
 
     def calibration(self) -> DifferenceCalibration:
-        """As a receiver applies it."""
+        """The calibration that a receiver applies."""
         slope_m = self.slope_m or 0.0
         return DifferenceCalibration(
             {
@@ -224,29 +225,26 @@ def _at_most(anchor: AnchorEstimate) -> float | None:
     return None if anchor.noise_m is None else anchor.noise_m * (1.0 + 2.0 * _MAD_ERROR / anchor.count**0.5)
 
 
-def estimate(differences: Differences, *, zero: int | None = None, slope: bool = True) -> CalibrationEstimate:
-    """Estimate the anchors' constants; ``zero``: the anchor whose constant is 0, by default their mean is.
+def estimate(differences: Differences) -> CalibrationEstimate:
+    """Estimate the anchors' constants, whose mean is 0.
 
-    With ``slope`` the growth with the range is estimated too, and used if it differs from zero and is one that
-    the radio can have.
+    Their growth with the range is estimated too, and used if it differs from zero and is one that the radio can have.
     """
     found = np.unique(np.concatenate([differences.anchor_a, differences.anchor_b]))
-    kept, reasons = _connected(differences, found.tolist(), zero)
+    kept, reasons = _connected(differences, found.tolist())
     data = differences.select(np.isin(differences.anchor_a, kept))
     plain = fit(data, np.array(kept, dtype=np.int64), slope=False)
-    steep = fit(data, plain.anchors, slope=True) if slope and moves(data, plain) else None
-    note = _ALIKE if slope else "not asked for"
-    if steep is not None:
-        note = _slope_note(steep)
+    steep = fit(data, plain.anchors, slope=True) if moves(data, plain) else None
+    note = _ALIKE if steep is None else _slope_note(steep)
     chosen = steep if steep is not None and not note else plain
     for anchor, count in zip(chosen.anchors.tolist(), chosen.counts.tolist(), strict=True):
         if count < _FEWEST:
             reasons[anchor] = f"only {count} differences that can be used; {_FEWEST} are needed"
-    return _estimate(differences, chosen, steep, note or "used", reasons, zero)
+    return _estimate(differences, chosen, steep, note or "used", reasons)
 
 
-def _connected(differences: Differences, anchors: Sequence[int], zero: int | None) -> tuple[list[int], dict[int, str]]:
-    """Anchors of the part that holds the zero, or else of the part with most anchors; and why others are not."""
+def _connected(differences: Differences, anchors: Sequence[int]) -> tuple[list[int], dict[int, str]]:
+    """Anchors of the part with most anchors, and why the others are left out."""
     part_of = {anchor: {anchor} for anchor in anchors}
     pairs = np.unique(np.stack([differences.anchor_a, differences.anchor_b], 1), axis=0)
     for a, b in pairs.tolist():
@@ -254,7 +252,7 @@ def _connected(differences: Differences, anchors: Sequence[int], zero: int | Non
         if joined is not other:
             joined |= other
             part_of.update(dict.fromkeys(other, joined))
-    chosen = part_of[zero] if zero in part_of else max(part_of.values(), key=lambda part: (len(part), -min(part)))
+    chosen = max(part_of.values(), key=lambda part: (len(part), -min(part)))
     kept = sorted(chosen)
     lost = [anchor for anchor in anchors if anchor not in chosen]
     return kept, dict.fromkeys(lost, "no chain of differences ties it to the others")
@@ -272,16 +270,11 @@ def _slope_note(found: Fit) -> str:
 
 
 def _estimate(
-    differences: Differences,
-    found: Fit,
-    steep: Fit | None,
-    note: str,
-    reasons: dict[int, str],
-    zero: int | None,
+    differences: Differences, found: Fit, steep: Fit | None, note: str, reasons: dict[int, str]
 ) -> CalibrationEstimate:
     count = len(found.anchors)
     good = np.array([anchor not in reasons for anchor in found.anchors.tolist()])
-    bias_m, std_m = _in_gauge(found, good, zero)
+    bias_m, std_m = _in_gauge(found, good)
     for row in np.flatnonzero(good & (std_m > _MAX_STD_M)):
         reasons[int(found.anchors[row])] = f"its standard error would be {std_m[row]:.2f} m"
     rows = {anchor: row for row, anchor in enumerate(found.anchors.tolist())}
@@ -294,18 +287,18 @@ def _estimate(
             anchors.append(AnchorEstimate(anchor, used, None, None, None, reasons[anchor]))
             continue
         of_anchor = np.abs(found.residual_m[found.used & ((found.a == own_row) | (found.b == own_row))])
-        noise_m = 1.4826 * float(np.median(of_anchor)) * _spent(differences_used, len(found.anchors))
+        noise_m = STD_OVER_MAD * float(np.median(of_anchor)) * _spent(differences_used, len(found.anchors))
         anchors.append(AnchorEstimate(anchor, used, float(bias_m[own_row]), float(std_m[own_row]), noise_m, None))
     pair = found.a * count + found.b
     medians = [float(np.median(found.residual_m[here])) for here in map(pair.__eq__, np.unique(pair[found.used]))]
     return CalibrationEstimate(
         anchors=tuple(anchors),
-        zero="mean" if zero is None else f"anchor {zero}",
+        zero="mean",
         slope_m=found.slope_m,
         slope_std_m=None if steep is None else float(np.sqrt(steep.covariance_m2[-1, -1])),
         slope_note=note,
         noise_m=found.scale_m * _spent(differences_used, len(found.anchors)),
-        noise_before_m=1.4826 * float(np.median(np.abs(differences.excess_m))),
+        noise_before_m=STD_OVER_MAD * float(np.median(np.abs(differences.excess_m))),
         loop_m=float(np.sqrt(np.mean(np.square(medians)))),
         used=differences_used,
         rejected=len(differences.t_s) - differences_used,
@@ -317,14 +310,9 @@ def _spent(differences: int, anchors: int) -> float:
     return float(np.sqrt(differences / max(differences - anchors + 1, 1)))
 
 
-def _in_gauge(found: Fit, good: Mask, zero: int | None) -> tuple[Vector, Vector]:
-    """Constants and their standard errors with the zero where it should be, each of shape (m,)."""
+def _in_gauge(found: Fit, good: Mask) -> tuple[Vector, Vector]:
+    """Constants less the mean of the good ones, and their standard errors, each of shape (m,)."""
     count = len(found.anchors)
-    zero_weights = np.zeros(count)
-    if zero is not None:
-        zero_weights[found.anchors == zero] = 1.0
-    else:
-        zero_weights[good] = 1.0 / max(int(good.sum()), 1)
-    shift = np.eye(count) - zero_weights
+    shift = np.eye(count) - good / max(int(good.sum()), 1)
     covariance = shift @ found.covariance_m2[:count, :count] @ shift.T
     return shift @ found.bias_m, np.sqrt(np.maximum(np.diag(covariance), 0.0))

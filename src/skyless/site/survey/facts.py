@@ -7,7 +7,7 @@ from msgspec import Struct, structs
 
 
 class TagReceived(Struct, frozen=True, eq=False):
-    """What a tag received of the anchors; always a ``TagEpochs``."""
+    """What a tag received of the anchors. It is always a ``TagEpochs``, whose arrays are not sent in messages."""
 
 
 class PairRange(Struct, frozen=True, gc=False):

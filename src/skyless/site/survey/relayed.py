@@ -2,7 +2,7 @@
 
 With T, S and R for stamps of transmission, of the anchor's and of the tag's reception, ``R_b − R_a − (T_b − S_ba)`` is
 ``|p − b| − |p − a| + D_ab + h_b − h_a``: D_ab is the range that the anchors themselves measure. No position is needed,
-and whatever delays the way between the two anchors is in D_ab as well.
+and D_ab includes every delay of the way between the two anchors.
 """
 
 from collections import deque

@@ -103,7 +103,7 @@ class SurveyRecord(Struct, frozen=True, tag=FORMAT, tag_field="format"):
     site_id: int
     unix_s: float
     ranges: PairRanges
-    """As measured with the antenna delays before the survey."""
+    """Ranges measured with the antenna delays before the survey."""
     survey: Survey
     delay_changes_ticks: dict[int, int]
     """What was added to the TX antenna delays."""

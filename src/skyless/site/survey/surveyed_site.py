@@ -23,16 +23,15 @@ from skyless.core.constants import TICK_M
 from skyless.core.errors import SkylessError
 from skyless.core.site import AccuracySite, AnchorSite, Site, UnplacedAnchor
 from skyless.site.file.check import SITE_LIMITS, check_site
-from skyless.site.file.rewrite import DELAY_KEY, with_values
-from skyless.site.survey.facts import PairRanges
+from skyless.site.file.rewrite import with_values
 from skyless.site.survey.result import Survey, SurveyedAnchor
 
-_DELAY: Final = SITE_LIMITS[f"anchors.{DELAY_KEY}"]
+_DELAY: Final = SITE_LIMITS["anchors.tx_antenna_delay_ticks"]
 _MAX_STATED_M: Final = SITE_LIMITS["anchors.std_m"].high
 _RANGE_STD: Final = SITE_LIMITS["accuracy.range_std_m"]
 _STD_STEPS_PER_M: Final = 1e4
 _POSITION_DIGITS: Final = 4
-_KEYS: Final = ("x_m", "y_m", "z_m", DELAY_KEY, "std_m")
+_KEYS: Final = ("x_m", "y_m", "z_m", "tx_antenna_delay_ticks", "std_m")
 
 
 def surveyed_site(site: Site, survey: Survey) -> Site:
@@ -98,7 +97,10 @@ def delay_changes_ticks(site: Site, survey: Survey) -> dict[int, int]:
 
 
 def delay_differences_m(recorded: Site, site: Site) -> dict[int, float]:
-    """By how much half of the antenna delays of anchors is larger in a site than in a recording of it."""
+    """By how much half of the antenna delays of anchors is larger in a site than in a recording of it.
+
+    ``PairRanges.without_delays`` subtracts them from ranges that were measured with the delays of the recording.
+    """
     before = {anchor.id: anchor for anchor in recorded.all_anchors}
     half_m = {}
     for anchor in site.all_anchors:
@@ -107,11 +109,6 @@ def delay_differences_m(recorded: Site, site: Site) -> dict[int, float]:
             more += anchor.rx_antenna_delay_ticks - old.rx_antenna_delay_ticks
             half_m[anchor.id] = more * TICK_M / 2.0
     return half_m
-
-
-def with_delays_of(ranges: PairRanges, recorded: Site, site: Site) -> PairRanges:
-    """The ranges as they would have been measured with the antenna delays of another file of the same site."""
-    return ranges.without_delays(delay_differences_m(recorded, site))
 
 
 def _placed(

@@ -21,6 +21,7 @@ from skyless.core.kernels.arrays import Array, Integers, Mask, Vector
 from skyless.site.survey.facts import TagReceived
 from skyless.site.survey.fit.problem import Problem, Solution, distances_m, solve_least_squares, unknown_columns
 from skyless.site.survey.fit.robust import LATE_CUTOFF
+from skyless.site.survey.stamps.repeats import STD_OVER_MAD
 
 # Differences, averaged over epochs of half a second
 
@@ -46,9 +47,9 @@ _HUBER_ROUNDS: Final = 4
 class TagEpochs(TagReceived, frozen=True, eq=False):
     """Differences of one tag, ``r`` means over an epoch and a pair of anchors, in ``k`` epochs; ``n`` anchors.
 
-    A difference is the range to ``second`` less that to ``first``, both with their delays h. If it is ``relayed``, the
-    range of the pair, as the anchors measure it, is in it as well: ``second`` has received ``first`` and sent its own
-    stamp of it. That range is to be taken off with all its errors, for they are the same.
+    A difference is the range to ``second`` less that to ``first``, both with their delays h, plus the range of the pair
+    as the anchors measure it: ``second`` has received ``first`` and sent its own stamp of it. ``tag_ranges`` subtracts
+    the pair's range with all its errors, which are the same.
     """
 
     anchors: tuple[int, ...]
@@ -64,7 +65,6 @@ class TagEpochs(TagReceived, frozen=True, eq=False):
     """Shape (r,): mean time of a difference's samples since the middle of its epoch."""
     count: Integers
     """Shape (r,): samples in the mean."""
-    relayed: bool
     known_m: Array
     """Shape (k, 3): the tag's coordinates where they are known, NaN elsewhere."""
     known_std_m: tuple[float, float, float] = (0.01, 0.01, 0.01)
@@ -77,8 +77,7 @@ class TagEpochs(TagReceived, frozen=True, eq=False):
 class EpochCollector:
     """Gathers a tag's differences as they come."""
 
-    def __init__(self, *, relayed: bool) -> None:
-        self._relayed = relayed
+    def __init__(self) -> None:
         self._times, self._values = array("d"), array("d")
         self._firsts, self._seconds = array("q"), array("q")
 
@@ -103,7 +102,7 @@ class EpochCollector:
         group, group_of = np.unique((epoch * n + first) * n + second, return_inverse=True)
         median = _group_medians(group_of, value_m, len(group))
         away = np.abs(value_m - median[group_of])
-        scale = np.maximum(1.4826 * _group_medians(group_of, away, len(group)), 0.02)
+        scale = np.maximum(STD_OVER_MAD * _group_medians(group_of, away, len(group)), 0.02)
         kept = away <= _REJECT * scale[group_of]
         group_of, value_m, since_s = group_of[kept], value_m[kept], (t_s - middle_s[epoch])[kept]
         count = np.bincount(group_of, minlength=len(group))
@@ -118,7 +117,6 @@ class EpochCollector:
             mean_m,
             mean_s,
             count,
-            self._relayed,
             np.full((len(middle_s), 3), np.nan),
         )
 
@@ -134,21 +132,18 @@ def _group_medians(group_of: Integers, values: Vector, groups: int) -> Vector:
 def tag_ranges(epochs: TagEpochs, pair_ranges_m: Mapping[tuple[int, int], float]) -> Array:
     """Ranges to all anchors in each epoch up to one constant, shape (k, n); NaN where there are none.
 
-    ``pair_ranges_m``: of the anchors, by identifiers in ascending order. A relayed difference whose pair is missing
-    there is not used. Anchors that an epoch's differences do not tie to most others are NaN.
+    ``pair_ranges_m``: of the anchors, by identifiers in ascending order. A difference whose pair is missing there is
+    not used. Anchors that an epoch's differences do not tie to most others are NaN.
     """
     k, n = len(epochs.t_s), len(epochs.anchors)
-    epoch, first, second, value_m = epochs.epoch, epochs.first, epochs.second, epochs.difference_m
-    since_s, count = epochs.since_s, epochs.count
-    if epochs.relayed:
-        of_pair = np.full((n, n), np.nan)
-        for i, a in enumerate(epochs.anchors):
-            for j, b in enumerate(epochs.anchors):
-                of_pair[i, j] = pair_ranges_m.get((min(a, b), max(a, b)), np.nan)
-        value_m = value_m - of_pair[first, second]
-        known = np.isfinite(value_m)
-        epoch, first, second, value_m = epoch[known], first[known], second[known], value_m[known]
-        since_s, count = since_s[known], count[known]
+    of_pair = np.full((n, n), np.nan)
+    for i, a in enumerate(epochs.anchors):
+        for j, b in enumerate(epochs.anchors):
+            of_pair[i, j] = pair_ranges_m.get((min(a, b), max(a, b)), np.nan)
+    value_m = epochs.difference_m - of_pair[epochs.first, epochs.second]
+    known = np.isfinite(value_m)
+    epoch, first, second, value_m = epochs.epoch[known], epochs.first[known], epochs.second[known], value_m[known]
+    since_s, count = epochs.since_s[known], epochs.count[known]
     joined = _largest_part(epoch * n + first, epoch * n + second, k, n)
     strength = np.minimum(count, _FLOOR_COUNT) / _LONE_STD_M**2
     columns = np.stack([first, second, n + first, n + second], axis=1)
@@ -260,7 +255,7 @@ class WalkRows:
         inverse = self._inverse_local(local)
         leverage = np.einsum("kjl,klm,kjm->kj", local, inverse, local) / TAG_STD_M**2
         away = np.abs(residual) / np.sqrt(np.maximum(1.0 - leverage, _MIN_FREE))
-        typical = 1.4826 * float(np.median(away[self.used])) if self.used.any() else 0.0
+        typical = STD_OVER_MAD * float(np.median(away[self.used])) if self.used.any() else 0.0
         worst = (away == away.max(axis=1, initial=0.0, keepdims=True)) & (away > limit * max(_MIN_SCALE_M, typical))
         if (worst & self.used).any():
             self.used = self._with_enough(self.used & ~worst)

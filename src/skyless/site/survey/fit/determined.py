@@ -280,7 +280,7 @@ _AS_GOOD: Final = 0.98
 _AS_LITTLE: Final = 1.2
 """Gain, as a part of the best one, and what remains, as a multiple of the least, that are no worse.
 
-Of equal tapes the first is named, whatever the noise.
+Noise does not change which of several equal tapes is named: it is the first.
 """
 
 

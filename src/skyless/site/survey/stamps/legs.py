@@ -11,6 +11,7 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.core.air.frame import Heard, Malformed
+from skyless.core.air.masterless_packets import Relay
 from skyless.core.air.reception import Reception
 from skyless.core.constants import TICK_BITS, TICK_RATE_HZ
 from skyless.core.protocols import decode_any
@@ -38,14 +39,6 @@ class AnchorLeg(Struct, frozen=True, gc=False):
     """When the listener received the same broadcast, on its own clock."""
 
 
-class Relayed(Struct, frozen=True, gc=False):
-    """The sender of a frame has received a frame of another anchor."""
-
-    anchor: int
-    sequence: int
-    rx_ticks: int
-
-
 class _Received(Struct, frozen=True, gc=False):
     tx_ticks: int
     listener_ticks: int
@@ -71,7 +64,7 @@ class RelayMatcher:
         """RX stamp of each directed pair's last leg: a stamp is relayed until there is another."""
 
     def add(
-        self, anchor: int, sequence: int, tx_ticks: int, relays: Iterable[Relayed | Heard], now_ticks: int, t_s: float
+        self, anchor: int, sequence: int, tx_ticks: int, relays: Iterable[Relay | Heard], now_ticks: int, t_s: float
     ) -> list[AnchorLeg]:
         """The legs that a frame's relays complete. ``now_ticks``: the listener's counter, unwrapped, and its clock."""
         legs = []
@@ -84,7 +77,7 @@ class RelayMatcher:
         self._prune(now_ticks)
         return legs
 
-    def _leg(self, anchor: int, tx_ticks: int, relay: Relayed | Heard, now_ticks: int) -> AnchorLeg | None:
+    def _leg(self, anchor: int, tx_ticks: int, relay: Relay | Heard, now_ticks: int) -> AnchorLeg | None:
         """The leg that a relay describes, if the listener has received the same frame."""
         pair = (relay.anchor, anchor)
         if relay.anchor == anchor or self._last.get(pair) == relay.rx_ticks:

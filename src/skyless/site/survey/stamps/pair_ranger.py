@@ -17,18 +17,16 @@ from skyless.core.constants import TICK_BITS, TICK_M, TICK_RATE_HZ
 from skyless.core.kernels.arrays import Array, Integers, Mask
 from skyless.core.ticks import Unwrapper
 from skyless.site.survey.facts import PairBlock, PairRange, PairRanges
-from skyless.site.survey.stamps.repeats import earliest_cluster
+from skyless.site.survey.stamps.repeats import STD_OVER_MAD, earliest_cluster
 from skyless.site.survey.two_way import MAX_BRACKET_RATE, MAX_FLIGHT_TICKS
 
 _KEPT_S: Final = 5.0  # legs wait so long for the other direction, which another anchor may publish later
+_LONGEST_BRACKET_S: Final = 0.5  # between two frames of an anchor that bracket one of another; at most half a wrap
 _LARGEST_TICKS: Final = 1 << 62  # stamps are computed with 64 bits
 _MAX_BLOCKS: Final = 256
 _MAX_PAIRS: Final = 1 << 16
 _MAX_OPEN_LEGS: Final = 1 << 18  # a block with more legs is closed before its time
 _OUTLIER_SIGMAS: Final = 5.0
-_MAD_STD: Final = 1.4826
-"""Standard deviation of normally distributed values over the median of their distances from the median."""
-
 _PRIOR_WEIGHT: Final = 500.0  # weight of the site's noise in a pair's, in flights
 _PRIOR_PRODUCTS: Final = 200.0
 """Weight of the assumption that TX and RX stamps are equally good, in products of two pairs."""
@@ -89,7 +87,7 @@ def flights_of(legs: Legs, longest_ticks: int) -> tuple[Flights, Legs, int]:
 class _OneWay(Struct, frozen=True, eq=False):
     flights: Flights
     seen: Integers
-    """Legs that were bracketed, whatever came of it."""
+    """Legs that were bracketed, with or without a time of flight."""
     is_needed: Mask
     impossible: int
 
@@ -235,18 +233,16 @@ class PairRanger:
         self,
         bits: int = TICK_BITS,
         block_s: float = 1.0,
-        longest_bracket_s: float = 0.5,
         on_block: Callable[[PairBlock], None] | None = None,
     ) -> None:
         """``bits``: of the counters; ``block_s``: length of a block.
 
-        ``longest_bracket_s``: between two frames of an anchor that bracket one of another; four superframes are good,
-        and it is at most half a wrap. ``on_block`` is given every block of every pair when its time is over, late ones
-        too, and the blocks of one time directly after one another.
+        ``on_block`` is given every block of every pair when its time is over, late ones too, and the blocks of one time
+        directly after one another.
         """
         self.counters: Counter[str] = Counter()
         self._bits, self._block_s, self._on_block = bits, block_s, on_block
-        self._longest_ticks = min(round(longest_bracket_s * TICK_RATE_HZ), (1 << (bits - 1)) - 1)
+        self._longest_ticks = min(round(_LONGEST_BRACKET_S * TICK_RATE_HZ), (1 << (bits - 1)) - 1)
         self._clocks: dict[int, Unwrapper] = {}
         self._number: dict[tuple[int, int], int] = {}
         self._open: list[tuple[int, int, int, bool, float]] = []
@@ -523,7 +519,7 @@ def _inliers(pair: Integers, value: Array) -> Mask:
     order = np.lexsort((distance, pair))
     scatter = np.zeros(len(median))
     scatter[pair[order[begin]]] = distance[order[begin + size // 2]]
-    scatter = _MAD_STD * np.maximum(scatter, np.median(distance))
+    scatter = STD_OVER_MAD * np.maximum(scatter, np.median(distance))
     return np.asarray(distance <= _OUTLIER_SIGMAS * scatter[pair] + TICK_M)
 
 

@@ -5,13 +5,16 @@ holds enough of them.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
 
 from skyless.core.kernels.arrays import Array, Mask
 from skyless.site.survey.facts import PairRange, PairRanges
+
+STD_OVER_MAD: Final = 1.4826
+"""Standard deviation of normally distributed values over the median of their distances from their median."""
 
 MIN_CLUSTER_SHARE: Final = 0.1
 """An earlier cluster with a smaller share of all exchanges is an error."""
@@ -62,22 +65,20 @@ def _densest(ordered: Array, until: Array) -> float:
 
 _ENOUGH: Final = 5  # ranges of a pair from which it has clusters; of fewer the median is used
 _MIN_COUNT: Final = 3  # ranges in a cluster, and of a pair whose scatter is looked at
-_SIGMAS_OF_MAD: Final = 1.4826
 _MEDIAN_OVER_MEAN: Final = 1.25  # standard deviation of a median over that of the mean
 _MIN_NOISE_M: Final = 1e-3
 _UNKNOWN_NOISE_M: Final = 0.05  # of a range where no pair was measured more than once
 
 
-def mean_ranges(ranges_m: Mapping[tuple[int, int], Sequence[float]], anchors: Iterable[int] = ()) -> PairRanges:
-    """One range of each pair, by pair ``(a, b)`` with a < b; ``anchors``: further ones, without a range.
+def mean_ranges(ranges_m: Mapping[tuple[int, int], Sequence[float]]) -> PairRanges:
+    """One range of each pair, by pair ``(a, b)`` with a < b.
 
     Ranges that are not finite are left out, and so are pairs without any other.
     """
     finite_m = {pair: [value for value in values if math.isfinite(value)] for pair, values in ranges_m.items()}
     noise_m = _noise(finite_m)
     pairs = tuple(_mean(a, b, np.sort(values), noise_m) for (a, b), values in sorted(finite_m.items()) if values)
-    everybody = {anchor for pair in ranges_m for anchor in pair} | set(anchors)
-    return PairRanges(pairs, tuple(sorted(everybody)))
+    return PairRanges(pairs, tuple(sorted({anchor for pair in ranges_m for anchor in pair})))
 
 
 def _noise(ranges_m: Mapping[tuple[int, int], Sequence[float]]) -> float:
@@ -96,7 +97,7 @@ def _noise(ranges_m: Mapping[tuple[int, int], Sequence[float]]) -> float:
 def _robust_std(values: Array) -> float:
     """Robust standard deviation; of few values corrected for their number."""
     deviation = float(np.median(np.abs(values - np.median(values))))
-    return _SIGMAS_OF_MAD * deviation * math.sqrt(len(values) / (len(values) - 1.0))
+    return STD_OVER_MAD * deviation * math.sqrt(len(values) / (len(values) - 1.0))
 
 
 def _mean(a: int, b: int, values_m: Array, noise_m: float) -> PairRange:

@@ -12,6 +12,7 @@ from scipy.special import chdtri
 
 from skyless.core.kernels.arrays import Array, Integers, Mask
 from skyless.site.survey.facts import PairBlock
+from skyless.site.survey.stamps.repeats import STD_OVER_MAD
 from skyless.site.survey.watch.explain import (
     Explanation,
     Finding,
@@ -26,7 +27,6 @@ from skyless.site.survey.watch.explain import (
     weight_of,
 )
 
-_GAUSSIAN: Final = 1.4826  # from a median of magnitudes to a standard deviation
 _USUAL_WINDOWS: Final = 60  # windows of which the usual range is the median
 _DRIFT_WINDOWS: Final = 360
 _MIN_DRIFT_M: Final = 0.02
@@ -134,16 +134,16 @@ class RangeHistory:
         scale_m2 = np.zeros(len(self))
         rows = np.flatnonzero(count)
         if len(rows):
-            scale_m2[rows] = (_GAUSSIAN * np.nanmedian(apart[rows], axis=1)) ** 2 / 2.0
+            scale_m2[rows] = (STD_OVER_MAD * np.nanmedian(apart[rows], axis=1)) ** 2 / 2.0
         learned_m2 = (count * scale_m2 + _PRIOR_DIFFERENCES * _PRIOR_DRIFT_M**2) / (count + _PRIOR_DIFFERENCES)
         return np.asarray(np.sqrt(np.maximum(learned_m2, _MIN_DRIFT_M**2)))
 
-    def restart(self, pairs: Mask) -> None:
-        """Forget the usual ranges of these pairs, which are learned from the start."""
-        self._used[pairs] = 0
-        self._usual[pairs] = np.nan
-        self._usual_m[pairs] = self.first_m[pairs] = np.nan
-        self._values[pairs] = np.nan
+    def restart(self) -> None:
+        """Forget the usual ranges, which are learned from the start."""
+        self._used[:] = 0
+        self._usual[:] = np.nan
+        self._usual_m[:] = self.first_m[:] = np.nan
+        self._values[:] = np.nan
 
 
 _LASTING: Final = 1e-3  # a finding lasts while what it says has more evidence than chance gives with this probability
@@ -285,19 +285,16 @@ class AnchorWatch:
             self._conclude(self._open, self._pending.pop(self._open, {}))
             self._open += 1
 
-    def accept(self, anchors: Iterable[int] | None = None) -> None:
-        """Learn again what is usual: for all pairs, or for those of some anchors. Their findings end.
+    def accept(self) -> None:
+        """Learn again what is usual. All findings end.
 
         A site that was surveyed again gets a new watch instead, as positions differ.
         """
-        chosen = set(self._ids if anchors is None else anchors)
-        rows = np.array([self._ids[a] in chosen or self._ids[b] in chosen for a, b in self._ends()], dtype=np.bool_)
-        self._history.restart(rows)
-        self._held = [one for one in self._held if not chosen & set(one.finding.anchors)]
+        self._history.restart()
+        self._history.presence[list(self._blocked)] = 0.0
+        self._held.clear()
         self._windows.clear()
-        for row in [row for row in self._blocked if rows[row]]:
-            del self._blocked[row]
-            self._history.presence[row] = 0.0
+        self._blocked.clear()
 
     def _ends(self) -> list[tuple[int, int]]:
         return list(zip(self._first, self._second, strict=True))

@@ -17,6 +17,7 @@ from skyless.core.kernels.arrays import Array
 from skyless.site.survey.facts import Facts, PairRange, PairRanges
 from skyless.site.survey.result import Survey
 from skyless.site.survey.stamps.pair_ranger import PairRanger, StepTable
+from skyless.site.survey.stamps.repeats import STD_OVER_MAD
 from skyless.site.survey.watch.explain import Pairs, Part, explain, sentence_of, weight_of
 
 _MIN_STEPS: Final = 4  # in fewer, a change and the scatter of ranges look the same
@@ -24,7 +25,6 @@ _FALSE_ALARM: Final = 1e-3
 """Probability that the scatter of all ranges and splits alone makes one of them differ, where several have to."""
 
 _MIN_PAIRS: Final = 2  # pairs of one anchor whose ranges differ
-_GAUSSIAN: Final = 1.4826  # from a median of magnitudes to a standard deviation
 _DRIFT_FLOOR_M: Final = 0.02  # ranges of rooms wander by this much, and more slowly than steps follow one another
 
 Solve = Callable[[PairRanges, Facts], Survey]
@@ -96,7 +96,7 @@ def _scatter(table: StepTable) -> tuple[Array, Array]:
         warnings.simplefilter("ignore", RuntimeWarning)
         white_m2 = np.nanmedian(table.variance_m2, axis=0)
         apart_m = np.nanmedian(np.abs(np.diff(table.range_m, axis=0)), axis=0)
-    drift_m2 = np.maximum(np.nan_to_num(_GAUSSIAN * apart_m) ** 2 / 2.0, _DRIFT_FLOOR_M**2)
+    drift_m2 = np.maximum(np.nan_to_num(STD_OVER_MAD * apart_m) ** 2 / 2.0, _DRIFT_FLOOR_M**2)
     return np.maximum(white_m2, 1e-8), drift_m2
 
 
