@@ -24,7 +24,7 @@ import skyless
 from skyless.page.state import SILENT_S
 from support.processes import free_port
 
-PAGE = Path(skyless.__file__).parent / "dashboard" / "page"
+PAGE = Path(skyless.__file__).parent / "page" / "browser"
 RECORDED_S = 90.0
 FIRST_FIX_S = 2.0
 PLAN = {"image": "hall.png", "width_m": 24.0, "x_m": 0.0, "y_m": -1.0}
@@ -266,7 +266,7 @@ class FakeServer:
         since = now - self.started
         anchors = [made_up.anchor_health(n, since, now - (20 if n == 8 else 0), n != 5) for n in range(1, 9)]
         if self.mode != "master":
-            anchors = [made_up.anchor_health_2(n, since, now, self.mode) for n in range(1, 9)]
+            anchors = [made_up.anchor_health_2(n, since, now) for n in range(1, 9)]
         anchors = [health | self.anchor_reports.get(health["anchor"], {}) for health in anchors]
         tags = []
         for number, name in enumerate(made_up.names(self.tags)):

@@ -116,13 +116,10 @@ def tag_health(name, number, time_s, unix_s, reason=None):
     }  # fmt: skip
 
 
-def anchor_health_2(anchor, time_s, unix_s, mode):
-    """Of protocol 2: anchor 3 leads the slot time."""
-    shared = {"master": None, "mode": mode, "synchronised": True, "role": "anchor", "term": None, "root": None}
-    if mode == "slots":
-        role, hop, parents = ("root", 0, []) if anchor == 3 else ("anchor", 2, [3, 4])
-        shared |= {"role": role, "root": 3, "term": 1, "hop": hop, "parents": parents}
-    return anchor_health(anchor, time_s, unix_s) | shared
+def anchor_health_2(anchor, time_s, unix_s):
+    """An anchor of protocol 2 knows no common time."""
+    nothing = dict.fromkeys(("master", "term", "offset_s", "rate_ppm", "offset_std_m"))
+    return anchor_health(anchor, time_s, unix_s) | nothing | {"mode": "free", "synchronised": True, "role": "anchor"}
 
 
 def anchor_health(anchor, time_s, unix_s, synchronised=True):

@@ -17,7 +17,7 @@ MQTT = Counters(0, 0, 0)
 TAG = TagHealth("t", UNIX_S, 60.0, "joint", 400, 390, 400.0, None, 0.1, 1e-3, 2e-3, {}, MQTT, 0.1, 1, ())
 TRUSTING = replace(TAG, trust="open", is_verified=True)
 ANCHOR = AnchorHealth(
-    1, UNIX_S, 60.0, "anchor", None, None, True, 0.1, 0.5, 0.01, 9, 0, 9, 7, {}, {}, MQTT, mode="slots"
+    1, UNIX_S, 60.0, "anchor", None, None, True, 0.1, 0.5, 0.01, 9, 0, 9, 7, {}, {}, MQTT, mode="free"
 )
 KEYED = replace(ANCHOR, chain=2, chain_ends_unix_s=UNIX_S + 400 * DAY_S)
 

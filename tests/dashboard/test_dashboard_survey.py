@@ -215,7 +215,7 @@ def test_other_sites_pages_change_nothing(browser, wire):
 
 def test_a_site_without_positions_has_no_overlay_yet(live, wire):
     unplaced = tuple(UnplacedAnchor(anchor.id, slot) for slot, anchor in enumerate(SITE.site.anchors))
-    schedule = replace(SITE.site.schedule, mode="slots", slots=8)
+    schedule = replace(SITE.site.schedule, mode="free")
     site = replace(SITE.site, anchors=(), unplaced=unplaced, schedule=schedule)
     wire.deliver(topics.site_topic(SITE_ID), replace(SITE, site=site))
     assert live.dropped == {}

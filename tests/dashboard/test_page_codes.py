@@ -12,7 +12,7 @@ DAY_S = 86400.0
 
 @pytest.fixture
 def hall(serve, visit):
-    server = serve(mode="slots")
+    server = serve(mode="free")
     return server, visit(server).page
 
 

@@ -167,22 +167,6 @@ def test_health_and_phases_are_shown(hall):
     assert page.locator("#phases .fix").count() == 3 * (made_up.SUPERFRAME - 3)
 
 
-def test_a_site_in_slots_shows_the_root_and_what_it_leads(serve, visit):
-    page = visit(serve(mode="slots")).page
-    page.click("#tab-anchors")
-    page.wait_for_selector("#panel-anchors tr.good:has-text('3 root')")
-    assert "master" not in page.locator("#panel-anchors").inner_text()
-    page.click("#panel-anchors button:has-text('5')")
-    facts = page.locator("#panel-anchors .detail .facts")
-    facts.locator("dt:has-text('Slot time led by')").wait_for()
-    shown = facts.inner_text()
-    assert all(words in shown for words in ("anchor 3", "Hops", "anchor 3, anchor 4"))
-    page.click("#legend summary")
-    marks = page.locator(".marks").inner_text()
-    assert "root: its clock leads the slot time" in marks
-    assert "master" not in marks
-
-
 def test_a_site_with_random_instants_has_no_leader_and_no_superframe(serve, visit):
     page = visit(serve(mode="free", tags=0)).page
     page.click("#tab-anchors")

@@ -22,7 +22,7 @@ class Site:
 
     def __init__(self, serve, visit, survey=None, **context):
         self.survey = survey or FakeSurvey()
-        self.server = serve(tags=0, zones=(), mode="slots", placed=False, survey=self.survey)
+        self.server = serve(tags=0, zones=(), mode="free", placed=False, survey=self.survey)
         self.visit = visit(self.server, **context)
         self.page = self.visit.page
         until(self.page, "skyless.state.survey !== null")
@@ -348,7 +348,7 @@ def test_a_site_in_use_that_nobody_sets_up_has_no_fault(serve, visit):
     """What another survey would leave open is none, until somebody begins one; saving it asks all the same."""
     survey = FakeSurvey()
     survey.unchecked, survey.undetermined = "Nothing checks this survey.", (6,)
-    page = visit(serve(tags=0, zones=(), mode="slots", survey=survey)).page
+    page = visit(serve(tags=0, zones=(), mode="free", survey=survey)).page
     until(page, "skyless.state.survey !== null")
     page.click("#tab-setup")
     page.wait_for_selector("#verdict.note:has-text('In use. All anchors have positions.')")
@@ -364,7 +364,7 @@ def test_a_site_in_use_that_nobody_sets_up_has_no_fault(serve, visit):
 
 
 def test_a_site_in_use_without_a_survey_program_has_no_fault(serve, visit):
-    page = visit(serve(tags=0, zones=(), mode="slots")).page
+    page = visit(serve(tags=0, zones=(), mode="free")).page
     page.click("#tab-setup")
     page.wait_for_selector("#verdict.note:has-text('start the survey program')")
     assert "skyless survey" in page.locator(".command code").inner_text()
@@ -403,7 +403,7 @@ def test_an_old_message_is_reported_as_old(site):
 
 
 def test_without_a_survey_program_the_page_shows_how_to_start_it(serve, visit):
-    server = serve(tags=0, zones=(), mode="slots", placed=False)
+    server = serve(tags=0, zones=(), mode="free", placed=False)
     page = visit(server).page
     page.wait_for_selector("#verdict:has-text('No survey program')")
     server.send({"type": "mqtt", "connected": True, "broker": "mqtt://hall:1883"})

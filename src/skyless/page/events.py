@@ -126,8 +126,7 @@ class EventLog:
             before = self._leader.leader
             leader = self._leader.update(health, now_s)
             if leader is not None:
-                word = "master" if health.mode == "master" else "root of the slot time"
-                text = f"anchor {leader} is the {word} now, after anchor {before}"
+                text = f"anchor {leader} is the master now, after anchor {before}"
                 self._add(now_s, "master", "warning", f"anchor/{leader}", text)
 
     def tick(self, now_s: float) -> None:

@@ -147,7 +147,7 @@ class SiteState:
         self._health_serial += 1
         self._healths[_KINDS[type(health)]][name] = _Health(self._health_serial, now_s, health)
         if isinstance(health, AnchorHealth):
-            (self._leaders.add if health.role in {"master", "root"} else self._leaders.discard)(name)
+            (self._leaders.add if health.role == "master" else self._leaders.discard)(name)
 
     def expire(self, now_s: float) -> None:
         """Drop what is older than ``EXPIRY_S``."""

@@ -21,11 +21,7 @@ const SWITCHES = {
 };
 /** How much `tracks.js` and `player.js` keep. */
 const KEPT = "What this page holds: of the live site the last 2048 fixes of each tag, of a recording about 90 s up to now";
-/** Anchors with a frame, by the mode of the site. */
-const LEADERS = {
-  master: "master: its clock is the site's time",
-  slots: "root: its clock leads the slot time of anchors linked to it",
-};
+const MASTER = "master: its clock is the site's time";
 
 /** Fill the legend. */
 export function start() {
@@ -78,8 +74,8 @@ function marks() {
   const list = h("ul", { class: "marks" });
   const show = () => {
     const rows = Object.keys(CONDITIONS).map((kind) => h("li", {}, anchorMark(kind), `anchor ${wordsOf(kind)}`));
-    const leader = LEADERS[siteMode()];
-    list.replaceChildren(...rows, ...(leader ? [h("li", {}, anchorMark("good", true), leader)] : []));
+    const master = siteMode() === "master" ? [h("li", {}, anchorMark("good", true), MASTER)] : [];
+    list.replaceChildren(...rows, ...master);
   };
   on(["site"], show);
   show();

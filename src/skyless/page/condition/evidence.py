@@ -323,7 +323,7 @@ class FixAges:
 
 
 class LeaderTracker:
-    """Watches the anchors' health. Of several that claim to lead, the newest term counts."""
+    """Follows who is the master by the anchors' health. Where several say that they are, the newest term counts."""
 
     def __init__(self) -> None:
         self.leader: int | None = None
@@ -332,7 +332,7 @@ class LeaderTracker:
 
     def update(self, health: AnchorHealth, time_s: float) -> int | None:
         """Process a health message. Returns the new leader if the leader has changed."""
-        if health.role in {"master", "root"}:
+        if health.role == "master":
             self._claims[health.anchor] = time_s, health.term or 0
         else:
             self._claims.pop(health.anchor, None)

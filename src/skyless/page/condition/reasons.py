@@ -375,13 +375,11 @@ def multipath_reason(evidence: Evidence, now_s: float) -> Reason | None:
 
 
 def master_reason(evidence: Evidence, now_s: float) -> Reason | None:
-    """The master, or the root of the slot time, changes often."""
+    """The master changes often (protocol 1)."""
     count = sum(now_s - time_s < OFTEN_S for time_s in evidence.leader.changes_s)
     if count < OFTEN:
         return None
-    slots = evidence.site is not None and evidence.site.schedule.mode != "master"
-    leader = "root of the slot time" if slots else "master"
-    text = f"the {leader} has changed {count} times within a minute; now it is anchor {evidence.leader.leader}"
+    text = f"the master has changed {count} times within a minute; now it is anchor {evidence.leader.leader}"
     advice = "Anchors lose its messages: a computer is too slow, or something blocks it; move it, or name another."
     return Reason("master", "warning", text, advice)
 

@@ -191,13 +191,13 @@ class AnchorHealth(Struct, frozen=True):
     uptime_s: float
     role: Literal["master", "anchor", "listening"]
     master: int | None
-    """The anchor whose time it uses; None in protocol 2, which has no master."""
+    """The anchor whose time it uses; None in mode free, which has no master."""
     term: int | None
-    """Of the master, or of the claim on the slot time; None in mode free."""
+    """Counts the masters; None in mode free."""
     synchronised: bool
     """Whether it may send; always in mode free."""
     offset_s: float | None
-    """Own counter less the master's scale, or the slot time, modulo the wrap, in (-8.6, 8.6]."""
+    """Own counter less the master's scale, modulo the wrap, in (-8.6, 8.6]; None in mode free."""
     rate_ppm: float | None
     """Own rate against the same."""
     offset_std_m: float | None

@@ -39,7 +39,7 @@ export function condition(id) {
   return state.health.conditions.get(id) ?? "unknown";
 }
 
-/** How the site's anchors share the air: master, slots or free. */
+/** How the site's anchors share the air: master or free. */
 export function siteMode() {
   return state.site?.schedule?.mode ?? "master";
 }
@@ -49,11 +49,9 @@ export function wordsOf(kind) {
   return kind === "good" && siteMode() === "free" ? "on the air" : CONDITIONS[kind].words;
 }
 
-/** What the anchor leads: "master" of the site, "root" of a slot time (islands have one each), or ""; `master` if known. */
+/** "master" for the master of a site that has one, "" for other anchors; `master` if known. */
 export function leads(id, master = undefined) {
-  if (siteMode() === "master") return id === (master ?? masterNow()) ? "master" : "";
-  const root = state.mode === "live" && state.health.anchors.get(id)?.role === "root";
-  return root && !["bad", "unknown"].includes(condition(id)) ? "root" : "";
+  return siteMode() === "master" && id === (master ?? masterNow()) ? "master" : "";
 }
 
 /** The current master: as the anchors report it, or else as in the site file. */
@@ -64,7 +62,7 @@ function masterNow() {
   return state.site?.master ?? null;
 }
 
-/** A condition's mark as a small picture; that of a master or root has a frame. */
+/** A condition's mark as a small picture; that of a master has a frame. */
 export function anchorMark(kind, leading = false) {
   const path = s("path", { d: CONDITIONS[kind].shape, transform: "translate(9 9) scale(5)" });
   const mark = s("svg", { viewBox: "0 0 18 18", class: `mark ${kind}`, "aria-hidden": "true" }, path);
@@ -75,7 +73,7 @@ export function anchorMark(kind, leading = false) {
 /** The anchors as drawn last, for the pointer and for names that avoid them. @type {Array<{id: number, x: number, y: number}>} */
 export let drawnAnchors = [];
 
-/** Draw all anchors, unless the survey's picture shows them; a master or root has a frame around it, the selected one a ring. */
+/** Draw all anchors, unless the survey's picture shows them; a master has a frame around it, the selected one a ring. */
 export function drawAnchors(context) {
   drawnAnchors = [];
   if (surveyShown()) return;

@@ -165,9 +165,6 @@ function anchorFacts(id, health) {
   return {
     State: [wordsOf(kind), health.role === "anchor" ? "" : health.role].filter(Boolean).join(", "),
     "Synchronised to": kind !== "good" || health.master === null || health.master === id ? null : `anchor ${health.master}`,
-    "Slot time led by": health.root == null || health.root === id ? null : `anchor ${health.root}`,
-    Hops: number(health.hop),
-    Parents: health.parents?.length ? health.parents.map((parent) => `anchor ${parent}`).join(", ") : null,
     Codes: codesOf(health)?.words,
     "Key chain": chainWords(health)?.words,
     "Not accepted": faultWords(health.faults),
