@@ -42,7 +42,7 @@ def rotated(covariance: Matrix, heading_deg: float) -> Matrix:
 def geodetic(point_m: Vector, origin: GeoreferenceSite) -> Vector:
     """Latitude, longitude (degrees, WGS 84) and height (m) of a point of the site.
 
-    The plane of x and y touches the Earth at the origin. A height is the origin's and z, wherever the point is: a
+    The plane of x and y touches the Earth at the origin. A height is always the sum of the origin's and z: a
     survey levels its anchors, so that z follows the Earth's curvature (8 cm at a distance of 1 km).
     """
     east, north, up = east_north_up(point_m, origin.heading_deg)

@@ -20,7 +20,7 @@ MAX_LINE_BYTES: Final = 1 << 14
 
 MAX_TEXT_BYTES: Final = 1 << 29
 MAX_HEAD_BYTES: Final = 1 << 20
-"""Of a text file that is read whole, and of its first line: devices do not end, and archives can unpack to far more."""
+"""Limits of a text file read whole, and of its first line: devices do not end, and archives can unpack to far more."""
 
 _GZIP_MAGIC: Final = b"\x1f\x8b"
 

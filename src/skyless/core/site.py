@@ -182,7 +182,7 @@ _DIGITS: Final = 16
 def site_digest(site: Site) -> str:
     """16 hexadecimal digits that depend on the site's name and number, and on its anchors, and on nothing else.
 
-    Of the anchors their identifiers, positions, slots and antenna delays count, whatever their order.
+    Identifiers, positions, slots and antenna delays of the anchors count. Their order does not.
     """
     anchors = [
         (

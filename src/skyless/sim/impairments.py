@@ -73,7 +73,7 @@ class PairError(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class WarmUp(Struct, frozen=True, forbid_unknown_fields=True):
-    """A crystal whose frequency changes, besides all else, by ppm·(1 − exp(−(t − start_s)/tau_s)) from a time on."""
+    """A crystal whose frequency also changes by ppm·(1 − exp(−(t − start_s)/tau_s)) from a time on."""
 
     ppm: float
     tau_s: float

@@ -110,7 +110,7 @@ class Flight:
 
 
 class OnAir:
-    """The frames that are, were lately, or will soon be on the air."""
+    """The frames that are, recently were, or soon will be on the air."""
 
     def __init__(self) -> None:
         self._flights: deque[Flight] = deque()
@@ -297,7 +297,7 @@ class Medium(Generic[Result]):
         return True
 
     def miss(self, until_s: float) -> tuple[int, ...]:
-        """Withdraw all frames whose RMARKER would leave before ``until_s``: whoever lets time pass came too late.
+        """Withdraw all frames whose RMARKER would leave before ``until_s``, because time was let pass too late.
 
         Returns the nodes that planned them.
         """

@@ -22,7 +22,7 @@ _SLOPE_MIDDLE_M: Final = 4.0
 """The slope's error is 0 at this distance, and reaches its size at 0 and at twice this distance."""
 
 _PURPOSE: Final = 2
-"""Of a tag's stream of random numbers, besides its noise and its crystal."""
+"""Purpose of a tag's stream of random numbers, other than its noise and its crystal."""
 
 
 class RangeErrorModel(Struct, frozen=True, forbid_unknown_fields=True):

@@ -60,7 +60,7 @@ class GeoreferencePage(Struct, frozen=True, gc=False, tag="georeference"):
 
 
 class SitePage(Struct, frozen=True, gc=False, tag="site"):
-    """What is common to a site of protocol 2 besides noise, accuracy and georeference."""
+    """What is common to a site of protocol 2, other than noise, accuracy and georeference."""
 
     pages: int
     """Number of pages, this one included, so that a tag knows when it has them all."""

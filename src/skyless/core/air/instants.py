@@ -1,7 +1,7 @@
 """When an anchor of protocol 2 sends: at random instants that everybody can predict (``docs/protocol2.md``).
 
 The gap between two beacons of an anchor is a function of its identifier, of the first one's sequence number and of the
-mean period that this one states. So whoever has received a beacon knows when the next ones leave, by the anchor's
+mean period that this one states. So a receiver of one beacon knows when the next ones leave, by the anchor's
 counter, however many of them get lost; and two anchors whose beacons collided hardly collide again the next time.
 
 A period is stated as a code of 8 bits, as floating-point numbers are: 16 steps for each doubling, from 4 ms on.

@@ -120,7 +120,7 @@ class LocalAlmanacState(Struct, frozen=True):
 class LocalAlmanac:
     """What a tag has learned of a site of protocol 2.
 
-    An anchor's own beacons state its position. The common pages count once a majority of the anchors received lately
+    An anchor's own beacons state its position. The common pages count once a majority of the anchors received recently
     states their issue, and they fit it; those in use stay until all pages of another such issue are there.
     """
 
@@ -128,7 +128,7 @@ class LocalAlmanac:
         self.pages: CommonPages | None = None
         """None until they are complete."""
         self.issue: int | None = None
-        """Of the pages in use."""
+        """Issue of the pages in use."""
         self._first_ticks: int | None = None
         self._anchors: dict[int, AnchorStatement] = {}
         self._positions_m: dict[int, Array] = {}

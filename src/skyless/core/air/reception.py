@@ -4,7 +4,7 @@ from msgspec import Struct
 
 
 class Diagnostics(Struct, frozen=True, gc=False):
-    """What a radio measured of one frame besides its time; a value is None where the radio does not report it.
+    """What a radio measured of one frame in addition to its time. A value is None where the radio does not report it.
 
     Powers are those of the chip's formulas without corrections (``core/air/first_path.py``).
     """

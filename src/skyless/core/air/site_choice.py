@@ -21,7 +21,7 @@ PRESENT_TICKS: Final = from_seconds(1.0)
 
 MAX_SITES: Final = 8
 MAX_COUNTED: Final = 32
-"""Of one site, as far as they are counted."""
+"""Largest number of anchors of one site that is counted."""
 
 
 class SiteUse(Enum):

@@ -72,7 +72,7 @@ class _Offset(Struct):
         self.frames += 1
 
     def is_far(self, timing: ChainTiming) -> bool:
-        """Whether the clocks are too far apart, whatever the instants at which that anchor sends."""
+        """Whether the clocks are too far apart for any instants at which that anchor may send."""
         least_s = min(self.present_s, self.before_s)
         latest_s = min(SPACINGS / self.frames_before, timing.interval_s) if self.frames_before else timing.interval_s
         return least_s < -timing.anchors_apart_s or least_s > timing.anchors_apart_s + latest_s

@@ -47,7 +47,7 @@ class Chain(Struct, frozen=True, repr_omit_defaults=True):
     first: int
     """The first interval in which it counts."""
     signatures: bytes
-    """Of its sections in their order, from that of ``first`` on, 64 bytes each."""
+    """Signatures of its sections in order, from the section of ``first`` on, 64 bytes each."""
     seed: bytes
     """32 bytes, secret."""
 
@@ -146,7 +146,7 @@ class ChainRing:
 
     @property
     def timing(self) -> ChainTiming | None:
-        """Of the newest chain; None without any."""
+        """Timing of the newest chain; None without any."""
         return self._chains[0].chain.timing if self._chains else None
 
     def successor(self, interval: int) -> bytes | None:

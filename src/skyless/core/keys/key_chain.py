@@ -79,7 +79,7 @@ def mac_of(signed: bytes, key_of_macs: bytes) -> bytes:
 
 
 def is_mac(signed: bytes, mac: bytes, key_of_macs: bytes) -> bool:
-    """Whether a code is that of these bytes; takes the same time wherever they differ."""
+    """Whether a code is that of these bytes, in constant time."""
     return hmac.compare_digest(mac, mac_of(signed, key_of_macs))
 
 

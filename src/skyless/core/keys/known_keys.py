@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 KEPT_KEYS: Final = 256
-"""Of one section: frames wait for their key for seconds only."""
+"""Keys kept of one section. Frames wait for their key for seconds only."""
 MAX_CERTIFICATES: Final = 6
 
 NEAR_STEPS: Final = 16

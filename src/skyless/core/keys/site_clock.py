@@ -16,7 +16,7 @@ KEY_WAIT_INTERVALS: Final = 2
 """The newest key is known to have been disclosed within this number of intervals, by the quickest of those before."""
 
 RECENT_KEYS: Final = 10
-"""Of this number of keys the one that came soonest after its disclosure shows how far the host's clock is off."""
+"""Number of recent keys. The quickest of them after its disclosure shows how far the host's clock is off."""
 
 AHEAD_S: Final = 1.0
 """A host's clock that is farther ahead of the lower bound has been set; without keys that bound loses 0.2 s an hour."""

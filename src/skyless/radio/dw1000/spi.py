@@ -25,7 +25,7 @@ REOPEN_S: Final = 1.0
 CHIP_POLL_S: Final = 0.5e-3
 """Interval at which a chip without an interrupt line is served."""
 _LINE_CHECK_S: Final = 0.02
-"""And one with a line, should an edge have been missed."""
+"""Interval at which a chip with an interrupt line is served, in case an edge was missed."""
 MAX_VAIN_INTERRUPTS: Final = 8
 """Number of interrupts in a row without an event after which the chip is polled instead."""
 

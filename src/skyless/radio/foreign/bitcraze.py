@@ -27,7 +27,7 @@ TDOA3: Final = 0x30
 STAMP_BITS: Final = 32
 
 ANTENNA_DELAYS_TICKS: Final = round(154.6 / TICK_M)
-"""Of a sender and a receiver together, which the stamps include: 154.6 m by the firmware of Crazyflies."""
+"""Antenna delays of a sender and a receiver together, which the stamps include: 154.6 m in Crazyflies' firmware."""
 
 _TDOA2: Final = Layout("<B8B8I8H")
 _TDOA3_HEAD: Final = Layout("<BBIB")
@@ -142,7 +142,7 @@ def packet_of_line(line: bytes, drops: Drops) -> Packet | None:
 # no checksum: the length, which stands there twice, is all that marks a record.
 
 MAX_PAYLOAD_BYTES: Final = 1014
-"""Of a long DW1000 frame, less the MAC header of at least 7 bytes and the check sequence."""
+"""Payload of a long DW1000 frame, less the MAC header of at least 7 bytes and the check sequence."""
 
 _MARK: Final = 0xBC
 _HEADER_BYTES: Final = 10

@@ -92,7 +92,7 @@ class SerialPort:
             self._gone(reason)
 
     def clear_report(self) -> None:
-        """The board works: report the next reason, whatever it is."""
+        """The board works: report the next reason in any case."""
         self._reported = ""
 
 

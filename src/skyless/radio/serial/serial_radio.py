@@ -101,7 +101,7 @@ class LinkSession:
         return None
 
     def _count_idle_poll(self) -> None:
-        """Report once that a board answers and yet does not receive, whatever it is sent."""
+        """Report once that a board answers but does not receive."""
         self._idle_polls += 1
         if self._idle_polls * STATUS_S >= _IDLE_S and not self._reported_idle:
             self._reported_idle = True

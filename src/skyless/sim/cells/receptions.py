@@ -72,7 +72,7 @@ class Scene(NamedTuple):
     positions_m: Array
     """True positions of the anchors, shape (anchors, 3)."""
     keys: Integers
-    """Of all nodes, anchors first."""
+    """Keys of all nodes, anchors first."""
 
 
 class PairErrors(NamedTuple):

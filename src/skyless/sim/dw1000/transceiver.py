@@ -123,7 +123,7 @@ class Transceiver:
             self._listen()
 
     def off(self) -> None:
-        """TRXOFF: abort whatever is under way; HPDWARN goes with what it warned of (UM p. 91)."""
+        """TRXOFF: abort what is under way; HPDWARN goes with what it warned of (UM p. 91)."""
         self._withdraw()
         self.sending, self.listening_since = None, None
         self.drop_bits(r.HPDWARN)

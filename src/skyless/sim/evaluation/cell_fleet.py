@@ -42,7 +42,7 @@ def period_codes_of(site: Site) -> Integers:
 
 
 class SiteBeacons:
-    """What the beacons of a site say, whatever is received."""
+    """The contents of the beacons of a site."""
 
     def __init__(self, site: Site) -> None:
         self._site, self._pages = site.id, tuple(map(_on_air, site_pages_of(site)))

@@ -33,7 +33,7 @@ WALL_MARGIN_M: Final = 0.5
 """Walking tags keep this distance from the box around the anchors."""
 
 MIN_WALK_M: Final = 1.0
-"""And have at least this much space along x and y, even around a single anchor."""
+"""Walking tags have at least this much space along x and y, even around a single anchor."""
 
 WAYPOINTS: Final = 8
 
@@ -46,19 +46,19 @@ ROOM_QA_M2PS3: Final = 0.3
 _BOX_SIGMAS: Final = 3.0
 """Standard deviations from the middle of the box in which tags wander to its walls."""
 
+# Keys of streams of random numbers, in addition to those of the simulated world.
 _ROOM_KEY: Final = 4
 _ROAM_KEY: Final = 6
-"""Of streams of random numbers, next to those of the simulated world."""
 
 
 class Room(Struct, frozen=True):
-    """What is wrong in a real room besides the noise: errors of survey and ranges, drawn from a world's seed.
+    """What is wrong in a real room in addition to noise: errors of survey and ranges, drawn from a world's seed.
 
     The sizes are those that recordings of DW1000s show after a survey and a calibration by hand (``docs/studies.md``).
     """
 
     axis_std_m: float = 0.02
-    """Of the stated positions of the anchors: each coordinate has a normal error; the height where it is used."""
+    """Standard deviation of each stated anchor coordinate; of the height only where it is used."""
     off_anchors: int = 0
     """Number of anchors, drawn by chance, that are off by ``off_m`` more, each in a random horizontal direction."""
     off_m: float = 0.0

@@ -212,7 +212,7 @@ class LevelTally:
         return LevelCounts(fixes, levels, exceeded, unwarned, self._sample.rows[:, 0])
 
     def report(self) -> LevelReport | None:
-        """Of all tags together; None where no fix was judged, or the method gives no levels."""
+        """Report of all tags together; None where no fix was judged, or the method gives no levels."""
         if self._risk is None:
             return None
         fixes, levels = self._counts[:2].sum(axis=1).tolist()
