@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.protocols import new_anchor
-from skyless.core.site import ScheduleSite, UnplacedAnchor
+from skyless.core.site import AccuracySite, ScheduleSite, UnplacedAnchor
 from skyless.sim.impairments import DelayError, lab_impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.stations import TagSpec
@@ -23,7 +23,7 @@ SHIFT_M = np.array((1.0, -2.0))
 
 
 def site_of(mode):
-    lab = paper_lab_site()
+    lab = paper_lab_site(accuracy=AccuracySite())
     return lab if mode == "master" else replace(lab, schedule=ScheduleSite(mode="free", rate_hz=50.0))
 
 

@@ -10,10 +10,13 @@ from skyless import Request, fleet_of
 from skyless.core.estimator.estimator import Estimator
 from skyless.core.estimator.measurements import difference_terms, reception_terms
 from skyless.core.estimator.state import EstimatorSettings, layout
+from skyless.core.site import AccuracySite
 from skyless.sim.evaluation.scenarios import Room, displacements
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.range_errors import RangeErrorModel
 
+LAB = paper_lab_site(accuracy=AccuracySite())
+"""Its site file states the typical errors of survey and ranges."""
 ANCHORS_M = {
     2: np.array([[0, 0, 0], [6, 0, 0], [6, 4, 0], [6, 8, 0], [0, 8, 0], [0, 4, 0]], float),
     3: np.array([[0, 0, 0.2], [8, 0, 3], [8, 6, 0.2], [0, 6, 3], [4, 0, 3], [8, 3, 0.2], [4, 6, 3]], float),
@@ -63,8 +66,7 @@ def rmse_m(judged, from_s, to_s):
 
 @pytest.mark.parametrize("room", [None, Room()], ids=("right air", "room"))
 def test_a_tag_at_rest_stays_where_it_is(room):
-    site = paper_lab_site()
-    site = replace(site, schedule=replace(site.schedule, slot_s=10e-3))
+    site = replace(LAB, schedule=replace(LAB.schedule, slot_s=10e-3))
     request = Request(site=site, seed=3, room=room, positions_m=((1.0, 1.0), (5.0, 6.5), (3.0, 4.0)))
     judged = list(fleet_of(request).run(100.0))
     assert rmse_m(judged, 90.0, 100.0) < 1.2 * rmse_m(judged, 3.0, 13.0)
@@ -80,19 +82,19 @@ def estimator_after(request, duration_s):
 def test_multipath_is_learnt_from_the_way():
     """A field of 8 cm that changes within 10 cm; the site file states 5 mm within 1 m."""
     field = Room(ranges=RangeErrorModel(constant_m=0.05, slope_m=0.05, changing_m=0.08, correlation_m=0.1))
-    std_m, distance_m = estimator_after(Request(site=paper_lab_site(), seed=5, room=field), 40.0).multipath_m
+    std_m, distance_m = estimator_after(Request(site=LAB, seed=5, room=field), 40.0).multipath_m
     assert std_m == pytest.approx(0.08, rel=0.3)
     assert 0.04 < distance_m < 0.25
 
 
 def test_no_multipath_is_learnt_in_a_room_without_any():
-    assert estimator_after(Request(site=paper_lab_site(), seed=5, room=Room()), 20.0).multipath_m is None
+    assert estimator_after(Request(site=LAB, seed=5, room=Room()), 20.0).multipath_m is None
 
 
 def test_a_misplaced_anchor_is_found_by_its_ranges_to_the_others():
     left_m, room = [], Room(off_anchors=1, off_m=0.3)
     for seed in range(1, 5):
-        request = Request(site=paper_lab_site(), seed=seed, room=room)
+        request = Request(site=LAB, seed=seed, room=room)
         estimator = estimator_after(request, 6.0)
         true_m = {one.anchor: (one.x_m, one.y_m) for one in displacements(room, request.site, request.seed)}
         s = estimator.state
