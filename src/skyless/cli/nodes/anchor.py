@@ -31,8 +31,8 @@ def anchor(
 ) -> None:
     """Run anchors of a site until Ctrl-C.
 
-    Anchors send at random instants, or, at a site of the paper's protocol, in slots on the master's time. They work with
-    or without a broker.
+    Anchors send at random instants or, at a site of the paper's protocol, in slots on the master's time. They work
+    with or without a broker.
 
     Parameters
     ----------
