@@ -18,7 +18,6 @@ from msgspec.structs import replace
 from skyless.core.air.frame import Malformed
 from skyless.core.air.reception import Reception, Transmission
 from skyless.core.anchor.authentication import BeaconAuthentication
-from skyless.core.any_receiver import AnyReceiver
 from skyless.core.constants import TICK_RATE_HZ, TICK_S
 from skyless.core.fix import Fix
 from skyless.core.kernels.arrays import Array
@@ -26,6 +25,7 @@ from skyless.core.keys.chain import Chain, section_signatures
 from skyless.core.keys.key_chain import SECTION_BITS, SEED_BYTES, USUAL_TIMING, ChainTiming
 from skyless.core.protocols import AnchorMachine, SiteBeacon, decode_any, new_anchor
 from skyless.core.site import AnchorSite, Site
+from skyless.core.tag.receiver import Receiver
 from skyless.core.ticks import Unwrapper, difference, from_seconds, wrap
 from skyless.core.trusted_receiver import GivenFix, SiteTrust, Trust, TrustedReceiver
 from skyless.sim.evaluation.scenarios import Request, impairments_of, trajectories_of
@@ -272,7 +272,7 @@ class Comparison(Struct, frozen=True):
     """The farthest that a fix is from the one that a plain receiver makes with the same reception."""
 
 
-class _Noting(AnyReceiver):
+class _Noting(Receiver):
     """A receiver that notes what it processes."""
 
     def __init__(self, site: int, accepted: list[FixKey]) -> None:
@@ -280,7 +280,7 @@ class _Noting(AnyReceiver):
         self._accepted = accepted
 
     def hear_beacon(self, beacon: SiteBeacon, reception: Reception) -> Fix | None:
-        """As ``AnyReceiver``."""
+        """As ``Receiver``."""
         self._accepted.append(key_of(reception))
         return super().hear_beacon(beacon, reception)
 
@@ -297,7 +297,7 @@ def run_tag(
     accepted: list[FixKey] = []
     plain = trust.trust is Trust.OPEN
     tag = TrustedReceiver(
-        trust, lambda: AnyReceiver(site=trust.site) if plain else _Noting(trust.site, accepted), certificates
+        trust, lambda: Receiver(site=trust.site) if plain else _Noting(trust.site, accepted), certificates
     )
     given, faults = list[Given](), Counter[str]()
     for number, one in enumerate(received):
@@ -313,7 +313,7 @@ def compare(run: TagRun, received: Sequence[Received], site: int) -> Comparison:
     """Compare verified fixes with those that a plain receiver makes of the same genuine frames alone."""
     genuine = {key_of(one.reception) for one in received if one.is_genuine}
     accepted = set(run.accepted)
-    plain = AnyReceiver(site=site)
+    plain = Receiver(site=site)
     expected = {}
     last = max((number for number, one in enumerate(received) if key_of(one.reception) in accepted), default=-1)
     refused = 0
