@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 from cyclopts import App, CycloptsError, Group, Parameter
 from cyclopts.help import DefaultFormatter
 
+from skyless.cli.common.extras import what_to_install
 from skyless.core.errors import SkylessError
 
 if TYPE_CHECKING:
@@ -117,21 +118,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
             result = program()(arguments)
         if sys.stdout is not None:
             sys.stdout.flush()
-    except SkylessError as error:
-        print(f"skyless: {error}", file=sys.stderr)
-        return _USER_ERROR
-    except CycloptsError as error:
-        print(f"skyless: {' '.join(str(error).split())}", file=sys.stderr)
-        return _USER_ERROR
     except KeyboardInterrupt:
         return _INTERRUPTED
     except BrokenPipeError:
         _drop_output()
         return _BROKEN_PIPE
-    except OSError as error:
-        print(f"skyless: {_trouble(error)}", file=sys.stderr)
+    except (SkylessError, CycloptsError, ModuleNotFoundError, OSError) as error:
+        if (line := _line_for_the_user(error)) is None:
+            raise
+        print(f"skyless: {line}", file=sys.stderr)
         return _USER_ERROR
     return result if isinstance(result, int) else 0
+
+
+def _line_for_the_user(error: Exception) -> str | None:
+    """What is wrong and what to do about it; None for a defect of the program."""
+    if isinstance(error, OSError):
+        return _trouble(error)
+    if isinstance(error, ModuleNotFoundError):
+        return what_to_install(error.name)
+    return " ".join(str(error).split()) if isinstance(error, CycloptsError) else str(error)
 
 
 @contextmanager
