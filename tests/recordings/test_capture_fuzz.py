@@ -47,6 +47,7 @@ def replay(path, name, rng):
     asked = ReplayOptions(
         path,
         anchors=synthetic.ANCHORS_M,
+        truth=((0.0, 1.0, 1.0, 1.0),),
         format=rng.choice([name, name, None]),
         tag_height_m=rng.choice(["free", 1.2]),
     )

@@ -169,7 +169,7 @@ def forged(path, change):
 def nonsense(start):
     """Figures that are sound as data, and of which no receiver can make anything."""
     state = msgspec.msgpack.decode(start.state, strict=False)
-    state["receiver"]["own_ticks"]["last_host_s"] = float("nan")
+    state["receiver"]["receiver"]["admission"]["own_ticks"]["last_host_s"] = float("nan")
     return replace(start, state=msgspec.msgpack.encode(state))
 
 
