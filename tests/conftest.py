@@ -17,8 +17,8 @@ settings.load_profile("skyless")
 
 TIERS = {
     "unit": "no process, and no simulated site for longer than a second; the tier of tests without a marker",
-    "site": "simulates a site, or runs a command or a program in the test's own process",
-    "live": "processes in real time, one test after the other",
+    "site": "simulates a site, runs a command, or starts a program or a browser",
+    "live": "a whole site of processes in real time, one test after the other",
     "statistical": "Monte Carlo, long fuzzing, heavy clients",
 }
 _TIER_OF_FILE = re.compile(r"^pytestmark = pytest\.mark\.(\w+)$", re.MULTILINE)
@@ -65,15 +65,22 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = [item for item in items if _tier(item) in tiers]
 
 
-def pytest_collection_finish(session: pytest.Session) -> None:
-    """Compile all kernels once, before the tests that start programs: these would report it.
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile before the workers of pytest-xdist start; what they collect is not known here."""
+    if session.config.getoption("numprocesses", None) and _tiers(session.config) != ["unit"]:
+        _compile_kernels()
 
-    Unit tests compile what they call, when they call it.
-    """
-    if not hasattr(session.config, "workerinput") and not session.config.option.collectonly:
-        tiers = {_tier(item) for item in session.items} or set(_tiers(session.config) or TIERS)  # xdist: no items here
-        if tiers != {"unit"}:
-            compile_with_counts(missing(EVERY_PART))
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Compile before the first test that may start a program. Unit tests compile what they call, when they call it."""
+    is_worker = hasattr(session.config, "workerinput")
+    if not is_worker and not session.config.option.collectonly and {_tier(item) for item in session.items} - {"unit"}:
+        _compile_kernels()
+
+
+def _compile_kernels() -> None:
+    """Compile all kernels once: programs that start in tests would report it."""
+    compile_with_counts(missing(EVERY_PART))
 
 
 @pytest.fixture(scope="session", autouse=True)
