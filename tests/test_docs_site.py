@@ -13,6 +13,8 @@ import pytest
 
 from skyless.cli.main import program
 
+pytestmark = pytest.mark.site
+
 ROOT = Path(__file__).parents[1]
 PAGES = [
     *sorted(ROOT.glob("docs/**/*.md")),
@@ -199,6 +201,7 @@ def test_pictures_show_what_the_documents_and_the_code_say():
 @pytest.mark.skipif(
     any(importlib.util.find_spec(name) is None for name in GENERATOR), reason="the dependency group docs is missing"
 )
+@pytest.mark.statistical
 def test_the_site_builds_without_a_warning_and_needs_no_network(tmp_path):
     site = tmp_path / "site"
     built = subprocess.run(

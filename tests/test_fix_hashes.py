@@ -9,6 +9,8 @@ import pytest
 import fix_hashes
 from skyless import METHODS
 
+pytestmark = pytest.mark.statistical
+
 KEPT = json.loads(Path(__file__).with_name("fix_hashes.json").read_text())
 ROUNDING_M = 1e-3
 """Another processor rounds otherwise, and a filter's decisions may then differ for single frames."""

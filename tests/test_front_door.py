@@ -8,6 +8,8 @@ import pytest
 
 import skyless
 
+pytestmark = pytest.mark.site
+
 
 def test_every_name_opens():
     for name in skyless.__all__:

@@ -200,6 +200,7 @@ def walk(tmp_path_factory):
 
 
 @pages
+@pytest.mark.statistical
 def test_the_commands_of_a_page_run(page, walk, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("walk.mcap").write_bytes(walk)
@@ -222,6 +223,7 @@ def test_the_commands_of_a_page_run(page, walk, tmp_path, monkeypatch, capsys):
             exec(compile(example, name_of(page), "exec"), {})
 
 
+@pytest.mark.statistical
 def test_what_the_first_tutorial_says_of_its_simulations_is_so(tmp_path, monkeypatch, capsys):
     """Errors as large as the fixes state, nearly all within their levels, and larger with faults."""
     page = ROOT / "docs" / "tutorials" / "first_site.md"
@@ -250,7 +252,9 @@ def test_every_entry_is_of_a_line_and_names_a_test():
         file, _, name = test.partition("::")
         if file.startswith("tests/"):
             tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
-            assert not name or name in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}, test
+            assert not name or name in {
+                node.name for node in tree.body if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+            }, test
 
 
 @pages

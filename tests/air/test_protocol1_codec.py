@@ -12,6 +12,8 @@ from skyless.core.air.ieee802154 import fcs
 from skyless.core.protocol1.beacon import Beacon, MasterTime
 from skyless.core.protocol1.codec import decode, decode_cached, encode, heard_capacity
 
+pytestmark = pytest.mark.site
+
 BARE = msgspec.structs.replace(FULL, master_heard=None, master_time=None, heard=(), page=None)
 PAYLOAD_AT, VERSION_AT, FLAGS_AT, COUNT_AT = 9, 10, 11, 40
 

@@ -36,6 +36,8 @@ from skyless.radio.uci.uci import (
     location_of,
 )
 
+pytestmark = pytest.mark.site
+
 INPUTS = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "20000"))
 AOSP_1 = bytes.fromhex(
     "0a01330553050205 07090a0102050709 0a01020507090a01 0205070905070 90a 0102050709050709 0a01020507090709 05070"

@@ -28,6 +28,8 @@ from skyless.site.file.load import load_site
 from skyless.site.file.template import grid_site, site_template
 from skyless.site.planning.links import PLAN_COLUMNS
 
+pytestmark = pytest.mark.site
+
 MEASURED_TIMES = {"skyless_version", "wall_s", "speed", "receptions_per_s", *MEASURED}
 ROWS = 600
 

@@ -4,6 +4,9 @@ Ten worlds are few; ``benchmarks/fira_accuracy.py`` has more, with several seeds
 """
 
 import fira_accuracy
+import pytest
+
+pytestmark = pytest.mark.statistical
 
 
 def test_a_tag_on_an_emulated_board_errs_as_planned():

@@ -11,6 +11,8 @@ import pytest
 import synthetic_recordings as synthetic
 from skyless.cli.main import main
 
+pytestmark = pytest.mark.site
+
 ROWS = 4000
 SETTLE_S = 3.0
 ARM_M = (-0.01245, 0.00127, 0.0908)
@@ -68,6 +70,7 @@ def replayed(folder, tmp_path, capsys):
     return report, np.array(errors_m), np.array(covariances_m2)
 
 
+@pytest.mark.statistical
 def test_sums_are_those_of_the_command(bench, folder, tmp_path, capsys):
     first, second = told_by(bench, capsys, folder)["default"]["recordings"]
     report, error_m, covariance_m2 = replayed(folder, tmp_path, capsys)
@@ -147,6 +150,7 @@ def test_nodes_are_placed_by_their_distances(bench):
     )
 
 
+@pytest.mark.statistical
 def test_real_flights(bench, recordings, capsys):
     """DATA.md: a plain filter of this kind comes to 0.031 to 0.044 m in 2-D and 0.10 to 0.12 m in 3-D."""
     told = told_by(bench, capsys, recordings, "--only", "const1-trial1-tdoa2")

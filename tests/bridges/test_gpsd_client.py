@@ -21,7 +21,7 @@ from skyless.core.site import GeoreferenceSite
 from skyless.run.mqtt.messages import FixMessage
 
 GPSD = shutil.which("gpsd") or shutil.which("gpsd", path="/usr/sbin")
-pytestmark = pytest.mark.skipif(GPSD is None, reason="gpsd is not installed: apt-get install gpsd")
+pytestmark = [pytest.mark.site, pytest.mark.skipif(GPSD is None, reason="gpsd is not installed: apt-get install gpsd")]
 
 HALL = GeoreferenceSite(latitude_deg=52.513, longitude_deg=13.4, height_m=40.0, heading_deg=25.0)
 SITE = BridgedSite(1, "lab", simulated=True, anchors_m={}, georeference=HALL)

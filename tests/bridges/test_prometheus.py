@@ -31,6 +31,8 @@ from skyless.bridges.target import BridgeContext, TargetUrl
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt.messages import AnchorHealth, Counters, StatusMessage, TagHealth
 
+pytestmark = pytest.mark.site
+
 NO_LINK = Counters(0, 0, 0)
 CONTEXT = BridgeContext(print)
 

@@ -167,6 +167,7 @@ def test_a_stamp_is_always_one(unix_s):
 
 
 @given(fix=fixes())
+@pytest.mark.statistical
 def test_cyclone_dds_reads_and_writes_the_same_bytes(fix):
     pytest.importorskip("cyclonedds", reason="Cyclone DDS has no wheel here")
     types = DdsTypes()

@@ -16,6 +16,8 @@ from skyless.bridges.psn import MAX_PACKET_BYTES, PsnFrames
 from skyless.bridges.target import BridgeContext, TargetUrl, turned
 from skyless.core.errors import SkylessError
 
+pytestmark = pytest.mark.site
+
 START_UNIX_S = 1_795_000_000.0
 CONTEXT = BridgeContext(print)
 names = st.from_regex(r"[A-Za-z0-9_-]{1,32}", fullmatch=True)

@@ -3,10 +3,13 @@
 import functools
 import json
 
+import pytest
+
 from skyless.cli.main import main
 from skyless.research.bench import measure, monte_carlo_speed
 
 
+@pytest.mark.statistical
 def test_it_measures_everything_next_to_its_baselines_and_the_table_names_every_way(capsys, monkeypatch):
     measured = functools.cache(measure.measure_all), functools.cache(monte_carlo_speed.measure)
     monkeypatch.setattr(measure, "measure_all", measured[0])  # the table shows the same run

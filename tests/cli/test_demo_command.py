@@ -22,6 +22,8 @@ from skyless.run.mqtt.connection import Introduction, Reactions, open_connection
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.topics import fix_topic, health_topic, status_topic
 
+pytestmark = pytest.mark.live
+
 COMMAND = [sys.executable, "-m", "skyless.cli.main", "demo"]
 START_S = 120.0
 """A first start compiles the kernels."""

@@ -11,6 +11,8 @@ import pytest
 
 from skyless.cli.common.extras import EXTRA_OF, what_to_install
 
+pytestmark = pytest.mark.site
+
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
 BLOCKED = f"import sys\nsys.modules.update(dict.fromkeys({sorted(EXTRA_OF)!r}))\nfrom skyless.cli.main import main\n"
 

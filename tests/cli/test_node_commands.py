@@ -13,6 +13,8 @@ from skyless.run.mqtt.address import MqttAddress
 from skyless.run.process import hold_any
 from support.processes import SKYLESS, started
 
+pytestmark = pytest.mark.site
+
 
 @pytest.mark.parametrize(
     ("command", "right"),

@@ -10,6 +10,8 @@ import pytest
 
 from skyless.cli.main import main, program
 
+pytestmark = pytest.mark.site
+
 WORDS = 2
 """First words of the help that all commands share; what differs follows."""
 

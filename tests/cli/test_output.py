@@ -15,6 +15,8 @@ from msgspec import Struct
 import skyless
 from skyless.cli.common.output import print_json, to_json
 
+pytestmark = pytest.mark.site
+
 
 class Colour(StrEnum):
     RED = "red"

@@ -13,6 +13,8 @@ from skyless.sim.lab import paper_lab_site
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template
 
+pytestmark = pytest.mark.site
+
 EXTRAS = """
 [[walls]]
 x1_m = 2.0
@@ -50,6 +52,7 @@ def refused(capsys, *arguments):
     return line
 
 
+@pytest.mark.statistical
 def test_all_files_at_once(lab, tmp_path, capsys):
     png, page, table = tmp_path / "map.png", tmp_path / "plan.html", tmp_path / "grid.geojson"
     files = ["--plot", png, "--html", page, "--grid", table]

@@ -15,6 +15,8 @@ from skyless.core.site import AccuracySite
 from skyless.sim.lab import paper_lab_site
 from skyless.site.file.template import site_template
 
+pytestmark = pytest.mark.site
+
 SKYLESS = [sys.executable, "-m", "skyless.cli.main"]
 
 
@@ -117,6 +119,7 @@ def test_a_full_disk_behind_standard_output(lab):
 
 
 @pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+@pytest.mark.statistical
 def test_closed_streams(lab, closed):
     done = subprocess.run(["sh", "-c", f'"$@" {closed}', "sh", *SKYLESS, "site", "check", str(lab)], check=False)
     assert done.returncode == 0
@@ -132,6 +135,7 @@ def test_a_terminal_without_unicode(lab):
     ("arguments", "worker"),
     [(["warm"], "skyless.core.kernels.worker"), (["paper", "--quick", "--out", "report"], "multiprocessing.spawn")],
 )
+@pytest.mark.statistical
 def test_sigterm_ends_a_command_with_all_its_processes(tmp_path, arguments, worker):
     kernels = {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")} if arguments == ["warm"] else {}
     options = {"env": {**os.environ, **kernels}, "cwd": tmp_path, "stderr": subprocess.PIPE, "start_new_session": True}

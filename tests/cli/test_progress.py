@@ -6,9 +6,13 @@ import subprocess
 import sys
 import threading
 
+import pytest
+
 from skyless.cli.common import progress
 from skyless.core.kernels import processes
 from skyless.core.kernels.processes import LAB
+
+pytestmark = pytest.mark.site
 
 WORK = """
 from skyless.cli.common import progress

@@ -17,6 +17,8 @@ from skyless.run.recordings.recorder import McapFile
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.file.template import site_template
 
+pytestmark = pytest.mark.site
+
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 8
 
 

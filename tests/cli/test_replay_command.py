@@ -22,6 +22,8 @@ from skyless.core.site import AnchorSite, TagsSite
 from skyless.sim.lab import lab_site
 from skyless.site.file.template import site_template
 
+pytestmark = pytest.mark.site
+
 ROWS = 1500
 MIN_FIXES = ROWS - 60 - 10
 """A start from ready-made differences takes 60 of them."""
@@ -316,6 +318,7 @@ def test_a_file_that_may_not_be_written(run, tmp_path):
     assert "Permission denied" in err
 
 
+@pytest.mark.statistical
 def test_interrupted_replay_keeps_what_it_has_written(room, tmp_path):
     long = synthetic.write(tmp_path / "long", "bitcraze-binary", 100_000)
     path = tmp_path / "fixes.csv"

@@ -19,6 +19,8 @@ from skyless.cli.simulate import FIXES_CSV_COLUMNS
 from skyless.sim.lab import lab_site
 from skyless.site.file.load import load_site
 
+pytestmark = pytest.mark.site
+
 C = 299_792_458.0
 COMMAND = [sys.executable, "-m", "skyless.cli.main", "simulate"]
 KEYS = {
@@ -162,6 +164,7 @@ SITE_OFF = [argument for anchor in range(1, 7) for argument in ("--outage", f"{a
 
 
 @pytest.mark.parametrize(("fault", "end_s"), [(["--silence", "3"], 63), (SITE_OFF, 63), (["--silence", "3:70"], 70.5)])
+@pytest.mark.statistical
 def test_a_goal_that_cannot_be_reached_is_given_up(run, fault, end_s):
     told = report(run("--method", "literal", "--position", "3,4", "--fixes", "100", *fault, "--json"))
     assert told["simulated_s"] == pytest.approx(end_s, abs=0.5)

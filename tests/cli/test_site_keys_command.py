@@ -13,6 +13,8 @@ from skyless.cli.main import main
 from skyless.core.whole_files import replace_files
 from skyless.run.keys.key_files import read_keys, read_private, read_site_public
 
+pytestmark = pytest.mark.site
+
 SHORT = ("--years", "0.0001")
 
 

@@ -26,6 +26,8 @@ from skyless.site.survey.facts import Facts, Gauge, KnownDelay, Tape, count
 from skyless.site.survey.result import Survey, read_record
 from skyless.site.tables import read_anchors, read_calibration, read_ranges
 
+pytestmark = pytest.mark.site
+
 DRAW = np.random.default_rng(12)
 HALL_M = np.column_stack(
     [*(a.ravel() for a in np.meshgrid([0.0, 12.0, 24.0, 36.0], [0.0, 12.0, 24.0])), np.full(12, 6.0)]

@@ -19,6 +19,8 @@ from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template
 from skyless.site.tables import read_calibration
 
+pytestmark = pytest.mark.site
+
 OFF = {2: (40.0, 0.0), 3: (0.0, -50.0), 4: (30.0, 30.0), 5: (-64.0, 20.0), 1: (0.0, 0.0), 6: (0.0, 0.0)}
 """True minus configured TX and RX delays, ticks."""
 

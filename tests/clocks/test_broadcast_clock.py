@@ -14,6 +14,8 @@ from skyless.research.masterless.pair_engine import (
     BroadcastClock,
 )
 
+pytestmark = pytest.mark.site
+
 SECOND = 63_897_600_000
 PERIOD = SECOND // 50
 

@@ -21,6 +21,8 @@ from skyless.page.live import (
 )
 from skyless.run.mqtt import topics
 
+pytestmark = pytest.mark.site
+
 TOKEN = "correct-horse-battery"
 SOCKET = "ws://localhost:8080/live"
 STRANGE_SOCKET = "ws://192.168.1.5:8080/live"

@@ -18,6 +18,8 @@ from skyless.page.serve import PORT, ListenAddress, _Server, bind
 from skyless.run.process import reserve
 from support.processes import free_port
 
+pytestmark = pytest.mark.site
+
 
 @pytest.mark.parametrize(
     ("text", "host", "port"),

@@ -28,6 +28,8 @@ from skyless.run.mqtt.messages import ZonesMessage
 from support.loops import in_loop
 from support.processes import SKYLESS, free_port, running_program
 
+pytestmark = pytest.mark.site
+
 PATIENCE_S = 20.0
 
 

@@ -15,6 +15,8 @@ from skyless.site.planning.colours import COLOUR_STOPS
 from skyless.site.planning.links import HDOP, PDOP, SIGMA
 from skyless.site.planning.predict import PlanSettings, Predictor
 
+pytestmark = pytest.mark.site
+
 LAB = lab_site(100.0)
 PNG_2_BY_1 = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\x0dIHDR" + (200).to_bytes(4, "big") + (100).to_bytes(4, "big")
 
@@ -98,6 +100,7 @@ def test_too_few_anchors_are_an_error():
         get(Overlays(), site, None, [], "pdop", 1.0)
 
 
+@pytest.mark.statistical
 def test_nothing_is_computed_after_the_end():
     async def ask():
         overlays = Overlays()

@@ -14,6 +14,8 @@ from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import WatchFinding, WatchMessage, ZonesMessage
 from skyless.run.recordings.recorder import McapFile, McapRecorder
 
+pytestmark = pytest.mark.site
+
 START_S = 1_700_000_000.0
 PLAN = b"\x89PNG\r\n\x1a\nplan"
 DURATION_S = 10.0

@@ -23,6 +23,8 @@ from skyless.run.mqtt.survey_facts import BadFactsError
 from skyless.site.survey.facts import Facts, Gauge, Tape
 from skyless.site.survey.result import Survey, SurveyedAnchor, TapeAdvice
 
+pytestmark = pytest.mark.site
+
 SURVEY, WATCH = topics.survey_topic(SITE_ID), topics.watch_topic(SITE_ID)
 FLOOR = topics.floor_plan_topic(SITE_ID)
 IMAGE = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 40, 30) + bytes(9)

@@ -10,6 +10,8 @@ import pytest
 from page_browser import THREE_FRAMES, until
 from page_fake_survey import FakeSurvey
 
+pytestmark = pytest.mark.site
+
 axe = pytest.importorskip("axe_playwright_python.base")
 
 SERIOUS = {"serious", "critical"}

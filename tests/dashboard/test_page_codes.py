@@ -7,6 +7,8 @@ from page_browser import until
 
 from skyless.core.keys.fault import Fault
 
+pytestmark = pytest.mark.site
+
 DAY_S = 86400.0
 
 

@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.site
+
 
 @pytest.fixture
 def page(serve, visit):

@@ -6,6 +6,8 @@ import page_fake_site as made_up
 import pytest
 from page_browser import until
 
+pytestmark = pytest.mark.site
+
 TAGS = 400
 SHOWN = "document.querySelectorAll('#panel-tags tbody button.name').length"
 BUSY = "(ms) => { const end = performance.now() + ms; while (performance.now() < end); }"

@@ -4,10 +4,13 @@ import io
 import time
 
 import page_fake_site as made_up
+import pytest
 from page_browser import THREE_FRAMES, until
 from PIL import Image
 
 from skyless.core.integrity import Alert
+
+pytestmark = pytest.mark.site
 
 SHOWN = "document.getElementById('banner').hidden === false"
 

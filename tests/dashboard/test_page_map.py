@@ -17,6 +17,8 @@ from PIL import Image
 from skyless.site.planning.colours import COLOUR_STOPS, scale_of
 from value_colours import colour_of
 
+pytestmark = pytest.mark.site
+
 PROTANOPIA = np.array([[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]])
 DEUTERANOPIA = np.array([[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]])
 """Linear red, green and blue as a reader without one kind of cones sees them (Machado and others, 2009)."""

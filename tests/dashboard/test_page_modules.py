@@ -4,7 +4,11 @@ import re
 from graphlib import TopologicalSorter
 from pathlib import Path
 
+import pytest
+
 import skyless.page
+
+pytestmark = pytest.mark.site
 
 BROWSER = (Path(skyless.page.__file__).parent / "browser").resolve()
 

@@ -9,6 +9,8 @@ from page_browser import THREE_FRAMES, until
 from page_fake_server import FIRST_FIX_S
 from PIL import Image
 
+pytestmark = pytest.mark.site
+
 
 @pytest.fixture
 def replay(serve, visit):

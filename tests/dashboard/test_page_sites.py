@@ -6,6 +6,8 @@ import pytest
 from page_browser import until
 from page_fake_site import condition
 
+pytestmark = pytest.mark.site
+
 
 def sites(shown, *known):
     return {"type": "sites", "shown": shown, "sites": known}

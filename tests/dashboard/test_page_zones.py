@@ -8,6 +8,8 @@ import pytest
 from page_browser import THREE_FRAMES, until
 from page_fake_server import DOCK
 
+pytestmark = pytest.mark.site
+
 
 @pytest.fixture
 def hall(serve, visit):

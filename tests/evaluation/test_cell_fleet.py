@@ -20,6 +20,7 @@ def tags(count):
     return [Roaming((100.0 + 10.0 * n, 120.0, 1.0), (6.0, 6.0, 0.0), seed=n) for n in range(count)]
 
 
+@pytest.mark.statistical
 def test_tags_are_as_accurate_as_their_fixes_say():
     fleet = CellFleet(GRID, tags(3), Impairments(), 7, FleetSettings())
     assert all(judged.fix.std_m < 0.5 for judged in fleet.run(4.0))

@@ -12,6 +12,8 @@ from skyless.sim.evaluation.scenarios import Request, fleet_of, trajectories_of
 from skyless.sim.impairments import AnchorOutage, Outage
 from skyless.sim.lab import paper_lab_site
 
+pytestmark = pytest.mark.site
+
 LAB = paper_lab_site()
 P1 = (3.0, 4.0)
 SEEDS = (1, 2, 3)
@@ -60,6 +62,7 @@ def theory(delayed, weighted):
         ("bracketed", True, True),
     ],
 )
+@pytest.mark.statistical
 def test_snapshots_err_as_the_propagated_covariance_says(method, delayed, weighted):
     """3000 fixes at 100 ps. Neighbouring fixes share a frame of each node; their squared errors correlate by < 0.1."""
     runs = [run(16.0, method=method, seed=seed, settle_s=1.0) for seed in SEEDS]
@@ -86,6 +89,7 @@ def test_chi2_of_weighted_fixes_is_chi2():
     assert np.mean([one.fix.chi2 / one.fix.dof for one in judged]) == pytest.approx(1.0, abs=4 * 0.028)
 
 
+@pytest.mark.statistical
 def test_joint_keeps_a_centimetre_and_a_half():
     """1.33 cm (docs/maths.md). Errors last about 0.3 s: 5 runs of 10 s are 170 independent ones, 4.5 % per sigma."""
     reports = [run(12.0, seed=seed, method="joint")[1] for seed in (11, 12, 13, 14, 15)]
@@ -95,6 +99,7 @@ def test_joint_keeps_a_centimetre_and_a_half():
     assert all(one.first_fix_s < 0.15 for one in reports)
 
 
+@pytest.mark.statistical
 def test_joint_is_not_over_confident():
     """Static, with an agility near the truth: at most 1.3 times the variance it claims; with agility to spare, less."""
     for qa, low, high in ((1e-2, 0.6, 1.3), (0.3, 0.5, 1.1)):
@@ -121,6 +126,7 @@ def test_another_tag_changes_nothing_for_the_first(method):
     assert [(one.time_s, *one.fix.position_m) for one in alone] == [(o.time_s, *o.fix.position_m) for o in together]
 
 
+@pytest.mark.statistical
 def test_half_of_the_messages_lost():
     """It costs joint a quarter; snapshots, which need whole rounds, hardly exist."""
     whole = [run(10.0, seed=seed)[1] for seed in (1, 2, 3, 4)]

@@ -22,6 +22,8 @@ from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.range_errors import RangeErrorModel
 from skyless.sim.trajectory import Roaming, Static
 
+pytestmark = pytest.mark.site
+
 LAB = lab_site()
 
 
@@ -72,6 +74,7 @@ def test_tags_of_a_room_roam_in_the_box_unless_told_where_to_be():
     assert isinstance(trajectories_of(Request(LAB, room=Room(), positions_m=((3.0, 4.0),)))[0], Static)
 
 
+@pytest.mark.statistical
 def test_the_room_costs_accuracy_and_is_the_same_for_every_method():
     """``joint`` has about 5 cm where it has 2 in clean air."""
     told = []

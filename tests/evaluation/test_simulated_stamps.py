@@ -10,6 +10,8 @@ from skyless.research.surveys.anchor_stamps import stamps_of
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import lab_site
 
+pytestmark = pytest.mark.site
+
 LAB = lab_site()
 
 

@@ -8,6 +8,9 @@ from pathlib import Path
 import matplotlib.image
 import nbclient
 import nbformat
+import pytest
+
+pytestmark = pytest.mark.site
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 IN_THE_TESTS = {"first_fix.py", "own_radio.py", "replay_recording.py", "plan_a_hall.py", "compare_methods.py"}
@@ -44,6 +47,7 @@ def test_replay_recording(capsys, monkeypatch, tmp_path):
     assert matplotlib.image.imread(tmp_path / "track.png").shape[0] > 100
 
 
+@pytest.mark.statistical
 def test_plan_a_hall(capsys, monkeypatch):
     now, better, anchors = printed("plan_a_hall.py", capsys, monkeypatch).splitlines()
     mean_cm, better_cm = (float(re.search(r"mean ([\d.]+) cm", line)[1]) for line in (now, better))
@@ -51,6 +55,7 @@ def test_plan_a_hall(capsys, monkeypatch):
     assert anchors.count("(") == 8
 
 
+@pytest.mark.statistical
 def test_compare_methods(capsys, monkeypatch):
     _, *rows = printed("compare_methods.py", capsys, monkeypatch).splitlines()
     errors_cm = {name: float(at_rest) for name, at_rest, _ in map(str.split, rows)}
@@ -58,6 +63,7 @@ def test_compare_methods(capsys, monkeypatch):
     assert errors_cm["joint"] == min(errors_cm.values())
 
 
+@pytest.mark.statistical
 def test_the_notebook_runs():
     notebook = nbformat.read(EXAMPLES / "notebook.ipynb", as_version=4)
     assert not any(cell.get("outputs") for cell in notebook.cells)

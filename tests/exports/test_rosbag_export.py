@@ -15,6 +15,8 @@ from skyless.cli.main import main
 from skyless.core.earth import geodetic
 from skyless.run.recordings.recording import McapRecording
 
+pytestmark = pytest.mark.site
+
 KILTED = get_typestore(Stores.ROS2_KILTED)
 TAGS = ("a", "b")
 

@@ -24,7 +24,7 @@ from skyless.core.ticks import difference, wrap
 from skyless.radio.dw1000 import driver as dw1000
 from skyless.radio.serial.link import Done, Heard, Hello, NotDone, Status, TooLate
 
-pytestmark = needs_compiler
+pytestmark = [pytest.mark.site, needs_compiler]
 
 FRAME = frame_of(range(98))
 SHORT = frame_of(range(40))
@@ -138,6 +138,7 @@ def test_errors_are_counted_and_it_listens_on():
 
 @pytest.mark.parametrize("ahead_us", [450, 1000, 1200, 3000, 14_700, 2_000_000])
 @pytest.mark.parametrize("step_us", [1, 37, 100])
+@pytest.mark.statistical
 def test_frames_leave_at_their_tick_and_the_receiver_is_off_no_longer_than_needed(ahead_us, step_us):
     stage = BoardStage().ready()
     tx_ticks = stage.tx_at(ahead_us, SHORT)

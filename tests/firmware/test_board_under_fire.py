@@ -2,6 +2,7 @@
 
 from collections import Counter
 
+import pytest
 from board_stage import (
     ASK_HELLO,
     ASK_STATUS,
@@ -21,6 +22,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from skyless.core.ticks import wrap
 from skyless.radio.serial.link import Done, Heard, Status, TooLate
+
+pytestmark = pytest.mark.site
 
 FAULTS = st.sampled_from([None, None, None, "header", "parity", "delimiter", "first-path"])
 

@@ -13,6 +13,8 @@ from skyless.run.mqtt.messages import FixMessage
 from skyless.sim.trajectory import Static
 from skyless.site.file.load import load_site
 
+pytestmark = pytest.mark.site
+
 PATHS = [Static(2.0, 3.0, 0.0)]
 SECONDS = 1.0
 

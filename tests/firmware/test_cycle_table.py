@@ -10,6 +10,8 @@ pytest.importorskip("unicorn")
 
 from emulator.processor.cycle_table import markdown, measure_cycles
 
+pytestmark = pytest.mark.site
+
 PAGE = FIRMWARE.parent / "docs" / "hardware.md"
 RENEW = "python benchmarks/firmware_cycles.py --write renews docs/hardware.md"
 
@@ -25,6 +27,7 @@ def measured():
 
 
 @needs_processor
+@pytest.mark.statistical
 def test_the_page_has_what_is_measured(measured):
     """Another release of the compiler may change a figure a little."""
     page = PAGE.read_text("utf-8").partition("<!-- cycles")[2].partition("<!-- end -->")[0]

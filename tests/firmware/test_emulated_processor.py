@@ -23,7 +23,7 @@ from emulator.processor.cycles import cost_16, cost_32
 from emulator.processor.lone_board import DELAYS, IDENTITY, LoneBoard
 from emulator.processor.nrf52832 import LED_PINS
 
-pytestmark = needs_processor
+pytestmark = [pytest.mark.site, needs_processor]
 
 AWAKE_PIN = 15
 WATCHDOG, SOFTWARE, LOCKUP = 2, 4, 8

@@ -9,6 +9,8 @@ from site_stage import KINDS, site_of
 
 from skyless.research.compile_ahead import compile_kernels
 
+pytestmark = pytest.mark.site
+
 SECONDS = {"host": 2.0, "image": 1.2}
 WARMUP_S = 0.6
 
@@ -26,6 +28,7 @@ def ran(request):
     return site, SECONDS[request.param]
 
 
+@pytest.mark.statistical
 def test_frames_are_sent_in_time_and_receptions_are_reported_with_the_right_stamps(ran):
     site, _ = ran
     result = site.result(WARMUP_S)

@@ -9,6 +9,8 @@ from emulator.build import FIRMWARE, HAS_ARM_COMPILER, HAS_HOST_COMPILER, build
 
 from skyless.radio.dw1000.driver import SOURCES
 
+pytestmark = pytest.mark.site
+
 needs_arm = pytest.mark.skipif(not HAS_ARM_COMPILER, reason="gcc-arm-none-eabi or make is not installed")
 
 MAX_FLASH, MAX_RAM = 32 * 1024, 16 * 1024

@@ -25,6 +25,8 @@ from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.sim.world import World
 
+pytestmark = pytest.mark.site
+
 LAB = paper_lab_site()
 SECONDS = 1.5
 SEED = 7

@@ -9,6 +9,8 @@ from site_stage import HOST, IMAGE, play, site_of, until
 from skyless.research.compile_ahead import compile_kernels
 from skyless.sim.trajectory import Static
 
+pytestmark = pytest.mark.site
+
 SLOT_MS = 5.0
 PLACES = [Static(2.0, 3.0, 0.0)]
 
@@ -71,6 +73,7 @@ def test_a_chip_that_is_absent_is_reported_and_found_when_it_is_there(kind):
 
 
 @pytest.mark.parametrize(("state", "kind"), [*with_kind(HOST, False, True), *with_kind(IMAGE, False)])
+@pytest.mark.statistical
 def test_a_stuck_interrupt_line_is_reported_and_the_chip_polled(kind, state):
     async def script(site):
         anchor, tag = site.anchors[2], site.tags[0]
@@ -94,6 +97,7 @@ def test_a_stuck_interrupt_line_is_reported_and_the_chip_polled(kind, state):
 
 
 @pytest.mark.parametrize(("part", "kind"), [*with_kind(HOST, "processor", "chip", "both"), *with_kind(IMAGE, "both")])
+@pytest.mark.statistical
 def test_a_brown_out_in_the_middle_of_a_frame(kind, part):
     async def script(site):
         node = site.anchors[1]

@@ -14,6 +14,8 @@ import pytest
 from skyless.core.kernels import cache
 from skyless.core.kernels.cache import KernelFolder, choose_folder
 
+pytestmark = pytest.mark.site
+
 KEY = "abc"
 
 
@@ -105,6 +107,7 @@ def run_twice(tmp_path):
     return run
 
 
+@pytest.mark.statistical
 def test_a_damaged_file_is_compiled_again(run_twice, tmp_path):
     assert run_twice(tmp_path / "kept") == [4.0, True, 0, 1]
     assert run_twice(tmp_path / "kept") == [4.0, True, 1, 0]

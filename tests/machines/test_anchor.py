@@ -19,6 +19,8 @@ from skyless.core.protocol1.schedule import first_slots, schedule_of
 from skyless.core.ticks import difference, wrap
 from skyless.sim.impairments import AnchorOutage, Outage
 
+pytestmark = pytest.mark.site
+
 RANGE_TICKS = {anchor.id: math.hypot(anchor.x_m, anchor.y_m) / TICK_M for anchor in LAB.anchors}
 
 

@@ -19,6 +19,8 @@ from skyless.sim.trajectory import Static
 from skyless.sim.world import World
 from support.keyed_air import START_UNIX_S, anchors_with_keys, made_keys
 
+pytestmark = pytest.mark.site
+
 TRUTH_M = np.array((3.0, 4.0, 0.0))
 KEYS = made_keys(FREE.id, 0.0)
 ROTATED = made_keys(FREE.id, 0.0, 1.5)

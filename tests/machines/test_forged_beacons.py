@@ -36,6 +36,8 @@ from support.keyed_air import (
     run_tag,
 )
 
+pytestmark = pytest.mark.site
+
 KEYS = made_keys(FREE.id, -60.0)
 VERIFIED = SiteTrust(FREE.id, KEYS.public, trust=Trust.VERIFIED)
 OPEN = replace(VERIFIED, trust=Trust.OPEN)
@@ -81,6 +83,7 @@ def genuine_of(tape):
 
 
 @pytest.mark.parametrize("name", FORGERIES)
+@pytest.mark.statistical
 def test_no_forged_frame_moves_a_verified_fix_or_an_anchor(name):
     tape, air = air_of(FORGERIES[name])
     noise, _ = air_of(FORGERIES[name], is_noise=True)

@@ -19,6 +19,8 @@ from skyless.core.site import AnchorSite, ScheduleSite, Site, UnplacedAnchor
 from skyless.core.ticks import Unwrapper, difference, from_seconds, to_seconds, wrap
 from skyless.sim.impairments import AnchorOutage, Outage
 
+pytestmark = pytest.mark.site
+
 
 def site_of(columns, rows, step_m, **schedule) -> Site:
     """Anchors on a grid; identifiers from 1."""

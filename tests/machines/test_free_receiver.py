@@ -21,6 +21,8 @@ from skyless.core.tag.receiver import Receiver
 from skyless.core.ticks import from_seconds, wrap
 from skyless.run.recordings.reception_log import load, save
 
+pytestmark = pytest.mark.site
+
 STRANGER = 999
 ANCHORS = len(FREE.anchors)
 

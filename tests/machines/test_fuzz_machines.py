@@ -25,6 +25,8 @@ from skyless.core.protocols import new_anchor
 from skyless.core.site import AnchorSite, ScheduleSite, UnplacedAnchor
 from skyless.core.ticks import wrap
 
+pytestmark = pytest.mark.site
+
 FRAMES = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "20000"))
 NOISE_PER_FRAME = 6
 SLOT_TICKS = round(2.5e-3 * TICK_RATE_HZ)
@@ -79,6 +81,7 @@ def mixture(site, seed, count):
 
 @pytest.mark.parametrize("method", EVERY_METHOD)
 @pytest.mark.parametrize("site", [LAB, ROOM], ids=["2-D", "3-D"])
+@pytest.mark.statistical
 def test_a_tag_on_a_hostile_channel(method, site):
     """Nothing raises. Forged frames may cost fixes; valid ones still give them, and once the forger stops, all do."""
     receiver, valid = AnyReceiver(method, site=1), []

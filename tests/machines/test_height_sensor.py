@@ -23,6 +23,7 @@ def heard_with_heights(position, height_of, seconds=6.0):
 
 
 @pytest.mark.parametrize("z_m", [5.0, 7.0, 3.0], ids=["in the plane", "above", "below"])
+@pytest.mark.statistical
 def test_the_sensor_tells_the_height_and_which_side_it_is(z_m):
     random = np.random.default_rng(1)
     fixes, used = heard_with_heights((3.0, 4.0, z_m), lambda one: one.truth_m[2] + random.normal(0.0, STD_M))

@@ -6,6 +6,7 @@ Half an hour by default, ``SKYLESS_LONG=1`` for a whole day.
 import math
 import os
 
+import pytest
 from msgspec.structs import replace
 
 from bench import LAB
@@ -15,6 +16,8 @@ from skyless.sim.evaluation.fleet import Fleet, FleetSettings
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.oscillator import OscillatorModel
 from skyless.sim.trajectory import Static
+
+pytestmark = pytest.mark.statistical
 
 HOURS = 24.0 if os.environ.get("SKYLESS_LONG") == "1" else 0.5
 SLOW = replace(

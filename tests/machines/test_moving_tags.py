@@ -18,6 +18,8 @@ from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Waypoints
 from skyless.site.file.template import rectangular_site
 
+pytestmark = pytest.mark.site
+
 LISTENING_S = 3.0
 HALL = replace(rectangular_site(30.0, 20.0, 8, 4.0, None), accuracy=EXACT)
 
@@ -37,6 +39,7 @@ def test_a_vehicle_at_20_metres_a_second(tag_height_m, seed):
     assert judged[-1].fix.velocity_mps[0] == pytest.approx(20.0, abs=1.0)
 
 
+@pytest.mark.statistical
 def test_fixes_know_what_hard_turns_cost_them():
     """Round corners in 0.2 s at 3 m/s, 21 m/s²: the filter lags behind."""
     site, normalised = paper_lab_site(), []
@@ -53,6 +56,7 @@ def test_fixes_know_what_hard_turns_cost_them():
 
 @pytest.mark.parametrize("site", [paper_lab_site(), HALL], ids=lambda site: site.name)
 @pytest.mark.parametrize("silence_s", [2.0, 3.0, 4.5])
+@pytest.mark.statistical
 def test_fixes_after_a_silence_know_their_error(site, silence_s):
     """Errors of a normal variable in 2 or 3 axes exceed five of its radial sigmas once in 10⁶ and more."""
     fleet = fleet_of(Request(site, seed=3, tags=2, speed_mps=2.0))

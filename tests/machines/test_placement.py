@@ -15,6 +15,8 @@ from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.sim.world import World
 
+pytestmark = pytest.mark.site
+
 TAG_M = np.array((2.0, 3.0))
 DELAY_TICKS = {1: 40, 2: -30, 3: 20, 4: 60, 5: -60, 6: 10}
 PLACED_S = 2.0

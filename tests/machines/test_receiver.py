@@ -19,6 +19,8 @@ from skyless.core.protocol1.snapshots import SnapshotMethod
 from skyless.core.ticks import wrap
 from skyless.sim.impairments import AnchorOutage, Outage
 
+pytestmark = pytest.mark.site
+
 SUPERFRAME_S = 15e-3
 P1 = (3.0, 4.0, 0.0)
 
@@ -252,6 +254,7 @@ def test_impossible_stamps_of_one_anchor_cost_only_its_frames(method):
 
 @pytest.mark.parametrize("method", EVERY_METHOD)
 @pytest.mark.parametrize("anchor", [1, 4], ids=["master", "anchor"])
+@pytest.mark.statistical
 def test_an_anchor_restarts(method, anchor):
     """With a new counter; when it is the master, all time starts anew."""
     stage = Stage(LAB, 3, (P1,), anchor_outages=(AnchorOutage(anchor, Outage(2.0, 2.5)),))
@@ -374,6 +377,7 @@ def test_gaps_with_host_time(method, gap_s):
 
 @pytest.mark.parametrize("method", EVERY_METHOD)
 @pytest.mark.parametrize("gap_s", [9.0, 15.0, 20.0])
+@pytest.mark.statistical
 def test_gaps_without_host_time(method, gap_s):
     """The tag cannot know how long it was deaf; it recovers at once and its time still increases."""
     heard = [one for one in tape(LAB, 22.5) if not 1.0 < one.host_s < 1.0 + gap_s]
@@ -470,6 +474,7 @@ def lie(seconds):
 
 @pytest.mark.parametrize("seconds", [1e-6, -1e-6, 1e-3, 5.0, -8.0])
 @pytest.mark.parametrize("from_s", [0.0, 1.0], ids=["from the cold start", "later"])
+@pytest.mark.statistical
 def test_an_anchor_lies_about_the_masters_time(seconds, from_s):
     """From the start or later, it costs no method anything: all go by raw stamps."""
     honest = [one for one in tape() if one.host_s > 0.3]
@@ -571,6 +576,7 @@ def test_what_the_almanac_says_is_taken_from_the_air():
     assert receiver.counters == Counter(heard=len(tape()), fixes=receiver.counters["fixes"])
 
 
+@pytest.mark.statistical
 def test_stamps_in_the_middle_of_a_wrap():
     """The tag's counter and all anchors' wrap within these 18 s."""
     heard = tape(LAB, 18.5)
@@ -586,6 +592,7 @@ def test_stamps_in_the_middle_of_a_wrap():
 
 
 @pytest.mark.parametrize("loss", [0.5, 0.9])
+@pytest.mark.statistical
 def test_fixes_know_what_lossy_links_between_anchors_cost_them(loss):
     """Mean NEES of a tag at rest, which errs less than the filter allows for, as it might walk off: 0.75, nothing lost.
 

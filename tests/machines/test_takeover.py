@@ -20,6 +20,8 @@ from skyless.core.ticks import Unwrapper
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.impairments import AnchorOutage, Outage
 
+pytestmark = pytest.mark.site
+
 SUPERFRAME_S = 15e-3
 CENTRE, WALL = (3.0, 4.0, 0.0), (1.2, 1.6, 0.0)
 
@@ -197,6 +199,7 @@ def test_in_three_dimensions():
     assert len(story.fixes[0][-1][1].anchors) == 8
 
 
+@pytest.mark.statistical
 def test_fixes_stay_as_honest_as_they_say():
     """Mean squared error in units of the fixes' own covariance, for x and y; from the death on to half a second after.
 
@@ -261,6 +264,7 @@ def test_a_living_master_is_believed_dead_next_to_never(loss, others):
 
 
 @pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.statistical
 def test_half_of_all_frames_lost_for_minutes(seed):
     stage = Stage(LAB, seed, channel=lossy(0.5))
     story = Story(stage, 100.0)

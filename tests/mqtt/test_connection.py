@@ -9,6 +9,8 @@ from skyless.core.errors import SkylessError
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.connection import Introduction, check_broker, open_connection
 
+pytestmark = pytest.mark.site
+
 
 @contextlib.asynccontextmanager
 async def player(answer):

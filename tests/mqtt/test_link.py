@@ -20,6 +20,8 @@ from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import StatusMessage, Zone, ZonesMessage
 from skyless.run.mqtt.topics import fix_topic, receptions_topic, status_topic, zones_topic
 
+pytestmark = pytest.mark.site
+
 ZONES = ZonesMessage((Zone("z1", "door", ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0))),))
 
 

@@ -8,6 +8,8 @@ from live_nodes import PLACES, LiveSite, are_right
 
 from skyless.research.compile_ahead import compile_kernels, compile_packet_kernels
 
+pytestmark = pytest.mark.live
+
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled():

@@ -27,6 +27,8 @@ from skyless.run.mqtt.topics import EVERY_NODE, fix_topic, health_topic, site_to
 from support.loops import in_loop
 from support.processes import SKYLESS, running_program
 
+pytestmark = pytest.mark.site
+
 ZONE = Zone("dock", "Dock", ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0)))
 
 

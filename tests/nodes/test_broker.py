@@ -25,6 +25,8 @@ from skyless.run.mqtt.link import Link
 from support.loops import in_loop
 from support.processes import SKYLESS, free_port, started
 
+pytestmark = pytest.mark.site
+
 
 @pytest.fixture
 def port():

@@ -17,6 +17,8 @@ from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.connection import check_broker
 from skyless.run.mqtt.link import Link
 
+pytestmark = pytest.mark.site
+
 KINDS = ("tag", "anchor", "ether", "dashboard", "recorder", "survey", "bridge", "homeassistant", "watch")
 NODES = {
     topics.status_topic: [(7, kind, "n1") for kind in KINDS],

@@ -13,6 +13,8 @@ from skyless.run import children
 from skyless.run.children import Child, Program, end
 from support.loops import in_loop
 
+pytestmark = pytest.mark.site
+
 
 def alive(pid):
     try:

@@ -21,6 +21,8 @@ from skyless.sim.lab import lab_site
 from support.loops import in_loop
 from support.processes import SKYLESS
 
+pytestmark = pytest.mark.site
+
 
 def site_message(number, name):
     site = msgspec.structs.replace(lab_site(), id=number, name=name)

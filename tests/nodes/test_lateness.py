@@ -18,6 +18,8 @@ from skyless.run.mqtt.messages import Counters, RequestMessage
 from skyless.run.recordings.reception_log import ReceptionLog, receiver_settings
 from skyless.run.tag import TagNode, TagSettings
 
+pytestmark = pytest.mark.site
+
 HEARD = receptions(1.5)
 UNIX_S = 1e9
 REST_MS = 30

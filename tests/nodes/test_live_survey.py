@@ -29,6 +29,8 @@ from skyless.run.mqtt.messages import (
 from skyless.site.file.load import load_site
 from skyless.site.survey.facts import Facts, Gauge
 
+pytestmark = pytest.mark.live
+
 _log = logging.getLogger(__name__)
 
 SITE = 78

@@ -18,6 +18,8 @@ from skyless.run.ether import Ether
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.trajectory import Static
 
+pytestmark = pytest.mark.site
+
 MANY = 1150
 HOST = "127.0.0.1"
 

@@ -20,6 +20,8 @@ from skyless.research.compile_ahead import compile_kernels
 from skyless.run.keys.key_files import read_keys
 from skyless.run.mqtt.link import Link
 
+pytestmark = pytest.mark.site
+
 SITE = 300
 TOPICS = f"skyless/v1/{SITE}/"
 ANCHORS = (1, 2, 3, 4)

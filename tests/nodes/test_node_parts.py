@@ -35,6 +35,8 @@ from skyless.run.recordings.recorder import McapFile
 from support.loops import in_loop
 from support.processes import started
 
+pytestmark = pytest.mark.site
+
 # Latencies and phases
 
 

@@ -29,6 +29,8 @@ from skyless.run.recordings.recording import McapRecording
 from skyless.run.tag import Tags, TagSettings
 from support.processes import SKYLESS, usual_signals
 
+pytestmark = pytest.mark.site
+
 SECONDS = 20.0
 PLACES = ((3.0, 4.0, 0.0), (2.0, 2.0, 0.0))
 
@@ -149,6 +151,7 @@ def replayed(path):
         return SiteReplay(recording).run(None, lambda _: None), recording.summary()
 
 
+@pytest.mark.statistical
 def test_a_recording_replays_bit_by_bit_and_ctrl_c_closes_it(broker, tmp_path):
     recorder = Recorder(broker.address, tmp_path / "live.mcap", "--json")
 
@@ -175,6 +178,7 @@ def test_a_recording_replays_bit_by_bit_and_ctrl_c_closes_it(broker, tmp_path):
 
 
 @both
+@pytest.mark.statistical
 def test_a_broker_that_dies_and_returns_costs_no_reception_that_it_kept(broker, tmp_path):
     recorder = Recorder(broker.address, tmp_path / "restart.mcap", "--site-id", str(LAB.id), "--json")
 
@@ -204,6 +208,7 @@ def test_a_broker_that_dies_and_returns_costs_no_reception_that_it_kept(broker, 
 
 
 @both
+@pytest.mark.statistical
 def test_a_killed_recorder_leaves_all_but_the_last_second_and_another_one_goes_on(broker, tmp_path):
     first = Recorder(broker.address, tmp_path / "killed.mcap")
     second = Recorder(broker.address, tmp_path / "second.mcap", "--duration", "2", "--json")

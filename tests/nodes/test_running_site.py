@@ -21,6 +21,8 @@ from site_programs import ANCHORS, SITE, TAGS, SevenAnchors
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.topics import zone_event_topic
 
+pytestmark = pytest.mark.live
+
 _log = logging.getLogger(__name__)
 
 RECOVERY_S = 1.0

@@ -21,6 +21,8 @@ from skyless.run.mqtt.connection import check_broker
 from skyless.run.mqtt.link import Link
 from support.loops import in_loop
 
+pytestmark = pytest.mark.site
+
 HOWTO = Path(__file__).parents[2] / "docs" / "howto" / "secure_a_site.md"
 SITE = "skyless/v1/77/"
 
@@ -68,6 +70,7 @@ def test_a_shell_reads_the_file_of_a_role(broker, tmp_path):
     assert f"SKYLESS_MQTT_PASSWORD={broker.settings.roles[Role.TAGS]}\n" in said
 
 
+@pytest.mark.statistical
 def test_the_programs_of_a_site_may_do_all_that_they_do(broker, tmp_path):
     def program(role, *arguments):
         password = {"SKYLESS_MQTT": f"mqtts://{role}@127.0.0.1:{broker.address.port}"}

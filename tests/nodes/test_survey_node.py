@@ -42,6 +42,8 @@ from skyless.site.survey.facts import Facts, Gauge, PairRanges, Tape
 from skyless.site.survey.result import Survey, SurveyedAnchor, read_record, record_path
 from support.loops import in_loop
 
+pytestmark = pytest.mark.site
+
 POSITIONS_M = {1: (0.0, 0.0), 2: (6.0, 0.0), 3: (6.5, 4.0), 4: (6.0, 8.0), 5: (0.0, 8.0), 6: (-1.0, 3.5)}
 SCHEDULE = ScheduleSite(mode="free")
 SITE = replace(

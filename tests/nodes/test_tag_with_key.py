@@ -15,6 +15,8 @@ from skyless.run.mqtt.messages import Counters
 from skyless.run.tag import TagNode, TagSettings
 from support.keyed_air import START_UNIX_S
 
+pytestmark = pytest.mark.site
+
 SITE_TRUST = SiteTrust(FREE.id, KEYS.public, 1, Trust.VERIFIED)
 
 
@@ -75,6 +77,7 @@ def test_open_fixes_come_at_once_and_state_how_far_they_are_verified():
     assert bench.health().trust == "open"
 
 
+@pytest.mark.statistical
 def test_an_anchor_that_is_refused_for_long_is_named_once():
     forged = [one for one in tape(12.0, OTHER_KEYS.chains) if decode(one.frame).anchor == 3 and one.host_s > 2.0]
     bench = Bench().hear(sorted((*tape(12.0), *forged), key=lambda one: one.host_s))
@@ -103,6 +106,7 @@ def test_a_tag_without_a_key_computes_as_before():
         ("behind", "clock-wrong", "this host's clock is 5.0 s behind that of site"),
     ],
 )
+@pytest.mark.statistical
 def test_why_nothing_is_verified_is_said_once(case, reason, words):
     trust = replace(SITE_TRUST, public=OTHER_KEYS.public) if case == "other key" else SITE_TRUST
     ahead_s = {"ahead": 5.0, "behind": -5.0}.get(case, 0.0)

@@ -27,6 +27,7 @@ def checks():
     return paper_checks(1, DRAWS)
 
 
+@pytest.mark.statistical
 def test_every_quantity_of_ten_anchors_is_checked_for_both_noises(checks):
     assert {(c.noise, c.quantity, c.anchor) for c in checks} == {
         (noise, quantity, anchor)

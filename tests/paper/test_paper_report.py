@@ -13,6 +13,8 @@ from skyless.research.paper import run
 from skyless.research.paper.checks import QUANTITY_NAMES
 from skyless.research.paper.plan import Plan
 
+pytestmark = pytest.mark.site
+
 TINY = Plan(
     seed=3, quick=True, fixes=600, noises_ps=(50.0, 100.0, 150.0), laps=1, fleet_sizes=(1, 3), rate_s=1.0, draws=20_000
 )
@@ -63,6 +65,7 @@ class Page(HTMLParser):
         assert self.open.pop() == tag, f"{tag} closes out of turn at {self.getpos()}"
 
 
+@pytest.mark.statistical
 def test_every_picture_is_there_twice_and_nothing_is_left_over(made):
     folder, told = made
     assert len(told["figures"]) >= 2 * 20
@@ -148,6 +151,7 @@ def test_a_file_is_no_place_for_a_report(tmp_path, capsys, below):
     assert (tmp_path / "taken").read_text() == "mine"
 
 
+@pytest.mark.statistical
 def test_an_interrupt_leaves_nothing_behind(tmp_path):
     def interrupt(done):
         raise KeyboardInterrupt

@@ -14,6 +14,8 @@ from skyless.sim.evaluation.scenarios import Request, fleet_of
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.report.report_page import inline_svg
 
+pytestmark = pytest.mark.site
+
 HOLDS, CORRECTED, FAILS = Verdict.HOLDS, Verdict.CORRECTED, Verdict.FAILS
 
 

@@ -26,6 +26,8 @@ from skyless.site.planning.links import (
 )
 from skyless.site.planning.predict import PlanSettings, Predictor
 
+pytestmark = pytest.mark.site
+
 LAB = paper_lab_site(100.0)
 PLACES = ((0, 0, 0.2), (4, 0, 2.9), (8, 0, 0.4), (8, 5, 2.7), (8, 10, 0.2), (4, 10, 2.9), (0, 10, 0.5), (0, 5, 2.6))
 ROOM = Site("room", 2, 1, tuple(AnchorSite(k + 1, *place) for k, place in enumerate(PLACES)), accuracy=EXACT)

@@ -230,6 +230,7 @@ RUNS = [
 
 
 @pytest.mark.parametrize(("name", "method", "rounds"), RUNS)
+@pytest.mark.statistical
 def test_prediction_and_simulation_agree(monkeypatch, name, method, rounds):
     """3 % for snapshots, 5 % for joint, and four standard errors of the simulation on top.
 

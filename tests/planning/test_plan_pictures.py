@@ -15,6 +15,8 @@ from skyless.site.planning.links import ANCHORS_IN_VIEW, PLAN_COLUMNS, SIGMA
 from skyless.site.planning.maps import PlanMap, grid_of
 from skyless.site.planning.picture import RMSE_LAYER, SIGMA_LAYER, Background, Layer, draw_layer
 
+pytestmark = pytest.mark.site
+
 LAB = paper_lab_site()
 IN_VIEW = Layer(ANCHORS_IN_VIEW, "anchors in view", "", more_is_better=True)
 

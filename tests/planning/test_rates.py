@@ -90,6 +90,7 @@ def test_against_a_plain_loop():
         assert rates.received[k] == sum(hz >= RECEIVED_HZ for hz in each)
 
 
+@pytest.mark.statistical
 def test_rates_of_the_simulated_cells():
     """Tags at rest for a second: 16 times about 155 beacons, so 2 % of chance.
 

@@ -11,6 +11,8 @@ from skyless.site.planning.colours import round_values, scale_of
 from skyless.site.planning.picture import value_colours
 from value_colours import colour_at, colour_of
 
+pytestmark = pytest.mark.site
+
 POSITIVE = st.floats(1e-4, 1e4)
 
 

@@ -15,6 +15,8 @@ from skyless.sim.evaluation.scenarios import Room, displacements
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.range_errors import RangeErrorModel
 
+pytestmark = pytest.mark.statistical
+
 LAB = paper_lab_site(accuracy=AccuracySite())
 """Its site file states the typical errors of survey and ranges."""
 ANCHORS_M = {

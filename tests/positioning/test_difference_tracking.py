@@ -24,6 +24,8 @@ from skyless.research.masterless.difference_tracking import (
 )
 from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
 
+pytestmark = pytest.mark.site
+
 ANCHORS_M = {n: (8.0 * (n & 1), 6.0 * (n >> 1 & 1), 0.3 + 2.4 * ((n ^ n >> 1 ^ n >> 2) & 1)) for n in range(4)}
 ANCHORS_M |= {4 + n: (8.0 * (n & 1), 6.0 * (n >> 1 & 1), 2.7 - ANCHORS_M[n][2] + 0.3) for n in range(4)}
 STEP_S = 0.0025
@@ -122,6 +124,7 @@ def test_nothing_is_early_by_more_than_the_bound():
 
 
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.statistical
 def test_covariances_hold_where_anchors_are_off_as_assumed(seed):
     """Errors squared over their variance, of anchors as far off in all as the settings have them: about one.
 

@@ -26,6 +26,8 @@ from skyless.core.observation import MasterTerm, Observation
 from skyless.core.tag.joint import Estimation, MasterScale
 from skyless.core.ticks import TICK_MASK
 
+pytestmark = pytest.mark.site
+
 CALM = Case(qa=0.02)
 MODULO = SUBTICKS * (TICK_MASK + 1)
 
@@ -51,6 +53,7 @@ def errors_of(method, packets, path_m):
 
 @pytest.mark.parametrize("case", [PLAIN, MESH], ids=["plain", "mesh"])
 @pytest.mark.parametrize(("anchors_m", "height_m"), [(LAB_M, 0.0), (ROOM_M, None)], ids=["2-D", "3-D"])
+@pytest.mark.statistical
 def test_fixes_are_honest_from_the_first_on(case, anchors_m, height_m):
     """Two superframes make a start, without a word of any master; over many starts errors are as large as said."""
     dim, squares = 3 if height_m is None else 2, {0: [], 30: [], 100: []}
@@ -88,6 +91,7 @@ def test_starts_know_what_range_errors_they_have():
 
 
 @pytest.mark.parametrize("late_anchors", [1, 2, 3])
+@pytest.mark.statistical
 def test_starts_from_packets_that_contradict_each_other_are_honest(late_anchors):
     """One to three of six anchors late by 0.5 to 2 m: there is a fix within a second, and levels cover its error.
 

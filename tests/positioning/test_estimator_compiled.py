@@ -5,6 +5,10 @@ import re
 import subprocess
 import sys
 
+import pytest
+
+pytestmark = pytest.mark.site
+
 SCRIPT = """
 from estimator_builders import MESH, begun, episode_of, settings_of
 from skyless.core.estimator import estimator

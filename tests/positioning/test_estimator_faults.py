@@ -48,6 +48,8 @@ from skyless.core.estimator.state import (
 )
 from skyless.core.integrity import CONTRADICTED, HPL, Alert, IntegrityRequirement, integrity_of, limits_of
 
+pytestmark = pytest.mark.site
+
 RISK = 1e-4
 LATE_M = 4 * TICK_M
 """Whole ticks, as stamps are."""
@@ -397,6 +399,7 @@ WORLDS = {
 
 @pytest.mark.parametrize("errors", [{}, ROOM_ERRORS], ids=["exact", "range errors"])
 @pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.statistical
 def test_errors_exceed_levels_as_seldom_as_stated(name, errors):
     """At a risk of 2 % a fault that is not covered shows in 160 epochs; more than 9 above come once in 400 times."""
     case, risk = Case(qa=0.3), 0.02

@@ -51,6 +51,8 @@ from skyless.core.estimator.state import (
 from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM
 from skyless.research.uncertainty.bounds import BoundSettings, tracking_bound
 
+pytestmark = pytest.mark.site
+
 BIASED = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
 """Errors of survey and ranges that a real room has."""
 
@@ -67,6 +69,7 @@ BIASED = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place
     ],
     ids=["plain", "mesh", "height above", "height uncertain", "3-D"],
 )
+@pytest.mark.statistical
 def test_a_textbook_filter_says_the_same(case, anchors_m, height_m, height_std_m, errors):
     episode = episode_of(case, 25, 3, anchors_m)
     assumed = settings_of(case, height_m, gate=1e3, height_std_m=height_std_m, **errors)
@@ -281,6 +284,7 @@ def test_at_rest_nothing_is_learnt_of_how_range_errors_grow():
 
 
 @pytest.mark.parametrize("errors", [{}, BIASED], ids=["exact", "range errors"])
+@pytest.mark.statistical
 def test_a_million_packets_leave_the_covariance_sound(errors):
     """Forty minutes at rest: the same 15 s again and again, on counters that go on."""
     packets, place_m = standing(1024 * 6, np.array([3.0, 4.0, 0.0])), [3.0, 4.0]

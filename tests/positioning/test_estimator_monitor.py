@@ -31,6 +31,8 @@ from skyless.core.kernels.filter import ClockFilter, clock_noise
 from skyless.core.ticks import TICK_MASK
 from skyless.research.studies.episodes import WHITE_FM
 
+pytestmark = pytest.mark.site
+
 ROOM_ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
 AGILE = Case(qa=0.3)
 CASES = pytest.mark.parametrize("case", [replace(PLAIN, qa=0.3), AGILE], ids=["plain", "mesh"])

@@ -19,6 +19,8 @@ from skyless.sim.trajectory import Static
 from skyless.sim.world import World
 from skyless.site.channel import ChannelModel, first_path_loss_db
 
+pytestmark = pytest.mark.site
+
 POWERS = st.floats(-150.0, 0.0)
 
 

@@ -6,6 +6,8 @@ from estimator_builders import MESH, ROOM_M, begun, episode_of, settings_of, tra
 
 from skyless.core.integrity import HPL
 
+pytestmark = pytest.mark.site
+
 HEIGHT_STD_M = 0.3
 EPISODES = 40
 SETTLED = 120
@@ -28,6 +30,7 @@ def nees_of_ends(runs):
     return sum(ends) / (2 * EPISODES)
 
 
+@pytest.mark.statistical
 def test_the_covariance_counts_the_height():
     runs = list(runs_of(HEIGHT_STD_M))
     # χ² of 80 degrees of freedom, 0.1 % on either side

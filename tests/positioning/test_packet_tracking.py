@@ -13,6 +13,8 @@ from skyless.radio.foreign.bitcraze import decode_payload
 from skyless.research.masterless.packet_tracking import MASTERLESS, PacketTracking
 from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
 
+pytestmark = pytest.mark.site
+
 SECONDS = 6.0
 SPEED_MPS = 1.0
 EXACT = structs.replace(
@@ -76,6 +78,7 @@ def test_a_walk_is_followed_and_the_errors_are_as_said(walked):
 
 
 @pytest.mark.parametrize("system", hall.CAPTURES)
+@pytest.mark.statistical
 def test_errors_over_many_halls_are_as_said(system):
     """Tags at rest: six halls of other clocks, antenna delays and noise."""
     means = []

@@ -14,6 +14,8 @@ from skyless.core.protocol1.snapshots import (
     literal_tdoa,
 )
 
+pytestmark = pytest.mark.site
+
 SUPERFRAME = round(15e-3 * TICK_RATE_HZ)
 
 

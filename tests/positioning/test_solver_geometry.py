@@ -23,6 +23,8 @@ from skyless.core.tag.locate import (
     mean_if_positive,
 )
 
+pytestmark = pytest.mark.site
+
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -11,6 +11,8 @@ from scipy.stats import chi2
 from skyless.core.fix import NoFixReason
 from skyless.core.tag.locate import NoSolution, Solution, chi2_limit, locate, locate_pseudoranges
 
+pytestmark = pytest.mark.site
+
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
 LAB_3D = LAB + np.column_stack([np.zeros((6, 2)), [0.5, 2.5] * 3])
 """Alternating heights, as docs/maths.md section 5 advises."""
@@ -65,6 +67,7 @@ def test_the_minimum_is_the_one_that_scipy_finds(anchors, height, weighted):
         (LAB, np.array([2.0, 3.0, 1.5]), None, 0.01),  # one plane: the unfolded covariance
     ],
 )
+@pytest.mark.statistical
 def test_the_covariance_is_that_of_the_estimates(anchors, p, height, std, weighted):
     """4000 draws: N·S of a normal sample is Wishart, so each variance has a relative error of √(2/N) = 2.2 %."""
     count, covariance = 4000, std**2 * LITERAL
@@ -106,6 +109,7 @@ def test_weights_pay():
 
 
 @pytest.mark.parametrize("height", [0.0, None])
+@pytest.mark.statistical
 def test_the_joint_covariance_is_that_of_position_and_bias(height):
     count, variances = 4000, np.array([4, 1, 2, 1, 3, 1]) * 0.01**2
     anchors, p = (LAB, P2) if height is not None else (LAB_3D, np.array([2.0, 3.0, 1.2]))
@@ -121,6 +125,7 @@ def test_the_joint_covariance_is_that_of_position_and_bias(height):
 
 
 @pytest.mark.parametrize("std", [0.1, 0.5])
+@pytest.mark.statistical
 def test_it_always_converges_in_the_lab(std):
     """Tags anywhere in the lab. With 0.5 m of noise the two sides of a wall of anchors can fit equally well."""
     covariance = std**2 * (np.eye(5) + 1)
@@ -144,6 +149,7 @@ def test_it_always_converges_in_the_lab(std):
 
 
 @pytest.mark.parametrize("across", [0.0, 0.05, 0.2, 0.5, 1.0, 2.0])
+@pytest.mark.statistical
 def test_near_the_anchors_plane_the_reported_height_error_is_honest(across):
     """Merged or apart, the height is known about as well as claimed: its mean normalised square is 1, or less.
 

@@ -14,6 +14,8 @@ from skyless.cli import warm
 from skyless.cli.main import program
 from skyless.run.mqtt.access import Role
 
+pytestmark = pytest.mark.site
+
 ROOT = Path(__file__).parents[2]
 COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text(encoding="utf-8"))
 UNITS = sorted((ROOT / "packaging" / "systemd").glob("*.service"))

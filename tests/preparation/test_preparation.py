@@ -17,6 +17,8 @@ from skyless.core.kernels import processes
 from skyless.core.kernels.cache import KernelFolder
 from skyless.core.kernels.processes import LAB, SIMULATED, Part, Preparation, compile_parts, missing, parts_of
 
+pytestmark = pytest.mark.site
+
 TINY = """
 from skyless.core.kernels.compiled import kernel
 

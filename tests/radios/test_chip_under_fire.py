@@ -1,5 +1,6 @@
 """The driver against the register model, whatever comes in which order: a state machine of hypothesis."""
 
+import pytest
 from chip_stage import HandClock, TimedNode
 from hypothesis import event, settings
 from hypothesis import strategies as st
@@ -11,6 +12,8 @@ from skyless.core.ticks import from_seconds, wrap
 from skyless.radio.dw1000 import driver as dw1000
 from skyless.radio.interface import AntennaDelays, Late, Sent
 from skyless.sim.dw1000 import registers as r
+
+pytestmark = pytest.mark.site
 
 DELAYS = AntennaDelays(16_500, 16_300)
 FAULTS = st.sampled_from([None, None, None, "header", "parity", "delimiter", "first-path", "fcs"])

@@ -14,6 +14,8 @@ from skyless.radio.dw1000 import driver as dw1000
 from skyless.radio.serial import link
 from skyless.run.open_radio import open_radios
 
+pytestmark = pytest.mark.site
+
 DEVICE_ID = b"\x30\x01\xca\xde"
 OTP = {0x04: 0x28, 0x06: 0x0A0B0C0D, 0x07: 0x01020304, 0x08: 0x7D, 0x09: 0x86, 0x1E: 0x11}
 LISTEN_AGAIN = ["w f603 e0", "w f603 f0", "w 8d 0001"]

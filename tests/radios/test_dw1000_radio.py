@@ -25,6 +25,8 @@ from skyless.research.compile_ahead import compile_kernels
 from skyless.run.open_radio import is_simulated, open_radios
 from skyless.sim.dw1000.chip import ModelBus
 
+pytestmark = pytest.mark.site
+
 
 @pytest.fixture(scope="module")
 def compiled():

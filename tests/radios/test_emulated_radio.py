@@ -18,6 +18,8 @@ from skyless.radio.interface import Gone, Late, Restarted, Sent
 from skyless.run.ether import Client
 from skyless.run.open_radio import host_and_port, is_simulated, open_radios
 
+pytestmark = pytest.mark.site
+
 HOST = "127.0.0.1"
 WORD = b"a frame" * 10
 

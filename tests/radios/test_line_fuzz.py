@@ -27,6 +27,8 @@ from skyless.radio.uci.uci import (
     encode_session_info,
 )
 
+pytestmark = pytest.mark.site
+
 BYTES = int(os.environ.get("SKYLESS_FUZZ_BYTES", "300000"))
 ALPHABETS = (
     bytes(range(256)),

@@ -21,6 +21,8 @@ from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.sim.world import World
 
+pytestmark = pytest.mark.site
+
 LAB = paper_lab_site()
 SECONDS = 4.0
 SEED = 7

@@ -11,6 +11,8 @@ from skyless.core.errors import ConfigurationError
 from skyless.research.replays.captures import CaptureReplay
 from skyless.research.replays.options import ReplayOptions
 
+pytestmark = pytest.mark.site
+
 MUTATIONS = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "20000"))
 PER_FILE = 100
 NUMBERS = [b"nan", b"inf", b"-1", b"1e999", b"0x10", b"9" * 30, b"1_0", b"", b"\xff\xfe", b"\x00", b"---\n", b"\n"]
@@ -80,6 +82,7 @@ def fuzz(whole, name, path, mutations, seed):
 
 
 @pytest.mark.parametrize("name", synthetic.MAKERS)
+@pytest.mark.statistical
 def test_made_up_captures(tmp_path, name):
     whole = b"".join(synthetic.MAKERS[name](1500))
     assert fuzz(whole, name, tmp_path / "damaged", MUTATIONS // 10, seed=name) > 0

@@ -31,6 +31,8 @@ from skyless.research.foreign.formats import open_recording
 from skyless.research.replays.captures import CaptureReplay
 from skyless.research.replays.options import ReplayOptions
 
+pytestmark = pytest.mark.site
+
 LINES = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "20000"))
 """SKYLESS_FUZZ_FRAMES=1000000 for a full run."""
 

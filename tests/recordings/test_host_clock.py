@@ -15,6 +15,8 @@ from skyless.run.mqtt.messages import FixMessage, ReceptionsMessage, TrueMotion,
 from skyless.run.recordings.host_clock import HostClock
 from skyless.run.recordings.recording import McapRecording
 
+pytestmark = pytest.mark.site
+
 _STEP_S = 0.02
 
 

@@ -8,6 +8,8 @@ import masterless_world as hall
 from skyless.cli.main import main
 from skyless.research.foreign.formats import open_recording
 
+pytestmark = pytest.mark.site
+
 SECONDS = 8.0
 
 
@@ -38,6 +40,7 @@ def replay(folder, capsys, monkeypatch):
 
 @pytest.mark.parametrize("system", hall.CAPTURES)
 @pytest.mark.parametrize("speed_mps", [0.0, 1.0])
+@pytest.mark.statistical
 def test_packets_are_better_than_their_differences(replay, system, speed_mps):
     packets = replay(f"{system}-{speed_mps}")
     assert (packets["format"], packets["measurements"]) == ("bitcraze-binary", "packets")

@@ -21,6 +21,8 @@ from skyless.core.method_names import METHODS
 from skyless.core.protocol1.codec import decode, encode
 from skyless.run.recordings.reception_log import RefusedError, load, save
 
+pytestmark = pytest.mark.site
+
 RNG = np.random.default_rng(20)
 
 
@@ -32,6 +34,7 @@ def bits(fix):
 
 @pytest.mark.parametrize("site", [LAB, ROOM, PAIRS], ids=["lab", "room", "pairs"])
 @pytest.mark.parametrize("method", METHODS)
+@pytest.mark.statistical
 def test_a_receiver_goes_on_with_the_same_bits(method, site):
     heard = [one.reception for one in tape(site, 2.5)]
     cuts = set(RNG.choice(len(heard), 25, replace=False)) | {0, 1}

@@ -25,6 +25,8 @@ from skyless.run.mqtt.messages import FixMessage
 from skyless.run.recordings.recorder import McapFile
 from skyless.run.recordings.recording import McapRecording, channel_of
 
+pytestmark = pytest.mark.site
+
 PAYLOADS = (
     *(outputs.SiteMessage, outputs.FixMessage, outputs.ReceptionsMessage, outputs.TruthMessage, outputs.ZonesMessage),
     *(outputs.ZoneEvent, outputs.TagHealth, outputs.AnchorHealth, outputs.EtherHealth, outputs.StatusMessage),

@@ -17,6 +17,8 @@ from skyless.run.mqtt.messages import ReceptionsMessage
 from skyless.run.recordings.recording import McapRecording
 from skyless.site.channel import ChannelModel
 
+pytestmark = pytest.mark.site
+
 
 def replayed(path, **options):
     with McapRecording(path) as recording:

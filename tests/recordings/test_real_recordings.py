@@ -11,6 +11,8 @@ from skyless.research.foreign.formats import open_recording
 from skyless.research.masterless.pair_engine import PairEngine
 from skyless.site.tables import read_anchors, read_truth
 
+pytestmark = pytest.mark.site
+
 KUIPMAN = {
     "6af847e_testoutput2": (3309, 3295),
     "b34daf0_output20240415": (2753, 7813),

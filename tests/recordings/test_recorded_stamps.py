@@ -22,6 +22,8 @@ from skyless.sim.world import World
 from skyless.site.survey.facts import Facts, Tape
 from skyless.site.survey.solve import run_survey
 
+pytestmark = pytest.mark.site
+
 POSITION_M = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in SITE.anchors}
 
 

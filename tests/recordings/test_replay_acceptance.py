@@ -9,6 +9,8 @@ import yaml
 
 from skyless.cli.main import main
 
+pytestmark = pytest.mark.site
+
 KEYS = {
     *("format", "receptions", "fixes", "dropped", "median_m", "std_m", "rmse_2d_m", "rmse_3d_m", "p95_m", "max_m"),
     "rate_hz",
@@ -86,6 +88,7 @@ def test_two_anchors_give_no_fix_and_the_reason(recordings, replay, measurements
 
 @pytest.mark.parametrize("trial", [1, 2, 3])
 @pytest.mark.parametrize(("system", "limit_2d_m", "limit_3d_m"), [("tdoa2", 0.030, 0.11), ("tdoa3", 0.052, 0.11)])
+@pytest.mark.statistical
 def test_flights_in_free_space(recordings, replay, trial, system, limit_2d_m, limit_3d_m):
     name = f"util_flights/const1/const1-trial{trial}-{system}"
     report = replay(*flight(recordings, "util_flights/anchors_const1.csv", name))
@@ -107,6 +110,7 @@ def test_flights_in_free_space(recordings, replay, trial, system, limit_2d_m, li
         ("7-tdoa2-manual3", 0.10, 0.19),
     ],
 )
+@pytest.mark.statistical
 def test_flights_among_obstacles(recordings, replay, trial, limit_2d_m, limit_3d_m):
     name = f"util_flights/const4/const4-trial{trial}"
     report = replay(*flight(recordings, "util_flights/anchors_const4.csv", name))
@@ -117,6 +121,7 @@ def test_flights_among_obstacles(recordings, replay, trial, limit_2d_m, limit_3d
 @pytest.mark.parametrize(
     ("log", "limit_2d_m", "limit_3d_m"), [("traj1", 0.25, 0.5), ("traj13", 0.18, 0.4), ("traj2", 0.18, 0.4)]
 )
+@pytest.mark.statistical
 def test_noisy_flights_with_attitude(recordings, replay, log, limit_2d_m, limit_3d_m):
     """A gate alone has 0.11 to 0.20 m, 0.18 of traj1, which was 0.155 with the starts of version 0.2."""
     report = replay(*flight(recordings, "util_sdlogs/anchors/anchors_0425.csv", f"util_sdlogs/csv/0425/0425-{log}"))
@@ -124,6 +129,7 @@ def test_noisy_flights_with_attitude(recordings, replay, log, limit_2d_m, limit_
     assert report["rmse_3d_m"] < limit_3d_m
 
 
+@pytest.mark.statistical
 def test_the_lever_arm_brings_the_truth_to_the_antenna(recordings, replay):
     arguments = flight(recordings, "util_flights/anchors_const1.csv", "util_flights/const1/const1-trial1-tdoa2")
     everything = "--above=-9"  # otherwise the arm moves the moment from which a flight is judged

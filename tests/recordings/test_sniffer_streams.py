@@ -147,6 +147,7 @@ class Endless:
 
 
 @both
+@pytest.mark.statistical
 def test_memory_stays_flat_with_packets_and_without_any_separator(kind):
     for piece in (capture(kind, 100), b"\xbc\x01a: " + b"x" * 95):
         drops = Counter()

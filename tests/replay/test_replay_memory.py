@@ -7,6 +7,8 @@ import pytest
 
 import synthetic_recordings as synthetic
 
+pytestmark = pytest.mark.statistical
+
 ROWS = {"tdoa-table": 15_000, "bitcraze-binary": 4_000, "avalue": 4_000}
 PEAKS = """
 import sys

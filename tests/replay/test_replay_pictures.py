@@ -9,6 +9,8 @@ from matplotlib.image import imread
 from skyless.research.replays.plot import track_figure
 from skyless.site.report.figures import save_figure
 
+pytestmark = pytest.mark.site
+
 
 def draw(path, rows, title):
     save_figure(track_figure(rows, title), path)

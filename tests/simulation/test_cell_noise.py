@@ -15,6 +15,8 @@ from skyless.sim.cells.clocks import CHECKPOINT_KNOTS, KNOT_TICKS, CellClocks, o
 from skyless.sim.cells.keyed import key_of, mixed, normal, normal_pair, purpose_key, uniform
 from skyless.sim.oscillator import OscillatorModel, Temperature
 
+pytestmark = pytest.mark.site
+
 COUNT = 20_000
 Z = 5.0
 """Bounds are five standard deviations of what is measured."""

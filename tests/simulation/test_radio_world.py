@@ -25,6 +25,8 @@ from skyless.sim.trajectory import Roaming, Static, Waypoints
 from skyless.sim.world import World
 from skyless.site.channel import ChannelModel, power_bias_m, received_power_dbm
 
+pytestmark = pytest.mark.site
+
 LAB = paper_lab_site(accuracy=AccuracySite())
 AT_P1 = TagSpec(Static(3.0, 4.0))
 

@@ -24,6 +24,8 @@ from skyless.sim.trajectory import Roaming, Static, Waypoints
 from skyless.sim.world import World
 from skyless.site.channel import ChannelModel
 
+pytestmark = pytest.mark.site
+
 LAB = paper_lab_site()
 PLACES_M = {anchor.id: np.array([anchor.x_m, anchor.y_m]) for anchor in LAB.anchors}
 MIDDLE = Static(3.0, 4.0)

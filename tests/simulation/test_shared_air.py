@@ -10,6 +10,8 @@ from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.sim.world import World
 
+pytestmark = pytest.mark.site
+
 PERIODS_S = {1: 3.1e-3, 2: 2.3e-3 * 2**0.5}
 FRAME_BYTES = {1: 40, 2: 100}
 

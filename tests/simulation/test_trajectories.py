@@ -10,6 +10,8 @@ from scipy.stats import chi2
 
 from skyless.sim.trajectory import Roaming, Static, Waypoints
 
+pytestmark = pytest.mark.site
+
 SQUARE = [(0.0, 0.0), (4.0, 0.0), (4.0, 3.0), (0.0, 3.0)]
 
 

@@ -56,6 +56,7 @@ def test_episodes_do_not_depend_on_how_they_are_shared_out():
 
 
 @pytest.mark.parametrize("case", CASES, ids=["plain", "mesh", "mesh at once"])
+@pytest.mark.statistical
 def test_the_filter_is_at_the_bound(case):
     """To the statistics of 400 episodes; the bounds within 3 % of those over many paths."""
     seeds = np.random.SeedSequence(5).spawn(400)

@@ -26,6 +26,8 @@ from skyless.research.studies.integrity import (
 from skyless.sim.lab import paper_lab_site
 from skyless.site.report.figures import picture
 
+pytestmark = pytest.mark.site
+
 SLOT_S = paper_lab_site().schedule.slot_s
 PLAN = plan_of("joint", 1, episodes=100)
 

@@ -1,10 +1,13 @@
 """The study ``large``: a thousand anchors without a master. What its commands show is in docs/studies.md."""
 
 import numpy as np
+import pytest
 from msgspec.structs import replace
 
 from skyless.research.studies import large
 from skyless.research.studies.common.plan import Plan
+
+pytestmark = pytest.mark.site
 
 PLAN = Plan(seed=5, worlds=2, seconds=8.0)
 CASES = {case.name: case for case in large.cases(PLAN)}

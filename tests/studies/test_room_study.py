@@ -22,6 +22,8 @@ from skyless.sim.lab import lab_site
 from skyless.site.channel import cross_walls, pack_walls
 from skyless.site.report.figures import picture
 
+pytestmark = pytest.mark.site
+
 PLAN = plan_of("joint", 1, study="room")
 CASES = {case.name: case for case in room.cases(PLAN)}
 RESTS = ("at rest, unbiased air", "at rest", "at rest, 3-D room")
@@ -43,6 +45,7 @@ def test_the_room_has_a_hundred_tags_in_twenty_draws_and_the_rest_a_quarter():
     assert {(len(case.runs), len(case.runs[0].trajectories)) for case in few} == {(6, 2), (2, 2)}
 
 
+@pytest.mark.statistical
 def test_worlds_are_the_same_for_every_method_and_of_one_seed_in_all_cases():
     for case, other in zip(CASES.values(), room.cases(replace(PLAN, method="literal")), strict=True):
         for a, b, base in zip(case.runs, other.runs, CASES[room.BASE].runs, strict=False):
@@ -313,6 +316,7 @@ def test_rows_have_shares_of_the_fixes_with_a_level_and_intervals_over_tags():
     assert (row.level, row.exceeded, row.hpl_m) == (0.0, None, None)
 
 
+@pytest.mark.statistical
 def test_the_table_and_the_picture_show_levels_and_what_is_missed(capsys):
     plan = plan_of("joint", 1, study="room", worlds=2)
     counts = LevelCounts(*map(np.array, ([4.0, 5.0], [4.0, 2.0], [3.0, 0.0], [1.0, 0.0])), hpl_m=np.array([0.1, 0.4]))
@@ -356,6 +360,7 @@ def test_the_bound_is_of_what_the_worlds_draw():
     assert biases_of(None) == Biases()
 
 
+@pytest.mark.statistical
 def test_the_bound_of_the_room():
     """What ``docs/maths.md`` says of it, from the first six of the hundred tags."""
     plan = replace(plan_of("joint", 11, study="room", worlds=2), tags=3)

@@ -15,6 +15,8 @@ import pytest
 
 from skyless.cli.main import main
 
+pytestmark = pytest.mark.statistical
+
 COMMAND = [sys.executable, "-m", "skyless.cli.main", "study"]
 SMALL = ["--method", "joint", "--quick", "--worlds", "2", "--seconds", "1", "--processes", "1"]
 

@@ -15,6 +15,8 @@ from skyless.sim.lab import lab_site
 from skyless.sim.world import World
 from skyless.site.file.check import check_site
 
+pytestmark = pytest.mark.site
+
 SMALL = Plan(method="joint", worlds=2, seconds=1.0, tags=1)
 RANDOM = np.random.default_rng(5)
 
@@ -88,6 +90,7 @@ def test_the_interval_is_students():
     assert interval(None, 1) is None
 
 
+@pytest.mark.statistical
 def test_joint_in_the_lab_is_found_honest_and_as_good_as_it_is():
     """1.4 cm at 100 ps (``docs/studies.md``), walking at 1 m/s; it allows for turns that are few, so NEES is 0.8."""
     plan = Plan(method="joint", worlds=6, seconds=4.0, tags=2)

@@ -16,6 +16,8 @@ from skyless.research.studies.common.plan import MEASURED, Cell, Plan
 from skyless.research.studies.common.runner import run_cells, run_cells_on_dask
 from skyless.research.studies.common.summary import world_cells, world_rows
 
+pytestmark = pytest.mark.site
+
 PLAN = Plan(method="joint", seed=3, quick=True, worlds=2, seconds=1.0, tags=1)
 
 
@@ -55,6 +57,7 @@ def cells(function, arguments):
     return [Cell("cell", function, argument, 1.0 + argument) for argument in arguments]
 
 
+@pytest.mark.statistical
 def test_the_same_rows_from_one_process_from_two_and_from_a_cluster(cluster):
     work = world_cells(CASES)
     told = []
@@ -70,15 +73,18 @@ def test_another_seed_gives_other_rows():
     assert first.squared_m2 != second.squared_m2
 
 
+@pytest.mark.statistical
 def test_results_stand_in_the_order_of_the_cells():
     assert run_cells(cells(double, range(7)), lambda share: None, 2) == [0, 2, 4, 6, 8, 10, 12]
 
 
+@pytest.mark.statistical
 def test_a_process_that_dies_is_told():
     with pytest.raises(SkylessError, match="a process of the study died"):
         run_cells(cells(die, range(4)), lambda share: None, 2)
 
 
+@pytest.mark.statistical
 def test_a_worker_of_a_cluster_that_dies_is_told(cluster):
     with pytest.raises(SkylessError, match="the cluster failed, nothing was written"):
         run_cells_on_dask(cells(die, [1]), lambda share: None, cluster.scheduler_address)
@@ -137,6 +143,7 @@ def test_an_interrupt_ends_cells_that_would_last_for_minutes():
     assert time.monotonic() - begun_s < 60.0
 
 
+@pytest.mark.statistical
 def test_processes_end_with_the_one_that_started_them(tmp_path):
     """Killed without a word, it leaves nobody behind."""
     code = (

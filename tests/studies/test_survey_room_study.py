@@ -20,6 +20,8 @@ from skyless.research.surveys.rooms import (
     true_site,
 )
 
+pytestmark = pytest.mark.site
+
 ERRORS = RoomErrors(0.07, 0.02, ROOM_RANGES)
 
 
@@ -54,6 +56,7 @@ def test_a_taped_survey_through_the_air_finds_positions_and_delays():
     assert np.std(left_m) < np.std(one_way_m(room, hand_site(room)))
 
 
+@pytest.mark.statistical
 def test_rows_of_few_worlds(monkeypatch):
     small = (Group("lab, at rest", "lab", at_rest=True), Group("lab, room", "lab", ERRORS, (TRUTH, SURVEYED)))
     monkeypatch.setattr(study, "groups", lambda: small)

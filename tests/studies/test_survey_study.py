@@ -12,6 +12,8 @@ from skyless.research.surveys.judge import aligned, tag_error_m
 from skyless.research.surveys.layouts import survey_layouts
 from skyless.site.report.figures import picture
 
+pytestmark = pytest.mark.site
+
 SMALL = {
     "lab": (
         Group("exact", (Variant("delays known", 0.0), Variant("positions kept", 0.15, keeps=True)), seconds=1.0),

@@ -8,6 +8,8 @@ from skyless.research.studies.common.plan import Plan
 from skyless.research.surveys.drawn_faults import WatchResult, WatchRun, run_watch
 from skyless.site.report.figures import picture
 
+pytestmark = pytest.mark.site
+
 
 @pytest.fixture
 def few(monkeypatch):

@@ -1,10 +1,13 @@
 """Other results that fit as well are found; clean sites have none."""
 
 import numpy as np
+import pytest
 from random_sites import HALL_J, LAB, ROOM_J, aligned_error_m, draw, is_unchecked, problem_of, rms
 
 from skyless.site.survey.fit.robust import aligned_std_m, aligned_to, find_ambiguities, fit_robustly
 from skyless.site.survey.fit.start import start_positions
+
+pytestmark = pytest.mark.site
 
 
 def fitted(problem, sketch_m=None):

@@ -14,6 +14,8 @@ from skyless.site.survey.facts import PairBlock
 from skyless.site.survey.watch.explain import sentence_of
 from skyless.site.survey.watch.monitor import AnchorWatch
 
+pytestmark = pytest.mark.site
+
 SQUARE = {1: (0.0, 0.0, 0.0), 2: (6.0, 0.0, 0.0), 3: (6.5, 5.0, 0.0), 4: (0.0, 6.0, 0.0), 5: (2.5, 2.0, 0.0)}
 
 

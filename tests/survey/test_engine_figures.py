@@ -11,10 +11,12 @@ from skyless.research.surveys.layouts import survey_layouts
 from skyless.site.survey.build import build_problem, own_delays, usable
 from skyless.site.survey.facts import Facts, Tape
 from skyless.site.survey.fit import determined as determination
-from skyless.site.survey.fit.problem import solve_least_squares
+from skyless.site.survey.fit.problem import jacobian, solve_least_squares
 from skyless.site.survey.frame import align
 from skyless.site.survey.solve import run_survey
 from support.drawn_ranges import drawn_ranges
+
+pytestmark = pytest.mark.site
 
 LAYOUTS = survey_layouts()
 RUNS = 60
@@ -79,7 +81,7 @@ def test_errors_are_as_large_as_stated(name, delay_std_m, pair_std_m, tapes, mos
         problem, _ = build_problem(usable(ranges, facts), everyone, pair_std_m, None, None)
         solution = solve_least_squares(problem, layout.position_m)
         core = np.ones(len(everyone), bool)
-        rows = determination.jacobian(problem, layout.position_m)
+        rows = jacobian(problem, layout.position_m)
         covariance = determination.aligned_covariance(problem, rows, layout.position_m, core)
         error = aligned_error_m(layout, solution.position_m).ravel()
         size = len(error)
@@ -102,7 +104,7 @@ def test_delays_are_as_good_as_stated(name):
         measured = usable(ranges, facts)
         problem, _ = build_problem(measured, everyone, 0.02, None, None)
         solution = solve_least_squares(problem, layout.position_m)
-        rows = determination.jacobian(problem, layout.position_m)
+        rows = jacobian(problem, layout.position_m)
         covariance = determination.aligned_covariance(problem, rows, layout.position_m, np.ones(len(everyone), bool))
         of_delays = covariance[3 * len(everyone) :, 3 * len(everyone) :]
         delay, std = own_delays(measured, layout.anchors, problem, solution.delay_m, of_delays)

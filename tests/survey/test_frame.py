@@ -14,6 +14,8 @@ from skyless.site.survey.frame import align, axes_through
 from skyless.site.survey.solve import run_survey
 from support.drawn_ranges import drawn_ranges
 
+pytestmark = pytest.mark.site
+
 LAB = survey_layouts()["lab"]
 ROOM = survey_layouts()["room"]
 KNOWN = Facts(delay_std_m=0.0, pair_std_m=0.0)

@@ -17,6 +17,8 @@ from skyless.site.survey.solve import run_survey
 from skyless.site.survey.stamps.pair_ranger import PairRanger, RangeSteps
 from skyless.site.survey.watch.moved import change_of, drop_moved
 
+pytestmark = pytest.mark.site
+
 LAB = {anchor.id: (anchor.x_m, anchor.y_m) for anchor in lab_site().anchors}
 SMALL = {1: (0.0, 0.0), 2: (7.0, 0.0), 3: (6.0, 5.0), 4: (-1.0, 6.0)}
 HALL = {1 + k: (12.0 * (k % 4) + 0.7 * (k % 3), 12.0 * (k // 4) - 0.5 * (k % 2)) for k in range(12)}
@@ -69,6 +71,7 @@ def test_people_who_walk_through_links_and_late_links_are_no_motion():
 
 @pytest.mark.parametrize("places", [LAB, HALL])
 @pytest.mark.parametrize(("seconds", "moved_s"), [(30, 15), (30, 24), (60, 8), (250, 232)])
+@pytest.mark.statistical
 def test_a_moved_anchor_is_named_with_its_distance(places, seconds, moved_s):
     for seed in range(2):
         direction = np.random.default_rng(seed).uniform(0.0, 2.0 * math.pi)

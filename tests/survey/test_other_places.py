@@ -3,11 +3,14 @@
 import re
 
 import numpy as np
+import pytest
 from msgspec.structs import replace
 from random_sites import draw_plant
 
 from skyless.site.survey.facts import Facts, PairRange, PairRanges, Tape
 from skyless.site.survey.solve import run_survey
+
+pytestmark = pytest.mark.site
 
 PLACES = re.compile(
     r"^(?P<case>.+), anchor (?P<anchor>\d+) is not at \((?P<here>[^)]+)\) but (?P<apart>[\d.]+) m away at "

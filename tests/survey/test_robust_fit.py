@@ -15,6 +15,8 @@ from skyless.site.survey.fit.robust import aligned_std_m, find_ambiguities, fit_
 from skyless.site.survey.fit.start import start_positions
 from skyless.site.survey.solve import run_survey
 
+pytestmark = pytest.mark.site
+
 
 def fitted(drawn, pair_std_m=0.03):
     return fit_robustly(drawn.problem, start_positions(drawn.problem, drawn.sketch_m), pair_std_m)

@@ -29,6 +29,8 @@ from skyless.site.survey.result import (
 )
 from skyless.site.survey.surveyed_site import delay_changes_ticks, surveyed_site, surveyed_text, unchanged_anchors
 
+pytestmark = pytest.mark.site
+
 LAB = paper_lab_site(accuracy=AccuracySite())
 
 

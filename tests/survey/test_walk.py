@@ -126,6 +126,7 @@ def test_rows_say_nothing_about_rigid_motion():
     [(LAB_M, True, 0.0, 0.80, None), (ROOM_M, False, 1.2, 0.80, 0.85), (HALL_M, False, 1.2, 0.85, 0.3)],
     ids=["lab", "room", "hall"],
 )
+@pytest.mark.statistical
 def test_a_minute_of_walking(positions_m, planar, height_m, xy, z):
     """A fourth or more off the errors of the ranges alone, and heights of a ceiling where they had none (SURVEY 6)."""
     alone_m, joint_m = [], []
@@ -145,6 +146,7 @@ def test_a_minute_of_walking(positions_m, planar, height_m, xy, z):
         assert after[1] < z * before[1]
 
 
+@pytest.mark.statistical
 def test_the_stated_errors_are_true():
     """Of delays and distances, whose errors are normal: the mean square over the stated variance is 1."""
     squares = []
@@ -191,6 +193,7 @@ def test_a_walk_chooses_between_results_that_the_ranges_cannot_tell_apart():
     ("fault", "words"),
     [("noise", "not used"), ("moved", "not used"), ("short", "10 are needed"), ("no pairs", "10 are needed")],
 )
+@pytest.mark.statistical
 def test_a_walk_that_does_not_fit_is_not_used(fault, words):
     rng = np.random.default_rng(4)
     problem, delay_m = problem_of(rng, ROOM_M, planar=False)
@@ -289,6 +292,7 @@ def flight_of(folder, trial):
     return collector.epochs()
 
 
+@pytest.mark.statistical
 def test_flights_mend_the_heights_of_a_room(recordings):
     """Ranges of the surveyed positions with errors of 5.5 cm, as pairs of these radios have, and 0.3 m of start error.
 

@@ -5,6 +5,8 @@ import pytest
 
 from skyless.site.survey.estimate import Differences, estimate
 
+pytestmark = pytest.mark.site
+
 ANCHORS_M = np.array([[x, y, z] for x, y in ((-3, -4), (3, -4), (3, 4), (-3, 4)) for z in (0.2, 2.7)])
 BIAS_M = np.array([-0.08, 0.33, 0.19, -0.15, -0.24, 0.07, 0.06, -0.18])
 
@@ -54,6 +56,7 @@ def test_the_error_is_that_of_least_squares_on_clean_data():
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(expected_m / np.sqrt(0.95), rel=0.15)
 
 
+@pytest.mark.statistical
 def test_errors_that_last_widen_the_standard_errors():
     """A reflection that stays for five seconds is one error and not five hundred."""
     rng = np.random.default_rng(5)

@@ -25,6 +25,8 @@ from skyless.sim.world import World
 from skyless.site.survey.facts import Facts
 from skyless.site.survey.solve import run_survey
 
+pytestmark = pytest.mark.site
+
 HEIGHT_M = 0.0
 WAY = [(1.0, 1.0, HEIGHT_M), (5.0, 7.0, HEIGHT_M), (5.0, 1.0, HEIGHT_M), (1.0, 7.0, HEIGHT_M), (3.0, 4.0, HEIGHT_M)]
 RNG = np.random.default_rng(1)
@@ -61,6 +63,7 @@ def rms_m(survey):
     return np.sqrt((((found_m @ (u @ vt)) - true_m) ** 2).sum(axis=1).mean())
 
 
+@pytest.mark.statistical
 def test_a_walk_separates_delays_from_positions_where_the_anchors_are_on_two_lines(walk):
     """The lab's ranges alone cannot (SURVEY.md 2): its left side is as well wider, with other delays."""
     ranges = ranges_of(walk).ranges

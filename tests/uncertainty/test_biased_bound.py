@@ -17,6 +17,8 @@ from skyless.research.uncertainty.bounds import (
     tracking_bound,
 )
 
+pytestmark = pytest.mark.site
+
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
 RAISED = LAB + np.column_stack([np.zeros((6, 2)), [0.5, 2.5] * 3])
 SLOT_S = 2.5e-3

@@ -81,6 +81,7 @@ def snapshot_bound(place, *, superframes=2, mesh=False):
 
 
 @pytest.mark.parametrize(("stamp_s", "walk", "qa", "without", "with_mesh", "paths"), TABLE)
+@pytest.mark.statistical
 def test_the_published_bounds_of_the_lab(stamp_s, walk, qa, without, with_mesh, paths):
     for mesh, expected in ((False, without), (True, with_mesh)):
         found = lab_tracking_bound_m(stamp_s, random_walk_fm=walk, qa=qa, mesh=mesh, paths=paths)

@@ -53,6 +53,7 @@ def test_its_shapes_are_checked():
         received_bound(LAB_M, PATH_M[:12], settings(True), known(6, 0.0, 0.0, True))
 
 
+@pytest.mark.statistical
 def test_the_limits_of_the_study_lie_below_the_bound():
     """With mesh 1.40 and 3.26 at tags, 1.46 and 3.9 everywhere; limits are 1.3 and 2.5."""
     plan = Plan(seed=1, worlds=4)
@@ -73,6 +74,7 @@ def test_sendings_in_turn_are_the_superframe():
     np.testing.assert_allclose(again, plain, rtol=1e-9)
 
 
+@pytest.mark.statistical
 def test_sendings_in_any_order_are_those_of_another_numbering():
     """The first anchor, against which clocks are counted, is nothing special."""
     order = np.array([3, 1, 4, 0, 5, 2])

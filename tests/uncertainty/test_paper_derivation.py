@@ -18,6 +18,8 @@ from skyless.core.protocol1.snapshots import (
 from skyless.research.uncertainty import chain
 from skyless.research.uncertainty.chain import CORRECTED, PRINTED, Chain
 
+pytestmark = pytest.mark.site
+
 POSITIVE = [
     "master_rate",
     "tag_rate",
@@ -128,6 +130,7 @@ def equal(a, b):
 
 
 @pytest.mark.parametrize("name", QUANTITIES)
+@pytest.mark.statistical
 def test_the_corrected_variances_are_those_of_the_algorithm(gradients, name):
     assert equal(covariance(gradients[name], gradients[name]), getattr(CORRECTED, name)(CHAIN))
 
@@ -187,6 +190,7 @@ def test_what_is_wrong_in_the_printed_variances():
 
 
 @pytest.mark.parametrize("packet", [M1, M2])
+@pytest.mark.statistical
 def test_a_reference_among_the_sync_packets_takes_the_master_out(packet):
     """Then neither its noise nor the rate error is left, and the spacing D does not matter (MATHS section 2)."""
     c = CHAIN
@@ -199,6 +203,7 @@ def test_a_reference_among_the_sync_packets_takes_the_master_out(packet):
 
 
 @pytest.mark.parametrize(("packet", "masters"), [(None, "1 + w1**2 + w2**2"), (M1, "0"), (M2, "0")])
+@pytest.mark.statistical
 def test_what_two_anchors_have_in_common(packet, masters):
     """Two anchors share the master's stamps and the tag's reference stamp; all else is their own."""
     c = CHAIN

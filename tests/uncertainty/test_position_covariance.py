@@ -36,6 +36,7 @@ def test_it_is_what_the_solver_says_of_its_solution(anchors, height, weighted):
 
 @pytest.mark.parametrize("weighted", [True, False])
 @pytest.mark.parametrize(("anchors", "height"), GEOMETRIES)
+@pytest.mark.statistical
 def test_it_is_the_scatter_of_the_solvers_estimates(anchors, height, weighted):
     """4000 draws of correlated noise: each normalised variance within 5·√(2/4000)."""
     count, dims = 4000, 3 if height is None else 2

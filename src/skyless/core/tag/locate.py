@@ -254,6 +254,8 @@ def chi2_limit(dof: int, tail: float) -> float:
 
     Without degrees of freedom residuals are zero unless nothing fits at all, and the limit of one serves.
     """
+    if tail <= 0.0:
+        return math.inf
     low, high = 0.0, 1.0
     while _chi2_tail(dof, high) > tail:
         low, high = high, 2.0 * high
