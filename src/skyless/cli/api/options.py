@@ -187,9 +187,8 @@ class _Studied(ComputedOptions, frozen=True):
     """efficiency: RMSE over the Cramér–Rao bound. loss: lost messages. nlos: late ones. motion: speed and turns.
     sync: masters that die, superframes, crystals. integrity: protection levels with a faulty anchor.
     room: the errors of real rooms, and what goes wrong in them. large: 1,024 anchors without a master.
-    claims: whose counter leads protocol 2. survey: anchors that survey themselves. survey-room: tags in rooms
-    whose site files a survey wrote. watch: anchors that have moved. sitetime: one timeline over many hops.
-    scale: numbers of tags and anchors."""
+    survey: anchors that survey themselves. survey-room: tags in rooms whose site files a survey wrote.
+    watch: anchors that have moved. scale: numbers of tags and anchors."""
 
 
 class StudyOptions(_Studied, frozen=True, kw_only=True):

@@ -328,15 +328,15 @@ class LeaderTracker:
     def __init__(self) -> None:
         self.leader: int | None = None
         self.changes_s: deque[float] = deque(maxlen=_MAX_CHANGES)  # times of the changes, the newest last
-        self._claims: dict[int, tuple[float, int]] = {}  # by anchor that leads: when it last said so, and its term
+        self._masters: dict[int, tuple[float, int]] = {}  # by anchor: when it last said so, and its term
 
     def update(self, health: AnchorHealth, time_s: float) -> int | None:
         """Process a health message. Returns the new leader if the leader has changed."""
         if health.role == "master":
-            self._claims[health.anchor] = time_s, health.term or 0
+            self._masters[health.anchor] = time_s, health.term or 0
         else:
-            self._claims.pop(health.anchor, None)
-        fresh = {a: term for a, (seen_s, term) in self._claims.items() if abs(time_s - seen_s) <= _LEADER_AGE_S}
+            self._masters.pop(health.anchor, None)
+        fresh = {a: term for a, (seen_s, term) in self._masters.items() if abs(time_s - seen_s) <= _LEADER_AGE_S}
         if not fresh:
             return None
         newest = max(fresh, key=lambda anchor: (fresh[anchor], anchor == self.leader, -anchor))
