@@ -103,7 +103,7 @@ def test_the_master_s_second_frame_ends_the_round_and_tells_when_it_heard_the_re
 @pytest.mark.parametrize(("x_m", "ticks"), [(300.0, round(300.0 / TICK_M)), (310.0, 0)])
 def test_a_flight_that_the_line_has_no_bits_for_is_unknown(x_m, ticks):
     board = Board(1)
-    board.speech._almanac._anchors_m = {1: (0.0, 0.0, 2.0), 2: (x_m, 0.0, 2.0)}
+    board.speech._almanac.anchors_m = {1: (0.0, 0.0, 2.0), 2: (x_m, 0.0, 2.0)}
     board.hear(beacon(1, 9, 1000))
     board.hear(beacon(2, 9, 9000, Heard(1, 7, 8000)))
     *_, info = board.said()
