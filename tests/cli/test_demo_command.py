@@ -250,7 +250,7 @@ def test_on_a_terminal_the_picture_is_drawn_again_and_again_until_ctrl_c(tmp_pat
     try:
         while data := os.read(terminal, 65536):
             written += data
-            if not pressed and written.count(b"synchronisation") >= 6:
+            if not pressed and written.count(b"anchors") >= 8:
                 pressed = True
                 os.write(terminal, b"\x03")
     except OSError:  # the program has gone
