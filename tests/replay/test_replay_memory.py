@@ -40,4 +40,5 @@ def test_ten_times_the_recording_takes_the_same_memory(tmp_path, name):
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     _, short, long = map(int, done.stderr.split())
     samples = min(9 * ROWS[name], 2**17) * (7 + 3 + 1 + 1) * 8 / 1024
-    assert long - short < 2 * samples + 4_000, (short, long)  # they are copied to be halved and to be sorted
+    # Three times: the store, the copy that ``rows`` gives of it, and the one that a percentile sorts.
+    assert long - short < 3 * samples + 4_000, (short, long)
