@@ -271,6 +271,7 @@ def test_no_command_stands_outside_a_shell_block(page):
     assert not re.findall(r"^ {4}(?:skyless|scripts|python|sudo|docker) .*", prose, re.MULTILINE)
 
 
+@pytest.mark.site
 def test_the_example_runs(capsys):
     (example,) = blocks(README, "python")
     exec(compile(example, str(README), "exec"), {})

@@ -13,6 +13,8 @@ from skyless.research.bench.runs import (
     packets_of,
 )
 
+pytestmark = pytest.mark.site
+
 
 @pytest.mark.parametrize("mesh", [False, True])
 def test_plain_numpy_is_the_estimator_but_for_its_first_packets(mesh):

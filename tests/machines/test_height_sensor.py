@@ -8,6 +8,8 @@ from skyless.core.any_receiver import AnyReceiver
 from skyless.core.fix import Fix
 from skyless.core.integrity import Alert
 
+pytestmark = pytest.mark.site
+
 STD_M = 0.03
 
 

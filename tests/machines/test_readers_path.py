@@ -4,9 +4,13 @@ import re
 import sys
 from pathlib import Path
 
+import pytest
+
 import skyless
 from skyless import Request, fleet_of, lab_site
 from skyless.core.air.codec import decode_cached
+
+pytestmark = pytest.mark.site
 
 SOURCE = str(Path(skyless.__file__).parent) + "/"
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "architecture.md").read_text(encoding="utf-8")

@@ -131,6 +131,11 @@ async def running(broker, *links):
         await broker.stop()
 
 
+async def subscribed(link):
+    """Wait until the broker has a link's subscriptions: the link subscribes to its own status among them."""
+    await until(lambda: link.connected and link._has_echo)
+
+
 async def until(condition, limit_s=20.0):
     """Wait for something that should come; a test that waits in vain fails."""
     async with asyncio.timeout(limit_s):

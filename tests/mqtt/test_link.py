@@ -9,7 +9,7 @@ import threading
 
 import msgspec
 import pytest
-from mqtt_brokers import free_port, running, stopped, until
+from mqtt_brokers import free_port, running, stopped, subscribed, until
 
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt import connection
@@ -278,7 +278,7 @@ def test_a_persistent_subscriber_gets_what_came_while_it_was_away_and_the_broker
         tag = tag_link(broker.address)
         async with running(broker, tag):
             crashed = asyncio.ensure_future(inbox.link.run())
-            await until(lambda: inbox.link.connected)
+            await subscribed(inbox.link)
             tag.publish(topic, b"0", qos=1)
             await until(lambda: inbox.messages)
             inbox.link._connection.abort("crash")

@@ -17,6 +17,8 @@ from skyless.cli.nodes import tag as command
 from skyless.cli.nodes.fix_lines import CSV_COLUMNS, FixLines, csv_row, line_for_people
 from skyless.run.mqtt.messages import FixMessage
 
+pytestmark = pytest.mark.site
+
 TAG = ["tag", "one", "--mqtt", "none", "--publish-hz", "1000"]
 
 

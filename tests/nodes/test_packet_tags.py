@@ -14,6 +14,8 @@ from skyless.research.live.packet_tags import PacketTagNode, PacketTags, PacketT
 from skyless.run.mqtt.messages import FixMessage, SiteMessage, TagHealth
 from skyless.run.open_radio import is_simulated, open_sniffers
 
+pytestmark = pytest.mark.site
+
 SETTINGS = PacketTagSettings(hall.ANCHORS_M, site=7, publish_hz=1e5)
 
 

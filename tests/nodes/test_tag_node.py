@@ -17,6 +17,8 @@ from skyless.run.mqtt.messages import FixMessage, SiteMessage, TagHealth
 from skyless.run.tag import Tag, TagNode, TagSettings
 from support.loops import in_loop
 
+pytestmark = pytest.mark.site
+
 HEARD = receptions(6.0)
 
 

@@ -16,6 +16,8 @@ from skyless.research.paper.monte_carlo import (
 )
 from skyless.research.uncertainty.chain import CORRECTED, Chain, Reference, chain_covariance
 
+pytestmark = pytest.mark.site
+
 SHARING = list(Reference)
 
 

@@ -39,6 +39,8 @@ from skyless.site.planning.links import (
 from skyless.site.planning.predict import PlanSettings, Predictor, with_noise
 from skyless.site.planning.snapshot_sigma import delays, phase_covariance
 
+pytestmark = pytest.mark.site
+
 LAB = paper_lab_site(100.0)
 QUIET = replace(LAB, noise=NoiseSite(100.0, 100.0, 1e-15, 1e-15))
 """The lab with crystals so good that only stamps count."""

@@ -22,6 +22,8 @@ from skyless.site.planning.links import range_of, with_range
 from skyless.site.planning.picture import draw_rates
 from skyless.site.planning.rates import RECEIVED_HZ, rate_map, rate_report, tag_rates
 
+pytestmark = pytest.mark.site
+
 SHARP = ChannelModel(sensitivity_width_db=1e-3)
 RATE_HZ = 100.0
 LEFT_OVER = math.exp(-2.0 * air_time_s(MAX_FRAME_BYTES) * RATE_HZ)

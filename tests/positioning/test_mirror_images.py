@@ -67,6 +67,7 @@ def test_the_best_position_on_the_other_side_counts_not_the_image_itself():
     assert not is_open_at(state_of(zigzag_m), np.array([5.0, 3.0]))
 
 
+@pytest.mark.site
 def test_there_is_no_level_on_an_open_side():
     for anchors_m, state in ((LAB_M, SOUND), (LAB_M * (1.0, 0.01, 1.0), UNAVAILABLE)):
         path_m = np.tile((3.0, 2.5, 0.0), (600, 1))

@@ -1,11 +1,14 @@
 """TDoAs of pairs brought against one reference."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.core.tag.locate import Solution, locate
 from skyless.research.masterless.difference_tracking import START_DIFFERENCE_STD_M, joined_tdoas
+
+pytestmark = pytest.mark.site
 
 
 def _tdoas(anchors, p, pairs):

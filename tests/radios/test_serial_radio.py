@@ -58,6 +58,7 @@ def listener_pair():
     return board, ListenerRadio(board.pty.name, 115_200, "tag1")
 
 
+@pytest.mark.site
 def test_fixes_over_a_listener_are_those_of_the_radio_itself_bit_for_bit():
     """Those over the serial link: ``test_three_radios.py``."""
 

@@ -9,6 +9,8 @@ from skyless.core.any_receiver import AnyReceiver
 from skyless.run.mqtt.messages import RawReception, ReceptionsMessage, RequestMessage
 from skyless.run.recordings.reception_log import MAX_PENDING_RECEPTIONS, ReceptionLog, load, raw, receiver_settings
 
+pytestmark = pytest.mark.site
+
 SETTINGS = receiver_settings("joint")
 HEARD = [one.reception for one in tape(LAB, 2.0)]
 

@@ -206,6 +206,7 @@ def test_a_walk_that_does_not_fit_is_not_used(fault, words):
     assert words in joint.sentence
 
 
+@pytest.mark.site
 def test_late_receptions_are_left_out():
     """One anchor in ten is 0.6 m late in a while of the walk."""
     rng = np.random.default_rng(5)
@@ -247,6 +248,7 @@ def test_nothing_received_is_no_epoch():
 
 
 @pytest.mark.parametrize("site", [LAB, ROOM], ids=["lab", "room"])
+@pytest.mark.site
 def test_differences_of_simulated_air_are_free_of_delays_and_clocks(site):
     """Raw stamps of a moving tag with anchors whose delays are 0.2 m off, against geometry; no position is used."""
     rng = np.random.default_rng(7)

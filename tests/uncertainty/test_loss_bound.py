@@ -30,6 +30,7 @@ def known(frames, tags, anchors, mesh, seed=1):
 
 
 @pytest.mark.parametrize("mesh", [False, True])
+@pytest.mark.site
 def test_where_nothing_is_lost_it_is_the_bound_of_all(mesh):
     bound = received_bound(LAB_M, PATH_M, settings(mesh), known(600, 0.0, 0.0, mesh))
     np.testing.assert_allclose(bound[5::6], tracking_bound(LAB_M, PATH_M, settings(mesh)), rtol=1e-9)
@@ -67,6 +68,7 @@ def test_the_limits_of_the_study_lie_below_the_bound():
         assert everywhere < 1.9 * limit
 
 
+@pytest.mark.site
 def test_sendings_in_turn_are_the_superframe():
     plain = received_bound(LAB_M, PATH_M, settings(True), known(600, 0.2, 0.1, True))
     in_turn = Sendings(np.arange(600) % 6, np.arange(600) * 2.5e-3)
