@@ -23,6 +23,8 @@ from emulator.processor.cycles import cost_16, cost_32
 from emulator.processor.lone_board import DELAYS, IDENTITY, LoneBoard
 from emulator.processor.nrf52832 import LED_PINS
 
+pytestmark = pytest.mark.site
+
 pytestmark = [pytest.mark.site, needs_processor]
 
 AWAKE_PIN = 15

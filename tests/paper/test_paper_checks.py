@@ -8,6 +8,8 @@ import pytest
 from skyless.research.paper.checks import CHECKED_ANCHORS, NOISES, QUANTITY_NAMES, paper_chain, paper_checks
 from skyless.research.paper.distributions import lambda_distributions
 
+pytestmark = pytest.mark.site
+
 DRAWS = 2_000_000
 PRINTED_PCT = {
     "beta": (0.0, 0.25),

@@ -27,6 +27,8 @@ from skyless.site.planning.optimise import (
 from skyless.site.planning.predict import PlanSettings, Predictor
 from skyless.site.planning.report import plan_warnings
 
+pytestmark = pytest.mark.site
+
 FILE = Path("site.toml")
 BRACKETED = PlanSettings("bracketed")
 

@@ -29,6 +29,8 @@ from skyless.sim.trajectory import Static
 from skyless.site.channel import ChannelModel
 from support.cell_medium import cell_world
 
+pytestmark = pytest.mark.site
+
 RULES = rules_of(ChannelModel(), 0.0, 0.0, 1)
 AFTER_TICKS = 1.0e7
 LENGTH_S = (PREAMBLE_TICKS + AFTER_TICKS) * TICK_S

@@ -20,6 +20,8 @@ from skyless.sim.range_errors import RangeErrorModel
 from skyless.sim.trajectory import Roaming, Static, Waypoints
 from skyless.site.channel import ChannelModel
 
+pytestmark = pytest.mark.site
+
 POSITIONS_M = np.array([(15.0 * x, 15.0 * y, 3.0) for y in range(20) for x in range(20)])
 QUIET = OscillatorModel(offset_ppm=0.0, white_fm=0.0, random_walk_fm=0.0)
 ROOM = Impairments(range_errors=RangeErrorModel(0.05, 0.1, 0.02, correlation_m=1.0))
