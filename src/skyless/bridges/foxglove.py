@@ -45,7 +45,7 @@ _MESSAGE_DATA: Final = Format("<BIQ")
 _LAST_NS: Final = 2**64 - 1
 
 _MAX_IDS: Final = 1000
-"""Of one request."""
+"""Largest number of channels in one request."""
 
 Identifier = Annotated[int, Meta(ge=0, le=0xFFFFFFFF)]
 
@@ -241,7 +241,7 @@ class FoxgloveTarget(Target):
         self._site: BridgedSite | None = None
         self._channels: dict[int, Channel] = {}
         self._numbers: dict[str, int] = {}
-        """Of channels, by topic."""
+        """Numbers of channels, by topic."""
         self._sessions: set[Session] = set()
 
     def on_site(self, site: BridgedSite) -> None:
@@ -367,5 +367,5 @@ class FoxgloveTarget(Target):
 
 
 def make_target(url: TargetUrl, _context: BridgeContext) -> FoxgloveTarget:
-    """Of ``foxglove://HOST:PORT``."""
+    """The target of ``foxglove://HOST:PORT``."""
     return FoxgloveTarget(url.text, url.host(), url.port(_PORT))

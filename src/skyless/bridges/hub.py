@@ -41,7 +41,7 @@ class Route(Struct):
     """The only tag; None for all, or for the first where the target carries one."""
     hz: float
     rates: dict[str, RateLimit] = {}
-    """Of each tag."""
+    """Rate limit of each tag."""
     others: bool = False
     """Whether it needs no line that there are more tags than the target carries: there was one, or the user chose."""
     refused: str = ""

@@ -41,7 +41,7 @@ _HEADER_BYTES: Final = 12
 MAX_PACKET_BYTES: Final = 1472
 """A packet with its UDP and IP headers fits an Ethernet frame."""
 MAX_PACKETS: Final = 255
-"""Of one frame; a byte counts them."""
+"""Packets of one frame; a byte counts them."""
 MAX_TRACKERS: Final = 0xFFFF
 
 _LAST_NUMBER: Final = re.compile(r"(\d{1,5})$")
@@ -55,7 +55,7 @@ class Tracker(Struct):
     """None while there is no fix."""
     velocity_mps: Vector | None = None
     unix_s: float = 0.0
-    """Of the fix."""
+    """Time of the fix."""
 
 
 class PsnFrames:

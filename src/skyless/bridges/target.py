@@ -215,7 +215,7 @@ class TargetUrl:
         return self._netloc
 
     def path(self) -> str:
-        """Of a port or a link; empty where there is none."""
+        """Path of a port or a link; empty if there is none."""
         self._parts.add(_PATH)
         return self._path
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _Metres = Annotated[float, number(above=0.0, most=10_000.0)]
 _RoomMetres = Annotated[float, number(least=0.1, most=10_000.0)]
-"""Of a room's side, along whose walls even 255 anchors stand apart."""
+"""Length of a room's side, long enough for 255 anchors along the walls."""
 _GRID_HEIGHT_M: Final = 4.0
 _TAGS_BELOW_A_GRID_M: Final = 1.2
 _PAPER_SLOT_S: Final = 2.5e-3

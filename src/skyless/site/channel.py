@@ -59,9 +59,9 @@ class ChannelModel(Struct, frozen=True, forbid_unknown_fields=True):
     power_bias: bool = False
     """Whether RX stamps carry the power-dependent bias (APS011, 500 MHz, PRF 64 MHz)."""
     power_noise_db: float = 0.5
-    """Of the reported powers (assumed)."""
+    """Noise of the reported powers (assumed)."""
     carrier_noise_ppm: float = 0.03
-    """Of the reported carrier offset (assumed: the resolution of RX_TTCKO)."""
+    """Noise of the reported carrier offset (assumed: the resolution of RX_TTCKO)."""
 
 
 CHANNEL_RECORD: Final = np.dtype([(field.name, np.float64) for field in structs.fields(ChannelModel)])

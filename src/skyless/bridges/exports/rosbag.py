@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 BagVersion = Literal[8, 9]
-"""Of the folder's metadata: 8 for Humble and Iron, 9 from Jazzy on."""
+"""Version of the folder's metadata: 8 for Humble and Iron, 9 from Jazzy on."""
 
 _KINDS: Final = {"site", "fix", "health", "truth"}
 _KEPT: Final = 10

@@ -80,7 +80,7 @@ class MavlinkEncoder(Encoder):
         self._armed = False
         self._log = log
         self._logged: set[str] = set()
-        """Of what it has logged already."""
+        """What it has logged already."""
         self._silent_s = 0
         """Seconds since the vehicle's last message."""
         self._vehicle_origin: GpsGlobalOrigin | None = None

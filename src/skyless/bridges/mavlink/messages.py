@@ -20,7 +20,7 @@ HEADER_BYTES_2: Final = 10
 CHECK_BYTES: Final = 2
 SIGNATURE_BYTES: Final = 13
 IS_SIGNED: Final = 0x01
-"""Of the incompatible flags, the only one that is defined: a signature stands after the check."""
+"""The only incompatible flag that is defined: a signature follows the checksum."""
 
 
 def _crc_table() -> tuple[int, ...]:
@@ -48,7 +48,7 @@ class Frame(Struct, frozen=True):
     """A received frame whose check is right."""
 
     number: int
-    """Of the message."""
+    """Number of the message."""
     system: int
     component: int
     payload: bytes
@@ -99,7 +99,7 @@ class FrameReader:
         return bool(self._buffer)
 
     def _length(self) -> int | None:
-        """Of the frame at the start; None while too little of it is here."""
+        """Length of the frame at the start; None until enough of it has arrived."""
         if len(self._buffer) < 3:
             return None
         if self._buffer[0] == MAGIC_1:
@@ -135,7 +135,7 @@ NO_AUTOPILOT: Final = 8
 ACTIVE: Final = 4
 """Type, autopilot and state in our heartbeat."""
 ARMED: Final = 0x80
-"""Of a vehicle's ``base_mode``."""
+"""Flag in a vehicle's ``base_mode``."""
 
 LOCAL_NED: Final = 1
 """MAV_FRAME: north, east, down of an origin that rests on the Earth."""
@@ -263,7 +263,7 @@ _LAYOUTS: Final[dict[type[Message], _Layout]] = {
 _READ: Final[tuple[type[Heartbeat | Timesync | GpsGlobalOrigin], ...]] = (Heartbeat, Timesync, GpsGlobalOrigin)
 _READ_BY_NUMBER: Final = {_LAYOUTS[kind].number: kind for kind in _READ}
 CRC_EXTRAS: Final = {_LAYOUTS[kind].number: _LAYOUTS[kind].crc_extra for kind in _READ}
-"""Of the messages that are read here."""
+"""CRC_EXTRA of the messages that are read here, by number."""
 
 
 def encoded(message: Message, *, sequence: int, system: int, component: int) -> bytes:

@@ -36,7 +36,7 @@ UNKNOWN_ANGLE_RAD2: Final = pi**2
 """Variance of an angle of which nothing is known, for ArduPilot, which does not check for NaN."""
 UNKNOWN_HEIGHT_STD_M: Final = 100.0
 UNKNOWN_CLIMB_STD_MPS: Final = 100.0
-"""Of a height that is the site's assumption (``height_known``) and no measurement, and of its change."""
+"""Standard deviations of a height that the site assumes (``height_known``) without measuring it, and of its change."""
 
 IGNORE_HDOP: Final = 2
 IGNORE_VDOP: Final = 4
@@ -170,7 +170,7 @@ def gps_time(unix_s: float) -> tuple[int, int]:
 
 
 def _dilution(value: float | None) -> float:
-    """Of a GPS receiver; 0 where it is not known."""
+    """Dilution of precision as a GPS receiver states it; 0 if it is not known."""
     return value if value is not None and isfinite(value) else 0.0
 
 

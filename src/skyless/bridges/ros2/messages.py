@@ -27,7 +27,7 @@ FRAME_RULE: Final = "a frame's name: letters, digits, _, - and /, not a / first"
 """In words, for messages."""
 
 UNKNOWN_VARIANCE: Final = 1e6
-"""Of an angle in rad² and of its rate: a tag does not know how it is turned."""
+"""Variance of each angle [rad²] and of its rate: a tag does not know its orientation."""
 
 _NO_TURN: Final = (0.0, 0.0, 0.0, 1.0)
 _ANGLES: Final = 3

@@ -41,7 +41,7 @@ class ReplayResult(Result, frozen=True, eq=False):
     fixes: Fixes
     """All fixes; ``truth_m`` is NaN where it is not known."""
     tracks: dict[str, Matrix]
-    """Of each tag rows of time, position and true position, shape (k, 7): an even sample, which is what is drawn."""
+    """Time, position and true position of each tag, shape (k, 7): an even sample, for drawing."""
     warnings: tuple[str, ...]
     height_note: str
     """Where the tags' height is from."""

@@ -65,7 +65,7 @@ class SurveyResult(Result, frozen=True, eq=False):
     """What could not be used of the recording, by reason."""
     site: Site | None
     file: Path | None
-    """Of the site, where it is from one."""
+    """The site's file, if it comes from one."""
     ranges: PairRanges
     """What was measured, with the antenna delays of the site."""
 

@@ -13,7 +13,7 @@ from skyless.site.survey.result import Survey, SurveyedAnchor
 
 _SIGMAS: Final = 3.0
 _SMALLEST_SHARE: Final = 0.01
-"""Of the picture's size that the median ellipse should have at least: it is magnified by 10, 100 … for that."""
+"""Least size of the median ellipse, as a share of the picture: ellipses are magnified by 10, 100 … for it."""
 
 
 def survey_figure(survey: Survey) -> Figure:

@@ -242,7 +242,7 @@ class _Tag:
         self.begin(now_s)
         self.unix_s = float("-inf")  # of the last fix
         self.delay_s, self.delay_seen_s = 0.0, float("-inf")
-        """Of the last health message, where this computer sent it, and when it arrived."""
+        """Delay of the last health message, if this computer sent it, and when that message arrived."""
         self.least_age_s: float | None = None  # of the fixes since the last ``least_ages_s``
         self.made_s = 0.0  # its part until the fix was made
 

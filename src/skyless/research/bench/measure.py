@@ -31,7 +31,7 @@ _WARM_S: Final = 2.0
 """A receiver has its almanac and its first fix by then."""
 _TAGS: Final = (1, 100, 10_000)
 _CHUNK_SUPERFRAMES: Final = 10
-"""Of each tag in a call."""
+"""Superframes of each tag in one call."""
 _CHUNKS: Final = 64
 
 Tag = Callable[[int], None]
@@ -59,7 +59,7 @@ class KernelSpeed(Struct, frozen=True):
     """To plain NumPy."""
     numpy_messages_per_s: float
     loop_messages_per_s: float
-    """Of a plain Numba loop of 18 states with a sync update."""
+    """Messages per second of a plain Numba loop of 18 states with a sync update."""
     loop_ratio: float
     filterpy_messages_per_s: float | None = None
     """Measured for ``joint`` only."""

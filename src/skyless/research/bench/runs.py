@@ -25,7 +25,7 @@ BENCH_ANCHORS_M: Final = np.column_stack(
 )
 _RANGE_ERRORS: Final = ("survey_std_m", "range_std_m", "slope_std_m", "place_std_m")
 START_VARIANCES: Final = (0.09, 0.16)
-"""Of a position and of a speed."""
+"""Variances of a position and of a speed at the start."""
 
 
 class JointRuns:

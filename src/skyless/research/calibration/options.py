@@ -231,7 +231,7 @@ class SurveyOptions(RecordingOptions, frozen=True, kw_only=True):
     recorded_truth: bool = False
     """Use where a simulated site's recording says its tags were, as --truth."""
     first: Annotated[str | None, Rule(_check_first)] = None
-    """Of a tag at known positions use the beginning only: a number of differences (30), seconds (60s) or a part (50%).
+    """Use only the beginning at known positions: a number of differences (30), seconds (60s) or a part (50%).
     """
     site: Annotated["Site | str | Path | None", Path] = None
     """Site file of the present: its anchors, heights, and rough positions; in Python also a site."""

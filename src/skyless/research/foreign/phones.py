@@ -64,7 +64,7 @@ class _AnchorLocation(Struct, rename="camel"):
 
 
 class _Record(Struct, rename="camel"):
-    """Of either system; which one shows by the key of the message's type."""
+    """A record of either system; the key of the message's type shows which."""
 
     address: int | str
     measurement_type: int | str | None = None

@@ -24,7 +24,7 @@ CHECKED_ANCHORS: Final = 10
 """As many as in the paper's numerical analysis."""
 
 _SIGMAS_S: Final = {"gaussian": TICK_S / 3.0, "uniform": TICK_S / 3.0**0.5}
-"""Of every stamp: "plus/minus 15.65 ps" read as three sigma, or as the half width of the uniform noise."""
+"""Noise of every stamp: "plus/minus 15.65 ps" read as three sigma, or as the half width of the uniform noise."""
 
 _ROWS: Final = {
     "beta": (Quantity.BETA, PRINTED.beta, CORRECTED.beta),

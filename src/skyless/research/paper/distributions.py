@@ -28,7 +28,7 @@ class LambdaDistribution(Struct, frozen=True):
     counts: Integers
     """Shape (bins,)."""
     std_m: float
-    """Of the draws."""
+    """Standard deviation of the draws."""
     corrected_std_m: float
     printed_std_m: float | None
     draws: int

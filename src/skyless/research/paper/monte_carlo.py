@@ -41,9 +41,9 @@ _BATCH_DRAWS: Final = 256
 """Draws whose noise is made at a time: it stays in the processor's cache."""
 
 _SHARED_NOISES: Final = 4
-"""Of a draw: the master's two synchronisation messages, its reference message, the tag's reception of that."""
+"""Noises of a draw: the master's two synchronisation messages, its reference message, the tag's reception of it."""
 _ANCHOR_NOISES: Final = 6
-"""Of each anchor in a draw: its two receptions, its two transmissions, the tag's receptions of these."""
+"""Noises of each anchor in a draw: its two receptions, its two transmissions, the tag's receptions of these."""
 
 
 class Quantity(IntEnum):
@@ -239,7 +239,7 @@ class ChainMoments(Struct, frozen=True):
     epsilon_covariance_s2: Array
     """E[ε(t_i)·ε(t_i + Δ_i)], shape (n,)."""
     lambda_covariance_m2: Array
-    """Of the TDoAs of all anchors, shape (n, n)."""
+    """Covariance of the TDoAs of all anchors, shape (n, n)."""
 
     @property
     def std(self) -> Array:
@@ -315,7 +315,7 @@ class _Merge:
 
 
 class _Sums(NamedTuple):
-    """Of the draws of a chunk, as ``add_draws`` makes them."""
+    """Sums over the draws of a chunk, as ``add_draws`` makes them."""
 
     draws: int
     powers: Array

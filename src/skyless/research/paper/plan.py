@@ -88,7 +88,7 @@ class Panel(Struct, frozen=True):
     """One picture."""
 
     name: str
-    """Of its files, without ending."""
+    """Name of its files, without the ending."""
     caption: str
     figure: Figure
 

@@ -44,7 +44,7 @@ class PairNoise(Struct, frozen=True):
     anchor_b: int
     count: int
     median_m: float
-    """Of the difference, or of its error where the truth is known."""
+    """Median of the difference, or of its error where the truth is known."""
     noise_m: float
     """1.4826 times the median absolute deviation, a standard deviation that outliers do not touch."""
     against_truth: bool
@@ -95,7 +95,7 @@ Triple = tuple[float, float, float]
 
 _SAMPLED: Final = 128
 _SAMPLED_OF: Final = 1024
-"""Of each 1024 packets the first 128 are made into time differences as well, to measure the recording's noise."""
+"""The first 128 of each 1024 packets are made into time differences as well, to measure the recording's noise."""
 
 
 class ByPairs:

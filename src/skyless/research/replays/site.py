@@ -191,7 +191,7 @@ class TagReplay:
         self._asked = method
         self._receiver: AnyReceiver | None = None
         self._serial: int | None = None
-        """Of the last fix; None where it cannot be known, as the receiver did not go on where the tag's was."""
+        """Serial of the last fix; None if the receiver did not continue where the tag's was."""
         self._restored = False
         self._segment = ""
         self._next = 0

@@ -27,7 +27,7 @@ _START_STD_M: Final = 0.3
 """Error of the filter's start, per axis; after two seconds nothing of it is left."""
 
 _CHUNK_EPISODES: Final = 50
-"""Of a cell."""
+"""Episodes in a chunk of a cell."""
 
 _EPISODE_COST_S: Final = 0.02
 """About what an episode and its bounds take."""
@@ -60,9 +60,9 @@ class Efficiency(Struct, frozen=True):
     said_m: float
     """Predicted by the filter's covariance."""
     bound_m: float
-    """Of all receptions that the anchors have made."""
+    """Bound given all receptions that the anchors have made."""
     arrived_bound_m: float
-    """Of those that the tag knew of; the bound of any receiver."""
+    """Bound given the receptions that the tag knew of, which no receiver can beat."""
     nees: float
     """Mean normalised error squared after the last superframe, 2 for a consistent filter."""
     nees_interval: tuple[float, float]

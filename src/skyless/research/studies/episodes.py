@@ -18,7 +18,7 @@ from skyless.core.kernels.arrays import Array, Integers
 EPISODE_SUPERFRAMES: Final = 134
 """Two seconds, after which nothing of what was known before the first frame is left."""
 EPISODE_SPEED_STD_MPS: Final = 0.4
-"""Of each component of a tag's velocity at the start."""
+"""Standard deviation of each component of a tag's velocity at the start."""
 WHITE_FM: Final = 2e-11
 
 _CRYSTALS_PPM: Final = 10.0
@@ -30,7 +30,7 @@ class Case(Struct, frozen=True):
     """What all episodes of a study's case have in common."""
 
     noise_ps: float = 100.0
-    """Of a stamp, TX and RX alike."""
+    """Noise of a stamp, TX and RX alike."""
     random_walk_fm: float = 1e-9
     qa: float = 0.5
     mesh: bool = False

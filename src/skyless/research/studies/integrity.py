@@ -178,11 +178,11 @@ class Chunk(Struct, frozen=True):
     """Results of the episodes of a chunk."""
 
     counts: Array
-    """Of each episode the fixes, those with a level, misleading ones (horizontal, vertical), shape (episodes, 4)."""
+    """Fixes of each episode, fixes with a level, misleading ones (horizontal, vertical), shape (episodes, 4)."""
     squared_m2: float
     """Sum of the squared horizontal errors."""
     medians_m: tuple[float, float] | None
-    """Of both levels; None where no fix has one."""
+    """Medians of both levels; None where no fix has one."""
     top: Array
     """The largest horizontal errors over their levels."""
     errors_m: Array

@@ -45,7 +45,7 @@ _LEG_M: Final = (40.0, 100.0)
 """From point to point; tags that drive go farther."""
 
 _POINTS: Final = 40
-"""Of a path, after which a tag comes back to the first."""
+"""Points of a path, after which a tag comes back to the first."""
 
 _CORNER_S: Final = 2.0
 _SETTLED_S: Final = 2.0
@@ -53,7 +53,7 @@ _SETTLED_S: Final = 2.0
 
 _SPAN_S: Final = 0.5
 _ROAM_STD_M: Final = 6.0
-"""Of tags whose motion is that which the bound assumes, along each axis."""
+"""Standard deviation per axis of the positions of tags that move as the bound assumes."""
 
 _BOUND_S: Final = 12.0
 _ROOM: Final = Room()

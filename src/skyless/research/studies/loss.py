@@ -44,11 +44,11 @@ def _name(share: float, kind: str) -> str:
 _BOUND_S: Final = 9.0
 _BOUND_FROM_S: Final = 3.0
 _BOUND_EPISODES: Final = 24
-"""Of the bound: how long tags move, from when on it counts, and the number of tags."""
+"""Episodes from which the bound is computed."""
 
 _SPEED_STD_MPS: Final = 1.0
 _BOUND_KEY: Final = 17
-"""Of the stream of random numbers that decides what is lost."""
+"""Key of the stream of random numbers that decides what is lost."""
 
 
 def rows(plan: Plan, results: Sequence[Any]) -> Sequence[Row]:

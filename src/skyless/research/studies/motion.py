@@ -24,7 +24,10 @@ _LEG_S: Final = (2.4, 2.8)
 """Time from corner to corner; at 3 m/s² a right angle at 5 m/s takes 2.36 s."""
 
 _LAP_SHARE: Final = (0.86, 1.0)
-"""Of the box; in the lab's a right angle at 3 m/s takes 4.2 m of a leg with 3 m/s², and the shortest has 4.3 m."""
+"""Shares of the box that laps take.
+
+In the lab, a right angle at 3 m/s takes 4.2 m of a leg with 3 m/s², and the shortest leg has 4.3 m.
+"""
 
 
 def cases(plan: Plan) -> list[Case]:

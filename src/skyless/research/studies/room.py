@@ -47,7 +47,7 @@ _BOUND_RATIO: Final = 1.15
 """Over the Cramér–Rao bound, at most, in the room itself."""
 
 _LATER_RATIO: Final = 1.2
-"""Of the RMSE of tags that have lain still for long to that at first, at most."""
+"""Largest ratio of the RMSE of tags after a long rest to their RMSE at first."""
 
 _SHARE: Final = 0.25
 """Worlds of each case but the room itself, of those that the room has."""
@@ -58,10 +58,10 @@ _CHANGING_M: Final = 0.029
 _HALL_M: Final = (12.0, 16.0)
 _ROOM_3D_M: Final = (8.0, 6.0)
 _HEIGHTS_M: Final = (0.2, 3.0)
-"""Of neighbouring anchors in the 3-D room."""
+"""Heights of neighbouring anchors in the 3-D room."""
 _STAIRWELL_M: Final = (4.0, 6.0)
 _STAIRWELL_HEIGHTS_M: Final = (0.2, 3.8, 1.4, 5.0, 0.8, 4.4, 2.0, 5.2)
-"""Of its anchors, one after the other round the walls."""
+"""Heights of its anchors, in their order around the walls."""
 _LINE_M: Final = (10.0, 0.1)
 """Length of the row of anchors along a wall, and by how much every second one stands off it."""
 _BESIDE_M: Final = ((0.5, 1.0), (9.5, 5.0))
@@ -97,10 +97,10 @@ _CREEP_MPS: Final = 0.05
 _CREEPS_S: Final = (5.0, 20.0, 60.0)
 
 _LONG_WORLDS: Final = 2
-"""Of cases whose worlds last for minutes."""
+"""Number of worlds in cases whose worlds last for minutes."""
 _REST_SPANS: Final = 8
 _WALK_SPANS: Final = 4
-"""Of as much time as is judged elsewhere: of tags at rest, with the span judged, and of walks before it."""
+"""Tags at rest: spans of rest, of which the last is judged, and of walking before. A span is what other cases judge."""
 _QUICK_SPANS: Final = 2
 
 TURNS_MPS2: Final = (3.0, 6.0, 10.0, 30.0)
@@ -111,7 +111,7 @@ _STATED_MPS2: Final = 10.0
 _LATE_KEY: Final = 23
 _PATH_KEY: Final = 29
 _CRYSTAL_KEY: Final = 31
-"""Of streams of random numbers, next to the worlds' own."""
+"""Keys of streams of random numbers, next to the worlds' own."""
 
 _BOUND_SPEED_STD_MPS: Final = 1.0
 """Before the first frame; after the second and a half for which nothing is judged nothing of it is left."""
@@ -348,7 +348,7 @@ def warming_anchors(plan: Plan, low_ppm: float, high_ppm: float, tau_s: float, n
 
 
 def _turns(plan: Plan) -> list[Case]:
-    """Of tags whose largest acceleration is not stated, and of some for which it is."""
+    """Cases of tags that turn, with and without a stated largest acceleration."""
     found = []
     for turn, stated in (*((turn, False) for turn in TURNS_MPS2), (_STATED_MPS2, True)):
         name = f"turns of {turn:g} m/s² at {_TURNING_MPS:g} m/s" + (", stated" if stated else "")

@@ -90,7 +90,7 @@ def _errors(pair_std_m: float) -> RoomErrors:
 
 
 def limits_of(group: Group, file: str) -> tuple[Limit, ...]:
-    """Of issue 13: within 1.2 times what surveyed truth gives in the room, 5 % at rest; honest fixes and levels."""
+    """Limits: within 1.2 times what surveyed truth gives in the room, 5 % at rest; honest fixes and levels."""
     if file in {TRUTH, HAND}:
         return ()
     if group.at_rest:

@@ -24,9 +24,9 @@ from skyless.research.surveys.layouts import survey_layouts
 
 _LAYOUTS: Final = ("lab", "room", "hall")
 _EVENTS: Final = 50
-"""Of a world."""
+"""Events in a world."""
 _QUIET_WINDOWS: Final = 1080
-"""Of 10 s, without an event, in a world: three hours."""
+"""Windows of 10 s without an event in a world: three hours."""
 _QUIET_DRIFTS_S: Final = (10.0, 60.0, 600.0)
 _REAL_DRIFT_M: Final = (0.008, 0.025)
 _LIVELY_M: Final = 0.09
@@ -105,7 +105,7 @@ def _cases() -> list[_Case]:
 
 
 def watched_layout(name: str) -> WatchedLayout:
-    """Of ``survey_layouts``."""
+    """A layout of ``survey_layouts``, by name."""
     layout = survey_layouts()[name]
     return WatchedLayout(layout.dimensions, tuple((x, y, z) for x, y, z in layout.position_m.tolist()))
 

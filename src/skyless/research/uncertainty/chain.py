@@ -135,7 +135,7 @@ class Reference(StrEnum):
 
 
 def chain_covariance(chain: Chain, reference: Reference) -> Matrix:
-    """Of the paper's TDoAs (``eq:GPSTDoA``) of n anchors, shape (n, n), first order in the noise.
+    """Covariance of the paper's TDoAs (``eq:GPSTDoA``) of n anchors, shape (n, n), first order in the noise.
 
     The tag's stamp of the reference packet is common to all, and so are the master's stamps: with weights w1 and w2
     those of the synchronisation, and with one that of the reference packet. If that is one of the two, its weights

@@ -46,7 +46,7 @@ SEEDS_VARIABLE: Final = "SKYLESS_CHAIN_SEEDS"
 
 MAX_SERIAL: Final = 0xFFFF
 _MAX_BYTES: Final = 1 << 26
-"""Of any of the files: devices do not end. Ten years take 25 MB."""
+"""Largest size of any of the files, as devices never end. Ten years take 25 MB."""
 
 _CHAIN_FILE: Final = re.compile(r"chain-([1-9]\d{0,4})\.public")
 _MAGIC: Final = b"skyless chain 1\n"

@@ -211,7 +211,7 @@ class AnchorHealth(Struct, frozen=True):
     counters: dict[str, int]
     mqtt: Counters
     mode: Literal["master", "free"] = "master"
-    """Of the site's schedule."""
+    """Mode of the site's schedule."""
     missed_share: float = 0.0
     """Share of its transmissions of the last second that came too late."""
     chain: int | None = None
@@ -379,7 +379,7 @@ class TagZones(Struct, frozen=True):
 
     tag: str
     unix_s: float
-    """Of the fix with which this became so."""
+    """Time of the fix with which this became so."""
     usable: bool
     """Whether the tag has fixes that may be used; without, it is in no zone."""
     zone: str | None = None
@@ -397,7 +397,7 @@ class TagPosition(Struct, frozen=True):
 
     tag: str
     unix_s: float
-    """Of the fix."""
+    """Time of the fix."""
     position_m: Vector
     std_m: float
     """One-sigma radial error, at least 1 cm in each axis."""
@@ -450,7 +450,7 @@ class SurveySaveMessage(Struct, frozen=True):
 
 
 class SurveyProgress(Struct, frozen=True):
-    """Of one pair of anchors."""
+    """Progress of one pair of anchors."""
 
     a: int
     b: int
@@ -464,7 +464,7 @@ class SurveyMessage(Struct, frozen=True):
 
     unix_s: float
     serial: int
-    """Of the result; ``SurveySaveMessage`` names it."""
+    """Number of the result; ``SurveySaveMessage`` names it."""
     anchors: tuple[int, ...]
     """Those that have been received."""
     missing: tuple[int, ...]
@@ -477,7 +477,7 @@ class SurveyMessage(Struct, frozen=True):
     error: str | None = None
     """A sentence: why there is no result, or why the last one could not be saved."""
     saved_serial: int | None = None
-    """Of the result that was saved last, by this run of the program."""
+    """Number of the result that this run of the program saved last."""
     saved_unix_s: float | None = None
     """When that was."""
     file: str | None = None

@@ -68,7 +68,7 @@ class Channel(Struct, frozen=True):
     kind: str
     """``fix``, ``receptions``, ``stamps``, ``status``, ``health``, ``event``, ``site``, ``zones``, ``watch`` ..."""
     name: str = ""
-    """Of the tag, anchor or zone."""
+    """Name of the tag, anchor or zone."""
     payload: type[Struct] | None = None
 
 
@@ -132,7 +132,7 @@ class ChunkIndex(Struct):
     """Where a chunk is in the file, and its index."""
 
     offset: int
-    """Of its content in the file."""
+    """Offset of its content in the file."""
     length: int
     start_ns: int
     end_ns: int
@@ -153,7 +153,7 @@ class McapScan:
         self.attachments: dict[str, tuple[int, int]] = {}
         """Where each one's record lies: offset and length."""
         self.topics: dict[int, str] = {}
-        """Of channels."""
+        """Topics of channels, by number."""
         self.finished = False
         self._next = len(MAGIC)
         try:
@@ -308,7 +308,7 @@ class RecordingSummary(Struct, frozen=True):
     finished: bool
     """False for one that is being written, or was never closed."""
     unread_bytes: int
-    """Of a last chunk that is not whole."""
+    """Bytes of a last chunk that is not whole."""
     tags: tuple[str, ...]
     """Tags with fixes or receptions."""
     raw_tags: tuple[str, ...]

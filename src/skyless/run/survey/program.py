@@ -443,7 +443,7 @@ class SurveyNode:
 
 
 class Precedence:
-    """Of two survey programs at one site the later one waits, else both would save what the page asks for. No I/O."""
+    """Decides which of two survey programs at one site waits, so that only one saves what the page asks for. No I/O."""
 
     def __init__(self, unix_s: float) -> None:
         """``unix_s``: when this program started."""

@@ -39,13 +39,13 @@ class Sides(Struct, frozen=True):
 
 
 CONFIDENCE: Final = Sides("errors smaller than reported: safe side", "errors larger than reported: too confident")
-"""Of squared errors over reported variances, whose limit is 1."""
+"""Sides of the ratio of squared errors to reported variances, whose limit is 1."""
 
 STATED_RISK: Final = Sides("rarer than stated: safe side", "more often than stated: too confident")
-"""Of the share of errors beyond a protection level, whose limit is the stated probability."""
+"""Sides of the share of errors beyond a protection level, whose limit is the stated probability."""
 
 BOUND: Final = Sides("below the bound: by chance alone", "above the bound: information not used", "neither")
-"""Of errors over the smallest possible ones, whose limit is 1."""
+"""Sides of the ratio of errors to the smallest possible ones, whose limit is 1."""
 
 
 def shade_sides(axes: Axes, sides: Sides, limit: float, *, along: Literal["x", "y"]) -> None:

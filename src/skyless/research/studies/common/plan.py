@@ -30,7 +30,7 @@ class Plan(Struct, frozen=True):
     tags: int = 4
     """In each world."""
     episodes: int = 2000
-    """Of a case of the studies ``efficiency`` and ``integrity``."""
+    """Episodes in a case of the studies ``efficiency`` and ``integrity``."""
     integrity_risk: float = RISK
     """Stated probability that a fix's error exceeds its protection level (``integrity``)."""
     alert_limit_m: float | None = None
@@ -46,7 +46,7 @@ _USUAL: Final = {
     "survey-room": Plan(worlds=8, seconds=15.0, tags=8),
     "watch": Plan(worlds=20),
 }
-"""Of studies that do not take the usual amounts; those of ``room`` are the room's own, its other cases have fewer."""
+"""Amounts of studies that need others than the usual ones; ``room`` has fewer in all but its main cases."""
 
 
 def plan_of(
@@ -86,7 +86,7 @@ class Cell(Struct, frozen=True):
     """Work that shares nothing with the other cells: it may run in any process of any machine."""
 
     name: str
-    """Of the case to which it belongs."""
+    """Name of the case to which it belongs."""
     function: Callable[[Any], Any]
     """Defined at the top of a module."""
     argument: Any

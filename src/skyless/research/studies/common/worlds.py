@@ -42,7 +42,7 @@ _OUTSIDE: Final = 0.999
 _SAMPLE_ROWS: Final = 1 << 13
 
 _LOSS_KEY: Final = 3
-"""Of the stream of random numbers, next to those of the simulated world."""
+"""Key of the stream of random numbers, next to the keys of the simulated world."""
 
 
 class Run(Struct, frozen=True):
@@ -68,7 +68,7 @@ class RunResult(Struct, frozen=True):
 
     fixes: int
     superframes: int
-    """Of all tags together, with a fix or without."""
+    """Superframes of all tags together, with or without a fix."""
     squared_m2: float
     """Sum of squared errors; as all of these horizontal where the height is given."""
     variance_m2: float
