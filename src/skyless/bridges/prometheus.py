@@ -37,7 +37,7 @@ _PORT: Final = 9464
 _MAX_CONNECTIONS: Final = 32
 _MAX_REQUEST_BYTES: Final = 8192
 _ANSWER_S: Final = 5.0
-"""A connection is ended after this time, whatever it has sent or read."""
+"""A connection is ended after this time, even in the middle of an answer."""
 
 # What is given as it stands in a message: the metric's name, the message's field, and a line of help.
 

@@ -178,14 +178,14 @@ class UdpSender:
 
 
 class PtySender:
-    """Sends to whatever program opens a pseudo-terminal, by its path or by a link to it."""
+    """Sends to the program that opens a pseudo-terminal, by its path or by a link to it."""
 
     def __init__(self, text: str, link: str, log: Callable[[str], None]) -> None:
         """``link`` is where the user wants it; empty for none."""
         self.dropped: Counter[str] = Counter()
         self._text, self._link, self._log = text, Path(link) if link else None, log
         self._pty: Pty | None = None
-        """While it runs: a link that stayed would lead to whatever terminal the system opens next."""
+        """Exists while it runs: a link left behind would lead to the terminal that the system opens next."""
 
     def send(self, data: bytes) -> None:
         """Write; where nobody reads, this and what nobody has read is dropped."""

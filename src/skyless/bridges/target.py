@@ -63,7 +63,7 @@ def floored(covariance_m2: Matrix) -> Matrix:
 
 
 def require_georeference(site: BridgedSite, target: str) -> GeoreferenceSite:
-    """Where the site is on the Earth, for a target that speaks of nothing else.
+    """Where the site is on the Earth, for a target whose positions are global.
 
     Raises:
         SkylessError: the site does not know it.

@@ -34,7 +34,7 @@ class AccessRules(Struct, frozen=True):
     token: str | None = None
     """What requests must carry, or None where only programs of this machine can reach the server."""
     names: frozenset[str] = frozenset()
-    """Valid host names, in lower case, besides ``localhost``."""
+    """Valid host names, in lower case, in addition to ``localhost``."""
     remote: bool = False
     """Whether other machines can reach the server: then any IP address is a valid host."""
     cookie: str = "skyless"

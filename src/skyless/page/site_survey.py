@@ -34,7 +34,7 @@ class Newest(Generic[_M]):
     """The newest message of a retained topic, and how old it is.
 
     The first after a connection may be old: the broker kept it, and only its own time says how long. The others are
-    new when they arrive, whatever their sender's clock shows.
+    new when they arrive; their sender's clock does not matter.
     """
 
     def __init__(self, kind: type[_M], clock: Callable[[], float], wall_clock: Callable[[], float]) -> None:

@@ -45,7 +45,7 @@ UNHEARD_S: Final = 10.0
 """A tag without a fix for this long is no longer on the map, as in ``page/clock.js``."""
 
 SILENT_S: Final = 3.5
-"""A node that reported once a second and has not for this long is offline, whatever its status says."""
+"""A node that reports once a second and has been silent for this long is offline, even if its status says online."""
 
 
 class PageRequest(Struct, frozen=True):

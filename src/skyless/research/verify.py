@@ -45,7 +45,7 @@ class _Batches:
         return int(sum(sums[0] for sums in self._sums.values()))
 
     def statistics(self, *, about_mean: bool) -> tuple[float, float, float]:
-        """Standard deviation, root mean square, and the relative standard error of the former or of the latter."""
+        """Standard deviation, root mean square, and the relative standard error of either."""
         rows = np.array(list(self._sums.values()))
         total = rows.sum(axis=0)
         mean = total[1:4] / total[0]

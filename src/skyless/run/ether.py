@@ -146,7 +146,7 @@ class Ether:
         self._timer: asyncio.TimerHandle | None = None
         self.stalls = self.overruns = 0
         self._missed = 0
-        """Transmissions whose time had passed when this process came to them."""
+        """Transmissions whose time had passed before this process handled them."""
         self._reported = 0, 0
         """Sent and missed transmissions at the last health message."""
         self.machine = wire.this_machine()
@@ -269,7 +269,7 @@ class Ether:
         if node >= len(self.site.anchors) or len(message.frame) > MAX_FRAME_BYTES:
             raise wire.WireError("a transmission by a tag, or of a frame that is too long")
         self.advance()
-        # a radio starts its frame on multiples of 512, and the antenna's delay, whatever it is set to, comes on top
+        # a radio starts its frame on multiples of 512, and the antenna's true delay comes on top
         leaves_ticks = wrap(message.tx_ticks - session.wrong_ticks[message.node])
         is_planned = node not in self._flying and self.medium.transmit(node, Transmission(message.frame, leaves_ticks))
         if is_planned:

@@ -98,7 +98,7 @@ async def _until_terminated(main: Coroutine[Any, Any, None]) -> None:
 
 
 def ending_signals() -> tuple[signal.Signals, ...]:
-    """Signals besides Ctrl-C that end a program: SIGTERM and, except under ``nohup``, SIGHUP of a closed terminal."""
+    """Signals that end a program like Ctrl-C: SIGTERM and, except under ``nohup``, SIGHUP of a closed terminal."""
     is_ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     return (signal.SIGTERM,) if is_ignored else (signal.SIGTERM, signal.SIGHUP)
 

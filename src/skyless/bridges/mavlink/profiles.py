@@ -160,7 +160,7 @@ def global_origin(origin: GeoreferenceSite, target_system: int, unix_s: float) -
 def gps_time(unix_s: float) -> tuple[int, int]:
     """Week of GPS time and the milliseconds in it; (0, 0) before 1980 or after week 65535.
 
-    Stamps of before 2017, when there were fewer leap seconds, come out late by the difference.
+    Stamps before 2017 come out late, by the leap seconds added since.
     """
     since_ms = (unix_s - GPS_EPOCH_UNIX_S + LEAP_S) * 1e3 if isfinite(unix_s) else -inf
     if not 0.0 <= since_ms < 65536.0 * WEEK_MS:

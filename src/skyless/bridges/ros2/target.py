@@ -101,7 +101,7 @@ class DdsPublisher:
         self._writers: dict[str, Any] = {}
 
     def write(self, message: RosMessage) -> None:
-        """Publish one. Raises whatever DDS raises."""
+        """Publish one. Lets the errors of DDS through."""
         writer = self._writers.get(message.topic)
         if writer is None:
             writer = self._writers[message.topic] = self._writer(message)

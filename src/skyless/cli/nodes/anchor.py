@@ -48,7 +48,7 @@ def anchor(
         chain-N.seed of skyless site keys. Files that change are used without a restart. SKYLESS_CHAIN_SEEDS, as
         "1:HEX 2:HEX", may hold the seeds instead.
     allow_placement
-        With keys: adopt whatever a survey saves, as while a site is set up. Otherwise an anchor with keys adopts
+        With keys: adopt every survey that is saved, as while a site is set up. Otherwise an anchor with keys adopts
         positions and delays up to 0.5 m from those of its site file.
     json
         Write one JSON object at the end: the last health of each anchor.

@@ -46,7 +46,7 @@ MAX_ALERTS: Final = 3
 """Tags named in the line of alerts, so that the tables stay in view."""
 
 ALERT_SHOWN_S: Final = 1.0
-"""How long an alert is shown, be it of one fix: some come and go with each message of a faulty anchor."""
+"""How long an alert is shown, even if only one fix has it: some come and go with each message of a faulty anchor."""
 
 _SENDING_S: Final = 3.0
 """An anchor whose health is not older than this is on the air."""

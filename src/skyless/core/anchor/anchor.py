@@ -179,7 +179,7 @@ def delay_change_ticks(before: Site, after: Site, anchor_id: int) -> int:
     """By how much later an anchor's frames leave than its radio states, if the delays of ``after`` are right.
 
     The radio uses those of ``before``. Only TX and RX delay together can be observed, so a change of the latter counts
-    as one of the former. Raises KeyError where a site has no such anchor.
+    as a change of the TX delay. Raises KeyError if the site has no such anchor.
     """
     old, new = anchor_of(before, anchor_id), anchor_of(after, anchor_id)
     change_ticks = new.tx_antenna_delay_ticks - old.tx_antenna_delay_ticks

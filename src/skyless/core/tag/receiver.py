@@ -176,7 +176,7 @@ class Receiver(BeaconReceiver[Beacon]):
                 self._renew_method()
 
     def _is_kept_apart(self, anchor: int, rx_ticks: int) -> bool:
-        """Whether an anchor states its position of before a move while those in use have moved, or the reverse."""
+        """Whether an anchor states its position before a move while the anchors in use have moved, or the reverse."""
         moved = self._moved_ticks
         if not moved:
             return False

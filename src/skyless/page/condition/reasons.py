@@ -143,9 +143,7 @@ def late_reason(evidence: Evidence, ages: Mapping[str, tuple[float, float]]) -> 
         why = "the broker or the network delivers late"
         advice = "See whether the broker's computer or the network is busy."
         if host not in {"", evidence.host}:
-            advice += (
-                f" Measured against the quickest message from {host} in the last minutes, whatever its clock shows."
-            )
+            advice += f" Measured against the quickest message from {host} in the last minutes, not by its clock."
     text = f"{whose} are {age_s:.1f} s behind: {why}"
     return of_tags("late", "bad" if age_s > VERY_LATE_S else "warning", text, advice, late)
 

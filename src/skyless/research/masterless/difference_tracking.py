@@ -198,7 +198,7 @@ class DifferenceTracking:
         return is_enough and not 0.0 <= pair.time_s - self._tried_s < every_s
 
     def _try_start(self) -> bool:
-        """Look for a start, or for one that confirms or contradicts that which there is; True if the filter begins."""
+        """Look for a start, or for one that confirms or contradicts the present one; True if the filter begins."""
         window, dim = self._window, self._estimator.dim
         self._tried_s = self._newest_s
         start = find_start(window, self._positions_m, self._calibration, self._settings.height_m, self._z_bounds_m)

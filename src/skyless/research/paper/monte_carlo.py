@@ -224,7 +224,7 @@ def noise_batches(seed: int, chunk: int, draws: int, size: int, *, uniform: bool
 
 
 class ChainMoments(Struct, frozen=True):
-    """What draws of a chain came to; rows in the order of ``Quantity``, one column for each anchor.
+    """Results of the draws of a chain; rows in the order of ``Quantity``, one column for each anchor.
 
     Rates are pure numbers, λ is in metres, all else in seconds.
     """

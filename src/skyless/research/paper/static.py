@@ -137,7 +137,7 @@ def moments_of(error_m: Array) -> Moments:
 def judge(noise_only: list[Moments], biased: list[Moments]) -> tuple[Verdict, str]:
     """Whether noise alone leaves no mean and a Gaussian, and biased stamps leave a mean.
 
-    A Gaussian's moments scatter by √(6/n) and √(24/n); what is smaller than a tenth is no matter.
+    A Gaussian's moments scatter by √(6/n) and √(24/n); less than a tenth does not matter.
     """
     gaussian = all(
         abs(axis.skewness) < 0.1 + 4.0 * (6.0 / axis.count) ** 0.5

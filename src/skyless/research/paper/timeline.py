@@ -103,7 +103,7 @@ def phases_of(heard: list[TimedReception]) -> list[Phase]:
 
 
 def judge(tags_with_fixes: int, tags: int, fixes: int, possible: int) -> tuple[Verdict, str]:
-    """Whether every receiver had a fix in every superframe, whatever the others did."""
+    """Whether every receiver had a fix in every superframe, independently of the others."""
     counts = f"{fixes} fixes of {possible} possible, {tags_with_fixes} of {tags} receivers"
     if tags_with_fixes == tags and fixes >= 0.99 * possible:
         return Verdict.HOLDS, (

@@ -363,7 +363,7 @@ SITE_FORMAT: Final = "skyless-mcap"
 
 
 class TagReport(ReplayReport, frozen=True, kw_only=True):
-    """What the replay of one tag came to; times are Unix seconds."""
+    """Result of the replay of one tag; times are Unix seconds."""
 
     tag: str
     identical: Identical | None

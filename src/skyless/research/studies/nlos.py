@@ -12,7 +12,7 @@ from skyless.sim.lab import paper_lab_site
 _MAX_RATIO: Final = 1.3
 _BURST_S: Final = 5.0
 _MIN_S: Final = 3 * _BURST_S
-"""Judged time in which a burst fits wherever the judging begins."""
+"""Judged time, long enough to hold a burst no matter when it begins."""
 
 _NOTHING_LATE: Final = "clean"
 _DIAGNOSTICS: Final = {"diagnostics": True}

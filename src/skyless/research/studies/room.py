@@ -244,7 +244,7 @@ def _errors(plan: Plan) -> list[Case]:
 
 
 def _fields(plan: Plan) -> list[Case]:
-    """Multipath over centimetres besides the room's own errors, at tags that have walked through it for a while."""
+    """Multipath over centimetres, with the room's own errors, at tags that have walked through it for a while."""
     return [
         _case(
             plan,

@@ -208,7 +208,7 @@ def scene(
     walls: Sequence[WallSite] = (),
     zones: Sequence[Zone] = (),
 ) -> bytes:
-    """``foxglove.SceneUpdate`` in the stead of whatever was there before: anchors, walls, outlines of zones."""
+    """``foxglove.SceneUpdate`` that replaces the earlier one: anchors, walls, outlines of zones."""
     entities = [
         *(_anchor(unix_s, number, position_m, number == master) for number, position_m in anchors_m.items()),
         *(_wall(unix_s, number, wall) for number, wall in enumerate(walls)),

@@ -96,7 +96,7 @@ class AnchorKeys:
         except SkylessError as error:
             if str(error) != self._trouble:
                 self._trouble = str(error)
-                self._log(f"keys: the former ones stay in use: {error}")
+                self._log(f"keys: the earlier ones stay in use: {error}")
             return False
         self._trouble = ""
         self._use(keys)

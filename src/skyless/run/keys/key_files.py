@@ -316,5 +316,5 @@ def _read(file: Path, *, is_secret: bool = False) -> bytes:
 
 
 def _open_at_once(path: str, flags: int) -> int:
-    """Without waiting for whoever may write into a pipe of that name."""
+    """Does not wait for a writer if the name belongs to a pipe."""
     return os.open(path, flags | os.O_NONBLOCK)

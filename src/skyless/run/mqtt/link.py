@@ -137,7 +137,7 @@ class Link:
         retain: bool = False,
         until_s: float = math.inf,
     ) -> None:
-        """Hand over a message; returns at once, whatever the broker does. A struct becomes JSON.
+        """Hand over a message; returns at once, even if the broker does not answer. A struct becomes JSON.
 
         One of QoS 0 that cannot be sent before ``until_s``, of the host's monotonic clock, is dropped.
         """

@@ -483,7 +483,7 @@ class SurveyMessage(Struct, frozen=True):
     file: str | None = None
     """The site file that it writes."""
     state: Literal["collecting", "surveyed", "no data"] = "collecting"
-    """``no data``: no stamps have come for 5 s, so that ``survey``, if there is one, is of before."""
+    """``no data``: no stamps have come for 5 s, so that ``survey``, if there is one, is an earlier result."""
     by: str = ""
     """Names this run of the program: two of them at one site notice each other."""
 

@@ -37,7 +37,7 @@ from skyless.run.recordings.recording import (
     decoder_of,
 )
 
-# An MCAP file that is being written: whole after every flush, whatever happens then.
+# An MCAP file that is being written: whole after every flush.
 #
 # Chunks are compressed (zstd) and handed to the system at once; a program that is killed loses what came after the last
 # flush. A full disk ends the recording and is reported once; the file is cut back to its last whole chunk.

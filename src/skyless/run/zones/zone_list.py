@@ -82,7 +82,7 @@ _MAX_CORNERS: Final = 100
 _MAX_CORNER_M: Final = 1e5
 
 MAX_OTHER_SITES: Final = 20
-"""Sites of one number whose zones are kept besides the present one's; those not seen for longest are dropped."""
+"""Other sites of one number whose zones are kept; the ones not seen for longest are dropped."""
 
 _ID = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 _COLOUR = re.compile(r"#[0-9A-Fa-f]{3,8}|[A-Za-z]{1,32}")

@@ -159,7 +159,7 @@ def disturb(
     wanted: tuple[int, int, float, float, float],
     before: tuple[int, float],
 ) -> tuple[int, float]:
-    """What the frames start to stop do to a wanted one at a listener, in whatever order.
+    """What the frames start to stop do to a wanted one at a listener, in any order.
 
     ``listener`` is its index if it is an anchor, else -1, ``point_m`` its position, ``wanted`` the frame's sender,
     emission (whole and fraction), length after its RMARKER and squared distance. ``before`` is the result of other

@@ -144,7 +144,7 @@ class Chip:
         seconds: Callable[[], float],
         sensors: Sensors | None = None,
     ) -> None:
-        """The delays are the true ones between chip and antenna, whatever the host sets."""
+        """The true delays between chip and antenna, which do not depend on what the host sets."""
         self.misuse: Counter[str] = Counter()
         """Violations of the manual by the host."""
         self.arrivals: Counter[str] = Counter()

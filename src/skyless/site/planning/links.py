@@ -150,7 +150,7 @@ def anchor_links(anchors_m: Matrix, master: int, budget: Vector, walls: Matrix) 
 
 
 def masters_by_links(anchors_m: Matrix, budget: Vector, walls: Matrix) -> Integers:
-    """Rows of anchors, best master first: that which all others hear best; equals by distance from the middle."""
+    """Rows of anchors, best master first, which all others hear best; equals by distance from the middle."""
     heard, _ = links(anchors_m, anchors_m, budget, walls)
     total = np.round(np.minimum(heard, 0.99).sum(axis=0), 3)
     middle = np.linalg.norm(anchors_m[:, :2] - anchors_m[:, :2].mean(axis=0), axis=1)

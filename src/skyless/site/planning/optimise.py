@@ -210,7 +210,7 @@ class Optimised(Struct, frozen=True):
     even: Scored
     evaluations: int
     finished: bool
-    """Whether the search came to its end before the time did, or Ctrl-C."""
+    """Whether the search was complete before time ran out or Ctrl-C was pressed."""
     target_met: bool | None
 
 

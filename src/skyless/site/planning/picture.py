@@ -65,7 +65,7 @@ _LAYERS: Final = (
 
 
 class Background(Struct, frozen=True):
-    """What is drawn besides the map."""
+    """What is drawn in addition to the map."""
 
     site: Site
     floor: Floor

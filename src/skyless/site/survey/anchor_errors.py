@@ -116,7 +116,7 @@ def distance_ticks(anchors_m: Mapping[int, Point], a: int, b: int) -> float | No
 
 
 EXCESS_STD_M: Final = 0.1
-"""What is in the excess of a pair besides the delays of its nodes: errors of positions, strong and weak signals."""
+"""Parts of a pair's excess other than its nodes' delays: errors of positions, strong and weak signals."""
 
 ANTENNA_DELAY_STD_M: Final = 0.07
 """How much the delays of nodes of one kind scatter: two of them as much as all else."""

@@ -9,7 +9,7 @@ What goes where (``docs/survey.md``, "What is written"):
 - ``accuracy.range_std_m`` is raised to the constant error of the ranges between anchors, if that is larger: a tag's
   ranges are not better.
 - Where delays change, something of the accuracy does, by 0.1 mm if nothing else: tags see from it that they have to
-  begin again. What they have learned of ranges holds the former delays, and delays are not on the air.
+  begin again. What they have learned of ranges holds the earlier delays, and delays are not on the air.
 """
 
 import math

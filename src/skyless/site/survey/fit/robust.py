@@ -193,7 +193,7 @@ def _best_near(problem: Problem, minima: Minima, pair_std_m: float) -> RobustFit
 def _shown_std_m(fit: RobustFit) -> float:
     """The constant error of a pair that residuals of ranges in use show, if it is more than the fit assumes.
 
-    Few ranges too many can be made to agree by leaving out those that do not, whatever their error: so the search
+    Few ranges too many can be made to agree by leaving out those that do not, even small ones: so the search
     begins with a larger error, and goes on to what the residuals show until both agree.
     """
     least_m, problem = fit.range_std_m, fit.problem
@@ -493,7 +493,7 @@ def regular(information: Array) -> Array:
 
 
 def mirrored(problem: Problem, position_m: Array) -> Array:
-    """Starts with parts reflected in the line (plane) through the two (three) anchors they hang on, shape (b, n, 3).
+    """Starts with parts reflected in the line (plane) through the two (three) anchors that hold them, shape (b, n, 3).
 
     Single anchors are among those of ``relocated``.
     """
@@ -510,7 +510,7 @@ def mirrored(problem: Problem, position_m: Array) -> Array:
 
 
 def _hanging_parts(joined: Mask, dimensions: int) -> list[Mask]:
-    """Pairs of anchors that hang on no more others than there are dimensions; each shape (n,)."""
+    """Pairs of anchors held by no more others than there are dimensions; each shape (n,)."""
     n = len(joined)
     parts = []
     for pair in combinations(range(n), 2):
