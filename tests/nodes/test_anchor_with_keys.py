@@ -119,7 +119,7 @@ async def test_files_that_are_copied_at_the_moment_change_nothing(tmp_path, cloc
         whole = file.read_bytes()
         file.write_bytes(whole[:-9])
         await asyncio.sleep(10.0)
-        said = [line for line in stage.said if line.startswith("keys: the former ones stay in use:")]
+        said = [line for line in stage.said if line.startswith("keys: the earlier ones stay in use:")]
         assert len(said) == 1
         assert "chain-2.public" in said[0]
         assert [chain.serial for chain in stage.anchors._keys.chains] == [1]
