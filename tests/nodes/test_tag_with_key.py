@@ -102,8 +102,8 @@ def test_a_tag_without_a_key_computes_as_before():
     [
         ("no codes", "no-code", "the beacons carry no codes"),
         ("other key", "no-certificate", "no certificate of the site's key was received"),
-        ("ahead", "clock-wrong", "this host's clock is 5.0 s ahead of that of site"),
-        ("behind", "clock-wrong", "this host's clock is 5.0 s behind that of site"),
+        ("ahead", "clock-wrong", "this host's clock is 5.0 s ahead of site"),
+        ("behind", "clock-wrong", "this host's clock is 5.0 s behind site"),
     ],
 )
 @pytest.mark.statistical

@@ -149,7 +149,7 @@ def _warn_of_unknown(report: "ReplayReport") -> None:
     unknown = report.drops.get("unknown-anchor", 0)
     if report.fixes and unknown >= _MANY_UNKNOWN * report.receptions:
         share = f"{unknown} of {report.receptions} receptions ({unknown / report.receptions:.0%})"
-        _warn(f"{share} are of anchors that the table or site file does not have; is it that of this recording?")
+        _warn(f"{share} are of anchors that the table or site file does not have; does it belong to this recording?")
 
 
 def _warn_of_few_members(tag: str, report: "ReplayReport") -> None:

@@ -110,7 +110,7 @@ class SurveyResult(Result, frozen=True, eq=False):
             SkylessError: no file of the site was given.
         """
         if self.site is None or self.file is None:
-            raise SkylessError("--site was no path; it should be that of the site file, which is then corrected")
+            raise SkylessError("--site was no path; it should be the path of the site file, which is then corrected")
         return surveyed_text(self.file.read_bytes().decode("utf-8-sig"), self.survey, self.site, self.file)
 
     def to_dataframe(self) -> "DataFrame":

@@ -36,7 +36,7 @@ class MqttOptions(Options, frozen=True, kw_only=True):
     def address(self) -> "MqttAddress | None":
         """The broker's address; None for ``none``. Raises SkylessError.
 
-        By default it is that of the broker that runs on this machine, which is said in one line; else the usual one.
+        By default the broker that runs on this machine, which is said in one line; else the usual address.
         """
         from skyless.run.broker import running_broker
         from skyless.run.mqtt.address import mqtt_address

@@ -37,7 +37,7 @@ class LiveOptions(Options, frozen=True, kw_only=True):
     radio: str | None = None
     """Radio of a listener, to survey with what it receives instead, as skyless tag --radio; needs --site."""
     radio_name: str = "survey"
-    """Name of that listener on an ether: that of one of its bodies, such as tag1."""
+    """Name of that listener on an ether, one of its tags, such as tag1."""
     site_id: SiteId | None = None
     """Number of the site; by default that of --site, or the one whose programs are online."""
     duration: Positive | None = None

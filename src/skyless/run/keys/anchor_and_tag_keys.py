@@ -57,7 +57,7 @@ _NOT_ACCEPTED: Final = {
 _WITHOUT_CODES: Final = {
     Fault.NO_TIME: "the radio's counter has not been read yet",
     Fault.NO_CHAIN: "no key chain counts now (skyless site keys show)",
-    Fault.CLOCK_WRONG: "this host's clock is not that of the other anchors: set it with chrony or NTP",
+    Fault.CLOCK_WRONG: "this host's clock differs from the other anchors' clocks: set it with chrony or NTP",
 }
 
 _NOT_VERIFIED: Final = {
@@ -276,11 +276,11 @@ class TagReport:
         if error_s is not None and self._clock_s is None:
             side = "ahead of" if error_s > 0.0 else "behind"
             self._log(
-                f"{self._name}: this host's clock is {abs(error_s):.1f} s {side} that of site {self._site}: set it "
+                f"{self._name}: this host's clock is {abs(error_s):.1f} s {side} site {self._site}'s: set it "
                 "with chrony or NTP"
             )
         elif error_s is None and self._clock_s is not None:
-            self._log(f"{self._name}: this host's clock is that of site {self._site} again")
+            self._log(f"{self._name}: this host's clock agrees with site {self._site} again")
         self._clock_s = error_s
 
 

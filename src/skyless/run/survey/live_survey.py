@@ -142,7 +142,7 @@ class LiveSurvey:
         return self._results.get(serial)
 
     def place(self, site: Site, record: SurveyRecord, serial: int, now_s: float, unix_s: float) -> None:
-        """The site is that of a result from now on: ranges begin again, as antenna delays are others."""
+        """Use a result's site from now on. Ranges begin again, as the antenna delays differ."""
         self.site, self.saved_serial, self.saved_unix_s, self.error = site, serial, unix_s, None
         if self.facts.sketch_m:
             sketch = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}

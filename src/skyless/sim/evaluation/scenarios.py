@@ -99,7 +99,7 @@ def stated_room(site: Site, *, slope_m: float, at_rest: bool) -> Room:
 
 
 def room_of(site: Site, seed: int, *, is_named_room: bool, at_rest: bool) -> Room | None:
-    """What is wrong in a simulation: that of the named room, else what the site states; None where that is nothing."""
+    """Errors of a simulation: the named room's, else what the site states; None if there are none."""
     if is_named_room:
         return Room()
     if site.accuracy.is_exact and not any(anchor.std_m for anchor in site.anchors):

@@ -1,6 +1,6 @@
 """Where anchors should hang: the best of several starts, first on a lattice, then by the method's own prediction.
 
-A quick search exchanges anchors on a lattice of mounts. The error that counts there is that of (HᵀWH)⁻¹ with each
+A quick search exchanges anchors on a lattice of mounts. The error that counts there is given by (HᵀWH)⁻¹ with each
 anchor weighted by the share of its frames that arrives: independent of the method. What it finds is judged, and
 improved, by the method's own prediction. The evenly spaced layout is one of the starts, so the result is never worse
 than it. Mean and worst error over the region count alike, relative to that layout's. Same seed, same result, unless

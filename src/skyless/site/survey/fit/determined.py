@@ -80,7 +80,7 @@ def _groups(joined: Mask, active: Mask) -> list[Integers]:
 
 _MAX_STD_M: Final = 0.25
 _MAX_RANGE_STDS: Final = 4.0
-"""Standard deviation per axis above which an anchor is not determined, in metres and in those of a range."""
+"""Standard deviation per axis above which an anchor is not determined, in metres and as a multiple of a range's."""
 
 TOUCHED: Final = 0.3
 """Part of a direction's largest component from which on it touches an anchor."""

@@ -148,7 +148,7 @@ class RangeHistory:
 
 _LASTING: Final = 1e-3  # a finding lasts while what it says has more evidence than chance gives with this probability
 _SLOW_DRIFT: Final = 2.0
-"""Drift of the usual range from the first one, as a multiple of that of one window from the usual range."""
+"""Drift of the usual range from the first one, as a multiple of one window's difference from the usual range."""
 
 _REGULAR: Final = 0.8  # share of windows in which a pair must have had ranges for their absence to be a finding
 _KNOWN_WINDOWS: Final = 12
