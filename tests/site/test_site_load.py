@@ -9,12 +9,13 @@ from hypothesis import strategies as st
 
 from skyless.core.errors import ConfigurationError
 from skyless.core.site import AccuracySite
-from skyless.sim.lab import lab_site
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.file.check import SITE_LIMITS
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template
 
 LAB = site_template(lab_site())
+PAPER = site_template(paper_lab_site())
 HEAD = 'name = "x"\nid = 1\nmaster = 1\n'
 
 
@@ -216,7 +217,8 @@ def test_files_that_are_not_there(tmp_path):
 def test_no_number_takes_what_is_none(refused, key, number):
     """Every numeric key of the template, given a value that is no finite number."""
     name = key.split(".")[-1]
-    text, count = re.subn(rf"^(# )?({name} = )[^ \n]+", rf"\g<2>{number}", LAB, count=1, flags=re.MULTILINE)
+    own = LAB if f"{name} = " in LAB else PAPER
+    text, count = re.subn(rf"^(# )?({name} = )[^ \n]+", rf"\g<2>{number}", own, count=1, flags=re.MULTILINE)
     if key in ("anchors.id", "anchors.slot") or count == 0 or "antenna_delay" in key:
         text = LAB.replace("[[anchors]]\nid = 1", f"[[anchors]]\nid = 1\n{name} = {number}").replace("id = 1\nid", "id")
     error = refused(text)

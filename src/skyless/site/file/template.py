@@ -24,19 +24,10 @@ _HEAD = """\
 
 name = {name}
 id = {id}                          # of the site on the air, 0 to 65533; neighbouring sites need different ones
-{no_master}master = {master}                      # its clock is the site's time; best in the middle, in range of all
-# The room: its corners in order, [x, y] each; for the map, planning and simulation.
+{master}# The room: its corners in order, [x, y] each; for the map, planning and simulation.
 {no_outline}outline_m = {outline}
 
-[schedule]                      # who sends when
-# "master": all anchors hear one master and send in turn, in slots. "free": no master, any size; random instants.
-{master_mode}mode = "{mode}"
-{no_slot_s}slot_s = {slot_s}                 # mode master: length of a slot in seconds; all slots make a superframe
-{no_slot_s}guard_s = {guard_s}                # mode master: silence at the end of each slot, to prepare a frame
-{no_slot_s}frames_per_node = {frames}             # mode master: frames of each anchor in a superframe
-{no_slots}slots = {slots}                     # mode master: slots in a superframe; by default one for each frame
-{no_rate}rate_hz = {rate_hz}                # mode free: beacons per second of each anchor; as many as fit by default
-
+{schedule}
 [noise]                         # what the filters assume; too small costs more than too large
 tx_stamp_ps = {tx_ps}             # standard deviation of a transmit stamp in picoseconds
 rx_stamp_ps = {rx_ps}             # of a receive stamp; a DW1000 has 100 to 150
@@ -54,6 +45,25 @@ place_distance_m = {place_distance_m}          # how far a tag moves until that 
 place_time_s = {place_time_s}            # after how many seconds it is a different one while the tag is at rest
 """
 
+_MASTER = """\
+master = {master}                      # its clock is the site's time; best in the middle, in range of all
+"""
+
+_FREE_SCHEDULE = """\
+[schedule]                      # who sends when
+mode = "free"                   # anchors send at random instants; "master" is the paper's protocol, with slots
+{no_rate}rate_hz = {rate_hz}                # beacons per second of each anchor; as many as fit by default
+"""
+
+_MASTER_SCHEDULE = """\
+[schedule]                      # who sends when
+mode = "master"                 # the paper's protocol: all anchors hear one master and send in turn, in slots
+slot_s = {slot_s}                 # length of a slot in seconds; all slots make a superframe
+guard_s = {guard_s}                # silence at the end of each slot, to prepare a frame
+frames_per_node = {frames}             # frames of each anchor in a superframe
+{no_slots}slots = {slots}                     # slots in a superframe; by default one for each frame
+"""
+
 _KNOWN_HEIGHT = """
 [tags]
 height_m = {height}                  # all tags move at this height (2-D); leave the key out to estimate the height
@@ -66,14 +76,19 @@ _ESTIMATED_HEIGHT = """
 
 _ANCHORS = """
 # The anchors: positions of the antennas. Optional keys, with their defaults:
-#   slot = 0                         mode master: first slot; otherwise the master sends first, the others as listed
 #   tx_antenna_delay_ticks = 16436   antenna delays in ticks of 15.65 ps
 #   rx_antenna_delay_ticks = 16436
-# In mode free an anchor states its position itself. It may also be listed without x_m, y_m and z_m: it then
-# sends and relays, and tags do not use it. Further keys:
+{more}"""
+
+_MASTER_ANCHORS = """\
+#   slot = 0                         first slot; otherwise the master sends first, the others as listed
+"""
+
+_FREE_ANCHORS = """\
 #   floor = 0                        storey
 #   zone = 0                         zone of the site, 0 to 255; 0 for none
 #   std_m = 0.02                     how well its position is known; by default survey_std_m
+# An anchor may be listed without x_m, y_m and z_m: it then sends and relays, and tags do not use it.
 """
 
 _ANCHOR = """
@@ -145,7 +160,7 @@ _FARTHEST_M: Final = 8388.0  # distance from the origin along each axis that an 
 
 
 def site_template(site: Site) -> str:
-    """Site file, with a comment on every key, of a site whose anchors have no keys but position and slot.
+    """Site file, with a comment on every key of its mode, of a site whose anchors have no keys but position and slot.
 
     Walls, floor plan and georeference that the site has not are commented examples.
     """
@@ -153,20 +168,10 @@ def site_template(site: Site) -> str:
     head = _HEAD.format(
         name=json.dumps(site.name, ensure_ascii=False),
         id=site.id,
-        master=site.master,
-        slot_s=schedule.slot_s,
-        guard_s=schedule.guard_s,
-        frames=schedule.frames_per_node,
-        slots=schedule.slots or len(site.all_anchors) * schedule.frames_per_node,
-        mode="free",
-        rate_hz=schedule.rate_hz or _EXAMPLE_RATE_HZ,
+        master=_MASTER.format(master=site.master) if schedule.needs_master else "",
+        schedule=_schedule(site),
         outline=[list(corner) for corner in (_EXAMPLE_OUTLINE if site.outline_m is UNSET else site.outline_m)],
         no_outline=_off(site.outline_m is not UNSET),
-        no_master=_off(schedule.needs_master),
-        no_slots=_off(schedule.slots is not None),
-        master_mode=_off(not schedule.needs_master),
-        no_slot_s=_off(schedule.needs_master),
-        no_rate=_off(schedule.rate_hz is not None),
         tx_ps=noise.tx_stamp_ps,
         rx_ps=noise.rx_stamp_ps,
         white=noise.white_fm,
@@ -175,7 +180,23 @@ def site_template(site: Site) -> str:
     )
     height = site.tags.height_m
     tags = _ESTIMATED_HEIGHT if height is None else _KNOWN_HEIGHT.format(height=height)
-    return head + tags + _ANCHORS + "".join(map(_anchor, site.all_anchors)) + _tail(site)
+    anchors = _ANCHORS.format(more=_MASTER_ANCHORS if schedule.needs_master else _FREE_ANCHORS)
+    return head + tags + anchors + "".join(map(_anchor, site.all_anchors)) + _tail(site)
+
+
+def _schedule(site: Site) -> str:
+    schedule = site.schedule
+    if not schedule.needs_master:
+        return _FREE_SCHEDULE.format(
+            rate_hz=schedule.rate_hz or _EXAMPLE_RATE_HZ, no_rate=_off(schedule.rate_hz is not None)
+        )
+    return _MASTER_SCHEDULE.format(
+        slot_s=schedule.slot_s,
+        guard_s=schedule.guard_s,
+        frames=schedule.frames_per_node,
+        slots=schedule.slots or len(site.all_anchors) * schedule.frames_per_node,
+        no_slots=_off(schedule.slots is not None),
+    )
 
 
 def _off(given: bool) -> str:
@@ -246,8 +267,7 @@ def grid_site(
 ) -> Site:
     """A hall from the corner (0, 0) on, its anchors on a square grid, half a spacing or so from the walls.
 
-    A side too long for positions on the air is centred on the
-    origin.
+    A side too long for positions on the air is centred on the origin.
 
     Raises:
         ValueError: there are more anchors than identifiers.
