@@ -18,7 +18,7 @@ from skyless.core.air.instants import (
 from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS
 from skyless.core.kernels.compiled import kernel
 from skyless.core.ticks import HALF_WRAP_TICKS, from_seconds, to_seconds
-from skyless.sim.cells import timetable
+from skyless.sim.cells import _timetable as timetable
 
 ANCHORS = st.integers(0, 0xFFFF)
 SEQUENCES = st.integers(0, 0xFF)

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.core.constants import MAX_DRIFT
-from skyless.core.keys.arrivals import SILENCE_TICKS, Arrival, Arrivals, Stamps
+from skyless.core.keys._arrivals import SILENCE_TICKS, Arrival, Arrivals, Stamps
 from skyless.core.ticks import from_seconds, wrap
 
 MS = from_seconds(1e-3)

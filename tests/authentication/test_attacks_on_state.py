@@ -11,7 +11,8 @@ from skyless.core.air.beacon import Beacon
 from skyless.core.air.codec import decode, encode, with_authentication
 from skyless.core.air.reception import Reception
 from skyless.core.anchor.authentication import NO_KEYS_S, BeaconAuthentication
-from skyless.core.keys import chain, known_keys
+from skyless.core.keys import _known_keys as known_keys
+from skyless.core.keys import chain
 from skyless.core.keys.fault import Fault
 from skyless.core.keys.key_chain import SECTION_INTERVALS, earlier_key, mac_of
 from skyless.core.keys.verifier import Verifier

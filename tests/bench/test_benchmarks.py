@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from skyless.research.bench.baselines import FilterpyJoint, PlainJoint, joint_filter
-from skyless.research.bench.runs import (
+from skyless.research.bench._baselines import FilterpyJoint, PlainJoint, joint_filter
+from skyless.research.bench._runs import (
     BENCH_ANCHORS_M,
     BENCH_NODES,
     BENCH_SLOT_S,

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from msgspec import structs
 
 from skyless.bridges.hub import open_hub
+from skyless.bridges.mavlink._profiles import gps_input, gps_time, no_gps_fix, odometry, vision_position_estimate
 from skyless.bridges.mavlink.encoder import MavlinkEncoder
 from skyless.bridges.mavlink.messages import (
     CRC_EXTRAS,
@@ -28,7 +29,6 @@ from skyless.bridges.mavlink.messages import (
     encoded,
     frame,
 )
-from skyless.bridges.mavlink.profiles import gps_input, gps_time, no_gps_fix, odometry, vision_position_estimate
 from skyless.bridges.target import BridgeContext
 from skyless.bridges.targets import open_route
 from skyless.core.earth import geodetic

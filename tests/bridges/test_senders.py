@@ -7,8 +7,8 @@ import stat
 
 import pytest
 
+from skyless.bridges._senders import MAX_READERS, PtySender, SerialSender, TcpServer, UdpSender
 from skyless.bridges.jsonl import JsonLines
-from skyless.bridges.senders import MAX_READERS, PtySender, SerialSender, TcpServer, UdpSender
 from skyless.core.errors import SkylessError
 from skyless.radio.serial.pseudo_terminal import Pty
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skyless.core.keys.fault import Fault
+from skyless.page.condition._reasons import authentication_reasons
 from skyless.page.condition.evidence import Evidence
-from skyless.page.condition.reasons import authentication_reasons
 from skyless.run.mqtt.messages import AnchorHealth, Counters, TagHealth
 
 DAY_S = 86400.0

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from skyless.page.condition._reasons import START_S, alert_reasons
 from skyless.page.condition.evidence import FRESH_S, GRACE_S, Evidence
 from skyless.page.condition.monitor import EVALUATION_S, HOLD_S, ConditionMonitor
-from skyless.page.condition.reasons import START_S, alert_reasons
 from skyless.run.mqtt.messages import AnchorHealth, Counters, EtherHealth, TagHealth, WatchFinding, WatchMessage
 
 IDS = [anchor.id for anchor in SITE.site.anchors]

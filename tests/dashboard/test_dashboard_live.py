@@ -9,7 +9,7 @@ from dashboard_builders import SITE, SITE_ID, SQUARE, fix, status, truth
 from msgspec.structs import replace
 from test_dashboard_condition import anchor_health
 
-from skyless.page.events import MAX_EVENTS, SILENT_S
+from skyless.page._events import MAX_EVENTS, SILENT_S
 from skyless.page.live import LiveSite
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import PreparationMessage, SiteZones, ZoneEvent, ZonesMessage

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skyless.core.site import FloorPlanSite, UnplacedAnchor
+from skyless.page._site_survey import SiteSurvey
 from skyless.page.app import MAX_FLOOR_PLAN_BYTES
 from skyless.page.overlays import NoOverlayError, overlay_task
-from skyless.page.site_survey import SiteSurvey
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.access import Role
 from skyless.run.mqtt.address import MqttAddress

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from skyless.research.surveys.anchor_stamps import stamps_of
+from skyless.research.surveys._anchor_stamps import stamps_of
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import lab_site
 

@@ -30,8 +30,8 @@ from skyless.run.mqtt.messages import (
     WatchMessage,
 )
 from skyless.run.survey import program as program_module
+from skyless.run.survey._live_survey import ADOPTION_S, NO_DATA_S, LiveSurvey
 from skyless.run.survey.files import FloorImage, is_record_of, save_survey
-from skyless.run.survey.live_survey import ADOPTION_S, NO_DATA_S, LiveSurvey
 from skyless.run.survey.program import SurveyNode, SurveySettings
 from skyless.sim.impairments import DelayError, lab_impairments
 from skyless.sim.lab import lab_site

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from skyless.research.paper.checks import CHECKED_ANCHORS, NOISES, QUANTITY_NAMES, paper_chain, paper_checks
-from skyless.research.paper.distributions import lambda_distributions
+from skyless.research.paper._checks import CHECKED_ANCHORS, NOISES, QUANTITY_NAMES, paper_chain, paper_checks
+from skyless.research.paper._distributions import lambda_distributions
 
 pytestmark = pytest.mark.site
 

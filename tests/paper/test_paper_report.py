@@ -10,7 +10,7 @@ import pytest
 from skyless.cli.main import main
 from skyless.research.paper import plan as plans
 from skyless.research.paper import run
-from skyless.research.paper.checks import QUANTITY_NAMES
+from skyless.research.paper._checks import QUANTITY_NAMES
 from skyless.research.paper.plan import Plan
 
 pytestmark = pytest.mark.site

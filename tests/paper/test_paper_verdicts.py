@@ -6,9 +6,18 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.research.paper import checks, claim, distributions, dop_map, rate, scale, scenario, static, timeline, walk
-from skyless.research.paper.checks import PaperCheck
-from skyless.research.paper.distributions import LambdaDistribution
+from skyless.research.paper import _checks as checks
+from skyless.research.paper import _claim as claim
+from skyless.research.paper import _distributions as distributions
+from skyless.research.paper import _dop_map as dop_map
+from skyless.research.paper import _rate as rate
+from skyless.research.paper import _scale as scale
+from skyless.research.paper import _scenario as scenario
+from skyless.research.paper import _static as static
+from skyless.research.paper import _timeline as timeline
+from skyless.research.paper import _walk as walk
+from skyless.research.paper._checks import PaperCheck
+from skyless.research.paper._distributions import LambdaDistribution
 from skyless.research.paper.plan import P1, P2, Verdict, plan_of
 from skyless.sim.evaluation.scenarios import Request, fleet_of
 from skyless.sim.lab import lab_site, paper_lab_site

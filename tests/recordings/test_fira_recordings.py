@@ -26,7 +26,7 @@ from skyless.radio.uci.uci import (
     SessionInfo,
     encode_wgs84,
 )
-from skyless.research.foreign import phones
+from skyless.research.foreign import _phones as phones
 from skyless.research.foreign.formats import open_recording
 from skyless.research.replays.captures import CaptureReplay
 from skyless.research.replays.options import ReplayOptions

@@ -9,7 +9,7 @@ from metronome import IDEAL, Metronome, sent, staggered
 
 from skyless.core.constants import TICK_M
 from skyless.core.ticks import difference
-from skyless.sim.anchor_pairs import AnchorPairErrors
+from skyless.sim._anchor_pairs import AnchorPairErrors
 from skyless.sim.impairments import AnchorDisplacement, DelayError, PairError
 from skyless.sim.lab import lab_site
 from skyless.sim.world import World

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.stats import kstest
 
 from skyless.core.constants import TICK_RATE_HZ, TICK_S
-from skyless.sim.cells.clocks import CHECKPOINT_KNOTS, KNOT_TICKS, CellClocks, own_time, true_time
-from skyless.sim.cells.keyed import key_of, mixed, normal, normal_pair, purpose_key, uniform
+from skyless.sim.cells._clocks import CHECKPOINT_KNOTS, KNOT_TICKS, CellClocks, own_time, true_time
+from skyless.sim.cells._keyed import key_of, mixed, normal, normal_pair, purpose_key, uniform
 from skyless.sim.oscillator import OscillatorModel, Temperature
 
 pytestmark = pytest.mark.site

@@ -8,7 +8,7 @@ from metronome import IDEAL, Metronome, site_of
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.core.ticks import difference
-from skyless.sim.cells.reception import (
+from skyless.sim.cells._reception import (
     COLLISION,
     HALF_DUPLEX,
     PREAMBLE_TICKS,

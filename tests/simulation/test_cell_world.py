@@ -8,11 +8,11 @@ from scipy.stats import kstest
 
 from skyless.core.air.instants import period_code
 from skyless.core.constants import DEFAULT_ANTENNA_DELAY_TICKS, TICK_M, TICK_S
-from skyless.sim.cells.clocks import KNOT_TICKS
-from skyless.sim.cells.grid import anchors_within, list_neighbours, make_grid
-from skyless.sim.cells.paths import TagPath
-from skyless.sim.cells.reception import delivery_chance, rules_of
-from skyless.sim.cells.receptions import KNOTS_A_LENGTH, PairErrors, changing_error
+from skyless.sim.cells._clocks import KNOT_TICKS
+from skyless.sim.cells._grid import anchors_within, list_neighbours, make_grid
+from skyless.sim.cells._paths import TagPath
+from skyless.sim.cells._reception import delivery_chance, rules_of
+from skyless.sim.cells._receptions import KNOTS_A_LENGTH, PairErrors, changing_error
 from skyless.sim.cells.world import CellAnchors, CellWorld
 from skyless.sim.impairments import AnchorOutage, Impairments, Outage
 from skyless.sim.oscillator import OscillatorModel

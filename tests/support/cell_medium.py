@@ -20,9 +20,9 @@ from skyless.core.kernels.arrays import Array, Integers, Records
 from skyless.core.kernels.compiled import kernel
 from skyless.core.site import Site
 from skyless.core.ticks import WRAP_TICKS, difference, from_seconds, wrap
-from skyless.sim.cells.clocks import KNOT_TICKS, CellClocks, Knots, own_time, true_time
-from skyless.sim.cells.keyed import START, TAG_NODES, key_of, purpose_key, uniform
-from skyless.sim.cells.reception import (
+from skyless.sim.cells._clocks import KNOT_TICKS, CellClocks, Knots, own_time, true_time
+from skyless.sim.cells._keyed import START, TAG_NODES, key_of, purpose_key, uniform
+from skyless.sim.cells._reception import (
     PREAMBLE_TICKS,
     RECEIVED,
     Frames,

@@ -11,7 +11,7 @@ from skyless.core.air.frame import Heard
 from skyless.core.air.reception import Reception
 from skyless.core.protocols import new_anchor
 from skyless.core.ticks import from_seconds, wrap
-from skyless.research.surveys.anchor_stamps import RecordedAnchor
+from skyless.research.surveys._anchor_stamps import RecordedAnchor
 from skyless.sim.impairments import AnchorOutage, Outage, lab_impairments
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.stations import TagSpec

@@ -9,7 +9,7 @@ import pytest
 
 from skyless.cli.main import main
 from skyless.core.constants import TICK_M, TICK_RATE_HZ
-from skyless.run.survey.live_survey import LiveSurvey
+from skyless.run.survey._live_survey import LiveSurvey
 from skyless.run.survey.program import SurveyNode, SurveySettings
 from skyless.sim.lab import lab_site
 from skyless.site.survey.facts import Facts, Gauge, PairBlock

@@ -13,7 +13,7 @@ from typing import Final, cast
 
 from msgspec import Struct
 
-from skyless.bridges.senders import UdpSender
+from skyless.bridges._senders import UdpSender
 from skyless.bridges.target import UPS, BridgeContext, BridgedSite, Target, TargetUrl, Up, turned
 from skyless.run.mqtt.messages import FixMessage, Vector
 

@@ -7,8 +7,8 @@ from typing import Final, cast
 
 from msgspec import Struct
 
+from skyless.bridges._senders import PtySender, SerialSender, TcpServer, UdpSender
 from skyless.bridges.hub import Route
-from skyless.bridges.senders import PtySender, SerialSender, TcpServer, UdpSender
 from skyless.bridges.target import BridgeContext, BridgedSite, Encoder, Target, TargetUrl
 from skyless.run.mqtt.messages import FixMessage
 

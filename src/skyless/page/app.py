@@ -19,14 +19,14 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyless.core.errors import SkylessError
-from skyless.page.geojson import MEDIA_TYPE
+from skyless.page._geojson import MEDIA_TYPE
+from skyless.page._site_survey import NoResultError
+from skyless.page._state import PageRequest
 from skyless.page.guard import AccessRules, Guard
 from skyless.page.live import LiveSite, NoBrokerError, NoSiteError, NotAllowedError, TooManyPagesError
 from skyless.page.overlays import KINDS, NoOverlayError, Overlays
 from skyless.page.playback import NoRecordingError, Playback, RecordingFile
-from skyless.page.site_survey import NoResultError
 from skyless.page.sites import LiveSites
-from skyless.page.state import PageRequest
 from skyless.run.mqtt.survey_facts import BadFactsError
 from skyless.run.zones.zone_list import BadZonesError, read_zones
 from skyless.site.file.check import image_size

@@ -20,12 +20,12 @@ from msgspec import Struct
 from skyless.bridges.target import bridged_site
 from skyless.core.errors import ConfigurationError
 from skyless.core.version import installed_version
+from skyless.page._events import MAX_EVENTS, MAX_LOGGED, EventLog, EventQueue, publisher_rank
+from skyless.page._geojson import OLDEST_S, features
+from skyless.page._site_survey import SiteSurvey
+from skyless.page._state import PageRequest, Sent, SiteState, encode
 from skyless.page.condition.evidence import Evidence
 from skyless.page.condition.monitor import EVALUATION_S, Condition, ConditionMonitor
-from skyless.page.events import MAX_EVENTS, MAX_LOGGED, EventLog, EventQueue, publisher_rank
-from skyless.page.geojson import OLDEST_S, features
-from skyless.page.site_survey import SiteSurvey
-from skyless.page.state import PageRequest, Sent, SiteState, encode
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.access import Role
 from skyless.run.mqtt.link import Link

@@ -14,8 +14,8 @@ from typing import BinaryIO, Final
 from msgspec import Struct
 
 from skyless.core.errors import SkylessError
-from skyless.page.events import Event, EventLog
-from skyless.page.state import SiteState
+from skyless.page._events import Event, EventLog
+from skyless.page._state import SiteState
 from skyless.run.mqtt.messages import (
     REACH_S,
     AnchorHealth,

@@ -12,9 +12,9 @@ import uvicorn
 from msgspec import Struct
 
 from skyless.core.errors import SkylessError
+from skyless.page._state import MAX_REQUEST_BYTES
 from skyless.page.app import PAGE_TIMEOUT_S, Services, make_app
 from skyless.page.guard import AccessRules
-from skyless.page.state import MAX_REQUEST_BYTES
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.process import ending_signals, reserve
 

@@ -15,7 +15,7 @@ from skyless.radio.foreign.foreign_radios import ListenerRadio, SnifferRadio, Uc
 from skyless.radio.interface import AntennaDelays, Radio
 from skyless.radio.serial.serial_port import check_path
 from skyless.radio.serial.serial_radio import SerialRadio
-from skyless.run.dw1000_model import ModelPort
+from skyless.run._dw1000_model import ModelPort
 
 DEFAULT_RADIO: Final = f"ether:127.0.0.1:{DEFAULT_PORT}"
 _SERIAL_BAUD: Final = 1_000_000

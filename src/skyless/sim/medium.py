@@ -22,7 +22,7 @@ from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ, T
 from skyless.core.kernels.arrays import Array, Records
 from skyless.core.site import Site
 from skyless.core.ticks import difference, from_seconds, wrap
-from skyless.sim.anchor_pairs import AnchorPairErrors
+from skyless.sim._anchor_pairs import AnchorPairErrors
 from skyless.sim.impairments import Impairments
 from skyless.sim.listening import OUTCOMES, RECEPTION_RECORD, receive_frame
 from skyless.sim.oscillator import advance, emit, foresee, make_clocks, restart_counter, warm_up

@@ -5,6 +5,16 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Final, cast
 
+from skyless.bridges.mavlink._profiles import (
+    MAVLINK_PROFILES,
+    MAX_SATELLITES,
+    Profile,
+    global_origin,
+    gps_input,
+    no_gps_fix,
+    odometry,
+    vision_position_estimate,
+)
 from skyless.bridges.mavlink.messages import (
     ARMED,
     CRC_EXTRAS,
@@ -16,16 +26,6 @@ from skyless.bridges.mavlink.messages import (
     Timesync,
     decoded,
     encoded,
-)
-from skyless.bridges.mavlink.profiles import (
-    MAVLINK_PROFILES,
-    MAX_SATELLITES,
-    Profile,
-    global_origin,
-    gps_input,
-    no_gps_fix,
-    odometry,
-    vision_position_estimate,
 )
 from skyless.bridges.target import BridgeContext, BridgedSite, Encoder, TargetUrl, require_georeference
 from skyless.core.errors import SkylessError

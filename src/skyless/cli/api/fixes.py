@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.cli.api.result import axes_columns, data_frame
+from skyless.cli.api._result import axes_columns, data_frame
 from skyless.core.arguments import wrong
 from skyless.core.fix import Fix
 from skyless.core.kernels.arrays import Array, Integers, Mask, Matrix, Vector

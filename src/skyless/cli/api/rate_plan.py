@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from skyless.cli.api.floor_result import FloorResult
-from skyless.cli.api.result import data_frame
+from skyless.cli.api._floor_result import FloorResult
+from skyless.cli.api._result import data_frame
 from skyless.core.errors import SkylessError
 from skyless.core.geometry import Box
 from skyless.core.kernels.arrays import Array, Matrix

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from msgspec.structs import replace
 
+from skyless.cli.api._result import Result, cm
 from skyless.cli.api.fixes import Fixes, FixRecorder
-from skyless.cli.api.result import Result, cm
 from skyless.core.air.masterless_packets import Point
 from skyless.core.arguments import python_function, wrong
 from skyless.core.errors import ConfigurationError

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.cli.api.result import Result, cm, data_frame, figures
+from skyless.cli.api._result import Result, cm, data_frame, figures
 from skyless.core.arguments import python_function
 from skyless.core.errors import SkylessError
 from skyless.core.kernels.arrays import Integers, Vector
@@ -124,7 +124,7 @@ class SurveyResult(Result, frozen=True, eq=False):
 
     def plot(self) -> "Figure":
         """The anchors from above, with their ellipses."""
-        from skyless.cli.api.survey_picture import survey_figure
+        from skyless.cli.api._survey_picture import survey_figure
 
         return survey_figure(self.survey)
 
@@ -190,7 +190,7 @@ class BiasResult(Result, frozen=True, eq=False):
 
     def plot(self) -> "Figure":
         """The constants with their standard errors, one bar an anchor."""
-        from skyless.cli.api.survey_picture import bias_figure
+        from skyless.cli.api._survey_picture import bias_figure
 
         return bias_figure(self.path.name, self.anchors, self.bias_m, self.std_m)
 

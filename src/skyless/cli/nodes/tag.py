@@ -10,7 +10,7 @@ from cyclopts import App, Parameter
 
 from skyless.cli.common.options import command
 from skyless.cli.common.progress import loading_kernels
-from skyless.cli.nodes.fix_lines import FixLines, LineOptions
+from skyless.cli.nodes._fix_lines import FixLines, LineOptions
 from skyless.cli.nodes.options import MqttOptions, SiteId, log
 from skyless.core.arguments import Method, NotNegative, Positive, Text, number, process_noise, read_height
 from skyless.core.errors import SkylessError

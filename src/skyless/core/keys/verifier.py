@@ -13,11 +13,11 @@ from skyless.core.air.almanac import KeyPage
 from skyless.core.air.beacon import Authentication, Beacon
 from skyless.core.air.codec import INTERVAL_BITS, signed_bytes
 from skyless.core.air.reception import Reception
-from skyless.core.keys.arrivals import Arrival, Arrivals, Stamps
+from skyless.core.keys._arrivals import Arrival, Arrivals, Stamps
+from skyless.core.keys._known_keys import CertificateUse, KeyUse, KnownKeys
+from skyless.core.keys._site_clock import SiteClock
 from skyless.core.keys.fault import Fault
 from skyless.core.keys.key_chain import ChainTiming, is_mac, section_of
-from skyless.core.keys.known_keys import CertificateUse, KeyUse, KnownKeys
-from skyless.core.keys.site_clock import SiteClock
 from skyless.core.ticks import Unwrapper, from_seconds, nearest
 
 if TYPE_CHECKING:

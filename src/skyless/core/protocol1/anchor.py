@@ -17,12 +17,12 @@ from skyless.core.anchor.anchor import MAX_RELAY_AGE_TICKS, delay_change_ticks, 
 from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS, SUBTICKS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.core.kernels.filter import ClockFilter, clock_noise, stamp_variance_m2
 from skyless.core.observation import MasterTerm
+from skyless.core.protocol1._site_clock import SiteClock
 from skyless.core.protocol1.almanac import almanac_issue, page_for, pages_of
 from skyless.core.protocol1.beacon import Beacon, MasterTime
 from skyless.core.protocol1.codec import decode_cached, encode, heard_capacity
 from skyless.core.protocol1.election import MasterElection, Role, Verdict
 from skyless.core.protocol1.schedule import first_slots, schedule_of
-from skyless.core.protocol1.site_clock import SiteClock
 from skyless.core.site import AnchorSite, Site
 from skyless.core.ticks import Unwrapper, difference, wrap
 

@@ -15,10 +15,10 @@ from skyless.core.integrity import IntegrityRequirement
 from skyless.core.kernels.arrays import Array
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.core.observation import Observation
+from skyless.core.protocol1._master_term import FollowedMaster, master_term_of
 from skyless.core.protocol1.almanac import AlmanacAssembly, AlmanacState
 from skyless.core.protocol1.beacon import Beacon
 from skyless.core.protocol1.codec import decode_cached, packed_relays
-from skyless.core.protocol1.master_term import FollowedMaster, master_term_of
 from skyless.core.protocol1.schedule import Schedule, schedule_from_page
 from skyless.core.protocol1.snapshots import SnapshotMethod, Snapshots, SnapshotSettings, SnapshotsState
 from skyless.core.tag.beacon_receiver import (

@@ -23,7 +23,7 @@ from skyless.core.fix import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELO
 from skyless.core.integrity import UNAVAILABLE, IntegrityRequirement
 from skyless.core.kernels.arrays import Array
 from skyless.core.observation import MasterTerm, Observation
-from skyless.core.tag.acquisition import (
+from skyless.core.tag._acquisition import (
     EARLY_S,
     MAX_RELATIVE_STD,
     MAX_SILENCE_S,

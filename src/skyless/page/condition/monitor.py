@@ -11,8 +11,7 @@ from typing import Final, Literal
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.page.condition.evidence import FRESH_S, Evidence
-from skyless.page.condition.reasons import (
+from skyless.page.condition._reasons import (
     LAG_S,
     Reason,
     alert_reasons,
@@ -30,6 +29,7 @@ from skyless.page.condition.reasons import (
     slow_reason,
     watch_reasons,
 )
+from skyless.page.condition.evidence import FRESH_S, Evidence
 from skyless.run.mqtt.messages import WatchMessage
 
 EVALUATION_S: Final = 0.5

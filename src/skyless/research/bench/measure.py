@@ -20,7 +20,7 @@ from skyless.core.kernels.processors import cores
 from skyless.core.protocol1.codec import decode_cached
 from skyless.core.tag.locate import PseudorangeSolution, locate_pseudoranges
 from skyless.core.tag.receiver import Receiver
-from skyless.research.bench.runs import BENCH_ANCHORS_M, BENCH_NODES, JointRuns, Run
+from skyless.research.bench._runs import BENCH_ANCHORS_M, BENCH_NODES, JointRuns, Run
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import paper_lab_site

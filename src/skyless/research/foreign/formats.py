@@ -14,7 +14,10 @@ from skyless.core.constants import TICK_BITS
 from skyless.core.errors import ConfigurationError
 from skyless.core.input_files import Drops, open_source, read_head
 from skyless.radio.foreign import bitcraze, fira
-from skyless.research.foreign import avalue, bitcraze_captures, phones, tdoa_tables
+from skyless.research.foreign import _bitcraze_captures as bitcraze_captures
+from skyless.research.foreign import _phones as phones
+from skyless.research.foreign import _tdoa_tables as tdoa_tables
+from skyless.research.foreign import avalue
 
 Record = Packet | PairTdoa
 

@@ -18,8 +18,17 @@ from msgspec import Struct
 
 from skyless.core.errors import SkylessError
 from skyless.core.kernels.processors import cores
-from skyless.research.paper import checks, claim, distributions, dop_map, rate, scale, scenario, static, timeline, walk
-from skyless.research.paper.html import Heading, report_page
+from skyless.research.paper import _checks as checks
+from skyless.research.paper import _claim as claim
+from skyless.research.paper import _distributions as distributions
+from skyless.research.paper import _dop_map as dop_map
+from skyless.research.paper import _rate as rate
+from skyless.research.paper import _scale as scale
+from skyless.research.paper import _scenario as scenario
+from skyless.research.paper import _static as static
+from skyless.research.paper import _timeline as timeline
+from skyless.research.paper import _walk as walk
+from skyless.research.paper._html import Heading, report_page
 from skyless.research.paper.plan import Plan, Section, Task
 from skyless.site.report.figures import picture, report_style
 

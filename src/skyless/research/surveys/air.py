@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from skyless.core.constants import TICK_M
 from skyless.core.kernels.arrays import Array
 from skyless.core.site import EXACT, AnchorSite, ScheduleSite, Site
-from skyless.research.surveys.anchor_stamps import stamps_of
+from skyless.research.surveys._anchor_stamps import stamps_of
 from skyless.research.surveys.layouts import SLOT_S, SurveyLayout
 from skyless.sim.impairments import DelayError, PairError, lab_impairments
 from skyless.site.channel import ChannelModel

@@ -17,8 +17,8 @@ from skyless.core.constants import TICK_M
 from skyless.core.geometry import anchor_positions
 from skyless.core.kernels.arrays import Array
 from skyless.core.site import EXACT, AccuracySite, AnchorSite, Site, TagsSite
+from skyless.research.surveys._anchor_stamps import stamps_of
 from skyless.research.surveys.air import free_axes
-from skyless.research.surveys.anchor_stamps import stamps_of
 from skyless.research.surveys.judge import aligned
 from skyless.research.surveys.layouts import SurveyLayout
 from skyless.sim.evaluation.scenarios import Room

@@ -42,8 +42,8 @@ from skyless.run.mqtt.topics import (
 )
 from skyless.run.process import Log, every, keep, outlasting, reader, together
 from skyless.run.radio_monitor import RadioMonitor
+from skyless.run.survey._live_survey import FactsOf, LiveSurvey
 from skyless.run.survey.files import FloorImage, Saved, record_of, save_survey, saved_without_file
-from skyless.run.survey.live_survey import FactsOf, LiveSurvey
 from skyless.site.file.load import load_site
 from skyless.site.survey.facts import Facts, PairRanges
 from skyless.site.survey.result import Survey

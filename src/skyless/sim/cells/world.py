@@ -20,9 +20,9 @@ from skyless.core.kernels.arrays import Array, Integers
 from skyless.core.kernels.compiled import kernel
 from skyless.core.site import Site
 from skyless.core.ticks import TICK_MASK, from_seconds
-from skyless.sim.cells.clocks import KNOT_TICKS, CellClocks
-from skyless.sim.cells.grid import anchors_within, list_neighbours, make_grid
-from skyless.sim.cells.keyed import (
+from skyless.sim.cells._clocks import KNOT_TICKS, CellClocks
+from skyless.sim.cells._grid import anchors_within, list_neighbours, make_grid
+from skyless.sim.cells._keyed import (
     RANGE_CHANGING,
     RANGE_CONSTANT,
     SURVEY,
@@ -31,9 +31,9 @@ from skyless.sim.cells.keyed import (
     normal,
     purpose_key,
 )
-from skyless.sim.cells.paths import TagPath
-from skyless.sim.cells.reception import PREAMBLE_TICKS, rules_of
-from skyless.sim.cells.receptions import (
+from skyless.sim.cells._paths import TagPath
+from skyless.sim.cells._reception import PREAMBLE_TICKS, rules_of
+from skyless.sim.cells._receptions import (
     KNOTS_A_LENGTH,
     LOOK_BACK_TICKS,
     PairErrors,
@@ -42,7 +42,7 @@ from skyless.sim.cells.receptions import (
     fill_relays,
     receive_at_tag,
 )
-from skyless.sim.cells.timetable import (
+from skyless.sim.cells._timetable import (
     Senders,
     Table,
     make_buckets,

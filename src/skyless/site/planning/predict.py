@@ -19,6 +19,7 @@ from skyless.core.protocols import superframe_s
 from skyless.core.site import Site
 from skyless.core.tag.factory import estimator_settings
 from skyless.site.channel import ChannelModel, pack_walls
+from skyless.site.planning._snapshot_sigma import fill_snapshot_sigma, rounds_of
 from skyless.site.planning.anchor_clocks import anchor_clocks, relays_of, row_of_master
 from skyless.site.planning.joint_sigma import fill_joint_sigma
 from skyless.site.planning.links import (
@@ -31,7 +32,6 @@ from skyless.site.planning.links import (
     link_budget,
     weighted_pdop,
 )
-from skyless.site.planning.snapshot_sigma import fill_snapshot_sigma, rounds_of
 
 Fill = Callable[[Matrix, Matrix], None]
 

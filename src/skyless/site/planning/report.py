@@ -13,13 +13,13 @@ from skyless.core.protocol1.snapshots import literal_covariance
 from skyless.core.protocols import superframe_s
 from skyless.core.tag.locate import NoSolution, locate
 from skyless.site.file.advice import warnings_of
+from skyless.site.planning._snapshot_sigma import delays
 from skyless.site.planning.anchor_clocks import master_warnings, stamp_variances
 from skyless.site.planning.floor import Floor, Mounts, sample_points
 from skyless.site.planning.links import BIAS, FIX_SHARE, IN_VIEW, SIGMA, range_of
 from skyless.site.planning.maps import MapSummary, PlanMap
 from skyless.site.planning.optimise import Optimised, Scored, one_more
 from skyless.site.planning.predict import Predictor
-from skyless.site.planning.snapshot_sigma import delays
 
 
 class PointCheck(Struct, frozen=True):

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import structs
 
 from skyless.core.kernels.arrays import Array, Integers, Mask
-from skyless.site.survey.build import (
+from skyless.site.survey._build import (
     Measured,
     as_array,
     assumed_heights,
@@ -25,8 +25,7 @@ from skyless.site.survey.build import (
     own_delays,
     usable,
 )
-from skyless.site.survey.facts import MIN_CHECKS, Facts, PairRange, PairRanges
-from skyless.site.survey.findings import (
+from skyless.site.survey._findings import (
     advised_tapes,
     anchor_reasons,
     held_by_expected_delays,
@@ -34,12 +33,13 @@ from skyless.site.survey.findings import (
     unchecked,
     unlikely_delays,
 )
+from skyless.site.survey._frame import Framed, in_frame
+from skyless.site.survey._shape import Fitted, fit_shape, redundancy, with_tags
+from skyless.site.survey.facts import MIN_CHECKS, Facts, PairRange, PairRanges
 from skyless.site.survey.fit.determined import Links, count_links, position_stds_m
 from skyless.site.survey.fit.problem import Problem, adjacency, delay_weights, unit_vectors
 from skyless.site.survey.fit.robust import OtherFit, RobustFit, find_ambiguities, fit_robustly
-from skyless.site.survey.frame import Framed, in_frame
 from skyless.site.survey.result import Ambiguity, Survey, SurveyedAnchor, SurveyedPair, anchors_named, are, joined
-from skyless.site.survey.shape import Fitted, fit_shape, redundancy, with_tags
 from skyless.site.survey.walk import TagEpochs, fit_with_tag
 
 _MOVED_M: Final = 0.1  # an anchor whose position differs less in another result is at the same position

@@ -6,8 +6,8 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.kernels.arrays import Array
-from skyless.research.paper.dop_map import EXPLAINING_CORRELATION, LAB_ANCHORS_M, literal_covariance_m2, pdop_at
-from skyless.research.paper.listening import Track, listen
+from skyless.research.paper._dop_map import EXPLAINING_CORRELATION, LAB_ANCHORS_M, literal_covariance_m2, pdop_at
+from skyless.research.paper._listening import Track, listen
 from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Progress, Results, Section, Task, Verdict, grouped
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import paper_lab_site

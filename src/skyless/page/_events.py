@@ -9,9 +9,9 @@ from typing import Final, Literal
 
 from msgspec import Struct
 
+from skyless.page._state import SILENT_S
 from skyless.page.condition.evidence import ALERT_WORDS, ALERTS, Health, LeaderTracker
 from skyless.page.condition.monitor import Condition
-from skyless.page.state import SILENT_S
 from skyless.run.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, SurveyMessage, WatchMessage, ZoneEvent
 
 MAX_LOGGED: Final = 500

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from matplotlib.axes import Axes
 
-from skyless.research.paper.dop_map import LAB_ANCHORS_M
+from skyless.research.paper._dop_map import LAB_ANCHORS_M
 from skyless.research.paper.plan import P1, P2, Panel, Plan, Progress, Results, Section, Task, Verdict
 from skyless.sim.evaluation.scenarios import Request, fleet_of
 from skyless.sim.lab import paper_lab_site

@@ -6,7 +6,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.kernels.arrays import Array
-from skyless.research.paper.listening import listen
+from skyless.research.paper._listening import listen
 from skyless.research.paper.plan import (
     CLAIM_M,
     DW1000_PS,

@@ -8,14 +8,14 @@ from typing import Final
 import numpy as np
 
 from skyless.core.kernels.arrays import Array, Mask
-from skyless.site.survey.build import Measured, levels, with_free_delays
+from skyless.site.survey._build import Measured, levels, with_free_delays
+from skyless.site.survey._frame import Framed
+from skyless.site.survey._shape import Fitted, redundancy, surveyed_problem
 from skyless.site.survey.facts import MIN_CHECKS, Facts
 from skyless.site.survey.fit import determined as determination
 from skyless.site.survey.fit.determined import Links, TapeChoice, best_tapes, mending_tapes
 from skyless.site.survey.fit.problem import Problem, delay_weights, jacobian
-from skyless.site.survey.frame import Framed
 from skyless.site.survey.result import SurveyedAnchor, TapeAdvice, anchors_named, are, distances_named, joined
-from skyless.site.survey.shape import Fitted, redundancy, surveyed_problem
 
 _FLAT: Final = 0.3  # a site is flat if its smallest extent is a smaller part of its largest one
 _ONE_AXIS: Final = 0.7

@@ -17,8 +17,8 @@ from skyless.core.constants import TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.core.kernels.arrays import Array, Integers
 from skyless.core.kernels.compiled import kernel, step
 from skyless.core.ticks import TICK_MASK, from_seconds
-from skyless.sim.cells.clocks import Knots, own_time
-from skyless.sim.cells.keyed import CHANCE, LOSS, RX_NOISE, TX_NOISE, key_of, mixed, normal, purpose_key, uniform
+from skyless.sim.cells._clocks import Knots, own_time
+from skyless.sim.cells._keyed import CHANCE, LOSS, RX_NOISE, TX_NOISE, key_of, mixed, normal, purpose_key, uniform
 from skyless.sim.listening import OUTCOMES, Outcome
 from skyless.site.channel import (
     FREE_SPACE_LOSS_1_M_DB,

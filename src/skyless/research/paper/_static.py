@@ -10,7 +10,7 @@ from scipy.stats import kurtosis, norm, skew
 
 from skyless.core.constants import TICK_M
 from skyless.core.kernels.arrays import Array
-from skyless.research.paper.listening import Track, listen
+from skyless.research.paper._listening import Track, listen
 from skyless.research.paper.plan import (
     CLAIM_M,
     P1,

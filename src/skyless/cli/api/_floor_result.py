@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from skyless.cli.api.result import Result
+from skyless.cli.api._result import Result
 from skyless.core.kernels.arrays import Vector
 from skyless.core.site import Site
 from skyless.site.planning.floor import Floor

@@ -13,10 +13,10 @@ from skyless.core.constants import TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.core.kernels.arrays import Array, Integers, Records
 from skyless.core.kernels.compiled import kernel, step
 from skyless.core.ticks import TICK_MASK
-from skyless.sim.cells.clocks import KNOT_TICKS, Knots, true_time
-from skyless.sim.cells.grid import Grid, Neighbours, cells_within
-from skyless.sim.cells.keyed import key_of, normal, uniform
-from skyless.sim.cells.reception import (
+from skyless.sim.cells._clocks import KNOT_TICKS, Knots, true_time
+from skyless.sim.cells._grid import Grid, Neighbours, cells_within
+from skyless.sim.cells._keyed import key_of, normal, uniform
+from skyless.sim.cells._reception import (
     FIRST_PATH_TICKS,
     PREAMBLE_TICKS,
     RECEIVED,
@@ -28,7 +28,7 @@ from skyless.sim.cells.reception import (
     rx_stamp,
     squared_m2,
 )
-from skyless.sim.cells.timetable import BIN_BITS, Buckets, Table, latest
+from skyless.sim.cells._timetable import BIN_BITS, Buckets, Table, latest
 from skyless.sim.range_errors import slope_error_m
 from skyless.sim.stations import coordinate_m
 

@@ -15,7 +15,7 @@ from skyless.core.constants import TICK_RATE_HZ
 from skyless.core.kernels.arrays import Array, Integers
 from skyless.core.kernels.compiled import kernel
 from skyless.core.ticks import WRAP_TICKS
-from skyless.sim.cells.keyed import CRYSTAL, START, key_of, mixed, normal_pair, purpose_key, uniform
+from skyless.sim.cells._keyed import CRYSTAL, START, key_of, mixed, normal_pair, purpose_key, uniform
 from skyless.sim.oscillator import OscillatorModel
 
 KNOT_BITS: Final = 31

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from skyless.core.kernels.arrays import Array, Integers
 from skyless.core.kernels.compiled import kernel
-from skyless.sim.cells.reception import Rules, delivery_chance, pair_key, squared_m2
+from skyless.sim.cells._reception import Rules, delivery_chance, pair_key, squared_m2
 
 _MAX_CELLS: Final = 1_000_000
 """Anchors far apart get larger cells instead of more."""

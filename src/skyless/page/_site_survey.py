@@ -10,7 +10,7 @@ from typing import Generic, TypeVar
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.page.state import encode
+from skyless.page._state import encode
 from skyless.run.mqtt.messages import (
     SurveyFactsMessage,
     SurveyMessage,

@@ -9,7 +9,7 @@ from msgspec import Struct
 from scipy.stats import norm
 
 from skyless.core.kernels.arrays import Array, Integers
-from skyless.research.paper.checks import NOISES, draw_seed, first_number, paper_chain
+from skyless.research.paper._checks import NOISES, draw_seed, first_number, paper_chain
 from skyless.research.paper.monte_carlo import draw_lambdas
 from skyless.research.paper.plan import Panel, Plan, Progress, Results, Section, Task, Verdict, grouped
 from skyless.research.uncertainty.chain import CORRECTED, PRINTED

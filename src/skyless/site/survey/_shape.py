@@ -8,13 +8,13 @@ from msgspec import Struct, structs
 from scipy.special import chdtri
 
 from skyless.core.kernels.arrays import Array, Integers, Mask
-from skyless.site.survey.build import Measured, as_array, build_problem, levels, own_variance_m2, with_free_delays
+from skyless.site.survey._build import Measured, as_array, build_problem, levels, own_variance_m2, with_free_delays
+from skyless.site.survey._frame import Motion, align, fitting_points
 from skyless.site.survey.facts import PairRange
 from skyless.site.survey.fit import determined as determination
 from skyless.site.survey.fit.problem import MoreRows, Problem, Solution, jacobian, solve_least_squares
 from skyless.site.survey.fit.robust import OtherFit, RobustFit, fit_robustly
 from skyless.site.survey.fit.start import start_positions
-from skyless.site.survey.frame import Motion, align, fitting_points
 from skyless.site.survey.result import joined
 from skyless.site.survey.walk import TagEpochs, fit_with_tag
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from skyless.core.constants import TICK_S
 from skyless.core.kernels.arrays import Records
-from skyless.sim.cells.clocks import KNOT_BITS, KNOT_TICKS
-from skyless.sim.cells.receptions import PIECE, Path
+from skyless.sim.cells._clocks import KNOT_BITS, KNOT_TICKS
+from skyless.sim.cells._receptions import PIECE, Path
 from skyless.sim.trajectory import Piece, Trajectory
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.kernels.arrays import Array, Integers, Mask
-from skyless.site.survey.build import Measured, as_array, levels
+from skyless.site.survey._build import Measured, as_array, levels
 from skyless.site.survey.facts import Gauge
 from skyless.site.survey.fit.problem import distances_m
 from skyless.site.survey.result import anchors_named, joined
