@@ -151,7 +151,7 @@ def revoke(asked: _KeysOptions, made: _ChainOptions) -> None:
         f"next: 1. copy chain-{chain.serial}.public and chain-{chain.serial}.seed at once to each host of anchors that "
         "you trust; anchors that run use them without a restart, and tags that receive them refuse the earlier chain\n"
         f"2. copy {SITE_PUBLIC} to each host of anchors and each tag, so that tags that were off refuse it as well\n"
-        "3. delete the seeds of former chains",
+        "3. delete the seeds of earlier chains",
         markup=False,
         soft_wrap=True,
     )
