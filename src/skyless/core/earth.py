@@ -1,6 +1,6 @@
 """From a site's frame to the Earth: longitude, latitude and height of a point, and east, north and up of a vector.
 
-Plain arithmetic on single values, for programs that must start quickly; ``georeference.py`` has it for arrays.
+Plain arithmetic on single values, for programs that must start quickly.
 """
 
 from math import atan2, cos, degrees, hypot, radians, sin, sqrt
