@@ -17,9 +17,9 @@ settings.load_profile("skyless")
 
 TIERS = {
     "unit": "no process, and no simulated site for longer than a second; the tier of tests without a marker",
-    "site": "simulates a site, runs a command, or starts a program or a browser",
+    "site": "simulates a site, runs a command, or starts a program",
     "live": "a whole site of processes in real time, one test after the other",
-    "statistical": "Monte Carlo, long fuzzing, heavy clients: what takes more than some five seconds of a core",
+    "statistical": "Monte Carlo, long fuzzing, heavy clients such as browsers: what takes more than some two seconds",
 }
 _TIER_OF_FILE = re.compile(r"^pytestmark = pytest\.mark\.(\w+)$", re.MULTILINE)
 

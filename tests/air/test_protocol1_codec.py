@@ -31,6 +31,7 @@ def with_body(body):
 
 @given(beacons())
 @settings(max_examples=500)
+@pytest.mark.statistical
 def test_round_trip_over_all_ranges(beacon):
     frame = encode(beacon)
     assert decode(frame) == beacon
@@ -57,6 +58,7 @@ def test_truncated_frames_are_dropped(beacon):
 
 @given(beacons(), st.data())
 @settings(max_examples=300)
+@pytest.mark.statistical
 def test_any_changed_bytes_with_a_good_fcs_are_a_beacon_that_encodes_again_or_a_reason(beacon, data):
     body = bytearray(encode(beacon)[:-2])
     at = data.draw(st.integers(0, len(body)))

@@ -92,6 +92,7 @@ def repeatable(value):
 
 
 @pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.statistical
 def test_a_function_gives_the_figures_of_its_command(results, name, folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert main([*COMMANDS[name].split(), "--json"]) in {None, 0}

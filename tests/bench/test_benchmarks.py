@@ -13,7 +13,7 @@ from skyless.research.bench._runs import (
     packets_of,
 )
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 
 @pytest.mark.parametrize("mesh", [False, True])

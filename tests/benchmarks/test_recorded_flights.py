@@ -11,7 +11,7 @@ import pytest
 import synthetic_recordings as synthetic
 from skyless.cli.main import main
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 ROWS = 4000
 SETTLE_S = 3.0

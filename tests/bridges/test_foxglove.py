@@ -315,6 +315,7 @@ json_values = st.recursive(
 @settings(max_examples=300)
 @given(data=st.text() | st.binary() | json_values.map(json.dumps))
 @pytest.mark.site
+@pytest.mark.statistical
 def test_no_request_raises(data):
     request = decode_request(data)
     assert request is None or isinstance(request, Subscribe | Unsubscribe)

@@ -92,6 +92,7 @@ def test_a_recorder_that_found_no_site_says_so_with_its_exit_code(tmp_path, caps
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.statistical
 def test_a_program_that_is_asked_to_end_does_so_as_planned(number):
     with started(*SKYLESS, "ether", "--mqtt", "none", "--listen", "0") as program:
         assert "ether at" in program.stderr.readline()

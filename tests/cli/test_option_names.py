@@ -87,6 +87,7 @@ def test_every_option_has_help(options):
     ] == []
 
 
+@pytest.mark.statistical
 def test_a_number_that_is_none_is_refused_by_every_option(options, capsys):
     """Before the command begins: NaN, and infinities."""
     numbers = [(name, command) for name, uses in options.items() for command, (one, _) in uses.items() if one is float]

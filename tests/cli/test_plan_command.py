@@ -13,7 +13,7 @@ from skyless.sim.lab import paper_lab_site
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 EXTRAS = """
 [[walls]]

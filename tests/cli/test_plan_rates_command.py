@@ -8,7 +8,7 @@ from matplotlib.image import imread
 from skyless.cli.main import main
 from skyless.site.file.load import load_site
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 GRID = ["--width", "120", "--depth", "90", "--spacing", "15"]
 HALL = """\

@@ -59,6 +59,7 @@ def test_version():
     assert (done.returncode, done.stdout.strip()) == (0, version("skyless"))
 
 
+@pytest.mark.statistical
 def test_every_command_has_help_with_an_example():
     for command in (["demo"], ["simulate"], ["replay"], ["bench"], ["site"], ["site", "new"], ["site", "check"]):
         done = skyless(*command, "--help")
@@ -101,6 +102,7 @@ def test_a_site_file_is_a_file(tmp_path, capsys):
         assert "a site file, not a pipe or a device" in capsys.readouterr().err
 
 
+@pytest.mark.statistical
 def test_a_reader_that_goes_away(lab):
     for arguments in (["site", "check", lab], ["site", "check", lab, "--json"], ["--help"]):
         reader, writer = os.pipe()
@@ -110,6 +112,7 @@ def test_a_reader_that_goes_away(lab):
         assert (done.returncode, done.stderr) == (1, b"")
 
 
+@pytest.mark.statistical
 def test_a_full_disk_behind_standard_output(lab):
     for arguments in (["site", "check", lab], ["site", "check", lab, "--json"], ["--help"]):
         with Path("/dev/full").open("wb") as full:

@@ -140,6 +140,7 @@ def test_a_site_file_serves_as_anchors(run):
     assert told["drops"]["unknown-anchor"] > 0  # the site has six anchors, the recording eight
 
 
+@pytest.mark.statistical
 def test_pictures(run, tmp_path):
     arguments = ["tdoa-table", "--anchors", "anchors.csv", "--json"]
     report(run(*arguments, "--truth", "truth.csv", "--plot", tmp_path / "a.png"))
@@ -148,6 +149,7 @@ def test_pictures(run, tmp_path):
     assert b"<svg" in (tmp_path / "b.SVG").read_bytes()
 
 
+@pytest.mark.statistical
 def test_a_table_for_people_in_a_pipe_has_no_control_characters(room):
     environment = {**os.environ, "FORCE_COLOR": "", "FIXES_COLUMNS": "80"}
     done = subprocess.run(

@@ -61,6 +61,7 @@ def test_a_run_tells_what_was_asked_of_it(run):
     assert told["dropped"] == sum(told["drops"].values())
 
 
+@pytest.mark.statistical
 def test_protection_levels_are_told_and_hold_with_a_late_anchor(run, tmp_path):
     asked = ["--method", "joint", "--duration", "6", "--bias", "2:0.5", "--integrity-risk", "1e-3", "--json"]
     told = report(run(*asked, "--alert-limit-m", "0.2", "--fixes-csv", "fixes.csv"))
@@ -126,6 +127,7 @@ def test_a_tag_walks_its_path_and_rests_at_its_end(run, tmp_path):
     assert all(math.dist(a[1:], b[1:]) <= 2.0 * (b[0] - a[0]) + 1.3e-5 for a, b in pairwise(truth))
 
 
+@pytest.mark.statistical
 def test_faults_show_in_the_figures(run):
     base = ["--scenario", "paper", "--position", "3,4", "--duration", "6", "--noise-ps", "100", "--json"]
     clean = report(run(*base))
@@ -136,6 +138,7 @@ def test_faults_show_in_the_figures(run):
     assert silent["messages"] == pytest.approx(clean["messages"] * (1 - 4 / 6 / 6), rel=0.02)
 
 
+@pytest.mark.statistical
 def test_the_room_is_the_lab_with_the_errors_of_rooms(run):
     """The same seed again gives the same room; paths may be given there, with their speed."""
     base = ["--method", "joint", "--tags", "3", "--duration", "5", "--json"]
@@ -274,6 +277,7 @@ def test_a_mistake_is_told_in_one_line(run, tmp_path, arguments, said):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.statistical
 def test_an_interrupted_run_keeps_what_it_has_written(tmp_path):
     path = tmp_path / "fixes.csv"
     process = subprocess.Popen(

@@ -151,6 +151,7 @@ def test_wrong_input_is_one_line(site, keys, tmp_path, capsys):
     refused(["show", site], capsys, "holds no chain-N.public")
 
 
+@pytest.mark.statistical
 def test_an_interrupt_leaves_nothing(site, tmp_path):
     command = [sys.executable, "-m", "skyless.cli.main", "site", "keys", "new", site, "--years", "10"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True)

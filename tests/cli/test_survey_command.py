@@ -377,6 +377,7 @@ def test_facts_from_options(hall):
     assert (free.dimensions, sorted(free.heights_m), free.height_std_m) == (3, [1, 2], 0.1)
 
 
+@pytest.mark.statistical
 def test_missing_heights_are_those_of_the_others_and_said(hall, capsys):
     """They are neither typed nor measured, so the reader of the result has to know."""
     heights = [part for k in range(1, 11) for part in ("--anchor-height", f"{k}={3 if k < 10 else 5}")]

@@ -69,6 +69,7 @@ def test_the_delays_of_a_site_are_found_and_written_back(site_recording, capsys,
     ]
 
 
+@pytest.mark.statistical
 def test_a_replay_with_the_corrected_file_is_as_good_as_without_errors(site_recording, capsys, tmp_path):
     folder, _ = site_recording
     out = tmp_path / "new.toml"

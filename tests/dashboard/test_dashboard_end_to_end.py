@@ -92,6 +92,7 @@ async def settled(condition):
 
 
 @in_loop
+@pytest.mark.statistical
 async def test_a_site_is_found_shown_and_watched(tmp_path):
     where = BrokerSettings(port=free_port(), data=tmp_path / "broker")
     broker = await start_broker(where)
@@ -138,6 +139,7 @@ async def test_a_site_is_found_shown_and_watched(tmp_path):
 
 
 @in_loop
+@pytest.mark.statistical
 async def test_a_page_that_does_not_read_delays_no_other(tmp_path):
     settings = BrokerSettings(port=free_port(), data=tmp_path / "broker")
     async with (

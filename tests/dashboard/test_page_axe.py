@@ -10,7 +10,7 @@ import pytest
 from page_browser import THREE_FRAMES, until
 from page_fake_survey import FakeSurvey
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 axe = pytest.importorskip("axe_playwright_python.base")
 

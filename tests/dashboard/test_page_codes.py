@@ -7,7 +7,7 @@ from page_browser import until
 
 from skyless.core.keys.fault import Fault
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 DAY_S = 86400.0
 

@@ -7,7 +7,7 @@ import pytest
 from page_browser import until
 from page_fake_survey import moved, watch
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 OFFLINE = made_up.reason("anchors", "warning", "anchor 8 of 8 is offline", "See its power.", ["anchor/8"])
 SLOW = made_up.reason("slow", "bad", "this computer is too slow: the emulated air missed 41 % of the transmissions")

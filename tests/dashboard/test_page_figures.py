@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 
 @pytest.fixture

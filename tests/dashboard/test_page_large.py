@@ -6,7 +6,7 @@ import page_fake_site as made_up
 import pytest
 from page_browser import until
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 TAGS = 400
 SHOWN = "document.querySelectorAll('#panel-tags tbody button.name').length"

@@ -10,7 +10,7 @@ from PIL import Image
 
 from skyless.core.integrity import Alert
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 SHOWN = "document.getElementById('banner').hidden === false"
 

@@ -3,7 +3,7 @@
 import pytest
 from page_browser import until
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 TABS = ("tags", "anchors", "events", "timing", "zones", "recordings")
 LUMA = "getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number).reduce((a, b) => a + b)"

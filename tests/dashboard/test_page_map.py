@@ -17,7 +17,7 @@ from PIL import Image
 from skyless.site.planning.colours import COLOUR_STOPS, scale_of
 from value_colours import colour_of
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 PROTANOPIA = np.array([[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]])
 DEUTERANOPIA = np.array([[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]])

@@ -9,7 +9,7 @@ from page_browser import THREE_FRAMES, until
 from page_fake_server import FIRST_FIX_S
 from PIL import Image
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from page_browser import until
 from page_fake_survey import TRUE, FakeSurvey
 from PIL import Image
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 SIDEWAYS = """[...document.querySelectorAll("html, body, #panels, .step-body")]
   .filter((e) => e.scrollWidth > e.clientWidth + 1).map((e) => e.id || e.className || e.tagName)"""

@@ -6,7 +6,7 @@ import pytest
 from page_browser import until
 from page_fake_site import condition
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 
 def sites(shown, *known):

@@ -8,7 +8,7 @@ import pytest
 from page_browser import THREE_FRAMES, until
 from page_fake_server import DOCK
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from skyless.sim.impairments import Impairments
 from skyless.sim.trajectory import Roaming
 from skyless.site.file.template import grid_site
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 GRID = replace(grid_site(240.0, 240.0, 15.0, 4.0, 1.0), accuracy=EXACT)
 

@@ -82,6 +82,7 @@ def test_snapshots_err_as_the_propagated_covariance_says(method, delayed, weight
     assert per_dimension == pytest.approx(1.0, abs=0.08)
 
 
+@pytest.mark.statistical
 def test_chi2_of_weighted_fixes_is_chi2():
     """Mean over degrees of freedom (3 each); one sigma of 1000 correlated fixes is √(2·1.2/3000) = 0.028."""
     judged = run(16.0, method="weighted", seed=4, settle_s=1.0)[2]
@@ -111,6 +112,7 @@ def test_joint_is_not_over_confident():
         assert low < np.mean(squares) < high
 
 
+@pytest.mark.statistical
 def test_the_same_seed_gives_the_same_report():
     def facts(seed):
         return {k: v for k, v in asdict(run(4.0, seed=seed, method="joint")[1]).items() if k not in {"wall_s", "speed"}}

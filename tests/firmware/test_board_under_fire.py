@@ -23,7 +23,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from skyless.core.ticks import wrap
 from skyless.radio.serial.link import Done, Heard, Status, TooLate
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 FAULTS = st.sampled_from([None, None, None, "header", "parity", "delimiter", "first-path"])
 

@@ -29,6 +29,7 @@ def file(tmp_path_factory):
 
 
 @pytest.mark.parametrize("kind", [HOST])
+@pytest.mark.statistical
 def test_the_commands_give_the_fixes_that_their_classes_give(kind, file, capfd):
     site = load_site(file)
     of_classes = EmulatedSite(site, PATHS, boards(kind), wire=wire_of(kind))

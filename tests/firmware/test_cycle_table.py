@@ -10,7 +10,7 @@ pytest.importorskip("unicorn")
 
 from emulator.processor.cycle_table import markdown, measure_cycles
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 PAGE = FIRMWARE.parent / "docs" / "hardware.md"
 RENEW = "python benchmarks/firmware_cycles.py --write renews docs/hardware.md"

@@ -9,7 +9,7 @@ from site_stage import KINDS, site_of
 
 from skyless.research.compile_ahead import compile_kernels
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 SECONDS = {"host": 2.0, "image": 1.2}
 WARMUP_S = 0.6

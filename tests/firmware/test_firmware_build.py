@@ -97,6 +97,7 @@ def test_the_image_starts_at_the_processors_vectors_and_stays_in_its_flash(built
 
 @pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")
 @pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.statistical
 def test_ten_million_random_bytes_and_any_chip_stop_nothing(seed):
     """With the address and undefined-behaviour sanitizers; what is checked stands in firmware/host/fuzz.c."""
     done = run(str(build("fuzz")), "10000000", str(seed))

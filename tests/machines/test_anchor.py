@@ -113,6 +113,7 @@ def test_stamps_lie_on_the_radios_grid_and_frames_in_their_slots():
         assert -DELAYED_TX_GRANULARITY_TICKS - noise_ticks < late < DELAYED_TX_GRANULARITY_TICKS + noise_ticks
 
 
+@pytest.mark.statistical
 def test_the_master_time_is_as_good_as_it_says():
     """Mean of the squared normalised error over anchors, times and seeds.
 

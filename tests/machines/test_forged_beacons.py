@@ -36,7 +36,7 @@ from support.keyed_air import (
     run_tag,
 )
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 KEYS = made_keys(FREE.id, -60.0)
 VERIFIED = SiteTrust(FREE.id, KEYS.public, trust=Trust.VERIFIED)

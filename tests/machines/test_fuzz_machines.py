@@ -180,6 +180,7 @@ STAMPS = st.integers(0, 2**40 - 1)
 
 @settings(max_examples=100)
 @given(st.lists(st.tuples(st.binary(max_size=140), STAMPS, st.none() | st.floats(-1e9, 1e9)), max_size=20))
+@pytest.mark.statistical
 def test_any_bytes_at_any_time(receptions):
     """Random bytes are dropped and counted, and leave no trace in what comes after."""
     heard = tape()[:120]

@@ -132,6 +132,7 @@ def test_a_killed_process_is_reported_offline_by_its_last_will(make_broker):
     asyncio.run(check())
 
 
+@pytest.mark.statistical
 def test_a_process_frozen_for_longer_than_the_broker_waits_comes_back(make_broker):
     async def check():
         broker = make_broker()
@@ -241,6 +242,7 @@ def test_after_a_broker_s_death_it_reconnects_and_logs_what_was_dropped(make_bro
 
 
 @pytest.mark.parametrize("end", ["stop", "kill"])
+@pytest.mark.statistical
 def test_no_message_of_qos_1_is_lost_across_a_restart(make_broker, end):
     """The publisher goes on at 200 a second, the subscriber has a persistent session."""
 
@@ -298,6 +300,7 @@ def test_a_persistent_subscriber_gets_what_came_while_it_was_away_and_the_broker
     asyncio.run(check())
 
 
+@pytest.mark.statistical
 def test_a_frozen_broker_delays_nothing_and_gets_the_newest_afterwards(make_broker):
     """The same event loop freezes and thaws the broker: were anything to block, it would never be thawed."""
 
@@ -525,6 +528,7 @@ def test_a_message_costs_no_more_with_many_filters_and_more_topics_than_are_kept
 
 
 @pytest.mark.parametrize("first", ["gone", "mute"])
+@pytest.mark.statistical
 def test_a_link_goes_on_to_the_next_broker(make_broker, first, monkeypatch, caplog):
     """After a refusal, or without an answer; and when the one in use has died."""
     monkeypatch.setattr(connection, "BROKER_ANSWER_S", 1.0)

@@ -108,6 +108,7 @@ async def test_a_site_that_lacks_what_the_only_target_needs_ends_the_bridge_with
             await asyncio.wait_for(node.run(), 30)
 
 
+@pytest.mark.statistical
 def test_the_command_serves_readers_until_ctrl_c_and_then_says_what_it_did(tmp_path):
     async def main():
         port = free_port()

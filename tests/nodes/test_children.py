@@ -49,6 +49,7 @@ async def test_a_program_that_is_killed_is_started_again_and_logged():
 
 
 @in_loop
+@pytest.mark.statistical
 async def test_a_program_that_cannot_live_is_tried_ever_more_seldom_and_its_last_lines_are_reported(monkeypatch):
     waits = []
 

@@ -76,6 +76,7 @@ async def test_a_site_of_which_nothing_is_online_is_not_chosen_though_its_number
 
 
 @in_loop
+@pytest.mark.statistical
 async def test_commands_name_the_sites_that_are_alive_and_ask_for_one(tmp_path):
     broker = Embedded(tmp_path)
     await broker.start()

@@ -77,6 +77,7 @@ PAUSES = st.dictionaries(st.integers(0, len(HEARD) - 1), st.tuples(MILLISECONDS,
 
 @settings(max_examples=20)
 @given(PAUSES, st.integers(0, 8000))
+@pytest.mark.statistical
 def test_no_fix_that_is_given_is_too_old_and_the_counts_add_up(pauses, each_us):
     host = SlowHost()
     for number, reception in enumerate(HEARD):

@@ -71,6 +71,7 @@ def site(tmp_path):
     return file
 
 
+@pytest.mark.statistical
 def test_no_key_leaves_the_programs(site, tmp_path):
     seen = []
 

@@ -230,6 +230,7 @@ def test_a_killed_recorder_leaves_all_but_the_last_second_and_another_one_goes_o
     assert json.loads(out)["receptions"] > 400
 
 
+@pytest.mark.statistical
 def test_a_disk_that_takes_no_more_is_reported_once_and_leaves_a_whole_file(broker, tmp_path):
     recorder = Recorder(broker.address, tmp_path / "full.mcap", limit_bytes=250_000)
 

@@ -123,6 +123,7 @@ def true_survey(anchors=tuple(POSITIONS_M)):
     return Survey(found, (), 0.03, 3, None, (), (), (), "true", None, ())
 
 
+@pytest.mark.statistical
 def test_ranges_come_of_the_stamps_that_anchors_publish():
     live = live_after(6.0)
     ranges = live.ranges()

@@ -16,7 +16,7 @@ from skyless.research.paper.monte_carlo import (
 )
 from skyless.research.uncertainty.chain import CORRECTED, Chain, Reference, chain_covariance
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 SHARING = list(Reference)
 

@@ -8,7 +8,7 @@ import pytest
 from skyless.research.paper._checks import CHECKED_ANCHORS, NOISES, QUANTITY_NAMES, paper_chain, paper_checks
 from skyless.research.paper._distributions import lambda_distributions
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 DRAWS = 2_000_000
 PRINTED_PCT = {

@@ -13,7 +13,7 @@ from skyless.research.paper import run
 from skyless.research.paper._checks import QUANTITY_NAMES
 from skyless.research.paper.plan import Plan
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 TINY = Plan(
     seed=3, quick=True, fixes=600, noises_ps=(50.0, 100.0, 150.0), laps=1, fleet_sizes=(1, 3), rate_s=1.0, draws=20_000

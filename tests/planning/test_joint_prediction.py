@@ -26,7 +26,7 @@ from skyless.site.planning.links import (
 )
 from skyless.site.planning.predict import PlanSettings, Predictor
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 LAB = paper_lab_site(100.0)
 PLACES = ((0, 0, 0.2), (4, 0, 2.9), (8, 0, 0.4), (8, 5, 2.7), (8, 10, 0.2), (4, 10, 2.9), (0, 10, 0.5), (0, 5, 2.6))

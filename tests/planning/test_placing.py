@@ -27,7 +27,7 @@ from skyless.site.planning.optimise import (
 from skyless.site.planning.predict import PlanSettings, Predictor
 from skyless.site.planning.report import plan_warnings
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 FILE = Path("site.toml")
 BRACKETED = PlanSettings("bracketed")

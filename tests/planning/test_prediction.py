@@ -39,7 +39,7 @@ from skyless.site.planning.links import (
 )
 from skyless.site.planning.predict import PlanSettings, Predictor, with_noise
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 LAB = paper_lab_site(100.0)
 QUIET = replace(LAB, noise=NoiseSite(100.0, 100.0, 1e-15, 1e-15))

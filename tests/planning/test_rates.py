@@ -22,7 +22,7 @@ from skyless.site.planning.links import range_of, with_range
 from skyless.site.planning.picture import draw_rates
 from skyless.site.planning.rates import RECEIVED_HZ, rate_map, rate_report, tag_rates
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 SHARP = ChannelModel(sensitivity_width_db=1e-3)
 RATE_HZ = 100.0

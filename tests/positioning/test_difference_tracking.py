@@ -142,6 +142,7 @@ def test_covariances_hold_where_anchors_are_off_as_assumed(seed):
     assert 0.3 < np.mean(normalised) < 1.44
 
 
+@pytest.mark.statistical
 def test_a_tag_at_rest_is_known_better_than_one_that_may_move_and_wakes_at_once():
     moving, _ = run(30.0)
     rows, tracking = run(30.0, still=True)
@@ -258,6 +259,7 @@ def test_no_level_where_the_anchors_do_not_tell_the_height(height_m):
 CORNERS_M = {n: (8.0 * (n & 1), 6.0 * (n >> 1 & 1), 0.3 + 2.4 * (n >> 2)) for n in range(8)}
 
 
+@pytest.mark.statistical
 def test_a_tag_that_moved_on_in_silence_is_found_again():
     """Round and round at 1 m/s, heard for 3 s and then not for 8 s; the noise is half of what the filter assumes."""
     generator = np.random.default_rng(4)

@@ -71,6 +71,7 @@ def test_fixes_are_honest_from_the_first_on(case, anchors_m, height_m):
     assert 0.6 < np.mean(squares[100]) < 1.35
 
 
+@pytest.mark.statistical
 def test_starts_know_what_range_errors_they_have():
     """Every anchor late by its own 3 cm, its place told wrong by 2 cm on each axis."""
     errors = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
@@ -396,6 +397,7 @@ def with_site_time(packets, master_term):
         )
 
 
+@pytest.mark.statistical
 def test_reports_help_where_most_packets_are_lost():
     squares, used = np.zeros(2), 0
     for seed in range(12):

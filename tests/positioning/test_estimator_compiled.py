@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 SCRIPT = """
 from estimator_builders import MESH, begun, episode_of, settings_of

@@ -86,6 +86,7 @@ def test_clean_receptions_lose_nothing():
 
 
 @pytest.mark.parametrize(("fault", "least_gain"), [({"bias_m": 0.4}, 0.9), ({"nlos": 0.4}, 1.0)])
+@pytest.mark.statistical
 def test_blocked_paths_that_show_cost_less(fault, least_gain):
     """One anchor alone is found out by its innovations, too: there is nothing to gain, and little to lose."""
     squared, normalised, _ = _squared("joint", True, True, **fault)

@@ -45,6 +45,7 @@ def test_a_height_that_is_called_exact_is_believed():
 
 
 @pytest.mark.parametrize("height_std_m", [0.0, HEIGHT_STD_M])
+@pytest.mark.statistical
 def test_what_is_told_is_the_given_height(height_std_m):
     episode = episode_of(MESH, 10, 1, ROOM_M)
     estimator = begun(episode, settings_of(height_std_m=height_std_m), ROOM_M)

@@ -216,6 +216,7 @@ def test_the_order_of_the_anchors_does_not_move_the_position(seed, n, height_kno
 
 
 @pytest.mark.parametrize("height_known", [True, False])
+@pytest.mark.statistical
 def test_the_order_of_the_anchors_hardly_ever_decides_whether_a_rival_is_found(height_known):
     """Rivals are searched from starts that depend on the reference: 1 in 1000 rooms may differ."""
     both = [pair for seed in range(1000) if (pair := in_two_orders(seed, 5 + seed % 4, height_known)) is not None]

@@ -169,6 +169,7 @@ def test_near_the_anchors_plane_the_reported_height_error_is_honest(across):
         assert np.mean(normalised) == pytest.approx(1.0, abs=0.2)
 
 
+@pytest.mark.statistical
 def test_chi2_rejects_about_as_often_as_it_says():
     count, tail, covariance = 4000, 0.05, 0.05**2 * (np.eye(5) + 1)
     rejected = [

@@ -53,6 +53,7 @@ def tiny(name, *after):
     return Part(name, "tiny:compile_all", (name,), after=after)
 
 
+@pytest.mark.statistical
 def test_parts_are_compiled_once_and_counted(folder):
     reports = []
     parts = (tiny("one"), tiny("two", "one"))
@@ -83,6 +84,7 @@ def test_a_slow_machine_is_promised_nothing_before_it_is_measured_and_little_tha
     assert processes._time_left_s([waiting], 0.0, 1) is None
 
 
+@pytest.mark.statistical
 def test_a_part_that_fails_is_reported_and_the_others_are_compiled(folder):
     parts = (tiny("wrong"), tiny("fine", "wrong"))
     failures = asyncio.run(compile_parts(parts, lambda _: None))
@@ -182,6 +184,7 @@ print(json.dumps(compiled))
 """
 
 
+@pytest.mark.statistical
 def test_after_the_parts_of_the_lab_nothing_is_left_to_compile():
     """What this finds missing is compiled first, as at any first start."""
     done = subprocess.run([sys.executable, "-c", NOTHING_NEW], capture_output=True, text=True, check=True)

@@ -149,6 +149,7 @@ def damage(record, rng):
 
 
 @pytest.mark.parametrize("kind", LINES)
+@pytest.mark.statistical
 def test_whatever_is_on_the_line_costs_one_record_behind_it_at_most_and_is_counted(kind):
     rng, line = random.Random(11), LINES[kind]()
     number, spoilt, missed, covered, passed = 1, 0, 0, 0, 0

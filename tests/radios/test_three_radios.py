@@ -82,6 +82,7 @@ def ways():
     return emulated, rounded, asyncio.run(over_the_line(rounded)), chip, machines, tag
 
 
+@pytest.mark.statistical
 def test_the_same_frames_at_the_same_ticks_from_a_whole_site_on_driver_and_model(ways):
     emulated, _, serial, chip, machines, tag = ways
     assert len(emulated) > 1000

@@ -192,6 +192,7 @@ def test_any_record_is_a_packet_or_counted(records):
 
 
 @pytest.mark.parametrize("reader", [fira.read_text, phones.read])
+@pytest.mark.statistical
 def test_random_lines_never_raise(reader):
     rng, found = random.Random(5), 0
     whole = b"".join(synthetic.uci_text(90) if reader is fira.read_text else synthetic.phone_records(90))

@@ -35,6 +35,7 @@ delays = st.lists(st.floats(0.0, 0.08), min_size=300, max_size=300)
 
 
 @given(delays, st.integers(60, 250), st.floats(0.3, 30.0))
+@pytest.mark.statistical
 def test_a_counter_that_stood_still_is_tied_again(late_s, stalled_at, stall_s):
     """The emulated air was stopped, or the host's clock set: all later times are later, none is between."""
     late_s[0] = late_s[stalled_at] = 0.0

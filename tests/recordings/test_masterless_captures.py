@@ -53,6 +53,7 @@ def test_packets_are_better_than_their_differences(replay, system, speed_mps):
 
 
 @pytest.mark.parametrize("system", hall.CAPTURES)
+@pytest.mark.statistical
 def test_the_captures_are_of_the_systems(folder, system):
     with open_recording(folder / f"{system}-0.0") as recording:
         packets = list(recording)

@@ -239,6 +239,7 @@ def test_a_file_cut_anywhere_loses_only_what_is_beyond_the_cut(small, tmp_path_f
 
 @given(st.data())
 @settings(max_examples=300)
+@pytest.mark.statistical
 def test_damaged_files_do_not_raise(small, tmp_path_factory, data):
     content = bytearray(small[0])
     for _ in range(data.draw(st.integers(1, 5))):
@@ -267,6 +268,7 @@ time.sleep(60)
 """
 
 
+@pytest.mark.statistical
 def test_a_writer_that_is_killed_leaves_all_that_it_flushed(tmp_path):
     path = tmp_path / "killed.mcap"
     here = Path(__file__).parent

@@ -73,6 +73,7 @@ def test_what_was_asked_of_levels_is_replayed(tmp_path, join_s, with_state):
     assert {fix.alert for fix in fixes if fix.hpl_m is not None} == {Alert.LIMIT}
 
 
+@pytest.mark.statistical
 def test_levels_of_another_risk_are_larger_and_no_longer_compared(tmp_path):
     path = tmp_path / "live.mcap"
     record(path, messages(2.0, ("a",), "joint", 0.0))
@@ -125,6 +126,7 @@ def test_a_recorded_fix_of_other_bits_is_found(tmp_path):
     assert replayed(path)[0].identical.different == 1
 
 
+@pytest.mark.statistical
 def test_judged_against_the_recorded_truth(tmp_path):
     path = tmp_path / "live.mcap"
     record(path, messages(3.0, tuple(PLACES)))
@@ -234,6 +236,7 @@ def test_another_method_begins_cold_and_is_compared_with_nothing(tmp_path):
     assert 60 < report.fixes < 200
 
 
+@pytest.mark.statistical
 def test_the_command_tells_one_tag_as_other_replays_and_all_in_sums(tmp_path, capsys):
     path, table, plot = tmp_path / "live.mcap", tmp_path / "fixes.csv", tmp_path / "plot.png"
     record(path, messages(2.0, ("a", "b"), publish_every=8))

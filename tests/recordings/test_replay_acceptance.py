@@ -52,6 +52,7 @@ def kuipman(recordings, capture):
     return folder / "raw_yaml" / f"{capture}.yaml", "--anchors", folder / "anchors.csv"
 
 
+@pytest.mark.statistical
 def test_a_static_tag_is_found_in_a_process_of_its_own(recordings):
     arguments = ["replay", *kuipman(recordings, "b34daf0_output20240415"), "--json"]
     command = [sys.executable, "-m", "skyless.cli.main", *map(str, arguments)]

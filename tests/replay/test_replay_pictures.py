@@ -35,6 +35,7 @@ def test_a_png_has_a_size_and_something_in_it(tmp_path, count, truth):
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.statistical
 def test_an_svg_is_xml_and_a_pdf_is_a_pdf(tmp_path):
     draw(tmp_path / "picture.svg", rows(50, truth=True), "a < b & c")
     assert ElementTree.parse(tmp_path / "picture.svg").getroot().tag.endswith("}svg")

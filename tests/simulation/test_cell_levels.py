@@ -14,7 +14,7 @@ from skyless.sim.trajectory import Roaming, Static, Waypoints
 from skyless.site.channel import ChannelModel
 from support.cell_medium import cell_world
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 CODES = np.array([period_code(1.0 / rate_hz) for rate_hz in np.linspace(20.0, 40.0, 60)])
 UNTIL_S = 1.5

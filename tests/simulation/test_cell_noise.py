@@ -138,6 +138,7 @@ print(len(received), received.rx_ticks.tolist(), received.relay_rx_ticks.tolist(
 """
 
 
+@pytest.mark.statistical
 def test_plain_python_computes_the_same_world():
     """NumPy warns of the keys' overflow, which is wanted."""
     printed = []

@@ -410,6 +410,7 @@ for b in _busy_world(3).run(0.12):
 """
 
 
+@pytest.mark.statistical
 def test_without_the_compiler_the_world_is_the_same():
     """Interpreted kernels give the same frames at the same listeners, and stamps to the rounding."""
     here = Path(__file__).parent

@@ -129,6 +129,7 @@ def _lagged(history, lag):
 
 
 @pytest.mark.parametrize("along", ["time", "way"])
+@pytest.mark.statistical
 def test_changing_errors_forget_with_their_correlation_length(along):
     """300 tags that walk at 0.5 m/s: 10 s are 5 m. Tags at rest forget with the time alone."""
     paths = [Waypoints([(0, k), (500, k)], 0.5) for k in range(300)] + [Static(0.0, 0.0)]
@@ -230,6 +231,7 @@ def test_a_bias_that_creeps_grows_from_its_beginning_and_ends_at_once():
 
 
 @pytest.mark.parametrize("ppm", [1.0, -1.0, 5.0])
+@pytest.mark.statistical
 def test_a_warming_crystal_gains_what_its_curve_says(ppm):
     """The tag's stamps run ahead by ppm·(t − τ(1 − e^(−t/τ))), t from the start of the warm-up."""
     rows = np.vstack(list(_late_m(_with(warm_ups=(WarmUp(ppm, 20.0, 1.0),)), 10.0).values()))

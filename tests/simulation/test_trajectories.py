@@ -66,6 +66,7 @@ def test_paths_that_cannot_be_walked_are_refused(points, options):
         Waypoints(points, 1.0, **options)
 
 
+@pytest.mark.statistical
 def test_roaming_keeps_its_spread_and_speed_from_the_start_on():
     """Over 400 paths, at the start and much later; and velocities gain what a constant-velocity model says."""
     count, qa, damping_s = 400, 0.3, 3.0

@@ -11,7 +11,7 @@ from skyless.research.studies.efficiency import run_chunk, summary
 from skyless.research.studies.episodes import Case, draw_episode
 from skyless.sim.lab import paper_lab_site
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 LAB_M = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in paper_lab_site().anchors])
 SLOT_S = paper_lab_site().schedule.slot_s

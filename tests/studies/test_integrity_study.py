@@ -129,6 +129,7 @@ def test_levels_that_mislead_often_fail():
 
 
 @pytest.mark.parametrize("levels_m", [(0.1, 0.2), None])
+@pytest.mark.statistical
 def test_it_can_be_drawn(levels_m):
     study = STUDIES["integrity"]
     told = study.rows(PLAN, [chunk(3, levels_m)] * 2 * len(FAULTS))

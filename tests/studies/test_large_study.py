@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from skyless.research.studies import large
 from skyless.research.studies.common.plan import Plan
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 PLAN = Plan(seed=5, worlds=2, seconds=8.0)
 CASES = {case.name: case for case in large.cases(PLAN)}

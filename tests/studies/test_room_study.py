@@ -379,6 +379,7 @@ def test_tags_that_know_how_hard_they_turn_turn_as_those_that_do_not():
         assert [p.position(5.0).tolist() for p in a.trajectories] == [p.position(5.0).tolist() for p in b.trajectories]
 
 
+@pytest.mark.statistical
 def test_one_world_of_the_room_judges_levels_beside_errors():
     plan = plan_of("joint", 1, study="room", worlds=2, seconds=3.0)
     result = run_world(room.cases(plan)[0].runs[0])

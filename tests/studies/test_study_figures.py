@@ -15,7 +15,7 @@ from skyless.sim.lab import lab_site
 from skyless.sim.world import World
 from skyless.site.file.check import check_site
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 SMALL = Plan(method="joint", worlds=2, seconds=1.0, tags=1)
 RANDOM = np.random.default_rng(5)

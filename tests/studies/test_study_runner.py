@@ -16,7 +16,7 @@ from skyless.research.studies.common.plan import MEASURED, Cell, Plan
 from skyless.research.studies.common.runner import run_cells, run_cells_on_dask
 from skyless.research.studies.common.summary import world_cells, world_rows
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 PLAN = Plan(method="joint", seed=3, quick=True, worlds=2, seconds=1.0, tags=1)
 

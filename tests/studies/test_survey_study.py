@@ -33,6 +33,7 @@ def test_all_cases_have_their_limits():
     assert len(with_limits) >= 18
 
 
+@pytest.mark.statistical
 def test_rows_of_few_runs(monkeypatch):
     monkeypatch.setattr(study, "GROUPS", SMALL)
     chosen, plan = STUDIES["survey"], Plan(worlds=2, seconds=1.0, seed=5, quick=True)

@@ -14,6 +14,7 @@ def fitted(problem, sketch_m=None):
     return fit_robustly(problem, start_positions(problem, sketch_m), 0.03)
 
 
+@pytest.mark.statistical
 def test_clean_sites_are_not_ambiguous():
     """At most 1 % are flagged: two of 18 would come once in 70 runs of this test if 1 % were."""
     flagged = 0
@@ -55,6 +56,7 @@ def test_two_anchors_that_hang_on_two_others_have_a_mirror_image():
     assert (5, 6) in [other.anchors for other in others]
 
 
+@pytest.mark.statistical
 def test_wrong_results_are_flagged():
     """Of runs beyond 10 cm and 4 stated standard deviations 90 % are: not fewer than 2 σ below."""
     wrong, flagged = 0, 0

@@ -30,6 +30,7 @@ def plant(seed):
     return drawn.position_m, PairRanges(pairs, tuple(range(1, 29))), Facts(heights_m=heights_m)
 
 
+@pytest.mark.statistical
 def test_the_one_anchor_is_named_and_the_others_that_follow_it_by_centimetres_are_not():
     _, ranges, facts = plant(0)
     survey = run_survey(ranges, facts)
@@ -46,6 +47,7 @@ def test_the_one_anchor_is_named_and_the_others_that_follow_it_by_centimetres_ar
         assert abs(np.linalg.norm(here - there) - float(said["apart"])) < 0.02
 
 
+@pytest.mark.statistical
 def test_the_tape_that_is_named_decides_between_the_mirror_places():
     position_m, ranges, facts = plant(1)
     survey = run_survey(ranges, facts)

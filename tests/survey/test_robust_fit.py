@@ -45,6 +45,7 @@ def test_errors_are_those_of_the_stated_covariance(layout, dimensions):
     assert abs(ratios.mean() - 1.0) < 4.0 * ratios.std() / np.sqrt(len(ratios))
 
 
+@pytest.mark.statistical
 def test_late_ranges_of_the_lab_are_left_out():
     """80 % of runs below 10 cm are asked for; fewer than 6 of 12 would come once in 250 then."""
     runs = [draw(LAB, 500 + seed, late=0.1) for seed in range(12)]
@@ -52,6 +53,7 @@ def test_late_ranges_of_the_lab_are_left_out():
     assert sum(good) >= 6
 
 
+@pytest.mark.statistical
 def test_late_ranges_of_a_hall_with_unknown_delays():
     """95 % below 10 cm and 2 % of good pairs left out are asked for: bounds that are missed once in 1000 then."""
     good, out, pairs = 0, 0, 0
@@ -77,6 +79,7 @@ def worse(seed):
     return drawn._replace(problem=replace(drawn.problem, variance_m2=np.full(len(drawn.problem.range_m), 0.03**2)))
 
 
+@pytest.mark.statistical
 def test_a_sparse_plant_unfolds_and_most_of_its_anchors_are_determined():
     """Its ranges are off by 16 cm (rms) where 3 cm are expected; its positions are no better, and say so."""
     drawn = draw_plant(7)

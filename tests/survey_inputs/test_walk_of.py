@@ -78,6 +78,7 @@ def test_a_walk_separates_delays_from_positions_where_the_anchors_are_on_two_lin
     assert rms_m(joint) < 3.0 * np.sqrt(2.0) * stds[1]
 
 
+@pytest.mark.statistical
 def test_a_part_of_the_walk(walk):
     with McapRecording(walk) as recording:
         epochs = walk_of(recording, LAB.id, "a", (5.0, 12.0))

@@ -18,7 +18,7 @@ from skyless.core.protocol1.snapshots import (
 from skyless.research.uncertainty import chain
 from skyless.research.uncertainty.chain import CORRECTED, PRINTED, Chain
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 POSITIVE = [
     "master_rate",
