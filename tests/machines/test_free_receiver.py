@@ -15,6 +15,7 @@ from skyless.core.air.frame import Heard as Relay
 from skyless.core.air.instants import period_code
 from skyless.core.air.local_almanac import site_issue, site_page_for, site_pages_of
 from skyless.core.any_receiver import AnyReceiver
+from skyless.core.fix import NoFixReason
 from skyless.core.site import GeoreferenceSite
 from skyless.core.tag.beacon_receiver import NOT_DROPS
 from skyless.core.tag.receiver import Receiver
@@ -80,6 +81,7 @@ def test_methods_that_need_a_master_give_no_fix(method):
     receiver = AnyReceiver(method)
     assert not fixes_of(receiver, free_tape())
     assert receiver.counters == {"other-version": len(free_tape())}
+    assert receiver.reason is NoFixReason.NO_MASTER
 
 
 def undisturbed(falses, new_receiver=Receiver):

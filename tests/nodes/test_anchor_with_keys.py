@@ -20,8 +20,8 @@ from skyless.core.site import UnplacedAnchor, site_digest
 from skyless.core.ticks import difference
 from skyless.radio.interface import Restarted
 from skyless.run.anchor import AnchorNode, Anchors, health_of
-from skyless.run.keys.anchor_and_tag_keys import CALM_S, LASTING_S, MAX_NAMED, AnchorKeys, AnchorReport, FaultLines
 from skyless.run.keys.key_files import SEEDS_VARIABLE, chain_public_file, chain_seed_file, seed_bytes
+from skyless.run.keys.node_keys import CALM_S, LASTING_S, MAX_NAMED, AnchorKeys, AnchorReport, FaultLines
 from skyless.run.mqtt.messages import Counters, PlacementMessage
 from support.keyed_air import START_UNIX_S
 

@@ -100,6 +100,8 @@ class AnyReceiver:
     @property
     def reason(self) -> NoFixReason:
         """Why the last frame has made no fix."""
+        if not self._may_change and self.counters["other-version"] and not self.counters["heard"]:
+            return NoFixReason.NO_MASTER
         return self._receiver.reason
 
     @property

@@ -21,7 +21,7 @@ from skyless.core.protocols import AnchorMachine, decode_any, new_anchor
 from skyless.core.site import Site, is_same_but_placed, largest_change_m, site_digest
 from skyless.core.ticks import difference
 from skyless.radio.interface import Gone, Late, Radio, RadioEvent, Restarted, Sent
-from skyless.run.keys.anchor_and_tag_keys import KEYS_S, AnchorKeys, AnchorReport, recent_faults
+from skyless.run.keys.node_keys import KEYS_S, AnchorKeys, AnchorReport, recent_faults
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (

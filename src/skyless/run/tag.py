@@ -19,7 +19,7 @@ from skyless.core.tag.receiver import Receiver
 from skyless.core.trusted_receiver import GivenFix, SiteTrust, Trust, TrustedReceiver
 from skyless.radio.interface import Gone, Hint, Radio, RadioEvent, Restarted
 from skyless.run.fix_log import FIX_LEAVES_S, FixListener, FixLog, PhaseLog
-from skyless.run.keys.anchor_and_tag_keys import Remembered, TagMemory, TagReport, trust_reason
+from skyless.run.keys.node_keys import Remembered, TagMemory, TagReport, trust_reason
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import Counters, FixMessage, RequestMessage, TagHealth

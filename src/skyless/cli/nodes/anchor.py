@@ -57,7 +57,7 @@ def anchor(
     from skyless.radio.interface import AntennaDelays
     from skyless.research.compile_ahead import compile_kernels
     from skyless.run.anchor import Anchors
-    from skyless.run.keys.anchor_and_tag_keys import AnchorKeys
+    from skyless.run.keys.node_keys import AnchorKeys
     from skyless.run.open_radio import is_simulated, open_radios
     from skyless.run.process import run
 
