@@ -83,9 +83,8 @@ def round_planned_m(site, settings):
     clocks = AnchorClocks(clocks.sends, clocks.sender[:messages], gaps_s, clocks.kept)
     rest = (column[kept].copy() for column in relays[1:])
     table = np.zeros((len(PLACES_M), len(PLAN_COLUMNS)))
-    fill_joint_sigma(
-        PLACES_M, settings, planner.scene, clocks, Relays(np.array(ends, np.int64), *rest), planner.farthest_m, table
-    )
+    relays = Relays(np.array(ends, np.int64), *rest)
+    fill_joint_sigma(PLACES_M, settings, planner.scene, clocks, relays, planner.farthest_m, len(clocks.sends), table)
     return math.sqrt(float(np.mean(table[:, RMSE] ** 2)))
 
 

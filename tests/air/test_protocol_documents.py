@@ -18,7 +18,7 @@ from skyless.core.protocol1 import beacon as protocol1_beacon
 from skyless.core.protocol1 import codec as protocol1_codec
 from skyless.core.protocol1.almanac import page_for, pages_of
 from skyless.core.site import AnchorSite, Site
-from skyless.core.tag._selection import MAX_ANCHORS_IN_USE
+from skyless.core.tag.selection import MAX_ANCHORS_IN_USE
 from skyless.core.ticks import to_seconds
 
 SIGNED = {"x_m", "y_m", "z_m", "floor", "tag_height_m"}

@@ -1,7 +1,7 @@
 import pytest
 
 from skyless.core.air.frame import HEARD
-from skyless.core.tag._selection import (
+from skyless.core.tag.selection import (
     BETTER_DB,
     MAX_ANCHORS_IN_USE,
     MAX_KEPT,

@@ -10,9 +10,9 @@ from skyless.core.air.local_almanac import CommonPages, LocalAlmanacState
 from skyless.core.estimator.state import EstimatorSettings
 from skyless.core.kernels.filter import clock_noise, stamp_variance_m2
 from skyless.core.observation import Observation
-from skyless.core.tag._selection import MAX_ANCHORS_IN_USE, AnchorSelection
 from skyless.core.tag.beacon_receiver import AdmissionState, MethodOptions
 from skyless.core.tag.joint import Estimation, EstimationState
+from skyless.core.tag.selection import MAX_ANCHORS_IN_USE, AnchorSelection
 from skyless.core.ticks import FixTime, to_seconds
 
 DROP_S: Final = 2.0

@@ -18,8 +18,8 @@ from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.observation import Observation
-from skyless.core.tag._selection import MIN_FITTING, AnchorSelection, fitting_relays, is_full
 from skyless.core.tag.beacon_receiver import BeaconReceiver, HeardSite, MethodOptions, variance_factor_of
+from skyless.core.tag.selection import MIN_FITTING, AnchorSelection, fitting_relays, is_full
 from skyless.core.ticks import from_seconds
 
 if TYPE_CHECKING:

@@ -196,9 +196,10 @@ def fill_joint_sigma(
     clocks: AnchorClocks,
     relays: Relays,
     farthest: float,
+    most: int,
     table: Matrix,
 ) -> None:
-    """Fill ``table`` (points, columns) for the points, shape (m, 3)."""
+    """Fill ``table`` (points, columns) for the points, shape (m, 3), whose tags use at most ``most`` anchors."""
     dim = settings.dim
     shares, delays_m = scene.heard_at(points)
     fill_dops(scene, points, shares, dim, table)
@@ -207,7 +208,7 @@ def fill_joint_sigma(
     fresh = site_state(settings, scene.anchors, seen)
     motions = np.zeros((len(points), 3))
     for point, share, delay_m, motion, row in zip(points, shares, delays_m, motions, table, strict=True):
-        in_view = np.flatnonzero(share >= _RARELY)
+        in_view = scene.strongest(point, np.flatnonzero(share >= _RARELY), most)
         if len(in_view) <= dim:
             continue
         if not np.array_equal(in_view, seen):

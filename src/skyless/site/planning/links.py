@@ -174,6 +174,20 @@ class Scene(NamedTuple):
         share, delay_m = links(self.anchors, points, self.budget, self.walls)
         return share * self.sends, delay_m
 
+    def strongest(self, point: Vector, rows: Integers, most: int) -> Integers:
+        """Those of these rows of anchors, at most ``most``, from which a point receives the most power; ascending."""
+        if len(rows) <= most:
+            return rows
+        power_dbm = [
+            received_power_dbm(
+                self.budget[0],
+                float(np.linalg.norm(point - anchor_m)),
+                cross_walls(self.walls, anchor_m[0], anchor_m[1], point[0], point[1])[0],
+            )
+            for anchor_m in self.anchors[rows]
+        ]
+        return np.sort(rows[np.argsort(power_dbm, kind="stable")[-most:]])
+
 
 def fill_dops(scene: Scene, points: Matrix, share: Matrix, dim: int, table: Matrix) -> None:
     """Fill the number of anchors in view and the columns of their DOPs."""

@@ -18,6 +18,7 @@ from skyless.core.protocol1.snapshots import SnapshotMethod
 from skyless.core.protocols import superframe_s
 from skyless.core.site import Site
 from skyless.core.tag.factory import estimator_settings
+from skyless.core.tag.selection import MAX_ANCHORS_IN_USE
 from skyless.site.channel import ChannelModel, pack_walls
 from skyless.site.planning._snapshot_sigma import fill_snapshot_sigma, rounds_of
 from skyless.site.planning.anchor_clocks import anchor_clocks, relays_of, row_of_master
@@ -94,8 +95,9 @@ class Predictor:
             self.settings.qa, self.site.tags.height_m, *filter_pages_of(self.site), superframe_s(self.site)
         )
         relays = relays_of(self.anchors_m, self.master, self.clocks, self.budget, self.walls)
+        most = MAX_ANCHORS_IN_USE if self.master is None else len(self.anchors_m)
         return lambda points, table: fill_joint_sigma(
-            points, settings, self.scene, self.clocks, relays, self.farthest_m, table
+            points, settings, self.scene, self.clocks, relays, self.farthest_m, most, table
         )
 
     def at(self, points_m: Matrix, progress: Callable[[float], None] | None = None) -> Matrix:
