@@ -197,7 +197,7 @@ class StudyOptions(_Studied, frozen=True, kw_only=True):
     method: Method = DEFAULT_METHOD
     """How positions are computed; by default the best method."""
     seed: Seed = 1
-    """The same seed gives the same rows on every scheduler, except CPU times."""
+    """Same seed, same rows on every scheduler, except CPU times."""
     episodes: Annotated[int | None, whole(1, 10**6)] = None
     """Episodes of two seconds for each case (efficiency, integrity)."""
     worlds: Annotated[int | None, whole(2, 10**5)] = None
