@@ -28,7 +28,7 @@ from skyless.site.file.load import load_site
 from skyless.site.file.template import grid_site, site_template
 from skyless.site.planning.links import PLAN_COLUMNS
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 MEASURED_TIMES = {"skyless_version", "wall_s", "speed", "receptions_per_s", *MEASURED}
 ROWS = 600

@@ -22,7 +22,7 @@ from skyless.site.planning.links import ANCHORS_IN_VIEW, PDOP, PLAN_COLUMNS, SIG
 from skyless.site.planning.maps import csv_lines, geojson_lines, grid_of, plan_map, summary_of, to_wgs84
 from skyless.site.planning.predict import PlanSettings, Predictor
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 L_SHAPE = np.array([(0, 0), (12, 0), (12, 4), (5, 4), (5, 9), (0, 9)], dtype=float)
 LAB = paper_lab_site()

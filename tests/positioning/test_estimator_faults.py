@@ -118,6 +118,7 @@ def test_sensitivities_to_acceleration_are_what_it_does():
     np.testing.assert_allclose(behind_m / acceleration, expected, atol=0.2 * np.linalg.norm(expected))
 
 
+@pytest.mark.statistical
 def test_evidence_finds_the_size_of_a_fault():
     episode, sizes = episode_of(MESH), []
     for late_m in (0.0, LATE_M):

@@ -108,6 +108,7 @@ def test_a_textbook_filter_says_the_same(case, anchors_m, height_m, height_std_m
     [PLAIN, MESH, Case(noise_ps=150.0), Case(random_walk_fm=1e-8), Case(qa=2.0, mesh=False)],
     ids=["plain", "mesh", "150 ps", "random walk", "agile"],
 )
+@pytest.mark.statistical
 def test_the_covariance_is_the_bound_of_what_has_come_in(case):
     """Process noise that follows what innovations show is that of the settings, with these seeds."""
     episode = episode_of(case, 100)

@@ -20,7 +20,7 @@ from skyless.sim.range_errors import RangeErrorModel
 from skyless.sim.trajectory import Roaming, Static, Waypoints
 from skyless.site.channel import ChannelModel
 
-pytestmark = pytest.mark.site
+pytestmark = pytest.mark.statistical
 
 POSITIONS_M = np.array([(15.0 * x, 15.0 * y, 3.0) for y in range(20) for x in range(20)])
 QUIET = OscillatorModel(offset_ppm=0.0, white_fm=0.0, random_walk_fm=0.0)
