@@ -114,3 +114,19 @@ def test_truth_in_a_broken_archive_is_an_error(tmp_path):
     file.write_bytes(gzip.compress(b"t_s,x_m,y_m,z_m\n" + b"0,1,2,3\n" * 1000)[:-20])
     with pytest.raises(ConfigurationError, match="whole file"):
         read_truth(file)
+
+
+def test_damaged_rows_of_a_recording_that_has_its_own_truth_are_left_out(tmp_path):
+    names = "t_s,listener,gt_L_x_m,gt_L_y_m,gt_L_z_m"
+    good = [f"{k / 10},7,{k},2,3" for k in range(6)]
+    damaged = [
+        "0.25,7,nan,2,3",
+        "0.25,7,1e300,2,3",
+        "0.25,7,x,2,3",
+        "0.2",
+        "\N{REPLACEMENT CHARACTER},7,1,2,3",
+        "0.3,7,1,2,3,4,5",
+    ]
+    truth = read_truth(write(tmp_path, "\n".join([names, *good[:3], *damaged, good[4], good[3], good[5]])))
+    assert truth.t_s.tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 0.5])
+    assert truth.position_m[:, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]

@@ -74,7 +74,7 @@ class _Row(Struct, frozen=True, gc=False):
 
 
 def _rows(path: str | PathLike[str], *headers: Sequence[str]) -> Iterator[_Row]:
-    """The rows of a table that has all columns of one of the headers."""
+    """The rows of a table that has all columns of one of the headers; of a recording those that are whole."""
     try:
         table = list(csv.reader(read_lines(path)))
     except csv.Error as error:
@@ -89,6 +89,8 @@ def _rows(path: str | PathLike[str], *headers: Sequence[str]) -> Iterator[_Row]:
         if not any(field.strip() for field in row):
             continue
         if len(row) != len(names):
+            if wanted is LISTENER_COLUMNS:
+                continue
             raise ConfigurationError(path, f"line {line}", ",".join(row), f"{len(names)} columns as in the header")
         yield _Row(path, line, {name: field.strip() for name, field in zip(names, row, strict=True)})
 
@@ -112,7 +114,10 @@ class Truth(Struct, frozen=True):
 
 
 def read_truth(path: str | PathLike[str], listener: str | None = None) -> Truth:
-    """Read a table of truth. Of MILUV ticks it reads the rows of one listener, by default of the first row."""
+    """Read a table of truth. Of MILUV ticks it reads the rows of one listener, by default of the first row.
+
+    These are a recording: its damaged rows are left out, as the replay drops and counts them.
+    """
     values: list[list[float]] = []
     columns: tuple[str, ...] = ()
     for row in _rows(path, POSITION_COLUMNS, LISTENER_COLUMNS):
@@ -124,12 +129,18 @@ def read_truth(path: str | PathLike[str], listener: str | None = None) -> Truth:
             listener = listener or row.fields.get("listener")
             if row.fields.get("listener", listener) != listener:
                 continue
-        values.append([row.number(name, _MAX_EARTH_M if name in columns[1:4] else inf) for name in columns])
+        try:
+            values.append([row.number(name, _MAX_EARTH_M if name in columns[1:4] else inf) for name in columns])
+        except ConfigurationError:
+            if columns is not LISTENER_COLUMNS:
+                raise
     if not values and listener is not None and columns is LISTENER_COLUMNS:
         raise ConfigurationError(path, "listener", listener, "one that the recording names")
     if not values:
         raise _empty(path, "row")
     table = np.array(values, dtype=np.float64)
+    if columns is LISTENER_COLUMNS:
+        table = table[np.argsort(table[:, 0], kind="stable")]
     times = table[:, 0]
     backwards = np.flatnonzero(np.diff(times) < 0.0)
     if len(backwards):
