@@ -84,7 +84,7 @@ def round_planned_m(site, settings):
     rest = (column[kept].copy() for column in relays[1:])
     table = np.zeros((len(PLACES_M), len(PLAN_COLUMNS)))
     relays = Relays(np.array(ends, np.int64), *rest)
-    fill_joint_sigma(PLACES_M, settings, planner.scene, clocks, relays, planner.farthest_m, len(clocks.sends), table)
+    fill_joint_sigma(PLACES_M, settings, planner.scene, clocks, relays, planner.farthest_m, None, table)
     return math.sqrt(float(np.mean(table[:, RMSE] ** 2)))
 
 

@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from skyless.core.kernels.arrays import Matrix
 from skyless.core.method_names import FILTERS
 from skyless.core.protocols import superframe_s as period_s
+from skyless.core.tag.selection import MAX_ANCHORS_IN_USE
 from skyless.sim.evaluation.fleet import Fleet, FleetSettings
 from skyless.sim.evaluation.scenarios import Request, impairments_of, stated_room
 from skyless.sim.trajectory import Static
@@ -103,6 +104,8 @@ def verify(
                 progress((world + now_s / end_s) / worlds)
     # filters give a fix for every message, snapshots one for each frame of a node
     per_round = len(predictor.clocks.sender) if settings.method in FILTERS else site.schedule.frames_per_node
+    if predictor.master is None:
+        per_round = min(per_round, MAX_ANCHORS_IN_USE)
     possible, rows = worlds * rounds * per_round, predictor.at(points_m)
     checks = [
         _check(point, row, batch, possible, has_range_errors=worlds > 1)

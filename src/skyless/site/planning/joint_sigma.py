@@ -196,19 +196,27 @@ def fill_joint_sigma(
     clocks: AnchorClocks,
     relays: Relays,
     farthest: float,
-    most: int,
+    most: int | None,
     table: Matrix,
 ) -> None:
-    """Fill ``table`` (points, columns) for the points, shape (m, 3), whose tags use at most ``most`` anchors."""
+    """Fill ``table`` (points, columns) for the points, shape (m, 3).
+
+    ``most``: anchors that a tag uses at most; the share of fixes is then that of these anchors' messages. None for all.
+    """
     dim = settings.dim
     shares, delays_m = scene.heard_at(points)
     fill_dops(scene, points, shares, dim, table)
     table[:, SIGMA:], table[:, FIX_SHARE] = math.inf, 0.0
     seen = np.zeros(0, np.int64)
     fresh = site_state(settings, scene.anchors, seen)
-    motions = np.zeros((len(points), 3))
-    for point, share, delay_m, motion, row in zip(points, shares, delays_m, motions, table, strict=True):
-        in_view = scene.strongest(point, np.flatnonzero(share >= _RARELY), most)
+    motions, messages = np.zeros((len(points), 3)), np.full(len(points), len(clocks.sender))
+    for k, (point, share, delay_m, motion, row) in enumerate(
+        zip(points, shares, delays_m, motions, table, strict=True)
+    ):
+        in_view = np.flatnonzero(share >= _RARELY)
+        if most is not None:
+            in_view = scene.strongest(point, in_view, most)
+            messages[k] = np.isin(clocks.sender, in_view).sum()
         if len(in_view) <= dim:
             continue
         if not np.array_equal(in_view, seen):
@@ -223,6 +231,6 @@ def fill_joint_sigma(
     claimed = table[known, SIGMA_X : SIGMA_Z + 1] / heard[:, None]
     variance = np.maximum(claimed - motions[known], 0.0)
     fill_errors(table, known, variance, table[known, BIAS] / heard, claimed.sum(axis=1))
-    table[known, FIX_SHARE] = heard / len(clocks.sender)
+    table[known, FIX_SHARE] = heard / messages[known]
     lost = ~(table[:, SIGMA] < farthest)
     table[lost, SIGMA:], table[lost, FIX_SHARE] = math.inf, 0.0

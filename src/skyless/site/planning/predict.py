@@ -95,7 +95,7 @@ class Predictor:
             self.settings.qa, self.site.tags.height_m, *filter_pages_of(self.site), superframe_s(self.site)
         )
         relays = relays_of(self.anchors_m, self.master, self.clocks, self.budget, self.walls)
-        most = MAX_ANCHORS_IN_USE if self.master is None else len(self.anchors_m)
+        most = MAX_ANCHORS_IN_USE if self.master is None else None
         return lambda points, table: fill_joint_sigma(
             points, settings, self.scene, self.clocks, relays, self.farthest_m, most, table
         )
