@@ -21,7 +21,9 @@ TIERS = {
     "live": "a whole site of processes in real time, one test after the other",
     "statistical": "Monte Carlo, long fuzzing, heavy clients such as browsers: what takes more than some two seconds",
 }
-_TIER_OF_FILE = re.compile(r"^pytestmark = pytest\.mark\.(\w+)$", re.MULTILINE)
+_TIER = f"({'|'.join(TIERS)})"
+_TIER_OF_FILE = re.compile(rf"^pytestmark = pytest\.mark\.{_TIER}$", re.MULTILINE)
+_MARKED = re.compile(rf"\bpytest\.mark\.{_TIER}\b")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -55,8 +57,9 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
         return True if not any("clients" in argument for argument in config.args) else None
     if not _tiers(config) or collection_path.suffix != ".py":
         return None
-    tier = _TIER_OF_FILE.search(collection_path.read_text(encoding="utf-8"))
-    return True if tier and tier[1] not in _tiers(config) else None
+    text = collection_path.read_text(encoding="utf-8")
+    tiers = set(_MARKED.findall(text)) | (set() if _TIER_OF_FILE.search(text) else {"unit"})
+    return True if tiers.isdisjoint(_tiers(config)) else None
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
