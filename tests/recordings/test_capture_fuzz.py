@@ -15,6 +15,7 @@ pytestmark = pytest.mark.site
 
 MUTATIONS = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "20000"))
 PER_FILE = 100
+TRUTH = tuple((k / 20, 1.0, 1.0, 1.0) for k in range(1200))
 NUMBERS = [b"nan", b"inf", b"-1", b"1e999", b"0x10", b"9" * 30, b"1_0", b"", b"\xff\xfe", b"\x00", b"---\n", b"\n"]
 REAL = {
     "bitcraze-yaml": "kuipman_tdoa3_sniffer/raw_yaml/b34daf0_output20240415.yaml",
@@ -49,7 +50,7 @@ def replay(path, name, rng):
     asked = ReplayOptions(
         path,
         anchors=synthetic.ANCHORS_M,
-        truth=((0.0, 1.0, 1.0, 1.0),),
+        truth=TRUTH,
         format=rng.choice([name, name, None]),
         tag_height_m=rng.choice(["free", 1.2]),
     )
