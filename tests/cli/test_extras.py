@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from skyless.cli.common.extras import EXTRA_OF, what_to_install
+from skyless.core.extras import EXTRA_OF, what_to_install
 
 pytestmark = pytest.mark.site
 
@@ -42,8 +42,8 @@ def test_every_library_of_an_extra_is_named():
 
 
 def test_another_missing_module_is_a_defect():
-    assert what_to_install("skyless.nothing") is None
-    assert what_to_install(None) is None
+    assert what_to_install(ImportError("text", name="skyless.nothing")) is None
+    assert what_to_install(ImportError("text")) is None
 
 
 @pytest.mark.parametrize(

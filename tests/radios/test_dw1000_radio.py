@@ -310,7 +310,8 @@ def test_a_package_that_is_missing_is_reported_at_the_start(monkeypatch, package
     if not refused:
         assert open_radios(spec, "tag", ("tag1",))
         return
-    words = rf"--radio is '{spec}'; .*package {package.partition('.')[0]}: pip install {package.partition('.')[0]}"
+    library = package.partition(".")[0]
+    words = rf"--radio is '{spec}'; .*needs {library}, which is not installed: pip install 'skyless\[pi\]'"
     with pytest.raises(SkylessError, match=words):
         open_radios(spec, "tag", ("tag1",))
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Final
 from cyclopts import App, CycloptsError, Group, Parameter
 from cyclopts.help import DefaultFormatter
 
-from skyless.cli.common.extras import what_to_install
 from skyless.core.errors import SkylessError
+from skyless.core.extras import what_to_install
 
 if TYPE_CHECKING:
     from cyclopts.help import HelpPanel
@@ -136,7 +136,7 @@ def _line_for_the_user(error: Exception) -> str | None:
     if isinstance(error, OSError):
         return _trouble(error)
     if isinstance(error, ModuleNotFoundError):
-        return what_to_install(error.name)
+        return what_to_install(error)
     return " ".join(str(error).split()) if isinstance(error, CycloptsError) else str(error)
 
 

@@ -18,6 +18,7 @@ from msgspec import Struct
 from skyless.bridges.ros2.messages import RosEncoder, RosMessage, RosSettings
 from skyless.bridges.target import bridged_site, is_usable
 from skyless.core.errors import ConfigurationError, SkylessError
+from skyless.core.extras import extra_module
 from skyless.run.mqtt.messages import AnchorHealth, FixMessage, SiteMessage, TagHealth, TruthMessage
 from skyless.run.recordings.recording import NS, McapRecording, Recorded
 
@@ -140,12 +141,7 @@ class _BagWriter:
 
     def __init__(self, folder: Path, version: BagVersion) -> None:
         """Raises SkylessError: the package that writes bags is missing."""
-        try:
-            rosbag2, typesys = importlib.import_module("rosbags.rosbag2"), importlib.import_module("rosbags.typesys")
-        except ImportError:
-            raise SkylessError(
-                "bags need the package rosbags: pip install '.[ros2]' in a copy of Skyless's repository brings it"
-            ) from None
+        rosbag2, typesys = (extra_module(f"rosbags.{part}", "a bag of ROS 2") for part in ("rosbag2", "typesys"))
         self._writer: Writer = rosbag2.Writer(folder, version=version, storage_plugin=rosbag2.StoragePlugin.MCAP)
         self._writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
         self._types: Typestore = typesys.get_typestore(typesys.Stores.ROS2_KILTED)

@@ -27,6 +27,7 @@ from skyless.bridges.ros2.messages import (
 )
 from skyless.bridges.target import BridgeContext, BridgedSite, Target, TargetUrl
 from skyless.core.errors import SkylessError
+from skyless.core.extras import what_to_install
 from skyless.run.mqtt.messages import AnchorHealth, FixMessage, TagHealth
 
 DEPTH: Final = 10
@@ -85,11 +86,10 @@ class DdsPublisher:
             for name in ("core", "domain", "pub", "qos", "topic"):
                 import_module(f"cyclonedds.{name}")
             self._types = DdsTypes()
-        except ImportError:
+        except ImportError as error:
             raise SkylessError(
-                f"the target {text!r} needs the packages cyclonedds and rosbags: pip install '.[ros2]' in a copy of "
-                "Skyless's repository brings them on x86-64 up to Python 3.13; elsewhere use jsonl+tcp: and the node "
-                "examples/ros2/skyless_node.py"
+                f"{what_to_install(error, f'the target {text!r}')}; it is made for x86-64 up to Python 3.13: elsewhere "
+                "use jsonl+tcp: and the node examples/ros2/skyless_node.py"
             ) from None
         given = os.environ.get("CYCLONEDDS_URI", "")
         try:

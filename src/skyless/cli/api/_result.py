@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.errors import SkylessError
+from skyless.core.extras import extra_module
 from skyless.core.kernels.arrays import Array
 
 if TYPE_CHECKING:
@@ -40,11 +40,8 @@ class Result(Struct, frozen=True, eq=False):
 
 def data_frame(columns: Mapping[str, Any]) -> "DataFrame":
     """Columns as a table of pandas. Raises SkylessError where pandas is not installed."""
-    try:
-        from pandas import DataFrame
-    except ImportError:
-        raise SkylessError("to_dataframe needs the package pandas: pip install pandas") from None
-    return DataFrame(dict(columns))
+    frame: DataFrame = extra_module("pandas", "to_dataframe").DataFrame(dict(columns))
+    return frame
 
 
 def axes_columns(prefix: str, values: Array, suffix: str = "") -> dict[str, Array]:

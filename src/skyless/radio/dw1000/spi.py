@@ -2,15 +2,14 @@
 
 import asyncio
 import contextlib
-import importlib
 import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Final
 
 from skyless.core.errors import SkylessError
+from skyless.core.extras import extra_module
 from skyless.radio.dw1000.driver import ChipError
 from skyless.radio.dw1000.radio import Dw1000Radio
 
@@ -20,6 +19,8 @@ DEFAULT_FAST_HZ: Final = 8_000_000
 MAX_FAST_HZ: Final = 20_000_000
 """Wires of 10 cm carry some 8 MHz; the chip accepts 20."""
 DEFAULT_CHIP: Final = "/dev/gpiochip0"
+
+_NEEDED_FOR: Final = "a DW1000 on SPI"
 
 REOPEN_S: Final = 1.0
 CHIP_POLL_S: Final = 0.5e-3
@@ -75,7 +76,7 @@ class SpiBus:
             raise
 
     def _open_spi(self, bus: int, device: int) -> None:
-        spi = _package("spidev").SpiDev()
+        spi = extra_module("spidev", _NEEDED_FOR).SpiDev()
         try:
             spi.open(bus, device)
             spi.mode = 0
@@ -88,8 +89,8 @@ class SpiBus:
         self.set_spi_fast(False)
 
     def _open_lines(self, chip: str, irq_pin: int | None) -> None:
-        gpiod = _package("gpiod")
-        line = _package("gpiod.line")
+        gpiod = extra_module("gpiod", _NEEDED_FOR)
+        line = extra_module("gpiod.line", _NEEDED_FOR)
         try:
             if irq_pin is not None:
                 raised = gpiod.LineSettings(
@@ -226,7 +227,7 @@ def check_spi(spec: str, bus: int, device: int, gpio_chip: str | None) -> None:
     """
     try:
         for package in ("spidev",) if gpio_chip is None else ("spidev", "gpiod", "gpiod.line"):
-            _package(package)
+            extra_module(package, _NEEDED_FOR)
     except SkylessError as error:
         raise SkylessError(f"--radio is {spec!r}; {error}") from None
     remedy = "SPI should be switched on (Raspberry Pi: dtparam=spi=on in config.txt), spi:BUS.DEVICE name one"
@@ -245,11 +246,3 @@ def _check_file(spec: str, path: str, group: str, remedy: str) -> None:
             f"--radio is {spec!r}; {path} may not be opened: its group, usually {group}, must be one of yours "
             "(sudo usermod -aG ...)"
         )
-
-
-def _package(name: str) -> ModuleType:
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        package = name.partition(".")[0]
-        raise SkylessError(f"a DW1000 on SPI needs the package {package}: pip install {package}") from None

@@ -26,7 +26,7 @@ from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
 
-_NO_FILTERPY: Final = "filterpy is not installed; pip install filterpy adds it"
+_NO_FILTERPY: Final = "filterpy is not installed; pip install 'skyless[bench]' adds it"
 _WARM_S: Final = 2.0
 """A receiver has its almanac and its first fix by then."""
 _TAGS: Final = (1, 100, 10_000)

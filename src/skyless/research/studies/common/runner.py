@@ -14,6 +14,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Final
 
 from skyless.core.errors import SkylessError
+from skyless.core.extras import extra_module
 from skyless.core.kernels.processors import cores
 from skyless.research.studies.common.plan import Cell
 
@@ -139,13 +140,10 @@ def _start_worker(parent: Connection) -> None:
 def _cluster(scheduler: str) -> Iterator[Executor]:
     if not _ADDRESS.fullmatch(scheduler):
         raise SkylessError(f"--scheduler is {scheduler!r}; it should be an address such as tcp://127.0.0.1:8786")
-    try:
-        from distributed import Client  # noqa: PLC0415 - an extra, and slow to import
-    except ImportError:
-        raise SkylessError("--scheduler needs the package distributed: pip install distributed") from None
+    connect = extra_module("distributed", "--scheduler").Client
     logging.disable(logging.ERROR)  # what goes wrong is reported once, by an exception
     try:
-        yield from _connected(Client, scheduler)
+        yield from _connected(connect, scheduler)
     finally:
         logging.disable(logging.NOTSET)
 

@@ -1,0 +1,41 @@
+"""Libraries that an extra of the package brings, and which one where a library is not installed."""
+
+from importlib import import_module
+from types import ModuleType
+from typing import Final
+
+from skyless.core.errors import SkylessError
+
+EXTRA_OF: Final = {
+    "cryptography": "keys",
+    "cyclonedds": "ros2",
+    "distributed": "dask",
+    "filterpy": "bench",
+    "gpiod": "pi",
+    "matplotlib": "site",
+    "mcap": "site",
+    "pandas": "pandas",
+    "rosbags": "ros2",
+    "scipy": "site",
+    "spidev": "pi",
+    "starlette": "page",
+    "uvicorn": "page",
+    "websockets": "page",
+    "yaml": "research",
+}
+"""Extras of ``pyproject.toml`` by the name under which a library of theirs is imported."""
+
+
+def what_to_install(error: ImportError, what: str = "this") -> str | None:
+    """Say which extra brings the library that ``what`` needs and that could not be imported; None if none does."""
+    library = (error.name or "").partition(".")[0]
+    extra = EXTRA_OF.get(library)
+    return None if extra is None else f"{what} needs {library}, which is not installed: pip install 'skyless[{extra}]'"
+
+
+def extra_module(name: str, what: str) -> ModuleType:
+    """Import a module of a library that an extra brings. Raises SkylessError: ``what`` needs it, and it is missing."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise SkylessError(what_to_install(error, what)) from None
