@@ -26,7 +26,8 @@ from msgspec.structs import replace
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_S
 from skyless.core.estimator.estimator import ACCEPTED, REJECTED, Report
 from skyless.core.estimator.measurements import REPORT_GAIN
-from skyless.core.estimator.monitor import gate_of
+from skyless.core.estimator.monitor import PLACE_MEMORY, gate_of
+from skyless.core.estimator.state import uncertain_states
 from skyless.core.kernels.filter import ClockFilter, clock_noise
 from skyless.core.ticks import TICK_MASK
 from skyless.research.studies.episodes import WHITE_FM
@@ -313,3 +314,21 @@ def test_where_the_offset_is_for_now_agrees_with_the_stamps():
         flight_m = np.linalg.norm(episode.path_m[k] - LAB_M[anchor])
         later_s = (now - int(episode.packets.rx_ticks[k])) * TICK_S
         assert measured * TICK_M - flight_m + later_s * rate_mps == pytest.approx(stationary_m, abs=0.2)
+
+
+def test_multipath_that_was_learnt_is_estimated_also_where_the_settings_call_ranges_exact():
+    """Its variance counts in all arithmetic; else variances would fall below zero, and errors reach metres."""
+    episode = walking(superframes=120)
+    estimator, packets = begun(episode, settings_of(AGILE), std_m=0.1), list(one_by_one(episode.packets))
+    for packet in packets[:360]:
+        estimator.process(*packet)
+    status = estimator.state.status
+    status["place_samples"], status["place_square_m2"] = PLACE_MEMORY, (0.004, 0.005)
+    for packet in packets[360:]:
+        estimator.process(*packet)
+        P = estimator.state.P
+        assert not P[uncertain_states(estimator.state) :].any()
+        used = np.flatnonzero(P.diagonal())
+        std = np.sqrt(P.diagonal()[used])
+        assert np.linalg.eigvalsh(P[np.ix_(used, used)] / np.outer(std, std)).min() > -1e-9
+    assert estimator.multipath_m is not None

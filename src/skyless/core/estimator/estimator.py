@@ -37,6 +37,7 @@ from skyless.core.estimator.measurements import (
 )
 from skyless.core.estimator.monitor import LATE_OFTEN_SHARE, covariance_scale, update_stationary
 from skyless.core.estimator.state import (
+    ALL_RANGE_ERRORS,
     LASTING,
     LASTING_STD_M,
     NEVER,
@@ -525,6 +526,7 @@ class Estimator:
         state.x[change], state.x[constant] = late_m - STAYING_SHARE * staying_m, STAYING_SHARE * staying_m
         state.P[change, change] += variance_m2
         state.P[constant, constant] += (STAYING_STD * staying_m) ** 2
+        state.status["range_errors"] = ALL_RANGE_ERRORS
 
     def withhold_levels(self, are_withheld: bool = True) -> None:
         """State no levels: it is not sure yet where the tag is, or the anchors' positions are known to be wrong."""

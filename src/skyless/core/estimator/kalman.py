@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from skyless.core.constants import TICK_S
-from skyless.core.estimator.state import FAULT_KINDS, EstimatorState, layout, uncertain_states
+from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, FAULT_KINDS, EstimatorState, layout, uncertain_states
 from skyless.core.kernels.compiled import step
 from skyless.core.kernels.covariance import (
     add_process_noise,
@@ -115,7 +115,8 @@ def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float
         variance = place_variance + share * OBSTRUCTED_STD_M**2
         usual = dt / settings["place_time_s"] + walked_m / status["place_distance_m"]
         kept = np.exp(-obstructed - (1.0 - share) * usual)
-    if variance > 0.0:
+    if variance > 0.0:  # also where the site calls ranges exact: multipath is learnt there as well
+        s.status[0]["range_errors"] = max(status["range_errors"], CHANGING_RANGE_ERRORS)
         _decay(s, change, kept, variance)
     if obstructed > 1e-6 and settings["range_std_m"] > 0.0:
         _decay(s, constant, np.exp(-obstructed), settings["range_std_m"] ** 2)
