@@ -5,7 +5,7 @@ and nothing else. Nothing that keeps time for the site is on the air.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from typing import Final
 
@@ -16,13 +16,13 @@ from msgspec.structs import replace
 from skyless.core.air.beacon import Beacon
 from skyless.core.air.reception import Reception
 from skyless.core.fix import Fix
-from skyless.core.kernels.arrays import Array, Integers, Mask
+from skyless.core.kernels.arrays import Array
 from skyless.core.site import EXACT, AccuracySite, Site
 from skyless.core.tag.joint import Estimation
 from skyless.core.tag.receiver import Receiver
 from skyless.research.studies.common.plan import Cell, Limit, Plan, Row, seed_of, with_limits
 from skyless.research.studies.common.summary import interval, jackknife
-from skyless.research.uncertainty.bounds import Biases, BoundSettings, Sendings, received_bound
+from skyless.research.uncertainty.bounds import Biases, BoundSettings, Sendings, received_bound, relayed_receptions
 from skyless.sim.cells.world import CellWorld, TagReceptions, anchors_of
 from skyless.sim.evaluation.cell_fleet import SiteBeacons, period_codes_of
 from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3, Room
@@ -93,8 +93,8 @@ def cases(plan: Plan) -> list[LargeCase]:
         LargeCase("random instants", "walking", limits=walk),
         LargeCase("7 m apart", "walking", spacing_m=7.0),
         LargeCase("5 m/s through the whole site", "walking", speed_mps=5.0, seconds=roaming, limits=errors),
-        LargeCase("30 % lost", "walking", loss=0.3),
-        LargeCase("20 % of the anchors dead", "walking", dead_share=0.2),
+        LargeCase("30 % lost", "walking", loss=0.3, limits=(Limit("restarts", most=0.0),)),
+        LargeCase("20 % of the anchors dead", "walking", dead_share=0.2, limits=(Limit("restarts", most=0.0),)),
         LargeCase("exact ranges, bounded", "bounds", bounded=True),
         LargeCase("room", "bounds", in_room=True, bounded=True, limits=(Limit("ratio", most=1.2),)),
         LargeCase("cold starts", "cold starts", starts=True, limits=start),
@@ -312,7 +312,9 @@ def _bound_m2(world: CellWorld, site: Site, spans: Sequence[TagReceptions], case
     anchor, sequence = (np.concatenate([getattr(one, name) for one in spans]) for name in ("anchor", "sequence"))
     times_s = np.concatenate([one.emission_s for one in spans])
     ids, senders = np.unique(anchor, return_inverse=True)
-    known = _known(spans, {identifier: index for index, identifier in enumerate(ids.tolist())}, senders, sequence)
+    index_of = {identifier: index for index, identifier in enumerate(ids.tolist())}
+    relays = [listed for one in spans for listed in _relays(one, index_of)]
+    known = relayed_receptions(senders, sequence, relays, len(ids))
     row_of = {one.id: row for row, one in enumerate(site.anchors)}
     anchors_m = world.true_positions_m[[row_of[identifier] for identifier in ids.tolist()]]
     noise = site.noise
@@ -338,22 +340,12 @@ def _bound_m2(world: CellWorld, site: Site, spans: Sequence[TagReceptions], case
     return np.asarray(np.trace(bound, axis1=1, axis2=2))
 
 
-def _known(spans: Sequence[TagReceptions], index_of: dict[int, int], senders: Integers, sequence: Integers) -> Mask:
-    """Which anchors' receptions of each beacon some beacon has relayed to the tag; its own are the last column."""
-    known = np.zeros((len(senders), len(index_of) + 1), np.bool_)
-    known[:, -1] = True
-    newest: dict[tuple[int, int], int] = {}
-    frame = 0
-    for span in spans:
-        for row in range(len(span)):
-            for number in range(int(span.relays[row])):
-                sender = index_of.get(int(span.relay_anchor[row, number]))
-                relayed = None if sender is None else newest.get((sender, int(span.relay_sequence[row, number])))
-                if relayed is not None:
-                    known[relayed, senders[frame]] = True
-            newest[int(senders[frame]), int(sequence[frame])] = frame
-            frame += 1
-    return known
+def _relays(span: TagReceptions, index_of: dict[int, int]) -> Iterator[list[tuple[int, int]]]:
+    """Of each beacon, anchor and sequence number of those whose reception it relays."""
+    rows = zip(span.relays.tolist(), span.relay_anchor.tolist(), span.relay_sequence.tolist(), strict=True)
+    for count, anchors, sequences in rows:
+        pairs = zip(anchors[:count], sequences[:count], strict=True)
+        yield [(index_of[anchor], sequence) for anchor, sequence in pairs if anchor in index_of]
 
 
 # Cells and rows

@@ -4,8 +4,9 @@ The room is the lab with anchors, ranges and motions as in ``sim/evaluation/scen
 thing in it. The worlds do not depend on the method.
 
 Cases whose errors of survey and ranges are all that is wrong, and whose tags accelerate at random, have a Cramér–Rao
-bound: that of all receptions on the air, for errors with the variances with which the worlds draw them, whatever a site
-file states. That tags are also held in the room by a spring and damping is left out, as no receiver knows it.
+bound: that of all receptions that a tag's beacons state, counted as known when they happened, for errors with the
+variances with which the worlds draw them, whatever a site file states. That tags are also held in the room by a spring
+and damping is left out, as no receiver knows it.
 """
 
 import math
@@ -17,8 +18,10 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import asdict, replace
 
+from skyless.core.air.beacon import Beacon
+from skyless.core.air.codec import decode_cached
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.kernels.arrays import Array
+from skyless.core.kernels.arrays import Array, Integers, Mask
 from skyless.core.site import AnchorSite, Site, TagsSite, WallSite
 from skyless.research.studies.common.plan import Cell, Limit, Plan, Row, seed_of, with_limits
 from skyless.research.studies.common.summary import (
@@ -31,13 +34,15 @@ from skyless.research.studies.common.summary import (
 )
 from skyless.research.studies.common.worlds import Run, RunResult, anchor_of, box, worlds
 from skyless.research.studies.motion import laps
-from skyless.research.uncertainty.bounds import Biases, BoundSettings, tracking_bound
+from skyless.research.uncertainty.bounds import Biases, BoundSettings, Sendings, received_bound, relayed_receptions
+from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3, Room, wanderer, wanderers
 from skyless.sim.evaluation.statistics import LevelCounts
 from skyless.sim.impairments import AnchorBias, Body, WarmUp
 from skyless.sim.lab import lab_site
 from skyless.sim.range_errors import RangeErrorModel
 from skyless.sim.trajectory import Static, Trajectory, Waypoints
+from skyless.sim.world import Broadcast
 
 BASE: Final = "the room"
 AIR: Final = "unbiased air"
@@ -116,8 +121,8 @@ _CRYSTAL_KEY: Final = 31
 _BOUND_SPEED_STD_MPS: Final = 1.0
 """Before the first frame; after the second and a half for which nothing is judged nothing of it is left."""
 
-_BOUND_UPDATE_S: Final = 1e-6
-"""About what the bound takes for one measurement."""
+_BOUND_TAG_S: Final = 0.03
+"""About what simulation and bound take for a second of a tag."""
 
 Paths = Callable[[int], Sequence[Trajectory]]
 
@@ -491,17 +496,13 @@ def biases_of(room: Room | None) -> Biases:
 def bound_cells(cases: Sequence[Case]) -> list[Cell]:
     """One cell for each world of the cases that have a bound."""
     return [
-        Cell(case.name, bound_variance_m2, BoundRun(run, case.biases), _weight_s(run))
+        Cell(
+            case.name, bound_variance_m2, BoundRun(run, case.biases), _BOUND_TAG_S * len(run.trajectories) * run.until_s
+        )
         for case in cases
         if case.biases is not None
         for run in case.runs
     ]
-
-
-def _weight_s(run: Run) -> float:
-    return (
-        _BOUND_UPDATE_S * 2.0 * len(run.trajectories) * len(run.site.anchors) * run.until_s / run.site.schedule.slot_s
-    )
 
 
 def bound_variance_m2(world: BoundRun) -> float:
@@ -512,26 +513,43 @@ def bound_variance_m2(world: BoundRun) -> float:
     anchors_m = np.array(
         [np.add((one.x_m, one.y_m, one.z_m), off_m.get(one.id, (0.0, 0.0, 0.0))) for one in site.anchors]
     )
-    superframe_s = len(anchors_m) * site.schedule.slot_s
     settings = BoundSettings(
         noise.rx_stamp_ps * 1e-12,
         white_fm=noise.oscillator.white_fm,
         random_walk_fm=noise.oscillator.random_walk_fm,
         qa=ROOM_QA_M2PS3,
-        slot_s=site.schedule.slot_s,
+        slot_s=1.0,  # of no use here: the frames state when they were sent
         speed_std_mps=_BOUND_SPEED_STD_MPS,
         mesh=run.mesh,
         height_known=site.tags.height_m is not None,
-        at_once=False,
     )
-    frames = int(run.until_s / superframe_s) * len(anchors_m)
-    first = int(run.warmup_s / superframe_s)
     means = []
-    for tag in run.trajectories:
-        path_m = np.array([tag.position(frame * site.schedule.slot_s) for frame in range(frames)])
-        bound = tracking_bound(anchors_m, path_m, settings, world.biases)[first:]
-        means.append(np.trace(bound, axis1=1, axis2=2).mean())
+    for received in _received(run):
+        times_s = np.array([broadcast.emission_s for broadcast, _ in received])
+        path_m = np.array([position_m for _, position_m in received])
+        known, senders = _known(site, [broadcast.frame for broadcast, _ in received])
+        bound = received_bound(anchors_m, path_m, settings, known, Sendings(senders, times_s), world.biases)
+        means.append(np.trace(bound, axis1=1, axis2=2)[times_s >= run.warmup_s].mean())
     return float(np.mean(means))
+
+
+def _received(run: Run) -> list[list[tuple[Broadcast, Array]]]:
+    """What each tag of a world received, and where it was then."""
+    received: list[list[tuple[Broadcast, Array]]] = [[] for _ in run.trajectories]
+    for broadcast in world_of(run.site, run.trajectories, run.impairments, run.seed).run(run.until_s):
+        for tag, position_m in zip(broadcast.tags.tolist(), broadcast.positions_m, strict=True):
+            received[tag].append((broadcast, position_m))
+    return received
+
+
+def _known(site: Site, frames: Sequence[bytes]) -> tuple[Mask, Integers]:
+    """Which receptions the frames of a tag tell it of, as ``relayed_receptions``, and the frames' senders."""
+    index_of = {one.id: row for row, one in enumerate(site.anchors)}
+    beacons = [beacon for frame in frames if isinstance(beacon := decode_cached(frame), Beacon)]
+    senders = np.array([index_of[one.anchor] for one in beacons])
+    sequences = np.array([one.sequence for one in beacons])
+    relays = [[(index_of[entry.anchor], entry.sequence) for entry in one.heard] for one in beacons]
+    return relayed_receptions(senders, sequences, relays, len(index_of)), senders
 
 
 def with_bound(row: WorldRow, worlds: Sequence[RunResult], variances_m2: Sequence[float]) -> WorldRow:

@@ -6,6 +6,7 @@ they say of the survey, both of which the estimator approximates. Equations: ``d
 """
 
 import math
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
@@ -179,6 +180,25 @@ def known_receptions(
     heard[:, :-1] &= others
     heard[np.arange(frames), senders] = False
     return heard
+
+
+def relayed_receptions(
+    senders: Integers, sequences: Integers, relays: Sequence[Iterable[tuple[int, int]]], anchors: int
+) -> Mask:
+    """Which anchors' receptions of each beacon another beacon has relayed to the tag, shape (frames, anchors + 1).
+
+    The frames are those that the tag has received, which its own column, the last, says. ``senders``: index of each
+    frame's anchor; ``relays``: of each frame, anchor and sequence number of the beacons whose reception it relays.
+    """
+    known = np.zeros((len(senders), anchors + 1), np.bool_)
+    known[:, -1] = True
+    newest: dict[tuple[int, int], int] = {}
+    for frame, (listener, sequence) in enumerate(zip(senders.tolist(), sequences.tolist(), strict=True)):
+        for beacon in relays[frame]:
+            if beacon in newest:
+                known[newest[beacon], listener] = True
+        newest[listener, sequence] = frame
+    return known
 
 
 def _frame_bound(
