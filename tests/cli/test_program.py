@@ -142,7 +142,8 @@ def test_a_terminal_without_unicode(lab):
 def test_sigterm_ends_a_command_with_all_its_processes(tmp_path, arguments, worker):
     kernels = {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")} if arguments == ["warm"] else {}
     options = {"env": {**os.environ, **kernels}, "cwd": tmp_path, "stderr": subprocess.PIPE, "start_new_session": True}
-    process = subprocess.Popen([*SKYLESS, *arguments], **options)
+    default = ["env", "--default-signal=INT"]  # what a shell starts in the background ignores it
+    process = subprocess.Popen([*default, *SKYLESS, *arguments], **options)
     workers = until(lambda: [pid for pid in children(process.pid) if worker in words_of(pid)], 120.0)
     process.terminate()
     _, told = process.communicate(timeout=60)

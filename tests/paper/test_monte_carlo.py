@@ -94,12 +94,6 @@ def test_moments_are_those_of_the_draws_one_by_one():
     assert moments.std_relative_error[Quantity.LAMBDA].mean() == pytest.approx(scatter, rel=0.06)
 
 
-def test_progress_counts_every_draw():
-    seen = []
-    draw_moments(chain_for(Reference.APART), 1, 2 * CHUNK_DRAWS + 3, progress=seen.append)
-    assert seen == [CHUNK_DRAWS, 2 * CHUNK_DRAWS, 2 * CHUNK_DRAWS + 3]
-
-
 def test_the_numpy_loop_of_the_bench_computes_the_same_chain():
     chain = chain_for(Reference.APART)
     ideal_ticks = ideal_values(readings_of(chain, Reference.APART))

@@ -156,7 +156,7 @@ def test_antenna_delays_move_the_least_squares_by_the_normal_equations():
 
 def test_the_command_beside_a_figure_makes_its_number_again():
     """Several methods and tags in one world hear what ``skyless simulate`` lets one tag hear."""
-    tracks = static.run_world(lambda share: None, "noise", 9, 60)
+    tracks = static.run_world("noise", 9, 60)
     fleet = fleet_of(Request(paper_lab_site(), method="literal", seed=9, noise_ps=100.0, positions_m=(P1,), fixes=60))
     for _ in fleet.run(3.2):
         pass

@@ -80,7 +80,7 @@ def test_results_stand_in_the_order_of_the_cells():
 
 @pytest.mark.statistical
 def test_a_process_that_dies_is_told():
-    with pytest.raises(SkylessError, match="a process of the study died"):
+    with pytest.raises(SkylessError, match="a process died"):
         run_cells(cells(die, range(4)), lambda share: None, 2)
 
 

@@ -4,10 +4,11 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from errno import EDQUOT, EFBIG, EIO, ENOSPC
 from io import TextIOWrapper
+from types import FrameType
 from typing import TYPE_CHECKING, Final
 
 from cyclopts import App, CycloptsError, Group, Parameter
@@ -95,6 +96,7 @@ def program() -> App:
         print_error=False,
         exit_on_error=False,
         result_action="return_value",
+        suppress_keyboard_interrupt=False,
         default_parameter=Parameter(negative=()),
     )
     for number, (title, commands) in enumerate(_GROUPS.items()):
@@ -113,13 +115,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     A command's own exit code is what it returns, None meaning 0.
     """
     _write_any_character()
+    interrupted = [_INTERRUPTED]
     try:
-        with _ended_by_sigterm():
+        with _ended_by_sigterm(lambda: interrupted.append(_TERMINATED)):
             result = program()(arguments)
         if sys.stdout is not None:
             sys.stdout.flush()
     except KeyboardInterrupt:
-        return _INTERRUPTED
+        return interrupted[-1]
     except BrokenPipeError:
         _drop_output()
         return _BROKEN_PIPE
@@ -141,14 +144,20 @@ def _line_for_the_user(error: Exception) -> str | None:
 
 
 @contextmanager
-def _ended_by_sigterm() -> Iterator[None]:
-    """Let SIGTERM end the command in the block with the processes that it has started, unless it is handled already."""
+def _ended_by_sigterm(note: Callable[[], None]) -> Iterator[None]:
+    """Let SIGTERM end the command in the block as Ctrl-C does, after ``note``, unless the signal is handled already.
+
+    An event loop turns Ctrl-C into the cancellation of its task; an exception raised in the middle of it, as it starts
+    a process, could leave it waiting for ever.
+    """
     if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
         yield
         return
 
-    def end(*_: object) -> None:
-        raise SystemExit(_TERMINATED)
+    def end(_: int, frame: FrameType | None) -> None:
+        note()
+        interrupt = signal.getsignal(signal.SIGINT)
+        (interrupt if callable(interrupt) else signal.default_int_handler)(signal.SIGINT, frame)
 
     signal.signal(signal.SIGTERM, end)
     try:

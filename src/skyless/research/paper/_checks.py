@@ -1,7 +1,7 @@
 """Figure 2: printed and corrected standard deviations against Monte Carlo draws (fig:GammaApprox, E1 to E7)."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -11,7 +11,7 @@ from msgspec import Struct
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.core.kernels.arrays import Array
 from skyless.research.paper.monte_carlo import ChainMoments, Quantity, draw_moments
-from skyless.research.paper.plan import Panel, Plan, Progress, Results, Section, Task, Verdict, grouped
+from skyless.research.paper.plan import Panel, Plan, Results, Section, Task, Verdict, grouped
 from skyless.research.uncertainty.chain import CORRECTED, PRINTED, Chain
 from skyless.site.report.figures import BLUE, INK, RED, panel
 
@@ -48,8 +48,6 @@ _SYMBOLS: Final = {
     "lambda": "λ",
 }
 _GAMMAS: Final = ("gamma_first", "gamma_delayed", "gamma_averaged")
-_DRAWN_TIMES: Final = 2 * CHECKED_ANCHORS
-"""Each anchor draws with either kind of noise."""
 _SECONDS_PER_DRAW: Final = 2e-5
 _FAR_S: Final = 1.0
 """Reading of the master's clock at the synchronisation, in the second check."""
@@ -117,27 +115,18 @@ def paper_chain(seed: int, anchor: int, noise: str, *, origin_s: float | None = 
 def paper_checks(
     seed: int,
     draws: int,
-    progress: Callable[[int], None] | None = None,
     *,
     origin_s: float | None = None,
 ) -> tuple[PaperCheck, ...]:
     """Every quantity of ``QUANTITY_NAMES`` for ten random anchors, Gaussian and uniform noise.
 
-    ``draws`` of each anchor and noise; ``progress`` is called with the draws done, of 20·``draws`` in all.
-    ``origin_s``: see ``paper_chain``.
+    ``draws`` of each anchor and noise; ``origin_s``: see ``paper_chain``.
     """
     checks: list[PaperCheck] = []
-    done = 0
-
-    def report(part: int) -> None:
-        if progress is not None:
-            progress(done + part)
-
     for noise in NOISES:
         for anchor in range(1, CHECKED_ANCHORS + 1):
             chain = paper_chain(seed, anchor, noise, origin_s=origin_s)
-            moments = draw_moments(chain, draw_seed(seed, anchor), draws, uniform=noise == "uniform", progress=report)
-            done += draws
+            moments = draw_moments(chain, draw_seed(seed, anchor), draws, uniform=noise == "uniform")
             checks.extend(_checks(chain, moments, noise, anchor))
     return tuple(checks)
 
@@ -177,14 +166,11 @@ def tasks(plan: Plan) -> list[Task]:
     """All quantities of ten anchors, Gaussian and uniform; and a few draws with clocks that started earlier."""
     few = max(plan.draws // 20, 10_000)
     return [
-        Task("checks", run_checks, {"seed": plan.seed, "draws": plan.draws}, plan.draws * _SECONDS_PER_DRAW),
-        Task("checks/far", run_checks, {"seed": plan.seed, "draws": few, "origin_s": _FAR_S}, few * _SECONDS_PER_DRAW),
+        Task("checks", paper_checks, {"seed": plan.seed, "draws": plan.draws}, plan.draws * _SECONDS_PER_DRAW),
+        Task(
+            "checks/far", paper_checks, {"seed": plan.seed, "draws": few, "origin_s": _FAR_S}, few * _SECONDS_PER_DRAW
+        ),
     ]
-
-
-def run_checks(progress: Progress, seed: int, draws: int, origin_s: float | None = None) -> tuple[PaperCheck, ...]:
-    """Draw, and compare; ``origin_s`` is what the master's clock reads at the synchronisation."""
-    return paper_checks(seed, draws, lambda done: progress(done / (_DRAWN_TIMES * draws)), origin_s=origin_s)
 
 
 def judge(checks: tuple[PaperCheck, ...]) -> tuple[Verdict, str]:

@@ -14,7 +14,6 @@ from skyless.research.paper.plan import (
     PAPER_PS,
     Panel,
     Plan,
-    Progress,
     Results,
     Section,
     Task,
@@ -74,10 +73,10 @@ def seed_of(plan: Plan, noise_ps: float) -> int:
     return plan.seed + 1 + plan.noises_ps.index(noise_ps)
 
 
-def run_world(progress: Progress, noise_ps: float, seed: int, fixes: int) -> list[Worst]:
+def run_world(noise_ps: float, seed: int, fixes: int) -> list[Worst]:
     """One tag at P1, heard by all methods."""
     site, impairments = paper_lab_site(noise_ps), lab_impairments(noise_ps)
-    (tracks,) = listen(site, [Static(*P1)], _METHODS, impairments, seed, progress, fixes=fixes)
+    (tracks,) = listen(site, [Static(*P1)], _METHODS, impairments, seed, fixes=fixes)
     return [worst_of(method, noise_ps, seed, tracks[method].error_m) for method in _METHODS]
 
 

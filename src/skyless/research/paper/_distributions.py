@@ -1,7 +1,6 @@
 """Figure 3: the distribution of one DTDoA's error, Gaussian and uniform stamps (fig:TDoAApprox, E10)."""
 
 import math
-from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -11,7 +10,7 @@ from scipy.stats import norm
 from skyless.core.kernels.arrays import Array, Integers
 from skyless.research.paper._checks import NOISES, draw_seed, first_number, paper_chain
 from skyless.research.paper.monte_carlo import draw_lambdas
-from skyless.research.paper.plan import Panel, Plan, Progress, Results, Section, Task, Verdict, grouped
+from skyless.research.paper.plan import Panel, Plan, Results, Section, Task, Verdict, grouped
 from skyless.research.uncertainty.chain import CORRECTED, PRINTED
 from skyless.site.report.figures import BLUE, INK, RED, panel
 
@@ -34,16 +33,9 @@ class LambdaDistribution(Struct, frozen=True):
     draws: int
 
 
-def lambda_distributions(
-    seed: int, draws: int, bins: int = 101, progress: Callable[[int], None] | None = None
-) -> tuple[LambdaDistribution, ...]:
-    """Distributions of λ of anchor 1, one for each of ``NOISES``; ``progress``: of 2·``draws`` in all."""
-    found = []
-    for number, noise in enumerate(NOISES):
-        found.append(_distribution(seed, noise, draws, bins))
-        if progress is not None:
-            progress((number + 1) * draws)
-    return tuple(found)
+def lambda_distributions(seed: int, draws: int, bins: int = 101) -> tuple[LambdaDistribution, ...]:
+    """Distributions of λ of anchor 1, one for each of ``NOISES``."""
+    return tuple(_distribution(seed, noise, draws, bins) for noise in NOISES)
 
 
 def _distribution(seed: int, noise: str, draws: int, bins: int) -> LambdaDistribution:
@@ -70,12 +62,7 @@ def _distribution(seed: int, noise: str, draws: int, bins: int) -> LambdaDistrib
 
 def tasks(plan: Plan) -> list[Task]:
     """One anchor, two kinds of noise."""
-    return [Task("distributions", run_draws, {"seed": plan.seed, "draws": plan.draws}, plan.draws * 3e-6)]
-
-
-def run_draws(progress: Progress, seed: int, draws: int) -> tuple[LambdaDistribution, ...]:
-    """Draw both distributions."""
-    return lambda_distributions(seed, draws, progress=lambda done: progress(done / (2 * draws)))
+    return [Task("distributions", lambda_distributions, {"seed": plan.seed, "draws": plan.draws}, plan.draws * 3e-6)]
 
 
 def shape_distance(one: LambdaDistribution) -> float:

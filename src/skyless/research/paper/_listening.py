@@ -11,7 +11,6 @@ from skyless.core.kernels.arrays import Array
 from skyless.core.protocol1.receiver import Receiver
 from skyless.core.protocol1.schedule import schedule_of
 from skyless.core.site import Site
-from skyless.research.paper.plan import Progress
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.statistics import FirstFixes
 from skyless.sim.impairments import Impairments
@@ -61,7 +60,6 @@ def listen(
     methods: Sequence[str],
     impairments: Impairments,
     seed: int,
-    progress: Progress,
     *,
     fixes: int | None = None,
     until_s: float | None = None,
@@ -84,7 +82,6 @@ def listen(
                     fix = receiver.hear(reception)
                     if fix is not None and broadcast.end_s >= _WARMUP_S:
                         log.add(broadcast.end_s, fix, truth_m)
-        progress(min(now_s / end_s, 1.0))
     return [{method: log.track(fixes) for method, (_, log) in zip(methods, pairs, strict=True)} for pairs in listeners]
 
 

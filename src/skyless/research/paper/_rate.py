@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from skyless.core.protocol1.receiver import Receiver
 from skyless.core.protocol1.schedule import schedule_of
 from skyless.core.site import AnchorSite, ScheduleSite, Site
-from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Progress, Results, Section, Task, Verdict
+from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Task, Verdict
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import paper_lab_site
@@ -55,7 +55,7 @@ def tasks(plan: Plan) -> list[Task]:
     ]
 
 
-def run_world(progress: Progress, name: str, seed: int, seconds: float) -> list[Count]:
+def run_world(name: str, seed: int, seconds: float) -> list[Count]:
     """Count the updates of one tag."""
     site = sites()[name]
     world = world_of(site, [Static(3.0, 4.0)], lab_impairments(RADIO_PS), seed)
@@ -67,7 +67,6 @@ def run_world(progress: Progress, name: str, seed: int, seconds: float) -> list[
             for method, receiver in receivers.items():
                 if receiver.hear(reception) is not None and broadcast.end_s >= _COUNTED_FROM_S:
                     times_s[method].append(broadcast.end_s)
-        progress(broadcast.end_s / until_s)
     schedule, nodes = schedule_of(site), len(site.anchors)
     foreseen = {"literal": schedule.superframe_rate_hz, "joint": schedule.messages_per_s(nodes)}
     return [

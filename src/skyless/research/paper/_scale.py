@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from skyless.core.kernels.arrays import Array, Integers
 from skyless.core.protocol1.receiver import Receiver
-from skyless.research.paper.plan import P1, RADIO_PS, Panel, Plan, Progress, Results, Section, Task, Verdict, grouped
+from skyless.research.paper.plan import P1, RADIO_PS, Panel, Plan, Results, Section, Task, Verdict, grouped
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import paper_lab_site
@@ -61,7 +61,7 @@ def tasks(plan: Plan) -> list[Task]:
     ]
 
 
-def run_world(progress: Progress, tags: int, seed: int) -> FleetResult:
+def run_world(tags: int, seed: int) -> FleetResult:
     """Tags at P1 with radios and clocks of their own; other positions would only mix geometry into the comparison."""
     site = paper_lab_site(RADIO_PS)
     world = world_of(site, [Static(*P1)] * tags, lab_impairments(RADIO_PS), seed)
@@ -84,7 +84,6 @@ def run_world(progress: Progress, tags: int, seed: int) -> FleetResult:
                 fixes[tag] += 1
         if judged:
             cpu_s += time.process_time() - begun_s
-        progress(broadcast.end_s / _JUDGED_UNTIL_S)
     return summarise(seed, squares_m2, fixes, frames, digest.hexdigest()[:16], cpu_s)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from skyless.research.paper._dop_map import LAB_ANCHORS_M
-from skyless.research.paper.plan import P1, P2, Panel, Plan, Progress, Results, Section, Task, Verdict
+from skyless.research.paper.plan import P1, P2, Panel, Plan, Results, Section, Task, Verdict
 from skyless.sim.evaluation.scenarios import Request, fleet_of
 from skyless.sim.lab import paper_lab_site
 from skyless.site.report.figures import BLUE, GREEN, ORANGE, PAPER, RED, draw_floor_plan, panel
@@ -24,13 +24,12 @@ def tasks(plan: Plan) -> list[Task]:
     ]
 
 
-def count_frames(progress: Progress, tags: int, seed: int) -> dict[str, int]:
+def count_frames(tags: int, seed: int) -> dict[str, int]:
     """Frames on the air by sender, and frames that tags received."""
     fleet = fleet_of(Request(site=paper_lab_site(), tags=tags, seed=seed))
     senders: set[int] = set()
     for broadcast in fleet.world.run(_SECONDS):
         senders.add(broadcast.anchor)
-        progress(broadcast.end_s / _SECONDS)
     tally = fleet.world.tally
     return {"sent": tally.transmissions, "senders": len(senders), "heard_by_tags": tally.at_tags["heard"]}
 

@@ -19,7 +19,6 @@ from skyless.research.paper.plan import (
     Panel,
     Plan,
     Point,
-    Progress,
     Results,
     Section,
     Task,
@@ -71,12 +70,10 @@ def tasks(plan: Plan) -> list[Task]:
     ]
 
 
-def run_world(progress: Progress, name: str, seed: int, fixes: int) -> list[dict[str, Track]]:
+def run_world(name: str, seed: int, fixes: int) -> list[dict[str, Track]]:
     """Two tags at rest that compute with ``_METHODS``."""
     paths = [Static(*point) for point in _POSITIONS.values()]
-    return listen(
-        paper_lab_site(RADIO_PS), paths, _METHODS, biased_impairments(name, seed), seed, progress, fixes=fixes
-    )
+    return listen(paper_lab_site(RADIO_PS), paths, _METHODS, biased_impairments(name, seed), seed, fixes=fixes)
 
 
 def biased_impairments(name: str, seed: int) -> Impairments:

@@ -11,7 +11,7 @@ from skyless.core.constants import SPEED_OF_LIGHT_MPS
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.protocol1.receiver import Receiver
 from skyless.core.protocol1.schedule import schedule_of
-from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Progress, Results, Section, Task, Verdict
+from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Task, Verdict
 from skyless.sim.impairments import Outage, lab_impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.stations import TagSpec
@@ -61,7 +61,7 @@ def tasks(plan: Plan) -> list[Task]:
     return [Task("timeline", run_world, {"seed": plan.seed, "until_s": 4.0 if plan.quick else 12.0}, 6.0)]
 
 
-def run_world(progress: Progress, seed: int, until_s: float) -> list[TimedReception]:
+def run_world(seed: int, until_s: float) -> list[TimedReception]:
     """All receptions of the receivers, and which gave a fix."""
     site = paper_lab_site(RADIO_PS)
     specs = [
@@ -74,7 +74,6 @@ def run_world(progress: Progress, seed: int, until_s: float) -> list[TimedRecept
     heard: list[TimedReception] = []
     for broadcast in world.run(until_s):
         heard.extend(_receive(broadcast, receivers, anchors_m))
-        progress(broadcast.end_s / until_s)
     return heard
 
 

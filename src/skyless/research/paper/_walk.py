@@ -8,7 +8,7 @@ from msgspec import Struct
 from skyless.core.kernels.arrays import Array
 from skyless.research.paper._dop_map import EXPLAINING_CORRELATION, LAB_ANCHORS_M, literal_covariance_m2, pdop_at
 from skyless.research.paper._listening import Track, listen
-from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Progress, Results, Section, Task, Verdict, grouped
+from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Task, Verdict, grouped
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Waypoints
@@ -45,13 +45,11 @@ def tasks(plan: Plan) -> list[Task]:
     return [Task("walk", run_world, {"seed": plan.seed, "laps": plan.laps}, plan.laps * 0.9)]
 
 
-def run_world(progress: Progress, seed: int, laps: int) -> dict[str, Track]:
+def run_world(seed: int, laps: int) -> dict[str, Track]:
     """The tag walks round its rectangle; its receptions go to ``_METHODS``."""
     path = Waypoints(_CORNERS_M, _SPEED_MPS, loop=True, corner_s=_CORNER_S)
     until_s = (laps + 0.5) * _LAP_S
-    (tracks,) = listen(
-        paper_lab_site(RADIO_PS), [path], _METHODS, lab_impairments(RADIO_PS), seed, progress, until_s=until_s
-    )
+    (tracks,) = listen(paper_lab_site(RADIO_PS), [path], _METHODS, lab_impairments(RADIO_PS), seed, until_s=until_s)
     return tracks
 
 

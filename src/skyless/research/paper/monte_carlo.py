@@ -33,8 +33,6 @@ from skyless.core.protocol1.snapshots import (
 )
 from skyless.research.uncertainty.chain import Chain, Reference
 
-Progress = Callable[[int], None]
-
 CHUNK_DRAWS: Final = 1 << 14
 """Draws with one key, which one thread sums up at a time."""
 _BATCH_DRAWS: Final = 256
@@ -331,12 +329,10 @@ def draw_moments(
     reference: Reference = Reference.APART,
     uniform: bool = False,
     threads: int | None = None,
-    progress: Progress | None = None,
 ) -> ChainMoments:
     """Moments of every quantity of the chain over ``draws`` (at least 2) draws.
 
     ``uniform``: noise uniform within ±√3·σ instead of Gaussian. ``threads``: as many as the machine has unless given.
-    ``progress`` is called with the draws done so far.
     """
     readings = readings_of(chain, reference)
     ideal = ideal_values(readings)
@@ -349,12 +345,8 @@ def draw_moments(
             add_draws(readings, ideal, noise, sums.powers, sums.epsilon_products, sums.lambda_products)
         return sums
 
-    done = 0
     for sums in _in_order(sums_of, draws, threads or cores()):
         merge.add(sums)
-        done += sums.draws
-        if progress is not None:
-            progress(done)
     return merge.moments()
 
 

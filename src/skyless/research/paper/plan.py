@@ -25,9 +25,6 @@ DW1000_PS: Final = (100.0, 150.0)
 CLAIM_M: Final = 0.20
 """The paper's bound on the position error."""
 
-Progress = Callable[[float], None]
-"""Called with the share done, 0 to 1; raises when the work should end."""
-
 Results = Mapping[str, Any]
 """What the tasks returned, by their names."""
 
@@ -70,7 +67,7 @@ class Task(Struct, frozen=True):
 
     name: str
     function: Callable[..., Any]
-    """Defined at the top of a module; called with ``progress`` first, then ``arguments``."""
+    """Defined at the top of a module."""
     arguments: dict[str, Any]
     weight_s: float
     """About how long it takes: the longest are begun first."""

@@ -1,15 +1,11 @@
 """Runs all simulations of the report on every core, then draws and writes it."""
 
-import multiprocessing
 import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from importlib.metadata import version
-from multiprocessing.sharedctypes import Synchronized
-from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,7 +13,6 @@ import msgspec
 from msgspec import Struct
 
 from skyless.core.errors import SkylessError
-from skyless.core.kernels.processors import cores
 from skyless.research.paper import _checks as checks
 from skyless.research.paper import _claim as claim
 from skyless.research.paper import _distributions as distributions
@@ -30,6 +25,8 @@ from skyless.research.paper import _timeline as timeline
 from skyless.research.paper import _walk as walk
 from skyless.research.paper._html import Heading, report_page
 from skyless.research.paper.plan import Plan, Section, Task
+from skyless.research.studies.common.plan import Cell
+from skyless.research.studies.common.runner import run_cells
 from skyless.site.report.figures import picture, report_style
 
 _FIGURES: Final = (scenario, checks, distributions, static, walk, dop_map, timeline, rate, claim, scale)
@@ -37,8 +34,6 @@ _FIGURES: Final = (scenario, checks, distributions, static, walk, dop_map, timel
 
 _REPORT: Final = "report.html"
 _NUMBERS: Final = "numbers.json"
-
-_POLL_S: Final = 0.2
 
 
 class Report(Struct, frozen=True):
@@ -56,14 +51,6 @@ class Report(Struct, frozen=True):
     """Key, title, label, verdict, reason and numbers of every figure."""
 
 
-class StoppedError(Exception):
-    """The report was given up while this task ran."""
-
-
-# Set in each worker process by its initializer: a share of the work done, and whether to stop.
-_shared: dict[str, Any] = {}
-
-
 def write_report(plan: Plan, out: Path, reached: Callable[[float], None], processes: int | None = None) -> Report:
     """Simulate, draw, write; ``reached`` is called with the share of the work that is done.
 
@@ -73,7 +60,8 @@ def write_report(plan: Plan, out: Path, reached: Callable[[float], None], proces
         SkylessError: ``out`` cannot be a folder with the report.
     """
     with _scratch(out) as folder:
-        results = run_tasks([task for figure in _FIGURES for task in figure.tasks(plan)], reached, processes)
+        cells = [Cell(task.name, _run, task, task.weight_s) for figure in _FIGURES for task in figure.tasks(plan)]
+        results = dict(zip((cell.name for cell in cells), run_cells(cells, reached, processes), strict=True))
         with report_style():
             sections = [figure.section(plan, results) for figure in _FIGURES]
             report = _write(plan, sections, results, folder, out)
@@ -81,53 +69,8 @@ def write_report(plan: Plan, out: Path, reached: Callable[[float], None], proces
     return report
 
 
-def run_tasks(tasks: list[Task], reached: Callable[[float], None], processes: int | None = None) -> dict[str, Any]:
-    """Results of the tasks by name; the longest begin first. An interrupt stops all of them."""
-    context = multiprocessing.get_context("spawn")
-    total_s = sum(task.weight_s for task in tasks)
-    done_s, stop = context.Value("d", 0.0), context.Event()
-    workers = min(processes or cores(), len(tasks))
-    with ProcessPoolExecutor(workers, context, _start_worker, (done_s, stop)) as pool:
-        try:
-            futures = {pool.submit(_run, task): task.name for task in sorted(tasks, key=lambda task: -task.weight_s)}
-            waiting: set[Future[Any]] = set(futures)
-            while waiting:
-                finished, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
-                for future in finished:
-                    future.result()
-                reached(done_s.value / total_s)
-        except BaseException:
-            stop.set()
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
-    return {name: future.result() for future, name in futures.items()}
-
-
-def _start_worker(done_s: "Synchronized[float]", stop: Event) -> None:
-    """An interrupt reaches all processes of a terminal; the parent alone acts on it and stops the others."""
-    import signal  # noqa: PLC0415 - only workers need it
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _shared.update(done_s=done_s, stop=stop)
-
-
 def _run(task: Task) -> Any:  # noqa: ANN401 - each task has a result of its own
-    """Run one task in a worker."""
-    done_s, stop = _shared["done_s"], _shared["stop"]
-    reported = 0.0
-
-    def progress(share: float) -> None:
-        nonlocal reported
-        if stop.is_set():
-            raise StoppedError
-        if share - reported >= 0.01 or share >= 1.0 > reported:
-            with done_s.get_lock():
-                done_s.value += (share - reported) * task.weight_s
-            reported = share
-
-    result = task.function(progress, **task.arguments)
-    progress(1.0)
-    return result
+    return task.function(**task.arguments)
 
 
 @contextmanager

@@ -39,7 +39,7 @@ def run_cells(cells: Sequence[Cell], reached: Reached, processes: int | None = N
             return _map(pool, cells, reached)
         except BrokenProcessPool:
             raise SkylessError(
-                "a process of the study died, killed from outside or for want of memory; nothing was written"
+                "a process died, killed from outside or for want of memory; nothing was written"
             ) from None
 
 
@@ -94,15 +94,15 @@ def _map(pool: Executor, cells: Sequence[Cell], reached: Reached) -> list[Any]:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Hold Ctrl-C back: processes started in the block never get it, only this one, after the block."""
+    """Hold Ctrl-C and SIGTERM back until the block ends; processes started in it never get Ctrl-C, only this one."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
 
 
 @contextmanager
@@ -126,6 +126,7 @@ def _pool(processes: int) -> Iterator[ProcessPoolExecutor]:
 
 def _start_worker(parent: Connection) -> None:
     """End this process as soon as the other end of the pipe is closed, in the middle of a cell if need be."""
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
 
     def watch() -> None:
         try:
