@@ -98,6 +98,7 @@ def test_starts_from_packets_that_contradict_each_other_are_honest(late_anchors)
 
     Now and then three late anchors agree with the others on a wrong place and nothing contradicts: one tag in 60 so
     far, of which more than 4 come in 40 with a probability of 10⁻³. One late anchor alone is left out at no cost.
+    The same holds for tags that begin with a part of the anchors, as in a large hall.
     """
     exceeded, squares = 0, []
     errors = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
@@ -107,9 +108,8 @@ def test_starts_from_packets_that_contradict_each_other_are_honest(late_anchors)
         wrong[draw.permutation(6)[:late_anchors]] = draw.uniform(0.5, 2.0, late_anchors)
         episode = episode_of(Case(qa=0.3), 250, seed)
         packets = late(episode.packets, wrong[episode.packets.anchors])
-        fixes = list(
-            fixes_of(Estimation(settings_of(Case(qa=0.3), **errors)), observations_of(packets), episode.path_m)
-        )
+        method = Estimation(settings_of(Case(qa=0.3), **errors), most_anchors=24 if seed % 2 else None)
+        fixes = list(fixes_of(method, observations_of(packets), episode.path_m))
         assert fixes[0][0] * SLOT_S < 1.0
         exceeded += any(fix.hpl_m is not None and np.linalg.norm(error[:2]) > fix.hpl_m for _, fix, error in fixes)
         squares.append(np.square(fixes[-1][2][:2]).sum())

@@ -226,8 +226,6 @@ class Estimation:
         start = starting.add(observation)
         if isinstance(start, NoFixReason):
             return start
-        if self._most_anchors is not None and start.misfitting:
-            start = replace(start, is_contradicted=False, misfitting=())  # the others will do; it may join later
         if start.is_contradicted and not start.misfitting and self._estimator.is_late_often:
             return NoFixReason.RESIDUALS  # single packets are late: others will not be
         if self._superframe_s > LONGEST_SUPERFRAME_S:
