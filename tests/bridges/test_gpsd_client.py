@@ -19,6 +19,7 @@ from skyless.bridges.targets import open_route
 from skyless.core.earth import geodetic, rotated
 from skyless.core.site import GeoreferenceSite
 from skyless.run.mqtt.messages import FixMessage
+from support.processes import free_port
 
 GPSD = shutil.which("gpsd") or shutil.which("gpsd", path="/usr/sbin")
 pytestmark = [pytest.mark.site, pytest.mark.skipif(GPSD is None, reason="gpsd is not installed: apt-get install gpsd")]
@@ -49,12 +50,6 @@ def fixes():
         )
         for number in range(EPOCHS)
     ]  # fmt: skip
-
-
-def free_port(kind=socket.SOCK_STREAM):
-    with socket.socket(socket.AF_INET, kind) as free:
-        free.bind(("127.0.0.1", 0))
-        return free.getsockname()[1]
 
 
 class Client:

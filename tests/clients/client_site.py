@@ -3,7 +3,6 @@
 import contextlib
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -13,6 +12,7 @@ import paho.mqtt.publish
 import paho.mqtt.subscribe
 
 from skyless.run.process import end_with_parent
+from support.processes import free_port
 
 START_S = 120.0
 """A first start compiles the kernels."""
@@ -30,12 +30,6 @@ def site_text():
     for number, (x_m, y_m) in enumerate(_POSITIONS_M, start=1):
         lines += ["[[anchors]]", f"id = {number}", f"x_m = {x_m}", f"y_m = {y_m}"]
     return "\n".join(lines) + "\n"
-
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 class Process:

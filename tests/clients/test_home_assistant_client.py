@@ -11,9 +11,10 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from client_site import ORIGIN, ClientSite, Process, free_port, until
+from client_site import ORIGIN, ClientSite, Process, until
 
 from skyless.run.mqtt.messages import FixMessage, Zone, ZonesMessage
+from support.processes import free_port
 
 ENVIRONMENT = Path(__file__).parents[2] / ".venv-clients" / "homeassistant"
 PACKAGES = ("homeassistant==2025.4.4", "home-assistant-frontend==20250411.0", "paho-mqtt==2.1.0")

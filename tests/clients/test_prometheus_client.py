@@ -12,10 +12,11 @@ from bisect import bisect
 import msgspec
 import paho.mqtt.client
 import pytest
-from client_site import ClientSite, Process, free_port, until
+from client_site import ClientSite, Process, until
 from paho.mqtt.enums import CallbackAPIVersion
 
 from skyless.run.mqtt.messages import TagHealth
+from support.processes import free_port
 
 CONFIGURATION = """
 global:

@@ -11,7 +11,6 @@ import random
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -30,6 +29,7 @@ from skyless.bridges.targets import open_route
 from skyless.cli.main import main
 from skyless.core.earth import geodetic, rotated
 from skyless.run.recordings.recording import McapRecording
+from support.processes import free_port
 
 ROOT = Path(__file__).parents[2]
 HERE = Path(__file__).parent
@@ -141,9 +141,7 @@ def door(request, ros, capfd):
         with Feed(f"ros2://?domain={ros.domain}&hz=1000", print) as feed:
             yield feed
         return
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     node = ros.start(ros.python, ROOT / "examples/ros2/skyless_node.py", "--ros-args", "-p", f"port:={port}")
     try:
         with Feed(f"jsonl+tcp://:{port}?hz=1000", print) as feed:

@@ -6,7 +6,6 @@ import os
 import secrets
 import shutil
 import signal
-import socket
 import subprocess
 import time
 import weakref
@@ -14,14 +13,9 @@ from pathlib import Path
 
 from skyless.run.broker import BrokerSettings, start_broker
 from skyless.run.mqtt.address import MqttAddress
+from support.processes import free_port
 
 MOSQUITTO = shutil.which("mosquitto", path=os.environ.get("PATH", "") + ":/usr/sbin")
-
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 class Embedded:

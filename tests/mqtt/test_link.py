@@ -9,7 +9,7 @@ import threading
 
 import msgspec
 import pytest
-from mqtt_brokers import free_port, running, stopped, subscribed, until
+from mqtt_brokers import running, stopped, subscribed, until
 
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt import connection
@@ -19,6 +19,7 @@ from skyless.run.mqtt.connection import check_broker
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import StatusMessage, Zone, ZonesMessage
 from skyless.run.mqtt.topics import fix_topic, receptions_topic, status_topic, zones_topic
+from support.processes import free_port
 
 pytestmark = pytest.mark.site
 

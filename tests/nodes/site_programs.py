@@ -5,10 +5,10 @@ import contextlib
 import signal
 import time
 
-from mqtt_brokers import Mosquitto, free_port
+from mqtt_brokers import Mosquitto
 
 from skyless.research.compile_ahead import compile_kernels
-from support.processes import SKYLESS, usual_signals
+from support.processes import SKYLESS, free_port, usual_signals
 
 START_S = 120.0
 """A first start compiles the kernels."""

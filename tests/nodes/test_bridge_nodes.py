@@ -7,7 +7,7 @@ import signal
 from types import SimpleNamespace
 
 import pytest
-from mqtt_brokers import Embedded, free_port, until
+from mqtt_brokers import Embedded, until
 from msgspec import structs
 from node_stage import running
 
@@ -25,7 +25,7 @@ from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import SiteMessage, StatusMessage, Zone, ZonesMessage
 from skyless.run.mqtt.topics import EVERY_NODE, fix_topic, health_topic, site_topic, status_topic, zones_topic
 from support.loops import in_loop
-from support.processes import SKYLESS, running_program
+from support.processes import SKYLESS, free_port, running_program
 
 pytestmark = pytest.mark.site
 

@@ -7,11 +7,12 @@ import signal
 import sys
 
 import pytest
-from mqtt_brokers import free_port, until
+from mqtt_brokers import until
 
 from skyless.run import children
 from skyless.run.children import Child, Program, end
 from support.loops import in_loop
+from support.processes import free_port
 
 pytestmark = pytest.mark.site
 

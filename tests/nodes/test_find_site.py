@@ -9,7 +9,7 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mqtt_brokers import Embedded, free_port
+from mqtt_brokers import Embedded
 
 from skyless.core.errors import SkylessError
 from skyless.run.find_site import KnownSites, find_site
@@ -19,7 +19,7 @@ from skyless.run.mqtt.messages import SiteMessage, StatusMessage
 from skyless.run.mqtt.topics import site_topic, status_topic
 from skyless.sim.lab import lab_site
 from support.loops import in_loop
-from support.processes import SKYLESS
+from support.processes import SKYLESS, free_port
 
 pytestmark = pytest.mark.site
 

@@ -10,7 +10,7 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from mqtt_brokers import MOSQUITTO, Mosquitto, free_port, until
+from mqtt_brokers import MOSQUITTO, Mosquitto, until
 from site_programs import Program
 
 from skyless.research.compile_ahead import compile_kernels
@@ -28,6 +28,7 @@ from skyless.run.mqtt.messages import (
 )
 from skyless.site.file.load import load_site
 from skyless.site.survey.facts import Facts, Gauge
+from support.processes import free_port
 
 pytestmark = pytest.mark.live
 

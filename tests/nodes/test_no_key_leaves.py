@@ -11,7 +11,7 @@ import time
 
 import pytest
 from mcap.reader import make_reader
-from mqtt_brokers import Embedded, free_port, until
+from mqtt_brokers import Embedded, until
 from site_programs import START_S, Program
 
 from skyless.cli.main import main
@@ -19,6 +19,7 @@ from skyless.core.keys.chain import ChainKeys
 from skyless.research.compile_ahead import compile_kernels
 from skyless.run.keys.key_files import read_keys
 from skyless.run.mqtt.link import Link
+from support.processes import free_port
 
 pytestmark = pytest.mark.site
 

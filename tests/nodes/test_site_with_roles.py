@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from mqtt_brokers import Embedded, free_port, until
+from mqtt_brokers import Embedded, until
 from site_programs import START_S, Program, site_file
 
 from skyless.core.errors import SkylessError
@@ -20,6 +20,7 @@ from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.connection import check_broker
 from skyless.run.mqtt.link import Link
 from support.loops import in_loop
+from support.processes import free_port
 
 pytestmark = pytest.mark.site
 

@@ -2,6 +2,8 @@
 
 import asyncio
 import contextlib
+import itertools
+import os
 import signal
 import socket
 import subprocess
@@ -26,11 +28,18 @@ def usual_signals():
     return prepare
 
 
-def free_port():
-    """A port of loopback where nobody listens at this moment."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+# Below the ports that Linux gives to connections (32768 and up), which could take one before the test listens there.
+_FIRST_PORT = 12000 + 2000 * (int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")) % 10)
+_ports = itertools.cycle(range(_FIRST_PORT, _FIRST_PORT + 2000))
+
+
+def free_port(kind=socket.SOCK_STREAM):
+    """A port of loopback where nobody listens, and which no other test of this run gets."""
+    while True:
+        port = next(_ports)
+        with contextlib.suppress(OSError), socket.socket(socket.AF_INET, kind) as probe:
+            probe.bind(("127.0.0.1", port))
+            return port
 
 
 @contextlib.contextmanager
