@@ -23,6 +23,8 @@ _CONNECT_S: Final = 10.0
 
 _ADDRESS: Final = re.compile(r"((tcp|tls|ws|wss)://)?[^\s/]+:\d{1,5}")
 
+_ENDING: Final = (signal.SIGINT, signal.SIGTERM)
+
 Reached = Callable[[float], None]
 
 
@@ -98,11 +100,18 @@ def _uninterrupted() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    came: list[int] = []
+    # The mask is for the processes, which inherit it: here a signal may reach another thread, as one of NumPy's.
+    signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
+    handlers = {number: signal.signal(number, lambda number, _: came.append(number)) for number in _ENDING}
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
+    if came:
+        signal.raise_signal(came[0])
 
 
 @contextmanager
