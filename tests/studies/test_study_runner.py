@@ -106,7 +106,7 @@ def test_what_is_no_address_is_told(address):
 def test_a_scheduler_without_workers_is_told():
     with (
         LocalCluster(n_workers=0, dashboard_address=None, protocol="tcp") as empty,
-        pytest.raises(SkylessError, match="has no workers"),
+        pytest.raises(SkylessError, match="has no workers; start some: dask worker tcp:"),
     ):
         run_cells_on_dask(cells(double, [1]), lambda share: None, empty.scheduler_address)
 

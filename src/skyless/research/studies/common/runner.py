@@ -23,7 +23,7 @@ _CONNECT_S: Final = 10.0
 
 _ADDRESS: Final = re.compile(r"((tcp|tls|ws|wss)://)?[^\s/]+:\d{1,5}")
 
-_ENDING: Final = (signal.SIGINT, signal.SIGTERM)
+_ENDING_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 Reached = Callable[[float], None]
 
@@ -101,15 +101,16 @@ def _uninterrupted() -> Iterator[None]:
         yield
         return
     came: list[int] = []
-    # The mask is for the processes, which inherit it: here a signal may reach another thread, as one of NumPy's.
-    signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
-    handlers = {number: signal.signal(number, lambda number, _: came.append(number)) for number in _ENDING}
+    # Processes inherit the mask. This program needs handlers as well: where its main thread masks a signal, the system
+    # gives it to another thread, such as one of NumPy's, and Python would interrupt the main thread all the same.
+    signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING_SIGNALS)
+    handlers = {number: signal.signal(number, lambda number, _: came.append(number)) for number in _ENDING_SIGNALS}
     try:
         yield
     finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING_SIGNALS)  # what was held back by it comes to these handlers
         for number, handler in handlers.items():
             signal.signal(number, handler)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
     if came:
         signal.raise_signal(came[0])
 
@@ -165,7 +166,9 @@ def _connected(connect: Callable[..., Any], scheduler: str) -> Iterator[Executor
         raise SkylessError(f"--scheduler is {scheduler!r}, where no Dask scheduler answers: {error}") from None
     try:
         if not client.scheduler_info(n_workers=-1)["workers"]:
-            raise SkylessError(f"--scheduler is {scheduler!r}, which has no workers; start some: dask worker _ADDRESS")
+            raise SkylessError(
+                f"--scheduler is {scheduler!r}, which has no workers; start some: dask worker {scheduler}"
+            )
         executor = client.get_executor(pure=False)
         try:
             yield executor
