@@ -96,18 +96,18 @@ def jump_share(s: EstimatorState) -> float:
 
 
 @step
-def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float) -> None:
-    """Time update of an anchor's range errors over what has passed and was walked since its newest packet.
+def range_error_decay(s: EstimatorState, anchor: int, dt: float, walked_m: float) -> tuple[float, float, float]:
+    """What an anchor's range errors keep over what has passed and was walked since its newest packet.
 
+    Of the changing part: the share that is kept and its variance in the long run; then the share of the constant part.
     The changing part is a Gauss–Markov process of walked distance and of time. Where range errors jump, both parts
     forget within seconds; one that has jumped itself wanders and returns to zero.
     """
-    status, settings = s.status[0], s.settings[0]
-    where, share = layout(settings["dim"], len(s.anchors)), jump_share(s)
-    change, constant = where.change + anchor, where.constant + anchor
+    status, settings, share = s.status[0], s.settings[0], jump_share(s)
     obstructed = share * dt / OBSTRUCTED_S
     if s.anchors[anchor]["is_obstructed"]:
-        memory_s = OBSTRUCTION_MEMORY_S * max(1.0, abs(s.x[change]) / OBSTRUCTION_RETURN_M)
+        change_m = s.x[layout(settings["dim"], len(s.anchors)).change + anchor]
+        memory_s = OBSTRUCTION_MEMORY_S * max(1.0, abs(change_m) / OBSTRUCTION_RETURN_M)
         variance = 0.5 * memory_s * OBSTRUCTED_WALK * s.anchors[anchor]["change_scale"]
         kept = np.exp(-dt / memory_s)
     else:
@@ -115,11 +115,22 @@ def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float
         variance = place_variance + share * OBSTRUCTED_STD_M**2
         usual = dt / settings["place_time_s"] + walked_m / status["place_distance_m"]
         kept = np.exp(-obstructed - (1.0 - share) * usual)
-    if variance > 0.0:  # also where the site calls ranges exact: multipath is learnt there as well
-        s.status[0]["range_errors"] = max(status["range_errors"], CHANGING_RANGE_ERRORS)
-        _decay(s, change, kept, variance)
+    kept_constant = 1.0
     if obstructed > 1e-6 and settings["range_std_m"] > 0.0:
-        _decay(s, constant, np.exp(-obstructed), settings["range_std_m"] ** 2)
+        kept_constant = np.exp(-obstructed)
+    return float(kept), float(variance), float(kept_constant)
+
+
+@step
+def relax_range_error(s: EstimatorState, anchor: int, dt: float, walked_m: float) -> None:
+    """Time update of an anchor's range errors since its newest packet, by what ``range_error_decay`` says."""
+    where = layout(s.settings[0]["dim"], len(s.anchors))
+    kept, variance, kept_constant = range_error_decay(s, anchor, dt, walked_m)
+    if variance > 0.0:  # also where the site calls ranges exact: multipath is learnt there as well
+        s.status[0]["range_errors"] = max(s.status[0]["range_errors"], CHANGING_RANGE_ERRORS)
+        _decay(s, where.change + anchor, kept, variance)
+    if kept_constant < 1.0:
+        _decay(s, where.constant + anchor, kept_constant, s.settings[0]["range_std_m"] ** 2)
 
 
 @step
