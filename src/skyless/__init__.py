@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from skyless.cli.api.simulate import SimulationResult, simulate
     from skyless.cli.api.study import StudyResult, study
     from skyless.cli.api.survey import BiasResult, SurveyResult, survey_site
+    from skyless.core.air.masterless_packets import PairTdoa
     from skyless.core.air.reception import Reception, Transmission
     from skyless.core.anchor.anchor import Anchor
     from skyless.core.errors import SkylessError
@@ -38,6 +39,7 @@ _MODULES: Final = {
     "Fix": "skyless.core.fix",
     "Fleet": "skyless.sim.evaluation.fleet",
     "NoFixReason": "skyless.core.fix",
+    "PairTdoa": "skyless.core.air.masterless_packets",
     "PlanResult": "skyless.cli.api.plan",
     "RatePlanResult": "skyless.cli.api.rate_plan",
     "Receiver": "skyless.core.tag.receiver",
@@ -72,6 +74,7 @@ __all__ = [
     "Fix",
     "Fleet",
     "NoFixReason",
+    "PairTdoa",
     "PlanResult",
     "RatePlanResult",
     "Receiver",

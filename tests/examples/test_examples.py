@@ -13,7 +13,14 @@ import pytest
 pytestmark = pytest.mark.site
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-IN_THE_TESTS = {"first_fix.py", "own_radio.py", "replay_recording.py", "plan_a_hall.py", "compare_methods.py"}
+IN_THE_TESTS = {
+    "first_fix.py",
+    "own_estimator.py",
+    "own_radio.py",
+    "replay_recording.py",
+    "plan_a_hall.py",
+    "compare_methods.py",
+}
 
 
 def printed(name, capsys, monkeypatch, *arguments):
@@ -30,6 +37,13 @@ def test_first_fix(capsys, monkeypatch):
     assert abs(x_m - 3.0) < 0.15
     assert abs(y_m - 4.0) < 0.15
     assert z_m == 0.0
+
+
+def test_own_estimator(capsys, monkeypatch):
+    """Its filter is half as far off as its least squares, which knows no motion."""
+    by_name = dict(re.findall(r"(\w+): ([\d.]+) cm", printed("own_estimator.py", capsys, monkeypatch)))
+    assert float(by_name["Filter"]) < 10.0
+    assert float(by_name["LeastSquares"]) < 25.0
 
 
 def test_own_radio(capsys, monkeypatch):

@@ -96,7 +96,7 @@ def test_a_replay_judges_after_a_stall_of_the_air_as_the_live_run_did(tmp_path):
     assert report.identical.different == 0
     assert report.identical.compared == report.fixes == len(found) > 200
     assert max(abs(at_s - live[position_m]) for position_m, at_s in found.items()) < 0.01
-    assert report.max_m < 0.3
+    assert report.max_2d_m < 0.3
 
 
 def _after_a_stall(unix_s, topic, payload, stalled_s, stall_s):

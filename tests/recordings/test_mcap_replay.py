@@ -252,7 +252,7 @@ def test_the_command_tells_one_tag_as_other_replays_and_all_in_sums(tmp_path, ca
     assert main(["replay", str(path), "--tag", "b", "--json", "--plot", str(plot)]) == 0
     one = json.loads(capsys.readouterr().out)
     assert one["identical"] == both["tags"]["b"]["identical"]
-    assert {"rmse_2d_m", "p95_m", "median_m", "receptions_per_s", "height_note"} <= one.keys()
+    assert {"rmse_2d_m", "p95_2d_m", "median_m", "receptions_per_s", "height_note"} <= one.keys()
     assert plot.stat().st_size > 10_000
     assert main(["replay", str(path), "--tag", "a"]) == 0
     shown = capsys.readouterr().out
@@ -296,7 +296,7 @@ def test_snapshots_of_few_members_are_warned_of(tmp_path, capsys, loss, method, 
     assert main(["replay", str(path), "--method", method]) == 0
     told = capsys.readouterr()
     assert ("a: weighted had " in told.err) is warned
-    assert "95 % 2-D" in told.out
+    assert "50, 75, 95, 100 % 2-D" in told.out
 
 
 def test_a_recording_without_receptions_says_so(tmp_path):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from skyless.core.air.masterless_packets import PairTdoa
-from skyless.research.replays.captures import MAX_PAIRS, MIN_PAIR_DIFFERENCES, ROWS_PER_PAIR, NoiseByPair
-from skyless.sim.evaluation.judge import Judge
+from skyless.research.replays.noise import MAX_PAIRS, MIN_PAIR_DIFFERENCES, ROWS_PER_PAIR, NoiseByPair
+from skyless.sim.evaluation.truth import TruthTrack
 from skyless.site.tables import Truth
 
 ANCHORS_M = {1: (0.0, 0.0, 0.0), 2: (8.0, 0.0, 1.0), 3: (0.0, 6.0, 2.0)}
@@ -20,11 +20,11 @@ def moving(until_s):
 
 def test_noise_about_the_truth_of_a_moving_tag_withstands_outliers():
     random = np.random.default_rng(11)
-    judge = Judge(moving(100.0), planar=False)
-    book = NoiseByPair(judge, ANCHORS_M)
+    track = TruthTrack(moving(100.0))
+    book = NoiseByPair(moving(100.0), ANCHORS_M)
     count = 3000
     for time_s in np.linspace(0.0, 100.0, count):
-        at_m = judge.at(float(time_s))
+        at_m = track.at(float(time_s))
         error_m = random.normal(0.3, 0.1) + (50.0 if random.random() < 0.05 else 0.0)
         book.add(PairTdoa(float(time_s), 1, 2, dist(at_m, ANCHORS_M[2]) - dist(at_m, ANCHORS_M[1]) + error_m))
     (pair,) = book.pairs()
@@ -35,7 +35,7 @@ def test_noise_about_the_truth_of_a_moving_tag_withstands_outliers():
 
 
 def test_noise_without_truth_is_about_the_median():
-    book = NoiseByPair(Judge(None, planar=False), {})
+    book = NoiseByPair(None, {})
     values = np.random.default_rng(2).normal(3.0, 0.05, 500)
     for value in values:
         book.add(PairTdoa(0.0, 7, 8, float(value)))
@@ -46,7 +46,7 @@ def test_noise_without_truth_is_about_the_median():
 
 
 def test_positions_that_come_with_the_difference_serve():
-    book = NoiseByPair(Judge(moving(1.0), planar=False), {})
+    book = NoiseByPair(moving(1.0), {})
     at_m = (1.0, 2.0, 1.0)
     for _ in range(MIN_PAIR_DIFFERENCES):
         book.add(PairTdoa(0.0, 7, 8, dist(at_m, (5.0, 5.0, 5.0)) - dist(at_m, (0.0, 0.0, 0.0)), (0.0,) * 3, (5.0,) * 3))
@@ -56,14 +56,14 @@ def test_positions_that_come_with_the_difference_serve():
 
 
 def test_a_pair_heard_too_seldom_says_nothing():
-    book = NoiseByPair(Judge(None, planar=False), {})
+    book = NoiseByPair(None, {})
     for _ in range(MIN_PAIR_DIFFERENCES - 1):
         book.add(PairTdoa(0.0, 1, 2, 0.0))
     assert book.pairs() == ()
 
 
 def test_a_stream_of_any_length_and_of_any_identifiers_takes_bounded_memory():
-    book = NoiseByPair(Judge(None, planar=False), {})
+    book = NoiseByPair(None, {})
     for k in range(3 * ROWS_PER_PAIR):
         book.add(PairTdoa(0.0, 1, 2, float(k % 2)))
     for k in range(100_000, 100_000 + 4 * MAX_PAIRS):

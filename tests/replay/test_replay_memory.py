@@ -26,7 +26,7 @@ for recording in sys.argv[1:4]:
 
 @pytest.mark.parametrize("name", ROWS)
 def test_ten_times_the_recording_takes_the_same_memory(tmp_path, name):
-    """What may grow is bounded: samples of 131 072 rows (13 MB at most) that percentiles and pictures come from.
+    """What may grow is bounded: a table of 524 288 fixes (55 MB at most) that figures and pictures come from.
 
     One process replays a few rows first, which load the kernels or compile them, and then the two recordings.
     """
@@ -39,6 +39,6 @@ def test_ten_times_the_recording_takes_the_same_memory(tmp_path, name):
     command = [sys.executable, "-c", PEAKS, *map(str, [*files, *options])]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     _, short, long = map(int, done.stderr.split())
-    samples = min(9 * ROWS[name], 2**17) * (7 + 3 + 1 + 1) * 8 / 1024
-    # Three times: the store, the copy that ``rows`` gives of it, and the one that a percentile sorts.
-    assert long - short < 3 * samples + 4_000, (short, long)
+    table = min(9 * ROWS[name], 2**19) * 13 * 8 / 1024
+    # Six times: the store, the copy that ``rows`` gives of it, and what the figures of all fixes are computed with.
+    assert long - short < 6 * table + 4_000, (short, long)

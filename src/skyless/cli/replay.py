@@ -2,7 +2,6 @@
 
 import csv
 import sys
-from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from skyless.cli.api.replay import OnFix
     from skyless.core.fix import Fix
     from skyless.research.replays.captures import ReplayReport
-    from skyless.sim.evaluation.judge import Judge
 
 FIXES_COLUMNS: Final = (
     *("t_s", "x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps"),
@@ -80,10 +78,11 @@ def replay(asked: ReplayOptions, output: _Output) -> int:
     with ExitStack() as until_done:
         bar = until_done.enter_context(progress_bar("replaying", 1.0))
 
-        def begin(judges: "Mapping[str, Judge]", given: str) -> "OnFix | None":
-            if output.plot is not None and len(judges) > 1:
-                raise SkylessError(f"--plot draws one tag; choose it with --tag, one of {', '.join(judges)}")
-            _load_kernels(given)
+        def begin(tags: tuple[str, ...], given: str) -> "OnFix | None":
+            if output.plot is not None and len(tags) > 1:
+                raise SkylessError(f"--plot draws one tag; choose it with --tag, one of {', '.join(tags)}")
+            if asked.estimator is None:
+                _load_kernels(given)
             if output.fixes_csv is None:
                 return None
             write = csv.writer(until_done.enter_context(new_table(output.fixes_csv))).writerow

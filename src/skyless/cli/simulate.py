@@ -60,8 +60,9 @@ def simulate(*, asked: SimulateOptions, output: _Output) -> int:
     with progress_bar("simulating", 1.0) as bar:
         simulation = Simulation(replace(asked, progress=bar.reach))
         name_unplaced(simulation.request.site)
-        with loading_kernels(*parts_of(asked.method)):
-            compile_kernels(asked.method)
+        if asked.estimator is None:
+            with loading_kernels(*parts_of(asked.method)):
+                compile_kernels(asked.method)
         with nullcontext() if output.fixes_csv is None else new_table(output.fixes_csv) as file:
             write = None if file is None else csv.writer(file).writerow
             if write is not None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from msgspec import Struct
+from numpy.typing import ArrayLike
 
 from skyless.core.alert import Alert
 from skyless.core.integrity import Integrity, IntegrityRequirement, integrity_of
@@ -72,6 +73,23 @@ class Fix(Struct, frozen=True, gc=False):
     """Up to this time, on the scale of ``time_s``, every beacon that counts is verified; None where none is."""
     unverified: float = 1.0
     """Share of the beacons of the last second that are not verified, or not yet."""
+
+    @classmethod
+    def of(
+        cls,
+        time_s: float,
+        position_m: ArrayLike,
+        covariance_m2: ArrayLike | None = None,
+        *,
+        anchors: tuple[int, ...] = (),
+        method: str = "own",
+    ) -> "Fix":
+        """A fix of one's own estimator: shapes (3,) and (3, 3); without a covariance it claims nothing."""
+        rows = np.full((VELOCITY, 3), np.nan)
+        rows[POSITION] = position_m
+        if covariance_m2 is not None:
+            rows[POSITION + 1 : QUALITY] = covariance_m2
+        return cls(time_s, rows.tobytes(), anchors, np.empty((0, 3)), method, height_known=False)
 
     def __repr__(self) -> str:
         return (

@@ -149,6 +149,21 @@ def read_truth(path: str | PathLike[str], listener: str | None = None) -> Truth:
     return Truth(times, table[:, 1:4], table[:, 4:8] if len(columns) == 8 else None)
 
 
+HEIGHT_STD_M: Final = 0.05
+"""Standard deviation of a reading of a height sensor, where its table states none."""
+
+
+def read_height_readings(path: str | PathLike[str]) -> Array:
+    """Readings of a height sensor: rows of time, height and standard deviation, shape (n, 3)."""
+    rows = [
+        (row.number("t_s"), row.number("height_m"), row.number("std_m") if row.fields.get("std_m") else HEIGHT_STD_M)
+        for row in _rows(path, ("t_s", "height_m"))
+    ]
+    if not rows:
+        raise _empty(path, "row")
+    return np.array(rows)
+
+
 # Anchors and their calibration
 
 

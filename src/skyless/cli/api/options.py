@@ -30,10 +30,14 @@ from skyless.core.arguments import (
 )
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import DEFAULT_METHOD, Dynamics
+from skyless.research.replays.options import check_estimator, read_estimator
 from skyless.sim.evaluation.request import Conditions, IntegrityRisk
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from skyless.core.site import Site
+    from skyless.research.masterless.own_estimator import OwnEstimator
 
 _USUAL_DURATION_S = 60.0
 """Duration of a simulation without a goal."""
@@ -49,6 +53,11 @@ class SimulateOptions(Conditions, frozen=True, kw_only=True):
     site: Annotated["Site | str | Path | None", Path] = None
     """Site file instead of a named site; in Python also a site. Positions of anchors and ranges are wrong by chance, as
     its accuracy states; all its deviations 0: exact."""
+    estimator: Annotated[
+        "Callable[[], OwnEstimator] | None", Text(read_estimator, "FILE.py:CLASS"), Rule(check_estimator)
+    ] = None
+    """Your own estimator instead of the method, a class with hear(observation): each tag makes one, and gives it one
+    time difference after the other."""
     duration_s: Annotated[Positive | None, Option("duration")] = None
     """Seconds to simulate; by default 60 unless --fixes is given."""
 

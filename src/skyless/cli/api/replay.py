@@ -1,12 +1,12 @@
 """``skyless.replay``: a recording becomes fixes, judged against the truth where there is one."""
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
+import numpy as np
 from msgspec.structs import replace
 
 from skyless.cli.api._result import Result, cm
@@ -23,13 +23,17 @@ from skyless.research.replays.captures import CaptureReplay, ReplayReport, dista
 from skyless.research.replays.options import ReplayOptions
 from skyless.research.replays.site import SiteReplay, TagReport, summary_of
 from skyless.run.recordings.recording import McapRecording, is_mcap
-from skyless.sim.evaluation.judge import Judge
-from skyless.sim.evaluation.statistics import dimensions
+from skyless.sim.evaluation.figures import FixSamples, Judged
+from skyless.sim.evaluation.truth import truth_at
 from skyless.site.file.load import site_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
+
+
+_WORTH_SHIFTING_S: Final = 0.05
+"""Offsets of the truth's times up to this are those of the filter itself."""
 
 
 class ReplayResult(Result, frozen=True, eq=False):
@@ -42,6 +46,8 @@ class ReplayResult(Result, frozen=True, eq=False):
     """All fixes; ``truth_m`` is NaN where it is not known."""
     tracks: dict[str, Matrix]
     """Time, position and true position of each tag, shape (k, 7): an even sample, for drawing."""
+    judged: dict[str, Judged]
+    """Which fixes of each tag are judged, and against which truth."""
     warnings: tuple[str, ...]
     height_note: str
     """Where the tags' height is from."""
@@ -100,11 +106,7 @@ class ReplayResult(Result, frozen=True, eq=False):
         # without truth, the tag's own motion is in it
         truth_known = any(pair.against_truth for pair in report.pairs)
         yield "noise of a difference" if truth_known else "scatter of a difference", cm(report.tdoa_noise_m)
-        yield "RMSE 2-D", cm(report.rmse_2d_m)
-        yield "RMSE 3-D", cm(report.rmse_3d_m)
-        of_all = dimensions(planar=report.rmse_3d_m is None)
-        yield f"95 % {of_all}", cm(report.p95_m)
-        yield f"largest error {of_all}", cm(report.max_m)
+        yield from _judged_facts(report)
         yield "speed", f"{report.receptions_per_s:,.0f} receptions/s"
         for reason, count in report.drops.items():
             yield f"dropped: {reason}", str(count)
@@ -113,6 +115,41 @@ class ReplayResult(Result, frozen=True, eq=False):
             yield f"anchors {pair}", f"range each other {abs(by_m):.2f} m {nearer} than the table has them"
         for pair, distance_m in self.summary.get("anchor_distances_m", {}).items():
             yield f"distance {pair}", f"{distance_m:.3f} m"
+
+
+def _judged_facts(report: ReplayReport) -> Iterator[tuple[str, str]]:
+    """What comes of the truth, and what fixes say of themselves."""
+    if report.first_fix_s is not None:
+        off = "" if report.first_fix_error_m is None else f", {cm(report.first_fix_error_m)} off"
+        yield "first fix", f"after {report.first_fix_s:.2f} s{off}"
+        yield "available", _share(report.availability)
+    left_out = ", ".join(f"{count} {reason}" for reason, count in report.left_out.items())
+    yield "judged", f"{report.judged} fixes, {report.judged_s:.1f} s" + (f" (left out: {left_out})" if left_out else "")
+    for of in ("2d", "3d"):
+        rmse_m, *others_m = (getattr(report, f"{name}_{of}_m") for name in ("rmse", "p50", "p75", "p95", "max"))
+        if rmse_m is not None:
+            name = of.upper().replace("D", "-D")
+            yield f"RMSE {name}", cm(rmse_m)
+            yield f"50, 75, 95, 100 % {name}", ", ".join(cm(value) for value in others_m)
+    if report.bias_m is not None and report.rmse_axes_m is not None:
+        yield "RMSE x, y, z", _triple(report.rmse_axes_m)
+        yield "bias x, y, z", _triple(report.bias_m)
+        yield "claimed σ", cm(report.sigma_2d_m if report.sigma_3d_m is None else report.sigma_3d_m)
+        yield "NEES", "–" if report.nees is None else f"{report.nees:.2f}; {_share(report.beyond_95)} beyond 95 %"
+        yield "trajectory errors", f"absolute {cm(report.ate_m)}, relative {cm(report.rpe_m)} in a metre"
+    if report.levels:
+        exceeded = f"exceeded by {report.exceeded_horizontal} horizontally, {report.exceeded_vertical} vertically"
+        yield "protection levels", f"{report.levels}, {exceeded} ({report.exceeded_unalerted} without alert)"
+    if report.hpl_m is not None:
+        yield "median level", cm(report.hpl_m) + ("" if report.vpl_m is None else f", vertical {cm(report.vpl_m)}")
+    if alerts := ", ".join(f"{alert} {count}" for alert, count in report.alerts.items() if alert != "none"):
+        yield "alerts", alerts
+    if report.truth_offset_s is not None and abs(report.truth_offset_s) > _WORTH_SHIFTING_S:
+        yield "truth", f"fits best {report.truth_offset_s:+.3f} s later: see --truth-offset"
+
+
+def _share(value: float | None) -> str:
+    return "–" if value is None else f"{100.0 * value:.1f} %"
 
 
 def _same(report: TagReport) -> str:
@@ -135,8 +172,8 @@ OnFix = Callable[[str, float, Fix], None]
 """Gets the tag's name, the fix's time in the recording's own scale (Unix time for one of skyless record), and the fix.
 """
 
-Begin = Callable[[Mapping[str, Judge], str], OnFix | None]
-"""Gets, before a replay begins, the judge of each tag, and the method or what the filter is given."""
+Begin = Callable[[tuple[str, ...], str], OnFix | None]
+"""Gets, before a replay begins, the tags' names, and the method or what the filter is given."""
 
 
 def replay_recording(asked: ReplayOptions, begin: Begin) -> ReplayResult:
@@ -146,49 +183,58 @@ def replay_recording(asked: ReplayOptions, begin: Begin) -> ReplayResult:
 
 def _replay_capture(asked: ReplayOptions, begin: Begin) -> ReplayResult:
     run, path = CaptureReplay(asked), Path(asked.file)
-    write = begin({"tag": run.judge}, run.measurements)
+    write = begin(("tag",), run.measurements)
     size = max(path.stat().st_size, 1)
     on_fix = None if write is None else lambda fix: write("tag", fix.time_s, fix)
     report = run.run(on_fix, lambda read: asked.progress(min(read / size, 1.0)))
     asked.progress(1.0)
     summary = {**msgspec.to_builtins(report), "height_note": run.height_note}
     summary["anchor_distances_m"] = distances_of(path, report.format)
-    return _result(path, {"tag": report}, {"tag": run.judge}, run.height_note, summary)
+    samples, judged = {"tag": run.samples}, {"tag": run.judged}
+    return _result(path, {"tag": report}, samples, judged, run.height_note, summary)
 
 
 def _replay_site(asked: ReplayOptions, begin: Begin) -> ReplayResult:
     why, path = "a recording of skyless record brings its own", Path(asked.file)
     asked.leave_out(
-        *("anchors", "truth", "lever_arm_m", "format", "listener", "qa", "dynamics", "tdoa_std_m", "measurements"),
-        *("uncalibrated", "tag_height_m"),
+        *("anchors", "truth", "truth_offset_s", "lever_arm_m", "format", "listener", "qa", "dynamics", "tdoa_std_m"),
+        *("measurements", "uncalibrated", "tag_height_m", "z_bounds_m", "heights"),
         why=why,
     )
+    asked.leave_out("smooth", why="it is for time differences, and these are receptions, whose clocks are estimated")
     wanted = None if asked.site is None else site_of(asked.site)[0]
     tags, settle_s = None if asked.tag is None else (asked.tag,), 2.0 if asked.settle_s is None else asked.settle_s
     with McapRecording(path) as recording:
         run = SiteReplay(recording, tags, asked.method, settle_s, asked.above_m, wanted, asked.requirement)
         found = recording.summary()
         span_s = max((found.end_s or 0.0) - (found.start_s or 0.0), 1e-9)
-        write = begin(run.judges, asked.method or DEFAULT_METHOD)
+        write = begin(tuple(run.tags), asked.method or DEFAULT_METHOD)
         on_fix = None if write is None else lambda tag, made: write(tag, made.unix_s, made.fix)
         reports = run.run(on_fix, lambda done_s: asked.progress(min(max(done_s / span_s, 0.0), 1.0)))
     asked.progress(1.0)
     unfinished = f"{path} has no end: it was cut off, or is still being written; later fixes are missing"
     by_tag: dict[str, ReplayReport] = {report.tag: report for report in reports}
+    judged = {tag: run.judged(tag) for tag in by_tag}
     warnings = () if found.finished else (unfinished,)
-    return _result(path, by_tag, run.judges, "from the site", summary_of(reports), warnings)
+    return _result(path, by_tag, run.samples, judged, "from the site", summary_of(reports), warnings)
 
 
 def _result(
     path: Path,
     reports: dict[str, ReplayReport],
-    judges: Mapping[str, Judge],
+    samples: Mapping[str, FixSamples],
+    judged: dict[str, Judged],
     height_note: str,
     summary: dict[str, Any],
     warnings: tuple[str, ...] = (),
 ) -> ReplayResult:
-    tracks = {tag: judges[tag].track.rows for tag in reports}
-    return ReplayResult(path, reports, FixRecorder(tuple(reports)).fixes(), tracks, warnings, height_note, summary)
+    tracks = {}
+    for tag in reports:
+        table = samples[tag].table()
+        truth_m = truth_at(judged[tag].truth, table.time_s)
+        tracks[tag] = np.column_stack([table.time_s, table.position_m, truth_m])
+    no_fixes = FixRecorder(tuple(reports)).fixes()
+    return ReplayResult(path, reports, no_fixes, tracks, judged, warnings, height_note, summary)
 
 
 def run_replay(asked: ReplayOptions) -> ReplayResult:
@@ -200,20 +246,17 @@ def run_replay(asked: ReplayOptions) -> ReplayResult:
     """
     recorders: list[FixRecorder] = []
 
-    def begin(judges: Mapping[str, Judge], _given: str) -> OnFix:
-        tags, judged_before = tuple(judges), Counter[str]()
-        recorder = FixRecorder(tags)
-        recorders.append(recorder)
-
-        def on_fix(tag: str, time_s: float, fix: Fix) -> None:
-            judge = judges[tag]
-            is_judged, judged_before[tag] = judge.judged > judged_before[tag], judge.judged
-            recorder.add(tags.index(tag), time_s, fix, judge.newest_truth_m, judged=is_judged)
-
-        return on_fix
+    def begin(tags: tuple[str, ...], _given: str) -> OnFix:
+        recorders.append(recorder := FixRecorder(tags))
+        return lambda tag, time_s, fix: recorder.add(tags.index(tag), time_s, fix, None, judged=False)
 
     result = replay_recording(asked, begin)
-    return replace(result, fixes=recorders[0].fixes())
+    fixes = recorders[0].fixes()
+    truth_m, judged = np.full((len(fixes), 3), np.nan), np.zeros(len(fixes), dtype=bool)
+    for tag in result.tags:
+        of_tag = fixes.of_tag(tag)
+        truth_m[of_tag], judged[of_tag] = result.judged[tag].of(fixes.time_s[of_tag])
+    return replace(result, fixes=replace(fixes, truth_m=truth_m, judged=judged))
 
 
 replay = python_function(ReplayOptions, run_replay)

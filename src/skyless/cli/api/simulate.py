@@ -14,6 +14,7 @@ from skyless.core.arguments import python_function
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import FILTERS
 from skyless.core.site import Site
+from skyless.research.masterless.own_estimator import OwnReceiver
 from skyless.sim.evaluation.fleet import FleetReport, JudgedFix, TagFleet, report
 from skyless.sim.evaluation.request import Conditions
 from skyless.sim.evaluation.scenarios import (
@@ -120,11 +121,12 @@ class Simulation:
         """Make the world and its tags. Raises SkylessError."""
         self._asked = asked
         site, is_room = _site(asked), asked.scenario == "room"
-        at_rest = bool(asked.positions_m) and not asked.paths_m
+        at_rest, make = bool(asked.positions_m) and not asked.paths_m, asked.estimator
         self.request = Request(
             site,
             room=room_of(site, asked.seed, is_named_room=is_room, at_rest=at_rest),
             **{name: getattr(asked, name) for name in Conditions.__struct_fields__},
+            new_receiver=None if make is None else lambda: OwnReceiver(make(), site),
         )
         check_can_be_simulated(site, asked.method)
         try:

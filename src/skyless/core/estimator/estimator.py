@@ -380,9 +380,11 @@ def _process_difference(
 
 
 @kernel
-def _process_height(s: EstimatorState, height_m: float, std_m: float, levels: Vector, rows: Matrix) -> int:
+def _process_height(
+    s: EstimatorState, height_m: float, std_m: float, is_barometer: bool, levels: Vector, rows: Matrix
+) -> int:
     """Process a sensor's height of the tag, and all that a fix carries."""
-    outcome = ACCEPTED if height(s, height_m, std_m) == 1 else REJECTED
+    outcome = ACCEPTED if height(s, height_m, std_m, is_barometer) == 1 else REJECTED
     _fill_rows(s, levels, rows)
     return outcome
 
@@ -609,9 +611,12 @@ class Estimator:
                 return outcome
             self._resize(outcome, table_a, rx_ticks)
 
-    def process_height(self, height_m: float, std_m: float) -> int:
-        """Process the tag's height at the newest packet, as a sensor measures it; ``ACCEPTED`` or ``REJECTED``."""
-        return _process_height(self._state, height_m, std_m, self._levels, self._rows)
+    def process_height(self, height_m: float, std_m: float, is_barometer: bool = False) -> int:
+        """Process the tag's height at the newest packet, as a sensor measures it; ``ACCEPTED`` or ``REJECTED``.
+
+        A barometer's zero, which is unknown and moves slowly, is estimated; in three dimensions only.
+        """
+        return _process_height(self._state, height_m, std_m, is_barometer, self._levels, self._rows)
 
     def track(
         self,

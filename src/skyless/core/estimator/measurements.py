@@ -86,6 +86,7 @@ MIN_REPORT_VARIANCE: Final = 0.1
 REJOIN_AFTER: Final = 20
 STEADY_WALK_SCALE: Final = 4.0  # reports of clocks whose random walk counts more than this are not used
 CLOCK_JUMPED: Final = 2
+ZERO_VARIANCE_M2: Final = 1e4  # of a barometer's zero, before its first reading
 STATIONARY_STD_MPS: Final = 0.01  # of the velocity of a tag that stands still, each time a measurement is processed
 
 
@@ -557,16 +558,25 @@ def _bound_changes(s: EstimatorState) -> None:
 
 
 @step
-def height(s: EstimatorState, height_m: float, std_m: float) -> int:
+def height(s: EstimatorState, height_m: float, std_m: float, is_barometer: bool) -> int:
     """Process the tag's height as a sensor measures it: 1 if it was used, 0 if not.
 
-    Where a height is given, it corrects that.
+    Where a height is given, it corrects that. A barometer's zero is estimated as well, from its first reading on.
     """
-    settings, dim = s.settings[0], s.settings[0]["dim"]
-    state = layout(dim, len(s.anchors)).height
+    settings, dim, status = s.settings[0], s.settings[0]["dim"], s.status[0]
+    where = layout(dim, len(s.anchors))
     given_m = settings["height_m"] if dim == 2 else 0.0
-    term = _set_term(s, 0, state, 1.0)
-    innovation = height_m - given_m - s.x[state]
+    term = _set_term(s, 0, where.height, 1.0)
+    innovation = height_m - given_m - s.x[where.height]
+    if is_barometer:
+        is_first = s.P[where.zero, where.zero] == 0.0
+        since_s = (status["epoch_ticks"] - status["height_ticks"]) * TICK_S
+        if is_first:
+            s.x[where.zero] = innovation
+            s.status[0]["range_errors"] = ALL_RANGE_ERRORS
+        s.P[where.zero, where.zero] += ZERO_VARIANCE_M2 if is_first else settings["barometer_walk"] * since_s
+        innovation -= s.x[where.zero]
+        term = _set_term(s, term, where.zero, 1.0)
     innovation_variance = compute_ph(s, term) + std_m * std_m
     used = innovation * innovation <= settings["gate"] ** 2 * innovation_variance
     if used:

@@ -10,6 +10,7 @@ The state vector, all clocks against the tag's own counter, in metres and m/s:
     constants   the part that stays
     slope       how ranges lengthen with distance
     height      the tag's true height − the one that is given, in two dimensions
+    zero        what a barometer reads − the tag's true height, in three dimensions
     surveys     for each anchor (dim) its true position − its position in the almanac
 
 Range errors and surveys stand last because many a site calls them exact. What is exact has no variance and no
@@ -76,6 +77,8 @@ class EstimatorSettings(Struct, frozen=True):
     """Time over which that part changes while the tag is stationary."""
     change_memory_s: float = 0.0
     """Time within which the size of each anchor's changing part is estimated again; 0 where it is ``place_std_m``."""
+    barometer_walk: float = 2.5e-4
+    """Random walk of a barometer's zero, m²/s: 5 cm in ten seconds, as where doors and windows are opened."""
     least_change_std_m: float = 0.05
     """No changing part is estimated to be smaller."""
     earliest_m: float = -np.inf
@@ -299,6 +302,8 @@ class Layout(NamedTuple):
     slope: int
     height: int
     """In two dimensions; in three it is one of the position."""
+    zero: int
+    """In three dimensions; in two it is the slope's place, and not used."""
     survey: int
     """``dim`` states for each anchor."""
     end: int
@@ -312,10 +317,11 @@ def layout(dim: int, anchors: int) -> Layout:
     values = dim + anchors
     behind = 2 * values
     slope = behind + 3 * anchors
-    height, survey = (slope + 1, slope + 2) if dim == 2 else (2, slope + 1)
+    height, zero = (slope + 1, slope) if dim == 2 else (2, slope + 1)
+    survey = slope + 2
     end = survey + dim * anchors
     return Layout(
-        dim, values, values + dim, behind, behind + anchors, behind + 2 * anchors, slope, height, survey, end,
+        dim, values, values + dim, behind, behind + anchors, behind + 2 * anchors, slope, height, zero, survey, end,
         -(-end // LANES) * LANES,
     )  # fmt: skip
 

@@ -18,8 +18,8 @@ from skyless.research.calibration.tags import PositionAt, position_of_stays, pos
 from skyless.research.foreign.formats import Recording, open_recording
 from skyless.research.masterless.pair_engine import PairEngine
 from skyless.research.replays.inputs import flight_height, known_anchors, known_truth
-from skyless.sim.evaluation.judge import Judge
 from skyless.sim.evaluation.statistics import EvenSample
+from skyless.sim.evaluation.truth import TruthTrack
 from skyless.site.survey.estimate import CalibrationEstimate, Differences, estimate
 from skyless.site.tables import calibrated_table, new_table
 
@@ -90,7 +90,7 @@ def biases_of(asked: SurveyOptions) -> Biases:
     def position_from(begin_s: float) -> PositionAt:
         if asked.stays:
             return position_of_stays([one for one in asked.stays if isinstance(one, Stay)], height_m, begin_s)
-        return position_of_truth(Judge(truth, planar=False), above_m)
+        return position_of_truth(TruthTrack(truth), above_m)
 
     with open_recording(path, asked.format, asked.listener) as recording:
         samples = gather(tdoas_of(recording, anchors_m), anchors_m, position_from, first)

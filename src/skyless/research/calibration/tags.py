@@ -16,7 +16,7 @@ from skyless.research.replays.site import reception_of, recorded_truth
 from skyless.run.mqtt.messages import ReceptionsMessage
 from skyless.run.recordings.host_clock import HostClock
 from skyless.run.recordings.recording import McapRecording, tags_to_replay
-from skyless.sim.evaluation.judge import Judge
+from skyless.sim.evaluation.truth import TruthTrack
 from skyless.site.survey.relayed import RelayedDifferences
 from skyless.site.survey.walk import EPOCH_S, EpochCollector, TagEpochs
 from skyless.site.tables import Truth
@@ -35,11 +35,11 @@ PositionAt = Callable[[float], Point | None]
 """Where the tag's antenna was at a time of the recording; None where that is not known."""
 
 
-def position_of_truth(judge: Judge, above_m: float | None) -> PositionAt:
+def position_of_truth(truth: TruthTrack, above_m: float | None) -> PositionAt:
     """Truth by time, where it is high enough."""
 
     def position_at(time_s: float) -> Point | None:
-        at_m = judge.at(time_s)
+        at_m = truth.at(time_s)
         return None if at_m is None or (above_m is not None and at_m[2] <= above_m) else at_m
 
     return position_at
@@ -99,7 +99,7 @@ def known_tags(
                 [one for one in asked.stays if isinstance(one, Stay)], site.tags.height_m, begin_s
             )
         else:
-            known = position_of_truth(Judge(truth or recorded.get(tag), planar=False), asked.above_m)
+            known = position_of_truth(TruthTrack(truth or recorded.get(tag)), asked.above_m)
         end_s = _end_s(epochs, begin_s, asked.first)
         found.append(at_positions(epochs, tag, lambda t_s: known(t_s) if t_s <= end_s else None))  # noqa: B023 - at once
     if not any(len(epochs.t_s) for epochs in found):

@@ -93,6 +93,16 @@ class DifferenceTracking:
         """The filter with all its states."""
         return self._estimator
 
+    @property
+    def has_started(self) -> bool:
+        """Whether the filter has a state."""
+        return self._start is not None
+
+    def update_height(self, height_m: float, std_m: float, is_barometer: bool = False) -> None:
+        """Process a reading of the tag's height sensor at the time of the newest difference."""
+        if self.has_started and self._estimator.process_height(height_m, std_m, is_barometer) != ACCEPTED:
+            self.counters["outlier-height"] += 1
+
     def update(self, pairs: Sequence[PairTdoa]) -> bool:
         """Process the differences of one reception, receptions in the order of time.
 
@@ -139,8 +149,12 @@ class DifferenceTracking:
         error_m = self._calibration.error_m(pair.anchor_b, dist(position_m, self._positions_m[pair.anchor_b]))
         error_m -= self._calibration.error_m(pair.anchor_a, dist(position_m, self._positions_m[pair.anchor_a]))
         a, b = self._index(pair.anchor_a), self._index(pair.anchor_b)
-        ticks = round((pair.time_s - self._begin_s) * TICK_RATE_HZ)
+        ticks = self.ticks(pair.time_s)
         return self._estimator.process_difference(a, b, ticks, pair.tdoa_m - error_m) == ACCEPTED
+
+    def ticks(self, time_s: float) -> int:
+        """A time on the scale of the filter."""
+        return round((time_s - self._begin_s) * TICK_RATE_HZ)
 
     def _index(self, anchor: int) -> int:
         """Index of an anchor in the estimator's table."""

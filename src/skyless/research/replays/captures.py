@@ -2,15 +2,14 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from itertools import islice
-from math import dist
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from msgspec import Struct, structs
+from msgspec import field, structs
 
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.core.arguments import process_noise
@@ -22,182 +21,14 @@ from skyless.research.foreign.formats import Format, Recording, format_of, open_
 from skyless.research.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
 from skyless.research.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, MASTERLESS, PacketTracking
 from skyless.research.masterless.pair_engine import PairEngine
-from skyless.research.replays.inputs import flight_height, height_to_hold, known_anchors, known_truth
+from skyless.research.replays.inputs import flight_height, height_to_hold, known_anchors, known_heights, known_truth
+from skyless.research.replays.noise import NoiseByPair, PairNoise
 from skyless.research.replays.options import DIFFERENCES_MADE, PACKETS, ReplayOptions
-from skyless.sim.evaluation.judge import Judge, Judgement
-from skyless.sim.evaluation.statistics import EvenSample
+from skyless.research.replays.pipelines import ByOwnEstimator, ByPackets, ByPairs, Pipeline, Smoothed
+from skyless.sim.evaluation.figures import Figures, FixSamples, FixTable, Judged, figures_of
+from skyless.sim.evaluation.truth import estimated_offset_s, shifted, truth_at
 from skyless.site.survey.anchor_errors import DifferenceCalibration
 from skyless.site.tables import read_calibration
-
-# Noise of the time differences of a recording, pair by pair, in bounded memory.
-
-MAX_PAIRS: Final = 256
-ROWS_PER_PAIR: Final = 4096
-MIN_PAIR_DIFFERENCES: Final = 20
-"""Differences of a pair from which its noise can be estimated."""
-
-
-class PairNoise(Struct, frozen=True):
-    """Differences of one pair of anchors."""
-
-    anchor_a: int
-    anchor_b: int
-    count: int
-    median_m: float
-    """Median of the difference, or of its error where the truth is known."""
-    noise_m: float
-    """1.4826 times the median absolute deviation, a standard deviation that outliers do not touch."""
-    against_truth: bool
-
-
-class NoiseByPair:
-    """Keeps an even sample of every pair's differences, less what the truth predicts where it is known."""
-
-    def __init__(self, judge: Judge, anchors_m: Mapping[int, Point]) -> None:
-        self._judge = judge
-        self._anchors_m = anchors_m
-        self._samples: dict[tuple[int, int, bool], EvenSample] = {}
-
-    def add(self, pair: PairTdoa) -> None:
-        """Add one difference."""
-        predicted_m = self._predicted_m(pair) if self._judge.has_truth else None
-        key = (pair.anchor_a, pair.anchor_b, predicted_m is not None)
-        sample = self._samples.get(key)
-        if sample is None:
-            if len(self._samples) >= MAX_PAIRS:
-                return
-            sample = self._samples[key] = EvenSample(1, ROWS_PER_PAIR)
-        sample.add((pair.tdoa_m if predicted_m is None else pair.tdoa_m - predicted_m,))
-
-    def _predicted_m(self, pair: PairTdoa) -> float | None:
-        truth = self._judge.at(pair.time_s)
-        a_m = pair.a_m or self._anchors_m.get(pair.anchor_a)
-        b_m = pair.b_m or self._anchors_m.get(pair.anchor_b)
-        if truth is None or a_m is None or b_m is None:
-            return None
-        return dist(truth, b_m) - dist(truth, a_m)
-
-    def pairs(self) -> tuple[PairNoise, ...]:
-        """What is known of each pair that was heard often enough."""
-        found = []
-        for (a, b, against_truth), sample in sorted(self._samples.items()):
-            if len(sample.rows) >= MIN_PAIR_DIFFERENCES:
-                median = float(np.median(sample.rows))
-                noise = 1.4826 * float(np.median(np.abs(sample.rows - median)))
-                found.append(PairNoise(a, b, sample.seen, median, noise, against_truth))
-        return tuple(found)
-
-
-# The two ways from records to fixes: time differences of pairs, or the packets themselves.
-
-Record = Packet | PairTdoa
-Triple = tuple[float, float, float]
-
-_SAMPLED: Final = 128
-_SAMPLED_OF: Final = 1024
-"""The first 128 of each 1024 packets are made into time differences as well, to measure the recording's noise."""
-
-
-class ByPairs:
-    """Time differences of pairs, ready or made of packets, and the filter of pairs."""
-
-    def __init__(self, tracking: DifferenceTracking, engine: PairEngine | None, noise: NoiseByPair) -> None:
-        self._tracking = tracking
-        self._engine = engine
-        self._noise = noise
-        self._made = False
-
-    def process(self, record: Record) -> float | None:
-        """Process one record; the time of its differences."""
-        pairs: Sequence[PairTdoa]
-        if isinstance(record, Packet):
-            assert self._engine is not None
-            pairs = self._engine.on_packet(record)
-        else:
-            pairs = (record,)
-        self._made = False
-        if not pairs:
-            return None
-        for pair in pairs:
-            self._noise.add(pair)
-        self._made = self._tracking.update(pairs)
-        return pairs[0].time_s
-
-    @property
-    def position_m(self) -> Triple | None:
-        """Where the record put the tag, None if it made no fix."""
-        return self._tracking.position_m if self._made else None
-
-    def fix(self) -> Fix:
-        """The newest position with all that is known of it."""
-        return self._tracking.fix()
-
-    @property
-    def reason(self) -> NoFixReason:
-        """Why there was no fix of late."""
-        return self._tracking.reason
-
-    @property
-    def drops(self) -> Counter[str]:
-        """What could not be used, by reason."""
-        total = Counter({name: self._tracking.counters[name] for name in ("outlier", "unknown-anchor")})
-        if self._engine is not None:
-            total.update(self._engine.drops)
-        return total
-
-    @property
-    def contradictions_m(self) -> Mapping[tuple[int, int], float]:
-        """Pairs of anchors whose own ranging contradicts the table: none, as differences hold no ranges."""
-        return {}
-
-
-class ByPackets:
-    """Packets as they are; a part of them is made into differences as well, to measure the recording's noise."""
-
-    def __init__(self, tracking: PacketTracking, engine: PairEngine, noise: NoiseByPair) -> None:
-        self._tracking = tracking
-        self._engine = engine
-        self._noise = noise
-        self._heard = 0
-        self._fix: Fix | None = None
-
-    def process(self, record: Record) -> float | None:
-        """Process one packet; its time."""
-        assert isinstance(record, Packet)
-        if self._heard % _SAMPLED_OF < _SAMPLED:
-            for pair in self._engine.on_packet(record):
-                self._noise.add(pair)
-        self._heard += 1
-        self._fix = self._tracking.on_packet(record)
-        return self._tracking.time_s
-
-    @property
-    def position_m(self) -> Triple | None:
-        """Where the packet put the tag, None if it made no fix."""
-        return None if self._fix is None else self._tracking.position_m
-
-    def fix(self) -> Fix:
-        """The newest position with all that is known of it."""
-        assert self._fix is not None
-        return self._fix
-
-    @property
-    def reason(self) -> NoFixReason:
-        """Why there was no fix of late."""
-        return self._tracking.reason
-
-    @property
-    def drops(self) -> Counter[str]:
-        """What could not be used, by reason."""
-        return self._tracking.drops
-
-    @property
-    def contradictions_m(self) -> Mapping[tuple[int, int], float]:
-        """Pairs of anchors whose own ranging contradicts the table."""
-        return self._tracking.contradictions_m
-
-
-# Replay of recordings: records in, fixes out, judged against the truth where there is one.
 
 PROFILES: Final[Mapping[str, EstimatorSettings]] = {
     "miluv": structs.replace(DIFFERENCES, qa=0.1, difference_std_m=0.5, range_std_m=0.15, place_std_m=0.15),
@@ -218,7 +49,7 @@ _MAX_TO_FIND_ANCHORS: Final = 2_000
 """Records within which every anchor of a recording of DL-TDoA is heard."""
 
 
-class ReplayReport(Struct, frozen=True, kw_only=True):
+class ReplayReport(Figures, frozen=True, kw_only=True):
     """Result of a replay: metres and seconds, None where it is not known."""
 
     format: str
@@ -226,20 +57,13 @@ class ReplayReport(Struct, frozen=True, kw_only=True):
     """Packets, or rows of a table of differences."""
     fixes: int
     dropped: int
-    median_m: tuple[float, float, float] | None
-    """Median position after the settling time."""
-    std_m: tuple[float, float, float] | None
-    """Standard deviation of the position after the settling time, for tags at rest."""
-    rmse_2d_m: float | None
-    rmse_3d_m: float | None
-    p95_m: float | None
-    max_m: float | None
     rate_hz: float | None
     """Fixes per second of recorded time, None without fixes."""
     tdoa_noise_m: float | None = None
     """Median over the pairs of anchors of their differences' noise (1.4826 MAD), about the truth or the median."""
-    bias_m: tuple[float, float, float] | None
-    first_fix_s: float | None
+    truth_offset_s: float | None = None
+    """What would have to be added to the truth's times, beyond what was asked for, to fit the fixes best; None where
+    that does not show."""
     height_m: float | None
     reason: str | None
     """Why there is no fix at all."""
@@ -250,24 +74,21 @@ class ReplayReport(Struct, frozen=True, kw_only=True):
     method: str | None
     measurements: str | None = None
     """What the filter was given, one of ``MEASUREMENTS``; None for the receptions of a site."""
-    contradictions_m: dict[str, float] = {}
+    contradictions_m: dict[str, float] = field(default_factory=dict)
     """Pairs of anchors whose own ranging contradicts the table: by how much they are farther (if negative, nearer)
     than there."""
 
 
 def common_figures(
-    judgement: Judgement, receptions: int, fixes: int, drops: dict[str, int], wall_s: float
+    figures: Figures, receptions: int, fixes: int, drops: dict[str, int], wall_s: float
 ) -> dict[str, Any]:
-    """What every ``ReplayReport`` holds of a judgement and of counts."""
-    errors = judgement.errors
+    """What every ``ReplayReport`` holds of figures and of counts."""
     return {
+        **structs.asdict(figures),
         "receptions": receptions,
         "fixes": fixes,
         "drops": drops,
         "dropped": sum(drops.values()),
-        "median_m": judgement.median_m,
-        "std_m": judgement.std_m,
-        **{name: getattr(errors, name) for name in errors.__struct_fields__ if name != "count"},
         "wall_s": wall_s,
         "receptions_per_s": receptions / wall_s if wall_s > 0.0 else 0.0,
     }
@@ -276,12 +97,7 @@ def common_figures(
 class CaptureReplay:
     """One recording of another system on its way through the filter."""
 
-    def __init__(
-        self,
-        asked: ReplayOptions,
-        calibration: DifferenceCalibration | None = None,
-        judge_class: type[Judge] = Judge,
-    ) -> None:
+    def __init__(self, asked: ReplayOptions, calibration: DifferenceCalibration | None = None) -> None:
         """Open the recording; ``calibration`` is used instead of that of the table of anchors. Raises SkylessError."""
         asked.leave_out(
             *("tag", "method", "integrity_risk", "alert_limit_m", "max_acceleration_mps2"),
@@ -301,27 +117,30 @@ class CaptureReplay:
             self._height_std_m = asked.tag_height_std_m
             if self._height_m is None:
                 asked.leave_out("tag_height_std_m", why="the height is estimated")
-        settle_s = asked.settle_s if asked.settle_s is not None else (2.0 if self._truth is None else 3.0)
-        above_m = flight_height(asked.above_m, self._truth)
-        self.judge = judge_class(self._truth, planar=self._height_m is not None, settle_s=settle_s, above_m=above_m)
+        if self._height_m is not None:
+            asked.leave_out("z_bounds_m", why=f"the height is {self.height_note}")
         self.measurements = self._measurements(kind)
+        self._heights = known_heights(asked)
         path, anchors_m = asked.file, self._anchors_m
         self.recording: Recording = open_recording(path, asked.format, asked.listener, anchors_m)
         self._qa = process_noise(asked.qa, asked.dynamics)
         self._calibration = calibration
         if calibration is None and isinstance(asked.anchors, str | Path) and not asked.uncalibrated:
             self._calibration = read_calibration(asked.anchors)
-        self._noise = NoiseByPair(self.judge, self._known_m)
-        self._pipeline: ByPairs | ByPackets = self._by_packets() if self.measurements == PACKETS else self._by_pairs()
+        self._noise = NoiseByPair(self._truth, self._known_m)
+        self._pipeline = self._new_pipeline()
         self.receptions = 0
-        self.fixes = 0
+        self.samples = FixSamples()
         self._first_s: float | None = None
         self._last_s = 0.0
-        self._first_fix_s: float | None = None
 
     def _measurements(self, kind: Format) -> str:
         """The measurements that were asked for, or that suit the recording."""
         asked = self._asked
+        if asked.needs_differences:
+            if asked.measurements == PACKETS:
+                raise SkylessError(f"--measurements is 'packets'; {asked.needs_differences} needs differences")
+            return DIFFERENCES_MADE
         if asked.measurements is None:
             suits = kind.is_dl_tdoa or (kind.name in FORMATS_BY_PACKETS and self._anchors_m)
             return PACKETS if suits and asked.tdoa_std_m is None else DIFFERENCES_MADE
@@ -332,21 +151,22 @@ class CaptureReplay:
             raise SkylessError("--tdoa-std is the noise of differences; --measurements packets makes none")
         return asked.measurements
 
-    def _engine(self) -> PairEngine | None:
+    def _new_pipeline(self) -> Pipeline:
+        if self.measurements == PACKETS:
+            return self._by_packets()
         bits = self.recording.format.tx_bits
-        return None if bits is None else PairEngine(bits, anchors_m=self._known_m)
-
-    def _by_pairs(self) -> ByPairs:
+        engine = None if bits is None else PairEngine(bits, anchors_m=self._known_m)
+        if self._asked.estimator is not None:
+            return ByOwnEstimator(self._asked.estimator(), self._known_m, engine, self._noise)
         asked = {"qa": self._qa, "difference_std_m": self._asked.tdoa_std_m, "height_m": self._height_m}
         asked["height_std_m"] = self._height_std_m
         known = {key: value for key, value in asked.items() if value is not None}
         settings = structs.replace(PROFILES.get(self.recording.format.name, DIFFERENCES), **known)
-        tracking = DifferenceTracking(settings, self._known_m, calibration=self._calibration)
-        return ByPairs(tracking, self._engine(), self._noise)
+        tracking = DifferenceTracking(settings, self._known_m, self._asked.z_bounds_m, self._calibration)
+        return (Smoothed if self._asked.smooth else ByPairs)(tracking, engine, self._noise)
 
     def _by_packets(self) -> ByPackets:
-        engine, bits = self._engine(), self.recording.format.tx_bits
-        assert engine is not None
+        bits = self.recording.format.tx_bits
         assert bits is not None
         qa = MASTERLESS.qa if self._qa is None else self._qa
         known = {"qa": qa, "height_m": self._height_m, "height_std_m": self._height_std_m}
@@ -355,10 +175,11 @@ class CaptureReplay:
             structs.replace(DL_TDOA if is_dl_tdoa else MASTERLESS, **known),
             self._anchors_m,
             bits,
+            self._asked.z_bounds_m,
             calibration=self._calibration,
             one_way=structs.replace(DL_TDOA_ONE_WAY, **known) if is_dl_tdoa else None,
         )
-        return ByPackets(tracking, engine, self._noise)
+        return ByPackets(tracking, PairEngine(bits, anchors_m=self._known_m), self._noise)
 
     def run(self, on_fix: Callable[[Fix], None] | None, on_progress: Callable[[int], None]) -> ReplayReport:
         """Read to the end; ``on_fix`` gets every fix, ``on_progress`` now and then the bytes read so far."""
@@ -368,61 +189,78 @@ class CaptureReplay:
             while batch := list(islice(records, BATCH)):
                 for record in batch:
                     self.receptions += 1
-                    time_s = self._pipeline.process(record)
+                    if self._heights and isinstance(record, PairTdoa):
+                        self._process_heights(record.time_s)
+                    time_s, fix = self._pipeline.process(record)
                     if time_s is not None:
-                        self._add_result(time_s, on_fix)
+                        self._first_s = time_s if self._first_s is None else self._first_s
+                        self._last_s = time_s
+                    if fix is not None:
+                        self._add(fix, on_fix)
                 on_progress(self.recording.bytes_read)
-        report = self._report(time.perf_counter() - started_s)
-        self._check_afterwards(report)
-        return report
+            for fix in self._pipeline.rest():
+                self._add(fix, on_fix)
+        table = self.samples.table()
+        self._check_truth(table)
+        offset_s = None if self._truth is None else estimated_offset_s(self._truth, table.time_s, table.position_m)
+        if self._truth is not None and self._asked.truth_offset_s == "auto" and offset_s is not None:
+            self._truth, offset_s = shifted(self._truth, offset_s), 0.0
+        figures = figures_of(table, self.judged, self.samples.count)
+        return self._report(figures, offset_s, time.perf_counter() - started_s)
 
-    def _check_afterwards(self, report: "ReplayReport") -> None:
-        """See that the listener was in the recording, and that the truth was of it. Raises SkylessError."""
-        asked, judge = self._asked, self.judge
-        if asked.listener is not None and report.receptions == 0:
-            raise ConfigurationError(asked.file, "listener", asked.listener, "one that the recording names")
-        times_s, true_x_m = judge.track.rows[:, 0], judge.track.rows[:, 4]
-        if asked.truth is not None and self._truth is not None and len(times_s) and np.isnan(true_x_m).all():
-            span = f"{self._truth.t_s[0]:.3f} to {self._truth.t_s[-1]:.3f}"
-            expected = f"in the time of the recording, whose fixes are from {times_s.min():.3f} to {times_s.max():.3f}"
-            table = asked.truth if isinstance(asked.truth, str | Path) else "truth"
-            raise ConfigurationError(table, "column t_s", span, expected)
+    @property
+    def judged(self) -> Judged:
+        """Which fixes are judged."""
+        asked, settle_s = self._asked, 2.0 if self._truth is None else 3.0
+        return Judged(
+            truth=self._truth,
+            begin_s=self._first_s,
+            end_s=self._last_s,
+            planar=self._height_m is not None,
+            settle_s=settle_s if asked.settle_s is None else asked.settle_s,
+            above_m=flight_height(asked.above_m, self._truth),
+        )
 
-    def _add_result(self, time_s: float, on_fix: Callable[[Fix], None] | None) -> None:
-        """Add what one reception gave: one fix at most."""
-        if self._first_s is None:
-            self._first_s = time_s
-        self._last_s = time_s
-        position_m = self._pipeline.position_m
-        if position_m is None:
-            return
-        self.fixes += 1
-        if self._first_fix_s is None:
-            self._first_fix_s = time_s - self._first_s
-        self.judge.add(time_s, time_s - self._first_s, position_m)
+    def _process_heights(self, until_s: float) -> None:
+        while self._heights and self._heights[0].time_s <= until_s:
+            self._pipeline.process_height(self._heights.popleft())
+
+    def _add(self, fix: Fix, on_fix: Callable[[Fix], None] | None) -> None:
+        self.samples.add(fix.time_s, fix)
         if on_fix is not None:
-            on_fix(self._pipeline.fix())
+            on_fix(fix)
 
-    def _drops(self) -> dict[str, int]:
-        total = self.recording.drops + self._pipeline.drops
-        return {name: count for name, count in sorted(total.items()) if count}
+    def _check_truth(self, table: FixTable) -> None:
+        """See that the listener was in the recording, and that the truth was of it. Raises SkylessError."""
+        asked, truth, times_s = self._asked, self._truth, table.time_s
+        if asked.listener is not None and self.receptions == 0:
+            raise ConfigurationError(asked.file, "listener", asked.listener, "one that the recording names")
+        if asked.truth is not None and truth is not None and len(times_s) and np.isnan(truth_at(truth, times_s)).all():
+            span = f"{truth.t_s[0]:.3f} to {truth.t_s[-1]:.3f}"
+            expected = f"in the time of the recording, whose fixes are from {times_s.min():.3f} to {times_s.max():.3f}"
+            table_name = asked.truth if isinstance(asked.truth, str | Path) else "truth"
+            raise ConfigurationError(table_name, "column t_s", span, expected)
 
-    def _report(self, wall_s: float) -> ReplayReport:
-        pairs = self._noise.pairs()
+    def _report(self, figures: Figures, offset_s: float | None, wall_s: float) -> ReplayReport:
+        pairs, fixes = self._noise.pairs(), self.samples.count
         span_s = self._last_s - (self._first_s or 0.0)
-        reason = self._pipeline.reason if self._known_m or self.fixes else NoFixReason.NO_ALMANAC
+        reason = self._pipeline.reason if self._known_m or fixes else NoFixReason.NO_ALMANAC
+        total = self.recording.drops + self._pipeline.drops
+        drops = {name: count for name, count in sorted(total.items()) if count}
+        by_m = sorted(self._pipeline.contradictions_m.items())
+        own, filtered = self._asked.estimator, "joint-smoothed" if self._asked.smooth else "joint"
         return ReplayReport(
             format=self.recording.format.name,
-            **common_figures(self.judge.judgement(), self.receptions, self.fixes, self._drops(), wall_s),
-            rate_hz=self.fixes / span_s if self.fixes and span_s > 0.0 else None,
+            **common_figures(figures, self.receptions, fixes, drops, wall_s),
+            rate_hz=fixes / span_s if fixes and span_s > 0.0 else None,
             tdoa_noise_m=float(np.median([pair.noise_m for pair in pairs])) if pairs else None,
-            first_fix_s=self._first_fix_s,
+            truth_offset_s=offset_s,
             height_m=self._height_m,
-            reason=None if self.fixes else str(reason),
+            reason=None if fixes else str(reason),
             pairs=pairs,
-            method="joint",
+            method=filtered if own is None else getattr(own, "__name__", "own"),
             measurements=self.measurements,
-            contradictions_m={f"{a}-{b}": by_m for (a, b), by_m in sorted(self._pipeline.contradictions_m.items())},
+            contradictions_m={f"{a}-{b}": metres for (a, b), metres in by_m},
         )
 
 

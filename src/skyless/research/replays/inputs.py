@@ -1,5 +1,6 @@
 """What a replay or a survey is given with a recording: anchors, truth and heights, as values."""
 
+from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -12,10 +13,11 @@ from skyless.core.dop import GUESSED_STD_M, plane_height_m
 from skyless.core.errors import SkylessError
 from skyless.core.site import Site
 from skyless.research.foreign.formats import format_of
-from skyless.research.replays.options import RecordingOptions
-from skyless.sim.evaluation.judge import FLIGHT_M, antenna_truth, flies
+from skyless.research.masterless.smoothing import Height
+from skyless.research.replays.options import BAROMETER, RecordingOptions, ReplayOptions
+from skyless.sim.evaluation.truth import FLIGHT_M, antenna_truth, flies, shifted
 from skyless.site.file.load import site_of
-from skyless.site.tables import Truth, read_anchors, read_truth
+from skyless.site.tables import HEIGHT_STD_M, Truth, read_anchors, read_height_readings, read_truth
 
 Anchors = Mapping[int, tuple[float, float, float]] | str | Path
 """Positions by identifier in metres, or the path of a table."""
@@ -53,13 +55,14 @@ def known_truth(path: Path, asked: RecordingOptions) -> Truth | None:
     if truth is None and format_of(path, asked.format).name == "miluv":
         truth = path
     if truth is None:
-        if arm_m is not None:
-            raise SkylessError("--lever-arm moves the truth, which --truth must give")
+        asked.leave_out("lever_arm_m", "truth_offset_s", why="it moves the truth, which --truth must give")
         return None
     if isinstance(truth, str | Path):
         known = read_truth(existing_file("--truth", truth), asked.listener)
     else:
         known = _truth_of(truth)
+    if isinstance(asked.truth_offset_s, float | int):
+        known = shifted(known, asked.truth_offset_s)
     return known if arm_m is None else antenna_truth(known, arm_m)
 
 
@@ -73,6 +76,24 @@ def _truth_of(given: ArrayLike) -> Truth:
     if not (is_table and np.isfinite(rows).all() and (np.diff(rows[:, 0]) >= 0.0).all()):
         raise SkylessError(f"--truth is an array of shape {rows.shape}; it should be {right}")
     return Truth(rows[:, 0], rows[:, 1:], None)
+
+
+def known_heights(asked: ReplayOptions) -> deque[Height]:
+    """Readings of the tag's height sensor by time, by an array or a table. Raises SkylessError."""
+    given = asked.heights
+    if given is None:
+        return deque()
+    if isinstance(given, str | Path):
+        rows = read_height_readings(existing_file("--heights", given))
+    else:
+        rows = np.array(given, dtype=np.float64)
+        if rows.ndim == 2 and rows.shape[1] == 2:
+            rows = np.column_stack([rows, np.full(len(rows), HEIGHT_STD_M)])
+    right = rows.ndim == 2 and rows.shape[1] == 3 and np.isfinite(rows).all() and (rows[:, 2] > 0.0).all()
+    if not right or (np.diff(rows[:, 0]) < 0.0).any():
+        expected = "rows of time in s, which does not decrease, height in m and, above 0, its standard deviation in m"
+        raise wrong("--heights", given, expected)
+    return deque(Height(t_s, height_m, std_m, asked.height_kind == BAROMETER) for t_s, height_m, std_m in rows.tolist())
 
 
 def height_to_hold(

@@ -2,6 +2,7 @@
 
 from functools import partial
 from pathlib import Path
+from runpy import run_path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from skyless.core.air.page_codec import MAX_COORDINATE_M
@@ -14,24 +15,37 @@ from skyless.core.arguments import (
     Rule,
     Text,
     check_number,
+    check_point,
     choice,
     existing_file,
     numbers,
     point,
     process_noise,
     read_height,
+    read_numbers,
+    wrong,
 )
+from skyless.core.errors import SkylessError
 from skyless.core.method_names import Dynamics
 from skyless.sim.evaluation.request import IntegrityRisk, ProtectionOptions
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import ArrayLike
+
     from skyless.core.integrity import IntegrityRequirement
     from skyless.core.site import Site
+    from skyless.research.masterless.own_estimator import OwnEstimator
     from skyless.research.replays.inputs import Anchors, AnyTruth
 
 PACKETS, DIFFERENCES_MADE = "packets", "differences"
 MEASUREMENTS: Final = (PACKETS, DIFFERENCES_MADE)
 """What the filter is given: anchors' packets as they are, or time differences made of them."""
+
+AUTO: Final = "auto"
+
+HEIGHT_SENSOR, BAROMETER = "sensor", "barometer"
 
 HEIGHT_WORDS: Final = ("truth", "free", "auto")
 """What a tag's height may be instead of metres: the truth's median, estimated, or what suits."""
@@ -46,6 +60,21 @@ def _check_height(name: str, value: Any) -> Any:  # noqa: ANN401 - a number or a
     return _read_height(name, value)
 
 
+def _read_offset(name: str, text: str) -> float | str:
+    return text if text == AUTO else read_numbers(name, text, (1,))[0]
+
+
+def _check_offset(name: str, value: Any) -> Any:  # noqa: ANN401 - a number or a word
+    return value if value == AUTO else check_number(name, value)
+
+
+def _check_bounds(name: str, value: Any) -> tuple[float, float]:  # noqa: ANN401 - what a user gives
+    low_m, high_m = check_point(name, value, (2,), MAX_COORDINATE_M)
+    if not low_m < high_m:
+        raise wrong(name, value, "the lowest and then the highest height in metres")
+    return low_m, high_m
+
+
 class RecordingOptions(ComputedOptions, frozen=True, kw_only=True):
     """What is known of a recording."""
 
@@ -55,6 +84,8 @@ class RecordingOptions(ComputedOptions, frozen=True, kw_only=True):
     truth: Annotated["AnyTruth | None", Path] = None
     """Table of true positions: t_s,x_m,y_m,z_m, with qx,qy,qz,qw if the body turns; t_s in the recording's time, in
     Unix time for a recording of skyless record; in Python also an array of shape (n, 4). MILUV ticks bring theirs."""
+    truth_offset_s: Annotated[float | str, Option("truth-offset"), Text(_read_offset), Rule(_check_offset)] = 0.0
+    """Seconds to add to the truth's times; auto: what fits the fixes best."""
     lever_arm_m: Annotated[
         "tuple[float, float, float] | None",
         Option("lever-arm"),
@@ -78,6 +109,26 @@ class _Recording(RecordingOptions, frozen=True):
     """The recording, plain or gzip."""
 
 
+def read_estimator(name: str, text: str) -> Any:  # noqa: ANN401 - any class
+    """A class of a file of the reader's, given as FILE.py:CLASS. Raises SkylessError."""
+    path, _, named = text.rpartition(":")
+    file = existing_file(name, path or text)
+    try:
+        found = run_path(str(file))
+    except Exception as error:  # noqa: BLE001 - the reader's own program can fail in any way
+        raise SkylessError(f"{name} is {text!r}; it cannot be loaded: {type(error).__name__}: {error}") from None
+    if named not in found:
+        raise wrong(name, text, f"FILE.py:CLASS, and {file} has no such class")
+    return found[named]
+
+
+def check_estimator(name: str, value: Any) -> Any:  # noqa: ANN401 - any class
+    """See that it makes something that has ``hear``. Raises SkylessError."""
+    if not callable(value) or (isinstance(value, type) and not callable(getattr(value, "hear", None))):
+        raise wrong(name, value, "a class with a method hear(observation), or what makes an instance of one")
+    return value
+
+
 class ReplayOptions(_Recording, frozen=True, kw_only=True):
     """Options of ``skyless replay``."""
 
@@ -91,6 +142,23 @@ class ReplayOptions(_Recording, frozen=True, kw_only=True):
     tag_height_std_m: Annotated[NotNegative | None, Option("tag-height-std")] = None
     """Standard deviation of the tag's height from the one that is given, in metres, which fixes and levels then
     count; by default 0.5 where the height is only taken for the anchors', else 0."""
+    z_bounds_m: Annotated[
+        "tuple[float, float] | None", Option("z-bounds"), numbers(2, form="low,high"), Rule(_check_bounds)
+    ] = None
+    """Lowest and highest height of the tag in metres, where its height is estimated."""
+    heights: Annotated["ArrayLike | str | Path | None", Path] = None
+    """Table of readings of the tag's height sensor: t_s,height_m, with std_m where that is not 0.05; in Python also an
+    array of two or three columns; recording for those that the recording itself holds."""
+    height_kind: Annotated[str, choice(HEIGHT_SENSOR, BAROMETER)] = HEIGHT_SENSOR
+    """What gave the heights: a sensor of the height itself, or a barometer, whose zero is unknown and moves slowly."""
+    smooth: bool = False
+    """Let every fix use all of the recording, what came later as well (of time differences); fixes have no protection
+    level then."""
+    estimator: Annotated[
+        "Callable[[], OwnEstimator] | None", Text(read_estimator, "FILE.py:CLASS"), Rule(check_estimator)
+    ] = None
+    """Your own estimator instead of the filter: a class with hear(observation), which gets one time difference after
+    the other."""
     settle_s: Annotated[NotNegative | None, Option("settle")] = None
     """Seconds from the start that are not judged; by default 3 with a truth table, 2 without."""
     qa: Positive | None = None
@@ -116,8 +184,17 @@ class ReplayOptions(_Recording, frozen=True, kw_only=True):
     --tag-height-std, tags start from the beginning, as with another method, and those that are not given are as of
     a tag of which nothing was asked."""
 
+    @property
+    def needs_differences(self) -> str:
+        """The option that only time differences can serve; empty where there is none."""
+        return "--smooth" if self.smooth else "--estimator" if self.estimator is not None else ""
+
     def check(self) -> None:
         """See that the options fit one another. Raises SkylessError."""
+        if self.estimator is not None:
+            self.leave_out("smooth", "heights", "qa", "dynamics", "tdoa_std_m", why="the estimator is your own")
+        if self.heights is None:
+            self.leave_out("height_kind", why="--heights gives none")
         process_noise(self.qa, self.dynamics)
         _ = self.requirement
 

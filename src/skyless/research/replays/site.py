@@ -29,7 +29,7 @@ from skyless.run.mqtt.messages import FixMessage, RawReception, ReceptionsMessag
 from skyless.run.recordings.host_clock import HostClock
 from skyless.run.recordings.reception_log import RefusedError, load
 from skyless.run.recordings.recording import McapRecording, Recorded, tags_to_replay
-from skyless.sim.evaluation.judge import Judge
+from skyless.sim.evaluation.figures import FixSamples, Judged, figures_of
 from skyless.site.tables import Truth
 
 # Recorded fixes against those of a replay: whether they are the same, bit by bit.
@@ -404,19 +404,16 @@ class SiteReplay:
             if tag not in raw_tags:
                 raise ConfigurationError(summary.path, "tag", tag, f"one of {', '.join(raw_tags)}")
         self._recording = recording
-        self._settle_s = settle_s
+        self._settle_s, self._above_m = settle_s, above_m
         site = recording.site
         self.height_m = None if site is None else site.site.tags.height_m
         self._begin_s = summary.start_s or 0.0
-        truth = recorded_truth(recording)
+        self._truth = recorded_truth(recording)
         delays = None
         if wanted is not None:
             delays = delay_changes(recorded_site(recording, wanted.id), wanted)
         self.tags = {tag: TagReplay(tag, method, delays, integrity) for tag in tags or summary.raw_tags}
-        self.judges = {
-            tag: Judge(truth.get(tag), planar=self.height_m is not None, settle_s=settle_s, above_m=above_m)
-            for tag in self.tags
-        }
+        self.samples = {tag: FixSamples() for tag in self.tags}
         self._spans: dict[str, tuple[float, float]] = {}
         """First and last fix of each tag, Unix time."""
         self._anchors: dict[str, Counter[int]] = {tag: Counter() for tag in self.tags}
@@ -453,19 +450,30 @@ class SiteReplay:
             first_s, _ = self._spans.get(tag, (made.unix_s, 0.0))
             self._spans[tag] = (first_s, made.unix_s)
             self._anchors[tag][len(made.fix.anchors)] += 1
-            x, y, z = made.fix.position_m.tolist()
-            self.judges[tag].add(made.unix_s, made.unix_s - (replay.begun_s or 0.0), (x, y, z))
+            self.samples[tag].add(made.unix_s, made.fix)
             if on_fix is not None:
                 on_fix(tag, made)
 
+    def judged(self, tag: str) -> Judged:
+        """Which fixes of a tag are judged."""
+        replay, (_, last_s) = self.tags[tag], self._spans.get(tag, (0.0, 0.0))
+        return Judged(
+            truth=self._truth.get(tag),
+            begin_s=replay.begun_s,
+            end_s=last_s,
+            planar=self.height_m is not None,
+            settle_s=self._settle_s,
+            above_m=self._above_m,
+        )
+
     def _report(self, tag: str, wall_s: float) -> TagReport:
-        replay, anchors = self.tags[tag], self._anchors[tag]
+        replay, anchors, samples = self.tags[tag], self._anchors[tag], self.samples[tag]
+        figures = figures_of(samples.table(), self.judged(tag), samples.count)
         first_s, last_s = self._spans.get(tag, (0.0, 0.0))
         return TagReport(
             format=SITE_FORMAT,
-            **common_figures(self.judges[tag].judgement(), replay.receptions, replay.fixes, replay.all_drops(), wall_s),
+            **common_figures(figures, replay.receptions, replay.fixes, replay.all_drops(), wall_s),
             rate_hz=replay.fixes / (last_s - first_s) if last_s > first_s else None,
-            first_fix_s=first_s - replay.begun_s if replay.fixes and replay.begun_s is not None else None,
             height_m=self.height_m,
             reason=None if replay.fixes else replay.reason,
             tag=tag,

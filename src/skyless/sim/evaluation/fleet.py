@@ -2,19 +2,19 @@
 
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from typing import Final
+from collections.abc import Callable, Iterator, Sequence
+from typing import Final, Protocol
 
 import numpy as np
 from msgspec import Struct
 
 from skyless.core.air.reception import Reception
 from skyless.core.any_receiver import AnyReceiver
-from skyless.core.fix import Fix
+from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.kernels.arrays import Array
 from skyless.core.method_names import DEFAULT_METHOD
-from skyless.core.protocols import AnchorMachine, new_anchor
+from skyless.core.protocols import AnchorMachine, SiteBeacon, new_anchor
 from skyless.core.site import Site
 from skyless.core.tag.beacon_receiver import NOT_DROPS
 from skyless.sim.evaluation.statistics import ErrorStatistics, ErrorSummary, FirstFixes, LevelReport, LevelTally
@@ -44,6 +44,24 @@ class JudgedFix(Struct, frozen=True, gc=False):
         return self.fix.position_m - self.truth_m
 
 
+class TagReceiver(Protocol):
+    """What a tag computes with."""
+
+    @property
+    def counters(self) -> Counter[str]:
+        """Frames by what became of them."""
+
+    @property
+    def reason(self) -> NoFixReason:
+        """Why the last frame has made no fix."""
+
+    def hear(self, reception: Reception) -> Fix | None:
+        """Process a frame from the air; a fix if it made one."""
+
+    def hear_beacon(self, beacon: SiteBeacon, reception: Reception) -> Fix | None:
+        """Process a beacon that is decoded already, as ``hear`` does."""
+
+
 class FleetSettings(Struct, frozen=True):
     """How the tags compute, and from when on they are judged."""
 
@@ -56,6 +74,8 @@ class FleetSettings(Struct, frozen=True):
     integrity: IntegrityRequirement = IntegrityRequirement()
     silences: tuple[Outage, ...] = ()
     """True times in which no tag's radio receives."""
+    new_receiver: Callable[[], TagReceiver] | None = None
+    """Makes each tag's receiver, instead of one of the method."""
 
 
 class ReceiverWithOutages(AnyReceiver):
@@ -127,8 +147,10 @@ class TagFleet:
         """Let true time pass; every fix of every tag, with the truth."""
         raise NotImplementedError
 
-    def _new_receiver(self) -> AnyReceiver:
+    def _new_receiver(self) -> TagReceiver:
         asked = self._settings
+        if asked.new_receiver is not None:
+            return asked.new_receiver()
         if asked.silences:
             return ReceiverWithOutages(asked.method, qa=asked.qa, integrity=asked.integrity, silences=asked.silences)
         return AnyReceiver(asked.method, qa=asked.qa, integrity=asked.integrity)
@@ -156,7 +178,8 @@ class TagFleet:
         error = judged.error_m
         self.levels.add(judged.tag, judged.fix, error)
         self.errors.add(float(error[0]), float(error[1]), float(error[2]))
-        self.sigma_squared_sum += float(np.trace(judged.fix.covariance_m2))
+        dim = 2 if self.site.tags.height_m is not None else 3
+        self.sigma_squared_sum += float(np.trace(judged.fix.covariance_m2[:dim, :dim]))
 
     @property
     def drops(self) -> dict[str, int]:

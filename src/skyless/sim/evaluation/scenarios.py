@@ -15,7 +15,7 @@ from skyless.core.kernels.arrays import Array
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, SNAPSHOTS
 from skyless.core.site import Site
 from skyless.sim.evaluation.cell_fleet import MAX_MACHINES, CellFleet
-from skyless.sim.evaluation.fleet import Fleet, FleetSettings, JudgedFix, TagFleet
+from skyless.sim.evaluation.fleet import Fleet, FleetSettings, JudgedFix, TagFleet, TagReceiver
 from skyless.sim.evaluation.request import Conditions
 from skyless.sim.impairments import (
     AnchorDisplacement,
@@ -75,6 +75,8 @@ class Request(Conditions, frozen=True):
     site: Site
     room: Room | None = None
     """Errors of survey and ranges (``room_of``); None for anchors at the site's positions and exact ranges."""
+    new_receiver: Callable[[], TagReceiver] | None = None
+    """Makes each tag's receiver, instead of one of the method."""
     diagnostics: bool = False
     """Whether receptions carry powers, of which the first path's is low where they are late."""
     body: Body | None = None
@@ -202,6 +204,7 @@ def _settings(request: Request) -> FleetSettings:
         request.fixes,
         request.requirement(request.method),
         tuple(request.silences),
+        request.new_receiver,
     )
 
 

@@ -1,0 +1,238 @@
+"""Fixed-interval smoothing: what all of a recording says of each moment, by the filter's own model.
+
+The filter runs through the recording, and the recursion of Rauch, Tung and Striebel (1965) back: with the state x and
+covariance P that the filter had, the transition F to the next one and its process noise Q,
+
+    C = P·Fᵀ·(F·P·Fᵀ + Q)⁻¹,    x̂ = x + C·(x̂⁺ − F·x),    P̂ = P + C·(P̂⁺ − F·P·Fᵀ − Q)·Cᵀ.
+
+The state is that of the filter but for clocks, which time differences do not have: motion, range errors, surveys. Where
+the filter began again, nothing is carried back.
+"""
+
+from collections.abc import Iterator, Sequence
+from copy import deepcopy
+from typing import Final, NamedTuple
+
+import numpy as np
+from msgspec.structs import replace
+
+from skyless.core.air.masterless_packets import PairTdoa
+from skyless.core.constants import TICK_S
+from skyless.core.estimator.kalman import STATIONARY_NOISE_SHARE, is_stationary, range_error_decay
+from skyless.core.estimator.measurements import ZERO_VARIANCE_M2
+from skyless.core.estimator.state import layout
+from skyless.core.fix import POSITION, VELOCITY, Fix
+from skyless.core.kernels.arrays import Indices, Matrix, Vector
+from skyless.research.masterless.difference_tracking import DifferenceTracking
+
+CHUNK: Final = 2_000
+"""Events between two copies of the filter, from which it runs once more: memory for as many covariances."""
+
+
+class Height(NamedTuple):
+    """A reading of a sensor of the tag's height."""
+
+    time_s: float
+    height_m: float
+    std_m: float
+    is_barometer: bool
+
+
+Event = PairTdoa | Height
+
+
+class _Decay(NamedTuple):
+    """A state that decays towards zero: the share that is kept, and the variance that is added."""
+
+    state: int
+    kept: float
+    variance: float
+
+
+def _decay(state: int, kept: float, variance: float) -> _Decay:
+    """``variance`` is that in the long run."""
+    return _Decay(state, kept, variance * (1.0 - kept * kept))
+
+
+class _Step(NamedTuple):
+    """The filter after an event, and how it came there from the event before."""
+
+    start: int
+    """Number of the filter's start."""
+    x: Vector
+    P: Matrix
+    dt_s: float
+    q: float
+    """Density of the acceleration."""
+    decays: tuple[_Decay, ...]
+
+
+class _States:
+    """Where the states that are smoothed stand, of all anchors that a recording has, present or not."""
+
+    def __init__(self, tracking: DifferenceTracking) -> None:
+        estimator = tracking.estimator
+        self.dim, self._anchors = estimator.dim, list(estimator.index_of)
+        self._column = {anchor: column for column, anchor in enumerate(self._anchors)}
+        settings, count, dim = estimator.settings, len(self._anchors), self.dim
+        self.change, self.constant = 2 * dim, 2 * dim + count
+        self._common = self.constant + count
+        self.zero, self._survey = self._common + 1, self._common + 2
+        variances = {
+            self.change: (count, settings.place_std_m**2),
+            self.constant: (count, settings.range_std_m**2),
+            self._survey: (dim * count, settings.survey_std_m**2),
+        }
+        self._prior = np.zeros(self._survey + dim * count)
+        for first, (number, variance) in variances.items():
+            self._prior[first : first + number] = variance
+
+    def column(self, anchor: int) -> int:
+        """Number of an anchor."""
+        return self._column[anchor]
+
+    def of_anchor(self, anchor: int) -> list[int]:
+        """All states of an anchor."""
+        column, survey = self._column[anchor], self._survey + self.dim * self._column[anchor]
+        return [self.change + column, self.constant + column, *range(survey, survey + self.dim)]
+
+    def prior(self, state: int) -> float:
+        """Variance of a state of an anchor that is not there."""
+        return float(self._prior[state])
+
+    def read(self, tracking: DifferenceTracking) -> tuple[Vector, Matrix]:
+        """State and covariance of the filter as it is now."""
+        s, anchors, dim = tracking.estimator.state, tracking.estimator.anchors, self.dim
+        where, columns = layout(dim, len(anchors)), [self._column[anchor] for anchor in anchors]
+        count = len(columns)
+        there = [
+            *range(dim), *range(where.velocity, where.velocity + dim), *range(where.change, where.change + count),
+            *range(where.constant, where.constant + count), *range(where.slope, where.survey + dim * count),
+        ]  # fmt: skip
+        here: Indices = np.array([
+            *range(2 * dim), *(self.change + column for column in columns),
+            *(self.constant + column for column in columns), *range(self._common, self._survey),
+            *(self._survey + dim * column + axis for column in columns for axis in range(dim)),
+        ])  # fmt: skip
+        x, P = np.zeros(len(self._prior)), np.diag(self._prior)
+        x[here] = s.x[there]
+        P[np.ix_(here, here)] = s.P[np.ix_(there, there)]
+        return x, P
+
+
+def smoothed(tracking: DifferenceTracking, events: Sequence[Event]) -> Iterator[tuple[int, Fix]]:
+    """Fixes of all of the events together, each with the number of its event, from the last one back.
+
+    ``tracking`` has heard nothing yet. There is a fix where the filter makes one; it has no protection level, as those
+    are of what is known at the time.
+    """
+    copies = []
+    for number, event in enumerate(events):
+        if number % CHUNK == 0:
+            copies.append(deepcopy(tracking))
+        _process(tracking, event)
+    states = _States(tracking)
+    later: tuple[_Step, Vector, Matrix] | None = None
+    for chunk in reversed(range(len(copies))):
+        begin = chunk * CHUNK
+        steps = _forward(copies.pop(), events[begin : begin + CHUNK], states)
+        for number, (step, fix) in reversed(list(enumerate(steps, begin))):
+            if step is None:
+                later = None
+                continue
+            x, P = step.x, step.P
+            if later is not None and later[0].start == step.start:
+                x, P = _back(step, *later, states.dim)
+            later = step, x, P
+            if fix is not None:
+                yield number, _as_fix(fix, x, P, states.dim)
+
+
+def _process(tracking: DifferenceTracking, event: Event) -> bool:
+    """Process one event; whether it made a fix."""
+    if isinstance(event, PairTdoa):
+        return tracking.update((event,))
+    tracking.update_height(event.height_m, event.std_m, event.is_barometer)
+    return False
+
+
+def _forward(
+    tracking: DifferenceTracking, events: Sequence[Event], states: _States
+) -> list[tuple[_Step | None, Fix | None]]:
+    found: list[tuple[_Step | None, Fix | None]] = []
+    for event in events:
+        before = tracking.estimator.anchors
+        dt_s, q, decays = _transition(tracking, event, states)
+        made = _process(tracking, event)
+        if not tracking.has_started:
+            found.append((None, None))
+            continue
+        gone = set(before) - set(tracking.estimator.anchors)
+        forgotten = (_Decay(one, 0.0, states.prior(one)) for anchor in gone for one in states.of_anchor(anchor))
+        x, P = states.read(tracking)
+        step = _Step(tracking.counters["start"], x, P, dt_s, q, (*decays, *forgotten))
+        found.append((step, tracking.fix() if made else None))
+    return found
+
+
+def _transition(tracking: DifferenceTracking, event: Event, states: _States) -> tuple[float, float, list[_Decay]]:
+    """Time, density of the acceleration, and what decays, from the newest event to this one."""
+    if not tracking.has_started:
+        return 0.0, 0.0, []
+    estimator = tracking.estimator
+    s, settings = estimator.state, estimator.settings
+    status = s.status[0]
+    if isinstance(event, Height):
+        since_s = float(status["epoch_ticks"] - status["height_ticks"]) * TICK_S
+        walked_m2 = min(settings.barometer_walk * since_s, ZERO_VARIANCE_M2)
+        return 0.0, 0.0, [_Decay(states.zero, 1.0, walked_m2)] if event.is_barometer else []
+    rx_ticks = tracking.ticks(event.time_s)
+    dt_s = max((rx_ticks - status["epoch_ticks"]) * TICK_S, 0.0)
+    motion, _ = estimator.motion()
+    walked_m = status["walked_m"] + float(np.linalg.norm(motion[states.dim :])) * dt_s
+    decays = []
+    for anchor in (event.anchor_a, event.anchor_b):
+        if not estimator.has_anchor(anchor):
+            continue
+        index = s.index_of.item(estimator.index_of[anchor])
+        a, column = s.anchors[index], states.column(anchor)
+        elapsed_s = (rx_ticks - a["rx_ticks"]) * TICK_S if a["packets"] > 0 else 0.0
+        kept, variance, kept_constant = range_error_decay(s, index, elapsed_s, walked_m - a["walked_m"])
+        decays.append(_decay(states.change + column, kept, variance))
+        if kept_constant < 1.0:
+            decays.append(_decay(states.constant + column, kept_constant, settings.range_std_m**2))
+    q = settings.qa * float(status["q_scale"]) * (STATIONARY_NOISE_SHARE if is_stationary(s) else 1.0)
+    return dt_s, q, decays
+
+
+def _back(step: _Step, later: _Step, x_later: Vector, P_later: Matrix, dim: int) -> tuple[Vector, Matrix]:
+    """One step of the recursion: state and covariance given all that came later."""
+    x, P, dt_s, q = step.x, step.P, later.dt_s, later.q
+    kept, positions, speeds = np.ones(len(x)), range(dim), range(dim, 2 * dim)
+    for decay in later.decays:
+        kept[decay.state] = decay.kept
+    Fx, FP = kept * x, kept[:, None] * P
+    Fx[positions] += dt_s * x[speeds]
+    FP[positions] += dt_s * P[speeds]
+    predicted = FP * kept
+    predicted[:, positions] += dt_s * FP[:, speeds]
+    predicted[positions, positions] += q * dt_s**3 / 3.0
+    predicted[positions, speeds] += q * dt_s**2 / 2.0
+    predicted[speeds, positions] += q * dt_s**2 / 2.0
+    predicted[speeds, speeds] += q * dt_s
+    for decay in later.decays:
+        predicted[decay.state, decay.state] += decay.variance
+    sure = np.diagonal(predicted) <= 0.0  # states that are exact stay so
+    predicted[sure, sure] = 1.0
+    C = np.linalg.solve(predicted, FP).T
+    P_back = P + C @ (P_later - predicted) @ C.T
+    return x + C @ (x_later - Fx), 0.5 * (P_back + P_back.T)
+
+
+def _as_fix(fix: Fix, x: Vector, P: Matrix, dim: int) -> Fix:
+    """The filter's fix with what is smoothed instead."""
+    rows = np.frombuffer(fix.rows).reshape(-1, 3)[: VELOCITY + 4].copy()
+    for first, states in ((POSITION, slice(0, dim)), (VELOCITY, slice(dim, 2 * dim))):
+        rows[first, :dim] = x[states]
+        rows[first + 1 : first + 1 + dim, :dim] = P[states, states]
+    return replace(fix, rows=rows.tobytes(), method="joint-smoothed", requirement=None)

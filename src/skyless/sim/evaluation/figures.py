@@ -1,0 +1,271 @@
+"""Figures that one can cite: what fixes were worth against the truth, and whether they said so.
+
+``docs/recordings.md`` defines each. Replays, benchmarks and Python have them from here alone.
+"""
+
+from struct import Struct as Format
+from typing import Any, Final
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.core.alert import Alert
+from skyless.core.fix import Fix
+from skyless.core.kernels.arrays import Array, Mask, Matrix, Vector
+from skyless.sim.evaluation.statistics import EvenSample
+from skyless.sim.evaluation.truth import Triple, truth_at
+from skyless.site.tables import Truth
+
+KEPT_FIXES: Final = 1 << 19
+"""Of a recording with more fixes, every second, fourth, … is judged."""
+
+HOLD_S: Final = 1.0
+"""A fix serves until the next one, and so long at most."""
+
+STEP_M: Final = 1.0
+"""Way of the truth over which relative errors are taken."""
+
+CHI2_95: Final = {2: 5.991464547107979, 3: 7.814727903251179}
+"""95 % points of χ² with two and three degrees of freedom."""
+
+_ALERTS: Final = tuple(Alert)
+_NUMBER: Final = {alert: float(number) for number, alert in enumerate(_ALERTS)}
+_NO_LEVELS: Final = (np.nan, np.nan, -1.0)
+_PLACE: Final = Format("12d")
+"""A position and its covariance, with which the rows of a fix begin."""
+
+
+class FixTable(Struct, frozen=True):
+    """n fixes as arrays."""
+
+    time_s: Vector
+    """Shape (n,): in the recording's own time."""
+    position_m: Matrix
+    """Shape (n, 3)."""
+    covariance_m2: Array
+    """Shape (n, 3, 3); NaN where none is claimed."""
+    levels_m: Matrix
+    """Shape (n, 2): protection levels, horizontal and vertical; NaN where there is none."""
+    alert: Vector
+    """Shape (n,): number of the alert in ``Alert``; −1 without levels."""
+
+
+class FixSamples:
+    """Gathers fixes, 104 bytes each, in bounded memory."""
+
+    def __init__(self) -> None:
+        self._sample = EvenSample(13, KEPT_FIXES)
+
+    def add(self, time_s: float, fix: Fix) -> None:
+        """Add a fix; ``time_s`` is in the recording's own time."""
+        integrity, levels = fix.integrity, _NO_LEVELS
+        if integrity is not None:
+            hpl_m, vpl_m = (np.nan if level_m is None else level_m for level_m in (integrity.hpl_m, integrity.vpl_m))
+            levels = hpl_m, vpl_m, _NUMBER[integrity.alert]
+        x, y, z, xx, xy, xz, _, yy, yz, _, _, zz = _PLACE.unpack_from(fix.rows)
+        self._sample.add((time_s, x, y, z, xx, xy, xz, yy, yz, zz, *levels))
+
+    @property
+    def count(self) -> int:
+        """How many fixes there were."""
+        return self._sample.seen
+
+    def table(self) -> FixTable:
+        """All of them, or an even sample."""
+        rows = self._sample.rows
+        covariance_m2 = rows[:, [4, 5, 6, 5, 7, 8, 6, 8, 9]].reshape(-1, 3, 3)
+        return FixTable(rows[:, 0], rows[:, 1:4], covariance_m2, rows[:, 10:12], rows[:, 12])
+
+
+class Judged(Struct, frozen=True):
+    """Which fixes are judged: those of a recording after it has settled, where the truth is known and high enough."""
+
+    truth: Truth | None
+    begin_s: float | None
+    """Time of the first record; None before there is one."""
+    end_s: float
+    planar: bool
+    """Whether the height was given: then the horizontal error is judged alone."""
+    settle_s: float
+    above_m: float | None = None
+    """True height above which fixes are judged."""
+
+    def of(self, times_s: Vector) -> tuple[Matrix, Mask]:
+        """The truth at these times, shape (n, 3), and whether fixes of them are judged, shape (n,)."""
+        truth_m, masks = self.masks(times_s)
+        return truth_m, masks["judged"]
+
+    def masks(self, times_s: Vector) -> tuple[Matrix, dict[str, Mask]]:
+        """The truth at these times, and which are judged or left out why."""
+        truth_m = truth_at(self.truth, times_s)
+        settled = times_s - (self.begin_s or 0.0) >= self.settle_s
+        known = np.isfinite(truth_m[:, 0])
+        high = np.full(len(known), True) if self.above_m is None else ~(truth_m[:, 2] <= self.above_m)
+        return truth_m, {
+            "judged": settled & known & high,
+            "settling": ~settled,
+            "without-truth": settled & ~known,
+            "below-height": settled & known & ~high,
+        }
+
+
+class Figures(Struct, frozen=True, kw_only=True):
+    """Figures of a run; metres and seconds, None where there is nothing to tell them from."""
+
+    judged: int = 0
+    """Fixes that are judged, ..."""
+    judged_s: float = 0.0
+    """... the time that they cover, ..."""
+    left_out: dict[str, int] = {}
+    """... and how many are not, by reason: ``settling``, ``without-truth``, ``below-height``, ``thinned``."""
+    median_m: Triple | None = None
+    """Median position after the settling time."""
+    std_m: Triple | None = None
+    """Standard deviation of the position after the settling time, for tags at rest."""
+    rmse_2d_m: float | None = None
+    rmse_3d_m: float | None = None
+    """Root mean square errors; all figures in three dimensions are None where the height was given."""
+    rmse_axes_m: Triple | None = None
+    p50_2d_m: float | None = None
+    p75_2d_m: float | None = None
+    p95_2d_m: float | None = None
+    max_2d_m: float | None = None
+    p50_3d_m: float | None = None
+    p75_3d_m: float | None = None
+    p95_3d_m: float | None = None
+    max_3d_m: float | None = None
+    bias_m: Triple | None = None
+    """Mean error."""
+    sigma_2d_m: float | None = None
+    sigma_3d_m: float | None = None
+    """Claimed: root of the mean trace of the covariances."""
+    nees: float | None = None
+    """Mean of the squared error over the claimed covariance, by degree of freedom: 1 where the claim is right."""
+    beyond_95: float | None = None
+    """Share of the fixes outside the ellipse, or the ellipsoid, that should hold 95 % of them."""
+    ate_m: float | None = None
+    """Absolute trajectory error: RMSE after the best rotation and translation."""
+    rpe_m: float | None = None
+    """Relative trajectory error: RMSE of the way over each ``STEP_M`` of the truth."""
+    levels: int = 0
+    """Fixes with a protection level and a known truth, from the first fix on, ..."""
+    exceeded_horizontal: int = 0
+    exceeded_vertical: int = 0
+    """... how many of them have a larger error, ..."""
+    exceeded_unalerted: int = 0
+    """... and how many of those carry no alert."""
+    hpl_m: float | None = None
+    vpl_m: float | None = None
+    """Medians of the levels."""
+    alerts: dict[str, int] = {}
+    """How many fixes carry which alert, from the first fix on."""
+    availability: float | None = None
+    """Share of the recording's time in which the newest fix is at most ``HOLD_S`` old."""
+    first_fix_s: float | None = None
+    """From the first record on."""
+    first_fix_error_m: float | None = None
+
+
+def figures_of(table: FixTable, how: Judged, count: int | None = None) -> Figures:
+    """Figures of fixes; ``count`` is how many there were where the table is a sample of them."""
+    if how.begin_s is None or len(table.time_s) == 0:
+        return Figures()
+    dim, time_s = 2 if how.planar else 3, table.time_s
+    truth_m, masks = how.masks(time_s)
+    here, all_errors_m = masks.pop("judged"), (table.position_m - truth_m)[:, :dim]
+    left_out = {name: int(mask.sum()) for name, mask in masks.items() if mask.any()}
+    if count is not None and count > len(time_s):
+        left_out["thinned"] = count - len(time_s)
+    lengths_m = np.sqrt((all_errors_m**2).sum(axis=1))
+    hold_s = np.diff(time_s, append=max(how.end_s, time_s[-1])).clip(0.0, HOLD_S)
+    span_s = how.end_s - how.begin_s
+    settled_m = table.position_m[~masks["settling"]]
+    return Figures(
+        judged=int(here.sum()),
+        judged_s=float(hold_s[here].sum()),
+        left_out=left_out,
+        median_m=_triple(np.median(settled_m, axis=0)) if len(settled_m) else None,
+        std_m=_triple(settled_m.std(axis=0)) if len(settled_m) else None,
+        **_errors((table.position_m - truth_m)[here], dim),
+        **_claims(all_errors_m[here], table.covariance_m2[here, :dim, :dim]),
+        **_trajectory(table.position_m[here], truth_m[here], dim),
+        **_levels(table, all_errors_m),
+        availability=float(min(hold_s.sum() / span_s, 1.0)) if span_s > 0.0 else None,
+        first_fix_s=float(time_s[0] - how.begin_s),
+        first_fix_error_m=float(lengths_m[0]) if np.isfinite(lengths_m[0]) else None,
+    )
+
+
+def _triple(values: Array) -> Triple:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def _errors(error_m: Matrix, dim: int) -> dict[str, Any]:
+    if len(error_m) == 0:
+        return {}
+    found: dict[str, Any] = {
+        "rmse_axes_m": _triple(np.sqrt((error_m**2).mean(axis=0))),
+        "bias_m": _triple(error_m.mean(axis=0)),
+    }
+    for of in range(2, dim + 1):
+        length_m = np.sqrt((error_m[:, :of] ** 2).sum(axis=1))
+        found[f"rmse_{of}d_m"] = float(np.sqrt((length_m**2).mean()))
+        for share in (50, 75, 95):
+            found[f"p{share}_{of}d_m"] = float(np.percentile(length_m, share))
+        found[f"max_{of}d_m"] = float(length_m.max())
+    return found
+
+
+def _claims(error_m: Matrix, covariance_m2: Array) -> dict[str, Any]:
+    """Errors of shape (n, dim) against their covariances (n, dim, dim)."""
+    dim = error_m.shape[1]
+    told: Mask = np.asarray(np.isfinite(covariance_m2).all(axis=(1, 2)))
+    told[told] = np.linalg.det(covariance_m2[told]) > 0.0
+    error_m, covariance_m2 = error_m[told], covariance_m2[told]
+    if len(error_m) == 0:
+        return {}
+    nees = (error_m * np.linalg.solve(covariance_m2, error_m[..., None])[..., 0]).sum(axis=1)
+    variances_m2 = np.diagonal(covariance_m2, axis1=1, axis2=2).mean(axis=0)
+    sigmas = {f"sigma_{of}d_m": float(np.sqrt(variances_m2[:of].sum())) for of in range(2, dim + 1)}
+    return {"nees": float(nees.mean() / dim), "beyond_95": float((nees > CHI2_95[dim]).mean()), **sigmas}
+
+
+def _trajectory(position_m: Matrix, truth_m: Matrix, dim: int) -> dict[str, Any]:
+    """Trajectory errors as the programs that compare trajectories define them (Sturm et al. 2012)."""
+    if len(position_m) < 3:
+        return {}
+    position_m, truth_m = position_m.copy(), truth_m.copy()
+    position_m[:, dim:] = truth_m[:, dim:] = 0.0
+    centred_m, true_m = position_m - position_m.mean(axis=0), truth_m - truth_m.mean(axis=0)
+    U, _, Vt = np.linalg.svd(true_m.T @ centred_m)
+    U[:, 2] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    found = {"ate_m": float(np.sqrt(((true_m - centred_m @ (U @ Vt).T) ** 2).sum(axis=1).mean()))}
+    way_m = np.concatenate([[0.0], np.cumsum(np.sqrt((np.diff(truth_m, axis=0) ** 2).sum(axis=1)))])
+    ends, last_m = [0], 0.0
+    while (end := int(np.searchsorted(way_m, last_m + STEP_M))) < len(way_m):
+        ends.append(end)
+        last_m = way_m[end]
+    if len(ends) > 1:
+        gone_m = np.diff(position_m[ends], axis=0) - np.diff(truth_m[ends], axis=0)
+        found["rpe_m"] = float(np.sqrt((gone_m**2).sum(axis=1).mean()))
+    return found
+
+
+def _levels(table: FixTable, error_m: Matrix) -> dict[str, Any]:
+    horizontal_m, vertical_m = table.levels_m.T
+    has_level = np.isfinite(error_m[:, 0]) & np.isfinite(horizontal_m)
+    over = has_level & (np.hypot(error_m[:, 0], error_m[:, 1]) > horizontal_m)
+    above = has_level & (np.abs(error_m[:, -1]) > vertical_m) if error_m.shape[1] == 3 else np.zeros_like(over)
+    numbers, counts = np.unique(table.alert[table.alert >= 0.0], return_counts=True)
+    medians = (np.median(level[np.isfinite(level)]) if np.isfinite(level).any() else None for level in table.levels_m.T)
+    hpl_m, vpl_m = (None if median is None else float(median) for median in medians)
+    return {
+        "levels": int(has_level.sum()),
+        "exceeded_horizontal": int(over.sum()),
+        "exceeded_vertical": int(above.sum()),
+        "exceeded_unalerted": int(((over | above) & (table.alert == _NUMBER[Alert.NONE])).sum()),
+        "hpl_m": hpl_m,
+        "vpl_m": vpl_m,
+        "alerts": {_ALERTS[int(number)].value: int(n) for number, n in zip(numbers, counts, strict=True)},
+    }
