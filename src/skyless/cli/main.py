@@ -56,6 +56,7 @@ _GROUPS: Final = {
     "Research": (
         ("study", "study", "Measure the receiver's errors over many simulated runs."),
         ("paper", "paper", "Reproduce the paper's figures and claims in one report."),
+        ("benchmark", "benchmark", "Compare methods on every recording below a folder."),
         ("bench", "bench", "Measure how fast filters and Monte Carlo draws run on this machine."),
     ),
 }

@@ -198,7 +198,7 @@ def _replay_site(asked: ReplayOptions, begin: Begin) -> ReplayResult:
     why, path = "a recording of skyless record brings its own", Path(asked.file)
     asked.leave_out(
         *("anchors", "truth", "truth_offset_s", "lever_arm_m", "format", "listener", "qa", "dynamics", "tdoa_std_m"),
-        *("measurements", "uncalibrated", "tag_height_m", "z_bounds_m", "heights"),
+        *("measurements", "uncalibrated", "tag_height_m", "z_bounds_m", "heights", "first_s"),
         why=why,
     )
     asked.leave_out("smooth", why="it is for time differences, and these are receptions, whose clocks are estimated")

@@ -110,14 +110,14 @@ class CaptureReplay:
             _check_carries_anchors(asked)
         self._known_m = self._anchors_m or _stated_anchors(asked, kind)
         """Positions at the recording's beginning, for time differences; packets carry theirs, which may change."""
-        self._height_m, self._height_std_m, self.height_note = height_to_hold(
+        self.height_m, self._height_std_m, self.height_note = height_to_hold(
             asked.tag_height_m, self._known_m, site_height_m, self._truth, kind.name
         )
         if asked.tag_height_std_m is not None:
             self._height_std_m = asked.tag_height_std_m
-            if self._height_m is None:
+            if self.height_m is None:
                 asked.leave_out("tag_height_std_m", why="the height is estimated")
-        if self._height_m is not None:
+        if self.height_m is not None:
             asked.leave_out("z_bounds_m", why=f"the height is {self.height_note}")
         self.measurements = self._measurements(kind)
         self._heights = known_heights(asked)
@@ -158,7 +158,7 @@ class CaptureReplay:
         engine = None if bits is None else PairEngine(bits, anchors_m=self._known_m)
         if self._asked.estimator is not None:
             return ByOwnEstimator(self._asked.estimator(), self._known_m, engine, self._noise)
-        asked = {"qa": self._qa, "difference_std_m": self._asked.tdoa_std_m, "height_m": self._height_m}
+        asked = {"qa": self._qa, "difference_std_m": self._asked.tdoa_std_m, "height_m": self.height_m}
         asked["height_std_m"] = self._height_std_m
         known = {key: value for key, value in asked.items() if value is not None}
         settings = structs.replace(PROFILES.get(self.recording.format.name, DIFFERENCES), **known)
@@ -169,7 +169,7 @@ class CaptureReplay:
         bits = self.recording.format.tx_bits
         assert bits is not None
         qa = MASTERLESS.qa if self._qa is None else self._qa
-        known = {"qa": qa, "height_m": self._height_m, "height_std_m": self._height_std_m}
+        known = {"qa": qa, "height_m": self.height_m, "height_std_m": self._height_std_m}
         is_dl_tdoa = self.recording.format.is_dl_tdoa
         tracking = PacketTracking(
             structs.replace(DL_TDOA if is_dl_tdoa else MASTERLESS, **known),
@@ -186,7 +186,7 @@ class CaptureReplay:
         started_s = time.perf_counter()
         with closing(self.recording):
             records = iter(self.recording)
-            while batch := list(islice(records, BATCH)):
+            while not self._is_over() and (batch := list(islice(records, BATCH))):
                 for record in batch:
                     self.receptions += 1
                     if self._heights and isinstance(record, PairTdoa):
@@ -195,6 +195,8 @@ class CaptureReplay:
                     if time_s is not None:
                         self._first_s = time_s if self._first_s is None else self._first_s
                         self._last_s = time_s
+                        if self._is_over():
+                            break
                     if fix is not None:
                         self._add(fix, on_fix)
                 on_progress(self.recording.bytes_read)
@@ -208,6 +210,11 @@ class CaptureReplay:
         figures = figures_of(table, self.judged, self.samples.count)
         return self._report(figures, offset_s, time.perf_counter() - started_s)
 
+    def _is_over(self) -> bool:
+        """Whether as much has been replayed as was asked for."""
+        first_s = self._asked.first_s
+        return first_s is not None and self._first_s is not None and self._last_s - self._first_s > first_s
+
     @property
     def judged(self) -> Judged:
         """Which fixes are judged."""
@@ -216,7 +223,7 @@ class CaptureReplay:
             truth=self._truth,
             begin_s=self._first_s,
             end_s=self._last_s,
-            planar=self._height_m is not None,
+            planar=self.height_m is not None,
             settle_s=settle_s if asked.settle_s is None else asked.settle_s,
             above_m=flight_height(asked.above_m, self._truth),
         )
@@ -255,7 +262,7 @@ class CaptureReplay:
             rate_hz=fixes / span_s if fixes and span_s > 0.0 else None,
             tdoa_noise_m=float(np.median([pair.noise_m for pair in pairs])) if pairs else None,
             truth_offset_s=offset_s,
-            height_m=self._height_m,
+            height_m=self.height_m,
             reason=None if fixes else str(reason),
             pairs=pairs,
             method=filtered if own is None else getattr(own, "__name__", "own"),

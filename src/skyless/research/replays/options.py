@@ -159,6 +159,8 @@ class ReplayOptions(_Recording, frozen=True, kw_only=True):
     ] = None
     """Your own estimator instead of the filter: a class with hear(observation), which gets one time difference after
     the other."""
+    first_s: Annotated[Positive | None, Option("first")] = None
+    """Replay only so many seconds from the first record on."""
     settle_s: Annotated[NotNegative | None, Option("settle")] = None
     """Seconds from the start that are not judged; by default 3 with a truth table, 2 without."""
     qa: Positive | None = None

@@ -1,0 +1,106 @@
+"""``skyless benchmark``: every recording below a folder by every method."""
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated, Final
+
+from cyclopts import App
+
+from skyless.cli.common.options import command
+from skyless.cli.common.output import console, print_json
+from skyless.cli.common.progress import loading_kernels, progress_bar
+from skyless.core.air.page_codec import MAX_COORDINATE_M
+from skyless.core.arguments import Option, Options, Positive, Text, numbers, point
+from skyless.core.errors import SkylessError
+from skyless.research.replays.options import check_estimator, read_estimator
+
+_QUICK_S: Final = 12.0
+
+app = App(name="benchmark", help_epilogue="Example: skyless benchmark recordings --quick --out compared")
+
+
+class BenchmarkOptions(Options, frozen=True, kw_only=True):
+    """Options of ``skyless benchmark``."""
+
+    out: Path = Path("benchmark")
+    """Write index.html, results.csv and results.json into this folder; results that are there already are kept."""
+    only: str = ""
+    """Only recordings whose name holds this text."""
+    lever_arm_m: Annotated[
+        tuple[float, float, float] | None,
+        Option("lever-arm"),
+        numbers(3, form="x,y,z"),
+        point(3, farthest_m=MAX_COORDINATE_M),
+    ] = None
+    """The antenna in the body's frame, in metres, added to the truth of tables."""
+    calibrate_on: Annotated[tuple[str, ...], Option("calibrate-on"), Text(lambda _, text: text, "NAME", many=True)] = ()
+    """Calibrate anchors on the recordings whose names hold this text; others with the same anchors are replayed with
+    that as well."""
+    estimator: Annotated[tuple[str, ...], Text(lambda _, text: text, "FILE.py:CLASS", many=True)] = ()
+    """Your own estimator as one more method: a class with hear(observation)."""
+    first_s: Annotated[Positive | None, Option("first")] = None
+    """Only so many seconds of each recording."""
+    quick: bool = False
+    """The first twelve seconds of each recording, without smoothing: about a minute for thirty recordings."""
+    json: bool = False
+    """Write one JSON object instead of the table."""
+
+
+@app.default
+@command
+def benchmark(folder: Path, *, asked: BenchmarkOptions) -> int:
+    """Compare methods on every recording below a folder.
+
+    Finds what skyless replay can read, and beside NAME_tdoa.csv its truth, NAME_pose.csv, and above it the anchors,
+    anchors*.csv. Runs joint, joint smoothed and calibrated, a plain filter with a gate, one with Bitcraze's rule of
+    refusing outliers, and estimators of your own. Continues where it was interrupted.
+    """
+    if not folder.is_dir():
+        raise SkylessError(f"FOLDER is {str(folder)!r}; it should be a folder with recordings")
+    from skyless.core.kernels.processes import PAIRS
+    from skyless.research.benchmark.page import SUMMARY_HEADS, summary_rows, write
+    from skyless.research.benchmark.recordings import recordings_below
+    from skyless.research.benchmark.run import Asked, results_of
+    from skyless.research.compile_ahead import compile_pair_kernels
+
+    estimators = {
+        text.rpartition(":")[2]: check_estimator("--estimator", read_estimator("--estimator", text))
+        for text in asked.estimator
+    }
+    found = [one for one in recordings_below(folder) if asked.only in one.name]
+    if not found:
+        raise SkylessError(f"FOLDER is {str(folder)!r}; it should hold recordings that skyless replay can read")
+    kept = asked.out / "results"
+    try:
+        kept.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SkylessError(f"--out is {str(asked.out)!r}; it should be a folder: {error.strerror}") from None
+    with loading_kernels(PAIRS):
+        compile_pair_kernels()
+    first_s = _QUICK_S if asked.quick and asked.first_s is None else asked.first_s
+    programs = tuple(Path(text.rpartition(":")[0]) for text in asked.estimator)
+    how = Asked(asked.lever_arm_m, first_s, asked.calibrate_on, estimators, programs, not asked.quick)
+    try:
+        with progress_bar("replaying", 1.0) as bar:
+            results = list(results_of(found, how, kept, bar.reach))
+    except KeyboardInterrupt:
+        print("stopped; the same command continues where it was", file=sys.stderr)
+        raise
+    title = f"{len(found)} recordings" + ("" if first_s is None else f", the first {first_s:g} s of each")
+    write(asked.out, results, title, shlex.join(["skyless", *sys.argv[1:]]))
+    summary = list(summary_rows(results))
+    if asked.json:
+        rows = [dict(zip(SUMMARY_HEADS, row, strict=True)) for row in summary]
+        print_json({"recordings": len(found), "seconds": first_s, "methods": rows})
+        return 0
+    from rich.table import Table
+
+    table = Table(title=title)
+    for head in SUMMARY_HEADS:
+        table.add_column(head, overflow="fold")
+    for row in summary:
+        table.add_row(*row)
+    console().print(table)
+    console().print(f"{asked.out / 'index.html'}: each recording; results.csv and results.json beside it")
+    return 0

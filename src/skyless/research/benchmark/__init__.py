@@ -1,0 +1,1 @@
+"""Every recording below a folder by every method, beside each other."""

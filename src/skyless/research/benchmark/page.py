@@ -1,0 +1,173 @@
+"""A benchmark as a page, a table and JSON."""
+
+import csv
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import numpy as np
+from matplotlib.figure import Figure
+
+from skyless.core.kernels.arrays import Matrix
+from skyless.research.benchmark.run import JOINT, PLAIN, Result
+from skyless.sim.evaluation.figures import Figures
+from skyless.site.report.figures import picture, report_style
+from skyless.site.report.report_page import bullets, page, svg_figure, table
+
+_HEADS: Final = (
+    *("recording", "method", "judged", "RMSE 2-D", "3-D", "50 %", "95 %", "largest", "bias x, y, z", "σ", "NEES"),
+    *("beyond 95 %", "levels", "exceeded h, v", "median level", "available", "first fix", "ATE", "RPE"),
+)
+_NUMBERS: Final = tuple(
+    name
+    for name in Figures.__struct_fields__
+    if name not in {"left_out", "alerts", "median_m", "std_m", "rmse_axes_m", "bias_m"}
+)
+_TRIPLES: Final = ("median_m", "std_m", "rmse_axes_m", "bias_m")
+_MOST_COLOURS: Final = 10
+
+
+def write(folder: Path, results: Sequence[Result], title: str, command: str) -> None:
+    """Write ``index.html``, ``results.csv`` and ``results.json`` into the folder."""
+    told = [{name: value for name, value in msgspec.to_builtins(one).items() if name != "drawn"} for one in results]
+    (folder / "results.json").write_bytes(msgspec.json.format(msgspec.json.encode(told), indent=1))
+    with (folder / "results.csv").open("w", newline="", encoding="utf-8") as file:
+        rows = csv.writer(file)
+        rows.writerow(
+            [
+                "recording",
+                "method",
+                "reason",
+                *_NUMBERS,
+                *(f"{name[:-1]}{axis}_m" for name in _TRIPLES for axis in "xyz"),
+            ]
+        )
+        rows.writerows(_csv_row(one) for one in results)
+    (folder / "index.html").write_text(_page(results, title, command), encoding="utf-8")
+
+
+def _csv_row(result: Result) -> list[object]:
+    found = result.figures or Figures()
+    triples = (value for name in _TRIPLES for value in getattr(found, name) or (None, None, None))
+    return [result.recording, result.method, result.reason, *(getattr(found, name) for name in _NUMBERS), *triples]
+
+
+def ratios(results: Sequence[Result], method: str) -> dict[str, float | int]:
+    """Geometric means of a method's errors over the plain filter's, of recordings that both were judged on."""
+    plain = {one.recording: one.figures for one in results if one.method == PLAIN and one.figures is not None}
+    found: dict[str, list[float]] = defaultdict(list)
+    for one in results:
+        other = plain.get(one.recording)
+        if one.method == method and one.figures is not None and other is not None:
+            for name in ("rmse_2d_m", "rmse_3d_m"):
+                mine_m, its_m = getattr(one.figures, name), getattr(other, name)
+                if mine_m is not None and its_m is not None:
+                    found[name].append(float(np.log(mine_m / its_m)))
+    means: dict[str, float | int] = {name: float(np.exp(np.mean(logs))) for name, logs in found.items()}
+    return {**means, "recordings": len(found["rmse_2d_m"])}
+
+
+def summary_rows(results: Sequence[Result]) -> Iterator[tuple[str, ...]]:
+    """One line for each method: ratios to the plain filter, NEES, and levels exceeded."""
+    for method in dict.fromkeys(one.method for one in results):
+        ratio = ratios(results, method)
+        judged = [one.figures for one in results if one.method == method and one.figures and one.figures.judged]
+        nees = [one.nees for one in judged if one.nees is not None]
+        exceeded = (sum(getattr(one, f"exceeded_{way}") for one in judged) for way in ("horizontal", "vertical"))
+        yield (
+            method,
+            f"{len(judged)}",
+            *(_number(ratio.get(name), ".3f") for name in ("rmse_2d_m", "rmse_3d_m")),
+            f"{np.median(nees):.2f} ({min(nees):.2f} to {max(nees):.2f})" if nees else "–",
+            f"{sum(one.levels for one in judged)}",
+            ", ".join(map(str, exceeded)),
+        )
+
+
+SUMMARY_HEADS: Final = ("method", "recordings", "2-D / gate", "3-D / gate", "NEES", "levels", "exceeded h, v")
+
+
+def _page(results: Sequence[Result], title: str, command: str) -> str:
+    by_recording: Mapping[str, list[Result]] = defaultdict(list)
+    for one in results:
+        by_recording[one.recording].append(one)
+    failed = [f"{one.recording}, {one.method}: {one.reason}" for one in results if one.figures is None]
+    rows = [_row(one) for one in results if one.figures is not None]
+    parts = [
+        f"<header><h1>{escape(title)}</h1>\n<p>Recordings were made by others; fixes are of methods as they stand. "
+        "Figures are defined in <code>docs/recordings.md</code>; lengths in metres. Made by "
+        f"<code>{escape(command)}</code>; the same figures are in <code>results.csv</code> and "
+        "<code>results.json</code>.</p></header>",
+        "<section><h2>Methods</h2>",
+        table(SUMMARY_HEADS, summary_rows(results)),
+        "<p class='note'>Ratios are geometric means of RMSE over that of the plain filter with a gate (gate).</p>"
+        "</section><section><h2>Recordings</h2>",
+        table(_HEADS, rows),
+        "</section>",
+    ]
+    if failed:
+        parts.append("<section><h2>Left out</h2>" + bullets(failed, "warning") + "</section>")
+    parts += [_section(number, name, ones) for number, (name, ones) in enumerate(by_recording.items())]
+    return page(title, parts)
+
+
+def _row(result: Result) -> tuple[str, ...]:
+    found = result.figures
+    assert found is not None
+    over = "3d" if found.rmse_3d_m is not None else "2d"
+    of_all = (getattr(found, f"{name}_{over}_m") for name in ("p50", "p95", "max"))
+    return (
+        *(result.recording, result.method, f"{found.judged}, {found.judged_s:.0f} s"),
+        *(_number(value, ".3f") for value in (found.rmse_2d_m, found.rmse_3d_m, *of_all)),
+        "–" if found.bias_m is None else ", ".join(f"{value:.3f}" for value in found.bias_m),
+        _number(getattr(found, f"sigma_{over}_m"), ".3f"),
+        _number(found.nees, ".2f"),
+        _number(found.beyond_95, ".1%"),
+        f"{found.levels}",
+        f"{found.exceeded_horizontal}, {found.exceeded_vertical}",
+        _number(found.hpl_m, ".2f"),
+        _number(found.availability, ".1%"),
+        _number(found.first_fix_s, ".2f"),
+        *(_number(value, ".3f") for value in (found.ate_m, found.rpe_m)),
+    )
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form)
+
+
+def _section(number: int, name: str, results: Sequence[Result]) -> str:
+    drawn = {one.method: np.array(one.drawn, dtype=np.float64) for one in results if one.drawn}
+    if not drawn:
+        return ""
+    with report_style():
+        svg = picture(_figure(drawn), "svg", 60.0)
+    caption = f"{name}: map, error over time, and errors of {JOINT} against its protection levels (Stanford diagram)"
+    return f"<section><h2>{escape(name)}</h2>{svg_figure(svg, f'recording{number}', caption)}</section>"
+
+
+def _figure(drawn: Mapping[str, Matrix]) -> Figure:
+    """Of rows of time, position, truth and levels by method."""
+    figure = Figure(figsize=(10.0, 3.2), layout="constrained")
+    chart, over_time, levels = figure.subplots(1, 3)
+    begin_s = min(rows[0, 0] for rows in drawn.values())
+    for number, (method, rows) in enumerate(drawn.items()):
+        colour = f"C{number % _MOST_COLOURS}"
+        chart.plot(rows[:, 1], rows[:, 2], ".", markersize=2, color=colour, rasterized=True)
+        error_m = np.linalg.norm(rows[:, 1:4] - rows[:, 4:7], axis=1)
+        over_time.plot(rows[:, 0] - begin_s, error_m, linewidth=0.7, color=colour, label=method)
+    truth_m = next(iter(drawn.values()))[:, 4:6]
+    chart.plot(*truth_m.T, color="black", linewidth=0.7)
+    chart.set(xlabel="x in m", ylabel="y in m", aspect="equal", title="map (line: truth)")
+    over_time.set(xlabel="time in s", ylabel="error in m", title="error, 3-D", yscale="log")
+    over_time.legend(fontsize="x-small")
+    rows = drawn.get(JOINT, np.empty((0, 9)))
+    error_m = np.linalg.norm(rows[:, 1:3] - rows[:, 4:6], axis=1)
+    most = float(np.nanmax([*error_m, *rows[:, 7], 0.1])) * 1.05 if len(rows) else 1.0
+    levels.plot(error_m, rows[:, 7], ".", markersize=2, rasterized=True)
+    levels.plot([0.0, most], [0.0, most], color="black", linewidth=0.7)
+    levels.set(xlabel="horizontal error in m", ylabel="level in m", xlim=(0, most), ylim=(0, most), title="levels")
+    return figure
