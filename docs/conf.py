@@ -44,6 +44,7 @@ NAVIGATION = {
         "docs/howto/simulate",
         "docs/howto/plan",
         "docs/howto/replay",
+        "docs/howto/compare",
         "docs/howto/survey_and_calibrate",
         "docs/howto/study",
         "docs/howto/reproduce_the_paper",

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from skyless.core.kernels.arrays import Matrix
 from skyless.research.benchmark.run import JOINT, PLAIN, Result
 from skyless.sim.evaluation.figures import Figures
-from skyless.site.report.figures import picture, report_style
+from skyless.site.report.figures import panel, picture, report_style
 from skyless.site.report.report_page import bullets, page, svg_figure, table
 
 _HEADS: Final = (
@@ -27,7 +27,8 @@ _NUMBERS: Final = tuple(
     if name not in {"left_out", "alerts", "median_m", "std_m", "rmse_axes_m", "bias_m"}
 )
 _TRIPLES: Final = ("median_m", "std_m", "rmse_axes_m", "bias_m")
-_MOST_COLOURS: Final = 10
+_DIVERGED_M: Final = 1.0
+"""A plain filter with a larger error has lost the tag: no ratio is made with it."""
 
 
 def write(folder: Path, results: Sequence[Result], title: str, command: str) -> None:
@@ -64,7 +65,7 @@ def ratios(results: Sequence[Result], method: str) -> dict[str, float | int]:
         if one.method == method and one.figures is not None and other is not None:
             for name in ("rmse_2d_m", "rmse_3d_m"):
                 mine_m, its_m = getattr(one.figures, name), getattr(other, name)
-                if mine_m is not None and its_m is not None:
+                if mine_m is not None and its_m is not None and its_m < _DIVERGED_M:
                     found[name].append(float(np.log(mine_m / its_m)))
     means: dict[str, float | int] = {name: float(np.exp(np.mean(logs))) for name, logs in found.items()}
     return {**means, "recordings": len(found["rmse_2d_m"])}
@@ -103,7 +104,8 @@ def _page(results: Sequence[Result], title: str, command: str) -> str:
         "<code>results.json</code>.</p></header>",
         "<section><h2>Methods</h2>",
         table(SUMMARY_HEADS, summary_rows(results)),
-        "<p class='note'>Ratios are geometric means of RMSE over that of the plain filter with a gate (gate).</p>"
+        "<p class='note'>Ratios are geometric means of RMSE over that of the plain filter with a gate (gate), "
+        "of recordings where that is below 1 m.</p>"
         "</section><section><h2>Recordings</h2>",
         table(_HEADS, rows),
         "</section>",
@@ -144,30 +146,49 @@ def _section(number: int, name: str, results: Sequence[Result]) -> str:
     if not drawn:
         return ""
     with report_style():
-        svg = picture(_figure(drawn), "svg", 60.0)
-    caption = f"{name}: map, error over time, and errors of {JOINT} against its protection levels (Stanford diagram)"
-    return f"<section><h2>{escape(name)}</h2>{svg_figure(svg, f'recording{number}', caption)}</section>"
+        panels = {
+            "Map; the line is the truth": _map(drawn),
+            "Error over time": _over_time(drawn),
+            f"Horizontal errors of {JOINT} and its protection levels (Stanford diagram)": _levels(drawn),
+        }
+        figures = "\n".join(
+            svg_figure(picture(figure, "svg", 60.0), f"recording{number}_{place}", caption)
+            for place, (caption, figure) in enumerate(panels.items())
+        )
+    return f"<section><h2>{escape(name)}</h2><div class='panels'>{figures}</div></section>"
 
 
-def _figure(drawn: Mapping[str, Matrix]) -> Figure:
+def _map(drawn: Mapping[str, Matrix]) -> Figure:
     """Of rows of time, position, truth and levels by method."""
-    figure = Figure(figsize=(10.0, 3.2), layout="constrained")
-    chart, over_time, levels = figure.subplots(1, 3)
-    begin_s = min(rows[0, 0] for rows in drawn.values())
-    for number, (method, rows) in enumerate(drawn.items()):
-        colour = f"C{number % _MOST_COLOURS}"
-        chart.plot(rows[:, 1], rows[:, 2], ".", markersize=2, color=colour, rasterized=True)
-        error_m = np.linalg.norm(rows[:, 1:4] - rows[:, 4:7], axis=1)
-        over_time.plot(rows[:, 0] - begin_s, error_m, linewidth=0.7, color=colour, label=method)
+    figure, axes = panel("")
     truth_m = next(iter(drawn.values()))[:, 4:6]
-    chart.plot(*truth_m.T, color="black", linewidth=0.7)
-    chart.set(xlabel="x in m", ylabel="y in m", aspect="equal", title="map (line: truth)")
-    over_time.set(xlabel="time in s", ylabel="error in m", title="error, 3-D", yscale="log")
-    over_time.legend(fontsize="x-small")
+    for method, rows in drawn.items():
+        axes.plot(rows[:, 1], rows[:, 2], ".", markersize=2, rasterized=True, label=method)
+    axes.plot(*truth_m.T, color="black", linewidth=0.7)
+    if np.isfinite(truth_m).any():  # a filter that has lost its tag shall not fill the map
+        low_m, high_m = np.nanmin(truth_m, axis=0) - 1.0, np.nanmax(truth_m, axis=0) + 1.0
+        axes.set(xlim=(low_m[0], high_m[0]), ylim=(low_m[1], high_m[1]))
+    axes.set(xlabel="x in m", ylabel="y in m", aspect="equal")
+    return figure
+
+
+def _over_time(drawn: Mapping[str, Matrix]) -> Figure:
+    figure, axes = panel("")
+    begin_s = min(rows[0, 0] for rows in drawn.values())
+    for method, rows in drawn.items():
+        error_m = np.linalg.norm(rows[:, 1:4] - rows[:, 4:7], axis=1)
+        axes.plot(rows[:, 0] - begin_s, error_m, linewidth=0.7, label=method)
+    axes.set(xlabel="time in s", ylabel="error in m", yscale="log")
+    axes.legend(fontsize="x-small")
+    return figure
+
+
+def _levels(drawn: Mapping[str, Matrix]) -> Figure:
+    figure, axes = panel("")
     rows = drawn.get(JOINT, np.empty((0, 9)))
     error_m = np.linalg.norm(rows[:, 1:3] - rows[:, 4:6], axis=1)
-    most = float(np.nanmax([*error_m, *rows[:, 7], 0.1])) * 1.05 if len(rows) else 1.0
-    levels.plot(error_m, rows[:, 7], ".", markersize=2, rasterized=True)
-    levels.plot([0.0, most], [0.0, most], color="black", linewidth=0.7)
-    levels.set(xlabel="horizontal error in m", ylabel="level in m", xlim=(0, most), ylim=(0, most), title="levels")
+    most_m = 1.05 * float(np.nanmax([*error_m, *rows[:, 7], 0.1]))
+    axes.plot(error_m, rows[:, 7], ".", markersize=2, rasterized=True)
+    axes.plot([0.0, most_m], [0.0, most_m], color="black", linewidth=0.7)
+    axes.set(xlabel="error in m", ylabel="level in m", xlim=(0.0, most_m), ylim=(0.0, most_m))
     return figure
