@@ -51,6 +51,7 @@ BROKER = "tests/nodes/test_broker.py::"
 ROLES = "tests/nodes/test_site_with_roles.py::"
 MQTT = "tests/cli/test_node_commands.py::test_the_demo_tells_how_to_watch_its_broker"
 PLAN = "tests/cli/test_plan_command.py::"
+BENCHMARK = "tests/replay/test_benchmark.py::"
 REPLAY = "tests/cli/test_replay_command.py::"
 ELSEWHERE = {
     "scripts/run": DEMO + "test_a_pipe_gets_the_places_and_the_tables_once_also_when_it_is_terminated",
@@ -121,6 +122,16 @@ ELSEWHERE = {
     "skyless replay flight_tdoa.csv.gz --anchors anchors.csv --truth flight_pose.csv.gz"
     " --lever-arm=-0.012,0.001,0.091 --plot flight.png": (
         "tests/recordings/test_replay_acceptance.py::test_the_lever_arm_brings_the_truth_to_the_antenna"
+    ),
+    "skyless benchmark recordings --out compared": BENCHMARK + "test_figures_are_those_of_the_fixes",
+    "skyless benchmark recordings --quick --out quick": BENCHMARK + "test_what_exists_is_not_computed_again",
+    "skyless benchmark recordings --estimator own_estimator.py:Filter --out compared": (
+        BENCHMARK + "test_figures_are_those_of_the_fixes"
+    ),
+    "skyless replay flight_tdoa.csv.gz --anchors anchors.csv --truth flight_pose.csv.gz"
+    " --estimator own_estimator.py:Filter": "tests/examples/test_examples.py::test_own_estimator_on_a_recording",
+    "skyless simulate --scenario room --estimator own_estimator.py:Filter": (
+        "tests/examples/test_examples.py::test_own_estimator"
     ),
     "skyless survey --mqtt mqtt://127.0.0.1 --site site.toml --duration 30 --anchor-height 2.6 --anchor-height 3=0.5"
     " --origin 1 --x-axis 4 --left 6 --out surveyed.toml": (
