@@ -4,7 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from io import BufferedIOBase
-from typing import Final
+from typing import Final, Literal
 
 from skyless.core.air.masterless_packets import Packet, Point
 from skyless.core.constants import TICK_BITS
@@ -147,6 +147,52 @@ def read_binary(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Po
     for chunk in chunks(stream, drops):
         for packet in reader.feed(chunk):
             yield from tag.on_uci(packet)
+
+
+PCAPNG_MAGIC: Final = b"\x0a\x0d\x0d\x0a"
+_INTERFACE, _PACKET = 1, 6
+LINK_TYPE: Final = 299
+"""Of UCI in captures (tcpdump.org's list of link types)."""
+
+_MAX_BLOCK_BYTES: Final = 1 << 20
+
+
+def recognise_pcapng(head: bytes) -> bool:
+    """Whether the file is a pcapng whose first interface has UCI on it."""
+    blocks = _blocks(iter((head,)), Counter())
+    link_types = (int.from_bytes(body[:2], order) for kind, body, order in blocks if kind == _INTERFACE)
+    return head.startswith(PCAPNG_MAGIC) and next(link_types, None) == LINK_TYPE
+
+
+def read_pcapng(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> Iterator[Packet]:
+    """Yield the packets of a capture of UCI."""
+    reader, tag = UciReader(drops), DtTag(drops, anchors_m)
+    for kind, body, order in _blocks(chunks(stream, drops), drops):
+        if kind == _PACKET and len(body) >= 20:
+            length = int.from_bytes(body[12:16], order)
+            for packet in reader.feed(body[20 : 20 + length]):
+                yield from tag.on_uci(packet)
+
+
+def _blocks(pieces: Iterator[bytes], drops: Drops) -> Iterator[tuple[int, bytes, Literal["little", "big"]]]:
+    """Kind, body and byte order of each block of a pcapng; ends where it is none, or is cut off."""
+    data = b""
+    order: Literal["little", "big"] = "little"
+    for piece in pieces:
+        data += piece
+        while len(data) >= 12:
+            if data.startswith(PCAPNG_MAGIC):
+                order = "little" if data[8:12] == b"\x4d\x3c\x2b\x1a" else "big"
+            length = int.from_bytes(data[4:8], order)
+            if not 12 <= length <= _MAX_BLOCK_BYTES or length % 4:
+                drops["malformed-block"] += 1
+                return
+            if len(data) < length:
+                break
+            yield int.from_bytes(data[:4], order), data[8 : length - 4], order
+            data = data[length:]
+    if data:
+        drops["unfinished-block"] += 1
 
 
 def read_text(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> Iterator[Packet]:

@@ -15,6 +15,8 @@ _TABLE: Final = re.compile(r"_(?:tdoa|data)(?=\.)")
 _TRUTHS: Final = ("_pose", "_truth", "_lighthouse")
 """``NAME_tdoa.csv`` has its truth in ``NAME_pose.csv``, or with another of these words."""
 
+_ANCHORS: Final = ("anchors*.csv", "anchors/anchors*.csv", "anchor_positions.yaml")
+
 _SMALLEST: Final = 200
 """Bytes that a recording has at least."""
 
@@ -60,12 +62,12 @@ def truth_of(path: Path) -> Path | None:
 
 
 def anchors_of(path: Path, folder: Path) -> Path | None:
-    """The nearest table of anchors: ``anchors*.csv`` beside the recording or above, in ``anchors`` as well.
+    """The nearest table of anchors: one of ``_ANCHORS`` beside the recording or above.
 
     Of several the one whose ending stands in the recording's path, as ``const1`` of ``anchors_const1.csv``.
     """
     for place in (one for one in path.parents if one == folder or folder in one.parents):
-        tables = sorted([*place.glob("anchors*.csv"), *place.glob("anchors/anchors*.csv")])
+        tables = sorted(table for name in _ANCHORS for table in place.glob(name))
         fitting = [table for table in tables if table.stem.partition("_")[2] in path.parts]
         if fitting or len(tables) == 1:
             return (fitting or tables)[0]

@@ -1,18 +1,32 @@
 """Tables whose rows are time differences of two anchors: ready ones, and MILUV's stamps of exchanges."""
 
+from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from io import BufferedIOBase
 from math import dist, isfinite
+from os import PathLike
 from typing import Final
+
+import numpy as np
 
 from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.constants import TICK_M
-from skyless.core.input_files import Drops, header_of, rows
+from skyless.core.input_files import Drops, header_of, open_source, rows
+from skyless.core.kernels.arrays import Array
 from skyless.core.ticks import difference
+from skyless.research.foreign._crazyflie import heights_of
+from skyless.site.tables import Truth
 
 # Tables of TDoAs: ``t_s,idA,idB,tdoa_m`` with tdoa_m = |p − b| − |p − a|, as the UTIL flights and Crazyflie logs.
 
 TDOA_COLUMNS: Final = ("t_s", "idA", "idB", "tdoa_m")
+
+
+UTIL_COLUMNS: Final = ("t_tdoa", "idA", "idB", "tdoa_meas")
+"""The same in UTIL's own tables, which have the columns of other sensors, of other lengths, beside them."""
+
+_POSE_COLUMNS: Final = ("t_pose", "pose_x", "pose_y", "pose_z", "pose_qx", "pose_qy", "pose_qz", "pose_qw")
 
 
 def recognise_tdoas(head: bytes) -> bool:
@@ -20,14 +34,25 @@ def recognise_tdoas(head: bytes) -> bool:
     return set(TDOA_COLUMNS) <= set(header_of(head))
 
 
-def read_tdoas(stream: BufferedIOBase, drops: Drops) -> Iterator[PairTdoa]:
+def recognise_util(head: bytes) -> bool:
+    """Whether the first line names those of UTIL."""
+    return set(UTIL_COLUMNS) <= set(header_of(head))
+
+
+def read_tdoas(
+    stream: BufferedIOBase, drops: Drops, columns: tuple[str, str, str, str] = TDOA_COLUMNS
+) -> Iterator[PairTdoa]:
     """Yield the TDoAs of a table, in its own time."""
-    for time, a, b, tdoa in rows(stream, drops, TDOA_COLUMNS):
+    for time, a, b, tdoa in rows(stream, drops, columns):
         try:
-            time_s, anchor_a, anchor_b, tdoa_m = float(time), int(a), int(b), float(tdoa)
+            time_s, anchor_a, anchor_b, tdoa_m = float(time), int(float(a)), int(float(b)), float(tdoa)
         except ValueError:
-            blank = not (time.strip() and a.strip() and b.strip() and tdoa.strip())
-            drops["blank-field" if blank else "malformed-number"] += 1
+            given = [bool(field.strip()) for field in (time, a, b, tdoa)]
+            if any(given) or columns is TDOA_COLUMNS:
+                drops["malformed-number" if all(given) else "blank-field"] += 1
+            continue
+        except OverflowError:
+            drops["not-finite"] += 1
             continue
         if not (isfinite(time_s) and isfinite(tdoa_m)):
             drops["not-finite"] += 1
@@ -35,6 +60,39 @@ def read_tdoas(stream: BufferedIOBase, drops: Drops) -> Iterator[PairTdoa]:
             drops["anchor-against-itself"] += 1
         else:
             yield PairTdoa(time_s, anchor_a, anchor_b, tdoa_m)
+
+
+def read_util(stream: BufferedIOBase, drops: Drops) -> Iterator[PairTdoa]:
+    """Yield the TDoAs of one of UTIL's tables."""
+    yield from read_tdoas(stream, drops, UTIL_COLUMNS)
+
+
+def read_util_truth(path: str | PathLike[str], _listener: str | None) -> Truth | None:
+    """Poses of motion capture in one of UTIL's tables; None where it has none."""
+    table = _numbers(path, _POSE_COLUMNS)
+    return Truth(table[:, 0], table[:, 1:4], table[:, 4:8]) if len(table) else None
+
+
+def read_util_heights(path: str | PathLike[str], *, is_barometer: bool) -> Array | None:
+    """Rows of time, height and standard deviation of its ranger or barometer; None where it has none."""
+    columns = ("t_baro", "baro") if is_barometer else ("t_tof", "tof")
+    return heights_of(_numbers(path, columns), is_barometer=is_barometer)
+
+
+def _numbers(path: str | PathLike[str], columns: tuple[str, ...]) -> Array:
+    """Rows of numbers of some columns where all of them are given, in the order of the first."""
+    found = []
+    with open_source(path) as stream:
+        head = stream.readline()
+        if not set(columns) <= set(header_of(head)):
+            return np.empty((0, len(columns)))
+        stream.seek(0)
+        for row in rows(stream, Counter(), columns):
+            with suppress(ValueError):
+                found.append([float(field) for field in row])
+    table = np.array(found, dtype=np.float64).reshape(-1, len(columns))
+    table = table[np.isfinite(table).all(axis=1)]
+    return table[np.argsort(table[:, 0], kind="stable")]
 
 
 # MILUV passive ticks: three-message exchanges of two nodes that a third overhears (Shalaby et al., MILUV, 2025).

@@ -13,11 +13,14 @@ from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.core.constants import TICK_BITS
 from skyless.core.errors import ConfigurationError
 from skyless.core.input_files import Drops, open_source, read_head
+from skyless.core.kernels.arrays import Array
 from skyless.radio.foreign import bitcraze, fira
 from skyless.research.foreign import _bitcraze_captures as bitcraze_captures
+from skyless.research.foreign import _crazyflie as crazyflie
 from skyless.research.foreign import _phones as phones
 from skyless.research.foreign import _tdoa_tables as tdoa_tables
 from skyless.research.foreign import avalue
+from skyless.site.tables import Truth, read_truth
 
 Record = Packet | PairTdoa
 
@@ -41,6 +44,10 @@ class Format:
     """Identifiers are hexadecimal."""
     is_dl_tdoa: bool = False
     """FiRa's: packets may state where their senders are, and relay only initiators and those that answered them."""
+    read_truth: Callable[[str | PathLike[str], str | None], Truth | None] | None = None
+    """The truth that a recording itself holds, from its path and the listener; None for a format that holds none."""
+    read_heights: Callable[..., Array | None] | None = None
+    """Rows of time, height and standard deviation of a sensor that was recorded, from the path and ``is_barometer``."""
     delays_ticks: int = 0
     """Antenna delays of a sender and a receiver together, where its stamps include them."""
 
@@ -71,6 +78,7 @@ FORMATS: Final = (
         tdoa_tables.read_miluv,
         None,
         any_listener=True,
+        read_truth=read_truth,
     ),
     Format(
         "avalue",
@@ -94,6 +102,30 @@ FORMATS: Final = (
         fira.read_text,
     ),
     Format("tdoa-table", "Table t_s,idA,idB,tdoa_m", tdoa_tables.recognise_tdoas, tdoa_tables.read_tdoas, None),
+    Format(
+        "util-table",
+        "UTIL's published tables t_tdoa,idA,idB,tdoa_meas, with poses, ranger and barometer",
+        tdoa_tables.recognise_util,
+        tdoa_tables.read_util,
+        None,
+        read_truth=tdoa_tables.read_util_truth,
+        read_heights=tdoa_tables.read_util_heights,
+    ),
+    Format(
+        "crazyflie-log",
+        "Log of a Crazyflie's SD card (events estTDOA or estTdoaCand, poses, lighthouse, ranger, barometer)",
+        crazyflie.recognise,
+        crazyflie.read,
+        None,
+        read_truth=crazyflie.read_truth,
+        read_heights=crazyflie.read_heights,
+    ),
+    _dl_tdoa(
+        "uci-pcapng",
+        "UCI capture, pcapng of link type 299 (DL-TDoA measurements, versions 1 and 2)",
+        fira.recognise_pcapng,
+        fira.read_pcapng,
+    ),
     _bitcraze("binary", "binary records BC ..", bitcraze.recognise_binary, bitcraze.read_binary),
     _dl_tdoa(
         "uci-binary",

@@ -21,7 +21,14 @@ from skyless.research.foreign.formats import Format, Recording, format_of, open_
 from skyless.research.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
 from skyless.research.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, MASTERLESS, PacketTracking
 from skyless.research.masterless.pair_engine import PairEngine
-from skyless.research.replays.inputs import flight_height, height_to_hold, known_anchors, known_heights, known_truth
+from skyless.research.replays.inputs import (
+    YAML_SUFFIXES,
+    flight_height,
+    height_to_hold,
+    known_anchors,
+    known_heights,
+    known_truth,
+)
 from skyless.research.replays.noise import NoiseByPair, PairNoise
 from skyless.research.replays.options import DIFFERENCES_MADE, PACKETS, ReplayOptions
 from skyless.research.replays.pipelines import ByOwnEstimator, ByPackets, ByPairs, Pipeline, Smoothed
@@ -125,8 +132,9 @@ class CaptureReplay:
         self.recording: Recording = open_recording(path, asked.format, asked.listener, anchors_m)
         self._qa = process_noise(asked.qa, asked.dynamics)
         self._calibration = calibration
-        if calibration is None and isinstance(asked.anchors, str | Path) and not asked.uncalibrated:
-            self._calibration = read_calibration(asked.anchors)
+        table = asked.anchors if isinstance(asked.anchors, str | Path) and not asked.uncalibrated else None
+        if calibration is None and table is not None and Path(table).suffix not in YAML_SUFFIXES:
+            self._calibration = read_calibration(table)
         self._noise = NoiseByPair(self._truth, self._known_m)
         self._pipeline = self._new_pipeline()
         self.receptions = 0

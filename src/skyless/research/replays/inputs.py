@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,11 +11,11 @@ from numpy.typing import ArrayLike
 from skyless.core.air.masterless_packets import Point
 from skyless.core.arguments import check_point, existing_file, wrong
 from skyless.core.dop import GUESSED_STD_M, plane_height_m
-from skyless.core.errors import SkylessError
+from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.site import Site
 from skyless.research.foreign.formats import format_of
 from skyless.research.masterless.smoothing import Height
-from skyless.research.replays.options import BAROMETER, RecordingOptions, ReplayOptions
+from skyless.research.replays.options import BAROMETER, RECORDED, RecordingOptions, ReplayOptions
 from skyless.sim.evaluation.truth import FLIGHT_M, antenna_truth, flies, shifted
 from skyless.site.file.load import site_of
 from skyless.site.tables import HEIGHT_STD_M, Truth, read_anchors, read_height_readings, read_truth
@@ -29,6 +30,9 @@ TOO_FLAT = "the anchors' mean: they lie too flat to determine the height"
 """Where a height is from that nobody gave."""
 
 
+YAML_SUFFIXES: Final = frozenset({".yaml", ".yml"})
+
+
 def known_anchors(anchors: Anchors | None, site: Site | str | Path | None) -> tuple[dict[int, Point], float | None]:
     """Positions of the anchors, and the tags' height where a site states it. Raises SkylessError."""
     if anchors is not None and site is not None:
@@ -39,7 +43,8 @@ def known_anchors(anchors: Anchors | None, site: Site | str | Path | None) -> tu
     if anchors is None:
         return {}, None
     if not isinstance(anchors, Mapping):
-        return read_anchors(existing_file("--anchors", anchors)), None
+        path = existing_file("--anchors", anchors)
+        return (_read_yaml(path) if path.suffix in YAML_SUFFIXES else read_anchors(path)), None
     anchors_m: dict[int, Point] = {}
     for identifier, position_m in anchors.items():
         if not isinstance(identifier, int) or identifier < 0:
@@ -49,18 +54,31 @@ def known_anchors(anchors: Anchors | None, site: Site | str | Path | None) -> tu
     return anchors_m, None
 
 
+def _read_yaml(path: Path) -> dict[int, Point]:
+    """Positions of anchors as Bitcraze's programs keep them, x, y and z by identifier. Raises ConfigurationError."""
+    import yaml  # noqa: PLC0415 - of the extra research
+
+    try:
+        known = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return {int(anchor): (float(one["x"]), float(one["y"]), float(one["z"])) for anchor, one in known.items()}
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError) as error:
+        raise ConfigurationError(path, "the file", type(error).__name__, "identifiers with x, y and z each") from None
+
+
 def known_truth(path: Path, asked: RecordingOptions) -> Truth | None:
     """Where the antenna was, by an array, a table, or the recording itself. Raises SkylessError."""
     truth, arm_m = asked.truth, asked.lever_arm_m
-    if truth is None and format_of(path, asked.format).name == "miluv":
-        truth = path
-    if truth is None:
+    own, known = format_of(path, asked.format).read_truth, None
+    if truth is None and own is not None:
+        known = own(path, asked.listener)
+    if truth is None and known is None:
         asked.leave_out("lever_arm_m", "truth_offset_s", why="it moves the truth, which --truth must give")
         return None
     if isinstance(truth, str | Path):
         known = read_truth(existing_file("--truth", truth), asked.listener)
-    else:
+    elif truth is not None:
         known = _truth_of(truth)
+    assert known is not None
     if isinstance(asked.truth_offset_s, float | int):
         known = shifted(known, asked.truth_offset_s)
     return known if arm_m is None else antenna_truth(known, arm_m)
@@ -83,7 +101,13 @@ def known_heights(asked: ReplayOptions) -> deque[Height]:
     given = asked.heights
     if given is None:
         return deque()
-    if isinstance(given, str | Path):
+    if str(given) == RECORDED:
+        own = format_of(asked.file, asked.format).read_heights
+        found = None if own is None else own(asked.file, is_barometer=asked.height_kind == BAROMETER)
+        if found is None:
+            raise wrong("--heights", RECORDED, "a table: the recording holds none of this kind")
+        rows = found
+    elif isinstance(given, str | Path):
         rows = read_height_readings(existing_file("--heights", given))
     else:
         rows = np.array(given, dtype=np.float64)

@@ -45,7 +45,7 @@ MEASUREMENTS: Final = (PACKETS, DIFFERENCES_MADE)
 
 AUTO: Final = "auto"
 
-HEIGHT_SENSOR, BAROMETER = "sensor", "barometer"
+HEIGHT_SENSOR, BAROMETER, RECORDED = "sensor", "barometer", "recording"
 
 HEIGHT_WORDS: Final = ("truth", "free", "auto")
 """What a tag's height may be instead of metres: the truth's median, estimated, or what suits."""

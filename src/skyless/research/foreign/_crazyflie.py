@@ -1,0 +1,200 @@
+"""Logs of a Crazyflie's SD card: events that the file itself describes, with a CRC-32 at its end.
+
+    0xBC, version u16 (1 or 2), number of kinds of events u16
+    of each kind   number u16, name, number of fields u16, of each field "name(type)" with a type of Python's struct
+    of each event  number u16, time (version 1: u32, ms; version 2: u64, µs), its fields
+    CRC-32 u32 of everything before
+
+Texts end with a zero byte; all numbers are little-endian. As in ``tools/usdlog`` of Bitcraze's firmware.
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+from io import BufferedIOBase
+from os import PathLike
+from struct import Struct as Binary
+from typing import Final, NamedTuple
+from zlib import crc32
+
+import numpy as np
+
+from skyless.core.air.masterless_packets import PairTdoa
+from skyless.core.input_files import Drops, chunks, open_source
+from skyless.core.kernels.arrays import Array
+from skyless.site.tables import HEIGHT_STD_M, Truth
+
+_MAGIC: Final = b"\xbc"
+_HEADER: Final = Binary("<cHH")
+_TWO: Final = Binary("<H")
+_TIMES: Final = {1: (Binary("<HI"), 1e-3), 2: (Binary("<HQ"), 1e-6)}
+_TYPES: Final = frozenset("bBhHiIqQefd?")
+_CRC_BYTES: Final = 4
+_MOST_KINDS: Final = 256
+_MOST_FIELDS: Final = 64
+_LONGEST_NAME: Final = 1 << 10
+
+CANDIDATES, CHOSEN = "estTdoaCand", "estTDOA"
+"""Differences of all pairs, which newer firmware logs, and those that its filter was given."""
+
+_TRUTHS: Final = ("estPose", "estPosition", "lhPosition")
+"""Events with a position of motion capture or lighthouse, the better first."""
+
+_SENSOR, _BAROMETER = "estTOF", "estBarometer"
+_MILLIMETRES_FROM: Final = 20.0
+"""A ranger's reading from here on is in millimetres: it reaches four metres."""
+
+BAROMETER_STD_M: Final = 0.2
+
+
+class _Kind(NamedTuple):
+    name: str
+    fields: tuple[str, ...]
+    """Without what stands before a dot."""
+    binary: Binary
+
+
+class _Event(NamedTuple):
+    name: str
+    time_s: float
+    """Since the log's first event."""
+    values: dict[str, float]
+
+
+def recognise(head: bytes) -> bool:
+    """Whether the file begins with a description of events."""
+    if len(head) < _HEADER.size:
+        return False
+    magic, version, kinds = _HEADER.unpack_from(head)
+    name = head[_HEADER.size + 2 : _HEADER.size + 34].partition(b"\0")[0]
+    return magic == _MAGIC and version in _TIMES and 0 < kinds <= _MOST_KINDS and name.isalnum()
+
+
+def read(stream: BufferedIOBase, drops: Drops) -> Iterator[PairTdoa]:
+    """Yield the differences: of all candidates where the log has them, else those that the firmware used."""
+    log = _Log(stream, drops)
+    wanted = CANDIDATES if CANDIDATES in log.names else CHOSEN
+    for event in log.events():
+        if event.name == wanted:
+            values = event.values
+            if not values.keys() >= {"idA", "idB", "distanceDiff"}:
+                drops["unknown-fields"] += 1
+            elif not np.isfinite(values["distanceDiff"]):
+                drops["not-finite"] += 1
+            elif values["idA"] == values["idB"]:
+                drops["anchor-against-itself"] += 1
+            else:
+                yield PairTdoa(event.time_s, int(values["idA"]), int(values["idB"]), values["distanceDiff"])
+
+
+def read_truth(path: str | PathLike[str], _listener: str | None) -> Truth | None:
+    """Positions of motion capture or lighthouse in the log; None where it has none."""
+    found: dict[str, list[tuple[float, ...]]] = {name: [] for name in _TRUTHS}
+    names = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    with open_source(path) as stream:
+        for event in _Log(stream, Counter()).events():
+            if event.name in found and event.values.keys() >= {"x", "y", "z"}:
+                found[event.name].append(
+                    (event.time_s, *(event.values[name] for name in names if name in event.values))
+                )
+    for rows in found.values():
+        table = np.array(rows, dtype=np.float64)
+        if len(table):
+            table = table[np.isfinite(table).all(axis=1)]
+            table = table[np.argsort(table[:, 0], kind="stable")]
+            return Truth(table[:, 0], table[:, 1:4], table[:, 4:8] if table.shape[1] == 8 else None)
+    return None
+
+
+def read_heights(path: str | PathLike[str], *, is_barometer: bool) -> Array | None:
+    """Rows of time, height and standard deviation of the ranger or the barometer; None where the log has none."""
+    wanted = _BAROMETER if is_barometer else _SENSOR
+    with open_source(path) as stream:
+        events = [event for event in _Log(stream, Counter()).events() if event.name == wanted and event.values]
+    rows = [(event.time_s, next(iter(event.values.values()))) for event in events]
+    return heights_of(np.array(rows).reshape(-1, 2), is_barometer=is_barometer)
+
+
+def heights_of(rows: Array, *, is_barometer: bool) -> Array | None:
+    """Rows of time and reading as rows of time, height in metres and standard deviation; None of none."""
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    if len(rows) == 0:
+        return None
+    if not is_barometer and np.median(rows[:, 1]) > _MILLIMETRES_FROM:
+        rows = rows * (1.0, 1e-3)
+    return np.column_stack([rows, np.full(len(rows), BAROMETER_STD_M if is_barometer else HEIGHT_STD_M)])
+
+
+class _Log:
+    """A log as it is read: first what events there are, then the events."""
+
+    def __init__(self, stream: BufferedIOBase, drops: Drops) -> None:
+        self._drops = drops
+        self._chunks = chunks(stream, drops)
+        self._bytes = b""
+        self._crc = 0
+        self._kinds: dict[int, _Kind] = {}
+        self._time = self._read_kinds()
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of the kinds of events."""
+        return frozenset(kind.name for kind in self._kinds.values())
+
+    def _has(self, count: int) -> bool:
+        """Whether so many bytes are left before the checksum."""
+        while len(self._bytes) < count + _CRC_BYTES:
+            chunk = next(self._chunks, None)
+            if chunk is None:
+                return False
+            self._bytes += chunk
+        return True
+
+    def _take(self, count: int) -> bytes | None:
+        if not self._has(count):
+            return None
+        taken, self._bytes = self._bytes[:count], self._bytes[count:]
+        self._crc = crc32(taken, self._crc)
+        return taken
+
+    def _text(self) -> str:
+        while (end := self._bytes.find(b"\0")) < 0 and len(self._bytes) < _LONGEST_NAME and self._has(len(self._bytes)):
+            pass
+        return (self._take(end + 1) or b"\0")[:-1].decode("ascii", "replace")
+
+    def _number(self) -> int:
+        taken = self._take(_TWO.size)
+        return 0 if taken is None else int(_TWO.unpack(taken)[0])
+
+    def _read_kinds(self) -> tuple[Binary, float]:
+        header = self._take(_HEADER.size)
+        _, version, kinds = (_MAGIC, 1, 0) if header is None else _HEADER.unpack(header)
+        for _ in range(min(kinds, _MOST_KINDS)):
+            number, name = self._number(), self._text()
+            fields = [self._text() for _ in range(min(self._number(), _MOST_FIELDS))]
+            types = "".join(field[-2:-1] for field in fields)
+            if not set(types) <= _TYPES or len(types) < len(fields):
+                self._drops["unknown-type"] += 1
+                self._kinds.clear()
+                break
+            names = tuple(field[:-3].rpartition(".")[2] for field in fields)
+            self._kinds[number] = _Kind(name, names, Binary("<" + types))
+        return _TIMES.get(version, _TIMES[2])
+
+    def events(self) -> Iterator[_Event]:
+        """All events up to where the log breaks off, or is no log any more."""
+        binary, unit_s = self._time
+        begin: int | None = None
+        while (head := self._take(binary.size)) is not None:
+            number, time = binary.unpack(head)
+            kind = self._kinds.get(number)
+            if kind is None:
+                self._drops["unknown-event"] += 1
+                return
+            body = self._take(kind.binary.size)
+            if body is None:
+                break
+            begin = time if begin is None else begin
+            values = dict(zip(kind.fields, map(float, kind.binary.unpack(body)), strict=True))
+            yield _Event(kind.name, (time - begin) * unit_s, values)
+        if int.from_bytes(self._bytes, "little") != self._crc or len(self._bytes) != _CRC_BYTES:
+            self._drops["wrong-checksum"] += 1
