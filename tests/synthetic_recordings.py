@@ -10,6 +10,7 @@ from itertools import product
 from math import cos, dist, sin
 from random import Random
 from struct import pack
+from zlib import crc32
 
 from recordings.capture_makers import binary_record, tdoa3, text_line, yaml_document
 
@@ -222,7 +223,7 @@ MAKERS = {
     "uci-text": uci_text,
     "dl-tdoa-json": phone_records,
 }
-LISTENER = {"avalue": ["--listener", "99"]}
+LISTENER = {"avalue": ["--listener", "0x99"]}
 
 
 def write(path, name, count, **options):
@@ -230,3 +231,39 @@ def write(path, name, count, **options):
     with path.open("wb") as file:
         file.writelines(MAKERS[name](count, **options))
     return path
+
+
+CRAZYFLIE_KINDS = {
+    5: ("estTDOA", ("idA(B)", "idB(B)", "distanceDiff(f)")),
+    6: ("estTdoaCand", ("idA(B)", "idB(B)", "distanceDiff(f)")),
+    7: ("estPose", tuple(f"locSrv.{name}(f)" for name in ("x", "y", "z", "qx", "qy", "qz", "qw"))),
+    9: ("estTOF", ("range.zrange(H)",)),
+    10: ("estBarometer", ("baro.asl(f)",)),
+}
+
+
+def crazyflie_log(events, version=2, kinds=CRAZYFLIE_KINDS):
+    """A log of a Crazyflie's SD card, of events (number, seconds, values)."""
+    data = b"\xbc" + pack("<HH", version, len(kinds))
+    for number, (name, fields) in kinds.items():
+        data += pack("<H", number) + name.encode() + b"\0" + pack("<H", len(fields))
+        data += b"".join(field.encode() + b"\0" for field in fields)
+    for number, time_s, values in events:
+        types = "".join(field[-2] for field in kinds[number][1])
+        head = pack("<HI", number, round(1e3 * time_s)) if version == 1 else pack("<HQ", number, round(1e6 * time_s))
+        data += head + pack("<" + types, *values)
+    return data + pack("<I", crc32(data))
+
+
+def pcapng(*packets, order="<"):
+    """A capture of UCI packets, in either order of bytes."""
+
+    def block(kind, body):
+        body += b"\0" * (-len(body) % 4)
+        return pack(order + "II", kind, len(body) + 12) + body + pack(order + "I", len(body) + 12)
+
+    capture = block(0x0A0D0D0A, pack(order + "IHHq", 0x1A2B3C4D, 1, 0, -1))
+    capture += block(1, pack(order + "HHI", 299, 0, 0))
+    for packet in packets:
+        capture += block(6, pack(order + "IIIII", 0, 0, 0, len(packet), len(packet)) + packet)
+    return capture

@@ -16,6 +16,7 @@ WORDS = 2
 """First words of the help that all commands share; what differs follows."""
 
 OF_SEVERAL_TYPES = {
+    "--heights": "heights; of a tag's sensor, which are many, a table of them",
     "--site": "a site file; where a site is emulated or shown also lab",
     "--to": "a folder; where a site runs, targets",
 }
@@ -99,6 +100,6 @@ def test_a_number_that_is_none_is_refused_by_every_option(options, capsys):
             assert (err.count("\n"), name in err, "Traceback" in err) == (1, True, False), err
 
 
-_POSITIONAL = dict.fromkeys(("plan", "replay", "site new", "site check", "board"), (__file__,))
+_POSITIONAL = dict.fromkeys(("benchmark", "plan", "replay", "site new", "site check", "board"), (__file__,))
 _POSITIONAL |= dict.fromkeys(("site keys new", "site keys rotate", "site keys revoke"), ("x",))
 _POSITIONAL["study"] = ("loss",)

@@ -1,9 +1,7 @@
 """Logs of a Crazyflie's SD card, UTIL's tables and captures of UCI, made here by their descriptions."""
 
-import struct
 from collections import Counter
 from io import BytesIO
-from zlib import crc32
 
 import numpy as np
 import pytest
@@ -17,30 +15,6 @@ from skyless.research.foreign.formats import format_of, open_recording
 from skyless.research.replays.inputs import known_anchors
 
 ROWS = 3000
-KINDS = {
-    5: ("estTDOA", ("idA(B)", "idB(B)", "distanceDiff(f)")),
-    6: ("estTdoaCand", ("idA(B)", "idB(B)", "distanceDiff(f)")),
-    7: ("estPose", tuple(f"locSrv.{name}(f)" for name in ("x", "y", "z", "qx", "qy", "qz", "qw"))),
-    9: ("estTOF", ("range.zrange(H)",)),
-    10: ("estBarometer", ("baro.asl(f)",)),
-}
-
-
-def log(events, version=2, kinds=KINDS):
-    """A log of (number, seconds, values)."""
-    data = b"\xbc" + struct.pack("<HH", version, len(kinds))
-    for number, (name, fields) in kinds.items():
-        data += struct.pack("<H", number) + name.encode() + b"\0" + struct.pack("<H", len(fields))
-        data += b"".join(field.encode() + b"\0" for field in fields)
-    for number, time_s, values in events:
-        types = "".join(field[-2] for field in kinds[number][1])
-        head = (
-            struct.pack("<HI", number, round(1e3 * time_s))
-            if version == 1
-            else struct.pack("<HQ", number, round(1e6 * time_s))
-        )
-        data += head + struct.pack("<" + types, *values)
-    return data + struct.pack("<I", crc32(data))
 
 
 def differences():
@@ -59,8 +33,8 @@ def flight(version=2, candidates=False, chosen=True):
             (9, 1.0 + t, (round(1000 * z),)),
             (10, 1.0 + t, (z + 500.0,)),
         ]
-    used = {number: kind for number, kind in KINDS.items() if number in (*kinds, 7, 9, 10)}
-    return log(sorted(events, key=lambda event: event[1]), version, used)
+    used = {number: kind for number, kind in synthetic.CRAZYFLIE_KINDS.items() if number in (*kinds, 7, 9, 10)}
+    return synthetic.crazyflie_log(sorted(events, key=lambda event: event[1]), version, used)
 
 
 @pytest.fixture
@@ -91,13 +65,13 @@ def test_a_log_gives_differences_truth_and_heights(write, version, candidates):
 def test_candidates_are_used_where_both_are_logged(write):
     events = [(6, t, (a, b, d)) for t, a, b, d in differences()]
     events += [(5, t, (a, b, d)) for t, a, b, d in differences()[::3]]
-    assert replayed(write(log(sorted(events, key=lambda event: event[1])))).receptions == ROWS
+    assert replayed(write(synthetic.crazyflie_log(sorted(events, key=lambda event: event[1])))).receptions == ROWS
 
 
 @given(cut=st.floats(0.0, 1.0), flipped=st.integers(0, 10_000), junk=st.binary(max_size=200))
 def test_damaged_logs_are_counted(tmp_path_factory, cut, flipped, junk):
     """Whatever is broken off, wrong or added: what comes is a difference, and something is counted."""
-    whole = log([(5, k / 100.0, (k % 8, (k + 1) % 8, 0.5)) for k in range(100)])
+    whole = synthetic.crazyflie_log([(5, k / 100.0, (k % 8, (k + 1) % 8, 0.5)) for k in range(100)])
     damaged = bytearray(whole[: max(40, int(cut * len(whole)))] + junk)
     damaged[40 + flipped % (len(damaged) - 39) - 1] ^= 0x40
     path = tmp_path_factory.mktemp("log") / "log"
@@ -133,15 +107,8 @@ def test_a_recording_without_heights_says_so(write):
 
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_uci_comes_out_of_a_capture_as_it_went_in(order):
-    def block(kind, body):
-        body += b"\0" * (-len(body) % 4)
-        return struct.pack(order + "II", kind, len(body) + 12) + body + struct.pack(order + "I", len(body) + 12)
-
     packets = [bytes(range(k, k + 7)) for k in range(5)]
-    capture = block(0x0A0D0D0A, struct.pack(order + "IHHq", 0x1A2B3C4D, 1, 0, -1))
-    capture += block(1, struct.pack(order + "HHI", fira.LINK_TYPE, 0, 0))
-    for packet in packets:
-        capture += block(6, struct.pack(order + "IIIII", 0, 0, 0, len(packet), len(packet)) + packet)
+    capture = synthetic.pcapng(*packets, order=order)
     assert fira.recognise_pcapng(capture)
     drops = Counter()
     bodies = [body for kind, body, _ in fira._blocks(iter((capture[:50], capture[50:])), drops) if kind == 6]

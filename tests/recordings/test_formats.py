@@ -5,13 +5,16 @@ from capture_makers import binary_record, tdoa3, text_line, yaml_document
 
 from skyless.core.errors import ConfigurationError
 from skyless.research.foreign.formats import FORMATS, open_recording
-from synthetic_recordings import phone_records, uci_binary, uci_text
+from synthetic_recordings import CRAZYFLIE_KINDS, crazyflie_log, pcapng, phone_records, uci_binary, uci_text
 
 PACKET = (2, 12345, tdoa3(5, 6, [(1, 2, 3, 33000)]))
 SAMPLES = {
     "bitcraze-yaml": yaml_document(*PACKET),
     "bitcraze-text": text_line(*PACKET),
     "bitcraze-binary": b"boot\xbc\x00" + binary_record(*PACKET),
+    "uci-pcapng": pcapng(b"".join(uci_binary(1))),
+    "util-table": b"t_tdoa,idA,idB,tdoa_meas,t_pose\n1,2,3,4,\n,,,,5\n",
+    "crazyflie-log": crazyflie_log([(5, 0.0, (1, 2, 0.5))], kinds={5: CRAZYFLIE_KINDS[5]}),
     "tdoa-table": b"t_s,idA,idB,tdoa_m\n1,2,3,4\n",
     "avalue": b"t_host,order,slave,master,status,tx_ticks_u40,rx_ticks_u40\n1,1,A,B,0,5,6\n",
     "uci-binary": b"".join(uci_binary(1)),

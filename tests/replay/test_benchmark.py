@@ -93,7 +93,7 @@ def test_figures_are_those_of_the_fixes(folder, tmp_path, capsys):
 
 
 def test_what_exists_is_not_computed_again(folder, tmp_path, monkeypatch):
-    asked = ["benchmark", str(folder), ARM, "--out", str(tmp_path), "--only", "trial2", "--first", "6"]
+    asked = ["benchmark", str(folder), ARM, "--out", str(tmp_path), "--only", "trial2", "--only-first", "6"]
     assert main(asked) == 0
     before = (tmp_path / "results.json").read_bytes()
     (gone, *kept) = sorted((tmp_path / "results").glob("*.json"))

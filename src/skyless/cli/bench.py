@@ -36,7 +36,7 @@ def bench(
     anchor_count
         How many anchors each draw has.
     quick
-        Simulate a fraction: a few seconds only, with fewer and shorter runs and at most a tenth of a million draws.
+        Compute a fraction: a few seconds only, with fewer and shorter runs and at most a tenth of a million draws.
     json
         Write one JSON object instead of a table.
     """

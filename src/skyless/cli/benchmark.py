@@ -3,7 +3,7 @@
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 from cyclopts import App
 
@@ -11,9 +11,14 @@ from skyless.cli.common.options import command
 from skyless.cli.common.output import console, print_json
 from skyless.cli.common.progress import loading_kernels, progress_bar
 from skyless.core.air.page_codec import MAX_COORDINATE_M
-from skyless.core.arguments import Option, Options, Positive, Text, numbers, point
+from skyless.core.arguments import Option, Options, Positive, Rule, Text, numbers, point
 from skyless.core.errors import SkylessError
 from skyless.research.replays.options import check_estimator, read_estimator
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from skyless.research.masterless.own_estimator import OwnEstimator
 
 _QUICK_S: Final = 12.0
 
@@ -24,7 +29,7 @@ class BenchmarkOptions(Options, frozen=True, kw_only=True):
     """Options of ``skyless benchmark``."""
 
     out: Path = Path("benchmark")
-    """Write index.html, results.csv and results.json into this folder; results that are there already are kept."""
+    """Write the result here, into a folder: index.html, results.csv and results.json. What is there already is kept."""
     only: str = ""
     """Only recordings whose name holds this text."""
     lever_arm_m: Annotated[
@@ -35,21 +40,23 @@ class BenchmarkOptions(Options, frozen=True, kw_only=True):
     ] = None
     """The antenna in the body's frame, in metres, added to the truth of tables."""
     calibrate_on: Annotated[tuple[str, ...], Option("calibrate-on"), Text(lambda _, text: text, "NAME", many=True)] = ()
-    """Calibrate anchors on the recordings whose names hold this text; others with the same anchors are replayed with
-    that as well."""
-    estimator: Annotated[tuple[str, ...], Text(lambda _, text: text, "FILE.py:CLASS", many=True)] = ()
+    """Calibrate anchors on recordings whose names hold this text, for each table of anchors on the first; others with
+    the same table are replayed with that as well."""
+    estimator: Annotated[
+        "Callable[[], OwnEstimator] | None", Text(read_estimator, "FILE.py:CLASS"), Rule(check_estimator)
+    ] = None
     """Your own estimator as one more method: a class with hear(observation)."""
-    first_s: Annotated[Positive | None, Option("first")] = None
-    """Only so many seconds of each recording."""
+    first_s: Annotated[Positive | None, Option("only-first")] = None
+    """Replay only so many seconds of each recording."""
     quick: bool = False
-    """The first twelve seconds of each recording, without smoothing: about a minute for thirty recordings."""
+    """Compute a fraction: the first twelve seconds of each recording, without smoothing; about a minute for thirty."""
     json: bool = False
     """Write one JSON object instead of the table."""
 
 
 @app.default
 @command
-def benchmark(folder: Path, *, asked: BenchmarkOptions) -> int:
+def benchmark(folder: Path, /, *, asked: BenchmarkOptions) -> int:
     """Compare methods on every recording below a folder.
 
     Finds what skyless replay can read, and beside NAME_tdoa.csv its truth, NAME_pose.csv, and above it the anchors,
@@ -64,10 +71,6 @@ def benchmark(folder: Path, *, asked: BenchmarkOptions) -> int:
     from skyless.research.benchmark.run import Asked, results_of
     from skyless.research.compile_ahead import compile_pair_kernels
 
-    estimators = {
-        text.rpartition(":")[2]: check_estimator("--estimator", read_estimator("--estimator", text))
-        for text in asked.estimator
-    }
     found = [one for one in recordings_below(folder) if asked.only in one.name]
     if not found:
         raise SkylessError(f"FOLDER is {str(folder)!r}; it should hold recordings that skyless replay can read")
@@ -79,7 +82,9 @@ def benchmark(folder: Path, *, asked: BenchmarkOptions) -> int:
     with loading_kernels(PAIRS):
         compile_pair_kernels()
     first_s = _QUICK_S if asked.quick and asked.first_s is None else asked.first_s
-    programs = tuple(Path(text.rpartition(":")[0]) for text in asked.estimator)
+    own = asked.estimator
+    estimators = {} if own is None else {getattr(own, "__name__", "own"): own}
+    programs = () if own is None else (Path(getattr(own, "hear", own).__code__.co_filename),)
     how = Asked(asked.lever_arm_m, first_s, asked.calibrate_on, estimators, programs, not asked.quick)
     try:
         with progress_bar("replaying", 1.0) as bar:

@@ -39,7 +39,7 @@ def paper(
     seed
         Same seed, same numbers, except for times that are measured.
     quick
-        Simulate a fraction: ready in well under a minute, with more scatter.
+        Compute a fraction: ready in well under a minute, with more scatter.
     json
         Write one JSON object instead of the table.
     """

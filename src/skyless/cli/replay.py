@@ -174,7 +174,11 @@ def _likely_reason(report: "ReplayReport", asked: ReplayOptions) -> str:
     if report.receptions == 0:
         found = "the recording holds no reception that can be used"
     elif asked.anchors is None and asked.site is None and report.reason == "no-almanac":
+        from skyless.research.foreign.formats import format_of
+        from skyless.research.replays.captures import how_to_find_anchors
+
         found = "no message of the recording says where its anchors are"
+        found += how_to_find_anchors(asked.file, format_of(asked.file, asked.format))
     else:
         found = _REASONS.get(report.reason or "", report.reason or "unknown")
     drops = sorted(report.drops.items(), key=lambda item: -item[1])[:_MAX_DROPS]

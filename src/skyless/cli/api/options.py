@@ -226,7 +226,7 @@ class StudyOptions(_Studied, frozen=True, kw_only=True):
     without_mesh: bool = False
     """Anchors relay only when they heard the master."""
     quick: bool = False
-    """Simulate a fraction, with more scatter."""
+    """Compute a fraction, with more scatter."""
     processes: Annotated[int | None, whole(1, 1024)] = None
     """Processes on this machine; by default one for each core. 1 is this process."""
     scheduler: str | None = None

@@ -62,7 +62,7 @@ def recognise_blinks(head: bytes) -> bool:
 
 def read(stream: BufferedIOBase, drops: Drops, listener: str | None = None) -> Iterator[Packet]:
     """Yield the packets that one anchor heard; by default the receiver of the first row."""
-    tag = None if listener is None else int(listener, 16)
+    tag = None if listener is None else int(listener)
     relays: dict[int, list[Relay]] = {}
     for sent in _transmissions(cross_receptions(stream, drops), drops):
         first = sent.first

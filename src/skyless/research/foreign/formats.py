@@ -1,6 +1,7 @@
 """The table of formats, and how a recording of any of them is opened."""
 
 import os
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -40,8 +41,6 @@ class Format:
     """Width of the anchors' stamps in its packets; None for a format of ready TDoAs."""
     any_listener: bool = False
     """One recording holds several listeners, one of which is chosen."""
-    hexadecimal: bool = False
-    """Identifiers are hexadecimal."""
     is_dl_tdoa: bool = False
     """FiRa's: packets may state where their senders are, and relay only initiators and those that answered them."""
     read_truth: Callable[[str | PathLike[str], str | None], Truth | None] | None = None
@@ -87,7 +86,6 @@ FORMATS: Final = (
         avalue.read,
         TICK_BITS,
         any_listener=True,
-        hexadecimal=True,
     ),
     _dl_tdoa(
         "dl-tdoa-json",
@@ -234,11 +232,11 @@ def _listening(
     if not chosen.any_listener:
         raise ConfigurationError(path, "listener", listener, f"left out: format {chosen.name} has one listener only")
     try:
-        int(listener, 16 if chosen.hexadecimal else 10)
+        identifier = int(listener, 16 if re.search("[xa-f]", listener.lower()) else 10)
     except ValueError as error:
-        kind = "hexadecimal" if chosen.hexadecimal else "decimal"
-        raise ConfigurationError(path, "listener", listener, f"a {kind} identifier") from error
-    return partial(chosen.read, listener=listener)
+        right = "an identifier, decimal, or hexadecimal with 0x or letters"
+        raise ConfigurationError(path, "listener", listener, right) from error
+    return partial(chosen.read, listener=str(identifier))
 
 
 def _readable() -> str:

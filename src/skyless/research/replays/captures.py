@@ -293,8 +293,14 @@ def _check_carries_anchors(asked: ReplayOptions) -> None:
     if read and not distances_of(asked.file, name):  # those are worth a replay by themselves
         raise SkylessError(
             f"--anchors is missing: {asked.file} ({name}) does not say where its anchors are; give their table, "
-            "id,x_m,y_m,z_m, or --site"
+            f"id,x_m,y_m,z_m, or --site{how_to_find_anchors(asked.file, recording.format)}"
         )
+
+
+def how_to_find_anchors(file: str | Path, kind: Format) -> str:
+    """The command that finds the anchors of a recording in which they range each other; empty for others."""
+    ranges = kind.tx_bits is not None and not kind.is_dl_tdoa
+    return f"; skyless survey --recording {file} --out anchors.csv finds them" if ranges else ""
 
 
 def _stated_anchors(asked: ReplayOptions, kind: Format) -> dict[int, Point]:
@@ -310,4 +316,4 @@ def distances_of(file: str | Path, name: str) -> dict[str, float]:
     """Distances of the anchors, where the recording itself measures them."""
     if name != "avalue":
         return {}
-    return {f"{a:X}-{b:X}": metres for (a, b), metres in sorted(anchor_distances_m(file, Counter()).items())}
+    return {f"{a}-{b}": metres for (a, b), metres in sorted(anchor_distances_m(file, Counter()).items())}

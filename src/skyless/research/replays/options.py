@@ -147,8 +147,8 @@ class ReplayOptions(_Recording, frozen=True, kw_only=True):
     ] = None
     """Lowest and highest height of the tag in metres, where its height is estimated."""
     heights: Annotated["ArrayLike | str | Path | None", Path] = None
-    """Table of readings of the tag's height sensor: t_s,height_m, with std_m where that is not 0.05; in Python also an
-    array of two or three columns; recording for those that the recording itself holds."""
+    """Heights at times, as a sensor of the tag read them: a table t_s,height_m, with std_m where that is not 0.05; in
+    Python also an array of two or three columns; recording for those that the recording itself holds."""
     height_kind: Annotated[str, choice(HEIGHT_SENSOR, BAROMETER)] = HEIGHT_SENSOR
     """What gave the heights: a sensor of the height itself, or a barometer, whose zero is unknown and moves slowly."""
     smooth: bool = False
@@ -159,7 +159,7 @@ class ReplayOptions(_Recording, frozen=True, kw_only=True):
     ] = None
     """Your own estimator instead of the filter: a class with hear(observation), which gets one time difference after
     the other."""
-    first_s: Annotated[Positive | None, Option("first")] = None
+    first_s: Annotated[Positive | None, Option("only-first")] = None
     """Replay only so many seconds from the first record on."""
     settle_s: Annotated[NotNegative | None, Option("settle")] = None
     """Seconds from the start that are not judged; by default 3 with a truth table, 2 without."""
