@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from evo.core import geometry, metrics
 from evo.core.trajectory import PosePath3D
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -72,6 +72,7 @@ def test_truth_is_interpolated_but_not_across_gaps_nor_beyond_its_ends(times_s):
 
 
 @given(offset_s=st.floats(-2.0, 2.0))
+@settings(max_examples=15)
 def test_the_offset_of_a_truth_is_found(offset_s):
     times_s = np.arange(0.0, 30.0, 0.02)
     truth = Truth(times_s, np.column_stack([np.sin(times_s), np.cos(0.7 * times_s), 0.0 * times_s]), None)

@@ -48,7 +48,7 @@ def folder(tmp_path_factory):
 
 def test_recordings_are_found_with_what_belongs_to_them(folder):
     found = list(recordings_below(folder))
-    assert [one.name for one in found] == ["flights/const1/trial1", "flights/const1/trial2"]
+    assert [one.name for one in found] == ["flights/const1/trial1_tdoa", "flights/const1/trial2_tdoa"]
     for one in found:
         assert (one.format, one.anchors.name) == ("tdoa-table", "anchors_const1.csv")
         assert one.truth.name == one.path.name.replace("_tdoa", "_pose")
@@ -78,7 +78,7 @@ def test_figures_are_those_of_the_fixes(folder, tmp_path, capsys):
     begin_s = np.genfromtxt(f"{flight}_tdoa.csv.gz", delimiter=",", skip_header=1, max_rows=1)[0]
     here = (times_s - begin_s >= SETTLE_S) & (times_s <= truth[-1, 0])
     errors_m = (position_m - true_m)[here]
-    figures = list(rows["flights/const1/trial1", "joint"].items())[3:]
+    figures = list(rows["flights/const1/trial1_tdoa", "joint"].items())[3:]
     joint = {name: float(value) for name, value in figures if value}
     for of in (2, 3):
         lengths_m = np.sqrt((errors_m[:, :of] ** 2).sum(axis=1))
@@ -103,6 +103,9 @@ def test_what_exists_is_not_computed_again(folder, tmp_path, monkeypatch):
     assert gone.exists()
     assert [one.stat().st_mtime_ns for one in kept] == states
     assert (tmp_path / "results.json").read_bytes() == before
+    kept[0].write_bytes(b"damaged")
+    assert main(asked) == 0
+    assert (tmp_path / "results.json").read_bytes() == before
     monkeypatch.setattr(run, "_results", lambda *_: pytest.fail("computed again"))
     assert main(asked) == 0
 
@@ -110,6 +113,14 @@ def test_what_exists_is_not_computed_again(folder, tmp_path, monkeypatch):
 def test_a_folder_without_recordings_is_named(tmp_path, capsys):
     assert main(["benchmark", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert "it should hold recordings that skyless replay can read" in capsys.readouterr().err
+
+
+def test_results_that_cannot_be_written_are_one_line(folder, tmp_path, capsys):
+    (tmp_path / "results").mkdir()
+    (tmp_path / "index.html").mkdir()
+    assert main(["benchmark", str(folder), "--out", str(tmp_path), "--only", "trial2", "--only-first", "4"]) == 2
+    err = capsys.readouterr().err
+    assert (err.count("\n"), "cannot be written" in err) == (1, True)
 
 
 @pytest.mark.parametrize("is_planar", [False, True])

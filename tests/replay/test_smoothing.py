@@ -138,6 +138,20 @@ def test_a_height_sensor_corrects_the_height(table):
     assert barometer.rmse_axes_m[2] < alone.rmse_axes_m[2]
 
 
+def test_heights_serve_packets_as_well(tmp_path):
+    """Of a recording whose time is that of its first packet."""
+    (tmp_path / "anchors.csv").write_text(synthetic.anchors_csv())
+    path = synthetic.write(tmp_path / "packets", "bitcraze-binary", 3000)
+    times_s = np.arange(0.0, 3000 * synthetic.PERIOD_S, 0.05)
+    for asked in ({}, {"measurements": "differences"}):
+        alone, given = (
+            skyless.replay(path, anchors=tmp_path / "anchors.csv", tag_height_m="free", **asked, **more)
+            for more in ({}, {"heights": heights_of(times_s, 0.01)})
+        )
+        spread_m = [result.fixes.position_m[len(result.fixes) // 2 :, 2].std() for result in (alone, given)]
+        assert spread_m[1] < 0.7 * spread_m[0]
+
+
 def test_smoothing_serves_the_command_as_well(table):
     alone, later = replayed(table), replayed(table, smooth=True)
     assert (later.fixes, later.method, later.hpl_m) == (alone.fixes, "joint-smoothed", None)
@@ -150,6 +164,21 @@ def test_a_truth_that_is_late_is_moved(table):
     assert moved.truth_offset_s == pytest.approx(-0.7, abs=0.1)
 
 
+class Failing:
+    def hear(self, one):
+        return one.tdoa_m / 0
+
+
+class Misleading:
+    def hear(self, one):
+        return [one.tdoa_m]
+
+
+class Nowhere:
+    def hear(self, one):
+        return skyless.Fix.of(one.time_s, [np.nan] * 3)
+
+
 @pytest.mark.parametrize(
     ("asked", "named"),
     [
@@ -158,6 +187,13 @@ def test_a_truth_that_is_late_is_moved(table):
         ({"z_bounds_m": (2.0, 1.0)}, "z_bounds_m is .*; it should be the lowest and then the highest"),
         ({"truth_offset_s": "soon"}, "truth_offset_s is 'soon'; it should be a number"),
         ({"smooth": True, "measurements": "packets"}, "measurements is 'packets'; smooth needs differences"),
+        (
+            {"tag_height_m": 1.2, "heights": np.ones((3, 2)), "height_kind": "barometer"},
+            "height_kind is 'barometer'; it",
+        ),
+        ({"estimator": Failing}, r"Failing.hear has failed: ZeroDivisionError: .* \(.*test_smoothing.py, line \d+\)"),
+        ({"estimator": Misleading}, "Misleading.hear has returned list; it should be None or a fix"),
+        ({"estimator": Nowhere}, r"Nowhere.hear has failed: ValueError: time_s is .*; both should be finite"),
         ({"estimator": 3}, "estimator is 3; it should be a class with a method hear"),
     ],
     ids=str,

@@ -47,7 +47,7 @@ class BenchmarkOptions(Options, frozen=True, kw_only=True):
     ] = None
     """Your own estimator as one more method: a class with hear(observation)."""
     first_s: Annotated[Positive | None, Option("only-first")] = None
-    """Replay only so many seconds of each recording."""
+    """Replay only this number of seconds of each recording."""
     quick: bool = False
     """Compute a fraction: the first twelve seconds of each recording, without smoothing; about a minute for thirty."""
     json: bool = False
@@ -84,16 +84,19 @@ def benchmark(folder: Path, /, *, asked: BenchmarkOptions) -> int:
     first_s = _QUICK_S if asked.quick and asked.first_s is None else asked.first_s
     own = asked.estimator
     estimators = {} if own is None else {getattr(own, "__name__", "own"): own}
-    programs = () if own is None else (Path(getattr(own, "hear", own).__code__.co_filename),)
+    code = getattr(getattr(own, "hear", own), "__code__", None)
+    programs = () if code is None else (Path(code.co_filename),)
     how = Asked(asked.lever_arm_m, first_s, asked.calibrate_on, estimators, programs, not asked.quick)
     try:
         with progress_bar("replaying", 1.0) as bar:
             results = list(results_of(found, how, kept, bar.reach))
+        title = f"{len(found)} recordings" + ("" if first_s is None else f", the first {first_s:g} s of each")
+        write(asked.out, results, title, shlex.join(["skyless", *sys.argv[1:]]))
     except KeyboardInterrupt:
         print("stopped; the same command continues where it was", file=sys.stderr)
         raise
-    title = f"{len(found)} recordings" + ("" if first_s is None else f", the first {first_s:g} s of each")
-    write(asked.out, results, title, shlex.join(["skyless", *sys.argv[1:]]))
+    except OSError as error:
+        raise SkylessError(f"{asked.out} cannot be written: {error.strerror}") from None
     summary = list(summary_rows(results))
     if asked.json:
         rows = [dict(zip(SUMMARY_HEADS, row, strict=True)) for row in summary]

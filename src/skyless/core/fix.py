@@ -84,9 +84,15 @@ class Fix(Struct, frozen=True, gc=False):
         anchors: tuple[int, ...] = (),
         method: str = "own",
     ) -> "Fix":
-        """A fix of one's own estimator: shapes (3,) and (3, 3); without a covariance it claims nothing."""
+        """A fix of one's own estimator: shapes (3,) and (3, 3); without a covariance it claims nothing.
+
+        Raises:
+            ValueError: the shapes are others, or the time or the position is not finite.
+        """
         rows = np.full((VELOCITY, 3), np.nan)
         rows[POSITION] = position_m
+        if not (np.isfinite(time_s) and np.isfinite(rows[POSITION]).all()):
+            raise ValueError(f"time_s is {time_s} and position_m {rows[POSITION].tolist()}; both should be finite")
         if covariance_m2 is not None:
             rows[POSITION + 1 : QUALITY] = covariance_m2
         return cls(time_s, rows.tobytes(), anchors, np.empty((0, 3)), method, height_known=False)

@@ -31,7 +31,7 @@ from skyless.core.arguments import (
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import DEFAULT_METHOD, Dynamics
 from skyless.research.replays.options import check_estimator, read_estimator
-from skyless.sim.evaluation.request import Conditions, IntegrityRisk
+from skyless.sim.evaluation.request import Conditions, IntegrityRisk, ProtectionOptions
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -69,6 +69,9 @@ class SimulateOptions(Conditions, frozen=True, kw_only=True):
     def check(self) -> None:
         """See that the options fit one another. Raises SkylessError."""
         Conditions.check(self)
+        if self.estimator is not None:
+            names = "method", "qa", "dynamics", "silences", *ProtectionOptions.__struct_fields__
+            self.leave_out(*(name for name in names if name != "progress"), why="the estimator is your own")
         if self.site is not None and self.scenario is not None:
             raise SkylessError("give either --scenario or --site, not both")
         if self.positions_m and not self.paths_m and (self.tags is not None or self.speed_mps is not None):

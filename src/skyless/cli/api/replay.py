@@ -184,9 +184,8 @@ def replay_recording(asked: ReplayOptions, begin: Begin) -> ReplayResult:
 def _replay_capture(asked: ReplayOptions, begin: Begin) -> ReplayResult:
     run, path = CaptureReplay(asked), Path(asked.file)
     write = begin(("tag",), run.measurements)
-    size = max(path.stat().st_size, 1)
     on_fix = None if write is None else lambda fix: write("tag", fix.time_s, fix)
-    report = run.run(on_fix, lambda read: asked.progress(min(read / size, 1.0)))
+    report = run.run(on_fix, asked.progress)
     asked.progress(1.0)
     summary = {**msgspec.to_builtins(report), "height_note": run.height_note}
     summary["anchor_distances_m"] = distances_of(path, report.format)
@@ -201,7 +200,7 @@ def _replay_site(asked: ReplayOptions, begin: Begin) -> ReplayResult:
         *("measurements", "uncalibrated", "tag_height_m", "z_bounds_m", "heights", "first_s"),
         why=why,
     )
-    asked.leave_out("smooth", why="it is for time differences, and these are receptions, whose clocks are estimated")
+    asked.leave_out("smooth", "estimator", why="it is for time differences, and these are receptions of beacons")
     wanted = None if asked.site is None else site_of(asked.site)[0]
     tags, settle_s = None if asked.tag is None else (asked.tag,), 2.0 if asked.settle_s is None else asked.settle_s
     with McapRecording(path) as recording:

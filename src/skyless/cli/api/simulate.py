@@ -139,7 +139,9 @@ class Simulation:
         started_s = time.perf_counter()
         run_fleet(self.fleet, self.request, self._asked.until_s, on_fix, self.request.progress)
         self.request.progress(1.0)
-        return report(self.fleet, self.request.method, started_s)
+        own = self._asked.estimator
+        method = self.request.method if own is None else getattr(own, "__name__", "own")
+        return report(self.fleet, method, started_s)
 
     @property
     def tags(self) -> tuple[str, ...]:

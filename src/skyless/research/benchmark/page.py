@@ -4,14 +4,17 @@ import csv
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
+from io import StringIO
 from pathlib import Path
 from typing import Final
 
 import msgspec
 import numpy as np
 from matplotlib.figure import Figure
+from msgspec import structs
 
 from skyless.core.kernels.arrays import Matrix
+from skyless.core.whole_files import replace_files
 from skyless.research.benchmark.run import JOINT, PLAIN, Result
 from skyless.sim.evaluation.figures import Figures
 from skyless.site.report.figures import panel, picture, report_style
@@ -32,22 +35,19 @@ _DIVERGED_M: Final = 1.0
 
 
 def write(folder: Path, results: Sequence[Result], title: str, command: str) -> None:
-    """Write ``index.html``, ``results.csv`` and ``results.json`` into the folder."""
-    told = [{name: value for name, value in msgspec.to_builtins(one).items() if name != "drawn"} for one in results]
-    (folder / "results.json").write_bytes(msgspec.json.format(msgspec.json.encode(told), indent=1))
-    with (folder / "results.csv").open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file)
-        rows.writerow(
-            [
-                "recording",
-                "method",
-                "reason",
-                *_NUMBERS,
-                *(f"{name[:-1]}{axis}_m" for name in _TRIPLES for axis in "xyz"),
-            ]
-        )
-        rows.writerows(_csv_row(one) for one in results)
-    (folder / "index.html").write_text(_page(results, title, command), encoding="utf-8")
+    """Write ``index.html``, ``results.csv`` and ``results.json`` into the folder. Raises OSError."""
+    without_drawn = [structs.replace(one, drawn=()) for one in results]
+    table_of_all = StringIO()
+    rows = csv.writer(table_of_all)
+    axes = (f"{name[:-1]}{axis}_m" for name in _TRIPLES for axis in "xyz")
+    rows.writerow(["recording", "method", "reason", *_NUMBERS, *axes])
+    rows.writerows(_csv_row(one) for one in results)
+    files = {
+        "results.json": msgspec.json.format(msgspec.json.encode(without_drawn), indent=1),
+        "results.csv": table_of_all.getvalue().encode(),
+        "index.html": _page(results, title, command).encode(),
+    }
+    replace_files({folder / name: data for name, data in files.items()})
 
 
 def _csv_row(result: Result) -> list[object]:

@@ -8,7 +8,8 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.core.errors import ConfigurationError
-from skyless.research.foreign.formats import Format, format_of
+from skyless.research.foreign.formats import format_of
+from skyless.research.replays.site import SITE_FORMAT
 from skyless.run.recordings.recording import is_mcap
 
 _TABLE: Final = re.compile(r"_(?:tdoa|data)(?=\.)")
@@ -29,7 +30,10 @@ class Found(Struct, frozen=True):
     path: Path
     format: str
     truth: Path | None = None
+    """A table of the body's positions beside it."""
     anchors: Path | None = None
+    has_body_truth: bool = False
+    """Whether the truth, of the table or in the recording itself, is of the body that carries the antenna."""
 
 
 def recordings_below(folder: Path) -> Iterator[Found]:
@@ -39,20 +43,18 @@ def recordings_below(folder: Path) -> Iterator[Found]:
     for path in paths:
         if path in truths or path.stat().st_size < _SMALLEST or "anchors" in path.name:
             continue
-        kind = _kind_of(path)
-        if kind is not None:
-            name = re.sub(r"(_tdoa)?\.[\w.]+$", "", str(path.relative_to(folder)))
-            yield Found(name, path, kind, truth_of(path), anchors_of(path, folder))
-
-
-def _kind_of(path: Path) -> str | None:
-    if is_mcap(path):
-        return "skyless-mcap"
-    try:
-        found: Format = format_of(path)
-    except ConfigurationError:
-        return None
-    return found.name
+        name, truth = re.sub(r"\.[\w.]+$", "", str(path.relative_to(folder))), truth_of(path)
+        if is_mcap(path):
+            yield Found(name, path, SITE_FORMAT)
+            continue
+        try:
+            kind = format_of(path)
+        except ConfigurationError:
+            continue
+        is_of_body = truth is not None
+        if truth is None and kind.truth_is_of_body and kind.read_truth is not None:
+            is_of_body = kind.read_truth(path, None) is not None
+        yield Found(name, path, kind.name, truth, anchors_of(path, folder), is_of_body)
 
 
 def truth_of(path: Path) -> Path | None:

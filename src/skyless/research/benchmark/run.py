@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -9,9 +10,11 @@ import msgspec
 import numpy as np
 from msgspec import Struct, structs
 
+import skyless
 from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.errors import SkylessError
 from skyless.core.kernels.arrays import Matrix, Vector
+from skyless.core.whole_files import write_whole
 from skyless.research.benchmark.plain import BITCRAZE, GATE, plain_track
 from skyless.research.benchmark.recordings import Found
 from skyless.research.calibration.biases import biases_of, tdoas_of
@@ -87,20 +90,31 @@ def results_of(
     calibrations: dict[Path, DifferenceCalibration] = {}
     for number, (one, method) in enumerate(cells):
         file = kept / f"{_key(one, method, asked)}.json"
-        if file.exists():
-            results = msgspec.json.decode(file.read_bytes(), type=tuple[Result, ...])
-        else:
+        results = _kept(file)
+        if results is None:
             try:
                 if method == CALIBRATED and not calibrations:
                     calibrations = _calibrations(found, asked)
                 results = tuple(_results(one, method, asked, calibrations))
             except SkylessError as error:
                 results = (Result(one.name, method, None, str(error)),)
-            unfinished = file.with_suffix(".part")
-            unfinished.write_bytes(msgspec.json.encode(results))
-            unfinished.rename(file)
+            write_whole(file, msgspec.json.encode(results))
         on_progress((number + 1) / len(cells))
         yield from results
+
+
+def _kept(file: Path) -> tuple[Result, ...] | None:
+    """Results of an earlier run; None where there are none, or they are damaged."""
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=tuple[Result, ...])
+    except (FileNotFoundError, msgspec.DecodeError):
+        return None
+
+
+@cache
+def _newest_source() -> int:
+    """When the program was last changed."""
+    return max(source.stat().st_mtime_ns for source in Path(skyless.__file__).parent.rglob("*.py"))
 
 
 def _key(found: Found, method: str, asked: Asked) -> str:
@@ -108,7 +122,14 @@ def _key(found: Found, method: str, asked: Asked) -> str:
     programs = asked.programs if method in asked.estimators else ()
     files = [one for one in (found.path, found.truth, found.anchors, *programs) if one]
     states = [(str(one), one.stat().st_size, one.stat().st_mtime_ns) for one in files if one.is_file()]
-    given = (states, method, asked.lever_arm_m, asked.first_s, tuple(asked.calibrate_on) * (method == CALIBRATED))
+    given = (
+        _newest_source(),
+        states,
+        method,
+        asked.lever_arm_m,
+        asked.first_s,
+        tuple(asked.calibrate_on) * (method == CALIBRATED),
+    )
     return hashlib.sha256(repr(given).encode()).hexdigest()[:24]
 
 
@@ -143,7 +164,7 @@ def _site_results(found: Found) -> Iterator[Result]:
 
 
 def _options(found: Found, asked: Asked) -> ReplayOptions:
-    arm_m = None if found.truth is None else asked.lever_arm_m
+    arm_m = asked.lever_arm_m if found.has_body_truth else None
     return ReplayOptions(
         found.path,
         anchors=found.anchors,

@@ -130,7 +130,7 @@ class _Log:
     def __init__(self, stream: BufferedIOBase, drops: Drops) -> None:
         self._drops = drops
         self._chunks = chunks(stream, drops)
-        self._bytes = b""
+        self._bytes, self._at = b"", 0
         self._crc = 0
         self._kinds: dict[int, _Kind] = {}
         self._time = self._read_kinds()
@@ -141,25 +141,27 @@ class _Log:
         return frozenset(kind.name for kind in self._kinds.values())
 
     def _has(self, count: int) -> bool:
-        """Whether so many bytes are left before the checksum."""
-        while len(self._bytes) < count + _CRC_BYTES:
+        """Whether this number of bytes is left before the checksum."""
+        while len(self._bytes) - self._at < count + _CRC_BYTES:
             chunk = next(self._chunks, None)
             if chunk is None:
                 return False
-            self._bytes += chunk
+            self._bytes, self._at = self._bytes[self._at :] + chunk, 0
         return True
 
     def _take(self, count: int) -> bytes | None:
         if not self._has(count):
             return None
-        taken, self._bytes = self._bytes[:count], self._bytes[count:]
+        taken = self._bytes[self._at : self._at + count]
+        self._at += count
         self._crc = crc32(taken, self._crc)
         return taken
 
     def _text(self) -> str:
-        while (end := self._bytes.find(b"\0")) < 0 and len(self._bytes) < _LONGEST_NAME and self._has(len(self._bytes)):
-            pass
-        return (self._take(end + 1) or b"\0")[:-1].decode("ascii", "replace")
+        length = 0
+        while length < _LONGEST_NAME and self._has(length + 1) and self._bytes[self._at + length] != 0:
+            length += 1
+        return (self._take(length + 1) or b"\0")[:-1].decode("ascii", "replace")
 
     def _number(self) -> int:
         taken = self._take(_TWO.size)
@@ -196,5 +198,5 @@ class _Log:
             begin = time if begin is None else begin
             values = dict(zip(kind.fields, map(float, kind.binary.unpack(body)), strict=True))
             yield _Event(kind.name, (time - begin) * unit_s, values)
-        if int.from_bytes(self._bytes, "little") != self._crc or len(self._bytes) != _CRC_BYTES:
+        if self._bytes[self._at :] != self._crc.to_bytes(_CRC_BYTES, "little"):
             self._drops["wrong-checksum"] += 1

@@ -45,14 +45,11 @@ def read_tdoas(
     """Yield the TDoAs of a table, in its own time."""
     for time, a, b, tdoa in rows(stream, drops, columns):
         try:
-            time_s, anchor_a, anchor_b, tdoa_m = float(time), int(float(a)), int(float(b)), float(tdoa)
+            time_s, anchor_a, anchor_b, tdoa_m = float(time), _identifier(a), _identifier(b), float(tdoa)
         except ValueError:
             given = [bool(field.strip()) for field in (time, a, b, tdoa)]
             if any(given) or columns is TDOA_COLUMNS:
                 drops["malformed-number" if all(given) else "blank-field"] += 1
-            continue
-        except OverflowError:
-            drops["not-finite"] += 1
             continue
         if not (isfinite(time_s) and isfinite(tdoa_m)):
             drops["not-finite"] += 1
@@ -60,6 +57,11 @@ def read_tdoas(
             drops["anchor-against-itself"] += 1
         else:
             yield PairTdoa(time_s, anchor_a, anchor_b, tdoa_m)
+
+
+def _identifier(text: bytes) -> int:
+    """A whole number, which UTIL's tables write as ``7.0``. Raises ValueError."""
+    return int(text.removesuffix(b".0"))
 
 
 def read_util(stream: BufferedIOBase, drops: Drops) -> Iterator[PairTdoa]:

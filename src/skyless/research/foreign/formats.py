@@ -45,6 +45,8 @@ class Format:
     """FiRa's: packets may state where their senders are, and relay only initiators and those that answered them."""
     read_truth: Callable[[str | PathLike[str], str | None], Truth | None] | None = None
     """The truth that a recording itself holds, from its path and the listener; None for a format that holds none."""
+    truth_is_of_body: bool = False
+    """That truth is of the body that carries the antenna, not of the antenna itself."""
     read_heights: Callable[..., Array | None] | None = None
     """Rows of time, height and standard deviation of a sensor that was recorded, from the path and ``is_barometer``."""
     delays_ticks: int = 0
@@ -107,6 +109,7 @@ FORMATS: Final = (
         tdoa_tables.read_util,
         None,
         read_truth=tdoa_tables.read_util_truth,
+        truth_is_of_body=True,
         read_heights=tdoa_tables.read_util_heights,
     ),
     Format(
@@ -116,6 +119,7 @@ FORMATS: Final = (
         crazyflie.read,
         None,
         read_truth=crazyflie.read_truth,
+        truth_is_of_body=True,
         read_heights=crazyflie.read_heights,
     ),
     _dl_tdoa(

@@ -2,12 +2,16 @@
 
 from collections import Counter
 from collections.abc import Mapping
+from traceback import extract_tb
 from typing import Protocol
+
+from msgspec import structs
 
 from skyless.core.air.frame import Malformed
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point, Relay
 from skyless.core.air.reception import Reception
 from skyless.core.constants import TICK_BITS
+from skyless.core.errors import SkylessError
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.protocols import SiteBeacon, decode_any
 from skyless.core.site import Site
@@ -21,12 +25,27 @@ class OwnEstimator(Protocol):
         """Process one time difference, which holds both anchors' positions; a fix if it makes one (``Fix.of``)."""
 
 
-def with_positions(pair: PairTdoa, anchors_m: Mapping[int, Point]) -> PairTdoa | None:
-    """The difference with the positions of both anchors; None where one is not known."""
+def heard(estimator: OwnEstimator, pair: PairTdoa, anchors_m: Mapping[int, Point], drops: Counter[str]) -> Fix | None:
+    """Give an estimator one difference, with the positions that it lacks; unknown anchors are counted.
+
+    Raises SkylessError where the estimator fails or returns anything but a fix or None.
+    """
     a_m, b_m = pair.a_m or anchors_m.get(pair.anchor_a), pair.b_m or anchors_m.get(pair.anchor_b)
     if a_m is None or b_m is None:
+        drops["unknown-anchor"] += 1
         return None
-    return PairTdoa(pair.time_s, pair.anchor_a, pair.anchor_b, pair.tdoa_m, a_m, b_m)
+    name = f"{type(estimator).__name__}.hear"
+    try:
+        fix = estimator.hear(structs.replace(pair, a_m=a_m, b_m=b_m))
+    except Exception as error:
+        *_, place = extract_tb(error.__traceback__)
+        failed = f"{type(error).__name__}: {error} ({place.filename}, line {place.lineno})"
+        raise SkylessError(f"{name} has failed: {failed}") from error
+    if not isinstance(fix, Fix | None):
+        raise SkylessError(
+            f"{name} has returned {type(fix).__name__}; it should be None or a fix, as of skyless.Fix.of"
+        )
+    return fix
 
 
 class OwnReceiver:
@@ -56,7 +75,6 @@ class OwnReceiver:
         sent = (beacon.anchor, beacon.sequence, beacon.tx_ticks)
         fix = None
         for pair in self._engine.on_packet(Packet(reception.host_s, *sent, reception.rx_ticks, relays)):
-            known = with_positions(pair, self._anchors_m)
-            fix = (None if known is None else self._estimator.hear(known)) or fix
+            fix = heard(self._estimator, pair, self._anchors_m, self.counters) or fix
         self.reason = NoFixReason.ACQUIRING
         return fix

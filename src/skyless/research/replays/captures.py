@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from msgspec import field, structs
 
-from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
+from skyless.core.air.masterless_packets import Packet, Point
 from skyless.core.arguments import process_noise
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.estimator.state import EstimatorSettings
@@ -44,6 +44,9 @@ PROFILES: Final[Mapping[str, EstimatorSettings]] = {
 
 BATCH: Final = 512
 """Records that are read at a time: reading and filtering by turns evict each other from the processor's caches."""
+
+READING_SHARE: Final = 0.1
+"""Part of the time of a smoothed replay in which the recording is read."""
 
 FORMATS_BY_PACKETS: Final = frozenset({"bitcraze-yaml", "bitcraze-text", "bitcraze-binary"})
 """Formats of which packets are used by default, as real captures showed that to be better; of Avalue's it was not."""
@@ -125,7 +128,7 @@ class CaptureReplay:
             if self.height_m is None:
                 asked.leave_out("tag_height_std_m", why="the height is estimated")
         if self.height_m is not None:
-            asked.leave_out("z_bounds_m", why=f"the height is {self.height_note}")
+            asked.leave_out("z_bounds_m", "height_kind", why=f"the height is not estimated ({self.height_note})")
         self.measurements = self._measurements(kind)
         self._heights = known_heights(asked)
         path, anchors_m = asked.file, self._anchors_m
@@ -189,32 +192,33 @@ class CaptureReplay:
         )
         return ByPackets(tracking, PairEngine(bits, anchors_m=self._known_m), self._noise)
 
-    def run(self, on_fix: Callable[[Fix], None] | None, on_progress: Callable[[int], None]) -> ReplayReport:
-        """Read to the end; ``on_fix`` gets every fix, ``on_progress`` now and then the bytes read so far."""
-        started_s = time.perf_counter()
+    def run(self, on_fix: Callable[[Fix], None] | None, on_progress: Callable[[float], None]) -> ReplayReport:
+        """Read to the end; ``on_fix`` gets every fix, ``on_progress`` now and then the share that is done."""
+        started_s, size = time.perf_counter(), max(Path(self._asked.file).stat().st_size, 1)
+        reading = READING_SHARE if self._asked.smooth else 1.0
         with closing(self.recording):
             records = iter(self.recording)
             while not self._is_over() and (batch := list(islice(records, BATCH))):
                 for record in batch:
                     self.receptions += 1
-                    if self._heights and isinstance(record, PairTdoa):
-                        self._process_heights(record.time_s)
                     time_s, fix = self._pipeline.process(record)
                     if time_s is not None:
                         self._first_s = time_s if self._first_s is None else self._first_s
                         self._last_s = time_s
+                        self._process_heights(time_s)
                         if self._is_over():
                             break
                     if fix is not None:
                         self._add(fix, on_fix)
-                on_progress(self.recording.bytes_read)
-            for fix in self._pipeline.rest():
+                on_progress(reading * min(self.recording.bytes_read / size, 1.0))
+            for fix in self._pipeline.rest(lambda share: on_progress(reading + (1.0 - reading) * share)):
                 self._add(fix, on_fix)
         table = self.samples.table()
         self._check_truth(table)
         offset_s = None if self._truth is None else estimated_offset_s(self._truth, table.time_s, table.position_m)
         if self._truth is not None and self._asked.truth_offset_s == "auto" and offset_s is not None:
             self._truth, offset_s = shifted(self._truth, offset_s), 0.0
+            self._noise.truth = self._truth
         figures = figures_of(table, self.judged, self.samples.count)
         return self._report(figures, offset_s, time.perf_counter() - started_s)
 

@@ -36,7 +36,7 @@ class NoiseByPair:
     """Keeps an even sample of every pair's differences, less what the truth predicts where it is known."""
 
     def __init__(self, truth: Truth | None, anchors_m: Mapping[int, Point]) -> None:
-        self._truth = truth
+        self.truth = truth
         self._anchors_m = anchors_m
         self._samples: dict[tuple[int, int], EvenSample] = {}
 
@@ -57,7 +57,7 @@ class NoiseByPair:
         found = []
         for (a, b), sample in sorted(self._samples.items()):
             time_s, tdoa_m, places_m = sample.rows[:, 0], sample.rows[:, 1], sample.rows[:, 2:].reshape(-1, 2, 3)
-            to_a_m, to_b_m = np.linalg.norm(truth_at(self._truth, time_s)[:, None] - places_m, axis=2).T
+            to_a_m, to_b_m = np.linalg.norm(truth_at(self.truth, time_s)[:, None] - places_m, axis=2).T
             errors_m = tdoa_m - (to_b_m - to_a_m)
             known = np.isfinite(errors_m)
             against_truth = bool(known.sum() >= MIN_PAIR_DIFFERENCES)

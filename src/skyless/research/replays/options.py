@@ -147,8 +147,9 @@ class ReplayOptions(_Recording, frozen=True, kw_only=True):
     ] = None
     """Lowest and highest height of the tag in metres, where its height is estimated."""
     heights: Annotated["ArrayLike | str | Path | None", Path] = None
-    """Heights at times, as a sensor of the tag read them: a table t_s,height_m, with std_m where that is not 0.05; in
-    Python also an array of two or three columns; recording for those that the recording itself holds."""
+    """Heights at times of the recording, as a sensor of the tag read them: a table t_s,height_m, with std_m where that
+    is not 0.05; in Python also an array of two or three columns; recording for those that the recording itself
+    holds."""
     height_kind: Annotated[str, choice(HEIGHT_SENSOR, BAROMETER)] = HEIGHT_SENSOR
     """What gave the heights: a sensor of the height itself, or a barometer, whose zero is unknown and moves slowly."""
     smooth: bool = False
@@ -160,7 +161,7 @@ class ReplayOptions(_Recording, frozen=True, kw_only=True):
     """Your own estimator instead of the filter: a class with hear(observation), which gets one time difference after
     the other."""
     first_s: Annotated[Positive | None, Option("only-first")] = None
-    """Replay only so many seconds from the first record on."""
+    """Replay only this number of seconds from the first record on."""
     settle_s: Annotated[NotNegative | None, Option("settle")] = None
     """Seconds from the start that are not judged; by default 3 with a truth table, 2 without."""
     qa: Positive | None = None
@@ -189,7 +190,12 @@ class ReplayOptions(_Recording, frozen=True, kw_only=True):
     @property
     def needs_differences(self) -> str:
         """The option that only time differences can serve; empty where there is none."""
-        return "--smooth" if self.smooth else "--estimator" if self.estimator is not None else ""
+        asked = {
+            "--smooth": self.smooth,
+            "--estimator": self.estimator is not None,
+            "--height-kind barometer": self.height_kind == BAROMETER,
+        }
+        return next((option for option, is_asked in asked.items() if is_asked), "")
 
     def check(self) -> None:
         """See that the options fit one another. Raises SkylessError."""

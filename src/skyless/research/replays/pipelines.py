@@ -4,13 +4,13 @@ All have the same methods: ``process`` takes a record, and ``rest`` gives the fi
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Final, Protocol
 
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.core.fix import Fix, NoFixReason
 from skyless.research.masterless.difference_tracking import DifferenceTracking
-from skyless.research.masterless.own_estimator import OwnEstimator, with_positions
+from skyless.research.masterless.own_estimator import OwnEstimator, heard
 from skyless.research.masterless.packet_tracking import PacketTracking
 from skyless.research.masterless.pair_engine import PairEngine
 from skyless.research.masterless.smoothing import Event, Height, smoothed
@@ -36,8 +36,8 @@ class Pipeline(Protocol):
     def process_height(self, height: Height) -> None:
         """Process a reading of the tag's height sensor, which came before the next record."""
 
-    def rest(self) -> Iterable[Fix]:
-        """Fixes that no record has made, at the end of the recording."""
+    def rest(self, on_progress: Callable[[float], None]) -> Iterable[Fix]:
+        """Fixes that only the whole recording makes, at its end; ``on_progress`` gets the share that is done."""
 
     @property
     def drops(self) -> Counter[str]:
@@ -74,7 +74,7 @@ class _Differences:
         """What the engine could not use, by reason."""
         return Counter() if self._engine is None else Counter(self._engine.drops)
 
-    def rest(self) -> Iterable[Fix]:
+    def rest(self, _on_progress: Callable[[float], None]) -> Iterable[Fix]:
         """See ``Pipeline``."""
         return ()
 
@@ -126,9 +126,13 @@ class Smoothed(ByPairs):
         """See ``Pipeline``."""
         self._events.append(height)
 
-    def rest(self) -> Iterable[Fix]:
+    def rest(self, on_progress: Callable[[float], None]) -> Iterable[Fix]:
         """See ``Pipeline``."""
-        return reversed([fix for _, fix in smoothed(self._tracking, self._events)])
+        found, count = [], max(len(self._events), 1)
+        for number, fix in smoothed(self._tracking, self._events):
+            found.append(fix)
+            on_progress(1.0 - number / count)
+        return reversed(found)
 
 
 class ByPackets:
@@ -150,9 +154,9 @@ class ByPackets:
 
     def process_height(self, height: Height) -> None:
         """See ``Pipeline``."""
-        self._tracking.tracking.estimator.process_height(height.height_m, height.std_m, height.is_barometer)
+        self._tracking.tracking.update_height(height.height_m, height.std_m)
 
-    def rest(self) -> Iterable[Fix]:
+    def rest(self, _on_progress: Callable[[float], None]) -> Iterable[Fix]:
         """See ``Pipeline``."""
         return ()
 
@@ -182,29 +186,18 @@ class ByOwnEstimator(_Differences):
         self._estimator = estimator
         self._anchors_m = dict(anchors_m)
         self._drops: Counter[str] = Counter()
-        self._reason = NoFixReason.NO_BEACONS
 
     def process(self, record: Record) -> tuple[float | None, Fix | None]:
         """See ``Pipeline``."""
         pairs, fix = self.pairs(record), None
         for pair in pairs:
-            fix = self.process_pair(pair) or fix
+            fix = heard(self._estimator, pair, self._anchors_m, self._drops) or fix
         return (pairs[0].time_s if pairs else None), fix
-
-    def process_pair(self, pair: PairTdoa) -> Fix | None:
-        """Give one difference to the estimator, with the positions that it lacks."""
-        known = with_positions(pair, self._anchors_m)
-        if known is None:
-            self._drops["unknown-anchor"] += 1
-            self._reason = NoFixReason.NO_ALMANAC
-            return None
-        self._reason = NoFixReason.ACQUIRING
-        return self._estimator.hear(known)
 
     @property
     def reason(self) -> NoFixReason:
         """See ``Pipeline``."""
-        return self._reason
+        return NoFixReason.NO_ALMANAC if self._drops else NoFixReason.ACQUIRING
 
     def process_height(self, height: Height) -> None:
         """Leave heights out: an own estimator gets differences alone."""

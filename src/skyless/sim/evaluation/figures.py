@@ -1,4 +1,4 @@
-"""Figures that one can cite: what fixes were worth against the truth, and whether they said so.
+"""Figures that one can cite: errors of fixes against the truth, and whether what fixes claim of them holds.
 
 ``docs/recordings.md`` defines each. Replays, benchmarks and Python have them from here alone.
 """
@@ -20,10 +20,10 @@ KEPT_FIXES: Final = 1 << 19
 """Of a recording with more fixes, every second, fourth, … is judged."""
 
 HOLD_S: Final = 1.0
-"""A fix serves until the next one, and so long at most."""
+"""A fix counts as the newest until the next one, for this time at most."""
 
 STEP_M: Final = 1.0
-"""Way of the truth over which relative errors are taken."""
+"""Length of the true path over which relative errors are taken."""
 
 CHI2_95: Final = {2: 5.991464547107979, 3: 7.814727903251179}
 """95 % points of χ² with two and three degrees of freedom."""
@@ -110,7 +110,7 @@ class Judged(Struct, frozen=True):
 
 
 class Figures(Struct, frozen=True, kw_only=True):
-    """Figures of a run; metres and seconds, None where there is nothing to tell them from."""
+    """Figures of a run; metres and seconds, None where they are not known."""
 
     judged: int = 0
     """Fixes that are judged, ..."""
@@ -146,7 +146,7 @@ class Figures(Struct, frozen=True, kw_only=True):
     ate_m: float | None = None
     """Absolute trajectory error: RMSE after the best rotation and translation."""
     rpe_m: float | None = None
-    """Relative trajectory error: RMSE of the way over each ``STEP_M`` of the truth."""
+    """Relative trajectory error: RMSE of the displacement over each ``STEP_M`` of the true path."""
     levels: int = 0
     """Fixes with a protection level and a known truth, from the first fix on, ..."""
     exceeded_horizontal: int = 0
@@ -220,9 +220,9 @@ def _errors(error_m: Matrix, dim: int) -> dict[str, Any]:
 def _claims(error_m: Matrix, covariance_m2: Array) -> dict[str, Any]:
     """Errors of shape (n, dim) against their covariances (n, dim, dim)."""
     dim = error_m.shape[1]
-    told: Mask = np.asarray(np.isfinite(covariance_m2).all(axis=(1, 2)))
-    told[told] = np.linalg.det(covariance_m2[told]) > 0.0
-    error_m, covariance_m2 = error_m[told], covariance_m2[told]
+    claimed: Mask = np.asarray(np.isfinite(covariance_m2).all(axis=(1, 2)))
+    claimed[claimed] = np.linalg.det(covariance_m2[claimed]) > 0.0
+    error_m, covariance_m2 = error_m[claimed], covariance_m2[claimed]
     if len(error_m) == 0:
         return {}
     nees = (error_m * np.linalg.solve(covariance_m2, error_m[..., None])[..., 0]).sum(axis=1)

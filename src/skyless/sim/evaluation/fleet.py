@@ -270,6 +270,7 @@ def report(fleet: TagFleet, method: str, started_s: float) -> FleetReport:
     fixes = sum(record.fixes for record in fleet.records)
     listening_s = sum(simulated_s - first for first in firsts)
     rmse_m = summary.rmse_2d_m if fleet.site.tags.height_m is not None else summary.rmse_3d_m
+    claims = np.isfinite(fleet.sigma_squared_sum)  # one's own estimator may claim nothing
     return FleetReport(
         method=method,
         tags=len(fleet.records),
@@ -281,7 +282,7 @@ def report(fleet: TagFleet, method: str, started_s: float) -> FleetReport:
         updates_per_s=fixes / listening_s if listening_s > 0.0 else 0.0,
         dropped=sum(fleet.drops.values()),
         std_m=_std_m(rmse_m, summary),
-        sigma_m=(fleet.sigma_squared_sum / summary.count) ** 0.5 if summary.count else None,
+        sigma_m=(fleet.sigma_squared_sum / summary.count) ** 0.5 if summary.count and claims else None,
         bias_m=summary.bias_m,
         first_fix_s=float(np.median(firsts)) if firsts else None,
         tags_without_fix=len(fleet.records) - len(firsts),
