@@ -8,8 +8,7 @@ from msgspec.structs import replace
 
 from skyless.core.estimator.estimator import Estimator
 from skyless.core.estimator.kalman import predict
-from skyless.core.estimator.monitor import INCONSISTENT_NIS
-from skyless.core.estimator.state import EstimatorSettings
+from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.site import EXACT
 from skyless.core.ticks import from_seconds
 from skyless.sim.evaluation.fleet import Fleet, FleetSettings
@@ -47,7 +46,7 @@ def test_fixes_know_what_hard_turns_cost_them():
     for seed in (1, 2):
         fleet = Fleet(site, [path], impairments_of(Request(site), site), seed, FleetSettings())
         for one in fleet.run(15.0):
-            if one.time_s > 2.0 and one.fix.chi2 > INCONSISTENT_NIS:
+            if one.time_s > 2.0 and one.fix.chi2 > TUNING.inconsistent_nis:
                 error = one.error_m[:2]
                 normalised.append(error @ np.linalg.solve(one.fix.covariance_m2[:2, :2], error) / 2.0)
     assert len(normalised) > 200

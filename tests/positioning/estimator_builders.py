@@ -10,8 +10,10 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M
-from skyless.core.estimator.estimator import LEVELS, Estimator, Packets
-from skyless.core.estimator.state import EstimatorSettings, layout
+from skyless.core.estimator.estimator import Estimator, Packets
+from skyless.core.estimator.levels import LEVELS
+from skyless.core.estimator.settings import EstimatorSettings
+from skyless.core.estimator.state import layout
 from skyless.core.observation import Observation
 from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM, random_path
 from skyless.sim.lab import paper_lab_site

@@ -9,7 +9,8 @@ from msgspec.structs import replace
 from skyless import Request, fleet_of
 from skyless.core.estimator.estimator import Estimator
 from skyless.core.estimator.measurements import difference_terms, reception_terms
-from skyless.core.estimator.state import EstimatorSettings, layout
+from skyless.core.estimator.settings import EstimatorSettings
+from skyless.core.estimator.state import layout
 from skyless.core.site import AccuracySite
 from skyless.sim.evaluation.scenarios import Room, displacements
 from skyless.sim.lab import paper_lab_site

@@ -25,18 +25,9 @@ from scipy.stats import binom, chi2
 
 from skyless.core.constants import TICK_M, TICK_S
 from skyless.core.estimator import faults
-from skyless.core.estimator.faults import (
-    CREEPING_S,
-    OPENED_STD_M,
-    RECENT_PACKETS,
-    SURE_CHI2,
-    explained_chi2,
-    fade_faults,
-    fault_chi2,
-    open_faults,
-    whiten,
-)
+from skyless.core.estimator.faults import explained_chi2, fade_faults, fault_chi2, open_faults, whiten
 from skyless.core.estimator.levels import FIRST_TEST, LEVELS, protect
+from skyless.core.estimator.settings import TUNING
 from skyless.core.estimator.state import (
     ALL_RANGE_ERRORS,
     CREEPING_STD_M,
@@ -158,7 +149,7 @@ def test_how_much_one_or_two_faults_explain():
     draw = np.random.default_rng(2)
     root = draw.normal(size=(6, 9))
     s.information[:6, :6], s.evidence[:6] = root @ root.T, draw.normal(size=6)
-    M = s.information[:6, :6] + np.eye(6) / OPENED_STD_M**2
+    M = s.information[:6, :6] + np.eye(6) / TUNING.opened_std_m**2
     for one in range(6):
         for other in range(one + 1):
             both = sorted({one, other})
@@ -186,7 +177,7 @@ def test_opening_a_fault_is_a_filter_that_had_it_open_from_the_beginning(late_m,
         if packet[0] == anchor and estimator.state.index_of[anchor] < 0:
             estimator._state = with_anchor(estimator.state, anchor, LAB_M[anchor])
             constant = where(estimator).constant + int(estimator.state.index_of[anchor])
-            estimator.state.P[constant, constant] += OPENED_STD_M**2
+            estimator.state.P[constant, constant] += TUNING.opened_std_m**2
             estimator.state.status["range_errors"] = ALL_RANGE_ERRORS
 
     follow(opened, packets, wide, packets, widen)
@@ -215,7 +206,7 @@ def test_other_faults_are_conditioned_on_one_that_is_opened(kind):
     faults._open_fault(s, kind, anchor)
     chosen = 6 * kind + anchor
     others = np.delete(np.arange(18), chosen)
-    share = whole[others, chosen] / (whole[chosen, chosen] + 1.0 / OPENED_STD_M**2)
+    share = whole[others, chosen] / (whole[chosen, chosen] + 1.0 / TUNING.opened_std_m**2)
     expected = whole[np.ix_(others, others)] - np.outer(share, whole[chosen, others])
     np.testing.assert_allclose(s.information[np.ix_(others, others)], expected, rtol=1e-9)
     np.testing.assert_allclose(s.evidence[others], y[others] - share * y[chosen], rtol=1e-9)
@@ -231,7 +222,7 @@ def test_what_has_not_lasted_is_forgotten():
     faded_s, s.status["packets"] = 0.3, 600
     s.status["faded_ticks"] = s.status["epoch_ticks"] - round(faded_s / TICK_S)
     fade_faults(s)
-    kept = np.repeat([1.0, 1.0 - 1.0 / RECENT_PACKETS, np.exp(-faded_s / CREEPING_S)], 6)
+    kept = np.repeat([1.0, 1.0 - 1.0 / TUNING.recent_packets, np.exp(-faded_s / TUNING.creeping_s)], 6)
     np.testing.assert_allclose(s.V, V * np.append(kept, [1.0, 1.0])[:, None], rtol=1e-6)
     np.testing.assert_allclose(s.evidence, evidence * kept, rtol=1e-6)
     of_kind = np.arange(18) // 6
@@ -338,7 +329,7 @@ def test_too_few_anchors_single_nobody_out():
     estimator = begun(episode, settings_of(MESH))
     estimator.track(packets)
     estimator.state.evidence[:4] = [1e4, 0.0, 0.0, 0.0]
-    assert fault_chi2(estimator.state, LASTING, 0) > 10.0 * SURE_CHI2
+    assert fault_chi2(estimator.state, LASTING, 0) > 10.0 * TUNING.sure_chi2
     open_faults(estimator.state)
     assert estimator.state.status["faults_opened"] == 0
 

@@ -39,15 +39,8 @@ from skyless.core.constants import TICK_RATE_HZ, TICK_S
 from skyless.core.estimator.estimator import JOINED, REJECTED, STALE, Estimator, Packets
 from skyless.core.estimator.kalman import predict
 from skyless.core.estimator.levels import FIRST_TEST
-from skyless.core.estimator.state import (
-    FAULT_KINDS,
-    LASTING,
-    EstimatorSettings,
-    layout,
-    new_state,
-    with_anchor,
-    without_anchor,
-)
+from skyless.core.estimator.settings import EstimatorSettings
+from skyless.core.estimator.state import FAULT_KINDS, LASTING, layout, new_state, with_anchor, without_anchor
 from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM
 from skyless.research.uncertainty.bounds import BoundSettings, tracking_bound
 

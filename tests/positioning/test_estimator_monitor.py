@@ -25,8 +25,8 @@ from msgspec.structs import replace
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_S
 from skyless.core.estimator.estimator import ACCEPTED, REJECTED, Report
-from skyless.core.estimator.measurements import REPORT_GAIN
-from skyless.core.estimator.monitor import PLACE_MEMORY, gate_of
+from skyless.core.estimator.monitor import gate_of
+from skyless.core.estimator.settings import TUNING
 from skyless.core.estimator.state import uncertain_states
 from skyless.core.kernels.filter import ClockFilter, clock_noise
 from skyless.core.ticks import TICK_MASK
@@ -277,7 +277,7 @@ def test_a_report_replaces_what_is_known_worse():
     h[[place.offset + m, place.offset + i]] = 1.0, -1.0
     h[[place.rate + m, place.rate + i]] = -back_s, back_s
     spread = h @ s.P @ h
-    assert spread > REPORT_GAIN * q
+    assert spread > TUNING.report_gain * q
     gain = s.P @ h / spread
     gain[place.slope :] = 0.0
     whole = int(s.anchors["offset_ticks"][m] - s.anchors["offset_ticks"][i]) * SUBTICKS
@@ -323,7 +323,7 @@ def test_multipath_that_was_learnt_is_estimated_also_where_the_settings_call_ran
     for packet in packets[:360]:
         estimator.process(*packet)
     status = estimator.state.status
-    status["place_samples"], status["place_square_m2"] = PLACE_MEMORY, (0.004, 0.005)
+    status["place_samples"], status["place_square_m2"] = TUNING.place_memory, (0.004, 0.005)
     for packet in packets[360:]:
         estimator.process(*packet)
         P = estimator.state.P

@@ -9,7 +9,7 @@ from itertools import pairwise, permutations
 import numpy as np
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.core.estimator.measurements import HELD_MAX_M, HELD_SHARE, HELD_STD, HELD_STEP_M, PAIR_RELAYS
+from skyless.core.estimator.settings import TUNING
 from skyless.core.estimator.state import OPEN_PAIR_STD_M
 
 
@@ -87,8 +87,8 @@ class TextbookFilter:
         h, survey = np.zeros(self.size), self.surveys[self.dim * anchor : self.dim * (anchor + 1)]
         given_m = [] if self.dim == 3 else [self.settings.height_m]
         place_m, trace = np.append(self.x[self.p], given_m), np.trace(self.P[: self.dim, : self.dim])
-        step_m = min(HELD_STEP_M, HELD_SHARE * np.linalg.norm(place_m - self.anchors_m[anchor]))
-        step_m = max(step_m, min(HELD_STD * trace**0.5, HELD_MAX_M))
+        step_m = min(TUNING.held_step_m, TUNING.held_share * np.linalg.norm(place_m - self.anchors_m[anchor]))
+        step_m = max(step_m, min(TUNING.held_std * trace**0.5, TUNING.held_max_m))
         if not any((self.settings.survey_std_m, self.settings.range_std_m, self.settings.height_std_m)):
             step_m = 0.0  # exact ranges leave nothing open
         if not np.linalg.norm(place_m - self.held_m.get(anchor, np.nan)) <= step_m:
@@ -158,7 +158,7 @@ class TextbookFilter:
         pair[0] += share * innovation
         pair[1] *= 1 - share
         self.relays[listener, sender] += 1
-        if self.relays[listener, sender] == PAIR_RELAYS and self.relays[sender, listener] >= PAIR_RELAYS:
+        if self.relays[listener, sender] == TUNING.pair_relays and self.relays[sender, listener] >= TUNING.pair_relays:
             self._pair_range(listener, sender, *pair)
 
     def _pair_range(self, one, other, longer_m, variance):

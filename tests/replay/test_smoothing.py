@@ -6,7 +6,7 @@ import pytest
 import skyless
 import synthetic_recordings as synthetic
 from skyless.core.air.masterless_packets import PairTdoa
-from skyless.core.estimator.state import EstimatorSettings
+from skyless.core.estimator.settings import EstimatorSettings
 from skyless.research.masterless.difference_tracking import DifferenceTracking
 from skyless.research.masterless.smoothing import CHUNK, smoothed
 from skyless.site.survey.anchor_errors import DifferenceCalibration

@@ -12,19 +12,9 @@ from numpy.typing import NDArray
 
 from skyless.core.air.frame import HEARD
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.core.estimator.faults import (
-    explained_chi2,
-    fade_faults,
-    open_faults,
-)
+from skyless.core.estimator.faults import explained_chi2, fade_faults, open_faults
 from skyless.core.estimator.kalman import is_stationary, predict
-from skyless.core.estimator.levels import (
-    FIRST_TEST,
-    LEVELS,
-    fit_plane,
-    integrity_state,
-    protect,
-)
+from skyless.core.estimator.levels import FIRST_TEST, LEVELS, fit_plane, integrity_state, protect
 from skyless.core.estimator.measurements import (
     CLOCK_JUMPED,
     difference,
@@ -35,14 +25,14 @@ from skyless.core.estimator.measurements import (
     report,
     zero_velocity,
 )
-from skyless.core.estimator.monitor import LATE_OFTEN_SHARE, covariance_scale, update_stationary
+from skyless.core.estimator.monitor import covariance_scale, update_stationary
+from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.estimator.state import (
     ALL_RANGE_ERRORS,
     LASTING,
     LASTING_STD_M,
     NEVER,
     PACKETS_KEPT,
-    EstimatorSettings,
     EstimatorState,
     layout,
     new_state,
@@ -62,8 +52,6 @@ REJECTED, ACCEPTED, JOINED, STALE, NEW_ANCHOR, SILENT_ANCHOR, RESTARTED_CLOCK = 
 """What became of a packet; the last three require an anchor to join or leave, and for the packet again."""
 
 # Paths that seem longer than expected by more than this, for this number of packets in a row: a counter has jumped.
-RESTART_M: Final = 300.0
-RESTART_IN_ROW: Final = 3
 MAX_RATE_MPS: Final = 100e-6 * SPEED_OF_LIGHT_MPS  # between two clocks that are still crystals
 # The state is wrong where this number of packets in a row, or a larger share of all, lies beyond the gate.
 LOST_IN_ROW: Final = 8
@@ -73,7 +61,6 @@ FITTING_CHI2: Final = 2.0  # largest χ² for each anchor of range errors that a
 # Part of an anchor's lateness at the start that stays: mean and standard deviation.
 STAYING_SHARE: Final = 0.2
 STAYING_STD: Final = 0.5
-FADING: Final = 0.95  # factor on the counts of recent relays with each packet
 MAX_PACKED: Final = 16  # relays in a frame; 13 fit
 
 
@@ -120,10 +107,11 @@ def _silent_anchor(s: EstimatorState, rx_ticks: int) -> int:
 @step
 def _is_impossible(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int) -> bool:
     """Whether no clock can have gone from an anchor's newest packet to this one."""
+    settings = s.settings[0]
     a = s.anchors[anchor]
     elapsed = rx_ticks - a["rx_ticks"]
     change_m = abs(elapsed - (tx_ticks - a["tx_ticks"])) * TICK_M
-    return bool(change_m > RESTART_M + MAX_RATE_MPS * elapsed * TICK_S)
+    return bool(change_m > settings["restart_m"] + MAX_RATE_MPS * elapsed * TICK_S)
 
 
 @kernel
@@ -142,6 +130,7 @@ def _process(
     variance_factor: float,
 ) -> int:
     """Process one packet and what it relays, rows ``first`` to ``last``; what became of it."""
+    settings = s.settings[0]
     status, anchor = s.status[0], s.index_of[table_index]
     outcome = _admit(s, anchor, rx_ticks, tx_ticks)
     joins, was_known = outcome == JOINED, outcome == ACCEPTED
@@ -160,8 +149,8 @@ def _process(
         status["packets"] += 1
         _keep_packet(s, anchor, sequence, rx_ticks, tx_ticks)
     if was_known:
-        status["relays_lately_accepted"] *= FADING
-        status["relays_lately_rejected"] *= FADING
+        status["relays_lately_accepted"] *= settings["fading"]
+        status["relays_lately_rejected"] *= settings["fading"]
     _process_relays(s, relays, first, last if was_known else first)
     if was_known and report_variance_m2 > 0.0 and master >= 0 and s.index_of[master] not in (-1, anchor):
         report(s, anchor, s.index_of[master], subticks, report_variance_m2)
@@ -185,6 +174,7 @@ def _check_motion_and_faults(s: EstimatorState, elapsed_s: float) -> None:
 @step
 def _admit(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int) -> int:
     """``JOINED`` or ``ACCEPTED`` for a packet that can be processed; for others what becomes of them, counted."""
+    settings = s.settings[0]
     status = s.status[0]
     outcome = ACCEPTED
     if status["packets"] > 0 and rx_ticks < status["epoch_ticks"]:
@@ -202,7 +192,7 @@ def _admit(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int) -> int:
     elif _is_impossible(s, anchor, rx_ticks, tx_ticks):
         s.anchors[anchor]["outliers_in_row"] += 1
         status["rejected_in_row"] += 1
-        outcome = REJECTED if s.anchors[anchor]["outliers_in_row"] < RESTART_IN_ROW else RESTARTED_CLOCK
+        outcome = REJECTED if s.anchors[anchor]["outliers_in_row"] < settings["restart_in_row"] else RESTARTED_CLOCK
     s.status[0]["impossible"] += int(outcome == REJECTED)
     return outcome
 
@@ -689,7 +679,7 @@ class Estimator:
     @property
     def is_late_often(self) -> bool:
         """Whether single packets are late often."""
-        return bool(self._state.status[0]["late_share"] > LATE_OFTEN_SHARE)
+        return bool(self._state.status[0]["late_share"] > TUNING.late_often_share)
 
     @property
     def jumps(self) -> int:

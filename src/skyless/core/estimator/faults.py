@@ -33,19 +33,10 @@ from skyless.core.estimator.state import (
 from skyless.core.kernels.arrays import Matrix
 from skyless.core.kernels.compiled import step
 
-RECENT_PACKETS: Final = 16.0  # number of packets of each anchor over which a fault counts as recent
-CREEPING_S: Final = 3.0  # in this time a creeping fault has become e times as large
-OPENED_STD_M: Final = 1.0  # standard deviation of a fault that is added to the state, before anything is known of it
 # A test beyond this shows a lasting fault: χ² of eight degrees of freedom is larger with a probability of 4·10⁻⁸.
-SURE_CHI2: Final = 50.0
-EXPLAINED_CHI2: Final = 20.0  # largest part of the test that the faults of the right anchors may leave unexplained
-RIVAL_FAULT_CHI2: Final = 20.0  # least difference to what the faults of any other anchors explain
 MAX_FAULTS: Final = 2  # largest number of anchors that are selected
 # Obstacles make packets late, not early; a fault that is early has to explain more by this.
-EARLY_WEIGHT: Final = 0.8
-JUMP_RISE: Final = 0.5  # by this part of its full size a jump raises the process noise of all range errors
 # Factor on the process noise of a range error that has just jumped: it may still be changing.
-FIRST_CHANGE_SCALE: Final = 25.0
 
 
 @step
@@ -82,13 +73,18 @@ def gather_evidence(s: EstimatorState, innovation: float, innovation_variance: f
 @step
 def fade_faults(s: EstimatorState) -> None:
     """Forget, once in a round of packets, a share of what has not lasted has done, and of the evidence for it."""
+    settings = s.settings[0]
     count, n, status = len(s.anchors), uncertain_states(s), s.status[0]
     is_round = status["packets"] % count == 0
     elapsed_s = (status["epoch_ticks"] - status["faded_ticks"]) * TICK_S
     status["faded_ticks"] = status["epoch_ticks"] if is_round else status["faded_ticks"]
     for fault in range(count, FAULT_KINDS * count if is_round else count):
         begin = fault - fault % count
-        kept = 1.0 - 1.0 / RECENT_PACKETS if begin == RECENT * count else np.exp(-elapsed_s / CREEPING_S)
+        kept = (
+            1.0 - 1.0 / settings["recent_packets"]
+            if begin == RECENT * count
+            else np.exp(-elapsed_s / settings["creeping_s"])
+        )
         s.evidence[fault] *= kept
         for state in range(n):
             s.V[fault, state] *= kept
@@ -139,7 +135,8 @@ def fault_chi2(s: EstimatorState, kind: int, axes: int) -> float:
 @step
 def explained_chi2(s: EstimatorState, one: int, other: int) -> float:
     """How much of the test of all lasting faults one anchor or two explain; for one, both arguments are the same."""
-    y, M, weight = s.evidence, s.information, 1.0 / OPENED_STD_M**2
+    settings = s.settings[0]
+    y, M, weight = s.evidence, s.information, 1.0 / settings["opened_std_m"] ** 2
     a, b, both = M[one, one] + weight, M[other, other] + weight, M[one, other]
     if one == other:
         explained = y[one] * y[one] / a
@@ -155,14 +152,15 @@ def open_faults(s: EstimatorState) -> None:
     After a start that was contradicted, none are selected: any number of anchors may be late then, and those that
     explain the test are now and then the wrong ones.
     """
+    settings = s.settings[0]
     lasting_chi2, creeping_chi2 = fault_chi2(s, LASTING, 0), fault_chi2(s, CREEPING, 0)
     lasting, recent, creeping = _largest(s, LASTING), _largest(s, RECENT), _largest(s, CREEPING)
     if s.status[0]["fault_std_m"][LASTING] <= LASTING_STD_M:
-        if creeping_chi2 > max(SURE_CHI2, lasting_chi2) and creeping > recent and creeping >= lasting:
+        if creeping_chi2 > max(settings["sure_chi2"], lasting_chi2) and creeping > recent and creeping >= lasting:
             _open_new_faults(s, CREEPING)
-        elif fault_chi2(s, RECENT, 0) > SURE_CHI2 and recent >= lasting:
+        elif fault_chi2(s, RECENT, 0) > settings["sure_chi2"] and recent >= lasting:
             _open_new_faults(s, RECENT)
-        elif lasting_chi2 > SURE_CHI2:
+        elif lasting_chi2 > settings["sure_chi2"]:
             _open_lasting_faults(s, lasting_chi2)
 
 
@@ -178,9 +176,10 @@ def _largest(s: EstimatorState, kind: int) -> float:
 @step
 def _explained_alone(s: EstimatorState, kind: int, anchor: int) -> float:
     """How much the fault of an anchor explains; that it is early is less likely, and counts less."""
+    settings = s.settings[0]
     fault = kind * len(s.anchors) + anchor
     y, M = s.evidence[fault], s.information[fault, fault]
-    return float((1.0 if y > 0.0 else EARLY_WEIGHT) * y * y / (M + 1.0 / OPENED_STD_M**2))
+    return float((1.0 if y > 0.0 else settings["early_weight"]) * y * y / (M + 1.0 / settings["opened_std_m"] ** 2))
 
 
 @step
@@ -190,11 +189,12 @@ def _open_new_faults(s: EstimatorState, kind: int) -> None:
     A single one opens by itself; where it is open which of several it is, the position uses none of them,
     as long as enough anchors are left.
     """
+    settings = s.settings[0]
     count, spare = len(s.anchors), len(s.anchors) - s.settings[0]["dim"] - 1
     for anchor in range(count):
         spare -= 1 if s.anchors[anchor]["is_obstructed"] else 0
         s.ph[anchor] = _explained_alone(s, kind, anchor)
-    limit = _largest(s, kind) - RIVAL_FAULT_CHI2
+    limit = _largest(s, kind) - settings["rival_fault_chi2"]
     first = 0
     while spare > 0 and first >= 0:
         first = -1
@@ -211,16 +211,18 @@ def _open_new_faults(s: EstimatorState, kind: int) -> None:
 @step
 def begin_obstruction(s: EstimatorState, anchor: int) -> None:
     """Note that an anchor's range error has jumped; it may still be changing."""
+    settings = s.settings[0]
     a, status = s.anchors[anchor], s.status[0]
     a["outliers_in_row"] = 0
     a["is_obstructed"] = 1
-    a["change_mean"], a["change_scale"] = 0.0, FIRST_CHANGE_SCALE
-    status["obstruction"] = min(status["obstruction"] + JUMP_RISE, 2.0)
+    a["change_mean"], a["change_scale"] = 0.0, settings["first_change_scale"]
+    status["obstruction"] = min(status["obstruction"] + settings["jump_rise"], 2.0)
 
 
 @step
 def _open_lasting_faults(s: EstimatorState, chi2: float) -> None:
     """Add the lasting faults of one or two anchors to the state, where no others explain the test as well."""
+    settings = s.settings[0]
     count, dim = len(s.anchors), s.settings[0]["dim"]
     most_faults, opened = min(MAX_FAULTS, count - dim - 2), False
     for faults in range(1, most_faults + 1):
@@ -233,7 +235,7 @@ def _open_lasting_faults(s: EstimatorState, chi2: float) -> None:
                         first, second, most, rival = one, other, explained, most
                     elif explained > rival:
                         rival = explained
-        if not opened and chi2 - most < EXPLAINED_CHI2 and most - rival > RIVAL_FAULT_CHI2:
+        if not opened and chi2 - most < settings["explained_chi2"] and most - rival > settings["rival_fault_chi2"]:
             opened = True
             for one in range(faults):
                 anchor = second if one else first
@@ -247,18 +249,19 @@ def end_lasting_fault(s: EstimatorState, anchor: int) -> None:
     settings = s.settings[0]
     _open_fault(s, LASTING, anchor)
     reset_state(s, layout(settings["dim"], len(s.anchors)).constant + anchor, settings["range_std_m"] ** 2)
-    s.status[0]["obstruction"] = min(s.status[0]["obstruction"] + JUMP_RISE, 2.0)
+    s.status[0]["obstruction"] = min(s.status[0]["obstruction"] + settings["jump_rise"], 2.0)
 
 
 @step
 def _open_fault(s: EstimatorState, kind: int, anchor: int) -> None:
     """Add a fault to its anchor's range error; all other hypotheses are conditioned on it (Schur's complement)."""
+    settings = s.settings[0]
     status, is_lasting = s.status[0], kind == LASTING
     status["range_errors"] = max(status["range_errors"], ALL_RANGE_ERRORS if is_lasting else CHANGING_RANGE_ERRORS)
     x, P, V, evidence, information, column = s.x, s.P, s.V, s.evidence, s.information, s.fault_input
     count, n = len(s.anchors), uncertain_states(s)
     where, chosen = layout(s.settings[0]["dim"], count), kind * count + anchor
-    gain = 1.0 / (information[chosen, chosen] + 1.0 / OPENED_STD_M**2)
+    gain = 1.0 / (information[chosen, chosen] + 1.0 / settings["opened_std_m"] ** 2)
     fault_m = gain * evidence[chosen]
     variance = gain if is_lasting else gain + fault_m * fault_m
     opened = V[chosen]  # what it adds to each state: 1 − V for the range error, −V for all others

@@ -1,7 +1,5 @@
 """The filter itself: time update and scalar measurement update of state, covariance and fault sensitivities."""
 
-from typing import Final
-
 import numpy as np
 
 from skyless.core.constants import TICK_S
@@ -19,15 +17,8 @@ from skyless.core.kernels.covariance import (
 # Where range errors jump, those of all anchors change by OBSTRUCTED_STD_M within OBSTRUCTED_S. One that has jumped
 # itself wanders with the density OBSTRUCTED_WALK, m²/s, and returns to zero within OBSTRUCTION_MEMORY_S, else all would
 # drift away together; by OBSTRUCTION_RETURN_M in that time at most, as long delays are no less likely to stay.
-OBSTRUCTED_STD_M: Final = 0.08
-OBSTRUCTED_S: Final = 5.0
-OBSTRUCTED_WALK: Final = 0.004
-OBSTRUCTION_MEMORY_S: Final = 10.0
-OBSTRUCTION_RETURN_M: Final = 0.2
 # Learnt multipath of this standard deviation makes errors that would be taken for jumps.
-MULTIPATH_STD_M: Final = 0.06
 # Part of the process noise of motion that is left for a stationary tag: 5 cm within half a minute.
-STATIONARY_NOISE_SHARE: Final = 2e-7
 
 
 @step
@@ -45,11 +36,11 @@ def predict(s: EstimatorState, rx_ticks: int) -> None:
         speed_squared += s.x[where.velocity + axis] ** 2
     status["walked_m"] += np.sqrt(speed_squared) * dt
     if status["obstruction"] > 0.0:
-        status["obstruction"] *= np.exp(-dt / OBSTRUCTION_MEMORY_S)
+        status["obstruction"] *= np.exp(-dt / settings["obstruction_memory_s"])
     _advance(s, where.velocity, dt)
     motion = settings["qa"] * status["q_scale"]
     if is_stationary(s):
-        motion *= STATIONARY_NOISE_SHARE
+        motion *= settings["stationary_noise_share"]
     for axis in range(dim):
         add_process_noise(s.P, axis, where.velocity + axis, axis, where.velocity + axis, dt, 0.0, motion)
         s.V[FAULT_KINDS * count + axis, axis] -= 0.5 * dt * dt  # an acceleration that the filter does not know of
@@ -89,8 +80,9 @@ def _advance(s: EstimatorState, values: int, dt: float) -> None:
 @step
 def jump_share(s: EstimatorState) -> float:
     """1 where range errors have jumped recently, 0 where none has or learnt multipath is as large."""
+    settings = s.settings[0]
     share, status = 1.0, s.status[0]
-    if status["place_variance_m2"] >= MULTIPATH_STD_M**2:
+    if status["place_variance_m2"] >= settings["multipath_std_m"] ** 2:
         share = 0.0
     return float(share * min(status["obstruction"], 1.0))
 
@@ -104,15 +96,15 @@ def range_error_decay(s: EstimatorState, anchor: int, dt: float, walked_m: float
     forget within seconds; one that has jumped itself wanders and returns to zero.
     """
     status, settings, share = s.status[0], s.settings[0], jump_share(s)
-    obstructed = share * dt / OBSTRUCTED_S
+    obstructed = share * dt / settings["obstructed_s"]
     if s.anchors[anchor]["is_obstructed"]:
         change_m = s.x[layout(settings["dim"], len(s.anchors)).change + anchor]
-        memory_s = OBSTRUCTION_MEMORY_S * max(1.0, abs(change_m) / OBSTRUCTION_RETURN_M)
-        variance = 0.5 * memory_s * OBSTRUCTED_WALK * s.anchors[anchor]["change_scale"]
+        memory_s = settings["obstruction_memory_s"] * max(1.0, abs(change_m) / settings["obstruction_return_m"])
+        variance = 0.5 * memory_s * settings["obstructed_walk"] * s.anchors[anchor]["change_scale"]
         kept = np.exp(-dt / memory_s)
     else:
         place_variance = max(s.anchors[anchor]["change_variance_m2"], status["place_variance_m2"])
-        variance = place_variance + share * OBSTRUCTED_STD_M**2
+        variance = place_variance + share * settings["obstructed_std_m"] ** 2
         usual = dt / settings["place_time_s"] + walked_m / status["place_distance_m"]
         kept = np.exp(-obstructed - (1.0 - share) * usual)
     kept_constant = 1.0

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from skyless.core.constants import TICK_S
-from skyless.core.estimator.faults import SURE_CHI2, fault_chi2, whiten
+from skyless.core.estimator.faults import fault_chi2, whiten
 from skyless.core.estimator.monitor import covariance_scale
 from skyless.core.estimator.state import FAULT_KINDS, LASTING, LASTING_STD_M, EstimatorState
 from skyless.core.integrity import CONTRADICTED, HPL, OBSTRUCTED, SOUND, UNAVAILABLE, VPL
@@ -66,12 +66,8 @@ def protect(s: EstimatorState, levels: Vector) -> None:
 
 
 # Least distance from the plane at which the two sides are compared; for a tag that is farther off it is its own.
-PROBE_M: Final = 1.0
 # Standard deviation of how far the best position on the other side lies from the mirror image, over that distance.
-SHIFT_PART: Final = 0.25
 # The sides differ where their ranges' squared differences, over the variance of range errors, sum to more.
-SIDES_CHI2: Final = 25.0
-SENSOR_VALID_S: Final = 1.0  # time for which a sensor's height resolves which side it is
 
 
 def fit_plane(s: EstimatorState) -> None:
@@ -96,11 +92,11 @@ def is_side_open(s: EstimatorState) -> bool:
     variance = settings["range_std_m"] ** 2 + settings["survey_std_m"] ** 2 + settings["rx_variance_m2"]
     for axis in range(dim):
         off_m += normal[axis] * (s.x[axis] - status["plane_m"][axis])
-    probe_m = max(abs(off_m), PROBE_M) * (1.0 if off_m > 0.0 else -1.0)
+    probe_m = max(abs(off_m), settings["probe_m"]) * (1.0 if off_m > 0.0 else -1.0)
     if count > dim:
         for one in range(dim + 2):
             for other in range(dim + 1):
-                work[one, other] = variance / (SHIFT_PART * probe_m) ** 2 if one == other < dim else 0.0
+                work[one, other] = variance / (settings["shift_part"] * probe_m) ** 2 if one == other < dim else 0.0
         for anchor in range(count):
             tag_m = image_m = 0.0 if dim == 3 else (settings["height_m"] - s.anchors[anchor]["position_m"][2]) ** 2
             for axis in range(dim):
@@ -121,30 +117,24 @@ def is_side_open(s: EstimatorState) -> bool:
     image_z_m = s.x[2] - 2.0 * off_m * normal[2]
     is_possible = dim == 2 or settings["lowest_m"] <= image_z_m <= settings["highest_m"]
     is_near = off_m * off_m * normal[2] ** 2 <= s.P[2, 2]
-    has_sensor = (status["epoch_ticks"] - status["height_ticks"]) * TICK_S < SENSOR_VALID_S
-    return bool(square < SIDES_CHI2 * variance and not has_sensor and (is_possible or is_near))
+    has_sensor = (status["epoch_ticks"] - status["height_ticks"]) * TICK_S < settings["sensor_valid_s"]
+    return bool(square < settings["sides_chi2"] * variance and not has_sensor and (is_possible or is_near))
 
 
 # Whether a position can be relied on
 
 
-UNCOVERED_CHI2: Final = 240.0  # a test of faults beyond this shows one that the levels may not cover
-FIRST_PACKETS: Final = 3  # of each anchor, before which there are no levels
-
-
 # Part of the mean range; ranges are curved within positions of a larger standard deviation, which have no level.
-MAX_LEVEL_STD: Final = 0.05
 # There is no level for this time after a start whose packets contradicted each other: where several anchors are late,
 # the others may agree on a wrong position, until the tag has moved enough to show it.
-CONTRADICTED_START_S: Final = 5.0
 # The same where all range errors are open: then only the tag's motion determines its position, by directions that
 # change, and a filter that is linearised at a wrong position becomes too certain (errors of 5 standard deviations).
-MAX_OPEN_LEVEL_STD: Final = 0.02
 
 
 @step
 def integrity_state(s: EstimatorState, levels: Vector) -> int:
     """Whether a position's levels can be relied on: ``SOUND``, ``OBSTRUCTED``, ``CONTRADICTED`` or ``UNAVAILABLE``."""
+    settings = s.settings[0]
     count, status = len(s.anchors), s.status[0]
     state, range_m = SOUND, 0.0
     for anchor in range(count):
@@ -152,15 +142,15 @@ def integrity_state(s: EstimatorState, levels: Vector) -> int:
         if s.anchors[anchor]["is_obstructed"] or s.anchors[anchor]["has_fault"]:
             state = OBSTRUCTED
     was_contradicted = status["fault_std_m"][LASTING] > LASTING_STD_M  # then none are selected
-    limit = SURE_CHI2 if was_contradicted else UNCOVERED_CHI2
+    limit = settings["sure_chi2"] if was_contradicted else settings["uncovered_chi2"]
     share = np.sqrt(s.P[0, 0] + s.P[1, 1]) / max(range_m, 1e-6)  # levels are of first order in it
     if status["withholds_levels"] or levels[FIRST_TEST:].max() > limit:
         state = CONTRADICTED
-    if was_contradicted and (status["epoch_ticks"] - status["start_ticks"]) * TICK_S < CONTRADICTED_START_S:
+    if was_contradicted and (status["epoch_ticks"] - status["start_ticks"]) * TICK_S < settings["contradicted_start_s"]:
         state = CONTRADICTED
-    if status["open_range_errors"] and share > MAX_OPEN_LEVEL_STD:
+    if status["open_range_errors"] and share > settings["max_open_level_std"]:
         state = CONTRADICTED
-    is_new = count <= s.settings[0]["dim"] or status["packets"] < FIRST_PACKETS * count
-    if is_new or share > MAX_LEVEL_STD or is_side_open(s):
+    is_new = count <= s.settings[0]["dim"] or status["packets"] < settings["first_packets"] * count
+    if is_new or share > settings["max_level_std"] or is_side_open(s):
         state = UNAVAILABLE
     return state

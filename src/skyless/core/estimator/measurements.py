@@ -15,23 +15,9 @@ from typing import Final
 import numpy as np
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_S
-from skyless.core.estimator.faults import (
-    compute_fault_input,
-    end_lasting_fault,
-    gather_evidence,
-    subtract_fault_input,
-)
-from skyless.core.estimator.kalman import (
-    OBSTRUCTED_STD_M,
-    compute_ph,
-    jump_share,
-    relax_range_error,
-    reset_state,
-    update,
-)
+from skyless.core.estimator.faults import compute_fault_input, end_lasting_fault, gather_evidence, subtract_fault_input
+from skyless.core.estimator.kalman import compute_ph, jump_share, relax_range_error, reset_state, update
 from skyless.core.estimator.monitor import (
-    COMMON,
-    LATE_OFTEN_SHARE,
     adapt_change_noise,
     adapt_change_variance,
     adapt_clock_noise,
@@ -57,42 +43,23 @@ from skyless.core.kernels.compiled import step
 from skyless.core.ticks import TICK_MASK
 
 # Where the errors that grow with distance pass through zero, and by which range they change once (APS011).
-SLOPE_FROM_M: Final = 4.0
 # A range is linearised at a held point of the tag, which moves onto the estimate when that is HELD_STEP_M away, or
 # HELD_SHARE of the range if that is less; but within HELD_STD standard deviations of the estimate, up to HELD_MAX_M,
 # it stays, as noise is no motion (``docs/maths.md`` section 6, Linearisation).
-HELD_STEP_M: Final = 0.15
-HELD_SHARE: Final = 0.1
-HELD_STD: Final = 3.0
-HELD_MAX_M: Final = 0.4
-CURVATURE_SHARE: Final = 0.01  # part of the stamps' variance from which the curvature of ranges counts
 # Relays of an anchor in a row beyond the gate, while its receptions jump: its clock has jumped.
-CLOCK_JUMP_RELAYS: Final = 4
-JOIN_VARIANCE_M2: Final = 1.0  # where packets are late often an anchor's first one may be so too
 # Pairs of anchors: PAIR_OUTLIERS relays in a row beyond the gate are another path between the two. After PAIR_RELAYS
 # in either direction their mean is a range; beyond PAIR_SUSPECT standard deviations it contradicts the survey. An
 # anchor with MISPLACED_PAIRS such ranges, more than the other end has, is off by about MISPLACED_STD_M in each
 # coordinate.
-PAIR_OUTLIERS: Final = 4
-PAIR_JUMP_M2: Final = 0.25
-PAIR_RELAYS: Final = 12
-PAIR_SUSPECT: Final = 3.0
-MISPLACED_PAIRS: Final = 2
-MISPLACED_STD_M: Final = 0.3
-REPORT_GAIN: Final = 1.25  # a report is used where the filter's own variance is larger by this factor
 # Least variance of a report over that of a pair of stamps: no anchor knows its clock better.
-MIN_REPORT_VARIANCE: Final = 0.1
 # An anchor with this number of rejected packets in a row joins again: its first was late, so its rate is wrong.
-REJOIN_AFTER: Final = 20
-STEADY_WALK_SCALE: Final = 4.0  # reports of clocks whose random walk counts more than this are not used
 CLOCK_JUMPED: Final = 2
-ZERO_VARIANCE_M2: Final = 1e4  # of a barometer's zero, before its first reading
-STATIONARY_STD_MPS: Final = 0.01  # of the velocity of a tag that stands still, each time a measurement is processed
 
 
 @step
 def _hold_direction(s: EstimatorState, anchor: int) -> None:
     """Move the point at which ranges to an anchor are linearised onto the estimate, once that is far enough away."""
+    settings = s.settings[0]
     dim, a = s.settings[0]["dim"], s.anchors[anchor]
     moved_m, squared, variance = 0.0, 0.0, 0.0
     if dim == 2:
@@ -101,8 +68,8 @@ def _hold_direction(s: EstimatorState, anchor: int) -> None:
         moved_m += (s.x[axis] - a["held_m"][axis]) ** 2
         squared += (s.x[axis] - a["position_m"][axis]) ** 2
         variance += s.P[axis, axis]
-    noise = min(HELD_STD**2 * variance, HELD_MAX_M**2)
-    step = max(noise, min(HELD_STEP_M**2, HELD_SHARE**2 * squared))
+    noise = min(settings["held_std"] ** 2 * variance, settings["held_max_m"] ** 2)
+    step = max(noise, min(settings["held_step_m"] ** 2, settings["held_share"] ** 2 * squared))
     if s.status[0]["range_errors"] == NO_RANGE_ERRORS:
         step = 0.0  # ranges leave nothing open that noise could seem to measure
     moves = not moved_m <= step  # true at first, for NaN
@@ -146,10 +113,11 @@ def _set_term(s: EstimatorState, term: int, state: int, weight: float) -> int:
 @step
 def _range_error_terms(s: EstimatorState, term: int, anchor: int, sign: float) -> int:
     """Range errors of an anchor: the part that changes, the part that stays, and the slope."""
+    settings = s.settings[0]
     where = layout(s.settings[0]["dim"], len(s.anchors))
     term = _set_term(s, term, where.change + anchor, sign)
     term = _set_term(s, term, where.constant + anchor, sign)
-    far = min(max((s.anchors[anchor]["held_range_m"] - SLOPE_FROM_M) / SLOPE_FROM_M, -1.0), 1.0)
+    far = min(max((s.anchors[anchor]["held_range_m"] - settings["slope_from_m"]) / settings["slope_from_m"], -1.0), 1.0)
     return int(_set_term(s, term, where.slope, sign * far))
 
 
@@ -169,11 +137,12 @@ def _curvature_m(s: EstimatorState, range_m: float, variance: float) -> float:
     The second term of its Taylor series, with the variance 2·bend² (Jazwinski 1970, section 9.3); 0 where that is
     small compared with that of the stamps. The direction stands in the first terms of the measurement.
     """
+    settings = s.settings[0]
     dim, P, h = s.settings[0]["dim"], s.P, s.h
     across = 0.0
     for axis in range(dim):
         across += P[axis, axis]
-    least = CURVATURE_SHARE * variance * range_m * range_m
+    least = settings["curvature_share"] * variance * range_m * range_m
     if 0.5 * across * across >= least:
         for one in range(dim):
             for other in range(dim):
@@ -223,14 +192,14 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
     innovation_variance = compute_ph(s, terms) + rx_variance
     a["range_m"] = range_m
     a["innovation"] = innovation / np.sqrt(innovation_variance)
-    if status["late_share"] <= LATE_OFTEN_SHARE:  # late packets are no multipath
+    if status["late_share"] <= settings["late_often_share"]:  # late packets are no multipath
         learn_place(s, anchor, innovation + s.x[where.change + anchor])
     clock_jumped = False
-    if is_warm(s) and abs(a["innovation"]) > COMMON and is_common(s, a["innovation"]):
+    if is_warm(s) and abs(a["innovation"]) > settings["common"] and is_common(s, a["innovation"]):
         status["walk_scale"] = settings["max_walk_scale"]
         a["outliers_in_row"] = 0
     elif is_warm(s) and has_jumped(s, anchor, innovation, innovation_variance):
-        clock_jumped = a["relay_outliers_in_row"] >= CLOCK_JUMP_RELAYS
+        clock_jumped = a["relay_outliers_in_row"] >= settings["clock_jump_relays"]
         if not clock_jumped:
             innovation, innovation_variance = _jump(s, anchor, innovation, terms, rx_variance)
     scale = 0.0 if clock_jumped else variance_scale(s, innovation, innovation_variance)
@@ -251,7 +220,7 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
         a["offset_ticks"] += steps
         s.x[offset] -= steps * TICK_M
     s.anchors[anchor]["rejected_in_row"] = 0 if used else a["rejected_in_row"] + 1
-    return CLOCK_JUMPED if clock_jumped or a["rejected_in_row"] >= REJOIN_AFTER else int(used)
+    return CLOCK_JUMPED if clock_jumped or a["rejected_in_row"] >= settings["rejoin_after"] else int(used)
 
 
 @step
@@ -271,7 +240,7 @@ def _jump(s: EstimatorState, anchor: int, innovation: float, terms: int, rx_vari
         before_m = _h_dot_x(s, 0, terms)
         if a["is_obstructed"]:
             share = jump_share(s)
-            reset_state(s, change, a["change_variance_m2"] + share * OBSTRUCTED_STD_M**2)
+            reset_state(s, change, a["change_variance_m2"] + share * settings["obstructed_std_m"] ** 2)
         else:
             end_lasting_fault(s, anchor)
         innovation += before_m - _h_dot_x(s, 0, terms)
@@ -304,8 +273,8 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
     curvature_m = _curvature_m(s, range_m, variance)
     variance += 2.0 * curvature_m * curvature_m + compute_ph(s, terms)
     compute_fault_input(s, terms, anchor)
-    if s.status[0]["late_share"] > LATE_OFTEN_SHARE:
-        variance += JOIN_VARIANCE_M2
+    if s.status[0]["late_share"] > settings["late_often_share"]:
+        variance += settings["join_variance_m2"]
     for state in range(n):
         P[state, offset] = -s.ph[state]
         P[offset, state] = -s.ph[state]
@@ -377,9 +346,9 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
         i["relay_outliers_in_row"] += 1
         j["relay_outliers_in_row"] += 1
         link["outliers_in_row"] += 1
-        if link["outliers_in_row"] >= PAIR_OUTLIERS:
+        if link["outliers_in_row"] >= settings["pair_outliers"]:
             link["outliers_in_row"] = 0
-            link["variance_m2"] += PAIR_JUMP_M2
+            link["variance_m2"] += settings["pair_jump_m2"]
             s.links[listener, sender]["relays"] = s.links[sender, listener]["relays"] = 0
     else:
         status["relays_used"] += 1
@@ -393,7 +362,7 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
         update(s, innovation, innovation_variance)
         forth, back = s.links[listener, sender], s.links[sender, listener]
         forth["relays"] += 1
-        if forth["relays"] == PAIR_RELAYS and back["relays"] >= PAIR_RELAYS:
+        if forth["relays"] == settings["pair_relays"] and back["relays"] >= settings["pair_relays"]:
             _survey_pair(s, listener, sender)
     s.anchors[sender]["is_relayed"] = 1
 
@@ -401,6 +370,7 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
 @step
 def _survey_pair(s: EstimatorState, one: int, other: int) -> None:
     """Use the range between two anchors for their survey; anchors that contradict most of theirs are misplaced."""
+    settings = s.settings[0]
     count, dim, status = len(s.anchors), s.settings[0]["dim"], s.status[0]
     _pair_range(s, one, other)
     contradicted, rival = 0, 0
@@ -408,7 +378,7 @@ def _survey_pair(s: EstimatorState, one: int, other: int) -> None:
         contradicted += s.links[min(one, anchor), max(one, anchor)]["contradicts"]
         rival += s.links[min(other, anchor), max(other, anchor)]["contradicts"]
     misplaced, where = one if contradicted > rival else other, layout(dim, count)
-    is_misplaced = contradicted != rival and max(contradicted, rival) >= MISPLACED_PAIRS
+    is_misplaced = contradicted != rival and max(contradicted, rival) >= settings["misplaced_pairs"]
     is_misplaced = is_misplaced and s.links[min(one, other), max(one, other)]["contradicts"] != 0
     status["range_errors"] = ALL_RANGE_ERRORS if is_misplaced else status["range_errors"]
     if is_misplaced and s.anchors[misplaced]["is_obstructed"]:  # what seemed to be an obstacle
@@ -416,7 +386,7 @@ def _survey_pair(s: EstimatorState, one: int, other: int) -> None:
         s.anchors[misplaced]["is_obstructed"] = 0
     for axis in range(dim if is_misplaced else 0):
         survey = where.survey + dim * misplaced + axis
-        s.P[survey, survey] += MISPLACED_STD_M**2
+        s.P[survey, survey] += settings["misplaced_std_m"] ** 2
     for anchor in range(count if is_misplaced else 0):
         if s.links[min(misplaced, anchor), max(misplaced, anchor)]["contradicts"]:
             _pair_range(s, misplaced, anchor)
@@ -425,6 +395,7 @@ def _survey_pair(s: EstimatorState, one: int, other: int) -> None:
 @step
 def _pair_range(s: EstimatorState, one: int, other: int) -> None:
     """Process |a + δa − a' − δa'| + constant as two anchors measured it, unless it contradicts the survey."""
+    settings = s.settings[0]
     dim, term, squared = s.settings[0]["dim"], 0, 0.0
     a, b = s.anchors[one], s.anchors[other]
     survey = layout(dim, len(s.anchors)).survey
@@ -437,7 +408,7 @@ def _pair_range(s: EstimatorState, one: int, other: int) -> None:
     link = s.links[min(one, other), max(one, other)]
     innovation = link["constant_m"] - _h_dot_x(s, 0, term)
     innovation_variance = compute_ph(s, term) + s.settings[0]["pair_std_m"] ** 2 + link["variance_m2"]
-    fits = innovation * innovation <= PAIR_SUSPECT**2 * innovation_variance
+    fits = innovation * innovation <= settings["pair_suspect"] ** 2 * innovation_variance
     if fits:
         compute_fault_input(s, term, -1)
         gather_evidence(s, innovation, innovation_variance)
@@ -459,7 +430,9 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
     """
     settings, a = s.settings[0], s.anchors[anchor]
     dim = settings["dim"]
-    variance = max(variance_m2, MIN_REPORT_VARIANCE * (settings["tx_variance_m2"] + settings["rx_variance_m2"]))
+    variance = max(
+        variance_m2, settings["min_report_variance"] * (settings["tx_variance_m2"] + settings["rx_variance_m2"])
+    )
     back_s = a["range_m"] / SPEED_OF_LIGHT_MPS
     where = layout(dim, len(s.anchors))
     term = _set_term(s, 0, where.offset + master, 1.0)
@@ -477,8 +450,8 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
         off -= wrap
     innovation = off * (TICK_M / SUBTICKS) - _h_dot_x(s, 0, term)
     # the filter of an anchor assumes what the almanac states of clocks; behind one that wanders more it lags as well
-    steady = max(a["walk_scale"], s.anchors[master]["walk_scale"]) <= STEADY_WALK_SCALE
-    is_news = steady and own_variance > REPORT_GAIN * variance
+    steady = max(a["walk_scale"], s.anchors[master]["walk_scale"]) <= settings["steady_walk_scale"]
+    is_news = steady and own_variance > settings["report_gain"] * variance
     fits = innovation * innovation <= settings["gate"] ** 2 * (own_variance + variance)
     if is_news and fits:
         compute_ph(s, term)
@@ -574,7 +547,9 @@ def height(s: EstimatorState, height_m: float, std_m: float, is_barometer: bool)
         if is_first:
             s.x[where.zero] = innovation
             s.status[0]["range_errors"] = ALL_RANGE_ERRORS
-        s.P[where.zero, where.zero] += ZERO_VARIANCE_M2 if is_first else settings["barometer_walk"] * since_s
+        s.P[where.zero, where.zero] += (
+            settings["zero_variance_m2"] if is_first else settings["barometer_walk"] * since_s
+        )
         innovation -= s.x[where.zero]
         term = _set_term(s, term, where.zero, 1.0)
     innovation_variance = compute_ph(s, term) + std_m * std_m
@@ -593,11 +568,12 @@ def height(s: EstimatorState, height_m: float, std_m: float, is_barometer: bool)
 @step
 def zero_velocity(s: EstimatorState) -> None:
     """Process the knowledge that a stationary tag has no velocity, one axis after the other."""
+    settings = s.settings[0]
     dim = s.settings[0]["dim"]
     velocity = layout(dim, len(s.anchors)).velocity
     for axis in range(dim):
         term = _set_term(s, 0, velocity + axis, 1.0)
-        variance = compute_ph(s, term) + STATIONARY_STD_MPS**2
+        variance = compute_ph(s, term) + settings["stationary_std_mps"] ** 2
         innovation = -s.x[velocity + axis]
         compute_fault_input(s, term, -1)
         update(s, innovation, variance)

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from skyless.core.air.almanac import AccuracyPage, NoisePage
 from skyless.core.air.local_almanac import CommonPages, LocalAlmanacState
-from skyless.core.estimator.state import EstimatorSettings
+from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.kernels.filter import clock_noise, stamp_variance_m2
 from skyless.core.observation import Observation
 from skyless.core.tag.beacon_receiver import AdmissionState, MethodOptions

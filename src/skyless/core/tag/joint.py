@@ -7,18 +7,9 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.constants import SUBTICKS, TICK_S
-from skyless.core.estimator.estimator import (
-    ACCEPTED,
-    NO_REPORT,
-    REJECTED,
-    STALE,
-    Estimator,
-    Report,
-    SavedEstimator,
-)
-from skyless.core.estimator.faults import SURE_CHI2
-from skyless.core.estimator.levels import UNCOVERED_CHI2
-from skyless.core.estimator.state import CONTRADICTED_STD_M, LASTING_STD_M, OPEN_RANGE_STD_M, EstimatorSettings
+from skyless.core.estimator.estimator import ACCEPTED, NO_REPORT, REJECTED, STALE, Estimator, Report, SavedEstimator
+from skyless.core.estimator.settings import TUNING, EstimatorSettings
+from skyless.core.estimator.state import CONTRADICTED_STD_M, LASTING_STD_M, OPEN_RANGE_STD_M
 from skyless.core.fix import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY, Fix, NoFixReason
 from skyless.core.integrity import UNAVAILABLE, IntegrityRequirement
 from skyless.core.kernels.arrays import Array
@@ -278,12 +269,16 @@ class Estimation:
         if self._course.is_open and age_s > OPEN_START_HOLD_S and self._estimator.fits_settings:
             self._course.open_range_errors = False
             return True
-        if self._estimator.rows.item(QUALITY, 2) > SURE_CHI2:
-            limit = SURE_CHI2 if age_s < EARLY_FAULT_S or self._course.start_was_contradicted else UNCOVERED_CHI2
+        if self._estimator.rows.item(QUALITY, 2) > TUNING.sure_chi2:
+            limit = (
+                TUNING.sure_chi2
+                if age_s < EARLY_FAULT_S or self._course.start_was_contradicted
+                else TUNING.uncovered_chi2
+            )
             calm = self._estimator.obstruction < CALM_OBSTRUCTION
             is_new = not self._course.start_was_contradicted and age_s < EARLY_FAULT_S
             if is_new and self._estimator.unexplained_test < UNEXPLAINED_CHI2:
-                limit = UNCOVERED_CHI2  # one or two anchors, which the estimator will find
+                limit = TUNING.uncovered_chi2  # one or two anchors, which the estimator will find
             if calm and self._estimator.fault_test > limit and (not self._course.is_open or age_s > OPEN_START_HOLD_S):
                 self._course.open_range_errors = not self._estimator.is_late_often
                 return age_s > LATE_SHARE_KNOWN_S or self._course.open_range_errors

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.core.estimator.monitor import COMMON_GAIN, COMMON_LIMIT, WALK_GAIN, WALK_LOSS
-from skyless.core.estimator.state import MAX_CLOCK_RATE, START_WALK_SCALE, EstimatorSettings
+from skyless.core.estimator.settings import MAX_CLOCK_RATE, TUNING, EstimatorSettings
+from skyless.core.estimator.state import START_WALK_SCALE
 from skyless.core.kernels.arrays import Integers, Matrix, Vector
 from skyless.core.kernels.compiled import threaded_kernel
 from skyless.core.tag.factory import RELAY_AGE_S
@@ -93,9 +93,11 @@ class PlainJoint:
 
     def _adapt(self, normalised: float) -> None:
         """The process noise of the tag's clock, from an innovation over its standard deviation."""
-        self._common_mean += COMMON_GAIN * (normalised - self._common_mean)
-        square = self._common_mean**2 * (2.0 - COMMON_GAIN) / COMMON_GAIN
-        self._walk_scale = max(self._walk_scale * (WALK_GAIN if square > COMMON_LIMIT else WALK_LOSS), 1.0)
+        self._common_mean += TUNING.common_gain * (normalised - self._common_mean)
+        square = self._common_mean**2 * (2.0 - TUNING.common_gain) / TUNING.common_gain
+        self._walk_scale = max(
+            self._walk_scale * (TUNING.walk_gain if square > TUNING.common_limit else TUNING.walk_loss), 1.0
+        )
 
     def _process_relay(self, listener: int, of: int, sequence: int, heard: int) -> None:
         n, s = self._n, self._s

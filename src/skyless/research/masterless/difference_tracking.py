@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.constants import TICK_RATE_HZ
 from skyless.core.estimator.estimator import ACCEPTED, Estimator
-from skyless.core.estimator.state import EstimatorSettings
+from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.kernels.arrays import Array

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from skyless.core.air.masterless_packets import Packet, Point, Relay
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ
-from skyless.core.estimator.state import EstimatorSettings
+from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.observation import Observation
 from skyless.core.tag.joint import Estimation

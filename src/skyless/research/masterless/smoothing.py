@@ -18,8 +18,8 @@ from msgspec.structs import replace
 
 from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.constants import TICK_S
-from skyless.core.estimator.kalman import STATIONARY_NOISE_SHARE, is_stationary, range_error_decay
-from skyless.core.estimator.measurements import ZERO_VARIANCE_M2
+from skyless.core.estimator.kalman import is_stationary, range_error_decay
+from skyless.core.estimator.settings import TUNING
 from skyless.core.estimator.state import layout
 from skyless.core.fix import POSITION, VELOCITY, Fix
 from skyless.core.kernels.arrays import Indices, Matrix, Vector
@@ -184,7 +184,7 @@ def _transition(tracking: DifferenceTracking, event: Event, states: _States) -> 
     status = s.status[0]
     if isinstance(event, Height):
         since_s = float(status["epoch_ticks"] - status["height_ticks"]) * TICK_S
-        walked_m2 = min(settings.barometer_walk * since_s, ZERO_VARIANCE_M2)
+        walked_m2 = min(settings.barometer_walk * since_s, TUNING.zero_variance_m2)
         return 0.0, 0.0, [_Decay(states.zero, 1.0, walked_m2)] if event.is_barometer else []
     rx_ticks = tracking.ticks(event.time_s)
     dt_s = max((rx_ticks - status["epoch_ticks"]) * TICK_S, 0.0)
@@ -201,7 +201,7 @@ def _transition(tracking: DifferenceTracking, event: Event, states: _States) -> 
         decays.append(_decay(states.change + column, kept, variance))
         if kept_constant < 1.0:
             decays.append(_decay(states.constant + column, kept_constant, settings.range_std_m**2))
-    q = settings.qa * float(status["q_scale"]) * (STATIONARY_NOISE_SHARE if is_stationary(s) else 1.0)
+    q = settings.qa * float(status["q_scale"]) * (TUNING.stationary_noise_share if is_stationary(s) else 1.0)
     return dt_s, q, decays
 
 

@@ -12,7 +12,7 @@ from numpy.random import Generator
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.core.estimator.estimator import Packets
-from skyless.core.estimator.state import EstimatorSettings
+from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.kernels.arrays import Array, Integers
 
 EPISODE_SUPERFRAMES: Final = 134

@@ -17,14 +17,8 @@ from numpy.typing import ArrayLike
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.core.estimator.kalman import compute_ph, predict, relax_range_error, reset_state, update
 from skyless.core.estimator.measurements import reception_terms, relay_terms
-from skyless.core.estimator.state import (
-    ALL_RANGE_ERRORS,
-    EstimatorSettings,
-    EstimatorState,
-    layout,
-    new_state,
-    with_anchor,
-)
+from skyless.core.estimator.settings import EstimatorSettings
+from skyless.core.estimator.state import ALL_RANGE_ERRORS, EstimatorState, layout, new_state, with_anchor
 from skyless.core.kernels.arrays import Array, Integers, Mask, Vector
 from skyless.core.kernels.compiled import kernel, threaded_kernel
 

@@ -17,22 +17,10 @@ import numpy as np
 
 from skyless.core.constants import TICK_S
 from skyless.core.estimator.faults import compute_fault_input
-from skyless.core.estimator.kalman import (
-    compute_ph,
-    predict,
-    relax_range_error,
-    reset_state,
-    update,
-)
+from skyless.core.estimator.kalman import compute_ph, predict, relax_range_error, reset_state, update
 from skyless.core.estimator.measurements import first_reception, reception_terms, relay_terms, relay_variance
-from skyless.core.estimator.state import (
-    FAULT_KINDS,
-    EstimatorSettings,
-    EstimatorState,
-    layout,
-    new_state,
-    with_anchor,
-)
+from skyless.core.estimator.settings import EstimatorSettings
+from skyless.core.estimator.state import FAULT_KINDS, EstimatorState, layout, new_state, with_anchor
 from skyless.core.kernels.arrays import Integers, Matrix, Vector
 from skyless.core.kernels.compiled import kernel, threaded_kernel
 from skyless.site.planning.anchor_clocks import AnchorClocks, Relays

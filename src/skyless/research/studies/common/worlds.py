@@ -5,7 +5,7 @@
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import lru_cache
 from itertools import compress
 from typing import Any, Final
@@ -16,6 +16,7 @@ from msgspec.structs import replace
 from scipy.stats import chi2
 
 from skyless.core.air.frame import Malformed
+from skyless.core.air.reception import Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.fix import Fix
 from skyless.core.integrity import IntegrityRequirement
@@ -136,11 +137,22 @@ class _Tally:
         )
 
 
+class Heard(Struct, frozen=True):
+    """A beacon at the tags that received it."""
+
+    end_s: float
+    receptions: list[tuple[int, Reception, Array]]
+    """Tag, reception, and the tag's true position, shape (3,)."""
+
+
 def run_world(run: Run) -> RunResult:
     """Run a world and judge its tags."""
+    return judged(run, beacons_of(run))
+
+
+def beacons_of(run: Run) -> Iterator[Heard]:
+    """Simulate what the tags of a world receive."""
     world = world_of(run.site, run.trajectories, run.impairments, run.seed)
-    receivers = [AnyReceiver(run.method, qa=run.qa, integrity=run.integrity) for _ in run.trajectories]
-    tally, messages, cpu_s = _Tally(run), 0, 0.0
     draw = stream(run.seed, _LOSS_KEY, 0)
     for broadcast in world.run(run.until_s):
         if not run.mesh:
@@ -148,13 +160,21 @@ def run_world(run: Run) -> RunResult:
         receptions = list(broadcast.receptions())
         if run.lost_at_tags:
             receptions = list(compress(receptions, draw.random(len(receptions)) >= run.lost_at_tags))
+        yield Heard(broadcast.end_s, receptions)
+
+
+def judged(run: Run, beacons: Iterable[Heard]) -> RunResult:
+    """Let the tags of a world compute their positions from what they received, and judge them."""
+    receivers = [AnyReceiver(run.method, qa=run.qa, integrity=run.integrity) for _ in run.trajectories]
+    tally, messages, cpu_s = _Tally(run), 0, 0.0
+    for beacon in beacons:
         begun_s = time.thread_time()
-        fixes = [receivers[tag].hear(reception) for tag, reception, _ in receptions]
+        fixes = [receivers[tag].hear(reception) for tag, reception, _ in beacon.receptions]
         cpu_s += time.thread_time() - begun_s
-        messages += len(receptions)
-        for (tag, _, truth_m), fix in zip(receptions, fixes, strict=True):
+        messages += len(fixes)
+        for (tag, _, truth_m), fix in zip(beacon.receptions, fixes, strict=True):
             if fix is not None:
-                tally.add(tag, broadcast.end_s, fix, truth_m)
+                tally.add(tag, beacon.end_s, fix, truth_m)
     return tally.result(messages, run.until_s * len(receivers), cpu_s)
 
 
