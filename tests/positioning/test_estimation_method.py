@@ -22,8 +22,9 @@ from msgspec.structs import replace
 from skyless.core.constants import SUBTICKS, TICK_M, TICK_RATE_HZ
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import Alert
-from skyless.core.observation import MasterTerm, Observation
-from skyless.core.tag.joint import Estimation, MasterScale
+from skyless.core.protocol1._master_scale import MasterScale
+from skyless.core.protocol1._master_term import MasterTerm
+from skyless.core.tag.joint import Estimation
 from skyless.core.ticks import TICK_MASK
 
 pytestmark = pytest.mark.site
@@ -324,26 +325,6 @@ def test_fixes_carry_levels_and_alert_limit():
 # Reports of the anchors' clocks
 
 
-def packet(anchor, own_ticks, site_subticks, master_term):
-    whole, fraction = divmod(site_subticks, SUBTICKS)
-    return Observation(
-        anchor,
-        np.zeros(3),
-        0,
-        0,
-        own_ticks,
-        own_ticks,
-        None,
-        None,
-        whole,
-        fraction / SUBTICKS,
-        0.0,
-        (),
-        master_term,
-        1e-4,
-    )
-
-
 def test_a_master_may_lead_the_sites_time_at_another_rate_than_its_own():
     """As one does that took over; the first packets of its term say at which."""
     scale, master_term = MasterScale(), MasterTerm(3, 7)
@@ -351,19 +332,19 @@ def test_a_master_may_lead_the_sites_time_at_another_rate_than_its_own():
     own = [5_000 + k * step for k in range(4)]
     site = [123_456_789_012 + round(t * lead * SUBTICKS) for t in own]
     at = own[-1] + step // 2
-    other = packet(1, 77, 123_456_789_012 + round(at * lead * SUBTICKS), master_term)
-    scale.update(packet(7, own[0], site[0], master_term))
-    assert scale.difference(other) is None
+    site_at = 123_456_789_012 + round(at * lead * SUBTICKS)
+    scale.update(master_term, site[0], own[0])
+    assert scale.difference(master_term, site_at, 77) is None
     for ticks, subticks in zip(own[1:], site[1:], strict=True):
-        scale.update(packet(7, ticks, subticks, master_term))
-    assert abs(scale.difference(other) - (77 - at) * SUBTICKS % MODULO) <= 3
-    assert scale.difference(replace(other, master_term=MasterTerm(4, 7))) is None
-    scale.update(packet(7, own[3] + step, site[3] + 3 * step, master_term))
-    assert scale.difference(replace(other, tx_ticks_master=other.tx_ticks_master + step)) is None
+        scale.update(master_term, subticks, ticks)
+    assert abs(scale.difference(master_term, site_at, 77) - (77 - at) * SUBTICKS % MODULO) <= 3
+    assert scale.difference(MasterTerm(4, 7), site_at, 77) is None
+    scale.update(master_term, site[3] + 3 * step, own[3] + step)
+    assert scale.difference(master_term, site_at + step * SUBTICKS, 77) is None
 
 
-def with_site_time(packets, master_term):
-    """Observations that tell the site's time as each anchor knows it: the first anchor's clock, to 5 mm."""
+def with_reports(packets):
+    """Observations with what each anchor knows of its clock against the first anchor's, to 5 mm."""
     relayed, ends = packets.relays, packets.ends
     master = {int(packets.sequences[k]): int(packets.tx_ticks[k]) for k in np.flatnonzero(packets.anchors == 0)}
     begins, lines = np.concatenate([[0], ends[:-1]]), {}
@@ -388,13 +369,8 @@ def with_site_time(packets, master_term):
         else:
             yield observation
             continue
-        yield replace(
-            observation,
-            tx_ticks_master=int(ticks),
-            tx_fraction_ticks=float(fraction),
-            tx_variance_m2=variance,
-            master_term=master_term,
-        )
+        ahead = (observation.tx_ticks_anchor - int(ticks)) * SUBTICKS - round(float(fraction) * SUBTICKS)
+        yield replace(observation, tx_variance_m2=variance, report=(0, ahead % MODULO))
 
 
 @pytest.mark.statistical
@@ -404,8 +380,8 @@ def test_reports_help_where_most_packets_are_lost():
         episode = episode_of(replace(PLAIN, qa=0.3), 300, seed)
         keep = np.random.default_rng(seed + 50).random(len(episode.path_m)) >= 0.85
         keep[:30] = True
-        told = list(with_site_time(episode.packets, MasterTerm(1, 0)))
-        silent = [replace(o, master_term=None, tx_variance_m2=0.0, tx_ticks_master=None) for o in told]
+        told = list(with_reports(episode.packets))
+        silent = [replace(o, report=None, tx_variance_m2=0.0) for o in told]
         for k, observations in enumerate((silent, told)):
             method = Estimation(settings_of(replace(PLAIN, qa=0.3)))
             for n, observation in enumerate(observations):

@@ -9,13 +9,6 @@ from skyless.core.kernels.arrays import Array
 from skyless.core.ticks import nearest
 
 
-class MasterTerm(Struct, frozen=True, gc=False):
-    """Whose time an anchor states (protocol 1): the master, and how often that role has changed hands, modulo 256."""
-
-    term: int
-    master: int
-
-
 class Observation(Struct, frozen=True, gc=False):
     """A beacon received by the tag; integers never wrap."""
 
@@ -40,8 +33,9 @@ class Observation(Struct, frozen=True, gc=False):
     """Variance of the TX time on the master's scale, from the anchor's clock filter."""
     relays: tuple[tuple[int, int, int], ...] = ()
     """When the anchor received others: (anchor, sequence number, own RX stamp, unwrapped); for ``joint`` only."""
-    master_term: MasterTerm | None = None
-    """Whose time ``tx_ticks_master`` is; for ``joint`` only."""
+    report: tuple[int, int] | None = None
+    """What the anchor knows of its clock: the master, and its own reading less the master's at its TX stamp, in
+    subticks modulo 2⁴⁸, with the variance ``tx_variance_m2``; for ``joint`` only."""
     rx_variance_factor: float = 1.0
     """On the variance of this reception, at least 1: from the radio's diagnostics (``variance_factor``)."""
     packed_relays: bytes = b""

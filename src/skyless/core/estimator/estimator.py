@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from skyless.core.air.frame import HEARD
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.core.estimator.faults import explained_chi2, fade_faults, open_faults
+from skyless.core.estimator.faults import fade_faults, open_faults
 from skyless.core.estimator.kalman import is_stationary, predict
 from skyless.core.estimator.levels import FIRST_TEST, LEVELS, fit_plane, integrity_state, protect
 from skyless.core.estimator.measurements import (
@@ -655,13 +655,6 @@ class Estimator:
         return float(self._levels[FIRST_TEST:].max())
 
     @property
-    def unexplained_test(self) -> float:
-        """What the faults of any two anchors leave of the test of lasting ones."""
-        s = self._state
-        pairs = ((one, other) for one in range(len(s.anchors)) for other in range(one + 1))
-        return float(self._levels[FIRST_TEST + LASTING]) - max(explained_chi2(s, one, other) for one, other in pairs)
-
-    @property
     def fits_settings(self) -> bool:
         """Whether the constants of the ranges are as small as the settings state, as far as they are known."""
         s, count = self._state, len(self._state.anchors)
@@ -685,11 +678,6 @@ class Estimator:
     def jumps(self) -> int:
         """How many range errors have jumped since the start."""
         return int(self._state.status[0]["obstructions"])
-
-    @property
-    def obstruction(self) -> float:
-        """1 where range errors have jumped recently, 0 where they do not."""
-        return float(self._state.status[0]["obstruction"])
 
     @property
     def is_lost(self) -> bool:

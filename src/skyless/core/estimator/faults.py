@@ -33,10 +33,7 @@ from skyless.core.estimator.state import (
 from skyless.core.kernels.arrays import Matrix
 from skyless.core.kernels.compiled import step
 
-# A test beyond this shows a lasting fault: χ² of eight degrees of freedom is larger with a probability of 4·10⁻⁸.
 MAX_FAULTS: Final = 2  # largest number of anchors that are selected
-# Obstacles make packets late, not early; a fault that is early has to explain more by this.
-# Factor on the process noise of a range error that has just jumped: it may still be changing.
 
 
 @step
@@ -176,8 +173,7 @@ def _largest(s: EstimatorState, kind: int) -> float:
 @step
 def _explained_alone(s: EstimatorState, kind: int, anchor: int) -> float:
     """How much the fault of an anchor explains; that it is early is less likely, and counts less."""
-    settings = s.settings[0]
-    fault = kind * len(s.anchors) + anchor
+    settings, fault = s.settings[0], kind * len(s.anchors) + anchor
     y, M = s.evidence[fault], s.information[fault, fault]
     return float((1.0 if y > 0.0 else settings["early_weight"]) * y * y / (M + 1.0 / settings["opened_std_m"] ** 2))
 
@@ -194,7 +190,7 @@ def _open_new_faults(s: EstimatorState, kind: int) -> None:
     for anchor in range(count):
         spare -= 1 if s.anchors[anchor]["is_obstructed"] else 0
         s.ph[anchor] = _explained_alone(s, kind, anchor)
-    limit = _largest(s, kind) - settings["rival_fault_chi2"]
+    limit = _largest(s, kind) - settings["rival_chi2"]
     first = 0
     while spare > 0 and first >= 0:
         first = -1
@@ -235,7 +231,7 @@ def _open_lasting_faults(s: EstimatorState, chi2: float) -> None:
                         first, second, most, rival = one, other, explained, most
                     elif explained > rival:
                         rival = explained
-        if not opened and chi2 - most < settings["explained_chi2"] and most - rival > settings["rival_fault_chi2"]:
+        if not opened and chi2 - most < settings["rival_chi2"] and most - rival > settings["rival_chi2"]:
             opened = True
             for one in range(faults):
                 anchor = second if one else first

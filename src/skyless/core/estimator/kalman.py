@@ -79,12 +79,8 @@ def _advance(s: EstimatorState, values: int, dt: float) -> None:
 
 @step
 def jump_share(s: EstimatorState) -> float:
-    """1 where range errors have jumped recently, 0 where none has or learnt multipath is as large."""
-    settings = s.settings[0]
-    share, status = 1.0, s.status[0]
-    if status["place_variance_m2"] >= settings["multipath_std_m"] ** 2:
-        share = 0.0
-    return float(share * min(status["obstruction"], 1.0))
+    """1 where range errors have jumped recently, 0 where none has."""
+    return float(min(s.status[0]["obstruction"], 1.0))
 
 
 @step

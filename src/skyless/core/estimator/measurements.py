@@ -22,7 +22,6 @@ from skyless.core.estimator.monitor import (
     adapt_change_variance,
     adapt_clock_noise,
     adapt_process_noise,
-    difference_scale,
     end_small_obstruction,
     has_jumped,
     is_common,
@@ -42,17 +41,6 @@ from skyless.core.estimator.state import (
 from skyless.core.kernels.compiled import step
 from skyless.core.ticks import TICK_MASK
 
-# Where the errors that grow with distance pass through zero, and by which range they change once (APS011).
-# A range is linearised at a held point of the tag, which moves onto the estimate when that is HELD_STEP_M away, or
-# HELD_SHARE of the range if that is less; but within HELD_STD standard deviations of the estimate, up to HELD_MAX_M,
-# it stays, as noise is no motion (``docs/maths.md`` section 6, Linearisation).
-# Relays of an anchor in a row beyond the gate, while its receptions jump: its clock has jumped.
-# Pairs of anchors: PAIR_OUTLIERS relays in a row beyond the gate are another path between the two. After PAIR_RELAYS
-# in either direction their mean is a range; beyond PAIR_SUSPECT standard deviations it contradicts the survey. An
-# anchor with MISPLACED_PAIRS such ranges, more than the other end has, is off by about MISPLACED_STD_M in each
-# coordinate.
-# Least variance of a report over that of a pair of stamps: no anchor knows its clock better.
-# An anchor with this number of rejected packets in a row joins again: its first was late, so its rate is wrong.
 CLOCK_JUMPED: Final = 2
 
 
@@ -69,7 +57,7 @@ def _hold_direction(s: EstimatorState, anchor: int) -> None:
         squared += (s.x[axis] - a["position_m"][axis]) ** 2
         variance += s.P[axis, axis]
     noise = min(settings["held_std"] ** 2 * variance, settings["held_max_m"] ** 2)
-    step = max(noise, min(settings["held_step_m"] ** 2, settings["held_share"] ** 2 * squared))
+    step = max(noise, settings["held_step_m"] ** 2)
     if s.status[0]["range_errors"] == NO_RANGE_ERRORS:
         step = 0.0  # ranges leave nothing open that noise could seem to measure
     moves = not moved_m <= step  # true at first, for NaN
@@ -202,7 +190,7 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
         clock_jumped = a["relay_outliers_in_row"] >= settings["clock_jump_relays"]
         if not clock_jumped:
             innovation, innovation_variance = _jump(s, anchor, innovation, terms, rx_variance)
-    scale = 0.0 if clock_jumped else variance_scale(s, innovation, innovation_variance)
+    scale = 0.0 if clock_jumped else variance_scale(s, innovation, innovation_variance, False)
     used = scale > 0.0
     if used:
         end_small_obstruction(s, anchor)
@@ -216,11 +204,10 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
         gather_evidence(s, innovation, used_variance)
         update(s, innovation, used_variance)
         adapt_change_variance(s, anchor, elapsed_s)
-        steps = int(np.floor(s.x[offset] / TICK_M))
-        a["offset_ticks"] += steps
-        s.x[offset] -= steps * TICK_M
-    s.anchors[anchor]["rejected_in_row"] = 0 if used else a["rejected_in_row"] + 1
-    return CLOCK_JUMPED if clock_jumped or a["rejected_in_row"] >= settings["rejoin_after"] else int(used)
+    steps = int(np.floor(s.x[offset] / TICK_M))
+    s.anchors[anchor]["offset_ticks"] += steps
+    s.x[offset] -= steps * TICK_M
+    return CLOCK_JUMPED if clock_jumped else int(used)
 
 
 @step
@@ -273,8 +260,6 @@ def first_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int
     curvature_m = _curvature_m(s, range_m, variance)
     variance += 2.0 * curvature_m * curvature_m + compute_ph(s, terms)
     compute_fault_input(s, terms, anchor)
-    if s.status[0]["late_share"] > settings["late_often_share"]:
-        variance += settings["join_variance_m2"]
     for state in range(n):
         P[state, offset] = -s.ph[state]
         P[offset, state] = -s.ph[state]
@@ -345,15 +330,10 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
         status["relays_lately_rejected"] += 1.0
         i["relay_outliers_in_row"] += 1
         j["relay_outliers_in_row"] += 1
-        link["outliers_in_row"] += 1
-        if link["outliers_in_row"] >= settings["pair_outliers"]:
-            link["outliers_in_row"] = 0
-            link["variance_m2"] += settings["pair_jump_m2"]
-            s.links[listener, sender]["relays"] = s.links[sender, listener]["relays"] = 0
     else:
         status["relays_used"] += 1
         status["relays_lately_accepted"] += 1.0
-        i["relay_outliers_in_row"] = j["relay_outliers_in_row"] = link["outliers_in_row"] = 0
+        i["relay_outliers_in_row"] = j["relay_outliers_in_row"] = 0
         share = pair_variance / innovation_variance
         link["constant_m"] += share * innovation
         link["variance_m2"] -= share * pair_variance
@@ -408,7 +388,7 @@ def _pair_range(s: EstimatorState, one: int, other: int) -> None:
     link = s.links[min(one, other), max(one, other)]
     innovation = link["constant_m"] - _h_dot_x(s, 0, term)
     innovation_variance = compute_ph(s, term) + s.settings[0]["pair_std_m"] ** 2 + link["variance_m2"]
-    fits = innovation * innovation <= settings["pair_suspect"] ** 2 * innovation_variance
+    fits = innovation * innovation <= settings["suspect"] ** 2 * innovation_variance
     if fits:
         compute_fault_input(s, term, -1)
         gather_evidence(s, innovation, innovation_variance)
@@ -430,9 +410,6 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
     """
     settings, a = s.settings[0], s.anchors[anchor]
     dim = settings["dim"]
-    variance = max(
-        variance_m2, settings["min_report_variance"] * (settings["tx_variance_m2"] + settings["rx_variance_m2"])
-    )
     back_s = a["range_m"] / SPEED_OF_LIGHT_MPS
     where = layout(dim, len(s.anchors))
     term = _set_term(s, 0, where.offset + master, 1.0)
@@ -449,15 +426,13 @@ def report(s: EstimatorState, anchor: int, master: int, subticks: int, variance_
     if off >= wrap // 2:
         off -= wrap
     innovation = off * (TICK_M / SUBTICKS) - _h_dot_x(s, 0, term)
-    # the filter of an anchor assumes what the almanac states of clocks; behind one that wanders more it lags as well
-    steady = max(a["walk_scale"], s.anchors[master]["walk_scale"]) <= settings["steady_walk_scale"]
-    is_news = steady and own_variance > settings["report_gain"] * variance
-    fits = innovation * innovation <= settings["gate"] ** 2 * (own_variance + variance)
+    is_news = own_variance > variance_m2
+    fits = innovation * innovation <= settings["gate"] ** 2 * (own_variance + variance_m2)
     if is_news and fits:
         compute_ph(s, term)
         compute_fault_input(s, term, -1)
         # K = P_xd/P for x and V; for the covariance the factor is (P − q)/P², that of an S of P²/(P − q)
-        whole_s = own_variance * own_variance / (own_variance - variance)
+        whole_s = own_variance * own_variance / (own_variance - variance_m2)
         update(s, innovation, whole_s, whole_s / own_variance)
     s.status[0]["reports_used"] += int(is_news and fits)
     s.status[0]["reports_rejected"] += int(is_news and not fits)
@@ -500,7 +475,7 @@ def difference(s: EstimatorState, a: int, b: int, rx_ticks: int, difference_m: f
     terms, expected_m = difference_terms(s, a, b)
     innovation = difference_m - expected_m - _h_dot_x(s, 2 * direction_terms(dim), terms)
     innovation_variance = compute_ph(s, terms) + settings["difference_std_m"] ** 2
-    scale = difference_scale(s, innovation, innovation_variance)
+    scale = variance_scale(s, innovation, innovation_variance, True)
     if scale > 0.0:
         if is_warm(s):
             adapt_process_noise(s, innovation / np.sqrt(innovation_variance) / scale)

@@ -9,36 +9,8 @@ anchor's clock is that clock.
 import numpy as np
 
 from skyless.core.estimator.faults import begin_obstruction
-from skyless.core.estimator.kalman import jump_share
 from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, EstimatorState, layout
 from skyless.core.kernels.compiled import step
-
-# All innovations: weight of the newest in the running means, about the last 50.
-
-# A range error has jumped where IN_ROW innovations of an anchor lie beyond SUSPECT standard deviations, together beyond
-# TOGETHER (by chance once in some million packets), and agree within AGREEMENT standard deviations of two receptions.
-# Where range errors have jumped recently, more jumps are to be expected and less evidence is enough (by chance once in
-# some thousand packets), while enough other anchors are clear: else the tag's clock, which all share, would open all.
-
-# After a jump: the error's standard deviation, unless it has jumped by more. Its process noise is scaled up by GROWTH
-# with each packet while the squared running mean of its innovations, 1 where it wanders as expected, exceeds LIMIT.
-# An obstruction has ended where the error is known to this, and within this number of standard deviations of 0.
-
-# Late receptions: density of their normalised innovations (a standard deviation of 5 cm, a metre late), and the number
-# of standard deviations beyond which innovations have less weight, of receptions where they are late often, of
-# differences always.
-
-# Multipath: range errors are compared after each step of the tag and after two. As jumps are not multipath, a
-# comparison counts as PLACE_LIMIT times their mean at most, which leaves PLACE_LIMITED_MEAN of a normal mean square.
-# PLACE_FIRST comparisons stand for the stamps' noise beforehand; PLACE_SAMPLES are needed, and PLACE_MEMORY
-# remembered.
-
-# Motion: a tag moves where the mean square of its way, over the variances, exceeds MOVED. Process noise grows while the
-# mean square of the innovations' running means along the axes, 1 where the filter is right, exceeds LAG_LIMIT.
-
-# The tag's clock: limit of the squared running mean of all innovations. Where the newest of all anchors lie beyond
-# COMMON standard deviations on one side, it has left its rate: nothing else makes all late, or early, at once.
-# Each anchor's clock: limit of the squared running mean of what relays show of it.
 
 
 @step
@@ -61,26 +33,17 @@ def is_warm(s: EstimatorState) -> bool:
 def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_variance: float) -> bool:
     """Whether this reception and those before it show that an anchor's range error has jumped."""
     a, status, settings = s.anchors[anchor], s.status[0], s.settings[0]
-    free = 0
-    for other in range(len(s.anchors)):
-        free += 0 if s.anchors[other]["is_obstructed"] else 1
-    share = jump_share(s) * (1.0 if free > settings["dim"] + 1 else 0.0)
-    suspect = settings["suspect"] + share * (settings["obstructed_suspect"] - settings["suspect"])
-    together = settings["together"] + share * (settings["obstructed_together"] - settings["together"])
-    if innovation * innovation <= suspect * suspect * innovation_variance:
+    if innovation * innovation <= settings["suspect"] ** 2 * innovation_variance:
         a["outliers_in_row"] = 0
     else:
         stamps = 2.0 * (settings["tx_variance_m2"] + settings["rx_variance_m2"])
-        apart = innovation - a["outlier_m"]
-        both = innovation + a["outlier_m"]
-        agrees = a["outliers_in_row"] > 0 and apart * apart <= settings["agreement"] * settings["agreement"] * stamps
-        agrees = agrees and both * both > together * together * innovation_variance
+        apart, both = innovation - a["outlier_m"], innovation + a["outlier_m"]
+        agrees = a["outliers_in_row"] > 0 and apart * apart <= settings["agreement"] ** 2 * stamps
+        agrees = agrees and both * both > settings["together"] ** 2 * innovation_variance
         a["outliers_in_row"] = a["outliers_in_row"] + 1 if agrees else 1
         a["outlier_m"] = innovation
-    needed = (
-        settings["in_row_where_late"] if status["late_share"] > settings["late_often_share"] else settings["in_row"]
-    )
-    return bool(a["outliers_in_row"] >= needed)
+    often = status["late_share"] > settings["late_often_share"]
+    return bool(a["outliers_in_row"] >= (settings["in_row_where_late"] if often else settings["in_row"]))
 
 
 @step
@@ -113,14 +76,19 @@ def open_range_error(s: EstimatorState, anchor: int, innovation: float) -> None:
 
 @step
 def adapt_change_noise(s: EstimatorState, anchor: int, normalised: float) -> None:
-    """Raise the process noise of an obstructed anchor's range error where its innovations stay on one side."""
-    settings = s.settings[0]
-    a = s.anchors[anchor]
+    """Adapt the process noise of an obstructed anchor's range error to an innovation."""
+    settings, a = s.settings[0], s.anchors[anchor]
     a["change_mean"] += settings["change_gain"] * (normalised - a["change_mean"])
-    if a["change_mean"] ** 2 * (2.0 - settings["change_gain"]) / settings["change_gain"] > settings["change_limit"]:
+    if _is_off_zero(a["change_mean"], settings["change_gain"], settings["mean_limit"]):
         a["change_scale"] = min(a["change_scale"] * settings["change_growth"], settings["max_change_scale"])
     else:
         a["change_scale"] = max(a["change_scale"] * settings["change_loss"], 1.0)
+
+
+@step
+def _is_off_zero(mean: float, gain: float, limit: float) -> bool:
+    """Whether the square of a running mean of normalised innovations exceeds its expectation that many times."""
+    return bool(mean * mean * (2.0 - gain) / gain > limit)
 
 
 @step
@@ -140,50 +108,31 @@ def end_small_obstruction(s: EstimatorState, anchor: int) -> None:
 
 
 @step
-def variance_scale(s: EstimatorState, innovation: float, innovation_variance: float) -> float:
-    """Factor on the innovation's variance of a reception of the tag; 0 if it is not to be used. Counts it."""
-    status, settings = s.status[0], s.settings[0]
-    normalised = innovation / np.sqrt(innovation_variance)
-    within = -settings["gate"] <= normalised <= settings["gate"]
-    status["late_share"] += settings["late_forgetting"] * ((0.0 if within else 1.0) - status["late_share"])
-    status["rejected_share"] *= 1.0 - settings["forgetting"]
-    scale, gate = 1.0, gate_of(s)
-    if not within or normalised > gate:
-        scale = 0.0
-        status["rejected"] += 1
-        if not within:
-            status["rejected_in_row"] += 1
-            status["rejected_share"] += settings["forgetting"]
-    else:
-        status["accepted"] += 1
-        status["rejected_in_row"] = 0
-        status["mean_nis"] += settings["forgetting"] * (normalised * normalised - status["mean_nis"])
-        status["mean_square_m2"] += settings["forgetting"] * (innovation * innovation - status["mean_square_m2"])
-        if status["late_share"] > settings["late_often_share"] and abs(normalised) > settings["reception_huber"]:
-            scale = abs(normalised) / settings["reception_huber"]
-    return float(scale)
+def variance_scale(s: EstimatorState, innovation: float, innovation_variance: float, is_difference: bool) -> float:
+    """Factor on an innovation's variance; 0 if the measurement is not to be used. Counts it.
 
-
-@step
-def difference_scale(s: EstimatorState, innovation: float, innovation_variance: float) -> float:
-    """Factor on the innovation's variance of a time difference; 0 if it is not to be used. Counts it.
-
-    Either of its anchors may be late, so large ones have less weight on both sides.
+    Large innovations have less weight where receptions are late often, and always in time differences, of which
+    either anchor may be late.
     """
-    settings = s.settings[0]
-    status, normalised = s.status[0], abs(innovation) / np.sqrt(innovation_variance)
-    used = normalised <= s.settings[0]["gate"]
-    status["rejected_share"] *= 1.0 - settings["forgetting"]
+    status, settings, forgetting = s.status[0], s.settings[0], s.settings[0]["forgetting"]
+    normalised = innovation / np.sqrt(innovation_variance)
+    beyond = 0.0 if -settings["gate"] <= normalised <= settings["gate"] else 1.0
+    if not is_difference:
+        status["late_share"] += settings["late_forgetting"] * (beyond - status["late_share"])
+    used = beyond == 0.0 and (is_difference or normalised <= gate_of(s))
+    has_less_weight = is_difference or status["late_share"] > settings["late_often_share"]
+    limit = settings["difference_huber"] if is_difference else settings["reception_huber"]
+    scale = max(1.0, abs(normalised) / limit) if used and has_less_weight else 1.0 if used else 0.0
     if used:
         status["accepted"] += 1
         status["rejected_in_row"] = 0
-        status["mean_nis"] += settings["forgetting"] * (normalised * normalised - status["mean_nis"])
-        status["mean_square_m2"] += settings["forgetting"] * (innovation * innovation - status["mean_square_m2"])
+        status["mean_nis"] += forgetting * (normalised * normalised - status["mean_nis"])
+        status["mean_square_m2"] += forgetting * (innovation * innovation - status["mean_square_m2"])
     else:
         status["rejected"] += 1
-        status["rejected_in_row"] += 1
-        status["rejected_share"] += settings["forgetting"]
-    return float(max(1.0, normalised / settings["difference_huber"])) if used else 0.0
+        status["rejected_in_row"] += int(beyond)
+    s.status[0]["rejected_share"] += forgetting * (beyond - status["rejected_share"])
+    return float(scale)
 
 
 @step
@@ -211,19 +160,16 @@ def learn_place(s: EstimatorState, anchor: int, residual_m: float) -> None:
     a Gauss–Markov process of variance σ² with the correlation c over a step (a semivariogram, Matheron 1963).
     """
     settings, status, a = s.settings[0], s.status[0], s.anchors[anchor]
-    step_m, velocity = status["walked_m"] - a["place_walked_m"], layout(settings["dim"], len(s.anchors)).velocity
-    motion = 0.0  # beyond the estimate's noise
-    for state in range(velocity, velocity + settings["dim"]):
-        motion += s.x[state] ** 2 - settings["place_moving"] ** 2 * s.P[state, state]
+    step_m = status["walked_m"] - a["place_walked_m"]
     if step_m >= settings["place_step_m"]:
-        a["place_steps"] = a["place_steps"] + 1 if step_m < 2.0 * settings["place_step_m"] and motion > 0.0 else 0
+        a["place_steps"] = a["place_steps"] + 1 if step_m < 2.0 * settings["place_step_m"] else 0
         if a["place_steps"] >= 2:
             status["place_samples"] = min(status["place_samples"] + 1, int(settings["place_memory"]))
             for lag in range(2):
                 half = 0.5 * (residual_m - a["place_residual_m"][lag]) ** 2
                 mean = status["place_square_m2"][lag]
                 limited = min(half, settings["place_limit"] * mean) / settings["place_limited_mean"]
-                status["place_square_m2"][lag] += (limited - mean) / (settings["place_first"] + status["place_samples"])
+                status["place_square_m2"][lag] += (limited - mean) / status["place_samples"]
         a["place_residual_m"][1] = a["place_residual_m"][0]
         a["place_residual_m"][0] = residual_m
         a["place_walked_m"] = status["walked_m"]
@@ -231,8 +177,8 @@ def learn_place(s: EstimatorState, anchor: int, residual_m: float) -> None:
         near, far = status["place_square_m2"][0] - noise, status["place_square_m2"][1] - noise
         status["place_variance_m2"], status["place_distance_m"] = 0.0, settings["place_distance_m"]
         if status["place_samples"] >= settings["place_samples"] and near > settings["place_min_m2"]:
-            kept = min(max(far / near - 1.0, settings["place_min_kept"]), settings["place_max_kept"])
-            variance = min(settings["place_absorbed"] * near / (1.0 - kept), settings["max_change_std_m"] ** 2)
+            kept = min(max(far / near - 1.0, settings["place_kept"]), 1.0 - settings["place_kept"])
+            variance = min(near / (1.0 - kept), settings["max_change_std_m"] ** 2)
             if variance > settings["place_std_m"] ** 2:
                 status["place_variance_m2"], status["place_distance_m"] = (
                     variance,
@@ -263,30 +209,40 @@ def update_stationary(s: EstimatorState, dt: float) -> None:
 
 @step
 def adapt_process_noise(s: EstimatorState, normalised: float) -> None:
-    """Raise the motion's and the tag clock's process noise where innovations stay on one side, else lower it.
+    """Adapt the process noise of the tag's motion and clock to an innovation.
 
     The direction to the anchor stands in ``h``, the first of the measurement's terms.
     """
-    settings = s.settings[0]
-    status, dim = s.status[0], s.settings[0]["dim"]
-    square = 0.0
-    for axis in range(dim):
-        status["lag"][axis] += settings["lag_gain"] * (s.h[axis] * normalised - status["lag"][axis])
+    settings, status = s.settings[0], s.status[0]
+    gain, square = settings["mean_gain"], 0.0
+    for axis in range(settings["dim"]):
+        status["lag"][axis] += gain * (s.h[axis] * normalised - status["lag"][axis])
         square += status["lag"][axis] ** 2
-    square *= (2.0 - settings["lag_gain"]) / settings["lag_gain"]
+    square *= (2.0 - gain) / gain
     status["lag_square"] += settings["lag_forgetting"] * (square - status["lag_square"])
     if status["lag_square"] > settings["lag_limit"]:
         status["q_scale"] = min(status["q_scale"] * settings["q_scale_gain"], settings["max_q_scale"])
     else:
-        status["q_scale"] = max(status["q_scale"] * settings["q_scale_loss"], 1.0)
-    status["common_mean"] += settings["common_gain"] * (normalised - status["common_mean"])
-    if (
-        status["common_mean"] ** 2 * (2.0 - settings["common_gain"]) / settings["common_gain"]
-        > settings["common_limit"]
-    ):
-        status["walk_scale"] = min(status["walk_scale"] * settings["walk_gain"], s.settings[0]["max_walk_scale"])
-    else:
-        status["walk_scale"] = max(status["walk_scale"] * settings["walk_loss"], 1.0)
+        status["q_scale"] = max(status["q_scale"] * settings["scale_loss"], 1.0)
+    status["common_mean"] += gain * (normalised - status["common_mean"])
+    status["walk_scale"] = _walk_scale(s, status["walk_scale"], status["common_mean"])
+
+
+@step
+def adapt_clock_noise(s: EstimatorState, anchor: int, normalised: float) -> None:
+    """Adapt the process noise of an anchor's clock to what a relay shows of it."""
+    a = s.anchors[anchor]
+    a["relay_mean"] += s.settings[0]["mean_gain"] * (normalised - a["relay_mean"])
+    a["walk_scale"] = _walk_scale(s, a["walk_scale"], a["relay_mean"])
+
+
+@step
+def _walk_scale(s: EstimatorState, scale: float, mean: float) -> float:
+    """Factor on the random walk of a clock: it grows while the running mean of its innovations is off zero."""
+    settings = s.settings[0]
+    grows = _is_off_zero(mean, settings["mean_gain"], settings["mean_limit"])
+    scale *= settings["walk_scale_gain"] if grows else settings["scale_loss"]
+    return float(min(max(scale, 1.0), settings["max_walk_scale"]))
 
 
 @step
@@ -298,15 +254,3 @@ def covariance_scale(s: EstimatorState) -> float:
     settings = s.settings[0]
     nis = s.status[0]["mean_nis"]
     return float(nis * nis) if nis > settings["inconsistent_nis"] else 1.0
-
-
-@step
-def adapt_clock_noise(s: EstimatorState, anchor: int, normalised: float) -> None:
-    """Raise the process noise of an anchor's clock where what relays show of it stays on one side, else lower it."""
-    settings = s.settings[0]
-    a = s.anchors[anchor]
-    a["relay_mean"] += settings["relay_gain"] * (normalised - a["relay_mean"])
-    if a["relay_mean"] ** 2 * (2.0 - settings["relay_gain"]) / settings["relay_gain"] > settings["relay_limit"]:
-        a["walk_scale"] = min(a["walk_scale"] * settings["relay_walk_gain"], s.settings[0]["max_walk_scale"])
-    else:
-        a["walk_scale"] = max(a["walk_scale"] * settings["relay_walk_loss"], 1.0)

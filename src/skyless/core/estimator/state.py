@@ -57,7 +57,6 @@ ANCHOR_DTYPE: Final = np.dtype(
         ("has_tx_noise", np.int64),  # whether its newest packet's TX noise is a state
         ("packets", np.int64),
         ("innovation", np.float64),  # its newest one, normalised
-        ("rejected_in_row", np.int64),
         ("outliers_in_row", np.int64),
         ("outlier_m", np.float64),  # the newest of them
         ("is_obstructed", np.int64),  # whether its range error has jumped and not come back
@@ -84,7 +83,6 @@ LINK_DTYPE: Final = np.dtype(
         ("tx_ticks", np.int64),  # newest packet of the sender whose reception by the listener was processed
         ("constant_m", np.float64),  # estimated constant of the pair, in the row of the lower index
         ("variance_m2", np.float64),  # variance of that
-        ("outliers_in_row", np.int64),
         ("relays", np.int64),  # used in this direction
         ("contradicts", np.int64),  # whether its range contradicts the survey
     ],

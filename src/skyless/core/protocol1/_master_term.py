@@ -4,7 +4,6 @@ from typing import Final
 
 from msgspec import Struct, field
 
-from skyless.core.observation import MasterTerm
 from skyless.core.protocol1.beacon import Beacon
 from skyless.core.ticks import from_seconds
 
@@ -15,6 +14,13 @@ _CONFIRMATION_TICKS: Final = from_seconds(0.5)
 
 _OLDER_AFTER_TICKS: Final = from_seconds(0.5)
 """A whole site that was switched off and on counts its terms from 0 again."""
+
+
+class MasterTerm(Struct, frozen=True, gc=False):
+    """Whose time an anchor states: the master, and how often that role has changed hands, modulo 256."""
+
+    term: int
+    master: int
 
 
 def master_term_of(beacon: Beacon) -> MasterTerm:

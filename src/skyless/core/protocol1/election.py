@@ -3,8 +3,7 @@
 from enum import StrEnum
 from typing import Final
 
-from skyless.core.observation import MasterTerm
-from skyless.core.protocol1._master_term import TERMS, Confirmations, is_newer, master_term_of
+from skyless.core.protocol1._master_term import TERMS, Confirmations, MasterTerm, is_newer, master_term_of
 from skyless.core.protocol1._watch import MasterWatch
 from skyless.core.protocol1.beacon import Beacon
 from skyless.core.protocol1.schedule import Schedule

@@ -15,6 +15,7 @@ from skyless.core.integrity import IntegrityRequirement
 from skyless.core.kernels.arrays import Array
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.core.observation import Observation
+from skyless.core.protocol1._master_scale import MasterScale
 from skyless.core.protocol1._master_term import FollowedMaster, master_term_of
 from skyless.core.protocol1.almanac import AlmanacAssembly, AlmanacState
 from skyless.core.protocol1.beacon import Beacon
@@ -40,7 +41,8 @@ class ReceiverState(Struct, frozen=True, tag="protocol-1"):
     almanac: AlmanacState
     followed: FollowedMaster
     master: int | None
-    master_scale: tuple[int, int] | None
+    time_scale: tuple[int, int] | None
+    master_scale: MasterScale
     superframe_ticks: int
     has_method_key: bool
     """Whether a method has been looked for since stamps were forgotten."""
@@ -78,6 +80,7 @@ class Receiver(BeaconReceiver[Beacon]):
         self._method_key: object = None
         self._superframe_ticks = 0
         self._followed = FollowedMaster()
+        self._master_scale = MasterScale()
         self._master: int | None = None
         self._positions: dict[int, Array] = {}
         self._positions_issue: int | None = None
@@ -89,7 +92,8 @@ class Receiver(BeaconReceiver[Beacon]):
             almanac=self.almanac.state(),
             followed=self._followed,
             master=self._master,
-            master_scale=self._scale,
+            time_scale=self._scale,
+            master_scale=self._master_scale,
             superframe_ticks=self._superframe_ticks,
             has_method_key=self._method_key is not None,
             method=None if self._method is None else self._method.state(),
@@ -107,7 +111,7 @@ class Receiver(BeaconReceiver[Beacon]):
         made._superframe_ticks, made._followed = state.superframe_ticks, state.followed
         made.almanac.restore(state.almanac)
         made._read_positions()
-        made._master, made._scale = state.master, state.master_scale
+        made._master, made._scale, made._master_scale = state.master, state.time_scale, state.master_scale
         if state.has_method_key:
             made._choose_method()
         match made._method, state.method:
@@ -181,15 +185,22 @@ class Receiver(BeaconReceiver[Beacon]):
                 beacon.anchor, anchor_m, self._round(beacon), beacon.sequence, rx_ticks, tx_ticks, master_sequence,
                 master_rx_ticks, ticks_master, fraction, variance_m2, (), None, factor,
             )  # fmt: skip
-        master_term = self._followed.master_term
-        if ticks_master is None:
-            master_term = None
-        elif master_term is None or master_term.master != beacon.master or master_term.term != beacon.term:
-            master_term = master_term_of(beacon)
         return Observation(
             beacon.anchor, anchor_m, 0, beacon.sequence, rx_ticks, tx_ticks, None, None, ticks_master, fraction,
-            variance_m2, (), master_term, factor, packed_relays(reception.frame, beacon),
+            variance_m2, (), self._report(beacon, tx_ticks, ticks_master), factor,
+            packed_relays(reception.frame, beacon),
         )  # fmt: skip
+
+    def _report(self, beacon: Beacon, tx_ticks: int, ticks_master: int | None) -> tuple[int, int] | None:
+        """What an anchor reports of its clock against the master's (``Observation.report``)."""
+        if beacon.master_time is None or ticks_master is None:
+            return None
+        master_term, subticks = master_term_of(beacon), beacon.master_time.tx_subticks_master % SUBTICKS
+        site_subticks = ticks_master * SUBTICKS + subticks
+        if beacon.anchor == beacon.master:
+            self._master_scale.update(master_term, site_subticks, tx_ticks)
+        difference = self._master_scale.difference(master_term, site_subticks, tx_ticks)
+        return None if difference is None else (beacon.master, difference)
 
     def _round(self, beacon: Beacon) -> int:
         """Round of a frame, counted from the master's slot: what follows a frame of the master refers to it."""
@@ -225,7 +236,7 @@ class Receiver(BeaconReceiver[Beacon]):
 
     def _forget_stamps(self) -> None:
         self._scale = None
-        self._followed = FollowedMaster()
+        self._followed, self._master_scale = FollowedMaster(), MasterScale()
         self._method = self._method_key = None
 
     def _read_almanac(self, beacon: Beacon) -> None:

@@ -6,14 +6,14 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.constants import SUBTICKS, TICK_S
+from skyless.core.constants import TICK_S
 from skyless.core.estimator.estimator import ACCEPTED, NO_REPORT, REJECTED, STALE, Estimator, Report, SavedEstimator
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.estimator.state import CONTRADICTED_STD_M, LASTING_STD_M, OPEN_RANGE_STD_M
 from skyless.core.fix import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY, Fix, NoFixReason
 from skyless.core.integrity import UNAVAILABLE, IntegrityRequirement
 from skyless.core.kernels.arrays import Array
-from skyless.core.observation import MasterTerm, Observation
+from skyless.core.observation import Observation
 from skyless.core.tag._acquisition import (
     EARLY_S,
     MAX_RELATIVE_STD,
@@ -28,27 +28,18 @@ from skyless.core.tag._acquisition import (
     Acquisition,
     Start,
 )
-from skyless.core.ticks import TICK_MASK, FixTime, from_seconds
+from skyless.core.ticks import FixTime, from_seconds
 
 # Factor on the start's covariance, as the filter is then given the packets that it rests on.
 COVARIANCE_MARGIN: Final = 4.0
-# Faults that show within this time of a start, and whose anchors are not clear, have led to a wrong position.
-EARLY_FAULT_S: Final = 2.0
-UNEXPLAINED_CHI2: Final = 30.0  # what faults of two anchors leave of the test where there are more
-# Number of range errors that jump early, and mean NIS, beyond which the tag is faster than assumed.
-MANY_JUMPS: Final = 3
-EARLY_NIS: Final = 3.0
+MANY_JUMPS: Final = 3  # of range errors, soon after a start: the tag is faster than assumed
 # A sensor's height is not wrong by more standard deviations than this; where this number of them in a row do not fit,
 # the position is wrong.
 HEIGHT_SIGMAS: Final = 5.0
 MAX_HEIGHTS_REJECTED: Final = 20
-# Range errors that have jumped more recently cause faults themselves; a new start would not help.
-CALM_OBSTRUCTION: Final = 0.1
 # In longer ones a tag may be metres away when it receives an anchor again: nothing is predicted over them, and each
 # round of packets is a start of its own.
 LONGEST_SUPERFRAME_S: Final = 2.0
-# By then it is known how often packets are late; a start that was wrong for that reason is repeated.
-LATE_SHARE_KNOWN_S: Final = 0.5
 # A start with open range errors is not repeated for this time; then it is, once they fit the settings.
 OPEN_START_HOLD_S: Final = 1.0
 # Packets that are older than the newest by less are late from the radio or the host; others mean another counter.
@@ -64,13 +55,6 @@ class AnchorsInUseState(Struct, frozen=True):
     used: tuple[Observation, ...]
     checked_ticks: int
     extent_m: float
-
-
-class MasterScaleState(Struct, frozen=True):
-    """What a ``MasterScale`` keeps: of each packet site time and its lead, each in ticks and subticks."""
-
-    master_term: MasterTerm | None
-    points: tuple[tuple[int, int, int, int], ...]
 
 
 class _Course(Struct):
@@ -95,7 +79,6 @@ class EstimationState(Struct, frozen=True, tag="joint"):
     estimator: SavedEstimator
     start: Acquisition | None
     in_use: AnchorsInUseState
-    master_scale: MasterScaleState
     course: _Course
 
 
@@ -130,13 +113,10 @@ class Estimation:
         self._start: Acquisition | None = self._new_start()
         self._time = fix_time or FixTime()
         self._in_use = AnchorsInUse(superframe_s)
-        self._master_scale = MasterScale()
 
     def state(self) -> EstimationState:
         """All that it keeps, as it is now."""
-        return EstimationState(
-            self._estimator.save(), self._start, self._in_use.state(), self._master_scale.state(), self._course
-        )
+        return EstimationState(self._estimator.save(), self._start, self._in_use.state(), self._course)
 
     def restore(self, state: EstimationState) -> None:
         """Continue from the state of one with the same settings.
@@ -147,7 +127,6 @@ class Estimation:
         self._start = state.start
         self._estimator.restore(state.estimator)
         self._in_use.restore(state.in_use)
-        self._master_scale.restore(state.master_scale)
         self._course = state.course
 
     @property
@@ -180,15 +159,9 @@ class Estimation:
 
     def update(self, observation: Observation) -> Fix | NoFixReason:
         """Process one observation; a fix for every accepted packet once started."""
-        ticks_master, rx_ticks, master_term = (
-            observation.tx_ticks_master,
-            observation.rx_ticks_tag,
-            observation.master_term,
-        )
+        ticks_master, rx_ticks = observation.tx_ticks_master, observation.rx_ticks_tag
         if ticks_master is not None:
             self._course.master_less_tag_ticks = ticks_master - rx_ticks
-            if master_term is not None and master_term.master == observation.anchor:
-                self._master_scale.update(observation)
         if (
             self._start is None
             and not 0 <= rx_ticks - self._course.newest_ticks < SURELY_IN_REACH_TICKS
@@ -252,11 +225,9 @@ class Estimation:
         self._start = self._new_start()
 
     def _is_too_fast(self, rx_ticks: int) -> bool:
-        """Whether the range errors of several anchors jump early, or nothing fits: it is the tag that has moved."""
-        if (rx_ticks - self._course.started_ticks) * TICK_S >= EARLY_S:
-            return False
-        several = self._estimator.jumps >= MANY_JUMPS or self._estimator.rows.item(QUALITY, 0) > EARLY_NIS
-        return several and self._course.speed_std_mps < MAX_SPEED_STD_MPS
+        """Whether the range errors of several anchors jump early: it is the tag that has moved."""
+        is_early = (rx_ticks - self._course.started_ticks) * TICK_S < EARLY_S
+        return is_early and self._estimator.jumps >= MANY_JUMPS and self._course.speed_std_mps < MAX_SPEED_STD_MPS
 
     def _is_contradicted(self, rx_ticks: int) -> bool:
         """Whether a new start is needed, as relays or faults contradict this one; decides what that has to expect."""
@@ -270,18 +241,10 @@ class Estimation:
             self._course.open_range_errors = False
             return True
         if self._estimator.rows.item(QUALITY, 2) > TUNING.sure_chi2:
-            limit = (
-                TUNING.sure_chi2
-                if age_s < EARLY_FAULT_S or self._course.start_was_contradicted
-                else TUNING.uncovered_chi2
-            )
-            calm = self._estimator.obstruction < CALM_OBSTRUCTION
-            is_new = not self._course.start_was_contradicted and age_s < EARLY_FAULT_S
-            if is_new and self._estimator.unexplained_test < UNEXPLAINED_CHI2:
-                limit = TUNING.uncovered_chi2  # one or two anchors, which the estimator will find
-            if calm and self._estimator.fault_test > limit and (not self._course.is_open or age_s > OPEN_START_HOLD_S):
+            limit = TUNING.sure_chi2 if self._course.start_was_contradicted else TUNING.uncovered_chi2
+            if self._estimator.fault_test > limit and (not self._course.is_open or age_s > OPEN_START_HOLD_S):
                 self._course.open_range_errors = not self._estimator.is_late_often
-                return age_s > LATE_SHARE_KNOWN_S or self._course.open_range_errors
+                return True
         if not self._course.relays_may_contradict:
             self._course.relays_may_contradict = self._estimator.relays_fit
         elif self._estimator.is_contradicted:
@@ -368,11 +331,11 @@ class Estimation:
 
     def _report(self, observation: Observation) -> Report:
         """What the anchor reports of its clock against the master's."""
-        master_term, variance_m2 = observation.master_term, observation.tx_variance_m2
-        if master_term is None or variance_m2 <= 0.0:
+        if observation.report is None or observation.tx_variance_m2 <= 0.0:
             return NO_REPORT
-        master, subticks = self._estimator.index_of.get(master_term.master), self._master_scale.difference(observation)
-        return NO_REPORT if master is None or subticks is None else Report(master, subticks, variance_m2)
+        master, subticks = observation.report
+        index = self._estimator.index_of.get(master)
+        return NO_REPORT if index is None else Report(index, subticks, observation.tx_variance_m2)
 
     def _fix_of(self, start: Start, observation: Observation) -> Fix:
         """What a start knows by itself: a position, and of the velocity that it is a tag's; no protection level."""
@@ -471,68 +434,3 @@ class AnchorsInUse:
         """From a position, shape (2,) or (3,), to the anchors."""
         away = self.anchors_m[:, : len(position_m)] - position_m
         return float(np.linalg.norm(away, axis=1).mean())
-
-
-# The master's own counter
-
-
-FARTHEST_LENGTHS: Final = 16  # lines are extended by this number of times their length
-MISFIT_SUBTICKS: Final = 64  # by which a master's packets may lie off the line: roundings, extended that far
-
-SITE_TIME_MASK: Final = SUBTICKS * (TICK_MASK + 1) - 1
-
-
-class MasterScale:
-    """The master's own counter against the site's time, which it may continue at another rate than its own."""
-
-    def __init__(self) -> None:
-        self._master_term: MasterTerm | None = None
-        self._points: tuple[tuple[int, int], ...] = ()
-        """Site time in subticks and its lead on the master's counter, of the first and the last packet of the term."""
-
-    def state(self) -> MasterScaleState:
-        """All that it keeps; in 64 bits, which subticks exceed."""
-        points = ((*divmod(site, SUBTICKS), *divmod(lead, SUBTICKS)) for site, lead in self._points)
-        return MasterScaleState(self._master_term, tuple(points))
-
-    def restore(self, state: MasterScaleState) -> None:
-        """Continue from a state."""
-        self._master_term = state.master_term
-        self._points = tuple((site * SUBTICKS + a, lead * SUBTICKS + b) for site, a, lead, b in state.points)
-
-    def update(self, observation: Observation) -> None:
-        """Process a packet of the master."""
-        master_term = observation.master_term
-        if master_term is None or observation.anchor != master_term.master:
-            return
-        site, lead = _site_time(observation)
-        if master_term != self._master_term:
-            self._master_term, self._points = master_term, ((site, lead),)
-        elif site > self._points[-1][0]:
-            expected = self._lead(site)
-            fits = len(self._points) < 2 or (expected is not None and abs(expected - lead) <= MISFIT_SUBTICKS)
-            self._points = (self._points[0], (site, lead)) if fits else ((site, lead),)
-
-    def difference(self, observation: Observation) -> int | None:
-        """The sender's reading less the master's at its TX stamp, in subticks modulo 2⁴⁸; None while not known."""
-        master_term, ticks = observation.master_term, observation.tx_ticks_master
-        if master_term is None or ticks is None or master_term != self._master_term:
-            return None
-        site = ticks * SUBTICKS + round(observation.tx_fraction_ticks * SUBTICKS)
-        lead = self._lead(site)
-        return None if lead is None else (lead - site + observation.tx_ticks_anchor * SUBTICKS) & SITE_TIME_MASK
-
-    def _lead(self, site: int) -> int | None:
-        """Lead of the site's time on the master's counter, on a straight line; None too far from what is known."""
-        if len(self._points) < 2:
-            return None
-        (first, before), (last, lead) = self._points
-        length, beyond = last - first, site - last
-        return lead + (lead - before) * beyond // length if 0 <= beyond <= FARTHEST_LENGTHS * length else None
-
-
-def _site_time(observation: Observation) -> tuple[int, int]:
-    """Site time in subticks, and by how much it is ahead of the sender's counter."""
-    assert observation.tx_ticks_master is not None
-    site = observation.tx_ticks_master * SUBTICKS + round(observation.tx_fraction_ticks * SUBTICKS)
-    return site, site - observation.tx_ticks_anchor * SUBTICKS

@@ -93,10 +93,10 @@ class PlainJoint:
 
     def _adapt(self, normalised: float) -> None:
         """The process noise of the tag's clock, from an innovation over its standard deviation."""
-        self._common_mean += TUNING.common_gain * (normalised - self._common_mean)
-        square = self._common_mean**2 * (2.0 - TUNING.common_gain) / TUNING.common_gain
+        self._common_mean += TUNING.mean_gain * (normalised - self._common_mean)
+        square = self._common_mean**2 * (2.0 - TUNING.mean_gain) / TUNING.mean_gain
         self._walk_scale = max(
-            self._walk_scale * (TUNING.walk_gain if square > TUNING.common_limit else TUNING.walk_loss), 1.0
+            self._walk_scale * (TUNING.walk_scale_gain if square > TUNING.mean_limit else TUNING.scale_loss), 1.0
         )
 
     def _process_relay(self, listener: int, of: int, sequence: int, heard: int) -> None:
