@@ -31,7 +31,7 @@ from skyless.research.replays.inputs import (
 )
 from skyless.research.replays.noise import NoiseByPair, PairNoise
 from skyless.research.replays.options import DIFFERENCES_MADE, PACKETS, ReplayOptions
-from skyless.research.replays.pipelines import ByOwnEstimator, ByPackets, ByPairs, Pipeline, Smoothed
+from skyless.research.replays.pipelines import ByOwnEstimator, ByPackets, ByPairs, Pipeline, Record, Smoothed
 from skyless.sim.evaluation.figures import Figures, FixSamples, FixTable, Judged, figures_of
 from skyless.sim.evaluation.truth import estimated_offset_s, shifted, truth_at
 from skyless.site.survey.anchor_errors import DifferenceCalibration
@@ -192,8 +192,17 @@ class CaptureReplay:
         )
         return ByPackets(tracking, PairEngine(bits, anchors_m=self._known_m), self._noise)
 
-    def run(self, on_fix: Callable[[Fix], None] | None, on_progress: Callable[[float], None]) -> ReplayReport:
-        """Read to the end; ``on_fix`` gets every fix, ``on_progress`` now and then the share that is done."""
+    def run(
+        self,
+        on_fix: Callable[[Fix], None] | None,
+        on_progress: Callable[[float], None],
+        on_measured: Callable[[float, Record, bool], None] | None = None,
+    ) -> ReplayReport:
+        """Read to the end.
+
+        ``on_fix`` gets every fix, ``on_progress`` now and then the share that is done, and ``on_measured`` the parts of
+        ``Measured``.
+        """
         started_s, size = time.perf_counter(), max(Path(self._asked.file).stat().st_size, 1)
         reading = READING_SHARE if self._asked.smooth else 1.0
         with closing(self.recording):
@@ -202,6 +211,7 @@ class CaptureReplay:
                 for record in batch:
                     self.receptions += 1
                     time_s, fix = self._pipeline.process(record)
+                    self._tell(on_measured)
                     if time_s is not None:
                         self._first_s = time_s if self._first_s is None else self._first_s
                         self._last_s = time_s
@@ -213,6 +223,7 @@ class CaptureReplay:
                 on_progress(reading * min(self.recording.bytes_read / size, 1.0))
             for fix in self._pipeline.rest(lambda share: on_progress(reading + (1.0 - reading) * share)):
                 self._add(fix, on_fix)
+            self._tell(on_measured)
         table = self.samples.table()
         self._check_truth(table)
         offset_s = None if self._truth is None else estimated_offset_s(self._truth, table.time_s, table.position_m)
@@ -221,6 +232,11 @@ class CaptureReplay:
             self._noise.truth = self._truth
         figures = figures_of(table, self.judged, self.samples.count)
         return self._report(figures, offset_s, time.perf_counter() - started_s)
+
+    def _tell(self, on_measured: Callable[[float, Record, bool], None] | None) -> None:
+        if on_measured is not None:
+            for measured in self._pipeline.measured():
+                on_measured(*measured)
 
     def _is_over(self) -> bool:
         """Whether as much has been replayed as was asked for."""
