@@ -67,30 +67,29 @@ def replay(asked: ReplayOptions, *more: Path, output: _Output) -> int:
     below it takes --site, --tag, --method, --integrity-risk, --alert-limit-m, --max-acceleration, --tag-height-std,
     --settle, --above, --fixes-csv, --plot and --json.
 
-    Of several recordings each has its own report, and --json writes one line with all of them, under recordings; one that
-    cannot be replayed is named, and the others still are.
+    Of several recordings each has its own report, and --json writes one line with all of them, under recordings; one
+    that cannot be replayed is named, and the others still are.
 
-    Ends with exit code 1 if a recording gives no fix at all, and names the likely reason; with 2 if one cannot be replayed.
+    Ends with exit code 1 if a recording gives no fix at all, and names the likely reason; with 2 if one cannot be
+    replayed.
     """
     if not more:
         code, summary = _replayed(asked, output)
         if output.json:
             print_json(summary)
         return code
-    output.leave_out(
-        "fixes_csv", "plot", why="it is one file, and there are several recordings; replay them one by one"
-    )
+    output.leave_out("fixes_csv", "plot", why="it is one file, and there are several recordings")
     for file in more:
         existing_file("FILE", file)
     codes, told = [], []
-    for file in (asked.file, *more):
+    for one in (asked.file, *more):
         try:
-            code, summary = _replayed(replace(asked, file=file), output, f"{file}: ")
+            code, summary = _replayed(replace(asked, file=one), output, f"{one}: ")
         except (SkylessError, OSError) as error:
-            print(f"skyless: {file}: {error}", file=sys.stderr)
+            print(f"skyless: {one}: {error}", file=sys.stderr)
             code, summary = USER_ERROR, {"error": str(error)}
         codes.append(code)
-        told.append({"file": file, **summary})
+        told.append({"file": one, **summary})
     if output.json:
         print_json({"recordings": told})
     return max(codes)
