@@ -49,7 +49,8 @@ READING_SHARE: Final = 0.1
 """Part of the time of a smoothed replay in which the recording is read."""
 
 FORMATS_BY_PACKETS: Final = frozenset({"bitcraze-yaml", "bitcraze-text", "bitcraze-binary"})
-"""Formats of which packets are used by default, as real captures showed that to be better; of Avalue's it was not."""
+"""Formats of which packets are used by default, as real captures showed that to be better; of Avalue's and MULoc's it
+was not."""
 
 
 _MAX_WITHOUT_ANCHORS: Final = 20_000
@@ -115,13 +116,15 @@ class CaptureReplay:
         )
         self._asked, kind = asked, format_of(asked.file, asked.format)
         self._anchors_m, site_height_m = known_anchors(asked.anchors, asked.site)
+        if not self._anchors_m and kind.read_anchors is not None:
+            self._anchors_m = kind.read_anchors(asked.file)
         self._truth = known_truth(Path(asked.file), asked)
         if not self._anchors_m:
             _check_carries_anchors(asked)
-        self._known_m = self._anchors_m or _stated_anchors(asked, kind)
+        self.known_m = self._anchors_m or _stated_anchors(asked, kind)
         """Positions at the recording's beginning, for time differences; packets carry theirs, which may change."""
         self.height_m, self._height_std_m, self.height_note = height_to_hold(
-            asked.tag_height_m, self._known_m, site_height_m, self._truth, kind.name
+            asked.tag_height_m, self.known_m, site_height_m, self._truth, kind.name
         )
         if asked.tag_height_std_m is not None:
             self._height_std_m = asked.tag_height_std_m
@@ -138,7 +141,7 @@ class CaptureReplay:
         table = asked.anchors if isinstance(asked.anchors, str | Path) and not asked.uncalibrated else None
         if calibration is None and table is not None and Path(table).suffix not in YAML_SUFFIXES:
             self._calibration = read_calibration(table)
-        self._noise = NoiseByPair(self._truth, self._known_m)
+        self._noise = NoiseByPair(self._truth, self.known_m)
         self._pipeline = self._new_pipeline()
         self.receptions = 0
         self.samples = FixSamples()
@@ -166,14 +169,14 @@ class CaptureReplay:
         if self.measurements == PACKETS:
             return self._by_packets()
         bits = self.recording.format.tx_bits
-        engine = None if bits is None else PairEngine(bits, anchors_m=self._known_m)
+        engine = None if bits is None else PairEngine(bits, anchors_m=self.known_m)
         if self._asked.estimator is not None:
-            return ByOwnEstimator(self._asked.estimator(), self._known_m, engine, self._noise)
+            return ByOwnEstimator(self._asked.estimator(), self.known_m, engine, self._noise)
         asked = {"qa": self._qa, "difference_std_m": self._asked.tdoa_std_m, "height_m": self.height_m}
         asked["height_std_m"] = self._height_std_m
         known = {key: value for key, value in asked.items() if value is not None}
         settings = structs.replace(PROFILES.get(self.recording.format.name, DIFFERENCES), **known)
-        tracking = DifferenceTracking(settings, self._known_m, self._asked.z_bounds_m, self._calibration)
+        tracking = DifferenceTracking(settings, self.known_m, self._asked.z_bounds_m, self._calibration)
         return (Smoothed if self._asked.smooth else ByPairs)(tracking, engine, self._noise)
 
     def _by_packets(self) -> ByPackets:
@@ -190,7 +193,7 @@ class CaptureReplay:
             calibration=self._calibration,
             one_way=structs.replace(DL_TDOA_ONE_WAY, **known) if is_dl_tdoa else None,
         )
-        return ByPackets(tracking, PairEngine(bits, anchors_m=self._known_m), self._noise)
+        return ByPackets(tracking, PairEngine(bits, anchors_m=self.known_m), self._noise)
 
     def run(
         self,
@@ -279,7 +282,7 @@ class CaptureReplay:
     def _report(self, figures: Figures, offset_s: float | None, wall_s: float) -> ReplayReport:
         pairs, fixes = self._noise.pairs(), self.samples.count
         span_s = self._last_s - (self._first_s or 0.0)
-        reason = self._pipeline.reason if self._known_m or fixes else NoFixReason.NO_ALMANAC
+        reason = self._pipeline.reason if self.known_m or fixes else NoFixReason.NO_ALMANAC
         total = self.recording.drops + self._pipeline.drops
         drops = {name: count for name, count in sorted(total.items()) if count}
         by_m = sorted(self._pipeline.contradictions_m.items())
