@@ -33,6 +33,10 @@ def muloc_file(**changed):
 
 SAMPLES = {
     "muloc": muloc_file(),
+    "starloc": (
+        b"time_s,from_id,to_id,tx1,rx1,tx2,rx2,tx3,rx3\n"
+        b"0.00,1,4,0,0,300000,300020,1900000,1900020\n0.01,1,5,0,0,300000,300020,1900000,1900020\n"
+    ),
     "bitcraze-yaml": yaml_document(*PACKET),
     "bitcraze-text": text_line(*PACKET),
     "bitcraze-binary": b"boot\xbc\x00" + binary_record(*PACKET),

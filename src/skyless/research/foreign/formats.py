@@ -20,6 +20,7 @@ from skyless.research.foreign import _bitcraze_captures as bitcraze_captures
 from skyless.research.foreign import _crazyflie as crazyflie
 from skyless.research.foreign import _muloc as muloc
 from skyless.research.foreign import _phones as phones
+from skyless.research.foreign import _starloc as starloc
 from skyless.research.foreign import _tdoa_tables as tdoa_tables
 from skyless.research.foreign import avalue
 from skyless.site.tables import Truth, read_truth
@@ -130,6 +131,16 @@ FORMATS: Final = (
         "UCI capture, pcapng of link type 299 (DL-TDoA measurements, versions 1 and 2)",
         fira.recognise_pcapng,
         fira.read_pcapng,
+    ),
+    Format(
+        "starloc",
+        "STARLOC's two-way exchanges of a tag with anchors (uwb.csv), as differences of successive ranges",
+        starloc.recognise,
+        starloc.read,
+        None,
+        any_listener=True,
+        read_truth=starloc.read_truth,
+        read_anchors=starloc.read_anchors,
     ),
     Format(
         "muloc",
