@@ -60,8 +60,8 @@ def replay(asked: ReplayOptions, *more: Path, output: _Output) -> int:
     """Turn a recording, or each of several, into fixes; judge them where the truth is known.
 
     Reads recordings of skyless record (MCAP), Bitcraze sniffer captures (YAML, binary, text; TDoA2 and TDoA3), FiRa
-    UCI logs (binary, text) and phones' records (JSON) of DL-TDoA, tables of time differences, MILUV passive ticks and
-    Avalue receptions; the format is recognised by the content.
+    UCI logs (binary, text) and phones' records (JSON) of DL-TDoA, tables of time differences, MILUV passive ticks,
+    Avalue receptions, and recordings of MULoc and STARLOC; the format is recognised by the content.
 
     A recording of skyless record knows its site and truth and gives the very fixes that the tags gave; of the options
     below it takes --site, --tag, --method, --integrity-risk, --alert-limit-m, --max-acceleration, --tag-height-std,
