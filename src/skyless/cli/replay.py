@@ -86,7 +86,8 @@ def replay(asked: ReplayOptions, *more: Path, output: _Output) -> int:
         try:
             code, summary = _replayed(replace(asked, file=one), output, f"{one}: ")
         except (SkylessError, OSError) as error:
-            print(f"skyless: {one}: {error}", file=sys.stderr)
+            named = "" if str(one) in str(error) else f"{one}: "
+            print(f"skyless: {named}{error}", file=sys.stderr)
             code, summary = USER_ERROR, {"error": str(error)}
         codes.append(code)
         told.append({"file": one, **summary})
