@@ -145,6 +145,48 @@ def test_fixes_of_replays(results):
     assert np.isfinite(results.recorded.fixes.hpl_m).any()
 
 
+def test_measurements_of_a_replay_are_what_the_estimator_was_given(results, folder):
+    told, table = results.replay.measurements, results.replay.measurements.to_dataframe()
+    assert len(told) == len(table) == results.replay.reports["tag"].receptions == ROWS
+    recorded = list(skyless.open_recording(folder / "tdoa-table"))
+    for name in ("time_s", "anchor_a", "anchor_b", "tdoa_m"):
+        np.testing.assert_array_equal(getattr(told, name), [getattr(pair, name) for pair in recorded])
+    assert told.used.sum() == len(results.replay.fixes)
+    assert (told.rx_ticks == -1).all()
+    with pytest.raises(ValueError, match="read-only"):
+        told.tdoa_m[0] = 0.0
+
+
+def test_measurements_of_packets_and_beacons(results, folder):
+    synthetic.write(folder / "bitcraze-text", "bitcraze-text", 200)
+    result = skyless.replay(folder / "bitcraze-text", anchors=synthetic.ANCHORS_M)
+    told, recorded = result.measurements, list(skyless.open_recording(folder / "bitcraze-text"))
+    for ours, theirs in {"anchor_b": "anchor", "sequence": "sequence", "tx_ticks": "tx_ticks"}.items():
+        np.testing.assert_array_equal(getattr(told, ours), [getattr(packet, theirs) for packet in recorded])
+    assert np.isin(result.fixes.time_s, told.time_s[told.used]).all()
+    beacons = results.recorded.measurements
+    assert beacons.used.sum() == len(results.recorded.fixes)
+    assert np.isin(results.recorded.fixes.time_s, beacons.time_s).all()
+
+
+class EverySecond:
+    """An estimator that makes a fix of every second difference."""
+
+    def __init__(self):
+        self.count = 0
+
+    def hear(self, observation):
+        self.count += 1
+        return skyless.Fix.of(observation.time_s, (1.0, 1.0, 1.0)) if self.count % 2 else None
+
+
+@pytest.mark.parametrize("options", [{"smooth": True}, {"estimator": EverySecond}])
+def test_measurements_of_other_estimators(folder, options):
+    result = skyless.replay(folder / "tdoa-table", anchors=folder / "anchors.csv", **options)
+    assert len(result.measurements) == ROWS
+    assert result.measurements.used.sum() == len(result.fixes) > 0
+
+
 def test_values_serve_as_well_as_files(results, folder):
     """Anchors as a mapping, truth as an array, a site as a value."""
     truth = np.loadtxt(folder / "truth.csv", delimiter=",", skiprows=1)

@@ -126,6 +126,33 @@ def test_a_fixes_file_of_a_tag_at_known_height_has_that_height(run, tmp_path):
         assert {row["z_m"] for row in csv.DictReader(file)} == {"1.20000"}
 
 
+def test_several_recordings_have_a_report_each(run, tmp_path):
+    bad = tmp_path / "letter.txt"
+    bad.write_text("Dear reader,\n" * 30)
+    files, options = ["tdoa-table", bad, "bitcraze-text"], ["--anchors", "anchors.csv"]
+    code, out, err = run(*files, *options, "--json")
+    told = json.loads(out)["recordings"]
+    assert (code, out.count("\n")) == (2, 1)
+    assert [one["file"] for one in told] == list(map(str, files))
+    assert str(bad) in err and "a recording of skyless record" in told[1]["error"]
+    for one in (told[0], told[2]):
+        alone = report(run(one["file"], *options, "--json"))
+        assert one["median_m"] == alone["median_m"]
+    code, out, _ = run("tdoa-table", "bitcraze-text", *options)
+    assert code == 0
+    assert "tdoa-table: tdoa-table: 1500 receptions" in out and "bitcraze-text: bitcraze-text" in out
+
+
+def test_several_recordings_have_no_single_output(run, tmp_path):
+    for option in ("--fixes-csv", "--plot"):
+        code, out, err = run("tdoa-table", "bitcraze-text", "--anchors", "anchors.csv", option, tmp_path / "out.png")
+        assert (code, out) == (2, "")
+        assert f"{option} is" in err and "several recordings" in err
+    code, out, err = run("tdoa-table", "nowhere", "--anchors", "anchors.csv")
+    assert (code, out) == (2, "")
+    assert "'nowhere'" in err
+
+
 def test_heights(run):
     arguments = ["tdoa-table", "--anchors", "anchors.csv", "--json"]
     assert report(run(*arguments))["height_m"] is None  # these anchors tell it

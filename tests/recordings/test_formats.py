@@ -1,5 +1,7 @@
 import gzip
+import io
 
+import numpy as np
 import pytest
 from capture_makers import binary_record, tdoa3, text_line, yaml_document
 
@@ -8,7 +10,33 @@ from skyless.research.foreign.formats import FORMATS, open_recording
 from synthetic_recordings import CRAZYFLIE_KINDS, crazyflie_log, pcapng, phone_records, uci_binary, uci_text
 
 PACKET = (2, 12345, tdoa3(5, 6, [(1, 2, 3, 33000)]))
+
+
+def muloc_file(**changed):
+    """One round of a MULoc recording in which anchor 0 heard nothing, as the tag did after it."""
+    rx_ticks = np.full((1, 4, 5), -1)
+    rx_ticks[0, :, 4] = [1000 + k * ((600 << 16) + 32_880) for k in range(4)]
+    rx_ticks[0, 0, 1] = 5_000
+    arrays = {
+        "anchors_m": [[0.0, 0.0], [0.0, 4.0], [3.0, 4.0], [3.0, 0.0]],
+        "start_m": [1.0, 1.0],
+        "end_m": [2.0, 1.0],
+        "stops_s": [[0.0, 1.0], [3.0, 4.0]],
+        "index": [7],
+        "channel": [1],
+        "rx_ticks": rx_ticks,
+    }
+    file = io.BytesIO()
+    np.savez_compressed(file, **(arrays | changed))
+    return file.getvalue()
+
+
 SAMPLES = {
+    "muloc": muloc_file(),
+    "starloc": (
+        b"time_s,from_id,to_id,tx1,rx1,tx2,rx2,tx3,rx3\n"
+        b"0.00,1,4,0,0,300000,300020,1900000,1900020\n0.01,1,5,0,0,300000,300020,1900000,1900020\n"
+    ),
     "bitcraze-yaml": yaml_document(*PACKET),
     "bitcraze-text": text_line(*PACKET),
     "bitcraze-binary": b"boot\xbc\x00" + binary_record(*PACKET),

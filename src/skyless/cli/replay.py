@@ -4,15 +4,15 @@ import csv
 import sys
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from cyclopts import App
 from msgspec.structs import replace
 
 from skyless.cli.common.options import check_output, check_picture, command
-from skyless.cli.common.output import NO_FIX, new_table, print_facts, print_json, print_warnings
+from skyless.cli.common.output import NO_FIX, USER_ERROR, new_table, print_facts, print_json, print_warnings
 from skyless.cli.common.progress import loading_kernels, progress_bar
-from skyless.core.arguments import Options
+from skyless.core.arguments import Options, existing_file
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import METHODS, SNAPSHOTS
 from skyless.research.replays.options import ReplayOptions
@@ -56,19 +56,48 @@ class _Output(Options, frozen=True, kw_only=True):
 
 @app.default
 @command
-def replay(asked: ReplayOptions, output: _Output) -> int:
-    """Turn a recording into fixes; judge them where the truth is known.
+def replay(asked: ReplayOptions, *more: Path, output: _Output) -> int:
+    """Turn a recording, or each of several, into fixes; judge them where the truth is known.
 
     Reads recordings of skyless record (MCAP), Bitcraze sniffer captures (YAML, binary, text; TDoA2 and TDoA3), FiRa
-    UCI logs (binary, text) and phones' records (JSON) of DL-TDoA, tables of time differences, MILUV passive ticks and
-    Avalue receptions; the format is recognised by the content.
+    UCI logs (binary, text) and phones' records (JSON) of DL-TDoA, tables of time differences, MILUV passive ticks,
+    Avalue receptions, and recordings of MULoc and STARLOC; the format is recognised by the content.
 
     A recording of skyless record knows its site and truth and gives the very fixes that the tags gave; of the options
     below it takes --site, --tag, --method, --integrity-risk, --alert-limit-m, --max-acceleration, --tag-height-std,
     --settle, --above, --fixes-csv, --plot and --json.
 
-    Ends with exit code 1 if there is no fix at all, and names the likely reason.
+    Of several recordings each has its own report, and --json writes one line with all of them, under recordings; one
+    that cannot be replayed is named, and the others still are.
+
+    Ends with exit code 1 if a recording gives no fix at all, and names the likely reason; with 2 if one cannot be
+    replayed.
     """
+    if not more:
+        code, summary = _replayed(asked, output)
+        if output.json:
+            print_json(summary)
+        return code
+    output.leave_out("fixes_csv", "plot", why="it is one file, and there are several recordings")
+    for file in more:
+        existing_file("FILE", file)
+    codes, told = [], []
+    for one in (asked.file, *more):
+        try:
+            code, summary = _replayed(replace(asked, file=one), output, f"{one}: ")
+        except (SkylessError, OSError) as error:
+            named = "" if str(one) in str(error) else f"{one}: "
+            print(f"skyless: {named}{error}", file=sys.stderr)
+            code, summary = USER_ERROR, {"error": str(error)}
+        codes.append(code)
+        told.append({"file": one, **summary})
+    if output.json:
+        print_json({"recordings": told})
+    return max(codes)
+
+
+def _replayed(asked: ReplayOptions, output: _Output, name: str = "") -> tuple[int, dict[str, Any]]:
+    """Replay one recording, whose ``name`` stands before what is reported: exit code, and what --json writes."""
     inputs = [path for path in (asked.file, asked.anchors, asked.site, asked.truth) if isinstance(path, Path)]
     check_output("fixes-csv", output.fixes_csv, *inputs)
     check_output("plot", output.plot, *inputs, output.fixes_csv)
@@ -99,20 +128,18 @@ def replay(asked: ReplayOptions, output: _Output) -> int:
         except (OSError, ValueError) as error:
             raise SkylessError(f"{output.plot} cannot be drawn: {error}") from None
     for tag, report in result.reports.items():
-        _warn_of_few_members(tag, report)
-    if output.json:
-        print_json(result.summary)
-    else:
+        _warn_of_few_members(f"{name}{tag}", report)
+    if not output.json:
         for tag, report in result.reports.items():
-            print_facts(f"{report.format}: {report.receptions} receptions", result.facts_of(tag))
+            print_facts(f"{name}{report.format}: {report.receptions} receptions", result.facts_of(tag))
         print_warnings(result.warnings)
     reports = list(result.reports.values())
     for report in reports:
-        _warn_of_unknown(report)
+        _warn_of_unknown(name, report)
     if any(report.fixes for report in reports):
-        return 0
-    print(f"skyless: no fix: {_likely_reason(reports[0], asked)}", file=sys.stderr)
-    return NO_FIX
+        return 0, result.summary
+    print(f"skyless: {name}no fix: {_likely_reason(reports[0], asked)}", file=sys.stderr)
+    return NO_FIX, result.summary
 
 
 def _load_kernels(given: str) -> None:
@@ -143,12 +170,14 @@ _REASONS: Final = {
 """Why a recording gives no fix, by the reason that the filter gave last."""
 
 
-def _warn_of_unknown(report: "ReplayReport") -> None:
+def _warn_of_unknown(name: str, report: "ReplayReport") -> None:
     """Warn where fixes are of the lesser part of a recording."""
     unknown = report.drops.get("unknown-anchor", 0)
     if report.fixes and unknown >= _MANY_UNKNOWN * report.receptions:
         share = f"{unknown} of {report.receptions} receptions ({unknown / report.receptions:.0%})"
-        _warn(f"{share} are of anchors that the table or site file does not have; does it belong to this recording?")
+        _warn(
+            f"{name}{share} are of anchors that the table or site file does not have; does it belong to this recording?"
+        )
 
 
 def _warn_of_few_members(tag: str, report: "ReplayReport") -> None:

@@ -1,6 +1,7 @@
 """``skyless.replay``: a recording becomes fixes, judged against the truth where there is one."""
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -11,7 +12,8 @@ from msgspec.structs import replace
 
 from skyless.cli.api._result import Result, cm
 from skyless.cli.api.fixes import Fixes, FixRecorder
-from skyless.core.air.masterless_packets import Point
+from skyless.cli.api.measurements import MeasurementRecorder, Measurements
+from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.core.arguments import python_function, wrong
 from skyless.core.errors import ConfigurationError
 from skyless.core.fix import Fix
@@ -48,6 +50,8 @@ class ReplayResult(Result, frozen=True, eq=False):
     """Time, position and true position of each tag, shape (k, 7): an even sample, for drawing."""
     judged: dict[str, Judged]
     """Which fixes of each tag are judged, and against which truth."""
+    measurements: Measurements
+    """What the estimator was given, and whether it used that."""
     warnings: tuple[str, ...]
     height_note: str
     """Where the tags' height is from."""
@@ -176,16 +180,23 @@ Begin = Callable[[tuple[str, ...], str], OnFix | None]
 """Gets, before a replay begins, the tags' names, and the method or what the filter is given."""
 
 
-def replay_recording(asked: ReplayOptions, begin: Begin) -> ReplayResult:
-    """Replay a recording; ``begin`` says what gets the fixes, and the result holds none. Raises SkylessError."""
-    return _replay_site(asked, begin) if is_mcap(asked.file) else _replay_capture(asked, begin)
+OnMeasured = Callable[[str, float, Packet | PairTdoa, bool], None]
+"""Gets the tag's name, a time, what the estimator was given and whether it used that."""
 
 
-def _replay_capture(asked: ReplayOptions, begin: Begin) -> ReplayResult:
+def replay_recording(asked: ReplayOptions, begin: Begin, on_measured: OnMeasured | None = None) -> ReplayResult:
+    """Replay a recording; ``begin`` says what gets the fixes, and the result holds none, nor measurements.
+
+    Raises SkylessError.
+    """
+    return (_replay_site if is_mcap(asked.file) else _replay_capture)(asked, begin, on_measured)
+
+
+def _replay_capture(asked: ReplayOptions, begin: Begin, on_measured: OnMeasured | None) -> ReplayResult:
     run, path = CaptureReplay(asked), Path(asked.file)
     write = begin(("tag",), run.measurements)
     on_fix = None if write is None else lambda fix: write("tag", fix.time_s, fix)
-    report = run.run(on_fix, asked.progress)
+    report = run.run(on_fix, asked.progress, None if on_measured is None else partial(on_measured, "tag"))
     asked.progress(1.0)
     summary = {**msgspec.to_builtins(report), "height_note": run.height_note}
     summary["anchor_distances_m"] = distances_of(path, report.format)
@@ -193,7 +204,7 @@ def _replay_capture(asked: ReplayOptions, begin: Begin) -> ReplayResult:
     return _result(path, {"tag": report}, samples, judged, run.height_note, summary)
 
 
-def _replay_site(asked: ReplayOptions, begin: Begin) -> ReplayResult:
+def _replay_site(asked: ReplayOptions, begin: Begin, on_measured: OnMeasured | None) -> ReplayResult:
     why, path = "a recording of skyless record brings its own", Path(asked.file)
     asked.leave_out(
         *("anchors", "truth", "truth_offset_s", "lever_arm_m", "format", "listener", "qa", "dynamics", "tdoa_std_m"),
@@ -209,7 +220,7 @@ def _replay_site(asked: ReplayOptions, begin: Begin) -> ReplayResult:
         span_s = max((found.end_s or 0.0) - (found.start_s or 0.0), 1e-9)
         write = begin(tuple(run.tags), asked.method or DEFAULT_METHOD)
         on_fix = None if write is None else lambda tag, made: write(tag, made.unix_s, made.fix)
-        reports = run.run(on_fix, lambda done_s: asked.progress(min(max(done_s / span_s, 0.0), 1.0)))
+        reports = run.run(on_fix, lambda done_s: asked.progress(min(max(done_s / span_s, 0.0), 1.0)), on_measured)
     asked.progress(1.0)
     unfinished = f"{path} has no end: it was cut off, or is still being written; later fixes are missing"
     by_tag: dict[str, ReplayReport] = {report.tag: report for report in reports}
@@ -232,8 +243,9 @@ def _result(
         table = samples[tag].table()
         truth_m = truth_at(judged[tag].truth, table.time_s)
         tracks[tag] = np.column_stack([table.time_s, table.position_m, truth_m])
-    no_fixes = FixRecorder(tuple(reports)).fixes()
-    return ReplayResult(path, reports, no_fixes, tracks, judged, warnings, height_note, summary)
+    tags = tuple(reports)
+    nothing = FixRecorder(tags).fixes(), MeasurementRecorder(tags).measurements()
+    return ReplayResult(path, reports, nothing[0], tracks, judged, nothing[1], warnings, height_note, summary)
 
 
 def run_replay(asked: ReplayOptions) -> ReplayResult:
@@ -243,19 +255,22 @@ def run_replay(asked: ReplayOptions) -> ReplayResult:
     ``method``, ``integrity_risk``, ``alert_limit_m``, ``max_acceleration_mps2``, ``tag_height_std_m``, ``settle_s`` and
     ``above_m``. One of another system needs ``anchors`` or ``site``, unless it holds their positions.
     """
-    recorders: list[FixRecorder] = []
+    recorders: list[tuple[FixRecorder, MeasurementRecorder]] = []
 
     def begin(tags: tuple[str, ...], _given: str) -> OnFix:
-        recorders.append(recorder := FixRecorder(tags))
+        recorders.append((recorder := FixRecorder(tags), MeasurementRecorder(tags)))
         return lambda tag, time_s, fix: recorder.add(tags.index(tag), time_s, fix, None, judged=False)
 
-    result = replay_recording(asked, begin)
-    fixes = recorders[0].fixes()
+    def on_measured(tag: str, time_s: float, measured: Packet | PairTdoa, used: bool) -> None:
+        recorders[0][1].add(tag, time_s, measured, used)
+
+    result = replay_recording(asked, begin, on_measured)
+    fixes, measurements = recorders[0][0].fixes(), recorders[0][1].measurements()
     truth_m, judged = np.full((len(fixes), 3), np.nan), np.zeros(len(fixes), dtype=bool)
     for tag in result.tags:
         of_tag = fixes.of_tag(tag)
         truth_m[of_tag], judged[of_tag] = result.judged[tag].of(fixes.time_s[of_tag])
-    return replace(result, fixes=replace(fixes, truth_m=truth_m, judged=judged))
+    return replace(result, fixes=replace(fixes, truth_m=truth_m, judged=judged), measurements=measurements)
 
 
 replay = python_function(ReplayOptions, run_replay)

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 NO_FIX: Final = 1
 """Exit code of a simulation or replay without any fix."""
 
+USER_ERROR: Final = 2
+"""Exit code of a command that was asked for what is not possible."""
+
 
 def print_json(value: object) -> None:
     """Write a struct or mapping as one line of JSON on standard output; NaN and infinities become null.

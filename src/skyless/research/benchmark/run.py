@@ -190,7 +190,7 @@ def _calibrations(found: Sequence[Found], asked: Asked) -> dict[Path, Difference
 
 
 def _plain(found: Found, options: ReplayOptions, run: CaptureReplay, rule: int) -> tuple[FixTable, Judged]:
-    anchors_m = known_anchors(options.anchors, None)[0]
+    anchors_m = run.known_m
     with open_recording(found.path, anchors_m=anchors_m) as recording:
         rows = [row for pair in tdoas_of(recording, anchors_m) if (row := _row(pair, anchors_m)) is not None]
     if not rows:

@@ -18,7 +18,9 @@ from skyless.core.kernels.arrays import Array
 from skyless.radio.foreign import bitcraze, fira
 from skyless.research.foreign import _bitcraze_captures as bitcraze_captures
 from skyless.research.foreign import _crazyflie as crazyflie
+from skyless.research.foreign import _muloc as muloc
 from skyless.research.foreign import _phones as phones
+from skyless.research.foreign import _starloc as starloc
 from skyless.research.foreign import _tdoa_tables as tdoa_tables
 from skyless.research.foreign import avalue
 from skyless.site.tables import Truth, read_truth
@@ -49,6 +51,8 @@ class Format:
     """That truth is of the body that carries the antenna, not of the antenna itself."""
     read_heights: Callable[..., Array | None] | None = None
     """Rows of time, height and standard deviation of a sensor that was recorded, from the path and ``is_barometer``."""
+    read_anchors: Callable[[str | PathLike[str]], dict[int, Point]] | None = None
+    """Where its anchors stand, from the path, where the recording itself holds that for all."""
     delays_ticks: int = 0
     """Antenna delays of a sender and a receiver together, where its stamps include them."""
 
@@ -127,6 +131,25 @@ FORMATS: Final = (
         "UCI capture, pcapng of link type 299 (DL-TDoA measurements, versions 1 and 2)",
         fira.recognise_pcapng,
         fira.read_pcapng,
+    ),
+    Format(
+        "starloc",
+        "STARLOC's two-way exchanges of a tag with anchors (uwb.csv), as differences of successive ranges",
+        starloc.recognise,
+        starloc.read,
+        None,
+        any_listener=True,
+        read_truth=starloc.read_truth,
+        read_anchors=starloc.read_anchors,
+    ),
+    Format(
+        "muloc",
+        "MULoc's arrays (npz): four anchors that hear each other and a tag, with anchors and truth",
+        muloc.recognise,
+        muloc.read,
+        TICK_BITS,
+        read_truth=muloc.read_truth,
+        read_anchors=muloc.read_anchors,
     ),
     _bitcraze("binary", "binary records BC ..", bitcraze.recognise_binary, bitcraze.read_binary),
     _dl_tdoa(

@@ -69,6 +69,8 @@ class DifferenceTracking:
         self._calibration = DifferenceCalibration({}) if calibration is None else calibration
         self.counters: Counter[str] = Counter()
         self.reason: NoFixReason = NoFixReason.NO_BEACONS
+        self.used: list[bool] = []
+        """Of each difference of the last update, whether the filter took it."""
         is_calibrated = bool(self._calibration.anchors)
         self._settings = replace(
             settings,
@@ -108,14 +110,14 @@ class DifferenceTracking:
 
         True if they made a fix, else ``reason`` states why not.
         """
-        used = False
+        self.used = []
         for pair in pairs:
-            if self._update_positions(pair):
-                used = self._add(pair) or used
-            else:
+            is_known = self._update_positions(pair)
+            self.used.append(is_known and self._add(pair))
+            if not is_known:
                 self.counters["unknown-anchor"] += 1
                 self.reason = NoFixReason.NO_ALMANAC
-        return used and self._start is not None and self._is_plausible()
+        return any(self.used) and self._start is not None and self._is_plausible()
 
     def _update_positions(self, pair: PairTdoa) -> bool:
         """Whether it is known where both anchors stand."""

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from skyless.core.air.masterless_packets import Packet, Point, Relay
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.observation import Observation
@@ -109,6 +109,8 @@ class PacketTracking:
         """Time of the newest fix, by the tag's clock since its first packet."""
         self.position_m: Point | None = None
         """Position of the newest fix."""
+        self.used = False
+        """Whether the filter took the reception of the last packet."""
         self._tx_bits = tx_bits
         self._positions_m = dict(anchors_m)
         self._surveyed = frozenset(anchors_m)
@@ -139,6 +141,11 @@ class PacketTracking:
         return self._positions_m
 
     @property
+    def newest_s(self) -> float:
+        """When the newest packet that could be used was received, on the scale of fixes' times."""
+        return ((self._newest_rx_ticks or 0) - (self._time.first_ticks_master or 0)) * TICK_S
+
+    @property
     def drops(self) -> Counter[str]:
         """What was not used, by reason."""
         self._count_relays()
@@ -154,6 +161,7 @@ class PacketTracking:
 
         A fix's ``time_s`` counts from the first packet, by the tag's clock.
         """
+        self.used = False
         anchor = self._unwrap(packet)
         if anchor is None:
             return None
@@ -184,6 +192,7 @@ class PacketTracking:
         if self._delays.contradictions_m:
             self._tracking.estimator.withhold_levels()
         fix = self._tracking.update(observation)
+        self.used = isinstance(fix, Fix)
         if not isinstance(fix, Fix):
             self._count_relays()
             if fix is NoFixReason.RESIDUALS:

@@ -31,7 +31,7 @@ from skyless.research.replays.inputs import (
 )
 from skyless.research.replays.noise import NoiseByPair, PairNoise
 from skyless.research.replays.options import DIFFERENCES_MADE, PACKETS, ReplayOptions
-from skyless.research.replays.pipelines import ByOwnEstimator, ByPackets, ByPairs, Pipeline, Smoothed
+from skyless.research.replays.pipelines import ByOwnEstimator, ByPackets, ByPairs, Pipeline, Record, Smoothed
 from skyless.sim.evaluation.figures import Figures, FixSamples, FixTable, Judged, figures_of
 from skyless.sim.evaluation.truth import estimated_offset_s, shifted, truth_at
 from skyless.site.survey.anchor_errors import DifferenceCalibration
@@ -49,7 +49,8 @@ READING_SHARE: Final = 0.1
 """Part of the time of a smoothed replay in which the recording is read."""
 
 FORMATS_BY_PACKETS: Final = frozenset({"bitcraze-yaml", "bitcraze-text", "bitcraze-binary"})
-"""Formats of which packets are used by default, as real captures showed that to be better; of Avalue's it was not."""
+"""Formats of which packets are used by default, as real captures showed that to be better; of Avalue's and MULoc's it
+was not."""
 
 
 _MAX_WITHOUT_ANCHORS: Final = 20_000
@@ -115,13 +116,15 @@ class CaptureReplay:
         )
         self._asked, kind = asked, format_of(asked.file, asked.format)
         self._anchors_m, site_height_m = known_anchors(asked.anchors, asked.site)
+        if not self._anchors_m and kind.read_anchors is not None:
+            self._anchors_m = kind.read_anchors(asked.file)
         self._truth = known_truth(Path(asked.file), asked)
         if not self._anchors_m:
             _check_carries_anchors(asked)
-        self._known_m = self._anchors_m or _stated_anchors(asked, kind)
+        self.known_m = self._anchors_m or _stated_anchors(asked, kind)
         """Positions at the recording's beginning, for time differences; packets carry theirs, which may change."""
         self.height_m, self._height_std_m, self.height_note = height_to_hold(
-            asked.tag_height_m, self._known_m, site_height_m, self._truth, kind.name
+            asked.tag_height_m, self.known_m, site_height_m, self._truth, kind.name
         )
         if asked.tag_height_std_m is not None:
             self._height_std_m = asked.tag_height_std_m
@@ -138,7 +141,7 @@ class CaptureReplay:
         table = asked.anchors if isinstance(asked.anchors, str | Path) and not asked.uncalibrated else None
         if calibration is None and table is not None and Path(table).suffix not in YAML_SUFFIXES:
             self._calibration = read_calibration(table)
-        self._noise = NoiseByPair(self._truth, self._known_m)
+        self._noise = NoiseByPair(self._truth, self.known_m)
         self._pipeline = self._new_pipeline()
         self.receptions = 0
         self.samples = FixSamples()
@@ -166,14 +169,14 @@ class CaptureReplay:
         if self.measurements == PACKETS:
             return self._by_packets()
         bits = self.recording.format.tx_bits
-        engine = None if bits is None else PairEngine(bits, anchors_m=self._known_m)
+        engine = None if bits is None else PairEngine(bits, anchors_m=self.known_m)
         if self._asked.estimator is not None:
-            return ByOwnEstimator(self._asked.estimator(), self._known_m, engine, self._noise)
+            return ByOwnEstimator(self._asked.estimator(), self.known_m, engine, self._noise)
         asked = {"qa": self._qa, "difference_std_m": self._asked.tdoa_std_m, "height_m": self.height_m}
         asked["height_std_m"] = self._height_std_m
         known = {key: value for key, value in asked.items() if value is not None}
         settings = structs.replace(PROFILES.get(self.recording.format.name, DIFFERENCES), **known)
-        tracking = DifferenceTracking(settings, self._known_m, self._asked.z_bounds_m, self._calibration)
+        tracking = DifferenceTracking(settings, self.known_m, self._asked.z_bounds_m, self._calibration)
         return (Smoothed if self._asked.smooth else ByPairs)(tracking, engine, self._noise)
 
     def _by_packets(self) -> ByPackets:
@@ -190,10 +193,19 @@ class CaptureReplay:
             calibration=self._calibration,
             one_way=structs.replace(DL_TDOA_ONE_WAY, **known) if is_dl_tdoa else None,
         )
-        return ByPackets(tracking, PairEngine(bits, anchors_m=self._known_m), self._noise)
+        return ByPackets(tracking, PairEngine(bits, anchors_m=self.known_m), self._noise)
 
-    def run(self, on_fix: Callable[[Fix], None] | None, on_progress: Callable[[float], None]) -> ReplayReport:
-        """Read to the end; ``on_fix`` gets every fix, ``on_progress`` now and then the share that is done."""
+    def run(
+        self,
+        on_fix: Callable[[Fix], None] | None,
+        on_progress: Callable[[float], None],
+        on_measured: Callable[[float, Record, bool], None] | None = None,
+    ) -> ReplayReport:
+        """Read to the end.
+
+        ``on_fix`` gets every fix, ``on_progress`` now and then the share that is done, and ``on_measured`` the parts of
+        ``Measured``.
+        """
         started_s, size = time.perf_counter(), max(Path(self._asked.file).stat().st_size, 1)
         reading = READING_SHARE if self._asked.smooth else 1.0
         with closing(self.recording):
@@ -202,6 +214,7 @@ class CaptureReplay:
                 for record in batch:
                     self.receptions += 1
                     time_s, fix = self._pipeline.process(record)
+                    self._tell(on_measured)
                     if time_s is not None:
                         self._first_s = time_s if self._first_s is None else self._first_s
                         self._last_s = time_s
@@ -213,6 +226,7 @@ class CaptureReplay:
                 on_progress(reading * min(self.recording.bytes_read / size, 1.0))
             for fix in self._pipeline.rest(lambda share: on_progress(reading + (1.0 - reading) * share)):
                 self._add(fix, on_fix)
+            self._tell(on_measured)
         table = self.samples.table()
         self._check_truth(table)
         offset_s = None if self._truth is None else estimated_offset_s(self._truth, table.time_s, table.position_m)
@@ -221,6 +235,11 @@ class CaptureReplay:
             self._noise.truth = self._truth
         figures = figures_of(table, self.judged, self.samples.count)
         return self._report(figures, offset_s, time.perf_counter() - started_s)
+
+    def _tell(self, on_measured: Callable[[float, Record, bool], None] | None) -> None:
+        if on_measured is not None:
+            for measured in self._pipeline.measured():
+                on_measured(*measured)
 
     def _is_over(self) -> bool:
         """Whether as much has been replayed as was asked for."""
@@ -263,7 +282,7 @@ class CaptureReplay:
     def _report(self, figures: Figures, offset_s: float | None, wall_s: float) -> ReplayReport:
         pairs, fixes = self._noise.pairs(), self.samples.count
         span_s = self._last_s - (self._first_s or 0.0)
-        reason = self._pipeline.reason if self._known_m or fixes else NoFixReason.NO_ALMANAC
+        reason = self._pipeline.reason if self.known_m or fixes else NoFixReason.NO_ALMANAC
         total = self.recording.drops + self._pipeline.drops
         drops = {name: count for name, count in sorted(total.items()) if count}
         by_m = sorted(self._pipeline.contradictions_m.items())

@@ -18,6 +18,9 @@ from skyless.research.replays.noise import NoiseByPair
 
 Record = Packet | PairTdoa
 
+Measured = tuple[float, Record, bool]
+"""A time, what the estimator was given, and whether it used that."""
+
 _SAMPLED: Final = 128
 _SAMPLED_OF: Final = 1024
 """The first 128 of each 1024 packets are made into time differences as well, to measure the recording's noise."""
@@ -39,6 +42,9 @@ class Pipeline(Protocol):
     def rest(self, on_progress: Callable[[float], None]) -> Iterable[Fix]:
         """Fixes that only the whole recording makes, at its end; ``on_progress`` gets the share that is done."""
 
+    def measured(self) -> Iterable[Measured]:
+        """What the last ``process``, or ``rest``, gave the estimator."""
+
     @property
     def drops(self) -> Counter[str]:
         """What could not be used, by reason."""
@@ -57,6 +63,12 @@ class _Differences:
     def __init__(self, engine: PairEngine | None, noise: NoiseByPair) -> None:
         self._engine = engine
         self._noise = noise
+        self._measured: Sequence[PairTdoa] = ()
+        self._used: Sequence[bool] = ()
+
+    def measured(self) -> Iterable[Measured]:
+        """See ``Pipeline``."""
+        return ((pair.time_s, pair, used) for pair, used in zip(self._measured, self._used, strict=True))
 
     def pairs(self, record: Record) -> Sequence[PairTdoa]:
         """The differences of one record."""
@@ -76,6 +88,7 @@ class _Differences:
 
     def rest(self, _on_progress: Callable[[float], None]) -> Iterable[Fix]:
         """See ``Pipeline``."""
+        self._measured = self._used = ()
         return ()
 
 
@@ -90,8 +103,11 @@ class ByPairs(_Differences):
         """See ``Pipeline``."""
         pairs = self.pairs(record)
         if not pairs:
+            self._measured = self._used = ()
             return None, None
-        return pairs[0].time_s, self._tracking.fix() if self._tracking.update(pairs) else None
+        fix = self._tracking.fix() if self._tracking.update(pairs) else None
+        self._measured, self._used = pairs, self._tracking.used
+        return pairs[0].time_s, fix
 
     def process_height(self, height: Height) -> None:
         """See ``Pipeline``."""
@@ -128,10 +144,13 @@ class Smoothed(ByPairs):
 
     def rest(self, on_progress: Callable[[float], None]) -> Iterable[Fix]:
         """See ``Pipeline``."""
-        found, count = [], max(len(self._events), 1)
+        found, numbers, count = [], set(), max(len(self._events), 1)
         for number, fix in smoothed(self._tracking, self._events):
             found.append(fix)
+            numbers.add(number)
             on_progress(1.0 - number / count)
+        pairs = {number: event for number, event in enumerate(self._events) if isinstance(event, PairTdoa)}
+        self._measured, self._used = tuple(pairs.values()), [number in numbers for number in pairs]
         return reversed(found)
 
 
@@ -142,6 +161,11 @@ class ByPackets:
         self._tracking = tracking
         self._differences = _Differences(engine, noise)
         self._heard = 0
+        self._newest: Packet | None = None
+
+    def measured(self) -> Iterable[Measured]:
+        """See ``Pipeline``."""
+        return () if self._newest is None else ((self._tracking.newest_s, self._newest, self._tracking.used),)
 
     def process(self, record: Record) -> tuple[float | None, Fix | None]:
         """See ``Pipeline``."""
@@ -150,6 +174,7 @@ class ByPackets:
             self._differences.pairs(record)
         self._heard += 1
         fix = self._tracking.on_packet(record)
+        self._newest = record
         return self._tracking.time_s, fix
 
     def process_height(self, height: Height) -> None:
@@ -158,6 +183,7 @@ class ByPackets:
 
     def rest(self, _on_progress: Callable[[float], None]) -> Iterable[Fix]:
         """See ``Pipeline``."""
+        self._newest = None
         return ()
 
     @property
@@ -189,10 +215,10 @@ class ByOwnEstimator(_Differences):
 
     def process(self, record: Record) -> tuple[float | None, Fix | None]:
         """See ``Pipeline``."""
-        pairs, fix = self.pairs(record), None
-        for pair in pairs:
-            fix = heard(self._estimator, pair, self._anchors_m, self._drops) or fix
-        return (pairs[0].time_s if pairs else None), fix
+        pairs = self.pairs(record)
+        fixes = [heard(self._estimator, pair, self._anchors_m, self._drops) for pair in pairs]
+        self._measured, self._used = pairs, [fix is not None for fix in fixes]
+        return (pairs[0].time_s if pairs else None), next((fix for fix in reversed(fixes) if fix), None)
 
     @property
     def reason(self) -> NoFixReason:

@@ -3,6 +3,7 @@
 import time
 from collections import Counter, OrderedDict, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import Any, Final, TypeVar, cast
 
 import msgspec
@@ -12,6 +13,7 @@ from msgspec import Struct, structs
 from skyless.core.air import codec
 from skyless.core.air.beacon import Beacon
 from skyless.core.air.frame import Heard, Malformed
+from skyless.core.air.masterless_packets import Packet
 from skyless.core.air.reception import Diagnostics, Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.errors import ConfigurationError
@@ -150,10 +152,11 @@ def _relay(heard: Heard, own: DelayChange) -> Heard:
 # One tag of a recording once more: its receptions through its receiver, bit by bit as it was.
 
 
-class _MadeFix(Struct, frozen=True):
-    """A fix whose time is not known yet, and its number where that is known."""
+class _Heard(Struct, frozen=True):
+    """A reception whose time is not known yet, its fix if it made one, and the fix's number where that is known."""
 
-    fix: Fix
+    reception: Reception
+    fix: Fix | None
     serial: int | None
 
 
@@ -195,7 +198,9 @@ class TagReplay:
         self._restored = False
         self._segment = ""
         self._next = 0
-        self._clock: HostClock[_MadeFix | None] = HostClock()
+        self._clock: HostClock[_Heard] = HostClock()
+        self.on_measured: Callable[[float, Packet, bool], None] | None = None
+        """Gets the Unix time of each beacon, the beacon as a packet without relays, and whether it made a fix."""
         self._comparison = Comparison(tag)
 
     def process(self, message: ReceptionsMessage) -> Iterator[Replayed]:
@@ -219,24 +224,32 @@ class TagReplay:
         """The last fixes, at the end of the recording."""
         yield from self._timed(self._clock.rest())
 
-    def _made(self, reception: Reception) -> _MadeFix | None:
+    def _made(self, reception: Reception) -> _Heard:
         fix = self._fix(reception)
-        if fix is None:
-            return None
-        self.fixes += 1
-        if self._serial is not None:
-            self._serial += 1
-        return _MadeFix(fix, self._serial)
+        if fix is not None:
+            self.fixes += 1
+            if self._serial is not None:
+                self._serial += 1
+        return _Heard(reception, fix, self._serial)
 
-    def _timed(self, found: list[tuple[_MadeFix | None, float]]) -> Iterator[Replayed]:
+    def _timed(self, found: list[tuple[_Heard, float]]) -> Iterator[Replayed]:
         """Fixes of receptions whose Unix time is known now."""
         for made, unix_s in found:
             self.begun_s = unix_s if self.begun_s is None else self.begun_s
-            if made is None:
+            if self.on_measured is not None:
+                self._tell(self.on_measured, made, unix_s)
+            if made.fix is None:
                 continue
             if made.serial is not None:
                 self._comparison.replayed(made.serial, made.fix, unix_s)
             yield Replayed(made.fix, unix_s)
+
+    @staticmethod
+    def _tell(on_measured: Callable[[float, Packet, bool], None], made: _Heard, unix_s: float) -> None:
+        beacon, rx_ticks = decode_any(made.reception.frame), made.reception.rx_ticks
+        if not isinstance(beacon, Malformed):
+            packet = Packet(None, beacon.anchor, beacon.sequence, beacon.tx_ticks, rx_ticks, ())
+            on_measured(unix_s, packet, made.fix is not None)
 
     def compare(self, recorded: FixMessage) -> None:
         """Add a recorded fix."""
@@ -420,10 +433,19 @@ class SiteReplay:
         """How many fixes of each tag are of that many anchors."""
 
     def run(
-        self, on_fix: Callable[[str, Replayed], None] | None, on_progress: Callable[[float], None]
+        self,
+        on_fix: Callable[[str, Replayed], None] | None,
+        on_progress: Callable[[float], None],
+        on_measured: Callable[[str, float, Packet, bool], None] | None = None,
     ) -> list[TagReport]:
-        """Replay all; ``on_progress`` gets now and then the recording's seconds done so far."""
+        """Replay all; ``on_progress`` gets now and then the recording's seconds done so far.
+
+        ``on_measured`` gets the tag's name and what ``TagReplay.on_measured`` gets.
+        """
         begun_s = time.perf_counter()
+        if on_measured is not None:
+            for tag, replay in self.tags.items():
+                replay.on_measured = partial(on_measured, tag)
         for number, found in enumerate(self._recording.messages({"receptions", "fix"})):
             if found.channel.name in self.tags:
                 self._process(found, on_fix)

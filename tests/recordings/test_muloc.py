@@ -1,0 +1,54 @@
+"""Recordings of MULoc: TX stamps as their rule gives them, anchors and truth from the file, and what is damaged."""
+
+import numpy as np
+import pytest
+
+import skyless
+from recordings.test_formats import muloc_file
+from skyless.core.air.masterless_packets import Relay
+from skyless.research.foreign import _muloc as muloc
+from skyless.research.foreign.formats import open_recording
+
+
+def test_stamps_anchors_and_stops(tmp_path):
+    path = tmp_path / "one.npz"
+    path.write_bytes(muloc_file())
+    with open_recording(path) as recording:
+        (packet,) = recording
+    assert (packet.anchor, packet.rx_ticks) == (1, 1000 + (600 << 16) + 32_880)
+    assert packet.tx_ticks == (5_000 + 600 * 65_536) // 512 * 512 + 32_880
+    assert packet.relays == (Relay(0, 0, 5_000, None),)
+    assert recording.drops == {"tx-stamp-unknown": 3}
+    assert muloc.read_anchors(path)[2] == (3.0, 4.0, 0.0)
+    truth = muloc.read_truth(path, None)
+    assert truth.t_s.tolist() == [0.0, 0.25, 0.5, 0.75, 1.0, 3.0, 3.25, 3.5, 3.75, 4.0]
+    assert truth.position_m[[0, -1]].tolist() == [[1.0, 1.0, 0.0], [2.0, 1.0, 0.0]]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        muloc_file()[:-300],
+        muloc_file(rx_ticks=np.zeros((1, 3, 5), dtype=np.int64)),
+        muloc_file(rx_ticks=np.array([[["pickled"]]], dtype=object)),
+        muloc_file(rx_ticks=np.array([["text"]])),
+    ],
+)
+def test_damage_is_counted(tmp_path, content):
+    path = tmp_path / "damaged.npz"
+    path.write_bytes(content)
+    with open_recording(path, "muloc") as recording:
+        assert list(recording) == []
+    assert recording.drops == {"damaged-array": 1}
+
+
+@pytest.mark.statistical
+def test_the_published_recording_is_replayed_without_options(recordings):
+    path = recordings / "muloc" / "location1_2.npz"
+    if not path.is_file():
+        pytest.skip(f"no recording at {path}")
+    report = skyless.replay(path).reports["tag"]
+    assert report.height_m == 0.0
+    assert report.judged > 30_000
+    assert report.rmse_2d_m < 0.1
+    assert report.exceeded_horizontal == 0
