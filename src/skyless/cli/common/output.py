@@ -78,7 +78,7 @@ def number(value: float | None, form: str = "{:.3f}", scale: float = 1.0) -> str
 
 
 def cm(value_m: float | None) -> str:
-    """A length in centimetres for people."""
+    """A length in centimetres for people; a dash where there is none."""
     return number(value_m, "{:.2f} cm", 100.0)
 
 
