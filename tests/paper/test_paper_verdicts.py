@@ -96,8 +96,8 @@ def test_other_verdicts_follow_their_numbers():
 
 
 def test_scaling_holds_only_if_nothing_changes():
-    one = scale.summarise(1, np.array([0.04]), np.array([240]), 240, "same", 0.1)
-    many = scale.summarise(1, np.array([0.04] * 5), np.array([240] * 5), 240, "same", 0.5)
+    one = scale.summarise(np.array([0.04]), np.array([240]), 240, "same", 0.1)
+    many = scale.summarise(np.array([0.04] * 5), np.array([240] * 5), 240, "same", 0.5)
     assert scale.judge([one, many])[0] is HOLDS
     assert scale.judge([one, replace(many, fewest_fixes_per_s=200.0)])[0] is CORRECTED
     assert scale.judge([one, replace(many, first_tag="other")])[0] is FAILS

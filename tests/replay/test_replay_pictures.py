@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from skyless.cli.common.output import write_picture
 from skyless.research.replays.plot import track_figure
-from skyless.site.report.figures import save_figure
 
 pytestmark = pytest.mark.site
 
 
 def draw(path, rows, title):
-    save_figure(track_figure(rows, title), path)
+    write_picture(path, track_figure(rows, title))
 
 
 def rows(count, *, truth):

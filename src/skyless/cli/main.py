@@ -16,6 +16,7 @@ from cyclopts.help import DefaultFormatter
 
 from skyless.core.errors import SkylessError
 from skyless.core.extras import what_to_install
+from skyless.core.version import installed_version
 
 if TYPE_CHECKING:
     from cyclopts.help import HelpPanel
@@ -93,7 +94,7 @@ def program() -> App:
         ),
         help_format="plaintext",
         help_formatter=_Help(),
-        version=_version,
+        version=installed_version,
         print_error=False,
         exit_on_error=False,
         result_action="return_value",
@@ -175,12 +176,6 @@ def _trouble(error: OSError) -> str:
         raise error
     _drop_output()
     return f"standard output cannot be written: {error.strerror}"
-
-
-def _version() -> str:
-    from importlib.metadata import version
-
-    return version("skyless")
 
 
 def _write_any_character() -> None:

@@ -10,14 +10,12 @@ from msgspec.structs import replace
 
 from skyless.cli.api.options import PlanOptions
 from skyless.cli.common.options import check_output, check_picture, command
-from skyless.cli.common.output import new_table, print_facts, print_json, print_warnings, write_file
+from skyless.cli.common.output import new_table, print_facts, print_json, print_warnings, write_file, write_picture
 from skyless.cli.common.progress import progress_bar
 from skyless.core.arguments import Options
 from skyless.core.errors import ConfigurationError, SkylessError
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from skyless.cli.api.plan import PlanResult
     from skyless.cli.api.rate_plan import RatePlanResult
     from skyless.core.site import Site
@@ -117,7 +115,7 @@ def _check_image(file: Path, site: "Site", image: Path) -> None:
 def _show_rates(result: "RatePlanResult", file: Path, output: _Output) -> None:
     """Show the plan of a site without a master, and draw it."""
     if output.plot is not None:
-        _save(result.plot(), output.plot)
+        write_picture(output.plot, result.plot())
     if output.json:
         print_json(result.summary)
     else:
@@ -175,20 +173,10 @@ def _write_files(plan: "PlanResult", output: _Output) -> None:
             is_csv = grid.suffix.lower() == ".csv"
             table.writelines(csv_lines(plan.map) if is_csv else geojson_lines(plan.map, plan.site.georeference))
     if output.plot is not None:
-        _save(plan.plot(), output.plot)
+        write_picture(output.plot, plan.plot())
     if output.html is not None:
         from skyless.site.planning.picture import Background
         from skyless.site.planning.report import described
 
         background = Background(plan.site, plan.floor, plan.file, described(plan.summary))
         write_file(output.html, _page(plan, background).encode())
-
-
-def _save(figure: "Figure", plot: Path) -> None:
-    """Write a picture. Raises SkylessError when it cannot be written."""
-    from skyless.site.report.figures import save_figure
-
-    try:
-        save_figure(figure, plot)
-    except (OSError, ValueError) as error:
-        raise SkylessError(f"{plot} cannot be written: {error}") from None

@@ -10,7 +10,15 @@ from cyclopts import App
 from msgspec.structs import replace
 
 from skyless.cli.common.options import check_output, check_picture, command
-from skyless.cli.common.output import NO_FIX, USER_ERROR, new_table, print_facts, print_json, print_warnings
+from skyless.cli.common.output import (
+    NO_FIX,
+    USER_ERROR,
+    new_table,
+    print_facts,
+    print_json,
+    print_warnings,
+    write_picture,
+)
 from skyless.cli.common.progress import loading_kernels, progress_bar
 from skyless.core.arguments import Options, existing_file
 from skyless.core.errors import SkylessError
@@ -121,12 +129,7 @@ def _replayed(asked: ReplayOptions, output: _Output, name: str = "") -> tuple[in
 
         result = replay_recording(replace(asked, progress=bar.reach), begin)
     if output.plot is not None:
-        from skyless.site.report.figures import save_figure
-
-        try:
-            save_figure(result.plot(), output.plot)
-        except (OSError, ValueError) as error:
-            raise SkylessError(f"{output.plot} cannot be drawn: {error}") from None
+        write_picture(output.plot, result.plot())
     for tag, report in result.reports.items():
         _warn_of_few_members(f"{name}{tag}", report)
     if not output.json:

@@ -9,7 +9,16 @@ from cyclopts import App
 from msgspec.structs import replace
 
 from skyless.cli.common.options import check_folder, check_output, check_picture, command
-from skyless.cli.common.output import cm, console, number, print_facts, print_json, print_warnings, write_file
+from skyless.cli.common.output import (
+    cm,
+    console,
+    number,
+    print_facts,
+    print_json,
+    print_warnings,
+    write_file,
+    write_picture,
+)
 from skyless.cli.common.progress import progress_bar
 from skyless.cli.nodes.survey_live import LiveOptions, gather_live, serve_live
 from skyless.core.arguments import Options
@@ -76,7 +85,7 @@ def survey(*, asked: SurveyOptions, live: LiveOptions, output: _Output) -> int:
     written, more = ((), ()) if output.out is None or not found.usable else _written(found, output.out)
     found = replace(found, warnings=(*found.warnings, *more))
     if output.plot is not None:
-        _draw(found, output.plot)
+        write_picture(output.plot, found.plot())
     if output.json:
         unchanged = list(found.unchanged) if written else []
         print_json({**found.summary, "unchanged": unchanged, "written": list(written)})
@@ -171,15 +180,6 @@ def _table(result: "Survey") -> str:
     return new_table(positions_m, DifferenceCalibration(delays))
 
 
-def _draw(found: "SurveyResult | BiasResult", plot: Path) -> None:
-    from skyless.site.report.figures import save_figure
-
-    try:
-        save_figure(found.plot(), plot)
-    except OSError as error:
-        raise SkylessError(f"{plot} cannot be written: {error.strerror}") from None
-
-
 # Reports
 
 
@@ -187,7 +187,7 @@ def _report_biases(found: "BiasResult", output: _Output) -> None:
     if output.out is not None:
         write_file(output.out, found.corrected_file().encode())
     if output.plot is not None:
-        _draw(found, output.plot)
+        write_picture(output.plot, found.plot())
     if output.json:
         print_json({**found.summary, "written": output.out})
         return

@@ -61,13 +61,6 @@ class PairError(Struct, frozen=True, forbid_unknown_fields=True):
     b: int
     late_m: float = 0.0
     """What either receives the other late."""
-    drift_std_m: float = 0.0
-    """Standard deviation of an error that changes, a Gauss–Markov process."""
-    drift_time_s: float = 60.0
-    """Time in which its correlation falls to 1/e."""
-    from_s: float = 0.0
-    to_s: float = math.inf
-    """With ``from_s``: the interval of true time that has the error."""
     blocked: bool = False
     """Neither receives the other at all."""
 

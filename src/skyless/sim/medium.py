@@ -22,7 +22,6 @@ from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ, T
 from skyless.core.kernels.arrays import Array, Records
 from skyless.core.site import Site
 from skyless.core.ticks import difference, from_seconds, wrap
-from skyless.sim._anchor_pairs import AnchorPairErrors
 from skyless.sim.impairments import Impairments
 from skyless.sim.listening import OUTCOMES, RECEPTION_RECORD, receive_frame
 from skyless.sim.oscillator import advance, emit, foresee, make_clocks, restart_counter, warm_up
@@ -53,7 +52,7 @@ class Timeline(Generic[Result]):
 
     def __init__(self) -> None:
         self.now_ticks = 0
-        self._serial = self._until_ticks = 0
+        self._serial = 0
         self._events: list[tuple[int, int, Callable[[], Result | None]]] = []
 
     @property
@@ -61,26 +60,13 @@ class Timeline(Generic[Result]):
         """When the next event happens; None while nothing is planned."""
         return self._events[0][0] if self._events else None
 
-    @property
-    def until_ticks(self) -> int:
-        """Where the present ``run`` ends."""
-        return self._until_ticks
-
     def at(self, ticks: int, happen: Callable[[], Result | None]) -> None:
         """Plan an event; one in the past happens now."""
         self._serial += 1
         heapq.heappush(self._events, (max(ticks, self.now_ticks), self._serial, happen))
 
-    def pass_to(self, ticks: int) -> bool:
-        """Let time pass up to ``ticks`` at once if no event and no end of ``run`` lies before; whether it did."""
-        if ticks > self._until_ticks or (self._events and self._events[0][0] <= ticks):
-            return False
-        self.now_ticks = max(self.now_ticks, ticks)
-        return True
-
     def run(self, until_ticks: int) -> Iterator[Result]:
         """Run all events up to a time, and yield their results."""
-        self._until_ticks = until_ticks
         while self._events and self._events[0][0] <= until_ticks:
             self.now_ticks, _, happen = heapq.heappop(self._events)
             result = happen()
@@ -205,7 +191,9 @@ class Medium(Generic[Result]):
         self.clocks = make_clocks(impairments.oscillator, self._setups)
         self._warm_up()
         self.range_errors = RangeErrors(impairments.range_errors, len(tags), len(site.anchors), seed)
-        self._pair_errors = AnchorPairErrors(impairments.anchor_pair_errors, self.node_of, seed)
+        for error in impairments.anchor_pair_errors:
+            a, b = self.node_of[error.a], self.node_of[error.b]
+            self.range_errors.present_m[[a, b], [b, a]] += math.inf if error.blocked else error.late_m
         self._plan_changes()
         self._channel, self._walls = pack_channel(impairments.channel), pack_walls(site.walls)
         self._air = OnAir()
@@ -320,7 +308,6 @@ class Medium(Generic[Result]):
         t_s = ticks * TICK_S
         self._move_tags(t_s)
         self.range_errors.advance_to(t_s, self.stations)
-        self._pair_errors.set_present(t_s, self.range_errors.present_m)
         anchors, count, highest = receive_frame(
             self.clocks,
             normals,

@@ -62,7 +62,7 @@ class RangeErrors:
 
     def __init__(self, model: RangeErrorModel, tags: int, anchors: int, seed: int) -> None:
         self.present_m: Array = np.zeros((anchors + tags, anchors))
-        """Shape (nodes, anchors) as the kernels count them, without the slope's part; zeros for anchors."""
+        """Shape (nodes, anchors) as the kernels count them, without the slope part; those of anchors stay as set."""
         self._model, self._anchors = model, anchors
         self._constant_m = np.zeros((tags, anchors))
         self._step = (model.correlation_s or model.correlation_m or math.inf) / _KNOTS

@@ -20,7 +20,6 @@ MAX_DRAWS: Final = 16
 
 ANCHOR_KEY: Final = 0
 TAG_KEY: Final = 1
-PAIR_KEY: Final = 2
 
 
 def stream(seed: int, kind: int, number: int, purpose: int = 0) -> np.random.Generator:

@@ -4,7 +4,7 @@ A tag has no attitude, so that none is given: the vehicle's own compass keeps it
 and down of the site's origin.
 """
 
-from math import floor, hypot, inf, isfinite, pi, sqrt
+from math import floor, inf, isfinite, pi, sqrt
 from typing import Final, Literal
 
 from skyless.bridges.mavlink.messages import (
@@ -20,6 +20,7 @@ from skyless.bridges.mavlink.messages import (
 )
 from skyless.bridges.target import floored
 from skyless.core.earth import east_north_up, geodetic, rotated
+from skyless.core.ellipse import horizontal_ellipse
 from skyless.core.site import GeoreferenceSite
 from skyless.run.mqtt.messages import FixMessage, Matrix, Vector
 
@@ -106,7 +107,7 @@ def odometry(fix: FixMessage, heading_deg: float, reset_counter: int) -> Odometr
 def gps_input(fix: FixMessage, origin: GeoreferenceSite, satellites: int | None = None) -> GpsInput:
     """A position on the Earth as a GPS receiver would give it; ``satellites`` is by default the number of anchors."""
     latitude_deg, longitude_deg, height_m = geodetic(fix.position_m, origin)
-    nn, ne, _, _, ee, _, _, _, dd = _covariance_ned(fix.covariance_m2, origin.heading_deg)
+    covariance_m2 = _covariance_ned(fix.covariance_m2, origin.heading_deg)
     hdop, vdop = _dilution(fix.hdop), _dilution(fix.vdop)
     ignore = (IGNORE_HDOP if hdop == 0.0 else 0) | (IGNORE_VDOP if vdop == 0.0 else 0)
     moving = _velocity(fix)
@@ -115,8 +116,8 @@ def gps_input(fix: FixMessage, origin: GeoreferenceSite, satellites: int | None 
         ignore |= _IGNORE_VELOCITY
     else:
         velocity = _ned(moving[0], origin.heading_deg)
-        north, cross, _, _, east, _, _, _, down = _swapped(rotated(moving[1], origin.heading_deg))
-        speed_std = sqrt(max(_largest(north, cross, east), down, 0.0))
+        covariance = _swapped(rotated(moving[1], origin.heading_deg))
+        speed_std = max(horizontal_ellipse(covariance)[0], sqrt(max(covariance[8], 0.0)))
         if fix.height_known:
             ignore |= IGNORE_VERTICAL_VELOCITY
     week, week_ms = gps_time(fix.unix_s)
@@ -131,8 +132,8 @@ def gps_input(fix: FixMessage, origin: GeoreferenceSite, satellites: int | None 
         vdop=vdop,
         velocity=velocity,
         speed_accuracy=speed_std,
-        horizontal_accuracy=sqrt(_largest(nn, ne, ee)),
-        vertical_accuracy=UNKNOWN_HEIGHT_STD_M if fix.height_known else sqrt(dd),
+        horizontal_accuracy=horizontal_ellipse(covariance_m2)[0],
+        vertical_accuracy=UNKNOWN_HEIGHT_STD_M if fix.height_known else sqrt(covariance_m2[8]),
         ignore_flags=ignore,
         time_week=week,
         fix_type=FIX_3D,
@@ -208,8 +209,3 @@ def _pose_covariance(covariance: Matrix, between: float, angle: float) -> tuple[
     nn, ne, nd, _, ee, ed, _, _, dd = covariance
     b, a = between, angle
     return nn, ne, nd, b, b, b, ee, ed, b, b, b, dd, b, b, b, a, b, b, a, b, a
-
-
-def _largest(xx: float, xy: float, yy: float) -> float:
-    """Largest variance of any direction in a plane."""
-    return 0.5 * (xx + yy) + hypot(0.5 * (xx - yy), xy)

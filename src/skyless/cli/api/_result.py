@@ -52,8 +52,3 @@ def axes_columns(prefix: str, values: Array, suffix: str = "") -> dict[str, Arra
 def figures(values: Any) -> Array:  # noqa: ANN401 - whatever has numbers and None
     """Numbers as an array of floats, NaN for None."""
     return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
-
-
-def cm(value_m: float | None) -> str:
-    """A length in centimetres for people; a dash where there is none."""
-    return "–" if value_m is None else f"{100.0 * value_m:.2f} cm"

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from skyless.cli.api._floor_result import FloorResult
-from skyless.cli.api._result import cm, data_frame
+from skyless.cli.api._result import data_frame
 from skyless.cli.api.options import PlanOptions
 from skyless.cli.api.rate_plan import RatePlanResult, plan_rates
+from skyless.cli.common.output import cm
 from skyless.core.arguments import check_choice, check_whole, process_noise, python_function, wrong
 from skyless.core.errors import SkylessError
 from skyless.core.geometry import Box

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from msgspec.structs import replace
 
-from skyless.cli.api._result import Result, cm
+from skyless.cli.api._result import Result
 from skyless.cli.api.fixes import Fixes, FixRecorder
 from skyless.cli.api.options import SimulateOptions
+from skyless.cli.common.output import cm
 from skyless.core.arguments import python_function
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import FILTERS

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from skyless.cli.api._result import Result, cm, data_frame, figures
+from skyless.cli.api._result import Result, data_frame, figures
 from skyless.cli.api.options import StudyOptions
+from skyless.cli.common.output import cm
 from skyless.core.arguments import check_choice, process_noise, python_function
 from skyless.core.integrity import RISK
 from skyless.core.kernels.arrays import Vector

@@ -9,7 +9,8 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.cli.api._result import Result, cm, data_frame, figures
+from skyless.cli.api._result import Result, data_frame, figures
+from skyless.cli.common.output import cm
 from skyless.core.arguments import python_function
 from skyless.core.errors import SkylessError
 from skyless.core.kernels.arrays import Integers, Vector

@@ -13,6 +13,7 @@ from skyless.core.errors import SkylessError
 from skyless.core.whole_files import whole_file, write_whole
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from rich.console import Console
 
 
@@ -80,7 +81,7 @@ def number(value: float | None, form: str = "{:.3f}", scale: float = 1.0) -> str
 
 
 def cm(value_m: float | None) -> str:
-    """A length in centimetres for people."""
+    """A length in centimetres for people; a dash where there is none."""
     return number(value_m, "{:.2f} cm", 100.0)
 
 
@@ -113,3 +114,10 @@ def write_file(path: Path, data: bytes) -> None:
         write_whole(path, data)
     except OSError as error:
         raise SkylessError(f"{path} cannot be written: {error.strerror}") from None
+
+
+def write_picture(path: Path, figure: "Figure") -> None:
+    """Write a figure in the format of the file's ending. Raises SkylessError when it cannot be written."""
+    from skyless.site.report.figures import picture
+
+    write_file(path, picture(figure, path.suffix.removeprefix(".")))

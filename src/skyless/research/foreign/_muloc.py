@@ -49,7 +49,8 @@ _MAX_STALE_TICKS: Final = round(2e-6 * TICK_RATE_HZ)
 """By how much the tag's stamps of a round may be off the programmed delay; beyond, some are of an earlier packet."""
 
 _STOPS_S: Final = ((0.25, 3.75), (5.25, 11.5), (13.0, 19.25), (20.5, 27.0), (28.25, 34.5), (35.75, 39.75))
-"""When the tag stood in the recording location1_2, which does not hold that itself, from its first round on."""
+_STOPS_ROUNDS: Final = 14_032
+"""When the tag stood in the recording location1_2, known by its number of rounds: the file does not hold that."""
 
 
 def recognise(head: bytes) -> bool:
@@ -118,10 +119,13 @@ def read_anchors(path: str | PathLike[str]) -> dict[int, Point]:
 def read_truth(path: str | PathLike[str], _listener: str | None) -> Truth | None:
     """Where the tag stood, at even steps from its first stop to its last, while it did; None where that is damaged."""
     with open_source(path) as stream:
-        arrays = arrays_of(stream, Counter(), "start_m", "end_m")
+        arrays = arrays_of(stream, Counter(), "index", "start_m", "end_m")
         held = arrays_of(stream, Counter(), "stops_s")
-    stops_s = _STOPS_S if held is None else held["stops_s"].tolist()
-    if arrays is None or len(arrays["start_m"]) != 2 or len(arrays["end_m"]) != 2 or not stops_s:
+    if arrays is None or len(arrays["start_m"]) != 2 or len(arrays["end_m"]) != 2:
+        return None
+    known = _STOPS_S if len(arrays["index"]) == _STOPS_ROUNDS else ()
+    stops_s = known if held is None else held["stops_s"].tolist()
+    if not stops_s:
         return None
     rows = []
     for share, (begin_s, end_s) in zip(np.linspace(0.0, 1.0, len(stops_s)), stops_s, strict=True):

@@ -29,8 +29,6 @@ class Track(Struct, frozen=True):
     """Shape (n, 2)."""
     truth_m: Array
     """Shape (n, 2): where the tag was at the emission of the last message."""
-    sigma_m: Array
-    """Shape (n,): predicted by the fixes, root of the covariance's trace."""
 
     @property
     def error_m(self) -> Array:
@@ -47,11 +45,11 @@ class _Log:
 
     def add(self, time_s: float, fix: Fix, truth_m: Array) -> None:
         if self._first_fixes.is_first(0, time_s):
-            self.rows.append((time_s, *fix.position_m[:2].tolist(), *truth_m[:2].tolist(), fix.std_m))
+            self.rows.append((time_s, *fix.position_m[:2].tolist(), *truth_m[:2].tolist()))
 
     def track(self, most: int | None) -> Track:
-        rows = np.array(self.rows[:most]).reshape(-1, 6)
-        return Track(rows[:, 0], rows[:, 1:3], rows[:, 3:5], rows[:, 5])
+        rows = np.array(self.rows[:most]).reshape(-1, 5)
+        return Track(rows[:, 0], rows[:, 1:3], rows[:, 3:5])
 
 
 def listen(

@@ -26,7 +26,6 @@ class Count(Struct, frozen=True):
     """Updates of one method at one site."""
 
     site: str
-    nodes: int
     method: str
     updates: int
     counted_s: float
@@ -70,7 +69,7 @@ def run_world(name: str, seed: int, seconds: float) -> list[Count]:
     schedule, nodes = schedule_of(site), len(site.anchors)
     foreseen = {"literal": schedule.superframe_rate_hz, "joint": schedule.messages_per_s(nodes)}
     return [
-        Count(name, nodes, method, len(times), seconds, foreseen[method], float(np.diff(times).max()))
+        Count(name, method, len(times), seconds, foreseen[method], float(np.diff(times).max()))
         for method, times in times_s.items()
     ]
 

@@ -35,7 +35,6 @@ class FleetResult(Struct, frozen=True):
     """A fleet of tags in the stretch of time that is judged."""
 
     tags: int
-    seed: int
     rmse_m: float
     """Over all tags and fixes."""
     rmse_standard_error_m: float | None
@@ -84,10 +83,10 @@ def run_world(tags: int, seed: int) -> FleetResult:
                 fixes[tag] += 1
         if judged:
             cpu_s += time.process_time() - begun_s
-    return summarise(seed, squares_m2, fixes, frames, digest.hexdigest()[:16], cpu_s)
+    return summarise(squares_m2, fixes, frames, digest.hexdigest()[:16], cpu_s)
 
 
-def summarise(seed: int, squares_m2: Array, fixes: Integers, frames: int, digest: str, cpu_s: float) -> FleetResult:
+def summarise(squares_m2: Array, fixes: Integers, frames: int, digest: str, cpu_s: float) -> FleetResult:
     """Sum a fleet up: squared errors and fixes of each tag, shape (tags,)."""
     tags, span_s = len(fixes), _JUDGED_UNTIL_S - _JUDGED_FROM_S
     own = np.sqrt(squares_m2 / np.maximum(fixes, 1))
@@ -96,7 +95,6 @@ def summarise(seed: int, squares_m2: Array, fixes: Integers, frames: int, digest
     low, high = np.percentile(own, (5, 95)).tolist()
     return FleetResult(
         tags=tags,
-        seed=seed,
         rmse_m=rmse,
         rmse_standard_error_m=None if mean_square_error is None else mean_square_error / (2.0 * rmse),
         tag_rmse_m=(low, high),

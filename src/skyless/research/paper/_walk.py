@@ -27,8 +27,6 @@ _BINS: Final = 40
 class AlongPath(Struct, frozen=True):
     """Errors of ``literal`` piece by piece of the path, and what could explain them; arrays of shape (_BINS,)."""
 
-    position_m: Array
-    """True mean position, shape (_BINS, 2)."""
     rms_m: Array
     """About the piece's mean error, which holds the delay of a fix behind a moving tag."""
     pdop: Array
@@ -63,7 +61,6 @@ def along_path(track: Track) -> AlongPath:
     pdop = pdop_at(positions_m)
     predicted = np.array([float(np.trace(literal_covariance_m2(at)) ** 0.5) for at in positions_m])
     return AlongPath(
-        positions_m,
         scatter,
         pdop,
         predicted,

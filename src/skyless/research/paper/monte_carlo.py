@@ -256,19 +256,6 @@ class ChainMoments(Struct, frozen=True):
         error: Array = np.sqrt(excess / self.draws) / 2.0
         return error
 
-    @property
-    def epsilon_covariance_error_s2(self) -> Array:
-        """Standard error of ``epsilon_covariance_s2``, for jointly Gaussian errors."""
-        both = self.variance[Quantity.EPSILON_FIRST] * self.variance[Quantity.EPSILON_DELAYED]
-        error: Array = np.sqrt((both + self.epsilon_covariance_s2**2) / self.draws)
-        return error
-
-    @property
-    def lambda_covariance_error_m2(self) -> Array:
-        """Standard error of ``lambda_covariance_m2``, for jointly Gaussian errors."""
-        own = np.diag(self.lambda_covariance_m2)
-        return np.sqrt((np.outer(own, own) + self.lambda_covariance_m2**2) / self.draws)
-
 
 class _Merge:
     """Mean, squares about the mean and products of all chunks so far (T. Chan, G. Golub, R. LeVeque 1979)."""

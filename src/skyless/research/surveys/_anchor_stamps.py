@@ -7,29 +7,17 @@ from skyless.core.air.reception import Reception, Transmission
 from skyless.core.protocols import AnchorMachine, decode_any, new_anchor
 from skyless.core.site import Site
 from skyless.sim.impairments import Impairments
-from skyless.sim.stations import TagSpec
-from skyless.sim.trajectory import Static
 from skyless.sim.world import World
-from skyless.site.survey.stamps.legs import LegCollector
 from skyless.site.survey.stamps.pair_ranger import PairRanger
 
 OnLeg = Callable[[int, int, int, int, float], None]
 """Sender, receiver, TX and RX ticks, true time: as ``PairRanger.add`` accepts them."""
 
 
-def stamps_of(
-    site: Site,
-    impairments: Impairments,
-    seconds: float,
-    seed: int,
-    *,
-    listener_m: tuple[float, float, float] | None = None,
-    settle_s: float = 0.0,
-) -> PairRanger:
-    """Ranges of ``seconds`` of a site.
+def stamps_of(site: Site, impairments: Impairments, seconds: float, seed: int, *, settle_s: float = 0.0) -> PairRanger:
+    """Ranges of ``seconds`` of a site, from all that its anchors receive.
 
-    ``listener_m``: the legs are those that one listener there learns of the anchors' beacons; by default all that the
-    anchors receive. ``settle_s``: time that passes before the first leg. The last block is closed.
+    ``settle_s``: time that passes before the first leg. The last block is closed.
     """
     whole = PairRanger()
     until_s = settle_s + seconds
@@ -38,22 +26,13 @@ def stamps_of(
         if t_s >= settle_s:
             whole.add(sender, receiver, tx_ticks, rx_ticks, t_s)
 
-    if listener_m is None:
-        for _ in World(site, _recorded(site, on_leg), (), impairments, seed).run(until_s):
-            pass
-    else:
-        collector = LegCollector(site.id)
-        tag = TagSpec(Static(*listener_m))
-        for broadcast in World(site, lambda anchor: new_anchor(site, anchor), (tag,), impairments, seed).run(until_s):
-            for _, reception, _ in broadcast.receptions():
-                for leg in collector.add(reception):
-                    on_leg(leg.sender, leg.receiver, leg.tx_ticks, leg.rx_ticks, leg.t_s)
+    def new_recorded(anchor: int) -> RecordedAnchor:
+        return RecordedAnchor(new_anchor(site, anchor), site.id, on_leg)
+
+    for _ in World(site, new_recorded, (), impairments, seed).run(until_s):
+        pass
     whole.finish()
     return whole
-
-
-def _recorded(site: Site, on_leg: OnLeg) -> Callable[[int], "RecordedAnchor"]:
-    return lambda anchor: RecordedAnchor(new_anchor(site, anchor), site.id, on_leg)
 
 
 class RecordedAnchor:

@@ -4,9 +4,9 @@ No I/O; the time is passed in. Noise at an edge causes no series of events: a ta
 lies beyond it by the margin, or by half of the margin in every fix for a while. In between, it stays on its side.
 """
 
-import math
 from typing import Final
 
+from skyless.core.ellipse import horizontal_ellipse
 from skyless.run.mqtt.messages import FixMessage, Vector, Zone, ZoneEvent
 from skyless.run.zones.zone_list import area_m2, depth_m, perimeter_m
 
@@ -74,7 +74,7 @@ class ZoneMonitor:
         """Process a fix; ``now_s`` is its time of arrival, by the clock of ``expire_tags``."""
         tag = self._tags.setdefault(fix.tag, _TagState())
         tag.updated_s, tag.position_m = now_s, fix.position_m
-        margin_m = max(MIN_MARGIN_M, _MARGIN_SIGMAS * _worst_std_m(fix))
+        margin_m = max(MIN_MARGIN_M, _MARGIN_SIGMAS * horizontal_ellipse(fix.covariance_m2)[0])
         events = []
         for zone_id, zone in self._monitored.items():
             if zone_id not in tag.inside and not zone.may_hold(fix.position_m):
@@ -119,12 +119,6 @@ def _crossed(tag: _TagState, zone: _MonitoredZone, fix: FixMessage, margin_m: fl
     del tag.beyond_since_s[zone_id]
     (tag.inside.discard if was_inside else tag.inside.add)(zone_id)
     return True
-
-
-def _worst_std_m(fix: FixMessage) -> float:
-    """Standard deviation along the longer axis of the horizontal error ellipse."""
-    xx, xy, _, _, yy = fix.covariance_m2[:5]
-    return math.sqrt(max(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy), 0.0))
 
 
 def _event(zone: Zone, name: str, tag: _TagState, unix_s: float, *, entered: bool) -> ZoneEvent:

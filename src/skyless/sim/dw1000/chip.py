@@ -153,7 +153,6 @@ class Chip:
         self.memory = Memory(self.misuse)
         self.clocking = Clocking(self.memory, self.misuse, seconds, sensors or Sensors())
         self.transceiver = Transceiver(self.memory, air, tx_delay_ticks, self.misuse)
-        self.transfers = 0
         self.pull_reset()
 
     # Pins
@@ -180,7 +179,6 @@ class Chip:
 
     def transfer(self, out: bytes, hz: int) -> bytes:
         """One transaction: the octets that the chip sends while it receives ``out``, as many."""
-        self.transfers += 1
         access = decode_header(out)
         if access is None:
             self.misuse["transaction-without-header"] += 1

@@ -6,7 +6,6 @@ Files are written whole or not at all, and without a screen.
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, Final
 
 from cycler import cycler
@@ -14,8 +13,6 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-
-from skyless.core.whole_files import write_whole
 
 INK: Final = "#1f2933"
 MUTED: Final = "#5f6b7a"
@@ -111,15 +108,6 @@ def draw_floor_plan(axes: Axes, anchors_m: list[tuple[float, float]], *, labels:
             )
     axes.set(xlabel="x in m", ylabel="y in m", aspect="equal")
     axes.grid(visible=False)
-
-
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure in the format of the file's ending (PNG where it has none), whole or not at all.
-
-    Raises:
-        OSError, ValueError: the file cannot be written, or its ending names no kind of picture.
-    """
-    write_whole(path, picture(figure, path.suffix.removeprefix(".") or "png"))
 
 
 def picture(figure: Figure, kind: str, dpi: float = 130.0) -> bytes:
