@@ -30,11 +30,8 @@ from skyless.core.estimator.levels import FIRST_TEST, LEVELS, protect
 from skyless.core.estimator.settings import TUNING
 from skyless.core.estimator.state import (
     ALL_RANGE_ERRORS,
-    CREEPING_STD_M,
     FAULT_KINDS,
     LASTING,
-    LASTING_STD_M,
-    RECENT_STD_M,
     with_anchor,
 )
 from skyless.core.integrity import CONTRADICTED, HPL, Alert, IntegrityRequirement, integrity_of, limits_of
@@ -351,7 +348,7 @@ def test_levels_are_the_ellipse_and_the_shift_of_all_faults():
     levels = np.zeros(LEVELS)
     protect(s, levels)
     hpl, vpl = [], []
-    for kind, std_m in enumerate((LASTING_STD_M, RECENT_STD_M, CREEPING_STD_M)):
+    for kind, std_m in enumerate((TUNING.lasting_std_m, TUNING.recent_std_m, TUNING.creeping_std_m)):
         of_kind = slice(kind * n, (kind + 1) * n)
         information, evidence = s.information[of_kind, of_kind] + np.eye(n) / std_m**2, s.evidence[of_kind]
         V = s.V[of_kind, :3]

@@ -10,7 +10,6 @@ import numpy as np
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.core.estimator.settings import TUNING
-from skyless.core.estimator.state import OPEN_PAIR_STD_M
 
 
 class Newest:
@@ -39,7 +38,7 @@ class TextbookFilter:
         self.x[self.p], self.P[: self.dim, : self.dim] = position_m, covariance_m2
         self.held_m = {}
         self.whole, self.newest, self.packets, self.relayed, self.walked_m = {}, {}, {}, set(), 0.0
-        pair_variance = OPEN_PAIR_STD_M**2 if settings.range_std_m or settings.survey_std_m else 0.0
+        pair_variance = TUNING.open_pair_std_m**2 if settings.range_std_m or settings.survey_std_m else 0.0
         self.pairs = {frozenset((i, j)): [0.0, pair_variance] for i in range(n) for j in range(i)}
         self.relays = dict.fromkeys(permutations(range(n), 2), 0)
 

@@ -30,7 +30,6 @@ from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.estimator.state import (
     ALL_RANGE_ERRORS,
     LASTING,
-    LASTING_STD_M,
     NEVER,
     PACKETS_KEPT,
     EstimatorState,
@@ -51,16 +50,7 @@ from skyless.core.ticks import HALF_WRAP_TICKS, TICK_MASK
 REJECTED, ACCEPTED, JOINED, STALE, NEW_ANCHOR, SILENT_ANCHOR, RESTARTED_CLOCK = range(7)
 """What became of a packet; the last three require an anchor to join or leave, and for the packet again."""
 
-# Paths that seem longer than expected by more than this, for this number of packets in a row: a counter has jumped.
 MAX_RATE_MPS: Final = 100e-6 * SPEED_OF_LIGHT_MPS  # between two clocks that are still crystals
-# The state is wrong where this number of packets in a row, or a larger share of all, lies beyond the gate.
-LOST_IN_ROW: Final = 8
-LOST_SHARE: Final = 0.5
-MAX_RELAYS_REJECTED: Final = 4.0  # recent relays beyond the gate; fewer may be late ones
-FITTING_CHI2: Final = 2.0  # largest χ² for each anchor of range errors that are as the settings state them
-# Part of an anchor's lateness at the start that stays: mean and standard deviation.
-STAYING_SHARE: Final = 0.2
-STAYING_STD: Final = 0.5
 MAX_PACKED: Final = 16  # relays in a frame; 13 fit
 
 
@@ -149,8 +139,8 @@ def _process(
         status["packets"] += 1
         _keep_packet(s, anchor, sequence, rx_ticks, tx_ticks)
     if was_known:
-        status["relays_lately_accepted"] *= settings["fading"]
-        status["relays_lately_rejected"] *= settings["fading"]
+        status["relays_lately_accepted"] *= settings["relay_fading"]
+        status["relays_lately_rejected"] *= settings["relay_fading"]
     _process_relays(s, relays, first, last if was_known else first)
     if was_known and report_variance_m2 > 0.0 and master >= 0 and s.index_of[master] not in (-1, anchor):
         report(s, anchor, s.index_of[master], subticks, report_variance_m2)
@@ -515,9 +505,9 @@ class Estimator:
         anchor = int(state.index_of[table_index])
         change, constant = where.change + anchor, where.constant + anchor
         staying_m = late_m if may_stay else 0.0
-        state.x[change], state.x[constant] = late_m - STAYING_SHARE * staying_m, STAYING_SHARE * staying_m
+        state.x[change], state.x[constant] = late_m - TUNING.staying_share * staying_m, TUNING.staying_share * staying_m
         state.P[change, change] += variance_m2
-        state.P[constant, constant] += (STAYING_STD * staying_m) ** 2
+        state.P[constant, constant] += (TUNING.staying_std * staying_m) ** 2
         state.status["range_errors"] = ALL_RANGE_ERRORS
 
     def withhold_levels(self, are_withheld: bool = True) -> None:
@@ -531,7 +521,7 @@ class Estimator:
         covariance_m2: Matrix,
         speed_variance: float,
         open_range_errors: bool = False,
-        fault_std_m: float = LASTING_STD_M,
+        fault_std_m: float = TUNING.lasting_std_m,
         misfitting: Iterable[int] = (),
     ) -> None:
         """Start at a position, shapes (dim,) and (dim, dim), without any anchor; the share of late packets is kept.
@@ -660,7 +650,7 @@ class Estimator:
         s, count = self._state, len(self._state.anchors)
         constants = slice((first := layout(self.dim, count).constant), first + count)
         variances = s.P[constants, constants] + self.settings.range_std_m**2 * np.eye(count)
-        return bool(s.x[constants] @ np.linalg.solve(variances, s.x[constants]) < FITTING_CHI2 * count)
+        return bool(s.x[constants] @ np.linalg.solve(variances, s.x[constants]) < TUNING.fitting_chi2 * count)
 
     @property
     def multipath_m(self) -> tuple[float, float] | None:
@@ -685,26 +675,26 @@ class Estimator:
         status = self._state.status[0]
         in_row = int(status["rejected_in_row"]) + int(status["stale_in_row"])
         late = min(float(status["late_share"]), 0.45)
-        return bool(status["rejected_share"] > LOST_SHARE or in_row * (1.0 - 2.0 * late) >= LOST_IN_ROW)
+        return bool(status["rejected_share"] > TUNING.lost_share or in_row * (1.0 - 2.0 * late) >= TUNING.lost_in_row)
 
     @property
     def rejects_most(self) -> bool:
         """Whether most measurements lie beyond the gate."""
-        return bool(self._state.status[0]["rejected_share"] > LOST_SHARE)
+        return bool(self._state.status[0]["rejected_share"] > TUNING.lost_share)
 
     @property
     def is_contradicted(self) -> bool:
         """Whether most of what anchors received of each other does not fit: a wrong position shifts all clocks."""
-        rejected = self._state.status["relays_lately_rejected"].item()
-        return rejected > MAX_RELAYS_REJECTED and bool(rejected > self._state.status["relays_lately_accepted"].item())
+        status = self._state.status[0]
+        return bool(
+            status["relays_lately_rejected"] > max(TUNING.max_relays_rejected, status["relays_lately_accepted"])
+        )
 
     @property
     def relays_fit(self) -> bool:
         """Whether most of what anchors received of each other fits, and that is more than a few receptions."""
-        status = self._state.status[0]
-        return bool(
-            status["relays_lately_accepted"] > max(MAX_RELAYS_REJECTED, 4.0 * float(status["relays_lately_rejected"]))
-        )
+        accepted, rejected = (self._state.status[0][f"relays_lately_{name}"] for name in ("accepted", "rejected"))
+        return bool(accepted > max(TUNING.max_relays_rejected, 4.0 * rejected))
 
     @property
     def obstructed(self) -> tuple[int, ...]:

@@ -24,7 +24,6 @@ from skyless.core.estimator.state import (
     CREEPING,
     FAULT_KINDS,
     LASTING,
-    LASTING_STD_M,
     RECENT,
     EstimatorState,
     layout,
@@ -152,7 +151,7 @@ def open_faults(s: EstimatorState) -> None:
     settings = s.settings[0]
     lasting_chi2, creeping_chi2 = fault_chi2(s, LASTING, 0), fault_chi2(s, CREEPING, 0)
     lasting, recent, creeping = _largest(s, LASTING), _largest(s, RECENT), _largest(s, CREEPING)
-    if s.status[0]["fault_std_m"][LASTING] <= LASTING_STD_M:
+    if s.status[0]["fault_std_m"][LASTING] <= settings["lasting_std_m"]:
         if creeping_chi2 > max(settings["sure_chi2"], lasting_chi2) and creeping > recent and creeping >= lasting:
             _open_new_faults(s, CREEPING)
         elif fault_chi2(s, RECENT, 0) > settings["sure_chi2"] and recent >= lasting:

@@ -14,12 +14,6 @@ from skyless.core.kernels.covariance import (
     subtract_information,
 )
 
-# Where range errors jump, those of all anchors change by OBSTRUCTED_STD_M within OBSTRUCTED_S. One that has jumped
-# itself wanders with the density OBSTRUCTED_WALK, m²/s, and returns to zero within OBSTRUCTION_MEMORY_S, else all would
-# drift away together; by OBSTRUCTION_RETURN_M in that time at most, as long delays are no less likely to stay.
-# Learnt multipath of this standard deviation makes errors that would be taken for jumps.
-# Part of the process noise of motion that is left for a stationary tag: 5 cm within half a minute.
-
 
 @step
 def predict(s: EstimatorState, rx_ticks: int) -> None:

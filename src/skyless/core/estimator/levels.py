@@ -17,7 +17,7 @@ import numpy as np
 from skyless.core.constants import TICK_S
 from skyless.core.estimator.faults import fault_chi2, whiten
 from skyless.core.estimator.monitor import covariance_scale
-from skyless.core.estimator.state import FAULT_KINDS, LASTING, LASTING_STD_M, EstimatorState
+from skyless.core.estimator.state import FAULT_KINDS, LASTING, EstimatorState
 from skyless.core.integrity import CONTRADICTED, HPL, OBSTRUCTED, SOUND, UNAVAILABLE, VPL
 from skyless.core.kernels.arrays import Vector
 from skyless.core.kernels.compiled import step
@@ -63,11 +63,6 @@ def protect(s: EstimatorState, levels: Vector) -> None:
 
 
 # Whether the anchors determine on which side of them the tag is
-
-
-# Least distance from the plane at which the two sides are compared; for a tag that is farther off it is its own.
-# Standard deviation of how far the best position on the other side lies from the mirror image, over that distance.
-# The sides differ where their ranges' squared differences, over the variance of range errors, sum to more.
 
 
 def fit_plane(s: EstimatorState) -> None:
@@ -124,13 +119,6 @@ def is_side_open(s: EstimatorState) -> bool:
 # Whether a position can be relied on
 
 
-# Part of the mean range; ranges are curved within positions of a larger standard deviation, which have no level.
-# There is no level for this time after a start whose packets contradicted each other: where several anchors are late,
-# the others may agree on a wrong position, until the tag has moved enough to show it.
-# The same where all range errors are open: then only the tag's motion determines its position, by directions that
-# change, and a filter that is linearised at a wrong position becomes too certain (errors of 5 standard deviations).
-
-
 @step
 def integrity_state(s: EstimatorState, levels: Vector) -> int:
     """Whether a position's levels can be relied on: ``SOUND``, ``OBSTRUCTED``, ``CONTRADICTED`` or ``UNAVAILABLE``."""
@@ -141,7 +129,7 @@ def integrity_state(s: EstimatorState, levels: Vector) -> int:
         range_m += s.anchors[anchor]["range_m"] / count
         if s.anchors[anchor]["is_obstructed"] or s.anchors[anchor]["has_fault"]:
             state = OBSTRUCTED
-    was_contradicted = status["fault_std_m"][LASTING] > LASTING_STD_M  # then none are selected
+    was_contradicted = status["fault_std_m"][LASTING] > settings["lasting_std_m"]  # then none are selected
     limit = settings["sure_chi2"] if was_contradicted else settings["uncovered_chi2"]
     share = np.sqrt(s.P[0, 0] + s.P[1, 1]) / max(range_m, 1e-6)  # levels are of first order in it
     if status["withholds_levels"] or levels[FIRST_TEST:].max() > limit:

@@ -1,9 +1,19 @@
 """Which measurements are used, and how process noise is adapted to innovations.
 
-Late receptions are the rule where paths are blocked, early ones are not. A single late one is rejected; where those
-that follow agree with it, the range error has jumped, and is estimated again from there. What is systematic in the
-innovations along an axis is motion, what all anchors have in common is the tag's clock, and what relays show of one
-anchor's clock is that clock.
+It must handle
+
+1. single late receptions, as paths are blocked for a moment: the gate, which narrows where they are frequent;
+2. an anchor behind an obstacle from now on, and its return: its range error jumps, and is estimated again;
+3. a person or a wall that obstructs several anchors in turn: a jump raises the process noise of all range errors;
+4. reflections that change as the tag walks: learnt from what range errors differ by from step to step;
+5. a tag that moves more than assumed: innovations stay on one side along an axis;
+6. the tag's oscillator that warms up, at once or slowly: innovations of all anchors are on one side;
+7. an anchor's oscillator that warms up, or its counter that jumps: relays show it;
+8. a tag that stands still, so that noise does not move it;
+9. all that does not fit any of these: covariances grow with the mean NIS.
+
+Anchors that are late from the start, or ever more, without a jump are found by ``faults``. ``docs/estimator_table.md``
+says what each of these buys.
 """
 
 import numpy as np
@@ -38,7 +48,7 @@ def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_var
     else:
         stamps = 2.0 * (settings["tx_variance_m2"] + settings["rx_variance_m2"])
         apart, both = innovation - a["outlier_m"], innovation + a["outlier_m"]
-        agrees = a["outliers_in_row"] > 0 and apart * apart <= settings["agreement"] ** 2 * stamps
+        agrees = a["outliers_in_row"] > 0 and apart * apart <= settings["suspect"] ** 2 * stamps
         agrees = agrees and both * both > settings["together"] ** 2 * innovation_variance
         a["outliers_in_row"] = a["outliers_in_row"] + 1 if agrees else 1
         a["outlier_m"] = innovation
@@ -195,11 +205,7 @@ def update_stationary(s: EstimatorState, dt: float) -> None:
     for axis in range(dim):
         square += (s.x[axis] - status["stationary_m"][axis]) ** 2 / s.P[axis, axis]
     status["stationary_s"] += dt
-    moved = (
-        square > settings["moved"] * dim
-        or status["lag_square"] > settings["lag_limit"]
-        or status["rejected_in_row"] > 1
-    )
+    moved = square > dim or status["lag_square"] > settings["lag_limit"] or status["rejected_in_row"] > 1
     if moved:
         status["stationary_s"] = 0.0
     for axis in range(dim):  # a place that has become known better moves as well

@@ -1,4 +1,4 @@
-"""Settings."""
+"""What the estimator assumes: constants that are the same everywhere, and settings of a site and its tags."""
 
 from typing import Final
 
@@ -11,87 +11,208 @@ from skyless.core.kernels.arrays import Records
 
 
 class Tuning(Struct, frozen=True):
-    """Constants."""
+    """Constants of the estimator, which are the same at every site; ``docs/estimator_table.md`` says what each buys.
 
+    Normalised: over its standard deviation. A running mean's weight is that of the newest value.
+    """
+
+    # Clocks
     restart_m: float = 300.0
+    """Paths that change by more than this between packets are impossible [m]."""
     restart_in_row: float = 3
-    fading: float = 0.95
-    recent_packets: float = 16.0
-    creeping_s: float = 3.0
-    opened_std_m: float = 1.0
-    sure_chi2: float = 50.0
-    rival_chi2: float = 20.0
-    early_weight: float = 0.8
-    jump_rise: float = 0.5
-    first_change_scale: float = 25.0
-    obstructed_std_m: float = 0.08
-    obstructed_s: float = 5.0
-    obstructed_walk: float = 0.004
-    obstruction_memory_s: float = 10.0
-    obstruction_return_m: float = 0.2
-    stationary_noise_share: float = 2e-07
-    probe_m: float = 1.0
-    shift_part: float = 0.25
-    sides_chi2: float = 25.0
-    sensor_valid_s: float = 1.0
-    uncovered_chi2: float = 240.0
-    first_packets: float = 3
-    max_level_std: float = 0.05
-    contradicted_start_s: float = 5.0
-    max_open_level_std: float = 0.02
-    slope_from_m: float = 4.0
-    held_step_m: float = 0.15
-    held_std: float = 3.0
-    held_max_m: float = 0.4
-    clock_jump_relays: float = 4
-    curvature_share: float = 0.01
-    pair_relays: float = 12
-    misplaced_pairs: float = 2
-    misplaced_std_m: float = 0.3
-    zero_variance_m2: float = 10000.0
-    stationary_std_mps: float = 0.01
-    forgetting: float = 0.02
-    inconsistent_nis: float = 1.6
-    suspect: float = 3.0
-    in_row: float = 2
-    in_row_where_late: float = 5
-    late_often_share: float = 0.02
-    together: float = 7.0
-    agreement: float = 3.0
-    jump_std_m: float = 0.2
-    change_gain: float = 0.1
-    change_growth: float = 1.2
-    change_loss: float = 0.97
-    max_change_scale: float = 250.0
-    ended_std_m: float = 0.05
-    ended: float = 2.0
-    settled_change_scale: float = 2.0
-    late_forgetting: float = 0.005
-    late_probability_density: float = 0.05
-    reception_huber: float = 1.5
-    difference_huber: float = 1.0
-    place_step_m: float = 0.1
-    place_limit: float = 2.0
-    place_limited_mean: float = 0.742
-    place_samples: float = 100
-    place_memory: float = 1000
-    place_min_m2: float = 0.0012
-    place_kept: float = 0.1
-    max_change_std_m: float = 0.5
-    moved: float = 1.0
-    better_known: float = 0.8
+    """Number of impossible packets in a row after which an anchor's counter has restarted."""
+    start_walk_scale: float = 100.0
+    """Factor on the random walk of the tag's oscillator at a start: it warms up after it was switched on."""
     mean_gain: float = 0.05
-    lag_forgetting: float = 0.01
-    lag_limit: float = 2.6
-    q_scale_gain: float = 1.05
-    max_q_scale: float = 100.0
-    scale_loss: float = 0.99
-    common: float = 1.5
+    """Weight in running means of normalised innovations: along each axis, of all anchors, and of an anchor's relays."""
     mean_limit: float = 9.0
+    """Square of such a mean over its expectation beyond which process noise grows."""
     walk_scale_gain: float = 1.2
+    """Growth of a clock's process noise with each innovation."""
+    scale_loss: float = 0.99
+    """Factor on adapted process noise with each innovation that does not call for more."""
+    common: float = 1.5
+    """Normalised innovations of all anchors beyond this on one side: the tag's clock has left its rate."""
+    clock_jump_relays: float = 4
+    """Number of relays of an anchor in a row beyond the gate, while its receptions jump: its clock has jumped."""
+
+    # Motion
+    q_scale_gain: float = 1.05
+    """Growth of the process noise of motion with each innovation."""
+    max_q_scale: float = 100.0
+    """Largest factor on the process noise of motion."""
+    lag_limit: float = 2.6
+    """Mean square of the innovations along the axes, 1 where the filter is right, beyond which that noise grows."""
+    lag_forgetting: float = 0.01
+    """Weight in that mean."""
+    better_known: float = 0.8
+    """The place of a tag at rest moves when its variance has shrunk to this part."""
+    stationary_noise_share: float = 2e-7
+    """Part of the process noise of motion that a tag at rest keeps: 5 cm within half a minute."""
+    stationary_std_mps: float = 0.01
+    """Standard deviation of the velocity of a tag at rest [m/s]."""
+
+    # Linearisation (docs/maths.md, section 6)
+    held_step_m: float = 0.15
+    """Distance of the estimate from the point of linearisation at which that moves [m]."""
+    held_std: float = 3.0
+    """It stays within this number of standard deviations of the estimate …"""
+    held_max_m: float = 0.4
+    """… up to this distance [m]."""
+    curvature_share: float = 0.01
+    """Share of the stamps' variance below which the curvature of ranges is neglected."""
+    slope_from_m: float = 4.0
+    """Range at which errors that grow with distance pass through zero, and by which they change once [m] (APS011)."""
+
+    # Which innovations are used
+    forgetting: float = 0.02
+    """Weight in the mean NIS and in the share of rejected innovations: the last 50."""
+    inconsistent_nis: float = 1.6
+    """Mean NIS beyond which covariances are scaled by its square."""
+    late_forgetting: float = 0.005
+    """Weight in the share of late receptions: the last 200."""
+    late_often_share: float = 0.02
+    """Share of late receptions beyond which single ones are late often."""
+    late_probability_density: float = 0.05
+    """Density of the normalised innovations of late receptions: a metre late at 5 cm."""
+    reception_huber: float = 1.5
+    """Normalised innovation beyond which receptions have less weight where they are late often (Huber 1964)."""
+    difference_huber: float = 1.0
+    """The same of time differences, always."""
+    relay_fading: float = 0.95
+    """Factor on the counts of recent relays with each packet."""
+    max_relays_rejected: float = 4.0
+    """Count of recent relays beyond the gate up to which they may be late ones."""
+    lost_in_row: float = 8
+    """Number of rejected packets in a row, single late ones left out, at which the state is wrong."""
+    lost_share: float = 0.5
+    """Share of rejected innovations at which it is."""
+
+    # Range errors that jump
+    suspect: float = 3.0
+    """Normalised innovation beyond which a reception may be a jump, and two of them differ by chance."""
+    in_row: float = 2
+    """Number of such receptions in a row that make a jump …"""
+    in_row_where_late: float = 5
+    """… and where single receptions are late often."""
+    together: float = 7.0
+    """Sum of two such normalised innovations: by chance once in some million packets."""
+    jump_std_m: float = 0.2
+    """Least standard deviation of a range error that has jumped [m]."""
+    first_change_scale: float = 25.0
+    """Factor on the process noise of a range error that has just jumped: it may still be changing."""
+    change_gain: float = 0.1
+    """Weight in the running mean of the innovations of such an anchor."""
+    change_growth: float = 1.2
+    """Growth of that process noise while the mean is off zero …"""
+    change_loss: float = 0.97
+    """… and its factor otherwise."""
+    max_change_scale: float = 250.0
+    """Largest factor on it."""
+    settled_change_scale: float = 2.0
+    """Factor below which such a range error has settled."""
+    ended_std_m: float = 0.05
+    """An obstruction has ended where the range error is known to this [m] …"""
+    ended: float = 2.0
+    """… and within this number of standard deviations of zero."""
+    obstructed_walk: float = 0.004
+    """Density with which a range error that has jumped wanders [m²/s]."""
+    obstruction_memory_s: float = 10.0
+    """Time in which it returns to zero, and in which a jump is forgotten [s]."""
+    obstruction_return_m: float = 0.2
+    """Largest return in that time [m]: long delays are no less likely to stay."""
+    jump_rise: float = 0.5
+    """Part of its full size by which a jump raises the process noise of all range errors."""
+    obstructed_std_m: float = 0.08
+    """Standard deviation by which all range errors change where some have jumped [m] …"""
+    obstructed_s: float = 5.0
+    """… and the time in which they do [s]."""
+
+    # Multipath, from range errors compared after each step of the tag and after two (a semivariogram, Matheron 1963)
+    place_step_m: float = 0.1
+    """Length of a step [m]."""
+    place_limit: float = 2.0
+    """A comparison counts as this many times their mean at most, as jumps are not multipath."""
+    place_limited_mean: float = 0.742
+    """What that leaves of the mean square of normal errors."""
+    place_samples: float = 100
+    """Number of comparisons that are needed …"""
+    place_memory: float = 1000
+    """… and that are remembered."""
+    place_min_m2: float = 0.0012
+    """Least variance between two steps that counts as multipath [m²]."""
+    place_kept: float = 0.1
+    """Least correlation over a step, and least loss of it."""
+    max_change_std_m: float = 0.5
+    """Largest standard deviation of the part of a range error that changes as the tag moves [m]."""
+
+    # Faults that the state does not hold (docs/maths.md, section 8)
+    lasting_std_m: float = 0.3
+    """Standard deviation beforehand of a fault since an anchor joined [m] …"""
+    recent_std_m: float = 0.08
+    """… of one that has begun recently without a visible jump [m] …"""
+    creeping_std_m: float = 0.2
+    """… and of one that grows for seconds [m]."""
+    recent_packets: float = 16.0
+    """Number of packets of each anchor over which a fault is recent."""
+    creeping_s: float = 3.0
+    """Time in which a creeping fault has become e times as large [s]."""
+    opened_std_m: float = 1.0
+    """Standard deviation beforehand of a fault that is added to the state [m]."""
+    sure_chi2: float = 50.0
+    """Test beyond which there is a fault: χ² of eight degrees of freedom with a probability of 4·10⁻⁸."""
+    rival_chi2: float = 20.0
+    """Least difference to what other anchors' faults explain, and most of the test that chosen ones leave."""
+    early_weight: float = 0.8
+    """Weight of what an early fault explains: obstacles make packets late."""
+
+    # Anchors that stand elsewhere
+    open_pair_std_m: float = 0.1
+    """Standard deviation of the range between two anchors against the survey, before it is measured [m]."""
+    pair_relays: float = 12
+    """Number of relays in either direction after which their mean is a range."""
+    misplaced_pairs: float = 2
+    """Number of such ranges beyond ``suspect``, and more than the other end has, that make an anchor misplaced."""
+    misplaced_std_m: float = 0.3
+    """Standard deviation of each of its coordinates then [m]."""
+
+    # Starts
+    open_range_std_m: float = 1.0
+    """Standard deviation of ranges after a start that was contradicted [m] …"""
+    open_survey_std_m: float = 0.15
+    """… and of each coordinate of an anchor [m]."""
+    fitting_chi2: float = 2.0
+    """χ² for each anchor below which range errors are as the settings state them."""
+    staying_share: float = 0.2
+    """Part of an anchor's lateness at the start that stays: its mean …"""
+    staying_std: float = 0.5
+    """… and its standard deviation."""
+    zero_variance_m2: float = 1e4
+    """Variance of a barometer's zero at first [m²]."""
+
+    # Levels that are withheld
+    uncovered_chi2: float = 240.0
+    """Test beyond which faults are larger than levels cover."""
+    first_packets: float = 3
+    """Number of packets of each anchor before the first level."""
+    max_level_std: float = 0.05
+    """Part of the mean range beyond which a standard deviation has no level: ranges are curved …"""
+    max_open_level_std: float = 0.02
+    """… and the same where all range errors are open: then only motion determines the position."""
+    contradicted_start_s: float = 5.0
+    """Time without a level after a start that was contradicted: several late anchors may agree on a wrong place [s]."""
+    probe_m: float = 1.0
+    """Least distance from the anchors' plane at which its two sides are compared [m]."""
+    shift_part: float = 0.25
+    """Standard deviation of the best place on the other side about the mirror image, over that distance."""
+    sides_chi2: float = 25.0
+    """Squared differences of the ranges of both sides, over their variance, from which the sides differ."""
+    sensor_valid_s: float = 1.0
+    """Time for which a sensor's height decides between them [s]."""
 
 
 TUNING: Final = Tuning()
+"""The constants in use. Kernels read them from the record of the settings."""
 
 
 MAX_CLOCK_RATE: Final = 50e-6  # two crystals of ±20 ppm, and margin

@@ -23,7 +23,7 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.core.estimator.settings import EstimatorSettings
+from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.kernels.arrays import Indices, Integers, Matrix, Records, Vector
 from skyless.core.kernels.compiled import jitted, step
 
@@ -263,8 +263,8 @@ def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors
     status["range_errors"] = _expected_range_errors(settings.record()[0], status[0])
     status["q_scale"] = status["mean_nis"] = 1.0
     status["height_ticks"] = NEVER
-    status["walk_scale"] = min(START_WALK_SCALE, settings.max_walk_scale)
-    status["fault_std_m"] = (LASTING_STD_M, RECENT_STD_M, CREEPING_STD_M)
+    status["walk_scale"] = min(TUNING.start_walk_scale, settings.max_walk_scale)
+    status["fault_std_m"] = (TUNING.lasting_std_m, TUNING.recent_std_m, TUNING.creeping_std_m)
     status["place_square_m2"] = settings.tx_variance_m2 + settings.rx_variance_m2
     status["place_distance_m"] = settings.place_distance_m
     status["mean_square_m2"] = settings.tx_variance_m2 + settings.rx_variance_m2
@@ -292,18 +292,6 @@ def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors
     )
 
 
-START_WALK_SCALE: Final = 100.0  # of the tag's oscillator, which warms up after it was switched on
-LASTING_STD_M: Final = 0.3  # of a fault that has been there since the anchor joined
-# The same after a start from packets that contradict each other, of which some are late by more.
-CONTRADICTED_STD_M: Final = 1.0
-RECENT_STD_M: Final = 0.08  # of a fault that has begun recently without a visible jump
-CREEPING_STD_M: Final = 0.2  # of one that grows for seconds
-OPEN_PAIR_STD_M: Final = 0.1  # of the range between two anchors against the survey, before it is measured
-# What a start expects of ranges and survey that follows one which was contradicted.
-OPEN_RANGE_STD_M: Final = 1.0
-OPEN_SURVEY_STD_M: Final = 0.15
-
-
 def with_anchor(
     s: EstimatorState, table_index: int, position_m: Vector, is_open: bool = False, std_m: float | None = None
 ) -> EstimatorState:
@@ -322,7 +310,7 @@ def with_anchor(
     grown.packets[count] = (NEVER, NEVER, NEVER)
     pair_variance = 0.0
     if settings["range_std_m"] > 0.0 or settings["survey_std_m"] > 0.0 or std_m:
-        pair_variance = OPEN_PAIR_STD_M**2
+        pair_variance = TUNING.open_pair_std_m**2
     for link in (grown.links[count], grown.links[:, count]):
         link["tx_ticks"], link["variance_m2"] = NEVER, pair_variance
     where = layout(dim, count + 1)
@@ -332,7 +320,7 @@ def with_anchor(
         s.status[0]["range_errors"] = ALL_RANGE_ERRORS
     if is_open or s.status[0]["open_range_errors"]:
         s.status[0]["range_errors"] = ALL_RANGE_ERRORS
-        range_std_m, survey_std_m = OPEN_RANGE_STD_M, OPEN_SURVEY_STD_M
+        range_std_m, survey_std_m = TUNING.open_range_std_m, TUNING.open_survey_std_m
     grown.P[where.constant + count, where.constant + count] = range_std_m**2
     survey = where.survey + dim * count
     for axis in range(dim):

@@ -9,7 +9,6 @@ from msgspec.structs import replace
 from skyless.core.constants import TICK_S
 from skyless.core.estimator.estimator import ACCEPTED, NO_REPORT, REJECTED, STALE, Estimator, Report, SavedEstimator
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
-from skyless.core.estimator.state import CONTRADICTED_STD_M, LASTING_STD_M, OPEN_RANGE_STD_M
 from skyless.core.fix import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY, Fix, NoFixReason
 from skyless.core.integrity import UNAVAILABLE, IntegrityRequirement
 from skyless.core.kernels.arrays import Array
@@ -287,7 +286,7 @@ class Estimation:
         is_contradicted = start.is_contradicted and not self._estimator.is_late_often
         self._course.is_open = self._course.open_range_errors or (is_contradicted and not start.misfitting)
         self._course.start_was_contradicted = self._course.is_open or is_contradicted
-        error = OPEN_RANGE_STD_M if self._course.start_was_contradicted else self._settings.range_std_m
+        error = TUNING.open_range_std_m if self._course.start_was_contradicted else self._settings.range_std_m
         inflation = 1.0 + error**2 / (self._settings.tx_variance_m2 + self._settings.rx_variance_m2)
         if not self._course.start_was_contradicted:
             inflation *= COVARIANCE_MARGIN
@@ -298,7 +297,7 @@ class Estimation:
             covariance,
             start.speed_variance,
             self._course.is_open,
-            CONTRADICTED_STD_M if self._course.start_was_contradicted else LASTING_STD_M,
+            TUNING.open_range_std_m if self._course.start_was_contradicted else TUNING.lasting_std_m,
             [
                 self._estimator.anchor_index(packet.anchor, packet.anchor_m, packet.anchor_std_m)
                 for packet in packets

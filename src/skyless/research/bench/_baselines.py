@@ -13,7 +13,6 @@ import numpy as np
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.core.estimator.settings import MAX_CLOCK_RATE, TUNING, EstimatorSettings
-from skyless.core.estimator.state import START_WALK_SCALE
 from skyless.core.kernels.arrays import Integers, Matrix, Vector
 from skyless.core.kernels.compiled import threaded_kernel
 from skyless.core.tag.factory import RELAY_AGE_S
@@ -46,7 +45,7 @@ class PlainJoint:
         self._relayed: dict[tuple[int, int], int] = {}
         self._newest: dict[int, int] = {}
         self._range_m: dict[int, float] = {}
-        self._walk_scale, self._common_mean, self._count = START_WALK_SCALE, 0.0, 0
+        self._walk_scale, self._common_mean, self._count = TUNING.start_walk_scale, 0.0, 0
 
     def process(self, anchor: int, sequence: int, rx: int, tx: int, relays: Integers) -> None:
         """Process one packet, as ``Estimator.process`` does."""

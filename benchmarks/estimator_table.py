@@ -1,0 +1,266 @@
+"""What each mechanism of the estimator buys: ``python benchmarks/estimator_table.py [--data FOLDER] [--docs FILE]``.
+
+One mechanism at a time is switched off, by values of constants with which it does nothing, and the same receptions are
+processed again: simulated rooms, the paper's lab, and recordings below ``--data``. The table has the RMSE over that with
+all mechanisms on. ``--kept FILE`` keeps the sums as JSON: a run that was interrupted continues there. ``--only WORD``
+leaves mechanisms out, ``--rows WORD`` rows.
+"""
+
+import argparse
+import json
+import multiprocessing
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from msgspec import structs
+
+from skyless.core.errors import SkylessError
+from skyless.core.estimator import settings as parameters
+from skyless.research.benchmark.recordings import Found, recordings_below
+from skyless.research.replays.captures import CaptureReplay
+from skyless.research.replays.options import ReplayOptions
+from skyless.research.studies import loss, motion, nlos, room
+from skyless.research.studies.common.plan import plan_of
+from skyless.research.studies.common.summary import Case
+from skyless.research.studies.common.worlds import Run, beacons_of, judged
+
+OFF = 1e12
+JOINT, ACQUISITION = "skyless.core.tag.joint:", "skyless.core.tag._acquisition:"
+STATE, ESTIMATOR = "skyless.core.estimator.state:", "skyless.core.estimator.estimator:"
+DIFFERENCES = "skyless.research.masterless.difference_tracking:"
+
+MECHANISMS: dict[str, dict[str, float]] = {
+    "": {},
+    "Jumps of range errors": {"in_row": OFF, "in_row_where_late": OFF},
+    "… by receptions that agree": {"agreement": OFF},
+    "… widen all range errors": {"jump_rise": 0.0},
+    "… may still be changing": {"first_change_scale": 1.0, "change_growth": 1.0},
+    "… grow while innovations stay on one side": {"change_growth": 1.0},
+    "… of more than 20 cm return slowly": {"obstruction_return_m": OFF},
+    "… end where the error is small": {"ended_std_m": 0.0},
+    "Single late packets": {"late_often_share": OFF, "late_probability_density": 0.0},
+    "… narrow the gate": {"late_probability_density": 0.0},
+    "… need more in a row for a jump": {"in_row_where_late": 2},
+    "… less weight of large innovations": {"reception_huber": OFF},
+    "… weak first paths": {"skyless.core.air.first_path:MAX_VARIANCE_FACTOR": 1.0},
+    "Faults are opened": {"sure_chi2": OFF},
+    "… lasting ones": {"rival_chi2": -1.0},
+    "… creeping ones": {STATE + "CREEPING_STD_M": 1e-6},
+    "… recent ones": {STATE + "RECENT_STD_M": 1e-6},
+    "… early ones weigh less": {"early_weight": 1.0},
+    "Noise of motion adapts": {"q_scale_gain": 1.0},
+    "Noise of the tag's clock adapts": {"walk_scale_gain": 1.0, "common": OFF},
+    "… a step of it is seen at once": {"common": OFF},
+    "Anchors' clocks that jump join again": {"clock_jump_relays": OFF},
+    "Covariance is scaled by NIS": {"inconsistent_nis": OFF},
+    "Multipath is learnt": {"place_samples": OFF},
+    "Ranges are linearised at held points": {"held_step_m": 0.0, "held_max_m": 0.0},
+    "… within three standard deviations": {"held_std": 0.0},
+    "Curvature of ranges": {"curvature_share": OFF},
+    "Relays survey pairs of anchors": {"pair_relays": OFF},
+    "… and find misplaced anchors": {"misplaced_pairs": OFF},
+    "Differences: sizes of changes adapt": {DIFFERENCES + "DIFFERENCES.change_memory_s": 0.0},
+    "Differences: changes are not early": {DIFFERENCES + "DIFFERENCES.earliest_m": -OFF},
+    "Differences: less weight of large innovations": {"difference_huber": OFF},
+    "Differences: tags at rest": {DIFFERENCES + "DIFFERENCES.stationary_s": 0.0},
+    "Differences: starts with late anchors": {DIFFERENCES + "MAX_LATE": 0},
+    "Start: relays may contradict it": {"fading": 0.0},
+    "Start: speed grows when lost early": {ACQUISITION + "EARLY_S": 0.0},
+    "Start: many jumps mean a fast tag": {JOINT + "MANY_JUMPS": OFF},
+    "Start: wide ones wait": {ACQUISITION + "WIDE_START": OFF},
+    "Start: margin on its covariance": {JOINT + "COVARIANCE_MARGIN": 1.0},
+    "Levels: mirror images": {"sides_chi2": 0.0},
+    "Levels: open starts": {"max_open_level_std": OFF},
+    "Levels: wide positions": {"max_level_std": OFF},
+}
+"""Each mechanism, and the constants by which it does nothing: fields of ``Tuning``, or names in a module."""
+
+ROOM = {
+    "the room": "room",
+    "unbiased air": "clean",
+    "3-D room, 8 anchors": "3-D",
+    "anchors in a line": "line",
+    "at rest, later": "rest",
+    "one anchor 20 cm off": "off",
+    "multipath of 5 cm over 10 cm": "multipath",
+    "past a wall": "wall",
+    "a body": "body",
+    "1 of 6 late, 0.1–0.4 m": "1 late",
+    "2 of 6 late, 0.1–0.4 m, 6 s": "2 late, 6 s",
+    "2 of 6 late, 0.5–2 m": "2 late, far",
+    "1 of 6 creeps 5 cm/s for 5 s": "creep",
+    "tags' crystals +2 ppm": "crystal",
+    "all anchors' crystals ±0.03–0.1 ppm/s": "draughts",
+    "turns of 30 m/s² at 3 m/s": "turns",
+}
+LAB = {
+    "nothing lost": "lab",
+    "90 % lost everywhere": "90 % lost",
+    "20 % late by exp(1 m)": "20 % late",
+    "20 % late by exp(1 m), reported": "… reported",
+    "one anchor +1.5 m in bursts": "bursts",
+    "rounds at 5 m/s": "5 m/s",
+}
+"""Cases of the studies, and the columns' names."""
+
+RECORDED = (
+    "const1-trial1-tdoa2",
+    "const1-trial2-tdoa3",
+    "const2-trial4",
+    "const3-trial8",
+    "const4-trial3",
+    "0425-traj6",
+)
+"""Recordings that the table takes: two in free space, three with obstacles, one noisier."""
+
+SUMS = ("fixes", "squared_m2", "nees", "levels", "exceeded")
+Sums = dict[str, list[float]]
+
+
+def cases(seed: int, worlds: int) -> list[Case]:
+    """The simulated rows."""
+    plan = structs.replace(plan_of("joint", seed, study="room"), worlds=4 * worlds, tags=4, seconds=15.0)
+    in_room = [case for case in room.cases(plan) if case.name in ROOM]
+    plan = structs.replace(plan, worlds=worlds)
+    in_lab = [case for case in (*loss.cases(plan), *nlos.cases(plan), *motion.cases(plan)) if case.name in LAB]
+    named = {ROOM.get(case.name) or LAB[case.name]: case for case in (*in_room, *in_lab)}
+    return [structs.replace(case, name=name, runs=case.runs[:worlds]) for name, case in named.items()]
+
+
+@contextmanager
+def switched(changes: dict[str, float]) -> Iterator[None]:
+    """Let constants have other values within the block, in every module that has imported them."""
+    new: dict[str, Any] = {"TUNING": structs.replace(
+        parameters.TUNING, **{name: value for name, value in changes.items() if ":" not in name}
+    )}  # fmt: skip
+    for place, value in changes.items():
+        module, _, attribute = place.rpartition(":")
+        if module:
+            name, _, field = attribute.partition(".")
+            new[name] = structs.replace(getattr(import_module(module), name), **{field: value}) if field else value
+    modules = [module for name, module in sys.modules.items() if name.startswith("skyless.")]
+    undo = [(module, name, vars(module)[name]) for module in modules for name in new if name in vars(module)]
+    for module, name, _ in undo:
+        setattr(module, name, new[name])
+    try:
+        yield
+    finally:
+        for module, name, value in undo:
+            setattr(module, name, value)
+
+
+def simulated(run: Run, mechanisms: dict[str, dict[str, float]]) -> Sums:
+    """Sums over the fixes of a world, with each mechanism off; none where there is no fix."""
+    tape, sums = list(beacons_of(run)), {}
+    for name, changes in mechanisms.items():
+        with switched(changes):
+            found = judged(run, tape)
+        levels = (0.0, 0.0) if found.levels is None else (found.levels.levels.sum(), found.levels.exceeded.sum())
+        sums[name] = [float(one) for one in (found.fixes, found.squared_m2, found.nees, *levels)]
+    return sums
+
+
+def recorded(found: Found, first_s: float, mechanisms: dict[str, dict[str, float]]) -> Sums:
+    """The same of a recording."""
+    sums = {}
+    options = ReplayOptions(
+        found.path, anchors=found.anchors, truth=found.truth, lever_arm_m=(-0.01245, 0.00127, 0.0908),
+        uncalibrated=True, first_s=first_s,
+    )  # fmt: skip
+    for name, changes in mechanisms.items():
+        with switched(changes):
+            run = CaptureReplay(options)
+            run.run(None, lambda _: None)
+            table, (truth_m, is_judged) = run.samples.table(), run.judged.of(run.samples.table().time_s)
+        error_m, levels_m = (table.position_m - truth_m)[is_judged], table.levels_m[is_judged]
+        nees = np.einsum("ni,nij,nj->", error_m, np.linalg.inv(table.covariance_m2[is_judged]), error_m) / 3.0
+        exceeded = np.hypot(error_m[:, 0], error_m[:, 1]) > levels_m[:, 0]
+        levels = np.isfinite(levels_m[:, 0])
+        sums[name] = [float(one) for one in (len(error_m), (error_m**2).sum(), nees, levels.sum(), exceeded.sum())]
+    return sums
+
+
+def call(cell: tuple[str, Callable[[], Sums]]) -> tuple[str, Sums]:
+    """The work of one process."""
+    name, function = cell
+    return name, function()
+
+
+def markdown(rows: dict[str, dict[str, np.ndarray]]) -> str:
+    """Two tables: everything on, and the RMSE with each mechanism off over that."""
+    lines = ["| | RMSE | NEES | levels | exceeded |", "|---|---|---|---|---|"]
+    for row, by_name in rows.items():
+        fixes, squared_m2, nees, levels, exceeded = by_name[""]
+        rmse_cm = 100.0 * (squared_m2 / fixes) ** 0.5
+        lines.append(
+            f"| {row} | {rmse_cm:.2f} cm | {nees / fixes:.2f} | {100 * levels / fixes:.0f} % | {exceeded:.0f} |"
+        )
+    lines += ["", f"| off | {' | '.join(rows)} |", "|---" * (len(rows) + 1) + "|"]
+    names = next(iter(rows.values()))
+    for name in (one for one in names if one):
+        lines.append(f"| {name} | {' | '.join(_cell(by_name[''], by_name[name]) for by_name in rows.values())} |")
+    return "\n".join(lines) + "\n"
+
+
+def _cell(on: np.ndarray, off: np.ndarray) -> str:
+    """RMSE over that with everything on, and in brackets a NEES that is worse by half, and levels exceeded in addition."""
+    if not off[0]:
+        return "no fix"
+    ratio = ((off[1] / off[0]) / (on[1] / on[0])) ** 0.5
+    parts = [f"{ratio:.2f}" if abs(ratio - 1.0) >= 0.005 else ""]
+    if off[2] / off[0] > max(1.5 * on[2] / on[0], 1.3):
+        parts.append(f"(NEES {off[2] / off[0]:.1f})")
+    if off[4] > on[4]:
+        parts.append(f"**{off[4] - on[4]:.0f} exceeded**")
+    return " ".join(part for part in parts if part) or "·"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--worlds", type=int, default=2, help="of each simulated row")
+    parser.add_argument("--data", type=Path, help="folder of recordings")
+    parser.add_argument("--first", type=float, default=60.0, help="seconds of each recording")
+    parser.add_argument("--rows", nargs="*", default=[""])
+    parser.add_argument("--only", nargs="*", default=[""])
+    parser.add_argument("--kept", type=Path, default=Path("estimator_table.json"))
+    parser.add_argument("--docs", type=Path, help="page whose part behind <!-- table --> is replaced")
+    asked = parser.parse_args()
+    chosen = {name: off for name, off in MECHANISMS.items() if not name or any(word in name for word in asked.only)}
+    cells = [
+        (case.name, partial(simulated, run, chosen)) for case in cases(asked.seed, asked.worlds) for run in case.runs
+    ]
+    for found in recordings_below(asked.data) if asked.data else ():
+        if name := next((name for name in RECORDED if name in found.name), None):
+            cells.append((name, partial(recorded, found, asked.first, chosen)))
+    cells = [cell for cell in cells if any(word in cell[0] for word in asked.rows)]
+    kept = json.loads(asked.kept.read_text()) if asked.kept.exists() else []
+    before = [name for name, _ in kept]
+    todo = [cell for cell in cells if cell[0] not in before or before.remove(cell[0])]
+    with multiprocessing.Pool() as pool:
+        for name, sums in pool.imap_unordered(call, todo, 1):
+            kept.append((name, sums))
+            asked.kept.write_text(json.dumps(kept))
+            print(f"{len(kept)} of {len(cells)}: {name}", file=sys.stderr, flush=True)
+    rows: dict[str, dict[str, np.ndarray]] = {name: {} for name, _ in cells}
+    for name, sums in kept:
+        for mechanism, values in sums.items():
+            rows[name][mechanism] = rows[name].get(mechanism, 0.0) + np.array(values)
+    text = markdown(rows)
+    print(text)
+    if asked.docs:
+        head = asked.docs.read_text().partition("<!-- table -->")[0]
+        asked.docs.write_text(f"{head}<!-- table -->\n\n{text}")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except SkylessError as error:
+        sys.exit(str(error))
