@@ -88,6 +88,7 @@ NAVIGATION = {
         "docs/architecture",
         "docs/comparison",
         "docs/maths",
+        "docs/estimator_table",
         "docs/studies",
         "docs/recordings",
         "docs/planning",

@@ -73,8 +73,9 @@ def _advance(s: EstimatorState, values: int, dt: float) -> None:
 
 @step
 def jump_share(s: EstimatorState) -> float:
-    """1 where range errors have jumped recently, 0 where none has."""
-    return float(min(s.status[0]["obstruction"], 1.0))
+    """1 where range errors have jumped recently, 0 where none has or learnt multipath is as large as a jump."""
+    status, multipath_m2 = s.status[0], s.settings[0]["multipath_std_m"] ** 2
+    return float(min(status["obstruction"], 1.0) if status["place_variance_m2"] < multipath_m2 else 0.0)
 
 
 @step

@@ -330,10 +330,15 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
         status["relays_lately_rejected"] += 1.0
         i["relay_outliers_in_row"] += 1
         j["relay_outliers_in_row"] += 1
+        link["outliers_in_row"] += 1
+        if link["outliers_in_row"] >= settings["pair_outliers"]:
+            link["outliers_in_row"] = 0
+            link["variance_m2"] += settings["pair_jump_m2"]
+            s.links[listener, sender]["relays"] = s.links[sender, listener]["relays"] = 0
     else:
         status["relays_used"] += 1
         status["relays_lately_accepted"] += 1.0
-        i["relay_outliers_in_row"] = j["relay_outliers_in_row"] = 0
+        i["relay_outliers_in_row"] = j["relay_outliers_in_row"] = link["outliers_in_row"] = 0
         share = pair_variance / innovation_variance
         link["constant_m"] += share * innovation
         link["variance_m2"] -= share * pair_variance

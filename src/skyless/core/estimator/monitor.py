@@ -19,6 +19,7 @@ says what each of these buys.
 import numpy as np
 
 from skyless.core.estimator.faults import begin_obstruction
+from skyless.core.estimator.kalman import jump_share
 from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, EstimatorState, layout
 from skyless.core.kernels.compiled import step
 
@@ -43,13 +44,20 @@ def is_warm(s: EstimatorState) -> bool:
 def has_jumped(s: EstimatorState, anchor: int, innovation: float, innovation_variance: float) -> bool:
     """Whether this reception and those before it show that an anchor's range error has jumped."""
     a, status, settings = s.anchors[anchor], s.status[0], s.settings[0]
-    if innovation * innovation <= settings["suspect"] ** 2 * innovation_variance:
+    clear = 0
+    for other in range(len(s.anchors)):
+        clear += 0 if s.anchors[other]["is_obstructed"] else 1
+    is_easy = clear > settings["dim"] + 1 and a["walk_scale"] <= settings["steady_walk_scale"]
+    share = jump_share(s) if is_easy else 0.0  # else clocks, which all anchors share or which wander, would open all
+    suspect = settings["suspect"] + share * (settings["obstructed_suspect"] - settings["suspect"])
+    together = settings["together"] + share * (settings["obstructed_together"] - settings["together"])
+    if innovation * innovation <= suspect * suspect * innovation_variance:
         a["outliers_in_row"] = 0
     else:
         stamps = 2.0 * (settings["tx_variance_m2"] + settings["rx_variance_m2"])
         apart, both = innovation - a["outlier_m"], innovation + a["outlier_m"]
         agrees = a["outliers_in_row"] > 0 and apart * apart <= settings["suspect"] ** 2 * stamps
-        agrees = agrees and both * both > settings["together"] ** 2 * innovation_variance
+        agrees = agrees and both * both > together * together * innovation_variance
         a["outliers_in_row"] = a["outliers_in_row"] + 1 if agrees else 1
         a["outlier_m"] = innovation
     often = status["late_share"] > settings["late_often_share"]

@@ -121,6 +121,14 @@ class Tuning(Struct, frozen=True):
     """Time in which it returns to zero, and in which a jump is forgotten [s]."""
     obstruction_return_m: float = 0.2
     """Largest return in that time [m]: long delays are no less likely to stay."""
+    obstructed_suspect: float = 2.2
+    """Where others have jumped recently, a normalised innovation of this much may be a jump …"""
+    obstructed_together: float = 5.0
+    """… if two are together beyond this, and the anchor's clock is steady: by chance once in some thousand packets."""
+    steady_walk_scale: float = 4.0
+    """Factor on the random walk of a clock up to which it is steady."""
+    multipath_std_m: float = 0.06
+    """Learnt multipath of this standard deviation makes errors that would be taken for jumps [m]."""
     jump_rise: float = 0.5
     """Part of its full size by which a jump raises the process noise of all range errors."""
     obstructed_std_m: float = 0.08
@@ -169,6 +177,10 @@ class Tuning(Struct, frozen=True):
     # Anchors that stand elsewhere
     open_pair_std_m: float = 0.1
     """Standard deviation of the range between two anchors against the survey, before it is measured [m]."""
+    pair_outliers: float = 4
+    """Number of relays of a pair in a row beyond the gate that are another path between the two …"""
+    pair_jump_m2: float = 0.25
+    """… of which this variance is expected [m²]."""
     pair_relays: float = 12
     """Number of relays in either direction after which their mean is a range."""
     misplaced_pairs: float = 2

@@ -83,6 +83,7 @@ LINK_DTYPE: Final = np.dtype(
         ("tx_ticks", np.int64),  # newest packet of the sender whose reception by the listener was processed
         ("constant_m", np.float64),  # estimated constant of the pair, in the row of the lower index
         ("variance_m2", np.float64),  # variance of that
+        ("outliers_in_row", np.int64),
         ("relays", np.int64),  # used in this direction
         ("contradicts", np.int64),  # whether its range contradicts the survey
     ],
