@@ -86,7 +86,7 @@ class TextbookFilter:
         h, survey = np.zeros(self.size), self.surveys[self.dim * anchor : self.dim * (anchor + 1)]
         given_m = [] if self.dim == 3 else [self.settings.height_m]
         place_m, trace = np.append(self.x[self.p], given_m), np.trace(self.P[: self.dim, : self.dim])
-        step_m = max(TUNING.held_step_m, min(TUNING.held_std * trace**0.5, TUNING.held_max_m))
+        step_m = max(TUNING.held_step_m, min(TUNING.suspect * trace**0.5, TUNING.held_max_m))
         if not any((self.settings.survey_std_m, self.settings.range_std_m, self.settings.height_std_m)):
             step_m = 0.0  # exact ranges leave nothing open
         if not np.linalg.norm(place_m - self.held_m.get(anchor, np.nan)) <= step_m:

@@ -56,7 +56,7 @@ def _hold_direction(s: EstimatorState, anchor: int) -> None:
         moved_m += (s.x[axis] - a["held_m"][axis]) ** 2
         squared += (s.x[axis] - a["position_m"][axis]) ** 2
         variance += s.P[axis, axis]
-    noise = min(settings["held_std"] ** 2 * variance, settings["held_max_m"] ** 2)
+    noise = min(settings["suspect"] ** 2 * variance, settings["held_max_m"] ** 2)
     step = max(noise, settings["held_step_m"] ** 2)
     if s.status[0]["range_errors"] == NO_RANGE_ERRORS:
         step = 0.0  # ranges leave nothing open that noise could seem to measure
@@ -187,7 +187,7 @@ def own_reception(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int, 
         status["walk_scale"] = settings["max_walk_scale"]
         a["outliers_in_row"] = 0
     elif is_warm(s) and has_jumped(s, anchor, innovation, innovation_variance):
-        clock_jumped = a["relay_outliers_in_row"] >= settings["clock_jump_relays"]
+        clock_jumped = a["relay_outliers_in_row"] >= settings["relays_in_row"]
         if not clock_jumped:
             innovation, innovation_variance = _jump(s, anchor, innovation, terms, rx_variance)
     scale = 0.0 if clock_jumped else variance_scale(s, innovation, innovation_variance, False)
@@ -331,7 +331,7 @@ def relay(s: EstimatorState, listener: int, sender: int, tx_ticks: int, packet_r
         i["relay_outliers_in_row"] += 1
         j["relay_outliers_in_row"] += 1
         link["outliers_in_row"] += 1
-        if link["outliers_in_row"] >= settings["pair_outliers"]:
+        if link["outliers_in_row"] >= settings["relays_in_row"]:
             link["outliers_in_row"] = 0
             link["variance_m2"] += settings["pair_jump_m2"]
             s.links[listener, sender]["relays"] = s.links[sender, listener]["relays"] = 0

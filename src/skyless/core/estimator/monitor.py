@@ -96,17 +96,18 @@ def open_range_error(s: EstimatorState, anchor: int, innovation: float) -> None:
 def adapt_change_noise(s: EstimatorState, anchor: int, normalised: float) -> None:
     """Adapt the process noise of an obstructed anchor's range error to an innovation."""
     settings, a = s.settings[0], s.anchors[anchor]
-    a["change_mean"] += settings["change_gain"] * (normalised - a["change_mean"])
-    if _is_off_zero(a["change_mean"], settings["change_gain"], settings["mean_limit"]):
+    a["change_mean"] += settings["mean_gain"] * (normalised - a["change_mean"])
+    if _is_off_zero(s, a["change_mean"]):
         a["change_scale"] = min(a["change_scale"] * settings["change_growth"], settings["max_change_scale"])
     else:
         a["change_scale"] = max(a["change_scale"] * settings["change_loss"], 1.0)
 
 
 @step
-def _is_off_zero(mean: float, gain: float, limit: float) -> bool:
-    """Whether the square of a running mean of normalised innovations exceeds its expectation that many times."""
-    return bool(mean * mean * (2.0 - gain) / gain > limit)
+def _is_off_zero(s: EstimatorState, mean: float) -> bool:
+    """Whether a running mean of normalised innovations is further off zero than chance makes it."""
+    settings = s.settings[0]
+    return bool(mean * mean * (2.0 - settings["mean_gain"]) / settings["mean_gain"] > settings["mean_limit"])
 
 
 @step
@@ -254,8 +255,7 @@ def adapt_clock_noise(s: EstimatorState, anchor: int, normalised: float) -> None
 def _walk_scale(s: EstimatorState, scale: float, mean: float) -> float:
     """Factor on the random walk of a clock: it grows while the running mean of its innovations is off zero."""
     settings = s.settings[0]
-    grows = _is_off_zero(mean, settings["mean_gain"], settings["mean_limit"])
-    scale *= settings["walk_scale_gain"] if grows else settings["scale_loss"]
+    scale *= settings["walk_scale_gain"] if _is_off_zero(s, mean) else settings["scale_loss"]
     return float(min(max(scale, 1.0), settings["max_walk_scale"]))
 
 

@@ -33,8 +33,8 @@ class Tuning(Struct, frozen=True):
     """Factor on adapted process noise with each innovation that does not call for more."""
     common: float = 1.5
     """Normalised innovations of all anchors beyond this on one side: the tag's clock has left its rate."""
-    clock_jump_relays: float = 4
-    """Number of relays of an anchor in a row beyond the gate, while its receptions jump: its clock has jumped."""
+    relays_in_row: float = 4
+    """Number of relays in a row beyond the gate that show a jump: of an anchor's clock, or of the path of a pair."""
 
     # Motion
     q_scale_gain: float = 1.05
@@ -55,10 +55,8 @@ class Tuning(Struct, frozen=True):
     # Linearisation (docs/maths.md, section 6)
     held_step_m: float = 0.15
     """Distance of the estimate from the point of linearisation at which that moves [m]."""
-    held_std: float = 3.0
-    """It stays within this number of standard deviations of the estimate …"""
     held_max_m: float = 0.4
-    """… up to this distance [m]."""
+    """It stays within ``suspect`` standard deviations of the estimate, up to this distance [m]."""
     curvature_share: float = 0.01
     """Share of the stamps' variance below which the curvature of ranges is neglected."""
     slope_from_m: float = 4.0
@@ -101,10 +99,8 @@ class Tuning(Struct, frozen=True):
     """Least standard deviation of a range error that has jumped [m]."""
     first_change_scale: float = 25.0
     """Factor on the process noise of a range error that has just jumped: it may still be changing."""
-    change_gain: float = 0.1
-    """Weight in the running mean of the innovations of such an anchor."""
     change_growth: float = 1.2
-    """Growth of that process noise while the mean is off zero …"""
+    """Growth of that process noise while the mean of the anchor's innovations is off zero …"""
     change_loss: float = 0.97
     """… and its factor otherwise."""
     max_change_scale: float = 250.0
@@ -177,10 +173,8 @@ class Tuning(Struct, frozen=True):
     # Anchors that stand elsewhere
     open_pair_std_m: float = 0.1
     """Standard deviation of the range between two anchors against the survey, before it is measured [m]."""
-    pair_outliers: float = 4
-    """Number of relays of a pair in a row beyond the gate that are another path between the two …"""
     pair_jump_m2: float = 0.25
-    """… of which this variance is expected [m²]."""
+    """Variance of a pair's range that has jumped [m²]."""
     pair_relays: float = 12
     """Number of relays in either direction after which their mean is a range."""
     misplaced_pairs: float = 2
