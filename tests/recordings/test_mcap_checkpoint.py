@@ -145,7 +145,7 @@ def changed(state, path, value):
         (["method", "estimator", "table", 0], lambda row: row[:3]),
         (["method", "in_use", "used", 0, "anchor_m"], bytes(16)),
         (["method", "in_use", "used", 0, "anchor_m"], "x"),
-        (["method", "master_scale", "points", 0], [1, 2]),
+        (["master_scale", "points", 0], [1, 2]),
     ],
 )
 def test_states_of_other_things_are_refused(path, value):

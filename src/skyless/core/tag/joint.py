@@ -31,7 +31,9 @@ from skyless.core.ticks import FixTime, from_seconds
 
 # Factor on the start's covariance, as the filter is then given the packets that it rests on.
 COVARIANCE_MARGIN: Final = 4.0
-MANY_JUMPS: Final = 3  # of range errors, soon after a start: the tag is faster than assumed
+# Number of range errors that jump early, and mean NIS, beyond which the tag is faster than assumed.
+MANY_JUMPS: Final = 3
+EARLY_NIS: Final = 3.0
 # A sensor's height is not wrong by more standard deviations than this; where this number of them in a row do not fit,
 # the position is wrong.
 HEIGHT_SIGMAS: Final = 5.0
@@ -224,9 +226,11 @@ class Estimation:
         self._start = self._new_start()
 
     def _is_too_fast(self, rx_ticks: int) -> bool:
-        """Whether the range errors of several anchors jump early: it is the tag that has moved."""
-        is_early = (rx_ticks - self._course.started_ticks) * TICK_S < EARLY_S
-        return is_early and self._estimator.jumps >= MANY_JUMPS and self._course.speed_std_mps < MAX_SPEED_STD_MPS
+        """Whether the range errors of several anchors jump early, or nothing fits: it is the tag that has moved."""
+        if (rx_ticks - self._course.started_ticks) * TICK_S >= EARLY_S:
+            return False
+        several = self._estimator.jumps >= MANY_JUMPS or self._estimator.rows.item(QUALITY, 0) > EARLY_NIS
+        return several and self._course.speed_std_mps < MAX_SPEED_STD_MPS
 
     def _is_contradicted(self, rx_ticks: int) -> bool:
         """Whether a new start is needed, as relays or faults contradict this one; decides what that has to expect."""
