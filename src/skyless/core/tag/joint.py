@@ -33,7 +33,7 @@ from skyless.core.ticks import FixTime, from_seconds
 COVARIANCE_MARGIN: Final = 4.0
 # Number of range errors that jump early, and mean NIS, beyond which the tag is faster than assumed.
 MANY_JUMPS: Final = 3
-EARLY_NIS: Final = 3.0
+EARLY_NIS: Final = 2.0
 # A sensor's height is not wrong by more standard deviations than this; where this number of them in a row do not fit,
 # the position is wrong.
 HEIGHT_SIGMAS: Final = 5.0
