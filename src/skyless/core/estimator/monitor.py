@@ -188,7 +188,7 @@ def learn_place(s: EstimatorState, anchor: int, residual_m: float) -> None:
                 half = 0.5 * (residual_m - a["place_residual_m"][lag]) ** 2
                 mean = status["place_square_m2"][lag]
                 limited = min(half, settings["place_limit"] * mean) / settings["place_limited_mean"]
-                status["place_square_m2"][lag] += (limited - mean) / status["place_samples"]
+                status["place_square_m2"][lag] += (limited - mean) / (settings["place_first"] + status["place_samples"])
         a["place_residual_m"][1] = a["place_residual_m"][0]
         a["place_residual_m"][0] = residual_m
         a["place_walked_m"] = status["walked_m"]

@@ -139,6 +139,8 @@ class Tuning(Struct, frozen=True):
     """A comparison counts as this many times their mean at most, as jumps are not multipath."""
     place_limited_mean: float = 0.742
     """What that leaves of the mean square of normal errors."""
+    place_first: float = 20
+    """Number of comparisons for which the stamps' noise stands beforehand."""
     place_samples: float = 100
     """Number of comparisons that are needed …"""
     place_memory: float = 1000
