@@ -231,7 +231,7 @@ def main() -> None:
     parser.add_argument("--first", type=float, default=60.0, help="seconds of each recording")
     parser.add_argument("--rows", nargs="*", default=[""])
     parser.add_argument("--only", nargs="*", default=[""])
-    parser.add_argument("--kept", type=Path, default=Path("estimator_table.json"))
+    parser.add_argument("--kept", type=Path, help="file in which the sums are kept")
     parser.add_argument("--docs", type=Path, help="page whose part behind <!-- table --> is replaced")
     asked = parser.parse_args()
     chosen = {name: off for name, off in MECHANISMS.items() if not name or any(word in name for word in asked.only)}
@@ -245,13 +245,19 @@ def main() -> None:
     )
     cells += [(name, partial(recorded, found, asked.first, chosen)) for name, found in below]
     cells = [cell for cell in cells if any(word in cell[0] for word in asked.rows)]
-    kept = json.loads(asked.kept.read_text()) if asked.kept.exists() else []
+    amounts = [asked.seed, asked.worlds, asked.first, *chosen]
+    kept: list[tuple[str, Sums]] = []
+    if asked.kept and asked.kept.exists():
+        of, kept = json.loads(asked.kept.read_text())
+        if of != amounts:
+            parser.error(f"--kept {asked.kept} is of another seed, amount or choice of mechanisms: name another file")
     before = [name for name, _ in kept]
     todo = [cell for cell in cells if cell[0] not in before or before.remove(cell[0])]
     with multiprocessing.Pool() as pool:
         for name, sums in pool.imap_unordered(call, todo, 1):
             kept.append((name, sums))
-            asked.kept.write_text(json.dumps(kept))
+            if asked.kept:
+                asked.kept.write_text(json.dumps([amounts, kept]))
             print(f"{len(kept)} of {len(cells)}: {name}", file=sys.stderr, flush=True)
     rows: dict[str, dict[str, np.ndarray]] = {name: {} for name, _ in cells}
     for name, sums in kept:

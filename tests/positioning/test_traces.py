@@ -2,7 +2,7 @@
 
 The traces are thinned fixes in ``traces/``, so that a change of the estimator's output is a diff that can be read:
 
-    python tests/positioning/test_traces.py        writes them anew
+    python tests/positioning/test_traces.py        writes them again
 """
 
 import os

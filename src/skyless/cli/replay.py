@@ -89,7 +89,7 @@ def replay(asked: ReplayOptions, *more: Path, output: _Output) -> int:
     output.leave_out("fixes_csv", "plot", why="it is one file, and there are several recordings")
     for file in more:
         existing_file("FILE", file)
-    codes, told = [], []
+    codes, summaries = [], []
     for one in (asked.file, *more):
         try:
             code, summary = _replayed(replace(asked, file=one), output, f"{one}: ")
@@ -98,9 +98,9 @@ def replay(asked: ReplayOptions, *more: Path, output: _Output) -> int:
             print(f"skyless: {named}{error}", file=sys.stderr)
             code, summary = USER_ERROR, {"error": str(error)}
         codes.append(code)
-        told.append({"file": one, **summary})
+        summaries.append({"file": one, **summary})
     if output.json:
-        print_json({"recordings": told})
+        print_json({"recordings": summaries})
     return max(codes)
 
 
