@@ -12,12 +12,12 @@ from msgspec.structs import replace
 
 from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.estimator.kalman import is_stationary
+from skyless.core.estimator.settings import TUNING
 from skyless.core.estimator.state import layout
 from skyless.core.fix import NoFixReason
 from skyless.core.integrity import Alert
 from skyless.research.masterless.difference_tracking import (
     DIFFERENCES,
-    WINDOW,
     DifferenceTracking,
     Start,
     find_start,
@@ -96,7 +96,7 @@ def test_a_start_tells_which_two_anchors_are_late_or_doubts_and_claims_no_more_t
     generator = np.random.default_rng(seed)
     late = dict(zip(generator.choice(8, 2, replace=False).tolist(), generator.uniform(0.4, 2.0, 2), strict=True))
     tag_m, window = place_m(float(seed)), []
-    for k in range(WINDOW):
+    for k in range(int(TUNING.window)):
         a, b = k % 8, (k + 1 + k // 8 % 3) % 8
         true_m = dist(tag_m, ANCHORS_M[b]) - dist(tag_m, ANCHORS_M[a]) + late.get(b, 0.0) - late.get(a, 0.0)
         window.append(PairTdoa(0.002 * k, a, b, true_m + generator.normal(0.0, STD_M)))

@@ -146,7 +146,7 @@ def test_how_much_one_or_two_faults_explain():
     draw = np.random.default_rng(2)
     root = draw.normal(size=(6, 9))
     s.information[:6, :6], s.evidence[:6] = root @ root.T, draw.normal(size=6)
-    M = s.information[:6, :6] + np.eye(6) / TUNING.opened_std_m**2
+    M = s.information[:6, :6] + np.eye(6) / TUNING.late_std_m**2
     for one in range(6):
         for other in range(one + 1):
             both = sorted({one, other})
@@ -174,7 +174,7 @@ def test_opening_a_fault_is_a_filter_that_had_it_open_from_the_beginning(late_m,
         if packet[0] == anchor and estimator.state.index_of[anchor] < 0:
             estimator._state = with_anchor(estimator.state, anchor, LAB_M[anchor])
             constant = where(estimator).constant + int(estimator.state.index_of[anchor])
-            estimator.state.P[constant, constant] += TUNING.opened_std_m**2
+            estimator.state.P[constant, constant] += TUNING.late_std_m**2
             estimator.state.status["range_errors"] = ALL_RANGE_ERRORS
 
     follow(opened, packets, wide, packets, widen)
@@ -203,7 +203,7 @@ def test_other_faults_are_conditioned_on_one_that_is_opened(kind):
     faults._open_fault(s, kind, anchor)
     chosen = 6 * kind + anchor
     others = np.delete(np.arange(18), chosen)
-    share = whole[others, chosen] / (whole[chosen, chosen] + 1.0 / TUNING.opened_std_m**2)
+    share = whole[others, chosen] / (whole[chosen, chosen] + 1.0 / TUNING.late_std_m**2)
     expected = whole[np.ix_(others, others)] - np.outer(share, whole[chosen, others])
     np.testing.assert_allclose(s.information[np.ix_(others, others)], expected, rtol=1e-9)
     np.testing.assert_allclose(s.evidence[others], y[others] - share * y[chosen], rtol=1e-9)

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skyless.core.estimator.settings import TUNING
 from skyless.core.tag.locate import Solution, locate
-from skyless.research.masterless.difference_tracking import START_DIFFERENCE_STD_M, joined_tdoas
+from skyless.research.masterless.difference_tracking import joined_tdoas
 
 pytestmark = pytest.mark.site
 
@@ -23,7 +24,7 @@ def test_against_numpy_on_random_connected_graphs(seed, n, extra):
     pairs = [(int(draw.integers(i)), i) for i in range(1, n)]
     pairs += [tuple(map(int, draw.choice(n, 2, replace=False))) for _ in range(extra)]
     pairs = [pair[:: int(draw.choice([1, -1]))] for pair in pairs]
-    measured = draw.uniform(-0.1, 0.1, len(pairs)) * START_DIFFERENCE_STD_M
+    measured = draw.uniform(-0.1, 0.1, len(pairs)) * TUNING.median_difference_std_m
     anchors, tdoa_m, covariance_m2 = joined_tdoas(pairs, measured)
     assert anchors == tuple(range(n))
     H = np.zeros((len(pairs), n))
@@ -33,7 +34,7 @@ def test_against_numpy_on_random_connected_graphs(seed, n, extra):
     # An independent way: the pseudo-inverse of the whole graph's Laplacian, with no anchor singled out.
     potentials, *_ = np.linalg.lstsq(H, measured)
     difference = np.eye(n)[1:] - np.eye(n)[0]
-    covariance = START_DIFFERENCE_STD_M**2 * difference @ np.linalg.pinv(H.T @ H) @ difference.T
+    covariance = TUNING.median_difference_std_m**2 * difference @ np.linalg.pinv(H.T @ H) @ difference.T
     np.testing.assert_allclose(tdoa_m, difference @ potentials, atol=1e-9)
     np.testing.assert_allclose(covariance_m2, covariance, atol=1e-9)
 

@@ -665,11 +665,6 @@ class Estimator:
         return bool(self._state.status[0]["late_share"] > TUNING.late_often_share)
 
     @property
-    def jumps(self) -> int:
-        """How many range errors have jumped since the start."""
-        return int(self._state.status[0]["obstructions"])
-
-    @property
     def is_lost(self) -> bool:
         """Whether more packets are rejected than a right state would reject."""
         status = self._state.status[0]

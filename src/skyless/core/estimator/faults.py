@@ -132,7 +132,7 @@ def fault_chi2(s: EstimatorState, kind: int, axes: int) -> float:
 def explained_chi2(s: EstimatorState, one: int, other: int) -> float:
     """How much of the test of all lasting faults one anchor or two explain; for one, both arguments are the same."""
     settings = s.settings[0]
-    y, M, weight = s.evidence, s.information, 1.0 / settings["opened_std_m"] ** 2
+    y, M, weight = s.evidence, s.information, 1.0 / settings["late_std_m"] ** 2
     a, b, both = M[one, one] + weight, M[other, other] + weight, M[one, other]
     if one == other:
         explained = y[one] * y[one] / a
@@ -174,7 +174,7 @@ def _explained_alone(s: EstimatorState, kind: int, anchor: int) -> float:
     """How much the fault of an anchor explains; that it is early is less likely, and counts less."""
     settings, fault = s.settings[0], kind * len(s.anchors) + anchor
     y, M = s.evidence[fault], s.information[fault, fault]
-    return float((1.0 if y > 0.0 else settings["early_weight"]) * y * y / (M + 1.0 / settings["opened_std_m"] ** 2))
+    return float((1.0 if y > 0.0 else settings["early_weight"]) * y * y / (M + 1.0 / settings["late_std_m"] ** 2))
 
 
 @step
@@ -256,7 +256,7 @@ def _open_fault(s: EstimatorState, kind: int, anchor: int) -> None:
     x, P, V, evidence, information, column = s.x, s.P, s.V, s.evidence, s.information, s.fault_input
     count, n = len(s.anchors), uncertain_states(s)
     where, chosen = layout(s.settings[0]["dim"], count), kind * count + anchor
-    gain = 1.0 / (information[chosen, chosen] + 1.0 / settings["opened_std_m"] ** 2)
+    gain = 1.0 / (information[chosen, chosen] + 1.0 / settings["late_std_m"] ** 2)
     fault_m = gain * evidence[chosen]
     variance = gain if is_lasting else gain + fault_m * fault_m
     opened = V[chosen]  # what it adds to each state: 1 − V for the range error, −V for all others

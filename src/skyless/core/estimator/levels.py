@@ -113,7 +113,7 @@ def is_side_open(s: EstimatorState) -> bool:
     is_possible = dim == 2 or settings["lowest_m"] <= image_z_m <= settings["highest_m"]
     is_near = off_m * off_m * normal[2] ** 2 <= s.P[2, 2]
     has_sensor = (status["epoch_ticks"] - status["height_ticks"]) * TICK_S < settings["sensor_valid_s"]
-    return bool(square < settings["sides_chi2"] * variance and not has_sensor and (is_possible or is_near))
+    return bool(square < settings["apart_chi2"] * variance and not has_sensor and (is_possible or is_near))
 
 
 # Whether a position can be relied on
@@ -139,6 +139,6 @@ def integrity_state(s: EstimatorState, levels: Vector) -> int:
     if status["open_range_errors"] and share > settings["max_open_level_std"]:
         state = CONTRADICTED
     is_new = count <= s.settings[0]["dim"] or status["packets"] < settings["first_packets"] * count
-    if is_new or share > settings["max_level_std"] or is_side_open(s):
+    if is_new or share > settings["curved_std"] or is_side_open(s):
         state = UNAVAILABLE
     return state

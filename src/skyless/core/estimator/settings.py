@@ -163,8 +163,8 @@ class Tuning(Struct, frozen=True):
     """Number of packets of each anchor over which a fault is recent."""
     creeping_s: float = 3.0
     """Time in which a creeping fault has become e times as large [s]."""
-    opened_std_m: float = 1.0
-    """Standard deviation beforehand of a fault that is added to the state [m]."""
+    late_std_m: float = 1.0
+    """Standard deviation beforehand of a fault that is added to the state, and of all faults at the start [m]."""
     sure_chi2: float = 50.0
     """Test beyond which there is a fault: χ² of eight degrees of freedom with a probability of 4·10⁻⁸."""
     rival_chi2: float = 20.0
@@ -184,17 +184,68 @@ class Tuning(Struct, frozen=True):
     misplaced_std_m: float = 0.3
     """Standard deviation of each of its coordinates then [m]."""
 
-    # Starts
-    open_range_std_m: float = 1.0
-    """Standard deviation of ranges after a start that was contradicted [m] …"""
+    # Starts, and what is lost
+    start_age_s: float = 0.5
+    """Older packets are not used for a start; where superframes are longer, for the rate of the clock only [s]."""
+    curved_std: float = 0.05
+    """Part of the mean range beyond which ranges are curved within a standard deviation: updates would make the filter
+    sure of a wrong position. It has no level, and is not predicted further."""
+    start_patience_s: float = 0.5
+    """Time for which a start waits that is so wide, or that is contradicted: more anchors may come [s]."""
+    start_tail: float = 1e-4
+    """Probability with which residuals of a start are larger by chance than those that contradict it."""
+    open_start_s: float = 1.0
+    """A start with open range errors is not repeated within this time [s]."""
+    start_margin: float = 4.0
+    """Factor on the start's covariance, as the filter is then given the packets that it rests on."""
+    short_silence_s: float = 0.1
+    """No state grows much wider over shorter silences; packets that are late by less are late from the radio [s]."""
+    longest_silence_s: float = 5.0
+    """After a longer one the state is worse than a new start [s]."""
+    slow_superframe_s: float = 0.2
+    """In longer superframes, where a new start takes seconds, a silence may widen the state more [s] …"""
+    slow_curved_std: float = 0.2
+    """… up to this part of the mean range."""
+    longest_superframe_s: float = 2.0
+    """In longer ones a tag may be metres away: nothing is predicted, and each round of packets is a start [s]."""
+    height_sigmas: float = 5.0
+    """Number of standard deviations by which a sensor's height is wrong at most."""
+    heights_in_row: float = 20
+    """Number of heights in a row that do not fit, after which the position is wrong."""
     open_survey_std_m: float = 0.15
-    """… and of each coordinate of an anchor [m]."""
+    """Standard deviation of each coordinate of an anchor after a start that was contradicted [m]."""
     fitting_chi2: float = 2.0
     """χ² for each anchor below which range errors are as the settings state them."""
+    most_late: float = 2
+    """Number of anchors that are late at the start at most: on the floor or behind metal one often is."""
+    late_penalty: float = 2.0
+    """What each of them adds to χ²: odds of 1 to 3."""
     staying_share: float = 0.2
     """Part of an anchor's lateness at the start that stays: its mean …"""
     staying_std: float = 0.5
     """… and its standard deviation."""
+    window: float = 60
+    """Number of ready-made time differences from which a start is looked for …"""
+    window_s: float = 1.0
+    """… or those of this time [s]."""
+    median_difference_std_m: float = 0.08
+    """Standard deviation of the median of a pair's differences [m]."""
+    late_start_std_m: float = 0.14
+    """Standard deviation of each anchor's error at the start, before any are estimated [m]."""
+    chance: float = 0.01
+    """Probability below which residuals are not noise, and rivals no rivals, in a start from differences."""
+    rival_m: float = 0.5
+    """Distance from which two positions are rivals; anchors lie elsewhere for a tag that has moved as far [m]."""
+    height_margin_m: float = 1.0
+    """Starts lie no higher above or below anchors of different heights than this, unless bounds are given [m]."""
+    neighbourhood: float = 1.5
+    """A tag without beacons that is farther from the anchors' centre than this part of their diagonal is lost …"""
+    neighbourhood_height: float = 0.5
+    """… or higher above it or below than this part …"""
+    least_diagonal_m: float = 5.0
+    """… of a diagonal of at least this [m]."""
+    most_horizontal_std_m: float = 3.0
+    """While its horizontal standard deviation is larger, there is no fix [m]."""
     zero_variance_m2: float = 1e4
     """Variance of a barometer's zero at first [m²]."""
 
@@ -203,18 +254,16 @@ class Tuning(Struct, frozen=True):
     """Test beyond which faults are larger than levels cover."""
     first_packets: float = 3
     """Number of packets of each anchor before the first level."""
-    max_level_std: float = 0.05
-    """Part of the mean range beyond which a standard deviation has no level: ranges are curved …"""
     max_open_level_std: float = 0.02
-    """… and the same where all range errors are open: then only motion determines the position."""
+    """Part of the mean range beyond which, where all range errors are open, a standard deviation has no level."""
     contradicted_start_s: float = 5.0
     """Time without a level after a start that was contradicted: several late anchors may agree on a wrong place [s]."""
     probe_m: float = 1.0
     """Least distance from the anchors' plane at which its two sides are compared [m]."""
     shift_part: float = 0.25
     """Standard deviation of the best place on the other side about the mirror image, over that distance."""
-    sides_chi2: float = 25.0
-    """Squared differences of the ranges of both sides, over their variance, from which the sides differ."""
+    apart_chi2: float = 25.0
+    """Squared difference over its variance from which two things differ: ranges of both sides, or two starts."""
     sensor_valid_s: float = 1.0
     """Time for which a sensor's height decides between them [s]."""
 
@@ -233,6 +282,8 @@ class EstimatorSettings(Struct, frozen=True):
 
     qa: float = 0.5
     """Spectral density of the tag's acceleration, m²/s³ per axis."""
+    start_speed_std_mps: float = 2.0
+    """Standard deviation of the tag's speed at the start. It smears pseudoranges, which are not taken at once."""
     white: float = 3.6e-5
     """White frequency noise of each oscillator, m²/s."""
     walk: float = 0.09

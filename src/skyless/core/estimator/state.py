@@ -321,7 +321,7 @@ def with_anchor(
         s.status[0]["range_errors"] = ALL_RANGE_ERRORS
     if is_open or s.status[0]["open_range_errors"]:
         s.status[0]["range_errors"] = ALL_RANGE_ERRORS
-        range_std_m, survey_std_m = TUNING.open_range_std_m, TUNING.open_survey_std_m
+        range_std_m, survey_std_m = TUNING.late_std_m, TUNING.open_survey_std_m
     grown.P[where.constant + count, where.constant + count] = range_std_m**2
     survey = where.survey + dim * count
     for axis in range(dim):

@@ -15,42 +15,14 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.core.estimator.settings import TUNING
 from skyless.core.fix import NoFixReason
 from skyless.core.kernels.arrays import Array
 from skyless.core.observation import Observation
-from skyless.core.tag.locate import RESIDUAL_TAIL, RIVAL_MINIMUM_CHI2, NoSolution, locate_pseudoranges
-
-# Older messages are not used for the start, unless superframes are longer; and then only for the rate of the clock,
-# as the tag may be elsewhere by now.
-START_MAX_AGE_S: Final = 0.5
-# With a standard deviation above this part of the mean range, ranges are not linear in the state: updates would make
-# the filter sure of a wrong position. It waits for more anchors: START_PATIENCE_S after the first such start, and four
-# times as long for one wider by four times.
-WIDE_START: Final = 0.05
-WIDEST_START: Final = 1.0  # wider ones are not used at all: they would be tens of metres off
-START_PATIENCE_S: Final = 0.5
+from skyless.core.tag.locate import NoSolution, locate_pseudoranges
 
 CONTRADICTIONS: Final = frozenset({NoFixReason.RESIDUALS, NoFixReason.BAD_GEOMETRY, NoFixReason.NOT_CONVERGED})
 """How a start fails with one faulty anchor; absurd pseudoranges count as bad geometry."""
-
-# Typical speed of a tag; it smears pseudoranges taken at different times and starts the velocity.
-TAG_SPEED_STD_MPS: Final = 1.0
-MAX_SILENCE_S: Final = 5.0  # after a longer silence the state is worse than a new start
-# With a horizontal standard deviation above this part of the anchors' mean range, ranges are no longer linear in the
-# state: updates would make it confident of a wrong position, so a new start is better.
-MAX_RELATIVE_STD: Final = 0.05
-# Accepted in longer superframes, where a new start takes seconds.
-SLOW_S: Final = 0.2
-SLOW_MAX_RELATIVE_STD: Final = 0.2
-SHORT_SILENCE_S: Final = 0.1  # over shorter silences no state grows much wider
-# A filter that is lost within this time of its start may have a tag that is faster than assumed: the next start assumes
-# a speed higher by this factor, up to this.
-EARLY_S: Final = 1.0
-SPEED_STD_GROWTH: Final = 4.0
-MAX_SPEED_STD_MPS: Final = 32.0
-
-
-MAX_LINK_AGE_S: Final = 1.0  # older links are forgotten
 
 
 class _Link(Struct, frozen=True):
@@ -66,13 +38,12 @@ class _Scale(Struct, frozen=True):
 
     ticks: int
     fraction_ticks: float
-    rates_at: tuple[tuple[float, int], ...]
-    """What each link lacks: a rate, and since which reading of the tag."""
-    links: int
+    drifts: tuple[tuple[float, float, int], ...]
+    """Of each link: the rate at which it goes out of date, its variance in m²/s², and since when."""
 
 
 class Start(Struct, frozen=True):
-    """A first position, and the speed that is assumed of the tag."""
+    """A first position."""
 
     used: tuple[Observation, ...]
     """The messages that it uses, one of each anchor."""
@@ -80,7 +51,6 @@ class Start(Struct, frozen=True):
     solution: Array
     """[position (dim), clock offset], metres."""
     covariance: Array
-    speed_variance: float
     is_contradicted: bool = False
     """Whether the messages of all anchors contradict each other."""
     misfitting: tuple[int, ...] = ()
@@ -96,12 +66,12 @@ class Acquisition(Struct):
     _z_bounds_m: tuple[float, float] | None
     _max_age_s: float
     _speed_std_mps: float
-    """Assumed speed of the tag. A fast tag makes a start wide, and more anchors do not help."""
+    """Assumed speed of the tag."""
     _error_variance_m2: float = 0.0
-    """Variance of survey and ranges. Rivals must differ by more, so that no mirror image is chosen."""
+    """Variance of survey and ranges."""
     _heard: dict[int, list[Observation]] = {}
-    _possible_ticks: int | None = None
-    """When a start was first possible."""
+    _wide_ticks: int | None = None
+    """When a start was first possible, but wide."""
     _contradicted_ticks: int | None = None
     """When packets first contradicted each other."""
     _links: dict[tuple[int, int], _Link] = {}
@@ -141,7 +111,7 @@ class Acquisition(Struct):
         came_around = len(kept) == 2
         self._heard[observation.anchor] = [*kept[-1:], observation]
         pairs = [kept for kept in self._heard.values() if len(kept) == 2]
-        pairs = [kept for kept in pairs if (now - kept[-1].rx_ticks_tag) * TICK_S < START_MAX_AGE_S]
+        pairs = [kept for kept in pairs if (now - kept[-1].rx_ticks_tag) * TICK_S < TUNING.start_age_s]
         pairs = [kept for kept in self._on_one_scale(pairs) if _possible(*kept)]
         needed = 4 if self._height_m is None else 3
         if len(pairs) < needed:
@@ -165,10 +135,10 @@ class Acquisition(Struct):
         self._links = {
             ends: link
             for ends, link in self._links.items()
-            if (now - link.rx_ticks_tag) * TICK_S < max(MAX_LINK_AGE_S, self._max_age_s)
+            if (now - link.rx_ticks_tag) * TICK_S < 2.0 * self._max_age_s
         }
         by_anchor = {pair[0].anchor: pair for pair in pairs}
-        rates = {anchor: _rate(*pair) for anchor, pair in by_anchor.items()}
+        rates = {name: _rate(first, second, self._variance_m2) for name, (first, second) in by_anchor.items()}
         best: dict[int, _Scale] = {}
         for reference in rates:
             if reference not in best:  # it would reach the same anchors as before
@@ -181,9 +151,9 @@ class Acquisition(Struct):
             [self._convert(packet, best[anchor]) for packet in by_anchor[anchor]] for anchor in rates if anchor in best
         ]
 
-    def _reach(self, reference: int, rates: dict[int, float]) -> dict[int, _Scale]:
+    def _reach(self, reference: int, rates: dict[int, tuple[float, float]]) -> dict[int, _Scale]:
         """The scale of every anchor to which links lead, by as few of them as can be."""
-        reached = {reference: _Scale(0, 0.0, (), 0)}
+        reached = {reference: _Scale(0, 0.0, ())}
         queue = deque([reference])
         while queue:
             known = queue.popleft()
@@ -193,43 +163,47 @@ class Acquisition(Struct):
                 other, sign = (sender, 1) if known == listener else (listener, -1)
                 if other in reached or other not in rates:
                     continue
-                scale = reached[known]
+                scale, known_rate, rate = reached[known], rates[known], rates[other]
+                drift = (known_rate[0] - rate[0], known_rate[1] + rate[1], link.rx_ticks_tag)
                 reached[other] = _Scale(
                     scale.ticks + sign * link.ticks,
                     scale.fraction_ticks + sign * link.fraction_ticks,
-                    (*scale.rates_at, (rates[known] - rates[other], link.rx_ticks_tag)),
-                    scale.links + 1,
+                    (*scale.drifts, drift),
                 )
                 queue.append(other)
         return reached
 
     def _convert(self, packet: Observation, scale: _Scale) -> Observation:
         fraction = scale.fraction_ticks
-        variance = 2.0 * scale.links * self._variance_m2
-        for rate, rx_ticks in scale.rates_at:
-            fraction += rate * (packet.rx_ticks_tag - rx_ticks)
+        variance_m2 = 2.0 * len(scale.drifts) * self._variance_m2
+        for rate, rate_variance, rx_ticks in scale.drifts:
+            elapsed = packet.rx_ticks_tag - rx_ticks
+            fraction += rate * elapsed
+            variance_m2 += rate_variance * (elapsed * TICK_S) ** 2
         whole = int(np.floor(fraction))
         return msgspec.structs.replace(
             packet,
             tx_ticks_master=packet.tx_ticks_anchor + scale.ticks + whole,
             tx_fraction_ticks=fraction - whole,
-            tx_variance_m2=variance,
+            tx_variance_m2=variance_m2,
         )
 
     def _unless_wide(self, start: Start) -> Start | NoFixReason:
-        """Hold a start back while it is wide and more anchors may come."""
-        if self._possible_ticks is None:
-            self._possible_ticks = start.rx_ticks_tag
-        waited_s = (start.rx_ticks_tag - self._possible_ticks) * TICK_S
+        """Hold a start back while ranges are curved within its standard deviation by more than their noise.
+
+        Updates would then make the filter sure of a wrong position. More anchors may come; if they do not, a start that
+        at least one anchor more than needed agrees with is used.
+        """
         dim = len(start.solution) - 1
-        ranges_m = [np.linalg.norm(o.anchor_m[:dim] - start.solution[:dim]) for o in start.used]
-        relative_std = np.sqrt(np.trace(start.covariance[:2, :2])) / np.mean(ranges_m)
-        patience_s = (
-            START_PATIENCE_S * min(relative_std / WIDE_START, 4.0)
-            if relative_std > WIDE_START and self._speed_std_mps <= TAG_SPEED_STD_MPS
-            else 0.0
-        )
-        return start if waited_s >= patience_s and relative_std < WIDEST_START else NoFixReason.ACQUIRING
+        range_m = np.mean([np.linalg.norm(o.anchor_m[:dim] - start.solution[:dim]) for o in start.used])
+        curvature_m = 0.5 * np.trace(start.covariance[:2, :2]) / range_m
+        if curvature_m**2 < self._variance_m2 + self._error_variance_m2:
+            return start
+        if self._wide_ticks is None:
+            self._wide_ticks = start.rx_ticks_tag
+        waited_s = (start.rx_ticks_tag - self._wide_ticks) * TICK_S
+        is_checked = len(start.used) > len(start.solution)
+        return start if is_checked and waited_s > TUNING.start_patience_s else NoFixReason.ACQUIRING
 
     def _solve_without_one(self, pairs: list[list[Observation]], now: int) -> Start | NoFixReason:
         """If exactly one anchor contradicts all others, leave it out. The others must still be able to contradict.
@@ -246,13 +220,13 @@ class Acquisition(Struct):
         ]
         if len(starts) == 1:
             return starts[0]
-        if (now - self._contradicted_ticks) * TICK_S < START_PATIENCE_S:
+        if (now - self._contradicted_ticks) * TICK_S < TUNING.start_patience_s:
             return NoFixReason.RESIDUALS
         result = self._solve(pairs, now, residual_tail=0.0)
         return msgspec.structs.replace(result, is_contradicted=True) if isinstance(result, Start) else result
 
     def _solve(
-        self, pairs: list[list[Observation]], now: int, residual_tail: float = RESIDUAL_TAIL
+        self, pairs: list[list[Observation]], now: int, residual_tail: float | None = None
     ) -> Start | NoFixReason:
         base = _offset_ticks(pairs[0][-1])[0]
         rates = np.array([_clock_rate(first, second) for first, second in pairs])
@@ -263,21 +237,20 @@ class Acquisition(Struct):
         ages_s = np.array([(now - o.rx_ticks_tag) * TICK_S for o in newest])
         pseudoranges = np.array([_pseudorange_m(o, base) for o in newest]) + rate * ages_s
         variances = np.array([o.rx_variance_factor * self._variance_m2 + o.tx_variance_m2 for o in newest])
-        variances += ages_s**2 * (rate_variance / len(pairs) + self._speed_std_mps**2)
+        variances += self._error_variance_m2 + ages_s**2 * (rate_variance / len(pairs) + self._speed_std_mps**2)
         result = locate_pseudoranges(
             np.array([o.anchor_m for o in newest]),
             pseudoranges,
             variances,
             height_m=self._height_m,
             z_bounds_m=self._z_bounds_m,
-            residual_tail=residual_tail,
-            rival_chi2=RIVAL_MINIMUM_CHI2 * (1.0 + self._error_variance_m2 / float(variances.min())),
+            residual_tail=TUNING.start_tail if residual_tail is None else residual_tail,
         )
         if isinstance(result, NoSolution):
             return result.reason
         dim = 3 if self._height_m is None else 2
         solution = np.append(result.position_m[:dim], result.bias_m)
-        return Start(tuple(newest), now, solution, result.covariance_joint_m2, self._speed_std_mps**2)
+        return Start(tuple(newest), now, solution, result.covariance_joint_m2)
 
 
 def _offset_ticks(observation: Observation) -> tuple[int, float]:
@@ -304,7 +277,10 @@ def _possible(first: Observation, second: Observation) -> bool:
     return abs(_clock_rate(first, second)) <= MAX_DRIFT * SPEED_OF_LIGHT_MPS
 
 
-def _rate(first: Observation, second: Observation) -> float:
-    """How much faster an anchor's clock runs than the tag's, as a fraction."""
+def _rate(first: Observation, second: Observation, variance_m2: float) -> tuple[float, float]:
+    """How much faster an anchor's clock runs than the tag's, as a fraction, and the variance of that in m²/s²."""
     elapsed = second.rx_ticks_tag - first.rx_ticks_tag
-    return (second.tx_ticks_anchor - first.tx_ticks_anchor - elapsed) / elapsed if elapsed > 0 else 0.0
+    if elapsed <= 0:
+        return 0.0, 0.0
+    rate = (second.tx_ticks_anchor - first.tx_ticks_anchor - elapsed) / elapsed
+    return rate, 2.0 * variance_m2 / (elapsed * TICK_S) ** 2

@@ -13,40 +13,10 @@ from skyless.core.fix import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELO
 from skyless.core.integrity import UNAVAILABLE, IntegrityRequirement
 from skyless.core.kernels.arrays import Array
 from skyless.core.observation import Observation
-from skyless.core.tag._acquisition import (
-    EARLY_S,
-    MAX_RELATIVE_STD,
-    MAX_SILENCE_S,
-    MAX_SPEED_STD_MPS,
-    SHORT_SILENCE_S,
-    SLOW_MAX_RELATIVE_STD,
-    SLOW_S,
-    SPEED_STD_GROWTH,
-    START_MAX_AGE_S,
-    TAG_SPEED_STD_MPS,
-    Acquisition,
-    Start,
-)
+from skyless.core.tag._acquisition import Acquisition, Start
 from skyless.core.ticks import FixTime, from_seconds
 
-# Factor on the start's covariance, as the filter is then given the packets that it rests on.
-COVARIANCE_MARGIN: Final = 4.0
-# Number of range errors that jump early, and mean NIS, beyond which the tag is faster than assumed.
-MANY_JUMPS: Final = 3
-EARLY_NIS: Final = 2.0
-# A sensor's height is not wrong by more standard deviations than this; where this number of them in a row do not fit,
-# the position is wrong.
-HEIGHT_SIGMAS: Final = 5.0
-MAX_HEIGHTS_REJECTED: Final = 20
-# In longer ones a tag may be metres away when it receives an anchor again: nothing is predicted over them, and each
-# round of packets is a start of its own.
-LONGEST_SUPERFRAME_S: Final = 2.0
-# A start with open range errors is not repeated for this time; then it is, once they fit the settings.
-OPEN_START_HOLD_S: Final = 1.0
-# Packets that are older than the newest by less are late from the radio or the host; others mean another counter.
-REORDERED_S: Final = 0.1
-
-SURELY_IN_REACH_TICKS: Final = from_seconds(SHORT_SILENCE_S) - 1
+SURELY_IN_REACH_TICKS: Final = from_seconds(TUNING.short_silence_s) - 1
 """Silences up to this need no check of the filter."""
 
 
@@ -61,7 +31,6 @@ class AnchorsInUseState(Struct, frozen=True):
 class _Course(Struct):
     """What has become of the starts so far."""
 
-    speed_std_mps: float = TAG_SPEED_STD_MPS
     open_range_errors: bool = False
     """Whether the next start expects larger range errors than the settings state."""
     is_open: bool = False
@@ -107,7 +76,9 @@ class Estimation:
         )
         self._superframe_s = superframe_s
         self._most_anchors = most_anchors
-        self._max_relative_std = MAX_RELATIVE_STD if superframe_s < SLOW_S else SLOW_MAX_RELATIVE_STD
+        self._max_relative_std = (
+            TUNING.curved_std if superframe_s < TUNING.slow_superframe_s else TUNING.slow_curved_std
+        )
         self._z_bounds_m = z_bounds_m
         self._course = _Course()
         self._estimator = Estimator(settings)
@@ -175,11 +146,8 @@ class Estimation:
         self._course.newest_ticks = max(self._course.newest_ticks, rx_ticks)
         if outcome in {REJECTED, STALE}:
             if self._estimator.is_lost:
-                self._restart(rx_ticks)
+                self._start = self._new_start()
             return NoFixReason.RESIDUALS
-        if self._is_too_fast(rx_ticks):
-            self._restart(rx_ticks)
-            return NoFixReason.ACQUIRING
         if self._is_contradicted(rx_ticks):
             self._start = self._new_start()
             return NoFixReason.ACQUIRING
@@ -193,7 +161,7 @@ class Estimation:
             return start
         if start.is_contradicted and not start.misfitting and self._estimator.is_late_often:
             return NoFixReason.RESIDUALS  # single packets are late: others will not be
-        if self._superframe_s > LONGEST_SUPERFRAME_S:
+        if self._superframe_s > TUNING.longest_superframe_s:
             return self._fix_of(start, observation)
         self._begin(start, starting.packets())
         return self._fix(observation)
@@ -204,12 +172,12 @@ class Estimation:
         Before a start it bounds the heights of the search. Where many in a row do not fit, the start was wrong.
         """
         if self._start is not None:
-            margin_m = HEIGHT_SIGMAS * std_m
+            margin_m = TUNING.height_sigmas * std_m
             self._start.expect_height(height_m - margin_m, height_m + margin_m)
             return False
         used = self._estimator.process_height(height_m, std_m) == ACCEPTED
         self._course.heights_rejected = 0 if used else self._course.heights_rejected + 1
-        if self._course.heights_rejected >= MAX_HEIGHTS_REJECTED and not self._height_known:
+        if self._course.heights_rejected >= TUNING.heights_in_row and not self._height_known:
             self._course.heights_rejected = 0
             self._start = self._new_start()
         return used
@@ -217,20 +185,6 @@ class Estimation:
     def coast(self, observation: Observation) -> Fix | NoFixReason:
         """A fix when a packet came that was not used itself: by all others, and by what was relayed with it."""
         return NoFixReason.RESIDUALS if self._start is not None else self._fix(observation)
-
-    def _restart(self, rx_ticks: int) -> None:
-        """Look for a new start; a filter that is lost early has a tag that is faster than assumed."""
-        early = (rx_ticks - self._course.started_ticks) * TICK_S < EARLY_S
-        faster = min(SPEED_STD_GROWTH * self._course.speed_std_mps, MAX_SPEED_STD_MPS)
-        self._course.speed_std_mps = faster if early else TAG_SPEED_STD_MPS
-        self._start = self._new_start()
-
-    def _is_too_fast(self, rx_ticks: int) -> bool:
-        """Whether the range errors of several anchors jump early, or nothing fits: it is the tag that has moved."""
-        if (rx_ticks - self._course.started_ticks) * TICK_S >= EARLY_S:
-            return False
-        several = self._estimator.jumps >= MANY_JUMPS or self._estimator.rows.item(QUALITY, 0) > EARLY_NIS
-        return several and self._course.speed_std_mps < MAX_SPEED_STD_MPS
 
     def _is_contradicted(self, rx_ticks: int) -> bool:
         """Whether a new start is needed, as relays or faults contradict this one; decides what that has to expect."""
@@ -240,12 +194,12 @@ class Estimation:
             )
             return True
         age_s = (rx_ticks - self._course.started_ticks) * TICK_S
-        if self._course.is_open and age_s > OPEN_START_HOLD_S and self._estimator.fits_settings:
+        if self._course.is_open and age_s > TUNING.open_start_s and self._estimator.fits_settings:
             self._course.open_range_errors = False
             return True
         if self._estimator.rows.item(QUALITY, 2) > TUNING.sure_chi2:
             limit = TUNING.sure_chi2 if self._course.start_was_contradicted else TUNING.uncovered_chi2
-            if self._estimator.fault_test > limit and (not self._course.is_open or age_s > OPEN_START_HOLD_S):
+            if self._estimator.fault_test > limit and (not self._course.is_open or age_s > TUNING.open_start_s):
                 self._course.open_range_errors = not self._estimator.is_late_often
                 return True
         if not self._course.relays_may_contradict:
@@ -259,19 +213,18 @@ class Estimation:
 
     def _new_start(self) -> Acquisition:
         settings = self._settings
-        max_age_s = max(START_MAX_AGE_S, 2.5 * self._superframe_s)
+        max_age_s = max(TUNING.start_age_s, 2.5 * self._superframe_s)
         variance = settings.tx_variance_m2 + settings.rx_variance_m2
-        errors = settings.range_std_m**2 + settings.survey_std_m**2
-        if self._superframe_s > LONGEST_SUPERFRAME_S:
-            variance += errors
-        return Acquisition(settings.height_m, variance, self._z_bounds_m, max_age_s, self._course.speed_std_mps, errors)
+        errors = _error_variance_m2(settings)
+        speed_mps = settings.start_speed_std_mps
+        return Acquisition(settings.height_m, variance, self._z_bounds_m, max_age_s, speed_mps, errors)
 
     def _is_out_of_reach(self, observation: Observation) -> bool:
         """Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back."""
         silent_s = (observation.rx_ticks_tag - self._course.newest_ticks) * TICK_S
-        if not -REORDERED_S <= silent_s <= MAX_SILENCE_S:
+        if not -TUNING.short_silence_s <= silent_s <= TUNING.longest_silence_s:
             return True
-        if silent_s < SHORT_SILENCE_S:
+        if silent_s < TUNING.short_silence_s:
             return False
         std_m = self._estimator.horizontal_variance_m2(silent_s) ** 0.5
         position_m = self._estimator.state.x[: self._estimator.dim]
@@ -285,23 +238,24 @@ class Estimation:
             packets = [packet for packet in packets if packet.anchor in kept]
         self._course.newest_ticks = self._course.started_ticks = packets[-1].rx_ticks_tag
         self._in_use.begin(start.used)
-        dim, begin_ticks = self._estimator.dim, packets[0].rx_ticks_tag
+        settings, dim, begin_ticks = self._settings, self._estimator.dim, packets[0].rx_ticks_tag
         age_s = (start.rx_ticks_tag - begin_ticks) * TICK_S
         is_contradicted = start.is_contradicted and not self._estimator.is_late_often
         self._course.is_open = self._course.open_range_errors or (is_contradicted and not start.misfitting)
         self._course.start_was_contradicted = self._course.is_open or is_contradicted
-        error = TUNING.open_range_std_m if self._course.start_was_contradicted else self._settings.range_std_m
-        inflation = 1.0 + error**2 / (self._settings.tx_variance_m2 + self._settings.rx_variance_m2)
-        if not self._course.start_was_contradicted:
-            inflation *= COVARIANCE_MARGIN
-        covariance = inflation * start.covariance[:dim, :dim] + age_s**2 * start.speed_variance * np.eye(dim)
+        expected_m2 = settings.tx_variance_m2 + settings.rx_variance_m2 + _error_variance_m2(settings)
+        is_wide = self._course.start_was_contradicted
+        inflation = 1.0 + TUNING.late_std_m**2 / expected_m2 if is_wide else TUNING.start_margin
+        covariance = inflation * start.covariance[
+            :dim, :dim
+        ] + age_s**2 * self._settings.start_speed_std_mps**2 * np.eye(dim)
         self._estimator.start(
             begin_ticks,
             start.solution[:dim],
             covariance,
-            start.speed_variance,
+            self._settings.start_speed_std_mps**2,
             self._course.is_open,
-            TUNING.open_range_std_m if self._course.start_was_contradicted else TUNING.lasting_std_m,
+            TUNING.late_std_m if self._course.start_was_contradicted else TUNING.lasting_std_m,
             [
                 self._estimator.anchor_index(packet.anchor, packet.anchor_m, packet.anchor_std_m)
                 for packet in packets
@@ -347,7 +301,7 @@ class Estimation:
         if self._settings.height_m is not None:
             rows[POSITION, 2] = self._settings.height_m
         rows[POSITION + 1 : POSITION + 1 + dim, :dim] = start.covariance[:dim, :dim]
-        rows[VELOCITY + 1 : VELOCITY + 1 + dim, :dim] = start.speed_variance * np.eye(dim)
+        rows[VELOCITY + 1 : VELOCITY + 1 + dim, :dim] = self._settings.start_speed_std_mps**2 * np.eye(dim)
         rows[PROTECTION, 2] = UNAVAILABLE
         self._in_use.begin(start.used)
         rx_ticks, in_use = observation.rx_ticks_tag, self._in_use
@@ -368,6 +322,11 @@ class Estimation:
         )
 
 
+def _error_variance_m2(settings: EstimatorSettings) -> float:
+    """Variance of a range by the errors of anchors and ranges."""
+    return settings.range_std_m**2 + settings.survey_std_m**2
+
+
 def _nearest(start: Start, most: int) -> set[int]:
     """The anchors of a start that are nearest to its position, and those that do not fit."""
     dim = len(start.solution) - 1
@@ -379,15 +338,12 @@ def _nearest(start: Start, most: int) -> set[int]:
 # Anchors in use
 
 
-# An anchor counts as in use while its last accepted message is younger than this, or than 1.5 superframes.
-MIN_IN_USE_S: Final = 0.1
-
-
 class AnchorsInUse:
     """The anchors whose messages were accepted recently. Their list is made again only when it changes."""
 
     def __init__(self, superframe_s: float) -> None:
-        self._in_use_s = max(MIN_IN_USE_S, 1.5 * superframe_s)
+        # one counts as in use while its last accepted message is younger than this
+        self._in_use_s = max(TUNING.short_silence_s, 1.5 * superframe_s)
         self._used: dict[int, Observation] = {}
         self._checked_ticks = 0
         self.anchors: tuple[int, ...] = ()

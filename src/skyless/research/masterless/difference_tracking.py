@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.constants import TICK_RATE_HZ
 from skyless.core.estimator.estimator import ACCEPTED, Estimator
-from skyless.core.estimator.settings import EstimatorSettings
+from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.kernels.arrays import Array
@@ -22,6 +22,7 @@ from skyless.core.tag.locate import NoSolution, locate
 from skyless.site.survey.anchor_errors import KNOWN_STD_M, DifferenceCalibration
 
 DIFFERENCES: Final = EstimatorSettings(
+    start_speed_std_mps=1.0,
     gate=3.0,
     white=0.0,
     walk=0.0,
@@ -37,19 +38,6 @@ DIFFERENCES: Final = EstimatorSettings(
 )
 """What recorded flights of DW1000s show (docs/recordings.md): reflections change within half a metre, and by how much
 differs from anchor to anchor."""
-
-# A start uses the newest differences: this number of them, or at least those of this time.
-WINDOW: Final = 60
-WINDOW_S: Final = 1.0
-MAX_DIFFERENCE_SILENCE_S: Final = 10.0  # after a longer silence the state is worse than a new start
-START_SPEED_STD_MPS: Final = 1.0  # of the velocity at the start
-DIFFERENCE_IN_USE_S: Final = 0.5  # an anchor counts as in use while its last accepted difference is younger
-# While the horizontal standard deviation is larger, there is no fix; a silence that makes it so means a new start.
-MAX_HORIZONTAL_STD_M: Final = 3.0
-SHORT_SILENCE_S: Final = 0.1  # over shorter silences no state grows much wider
-TRY_EVERY_S: Final = 0.1  # between two attempts at a start
-# A start from later differences that is farther off (3-D: once in 60,000) begins again.
-CONTRADICTED_CHI2: Final = 25.0
 
 
 class DifferenceTracking:
@@ -83,7 +71,7 @@ class DifferenceTracking:
         self._positions_m = {anchor: np.array(point) for anchor, point in anchors_m.items()}
         self._z_bounds_m = z_bounds_m
         self._estimator = Estimator(self._settings)
-        self._window: deque[PairTdoa] = deque(maxlen=WINDOW)
+        self._window: deque[PairTdoa] = deque(maxlen=int(TUNING.window))
         self._begin_s = self._newest_s = 0.0
         self._received_s: dict[int, float] = {}
         self._tried_s = -np.inf
@@ -164,9 +152,10 @@ class DifferenceTracking:
 
     def _is_out_of_reach(self, silent_s: float) -> bool:
         """Whether the filter cannot predict that far: too long a silence for it, or a clock that went back."""
-        if not 0.0 <= silent_s <= MAX_DIFFERENCE_SILENCE_S:
+        if not 0.0 <= silent_s <= TUNING.longest_silence_s:
             return True
-        return silent_s > SHORT_SILENCE_S and self._estimator.horizontal_variance_m2(silent_s) > MAX_HORIZONTAL_STD_M**2
+        is_short = silent_s <= TUNING.short_silence_s
+        return not is_short and self._estimator.horizontal_variance_m2(silent_s) > TUNING.most_horizontal_std_m**2
 
     def _is_plausible(self) -> bool:
         """Whether the state is near the anchors, where differences have information, and known well enough."""
@@ -175,10 +164,10 @@ class DifferenceTracking:
             self.reason = NoFixReason.NOT_CONVERGED
             self._stop()
             return False
-        if state.P[0, 0] + state.P[1, 1] > MAX_HORIZONTAL_STD_M**2:
+        if state.P[0, 0] + state.P[1, 1] > TUNING.most_horizontal_std_m**2:
             self.reason = NoFixReason.ACQUIRING
             return False
-        if dim == 3 and state.P[2, 2] > MAX_HORIZONTAL_STD_M**2:
+        if dim == 3 and state.P[2, 2] > TUNING.most_horizontal_std_m**2:
             self.reason = NoFixReason.BAD_GEOMETRY
             return False
         return True
@@ -191,7 +180,7 @@ class DifferenceTracking:
 
     def fix(self) -> Fix:
         """The newest position with all that is known of it; only after an ``update`` that made one."""
-        used = [anchor for anchor, when_s in self._received_s.items() if self._newest_s - when_s <= DIFFERENCE_IN_USE_S]
+        used = [anchor for anchor, when_s in self._received_s.items() if self._newest_s - when_s <= TUNING.start_age_s]
         anchors_m = np.array([self._positions_m[anchor] for anchor in used]).reshape(-1, 3)
         rows, known = self._estimator.rows.tobytes(), self._settings.height_m is not None
         return Fix(self._newest_s, rows, tuple(used), anchors_m, "joint", known, 1, self._asked)
@@ -206,11 +195,11 @@ class DifferenceTracking:
     def _is_time_to_start(self, pair: PairTdoa) -> bool:
         """Gather differences; whether they are enough for a start."""
         window = self._window
-        while window and not 0.0 <= pair.time_s - window[0].time_s <= MAX_DIFFERENCE_SILENCE_S:
+        while window and not 0.0 <= pair.time_s - window[0].time_s <= TUNING.longest_silence_s:
             window.popleft()
         window.append(pair)
-        is_enough = len(window) == WINDOW or pair.time_s - window[0].time_s >= WINDOW_S
-        every_s = TRY_EVERY_S if self._start is None else WINDOW_S
+        is_enough = len(window) == TUNING.window or pair.time_s - window[0].time_s >= TUNING.window_s
+        every_s = TUNING.short_silence_s if self._start is None else TUNING.window_s
         return is_enough and not 0.0 <= pair.time_s - self._tried_s < every_s
 
     def _try_start(self) -> bool:
@@ -225,15 +214,17 @@ class DifferenceTracking:
             position_m, covariance_m2 = (array[..., :dim] for array in self._estimator.motion())
             gap_m = position_m - start.position_m[:dim]
             both_m2 = covariance_m2[:dim] + start.covariance_m2[:dim, :dim]
-            if start.is_ambiguous or gap_m @ np.linalg.solve(both_m2, gap_m) < CONTRADICTED_CHI2:
-                has_moved = bool(np.linalg.norm(position_m - self._start.position_m[:dim]) > RIVAL_M)
+            if start.is_ambiguous or gap_m @ np.linalg.solve(both_m2, gap_m) < TUNING.apart_chi2:
+                has_moved = bool(np.linalg.norm(position_m - self._start.position_m[:dim]) > TUNING.rival_m)
                 self._is_confirmed = has_moved or not start.is_ambiguous
                 self._estimator.withhold_levels(not self._is_confirmed)
                 window.clear()
                 return False
             self.counters["restart"] += 1
         self._begin_s, newest = self._newest_s, window[-1]
-        self._estimator.start(0, start.position_m[:dim], start.covariance_m2[:dim, :dim], START_SPEED_STD_MPS**2)
+        self._estimator.start(
+            0, start.position_m[:dim], start.covariance_m2[:dim, :dim], self._settings.start_speed_std_mps**2
+        )
         self._estimator.withhold_levels(True)
         self._start = start
         for anchor, (late_m, variance_m2) in start.late.items():
@@ -248,24 +239,7 @@ class DifferenceTracking:
 # Start
 
 
-NEIGHBOURHOOD: Final = (1.5, 1.5, 0.5)
-"""A tag farther from the anchors' centre than these parts of their figure's diagonal is lost."""
-
-MIN_DIAGONAL_M: Final = 5.0
-# Starts lie no higher above or below anchors of different heights than this, unless bounds are given.
-HEIGHT_MARGIN_M: Final = 1.0
-START_DIFFERENCE_STD_M: Final = 0.08  # of the median of a pair's differences
-START_ANCHOR_STD_M: Final = 0.14  # of the errors of each anchor, before any are estimated
-# By how much an anchor may be late. On the floor or behind metal one often is, and at times two.
-START_LATE_STD_M: Final = 1.0
-
-LATE_PENALTY: Final = 2.0  # what each anchor that is late adds to chi² (odds of 1 to 3)
-MAX_LATE: Final = 2
-START_TAIL: Final = 1e-2  # where residuals are larger than noise makes them this rarely, more anchors are late
 JOINING_STEPS: Final = 4  # of least squares with the weights that the last one shows
-# A rival has at least this probability and distance; anchors lie elsewhere for a tag that has moved as far.
-RIVAL_WEIGHT: Final = 0.01
-RIVAL_M: Final = 0.5
 
 
 class Start(Struct, frozen=True):
@@ -284,8 +258,22 @@ class Start(Struct, frozen=True):
 
     def holds(self, position_m: Array) -> bool:
         """Whether a position, of two or three coordinates, lies in the neighbourhood of the anchors."""
-        low_m, high_m = self.corners_m[:, : len(position_m)]
-        return bool(np.all((low_m <= position_m) & (position_m <= high_m)))
+        return is_within(self.corners_m, position_m)
+
+
+def neighbourhood_m(anchors_m: Array) -> Array:
+    """Opposite corners of the space around the anchors beyond which time differences say nothing, shape (2, 3)."""
+    low, high = anchors_m.min(axis=0), anchors_m.max(axis=0)
+    diagonal_m = max(float(np.linalg.norm((high - low)[:2])), TUNING.least_diagonal_m)
+    reach = (TUNING.neighbourhood, TUNING.neighbourhood, TUNING.neighbourhood_height)
+    corners_m: Array = (low + high) / 2.0 + diagonal_m * np.outer((-1.0, 1.0), reach)
+    return corners_m
+
+
+def is_within(corners_m: Array, position_m: Array) -> bool:
+    """Whether a position, of two or three coordinates, lies between two corners."""
+    low_m, high_m = corners_m[:, : len(position_m)]
+    return bool(np.all((low_m <= position_m) & (position_m <= high_m)))
 
 
 def find_start(
@@ -309,25 +297,27 @@ def find_start(
     anchors, tdoa_m, joined_m2 = joined_tdoas(list(grouped), [np.median(group) for group in grouped.values()])
     dim, anchors_m = 3 if height_m is None else 2, np.array([positions_m[anchor] for anchor in anchors])
     low, high, count = anchors_m.min(axis=0), anchors_m.max(axis=0), len(anchors_m)
-    if z_bounds_m is None and high[2] - low[2] > HEIGHT_MARGIN_M:
-        z_bounds_m = (low[2] - HEIGHT_MARGIN_M, high[2] + HEIGHT_MARGIN_M)
+    if z_bounds_m is None and high[2] - low[2] > TUNING.height_margin_m:
+        z_bounds_m = (low[2] - TUNING.height_margin_m, high[2] + TUNING.height_margin_m)
     low_m, high_m = z_bounds_m if z_bounds_m and height_m is None else (-np.inf, np.inf)
     shares = np.vstack([-np.ones(count - 1), np.eye(count - 1)])  # of each anchor's error in the TDoAs
-    usual_m2 = joined_m2 + START_ANCHOR_STD_M**2 * shares.T @ shares
-    most = min(MAX_LATE, max(count - dim - 3, 0)) if len(window) == WINDOW else 0
+    usual_m2 = joined_m2 + TUNING.late_start_std_m**2 * shares.T @ shares
+    most = min(int(TUNING.most_late), max(count - dim - 3, 0)) if len(window) == TUNING.window else 0
     hypotheses: list[tuple[float, Array, Array, Array]] = []
     reason = NoSolution(NoFixReason.RESIDUALS, "more anchors are late than the others can show")
     for some in (list(some) for size in range(most + 1) for some in combinations(range(count), size)):
-        sigma_m2 = usual_m2 + START_LATE_STD_M**2 * shares[some].T @ shares[some]
-        found = locate(anchors_m, tdoa_m, sigma_m2, height_m=height_m, z_bounds_m=z_bounds_m, residual_tail=START_TAIL)
+        sigma_m2 = usual_m2 + TUNING.late_std_m**2 * shares[some].T @ shares[some]
+        found = locate(
+            anchors_m, tdoa_m, sigma_m2, height_m=height_m, z_bounds_m=z_bounds_m, residual_tail=TUNING.chance
+        )
         if isinstance(found, NoSolution):
             reason = reason if some else found
             continue
-        late_m = START_LATE_STD_M**2 * shares @ np.linalg.solve(sigma_m2, found.residuals_m)
+        late_m = TUNING.late_std_m**2 * shares @ np.linalg.solve(sigma_m2, found.residuals_m)
         if all(late_m[some] > 0.0) and low_m <= found.position_m[2] <= high_m:
-            score = found.chi2 + float(np.linalg.slogdet(sigma_m2)[1]) + LATE_PENALTY * len(some)
+            score = found.chi2 + float(np.linalg.slogdet(sigma_m2)[1]) + TUNING.late_penalty * len(some)
             misfit = max(1.0, found.chi2 / max(found.dof, 1))
-            expected = np.array([late_m, np.full(count, START_LATE_STD_M**2)]) * np.isin(np.arange(count), some)
+            expected = np.array([late_m, np.full(count, TUNING.late_std_m**2)]) * np.isin(np.arange(count), some)
             hypotheses.append((score, found.position_m, misfit * found.covariance_m2, expected))
     if not hypotheses:
         return reason
@@ -338,12 +328,10 @@ def find_start(
     off_m = positions - position_m
     covariance_m2 = np.tensordot(weights, covariances + off_m[:, :, None] * off_m[:, None, :], 1)
     best_m = positions[int(np.argmin(scores))]
-    has_rival = np.any((np.linalg.norm(positions - best_m, axis=1) > RIVAL_M) & (weights > RIVAL_WEIGHT))
+    has_rival = np.any((np.linalg.norm(positions - best_m, axis=1) > TUNING.rival_m) & (weights > TUNING.chance))
     late = dict(zip(anchors, np.tensordot(weights, lates, 1).T.tolist(), strict=True))
-    is_ambiguous = bool(has_rival) or sum(variance for _, variance in late.values()) > 0.5 * START_LATE_STD_M**2
-    diagonal_m = max(float(np.linalg.norm((high - low)[:2])), MIN_DIAGONAL_M)
-    corners_m = (low + high) / 2.0 + diagonal_m * np.outer((-1.0, 1.0), NEIGHBOURHOOD)
-    start = Start(position_m, covariance_m2, late, is_ambiguous, corners_m)
+    is_ambiguous = bool(has_rival) or sum(variance for _, variance in late.values()) > 0.5 * TUNING.late_std_m**2
+    start = Start(position_m, covariance_m2, late, is_ambiguous, neighbourhood_m(anchors_m))
     if not start.holds(position_m[:dim]):
         return NoSolution(NoFixReason.NOT_CONVERGED, "the position lies far from all anchors")
     return start
@@ -362,8 +350,9 @@ def joined_tdoas(pairs: Sequence[tuple[int, int]], differences_m: ArrayLike) -> 
     part = np.flatnonzero(linked[np.argmax(linked.sum(axis=1))])
     used = H[:, part].any(axis=1)
     H, measured_m, weights = H[np.ix_(used, part[1:])], np.array(differences_m)[used], np.ones((used.sum(), 1))
+    std_m = TUNING.median_difference_std_m
     for _ in range(JOINING_STEPS):
         covariance: Array = np.asarray(np.linalg.inv(H.T @ (weights * H)), np.float64)
         tdoa_m = covariance @ H.T @ (weights[:, 0] * measured_m)
-        weights = (START_DIFFERENCE_STD_M / np.fmax(np.abs(measured_m - H @ tdoa_m), START_DIFFERENCE_STD_M))[:, None]
-    return tuple(anchors[part].tolist()), tdoa_m, START_DIFFERENCE_STD_M**2 * covariance
+        weights = (std_m / np.fmax(np.abs(measured_m - H @ tdoa_m), std_m))[:, None]
+    return tuple(anchors[part].tolist()), tdoa_m, std_m**2 * covariance

@@ -14,12 +14,12 @@ from msgspec.structs import replace
 
 from skyless.core.air.masterless_packets import Packet, Point, Relay
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.core.estimator.settings import EstimatorSettings
+from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.observation import Observation
 from skyless.core.tag.joint import Estimation
 from skyless.core.ticks import LAST_TICKS, FixTime, Unwrapper, continued, nearest
-from skyless.research.masterless.difference_tracking import DIFFERENCES, MAX_HORIZONTAL_STD_M, NEIGHBOURHOOD
+from skyless.research.masterless.difference_tracking import DIFFERENCES, is_within, neighbourhood_m
 from skyless.research.masterless.pair_engine import MAX_ANCHORS, remember
 from skyless.site.survey.anchor_errors import NO_BIAS, SLOPE_NEAREST_M, DifferenceCalibration, RelayDelays
 
@@ -126,7 +126,7 @@ class PacketTracking:
         self._pairs: set[tuple[int, int]] | None = None if one_way is None else set()
         """Listeners and senders of relays, until two have relayed each other."""
         self._tracking = self._new_tracking()
-        self._area_m = (0.0, 0.0, 0.0)
+        self._area_m = np.zeros((2, 3))
         self._drops: Counter[str] = Counter()
         self._rejected_before = self._rejected_now = 0
 
@@ -219,12 +219,11 @@ class PacketTracking:
         if isinstance(fix, Fix):
             x_m, y_m, z_m = fix.position_m.tolist()
             self.position_m, self.time_s = (x_m, y_m, z_m), fix.time_s
-            middle_x_m, middle_y_m, reach_m = self._area_m
             covariance = fix.covariance_m2
-            if abs(x_m - middle_x_m) > reach_m or abs(y_m - middle_y_m) > reach_m:
+            if not is_within(self._area_m, fix.position_m[:2]):
                 fix = NoFixReason.NOT_CONVERGED
                 self._tracking = self._new_tracking()
-            elif covariance.item(0) + covariance.item(4) > MAX_HORIZONTAL_STD_M**2:
+            elif covariance.item(0) + covariance.item(4) > TUNING.most_horizontal_std_m**2:
                 fix = NoFixReason.ACQUIRING
             else:
                 return fix
@@ -295,10 +294,7 @@ class PacketTracking:
         return stated_m
 
     def _update_area(self) -> None:
-        positions = np.array([anchor.position_m[:2] for anchor in self._anchors.values()])
-        low, high = positions.min(axis=0), positions.max(axis=0)
-        x_m, y_m = ((low + high) / 2.0).tolist()
-        self._area_m = (x_m, y_m, NEIGHBOURHOOD[0] * max(float(np.linalg.norm(high - low)), 5.0))
+        self._area_m = neighbourhood_m(np.array([anchor.position_m for anchor in self._anchors.values()]))
 
     def _relayed(self, listener: int, anchor: _Anchor, relay: Relay) -> int | str:
         """The anchor's reception of another's packet, unwrapped and without antenna delays, or why it cannot be had."""
