@@ -87,7 +87,7 @@ def test_no_start_takes_the_wrong_side_of_a_row_of_anchors(seed):
     reasons = set()
     for _ in range(40):
         heard_m = ranges_m + late_m + draw.normal(0.0, 0.045, 6)
-        found = locate_pseudoranges(anchors_m, heard_m, np.full(6, 0.045**2), height_m=1.0, rival_chi2=15.0)
+        found = locate_pseudoranges(anchors_m, heard_m, np.full(6, 0.045**2 + 0.03**2 + 0.02**2), height_m=1.0)
         if isinstance(found, NoSolution):
             reasons.add(found.reason)
         else:

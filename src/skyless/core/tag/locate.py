@@ -153,7 +153,6 @@ def locate(
     weighted: bool = True,
     z_bounds_m: tuple[float, float] | None = None,
     residual_tail: float = RESIDUAL_TAIL,
-    rival_chi2: float = RIVAL_MINIMUM_CHI2,
 ) -> Solution | NoSolution:
     """Locate a tag by TDoAs ``tdoa_m[i] = |p − anchors_m[i + 1]| − |p − anchors_m[0]|``.
 
@@ -161,7 +160,7 @@ def locate(
     symmetric. ``height_m``: the tag's known height (2-D positioning; anchors may have any
     heights). ``weighted=False`` minimises the plain sum of squares; its covariance still follows from Σ.
 
-    Where two positions explain the data about equally well (``rival_chi2``), as the two sides of the anchors' plane do
+    Where two positions explain the data about equally well, as the two sides of the anchors' plane do
     in 3-D, ``z_bounds_m`` may decide; else the answer is MIRROR. A tag so near that plane that the two have merged is
     put into it, with a variance that covers both. Residuals less likely than ``residual_tail`` give RESIDUALS (0 lets
     everything pass). No value raises; arrays that do not fit each other raise ValueError.
@@ -185,7 +184,7 @@ def locate(
     if problem.kind == PLANE:
         minima = unfold(best)
     else:
-        minima = [best, *(m for m in minima[1:] if m.chi2 <= best.chi2 + rival_chi2 and distinct(best, m))]
+        minima = [best, *(m for m in minima[1:] if m.chi2 <= best.chi2 + RIVAL_MINIMUM_CHI2 and distinct(best, m))]
     return _decide(problem, minima, z_bounds_m)
 
 
@@ -197,7 +196,6 @@ def locate_pseudoranges(
     height_m: float | None = None,
     z_bounds_m: tuple[float, float] | None = None,
     residual_tail: float = RESIDUAL_TAIL,
-    rival_chi2: float = RIVAL_MINIMUM_CHI2,
 ) -> PseudorangeSolution | NoSolution:
     """Locate a tag by pseudoranges |p − anchors_m[i]| + bias with independent errors.
 
@@ -220,7 +218,6 @@ def locate_pseudoranges(
         height_m=height_m,
         z_bounds_m=z_bounds_m,
         residual_tail=residual_tail,
-        rival_chi2=rival_chi2,
     )
     if isinstance(solution, NoSolution):
         return solution
