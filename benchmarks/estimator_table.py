@@ -74,7 +74,7 @@ MECHANISMS: dict[str, dict[str, float]] = {
     "Differences: less weight of large innovations": {"difference_huber": OFF},
     "Differences: tags at rest": {DIFFERENCES + "DIFFERENCES.stationary_s": 0.0},
     "Differences: starts with late anchors": {"most_late": 0},
-    "Start: relays may contradict it": {"relay_fading": 0.0},
+    "Start: relays may contradict it": {"max_relays_rejected": OFF},
     "Start: wide ones wait": {"start_patience_s": 0.0},
     "Start: what contradicts it": {"start_tail": 0.0},
     "Start: margin on its covariance": {"start_margin": 1.0},

@@ -139,8 +139,8 @@ def _process(
         status["packets"] += 1
         _keep_packet(s, anchor, sequence, rx_ticks, tx_ticks)
     if was_known:
-        status["relays_lately_accepted"] *= settings["relay_fading"]
-        status["relays_lately_rejected"] *= settings["relay_fading"]
+        status["relays_lately_accepted"] *= 1.0 - settings["mean_gain"]
+        status["relays_lately_rejected"] *= 1.0 - settings["mean_gain"]
     _process_relays(s, relays, first, last if was_known else first)
     if was_known and report_variance_m2 > 0.0 and master >= 0 and s.index_of[master] not in (-1, anchor):
         report(s, anchor, s.index_of[master], subticks, report_variance_m2)
@@ -182,7 +182,7 @@ def _admit(s: EstimatorState, anchor: int, rx_ticks: int, tx_ticks: int) -> int:
     elif _is_impossible(s, anchor, rx_ticks, tx_ticks):
         s.anchors[anchor]["outliers_in_row"] += 1
         status["rejected_in_row"] += 1
-        outcome = REJECTED if s.anchors[anchor]["outliers_in_row"] < settings["restart_in_row"] else RESTARTED_CLOCK
+        outcome = REJECTED if s.anchors[anchor]["outliers_in_row"] < settings["in_row"] else RESTARTED_CLOCK
     s.status[0]["impossible"] += int(outcome == REJECTED)
     return outcome
 
@@ -643,14 +643,6 @@ class Estimator:
     def fault_test(self) -> float:
         """The larger test of faults, χ² with as many degrees of freedom as there are anchors if there are none."""
         return float(self._levels[FIRST_TEST:].max())
-
-    @property
-    def fits_settings(self) -> bool:
-        """Whether the constants of the ranges are as small as the settings state, as far as they are known."""
-        s, count = self._state, len(self._state.anchors)
-        constants = slice((first := layout(self.dim, count).constant), first + count)
-        variances = s.P[constants, constants] + self.settings.range_std_m**2 * np.eye(count)
-        return bool(s.x[constants] @ np.linalg.solve(variances, s.x[constants]) < TUNING.fitting_chi2 * count)
 
     @property
     def multipath_m(self) -> tuple[float, float] | None:

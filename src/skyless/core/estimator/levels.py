@@ -16,7 +16,7 @@ import numpy as np
 
 from skyless.core.constants import TICK_S
 from skyless.core.estimator.faults import fault_chi2, whiten
-from skyless.core.estimator.monitor import covariance_scale
+from skyless.core.estimator.monitor import covariance_scale, is_warm
 from skyless.core.estimator.state import FAULT_KINDS, LASTING, EstimatorState
 from skyless.core.integrity import CONTRADICTED, HPL, OBSTRUCTED, SOUND, UNAVAILABLE, VPL
 from skyless.core.kernels.arrays import Vector
@@ -138,7 +138,7 @@ def integrity_state(s: EstimatorState, levels: Vector) -> int:
         state = CONTRADICTED
     if status["open_range_errors"] and share > settings["max_open_level_std"]:
         state = CONTRADICTED
-    is_new = count <= s.settings[0]["dim"] or status["packets"] < settings["first_packets"] * count
+    is_new = count <= s.settings[0]["dim"] or not is_warm(s)
     if is_new or share > settings["curved_std"] or is_side_open(s):
         state = UNAVAILABLE
     return state

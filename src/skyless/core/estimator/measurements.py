@@ -371,7 +371,7 @@ def _survey_pair(s: EstimatorState, one: int, other: int) -> None:
         s.anchors[misplaced]["is_obstructed"] = 0
     for axis in range(dim if is_misplaced else 0):
         survey = where.survey + dim * misplaced + axis
-        s.P[survey, survey] += settings["misplaced_std_m"] ** 2
+        s.P[survey, survey] += settings["lasting_std_m"] ** 2
     for anchor in range(count if is_misplaced else 0):
         if s.links[min(misplaced, anchor), max(misplaced, anchor)]["contradicts"]:
             _pair_range(s, misplaced, anchor)

@@ -98,7 +98,7 @@ def adapt_change_noise(s: EstimatorState, anchor: int, normalised: float) -> Non
     settings, a = s.settings[0], s.anchors[anchor]
     a["change_mean"] += settings["mean_gain"] * (normalised - a["change_mean"])
     if _is_off_zero(s, a["change_mean"]):
-        a["change_scale"] = min(a["change_scale"] * settings["change_growth"], settings["max_change_scale"])
+        a["change_scale"] = min(a["change_scale"] * settings["change_growth"], settings["max_scale"])
     else:
         a["change_scale"] = max(a["change_scale"] * settings["change_loss"], 1.0)
 
@@ -116,12 +116,8 @@ def end_small_obstruction(s: EstimatorState, anchor: int) -> None:
     settings = s.settings[0]
     a, change = s.anchors[anchor], layout(s.settings[0]["dim"], len(s.anchors)).change + anchor
     error_m, variance, usual = s.x[change], s.P[change, change], s.status[0]["place_variance_m2"]
-    settled = (
-        a["is_obstructed"]
-        and a["change_scale"] < settings["settled_change_scale"]
-        and variance < settings["ended_std_m"] ** 2 + usual
-    )
-    if settled and error_m * error_m < settings["ended"] * settings["ended"] * (variance + usual):
+    settled = a["is_obstructed"] and variance < settings["ended_std_m"] ** 2 + usual
+    if settled and error_m * error_m < settings["ended"] ** 2 * (variance + usual):
         a["is_obstructed"] = 0
         s.status[0]["ends_of_obstructions"] += 1
 
@@ -236,7 +232,7 @@ def adapt_process_noise(s: EstimatorState, normalised: float) -> None:
     square *= (2.0 - gain) / gain
     status["lag_square"] += settings["lag_forgetting"] * (square - status["lag_square"])
     if status["lag_square"] > settings["lag_limit"]:
-        status["q_scale"] = min(status["q_scale"] * settings["q_scale_gain"], settings["max_q_scale"])
+        status["q_scale"] = min(status["q_scale"] * settings["q_scale_gain"], settings["max_scale"])
     else:
         status["q_scale"] = max(status["q_scale"] * settings["scale_loss"], 1.0)
     status["common_mean"] += gain * (normalised - status["common_mean"])

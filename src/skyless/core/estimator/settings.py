@@ -1,5 +1,6 @@
 """What the estimator assumes: constants that are the same everywhere, and settings of a site and its tags."""
 
+from math import erf, erfc, exp, pi, sqrt
 from typing import Final
 
 import numpy as np
@@ -19,12 +20,11 @@ class Tuning(Struct, frozen=True):
     # Clocks
     restart_m: float = 300.0
     """Paths that change by more than this between packets are impossible [m]."""
-    restart_in_row: float = 3
-    """Number of impossible packets in a row after which an anchor's counter has restarted."""
     start_walk_scale: float = 100.0
     """Factor on the random walk of the tag's oscillator at a start: it warms up after it was switched on."""
     mean_gain: float = 0.05
-    """Weight in running means of normalised innovations: along each axis, of all anchors, and of an anchor's relays."""
+    """Weight in running means of normalised innovations (along each axis, of all anchors, of an anchor's relays), and
+    loss of the counts of recent relays with each packet."""
     mean_limit: float = 9.0
     """Square of such a mean over its expectation beyond which process noise grows."""
     walk_scale_gain: float = 1.2
@@ -39,8 +39,8 @@ class Tuning(Struct, frozen=True):
     # Motion
     q_scale_gain: float = 1.05
     """Growth of the process noise of motion with each innovation."""
-    max_q_scale: float = 100.0
-    """Largest factor on the process noise of motion."""
+    max_scale: float = 100.0
+    """Largest factor on the process noise of motion, and of a range error that has jumped."""
     lag_limit: float = 2.6
     """Mean square of the innovations along the axes, 1 where the filter is right, beyond which that noise grows."""
     lag_forgetting: float = 0.01
@@ -77,8 +77,6 @@ class Tuning(Struct, frozen=True):
     """Normalised innovation beyond which receptions have less weight where they are late often (Huber 1964)."""
     difference_huber: float = 1.0
     """The same of time differences, always."""
-    relay_fading: float = 0.95
-    """Factor on the counts of recent relays with each packet."""
     max_relays_rejected: float = 4.0
     """Count of recent relays beyond the gate up to which they may be late ones."""
     lost_in_row: float = 8
@@ -90,7 +88,7 @@ class Tuning(Struct, frozen=True):
     suspect: float = 3.0
     """Normalised innovation beyond which a reception may be a jump, and two of them differ by chance."""
     in_row: float = 2
-    """Number of such receptions in a row that make a jump …"""
+    """Number of such receptions in a row that make a jump, and of impossible ones if a counter has restarted …"""
     in_row_where_late: float = 5
     """… and where single receptions are late often."""
     together: float = 7.0
@@ -103,10 +101,6 @@ class Tuning(Struct, frozen=True):
     """Growth of that process noise while the mean of the anchor's innovations is off zero …"""
     change_loss: float = 0.97
     """… and its factor otherwise."""
-    max_change_scale: float = 250.0
-    """Largest factor on it."""
-    settled_change_scale: float = 2.0
-    """Factor below which such a range error has settled."""
     ended_std_m: float = 0.05
     """An obstruction has ended where the range error is known to this [m] …"""
     ended: float = 2.0
@@ -137,8 +131,6 @@ class Tuning(Struct, frozen=True):
     """Length of a step [m]."""
     place_limit: float = 2.0
     """A comparison counts as this many times their mean at most, as jumps are not multipath."""
-    place_limited_mean: float = 0.742
-    """What that leaves of the mean square of normal errors."""
     place_first: float = 20
     """Number of comparisons for which the stamps' noise stands beforehand."""
     place_samples: float = 100
@@ -154,7 +146,7 @@ class Tuning(Struct, frozen=True):
 
     # Faults that the state does not hold (docs/maths.md, section 8)
     lasting_std_m: float = 0.3
-    """Standard deviation beforehand of a fault since an anchor joined [m] …"""
+    """Standard deviation of each coordinate of an anchor that stands elsewhere, and of a fault since it joined [m] …"""
     recent_std_m: float = 0.08
     """… of one that has begun recently without a visible jump [m] …"""
     creeping_std_m: float = 0.2
@@ -181,8 +173,6 @@ class Tuning(Struct, frozen=True):
     """Number of relays in either direction after which their mean is a range."""
     misplaced_pairs: float = 2
     """Number of such ranges beyond ``suspect``, and more than the other end has, that make an anchor misplaced."""
-    misplaced_std_m: float = 0.3
-    """Standard deviation of each of its coordinates then [m]."""
 
     # Starts, and what is lost
     start_age_s: float = 0.5
@@ -214,8 +204,6 @@ class Tuning(Struct, frozen=True):
     """Number of heights in a row that do not fit, after which the position is wrong."""
     open_survey_std_m: float = 0.15
     """Standard deviation of each coordinate of an anchor after a start that was contradicted [m]."""
-    fitting_chi2: float = 2.0
-    """χ² for each anchor below which range errors are as the settings state them."""
     most_late: float = 2
     """Number of anchors that are late at the start at most: on the floor or behind metal one often is."""
     late_penalty: float = 2.0
@@ -239,11 +227,7 @@ class Tuning(Struct, frozen=True):
     height_margin_m: float = 1.0
     """Starts lie no higher above or below anchors of different heights than this, unless bounds are given [m]."""
     neighbourhood: float = 1.5
-    """A tag without beacons that is farther from the anchors' centre than this part of their diagonal is lost …"""
-    neighbourhood_height: float = 0.5
-    """… or higher above it or below than this part …"""
-    least_diagonal_m: float = 5.0
-    """… of a diagonal of at least this [m]."""
+    """A tag without beacons that is farther from the anchors' centre than this part of their diagonal is lost."""
     most_horizontal_std_m: float = 3.0
     """While its horizontal standard deviation is larger, there is no fix [m]."""
     zero_variance_m2: float = 1e4
@@ -252,8 +236,6 @@ class Tuning(Struct, frozen=True):
     # Levels that are withheld
     uncovered_chi2: float = 240.0
     """Test beyond which faults are larger than levels cover."""
-    first_packets: float = 3
-    """Number of packets of each anchor before the first level."""
     max_open_level_std: float = 0.02
     """Part of the mean range beyond which, where all range errors are open, a standard deviation has no level."""
     contradicted_start_s: float = 5.0
@@ -354,6 +336,10 @@ class EstimatorSettings(Struct, frozen=True):
         for name, value in structs.asdict(TUNING).items():
             record[name] = value
         record["dim"] = self.dim
+        root = sqrt(0.5 * TUNING.place_limit)  # the mean of the lower of χ² with one degree of freedom and the limit
+        record["place_limited_mean"] = (
+            erf(root) - 2.0 * root * exp(-root * root) / sqrt(pi) + 2.0 * root**2 * erfc(root)
+        )
         record["clock_rate_variance"] = (MAX_CLOCK_RATE * SPEED_OF_LIGHT_MPS) ** 2
         record["horizontal_k"], record["vertical_k"] = limits_of(self.integrity_risk)[:2]
         return record
@@ -367,6 +353,7 @@ SETTINGS_DTYPE: Final = np.dtype(
     [
         ("dim", np.int64),
         *((name, np.float64) for name in (*_NAMES, *Tuning.__struct_fields__)),
+        ("place_limited_mean", np.float64),
         ("clock_rate_variance", np.float64),
         ("horizontal_k", np.float64),  # how many standard deviations the risk of levels allows
         ("vertical_k", np.float64),

@@ -194,9 +194,6 @@ class Estimation:
             )
             return True
         age_s = (rx_ticks - self._course.started_ticks) * TICK_S
-        if self._course.is_open and age_s > TUNING.open_start_s and self._estimator.fits_settings:
-            self._course.open_range_errors = False
-            return True
         if self._estimator.rows.item(QUALITY, 2) > TUNING.sure_chi2:
             limit = TUNING.sure_chi2 if self._course.start_was_contradicted else TUNING.uncovered_chi2
             if self._estimator.fault_test > limit and (not self._course.is_open or age_s > TUNING.open_start_s):

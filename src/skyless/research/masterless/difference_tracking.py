@@ -264,9 +264,8 @@ class Start(Struct, frozen=True):
 def neighbourhood_m(anchors_m: Array) -> Array:
     """Opposite corners of the space around the anchors beyond which time differences say nothing, shape (2, 3)."""
     low, high = anchors_m.min(axis=0), anchors_m.max(axis=0)
-    diagonal_m = max(float(np.linalg.norm((high - low)[:2])), TUNING.least_diagonal_m)
-    reach = (TUNING.neighbourhood, TUNING.neighbourhood, TUNING.neighbourhood_height)
-    corners_m: Array = (low + high) / 2.0 + diagonal_m * np.outer((-1.0, 1.0), reach)
+    reach_m = TUNING.neighbourhood * np.linalg.norm((high - low)[:2])
+    corners_m: Array = (low + high) / 2.0 + np.outer((-reach_m, reach_m), np.ones(3))
     return corners_m
 
 
