@@ -184,8 +184,10 @@ class Tuning(Struct, frozen=True):
     """Time for which a start waits that is so wide, or that is contradicted: more anchors may come [s]."""
     start_tail: float = 1e-4
     """Probability with which residuals of a start are larger by chance than those that contradict it."""
-    open_start_s: float = 1.0
-    """A start with open range errors is not repeated within this time [s]."""
+    new_start_s: float = 1.0
+    """Time for which a start is new [s]: one with open range errors is not repeated within it …"""
+    early_nis: float = 2.0
+    """… and one with a mean NIS beyond this was wrong, as packets were late."""
     start_margin: float = 4.0
     """Factor on the start's covariance, as the filter is then given the packets that it rests on."""
     short_silence_s: float = 0.1

@@ -37,6 +37,8 @@ class _Course(Struct):
     """Whether the last start did."""
     start_was_contradicted: bool = False
     relays_may_contradict: bool = True
+    may_begin_again: bool = True
+    """Whether a start that fits badly from the beginning is given up: not twice in a row."""
     master_less_tag_ticks: int = 0
     started_ticks: int = 0
     newest_ticks: int = 0
@@ -163,8 +165,7 @@ class Estimation:
             return NoFixReason.RESIDUALS  # single packets are late: others will not be
         if self._superframe_s > TUNING.longest_superframe_s:
             return self._fix_of(start, observation)
-        self._begin(start, starting.packets())
-        return self._fix(observation)
+        return self._fix(observation) if self._begin(start, starting.packets()) else NoFixReason.ACQUIRING
 
     def update_height(self, height_m: float, std_m: float) -> bool:
         """Process the tag's height as a sensor measures it, at the newest packet; True if it was used.
@@ -194,9 +195,14 @@ class Estimation:
             )
             return True
         age_s = (rx_ticks - self._course.started_ticks) * TICK_S
+        if age_s >= TUNING.new_start_s:
+            self._course.may_begin_again = True
+        elif self._course.may_begin_again and self._estimator.rows.item(QUALITY, 0) > TUNING.early_nis:
+            self._course.may_begin_again = False  # if it does not help, all is noisier than stated
+            return True
         if self._estimator.rows.item(QUALITY, 2) > TUNING.sure_chi2:
             limit = TUNING.sure_chi2 if self._course.start_was_contradicted else TUNING.uncovered_chi2
-            if self._estimator.fault_test > limit and (not self._course.is_open or age_s > TUNING.open_start_s):
+            if self._estimator.fault_test > limit and (not self._course.is_open or age_s > TUNING.new_start_s):
                 self._course.open_range_errors = not self._estimator.is_late_often
                 return True
         if not self._course.relays_may_contradict:
@@ -227,31 +233,34 @@ class Estimation:
         position_m = self._estimator.state.x[: self._estimator.dim]
         return bool(std_m > self._max_relative_std * self._in_use.mean_range_m(position_m))
 
-    def _begin(self, start: Start, packets: list[Observation]) -> None:
-        """Begin at the start's position, and process the packets that led there."""
-        self._start = None
+    def _begin(self, start: Start, packets: list[Observation]) -> bool:
+        """Begin at the start's position, and process the packets that led there.
+
+        False where anchors that are late may have moved it by more than their distance: it says nothing then.
+        """
+        settings, dim = self._settings, self._estimator.dim
         if self._most_anchors is not None:
             kept = _nearest(start, self._most_anchors)
             packets = [packet for packet in packets if packet.anchor in kept]
-        self._course.newest_ticks = self._course.started_ticks = packets[-1].rx_ticks_tag
-        self._in_use.begin(start.used)
-        settings, dim, begin_ticks = self._settings, self._estimator.dim, packets[0].rx_ticks_tag
-        age_s = (start.rx_ticks_tag - begin_ticks) * TICK_S
         is_contradicted = start.is_contradicted and not self._estimator.is_late_often
-        self._course.is_open = self._course.open_range_errors or (is_contradicted and not start.misfitting)
-        self._course.start_was_contradicted = self._course.is_open or is_contradicted
+        is_open = self._course.open_range_errors or (is_contradicted and not start.misfitting)
         expected_m2 = settings.tx_variance_m2 + settings.rx_variance_m2 + _error_variance_m2(settings)
-        is_wide = self._course.start_was_contradicted
-        inflation = 1.0 + TUNING.late_std_m**2 / expected_m2 if is_wide else TUNING.start_margin
-        covariance = inflation * start.covariance[
-            :dim, :dim
-        ] + age_s**2 * self._settings.start_speed_std_mps**2 * np.eye(dim)
+        inflation = 1.0 + TUNING.late_std_m**2 / expected_m2 if is_open or is_contradicted else TUNING.start_margin
+        begin_ticks, speed_m2ps2 = packets[0].rx_ticks_tag, settings.start_speed_std_mps**2
+        age_s = (start.rx_ticks_tag - begin_ticks) * TICK_S
+        covariance = inflation * start.covariance[:dim, :dim] + age_s**2 * speed_m2ps2 * np.eye(dim)
+        self._in_use.begin(start.used)
+        if np.trace(covariance[:2, :2]) > self._in_use.mean_range_m(start.solution[:dim]) ** 2:
+            return False
+        self._start = None
+        self._course.newest_ticks = self._course.started_ticks = packets[-1].rx_ticks_tag
+        self._course.is_open, self._course.start_was_contradicted = is_open, is_open or is_contradicted
         self._estimator.start(
             begin_ticks,
             start.solution[:dim],
             covariance,
-            self._settings.start_speed_std_mps**2,
-            self._course.is_open,
+            speed_m2ps2,
+            is_open,
             TUNING.late_std_m if self._course.start_was_contradicted else TUNING.lasting_std_m,
             [
                 self._estimator.anchor_index(packet.anchor, packet.anchor_m, packet.anchor_std_m)
@@ -261,6 +270,7 @@ class Estimation:
         )
         for packet in packets:
             self._process(packet)
+        return True
 
     def _process(self, observation: Observation) -> int:
         return self._estimator.process(
