@@ -82,6 +82,7 @@ MECHANISMS: dict[str, dict[str, float]] = {
     "Start: open ones stay for a second": {"new_start_s": 0.0},
     "Start: the tag's oscillator warms up": {"start_walk_scale": 1.0},
     "Start: anchors may stand elsewhere if contradicted": {"open_survey_std_m": 1e-6},
+    "… and are repeated once errors fit": {"fitting_chi2": 0.0},
     "Start: no level after a contradicted one": {"max_open_level_std": OFF, "contradicted_start_s": 0.0},
     "Levels: mirror images": {"sides_chi2": 0.0},
     "Levels: wide positions": {"curved_std": OFF},
@@ -152,17 +153,18 @@ def starts(plan: Plan) -> list[Case]:
     wide = structs.replace(
         lab, anchors=tuple(structs.replace(one, x_m=5.0 * one.x_m, y_m=5.0 * one.y_m) for one in lab.anchors)
     )
-    late = partial(room.late_anchors, plan, 2, (0.5, 2.0), 0.0, np.inf)
+    late, soon = (partial(room.late_anchors, plan, 2, (0.5, 2.0), 0.0, until_s) for until_s in (np.inf, 1.0))
     some: dict[str, tuple[Site, Callable[..., Any], dict[str, Any]]] = {
         "start": (lab, wanderers, {"room": Room()}),
         "start, 2 late": (lab, wanderers, {"room": Room(), "biases": late}),
         "start, 80 % lost": (lab, wanderers, {"lost_at_tags": 0.8}),
         "start in a hall": (wide, wanderers, {}),
+        "late for 1 s": (lab, wanderers, {"room": Room(), "biases": soon, "warmup_s": 5.0, "seconds": 5.0}),
         "start at 5 m/s": (hall, partial(straight, speed_mps=5.0), {}),
         "start at 20 m/s": (hall, partial(straight, speed_mps=20.0), {}),
     }
     return [
-        Case(name, "starts", None, worlds(plan, site, partial(paths, site, plan.tags), warmup_s=0.0, **more))
+        Case(name, "starts", None, worlds(plan, site, partial(paths, site, plan.tags), **{"warmup_s": 0.0, **more}))
         for name, (site, paths, more) in some.items()
     ]
 
@@ -266,6 +268,8 @@ def _cell(on: np.ndarray, off: np.ndarray) -> str:
         parts.append(f"{100.0 * (off[0] / on[0] - 1.0):+.0f} % fixes")
     if off[2] / off[0] > max(1.5 * on[2] / on[0], 1.3):
         parts.append(f"(NEES {off[2] / off[0]:.1f})")
+    if off[3] / off[0] < on[3] / on[0] - 0.05:
+        parts.append(f"levels {100.0 * off[3] / off[0]:.0f} %")
     if off[4] > on[4]:
         parts.append(f"**{off[4] - on[4]:.0f} exceeded**")
     return " ".join(part for part in parts if part) or "·"

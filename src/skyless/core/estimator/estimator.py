@@ -645,6 +645,14 @@ class Estimator:
         return float(self._levels[FIRST_TEST:].max())
 
     @property
+    def fits_settings(self) -> bool:
+        """Whether the constants of the ranges are as small as the settings state, as far as they are known."""
+        s, count = self._state, len(self._state.anchors)
+        constants = slice((first := layout(self.dim, count).constant), first + count)
+        variances = s.P[constants, constants] + self.settings.range_std_m**2 * np.eye(count)
+        return bool(s.x[constants] @ np.linalg.solve(variances, s.x[constants]) < TUNING.fitting_chi2 * count)
+
+    @property
     def multipath_m(self) -> tuple[float, float] | None:
         """How far range errors change, and over which distance walked, where that is more than the settings state."""
         status = self._state.status[0]

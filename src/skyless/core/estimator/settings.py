@@ -181,7 +181,7 @@ class Tuning(Struct, frozen=True):
     """Part of the mean range beyond which ranges are curved within a standard deviation: updates would make the filter
     sure of a wrong position. It has no level, and is not predicted further."""
     start_patience_s: float = 0.5
-    """Time for which a start waits that is so wide, or that is contradicted: more anchors may come [s]."""
+    """Time for which a start waits that is wide or contradicted: more anchors may come [s]."""
     start_tail: float = 1e-4
     """Probability with which residuals of a start are larger by chance than those that contradict it."""
     new_start_s: float = 1.0
@@ -206,6 +206,8 @@ class Tuning(Struct, frozen=True):
     """Number of heights in a row that do not fit, after which the position is wrong."""
     open_survey_std_m: float = 0.15
     """Standard deviation of each coordinate of an anchor after a start that was contradicted [m]."""
+    fitting_chi2: float = 2.0
+    """χ² for each anchor below which range errors are as the settings state them."""
     most_late: float = 2
     """Number of anchors that are late at the start at most: on the floor or behind metal one often is."""
     late_penalty: float = 2.0

@@ -200,6 +200,9 @@ class Estimation:
         elif self._course.may_begin_again and self._estimator.rows.item(QUALITY, 0) > TUNING.early_nis:
             self._course.may_begin_again = False  # if it does not help, all is noisier than stated
             return True
+        if self._course.is_open and age_s > TUNING.new_start_s and self._estimator.fits_settings:
+            self._course.open_range_errors = False
+            return True
         if self._estimator.rows.item(QUALITY, 2) > TUNING.sure_chi2:
             limit = TUNING.sure_chi2 if self._course.start_was_contradicted else TUNING.uncovered_chi2
             if self._estimator.fault_test > limit and (not self._course.is_open or age_s > TUNING.new_start_s):
