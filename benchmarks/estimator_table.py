@@ -84,7 +84,7 @@ MECHANISMS: dict[str, dict[str, float]] = {
     "Start: anchors may stand elsewhere if contradicted": {"open_survey_std_m": 1e-6},
     "… and are repeated once errors fit": {"fitting_chi2": 0.0},
     "Start: no level after a contradicted one": {"max_open_level_std": OFF, "contradicted_start_s": 0.0},
-    "Levels: mirror images": {"sides_chi2": 0.0},
+    "Levels: mirror images": {"sensor_valid_s": OFF},
     "Levels: wide positions": {"curved_std": OFF},
 }
 """Each mechanism, and the constants by which it does nothing: fields of ``Tuning``, or names in a module."""

@@ -95,7 +95,7 @@ def test_superframes_of_seconds_are_silences():
     assert max(one.fix.std_m for one in judged) < 1.0
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [2, 3, 21])
 def test_a_start_is_not_sure_of_a_wrong_place(seed):
     """A wide start drawn tight by ranges that are not linear was off by up to 57 m while it said 0.4 m.
 

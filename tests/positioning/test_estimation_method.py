@@ -118,6 +118,19 @@ def test_starts_from_packets_that_contradict_each_other_are_honest(late_anchors)
     assert np.sqrt(np.mean(squares)) < (0.1 if late_anchors == 1 else 0.5)
 
 
+@pytest.mark.parametrize("seed", [2, 3, 4, 5])
+def test_an_open_start_is_repeated_once_its_errors_fit(seed):
+    """Three anchors are late when the tag is switched on, and right again half a second later."""
+    episode, errors = episode_of(Case(qa=0.3), 250, seed), {"range_std_m": 0.03, "survey_std_m": 0.02}
+    packets = episode.packets
+    for anchor, late_m in ((0, 1.0), (2, 1.6), (3, 0.7)):
+        packets = late_from(packets, anchor, late_m, 0, 200)
+    method = Estimation(settings_of(Case(qa=0.3), **errors))
+    fixes = list(fixes_of(method, observations_of(packets), episode.path_m))
+    assert all(fix.hpl_m is None for _, fix, _ in fixes[:200])
+    assert all(fix.hpl_m is not None and np.hypot(*error[:2]) < fix.hpl_m for _, fix, error in fixes[-300:])
+
+
 def neighbours_only(observation, n):
     """An anchor that receives only those beside it."""
     near = {(observation.anchor + 1) % n, (observation.anchor - 1) % n}
