@@ -187,7 +187,7 @@ class Tuning(Struct, frozen=True):
     new_start_s: float = 1.0
     """Time for which a start is new [s]: one with open range errors is not repeated within it …"""
     early_nis: float = 2.0
-    """… and one with a mean NIS beyond this was wrong, as packets were late."""
+    """… and one whose mean NIS exceeds this is given up, once: it was wrong, for example by packets that were late."""
     start_margin: float = 4.0
     """Factor on the start's covariance, as the filter is then given the packets that it rests on."""
     short_silence_s: float = 0.1
