@@ -1,0 +1,89 @@
+"""Types of the functions that are also translated to C (``tools/python_to_c.py``): numbers, records and their arrays.
+
+A record is a ``ctypes`` structure, so it has the layout of the C structure of its name and both work on the same
+memory. Its fields are declared like those of a dataclass; arrays in it have fixed lengths:
+
+    @record
+    class Track(Record):
+        count: int
+        rx_ticks: Ticks
+        position_m: Annotated[Reals, 3]
+        P: Annotated[Matrix, STATES, STATES]
+        anchors: Annotated[Array[Anchor], MAX_ANCHORS]
+
+An element that is itself an array or a record is a reference: ``row = P[one]`` and ``a = anchors[index]`` copy nothing,
+``anchors[index] = anchors[other]`` copies. A new record is all zeros.
+"""
+
+import ctypes
+from typing import Annotated, Any, Final, Protocol, TypeVar, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+Value = TypeVar("Value")
+Made = TypeVar("Made", bound="Record")
+
+Ticks = Annotated[int, ctypes.c_int64]
+"""A whole number of 64 bits. A plain ``int`` has 32: counts and indices."""
+
+Byte = Annotated[int, ctypes.c_uint8]
+
+REAL: Final = ctypes.c_double
+"""What a ``float`` of a record is; C's ``real``."""
+
+_C_TYPES: Final[dict[object, Any]] = {int: ctypes.c_int32, bool: ctypes.c_bool, float: REAL}
+
+
+class Array(Protocol[Value]):
+    """Elements that follow each other in memory."""
+
+    def __getitem__(self, index: int, /) -> Value:
+        """The element, or a reference to it."""
+
+    def __setitem__(self, index: int, value: Value, /) -> None:
+        """Copy the value there."""
+
+    def __len__(self) -> int:
+        """How many there are; not for functions that are translated."""
+
+
+Reals = Array[float]
+Matrix = Array[Array[float]]
+Integers = Array[int]
+Bytes = Array[Byte]
+
+
+class Record(ctypes.Structure):
+    """Base of all records."""
+
+
+def record(made: type[Made]) -> type[Made]:
+    """Give a record the fields that its annotations declare."""
+    hints = get_type_hints(made, include_extras=True)
+    made._fields_ = [(name, _c_type(hint)) for name, hint in hints.items() if not name.startswith("_")]
+    return made
+
+
+def _c_type(hint: Any) -> Any:  # noqa: ANN401 - types have no type
+    if get_origin(hint) is not Annotated:
+        return _C_TYPES.get(hint, hint)
+    base, *extras = get_args(hint)
+    if isinstance(extras[0], type):
+        return extras[0]
+    element = base
+    for _ in extras:
+        element = get_args(element)[0]
+    found = _c_type(element)
+    for length in reversed(extras):
+        found *= length
+    return found
+
+
+def view(array: Any) -> NDArray[Any]:  # noqa: ANN401 - ctypes' arrays have no common type
+    """A record, or an array of numbers or records, as NumPy sees the same memory."""
+    element, shape = type(array), []
+    while issubclass(element, ctypes.Array):
+        shape.append(element._length_)
+        element = element._type_
+    return np.frombuffer(array, np.dtype(element)).reshape(shape)
