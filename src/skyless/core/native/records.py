@@ -82,7 +82,8 @@ def _c_type(hint: Any) -> Any:  # noqa: ANN401 - types have no type
 
 def view(array: Any) -> NDArray[Any]:  # noqa: ANN401 - ctypes' arrays have no common type
     """A record, or an array of numbers or records, as NumPy sees the same memory."""
-    element, shape = type(array), []
+    element: Any = type(array)
+    shape: list[int] = []
     while issubclass(element, ctypes.Array):
         shape.append(element._length_)
         element = element._type_
