@@ -12,133 +12,205 @@ a jump or in yᵀ·(M + I/σ_f²)⁻¹·y, which is χ² without faults; then th
 
 from typing import Final
 
-import numpy as np
-
 from skyless.core.constants import TICK_S
 from skyless.core.estimator.faults import fault_chi2, whiten
 from skyless.core.estimator.monitor import covariance_scale, is_warm
-from skyless.core.estimator.state import FAULT_KINDS, LASTING, EstimatorState
+from skyless.core.estimator.state import AXES, FAULT_KINDS, LASTING, State
 from skyless.core.integrity import CONTRADICTED, HPL, OBSTRUCTED, SOUND, UNAVAILABLE, VPL
-from skyless.core.kernels.arrays import Vector
-from skyless.core.kernels.compiled import step
+from skyless.core.native.arithmetic import hypot, sqrt, square
 
 FIRST_TEST: Final = 2
 """Where ``protect`` writes the tests of all kinds of faults, after ``HPL`` and ``VPL``."""
-LEVELS: Final = FIRST_TEST + FAULT_KINDS
 
 
-@step
-def protect(s: EstimatorState, levels: Vector) -> None:
+_SWEEPS: Final = 8
+"""Of Jacobi's rotations: each squares what is left off the diagonal."""
+
+
+def protect(s: State) -> None:
     """Write the levels in metres and the tests of faults."""
-    settings = s.settings[0]
-    dim, count = settings["dim"], len(s.anchors)
-    scale = covariance_scale(s)
+    settings, levels, scale = s.settings, s.levels, covariance_scale(s)
     levels[HPL] = levels[VPL] = 0.0
     for kind in range(FAULT_KINDS):
-        levels[FIRST_TEST + kind] = fault_chi2(s, kind, dim)
+        levels[FIRST_TEST + kind] = fault_chi2(s, kind, s.dim)
+        faults, x, y, z = s.work[s.count], s.work[s.count + 1], s.work[s.count + 2], s.work[s.count + 3]
         shift_x, shift_y, shift_z = 0.0, 0.0, 0.0
-        xx, xy, yy, zz = scale * s.P[0, 0], scale * s.P[0, 1], scale * s.P[1, 1], 0.0
-        for one in range(count):
-            fault, vx, vy = s.work[count, one], s.work[count + 1, one], s.work[count + 2, one]
-            shift_x += vx * fault
-            shift_y += vy * fault
-            xx += vx * vx
-            xy += vx * vy
-            yy += vy * vy
-            if dim == 3:
-                vz = s.work[count + 3, one]
-                shift_z += vz * fault
-                zz += vz * vz
-        largest = 0.5 * (xx + yy) + np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
-        levels[HPL] = max(levels[HPL], np.hypot(shift_x, shift_y) + settings["horizontal_k"] * np.sqrt(largest))
-        if dim == 3:
-            levels[VPL] = max(levels[VPL], abs(shift_z) + settings["vertical_k"] * np.sqrt(scale * s.P[2, 2] + zz))
+        xx, xy, yy, zz = scale * s.P[0][0], scale * s.P[0][1], scale * s.P[1][1], 0.0
+        for one in range(s.count):
+            shift_x += x[one] * faults[one]
+            shift_y += y[one] * faults[one]
+            xx += x[one] * x[one]
+            xy += x[one] * y[one]
+            yy += y[one] * y[one]
+            if s.dim == 3:
+                shift_z += z[one] * faults[one]
+                zz += z[one] * z[one]
+        largest = 0.5 * (xx + yy) + sqrt(0.25 * square(xx - yy) + xy * xy)
+        levels[HPL] = max(levels[HPL], hypot(shift_x, shift_y) + s.horizontal_k * sqrt(largest))
+        if s.dim == 3:
+            levels[VPL] = max(levels[VPL], abs(shift_z) + s.vertical_k * sqrt(scale * s.P[2][2] + zz))
     squared, up = 0.0, 0.0
-    for column in range(FAULT_KINDS * count, FAULT_KINDS * count + dim):
-        squared += s.V[column, 0] ** 2 + s.V[column, 1] ** 2
-        if dim == 3:
-            up += s.V[column, 2] ** 2
-    levels[HPL] += s.settings[0]["max_acceleration_mps2"] * np.sqrt(squared)
-    levels[VPL] += s.settings[0]["max_acceleration_mps2"] * np.sqrt(up)
+    for row in range(FAULT_KINDS * s.count, FAULT_KINDS * s.count + s.dim):
+        squared += square(s.V[row][0]) + square(s.V[row][1])
+        if s.dim == 3:
+            up += square(s.V[row][2])
+    levels[HPL] += settings.max_acceleration_mps2 * sqrt(squared)
+    levels[VPL] += settings.max_acceleration_mps2 * sqrt(up)
+
+
+def largest_test(s: State) -> float:
+    """The largest test of faults, χ² with as many degrees of freedom as there are anchors if there are none."""
+    largest = 0.0
+    for kind in range(FAULT_KINDS):
+        largest = max(largest, s.levels[FIRST_TEST + kind])
+    return largest
 
 
 # Whether the anchors determine on which side of them the tag is
 
 
-def fit_plane(s: EstimatorState) -> None:
+def fit_plane(s: State) -> None:
     """Find the plane of least squares through the anchors; where the height is given, the line on the floor plan."""
-    status, dim = s.status[0], int(s.settings[0]["dim"])
-    anchors_m = s.anchors["position_m"][:, :dim]
-    status["plane_normal"] = 0.0
-    if len(anchors_m) >= dim:
-        status["plane_m"][:dim] = anchors_m.mean(axis=0)
-        status["plane_normal"][:dim] = np.linalg.svd(anchors_m - status["plane_m"][:dim])[2][dim - 1]
+    status = s.status
+    for axis in range(AXES):
+        status.plane_normal[axis] = 0.0
+        status.plane_m[axis] = 0.0
+    if s.count < s.dim:
+        return
+    for anchor in range(s.count):
+        for axis in range(s.dim):
+            status.plane_m[axis] += s.anchors[anchor].position_m[axis] / s.count
+    for one in range(s.dim):
+        for other in range(s.dim):
+            s.work[one][other] = 0.0
+    for anchor in range(s.count):
+        position_m = s.anchors[anchor].position_m
+        for one in range(s.dim):
+            for other in range(s.dim):
+                s.work[one][other] += (position_m[one] - status.plane_m[one]) * (
+                    position_m[other] - status.plane_m[other]
+                )
+    _find_least_axis(s, s.dim)
 
 
-@step
-def is_side_open(s: EstimatorState) -> bool:
+def _find_least_axis(s: State, dim: int) -> None:
+    """Write the axis along which the symmetric matrix in ``work`` is smallest into the plane's normal (Jacobi 1846)."""
+    M, axes = s.work, AXES
+    for one in range(dim):
+        for other in range(dim):
+            M[axes + one][other] = 1.0 if one == other else 0.0
+    for _ in range(_SWEEPS):
+        for one in range(dim):
+            for other in range(one):
+                if M[one][other] != 0.0:
+                    _rotate(s, dim, one, other)
+    least = 0
+    for axis in range(dim):
+        if M[axis][axis] < M[least][least]:
+            least = axis
+    for axis in range(dim):
+        s.status.plane_normal[axis] = M[axes + axis][least]
+
+
+def _rotate(s: State, dim: int, one: int, other: int) -> None:
+    """Rotate two axes of the matrix in ``work`` so that their common element becomes zero."""
+    M = s.work
+    half = 0.5 * (M[other][other] - M[one][one]) / M[one][other]
+    tangent = (1.0 if half >= 0.0 else -1.0) / (abs(half) + sqrt(half * half + 1.0))
+    cosine = 1.0 / sqrt(tangent * tangent + 1.0)
+    sine = tangent * cosine
+    for row in range(AXES + dim):  # columns, and of the axes behind the matrix as well
+        if row < dim or row >= AXES:
+            kept = M[row][one]
+            M[row][one] = cosine * kept - sine * M[row][other]
+            M[row][other] = sine * kept + cosine * M[row][other]
+    for column in range(dim):
+        kept = M[one][column]
+        M[one][column] = cosine * kept - sine * M[other][column]
+        M[other][column] = sine * kept + cosine * M[other][column]
+    M[one][other] = M[other][one] = 0.0
+
+
+def is_side_open(s: State) -> bool:
     """Whether the tag and its mirror image behind the anchors' plane, or in 2-D their line, explain the ranges alike.
 
     Range errors make up for what the tag's clock and a shift of the image, by least squares, leave of the difference.
     Not where the image lies where the tag cannot be, nor while a sensor measures the height.
     """
-    status, settings, work, off_m, square = s.status[0], s.settings[0], s.work, 0.0, 0.0
-    normal, dim, count = status["plane_normal"], settings["dim"], len(s.anchors)
-    variance = settings["range_std_m"] ** 2 + settings["survey_std_m"] ** 2 + settings["rx_variance_m2"]
+    status, tuning, settings, dim = s.status, s.tuning, s.settings, s.dim
+    if (status.epoch_ticks - status.height_ticks) * TICK_S < tuning.sensor_valid_s:
+        return False
+    normal, off_m = status.plane_normal, 0.0
     for axis in range(dim):
-        off_m += normal[axis] * (s.x[axis] - status["plane_m"][axis])
-    probe_m = max(abs(off_m), settings["probe_m"]) * (1.0 if off_m > 0.0 else -1.0)
-    if count > dim:
-        for one in range(dim + 2):
-            for other in range(dim + 1):
-                work[one, other] = variance / (settings["shift_part"] * probe_m) ** 2 if one == other < dim else 0.0
-        for anchor in range(count):
-            tag_m = image_m = 0.0 if dim == 3 else (settings["height_m"] - s.anchors[anchor]["position_m"][2]) ** 2
-            for axis in range(dim):
-                foot_m = s.x[axis] - off_m * normal[axis] - s.anchors[anchor]["position_m"][axis]
-                work[dim + 2, axis] = foot_m - probe_m * normal[axis]
-                tag_m += (foot_m + probe_m * normal[axis]) ** 2
-                image_m += (foot_m - probe_m * normal[axis]) ** 2
-            apart_m, nearness, work[dim + 2, dim] = np.sqrt(image_m) - np.sqrt(tag_m), 1.0 / np.sqrt(image_m), 1.0
-            square += apart_m * apart_m
-            for one in range(dim + 1):
-                work[dim + 2, one] *= nearness if one < dim else 1.0
-                work[dim + 1, one] += work[dim + 2, one] * apart_m
-                for other in range(one + 1):
-                    work[one, other] += work[dim + 2, one] * work[dim + 2, other]
-        whiten(work, dim + 1, 1)
-        for one in range(dim + 1):
-            square -= work[dim + 1, one] ** 2
+        off_m += normal[axis] * (s.x[axis] - status.plane_m[axis])
     image_z_m = s.x[2] - 2.0 * off_m * normal[2]
-    is_possible = dim == 2 or settings["lowest_m"] <= image_z_m <= settings["highest_m"]
-    is_near = off_m * off_m * normal[2] ** 2 <= s.P[2, 2]
-    has_sensor = (status["epoch_ticks"] - status["height_ticks"]) * TICK_S < settings["sensor_valid_s"]
-    return bool(square < settings["apart_chi2"] * variance and not has_sensor and (is_possible or is_near))
+    is_near = off_m * off_m * square(normal[2]) <= s.P[2][2]
+    if dim == 3 and not (settings.lowest_m <= image_z_m <= settings.highest_m or is_near):
+        return False
+    variance = square(settings.range_std_m) + square(settings.survey_std_m) + settings.rx_variance_m2
+    return _left_by_image(s, off_m, variance) < tuning.apart_chi2 * variance
+
+
+def _left_by_image(s: State, off_m: float, variance: float) -> float:
+    """What the tag's clock and a shift of the image leave of the ranges' difference: the sum of squares [m²].
+
+    ``off_m``: from the plane to the tag; ``variance``: of a range.
+    """
+    settings, dim, normal, left = s.settings, s.dim, s.status.plane_normal, 0.0
+    if s.count <= dim:
+        return left
+    probe_m = max(abs(off_m), s.tuning.probe_m) * (1.0 if off_m > 0.0 else -1.0)
+    information, seen = s.work[dim + 1], s.work[dim + 2]
+    for one in range(dim + 2):
+        for other in range(dim + 1):
+            s.work[one][other] = 0.0
+    for one in range(dim):
+        s.work[one][one] = variance / square(s.tuning.shift_part * probe_m)
+    for anchor in range(s.count):
+        position_m = s.anchors[anchor].position_m
+        tag_m2 = 0.0 if dim == 3 else square(settings.height_m - position_m[2])
+        image_m2 = tag_m2
+        for axis in range(dim):
+            foot_m = s.x[axis] - off_m * normal[axis] - position_m[axis]
+            seen[axis] = foot_m - probe_m * normal[axis]
+            tag_m2 += square(foot_m + probe_m * normal[axis])
+            image_m2 += square(foot_m - probe_m * normal[axis])
+        apart_m, image_m = sqrt(image_m2) - sqrt(tag_m2), sqrt(image_m2)
+        for axis in range(dim):
+            seen[axis] /= image_m
+        seen[dim] = 1.0
+        left += apart_m * apart_m
+        for one in range(dim + 1):
+            information[one] += seen[one] * apart_m
+            for other in range(one + 1):
+                s.work[one][other] += seen[one] * seen[other]
+    whiten(s, dim + 1, 1)
+    for one in range(dim + 1):
+        left -= square(information[one])
+    return left
 
 
 # Whether a position can be relied on
 
 
-@step
-def integrity_state(s: EstimatorState, levels: Vector) -> int:
+def integrity_state(s: State) -> int:
     """Whether a position's levels can be relied on: ``SOUND``, ``OBSTRUCTED``, ``CONTRADICTED`` or ``UNAVAILABLE``."""
-    settings = s.settings[0]
-    count, status = len(s.anchors), s.status[0]
+    status, tuning = s.status, s.tuning
     state, range_m = SOUND, 0.0
-    for anchor in range(count):
-        range_m += s.anchors[anchor]["range_m"] / count
-        if s.anchors[anchor]["is_obstructed"] or s.anchors[anchor]["has_fault"]:
+    for anchor in range(s.count):
+        range_m += s.anchors[anchor].range_m / s.count
+        if s.anchors[anchor].is_obstructed or s.anchors[anchor].has_fault:
             state = OBSTRUCTED
-    was_contradicted = status["fault_std_m"][LASTING] > settings["lasting_std_m"]  # then none are selected
-    limit = settings["sure_chi2"] if was_contradicted else settings["uncovered_chi2"]
-    share = np.sqrt(s.P[0, 0] + s.P[1, 1]) / max(range_m, 1e-6)  # levels are of first order in it
-    if status["withholds_levels"] or levels[FIRST_TEST:].max() > limit:
+    was_contradicted = status.fault_std_m[LASTING] > tuning.lasting_std_m  # then none are selected
+    limit = tuning.sure_chi2 if was_contradicted else tuning.uncovered_chi2
+    share = sqrt(s.P[0][0] + s.P[1][1]) / max(range_m, 1e-6)  # levels are of first order in it
+    if status.withholds_levels or largest_test(s) > limit:
         state = CONTRADICTED
-    if was_contradicted and (status["epoch_ticks"] - status["start_ticks"]) * TICK_S < settings["contradicted_start_s"]:
+    if was_contradicted and (status.epoch_ticks - status.start_ticks) * TICK_S < tuning.contradicted_start_s:
         state = CONTRADICTED
-    if status["open_range_errors"] and share > settings["max_open_level_std"]:
+    if status.has_open_ranges and share > tuning.max_open_level_std:
         state = CONTRADICTED
-    is_new = count <= s.settings[0]["dim"] or not is_warm(s)
-    if is_new or share > settings["curved_std"] or is_side_open(s):
+    is_new = s.count <= s.dim or not is_warm(s)
+    if is_new or share > tuning.curved_std or is_side_open(s):
         state = UNAVAILABLE
     return state

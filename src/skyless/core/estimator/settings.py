@@ -1,17 +1,21 @@
 """What the estimator assumes: constants that are the same everywhere, and settings of a site and its tags."""
 
-from math import erf, erfc, exp, pi, sqrt
+from math import erf, erfc, exp, inf, isnan, nan, pi, sqrt
 from typing import Final
 
-import numpy as np
-from msgspec import Struct, structs
-
 from skyless.core.constants import SPEED_OF_LIGHT_MPS
-from skyless.core.integrity import RISK, limits_of
-from skyless.core.kernels.arrays import Records
+from skyless.core.integrity import RISK
+from skyless.core.native.records import Record, record
 
 
-class Tuning(Struct, frozen=True):
+def _mean_up_to(limit: float) -> float:
+    """Mean of the lower of χ² with one degree of freedom and a limit."""
+    root = sqrt(0.5 * limit)
+    return erf(root) - 2.0 * root * exp(-root * root) / sqrt(pi) + limit * erfc(root)
+
+
+@record
+class Tuning(Record):
     """Constants of the estimator, which are the same at every site; ``docs/estimator_table.md`` says what each buys.
 
     Normalised: over its standard deviation. A running mean's weight is that of the newest value.
@@ -131,6 +135,8 @@ class Tuning(Struct, frozen=True):
     """Length of a step [m]."""
     place_limit: float = 2.0
     """A comparison counts as this many times their mean at most, as jumps are not multipath."""
+    place_limited_mean: float = _mean_up_to(2.0)
+    """Mean of χ² with one degree of freedom where no value counts as more than that."""
     place_first: float = 20
     """Number of comparisons for which the stamps' noise stands beforehand."""
     place_samples: float = 100
@@ -255,15 +261,17 @@ class Tuning(Struct, frozen=True):
 
 
 TUNING: Final = Tuning()
-"""The constants in use. Kernels read them from the record of the settings."""
+"""The constants in use. Each state holds a copy."""
 
 
 MAX_CLOCK_RATE: Final = 50e-6  # two crystals of ±20 ppm, and margin
+CLOCK_RATE_VARIANCE: Final = (MAX_CLOCK_RATE * SPEED_OF_LIGHT_MPS) ** 2  # m²/s²
 # Standard deviation of the constant error of the range between two anchors, without that of their survey.
 PAIR_STD_M: Final = 0.02
 
 
-class EstimatorSettings(Struct, frozen=True):
+@record
+class EstimatorSettings(Record):
     """What the filter assumes; standard deviations are one sigma."""
 
     qa: float = 0.5
@@ -279,12 +287,12 @@ class EstimatorSettings(Struct, frozen=True):
     """Variances of one stamp each."""
     gate: float = 4.0
     """Innovations beyond this number of standard deviations are not used."""
-    height_m: float | None = None
-    """Height of the tag where it is given; None to estimate it."""
+    height_m: float = nan
+    """Height of the tag where it is given; NaN to estimate it."""
     height_std_m: float = 0.0
     """Standard deviation of the given height."""
-    lowest_m: float = -np.inf
-    highest_m: float = np.inf
+    lowest_m: float = -inf
+    highest_m: float = inf
     """Bounds of the tag's height."""
     drop_s: float = 2.0
     """Anchors that are silent for longer leave the state."""
@@ -312,7 +320,7 @@ class EstimatorSettings(Struct, frozen=True):
     """Random walk of a barometer's zero, m²/s: 5 cm in ten seconds, as where doors and windows are opened."""
     least_change_std_m: float = 0.05
     """No changing part is estimated to be smaller."""
-    earliest_m: float = -np.inf
+    earliest_m: float = -inf
     """No changing part is below this: obstacles only lengthen ranges."""
     difference_std_m: float = 0.12
     """Standard deviation of each ready-made time difference."""
@@ -323,45 +331,10 @@ class EstimatorSettings(Struct, frozen=True):
     max_walk_scale: float = 1e4
     """Largest factor on ``walk`` where innovations show that oscillators wander more."""
     integrity_risk: float = RISK
-    alert_limit_m: float | None = None
+    alert_limit_m: float = inf
     """Fixes with a higher horizontal protection level have an alert."""
 
     @property
     def dim(self) -> int:
         """Dimensions of the position that are estimated."""
-        return 3 if self.height_m is None else 2
-
-    def record(self) -> Records:
-        """The settings for the kernels, shape (1,)."""
-        record = np.zeros(1, SETTINGS_DTYPE)
-        for name, value in structs.asdict(self).items():
-            if name in _NAMES:
-                record[name] = 0.0 if value is None else value
-        for name, value in structs.asdict(TUNING).items():
-            record[name] = value
-        record["dim"] = self.dim
-        root = sqrt(0.5 * TUNING.place_limit)  # the mean of the lower of χ² with one degree of freedom and the limit
-        record["place_limited_mean"] = (
-            erf(root) - 2.0 * root * exp(-root * root) / sqrt(pi) + 2.0 * root**2 * erfc(root)
-        )
-        record["clock_rate_variance"] = (MAX_CLOCK_RATE * SPEED_OF_LIGHT_MPS) ** 2
-        record["horizontal_k"], record["vertical_k"] = limits_of(self.integrity_risk)[:2]
-        return record
-
-
-_NAMES: Final = tuple(
-    name for name in EstimatorSettings.__struct_fields__ if name not in {"integrity_risk", "alert_limit_m"}
-)
-
-SETTINGS_DTYPE: Final = np.dtype(
-    [
-        ("dim", np.int64),
-        *((name, np.float64) for name in (*_NAMES, *Tuning.__struct_fields__)),
-        ("place_limited_mean", np.float64),
-        ("clock_rate_variance", np.float64),
-        ("horizontal_k", np.float64),  # how many standard deviations the risk of levels allows
-        ("vertical_k", np.float64),
-    ],
-    align=True,
-)
-"""``EstimatorSettings`` for the kernels."""
+        return 3 if isnan(self.height_m) else 2

@@ -1,9 +1,9 @@
-"""The estimator's state: what is estimated, data of each anchor, and how anchors join and leave.
+"""The estimator's state: one record of fixed capacity, and how anchors join and leave by moving blocks in it.
 
 The state vector, all clocks against the tag's own counter, in metres and m/s:
 
     values      position (dim), then for each anchor the offset of its clock: tag's reading − anchor's reading (its
-                whole ticks stand in ``ANCHOR_DTYPE``)
+                whole ticks stand in ``Anchor``)
     rates       velocity (dim), then the rate of each offset
     tx noises   of each anchor's newest TX stamp, which all who received it share
     changes     for each anchor the part of the tag's range error to it that changes as the tag moves
@@ -14,27 +14,43 @@ The state vector, all clocks against the tag's own counter, in metres and m/s:
     surveys     for each anchor (dim) its true position − its position in the almanac
 
 Range errors and surveys stand last because many a site calls them exact. What is exact has no variance and no
-covariance, so ``uncertain_states`` leaves it out of all arithmetic, until a jump or a fault shows otherwise.
+covariance, so it is left out of all arithmetic (``State.n``), until a jump or a fault shows otherwise. All that stands
+behind the states in use is zero.
 """
 
-from collections.abc import Mapping
-from typing import Final, NamedTuple, TypeVar
+from ctypes import sizeof
+from typing import Annotated, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from skyless.core.estimator.settings import TUNING, EstimatorSettings
-from skyless.core.kernels.arrays import Indices, Integers, Matrix, Records, Vector
-from skyless.core.kernels.compiled import jitted, step
+from skyless.core.estimator.settings import TUNING, EstimatorSettings, Tuning
+from skyless.core.fix import PROTECTED_ROWS
+from skyless.core.integrity import limits_of
+from skyless.core.native.arithmetic import square
+from skyless.core.native.records import Array, Count, Integers, Matrix, Reals, Record, Ticks, record
 
-# The state
-
-
-Scalar = TypeVar("Scalar", bound=np.generic)
-
-# Packets of each anchor that are kept for relays to come; divides the range of sequence numbers.
+MAX_ANCHORS: Final = 32
+"""Most anchors in the state."""
 PACKETS_KEPT: Final = 16
-LANES: Final = 8  # numbers in the longest vectors of processors
+"""Packets of each anchor that are kept for relays to come; divides the range of sequence numbers."""
+LANES: Final = 8
+"""Numbers in the longest vectors of processors."""
+
+AXES: Final = 3
+STATES: Final = 2 * (AXES + MAX_ANCHORS) + (3 + AXES) * MAX_ANCHORS + 2
+"""Capacity for states; a multiple of ``LANES``."""
+MOST_TERMS: Final = 2 * (AXES + 3) + 8
+"""Most terms of a measurement: a difference of two distances has the most."""
+
+LASTING, RECENT, CREEPING = range(3)
+"""Kinds of faults: there since an anchor joined, begun within its last packets, or growing for seconds."""
+FAULT_KINDS: Final = 3
+FAULTS: Final = FAULT_KINDS * MAX_ANCHORS
+EXTRA_ROWS: Final = 1 + 4 * AXES
+"""Rows of V for what planning adds."""
+SENSITIVITIES: Final = FAULTS + AXES + EXTRA_ROWS
+"""Capacity for rows of V."""
+WORK_ROWS: Final = MAX_ANCHORS + 1 + AXES
 
 NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS, ALL_RANGE_ERRORS = range(3)
 """Which range errors are not known to be zero: none, those that change, or all of them, and surveys."""
@@ -42,155 +58,172 @@ NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS, ALL_RANGE_ERRORS = range(3)
 NEVER: Final = -(1 << 62)
 """A time before all others."""
 
-ANCHOR_DTYPE: Final = np.dtype(
-    [
-        ("table_index", np.int64),
-        ("position_m", np.float64, (3,)),
-        ("tx_ticks", np.int64),  # newest packet, by its own clock
-        ("rx_ticks", np.int64),  # newest packet, by the tag's clock
-        ("offset_ticks", np.int64),  # whole ticks of the offset
-        ("range_m", np.float64),  # at its newest packet
-        ("held_m", np.float64, (3,)),  # the tag's position at which ranges to it are linearised
-        ("held_range_m", np.float64),  # distance of that point
-        ("walked_m", np.float64),  # the tag's walked distance at its newest packet
-        ("is_relayed", np.int64),  # whether others relay its packets
-        ("has_tx_noise", np.int64),  # whether its newest packet's TX noise is a state
-        ("packets", np.int64),
-        ("innovation", np.float64),  # its newest one, normalised
-        ("outliers_in_row", np.int64),
-        ("outlier_m", np.float64),  # the newest of them
-        ("is_obstructed", np.int64),  # whether its range error has jumped and not come back
-        ("change_mean", np.float64),  # running mean of its innovations since then, normalised
-        ("change_scale", np.float64),  # factor on the process noise of a range error that has jumped
-        ("has_fault", np.int64),  # whether a lasting fault of it was added to the state
-        ("relay_outliers_in_row", np.int64),
-        ("relay_mean", np.float64),  # running mean of what relays show of its clock, normalised
-        ("walk_scale", np.float64),  # factor on its oscillator's random walk
-        ("change_variance_m2", np.float64),  # of the part of its range error that changes as the tag moves
-        ("place_steps", np.int64),  # steps of the tag after which its range error was compared, in a row
-        ("place_walked_m", np.float64),  # the tag's walked distance at the newest of them
-        ("place_residual_m", np.float64, (2,)),  # what its reception left after the last two
-    ],
-    align=True,
-)
-"""What is kept of an anchor in addition to its states."""
-
-PACKET_DTYPE: Final = np.dtype([("sequence", np.int64), ("tx_ticks", np.int64), ("rx_ticks", np.int64)], align=True)
-"""A packet that others may relay."""
-
-LINK_DTYPE: Final = np.dtype(
-    [
-        ("tx_ticks", np.int64),  # newest packet of the sender whose reception by the listener was processed
-        ("constant_m", np.float64),  # estimated constant of the pair, in the row of the lower index
-        ("variance_m2", np.float64),  # variance of that
-        ("outliers_in_row", np.int64),
-        ("relays", np.int64),  # used in this direction
-        ("contradicts", np.int64),  # whether its range contradicts the survey
-    ],
-    align=True,
-)
-"""A pair of anchors, listener and sender."""
-
-LASTING, RECENT, CREEPING = range(3)
-"""Kinds of faults: there since an anchor joined, begun within its last packets, or growing for seconds."""
-FAULT_KINDS: Final = 3
-
-STATUS_DTYPE: Final = np.dtype(
-    [
-        ("epoch_ticks", np.int64),  # the tag's reading at the newest packet
-        ("start_ticks", np.int64),  # the tag's reading at the start
-        ("faded_ticks", np.int64),  # the tag's reading when faults that are not lasting last faded
-        ("outcome", np.int64),  # what became of it
-        ("packets", np.int64),
-        ("accepted", np.int64),
-        ("rejected", np.int64),
-        ("rejected_in_row", np.int64),
-        ("stale", np.int64),
-        ("stale_in_row", np.int64),
-        ("impossible", np.int64),
-        ("relays_used", np.int64),
-        ("relays_rejected", np.int64),
-        ("reports_used", np.int64),
-        ("reports_rejected", np.int64),
-        ("clock_restarts", np.int64),
-        ("obstructions", np.int64),
-        ("ends_of_obstructions", np.int64),
-        ("faults_opened", np.int64),
-        ("mean_nis", np.float64),
-        ("mean_square_m2", np.float64),  # of innovations
-        ("rejected_share", np.float64),
-        ("late_share", np.float64),
-        ("relays_lately_accepted", np.float64),  # running counts that fade
-        ("relays_lately_rejected", np.float64),
-        ("lag", np.float64, (3,)),  # running mean of innovations along each axis
-        ("lag_square", np.float64),
-        ("q_scale", np.float64),  # factor on qa
-        ("common_mean", np.float64),  # running mean of all innovations: the tag's own clock
-        ("walk_scale", np.float64),  # factor on its random walk
-        ("place_samples", np.int64),  # comparisons of range errors at places a step apart
-        ("place_square_m2", np.float64, (2,)),  # half their mean square after one and two steps
-        ("place_variance_m2", np.float64),  # of what multipath changes in them, 0 where not more than stated
-        ("place_distance_m", np.float64),  # distance over which multipath changes
-        ("obstruction", np.float64),  # 1 where range errors have jumped recently, 0 where they do not
-        ("walked_m", np.float64),
-        ("stationary_s", np.float64),  # since the tag last showed motion
-        ("stationary_m", np.float64, (3,)),  # where it was then
-        ("stationary_m2", np.float64, (3,)),  # variance of that on each axis
-        ("withholds_levels", np.int64),  # whether the anchors' positions are known to be wrong
-        ("height_ticks", np.int64),  # the tag's reading when a sensor's height was used last
-        ("plane_m", np.float64, (3,)),  # a point of the plane that lies closest to the anchors
-        ("plane_normal", np.float64, (3,)),  # normal of that plane
-        ("open_range_errors", np.int64),  # whether anchors join with range errors beyond those of the settings
-        ("range_errors", np.int64),  # NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS or ALL_RANGE_ERRORS
-        ("fault_std_m", np.float64, (FAULT_KINDS,)),  # of each kind of faults, beforehand
-    ],
-    align=True,
-)
-"""The estimator's counters and running means."""
+LEVELS: Final = 2 + FAULT_KINDS
+"""Numbers that ``levels.protect`` writes: ``HPL``, ``VPL``, and the tests of all kinds of faults."""
 
 
-class EstimatorState(NamedTuple):
-    """Everything that the kernels work on, for one tag with its anchors and n states (``Layout.room``)."""
+@record
+class Anchor(Record):
+    """What is kept of an anchor in addition to its states."""
 
-    x: Vector
-    """Shape (n,)."""
-    P: Matrix
-    """Shape (n, n), symmetric to the bit."""
-    V: Matrix
-    """What faults do to x, shape (FAULT_KINDS·anchors + dim, n): of each kind for each metre by which receptions of an
-    anchor are late, then for each m/s² of acceleration along an axis."""
-    information: Matrix
-    """Information of the innovations on all faults, shape (FAULT_KINDS·anchors, FAULT_KINDS·anchors)."""
-    evidence: Vector
-    """What innovations show of them, shape (FAULT_KINDS·anchors,)."""
-    anchors: Records
-    """``ANCHOR_DTYPE``, shape (anchors,)."""
-    packets: Records
-    """``PACKET_DTYPE``, shape (anchors, PACKETS_KEPT)."""
-    links: Records
-    """``LINK_DTYPE``, shape (anchors, anchors), listener and sender."""
-    status: Records
-    """``STATUS_DTYPE``, shape (1,)."""
-    settings: Records
-    """``SETTINGS_DTYPE``, shape (1,)."""
-    index_of: Integers
-    """Index among ``anchors`` of each anchor of the site's table, −1 for those that are not in the state."""
-    h: Vector
-    """The measurement at hand where it is not zero, at the indices in ``h_index``."""
-    h_index: Indices
-    ph: Vector
-    """P·h of the measurement at hand, shape (n,)."""
-    fault_input: Vector
-    """By how much each fault is in the present innovation, shape (2·anchors + dim,)."""
-    work: Matrix
-    """Scratch for systems of equations of all faults of one kind, shape (anchors + 1 + dim, anchors)."""
+    identifier: int
+    position_m: Annotated[Reals, AXES]
+    tx_ticks: Ticks
+    """Newest packet, by its own clock."""
+    rx_ticks: Ticks
+    """Newest packet, by the tag's clock."""
+    offset_ticks: Ticks
+    """Whole ticks of the offset."""
+    range_m: float
+    """At its newest packet."""
+    held_m: Annotated[Reals, AXES]
+    """The tag's position at which ranges to it are linearised."""
+    held_range_m: float
+    """Distance of that point."""
+    walked_m: float
+    """The tag's walked distance at its newest packet."""
+    is_relayed: bool
+    """Whether others relay its packets."""
+    has_tx_noise: bool
+    """Whether its newest packet's TX noise is a state."""
+    packets: Count
+    innovation: float
+    """Its newest one, normalised."""
+    outliers_in_row: int
+    outlier_m: float
+    """The newest of them."""
+    is_obstructed: bool
+    """Whether its range error has jumped and not come back."""
+    change_mean: float
+    """Running mean of its innovations since then, normalised."""
+    change_scale: float
+    """Factor on the process noise of a range error that has jumped."""
+    has_fault: bool
+    """Whether a lasting fault of it was added to the state."""
+    relay_outliers_in_row: int
+    relay_mean: float
+    """Running mean of what relays show of its clock, normalised."""
+    walk_scale: float
+    """Factor on its oscillator's random walk."""
+    change_variance_m2: float
+    """Of the part of its range error that changes as the tag moves."""
+    place_steps: int
+    """Steps of the tag after which its range error was compared, in a row."""
+    place_walked_m: float
+    """The tag's walked distance at the newest of them."""
+    place_residual_m: Annotated[Reals, 2]
+    """What its reception left after the last two."""
 
 
-class Layout(NamedTuple):
-    """Where the states of n anchors stand."""
+@record
+class KeptPacket(Record):
+    """A packet that others may relay."""
+
+    sequence: int
+    tx_ticks: Ticks
+    rx_ticks: Ticks
+
+
+@record
+class Link(Record):
+    """A pair of anchors, listener and sender."""
+
+    tx_ticks: Ticks
+    """Newest packet of the sender whose reception by the listener was processed."""
+    constant_m: float
+    """Estimated constant of the pair, in the row of the lower index."""
+    variance_m2: float
+    """Variance of that."""
+    outliers_in_row: int
+    relays: Count
+    """Used in this direction."""
+    contradicts: bool
+    """Whether its range contradicts the survey."""
+
+
+@record
+class Status(Record):
+    """The estimator's counters and running means."""
+
+    epoch_ticks: Ticks
+    """The tag's reading at the newest packet."""
+    start_ticks: Ticks
+    """The tag's reading at the start."""
+    faded_ticks: Ticks
+    """The tag's reading when faults that are not lasting last faded."""
+    outcome: int
+    """What became of it."""
+    packets: Count
+    accepted: Count
+    rejected: Count
+    rejected_in_row: int
+    stale: Count
+    stale_in_row: int
+    impossible: Count
+    relays_used: Count
+    relays_rejected: Count
+    reports_used: Count
+    reports_rejected: Count
+    clock_restarts: Count
+    obstructions: Count
+    ends_of_obstructions: Count
+    faults_opened: Count
+    mean_nis: float
+    mean_square_m2: float
+    """Of innovations."""
+    rejected_share: float
+    late_share: float
+    relays_lately_accepted: float
+    """Running counts that fade."""
+    relays_lately_rejected: float
+    lag: Annotated[Reals, AXES]
+    """Running mean of innovations along each axis."""
+    lag_square: float
+    q_scale: float
+    """Factor on qa."""
+    common_mean: float
+    """Running mean of all innovations: the tag's own clock."""
+    walk_scale: float
+    """Factor on its random walk."""
+    place_samples: int
+    """Comparisons of range errors at places a step apart."""
+    place_square_m2: Annotated[Reals, 2]
+    """Half their mean square after one and two steps."""
+    place_variance_m2: float
+    """Of what multipath changes in them, 0 where not more than stated."""
+    place_distance_m: float
+    """Distance over which multipath changes."""
+    obstruction: float
+    """1 where range errors have jumped recently, 0 where they do not."""
+    walked_m: float
+    stationary_s: float
+    """Since the tag last showed motion."""
+    stationary_m: Annotated[Reals, AXES]
+    """Where it was then."""
+    stationary_m2: Annotated[Reals, AXES]
+    """Variance of that on each axis."""
+    withholds_levels: bool
+    """Whether the anchors' positions are known to be wrong."""
+    height_ticks: Ticks
+    """The tag's reading when a sensor's height was used last."""
+    plane_m: Annotated[Reals, AXES]
+    """A point of the plane that lies closest to the anchors."""
+    plane_normal: Annotated[Reals, AXES]
+    """Normal of that plane."""
+    has_open_ranges: bool
+    """Whether anchors join with range errors beyond those of the settings."""
+    range_errors: int
+    """NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS or ALL_RANGE_ERRORS."""
+    fault_std_m: Annotated[Reals, FAULT_KINDS]
+    """Of each kind of faults, beforehand."""
+
+
+@record
+class Layout(Record):
+    """Where the states stand: the index of the first of each block."""
 
     offset: int
-    """Index of the first anchor's offset. The others' follow, as in all blocks."""
+    """Of the first anchor; the others' follow, as in all blocks."""
     velocity: int
     rate: int
     tx_noise: int
@@ -204,218 +237,293 @@ class Layout(NamedTuple):
     survey: int
     """``dim`` states for each anchor."""
     end: int
-    room: int
-    """Length of arrays of states: ``end`` up to a multiple of ``LANES``, so that rows fill whole vectors."""
 
 
-@jitted
-def layout(dim: int, anchors: int) -> Layout:
-    """Where what stands."""
-    values = dim + anchors
-    behind = 2 * values
-    slope = behind + 3 * anchors
-    height, zero = (slope + 1, slope) if dim == 2 else (2, slope + 1)
-    survey = slope + 2
-    end = survey + dim * anchors
-    return Layout(
-        dim, values, values + dim, behind, behind + anchors, behind + 2 * anchors, slope, height, zero, survey, end,
-        -(-end // LANES) * LANES,
-    )  # fmt: skip
+@record
+class State(Record):
+    """Everything that the estimator keeps of one tag."""
+
+    settings: EstimatorSettings
+    tuning: Tuning
+    horizontal_k: float
+    """How many standard deviations the risk of levels allows."""
+    vertical_k: float
+    dim: int
+    """Dimensions of the position: 2 where the height is given, else 3."""
+    count: int
+    """Anchors in the state."""
+    n: int
+    """States that are not known to be exact, up to a multiple of ``LANES``; covariances with all others are zero."""
+    rows: int
+    """Rows of V in use."""
+    layout: Layout
+    status: Status
+    x: Annotated[Reals, STATES]
+    P: Annotated[Matrix, STATES, STATES]
+    """Symmetric to the bit."""
+    V: Annotated[Matrix, SENSITIVITIES, STATES]
+    """What faults do to x: of each kind for each metre by which receptions of an anchor are late, then for each m/s² of
+    acceleration along an axis, then what planning adds."""
+    information: Annotated[Matrix, FAULTS, FAULTS]
+    """Information of the innovations on all faults."""
+    evidence: Annotated[Reals, FAULTS]
+    """What innovations show of them."""
+    anchors: Annotated[Array[Anchor], MAX_ANCHORS]
+    packets: Annotated[Array[Array[KeptPacket]], MAX_ANCHORS, PACKETS_KEPT]
+    links: Annotated[Array[Array[Link]], MAX_ANCHORS, MAX_ANCHORS]
+    """Of listener and sender."""
+    terms: int
+    """Terms of the measurement at hand, which stand in ``h``."""
+    h: Annotated[Reals, MOST_TERMS]
+    """The measurement where it is not zero, at the indices in ``h_index``."""
+    h_index: Annotated[Integers, MOST_TERMS]
+    ph: Annotated[Reals, STATES]
+    """P·h of the measurement at hand."""
+    fault_input: Annotated[Reals, SENSITIVITIES]
+    """By how much each fault is in the present innovation."""
+    work: Annotated[Matrix, WORK_ROWS, MAX_ANCHORS]
+    """Scratch for systems of equations of all faults of one kind."""
+    levels: Annotated[Reals, LEVELS]
+    fix: Annotated[Matrix, PROTECTED_ROWS, AXES]
+    """What a fix carries (``POSITION`` and the following)."""
 
 
-@jitted
-def direction_terms(dim: int) -> int:
-    """Terms of a distance: the position, the anchor's survey error and, in two dimensions, the height's error."""
-    return dim + 3
-
-
-def most_terms(dim: int) -> int:
-    """Most terms of a measurement: a difference of two distances has the most."""
-    return 2 * direction_terms(dim) + 8
-
-
-@step
-def uncertain_states(s: EstimatorState) -> int:
-    """How many states count: all that follow are exact, and their covariances with others are zero.
-
-    A multiple of ``LANES``.
-    """
-    where, range_errors = layout(s.settings[0]["dim"], len(s.anchors)), s.status[0]["range_errors"]
-    end = where.constant if range_errors == CHANGING_RANGE_ERRORS else where.change
-    end = where.end if range_errors == ALL_RANGE_ERRORS else end
-    return int(-(-end // LANES) * LANES)
-
-
-def _expected_range_errors(settings: Records, status: Records) -> int:
-    """Which of them there are from the beginning."""
-    names = ("survey_std_m", "range_std_m", "slope_std_m", "height_std_m")
-    if status["open_range_errors"] or any(settings[name] > 0.0 for name in names):
-        return ALL_RANGE_ERRORS
-    return CHANGING_RANGE_ERRORS if settings["place_std_m"] > 0.0 else NO_RANGE_ERRORS
-
-
-def new_state(settings: EstimatorSettings, table_size: int, *, open_range_errors: bool = False) -> EstimatorState:
-    """A state without anchors at the origin, for a table of that size; see ``Estimator.start``."""
-    dim = settings.dim
-    where = layout(dim, 0)
-    n = where.room
-    status = np.zeros(1, STATUS_DTYPE)
-    status["open_range_errors"] = open_range_errors
-    status["range_errors"] = _expected_range_errors(settings.record()[0], status[0])
-    status["q_scale"] = status["mean_nis"] = 1.0
-    status["height_ticks"] = NEVER
-    status["walk_scale"] = min(TUNING.start_walk_scale, settings.max_walk_scale)
-    status["fault_std_m"] = (TUNING.lasting_std_m, TUNING.recent_std_m, TUNING.creeping_std_m)
-    status["place_square_m2"] = settings.tx_variance_m2 + settings.rx_variance_m2
-    status["place_distance_m"] = settings.place_distance_m
-    status["mean_square_m2"] = settings.tx_variance_m2 + settings.rx_variance_m2
-    P = np.zeros((n, n))
-    P[where.slope, where.slope] = settings.slope_std_m**2
-    if dim == 2:
-        P[where.height, where.height] = settings.height_std_m**2
-    return EstimatorState(
-        x=np.zeros(n),
-        P=P,
-        V=np.zeros((dim, n)),
-        information=np.zeros((0, 0)),
-        evidence=np.zeros(0),
-        anchors=np.zeros(0, ANCHOR_DTYPE),
-        packets=np.zeros((0, PACKETS_KEPT), PACKET_DTYPE),
-        links=np.zeros((0, 0), LINK_DTYPE),
-        status=status,
-        settings=settings.record(),
-        index_of=np.full(table_size, -1, np.int64),
-        h=np.zeros(most_terms(dim)),
-        h_index=np.zeros(most_terms(dim), np.uint32),
-        ph=np.zeros(n),
-        fault_input=np.zeros(dim),
-        work=np.zeros((1 + dim, 0)),
-    )
-
-
-def with_anchor(
-    s: EstimatorState, table_index: int, position_m: Vector, is_open: bool = False, std_m: float | None = None
-) -> EstimatorState:
-    """The state with one more anchor, of whose clock and, if it is open, range error nothing is known.
-
-    ``std_m``: of each coordinate of this anchor; None for that of the settings.
-    """
-    settings, count = s.settings[0], len(s.anchors)
-    grown = _selected(s, [*range(count), -1])
-    dim, last = int(settings["dim"]), grown.anchors[count]
-    last["table_index"], last["position_m"] = table_index, position_m
-    last["tx_ticks"] = last["rx_ticks"] = NEVER
-    last["held_m"] = np.nan
-    last["walk_scale"] = 1.0
-    last["change_variance_m2"] = settings["place_std_m"] ** 2
-    grown.packets[count] = (NEVER, NEVER, NEVER)
-    pair_variance = 0.0
-    if settings["range_std_m"] > 0.0 or settings["survey_std_m"] > 0.0 or std_m:
-        pair_variance = TUNING.open_pair_std_m**2
-    for link in (grown.links[count], grown.links[:, count]):
-        link["tx_ticks"], link["variance_m2"] = NEVER, pair_variance
-    where = layout(dim, count + 1)
-    grown.P[where.change + count, where.change + count] = last["change_variance_m2"]
-    range_std_m, survey_std_m = settings["range_std_m"], settings["survey_std_m"] if std_m is None else std_m
-    if survey_std_m > 0.0:
-        s.status[0]["range_errors"] = ALL_RANGE_ERRORS
-    if is_open or s.status[0]["open_range_errors"]:
-        s.status[0]["range_errors"] = ALL_RANGE_ERRORS
-        range_std_m, survey_std_m = TUNING.late_std_m, TUNING.open_survey_std_m
-    grown.P[where.constant + count, where.constant + count] = range_std_m**2
-    survey = where.survey + dim * count
-    for axis in range(dim):
-        grown.P[survey + axis, survey + axis] = survey_std_m**2
-    grown.index_of[table_index] = count
-    return grown
-
-
-def without_anchor(s: EstimatorState, anchor: int) -> EstimatorState:
-    """The state without one of its anchors."""
-    return _selected(s, [index for index in range(len(s.anchors)) if index != anchor])
-
-
-def with_table(s: EstimatorState, table_size: int) -> EstimatorState:
-    """The same state for a longer table of anchors."""
-    index_of = np.full(table_size, -1, np.int64)
-    index_of[: len(s.index_of)] = s.index_of
-    return s._replace(index_of=index_of)
-
-
-KEPT_ARRAYS: Final = ("x", "P", "V", "information", "evidence", "anchors", "packets", "links", "status")
-"""Arrays that a state consists of; the others follow from the settings or are rewritten by each measurement."""
-
-
-def packed_state(s: EstimatorState) -> dict[str, bytes]:
-    """The arrays ``KEPT_ARRAYS`` as bytes."""
-    return {name: getattr(s, name).tobytes() for name in KEPT_ARRAYS}
-
-
-def unpacked_state(settings: EstimatorSettings, table_size: int, arrays: Mapping[str, bytes]) -> EstimatorState:
-    """The state whose arrays ``packed_state`` has turned into bytes, which may come from anywhere.
-
-    Kernels check no bounds: all arrays get the shapes that these settings and the number of anchors require, and what
-    is an index is checked. Any other numbers will do.
-
-    Raises:
-        ValueError: an array is missing or of another size, or an index is out of its range.
-    """
-    count = len(arrays.get("anchors", b"")) // ANCHOR_DTYPE.itemsize
-    if set(arrays) != set(KEPT_ARRAYS) or len(arrays["P"]) != 8 * layout(settings.dim, count).room ** 2:
-        raise ValueError("the estimator's arrays are incomplete, or of another number of anchors")
-    empty = _selected(new_state(settings, table_size), [-1] * count)
-    found = {name: np.frombuffer(arrays[name], getattr(empty, name).dtype) for name in KEPT_ARRAYS}
-    s = empty._replace(**{name: array.reshape(getattr(empty, name).shape).copy() for name, array in found.items()})
-    table_index = s.anchors["table_index"]
-    in_table = len(set(table_index.tolist()) & set(range(table_size))) == count
-    if not in_table or not NO_RANGE_ERRORS <= s.status["range_errors"][0] <= ALL_RANGE_ERRORS:
-        raise ValueError("an index of the estimator is out of its range")
-    s.index_of[table_index] = np.arange(count)
+def new_state(settings: EstimatorSettings, *, has_open_ranges: bool = False) -> State:
+    """A state without anchors at the origin; see ``Estimator.start``."""
+    s = State.from_buffer(np.zeros(sizeof(State), np.uint8).data)  # pages that are never used take no memory
+    s.settings, s.tuning = settings, TUNING
+    s.horizontal_k, s.vertical_k = limits_of(settings.integrity_risk)[:2]
+    s.dim = settings.dim
+    s.status.has_open_ranges = has_open_ranges
+    prepare(s)
     return s
 
 
-def _selected(s: EstimatorState, kept: list[int]) -> EstimatorState:
-    """The state with these of its anchors, in this order; −1 stands for a new one, all zeros."""
-    dim, old, new = int(s.settings[0]["dim"]), len(s.anchors), len(kept)
-    was = layout(dim, old)
-    states = list(range(dim))
-    states += [was.offset + anchor if anchor >= 0 else -1 for anchor in kept]
-    states += range(was.velocity, was.velocity + dim)
-    for block in (was.rate, was.tx_noise, was.change, was.constant):
-        states += [block + anchor if anchor >= 0 else -1 for anchor in kept]
-    states += range(was.slope, was.survey)
-    for anchor in kept:
-        first = was.survey + dim * anchor
-        states += [-1] * dim if anchor < 0 else range(first, first + dim)
-    states += [-1] * (layout(dim, new).room - len(states))
-    faults = [kind * old + anchor if anchor >= 0 else -1 for kind in range(FAULT_KINDS) for anchor in kept]
-    n, of_states = len(states), np.array(states)
-    of_anchors, of_faults = np.array(kept, np.int64), np.array(faults, np.int64)
-    inputs = np.append(of_faults, range(FAULT_KINDS * old, FAULT_KINDS * old + dim))
-    index_of = np.full_like(s.index_of, -1)
-    result = s._replace(
-        x=_select(s.x, of_states),
-        P=_select(s.P, of_states, of_states),
-        V=_select(s.V, inputs, of_states),
-        information=_select(s.information, of_faults, of_faults),
-        evidence=_select(s.evidence, of_faults),
-        anchors=_select(s.anchors, of_anchors),
-        packets=_select(s.packets, of_anchors),
-        links=_select(s.links, of_anchors, of_anchors),
-        index_of=index_of,
-        ph=np.zeros(n),
-        fault_input=np.zeros(len(inputs)),
-        work=np.zeros((new + 1 + dim, new)),
-    )
-    there = of_anchors >= 0
-    index_of[result.anchors["table_index"][there]] = np.flatnonzero(there)
-    return result
+def prepare(s: State) -> None:
+    """Initialise a state that is all zeros but for its settings and dimensions."""
+    status, settings, tuning = s.status, s.settings, s.tuning
+    stamps_m2 = settings.tx_variance_m2 + settings.rx_variance_m2
+    status.q_scale = status.mean_nis = 1.0
+    status.height_ticks = NEVER
+    status.walk_scale = min(tuning.start_walk_scale, settings.max_walk_scale)
+    status.fault_std_m[LASTING] = tuning.lasting_std_m
+    status.fault_std_m[RECENT] = tuning.recent_std_m
+    status.fault_std_m[CREEPING] = tuning.creeping_std_m
+    status.place_square_m2[0] = status.place_square_m2[1] = status.mean_square_m2 = stamps_m2
+    status.place_distance_m = settings.place_distance_m
+    if settings.place_std_m > 0.0:
+        status.range_errors = CHANGING_RANGE_ERRORS
+    stated = max(settings.survey_std_m, settings.range_std_m, settings.slope_std_m, settings.height_std_m)
+    if status.has_open_ranges or stated > 0.0:
+        status.range_errors = ALL_RANGE_ERRORS
+    set_layout(s)
+    s.P[s.layout.slope][s.layout.slope] = square(settings.slope_std_m)
+    if s.dim == 2:
+        s.P[s.layout.height][s.layout.height] = square(settings.height_std_m)
 
 
-def _select(source: NDArray[Scalar], *indices: Integers) -> NDArray[Scalar]:
-    """Rows (and columns) of an array; zeros for an index of −1."""
-    shape, axes = source.shape, len(indices)
-    with_zeros = np.zeros([length + 1 for length in shape[:axes]] + list(shape[axes:]), source.dtype)
-    with_zeros[tuple(slice(-1) for _ in indices)] = source  # the last ones, of index −1, are left
-    grid = [index.reshape([-1] + [1] * (axes - 1 - axis)) for axis, index in enumerate(indices)]
-    return with_zeros[tuple(grid)]
+def set_layout(s: State) -> None:
+    """Find where the states of so many anchors stand."""
+    where, count, dim = s.layout, s.count, s.dim
+    where.offset = dim
+    where.velocity = dim + count
+    where.rate = where.velocity + dim
+    where.tx_noise = where.rate + count
+    where.change = where.tx_noise + count
+    where.constant = where.change + count
+    where.slope = where.constant + count
+    where.height = where.slope + 1 if dim == 2 else 2
+    where.zero = where.slope if dim == 2 else where.slope + 1
+    where.survey = where.slope + 2
+    where.end = where.survey + dim * count
+    s.rows = FAULT_KINDS * count + dim
+    make_uncertain(s, s.status.range_errors)
+
+
+def make_uncertain(s: State, range_errors: int) -> None:
+    """From now on at least these range errors are not known to be zero; finds the number of uncertain states."""
+    s.status.range_errors = max(s.status.range_errors, range_errors)
+    end = s.layout.change
+    if s.status.range_errors == CHANGING_RANGE_ERRORS:
+        end = s.layout.constant
+    elif s.status.range_errors == ALL_RANGE_ERRORS:
+        end = s.layout.end
+    s.n = (end + LANES - 1) // LANES * LANES
+
+
+# Anchors join and leave
+
+
+def find_anchor(s: State, identifier: int) -> int:
+    """The index of an anchor in the state, or −1."""
+    for anchor in range(s.count):
+        if s.anchors[anchor].identifier == identifier:
+            return anchor
+    return -1
+
+
+def add_anchor(s: State, identifier: int, position_m: Reals, std_m: float, is_open: bool) -> int:
+    """Let an anchor join, of whose clock and, if it is open, range error nothing is known; its index.
+
+    ``std_m``: of each coordinate of this anchor; below 0 for that of the settings. There must be room.
+    """
+    settings, tuning, dim, anchor = s.settings, s.tuning, s.dim, s.count
+    where, a = s.layout, s.anchors[anchor]
+    for _ in range(dim):
+        _insert_state(s, where.end)
+    _insert_state(s, where.slope)  # behind the block of constants, and so on: from the last to the first
+    _insert_state(s, where.constant)
+    _insert_state(s, where.change)
+    _insert_state(s, where.tx_noise)
+    _insert_state(s, where.velocity)
+    for kind in range(FAULT_KINDS):
+        _insert_fault(s, (FAULT_KINDS - kind) * anchor, FAULT_KINDS * anchor + kind)
+    s.count += 1
+    set_layout(s)
+    s.anchors[anchor] = Anchor()
+    a.identifier = identifier
+    for axis in range(AXES):
+        a.position_m[axis] = position_m[axis]
+    a.tx_ticks = a.rx_ticks = NEVER
+    a.walk_scale = 1.0
+    a.change_variance_m2 = square(settings.place_std_m)
+    for kept in range(PACKETS_KEPT):
+        packet = s.packets[anchor][kept]
+        packet.sequence = -1
+        packet.tx_ticks = packet.rx_ticks = NEVER
+    has_errors = settings.range_std_m > 0.0 or settings.survey_std_m > 0.0 or std_m > 0.0
+    for other in range(s.count):
+        _clear_link(s.links[anchor][other], square(tuning.open_pair_std_m) if has_errors else 0.0)
+        _clear_link(s.links[other][anchor], square(tuning.open_pair_std_m) if has_errors else 0.0)
+    range_std_m, survey_std_m = settings.range_std_m, settings.survey_std_m if std_m < 0.0 else std_m
+    if is_open or s.status.has_open_ranges:
+        range_std_m, survey_std_m = tuning.late_std_m, tuning.open_survey_std_m
+    if survey_std_m > 0.0:
+        make_uncertain(s, ALL_RANGE_ERRORS)
+    s.P[where.change + anchor][where.change + anchor] = a.change_variance_m2
+    s.P[where.constant + anchor][where.constant + anchor] = square(range_std_m)
+    for axis in range(dim):
+        survey = where.survey + dim * anchor + axis
+        s.P[survey][survey] = square(survey_std_m)
+    return anchor
+
+
+def _clear_link(link: Link, variance_m2: float) -> None:
+    """Nothing has been relayed from one anchor to another yet."""
+    link.tx_ticks = NEVER
+    link.constant_m = 0.0
+    link.variance_m2 = variance_m2
+    link.outliers_in_row = 0
+    link.relays = 0
+    link.contradicts = False
+
+
+def remove_anchor(s: State, anchor: int) -> None:
+    """Let an anchor leave the state."""
+    where, dim, last = s.layout, s.dim, s.count - 1
+    for _ in range(dim):
+        _remove_state(s, where.survey + dim * anchor)
+    _remove_state(s, where.constant + anchor)
+    _remove_state(s, where.change + anchor)
+    _remove_state(s, where.tx_noise + anchor)
+    _remove_state(s, where.rate + anchor)
+    _remove_state(s, where.offset + anchor)
+    for kind in range(FAULT_KINDS):
+        _remove_fault(s, (FAULT_KINDS - 1 - kind) * s.count + anchor, FAULT_KINDS * s.count - kind)
+    for moved in range(anchor, last):
+        s.anchors[moved] = s.anchors[moved + 1]
+        for kept in range(PACKETS_KEPT):
+            s.packets[moved][kept] = s.packets[moved + 1][kept]
+        for other in range(s.count):
+            s.links[moved][other] = s.links[moved + 1][other]
+    for moved in range(anchor, last):
+        for other in range(last):
+            s.links[other][moved] = s.links[other][moved + 1]
+    s.count = last
+    set_layout(s)
+
+
+def _insert_state(s: State, index: int) -> None:
+    """Move all states from an index on one place back; the one that is there then is zero."""
+    end = s.layout.end
+    for state in range(end, index, -1):
+        s.x[state] = s.x[state - 1]
+        for other in range(end):
+            s.P[state][other] = s.P[state - 1][other]
+    s.x[index] = 0.0
+    for other in range(end):
+        s.P[index][other] = 0.0
+    for state in range(end + 1):
+        _insert(s.P[state], index, end)
+    for row in range(s.rows):
+        _insert(s.V[row], index, end)
+    s.layout.end = end + 1
+
+
+def _remove_state(s: State, index: int) -> None:
+    """Move all states behind an index one place forward."""
+    end = s.layout.end
+    for state in range(index, end - 1):
+        s.x[state] = s.x[state + 1]
+        for other in range(end):
+            s.P[state][other] = s.P[state + 1][other]
+    s.x[end - 1] = 0.0
+    for other in range(end):
+        s.P[end - 1][other] = 0.0
+    for state in range(end):
+        _remove(s.P[state], index, end)
+    for row in range(s.rows):
+        _remove(s.V[row], index, end)
+    s.layout.end = end - 1
+
+
+def _insert_fault(s: State, index: int, faults: int) -> None:
+    """Move all faults from an index on one place back; the one that is there then is zero."""
+    end = s.layout.end
+    for row in range(s.rows, index, -1):
+        for state in range(end):
+            s.V[row][state] = s.V[row - 1][state]
+    for state in range(end):
+        s.V[index][state] = 0.0
+    s.rows += 1
+    for row in range(faults, index, -1):
+        for other in range(faults):
+            s.information[row][other] = s.information[row - 1][other]
+    for other in range(faults):
+        s.information[index][other] = 0.0
+    for row in range(faults + 1):
+        _insert(s.information[row], index, faults)
+    _insert(s.evidence, index, faults)
+
+
+def _remove_fault(s: State, index: int, faults: int) -> None:
+    """Move all faults behind an index one place forward."""
+    end = s.layout.end
+    for row in range(index, s.rows - 1):
+        for state in range(end):
+            s.V[row][state] = s.V[row + 1][state]
+    for state in range(end):
+        s.V[s.rows - 1][state] = 0.0
+    s.rows -= 1
+    for row in range(index, faults - 1):
+        for other in range(faults):
+            s.information[row][other] = s.information[row + 1][other]
+    for other in range(faults):
+        s.information[faults - 1][other] = 0.0
+    for row in range(faults):
+        _remove(s.information[row], index, faults)
+    _remove(s.evidence, index, faults)
+
+
+def _insert(numbers: Reals, index: int, end: int) -> None:
+    """Move numbers from an index up to an end one place back."""
+    for place in range(end, index, -1):
+        numbers[place] = numbers[place - 1]
+    numbers[index] = 0.0
+
+
+def _remove(numbers: Reals, index: int, end: int) -> None:
+    """Move numbers behind an index one place forward."""
+    for place in range(index, end - 1):
+        numbers[place] = numbers[place + 1]
+    numbers[end - 1] = 0.0

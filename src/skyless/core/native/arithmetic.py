@@ -4,7 +4,7 @@ from math import floor as _floor
 from math import sqrt
 from typing import Final
 
-__all__ = ["exp", "floor", "hypot", "log", "sqrt"]
+__all__ = ["exp", "floor", "hypot", "log", "sqrt", "square"]
 
 _LN_2_HIGH: Final = 0.6931471803691238
 """The leading bits of ln 2: products with small whole numbers are exact."""
@@ -60,3 +60,8 @@ def log(x: float) -> float:
 def hypot(x: float, y: float) -> float:
     """The length of a vector; for lengths in a site, whose squares are numbers."""
     return sqrt(x * x + y * y)
+
+
+def square(x: float) -> float:
+    """x²."""
+    return x * x

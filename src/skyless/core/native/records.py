@@ -16,7 +16,19 @@ An element that is itself an array or a record is a reference: ``row = P[one]`` 
 """
 
 import ctypes
-from typing import Annotated, Any, Final, Protocol, TypeVar, get_args, get_origin, get_type_hints
+from collections.abc import Iterator, Sequence
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Final,
+    Protocol,
+    Self,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +38,9 @@ Made = TypeVar("Made", bound="Record")
 
 Ticks = Annotated[int, ctypes.c_int64]
 """A whole number of 64 bits. A plain ``int`` has 32: counts and indices."""
+
+Count = Annotated[int, ctypes.c_int64]
+"""The same, for what grows for years."""
 
 Byte = Annotated[int, ctypes.c_uint8]
 
@@ -44,24 +59,60 @@ class Array(Protocol[Value]):
     def __setitem__(self, index: int, value: Value, /) -> None:
         """Copy the value there."""
 
-    def __len__(self) -> int:
-        """How many there are; not for functions that are translated."""
+    def __iter__(self) -> Iterator[Value]:
+        """All of them; not for functions that are translated."""
 
 
 Reals = Array[float]
 Matrix = Array[Array[float]]
 Integers = Array[int]
-Bytes = Array[Byte]
+Bytes = Sequence[Byte]
+"""Bytes that are only read."""
 
 
 class Record(ctypes.Structure):
     """Base of all records."""
 
+    _names_: ClassVar[tuple[str, ...]] = ()
+    _defaults_: ClassVar[dict[str, Any]] = {}
+
+    def __init__(self, **values: Any) -> None:  # noqa: ANN401 - of fields
+        """All fields are zero but those with a default or a value.
+
+        Raises:
+            TypeError: there is no field of a name.
+        """
+        super().__init__()
+        self._set(self._defaults_)
+        self._set(values)
+
+    def changed(self, **values: Any) -> Self:  # noqa: ANN401 - of fields
+        """A copy with other values in these fields.
+
+        Raises:
+            TypeError: there is no field of a name.
+        """
+        copy = type(self).from_buffer_copy(self)
+        copy._set(values)
+        return copy
+
+    def values(self) -> dict[str, Any]:
+        """Its fields by name."""
+        return {name: getattr(self, name) for name in self._names_}
+
+    def _set(self, values: dict[str, Any]) -> None:
+        for name, value in values.items():
+            if name not in self._names_:
+                raise TypeError(f"{type(self).__name__} has no field {name}")
+            setattr(self, name, value)
+
 
 def record(made: type[Made]) -> type[Made]:
-    """Give a record the fields that its annotations declare."""
+    """Give a record the fields that its annotations declare, with their defaults."""
     hints = get_type_hints(made, include_extras=True)
-    made._fields_ = [(name, _c_type(hint)) for name, hint in hints.items() if not name.startswith("_")]
+    made._names_ = tuple(name for name in hints if not name.startswith("_"))
+    made._defaults_ = {name: made.__dict__[name] for name in made._names_ if name in made.__dict__}
+    made._fields_ = [(name, _c_type(hints[name])) for name in made._names_]
     return made
 
 
@@ -88,3 +139,8 @@ def view(array: Any) -> NDArray[Any]:  # noqa: ANN401 - ctypes' arrays have no c
         shape.append(element._length_)
         element = element._type_
     return np.frombuffer(array, np.dtype(element)).reshape(shape)
+
+
+def records(made: type[Made], array: NDArray[np.void]) -> Array[Made]:
+    """The records of a NumPy array of their type, shape (n,), in the same memory."""
+    return (made * len(array)).from_buffer(array.data)

@@ -1,0 +1,388 @@
+"""What the estimator does with a packet, a ready-made difference or a height; and with many packets in one loop."""
+
+from typing import Annotated, Final
+
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.core.estimator.faults import fade_faults, open_faults
+from skyless.core.estimator.kalman import is_stationary, predict
+from skyless.core.estimator.levels import fit_plane, integrity_state, largest_test, protect
+from skyless.core.estimator.measurements import (
+    CLOCK_JUMPED,
+    USED,
+    difference,
+    first_reception,
+    height,
+    own_reception,
+    relay,
+    report,
+    zero_velocity,
+)
+from skyless.core.estimator.monitor import covariance_scale, update_stationary
+from skyless.core.estimator.state import (
+    AXES,
+    LEVELS,
+    MAX_ANCHORS,
+    PACKETS_KEPT,
+    State,
+    add_anchor,
+    find_anchor,
+    remove_anchor,
+)
+from skyless.core.fix import POSITION, PROTECTION, QUALITY, VELOCITY
+from skyless.core.integrity import HPL, STATE, VPL
+from skyless.core.native.records import Array, Bytes, Matrix, Reals, Record, Ticks, record
+from skyless.core.ticks import HALF_WRAP_TICKS, TICK_MASK
+
+REJECTED, ACCEPTED, JOINED, STALE, RESTARTED_CLOCK = range(5)
+"""What became of a packet; after the last its anchor joins again, and the packet is processed again."""
+
+MAX_RATE_MPS: Final = 100e-6 * SPEED_OF_LIGHT_MPS  # between two clocks that are still crystals
+MAX_RELAYS: Final = 32
+"""Most relays with a packet; 13 fit into a frame."""
+PACKED_BYTES: Final = 8
+"""Bytes of a relay in a frame: identifier (2), sequence number (1), stamp (5), the lowest first."""
+
+
+@record
+class Place(Record):
+    """An anchor and where it stands."""
+
+    anchor: int
+    """Identifier."""
+    position_m: Annotated[Reals, AXES]
+    std_m: float
+    """Standard deviation of each coordinate; below 0 for that of the settings."""
+    is_open: bool
+    """Whether it joins with range errors beyond those of the settings."""
+
+
+@record
+class Relay(Record):
+    """When the packet's anchor received another."""
+
+    anchor: int
+    """Identifier of that other."""
+    sequence: int
+    rx_ticks: Ticks
+    """Stamp of the packet's anchor, unwrapped."""
+
+
+@record
+class Packet(Record):
+    """A packet that the tag received; all stamps are unwrapped."""
+
+    place: Place
+    sequence: int
+    rx_ticks: Ticks
+    """The tag's stamp."""
+    tx_ticks: Ticks
+    """The anchor's own."""
+    variance_factor: float
+    """On the variance of the tag's reception."""
+    master: int
+    """Identifier of the anchor against whose clock this one reports its own; −1 where it reports nothing."""
+    subticks: Ticks
+    """The anchor's reading less the master's at the packet's TX stamp, modulo 2⁴⁸."""
+    report_variance_m2: float
+    relay_count: int
+    relays: Annotated[Array[Relay], MAX_RELAYS]
+
+
+# One packet
+
+
+def process(s: State, packet: Packet) -> int:
+    """Process a packet and what it relays; returns what became of it, and leaves ``levels`` and ``fix``."""
+    outcome = _process(s, packet)
+    s.status.outcome = outcome
+    fill_fix(s)
+    return outcome
+
+
+def process_frame(s: State, packet: Packet, packed: Bytes, packed_bytes: int) -> int:
+    """``process`` with more relays, as frames carry them."""
+    for begin in range(0, packed_bytes, PACKED_BYTES):
+        if packet.relay_count < MAX_RELAYS:
+            relayed = packet.relays[packet.relay_count]
+            relayed.anchor = packed[begin] | packed[begin + 1] << 8
+            relayed.sequence = packed[begin + 2]
+            stamp: Ticks = 0
+            for byte in range(PACKED_BYTES - 1, 2, -1):
+                stamp = stamp << 8 | packed[begin + byte]
+            least = packet.tx_ticks - HALF_WRAP_TICKS
+            relayed.rx_ticks = least + ((stamp - least) & TICK_MASK)
+            packet.relay_count += 1
+    return process(s, packet)
+
+
+def _process(s: State, packet: Packet) -> int:
+    """Process a packet; its anchor joins where it is not in the state."""
+    status, place = s.status, packet.place
+    if status.packets > 0 and packet.rx_ticks < status.epoch_ticks:
+        status.stale += 1
+        status.stale_in_row += 1
+        return STALE
+    _remove_silent(s, packet.rx_ticks)
+    anchor = _present(s, place)
+    if anchor < 0:
+        return REJECTED
+    outcome = _process_of(s, anchor, packet)
+    if outcome == RESTARTED_CLOCK:
+        status.clock_restarts += 1
+        remove_anchor(s, anchor)
+        anchor = _present(s, place)
+        outcome = _process_of(s, anchor, packet)
+    return outcome
+
+
+def _present(s: State, place: Place) -> int:
+    """The index of an anchor, which joins where it is not in the state, or has moved; −1 where there is no room."""
+    anchor, is_new = find_anchor(s, place.anchor), False
+    if anchor < 0 and s.count < MAX_ANCHORS:
+        anchor, is_new = add_anchor(s, place.anchor, place.position_m, place.std_m, place.is_open), True
+    if anchor >= 0:
+        for axis in range(AXES):
+            is_new = is_new or s.anchors[anchor].position_m[axis] != place.position_m[axis]
+            s.anchors[anchor].position_m[axis] = place.position_m[axis]
+    if is_new:
+        fit_plane(s)
+    return anchor
+
+
+def _remove_silent(s: State, rx_ticks: Ticks) -> None:
+    """Let anchors leave that have been silent for too long."""
+    for behind in range(s.count):
+        anchor = s.count - 1 - behind
+        a = s.anchors[anchor]
+        if a.packets > 0 and (rx_ticks - a.rx_ticks) * TICK_S > s.settings.drop_s:
+            remove_anchor(s, anchor)
+            fit_plane(s)
+
+
+def _process_of(s: State, anchor: int, packet: Packet) -> int:
+    """Process a packet of an anchor in the state."""
+    status, a, rx_ticks, tx_ticks = s.status, s.anchors[anchor], packet.rx_ticks, packet.tx_ticks
+    elapsed_s = (rx_ticks - status.epoch_ticks) * TICK_S
+    outcome = _admit(s, anchor, rx_ticks, tx_ticks)
+    if outcome in (REJECTED, RESTARTED_CLOCK):
+        return outcome
+    status.stale_in_row = 0
+    predict(s, rx_ticks)
+    fade_faults(s)
+    if outcome == JOINED:
+        first_reception(s, anchor, rx_ticks, tx_ticks)
+    else:
+        result = own_reception(s, anchor, rx_ticks, tx_ticks, packet.variance_factor)
+        if result == CLOCK_JUMPED:
+            return RESTARTED_CLOCK
+        outcome = ACCEPTED if result == USED else REJECTED
+    is_known = a.packets > 0
+    status.packets += 1
+    _keep_packet(s, anchor, packet)
+    if is_known:
+        status.relays_lately_accepted *= 1.0 - s.tuning.mean_gain
+        status.relays_lately_rejected *= 1.0 - s.tuning.mean_gain
+        for one in range(packet.relay_count):
+            _process_relay(s, anchor, packet.relays[one])
+        if packet.report_variance_m2 > 0.0 and packet.master >= 0:
+            master = find_anchor(s, packet.master)
+            if master >= 0 and master != anchor:
+                report(s, anchor, master, packet.subticks, packet.report_variance_m2)
+    _check_motion_and_faults(s, elapsed_s)
+    return outcome
+
+
+def _admit(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> int:
+    """``JOINED`` or ``ACCEPTED`` for a packet that can be processed; for others what becomes of them, counted."""
+    a, status = s.anchors[anchor], s.status
+    if a.packets == 0:
+        return JOINED
+    if tx_ticks == a.tx_ticks:
+        status.impossible += 1
+        return REJECTED
+    if _is_impossible(s, anchor, rx_ticks, tx_ticks):
+        a.outliers_in_row += 1
+        status.rejected_in_row += 1
+        if a.outliers_in_row >= s.tuning.in_row:
+            return RESTARTED_CLOCK
+        status.impossible += 1
+        return REJECTED
+    return ACCEPTED
+
+
+def _is_impossible(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> bool:
+    """Whether no clock can have gone from an anchor's newest packet to this one."""
+    a = s.anchors[anchor]
+    elapsed = rx_ticks - a.rx_ticks
+    change_m = abs(elapsed - (tx_ticks - a.tx_ticks)) * TICK_M
+    return change_m > s.tuning.restart_m + MAX_RATE_MPS * elapsed * TICK_S
+
+
+def _keep_packet(s: State, anchor: int, packet: Packet) -> None:
+    """Keep what later packets and relays of this one need."""
+    a, kept = s.anchors[anchor], s.packets[anchor][packet.sequence % PACKETS_KEPT]
+    a.packets += 1
+    a.tx_ticks = packet.tx_ticks
+    a.rx_ticks = packet.rx_ticks
+    a.walked_m = s.status.walked_m
+    kept.sequence = packet.sequence
+    kept.tx_ticks = packet.tx_ticks
+    kept.rx_ticks = packet.rx_ticks
+
+
+def _process_relay(s: State, listener: int, relayed: Relay) -> None:
+    """Process a relayed reception once, if the tag has received that very packet."""
+    sender = find_anchor(s, relayed.anchor)
+    if sender < 0 or sender == listener:
+        return
+    kept, link = s.packets[sender][relayed.sequence % PACKETS_KEPT], s.links[listener][sender]
+    is_young = (s.status.epoch_ticks - kept.rx_ticks) * TICK_S < s.settings.relay_age_s
+    if kept.sequence == relayed.sequence and kept.tx_ticks > link.tx_ticks and is_young:
+        link.tx_ticks = kept.tx_ticks
+        relay(s, listener, sender, kept.tx_ticks, kept.rx_ticks, relayed.rx_ticks)
+
+
+def _check_motion_and_faults(s: State, elapsed_s: float) -> None:
+    """Check whether the tag stands still and, once in a round of packets, for faults."""
+    if s.settings.stationary_s > 0.0:
+        update_stationary(s, elapsed_s)
+        if is_stationary(s):
+            zero_velocity(s)
+    if s.status.packets % s.count == 0:
+        open_faults(s)
+
+
+# What a fix carries
+
+
+def fill_fix(s: State) -> None:
+    """Write all that a fix carries."""
+    velocity, scale = s.layout.velocity, covariance_scale(s)
+    for one in range(s.dim):
+        s.fix[POSITION][one] = s.x[one]
+        s.fix[VELOCITY][one] = s.x[velocity + one]
+        for other in range(s.dim):
+            s.fix[POSITION + 1 + one][other] = scale * s.P[one][other]
+            s.fix[VELOCITY + 1 + one][other] = scale * s.P[velocity + one][velocity + other]
+    if s.dim == 2:
+        s.fix[POSITION][2] = s.settings.height_m
+    protect(s)
+    s.fix[QUALITY][0] = s.status.mean_nis
+    s.fix[QUALITY][1] = s.status.mean_square_m2
+    s.fix[QUALITY][2] = largest_test(s)
+    s.fix[PROTECTION][HPL] = s.levels[HPL]
+    s.fix[PROTECTION][VPL] = s.levels[VPL]
+    s.fix[PROTECTION][STATE] = integrity_state(s)
+
+
+# Ready-made differences and heights
+
+
+def process_difference(s: State, a: Place, b: Place, rx_ticks: Ticks, difference_m: float) -> int:
+    """Process a ready-made difference of ranges, to anchor b less to anchor a, and leave all that a fix carries."""
+    status = s.status
+    if rx_ticks < status.epoch_ticks:
+        status.stale += 1
+        status.stale_in_row += 1
+        return STALE
+    _remove_silent(s, rx_ticks)
+    if _present(s, a) < 0 or _present(s, b) < 0:
+        return REJECTED
+    near, far = find_anchor(s, a.anchor), find_anchor(s, b.anchor)
+    status.stale_in_row = 0
+    elapsed_s = (rx_ticks - status.epoch_ticks) * TICK_S
+    predict(s, rx_ticks)
+    fade_faults(s)
+    outcome = ACCEPTED if difference(s, near, far, rx_ticks, difference_m) == USED else REJECTED
+    status.packets += 1
+    _note_difference(s, near, rx_ticks)
+    _note_difference(s, far, rx_ticks)
+    _check_motion_and_faults(s, elapsed_s)
+    fill_fix(s)
+    return outcome
+
+
+def _note_difference(s: State, anchor: int, rx_ticks: Ticks) -> None:
+    """An anchor was used in a difference."""
+    a = s.anchors[anchor]
+    a.packets += 1
+    a.rx_ticks = rx_ticks
+    a.walked_m = s.status.walked_m
+
+
+def process_height(s: State, height_m: float, std_m: float, is_barometer: bool) -> int:
+    """Process a sensor's height of the tag, and leave all that a fix carries."""
+    outcome = ACCEPTED if height(s, height_m, std_m, is_barometer) == USED else REJECTED
+    fill_fix(s)
+    return outcome
+
+
+# Many packets in one loop
+
+
+@record
+class BatchPacket(Record):
+    """A packet of a batch."""
+
+    place: int
+    """Row of its anchor in the table of places."""
+    sequence: int
+    rx_ticks: Ticks
+    tx_ticks: Ticks
+    end: int
+    """Where its relays end in their table; they begin where those of the packet before end."""
+
+
+@record
+class BatchRow(Record):
+    """The state after a packet of a batch."""
+
+    position_m: Annotated[Reals, AXES]
+    velocity_mps: Annotated[Reals, AXES]
+    covariance_m2: Annotated[Matrix, AXES, AXES]
+    levels: Annotated[Reals, LEVELS]
+    """As ``protect`` writes them, where they are asked for."""
+    integrity: int
+    outcome: int
+
+
+def track(
+    s: State,
+    places: Array[Place],
+    packets: Array[BatchPacket],
+    relays: Array[Relay],
+    rows: Array[BatchRow],
+    count: int,
+    has_levels: bool,
+) -> None:
+    """Process many packets, and write a row for each."""
+    packet = Packet()
+    packet.variance_factor = 1.0
+    packet.master = -1
+    begin = 0
+    for one in range(count):
+        given = packets[one]
+        packet.place = places[given.place]
+        packet.sequence = given.sequence
+        packet.rx_ticks = given.rx_ticks
+        packet.tx_ticks = given.tx_ticks
+        packet.relay_count = min(given.end - begin, MAX_RELAYS)
+        for place in range(packet.relay_count):
+            packet.relays[place] = relays[begin + place]
+        begin = given.end
+        rows[one].outcome = _process(s, packet)
+        _fill_row(s, rows[one], has_levels)
+
+
+def _fill_row(s: State, row: BatchRow, has_levels: bool) -> None:
+    """Write a row of a batch."""
+    for one in range(s.dim):
+        row.position_m[one] = s.x[one]
+        row.velocity_mps[one] = s.x[s.layout.velocity + one]
+        for other in range(s.dim):
+            row.covariance_m2[one][other] = s.P[one][other]
+    if has_levels:
+        protect(s)
+        for level in range(LEVELS):
+            row.levels[level] = s.levels[level]
+        row.integrity = integrity_state(s)

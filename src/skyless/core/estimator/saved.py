@@ -1,0 +1,73 @@
+"""The estimator's state as bytes of a version, and back."""
+
+from struct import Struct as Format
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyless.core.estimator.settings import EstimatorSettings
+from skyless.core.estimator.state import (
+    ALL_RANGE_ERRORS,
+    FAULT_KINDS,
+    MAX_ANCHORS,
+    NO_RANGE_ERRORS,
+    State,
+    new_state,
+    set_layout,
+)
+from skyless.core.native.records import view
+
+VERSION: Final = 1
+"""Changes with the fields of ``State`` and of the records in it."""
+_HEAD: Final = Format("<HBB")
+"""Version, dimensions, anchors."""
+
+
+def packed_state(s: State) -> bytes:
+    """A state as bytes: a head, then what is in use of each array."""
+    return _HEAD.pack(VERSION, s.dim, s.count) + b"".join(part.tobytes() for part in _parts(s))
+
+
+def unpacked_state(settings: EstimatorSettings, packed: bytes) -> State:
+    """The state that ``packed_state`` has turned into bytes, which may come from anywhere.
+
+    What the estimator uses as an index is checked or found anew. Any other numbers will do.
+
+    Raises:
+        ValueError: the bytes are of another version, other settings or another length, or hold an anchor twice.
+    """
+    if len(packed) < _HEAD.size or _HEAD.unpack_from(packed)[:2] != (VERSION, settings.dim):
+        raise ValueError("the estimator's state is of another version or of other settings")
+    s, place = new_state(settings), _HEAD.size
+    s.count = _HEAD.unpack_from(packed)[2]
+    if s.count > MAX_ANCHORS:
+        raise ValueError(f"the estimator's state has {s.count} anchors; it can have {MAX_ANCHORS}")
+    set_layout(s)
+    for part in _parts(s):
+        values = np.frombuffer(packed[place : place + part.nbytes].ljust(part.nbytes, b"\0"), part.dtype)
+        part[...] = values.reshape(part.shape)
+        place += part.nbytes
+    identifiers = {s.anchors[anchor].identifier for anchor in range(s.count)}
+    if place != len(packed) or len(identifiers) != s.count:
+        raise ValueError("the estimator's state is incomplete or holds an anchor twice")
+    if not NO_RANGE_ERRORS <= s.status.range_errors <= ALL_RANGE_ERRORS:
+        raise ValueError("the estimator's state has range errors of no kind")
+    set_layout(s)
+    return s
+
+
+def _parts(s: State) -> list[NDArray[Any]]:
+    """What is in use of the arrays of a state, and its counters."""
+    n, count, faults = s.layout.end, s.count, FAULT_KINDS * s.count
+    return [
+        view(s.status),
+        view(s.x)[:n],
+        view(s.P)[:n, :n],
+        view(s.V)[: faults + s.dim, :n],
+        view(s.information)[:faults, :faults],
+        view(s.evidence)[:faults],
+        view(s.anchors)[:count],
+        view(s.packets)[:count],
+        view(s.links)[:count, :count],
+    ]
