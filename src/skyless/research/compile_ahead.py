@@ -2,8 +2,6 @@
 
 from math import dist
 
-from msgspec import structs
-
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Relay
 from skyless.core.constants import TICK_M
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS
@@ -27,7 +25,7 @@ def compile_kernels(method: str = DEFAULT_METHOD) -> None:
 def compile_pair_kernels() -> None:
     """Start a filter of pair differences and run it on some measurements."""
     anchors_m = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in lab_site().anchors}
-    tracking = DifferenceTracking(structs.replace(DIFFERENCES, height_m=0.0), anchors_m)
+    tracking = DifferenceTracking(DIFFERENCES.changed(height_m=0.0), anchors_m)
     tag_m = (2.0, 3.0, 0.0)
     for k in range(24):
         a, b = 1 + k % 6, 1 + (k + 1) % 6
@@ -38,7 +36,7 @@ def compile_packet_kernels() -> None:
     """Start ``joint`` on packets of anchors whose clocks agree, each of which received the one before it."""
     anchors_m = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in lab_site().anchors}
     names = list(anchors_m)
-    tracking = PacketTracking(structs.replace(MASTERLESS, height_m=0.0), anchors_m)
+    tracking = PacketTracking(MASTERLESS.changed(height_m=0.0), anchors_m)
     heard: tuple[Relay, ...] = ()
     for k in range(4 * len(names)):
         anchor, follower = names[k % len(names)], names[(k + 1) % len(names)]

@@ -141,9 +141,10 @@ class Estimator:
         place.position_m[0], place.position_m[1], place.position_m[2] = map(float, position_m)
         self._known[anchor] = position_m, place
 
-    def knows_anchor(self, anchor: int) -> bool:
-        """Whether an anchor's position is known."""
-        return anchor in self._known
+    @property
+    def known_anchors(self) -> tuple[int, ...]:
+        """Identifiers of all anchors that it knows."""
+        return tuple(self._known)
 
     def has_anchor(self, anchor: int) -> bool:
         """Whether an anchor is in the state."""

@@ -377,17 +377,23 @@ def _survey_pair(s: State, one: int, other: int) -> None:
 
 def _pair_range(s: State, one: int, other: int) -> None:
     """Process |a + δa − a' − δa'| + constant as two anchors measured it, unless it contradicts the survey."""
-    a, b, link, distance_m = s.anchors[one], s.anchors[other], _pair(s, one, other), _distance_m(s, one, other)
+    link = _pair(s, one, other)
     s.terms = 0
-    for axis in range(s.dim):
-        towards = (a.position_m[axis] - b.position_m[axis]) / distance_m
-        _add_term(s, s.layout.survey + s.dim * one + axis, towards)
-        _add_term(s, s.layout.survey + s.dim * other + axis, -towards)
+    add_pair_survey(s, one, other)
     innovation = link.constant_m - _h_dot_x(s, 0)
     innovation_variance = compute_ph(s) + square(s.settings.pair_std_m) + link.variance_m2
     link.contradicts = innovation * innovation > square(s.tuning.suspect) * innovation_variance
     if not link.contradicts:
         _use(s, innovation, innovation_variance)
+
+
+def add_pair_survey(s: State, one: int, other: int) -> None:
+    """The measurement holds what survey errors change in the distance of two anchors."""
+    a, b, distance_m = s.anchors[one], s.anchors[other], _distance_m(s, one, other)
+    for axis in range(s.dim):
+        towards = (a.position_m[axis] - b.position_m[axis]) / distance_m
+        _add_term(s, s.layout.survey + s.dim * one + axis, towards)
+        _add_term(s, s.layout.survey + s.dim * other + axis, -towards)
 
 
 # An anchor reports what its clock reads against the master's

@@ -331,8 +331,18 @@ class EstimatorSettings(Record):
     max_walk_scale: float = 1e4
     """Largest factor on ``walk`` where innovations show that oscillators wander more."""
     integrity_risk: float = RISK
-    alert_limit_m: float = inf
-    """Fixes with a higher horizontal protection level have an alert."""
+    alert_limit_m: float = nan
+    """Fixes with a higher horizontal protection level have an alert; NaN for none."""
+
+    @property
+    def known_height_m(self) -> float | None:
+        """The height where it is given."""
+        return None if isnan(self.height_m) else self.height_m
+
+    @property
+    def alert_limit(self) -> float | None:
+        """The alert limit [m] where there is one."""
+        return None if isnan(self.alert_limit_m) else self.alert_limit_m
 
     @property
     def dim(self) -> int:

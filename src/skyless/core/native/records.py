@@ -17,6 +17,7 @@ An element that is itself an array or a record is a reference: ``row = P[one]`` 
 
 import ctypes
 from collections.abc import Iterator, Sequence
+from math import nan
 from typing import (
     Annotated,
     Any,
@@ -77,7 +78,7 @@ class Record(ctypes.Structure):
     _defaults_: ClassVar[dict[str, Any]] = {}
 
     def __init__(self, **values: Any) -> None:  # noqa: ANN401 - of fields
-        """All fields are zero but those with a default or a value.
+        """All fields are zero but those with a default or a value; NaN for a number that is None.
 
         Raises:
             TypeError: there is no field of a name.
@@ -104,7 +105,7 @@ class Record(ctypes.Structure):
         for name, value in values.items():
             if name not in self._names_:
                 raise TypeError(f"{type(self).__name__} has no field {name}")
-            setattr(self, name, value)
+            setattr(self, name, nan if value is None else value)
 
 
 def record(made: type[Made]) -> type[Made]:

@@ -3,7 +3,6 @@
 from typing import Final
 
 from msgspec import Struct
-from msgspec.structs import replace
 
 from skyless.core.air.almanac import AccuracyPage, NoisePage
 from skyless.core.air.local_almanac import CommonPages, LocalAlmanacState
@@ -30,14 +29,13 @@ def new_method(options: MethodOptions, pages: CommonPages, period_ticks: int, ti
     """Make the method for a site of protocol 2 whose anchors have mean periods of at most this."""
     superframe_s = to_seconds(period_ticks)
     settings = estimator_settings(options.qa, pages.site.tag_height_m, pages.noise, pages.accuracy, superframe_s)
-    settings = replace(as_required(settings, options), drop_s=max(CELL_DROP_S, 4.0 * superframe_s))
+    settings = as_required(settings, options).changed(drop_s=max(CELL_DROP_S, 4.0 * superframe_s))
     return Estimation(settings, options.z_bounds_m, time, superframe_s, MAX_ANCHORS_IN_USE)
 
 
 def as_required(settings: EstimatorSettings, options: MethodOptions) -> EstimatorSettings:
     """The settings with what is required of the protection levels."""
-    return replace(
-        settings,
+    return settings.changed(
         max_acceleration_mps2=options.integrity.max_acceleration_mps2,
         integrity_risk=options.integrity.risk,
         alert_limit_m=options.integrity.alert_limit_m,

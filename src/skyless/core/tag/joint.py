@@ -4,10 +4,10 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from msgspec.structs import replace
 
 from skyless.core.constants import TICK_S
-from skyless.core.estimator.estimator import ACCEPTED, NO_REPORT, REJECTED, STALE, Estimator, Report, SavedEstimator
+from skyless.core.estimator.estimator import NO_REPORT, Estimator, Report, SavedEstimator
+from skyless.core.estimator.process import ACCEPTED, REJECTED, STALE
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.fix import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY, Fix, NoFixReason
 from skyless.core.integrity import UNAVAILABLE, IntegrityRequirement
@@ -70,11 +70,12 @@ class Estimation:
         ``most_anchors``: with which to begin, the nearest, and none that does not belong to the start; None: with all.
         """
         if z_bounds_m is not None:
-            settings = replace(settings, lowest_m=z_bounds_m[0], highest_m=z_bounds_m[1])
+            settings = settings.changed(lowest_m=z_bounds_m[0], highest_m=z_bounds_m[1])
         self._settings = settings
-        self._height_known = settings.height_m is not None
+        self._height_m = settings.known_height_m
+        self._height_known = settings.dim == 2
         self._requirement = IntegrityRequirement(
-            settings.integrity_risk, settings.alert_limit_m, settings.max_acceleration_mps2, settings.height_std_m
+            settings.integrity_risk, settings.alert_limit, settings.max_acceleration_mps2, settings.height_std_m
         )
         self._superframe_s = superframe_s
         self._most_anchors = most_anchors
@@ -123,8 +124,7 @@ class Estimation:
 
     def clock(self, anchor: int) -> tuple[int, float, float] | None:
         """The tag's clock less that of an anchor in the state: whole ticks, the rest in metres, rate in m/s."""
-        index = self._estimator.index_of.get(anchor)
-        return None if index is None else self._estimator.clock(index)
+        return self._estimator.clock(anchor)
 
     @property
     def excluded(self) -> tuple[int, ...]:
@@ -197,13 +197,13 @@ class Estimation:
         age_s = (rx_ticks - self._course.started_ticks) * TICK_S
         if age_s >= TUNING.new_start_s:
             self._course.may_begin_again = True
-        elif self._course.may_begin_again and self._estimator.rows.item(QUALITY, 0) > TUNING.early_nis:
+        elif self._course.may_begin_again and self._estimator.state.fix[QUALITY][0] > TUNING.early_nis:
             self._course.may_begin_again = False  # if it does not help, all is noisier than stated
             return True
         if self._course.is_open and age_s > TUNING.new_start_s and self._estimator.fits_settings:
             self._course.open_range_errors = False
             return True
-        if self._estimator.rows.item(QUALITY, 2) > TUNING.sure_chi2:
+        if self._estimator.state.fix[QUALITY][2] > TUNING.sure_chi2:
             limit = TUNING.sure_chi2 if self._course.start_was_contradicted else TUNING.uncovered_chi2
             if self._estimator.fault_test > limit and (not self._course.is_open or age_s > TUNING.new_start_s):
                 self._course.open_range_errors = not self._estimator.is_late_often
@@ -223,7 +223,7 @@ class Estimation:
         variance = settings.tx_variance_m2 + settings.rx_variance_m2
         errors = _error_variance_m2(settings)
         speed_mps = settings.start_speed_std_mps
-        return Acquisition(settings.height_m, variance, self._z_bounds_m, max_age_s, speed_mps, errors)
+        return Acquisition(self._height_m, variance, self._z_bounds_m, max_age_s, speed_mps, errors)
 
     def _is_out_of_reach(self, observation: Observation) -> bool:
         """Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back."""
@@ -233,8 +233,8 @@ class Estimation:
         if silent_s < TUNING.short_silence_s:
             return False
         std_m = self._estimator.horizontal_variance_m2(silent_s) ** 0.5
-        position_m = self._estimator.state.x[: self._estimator.dim]
-        return bool(std_m > self._max_relative_std * self._in_use.mean_range_m(position_m))
+        mean_range_m = self._in_use.mean_range_m(self._estimator.position_m())
+        return std_m > self._max_relative_std * mean_range_m
 
     def _begin(self, start: Start, packets: list[Observation]) -> bool:
         """Begin at the start's position, and process the packets that led there.
@@ -265,51 +265,38 @@ class Estimation:
             speed_m2ps2,
             is_open,
             TUNING.late_std_m if self._course.start_was_contradicted else TUNING.lasting_std_m,
-            [
-                self._estimator.anchor_index(packet.anchor, packet.anchor_m, packet.anchor_std_m)
-                for packet in packets
-                if is_contradicted and packet.anchor in start.misfitting
-            ],
+            start.misfitting if is_contradicted else (),
         )
         for packet in packets:
             self._process(packet)
         return True
 
     def _process(self, observation: Observation) -> int:
-        return self._estimator.process(
-            self._estimator.anchor_index(observation.anchor, observation.anchor_m, observation.anchor_std_m),
+        estimator, relays = self._estimator, observation.relays
+        estimator.know_anchor(observation.anchor, observation.anchor_m, observation.anchor_std_m)
+        return estimator.process(
+            observation.anchor,
             observation.sequence,
             observation.rx_ticks_tag,
             observation.tx_ticks_anchor,
-            self._listed(observation) if observation.relays else (),
+            relays,
             packed=observation.packed_relays,
             report=self._report(observation),
             variance_factor=observation.rx_variance_factor,
         )
 
-    def _listed(self, observation: Observation) -> list[list[int]]:
-        """Relays of anchors that are known, in the form of the estimator."""
-        index_of, rows = self._estimator.index_of, []
-        for anchor, sequence, rx_ticks in observation.relays:
-            sender = index_of.get(anchor)
-            if sender is not None:
-                rows.append([index_of[observation.anchor], sender, sequence, rx_ticks])
-        return rows
-
     def _report(self, observation: Observation) -> Report:
         """What the anchor reports of its clock against the master's."""
         if observation.report is None or observation.tx_variance_m2 <= 0.0:
             return NO_REPORT
-        master, subticks = observation.report
-        index = self._estimator.index_of.get(master)
-        return NO_REPORT if index is None else Report(index, subticks, observation.tx_variance_m2)
+        return Report(*observation.report, observation.tx_variance_m2)
 
     def _fix_of(self, start: Start, observation: Observation) -> Fix:
         """What a start knows by itself: a position, and of the velocity that it is a tag's; no protection level."""
         dim, rows = self._estimator.dim, np.zeros((PROTECTED_ROWS, 3))
         rows[POSITION, :dim] = start.solution[:dim]
-        if self._settings.height_m is not None:
-            rows[POSITION, 2] = self._settings.height_m
+        if self._height_m is not None:
+            rows[POSITION, 2] = self._height_m
         rows[POSITION + 1 : POSITION + 1 + dim, :dim] = start.covariance[:dim, :dim]
         rows[VELOCITY + 1 : VELOCITY + 1 + dim, :dim] = self._settings.start_speed_std_mps**2 * np.eye(dim)
         rows[PROTECTION, 2] = UNAVAILABLE
@@ -322,14 +309,12 @@ class Estimation:
 
     def _fix(self, observation: Observation) -> Fix | NoFixReason:
         in_use, estimator, known = self._in_use, self._estimator, self._height_known
-        if not known and estimator.state.P.item(2, 2) > in_use.extent_m**2:
+        if not known and estimator.state.P[2][2] > in_use.extent_m**2:
             return NoFixReason.BAD_GEOMETRY
         rx_ticks = observation.rx_ticks_tag
         time_s = self._time.time_s(rx_ticks + self._course.master_less_tag_ticks, rx_ticks)
         # in the order of the fields: with their names it takes as long as all the rest
-        return Fix(
-            time_s, estimator.rows.tobytes(), in_use.anchors, in_use.anchors_m, "joint", known, 1, self._requirement
-        )
+        return Fix(time_s, estimator.rows, in_use.anchors, in_use.anchors_m, "joint", known, 1, self._requirement)
 
 
 def _error_variance_m2(settings: EstimatorSettings) -> float:

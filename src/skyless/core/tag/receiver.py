@@ -13,7 +13,6 @@ from skyless.core.air.frame import Malformed
 from skyless.core.air.instants import period_ticks
 from skyless.core.air.local_almanac import MIN_ANCHORS, PRESENT_TICKS, LocalAlmanac
 from skyless.core.air.reception import Reception
-from skyless.core.constants import TICK_S
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD
@@ -221,9 +220,8 @@ class Receiver(BeaconReceiver[Beacon]):
         A tag may come to where none of its anchors is received, nor receives the next ones: out of a lift.
         """
         assert self._method is not None
-        state = self._method.estimator.state
-        is_present = (rx_ticks - state.anchors["rx_ticks"]) * TICK_S <= state.settings[0]["drop_s"]
-        return int(np.count_nonzero(is_present & (state.anchors["packets"] > 0))) < MIN_ANCHORS
+        estimator = self._method.estimator
+        return estimator.heard_since(rx_ticks - from_seconds(estimator.settings.drop_s)) < MIN_ANCHORS
 
     def _may_join(self, method: "Estimation", observation: Observation) -> bool:
         """Whether an anchor is in use or may be: others have received it, and it is not weaker than 24 in use."""
@@ -236,7 +234,7 @@ class Receiver(BeaconReceiver[Beacon]):
         in_use = estimator.anchors
         if method.is_starting or not is_full(in_use):
             return True
-        position_m = estimator.state.x[: estimator.dim]
+        position_m = estimator.position_m()
         ranges_m = {anchor: float(np.linalg.norm(observation.anchor_m[: estimator.dim] - position_m))}
         for one in in_use:
             one_m = self.almanac.position_m(one)

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable
 from typing import Any, Final
 
 import numpy as np
-from msgspec.structs import replace
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS
 from skyless.core.estimator.estimator import Estimator, Packets
@@ -47,7 +46,7 @@ class JointRuns:
         self.settings = settings_of(Case(mesh=mesh), height_m=0.0)
         if not exact:
             usual = EstimatorSettings()
-            self.settings = replace(self.settings, **{name: getattr(usual, name) for name in _RANGE_ERRORS})
+            self.settings = self.settings.changed(**{name: getattr(usual, name) for name in _RANGE_ERRORS})
 
     def new_estimator(self) -> Estimator:
         """A filter that begins where the tag stands, without any anchor in view."""

@@ -103,11 +103,11 @@ class PacketTagNode:
         known = {"qa": asked.qa, "height_m": self._height_m, "height_std_m": self._height_std_m}
         is_dl_tdoa = isinstance(self.radio, UciRadio)
         return PacketTracking(
-            structs.replace(DL_TDOA if is_dl_tdoa else MASTERLESS, **known),
+            (DL_TDOA if is_dl_tdoa else MASTERLESS).changed(**known),
             asked.anchors_m,
             TICK_BITS if is_dl_tdoa else STAMP_BITS,
             calibration=asked.calibration,
-            one_way=structs.replace(DL_TDOA_ONE_WAY, **known) if is_dl_tdoa else None,
+            one_way=DL_TDOA_ONE_WAY.changed(**known) if is_dl_tdoa else None,
         )
 
     @property

@@ -8,12 +8,12 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
 from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.constants import TICK_RATE_HZ
-from skyless.core.estimator.estimator import ACCEPTED, Estimator
+from skyless.core.estimator.estimator import Estimator
+from skyless.core.estimator.process import ACCEPTED
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
@@ -60,14 +60,13 @@ class DifferenceTracking:
         self.used: list[bool] = []
         """Of each difference of the last update, whether the filter took it."""
         is_calibrated = bool(self._calibration.anchors)
-        self._settings = replace(
-            settings,
+        self._settings = settings.changed(
             difference_std_m=self._calibration.difference_std_m(settings.difference_std_m),
             range_std_m=min(settings.range_std_m, KNOWN_STD_M) if is_calibrated else settings.range_std_m,
             lowest_m=settings.lowest_m if z_bounds_m is None else z_bounds_m[0],
             highest_m=settings.highest_m if z_bounds_m is None else z_bounds_m[1],
         )
-        self._asked = IntegrityRequirement(settings.integrity_risk, settings.alert_limit_m)
+        self._asked = IntegrityRequirement(settings.integrity_risk, settings.alert_limit)
         self._positions_m = {anchor: np.array(point) for anchor, point in anchors_m.items()}
         self._z_bounds_m = z_bounds_m
         self._estimator = Estimator(self._settings)
@@ -138,17 +137,16 @@ class DifferenceTracking:
         position_m = self.position_m
         error_m = self._calibration.error_m(pair.anchor_b, dist(position_m, self._positions_m[pair.anchor_b]))
         error_m -= self._calibration.error_m(pair.anchor_a, dist(position_m, self._positions_m[pair.anchor_a]))
-        a, b = self._index(pair.anchor_a), self._index(pair.anchor_b)
-        ticks = self.ticks(pair.time_s)
-        return self._estimator.process_difference(a, b, ticks, pair.tdoa_m - error_m) == ACCEPTED
+        for anchor in (pair.anchor_a, pair.anchor_b):
+            self._estimator.know_anchor(anchor, self._positions_m[anchor])
+        found = self._estimator.process_difference(
+            pair.anchor_a, pair.anchor_b, self.ticks(pair.time_s), pair.tdoa_m - error_m
+        )
+        return found == ACCEPTED
 
     def ticks(self, time_s: float) -> int:
         """A time on the scale of the filter."""
         return round((time_s - self._begin_s) * TICK_RATE_HZ)
-
-    def _index(self, anchor: int) -> int:
-        """Index of an anchor in the estimator's table."""
-        return self._estimator.anchor_index(anchor, self._positions_m[anchor])
 
     def _is_out_of_reach(self, silent_s: float) -> bool:
         """Whether the filter cannot predict that far: too long a silence for it, or a clock that went back."""
@@ -160,14 +158,14 @@ class DifferenceTracking:
     def _is_plausible(self) -> bool:
         """Whether the state is near the anchors, where differences have information, and known well enough."""
         start, state, dim = self._start, self._estimator.state, self._estimator.dim
-        if start is None or not start.holds(state.x[:dim]):
+        if start is None or not start.holds(self._estimator.position_m()):
             self.reason = NoFixReason.NOT_CONVERGED
             self._stop()
             return False
-        if state.P[0, 0] + state.P[1, 1] > TUNING.most_horizontal_std_m**2:
+        if state.P[0][0] + state.P[1][1] > TUNING.most_horizontal_std_m**2:
             self.reason = NoFixReason.ACQUIRING
             return False
-        if dim == 3 and state.P[2, 2] > TUNING.most_horizontal_std_m**2:
+        if dim == 3 and state.P[2][2] > TUNING.most_horizontal_std_m**2:
             self.reason = NoFixReason.BAD_GEOMETRY
             return False
         return True
@@ -175,14 +173,14 @@ class DifferenceTracking:
     @property
     def position_m(self) -> tuple[float, float, float]:
         """The newest position."""
-        x, y, *z = self._estimator.state.x[: self._estimator.dim].tolist()
-        return x, y, z[0] if z else self._settings.height_m or 0.0
+        x, y, *z = self._estimator.position_m().tolist()
+        return x, y, z[0] if z else self._settings.height_m
 
     def fix(self) -> Fix:
         """The newest position with all that is known of it; only after an ``update`` that made one."""
         used = [anchor for anchor, when_s in self._received_s.items() if self._newest_s - when_s <= TUNING.start_age_s]
         anchors_m = np.array([self._positions_m[anchor] for anchor in used]).reshape(-1, 3)
-        rows, known = self._estimator.rows.tobytes(), self._settings.height_m is not None
+        rows, known = self._estimator.rows, self._settings.known_height_m is not None
         return Fix(self._newest_s, rows, tuple(used), anchors_m, "joint", known, 1, self._asked)
 
     def _stop(self) -> None:
@@ -206,7 +204,9 @@ class DifferenceTracking:
         """Look for a start, or for one that confirms or contradicts the present one; True if the filter begins."""
         window, dim = self._window, self._estimator.dim
         self._tried_s = self._newest_s
-        start = find_start(window, self._positions_m, self._calibration, self._settings.height_m, self._z_bounds_m)
+        start = find_start(
+            window, self._positions_m, self._calibration, self._settings.known_height_m, self._z_bounds_m
+        )
         if isinstance(start, NoSolution):
             self.reason = start.reason
             return False
@@ -229,7 +229,8 @@ class DifferenceTracking:
         self._start = start
         for anchor, (late_m, variance_m2) in start.late.items():
             may_stay = anchor not in self._calibration.anchors  # else it was not late then
-            self._estimator.expect_late(self._index(anchor), late_m, variance_m2, may_stay)
+            self._estimator.know_anchor(anchor, self._positions_m[anchor])
+            self._estimator.expect_late(anchor, late_m, variance_m2, may_stay)
         self._received_s = {anchor: self._newest_s for kept in window for anchor in (kept.anchor_a, kept.anchor_b)}
         self.counters["start"] += 1
         window.clear()

@@ -10,7 +10,6 @@ from math import dist, log, sqrt
 from typing import Final
 
 import numpy as np
-from msgspec.structs import replace
 
 from skyless.core.air.masterless_packets import Packet, Point, Relay
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ, TICK_S
@@ -26,8 +25,7 @@ from skyless.site.survey.anchor_errors import NO_BIAS, SLOPE_NEAREST_M, Differen
 MASTERLESS_RANDOM_WALK_FM: Final = 5e-9
 """Random walk of the oscillators, 1/√s. Captures of TDoA3 anchors show 1e-9 to 7e-9; too much costs little."""
 
-MASTERLESS: Final = replace(
-    DIFFERENCES,
+MASTERLESS: Final = DIFFERENCES.changed(
     gate=4.0,
     white=EstimatorSettings().white,
     walk=(MASTERLESS_RANDOM_WALK_FM * SPEED_OF_LIGHT_MPS) ** 2,
@@ -38,11 +36,10 @@ MASTERLESS: Final = replace(
 )
 """Ranges err as in ``DIFFERENCES``. In captures of TDoA3 anchors a reception is 4 cm off by itself."""
 
-DL_TDOA: Final = replace(EstimatorSettings(), qa=DIFFERENCES.qa)
+DL_TDOA: Final = EstimatorSettings(qa=DIFFERENCES.qa)
 """For FiRa's radios, of which there are no recordings yet: a site with typical errors is assumed."""
 
-DL_TDOA_ONE_WAY: Final = replace(
-    DL_TDOA,
+DL_TDOA_ONE_WAY: Final = DL_TDOA.changed(
     pair_std_m=0.0,
     survey_std_m=0.0,
     range_std_m=sqrt(DL_TDOA.range_std_m**2 + 3.0 * DL_TDOA.survey_std_m**2),
@@ -321,7 +318,7 @@ class PacketTracking:
 
     def _count_relays(self) -> None:
         """Add up what filters rejected: each start, before which there are packets without a fix, counts from zero."""
-        rejected = int(self._tracking.estimator.state.status[0]["relays_rejected"])
+        rejected = self._tracking.estimator.state.status.relays_rejected
         if rejected < self._rejected_now:
             self._rejected_before += self._rejected_now
         self._rejected_now = rejected

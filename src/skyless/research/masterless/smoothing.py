@@ -20,9 +20,10 @@ from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.constants import TICK_S
 from skyless.core.estimator.kalman import is_stationary, range_error_decay
 from skyless.core.estimator.settings import TUNING
-from skyless.core.estimator.state import layout
+from skyless.core.estimator.state import find_anchor
 from skyless.core.fix import POSITION, VELOCITY, Fix
 from skyless.core.kernels.arrays import Indices, Matrix, Vector
+from skyless.core.native.records import view
 from skyless.research.masterless.difference_tracking import DifferenceTracking
 
 CHUNK: Final = 2_000
@@ -72,7 +73,7 @@ class _States:
 
     def __init__(self, tracking: DifferenceTracking) -> None:
         estimator = tracking.estimator
-        self.dim, self._anchors = estimator.dim, list(estimator.index_of)
+        self.dim, self._anchors = estimator.dim, list(estimator.known_anchors)
         self._column = {anchor: column for column, anchor in enumerate(self._anchors)}
         settings, count, dim = estimator.settings, len(self._anchors), self.dim
         self.change, self.constant = 2 * dim, 2 * dim + count
@@ -103,7 +104,7 @@ class _States:
     def read(self, tracking: DifferenceTracking) -> tuple[Vector, Matrix]:
         """State and covariance of the filter as it is now."""
         s, anchors, dim = tracking.estimator.state, tracking.estimator.anchors, self.dim
-        where, columns = layout(dim, len(anchors)), [self._column[anchor] for anchor in anchors]
+        where, columns = s.layout, [self._column[anchor] for anchor in anchors]
         count = len(columns)
         there = [
             *range(dim), *range(where.velocity, where.velocity + dim), *range(where.change, where.change + count),
@@ -115,8 +116,8 @@ class _States:
             *(self._survey + dim * column + axis for column in columns for axis in range(dim)),
         ])  # fmt: skip
         x, P = np.zeros(len(self._prior)), np.diag(self._prior)
-        x[here] = s.x[there]
-        P[np.ix_(here, here)] = s.P[np.ix_(there, there)]
+        x[here] = view(s.x)[there]
+        P[np.ix_(here, here)] = view(s.P)[np.ix_(there, there)]
         return x, P
 
 
@@ -181,27 +182,27 @@ def _transition(tracking: DifferenceTracking, event: Event, states: _States) -> 
         return 0.0, 0.0, []
     estimator = tracking.estimator
     s, settings = estimator.state, estimator.settings
-    status = s.status[0]
+    status = s.status
     if isinstance(event, Height):
-        since_s = float(status["epoch_ticks"] - status["height_ticks"]) * TICK_S
+        since_s = (status.epoch_ticks - status.height_ticks) * TICK_S
         walked_m2 = min(settings.barometer_walk * since_s, TUNING.zero_variance_m2)
         return 0.0, 0.0, [_Decay(states.zero, 1.0, walked_m2)] if event.is_barometer else []
     rx_ticks = tracking.ticks(event.time_s)
-    dt_s = max((rx_ticks - status["epoch_ticks"]) * TICK_S, 0.0)
+    dt_s = max((rx_ticks - status.epoch_ticks) * TICK_S, 0.0)
     motion, _ = estimator.motion()
-    walked_m = status["walked_m"] + float(np.linalg.norm(motion[states.dim :])) * dt_s
+    walked_m = status.walked_m + float(np.linalg.norm(motion[states.dim :])) * dt_s
     decays = []
     for anchor in (event.anchor_a, event.anchor_b):
         if not estimator.has_anchor(anchor):
             continue
-        index = s.index_of.item(estimator.index_of[anchor])
+        index = find_anchor(s, anchor)
         a, column = s.anchors[index], states.column(anchor)
-        elapsed_s = (rx_ticks - a["rx_ticks"]) * TICK_S if a["packets"] > 0 else 0.0
-        kept, variance, kept_constant = range_error_decay(s, index, elapsed_s, walked_m - a["walked_m"])
+        elapsed_s = (rx_ticks - a.rx_ticks) * TICK_S if a.packets > 0 else 0.0
+        kept, variance, kept_constant = range_error_decay(s, index, elapsed_s, walked_m - a.walked_m)
         decays.append(_decay(states.change + column, kept, variance))
         if kept_constant < 1.0:
             decays.append(_decay(states.constant + column, kept_constant, settings.range_std_m**2))
-    q = settings.qa * float(status["q_scale"]) * (TUNING.stationary_noise_share if is_stationary(s) else 1.0)
+    q = settings.qa * status.q_scale * (TUNING.stationary_noise_share if is_stationary(s) else 1.0)
     return dt_s, q, decays
 
 

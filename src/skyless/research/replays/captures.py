@@ -38,7 +38,7 @@ from skyless.site.survey.anchor_errors import DifferenceCalibration
 from skyless.site.tables import read_calibration
 
 PROFILES: Final[Mapping[str, EstimatorSettings]] = {
-    "miluv": structs.replace(DIFFERENCES, qa=0.1, difference_std_m=0.5, range_std_m=0.15, place_std_m=0.15),
+    "miluv": DIFFERENCES.changed(qa=0.1, difference_std_m=0.5, range_std_m=0.15, place_std_m=0.15),
 }
 """Settings for formats that need others: MILUV's exchanges come once or twice a second, among obstacles."""
 
@@ -175,7 +175,7 @@ class CaptureReplay:
         asked = {"qa": self._qa, "difference_std_m": self._asked.tdoa_std_m, "height_m": self.height_m}
         asked["height_std_m"] = self._height_std_m
         known = {key: value for key, value in asked.items() if value is not None}
-        settings = structs.replace(PROFILES.get(self.recording.format.name, DIFFERENCES), **known)
+        settings = PROFILES.get(self.recording.format.name, DIFFERENCES).changed(**known)
         tracking = DifferenceTracking(settings, self.known_m, self._asked.z_bounds_m, self._calibration)
         return (Smoothed if self._asked.smooth else ByPairs)(tracking, engine, self._noise)
 
@@ -186,12 +186,12 @@ class CaptureReplay:
         known = {"qa": qa, "height_m": self.height_m, "height_std_m": self._height_std_m}
         is_dl_tdoa = self.recording.format.is_dl_tdoa
         tracking = PacketTracking(
-            structs.replace(DL_TDOA if is_dl_tdoa else MASTERLESS, **known),
+            (DL_TDOA if is_dl_tdoa else MASTERLESS).changed(**known),
             self._anchors_m,
             bits,
             self._asked.z_bounds_m,
             calibration=self._calibration,
-            one_way=structs.replace(DL_TDOA_ONE_WAY, **known) if is_dl_tdoa else None,
+            one_way=DL_TDOA_ONE_WAY.changed(**known) if is_dl_tdoa else None,
         )
         return ByPackets(tracking, PairEngine(bits, anchors_m=self.known_m), self._noise)
 

@@ -102,10 +102,10 @@ def _run(case: Case, draw: np.random.Generator) -> list[float]:
     site = paper_lab_site()
     anchors = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
     episode = draw_episode(draw, anchors, site.schedule.slot_s, case)
-    motions, variances = _filtered(case, anchors, episode, draw)
-    ends = np.arange(len(anchors) - 1, len(motions), len(anchors))[-_JUDGED_SUPERFRAMES:]
-    errors = motions[ends, :2] - episode.path_m[ends, :2]
-    covariances = variances[ends].reshape(-1, 2, 2)
+    positions_m, covariances_m2 = _filtered(case, anchors, episode, draw)
+    ends = np.arange(len(anchors) - 1, len(positions_m), len(anchors))[-_JUDGED_SUPERFRAMES:]
+    errors = positions_m[ends] - episode.path_m[ends, :2]
+    covariances = covariances_m2[ends]
     bounds = [_bound(case, anchors, episode, site.schedule.slot_s, at_once) for at_once in (True, False)]
     return [
         float(np.square(errors).sum(axis=1).mean()),
@@ -120,10 +120,8 @@ def _filtered(case: Case, anchors: Array, episode: Episode, draw: np.random.Gene
     estimator = Estimator(settings_of(case, height_m=0.0), anchors)
     start = episode.path_m[0, :2] + draw.normal(0.0, _START_STD_M, 2)
     estimator.start(int(episode.packets.rx_ticks[0]), start, _START_STD_M**2 * np.eye(2), EPISODE_SPEED_STD_MPS**2)
-    frames = len(episode.path_m)
-    motions, variances = np.empty((frames, 4)), np.empty((frames, 4))
-    estimator.track(episode.packets, motions, variances)
-    return motions, variances
+    rows = estimator.track(episode.packets)
+    return rows["position_m"][:, :2], rows["covariance_m2"][:, :2, :2]
 
 
 def _bound(case: Case, anchors: Array, episode: Episode, slot_s: float, at_once: bool) -> float:

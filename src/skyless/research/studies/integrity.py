@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from skyless.core.constants import TICK_M
 from skyless.core.errors import SkylessError
-from skyless.core.estimator.estimator import ACCEPTED, JOINED, Estimator, Packets
-from skyless.core.estimator.levels import LEVELS
+from skyless.core.estimator.estimator import Estimator, Packets
+from skyless.core.estimator.process import ACCEPTED, JOINED
 from skyless.core.integrity import CONTRADICTED, HPL, VPL
 from skyless.core.kernels.arrays import Array
 from skyless.research.studies.common.picture import (
@@ -55,8 +55,6 @@ _EPISODE_COST_S: Final = 0.008
 _MIN_LARGEST: Final = 100
 """A chunk returns at least this number of its largest errors, and ten times its epochs times the risk."""
 
-_OUTCOME, _SOUNDNESS = LEVELS, LEVELS + 1
-"""Columns after the levels: the outcome of a packet, and how sound the position is."""
 
 MAX_LEVEL_RATIO: Final = 1.5
 ALL_FAULTS: Final = "all faults"
@@ -240,28 +238,25 @@ def _run(setting: Setting, draw: Generator) -> tuple[NDArray[Any], ...]:
     episode = draw_episode(draw, anchors_m, slot_s, setting.case, EPISODE_SUPERFRAMES)
     onset = int(draw.integers(*_ONSETS)) * len(anchors_m)
     packets = faulty(episode, setting.fault, int(draw.integers(len(anchors_m))), onset, slot_s)
-    motions, levels = _filtered(setting, anchors_m, packets, episode.path_m[0] + draw.normal(0.0, _START_STD_M, 3))
-    fixes = np.flatnonzero(np.isin(levels[onset:, _OUTCOME], (ACCEPTED, JOINED))) + onset
-    errors, given = np.zeros((len(fixes), 3)), levels[fixes]
-    dim = motions.shape[1] // 2
-    errors[:, :dim] = motions[fixes, :dim] - episode.path_m[fixes, :dim]
+    dim, rows = _filtered(setting, anchors_m, packets, episode.path_m[0] + draw.normal(0.0, _START_STD_M, 3))
+    fixes = np.flatnonzero(np.isin(rows["outcome"][onset:], (ACCEPTED, JOINED))) + onset
+    errors, given = np.zeros((len(fixes), 3)), rows["levels"][fixes]
+    errors[:, :dim] = rows["position_m"][fixes, :dim] - episode.path_m[fixes, :dim]
     vpl = given[:, VPL] if dim == 3 else np.full(len(fixes), np.inf)
-    available = given[:, _SOUNDNESS] < CONTRADICTED
+    available = rows["integrity"][fixes] < CONTRADICTED
     if setting.alert_limit_m is not None:
         available &= given[:, HPL] <= setting.alert_limit_m
     return np.hypot(errors[:, 0], errors[:, 1]), np.abs(errors[:, 2]), given[:, HPL], vpl, available
 
 
-def _filtered(setting: Setting, anchors_m: Array, packets: Packets, start_m: Array) -> tuple[Array, Array]:
-    """Motions and levels after every packet."""
+def _filtered(setting: Setting, anchors_m: Array, packets: Packets, start_m: Array) -> tuple[int, Any]:
+    """Dimensions, and the filter's rows after every packet."""
     height_m = 0.0 if setting.fault.scene == "lab" else None
-    settings = replace(settings_of(setting.case, height_m), integrity_risk=setting.risk)
+    settings = settings_of(setting.case, height_m).changed(integrity_risk=setting.risk)
     estimator = Estimator(settings, anchors_m)
-    dim, n = estimator.dim, len(packets.anchors)
+    dim = estimator.dim
     estimator.start(int(packets.rx_ticks[0]), start_m[:dim], _START_STD_M**2 * np.eye(dim), EPISODE_SPEED_STD_MPS**2)
-    motions, levels = np.empty((n, 2 * dim)), np.zeros((n, LEVELS + 2))
-    estimator.track(packets, motions, levels=levels)
-    return motions, levels
+    return dim, estimator.track(packets, has_levels=True)
 
 
 def rows(plan: Plan, results: Sequence[Any]) -> list[IntegrityRow]:

@@ -15,12 +15,11 @@ from numpy.random import Generator
 from numpy.typing import ArrayLike
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.core.estimator.kalman import compute_ph, predict, relax_range_error, reset_state, update
-from skyless.core.estimator.measurements import reception_terms, relay_terms
 from skyless.core.estimator.settings import EstimatorSettings
-from skyless.core.estimator.state import ALL_RANGE_ERRORS, EstimatorState, layout, new_state, with_anchor
-from skyless.core.kernels.arrays import Array, Integers, Mask, Vector
-from skyless.core.kernels.compiled import kernel, threaded_kernel
+from skyless.core.estimator.state import State, add_anchor, new_state
+from skyless.core.estimator.steady_state import process_known
+from skyless.core.kernels.arrays import Array, Integers, Mask
+from skyless.core.native.records import view
 
 # What is known before the first frame, almost nothing: 30 m, 33 µs, ±10 ppm.
 POSITION_STD_M: Final = 30.0
@@ -206,115 +205,47 @@ def _frame_bound(
 ) -> Array:
     """Bound after every frame; where receptions are not known at once it holds at the end of a superframe."""
     s = _prior(anchors, settings, biases)
-    ticks = np.rint(sendings.times_s / TICK_S).astype(np.int64)
-    s.status["epoch_ticks"] = ticks[0]
-    walked_m = np.cumsum(np.linalg.norm(np.diff(path, axis=0, prepend=path[:1]), axis=1))
-    dims = settings.model().dim
-    bound, newest = np.empty((len(path), dims, dims)), np.zeros((2, len(anchors)), np.int64)
-    present = s._replace(P=s.P.copy(), status=s.status.copy())
-    senders = sendings.senders.astype(np.int64)
-    _run(s, present, np.ascontiguousarray(path), ticks, walked_m, senders, known, at_once, newest, bound)
+    n, dim, senders = len(anchors), s.dim, sendings.senders.tolist()
+    ticks = np.rint(sendings.times_s / TICK_S).astype(np.int64).tolist()
+    walked_m = np.cumsum(np.linalg.norm(np.diff(path, axis=0, prepend=path[:1]), axis=1)).tolist()
+    s.status.epoch_ticks = ticks[0]
+    path, heard, bound = np.ascontiguousarray(path), known.astype(np.uint8), np.empty((len(path), dim, dim))
+
+    def process(state: State, frame: int, first: int, newest: list[int]) -> None:
+        sender = senders[frame]
+        before = newest[sender]
+        elapsed_s, way_m = (ticks[frame] - ticks[before]) * TICK_S, walked_m[frame] - walked_m[before]
+        process_known(state, sender, ticks[frame], path[frame], heard[frame], first, elapsed_s, way_m)
+        if known[frame, n]:
+            newest[sender] = frame
+
+    newest = [0] * n
+    for frame in range(len(path)):
+        if not at_once and frame % n == 0:  # without what anchors whose turn is earlier relay in the next superframe
+            present, newest_present = State.from_buffer_copy(s), list(newest)
+            for own in range(frame, frame + n):
+                process(present, own, senders[own] + 1, newest_present)
+                bound[own] = view(present.P)[:dim, :dim]
+        process(s, frame, 0, newest)
+        if at_once:
+            bound[frame] = view(s.P)[:dim, :dim]
     return bound
 
 
-def _prior(anchors: Array, settings: BoundSettings, biases: Biases) -> EstimatorState:
+def _prior(anchors: Array, settings: BoundSettings, biases: Biases) -> State:
     """State before the first frame, with clocks known to ``OFFSET_STD_M`` and ``RATE_STD_MPS`` of the first anchor's.
 
     Its offsets are the tag's clock against each anchor's, so that the tag's own prior is in all of them.
     """
-    s = new_state(settings.model(biases), len(anchors))
-    s.status["walk_scale"] = 1.0
+    s, n = new_state(settings.model(biases)), len(anchors)
+    s.status.walk_scale = 1.0
     for row, position_m in enumerate(anchors):
-        s = with_anchor(s, row, position_m)
-    dim, n = settings.model().dim, len(anchors)
-    where = layout(dim, n)
-    P = s.P
+        add_anchor(s, row, position_m, -1.0, False)
+    s.rows = 0  # nothing is asked of faults
+    dim, where, P = s.dim, s.layout, view(s.P)
     for first, std in ((0, POSITION_STD_M), (where.velocity, settings.speed_std_mps)):
         P[first : first + dim, first : first + dim] = std**2 * np.eye(dim)
     shared = 1.0 + np.diag([0.0] + [1.0] * (n - 1))
     for first, std in ((where.offset, OFFSET_STD_M), (where.rate, RATE_STD_MPS)):
         P[first : first + n, first : first + n] = std**2 * shared
     return s
-
-
-@threaded_kernel
-def _run(
-    s: EstimatorState,
-    present: EstimatorState,
-    path: Array,
-    ticks: Integers,
-    walked_m: Vector,
-    senders: Integers,
-    known: Mask,
-    at_once: bool,
-    newest: Integers,
-    bound: Array,
-) -> None:
-    """Process frame by frame; ``newest`` has the newest frame that the tag received of each anchor, shape (2, n).
-
-    Where receptions are not known at once, those by anchors whose turn is earlier in the superframe come with the next
-    superframe: they are left out of ``present``, from which the superframe's own bound is.
-    """
-    n, dim = len(s.anchors), s.settings[0]["dim"]
-    for frame in range(len(path)):
-        if not at_once and frame % n == 0:
-            present.P[:] = s.P
-            present.status[0]["epoch_ticks"] = s.status[0]["epoch_ticks"]
-            newest[1] = newest[0]
-            for own in range(frame, frame + n):
-                _process_frame(present, path, ticks, walked_m, senders, known, own, False, newest[1])
-                bound[own] = present.P[:dim, :dim]
-        _process_frame(s, path, ticks, walked_m, senders, known, frame, True, newest[0])
-        if at_once:
-            bound[frame] = s.P[:dim, :dim]
-
-
-@kernel
-def _process_frame(
-    s: EstimatorState,
-    path: Array,
-    ticks: Integers,
-    walked_m: Vector,
-    senders: Integers,
-    known: Mask,
-    frame: int,
-    at_once: bool,
-    newest: Integers,
-) -> None:
-    """Process the receptions of a frame: the tag's, and those of anchors that are relayed."""
-    settings, n, sender = s.settings[0], len(s.anchors), senders[frame]
-    dim = settings["dim"]
-    where = layout(dim, n)
-    predict(s, ticks[frame])
-    s.x[:dim] = path[frame, :dim]
-    if dim == 2:
-        s.settings[0]["height_m"] = path[frame, 2]
-    reset_state(s, where.tx_noise + sender, settings["tx_variance_m2"])
-    if known[frame, n]:
-        before = newest[sender]
-        relax_range_error(s, sender, (ticks[frame] - ticks[before]) * TICK_S, walked_m[frame] - walked_m[before])
-        newest[sender] = frame
-        s.anchors[sender]["held_m"][0] = np.nan  # linearise here, not at a held point
-        terms, _ = reception_terms(s, sender, 1)
-        update(s, 0.0, compute_ph(s, terms) + settings["rx_variance_m2"])
-    for listener in range(n):
-        if known[frame, listener] and (at_once or listener > sender):
-            terms = _relay_terms(s, listener, sender)
-            update(s, 0.0, compute_ph(s, terms) + settings["rx_variance_m2"])
-
-
-@kernel
-def _relay_terms(s: EstimatorState, listener: int, sender: int) -> int:
-    """As ``relay_terms`` at the moment of the reception, with the displacements of both anchors; number of terms."""
-    term = relay_terms(s, listener, sender, 0.0, True)
-    if s.status[0]["range_errors"] == ALL_RANGE_ERRORS:
-        dim, here, there = s.settings[0]["dim"], s.anchors[sender]["position_m"], s.anchors[listener]["position_m"]
-        survey, squared = layout(dim, len(s.anchors)).survey, 0.0
-        for axis in range(3):
-            squared += (there[axis] - here[axis]) ** 2
-        for axis in range(dim):
-            towards = (there[axis] - here[axis]) / math.sqrt(squared)
-            s.h[term], s.h_index[term] = towards, survey + dim * listener + axis
-            s.h[term + 1], s.h_index[term + 1] = -towards, survey + dim * sender + axis
-            term += 2
-    return term
