@@ -1,5 +1,6 @@
 """``joint``: the estimator as a positioning method: cold start, packet by packet updates, new starts when lost."""
 
+from math import sqrt
 from typing import Final
 
 import numpy as np
@@ -232,7 +233,7 @@ class Estimation:
             return True
         if silent_s < TUNING.short_silence_s:
             return False
-        std_m = self._estimator.horizontal_variance_m2(silent_s) ** 0.5
+        std_m = sqrt(self._estimator.horizontal_variance_m2(silent_s))
         mean_range_m = self._in_use.mean_range_m(self._estimator.position_m())
         return std_m > self._max_relative_std * mean_range_m
 

@@ -228,7 +228,11 @@ def _many_joints() -> TagsSpeed:
 
     def tag() -> Tag:
         estimator = runs.new_estimator()
-        return lambda chunk: estimator.track(parts[chunk])
+
+        def run(chunk: int) -> None:
+            estimator.track(parts[chunk])
+
+        return run
 
     return _many(tag)
 
