@@ -114,7 +114,7 @@ def _add_range_errors(s: State, anchor: int, sign: float) -> None:
     _add_term(s, where.slope, sign * far)
 
 
-def _curvature_m(s: State, range_m: float, variance: float) -> float:
+def _find_curvature_m(s: State, range_m: float, variance: float) -> float:
     """Half the position's variance across the direction, over the range: what the range is longer by on average.
 
     The second term of its Taylor series, with the variance 2·bend² (Jazwinski 1970, section 9.3); 0 where that is
@@ -161,7 +161,7 @@ def own_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, varia
     else:
         rx_variance += settings.tx_variance_m2
     range_m = reception_terms(s, anchor, a.is_relayed)
-    curvature_m = _curvature_m(s, range_m, rx_variance)
+    curvature_m = _find_curvature_m(s, range_m, rx_variance)
     rx_variance += 2.0 * curvature_m * curvature_m
     expected_m = range_m + curvature_m + _h_dot_x(s, _direction_terms(s))
     innovation = (rx_ticks - tx_ticks - a.offset_ticks) * TICK_M - expected_m
@@ -244,7 +244,7 @@ def first_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> 
     _add_term(s, noise, 1.0)
     _add_range_errors(s, anchor, 1.0)
     variance = settings.rx_variance_m2
-    curvature_m = _curvature_m(s, range_m, variance)
+    curvature_m = _find_curvature_m(s, range_m, variance)
     variance += 2.0 * curvature_m * curvature_m + compute_ph(s)
     compute_fault_input(s, anchor)
     for state in range(s.n):
@@ -292,7 +292,7 @@ def relay(s: State, listener: int, sender: int, tx_ticks: Ticks, packet_rx_ticks
     """
     tuning, settings, status = s.tuning, s.settings, s.status
     i, j, link = s.anchors[listener], s.anchors[sender], _pair(s, listener, sender)
-    distance_m = _distance_m(s, listener, sender)
+    distance_m = _find_distance_m(s, listener, sender)
     age_s = (status.epoch_ticks - packet_rx_ticks) * TICK_S + (j.range_m - distance_m) / SPEED_OF_LIGHT_MPS
     has_tx_noise = j.tx_ticks == tx_ticks and j.has_tx_noise
     relay_terms(s, listener, sender, age_s, has_tx_noise)
@@ -337,7 +337,7 @@ def _pair(s: State, one: int, other: int) -> Link:
     return s.links[min(one, other)][max(one, other)]
 
 
-def _distance_m(s: State, one: int, other: int) -> float:
+def _find_distance_m(s: State, one: int, other: int) -> float:
     """How far two anchors are apart in the almanac."""
     squared = 0.0
     for axis in range(AXES):
@@ -389,7 +389,7 @@ def _pair_range(s: State, one: int, other: int) -> None:
 
 def add_pair_survey(s: State, one: int, other: int) -> None:
     """The measurement holds what survey errors change in the distance of two anchors."""
-    a, b, distance_m = s.anchors[one], s.anchors[other], _distance_m(s, one, other)
+    a, b, distance_m = s.anchors[one], s.anchors[other], _find_distance_m(s, one, other)
     for axis in range(s.dim):
         towards = (a.position_m[axis] - b.position_m[axis]) / distance_m
         _add_term(s, s.layout.survey + s.dim * one + axis, towards)

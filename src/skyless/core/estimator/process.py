@@ -93,7 +93,7 @@ class Packet(Record):
 
 def process(s: State, packet: Packet) -> int:
     """Process a packet and what it relays; returns what became of it, and leaves ``levels`` and ``fix``."""
-    outcome = _process(s, packet)
+    outcome = _process_packet(s, packet)
     s.status.outcome = outcome
     fill_fix(s)
     return outcome
@@ -115,7 +115,7 @@ def process_frame(s: State, packet: Packet, packed: Bytes, packed_bytes: int) ->
     return process(s, packet)
 
 
-def _process(s: State, packet: Packet) -> int:
+def _process_packet(s: State, packet: Packet) -> int:
     """Process a packet; its anchor joins where it is not in the state."""
     status, place = s.status, packet.place
     if status.packets > 0 and packet.rx_ticks < status.epoch_ticks:
@@ -370,7 +370,7 @@ def track(
         for place in range(packet.relay_count):
             packet.relays[place] = relays[begin + place]
         begin = given.end
-        rows[one].outcome = _process(s, packet)
+        rows[one].outcome = _process_packet(s, packet)
         _fill_row(s, rows[one], has_levels)
 
 

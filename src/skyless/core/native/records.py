@@ -113,11 +113,11 @@ def record(made: type[Made]) -> type[Made]:
     hints = get_type_hints(made, include_extras=True)
     made._names_ = tuple(name for name in hints if not name.startswith("_"))
     made._defaults_ = {name: made.__dict__[name] for name in made._names_ if name in made.__dict__}
-    made._fields_ = [(name, _c_type(hints[name])) for name in made._names_]
+    made._fields_ = [(name, c_type(hints[name])) for name in made._names_]
     return made
 
 
-def _c_type(hint: Any) -> Any:  # noqa: ANN401 - types have no type
+def c_type(hint: Any) -> Any:  # noqa: ANN401 - types have no type
     if get_origin(hint) is not Annotated:
         return _C_TYPES.get(hint, hint)
     base, *extras = get_args(hint)
@@ -126,7 +126,7 @@ def _c_type(hint: Any) -> Any:  # noqa: ANN401 - types have no type
     element = base
     for _ in extras:
         element = get_args(element)[0]
-    found = _c_type(element)
+    found = c_type(element)
     for length in reversed(extras):
         found *= length
     return found

@@ -1,0 +1,2699 @@
+/* Made by tools/python_to_c.py from the modules below; do not edit.
+
+   skyless.core.estimator.faults
+   skyless.core.estimator.kalman
+   skyless.core.estimator.levels
+   skyless.core.estimator.measurements
+   skyless.core.estimator.monitor
+   skyless.core.estimator.process
+   skyless.core.estimator.state
+   skyless.core.estimator.steady_state
+   skyless.core.native.arithmetic
+*/
+
+#include "skyless_core.h"
+
+#ifndef INTERNAL
+#define INTERNAL static
+#endif
+
+#ifdef SKYLESS_FLOAT
+#define SQRT(x) __builtin_sqrtf(x)
+#define FABS(x) __builtin_fabsf(x)
+#else
+#define SQRT(x) __builtin_sqrt(x)
+#define FABS(x) __builtin_fabs(x)
+#endif
+
+static inline real min_real(real one, real other) { return other < one ? other : one; }
+static inline real max_real(real one, real other) { return other > one ? other : one; }
+static inline int32_t min_32(int32_t one, int32_t other) { return other < one ? other : one; }
+static inline int32_t max_32(int32_t one, int32_t other) { return other > one ? other : one; }
+static inline int64_t min_64(int64_t one, int64_t other) { return other < one ? other : one; }
+static inline int64_t max_64(int64_t one, int64_t other) { return other > one ? other : one; }
+static inline real abs_real(real x) { return FABS(x); }
+static inline int32_t abs_32(int32_t x) { return x < 0 ? -x : x; }
+static inline int64_t abs_64(int64_t x) { return x < 0 ? -x : x; }
+static inline int64_t truncated(real x) { return REAL(-9e18) < x && x < REAL(9e18) ? (int64_t)x : 0; }
+static inline int64_t floor_real(real x) { const int64_t t = truncated(x); return t - (x < (real)t && t != 0); }
+static inline int32_t floor_div_32(int32_t x, int32_t y) { return x / y - (x % y != 0 && (x < 0) != (y < 0)); }
+static inline int64_t floor_div_64(int64_t x, int64_t y) { return x / y - (x % y != 0 && (x < 0) != (y < 0)); }
+static inline int32_t floor_mod_32(int32_t x, int32_t y) { return x - y * floor_div_32(x, y); }
+static inline int64_t floor_mod_64(int64_t x, int64_t y) { return x - y * floor_div_64(x, y); }
+
+typedef struct { real item_0; real item_1; real item_2; } range_error_decay_results;
+
+INTERNAL real exp_(real x);
+INTERNAL real log_(real x);
+INTERNAL real hypot_(real x, real y);
+INTERNAL real square(real x);
+INTERNAL void set_layout(State *s);
+INTERNAL void make_uncertain(State *s, int32_t range_errors);
+INTERNAL void clear_link(Link *link, real variance_m2);
+INTERNAL void insert_state(State *s, int32_t index_);
+INTERNAL void remove_state(State *s, int32_t index_);
+INTERNAL void insert_fault(State *s, int32_t index_, int32_t faults);
+INTERNAL void remove_fault(State *s, int32_t index_, int32_t faults);
+INTERNAL void insert(real *numbers, int32_t index_, int32_t end);
+INTERNAL void remove_(real *numbers, int32_t index_, int32_t end);
+INTERNAL void predict(State *s, int64_t rx_ticks);
+INTERNAL bool is_stationary(State *s);
+INTERNAL void advance(State *s, real dt);
+INTERNAL void add_noise(State *s, int32_t value, int32_t other, real dt, real white, real walk);
+INTERNAL real jump_share(State *s);
+INTERNAL range_error_decay_results range_error_decay(State *s, int32_t anchor, real dt, real walked_m);
+INTERNAL void relax_range_error(State *s, int32_t anchor, real dt, real walked_m);
+INTERNAL void decay(State *s, int32_t state, real kept, real variance);
+INTERNAL void reset_state(State *s, int32_t state, real variance);
+INTERNAL real compute_ph(State *s);
+INTERNAL void update(State *s, real innovation, real innovation_variance, real gain_scale);
+INTERNAL void compute_fault_input(State *s, int32_t own);
+INTERNAL void subtract_fault_input(State *s, int32_t anchor);
+INTERNAL void gather_evidence(State *s, real innovation, real innovation_variance);
+INTERNAL void fade_faults(State *s);
+INTERNAL void whiten(State *s, int32_t count, int32_t vectors);
+INTERNAL real fault_chi2(State *s, int32_t kind, int32_t axes);
+INTERNAL real explained_chi2(State *s, int32_t one, int32_t other);
+INTERNAL real explained_alone(State *s, int32_t kind, int32_t anchor);
+INTERNAL real largest(State *s, int32_t kind);
+INTERNAL void open_faults(State *s);
+INTERNAL void open_new_faults(State *s, int32_t kind);
+INTERNAL void begin_obstruction(State *s, int32_t anchor);
+INTERNAL void note_jump(State *s);
+INTERNAL void open_lasting_faults(State *s, real chi2);
+INTERNAL void open_lasting_fault(State *s, int32_t anchor);
+INTERNAL void end_lasting_fault(State *s, int32_t anchor);
+INTERNAL void open_fault(State *s, int32_t kind, int32_t anchor);
+INTERNAL real gate_of(State *s);
+INTERNAL bool is_warm(State *s);
+INTERNAL bool has_jumped(State *s, int32_t anchor, real innovation, real innovation_variance);
+INTERNAL bool is_common(State *s, real normalised);
+INTERNAL void open_range_error(State *s, int32_t anchor, real innovation);
+INTERNAL void adapt_change_noise(State *s, int32_t anchor, real normalised);
+INTERNAL bool is_off_zero(State *s, real mean);
+INTERNAL void end_small_obstruction(State *s, int32_t anchor);
+INTERNAL real variance_scale(State *s, real innovation, real innovation_variance, bool is_difference);
+INTERNAL void adapt_change_variance(State *s, int32_t anchor, real elapsed_s);
+INTERNAL void learn_place(State *s, int32_t anchor, real residual_m);
+INTERNAL void update_stationary(State *s, real dt);
+INTERNAL void adapt_process_noise(State *s, real normalised);
+INTERNAL void adapt_clock_noise(State *s, int32_t anchor, real normalised);
+INTERNAL real walk_scale(State *s, real scale, real mean);
+INTERNAL real covariance_scale(State *s);
+INTERNAL void protect(State *s);
+INTERNAL real largest_test(State *s);
+INTERNAL void find_least_axis(State *s, int32_t dim);
+INTERNAL void rotate(State *s, int32_t dim, int32_t one, int32_t other);
+INTERNAL bool is_side_open(State *s);
+INTERNAL real left_by_image(State *s, real off_m, real variance);
+INTERNAL int32_t integrity_state(State *s);
+INTERNAL void add_term(State *s, int32_t state, real weight);
+INTERNAL real h_dot_x(State *s, int32_t begin);
+INTERNAL int32_t direction_terms(State *s);
+INTERNAL real add_direction(State *s, int32_t anchor, real sign);
+INTERNAL void hold_direction(State *s, int32_t anchor);
+INTERNAL void add_range_errors(State *s, int32_t anchor, real sign);
+INTERNAL real find_curvature_m(State *s, real range_m, real variance);
+INTERNAL real reception_terms(State *s, int32_t anchor, bool has_tx_noise);
+INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks, real variance_factor);
+INTERNAL void carry_ticks(State *s, int32_t anchor);
+INTERNAL real jump(State *s, int32_t anchor, real innovation, real rx_variance);
+INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks);
+INTERNAL void relay_terms(State *s, int32_t listener, int32_t sender, real age_s, bool has_tx_noise);
+INTERNAL real relay_variance(State *s, int32_t listener, int32_t sender, real age_s);
+INTERNAL void relay(State *s, int32_t listener, int32_t sender, int64_t tx_ticks, int64_t packet_rx_ticks, int64_t
+        rx_ticks);
+INTERNAL Link *pair(State *s, int32_t one, int32_t other);
+INTERNAL real find_distance_m(State *s, int32_t one, int32_t other);
+INTERNAL void use(State *s, real innovation, real innovation_variance);
+INTERNAL void survey_pair(State *s, int32_t one, int32_t other);
+INTERNAL void pair_range(State *s, int32_t one, int32_t other);
+INTERNAL void add_pair_survey(State *s, int32_t one, int32_t other);
+INTERNAL void report(State *s, int32_t anchor, int32_t master, int64_t subticks, real variance_m2);
+INTERNAL real difference_terms(State *s, int32_t a, int32_t b);
+INTERNAL int32_t difference(State *s, int32_t a, int32_t b, int64_t rx_ticks, real difference_m);
+INTERNAL void bound_changes(State *s);
+INTERNAL int32_t height(State *s, real height_m, real std_m, bool is_barometer);
+INTERNAL void zero_velocity(State *s);
+INTERNAL int32_t process(State *s, Packet *packet);
+INTERNAL int32_t process_packet(State *s, Packet *packet);
+INTERNAL int32_t present(State *s, Place *place);
+INTERNAL void remove_silent(State *s, int64_t rx_ticks);
+INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet);
+INTERNAL int32_t admit(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks);
+INTERNAL bool is_impossible(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks);
+INTERNAL void keep_packet(State *s, int32_t anchor, Packet *packet);
+INTERNAL void process_relay(State *s, int32_t listener, Relay *relayed);
+INTERNAL void check_motion_and_faults(State *s, real elapsed_s);
+INTERNAL void fill_fix(State *s);
+INTERNAL void note_difference(State *s, int32_t anchor, int64_t rx_ticks);
+INTERNAL void fill_row(State *s, BatchRow *row, bool has_levels);
+INTERNAL int32_t walls(State *s);
+INTERNAL void process_superframe(State *s, PlannedMessage *messages, PlannedRelay *relays, int32_t count, int64_t
+        impulses_ticks, int64_t superframe, SteadyState *found);
+INTERNAL void add_fix(State *s, real share, SteadyState *found);
+INTERNAL void predict_with_impulses(State *s, int64_t now, int64_t impulses_ticks, int64_t superframe);
+INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks);
+INTERNAL void receive_relay(State *s, PlannedMessage *message, PlannedRelay *relayed);
+
+/* Arithmetic of the functions that are also translated to C: the same bits on every processor, without a C library. */
+
+/* The exponential of a number up to 0, to four units in the last place.
+ *
+ * x = k·ln 2 + r with |r| ≤ ½·ln 2, where the diagonal Padé approximant of order 6 leaves less than rounding. */
+INTERNAL real exp_(real x) {
+    if (x < LOWEST) {
+        return REAL(0.0);
+    }
+    int64_t halvings = -floor_real(x / REAL(0.6931471805599453) + REAL(0.5));
+    real r = x + (real)halvings * LN_2_HIGH + (real)halvings * LN_2_LOW;
+    real square = r * r;
+    real even = REAL(665280.0) + square * (REAL(75600.0) + square * (REAL(840.0) + square));
+    real odd = r * (REAL(332640.0) + square * (REAL(10080.0) + square * REAL(42.0)));
+    real result = (even + odd) / (even - odd);
+    for (int64_t time_1 = 0; time_1 < halvings; time_1++) {
+        result *= REAL(0.5);
+    }
+    return result;
+}
+
+/* The natural logarithm of a positive number, to four units in the last place.
+ *
+ * x = m·2ᵏ with m between √½ and √2, and log m = 2·artanh((m − 1)/(m + 1)) by its series. */
+INTERNAL real log_(real x) {
+    int32_t twos = 0;
+    while (x > REAL(1.4142135623730951)) {
+        x *= REAL(0.5);
+        twos += 1;
+    }
+    while (x < REAL(0.7071067811865476) && twos > -1100) {
+        x *= REAL(2.0);
+        twos -= 1;
+    }
+    real s = (x - REAL(1.0)) / (x + REAL(1.0));
+    real square = s * s;
+    real total = REAL(0.0);
+    for (int32_t term = 12; term > -1; term--) {
+        total = total * square + REAL(1.0) / (real)(2 * term + 1);
+    }
+    return (real)twos * REAL(0.6931471805599453) + REAL(2.0) * s * total;
+}
+
+/* The length of a vector; for lengths in a site, whose squares are numbers. */
+INTERNAL real hypot_(real x, real y) {
+    return SQRT(x * x + y * y);
+}
+
+/* x². */
+INTERNAL real square(real x) {
+    return x * x;
+}
+
+/* The estimator's state: one record of fixed capacity, and how anchors join and leave by moving blocks in it.
+ *
+ * The state vector, all clocks against the tag's own counter, in metres and m/s:
+ *
+ *     values      position (dim), then for each anchor the offset of its clock: tag's reading − anchor's reading (its
+ *                 whole ticks stand in ``Anchor``)
+ *     rates       velocity (dim), then the rate of each offset
+ *     tx noises   of each anchor's newest TX stamp, which all who received it share
+ *     changes     for each anchor the part of the tag's range error to it that changes as the tag moves
+ *     constants   the part that stays
+ *     slope       how ranges lengthen with distance
+ *     height      the tag's true height − the one that is given, in two dimensions
+ *     zero        what a barometer reads − the tag's true height, in three dimensions
+ *     surveys     for each anchor (dim) its true position − its position in the almanac
+ *
+ * Range errors and surveys stand last because many a site calls them exact. What is exact has no variance and no
+ * covariance, so it is left out of all arithmetic (``State.n``), until a jump or a fault shows otherwise. All that stands
+ * behind the states in use is zero. */
+
+/* Initialise a state that is all zeros but for its settings and dimensions. */
+SKYLESS_EXPORT void skyless_prepare(State *s) {
+    Status *status = &s->status;
+    EstimatorSettings *settings = &s->settings;
+    Tuning *tuning = &s->tuning;
+    real stamps_m2 = settings->tx_variance_m2 + settings->rx_variance_m2;
+    status->mean_nis = REAL(1.0);
+    status->q_scale = REAL(1.0);
+    status->height_ticks = NEVER;
+    status->walk_scale = min_real(tuning->start_walk_scale, settings->max_walk_scale);
+    status->fault_std_m[LASTING] = tuning->lasting_std_m;
+    status->fault_std_m[RECENT] = tuning->recent_std_m;
+    status->fault_std_m[CREEPING] = tuning->creeping_std_m;
+    status->mean_square_m2 = stamps_m2;
+    status->place_square_m2[1] = stamps_m2;
+    status->place_square_m2[0] = stamps_m2;
+    status->place_distance_m = settings->place_distance_m;
+    if (settings->place_std_m > REAL(0.0)) {
+        status->range_errors = CHANGING_RANGE_ERRORS;
+    }
+    real stated = max_real(max_real(max_real(settings->survey_std_m, settings->range_std_m), settings->slope_std_m),
+            settings->height_std_m);
+    if (status->has_open_ranges || stated > REAL(0.0)) {
+        status->range_errors = ALL_RANGE_ERRORS;
+    }
+    set_layout(s);
+    s->P[s->layout.slope][s->layout.slope] = square(settings->slope_std_m);
+    if (s->dim == 2) {
+        s->P[s->layout.height][s->layout.height] = square(settings->height_std_m);
+    }
+}
+
+/* Find where the states of so many anchors stand. */
+INTERNAL void set_layout(State *s) {
+    Layout *where = &s->layout;
+    int32_t count = s->count;
+    int32_t dim = s->dim;
+    where->offset = dim;
+    where->velocity = dim + count;
+    where->rate = where->velocity + dim;
+    where->tx_noise = where->rate + count;
+    where->change = where->tx_noise + count;
+    where->constant = where->change + count;
+    where->slope = where->constant + count;
+    where->height = dim == 2 ? where->slope + 1 : 2;
+    where->zero = dim == 2 ? where->slope : where->slope + 1;
+    where->survey = where->slope + 2;
+    where->end = where->survey + dim * count;
+    s->rows = FAULT_KINDS * count + dim;
+    make_uncertain(s, s->status.range_errors);
+}
+
+/* From now on at least these range errors are not known to be zero; finds the number of uncertain states. */
+INTERNAL void make_uncertain(State *s, int32_t range_errors) {
+    s->status.range_errors = max_32(s->status.range_errors, range_errors);
+    int32_t end = s->layout.change;
+    if (s->status.range_errors == CHANGING_RANGE_ERRORS) {
+        end = s->layout.constant;
+    } else if (s->status.range_errors == ALL_RANGE_ERRORS) {
+        end = s->layout.end;
+    }
+    s->n = floor_div_32(end + LANES - 1, LANES) * LANES;
+}
+
+/* Anchors join and leave */
+
+/* The index of an anchor in the state, or −1. */
+SKYLESS_EXPORT int32_t skyless_find_anchor(State *s, int32_t identifier) {
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        if (s->anchors[anchor].identifier == identifier) {
+            return anchor;
+        }
+    }
+    return -1;
+}
+
+/* Let an anchor join, of whose clock and, if it is open, range error nothing is known; its index.
+ *
+ * ``std_m``: of each coordinate of this anchor; below 0 for that of the settings. There must be room. */
+SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *position_m, real std_m, bool is_open) {
+    EstimatorSettings *settings = &s->settings;
+    Tuning *tuning = &s->tuning;
+    int32_t dim = s->dim;
+    int32_t anchor = s->count;
+    Layout *where = &s->layout;
+    Anchor *a = &s->anchors[anchor];
+    for (int32_t time_1 = 0; time_1 < dim; time_1++) {
+        insert_state(s, where->end);
+    }
+    insert_state(s, where->slope);  /* behind the block of constants, and so on: from the last to the first */
+    insert_state(s, where->constant);
+    insert_state(s, where->change);
+    insert_state(s, where->tx_noise);
+    insert_state(s, where->velocity);
+    for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
+        insert_fault(s, (FAULT_KINDS - kind) * anchor, FAULT_KINDS * anchor + kind);
+    }
+    s->count += 1;
+    set_layout(s);
+    s->anchors[anchor] = (Anchor){0};
+    a->identifier = identifier;
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        a->position_m[axis] = position_m[axis];
+    }
+    a->rx_ticks = NEVER;
+    a->tx_ticks = NEVER;
+    a->walk_scale = REAL(1.0);
+    a->change_variance_m2 = square(settings->place_std_m);
+    for (int32_t kept = 0; kept < PACKETS_KEPT; kept++) {
+        KeptPacket *packet = &s->packets[anchor][kept];
+        packet->sequence = -1;
+        packet->rx_ticks = NEVER;
+        packet->tx_ticks = NEVER;
+    }
+    bool has_errors = settings->range_std_m > REAL(0.0) || settings->survey_std_m > REAL(0.0) || std_m > REAL(0.0);
+    for (int32_t other = 0, other_end = s->count; other < other_end; other++) {
+        clear_link(&s->links[anchor][other], has_errors ? square(tuning->open_pair_std_m) : REAL(0.0));
+        clear_link(&s->links[other][anchor], has_errors ? square(tuning->open_pair_std_m) : REAL(0.0));
+    }
+    real range_std_m = settings->range_std_m;
+    real survey_std_m = std_m < REAL(0.0) ? settings->survey_std_m : std_m;
+    if (is_open || s->status.has_open_ranges) {
+        range_std_m = tuning->late_std_m;
+        survey_std_m = tuning->open_survey_std_m;
+    }
+    if (survey_std_m > REAL(0.0)) {
+        make_uncertain(s, ALL_RANGE_ERRORS);
+    }
+    s->P[where->change + anchor][where->change + anchor] = a->change_variance_m2;
+    s->P[where->constant + anchor][where->constant + anchor] = square(range_std_m);
+    for (int32_t axis = 0; axis < dim; axis++) {
+        int32_t survey = where->survey + dim * anchor + axis;
+        s->P[survey][survey] = square(survey_std_m);
+    }
+    return anchor;
+}
+
+/* Nothing has been relayed from one anchor to another yet. */
+INTERNAL void clear_link(Link *link, real variance_m2) {
+    link->tx_ticks = NEVER;
+    link->constant_m = REAL(0.0);
+    link->variance_m2 = variance_m2;
+    link->outliers_in_row = 0;
+    link->relays = 0;
+    link->contradicts = false;
+}
+
+/* Let an anchor leave the state. */
+SKYLESS_EXPORT void skyless_remove_anchor(State *s, int32_t anchor) {
+    Layout *where = &s->layout;
+    int32_t dim = s->dim;
+    int32_t last = s->count - 1;
+    for (int32_t time_1 = 0; time_1 < dim; time_1++) {
+        remove_state(s, where->survey + dim * anchor);
+    }
+    remove_state(s, where->constant + anchor);
+    remove_state(s, where->change + anchor);
+    remove_state(s, where->tx_noise + anchor);
+    remove_state(s, where->rate + anchor);
+    remove_state(s, where->offset + anchor);
+    for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
+        remove_fault(s, (FAULT_KINDS - 1 - kind) * s->count + anchor, FAULT_KINDS * s->count - kind);
+    }
+    for (int32_t moved = anchor; moved < last; moved++) {
+        s->anchors[moved] = s->anchors[moved + 1];
+        for (int32_t kept = 0; kept < PACKETS_KEPT; kept++) {
+            s->packets[moved][kept] = s->packets[moved + 1][kept];
+        }
+        for (int32_t other = 0, other_end = s->count; other < other_end; other++) {
+            s->links[moved][other] = s->links[moved + 1][other];
+        }
+    }
+    for (int32_t moved = anchor; moved < last; moved++) {
+        for (int32_t other = 0; other < last; other++) {
+            s->links[other][moved] = s->links[other][moved + 1];
+        }
+    }
+    s->count = last;
+    set_layout(s);
+}
+
+/* Move all states from an index on one place back; the one that is there then is zero. */
+INTERNAL void insert_state(State *s, int32_t index_) {
+    int32_t end = s->layout.end;
+    for (int32_t state = end; state > index_; state--) {
+        s->x[state] = s->x[state - 1];
+        for (int32_t other = 0; other < end; other++) {
+            s->P[state][other] = s->P[state - 1][other];
+        }
+    }
+    s->x[index_] = REAL(0.0);
+    for (int32_t other = 0; other < end; other++) {
+        s->P[index_][other] = REAL(0.0);
+    }
+    for (int32_t state = 0; state < end + 1; state++) {
+        insert(s->P[state], index_, end);
+    }
+    for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
+        insert(s->V[row], index_, end);
+    }
+    s->layout.end = end + 1;
+}
+
+/* Move all states behind an index one place forward. */
+INTERNAL void remove_state(State *s, int32_t index_) {
+    int32_t end = s->layout.end;
+    for (int32_t state = index_; state < end - 1; state++) {
+        s->x[state] = s->x[state + 1];
+        for (int32_t other = 0; other < end; other++) {
+            s->P[state][other] = s->P[state + 1][other];
+        }
+    }
+    s->x[end - 1] = REAL(0.0);
+    for (int32_t other = 0; other < end; other++) {
+        s->P[end - 1][other] = REAL(0.0);
+    }
+    for (int32_t state = 0; state < end; state++) {
+        remove_(s->P[state], index_, end);
+    }
+    for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
+        remove_(s->V[row], index_, end);
+    }
+    s->layout.end = end - 1;
+}
+
+/* Move all faults from an index on one place back; the one that is there then is zero. */
+INTERNAL void insert_fault(State *s, int32_t index_, int32_t faults) {
+    int32_t end = s->layout.end;
+    for (int32_t row = s->rows; row > index_; row--) {
+        for (int32_t state = 0; state < end; state++) {
+            s->V[row][state] = s->V[row - 1][state];
+        }
+    }
+    for (int32_t state = 0; state < end; state++) {
+        s->V[index_][state] = REAL(0.0);
+    }
+    s->rows += 1;
+    for (int32_t row = faults; row > index_; row--) {
+        for (int32_t other = 0; other < faults; other++) {
+            s->information[row][other] = s->information[row - 1][other];
+        }
+    }
+    for (int32_t other = 0; other < faults; other++) {
+        s->information[index_][other] = REAL(0.0);
+    }
+    for (int32_t row = 0; row < faults + 1; row++) {
+        insert(s->information[row], index_, faults);
+    }
+    insert(s->evidence, index_, faults);
+}
+
+/* Move all faults behind an index one place forward. */
+INTERNAL void remove_fault(State *s, int32_t index_, int32_t faults) {
+    int32_t end = s->layout.end;
+    for (int32_t row = index_, row_end = s->rows - 1; row < row_end; row++) {
+        for (int32_t state = 0; state < end; state++) {
+            s->V[row][state] = s->V[row + 1][state];
+        }
+    }
+    for (int32_t state = 0; state < end; state++) {
+        s->V[s->rows - 1][state] = REAL(0.0);
+    }
+    s->rows -= 1;
+    for (int32_t row = index_; row < faults - 1; row++) {
+        for (int32_t other = 0; other < faults; other++) {
+            s->information[row][other] = s->information[row + 1][other];
+        }
+    }
+    for (int32_t other = 0; other < faults; other++) {
+        s->information[faults - 1][other] = REAL(0.0);
+    }
+    for (int32_t row = 0; row < faults; row++) {
+        remove_(s->information[row], index_, faults);
+    }
+    remove_(s->evidence, index_, faults);
+}
+
+/* Move numbers from an index up to an end one place back. */
+INTERNAL void insert(real *numbers, int32_t index_, int32_t end) {
+    for (int32_t place = end; place > index_; place--) {
+        numbers[place] = numbers[place - 1];
+    }
+    numbers[index_] = REAL(0.0);
+}
+
+/* Move numbers behind an index one place forward. */
+INTERNAL void remove_(real *numbers, int32_t index_, int32_t end) {
+    for (int32_t place = index_; place < end - 1; place++) {
+        numbers[place] = numbers[place + 1];
+    }
+    numbers[end - 1] = REAL(0.0);
+}
+
+/* The filter itself: time update and scalar measurement update of state, covariance and fault sensitivities.
+ *
+ * All loops run over the states that are not exact (``State.n``); what stands behind them stays as it is. */
+
+/* Time update */
+
+/* Time update to a reading of the tag: F·P·Fᵀ + Q for constant velocity and constant clock rates.
+ *
+ * The tag's oscillator is in all offsets, so its noise is common to them. */
+INTERNAL void predict(State *s, int64_t rx_ticks) {
+    Status *status = &s->status;
+    EstimatorSettings *settings = &s->settings;
+    Layout *where = &s->layout;
+    real dt = (real)(rx_ticks - status->epoch_ticks) * TICK_S;
+    real speed_squared = REAL(0.0);
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        speed_squared += square(s->x[where->velocity + axis]);
+    }
+    status->walked_m += SQRT(speed_squared) * dt;
+    if (status->obstruction > REAL(0.0)) {
+        status->obstruction *= exp_(-dt / s->tuning.obstruction_memory_s);
+    }
+    advance(s, dt);
+    real motion = settings->qa * status->q_scale;
+    if (is_stationary(s)) {
+        motion *= s->tuning.stationary_noise_share;
+    }
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        add_noise(s, axis, axis, dt, REAL(0.0), motion);
+        real *unknown = s->V[FAULT_KINDS * s->count + axis];  /* an acceleration that the filter does not know of */
+        unknown[axis] -= REAL(0.5) * dt * dt;
+        unknown[where->velocity + axis] -= dt;
+    }
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        int32_t offset = where->offset + anchor;
+        add_noise(s, offset, offset, dt, settings->white, settings->walk * s->anchors[anchor].walk_scale);
+    }
+    for (int32_t one = where->offset, one_end = where->velocity; one < one_end; one++) {
+        for (int32_t other = where->offset, other_end = where->velocity; other < other_end; other++) {
+            add_noise(s, one, other, dt, settings->white, settings->walk * status->walk_scale);
+        }
+    }
+    status->epoch_ticks = rx_ticks;
+}
+
+/* Whether the tag has shown no motion for long enough to count as stationary. */
+INTERNAL bool is_stationary(State *s) {
+    return REAL(0.0) < s->settings.stationary_s && s->settings.stationary_s < s->status.stationary_s;
+}
+
+/* The values, which are the first states, gain dt·(their rates), which follow in the same order: F·P·Fᵀ. */
+INTERNAL void advance(State *s, real dt) {
+    int32_t values = s->layout.velocity;
+    for (int32_t value = 0; value < values; value++) {
+        s->x[value] += dt * s->x[values + value];
+    }
+    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+        real *row = s->P[state];
+        for (int32_t value = 0; value < values; value++) {
+            row[value] += dt * row[values + value];
+        }
+    }
+    for (int32_t value = 0; value < values; value++) {
+        real *row = s->P[value];
+        real *rates = s->P[values + value];
+        for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+            row[state] += dt * rates[state];
+        }
+    }
+    for (int32_t value = 0; value < values; value++) {
+        for (int32_t other = 0; other < value; other++) {
+            s->P[value][other] = s->P[other][value];
+        }
+    }
+    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+        real *row = s->V[fault];
+        for (int32_t value = 0; value < values; value++) {
+            row[value] += dt * row[values + value];
+        }
+    }
+}
+
+/* Q of a value and its rate, or what two such pairs have in common: white noise of values, walk of rates. */
+INTERNAL void add_noise(State *s, int32_t value, int32_t other, real dt, real white, real walk) {
+    int32_t rate = s->layout.velocity + value;
+    int32_t other_rate = s->layout.velocity + other;
+    s->P[value][other] += white * dt + walk * dt * dt * dt / REAL(3.0);
+    s->P[value][other_rate] += walk * dt * dt / REAL(2.0);
+    s->P[rate][other] += walk * dt * dt / REAL(2.0);
+    s->P[rate][other_rate] += walk * dt;
+}
+
+/* Range errors that change */
+
+/* 1 where range errors have jumped recently, 0 where none has or learnt multipath is as large as a jump. */
+INTERNAL real jump_share(State *s) {
+    Status *status = &s->status;
+    return status->place_variance_m2 < square(s->tuning.multipath_std_m) ? min_real(status->obstruction, REAL(1.0)) :
+            REAL(0.0);
+}
+
+/* What an anchor's range errors keep over what has passed and was walked since its newest packet.
+ *
+ * Of the changing part: the share that is kept and its variance in the long run; then the share of the constant part.
+ * The changing part is a Gauss–Markov process of walked distance and of time. Where range errors jump, both parts
+ * forget within seconds; one that has jumped itself wanders and returns to zero. */
+INTERNAL range_error_decay_results range_error_decay(State *s, int32_t anchor, real dt, real walked_m) {
+    real variance = 0;
+    real kept = 0;
+    Status *status = &s->status;
+    Tuning *tuning = &s->tuning;
+    EstimatorSettings *settings = &s->settings;
+    Anchor *a = &s->anchors[anchor];
+    real share = jump_share(s);
+    real obstructed = share * dt / tuning->obstructed_s;
+    if (a->is_obstructed) {
+        real change_m = s->x[s->layout.change + anchor];
+        real memory_s = tuning->obstruction_memory_s * max_real(REAL(1.0), abs_real(change_m) /
+                tuning->obstruction_return_m);
+        variance = REAL(0.5) * memory_s * tuning->obstructed_walk * a->change_scale;
+        kept = exp_(-dt / memory_s);
+    } else {
+        real place_variance = max_real(a->change_variance_m2, status->place_variance_m2);
+        variance = place_variance + share * square(tuning->obstructed_std_m);
+        real usual = dt / settings->place_time_s + walked_m / status->place_distance_m;
+        kept = exp_(-obstructed - (REAL(1.0) - share) * usual);
+    }
+    real kept_constant = obstructed > REAL(1e-06) && settings->range_std_m > REAL(0.0) ? exp_(-obstructed) : REAL(1.0);
+    return (range_error_decay_results){kept, variance, kept_constant};
+}
+
+/* Time update of an anchor's range errors since its newest packet, by what ``range_error_decay`` says. */
+INTERNAL void relax_range_error(State *s, int32_t anchor, real dt, real walked_m) {
+    const range_error_decay_results results_1 = range_error_decay(s, anchor, dt, walked_m);
+    real kept = results_1.item_0;
+    real variance = results_1.item_1;
+    real kept_constant = results_1.item_2;
+    if (variance > REAL(0.0)) {  /* also where the site calls ranges exact: multipath is learnt there as well */
+        make_uncertain(s, CHANGING_RANGE_ERRORS);
+        decay(s, s->layout.change + anchor, kept, variance);
+    }
+    if (kept_constant < REAL(1.0)) {
+        decay(s, s->layout.constant + anchor, kept_constant, square(s->settings.range_std_m));
+    }
+}
+
+/* A state decays towards zero and keeps, in the long run, that variance: Gauss–Markov. */
+INTERNAL void decay(State *s, int32_t state, real kept, real variance) {
+    s->x[state] *= kept;
+    real *row = s->P[state];
+    for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
+        row[other] *= kept;
+    }
+    for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
+        s->P[other][state] = row[other];
+    }
+    row[state] = kept * row[state] + (REAL(1.0) - kept * kept) * variance;
+    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+        s->V[fault][state] *= kept;
+    }
+}
+
+/* Forget a state: zero, uncorrelated, with that variance. */
+INTERNAL void reset_state(State *s, int32_t state, real variance) {
+    s->x[state] = REAL(0.0);
+    for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
+        s->P[state][other] = REAL(0.0);
+        s->P[other][state] = REAL(0.0);
+    }
+    s->P[state][state] = variance;
+    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+        s->V[fault][state] = REAL(0.0);
+    }
+}
+
+/* Measurement update */
+
+/* Compute P·h of the measurement in ``h``; returns hᵀ·P·h. */
+INTERNAL real compute_ph(State *s) {
+    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+        s->ph[state] = REAL(0.0);
+    }
+    for (int32_t term = 0, term_end = s->terms; term < term_end; term++) {
+        if (s->h_index[term] < s->n) {
+            real weight = s->h[term];
+            real *row = s->P[s->h_index[term]];
+            for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+                s->ph[state] += weight * row[state];
+            }
+        }
+    }
+    real total = REAL(0.0);
+    for (int32_t term = 0, term_end = s->terms; term < term_end; term++) {
+        if (s->h_index[term] < s->n) {
+            total += s->h[term] * s->ph[s->h_index[term]];
+        }
+    }
+    return total;
+}
+
+/* Scalar update by the measurement in ``h`` with P·h in ``ph``.
+ *
+ * K = gain_scale·P·h/S. A scale of 1 is the Kalman gain; a measurement whose variance counts more has the S that
+ * follows, and 1. P changes by −u·uᵀ with u = P·h/√S, which is symmetric to the bit. */
+INTERNAL void update(State *s, real innovation, real innovation_variance, real gain_scale) {
+    real root = SQRT(innovation_variance);
+    real step = gain_scale * innovation / root;
+    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+        s->ph[state] /= root;
+    }
+    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+        s->x[state] += s->ph[state] * step;
+        real factor = s->ph[state];
+        real *row = s->P[state];
+        for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
+            row[other] -= factor * s->ph[other];
+        }
+    }
+    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+        real gain = gain_scale * s->fault_input[fault] / root;
+        real *row = s->V[fault];
+        for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+            row[state] += gain * s->ph[state];
+        }
+    }
+}
+
+/* Faults that the state does not hold: what they do to it, what innovations show of them, and adding them to it.
+ *
+ * Where all that the tag receives of anchor j is late by b metres, the estimate errs by V_j·b, and the
+ * innovation of a measurement h holds s_j·b (Friedland 1969):
+ *
+ *     s = [own reception of j] − h·V        V ← F·V  (time)        V ← V + K·s  (update)
+ *
+ * With y = Σ s·ν/S and M = Σ s·sᵀ/S over the innovations ν of variance S, and σ_f²·I the faults' variance beforehand, all
+ * anchors' faults are b̂ = (M + I/σ_f²)⁻¹·y with the covariance (M + I/σ_f²)⁻¹, and yᵀ·(M + I/σ_f²)⁻¹·y tests whether there
+ * are any. Where V, y and M forget, b is the present size of a fault that has grown as fast as they forget: within packets
+ * (recent) or seconds (creeping). A fault that is sure is added to the anchor's range error, which gives the state that
+ * the filter would have, had that error been open from the beginning. */
+
+/* What innovations show */
+
+/* Compute s = [own reception] − h·V; ``own`` is the anchor that the tag has received, or −1. */
+INTERNAL void compute_fault_input(State *s, int32_t own) {
+    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+        real total = REAL(0.0);
+        for (int32_t term = 0, term_end = s->terms; term < term_end; term++) {
+            total -= s->h[term] * s->V[fault][s->h_index[term]];
+        }
+        s->fault_input[fault] = total;
+    }
+    if (own >= 0) {
+        for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
+            s->fault_input[kind * s->count + own] += REAL(1.0);
+        }
+    }
+}
+
+/* Subtract the reception of the first anchor of a difference: its faults count with the opposite sign. */
+INTERNAL void subtract_fault_input(State *s, int32_t anchor) {
+    for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
+        s->fault_input[kind * s->count + anchor] -= REAL(1.0);
+    }
+}
+
+/* What an innovation shows of the anchors' faults: y ← y + s·ν/S and M ← M + s·sᵀ/S. */
+INTERNAL void gather_evidence(State *s, real innovation, real innovation_variance) {
+    int32_t faults = FAULT_KINDS * s->count;
+    for (int32_t one = 0; one < faults; one++) {
+        real weight = s->fault_input[one] / innovation_variance;
+        real *row = s->information[one];
+        s->evidence[one] += weight * innovation;
+        for (int32_t other = 0; other < faults; other++) {
+            row[other] += weight * s->fault_input[other];
+        }
+    }
+}
+
+/* Forget, once in a round of packets, a share of what has not lasted has done, and of the evidence for it. */
+INTERNAL void fade_faults(State *s) {
+    Status *status = &s->status;
+    Tuning *tuning = &s->tuning;
+    int32_t count = s->count;
+    if (floor_mod_64(status->packets, count) != 0) {
+        return;
+    }
+    real elapsed_s = (real)(status->epoch_ticks - status->faded_ticks) * TICK_S;
+    status->faded_ticks = status->epoch_ticks;
+    for (int32_t kind = RECENT; kind < FAULT_KINDS; kind++) {
+        int32_t begin = kind * count;
+        int32_t end = (kind + 1) * count;
+        real kept = kind == RECENT ? REAL(1.0) - REAL(1.0) / tuning->recent_packets : exp_(-elapsed_s /
+                tuning->creeping_s);
+        for (int32_t fault = begin; fault < end; fault++) {
+            s->evidence[fault] *= kept;
+            for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+                s->V[fault][state] *= kept;
+            }
+            for (int32_t other = 0; other < FAULT_KINDS * count; other++) {
+                s->information[fault][other] *= kept;
+                if (!(begin <= other && other < end)) {
+                    s->information[other][fault] *= kept;
+                }
+            }
+        }
+    }
+}
+
+/* The test of all faults of a kind */
+
+/* Compute L⁻¹·r of the vectors r in the rows behind a symmetric matrix M = L·Lᵀ in ``work``, by Cholesky's method.
+ *
+ * So r·M⁻¹·q is the product of what becomes of r and of q. Rows of vectors are treated as rows of the matrix. */
+INTERNAL void whiten(State *s, int32_t count, int32_t vectors) {
+    for (int32_t column = 0; column < count; column++) {
+        real *pivot = s->work[column];
+        real total = s->work[column][column];
+        for (int32_t k = 0; k < column; k++) {
+            total -= pivot[k] * pivot[k];
+        }
+        real inverse = REAL(1.0) / SQRT(max_real(total, REAL(1e-30)));
+        for (int32_t place = column + 1; place < count + vectors; place++) {
+            real *row = s->work[place];
+            total = row[column];
+            for (int32_t k = 0; k < column; k++) {
+                total -= row[k] * pivot[k];
+            }
+            row[column] = total * inverse;
+        }
+    }
+}
+
+/* The test of all faults of a kind; leaves L⁻¹·y, and L⁻¹·V of that number of axes, in the rows of ``work``.
+ *
+ * L·Lᵀ is M + I/σ_f². */
+INTERNAL real fault_chi2(State *s, int32_t kind, int32_t axes) {
+    int32_t count = s->count;
+    int32_t begin = kind * s->count;
+    for (int32_t one = 0; one < count; one++) {
+        for (int32_t other = 0; other < count; other++) {
+            s->work[one][other] = s->information[begin + one][begin + other];
+        }
+        s->work[one][one] += REAL(1.0) / square(s->status.fault_std_m[kind]);
+        s->work[count][one] = s->evidence[begin + one];
+        for (int32_t axis = 0; axis < axes; axis++) {
+            s->work[count + 1 + axis][one] = s->V[begin + one][axis];
+        }
+    }
+    whiten(s, count, 1 + axes);
+    real total = REAL(0.0);
+    for (int32_t one = 0; one < count; one++) {
+        total += square(s->work[count][one]);
+    }
+    return total;
+}
+
+/* How much of the test of all lasting faults one anchor or two explain; for one, both arguments are the same. */
+INTERNAL real explained_chi2(State *s, int32_t one, int32_t other) {
+    real weight = REAL(1.0) / square(s->tuning.late_std_m);
+    real y_one = s->evidence[one];
+    real y_other = s->evidence[other];
+    real a = s->information[one][one] + weight;
+    real b = s->information[other][other] + weight;
+    real both = s->information[one][other];
+    if (one == other) {
+        return y_one * y_one / a;
+    }
+    return (b * square(y_one) - REAL(2.0) * both * y_one * y_other + a * square(y_other)) / (a * b - both * both);
+}
+
+/* How much the fault of an anchor explains; that it is early is less likely, and counts less. */
+INTERNAL real explained_alone(State *s, int32_t kind, int32_t anchor) {
+    int32_t fault = kind * s->count + anchor;
+    real y = s->evidence[fault];
+    real information = s->information[fault][fault];
+    return (y > REAL(0.0) ? REAL(1.0) : s->tuning.early_weight) * y * y / (information + REAL(1.0) /
+            square(s->tuning.late_std_m));
+}
+
+/* How much the fault of a single anchor explains at most. */
+INTERNAL real largest(State *s, int32_t kind) {
+    real most = REAL(0.0);
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        most = max_real(most, explained_alone(s, kind, anchor));
+    }
+    return most;
+}
+
+/* Adding faults to the state */
+
+/* Add faults to the state where the test of all of a kind is sure, of the kind that explains most.
+ *
+ * After a start that was contradicted, none are selected: any number of anchors may be late then, and those that
+ * explain the test are now and then the wrong ones. */
+INTERNAL void open_faults(State *s) {
+    real sure_chi2 = s->tuning.sure_chi2;
+    if (s->status.fault_std_m[LASTING] > s->tuning.lasting_std_m) {
+        return;
+    }
+    real lasting_chi2 = fault_chi2(s, LASTING, 0);
+    real creeping_chi2 = fault_chi2(s, CREEPING, 0);
+    real lasting = largest(s, LASTING);
+    real recent = largest(s, RECENT);
+    real creeping = largest(s, CREEPING);
+    if (creeping_chi2 > max_real(sure_chi2, lasting_chi2) && creeping > recent && creeping >= lasting) {
+        open_new_faults(s, CREEPING);
+    } else if (fault_chi2(s, RECENT, 0) > sure_chi2 && recent >= lasting) {
+        open_new_faults(s, RECENT);
+    } else if (lasting_chi2 > sure_chi2) {
+        open_lasting_faults(s, lasting_chi2);
+    }
+}
+
+/* Open the range errors of the anchors whose faults explain the innovations about as well as any other's.
+ *
+ * A single one opens by itself; where it is open which of several it is, the position uses none of them,
+ * as long as enough anchors are left. */
+INTERNAL void open_new_faults(State *s, int32_t kind) {
+    int32_t spare = s->count - s->dim - 1;
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        spare -= (int32_t)s->anchors[anchor].is_obstructed;
+        s->ph[anchor] = explained_alone(s, kind, anchor);
+    }
+    real limit = largest(s, kind) - s->tuning.rival_chi2;
+    int32_t first = 0;
+    while (spare > 0 && first >= 0) {
+        first = -1;
+        for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+            if (s->ph[anchor] > limit && (first < 0 || s->ph[anchor] > s->ph[first])) {
+                first = anchor;
+            }
+        }
+        if (first >= 0) {
+            s->ph[first] = REAL(0.0);
+            spare -= 1;
+            open_fault(s, kind, first);
+            begin_obstruction(s, first);
+        }
+    }
+}
+
+/* Note that an anchor's range error has jumped; it may still be changing. */
+INTERNAL void begin_obstruction(State *s, int32_t anchor) {
+    Anchor *a = &s->anchors[anchor];
+    a->outliers_in_row = 0;
+    a->is_obstructed = true;
+    a->change_mean = REAL(0.0);
+    a->change_scale = s->tuning.first_change_scale;
+    note_jump(s);
+}
+
+/* Range errors jump at present. */
+INTERNAL void note_jump(State *s) {
+    s->status.obstruction = min_real(s->status.obstruction + s->tuning.jump_rise, REAL(2.0));
+}
+
+/* Add the lasting faults of one or two anchors to the state, where no others explain the test as well. */
+INTERNAL void open_lasting_faults(State *s, real chi2) {
+    real rival_chi2 = s->tuning.rival_chi2;
+    for (int32_t faults = 1, faults_end = min_32(MAX_FAULTS, s->count - s->dim - 2) + 1; faults < faults_end; faults++)
+            {
+        int32_t first = -1;
+        int32_t second = -1;
+        real most = REAL(0.0);
+        real rival = REAL(0.0);
+        for (int32_t one = 0, one_end = s->count; one < one_end; one++) {
+            for (int32_t other = 0; other < one + 1; other++) {
+                if ((one == other) == (faults == 1)) {
+                    real explained = explained_chi2(s, one, other);
+                    if (explained > most) {
+                        const int32_t new_1 = one;
+                        const int32_t new_2 = other;
+                        const real new_3 = explained;
+                        const real new_4 = most;
+                        first = new_1;
+                        second = new_2;
+                        most = new_3;
+                        rival = new_4;
+                    } else if (explained > rival) {
+                        rival = explained;
+                    }
+                }
+            }
+        }
+        if (chi2 - most < rival_chi2 && most - rival > rival_chi2) {
+            open_lasting_fault(s, first);
+            if (faults == 2) {
+                open_lasting_fault(s, second);
+            }
+            return;
+        }
+    }
+}
+
+/* Add a lasting fault to the state, and note that the anchor has one. */
+INTERNAL void open_lasting_fault(State *s, int32_t anchor) {
+    open_fault(s, LASTING, anchor);
+    s->anchors[anchor].has_fault = true;
+}
+
+/* End a fault: an anchor's packets have been late since it joined, and are not any more. */
+INTERNAL void end_lasting_fault(State *s, int32_t anchor) {
+    open_fault(s, LASTING, anchor);
+    reset_state(s, s->layout.constant + anchor, square(s->settings.range_std_m));
+    note_jump(s);
+}
+
+/* Add a fault to its anchor's range error; all other hypotheses are conditioned on it (Schur's complement). */
+INTERNAL void open_fault(State *s, int32_t kind, int32_t anchor) {
+    bool is_lasting = kind == LASTING;
+    int32_t chosen = kind * s->count + anchor;
+    int32_t faults = FAULT_KINDS * s->count;
+    real *shared = s->fault_input;
+    make_uncertain(s, is_lasting ? ALL_RANGE_ERRORS : CHANGING_RANGE_ERRORS);
+    real gain = REAL(1.0) / (s->information[chosen][chosen] + REAL(1.0) / square(s->tuning.late_std_m));
+    real fault_m = gain * s->evidence[chosen];
+    real variance = is_lasting ? gain : gain + fault_m * fault_m;
+    real *opened = s->V[chosen];  /* what it adds to each state: 1 − V for the range error, −V for all others */
+    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+        opened[state] = -opened[state];
+    }
+    opened[(is_lasting ? s->layout.constant : s->layout.change) + anchor] += REAL(1.0);
+    for (int32_t one = 0, one_end = s->n; one < one_end; one++) {
+        s->x[one] += opened[one] * fault_m;
+        for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
+            s->P[one][other] += opened[one] * opened[other] * variance;
+        }
+    }
+    for (int32_t one = 0; one < faults; one++) {
+        shared[one] = s->information[one][chosen];
+    }
+    shared[chosen] = REAL(0.0);
+    for (int32_t one = 0; one < faults; one++) {
+        real share = gain * shared[one];
+        s->evidence[one] -= share * s->evidence[chosen];
+        for (int32_t other = 0; other < faults; other++) {
+            s->information[one][other] -= share * shared[other];
+        }
+        for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+            s->V[one][state] += share * opened[state];
+        }
+    }
+    s->evidence[chosen] = REAL(0.0);
+    for (int32_t one = 0; one < faults; one++) {
+        s->information[one][chosen] = REAL(0.0);
+        s->information[chosen][one] = REAL(0.0);
+    }
+    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+        opened[state] = REAL(0.0);
+    }
+    s->status.faults_opened += 1;
+}
+
+/* Which measurements are used, and how process noise is adapted to innovations.
+ *
+ * It must handle
+ *
+ * 1. single late receptions, as paths are blocked for a moment: the gate, which narrows where they are frequent;
+ * 2. an anchor behind an obstacle from now on, and its return: its range error jumps, and is estimated again;
+ * 3. a person or a wall that obstructs several anchors in turn: a jump raises the process noise of all range errors;
+ * 4. reflections that change as the tag walks: learnt from what range errors differ by from step to step;
+ * 5. a tag that moves more than assumed: innovations stay on one side along an axis;
+ * 6. the tag's oscillator that warms up, at once or slowly: innovations of all anchors are on one side;
+ * 7. an anchor's oscillator that warms up, or its counter that jumps: relays show it;
+ * 8. a tag that stands still, so that noise does not move it;
+ * 9. all that does not fit any of these: covariances grow with the mean NIS.
+ *
+ * Anchors that are late from the start, or ever more, without a jump are found by ``faults``. ``docs/estimator_table.md``
+ * says what each of these buys. */
+
+/* Beyond how many standard deviations a reception is more likely late than not. */
+INTERNAL real gate_of(State *s) {
+    real late = min_real(s->status.late_share, REAL(0.9));
+    real gate = s->settings.gate;
+    real odds = late * s->tuning.late_probability_density * ROOT_2_PI / (REAL(1.0) - late);
+    return odds > REAL(1e-06) ? min_real(gate, SQRT(-REAL(2.0) * log_(odds))) : gate;
+}
+
+/* Whether two packets of each anchor have been processed since the start. */
+INTERNAL bool is_warm(State *s) {
+    return s->status.packets > 2 * s->count;
+}
+
+/* Whether this reception and those before it show that an anchor's range error has jumped. */
+INTERNAL bool has_jumped(State *s, int32_t anchor, real innovation, real innovation_variance) {
+    Anchor *a = &s->anchors[anchor];
+    Status *status = &s->status;
+    Tuning *tuning = &s->tuning;
+    EstimatorSettings *settings = &s->settings;
+    int32_t clear = 0;
+    for (int32_t other = 0, other_end = s->count; other < other_end; other++) {
+        clear += (int32_t)!s->anchors[other].is_obstructed;
+    }
+    bool is_easy = clear > s->dim + 1 && a->walk_scale <= tuning->steady_walk_scale;
+    real share = is_easy ? jump_share(s) : REAL(0.0);  /* else clocks, which all anchors share or which wander, would open all */
+    real suspect = tuning->suspect + share * (tuning->obstructed_suspect - tuning->suspect);
+    real together = tuning->together + share * (tuning->obstructed_together - tuning->together);
+    if (innovation * innovation <= suspect * suspect * innovation_variance) {
+        a->outliers_in_row = 0;
+    } else {
+        real stamps = REAL(2.0) * (settings->tx_variance_m2 + settings->rx_variance_m2);
+        real apart = innovation - a->outlier_m;
+        real both = innovation + a->outlier_m;
+        bool agrees = a->outliers_in_row > 0 && apart * apart <= square(tuning->suspect) * stamps;
+        agrees = agrees && both * both > together * together * innovation_variance;
+        a->outliers_in_row = agrees ? a->outliers_in_row + 1 : 1;
+        a->outlier_m = innovation;
+    }
+    bool often = status->late_share > tuning->late_often_share;
+    return (real)a->outliers_in_row >= (often ? tuning->in_row_where_late : tuning->in_row);
+}
+
+/* Whether the newest innovations of all anchors but one, which may show nothing, lie on the side of this one.
+ *
+ * The tag's clock it is then. A faulty anchor draws the others to the opposite side of its own. */
+INTERNAL bool is_common(State *s, real normalised) {
+    int32_t others = 0;
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        real newest = s->anchors[anchor].innovation;
+        if (abs_real(newest) <= s->tuning.common) {
+            others += 1;
+        } else if (newest * normalised <= REAL(0.0)) {
+            others += 2;
+        }
+    }
+    return s->count > s->dim && others <= 1;
+}
+
+/* Let an anchor's range error be estimated again from a jump on. */
+INTERNAL void open_range_error(State *s, int32_t anchor, real innovation) {
+    int32_t change = s->layout.change + anchor;
+    s->status.obstructions += 1;
+    begin_obstruction(s, anchor);
+    s->P[change][change] += max_real(square(s->tuning.jump_std_m), innovation * innovation);
+    make_uncertain(s, CHANGING_RANGE_ERRORS);
+}
+
+/* Adapt the process noise of an obstructed anchor's range error to an innovation. */
+INTERNAL void adapt_change_noise(State *s, int32_t anchor, real normalised) {
+    Tuning *tuning = &s->tuning;
+    Anchor *a = &s->anchors[anchor];
+    a->change_mean += tuning->mean_gain * (normalised - a->change_mean);
+    if (is_off_zero(s, a->change_mean)) {
+        a->change_scale = min_real(a->change_scale * tuning->change_growth, tuning->max_scale);
+    } else {
+        a->change_scale = max_real(a->change_scale * tuning->change_loss, REAL(1.0));
+    }
+}
+
+/* Whether a running mean of normalised innovations is further off zero than chance makes it. */
+INTERNAL bool is_off_zero(State *s, real mean) {
+    real gain = s->tuning.mean_gain;
+    return mean * mean * (REAL(2.0) - gain) / gain > s->tuning.mean_limit;
+}
+
+/* End an obstruction that has gone without a jump back: the range error is known, and is hardly there. */
+INTERNAL void end_small_obstruction(State *s, int32_t anchor) {
+    Tuning *tuning = &s->tuning;
+    Anchor *a = &s->anchors[anchor];
+    int32_t change = s->layout.change + anchor;
+    real error_m = s->x[change];
+    real variance = s->P[change][change];
+    real usual = s->status.place_variance_m2;
+    bool settled = a->is_obstructed && variance < square(tuning->ended_std_m) + usual;
+    if (settled && error_m * error_m < square(tuning->ended) * (variance + usual)) {
+        a->is_obstructed = false;
+        s->status.ends_of_obstructions += 1;
+    }
+}
+
+/* Factor on an innovation's variance; 0 if the measurement is not to be used. Counts it.
+ *
+ * Large innovations have less weight where receptions are late often, and always in time differences, of which
+ * either anchor may be late. */
+INTERNAL real variance_scale(State *s, real innovation, real innovation_variance, bool is_difference) {
+    Status *status = &s->status;
+    Tuning *tuning = &s->tuning;
+    EstimatorSettings *settings = &s->settings;
+    real forgetting = tuning->forgetting;
+    real normalised = innovation / SQRT(innovation_variance);
+    bool is_beyond = !(-settings->gate <= normalised && normalised <= settings->gate);
+    real beyond = is_beyond ? REAL(1.0) : REAL(0.0);
+    if (!is_difference) {
+        status->late_share += tuning->late_forgetting * (beyond - status->late_share);
+    }
+    status->rejected_share += forgetting * (beyond - status->rejected_share);
+    if (is_beyond || (!is_difference && normalised > gate_of(s))) {
+        status->rejected += 1;
+        status->rejected_in_row += (int32_t)is_beyond;
+        return REAL(0.0);
+    }
+    status->accepted += 1;
+    status->rejected_in_row = 0;
+    status->mean_nis += forgetting * (normalised * normalised - status->mean_nis);
+    status->mean_square_m2 += forgetting * (innovation * innovation - status->mean_square_m2);
+    if (is_difference) {
+        return max_real(REAL(1.0), abs_real(normalised) / tuning->difference_huber);
+    }
+    if (status->late_share > tuning->late_often_share) {
+        return max_real(REAL(1.0), abs_real(normalised) / tuning->reception_huber);
+    }
+    return REAL(1.0);
+}
+
+/* Let the variance of an anchor's changing range error track its estimate: the mean of its square.
+ *
+ * The maximisation step of expectation maximisation (Shumway and Stoffer 1982) with a memory that fades. */
+INTERNAL void adapt_change_variance(State *s, int32_t anchor, real elapsed_s) {
+    Tuning *tuning = &s->tuning;
+    EstimatorSettings *settings = &s->settings;
+    Anchor *a = &s->anchors[anchor];
+    real memory_s = settings->change_memory_s;
+    if (memory_s > REAL(0.0)) {
+        int32_t change = s->layout.change + anchor;
+        real present = square(s->x[change]) + s->P[change][change];
+        real variance = a->change_variance_m2 + min_real(elapsed_s / memory_s, REAL(0.5)) * (present -
+                a->change_variance_m2);
+        variance = max_real(variance, square(settings->least_change_std_m));
+        a->change_variance_m2 = min_real(variance, square(tuning->max_change_std_m));
+    }
+}
+
+/* Learn how range errors change with the distance walked, from what they differ by after one and two steps.
+ *
+ * Half the mean square of the differences is noise + σ²·(1 − c) after one step and noise + σ²·(1 − c²) after two, for
+ * a Gauss–Markov process of variance σ² with the correlation c over a step (a semivariogram, Matheron 1963). */
+INTERNAL void learn_place(State *s, int32_t anchor, real residual_m) {
+    Tuning *tuning = &s->tuning;
+    EstimatorSettings *settings = &s->settings;
+    Status *status = &s->status;
+    Anchor *a = &s->anchors[anchor];
+    real step_m = status->walked_m - a->place_walked_m;
+    if (step_m < tuning->place_step_m) {
+        return;
+    }
+    a->place_steps = step_m < REAL(2.0) * tuning->place_step_m ? a->place_steps + 1 : 0;
+    if (a->place_steps >= 2) {
+        status->place_samples = min_64(status->place_samples + 1, truncated(tuning->place_memory));
+        for (int32_t lag = 0; lag < 2; lag++) {
+            real half = REAL(0.5) * square(residual_m - a->place_residual_m[lag]);
+            real mean = status->place_square_m2[lag];
+            real limited = min_real(half, tuning->place_limit * mean) / tuning->place_limited_mean;
+            status->place_square_m2[lag] += (limited - mean) / (tuning->place_first + (real)status->place_samples);
+        }
+    }
+    a->place_residual_m[1] = a->place_residual_m[0];
+    a->place_residual_m[0] = residual_m;
+    a->place_walked_m = status->walked_m;
+    real noise = settings->tx_variance_m2 + settings->rx_variance_m2;
+    real near = status->place_square_m2[0] - noise;
+    real far = status->place_square_m2[1] - noise;
+    status->place_variance_m2 = REAL(0.0);
+    status->place_distance_m = settings->place_distance_m;
+    if ((real)status->place_samples >= tuning->place_samples && near > tuning->place_min_m2) {
+        real kept = min_real(max_real(far / near - REAL(1.0), tuning->place_kept), REAL(1.0) - tuning->place_kept);
+        real variance = min_real(near / (REAL(1.0) - kept), square(tuning->max_change_std_m));
+        if (variance > square(settings->place_std_m)) {
+            status->place_variance_m2 = variance;
+            status->place_distance_m = -tuning->place_step_m / log_(kept);
+        }
+    }
+}
+
+/* Count for how long the tag has shown no motion: neither its position, nor innovations that stay on one side. */
+INTERNAL void update_stationary(State *s, real dt) {
+    Status *status = &s->status;
+    Tuning *tuning = &s->tuning;
+    real chi2 = REAL(0.0);
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        chi2 += square(s->x[axis] - status->stationary_m[axis]) / s->P[axis][axis];
+    }
+    status->stationary_s += dt;
+    bool moved = chi2 > (real)s->dim || status->lag_square > tuning->lag_limit || status->rejected_in_row > 1;
+    if (moved) {
+        status->stationary_s = REAL(0.0);
+    }
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {  /* a place that has become known better moves as well */
+        if (moved || s->P[axis][axis] < tuning->better_known * status->stationary_m2[axis]) {
+            status->stationary_m[axis] = s->x[axis];
+            status->stationary_m2[axis] = s->P[axis][axis];
+        }
+    }
+}
+
+/* Adapt the process noise of the tag's motion and clock to an innovation.
+ *
+ * The direction to the anchor stands in ``h``, the first of the measurement's terms. */
+INTERNAL void adapt_process_noise(State *s, real normalised) {
+    Tuning *tuning = &s->tuning;
+    Status *status = &s->status;
+    real gain = tuning->mean_gain;
+    real lag_square = REAL(0.0);
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        status->lag[axis] += gain * (s->h[axis] * normalised - status->lag[axis]);
+        lag_square += square(status->lag[axis]);
+    }
+    lag_square *= (REAL(2.0) - gain) / gain;
+    status->lag_square += tuning->lag_forgetting * (lag_square - status->lag_square);
+    if (status->lag_square > tuning->lag_limit) {
+        status->q_scale = min_real(status->q_scale * tuning->q_scale_gain, tuning->max_scale);
+    } else {
+        status->q_scale = max_real(status->q_scale * tuning->scale_loss, REAL(1.0));
+    }
+    status->common_mean += gain * (normalised - status->common_mean);
+    status->walk_scale = walk_scale(s, status->walk_scale, status->common_mean);
+}
+
+/* Adapt the process noise of an anchor's clock to what a relay shows of it. */
+INTERNAL void adapt_clock_noise(State *s, int32_t anchor, real normalised) {
+    Anchor *a = &s->anchors[anchor];
+    a->relay_mean += s->tuning.mean_gain * (normalised - a->relay_mean);
+    a->walk_scale = walk_scale(s, a->walk_scale, a->relay_mean);
+}
+
+/* Factor on the random walk of a clock: it grows while the running mean of its innovations is off zero. */
+INTERNAL real walk_scale(State *s, real scale, real mean) {
+    Tuning *tuning = &s->tuning;
+    scale *= is_off_zero(s, mean) ? tuning->walk_scale_gain : tuning->scale_loss;
+    return min_real(max_real(scale, REAL(1.0)), s->settings.max_walk_scale);
+}
+
+/* Factor on the position's covariance while innovations are larger than the filter expects.
+ *
+ * Most of an innovation is the stamps' noise, so the state errs by more than the innovations show. */
+INTERNAL real covariance_scale(State *s) {
+    real nis = s->status.mean_nis;
+    return nis > s->tuning.inconsistent_nis ? nis * nis : REAL(1.0);
+}
+
+/* Protection levels: how wrong a position may be, even if receptions are late (``docs/maths.md`` section 8).
+ *
+ * Hypothesis: the tag's receptions of every anchor are late (or early) by a constant of its own, all at once. With the
+ * faults b̂ and their sensitivities V (``faults``) the estimate under the hypothesis and its covariance are
+ *
+ *     x + V·b̂        P + V·(M + I/σ_f²)⁻¹·Vᵀ
+ *
+ * so the error exceeds |V·b̂| + k·σ with the stated risk only, whichever anchors are at fault. Three kinds are considered:
+ * constants since an anchor joined, what has begun recently, and what grows for seconds. What is larger than σ_f shows, as
+ * a jump or in yᵀ·(M + I/σ_f²)⁻¹·y, which is χ² without faults; then there is no number. */
+
+/* Write the levels in metres and the tests of faults. */
+INTERNAL void protect(State *s) {
+    EstimatorSettings *settings = &s->settings;
+    real *levels = s->levels;
+    real scale = covariance_scale(s);
+    levels[VPL] = REAL(0.0);
+    levels[HPL] = REAL(0.0);
+    for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
+        levels[FIRST_TEST + kind] = fault_chi2(s, kind, s->dim);
+        real *faults = s->work[s->count];
+        real *x = s->work[s->count + 1];
+        real *y = s->work[s->count + 2];
+        real *z = s->work[s->count + 3];
+        real shift_x = REAL(0.0);
+        real shift_y = REAL(0.0);
+        real shift_z = REAL(0.0);
+        real xx = scale * s->P[0][0];
+        real xy = scale * s->P[0][1];
+        real yy = scale * s->P[1][1];
+        real zz = REAL(0.0);
+        for (int32_t one = 0, one_end = s->count; one < one_end; one++) {
+            shift_x += x[one] * faults[one];
+            shift_y += y[one] * faults[one];
+            xx += x[one] * x[one];
+            xy += x[one] * y[one];
+            yy += y[one] * y[one];
+            if (s->dim == 3) {
+                shift_z += z[one] * faults[one];
+                zz += z[one] * z[one];
+            }
+        }
+        real largest = REAL(0.5) * (xx + yy) + SQRT(REAL(0.25) * square(xx - yy) + xy * xy);
+        levels[HPL] = max_real(levels[HPL], hypot_(shift_x, shift_y) + s->horizontal_k * SQRT(largest));
+        if (s->dim == 3) {
+            levels[VPL] = max_real(levels[VPL], abs_real(shift_z) + s->vertical_k * SQRT(scale * s->P[2][2] + zz));
+        }
+    }
+    real squared = REAL(0.0);
+    real up = REAL(0.0);
+    for (int32_t row = FAULT_KINDS * s->count, row_end = FAULT_KINDS * s->count + s->dim; row < row_end; row++) {
+        squared += square(s->V[row][0]) + square(s->V[row][1]);
+        if (s->dim == 3) {
+            up += square(s->V[row][2]);
+        }
+    }
+    levels[HPL] += settings->max_acceleration_mps2 * SQRT(squared);
+    levels[VPL] += settings->max_acceleration_mps2 * SQRT(up);
+}
+
+/* The largest test of faults, χ² with as many degrees of freedom as there are anchors if there are none. */
+INTERNAL real largest_test(State *s) {
+    real largest = REAL(0.0);
+    for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
+        largest = max_real(largest, s->levels[FIRST_TEST + kind]);
+    }
+    return largest;
+}
+
+/* Whether the anchors determine on which side of them the tag is */
+
+/* Find the plane of least squares through the anchors; where the height is given, the line on the floor plan. */
+SKYLESS_EXPORT void skyless_fit_plane(State *s) {
+    Status *status = &s->status;
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        status->plane_normal[axis] = REAL(0.0);
+        status->plane_m[axis] = REAL(0.0);
+    }
+    if (s->count < s->dim) {
+        return;
+    }
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+            status->plane_m[axis] += s->anchors[anchor].position_m[axis] / (real)s->count;
+        }
+    }
+    for (int32_t one = 0, one_end = s->dim; one < one_end; one++) {
+        for (int32_t other = 0, other_end = s->dim; other < other_end; other++) {
+            s->work[one][other] = REAL(0.0);
+        }
+    }
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        real *position_m = s->anchors[anchor].position_m;
+        for (int32_t one = 0, one_end = s->dim; one < one_end; one++) {
+            for (int32_t other = 0, other_end = s->dim; other < other_end; other++) {
+                s->work[one][other] += (position_m[one] - status->plane_m[one]) * (position_m[other] -
+                        status->plane_m[other]);
+            }
+        }
+    }
+    find_least_axis(s, s->dim);
+}
+
+/* Write the axis along which the symmetric matrix in ``work`` is smallest into the plane's normal (Jacobi 1846). */
+INTERNAL void find_least_axis(State *s, int32_t dim) {
+    real (*M)[32] = s->work;
+    int32_t axes = AXES;
+    for (int32_t one = 0; one < dim; one++) {
+        for (int32_t other = 0; other < dim; other++) {
+            M[axes + one][other] = one == other ? REAL(1.0) : REAL(0.0);
+        }
+    }
+    for (int32_t time_1 = 0; time_1 < SWEEPS; time_1++) {
+        for (int32_t one = 0; one < dim; one++) {
+            for (int32_t other = 0; other < one; other++) {
+                if (M[one][other] != REAL(0.0)) {
+                    rotate(s, dim, one, other);
+                }
+            }
+        }
+    }
+    int32_t least = 0;
+    for (int32_t axis = 0; axis < dim; axis++) {
+        if (M[axis][axis] < M[least][least]) {
+            least = axis;
+        }
+    }
+    for (int32_t axis = 0; axis < dim; axis++) {
+        s->status.plane_normal[axis] = M[axes + axis][least];
+    }
+}
+
+/* Rotate two axes of the matrix in ``work`` so that their common element becomes zero. */
+INTERNAL void rotate(State *s, int32_t dim, int32_t one, int32_t other) {
+    real (*M)[32] = s->work;
+    real half = REAL(0.5) * (M[other][other] - M[one][one]) / M[one][other];
+    real tangent = (half >= REAL(0.0) ? REAL(1.0) : -REAL(1.0)) / (abs_real(half) + SQRT(half * half + REAL(1.0)));
+    real cosine = REAL(1.0) / SQRT(tangent * tangent + REAL(1.0));
+    real sine = tangent * cosine;
+    for (int32_t row = 0; row < AXES + dim; row++) {  /* columns, and of the axes behind the matrix as well */
+        if (row < dim || row >= AXES) {
+            real kept = M[row][one];
+            M[row][one] = cosine * kept - sine * M[row][other];
+            M[row][other] = sine * kept + cosine * M[row][other];
+        }
+    }
+    for (int32_t column = 0; column < dim; column++) {
+        real kept = M[one][column];
+        M[one][column] = cosine * kept - sine * M[other][column];
+        M[other][column] = sine * kept + cosine * M[other][column];
+    }
+    M[other][one] = REAL(0.0);
+    M[one][other] = REAL(0.0);
+}
+
+/* Whether the tag and its mirror image behind the anchors' plane, or in 2-D their line, explain the ranges alike.
+ *
+ * Range errors make up for what the tag's clock and a shift of the image, by least squares, leave of the difference.
+ * Not where the image lies where the tag cannot be, nor while a sensor measures the height. */
+INTERNAL bool is_side_open(State *s) {
+    Status *status = &s->status;
+    Tuning *tuning = &s->tuning;
+    EstimatorSettings *settings = &s->settings;
+    int32_t dim = s->dim;
+    if ((real)(status->epoch_ticks - status->height_ticks) * TICK_S < tuning->sensor_valid_s) {
+        return false;
+    }
+    real *normal = status->plane_normal;
+    real off_m = REAL(0.0);
+    for (int32_t axis = 0; axis < dim; axis++) {
+        off_m += normal[axis] * (s->x[axis] - status->plane_m[axis]);
+    }
+    real image_z_m = s->x[2] - REAL(2.0) * off_m * normal[2];
+    bool is_near = off_m * off_m * square(normal[2]) <= s->P[2][2];
+    if (dim == 3 && !((settings->lowest_m <= image_z_m && image_z_m <= settings->highest_m) || is_near)) {
+        return false;
+    }
+    real variance = square(settings->range_std_m) + square(settings->survey_std_m) + settings->rx_variance_m2;
+    return left_by_image(s, off_m, variance) < tuning->apart_chi2 * variance;
+}
+
+/* What the tag's clock and a shift of the image leave of the ranges' difference: the sum of squares [m²].
+ *
+ * ``off_m``: from the plane to the tag; ``variance``: of a range. */
+INTERNAL real left_by_image(State *s, real off_m, real variance) {
+    EstimatorSettings *settings = &s->settings;
+    int32_t dim = s->dim;
+    real *normal = s->status.plane_normal;
+    real left = REAL(0.0);
+    if (s->count <= dim) {
+        return left;
+    }
+    real probe_m = max_real(abs_real(off_m), s->tuning.probe_m) * (off_m > REAL(0.0) ? REAL(1.0) : -REAL(1.0));
+    real *information = s->work[dim + 1];
+    real *seen = s->work[dim + 2];
+    for (int32_t one = 0; one < dim + 2; one++) {
+        for (int32_t other = 0; other < dim + 1; other++) {
+            s->work[one][other] = REAL(0.0);
+        }
+    }
+    for (int32_t one = 0; one < dim; one++) {
+        s->work[one][one] = variance / square(s->tuning.shift_part * probe_m);
+    }
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        real *position_m = s->anchors[anchor].position_m;
+        real tag_m2 = dim == 3 ? REAL(0.0) : square(settings->height_m - position_m[2]);
+        real image_m2 = tag_m2;
+        for (int32_t axis = 0; axis < dim; axis++) {
+            real foot_m = s->x[axis] - off_m * normal[axis] - position_m[axis];
+            seen[axis] = foot_m - probe_m * normal[axis];
+            tag_m2 += square(foot_m + probe_m * normal[axis]);
+            image_m2 += square(foot_m - probe_m * normal[axis]);
+        }
+        real apart_m = SQRT(image_m2) - SQRT(tag_m2);
+        real image_m = SQRT(image_m2);
+        for (int32_t axis = 0; axis < dim; axis++) {
+            seen[axis] /= image_m;
+        }
+        seen[dim] = REAL(1.0);
+        left += apart_m * apart_m;
+        for (int32_t one = 0; one < dim + 1; one++) {
+            information[one] += seen[one] * apart_m;
+            for (int32_t other = 0; other < one + 1; other++) {
+                s->work[one][other] += seen[one] * seen[other];
+            }
+        }
+    }
+    whiten(s, dim + 1, 1);
+    for (int32_t one = 0; one < dim + 1; one++) {
+        left -= square(information[one]);
+    }
+    return left;
+}
+
+/* Whether a position can be relied on */
+
+/* Whether a position's levels can be relied on: ``SOUND``, ``OBSTRUCTED``, ``CONTRADICTED`` or ``UNAVAILABLE``. */
+INTERNAL int32_t integrity_state(State *s) {
+    Status *status = &s->status;
+    Tuning *tuning = &s->tuning;
+    int32_t state = SOUND;
+    real range_m = REAL(0.0);
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        range_m += s->anchors[anchor].range_m / (real)s->count;
+        if (s->anchors[anchor].is_obstructed || s->anchors[anchor].has_fault) {
+            state = OBSTRUCTED;
+        }
+    }
+    bool was_contradicted = status->fault_std_m[LASTING] > tuning->lasting_std_m;  /* then none are selected */
+    real limit = was_contradicted ? tuning->sure_chi2 : tuning->uncovered_chi2;
+    real share = SQRT(s->P[0][0] + s->P[1][1]) / max_real(range_m, REAL(1e-06));  /* levels are of first order in it */
+    if (status->withholds_levels || largest_test(s) > limit) {
+        state = CONTRADICTED;
+    }
+    if (was_contradicted && (real)(status->epoch_ticks - status->start_ticks) * TICK_S < tuning->contradicted_start_s) {
+        state = CONTRADICTED;
+    }
+    if (status->has_open_ranges && share > tuning->max_open_level_std) {
+        state = CONTRADICTED;
+    }
+    bool is_new = s->count <= s->dim || !is_warm(s);
+    if (is_new || share > tuning->curved_std || is_side_open(s)) {
+        state = UNAVAILABLE;
+    }
+    return state;
+}
+
+/* The kinds of measurements. Each is linearised at the state, gated, and processed by one scalar update.
+ *
+ *     own reception    R − T  =  |p − a| + b + w + range errors + noise                  (the tag receives an anchor)
+ *     relay            S − T  =  |aᵢ − aⱼ| + bⱼ − bᵢ + wⱼ + pair's constant + noise      (anchor i received anchor j)
+ *     report           bₘ − bᵢ as anchor i knows it                                       (its clock against the master's)
+ *     difference       |p − b| − |p − a| + range errors + noise                           (ready-made, of a pair)
+ *     height           z                                                                  (a sensor of the tag's)
+ *     zero velocity    v                                                                  (the tag stands still)
+ *
+ * with offsets b, TX noise w, all in metres. ``docs/maths.md`` section 6 derives them. */
+
+/* The terms of a measurement */
+
+/* The measurement holds so much of a state. */
+INTERNAL void add_term(State *s, int32_t state, real weight) {
+    s->h[s->terms] = weight;
+    s->h_index[s->terms] = state;
+    s->terms += 1;
+}
+
+/* h·x of the terms from ``begin`` on. */
+INTERNAL real h_dot_x(State *s, int32_t begin) {
+    real total = REAL(0.0);
+    for (int32_t term = begin, term_end = s->terms; term < term_end; term++) {
+        total += s->h[term] * s->x[s->h_index[term]];
+    }
+    return total;
+}
+
+/* Terms of a distance: the position, the anchor's survey error and, in two dimensions, the height's error. */
+INTERNAL int32_t direction_terms(State *s) {
+    return s->dim + 3;
+}
+
+/* The measurement holds the distance to an anchor, by the unit vector from there; returns the distance.
+ *
+ * The anchor's survey error follows with the opposite sign, and the height's: ``_direction_terms`` in all. The vector
+ * is that of the held point, of the surveyed anchor and of the given height: were it that of the newest estimate, its
+ * noise would seem to give information on what the ranges leave open. */
+INTERNAL real add_direction(State *s, int32_t anchor, real sign) {
+    Layout *where = &s->layout;
+    Anchor *a = &s->anchors[anchor];
+    int32_t survey = where->survey + s->dim * anchor;
+    real squared = REAL(0.0);
+    real up_m = REAL(0.0);
+    hold_direction(s, anchor);
+    if (s->dim == 2) {
+        up_m = s->settings.height_m - a->position_m[2];
+        squared += square(up_m + s->x[where->height]);
+    }
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        squared += square(s->x[axis] - a->position_m[axis] - s->x[survey + axis]);
+        add_term(s, axis, sign * (a->held_m[axis] - a->position_m[axis]) / a->held_range_m);
+    }
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        add_term(s, survey + axis, -(sign * (a->held_m[axis] - a->position_m[axis]) / a->held_range_m));
+    }
+    if (s->dim == 2) {
+        add_term(s, where->height, sign * up_m / a->held_range_m);
+    }
+    return max_real(SQRT(squared), REAL(1e-06));
+}
+
+/* Move the point at which ranges to an anchor are linearised onto the estimate, once that is far enough away. */
+INTERNAL void hold_direction(State *s, int32_t anchor) {
+    Tuning *tuning = &s->tuning;
+    Anchor *a = &s->anchors[anchor];
+    real moved_m2 = REAL(0.0);
+    real squared = REAL(0.0);
+    real variance = REAL(0.0);
+    if (s->dim == 2) {
+        squared += square(s->settings.height_m - a->position_m[2]);
+    }
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        moved_m2 += square(s->x[axis] - a->held_m[axis]);
+        squared += square(s->x[axis] - a->position_m[axis]);
+        variance += s->P[axis][axis];
+    }
+    real step_m2 = max_real(min_real(square(tuning->suspect) * variance, square(tuning->held_max_m)),
+            square(tuning->held_step_m));
+    if (s->status.range_errors == NO_RANGE_ERRORS) {
+        step_m2 = REAL(0.0);  /* ranges leave nothing open that noise could seem to measure */
+    }
+    if (a->held_range_m == REAL(0.0) || moved_m2 > step_m2) {
+        for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+            a->held_m[axis] = s->x[axis];
+        }
+        a->held_range_m = max_real(SQRT(squared), REAL(1e-06));
+    }
+}
+
+/* The measurement holds an anchor's range errors: the part that changes, the part that stays, and the slope. */
+INTERNAL void add_range_errors(State *s, int32_t anchor, real sign) {
+    Layout *where = &s->layout;
+    real from_m = s->tuning.slope_from_m;
+    add_term(s, where->change + anchor, sign);
+    add_term(s, where->constant + anchor, sign);
+    real far = min_real(max_real((s->anchors[anchor].held_range_m - from_m) / from_m, -REAL(1.0)), REAL(1.0));
+    add_term(s, where->slope, sign * far);
+}
+
+/* Half the position's variance across the direction, over the range: what the range is longer by on average.
+ *
+ * The second term of its Taylor series, with the variance 2·bend² (Jazwinski 1970, section 9.3); 0 where that is
+ * small compared with that of the stamps. The direction stands in the first terms of the measurement. */
+INTERNAL real find_curvature_m(State *s, real range_m, real variance) {
+    real across = REAL(0.0);
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        across += s->P[axis][axis];
+    }
+    real least = s->tuning.curvature_share * variance * range_m * range_m;
+    if (REAL(0.5) * across * across >= least) {
+        for (int32_t one = 0, one_end = s->dim; one < one_end; one++) {
+            for (int32_t other = 0, other_end = s->dim; other < other_end; other++) {
+                across -= s->h[one] * s->P[one][other] * s->h[other];
+            }
+        }
+    }
+    return REAL(0.5) * across * across >= least ? REAL(0.5) * across / range_m : REAL(0.0);
+}
+
+/* The tag receives an anchor */
+
+/* Write the tag's reception of an anchor into ``h``; returns their distance. */
+INTERNAL real reception_terms(State *s, int32_t anchor, bool has_tx_noise) {
+    s->terms = 0;
+    real range_m = add_direction(s, anchor, REAL(1.0));
+    add_term(s, s->layout.offset + anchor, REAL(1.0));
+    if (has_tx_noise) {
+        add_term(s, s->layout.tx_noise + anchor, REAL(1.0));
+    }
+    add_range_errors(s, anchor, REAL(1.0));
+    return range_m;
+}
+
+/* Process the tag's reception of an anchor's packet: ``USED``, ``UNUSED`` or ``CLOCK_JUMPED``.
+ *
+ * R − T = |p − a − δa| + b + w + change + constant + slope·far + noise. A reception whose path looks blocked has
+ * its variance multiplied; it is gated as any other, as it is late rather than noisy. */
+INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks, real variance_factor) {
+    Tuning *tuning = &s->tuning;
+    EstimatorSettings *settings = &s->settings;
+    Status *status = &s->status;
+    Layout *where = &s->layout;
+    Anchor *a = &s->anchors[anchor];
+    real elapsed_s = (real)(rx_ticks - a->rx_ticks) * TICK_S;
+    relax_range_error(s, anchor, elapsed_s, status->walked_m - a->walked_m);
+    real rx_variance = settings->rx_variance_m2;
+    a->has_tx_noise = a->is_relayed;
+    if (a->is_relayed) {
+        reset_state(s, where->tx_noise + anchor, settings->tx_variance_m2);
+    } else {
+        rx_variance += settings->tx_variance_m2;
+    }
+    real range_m = reception_terms(s, anchor, a->is_relayed);
+    real curvature_m = find_curvature_m(s, range_m, rx_variance);
+    rx_variance += REAL(2.0) * curvature_m * curvature_m;
+    real expected_m = range_m + curvature_m + h_dot_x(s, direction_terms(s));
+    real innovation = (real)(rx_ticks - tx_ticks - a->offset_ticks) * TICK_M - expected_m;
+    real innovation_variance = compute_ph(s) + rx_variance;
+    a->range_m = range_m;
+    a->innovation = innovation / SQRT(innovation_variance);
+    if (status->late_share <= tuning->late_often_share) {  /* late packets are no multipath */
+        learn_place(s, anchor, innovation + s->x[where->change + anchor]);
+    }
+    if (is_warm(s) && abs_real(a->innovation) > tuning->common && is_common(s, a->innovation)) {
+        status->walk_scale = settings->max_walk_scale;
+        a->outliers_in_row = 0;
+    } else if (is_warm(s) && has_jumped(s, anchor, innovation, innovation_variance)) {
+        if ((real)a->relay_outliers_in_row >= tuning->relays_in_row) {
+            return CLOCK_JUMPED;
+        }
+        innovation = jump(s, anchor, innovation, rx_variance);
+        innovation_variance = compute_ph(s) + rx_variance;
+    }
+    real scale = variance_scale(s, innovation, innovation_variance, false);
+    if (scale > REAL(0.0)) {
+        end_small_obstruction(s, anchor);
+        real normalised = innovation / SQRT(innovation_variance);
+        if (a->is_obstructed) {
+            adapt_change_noise(s, anchor, normalised);
+        }
+        if (is_warm(s)) {
+            adapt_process_noise(s, normalised / scale);
+        }
+        real used_variance = innovation_variance * scale + (variance_factor - REAL(1.0)) * settings->rx_variance_m2;
+        compute_fault_input(s, anchor);
+        gather_evidence(s, innovation, used_variance);
+        update(s, innovation, used_variance, REAL(1.0));
+        adapt_change_variance(s, anchor, elapsed_s);
+    }
+    carry_ticks(s, anchor);
+    return scale > REAL(0.0) ? USED : UNUSED;
+}
+
+/* Carry whole ticks of an offset to where they stand. */
+INTERNAL void carry_ticks(State *s, int32_t anchor) {
+    int32_t offset = s->layout.offset + anchor;
+    int64_t steps = floor_real(s->x[offset] / TICK_M);
+    s->anchors[anchor].offset_ticks += steps;
+    s->x[offset] -= (real)steps * TICK_M;
+}
+
+/* An anchor's range error has jumped: back to what it was before it was obstructed, or to something new.
+ *
+ * Obstacles make packets late: an early jump of an anchor that is not known to be obstructed ends an obstruction that
+ * has been there since it joined, and all its earlier receptions are considered again.
+ *
+ * Returns the innovation that is left. */
+INTERNAL real jump(State *s, int32_t anchor, real innovation, real rx_variance) {
+    Anchor *a = &s->anchors[anchor];
+    Tuning *tuning = &s->tuning;
+    if (innovation < REAL(0.0)) {
+        real before_m = h_dot_x(s, 0);
+        if (a->is_obstructed) {
+            real variance = a->change_variance_m2 + jump_share(s) * square(tuning->obstructed_std_m);
+            reset_state(s, s->layout.change + anchor, variance);
+        } else {
+            end_lasting_fault(s, anchor);
+        }
+        innovation += before_m - h_dot_x(s, 0);
+        a->is_obstructed = false;
+        a->outliers_in_row = 0;
+        s->status.ends_of_obstructions += 1;
+        if (innovation * innovation <= square(s->settings.gate) * (compute_ph(s) + rx_variance)) {
+            return innovation;
+        }
+    }
+    open_range_error(s, anchor, innovation);
+    return innovation;
+}
+
+/* Initialise an anchor's clock: the limit of an update of an offset of which nothing was known.
+ *
+ * All errors of the position and of the range are then in the offset. */
+INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks) {
+    EstimatorSettings *settings = &s->settings;
+    Layout *where = &s->layout;
+    Anchor *a = &s->anchors[anchor];
+    int32_t offset = where->offset + anchor;
+    int32_t noise = where->tx_noise + anchor;
+    reset_state(s, noise, settings->tx_variance_m2);
+    reset_state(s, where->rate + anchor, CLOCK_RATE_VARIANCE);
+    reset_state(s, offset, REAL(0.0));
+    s->terms = 0;
+    real range_m = add_direction(s, anchor, REAL(1.0));
+    add_term(s, noise, REAL(1.0));
+    add_range_errors(s, anchor, REAL(1.0));
+    real variance = settings->rx_variance_m2;
+    real curvature_m = find_curvature_m(s, range_m, variance);
+    variance += REAL(2.0) * curvature_m * curvature_m + compute_ph(s);
+    compute_fault_input(s, anchor);
+    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+        s->P[state][offset] = -s->ph[state];
+        s->P[offset][state] = -s->ph[state];
+    }
+    s->P[offset][offset] = variance;
+    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+        s->V[fault][offset] = s->fault_input[fault];
+    }
+    a->offset_ticks = rx_ticks - tx_ticks - floor_real(range_m / TICK_M);
+    real rest_m = (real)(rx_ticks - tx_ticks - a->offset_ticks) * TICK_M;
+    s->x[offset] = rest_m - range_m - curvature_m - h_dot_x(s, direction_terms(s));
+    a->has_tx_noise = true;
+    a->range_m = range_m;
+}
+
+/* An anchor received another */
+
+/* Write an anchor's reception of another, ``age_s`` ago, into ``h``. */
+INTERNAL void relay_terms(State *s, int32_t listener, int32_t sender, real age_s, bool has_tx_noise) {
+    Layout *where = &s->layout;
+    s->terms = 0;
+    add_term(s, where->offset + sender, REAL(1.0));
+    add_term(s, where->offset + listener, -REAL(1.0));
+    add_term(s, where->rate + sender, -age_s);
+    add_term(s, where->rate + listener, age_s);
+    if (has_tx_noise) {
+        add_term(s, where->tx_noise + sender, REAL(1.0));
+    }
+}
+
+/* Variance of such a reception: of its RX stamp, and of what two oscillators have done since. */
+INTERNAL real relay_variance(State *s, int32_t listener, int32_t sender, real age_s) {
+    EstimatorSettings *settings = &s->settings;
+    real walk = settings->walk * max_real(s->anchors[listener].walk_scale, s->anchors[sender].walk_scale);
+    return settings->rx_variance_m2 + REAL(2.0) * age_s * (settings->white + walk * age_s * age_s / REAL(3.0));
+}
+
+/* Process the reception, by the anchor ``listener``, of a packet of ``sender`` that the tag has received as well.
+ *
+ * S − T = |aᵢ − aⱼ| + bⱼ − bᵢ + wⱼ + constant of the pair + noise, when the packet reached anchor i. Both offsets go
+ * back to that moment by their rates; what their oscillators have done since counts as noise. The pair's constant,
+ * in which the survey is, is estimated outside the filter: as both directions of a pair hold it with the same sign
+ * and the offsets with opposite ones, neither depends on the other. */
+INTERNAL void relay(State *s, int32_t listener, int32_t sender, int64_t tx_ticks, int64_t packet_rx_ticks, int64_t
+        rx_ticks) {
+    Tuning *tuning = &s->tuning;
+    EstimatorSettings *settings = &s->settings;
+    Status *status = &s->status;
+    Anchor *i = &s->anchors[listener];
+    Anchor *j = &s->anchors[sender];
+    Link *link = pair(s, listener, sender);
+    real distance_m = find_distance_m(s, listener, sender);
+    real age_s = (real)(status->epoch_ticks - packet_rx_ticks) * TICK_S + (j->range_m - distance_m) /
+            SPEED_OF_LIGHT_MPS;
+    bool has_tx_noise = j->tx_ticks == tx_ticks && j->has_tx_noise;
+    relay_terms(s, listener, sender, age_s, has_tx_noise);
+    real variance = relay_variance(s, listener, sender, age_s);
+    if (!has_tx_noise) {
+        variance += settings->tx_variance_m2;
+    }
+    int64_t whole = j->offset_ticks - i->offset_ticks;
+    real innovation = (real)(rx_ticks - tx_ticks - whole) * TICK_M - distance_m - link->constant_m - h_dot_x(s, 0);
+    real innovation_variance = compute_ph(s) + variance + link->variance_m2;
+    real normalised = innovation / SQRT(innovation_variance);
+    if (is_warm(s)) {
+        real clipped = min_real(max_real(normalised, -settings->gate), settings->gate);
+        adapt_clock_noise(s, sender, clipped);
+        adapt_clock_noise(s, listener, -clipped);
+    }
+    j->is_relayed = true;
+    Link *forth = &s->links[listener][sender];
+    Link *back = &s->links[sender][listener];
+    if (!(-settings->gate <= normalised && normalised <= settings->gate)) {
+        status->relays_rejected += 1;
+        status->relays_lately_rejected += REAL(1.0);
+        i->relay_outliers_in_row += 1;
+        j->relay_outliers_in_row += 1;
+        link->outliers_in_row += 1;
+        if ((real)link->outliers_in_row >= tuning->relays_in_row) {
+            link->outliers_in_row = 0;
+            link->variance_m2 += tuning->pair_jump_m2;
+            back->relays = 0;
+            forth->relays = 0;
+        }
+        return;
+    }
+    status->relays_used += 1;
+    status->relays_lately_accepted += REAL(1.0);
+    link->outliers_in_row = 0;
+    j->relay_outliers_in_row = 0;
+    i->relay_outliers_in_row = 0;
+    real share = link->variance_m2 / innovation_variance;
+    link->constant_m += share * innovation;
+    link->variance_m2 -= share * link->variance_m2;
+    use(s, innovation, innovation_variance);
+    forth->relays += 1;
+    if ((real)forth->relays == tuning->pair_relays && (real)back->relays >= tuning->pair_relays) {
+        survey_pair(s, listener, sender);
+    }
+}
+
+/* What is kept of two anchors in common, in the row of the lower index. */
+INTERNAL Link *pair(State *s, int32_t one, int32_t other) {
+    return &s->links[min_32(one, other)][max_32(one, other)];
+}
+
+/* How far two anchors are apart in the almanac. */
+INTERNAL real find_distance_m(State *s, int32_t one, int32_t other) {
+    real squared = REAL(0.0);
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        squared += square(s->anchors[one].position_m[axis] - s->anchors[other].position_m[axis]);
+    }
+    return SQRT(squared);
+}
+
+/* Update by the measurement in ``h``, which is no reception of the tag's, and by what it shows of faults. */
+INTERNAL void use(State *s, real innovation, real innovation_variance) {
+    compute_fault_input(s, -1);
+    gather_evidence(s, innovation, innovation_variance);
+    update(s, innovation, innovation_variance, REAL(1.0));
+}
+
+/* Use the range between two anchors for their survey; anchors that contradict most of theirs are misplaced. */
+INTERNAL void survey_pair(State *s, int32_t one, int32_t other) {
+    pair_range(s, one, other);
+    int32_t contradicted = 0;
+    int32_t rival = 0;
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        contradicted += (int32_t)pair(s, one, anchor)->contradicts;
+        rival += (int32_t)pair(s, other, anchor)->contradicts;
+    }
+    int32_t most = max_32(contradicted, rival);
+    if (contradicted == rival || (real)most < s->tuning.misplaced_pairs || !pair(s, one, other)->contradicts) {
+        return;
+    }
+    int32_t misplaced = contradicted > rival ? one : other;
+    Anchor *a = &s->anchors[misplaced];
+    int32_t survey = s->layout.survey + s->dim * misplaced;
+    make_uncertain(s, ALL_RANGE_ERRORS);
+    if (a->is_obstructed) {  /* what seemed to be an obstacle */
+        reset_state(s, s->layout.change + misplaced, a->change_variance_m2);
+        a->is_obstructed = false;
+    }
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        s->P[survey + axis][survey + axis] += square(s->tuning.lasting_std_m);
+    }
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        if (pair(s, misplaced, anchor)->contradicts) {
+            pair_range(s, misplaced, anchor);
+        }
+    }
+}
+
+/* Process |a + δa − a' − δa'| + constant as two anchors measured it, unless it contradicts the survey. */
+INTERNAL void pair_range(State *s, int32_t one, int32_t other) {
+    Link *link = pair(s, one, other);
+    s->terms = 0;
+    add_pair_survey(s, one, other);
+    real innovation = link->constant_m - h_dot_x(s, 0);
+    real innovation_variance = compute_ph(s) + square(s->settings.pair_std_m) + link->variance_m2;
+    link->contradicts = innovation * innovation > square(s->tuning.suspect) * innovation_variance;
+    if (!link->contradicts) {
+        use(s, innovation, innovation_variance);
+    }
+}
+
+/* The measurement holds what survey errors change in the distance of two anchors. */
+INTERNAL void add_pair_survey(State *s, int32_t one, int32_t other) {
+    Anchor *a = &s->anchors[one];
+    Anchor *b = &s->anchors[other];
+    real distance_m = find_distance_m(s, one, other);
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        real towards = (a->position_m[axis] - b->position_m[axis]) / distance_m;
+        add_term(s, s->layout.survey + s->dim * one + axis, towards);
+        add_term(s, s->layout.survey + s->dim * other + axis, -towards);
+    }
+}
+
+/* An anchor reports what its clock reads against the master's */
+
+/* Let what an anchor knows of its clock against the master's replace what the filter knows, where that is worse.
+ *
+ * The anchor has received all packets of the master that were relayed to the tag, and more, so its error is
+ * uncorrelated with the difference of both estimates, of variance P − q (P: the filter's, q: the anchor's), and the
+ * other states change by P_xd/P times that difference. ``subticks``: the anchor's reading less the master's at the
+ * packet's TX stamp, modulo 2⁴⁸. */
+INTERNAL void report(State *s, int32_t anchor, int32_t master, int64_t subticks, real variance_m2) {
+    Anchor *a = &s->anchors[anchor];
+    Status *status = &s->status;
+    relay_terms(s, anchor, master, a->range_m / SPEED_OF_LIGHT_MPS, false);
+    real own_variance = REAL(0.0);
+    for (int32_t one = 0, one_end = s->terms; one < one_end; one++) {
+        for (int32_t other = 0, other_end = s->terms; other < other_end; other++) {
+            own_variance += s->h[one] * s->h[other] * s->P[s->h_index[one]][s->h_index[other]];
+        }
+    }
+    int64_t whole = (s->anchors[master].offset_ticks - a->offset_ticks) & TICK_MASK;
+    int64_t off = (subticks - SUBTICKS * whole) & SUBTICK_MASK;
+    if (off > floor_div_64(SUBTICK_MASK, 2)) {
+        off -= SUBTICK_MASK + 1;
+    }
+    real innovation = (real)off * (TICK_M / (real)SUBTICKS) - h_dot_x(s, 0);
+    if (own_variance <= variance_m2) {
+        return;
+    }
+    if (innovation * innovation > square(s->settings.gate) * (own_variance + variance_m2)) {
+        status->reports_rejected += 1;
+        return;
+    }
+    status->reports_used += 1;
+    compute_ph(s);
+    compute_fault_input(s, -1);
+    /* K = P_xd/P for x and V; for the covariance the factor is (P − q)/P², that of an S of P²/(P − q) */
+    real whole_s = own_variance * own_variance / (own_variance - variance_m2);
+    update(s, innovation, whole_s, whole_s / own_variance);
+}
+
+/* A ready-made time difference */
+
+/* Write a difference of ranges, to anchor b less to anchor a, into ``h``; returns the difference.
+ *
+ * Its gradient stands in the first terms, as the other kinds' directions do. */
+INTERNAL real difference_terms(State *s, int32_t a, int32_t b) {
+    s->terms = 0;
+    real far_m = add_direction(s, b, REAL(1.0));
+    int32_t near = s->terms;
+    real near_m = add_direction(s, a, -REAL(1.0));
+    s->anchors[b].range_m = far_m;
+    s->anchors[a].range_m = near_m;
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        s->h[axis] += s->h[near + axis];
+        s->h[near + axis] = REAL(0.0);
+    }
+    add_range_errors(s, b, REAL(1.0));
+    add_range_errors(s, a, -REAL(1.0));
+    return far_m - near_m;
+}
+
+/* Process a ready-made difference of ranges, to anchor b less to anchor a: ``USED`` or ``UNUSED``.
+ *
+ * d = |p − b| − |p − a| + range errors of b − those of a + noise. Nothing is estimated of clocks, which whoever made
+ * the difference has removed. */
+INTERNAL int32_t difference(State *s, int32_t a, int32_t b, int64_t rx_ticks, real difference_m) {
+    EstimatorSettings *settings = &s->settings;
+    real walked_m = s->status.walked_m;
+    real a_elapsed_s = s->anchors[a].packets > 0 ? (real)(rx_ticks - s->anchors[a].rx_ticks) * TICK_S : REAL(0.0);
+    real b_elapsed_s = s->anchors[b].packets > 0 ? (real)(rx_ticks - s->anchors[b].rx_ticks) * TICK_S : REAL(0.0);
+    relax_range_error(s, a, a_elapsed_s, walked_m - s->anchors[a].walked_m);
+    relax_range_error(s, b, b_elapsed_s, walked_m - s->anchors[b].walked_m);
+    real expected_m = difference_terms(s, a, b);
+    real innovation = difference_m - expected_m - h_dot_x(s, 2 * direction_terms(s));
+    real innovation_variance = compute_ph(s) + square(settings->difference_std_m);
+    real scale = variance_scale(s, innovation, innovation_variance, true);
+    if (scale == REAL(0.0)) {
+        return UNUSED;
+    }
+    if (is_warm(s)) {
+        adapt_process_noise(s, innovation / SQRT(innovation_variance) / scale);
+    }
+    compute_fault_input(s, b);
+    subtract_fault_input(s, a);
+    gather_evidence(s, innovation, innovation_variance * scale);
+    update(s, innovation, innovation_variance * scale, REAL(1.0));
+    bound_changes(s);
+    end_small_obstruction(s, a);
+    end_small_obstruction(s, b);
+    adapt_change_variance(s, a, a_elapsed_s);
+    adapt_change_variance(s, b, b_elapsed_s);
+    return USED;
+}
+
+/* Move changing parts that are below their bound onto it: the likeliest state of all where nothing is earlier. */
+INTERNAL void bound_changes(State *s) {
+    for (int32_t change = s->layout.change, change_end = s->layout.constant; change < change_end; change++) {
+        real missing_m = s->settings.earliest_m - s->x[change];
+        if (missing_m > REAL(0.0)) {
+            for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+                s->x[state] += s->P[change][state] / s->P[change][change] * missing_m;
+            }
+        }
+    }
+}
+
+/* The tag has a sensor of its height */
+
+/* Process the tag's height as a sensor measures it: ``USED`` or ``UNUSED``.
+ *
+ * Where a height is given, it corrects that. A barometer's zero is estimated as well, from its first reading on. */
+INTERNAL int32_t height(State *s, real height_m, real std_m, bool is_barometer) {
+    EstimatorSettings *settings = &s->settings;
+    Status *status = &s->status;
+    Layout *where = &s->layout;
+    real innovation = height_m - s->x[where->height];
+    if (s->dim == 2) {
+        innovation -= settings->height_m;
+    }
+    s->terms = 0;
+    add_term(s, where->height, REAL(1.0));
+    if (is_barometer) {
+        int32_t zero = where->zero;
+        if (s->P[zero][zero] == REAL(0.0)) {
+            s->x[zero] = innovation;
+            make_uncertain(s, ALL_RANGE_ERRORS);
+            s->P[zero][zero] = s->tuning.zero_variance_m2;
+        } else {
+            s->P[zero][zero] += settings->barometer_walk * ((real)(status->epoch_ticks - status->height_ticks) *
+                    TICK_S);
+        }
+        innovation -= s->x[zero];
+        add_term(s, zero, REAL(1.0));
+    }
+    real innovation_variance = compute_ph(s) + square(std_m);
+    if (innovation * innovation > square(settings->gate) * innovation_variance) {
+        return UNUSED;
+    }
+    use(s, innovation, innovation_variance);
+    status->height_ticks = status->epoch_ticks;
+    return USED;
+}
+
+/* The tag stands still */
+
+/* Process the knowledge that a stationary tag has no velocity, one axis after the other. */
+INTERNAL void zero_velocity(State *s) {
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        int32_t speed = s->layout.velocity + axis;
+        s->terms = 0;
+        add_term(s, speed, REAL(1.0));
+        real variance = compute_ph(s) + square(s->tuning.stationary_std_mps);
+        compute_fault_input(s, -1);
+        update(s, -s->x[speed], variance, REAL(1.0));
+    }
+}
+
+/* What the estimator does with a packet, a ready-made difference or a height; and with many packets in one loop. */
+
+/* One packet */
+
+/* Process a packet and what it relays; returns what became of it, and leaves ``levels`` and ``fix``. */
+INTERNAL int32_t process(State *s, Packet *packet) {
+    int32_t outcome = process_packet(s, packet);
+    s->status.outcome = outcome;
+    fill_fix(s);
+    return outcome;
+}
+
+/* ``process`` with more relays, as frames carry them. */
+SKYLESS_EXPORT int32_t skyless_process_frame(State *s, Packet *packet, uint8_t *packed, int32_t packed_bytes) {
+    for (int32_t begin = 0; begin < packed_bytes; begin += 8) {
+        if (packet->relay_count < MAX_RELAYS) {
+            Relay *relayed = &packet->relays[packet->relay_count];
+            relayed->anchor = packed[begin] | (int32_t)((uint32_t)packed[begin + 1] << 8);
+            relayed->sequence = packed[begin + 2];
+            int64_t stamp = 0;
+            for (int32_t byte = PACKED_BYTES - 1; byte > 2; byte--) {
+                stamp = (int64_t)((uint64_t)stamp << 8) | packed[begin + byte];
+            }
+            int64_t least = packet->tx_ticks - HALF_WRAP_TICKS;
+            relayed->rx_ticks = least + ((stamp - least) & TICK_MASK);
+            packet->relay_count += 1;
+        }
+    }
+    return process(s, packet);
+}
+
+/* Process a packet; its anchor joins where it is not in the state. */
+INTERNAL int32_t process_packet(State *s, Packet *packet) {
+    Status *status = &s->status;
+    Place *place = &packet->place;
+    if (status->packets > 0 && packet->rx_ticks < status->epoch_ticks) {
+        status->stale += 1;
+        status->stale_in_row += 1;
+        return STALE;
+    }
+    remove_silent(s, packet->rx_ticks);
+    int32_t anchor = present(s, place);
+    if (anchor < 0) {
+        return REJECTED;
+    }
+    int32_t outcome = process_of(s, anchor, packet);
+    if (outcome == RESTARTED_CLOCK) {
+        status->clock_restarts += 1;
+        skyless_remove_anchor(s, anchor);
+        anchor = present(s, place);
+        outcome = process_of(s, anchor, packet);
+    }
+    return outcome;
+}
+
+/* The index of an anchor, which joins where it is not in the state, or has moved; −1 where there is no room. */
+INTERNAL int32_t present(State *s, Place *place) {
+    int32_t anchor = skyless_find_anchor(s, place->anchor);
+    bool is_new = false;
+    if (anchor < 0 && s->count < MAX_ANCHORS) {
+        anchor = skyless_add_anchor(s, place->anchor, place->position_m, place->std_m, place->is_open);
+        is_new = true;
+    }
+    if (anchor >= 0) {
+        for (int32_t axis = 0; axis < AXES; axis++) {
+            is_new = is_new || s->anchors[anchor].position_m[axis] != place->position_m[axis];
+            s->anchors[anchor].position_m[axis] = place->position_m[axis];
+        }
+    }
+    if (is_new) {
+        skyless_fit_plane(s);
+    }
+    return anchor;
+}
+
+/* Let anchors leave that have been silent for too long. */
+INTERNAL void remove_silent(State *s, int64_t rx_ticks) {
+    for (int32_t behind = 0, behind_end = s->count; behind < behind_end; behind++) {
+        int32_t anchor = s->count - 1 - behind;
+        Anchor *a = &s->anchors[anchor];
+        if (a->packets > 0 && (real)(rx_ticks - a->rx_ticks) * TICK_S > s->settings.drop_s) {
+            skyless_remove_anchor(s, anchor);
+            skyless_fit_plane(s);
+        }
+    }
+}
+
+/* Process a packet of an anchor in the state. */
+INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet) {
+    Status *status = &s->status;
+    Anchor *a = &s->anchors[anchor];
+    int64_t rx_ticks = packet->rx_ticks;
+    int64_t tx_ticks = packet->tx_ticks;
+    real elapsed_s = (real)(rx_ticks - status->epoch_ticks) * TICK_S;
+    int32_t outcome = admit(s, anchor, rx_ticks, tx_ticks);
+    if (outcome == REJECTED || outcome == RESTARTED_CLOCK) {
+        return outcome;
+    }
+    status->stale_in_row = 0;
+    predict(s, rx_ticks);
+    fade_faults(s);
+    if (outcome == JOINED) {
+        first_reception(s, anchor, rx_ticks, tx_ticks);
+    } else {
+        int32_t result = own_reception(s, anchor, rx_ticks, tx_ticks, packet->variance_factor);
+        if (result == CLOCK_JUMPED) {
+            return RESTARTED_CLOCK;
+        }
+        outcome = result == USED ? ACCEPTED : REJECTED;
+    }
+    bool is_known = a->packets > 0;
+    status->packets += 1;
+    keep_packet(s, anchor, packet);
+    if (is_known) {
+        status->relays_lately_accepted *= REAL(1.0) - s->tuning.mean_gain;
+        status->relays_lately_rejected *= REAL(1.0) - s->tuning.mean_gain;
+        for (int32_t one = 0, one_end = packet->relay_count; one < one_end; one++) {
+            process_relay(s, anchor, &packet->relays[one]);
+        }
+        if (packet->report_variance_m2 > REAL(0.0) && packet->master >= 0) {
+            int32_t master = skyless_find_anchor(s, packet->master);
+            if (master >= 0 && master != anchor) {
+                report(s, anchor, master, packet->subticks, packet->report_variance_m2);
+            }
+        }
+    }
+    check_motion_and_faults(s, elapsed_s);
+    return outcome;
+}
+
+/* ``JOINED`` or ``ACCEPTED`` for a packet that can be processed; for others what becomes of them, counted. */
+INTERNAL int32_t admit(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks) {
+    Anchor *a = &s->anchors[anchor];
+    Status *status = &s->status;
+    if (a->packets == 0) {
+        return JOINED;
+    }
+    if (tx_ticks == a->tx_ticks) {
+        status->impossible += 1;
+        return REJECTED;
+    }
+    if (is_impossible(s, anchor, rx_ticks, tx_ticks)) {
+        a->outliers_in_row += 1;
+        status->rejected_in_row += 1;
+        if ((real)a->outliers_in_row >= s->tuning.in_row) {
+            return RESTARTED_CLOCK;
+        }
+        status->impossible += 1;
+        return REJECTED;
+    }
+    return ACCEPTED;
+}
+
+/* Whether no clock can have gone from an anchor's newest packet to this one. */
+INTERNAL bool is_impossible(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks) {
+    Anchor *a = &s->anchors[anchor];
+    int64_t elapsed = rx_ticks - a->rx_ticks;
+    real change_m = (real)abs_64(elapsed - (tx_ticks - a->tx_ticks)) * TICK_M;
+    return change_m > s->tuning.restart_m + MAX_RATE_MPS * (real)elapsed * TICK_S;
+}
+
+/* Keep what later packets and relays of this one need. */
+INTERNAL void keep_packet(State *s, int32_t anchor, Packet *packet) {
+    Anchor *a = &s->anchors[anchor];
+    KeptPacket *kept = &s->packets[anchor][floor_mod_32(packet->sequence, PACKETS_KEPT)];
+    a->packets += 1;
+    a->tx_ticks = packet->tx_ticks;
+    a->rx_ticks = packet->rx_ticks;
+    a->walked_m = s->status.walked_m;
+    kept->sequence = packet->sequence;
+    kept->tx_ticks = packet->tx_ticks;
+    kept->rx_ticks = packet->rx_ticks;
+}
+
+/* Process a relayed reception once, if the tag has received that very packet. */
+INTERNAL void process_relay(State *s, int32_t listener, Relay *relayed) {
+    int32_t sender = skyless_find_anchor(s, relayed->anchor);
+    if (sender < 0 || sender == listener) {
+        return;
+    }
+    KeptPacket *kept = &s->packets[sender][floor_mod_32(relayed->sequence, PACKETS_KEPT)];
+    Link *link = &s->links[listener][sender];
+    bool is_young = (real)(s->status.epoch_ticks - kept->rx_ticks) * TICK_S < s->settings.relay_age_s;
+    if (kept->sequence == relayed->sequence && kept->tx_ticks > link->tx_ticks && is_young) {
+        link->tx_ticks = kept->tx_ticks;
+        relay(s, listener, sender, kept->tx_ticks, kept->rx_ticks, relayed->rx_ticks);
+    }
+}
+
+/* Check whether the tag stands still and, once in a round of packets, for faults. */
+INTERNAL void check_motion_and_faults(State *s, real elapsed_s) {
+    if (s->settings.stationary_s > REAL(0.0)) {
+        update_stationary(s, elapsed_s);
+        if (is_stationary(s)) {
+            zero_velocity(s);
+        }
+    }
+    if (floor_mod_64(s->status.packets, s->count) == 0) {
+        open_faults(s);
+    }
+}
+
+/* What a fix carries */
+
+/* Write all that a fix carries. */
+INTERNAL void fill_fix(State *s) {
+    int32_t velocity = s->layout.velocity;
+    real scale = covariance_scale(s);
+    for (int32_t one = 0, one_end = s->dim; one < one_end; one++) {
+        s->fix[POSITION][one] = s->x[one];
+        s->fix[VELOCITY][one] = s->x[velocity + one];
+        for (int32_t other = 0, other_end = s->dim; other < other_end; other++) {
+            s->fix[POSITION + 1 + one][other] = scale * s->P[one][other];
+            s->fix[VELOCITY + 1 + one][other] = scale * s->P[velocity + one][velocity + other];
+        }
+    }
+    if (s->dim == 2) {
+        s->fix[POSITION][2] = s->settings.height_m;
+    }
+    protect(s);
+    s->fix[QUALITY][0] = s->status.mean_nis;
+    s->fix[QUALITY][1] = s->status.mean_square_m2;
+    s->fix[QUALITY][2] = largest_test(s);
+    s->fix[PROTECTION][HPL] = s->levels[HPL];
+    s->fix[PROTECTION][VPL] = s->levels[VPL];
+    s->fix[PROTECTION][STATE] = (real)integrity_state(s);
+}
+
+/* Ready-made differences and heights */
+
+/* Process a ready-made difference of ranges, to anchor b less to anchor a, and leave all that a fix carries. */
+SKYLESS_EXPORT int32_t skyless_process_difference(State *s, Place *a, Place *b, int64_t rx_ticks, real difference_m) {
+    Status *status = &s->status;
+    if (rx_ticks < status->epoch_ticks) {
+        status->stale += 1;
+        status->stale_in_row += 1;
+        return STALE;
+    }
+    remove_silent(s, rx_ticks);
+    if (present(s, a) < 0 || present(s, b) < 0) {
+        return REJECTED;
+    }
+    int32_t near = skyless_find_anchor(s, a->anchor);
+    int32_t far = skyless_find_anchor(s, b->anchor);
+    status->stale_in_row = 0;
+    real elapsed_s = (real)(rx_ticks - status->epoch_ticks) * TICK_S;
+    predict(s, rx_ticks);
+    fade_faults(s);
+    int32_t outcome = difference(s, near, far, rx_ticks, difference_m) == USED ? ACCEPTED : REJECTED;
+    status->packets += 1;
+    note_difference(s, near, rx_ticks);
+    note_difference(s, far, rx_ticks);
+    check_motion_and_faults(s, elapsed_s);
+    fill_fix(s);
+    return outcome;
+}
+
+/* An anchor was used in a difference. */
+INTERNAL void note_difference(State *s, int32_t anchor, int64_t rx_ticks) {
+    Anchor *a = &s->anchors[anchor];
+    a->packets += 1;
+    a->rx_ticks = rx_ticks;
+    a->walked_m = s->status.walked_m;
+}
+
+/* Process a sensor's height of the tag, and leave all that a fix carries. */
+SKYLESS_EXPORT int32_t skyless_process_height(State *s, real height_m, real std_m, bool is_barometer) {
+    int32_t outcome = height(s, height_m, std_m, is_barometer) == USED ? ACCEPTED : REJECTED;
+    fill_fix(s);
+    return outcome;
+}
+
+/* Many packets in one loop */
+
+/* Process many packets, and write a row for each. */
+SKYLESS_EXPORT void skyless_track(State *s, Place *places, BatchPacket *packets, Relay *relays, BatchRow *rows, int32_t
+        count, bool has_levels) {
+    Packet packet = {0};
+    packet.variance_factor = REAL(1.0);
+    packet.master = -1;
+    int32_t begin = 0;
+    for (int32_t one = 0; one < count; one++) {
+        BatchPacket *given = &packets[one];
+        packet.place = places[given->place];
+        packet.sequence = given->sequence;
+        packet.rx_ticks = given->rx_ticks;
+        packet.tx_ticks = given->tx_ticks;
+        packet.relay_count = min_32(given->end - begin, MAX_RELAYS);
+        for (int32_t place = 0, place_end = packet.relay_count; place < place_end; place++) {
+            packet.relays[place] = relays[begin + place];
+        }
+        begin = given->end;
+        rows[one].outcome = process_packet(s, &packet);
+        fill_row(s, &rows[one], has_levels);
+    }
+}
+
+/* Write a row of a batch. */
+INTERNAL void fill_row(State *s, BatchRow *row, bool has_levels) {
+    for (int32_t one = 0, one_end = s->dim; one < one_end; one++) {
+        row->position_m[one] = s->x[one];
+        row->velocity_mps[one] = s->x[s->layout.velocity + one];
+        for (int32_t other = 0, other_end = s->dim; other < other_end; other++) {
+            row->covariance_m2[one][other] = s->P[one][other];
+        }
+    }
+    if (has_levels) {
+        protect(s);
+        for (int32_t level = 0; level < LEVELS; level++) {
+            row->levels[level] = s->levels[level];
+        }
+        row->integrity = integrity_state(s);
+    }
+}
+
+/* Covariance analysis: the filter's own steps without measurements, for planning and for Cramér–Rao bounds.
+ *
+ * What the filter will claim of a tag at rest at some place of a site: a superframe of messages is processed with
+ * innovations of zero until the position's variance repeats. That holds what the filter allows for accelerations, which
+ * such a tag does not have. Their part follows from sensitivities: rows of V begin, at moments of a superframe, as a
+ * velocity that the filter does not know of, and the squares of what they do to the position, integrated over the time
+ * after that, are what accelerations add to P. Another row of V holds the walls' delays.
+ *
+ * Where only a share of an anchor's packets arrives, the stamps of all count for as much less: their variances are divided
+ * by the share, and those of relayed receptions by the share of all three that they take. */
+
+/* The position's variance, or a sum, counts as complete when it changes by less than this share between two looks. */
+
+/* Find the steady state of a tag at the state's position.
+ *
+ * After ``most`` of the superframes it counts as steady in any case; sums are compared every ``step`` of them. */
+SKYLESS_EXPORT void skyless_find_steady_state(State *s, PlannedMessage *messages, PlannedRelay *relays, int32_t count,
+        int32_t most, int32_t step, SteadyState *found) {
+    s->rows = walls(s) + 1 + IMPULSES * s->dim;
+    int64_t superframe = 0;
+    for (int32_t one = 0; one < count; one++) {
+        superframe += messages[one].gap_ticks;
+    }
+    real before = REAL(0.0);
+    for (int32_t number = 0; number < most; number++) {
+        process_superframe(s, messages, relays, count, AFTER_ALL_TICKS, superframe, found);
+        if (floor_mod_32(number, step) == step - 1) {
+            real variance = found->variance_m2[0] + found->variance_m2[1] + found->variance_m2[2];
+            if (abs_real(variance - before) <= COMPLETE_CHANGE * variance) {
+                break;
+            }
+            before = variance;
+        }
+    }
+    int64_t impulses_ticks = s->status.epoch_ticks;
+    before = REAL(0.0);
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        found->motion_m2[axis] = REAL(0.0);
+    }
+    for (int32_t number = 0; number < most; number++) {
+        process_superframe(s, messages, relays, count, impulses_ticks, superframe, found);
+        if (floor_mod_32(number, step) == step - 1) {
+            real moved = found->motion_m2[0] + found->motion_m2[1] + found->motion_m2[2];
+            if (number >= 1 && moved - before <= COMPLETE_CHANGE * moved) {
+                break;
+            }
+            before = moved;
+        }
+    }
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        found->motion_m2[axis] *= s->settings.qa * ((real)superframe * TICK_S) / ((real)IMPULSES * found->fixes);
+    }
+}
+
+/* The row of V for the walls' delays; those of the impulses follow. */
+INTERNAL int32_t walls(State *s) {
+    return FAULT_KINDS * s->count + s->dim;
+}
+
+/* Process a superframe's messages; impulses act at moments of the one that begins at ``impulses_ticks``. */
+INTERNAL void process_superframe(State *s, PlannedMessage *messages, PlannedRelay *relays, int32_t count, int64_t
+        impulses_ticks, int64_t superframe, SteadyState *found) {
+    int64_t now = s->status.epoch_ticks;
+    int32_t begin = 0;
+    found->square_bias_m2 = REAL(0.0);
+    found->fixes = REAL(0.0);
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        found->variance_m2[axis] = REAL(0.0);
+    }
+    for (int32_t one = 0; one < count; one++) {
+        PlannedMessage *message = &messages[one];
+        now += message->gap_ticks;
+        if (message->anchor >= 0) {
+            predict_with_impulses(s, now, impulses_ticks, superframe);
+            receive(s, message, now);
+            for (int32_t other = begin, other_end = message->end; other < other_end; other++) {
+                if (relays[other].sender >= 0 && s->anchors[relays[other].sender].packets > 0) {
+                    receive_relay(s, message, &relays[other]);
+                }
+            }
+            add_fix(s, message->share, found);
+        }
+        begin = message->end;
+    }
+}
+
+/* Add a fix to the sums. */
+INTERNAL void add_fix(State *s, real share, SteadyState *found) {
+    found->fixes += share;
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        found->variance_m2[axis] += share * s->P[axis][axis];
+        found->square_bias_m2 += share * square(s->V[walls(s)][axis]);
+        for (int32_t row = walls(s) + 1, row_end = s->rows; row < row_end; row++) {
+            found->motion_m2[axis] += share * square(s->V[row][axis]);
+        }
+    }
+}
+
+/* Time update, with a velocity of 1 m/s that the filter does not know of from each impulse on. */
+INTERNAL void predict_with_impulses(State *s, int64_t now, int64_t impulses_ticks, int64_t superframe) {
+    int64_t before = s->status.epoch_ticks;
+    predict(s, now);
+    for (int32_t impulse = 0; impulse < IMPULSES; impulse++) {
+        int64_t moment = impulses_ticks + floor_real(((real)impulse + REAL(0.5)) / (real)IMPULSES * (real)superframe +
+                REAL(0.5));
+        if (before < moment && moment <= now) {
+            for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+                real *row = s->V[walls(s) + 1 + s->dim * impulse + axis];
+                row[axis] = (real)(now - moment) * TICK_S;
+                row[s->layout.velocity + axis] = REAL(1.0);
+            }
+        }
+    }
+}
+
+/* The tag's reception of a message. */
+INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks) {
+    Anchor *a = &s->anchors[message->anchor];
+    Layout *where = &s->layout;
+    if (a->packets == 0) {
+        first_reception(s, message->anchor, rx_ticks, rx_ticks);
+        s->V[walls(s)][where->offset + message->anchor] += message->late_m;
+    } else {
+        relax_range_error(s, message->anchor, (real)(rx_ticks - a->rx_ticks) * TICK_S, REAL(0.0));
+        reset_state(s, where->tx_noise + message->anchor, s->settings.tx_variance_m2 / message->share);
+        reception_terms(s, message->anchor, true);
+        real variance = compute_ph(s) + s->settings.rx_variance_m2 / message->share;
+        compute_fault_input(s, message->anchor);
+        s->fault_input[walls(s)] += message->late_m;
+        update(s, REAL(0.0), variance, REAL(1.0));
+    }
+    a->rx_ticks = rx_ticks;
+    a->packets += 1;
+}
+
+/* A relayed reception. */
+INTERNAL void receive_relay(State *s, PlannedMessage *message, PlannedRelay *relayed) {
+    relay_terms(s, message->anchor, relayed->sender, relayed->age_s, true);
+    real variance = relay_variance(s, message->anchor, relayed->sender, relayed->age_s) / relayed->share;
+    variance += compute_ph(s);
+    compute_fault_input(s, -1);
+    if (s->links[message->anchor][relayed->sender].variance_m2 == REAL(0.0)) {  /* else the pair's constant takes the delay */
+        s->fault_input[walls(s)] += relayed->late_m;
+    }
+    update(s, REAL(0.0), variance, REAL(1.0));
+}
+
+/* Cramér–Rao bounds */
+
+/* Process a frame at the tag's true position, with innovations of zero.
+ *
+ * ``known``: which receptions of it are known, of each anchor and then of the tag; those of anchors before ``first``
+ * are left out. ``elapsed_s``, ``walked_m``: since the frame before of this anchor that the tag received. */
+SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_ticks, real *position_m, uint8_t *known,
+        int32_t first, real elapsed_s, real walked_m) {
+    predict(s, rx_ticks);
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        s->x[axis] = position_m[axis];
+    }
+    if (s->dim == 2) {
+        s->settings.height_m = position_m[2];
+    }
+    reset_state(s, s->layout.tx_noise + sender, s->settings.tx_variance_m2);
+    if (known[s->count] != 0) {
+        relax_range_error(s, sender, elapsed_s, walked_m);
+        s->anchors[sender].held_range_m = REAL(0.0);  /* linearise here, not at a held point */
+        reception_terms(s, sender, true);
+        update(s, REAL(0.0), compute_ph(s) + s->settings.rx_variance_m2, REAL(1.0));
+    }
+    for (int32_t listener = first, listener_end = s->count; listener < listener_end; listener++) {
+        if (known[listener] != 0) {
+            relay_terms(s, listener, sender, REAL(0.0), true);
+            if (s->status.range_errors == ALL_RANGE_ERRORS) {
+                add_pair_survey(s, listener, sender);
+            }
+            update(s, REAL(0.0), compute_ph(s) + s->settings.rx_variance_m2, REAL(1.0));
+        }
+    }
+}

@@ -1,0 +1,526 @@
+/* Made by tools/python_to_c.py from the modules below; do not edit.
+
+   skyless.core.estimator.faults
+   skyless.core.estimator.kalman
+   skyless.core.estimator.levels
+   skyless.core.estimator.measurements
+   skyless.core.estimator.monitor
+   skyless.core.estimator.process
+   skyless.core.estimator.state
+   skyless.core.estimator.steady_state
+   skyless.core.native.arithmetic
+*/
+
+#ifndef SKYLESS_CORE_H
+#define SKYLESS_CORE_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#ifdef SKYLESS_FLOAT
+typedef float real;
+#define REAL(x) x##f
+#else
+typedef double real;
+#define REAL(x) x
+#endif
+
+#ifndef SKYLESS_EXPORT
+#define SKYLESS_EXPORT __attribute__((visibility("default")))
+#endif
+
+#define ACCEPTED 1
+#define AFTER_ALL_TICKS INT64_C(4611686018427387904)
+#define ALL_RANGE_ERRORS 2
+#define AXES 3
+#define CHANGING_RANGE_ERRORS 1
+#define CLOCK_JUMPED 2
+#define CLOCK_RATE_VARIANCE REAL(224688794.68420443)
+#define COMPLETE_CHANGE REAL(0.001)
+#define CONTRADICTED 2
+#define CREEPING 2
+#define FAULT_KINDS 3
+/* Where ``protect`` writes the tests of all kinds of faults, after ``HPL`` and ``VPL``. */
+#define FIRST_TEST 2
+#define HALF_WRAP_TICKS INT64_C(549755813888)
+#define HPL 0
+#define IMPULSES 4
+#define JOINED 2
+/* Numbers in the longest vectors of processors. */
+#define LANES 8
+#define LASTING 0
+#define LEVELS 5
+/* The leading bits of ln 2: products with small whole numbers are exact. */
+#define LN_2_HIGH REAL(0.6931471803691238)
+#define LN_2_LOW REAL(1.9082149292705877e-10)
+/* Its exponential counts as 0. */
+#define LOWEST REAL(-700.0)
+#define MAX_ANCHORS 32
+#define MAX_FAULTS 2
+#define MAX_RATE_MPS REAL(29979.2458)
+/* Most relays with a packet; 13 fit into a frame. */
+#define MAX_RELAYS 32
+/* A time before all others. */
+#define NEVER (INT64_C(-4611686018427387904))
+#define NO_RANGE_ERRORS 0
+#define OBSTRUCTED 1
+/* Bytes of a relay in a frame: identifier (2), sequence number (1), stamp (5), the lowest first. */
+#define PACKED_BYTES 8
+/* Packets of each anchor that are kept for relays to come; divides the range of sequence numbers. */
+#define PACKETS_KEPT 16
+#define POSITION 0
+#define PROTECTION 9
+#define QUALITY 4
+#define RECENT 1
+#define REJECTED 0
+#define RESTARTED_CLOCK 4
+#define ROOT_2_PI REAL(2.5066282746310002)
+#define SOUND 0
+#define SPEED_OF_LIGHT_MPS REAL(299792458.0)
+#define STALE 3
+#define STATE 2
+#define SUBTICKS 256
+#define SUBTICK_MASK INT64_C(281474976710655)
+/* Of Jacobi's rotations: each squares what is left off the diagonal. */
+#define SWEEPS 8
+#define TICK_M REAL(0.0046917639786157855)
+#define TICK_MASK INT64_C(1099511627775)
+#define TICK_S REAL(1.5650040064102565e-11)
+#define UNAVAILABLE 3
+#define UNUSED 0
+#define USED 1
+#define VELOCITY 5
+#define VPL 1
+
+/* What the filter assumes; standard deviations are one sigma. */
+typedef struct EstimatorSettings {
+    real qa;  /* Spectral density of the tag's acceleration, m²/s³ per axis. */
+    /* Standard deviation of the tag's speed at the start. It smears pseudoranges, which are not taken at once. */
+    real start_speed_std_mps;
+    real white;  /* White frequency noise of each oscillator, m²/s. */
+    real walk;  /* Random walk of each oscillator's rate, m²/s³. */
+    real tx_variance_m2;
+    real rx_variance_m2;  /* Variances of one stamp each. */
+    real gate;  /* Innovations beyond this number of standard deviations are not used. */
+    real height_m;  /* Height of the tag where it is given; NaN to estimate it. */
+    real height_std_m;  /* Standard deviation of the given height. */
+    real lowest_m;
+    real highest_m;  /* Bounds of the tag's height. */
+    real drop_s;  /* Anchors that are silent for longer leave the state. */
+    real relay_age_s;  /* Older packets are not relayed, as sequence numbers come around. */
+    real survey_std_m;  /* Standard deviation of each coordinate of an anchor. */
+    real range_std_m;  /* Standard deviation of the constant error of a tag's ranges to one anchor. */
+    /* Standard deviation of the constant error of the range between two anchors.
+     *
+     * It is not used where survey and ranges are exact. */
+    real pair_std_m;
+    real slope_std_m;  /* By how much ranges lengthen for each unit of clip((range − 4 m)/4 m, −1, 1). */
+    /* Standard deviation of the part of a range's error that changes as the tag moves (the site file's name). */
+    real place_std_m;
+    real place_distance_m;  /* Distance over which that part changes. */
+    real place_time_s;  /* Time over which that part changes while the tag is stationary. */
+    /* Time within which the size of each anchor's changing part is estimated again; 0 where it is ``place_std_m``. */
+    real change_memory_s;
+    /* Random walk of a barometer's zero, m²/s: 5 cm in ten seconds, as where doors and windows are opened. */
+    real barometer_walk;
+    real least_change_std_m;  /* No changing part is estimated to be smaller. */
+    real earliest_m;  /* No changing part is below this: obstacles only lengthen ranges. */
+    real difference_std_m;  /* Standard deviation of each ready-made time difference. */
+    real stationary_s;  /* A tag that has not shown any motion for this time counts as stationary; 0: never. */
+    real max_acceleration_mps2;  /* The tag's largest acceleration, as far as levels are to cover it beyond ``qa``. */
+    real max_walk_scale;  /* Largest factor on ``walk`` where innovations show that oscillators wander more. */
+    real integrity_risk;
+    real alert_limit_m;  /* Fixes with a higher horizontal protection level have an alert; NaN for none. */
+} EstimatorSettings;
+
+/* Constants of the estimator, which are the same at every site; ``docs/estimator_table.md`` says what each buys.
+ *
+ * Normalised: over its standard deviation. A running mean's weight is that of the newest value. */
+typedef struct Tuning {
+    real restart_m;  /* Paths that change by more than this between packets are impossible [m]. */
+    /* Factor on the random walk of the tag's oscillator at a start: it warms up after it was switched on. */
+    real start_walk_scale;
+    /* Weight in running means of normalised innovations (along each axis, of all anchors, of an anchor's relays), and
+     * loss of the counts of recent relays with each packet. */
+    real mean_gain;
+    real mean_limit;  /* Square of such a mean over its expectation beyond which process noise grows. */
+    real walk_scale_gain;  /* Growth of a clock's process noise with each innovation. */
+    real scale_loss;  /* Factor on adapted process noise with each innovation that does not call for more. */
+    /* Normalised innovations of all anchors beyond this on one side: the tag's clock has left its rate. */
+    real common;
+    /* Number of relays in a row beyond the gate that show a jump: of an anchor's clock, or of the path of a pair. */
+    real relays_in_row;
+    real q_scale_gain;  /* Growth of the process noise of motion with each innovation. */
+    real max_scale;  /* Largest factor on the process noise of motion, and of a range error that has jumped. */
+    /* Mean square of the innovations along the axes, 1 where the filter is right, beyond which that noise grows. */
+    real lag_limit;
+    real lag_forgetting;  /* Weight in that mean. */
+    real better_known;  /* The place of a tag at rest moves when its variance has shrunk to this part. */
+    /* Part of the process noise of motion that a tag at rest keeps: 5 cm within half a minute. */
+    real stationary_noise_share;
+    real stationary_std_mps;  /* Standard deviation of the velocity of a tag at rest [m/s]. */
+    real held_step_m;  /* Distance of the estimate from the point of linearisation at which that moves [m]. */
+    real held_max_m;  /* It stays within ``suspect`` standard deviations of the estimate, up to this distance [m]. */
+    real curvature_share;  /* Share of the stamps' variance below which the curvature of ranges is neglected. */
+    /* Range at which errors that grow with distance pass through zero, and by which they change once [m] (APS011). */
+    real slope_from_m;
+    real forgetting;  /* Weight in the mean NIS and in the share of rejected innovations: the last 50. */
+    real inconsistent_nis;  /* Mean NIS beyond which covariances are scaled by its square. */
+    real late_forgetting;  /* Weight in the share of late receptions: the last 200. */
+    real late_often_share;  /* Share of late receptions beyond which single ones are late often. */
+    /* Density of the normalised innovations of late receptions: a metre late at 5 cm. */
+    real late_probability_density;
+    /* Normalised innovation beyond which receptions have less weight where they are late often (Huber 1964). */
+    real reception_huber;
+    real difference_huber;  /* The same of time differences, always. */
+    real max_relays_rejected;  /* Count of recent relays beyond the gate up to which they may be late ones. */
+    /* Number of rejected packets in a row, single late ones left out, at which the state is wrong. */
+    real lost_in_row;
+    real lost_share;  /* Share of rejected innovations at which it is. */
+    real suspect;  /* Normalised innovation beyond which a reception may be a jump, and two of them differ by chance. */
+    /* Number of such receptions in a row that make a jump, and of impossible ones if a counter has restarted … */
+    real in_row;
+    real in_row_where_late;  /* … and where single receptions are late often. */
+    real together;  /* Sum of two such normalised innovations: by chance once in some million packets. */
+    real jump_std_m;  /* Least standard deviation of a range error that has jumped [m]. */
+    /* Factor on the process noise of a range error that has just jumped: it may still be changing. */
+    real first_change_scale;
+    real change_growth;  /* Growth of that process noise while the mean of the anchor's innovations is off zero … */
+    real change_loss;  /* … and its factor otherwise. */
+    real ended_std_m;  /* An obstruction has ended where the range error is known to this [m] … */
+    real ended;  /* … and within this number of standard deviations of zero. */
+    real obstructed_walk;  /* Density with which a range error that has jumped wanders [m²/s]. */
+    real obstruction_memory_s;  /* Time in which it returns to zero, and in which a jump is forgotten [s]. */
+    real obstruction_return_m;  /* Largest return in that time [m]: long delays are no less likely to stay. */
+    /* Where others have jumped recently, a normalised innovation of this much may be a jump … */
+    real obstructed_suspect;
+    /* … if two are together beyond this, and the anchor's clock is steady: by chance once in some thousand packets. */
+    real obstructed_together;
+    real steady_walk_scale;  /* Factor on the random walk of a clock up to which it is steady. */
+    /* Learnt multipath of this standard deviation makes errors that would be taken for jumps [m]. */
+    real multipath_std_m;
+    real jump_rise;  /* Part of its full size by which a jump raises the process noise of all range errors. */
+    real obstructed_std_m;  /* Standard deviation by which all range errors change where some have jumped [m] … */
+    real obstructed_s;  /* … and the time in which they do [s]. */
+    real place_step_m;  /* Length of a step [m]. */
+    real place_limit;  /* A comparison counts as this many times their mean at most, as jumps are not multipath. */
+    real place_limited_mean;  /* Mean of χ² with one degree of freedom where no value counts as more than that. */
+    real place_first;  /* Number of comparisons for which the stamps' noise stands beforehand. */
+    real place_samples;  /* Number of comparisons that are needed … */
+    real place_memory;  /* … and that are remembered. */
+    real place_min_m2;  /* Least variance between two steps that counts as multipath [m²]. */
+    real place_kept;  /* Least correlation over a step, and least loss of it. */
+    /* Largest standard deviation of the part of a range error that changes as the tag moves [m]. */
+    real max_change_std_m;
+    /* Standard deviation of each coordinate of an anchor that stands elsewhere, and of a fault since it joined [m] … */
+    real lasting_std_m;
+    real recent_std_m;  /* … of one that has begun recently without a visible jump [m] … */
+    real creeping_std_m;  /* … and of one that grows for seconds [m]. */
+    real recent_packets;  /* Number of packets of each anchor over which a fault is recent. */
+    real creeping_s;  /* Time in which a creeping fault has become e times as large [s]. */
+    /* Standard deviation beforehand of a fault that is added to the state, and of all faults at the start [m]. */
+    real late_std_m;
+    /* Test beyond which there is a fault: χ² of eight degrees of freedom with a probability of 4·10⁻⁸. */
+    real sure_chi2;
+    /* Least difference to what other anchors' faults explain, and most of the test that chosen ones leave. */
+    real rival_chi2;
+    real early_weight;  /* Weight of what an early fault explains: obstacles make packets late. */
+    /* Standard deviation of the range between two anchors against the survey, before it is measured [m]. */
+    real open_pair_std_m;
+    real pair_jump_m2;  /* Variance of a pair's range that has jumped [m²]. */
+    real pair_relays;  /* Number of relays in either direction after which their mean is a range. */
+    /* Number of such ranges beyond ``suspect``, and more than the other end has, that make an anchor misplaced. */
+    real misplaced_pairs;
+    /* Older packets are not used for a start; where superframes are longer, for the rate of the clock only [s]. */
+    real start_age_s;
+    /* Part of the mean range beyond which ranges are curved within a standard deviation: updates would make the filter
+     * sure of a wrong position. It has no level, and is not predicted further. */
+    real curved_std;
+    real start_patience_s;  /* Time for which a start waits that is wide or contradicted: more anchors may come [s]. */
+    /* Probability with which residuals of a start are larger by chance than those that contradict it. */
+    real start_tail;
+    real new_start_s;  /* Time for which a start is new [s]: one with open range errors is not repeated within it … */
+    /* … and one whose mean NIS exceeds this is given up, once: it was wrong, for example by packets that were late. */
+    real early_nis;
+    /* Factor on the start's covariance, as the filter is then given the packets that it rests on. */
+    real start_margin;
+    /* No state grows much wider over shorter silences; packets that are late by less are late from the radio [s]. */
+    real short_silence_s;
+    real longest_silence_s;  /* After a longer one the state is worse than a new start [s]. */
+    /* In longer superframes, where a new start takes seconds, a silence may widen the state more [s] … */
+    real slow_superframe_s;
+    real slow_curved_std;  /* … up to this part of the mean range. */
+    /* In longer ones a tag may be metres away: nothing is predicted, and each round of packets is a start [s]. */
+    real longest_superframe_s;
+    real height_sigmas;  /* Number of standard deviations by which a sensor's height is wrong at most. */
+    real heights_in_row;  /* Number of heights in a row that do not fit, after which the position is wrong. */
+    /* Standard deviation of each coordinate of an anchor after a start that was contradicted [m]. */
+    real open_survey_std_m;
+    real fitting_chi2;  /* χ² for each anchor below which range errors are as the settings state them. */
+    /* Number of anchors that are late at the start at most: on the floor or behind metal one often is. */
+    real most_late;
+    real late_penalty;  /* What each of them adds to χ²: odds of 1 to 3. */
+    real staying_share;  /* Part of an anchor's lateness at the start that stays: its mean … */
+    real staying_std;  /* … and its standard deviation. */
+    real window;  /* Number of ready-made time differences from which a start is looked for … */
+    real window_s;  /* … or those of this time [s]. */
+    real median_difference_std_m;  /* Standard deviation of the median of a pair's differences [m]. */
+    real late_start_std_m;  /* Standard deviation of each anchor's error at the start, before any are estimated [m]. */
+    /* Probability below which residuals are not noise, and rivals no rivals, in a start from differences. */
+    real chance;
+    /* Distance from which two positions are rivals; anchors lie elsewhere for a tag that has moved as far [m]. */
+    real rival_m;
+    /* Starts lie no higher above or below anchors of different heights than this, unless bounds are given [m]. */
+    real height_margin_m;
+    /* A tag without beacons that is farther from the anchors' centre than this part of their diagonal is lost. */
+    real neighbourhood;
+    real most_horizontal_std_m;  /* While its horizontal standard deviation is larger, there is no fix [m]. */
+    real zero_variance_m2;  /* Variance of a barometer's zero at first [m²]. */
+    real uncovered_chi2;  /* Test beyond which faults are larger than levels cover. */
+    /* Part of the mean range beyond which, where all range errors are open, a standard deviation has no level. */
+    real max_open_level_std;
+    /* Time without a level after a start that was contradicted: several late anchors may agree on a wrong place [s]. */
+    real contradicted_start_s;
+    real probe_m;  /* Least distance from the anchors' plane at which its two sides are compared [m]. */
+    /* Standard deviation of the best place on the other side about the mirror image, over that distance. */
+    real shift_part;
+    /* Squared difference over its variance from which two things differ: ranges of both sides, or two starts. */
+    real apart_chi2;
+    real sensor_valid_s;  /* Time for which a sensor's height decides between them [s]. */
+} Tuning;
+
+/* Where the states stand: the index of the first of each block. */
+typedef struct Layout {
+    int32_t offset;  /* Of the first anchor; the others' follow, as in all blocks. */
+    int32_t velocity;
+    int32_t rate;
+    int32_t tx_noise;
+    int32_t change;
+    int32_t constant;
+    int32_t slope;
+    int32_t height;  /* In two dimensions; in three it is one of the position. */
+    int32_t zero;  /* In three dimensions; in two it is the slope's place, and not used. */
+    int32_t survey;  /* ``dim`` states for each anchor. */
+    int32_t end;
+} Layout;
+
+/* The estimator's counters and running means. */
+typedef struct Status {
+    int64_t epoch_ticks;  /* The tag's reading at the newest packet. */
+    int64_t start_ticks;  /* The tag's reading at the start. */
+    int64_t faded_ticks;  /* The tag's reading when faults that are not lasting last faded. */
+    int32_t outcome;  /* What became of it. */
+    int64_t packets;
+    int64_t accepted;
+    int64_t rejected;
+    int32_t rejected_in_row;
+    int64_t stale;
+    int32_t stale_in_row;
+    int64_t impossible;
+    int64_t relays_used;
+    int64_t relays_rejected;
+    int64_t reports_used;
+    int64_t reports_rejected;
+    int64_t clock_restarts;
+    int64_t obstructions;
+    int64_t ends_of_obstructions;
+    int64_t faults_opened;
+    real mean_nis;
+    real mean_square_m2;  /* Of innovations. */
+    real rejected_share;
+    real late_share;
+    real relays_lately_accepted;  /* Running counts that fade. */
+    real relays_lately_rejected;
+    real lag[3];  /* Running mean of innovations along each axis. */
+    real lag_square;
+    real q_scale;  /* Factor on qa. */
+    real common_mean;  /* Running mean of all innovations: the tag's own clock. */
+    real walk_scale;  /* Factor on its random walk. */
+    int32_t place_samples;  /* Comparisons of range errors at places a step apart. */
+    real place_square_m2[2];  /* Half their mean square after one and two steps. */
+    real place_variance_m2;  /* Of what multipath changes in them, 0 where not more than stated. */
+    real place_distance_m;  /* Distance over which multipath changes. */
+    real obstruction;  /* 1 where range errors have jumped recently, 0 where they do not. */
+    real walked_m;
+    real stationary_s;  /* Since the tag last showed motion. */
+    real stationary_m[3];  /* Where it was then. */
+    real stationary_m2[3];  /* Variance of that on each axis. */
+    bool withholds_levels;  /* Whether the anchors' positions are known to be wrong. */
+    int64_t height_ticks;  /* The tag's reading when a sensor's height was used last. */
+    real plane_m[3];  /* A point of the plane that lies closest to the anchors. */
+    real plane_normal[3];  /* Normal of that plane. */
+    bool has_open_ranges;  /* Whether anchors join with range errors beyond those of the settings. */
+    int32_t range_errors;  /* NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS or ALL_RANGE_ERRORS. */
+    real fault_std_m[3];  /* Of each kind of faults, beforehand. */
+} Status;
+
+/* What is kept of an anchor in addition to its states. */
+typedef struct Anchor {
+    int32_t identifier;
+    real position_m[3];
+    int64_t tx_ticks;  /* Newest packet, by its own clock. */
+    int64_t rx_ticks;  /* Newest packet, by the tag's clock. */
+    int64_t offset_ticks;  /* Whole ticks of the offset. */
+    real range_m;  /* At its newest packet. */
+    real held_m[3];  /* The tag's position at which ranges to it are linearised. */
+    real held_range_m;  /* Distance of that point. */
+    real walked_m;  /* The tag's walked distance at its newest packet. */
+    bool is_relayed;  /* Whether others relay its packets. */
+    bool has_tx_noise;  /* Whether its newest packet's TX noise is a state. */
+    int64_t packets;
+    real innovation;  /* Its newest one, normalised. */
+    int32_t outliers_in_row;
+    real outlier_m;  /* The newest of them. */
+    bool is_obstructed;  /* Whether its range error has jumped and not come back. */
+    real change_mean;  /* Running mean of its innovations since then, normalised. */
+    real change_scale;  /* Factor on the process noise of a range error that has jumped. */
+    bool has_fault;  /* Whether a lasting fault of it was added to the state. */
+    int32_t relay_outliers_in_row;
+    real relay_mean;  /* Running mean of what relays show of its clock, normalised. */
+    real walk_scale;  /* Factor on its oscillator's random walk. */
+    real change_variance_m2;  /* Of the part of its range error that changes as the tag moves. */
+    int32_t place_steps;  /* Steps of the tag after which its range error was compared, in a row. */
+    real place_walked_m;  /* The tag's walked distance at the newest of them. */
+    real place_residual_m[2];  /* What its reception left after the last two. */
+} Anchor;
+
+/* A packet that others may relay. */
+typedef struct KeptPacket {
+    int32_t sequence;
+    int64_t tx_ticks;
+    int64_t rx_ticks;
+} KeptPacket;
+
+/* A pair of anchors, listener and sender. */
+typedef struct Link {
+    int64_t tx_ticks;  /* Newest packet of the sender whose reception by the listener was processed. */
+    real constant_m;  /* Estimated constant of the pair, in the row of the lower index. */
+    real variance_m2;  /* Variance of that. */
+    int32_t outliers_in_row;
+    int64_t relays;  /* Used in this direction. */
+    bool contradicts;  /* Whether its range contradicts the survey. */
+} Link;
+
+/* Everything that the estimator keeps of one tag. */
+typedef struct State {
+    EstimatorSettings settings;
+    Tuning tuning;
+    real horizontal_k;  /* How many standard deviations the risk of levels allows. */
+    real vertical_k;
+    int32_t dim;  /* Dimensions of the position: 2 where the height is given, else 3. */
+    int32_t count;  /* Anchors in the state. */
+    /* States that are not known to be exact, up to a multiple of ``LANES``; covariances with all others are zero. */
+    int32_t n;
+    int32_t rows;  /* Rows of V in use. */
+    Layout layout;
+    Status status;
+    real x[264];
+    real P[264][264];  /* Symmetric to the bit. */
+    /* What faults do to x: of each kind for each metre by which receptions of an anchor are late, then for each m/s² of
+     * acceleration along an axis, then what planning adds. */
+    real V[112][264];
+    real information[96][96];  /* Information of the innovations on all faults. */
+    real evidence[96];  /* What innovations show of them. */
+    Anchor anchors[32];
+    KeptPacket packets[32][16];
+    Link links[32][32];  /* Of listener and sender. */
+    int32_t terms;  /* Terms of the measurement at hand, which stand in ``h``. */
+    real h[20];  /* The measurement where it is not zero, at the indices in ``h_index``. */
+    int32_t h_index[20];
+    real ph[264];  /* P·h of the measurement at hand. */
+    real fault_input[112];  /* By how much each fault is in the present innovation. */
+    real work[36][32];  /* Scratch for systems of equations of all faults of one kind. */
+    real levels[5];
+    real fix[10][3];  /* What a fix carries (``POSITION`` and the following). */
+} State;
+
+/* An anchor and where it stands. */
+typedef struct Place {
+    int32_t anchor;  /* Identifier. */
+    real position_m[3];
+    real std_m;  /* Standard deviation of each coordinate; below 0 for that of the settings. */
+    bool is_open;  /* Whether it joins with range errors beyond those of the settings. */
+} Place;
+
+/* When the packet's anchor received another. */
+typedef struct Relay {
+    int32_t anchor;  /* Identifier of that other. */
+    int32_t sequence;
+    int64_t rx_ticks;  /* Stamp of the packet's anchor, unwrapped. */
+} Relay;
+
+/* A packet that the tag received; all stamps are unwrapped. */
+typedef struct Packet {
+    Place place;
+    int32_t sequence;
+    int64_t rx_ticks;  /* The tag's stamp. */
+    int64_t tx_ticks;  /* The anchor's own. */
+    real variance_factor;  /* On the variance of the tag's reception. */
+    /* Identifier of the anchor against whose clock this one reports its own; −1 where it reports nothing. */
+    int32_t master;
+    int64_t subticks;  /* The anchor's reading less the master's at the packet's TX stamp, modulo 2⁴⁸. */
+    real report_variance_m2;
+    int32_t relay_count;
+    Relay relays[32];
+} Packet;
+
+/* A packet of a batch. */
+typedef struct BatchPacket {
+    int32_t place;  /* Row of its anchor in the table of places. */
+    int32_t sequence;
+    int64_t rx_ticks;
+    int64_t tx_ticks;
+    int32_t end;  /* Where its relays end in their table; they begin where those of the packet before end. */
+} BatchPacket;
+
+/* The state after a packet of a batch. */
+typedef struct BatchRow {
+    real position_m[3];
+    real velocity_mps[3];
+    real covariance_m2[3][3];
+    real levels[5];  /* As ``protect`` writes them, where they are asked for. */
+    int32_t integrity;
+    int32_t outcome;
+} BatchRow;
+
+/* A message of a superframe. */
+typedef struct PlannedMessage {
+    int32_t anchor;  /* Index of its anchor in the state; −1 where the tag does not receive it. */
+    int64_t gap_ticks;  /* Time since the message before. */
+    real share;  /* Share of its anchor's messages that arrive. */
+    real late_m;  /* By how much walls delay them. */
+    int32_t end;  /* Where its relays end in their table; they begin where those of the message before end. */
+} PlannedMessage;
+
+/* A reception that is relayed with a message. */
+typedef struct PlannedRelay {
+    int32_t sender;  /* Index of the anchor that was received; −1 where the tag does not receive it itself. */
+    real age_s;
+    real share;  /* Share of its receptions of which the tag gets to know. */
+    real late_m;
+} PlannedRelay;
+
+/* What a superframe's fixes sum up to, each by how often its message arrives. */
+typedef struct SteadyState {
+    real fixes;
+    real variance_m2[3];  /* Of each axis as the filter claims it. */
+    real square_bias_m2;  /* Of the error that walls leave. */
+    real motion_m2[3];  /* What accelerations have of each axis' variance, for one fix. */
+} SteadyState;
+
+SKYLESS_EXPORT void skyless_prepare(State *s);
+SKYLESS_EXPORT int32_t skyless_find_anchor(State *s, int32_t identifier);
+SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *position_m, real std_m, bool is_open);
+SKYLESS_EXPORT void skyless_remove_anchor(State *s, int32_t anchor);
+SKYLESS_EXPORT void skyless_fit_plane(State *s);
+SKYLESS_EXPORT int32_t skyless_process_frame(State *s, Packet *packet, uint8_t *packed, int32_t packed_bytes);
+SKYLESS_EXPORT int32_t skyless_process_difference(State *s, Place *a, Place *b, int64_t rx_ticks, real difference_m);
+SKYLESS_EXPORT int32_t skyless_process_height(State *s, real height_m, real std_m, bool is_barometer);
+SKYLESS_EXPORT void skyless_track(State *s, Place *places, BatchPacket *packets, Relay *relays, BatchRow *rows, int32_t
+        count, bool has_levels);
+SKYLESS_EXPORT void skyless_find_steady_state(State *s, PlannedMessage *messages, PlannedRelay *relays, int32_t count,
+        int32_t most, int32_t step, SteadyState *found);
+SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_ticks, real *position_m, uint8_t *known,
+        int32_t first, real elapsed_s, real walked_m);
+
+#endif
