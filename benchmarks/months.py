@@ -14,7 +14,7 @@ import numpy as np
 from skyless.core.constants import TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.core.estimator.estimator import Estimator, Packets
 from skyless.core.estimator.settings import EstimatorSettings
-from skyless.core.estimator.state import layout
+from skyless.core.native.records import view
 
 NODES, SUPERFRAMES, SLOT_TICKS = 7, 2048, round(5e-3 * TICK_RATE_HZ)
 TAG_M = np.array([3.0, 4.0, 0.0])
@@ -76,8 +76,9 @@ class Joint:
         p.relays[:, 3] += self.minute.steps[p.relays[:, 0]]
 
     def state(self):
-        s, clocked = self.filter.state, layout(2, NODES).tx_noise
-        return s.x[:clocked], s.P[:clocked, :clocked], int(s.status[0]["rejected"])
+        s = self.filter.state
+        clocked = s.layout.tx_noise
+        return view(s.x)[:clocked], view(s.P)[:clocked, :clocked], s.status.rejected
 
     def position(self):
         return self.filter.motion()[0][:2]

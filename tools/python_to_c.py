@@ -405,7 +405,9 @@ class Body:
         elif isinstance(self.returned, Results):
             if not isinstance(value, ast.Tuple):
                 raise self.refuse(value, "several results are returned as a tuple")
-            items = [converted(self.value(item), kind) for item, kind in zip(value.elts, self.returned.items, strict=True)]
+            items = [
+                converted(self.value(item), kind) for item, kind in zip(value.elts, self.returned.items, strict=True)
+            ]
             listed = ", ".join(item.code for item in items)
             yield f"{indent}return ({self.returned.function}_results){{{listed}}};"
         else:
@@ -594,7 +596,9 @@ class Body:
             raise self.refuse(node, f"{op.__name__} is for whole numbers")
         if op in (ast.FloorDiv, ast.Mod):
             width = "64" if kind == LONG else "32"
-            return Value(f"{'floor_div' if op is ast.FloorDiv else 'floor_mod'}_{width}({left.code}, {right.code})", kind)
+            return Value(
+                f"{'floor_div' if op is ast.FloorDiv else 'floor_mod'}_{width}({left.code}, {right.code})", kind
+            )
         if op is ast.LShift:
             unsigned = "uint64_t" if left.kind == LONG else "uint32_t"
             kind = LONG if left.kind == LONG else INT
@@ -781,6 +785,11 @@ def _flat(block: list[Any]) -> Iterator[ast.Name]:
 
 
 HELPERS: Final = """\
+#ifdef SKYLESS_SOURCE_DIGEST
+SKYLESS_EXPORT extern const char *const skyless_source_digest;
+const char *const skyless_source_digest = SKYLESS_SOURCE_DIGEST;
+#endif
+
 #ifdef SKYLESS_FLOAT
 #define SQRT(x) __builtin_sqrtf(x)
 #define FABS(x) __builtin_fabsf(x)
@@ -863,7 +872,10 @@ def constant_lines(constants: dict[str, tuple[Any, str]]) -> list[str]:
     lines = []
     for name, (constant, doc) in sorted(constants.items()):
         value = literal(constant)
-        lines += [*(comment(doc) if doc else []), f"#define {name} {value.code if value.rank == 20 else f'({value.code})'}"]
+        lines += [
+            *(comment(doc) if doc else []),
+            f"#define {name} {value.code if value.rank == 20 else f'({value.code})'}",
+        ]
     return lines
 
 

@@ -9,6 +9,7 @@ from msgspec.structs import replace
 from skyless.core.estimator.estimator import Estimator
 from skyless.core.estimator.kalman import predict
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
+from skyless.core.native.records import view
 from skyless.core.site import EXACT
 from skyless.core.ticks import from_seconds
 from skyless.sim.evaluation.fleet import Fleet, FleetSettings
@@ -77,9 +78,9 @@ def test_the_spread_ahead_is_that_of_the_prediction():
     for dim in (2, 3):
         root = generator.normal(size=(2 * dim, 2 * dim))
         estimator = Estimator(EstimatorSettings(qa=0.4, height_m=0.0 if dim == 2 else None))
-        P = estimator.state.P
+        P = view(estimator.state.P)
         P[: 2 * dim, : 2 * dim] = root @ root.T
-        told, epoch = estimator.horizontal_variance_m2(1.7), int(estimator.state.status[0]["epoch_ticks"])
+        told, epoch = estimator.horizontal_variance_m2(1.7), estimator.state.status.epoch_ticks
         predict(estimator.state, epoch + from_seconds(1.7))
         assert told == pytest.approx(P[0, 0] + P[1, 1], rel=1e-9)
 

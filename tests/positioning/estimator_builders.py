@@ -5,15 +5,19 @@ frequency noise, every TX stamp an error that all who receive the packet share, 
 whole ticks. Anchors relay in their next packet whom they received since the one before.
 """
 
+from types import SimpleNamespace
+
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
+from numpy.lib.recfunctions import repack_fields
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.core.estimator.estimator import Estimator, Packets
-from skyless.core.estimator.levels import LEVELS
+from skyless.core.estimator.saved import packed_state
 from skyless.core.estimator.settings import EstimatorSettings
-from skyless.core.estimator.state import layout
+from skyless.core.estimator.state import FAULT_KINDS
+from skyless.core.native.records import view
 from skyless.core.observation import Observation
 from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM, random_path
 from skyless.sim.lab import paper_lab_site
@@ -128,6 +132,8 @@ class Run(Struct, frozen=True):
     covariances: np.ndarray
     """Of the position, shape (n, dim, dim)."""
     levels: np.ndarray
+    outcomes: np.ndarray
+    integrity: np.ndarray
 
     def errors(self, episode):
         dim = self.estimator.dim
@@ -135,10 +141,11 @@ class Run(Struct, frozen=True):
 
 
 def tracked(estimator, packets):
-    n, dim = len(packets.anchors), estimator.dim
-    motions, covariances, levels = np.empty((n, 2 * dim)), np.empty((n, dim * dim)), np.zeros((n, LEVELS + 2))
-    estimator.track(packets, motions, covariances, levels)
-    return Run(estimator, motions, covariances.reshape(n, dim, dim), levels)
+    rows, dim = estimator.track(packets, has_levels=True), estimator.dim
+    motions = np.concatenate([rows["position_m"][:, :dim], rows["velocity_mps"][:, :dim]], axis=1)
+    return Run(
+        estimator, motions, rows["covariance_m2"][:, :dim, :dim], rows["levels"], rows["outcome"], rows["integrity"]
+    )
 
 
 def rmse(errors):
@@ -155,7 +162,7 @@ def one_by_one(packets):
     begins = [0, *packets.ends[:-1].tolist()]
     for k, (begin, end) in enumerate(zip(begins, packets.ends.tolist(), strict=True)):
         columns = (packets.anchors, packets.sequences, packets.rx_ticks, packets.tx_ticks)
-        yield (*(int(column[k]) for column in columns), packets.relays[begin:end])
+        yield (*(int(column[k]) for column in columns), packets.relays[begin:end, 1:].tolist())
 
 
 def owners(packets):
@@ -192,16 +199,38 @@ def jumped(packets, anchor, begin, metres):
 def observations_of(packets, anchors_m=LAB_M):
     """What a receiver without any master would give its method."""
     for k, (anchor, sequence, rx_ticks, tx_ticks, relays) in enumerate(one_by_one(packets)):
-        told = tuple((sender, number, stamp) for _, sender, number, stamp in relays.tolist())
+        told = tuple(map(tuple, relays))
         stamps = (k // len(anchors_m), sequence, rx_ticks, tx_ticks, None, None, None, 0.0, 0.0)
         yield Observation(anchor, anchors_m[anchor], *stamps, told)
 
 
+def seen(state):
+    """What is in use of a state's arrays, in the same memory."""
+    where, count, faults = state.layout, state.count, FAULT_KINDS * state.count
+    n = where.end
+    return SimpleNamespace(
+        x=view(state.x)[:n],
+        P=view(state.P)[:n, :n],
+        V=view(state.V)[: faults + state.dim, :n],
+        information=view(state.information)[:faults, :faults],
+        evidence=view(state.evidence)[:faults],
+        anchors=view(state.anchors)[:count],
+        packets=view(state.packets)[:count],
+        links=view(state.links)[:count, :count],
+        status=view(state.status),
+        record=state,
+    )
+
+
 def same(one, other):
-    """Whether two states are the same to the bit, but for the room for calculations."""
-    pairs = zip(one._replace(work=one.x), other._replace(work=other.x), strict=True)
-    return all(ours.tobytes() == theirs.tobytes() for ours, theirs in pairs)
+    """Whether two states are the same to the bit."""
+    return packed_state(one) == packed_state(other)
+
+
+def bits(array):
+    """The bytes of numbers, or of records without what lies between their fields."""
+    return (repack_fields(array) if array.dtype.names else array).tobytes()
 
 
 def where(estimator):
-    return layout(estimator.dim, len(estimator.state.anchors))
+    return estimator.state.layout

@@ -10,7 +10,7 @@ from skyless import Request, fleet_of
 from skyless.core.estimator.estimator import Estimator
 from skyless.core.estimator.measurements import difference_terms, reception_terms
 from skyless.core.estimator.settings import EstimatorSettings
-from skyless.core.estimator.state import layout
+from skyless.core.native.records import view
 from skyless.core.site import AccuracySite
 from skyless.sim.evaluation.scenarios import Room, displacements
 from skyless.sim.lab import paper_lab_site
@@ -43,9 +43,9 @@ def rows_at_noisy_estimates(dim, position_m, seed, terms_of, cases):
     for _ in range(40):
         s.x[:dim] = position_m + NOISE_M * draw.uniform(-1.0, 1.0, dim)
         for case in cases:
-            terms, _ = terms_of(s, *case)
+            terms_of(s, *case)
             rows.append(np.zeros(len(s.x)))
-            np.add.at(rows[-1], s.h_index[:terms], s.h[:terms])
+            np.add.at(rows[-1], view(s.h_index)[: s.terms], view(s.h)[: s.terms])
     return np.array(rows)
 
 
@@ -101,8 +101,8 @@ def test_a_misplaced_anchor_is_found_by_its_ranges_to_the_others():
         estimator = estimator_after(request, 6.0)
         true_m = {one.anchor: (one.x_m, one.y_m) for one in displacements(room, request.site, request.seed)}
         s = estimator.state
-        survey = layout(2, len(s.anchors)).survey
-        found_m = dict(zip(estimator.anchors, s.x[survey : survey + 2 * len(s.anchors)].reshape(-1, 2), strict=True))
+        survey_m = view(s.x)[s.layout.survey : s.layout.end].reshape(-1, 2)
+        found_m = dict(zip(estimator.anchors, survey_m, strict=True))
         off = max(true_m, key=lambda anchor: np.hypot(*true_m[anchor]))
         left_m.append(np.hypot(*(found_m[off] - true_m[off])))
         assert all(np.hypot(*found_m[anchor]) < 0.1 for anchor in found_m if anchor != off)

@@ -8,12 +8,10 @@ from math import dist, log
 
 import numpy as np
 import pytest
-from msgspec.structs import replace
 
 from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.estimator.kalman import is_stationary
 from skyless.core.estimator.settings import TUNING
-from skyless.core.estimator.state import layout
 from skyless.core.fix import NoFixReason
 from skyless.core.integrity import Alert
 from skyless.research.masterless.difference_tracking import (
@@ -119,8 +117,7 @@ def test_nothing_is_early_by_more_than_the_bound():
     """An anchor that is late makes others seem early, which pulls the position towards it."""
     _, tracking = run(3.0, lambda time_s, n: 1.5 if n == 2 and time_s > 1.0 else 0.0)
     state = tracking.estimator.state
-    change = layout(3, len(state.anchors)).change
-    assert state.x[change : change + len(state.anchors)].min() > DIFFERENCES.earliest_m - 0.01
+    assert min(state.x[state.layout.change : state.layout.constant]) > DIFFERENCES.earliest_m - 0.01
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -233,7 +230,7 @@ def test_no_level_where_the_anchors_do_not_tell_the_height(height_m):
     """To first order the height is in no difference."""
     generator, reasons, std_m = np.random.default_rng(1), Counter(), []
     anchors_m = {n: (x, y, 2.0) for n, (x, y) in enumerate(SEEN_FROM_ABOVE)}
-    tracking, place = DifferenceTracking(replace(DIFFERENCES, height_m=height_m), anchors_m), np.array([3.0, 2.0, 2.0])
+    tracking, place = DifferenceTracking(DIFFERENCES.changed(height_m=height_m), anchors_m), np.array([3.0, 2.0, 2.0])
     for k in range(12_000):
         a, b = k % 6, (k + 1 + k // 6 % 5) % 6
         true_m = np.linalg.norm(place - anchors_m[b]) - np.linalg.norm(place - anchors_m[a])

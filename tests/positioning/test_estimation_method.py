@@ -15,6 +15,7 @@ from estimator_builders import (
     late,
     late_from,
     observations_of,
+    seen,
     settings_of,
 )
 from msgspec.structs import replace
@@ -205,7 +206,7 @@ def test_a_place_that_is_wrong_is_left():
     episode, method, errors = episode_of(CALM, 80), Estimation(settings_of(CALM)), {}
     for k, observation in enumerate(observations_of(episode.packets)):
         if k == 200:
-            method.estimator.state.x[:2] += 5.0
+            seen(method.estimator.state).x[:2] += 5.0
         result = method.update(observation)
         if isinstance(result, Fix):
             errors[k] = np.linalg.norm(result.position_m - episode.path_m[k])
@@ -220,7 +221,7 @@ def test_a_wrong_place_that_the_anchors_contradict_is_left():
     method, errors = Estimation(settings_of(CALM)), []
     for k, observation in enumerate(observations_of(episode.packets)):
         if k == 600:
-            x = method.estimator.state.x
+            x = seen(method.estimator.state).x
             x[:2] += 2.0
             for anchor in range(6):
                 away = x[:2] - LAB_M[anchor, :2]
@@ -239,7 +240,7 @@ def test_a_state_that_is_no_number_any_more_leads_to_a_new_start(what):
     method, observations = Estimation(settings_of(CALM)), list(observations_of(episode.packets))
     half = len(observations) // 2
     assert list(fixes_of(method, observations[:half], episode.path_m))
-    getattr(method.estimator.state, what)[0] = np.nan
+    getattr(seen(method.estimator.state), what)[0] = np.nan
     found = list(fixes_of(method, observations[half:], episode.path_m[half:]))
     assert len(found) > half // 2
     assert max(np.linalg.norm(error) for _, _, error in found) < 0.2
@@ -401,6 +402,6 @@ def test_reports_help_where_most_packets_are_lost():
                 fix = method.update(observation) if keep[n] else None
                 if isinstance(fix, Fix) and n > 200:
                     squares[k] += np.square(fix.position_m - episode.path_m[n]).sum()
-        used += int(method.estimator.state.status["reports_used"][0])
+        used += int(seen(method.estimator.state).status["reports_used"])
     assert used > 100
     assert squares[1] < 0.9 * squares[0]

@@ -16,6 +16,7 @@ from estimator_builders import (
     late_from,
     one_by_one,
     same,
+    seen,
     settings_of,
     tracked,
     where,
@@ -26,15 +27,18 @@ from scipy.stats import binom, chi2
 from skyless.core.constants import TICK_M, TICK_S
 from skyless.core.estimator import faults
 from skyless.core.estimator.faults import explained_chi2, fade_faults, fault_chi2, open_faults, whiten
-from skyless.core.estimator.levels import FIRST_TEST, LEVELS, protect
+from skyless.core.estimator.levels import FIRST_TEST, protect
 from skyless.core.estimator.settings import TUNING
 from skyless.core.estimator.state import (
     ALL_RANGE_ERRORS,
     FAULT_KINDS,
     LASTING,
-    with_anchor,
+    add_anchor,
+    make_uncertain,
+    new_state,
 )
 from skyless.core.integrity import CONTRADICTED, HPL, Alert, IntegrityRequirement, integrity_of, limits_of
+from skyless.core.native.records import view
 
 pytestmark = pytest.mark.site
 
@@ -51,16 +55,16 @@ def follow(one, packets, other, other_packets, before=None):
     for ours, theirs in zip(one_by_one(packets), one_by_one(other_packets), strict=True):
         if before is not None:
             before(other, theirs)
-        if len(one.state.anchors) == len(other.state.anchors):
+        if len(seen(one.state).anchors) == len(seen(other.state).anchors):
             for name in ("q_scale", "walk_scale", "common_mean", "lag", "lag_square"):
-                other.state.status[name] = one.state.status[name]
+                seen(other.state).status[name] = seen(one.state).status[name]
             for name in ("walk_scale", "held_m", "held_range_m"):
-                other.state.anchors[name] = one.state.anchors[name]
+                seen(other.state).anchors[name] = seen(one.state).anchors[name]
         assert one.process(*ours) == other.process(*theirs)
         for estimator in (one, other):  # constants of pairs are beside the filter, and in no sensitivity
-            estimator.state.links["variance_m2"] = 0.0
+            seen(estimator.state).links["variance_m2"] = 0.0
     for estimator in (one, other):
-        status = estimator.state.status
+        status = seen(estimator.state).status
         assert status["obstructions"] == status["faults_opened"] == status["rejected"] == 0
 
 
@@ -84,8 +88,8 @@ def test_sensitivities_are_what_a_fault_does_to_the_state(case, anchors_m, heigh
     clean, faulty = (begun(episode, assumed, anchors_m, 0.1, off=0.0) for _ in range(2))
     follow(clean, episode.packets, faulty, late_from(episode.packets, anchor, LATE_M))
     # range errors: the range at which their slope counts goes in steps, a little earlier or later in either
-    apart, s = np.arange(clean.dim) if errors else apart_from_offsets(clean), clean.state
-    moved, expected = ((faulty.state.x - s.x) / LATE_M)[apart], s.V[anchor][apart]
+    apart, s = np.arange(clean.dim) if errors else apart_from_offsets(clean), seen(clean.state)
+    moved, expected = ((seen(faulty.state).x - s.x) / LATE_M)[apart], s.V[anchor][apart]
     assert np.linalg.norm(expected[: clean.dim]) > 0.02
     np.testing.assert_allclose(moved, expected, rtol=0.03, atol=0.01 * np.abs(expected).max())
 
@@ -100,8 +104,8 @@ def test_sensitivities_to_acceleration_are_what_it_does():
     ]
     one, other = (begun(episode, settings_of(MESH, **OPEN), off=0.0) for _ in range(2))
     follow(one, episode.packets, other, late(episode.packets, flights_m[1] - flights_m[0]))
-    behind_m = other.state.x[:2] - step_m[-1, :2] - one.state.x[:2]
-    expected = one.state.V[FAULT_KINDS * len(LAB_M), :2]
+    behind_m = seen(other.state).x[:2] - step_m[-1, :2] - seen(one.state).x[:2]
+    expected = seen(one.state).V[FAULT_KINDS * len(LAB_M), :2]
     assert np.linalg.norm(expected) > 0.002
     np.testing.assert_allclose(behind_m / acceleration, expected, atol=0.2 * np.linalg.norm(expected))
 
@@ -111,7 +115,7 @@ def test_evidence_finds_the_size_of_a_fault():
     episode, sizes = episode_of(MESH), []
     for late_m in (0.0, LATE_M):
         run = tracked(begun(episode, settings_of(MESH, **OPEN)), late_from(episode.packets, 3, late_m))
-        s = run.estimator.state
+        s = seen(run.estimator.state)
         sizes.append(np.linalg.solve(s.information[:6, :6] + 1e-3 * np.eye(6), s.evidence[:6]))
     np.testing.assert_allclose((sizes[1] - sizes[0])[3] - np.delete(sizes[1] - sizes[0], 3).mean(), LATE_M, rtol=0.1)
 
@@ -121,13 +125,14 @@ def test_without_faults_their_test_is_chi_squared():
     total, freedom = 0.0, 0
     for seed in range(200):
         episode = episode_of(MESH, 60, seed)
-        s = tracked(begun(episode, settings_of(MESH, gate=6.0), seed=seed + 1000), episode.packets).estimator.state
+        run = tracked(begun(episode, settings_of(MESH, gate=6.0), seed=seed + 1000), episode.packets)
+        s = seen(run.estimator.state)
         if s.status["obstructions"] or s.status["faults_opened"]:
             continue
         values, vectors = np.linalg.eigh(s.information[:6, :6])
-        seen = values > 1e-3 * values[-1]
-        total += np.sum((vectors.T @ s.evidence[:6])[seen] ** 2 / values[seen])
-        freedom += np.count_nonzero(seen)
+        known = values > 1e-3 * values[-1]
+        total += np.sum((vectors.T @ s.evidence[:6])[known] ** 2 / values[known])
+        freedom += np.count_nonzero(known)
     low, high = chi2.ppf([0.0005, 0.9995], freedom)
     assert low < total < high
 
@@ -136,13 +141,16 @@ def test_products_of_whitened_vectors_are_solutions():
     draw = np.random.default_rng(1)
     root, right = draw.normal(size=(5, 7)), draw.normal(size=(3, 5))
     M = root @ root.T
-    work = np.vstack([M, right])
-    whiten(work, 5, 3)
+    state = new_state(settings_of(MESH))
+    work = view(state.work)[:8, :5]
+    work[:] = np.vstack([M, right])
+    whiten(state, 5, 3)
     np.testing.assert_allclose(work[5:] @ work[5:].T, right @ np.linalg.solve(M, right.T), rtol=1e-9)
 
 
 def test_how_much_one_or_two_faults_explain():
-    s = tracked(begun(episode := episode_of(MESH, 20), settings_of(MESH)), episode.packets).estimator.state
+    state = tracked(begun(episode := episode_of(MESH, 20), settings_of(MESH)), episode.packets).estimator.state
+    s = seen(state)
     draw = np.random.default_rng(2)
     root = draw.normal(size=(6, 9))
     s.information[:6, :6], s.evidence[:6] = root @ root.T, draw.normal(size=6)
@@ -151,7 +159,7 @@ def test_how_much_one_or_two_faults_explain():
         for other in range(one + 1):
             both = sorted({one, other})
             y = s.evidence[both]
-            assert explained_chi2(s, one, other) == pytest.approx(y @ np.linalg.solve(M[np.ix_(both, both)], y))
+            assert explained_chi2(state, one, other) == pytest.approx(y @ np.linalg.solve(M[np.ix_(both, both)], y))
 
 
 # Opening
@@ -171,15 +179,15 @@ def test_opening_a_fault_is_a_filter_that_had_it_open_from_the_beginning(late_m,
     opened, wide = (begun(episode, assumed, std_m=0.1, off=0.0) for _ in range(2))
 
     def widen(estimator, packet):
-        if packet[0] == anchor and estimator.state.index_of[anchor] < 0:
-            estimator._state = with_anchor(estimator.state, anchor, LAB_M[anchor])
-            constant = where(estimator).constant + int(estimator.state.index_of[anchor])
-            estimator.state.P[constant, constant] += TUNING.late_std_m**2
-            estimator.state.status["range_errors"] = ALL_RANGE_ERRORS
+        if packet[0] == anchor and not estimator.has_anchor(anchor):
+            added = add_anchor(estimator.state, anchor, LAB_M[anchor], -1.0, False)
+            constant = where(estimator).constant + added
+            seen(estimator.state).P[constant, constant] += TUNING.late_std_m**2
+            make_uncertain(estimator.state, ALL_RANGE_ERRORS)
 
     follow(opened, packets, wide, packets, widen)
     faults._open_fault(opened.state, LASTING, anchor)
-    ours, theirs, apart = opened.state, wide.state, apart_from_offsets(wide)
+    ours, theirs, apart = seen(opened.state), seen(wide.state), apart_from_offsets(wide)
     scale = np.sqrt(np.diag(theirs.P))
     used = scale > 1e-9
     apart = np.intersect1d(apart, np.flatnonzero(used))
@@ -195,12 +203,13 @@ def test_opening_a_fault_is_a_filter_that_had_it_open_from_the_beginning(late_m,
 @pytest.mark.parametrize("kind", range(FAULT_KINDS), ids=["lasting", "recent", "creeping"])
 def test_other_faults_are_conditioned_on_one_that_is_opened(kind):
     """Schur's complement of all 18 faults' information."""
-    s = tracked(begun(episode := episode_of(MESH, 20), settings_of(MESH)), episode.packets).estimator.state
+    state = tracked(begun(episode := episode_of(MESH, 20), settings_of(MESH)), episode.packets).estimator.state
+    s = seen(state)
     draw, anchor = np.random.default_rng(5), 3
     root = draw.normal(size=(18, 40))
     whole, y = root @ root.T, draw.normal(size=18)
     s.information[:], s.evidence[:] = whole, y
-    faults._open_fault(s, kind, anchor)
+    faults._open_fault(state, kind, anchor)
     chosen = 6 * kind + anchor
     others = np.delete(np.arange(18), chosen)
     share = whole[others, chosen] / (whole[chosen, chosen] + 1.0 / TUNING.late_std_m**2)
@@ -214,11 +223,12 @@ def test_other_faults_are_conditioned_on_one_that_is_opened(kind):
 
 def test_what_has_not_lasted_is_forgotten():
     """In one round of packets, by the memory of each kind; what lasts and what acceleration does are kept."""
-    s = tracked(begun(episode := episode_of(MESH, 20), settings_of(MESH)), episode.packets).estimator.state
+    state = tracked(begun(episode := episode_of(MESH, 20), settings_of(MESH)), episode.packets).estimator.state
+    s = seen(state)
     V, information, evidence = s.V.copy(), s.information.copy(), s.evidence.copy()
     faded_s, s.status["packets"] = 0.3, 600
     s.status["faded_ticks"] = s.status["epoch_ticks"] - round(faded_s / TICK_S)
-    fade_faults(s)
+    fade_faults(state)
     kept = np.repeat([1.0, 1.0 - 1.0 / TUNING.recent_packets, np.exp(-faded_s / TUNING.creeping_s)], 6)
     np.testing.assert_allclose(s.V, V * np.append(kept, [1.0, 1.0])[:, None], rtol=1e-6)
     np.testing.assert_allclose(s.evidence, evidence * kept, rtol=1e-6)
@@ -242,7 +252,7 @@ def test_an_anchor_that_creeps_deceives_nobody(rate_mps):
         late_m = np.where(episode.packets.anchors == seed, rate_mps * since_s, 0.0)
         run = tracked(begun(episode, settings_of(AGILE, **ROOM_ERRORS)), late(episode.packets, late_m))
         off_m = np.linalg.norm(run.errors(episode), axis=1)[800:]
-        sound = run.levels[800:, -1] < CONTRADICTED
+        sound = run.integrity[800:] < CONTRADICTED
         assert np.all(off_m[sound] < run.levels[800:, HPL][sound])
         given += sound.mean() / 6
         squares.append(np.square(off_m).mean())
@@ -264,7 +274,7 @@ def test_an_anchor_that_drifts_off_deceives_nobody(rate_mps):
         late_m = np.where(episode.packets.anchors == anchor, rate_mps * np.clip(since_s, 0.0, 1.0), 0.0)
         run = tracked(begun(episode, settings_of(AGILE)), late(episode.packets, late_m))
         off_m = np.linalg.norm(run.errors(episode), axis=1)[begin:]
-        sound = run.levels[begin:, -1] < CONTRADICTED
+        sound = run.integrity[begin:] < CONTRADICTED
         assert np.all(off_m[sound] < run.levels[begin:, HPL][sound])
         given += sound.mean() / 24
         squares.append(np.square(off_m).mean())
@@ -302,7 +312,7 @@ def test_levels_hold_with_anchors_that_are_late_from_the_start(late_anchors, err
         wrong = np.where(np.isin(episode.packets.anchors, late_anchors), late_m, 0.0)
         run = tracked(begun(episode, settings_of(AGILE, **errors)), late(episode.packets, wrong))
         off_m = np.linalg.norm(run.errors(episode), axis=1)[60:]
-        assert np.all((off_m < run.levels[60:, HPL]) | (run.levels[60:, -1] >= CONTRADICTED))
+        assert np.all((off_m < run.levels[60:, HPL]) | (run.integrity[60:] >= CONTRADICTED))
         if len(late_anchors) == 1:
             assert off_m[1140:].max() < 0.1
             assert not set(run.estimator.obstructed) - set(late_anchors)
@@ -314,7 +324,7 @@ def test_clean_packets_are_believed(errors):
     for seed in range(6):
         episode = episode_of(AGILE, 400, seed)
         run = tracked(begun(episode, settings_of(AGILE, **errors)), episode.packets)
-        status = run.estimator.state.status[0]
+        status = seen(run.estimator.state).status
         assert status["faults_opened"] == status["impossible"] == 0
         jumps += status["obstructions"]
     assert jumps == 0
@@ -325,10 +335,10 @@ def test_too_few_anchors_single_nobody_out():
     packets = kept(episode.packets, episode.packets.anchors < 4)
     estimator = begun(episode, settings_of(MESH))
     estimator.track(packets)
-    estimator.state.evidence[:4] = [1e4, 0.0, 0.0, 0.0]
+    seen(estimator.state).evidence[:4] = [1e4, 0.0, 0.0, 0.0]
     assert fault_chi2(estimator.state, LASTING, 0) > 10.0 * TUNING.sure_chi2
     open_faults(estimator.state)
-    assert estimator.state.status["faults_opened"] == 0
+    assert seen(estimator.state).status["faults_opened"] == 0
 
 
 # Protection levels
@@ -343,10 +353,10 @@ def test_levels_are_the_ellipse_and_the_shift_of_all_faults():
     episode = episode_of(MESH, 40, 1, ROOM_M)
     estimator = begun(episode, settings_of(MESH, None, **ROOM_ERRORS), ROOM_M)
     estimator.track(episode.packets)
-    s, n, k = estimator.state, len(ROOM_M), limits_of(RISK)
+    s, n, k = seen(estimator.state), len(ROOM_M), limits_of(RISK)
     s.evidence[:] = np.random.default_rng(3).normal(0.0, 10.0, s.evidence.shape)
-    levels = np.zeros(LEVELS)
-    protect(s, levels)
+    protect(estimator.state)
+    levels = view(estimator.state.levels)
     hpl, vpl = [], []
     for kind, std_m in enumerate((TUNING.lasting_std_m, TUNING.recent_std_m, TUNING.creeping_std_m)):
         of_kind = slice(kind * n, (kind + 1) * n)
@@ -365,11 +375,11 @@ def exceeded(case, assumed, worlds, draw_packets, risk):
     promised = above = 0
     for seed in range(worlds):
         episode = episode_of(case, 270, seed)
-        estimator = begun(episode, replace(assumed, integrity_risk=risk), seed=seed + 500)
+        estimator = begun(episode, assumed.changed(integrity_risk=risk), seed=seed + 500)
         run = tracked(estimator, draw_packets(np.random.default_rng(seed + 900), episode.packets))
         errors = np.linalg.norm(run.errors(episode), axis=1)
         for k in range(399, len(errors), 400):
-            if integrity_of([*run.levels[k, :2], run.levels[k, -1]], risk, True, None).hpl_m is not None:
+            if integrity_of([*run.levels[k, :2], run.integrity[k]], risk, True, None).hpl_m is not None:
                 promised += 1
                 above += bool(errors[k] > run.levels[k, HPL])
     return promised, above
@@ -405,7 +415,7 @@ def test_strict_levels_hold_and_are_not_much_larger_than_need_be():
 
 
 def integrity(run, k=-1):
-    return integrity_of([*run.levels[k, :2], run.levels[k, -1]], RISK, True, None)
+    return integrity_of([*run.levels[k, :2], run.integrity[k]], RISK, True, None)
 
 
 def test_a_coarse_fault_is_told_covered_and_forgotten_when_it_is_over():
@@ -425,7 +435,7 @@ def test_too_few_anchors_for_a_position_leave_nothing_to_promise():
         p = episode.packets
         packets = kept(p, (np.arange(len(p.anchors)) < 300) | (p.anchors < left))
         run = tracked(begun(episode, settings_of(MESH, drop_s=0.1)), packets)
-        assert len(run.estimator.state.anchors) == left
+        assert len(seen(run.estimator.state).anchors) == left
         assert (integrity(run).hpl_m is not None) == sound
         assert (integrity(run).alert is Alert.UNAVAILABLE) != sound
 

@@ -51,4 +51,4 @@ def test_what_is_told_is_the_given_height(height_std_m):
     estimator = begun(episode, settings_of(height_std_m=height_std_m), ROOM_M)
     estimator.track(episode.packets)
     assert estimator.process_height(0.0, 0.1) == 1
-    assert estimator.rows[0, 2] == 0.0
+    assert estimator.state.fix[0][2] == 0.0

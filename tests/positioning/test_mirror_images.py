@@ -7,6 +7,7 @@ from estimator_builders import LAB_M, MESH, ROOM_M, begun, episode_of, settings_
 from skyless.core.estimator.levels import is_side_open
 from skyless.core.fix import NoFixReason
 from skyless.core.integrity import SOUND, UNAVAILABLE
+from skyless.core.native.records import view
 from skyless.core.tag.locate import NoSolution, locate_pseudoranges
 
 ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03}
@@ -19,7 +20,7 @@ def state_of(anchors_m, height_m=0.0):
 
 
 def is_open_at(state, place_m):
-    state.x[: len(place_m)] = place_m
+    view(state.x)[: len(place_m)] = place_m
     return is_side_open(state)
 
 
@@ -73,7 +74,7 @@ def test_there_is_no_level_on_an_open_side():
         path_m = np.tile((3.0, 2.5, 0.0), (600, 1))
         episode = episode_of(MESH, 100, anchors_m=anchors_m, path_m=path_m)
         run = tracked(begun(episode, settings_of(MESH, **ERRORS), anchors_m, std_m=0.1), episode.packets)
-        assert run.levels[-1, -1] == state
+        assert run.integrity[-1] == state
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -17,8 +17,7 @@ pytestmark = pytest.mark.site
 
 SECONDS = 6.0
 SPEED_MPS = 1.0
-EXACT = structs.replace(
-    MASTERLESS, survey_std_m=0.0, range_std_m=0.0, slope_std_m=0.0, place_std_m=0.0, change_memory_s=0.0,
+EXACT = MASTERLESS.changed( survey_std_m=0.0, range_std_m=0.0, slope_std_m=0.0, place_std_m=0.0, change_memory_s=0.0,
     stationary_s=0.0, rx_variance_m2=9e-4,
 )  # fmt: skip
 """As the hall is where nothing else is asked for."""
@@ -44,7 +43,7 @@ def follow(
     timed, speed_mps=SPEED_MPS, anchors_m=hall.ANCHORS_M, height_m=None, settle_s=1.0, settings=MASTERLESS, **options
 ):
     """The tracking at the end, rows of true time, error and time of the fix, and the normalised errors squared."""
-    tracking = PacketTracking(structs.replace(settings, height_m=height_m), anchors_m, **options)
+    tracking = PacketTracking(settings.changed(height_m=height_m), anchors_m, **options)
     rows, squared = [], []
     for t_s, packet in timed:
         fix = tracking.on_packet(packet)

@@ -53,9 +53,9 @@ class TextbookFilter:
             self._join(anchor, rx, tx)
             return
         self._own_reception(anchor, rx, tx)
-        for listener, sender, number, stamp in relays.tolist():
-            if listener in self.newest and (sender, number) in self.packets:
-                self._relay(listener, sender, *self.packets[sender, number], stamp, max(walks[[listener, sender]]))
+        for sender, number, stamp in relays:
+            if (sender, number) in self.packets:
+                self._relay(anchor, sender, *self.packets[sender, number], stamp, max(walks[[anchor, sender]]))
                 self.relayed.add(sender)
 
     def _predict(self, rx, q_scale, own_walk_scale, walks):

@@ -94,7 +94,6 @@ class Packet(Record):
 def process(s: State, packet: Packet) -> int:
     """Process a packet and what it relays; returns what became of it, and leaves ``levels`` and ``fix``."""
     outcome = _process_packet(s, packet)
-    s.status.outcome = outcome
     fill_fix(s)
     return outcome
 

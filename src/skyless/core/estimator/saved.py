@@ -4,6 +4,7 @@ from struct import Struct as Format
 from typing import Any, Final
 
 import numpy as np
+from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
 from skyless.core.estimator.settings import EstimatorSettings
@@ -26,7 +27,7 @@ _HEAD: Final = Format("<HBB")
 
 def packed_state(s: State) -> bytes:
     """A state as bytes: a head, then what is in use of each array."""
-    return _HEAD.pack(VERSION, s.dim, s.count) + b"".join(part.tobytes() for part in _parts(s))
+    return _HEAD.pack(VERSION, s.dim, s.count) + b"".join(_packed(part).tobytes() for part in _parts(s))
 
 
 def unpacked_state(settings: EstimatorSettings, packed: bytes) -> State:
@@ -45,9 +46,9 @@ def unpacked_state(settings: EstimatorSettings, packed: bytes) -> State:
         raise ValueError(f"the estimator's state has {s.count} anchors; it can have {MAX_ANCHORS}")
     set_layout(s)
     for part in _parts(s):
-        values = np.frombuffer(packed[place : place + part.nbytes].ljust(part.nbytes, b"\0"), part.dtype)
-        part[...] = values.reshape(part.shape)
-        place += part.nbytes
+        size, dtype = part.size * _packed(part).itemsize, _packed(part).dtype
+        part[...] = np.frombuffer(packed[place : place + size].ljust(size, b"\0"), dtype).reshape(part.shape)
+        place += size
     identifiers = {s.anchors[anchor].identifier for anchor in range(s.count)}
     if place != len(packed) or len(identifiers) != s.count:
         raise ValueError("the estimator's state is incomplete or holds an anchor twice")
@@ -55,6 +56,11 @@ def unpacked_state(settings: EstimatorSettings, packed: bytes) -> State:
         raise ValueError("the estimator's state has range errors of no kind")
     set_layout(s)
     return s
+
+
+def _packed(part: NDArray[Any]) -> NDArray[Any]:
+    """Without what lies between the fields of records."""
+    return repack_fields(part) if part.dtype.names else part
 
 
 def _parts(s: State) -> list[NDArray[Any]]:

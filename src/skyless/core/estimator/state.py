@@ -151,8 +151,6 @@ class Status(Record):
     """The tag's reading at the start."""
     faded_ticks: Ticks
     """The tag's reading when faults that are not lasting last faded."""
-    outcome: int
-    """What became of it."""
     packets: Count
     accepted: Count
     rejected: Count

@@ -118,6 +118,7 @@ def record(made: type[Made]) -> type[Made]:
 
 
 def c_type(hint: Any) -> Any:  # noqa: ANN401 - types have no type
+    """What an annotation of a field is in ctypes."""
     if get_origin(hint) is not Annotated:
         return _C_TYPES.get(hint, hint)
     base, *extras = get_args(hint)

@@ -17,6 +17,11 @@
 #define INTERNAL static
 #endif
 
+#ifdef SKYLESS_SOURCE_DIGEST
+SKYLESS_EXPORT extern const char *const skyless_source_digest;
+const char *const skyless_source_digest = SKYLESS_SOURCE_DIGEST;
+#endif
+
 #ifdef SKYLESS_FLOAT
 #define SQRT(x) __builtin_sqrtf(x)
 #define FABS(x) __builtin_fabsf(x)
@@ -2210,7 +2215,6 @@ INTERNAL void zero_velocity(State *s) {
 /* Process a packet and what it relays; returns what became of it, and leaves ``levels`` and ``fix``. */
 INTERNAL int32_t process(State *s, Packet *packet) {
     int32_t outcome = process_packet(s, packet);
-    s->status.outcome = outcome;
     fill_fix(s);
     return outcome;
 }

@@ -309,7 +309,6 @@ typedef struct Status {
     int64_t epoch_ticks;  /* The tag's reading at the newest packet. */
     int64_t start_ticks;  /* The tag's reading at the start. */
     int64_t faded_ticks;  /* The tag's reading when faults that are not lasting last faded. */
-    int32_t outcome;  /* What became of it. */
     int64_t packets;
     int64_t accepted;
     int64_t rejected;

@@ -1,0 +1,31 @@
+"""Build hook: make the library of the estimator, for this machine or for that of a wheel (``tools/compile_core.py``)."""
+
+import os
+import sys
+import sysconfig
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+sys.path.insert(0, str(Path(__file__).parent / "tools"))
+from compile_core import NATIVE, TARGETS, ZIG, build, compiler  # noqa: E402 - not a package
+
+
+class CoreBuildHook(BuildHookInterface):  # type: ignore[type-arg]
+    """Makes the library before the wheel, or the editable installation, is put together."""
+
+    def dependencies(self) -> list[str]:
+        """A compiler, where this machine has none."""
+        return [] if compiler() else [ZIG]
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Compile, and name the platform that the wheel is for."""
+        if self.target_name != "wheel":
+            return
+        library = build(Path(self.root) / NATIVE)
+        asked = os.environ.get("SKYLESS_TARGET")
+        platform = TARGETS[asked][1] if asked else sysconfig.get_platform().replace("-", "_").replace(".", "_")
+        build_data["pure_python"] = False
+        build_data["tag"] = f"py3-none-{platform}"
+        build_data["artifacts"].append(f"/{library.relative_to(self.root)}")

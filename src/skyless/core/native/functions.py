@@ -1,0 +1,16 @@
+"""The functions that Python calls in the library; ``exports`` lists them."""
+
+from skyless.core.estimator import levels, process, state, steady_state
+from skyless.core.native.library import compiled
+
+prepare = compiled(state.prepare)
+add_anchor = compiled(state.add_anchor)
+remove_anchor = compiled(state.remove_anchor)
+find_anchor = compiled(state.find_anchor)
+fit_plane = compiled(levels.fit_plane)
+process_frame = compiled(process.process_frame)
+process_difference = compiled(process.process_difference)
+process_height = compiled(process.process_height)
+track = compiled(process.track)
+find_steady_state = compiled(steady_state.find_steady_state)
+process_known = compiled(steady_state.process_known)

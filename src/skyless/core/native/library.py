@@ -1,0 +1,90 @@
+"""The library that is made from the Python of ``core`` (``tools/python_to_c.py``), and its functions.
+
+With ``SKYLESS_UNCOMPILED=1`` in the environment the Python itself runs: the same bits, some thousand times slower.
+"""
+
+import ctypes
+import os
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, Final, ParamSpec, TypeVar, cast, get_origin, get_type_hints
+
+import numpy as np
+
+from skyless.core.errors import SkylessError
+from skyless.core.native.records import Record, c_type
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+UNCOMPILED_VARIABLE: Final = "SKYLESS_UNCOMPILED"
+LIBRARY: Final = Path(__file__).with_name("libskyless_core.so")
+SOURCE: Final = Path(__file__).with_name("skyless_core.c")
+
+
+def is_compiled() -> bool:
+    """Whether the library's functions are used, and not their Python."""
+    return os.environ.get(UNCOMPILED_VARIABLE, "") in {"", "0"}
+
+
+@cache
+def library() -> ctypes.CDLL:
+    """The library of this installation.
+
+    Raises:
+        SkylessError: it is not there, or was not made from the source beside it.
+    """
+    again = "install Skyless again (in a checkout: scripts/core)"
+    try:
+        found = ctypes.CDLL(str(LIBRARY))
+    except OSError as error:
+        raise SkylessError(f"{LIBRARY}: {error}; {again}") from None
+    digest = ctypes.c_char_p.in_dll(found, "skyless_source_digest").value
+    if SOURCE.exists() and digest != source_digest(SOURCE).encode():
+        raise SkylessError(f"{LIBRARY} was made from another {SOURCE.name} than the one beside it; {again}")
+    return found
+
+
+def source_digest(source: Path) -> str:
+    """What tells whether a library was made from this file."""
+    import hashlib  # noqa: PLC0415 - not needed where there is no source
+
+    header = source.with_suffix(".h")
+    return hashlib.sha256(source.read_bytes() + header.read_bytes()).hexdigest()[:16]
+
+
+def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """The function of the library that was made from one in Python.
+
+    Records are given as they are, arrays as ctypes has them, bytes also as ``bytes``. Nothing is checked but types.
+    """
+    if not is_compiled():
+        return function
+    hints = get_type_hints(function, include_extras=True)
+    returned = hints.pop("return")
+    called = library()[f"skyless_{function.__name__}"]
+    called.argtypes = [_argument_type(hint) for hint in hints.values()]
+    called.restype = None if returned is type(None) else c_type(returned)
+    return cast("Callable[Parameters, Result]", called)
+
+
+def _argument_type(hint: Any) -> Any:  # noqa: ANN401 - types have no type
+    origin = get_origin(hint)
+    if origin is not None and origin.__name__ in {"Array", "Sequence"}:
+        return _Address
+    found = c_type(hint)
+    if issubclass(found, Record):
+        return ctypes.POINTER(found)
+    return _Address if issubclass(found, ctypes.Array) else found
+
+
+class _Address:
+    """Where an array or bytes stand."""
+
+    @classmethod
+    def from_param(cls, array: Any) -> Any:  # noqa: ANN401 - arrays of several libraries
+        """What ctypes gives to C; the array has to be contiguous."""
+        if isinstance(array, np.ndarray):
+            return ctypes.c_void_p(array.ctypes.data)
+        return ctypes.c_void_p.from_param(array)
