@@ -184,9 +184,8 @@ def straight(_: Site, tags: int, seed: int, speed_mps: float) -> list[Trajectory
 @contextmanager
 def switched(changes: dict[str, float]) -> Iterator[None]:
     """Let constants have other values within the block, in every module that has imported them."""
-    new: dict[str, Any] = {"TUNING": structs.replace(
-        parameters.TUNING, **{name: value for name, value in changes.items() if ":" not in name}
-    )}  # fmt: skip
+    tuned = {name: value for name, value in changes.items() if ":" not in name}
+    new: dict[str, Any] = {"TUNING": parameters.TUNING.changed(**tuned)}
     for place, value in changes.items():
         module, _, attribute = place.rpartition(":")
         if module:

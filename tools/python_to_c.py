@@ -16,7 +16,7 @@ first of equals; a bound of a range is looked up once. A variable keeps the type
 of an array or a field of a record, and no number, is a reference, as in Python. Whole numbers are assumed to fit, and
 divisors not to be zero. Docstrings and comments come along.
 
-    python tools/python_to_c.py            writes the files of ``skyless.core.native``
+``make_core.py`` makes the files of ``skyless.core.native`` with it.
 """
 
 import ast
@@ -933,11 +933,3 @@ def function_lines(translator: Translator, function: FunctionType, before: Funct
 def is_heading(source: Source, line: int) -> bool:
     """Whether a comment stands by itself between functions."""
     return not any(node.lineno <= line <= (node.end_lineno or 0) for node in source.nodes.values())
-
-
-if __name__ == "__main__":
-    from skyless.core.native.exports import EXPORTS
-
-    FOLDER: Final = Path(inspect.getfile(arithmetic)).parent
-    for text, suffix in zip(translate(EXPORTS, "skyless_core"), ("h", "c"), strict=True):
-        (FOLDER / f"skyless_core.{suffix}").write_text(text)

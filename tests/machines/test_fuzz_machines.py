@@ -162,10 +162,10 @@ def test_memory_stays_flat(machine):
     hearer = AnyReceiver(site=1) if machine == "tag" else Anchor(LAB, 4)
     frames = [reception for reception, _ in mixture(LAB, 5, 3000) if reception is not None]
     more = [reception for reception, _ in mixture(LAB, 6, 3000) if reception is not None]
-    for reception in frames:
-        hearer.hear(reception)
     tracemalloc.start()
     try:
+        for reception in frames:
+            hearer.hear(reception)
         before = tracemalloc.get_traced_memory()[0]
         for reception in more:
             hearer.hear(reception)

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from skyless.core.dop import dilution_of_precision
 from skyless.core.fix import NoFixReason
+from skyless.core.tag.descent import GAIN_TOLERANCE
 from skyless.core.tag.locate import (
-    GAIN_TOLERANCE,
     NoSolution,
     PseudorangeSolution,
     Solution,
@@ -331,7 +331,7 @@ def test_a_singular_covariance_is_refused():
 def test_iterations_that_do_not_settle_are_told(monkeypatch):
     from skyless.core.tag import locate as minima
 
-    monkeypatch.setattr(minima, "descend", lambda *_: (minima.EXHAUSTED, 100))
+    monkeypatch.setattr(minima, "_descend", lambda _: minima.EXHAUSTED)
     refused(locate(LAB, np.zeros(5), sigma(5), height_m=0), NoFixReason.NOT_CONVERGED)
 
 

@@ -246,8 +246,8 @@ def third_anchor(data):
         with_field(np.dtype(Status), lambda _: 4, "range_errors", 3),
     ],
     ids=[
-        "short", "long", "none", "twice", "number", "version", "dimensions", "fewer anchors", "no anchors", "all anchors",
-        "an anchor twice", "an unknown anchor", "range errors -1", "range errors 3",
+        "short", "long", "none", "twice", "number", "version", "dimensions", "fewer anchors", "no anchors",
+        "all anchors", "an anchor twice", "an unknown anchor", "range errors -1", "range errors 3",
     ],
 )  # fmt: skip
 def test_states_that_would_lead_compiled_code_astray_are_refused(change):

@@ -8,15 +8,18 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike
 
-from skyless.core.kernels.arrays import Array
-from skyless.core.kernels.compiled import kernel, threaded_kernel
-from skyless.core.kernels.linear_algebra import factorise, invert
+from skyless.core.kernels.arrays import Array, Mask
 
 MAX_VDOP: Final = 4.0
 """With a larger vertical dilution in the middle of the anchors, the height is not worth estimating."""
 
 GUESSED_STD_M: Final = 0.5
 """Standard deviation of a tag's height from the anchors', where that is used instead."""
+
+
+SINGULAR_PIVOT: Final = 1e-12
+"""A pivot below this part of its diagonal element is rounding noise: the matrix is singular."""
+_POINTS_AT_ONCE: Final = 4096
 
 
 class Dops(Struct, frozen=True, gc=False):
@@ -61,49 +64,43 @@ def dops_at(anchors_m: ArrayLike, positions_m: ArrayLike, *, height_known: bool,
     positions = np.array(positions_m, np.float64).reshape(-1, 3)
     counts = np.broadcast_to(np.asarray(weights, np.float64), (len(positions), len(anchors)))
     dops = np.full((len(positions), 5), math.inf)
-    _fill_dops(anchors, positions, np.ascontiguousarray(counts), 3 if height_known else 4, dops)
+    for first in range(0, len(positions), _POINTS_AT_ONCE):
+        part = slice(first, first + _POINTS_AT_ONCE)
+        normal = _normal_matrices(anchors, positions[part], counts[part], 3 if height_known else 4)
+        inverse, is_sound = _inverses(normal)
+        variances = np.zeros((len(normal), 4))
+        variances[:, : normal.shape[1]] = np.diagonal(inverse, axis1=1, axis2=2)
+        clock, horizontal, vertical = variances[:, 0], variances[:, 1] + variances[:, 2], variances[:, 3]
+        position = horizontal + vertical
+        found = np.sqrt(np.column_stack([position + clock, position, horizontal, vertical, clock]))
+        dops[part][is_sound] = found[is_sound]
     return dops
 
 
-@threaded_kernel
-def _fill_dops(
-    anchors: Array,
-    positions: Array,
-    weights: Array,
-    size: int,
-    dops: Array,
-) -> None:
-    """From HᵀWH of rows [1, unit vector], where it is not singular and all anchors that count have a direction.
+def _normal_matrices(anchors: Array, positions: Array, weights: Array, size: int) -> Array:
+    """HᵀWH of rows [1, unit vector], shape (m, size, size); NaN where an anchor that counts has no direction.
 
     The clock comes first, so that a factorisation removes the mean direction before anything else.
     """
-    normal, inverse, row = np.empty((4, 4)), np.zeros((4, 4)), np.ones(4)
-    for k in range(len(positions)):
-        normal[:] = 0.0
-        for i in range(len(anchors)):
-            if weights[k, i] > 0.0:
-                row[1], row[2], row[3] = direction(anchors, i, positions[k])
-                for p in range(size):
-                    for q in range(p + 1):
-                        normal[p, q] += weights[k, i] * row[p] * row[q]
-        if not factorise(normal, size):
-            continue
-        invert(normal, size, inverse)
-        clock, horizontal, vertical = inverse[0, 0], inverse[1, 1] + inverse[2, 2], inverse[3, 3]
-        dops[k, 0] = math.sqrt(horizontal + vertical + clock)
-        dops[k, 1] = math.sqrt(horizontal + vertical)
-        dops[k, 2] = math.sqrt(horizontal)
-        dops[k, 3] = math.sqrt(vertical)
-        dops[k, 4] = math.sqrt(clock)
+    away = positions[:, None] - anchors
+    with np.errstate(all="ignore"):
+        rows = np.concatenate([np.ones((*away.shape[:2], 1)), away / np.linalg.norm(away, axis=2)[..., None]], axis=2)
+    rows[weights <= 0.0] = 0.0
+    rows = rows[..., :size]
+    normal: Array = np.einsum("mi,mip,miq->mpq", weights, rows, rows)
+    return normal
 
 
-@kernel
-def direction(anchors: Array, i: int, position: Array) -> tuple[float, float, float]:
-    """Unit vector from anchor ``i`` to the position; NaNs where there is none."""
-    x = position[0] - anchors[i, 0]
-    y = position[1] - anchors[i, 1]
-    z = position[2] - anchors[i, 2]
-    distance = math.sqrt(x * x + y * y + z * z)
-    if distance == 0.0 or not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
-        return math.nan, math.nan, math.nan
-    return x / distance, y / distance, z / distance
+def _inverses(normal: Array) -> tuple[Array, Mask]:
+    """Inverses of matrices, shape (m, k, k), by Cholesky's method, and which of them are positive definite."""
+    size = normal.shape[1]
+    L, is_sound = np.zeros_like(normal), np.ones(len(normal), np.bool_)
+    with np.errstate(all="ignore"):
+        for j in range(size):
+            pivot = normal[:, j, j] - np.square(L[:, j, :j]).sum(axis=1)
+            is_sound &= (pivot > SINGULAR_PIVOT * normal[:, j, j]) & (normal[:, j, j] > 0.0)
+            L[:, j, j] = np.sqrt(np.where(is_sound, pivot, 1.0))
+            for i in range(j + 1, size):
+                L[:, i, j] = (normal[:, i, j] - (L[:, i, :j] * L[:, j, :j]).sum(axis=1)) / L[:, j, j]
+    inverse = np.linalg.inv(np.where(is_sound[:, None, None], L, np.eye(size)))
+    return inverse.transpose(0, 2, 1) @ inverse, is_sound

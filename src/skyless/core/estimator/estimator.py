@@ -8,6 +8,8 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
+from skyless.core.estimator import compiled
+from skyless.core.estimator.compiled import add_anchor, find_anchor, fit_plane, remove_anchor
 from skyless.core.estimator.levels import largest_test
 from skyless.core.estimator.process import (
     MAX_RELAYS,
@@ -29,8 +31,6 @@ from skyless.core.estimator.state import (
     new_state,
 )
 from skyless.core.kernels.arrays import Integers, Matrix, Vector
-from skyless.core.native import functions
-from skyless.core.native.functions import add_anchor, find_anchor, fit_plane, remove_anchor
 from skyless.core.native.records import records, view
 
 MAX_ANCHORS_KNOWN: Final = 256
@@ -242,20 +242,20 @@ class Estimator:
         packet.relay_count = min(len(relays), MAX_RELAYS)
         for relayed, (sender, number, stamp) in zip(packet.relays, relays, strict=False):
             relayed.anchor, relayed.sequence, relayed.rx_ticks = sender, number, stamp
-        return functions.process_frame(self._state, packet, packed, len(packed))
+        return compiled.process_frame(self._state, packet, packed, len(packed))
 
     def process_difference(self, a: int, b: int, rx_ticks: int, difference_m: float) -> int:
         """Process a ready-made difference of ranges, to anchor b less to anchor a; as ``process``."""
         if not np.isfinite(difference_m):
             return REJECTED
-        return functions.process_difference(self._state, self._known[a][1], self._known[b][1], rx_ticks, difference_m)
+        return compiled.process_difference(self._state, self._known[a][1], self._known[b][1], rx_ticks, difference_m)
 
     def process_height(self, height_m: float, std_m: float, is_barometer: bool = False) -> int:
         """Process the tag's height at the newest packet, as a sensor measures it; ``ACCEPTED`` or ``REJECTED``.
 
         A barometer's zero, which is unknown and moves slowly, is estimated; in three dimensions only.
         """
-        return functions.process_height(self._state, height_m, std_m, is_barometer)
+        return compiled.process_height(self._state, height_m, std_m, is_barometer)
 
     def track(self, packets: Packets, *, has_levels: bool = False) -> NDArray[np.void]:
         """Process many packets in one loop; the state after each, an array of ``BatchRow``, shape (n,)."""
@@ -269,7 +269,7 @@ class Estimator:
             relays[name] = packets.relays[:, column]
         rows = np.zeros(count, np.dtype(BatchRow))
         columns = records(BatchPacket, given), records(Relay, relays), records(BatchRow, rows)
-        functions.track(self._state, places, *columns, count, has_levels)
+        compiled.track(self._state, places, *columns, count, has_levels)
         return rows
 
     # What it knows

@@ -9,6 +9,7 @@
    skyless.core.estimator.state
    skyless.core.estimator.steady_state
    skyless.core.native.arithmetic
+   skyless.core.tag.descent
 */
 
 #include "skyless_core.h"
@@ -160,6 +161,10 @@ INTERNAL void add_fix(State *s, real share, SteadyState *found);
 INTERNAL void predict_with_impulses(State *s, int64_t now, int64_t impulses_ticks, int64_t superframe);
 INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks);
 INTERNAL void receive_relay(State *s, PlannedMessage *message, PlannedRelay *relayed);
+INTERNAL real assemble(Descent *d, real *state, real (*normal)[4]);
+INTERNAL bool find_damped_step(Descent *d, real damping);
+INTERNAL bool is_far(Descent *d);
+INTERNAL real eased(real damping, real ratio);
 
 /* Arithmetic of the functions that are also translated to C: the same bits on every processor, without a C library. */
 
@@ -2700,4 +2705,182 @@ SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_t
             update(s, REAL(0.0), compute_ph(s) + s->settings.rx_variance_m2, REAL(1.0));
         }
     }
+}
+
+/* Gauss–Newton steps, damped after Levenberg and Marquardt where they fail, to a minimum of TDoAs' residuals. */
+
+/* It also ends where a step promises to lower the cost by less than this part: steps of 10⁻⁷ sigma. */
+
+/* Write ``system``; an anchor at the very position has no direction and counts with zeros. */
+SKYLESS_EXPORT void skyless_linearise(Descent *d, real *state) {
+    real reference_m = REAL(0.0);
+    real reference_x = REAL(0.0);
+    real reference_y = REAL(0.0);
+    real reference_z = REAL(0.0);
+    for (int32_t i = 0, i_end = d->anchors; i < i_end; i++) {
+        real *anchor = d->positions_m[i];
+        real x = state[0] - anchor[0];
+        real y = state[1] - anchor[1];
+        real z = state[2] - anchor[2];
+        real across = d->kind == PLANE ? state[2] : z * z;
+        real distance_m = SQRT(max_real(x * x + y * y + across, REAL(1e-18)));
+        x /= distance_m;
+        y /= distance_m;
+        z = (d->kind == PLANE ? REAL(0.5) : z) / distance_m;
+        if (i == 0) {
+            reference_m = distance_m;
+            reference_x = x;
+            reference_y = y;
+            reference_z = z;
+        } else {
+            real *row = d->system[i - 1];
+            row[2] = z - reference_z;  /* and then the residual, where the height is given */
+            row[0] = x - reference_x;
+            row[1] = y - reference_y;
+            row[d->dims] = d->tdoa_m[i - 1] - (distance_m - reference_m);
+        }
+    }
+}
+
+/* Linearise, whiten, and write the lower triangle of systemᵀ·system into ``normal``; returns the cost. */
+INTERNAL real assemble(Descent *d, real *state, real (*normal)[4]) {
+    skyless_linearise(d, state);
+    int32_t rows = d->anchors - 1;
+    for (int32_t i = rows - 1; i > -1; i--) {  /* W is a lower triangle: rows above are still to come */
+        for (int32_t j = 0, j_end = d->dims + 1; j < j_end; j++) {
+            real total = REAL(0.0);
+            for (int32_t k = 0; k < i + 1; k++) {
+                total += d->whitener[i][k] * d->system[k][j];
+            }
+            d->system[i][j] = total;
+        }
+    }
+    for (int32_t j = 0, j_end = d->dims + 1; j < j_end; j++) {
+        for (int32_t k = 0; k < j + 1; k++) {
+            real total = REAL(0.0);
+            for (int32_t i = 0; i < rows; i++) {
+                total += d->system[i][j] * d->system[i][k];
+            }
+            normal[j][k] = total;
+        }
+    }
+    return normal[d->dims][d->dims];
+}
+
+/* Solve (N + damping·diag N)·step = gradient by Cholesky's method; False where the matrix is singular. */
+INTERNAL bool find_damped_step(Descent *d, real damping) {
+    real (*L)[4] = d->damped;
+    real *step = d->step;
+    for (int32_t j = 0, j_end = d->dims; j < j_end; j++) {
+        step[j] = d->normal[d->dims][j];
+        for (int32_t k = 0; k < j + 1; k++) {
+            L[j][k] = d->normal[j][k];
+        }
+        L[j][j] *= REAL(1.0) + damping;
+    }
+    for (int32_t j = 0, j_end = d->dims; j < j_end; j++) {
+        real pivot = L[j][j];
+        for (int32_t k = 0; k < j; k++) {
+            pivot -= L[j][k] * L[j][k];
+        }
+        if (!(pivot > SINGULAR_PIVOT * L[j][j] && L[j][j] > REAL(0.0))) {
+            return false;
+        }
+        L[j][j] = SQRT(pivot);
+        for (int32_t i = j + 1, i_end = d->dims; i < i_end; i++) {
+            real total = L[i][j];
+            for (int32_t k = 0; k < j; k++) {
+                total -= L[i][k] * L[j][k];
+            }
+            L[i][j] = total / L[j][j];
+        }
+    }
+    for (int32_t i = 0, i_end = d->dims; i < i_end; i++) {
+        real total = step[i];
+        for (int32_t k = 0; k < i; k++) {
+            total -= L[i][k] * step[k];
+        }
+        step[i] = total / L[i][i];
+    }
+    for (int32_t i = d->dims - 1; i > -1; i--) {
+        real total = step[i];
+        for (int32_t k = i + 1, k_end = d->dims; k < k_end; k++) {
+            total -= L[k][i] * step[k];
+        }
+        step[i] = total / L[i][i];
+    }
+    return true;
+}
+
+/* Move the state to the minimum of its surroundings; returns how it ended. */
+SKYLESS_EXPORT int32_t skyless_descend(Descent *d) {
+    real cost = assemble(d, d->state, d->normal);
+    real damping = REAL(0.0);
+    real growth = REAL(2.0);
+    for (int32_t j = 0; j < 3; j++) {
+        d->trial[j] = d->state[j];
+    }
+    for (int32_t iteration = 1; iteration < MAX_ITERATIONS + 1; iteration++) {
+        d->iterations = iteration;
+        if (!find_damped_step(d, damping)) {
+            if (damping > REAL(1.0)) {
+                return UNDETERMINED;
+            }
+            damping = max_real(REAL(10.0) * damping, FIRST_DAMPING);
+            continue;
+        }
+        real predicted = REAL(0.0);
+        real longest = REAL(0.0);
+        for (int32_t j = 0, j_end = d->dims; j < j_end; j++) {
+            d->trial[j] = d->state[j] + d->step[j];
+            predicted += d->step[j] * (d->normal[d->dims][j] + damping * d->normal[j][j] * d->step[j]);
+            longest = max_real(longest, abs_real(d->step[j]) / d->scale[j]);
+        }
+        bool is_small = longest <= STEP_TOLERANCE || predicted <= GAIN_TOLERANCE * cost;
+        real next_cost = assemble(d, d->trial, d->next_normal);
+        if (next_cost < cost) {
+            damping = eased(damping, (cost - next_cost) / max_real(predicted, REAL(1e-300)));
+            growth = REAL(2.0);
+            cost = next_cost;
+            for (int32_t j = 0, j_end = d->dims; j < j_end; j++) {
+                d->state[j] = d->trial[j];
+            }
+            for (int32_t j = 0, j_end = d->dims + 1; j < j_end; j++) {
+                for (int32_t k = 0; k < j + 1; k++) {
+                    d->normal[j][k] = d->next_normal[j][k];
+                }
+            }
+        } else {
+            damping = max_real(growth * damping, FIRST_DAMPING);
+            growth = REAL(2.0) * growth;
+        }
+        if (is_small) {
+            return CONVERGED;
+        }
+        if (is_far(d)) {
+            return DIVERGED;
+        }
+    }
+    return EXHAUSTED;
+}
+
+/* Whether the state has left for infinity, or is no number. */
+INTERNAL bool is_far(Descent *d) {
+    for (int32_t j = 0, j_end = d->dims; j < j_end; j++) {
+        real reach = abs_real(d->state[j]) / d->scale[j];
+        if (!((d->kind == PLANE && j == 2 ? SQRT(reach) : reach) < FAR_EXTENTS)) {
+            return true;
+        }
+    }
+    return false;
+}
+
+/* Next damping after a success, by the ratio of what it gained to what was predicted (H. B. Nielsen 1999). */
+INTERNAL real eased(real damping, real ratio) {
+    if (ratio < REAL(0.5)) {
+        damping = max_real(damping, FIRST_DAMPING);
+    }
+    real excess = REAL(2.0) * ratio - REAL(1.0);
+    real eased = damping * max_real(REAL(1.0) / REAL(3.0), REAL(1.0) - excess * excess * excess);
+    return eased > MIN_DAMPING ? eased : REAL(0.0);
 }

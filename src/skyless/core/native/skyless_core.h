@@ -9,6 +9,7 @@
    skyless.core.estimator.state
    skyless.core.estimator.steady_state
    skyless.core.native.arithmetic
+   skyless.core.tag.descent
 */
 
 #ifndef SKYLESS_CORE_H
@@ -38,10 +39,16 @@ typedef double real;
 #define CLOCK_RATE_VARIANCE REAL(224688794.68420443)
 #define COMPLETE_CHANGE REAL(0.001)
 #define CONTRADICTED 2
+#define CONVERGED 0
 #define CREEPING 2
+#define DIVERGED 2
+#define EXHAUSTED 3
+#define FAR_EXTENTS REAL(10000.0)
 #define FAULT_KINDS 3
+#define FIRST_DAMPING REAL(0.01)
 /* Where ``protect`` writes the tests of all kinds of faults, after ``HPL`` and ``VPL``. */
 #define FIRST_TEST 2
+#define GAIN_TOLERANCE REAL(1e-13)
 #define HALF_WRAP_TICKS INT64_C(549755813888)
 #define HPL 0
 #define IMPULSES 4
@@ -57,9 +64,11 @@ typedef double real;
 #define LOWEST REAL(-700.0)
 #define MAX_ANCHORS 32
 #define MAX_FAULTS 2
+#define MAX_ITERATIONS 200
 #define MAX_RATE_MPS REAL(29979.2458)
 /* Most relays with a packet; 13 fit into a frame. */
 #define MAX_RELAYS 32
+#define MIN_DAMPING REAL(0.0001)
 /* A time before all others. */
 #define NEVER (INT64_C(-4611686018427387904))
 #define NO_RANGE_ERRORS 0
@@ -68,6 +77,7 @@ typedef double real;
 #define PACKED_BYTES 8
 /* Packets of each anchor that are kept for relays to come; divides the range of sequence numbers. */
 #define PACKETS_KEPT 16
+#define PLANE 2
 #define POSITION 0
 #define PROTECTION 9
 #define QUALITY 4
@@ -75,10 +85,13 @@ typedef double real;
 #define REJECTED 0
 #define RESTARTED_CLOCK 4
 #define ROOT_2_PI REAL(2.5066282746310002)
+/* A pivot below this part of its diagonal element is rounding noise: the matrix is singular. */
+#define SINGULAR_PIVOT REAL(1e-12)
 #define SOUND 0
 #define SPEED_OF_LIGHT_MPS REAL(299792458.0)
 #define STALE 3
 #define STATE 2
+#define STEP_TOLERANCE REAL(1e-10)
 #define SUBTICKS 256
 #define SUBTICK_MASK INT64_C(281474976710655)
 /* Of Jacobi's rotations: each squares what is left off the diagonal. */
@@ -87,6 +100,7 @@ typedef double real;
 #define TICK_MASK INT64_C(1099511627775)
 #define TICK_S REAL(1.5650040064102565e-11)
 #define UNAVAILABLE 3
+#define UNDETERMINED 1
 #define UNUSED 0
 #define USED 1
 #define VELOCITY 5
@@ -507,6 +521,25 @@ typedef struct SteadyState {
     real motion_m2[3];  /* What accelerations have of each axis' variance, for one fix. */
 } SteadyState;
 
+/* A set of TDoAs, the reference first, and where the iteration is. */
+typedef struct Descent {
+    int32_t kind;
+    int32_t anchors;
+    int32_t dims;  /* Number of unknowns. */
+    int32_t iterations;
+    real positions_m[64][3];
+    real tdoa_m[64];
+    real whitener[64][64];  /* A lower triangle; the unit matrix where the sum of squares is not weighted. */
+    real scale[3];  /* What the anchors' extent is for each unknown. */
+    real state[3];
+    real trial[3];
+    real step[3];
+    real system[64][4];  /* Rows [∂TDoA/∂state, measured − predicted]. */
+    real normal[4][4];  /* The lower triangle of systemᵀ·system. */
+    real next_normal[4][4];
+    real damped[4][4];
+} Descent;
+
 SKYLESS_EXPORT void skyless_prepare(State *s);
 SKYLESS_EXPORT int32_t skyless_find_anchor(State *s, int32_t identifier);
 SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *position_m, real std_m, bool is_open);
@@ -521,5 +554,7 @@ SKYLESS_EXPORT void skyless_find_steady_state(State *s, PlannedMessage *messages
         int32_t most, int32_t step, SteadyState *found);
 SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_ticks, real *position_m, uint8_t *known,
         int32_t first, real elapsed_s, real walked_m);
+SKYLESS_EXPORT void skyless_linearise(Descent *d, real *state);
+SKYLESS_EXPORT int32_t skyless_descend(Descent *d);
 
 #endif

@@ -14,7 +14,6 @@ from msgspec import Struct
 from skyless.core.constants import TICK_M
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.kernels.arrays import Array, Matrix, Vector
-from skyless.core.kernels.compiled import kernel, part
 from skyless.core.observation import Observation
 from skyless.core.tag.locate import NoSolution, Solution, locate
 from skyless.core.ticks import FLIGHT_SLACK_TICKS, FixTime, may_elapse
@@ -32,19 +31,16 @@ class SnapshotMethod(StrEnum):
 # The paper's arithmetic
 
 
-@part
 def relative_rate(rx_interval_anchor: float, tx_interval_master: float) -> float:
     """Relative rate ν̄_{i,m} of an anchor against the master from two messages (``eq:Synchro``)."""
     return rx_interval_anchor / tx_interval_master
 
 
-@part
 def relative_offset(rx_anchor: float, tx_master: float, rate: float, tof_ticks: float) -> float:
     """Relative offset ō_{i,m} of one synchronisation message, in ticks (``eq:SynchroOffset``)."""
     return rx_anchor - rate * tx_master - tof_ticks
 
 
-@part
 def averaged_offset(first: float, delayed: float) -> float:
     """Mean of the offsets of the two messages (``eq:AverageRelOff``).
 
@@ -53,13 +49,11 @@ def averaged_offset(first: float, delayed: float) -> float:
     return (first + delayed) / 2.0
 
 
-@part
 def to_master(ticks_anchor: float, rate: float, offset: float) -> float:
     """An anchor's reading on the master's scale (``eq:AnchorSync``), in ticks."""
     return (ticks_anchor - offset) / rate
 
 
-@part
 def synchronise(
     tx1_master: int, tx2_master: int, rx1_anchor: int, rx2_anchor: int, tof_ticks: float
 ) -> tuple[float, float]:
@@ -75,19 +69,16 @@ def synchronise(
     return rate, averaged_offset(first, delayed)
 
 
-@kernel
 def tag_rate(rx_interval_tag: float, tx_interval_master: float) -> float:
     """Rate ν̄_m of the tag against the master (``eq:TagSynchro``); the motion toward the anchor is in it."""
     return rx_interval_tag / tx_interval_master
 
 
-@kernel
 def protocol_interval(rate_tag: float, tx_anchor_master: float, tx_master: float) -> float:
     """Protocol interval g(Δ_{i,m}) as the tag's clock would show it, in ticks (``eq:ProtocolInterval``)."""
     return rate_tag * (tx_anchor_master - tx_master)
 
 
-@kernel
 def literal_tdoa(
     m1: int,
     m2: int,
@@ -115,7 +106,6 @@ def literal_tdoa(
     return tdoa_first, tdoa_delayed
 
 
-@kernel
 def bracketed_tdoa(
     m1: int, m2: int, s1: int, s2: int, a1: int, a2: int, r1: int, r2: int, rm2: int, tof_ticks: float
 ) -> float:

@@ -24,8 +24,22 @@ from numpy.typing import ArrayLike
 
 from skyless.core.fix import NoFixReason
 from skyless.core.kernels.arrays import Array
-from skyless.core.kernels.compiled import kernel, part
-from skyless.core.kernels.linear_algebra import SINGULAR_PIVOT, factorise, solve
+from skyless.core.native.library import compiled
+from skyless.core.native.records import view
+from skyless.core.tag.descent import (
+    CONVERGED,
+    EXHAUSTED,
+    FREE,
+    HEIGHT,
+    MAX_ANCHORS,
+    PLANE,
+    SINGULAR_PIVOT,
+    Descent,
+    descend,
+    linearise,
+)
+
+_descend, _linearise = compiled(descend), compiled(linearise)
 
 RESIDUAL_TAIL: Final = 1e-9  # residuals that noise exceeds this rarely are not noise
 # A second minimum is a rival while its chi2 is less than this above the best one (a likelihood ratio of 90).
@@ -67,30 +81,12 @@ class NoSolution(Struct, frozen=True, gc=False):
     detail: str
 
 
-FREE: Final = 0  # kind of problem: the state is (x, y, z)
-HEIGHT: Final = 1  # the state is (x, y); its third element is the given height
-PLANE: Final = 2  # all anchors have z = 0; the state is (x, y, s) with s = z², negative where noise makes it so
-
 # Anchors are in one line, or one point, if their figure's width is below this part of its length.
 COLLINEAR: Final = 1e-6
 # Anchors are in one plane if they leave it by less than this part of the smallest TDoA sigma.
 THIN_SIGMAS: Final = 0.1
 # Equations of a start are not independent if their smallest singular value is below this part of the largest.
 DEPENDENT: Final = 1e-6
-# The unknowns are not determined where the iteration ended.
-CONVERGED: Final = 0
-UNDETERMINED: Final = 1
-DIVERGED: Final = 2  # the iteration left for infinity
-EXHAUSTED: Final = 3  # no end after MAX_ITERATIONS
-# The iteration ends with a step below this part of the anchors' extent (1 nm in 10 m).
-MAX_ITERATIONS: Final = 200
-STEP_TOLERANCE: Final = 1e-10
-# It also ends where a step promises to lower the cost by less than this part: steps of 10⁻⁷ sigma.
-GAIN_TOLERANCE: Final = 1e-13
-FAR_EXTENTS: Final = 1e4  # nobody locates a tag at ten thousand times the anchors' extent
-# Smaller damping is none.
-FIRST_DAMPING: Final = 1e-2
-MIN_DAMPING: Final = 1e-4
 # Two minima are distinct where one lies outside the 3-sigma ellipsoid of the other.
 DISTINCT_MINIMA_CHI2: Final = 9.0
 # Mirror images have merged while the square of their distance from the plane is within these sigmas of zero.
@@ -287,6 +283,8 @@ def _prepare(
             f"anchors {anchors.shape}, TDoAs {tdoa.shape}, covariance {covariance.shape}: "
             "expected (n + 1, 3), (n,), (n, n)"
         )
+    if count >= MAX_ANCHORS:
+        raise ValueError(f"{count + 1} anchors; a position is located with at most {MAX_ANCHORS} at a time")
     sensible = all(np.abs(values).max() < LARGEST for values in (anchors, tdoa, covariance))
     if not (sensible and abs(height_m or 0.0) < LARGEST):
         return NoSolution(NoFixReason.BAD_GEOMETRY, "a coordinate or a measurement is not a sensible number")
@@ -381,15 +379,16 @@ def find_minima(problem: Problem) -> tuple[list[Minimum], int]:
     """
     found: list[Minimum] = []
     status, starts = CONVERGED, [*_algebraic_starts(problem), *_central_starts(problem)]
-    whitener, scale = problem.whitener if problem.weighted else np.eye(len(problem.tdoa)), problem.scale
-    system = np.empty((len(problem.tdoa), problem.dims + 1))
+    d, scale = _new_descent(problem), problem.scale
     for state in starts:
-        end, iterations = descend(problem.anchors, problem.tdoa, problem.kind, whitener, scale, system, state)
+        view(d.state)[:] = state
+        end = _descend(d)
+        state[:] = view(d.state)
         status = end or status
         if end == CONVERGED and not any(_same(minimum.state, state, scale) for minimum in found):
             if problem.kind != PLANE and not found and len(starts) < 9:  # singular minima do not go on without end
                 starts.append(_image(problem, state))
-            found += _assess(problem, system, state, iterations)
+            found += _assess(problem, d, state)
     found.sort(key=lambda minimum: minimum.cost)
     return found, status
 
@@ -470,123 +469,24 @@ def _image(problem: Problem, state: Array) -> Array:
 # Iterations
 
 
-@kernel
-def _linearise(anchors: Array, tdoa: Array, state: Array, kind: int, system: Array) -> None:
-    """Write rows [∂TDoA/∂state, measured − predicted] into ``system``, shape (n, dims + 1).
-
-    An anchor at the very position has no direction and counts with zeros.
-    """
-    last = system.shape[1] - 1
-    reference, reference_x, reference_y, reference_z = 0.0, 0.0, 0.0, 0.0
-    for i in range(len(anchors)):
-        x, y, z = state[0] - anchors[i, 0], state[1] - anchors[i, 1], state[2] - anchors[i, 2]
-        across = state[2] if kind == PLANE else z * z
-        distance = math.sqrt(max(x * x + y * y + across, 1e-18))
-        x, y, z = x / distance, y / distance, (0.5 if kind == PLANE else z) / distance
-        if i == 0:
-            reference, reference_x, reference_y, reference_z = distance, x, y, z
-            continue
-        row = system[i - 1]
-        row[2] = z - reference_z  # and then the residual, where the height is given
-        row[0], row[1] = x - reference_x, y - reference_y
-        row[last] = tdoa[i - 1] - (distance - reference)
+def _new_descent(problem: Problem) -> Descent:
+    """The problem as the iteration takes it."""
+    count = len(problem.tdoa)
+    d = Descent(kind=problem.kind, anchors=count + 1, dims=problem.dims)
+    view(d.positions_m)[: count + 1], view(d.tdoa_m)[:count] = problem.anchors, problem.tdoa
+    view(d.whitener)[:count, :count] = problem.whitener if problem.weighted else np.eye(count)
+    view(d.scale)[: problem.dims] = problem.scale
+    return d
 
 
-@kernel
-def _assemble(
-    anchors: Array, tdoa: Array, state: Array, kind: int, whitener: Array, system: Array, normal: Array
-) -> float:
-    """Linearise, whiten, and write the lower triangle of systemᵀ·system into ``normal``; returns the cost."""
-    _linearise(anchors, tdoa, state, kind, system)
-    columns = system.shape[1]
-    for i in range(len(system) - 1, -1, -1):  # W is a lower triangle: rows above are still to come
-        for j in range(columns):
-            total = 0.0
-            for k in range(i + 1):
-                total += whitener[i, k] * system[k, j]
-            system[i, j] = total
-    for j in range(columns):
-        for k in range(j + 1):
-            total = 0.0
-            for i in range(len(system)):
-                total += system[i, j] * system[i, k]
-            normal[j, k] = total
-    return float(normal[columns - 1, columns - 1])
-
-
-@kernel
-def _damped_step(normal: Array, damping: float, damped: Array, step: Array) -> bool:
-    """Solve (N + damping·diag N)·step = gradient; False where the matrix is singular."""
-    dims = len(step)
-    for j in range(dims):
-        step[j] = normal[dims, j]
-        for k in range(j + 1):
-            damped[j, k] = normal[j, k]
-        damped[j, j] *= 1.0 + damping
-    if not factorise(damped, dims):
-        return False
-    solve(damped, dims, step)
-    return True
-
-
-@kernel
-def descend(
-    anchors: Array, tdoa: Array, kind: int, whitener: Array, scale: Array, system: Array, state: Array
-) -> tuple[int, int]:
-    """Move ``state`` to the minimum of its surroundings; returns how it ended and after how many steps.
-
-    ``whitener``: the unit matrix where the sum of squares is not weighted. ``system``: scratch, shape (n, dims + 1).
-    """
-    dims = len(scale)
-    normal, next_normal = np.empty((dims + 1, dims + 1)), np.empty((dims + 1, dims + 1))
-    damped, step, trial = np.empty((dims, dims)), np.empty(dims), state.copy()
-    cost = _assemble(anchors, tdoa, state, kind, whitener, system, normal)
-    damping, growth = 0.0, 2.0
-    for iteration in range(1, MAX_ITERATIONS + 1):
-        if not _damped_step(normal, damping, damped, step):
-            if damping > 1.0:
-                return UNDETERMINED, iteration
-            damping = max(10.0 * damping, FIRST_DAMPING)
-            continue
-        predicted, longest = 0.0, 0.0
-        for j in range(dims):
-            trial[j] = state[j] + step[j]
-            predicted += step[j] * (normal[dims, j] + damping * normal[j, j] * step[j])
-            longest = max(longest, abs(step[j]) / scale[j])
-        small = longest <= STEP_TOLERANCE or predicted <= GAIN_TOLERANCE * cost
-        next_cost = _assemble(anchors, tdoa, trial, kind, whitener, system, next_normal)
-        if next_cost < cost:
-            damping, growth = _eased(damping, (cost - next_cost) / max(predicted, 1e-300)), 2.0
-            cost, normal, next_normal = next_cost, next_normal, normal
-            for j in range(dims):  # a whole array at once takes the compiler two seconds more
-                state[j] = trial[j]
-        else:
-            damping, growth = max(growth * damping, FIRST_DAMPING), 2.0 * growth
-        if small:
-            return CONVERGED, iteration
-        for j in range(dims):
-            reach = abs(state[j]) / scale[j]
-            if not (math.sqrt(reach) if kind == PLANE and j == 2 else reach) < FAR_EXTENTS:
-                return DIVERGED, iteration
-    return EXHAUSTED, MAX_ITERATIONS
-
-
-@part
-def _eased(damping: float, ratio: float) -> float:
-    """Next damping after a success, by the ratio of what it gained to what was predicted (H. B. Nielsen 1999)."""
-    if ratio < 0.5:
-        damping = max(damping, FIRST_DAMPING)
-    eased = damping * max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
-    return eased if eased > MIN_DAMPING else 0.0
-
-
-def _assess(problem: Problem, system: Array, state: Array, iterations: int) -> list[Minimum]:
+def _assess(problem: Problem, d: Descent, state: Array) -> list[Minimum]:
     """The minimum at a state, unless it is singular there.
 
     Its covariance is G·Σ·Gᵀ with the G of the estimate, (HᵀΣ⁻¹H)⁻¹HᵀΣ⁻¹ or, not weighted, (HᵀH)⁻¹Hᵀ. chi2 is rᵀΣ⁻¹r in
     both cases.
     """
-    _linearise(problem.anchors, problem.tdoa, state, problem.kind, system)
+    _linearise(d, d.state)
+    system = view(d.system)[: len(problem.tdoa), : problem.dims + 1]
     gradients, residuals = system[:, :-1], system[:, -1].copy()
     weights = problem.whitener.T @ problem.whitener if problem.weighted else np.eye(len(residuals))
     inverse = inverse_of(gradients.T @ weights @ gradients)
@@ -598,7 +498,7 @@ def _assess(problem: Problem, system: Array, state: Array, iterations: int) -> l
     whitened = problem.whitener @ residuals
     chi2 = float(whitened @ whitened)
     cost = chi2 if problem.weighted else float(residuals @ residuals)
-    return [Minimum(state, covariance, residuals, chi2, cost, iterations)]
+    return [Minimum(state, covariance, residuals, chi2, cost, d.iterations)]
 
 
 def _same(one: Array, other: Array, scale: Array) -> bool:

@@ -21,7 +21,7 @@ from msgspec import Struct
 
 from skyless.core.constants import TICK_M, TICK_S
 from skyless.core.kernels.arrays import Array
-from skyless.core.kernels.compiled import kernel, threaded_kernel
+from skyless.core.kernels.compiled import jitted, kernel, threaded_kernel
 from skyless.core.kernels.processors import cores
 from skyless.core.protocol1.snapshots import (
     averaged_offset,
@@ -32,6 +32,9 @@ from skyless.core.protocol1.snapshots import (
     to_master,
 )
 from skyless.research.uncertainty.chain import Chain, Reference
+
+for _function in (averaged_offset, protocol_interval, relative_offset, relative_rate, tag_rate, to_master):
+    jitted(_function)
 
 CHUNK_DRAWS: Final = 1 << 14
 """Draws with one key, which one thread sums up at a time."""

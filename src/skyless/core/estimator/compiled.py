@@ -1,4 +1,4 @@
-"""The functions that Python calls in the library; ``exports`` lists them."""
+"""The estimator's functions as the library has them."""
 
 from skyless.core.estimator import levels, process, state, steady_state
 from skyless.core.native.library import compiled

@@ -1,0 +1,39 @@
+"""Make ``skyless_core.h`` and ``skyless_core.c`` from the Python that boards and browsers share with it.
+
+python tools/make_core.py
+"""
+
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from python_to_c import translate
+
+from skyless.core.estimator import levels, process, state, steady_state
+from skyless.core.native import arithmetic
+from skyless.core.tag import descent
+
+EXPORTS: Final[tuple[Callable[..., Any], ...]] = (
+    state.prepare,
+    state.add_anchor,
+    state.remove_anchor,
+    state.find_anchor,
+    levels.fit_plane,
+    process.process_frame,
+    process.process_difference,
+    process.process_height,
+    process.track,
+    steady_state.find_steady_state,
+    steady_state.process_known,
+    descent.descend,
+    descent.linearise,
+)
+"""What is called from outside."""
+
+NAME: Final = "skyless_core"
+FOLDER: Final = Path(inspect.getfile(arithmetic)).parent
+
+if __name__ == "__main__":
+    for text, suffix in zip(translate(EXPORTS, NAME), ("h", "c"), strict=True):
+        (FOLDER / f"{NAME}.{suffix}").write_text(text)
