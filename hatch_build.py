@@ -1,4 +1,4 @@
-"""Build hook: make the library of the estimator, for this machine or for that of a wheel (``tools/compile_core.py``)."""
+"""Build hook: make the library of the estimator, for this machine or the one that a wheel is for."""
 
 import os
 import sys
@@ -9,7 +9,7 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 sys.path.insert(0, str(Path(__file__).parent / "tools"))
-from compile_core import NATIVE, TARGETS, ZIG, build, compiler  # noqa: E402 - not a package
+from compile_core import NATIVE, TARGETS, ZIG, build, compiler
 
 
 class CoreBuildHook(BuildHookInterface):  # type: ignore[type-arg]

@@ -33,8 +33,8 @@ from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError
 from skyless.core.site import AnchorSite, ScheduleSite, Site
-from skyless.research.compile_ahead import compile_kernels
 from skyless.run import anchor
+from skyless.sim.compile_ahead import compile_kernels
 from skyless.sim.evaluation.scenarios import Request, Room, trajectories_of
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.file.check import check_site

@@ -32,7 +32,7 @@ from msgspec.structs import replace
 
 from skyless.core.site import ScheduleSite, Site
 from skyless.core.trusted_receiver import SiteTrust, Trust
-from skyless.research.compile_ahead import compile_kernels
+from skyless.sim.compile_ahead import compile_kernels
 from skyless.sim.evaluation.scenarios import Request, Room
 from skyless.sim.lab import lab_site, paper_lab_site
 from support.adversary import FORGERIES, Forgery, any_forgery

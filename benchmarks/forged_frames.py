@@ -29,7 +29,7 @@ from skyless.core.anchor.authentication import BeaconAuthentication
 from skyless.core.site import Site
 from skyless.core.ticks import from_seconds, wrap
 from skyless.core.trusted_receiver import SiteTrust, Trust
-from skyless.research.compile_ahead import compile_kernels
+from skyless.sim.compile_ahead import compile_kernels
 from skyless.sim.evaluation.scenarios import Request
 from support.adversary import FORGERIES
 from support.keyed_air import START_UNIX_S, AttackedAir, MadeKeys, Received, compare, made_keys, run_tag

@@ -28,7 +28,7 @@ from skyless.core.alert import Alert
 from skyless.core.constants import SPEED_OF_LIGHT_MPS
 from skyless.core.site import Site
 from skyless.core.trusted_receiver import SiteTrust, Trust
-from skyless.research.compile_ahead import compile_kernels
+from skyless.sim.compile_ahead import compile_kernels
 from skyless.sim.evaluation.scenarios import Request, Room
 from skyless.sim.streams import stream
 from support.keyed_air import AttackedAir, Received, TagRun, delayed, key_of, made_keys, run_tag

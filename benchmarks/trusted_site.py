@@ -29,7 +29,7 @@ from skyless.core.keys.key_chain import public_key
 from skyless.core.keys.verifier import Verifier
 from skyless.core.site import ScheduleSite, Site
 from skyless.core.trusted_receiver import SiteTrust, Trust
-from skyless.research.compile_ahead import compile_kernels
+from skyless.sim.compile_ahead import compile_kernels
 from skyless.sim.evaluation.scenarios import Request, Room
 from support.keyed_air import START_UNIX_S, AttackedAir, MadeKeys, Received, made_keys, run_tag
 

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from skyless.cli.common.progress import compile_with_counts
-from skyless.core.kernels.processes import EVERY_PART, missing
+from skyless.sim.compile_ahead import compile_kernels
 
 settings.register_profile("skyless", deadline=None)  # the first call of a kernel compiles it
 settings.load_profile("skyless")
@@ -69,21 +68,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile before the workers of pytest-xdist start; what they collect is not known here."""
+    """Compile the simulation before the workers of pytest-xdist start; what they collect is not known here."""
     if session.config.getoption("numprocesses", None) and _tiers(session.config) != ["unit"]:
-        _compile_kernels()
+        compile_kernels()
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Compile before the first test that may start a program. Unit tests compile what they call, when they call it."""
     is_worker = hasattr(session.config, "workerinput")
     if not is_worker and not session.config.option.collectonly and {_tier(item) for item in session.items} - {"unit"}:
-        _compile_kernels()
-
-
-def _compile_kernels() -> None:
-    """Compile all kernels once: programs that start in tests would report it."""
-    compile_with_counts(missing(EVERY_PART))
+        compile_kernels()
 
 
 @pytest.fixture(scope="session", autouse=True)

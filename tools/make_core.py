@@ -8,11 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from python_to_c import translate
-
 from skyless.core.estimator import levels, process, state, steady_state
 from skyless.core.native import arithmetic
 from skyless.core.tag import descent
+from translator.files import translate
 
 EXPORTS: Final[tuple[Callable[..., Any], ...]] = (
     state.prepare,

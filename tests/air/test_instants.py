@@ -16,9 +16,9 @@ from skyless.core.air.instants import (
     ticks_ahead,
 )
 from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS
-from skyless.core.kernels.compiled import kernel
 from skyless.core.ticks import HALF_WRAP_TICKS, from_seconds, to_seconds
 from skyless.sim.cells import _timetable as timetable
+from skyless.site.kernels.compiled import kernel
 
 ANCHORS = st.integers(0, 0xFFFF)
 SEQUENCES = st.integers(0, 0xFF)

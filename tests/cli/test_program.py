@@ -134,14 +134,10 @@ def test_a_terminal_without_unicode(lab):
     assert "315 \\xb5s" in done.stdout
 
 
-@pytest.mark.parametrize(
-    ("arguments", "worker"),
-    [(["warm"], "skyless.core.kernels.worker"), (["paper", "--quick", "--out", "report"], "multiprocessing.spawn")],
-)
 @pytest.mark.statistical
-def test_sigterm_ends_a_command_with_all_its_processes(tmp_path, arguments, worker):
-    kernels = {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")} if arguments == ["warm"] else {}
-    options = {"env": {**os.environ, **kernels}, "cwd": tmp_path, "stderr": subprocess.PIPE, "start_new_session": True}
+def test_sigterm_ends_a_command_with_all_its_processes(tmp_path):
+    arguments, worker = ["paper", "--quick", "--out", "report"], "multiprocessing.spawn"
+    options = {"env": dict(os.environ), "cwd": tmp_path, "stderr": subprocess.PIPE, "start_new_session": True}
     default = ["env", "--default-signal=INT"]  # what a shell starts in the background ignores it
     process = subprocess.Popen([*default, *SKYLESS, *arguments], **options)
     workers = until(lambda: [pid for pid in children(process.pid) if worker in words_of(pid)], 120.0)

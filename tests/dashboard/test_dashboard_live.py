@@ -12,7 +12,7 @@ from test_dashboard_condition import anchor_health
 from skyless.page._events import MAX_EVENTS, SILENT_S
 from skyless.page.live import LiveSite
 from skyless.run.mqtt import topics
-from skyless.run.mqtt.messages import PreparationMessage, SiteZones, ZoneEvent, ZonesMessage
+from skyless.run.mqtt.messages import SiteZones, ZoneEvent, ZonesMessage
 from skyless.run.zones.monitor import TAG_TIMEOUT_S
 from skyless.run.zones.zone_list import BadZonesError
 
@@ -56,24 +56,6 @@ def test_pages_are_sent_the_site_and_the_state_of_the_broker(live, wire):
     assert of("site", messages)[0]["site"]["simulated"] is True
     assert of("mqtt", messages)[0]["connected"] is True
     assert drained(live, live.open_page())[0]["site"]["site"]["id"] == SITE_ID
-
-
-def test_pages_are_sent_how_far_kernels_are_compiled_until_nothing_comes(live, wire, times):
-    topic = topics.preparation_topic(SITE_ID)
-    wire.deliver(topic, PreparationMessage(37, 120, 25.0, times.unix_s))
-    page = live.open_page()
-    assert of("preparation", drained(live, page))[0]["preparation"]["done"] == 37
-    wire.deliver(topic, b"")
-    assert of("preparation", drained(live, page)) == [{"type": "preparation", "preparation": None}]
-    wire.deliver(topic, PreparationMessage(38, 120, 24.0, times.unix_s))
-    times.move(4.9)
-    live.tick()
-    assert of("preparation", drained(live, page))[0]["preparation"]["done"] == 38
-    times.move(0.2)  # the demo was killed
-    live.tick()
-    assert of("preparation", drained(live, page)) == [{"type": "preparation", "preparation": None}]
-    wire.deliver(topic, PreparationMessage(38, 120, 24.0, times.unix_s - 5.1))  # the broker has kept it
-    assert of("preparation", drained(live, live.open_page())) == []
 
 
 def test_a_slow_page_gets_one_state_of_all_that_it_missed(live, wire, times):

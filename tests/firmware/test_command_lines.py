@@ -8,8 +8,8 @@ from site_stage import HOST, boards, wire_of
 
 from skyless.cli.main import main
 from skyless.core.errors import SkylessError
-from skyless.research.compile_ahead import compile_kernels
 from skyless.run.mqtt.messages import FixMessage
+from skyless.sim.compile_ahead import compile_kernels
 from skyless.sim.trajectory import Static
 from skyless.site.file.load import load_site
 

@@ -7,7 +7,7 @@ import pytest
 from emulator.site.repeated_site import RepeatedSite
 from site_stage import KINDS, site_of
 
-from skyless.research.compile_ahead import compile_kernels
+from skyless.sim.compile_ahead import compile_kernels
 
 pytestmark = pytest.mark.statistical
 

@@ -16,7 +16,7 @@ from skyless.core.protocol1.anchor import Anchor
 from skyless.core.ticks import from_seconds, wrap
 from skyless.radio.interface import AntennaDelays, Reception
 from skyless.radio.serial.serial_radio import LinkSession
-from skyless.research.compile_ahead import compile_kernels
+from skyless.sim.compile_ahead import compile_kernels
 from skyless.sim.dw1000.chip import Chip
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.lab import paper_lab_site

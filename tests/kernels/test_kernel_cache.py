@@ -11,12 +11,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from skyless.core.kernels import cache
-from skyless.core.kernels.cache import KernelFolder, choose_folder
+from skyless.site.kernels import cache
+from skyless.site.kernels.cache import choose_folder
 
 pytestmark = pytest.mark.site
-
-KEY = "abc"
 
 
 @pytest.fixture
@@ -32,64 +30,57 @@ def test_the_first_folder_that_can_be_written_is_used(tmp_path):
     (tmp_path / "file").touch()
     homes = (tmp_path / "file", tmp_path / "first", tmp_path / "second")
     path = tmp_path / "first" / "kernels-1"
-    assert choose_folder(homes, "kernels-1", KEY) == KernelFolder(path, KEY, writable=True, temporary=False)
+    assert choose_folder(homes, "kernels-1") == path
     assert path.is_dir()
     assert not (tmp_path / "second").exists()
 
 
-def test_a_folder_of_an_image_is_used_where_it_holds_kernels_for_this_processor(tmp_path, unwritable):
+def test_a_folder_of_an_image_is_used_where_it_holds_kernels(tmp_path, unwritable):
     image, home = tmp_path / "image", tmp_path / "home"
-    built = choose_folder((image, home), "kernels-1", KEY)
-    built.mark_ready("air")
+    built = choose_folder((image, home), "kernels-1")
     unwritable.add(image)
-    found = choose_folder((image, home), "kernels-1", KEY)
-    assert found == KernelFolder(built.path, KEY, writable=False, temporary=False)
-    assert found.is_ready("air")
-    assert not found.is_ready("estimator")
-    assert choose_folder((image, home), "kernels-1", "other processor").path == home / "kernels-1"
-    assert choose_folder((image,), "kernels-1", "other processor") is None
+    assert choose_folder((image, home), "kernels-1") == home / "kernels-1"
+    (built / "kernel.nbi").touch()
+    assert choose_folder((image, home), "kernels-1") == built
 
 
 def test_without_a_folder_kernels_are_kept_among_temporary_files_for_this_user_only(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setenv("NUMBA_CACHE_DIR", "")
-    found = cache._temporary_folder("kernels-1", KEY)
-    assert (found.writable, found.temporary) == (True, True)
-    assert found.path.parent == tmp_path / f"skyless-{os.getuid()}"
-    assert found.path.parent.stat().st_mode & 0o077 == 0
-    assert cache._temporary_folder("kernels-1", KEY) == found
-    found.path.parent.chmod(0o777)  # anybody could have written there: kernels are code
-    other = cache._temporary_folder("kernels-1", KEY)
-    assert other.path.parent != found.path.parent
-    assert os.environ["NUMBA_CACHE_DIR"] == str(other.path.parent)
+    found = cache._temporary_folder("kernels-1")
+    assert found.is_dir()
+    assert found.parent == tmp_path / f"skyless-{os.getuid()}"
+    assert found.parent.stat().st_mode & 0o077 == 0
+    assert cache._temporary_folder("kernels-1") == found
+    found.parent.chmod(0o777)  # anybody could have written there: kernels are code
+    other = cache._temporary_folder("kernels-1")
+    assert other.parent != found.parent
+    assert os.environ["NUMBA_CACHE_DIR"] == str(other.parent)
 
 
 def test_where_nothing_can_be_written_there_is_still_an_answer(monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", "/proc/nowhere")
-    found = cache._temporary_folder("kernels-1", KEY)
-    assert (found.writable, found.temporary) == (False, True)
-    found.mark_ready("air")
-    assert not found.is_ready("air")
+    assert not cache._temporary_folder("kernels-1").exists()
 
 
 TWICE = """
 import json, sys, tempfile
 tempfile.tempdir = sys.argv[1]
-from skyless.core.kernels.cache import kernel_folder
-from skyless.core.kernels.compiled import kernel
+from skyless.site.kernels.cache import kernel_folder
+from skyless.site.kernels.compiled import kernel
 
 @kernel
 def twice(value: float) -> float:
     return 2.0 * value
 
 value, folder, stats = twice(2.0), kernel_folder(), twice.stats
-print(json.dumps([value, folder.writable, sum(stats.cache_hits.values()), sum(stats.cache_misses.values())]))
+print(json.dumps([value, folder.is_dir(), sum(stats.cache_hits.values()), sum(stats.cache_misses.values())]))
 """
 
 
 @pytest.fixture
 def run_twice(tmp_path):
-    """Run a kernel in a program of its own: its value, whether its folder can be written, cache hits and misses."""
+    """Run a kernel in a program of its own: its value, whether its folder exists, cache hits and misses."""
     program = tmp_path / "program.py"
     program.write_text(TWICE)
 
@@ -134,13 +125,13 @@ def test_the_folder_is_another_one_after_a_change_of_anything_that_a_kernel_may_
     package = Path(cache.__file__).parents[2]
     read = {file: file.read_bytes() for file in package.rglob("*.py")}
     of = {cache._module(file, package): text for file, text in read.items()}
-    wanted = {name for name, text in of.items() if b"skyless.core.kernels.compiled" in text}
+    wanted = {name for name, text in of.items() if b"skyless.site.kernels.compiled" in text}
     seen = set()
     while wanted:
         name = wanted.pop()
         seen.add(name)
         wanted |= imported(name, of) - seen
-    assert {"skyless.core.kernels.filter", "skyless.core.fix", "skyless.core.ticks", "skyless.core.constants"} <= seen
+    assert {"skyless.core.clock_filter", "skyless.core.fix", "skyless.core.ticks", "skyless.core.constants"} <= seen
     hashed = []
     monkeypatch.setattr(cache.hashlib, "sha1", lambda **_: SimpleNamespace(update=hashed.append, hexdigest=str))
     cache.digest(package)
@@ -154,7 +145,7 @@ def test_the_folder_is_another_one_after_a_change_of_anything_that_a_kernel_may_
 def test_a_constant_from_another_module_belongs_to_the_kernels(tmp_path, line):
     package, core = tmp_path / "skyless", tmp_path / "skyless" / "core"
     core.mkdir(parents=True)
-    (core / "air.py").write_text(f"from skyless.core.kernels.compiled import kernel\n{line}\n")
+    (core / "air.py").write_text(f"from skyless.site.kernels.compiled import kernel\n{line}\n")
     (package / "other.py").write_text("")
     (core / "ticks.py").write_text("PER_S = 1\n")
     first = cache.digest(package)
@@ -175,13 +166,13 @@ def test_a_home_that_may_not_be_searched_is_passed_over(tmp_path, monkeypatch):
     for method in ("mkdir", "is_dir"):
         monkeypatch.setattr(Path, method, refuse)
     monkeypatch.setattr(os, "access", lambda *_: True)
-    assert choose_folder((closed, tmp_path / "home"), "kernels-1", KEY).path == tmp_path / "home" / "kernels-1"
+    assert choose_folder((closed, tmp_path / "home"), "kernels-1") == tmp_path / "home" / "kernels-1"
 
 
 def test_a_relative_folder_stays_the_same_for_programs_that_work_elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("NUMBA_CACHE_DIR", "kept")
-    assert cache.kernel_folder.__wrapped__().path.parent == tmp_path / "kept"
+    assert cache.kernel_folder.__wrapped__().parent == tmp_path / "kept"
     assert os.environ["NUMBA_CACHE_DIR"] == str(tmp_path / "kept")
 
 
@@ -194,5 +185,5 @@ def test_a_folder_of_other_sources_that_is_used_now_and_then_is_kept(tmp_path, m
         patch.setattr(cache, "digest", lambda _: "used")
         patch.setattr(cache, "_remove_unused", lambda _: None)
         cache.kernel_folder.__wrapped__()  # another version starts
-    own = cache.kernel_folder.__wrapped__().path
+    own = cache.kernel_folder.__wrapped__()
     assert {path.name for path in tmp_path.iterdir()} == {"kernels-used", own.name}

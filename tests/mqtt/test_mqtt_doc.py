@@ -35,7 +35,6 @@ STRUCTS = {
     topics.survey_save_topic(SITE): messages.SurveySaveMessage,
     topics.placement_topic(SITE): messages.PlacementMessage,
     topics.watch_topic(SITE): messages.WatchMessage,
-    topics.preparation_topic(SITE): messages.PreparationMessage,
 }
 
 

@@ -13,7 +13,6 @@ import pytest
 from mqtt_brokers import MOSQUITTO, Mosquitto, until
 from site_programs import Program
 
-from skyless.research.compile_ahead import compile_kernels
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
@@ -26,6 +25,7 @@ from skyless.run.mqtt.messages import (
     TruthMessage,
     WatchMessage,
 )
+from skyless.sim.compile_ahead import compile_kernels
 from skyless.site.file.load import load_site
 from skyless.site.survey.facts import Facts, Gauge
 from support.processes import free_port

@@ -16,7 +16,6 @@ from mqtt_brokers import MOSQUITTO, Embedded, Mosquitto, until
 from machines.bench import LAB, tape
 from skyless.cli.main import main
 from skyless.core.air.reception import Reception
-from skyless.research.compile_ahead import compile_kernels
 from skyless.research.replays.site import SiteReplay
 from skyless.run import record
 from skyless.run.mqtt.address import MqttAddress
@@ -27,6 +26,7 @@ from skyless.run.record import RecorderNode
 from skyless.run.recordings.recorder import McapFile
 from skyless.run.recordings.recording import McapRecording
 from skyless.run.tag import Tags, TagSettings
+from skyless.sim.compile_ahead import compile_kernels
 from support.processes import SKYLESS, usual_signals
 
 pytestmark = pytest.mark.site

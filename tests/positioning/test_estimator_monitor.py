@@ -24,13 +24,13 @@ from estimator_builders import (
 )
 from msgspec.structs import replace
 
+from skyless.core.clock_filter import ClockFilter, clock_noise
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_S
 from skyless.core.estimator.estimator import Report
 from skyless.core.estimator.monitor import gate_of
 from skyless.core.estimator.process import ACCEPTED, REJECTED
 from skyless.core.estimator.settings import TUNING
 from skyless.core.estimator.state import find_anchor
-from skyless.core.kernels.filter import ClockFilter, clock_noise
 from skyless.core.ticks import TICK_MASK
 from skyless.research.studies.episodes import WHITE_FM
 

@@ -21,8 +21,8 @@ from skyless.radio.dw1000 import spi
 from skyless.radio.dw1000.radio import Dw1000Radio
 from skyless.radio.dw1000.spi import SpiPort
 from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Restarted, Sent
-from skyless.research.compile_ahead import compile_kernels
 from skyless.run.open_radio import is_simulated, open_radios
+from skyless.sim.compile_ahead import compile_kernels
 from skyless.sim.dw1000.chip import ModelBus
 
 pytestmark = pytest.mark.site

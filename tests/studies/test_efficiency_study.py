@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.core.kernels.processors import cores
+from skyless.core.processors import cores
 from skyless.research.studies.efficiency import run_chunk, summary
 from skyless.research.studies.episodes import Case, draw_episode
 from skyless.sim.lab import paper_lab_site

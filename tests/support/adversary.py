@@ -20,8 +20,8 @@ from skyless.core.air.beacon import Authentication, Beacon, StatedPosition
 from skyless.core.air.codec import INTERVAL_BITS, MAC_BYTES, decode, encode, with_authentication
 from skyless.core.air.frame import HEARD, Heard, PackedHeard
 from skyless.core.air.ieee802154 import fcs
+from skyless.core.arrays import Array
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
-from skyless.core.kernels.arrays import Array
 from skyless.core.keys.key_chain import (
     KEY_BYTES,
     SECTION_BITS,

@@ -15,9 +15,8 @@ import numpy as np
 
 from skyless.core.air.ieee802154 import after_rmarker_s
 from skyless.core.air.reception import Transmission
+from skyless.core.arrays import Array, Integers, Records
 from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_S
-from skyless.core.kernels.arrays import Array, Integers, Records
-from skyless.core.kernels.compiled import kernel
 from skyless.core.site import Site
 from skyless.core.ticks import WRAP_TICKS, difference, from_seconds, wrap
 from skyless.sim.cells._clocks import KNOT_TICKS, CellClocks, Knots, own_time, true_time
@@ -41,6 +40,7 @@ from skyless.sim.listening import RECEPTION_RECORD
 from skyless.sim.medium import TURNAROUND_S, Delivery, Flight, Medium
 from skyless.sim.stations import TagSpec, coordinate_m
 from skyless.sim.world import World
+from skyless.site.kernels.compiled import kernel
 
 _TURNAROUND_TICKS: Final = from_seconds(TURNAROUND_S)
 _KEPT_TICKS: Final = from_seconds(2e-3)

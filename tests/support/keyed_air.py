@@ -18,9 +18,9 @@ from msgspec.structs import replace
 from skyless.core.air.frame import Malformed
 from skyless.core.air.reception import Reception, Transmission
 from skyless.core.anchor.authentication import BeaconAuthentication
+from skyless.core.arrays import Array
 from skyless.core.constants import TICK_RATE_HZ, TICK_S
 from skyless.core.fix import Fix
-from skyless.core.kernels.arrays import Array
 from skyless.core.keys.chain import Chain, section_signatures
 from skyless.core.keys.key_chain import SECTION_BITS, SEED_BYTES, USUAL_TIMING, ChainTiming
 from skyless.core.protocols import AnchorMachine, SiteBeacon, decode_any, new_anchor

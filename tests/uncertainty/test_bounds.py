@@ -7,7 +7,7 @@ import pytest
 
 from dense_covariance import position_covariance
 from skyless.core.constants import SPEED_OF_LIGHT_MPS
-from skyless.core.kernels.processors import cores
+from skyless.core.processors import cores
 from skyless.core.protocol1.snapshots import bracketed_covariance, literal_covariance
 from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, EPISODE_SUPERFRAMES, WHITE_FM, random_path
 from skyless.research.uncertainty.bounds import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dense_covariance import position_covariance
-from skyless.core.kernels.filter import stamp_variance_m2
+from skyless.core.clock_filter import stamp_variance_m2
 from skyless.core.protocol1.snapshots import bracketed_covariance, literal_covariance, literal_delayed_covariance
 from skyless.core.tag.locate import Solution, locate
 

@@ -9,7 +9,7 @@ from cyclopts import App
 
 from skyless.cli.common.options import command
 from skyless.cli.common.output import console, print_json
-from skyless.cli.common.progress import loading_kernels, progress_bar
+from skyless.cli.common.progress import progress_bar
 from skyless.core.air.page_codec import MAX_COORDINATE_M
 from skyless.core.arguments import Option, Options, Positive, Rule, Text, numbers, point
 from skyless.core.errors import SkylessError
@@ -65,11 +65,9 @@ def benchmark(folder: Path, /, *, asked: BenchmarkOptions) -> int:
     """
     if not folder.is_dir():
         raise SkylessError(f"FOLDER is {str(folder)!r}; it should be a folder with recordings")
-    from skyless.core.kernels.processes import PAIRS
     from skyless.research.benchmark.page import SUMMARY_HEADS, summary_rows, write
     from skyless.research.benchmark.recordings import recordings_below
     from skyless.research.benchmark.run import Asked, results_of
-    from skyless.research.compile_ahead import compile_pair_kernels
 
     found = [one for one in recordings_below(folder) if asked.only in one.name]
     if not found:
@@ -79,8 +77,6 @@ def benchmark(folder: Path, /, *, asked: BenchmarkOptions) -> int:
         kept.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SkylessError(f"--out is {str(asked.out)!r}; it should be a folder: {error.strerror}") from None
-    with loading_kernels(PAIRS):
-        compile_pair_kernels()
     first_s = _QUICK_S if asked.quick and asked.first_s is None else asked.first_s
     own = asked.estimator
     estimators = {} if own is None else {getattr(own, "__name__", "own"): own}

@@ -1,11 +1,7 @@
-"""``skyless demo``: a site with broker, ether, anchors, tags, page, survey and recorder as processes, and its watch.
-
-Broker and page are up first and show how far the kernels are compiled, where they have not been; then the others start.
-"""
+"""``skyless demo``: a site with broker, ether, anchors, tags, page, survey and recorder as processes, and its watch."""
 
 import asyncio
 import contextlib
-import time
 from pathlib import Path
 from typing import Final
 
@@ -14,15 +10,14 @@ from msgspec.structs import replace
 
 from skyless.cli.watch import Watch
 from skyless.core.integrity import RISK, IntegrityRequirement
-from skyless.core.kernels.processes import Preparation, Report, compile_parts, parts_of
 from skyless.core.site import Site
 from skyless.run.broker import Broker, BrokerSettings, start_broker
 from skyless.run.children import Child, Program
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.connection import Introduction, Reactions, RefusedError, open_connection, trouble_with
 from skyless.run.mqtt.link import Link
-from skyless.run.mqtt.messages import PreparationMessage, StatusMessage, WrongMessageError, read_message
-from skyless.run.mqtt.topics import preparation_topic, site_topic, status_topic, survey_topic, watch_topic
+from skyless.run.mqtt.messages import StatusMessage, WrongMessageError, read_message
+from skyless.run.mqtt.topics import site_topic, status_topic, survey_topic, watch_topic
 from skyless.run.process import Log, hold_any, outlasting, reserve_next, together
 
 _HOST: Final = "127.0.0.1"
@@ -63,14 +58,12 @@ class WholeSite:
 
     def __init__(self, asked: SiteRun, log: Log) -> None:
         self._asked, self._log = asked, log
-        self.on_preparation: Report | None = None  # called while kernels are compiled, a few times a second
         self.ether_port, self._ether_held = hold_any(_HOST)
         self.page_port, self._page_held = reserve_next(_HOST, _PAGE_PORT)
         self.address: MqttAddress | None = asked.broker
         self.watch: Watch | None = None
         self.children: list[Child] = []
         self.ready = asyncio.Event()  # the broker is there and the page is starting
-        self.prepared = asyncio.Event()  # all kernels are compiled and the other programs are starting
 
     @property
     def page(self) -> str:
@@ -98,29 +91,11 @@ class WholeSite:
         self.watch = Watch(link, site.id, planar=site.tags.height_m is not None)
         options = ("--recordings", str(self._asked.recordings), "--site-id", str(site.id))
         command = ("dashboard", *_mqtt(address), "--listen", f"{_HOST}:{self.page_port}", *options)
-        page = Child(Program("page", command), self._log)
-        others = [Child(program, self._log) for program in self._programs(address)]
-        self.children = [*others, page]
+        programs = [*self._programs(address), Program("page", command)]
+        self.children = [Child(program, self._log) for program in programs]
         self.ready.set()
-        nodes = outlasting(link.run(), together(page.run(), self._run_prepared(link, others)))  # its end is published
+        nodes = outlasting(link.run(), together(*(child.run() for child in self.children)))  # its end is published
         await (nodes if broker is None else outlasting(self._keep(broker), nodes))  # they publish their end to it
-
-    async def _run_prepared(self, link: Link, children: list[Child]) -> None:
-        """Compile what is missing, and then keep the programs that need it alive."""
-        topic = preparation_topic(self._asked.site.id)
-
-        def report(now: Preparation) -> None:
-            if self.on_preparation is not None:
-                self.on_preparation(now)
-            link.publish(topic, PreparationMessage(now.done, now.total, now.left_s, time.time()), retain=True)
-
-        try:
-            for failure in await compile_parts(parts_of(self._asked.method), report):
-                self._log(f"{failure}; every program compiles for itself")
-        finally:
-            link.publish(topic, b"", qos=1, retain=True)
-        self.prepared.set()
-        await together(*(child.run() for child in children))
 
     async def _keep(self, broker: Broker) -> None:
         """Start the embedded broker again, on the same port and with the same store, whenever it ends."""

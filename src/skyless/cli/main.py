@@ -27,7 +27,6 @@ _GROUPS: Final = {
         # name, module below skyless.cli (imported only when it is called), what it does
         ("demo", "nodes.demo", "Show a site and walking tags in real time: no radio and no site file needed."),
         ("simulate", "simulate", "Run a site in the simulated world and judge it against the truth."),
-        ("warm", "warm", "Compile all kernels ahead, so that no later start has to."),
     ),
     "Set up and check a site": (
         ("site", "site", "Write and check site files."),

@@ -9,7 +9,7 @@ from cyclopts import App
 
 from skyless.cli.common.options import command
 from skyless.cli.common.output import console, json_form, print_json
-from skyless.cli.common.progress import loading_kernels, progress_bar
+from skyless.cli.common.progress import progress_bar
 from skyless.core.arguments import Seed
 
 if TYPE_CHECKING:
@@ -43,14 +43,10 @@ def paper(
     json
         Write one JSON object instead of the table.
     """
-    from skyless.core.kernels.processes import LAB
-    from skyless.research.compile_ahead import compile_kernels
     from skyless.research.paper.plan import plan_of
     from skyless.research.paper.run import write_report
 
     started_s = time.perf_counter()
-    with loading_kernels(*LAB):
-        compile_kernels()
     try:
         with progress_bar("simulating the paper", 1.0) as bar:
             report = write_report(plan_of(seed, quick=quick), out, bar.reach)

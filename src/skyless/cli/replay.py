@@ -19,7 +19,7 @@ from skyless.cli.common.output import (
     print_warnings,
     write_picture,
 )
-from skyless.cli.common.progress import loading_kernels, progress_bar
+from skyless.cli.common.progress import progress_bar
 from skyless.core.arguments import Options, existing_file
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import METHODS, SNAPSHOTS
@@ -118,8 +118,6 @@ def _replayed(asked: ReplayOptions, output: _Output, name: str = "") -> tuple[in
         def begin(tags: tuple[str, ...], given: str) -> "OnFix | None":
             if output.plot is not None and len(tags) > 1:
                 raise SkylessError(f"--plot draws one tag; choose it with --tag, one of {', '.join(tags)}")
-            if asked.estimator is None:
-                _load_kernels(given)
             if output.fixes_csv is None:
                 return None
             write = csv.writer(until_done.enter_context(new_table(output.fixes_csv))).writerow
@@ -143,22 +141,6 @@ def _replayed(asked: ReplayOptions, output: _Output, name: str = "") -> tuple[in
         return 0, result.summary
     print(f"skyless: {name}no fix: {_likely_reason(reports[0], asked)}", file=sys.stderr)
     return NO_FIX, result.summary
-
-
-def _load_kernels(given: str) -> None:
-    """Those of a method, or of what the filter is given of a recording of another system."""
-    from skyless.core.kernels.processes import PAIRS, SNIFFERS, parts_of
-    from skyless.research.compile_ahead import compile_kernels, compile_packet_kernels, compile_pair_kernels
-
-    if given in METHODS:
-        with loading_kernels(*parts_of(given)):
-            compile_kernels(given)
-    elif given == "packets":
-        with loading_kernels(*SNIFFERS):
-            compile_packet_kernels()
-    else:
-        with loading_kernels(PAIRS):
-            compile_pair_kernels()
 
 
 _REASONS: Final = {

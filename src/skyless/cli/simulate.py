@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from skyless.cli.api.options import SimulateOptions
 from skyless.cli.common.options import check_output, command
 from skyless.cli.common.output import NO_FIX, new_table, print_facts, print_json
-from skyless.cli.common.progress import loading_kernels, progress_bar
+from skyless.cli.common.progress import progress_bar, status
 from skyless.cli.nodes.options import name_unplaced
 from skyless.core.arguments import Options
 
@@ -54,14 +54,13 @@ def simulate(*, asked: SimulateOptions, output: _Output) -> int:
     check_output("fixes-csv", output.fixes_csv, asked.site if isinstance(asked.site, Path) else None)
     from skyless.cli.api.fixes import FixRecorder
     from skyless.cli.api.simulate import Simulation, SimulationResult
-    from skyless.core.kernels.processes import parts_of
-    from skyless.research.compile_ahead import compile_kernels
+    from skyless.sim.compile_ahead import compile_kernels
 
     with progress_bar("simulating", 1.0) as bar:
         simulation = Simulation(replace(asked, progress=bar.reach))
         name_unplaced(simulation.request.site)
         if asked.estimator is None:
-            with loading_kernels(*parts_of(asked.method)):
+            with status("compiling the simulation"):
                 compile_kernels(asked.method)
         with nullcontext() if output.fixes_csv is None else new_table(output.fixes_csv) as file:
             write = None if file is None else csv.writer(file).writerow

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from skyless.cli.api.options import StudyOptions
 from skyless.cli.common.options import check_picture, command
 from skyless.cli.common.output import console, print_json, to_json
-from skyless.cli.common.progress import loading_kernels, progress_bar
+from skyless.cli.common.progress import progress_bar, status
 from skyless.core.arguments import Options
 from skyless.core.errors import SkylessError
 from skyless.core.whole_files import write_whole
@@ -91,12 +91,11 @@ def study(asked: StudyOptions, output: _Output) -> None:
     """Measure errors over many simulated runs: a table with standard errors, a picture, JSON."""
     _check_outputs(output)
     from skyless.cli.api.study import run_study
-    from skyless.core.kernels.processes import parts_of
-    from skyless.research.compile_ahead import compile_kernels
     from skyless.research.studies.run import WITHOUT_POSITIONS
+    from skyless.sim.compile_ahead import compile_kernels
 
     if asked.name not in WITHOUT_POSITIONS:
-        with loading_kernels(*parts_of(asked.method)):
+        with status("compiling the simulation"):
             compile_kernels(asked.method)
     try:
         with progress_bar(f"studying {asked.name}", 1.0) as bar:

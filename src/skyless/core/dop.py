@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike
 
-from skyless.core.kernels.arrays import Array, Mask
+from skyless.core.arrays import Array, Mask
 
 MAX_VDOP: Final = 4.0
 """With a larger vertical dilution in the middle of the anchors, the height is not worth estimating."""

@@ -10,8 +10,8 @@ from msgspec import Struct
 from numpy.typing import ArrayLike
 
 from skyless.core.alert import Alert
+from skyless.core.arrays import Array
 from skyless.core.integrity import Integrity, IntegrityRequirement, integrity_of
-from skyless.core.kernels.arrays import Array
 
 if TYPE_CHECKING:
     from skyless.core.dop import Dops

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 from msgspec import UNSET
 
-from skyless.core.kernels.arrays import Integers, Mask, Matrix, Vector
+from skyless.core.arrays import Integers, Mask, Matrix, Vector
 from skyless.core.site import Site
 
 _DIRECTION: Final = np.array([0.8164, 0.5211, 0.2489])

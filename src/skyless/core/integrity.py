@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.alert import Alert
-from skyless.core.kernels.arrays import Array
+from skyless.core.arrays import Array
 
 RISK: Final = 1e-4
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from msgspec import Struct
 
 from skyless.core.air.frame import HEARD
-from skyless.core.kernels.arrays import Array
+from skyless.core.arrays import Array
 from skyless.core.ticks import nearest
 
 

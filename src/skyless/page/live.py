@@ -33,7 +33,6 @@ from skyless.run.mqtt.messages import (
     AnchorHealth,
     EtherHealth,
     FixMessage,
-    PreparationMessage,
     SiteMessage,
     StatusMessage,
     SurveyFactsMessage,
@@ -54,7 +53,6 @@ _STATE_PERIOD_S: Final = 0.05
 _HEALTH_PERIOD_S: Final = 1.0
 _EVALUATION_SHARE: Final = 5.0  # evaluations take at most a sixth of the time
 
-_PREPARATION_EXPIRY_S: Final = 5.0  # a preparation of which nothing has come for this time has ended without saying so
 
 _HEALTHS: Final[dict[str, type[Struct]]] = {"tag": TagHealth, "anchor": AnchorHealth, "ether": EtherHealth}
 _log = logging.getLogger("skyless.page")
@@ -169,8 +167,6 @@ class LiveSite:
         self.name, self.broker = name, broker
         self.site = site
         self.floor_plan: bytes | None = None
-        self.preparation: PreparationMessage | None = None
-        """How far the kernels of a site that starts for the first time are compiled."""
         self.connected = False
         self.state = SiteState()
         self.monitor = ZoneMonitor()
@@ -196,7 +192,6 @@ class LiveSite:
         self._logged_serial = 0
         self._lag_s = 0.0
         self._used_share = used_share
-        self._preparation_s = 0.0
         self._sites: bytes | None = None
 
     # MQTT
@@ -211,7 +206,6 @@ class LiveSite:
             topics.status_topic(site_id, "+", "+"): self._on_status,
             topics.health_topic(site_id, "+", "+"): self._on_health,
             topics.truth_topic(site_id): self._on_truth,
-            topics.preparation_topic(site_id): self._on_preparation,
             topics.zones_topic(site_id): self._on_zones,
             topics.zone_event_topic(site_id, "+"): self._on_zone_event,
             **self.survey.handlers(site_id),
@@ -306,18 +300,6 @@ class LiveSite:
             self.state.add_health(name, health, now_s)
             self.evidence.add_health(kind, name, health, now_s, unix_s)
             self.log.on_health(kind, name, health, now_s)
-
-    def _on_preparation(self, _topic: str, payload: bytes) -> None:
-        now = read_message(payload, PreparationMessage) if payload else None
-        if now is not None and self._wall_clock() - now.unix_s > _PREPARATION_EXPIRY_S:
-            return  # the broker has kept it, of a demo that was killed
-        self._preparation_s = self._clock()
-        self._show_preparation(now)
-
-    def _show_preparation(self, now: PreparationMessage | None) -> None:
-        if now is not None or self.preparation is not None:
-            self.preparation = now
-            self._broadcast("preparation", encode("preparation", {"preparation": self.preparation}))
 
     def _on_truth(self, _topic: str, payload: bytes) -> None:
         self.state.add_truth(read_message(payload, TruthMessage))
@@ -454,8 +436,6 @@ class LiveSite:
         self.state.now_s = self._clock()
         page.replace("condition", self._condition_message())
         page.replace("log", encode("log", {"events": self.log.since()}))
-        if self.preparation is not None:
-            page.replace("preparation", encode("preparation", {"preparation": self.preparation}))
         if self.floor_plan is not None:
             page.replace("floor_plan", self._floor_plan_message())
         if self._sites is not None:
@@ -494,8 +474,6 @@ class LiveSite:
         now_s, unix_s = self._clock(), self._wall_clock()
         self.state.now_s, self.state.unix_s = now_s, unix_s
         self.log.unix_offset_s = unix_s - now_s
-        if now_s > self._preparation_s + _PREPARATION_EXPIRY_S:
-            self._show_preparation(None)
         if self.state.serial != self._sent_serial:
             self._sent_serial = self.state.serial
             for page in self.pages:
@@ -516,7 +494,7 @@ class LiveSite:
     def _evaluate(self, now_s: float) -> None:
         watch = self.survey.watch
         unread_s = 0.0 if self._link is None else self._link.unread_s
-        used_share = None if self._used_share is None or self.preparation is not None else self._used_share(now_s)
+        used_share = None if self._used_share is None else self._used_share(now_s)
         self.condition = self._condition_monitor.evaluate(
             now_s, self._lag_s, watch, self.survey.watch_age_s, used_share, unread_s
         )

@@ -7,8 +7,8 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from skyless.core.arrays import Array
 from skyless.core.errors import SkylessError
-from skyless.core.kernels.arrays import Array
 from skyless.core.method_names import DEFAULT_METHOD, METHODS
 from skyless.page.overlays import OverlayGrids, OverlayTask
 from skyless.site.planning.links import FIX_SHARE, HDOP, PDOP, SIGMA

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.core.kernels.arrays import Matrix
+from skyless.core.arrays import Matrix
 from skyless.core.method_names import FILTERS
 from skyless.core.protocols import superframe_s as period_s
 from skyless.core.tag.selection import MAX_ANCHORS_IN_USE

@@ -11,9 +11,8 @@ from typing import Final
 
 import numpy as np
 
+from skyless.core.arrays import Array, Integers, Records
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.core.kernels.arrays import Array, Integers, Records
-from skyless.core.kernels.compiled import kernel, part
 from skyless.core.ticks import TICK_MASK
 from skyless.sim.oscillator import advance, clock_rate
 from skyless.sim.range_errors import slope_error_m
@@ -26,6 +25,7 @@ from skyless.site.channel import (
     power_bias_m,
     received_power_dbm,
 )
+from skyless.site.kernels.compiled import kernel, part
 
 
 class Outcome(StrEnum):

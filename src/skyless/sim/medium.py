@@ -18,8 +18,8 @@ from msgspec import Struct
 
 from skyless.core.air.ieee802154 import after_rmarker_s, preamble_s
 from skyless.core.air.reception import Transmission
+from skyless.core.arrays import Array, Records
 from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ, TICK_S
-from skyless.core.kernels.arrays import Array, Records
 from skyless.core.site import Site
 from skyless.core.ticks import difference, from_seconds, wrap
 from skyless.sim.impairments import Impairments

@@ -11,9 +11,9 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.core.kernels.arrays import Array, Records
-from skyless.core.kernels.compiled import kernel
+from skyless.core.arrays import Array, Records
 from skyless.sim.streams import TAG_KEY, stream
+from skyless.site.kernels.compiled import kernel
 
 _KNOTS: Final = 20
 """In a correlation length. Between two of them a straight line keeps 98.7 % of the standard deviation or more."""

@@ -7,12 +7,12 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
+from skyless.core.arrays import Records
 from skyless.core.constants import TICK_S
-from skyless.core.kernels.arrays import Records
-from skyless.core.kernels.compiled import kernel, part
 from skyless.core.site import AnchorSite
 from skyless.sim.impairments import AnchorDisplacement, DelayError, Impairments, Outage
 from skyless.sim.trajectory import Piece, Trajectory
+from skyless.site.kernels.compiled import kernel, part
 
 
 class TagSpec(Struct, frozen=True):

@@ -9,8 +9,8 @@ from typing import Final
 
 import numpy as np
 
-from skyless.core.kernels.arrays import Array, Integers
-from skyless.core.kernels.compiled import part
+from skyless.core.arrays import Array, Integers
+from skyless.site.kernels.compiled import part
 
 BLOCK: Final = 1024
 """Normals drawn ahead for each node."""

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skyless.core.kernels.arrays import Array
+from skyless.core.arrays import Array
 from skyless.sim.streams import stream
 
 _ROAM_KEY: Final = 5

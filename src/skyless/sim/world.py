@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 
 from skyless.core.air.reception import Diagnostics, Reception
+from skyless.core.arrays import Array, Integers
 from skyless.core.constants import TICK_S
-from skyless.core.kernels.arrays import Array, Integers
 from skyless.core.protocols import BeaconSender
 from skyless.core.site import Site
 from skyless.core.ticks import difference, from_seconds, wrap

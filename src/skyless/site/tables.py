@@ -19,9 +19,9 @@ from msgspec import Struct
 
 from skyless.core.air.masterless_packets import Point
 from skyless.core.air.page_codec import MAX_COORDINATE_M
+from skyless.core.arrays import Array
 from skyless.core.errors import ConfigurationError
 from skyless.core.input_files import finite, read_lines
-from skyless.core.kernels.arrays import Array
 from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
 from skyless.site.survey.facts import PairRanges
 from skyless.site.survey.stamps.repeats import mean_ranges

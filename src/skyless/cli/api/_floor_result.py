@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from skyless.cli.api._result import Result
-from skyless.core.kernels.arrays import Vector
+from skyless.core.arrays import Vector
 from skyless.core.site import Site
 from skyless.site.planning.floor import Floor
 from skyless.site.planning.maps import PlanMap

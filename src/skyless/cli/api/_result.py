@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from msgspec import Struct
 
+from skyless.core.arrays import Array
 from skyless.core.extras import extra_module
-from skyless.core.kernels.arrays import Array
 
 if TYPE_CHECKING:
     from pandas import DataFrame

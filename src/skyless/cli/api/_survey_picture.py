@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from skyless.core.kernels.arrays import Integers, Vector
+from skyless.core.arrays import Integers, Vector
 from skyless.site.report.figures import BLUE, GRID, INK, MUTED, ORANGE, RED, panel, report_style
 from skyless.site.survey.result import Survey, SurveyedAnchor
 

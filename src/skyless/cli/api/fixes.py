@@ -8,8 +8,8 @@ from msgspec import Struct
 
 from skyless.cli.api._result import axes_columns, data_frame
 from skyless.core.arguments import wrong
+from skyless.core.arrays import Array, Integers, Mask, Matrix, Vector
 from skyless.core.fix import Fix
-from skyless.core.kernels.arrays import Array, Integers, Mask, Matrix, Vector
 
 if TYPE_CHECKING:
     from pandas import DataFrame

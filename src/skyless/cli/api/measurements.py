@@ -8,7 +8,7 @@ from msgspec import Struct
 
 from skyless.cli.api._result import data_frame
 from skyless.core.air.masterless_packets import Packet, PairTdoa
-from skyless.core.kernels.arrays import Integers, Mask, Vector
+from skyless.core.arrays import Integers, Mask, Vector
 
 if TYPE_CHECKING:
     from pandas import DataFrame

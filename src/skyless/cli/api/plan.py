@@ -12,9 +12,9 @@ from skyless.cli.api.options import PlanOptions
 from skyless.cli.api.rate_plan import RatePlanResult, plan_rates
 from skyless.cli.common.output import cm
 from skyless.core.arguments import check_choice, check_whole, process_noise, python_function, wrong
+from skyless.core.arrays import Array, Matrix
 from skyless.core.errors import SkylessError
 from skyless.core.geometry import Box
-from skyless.core.kernels.arrays import Array, Matrix
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS
 from skyless.core.site import Site
 from skyless.research.verify import random_points, verify

@@ -9,9 +9,9 @@ import numpy as np
 
 from skyless.cli.api._floor_result import FloorResult
 from skyless.cli.api._result import data_frame
+from skyless.core.arrays import Array, Matrix
 from skyless.core.errors import SkylessError
 from skyless.core.geometry import Box
-from skyless.core.kernels.arrays import Array, Matrix
 from skyless.core.site import Site
 from skyless.site.channel import ChannelModel
 from skyless.site.planning.floor import floor_of

@@ -16,9 +16,9 @@ from skyless.cli.api.measurements import MeasurementRecorder, Measurements
 from skyless.cli.common.output import cm
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.core.arguments import python_function, wrong
+from skyless.core.arrays import Matrix
 from skyless.core.errors import ConfigurationError
 from skyless.core.fix import Fix
-from skyless.core.kernels.arrays import Matrix
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.research.foreign.formats import Recording
 from skyless.research.foreign.formats import open_recording as open_foreign

@@ -11,8 +11,8 @@ from skyless.cli.api._result import Result, data_frame, figures
 from skyless.cli.api.options import StudyOptions
 from skyless.cli.common.output import cm
 from skyless.core.arguments import check_choice, process_noise, python_function
+from skyless.core.arrays import Vector
 from skyless.core.integrity import RISK
-from skyless.core.kernels.arrays import Vector
 from skyless.research.studies.catalogue import STUDIES
 from skyless.research.studies.common.plan import Plan, Row, plan_of
 from skyless.research.studies.run import run_study as rows_of_study

@@ -12,8 +12,8 @@ from msgspec.structs import replace
 from skyless.cli.api._result import Result, data_frame, figures
 from skyless.cli.common.output import cm
 from skyless.core.arguments import python_function
+from skyless.core.arrays import Integers, Vector
 from skyless.core.errors import SkylessError
-from skyless.core.kernels.arrays import Integers, Vector
 from skyless.core.site import Site
 from skyless.research.calibration.biases import Biases, biases_of
 from skyless.research.calibration.facts import facts_of

@@ -9,10 +9,8 @@ from cyclopts import App, Parameter
 
 from skyless.cli.common.options import command
 from skyless.cli.common.output import print_json
-from skyless.cli.common.progress import loading_kernels
 from skyless.cli.nodes.options import MqttOptions, log, site_named
 from skyless.core.errors import SkylessError
-from skyless.core.method_names import WEIGHTED
 from skyless.run.open_radio import DEFAULT_RADIO
 
 app = App(name="anchor", help_epilogue="Example: skyless anchor 3 --site site.toml")
@@ -53,9 +51,7 @@ def anchor(
     json
         Write one JSON object at the end: the last health of each anchor.
     """
-    from skyless.core.kernels.processes import SIMULATED
     from skyless.radio.interface import AntennaDelays
-    from skyless.research.compile_ahead import compile_kernels
     from skyless.run.anchor import Anchors
     from skyless.run.keys.node_keys import AnchorKeys
     from skyless.run.open_radio import is_simulated, open_radios
@@ -79,8 +75,6 @@ def anchor(
             )
         chains = AnchorKeys(keys, plan.id, log)
     image = None if plan.floor_plan is None else Path(site).parent / plan.floor_plan.image
-    with loading_kernels(SIMULATED):
-        compile_kernels(WEIGHTED)
     anchors = Anchors(
         plan,
         radios,

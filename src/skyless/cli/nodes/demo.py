@@ -14,7 +14,6 @@ from cyclopts import App, Parameter
 
 from skyless.cli.common.options import command
 from skyless.cli.common.output import console, number, print_json
-from skyless.cli.common.progress import CountLine, count_text, report_kernel_folder
 from skyless.cli.nodes.options import MqttCa, WalkingSpeed, check_live, log, site_named
 from skyless.core.alert import Alert
 from skyless.core.arguments import Method, Picoseconds, Positive, Seed, whole
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
 
     from skyless.cli.demo import SiteRun, WholeSite
     from skyless.cli.watch import Watch, WatchedTag
-    from skyless.core.kernels.processes import Preparation
     from skyless.run.mqtt.address import MqttAddress
     from skyless.run.mqtt.messages import FixMessage
 
@@ -97,15 +95,11 @@ def demo(*, asked: DemoOptions) -> None:
     simulated. Watch it on the page, or with: mosquitto_sub -t 'skyless/#' -v
     """
     from skyless.cli.demo import WholeSite
-    from skyless.core.kernels.processes import missing, parts_of
     from skyless.run.process import run
 
     settings = _settings(asked)
-    if missing(parts_of(asked.method)):
-        report_kernel_folder()
     whole = WholeSite(settings, log)
     screen = Screen(whole, show=not asked.json and sys.stdout.isatty())
-    whole.on_preparation = screen.show_preparation
     with screen, contextlib.suppress(KeyboardInterrupt):
         run(_run(whole, settings, screen, asked))
     _report(screen, json=asked.json)
@@ -162,7 +156,6 @@ async def _run(whole: "WholeSite", settings: "SiteRun", screen: "Screen", asked:
     try:
         await _either(site, whole.ready.wait())
         screen.print_addresses(settings, json=asked.json)
-        await _either(site, whole.prepared.wait())
         await _either(site, _until_all_fix(whole, asked.tags))
         screen.begin()
         await _either(site, _watch(screen, asked.duration))
@@ -223,7 +216,6 @@ class Screen:
         self.stopped_early = True
         self._whole, self._show = whole, show
         self._live: Live | None = None
-        self._count = CountLine()
         self._begun_s: float | None = None
         self._took_s = 0.0
 
@@ -255,21 +247,12 @@ class Screen:
         else:
             print("\n".join(lines), file=sys.stderr if json else sys.stdout, flush=True)
 
-    def show_preparation(self, now: "Preparation") -> None:
-        """Show how far the kernels are compiled."""
-        if self._live is None:
-            self._count.show(now)
-        else:
-            self._live.update(count_text(now), refresh=True)
-
     def begin(self) -> None:
         """All tags have a fix."""
-        self._count.clear()
         self._begun_s = time.monotonic()
 
     def end(self) -> None:
         """The programs are about to be ended."""
-        self._count.clear()
         if self._begun_s is not None:
             self._took_s = time.monotonic() - self._begun_s
 

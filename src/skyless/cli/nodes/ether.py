@@ -12,11 +12,10 @@ from msgspec.structs import replace
 
 from skyless.cli.common.options import command
 from skyless.cli.common.output import print_json
-from skyless.cli.common.progress import loading_kernels
+from skyless.cli.common.progress import status
 from skyless.cli.nodes.options import MqttOptions, WalkingSpeed, check_live, listen_address, log, site_named
 from skyless.core.arguments import Options, Picoseconds, Seed, Text, number, read_numbers, whole
 from skyless.core.errors import SkylessError
-from skyless.core.method_names import WEIGHTED
 from skyless.core.ticks import from_seconds
 from skyless.radio.ether_wire import DEFAULT_PORT
 
@@ -61,10 +60,9 @@ def ether(*, asked: EtherOptions, broker: MqttOptions) -> None:
 
     It is a simulation of radios, clocks and motion; nothing is transmitted.
     """
-    from skyless.core.kernels.processes import SIMULATED
-    from skyless.research.compile_ahead import compile_kernels
     from skyless.run.ether import Ether, EtherNode
     from skyless.run.process import run
+    from skyless.sim.compile_ahead import compile_kernels
     from skyless.sim.evaluation.scenarios import Request, impairments_of, patrols
 
     site, address = site_named(asked.site), broker.address()
@@ -72,8 +70,8 @@ def ether(*, asked: EtherOptions, broker: MqttOptions) -> None:
     host, port = listen_address(asked.listen, DEFAULT_PORT)
     request = Request(site, noise_ps=asked.noise_ps, loss=asked.loss, nlos=asked.nlos, seed=asked.seed)
     moves = tuple(_move(text, [anchor.id for anchor in site.anchors]) for text in asked.move)
-    with loading_kernels(SIMULATED):
-        compile_kernels(WEIGHTED)
+    with status("compiling the simulation"):
+        compile_kernels()
     bodies = {f"tag{number}": path for number, path in enumerate(patrols(site, asked.tags, asked.speed), start=1)}
     emulated = Ether(site, bodies, replace(impairments_of(request, site), anchor_displacements=moves), asked.seed)
     for one in moves:

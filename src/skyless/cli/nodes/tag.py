@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 from cyclopts import App, Parameter
 
 from skyless.cli.common.options import command
-from skyless.cli.common.progress import loading_kernels
 from skyless.cli.nodes._fix_lines import FixLines, LineOptions
 from skyless.cli.nodes.options import MqttOptions, SiteId, log
 from skyless.core.arguments import Method, NotNegative, Positive, Text, number, process_noise, read_height
@@ -162,8 +161,6 @@ def _on_radios(
     bridge: "TagBridge | None",
 ) -> "Coroutine[Any, Any, None]":
     """Tags that hear beacons."""
-    from skyless.core.kernels.processes import parts_of
-    from skyless.research.compile_ahead import compile_kernels
     from skyless.run.tag import Tags, TagSettings
 
     required = asked.requirement(asked.method, asked.tag_height_std)
@@ -177,8 +174,6 @@ def _on_radios(
         trust=trust,
     )
     radios = open_radios(asked.radio, "tag", names)
-    with loading_kernels(*parts_of(asked.method)):
-        compile_kernels(asked.method)
     return Tags(settings, radios, address, log, on_fix, None if bridge is None else bridge.on_health).run()
 
 
@@ -210,14 +205,10 @@ def _on_sniffers(
     from msgspec import structs
 
     from skyless.bridges.program import heard_site
-    from skyless.core.kernels.processes import SNIFFERS
-    from skyless.research.compile_ahead import compile_packet_kernels
     from skyless.research.live.packet_tags import PacketTags
 
     settings = _system(asked)
     radios = open_sniffers(asked.radio, names, settings.anchors_m)
-    with loading_kernels(*SNIFFERS):
-        compile_packet_kernels()
     if bridge is not None and settings.anchors_m:
         bridge.on_site(heard_site(settings.site, settings.anchors_m, simulated=is_simulated(asked.radio)))
 

@@ -14,7 +14,7 @@ from skyless.core.air.beacon import Beacon, StatedPosition
 from skyless.core.air.frame import Malformed
 from skyless.core.air.instants import period_ticks
 from skyless.core.air.page_codec import PAGE_BYTES, decode_page, encode_page
-from skyless.core.kernels.arrays import Array
+from skyless.core.arrays import Array
 from skyless.core.site import AnchorSite, Site
 from skyless.core.ticks import from_seconds
 

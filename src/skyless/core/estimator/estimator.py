@@ -8,6 +8,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
+from skyless.core.arrays import Integers, Matrix, Vector
 from skyless.core.estimator import compiled
 from skyless.core.estimator.compiled import add_anchor, find_anchor, fit_plane, remove_anchor
 from skyless.core.estimator.levels import largest_test
@@ -30,7 +31,6 @@ from skyless.core.estimator.state import (
     make_uncertain,
     new_state,
 )
-from skyless.core.kernels.arrays import Integers, Matrix, Vector
 from skyless.core.native.records import records, view
 
 MAX_ANCHORS_KNOWN: Final = 256

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct
 
-from skyless.core.kernels.processors import cores
 from skyless.core.keys.key_chain import (
     CERTIFICATE_SIGNATURE_BYTES,
     SECTION_BITS,
@@ -28,6 +27,7 @@ from skyless.core.keys.key_chain import (
     root_of,
     sign,
 )
+from skyless.core.processors import cores
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey

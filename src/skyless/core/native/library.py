@@ -1,4 +1,4 @@
-"""The library that is made from the Python of ``core`` (``tools/python_to_c.py``), and its functions.
+"""The library that is made from the Python of ``core`` (``tools/translator``), and its functions.
 
 With ``SKYLESS_UNCOMPILED=1`` in the environment the Python itself runs: the same bits, some thousand times slower.
 """

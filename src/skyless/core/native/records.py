@@ -1,4 +1,4 @@
-"""Types of the functions that are also translated to C (``tools/python_to_c.py``): numbers, records and their arrays.
+"""Types of the functions that are also translated to C (``tools/translator``): numbers, records and their arrays.
 
 A record is a ``ctypes`` structure, so it has the layout of the C structure of its name and both work on the same
 memory. Its fields are declared like those of a dataclass; arrays in it have fixed lengths:

@@ -1,16 +1,16 @@
-/* Made by tools/python_to_c.py from the modules below; do not edit.
+/* Made by tools/make_core.py from these modules; do not edit.
 
-   skyless.core.estimator.faults
-   skyless.core.estimator.kalman
-   skyless.core.estimator.levels
-   skyless.core.estimator.measurements
-   skyless.core.estimator.monitor
-   skyless.core.estimator.process
-   skyless.core.estimator.state
-   skyless.core.estimator.steady_state
-   skyless.core.native.arithmetic
-   skyless.core.tag.descent
-*/
+ * skyless.core.estimator.faults
+ * skyless.core.estimator.kalman
+ * skyless.core.estimator.levels
+ * skyless.core.estimator.measurements
+ * skyless.core.estimator.monitor
+ * skyless.core.estimator.process
+ * skyless.core.estimator.state
+ * skyless.core.estimator.steady_state
+ * skyless.core.native.arithmetic
+ * skyless.core.tag.descent
+ */
 
 #include "skyless_core.h"
 

@@ -5,8 +5,8 @@ from typing import Final
 
 from msgspec import Struct
 
+from skyless.core.clock_filter import ClockFilter
 from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS, SUBTICKS, TICK_M
-from skyless.core.kernels.filter import ClockFilter
 from skyless.core.protocol1.beacon import Beacon
 from skyless.core.protocol1.schedule import Schedule
 from skyless.core.ticks import continued, nearest

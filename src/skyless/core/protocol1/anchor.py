@@ -14,8 +14,8 @@ from skyless.core.air.almanac import Page
 from skyless.core.air.frame import Heard, Malformed
 from skyless.core.air.reception import Reception, Transmission
 from skyless.core.anchor.anchor import MAX_RELAY_AGE_TICKS, delay_change_ticks, on_radio_grid
+from skyless.core.clock_filter import ClockFilter, clock_noise, stamp_variance_m2
 from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS, SUBTICKS, TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.core.kernels.filter import ClockFilter, clock_noise, stamp_variance_m2
 from skyless.core.protocol1._master_term import MasterTerm
 from skyless.core.protocol1._site_clock import SiteClock
 from skyless.core.protocol1.almanac import almanac_issue, page_for, pages_of

@@ -9,10 +9,10 @@ from msgspec import Struct
 from skyless.core.air.almanac import AccuracyPage, NoisePage, SchedulePage
 from skyless.core.air.frame import Heard, Malformed
 from skyless.core.air.reception import Reception
+from skyless.core.arrays import Array
 from skyless.core.constants import SUBTICKS, TICK_M
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.kernels.arrays import Array
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.core.observation import Observation
 from skyless.core.protocol1._master_scale import MasterScale

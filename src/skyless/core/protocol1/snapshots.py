@@ -11,9 +11,9 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
+from skyless.core.arrays import Array, Matrix, Vector
 from skyless.core.constants import TICK_M
 from skyless.core.fix import Fix, NoFixReason
-from skyless.core.kernels.arrays import Array, Matrix, Vector
 from skyless.core.observation import Observation
 from skyless.core.tag.locate import NoSolution, Solution, locate
 from skyless.core.ticks import FLIGHT_SLACK_TICKS, FixTime, may_elapse

@@ -14,10 +14,10 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
+from skyless.core.arrays import Array
 from skyless.core.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.core.estimator.settings import TUNING
 from skyless.core.fix import NoFixReason
-from skyless.core.kernels.arrays import Array
 from skyless.core.observation import Observation
 from skyless.core.tag.locate import NoSolution, locate_pseudoranges
 

@@ -6,8 +6,8 @@ from msgspec import Struct
 
 from skyless.core.air.almanac import AccuracyPage, NoisePage
 from skyless.core.air.local_almanac import CommonPages, LocalAlmanacState
+from skyless.core.clock_filter import clock_noise, stamp_variance_m2
 from skyless.core.estimator.settings import EstimatorSettings
-from skyless.core.kernels.filter import clock_noise, stamp_variance_m2
 from skyless.core.observation import Observation
 from skyless.core.tag.beacon_receiver import AdmissionState, MethodOptions
 from skyless.core.tag.joint import Estimation, EstimationState

@@ -6,13 +6,13 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
+from skyless.core.arrays import Array
 from skyless.core.constants import TICK_S
 from skyless.core.estimator.estimator import NO_REPORT, Estimator, Report, SavedEstimator
 from skyless.core.estimator.process import ACCEPTED, REJECTED, STALE
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.fix import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY, Fix, NoFixReason
 from skyless.core.integrity import UNAVAILABLE, IntegrityRequirement
-from skyless.core.kernels.arrays import Array
 from skyless.core.observation import Observation
 from skyless.core.tag._acquisition import Acquisition, Start
 from skyless.core.ticks import FixTime, from_seconds

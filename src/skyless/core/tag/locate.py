@@ -22,8 +22,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
+from skyless.core.arrays import Array
 from skyless.core.fix import NoFixReason
-from skyless.core.kernels.arrays import Array
 from skyless.core.native.library import compiled
 from skyless.core.native.records import view
 from skyless.core.tag.descent import (

@@ -24,7 +24,7 @@ let list = null;
 
 /** Fill the header and the banner, and keep them up to date. */
 export function start() {
-  on(["connection", "mode", "player", "condition", "site", "preparation"], show);
+  on(["connection", "mode", "player", "condition", "site"], show);
   setInterval(() => {
     show();
     if (state.connection.phase !== "lost") text(byId("time"), timeOfDay(now_s()));

@@ -49,7 +49,6 @@ function judged() {
   if (state.mqtt && !state.mqtt.connected && condition.level !== "bad") {
     return { level: condition.reasons.length ? "warning" : "waiting", text: "no broker", reasons: condition.reasons };
   }
-  if (condition.level === "waiting" && state.preparation) return { ...condition, text: "compiling, at the first start only" };
   return condition;
 }
 

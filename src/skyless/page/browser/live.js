@@ -159,7 +159,6 @@ const handlers = {
     state.condition = null;
     changed("connection", "events", "log", "condition");
     handlers.sites({ shown: null, sites: [] });
-    handlers.preparation({ preparation: null });
     handlers.zones(message);
     handlers.site(message);
   },
@@ -235,10 +234,6 @@ const handlers = {
     changed("sites");
     const chosen = chosenSite();
     if (chosen !== null && chosen !== shown && sites.some(([id]) => id === chosen)) connect(); // it was not known before
-  },
-  preparation(message) {
-    state.preparation = message.preparation;
-    changed("preparation");
   },
   floor_plan(message) {
     state.floorDigest = message.digest;

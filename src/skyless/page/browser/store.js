@@ -2,7 +2,7 @@
  * The one state of the page. Modules change it and notify the topics; callbacks run at most once a frame.
  *
  * Topics: connection, site, zones, events, health, tags, mode, player, recordings, selection, options, overlay, editor,
- * theme, survey, watch, setup, picking, plan, condition, log, read, preparation, sites.
+ * theme, survey, watch, setup, picking, plan, condition, log, read, sites.
  */
 
 /** @type {Map<string, Set<() => void>>} */
@@ -27,7 +27,6 @@ export const state = {
   /** The sites of the broker: number, name, whether programs are online. @type {Array<[number, string, boolean]>} */
   sites: [],
   /** @type {{done: number, total: number, left_s: number|null}|null} while kernels are compiled */
-  preparation: null,
   /** @type {"live"|"replay"} */
   mode: "live",
   /** @type {Array<{id: string, name: string, polygon_m: number[][], colour: string|null}>} */

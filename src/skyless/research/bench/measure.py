@@ -15,8 +15,8 @@ from msgspec import Struct
 from scipy.optimize import least_squares
 
 from skyless.core.air.reception import Reception
-from skyless.core.kernels.arrays import Array
-from skyless.core.kernels.processors import cores
+from skyless.core.arrays import Array
+from skyless.core.processors import cores
 from skyless.core.protocol1.codec import decode_cached
 from skyless.core.tag.locate import PseudorangeSolution, locate_pseudoranges
 from skyless.core.tag.receiver import Receiver

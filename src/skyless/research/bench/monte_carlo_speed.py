@@ -8,9 +8,9 @@ import numpy as np
 from msgspec import Struct
 from numpy.random import Generator
 
+from skyless.core.arrays import Array
 from skyless.core.constants import TICK_S
-from skyless.core.kernels.arrays import Array
-from skyless.core.kernels.processors import cores
+from skyless.core.processors import cores
 from skyless.research.paper.monte_carlo import Quantity, draw_moments
 from skyless.research.uncertainty.chain import Chain
 

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from msgspec import structs
 
-from skyless.core.kernels.arrays import Matrix
+from skyless.core.arrays import Matrix
 from skyless.core.whole_files import replace_files
 from skyless.research.benchmark.run import JOINT, PLAIN, Result
 from skyless.sim.evaluation.figures import Figures

@@ -14,8 +14,8 @@ from typing import Final
 
 import numpy as np
 
-from skyless.core.kernels.arrays import Array, Matrix, Vector
-from skyless.core.kernels.compiled import kernel
+from skyless.core.arrays import Array, Matrix, Vector
+from skyless.site.kernels.compiled import kernel
 
 GATE, BITCRAZE = range(2)
 TDOA_STD_M: Final = {GATE: 0.22, BITCRAZE: 0.15}

@@ -12,8 +12,8 @@ from msgspec import Struct, structs
 
 import skyless
 from skyless.core.air.masterless_packets import PairTdoa
+from skyless.core.arrays import Matrix, Vector
 from skyless.core.errors import SkylessError
-from skyless.core.kernels.arrays import Matrix, Vector
 from skyless.core.whole_files import write_whole
 from skyless.research.benchmark.plain import BITCRAZE, GATE, plain_track
 from skyless.research.benchmark.recordings import Found

@@ -19,8 +19,8 @@ from zlib import crc32
 import numpy as np
 
 from skyless.core.air.masterless_packets import PairTdoa
+from skyless.core.arrays import Array
 from skyless.core.input_files import Drops, chunks, open_source
-from skyless.core.kernels.arrays import Array
 from skyless.site.tables import HEIGHT_STD_M, Truth
 
 _MAGIC: Final = b"\xbc"

@@ -11,9 +11,9 @@ from typing import Final
 import numpy as np
 
 from skyless.core.air.masterless_packets import PairTdoa
+from skyless.core.arrays import Array
 from skyless.core.constants import TICK_M
 from skyless.core.input_files import Drops, header_of, open_source, rows
-from skyless.core.kernels.arrays import Array
 from skyless.core.ticks import difference
 from skyless.research.foreign._crazyflie import heights_of
 from skyless.site.tables import Truth

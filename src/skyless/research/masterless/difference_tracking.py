@@ -11,13 +11,13 @@ from msgspec import Struct
 from numpy.typing import ArrayLike
 
 from skyless.core.air.masterless_packets import PairTdoa
+from skyless.core.arrays import Array
 from skyless.core.constants import TICK_RATE_HZ
 from skyless.core.estimator.estimator import Estimator
 from skyless.core.estimator.process import ACCEPTED
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.kernels.arrays import Array
 from skyless.core.tag.locate import NoSolution, locate
 from skyless.site.survey.anchor_errors import KNOWN_STD_M, DifferenceCalibration
 

@@ -16,8 +16,8 @@ from math import dist
 from typing import Final
 
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point, Relay
+from skyless.core.clock_filter import MAX_RELATIVE_RATE, TwoState, predict, update
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.core.kernels.filter import MAX_RELATIVE_RATE, TwoState, predict, update
 from skyless.core.ticks import Unwrapper, difference, nearest
 from skyless.site.survey.anchor_errors import AnchorFlights, distance_ticks
 

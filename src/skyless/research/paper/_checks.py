@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from msgspec import Struct
 
+from skyless.core.arrays import Array
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.core.kernels.arrays import Array
 from skyless.research.paper.monte_carlo import ChainMoments, Quantity, draw_moments
 from skyless.research.paper.plan import Panel, Plan, Results, Section, Task, Verdict, grouped
 from skyless.research.uncertainty.chain import CORRECTED, PRINTED, Chain

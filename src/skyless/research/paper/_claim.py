@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.kernels.arrays import Array
+from skyless.core.arrays import Array
 from skyless.research.paper._listening import listen
 from skyless.research.paper.plan import (
     CLAIM_M,

@@ -7,7 +7,7 @@ import numpy as np
 from msgspec import Struct
 from scipy.stats import norm
 
-from skyless.core.kernels.arrays import Array, Integers
+from skyless.core.arrays import Array, Integers
 from skyless.research.paper._checks import NOISES, draw_seed, first_number, paper_chain
 from skyless.research.paper.monte_carlo import draw_lambdas
 from skyless.research.paper.plan import Panel, Plan, Results, Section, Task, Verdict, grouped

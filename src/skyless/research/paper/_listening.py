@@ -6,8 +6,8 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
+from skyless.core.arrays import Array
 from skyless.core.fix import Fix
-from skyless.core.kernels.arrays import Array
 from skyless.core.protocol1.receiver import Receiver
 from skyless.core.protocol1.schedule import schedule_of
 from skyless.core.site import Site

@@ -9,7 +9,7 @@ from matplotlib.ticker import FuncFormatter
 from msgspec import Struct
 from numpy.typing import ArrayLike
 
-from skyless.core.kernels.arrays import Array, Integers
+from skyless.core.arrays import Array, Integers
 from skyless.core.protocol1.receiver import Receiver
 from skyless.research.paper.plan import P1, RADIO_PS, Panel, Plan, Results, Section, Task, Verdict, grouped
 from skyless.sim.evaluation.fleet import world_of

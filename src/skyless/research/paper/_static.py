@@ -8,8 +8,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 from scipy.stats import kurtosis, norm, skew
 
+from skyless.core.arrays import Array
 from skyless.core.constants import TICK_M
-from skyless.core.kernels.arrays import Array
 from skyless.research.paper._listening import Track, listen
 from skyless.research.paper.plan import (
     CLAIM_M,

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.kernels.arrays import Array
+from skyless.core.arrays import Array
 from skyless.research.paper._dop_map import EXPLAINING_CORRELATION, LAB_ANCHORS_M, literal_covariance_m2, pdop_at
 from skyless.research.paper._listening import Track, listen
 from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Task, Verdict, grouped

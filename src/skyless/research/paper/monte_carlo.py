@@ -19,10 +19,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from msgspec import Struct
 
+from skyless.core.arrays import Array
 from skyless.core.constants import TICK_M, TICK_S
-from skyless.core.kernels.arrays import Array
-from skyless.core.kernels.compiled import jitted, kernel, threaded_kernel
-from skyless.core.kernels.processors import cores
+from skyless.core.processors import cores
 from skyless.core.protocol1.snapshots import (
     averaged_offset,
     protocol_interval,
@@ -32,6 +31,7 @@ from skyless.core.protocol1.snapshots import (
     to_master,
 )
 from skyless.research.uncertainty.chain import Chain, Reference
+from skyless.site.kernels.compiled import jitted, kernel, threaded_kernel
 
 for _function in (averaged_offset, protocol_interval, relative_offset, relative_rate, tag_rate, to_master):
     jitted(_function)

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from skyless.core.kernels.arrays import Matrix
+from skyless.core.arrays import Matrix
 
 
 def track_figure(rows: Matrix, title: str) -> Figure:

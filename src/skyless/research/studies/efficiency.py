@@ -12,9 +12,9 @@ import numpy as np
 from msgspec import Struct
 from scipy.stats import chi2
 
+from skyless.core.arrays import Array
 from skyless.core.errors import SkylessError
 from skyless.core.estimator.estimator import Estimator
-from skyless.core.kernels.arrays import Array
 from skyless.research.studies.common.plan import Cell, Plan, Row
 from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM, Case, Episode, draw_episode, settings_of
 from skyless.research.uncertainty.bounds import BoundSettings, tracking_bound

@@ -17,12 +17,12 @@ from msgspec.structs import replace
 from numpy.random import Generator, SeedSequence, default_rng
 from numpy.typing import NDArray
 
+from skyless.core.arrays import Array
 from skyless.core.constants import TICK_M
 from skyless.core.errors import SkylessError
 from skyless.core.estimator.estimator import Estimator, Packets
 from skyless.core.estimator.process import ACCEPTED, JOINED
 from skyless.core.integrity import CONTRADICTED, HPL, VPL
-from skyless.core.kernels.arrays import Array
 from skyless.research.studies.common.picture import (
     MIN_DRAWN_SHARE,
     STATED_RISK,

@@ -15,8 +15,8 @@ from msgspec.structs import replace
 
 from skyless.core.air.beacon import Beacon
 from skyless.core.air.reception import Reception
+from skyless.core.arrays import Array
 from skyless.core.fix import Fix
-from skyless.core.kernels.arrays import Array
 from skyless.core.site import EXACT, AccuracySite, Site
 from skyless.core.tag.joint import Estimation
 from skyless.core.tag.receiver import Receiver

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.random import Generator
 
-from skyless.core.kernels.arrays import Array
+from skyless.core.arrays import Array
 from skyless.research.studies.common.plan import Plan
 from skyless.research.studies.common.summary import Case
 from skyless.research.studies.common.worlds import box, large_lab_site, worlds

@@ -20,8 +20,8 @@ from msgspec.structs import asdict, replace
 
 from skyless.core.air.beacon import Beacon
 from skyless.core.air.codec import decode_cached
+from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.kernels.arrays import Array, Integers, Mask
 from skyless.core.site import AnchorSite, Site, TagsSite, WallSite
 from skyless.research.studies.common.plan import Cell, Limit, Plan, Row, seed_of, with_limits
 from skyless.research.studies.common.summary import (

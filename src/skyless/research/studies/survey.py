@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.kernels.arrays import Array
+from skyless.core.arrays import Array
 from skyless.research.studies.common.plan import Cell, Limit, Plan, Row, seed_of, with_limits
 from skyless.research.surveys.air import AirErrors, drawn_errors, free_axes, ranges_in_air
 from skyless.research.surveys.judge import Outcome, judged, survey_bound_m, tag_error_m

@@ -6,8 +6,8 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
+from skyless.core.arrays import Array
 from skyless.core.constants import TICK_M
-from skyless.core.kernels.arrays import Array
 from skyless.core.site import EXACT, AnchorSite, ScheduleSite, Site
 from skyless.research.surveys._anchor_stamps import stamps_of
 from skyless.research.surveys.layouts import SLOT_S, SurveyLayout

@@ -6,8 +6,8 @@ from typing import Final, Literal
 import numpy as np
 from msgspec import Struct
 
+from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.constants import SPEED_OF_LIGHT_MPS
-from skyless.core.kernels.arrays import Array, Integers, Mask
 from skyless.site.survey.facts import PairBlock
 from skyless.site.survey.watch.explain import Finding, Kind, Pairs, is_significant, weight_of
 from skyless.site.survey.watch.monitor import GRACE_S, AnchorWatch

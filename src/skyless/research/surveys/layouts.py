@@ -5,7 +5,7 @@ from typing import Final, Literal
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.kernels.arrays import Array
+from skyless.core.arrays import Array
 from skyless.sim.lab import lab_site
 
 SLOT_S: Final = 2.5e-3

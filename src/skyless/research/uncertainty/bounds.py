@@ -14,11 +14,11 @@ from msgspec import Struct
 from numpy.random import Generator
 from numpy.typing import ArrayLike
 
+from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.core.estimator.compiled import add_anchor, process_known
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import State, new_state
-from skyless.core.kernels.arrays import Array, Integers, Mask
 from skyless.core.native.records import view
 
 # What is known before the first frame, almost nothing: 30 m, 33 µs, ±10 ppm.

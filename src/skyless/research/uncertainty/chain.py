@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
+from skyless.core.arrays import Array, Matrix
 from skyless.core.constants import SPEED_OF_LIGHT_MPS
-from skyless.core.kernels.arrays import Array, Matrix
 
 
 @dataclass(frozen=True, slots=True)

@@ -62,17 +62,6 @@ class StatusMessage(Struct, frozen=True):
     """When it came online; 0 in a last will."""
 
 
-class PreparationMessage(Struct, frozen=True):
-    """How far the compilation of the kernels is, before a site's programs start for the first time; retained."""
-
-    done: int
-    total: int
-    """0 while it is not known yet."""
-    left_s: float | None
-    """Estimated from what has been done; None while that is too little."""
-    unix_s: float
-
-
 class FixMessage(Struct, frozen=True):
     """One fix of one tag. A tag publishes at its configured rate; ``serial`` counts all fixes that it made."""
 

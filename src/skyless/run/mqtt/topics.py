@@ -55,11 +55,6 @@ def request_topic(site: int | str) -> str:
     return f"{ROOT}/{site}/request"
 
 
-def preparation_topic(site: int | str) -> str:
-    """Retained ``PreparationMessage`` while kernels are compiled; empty when that has ended."""
-    return f"{ROOT}/{site}/preparation"
-
-
 def truth_topic(site: int | str) -> str:
     """``TruthMessage``; only a simulated site has one."""
     return f"{ROOT}/{site}/truth"

@@ -15,8 +15,8 @@ from msgspec import Struct
 
 from skyless.core.air.reception import Reception
 from skyless.core.any_receiver import AnyReceiver, AnyReceiverState
+from skyless.core.arrays import Array
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.kernels.arrays import Array
 from skyless.core.tag.beacon_receiver import TagReceiver
 from skyless.core.tag.factory import ReceiverState
 from skyless.run.mqtt.messages import Leases, RawReception, ReceptionsMessage, RequestMessage, SegmentStart

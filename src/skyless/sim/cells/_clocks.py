@@ -11,12 +11,12 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from skyless.core.arrays import Array, Integers
 from skyless.core.constants import TICK_RATE_HZ
-from skyless.core.kernels.arrays import Array, Integers
-from skyless.core.kernels.compiled import kernel
 from skyless.core.ticks import WRAP_TICKS
 from skyless.sim.cells._keyed import CRYSTAL, START, key_of, mixed, normal_pair, purpose_key, uniform
 from skyless.sim.oscillator import OscillatorModel
+from skyless.site.kernels.compiled import kernel
 
 KNOT_BITS: Final = 31
 KNOT_TICKS: Final = 1 << KNOT_BITS

@@ -6,9 +6,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skyless.core.kernels.arrays import Array, Integers
-from skyless.core.kernels.compiled import kernel
+from skyless.core.arrays import Array, Integers
 from skyless.sim.cells._reception import Rules, delivery_chance, pair_key, squared_m2
+from skyless.site.kernels.compiled import kernel
 
 _MAX_CELLS: Final = 1_000_000
 """Anchors far apart get larger cells instead of more."""

@@ -13,9 +13,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from skyless.core.air.ieee802154 import preamble_s
+from skyless.core.arrays import Array, Integers
 from skyless.core.constants import TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.core.kernels.arrays import Array, Integers
-from skyless.core.kernels.compiled import kernel, step
 from skyless.core.ticks import TICK_MASK, from_seconds
 from skyless.sim.cells._clocks import Knots, own_time
 from skyless.sim.cells._keyed import CHANCE, LOSS, RX_NOISE, TX_NOISE, key_of, mixed, normal, purpose_key, uniform
@@ -26,6 +25,7 @@ from skyless.site.channel import (
     delivery_probability,
     received_power_dbm,
 )
+from skyless.site.kernels.compiled import kernel, step
 
 AUDIBLE_WIDTHS: Final = 12.0
 """Widths of the loss's logistic function below the sensitivity, from which on nothing is received."""

@@ -9,9 +9,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from skyless.core.arrays import Array, Integers, Records
 from skyless.core.constants import TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.core.kernels.arrays import Array, Integers, Records
-from skyless.core.kernels.compiled import kernel, step
 from skyless.core.ticks import TICK_MASK
 from skyless.sim.cells._clocks import KNOT_TICKS, Knots, true_time
 from skyless.sim.cells._grid import Grid, Neighbours, cells_within
@@ -31,6 +30,7 @@ from skyless.sim.cells._reception import (
 from skyless.sim.cells._timetable import BIN_BITS, Buckets, Table, latest
 from skyless.sim.range_errors import slope_error_m
 from skyless.sim.stations import coordinate_m
+from skyless.site.kernels.compiled import kernel, step
 
 RELAY_AGE_TICKS: Final = round(1.0 * TICK_RATE_HZ)
 """Older receptions are not relayed, as in ``skyless.core.anchor.anchor``."""

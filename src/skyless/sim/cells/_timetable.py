@@ -8,12 +8,12 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from skyless.core.air.instants import gap_ticks, mixed, period_ticks, ticks_ahead
+from skyless.core.arrays import Array, Integers
 from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS
-from skyless.core.kernels.arrays import Array, Integers
-from skyless.core.kernels.compiled import jitted, kernel, step
 from skyless.sim.cells._clocks import Knots, own_time, true_time
 from skyless.sim.cells._grid import Grid
 from skyless.sim.cells._reception import Frames, Rules, emission
+from skyless.site.kernels.compiled import jitted, kernel, step
 
 BIN_BITS: Final = 25
 """Frames are sorted into bins of 2^24 ticks, 0.26 ms."""

@@ -15,9 +15,8 @@ from msgspec import Struct
 
 from skyless.core.air.ieee802154 import after_rmarker_s
 from skyless.core.air.instants import period_ticks
+from skyless.core.arrays import Array, Integers
 from skyless.core.constants import TICK_S
-from skyless.core.kernels.arrays import Array, Integers
-from skyless.core.kernels.compiled import kernel
 from skyless.core.site import Site
 from skyless.core.ticks import TICK_MASK, from_seconds
 from skyless.sim.cells._clocks import KNOT_TICKS, CellClocks
@@ -51,6 +50,7 @@ from skyless.sim.cells._timetable import (
 from skyless.sim.impairments import Impairments
 from skyless.sim.range_errors import RangeErrorModel
 from skyless.sim.trajectory import Trajectory
+from skyless.site.kernels.compiled import kernel
 
 MAX_RELAYS: Final = 6
 """In a frame: more than six hardly make fixes better."""

@@ -17,8 +17,8 @@ from skyless.core.air.instants import period_code, suitable_period_s
 from skyless.core.air.local_almanac import site_issue, site_page_for, site_pages_of, stated_position
 from skyless.core.air.page_codec import decode_page, encode_page
 from skyless.core.air.reception import Reception
+from skyless.core.arrays import Array, Integers
 from skyless.core.geometry import anchors_in_reach
-from skyless.core.kernels.arrays import Array, Integers
 from skyless.core.site import Site
 from skyless.sim.cells.world import CellWorld, TagReceptions, anchors_of
 from skyless.sim.evaluation.fleet import FleetSettings, JudgedFix, TagFleet

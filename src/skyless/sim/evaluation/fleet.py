@@ -10,9 +10,9 @@ from msgspec import Struct
 
 from skyless.core.air.reception import Reception
 from skyless.core.any_receiver import AnyReceiver
+from skyless.core.arrays import Array
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.kernels.arrays import Array
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.protocols import AnchorMachine, SiteBeacon, new_anchor
 from skyless.core.site import Site

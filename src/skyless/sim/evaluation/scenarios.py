@@ -9,9 +9,9 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
+from skyless.core.arrays import Array
 from skyless.core.errors import SkylessError
 from skyless.core.geometry import rectangle_of
-from skyless.core.kernels.arrays import Array
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, SNAPSHOTS
 from skyless.core.site import Site
 from skyless.sim.evaluation.cell_fleet import MAX_MACHINES, CellFleet

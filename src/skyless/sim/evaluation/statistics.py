@@ -12,8 +12,8 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.alert import Alert
+from skyless.core.arrays import Array
 from skyless.core.fix import Fix
-from skyless.core.kernels.arrays import Array
 from skyless.core.protocols import superframe_s
 from skyless.core.site import Site
 

@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from skyless.core.kernels.arrays import Array, Matrix, Vector
+from skyless.core.arrays import Array, Matrix, Vector
 from skyless.site.tables import Truth
 
 Triple = tuple[float, float, float]

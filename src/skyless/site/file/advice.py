@@ -7,6 +7,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from skyless.core.air.instants import OFFERED_HZ, suitable_period_s
+from skyless.core.arrays import Array
 from skyless.core.geometry import (
     OUTSIDE_M,
     RADIO_REACH_M,
@@ -17,7 +18,6 @@ from skyless.core.geometry import (
     links_in_reach,
     outline_of,
 )
-from skyless.core.kernels.arrays import Array
 from skyless.core.site import ScheduleSite, Site
 
 _MAX_OVERLOAD: Final = 2.0  # over the best number of frames in reach; half or double of it costs a tag less than 8 %

@@ -16,9 +16,9 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
+from skyless.core.arrays import Array, Mask, Matrix, Vector
+from skyless.core.clock_filter import ClockNoise, clock_noise
 from skyless.core.constants import TICK_S
-from skyless.core.kernels.arrays import Array, Mask, Matrix, Vector
-from skyless.core.kernels.filter import ClockNoise, clock_noise
 from skyless.core.protocol1.schedule import first_slots, schedule_of
 from skyless.core.protocol1.snapshots import SnapshotMethod, bracketed_covariance, literal_covariance
 from skyless.core.site import Site

@@ -15,17 +15,17 @@ from msgspec.structs import replace
 from skyless.core.air import codec
 from skyless.core.air.frame import MAX_FRAME_BYTES
 from skyless.core.air.ieee802154 import air_time_s
+from skyless.core.arrays import Integers, Mask, Matrix, Vector
+from skyless.core.clock_filter import clock_noise, predict, stamp_variance_m2, update
 from skyless.core.constants import TICK_S
 from skyless.core.geometry import anchor_positions, anchors_in_reach
-from skyless.core.kernels.arrays import Integers, Mask, Matrix, Vector
-from skyless.core.kernels.compiled import jitted, kernel
-from skyless.core.kernels.filter import clock_noise, predict, stamp_variance_m2, update
 from skyless.core.protocol1 import codec as protocol1_codec
 from skyless.core.protocol1.anchor import MAX_OFFSET_STD_M
 from skyless.core.protocol1.schedule import first_slots, schedule_of
 from skyless.core.protocols import beacon_period_s
 from skyless.core.site import Site
 from skyless.site.channel import ChannelModel, pack_walls
+from skyless.site.kernels.compiled import jitted, kernel
 from skyless.site.planning.links import MIN_SYNC, anchor_links, link_budget, links, masters_by_links
 
 _STEADY_CHANGE: Final = 1e-7

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from msgspec import UNSET, Struct
 
+from skyless.core.arrays import Integers, Matrix, Vector
 from skyless.core.errors import ConfigurationError
 from skyless.core.geometry import OUTSIDE_M, Box, anchor_positions, area, distance_outside, inside, outline_of
-from skyless.core.kernels.arrays import Integers, Matrix, Vector
 from skyless.core.site import Site
 from skyless.site.file.advice import anchors_needed
 from skyless.site.file.check import image_size

@@ -9,9 +9,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from msgspec import Struct
 
+from skyless.core.arrays import Array, Integers, Matrix, Vector
 from skyless.core.dop import dops_at
-from skyless.core.kernels.arrays import Array, Integers, Matrix, Vector
-from skyless.core.kernels.compiled import kernel, threaded_kernel
 from skyless.site.channel import (
     FREE_SPACE_LOSS_1_M_DB,
     ChannelModel,
@@ -19,6 +18,7 @@ from skyless.site.channel import (
     delivery_probability,
     received_power_dbm,
 )
+from skyless.site.kernels.compiled import kernel, threaded_kernel
 
 PLAN_COLUMNS: Final = (
     "anchors",  # number in view

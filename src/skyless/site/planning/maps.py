@@ -12,9 +12,9 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
+from skyless.core.arrays import Array, Integers, Mask, Matrix, Vector
 from skyless.core.earth import geodetic
 from skyless.core.geometry import inside
-from skyless.core.kernels.arrays import Array, Integers, Mask, Matrix, Vector
 from skyless.core.site import GeoreferenceSite
 from skyless.site.planning.floor import Floor
 from skyless.site.planning.links import (

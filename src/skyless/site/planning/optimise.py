@@ -16,11 +16,11 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.kernels.arrays import Integers, Matrix, Vector
-from skyless.core.kernels.compiled import kernel, threaded_kernel
-from skyless.core.kernels.linear_algebra import factorise, invert
+from skyless.core.arrays import Integers, Matrix, Vector
 from skyless.core.site import AnchorSite, Site
 from skyless.site.channel import pack_walls
+from skyless.site.kernels.compiled import kernel, threaded_kernel
+from skyless.site.kernels.linear_algebra import factorise, invert
 from skyless.site.planning.anchor_clocks import stamp_variances
 from skyless.site.planning.floor import Floor, Mounts, sample_points
 from skyless.site.planning.links import FIX_SHARE, SIGMA, link_budget, links, masters_by_links

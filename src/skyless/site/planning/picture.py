@@ -13,8 +13,8 @@ from matplotlib.text import Annotation, Text
 from matplotlib.transforms import Bbox
 from msgspec import Struct
 
+from skyless.core.arrays import Array
 from skyless.core.geometry import Box, anchor_positions
-from skyless.core.kernels.arrays import Array
 from skyless.core.site import Site
 from skyless.site.planning.colours import COLOUR_STOPS, round_values, scale_of
 from skyless.site.planning.floor import Floor, floor_plan_box

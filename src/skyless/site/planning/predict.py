@@ -11,8 +11,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.air.local_almanac import filter_pages_of
+from skyless.core.arrays import Matrix
 from skyless.core.geometry import anchor_positions
-from skyless.core.kernels.arrays import Matrix
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS
 from skyless.core.protocol1.snapshots import SnapshotMethod
 from skyless.core.protocols import superframe_s

@@ -13,9 +13,8 @@ from msgspec import Struct
 
 from skyless.core.air.frame import MAX_FRAME_BYTES
 from skyless.core.air.ieee802154 import air_time_s
+from skyless.core.arrays import Array, Integers, Matrix, Vector
 from skyless.core.geometry import anchor_positions
-from skyless.core.kernels.arrays import Array, Integers, Matrix, Vector
-from skyless.core.kernels.compiled import threaded_kernel
 from skyless.core.protocols import beacon_period_s
 from skyless.core.site import Site
 from skyless.site.channel import (
@@ -27,6 +26,7 @@ from skyless.site.channel import (
     received_power_dbm,
 )
 from skyless.site.file.advice import warnings_of
+from skyless.site.kernels.compiled import threaded_kernel
 from skyless.site.planning.floor import Floor
 from skyless.site.planning.links import IN_VIEW, range_of
 from skyless.site.planning.maps import Grid, grid_of

@@ -6,8 +6,8 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
+from skyless.core.arrays import Array, Mask
 from skyless.core.fix import NoFixReason
-from skyless.core.kernels.arrays import Array, Mask
 from skyless.core.method_names import FILTERS
 from skyless.core.protocol1.snapshots import literal_covariance
 from skyless.core.protocols import superframe_s

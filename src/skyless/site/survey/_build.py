@@ -6,8 +6,8 @@ from typing import Final
 import numpy as np
 from msgspec import Struct, structs
 
+from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.errors import SkylessError
-from skyless.core.kernels.arrays import Array, Integers, Mask
 from skyless.site.survey.facts import Facts, PairRange, PairRanges, Point, Tape
 from skyless.site.survey.fit.problem import Problem
 from skyless.site.survey.result import anchors_named

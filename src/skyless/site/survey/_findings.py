@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from skyless.core.kernels.arrays import Array, Mask
+from skyless.core.arrays import Array, Mask
 from skyless.site.survey._build import Measured, levels, with_free_delays
 from skyless.site.survey._frame import Framed
 from skyless.site.survey._shape import Fitted, redundancy, surveyed_problem

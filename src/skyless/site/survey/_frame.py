@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.kernels.arrays import Array, Integers, Mask
+from skyless.core.arrays import Array, Integers, Mask
 from skyless.site.survey._build import Measured, as_array, levels
 from skyless.site.survey.facts import Gauge
 from skyless.site.survey.fit.problem import distances_m

@@ -7,7 +7,7 @@ import numpy as np
 from msgspec import Struct, structs
 from scipy.special import chdtri
 
-from skyless.core.kernels.arrays import Array, Integers, Mask
+from skyless.core.arrays import Array, Integers, Mask
 from skyless.site.survey._build import Measured, as_array, build_problem, levels, own_variance_m2, with_free_delays
 from skyless.site.survey._frame import Motion, align, fitting_points
 from skyless.site.survey.facts import PairRange

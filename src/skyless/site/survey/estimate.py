@@ -11,7 +11,7 @@ from typing import Final, Literal
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.kernels.arrays import Array, Integers, Mask, Vector
+from skyless.core.arrays import Array, Integers, Mask, Vector
 from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
 from skyless.site.survey.stamps.repeats import STD_OVER_MAD
 

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from msgspec import structs
 
-from skyless.core.kernels.arrays import Array, Integers, Mask
+from skyless.core.arrays import Array, Integers, Mask
 from skyless.site.survey._build import (
     Measured,
     as_array,

@@ -17,7 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.special import chdtri
 
-from skyless.core.kernels.arrays import Array, Integers, Mask, Vector
+from skyless.core.arrays import Array, Integers, Mask, Vector
 from skyless.site.survey.facts import TagReceived
 from skyless.site.survey.fit.problem import Problem, Solution, distances_m, solve_least_squares, unknown_columns
 from skyless.site.survey.fit.robust import LATE_CUTOFF

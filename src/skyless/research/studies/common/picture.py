@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from msgspec import Struct
 
-from skyless.core.kernels.arrays import Array
+from skyless.core.arrays import Array
 from skyless.research.studies.common.plan import Row
 from skyless.site.report.figures import BLUE, GREEN, GRID, INK, MUTED, ORANGE, RED, report_style
 

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module
-from skyless.core.kernels.processors import cores
+from skyless.core.processors import cores
 from skyless.research.studies.common.plan import Cell
 
 _POLL_S: Final = 0.2

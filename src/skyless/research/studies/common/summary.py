@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from scipy.stats import chi2
 from scipy.stats import t as student
 
-from skyless.core.kernels.arrays import Array
+from skyless.core.arrays import Array
 from skyless.research.studies.common.plan import Cell, Limit, Plan, Row
 from skyless.research.studies.common.worlds import Run, RunResult, run_world
 from skyless.research.uncertainty.bounds import Biases

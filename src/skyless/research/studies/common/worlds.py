@@ -18,9 +18,9 @@ from scipy.stats import chi2
 from skyless.core.air.frame import Malformed
 from skyless.core.air.reception import Reception
 from skyless.core.any_receiver import AnyReceiver
+from skyless.core.arrays import Array
 from skyless.core.fix import Fix
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.kernels.arrays import Array
 from skyless.core.protocol1.codec import decode_cached, encode
 from skyless.core.site import AnchorSite, Site
 from skyless.research.studies.common.plan import Plan, seed_of

@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Struct, structs
 from scipy.sparse.csgraph import connected_components
 
-from skyless.core.kernels.arrays import Array, Integers, Mask
+from skyless.core.arrays import Array, Integers, Mask
 from skyless.site.survey.fit.problem import (
     Problem,
     adjacency,

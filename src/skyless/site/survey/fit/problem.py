@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.kernels.arrays import Array, Integers, Mask
+from skyless.core.arrays import Array, Integers, Mask
 
 _MIN_STD_M: Final = 1e-5  # of priors, so that facts without error do not make the equations singular
 _MAX_STEPS: Final = 60

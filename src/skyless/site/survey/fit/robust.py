@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import astuple, replace
 
-from skyless.core.kernels.arrays import Array, Integers, Mask
+from skyless.core.arrays import Array, Integers, Mask
 from skyless.site.survey.fit.determined import aligned_covariance
 from skyless.site.survey.fit.problem import (
     Problem,

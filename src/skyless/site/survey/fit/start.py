@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from skyless.core.kernels.arrays import Array, Integers, Mask
+from skyless.core.arrays import Array, Integers, Mask
 from skyless.site.survey.fit.problem import Problem, superimposed
 
 _PERTURBED: Final = 6

@@ -13,8 +13,8 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import astuple, replace
 
+from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.constants import TICK_BITS, TICK_M, TICK_RATE_HZ
-from skyless.core.kernels.arrays import Array, Integers, Mask
 from skyless.core.ticks import Unwrapper
 from skyless.site.survey.facts import PairBlock, PairRange, PairRanges
 from skyless.site.survey.stamps.repeats import STD_OVER_MAD, earliest_cluster

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from skyless.core.kernels.arrays import Array, Mask
+from skyless.core.arrays import Array, Mask
 from skyless.site.survey.facts import PairRange, PairRanges
 
 STD_OVER_MAD: Final = 1.4826

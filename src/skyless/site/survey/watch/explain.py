@@ -17,7 +17,7 @@ import numpy as np
 from msgspec import Struct
 from scipy.special import chdtri
 
-from skyless.core.kernels.arrays import Array, Integers, Mask
+from skyless.core.arrays import Array, Integers, Mask
 
 # Findings
 

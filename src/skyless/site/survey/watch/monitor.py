@@ -10,7 +10,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 from scipy.special import chdtri
 
-from skyless.core.kernels.arrays import Array, Integers, Mask
+from skyless.core.arrays import Array, Integers, Mask
 from skyless.site.survey.facts import PairBlock
 from skyless.site.survey.stamps.repeats import STD_OVER_MAD
 from skyless.site.survey.watch.explain import (

@@ -13,7 +13,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 from scipy.special import ndtri
 
-from skyless.core.kernels.arrays import Array
+from skyless.core.arrays import Array
 from skyless.site.survey.facts import Facts, PairRange, PairRanges
 from skyless.site.survey.result import Survey
 from skyless.site.survey.stamps.pair_ranger import PairRanger, StepTable

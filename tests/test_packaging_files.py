@@ -1,6 +1,5 @@
-"""What is packaged or compiled ahead runs commands that exist: compose.yaml, its image, units of systemd."""
+"""What is packaged runs commands that exist: compose.yaml, its image, units of systemd."""
 
-import json
 import re
 import shlex
 import shutil
@@ -10,13 +9,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from skyless.cli import warm
 from skyless.cli.main import program
 from skyless.run.mqtt.access import Role
 
 pytestmark = pytest.mark.site
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text(encoding="utf-8"))
 UNITS = sorted((ROOT / "packaging" / "systemd").glob("*.service"))
 DOCKERFILE = (ROOT / "packaging" / "Dockerfile").read_text(encoding="utf-8")
@@ -32,12 +30,6 @@ def commands():
         )
         line = re.sub(r"\$\{\w*LIMIT\w*}", "1000", re.sub(r"%i", "1", line))
         yield pytest.param(shlex.split(line), id=unit.name)
-    for name, lines in warm.RUNS.items():
-        yield from (pytest.param(shlex.split(line), id=f"warm {name}: {line}") for line in lines)
-    yield pytest.param(json.loads(re.findall(r"^CMD (.*)$", DOCKERFILE, re.MULTILINE)[0]), id="image")
-    yield pytest.param(
-        shlex.split(re.findall(r"^RUN skyless (.*?) *\\?$", DOCKERFILE, re.MULTILINE)[0]), id="image, built"
-    )
 
 
 @pytest.mark.parametrize("words", list(commands()))
@@ -72,7 +64,7 @@ def test_each_program_gets_the_password_of_its_role_and_no_other():
             r"skyless\.env\n(?:#.*\n)?EnvironmentFile=-/etc/skyless/access/(\w+)\.env$", text, re.M
         )
         assert len(re.findall("access/", text)) == len(found[program])
-    assert found == {"broker": [], "warm": []} | {program: [role] for program, role in ROLES.items()}
+    assert found == {"broker": []} | {program: [role] for program, role in ROLES.items()}
 
 
 def test_the_image_runs_as_a_user_without_rights_and_holds_only_what_is_copied():
@@ -107,13 +99,12 @@ def settings(unit):
 
 
 def test_no_unit_can_read_what_belongs_to_another():
-    """A user each, who is made; seeds lie with the anchors' and code that others run with the compiler's."""
+    """A user each, who is made; seeds lie with the anchors'."""
     users = {}
     for unit in UNITS:
         found, name = settings(unit), unit.name.removesuffix(".service").removesuffix("@")
         assert found["User"] == found["Group"] == found["StateDirectory"] == [name]
         assert found["WorkingDirectory"] == [f"/var/lib/{name}"]
-        assert ("CacheDirectory" in found) == (name == "skyless-warm")
         users[name] = {group for line in found.get("SupplementaryGroups", ()) for group in line.split()}
     assert len(users) == len(UNITS)
     made = (ROOT / "packaging" / "systemd" / "skyless.sysusers.conf").read_text(encoding="utf-8")

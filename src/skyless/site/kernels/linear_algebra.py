@@ -5,8 +5,8 @@ For the few unknowns of a position these beat LAPACK's call overhead, and they r
 
 import math
 
-from skyless.core.kernels.arrays import Array
-from skyless.core.kernels.compiled import kernel
+from skyless.core.arrays import Array
+from skyless.site.kernels.compiled import kernel
 
 SINGULAR_PIVOT = 1e-12
 """A pivot below this part of its diagonal element is rounding noise: the matrix is singular."""

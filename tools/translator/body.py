@@ -1,213 +1,44 @@
-"""Translate functions over records (``skyless.core.native.records``) from Python to C, with the same bits.
-
-What it takes: functions whose parameters and result have types; numbers, records, and their arrays of fixed length.
-
-    types        int (32 bits), Ticks and Count (64 bits), Byte, bool, float (C's ``real``), records (by reference),
-                 ``Array[Record]``, ``Reals``, ``Integers``, ``Bytes``, ``Annotated[Matrix, N, M]``;
-                 as a result also ``tuple`` of numbers
-    statements   assignments, also several at once, with an operator or with a type; ``if``, ``while``,
-                 ``for … in range(…)``, ``break``, ``continue``, ``return``, ``pass``, calls
-    expressions  arithmetic, comparisons, ``in (A, B)``, ``and``, ``or``, ``not``, ``x if c else y``, attributes,
-                 subscripts, calls of other such functions and of ``abs``, ``min``, ``max``, ``int``, ``float``,
-                 ``sqrt``; constants of modules; ``Record()`` as the value of a new variable
-
-All else is refused with file, line and reason. ``//`` and ``%`` round down as in Python; ``min`` and ``max`` give the
-first of equals; a bound of a range is looked up once. A variable keeps the type of its first value; what is an element
-of an array or a field of a record, and no number, is a reference, as in Python. Whole numbers are assumed to fit, and
-divisors not to be zero. Docstrings and comments come along.
-
-``make_core.py`` makes the files of ``skyless.core.native`` with it.
-"""
+"""Statements and expressions of a function."""
 
 import ast
 import inspect
-import io
 import math
-import sys
-import textwrap
-import tokenize
 from collections.abc import Callable, Iterator, Sequence
-from ctypes import Array, c_bool, c_double, c_int32, c_int64, c_uint8
-from pathlib import Path
-from types import FunctionType, ModuleType
-from typing import Any, Final, NamedTuple, get_args, get_origin, get_type_hints
+from types import FunctionType
+from typing import Any, Final, get_type_hints
 
 from skyless.core.native import arithmetic
-from skyless.core.native.records import Record, c_type
-
-WIDTH: Final = 120
-INDENT: Final = "    "
-RESERVED: Final = frozenset(
-    "exp log hypot floor sqrt index remove auto case char const default do double enum extern float goto inline int "
-    "long register restrict short signed sizeof static struct switch typedef union unsigned void volatile real".split()
+from skyless.core.native.records import Record
+from translator.scopes import Scopes, assigned
+from translator.sources import INDENT, c_name, comment, doc_of, source_of, wrapped
+from translator.types import (
+    BOOL,
+    BYTE,
+    INT,
+    LONG,
+    NEW,
+    REAL,
+    Elements,
+    Number,
+    Results,
+    Struct,
+    Type,
+    Value,
+    as_operand,
+    common,
+    converted,
+    declared,
+    literal,
+    parameter_type,
+    type_of,
 )
-"""Names that mean something else in C; an underscore is appended."""
+
+BUILTINS: Final[dict[str, Any]] = {"abs": abs, "min": min, "max": max, "int": int, "float": float, "bool": bool}
+SUFFIX: Final = {REAL: "real", LONG: "64", INT: "32", BYTE: "32", BOOL: "32"}
 
 
-class Refused(Exception):
+class RefusedError(Exception):
     """A place that cannot be translated."""
-
-
-# Types
-
-
-class Number(NamedTuple):
-    """A type of numbers, by its name in C."""
-
-    name: str
-
-
-BOOL, INT, LONG, BYTE, REAL = (Number(name) for name in ("bool", "int32_t", "int64_t", "uint8_t", "real"))
-OF_CTYPE: Final = {c_bool: BOOL, c_int32: INT, c_int64: LONG, c_uint8: BYTE, c_double: REAL}
-
-
-class Struct(NamedTuple):
-    """A record."""
-
-    made: type[Record]
-
-
-class Elements(NamedTuple):
-    """An array; where it is a parameter, its length is not known."""
-
-    element: "Type"
-    length: int
-
-
-class Results(NamedTuple):
-    """Several numbers that a function returns."""
-
-    function: str
-    items: tuple[Number, ...]
-
-
-Type = Number | Struct | Elements | Results
-
-
-def type_of(ctype: Any) -> Type:  # noqa: ANN401 - ctypes have no common type
-    """The type of a ctype."""
-    if ctype in OF_CTYPE:
-        return OF_CTYPE[ctype]
-    if issubclass(ctype, Array):
-        return Elements(type_of(ctype._type_), ctype._length_)
-    return Struct(ctype)
-
-
-def declared(kind: Type, name: str) -> str:
-    """The declaration of a variable or parameter; arrays and records are references."""
-    if isinstance(kind, Number):
-        return f"{kind.name} {name}"
-    if isinstance(kind, Results):
-        return f"{kind.function}_results {name}"
-    if isinstance(kind, Struct):
-        return f"{kind.made.__name__} *{name}"
-    lengths, element = "", kind.element
-    while isinstance(element, Elements):
-        lengths, element = f"{lengths}[{element.length}]", element.element
-    base = element.name if isinstance(element, Number) else element.made.__name__  # type: ignore[union-attr]
-    return f"{base} (*{name}){lengths}" if lengths else f"{base} *{name}"
-
-
-def parameter_type(hint: Any) -> Type:  # noqa: ANN401
-    """The type of an annotation of a parameter or result."""
-    if get_origin(hint) is tuple:
-        return Results("", tuple(type_of(c_type(item)) for item in get_args(hint)))  # type: ignore[arg-type]
-    origin = get_origin(hint)
-    if origin is not None and origin.__name__ in {"Array", "Sequence"}:
-        return Elements(parameter_type(get_args(hint)[0]), 0)
-    return type_of(c_type(hint))
-
-
-# Values
-
-
-class Value(NamedTuple):
-    """An expression in C."""
-
-    code: str
-    kind: Type
-    rank: int = 20
-    """How closely its operator binds, as in C; 20 where there is none."""
-    is_pointer: bool = True
-    """Of a record: whether it is a reference, and not the record itself."""
-
-
-def as_operand(value: Value, rank: int) -> str:
-    """Its code where an operator of a rank stands beside it."""
-    return value.code if value.rank >= rank else f"({value.code})"
-
-
-def converted(value: Value, kind: Type) -> Value:
-    """The value as a number of a type."""
-    if value.kind == kind or kind != REAL:
-        return value
-    return Value(f"(real){as_operand(value, 15)}", REAL, 15)
-
-
-# Modules
-
-
-class Source(NamedTuple):
-    """A module's text, taken apart."""
-
-    module: ModuleType
-    nodes: dict[str, ast.FunctionDef | ast.ClassDef]
-    docs: dict[str, str]
-    """Of constants."""
-    comments: dict[int, tuple[bool, str]]
-    """By line: whether it stands alone, and its text."""
-
-
-def source_of(module: ModuleType, known: dict[str, Source] = {}) -> Source:  # noqa: B006 - a cache
-    """The text of a module."""
-    if module.__name__ not in known:
-        text = inspect.getsource(module)
-        body = ast.parse(text).body
-        nodes = {node.name: node for node in body if isinstance(node, ast.FunctionDef | ast.ClassDef)}
-        docs, comments = {}, {}
-        for node, behind in zip(body, body[1:], strict=False):
-            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and (doc := doc_of(behind)):
-                docs[node.target.id] = doc
-        for token in tokenize.generate_tokens(io.StringIO(text).readline):
-            if token.type == tokenize.COMMENT and "noqa" not in token.string:
-                comments[token.start[0]] = (not token.line[: token.start[1]].strip(), token.string[1:].strip())
-        known[module.__name__] = Source(module, nodes, docs, comments)
-    return known[module.__name__]
-
-
-def doc_of(node: ast.stmt) -> str:
-    """The text of a statement that is nothing but a text."""
-    is_text = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
-    return inspect.cleandoc(node.value.value) if is_text else ""  # type: ignore[union-attr,arg-type]
-
-
-def c_name(name: str) -> str:
-    """A name as C has it."""
-    name = name.lstrip("_")
-    return f"{name}_" if name in RESERVED else name
-
-
-def comment(text: str, indent: str = "") -> list[str]:
-    """A comment of one or more lines."""
-    if "\n" not in text and len(indent) + len(text) + 6 <= WIDTH:
-        return [f"{indent}/* {text} */"]
-    lines = [f"{indent} * {line}".rstrip() for line in text.split("\n")]
-    lines[0] = f"{indent}/* {text.split(chr(10))[0]}"
-    return [*lines[:-1], f"{lines[-1]} */"] if len(lines) > 1 else [f"{lines[0]} */"]
-
-
-def wrapped(line: str) -> list[str]:
-    """A line of code in lines that are short enough."""
-    if len(line) <= WIDTH or "/*" in line:
-        return [line]
-    indent = line[: len(line) - len(line.lstrip())]
-    return textwrap.wrap(
-        line, WIDTH, initial_indent="", subsequent_indent=indent + 2 * INDENT, break_long_words=False,
-        break_on_hyphens=False, drop_whitespace=True,
-    )  # fmt: skip
-
-
-# A function
 
 
 class Translator:
@@ -228,7 +59,7 @@ class Translator:
         name = c_name(function.__name__)
         known = self.functions.setdefault(name, function)
         if known is not function:
-            raise Refused(f"two functions are called {name}: in {known.__module__} and {function.__module__}")
+            raise RefusedError(f"two functions are called {name}: in {known.__module__} and {function.__module__}")
         if name not in self.bodies:
             self.bodies[name] = []
             self.bodies[name] = Body(self, function).lines
@@ -285,17 +116,17 @@ class Body:
         node = self.source.nodes[function.__name__]
         statements = node.body[1:] if doc_of(node.body[0]) else node.body
         self.scopes = Scopes(statements, [name for name, _ in parameters])
-        self.variables = {c_name(one.id) for one in _flat(list(_uses(statements))) if isinstance(one.ctx, ast.Store)}
+        self.variables = {c_name(name) for name in assigned(statements)}
         self.last_line = statements[0].lineno - 1
         self.temporaries = 0
         self.hoisted: list[str] = []
         body = list(self.block(statements, INDENT))
         self.lines = [*(f"{INDENT}{one}" for one in self.hoisted), *body]
 
-    def refuse(self, node: ast.AST, reason: str) -> Refused:
+    def refuse(self, node: ast.AST, reason: str) -> RefusedError:
         """The error for a place."""
         line = getattr(node, "lineno", 0)
-        return Refused(f"{self.source.module.__file__}:{line}: {reason}: {ast.unparse(node)[:80]}")
+        return RefusedError(f"{self.source.module.__file__}:{line}: {reason}: {ast.unparse(node)[:80]}")
 
     # Statements
 
@@ -316,7 +147,7 @@ class Body:
                 lines[0] = f"{lines[0]}  /* {' '.join(texts)} */"
             yield from lines
 
-    def statement(self, node: ast.stmt, indent: str) -> Iterator[str]:  # noqa: PLR0912 - one for each kind
+    def statement(self, node: ast.stmt, indent: str) -> Iterator[str]:
         """The lines of a statement."""
         match node:
             case ast.Assign():
@@ -411,9 +242,10 @@ class Body:
             listed = ", ".join(item.code for item in items)
             yield f"{indent}return ({self.returned.function}_results){{{listed}}};"
         else:
-            found = self.value(value)
-            assert self.returned is not None
-            yield f"{indent}return {self.reference(found) if isinstance(found.kind, Struct) else converted(found, self.returned).code};"
+            found, kind = self.value(value), self.returned
+            assert kind is not None
+            code = self.reference(found) if isinstance(found.kind, Struct) else converted(found, kind).code
+            yield f"{indent}return {code};"
 
     def assign(self, node: ast.Assign, indent: str) -> Iterator[str]:
         if len(node.targets) > 1:
@@ -443,13 +275,13 @@ class Body:
                 yield from self.store(target, self.value(value), indent)
             return
         found = []
-        for value in map(self.value, values):
+        for one in map(self.value, values):
             self.temporaries += 1
             name = f"new_{self.temporaries}"
-            yield f"{indent}const {declared(value.kind, name)} = {value.code};"
-            found.append(value._replace(code=name, rank=20))
-        for target, value in zip(targets, found, strict=True):
-            yield from self.store(target, value, indent)
+            yield f"{indent}const {declared(one.kind, name)} = {one.code};"
+            found.append(one._replace(code=name, rank=20))
+        for target, one in zip(targets, found, strict=True):
+            yield from self.store(target, one, indent)
 
     def store(
         self, target: ast.expr, value: Value, indent: str, name: str = "", kind: Type | None = None
@@ -501,10 +333,11 @@ class Body:
         place = self.value(node.target)
         plain = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}.get(type(node.op))
         value = self.value(node.value)
-        if plain and isinstance(place.kind, Number) and (place.kind != INT or value.kind != LONG):
-            if place.kind == REAL or (plain != "/" and value.kind != REAL):
-                yield f"{indent}{place.code} {plain}= {converted(value, place.kind).code};"
-                return
+        is_real = REAL in (place.kind, value.kind) or plain == "/"
+        fits = isinstance(place.kind, Number) and (place.kind == REAL or not is_real)
+        if plain and fits and (place.kind != INT or value.kind != LONG):
+            yield f"{indent}{place.code} {plain}= {converted(value, place.kind).code};"
+            return
         whole = ast.BinOp(node.target, node.op, node.value)
         yield from self.store(node.target, self.value(ast.copy_location(whole, node)), indent)
 
@@ -527,7 +360,7 @@ class Body:
             raise self.refuse(node, "a condition has to be a comparison or a bool")
         return value
 
-    def value(self, node: ast.expr) -> Value:  # noqa: PLR0911 - one for each kind
+    def value(self, node: ast.expr) -> Value:  # noqa: PLR0911, PLR0912 - one for each kind
         """An expression."""
         match node:
             case ast.Constant(value=bool() as constant):
@@ -552,9 +385,8 @@ class Body:
                 kind = INT if value.kind == BYTE else value.kind
                 return Value(f"{'-' if isinstance(sign, ast.USub) else '~'}{as_operand(value, 15)}", kind, 15)
             case ast.BoolOp(op=op, values=parts):
-                sign, rank = ("&&", 5) if isinstance(op, ast.And) else ("||", 4)
-                listed = [as_operand(self.condition(part), 6) for part in parts]
-                return Value(f" {sign} ".join(listed), BOOL, rank)
+                word, rank = (" && ", 5) if isinstance(op, ast.And) else (" || ", 4)
+                return Value(word.join(as_operand(self.condition(part), 6) for part in parts), BOOL, rank)
             case ast.Compare():
                 return self.comparison(node)
             case ast.IfExp(test=test, body=body, orelse=orelse):
@@ -577,7 +409,7 @@ class Body:
         if not isinstance(of.kind, Struct):
             raise self.refuse(node, "only records have fields")
         self.all.need_record(of.kind.made)
-        ctype = dict(of.kind.made._fields_).get(field)  # type: ignore[arg-type,misc,var-annotated]
+        ctype = {one[0]: one[1] for one in of.kind.made._fields_}.get(field)
         if ctype is None:
             raise self.refuse(node, f"{of.kind.made.__name__} has no field {field}")
         return Value(f"{as_operand(of, 16)}{'->' if of.is_pointer else '.'}{c_name(field)}", type_of(ctype), 16, False)
@@ -605,10 +437,10 @@ class Body:
             return Value(f"({kind.name})(({unsigned}){as_operand(left, 15)} << {as_operand(right, 12)})", kind, 15)
         if op is ast.RShift:
             return Value(f"{as_operand(left, 20)} >> {as_operand(right, 20)}", left.kind, 11)
-        sign = {ast.BitAnd: "&", ast.BitOr: "|", ast.BitXor: "^"}.get(op)
-        if sign is None:
+        bitwise = {ast.BitAnd: "&", ast.BitOr: "|", ast.BitXor: "^"}.get(op)
+        if bitwise is None:
             raise self.refuse(node, f"{op.__name__} is not translated")
-        return Value(f"{as_operand(left, 15)} {sign} {as_operand(right, 15)}", kind, 7)
+        return Value(f"{as_operand(left, 15)} {bitwise} {as_operand(right, 15)}", kind, 7)
 
     def comparison(self, node: ast.Compare) -> Value:
         signs = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
@@ -661,7 +493,7 @@ class Body:
                 listed.append(converted(value, kind).code)
         return Value(f"{name}({', '.join(listed)})", returned or Results("void", ()))
 
-    def builtin(self, node: ast.Call, called: Any, values: list[Value]) -> Value:  # noqa: ANN401
+    def builtin(self, node: ast.Call, called: Any, values: list[Value]) -> Value:  # noqa: ANN401, PLR0911
         kinds = [value.kind for value in values]
         if not all(isinstance(kind, Number) for kind in kinds):
             raise self.refuse(node, "it is for numbers only")
@@ -687,249 +519,6 @@ class Body:
         return first if first.kind in (INT, LONG) else Value(f"(int32_t){as_operand(first, 15)}", INT, 15)
 
 
-NEW: Final = 21
-"""Rank of a new record."""
-BUILTINS: Final[dict[str, Any]] = {"abs": abs, "min": min, "max": max, "int": int, "float": float, "bool": bool}
-SUFFIX: Final = {REAL: "real", LONG: "64", INT: "32", BYTE: "32", BOOL: "32"}
-
-
 def evaluated(node: ast.expr, names: dict[str, Any]) -> Any:  # noqa: ANN401
     """What an annotation, or an expression of constants, is."""
-    return eval(ast.unparse(node), names)  # noqa: S307 - our own source
-
-
-def common(one: Number, other: Number) -> Number:
-    """The type of a result of arithmetic with two numbers."""
-    if REAL in (one, other):
-        return REAL
-    return LONG if LONG in (one, other) else INT
-
-
-def literal(number: float) -> Value:
-    """A number as C writes it."""
-    if isinstance(number, bool):
-        return Value("true" if number else "false", BOOL)
-    if isinstance(number, int):
-        kind = INT if -(2**31) <= number < 2**31 else LONG
-        code = str(number) if kind == INT else f"INT64_C({number})"
-        return Value(code, kind, 20 if number >= 0 else 15)
-    return Value(f"REAL({number!r})", REAL)
-
-
-class Scopes:
-    """Where the variables of a function are declared: in each block that assigns them before it uses them."""
-
-    def __init__(self, statements: Sequence[ast.stmt], parameters: Sequence[str]) -> None:
-        block = list(_uses(statements))
-        names = {one.id for one in _flat(block)} - set(parameters)
-        self.first: set[int] = set()
-        """Places at which variables are declared, by the identity of their nodes."""
-        self.hoisted: set[str] = set()
-        """Variables that are declared at the beginning of the function."""
-        for name in names:
-            found: set[int] = set()
-            if self._declare(name, block, found):
-                self.first |= found
-            else:
-                self.hoisted.add(name)
-
-    def _declare(self, name: str, block: list[Any], found: set[int]) -> bool:
-        """Find where a variable is declared in a block; False where it is used before it is assigned there."""
-        direct = [one for one in block if isinstance(one, ast.Name) and one.id == name]
-        inner = [one for one in block if isinstance(one, list) and any(use.id == name for use in _flat(one))]
-        if not direct:
-            return all(self._declare(name, one, found) for one in inner)
-        first = next(one for one in block if one in direct or one in inner)
-        found.add(id(first))
-        return first in direct and isinstance(first.ctx, ast.Store)
-
-
-def _uses(statements: Sequence[ast.stmt]) -> Iterator[Any]:
-    """Names in the order in which a block uses them; those of blocks in it as lists."""
-    for node in statements:
-        match node:
-            case ast.If() | ast.While():
-                yield from _names(node.test)
-                yield list(_uses(node.body))
-                yield list(_uses(node.orelse))
-            case ast.For():
-                yield from _names(node.iter)
-                yield [*_names(node.target), *_uses(node.body)]
-            case ast.AugAssign():
-                yield from _names(node.value)
-                yield from (ast.Name(name.id, ast.Load()) for name in _names(node.target))
-            case ast.Assign():
-                yield from _names(node.value)
-                for target in node.targets:
-                    yield from _names(target)
-            case ast.AnnAssign():
-                yield from _names(node.value or node.target)
-                yield from _names(node.target)
-            case _:
-                yield from _names(node)
-
-
-def _names(node: ast.AST) -> list[ast.Name]:
-    return [one for one in ast.walk(node) if isinstance(one, ast.Name)]
-
-
-def _flat(block: list[Any]) -> Iterator[ast.Name]:
-    for one in block:
-        if isinstance(one, list):
-            yield from _flat(one)
-        else:
-            yield one
-
-
-# The files
-
-
-HELPERS: Final = """\
-#ifdef SKYLESS_SOURCE_DIGEST
-SKYLESS_EXPORT extern const char *const skyless_source_digest;
-const char *const skyless_source_digest = SKYLESS_SOURCE_DIGEST;
-#endif
-
-#ifdef SKYLESS_FLOAT
-#define SQRT(x) __builtin_sqrtf(x)
-#define FABS(x) __builtin_fabsf(x)
-#else
-#define SQRT(x) __builtin_sqrt(x)
-#define FABS(x) __builtin_fabs(x)
-#endif
-
-static inline real min_real(real one, real other) { return other < one ? other : one; }
-static inline real max_real(real one, real other) { return other > one ? other : one; }
-static inline int32_t min_32(int32_t one, int32_t other) { return other < one ? other : one; }
-static inline int32_t max_32(int32_t one, int32_t other) { return other > one ? other : one; }
-static inline int64_t min_64(int64_t one, int64_t other) { return other < one ? other : one; }
-static inline int64_t max_64(int64_t one, int64_t other) { return other > one ? other : one; }
-static inline real abs_real(real x) { return FABS(x); }
-static inline int32_t abs_32(int32_t x) { return x < 0 ? -x : x; }
-static inline int64_t abs_64(int64_t x) { return x < 0 ? -x : x; }
-static inline int64_t truncated(real x) { return REAL(-9e18) < x && x < REAL(9e18) ? (int64_t)x : 0; }
-static inline int64_t floor_real(real x) { const int64_t t = truncated(x); return t - (x < (real)t && t != 0); }
-static inline int32_t floor_div_32(int32_t x, int32_t y) { return x / y - (x % y != 0 && (x < 0) != (y < 0)); }
-static inline int64_t floor_div_64(int64_t x, int64_t y) { return x / y - (x % y != 0 && (x < 0) != (y < 0)); }
-static inline int32_t floor_mod_32(int32_t x, int32_t y) { return x - y * floor_div_32(x, y); }
-static inline int64_t floor_mod_64(int64_t x, int64_t y) { return x - y * floor_div_64(x, y); }
-"""
-
-
-def translate(roots: Sequence[Callable[..., Any]], name: str) -> tuple[str, str]:
-    """The header and the source of these functions and all that they need; ``name`` is that of the header's file.
-
-    Raises:
-        Refused: something cannot be translated.
-    """
-    translator = Translator(roots)
-    functions = in_order(list(translator.functions.values()))
-    inner = [function for function in functions if function.__name__ not in translator.roots]
-    outer = [function for function in functions if function.__name__ in translator.roots]
-    modules = sorted({function.__module__ for function in functions})
-    head = [
-        "/* Made by tools/python_to_c.py from the modules below; do not edit.", "",
-        *(f"   {module}" for module in modules), "*/",
-    ]  # fmt: skip
-    records = [line for made in translator.records.values() for line in record_lines(made)]
-    header = [
-        *head, "", f"#ifndef {name.upper()}_H", f"#define {name.upper()}_H", "", "#include <stdbool.h>", "#include <stdint.h>",
-        "", "#ifdef SKYLESS_FLOAT", "typedef float real;", "#define REAL(x) x##f", "#else", "typedef double real;",
-        "#define REAL(x) x", "#endif", "", "#ifndef SKYLESS_EXPORT", '#define SKYLESS_EXPORT __attribute__((visibility("default")))',
-        "#endif", "", *constant_lines(translator.constants), "", *records,
-        *(line for function in outer for line in wrapped(f"{translator.head(function)};")), "", "#endif",
-    ]  # fmt: skip
-    source = [
-        *head, "", f'#include "{name}.h"', "", "#ifndef INTERNAL", "#define INTERNAL static", "#endif", "", *HELPERS.splitlines(), "",
-        *result_lines(translator.results),
-        *(line for function in inner for line in wrapped(f"{translator.head(function)};")),
-    ]  # fmt: skip
-    before: FunctionType | None = None
-    for function in functions:
-        source += ["", *function_lines(translator, function, before)]
-        before = function
-    return "\n".join(header) + "\n", "\n".join(source) + "\n"
-
-
-def in_order(functions: list[FunctionType]) -> list[FunctionType]:
-    """Functions in the order of their modules, those that are imported first, and of their lines."""
-    wanted, ordered = {function.__module__ for function in functions}, []
-
-    def visit(name: str) -> None:
-        if name not in ordered:
-            module = sys.modules[name]
-            for node in ast.parse(inspect.getsource(module)).body:
-                if isinstance(node, ast.ImportFrom) and node.module in wanted:
-                    visit(node.module)
-            ordered.append(name)
-
-    for name in sorted(wanted):
-        visit(name)
-    return sorted(functions, key=lambda one: (ordered.index(one.__module__), one.__code__.co_firstlineno))
-
-
-def constant_lines(constants: dict[str, tuple[Any, str]]) -> list[str]:
-    lines = []
-    for name, (constant, doc) in sorted(constants.items()):
-        value = literal(constant)
-        lines += [
-            *(comment(doc) if doc else []),
-            f"#define {name} {value.code if value.rank == 20 else f'({value.code})'}",
-        ]
-    return lines
-
-
-def result_lines(results: dict[str, Results]) -> list[str]:
-    lines = []
-    for name, found in results.items():
-        items = " ".join(f"{kind.name} item_{number};" for number, kind in enumerate(found.items))
-        lines += [f"typedef struct {{ {items} }} {name}_results;"]
-    return [*lines, ""] if lines else []
-
-
-def record_lines(made: type[Record]) -> list[str]:
-    """The structure of a record."""
-    node = source_of(sys.modules[made.__module__]).nodes[made.__name__]
-    docs = {}
-    for field, behind in zip(node.body, node.body[1:], strict=False):
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
-            docs[field.target.id] = doc_of(behind)
-    doc = doc_of(node.body[0])
-    lines = [*(comment(doc) if doc else []), f"typedef struct {made.__name__} {{"]
-    for name, ctype in made._fields_:  # type: ignore[misc]
-        kind, lengths = type_of(ctype), ""
-        while isinstance(kind, Elements):
-            kind, lengths = kind.element, f"{lengths}[{kind.length}]"
-        base = kind.name if isinstance(kind, Number) else kind.made.__name__  # type: ignore[union-attr]
-        line = f"{INDENT}{base} {c_name(name)}{lengths};"
-        text = docs.get(name, "")
-        if text and "\n" not in text and len(line) + len(text) + 8 <= WIDTH:
-            lines += [f"{line}  /* {text} */"]
-        else:
-            lines += [*(comment(text, INDENT) if text else []), line]
-    return [*lines, f"}} {made.__name__};", ""]
-
-
-def function_lines(translator: Translator, function: FunctionType, before: FunctionType | None) -> list[str]:
-    """A function with what stands before it."""
-    source = source_of(sys.modules[function.__module__])
-    node = source.nodes[function.__name__]
-    lines = []
-    if before is None or before.__module__ != function.__module__:
-        module_doc = inspect.getdoc(source.module) or ""
-        lines += [*comment(module_doc), ""]
-    begin = 0
-    if before is not None and before.__module__ == function.__module__:
-        begin = source.nodes[before.__name__].end_lineno or 0
-    headings = [source.comments[line][1] for line in range(begin + 1, node.lineno)
-                if line in source.comments and source.comments[line][0] and is_heading(source, line)]  # fmt: skip
-    if headings:
-        lines += [*comment(headings[-1]), ""]
-    doc = doc_of(node.body[0])
-    lines += comment(doc) if doc else []
-    return [*lines, *wrapped(f"{translator.head(function)} {{"), *translator.bodies[c_name(function.__name__)], "}"]
-
-
-def is_heading(source: Source, line: int) -> bool:
-    """Whether a comment stands by itself between functions."""
-    return not any(node.lineno <= line <= (node.end_lineno or 0) for node in source.nodes.values())
+    return eval(ast.unparse(node), names)
