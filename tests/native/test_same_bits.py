@@ -1,0 +1,268 @@
+"""The estimator's Python and the C that is made from it: the same bits, function by function, compiler by compiler."""
+
+import ctypes
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from core_build import NATIVE, has, input_of, library_of_all, rows_and_state, runner
+from numpy.lib.recfunctions import repack_fields
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "positioning"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+
+from estimator_builders import LAB_M, MESH, ROOM_M, begun, episode_of, kept, late, one_by_one, settings_of
+
+from make_core import EXPORTS, NAME
+from skyless.core.estimator.process import Packet, Relay
+from skyless.core.estimator.saved import packed_state
+from skyless.core.estimator.state import MAX_ANCHORS, Link, State
+from skyless.core.native.records import c_type, view
+from skyless.core.tag.descent import Descent
+from translator.body import Translator
+from translator.files import translate
+from translator.types import REAL, Elements, Number, Results, Struct, parameter_type
+
+pytestmark = pytest.mark.skipif(not has("gcc"), reason="there is no gcc")
+
+ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
+SITES = [(LAB_M, 0.0, {}), (ROOM_M, 0.0, ERRORS), (ROOM_M, None, ERRORS)]
+FUNCTIONS = Translator(EXPORTS).functions
+
+
+def test_the_files_are_what_their_source_makes():
+    header, source = translate(EXPORTS, NAME)
+    assert (NATIVE / f"{NAME}.h").read_text() == header, "run scripts/core"
+    assert (NATIVE / f"{NAME}.c").read_text() == source, "run scripts/core"
+
+
+@pytest.fixture(scope="module")
+def everything(tmp_path_factory):
+    return library_of_all(tmp_path_factory.mktemp("all"), "gcc", "-O3")
+
+
+def disturbed(episode, seed):
+    """Some packets are lost and some late; one anchor's are late from some time on."""
+    draw, frames = np.random.default_rng(seed), np.arange(len(episode.packets.anchors))
+    late_m = np.where(draw.random(len(frames)) < 0.05, draw.exponential(1.0, len(frames)), 0.0)
+    late_m[(episode.packets.anchors == 2) & (frames > 60)] += 0.5
+    return kept(late(episode.packets, late_m), draw.random(len(frames)) > 0.1)
+
+
+@pytest.fixture(scope="module")
+def states():
+    """States in the middle of things: two and three dimensions, exact and not, with and without a jump."""
+    found = []
+    for seed, (anchors_m, height_m, errors) in enumerate(
+        [(LAB_M, 0.0, {}), (ROOM_M, 0.0, ERRORS), (ROOM_M, None, ERRORS)]
+    ):
+        episode = episode_of(MESH, 16, seed + 1, anchors_m)
+        estimator = begun(episode, settings_of(height_m=height_m, stationary_s=0.5, **errors), anchors_m, std_m=0.05)
+        for packet in one_by_one(disturbed(episode, seed)):
+            estimator.process(*packet)
+        found.append(estimator.state)
+    return found
+
+
+def drawn_number(name, s, draw, anchor):
+    """A number that a parameter of this name may have; where it is an anchor, not another's."""
+    ahead = s.status.epoch_ticks + int(draw.integers(1, 10**9))
+    where = {
+        "rx_ticks": ahead,
+        "tx_ticks": s.anchors[anchor].tx_ticks + int(draw.integers(1, 10**9)),
+        "packet_rx_ticks": ahead - 10**9,
+        "impulses_ticks": s.status.epoch_ticks,
+        "now": ahead,
+        "superframe": 10**9,
+        "subticks": int(draw.integers(0, 2**48)),
+        "kind": int(draw.integers(3)),
+        "axes": s.dim,
+        "state": int(draw.integers(s.n)),
+        "value": anchor + s.dim,
+        "index": int(draw.integers(s.layout.end)),
+        "count": min(s.count, 5),
+        "vectors": 1,
+        "faults": 3 * s.count,
+        "end": 20,
+        "begin": 0,
+        "dim": s.dim,
+        "range_errors": int(draw.integers(3)),
+        "identifier": 77,
+        "master": (anchor + 1) % s.count,
+        "other": (anchor + 2) % s.count,
+        "sender": (anchor + 1) % s.count,
+        "b": (anchor + 1) % s.count,
+        "row": 3,
+    }
+    return where.get(name, anchor)
+
+
+REALS = {"dt": 0.02, "elapsed_s": 0.1, "age_s": 0.05, "ratio": 0.7, "sign": 1.0, "kept": 0.9}
+
+
+def arguments(function, s, draw):
+    """What a function is called with; the state is the first."""
+    found, anchor = [], int(draw.integers(s.count))
+    for name, hint in hints(function).items():
+        kind = parameter_type(hint)
+        if kind == Struct(State):
+            found.append(s)
+        elif isinstance(kind, Struct):
+            found.append(drawn_record(kind.made, s, draw))
+        elif kind == REAL:
+            found.append(REALS.get(name, abs(float(draw.normal())) + 1e-3))
+        elif isinstance(kind, Number):
+            found.append(bool(draw.integers(2)) if kind.name == "bool" else drawn_number(name, s, draw, anchor))
+        else:
+            found.append((ctypes.c_double * 64)(*draw.normal(size=64)) if kind.element == REAL else None)
+    return found
+
+
+def drawn_record(made, s, draw):
+    one = made()
+    if made is Packet:
+        anchor = int(draw.integers(s.count))
+        a = s.anchors[anchor]
+        one.place.anchor, one.place.std_m = a.identifier, -1.0
+        view(one.place.position_m)[:] = view(a.position_m)
+        one.sequence, one.variance_factor, one.master = 7, 1.5, s.anchors[0].identifier
+        one.rx_ticks, one.tx_ticks = (
+            s.status.epoch_ticks + 10**8,
+            a.tx_ticks + s.status.epoch_ticks + 10**8 - a.rx_ticks,
+        )
+        one.subticks, one.report_variance_m2 = 12345, 1e-3
+    elif made is Descent:
+        return drawn_descent(draw)
+    elif made in (Relay, Link):
+        one.rx_ticks = 1
+    return one
+
+
+def drawn_descent(draw):
+    count = 6
+    d = Descent(kind=0, anchors=count, dims=3)
+    positions = draw.uniform(-5.0, 5.0, (count, 3))
+    positions -= positions[0]
+    tag = draw.uniform(-3.0, 3.0, 3)
+    ranges = np.linalg.norm(positions - tag, axis=1)
+    view(d.positions_m)[:count], view(d.tdoa_m)[: count - 1] = (
+        positions,
+        ranges[1:] - ranges[0] + 0.05 * draw.normal(size=5),
+    )
+    view(d.whitener)[: count - 1, : count - 1] = np.linalg.cholesky(np.linalg.inv(np.eye(5) + 1.0)).T.T
+    view(d.scale)[:], view(d.state)[:] = 5.0, tag + draw.normal(size=3)
+    return d
+
+
+def hints(function):
+    found = inspect.get_annotations(function, eval_str=True)
+    return {name: hint for name, hint in found.items() if name != "return"}
+
+
+def bits(value):
+    if isinstance(value, State):
+        return packed_state(value) + repack_fields(view(value.levels)).tobytes() + view(value.ph).tobytes()
+    if isinstance(value, ctypes.Structure | ctypes.Array):
+        array = view(value)
+        return (repack_fields(array) if array.dtype.names else array).tobytes()
+    return value
+
+
+SKIPPED = {"track", "find_steady_state", "process_superframe", "process_known"}
+"""Their arguments are tables; the runs below, and the tests of planning and bounds, cover them."""
+ARRAYS = {"assemble", "linearise"}
+POINTED = ctypes.Structure | ctypes.Array
+
+
+@pytest.mark.parametrize("name", sorted(FUNCTIONS.keys() - SKIPPED - ARRAYS))
+def test_a_function_gives_the_same_bits(everything, states, name):
+    function = FUNCTIONS[name]
+    called = everything[f"skyless_{name}" if function in EXPORTS else name]
+    returned = inspect.get_annotations(function, eval_str=True)["return"]
+    kind = None if returned is None else parameter_type(returned)
+    if isinstance(kind, Results):
+        items = [(f"item_{k}", ctypes.c_double) for k in range(len(kind.items))]
+        called.restype = type("Results", (ctypes.Structure,), {"_fields_": items})
+    elif isinstance(kind, Struct):
+        called.restype = ctypes.c_void_p
+    else:
+        called.restype = None if kind is None else c_type(returned)
+    called.argtypes = [
+        ctypes.c_void_p if isinstance(parameter_type(hint), Elements | Struct) else c_type(hint)
+        for hint in hints(function).values()
+    ]
+    for seed, state in enumerate(states * 4):
+        ours = arguments(function, State.from_buffer_copy(state), np.random.default_rng(seed))
+        theirs = arguments(function, State.from_buffer_copy(state), np.random.default_rng(seed))
+        expected = function(*ours)
+        found = called(
+            *(ctypes.byref(one) if isinstance(one, ctypes.Structure | ctypes.Array) else one for one in theirs)
+        )
+        assert [bits(one) for one in ours] == [bits(one) for one in theirs]
+        if isinstance(kind, Results):
+            found = tuple(getattr(found, name) for name, _ in items)
+        if not isinstance(kind, Struct):
+            assert np.array_equal(np.array(expected, float), np.array(found, float), equal_nan=True)
+
+
+# Other compilers and processors
+
+
+@pytest.fixture(scope="module")
+def episode():
+    packets = disturbed(episode_of(MESH, 60, 5, ROOM_M), 9)
+    estimator = begun(episode_of(MESH, 60, 5, ROOM_M), settings_of(height_m=None, **ERRORS), ROOM_M, std_m=0.1)
+    given = input_of(estimator, packets, ROOM_M)
+    rows = estimator.track(packets, has_levels=True)
+    return given, rows, estimator.state
+
+
+TARGETS = {
+    "gcc -O2": ("gcc", "-O2"),
+    "gcc -O3 native": ("gcc", "-O3", "-march=native"),
+    "clang -O3": ("clang", "-O3"),
+    "aarch64": ("aarch64-linux-gnu-gcc", "-O3", "-static"),
+}
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_all_compilers_and_processors_give_the_same_bits(target, episode, tmp_path):
+    compiler, *flags = TARGETS[target]
+    emulator = ("qemu-aarch64",) if compiler.startswith("aarch64") else ()
+    if not has(compiler, *emulator):
+        pytest.skip(f"{' or '.join((compiler, *emulator))} is not here")
+    given, rows, state = episode
+    done = subprocess.run(
+        runner(tmp_path, compiler, *flags, emulator=emulator), input=given, capture_output=True, check=True
+    )
+    found, theirs = rows_and_state(done.stdout, len(rows))
+    assert bits(state) == bits(theirs)
+    for name in rows.dtype.names:
+        assert np.array_equal(rows[name], found[name])
+
+
+def test_records_are_as_large_as_in_c(tmp_path):
+    made = Translator(EXPORTS).records.values()
+    lines = "".join(f'printf("%zu\\n", sizeof({one.__name__}));' for one in made)
+    (tmp_path / "sizes.c").write_text(
+        f'#include <stdio.h>\n#include "skyless_core.h"\nint main(void) {{ {lines} return 0; }}'
+    )
+    subprocess.run(["gcc", f"-I{NATIVE}", tmp_path / "sizes.c", "-o", tmp_path / "sizes"], check=True)
+    found = subprocess.run([tmp_path / "sizes"], capture_output=True, check=True).stdout.split()
+    assert [int(size) for size in found] == [ctypes.sizeof(one) for one in made]
+
+
+def test_there_is_room_for_all_anchors_and_no_more(states):
+    s = State.from_buffer_copy(states[2])
+    draw = np.random.default_rng(1)
+    place = FUNCTIONS["present"]
+    packet = drawn_record(Packet, s, draw)
+    for anchor in range(100, 100 + MAX_ANCHORS):
+        packet.place.anchor = anchor
+        index = place(s, packet.place)
+        assert (index >= 0) == (s.count <= MAX_ANCHORS and index < MAX_ANCHORS and index >= 0)
+    assert s.count == MAX_ANCHORS
+    assert place(s, packet.place) == -1
