@@ -190,7 +190,7 @@ def switched(changes: dict[str, float]) -> Iterator[None]:
         module, _, attribute = place.rpartition(":")
         if module:
             name, _, field = attribute.partition(".")
-            new[name] = structs.replace(getattr(import_module(module), name), **{field: value}) if field else value
+            new[name] = getattr(import_module(module), name).changed(**{field: value}) if field else value
     modules = [module for name, module in sys.modules.items() if name.startswith("skyless.")]
     undo = [(module, name, vars(module)[name]) for module in modules for name in new if name in vars(module)]
     for module, name, _ in undo:

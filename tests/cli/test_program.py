@@ -72,7 +72,7 @@ def test_every_command_has_help_with_an_example():
     ("arguments", "said"),
     [
         (["sit"], 'Did you mean "site"?'),
-        (["sit"], "Available commands: demo, simulate, warm, site, "),
+        (["sit"], "Available commands: demo, simulate, site, "),
         (["site", "check", "--jso"], "Did you mean --json?"),
         (["site", "check"], "requires an argument"),
         (["site", "new", "x.toml", "--width", "wide", "--depth", "3"], "--width"),

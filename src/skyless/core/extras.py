@@ -14,6 +14,7 @@ EXTRA_OF: Final = {
     "gpiod": "pi",
     "matplotlib": "site",
     "mcap": "site",
+    "numba": "site",
     "pandas": "pandas",
     "rosbags": "ros2",
     "scipy": "site",
