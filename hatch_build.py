@@ -23,9 +23,9 @@ class CoreBuildHook(BuildHookInterface):  # type: ignore[type-arg]
         """Compile, and name the platform that the wheel is for."""
         if self.target_name != "wheel":
             return
-        library = build(Path(self.root) / NATIVE)
+        libraries = build(Path(self.root) / NATIVE)
         asked = os.environ.get("SKYLESS_TARGET")
         platform = TARGETS[asked][1] if asked else sysconfig.get_platform().replace("-", "_").replace(".", "_")
         build_data["pure_python"] = False
         build_data["tag"] = f"py3-none-{platform}"
-        build_data["artifacts"].append(f"/{library.relative_to(self.root)}")
+        build_data["artifacts"] += [f"/{library.relative_to(self.root)}" for library in libraries]

@@ -8,6 +8,7 @@ another machine (x86_64-linux or aarch64-linux), for which ``ziglang`` compiles.
 
 import hashlib
 import os
+import platform
 import shlex
 import shutil
 import subprocess
@@ -32,26 +33,35 @@ def compiler() -> list[str]:
     return next(([name] for name in ("cc", "gcc", "clang") if shutil.which(name)), [])
 
 
-def build(native: Path) -> Path:
-    """Compile the library in a folder; where it stands.
+def build(native: Path) -> list[Path]:
+    """Compile the libraries in a folder; where they stand. On x86-64 there is one more, for wider vectors.
 
     Raises:
         SystemExit: the compiler failed.
     """
-    source, library = native / "skyless_core.c", native / "libskyless_core.so"
+    machine = os.environ.get("SKYLESS_TARGET", platform.machine())
+    made = [compiled(native, "libskyless_core.so", [])]
+    if machine.startswith(("x86_64", "AMD64")):
+        made.append(compiled(native, "libskyless_core_avx2.so", ["-march=x86-64-v3"]))
+    return made
+
+
+def compiled(native: Path, name: str, flags: list[str]) -> Path:
+    """Compile one library."""
+    source, library = native / "skyless_core.c", native / name
     digest = hashlib.sha256(source.read_bytes() + source.with_suffix(".h").read_bytes()).hexdigest()[:16]
     target = os.environ.get("SKYLESS_TARGET")
     zig = [sys.executable, "-m", "ziglang", "cc", *(["-target", TARGETS[target][0]] if target else [])]
-    made = library.with_suffix(f".{os.getpid()}")
-    command = [*(compiler() or zig), *FLAGS, f'-DSKYLESS_SOURCE_DIGEST="{digest}"', str(source), "-o", str(made)]
+    new, given = library.with_suffix(f".{os.getpid()}"), f'-DSKYLESS_SOURCE_DIGEST="{digest}"'
+    command = [*(compiler() or zig), *FLAGS, *flags, given, str(source), "-o", str(new)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     except OSError as error:
         raise SystemExit(f"skyless: {command[0]} cannot be run: {error}; CC names another C compiler") from None
     if done.returncode:
-        made.unlink(missing_ok=True)
+        new.unlink(missing_ok=True)
         raise SystemExit(f"skyless: {shlex.join(command)} failed:\n{done.stderr}CC names another C compiler")
-    made.replace(library)
+    new.replace(library)
     return library
 
 

@@ -19,7 +19,10 @@ Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 UNCOMPILED_VARIABLE: Final = "SKYLESS_UNCOMPILED"
-LIBRARY: Final = Path(__file__).with_name("libskyless_core.so")
+LIBRARIES: Final = tuple(Path(__file__).with_name(f"libskyless_core{variant}.so") for variant in ("_avx2", ""))
+"""The first is for x86-64 processors with vectors of 256 bits; both give the same bits."""
+_AVX2: Final = frozenset({"avx2", "bmi1", "bmi2", "f16c", "fma", "movbe"})
+"""What Linux calls the instructions of x86-64-v3."""
 SOURCE: Final = Path(__file__).with_name("skyless_core.c")
 
 
@@ -36,14 +39,23 @@ def library() -> ctypes.CDLL:
         SkylessError: it is not there, or was not made from the source beside it.
     """
     again = "install Skyless again (in a checkout: scripts/core)"
+    file = next((one for one in LIBRARIES[:1] if one.exists() and _has_avx2()), LIBRARIES[-1])
     try:
-        found = ctypes.CDLL(str(LIBRARY))
+        found = ctypes.CDLL(str(file))
     except OSError as error:
-        raise SkylessError(f"{LIBRARY}: {error}; {again}") from None
+        raise SkylessError(f"{file}: {error}; {again}") from None
     digest = ctypes.c_char_p.in_dll(found, "skyless_source_digest").value
     if SOURCE.exists() and digest != source_digest(SOURCE).encode():
-        raise SkylessError(f"{LIBRARY} was made from another {SOURCE.name} than the one beside it; {again}")
+        raise SkylessError(f"{file} was made from another {SOURCE.name} than the one beside it; {again}")
     return found
+
+
+def _has_avx2() -> bool:
+    """Whether this processor has vectors of 256 bits; where that is not known, it counts as without."""
+    try:
+        return _AVX2 <= set(Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").split())
+    except OSError:
+        return False
 
 
 def source_digest(source: Path) -> str:
