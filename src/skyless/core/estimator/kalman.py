@@ -30,9 +30,9 @@ def predict(s: State, rx_ticks: Ticks) -> None:
         motion *= s.tuning.stationary_noise_share
     for axis in range(s.dim):
         _add_noise(s, axis, axis, dt, 0.0, motion)
-        unknown = s.V[FAULT_KINDS * s.count + axis]  # an acceleration that the filter does not know of
-        unknown[axis] -= 0.5 * dt * dt
-        unknown[where.velocity + axis] -= dt
+        unknown = FAULT_KINDS * s.count + axis  # an acceleration that the filter does not know of
+        s.V[axis][unknown] -= 0.5 * dt * dt
+        s.V[where.velocity + axis][unknown] -= dt
     for anchor in range(s.count):
         offset = where.offset + anchor
         _add_noise(s, offset, offset, dt, settings.white, settings.walk * s.anchors[anchor].walk_scale)
@@ -52,7 +52,10 @@ def _advance(s: State, dt: float) -> None:
     values = s.layout.velocity
     for value in range(values):
         s.x[value] += dt * s.x[values + value]
-    for state in range(s.n):
+        effects, of_rate = s.V[value], s.V[values + value]
+        for fault in range(s.rows):
+            effects[fault] += dt * of_rate[fault]
+    for state in range(s.used):
         row = s.P[state]
         for value in range(values):
             row[value] += dt * row[values + value]
@@ -63,10 +66,6 @@ def _advance(s: State, dt: float) -> None:
     for value in range(values):
         for other in range(value):
             s.P[value][other] = s.P[other][value]
-    for fault in range(s.rows):
-        row = s.V[fault]
-        for value in range(values):
-            row[value] += dt * row[values + value]
 
 
 def _add_noise(s: State, value: int, other: int, dt: float, white: float, walk: float) -> None:
@@ -127,11 +126,11 @@ def _decay(s: State, state: int, kept: float, variance: float) -> None:
     row = s.P[state]
     for other in range(s.n):
         row[other] *= kept
-    for other in range(s.n):
+    for other in range(s.used):
         s.P[other][state] = row[other]
     row[state] = kept * row[state] + (1.0 - kept * kept) * variance
     for fault in range(s.rows):
-        s.V[fault][state] *= kept
+        s.V[state][fault] *= kept
 
 
 def reset_state(s: State, state: int, variance: float) -> None:
@@ -142,7 +141,7 @@ def reset_state(s: State, state: int, variance: float) -> None:
         s.P[other][state] = 0.0
     s.P[state][state] = variance
     for fault in range(s.rows):
-        s.V[fault][state] = 0.0
+        s.V[state][fault] = 0.0
 
 
 # Measurement update
@@ -170,16 +169,14 @@ def update(s: State, innovation: float, innovation_variance: float, gain_scale: 
     K = gain_scale·P·h/S. A scale of 1 is the Kalman gain; a measurement whose variance counts more has the S that
     follows, and 1. P changes by −u·uᵀ with u = P·h/√S, which is symmetric to the bit.
     """
-    root = sqrt(innovation_variance)
-    step = gain_scale * innovation / root
+    inverse = 1.0 / sqrt(innovation_variance)
     for state in range(s.n):
-        s.ph[state] /= root
-    for state in range(s.n):
-        s.x[state] += s.ph[state] * step
-        factor, row = s.ph[state], s.P[state]
+        s.ph[state] *= inverse
+    step = gain_scale * inverse
+    for state in range(s.used):
+        u, row, effects = s.ph[state], s.P[state], s.V[state]
+        s.x[state] += u * step * innovation
         for other in range(s.n):
-            row[other] -= factor * s.ph[other]
-    for fault in range(s.rows):
-        gain, row = gain_scale * s.fault_input[fault] / root, s.V[fault]
-        for state in range(s.n):
-            row[state] += gain * s.ph[state]
+            row[other] -= u * s.ph[other]
+        for fault in range(s.rows):
+            effects[fault] += u * step * s.fault_input[fault]

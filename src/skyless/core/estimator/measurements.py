@@ -252,7 +252,7 @@ def first_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> 
         s.P[offset][state] = -s.ph[state]
     s.P[offset][offset] = variance
     for fault in range(s.rows):
-        s.V[fault][offset] = s.fault_input[fault]
+        s.V[offset][fault] = s.fault_input[fault]
     a.offset_ticks = rx_ticks - tx_ticks - floor(range_m / TICK_M)
     rest_m = (rx_ticks - tx_ticks - a.offset_ticks) * TICK_M
     s.x[offset] = rest_m - range_m - curvature_m - _h_dot_x(s, _direction_terms(s))

@@ -150,9 +150,9 @@ def _add_fix(s: State, share: float, found: SteadyState) -> None:
     found.fixes += share
     for axis in range(s.dim):
         found.variance_m2[axis] += share * s.P[axis][axis]
-        found.square_bias_m2 += share * square(s.V[_walls(s)][axis])
+        found.square_bias_m2 += share * square(s.V[axis][_walls(s)])
         for row in range(_walls(s) + 1, s.rows):
-            found.motion_m2[axis] += share * square(s.V[row][axis])
+            found.motion_m2[axis] += share * square(s.V[axis][row])
 
 
 def _predict_with_impulses(s: State, now: Ticks, impulses_ticks: Ticks, superframe: Ticks) -> None:
@@ -163,9 +163,9 @@ def _predict_with_impulses(s: State, now: Ticks, impulses_ticks: Ticks, superfra
         moment = impulses_ticks + floor((impulse + 0.5) / IMPULSES * superframe + 0.5)
         if before < moment <= now:
             for axis in range(s.dim):
-                row = s.V[_walls(s) + 1 + s.dim * impulse + axis]
-                row[axis] = (now - moment) * TICK_S
-                row[s.layout.velocity + axis] = 1.0
+                row = _walls(s) + 1 + s.dim * impulse + axis
+                s.V[axis][row] = (now - moment) * TICK_S
+                s.V[s.layout.velocity + axis][row] = 1.0
 
 
 def _receive(s: State, message: PlannedMessage, rx_ticks: Ticks) -> None:
@@ -173,7 +173,7 @@ def _receive(s: State, message: PlannedMessage, rx_ticks: Ticks) -> None:
     a, where = s.anchors[message.anchor], s.layout
     if a.packets == 0:
         first_reception(s, message.anchor, rx_ticks, rx_ticks)
-        s.V[_walls(s)][where.offset + message.anchor] += message.late_m
+        s.V[where.offset + message.anchor][_walls(s)] += message.late_m
     else:
         relax_range_error(s, message.anchor, (rx_ticks - a.rx_ticks) * TICK_S, 0.0)
         reset_state(s, where.tx_noise + message.anchor, s.settings.tx_variance_m2 / message.share)

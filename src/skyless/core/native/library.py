@@ -53,7 +53,7 @@ def library() -> ctypes.CDLL:
 def _has_avx2() -> bool:
     """Whether this processor has vectors of 256 bits; where that is not known, it counts as without."""
     try:
-        return _AVX2 <= set(Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").split())
+        return set(Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").split()) >= _AVX2
     except OSError:
         return False
 

@@ -299,6 +299,7 @@ INTERNAL void make_uncertain(State *s, int32_t range_errors) {
     } else if (s->status.range_errors == ALL_RANGE_ERRORS) {
         end = s->layout.end;
     }
+    s->used = end;
     s->n = floor_div_32(end + LANES - 1, LANES) * LANES;
 }
 
@@ -427,16 +428,19 @@ INTERNAL void insert_state(State *s, int32_t index_) {
         for (int32_t other = 0; other < end; other++) {
             s->P[state][other] = s->P[state - 1][other];
         }
+        for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
+            s->V[state][row] = s->V[state - 1][row];
+        }
     }
     s->x[index_] = REAL(0.0);
     for (int32_t other = 0; other < end; other++) {
         s->P[index_][other] = REAL(0.0);
     }
+    for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
+        s->V[index_][row] = REAL(0.0);
+    }
     for (int32_t state = 0; state < end + 1; state++) {
         insert(s->P[state], index_, end);
-    }
-    for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
-        insert(s->V[row], index_, end);
     }
     s->layout.end = end + 1;
 }
@@ -449,30 +453,27 @@ INTERNAL void remove_state(State *s, int32_t index_) {
         for (int32_t other = 0; other < end; other++) {
             s->P[state][other] = s->P[state + 1][other];
         }
+        for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
+            s->V[state][row] = s->V[state + 1][row];
+        }
     }
     s->x[end - 1] = REAL(0.0);
     for (int32_t other = 0; other < end; other++) {
         s->P[end - 1][other] = REAL(0.0);
     }
+    for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
+        s->V[end - 1][row] = REAL(0.0);
+    }
     for (int32_t state = 0; state < end; state++) {
         remove_(s->P[state], index_, end);
-    }
-    for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
-        remove_(s->V[row], index_, end);
     }
     s->layout.end = end - 1;
 }
 
 /* Move all faults from an index on one place back; the one that is there then is zero. */
 INTERNAL void insert_fault(State *s, int32_t index_, int32_t faults) {
-    int32_t end = s->layout.end;
-    for (int32_t row = s->rows; row > index_; row--) {
-        for (int32_t state = 0; state < end; state++) {
-            s->V[row][state] = s->V[row - 1][state];
-        }
-    }
-    for (int32_t state = 0; state < end; state++) {
-        s->V[index_][state] = REAL(0.0);
+    for (int32_t state = 0, state_end = s->layout.end; state < state_end; state++) {
+        insert(s->V[state], index_, s->rows);
     }
     s->rows += 1;
     for (int32_t row = faults; row > index_; row--) {
@@ -491,14 +492,8 @@ INTERNAL void insert_fault(State *s, int32_t index_, int32_t faults) {
 
 /* Move all faults behind an index one place forward. */
 INTERNAL void remove_fault(State *s, int32_t index_, int32_t faults) {
-    int32_t end = s->layout.end;
-    for (int32_t row = index_, row_end = s->rows - 1; row < row_end; row++) {
-        for (int32_t state = 0; state < end; state++) {
-            s->V[row][state] = s->V[row + 1][state];
-        }
-    }
-    for (int32_t state = 0; state < end; state++) {
-        s->V[s->rows - 1][state] = REAL(0.0);
+    for (int32_t state = 0, state_end = s->layout.end; state < state_end; state++) {
+        remove_(s->V[state], index_, s->rows);
     }
     s->rows -= 1;
     for (int32_t row = index_; row < faults - 1; row++) {
@@ -560,9 +555,9 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
     }
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
         add_noise(s, axis, axis, dt, REAL(0.0), motion);
-        real *unknown = s->V[FAULT_KINDS * s->count + axis];  /* an acceleration that the filter does not know of */
-        unknown[axis] -= REAL(0.5) * dt * dt;
-        unknown[where->velocity + axis] -= dt;
+        int32_t unknown = FAULT_KINDS * s->count + axis;  /* an acceleration that the filter does not know of */
+        s->V[axis][unknown] -= REAL(0.5) * dt * dt;
+        s->V[where->velocity + axis][unknown] -= dt;
     }
     for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
         int32_t offset = where->offset + anchor;
@@ -586,8 +581,13 @@ INTERNAL void advance(State *s, real dt) {
     int32_t values = s->layout.velocity;
     for (int32_t value = 0; value < values; value++) {
         s->x[value] += dt * s->x[values + value];
+        real *effects = s->V[value];
+        real *of_rate = s->V[values + value];
+        for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+            effects[fault] += dt * of_rate[fault];
+        }
     }
-    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+    for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
         real *row = s->P[state];
         for (int32_t value = 0; value < values; value++) {
             row[value] += dt * row[values + value];
@@ -603,12 +603,6 @@ INTERNAL void advance(State *s, real dt) {
     for (int32_t value = 0; value < values; value++) {
         for (int32_t other = 0; other < value; other++) {
             s->P[value][other] = s->P[other][value];
-        }
-    }
-    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-        real *row = s->V[fault];
-        for (int32_t value = 0; value < values; value++) {
-            row[value] += dt * row[values + value];
         }
     }
 }
@@ -684,12 +678,12 @@ INTERNAL void decay(State *s, int32_t state, real kept, real variance) {
     for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
         row[other] *= kept;
     }
-    for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
+    for (int32_t other = 0, other_end = s->used; other < other_end; other++) {
         s->P[other][state] = row[other];
     }
     row[state] = kept * row[state] + (REAL(1.0) - kept * kept) * variance;
     for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-        s->V[fault][state] *= kept;
+        s->V[state][fault] *= kept;
     }
 }
 
@@ -702,7 +696,7 @@ INTERNAL void reset_state(State *s, int32_t state, real variance) {
     }
     s->P[state][state] = variance;
     for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-        s->V[fault][state] = REAL(0.0);
+        s->V[state][fault] = REAL(0.0);
     }
 }
 
@@ -736,24 +730,21 @@ INTERNAL real compute_ph(State *s) {
  * K = gain_scale·P·h/S. A scale of 1 is the Kalman gain; a measurement whose variance counts more has the S that
  * follows, and 1. P changes by −u·uᵀ with u = P·h/√S, which is symmetric to the bit. */
 INTERNAL void update(State *s, real innovation, real innovation_variance, real gain_scale) {
-    real root = SQRT(innovation_variance);
-    real step = gain_scale * innovation / root;
+    real inverse = REAL(1.0) / SQRT(innovation_variance);
     for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-        s->ph[state] /= root;
+        s->ph[state] *= inverse;
     }
-    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-        s->x[state] += s->ph[state] * step;
-        real factor = s->ph[state];
+    real step = gain_scale * inverse;
+    for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
+        real u = s->ph[state];
         real *row = s->P[state];
+        real *effects = s->V[state];
+        s->x[state] += u * step * innovation;
         for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
-            row[other] -= factor * s->ph[other];
+            row[other] -= u * s->ph[other];
         }
-    }
-    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-        real gain = gain_scale * s->fault_input[fault] / root;
-        real *row = s->V[fault];
-        for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-            row[state] += gain * s->ph[state];
+        for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+            effects[fault] += u * step * s->fault_input[fault];
         }
     }
 }
@@ -776,11 +767,14 @@ INTERNAL void update(State *s, real innovation, real innovation_variance, real g
 /* Compute s = [own reception] − h·V; ``own`` is the anchor that the tag has received, or −1. */
 INTERNAL void compute_fault_input(State *s, int32_t own) {
     for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-        real total = REAL(0.0);
-        for (int32_t term = 0, term_end = s->terms; term < term_end; term++) {
-            total -= s->h[term] * s->V[fault][s->h_index[term]];
+        s->fault_input[fault] = REAL(0.0);
+    }
+    for (int32_t term = 0, term_end = s->terms; term < term_end; term++) {
+        real weight = s->h[term];
+        real *effects = s->V[s->h_index[term]];
+        for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+            s->fault_input[fault] -= weight * effects[fault];
         }
-        s->fault_input[fault] = total;
     }
     if (own >= 0) {
         for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
@@ -796,14 +790,14 @@ INTERNAL void subtract_fault_input(State *s, int32_t anchor) {
     }
 }
 
-/* What an innovation shows of the anchors' faults: y ← y + s·ν/S and M ← M + s·sᵀ/S. */
+/* What an innovation shows of the anchors' faults: y ← y + s·ν/S and M ← M + s·sᵀ/S, of which the lower half. */
 INTERNAL void gather_evidence(State *s, real innovation, real innovation_variance) {
-    int32_t faults = FAULT_KINDS * s->count;
-    for (int32_t one = 0; one < faults; one++) {
-        real weight = s->fault_input[one] / innovation_variance;
+    real inverse = REAL(1.0) / innovation_variance;
+    for (int32_t one = 0, one_end = FAULT_KINDS * s->count; one < one_end; one++) {
+        real weight = inverse * s->fault_input[one];
         real *row = s->information[one];
         s->evidence[one] += weight * innovation;
-        for (int32_t other = 0; other < faults; other++) {
+        for (int32_t other = 0; other < one + 1; other++) {
             row[other] += weight * s->fault_input[other];
         }
     }
@@ -824,16 +818,18 @@ INTERNAL void fade_faults(State *s) {
         int32_t end = (kind + 1) * count;
         real kept = kind == RECENT ? REAL(1.0) - REAL(1.0) / tuning->recent_packets : exp_(-elapsed_s /
                 tuning->creeping_s);
+        for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
+            for (int32_t fault = begin; fault < end; fault++) {
+                s->V[state][fault] *= kept;
+            }
+        }
         for (int32_t fault = begin; fault < end; fault++) {
             s->evidence[fault] *= kept;
-            for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-                s->V[fault][state] *= kept;
-            }
-            for (int32_t other = 0; other < FAULT_KINDS * count; other++) {
+            for (int32_t other = 0; other < fault + 1; other++) {
                 s->information[fault][other] *= kept;
-                if (!(begin <= other && other < end)) {
-                    s->information[other][fault] *= kept;
-                }
+            }
+            for (int32_t other = end; other < FAULT_KINDS * count; other++) {
+                s->information[other][fault] *= kept;
             }
         }
     }
@@ -870,13 +866,13 @@ INTERNAL real fault_chi2(State *s, int32_t kind, int32_t axes) {
     int32_t count = s->count;
     int32_t begin = kind * s->count;
     for (int32_t one = 0; one < count; one++) {
-        for (int32_t other = 0; other < count; other++) {
+        for (int32_t other = 0; other < one + 1; other++) {
             s->work[one][other] = s->information[begin + one][begin + other];
         }
         s->work[one][one] += REAL(1.0) / square(s->status.fault_std_m[kind]);
         s->work[count][one] = s->evidence[begin + one];
         for (int32_t axis = 0; axis < axes; axis++) {
-            s->work[count + 1 + axis][one] = s->V[begin + one][axis];
+            s->work[count + 1 + axis][one] = s->V[axis][begin + one];
         }
     }
     whiten(s, count, 1 + axes);
@@ -887,7 +883,9 @@ INTERNAL real fault_chi2(State *s, int32_t kind, int32_t axes) {
     return total;
 }
 
-/* How much of the test of all lasting faults one anchor or two explain; for one, both arguments are the same. */
+/* How much of the test of all lasting faults one anchor or two explain.
+ *
+ * ``other`` is not above ``one``, and the same for one anchor. */
 INTERNAL real explained_chi2(State *s, int32_t one, int32_t other) {
     real weight = REAL(1.0) / square(s->tuning.late_std_m);
     real y_one = s->evidence[one];
@@ -950,21 +948,22 @@ INTERNAL void open_faults(State *s) {
  * as long as enough anchors are left. */
 INTERNAL void open_new_faults(State *s, int32_t kind) {
     int32_t spare = s->count - s->dim - 1;
+    real *explained = s->work[0];
     for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
         spare -= (int32_t)s->anchors[anchor].is_obstructed;
-        s->ph[anchor] = explained_alone(s, kind, anchor);
+        explained[anchor] = explained_alone(s, kind, anchor);
     }
     real limit = largest(s, kind) - s->tuning.rival_chi2;
     int32_t first = 0;
     while (spare > 0 && first >= 0) {
         first = -1;
         for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
-            if (s->ph[anchor] > limit && (first < 0 || s->ph[anchor] > s->ph[first])) {
+            if (explained[anchor] > limit && (first < 0 || explained[anchor] > explained[first])) {
                 first = anchor;
             }
         }
         if (first >= 0) {
-            s->ph[first] = REAL(0.0);
+            explained[first] = REAL(0.0);
             spare -= 1;
             open_fault(s, kind, first);
             begin_obstruction(s, first);
@@ -1043,43 +1042,39 @@ INTERNAL void open_fault(State *s, int32_t kind, int32_t anchor) {
     bool is_lasting = kind == LASTING;
     int32_t chosen = kind * s->count + anchor;
     int32_t faults = FAULT_KINDS * s->count;
-    real *shared = s->fault_input;
     make_uncertain(s, is_lasting ? ALL_RANGE_ERRORS : CHANGING_RANGE_ERRORS);
     real gain = REAL(1.0) / (s->information[chosen][chosen] + REAL(1.0) / square(s->tuning.late_std_m));
     real fault_m = gain * s->evidence[chosen];
     real variance = is_lasting ? gain : gain + fault_m * fault_m;
-    real *opened = s->V[chosen];  /* what it adds to each state: 1 − V for the range error, −V for all others */
+    real *opened = s->ph;  /* what it adds to each state: 1 − V for the range error, −V for all others */
+    real *shared = s->fault_input;
     for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-        opened[state] = -opened[state];
+        opened[state] = -s->V[state][chosen];
     }
     opened[(is_lasting ? s->layout.constant : s->layout.change) + anchor] += REAL(1.0);
-    for (int32_t one = 0, one_end = s->n; one < one_end; one++) {
+    for (int32_t one = 0; one < faults; one++) {
+        shared[one] = gain * s->information[max_32(one, chosen)][min_32(one, chosen)];
+    }
+    shared[chosen] = REAL(0.0);
+    for (int32_t one = 0, one_end = s->used; one < one_end; one++) {
         s->x[one] += opened[one] * fault_m;
         for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
             s->P[one][other] += opened[one] * opened[other] * variance;
         }
-    }
-    for (int32_t one = 0; one < faults; one++) {
-        shared[one] = s->information[one][chosen];
-    }
-    shared[chosen] = REAL(0.0);
-    for (int32_t one = 0; one < faults; one++) {
-        real share = gain * shared[one];
-        s->evidence[one] -= share * s->evidence[chosen];
-        for (int32_t other = 0; other < faults; other++) {
-            s->information[one][other] -= share * shared[other];
+        for (int32_t fault = 0; fault < faults; fault++) {
+            s->V[one][fault] += shared[fault] * opened[one];
         }
-        for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-            s->V[one][state] += share * opened[state];
+        s->V[one][chosen] = REAL(0.0);
+    }
+    for (int32_t one = 0; one < faults; one++) {
+        s->evidence[one] -= shared[one] * s->evidence[chosen];
+        for (int32_t other = 0; other < one + 1; other++) {
+            s->information[one][other] -= shared[one] * shared[other] / gain;
         }
     }
     s->evidence[chosen] = REAL(0.0);
     for (int32_t one = 0; one < faults; one++) {
-        s->information[one][chosen] = REAL(0.0);
-        s->information[chosen][one] = REAL(0.0);
-    }
-    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-        opened[state] = REAL(0.0);
+        s->information[max_32(one, chosen)][min_32(one, chosen)] = REAL(0.0);
     }
     s->status.faults_opened += 1;
 }
@@ -1411,9 +1406,9 @@ INTERNAL void protect(State *s) {
     real squared = REAL(0.0);
     real up = REAL(0.0);
     for (int32_t row = FAULT_KINDS * s->count, row_end = FAULT_KINDS * s->count + s->dim; row < row_end; row++) {
-        squared += square(s->V[row][0]) + square(s->V[row][1]);
+        squared += square(s->V[0][row]) + square(s->V[1][row]);
         if (s->dim == 3) {
-            up += square(s->V[row][2]);
+            up += square(s->V[2][row]);
         }
     }
     levels[HPL] += settings->max_acceleration_mps2 * SQRT(squared);
@@ -1885,7 +1880,7 @@ INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_
     }
     s->P[offset][offset] = variance;
     for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-        s->V[fault][offset] = s->fault_input[fault];
+        s->V[offset][fault] = s->fault_input[fault];
     }
     a->offset_ticks = rx_ticks - tx_ticks - floor_real(range_m / TICK_M);
     real rest_m = (real)(rx_ticks - tx_ticks - a->offset_ticks) * TICK_M;
@@ -2618,9 +2613,9 @@ INTERNAL void add_fix(State *s, real share, SteadyState *found) {
     found->fixes += share;
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
         found->variance_m2[axis] += share * s->P[axis][axis];
-        found->square_bias_m2 += share * square(s->V[walls(s)][axis]);
+        found->square_bias_m2 += share * square(s->V[axis][walls(s)]);
         for (int32_t row = walls(s) + 1, row_end = s->rows; row < row_end; row++) {
-            found->motion_m2[axis] += share * square(s->V[row][axis]);
+            found->motion_m2[axis] += share * square(s->V[axis][row]);
         }
     }
 }
@@ -2634,9 +2629,9 @@ INTERNAL void predict_with_impulses(State *s, int64_t now, int64_t impulses_tick
                 REAL(0.5));
         if (before < moment && moment <= now) {
             for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
-                real *row = s->V[walls(s) + 1 + s->dim * impulse + axis];
-                row[axis] = (real)(now - moment) * TICK_S;
-                row[s->layout.velocity + axis] = REAL(1.0);
+                int32_t row = walls(s) + 1 + s->dim * impulse + axis;
+                s->V[axis][row] = (real)(now - moment) * TICK_S;
+                s->V[s->layout.velocity + axis][row] = REAL(1.0);
             }
         }
     }
@@ -2648,7 +2643,7 @@ INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks) {
     Layout *where = &s->layout;
     if (a->packets == 0) {
         first_reception(s, message->anchor, rx_ticks, rx_ticks);
-        s->V[walls(s)][where->offset + message->anchor] += message->late_m;
+        s->V[where->offset + message->anchor][walls(s)] += message->late_m;
     } else {
         relax_range_error(s, message->anchor, (real)(rx_ticks - a->rx_ticks) * TICK_S, REAL(0.0));
         reset_state(s, where->tx_noise + message->anchor, s->settings.tx_variance_m2 / message->share);

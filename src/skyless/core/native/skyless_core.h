@@ -53,8 +53,8 @@ typedef double real;
 #define HPL 0
 #define IMPULSES 4
 #define JOINED 2
-/* Numbers in the longest vectors of processors. */
-#define LANES 8
+/* Numbers in a vector of 256 bits. */
+#define LANES 4
 #define LASTING 0
 #define LEVELS 5
 /* The leading bits of ln 2: products with small whole numbers are exact. */
@@ -414,25 +414,25 @@ typedef struct Link {
     bool contradicts;  /* Whether its range contradicts the survey. */
 } Link;
 
-/* Everything that the estimator keeps of one tag. */
+/* Everything that the estimator keeps of one tag. What loops run over stands first: its rows fill cache lines. */
 typedef struct State {
+    real x[264];
+    real P[264][264];  /* Symmetric to the bit. */
+    /* What faults do to x: of each kind for each metre by which receptions of an anchor are late, then for each m/s² of
+     * acceleration along an axis, then what planning adds. */
+    real V[264][112];
     EstimatorSettings settings;
     Tuning tuning;
     real horizontal_k;  /* How many standard deviations the risk of levels allows. */
     real vertical_k;
     int32_t dim;  /* Dimensions of the position: 2 where the height is given, else 3. */
     int32_t count;  /* Anchors in the state. */
-    /* States that are not known to be exact, up to a multiple of ``LANES``; covariances with all others are zero. */
-    int32_t n;
-    int32_t rows;  /* Rows of V in use. */
+    int32_t used;  /* States that are not known to be exact; covariances with all others are zero. */
+    int32_t n;  /* The same up to a multiple of ``LANES``: what loops along rows of P go to. */
+    int32_t rows;  /* Columns of V in use. */
     Layout layout;
     Status status;
-    real x[264];
-    real P[264][264];  /* Symmetric to the bit. */
-    /* What faults do to x: of each kind for each metre by which receptions of an anchor are late, then for each m/s² of
-     * acceleration along an axis, then what planning adds. */
-    real V[112][264];
-    real information[96][96];  /* Information of the innovations on all faults. */
+    real information[96][96];  /* Information of the innovations on all faults; the lower half. */
     real evidence[96];  /* What innovations show of them. */
     Anchor anchors[32];
     KeptPacket packets[32][16];
