@@ -31,36 +31,13 @@ from skyless.core.native.arithmetic import exp, sqrt, square
 MAX_FAULTS: Final = 2  # largest number of anchors that are selected
 
 
-# What innovations show
-
-
-def compute_fault_input(s: State, own: int) -> None:
-    """Compute s = [own reception] − h·V; ``own`` is the anchor that the tag has received, or −1."""
-    for fault in range(s.rows):
-        s.fault_input[fault] = 0.0
-    for term in range(s.terms):
-        weight, effects = s.h[term], s.V[s.h_index[term]]
-        for fault in range(s.rows):
-            s.fault_input[fault] -= weight * effects[fault]
-    if own >= 0:
-        for kind in range(FAULT_KINDS):
-            s.fault_input[kind * s.count + own] += 1.0
+# What innovations show (gathered by ``kalman.update_later``)
 
 
 def subtract_fault_input(s: State, anchor: int) -> None:
     """Subtract the reception of the first anchor of a difference: its faults count with the opposite sign."""
     for kind in range(FAULT_KINDS):
-        s.fault_input[kind * s.count + anchor] -= 1.0
-
-
-def gather_evidence(s: State, innovation: float, innovation_variance: float) -> None:
-    """What an innovation shows of the anchors' faults: y ← y + s·ν/S and M ← M + s·sᵀ/S, of which the lower half."""
-    inverse = 1.0 / innovation_variance
-    for one in range(FAULT_KINDS * s.count):
-        weight, row = inverse * s.fault_input[one], s.information[one]
-        s.evidence[one] += weight * innovation
-        for other in range(one + 1):
-            row[other] += weight * s.fault_input[other]
+        s.G[s.waiting][kind * s.count + anchor] -= 1.0
 
 
 def fade_faults(s: State) -> None:
@@ -252,7 +229,7 @@ def _open_fault(s: State, kind: int, anchor: int) -> None:
     gain = 1.0 / (s.information[chosen][chosen] + 1.0 / square(s.tuning.late_std_m))
     fault_m = gain * s.evidence[chosen]
     variance = gain if is_lasting else gain + fault_m * fault_m
-    opened, shared = s.ph, s.fault_input  # what it adds to each state: 1 − V for the range error, −V for all others
+    opened, shared = s.U[0], s.G[0]  # what it adds to each state: 1 − V for the range error, −V for all others
     for state in range(s.n):
         opened[state] = -s.V[state][chosen]
     opened[(s.layout.constant if is_lasting else s.layout.change) + anchor] += 1.0

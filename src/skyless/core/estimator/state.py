@@ -36,6 +36,8 @@ LANES: Final = 4
 AXES: Final = 3
 STATES: Final = 2 * (AXES + MAX_ANCHORS) + (3 + AXES) * MAX_ANCHORS + 2
 """Capacity for states; a multiple of ``LANES``."""
+MOST_WAITING: Final = 8
+"""Most updates that wait."""
 MOST_TERMS: Final = 2 * (AXES + 3) + 8
 """Most terms of a measurement: a difference of two distances has the most."""
 
@@ -274,10 +276,12 @@ class State(Record):
     h: Annotated[Reals, MOST_TERMS]
     """The measurement where it is not zero, at the indices in ``h_index``."""
     h_index: Annotated[Integers, MOST_TERMS]
-    ph: Annotated[Reals, STATES]
-    """P·h of the measurement at hand."""
-    fault_input: Annotated[Reals, SENSITIVITIES]
-    """By how much each fault is in the present innovation."""
+    waiting: int
+    """Updates that are not in P and V yet: those of a packet's relays go there together."""
+    U: Annotated[Matrix, MOST_WAITING, STATES]
+    """Of each its u = P·h/√S; then P·h of the measurement at hand."""
+    G: Annotated[Matrix, MOST_WAITING, SENSITIVITIES]
+    """Of each, over √S, by how much each fault is in its innovation; then the same of the measurement at hand."""
     work: Annotated[Matrix, WORK_ROWS, MAX_ANCHORS]
     """Scratch for systems of equations of all faults of one kind."""
     levels: Annotated[Reals, LEVELS]

@@ -13,8 +13,16 @@ by the share, and those of relayed receptions by the share of all three that the
 from typing import Annotated, Final
 
 from skyless.core.constants import TICK_S
-from skyless.core.estimator.faults import compute_fault_input
-from skyless.core.estimator.kalman import compute_ph, predict, relax_range_error, reset_state, update
+from skyless.core.estimator.kalman import (
+    compute_fault_input,
+    compute_ph,
+    finish_updates,
+    predict,
+    relax_range_error,
+    reset_state,
+    update,
+    update_later,
+)
 from skyless.core.estimator.measurements import (
     add_pair_survey,
     first_reception,
@@ -141,6 +149,7 @@ def _process_superframe(
             for other in range(begin, message.end):
                 if relays[other].sender >= 0 and s.anchors[relays[other].sender].packets > 0:
                     _receive_relay(s, message, relays[other])
+            finish_updates(s)
             _add_fix(s, message.share, found)
         begin = message.end
 
@@ -180,7 +189,7 @@ def _receive(s: State, message: PlannedMessage, rx_ticks: Ticks) -> None:
         reception_terms(s, message.anchor, True)
         variance = compute_ph(s) + s.settings.rx_variance_m2 / message.share
         compute_fault_input(s, message.anchor)
-        s.fault_input[_walls(s)] += message.late_m
+        s.G[s.waiting][_walls(s)] += message.late_m
         update(s, 0.0, variance)
     a.rx_ticks = rx_ticks
     a.packets += 1
@@ -193,8 +202,8 @@ def _receive_relay(s: State, message: PlannedMessage, relayed: PlannedRelay) -> 
     variance += compute_ph(s)
     compute_fault_input(s, -1)
     if s.links[message.anchor][relayed.sender].variance_m2 == 0.0:  # else the pair's constant takes the delay
-        s.fault_input[_walls(s)] += relayed.late_m
-    update(s, 0.0, variance)
+        s.G[s.waiting][_walls(s)] += relayed.late_m
+    update_later(s, 0.0, variance)
 
 
 # Cramér–Rao bounds
@@ -231,4 +240,5 @@ def process_known(
             relay_terms(s, listener, sender, 0.0, True)
             if s.status.range_errors == ALL_RANGE_ERRORS:
                 add_pair_survey(s, listener, sender)
-            update(s, 0.0, compute_ph(s) + s.settings.rx_variance_m2)
+            update_later(s, 0.0, compute_ph(s) + s.settings.rx_variance_m2)
+    finish_updates(s)

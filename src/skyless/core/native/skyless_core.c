@@ -65,17 +65,24 @@ INTERNAL void remove_(real *numbers, int32_t index_, int32_t end);
 INTERNAL void predict(State *s, int64_t rx_ticks);
 INTERNAL bool is_stationary(State *s);
 INTERNAL void advance(State *s, real dt);
-INTERNAL void add_noise(State *s, int32_t value, int32_t other, real dt, real white, real walk);
+INTERNAL void add_noise(State *s, int32_t value, int32_t other, real of_values, real of_both, real of_rates);
 INTERNAL real jump_share(State *s);
 INTERNAL range_error_decay_results range_error_decay(State *s, int32_t anchor, real dt, real walked_m);
 INTERNAL void relax_range_error(State *s, int32_t anchor, real dt, real walked_m);
 INTERNAL void decay(State *s, int32_t state, real kept, real variance);
 INTERNAL void reset_state(State *s, int32_t state, real variance);
 INTERNAL real compute_ph(State *s);
-INTERNAL void update(State *s, real innovation, real innovation_variance, real gain_scale);
+INTERNAL real h_dot(State *s, real *states);
 INTERNAL void compute_fault_input(State *s, int32_t own);
+INTERNAL void update(State *s, real innovation, real innovation_variance, real gain_scale);
+INTERNAL void update_later(State *s, real innovation, real innovation_variance);
+INTERNAL void note_update(State *s, real innovation, real innovation_variance, real gain_scale);
+INTERNAL void finish_updates(State *s);
+INTERNAL int32_t fill_groups(State *s);
+INTERNAL void apply_updates(State *s);
+INTERNAL void apply_one(State *s, int32_t one);
+INTERNAL void apply_four(State *s, int32_t k);
 INTERNAL void subtract_fault_input(State *s, int32_t anchor);
-INTERNAL void gather_evidence(State *s, real innovation, real innovation_variance);
 INTERNAL void fade_faults(State *s);
 INTERNAL void whiten(State *s, int32_t count, int32_t vectors);
 INTERNAL real fault_chi2(State *s, int32_t kind, int32_t axes);
@@ -536,6 +543,7 @@ INTERNAL void remove_(real *numbers, int32_t index_, int32_t end) {
  *
  * The tag's oscillator is in all offsets, so its noise is common to them. */
 INTERNAL void predict(State *s, int64_t rx_ticks) {
+    real walk = 0;
     Status *status = &s->status;
     EstimatorSettings *settings = &s->settings;
     Layout *where = &s->layout;
@@ -550,22 +558,27 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
     }
     advance(s, dt);
     real motion = settings->qa * status->q_scale;
+    real white_m2 = settings->white * dt;
     if (is_stationary(s)) {
         motion *= s->tuning.stationary_noise_share;
     }
+    real square_s = dt * dt / REAL(2.0);
+    real cube_s = dt * dt * dt / REAL(3.0);
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
-        add_noise(s, axis, axis, dt, REAL(0.0), motion);
+        add_noise(s, axis, axis, motion * cube_s, motion * square_s, motion * dt);
         int32_t unknown = FAULT_KINDS * s->count + axis;  /* an acceleration that the filter does not know of */
         s->V[axis][unknown] -= REAL(0.5) * dt * dt;
         s->V[where->velocity + axis][unknown] -= dt;
     }
     for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
         int32_t offset = where->offset + anchor;
-        add_noise(s, offset, offset, dt, settings->white, settings->walk * s->anchors[anchor].walk_scale);
+        walk = settings->walk * s->anchors[anchor].walk_scale;
+        add_noise(s, offset, offset, white_m2 + walk * cube_s, walk * square_s, walk * dt);
     }
+    walk = settings->walk * status->walk_scale;
     for (int32_t one = where->offset, one_end = where->velocity; one < one_end; one++) {
         for (int32_t other = where->offset, other_end = where->velocity; other < other_end; other++) {
-            add_noise(s, one, other, dt, settings->white, settings->walk * status->walk_scale);
+            add_noise(s, one, other, white_m2 + walk * cube_s, walk * square_s, walk * dt);
         }
     }
     status->epoch_ticks = rx_ticks;
@@ -608,13 +621,13 @@ INTERNAL void advance(State *s, real dt) {
 }
 
 /* Q of a value and its rate, or what two such pairs have in common: white noise of values, walk of rates. */
-INTERNAL void add_noise(State *s, int32_t value, int32_t other, real dt, real white, real walk) {
+INTERNAL void add_noise(State *s, int32_t value, int32_t other, real of_values, real of_both, real of_rates) {
     int32_t rate = s->layout.velocity + value;
     int32_t other_rate = s->layout.velocity + other;
-    s->P[value][other] += white * dt + walk * dt * dt * dt / REAL(3.0);
-    s->P[value][other_rate] += walk * dt * dt / REAL(2.0);
-    s->P[rate][other] += walk * dt * dt / REAL(2.0);
-    s->P[rate][other_rate] += walk * dt;
+    s->P[value][other] += of_values;
+    s->P[value][other_rate] += of_both;
+    s->P[rate][other] += of_both;
+    s->P[rate][other_rate] += of_rates;
 }
 
 /* Range errors that change */
@@ -702,49 +715,188 @@ INTERNAL void reset_state(State *s, int32_t state, real variance) {
 
 /* Measurement update */
 
-/* Compute P·h of the measurement in ``h``; returns hᵀ·P·h. */
+/* Write P·h of the measurement in ``h`` into the next of ``U``; returns hᵀ·P·h. Counts updates that wait. */
 INTERNAL real compute_ph(State *s) {
+    if (s->waiting == MOST_WAITING) {
+        finish_updates(s);
+    }
+    real *ph = s->U[s->waiting];
     for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-        s->ph[state] = REAL(0.0);
+        ph[state] = REAL(0.0);
     }
     for (int32_t term = 0, term_end = s->terms; term < term_end; term++) {
         if (s->h_index[term] < s->n) {
             real weight = s->h[term];
             real *row = s->P[s->h_index[term]];
             for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-                s->ph[state] += weight * row[state];
+                ph[state] += weight * row[state];
             }
         }
     }
+    for (int32_t one = 0, one_end = s->waiting; one < one_end; one++) {
+        real weight = h_dot(s, s->U[one]);
+        real *u = s->U[one];
+        for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+            ph[state] -= weight * u[state];
+        }
+    }
+    return h_dot(s, ph);
+}
+
+/* The measurement in ``h`` times what stands in the order of states. */
+INTERNAL real h_dot(State *s, real *states) {
     real total = REAL(0.0);
     for (int32_t term = 0, term_end = s->terms; term < term_end; term++) {
         if (s->h_index[term] < s->n) {
-            total += s->h[term] * s->ph[s->h_index[term]];
+            total += s->h[term] * states[s->h_index[term]];
         }
     }
     return total;
 }
 
-/* Scalar update by the measurement in ``h`` with P·h in ``ph``.
+/* Write s = [own reception] − h·V into the next of ``G``; ``own`` is the anchor that the tag received, or −1. */
+INTERNAL void compute_fault_input(State *s, int32_t own) {
+    real *shares = s->G[s->waiting];
+    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+        shares[fault] = REAL(0.0);
+    }
+    for (int32_t term = 0, term_end = s->terms; term < term_end; term++) {
+        real weight = s->h[term];
+        real *effects = s->V[s->h_index[term]];
+        for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+            shares[fault] -= weight * effects[fault];
+        }
+    }
+    for (int32_t one = 0, one_end = s->waiting; one < one_end; one++) {
+        real weight = h_dot(s, s->U[one]);
+        real *effects = s->G[one];
+        for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+            shares[fault] -= weight * effects[fault];
+        }
+    }
+    if (own >= 0) {
+        for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
+            shares[kind * s->count + own] += REAL(1.0);
+        }
+    }
+}
+
+/* Scalar update by a measurement whose P·h and shares of faults are the next of ``U`` and ``G``.
  *
  * K = gain_scale·P·h/S. A scale of 1 is the Kalman gain; a measurement whose variance counts more has the S that
- * follows, and 1. P changes by −u·uᵀ with u = P·h/√S, which is symmetric to the bit. */
+ * follows, and 1. P changes by −u·uᵀ with u = P·h/√S, which is symmetric to the bit. No update may wait. */
 INTERNAL void update(State *s, real innovation, real innovation_variance, real gain_scale) {
-    real inverse = REAL(1.0) / SQRT(innovation_variance);
-    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-        s->ph[state] *= inverse;
+    note_update(s, innovation, innovation_variance, gain_scale);
+    apply_updates(s);
+}
+
+/* The same for a measurement that shows faults: y ← y + s·ν/S and M ← M + s·sᵀ/S.
+ *
+ * P, V and M wait for ``finish_updates``; until then only ``compute_ph`` and ``compute_fault_input`` may read P and V. */
+INTERNAL void update_later(State *s, real innovation, real innovation_variance) {
+    real *g = s->G[s->waiting];
+    note_update(s, innovation, innovation_variance, REAL(1.0));
+    real normalised = innovation / SQRT(innovation_variance);
+    for (int32_t fault = 0, fault_end = FAULT_KINDS * s->count; fault < fault_end; fault++) {
+        s->evidence[fault] += g[fault] * normalised;
     }
+}
+
+/* Update x, and make u = P·h/√S and g = s/√S of what stands in ``U`` and ``G``, for P and V. */
+INTERNAL void note_update(State *s, real innovation, real innovation_variance, real gain_scale) {
+    real inverse = REAL(1.0) / SQRT(innovation_variance);
     real step = gain_scale * inverse;
+    real *u = s->U[s->waiting];
+    real *g = s->G[s->waiting];
+    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+        u[state] *= inverse;
+    }
+    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+        g[fault] *= step;
+    }
+    step *= innovation;
     for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
-        real u = s->ph[state];
-        real *row = s->P[state];
-        real *effects = s->V[state];
-        s->x[state] += u * step * innovation;
-        for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
-            row[other] -= u * s->ph[other];
+        s->x[state] += u[state] * step;
+    }
+    s->waiting += 1;
+}
+
+/* Let P, V and M follow the updates that wait. */
+INTERNAL void finish_updates(State *s) {
+    if (s->waiting == 0) {
+        return;
+    }
+    int32_t faults = FAULT_KINDS * s->count;
+    int32_t groups = fill_groups(s);
+    for (int32_t group = 0; group < groups; group++) {
+        int32_t k = 4 * group;
+        for (int32_t fault = 0; fault < faults; fault++) {
+            real a = s->G[k][fault];
+            real b = s->G[k + 1][fault];
+            real c = s->G[k + 2][fault];
+            real d = s->G[k + 3][fault];
+            for (int32_t other = 0; other < fault + 1; other++) {
+                s->information[fault][other] += a * s->G[k][other] + b * s->G[k + 1][other] + c * s->G[k + 2][other] + d
+                        * s->G[k + 3][other];
+            }
+        }
+    }
+    apply_updates(s);
+}
+
+/* Fill the updates that wait with zeros up to a multiple of four; returns a quarter of their number. */
+INTERNAL int32_t fill_groups(State *s) {
+    int32_t groups = floor_div_32(s->waiting + 3, 4);
+    for (int32_t one = s->waiting; one < 4 * groups; one++) {
+        for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+            s->U[one][state] = REAL(0.0);
         }
         for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-            effects[fault] += u * step * s->fault_input[fault];
+            s->G[one][fault] = REAL(0.0);
+        }
+    }
+    return groups;
+}
+
+/* P ← P − Σ u·uᵀ and V ← V + Σ u·gᵀ over the updates that wait, four at a time: P is read and written once. */
+INTERNAL void apply_updates(State *s) {
+    if (s->waiting <= 2) {
+        for (int32_t one = 0, one_end = s->waiting; one < one_end; one++) {
+            apply_one(s, one);
+        }
+    } else {
+        for (int32_t group = 0, group_end = fill_groups(s); group < group_end; group++) {
+            apply_four(s, 4 * group);
+        }
+    }
+    s->waiting = 0;
+}
+
+INTERNAL void apply_one(State *s, int32_t one) {
+    for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
+        real u = s->U[one][state];
+        for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
+            s->P[state][other] -= u * s->U[one][other];
+        }
+        for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+            s->V[state][fault] += u * s->G[one][fault];
+        }
+    }
+}
+
+INTERNAL void apply_four(State *s, int32_t k) {
+    for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
+        real a = s->U[k][state];
+        real b = s->U[k + 1][state];
+        real c = s->U[k + 2][state];
+        real d = s->U[k + 3][state];
+        for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
+            s->P[state][other] -= a * s->U[k][other] + b * s->U[k + 1][other] + c * s->U[k + 2][other] + d * s->U[k +
+                    3][other];
+        }
+        for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+            s->V[state][fault] += a * s->G[k][fault] + b * s->G[k + 1][fault] + c * s->G[k + 2][fault] + d * s->G[k +
+                    3][fault];
         }
     }
 }
@@ -762,44 +914,12 @@ INTERNAL void update(State *s, real innovation, real innovation_variance, real g
  * (recent) or seconds (creeping). A fault that is sure is added to the anchor's range error, which gives the state that
  * the filter would have, had that error been open from the beginning. */
 
-/* What innovations show */
-
-/* Compute s = [own reception] − h·V; ``own`` is the anchor that the tag has received, or −1. */
-INTERNAL void compute_fault_input(State *s, int32_t own) {
-    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-        s->fault_input[fault] = REAL(0.0);
-    }
-    for (int32_t term = 0, term_end = s->terms; term < term_end; term++) {
-        real weight = s->h[term];
-        real *effects = s->V[s->h_index[term]];
-        for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-            s->fault_input[fault] -= weight * effects[fault];
-        }
-    }
-    if (own >= 0) {
-        for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
-            s->fault_input[kind * s->count + own] += REAL(1.0);
-        }
-    }
-}
+/* What innovations show (gathered by ``kalman.update_later``) */
 
 /* Subtract the reception of the first anchor of a difference: its faults count with the opposite sign. */
 INTERNAL void subtract_fault_input(State *s, int32_t anchor) {
     for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
-        s->fault_input[kind * s->count + anchor] -= REAL(1.0);
-    }
-}
-
-/* What an innovation shows of the anchors' faults: y ← y + s·ν/S and M ← M + s·sᵀ/S, of which the lower half. */
-INTERNAL void gather_evidence(State *s, real innovation, real innovation_variance) {
-    real inverse = REAL(1.0) / innovation_variance;
-    for (int32_t one = 0, one_end = FAULT_KINDS * s->count; one < one_end; one++) {
-        real weight = inverse * s->fault_input[one];
-        real *row = s->information[one];
-        s->evidence[one] += weight * innovation;
-        for (int32_t other = 0; other < one + 1; other++) {
-            row[other] += weight * s->fault_input[other];
-        }
+        s->G[s->waiting][kind * s->count + anchor] -= REAL(1.0);
     }
 }
 
@@ -1046,8 +1166,8 @@ INTERNAL void open_fault(State *s, int32_t kind, int32_t anchor) {
     real gain = REAL(1.0) / (s->information[chosen][chosen] + REAL(1.0) / square(s->tuning.late_std_m));
     real fault_m = gain * s->evidence[chosen];
     real variance = is_lasting ? gain : gain + fault_m * fault_m;
-    real *opened = s->ph;  /* what it adds to each state: 1 − V for the range error, −V for all others */
-    real *shared = s->fault_input;
+    real *opened = s->U[0];  /* what it adds to each state: 1 − V for the range error, −V for all others */
+    real *shared = s->G[0];
     for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
         opened[state] = -s->V[state][chosen];
     }
@@ -1239,6 +1359,7 @@ INTERNAL void adapt_change_variance(State *s, int32_t anchor, real elapsed_s) {
     Anchor *a = &s->anchors[anchor];
     real memory_s = settings->change_memory_s;
     if (memory_s > REAL(0.0)) {
+        finish_updates(s);
         int32_t change = s->layout.change + anchor;
         real present = square(s->x[change]) + s->P[change][change];
         real variance = a->change_variance_m2 + min_real(elapsed_s / memory_s, REAL(0.5)) * (present -
@@ -1809,8 +1930,7 @@ INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64
         }
         real used_variance = innovation_variance * scale + (variance_factor - REAL(1.0)) * settings->rx_variance_m2;
         compute_fault_input(s, anchor);
-        gather_evidence(s, innovation, used_variance);
-        update(s, innovation, used_variance, REAL(1.0));
+        update_later(s, innovation, used_variance);
         adapt_change_variance(s, anchor, elapsed_s);
     }
     carry_ticks(s, anchor);
@@ -1875,12 +1995,12 @@ INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_
     variance += REAL(2.0) * curvature_m * curvature_m + compute_ph(s);
     compute_fault_input(s, anchor);
     for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-        s->P[state][offset] = -s->ph[state];
-        s->P[offset][state] = -s->ph[state];
+        s->P[state][offset] = -s->U[0][state];
+        s->P[offset][state] = -s->U[0][state];
     }
     s->P[offset][offset] = variance;
     for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-        s->V[offset][fault] = s->fault_input[fault];
+        s->V[offset][fault] = s->G[0][fault];
     }
     a->offset_ticks = rx_ticks - tx_ticks - floor_real(range_m / TICK_M);
     real rest_m = (real)(rx_ticks - tx_ticks - a->offset_ticks) * TICK_M;
@@ -1989,11 +2109,10 @@ INTERNAL real find_distance_m(State *s, int32_t one, int32_t other) {
     return SQRT(squared);
 }
 
-/* Update by the measurement in ``h``, which is no reception of the tag's, and by what it shows of faults. */
+/* Update by the measurement in ``h``, which is no reception of the tag's, and by what it shows of faults; later. */
 INTERNAL void use(State *s, real innovation, real innovation_variance) {
     compute_fault_input(s, -1);
-    gather_evidence(s, innovation, innovation_variance);
-    update(s, innovation, innovation_variance, REAL(1.0));
+    update_later(s, innovation, innovation_variance);
 }
 
 /* Use the range between two anchors for their survey; anchors that contradict most of theirs are misplaced. */
@@ -2009,6 +2128,7 @@ INTERNAL void survey_pair(State *s, int32_t one, int32_t other) {
     if (contradicted == rival || (real)most < s->tuning.misplaced_pairs || !pair(s, one, other)->contradicts) {
         return;
     }
+    finish_updates(s);
     int32_t misplaced = contradicted > rival ? one : other;
     Anchor *a = &s->anchors[misplaced];
     int32_t survey = s->layout.survey + s->dim * misplaced;
@@ -2063,6 +2183,7 @@ INTERNAL void add_pair_survey(State *s, int32_t one, int32_t other) {
 INTERNAL void report(State *s, int32_t anchor, int32_t master, int64_t subticks, real variance_m2) {
     Anchor *a = &s->anchors[anchor];
     Status *status = &s->status;
+    finish_updates(s);
     relay_terms(s, anchor, master, a->range_m / SPEED_OF_LIGHT_MPS, false);
     real own_variance = REAL(0.0);
     for (int32_t one = 0, one_end = s->terms; one < one_end; one++) {
@@ -2135,8 +2256,8 @@ INTERNAL int32_t difference(State *s, int32_t a, int32_t b, int64_t rx_ticks, re
     }
     compute_fault_input(s, b);
     subtract_fault_input(s, a);
-    gather_evidence(s, innovation, innovation_variance * scale);
-    update(s, innovation, innovation_variance * scale, REAL(1.0));
+    update_later(s, innovation, innovation_variance * scale);
+    finish_updates(s);
     bound_changes(s);
     end_small_obstruction(s, a);
     end_small_obstruction(s, b);
@@ -2190,6 +2311,7 @@ INTERNAL int32_t height(State *s, real height_m, real std_m, bool is_barometer) 
         return UNUSED;
     }
     use(s, innovation, innovation_variance);
+    finish_updates(s);
     status->height_ticks = status->epoch_ticks;
     return USED;
 }
@@ -2326,6 +2448,7 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet) {
         for (int32_t one = 0, one_end = packet->relay_count; one < one_end; one++) {
             process_relay(s, anchor, &packet->relays[one]);
         }
+        finish_updates(s);
         if (packet->report_variance_m2 > REAL(0.0) && packet->master >= 0) {
             int32_t master = skyless_find_anchor(s, packet->master);
             if (master >= 0 && master != anchor) {
@@ -2602,6 +2725,7 @@ INTERNAL void process_superframe(State *s, PlannedMessage *messages, PlannedRela
                     receive_relay(s, message, &relays[other]);
                 }
             }
+            finish_updates(s);
             add_fix(s, message->share, found);
         }
         begin = message->end;
@@ -2650,7 +2774,7 @@ INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks) {
         reception_terms(s, message->anchor, true);
         real variance = compute_ph(s) + s->settings.rx_variance_m2 / message->share;
         compute_fault_input(s, message->anchor);
-        s->fault_input[walls(s)] += message->late_m;
+        s->G[s->waiting][walls(s)] += message->late_m;
         update(s, REAL(0.0), variance, REAL(1.0));
     }
     a->rx_ticks = rx_ticks;
@@ -2664,9 +2788,9 @@ INTERNAL void receive_relay(State *s, PlannedMessage *message, PlannedRelay *rel
     variance += compute_ph(s);
     compute_fault_input(s, -1);
     if (s->links[message->anchor][relayed->sender].variance_m2 == REAL(0.0)) {  /* else the pair's constant takes the delay */
-        s->fault_input[walls(s)] += relayed->late_m;
+        s->G[s->waiting][walls(s)] += relayed->late_m;
     }
-    update(s, REAL(0.0), variance, REAL(1.0));
+    update_later(s, REAL(0.0), variance);
 }
 
 /* Cramér–Rao bounds */
@@ -2697,9 +2821,10 @@ SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_t
             if (s->status.range_errors == ALL_RANGE_ERRORS) {
                 add_pair_survey(s, listener, sender);
             }
-            update(s, REAL(0.0), compute_ph(s) + s->settings.rx_variance_m2, REAL(1.0));
+            update_later(s, REAL(0.0), compute_ph(s) + s->settings.rx_variance_m2);
         }
     }
+    finish_updates(s);
 }
 
 /* Gauss–Newton steps, damped after Levenberg and Marquardt where they fail, to a minimum of TDoAs' residuals. */

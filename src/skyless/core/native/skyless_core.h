@@ -69,6 +69,7 @@ typedef double real;
 /* Most relays with a packet; 13 fit into a frame. */
 #define MAX_RELAYS 32
 #define MIN_DAMPING REAL(0.0001)
+#define MOST_WAITING 8
 /* A time before all others. */
 #define NEVER (INT64_C(-4611686018427387904))
 #define NO_RANGE_ERRORS 0
@@ -440,8 +441,10 @@ typedef struct State {
     int32_t terms;  /* Terms of the measurement at hand, which stand in ``h``. */
     real h[20];  /* The measurement where it is not zero, at the indices in ``h_index``. */
     int32_t h_index[20];
-    real ph[264];  /* P·h of the measurement at hand. */
-    real fault_input[112];  /* By how much each fault is in the present innovation. */
+    int32_t waiting;  /* Updates that are not in P and V yet: those of a packet's relays go there together. */
+    real U[8][264];  /* Of each its u = P·h/√S; then P·h of the measurement at hand. */
+    /* Of each, over √S, by how much each fault is in its innovation; then the same of the measurement at hand. */
+    real G[8][112];
     real work[36][32];  /* Scratch for systems of equations of all faults of one kind. */
     real levels[5];
     real fix[10][3];  /* What a fix carries (``POSITION`` and the following). */
