@@ -240,5 +240,4 @@ def process_known(
             relay_terms(s, listener, sender, 0.0, True)
             if s.status.range_errors == ALL_RANGE_ERRORS:
                 add_pair_survey(s, listener, sender)
-            update_later(s, 0.0, compute_ph(s) + s.settings.rx_variance_m2)
-    finish_updates(s)
+            update(s, 0.0, compute_ph(s) + s.settings.rx_variance_m2)

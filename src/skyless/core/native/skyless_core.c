@@ -2821,10 +2821,9 @@ SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_t
             if (s->status.range_errors == ALL_RANGE_ERRORS) {
                 add_pair_survey(s, listener, sender);
             }
-            update_later(s, REAL(0.0), compute_ph(s) + s->settings.rx_variance_m2);
+            update(s, REAL(0.0), compute_ph(s) + s->settings.rx_variance_m2, REAL(1.0));
         }
     }
-    finish_updates(s);
 }
 
 /* Gauss–Newton steps, damped after Levenberg and Marquardt where they fail, to a minimum of TDoAs' residuals. */
