@@ -92,3 +92,11 @@ def rows_and_state(output, count):
 def has(*programs):
     """Whether all of these programs are here."""
     return all(shutil.which(program) for program in programs)
+
+
+def damaged_program(folder):
+    """The program of ``damaged.c``, which ends at an access out of bounds, an overflow and the like."""
+    made, sources = folder / "damaged", [NATIVE / "skyless_core.c", Path(__file__).with_name("damaged.c")]
+    checks = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    subprocess.run(["gcc", *EXACT, *checks, f"-I{NATIVE}", *sources, "-o", made], check=True)
+    return made

@@ -16,8 +16,9 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
 from estimator_builders import LAB_M, MESH, ROOM_M, begun, episode_of, kept, late, one_by_one, settings_of
 
+import wasm_core
 from make_core import EXPORTS, NAME
-from skyless.core.estimator.process import Packet
+from skyless.core.estimator.process import BatchPacket, BatchRow, Packet, Place, Relay
 from skyless.core.estimator.saved import packed_state
 from skyless.core.estimator.state import MAX_ANCHORS, WORK_ROWS, State
 from skyless.core.estimator.steady_state import PlannedMessage, PlannedRelay
@@ -249,6 +250,19 @@ def test_all_compilers_and_processors_give_the_same_bits(target, episode, tmp_pa
     done = subprocess.run(
         runner(tmp_path, compiler, *flags, emulator=emulator), input=given, capture_output=True, check=True
     )
+    found, theirs = rows_and_state(done.stdout, len(rows))
+    assert bits(state) == bits(theirs)
+    for name in rows.dtype.names:
+        assert np.array_equal(rows[name], found[name])
+
+
+@pytest.mark.skipif(not has("clang", "wasm-ld", "node"), reason="clang, lld or node is not here")
+def test_webassembly_gives_the_same_bits(episode, tmp_path):
+    wasm_core.build(tmp_path / "core.wasm")
+    given, rows, state = episode
+    sizes = [str(ctypes.sizeof(one)) for one in (State, Place, BatchPacket, Relay, BatchRow)]
+    command = ["node", Path(__file__).with_name("run_core.mjs"), tmp_path / "core.wasm", *sizes]
+    done = subprocess.run(command, input=given, capture_output=True, check=True)
     found, theirs = rows_and_state(done.stdout, len(rows))
     assert bits(state) == bits(theirs)
     for name in rows.dtype.names:

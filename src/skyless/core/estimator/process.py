@@ -150,8 +150,7 @@ def _present(s: State, place: Place) -> int:
 
 def _remove_silent(s: State, rx_ticks: Ticks) -> None:
     """Let anchors leave that have been silent for too long."""
-    for behind in range(s.count):
-        anchor = s.count - 1 - behind
+    for anchor in range(s.count - 1, -1, -1):
         a = s.anchors[anchor]
         if a.packets > 0 and (rx_ticks - a.rx_ticks) * TICK_S > s.settings.drop_s:
             remove_anchor(s, anchor)

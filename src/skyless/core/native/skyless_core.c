@@ -2409,8 +2409,7 @@ INTERNAL int32_t present(State *s, Place *place) {
 
 /* Let anchors leave that have been silent for too long. */
 INTERNAL void remove_silent(State *s, int64_t rx_ticks) {
-    for (int32_t behind = 0, behind_end = s->count; behind < behind_end; behind++) {
-        int32_t anchor = s->count - 1 - behind;
+    for (int32_t anchor = s->count - 1; anchor > -1; anchor--) {
         Anchor *a = &s->anchors[anchor];
         if (a->packets > 0 && (real)(rx_ticks - a->rx_ticks) * TICK_S > s->settings.drop_s) {
             skyless_remove_anchor(s, anchor);
