@@ -101,7 +101,11 @@ def orthogonalise(m: Columns) -> None:
 
 def _has_rotated(m: Columns, one: int, other: int) -> bool:
     """Make two columns orthogonal and order them, by the smallest rotation; False where they are so already."""
-    square, square_other, product = _scalar_product(m, one, one), _scalar_product(m, other, other), _scalar_product(m, one, other)
+    square, square_other, product = (
+        _scalar_product(m, one, one),
+        _scalar_product(m, other, other),
+        _scalar_product(m, one, other),
+    )
     is_orthogonal = abs(product) <= ORTHOGONAL * sqrt(square * square_other)
     if is_orthogonal and square >= square_other:
         return False
