@@ -1,4 +1,7 @@
-"""Build hook: make the library of the estimator, for this machine or the one that a wheel is for."""
+"""Build hook: make the library of the estimator, for this machine or the one that a wheel is for.
+
+``CC`` names the C compiler and ``SKYLESS_TARGET`` the other machine; ``tools/compile_core.py`` says more.
+"""
 
 import os
 import sys
@@ -9,7 +12,7 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 sys.path.insert(0, str(Path(__file__).parent / "tools"))
-from compile_core import NATIVE, TARGETS, ZIG, build, compiler
+from compile_core import NATIVE, TARGETS, ZIG, build, compiler, target
 
 
 class CoreBuildHook(BuildHookInterface):  # type: ignore[type-arg]
@@ -21,11 +24,11 @@ class CoreBuildHook(BuildHookInterface):  # type: ignore[type-arg]
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Compile, and name the platform that the wheel is for."""
-        if self.target_name != "wheel":
-            return
-        libraries = build(Path(self.root) / NATIVE)
-        asked = os.environ.get("SKYLESS_TARGET")
-        platform = TARGETS[asked][1] if asked else sysconfig.get_platform().replace("-", "_").replace(".", "_")
+        if os.environ.get("SKYLESS_TARGET"):
+            platform = TARGETS[target()][1]
+        else:
+            platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
         build_data["pure_python"] = False
         build_data["tag"] = f"py3-none-{platform}"
+        libraries = build(Path(self.root) / NATIVE)
         build_data["artifacts"] += [f"/{library.relative_to(self.root)}" for library in libraries]

@@ -1,7 +1,8 @@
-"""Compile ``skyless_core.c``, which is made from the estimator's Python, to a library beside it.
+"""Compile ``skyless_core.c``, which is made from the estimator's Python, to libraries beside it.
 
-It takes ``$CC``, or the first of cc, gcc and clang that there is, or else PyPI's ``ziglang``. ``SKYLESS_TARGET`` names
-another machine (x86_64-linux or aarch64-linux), for which ``ziglang`` compiles.
+The compiler is ``$CC``, or the first of cc, gcc and clang on the PATH, or else that of PyPI's ``ziglang``, which
+``CC=ziglang`` asks for. ``SKYLESS_TARGET`` names another machine (x86_64-linux or aarch64-linux), for which ``ziglang``
+compiles.
 
     python tools/compile_core.py
 """
@@ -13,24 +14,42 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 NATIVE = Path("src/skyless/core/native")
 FLAGS = ["-std=c99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared", "-fvisibility=hidden"]
-ZIG = "ziglang>=0.13"
+AVX2_FLAGS = ["-mavx2", "-mbmi", "-mbmi2", "-mmovbe"]
+"""One by one, because compilers before 2021 know no ``-march=x86-64-v3``, and zig writes it differently."""
+ZIG = "ziglang==0.17.1"
 TARGETS = {
     "x86_64-linux": ("x86_64-linux-gnu.2.17", "manylinux_2_17_x86_64"),
     "aarch64-linux": ("aarch64-linux-gnu.2.17", "manylinux_2_17_aarch64"),
 }
+"""What zig and wheels call a machine, with the oldest C library that serves."""
+ADVICE = """\
+Compiling needs a C compiler and the C library's headers (Debian, Ubuntu: apt install gcc libc6-dev).
+CC names another compiler; with CC=ziglang the installation takes that of PyPI."""
 
 
 def compiler() -> list[str]:
-    """The command of the C compiler of this machine; empty where there is none, or for another machine."""
-    if os.environ.get("SKYLESS_TARGET"):
+    """The command of the C compiler of this machine; empty where ``ziglang`` compiles."""
+    asked = shlex.split(os.environ.get("CC", ""))
+    if os.environ.get("SKYLESS_TARGET") or asked == ["ziglang"]:
         return []
-    if asked := shlex.split(os.environ.get("CC", "")):
-        return asked
-    return next(([name] for name in ("cc", "gcc", "clang") if shutil.which(name)), [])
+    return asked or next(([name] for name in ("cc", "gcc", "clang") if shutil.which(name)), [])
+
+
+def target() -> str:
+    """The machine to compile for: that of ``SKYLESS_TARGET``, or this one.
+
+    Raises:
+        SystemExit: it is none of ``TARGETS``.
+    """
+    asked = os.environ.get("SKYLESS_TARGET")
+    if asked and asked not in TARGETS:
+        raise SystemExit(f"skyless: SKYLESS_TARGET is {asked}; it should be one of {', '.join(TARGETS)}")
+    return asked or f"{platform.machine()}-{sys.platform}"
 
 
 def build(native: Path) -> list[Path]:
@@ -39,30 +58,41 @@ def build(native: Path) -> list[Path]:
     Raises:
         SystemExit: the compiler failed.
     """
-    machine = os.environ.get("SKYLESS_TARGET", platform.machine())
     made = [compiled(native, "libskyless_core.so", [])]
-    if machine.startswith(("x86_64", "AMD64")):
-        made.append(compiled(native, "libskyless_core_avx2.so", ["-march=x86-64-v3"]))
+    if target().startswith(("x86_64-", "AMD64-")):
+        made.append(compiled(native, "libskyless_core_avx2.so", AVX2_FLAGS))
     return made
 
 
 def compiled(native: Path, name: str, flags: list[str]) -> Path:
-    """Compile one library."""
+    """Compile one library. It is there as a whole, or as it was before."""
     source, library = native / "skyless_core.c", native / name
     digest = hashlib.sha256(source.read_bytes() + source.with_suffix(".h").read_bytes()).hexdigest()[:16]
-    target = os.environ.get("SKYLESS_TARGET")
-    zig = [sys.executable, "-m", "ziglang", "cc", *(["-target", TARGETS[target][0]] if target else [])]
-    new, given = library.with_suffix(f".{os.getpid()}"), f'-DSKYLESS_SOURCE_DIGEST="{digest}"'
-    command = [*(compiler() or zig), *FLAGS, *flags, given, str(source), "-o", str(new)]
+    new = library.with_name(f"{library.stem}-{os.getpid()}.so")
+    given = f'-DSKYLESS_SOURCE_DIGEST="{digest}"'
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-    except OSError as error:
-        raise SystemExit(f"skyless: {command[0]} cannot be run: {error}; CC names another C compiler") from None
-    if done.returncode:
+        _run([*(compiler() or _zig()), *FLAGS, *flags, given, str(source), "-o", str(new)])
+        new.replace(library)
+    finally:
         new.unlink(missing_ok=True)
-        raise SystemExit(f"skyless: {shlex.join(command)} failed:\n{done.stderr}CC names another C compiler")
-    new.replace(library)
     return library
+
+
+def _zig() -> list[str]:
+    """The command of zig's compiler: for any processor of the machine, which without a target it would not be."""
+    known = TARGETS.get(target())
+    return [sys.executable, "-m", "ziglang", "cc", "-s", *(["-target", known[0]] if known else ["-mcpu=baseline"])]
+
+
+def _run(command: list[str]) -> None:
+    with tempfile.TemporaryDirectory() as cache:
+        folders = {"ZIG_GLOBAL_CACHE_DIR": cache, "ZIG_LOCAL_CACHE_DIR": cache}
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ | folders)
+        except OSError as error:
+            raise SystemExit(f"skyless: {command[0]} cannot be run: {error}\n{ADVICE}") from None
+    if done.returncode:
+        raise SystemExit(f"skyless: this failed: {shlex.join(command)}\n{done.stderr.rstrip()}\n{ADVICE}")
 
 
 if __name__ == "__main__":

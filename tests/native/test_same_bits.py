@@ -147,7 +147,12 @@ def hints(function):
 
 def bits(value):
     if isinstance(value, State):
-        return packed_state(value) + repack_fields(view(value.levels)).tobytes() + view(value.ph).tobytes()
+        return (
+            packed_state(value)
+            + repack_fields(view(value.levels)).tobytes()
+            + view(value.U).tobytes()
+            + view(value.G).tobytes()
+        )
     if isinstance(value, ctypes.Structure | ctypes.Array):
         array = view(value)
         return (repack_fields(array) if array.dtype.names else array).tobytes()

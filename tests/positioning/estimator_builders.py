@@ -211,7 +211,7 @@ def seen(state):
     return SimpleNamespace(
         x=view(state.x)[:n],
         P=view(state.P)[:n, :n],
-        V=view(state.V)[: faults + state.dim, :n],
+        V=view(state.V)[:n, : faults + state.dim].T,
         information=view(state.information)[:faults, :faults],
         evidence=view(state.evidence)[:faults],
         anchors=view(state.anchors)[:count],

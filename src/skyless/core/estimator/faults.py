@@ -31,35 +31,13 @@ from skyless.core.native.arithmetic import exp, sqrt, square
 MAX_FAULTS: Final = 2  # largest number of anchors that are selected
 
 
-# What innovations show
-
-
-def compute_fault_input(s: State, own: int) -> None:
-    """Compute s = [own reception] − h·V; ``own`` is the anchor that the tag has received, or −1."""
-    for fault in range(s.rows):
-        total = 0.0
-        for term in range(s.terms):
-            total -= s.h[term] * s.V[fault][s.h_index[term]]
-        s.fault_input[fault] = total
-    if own >= 0:
-        for kind in range(FAULT_KINDS):
-            s.fault_input[kind * s.count + own] += 1.0
+# What innovations show (gathered by ``kalman.update_later``)
 
 
 def subtract_fault_input(s: State, anchor: int) -> None:
     """Subtract the reception of the first anchor of a difference: its faults count with the opposite sign."""
     for kind in range(FAULT_KINDS):
-        s.fault_input[kind * s.count + anchor] -= 1.0
-
-
-def gather_evidence(s: State, innovation: float, innovation_variance: float) -> None:
-    """What an innovation shows of the anchors' faults: y ← y + s·ν/S and M ← M + s·sᵀ/S."""
-    faults = FAULT_KINDS * s.count
-    for one in range(faults):
-        weight, row = s.fault_input[one] / innovation_variance, s.information[one]
-        s.evidence[one] += weight * innovation
-        for other in range(faults):
-            row[other] += weight * s.fault_input[other]
+        s.G[s.waiting][kind * s.count + anchor] -= 1.0
 
 
 def fade_faults(s: State) -> None:
@@ -72,14 +50,15 @@ def fade_faults(s: State) -> None:
     for kind in range(RECENT, FAULT_KINDS):
         begin, end = kind * count, (kind + 1) * count
         kept = 1.0 - 1.0 / tuning.recent_packets if kind == RECENT else exp(-elapsed_s / tuning.creeping_s)
+        for state in range(s.used):
+            for fault in range(begin, end):
+                s.V[state][fault] *= kept
         for fault in range(begin, end):
             s.evidence[fault] *= kept
-            for state in range(s.n):
-                s.V[fault][state] *= kept
-            for other in range(FAULT_KINDS * count):
+            for other in range(fault + 1):
                 s.information[fault][other] *= kept
-                if not begin <= other < end:
-                    s.information[other][fault] *= kept
+            for other in range(end, FAULT_KINDS * count):
+                s.information[other][fault] *= kept
 
 
 # The test of all faults of a kind
@@ -110,12 +89,12 @@ def fault_chi2(s: State, kind: int, axes: int) -> float:
     """
     count, begin = s.count, kind * s.count
     for one in range(count):
-        for other in range(count):
+        for other in range(one + 1):
             s.work[one][other] = s.information[begin + one][begin + other]
         s.work[one][one] += 1.0 / square(s.status.fault_std_m[kind])
         s.work[count][one] = s.evidence[begin + one]
         for axis in range(axes):
-            s.work[count + 1 + axis][one] = s.V[begin + one][axis]
+            s.work[count + 1 + axis][one] = s.V[axis][begin + one]
     whiten(s, count, 1 + axes)
     total = 0.0
     for one in range(count):
@@ -124,7 +103,10 @@ def fault_chi2(s: State, kind: int, axes: int) -> float:
 
 
 def explained_chi2(s: State, one: int, other: int) -> float:
-    """How much of the test of all lasting faults one anchor or two explain; for one, both arguments are the same."""
+    """How much of the test of all lasting faults one anchor or two explain.
+
+    ``other`` is not above ``one``, and the same for one anchor.
+    """
     weight, y_one, y_other = 1.0 / square(s.tuning.late_std_m), s.evidence[one], s.evidence[other]
     a, b, both = s.information[one][one] + weight, s.information[other][other] + weight, s.information[one][other]
     if one == other:
@@ -175,18 +157,18 @@ def _open_new_faults(s: State, kind: int) -> None:
     A single one opens by itself; where it is open which of several it is, the position uses none of them,
     as long as enough anchors are left.
     """
-    spare = s.count - s.dim - 1
+    spare, explained = s.count - s.dim - 1, s.work[0]
     for anchor in range(s.count):
         spare -= int(s.anchors[anchor].is_obstructed)
-        s.ph[anchor] = _explained_alone(s, kind, anchor)
+        explained[anchor] = _explained_alone(s, kind, anchor)
     limit, first = _largest(s, kind) - s.tuning.rival_chi2, 0
     while spare > 0 and first >= 0:
         first = -1
         for anchor in range(s.count):
-            if s.ph[anchor] > limit and (first < 0 or s.ph[anchor] > s.ph[first]):
+            if explained[anchor] > limit and (first < 0 or explained[anchor] > explained[first]):
                 first = anchor
         if first >= 0:
-            s.ph[first] = 0.0
+            explained[first] = 0.0
             spare -= 1
             _open_fault(s, kind, first)
             begin_obstruction(s, first)
@@ -242,33 +224,30 @@ def end_lasting_fault(s: State, anchor: int) -> None:
 
 def _open_fault(s: State, kind: int, anchor: int) -> None:
     """Add a fault to its anchor's range error; all other hypotheses are conditioned on it (Schur's complement)."""
-    is_lasting, chosen, faults, shared = kind == LASTING, kind * s.count + anchor, FAULT_KINDS * s.count, s.fault_input
+    is_lasting, chosen, faults = kind == LASTING, kind * s.count + anchor, FAULT_KINDS * s.count
     make_uncertain(s, ALL_RANGE_ERRORS if is_lasting else CHANGING_RANGE_ERRORS)
     gain = 1.0 / (s.information[chosen][chosen] + 1.0 / square(s.tuning.late_std_m))
     fault_m = gain * s.evidence[chosen]
     variance = gain if is_lasting else gain + fault_m * fault_m
-    opened = s.V[chosen]  # what it adds to each state: 1 − V for the range error, −V for all others
+    opened, shared = s.U[0], s.G[0]  # what it adds to each state: 1 − V for the range error, −V for all others
     for state in range(s.n):
-        opened[state] = -opened[state]
+        opened[state] = -s.V[state][chosen]
     opened[(s.layout.constant if is_lasting else s.layout.change) + anchor] += 1.0
-    for one in range(s.n):
+    for one in range(faults):
+        shared[one] = gain * s.information[max(one, chosen)][min(one, chosen)]
+    shared[chosen] = 0.0
+    for one in range(s.used):
         s.x[one] += opened[one] * fault_m
         for other in range(s.n):
             s.P[one][other] += opened[one] * opened[other] * variance
+        for fault in range(faults):
+            s.V[one][fault] += shared[fault] * opened[one]
+        s.V[one][chosen] = 0.0
     for one in range(faults):
-        shared[one] = s.information[one][chosen]
-    shared[chosen] = 0.0
-    for one in range(faults):
-        share = gain * shared[one]
-        s.evidence[one] -= share * s.evidence[chosen]
-        for other in range(faults):
-            s.information[one][other] -= share * shared[other]
-        for state in range(s.n):
-            s.V[one][state] += share * opened[state]
+        s.evidence[one] -= shared[one] * s.evidence[chosen]
+        for other in range(one + 1):
+            s.information[one][other] -= shared[one] * shared[other] / gain
     s.evidence[chosen] = 0.0
     for one in range(faults):
-        s.information[one][chosen] = 0.0
-        s.information[chosen][one] = 0.0
-    for state in range(s.n):
-        opened[state] = 0.0
+        s.information[max(one, chosen)][min(one, chosen)] = 0.0
     s.status.faults_opened += 1

@@ -4,9 +4,9 @@ All loops run over the states that are not exact (``State.n``); what stands behi
 """
 
 from skyless.core.constants import TICK_S
-from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, FAULT_KINDS, State, make_uncertain
+from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, FAULT_KINDS, MOST_WAITING, State, make_uncertain
 from skyless.core.native.arithmetic import exp, sqrt, square
-from skyless.core.native.records import Ticks
+from skyless.core.native.records import Reals, Ticks
 
 # Time update
 
@@ -25,20 +25,23 @@ def predict(s: State, rx_ticks: Ticks) -> None:
     if status.obstruction > 0.0:
         status.obstruction *= exp(-dt / s.tuning.obstruction_memory_s)
     _advance(s, dt)
-    motion = settings.qa * status.q_scale
+    motion, white_m2 = settings.qa * status.q_scale, settings.white * dt
     if is_stationary(s):
         motion *= s.tuning.stationary_noise_share
+    square_s, cube_s = dt * dt / 2.0, dt * dt * dt / 3.0
     for axis in range(s.dim):
-        _add_noise(s, axis, axis, dt, 0.0, motion)
-        unknown = s.V[FAULT_KINDS * s.count + axis]  # an acceleration that the filter does not know of
-        unknown[axis] -= 0.5 * dt * dt
-        unknown[where.velocity + axis] -= dt
+        _add_noise(s, axis, axis, motion * cube_s, motion * square_s, motion * dt)
+        unknown = FAULT_KINDS * s.count + axis  # an acceleration that the filter does not know of
+        s.V[axis][unknown] -= 0.5 * dt * dt
+        s.V[where.velocity + axis][unknown] -= dt
     for anchor in range(s.count):
         offset = where.offset + anchor
-        _add_noise(s, offset, offset, dt, settings.white, settings.walk * s.anchors[anchor].walk_scale)
+        walk = settings.walk * s.anchors[anchor].walk_scale
+        _add_noise(s, offset, offset, white_m2 + walk * cube_s, walk * square_s, walk * dt)
+    walk = settings.walk * status.walk_scale
     for one in range(where.offset, where.velocity):
         for other in range(where.offset, where.velocity):
-            _add_noise(s, one, other, dt, settings.white, settings.walk * status.walk_scale)
+            _add_noise(s, one, other, white_m2 + walk * cube_s, walk * square_s, walk * dt)
     status.epoch_ticks = rx_ticks
 
 
@@ -52,7 +55,10 @@ def _advance(s: State, dt: float) -> None:
     values = s.layout.velocity
     for value in range(values):
         s.x[value] += dt * s.x[values + value]
-    for state in range(s.n):
+        effects, of_rate = s.V[value], s.V[values + value]
+        for fault in range(s.rows):
+            effects[fault] += dt * of_rate[fault]
+    for state in range(s.used):
         row = s.P[state]
         for value in range(values):
             row[value] += dt * row[values + value]
@@ -63,19 +69,15 @@ def _advance(s: State, dt: float) -> None:
     for value in range(values):
         for other in range(value):
             s.P[value][other] = s.P[other][value]
-    for fault in range(s.rows):
-        row = s.V[fault]
-        for value in range(values):
-            row[value] += dt * row[values + value]
 
 
-def _add_noise(s: State, value: int, other: int, dt: float, white: float, walk: float) -> None:
+def _add_noise(s: State, value: int, other: int, of_values: float, of_both: float, of_rates: float) -> None:
     """Q of a value and its rate, or what two such pairs have in common: white noise of values, walk of rates."""
     rate, other_rate = s.layout.velocity + value, s.layout.velocity + other
-    s.P[value][other] += white * dt + walk * dt * dt * dt / 3.0
-    s.P[value][other_rate] += walk * dt * dt / 2.0
-    s.P[rate][other] += walk * dt * dt / 2.0
-    s.P[rate][other_rate] += walk * dt
+    s.P[value][other] += of_values
+    s.P[value][other_rate] += of_both
+    s.P[rate][other] += of_both
+    s.P[rate][other_rate] += of_rates
 
 
 # Range errors that change
@@ -127,11 +129,11 @@ def _decay(s: State, state: int, kept: float, variance: float) -> None:
     row = s.P[state]
     for other in range(s.n):
         row[other] *= kept
-    for other in range(s.n):
+    for other in range(s.used):
         s.P[other][state] = row[other]
     row[state] = kept * row[state] + (1.0 - kept * kept) * variance
     for fault in range(s.rows):
-        s.V[fault][state] *= kept
+        s.V[state][fault] *= kept
 
 
 def reset_state(s: State, state: int, variance: float) -> None:
@@ -142,44 +144,149 @@ def reset_state(s: State, state: int, variance: float) -> None:
         s.P[other][state] = 0.0
     s.P[state][state] = variance
     for fault in range(s.rows):
-        s.V[fault][state] = 0.0
+        s.V[state][fault] = 0.0
 
 
 # Measurement update
 
 
 def compute_ph(s: State) -> float:
-    """Compute P·h of the measurement in ``h``; returns hᵀ·P·h."""
+    """Write P·h of the measurement in ``h`` into the next of ``U``; returns hᵀ·P·h. Counts updates that wait."""
+    if s.waiting == MOST_WAITING:
+        finish_updates(s)
+    ph = s.U[s.waiting]
     for state in range(s.n):
-        s.ph[state] = 0.0
+        ph[state] = 0.0
     for term in range(s.terms):
         if s.h_index[term] < s.n:
             weight, row = s.h[term], s.P[s.h_index[term]]
             for state in range(s.n):
-                s.ph[state] += weight * row[state]
+                ph[state] += weight * row[state]
+    for one in range(s.waiting):
+        weight, u = _h_dot(s, s.U[one]), s.U[one]
+        for state in range(s.n):
+            ph[state] -= weight * u[state]
+    return _h_dot(s, ph)
+
+
+def _h_dot(s: State, states: Reals) -> float:
+    """The measurement in ``h`` times what stands in the order of states."""
     total = 0.0
     for term in range(s.terms):
         if s.h_index[term] < s.n:
-            total += s.h[term] * s.ph[s.h_index[term]]
+            total += s.h[term] * states[s.h_index[term]]
     return total
 
 
+def compute_fault_input(s: State, own: int) -> None:
+    """Write s = [own reception] − h·V into the next of ``G``; ``own`` is the anchor that the tag received, or −1."""
+    shares = s.G[s.waiting]
+    for fault in range(s.rows):
+        shares[fault] = 0.0
+    for term in range(s.terms):
+        weight, effects = s.h[term], s.V[s.h_index[term]]
+        for fault in range(s.rows):
+            shares[fault] -= weight * effects[fault]
+    for one in range(s.waiting):
+        weight, effects = _h_dot(s, s.U[one]), s.G[one]
+        for fault in range(s.rows):
+            shares[fault] -= weight * effects[fault]
+    if own >= 0:
+        for kind in range(FAULT_KINDS):
+            shares[kind * s.count + own] += 1.0
+
+
 def update(s: State, innovation: float, innovation_variance: float, gain_scale: float = 1.0) -> None:
-    """Scalar update by the measurement in ``h`` with P·h in ``ph``.
+    """Scalar update by a measurement whose P·h and shares of faults are the next of ``U`` and ``G``.
 
     K = gain_scale·P·h/S. A scale of 1 is the Kalman gain; a measurement whose variance counts more has the S that
-    follows, and 1. P changes by −u·uᵀ with u = P·h/√S, which is symmetric to the bit.
+    follows, and 1. P changes by −u·uᵀ with u = P·h/√S, which is symmetric to the bit. No update may wait.
     """
-    root = sqrt(innovation_variance)
-    step = gain_scale * innovation / root
+    _note_update(s, innovation, innovation_variance, gain_scale)
+    _apply_updates(s)
+
+
+def update_later(s: State, innovation: float, innovation_variance: float) -> None:
+    """The same for a measurement that shows faults: y ← y + s·ν/S and M ← M + s·sᵀ/S.
+
+    P, V and M wait for ``finish_updates``; until then only ``compute_ph`` and ``compute_fault_input`` may read P and V.
+    """
+    g = s.G[s.waiting]
+    _note_update(s, innovation, innovation_variance, 1.0)
+    normalised = innovation / sqrt(innovation_variance)
+    for fault in range(FAULT_KINDS * s.count):
+        s.evidence[fault] += g[fault] * normalised
+
+
+def _note_update(s: State, innovation: float, innovation_variance: float, gain_scale: float) -> None:
+    """Update x, and make u = P·h/√S and g = s/√S of what stands in ``U`` and ``G``, for P and V."""
+    inverse = 1.0 / sqrt(innovation_variance)
+    step, u, g = gain_scale * inverse, s.U[s.waiting], s.G[s.waiting]
     for state in range(s.n):
-        s.ph[state] /= root
-    for state in range(s.n):
-        s.x[state] += s.ph[state] * step
-        factor, row = s.ph[state], s.P[state]
-        for other in range(s.n):
-            row[other] -= factor * s.ph[other]
+        u[state] *= inverse
     for fault in range(s.rows):
-        gain, row = gain_scale * s.fault_input[fault] / root, s.V[fault]
+        g[fault] *= step
+    step *= innovation
+    for state in range(s.used):
+        s.x[state] += u[state] * step
+    s.waiting += 1
+
+
+def finish_updates(s: State) -> None:
+    """Let P, V and M follow the updates that wait."""
+    if s.waiting == 0:
+        return
+    faults, groups = FAULT_KINDS * s.count, _fill_groups(s)
+    for group in range(groups):
+        k = 4 * group
+        for fault in range(faults):
+            a, b, c, d = s.G[k][fault], s.G[k + 1][fault], s.G[k + 2][fault], s.G[k + 3][fault]
+            for other in range(fault + 1):
+                s.information[fault][other] += (
+                    a * s.G[k][other] + b * s.G[k + 1][other] + c * s.G[k + 2][other] + d * s.G[k + 3][other]
+                )
+    _apply_updates(s)
+
+
+def _fill_groups(s: State) -> int:
+    """Fill the updates that wait with zeros up to a multiple of four; returns a quarter of their number."""
+    groups = (s.waiting + 3) // 4
+    for one in range(s.waiting, 4 * groups):
         for state in range(s.n):
-            row[state] += gain * s.ph[state]
+            s.U[one][state] = 0.0
+        for fault in range(s.rows):
+            s.G[one][fault] = 0.0
+    return groups
+
+
+def _apply_updates(s: State) -> None:
+    """P ← P − Σ u·uᵀ and V ← V + Σ u·gᵀ over the updates that wait, four at a time: P is read and written once."""
+    if s.waiting <= 2:
+        for one in range(s.waiting):
+            _apply_one(s, one)
+    else:
+        for group in range(_fill_groups(s)):
+            _apply_four(s, 4 * group)
+    s.waiting = 0
+
+
+def _apply_one(s: State, one: int) -> None:
+    for state in range(s.used):
+        u = s.U[one][state]
+        for other in range(s.n):
+            s.P[state][other] -= u * s.U[one][other]
+        for fault in range(s.rows):
+            s.V[state][fault] += u * s.G[one][fault]
+
+
+def _apply_four(s: State, k: int) -> None:
+    for state in range(s.used):
+        a, b, c, d = s.U[k][state], s.U[k + 1][state], s.U[k + 2][state], s.U[k + 3][state]
+        for other in range(s.n):
+            s.P[state][other] -= (
+                a * s.U[k][other] + b * s.U[k + 1][other] + c * s.U[k + 2][other] + d * s.U[k + 3][other]
+            )
+        for fault in range(s.rows):
+            s.V[state][fault] += (
+                a * s.G[k][fault] + b * s.G[k + 1][fault] + c * s.G[k + 2][fault] + d * s.G[k + 3][fault]
+            )

@@ -51,9 +51,9 @@ def protect(s: State) -> None:
             levels[VPL] = max(levels[VPL], abs(shift_z) + s.vertical_k * sqrt(scale * s.P[2][2] + zz))
     squared, up = 0.0, 0.0
     for row in range(FAULT_KINDS * s.count, FAULT_KINDS * s.count + s.dim):
-        squared += square(s.V[row][0]) + square(s.V[row][1])
+        squared += square(s.V[0][row]) + square(s.V[1][row])
         if s.dim == 3:
-            up += square(s.V[row][2])
+            up += square(s.V[2][row])
     levels[HPL] += settings.max_acceleration_mps2 * sqrt(squared)
     levels[VPL] += settings.max_acceleration_mps2 * sqrt(up)
 

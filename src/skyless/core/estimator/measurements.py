@@ -13,8 +13,17 @@ with offsets b, TX noise w, all in metres. ``docs/maths.md`` section 6 derives t
 from typing import Final
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_S
-from skyless.core.estimator.faults import compute_fault_input, end_lasting_fault, gather_evidence, subtract_fault_input
-from skyless.core.estimator.kalman import compute_ph, jump_share, relax_range_error, reset_state, update
+from skyless.core.estimator.faults import end_lasting_fault, subtract_fault_input
+from skyless.core.estimator.kalman import (
+    compute_fault_input,
+    compute_ph,
+    finish_updates,
+    jump_share,
+    relax_range_error,
+    reset_state,
+    update,
+    update_later,
+)
 from skyless.core.estimator.monitor import (
     adapt_change_noise,
     adapt_change_variance,
@@ -188,8 +197,7 @@ def own_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, varia
             adapt_process_noise(s, normalised / scale)
         used_variance = innovation_variance * scale + (variance_factor - 1.0) * settings.rx_variance_m2
         compute_fault_input(s, anchor)
-        gather_evidence(s, innovation, used_variance)
-        update(s, innovation, used_variance)
+        update_later(s, innovation, used_variance)
         adapt_change_variance(s, anchor, elapsed_s)
     _carry_ticks(s, anchor)
     return USED if scale > 0.0 else UNUSED
@@ -248,11 +256,11 @@ def first_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> 
     variance += 2.0 * curvature_m * curvature_m + compute_ph(s)
     compute_fault_input(s, anchor)
     for state in range(s.n):
-        s.P[state][offset] = -s.ph[state]
-        s.P[offset][state] = -s.ph[state]
+        s.P[state][offset] = -s.U[0][state]
+        s.P[offset][state] = -s.U[0][state]
     s.P[offset][offset] = variance
     for fault in range(s.rows):
-        s.V[fault][offset] = s.fault_input[fault]
+        s.V[offset][fault] = s.G[0][fault]
     a.offset_ticks = rx_ticks - tx_ticks - floor(range_m / TICK_M)
     rest_m = (rx_ticks - tx_ticks - a.offset_ticks) * TICK_M
     s.x[offset] = rest_m - range_m - curvature_m - _h_dot_x(s, _direction_terms(s))
@@ -346,10 +354,9 @@ def _find_distance_m(s: State, one: int, other: int) -> float:
 
 
 def _use(s: State, innovation: float, innovation_variance: float) -> None:
-    """Update by the measurement in ``h``, which is no reception of the tag's, and by what it shows of faults."""
+    """Update by the measurement in ``h``, which is no reception of the tag's, and by what it shows of faults; later."""
     compute_fault_input(s, -1)
-    gather_evidence(s, innovation, innovation_variance)
-    update(s, innovation, innovation_variance)
+    update_later(s, innovation, innovation_variance)
 
 
 def _survey_pair(s: State, one: int, other: int) -> None:
@@ -362,6 +369,7 @@ def _survey_pair(s: State, one: int, other: int) -> None:
     most = max(contradicted, rival)
     if contradicted == rival or most < s.tuning.misplaced_pairs or not _pair(s, one, other).contradicts:
         return
+    finish_updates(s)
     misplaced = one if contradicted > rival else other
     a, survey = s.anchors[misplaced], s.layout.survey + s.dim * misplaced
     make_uncertain(s, ALL_RANGE_ERRORS)
@@ -408,6 +416,7 @@ def report(s: State, anchor: int, master: int, subticks: Ticks, variance_m2: flo
     packet's TX stamp, modulo 2⁴⁸.
     """
     a, status = s.anchors[anchor], s.status
+    finish_updates(s)
     relay_terms(s, anchor, master, a.range_m / SPEED_OF_LIGHT_MPS, False)
     own_variance = 0.0
     for one in range(s.terms):
@@ -474,8 +483,8 @@ def difference(s: State, a: int, b: int, rx_ticks: Ticks, difference_m: float) -
         adapt_process_noise(s, innovation / sqrt(innovation_variance) / scale)
     compute_fault_input(s, b)
     subtract_fault_input(s, a)
-    gather_evidence(s, innovation, innovation_variance * scale)
-    update(s, innovation, innovation_variance * scale)
+    update_later(s, innovation, innovation_variance * scale)
+    finish_updates(s)
     _bound_changes(s)
     end_small_obstruction(s, a)
     end_small_obstruction(s, b)
@@ -521,6 +530,7 @@ def height(s: State, height_m: float, std_m: float, is_barometer: bool) -> int:
     if innovation * innovation > square(settings.gate) * innovation_variance:
         return UNUSED
     _use(s, innovation, innovation_variance)
+    finish_updates(s)
     status.height_ticks = status.epoch_ticks
     return USED
 

@@ -19,7 +19,7 @@ says what each of these buys.
 from typing import Final
 
 from skyless.core.estimator.faults import begin_obstruction
-from skyless.core.estimator.kalman import jump_share
+from skyless.core.estimator.kalman import finish_updates, jump_share
 from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, State, make_uncertain
 from skyless.core.native.arithmetic import log, sqrt, square
 
@@ -148,6 +148,7 @@ def adapt_change_variance(s: State, anchor: int, elapsed_s: float) -> None:
     tuning, settings, a = s.tuning, s.settings, s.anchors[anchor]
     memory_s = settings.change_memory_s
     if memory_s > 0.0:
+        finish_updates(s)
         change = s.layout.change + anchor
         present = square(s.x[change]) + s.P[change][change]
         variance = a.change_variance_m2 + min(elapsed_s / memory_s, 0.5) * (present - a.change_variance_m2)

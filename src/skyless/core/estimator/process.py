@@ -4,7 +4,7 @@ from typing import Annotated, Final
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.core.estimator.faults import fade_faults, open_faults
-from skyless.core.estimator.kalman import is_stationary, predict
+from skyless.core.estimator.kalman import finish_updates, is_stationary, predict
 from skyless.core.estimator.levels import fit_plane, integrity_state, largest_test, protect
 from skyless.core.estimator.measurements import (
     CLOCK_JUMPED,
@@ -183,6 +183,7 @@ def _process_of(s: State, anchor: int, packet: Packet) -> int:
         status.relays_lately_rejected *= 1.0 - s.tuning.mean_gain
         for one in range(packet.relay_count):
             _process_relay(s, anchor, packet.relays[one])
+        finish_updates(s)
         if packet.report_variance_m2 > 0.0 and packet.master >= 0:
             master = find_anchor(s, packet.master)
             if master >= 0 and master != anchor:

@@ -70,7 +70,7 @@ def _parts(s: State) -> list[NDArray[Any]]:
         view(s.status),
         view(s.x)[:n],
         view(s.P)[:n, :n],
-        view(s.V)[: faults + s.dim, :n],
+        view(s.V)[:n, : faults + s.dim],
         view(s.information)[:faults, :faults],
         view(s.evidence)[:faults],
         view(s.anchors)[:count],

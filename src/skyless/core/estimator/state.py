@@ -18,27 +18,26 @@ covariance, so it is left out of all arithmetic (``State.n``), until a jump or a
 behind the states in use is zero.
 """
 
-from ctypes import sizeof
 from typing import Annotated, Final
-
-import numpy as np
 
 from skyless.core.estimator.settings import TUNING, EstimatorSettings, Tuning
 from skyless.core.fix import PROTECTED_ROWS
 from skyless.core.integrity import limits_of
 from skyless.core.native.arithmetic import square
-from skyless.core.native.records import Array, Count, Integers, Matrix, Reals, Record, Ticks, record
+from skyless.core.native.records import Array, Count, Integers, Matrix, Reals, Record, Ticks, aligned, record
 
 MAX_ANCHORS: Final = 32
 """Most anchors in the state."""
 PACKETS_KEPT: Final = 16
 """Packets of each anchor that are kept for relays to come; divides the range of sequence numbers."""
-LANES: Final = 8
-"""Numbers in the longest vectors of processors."""
+LANES: Final = 4
+"""Numbers in a vector of 256 bits."""
 
 AXES: Final = 3
 STATES: Final = 2 * (AXES + MAX_ANCHORS) + (3 + AXES) * MAX_ANCHORS + 2
 """Capacity for states; a multiple of ``LANES``."""
+MOST_WAITING: Final = 8
+"""Most updates that wait."""
 MOST_TERMS: Final = 2 * (AXES + 3) + 8
 """Most terms of a measurement: a difference of two distances has the most."""
 
@@ -47,9 +46,9 @@ LASTING, RECENT, CREEPING = range(3)
 FAULT_KINDS: Final = 3
 FAULTS: Final = FAULT_KINDS * MAX_ANCHORS
 EXTRA_ROWS: Final = 1 + 4 * AXES
-"""Rows of V for what planning adds."""
+"""Columns of V for what planning adds."""
 SENSITIVITIES: Final = FAULTS + AXES + EXTRA_ROWS
-"""Capacity for rows of V."""
+"""Capacity for columns of V."""
 WORK_ROWS: Final = MAX_ANCHORS + 1 + AXES
 
 NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS, ALL_RANGE_ERRORS = range(3)
@@ -239,8 +238,14 @@ class Layout(Record):
 
 @record
 class State(Record):
-    """Everything that the estimator keeps of one tag."""
+    """Everything that the estimator keeps of one tag. What loops run over stands first: its rows fill cache lines."""
 
+    x: Annotated[Reals, STATES]
+    P: Annotated[Matrix, STATES, STATES]
+    """Symmetric to the bit."""
+    V: Annotated[Matrix, STATES, SENSITIVITIES]
+    """What faults do to x: of each kind for each metre by which receptions of an anchor are late, then for each m/s² of
+    acceleration along an axis, then what planning adds."""
     settings: EstimatorSettings
     tuning: Tuning
     horizontal_k: float
@@ -250,20 +255,16 @@ class State(Record):
     """Dimensions of the position: 2 where the height is given, else 3."""
     count: int
     """Anchors in the state."""
+    used: int
+    """States that are not known to be exact; covariances with all others are zero."""
     n: int
-    """States that are not known to be exact, up to a multiple of ``LANES``; covariances with all others are zero."""
+    """The same up to a multiple of ``LANES``: what loops along rows of P go to."""
     rows: int
-    """Rows of V in use."""
+    """Columns of V in use."""
     layout: Layout
     status: Status
-    x: Annotated[Reals, STATES]
-    P: Annotated[Matrix, STATES, STATES]
-    """Symmetric to the bit."""
-    V: Annotated[Matrix, SENSITIVITIES, STATES]
-    """What faults do to x: of each kind for each metre by which receptions of an anchor are late, then for each m/s² of
-    acceleration along an axis, then what planning adds."""
     information: Annotated[Matrix, FAULTS, FAULTS]
-    """Information of the innovations on all faults."""
+    """Information of the innovations on all faults; the lower half."""
     evidence: Annotated[Reals, FAULTS]
     """What innovations show of them."""
     anchors: Annotated[Array[Anchor], MAX_ANCHORS]
@@ -275,10 +276,12 @@ class State(Record):
     h: Annotated[Reals, MOST_TERMS]
     """The measurement where it is not zero, at the indices in ``h_index``."""
     h_index: Annotated[Integers, MOST_TERMS]
-    ph: Annotated[Reals, STATES]
-    """P·h of the measurement at hand."""
-    fault_input: Annotated[Reals, SENSITIVITIES]
-    """By how much each fault is in the present innovation."""
+    waiting: int
+    """Updates that are not in P and V yet: those of a packet's relays go there together."""
+    U: Annotated[Matrix, MOST_WAITING, STATES]
+    """Of each its u = P·h/√S; then P·h of the measurement at hand."""
+    G: Annotated[Matrix, MOST_WAITING, SENSITIVITIES]
+    """Of each, over √S, by how much each fault is in its innovation; then the same of the measurement at hand."""
     work: Annotated[Matrix, WORK_ROWS, MAX_ANCHORS]
     """Scratch for systems of equations of all faults of one kind."""
     levels: Annotated[Reals, LEVELS]
@@ -288,7 +291,7 @@ class State(Record):
 
 def new_state(settings: EstimatorSettings, *, has_open_ranges: bool = False) -> State:
     """A state without anchors at the origin; see ``Estimator.start``."""
-    s = State.from_buffer(np.zeros(sizeof(State), np.uint8).data)  # pages that are never used take no memory
+    s = aligned(State)
     s.settings, s.tuning = settings, TUNING
     s.horizontal_k, s.vertical_k = limits_of(settings.integrity_risk)[:2]
     s.dim = settings.dim
@@ -346,6 +349,7 @@ def make_uncertain(s: State, range_errors: int) -> None:
         end = s.layout.constant
     elif s.status.range_errors == ALL_RANGE_ERRORS:
         end = s.layout.end
+    s.used = end
     s.n = (end + LANES - 1) // LANES * LANES
 
 
@@ -448,13 +452,15 @@ def _insert_state(s: State, index: int) -> None:
         s.x[state] = s.x[state - 1]
         for other in range(end):
             s.P[state][other] = s.P[state - 1][other]
+        for row in range(s.rows):
+            s.V[state][row] = s.V[state - 1][row]
     s.x[index] = 0.0
     for other in range(end):
         s.P[index][other] = 0.0
+    for row in range(s.rows):
+        s.V[index][row] = 0.0
     for state in range(end + 1):
         _insert(s.P[state], index, end)
-    for row in range(s.rows):
-        _insert(s.V[row], index, end)
     s.layout.end = end + 1
 
 
@@ -465,24 +471,22 @@ def _remove_state(s: State, index: int) -> None:
         s.x[state] = s.x[state + 1]
         for other in range(end):
             s.P[state][other] = s.P[state + 1][other]
+        for row in range(s.rows):
+            s.V[state][row] = s.V[state + 1][row]
     s.x[end - 1] = 0.0
     for other in range(end):
         s.P[end - 1][other] = 0.0
+    for row in range(s.rows):
+        s.V[end - 1][row] = 0.0
     for state in range(end):
         _remove(s.P[state], index, end)
-    for row in range(s.rows):
-        _remove(s.V[row], index, end)
     s.layout.end = end - 1
 
 
 def _insert_fault(s: State, index: int, faults: int) -> None:
     """Move all faults from an index on one place back; the one that is there then is zero."""
-    end = s.layout.end
-    for row in range(s.rows, index, -1):
-        for state in range(end):
-            s.V[row][state] = s.V[row - 1][state]
-    for state in range(end):
-        s.V[index][state] = 0.0
+    for state in range(s.layout.end):
+        _insert(s.V[state], index, s.rows)
     s.rows += 1
     for row in range(faults, index, -1):
         for other in range(faults):
@@ -496,12 +500,8 @@ def _insert_fault(s: State, index: int, faults: int) -> None:
 
 def _remove_fault(s: State, index: int, faults: int) -> None:
     """Move all faults behind an index one place forward."""
-    end = s.layout.end
-    for row in range(index, s.rows - 1):
-        for state in range(end):
-            s.V[row][state] = s.V[row + 1][state]
-    for state in range(end):
-        s.V[s.rows - 1][state] = 0.0
+    for state in range(s.layout.end):
+        _remove(s.V[state], index, s.rows)
     s.rows -= 1
     for row in range(index, faults - 1):
         for other in range(faults):

@@ -13,8 +13,16 @@ by the share, and those of relayed receptions by the share of all three that the
 from typing import Annotated, Final
 
 from skyless.core.constants import TICK_S
-from skyless.core.estimator.faults import compute_fault_input
-from skyless.core.estimator.kalman import compute_ph, predict, relax_range_error, reset_state, update
+from skyless.core.estimator.kalman import (
+    compute_fault_input,
+    compute_ph,
+    finish_updates,
+    predict,
+    relax_range_error,
+    reset_state,
+    update,
+    update_later,
+)
 from skyless.core.estimator.measurements import (
     add_pair_survey,
     first_reception,
@@ -141,6 +149,7 @@ def _process_superframe(
             for other in range(begin, message.end):
                 if relays[other].sender >= 0 and s.anchors[relays[other].sender].packets > 0:
                     _receive_relay(s, message, relays[other])
+            finish_updates(s)
             _add_fix(s, message.share, found)
         begin = message.end
 
@@ -150,9 +159,9 @@ def _add_fix(s: State, share: float, found: SteadyState) -> None:
     found.fixes += share
     for axis in range(s.dim):
         found.variance_m2[axis] += share * s.P[axis][axis]
-        found.square_bias_m2 += share * square(s.V[_walls(s)][axis])
+        found.square_bias_m2 += share * square(s.V[axis][_walls(s)])
         for row in range(_walls(s) + 1, s.rows):
-            found.motion_m2[axis] += share * square(s.V[row][axis])
+            found.motion_m2[axis] += share * square(s.V[axis][row])
 
 
 def _predict_with_impulses(s: State, now: Ticks, impulses_ticks: Ticks, superframe: Ticks) -> None:
@@ -163,9 +172,9 @@ def _predict_with_impulses(s: State, now: Ticks, impulses_ticks: Ticks, superfra
         moment = impulses_ticks + floor((impulse + 0.5) / IMPULSES * superframe + 0.5)
         if before < moment <= now:
             for axis in range(s.dim):
-                row = s.V[_walls(s) + 1 + s.dim * impulse + axis]
-                row[axis] = (now - moment) * TICK_S
-                row[s.layout.velocity + axis] = 1.0
+                row = _walls(s) + 1 + s.dim * impulse + axis
+                s.V[axis][row] = (now - moment) * TICK_S
+                s.V[s.layout.velocity + axis][row] = 1.0
 
 
 def _receive(s: State, message: PlannedMessage, rx_ticks: Ticks) -> None:
@@ -173,14 +182,14 @@ def _receive(s: State, message: PlannedMessage, rx_ticks: Ticks) -> None:
     a, where = s.anchors[message.anchor], s.layout
     if a.packets == 0:
         first_reception(s, message.anchor, rx_ticks, rx_ticks)
-        s.V[_walls(s)][where.offset + message.anchor] += message.late_m
+        s.V[where.offset + message.anchor][_walls(s)] += message.late_m
     else:
         relax_range_error(s, message.anchor, (rx_ticks - a.rx_ticks) * TICK_S, 0.0)
         reset_state(s, where.tx_noise + message.anchor, s.settings.tx_variance_m2 / message.share)
         reception_terms(s, message.anchor, True)
         variance = compute_ph(s) + s.settings.rx_variance_m2 / message.share
         compute_fault_input(s, message.anchor)
-        s.fault_input[_walls(s)] += message.late_m
+        s.G[s.waiting][_walls(s)] += message.late_m
         update(s, 0.0, variance)
     a.rx_ticks = rx_ticks
     a.packets += 1
@@ -193,8 +202,8 @@ def _receive_relay(s: State, message: PlannedMessage, relayed: PlannedRelay) -> 
     variance += compute_ph(s)
     compute_fault_input(s, -1)
     if s.links[message.anchor][relayed.sender].variance_m2 == 0.0:  # else the pair's constant takes the delay
-        s.fault_input[_walls(s)] += relayed.late_m
-    update(s, 0.0, variance)
+        s.G[s.waiting][_walls(s)] += relayed.late_m
+    update_later(s, 0.0, variance)
 
 
 # Cramér–Rao bounds

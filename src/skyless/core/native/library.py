@@ -5,15 +5,15 @@ With ``SKYLESS_UNCOMPILED=1`` in the environment the Python itself runs: the sam
 
 import ctypes
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, ParamSpec, TypeVar, cast, get_origin, get_type_hints
+from typing import Any, Final, ParamSpec, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from skyless.core.errors import SkylessError
-from skyless.core.native.records import Record, c_type
+from skyless.core.native.records import Array, Record, c_type
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -43,7 +43,7 @@ def library() -> ctypes.CDLL:
     try:
         found = ctypes.CDLL(str(file))
     except OSError as error:
-        raise SkylessError(f"{file}: {error}; {again}") from None
+        raise SkylessError(f"the estimator's library: {error}; {again}") from None
     digest = ctypes.c_char_p.in_dll(found, "skyless_source_digest").value
     if SOURCE.exists() and digest != source_digest(SOURCE).encode():
         raise SkylessError(f"{file} was made from another {SOURCE.name} than the one beside it; {again}")
@@ -53,7 +53,7 @@ def library() -> ctypes.CDLL:
 def _has_avx2() -> bool:
     """Whether this processor has vectors of 256 bits; where that is not known, it counts as without."""
     try:
-        return _AVX2 <= set(Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").split())
+        return set(Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").split()) >= _AVX2
     except OSError:
         return False
 
@@ -69,7 +69,7 @@ def source_digest(source: Path) -> str:
 def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """The function of the library that was made from one in Python.
 
-    Records are given as they are, arrays as ctypes has them, bytes also as ``bytes``. Nothing is checked but types.
+    Records are given as they are, arrays as ctypes or NumPy has them, bytes also as ``bytes``. Lengths are not checked.
     """
     if not is_compiled():
         return function
@@ -82,21 +82,33 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
 
 
 def _argument_type(hint: Any) -> Any:  # noqa: ANN401 - types have no type
-    origin = get_origin(hint)
-    if origin is not None and origin.__name__ in {"Array", "Sequence"}:
-        return _Address
+    if get_origin(hint) in {Array, Sequence}:
+        return _address_type(c_type(get_args(hint)[0]))
     found = c_type(hint)
-    if issubclass(found, Record):
-        return ctypes.POINTER(found)
-    return _Address if issubclass(found, ctypes.Array) else found
+    return ctypes.POINTER(found) if issubclass(found, Record) else found
 
 
-class _Address:
-    """Where an array or bytes stand."""
+@cache
+def _address_type(element: Any) -> type:  # noqa: ANN401 - types have no type
+    """The type of an argument that is an array of such elements."""
+    expected = np.dtype(element)
 
-    @classmethod
-    def from_param(cls, array: Any) -> Any:  # noqa: ANN401 - arrays of several libraries
-        """What ctypes gives to C; the array has to be contiguous."""
-        if isinstance(array, np.ndarray):
+    class Address:
+        @classmethod
+        def from_param(cls, array: Any) -> Any:  # noqa: ANN401 - arrays of several libraries
+            """What ctypes gives to C.
+
+            Raises:
+                TypeError: it has other elements, or they do not follow each other in memory.
+            """
+            if getattr(array, "_type_", None) is element or (isinstance(array, bytes) and element is ctypes.c_uint8):
+                return ctypes.c_void_p.from_param(array)
+            if not isinstance(array, np.ndarray):
+                raise TypeError(f"the array is a {type(array).__name__}; it should have elements of {expected}")
+            if array.dtype != expected:
+                raise TypeError(f"the array has elements of {array.dtype}; they should be of {expected}")
+            if not array.flags.c_contiguous:
+                raise TypeError(f"the array's strides are {array.strides}; it should be contiguous")
             return ctypes.c_void_p(array.ctypes.data)
-        return ctypes.c_void_p.from_param(array)
+
+    return Address

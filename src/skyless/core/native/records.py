@@ -48,6 +48,7 @@ Byte = Annotated[int, ctypes.c_uint8]
 REAL: Final = ctypes.c_double
 """What a ``float`` of a record is; C's ``real``."""
 
+_CACHE_LINE: Final = 64
 _C_TYPES: Final[dict[object, Any]] = {int: ctypes.c_int32, bool: ctypes.c_bool, float: REAL}
 
 
@@ -146,3 +147,10 @@ def view(array: Any) -> NDArray[Any]:  # noqa: ANN401 - ctypes' arrays have no c
 def records(made: type[Made], array: NDArray[np.void]) -> Array[Made]:
     """The records of a NumPy array of their type, shape (n,), in the same memory."""
     return (made * len(array)).from_buffer(array.data)
+
+
+def aligned(made: type[Made]) -> Made:
+    """A record of zeros that begins at a cache line. Pages of it that are never used take no memory."""
+    memory = np.zeros(ctypes.sizeof(made) + _CACHE_LINE, np.uint8)
+    begin = -memory.ctypes.data % _CACHE_LINE
+    return made.from_buffer(memory[begin : begin + ctypes.sizeof(made)].data)

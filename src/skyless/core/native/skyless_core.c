@@ -47,7 +47,10 @@ static inline real abs_real(real x) { return FABS(x); }
 static inline int32_t abs_32(int32_t x) { return x < 0 ? -x : x; }
 static inline int64_t abs_64(int64_t x) { return x < 0 ? -x : x; }
 static inline int64_t truncated(real x) { return REAL(-9e18) < x && x < REAL(9e18) ? (int64_t)x : 0; }
-static inline int64_t floor_real(real x) { const int64_t t = truncated(x); return t - (x < (real)t && x > REAL(-9e18)); }
+static inline int64_t floor_real(real x) {
+    const int64_t t = truncated(x);
+    return t - (x < (real)t && x > REAL(-9e18));
+}
 static inline int32_t floor_div_32(int32_t x, int32_t y) { return x / y - (x % y != 0 && (x < 0) != (y < 0)); }
 static inline int64_t floor_div_64(int64_t x, int64_t y) { return x / y - (x % y != 0 && (x < 0) != (y < 0)); }
 static inline int32_t floor_mod_32(int32_t x, int32_t y) { return x - y * floor_div_32(x, y); }
@@ -71,17 +74,24 @@ INTERNAL void remove_(real *numbers, int32_t index_, int32_t end);
 INTERNAL void predict(State *s, int64_t rx_ticks);
 INTERNAL bool is_stationary(State *s);
 INTERNAL void advance(State *s, real dt);
-INTERNAL void add_noise(State *s, int32_t value, int32_t other, real dt, real white, real walk);
+INTERNAL void add_noise(State *s, int32_t value, int32_t other, real of_values, real of_both, real of_rates);
 INTERNAL real jump_share(State *s);
 INTERNAL range_error_decay_results range_error_decay(State *s, int32_t anchor, real dt, real walked_m);
 INTERNAL void relax_range_error(State *s, int32_t anchor, real dt, real walked_m);
 INTERNAL void decay(State *s, int32_t state, real kept, real variance);
 INTERNAL void reset_state(State *s, int32_t state, real variance);
 INTERNAL real compute_ph(State *s);
-INTERNAL void update(State *s, real innovation, real innovation_variance, real gain_scale);
+INTERNAL real h_dot(State *s, real *states);
 INTERNAL void compute_fault_input(State *s, int32_t own);
+INTERNAL void update(State *s, real innovation, real innovation_variance, real gain_scale);
+INTERNAL void update_later(State *s, real innovation, real innovation_variance);
+INTERNAL void note_update(State *s, real innovation, real innovation_variance, real gain_scale);
+INTERNAL void finish_updates(State *s);
+INTERNAL int32_t fill_groups(State *s);
+INTERNAL void apply_updates(State *s);
+INTERNAL void apply_one(State *s, int32_t one);
+INTERNAL void apply_four(State *s, int32_t k);
 INTERNAL void subtract_fault_input(State *s, int32_t anchor);
-INTERNAL void gather_evidence(State *s, real innovation, real innovation_variance);
 INTERNAL void fade_faults(State *s);
 INTERNAL void whiten(State *s, int32_t count, int32_t vectors);
 INTERNAL real fault_chi2(State *s, int32_t kind, int32_t axes);
@@ -347,6 +357,7 @@ INTERNAL void make_uncertain(State *s, int32_t range_errors) {
     } else if (s->status.range_errors == ALL_RANGE_ERRORS) {
         end = s->layout.end;
     }
+    s->used = end;
     s->n = floor_div_32(end + LANES - 1, LANES) * LANES;
 }
 
@@ -475,16 +486,19 @@ INTERNAL void insert_state(State *s, int32_t index_) {
         for (int32_t other = 0; other < end; other++) {
             s->P[state][other] = s->P[state - 1][other];
         }
+        for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
+            s->V[state][row] = s->V[state - 1][row];
+        }
     }
     s->x[index_] = REAL(0.0);
     for (int32_t other = 0; other < end; other++) {
         s->P[index_][other] = REAL(0.0);
     }
+    for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
+        s->V[index_][row] = REAL(0.0);
+    }
     for (int32_t state = 0; state < end + 1; state++) {
         insert(s->P[state], index_, end);
-    }
-    for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
-        insert(s->V[row], index_, end);
     }
     s->layout.end = end + 1;
 }
@@ -497,30 +511,27 @@ INTERNAL void remove_state(State *s, int32_t index_) {
         for (int32_t other = 0; other < end; other++) {
             s->P[state][other] = s->P[state + 1][other];
         }
+        for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
+            s->V[state][row] = s->V[state + 1][row];
+        }
     }
     s->x[end - 1] = REAL(0.0);
     for (int32_t other = 0; other < end; other++) {
         s->P[end - 1][other] = REAL(0.0);
     }
+    for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
+        s->V[end - 1][row] = REAL(0.0);
+    }
     for (int32_t state = 0; state < end; state++) {
         remove_(s->P[state], index_, end);
-    }
-    for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
-        remove_(s->V[row], index_, end);
     }
     s->layout.end = end - 1;
 }
 
 /* Move all faults from an index on one place back; the one that is there then is zero. */
 INTERNAL void insert_fault(State *s, int32_t index_, int32_t faults) {
-    int32_t end = s->layout.end;
-    for (int32_t row = s->rows; row > index_; row--) {
-        for (int32_t state = 0; state < end; state++) {
-            s->V[row][state] = s->V[row - 1][state];
-        }
-    }
-    for (int32_t state = 0; state < end; state++) {
-        s->V[index_][state] = REAL(0.0);
+    for (int32_t state = 0, state_end = s->layout.end; state < state_end; state++) {
+        insert(s->V[state], index_, s->rows);
     }
     s->rows += 1;
     for (int32_t row = faults; row > index_; row--) {
@@ -539,14 +550,8 @@ INTERNAL void insert_fault(State *s, int32_t index_, int32_t faults) {
 
 /* Move all faults behind an index one place forward. */
 INTERNAL void remove_fault(State *s, int32_t index_, int32_t faults) {
-    int32_t end = s->layout.end;
-    for (int32_t row = index_, row_end = s->rows - 1; row < row_end; row++) {
-        for (int32_t state = 0; state < end; state++) {
-            s->V[row][state] = s->V[row + 1][state];
-        }
-    }
-    for (int32_t state = 0; state < end; state++) {
-        s->V[s->rows - 1][state] = REAL(0.0);
+    for (int32_t state = 0, state_end = s->layout.end; state < state_end; state++) {
+        remove_(s->V[state], index_, s->rows);
     }
     s->rows -= 1;
     for (int32_t row = index_; row < faults - 1; row++) {
@@ -589,6 +594,7 @@ INTERNAL void remove_(real *numbers, int32_t index_, int32_t end) {
  *
  * The tag's oscillator is in all offsets, so its noise is common to them. */
 INTERNAL void predict(State *s, int64_t rx_ticks) {
+    real walk = 0;
     Status *status = &s->status;
     EstimatorSettings *settings = &s->settings;
     Layout *where = &s->layout;
@@ -603,22 +609,27 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
     }
     advance(s, dt);
     real motion = settings->qa * status->q_scale;
+    real white_m2 = settings->white * dt;
     if (is_stationary(s)) {
         motion *= s->tuning.stationary_noise_share;
     }
+    real square_s = dt * dt / REAL(2.0);
+    real cube_s = dt * dt * dt / REAL(3.0);
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
-        add_noise(s, axis, axis, dt, REAL(0.0), motion);
-        real *unknown = s->V[FAULT_KINDS * s->count + axis];  /* an acceleration that the filter does not know of */
-        unknown[axis] -= REAL(0.5) * dt * dt;
-        unknown[where->velocity + axis] -= dt;
+        add_noise(s, axis, axis, motion * cube_s, motion * square_s, motion * dt);
+        int32_t unknown = FAULT_KINDS * s->count + axis;  /* an acceleration that the filter does not know of */
+        s->V[axis][unknown] -= REAL(0.5) * dt * dt;
+        s->V[where->velocity + axis][unknown] -= dt;
     }
     for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
         int32_t offset = where->offset + anchor;
-        add_noise(s, offset, offset, dt, settings->white, settings->walk * s->anchors[anchor].walk_scale);
+        walk = settings->walk * s->anchors[anchor].walk_scale;
+        add_noise(s, offset, offset, white_m2 + walk * cube_s, walk * square_s, walk * dt);
     }
+    walk = settings->walk * status->walk_scale;
     for (int32_t one = where->offset, one_end = where->velocity; one < one_end; one++) {
         for (int32_t other = where->offset, other_end = where->velocity; other < other_end; other++) {
-            add_noise(s, one, other, dt, settings->white, settings->walk * status->walk_scale);
+            add_noise(s, one, other, white_m2 + walk * cube_s, walk * square_s, walk * dt);
         }
     }
     status->epoch_ticks = rx_ticks;
@@ -634,8 +645,13 @@ INTERNAL void advance(State *s, real dt) {
     int32_t values = s->layout.velocity;
     for (int32_t value = 0; value < values; value++) {
         s->x[value] += dt * s->x[values + value];
+        real *effects = s->V[value];
+        real *of_rate = s->V[values + value];
+        for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+            effects[fault] += dt * of_rate[fault];
+        }
     }
-    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+    for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
         real *row = s->P[state];
         for (int32_t value = 0; value < values; value++) {
             row[value] += dt * row[values + value];
@@ -653,22 +669,16 @@ INTERNAL void advance(State *s, real dt) {
             s->P[value][other] = s->P[other][value];
         }
     }
-    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-        real *row = s->V[fault];
-        for (int32_t value = 0; value < values; value++) {
-            row[value] += dt * row[values + value];
-        }
-    }
 }
 
 /* Q of a value and its rate, or what two such pairs have in common: white noise of values, walk of rates. */
-INTERNAL void add_noise(State *s, int32_t value, int32_t other, real dt, real white, real walk) {
+INTERNAL void add_noise(State *s, int32_t value, int32_t other, real of_values, real of_both, real of_rates) {
     int32_t rate = s->layout.velocity + value;
     int32_t other_rate = s->layout.velocity + other;
-    s->P[value][other] += white * dt + walk * dt * dt * dt / REAL(3.0);
-    s->P[value][other_rate] += walk * dt * dt / REAL(2.0);
-    s->P[rate][other] += walk * dt * dt / REAL(2.0);
-    s->P[rate][other_rate] += walk * dt;
+    s->P[value][other] += of_values;
+    s->P[value][other_rate] += of_both;
+    s->P[rate][other] += of_both;
+    s->P[rate][other_rate] += of_rates;
 }
 
 /* Range errors that change */
@@ -732,12 +742,12 @@ INTERNAL void decay(State *s, int32_t state, real kept, real variance) {
     for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
         row[other] *= kept;
     }
-    for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
+    for (int32_t other = 0, other_end = s->used; other < other_end; other++) {
         s->P[other][state] = row[other];
     }
     row[state] = kept * row[state] + (REAL(1.0) - kept * kept) * variance;
     for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-        s->V[fault][state] *= kept;
+        s->V[state][fault] *= kept;
     }
 }
 
@@ -750,58 +760,194 @@ INTERNAL void reset_state(State *s, int32_t state, real variance) {
     }
     s->P[state][state] = variance;
     for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-        s->V[fault][state] = REAL(0.0);
+        s->V[state][fault] = REAL(0.0);
     }
 }
 
 /* Measurement update */
 
-/* Compute P·h of the measurement in ``h``; returns hᵀ·P·h. */
+/* Write P·h of the measurement in ``h`` into the next of ``U``; returns hᵀ·P·h. Counts updates that wait. */
 INTERNAL real compute_ph(State *s) {
+    if (s->waiting == MOST_WAITING) {
+        finish_updates(s);
+    }
+    real *ph = s->U[s->waiting];
     for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-        s->ph[state] = REAL(0.0);
+        ph[state] = REAL(0.0);
     }
     for (int32_t term = 0, term_end = s->terms; term < term_end; term++) {
         if (s->h_index[term] < s->n) {
             real weight = s->h[term];
             real *row = s->P[s->h_index[term]];
             for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-                s->ph[state] += weight * row[state];
+                ph[state] += weight * row[state];
             }
         }
     }
+    for (int32_t one = 0, one_end = s->waiting; one < one_end; one++) {
+        real weight = h_dot(s, s->U[one]);
+        real *u = s->U[one];
+        for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+            ph[state] -= weight * u[state];
+        }
+    }
+    return h_dot(s, ph);
+}
+
+/* The measurement in ``h`` times what stands in the order of states. */
+INTERNAL real h_dot(State *s, real *states) {
     real total = REAL(0.0);
     for (int32_t term = 0, term_end = s->terms; term < term_end; term++) {
         if (s->h_index[term] < s->n) {
-            total += s->h[term] * s->ph[s->h_index[term]];
+            total += s->h[term] * states[s->h_index[term]];
         }
     }
     return total;
 }
 
-/* Scalar update by the measurement in ``h`` with P·h in ``ph``.
- *
- * K = gain_scale·P·h/S. A scale of 1 is the Kalman gain; a measurement whose variance counts more has the S that
- * follows, and 1. P changes by −u·uᵀ with u = P·h/√S, which is symmetric to the bit. */
-INTERNAL void update(State *s, real innovation, real innovation_variance, real gain_scale) {
-    real root = SQRT(innovation_variance);
-    real step = gain_scale * innovation / root;
-    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-        s->ph[state] /= root;
+/* Write s = [own reception] − h·V into the next of ``G``; ``own`` is the anchor that the tag received, or −1. */
+INTERNAL void compute_fault_input(State *s, int32_t own) {
+    real *shares = s->G[s->waiting];
+    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+        shares[fault] = REAL(0.0);
     }
-    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-        s->x[state] += s->ph[state] * step;
-        real factor = s->ph[state];
-        real *row = s->P[state];
-        for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
-            row[other] -= factor * s->ph[other];
+    for (int32_t term = 0, term_end = s->terms; term < term_end; term++) {
+        real weight = s->h[term];
+        real *effects = s->V[s->h_index[term]];
+        for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+            shares[fault] -= weight * effects[fault];
         }
     }
+    for (int32_t one = 0, one_end = s->waiting; one < one_end; one++) {
+        real weight = h_dot(s, s->U[one]);
+        real *effects = s->G[one];
+        for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+            shares[fault] -= weight * effects[fault];
+        }
+    }
+    if (own >= 0) {
+        for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
+            shares[kind * s->count + own] += REAL(1.0);
+        }
+    }
+}
+
+/* Scalar update by a measurement whose P·h and shares of faults are the next of ``U`` and ``G``.
+ *
+ * K = gain_scale·P·h/S. A scale of 1 is the Kalman gain; a measurement whose variance counts more has the S that
+ * follows, and 1. P changes by −u·uᵀ with u = P·h/√S, which is symmetric to the bit. No update may wait. */
+INTERNAL void update(State *s, real innovation, real innovation_variance, real gain_scale) {
+    note_update(s, innovation, innovation_variance, gain_scale);
+    apply_updates(s);
+}
+
+/* The same for a measurement that shows faults: y ← y + s·ν/S and M ← M + s·sᵀ/S.
+ *
+ * P, V and M wait for ``finish_updates``; until then only ``compute_ph`` and ``compute_fault_input`` may read P and V. */
+INTERNAL void update_later(State *s, real innovation, real innovation_variance) {
+    real *g = s->G[s->waiting];
+    note_update(s, innovation, innovation_variance, REAL(1.0));
+    real normalised = innovation / SQRT(innovation_variance);
+    for (int32_t fault = 0, fault_end = FAULT_KINDS * s->count; fault < fault_end; fault++) {
+        s->evidence[fault] += g[fault] * normalised;
+    }
+}
+
+/* Update x, and make u = P·h/√S and g = s/√S of what stands in ``U`` and ``G``, for P and V. */
+INTERNAL void note_update(State *s, real innovation, real innovation_variance, real gain_scale) {
+    real inverse = REAL(1.0) / SQRT(innovation_variance);
+    real step = gain_scale * inverse;
+    real *u = s->U[s->waiting];
+    real *g = s->G[s->waiting];
+    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+        u[state] *= inverse;
+    }
     for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-        real gain = gain_scale * s->fault_input[fault] / root;
-        real *row = s->V[fault];
+        g[fault] *= step;
+    }
+    step *= innovation;
+    for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
+        s->x[state] += u[state] * step;
+    }
+    s->waiting += 1;
+}
+
+/* Let P, V and M follow the updates that wait. */
+INTERNAL void finish_updates(State *s) {
+    if (s->waiting == 0) {
+        return;
+    }
+    int32_t faults = FAULT_KINDS * s->count;
+    int32_t groups = fill_groups(s);
+    for (int32_t group = 0; group < groups; group++) {
+        int32_t k = 4 * group;
+        for (int32_t fault = 0; fault < faults; fault++) {
+            real a = s->G[k][fault];
+            real b = s->G[k + 1][fault];
+            real c = s->G[k + 2][fault];
+            real d = s->G[k + 3][fault];
+            for (int32_t other = 0; other < fault + 1; other++) {
+                s->information[fault][other] += a * s->G[k][other] + b * s->G[k + 1][other] + c * s->G[k + 2][other] + d
+                        * s->G[k + 3][other];
+            }
+        }
+    }
+    apply_updates(s);
+}
+
+/* Fill the updates that wait with zeros up to a multiple of four; returns a quarter of their number. */
+INTERNAL int32_t fill_groups(State *s) {
+    int32_t groups = floor_div_32(s->waiting + 3, 4);
+    for (int32_t one = s->waiting; one < 4 * groups; one++) {
         for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-            row[state] += gain * s->ph[state];
+            s->U[one][state] = REAL(0.0);
+        }
+        for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+            s->G[one][fault] = REAL(0.0);
+        }
+    }
+    return groups;
+}
+
+/* P ← P − Σ u·uᵀ and V ← V + Σ u·gᵀ over the updates that wait, four at a time: P is read and written once. */
+INTERNAL void apply_updates(State *s) {
+    if (s->waiting <= 2) {
+        for (int32_t one = 0, one_end = s->waiting; one < one_end; one++) {
+            apply_one(s, one);
+        }
+    } else {
+        for (int32_t group = 0, group_end = fill_groups(s); group < group_end; group++) {
+            apply_four(s, 4 * group);
+        }
+    }
+    s->waiting = 0;
+}
+
+INTERNAL void apply_one(State *s, int32_t one) {
+    for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
+        real u = s->U[one][state];
+        for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
+            s->P[state][other] -= u * s->U[one][other];
+        }
+        for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+            s->V[state][fault] += u * s->G[one][fault];
+        }
+    }
+}
+
+INTERNAL void apply_four(State *s, int32_t k) {
+    for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
+        real a = s->U[k][state];
+        real b = s->U[k + 1][state];
+        real c = s->U[k + 2][state];
+        real d = s->U[k + 3][state];
+        for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
+            s->P[state][other] -= a * s->U[k][other] + b * s->U[k + 1][other] + c * s->U[k + 2][other] + d * s->U[k +
+                    3][other];
+        }
+        for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+            s->V[state][fault] += a * s->G[k][fault] + b * s->G[k + 1][fault] + c * s->G[k + 2][fault] + d * s->G[k +
+                    3][fault];
         }
     }
 }
@@ -819,41 +965,12 @@ INTERNAL void update(State *s, real innovation, real innovation_variance, real g
  * (recent) or seconds (creeping). A fault that is sure is added to the anchor's range error, which gives the state that
  * the filter would have, had that error been open from the beginning. */
 
-/* What innovations show */
-
-/* Compute s = [own reception] − h·V; ``own`` is the anchor that the tag has received, or −1. */
-INTERNAL void compute_fault_input(State *s, int32_t own) {
-    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-        real total = REAL(0.0);
-        for (int32_t term = 0, term_end = s->terms; term < term_end; term++) {
-            total -= s->h[term] * s->V[fault][s->h_index[term]];
-        }
-        s->fault_input[fault] = total;
-    }
-    if (own >= 0) {
-        for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
-            s->fault_input[kind * s->count + own] += REAL(1.0);
-        }
-    }
-}
+/* What innovations show (gathered by ``kalman.update_later``) */
 
 /* Subtract the reception of the first anchor of a difference: its faults count with the opposite sign. */
 INTERNAL void subtract_fault_input(State *s, int32_t anchor) {
     for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
-        s->fault_input[kind * s->count + anchor] -= REAL(1.0);
-    }
-}
-
-/* What an innovation shows of the anchors' faults: y ← y + s·ν/S and M ← M + s·sᵀ/S. */
-INTERNAL void gather_evidence(State *s, real innovation, real innovation_variance) {
-    int32_t faults = FAULT_KINDS * s->count;
-    for (int32_t one = 0; one < faults; one++) {
-        real weight = s->fault_input[one] / innovation_variance;
-        real *row = s->information[one];
-        s->evidence[one] += weight * innovation;
-        for (int32_t other = 0; other < faults; other++) {
-            row[other] += weight * s->fault_input[other];
-        }
+        s->G[s->waiting][kind * s->count + anchor] -= REAL(1.0);
     }
 }
 
@@ -872,16 +989,18 @@ INTERNAL void fade_faults(State *s) {
         int32_t end = (kind + 1) * count;
         real kept = kind == RECENT ? REAL(1.0) - REAL(1.0) / tuning->recent_packets : exp_(-elapsed_s /
                 tuning->creeping_s);
+        for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
+            for (int32_t fault = begin; fault < end; fault++) {
+                s->V[state][fault] *= kept;
+            }
+        }
         for (int32_t fault = begin; fault < end; fault++) {
             s->evidence[fault] *= kept;
-            for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-                s->V[fault][state] *= kept;
-            }
-            for (int32_t other = 0; other < FAULT_KINDS * count; other++) {
+            for (int32_t other = 0; other < fault + 1; other++) {
                 s->information[fault][other] *= kept;
-                if (!(begin <= other && other < end)) {
-                    s->information[other][fault] *= kept;
-                }
+            }
+            for (int32_t other = end; other < FAULT_KINDS * count; other++) {
+                s->information[other][fault] *= kept;
             }
         }
     }
@@ -918,13 +1037,13 @@ INTERNAL real fault_chi2(State *s, int32_t kind, int32_t axes) {
     int32_t count = s->count;
     int32_t begin = kind * s->count;
     for (int32_t one = 0; one < count; one++) {
-        for (int32_t other = 0; other < count; other++) {
+        for (int32_t other = 0; other < one + 1; other++) {
             s->work[one][other] = s->information[begin + one][begin + other];
         }
         s->work[one][one] += REAL(1.0) / square(s->status.fault_std_m[kind]);
         s->work[count][one] = s->evidence[begin + one];
         for (int32_t axis = 0; axis < axes; axis++) {
-            s->work[count + 1 + axis][one] = s->V[begin + one][axis];
+            s->work[count + 1 + axis][one] = s->V[axis][begin + one];
         }
     }
     whiten(s, count, 1 + axes);
@@ -935,7 +1054,9 @@ INTERNAL real fault_chi2(State *s, int32_t kind, int32_t axes) {
     return total;
 }
 
-/* How much of the test of all lasting faults one anchor or two explain; for one, both arguments are the same. */
+/* How much of the test of all lasting faults one anchor or two explain.
+ *
+ * ``other`` is not above ``one``, and the same for one anchor. */
 INTERNAL real explained_chi2(State *s, int32_t one, int32_t other) {
     real weight = REAL(1.0) / square(s->tuning.late_std_m);
     real y_one = s->evidence[one];
@@ -998,21 +1119,22 @@ INTERNAL void open_faults(State *s) {
  * as long as enough anchors are left. */
 INTERNAL void open_new_faults(State *s, int32_t kind) {
     int32_t spare = s->count - s->dim - 1;
+    real *explained = s->work[0];
     for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
         spare -= (int32_t)s->anchors[anchor].is_obstructed;
-        s->ph[anchor] = explained_alone(s, kind, anchor);
+        explained[anchor] = explained_alone(s, kind, anchor);
     }
     real limit = largest(s, kind) - s->tuning.rival_chi2;
     int32_t first = 0;
     while (spare > 0 && first >= 0) {
         first = -1;
         for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
-            if (s->ph[anchor] > limit && (first < 0 || s->ph[anchor] > s->ph[first])) {
+            if (explained[anchor] > limit && (first < 0 || explained[anchor] > explained[first])) {
                 first = anchor;
             }
         }
         if (first >= 0) {
-            s->ph[first] = REAL(0.0);
+            explained[first] = REAL(0.0);
             spare -= 1;
             open_fault(s, kind, first);
             begin_obstruction(s, first);
@@ -1091,43 +1213,39 @@ INTERNAL void open_fault(State *s, int32_t kind, int32_t anchor) {
     bool is_lasting = kind == LASTING;
     int32_t chosen = kind * s->count + anchor;
     int32_t faults = FAULT_KINDS * s->count;
-    real *shared = s->fault_input;
     make_uncertain(s, is_lasting ? ALL_RANGE_ERRORS : CHANGING_RANGE_ERRORS);
     real gain = REAL(1.0) / (s->information[chosen][chosen] + REAL(1.0) / square(s->tuning.late_std_m));
     real fault_m = gain * s->evidence[chosen];
     real variance = is_lasting ? gain : gain + fault_m * fault_m;
-    real *opened = s->V[chosen];  /* what it adds to each state: 1 − V for the range error, −V for all others */
+    real *opened = s->U[0];  /* what it adds to each state: 1 − V for the range error, −V for all others */
+    real *shared = s->G[0];
     for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-        opened[state] = -opened[state];
+        opened[state] = -s->V[state][chosen];
     }
     opened[(is_lasting ? s->layout.constant : s->layout.change) + anchor] += REAL(1.0);
-    for (int32_t one = 0, one_end = s->n; one < one_end; one++) {
+    for (int32_t one = 0; one < faults; one++) {
+        shared[one] = gain * s->information[max_32(one, chosen)][min_32(one, chosen)];
+    }
+    shared[chosen] = REAL(0.0);
+    for (int32_t one = 0, one_end = s->used; one < one_end; one++) {
         s->x[one] += opened[one] * fault_m;
         for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
             s->P[one][other] += opened[one] * opened[other] * variance;
         }
-    }
-    for (int32_t one = 0; one < faults; one++) {
-        shared[one] = s->information[one][chosen];
-    }
-    shared[chosen] = REAL(0.0);
-    for (int32_t one = 0; one < faults; one++) {
-        real share = gain * shared[one];
-        s->evidence[one] -= share * s->evidence[chosen];
-        for (int32_t other = 0; other < faults; other++) {
-            s->information[one][other] -= share * shared[other];
+        for (int32_t fault = 0; fault < faults; fault++) {
+            s->V[one][fault] += shared[fault] * opened[one];
         }
-        for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-            s->V[one][state] += share * opened[state];
+        s->V[one][chosen] = REAL(0.0);
+    }
+    for (int32_t one = 0; one < faults; one++) {
+        s->evidence[one] -= shared[one] * s->evidence[chosen];
+        for (int32_t other = 0; other < one + 1; other++) {
+            s->information[one][other] -= shared[one] * shared[other] / gain;
         }
     }
     s->evidence[chosen] = REAL(0.0);
     for (int32_t one = 0; one < faults; one++) {
-        s->information[one][chosen] = REAL(0.0);
-        s->information[chosen][one] = REAL(0.0);
-    }
-    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-        opened[state] = REAL(0.0);
+        s->information[max_32(one, chosen)][min_32(one, chosen)] = REAL(0.0);
     }
     s->status.faults_opened += 1;
 }
@@ -1292,6 +1410,7 @@ INTERNAL void adapt_change_variance(State *s, int32_t anchor, real elapsed_s) {
     Anchor *a = &s->anchors[anchor];
     real memory_s = settings->change_memory_s;
     if (memory_s > REAL(0.0)) {
+        finish_updates(s);
         int32_t change = s->layout.change + anchor;
         real present = square(s->x[change]) + s->P[change][change];
         real variance = a->change_variance_m2 + min_real(elapsed_s / memory_s, REAL(0.5)) * (present -
@@ -1459,9 +1578,9 @@ INTERNAL void protect(State *s) {
     real squared = REAL(0.0);
     real up = REAL(0.0);
     for (int32_t row = FAULT_KINDS * s->count, row_end = FAULT_KINDS * s->count + s->dim; row < row_end; row++) {
-        squared += square(s->V[row][0]) + square(s->V[row][1]);
+        squared += square(s->V[0][row]) + square(s->V[1][row]);
         if (s->dim == 3) {
-            up += square(s->V[row][2]);
+            up += square(s->V[2][row]);
         }
     }
     levels[HPL] += settings->max_acceleration_mps2 * SQRT(squared);
@@ -1862,8 +1981,7 @@ INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64
         }
         real used_variance = innovation_variance * scale + (variance_factor - REAL(1.0)) * settings->rx_variance_m2;
         compute_fault_input(s, anchor);
-        gather_evidence(s, innovation, used_variance);
-        update(s, innovation, used_variance, REAL(1.0));
+        update_later(s, innovation, used_variance);
         adapt_change_variance(s, anchor, elapsed_s);
     }
     carry_ticks(s, anchor);
@@ -1928,12 +2046,12 @@ INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_
     variance += REAL(2.0) * curvature_m * curvature_m + compute_ph(s);
     compute_fault_input(s, anchor);
     for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-        s->P[state][offset] = -s->ph[state];
-        s->P[offset][state] = -s->ph[state];
+        s->P[state][offset] = -s->U[0][state];
+        s->P[offset][state] = -s->U[0][state];
     }
     s->P[offset][offset] = variance;
     for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-        s->V[fault][offset] = s->fault_input[fault];
+        s->V[offset][fault] = s->G[0][fault];
     }
     a->offset_ticks = rx_ticks - tx_ticks - floor_real(range_m / TICK_M);
     real rest_m = (real)(rx_ticks - tx_ticks - a->offset_ticks) * TICK_M;
@@ -2042,11 +2160,10 @@ INTERNAL real find_distance_m(State *s, int32_t one, int32_t other) {
     return SQRT(squared);
 }
 
-/* Update by the measurement in ``h``, which is no reception of the tag's, and by what it shows of faults. */
+/* Update by the measurement in ``h``, which is no reception of the tag's, and by what it shows of faults; later. */
 INTERNAL void use(State *s, real innovation, real innovation_variance) {
     compute_fault_input(s, -1);
-    gather_evidence(s, innovation, innovation_variance);
-    update(s, innovation, innovation_variance, REAL(1.0));
+    update_later(s, innovation, innovation_variance);
 }
 
 /* Use the range between two anchors for their survey; anchors that contradict most of theirs are misplaced. */
@@ -2062,6 +2179,7 @@ INTERNAL void survey_pair(State *s, int32_t one, int32_t other) {
     if (contradicted == rival || (real)most < s->tuning.misplaced_pairs || !pair(s, one, other)->contradicts) {
         return;
     }
+    finish_updates(s);
     int32_t misplaced = contradicted > rival ? one : other;
     Anchor *a = &s->anchors[misplaced];
     int32_t survey = s->layout.survey + s->dim * misplaced;
@@ -2116,6 +2234,7 @@ INTERNAL void add_pair_survey(State *s, int32_t one, int32_t other) {
 INTERNAL void report(State *s, int32_t anchor, int32_t master, int64_t subticks, real variance_m2) {
     Anchor *a = &s->anchors[anchor];
     Status *status = &s->status;
+    finish_updates(s);
     relay_terms(s, anchor, master, a->range_m / SPEED_OF_LIGHT_MPS, false);
     real own_variance = REAL(0.0);
     for (int32_t one = 0, one_end = s->terms; one < one_end; one++) {
@@ -2188,8 +2307,8 @@ INTERNAL int32_t difference(State *s, int32_t a, int32_t b, int64_t rx_ticks, re
     }
     compute_fault_input(s, b);
     subtract_fault_input(s, a);
-    gather_evidence(s, innovation, innovation_variance * scale);
-    update(s, innovation, innovation_variance * scale, REAL(1.0));
+    update_later(s, innovation, innovation_variance * scale);
+    finish_updates(s);
     bound_changes(s);
     end_small_obstruction(s, a);
     end_small_obstruction(s, b);
@@ -2243,6 +2362,7 @@ INTERNAL int32_t height(State *s, real height_m, real std_m, bool is_barometer) 
         return UNUSED;
     }
     use(s, innovation, innovation_variance);
+    finish_updates(s);
     status->height_ticks = status->epoch_ticks;
     return USED;
 }
@@ -2379,6 +2499,7 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet) {
         for (int32_t one = 0, one_end = packet->relay_count; one < one_end; one++) {
             process_relay(s, anchor, &packet->relays[one]);
         }
+        finish_updates(s);
         if (packet->report_variance_m2 > REAL(0.0) && packet->master >= 0) {
             int32_t master = skyless_find_anchor(s, packet->master);
             if (master >= 0 && master != anchor) {
@@ -2655,6 +2776,7 @@ INTERNAL void process_superframe(State *s, PlannedMessage *messages, PlannedRela
                     receive_relay(s, message, &relays[other]);
                 }
             }
+            finish_updates(s);
             add_fix(s, message->share, found);
         }
         begin = message->end;
@@ -2666,9 +2788,9 @@ INTERNAL void add_fix(State *s, real share, SteadyState *found) {
     found->fixes += share;
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
         found->variance_m2[axis] += share * s->P[axis][axis];
-        found->square_bias_m2 += share * square(s->V[walls(s)][axis]);
+        found->square_bias_m2 += share * square(s->V[axis][walls(s)]);
         for (int32_t row = walls(s) + 1, row_end = s->rows; row < row_end; row++) {
-            found->motion_m2[axis] += share * square(s->V[row][axis]);
+            found->motion_m2[axis] += share * square(s->V[axis][row]);
         }
     }
 }
@@ -2682,9 +2804,9 @@ INTERNAL void predict_with_impulses(State *s, int64_t now, int64_t impulses_tick
                 REAL(0.5));
         if (before < moment && moment <= now) {
             for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
-                real *row = s->V[walls(s) + 1 + s->dim * impulse + axis];
-                row[axis] = (real)(now - moment) * TICK_S;
-                row[s->layout.velocity + axis] = REAL(1.0);
+                int32_t row = walls(s) + 1 + s->dim * impulse + axis;
+                s->V[axis][row] = (real)(now - moment) * TICK_S;
+                s->V[s->layout.velocity + axis][row] = REAL(1.0);
             }
         }
     }
@@ -2696,14 +2818,14 @@ INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks) {
     Layout *where = &s->layout;
     if (a->packets == 0) {
         first_reception(s, message->anchor, rx_ticks, rx_ticks);
-        s->V[walls(s)][where->offset + message->anchor] += message->late_m;
+        s->V[where->offset + message->anchor][walls(s)] += message->late_m;
     } else {
         relax_range_error(s, message->anchor, (real)(rx_ticks - a->rx_ticks) * TICK_S, REAL(0.0));
         reset_state(s, where->tx_noise + message->anchor, s->settings.tx_variance_m2 / message->share);
         reception_terms(s, message->anchor, true);
         real variance = compute_ph(s) + s->settings.rx_variance_m2 / message->share;
         compute_fault_input(s, message->anchor);
-        s->fault_input[walls(s)] += message->late_m;
+        s->G[s->waiting][walls(s)] += message->late_m;
         update(s, REAL(0.0), variance, REAL(1.0));
     }
     a->rx_ticks = rx_ticks;
@@ -2717,9 +2839,9 @@ INTERNAL void receive_relay(State *s, PlannedMessage *message, PlannedRelay *rel
     variance += compute_ph(s);
     compute_fault_input(s, -1);
     if (s->links[message->anchor][relayed->sender].variance_m2 == REAL(0.0)) {  /* else the pair's constant takes the delay */
-        s->fault_input[walls(s)] += relayed->late_m;
+        s->G[s->waiting][walls(s)] += relayed->late_m;
     }
-    update(s, REAL(0.0), variance, REAL(1.0));
+    update_later(s, REAL(0.0), variance);
 }
 
 /* Cramér–Rao bounds */

@@ -73,8 +73,8 @@ typedef double real;
 #define IMPOSSIBLE_SIGMAS REAL(6.0)
 #define IMPULSES 4
 #define JOINED 2
-/* Numbers in the longest vectors of processors. */
-#define LANES 8
+/* Numbers in a vector of 256 bits. */
+#define LANES 4
 #define LASTING 0
 #define LEVELS 5
 /* The leading bits of ln 2: products with small whole numbers are exact. */
@@ -94,6 +94,7 @@ typedef double real;
 #define MERGED_SIGMAS REAL(2.0)
 #define MIN_DAMPING REAL(0.0001)
 #define MIRROR 7
+#define MOST_WAITING 8
 /* A smaller square of a distance counts as this. */
 #define NEAREST_M2 REAL(1e-18)
 /* A time before all others. */
@@ -453,25 +454,25 @@ typedef struct Link {
     bool contradicts;  /* Whether its range contradicts the survey. */
 } Link;
 
-/* Everything that the estimator keeps of one tag. */
+/* Everything that the estimator keeps of one tag. What loops run over stands first: its rows fill cache lines. */
 typedef struct State {
+    real x[264];
+    real P[264][264];  /* Symmetric to the bit. */
+    /* What faults do to x: of each kind for each metre by which receptions of an anchor are late, then for each m/s² of
+     * acceleration along an axis, then what planning adds. */
+    real V[264][112];
     EstimatorSettings settings;
     Tuning tuning;
     real horizontal_k;  /* How many standard deviations the risk of levels allows. */
     real vertical_k;
     int32_t dim;  /* Dimensions of the position: 2 where the height is given, else 3. */
     int32_t count;  /* Anchors in the state. */
-    /* States that are not known to be exact, up to a multiple of ``LANES``; covariances with all others are zero. */
-    int32_t n;
-    int32_t rows;  /* Rows of V in use. */
+    int32_t used;  /* States that are not known to be exact; covariances with all others are zero. */
+    int32_t n;  /* The same up to a multiple of ``LANES``: what loops along rows of P go to. */
+    int32_t rows;  /* Columns of V in use. */
     Layout layout;
     Status status;
-    real x[264];
-    real P[264][264];  /* Symmetric to the bit. */
-    /* What faults do to x: of each kind for each metre by which receptions of an anchor are late, then for each m/s² of
-     * acceleration along an axis, then what planning adds. */
-    real V[112][264];
-    real information[96][96];  /* Information of the innovations on all faults. */
+    real information[96][96];  /* Information of the innovations on all faults; the lower half. */
     real evidence[96];  /* What innovations show of them. */
     Anchor anchors[32];
     KeptPacket packets[32][16];
@@ -479,8 +480,10 @@ typedef struct State {
     int32_t terms;  /* Terms of the measurement at hand, which stand in ``h``. */
     real h[20];  /* The measurement where it is not zero, at the indices in ``h_index``. */
     int32_t h_index[20];
-    real ph[264];  /* P·h of the measurement at hand. */
-    real fault_input[112];  /* By how much each fault is in the present innovation. */
+    int32_t waiting;  /* Updates that are not in P and V yet: those of a packet's relays go there together. */
+    real U[8][264];  /* Of each its u = P·h/√S; then P·h of the measurement at hand. */
+    /* Of each, over √S, by how much each fault is in its innovation; then the same of the measurement at hand. */
+    real G[8][112];
     real work[36][32];  /* Scratch for systems of equations of all faults of one kind. */
     real levels[5];
     real fix[10][3];  /* What a fix carries (``POSITION`` and the following). */

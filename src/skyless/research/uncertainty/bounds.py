@@ -209,7 +209,8 @@ def _frame_bound(
     ticks = np.rint(sendings.times_s / TICK_S).astype(np.int64).tolist()
     walked_m = np.cumsum(np.linalg.norm(np.diff(path, axis=0, prepend=path[:1]), axis=1)).tolist()
     s.status.epoch_ticks = ticks[0]
-    path, heard, bound = np.ascontiguousarray(path), known.astype(np.uint8), np.empty((len(path), dim, dim))
+    path, heard = np.ascontiguousarray(path), np.ascontiguousarray(known, np.uint8)
+    bound = np.empty((len(path), dim, dim))
 
     def process(state: State, frame: int, first: int, newest: list[int]) -> None:
         sender = senders[frame]
