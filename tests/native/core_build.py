@@ -44,7 +44,8 @@ int main(void) {
 def library_of_all(folder, compiler="gcc", *flags):
     """A library of all functions, also those that are called inside only."""
     made = folder / "all.so"
-    command = [compiler, *EXACT, *flags, "-DINTERNAL=", "-shared", "-fPIC", NATIVE / "skyless_core.c", "-o", made]
+    own = ("-DINTERNAL=", "-shared", "-fPIC", "-Wl,-Bsymbolic")  # not libc's, which has some of these names as well
+    command = [compiler, *EXACT, *flags, *own, NATIVE / "skyless_core.c", "-o", made]
     subprocess.run(command, check=True)
     return ctypes.CDLL(str(made))
 

@@ -17,9 +17,10 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from estimator_builders import LAB_M, MESH, ROOM_M, begun, episode_of, kept, late, one_by_one, settings_of
 
 from make_core import EXPORTS, NAME
-from skyless.core.estimator.process import Packet, Relay
+from skyless.core.estimator.process import Packet
 from skyless.core.estimator.saved import packed_state
-from skyless.core.estimator.state import MAX_ANCHORS, Link, State
+from skyless.core.estimator.state import MAX_ANCHORS, WORK_ROWS, State
+from skyless.core.estimator.steady_state import PlannedMessage, PlannedRelay
 from skyless.core.native import small_matrices, tails
 from skyless.core.native.records import c_type, view
 from skyless.core.tag import descent, minima, position, problem, starts
@@ -64,6 +65,7 @@ def states():
         estimator = begun(episode, settings_of(height_m=height_m, stationary_s=0.5, **errors), anchors_m, std_m=0.05)
         for packet in one_by_one(disturbed(episode, seed)):
             estimator.process(*packet)
+        view(estimator.state.work)[:] = np.random.default_rng(seed).uniform(0.5, 1.5, (WORK_ROWS, MAX_ANCHORS))
         found.append(estimator.state)
     return found
 
@@ -97,6 +99,8 @@ def drawn_number(name, s, draw, anchor):
         "sender": (anchor + 1) % s.count,
         "b": (anchor + 1) % s.count,
         "row": 3,
+        "k": 0,
+        "packed_bytes": 16,
     }
     return where.get(name, anchor)
 
@@ -118,7 +122,7 @@ def arguments(function, s, draw):
         elif isinstance(kind, Number):
             found.append(bool(draw.integers(2)) if kind.name == "bool" else drawn_number(name, s, draw, anchor))
         else:
-            found.append((ctypes.c_double * 64)(*draw.normal(size=64)) if kind.element == REAL else None)
+            found.append((ctypes.c_double * 512)(*draw.normal(size=512)) if kind.element == REAL else bytes(16))
     return found
 
 
@@ -135,8 +139,10 @@ def drawn_record(made, s, draw):
             a.tx_ticks + s.status.epoch_ticks + 10**8 - a.rx_ticks,
         )
         one.subticks, one.report_variance_m2 = 12345, 1e-3
-    elif made in (Relay, Link):
-        one.rx_ticks = 1
+    elif made is PlannedMessage:
+        one.anchor, one.share, one.late_m = int(draw.integers(s.count)), 0.7, 0.1
+    elif made is PlannedRelay:
+        one.sender, one.share, one.age_s, one.late_m = int(draw.integers(s.count)), 0.6, 0.01, 0.2
     return one
 
 
@@ -246,13 +252,9 @@ def test_records_are_as_large_as_in_c(tmp_path):
 
 
 def test_there_is_room_for_all_anchors_and_no_more(states):
-    s = State.from_buffer_copy(states[2])
-    draw = np.random.default_rng(1)
-    place = FUNCTIONS["present"]
-    packet = drawn_record(Packet, s, draw)
+    s, packet = State.from_buffer_copy(states[2]), Packet()
+    packet.place.std_m = -1.0
     for anchor in range(100, 100 + MAX_ANCHORS):
-        packet.place.anchor = anchor
-        index = place(s, packet.place)
-        assert (index >= 0) == (s.count <= MAX_ANCHORS and index < MAX_ANCHORS and index >= 0)
+        room, packet.place.anchor = s.count < MAX_ANCHORS, anchor
+        assert (FUNCTIONS["present"](s, packet.place) >= 0) == room
     assert s.count == MAX_ANCHORS
-    assert place(s, packet.place) == -1

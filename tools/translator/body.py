@@ -402,7 +402,9 @@ class Body:
         constant = self.globals.get(name)
         if not isinstance(constant, bool | int | float):
             raise self.refuse(node, f"{name} is neither a variable that has a value here nor a constant")
-        self.all.constants.setdefault(c_name(name), (constant, self.source.docs.get(name, "")))
+        known, _ = self.all.constants.setdefault(c_name(name), (constant, self.source.docs.get(name, "")))
+        if known != constant:
+            raise self.refuse(node, f"another constant of this name is {known}")
         return literal(constant)._replace(code=c_name(name), rank=20)
 
     def field(self, node: ast.expr, of: Value, field: str) -> Value:

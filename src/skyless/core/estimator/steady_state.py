@@ -98,20 +98,23 @@ def find_steady_state(
     superframe: Ticks = 0
     for one in range(count):
         superframe += messages[one].gap_ticks
+    now: Ticks = 0
     before = 0.0
     for number in range(most):
-        _process_superframe(s, messages, relays, count, AFTER_ALL_TICKS, superframe, found)
+        _process_superframe(s, messages, relays, count, now, AFTER_ALL_TICKS, superframe, found)
+        now += superframe
         if number % step == step - 1:
             variance = found.variance_m2[0] + found.variance_m2[1] + found.variance_m2[2]
             if abs(variance - before) <= COMPLETE_CHANGE * variance:
                 break
             before = variance
-    impulses_ticks = s.status.epoch_ticks
+    impulses_ticks = now
     before = 0.0
     for axis in range(AXES):
         found.motion_m2[axis] = 0.0
     for number in range(most):
-        _process_superframe(s, messages, relays, count, impulses_ticks, superframe, found)
+        _process_superframe(s, messages, relays, count, now, impulses_ticks, superframe, found)
+        now += superframe
         if number % step == step - 1:
             moved = found.motion_m2[0] + found.motion_m2[1] + found.motion_m2[2]
             if number >= 1 and moved - before <= COMPLETE_CHANGE * moved:
@@ -131,12 +134,13 @@ def _process_superframe(
     messages: Array[PlannedMessage],
     relays: Array[PlannedRelay],
     count: int,
+    now: Ticks,
     impulses_ticks: Ticks,
     superframe: Ticks,
     found: SteadyState,
 ) -> None:
-    """Process a superframe's messages; impulses act at moments of the one that begins at ``impulses_ticks``."""
-    now, begin = s.status.epoch_ticks, 0
+    """Process the messages of a superframe from now on; impulses act in the one that begins at ``impulses_ticks``."""
+    begin = 0
     found.fixes = found.square_bias_m2 = 0.0
     for axis in range(AXES):
         found.variance_m2[axis] = 0.0

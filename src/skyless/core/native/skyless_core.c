@@ -171,8 +171,8 @@ INTERNAL void fill_fix(State *s);
 INTERNAL void note_difference(State *s, int32_t anchor, int64_t rx_ticks);
 INTERNAL void fill_row(State *s, BatchRow *row, bool has_levels);
 INTERNAL int32_t walls(State *s);
-INTERNAL void process_superframe(State *s, PlannedMessage *messages, PlannedRelay *relays, int32_t count, int64_t
-        impulses_ticks, int64_t superframe, SteadyState *found);
+INTERNAL void process_superframe(State *s, PlannedMessage *messages, PlannedRelay *relays, int32_t count, int64_t now,
+        int64_t impulses_ticks, int64_t superframe, SteadyState *found);
 INTERNAL void add_fix(State *s, real share, SteadyState *found);
 INTERNAL void predict_with_impulses(State *s, int64_t now, int64_t impulses_ticks, int64_t superframe);
 INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks);
@@ -2719,9 +2719,11 @@ SKYLESS_EXPORT void skyless_find_steady_state(State *s, PlannedMessage *messages
     for (int32_t one = 0; one < count; one++) {
         superframe += messages[one].gap_ticks;
     }
+    int64_t now = 0;
     real before = REAL(0.0);
     for (int32_t number = 0; number < most; number++) {
-        process_superframe(s, messages, relays, count, AFTER_ALL_TICKS, superframe, found);
+        process_superframe(s, messages, relays, count, now, AFTER_ALL_TICKS, superframe, found);
+        now += superframe;
         if (floor_mod_32(number, step) == step - 1) {
             real variance = found->variance_m2[0] + found->variance_m2[1] + found->variance_m2[2];
             if (abs_real(variance - before) <= COMPLETE_CHANGE * variance) {
@@ -2730,13 +2732,14 @@ SKYLESS_EXPORT void skyless_find_steady_state(State *s, PlannedMessage *messages
             before = variance;
         }
     }
-    int64_t impulses_ticks = s->status.epoch_ticks;
+    int64_t impulses_ticks = now;
     before = REAL(0.0);
     for (int32_t axis = 0; axis < AXES; axis++) {
         found->motion_m2[axis] = REAL(0.0);
     }
     for (int32_t number = 0; number < most; number++) {
-        process_superframe(s, messages, relays, count, impulses_ticks, superframe, found);
+        process_superframe(s, messages, relays, count, now, impulses_ticks, superframe, found);
+        now += superframe;
         if (floor_mod_32(number, step) == step - 1) {
             real moved = found->motion_m2[0] + found->motion_m2[1] + found->motion_m2[2];
             if (number >= 1 && moved - before <= COMPLETE_CHANGE * moved) {
@@ -2755,10 +2758,9 @@ INTERNAL int32_t walls(State *s) {
     return FAULT_KINDS * s->count + s->dim;
 }
 
-/* Process a superframe's messages; impulses act at moments of the one that begins at ``impulses_ticks``. */
-INTERNAL void process_superframe(State *s, PlannedMessage *messages, PlannedRelay *relays, int32_t count, int64_t
-        impulses_ticks, int64_t superframe, SteadyState *found) {
-    int64_t now = s->status.epoch_ticks;
+/* Process the messages of a superframe from now on; impulses act in the one that begins at ``impulses_ticks``. */
+INTERNAL void process_superframe(State *s, PlannedMessage *messages, PlannedRelay *relays, int32_t count, int64_t now,
+        int64_t impulses_ticks, int64_t superframe, SteadyState *found) {
     int32_t begin = 0;
     found->square_bias_m2 = REAL(0.0);
     found->fixes = REAL(0.0);
