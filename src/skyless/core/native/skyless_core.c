@@ -2966,7 +2966,7 @@ INTERNAL bool has_rotated(Columns *m, int32_t one, int32_t other) {
     real square = scalar_product(m, one, one);
     real square_other = scalar_product(m, other, other);
     real product = scalar_product(m, one, other);
-    bool is_orthogonal = abs_real(product) <= ORTHOGONAL * SQRT(square * square_other);
+    bool is_orthogonal = !(abs_real(product) > ORTHOGONAL * SQRT(square * square_other));
     if (is_orthogonal && square >= square_other) {
         return false;
     }

@@ -106,7 +106,7 @@ def _has_rotated(m: Columns, one: int, other: int) -> bool:
         _scalar_product(m, other, other),
         _scalar_product(m, one, other),
     )
-    is_orthogonal = abs(product) <= ORTHOGONAL * sqrt(square * square_other)
+    is_orthogonal = not abs(product) > ORTHOGONAL * sqrt(square * square_other)
     if is_orthogonal and square >= square_other:
         return False
     tangent = 0.0
