@@ -59,8 +59,8 @@ static inline int32_t abs_32(int32_t x) { return x < 0 ? -x : x; }
 static inline int64_t abs_64(int64_t x) { return x < 0 ? -x : x; }
 static inline int64_t truncated(real x) { return REAL(-9e18) < x && x < REAL(9e18) ? (int64_t)x : 0; }
 static inline int64_t floor_real(real x) {
-    const int64_t t = truncated(x);
-    return t - (x < (real)t && x > REAL(-9e18));
+    const int64_t whole = truncated(x);
+    return x > REAL(-9e18) && x < (real)whole ? whole - 1 : whole;
 }
 static inline int32_t floor_div_32(int32_t x, int32_t y) { return x / y - (x % y != 0 && (x < 0) != (y < 0)); }
 static inline int64_t floor_div_64(int64_t x, int64_t y) { return x / y - (x % y != 0 && (x < 0) != (y < 0)); }

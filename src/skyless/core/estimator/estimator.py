@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from math import sqrt
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -119,7 +119,8 @@ class Estimator:
     @property
     def rows(self) -> bytes:
         """What a fix carries (``POSITION`` and the following), as of the newest packet."""
-        return view(self._state.fix).tobytes()
+        fix: Any = self._state.fix
+        return bytes(fix)
 
     # Anchors
 
