@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from skyless.core.estimator import levels, process, state, steady_state
 from skyless.core.native import arithmetic
-from skyless.core.tag import descent
+from skyless.core.tag import position
 from translator.files import translate
 
 EXPORTS: Final[tuple[Callable[..., Any], ...]] = (
@@ -25,8 +25,7 @@ EXPORTS: Final[tuple[Callable[..., Any], ...]] = (
     process.track,
     steady_state.find_steady_state,
     steady_state.process_known,
-    descent.descend,
-    descent.linearise,
+    position.find_position,
 )
 """What is called from outside."""
 

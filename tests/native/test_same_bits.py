@@ -22,8 +22,9 @@ from skyless.core.estimator.process import BatchPacket, BatchRow, Packet, Place,
 from skyless.core.estimator.saved import packed_state
 from skyless.core.estimator.state import MAX_ANCHORS, WORK_ROWS, State
 from skyless.core.estimator.steady_state import PlannedMessage, PlannedRelay
+from skyless.core.native import small_matrices, tails
 from skyless.core.native.records import c_type, view
-from skyless.core.tag.descent import Descent
+from skyless.core.tag import descent, minima, position, problem, starts
 from translator.body import Translator
 from translator.files import translate
 from translator.types import REAL, Elements, Number, Results, Struct, parameter_type
@@ -139,29 +140,11 @@ def drawn_record(made, s, draw):
             a.tx_ticks + s.status.epoch_ticks + 10**8 - a.rx_ticks,
         )
         one.subticks, one.report_variance_m2 = 12345, 1e-3
-    elif made is Descent:
-        return drawn_descent(draw)
     elif made is PlannedMessage:
         one.anchor, one.share, one.late_m = int(draw.integers(s.count)), 0.7, 0.1
     elif made is PlannedRelay:
         one.sender, one.share, one.age_s, one.late_m = int(draw.integers(s.count)), 0.6, 0.01, 0.2
     return one
-
-
-def drawn_descent(draw):
-    count = 6
-    d = Descent(kind=0, anchors=count, dims=3)
-    positions = draw.uniform(-5.0, 5.0, (count, 3))
-    positions -= positions[0]
-    tag = draw.uniform(-3.0, 3.0, 3)
-    ranges = np.linalg.norm(positions - tag, axis=1)
-    view(d.positions_m)[:count], view(d.tdoa_m)[: count - 1] = (
-        positions,
-        ranges[1:] - ranges[0] + 0.05 * draw.normal(size=5),
-    )
-    view(d.whitener)[: count - 1, : count - 1] = np.linalg.cholesky(np.linalg.inv(np.eye(5) + 1.0)).T.T
-    view(d.scale)[:], view(d.state)[:] = 5.0, tag + draw.normal(size=3)
-    return d
 
 
 def hints(function):
@@ -185,11 +168,13 @@ def bits(value):
 
 SKIPPED = {"track", "find_steady_state", "process_superframe", "process_known"}
 """Their arguments are tables; the runs below, and the tests of planning and bounds, cover them."""
-ARRAYS = {"assemble", "linearise"}
+OF_POSITIONS = {module.__name__ for module in (descent, minima, position, problem, small_matrices, starts, tails)}
+"""``test_position_same_bits`` covers these."""
+ONE_BY_ONE = {name for name, function in FUNCTIONS.items() if function.__module__ not in OF_POSITIONS}
 POINTED = ctypes.Structure | ctypes.Array
 
 
-@pytest.mark.parametrize("name", sorted(FUNCTIONS.keys() - SKIPPED - ARRAYS))
+@pytest.mark.parametrize("name", sorted(ONE_BY_ONE - SKIPPED))
 def test_a_function_gives_the_same_bits(everything, states, name):
     function = FUNCTIONS[name]
     called = everything[f"skyless_{name}" if function in EXPORTS else name]

@@ -9,6 +9,7 @@ from msgspec import Struct
 from numpy.typing import ArrayLike
 
 from skyless.core.arrays import Array, Mask
+from skyless.core.native.small_matrices import SINGULAR_PIVOT
 
 MAX_VDOP: Final = 4.0
 """With a larger vertical dilution in the middle of the anchors, the height is not worth estimating."""
@@ -16,9 +17,6 @@ MAX_VDOP: Final = 4.0
 GUESSED_STD_M: Final = 0.5
 """Standard deviation of a tag's height from the anchors', where that is used instead."""
 
-
-SINGULAR_PIVOT: Final = 1e-12
-"""A pivot below this part of its diagonal element is rounding noise: the matrix is singular."""
 _POINTS_AT_ONCE: Final = 4096
 
 
@@ -67,7 +65,7 @@ def dops_at(anchors_m: ArrayLike, positions_m: ArrayLike, *, height_known: bool,
     for first in range(0, len(positions), _POINTS_AT_ONCE):
         part = slice(first, first + _POINTS_AT_ONCE)
         normal = _normal_matrices(anchors, positions[part], counts[part], 3 if height_known else 4)
-        inverse, is_sound = _inverses(normal)
+        inverse, is_sound = inverses(normal)
         variances = np.zeros((len(normal), 4))
         variances[:, : normal.shape[1]] = np.diagonal(inverse, axis1=1, axis2=2)
         clock, horizontal, vertical = variances[:, 0], variances[:, 1] + variances[:, 2], variances[:, 3]
@@ -91,7 +89,7 @@ def _normal_matrices(anchors: Array, positions: Array, weights: Array, size: int
     return normal
 
 
-def _inverses(normal: Array) -> tuple[Array, Mask]:
+def inverses(normal: Array) -> tuple[Array, Mask]:
     """Inverses of matrices, shape (m, k, k), by Cholesky's method, and which of them are positive definite."""
     size = normal.shape[1]
     L, is_sound = np.zeros_like(normal), np.ones(len(normal), np.bool_)

@@ -9,7 +9,13 @@
  * skyless.core.estimator.state
  * skyless.core.estimator.steady_state
  * skyless.core.native.arithmetic
+ * skyless.core.native.small_matrices
+ * skyless.core.native.tails
  * skyless.core.tag.descent
+ * skyless.core.tag.minima
+ * skyless.core.tag.position
+ * skyless.core.tag.problem
+ * skyless.core.tag.starts
  */
 
 #include "skyless_core.h"
@@ -171,10 +177,52 @@ INTERNAL void add_fix(State *s, real share, SteadyState *found);
 INTERNAL void predict_with_impulses(State *s, int64_t now, int64_t impulses_ticks, int64_t superframe);
 INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks);
 INTERNAL void receive_relay(State *s, PlannedMessage *message, PlannedRelay *relayed);
-INTERNAL real assemble(Descent *d, real *state, real (*normal)[4]);
-INTERNAL bool find_damped_step(Descent *d, real damping);
-INTERNAL bool is_far(Descent *d);
+INTERNAL bool factorise(real *A, int32_t size);
+INTERNAL void solve_lower(real *L, int32_t size, real *x);
+INTERNAL void solve(real *L, int32_t size, real *x);
+INTERNAL void orthogonalise(Columns *m);
+INTERNAL bool has_rotated(Columns *m, int32_t one, int32_t other);
+INTERNAL real scalar_product(Columns *m, int32_t one, int32_t other);
+INTERNAL void rotate_columns(real (*A)[4], int32_t rows, int32_t one, int32_t other, real cosine, real sine);
+INTERNAL bool least_squares(Columns *m, real *right, real *x);
+INTERNAL real normal_tail(real z);
+INTERNAL real continued_fraction(real z, int32_t first);
+INTERNAL real chi2_tail(int32_t dof, real chi2);
+INTERNAL real mean_if_positive(real mean, real sigma);
+INTERNAL bool choose_axes(LocateProblem *p);
+INTERNAL real sigma_m(LocateProblem *p, int32_t index_);
+INTERNAL real least_sigma_m(LocateProblem *p);
+INTERNAL int32_t descend(LocateProblem *p);
+INTERNAL real assemble(LocateProblem *p, real *state, real *normal);
+INTERNAL void linearise(LocateProblem *p, real *state);
+INTERNAL void whiten_system(LocateProblem *p);
+INTERNAL bool find_damped_step(LocateProblem *p, real damping);
+INTERNAL bool is_far(LocateProblem *p);
 INTERNAL real eased(real damping, real ratio);
+INTERNAL void add_algebraic_starts(LocateProblem *p);
+INTERNAL void add_intersections(LocateProblem *p, int32_t coordinates);
+INTERNAL void add_at_distance(LocateProblem *p, Equations *e, real distance_m);
+INTERNAL void add_interpolation(LocateProblem *p, int32_t coordinates);
+INTERNAL void fill(LocateProblem *p, Equations *e, int32_t coordinates, bool has_distance);
+INTERNAL real given_height_m(LocateProblem *p);
+INTERNAL void add_central_starts(LocateProblem *p);
+INTERNAL void add_image(LocateProblem *p);
+INTERNAL void add(LocateProblem *p, real x, real y, real z);
+INTERNAL int32_t find_minima(LocateProblem *p);
+INTERNAL bool is_found(LocateProblem *p);
+INTERNAL void assess(LocateProblem *p);
+INTERNAL void find_gain(LocateProblem *p, int32_t index_);
+INTERNAL void keep_rivals(LocateProblem *p);
+INTERNAL bool is_outside(LocateProblem *p, Minimum *minimum, real *state);
+INTERNAL int32_t why_none(LocateProblem *p, int32_t status);
+INTERNAL real below_plane(Minimum *minimum);
+INTERNAL void unfold(LocateProblem *p);
+INTERNAL int32_t decide(LocateProblem *p, Found *found);
+INTERNAL int32_t chosen_by_height(LocateProblem *p);
+INTERNAL void fill_position(LocateProblem *p, Minimum *minimum, real *position_m);
+INTERNAL real site_coordinate(LocateProblem *p, Minimum *minimum, int32_t k);
+INTERNAL real site_covariance(LocateProblem *p, Minimum *minimum, int32_t a, int32_t b);
+INTERNAL void fill_residuals(LocateProblem *p, Found *found, Minimum *minimum);
 
 /* Arithmetic of the functions that are also translated to C: the same bits on every processor, without a C library. */
 
@@ -2830,122 +2878,305 @@ SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_t
     }
 }
 
-/* Gauss–Newton steps, damped after Levenberg and Marquardt where they fail, to a minimum of TDoAs' residuals. */
+/* Symmetric matrices by Cholesky's method, and least squares of few unknowns by rotations of columns.
+ *
+ * A symmetric matrix is kept as its lower triangle, row by row: element (i, j) with j ≤ i is number i·(i + 1)/2 + j. */
 
-/* It also ends where a step promises to lower the cost by less than this part: steps of 10⁻⁷ sigma. */
+/* Cholesky's method */
 
-/* Write ``system``; an anchor at the very position has no direction and counts with zeros. */
-SKYLESS_EXPORT void skyless_linearise(Descent *d, real *state) {
-    real reference_m = REAL(0.0);
-    real reference_x = REAL(0.0);
-    real reference_y = REAL(0.0);
-    real reference_z = REAL(0.0);
-    for (int32_t i = 0, i_end = d->anchors; i < i_end; i++) {
-        real *anchor = d->positions_m[i];
-        real x = state[0] - anchor[0];
-        real y = state[1] - anchor[1];
-        real z = state[2] - anchor[2];
-        real across = d->kind == PLANE ? state[2] : z * z;
-        real distance_m = SQRT(max_real(x * x + y * y + across, REAL(1e-18)));
-        x /= distance_m;
-        y /= distance_m;
-        z = (d->kind == PLANE ? REAL(0.5) : z) / distance_m;
-        if (i == 0) {
-            reference_m = distance_m;
-            reference_x = x;
-            reference_y = y;
-            reference_z = z;
-        } else {
-            real *row = d->system[i - 1];
-            row[2] = z - reference_z;  /* and then the residual, where the height is given */
-            row[0] = x - reference_x;
-            row[1] = y - reference_y;
-            row[d->dims] = d->tdoa_m[i - 1] - (distance_m - reference_m);
-        }
-    }
-}
-
-/* Linearise, whiten, and write the lower triangle of systemᵀ·system into ``normal``; returns the cost. */
-INTERNAL real assemble(Descent *d, real *state, real (*normal)[4]) {
-    skyless_linearise(d, state);
-    int32_t rows = d->anchors - 1;
-    for (int32_t i = rows - 1; i > -1; i--) {  /* W is a lower triangle: rows above are still to come */
-        for (int32_t j = 0, j_end = d->dims + 1; j < j_end; j++) {
-            real total = REAL(0.0);
-            for (int32_t k = 0; k < i + 1; k++) {
-                total += d->whitener[i][k] * d->system[k][j];
-            }
-            d->system[i][j] = total;
-        }
-    }
-    for (int32_t j = 0, j_end = d->dims + 1; j < j_end; j++) {
-        for (int32_t k = 0; k < j + 1; k++) {
-            real total = REAL(0.0);
-            for (int32_t i = 0; i < rows; i++) {
-                total += d->system[i][j] * d->system[i][k];
-            }
-            normal[j][k] = total;
-        }
-    }
-    return normal[d->dims][d->dims];
-}
-
-/* Solve (N + damping·diag N)·step = gradient by Cholesky's method; False where the matrix is singular. */
-INTERNAL bool find_damped_step(Descent *d, real damping) {
-    real (*L)[4] = d->damped;
-    real *step = d->step;
-    for (int32_t j = 0, j_end = d->dims; j < j_end; j++) {
-        step[j] = d->normal[d->dims][j];
-        for (int32_t k = 0; k < j + 1; k++) {
-            L[j][k] = d->normal[j][k];
-        }
-        L[j][j] *= REAL(1.0) + damping;
-    }
-    for (int32_t j = 0, j_end = d->dims; j < j_end; j++) {
-        real pivot = L[j][j];
-        for (int32_t k = 0; k < j; k++) {
-            pivot -= L[j][k] * L[j][k];
-        }
-        if (!(pivot > SINGULAR_PIVOT * L[j][j] && L[j][j] > REAL(0.0))) {
-            return false;
-        }
-        L[j][j] = SQRT(pivot);
-        for (int32_t i = j + 1, i_end = d->dims; i < i_end; i++) {
-            real total = L[i][j];
+/* Replace A by its lower factor L, with L·Lᵀ = A.
+ *
+ * False where A is not positive definite, or singular, or not finite; its elements are then undefined. */
+INTERNAL bool factorise(real *A, int32_t size) {
+    for (int32_t i = 0; i < size; i++) {
+        int32_t row = floor_div_32(i * (i + 1), 2);
+        real diagonal = A[row + i];
+        for (int32_t j = 0; j < i + 1; j++) {
+            int32_t other = floor_div_32(j * (j + 1), 2);
+            real total = A[row + j];
             for (int32_t k = 0; k < j; k++) {
-                total -= L[i][k] * L[j][k];
+                total -= A[row + k] * A[other + k];
             }
-            L[i][j] = total / L[j][j];
+            if (j < i) {
+                A[row + j] = total / A[other + j];
+            } else if (total > SINGULAR_PIVOT * diagonal && diagonal > REAL(0.0)) {
+                A[row + j] = SQRT(total);
+            } else {
+                return false;
+            }
         }
-    }
-    for (int32_t i = 0, i_end = d->dims; i < i_end; i++) {
-        real total = step[i];
-        for (int32_t k = 0; k < i; k++) {
-            total -= L[i][k] * step[k];
-        }
-        step[i] = total / L[i][i];
-    }
-    for (int32_t i = d->dims - 1; i > -1; i--) {
-        real total = step[i];
-        for (int32_t k = i + 1, k_end = d->dims; k < k_end; k++) {
-            total -= L[k][i] * step[k];
-        }
-        step[i] = total / L[i][i];
     }
     return true;
 }
 
+/* Replace x by L⁻¹·x. */
+INTERNAL void solve_lower(real *L, int32_t size, real *x) {
+    for (int32_t i = 0; i < size; i++) {
+        int32_t row = floor_div_32(i * (i + 1), 2);
+        real total = x[i];
+        for (int32_t k = 0; k < i; k++) {
+            total -= L[row + k] * x[k];
+        }
+        x[i] = total / L[row + i];
+    }
+}
+
+/* Replace x by (L·Lᵀ)⁻¹·x. */
+INTERNAL void solve(real *L, int32_t size, real *x) {
+    solve_lower(L, size, x);
+    for (int32_t i = size - 1; i > -1; i--) {
+        real total = x[i];
+        for (int32_t k = i + 1; k < size; k++) {
+            total -= L[floor_div_32(k * (k + 1), 2) + i] * x[k];
+        }
+        x[i] = total / L[floor_div_32(i * (i + 1), 2) + i];
+    }
+}
+
+/* Rotations of columns */
+
+/* Rotate pairs of columns, the longer one to the front, until all are orthogonal (M. R. Hestenes 1958). */
+INTERNAL void orthogonalise(Columns *m) {
+    for (int32_t i = 0, i_end = m->columns; i < i_end; i++) {
+        for (int32_t j = 0, j_end = m->columns; j < j_end; j++) {
+            m->V[i][j] = i == j ? REAL(1.0) : REAL(0.0);
+        }
+    }
+    for (int32_t time_1 = 0; time_1 < MAX_SWEEPS; time_1++) {
+        bool is_done = true;
+        for (int32_t one = 0, one_end = m->columns - 1; one < one_end; one++) {
+            for (int32_t other = one + 1, other_end = m->columns; other < other_end; other++) {
+                if (has_rotated(m, one, other)) {
+                    is_done = false;
+                }
+            }
+        }
+        if (is_done) {
+            break;
+        }
+    }
+    for (int32_t j = 0, j_end = m->columns; j < j_end; j++) {
+        m->squares[j] = scalar_product(m, j, j);
+    }
+}
+
+/* Make two columns orthogonal and order them, by the smallest rotation; False where they are so already. */
+INTERNAL bool has_rotated(Columns *m, int32_t one, int32_t other) {
+    real square = scalar_product(m, one, one);
+    real square_other = scalar_product(m, other, other);
+    real product = scalar_product(m, one, other);
+    bool is_orthogonal = !(abs_real(product) > ORTHOGONAL * SQRT(square * square_other));
+    if (is_orthogonal && square >= square_other) {
+        return false;
+    }
+    real tangent = REAL(0.0);
+    if (!is_orthogonal) {
+        real cotangent = (square_other - square) / (REAL(2.0) * product);  /* of twice the angle */
+        tangent = REAL(1.0) / (abs_real(cotangent) + SQRT(REAL(1.0) + cotangent * cotangent));
+        if (cotangent < REAL(0.0)) {
+            tangent = -tangent;
+        }
+    }
+    real cosine = REAL(1.0) / SQRT(REAL(1.0) + tangent * tangent);
+    real sine = tangent * cosine;
+    if (square < square_other) {
+        const real new_1 = -sine;
+        const real new_2 = cosine;
+        cosine = new_1;
+        sine = new_2;
+    }
+    rotate_columns(m->A, m->rows, one, other, cosine, sine);
+    rotate_columns(m->V, m->columns, one, other, cosine, sine);
+    return true;
+}
+
+/* The scalar product of two columns. */
+INTERNAL real scalar_product(Columns *m, int32_t one, int32_t other) {
+    real total = REAL(0.0);
+    for (int32_t i = 0, i_end = m->rows; i < i_end; i++) {
+        real *row = m->A[i];
+        total += row[one] * row[other];
+    }
+    return total;
+}
+
+INTERNAL void rotate_columns(real (*A)[4], int32_t rows, int32_t one, int32_t other, real cosine, real sine) {
+    for (int32_t i = 0; i < rows; i++) {
+        real *row = A[i];
+        real first = row[one];
+        real second = row[other];
+        row[one] = cosine * first - sine * second;
+        row[other] = sine * first + cosine * second;
+    }
+}
+
+/* Find the x that minimises |A·x − right|, after ``orthogonalise``; False where A does not determine it. */
+INTERNAL bool least_squares(Columns *m, real *right, real *x) {
+    if (!(m->squares[m->columns - 1] > DEPENDENT * DEPENDENT * m->squares[0])) {
+        return false;
+    }
+    for (int32_t k = 0, k_end = m->columns; k < k_end; k++) {
+        x[k] = REAL(0.0);
+    }
+    for (int32_t j = 0, j_end = m->columns; j < j_end; j++) {
+        real total = REAL(0.0);
+        for (int32_t i = 0, i_end = m->rows; i < i_end; i++) {
+            total += m->A[i][j] * right[i];
+        }
+        total /= m->squares[j];
+        for (int32_t k = 0, k_end = m->columns; k < k_end; k++) {
+            x[k] += m->V[k][j] * total;
+        }
+    }
+    return true;
+}
+
+/* Tails of the normal and the chi2 distribution. */
+
+/* Probability that a standard normal variable exceeds z, to 10⁻¹² of itself.
+ *
+ * With its density φ it is ½ − φ(z)·Σ z²ⁿ⁺¹/(1·3·…·(2n + 1)), or φ(z)/(z + 1/(z + 2/(z + …))) after Laplace. */
+INTERNAL real normal_tail(real z) {
+    real tail = 0;
+    real size = abs_real(z);
+    real density = exp_(-REAL(0.5) * size * size) / SQRT_2_PI;
+    if (size < FAR_TAIL) {
+        real term = size;
+        real total = size;
+        for (int32_t n = 1; n < TERMS; n++) {
+            term *= size * size / (real)(2 * n + 1);
+            total += term;
+        }
+        tail = REAL(0.5) - density * total;
+    } else {
+        tail = density / continued_fraction(size, 1);
+    }
+    return z >= REAL(0.0) ? tail : REAL(1.0) - tail;
+}
+
+/* The value of z + n/(z + (n + 1)/(z + …)) for the first n. */
+INTERNAL real continued_fraction(real z, int32_t first) {
+    real fraction = z;
+    for (int32_t n = TERMS; n > first - 1; n--) {
+        fraction = z + (real)n / fraction;
+    }
+    return fraction;
+}
+
+/* Probability that chi2 with at least one degree of freedom exceeds a value, by the finite sum. */
+INTERNAL real chi2_tail(int32_t dof, real chi2) {
+    real half = REAL(0.5) * chi2;
+    if (!(half < REAL(700.0))) {
+        return REAL(0.0);
+    }
+    bool is_odd = floor_mod_32(dof, 2) == 1;
+    real term = is_odd ? REAL(2.0) * SQRT(chi2) / SQRT_2_PI : REAL(1.0);
+    real total = REAL(0.0);
+    for (int32_t k = 0; k < floor_div_32(dof, 2); k++) {
+        total += term;
+        term *= half / ((real)k + (is_odd ? REAL(1.5) : REAL(1.0)));
+    }
+    return (is_odd ? REAL(2.0) * normal_tail(SQRT(chi2)) : REAL(0.0)) + exp_(-half) * total;
+}
+
+/* Mean of a normal variable given that it is positive: E[w²], where w² was measured and may be near 0. */
+INTERNAL real mean_if_positive(real mean, real sigma) {
+    real z = mean / sigma;
+    if (z < -FAR_TAIL) {  /* where the mean and what is added to it would cancel */
+        return sigma / continued_fraction(-z, 2);
+    }
+    return mean + sigma * exp_(-REAL(0.5) * z * z) / (SQRT_2_PI * normal_tail(-z));
+}
+
+/* A set of TDoAs, in the axes in which their solution is simplest. */
+
+/* Anchors are in one plane if they leave it by less than this part of the smallest TDoA sigma. */
+
+/* Move the anchors into axes with the reference at the origin, and choose the kind of problem.
+ *
+ * Without a given height, the axes are those of the anchors' figure, the longest first. False where the anchors are
+ * in one line or in one point. */
+INTERNAL bool choose_axes(LocateProblem *p) {
+    Columns m = {0};
+    m.rows = p->anchors;
+    m.columns = 3;
+    for (int32_t k = 0; k < 3; k++) {
+        p->origin_m[k] = p->anchors_m[0][k];
+    }
+    for (int32_t i = 0, i_end = p->anchors; i < i_end; i++) {
+        for (int32_t k = 0; k < 3; k++) {
+            p->anchors_m[i][k] -= p->origin_m[k];
+            m.A[i][k] = p->knows_height && k == 2 ? REAL(0.0) : p->anchors_m[i][k];
+        }
+    }
+    orthogonalise(&m);
+    real square = REAL(0.0);
+    real square_width = REAL(0.0);
+    real thickness_m = REAL(0.0);
+    for (int32_t i = 0, i_end = p->anchors; i < i_end; i++) {
+        real *row = m.A[i];
+        real square_across = row[1] * row[1] + row[2] * row[2];
+        square = max_real(square, row[0] * row[0] + square_across);
+        square_width = max_real(square_width, square_across);
+        thickness_m = max_real(thickness_m, abs_real(row[2]));
+    }
+    if (!(square_width > COLLINEAR * COLLINEAR * square)) {
+        return false;
+    }
+    p->extent_m = SQRT(square);
+    bool is_flat = thickness_m <= max_real(FLAT * p->extent_m, THIN_SIGMAS * least_sigma_m(p));
+    p->kind = p->knows_height ? HEIGHT : is_flat ? PLANE : FREE;
+    p->dims = p->kind == HEIGHT ? 2 : 3;
+    for (int32_t j = 0; j < 3; j++) {
+        p->scale[j] = p->kind == PLANE && j == 2 ? p->extent_m * p->extent_m : p->extent_m;
+        for (int32_t k = 0; k < 3; k++) {
+            p->axes[j][k] = p->kind != HEIGHT ? m.V[k][j] : j == k ? REAL(1.0) : REAL(0.0);
+        }
+    }
+    if (p->kind != HEIGHT) {
+        for (int32_t i = 0, i_end = p->anchors; i < i_end; i++) {
+            for (int32_t k = 0; k < 3; k++) {
+                p->anchors_m[i][k] = p->kind == PLANE && k == 2 ? REAL(0.0) : m.A[i][k];
+            }
+        }
+    }
+    return true;
+}
+
+/* Standard deviation of a TDoA, from the factor of Σ. */
+INTERNAL real sigma_m(LocateProblem *p, int32_t index_) {
+    int32_t row = floor_div_32(index_ * (index_ + 1), 2);
+    real total = REAL(0.0);
+    for (int32_t k = 0; k < index_ + 1; k++) {
+        total += p->covariance[row + k] * p->covariance[row + k];
+    }
+    return SQRT(total);
+}
+
+INTERNAL real least_sigma_m(LocateProblem *p) {
+    real least_m = sigma_m(p, 0);
+    for (int32_t i = 1, i_end = p->anchors - 1; i < i_end; i++) {
+        least_m = min_real(least_m, sigma_m(p, i));
+    }
+    return least_m;
+}
+
+/* Gauss–Newton steps, damped after Levenberg and Marquardt where they fail, to a minimum of TDoAs' residuals. */
+
+/* It also ends where a step promises to lower the cost by less than this part: steps of 10⁻⁷ sigma. */
+
 /* Move the state to the minimum of its surroundings; returns how it ended. */
-SKYLESS_EXPORT int32_t skyless_descend(Descent *d) {
-    real cost = assemble(d, d->state, d->normal);
+INTERNAL int32_t descend(LocateProblem *p) {
+    int32_t gradient = floor_div_32(p->dims * (p->dims + 1), 2);
+    real cost = assemble(p, p->state, p->normal);
     real damping = REAL(0.0);
     real growth = REAL(2.0);
     for (int32_t j = 0; j < 3; j++) {
-        d->trial[j] = d->state[j];
+        p->trial[j] = p->state[j];
     }
     for (int32_t iteration = 1; iteration < MAX_ITERATIONS + 1; iteration++) {
-        d->iterations = iteration;
-        if (!find_damped_step(d, damping)) {
+        p->iterations = iteration;
+        if (!find_damped_step(p, damping)) {
             if (damping > REAL(1.0)) {
                 return UNDETERMINED;
             }
@@ -2954,24 +3185,23 @@ SKYLESS_EXPORT int32_t skyless_descend(Descent *d) {
         }
         real predicted = REAL(0.0);
         real longest = REAL(0.0);
-        for (int32_t j = 0, j_end = d->dims; j < j_end; j++) {
-            d->trial[j] = d->state[j] + d->step[j];
-            predicted += d->step[j] * (d->normal[d->dims][j] + damping * d->normal[j][j] * d->step[j]);
-            longest = max_real(longest, abs_real(d->step[j]) / d->scale[j]);
+        for (int32_t j = 0, j_end = p->dims; j < j_end; j++) {
+            p->trial[j] = p->state[j] + p->step[j];
+            predicted += p->step[j] * (p->normal[gradient + j] + damping * p->normal[floor_div_32(j * (j + 3), 2)] *
+                    p->step[j]);
+            longest = max_real(longest, abs_real(p->step[j]) / p->scale[j]);
         }
         bool is_small = longest <= STEP_TOLERANCE || predicted <= GAIN_TOLERANCE * cost;
-        real next_cost = assemble(d, d->trial, d->next_normal);
+        real next_cost = assemble(p, p->trial, p->next_normal);
         if (next_cost < cost) {
-            damping = eased(damping, (cost - next_cost) / max_real(predicted, REAL(1e-300)));
+            damping = eased(damping, predicted > REAL(0.0) ? (cost - next_cost) / predicted : REAL(1.0));
             growth = REAL(2.0);
             cost = next_cost;
-            for (int32_t j = 0, j_end = d->dims; j < j_end; j++) {
-                d->state[j] = d->trial[j];
+            for (int32_t j = 0, j_end = p->dims; j < j_end; j++) {
+                p->state[j] = p->trial[j];
             }
-            for (int32_t j = 0, j_end = d->dims + 1; j < j_end; j++) {
-                for (int32_t k = 0; k < j + 1; k++) {
-                    d->normal[j][k] = d->next_normal[j][k];
-                }
+            for (int32_t k = 0, k_end = gradient + p->dims; k < k_end; k++) {
+                p->normal[k] = p->next_normal[k];
             }
         } else {
             damping = max_real(growth * damping, FIRST_DAMPING);
@@ -2980,18 +3210,101 @@ SKYLESS_EXPORT int32_t skyless_descend(Descent *d) {
         if (is_small) {
             return CONVERGED;
         }
-        if (is_far(d)) {
+        if (is_far(p)) {
             return DIVERGED;
         }
     }
     return EXHAUSTED;
 }
 
+/* Linearise, whiten where it is weighted, and write systemᵀ·system into ``normal``; returns the cost. */
+INTERNAL real assemble(LocateProblem *p, real *state, real *normal) {
+    linearise(p, state);
+    if (p->is_weighted) {
+        whiten_system(p);
+    }
+    int32_t element = 0;
+    for (int32_t j = 0, j_end = p->dims + 1; j < j_end; j++) {
+        for (int32_t k = 0; k < j + 1; k++) {
+            real total = REAL(0.0);
+            for (int32_t i = 0, i_end = p->anchors - 1; i < i_end; i++) {
+                total += p->system[i][j] * p->system[i][k];
+            }
+            normal[element] = total;
+            element += 1;
+        }
+    }
+    return normal[element - 1];
+}
+
+/* Write ``system``; an anchor at the very position has no direction and counts with zeros. */
+INTERNAL void linearise(LocateProblem *p, real *state) {
+    real reference_m = REAL(0.0);
+    real reference_x = REAL(0.0);
+    real reference_y = REAL(0.0);
+    real reference_z = REAL(0.0);
+    for (int32_t i = 0, i_end = p->anchors; i < i_end; i++) {
+        real *anchor = p->anchors_m[i];
+        real x = state[0] - anchor[0];
+        real y = state[1] - anchor[1];
+        real z = state[2] - anchor[2];
+        real across = p->kind == PLANE ? state[2] : z * z;
+        real distance_m = SQRT(max_real(x * x + y * y + across, NEAREST_M2));
+        x /= distance_m;
+        y /= distance_m;
+        z = (p->kind == PLANE ? REAL(0.5) : z) / distance_m;
+        if (i == 0) {
+            reference_m = distance_m;
+            reference_x = x;
+            reference_y = y;
+            reference_z = z;
+        } else {
+            real *row = p->system[i - 1];
+            row[2] = z - reference_z;  /* and then the residual, where the height is given */
+            row[0] = x - reference_x;
+            row[1] = y - reference_y;
+            row[p->dims] = p->tdoa_m[i - 1] - (distance_m - reference_m);
+        }
+    }
+}
+
+/* Replace ``system`` by L⁻¹·system. */
+INTERNAL void whiten_system(LocateProblem *p) {
+    for (int32_t i = 0, i_end = p->anchors - 1; i < i_end; i++) {
+        int32_t first = floor_div_32(i * (i + 1), 2);
+        real *row = p->system[i];
+        for (int32_t j = 0, j_end = p->dims + 1; j < j_end; j++) {
+            real total = row[j];
+            for (int32_t k = 0; k < i; k++) {
+                total -= p->covariance[first + k] * p->system[k][j];
+            }
+            row[j] = total / p->covariance[first + i];
+        }
+    }
+}
+
+/* Solve (N + damping·diag N)·step = gradient; False where the matrix is singular. */
+INTERNAL bool find_damped_step(LocateProblem *p, real damping) {
+    int32_t gradient = floor_div_32(p->dims * (p->dims + 1), 2);
+    for (int32_t k = 0; k < gradient; k++) {
+        p->factor[k] = p->normal[k];
+    }
+    for (int32_t j = 0, j_end = p->dims; j < j_end; j++) {
+        p->factor[floor_div_32(j * (j + 3), 2)] *= REAL(1.0) + damping;
+        p->step[j] = p->normal[gradient + j];
+    }
+    if (!factorise(p->factor, p->dims)) {
+        return false;
+    }
+    solve(p->factor, p->dims, p->step);
+    return true;
+}
+
 /* Whether the state has left for infinity, or is no number. */
-INTERNAL bool is_far(Descent *d) {
-    for (int32_t j = 0, j_end = d->dims; j < j_end; j++) {
-        real reach = abs_real(d->state[j]) / d->scale[j];
-        if (!((d->kind == PLANE && j == 2 ? SQRT(reach) : reach) < FAR_EXTENTS)) {
+INTERNAL bool is_far(LocateProblem *p) {
+    for (int32_t j = 0, j_end = p->dims; j < j_end; j++) {
+        real reach = abs_real(p->state[j]) / p->scale[j];
+        if (!((p->kind == PLANE && j == 2 ? SQRT(reach) : reach) < FAR_EXTENTS)) {
             return true;
         }
     }
@@ -3006,4 +3319,488 @@ INTERNAL real eased(real damping, real ratio) {
     real excess = REAL(2.0) * ratio - REAL(1.0);
     real eased = damping * max_real(REAL(1.0) / REAL(3.0), REAL(1.0) - excess * excess * excess);
     return eased > MIN_DAMPING ? eased : REAL(0.0);
+}
+
+/* States from which the iterations start: from TDoAs in closed form, without a guess.
+ *
+ * With the reference anchor at the origin, x the tag, ρ = |x| its distance from there, and the measured
+ * d_i = |x − a_i| − ρ, squaring ρ + d_i = |x − a_i| leaves equations that are linear in x and ρ:
+ *
+ *     a_iᵀx + d_i·ρ = (|a_i|² − d_i²)/2
+ *
+ * *Spherical intersection* solves them for x as a function of ρ, and |x|² = ρ² is then a quadratic with two roots;
+ * *spherical interpolation* takes ρ as one more unknown (H. C. Schau and A. Z. Robinson 1987; J. O. Smith and
+ * J. S. Abel 1987). Anchors in one plane determine nothing of the coordinate w across it except w² = ρ² − x² − y².
+ * The equations are not weighted. */
+
+/* Add what the closed forms find. */
+INTERNAL void add_algebraic_starts(LocateProblem *p) {
+    int32_t coordinates = p->kind == FREE ? 3 : 2;
+    if (p->kind != PLANE) {
+        add_intersections(p, coordinates);
+    }
+    if (p->anchors - 1 > coordinates) {
+        add_interpolation(p, coordinates);
+    }
+    if (p->kind == FREE) {
+        add_interpolation(p, 2);
+    }
+}
+
+/* Add the points x = u − v·ρ for each non-negative root ρ of |x|² = ρ².
+ *
+ * Where noise leaves no real root, the vertex of the parabola is used. The roots' form does not cancel. */
+INTERNAL void add_intersections(LocateProblem *p, int32_t coordinates) {
+    Equations e = {0};
+    fill(p, &e, coordinates, false);
+    if (!(least_squares(&e.left, e.right, e.u) && least_squares(&e.left, p->tdoa_m, e.v))) {
+        return;
+    }
+    real height_m = given_height_m(p);
+    real a = -REAL(1.0);
+    real half_b = REAL(0.0);
+    real c = height_m * height_m;
+    for (int32_t k = 0; k < coordinates; k++) {
+        a += e.v[k] * e.v[k];
+        half_b -= e.u[k] * e.v[k];
+        c += e.u[k] * e.u[k];
+    }
+    real discriminant = half_b * half_b - a * c;
+    if (discriminant < REAL(0.0)) {
+        add_at_distance(p, &e, -half_b / a);
+    } else {
+        real root = SQRT(discriminant);
+        real larger = half_b >= REAL(0.0) ? -half_b - root : root - half_b;
+        if (a != REAL(0.0)) {
+            add_at_distance(p, &e, larger / a);
+        }
+        if (larger != REAL(0.0)) {
+            add_at_distance(p, &e, c / larger);
+        }
+    }
+}
+
+INTERNAL void add_at_distance(LocateProblem *p, Equations *e, real distance_m) {
+    if (distance_m >= REAL(0.0)) {
+        real x = e->u[0] - e->v[0] * distance_m;
+        real y = e->u[1] - e->v[1] * distance_m;
+        add(p, x, y, p->kind == HEIGHT ? given_height_m(p) : e->u[2] - e->v[2] * distance_m);
+    }
+}
+
+/* Add the solution of the equations for these coordinates and ρ; with two of three, both that have this ρ. */
+INTERNAL void add_interpolation(LocateProblem *p, int32_t coordinates) {
+    Equations e = {0};
+    fill(p, &e, coordinates, true);
+    if (!least_squares(&e.left, e.right, e.u)) {
+        return;
+    }
+    real x = e.u[0];
+    real y = e.u[1];
+    real square_across = e.u[2] * e.u[2] - x * x - y * y;
+    if (p->kind == HEIGHT) {
+        add(p, x, y, given_height_m(p));
+    } else if (p->kind == PLANE) {
+        add(p, x, y, square_across);
+    } else if (coordinates == 3) {
+        add(p, x, y, e.u[2]);
+    } else {
+        real across_m = SQRT(max_real(square_across, REAL(0.0)));
+        add(p, x, y, across_m);
+        add(p, x, y, -across_m);
+    }
+}
+
+/* Write the equations for these coordinates and, if it has it, for ρ. */
+INTERNAL void fill(LocateProblem *p, Equations *e, int32_t coordinates, bool has_distance) {
+    Columns *m = &e->left;
+    m->rows = p->anchors - 1;
+    m->columns = coordinates + (has_distance ? 1 : 0);
+    for (int32_t i = 0, i_end = m->rows; i < i_end; i++) {
+        real *anchor = p->anchors_m[i + 1];
+        real square = anchor[0] * anchor[0] + anchor[1] * anchor[1] + anchor[2] * anchor[2];
+        e->right[i] = REAL(0.5) * (square - p->tdoa_m[i] * p->tdoa_m[i]) - anchor[2] * given_height_m(p);
+        m->A[i][coordinates] = p->tdoa_m[i];
+        for (int32_t k = 0; k < coordinates; k++) {
+            m->A[i][k] = anchor[k];
+        }
+    }
+    orthogonalise(m);
+}
+
+/* The given height above the reference anchor; 0 where none is given. */
+INTERNAL real given_height_m(LocateProblem *p) {
+    return p->kind == HEIGHT ? p->height_m - p->origin_m[2] : REAL(0.0);
+}
+
+/* Add the anchors' centroid; where the height is unknown, half their extent off their plane. */
+INTERNAL void add_central_starts(LocateProblem *p) {
+    real x = REAL(0.0);
+    real y = REAL(0.0);
+    real z = REAL(0.0);
+    real off_m = REAL(0.5) * p->extent_m;
+    for (int32_t i = 0, i_end = p->anchors; i < i_end; i++) {
+        x += p->anchors_m[i][0] / (real)p->anchors;
+        y += p->anchors_m[i][1] / (real)p->anchors;
+        z += p->anchors_m[i][2] / (real)p->anchors;
+    }
+    if (p->kind == FREE) {
+        add(p, x, y, z + off_m);
+        add(p, x, y, z - off_m);
+    } else {
+        add(p, x, y, p->kind == HEIGHT ? given_height_m(p) : off_m * off_m);
+    }
+}
+
+/* Add the state's mirror image behind the anchors' line or plane of least squares; a given height stays. */
+INTERNAL void add_image(LocateProblem *p) {
+    Columns m = {0};
+    m.rows = p->anchors;
+    m.columns = p->dims;
+    real off_m = REAL(0.0);
+    for (int32_t k = 0, k_end = p->dims; k < k_end; k++) {
+        real mean = REAL(0.0);
+        for (int32_t i = 0, i_end = p->anchors; i < i_end; i++) {
+            mean += p->anchors_m[i][k] / (real)p->anchors;
+        }
+        for (int32_t i = 0, i_end = p->anchors; i < i_end; i++) {
+            m.A[i][k] = p->anchors_m[i][k] - mean;
+        }
+        p->trial[k] = p->state[k] - mean;
+    }
+    orthogonalise(&m);
+    int32_t across = p->dims - 1;
+    for (int32_t k = 0, k_end = p->dims; k < k_end; k++) {
+        off_m += m.V[k][across] * p->trial[k];
+    }
+    for (int32_t k = 0, k_end = p->dims; k < k_end; k++) {
+        p->trial[k] = p->state[k] - REAL(2.0) * off_m * m.V[k][across];
+    }
+    add(p, p->trial[0], p->trial[1], p->kind == HEIGHT ? p->state[2] : p->trial[2]);
+}
+
+INTERNAL void add(LocateProblem *p, real x, real y, real z) {
+    real *start = p->starts[p->start_count];
+    start[0] = x;
+    start[1] = y;
+    start[2] = z;
+    p->start_count += 1;
+}
+
+/* The minima of a set of TDoAs, and which of them are distinct. */
+
+/* Two minima are distinct where one lies outside the 3-sigma ellipsoid of the other. */
+
+/* Fill ``minima`` with all that are found, the best first; returns how the last iteration that failed ended.
+ *
+ * The closed form's starts depend on the reference and miss about one rival in a hundred; the anchors' centroid
+ * finds most of these, and the mirror image of what is found the rest where anchors are nearly in one line or plane. */
+INTERNAL int32_t find_minima(LocateProblem *p) {
+    add_algebraic_starts(p);
+    add_central_starts(p);
+    int32_t status = CONVERGED;
+    int32_t start = 0;
+    while (start < p->start_count) {
+        for (int32_t k = 0; k < 3; k++) {
+            p->state[k] = p->starts[start][k];
+        }
+        start += 1;
+        int32_t end = descend(p);
+        if (end != CONVERGED) {
+            status = end;
+        } else if (!is_found(p)) {
+            if (p->kind != PLANE && p->minimum_count == 0 && p->start_count < MAX_STARTS) {
+                add_image(p);
+            }
+            assess(p);
+        }
+    }
+    return status;
+}
+
+/* Whether the state is at a minimum that has been found before. */
+INTERNAL bool is_found(LocateProblem *p) {
+    for (int32_t index_ = 0, index__end = p->minimum_count; index_ < index__end; index_++) {
+        real apart = REAL(0.0);
+        for (int32_t j = 0, j_end = p->dims; j < j_end; j++) {
+            apart += abs_real(p->minima[index_].state[j] - p->state[j]) / p->scale[j];
+        }
+        if (apart < SAME_POINT) {
+            return true;
+        }
+    }
+    return false;
+}
+
+/* Insert the minimum at the state, unless it is singular there.
+ *
+ * Its covariance is G·Σ·Gᵀ with the G of the estimate, (HᵀΣ⁻¹H)⁻¹HᵀΣ⁻¹ or, not weighted, (HᵀH)⁻¹Hᵀ. */
+INTERNAL void assess(LocateProblem *p) {
+    Minimum found = {0};
+    found.iterations = p->iterations;
+    found.cost = assemble(p, p->state, p->normal);
+    for (int32_t k = 0, k_end = floor_div_32(p->dims * (p->dims + 1), 2); k < k_end; k++) {
+        p->factor[k] = p->normal[k];
+    }
+    if (!factorise(p->factor, p->dims)) {
+        return;
+    }
+    for (int32_t j = 0; j < 3; j++) {
+        found.state[j] = p->state[j];
+    }
+    for (int32_t i = 0, i_end = p->anchors - 1; i < i_end; i++) {
+        find_gain(p, i);
+        int32_t element = 0;
+        for (int32_t j = 0, j_end = p->dims; j < j_end; j++) {
+            for (int32_t k = 0; k < j + 1; k++) {
+                found.covariance[element] += p->step[j] * p->step[k];
+                element += 1;
+            }
+        }
+    }
+    if (!(found.covariance[floor_div_32(p->dims * (p->dims + 1), 2) - 1] > REAL(0.0))) {  /* too small for a number */
+        return;
+    }
+    if (!p->is_weighted) {
+        whiten_system(p);
+    }
+    for (int32_t i = 0, i_end = p->anchors - 1; i < i_end; i++) {
+        found.chi2 += p->system[i][p->dims] * p->system[i][p->dims];
+    }
+    int32_t index_ = p->minimum_count;
+    while (index_ > 0 && p->minima[index_ - 1].cost > found.cost) {
+        p->minima[index_] = p->minima[index_ - 1];
+        index_ -= 1;
+    }
+    p->minima[index_] = found;
+    p->minimum_count += 1;
+}
+
+/* Write a column of G·L into ``step``; where it is weighted, ``system`` holds L⁻¹·H. */
+INTERNAL void find_gain(LocateProblem *p, int32_t index_) {
+    for (int32_t j = 0, j_end = p->dims; j < j_end; j++) {
+        if (p->is_weighted) {
+            p->step[j] = p->system[index_][j];
+        } else {
+            p->step[j] = REAL(0.0);
+            for (int32_t i = index_, i_end = p->anchors - 1; i < i_end; i++) {
+                p->step[j] += p->system[i][j] * p->covariance[floor_div_32(i * (i + 1), 2) + index_];
+            }
+        }
+    }
+    solve(p->factor, p->dims, p->step);
+}
+
+/* Keep the best minimum and those that explain the TDoAs about as well from somewhere else. */
+INTERNAL void keep_rivals(LocateProblem *p) {
+    int32_t kept = 1;
+    Minimum *best = &p->minima[0];
+    for (int32_t index_ = 1, index__end = p->minimum_count; index_ < index__end; index_++) {
+        Minimum *other = &p->minima[index_];
+        if (other->chi2 <= best->chi2 + RIVAL_MINIMUM_CHI2 && (is_outside(p, best, other->state) || is_outside(p, other,
+                best->state))) {
+            p->minima[kept] = p->minima[index_];
+            kept += 1;
+        }
+    }
+    p->minimum_count = kept;
+}
+
+/* Whether a state lies outside a minimum's error ellipsoid. */
+INTERNAL bool is_outside(LocateProblem *p, Minimum *minimum, real *state) {
+    for (int32_t k = 0, k_end = floor_div_32(p->dims * (p->dims + 1), 2); k < k_end; k++) {
+        p->factor[k] = minimum->covariance[k];
+    }
+    for (int32_t j = 0, j_end = p->dims; j < j_end; j++) {
+        p->step[j] = state[j] - minimum->state[j];
+    }
+    if (!factorise(p->factor, p->dims)) {
+        return true;
+    }
+    solve_lower(p->factor, p->dims, p->step);
+    real chi2 = REAL(0.0);
+    for (int32_t j = 0, j_end = p->dims; j < j_end; j++) {
+        chi2 += p->step[j] * p->step[j];
+    }
+    return !(chi2 <= DISTINCT_MINIMA_CHI2);
+}
+
+/* The position of a set of TDoAs: its minima, unfolded from a plane, and decided between by the height's bounds. */
+
+/* Mirror images have merged while the square of their distance from the plane is within these sigmas of zero. */
+
+/* Locate a tag by TDoAs whose numbers are finite; returns why there is no position.
+ *
+ * Needs 4 anchors, with a given height 3; with fewer, no position is determined. The problem is used up. */
+SKYLESS_EXPORT int32_t skyless_find_position(LocateProblem *p, Found *found) {
+    p->start_count = 0;
+    p->minimum_count = 0;
+    if (!factorise(p->covariance, p->anchors - 1)) {
+        return NO_COVARIANCE;
+    }
+    if (!choose_axes(p)) {
+        return COLLINEAR_ANCHORS;
+    }
+    int32_t status = find_minima(p);
+    if (p->minimum_count == 0) {
+        return why_none(p, status);
+    }
+    Minimum *best = &p->minima[0];
+    found->dof = p->anchors - 1 - p->dims;
+    real below = p->kind == PLANE ? below_plane(best) : REAL(0.0);
+    found->chi2 = best->chi2 + below;
+    int32_t dof = max_32(found->dof + (below > REAL(0.0) ? 1 : 0), 1);  /* without any, residuals are zero unless nothing fits at all */
+    if (chi2_tail(dof, found->chi2) < p->residual_tail) {
+        return RESIDUALS;
+    }
+    if (p->kind == PLANE) {
+        fill_residuals(p, found, best);
+        unfold(p);
+    } else {
+        keep_rivals(p);
+    }
+    return decide(p, found);
+}
+
+/* The reason when no iteration ended in a minimum. */
+INTERNAL int32_t why_none(LocateProblem *p, int32_t status) {
+    for (int32_t i = 0, i_end = p->anchors - 1; i < i_end; i++) {
+        real *anchor = p->anchors_m[i + 1];
+        real baseline_m = SQRT(anchor[0] * anchor[0] + anchor[1] * anchor[1] + anchor[2] * anchor[2]);
+        if (abs_real(p->tdoa_m[i]) > baseline_m + IMPOSSIBLE_SIGMAS * sigma_m(p, i)) {
+            return IMPOSSIBLE;
+        }
+    }
+    return status == EXHAUSTED ? UNSETTLED : SINGULAR;
+}
+
+/* Anchors in a plane */
+
+/* What the constraint s ≥ 0 adds to chi2: s²/σ_s² where the square of a distance came out negative. */
+INTERNAL real below_plane(Minimum *minimum) {
+    real s = minimum->state[2];
+    return s < REAL(0.0) ? s * s / minimum->covariance[5] : REAL(0.0);
+}
+
+/* From s = w² to w: the two images, or one in the plane where s cannot be distinguished from 0. */
+INTERNAL void unfold(LocateProblem *p) {
+    Minimum *best = &p->minima[0];
+    Minimum *image = &p->minima[1];
+    real s = best->state[2];
+    real sigma = SQRT(best->covariance[5]);
+    p->minimum_count = 1;
+    if (s < MERGED_SIGMAS * sigma) {
+        best->state[2] = REAL(0.0);
+        best->covariance[3] = REAL(0.0);
+        best->covariance[4] = REAL(0.0);
+        best->covariance[5] = mean_if_positive(s, sigma);
+        return;
+    }
+    real w = SQRT(s);
+    best->state[2] = w;
+    best->covariance[3] *= REAL(0.5) / w;
+    best->covariance[4] *= REAL(0.5) / w;
+    best->covariance[5] *= REAL(0.25) / s;
+    p->minima[1] = p->minima[0];
+    image->state[2] = -w;
+    image->covariance[3] = -image->covariance[3];
+    image->covariance[4] = -image->covariance[4];
+    p->minimum_count = 2;
+}
+
+/* Decision */
+
+/* Choose among rivals by the height's bounds, and reject what is not resolved. */
+INTERNAL int32_t decide(LocateProblem *p, Found *found) {
+    int32_t chosen = 0;
+    if (p->minimum_count > 1) {
+        found->has_mirror = true;
+        fill_position(p, &p->minima[0], found->position_m);
+        fill_position(p, &p->minima[1], found->mirror_m);
+        chosen = chosen_by_height(p);
+        if (chosen < 0) {
+            return MIRROR;
+        }
+        if (chosen > 0) {
+            fill_position(p, &p->minima[0], found->mirror_m);
+        }
+    }
+    Minimum *minimum = &p->minima[chosen];
+    fill_position(p, minimum, found->position_m);
+    real trace_m2 = REAL(0.0);
+    real distance_m = REAL(0.0);
+    for (int32_t a = 0; a < 3; a++) {
+        for (int32_t b = 0; b < 3; b++) {
+            found->covariance_m2[a][b] = site_covariance(p, minimum, a, b);
+        }
+        trace_m2 += found->covariance_m2[a][a];
+        distance_m += abs_real(minimum->state[a]);
+    }
+    if (!(trace_m2 < (p->extent_m + distance_m) * (p->extent_m + distance_m))) {
+        return UNCERTAIN;
+    }
+    if (p->kind != PLANE) {
+        fill_residuals(p, found, minimum);
+    }
+    found->chi2 = minimum->chi2;
+    found->iterations = minimum->iterations;
+    return FOUND;
+}
+
+/* The only position within the bounds, else the one that exceeds them least and by little; −1 if there is none. */
+INTERNAL int32_t chosen_by_height(LocateProblem *p) {
+    int32_t chosen = -1;
+    int32_t equals = 0;
+    real least_m = REAL(0.0);
+    if (!p->has_bounds) {
+        return chosen;
+    }
+    for (int32_t index_ = 0, index__end = p->minimum_count; index_ < index__end; index_++) {
+        real z = site_coordinate(p, &p->minima[index_], 2);
+        real excess_m = max_real(max_real(p->low_m - z, z - p->high_m), REAL(0.0));
+        if (chosen < 0 || excess_m < least_m) {
+            chosen = index_;
+            equals = 1;
+            least_m = excess_m;
+        } else if (excess_m == least_m) {
+            equals += 1;
+        }
+    }
+    real variance_m2 = max_real(site_covariance(p, &p->minima[chosen], 2, 2), REAL(0.0));
+    return equals > 1 || least_m > BOUND_SIGMAS * SQRT(variance_m2) ? -1 : chosen;
+}
+
+INTERNAL void fill_position(LocateProblem *p, Minimum *minimum, real *position_m) {
+    for (int32_t k = 0; k < 3; k++) {
+        position_m[k] = site_coordinate(p, minimum, k);
+    }
+}
+
+/* A coordinate of a minimum in the site frame. */
+INTERNAL real site_coordinate(LocateProblem *p, Minimum *minimum, int32_t k) {
+    real total = p->origin_m[k];
+    for (int32_t j = 0; j < 3; j++) {
+        total += p->axes[j][k] * minimum->state[j];
+    }
+    return total;
+}
+
+/* An element of a minimum's covariance in the site frame. */
+INTERNAL real site_covariance(LocateProblem *p, Minimum *minimum, int32_t a, int32_t b) {
+    real total = REAL(0.0);
+    for (int32_t j = 0; j < 3; j++) {
+        for (int32_t k = 0; k < 3; k++) {
+            int32_t one = max_32(j, k);
+            int32_t other = min_32(j, k);
+            total += p->axes[j][a] * minimum->covariance[floor_div_32(one * (one + 1), 2) + other] * p->axes[k][b];
+        }
+    }
+    return total;
+}
+
+INTERNAL void fill_residuals(LocateProblem *p, Found *found, Minimum *minimum) {
+    linearise(p, minimum->state);
+    for (int32_t i = 0, i_end = p->anchors - 1; i < i_end; i++) {
+        found->residuals_m[i] = p->system[i][p->dims];
+    }
 }

@@ -9,7 +9,13 @@
  * skyless.core.estimator.state
  * skyless.core.estimator.steady_state
  * skyless.core.native.arithmetic
+ * skyless.core.native.small_matrices
+ * skyless.core.native.tails
  * skyless.core.tag.descent
+ * skyless.core.tag.minima
+ * skyless.core.tag.position
+ * skyless.core.tag.problem
+ * skyless.core.tag.starts
  */
 
 #ifndef SKYLESS_CORE_H
@@ -34,23 +40,37 @@ typedef double real;
 #define AFTER_ALL_TICKS INT64_C(4611686018427387904)
 #define ALL_RANGE_ERRORS 2
 #define AXES 3
+#define BOUND_SIGMAS REAL(3.0)
 #define CHANGING_RANGE_ERRORS 1
 #define CLOCK_JUMPED 2
 #define CLOCK_RATE_VARIANCE REAL(224688794.68420443)
+#define COLLINEAR REAL(1e-06)
+#define COLLINEAR_ANCHORS 2
 #define COMPLETE_CHANGE REAL(0.001)
 #define CONTRADICTED 2
 #define CONVERGED 0
 #define CREEPING 2
+/* Columns are not independent if their smallest singular value is below this part of the largest. */
+#define DEPENDENT REAL(1e-06)
+#define DISTINCT_MINIMA_CHI2 REAL(9.0)
 #define DIVERGED 2
 #define EXHAUSTED 3
 #define FAR_EXTENTS REAL(10000.0)
+/* From here on the normal tail's continued fraction converges faster than its series. */
+#define FAR_TAIL REAL(3.0)
 #define FAULT_KINDS 3
 #define FIRST_DAMPING REAL(0.01)
 /* Where ``protect`` writes the tests of all kinds of faults, after ``HPL`` and ``VPL``. */
 #define FIRST_TEST 2
+#define FLAT REAL(1e-09)
+#define FOUND 0
+#define FREE 0
 #define GAIN_TOLERANCE REAL(1e-13)
 #define HALF_WRAP_TICKS INT64_C(549755813888)
+#define HEIGHT 1
 #define HPL 0
+#define IMPOSSIBLE 3
+#define IMPOSSIBLE_SIGMAS REAL(6.0)
 #define IMPULSES 4
 #define JOINED 2
 /* Numbers in a vector of 256 bits. */
@@ -68,12 +88,22 @@ typedef double real;
 #define MAX_RATE_MPS REAL(29979.2458)
 /* Most relays with a packet; 13 fit into a frame. */
 #define MAX_RELAYS 32
+#define MAX_STARTS 9
+/* Rotations of all pairs of columns; they converge quadratically, with four columns after about six. */
+#define MAX_SWEEPS 12
+#define MERGED_SIGMAS REAL(2.0)
 #define MIN_DAMPING REAL(0.0001)
+#define MIRROR 7
 #define MOST_WAITING 8
+/* A smaller square of a distance counts as this. */
+#define NEAREST_M2 REAL(1e-18)
 /* A time before all others. */
 #define NEVER (INT64_C(-4611686018427387904))
+#define NO_COVARIANCE 1
 #define NO_RANGE_ERRORS 0
 #define OBSTRUCTED 1
+/* Columns are orthogonal if the cosine of their angle is not larger. */
+#define ORTHOGONAL REAL(1e-14)
 /* Bytes of a relay in a frame: identifier (2), sequence number (1), stamp (5), the lowest first. */
 #define PACKED_BYTES 8
 /* Packets of each anchor that are kept for relays to come; divides the range of sequence numbers. */
@@ -84,12 +114,17 @@ typedef double real;
 #define QUALITY 4
 #define RECENT 1
 #define REJECTED 0
+#define RESIDUALS 6
 #define RESTARTED_CLOCK 4
+#define RIVAL_MINIMUM_CHI2 REAL(9.0)
 #define ROOT_2_PI REAL(2.5066282746310002)
+#define SAME_POINT REAL(1e-06)
+#define SINGULAR 5
 /* A pivot below this part of its diagonal element is rounding noise: the matrix is singular. */
 #define SINGULAR_PIVOT REAL(1e-12)
 #define SOUND 0
 #define SPEED_OF_LIGHT_MPS REAL(299792458.0)
+#define SQRT_2_PI REAL(2.5066282746310002)
 #define STALE 3
 #define STATE 2
 #define STEP_TOLERANCE REAL(1e-10)
@@ -97,11 +132,15 @@ typedef double real;
 #define SUBTICK_MASK INT64_C(281474976710655)
 /* Of Jacobi's rotations: each squares what is left off the diagonal. */
 #define SWEEPS 8
+#define TERMS 60
+#define THIN_SIGMAS REAL(0.1)
 #define TICK_M REAL(0.0046917639786157855)
 #define TICK_MASK INT64_C(1099511627775)
 #define TICK_S REAL(1.5650040064102565e-11)
 #define UNAVAILABLE 3
+#define UNCERTAIN 8
 #define UNDETERMINED 1
+#define UNSETTLED 4
 #define UNUSED 0
 #define USED 1
 #define VELOCITY 5
@@ -524,24 +563,76 @@ typedef struct SteadyState {
     real motion_m2[3];  /* What accelerations have of each axis' variance, for one fix. */
 } SteadyState;
 
-/* A set of TDoAs, the reference first, and where the iteration is. */
-typedef struct Descent {
-    int32_t kind;
-    int32_t anchors;
-    int32_t dims;  /* Number of unknowns. */
+/* A minimum of the cost, in the problem's axes. */
+typedef struct Minimum {
     int32_t iterations;
-    real positions_m[64][3];
-    real tdoa_m[64];
-    real whitener[64][64];  /* A lower triangle; the unit matrix where the sum of squares is not weighted. */
-    real scale[3];  /* What the anchors' extent is for each unknown. */
+    real cost;
+    real chi2;  /* rᵀΣ⁻¹r, also where the cost is not weighted by Σ⁻¹. */
+    real state[3];
+    real covariance[10];  /* A lower triangle; zeros for a given height. */
+} Minimum;
+
+/* A set of TDoAs ``tdoa_m[i] = |p − anchors_m[i + 1]| − |p − anchors_m[0]|``, and how far its solution is. */
+typedef struct LocateProblem {
+    int32_t anchors;
+    bool knows_height;
+    bool is_weighted;
+    bool has_bounds;  /* Whether the height is between ``low_m`` and ``high_m``. */
+    real height_m;
+    real low_m;
+    real high_m;
+    real residual_tail;  /* Residuals that noise exceeds more rarely are not noise. */
+    real anchors_m[32][3];  /* The reference first; ``choose_axes`` moves them into its axes. */
+    real tdoa_m[32];
+    real covariance[496];  /* The lower triangle of Σ, and then of its factor L. */
+    int32_t kind;
+    int32_t dims;  /* Number of unknowns. */
+    real extent_m;  /* Size of the anchors' figure. */
+    real origin_m[3];
+    real axes[3][3];  /* Its rows; a position is origin + axesᵀ·state. */
+    real scale[3];  /* What the extent is for each unknown. */
+    int32_t start_count;
+    int32_t minimum_count;
+    real starts[9][3];
+    Minimum minima[9];  /* The best first. */
+    int32_t iterations;
     real state[3];
     real trial[3];
     real step[3];
-    real system[64][4];  /* Rows [∂TDoA/∂state, measured − predicted]. */
-    real normal[4][4];  /* The lower triangle of systemᵀ·system. */
-    real next_normal[4][4];
-    real damped[4][4];
-} Descent;
+    real system[32][4];  /* Rows [∂TDoA/∂state, measured − predicted]. */
+    real normal[10];  /* The lower triangle of systemᵀ·system. */
+    real next_normal[10];
+    real factor[10];
+} LocateProblem;
+
+/* A position and how well it is known. Metres, site frame. */
+typedef struct Found {
+    bool has_mirror;
+    int32_t dof;
+    int32_t iterations;
+    real chi2;
+    real position_m[3];
+    real mirror_m[3];  /* The other position that fits as well. */
+    real covariance_m2[3][3];
+    real residuals_m[32];  /* Measured minus predicted TDoAs. */
+} Found;
+
+/* A matrix A of few columns; ``orthogonalise`` replaces it by A·V, whose columns are orthogonal. */
+typedef struct Columns {
+    int32_t rows;
+    int32_t columns;
+    real A[32][4];
+    real V[4][4];  /* A rotation; its columns are the right singular vectors of A. */
+    real squares[4];  /* Squares of the singular values, the largest first. */
+} Columns;
+
+/* Linear equations of a start. */
+typedef struct Equations {
+    Columns left;
+    real right[32];  /* What is known: (|a_i|² − d_i²)/2, less what a given height contributes. */
+    real u[4];
+    real v[4];
+} Equations;
 
 SKYLESS_EXPORT void skyless_prepare(State *s);
 SKYLESS_EXPORT int32_t skyless_find_anchor(State *s, int32_t identifier);
@@ -557,7 +648,6 @@ SKYLESS_EXPORT void skyless_find_steady_state(State *s, PlannedMessage *messages
         int32_t most, int32_t step, SteadyState *found);
 SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_ticks, real *position_m, uint8_t *known,
         int32_t first, real elapsed_s, real walked_m);
-SKYLESS_EXPORT void skyless_linearise(Descent *d, real *state);
-SKYLESS_EXPORT int32_t skyless_descend(Descent *d);
+SKYLESS_EXPORT int32_t skyless_find_position(LocateProblem *p, Found *found);
 
 #endif

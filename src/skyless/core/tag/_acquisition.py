@@ -18,6 +18,7 @@ from skyless.core.arrays import Array
 from skyless.core.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.core.estimator.settings import TUNING
 from skyless.core.fix import NoFixReason
+from skyless.core.native.sizes import MAX_ANCHORS
 from skyless.core.observation import Observation
 from skyless.core.tag.locate import NoSolution, locate_pseudoranges
 
@@ -112,7 +113,7 @@ class Acquisition(Struct):
         self._heard[observation.anchor] = [*kept[-1:], observation]
         pairs = [kept for kept in self._heard.values() if len(kept) == 2]
         pairs = [kept for kept in pairs if (now - kept[-1].rx_ticks_tag) * TICK_S < TUNING.start_age_s]
-        pairs = [kept for kept in self._on_one_scale(pairs) if _possible(*kept)]
+        pairs = [kept for kept in self._on_one_scale(pairs) if _possible(*kept)][:MAX_ANCHORS]
         needed = 4 if self._height_m is None else 3
         if len(pairs) < needed:
             return NoFixReason.TOO_FEW_ANCHORS

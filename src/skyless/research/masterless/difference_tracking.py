@@ -18,6 +18,7 @@ from skyless.core.estimator.process import ACCEPTED
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
+from skyless.core.native.sizes import MAX_ANCHORS
 from skyless.core.tag.locate import NoSolution, locate
 from skyless.site.survey.anchor_errors import KNOWN_STD_M, DifferenceCalibration
 
@@ -295,6 +296,8 @@ def find_start(
     if not grouped:
         return NoSolution(NoFixReason.TOO_FEW_ANCHORS, "no pair of anchors was heard")
     anchors, tdoa_m, joined_m2 = joined_tdoas(list(grouped), [np.median(group) for group in grouped.values()])
+    anchors, most_tdoas = anchors[:MAX_ANCHORS], slice(MAX_ANCHORS - 1)
+    tdoa_m, joined_m2 = tdoa_m[most_tdoas], joined_m2[most_tdoas, most_tdoas]
     dim, anchors_m = 3 if height_m is None else 2, np.array([positions_m[anchor] for anchor in anchors])
     low, high, count = anchors_m.min(axis=0), anchors_m.max(axis=0), len(anchors_m)
     if z_bounds_m is None and high[2] - low[2] > TUNING.height_margin_m:

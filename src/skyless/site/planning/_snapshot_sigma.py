@@ -19,10 +19,10 @@ from msgspec import Struct
 from skyless.core.arrays import Array, Mask, Matrix, Vector
 from skyless.core.clock_filter import ClockNoise, clock_noise
 from skyless.core.constants import TICK_S
+from skyless.core.dop import inverses
 from skyless.core.protocol1.schedule import first_slots, schedule_of
 from skyless.core.protocol1.snapshots import SnapshotMethod, bracketed_covariance, literal_covariance
 from skyless.core.site import Site
-from skyless.core.tag.locate import inverse_of
 from skyless.site.planning.anchor_clocks import row_of_master, stamp_variances
 from skyless.site.planning.links import FIX_SHARE, SIGMA, AnchorLinks, Scene, fill_dops, fill_errors
 
@@ -113,10 +113,9 @@ def gains(towards: Array, weights: Matrix, common: float) -> Array:
     mean = weighted.sum(axis=1)
     share = common / (1.0 + common * weights.sum(axis=1))[:, None, None]
     normal = towards.transpose(0, 2, 1) @ weighted - share * (mean[:, :, None] * mean[:, None])
-    inverse = inverse_of(normal)
-    singular = np.isinf(inverse)
-    gain: Array = (weighted - share * (weights[..., None] * mean[:, None])) @ np.where(singular, 0.0, inverse)
-    gain[singular[:, 0, 0]] = np.inf
+    inverse, is_determined = inverses(normal)
+    gain: Array = (weighted - share * (weights[..., None] * mean[:, None])) @ inverse
+    gain[~is_determined] = np.inf
     return gain
 
 

@@ -9,6 +9,7 @@ from msgspec import Struct
 from skyless.core.arrays import Array, Mask
 from skyless.core.fix import NoFixReason
 from skyless.core.method_names import FILTERS
+from skyless.core.native.sizes import MAX_ANCHORS
 from skyless.core.protocol1.snapshots import literal_covariance
 from skyless.core.protocols import superframe_s
 from skyless.core.tag.locate import NoSolution, locate
@@ -185,7 +186,9 @@ def _mirrors(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str]:
 
 
 def _has_mirror(anchors: Array, point: Array, height_m: float | None, tx_var: float, rx_var: float) -> bool:
-    """Whether the anchors in view, shape (n, 3), leave two positions."""
+    """Whether the anchors in view, shape (n, 3), or the nearest of many, leave two positions."""
+    nearest = np.argsort(np.linalg.norm(anchors - point, axis=1))[:MAX_ANCHORS]
+    anchors = anchors[np.sort(nearest)]
     if len(anchors) < (4 if height_m is None else 3):
         return False
     ranges = np.linalg.norm(anchors - point, axis=1)
