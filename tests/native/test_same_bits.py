@@ -20,10 +20,11 @@ import wasm_core
 from make_core import EXPORTS, NAME
 from skyless.core.estimator.process import BatchPacket, BatchRow, Packet, Place, Relay
 from skyless.core.estimator.saved import packed_state
-from skyless.core.estimator.state import MAX_ANCHORS, WORK_ROWS, State
+from skyless.core.estimator.state import WORK_ROWS, State
 from skyless.core.estimator.steady_state import PlannedMessage, PlannedRelay
 from skyless.core.native import small_matrices, tails
 from skyless.core.native.records import c_type, view
+from skyless.core.native.sizes import MAX_ANCHORS
 from skyless.core.tag import descent, minima, position, problem, starts
 from translator.body import Translator
 from translator.files import translate

@@ -3,7 +3,7 @@
 The offset is kept in two parts, whole ticks in an integer and a remainder below one tick in metres of light, so that
 nothing is lost however long the filter runs. One update processes one master beacon.
 
-Plain Python: so little arithmetic takes no longer than the call of a kernel.
+Plain Python: so little arithmetic takes no longer than a call of compiled code.
 """
 
 import math

@@ -3,7 +3,7 @@
 from enum import StrEnum
 from math import sqrt
 from struct import Struct as Format
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from msgspec import Struct
@@ -11,10 +11,8 @@ from numpy.typing import ArrayLike
 
 from skyless.core.alert import Alert
 from skyless.core.arrays import Array
+from skyless.core.dop import Dops, dilution_of_precision
 from skyless.core.integrity import Integrity, IntegrityRequirement, integrity_of
-
-if TYPE_CHECKING:
-    from skyless.core.dop import Dops
 
 # What fixes carry: rows of three numbers in one array, which costs less than separate arrays.
 
@@ -170,10 +168,8 @@ class Fix(Struct, frozen=True, gc=False):
         return float(np.sqrt(np.trace(self.covariance_m2)))
 
     @property
-    def dops(self) -> "Dops":
+    def dops(self) -> Dops:
         """Dilutions of precision of the anchors in use, seen from the position."""
-        from skyless.core.dop import dilution_of_precision  # noqa: PLC0415 (a value needs no compiler)
-
         return dilution_of_precision(self.anchors_m, self.position_m, height_known=self.height_known)
 
 

@@ -21,7 +21,6 @@ from skyless.core.estimator.monitor import covariance_scale, update_stationary
 from skyless.core.estimator.state import (
     AXES,
     LEVELS,
-    MAX_ANCHORS,
     PACKETS_KEPT,
     State,
     add_anchor,
@@ -31,6 +30,7 @@ from skyless.core.estimator.state import (
 from skyless.core.fix import POSITION, PROTECTION, QUALITY, VELOCITY
 from skyless.core.integrity import HPL, STATE, VPL
 from skyless.core.native.records import Array, Bytes, Matrix, Reals, Record, Ticks, record
+from skyless.core.native.sizes import MAX_ANCHORS
 from skyless.core.ticks import HALF_WRAP_TICKS, TICK_MASK
 
 REJECTED, ACCEPTED, JOINED, STALE, RESTARTED_CLOCK = range(5)

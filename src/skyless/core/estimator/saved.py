@@ -11,13 +11,13 @@ from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import (
     ALL_RANGE_ERRORS,
     FAULT_KINDS,
-    MAX_ANCHORS,
     NO_RANGE_ERRORS,
     State,
     new_state,
     set_layout,
 )
 from skyless.core.native.records import view
+from skyless.core.native.sizes import MAX_ANCHORS
 
 VERSION: Final = 1
 """Changes with the fields of ``State`` and of the records in it."""

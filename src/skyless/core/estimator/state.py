@@ -25,9 +25,8 @@ from skyless.core.fix import PROTECTED_ROWS
 from skyless.core.integrity import limits_of
 from skyless.core.native.arithmetic import square
 from skyless.core.native.records import Array, Count, Integers, Matrix, Reals, Record, Ticks, aligned, record
+from skyless.core.native.sizes import MAX_ANCHORS
 
-MAX_ANCHORS: Final = 32
-"""Most anchors in the state."""
 PACKETS_KEPT: Final = 16
 """Packets of each anchor that are kept for relays to come; divides the range of sequence numbers."""
 LANES: Final = 4

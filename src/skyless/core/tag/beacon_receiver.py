@@ -6,7 +6,7 @@ A beacon is admitted if it is of the site in use, and its stamps are possible on
 from abc import ABC, abstractmethod
 from collections import Counter
 from math import inf, isfinite
-from typing import TYPE_CHECKING, Final, Generic, Protocol, TypeVar
+from typing import Final, Generic, Protocol, TypeVar
 
 from msgspec import Struct
 
@@ -18,11 +18,8 @@ from skyless.core.air.reception import Reception
 from skyless.core.air.site_choice import SiteChoice, SiteUse
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
+from skyless.core.tag.joint import Estimation
 from skyless.core.ticks import LAST_TICKS, FixTime, Unwrapper, from_seconds
-
-if TYPE_CHECKING:
-    # It loads Numba and all kernels: only who makes a receiver waits for that, not who imports its class.
-    from skyless.core.tag.joint import Estimation
 
 NOT_DROPS: Final = frozenset({"heard", "fixes", "anchor-restart", "counter-jump", "site-change"})
 """Counters of a receiver that do not count dropped frames."""
@@ -123,7 +120,7 @@ class BeaconReceiver(ABC, Generic[B]):
 
     @property
     @abstractmethod
-    def _estimation(self) -> "Estimation | None":
+    def _estimation(self) -> Estimation | None:
         """The method in use where it is ``joint``."""
 
     @property

@@ -1,4 +1,4 @@
-"""What a tag needs kernels for: its positioning method as the almanac configures it, and its state as values."""
+"""A tag's positioning method as the almanac configures it, and a receiver's state as values."""
 
 from typing import Final
 

@@ -3,7 +3,7 @@
 It needs nothing but beacons of protocol 2: anchors state their positions, and the common pages of a site the rest.
 """
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -18,13 +18,10 @@ from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.observation import Observation
 from skyless.core.tag.beacon_receiver import BeaconReceiver, HeardSite, MethodOptions, variance_factor_of
+from skyless.core.tag.factory import ReceiverState, new_method
+from skyless.core.tag.joint import Estimation
 from skyless.core.tag.selection import MIN_FITTING, AnchorSelection, fitting_relays, is_full
 from skyless.core.ticks import from_seconds
-
-if TYPE_CHECKING:
-    # These load Numba and all kernels: only who makes a receiver waits for that, not who imports its class.
-    from skyless.core.tag.factory import ReceiverState
-    from skyless.core.tag.joint import Estimation
 
 MAX_WAITING: Final = 128
 """Beacons that are kept while the site's pages are not complete."""
@@ -67,10 +64,8 @@ class Receiver(BeaconReceiver[Beacon]):
         self._uses_moved = False
         """Whether they are in use, and not the others."""
 
-    def state(self) -> "ReceiverState":
+    def state(self) -> ReceiverState:
         """All that it keeps, as it is now; to be used or encoded before its next frame, as parts are shared."""
-        from skyless.core.tag.factory import ReceiverState  # noqa: PLC0415 - its types load the kernels
-
         return ReceiverState(
             admission=self._admission_state(),
             method_period_ticks=self._method_period_ticks,
@@ -83,7 +78,7 @@ class Receiver(BeaconReceiver[Beacon]):
         )
 
     @classmethod
-    def from_state(cls, state: "ReceiverState") -> "Receiver":
+    def from_state(cls, state: ReceiverState) -> "Receiver":
         """A receiver that continues with the same bits as the one with this state.
 
         Raises:
@@ -104,12 +99,12 @@ class Receiver(BeaconReceiver[Beacon]):
         return made
 
     @property
-    def method(self) -> "Estimation | None":
+    def method(self) -> Estimation | None:
         """The positioning method, None before the pages of the site are known."""
         return self._method
 
     @property
-    def _estimation(self) -> "Estimation | None":
+    def _estimation(self) -> Estimation | None:
         return self._method
 
     @property
@@ -223,7 +218,7 @@ class Receiver(BeaconReceiver[Beacon]):
         estimator = self._method.estimator
         return estimator.heard_since(rx_ticks - from_seconds(estimator.settings.drop_s)) < MIN_ANCHORS
 
-    def _may_join(self, method: "Estimation", observation: Observation) -> bool:
+    def _may_join(self, method: Estimation, observation: Observation) -> bool:
         """Whether an anchor is in use or may be: others have received it, and it is not weaker than 24 in use."""
         estimator, anchor = method.estimator, observation.anchor
         if estimator.has_anchor(anchor) and not method.is_starting:
@@ -264,8 +259,6 @@ class Receiver(BeaconReceiver[Beacon]):
 
         ``method_period_ticks``: for which it was made, where it continues from a state.
         """
-        from skyless.core.tag.factory import new_method  # noqa: PLC0415 - loads the kernels
-
         pages = self.almanac.pages
         assert pages is not None
         method_key = (pages.site.tag_height_m, pages.noise, pages.accuracy)
