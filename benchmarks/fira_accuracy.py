@@ -114,8 +114,8 @@ class Tag:
         drops, self._stream = Counter(), bytearray()
         self._board = UciProtocol(self._hear, version)
         self._reader, self._tag = UciReader(drops), DtTag(drops)
-        one_way = replace(DL_TDOA_ONE_WAY, **KNOWN)
-        self._tracking = PacketTracking(replace(DL_TDOA, **KNOWN), {}, TICK_BITS, one_way=one_way)
+        one_way = DL_TDOA_ONE_WAY.changed(**KNOWN)
+        self._tracking = PacketTracking(DL_TDOA.changed(**KNOWN), {}, TICK_BITS, one_way=one_way)
 
     def _hear(self, data):
         self._stream += data
@@ -141,7 +141,7 @@ def measure(frames, worlds, seed, version=1, until_s=UNTIL_S):
                     if broadcast.end_s > WARM_UP_S:
                         squares += float(np.sum((fix.position_m - truth_m)[:2] ** 2))
                         fixes += 1
-    settings = replace(DL_TDOA if frames > 1 else DL_TDOA_ONE_WAY, **KNOWN)
+    settings = (DL_TDOA if frames > 1 else DL_TDOA_ONE_WAY).changed(**KNOWN)
     rmse_m, plan_m, round_m = math.sqrt(squares / fixes), planned_m(site), round_planned_m(site, settings)
     return Measured(rmse_m, plan_m, round_m, rmse_m / plan_m, rmse_m / round_m, fixes)
 

@@ -78,6 +78,7 @@ int main(int count, char **words) {
                         relay->rx_ticks = flipped(relay->rx_ticks, 60);
                         relay->sequence = (int32_t)flipped(relay->sequence, 8);
                         relay->anchor = (int32_t)(draw() % 10);
+                        relay->listener = (int32_t)(draw() % 10);
                     }
                     break;
                 default:

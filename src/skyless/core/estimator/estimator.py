@@ -61,7 +61,7 @@ class Packets(Struct, frozen=True):
     tx_ticks: Integers
     """The anchors' own."""
     relays: Integers
-    """[the packet's anchor, sender, sequence number, RX stamp of the packet's anchor], shape (relays, 4)."""
+    """[listener, sender, sequence number, RX stamp of the listener], shape (relays, 4)."""
     ends: Integers
     """Where the relays of each packet end."""
 
@@ -242,7 +242,7 @@ class Estimator:
         packet.report_variance_m2 = report.variance_m2
         packet.relay_count = min(len(relays), MAX_RELAYS)
         for relayed, (sender, number, stamp) in zip(packet.relays, relays, strict=False):
-            relayed.anchor, relayed.sequence, relayed.rx_ticks = sender, number, stamp
+            relayed.listener, relayed.anchor, relayed.sequence, relayed.rx_ticks = anchor, sender, number, stamp
         return compiled.process_frame(self._state, packet, packed, len(packed))
 
     def process_difference(self, a: int, b: int, rx_ticks: int, difference_m: float) -> int:
@@ -266,7 +266,7 @@ class Estimator:
         given, relays = np.zeros(count, np.dtype(BatchPacket)), np.zeros(len(packets.relays), np.dtype(Relay))
         given["place"], given["sequence"], given["end"] = indices, packets.sequences, packets.ends
         given["rx_ticks"], given["tx_ticks"] = packets.rx_ticks, packets.tx_ticks
-        for column, name in enumerate(("anchor", "sequence", "rx_ticks"), 1):
+        for column, name in enumerate(("listener", "anchor", "sequence", "rx_ticks")):
             relays[name] = packets.relays[:, column]
         rows = np.zeros(count, np.dtype(BatchRow))
         columns = records(BatchPacket, given), records(Relay, relays), records(BatchRow, rows)

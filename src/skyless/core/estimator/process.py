@@ -58,13 +58,15 @@ class Place(Record):
 
 @record
 class Relay(Record):
-    """When the packet's anchor received another."""
+    """When an anchor, that of the packet as a rule, received a packet of another."""
 
+    listener: int
+    """Identifier of the one that received it."""
     anchor: int
-    """Identifier of that other."""
+    """Identifier of the other."""
     sequence: int
     rx_ticks: Ticks
-    """Stamp of the packet's anchor, unwrapped."""
+    """The listener's stamp, unwrapped."""
 
 
 @record
@@ -103,6 +105,7 @@ def process_frame(s: State, packet: Packet, packed: Bytes, packed_bytes: int) ->
     for begin in range(0, packed_bytes, PACKED_BYTES):
         if packet.relay_count < MAX_RELAYS:
             relayed = packet.relays[packet.relay_count]
+            relayed.listener = packet.place.anchor
             relayed.anchor = packed[begin] | packed[begin + 1] << 8
             relayed.sequence = packed[begin + 2]
             stamp: Ticks = 0
@@ -181,7 +184,7 @@ def _process_of(s: State, anchor: int, packet: Packet) -> int:
         status.relays_lately_accepted *= 1.0 - s.tuning.mean_gain
         status.relays_lately_rejected *= 1.0 - s.tuning.mean_gain
         for one in range(packet.relay_count):
-            _process_relay(s, anchor, packet.relays[one])
+            _process_relay(s, packet.relays[one])
         finish_updates(s)
         if packet.report_variance_m2 > 0.0 and packet.master >= 0:
             master = find_anchor(s, packet.master)
@@ -229,10 +232,10 @@ def _keep_packet(s: State, anchor: int, packet: Packet) -> None:
     kept.rx_ticks = packet.rx_ticks
 
 
-def _process_relay(s: State, listener: int, relayed: Relay) -> None:
+def _process_relay(s: State, relayed: Relay) -> None:
     """Process a relayed reception once, if the tag has received that very packet."""
-    sender = find_anchor(s, relayed.anchor)
-    if sender < 0 or sender == listener:
+    listener, sender = find_anchor(s, relayed.listener), find_anchor(s, relayed.anchor)
+    if listener < 0 or sender < 0 or sender == listener:
         return
     kept, link = s.packets[sender][relayed.sequence % PACKETS_KEPT], s.links[listener][sender]
     is_young = (s.status.epoch_ticks - kept.rx_ticks) * TICK_S < s.settings.relay_age_s

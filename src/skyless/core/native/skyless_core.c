@@ -165,7 +165,7 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet);
 INTERNAL int32_t admit(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks);
 INTERNAL bool is_impossible(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks);
 INTERNAL void keep_packet(State *s, int32_t anchor, Packet *packet);
-INTERNAL void process_relay(State *s, int32_t listener, Relay *relayed);
+INTERNAL void process_relay(State *s, Relay *relayed);
 INTERNAL void check_motion_and_faults(State *s, real elapsed_s);
 INTERNAL void fill_fix(State *s);
 INTERNAL void note_difference(State *s, int32_t anchor, int64_t rx_ticks);
@@ -2397,6 +2397,7 @@ SKYLESS_EXPORT int32_t skyless_process_frame(State *s, Packet *packet, uint8_t *
     for (int32_t begin = 0; begin < packed_bytes; begin += 8) {
         if (packet->relay_count < MAX_RELAYS) {
             Relay *relayed = &packet->relays[packet->relay_count];
+            relayed->listener = packet->place.anchor;
             relayed->anchor = packed[begin] | (int32_t)((uint32_t)packed[begin + 1] << 8);
             relayed->sequence = packed[begin + 2];
             int64_t stamp = 0;
@@ -2496,7 +2497,7 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet) {
         status->relays_lately_accepted *= REAL(1.0) - s->tuning.mean_gain;
         status->relays_lately_rejected *= REAL(1.0) - s->tuning.mean_gain;
         for (int32_t one = 0, one_end = packet->relay_count; one < one_end; one++) {
-            process_relay(s, anchor, &packet->relays[one]);
+            process_relay(s, &packet->relays[one]);
         }
         finish_updates(s);
         if (packet->report_variance_m2 > REAL(0.0) && packet->master >= 0) {
@@ -2555,9 +2556,10 @@ INTERNAL void keep_packet(State *s, int32_t anchor, Packet *packet) {
 }
 
 /* Process a relayed reception once, if the tag has received that very packet. */
-INTERNAL void process_relay(State *s, int32_t listener, Relay *relayed) {
+INTERNAL void process_relay(State *s, Relay *relayed) {
+    int32_t listener = skyless_find_anchor(s, relayed->listener);
     int32_t sender = skyless_find_anchor(s, relayed->anchor);
-    if (sender < 0 || sender == listener) {
+    if (listener < 0 || sender < 0 || sender == listener) {
         return;
     }
     KeptPacket *kept = &s->packets[sender][floor_mod_32(relayed->sequence, PACKETS_KEPT)];

@@ -497,11 +497,12 @@ typedef struct Place {
     bool is_open;  /* Whether it joins with range errors beyond those of the settings. */
 } Place;
 
-/* When the packet's anchor received another. */
+/* When an anchor, that of the packet as a rule, received a packet of another. */
 typedef struct Relay {
-    int32_t anchor;  /* Identifier of that other. */
+    int32_t listener;  /* Identifier of the one that received it. */
+    int32_t anchor;  /* Identifier of the other. */
     int32_t sequence;
-    int64_t rx_ticks;  /* Stamp of the packet's anchor, unwrapped. */
+    int64_t rx_ticks;  /* The listener's stamp, unwrapped. */
 } Relay;
 
 /* A packet that the tag received; all stamps are unwrapped. */
