@@ -79,20 +79,48 @@ class Translator:
     def signature(self, function: FunctionType) -> tuple[list[tuple[str, Type]], Type | None]:
         """Names and types of parameters, and the type of the result."""
         hints = get_type_hints(function, include_extras=True)
+        place = f"{function.__code__.co_filename}:{function.__code__.co_firstlineno}"
+        if hints.keys() != {*function.__code__.co_varnames[: function.__code__.co_argcount], "return"}:
+            raise RefusedError(f"{place}: each parameter and the result of {function.__name__} need a type")
         returned = hints.pop("return")
-        parameters = [(name, parameter_type(hint)) for name, hint in hints.items()]
+        try:
+            parameters = [(name, parameter_type(hint)) for name, hint in hints.items()]
+            result = None if returned is type(None) else parameter_type(returned)
+        except (IndexError, TypeError) as error:
+            raise RefusedError(f"{place}: {function.__name__}: {error}") from error
         for _, kind in parameters:
             element = kind
             while isinstance(element, Elements):
                 element = element.element
             if isinstance(element, Struct):
                 self.need_record(element.made)
-        if returned is type(None):
-            return parameters, None
-        kind = parameter_type(returned)
-        if isinstance(kind, Results):
-            kind = self.results[c_name(function.__name__)] = Results(c_name(function.__name__), kind.items)
-        return parameters, kind
+        if isinstance(result, Elements):
+            raise RefusedError(f"{place}: {function.__name__} returns an array; it can be a parameter")
+        if isinstance(result, Results):
+            result = self.results[c_name(function.__name__)] = Results(c_name(function.__name__), result.items)
+        return parameters, result
+
+    def written(self, node: ast.AST, names: dict[str, Any]) -> set[str]:
+        """Fields that may be written by the functions that are called in a statement or expression.
+
+        These are all that a function with an assignment to a field or an element names.
+        """
+        found: set[str] = set()
+        for body in self.called(node, names, set()):
+            parts = [one for one in ast.walk(body) if isinstance(one, ast.Attribute | ast.Subscript)]
+            if any(isinstance(one.ctx, ast.Store) for one in parts):
+                found |= {one.attr for one in parts if isinstance(one, ast.Attribute)} | {""}
+        return found
+
+    def called(self, node: ast.AST, names: dict[str, Any], known: set[FunctionType]) -> Iterator[ast.stmt]:
+        """The bodies of functions that are called in a statement or expression, and of those that they call."""
+        for one in ast.walk(node):
+            function = names.get(one.func.id) if isinstance(one, ast.Call) and isinstance(one.func, ast.Name) else None
+            if isinstance(function, FunctionType) and function not in known:
+                known.add(function)
+                body = source_of(inspect.getmodule(function)).nodes[function.__name__]  # type: ignore[arg-type]
+                yield body
+                yield from self.called(body, function.__globals__, known)
 
     def head(self, function: FunctionType) -> str:
         """The declaration of a function."""
@@ -128,6 +156,45 @@ class Body:
         line = getattr(node, "lineno", 0)
         return RefusedError(f"{self.source.module.__file__}:{line}: {reason}: {ast.unparse(node)[:80]}")
 
+    def check_order(self, node: ast.AST, *operands: ast.expr) -> None:
+        """Refuse operands of which one may write what another one reads: C evaluates them in any order."""
+        for one in operands:
+            written = self.all.written(one, self.globals)
+            if any(self.read(other) & written for other in operands if other is not one):
+                raise self.refuse(node, "a function is called that may write what is read beside it")
+
+    def read(self, node: ast.expr) -> set[str]:
+        """Fields that an expression reads, with those of functions that it calls; "" for elements of any of them."""
+        found: set[str] = set()
+        for body in self.all.called(node, self.globals, set()):
+            found |= {one.attr for one in ast.walk(body) if isinstance(one, ast.Attribute)}
+        for one in ast.walk(node):
+            if isinstance(one, ast.Attribute | ast.Subscript) and isinstance(self.value(one).kind, Number):
+                while isinstance(one, ast.Subscript):
+                    one = one.value  # noqa: PLW2901
+                found.add(one.attr if isinstance(one, ast.Attribute) else "")
+        return found
+
+    def once(self, node: ast.expr) -> None:
+        """Refuse an expression that C evaluates more often than Python if that makes a difference."""
+        if self.all.written(node, self.globals):
+            raise self.refuse(node, "a function that may write is called where C calls it more than once")
+
+    def fitting(self, node: ast.AST, value: Value, kind: Type) -> Value:
+        """The value as a number of a type that keeps it."""
+        is_whole = isinstance(kind, Number) and kind != REAL
+        narrow = (is_whole and value.kind == REAL) or (kind == BOOL and value.kind != BOOL)
+        if narrow or isinstance(kind, Number) != isinstance(value.kind, Number):
+            raise self.refuse(node, f"it is {_named(value.kind)}, and {_named(kind)} is wanted")
+        return converted(value, kind)
+
+    def annotated(self, node: ast.expr) -> Type:
+        """The type of an annotation."""
+        try:
+            return parameter_type(evaluated(node, self.globals))
+        except TypeError as error:
+            raise self.refuse(node, str(error)) from error
+
     # Statements
 
     def block(self, statements: Sequence[ast.stmt], indent: str) -> Iterator[str]:
@@ -153,8 +220,8 @@ class Body:
             case ast.Assign():
                 yield from self.assign(node, indent)
             case ast.AnnAssign(target=ast.Name(id=name), value=ast.expr() as value):
-                kind = parameter_type(evaluated(node.annotation, self.globals))
-                yield from self.store(node.target, converted(self.value(value), kind), indent, name, kind)
+                kind = self.annotated(node.annotation)
+                yield from self.store(node.target, self.value(value), indent, name, kind)
             case ast.AugAssign():
                 yield from self.augmented(node, indent)
             case ast.If():
@@ -200,22 +267,24 @@ class Body:
         if name == "_":
             self.temporaries += 1
             name = f"time_{self.temporaries}"
+        stores = (one for part in node.body for one in ast.walk(part) if isinstance(one, ast.Name))
+        if any(one.id == name and isinstance(one.ctx, ast.Store) for one in stores):
+            raise self.refuse(node, f"{name} is assigned within its loop")
+        if id(node.target) not in self.scopes.first and not name.startswith("time_"):
+            raise self.refuse(node, f"{name} is used beside its loop")
         values = [self.value(limit) for limit in limits]
         begin, end = (Value("0", INT), values[0]) if len(values) == 1 else (values[0], values[1])
-        step = evaluated(limits[2], self.globals) if len(limits) == 3 else 1
+        try:
+            step = evaluated(limits[2], self.globals) if len(limits) == 3 else 1
+        except NameError as error:
+            raise self.refuse(node, "the step of a range is a constant") from error
         kind = LONG if LONG in (begin.kind, end.kind) else INT
         self.kinds[name] = (kind, True)
         variable, limit = c_name(name), end.code
-        is_own = id(node.target) in self.scopes.first or name.startswith("time_")
-        first = f"{kind.name + ' ' if is_own else ''}{variable} = {begin.code}"
-        if not is_own:
-            self.hoist(name, kind)
+        first = f"{kind.name} {variable} = {begin.code}"
         if self.may_change(limits[0] if len(limits) == 1 else limits[1], node.body):
             limit = f"{variable}_end"
-            if is_own:
-                first += f", {limit} = {end.code}"
-            else:
-                yield f"{indent}const {kind.name} {limit} = {end.code};"
+            first += f", {limit} = {end.code}"
         after = {1: f"{variable}++", -1: f"{variable}--"}.get(step, f"{variable} += {step}")
         yield f"{indent}for ({first}; {variable} {'<' if step > 0 else '>'} {limit}; {after}) {{"
         yield from self.block(node.body, indent + INDENT)
@@ -236,22 +305,24 @@ class Body:
         elif isinstance(self.returned, Results):
             if not isinstance(value, ast.Tuple):
                 raise self.refuse(value, "several results are returned as a tuple")
-            items = [
-                converted(self.value(item), kind) for item, kind in zip(value.elts, self.returned.items, strict=True)
-            ]
+            self.check_order(value, *value.elts)
+            wanted = zip(value.elts, self.returned.items, strict=True)
+            items = [self.fitting(item, self.value(item), kind) for item, kind in wanted]
             listed = ", ".join(item.code for item in items)
             yield f"{indent}return ({self.returned.function}_results){{{listed}}};"
         else:
             found, kind = self.value(value), self.returned
             assert kind is not None
-            code = self.reference(found) if isinstance(found.kind, Struct) else converted(found, kind).code
+            code = self.reference(found) if isinstance(found.kind, Struct) else self.fitting(value, found, kind).code
             yield f"{indent}return {code};"
 
     def assign(self, node: ast.Assign, indent: str) -> Iterator[str]:
         if len(node.targets) > 1:
+            self.once(node.value)
             for target in reversed(node.targets):
                 yield from self.store(target, self.value(node.value), indent)
         elif not isinstance(node.targets[0], ast.Tuple):
+            self.check_order(node, node.value, *_indices(node.targets[0]))
             yield from self.store(node.targets[0], self.value(node.value), indent)
         elif isinstance(node.value, ast.Tuple):
             yield from self.assign_several(node.targets[0].elts, node.value.elts, indent)
@@ -270,7 +341,9 @@ class Body:
         """``a, b = x, y``: by way of other variables where a later value holds an earlier target."""
         written = [ast.unparse(target) for target in targets]
         later = [{ast.unparse(part) for part in ast.walk(value)} for value in values]
-        if not any(written[k] in names for k in range(len(targets)) for names in later[k + 1 :]):
+        calls = any(isinstance(part, ast.Call) for value in values[1:] for part in ast.walk(value))
+        is_local = all(isinstance(target, ast.Name) for target in targets) or not calls
+        if is_local and not any(written[k] in names for k in range(len(targets)) for names in later[k + 1 :]):
             for target, value in zip(targets, values, strict=True):
                 yield from self.store(target, self.value(value), indent)
             return
@@ -290,14 +363,16 @@ class Body:
         if isinstance(target, ast.Name):
             name, kind = target.id, kind or value.kind
             if name not in self.kinds or id(target) in self.scopes.first:
-                yield from self.declare(name, kind, value, indent)
+                yield from self.declare(target, kind, value, indent)
                 return
             known, is_pointer = self.kinds[name]
             if known == INT and value.kind == LONG:
                 raise self.refuse(target, f"{name} has 32 bits and is given 64; declare it as Ticks")
             if isinstance(known, Struct) and not is_pointer:
                 raise self.refuse(target, f"{name} is a record, and cannot become another")
-            code = self.reference(value) if isinstance(known, Struct) else converted(value, known).code
+            if isinstance(known, Struct) and value.kind != known:
+                raise self.refuse(target, f"{name} is {_named(known)}, and is given {_named(value.kind)}")
+            code = self.reference(value) if isinstance(known, Struct) else self.fitting(target, value, known).code
             yield f"{indent}{c_name(name)} = {code};"
             return
         place = self.value(target)
@@ -306,17 +381,21 @@ class Body:
         elif isinstance(place.kind, Elements):
             raise self.refuse(target, "an array cannot be assigned to")
         else:
-            yield f"{indent}{place.code} = {converted(value, place.kind).code};"
+            yield f"{indent}{place.code} = {self.fitting(target, value, place.kind).code};"
 
-    def declare(self, name: str, kind: Type, value: Value, indent: str) -> Iterator[str]:
+    def declare(self, target: ast.Name, kind: Type, value: Value, indent: str) -> Iterator[str]:
         """A new variable: where it is assigned if all blocks that use it assign it first, else at the beginning."""
-        variable = c_name(name)
+        name, variable, kind = target.id, c_name(target.id), INT if kind == BYTE else kind
         if isinstance(kind, Struct) and value.rank == NEW:
             self.kinds[name] = (kind, False)
-            yield f"{indent}{kind.made.__name__} {variable} = {{0}};"
+            if indent == INDENT:
+                yield f"{indent}{kind.made.__name__} {variable} = {{0}};"
+            else:  # it lives as long as the function runs, as in Python what has a reference does
+                self.hoisted.append(f"{kind.made.__name__} {variable};")
+                yield f"{indent}{variable} = ({kind.made.__name__}){{0}};"
             return
         self.kinds[name] = (kind, True)
-        code = self.reference(value) if isinstance(kind, Struct) else converted(value, kind).code
+        code = self.reference(value) if isinstance(kind, Struct) else self.fitting(target, value, kind).code
         if name in self.scopes.hoisted:
             self.hoist(name, kind)
             yield f"{indent}{variable} = {code};"
@@ -331,6 +410,8 @@ class Body:
 
     def augmented(self, node: ast.AugAssign, indent: str) -> Iterator[str]:
         place = self.value(node.target)
+        self.once(node.target)
+        self.check_order(node, node.target, node.value)
         plain = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}.get(type(node.op))
         value = self.value(node.value)
         is_real = REAL in (place.kind, value.kind) or plain == "/"
@@ -345,6 +426,10 @@ class Body:
 
     def reference(self, value: Value) -> str:
         """The address of a record."""
+        if value.rank == NEW:
+            raise RefusedError(
+                f"{self.source.module.__file__}:{self.last_line}: a new record needs a name: {value.code}()"
+            )
         return value.code if value.is_pointer else f"&{as_operand(value, 15)}"
 
     def record(self, value: Value) -> str:
@@ -366,6 +451,8 @@ class Body:
             case ast.Constant(value=bool() as constant):
                 return Value("true" if constant else "false", BOOL)
             case ast.Constant(value=int() | float() as constant):
+                if isinstance(constant, int) and constant >= 1 << 63:
+                    raise self.refuse(node, "it has more than 64 bits")
                 return literal(constant)
             case ast.Name(id=name):
                 return self.name(node, name)
@@ -373,10 +460,13 @@ class Body:
                 return self.field(node, self.value(of), field)
             case ast.Subscript(value=of, slice=index):
                 array, place = self.value(of), self.value(index)
+                if isinstance(index, ast.UnaryOp):
+                    raise self.refuse(node, "elements are counted from the first one")
                 if not isinstance(array.kind, Elements):
                     raise self.refuse(node, "only arrays have elements")
                 return Value(f"{as_operand(array, 16)}[{place.code}]", array.kind.element, 16, False)
             case ast.BinOp():
+                self.check_order(node, node.left, node.right)
                 return self.operation(node, type(node.op), self.value(node.left), self.value(node.right))
             case ast.UnaryOp(op=ast.Not(), operand=operand):
                 return Value(f"!{as_operand(self.condition(operand), 15)}", BOOL, 15)
@@ -408,8 +498,8 @@ class Body:
         return literal(constant)._replace(code=c_name(name), rank=20)
 
     def field(self, node: ast.expr, of: Value, field: str) -> Value:
-        if not isinstance(of.kind, Struct):
-            raise self.refuse(node, "only records have fields")
+        if not isinstance(of.kind, Struct) or of.rank == NEW:
+            raise self.refuse(node, "only records that have a name have fields")
         self.all.need_record(of.kind.made)
         ctype = {one[0]: one[1] for one in of.kind.made._fields_}.get(field)
         if ctype is None:
@@ -442,15 +532,20 @@ class Body:
         bitwise = {ast.BitAnd: "&", ast.BitOr: "|", ast.BitXor: "^"}.get(op)
         if bitwise is None:
             raise self.refuse(node, f"{op.__name__} is not translated")
+        kind = BOOL if left.kind == right.kind == BOOL else kind
         return Value(f"{as_operand(left, 15)} {bitwise} {as_operand(right, 15)}", kind, 7)
 
     def comparison(self, node: ast.Compare) -> Value:
         signs = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
         parts, left = [], self.value(node.left)
+        self.check_order(node, node.left, *node.comparators)
+        for middle in (*node.comparators[:-1], *([node.left] if isinstance(node.ops[0], ast.In | ast.NotIn) else [])):
+            self.once(middle)
         for op, other in zip(node.ops, node.comparators, strict=True):
-            if isinstance(op, ast.In) and isinstance(other, ast.Tuple):
-                parts.append(" || ".join(f"{as_operand(left, 10)} == {self.value(one).code}" for one in other.elts))
-                return Value(parts[0], BOOL, 4)
+            if isinstance(op, ast.In | ast.NotIn) and isinstance(other, ast.Tuple):
+                equal, word, rank = ("==", " || ", 4) if isinstance(op, ast.In) else ("!=", " && ", 5)
+                each = (f"{as_operand(left, 10)} {equal} {as_operand(self.value(one), 10)}" for one in other.elts)
+                return Value(word.join(each), BOOL, rank)
             right, sign = self.value(other), signs.get(type(op))
             if sign is None or not (isinstance(left.kind, Number) and isinstance(right.kind, Number)):
                 raise self.refuse(node, "only numbers are compared, by < <= > >= == != and in")
@@ -464,6 +559,8 @@ class Body:
         if isinstance(body.kind, Number) and isinstance(orelse.kind, Number) and body.kind != orelse.kind:
             kind = common(body.kind, orelse.kind)
             body, orelse = converted(body, kind), converted(orelse, kind)
+        if isinstance(body.kind, Struct):
+            body, orelse = (Value(self.reference(one), one.kind, 15) for one in (body, orelse))
         return Value(f"{as_operand(test, 4)} ? {as_operand(body, 4)} : {as_operand(orelse, 3)}", body.kind, 3)
 
     def call(self, node: ast.Call) -> Value:
@@ -483,22 +580,30 @@ class Body:
         if name in self.variables:
             raise self.refuse(node, f"a variable of this function is called {name} as well")
         parameters, returned = self.all.signature(called)
+        if len(node.args) > len(parameters):
+            raise self.refuse(node, f"{name} has {len(parameters)} parameters")
+        self.check_order(node, *node.args, *(keyword.value for keyword in node.keywords))
         given: dict[str, ast.expr] = dict(zip((name for name, _ in parameters), node.args, strict=False))
         given |= {keyword.arg: keyword.value for keyword in node.keywords if keyword.arg}
         defaults = {name: one.default for name, one in inspect.signature(called).parameters.items()}
         listed = []
         for parameter, kind in parameters:
+            if parameter not in given and defaults[parameter] is inspect.Parameter.empty:
+                raise self.refuse(node, f"it has no value for {parameter}")
             value = self.value(given[parameter]) if parameter in given else literal(defaults[parameter])
             if isinstance(kind, Struct):
                 listed.append(self.reference(value))
             else:
-                listed.append(converted(value, kind).code)
+                listed.append(self.fitting(node, value, kind).code)
         return Value(f"{name}({', '.join(listed)})", returned or Results("void", ()))
 
     def builtin(self, node: ast.Call, called: Any, values: list[Value]) -> Value:  # noqa: ANN401, PLR0911
         kinds = [value.kind for value in values]
         if not all(isinstance(kind, Number) for kind in kinds):
             raise self.refuse(node, "it is for numbers only")
+        if (len(values) < 2) if called in (min, max) else (len(values) != 1):
+            raise self.refuse(node, f"{called.__name__} has another number of arguments")
+        self.check_order(node, *node.args)
         [first, *others] = values
         if called in (min, max):
             for other in others:
@@ -519,6 +624,16 @@ class Body:
         if first.kind == REAL:
             return Value(f"truncated({first.code})", LONG)
         return first if first.kind in (INT, LONG) else Value(f"(int32_t){as_operand(first, 15)}", INT, 15)
+
+
+def _indices(target: ast.expr) -> list[ast.expr]:
+    """The indices of an element that is assigned."""
+    return [one.slice for one in ast.walk(target) if isinstance(one, ast.Subscript)]
+
+
+def _named(kind: Type) -> str:
+    """A type, for messages."""
+    return kind.name if isinstance(kind, Number) else kind.made.__name__ if isinstance(kind, Struct) else "an array"
 
 
 def evaluated(node: ast.expr, names: dict[str, Any]) -> Any:  # noqa: ANN401

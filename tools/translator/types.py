@@ -40,12 +40,18 @@ Type = Number | Struct | Elements | Results
 
 
 def type_of(ctype: Any) -> Type:  # noqa: ANN401 - ctypes have no common type
-    """The type of a ctype."""
-    if ctype in OF_CTYPE:
-        return OF_CTYPE[ctype]
-    if issubclass(ctype, Array):
-        return Elements(type_of(ctype._type_), ctype._length_)
-    return Struct(ctype)
+    """The type of a ctype.
+
+    Raises:
+        TypeError: C has none for it.
+    """
+    if isinstance(ctype, type) and issubclass(ctype, Array):
+        return Elements(type_of(ctype._type_), ctype._length_)  # type: ignore[arg-type]
+    if isinstance(ctype, type) and issubclass(ctype, Record):
+        return Struct(ctype)
+    if ctype not in OF_CTYPE:
+        raise TypeError(f"{getattr(ctype, '__name__', ctype)} is no type of C")
+    return OF_CTYPE[ctype]
 
 
 def declared(kind: Type, name: str) -> str:
@@ -64,12 +70,22 @@ def declared(kind: Type, name: str) -> str:
 
 
 def parameter_type(hint: Any) -> Type:  # noqa: ANN401
-    """The type of an annotation of a parameter or result."""
+    """The type of an annotation of a parameter or result.
+
+    Raises:
+        TypeError: C has none for it.
+    """
     if get_origin(hint) is tuple:
-        return Results("", tuple(OF_CTYPE[c_type(item)] for item in get_args(hint)))
+        items = tuple(type_of(c_type(item)) for item in get_args(hint))
+        if not all(isinstance(item, Number) for item in items):
+            raise TypeError("only numbers are returned together")
+        return Results("", items)  # type: ignore[arg-type]
     origin = get_origin(hint)
     if origin is not None and origin.__name__ in {"Array", "Sequence"}:
-        return Elements(parameter_type(get_args(hint)[0]), 0)
+        element = parameter_type(get_args(hint)[0])
+        if isinstance(element, Elements) and element.length == 0:
+            raise TypeError("an array of arrays needs its lengths")
+        return Elements(element, 0)
     return type_of(c_type(hint))
 
 
