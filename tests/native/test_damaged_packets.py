@@ -1,6 +1,6 @@
 """Damaged packets lead the compiled estimator neither out of its arrays nor to numbers that are none.
 
-python tests/native/test_damaged_packets.py 10000000 1        # so many, another seed
+python tests/native/test_damaged_packets.py 10000000 1        # number of packets, seed
 """
 
 import os

@@ -199,9 +199,9 @@ def jumped(packets, anchor, begin, metres):
 def observations_of(packets, anchors_m=LAB_M):
     """What a receiver without any master would give its method."""
     for k, (anchor, sequence, rx_ticks, tx_ticks, relays) in enumerate(one_by_one(packets)):
-        told = tuple(map(tuple, relays))
+        heard = tuple(map(tuple, relays))
         stamps = (k // len(anchors_m), sequence, rx_ticks, tx_ticks, None, None, None, 0.0, 0.0)
-        yield Observation(anchor, anchors_m[anchor], *stamps, told)
+        yield Observation(anchor, anchors_m[anchor], *stamps, heard)
 
 
 def seen(state):

@@ -212,7 +212,7 @@ def test_packed_relays_are_those_listed():
     for name, anchor_m in zip(names.tolist(), LAB_M, strict=True):
         packed.know_anchor(name, anchor_m)
     for anchor, sequence, rx_ticks, tx_ticks, relays in one_by_one(episode.packets):
-        told = b"".join(
+        frame_relays = b"".join(
             HEARD.pack(name, number & 0xFF, stamp & 0xFFFFFFFF, stamp >> 32 & 0xFF)
             for name, number, stamp in [
                 (9, 1, 5),
@@ -220,7 +220,7 @@ def test_packed_relays_are_those_listed():
             ]
         )
         outcome = listed.process(anchor, sequence, rx_ticks, tx_ticks, relays)
-        assert outcome == packed.process(int(names[anchor]), sequence, rx_ticks, tx_ticks, packed=told)
+        assert outcome == packed.process(int(names[anchor]), sequence, rx_ticks, tx_ticks, packed=frame_relays)
     assert seen(listed.state).status["relays_used"] > 100
     for part in ("x", "P", "V", "information", "evidence", "packets", "links", "status"):
         assert bits(getattr(seen(listed.state), part)) == bits(getattr(seen(packed.state), part))

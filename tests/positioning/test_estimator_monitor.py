@@ -295,13 +295,13 @@ def test_a_report_replaces_what_is_known_worse():
 def test_wrong_reports_are_counted_and_do_nothing():
     episode, packets, reports, _ = with_losses(MESH, 0.9, 7)
     wrong = [replace(said, subticks=(said.subticks + 10_000 * SUBTICKS) % MODULO) for said in reports]
-    bare, told = (begun(episode, settings_of(MESH)) for _ in range(2))
+    bare, reported = (begun(episode, settings_of(MESH)) for _ in range(2))
     processed(bare, packets, [NOTHING] * len(reports))
-    processed(told, packets, wrong)
-    assert seen(told.state).status["reports_rejected"] > 10
-    assert seen(told.state).status["reports_used"] == 0
-    assert np.array_equal(seen(bare.state).x, seen(told.state).x)
-    assert np.array_equal(seen(bare.state).P, seen(told.state).P)
+    processed(reported, packets, wrong)
+    assert seen(reported.state).status["reports_rejected"] > 10
+    assert seen(reported.state).status["reports_used"] == 0
+    assert np.array_equal(seen(bare.state).x, seen(reported.state).x)
+    assert np.array_equal(seen(bare.state).P, seen(reported.state).P)
 
 
 def test_where_the_offset_is_for_now_agrees_with_the_stamps():

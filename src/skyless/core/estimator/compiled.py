@@ -3,7 +3,6 @@
 from skyless.core.estimator import levels, process, state, steady_state
 from skyless.core.native.library import compiled
 
-prepare = compiled(state.prepare)
 add_anchor = compiled(state.add_anchor)
 remove_anchor = compiled(state.remove_anchor)
 find_anchor = compiled(state.find_anchor)

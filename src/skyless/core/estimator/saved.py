@@ -33,7 +33,7 @@ def packed_state(s: State) -> bytes:
 def unpacked_state(settings: EstimatorSettings, packed: bytes) -> State:
     """The state that ``packed_state`` has turned into bytes, which may come from anywhere.
 
-    What the estimator uses as an index is checked or found anew. Any other numbers will do.
+    What the estimator uses as an index is checked or computed again. Any other numbers will do.
 
     Raises:
         ValueError: the bytes are of another version, other settings or another length, or hold an anchor twice.

@@ -323,7 +323,7 @@ def prepare(s: State) -> None:
 
 
 def set_layout(s: State) -> None:
-    """Find where the states of so many anchors stand."""
+    """Find where the states stand with the present number of anchors."""
     where, count, dim = s.layout, s.count, s.dim
     where.offset = dim
     where.velocity = dim + count

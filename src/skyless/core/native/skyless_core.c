@@ -328,7 +328,7 @@ SKYLESS_EXPORT void skyless_prepare(State *s) {
     }
 }
 
-/* Find where the states of so many anchors stand. */
+/* Find where the states stand with the present number of anchors. */
 INTERNAL void set_layout(State *s) {
     Layout *where = &s->layout;
     int32_t count = s->count;

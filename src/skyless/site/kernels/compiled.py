@@ -1,4 +1,4 @@
-"""The one door to the compiler, so that kernels stay typed Python functions.
+"""How Numba compiles functions of the simulation and of planning, which stay typed Python functions.
 
 With ``NUMBA_DISABLE_JIT=1`` every kernel runs as plain Python and gives the same values to rounding.
 """
