@@ -8,12 +8,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
+from skyless.core.air import anchor_stamps, beacon_fields
 from skyless.core.estimator import levels, process, state, steady_state
 from skyless.core.native import arithmetic
-from skyless.core.tag import position
+from skyless.core.tag import admission, course, hearing, position
 from translator.files import translate
 
 EXPORTS: Final[tuple[Callable[..., Any], ...]] = (
+    beacon_fields.read_frame,
+    anchor_stamps.unwrap_stamp,
+    admission.admit_sender,
+    admission.admit_stamp,
+    hearing.hear_frame,
+    hearing.hear_fields,
+    course.process_in_course,
     state.prepare,
     state.add_anchor,
     state.remove_anchor,

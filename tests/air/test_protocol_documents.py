@@ -13,7 +13,8 @@ from skyless.core.air.codec import decode, encode, heard_capacity
 from skyless.core.air.frame import Malformed
 from skyless.core.air.ieee802154 import air_time_s
 from skyless.core.air.instants import LONGEST_PERIOD_CODE, OFFERED_HZ, SHORTEST_PERIOD_S, period_ticks
-from skyless.core.air.local_almanac import MAX_ISSUE_PAGES, MAX_ISSUES, MAX_POSITIONS, MIN_ANCHORS
+from skyless.core.air.local_almanac import MAX_ISSUE_PAGES, MAX_ISSUES, MIN_ANCHORS
+from skyless.core.air.neighbours import MAX_NEIGHBOURS
 from skyless.core.protocol1 import beacon as protocol1_beacon
 from skyless.core.protocol1 import codec as protocol1_codec
 from skyless.core.protocol1.almanac import page_for, pages_of
@@ -119,4 +120,4 @@ def test_periods_of_the_document():
 
 
 def test_bounds_of_the_document():
-    assert (MAX_ANCHORS_IN_USE, MAX_POSITIONS, MAX_ISSUES, MAX_ISSUE_PAGES, MIN_ANCHORS) == (24, 64, 4, 4, 3)
+    assert (MAX_ANCHORS_IN_USE, MAX_NEIGHBOURS, MAX_ISSUES, MAX_ISSUE_PAGES, MIN_ANCHORS) == (24, 256, 4, 4, 3)

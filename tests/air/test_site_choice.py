@@ -1,7 +1,19 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.core.air.site_choice import MAX_SITES, SITE_SILENCE_TICKS, TRIAL_TICKS, SiteChoice, SiteUse
+from skyless.core.air.site_choice import (
+    CHANGED,
+    FOREIGN,
+    MAX_COUNTED,
+    MAX_SITES,
+    NO_SITE,
+    SITE_SILENCE_TICKS,
+    TRIAL_TICKS,
+    USED,
+    SiteChoice,
+    choose_site,
+    note_fix,
+)
 from skyless.core.ticks import from_seconds
 
 HOME, OTHER = 1, 77
@@ -10,18 +22,18 @@ STEP = from_seconds(0.01)
 
 def received(choice, *rows, start=0):
     """What each beacon of (site, anchor) is, one every 10 ms."""
-    return [choice.on_beacon(key, anchor, start + number * STEP) for number, (key, anchor) in enumerate(rows)]
+    return [choose_site(choice, key, anchor, start + number * STEP) for number, (key, anchor) in enumerate(rows)]
 
 
 def test_the_first_site_is_used():
-    assert received(SiteChoice(), (HOME, 1), (HOME, 2)) == [SiteUse.CHANGED, SiteUse.USED]
+    assert received(SiteChoice(), (HOME, 1), (HOME, 2)) == [CHANGED, USED]
 
 
 def test_until_there_are_fixes_the_site_with_more_anchors_is_used():
     choice = SiteChoice()
     uses = received(choice, (OTHER, 9), (OTHER, 9), (HOME, 1), (HOME, 1), (HOME, 2), (OTHER, 9))
     assert uses == [
-        SiteUse.CHANGED, SiteUse.USED, SiteUse.FOREIGN, SiteUse.FOREIGN, SiteUse.CHANGED, SiteUse.FOREIGN,
+        CHANGED, USED, FOREIGN, FOREIGN, CHANGED, FOREIGN,
     ]  # fmt: skip
     assert choice.site == HOME
 
@@ -29,41 +41,44 @@ def test_until_there_are_fixes_the_site_with_more_anchors_is_used():
 def test_a_site_with_fixes_stays_until_it_is_silent():
     choice = SiteChoice()
     received(choice, (HOME, 1))
-    choice.fix_ticks = choice.heard_ticks = 0
-    assert set(received(choice, *((OTHER, anchor) for anchor in range(20)), start=STEP)) == {SiteUse.FOREIGN}
-    assert choice.on_beacon(OTHER, 1, SITE_SILENCE_TICKS) is SiteUse.CHANGED
+    note_fix(choice, 0)
+    choice.heard_ticks = 0
+    assert set(received(choice, *((OTHER, anchor) for anchor in range(20)), start=STEP)) == {FOREIGN}
+    assert choose_site(choice, OTHER, 1, SITE_SILENCE_TICKS) == CHANGED
 
 
 def test_a_site_that_gives_no_fixes_any_more_is_left_for_one_with_more_anchors():
     choice = SiteChoice()
     received(choice, (HOME, 1))
-    choice.fix_ticks = 0
+    note_fix(choice, 0)
     late = SITE_SILENCE_TICKS + STEP
     choice.heard_ticks = late
-    assert received(choice, (HOME, 1), (OTHER, 1), (OTHER, 2), start=late)[-1] is SiteUse.CHANGED
+    assert received(choice, (HOME, 1), (OTHER, 1), (OTHER, 2), start=late)[-1] == CHANGED
 
 
 def test_only_the_configured_site_is_used():
-    choice = SiteChoice(77)
-    assert received(choice, (HOME, 1), (HOME, 2), (OTHER, 1)) == [SiteUse.FOREIGN, SiteUse.FOREIGN, SiteUse.CHANGED]
+    choice = SiteChoice(only_site=77)
+    assert received(choice, (HOME, 1), (HOME, 2), (OTHER, 1)) == [FOREIGN, FOREIGN, CHANGED]
 
 
 @given(st.lists(st.tuples(st.integers(0, 200), st.integers(0, 300)), max_size=400))
 def test_memory_is_bounded_and_the_site_in_use_is_kept(rows):
     choice = SiteChoice()
     received(choice, *rows)
-    assert len(choice.anchors) <= MAX_SITES
-    assert all(len(anchors) <= 32 for anchors in choice.anchors.values())
-    if rows:
-        assert choice.site is not None
-        assert choice.site in choice.anchors
+    sites = choice.sites[: choice.count]
+    assert choice.count <= MAX_SITES
+    for one in sites:
+        anchors = [counted.anchor for counted in one.anchors[: one.count]]
+        assert len(set(anchors)) == one.count <= MAX_COUNTED
+    assert len({one.site for one in sites}) == choice.count
+    assert choice.site in ({one.site for one in sites} if rows else {NO_SITE})
 
 
 def sites_used(choice, rows, start=0):
     """The site in use at each beacon of (site, anchor), one every 10 ms, all of which are accepted."""
     used = []
     for number, (key, anchor) in enumerate(rows):
-        if choice.on_beacon(key, anchor, start + number * STEP) is not SiteUse.FOREIGN:
+        if choose_site(choice, key, anchor, start + number * STEP) != FOREIGN:
             choice.heard_ticks = start + number * STEP
         used.append(choice.site)
     return used
@@ -76,7 +91,7 @@ def test_a_site_that_gives_no_fix_makes_way_and_does_not_return_by_its_number_of
     used = sites_used(choice, rows)
     assert set(used[20 : trial - 1]) == {OTHER}
     assert set(used[trial + 1 : 2 * trial - 1]) == {HOME}
-    choice.on_fix(2 * trial * STEP)
+    note_fix(choice, 2 * trial * STEP)
     assert set(sites_used(choice, rows[: trial // 5], start=2 * trial * STEP)) == {HOME}
 
 

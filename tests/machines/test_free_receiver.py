@@ -221,7 +221,7 @@ def test_a_moved_anchor_counts_once_it_is_stated_twice_in_a_row():
         receiver,
         [with_beacon(one, position=StatedPosition(1.0, 2.0, 3.0)) if one.anchor == moved else one for one in heard],
     )
-    assert receiver.almanac.position_m(moved).tolist() == [1.0, 2.0, 3.0]
+    assert receiver.heard_site.anchors_m[moved] == (1.0, 2.0, 3.0)
 
 
 def test_changed_pages_are_used_when_most_anchors_state_them():

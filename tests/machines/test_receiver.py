@@ -8,6 +8,7 @@ from msgspec.structs import replace
 
 from bench import EVERY_METHOD, LAB, LOFT, PAIRS, ROOM, Heard, Stage, assert_honest, changed, listen, tape
 from skyless.core.air.almanac import AccuracyPage, AnchorPage, NoisePage, SchedulePage
+from skyless.core.air.neighbours import MAX_NEIGHBOURS
 from skyless.core.constants import TICK_RATE_HZ
 from skyless.core.fix import NoFixReason
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, METHODS
@@ -537,7 +538,7 @@ def test_forged_anchors_take_no_memory():
                 rx_ticks = wrap(one.rx_ticks + 10**6 * (k + 1))
                 receiver.hear(replace(one, frame=frame, rx_ticks=rx_ticks).reception)
     assert len(receiver.almanac.anchors_m) <= 255
-    assert len(receiver._stamps.tracks.of_anchor) <= 256
+    assert receiver.admission.neighbours.count <= MAX_NEIGHBOURS
     assert receiver.counters["unknown-anchor"] > 20_000
 
 

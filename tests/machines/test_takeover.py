@@ -80,7 +80,7 @@ class Story:
 
     def site_time(self):
         """True times and site time less true time in seconds, by the masters' beacons, with their terms."""
-        unwrapper, rows, origin = Unwrapper(48), [], None
+        unwrapper, rows, origin = Unwrapper(bits=48), [], None
         for true_s, ticks, fraction, beacon in self.beacons:
             if beacon.anchor == beacon.master:
                 site = unwrapper.unwrap(beacon.master_time.tx_subticks_master, true_s / 256.0)

@@ -4,12 +4,12 @@ import ctypes
 import inspect
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 from core_build import NATIVE, has, input_of, library_of_all, rows_and_state, runner
-from numpy.lib.recfunctions import repack_fields
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "positioning"))
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
@@ -18,6 +18,11 @@ from estimator_builders import LAB_M, MESH, ROOM_M, begun, episode_of, kept, lat
 
 import wasm_core
 from make_core import EXPORTS, NAME
+from skyless.core.air.almanac import GeoreferencePage, NoisePage, SitePage
+from skyless.core.air.beacon import Beacon, StatedPosition
+from skyless.core.air.codec import encode
+from skyless.core.air.frame import Heard
+from skyless.core.air.ieee802154 import fcs
 from skyless.core.estimator.process import BatchPacket, BatchRow, Packet, Place, Relay
 from skyless.core.estimator.saved import packed_state
 from skyless.core.estimator.state import WORK_ROWS, State
@@ -103,6 +108,11 @@ def drawn_number(name, s, draw, anchor):
         "row": 3,
         "k": 0,
         "packed_bytes": 16,
+        "length": 117 - int(draw.integers(4) == 0),
+        "at": 20,
+        "axis": int(draw.integers(3)),
+        "bits": 40,
+        "size": 3,
     }
     return where.get(name, anchor)
 
@@ -124,8 +134,20 @@ def arguments(function, s, draw):
         elif isinstance(kind, Number):
             found.append(bool(draw.integers(2)) if kind.name == "bool" else drawn_number(name, s, draw, anchor))
         else:
-            found.append((ctypes.c_double * 512)(*draw.normal(size=512)) if kind.element == REAL else bytes(16))
+            found.append((ctypes.c_double * 512)(*draw.normal(size=512)) if kind.element == REAL else frame_of(draw))
     return found
+
+
+def frame_of(draw):
+    """A beacon as anchors send it, or with a few other bytes and the right check sequence."""
+    heard = tuple(Heard(k + 1, int(draw.integers(256)), int(draw.integers(2**40))) for k in range(8))
+    place = StatedPosition(*draw.uniform(-9.0, 9.0, 3), 0.02, -1, 3)
+    page = [SitePage(3, 1.5), NoisePage(1e-10, 1e-10, 0.0, 1e-9), GeoreferencePage(48.0, -11.0, 500.0, 10.0)]
+    one = Beacon(3, 0, 7, int(draw.integers(2**40)), 5, 0x21, place, heard, 5, page[int(draw.integers(3))])
+    body = bytearray(encode(one)[:-2])
+    for _ in range(int(draw.integers(3))):
+        body[int(draw.integers(11, len(body)))] = int(draw.integers(256))
+    return bytes(body) + fcs(bytes(body))
 
 
 def drawn_record(made, s, draw):
@@ -145,7 +167,40 @@ def drawn_record(made, s, draw):
         one.anchor, one.share, one.late_m = int(draw.integers(s.count)), 0.7, 0.1
     elif made is PlannedRelay:
         one.sender, one.share, one.age_s, one.late_m = int(draw.integers(s.count)), 0.6, 0.01, 0.2
+    else:
+        fill(one, draw)
     return one
+
+
+FEW = 6
+
+
+def fill(one, draw):
+    """Small numbers in all fields, so that they fit any table, and stamps of seconds."""
+    for name, kind in one._fields_:
+        if issubclass(kind, ctypes.Structure | ctypes.Array):
+            fill_elements(getattr(one, name), draw)
+        elif name == "bits":
+            one.bits = 40
+        else:
+            setattr(one, name, drawn_scalar(kind, draw))
+
+
+def fill_elements(array, draw):
+    if isinstance(array, ctypes.Structure):
+        fill(array, draw)
+        return
+    for place in range(min(FEW, len(array))):
+        if issubclass(array._type_, ctypes.Structure | ctypes.Array):
+            fill_elements(array[place], draw)
+        else:
+            array[place] = drawn_scalar(array._type_, draw)
+
+
+def drawn_scalar(kind, draw):
+    if kind is ctypes.c_int64:
+        return int(draw.integers(2 * 10**11))
+    return float(draw.normal(0.0, 10.0)) if kind is ctypes.c_double else kind(int(draw.integers(FEW))).value
 
 
 def hints(function):
@@ -155,16 +210,22 @@ def hints(function):
 
 def bits(value):
     if isinstance(value, State):
-        return (
-            packed_state(value)
-            + repack_fields(view(value.levels)).tobytes()
-            + view(value.U).tobytes()
-            + view(value.G).tobytes()
-        )
+        return packed_state(value) + view(value.levels).tobytes() + view(value.U).tobytes() + view(value.G).tobytes()
     if isinstance(value, ctypes.Structure | ctypes.Array):
-        array = view(value)
-        return (repack_fields(array) if array.dtype.names else array).tobytes()
+        return np.frombuffer(value, np.uint8)[contents(type(value))].tobytes()
     return value
+
+
+@cache
+def contents(made):
+    """Which bytes of a type are not between the fields of records."""
+    if issubclass(made, ctypes.Array):
+        return np.tile(contents(made._type_), made._length_)
+    found = np.full(ctypes.sizeof(made), not issubclass(made, ctypes.Structure))
+    for name, kind in getattr(made, "_fields_", ()):
+        begin = getattr(made, name).offset
+        found[begin : begin + ctypes.sizeof(kind)] = contents(kind)
+    return found
 
 
 SKIPPED = {"track", "find_steady_state", "process_superframe", "process_known"}

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.core.air.first_path import MAX_VARIANCE_FACTOR, variance_factor
+from skyless.core.air.first_path import MAX_VARIANCE_FACTOR, variance_factor, variance_factor_of
 from skyless.core.air.reception import Diagnostics
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.fix import Fix
@@ -48,8 +48,9 @@ def test_it_has_no_steps(difference_db):
 
 @pytest.mark.parametrize("nonsense", [None, math.nan, math.inf, -math.inf])
 def test_what_is_not_told_or_impossible_says_nothing(nonsense):
-    assert variance_factor(nonsense, -90.0) == variance_factor(-80.0, nonsense) == 1.0
-    assert variance_factor(-90.0, -80.0) == variance_factor(nonsense, nonsense) == 1.0
+    for powers in [(nonsense, -90.0), (-80.0, nonsense), (-90.0, -80.0), (nonsense, nonsense)]:
+        assert variance_factor_of(Diagnostics(*powers)) == 1.0
+    assert variance_factor_of(None) == 1.0
 
 
 @pytest.mark.parametrize(("extra_m", "least_db", "most_db"), [(-1, 0, 6), (0, 0, 6), (0.05, 0, 6), (0.3, 8.5, 12)])

@@ -4,17 +4,19 @@ from msgspec.structs import replace
 
 from skyless.core.air.almanac import AccuracyPage, NoisePage, SitePage
 from skyless.core.air.beacon import Beacon, StatedPosition
+from skyless.core.air.codec import fields_of
 from skyless.core.air.local_almanac import (
     MAX_ISSUE_PAGES,
     MAX_ISSUES,
-    MAX_POSITIONS,
     PRESENT_TICKS,
     LocalAlmanac,
     site_issue,
     site_page_for,
     site_pages_of,
 )
+from skyless.core.air.neighbours import MAX_NEIGHBOURS, Neighbours, find_neighbour, neighbour_of
 from skyless.core.site import GeoreferenceSite
+from skyless.core.tag.hearing import keep_place
 from skyless.core.ticks import from_seconds
 from skyless.sim.lab import lab_site
 
@@ -39,8 +41,27 @@ def rotation(count, anchors=(1, 2, 3), pages=PAGES):
         yield beacon(anchor, site_page_for(pages, n // len(anchors), anchor), issue)
 
 
-def run(almanac, beacons, is_confirmed=True, start=0):
-    return [almanac.on_beacon(one, start + n * STEP, is_confirmed) for n, one in enumerate(beacons)]
+class Tag:
+    """A table of anchors, as a tag keeps it, and the almanac over it."""
+
+    def __init__(self):
+        self.neighbours = Neighbours()
+        self.almanac = LocalAlmanac(self.neighbours)
+
+    def hear(self, one, rx_ticks, is_confirmed=True):
+        t, fields = self.neighbours, fields_of(one)
+        t.row = neighbour_of(t, one.anchor, rx_ticks)
+        n = t.rows[t.row]
+        n.frames, n.rx_ticks, n.is_confirmed = min(n.frames + 1, 2), rx_ticks, is_confirmed
+        n.almanac_issue, n.period_code = one.almanac_issue, one.period_code
+        if is_confirmed:
+            n.relayed_ticks = rx_ticks
+        if fields.has_place:
+            keep_place(n, fields.place)
+        return self.almanac.on_beacon(one.page, rx_ticks)
+
+    def run(self, beacons, is_confirmed=True, start=0):
+        return [self.hear(one, start + n * STEP, is_confirmed) for n, one in enumerate(beacons)]
 
 
 def test_pages_of_a_site_in_the_order_of_their_types():
@@ -51,8 +72,9 @@ def test_pages_of_a_site_in_the_order_of_their_types():
 
 
 def test_three_anchors_make_the_pages_complete_in_two_rounds():
-    almanac = LocalAlmanac()
-    changes = run(almanac, rotation(9))
+    tag = Tag()
+    almanac = tag.almanac
+    changes = tag.run(rotation(9))
     assert changes.count(True) == 1
     assert changes.index(True) < 5
     assert (almanac.pages.noise, almanac.pages.accuracy, almanac.pages.site) == PAGES
@@ -60,74 +82,75 @@ def test_three_anchors_make_the_pages_complete_in_two_rounds():
 
 
 def test_two_anchors_count_only_once_they_are_all_for_a_second():
-    almanac = LocalAlmanac()
+    tag = Tag()
     before = int(PRESENT_TICKS / STEP)
-    changes = run(almanac, rotation(before + 40, (1, 2)))
+    changes = tag.run(rotation(before + 40, (1, 2)))
     assert not any(changes[:before])
     assert any(changes)
 
 
 def test_anchors_that_nobody_has_received_take_no_part():
-    almanac = LocalAlmanac()
-    assert not any(run(almanac, rotation(60), is_confirmed=False))
+    tag = Tag()
+    almanac = tag.almanac
+    assert not any(tag.run(rotation(60), is_confirmed=False))
     assert almanac.pages is None
 
 
 def test_pages_of_a_minority_are_not_used():
-    almanac = LocalAlmanac()
+    tag = Tag()
+    almanac = tag.almanac
     false_pages = (*PAGES[:-1], replace(PAGES[-1], tag_height_m=17.0))
     mixed = [one for pair in zip(rotation(60), rotation(60, (8, 9), false_pages), strict=True) for one in pair]
-    run(almanac, mixed)
+    tag.run(mixed)
     assert almanac.pages.site == PAGES[-1]
 
 
 def test_a_page_that_does_not_fit_the_issue_is_passed_over():
-    almanac = LocalAlmanac()
+    tag = Tag()
+    almanac = tag.almanac
     false_page = replace(PAGES[-1], tag_height_m=17.0)
     mixed = [one for n, good in enumerate(rotation(60)) for one in (beacon(4 + n % 5, false_page), good)]
-    run(almanac, mixed)
+    tag.run(mixed)
     assert almanac.pages.site == PAGES[-1]
 
 
 def test_another_issue_of_the_majority_replaces_the_pages_once_they_are_complete():
-    almanac = LocalAlmanac()
-    run(almanac, rotation(12))
+    tag = Tag()
+    almanac = tag.almanac
+    tag.run(rotation(12))
     changed = (replace(PAGES[0], rx_stamp_s=2e-10), *PAGES[1:])
-    changes = run(almanac, rotation(12, pages=changed), start=from_seconds(1.0))
+    changes = tag.run(rotation(12, pages=changed), start=from_seconds(1.0))
     assert changes.count(True) == 1
     assert almanac.pages.noise.rx_stamp_s == 2e-10
 
 
 def test_a_position_is_used_at_once_and_another_one_when_it_comes_twice_in_a_row():
-    almanac = LocalAlmanac()
-    moved = StatedPosition(9.0, 2.0, 3.0, 0.05)
-    run(almanac, [beacon(1)])
-    first = almanac.position_m(1)
-    run(almanac, [beacon(1, position=moved), beacon(1), beacon(1, position=moved)])
-    assert almanac.position_m(1) is first
-    run(almanac, [beacon(1, position=moved)])
-    assert almanac.position_m(1).tolist() == [9.0, 2.0, 3.0]
-    assert almanac.std_m(1) == 0.05
+    tag, moved = Tag(), StatedPosition(9.0, 2.0, 3.0, 0.05)
+    tag.run([beacon(1), beacon(1, position=moved), beacon(1), beacon(1, position=moved)])
+    assert tag.almanac.points_m() == {1: (1.0, 2.0, 3.0)}
+    tag.run([beacon(1, position=moved)])
+    assert tag.almanac.points_m() == {1: (9.0, 2.0, 3.0)}
+    assert tag.almanac.newest.place.std_mm == 50
 
 
 def test_an_anchor_without_a_position_has_none():
-    almanac = LocalAlmanac()
-    run(almanac, [beacon(1, position=None)])
-    assert almanac.position_m(1) is None
-    run(almanac, [beacon(1), beacon(1, position=None)])
-    assert almanac.position_m(1) is not None
+    tag = Tag()
+    tag.run([beacon(1, position=None)])
+    assert tag.almanac.points_m() == {}
+    tag.run([beacon(1), beacon(1, position=None)])
+    assert tag.almanac.points_m() == {1: (1.0, 2.0, 3.0)}
 
 
 @given(
     st.lists(st.tuples(st.integers(0, 65535), st.integers(0, 65535), st.integers(0, 2), st.booleans()), max_size=300)
 )
 def test_memory_is_bounded_whatever_comes_and_a_state_goes_on_the_same(rows):
-    almanac, again = LocalAlmanac(), LocalAlmanac()
+    tag, again = Tag(), Tag().almanac
     for n, (anchor, issue, page, is_confirmed) in enumerate(rows):
         height = replace(PAGES[-1], tag_height_m=float(n)) if page == 2 else PAGES[page]
-        almanac.on_beacon(beacon(anchor, height, issue % 9), n * STEP, is_confirmed)
-    state = almanac.state()
-    assert len(state.anchors) <= MAX_POSITIONS
+        tag.hear(beacon(anchor, height, issue % 9), n * STEP, is_confirmed)
+    state = tag.almanac.state()
+    assert tag.neighbours.count <= MAX_NEIGHBOURS
     assert len(state.collected) <= MAX_ISSUES * 3 * MAX_ISSUE_PAGES
     again.restore(state)
     assert again.state() == state
@@ -140,16 +163,17 @@ def test_the_issue_does_not_depend_on_the_order_of_the_pages():
 
 def test_strangers_do_not_displace_anchors_that_others_have_received():
     """Neither their positions nor the pages that they state, however many there are."""
-    almanac, good = LocalAlmanac(), rotation(190)
+    tag, good = Tag(), rotation(600)
+    almanac = tag.almanac
     for n, one in enumerate(good):
-        if n % 100 == 0:
-            almanac.on_beacon(one, n * STEP, True)
+        if n % 300 == 0:
+            tag.hear(one, n * STEP // 5)
         else:
             page = replace(PAGES[n % 2 * 2], **({"tag_height_m": float(n % 7)} if n % 2 else {"rx_stamp_s": n * 1e-12}))
-            almanac.on_beacon(beacon(1000 + n % 90, page, ISSUE if n % 3 else n % 7), n * STEP, False)
-    assert almanac.position_m(1) is not None
+            tag.hear(beacon(1000 + n // 2, page, ISSUE if n % 3 else n % 7), n * STEP // 5, False)
+    assert find_neighbour(tag.neighbours, 1) >= 0
+    assert tag.neighbours.count == MAX_NEIGHBOURS
     assert any(one.issue == ISSUE for one in almanac.state().collected)
-    run(almanac, rotation(9), start=from_seconds(2.0))
+    tag.run(rotation(9), start=from_seconds(4.0))
     assert almanac.pages is not None
     assert almanac.issue == ISSUE
-    assert len(almanac.state().anchors) <= MAX_POSITIONS

@@ -8,7 +8,7 @@ from types import FunctionType
 from typing import Any, Final, get_type_hints
 
 from skyless.core.native import arithmetic
-from skyless.core.native.records import Record
+from skyless.core.native.records import Record, has_defaults
 from translator.scopes import Scopes, assigned
 from translator.sources import INDENT, c_name, comment, doc_of, source_of, wrapped
 from translator.types import (
@@ -570,6 +570,8 @@ class Body:
         if isinstance(called, type) and issubclass(called, Record):
             if node.args or node.keywords:
                 raise self.refuse(node, "a new record has no values")
+            if has_defaults(called):
+                raise self.refuse(node, f"a new {called.__name__} would have defaults, which C does not know")
             self.all.need_record(called)
             return Value(called.__name__, Struct(called), NEW)
         if called in BUILTINS.values() or called in (math.sqrt, arithmetic.floor):

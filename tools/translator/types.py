@@ -81,7 +81,7 @@ def parameter_type(hint: Any) -> Type:  # noqa: ANN401
             raise TypeError("only numbers are returned together")
         return Results("", items)  # type: ignore[arg-type]
     origin = get_origin(hint)
-    if origin is not None and origin.__name__ in {"Array", "Sequence"}:
+    if origin is not None and origin.__name__ in {"Array", "ReadOnly"}:
         element = parameter_type(get_args(hint)[0])
         if isinstance(element, Elements) and element.length == 0:
             raise TypeError("an array of arrays needs its lengths")

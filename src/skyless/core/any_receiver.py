@@ -8,7 +8,8 @@ from typing import Any, Final
 from msgspec import Struct
 
 from skyless.core.air.beacon import Beacon
-from skyless.core.air.frame import Malformed
+from skyless.core.air.beacon_fields import VERSION_2
+from skyless.core.air.frame import Malformed, has_version
 from skyless.core.air.reception import Reception
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
@@ -79,7 +80,7 @@ class AnyReceiver:
         options = admission.options
         made = cls(
             options.method,
-            site=admission.choice.only_site,
+            site=admission.only_site,
             qa=options.qa,
             z_bounds_m=options.z_bounds_m,
             integrity=options.integrity,
@@ -133,7 +134,13 @@ class AnyReceiver:
 
         What does not belong here is counted in ``counters`` and dropped; nothing on the air raises.
         """
-        beacon = decode_any(reception.frame)
+        receiver, frame = self._receiver, reception.frame
+        if isinstance(receiver, Receiver) and has_version(frame, VERSION_2):
+            fix = receiver.hear(reception)
+            if fix is not None:
+                self._others = 0
+            return fix
+        beacon = decode_any(frame)
         if isinstance(beacon, Malformed):
             self.counters[beacon] += 1
             return None

@@ -4,11 +4,12 @@ Ticks are subtracted as integers and only then turned into seconds or metres (``
 float64 seconds lose 0.6 mm after an hour, integers lose nothing.
 """
 
-from typing import Annotated, Final
-
-from msgspec import Meta, Struct
+from math import nan
+from typing import Final
 
 from skyless.core.constants import MAX_DRIFT, TICK_BITS, TICK_RATE_HZ, TICK_S
+from skyless.core.native.arithmetic import floor
+from skyless.core.native.records import Record, Ticks, record
 
 WRAP_TICKS: Final = 1 << TICK_BITS
 HALF_WRAP_TICKS: Final = WRAP_TICKS // 2
@@ -16,6 +17,12 @@ TICK_MASK: Final = WRAP_TICKS - 1
 
 LAST_TICKS: Final = 1 << 61
 """A year of ticks, whose differences fit 64 bits; a host's clock that jumps by more was set."""
+
+NEVER: Final = -(1 << 62)
+"""Earlier than any reading."""
+
+_LONGEST_JUMP_S: Final = 1e8
+"""No jump of a host's clock counts as a longer one: the ticks of three years fit 64 bits."""
 
 
 def wrap(ticks: int, bits: int = TICK_BITS) -> int:
@@ -32,10 +39,11 @@ def difference(later: int, earlier: int, bits: int = TICK_BITS) -> int:
     return ((later - earlier + half) & ((half << 1) - 1)) - half
 
 
-def nearest(counter: int, expected_ticks: int, bits: int = TICK_BITS) -> int:
+def nearest(counter: Ticks, expected_ticks: Ticks, bits: int = TICK_BITS) -> Ticks:
     """The unwrapped time that the counter shows and that lies nearest to the expected one."""
-    half = 1 << (bits - 1)
-    return expected_ticks + ((counter - expected_ticks + half) & ((half << 1) - 1)) - half
+    half: Ticks = 1
+    half = half << (bits - 1)
+    return expected_ticks - half + ((counter - expected_ticks + half) & (2 * half - 1))
 
 
 def to_seconds(ticks: int) -> float:
@@ -55,7 +63,7 @@ NOISE_TICKS: Final = 64
 """0.3 m allow for the noise of two stamps of one anchor."""
 
 
-def may_elapse(counter_ticks: int, elapsed_ticks: int, slack_ticks: float) -> bool:
+def may_elapse(counter_ticks: Ticks, elapsed_ticks: Ticks, slack_ticks: float) -> bool:
     """Whether one crystal's counter may go by ``counter_ticks`` while another's goes by ``elapsed_ticks``."""
     return abs(counter_ticks - elapsed_ticks) <= MAX_DRIFT * elapsed_ticks + slack_ticks
 
@@ -66,55 +74,64 @@ def continued(counter: int, last_ticks: int, elapsed_ticks: int, bits: int = TIC
     return ticks if may_elapse(ticks - last_ticks, elapsed_ticks, NOISE_TICKS) else None
 
 
-class Unwrapper(Struct):
-    """Turns one counter's wrapped stamps into int64 ticks that never wrap.
+@record
+class Unwrapper(Record):
+    """Turns one counter's wrapped stamps into int64 ticks that never wrap (``unwrap``)."""
 
-    Without a host time a stamp is assumed to lie within half a wrap (8.6 s for 40 bits) of the stamp before it,
-    before or after. With one, the host's clock decides which wrap it is, however long the gap, as long as the
-    host's clock errs by less than half a wrap over that gap. Stamps with and without a host time may alternate.
-    """
-
-    bits: Annotated[int, Meta(ge=1, le=64)] = TICK_BITS
-    last_ticks: int | None = None
-    last_host_s: float | None = None
+    bits: int = TICK_BITS
+    """Width of the counter, 62 at most."""
+    has_stamp: bool
+    last_ticks: Ticks
+    last_host_s: float = nan
+    """NaN where no stamp has had a host time."""
 
     def unwrap(self, counter: int, host_s: float | None = None) -> int:
-        """Unwrapped ticks of a counter value; the first stamp keeps its own value.
-
-        A stamp out of order is placed where it belongs, before the ones already seen.
-        """
-        last, last_host_s, half_wrap = self.last_ticks, self.last_host_s, 1 << (self.bits - 1)
-        if last is None:
-            ticks = counter
-        else:
-            least = last - half_wrap
-            if host_s is not None and last_host_s is not None:
-                least += round((host_s - last_host_s) * TICK_RATE_HZ)
-            ticks = least + ((counter - least) & ((half_wrap << 1) - 1))
-            if host_s is None and last_host_s is not None:
-                host_s = last_host_s + to_seconds(ticks - last)
-        self.last_ticks, self.last_host_s = ticks, host_s
-        return ticks
+        """Unwrapped ticks of a counter value, as ``unwrap``."""
+        return unwrap(self, counter, nan if host_s is None else host_s)
 
     def expect(self, counter: int) -> int:
         """Unwrapped ticks of a counter value near the last stamp; it does not count as a stamp."""
-        return counter if self.last_ticks is None else nearest(counter, self.last_ticks, self.bits)
+        return nearest(counter, self.last_ticks, self.bits) if self.has_stamp else counter
 
 
-class FixTime(Struct):
+def unwrap(u: Unwrapper, counter: Ticks, host_s: float) -> Ticks:
+    """Unwrapped ticks of a counter value; the first stamp keeps its own value.
+
+    Without a host time, NaN, a stamp is assumed to lie within half a wrap (8.6 s for 40 bits) of the stamp before it,
+    before or after. With one, the host's clock decides which wrap it is, however long the gap, as long as the host's
+    clock errs by less than half a wrap over that gap. Stamps with and without a host time may alternate. A stamp out of
+    order is placed where it belongs, before the ones already seen.
+    """
+    ticks = counter
+    if u.has_stamp:
+        expected_ticks, elapsed_s = u.last_ticks, host_s - u.last_host_s
+        if abs(elapsed_s) >= 0.0:  # it is a number
+            elapsed_s = max(min(elapsed_s, _LONGEST_JUMP_S), -_LONGEST_JUMP_S)
+            expected_ticks += floor(elapsed_s * TICK_RATE_HZ + 0.5)
+        ticks = nearest(counter, expected_ticks, u.bits)
+        if not abs(host_s) >= 0.0:
+            host_s = u.last_host_s + (ticks - u.last_ticks) * TICK_S
+    u.has_stamp, u.last_ticks, u.last_host_s = True, ticks, host_s
+    return ticks
+
+
+@record
+class FixTime(Record):
     """Counts from the first fix of a receiver and never goes back, even if the master or the method changes."""
 
-    first_ticks_master: int | None = None
-    last_ticks_master: int = 0
-    last_rx_ticks_tag: int = 0
+    has_fix: bool
+    first_ticks_master: Ticks
+    last_ticks_master: Ticks
+    last_rx_ticks_tag: Ticks
 
-    def time_s(self, ticks_master: int, rx_ticks_tag: int) -> float:
-        """Time in seconds of a fix that holds at this master time, given the tag's reading for it, both unwrapped."""
-        if self.first_ticks_master is None:
-            self.first_ticks_master = ticks_master
-        else:
-            elapsed, gone = rx_ticks_tag - self.last_rx_ticks_tag, ticks_master - self.last_ticks_master
-            if elapsed <= 0 or not may_elapse(gone, elapsed, FLIGHT_SLACK_TICKS):
-                self.first_ticks_master += gone - max(elapsed, 1)
-        self.last_ticks_master, self.last_rx_ticks_tag = ticks_master, rx_ticks_tag
-        return (ticks_master - self.first_ticks_master) * TICK_S
+
+def fix_time_s(time: FixTime, ticks_master: Ticks, rx_ticks_tag: Ticks) -> float:
+    """Time in seconds of a fix that holds at this master time, given the tag's reading for it, both unwrapped."""
+    if not time.has_fix:
+        time.has_fix, time.first_ticks_master = True, ticks_master
+    else:
+        elapsed, gone = rx_ticks_tag - time.last_rx_ticks_tag, ticks_master - time.last_ticks_master
+        if elapsed <= 0 or not may_elapse(gone, elapsed, FLIGHT_SLACK_TICKS):
+            time.first_ticks_master += gone - max(elapsed, 1)
+    time.last_ticks_master, time.last_rx_ticks_tag = ticks_master, rx_ticks_tag
+    return (ticks_master - time.first_ticks_master) * TICK_S

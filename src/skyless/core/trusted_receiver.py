@@ -160,7 +160,7 @@ class TrustedReceiver:
         fix = self._live.hear_beacon(frame.beacon, frame.reception)
         if fix is None:
             return []
-        self._first_time = self._first_time or copy.copy(self._live.state().admission.time)
+        self._first_time = self._first_time or copy.copy(self._live.admission.time)
         return [(frame.rx_ticks, GivenFix(self._with_trust(fix, frame.rx_ticks), frame.reception))]
 
     def _verify(self) -> list[tuple[int, GivenFix]]:
@@ -192,10 +192,7 @@ class TrustedReceiver:
         """Let the verified receiver count time from the first fix of the live one."""
         if self._live is None or self._first_time is None or self._verified.counters["fixes"]:
             return
-        state, live = self._verified.state(), self._live.state()
-        admission = replace(state.admission, time=self._first_time, own_ticks=copy.copy(live.admission.own_ticks))
-        state = replace(state, admission=admission)
-        self._verified = Receiver.from_state(state)
+        self._verified.continue_time_of(self._live, self._first_time)
 
     def _is_attacked(self) -> bool:
         """Whether many of the plausible frames of the last seconds have turned out to be forged."""

@@ -7,9 +7,27 @@ from functools import lru_cache
 from operator import index
 from typing import Any, Final
 
+import numpy as np
+
+from skyless.core.air.almanac import Page
 from skyless.core.air.beacon import MAX_HEARD, Authentication, Beacon, StatedPosition
+from skyless.core.air.beacon_fields import (
+    AUTHENTICATION_BYTES,
+    CERTIFICATE_BYTES,
+    COUNT_BITS,
+    FLAGS_AT,
+    HAS_AUTHENTICATION,
+    HAS_CERTIFICATE,
+    HAS_PAGE,
+    HAS_POSITION,
+    INTACT,
+    RESERVED_FLAGS,
+    VERSION_2,
+    BeaconFields,
+    bare_bytes,
+    read_frame,
+)
 from skyless.core.air.frame import (
-    BEACON_MAGIC,
     BROADCAST,
     FCS_BYTES,
     FRAME_CONTROL,
@@ -18,72 +36,45 @@ from skyless.core.air.frame import (
     Heard,
     Malformed,
     PackedHeard,
-    not_a_beacon,
 )
-from skyless.core.air.ieee802154 import fcs, is_intact
+from skyless.core.air.ieee802154 import fcs
 from skyless.core.air.instants import LONGEST_PERIOD_CODE
-from skyless.core.air.page_codec import PAGE_BYTES, decode_page, encode_page
+from skyless.core.air.page_check import PAGE_BYTES
+from skyless.core.air.page_codec import decode_page, encode_page
+from skyless.core.native.library import compiled
+from skyless.core.native.records import view
 
-VERSION_2: Final = BEACON_MAGIC | 0x0200
-MAC_BYTES: Final = 8
+FAULTS: Final = tuple(Malformed)
+"""In the order of the numbers that ``read_frame`` returns."""
+
+MAC_BYTES: Final = AUTHENTICATION_BYTES - 2
 """Length of a message authentication code: the first 64 bits of an HMAC-SHA-256."""
 INTERVAL_BITS: Final = 16
 """How many bits of an interval's number a frame states."""
-CERTIFICATE_BYTES: Final = 94
-"""Length of a certificate (``skyless.core.keys.chain``)."""
 
 MAX_STATED_COORDINATE_M: Final = ((1 << 23) - 1) / 1000.0
 """8388.6 m, along each axis from the origin."""
 
-_HAS_POSITION: Final = 0x01
-_HAS_PAGE: Final = 0x02
-_HAS_AUTHENTICATION: Final = 0x04
-_HAS_CERTIFICATE: Final = 0x08
-_RESERVED_FLAGS: Final = 0xF0
-_NOT_WITH_CERTIFICATE: Final = _HAS_POSITION | _HAS_PAGE
-_COMBINATIONS: Final = 0x10
-
 _FIXED: Final = struct.Struct("<HBHHHHBIBHB")
-_FLAGS_AT: Final = 11
 _POSITION: Final = struct.Struct("<HbHbHbBbB")
 _COUNT: Final = struct.Struct("<H")
 _AUTHENTICATION: Final = struct.Struct("<H8s")
-_COUNT_BITS: Final = 4
-_COUNT_MASK: Final = (1 << _COUNT_BITS) - 1
 _STD_STEPS_PER_M: Final = 1000
 _MAX_STD_STEPS: Final = 0xFF
 
 
-def _count_at(flags: int) -> int:
-    return _FIXED.size + (_POSITION.size if flags & _HAS_POSITION else 0)
-
-
-def _bare_bytes(flags: int) -> int:
-    """Length of a frame with these flags that relays no receptions."""
-    return (
-        _count_at(flags)
-        + (CERTIFICATE_BYTES if flags & _HAS_CERTIFICATE else _COUNT.size)
-        + (PAGE_BYTES if flags & _HAS_PAGE else 0)
-        + (_AUTHENTICATION.size if flags & _HAS_AUTHENTICATION else 0)
-        + FCS_BYTES
-    )
-
-
-_BARE_BYTES: Final = tuple(_bare_bytes(flags) for flags in range(_COMBINATIONS))
-_COUNT_AT: Final = tuple(_count_at(flags) for flags in range(_COMBINATIONS))
 _CAPACITY: Final = tuple(
     0
-    if flags & _HAS_CERTIFICATE
-    else min((MAX_FRAME_BYTES - _bare_bytes(flags | _HAS_AUTHENTICATION)) // HEARD.size, MAX_HEARD)
-    for flags in range(_COMBINATIONS)
+    if flags & HAS_CERTIFICATE
+    else min((MAX_FRAME_BYTES - bare_bytes(flags | HAS_AUTHENTICATION)) // HEARD.size, MAX_HEARD)
+    for flags in range(RESERVED_FLAGS & -RESERVED_FLAGS)
 )
-_TRAILER_BYTES: Final = _AUTHENTICATION.size + FCS_BYTES
 _HEARD_ANCHORS: Final = tuple(struct.Struct("<" + count * "H6x") for count in range(MAX_HEARD + 4))
 
 
 def heard_capacity(*, position: bool = False, page: bool = True, certificate: bool = False) -> int:
     """How many ``heard`` entries a frame with these parts may carry, with space for authentication: 0, or 8 to 12."""
-    return _CAPACITY[position * _HAS_POSITION | page * _HAS_PAGE | certificate * _HAS_CERTIFICATE]
+    return _CAPACITY[position * HAS_POSITION | page * HAS_PAGE | certificate * HAS_CERTIFICATE]
 
 
 def encode(beacon: Beacon) -> bytes:
@@ -106,10 +97,9 @@ def encode(beacon: Beacon) -> bytes:
     position = beacon.position
     if position is not None:
         coordinates = [half for value in (position.x_m, position.y_m, position.z_m) for half in _millimetres(value)]
-        std = min(math.ceil(round(position.std_m * _STD_STEPS_PER_M, 6)), _MAX_STD_STEPS)
-        parts.append(_POSITION.pack(*coordinates, std, position.floor, position.zone))
+        parts.append(_POSITION.pack(*coordinates, _std_steps(position.std_m), position.floor, position.zone))
     if beacon.certificate is None:
-        parts += [_COUNT.pack(len(beacon.heard) | beacon.weak << _COUNT_BITS), _packed(beacon.heard)]
+        parts += [_COUNT.pack(len(beacon.heard) | beacon.weak << COUNT_BITS), _packed(beacon.heard)]
     else:
         parts.append(beacon.certificate)
     if beacon.page is not None:
@@ -126,7 +116,7 @@ def with_authentication(frame: bytes, interval: int, mac_of: Callable[[bytes], b
     ``interval``: its lowest 16 bits; ``mac_of`` gives the code of the bytes from the first to the interval.
     """
     signed = bytearray(frame[:-FCS_BYTES])
-    signed[_FLAGS_AT] |= _HAS_AUTHENTICATION
+    signed[FLAGS_AT] |= HAS_AUTHENTICATION
     signed += interval.to_bytes(2, "little")
     signed += mac_of(bytes(signed))
     return bytes(signed) + fcs(bytes(signed))
@@ -139,76 +129,61 @@ def signed_bytes(frame: bytes) -> bytes:
 
 def decode(frame: bytes) -> Beacon | Malformed:
     """Return the beacon in a whole frame of version 2 (FCS included), or why there is none; never raises."""
-    fault = _frame_fault(frame)
-    if fault is not None:
-        return fault
-    flags = frame[_FLAGS_AT]
-    _, sequence, site, _, anchor, _, _, tx_low, tx_high, issue, period_code = _FIXED.unpack_from(frame)
-    if period_code > LONGEST_PERIOD_CODE:
-        return Malformed.BAD_PERIOD
-    if flags & _HAS_CERTIFICATE:
-        certificate = frame[_FIXED.size : _FIXED.size + CERTIFICATE_BYTES]
-        return Beacon(
-            site, anchor, sequence, tx_low | tx_high << 32, issue, period_code, None, PackedHeard(b""), 0, None,
-            certificate, _authentication(frame, flags),
-        )  # fmt: skip
-    (entries,) = _COUNT.unpack_from(frame, _COUNT_AT[flags])
-    count, weak = entries & _COUNT_MASK, entries >> _COUNT_BITS
-    heard_at = _COUNT_AT[flags] + _COUNT.size
-    page_at = heard_at + count * HEARD.size
-    named = {anchor, *_HEARD_ANCHORS[count].unpack_from(frame, heard_at)}
-    if len(named) != count + 1 or count > MAX_HEARD or weak >> count:
-        return Malformed.BAD_HEARD
-    page = decode_page(frame[page_at : page_at + PAGE_BYTES]) if flags & _HAS_PAGE else None
-    if isinstance(page, Malformed):
-        return page
-    position = _position(frame, _FIXED.size) if flags & _HAS_POSITION else None
+    fields = BeaconFields()
+    fault = _read_frame(frame, len(frame), fields)
+    return beacon_of(fields, frame) if fault == INTACT else FAULTS[fault - 1]
+
+
+def beacon_of(b: BeaconFields, frame: bytes) -> Beacon:
+    """The beacon that was read from a frame."""
+    stated, place, certificate, authentication = b.place, None, None, None
+    if b.has_place:
+        x_m, y_m, z_m = (one_mm / 1000 for one_mm in stated.position_mm)
+        place = StatedPosition(x_m, y_m, z_m, stated.std_mm / _STD_STEPS_PER_M, stated.floor, stated.zone)
+    if b.certificate_at:
+        certificate = frame[b.certificate_at : b.certificate_at + CERTIFICATE_BYTES]
+    if b.authentication_at:
+        authentication = Authentication(*_AUTHENTICATION.unpack_from(frame, b.authentication_at))
+    heard = frame[b.heard_at : b.heard_at + b.heard_count * HEARD.size]
     return Beacon(
-        site, anchor, sequence, tx_low | tx_high << 32, issue, period_code, position,
-        PackedHeard(frame[heard_at:page_at]), weak, page, None, _authentication(frame, flags),
+        b.site, b.anchor, b.sequence, b.tx_ticks, b.almanac_issue, b.period_code, place, PackedHeard(heard), b.weak,
+        page_of(frame, b), certificate, authentication,
     )  # fmt: skip
+
+
+_read_frame: Final = compiled(read_frame)
+
+
+def page_of(frame: bytes, b: BeaconFields) -> Page | None:
+    """The page in a frame that has been read; None where there is none, or its type is not known here."""
+    page = decode_page(frame[b.page_at : b.page_at + PAGE_BYTES]) if b.page_at else None
+    assert page is not Malformed.BAD_PAGE, "read_frame refuses such frames"
+    return page
+
+
+def fields_of(beacon: Beacon) -> BeaconFields:
+    """What ``read_frame`` makes of the frame of a beacon, but for what is only passed on."""
+    place, relays = beacon.position, packed_relays(beacon)
+    fields = BeaconFields(
+        site=beacon.site,
+        anchor=beacon.anchor,
+        sequence=beacon.sequence,
+        tx_ticks=beacon.tx_ticks,
+        almanac_issue=beacon.almanac_issue,
+        period_code=beacon.period_code,
+        has_place=place is not None,
+        relay_bytes=len(relays),
+    )
+    view(fields.relays)[: len(relays)] = np.frombuffer(relays, np.uint8)
+    if place is not None:
+        view(fields.place.position_mm)[:] = [round(value_m * 1000) for value_m in (place.x_m, place.y_m, place.z_m)]
+        fields.place.std_mm = _std_steps(place.std_m)
+        fields.place.floor, fields.place.zone = place.floor, place.zone
+    return fields
 
 
 decode_cached = lru_cache(maxsize=256)(decode)
 """``decode`` that remembers the last 256 frames: for a program that runs many tags which receive the same bytes."""
-
-
-def _frame_fault(frame: bytes) -> Malformed | None:
-    """Why bytes are no beacon of version 2, as far as length, header and flags show it."""
-    length = len(frame)
-    if not FCS_BYTES < length <= MAX_FRAME_BYTES:
-        return Malformed.TOO_LONG if length > MAX_FRAME_BYTES else Malformed.TOO_SHORT
-    if not is_intact(frame):
-        return Malformed.BAD_FCS
-    fault = not_a_beacon(frame, VERSION_2)
-    if fault is None:
-        fault = Malformed.TOO_SHORT if length < _BARE_BYTES[0] else _length_fault(frame)
-    return fault
-
-
-def _length_fault(frame: bytes) -> Malformed | None:
-    flags, length = frame[_FLAGS_AT], len(frame)
-    if flags & _RESERVED_FLAGS or (flags & _HAS_CERTIFICATE and flags & _NOT_WITH_CERTIFICATE):
-        return Malformed.BAD_FLAGS
-    if length < _BARE_BYTES[flags]:
-        return Malformed.BAD_LENGTH
-    if flags & _HAS_CERTIFICATE:
-        return None if length == _BARE_BYTES[flags] else Malformed.BAD_LENGTH
-    (entries,) = _COUNT.unpack_from(frame, _COUNT_AT[flags])
-    fits = length == _BARE_BYTES[flags] + (entries & _COUNT_MASK) * HEARD.size
-    return None if fits else Malformed.BAD_LENGTH
-
-
-def _authentication(frame: bytes, flags: int) -> Authentication | None:
-    if not flags & _HAS_AUTHENTICATION:
-        return None
-    return Authentication(*_AUTHENTICATION.unpack_from(frame, len(frame) - _TRAILER_BYTES))
-
-
-def _position(frame: bytes, at: int) -> StatedPosition:
-    x, x_high, y, y_high, z, z_high, std, floor, zone = _POSITION.unpack_from(frame, at)
-    x_mm, y_mm, z_mm = x | x_high << 16, y | y_high << 16, z | z_high << 16
-    return StatedPosition(x_mm / 1000, y_mm / 1000, z_mm / 1000, std / _STD_STEPS_PER_M, floor, zone)
 
 
 def _packed(heard: tuple[Heard, ...] | PackedHeard) -> bytes:
@@ -220,8 +195,8 @@ def _packed(heard: tuple[Heard, ...] | PackedHeard) -> bytes:
 
 
 def packed_relays(beacon: Beacon) -> bytes:
-    """The receptions that a decoded beacon relays, ``HEARD`` after ``HEARD``, without those of a weak first path."""
-    packed: bytes = beacon.heard.packed  # type: ignore[union-attr]  # it is of a frame
+    """The receptions that a beacon relays, ``HEARD`` after ``HEARD``, without those of a weak first path."""
+    packed = _packed(beacon.heard)
     if not beacon.weak:
         return packed
     entries = (packed[at : at + HEARD.size] for at in range(0, len(packed), HEARD.size))
@@ -230,17 +205,17 @@ def packed_relays(beacon: Beacon) -> bytes:
 
 def _flags(beacon: Beacon) -> int:
     return (
-        (beacon.position is not None) * _HAS_POSITION
-        | (beacon.page is not None) * _HAS_PAGE
-        | (beacon.authentication is not None) * _HAS_AUTHENTICATION
-        | (beacon.certificate is not None) * _HAS_CERTIFICATE
+        (beacon.position is not None) * HAS_POSITION
+        | (beacon.page is not None) * HAS_PAGE
+        | (beacon.authentication is not None) * HAS_AUTHENTICATION
+        | (beacon.certificate is not None) * HAS_CERTIFICATE
     )
 
 
 def _authentication_fault(beacon: Beacon, flags: int) -> str | None:
     certificate, authentication = beacon.certificate, beacon.authentication
     if certificate is not None:
-        if flags & _NOT_WITH_CERTIFICATE:
+        if flags & (HAS_POSITION | HAS_PAGE):
             return "a beacon with a certificate has neither position nor page"
         if len(certificate) != CERTIFICATE_BYTES:
             return f"certificate has {len(certificate)} bytes; it must have {CERTIFICATE_BYTES}"
@@ -250,6 +225,11 @@ def _authentication_fault(beacon: Beacon, flags: int) -> str | None:
         if not 0 <= authentication.interval < 1 << INTERVAL_BITS:
             return f"authentication.interval is {authentication.interval!r}; it must be from 0 to 65535"
     return None
+
+
+def _std_steps(std_m: float) -> int:
+    """A standard deviation in the steps of a frame, rounded up."""
+    return min(math.ceil(round(std_m * _STD_STEPS_PER_M, 6)), _MAX_STD_STEPS)
 
 
 def _millimetres(value_m: float) -> tuple[int, int]:

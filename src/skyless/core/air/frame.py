@@ -20,7 +20,7 @@ FRAME_CONTROL: Final = 0x8841
 BROADCAST: Final = 0xFFFF
 BEACON_MAGIC: Final = 0xB053
 """The bytes 53 B0; the low half of the second is the version."""
-_MAGIC_MASK: Final = 0xF0FF
+MAGIC_MASK: Final = 0xF0FF
 _MAGIC_AT: Final = slice(9, 11)
 _START: Final = struct.Struct("<HBHHHH")
 
@@ -111,7 +111,7 @@ def not_a_beacon(frame: bytes, version: int) -> Malformed | None:
     if len(frame) < _START.size + FCS_BYTES:
         return Malformed.NOT_A_BEACON
     control, _, _, destination, _, magic = _START.unpack_from(frame)
-    if control != FRAME_CONTROL or destination != BROADCAST or magic & _MAGIC_MASK != BEACON_MAGIC:
+    if control != FRAME_CONTROL or destination != BROADCAST or magic & MAGIC_MASK != BEACON_MAGIC:
         return Malformed.NOT_A_BEACON
     return Malformed.UNKNOWN_VERSION if magic != version else None
 

@@ -12,6 +12,7 @@ from typing import Final
 from skyless.core.air.frame import MAX_FRAME_BYTES
 from skyless.core.air.ieee802154 import air_time_s
 from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ
+from skyless.core.native.records import Ticks
 
 PERIOD_CHANGES: Final = 16
 """An anchor changes its period only before a beacon whose sequence number is a multiple of this."""
@@ -36,9 +37,10 @@ _STEPS: Final = 16
 _LOW: Final = 0xFFFFFFFF
 
 
-def period_ticks(code: int) -> int:
+def period_ticks(code: int) -> Ticks:
     """Mean time between two beacons of an anchor that states this code."""
-    return int(((_STEPS + (code & 15)) << (code >> 4)) * _UNIT_STEPS * DELAYED_TX_GRANULARITY_TICKS)
+    unit: Ticks = _UNIT_STEPS * DELAYED_TX_GRANULARITY_TICKS
+    return int(unit * ((_STEPS + (code & 15)) << (code >> 4)))
 
 
 def period_code(period_s: float) -> int:

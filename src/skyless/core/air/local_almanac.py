@@ -5,16 +5,16 @@ from itertools import islice, product
 from typing import Annotated, Final
 from zlib import crc32
 
-import numpy as np
 from msgspec import Meta, Struct
 from msgspec.structs import asdict
 
 from skyless.core.air.almanac import AccuracyPage, GeoreferencePage, KeyPage, NoisePage, Page, SitePage
-from skyless.core.air.beacon import Beacon, StatedPosition
+from skyless.core.air.beacon import StatedPosition
 from skyless.core.air.frame import Malformed
 from skyless.core.air.instants import period_ticks
-from skyless.core.air.page_codec import PAGE_BYTES, decode_page, encode_page
-from skyless.core.arrays import Array
+from skyless.core.air.neighbours import Neighbour, Neighbours, StatedPlace
+from skyless.core.air.page_check import PAGE_BYTES
+from skyless.core.air.page_codec import decode_page, encode_page
 from skyless.core.site import AnchorSite, Site
 from skyless.core.ticks import from_seconds
 
@@ -23,10 +23,6 @@ PRESENT_TICKS: Final = from_seconds(1.0)
 
 MIN_ANCHORS: Final = 3
 """With fewer no majority counts, unless that is all that a tag receives for ``PRESENT_TICKS``."""
-
-MAX_POSITIONS: Final = 64
-"""Positions kept; that of the anchor received longest ago is forgotten, unless others confirm it: strangers must not
-displace anchors."""
 
 MAX_ISSUES: Final = 4
 MAX_ISSUE_PAGES: Final = 4
@@ -85,19 +81,6 @@ class CommonPages(Struct, frozen=True):
     georeference: GeoreferencePage | None = None
 
 
-class AnchorStatement(Struct):
-    """What an anchor has stated last."""
-
-    rx_ticks: int
-    issue: int
-    period_code: int
-    is_confirmed: bool
-    position: StatedPosition | None = None
-    """The one that is used."""
-    other: StatedPosition | None = None
-    """Another one, stated once; used when it is stated twice in a row."""
-
-
 class CollectedPage(Struct, frozen=True):
     """A page of an issue that is not complete yet."""
 
@@ -113,7 +96,6 @@ class LocalAlmanacState(Struct, frozen=True):
     first_ticks: int | None
     issue: int | None
     pages: CommonPages | None
-    anchors: dict[int, AnchorStatement]
     collected: tuple[CollectedPage, ...]
 
 
@@ -124,26 +106,26 @@ class LocalAlmanac:
     states their issue, and they fit it; those in use stay until all pages of another such issue are there.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, neighbours: Neighbours) -> None:
+        """``neighbours``: the anchors, with what each states of itself."""
         self.pages: CommonPages | None = None
         """None until they are complete."""
         self.issue: int | None = None
         """Issue of the pages in use."""
+        self._neighbours = neighbours
         self._first_ticks: int | None = None
-        self._anchors: dict[int, AnchorStatement] = {}
-        self._positions_m: dict[int, Array] = {}
         self._contents: dict[int, dict[type[Page], dict[Page, set[int]]]] = {}
         """For each issue the pages received, and from which anchors."""
 
     def state(self) -> LocalAlmanacState:
-        """All that it holds."""
+        """All that it holds, but for the anchors."""
         collected = tuple(
             CollectedPage(issue, encode_page(page), tuple(sorted(anchors)))
             for issue, by_type in self._contents.items()
             for contents in by_type.values()
             for page, anchors in contents.items()
         )
-        return LocalAlmanacState(self._first_ticks, self.issue, self.pages, self._anchors, collected)
+        return LocalAlmanacState(self._first_ticks, self.issue, self.pages, collected)
 
     def restore(self, state: LocalAlmanacState) -> None:
         """Continue from a state.
@@ -152,10 +134,6 @@ class LocalAlmanac:
             ValueError: it holds something that is not a page.
         """
         self._first_ticks, self.issue, self.pages = state.first_ticks, state.issue, state.pages
-        self._anchors = dict(state.anchors)
-        self._positions_m = {
-            anchor: _position_m(one.position) for anchor, one in self._anchors.items() if one.position is not None
-        }
         for one in state.collected:
             page = decode_page(one.page)
             if page is None or isinstance(page, Malformed):
@@ -163,82 +141,45 @@ class LocalAlmanac:
             for anchor in one.anchors:
                 self._collect(anchor, one.issue, page)
 
+    @property
+    def newest(self) -> Neighbour:
+        """The anchor whose beacon is processed."""
+        return self._neighbours.rows[self._neighbours.row]
+
+    @property
+    def rows(self) -> list[Neighbour]:
+        """All anchors, also those that are only relayed."""
+        return [self._neighbours.rows[row] for row in range(self._neighbours.count)]
+
     def points_m(self) -> dict[int, tuple[float, float, float]]:
         """Position of each anchor that has stated one."""
-        positions = ((anchor, one.position) for anchor, one in self._anchors.items())
-        return {anchor: (stated.x_m, stated.y_m, stated.z_m) for anchor, stated in positions if stated is not None}
-
-    def position_m(self, anchor: int) -> Array | None:
-        """Position of an anchor, shape (3,), the same array until it moves; None while it has stated none."""
-        return self._positions_m.get(anchor)
-
-    def std_m(self, anchor: int) -> float:
-        """Standard deviation of each coordinate of an anchor whose position is known."""
-        stated = self._anchors[anchor].position
-        assert stated is not None
-        return stated.std_m
+        return {row.anchor: point_m(row.place) for row in self.rows if row.has_place}
 
     def placed_since(self, rx_ticks: int) -> set[int]:
         """Anchors with a position that were received later than this, and by other anchors, too."""
-        return {
-            anchor
-            for anchor, one in self._anchors.items()
-            if one.position is not None and one.is_confirmed and one.rx_ticks > rx_ticks
-        }
+        return {row.anchor for row in self.rows if row.has_place and row.is_confirmed and row.rx_ticks > rx_ticks}
 
     def longest_period_ticks(self) -> int:
         """Longest mean time between two beacons of an anchor, of the anchors that were received last."""
-        newest_ticks = max(one.rx_ticks for one in self._anchors.values())
-        oldest_ticks = newest_ticks - PRESENT_TICKS
-        return max(period_ticks(one.period_code) for one in self._anchors.values() if one.rx_ticks >= oldest_ticks)
+        stated = [row for row in self.rows if row.frames > 0]
+        oldest_ticks = max((row.rx_ticks for row in stated), default=0) - PRESENT_TICKS
+        return max((period_ticks(row.period_code) for row in stated if row.rx_ticks >= oldest_ticks), default=0)
 
     def forget_times(self) -> None:
-        """The tag's counter has restarted: who was received when is not known any more."""
+        """The tag's counter has restarted."""
         self._first_ticks = None
-        for one in self._anchors.values():
-            one.is_confirmed = False
 
-    def on_beacon(self, beacon: Beacon, rx_ticks: int, is_confirmed: bool) -> bool:
-        """Process a beacon; whether other common pages are in use from now on.
-
-        ``is_confirmed``: whether other anchors have received its sender, too; only then it takes part in the majority.
-        """
+    def on_beacon(self, page: Page | None, rx_ticks: int) -> bool:
+        """Process the page in the beacon of the newest anchor; whether other common pages are in use from now on."""
         if self._first_ticks is None:
             self._first_ticks = rx_ticks
-        self._keep(beacon, rx_ticks, is_confirmed)
-        if beacon.almanac_issue == self.issue:
+        sender = self.newest
+        issue = sender.almanac_issue
+        if issue == self.issue:
             return False
-        if beacon.page is not None and not isinstance(beacon.page, KeyPage):
-            self._collect(beacon.anchor, beacon.almanac_issue, beacon.page)
-        return self._is_majority(beacon.almanac_issue, rx_ticks) and self._complete(beacon.almanac_issue)
-
-    def _keep(self, beacon: Beacon, rx_ticks: int, is_confirmed: bool) -> None:
-        """Keep what an anchor states of itself; it becomes the newest in the order of the dictionary."""
-        anchor, stated = beacon.anchor, beacon.position
-        one = self._anchors.pop(anchor, None) or AnchorStatement(
-            rx_ticks, beacon.almanac_issue, beacon.period_code, is_confirmed
-        )
-        one.rx_ticks, one.issue, one.period_code = rx_ticks, beacon.almanac_issue, beacon.period_code
-        one.is_confirmed = is_confirmed
-        self._anchors[anchor] = one
-        if stated is not None and stated != one.position:
-            if one.position is None or stated == one.other:
-                one.position, one.other = stated, None
-                self._positions_m[anchor] = _position_m(stated)
-            else:
-                one.other = stated
-        elif stated is not None:
-            one.other = None
-        if len(self._anchors) > MAX_POSITIONS:
-            self._forget_one(rx_ticks - PRESENT_TICKS)
-
-    def _forget_one(self, oldest_ticks: int) -> None:
-        """Forget the anchor received longest ago of those that are not confirmed, or gone; never the newest."""
-        others = list(self._anchors.items())[:-1]
-        gone = (name for name, one in others if not one.is_confirmed or one.rx_ticks <= oldest_ticks)
-        forgotten = next(gone, others[0][0])
-        del self._anchors[forgotten]
-        self._positions_m.pop(forgotten, None)
+        if page is not None and not isinstance(page, KeyPage):
+            self._collect(sender.anchor, issue, page)
+        return self._is_majority(issue, rx_ticks) and self._complete(issue)
 
     def _collect(self, anchor: int, issue: int, page: Page) -> None:
         if issue not in self._contents and len(self._contents) >= MAX_ISSUES:
@@ -250,17 +191,17 @@ class LocalAlmanac:
 
     def _issue_support(self, issue: int) -> int:
         """By how many anchors an issue is stated, of those that others have received: strangers are any number."""
-        return sum(one.is_confirmed and one.issue == issue for one in self._anchors.values())
+        return sum(row.is_confirmed and row.almanac_issue == issue for row in self.rows)
 
     def _page_support(self, anchors: set[int]) -> int:
         """How many of the anchors that have sent a page others have received."""
-        return sum(anchor in self._anchors and self._anchors[anchor].is_confirmed for anchor in anchors)
+        return sum(row.is_confirmed and row.anchor in anchors for row in self.rows)
 
     def _is_majority(self, issue: int, rx_ticks: int) -> bool:
         """Whether most of the anchors that are there state this issue."""
         assert self._first_ticks is not None
         oldest = rx_ticks - PRESENT_TICKS
-        present = [one.issue for one in self._anchors.values() if one.is_confirmed and one.rx_ticks > oldest]
+        present = [row.almanac_issue for row in self.rows if row.is_confirmed and row.rx_ticks > oldest]
         enough = len(present) >= MIN_ANCHORS or (present and self._first_ticks <= oldest)
         return bool(enough) and 2 * present.count(issue) > len(present)
 
@@ -289,5 +230,7 @@ def _common_pages(pages: tuple[Page, ...]) -> CommonPages | None:
             return None
 
 
-def _position_m(stated: StatedPosition) -> Array:
-    return np.array((stated.x_m, stated.y_m, stated.z_m))
+def point_m(place: StatedPlace) -> tuple[float, float, float]:
+    """The position that an anchor states."""
+    x_m, y_m, z_m = (one_mm / 1000 for one_mm in place.position_mm)
+    return x_m, y_m, z_m

@@ -16,15 +16,24 @@ from skyless.core.air.almanac import (
     SitePage,
 )
 from skyless.core.air.frame import Malformed
+from skyless.core.air.page_check import (
+    ACCURACY_PAGE,
+    ANCHOR_PAGE,
+    CIRCLE,
+    GEOREFERENCE_PAGE,
+    KEY_PAGE,
+    MAX_COORDINATE_MM,
+    MAX_SUPERFRAME_TICKS,
+    NOISE_PAGE,
+    PAGE_BYTES,
+    SCHEDULE_PAGE,
+    SITE_PAGE,
+    is_possible_page,
+)
 
-PAGE_BYTES: Final = 17
-
-MAX_COORDINATE_M: Final = 1e6
-"""Coordinates and heights beyond 1000 km from the origin are errors; a page has 32-bit millimetres, ±2147 km."""
+MAX_COORDINATE_M: Final = MAX_COORDINATE_MM / 1000
 MAX_NOISE: Final = 2.0**-19
 """Stamp noise beyond 1.9 µs (572 m) and oscillator noise beyond 1.9 ppm are errors; float32 keeps the bound."""
-MAX_SUPERFRAME_TICKS: Final = (1 << 39) - 1
-"""A superframe is shorter than half a wrap of the counter (8.6 s), else stamps become ambiguous."""
 
 _ANCHOR: Final = struct.Struct("<BHiiiBx")
 _SCHEDULE: Final = struct.Struct("<BIBBHBBixx")
@@ -33,21 +42,11 @@ _GEOREFERENCE: Final = struct.Struct("<BiiiI")
 _ACCURACY: Final = struct.Struct("<BHHHHHH4x")
 _SITE: Final = struct.Struct("<BB6xBi4x")
 
-_ANCHOR_TYPE: Final = 1
-_SCHEDULE_TYPE: Final = 2
-_NOISE_TYPE: Final = 3
-_GEOREFERENCE_TYPE: Final = 4
-_ACCURACY_TYPE: Final = 5
-_SITE_TYPE: Final = 6
-_KEY_TYPE: Final = 7
 
 _HEIGHT_GIVEN: Final = 0x01
-_MAX_COORDINATE_MM: Final = round(MAX_COORDINATE_M * 1000)
 _STD_STEPS_PER_M: Final = 10_000
 _DISTANCE_STEPS_PER_M: Final = 100
 _TIME_STEPS_PER_S: Final = 10
-_CIRCLE: Final = 3_600_000_000
-"""A whole turn in steps of 1e-7 degree."""
 
 
 @lru_cache(maxsize=1024)
@@ -70,8 +69,7 @@ def decode_page(data: bytes) -> Page | Literal[Malformed.BAD_PAGE] | None:
     decode = _DECODERS.get(data[0])
     if decode is None:
         return None
-    page = decode(data)
-    return Malformed.BAD_PAGE if page is None else page
+    return decode(data) if is_possible_page(data, 0) else Malformed.BAD_PAGE
 
 
 def _whole(name: str, value: int, low: int, high: int) -> int:
@@ -96,7 +94,7 @@ def _steps(name: str, value: float, per_unit: int, least: int = 0) -> int:
 
 def _encode_anchor(page: AnchorPage) -> bytes:
     return _ANCHOR.pack(
-        _ANCHOR_TYPE,
+        ANCHOR_PAGE,
         _whole("AnchorPage.anchor", page.anchor, 0, 0xFFFF),
         _millimetres("AnchorPage.x_m", page.x_m),
         _millimetres("AnchorPage.y_m", page.y_m),
@@ -111,7 +109,7 @@ def _encode_schedule(page: SchedulePage) -> bytes:
     frames_per_node = _whole("SchedulePage.frames_per_node", page.frames_per_node, 1, slots)
     height_m = page.tag_height_m
     return _SCHEDULE.pack(
-        _SCHEDULE_TYPE,
+        SCHEDULE_PAGE,
         _whole("SchedulePage.slot_ticks", page.slot_ticks, 1, longest_slot_ticks),
         slots,
         frames_per_node,
@@ -124,7 +122,7 @@ def _encode_schedule(page: SchedulePage) -> bytes:
 
 def _encode_noise(page: NoisePage) -> bytes:
     return _NOISE.pack(
-        _NOISE_TYPE,
+        NOISE_PAGE,
         _real("NoisePage.tx_stamp_s", page.tx_stamp_s, 0.0, MAX_NOISE),
         _real("NoisePage.rx_stamp_s", page.rx_stamp_s, 0.0, MAX_NOISE),
         _real("NoisePage.white_fm", page.white_fm, 0.0, MAX_NOISE),
@@ -134,17 +132,17 @@ def _encode_noise(page: NoisePage) -> bytes:
 
 def _encode_georeference(page: GeoreferencePage) -> bytes:
     return _GEOREFERENCE.pack(
-        _GEOREFERENCE_TYPE,
+        GEOREFERENCE_PAGE,
         round(_real("GeoreferencePage.latitude_deg", page.latitude_deg, -90.0, 90.0) * 1e7),
         round(_real("GeoreferencePage.longitude_deg", page.longitude_deg, -180.0, 180.0) * 1e7),
         _millimetres("GeoreferencePage.height_m", page.height_m),
-        round(_real("GeoreferencePage.heading_deg", page.heading_deg, 0.0, 360.0) * 1e7) % _CIRCLE,
+        round(_real("GeoreferencePage.heading_deg", page.heading_deg, 0.0, 360.0) * 1e7) % CIRCLE,
     )
 
 
 def _encode_accuracy(page: AccuracyPage) -> bytes:
     return _ACCURACY.pack(
-        _ACCURACY_TYPE,
+        ACCURACY_PAGE,
         _steps("AccuracyPage.survey_std_m", page.survey_std_m, _STD_STEPS_PER_M),
         _steps("AccuracyPage.range_std_m", page.range_std_m, _STD_STEPS_PER_M),
         _steps("AccuracyPage.slope_std_m", page.slope_std_m, _STD_STEPS_PER_M),
@@ -157,7 +155,7 @@ def _encode_accuracy(page: AccuracyPage) -> bytes:
 def _encode_site(page: SitePage) -> bytes:
     height_m = page.tag_height_m
     return _SITE.pack(
-        _SITE_TYPE,
+        SITE_PAGE,
         _whole("SitePage.pages", page.pages, 1, 0xFF),
         0 if height_m is None else _HEIGHT_GIVEN,
         0 if height_m is None else _millimetres("SitePage.tag_height_m", height_m),
@@ -167,59 +165,41 @@ def _encode_site(page: SitePage) -> bytes:
 def _encode_key(page: KeyPage) -> bytes:
     if len(page.key) != PAGE_BYTES - 1:
         raise ValueError(f"KeyPage.key has {len(page.key)} bytes; it must have {PAGE_BYTES - 1}")
-    return bytes((_KEY_TYPE,)) + page.key
+    return bytes((KEY_PAGE,)) + page.key
 
 
-def _decode_anchor(data: bytes) -> AnchorPage | None:
+def _decode_anchor(data: bytes) -> AnchorPage:
     _, anchor, x_mm, y_mm, z_mm, slot = _ANCHOR.unpack(data)
-    if max(abs(x_mm), abs(y_mm), abs(z_mm)) > _MAX_COORDINATE_MM:
-        return None
     return AnchorPage(anchor, x_mm / 1000, y_mm / 1000, z_mm / 1000, slot)
 
 
-def _decode_schedule(data: bytes) -> SchedulePage | None:
+def _decode_schedule(data: bytes) -> SchedulePage:
     _, slot_ticks, slots, frames_per_node, master, anchors, flags, height_mm = _SCHEDULE.unpack(data)
-    possible = (
-        slot_ticks > 0
-        and slot_ticks * slots <= MAX_SUPERFRAME_TICKS
-        and frames_per_node > 0
-        and 0 < anchors * frames_per_node <= slots
-        and abs(height_mm) <= _MAX_COORDINATE_MM
-    )
-    if not possible:
-        return None
     height_m = height_mm / 1000 if flags & _HEIGHT_GIVEN else None
     return SchedulePage(slot_ticks, slots, frames_per_node, master, anchors, height_m)
 
 
-def _decode_noise(data: bytes) -> NoisePage | None:
+def _decode_noise(data: bytes) -> NoisePage:
     _, *figures = _NOISE.unpack(data)
-    return NoisePage(*figures) if all(0.0 <= figure <= MAX_NOISE for figure in figures) else None
+    return NoisePage(*figures)
 
 
-def _decode_georeference(data: bytes) -> GeoreferencePage | None:
+def _decode_georeference(data: bytes) -> GeoreferencePage:
     _, latitude, longitude, height_mm, heading = _GEOREFERENCE.unpack(data)
-    on_earth = abs(latitude) <= _CIRCLE // 4 and abs(longitude) <= _CIRCLE // 2
-    if not on_earth or abs(height_mm) > _MAX_COORDINATE_MM or heading >= _CIRCLE:
-        return None
     # Division by 1e7 gives back the very float of a configured angle of up to seven decimals.
     return GeoreferencePage(latitude / 1e7, longitude / 1e7, height_mm / 1000, heading / 1e7)
 
 
-def _decode_accuracy(data: bytes) -> AccuracyPage | None:
+def _decode_accuracy(data: bytes) -> AccuracyPage:
     _, *stds, distance, time = _ACCURACY.unpack(data)
-    if distance == 0 or time == 0:
-        return None
     survey_m, range_m, slope_m, place_m = (std / _STD_STEPS_PER_M for std in stds)
     distance_m, time_s = distance / _DISTANCE_STEPS_PER_M, time / _TIME_STEPS_PER_S
     return AccuracyPage(survey_m, range_m, slope_m, place_m, distance_m, time_s)
 
 
-def _decode_site(data: bytes) -> SitePage | None:
+def _decode_site(data: bytes) -> SitePage:
     _, pages, flags, height_mm = _SITE.unpack(data)
-    possible = pages > 0 and abs(height_mm) <= _MAX_COORDINATE_MM
-    height_m = height_mm / 1000 if flags & _HEIGHT_GIVEN else None
-    return SitePage(pages, height_m) if possible else None
+    return SitePage(pages, height_mm / 1000 if flags & _HEIGHT_GIVEN else None)
 
 
 _ENCODERS: Final[dict[type, Callable[[Any], bytes]]] = {
@@ -231,12 +211,12 @@ _ENCODERS: Final[dict[type, Callable[[Any], bytes]]] = {
     SitePage: _encode_site,
     KeyPage: _encode_key,
 }
-_DECODERS: Final[dict[int, Callable[[bytes], Page | None]]] = {
-    _ANCHOR_TYPE: _decode_anchor,
-    _SCHEDULE_TYPE: _decode_schedule,
-    _NOISE_TYPE: _decode_noise,
-    _GEOREFERENCE_TYPE: _decode_georeference,
-    _ACCURACY_TYPE: _decode_accuracy,
-    _SITE_TYPE: _decode_site,
-    _KEY_TYPE: lambda data: KeyPage(data[1:]),
+_DECODERS: Final[dict[int, Callable[[bytes], Page]]] = {
+    ANCHOR_PAGE: _decode_anchor,
+    SCHEDULE_PAGE: _decode_schedule,
+    NOISE_PAGE: _decode_noise,
+    GEOREFERENCE_PAGE: _decode_georeference,
+    ACCURACY_PAGE: _decode_accuracy,
+    SITE_PAGE: _decode_site,
+    KEY_PAGE: lambda data: KeyPage(data[1:]),
 }

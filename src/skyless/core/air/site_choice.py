@@ -1,10 +1,8 @@
 """Which site a tag uses, of those that it receives."""
 
-from enum import Enum, auto
-from typing import Final
+from typing import Annotated, Final
 
-from msgspec import Struct
-
+from skyless.core.native.records import Array, Integers, Record, Ticks, record
 from skyless.core.ticks import from_seconds
 
 SITE_SILENCE_TICKS: Final = from_seconds(2.0)
@@ -24,86 +22,160 @@ MAX_COUNTED: Final = 32
 """Largest number of anchors of one site that is counted."""
 
 
-class SiteUse(Enum):
-    """What a beacon's site is to the tag."""
+FOREIGN, USED, CHANGED = range(3)
+"""What a beacon's site is to the tag; after the last it is used from this beacon on."""
 
-    USED = auto()
-    CHANGED = auto()
-    """Used from this beacon on."""
-    FOREIGN = auto()
+NO_SITE: Final = -1
 
 
-class SiteChoice(Struct):
+@record
+class CountedAnchor(Record):
+    """An anchor of a site."""
+
+    anchor: int
+    rx_ticks: Ticks
+    """RX stamp of its last beacon."""
+
+
+@record
+class CountedSite(Record):
+    """A site that is received."""
+
+    site: int
+    newest_ticks: Ticks
+    """RX stamp of its last beacon."""
+    count: int
+    anchors: Annotated[Array[CountedAnchor], MAX_COUNTED]
+
+
+@record
+class SiteChoice(Record):
     """The site in use and, where the tag may choose, how many anchors of others it receives.
 
     It uses the first site that it receives, but until there are fixes one with more anchors, so that a single foreign
     anchor cannot hold it. One that gives no fix makes way for others, and returns only after those have failed.
     """
 
-    only_site: int | None = None
-    """The site that was configured; None where the tag may choose."""
-    site: int | None = None
+    only_site: int = NO_SITE
+    """The site that was configured; ``NO_SITE`` where the tag may choose."""
+    site: int = NO_SITE
     """The site in use, by its PAN identifier."""
-    heard_ticks: int = 0
+    heard_ticks: Ticks
     """RX stamp of the last beacon of it that was accepted."""
-    since_ticks: int = 0
+    since_ticks: Ticks
     """RX stamp of the beacon with which it was chosen."""
-    fix_ticks: int | None = None
+    has_fix: bool
+    fix_ticks: Ticks
     """RX stamp of the last fix."""
-    failed: tuple[int, ...] = ()
-    """Sites that were left since the last fix as they gave none."""
-    anchors: dict[int, dict[int, int]] = {}
-    """RX stamp of the last beacon of each anchor, by site and anchor."""
+    failed_count: int
+    failed: Annotated[Integers, MAX_SITES]
+    """Sites that were left since the last fix as they gave none, the newest last."""
+    count: int
+    sites: Annotated[Array[CountedSite], MAX_SITES]
 
-    def on_beacon(self, site: int, anchor: int, rx_ticks: int) -> SiteUse:
-        """Count an anchor of a site; whether its beacon is to be used."""
-        if self.only_site is not None and site != self.only_site:
-            return SiteUse.FOREIGN
-        self._count(site, anchor, rx_ticks)
-        if site == self.site:
-            return SiteUse.USED
-        if self.site is not None and not self._prefers(site, rx_ticks):
-            return SiteUse.FOREIGN
-        if self.site is not None and self._has_failed(rx_ticks):
-            self.failed = (*self.failed, self.site)[-MAX_SITES:]
-        self.site, self.heard_ticks, self.since_ticks, self.fix_ticks = site, rx_ticks, rx_ticks, None
-        return SiteUse.CHANGED
 
-    def on_fix(self, rx_ticks: int) -> None:
-        """The site in use has given a fix."""
-        self.fix_ticks, self.failed = rx_ticks, ()
+def choose_site(choice: SiteChoice, site: int, anchor: int, rx_ticks: Ticks) -> int:
+    """Count an anchor of a site; whether its beacon is to be used."""
+    if choice.only_site not in (NO_SITE, site):
+        return FOREIGN
+    counted = _index_of(choice, site)
+    choice.sites[counted].newest_ticks = rx_ticks
+    _count_anchor(choice.sites[counted], anchor, rx_ticks)
+    if site == choice.site:
+        return USED
+    if choice.site != NO_SITE:
+        if not _prefers(choice, counted, rx_ticks):
+            return FOREIGN
+        if _has_failed(choice, rx_ticks):
+            _note_failed(choice)
+    choice.site, choice.has_fix = site, False
+    choice.heard_ticks = choice.since_ticks = rx_ticks
+    return CHANGED
 
-    def restart(self, rx_ticks: int) -> None:
-        """The tag's counter has restarted, and reads this."""
-        self.heard_ticks = self.since_ticks = rx_ticks
-        self.fix_ticks = None
-        self.anchors = {}
 
-    def _count(self, site: int, anchor: int, rx_ticks: int) -> None:
-        if site not in self.anchors and len(self.anchors) >= MAX_SITES:
-            others = [one for one in self.anchors if one != self.site]
-            del self.anchors[min(others, key=lambda one: max(self.anchors[one].values()))]
-        anchors = self.anchors.setdefault(site, {})
-        anchors.pop(anchor, None)
-        anchors[anchor] = rx_ticks
-        if len(anchors) > MAX_COUNTED:
-            del anchors[next(iter(anchors))]
+def note_fix(choice: SiteChoice, rx_ticks: Ticks) -> None:
+    """The site in use has given a fix."""
+    choice.has_fix, choice.fix_ticks, choice.failed_count = True, rx_ticks, 0
 
-    def _prefers(self, site: int, rx_ticks: int) -> bool:
-        """Whether another site is better than the one in use."""
-        assert self.site is not None
-        if rx_ticks - self.heard_ticks >= SITE_SILENCE_TICKS:
-            return True
-        if self.fix_ticks is not None and rx_ticks - self.fix_ticks < SITE_SILENCE_TICKS:
+
+def restart_choice(choice: SiteChoice, rx_ticks: Ticks) -> None:
+    """The tag's counter has restarted, and reads this."""
+    choice.heard_ticks = choice.since_ticks = rx_ticks
+    choice.has_fix, choice.count = False, 0
+
+
+def _find_site(choice: SiteChoice, site: int) -> int:
+    for one in range(choice.count):
+        if choice.sites[one].site == site:
+            return one
+    return -1
+
+
+def _index_of(choice: SiteChoice, site: int) -> int:
+    """Where a site is counted; a new one may take the place of that received longest ago, but not of the one in use."""
+    found = _find_site(choice, site)
+    if found < 0:
+        found = choice.count
+        if choice.count == MAX_SITES:
+            found = 0 if choice.sites[0].site != choice.site else 1
+            for one in range(MAX_SITES):
+                is_older = choice.sites[one].newest_ticks < choice.sites[found].newest_ticks
+                if is_older and choice.sites[one].site != choice.site:
+                    found = one
+        choice.count = max(choice.count, found + 1)
+        choice.sites[found].site, choice.sites[found].count = site, 0
+    return found
+
+
+def _count_anchor(counted: CountedSite, anchor: int, rx_ticks: Ticks) -> None:
+    """Note when an anchor was received; where there are too many, that received longest ago is forgotten."""
+    place, oldest = -1, 0
+    for one in range(counted.count):
+        if counted.anchors[one].anchor == anchor:
+            place = one
+        if counted.anchors[one].rx_ticks < counted.anchors[oldest].rx_ticks:
+            oldest = one
+    if place < 0:
+        place = counted.count if counted.count < MAX_COUNTED else oldest
+        counted.count = max(counted.count, place + 1)
+    counted.anchors[place].anchor, counted.anchors[place].rx_ticks = anchor, rx_ticks
+
+
+def _prefers(choice: SiteChoice, other: int, rx_ticks: Ticks) -> bool:
+    """Whether another site is better than the one in use."""
+    if rx_ticks - choice.heard_ticks >= SITE_SILENCE_TICKS:
+        return True
+    if choice.has_fix and rx_ticks - choice.fix_ticks < SITE_SILENCE_TICKS:
+        return False
+    present = _received(choice, other, rx_ticks)
+    if _has_failed(choice, rx_ticks):
+        return present >= MIN_ANCHORS
+    for one in range(choice.failed_count):
+        if choice.failed[one] == choice.sites[other].site:
             return False
-        if self._has_failed(rx_ticks):
-            return self._present(site, rx_ticks) >= MIN_ANCHORS
-        return site not in self.failed and self._present(site, rx_ticks) > self._present(self.site, rx_ticks)
+    used = _find_site(choice, choice.site)
+    return present > (_received(choice, used, rx_ticks) if used >= 0 else 0)
 
-    def _has_failed(self, rx_ticks: int) -> bool:
-        """Whether the site in use has given no fix for long."""
-        latest = self.since_ticks if self.fix_ticks is None else self.fix_ticks
-        return rx_ticks - latest >= TRIAL_TICKS
 
-    def _present(self, site: int, rx_ticks: int) -> int:
-        return sum(0 <= rx_ticks - last < PRESENT_TICKS for last in self.anchors.get(site, {}).values())
+def _has_failed(choice: SiteChoice, rx_ticks: Ticks) -> bool:
+    """Whether the site in use has given no fix for long."""
+    return rx_ticks - (choice.fix_ticks if choice.has_fix else choice.since_ticks) >= TRIAL_TICKS
+
+
+def _note_failed(choice: SiteChoice) -> None:
+    """The site in use has failed; with too many of them the first is forgotten."""
+    if choice.failed_count == MAX_SITES:
+        for one in range(1, MAX_SITES):
+            choice.failed[one - 1] = choice.failed[one]
+        choice.failed_count -= 1
+    choice.failed[choice.failed_count] = choice.site
+    choice.failed_count += 1
+
+
+def _received(choice: SiteChoice, counted: int, rx_ticks: Ticks) -> int:
+    """How many anchors of a site are received."""
+    one, present = choice.sites[counted], 0
+    for index in range(one.count):
+        if 0 <= rx_ticks - one.anchors[index].rx_ticks < PRESENT_TICKS:
+            present += 1
+    return present

@@ -10,16 +10,18 @@ anchors it receives, the less often it sends, so that together they offer what t
 from collections import Counter
 from typing import Final
 
-from skyless.core.air.anchor_stamps import AnchorStamps
+from skyless.core.air.anchor_stamps import STAMP_COUNTERS, STAMP_FITS, unwrap_stamp
 from skyless.core.air.beacon import Beacon, StatedPosition
 from skyless.core.air.codec import decode_cached, encode, heard_capacity
 from skyless.core.air.first_path import is_weak_first_path
 from skyless.core.air.frame import Heard, Malformed
 from skyless.core.air.instants import PERIOD_CHANGES, gap_ticks, period_code, period_ticks, suitable_period_s
 from skyless.core.air.local_almanac import site_issue, site_pages_of, stated_position
+from skyless.core.air.neighbours import Neighbours
 from skyless.core.air.reception import Reception, Transmission
 from skyless.core.anchor.authentication import BeaconAuthentication, Contents
 from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS
+from skyless.core.native.library import compiled
 from skyless.core.site import AnchorSite, Site, UnplacedAnchor
 from skyless.core.ticks import Unwrapper, from_seconds, to_seconds, wrap
 
@@ -58,7 +60,7 @@ class Anchor:
         """What frames state of their TX stamps beyond the radio's, as another site corrects its delays."""
         self._lead_ticks = from_seconds(lead_s) + DELAYED_TX_GRANULARITY_TICKS
         self._own_ticks = Unwrapper()
-        self._stamps = AnchorStamps(self.counters)
+        self._neighbours = Neighbours()
         self._heard: dict[int, tuple[Heard, int, bool]] = {}
         """Last reception of each, its unwrapped stamp, and whether its first path was weak; the newest last."""
         self._sequence = 0
@@ -104,11 +106,13 @@ class Anchor:
             self.counters[fault] += 1
             return
         rx_ticks = self._own_ticks.unwrap(reception.rx_ticks, reception.host_s)
-        if self._stamps.unwrap(beacon, rx_ticks, period_ticks(beacon.period_code)) is None:
+        stamps = beacon.anchor, beacon.sequence, beacon.tx_ticks
+        stamp = _unwrap_stamp(self._neighbours, *stamps, rx_ticks, period_ticks(beacon.period_code))
+        if stamp != STAMP_FITS:
+            self.counters.update(STAMP_COUNTERS[stamp])
             return
         self.counters["heard"] += 1
-        measured = reception.diagnostics
-        weak = measured is not None and is_weak_first_path(measured.rx_power_dbm, measured.first_path_power_dbm)
+        weak = is_weak_first_path(reception.diagnostics)
         self._heard.pop(beacon.anchor, None)
         self._heard[beacon.anchor] = (Heard(beacon.anchor, beacon.sequence, reception.rx_ticks), rx_ticks, weak)
 
@@ -190,3 +194,6 @@ def on_radio_grid(ticks_own: int, tx_antenna_delay_ticks: int) -> int:
     """The radio starts on multiples of 512 of its raw counter; the antenna's delay comes on top."""
     raw = ticks_own - tx_antenna_delay_ticks
     return raw - raw % DELAYED_TX_GRANULARITY_TICKS + tx_antenna_delay_ticks
+
+
+_unwrap_stamp: Final = compiled(unwrap_stamp)

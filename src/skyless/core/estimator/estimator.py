@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from skyless.core.arrays import Integers, Matrix, Vector
 from skyless.core.estimator import compiled
 from skyless.core.estimator.compiled import add_anchor, find_anchor, fit_plane, remove_anchor
-from skyless.core.estimator.levels import largest_test
 from skyless.core.estimator.process import (
     MAX_RELAYS,
     REJECTED,
@@ -26,12 +25,13 @@ from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.estimator.state import (
     ALL_RANGE_ERRORS,
     LASTING,
-    NEVER,
     State,
     make_uncertain,
     new_state,
 )
+from skyless.core.estimator.verdicts import is_late_often, is_lost, rejects_most
 from skyless.core.native.records import records, view
+from skyless.core.ticks import NEVER
 
 MAX_ANCHORS_KNOWN: Final = 256
 """With more, one that is not in the state is forgotten for each new one."""
@@ -108,8 +108,6 @@ class Estimator:
         if len(self._known) != len(saved.anchors):
             raise ValueError("the estimator knows an anchor twice")
         self._state = unpacked_state(self.settings, saved.state)
-        if not self._known.keys() >= set(self.anchors):
-            raise ValueError("the estimator's state holds an anchor whose position it does not know")
 
     @property
     def state(self) -> State:
@@ -141,6 +139,11 @@ class Estimator:
         self._known[anchor] = position_m, place
 
     @property
+    def misfits(self) -> frozenset[int]:
+        """Identifiers of the anchors that contradicted the others at the start."""
+        return self._misfits
+
+    @property
     def known_anchors(self) -> tuple[int, ...]:
         """Identifiers of all anchors that it knows."""
         return tuple(self._known)
@@ -153,11 +156,6 @@ class Estimator:
     def anchors(self) -> tuple[int, ...]:
         """Identifiers of the anchors in the state."""
         return tuple(self._state.anchors[index].identifier for index in range(self._state.count))
-
-    def heard_since(self, rx_ticks: int) -> int:
-        """How many anchors in the state have been received at this reading of the tag, or later."""
-        heard = (self._state.anchors[index] for index in range(self._state.count))
-        return sum(one.packets > 0 and one.rx_ticks >= rx_ticks for one in heard)
 
     def remove_anchor(self, anchor: int) -> None:
         """Let an anchor leave the state, if it is there."""
@@ -234,6 +232,20 @@ class Estimator:
         ``relays``: identifier, sequence number and RX stamp; ``packed``: relays as frames carry them
         (``codec.packed_relays``); ``variance_factor``: on the variance of the tag's reception.
         """
+        packet = self.packet_of(anchor, sequence, rx_ticks, tx_ticks, relays, report, variance_factor)
+        return compiled.process_frame(self._state, packet, packed, len(packed))
+
+    def packet_of(
+        self,
+        anchor: int,
+        sequence: int,
+        rx_ticks: int,
+        tx_ticks: int,
+        relays: Sequence[tuple[int, int, int]] = (),
+        report: Report = NO_REPORT,
+        variance_factor: float = 1.0,
+    ) -> Packet:
+        """A packet of a known anchor as compiled functions take it, in the same memory each time; see ``process``."""
         packet = self._packet
         packet.place = self._known[anchor][1]
         packet.sequence, packet.rx_ticks, packet.tx_ticks = sequence, rx_ticks, tx_ticks
@@ -243,7 +255,7 @@ class Estimator:
         packet.relay_count = min(len(relays), MAX_RELAYS)
         for relayed, (sender, number, stamp) in zip(packet.relays, relays, strict=False):
             relayed.listener, relayed.anchor, relayed.sequence, relayed.rx_ticks = anchor, sender, number, stamp
-        return compiled.process_frame(self._state, packet, packed, len(packed))
+        return packet
 
     def process_difference(self, a: int, b: int, rx_ticks: int, difference_m: float) -> int:
         """Process a ready-made difference of ranges, to anchor b less to anchor a; as ``process``."""
@@ -276,20 +288,6 @@ class Estimator:
     # What it knows
 
     @property
-    def fault_test(self) -> float:
-        """The largest test of faults, χ² with as many degrees of freedom as there are anchors if there are none."""
-        return largest_test(self._state)
-
-    @property
-    def fits_settings(self) -> bool:
-        """Whether the constants of the ranges are as small as the settings state, as far as they are known."""
-        s = self._state
-        block = slice(s.layout.constant, s.layout.slope)
-        constants, variances = view(s.x)[block], view(s.P)[block, block]
-        expected = variances + self.settings.range_std_m**2 * np.eye(s.count)
-        return bool(constants @ np.linalg.solve(expected, constants) < TUNING.fitting_chi2 * s.count)
-
-    @property
     def multipath_m(self) -> tuple[float, float] | None:
         """How far range errors change, and over which distance walked, where that is more than the settings state."""
         status = self._state.status
@@ -299,32 +297,17 @@ class Estimator:
     @property
     def is_late_often(self) -> bool:
         """Whether single packets are late often."""
-        return self._state.status.late_share > TUNING.late_often_share
+        return is_late_often(self._state)
 
     @property
     def is_lost(self) -> bool:
         """Whether more packets are rejected than a right state would reject."""
-        status = self._state.status
-        in_row = status.rejected_in_row + status.stale_in_row
-        late = min(status.late_share, 0.45)
-        return status.rejected_share > TUNING.lost_share or in_row * (1.0 - 2.0 * late) >= TUNING.lost_in_row
+        return is_lost(self._state)
 
     @property
     def rejects_most(self) -> bool:
         """Whether most measurements lie beyond the gate."""
-        return self._state.status.rejected_share > TUNING.lost_share
-
-    @property
-    def is_contradicted(self) -> bool:
-        """Whether most of what anchors received of each other does not fit: a wrong position shifts all clocks."""
-        status = self._state.status
-        return status.relays_lately_rejected > max(TUNING.max_relays_rejected, status.relays_lately_accepted)
-
-    @property
-    def relays_fit(self) -> bool:
-        """Whether most of what anchors received of each other fits, and that is more than a few receptions."""
-        status = self._state.status
-        return status.relays_lately_accepted > max(TUNING.max_relays_rejected, 4.0 * status.relays_lately_rejected)
+        return rejects_most(self._state)
 
     @property
     def obstructed(self) -> tuple[int, ...]:

@@ -2,6 +2,7 @@
 
 from typing import Annotated, Final
 
+from skyless.core.air.page_check import unsigned
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.core.estimator.faults import fade_faults, open_faults
 from skyless.core.estimator.kalman import finish_updates, is_stationary, predict
@@ -31,7 +32,7 @@ from skyless.core.fix import POSITION, PROTECTION, QUALITY, VELOCITY
 from skyless.core.integrity import HPL, STATE, VPL
 from skyless.core.native.records import Array, Bytes, Matrix, Reals, Record, Ticks, record
 from skyless.core.native.sizes import MAX_ANCHORS
-from skyless.core.ticks import HALF_WRAP_TICKS, TICK_MASK
+from skyless.core.ticks import nearest
 
 REJECTED, ACCEPTED, JOINED, STALE, RESTARTED_CLOCK = range(5)
 """What became of a packet; after the last its anchor joins again, and the packet is processed again."""
@@ -108,11 +109,7 @@ def process_frame(s: State, packet: Packet, packed: Bytes, packed_bytes: int) ->
             relayed.listener = packet.place.anchor
             relayed.anchor = packed[begin] | packed[begin + 1] << 8
             relayed.sequence = packed[begin + 2]
-            stamp: Ticks = 0
-            for byte in range(PACKED_BYTES - 1, 2, -1):
-                stamp = stamp << 8 | packed[begin + byte]
-            least = packet.tx_ticks - HALF_WRAP_TICKS
-            relayed.rx_ticks = least + ((stamp - least) & TICK_MASK)
+            relayed.rx_ticks = nearest(unsigned(packed, begin + 3, PACKED_BYTES - 3), packet.tx_ticks)
             packet.relay_count += 1
     return process(s, packet)
 

@@ -26,6 +26,7 @@ from skyless.core.integrity import limits_of
 from skyless.core.native.arithmetic import square
 from skyless.core.native.records import Array, Count, Integers, Matrix, Reals, Record, Ticks, aligned, record
 from skyless.core.native.sizes import MAX_ANCHORS
+from skyless.core.ticks import NEVER
 
 PACKETS_KEPT: Final = 16
 """Packets of each anchor that are kept for relays to come; divides the range of sequence numbers."""
@@ -52,9 +53,6 @@ WORK_ROWS: Final = MAX_ANCHORS + 1 + AXES
 
 NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS, ALL_RANGE_ERRORS = range(3)
 """Which range errors are not known to be zero: none, those that change, or all of them, and surveys."""
-
-NEVER: Final = -(1 << 62)
-"""A time before all others."""
 
 LEVELS: Final = 2 + FAULT_KINDS
 """Numbers that ``levels.protect`` writes: ``HPL``, ``VPL``, and the tests of all kinds of faults."""

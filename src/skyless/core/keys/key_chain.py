@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct
 
-from skyless.core.air.codec import CERTIFICATE_BYTES, MAC_BYTES
+from skyless.core.air.beacon_fields import CERTIFICATE_BYTES
+from skyless.core.air.codec import MAC_BYTES
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey

@@ -5,7 +5,7 @@ With ``SKYLESS_UNCOMPILED=1`` in the environment the Python itself runs: the sam
 
 import ctypes
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar, cast, get_args, get_origin, get_type_hints
@@ -13,7 +13,7 @@ from typing import Any, Final, ParamSpec, TypeVar, cast, get_args, get_origin, g
 import numpy as np
 
 from skyless.core.errors import SkylessError
-from skyless.core.native.records import Array, Record, c_type
+from skyless.core.native.records import Array, ReadOnly, Record, c_type
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -82,7 +82,7 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
 
 
 def _argument_type(hint: Any) -> Any:  # noqa: ANN401 - types have no type
-    if get_origin(hint) in {Array, Sequence}:
+    if get_origin(hint) in {Array, ReadOnly}:
         return _address_type(c_type(get_args(hint)[0]))
     found = c_type(hint)
     return ctypes.POINTER(found) if issubclass(found, Record) else found

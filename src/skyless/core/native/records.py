@@ -16,7 +16,7 @@ An element that is itself an array or a record is a reference: ``row = P[one]`` 
 """
 
 import ctypes
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from math import nan
 from typing import (
     Annotated,
@@ -30,11 +30,14 @@ from typing import (
     get_origin,
     get_type_hints,
 )
+from zlib import compress, decompressobj
+from zlib import error as zlib_error
 
 import numpy as np
 from numpy.typing import NDArray
 
 Value = TypeVar("Value")
+Read_co = TypeVar("Read_co", covariant=True)
 Made = TypeVar("Made", bound="Record")
 
 Ticks = Annotated[int, ctypes.c_int64]
@@ -65,11 +68,17 @@ class Array(Protocol[Value]):
         """All of them; not for functions that are translated."""
 
 
+class ReadOnly(Protocol[Read_co]):
+    """Elements that are only read; also ``bytes``."""
+
+    def __getitem__(self, index: int, /) -> Read_co:
+        """The element."""
+
+
 Reals = Array[float]
 Matrix = Array[Array[float]]
 Integers = Array[int]
-Bytes = Sequence[Byte]
-"""Bytes that are only read."""
+Bytes = ReadOnly[Byte]
 
 
 class Record(ctypes.Structure):
@@ -77,6 +86,8 @@ class Record(ctypes.Structure):
 
     _names_: ClassVar[tuple[str, ...]] = ()
     _defaults_: ClassVar[dict[str, Any]] = {}
+    _nested_: ClassVar[tuple[str, ...]] = ()
+    """Fields that are records with defaults of their own."""
 
     def __init__(self, **values: Any) -> None:  # noqa: ANN401 - of fields
         """All fields are zero but those with a default or a value; NaN for a number that is None.
@@ -85,7 +96,7 @@ class Record(ctypes.Structure):
             TypeError: there is no field of a name.
         """
         super().__init__()
-        self._set(self._defaults_)
+        self._set_defaults()
         self._set(values)
 
     def changed(self, **values: Any) -> Self:  # noqa: ANN401 - of fields
@@ -102,6 +113,11 @@ class Record(ctypes.Structure):
         """Its fields by name."""
         return {name: getattr(self, name) for name in self._names_}
 
+    def _set_defaults(self) -> None:
+        self._set(self._defaults_)
+        for name in self._nested_:
+            getattr(self, name)._set_defaults()
+
     def _set(self, values: dict[str, Any]) -> None:
         for name, value in values.items():
             if name not in self._names_:
@@ -115,7 +131,13 @@ def record(made: type[Made]) -> type[Made]:
     made._names_ = tuple(name for name in hints if not name.startswith("_"))
     made._defaults_ = {name: made.__dict__[name] for name in made._names_ if name in made.__dict__}
     made._fields_ = [(name, c_type(hints[name])) for name in made._names_]
+    made._nested_ = tuple(name for name, kind in made._fields_ if has_defaults(kind))  # type: ignore[misc]
     return made
+
+
+def has_defaults(kind: Any) -> bool:  # noqa: ANN401 - types have no type
+    """Whether a type is a record of which a new one is not all zeros."""
+    return isinstance(kind, type) and issubclass(kind, Record) and bool(kind._defaults_ or kind._nested_)
 
 
 def c_type(hint: Any) -> Any:  # noqa: ANN401 - types have no type
@@ -147,6 +169,27 @@ def view(array: Any) -> NDArray[Any]:  # noqa: ANN401 - ctypes' arrays have no c
 def records(made: type[Made], array: NDArray[np.void]) -> Array[Made]:
     """The records of a NumPy array of their type, shape (n,), in the same memory."""
     return (made * len(array)).from_buffer(array.data)
+
+
+def packed(one: Record) -> bytes:
+    """A record's bytes, compressed: what is not in use is zeros."""
+    return compress(bytes(one), level=1)
+
+
+def unpacked(made: type[Made], data: bytes) -> Made:
+    """The record that ``packed`` has turned into bytes.
+
+    Raises:
+        ValueError: they are no bytes of such a record.
+    """
+    size, reader = ctypes.sizeof(made), decompressobj()
+    try:
+        content = reader.decompress(data, size + 1)
+    except zlib_error as error:
+        raise ValueError(f"the bytes of {made.__name__} are damaged: {error}") from None
+    if len(content) != size or not reader.eof or reader.unused_data:
+        raise ValueError(f"{made.__name__} has {size} bytes, not what these are")
+    return made.from_buffer_copy(content)
 
 
 def aligned(made: type[Made]) -> Made:

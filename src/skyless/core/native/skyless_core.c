@@ -1,5 +1,12 @@
 /* Made by tools/make_core.py from these modules; do not edit.
 
+ * skyless.core.air.anchor_stamps
+ * skyless.core.air.beacon_fields
+ * skyless.core.air.first_path
+ * skyless.core.air.instants
+ * skyless.core.air.neighbours
+ * skyless.core.air.page_check
+ * skyless.core.air.site_choice
  * skyless.core.estimator.faults
  * skyless.core.estimator.kalman
  * skyless.core.estimator.levels
@@ -8,14 +15,20 @@
  * skyless.core.estimator.process
  * skyless.core.estimator.state
  * skyless.core.estimator.steady_state
+ * skyless.core.estimator.verdicts
  * skyless.core.native.arithmetic
  * skyless.core.native.small_matrices
  * skyless.core.native.tails
+ * skyless.core.tag.admission
+ * skyless.core.tag.course
  * skyless.core.tag.descent
+ * skyless.core.tag.hearing
  * skyless.core.tag.minima
  * skyless.core.tag.position
  * skyless.core.tag.problem
+ * skyless.core.tag.selection
  * skyless.core.tag.starts
+ * skyless.core.ticks
  */
 
 #include "skyless_core.h"
@@ -62,6 +75,42 @@ INTERNAL real exp_(real x);
 INTERNAL real log_(real x);
 INTERNAL real hypot_(real x, real y);
 INTERNAL real square(real x);
+INTERNAL int64_t nearest(int64_t counter, int64_t expected_ticks, int32_t bits);
+INTERNAL bool may_elapse(int64_t counter_ticks, int64_t elapsed_ticks, real slack_ticks);
+INTERNAL int64_t unwrap(Unwrapper *u, int64_t counter, real host_s);
+INTERNAL real fix_time_s(FixTime *time, int64_t ticks_master, int64_t rx_ticks_tag);
+INTERNAL int32_t find_neighbour(Neighbours *t, int32_t anchor);
+INTERNAL int32_t neighbour_of(Neighbours *t, int32_t anchor, int64_t rx_ticks);
+INTERNAL int32_t least_important(Neighbours *t, int64_t rx_ticks);
+INTERNAL bool is_confirmed(Neighbour *n, int64_t rx_ticks);
+INTERNAL bool is_relayed(Neighbour *n, int64_t rx_ticks);
+INTERNAL void forget_times(Neighbours *t);
+INTERNAL void keep(Neighbour *n, int32_t sequence, int64_t tx_ticks, int64_t rx_ticks, int32_t frames);
+INTERNAL int32_t reject(Neighbour *n, int32_t sequence, int64_t tx_counter, int64_t rx_ticks, bool is_silent);
+INTERNAL int64_t period_ticks(int32_t code);
+INTERNAL int64_t unsigned_(uint8_t *data, int32_t at, int32_t size);
+INTERNAL int64_t signed_(uint8_t *data, int32_t at);
+INTERNAL bool is_possible_page(uint8_t *data, int32_t at);
+INTERNAL bool is_coordinate(uint8_t *data, int32_t at);
+INTERNAL bool is_noise(uint8_t *data, int32_t at);
+INTERNAL int32_t header_fault(uint8_t *frame, int32_t length);
+INTERNAL int32_t length_fault(uint8_t *frame, int32_t length);
+INTERNAL int32_t bare_bytes(int32_t flags);
+INTERNAL void read_place(uint8_t *frame, int32_t at, StatedPlace *place);
+INTERNAL bool read_relays(uint8_t *frame, BeaconFields *b);
+INTERNAL int32_t two(uint8_t *data, int32_t at);
+INTERNAL int32_t checksum(uint8_t *data, int32_t length);
+INTERNAL real variance_factor(real rx_power_dbm, real first_path_power_dbm);
+INTERNAL int32_t choose_site(SiteChoice *choice, int32_t site, int32_t anchor, int64_t rx_ticks);
+INTERNAL void note_fix(SiteChoice *choice, int64_t rx_ticks);
+INTERNAL void restart_choice(SiteChoice *choice, int64_t rx_ticks);
+INTERNAL int32_t find_site(SiteChoice *choice, int32_t site);
+INTERNAL int32_t index_of(SiteChoice *choice, int32_t site);
+INTERNAL void count_anchor(CountedSite *counted, int32_t anchor, int64_t rx_ticks);
+INTERNAL bool prefers(SiteChoice *choice, int32_t other, int64_t rx_ticks);
+INTERNAL bool has_failed(SiteChoice *choice, int64_t rx_ticks);
+INTERNAL void note_failed(SiteChoice *choice);
+INTERNAL int32_t received(SiteChoice *choice, int32_t counted, int64_t rx_ticks);
 INTERNAL void set_layout(State *s);
 INTERNAL void make_uncertain(State *s, int32_t range_errors);
 INTERNAL void clear_link(Link *link, real variance_m2);
@@ -177,6 +226,12 @@ INTERNAL void add_fix(State *s, real share, SteadyState *found);
 INTERNAL void predict_with_impulses(State *s, int64_t now, int64_t impulses_ticks, int64_t superframe);
 INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks);
 INTERNAL void receive_relay(State *s, PlannedMessage *message, PlannedRelay *relayed);
+INTERNAL bool is_late_often(State *s);
+INTERNAL bool rejects_most(State *s);
+INTERNAL bool is_lost(State *s);
+INTERNAL bool relays_contradict(State *s);
+INTERNAL bool relays_fit(State *s);
+INTERNAL bool fits_settings(State *s);
 INTERNAL bool factorise(real *A, int32_t size);
 INTERNAL void solve_lower(real *L, int32_t size, real *x);
 INTERNAL void solve(real *L, int32_t size, real *x);
@@ -189,6 +244,13 @@ INTERNAL real normal_tail(real z);
 INTERNAL real continued_fraction(real z, int32_t first);
 INTERNAL real chi2_tail(int32_t dof, real chi2);
 INTERNAL real mean_if_positive(real mean, real sigma);
+INTERNAL int32_t settle(Course *c, State *s, FixTime *time, int64_t rx_ticks);
+INTERNAL bool is_surely_in_reach(Course *c, int64_t rx_ticks);
+INTERNAL bool is_contradicted(Course *c, State *s, int64_t rx_ticks);
+INTERNAL void use_anchor(Course *c, Place *place, int64_t rx_ticks);
+INTERNAL int32_t longest_silent(Course *c);
+INTERNAL void forget_silent(Course *c, int64_t rx_ticks);
+INTERNAL void widen(Course *c, int32_t axis);
 INTERNAL bool choose_axes(LocateProblem *p);
 INTERNAL real sigma_m(LocateProblem *p, int32_t index_);
 INTERNAL real least_sigma_m(LocateProblem *p);
@@ -199,6 +261,14 @@ INTERNAL void whiten_system(LocateProblem *p);
 INTERNAL bool find_damped_step(LocateProblem *p, real damping);
 INTERNAL bool is_far(LocateProblem *p);
 INTERNAL real eased(real damping, real ratio);
+INTERNAL void add_power(Neighbour *n, real power_dbm);
+INTERNAL void add_relays(Neighbours *t, BeaconFields *b, int64_t rx_ticks);
+INTERNAL int32_t fitting_relays(Neighbours *t, State *s, BeaconFields *b, int64_t rx_ticks);
+INTERNAL bool confirm(Hearing *h, State *s);
+INTERNAL bool has_too_few(State *s, int64_t rx_ticks);
+INTERNAL bool keep_place(Neighbour *n, StatedPlace *place);
+INTERNAL bool is_same(StatedPlace *one, StatedPlace *other);
+INTERNAL void fill_packet(Packet *packet, Hearing *h, Neighbour *n, real factor);
 INTERNAL void add_algebraic_starts(LocateProblem *p);
 INTERNAL void add_intersections(LocateProblem *p, int32_t coordinates);
 INTERNAL void add_at_distance(LocateProblem *p, Equations *e, real distance_m);
@@ -275,6 +345,592 @@ INTERNAL real hypot_(real x, real y) {
 /* x². */
 INTERNAL real square(real x) {
     return x * x;
+}
+
+/* Time as the radio counts it: 40-bit counters of 15.65 ps ticks, unwrapped to integers.
+ *
+ * Ticks are subtracted as integers and only then turned into seconds or metres (``docs/maths.md`` section 3):
+ * float64 seconds lose 0.6 mm after an hour, integers lose nothing. */
+
+/* The unwrapped time that the counter shows and that lies nearest to the expected one. */
+INTERNAL int64_t nearest(int64_t counter, int64_t expected_ticks, int32_t bits) {
+    int64_t half = 1;
+    half = (int64_t)((uint64_t)half << bits - 1);
+    return expected_ticks - half + ((counter - expected_ticks + half) & (2 * half - 1));
+}
+
+/* Whether one crystal's counter may go by ``counter_ticks`` while another's goes by ``elapsed_ticks``. */
+INTERNAL bool may_elapse(int64_t counter_ticks, int64_t elapsed_ticks, real slack_ticks) {
+    return (real)abs_64(counter_ticks - elapsed_ticks) <= MAX_DRIFT * (real)elapsed_ticks + slack_ticks;
+}
+
+/* Unwrapped ticks of a counter value; the first stamp keeps its own value.
+ *
+ * Without a host time, NaN, a stamp is assumed to lie within half a wrap (8.6 s for 40 bits) of the stamp before it,
+ * before or after. With one, the host's clock decides which wrap it is, however long the gap, as long as the host's
+ * clock errs by less than half a wrap over that gap. Stamps with and without a host time may alternate. A stamp out of
+ * order is placed where it belongs, before the ones already seen. */
+INTERNAL int64_t unwrap(Unwrapper *u, int64_t counter, real host_s) {
+    int64_t ticks = counter;
+    if (u->has_stamp) {
+        int64_t expected_ticks = u->last_ticks;
+        real elapsed_s = host_s - u->last_host_s;
+        if (abs_real(elapsed_s) >= REAL(0.0)) {  /* it is a number */
+            elapsed_s = max_real(min_real(elapsed_s, LONGEST_JUMP_S), -LONGEST_JUMP_S);
+            expected_ticks += floor_real(elapsed_s * TICK_RATE_HZ + REAL(0.5));
+        }
+        ticks = nearest(counter, expected_ticks, u->bits);
+        if (!(abs_real(host_s) >= REAL(0.0))) {
+            host_s = u->last_host_s + (real)(ticks - u->last_ticks) * TICK_S;
+        }
+    }
+    u->has_stamp = true;
+    u->last_ticks = ticks;
+    u->last_host_s = host_s;
+    return ticks;
+}
+
+/* Time in seconds of a fix that holds at this master time, given the tag's reading for it, both unwrapped. */
+INTERNAL real fix_time_s(FixTime *time, int64_t ticks_master, int64_t rx_ticks_tag) {
+    if (!time->has_fix) {
+        time->has_fix = true;
+        time->first_ticks_master = ticks_master;
+    } else {
+        int64_t elapsed = rx_ticks_tag - time->last_rx_ticks_tag;
+        int64_t gone = ticks_master - time->last_ticks_master;
+        if (elapsed <= 0 || !may_elapse(gone, elapsed, (real)FLIGHT_SLACK_TICKS)) {
+            time->first_ticks_master += gone - max_64(elapsed, 1);
+        }
+    }
+    time->last_ticks_master = ticks_master;
+    time->last_rx_ticks_tag = rx_ticks_tag;
+    return (real)(ticks_master - time->first_ticks_master) * TICK_S;
+}
+
+/* What is kept of each anchor that is received, or that others relay: one table with a row for each. */
+
+/* The row of an anchor, −1 where there is none. */
+INTERNAL int32_t find_neighbour(Neighbours *t, int32_t anchor) {
+    for (int32_t row = 0, row_end = t->count; row < row_end; row++) {
+        if (t->rows[row].anchor == anchor) {
+            return row;
+        }
+    }
+    return -1;
+}
+
+/* The row of an anchor of which something is learnt; a new one may take that of the least important. */
+INTERNAL int32_t neighbour_of(Neighbours *t, int32_t anchor, int64_t rx_ticks) {
+    Neighbour fresh;
+    int32_t row = find_neighbour(t, anchor);
+    if (row < 0) {
+        row = t->count < MAX_NEIGHBOURS ? t->count : least_important(t, rx_ticks);
+        t->count = max_32(t->count, row + 1);
+        fresh = (Neighbour){0};
+        t->rows[row] = fresh;
+        t->rows[row].anchor = anchor;
+        t->rows[row].own_relays_ticks = NEVER;
+        t->rows[row].relayed_ticks = NEVER;
+    }
+    t->rows[row].changed_ticks = rx_ticks;
+    return row;
+}
+
+/* The row to be forgotten: of an anchor that nobody confirms, of a single frame before others; the longest silent. */
+INTERNAL int32_t least_important(Neighbours *t, int64_t rx_ticks) {
+    int32_t least = -1;
+    int32_t least_rank = 0;
+    for (int32_t row = 0, row_end = t->count; row < row_end; row++) {
+        Neighbour *n = &t->rows[row];
+        int32_t rank = is_confirmed(n, rx_ticks) ? 2 : n->frames > 1 ? 1 : 0;
+        bool is_less = least < 0 || rank < least_rank;
+        if (!is_less && rank == least_rank) {
+            is_less = n->changed_ticks < t->rows[least].changed_ticks;
+        }
+        if (row != t->row && is_less) {
+            least = row;
+            least_rank = rank;
+        }
+    }
+    return least;
+}
+
+/* Whether another anchor has recently received this one, or its own relays have fitted. */
+INTERNAL bool is_confirmed(Neighbour *n, int64_t rx_ticks) {
+    return rx_ticks - max_64(n->relayed_ticks, n->own_relays_ticks) < RELAYED_TICKS;
+}
+
+/* Whether another anchor has recently received this one. */
+INTERNAL bool is_relayed(Neighbour *n, int64_t rx_ticks) {
+    return rx_ticks - n->relayed_ticks < RELAYED_TICKS;
+}
+
+/* The receiver's counter has restarted: who was received when is not known any more. */
+INTERNAL void forget_times(Neighbours *t) {
+    t->has_newest = false;
+    for (int32_t row = 0, row_end = t->count; row < row_end; row++) {
+        Neighbour *n = &t->rows[row];
+        n->frames = 0;
+        n->impossible = 0;
+        n->has_rival = false;
+        n->is_confirmed = false;
+        n->changed_ticks = NEVER;
+        n->own_relays_ticks = NEVER;
+        n->relayed_ticks = NEVER;
+    }
+}
+
+/* Every anchor's counter, unwrapped along the receiver's own. */
+
+/* times: forged frames in between do not replace an anchor that still sends. */
+
+/* Unwrap the TX stamp of a frame along the anchor's own counter; what the stamp is.
+ *
+ * ``rx_ticks`` is the receiver's own reading, unwrapped; ``period_ticks`` the time between two frames of an anchor,
+ * as far as it is known. Where the stamp fits, ``row`` is the anchor's, and holds it; a first one keeps its own value. */
+SKYLESS_EXPORT int32_t skyless_unwrap_stamp(Neighbours *t, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t
+        rx_ticks, int64_t period_ticks) {
+    int32_t row = neighbour_of(t, anchor, rx_ticks);
+    Neighbour *n = &t->rows[row];
+    t->row = row;
+    bool is_repeated = n->frames > 0 && (n->tx_ticks & TICK_MASK) == tx_counter && n->sequence == sequence;
+    if (t->has_newest && rx_ticks <= t->newest_rx_ticks) {
+        return is_repeated ? DUPLICATE : OUT_OF_ORDER;
+    }
+    if (n->frames > 0) {
+        int64_t elapsed = rx_ticks - n->rx_ticks;
+        int64_t tx_ticks = nearest(tx_counter, n->tx_ticks + elapsed, 40);
+        if (!may_elapse(tx_ticks - n->tx_ticks, elapsed, (real)NOISE_TICKS)) {
+            int64_t silence_ticks = max_64(RESTART_SILENCE_TICKS, RESTART_SILENCE_PERIODS * period_ticks);
+            return is_repeated ? DUPLICATE : reject(n, sequence, tx_counter, rx_ticks, elapsed > silence_ticks);
+        }
+        keep(n, sequence, tx_ticks, rx_ticks, 2);
+    } else {
+        keep(n, sequence, tx_counter, rx_ticks, 1);
+    }
+    t->has_newest = true;
+    t->newest_rx_ticks = rx_ticks;
+    return STAMP_FITS;
+}
+
+INTERNAL void keep(Neighbour *n, int32_t sequence, int64_t tx_ticks, int64_t rx_ticks, int32_t frames) {
+    n->frames = frames;
+    n->impossible = 0;
+    n->has_rival = false;
+    n->sequence = sequence;
+    n->tx_ticks = tx_ticks;
+    n->rx_ticks = rx_ticks;
+}
+
+/* After a few stamps that are impossible the next one of a silent anchor is a beginning.
+ *
+ * Where only the first stamp stands against it, which may have been a false one, two that fit each other are. */
+INTERNAL int32_t reject(Neighbour *n, int32_t sequence, int64_t tx_counter, int64_t rx_ticks, bool is_silent) {
+    n->impossible += 1;
+    if (n->frames == 1 && n->has_rival) {
+        int64_t elapsed = rx_ticks - n->rival_rx_ticks;
+        int64_t tx_ticks = nearest(tx_counter, n->rival_tx_ticks + elapsed, 40);
+        if (may_elapse(tx_ticks - n->rival_tx_ticks, elapsed, (real)NOISE_TICKS)) {
+            keep(n, sequence, tx_counter, rx_ticks, 2);
+            return IMPOSSIBLE_STAMP;
+        }
+    }
+    n->has_rival = true;
+    n->rival_rx_ticks = rx_ticks;
+    n->rival_tx_ticks = tx_counter;
+    if (n->impossible >= STAMPS_BEFORE_RESTART && is_silent) {
+        n->frames = 0;
+        return ANCHOR_RESTART;
+    }
+    return IMPOSSIBLE_STAMP;
+}
+
+/* When an anchor of protocol 2 sends: at random instants that everybody can predict (``docs/protocol2.md``).
+ *
+ * The gap between two beacons of an anchor is a function of its identifier, of the first one's sequence number and of the
+ * mean period that this one states. So a receiver of one beacon knows when the next ones leave, by the anchor's
+ * counter, however many of them get lost; and two anchors whose beacons collided hardly collide again the next time.
+ *
+ * A period is stated as a code of 8 bits, as floating-point numbers are: 16 steps for each doubling, from 4 ms on. */
+
+/* Mean time between two beacons of an anchor that states this code. */
+INTERNAL int64_t period_ticks(int32_t code) {
+    int64_t unit = UNIT_STEPS * DELAYED_TX_GRANULARITY_TICKS;
+    return unit * (int32_t)((uint32_t)(STEPS + (code & 15)) << (code >> 4));
+}
+
+/* Which contents of a page are possible (``docs/protocol.md``, "Pages"); what frames carry may be anything. */
+
+/* A whole number in this number of bytes, the lowest first. */
+INTERNAL int64_t unsigned_(uint8_t *data, int32_t at, int32_t size) {
+    int64_t number = 0;
+    for (int32_t byte = size - 1; byte > -1; byte--) {
+        number = (int64_t)((uint64_t)number << 8) | data[at + byte];
+    }
+    return number;
+}
+
+/* The same of a number of four bytes that may be negative. */
+INTERNAL int64_t signed_(uint8_t *data, int32_t at) {
+    int64_t number = unsigned_(data, at, 4);
+    return number < SIGN ? number : number - 2 * SIGN;
+}
+
+/* Whether the page in these bytes, from ``at`` on, can be; one of a type that is not known here can. */
+INTERNAL bool is_possible_page(uint8_t *data, int32_t at) {
+    int32_t kind = data[at];
+    if (kind == ANCHOR_PAGE) {
+        return is_coordinate(data, at + 3) && is_coordinate(data, at + 7) && is_coordinate(data, at + 11);
+    }
+    if (kind == SCHEDULE_PAGE) {
+        int32_t slots = data[at + 5];
+        int32_t frames_per_node = data[at + 6];
+        int32_t anchors = data[at + 9];
+        int64_t slot_ticks = unsigned_(data, at + 1, 4);
+        if (slot_ticks == 0 || slot_ticks * slots > MAX_SUPERFRAME_TICKS || frames_per_node == 0) {
+            return false;
+        }
+        return (0 < anchors * frames_per_node && anchors * frames_per_node <= slots) && is_coordinate(data, at + 11);
+    }
+    if (kind == NOISE_PAGE) {
+        return is_noise(data, at + 1) && is_noise(data, at + 5) && is_noise(data, at + 9) && is_noise(data, at + 13);
+    }
+    if (kind == GEOREFERENCE_PAGE) {
+        bool is_on_earth = abs_64(signed_(data, at + 1)) <= floor_div_64(CIRCLE, 4) && abs_64(signed_(data, at + 5)) <=
+                floor_div_64(CIRCLE, 2);
+        return is_on_earth && is_coordinate(data, at + 9) && unsigned_(data, at + 13, 4) < CIRCLE;
+    }
+    if (kind == ACCURACY_PAGE) {
+        return unsigned_(data, at + 9, 2) > 0 && unsigned_(data, at + 11, 2) > 0;
+    }
+    if (kind == SITE_PAGE) {
+        return data[at + 1] > 0 && is_coordinate(data, at + 9);
+    }
+    return true;
+}
+
+INTERNAL bool is_coordinate(uint8_t *data, int32_t at) {
+    return abs_64(signed_(data, at)) <= MAX_COORDINATE_MM;
+}
+
+INTERNAL bool is_noise(uint8_t *data, int32_t at) {
+    int64_t bits = unsigned_(data, at, 4);
+    return bits <= MAX_NOISE_BITS || bits == SIGN;
+}
+
+/* A beacon of protocol 2 as it is read from a frame (``docs/protocol2.md``); little endian throughout. */
+
+/* Read a whole frame, FCS included; why it is no beacon of version 2, ``INTACT`` if it is one. */
+SKYLESS_EXPORT int32_t skyless_read_frame(uint8_t *frame, int32_t length, BeaconFields *b) {
+    int32_t fault = header_fault(frame, length);
+    if (fault != INTACT) {
+        return fault;
+    }
+    int32_t flags = frame[FLAGS_AT];
+    int32_t at = FIXED_BYTES;
+    b->sequence = frame[2];
+    b->period_code = frame[19];
+    const int32_t new_1 = two(frame, 3);
+    const int32_t new_2 = two(frame, 7);
+    const int32_t new_3 = two(frame, 17);
+    b->site = new_1;
+    b->anchor = new_2;
+    b->almanac_issue = new_3;
+    b->tx_ticks = unsigned_(frame, 12, 5);
+    b->has_place = (flags & HAS_POSITION) != 0;
+    b->relay_bytes = 0;
+    b->certificate_at = 0;
+    b->page_at = 0;
+    b->weak = 0;
+    b->heard_count = 0;
+    b->heard_at = 0;
+    if (b->has_place) {
+        read_place(frame, at, &b->place);
+        at += POSITION_BYTES;
+    }
+    if ((flags & HAS_CERTIFICATE) != 0) {
+        b->certificate_at = at;
+        at += CERTIFICATE_BYTES;
+    } else {
+        int32_t entries = two(frame, at);
+        b->heard_at = at + COUNT_BYTES;
+        b->heard_count = entries & COUNT_MASK;
+        b->weak = entries >> COUNT_BITS;
+        at = b->heard_at + b->heard_count * HEARD_BYTES;
+    }
+    if ((flags & HAS_PAGE) != 0) {
+        b->page_at = at;
+        at += PAGE_BYTES;
+    }
+    b->authentication_at = (flags & HAS_AUTHENTICATION) != 0 ? at : 0;
+    if (b->period_code > LONGEST_PERIOD_CODE) {
+        return BAD_PERIOD;
+    }
+    if (b->heard_count > MAX_HEARD || (b->weak) >> (b->heard_count) != 0 || !read_relays(frame, b)) {
+        return BAD_HEARD;
+    }
+    return b->page_at > 0 && !is_possible_page(frame, b->page_at) ? BAD_PAGE : INTACT;
+}
+
+/* Why bytes are no beacon of version 2, as far as length, check sequence, header and flags show it. */
+INTERNAL int32_t header_fault(uint8_t *frame, int32_t length) {
+    if (length > MAX_FRAME_BYTES) {
+        return TOO_LONG;
+    }
+    if (length <= FCS_BYTES) {
+        return TOO_SHORT;
+    }
+    if (checksum(frame, length) != 0) {
+        return BAD_FCS;
+    }
+    if (length < HEADER_BYTES + FCS_BYTES || two(frame, 0) != FRAME_CONTROL || two(frame, 5) != BROADCAST) {
+        return NOT_A_BEACON;
+    }
+    int32_t magic = two(frame, 9);
+    if ((magic & MAGIC_MASK) != BEACON_MAGIC) {
+        return NOT_A_BEACON;
+    }
+    if (magic != VERSION_2) {
+        return UNKNOWN_VERSION;
+    }
+    if (length < FIXED_BYTES + COUNT_BYTES + FCS_BYTES) {
+        return TOO_SHORT;
+    }
+    return length_fault(frame, length);
+}
+
+INTERNAL int32_t length_fault(uint8_t *frame, int32_t length) {
+    int32_t flags = frame[FLAGS_AT];
+    if ((flags & RESERVED_FLAGS) != 0 || ((flags & HAS_CERTIFICATE) != 0 && (flags & (HAS_POSITION | HAS_PAGE)) != 0)) {
+        return BAD_FLAGS;
+    }
+    int32_t bare = bare_bytes(flags);
+    if (length < bare) {
+        return BAD_LENGTH;
+    }
+    if ((flags & HAS_CERTIFICATE) == 0) {
+        int32_t at = FIXED_BYTES + ((flags & HAS_POSITION) != 0 ? POSITION_BYTES : 0);
+        bare += (two(frame, at) & COUNT_MASK) * HEARD_BYTES;
+    }
+    return length == bare ? INTACT : BAD_LENGTH;
+}
+
+/* Length of a frame with these flags that relays no receptions. */
+INTERNAL int32_t bare_bytes(int32_t flags) {
+    int32_t size = FIXED_BYTES + FCS_BYTES + ((flags & HAS_CERTIFICATE) != 0 ? CERTIFICATE_BYTES : COUNT_BYTES);
+    size += (flags & HAS_POSITION) != 0 ? POSITION_BYTES : 0;
+    size += (flags & HAS_PAGE) != 0 ? PAGE_BYTES : 0;
+    return size + ((flags & HAS_AUTHENTICATION) != 0 ? AUTHENTICATION_BYTES : 0);
+}
+
+INTERNAL void read_place(uint8_t *frame, int32_t at, StatedPlace *place) {
+    for (int32_t axis = 0; axis < 3; axis++) {
+        int32_t low = two(frame, at + 3 * axis);
+        int32_t high = frame[at + 3 * axis + 2];
+        place->position_mm[axis] = low + 65536 * (high > 127 ? high - 256 : high);
+    }
+    int32_t floor_ = frame[at + 10];
+    place->std_mm = frame[at + 9];
+    place->floor_ = floor_ > 127 ? floor_ - 256 : floor_;
+    place->zone = frame[at + 11];
+}
+
+/* Copy the receptions that are not weak; False where one is of the sender, or two of the same anchor. */
+INTERNAL bool read_relays(uint8_t *frame, BeaconFields *b) {
+    for (int32_t one = 0, one_end = b->heard_count; one < one_end; one++) {
+        int32_t at = b->heard_at + one * HEARD_BYTES;
+        int32_t anchor = two(frame, at);
+        if (anchor == b->anchor) {
+            return false;
+        }
+        for (int32_t before = 0; before < one; before++) {
+            if (two(frame, b->heard_at + before * HEARD_BYTES) == anchor) {
+                return false;
+            }
+        }
+        if ((((b->weak) >> one) & 1) == 0) {
+            for (int32_t byte = 0; byte < HEARD_BYTES; byte++) {
+                b->relays[b->relay_bytes + byte] = frame[at + byte];
+            }
+            b->relay_bytes += HEARD_BYTES;
+        }
+    }
+    return true;
+}
+
+/* A whole number of two bytes. */
+INTERNAL int32_t two(uint8_t *data, int32_t at) {
+    return data[at] | (int32_t)((uint32_t)data[at + 1] << 8);
+}
+
+/* CRC-16 of x¹⁶ + x¹² + x⁵ + 1, initially 0, bit 0 of each byte first (clause 7.2.10); 0 with a frame's FCS.
+ *
+ * A byte's four low and four high bits each shift the polynomial in once, so no table is needed. */
+INTERNAL int32_t checksum(uint8_t *data, int32_t length) {
+    int32_t crc = 0;
+    for (int32_t at = 0; at < length; at++) {
+        int32_t low = (crc ^ data[at]) & 255;
+        int32_t mixed = (low ^ (int32_t)((uint32_t)low << 4)) & 255;
+        crc = (((crc >> 8) ^ (int32_t)((uint32_t)mixed << 8)) ^ (int32_t)((uint32_t)mixed << 3)) ^ (mixed >> 4);
+    }
+    return crc;
+}
+
+/* Receptions whose first path is weak: they may be late, and count for less. */
+
+/* Factor on the variance of a reception, from 1 to ``MAX_VARIANCE_FACTOR``; it grows with the powers' difference.
+ *
+ * Where a power is missing (NaN), not finite or impossible (a first path above the total) the factor is 1. */
+INTERNAL real variance_factor(real rx_power_dbm, real first_path_power_dbm) {
+    real difference_db = rx_power_dbm - first_path_power_dbm;
+    if (!(CLEAR_DB < difference_db && difference_db <= MAX_DIFFERENCE_DB)) {
+        return REAL(1.0);
+    }
+    real part = min_real((difference_db - CLEAR_DB) / (BLOCKED_DB - CLEAR_DB), REAL(1.0));
+    return MAX_VARIANCE_FACTOR * exp_((part * part * (REAL(3.0) - REAL(2.0) * part) - REAL(1.0)) * LOG_FACTOR);
+}
+
+/* Which site a tag uses, of those that it receives. */
+
+/* Count an anchor of a site; whether its beacon is to be used. */
+INTERNAL int32_t choose_site(SiteChoice *choice, int32_t site, int32_t anchor, int64_t rx_ticks) {
+    if (choice->only_site != NO_SITE && choice->only_site != site) {
+        return FOREIGN;
+    }
+    int32_t counted = index_of(choice, site);
+    choice->sites[counted].newest_ticks = rx_ticks;
+    count_anchor(&choice->sites[counted], anchor, rx_ticks);
+    if (site == choice->site) {
+        return USED;
+    }
+    if (choice->site != NO_SITE) {
+        if (!prefers(choice, counted, rx_ticks)) {
+            return FOREIGN;
+        }
+        if (has_failed(choice, rx_ticks)) {
+            note_failed(choice);
+        }
+    }
+    choice->site = site;
+    choice->has_fix = false;
+    choice->since_ticks = rx_ticks;
+    choice->heard_ticks = rx_ticks;
+    return CHANGED;
+}
+
+/* The site in use has given a fix. */
+INTERNAL void note_fix(SiteChoice *choice, int64_t rx_ticks) {
+    choice->has_fix = true;
+    choice->fix_ticks = rx_ticks;
+    choice->failed_count = 0;
+}
+
+/* The tag's counter has restarted, and reads this. */
+INTERNAL void restart_choice(SiteChoice *choice, int64_t rx_ticks) {
+    choice->since_ticks = rx_ticks;
+    choice->heard_ticks = rx_ticks;
+    choice->has_fix = false;
+    choice->count = 0;
+}
+
+INTERNAL int32_t find_site(SiteChoice *choice, int32_t site) {
+    for (int32_t one = 0, one_end = choice->count; one < one_end; one++) {
+        if (choice->sites[one].site == site) {
+            return one;
+        }
+    }
+    return -1;
+}
+
+/* Where a site is counted; a new one may take the place of that received longest ago, but not of the one in use. */
+INTERNAL int32_t index_of(SiteChoice *choice, int32_t site) {
+    int32_t found = find_site(choice, site);
+    if (found < 0) {
+        found = choice->count;
+        if (choice->count == MAX_SITES) {
+            found = choice->sites[0].site != choice->site ? 0 : 1;
+            for (int32_t one = 0; one < MAX_SITES; one++) {
+                bool is_older = choice->sites[one].newest_ticks < choice->sites[found].newest_ticks;
+                if (is_older && choice->sites[one].site != choice->site) {
+                    found = one;
+                }
+            }
+        }
+        choice->count = max_32(choice->count, found + 1);
+        choice->sites[found].site = site;
+        choice->sites[found].count = 0;
+    }
+    return found;
+}
+
+/* Note when an anchor was received; where there are too many, that received longest ago is forgotten. */
+INTERNAL void count_anchor(CountedSite *counted, int32_t anchor, int64_t rx_ticks) {
+    int32_t place = -1;
+    int32_t oldest = 0;
+    for (int32_t one = 0, one_end = counted->count; one < one_end; one++) {
+        if (counted->anchors[one].anchor == anchor) {
+            place = one;
+        }
+        if (counted->anchors[one].rx_ticks < counted->anchors[oldest].rx_ticks) {
+            oldest = one;
+        }
+    }
+    if (place < 0) {
+        place = counted->count < MAX_COUNTED ? counted->count : oldest;
+        counted->count = max_32(counted->count, place + 1);
+    }
+    counted->anchors[place].anchor = anchor;
+    counted->anchors[place].rx_ticks = rx_ticks;
+}
+
+/* Whether another site is better than the one in use. */
+INTERNAL bool prefers(SiteChoice *choice, int32_t other, int64_t rx_ticks) {
+    if (rx_ticks - choice->heard_ticks >= SITE_SILENCE_TICKS) {
+        return true;
+    }
+    if (choice->has_fix && rx_ticks - choice->fix_ticks < SITE_SILENCE_TICKS) {
+        return false;
+    }
+    int32_t present = received(choice, other, rx_ticks);
+    if (has_failed(choice, rx_ticks)) {
+        return present >= MIN_ANCHORS;
+    }
+    for (int32_t one = 0, one_end = choice->failed_count; one < one_end; one++) {
+        if (choice->failed[one] == choice->sites[other].site) {
+            return false;
+        }
+    }
+    int32_t used = find_site(choice, choice->site);
+    return present > (used >= 0 ? received(choice, used, rx_ticks) : 0);
+}
+
+/* Whether the site in use has given no fix for long. */
+INTERNAL bool has_failed(SiteChoice *choice, int64_t rx_ticks) {
+    return rx_ticks - (choice->has_fix ? choice->fix_ticks : choice->since_ticks) >= TRIAL_TICKS;
+}
+
+/* The site in use has failed; with too many of them the first is forgotten. */
+INTERNAL void note_failed(SiteChoice *choice) {
+    if (choice->failed_count == MAX_SITES) {
+        for (int32_t one = 1; one < MAX_SITES; one++) {
+            choice->failed[one - 1] = choice->failed[one];
+        }
+        choice->failed_count -= 1;
+    }
+    choice->failed[choice->failed_count] = choice->site;
+    choice->failed_count += 1;
+}
+
+/* How many anchors of a site are received. */
+INTERNAL int32_t received(SiteChoice *choice, int32_t counted, int64_t rx_ticks) {
+    CountedSite *one = &choice->sites[counted];
+    int32_t present = 0;
+    for (int32_t index_ = 0, index__end = one->count; index_ < index__end; index_++) {
+        if (0 <= rx_ticks - one->anchors[index_].rx_ticks && rx_ticks - one->anchors[index_].rx_ticks < PRESENT_TICKS) {
+            present += 1;
+        }
+    }
+    return present;
 }
 
 /* The estimator's state: one record of fixed capacity, and how anchors join and leave by moving blocks in it.
@@ -2400,12 +3056,7 @@ SKYLESS_EXPORT int32_t skyless_process_frame(State *s, Packet *packet, uint8_t *
             relayed->listener = packet->place.anchor;
             relayed->anchor = packed[begin] | (int32_t)((uint32_t)packed[begin + 1] << 8);
             relayed->sequence = packed[begin + 2];
-            int64_t stamp = 0;
-            for (int32_t byte = PACKED_BYTES - 1; byte > 2; byte--) {
-                stamp = (int64_t)((uint64_t)stamp << 8) | packed[begin + byte];
-            }
-            int64_t least = packet->tx_ticks - HALF_WRAP_TICKS;
-            relayed->rx_ticks = least + ((stamp - least) & TICK_MASK);
+            relayed->rx_ticks = nearest(unsigned_(packed, begin + 3, PACKED_BYTES - 3), packet->tx_ticks, 40);
             packet->relay_count += 1;
         }
     }
@@ -2880,6 +3531,57 @@ SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_t
     }
 }
 
+/* What the estimator's counters say of its state: whether a new start is needed, and what that has to expect. */
+
+/* Whether single packets are late often. */
+INTERNAL bool is_late_often(State *s) {
+    return s->status.late_share > s->tuning.late_often_share;
+}
+
+/* Whether most measurements lie beyond the gate. */
+INTERNAL bool rejects_most(State *s) {
+    return s->status.rejected_share > s->tuning.lost_share;
+}
+
+/* Whether more packets are rejected than a right state would reject. */
+INTERNAL bool is_lost(State *s) {
+    int32_t in_row = s->status.rejected_in_row + s->status.stale_in_row;
+    real late = min_real(s->status.late_share, MOST_LATE);
+    return rejects_most(s) || (real)in_row * (REAL(1.0) - REAL(2.0) * late) >= s->tuning.lost_in_row;
+}
+
+/* Whether most of what anchors received of each other does not fit: a wrong position shifts all clocks. */
+INTERNAL bool relays_contradict(State *s) {
+    Status *status = &s->status;
+    return status->relays_lately_rejected > max_real(s->tuning.max_relays_rejected, status->relays_lately_accepted);
+}
+
+/* Whether most of what anchors received of each other fits, and that is more than a few receptions. */
+INTERNAL bool relays_fit(State *s) {
+    Status *status = &s->status;
+    return status->relays_lately_accepted > max_real(s->tuning.max_relays_rejected, REAL(4.0) *
+            status->relays_lately_rejected);
+}
+
+/* Whether the constants of the ranges are as small as the settings state, as far as they are known. */
+INTERNAL bool fits_settings(State *s) {
+    int32_t first = s->layout.constant;
+    int32_t count = s->count;
+    for (int32_t one = 0; one < count; one++) {
+        for (int32_t other = 0; other < one + 1; other++) {
+            s->work[one][other] = s->P[first + one][first + other];
+        }
+        s->work[one][one] += square(s->settings.range_std_m);
+        s->work[count][one] = s->x[first + one];
+    }
+    whiten(s, count, 1);
+    real chi2 = REAL(0.0);
+    for (int32_t one = 0; one < count; one++) {
+        chi2 += square(s->work[count][one]);
+    }
+    return chi2 < s->tuning.fitting_chi2 * (real)count;
+}
+
 /* Symmetric matrices by Cholesky's method, and least squares of few unknowns by rotations of columns.
  *
  * A symmetric matrix is kept as its lower triangle, row by row: element (i, j) with j ≤ i is number i·(i + 1)/2 + j. */
@@ -3088,6 +3790,181 @@ INTERNAL real mean_if_positive(real mean, real sigma) {
         return sigma / continued_fraction(-z, 2);
     }
     return mean + sigma * exp_(-REAL(0.5) * z * z) / (SQRT_2_PI * normal_tail(-z));
+}
+
+/* Which frames a tag admits: of the site in use, with stamps that are possible on its sender's and its own counter. */
+
+/* Unwrap the tag's stamp of a frame, and find out whether its site is in use; ``ADMITTED`` or why not.
+ *
+ * ``host_s``: the host's time of it, NaN where that is not known. */
+SKYLESS_EXPORT int32_t skyless_admit_sender(Admission *a, int32_t site, int32_t anchor, int64_t rx_counter, real host_s)
+        {
+    a->rx_ticks = unwrap(&a->own, rx_counter, host_s);
+    Neighbours *t = &a->neighbours;
+    bool is_possible = -LAST_TICKS <= a->rx_ticks && a->rx_ticks <= LAST_TICKS;
+    if (!is_possible || (t->has_newest && a->rx_ticks < t->newest_rx_ticks - COUNTER_JUMP_TICKS)) {
+        forget_times(t);
+        a->events = a->events | (is_possible ? COUNTER_JUMPED : HOST_JUMPED);
+        restart_choice(&a->choice, is_possible ? a->rx_ticks : 0);
+        if (!is_possible) {
+            a->own.has_stamp = false;
+            return IMPOSSIBLE_HOST_TIME;
+        }
+    }
+    bool had_site = a->choice.site != NO_SITE;
+    int32_t use = choose_site(&a->choice, site, anchor, a->rx_ticks);
+    if (use == FOREIGN) {
+        return FOREIGN_SITE;
+    }
+    if (use == CHANGED && had_site) {
+        t->count = 0;
+        t->has_newest = false;
+        a->events = a->events | SITE_CHANGED;
+    }
+    return ADMITTED;
+}
+
+/* Unwrap the TX stamp of a frame of the site in use; ``ADMITTED`` or why it is not used. */
+SKYLESS_EXPORT int32_t skyless_admit_stamp(Admission *a, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t
+        period_ticks) {
+    int32_t stamp = skyless_unwrap_stamp(&a->neighbours, anchor, sequence, tx_counter, a->rx_ticks, period_ticks);
+    if (stamp == STAMP_FITS) {
+        a->choice.heard_ticks = a->rx_ticks;
+    }
+    return stamp;
+}
+
+/* A tag that knows where it is: what becomes of a packet, and when it has to begin again. */
+
+/* Process a packet of a tag that knows where it is, as ``process_frame``; what becomes of it. */
+SKYLESS_EXPORT int32_t skyless_process_in_course(Course *c, State *s, FixTime *time, Packet *packet, uint8_t *packed,
+        int32_t packed_bytes) {
+    int32_t outcome = skyless_process_frame(s, packet, packed, packed_bytes);
+    c->newest_ticks = max_64(c->newest_ticks, packet->rx_ticks);
+    if (outcome == REJECTED || outcome == STALE) {
+        return is_lost(s) ? LOST : OUTLIER;
+    }
+    if (is_contradicted(c, s, packet->rx_ticks)) {
+        return START_CONTRADICTED;
+    }
+    use_anchor(c, &packet->place, packet->rx_ticks);
+    return settle(c, s, time, packet->rx_ticks);
+}
+
+/* Whether the state is a fix: in three dimensions its height may be worse than the anchors' extent. */
+INTERNAL int32_t settle(Course *c, State *s, FixTime *time, int64_t rx_ticks) {
+    if (s->dim == AXES && s->P[2][2] > square(c->extent_m)) {
+        return BAD_GEOMETRY;
+    }
+    c->time_s = fix_time_s(time, rx_ticks + c->master_less_tag_ticks, rx_ticks);
+    return FIX;
+}
+
+/* Whether the last packet is so recent that the filter can predict from it without a check. */
+INTERNAL bool is_surely_in_reach(Course *c, int64_t rx_ticks) {
+    return 0 <= rx_ticks - c->newest_ticks && rx_ticks - c->newest_ticks < SURELY_IN_REACH_TICKS;
+}
+
+/* Whether a new start is needed, as relays or faults contradict this one; decides what that has to expect. */
+INTERNAL bool is_contradicted(Course *c, State *s, int64_t rx_ticks) {
+    Tuning *tuning = &s->tuning;
+    if (c->start_was_contradicted && is_late_often(s)) {
+        c->start_was_contradicted = false;  /* it was by single late packets */
+        c->open_range_errors = false;
+        return true;
+    }
+    real age_s = (real)(rx_ticks - c->started_ticks) * TICK_S;
+    if (age_s >= tuning->new_start_s) {
+        c->may_begin_again = true;
+    } else if (c->may_begin_again && s->fix[QUALITY][0] > tuning->early_nis) {
+        c->may_begin_again = false;  /* if it does not help, all is noisier than stated */
+        return true;
+    }
+    if (c->is_open && age_s > tuning->new_start_s && fits_settings(s)) {
+        c->open_range_errors = false;
+        return true;
+    }
+    real limit = c->start_was_contradicted ? tuning->sure_chi2 : tuning->uncovered_chi2;
+    if (largest_test(s) > limit && (!c->is_open || age_s > tuning->new_start_s)) {
+        c->open_range_errors = !is_late_often(s);
+        return true;
+    }
+    if (!c->relays_may_contradict) {
+        c->relays_may_contradict = relays_fit(s);
+    } else if (relays_contradict(s)) {
+        c->relays_may_contradict = false;  /* if a new start does not help, the anchors are wrong, not the position */
+        return true;
+    }
+    return false;
+}
+
+/* Anchors in use */
+
+/* Note that a packet of an anchor was accepted, and forget those that have been silent for too long. */
+INTERNAL void use_anchor(Course *c, Place *place, int64_t rx_ticks) {
+    int32_t index_ = 0;
+    while (index_ < c->count && c->used[index_].anchor != place->anchor) {
+        index_ += 1;
+    }
+    bool is_new = index_ == c->count;
+    if (is_new && c->count == MAX_ANCHORS) {
+        index_ = longest_silent(c);
+    }
+    c->count = max_32(c->count, index_ + 1);
+    UsedAnchor *used = &c->used[index_];
+    bool has_changed = is_new;
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        has_changed = has_changed || used->position_m[axis] != place->position_m[axis];
+        used->position_m[axis] = place->position_m[axis];
+    }
+    used->anchor = place->anchor;
+    used->rx_ticks = rx_ticks;
+    if ((real)(rx_ticks - c->checked_ticks) * TICK_S > c->in_use_s) {
+        c->checked_ticks = rx_ticks;
+        int32_t before = c->count;
+        forget_silent(c, rx_ticks);
+        has_changed = has_changed || c->count < before;
+    }
+    if (has_changed) {
+        c->changes += 1;
+        for (int32_t axis = 0; axis < AXES; axis++) {
+            widen(c, axis);
+        }
+    }
+}
+
+INTERNAL int32_t longest_silent(Course *c) {
+    int32_t oldest = 0;
+    for (int32_t index_ = 0, index__end = c->count; index_ < index__end; index_++) {
+        if (c->used[index_].rx_ticks < c->used[oldest].rx_ticks) {
+            oldest = index_;
+        }
+    }
+    return oldest;
+}
+
+INTERNAL void forget_silent(Course *c, int64_t rx_ticks) {
+    int32_t kept = 0;
+    for (int32_t index_ = 0, index__end = c->count; index_ < index__end; index_++) {
+        if ((real)(rx_ticks - c->used[index_].rx_ticks) * TICK_S <= c->in_use_s) {
+            if (kept < index_) {
+                c->used[kept] = c->used[index_];
+            }
+            kept += 1;
+        }
+    }
+    c->count = kept;
+}
+
+/* Take the anchors' span along an axis into account. */
+INTERNAL void widen(Course *c, int32_t axis) {
+    real highest = c->used[0].position_m[axis];
+    real lowest = c->used[0].position_m[axis];
+    for (int32_t index_ = 1, index__end = c->count; index_ < index__end; index_++) {
+        lowest = min_real(lowest, c->used[index_].position_m[axis]);
+        highest = max_real(highest, c->used[index_].position_m[axis]);
+    }
+    c->extent_m = max_real(c->extent_m, highest - lowest);
 }
 
 /* A set of TDoAs, in the axes in which their solution is simplest. */
@@ -3321,6 +4198,174 @@ INTERNAL real eased(real damping, real ratio) {
     real excess = REAL(2.0) * ratio - REAL(1.0);
     real eased = damping * max_real(REAL(1.0) / REAL(3.0), REAL(1.0) - excess * excess * excess);
     return eased > MIN_DAMPING ? eased : REAL(0.0);
+}
+
+/* Which anchors of a large site a tag uses: the strongest of those that other anchors receive too. */
+
+/* Process the power of a beacon; NaN where the radio reports none. */
+INTERNAL void add_power(Neighbour *n, real power_dbm) {
+    if (abs_real(power_dbm) <= MAX_POWER_DBM) {
+        n->power_dbm = n->has_power ? n->power_dbm + POWER_GAIN * (power_dbm - n->power_dbm) : power_dbm;
+        n->has_power = true;
+    }
+}
+
+/* Process what an anchor relays, so that it confirms others. */
+INTERNAL void add_relays(Neighbours *t, BeaconFields *b, int64_t rx_ticks) {
+    for (int32_t begin = 0, begin_end = b->relay_bytes; begin < begin_end; begin += 8) {
+        int32_t anchor = b->relays[begin] | (int32_t)((uint32_t)b->relays[begin + 1] << 8);
+        int32_t row = neighbour_of(t, anchor, rx_ticks);
+        t->rows[row].relayed_ticks = rx_ticks;
+        t->rows[row].own_relays_ticks = NEVER;
+    }
+}
+
+/* How many receptions that an anchor relays fit what the tag has received itself: so it really receives them.
+ *
+ * Only packets of anchors in use count. A reception fits if, on the anchor's counter, it lies as long before its own
+ * frame as on the tag's, to 1 µs (300 m) and the drift of crystals. */
+INTERNAL int32_t fitting_relays(Neighbours *t, State *s, BeaconFields *b, int64_t rx_ticks) {
+    int32_t fitting = 0;
+    int64_t tx_ticks = t->rows[t->row].tx_ticks;
+    for (int32_t begin = 0, begin_end = b->relay_bytes; begin < begin_end; begin += 8) {
+        int32_t anchor = b->relays[begin] | (int32_t)((uint32_t)b->relays[begin + 1] << 8);
+        int32_t row = find_neighbour(t, anchor);
+        if (row >= 0 && t->rows[row].frames > 0 && t->rows[row].sequence == b->relays[begin + 2]) {
+            int64_t elapsed = rx_ticks - t->rows[row].rx_ticks;
+            int64_t received_ticks = nearest(unsigned_(b->relays, begin + 3, 5), tx_ticks - elapsed, 40);
+            if (skyless_find_anchor(s, anchor) >= 0 && may_elapse(tx_ticks - received_ticks, elapsed,
+                    (real)FLIGHT_SLACK_TICKS)) {
+                fitting += 1;
+            }
+        }
+    }
+    return fitting;
+}
+
+/* A tag of protocol 2: from a frame's bytes to a fix, as long as it knows its site and where it is.
+ *
+ * What is rare is left to its owner (``Receiver``): pages of the site, starts, anchors that join or have moved. */
+
+/* Process a frame from the air; what becomes of it: of ``DROP_COUNTERS``, of a course, or one of the above.
+ *
+ * ``host_s`` and the powers are NaN where they are not known. Course and state are not used while it is starting. */
+SKYLESS_EXPORT int32_t skyless_hear_frame(Hearing *h, Course *c, State *s, uint8_t *frame, int32_t length, int64_t
+        rx_counter, real host_s, real rx_power_dbm, real first_path_power_dbm) {
+    int32_t fault = skyless_read_frame(frame, length, &h->beacon);
+    if (fault != INTACT) {
+        return MALFORMED + fault;
+    }
+    return skyless_hear_fields(h, c, s, rx_counter, host_s, rx_power_dbm, first_path_power_dbm);
+}
+
+/* The same of a beacon that has been read already. */
+SKYLESS_EXPORT int32_t skyless_hear_fields(Hearing *h, Course *c, State *s, int64_t rx_counter, real host_s, real
+        rx_power_dbm, real first_path_power_dbm) {
+    Admission *a = &h->admission;
+    BeaconFields *b = &h->beacon;
+    int32_t outcome = skyless_admit_sender(a, b->site, b->anchor, rx_counter, host_s);
+    if (outcome == ADMITTED) {
+        outcome = skyless_admit_stamp(a, b->anchor, b->sequence, b->tx_ticks, period_ticks(b->period_code));
+    }
+    h->is_starting = h->is_starting || a->events != 0;
+    if (outcome != ADMITTED) {
+        return outcome;
+    }
+    Neighbour *n = &a->neighbours.rows[a->neighbours.row];
+    add_power(n, rx_power_dbm);
+    n->is_confirmed = confirm(h, s);
+    n->almanac_issue = b->almanac_issue;
+    n->period_code = b->period_code;
+    h->has_moved = b->has_place && keep_place(n, &b->place);
+    fill_packet(&h->packet, h, n, variance_factor(rx_power_dbm, first_path_power_dbm));
+    if (h->is_starting || h->has_moved || h->is_moving || b->almanac_issue != h->almanac_issue) {
+        return IS_RARE;
+    }
+    if (skyless_find_anchor(s, b->anchor) < 0 || !is_surely_in_reach(c, a->rx_ticks)) {
+        return IS_RARE;
+    }
+    outcome = skyless_process_in_course(c, s, &a->time, &h->packet, b->relays, b->relay_bytes);
+    if (outcome == FIX) {
+        note_fix(&a->choice, a->rx_ticks);
+    }
+    return outcome;
+}
+
+/* Process which anchors a beacon confirms by its relays; whether other anchors confirm its sender.
+ *
+ * Only then its pages take part in the majority, and its relays confirm others. */
+INTERNAL bool confirm(Hearing *h, State *s) {
+    BeaconFields *b = &h->beacon;
+    Neighbours *t = &h->admission.neighbours;
+    int64_t rx_ticks = h->admission.rx_ticks;
+    Neighbour *n = &t->rows[t->row];
+    bool in_use = !h->is_starting && skyless_find_anchor(s, b->anchor) >= 0;
+    bool by_others = is_relayed(n, rx_ticks) || (in_use && n->own_relays_ticks == NEVER);
+    if (by_others || h->is_starting || has_too_few(s, rx_ticks)) {
+        add_relays(t, b, rx_ticks);
+    } else if (fitting_relays(t, s, b, rx_ticks) >= MIN_FITTING) {
+        n->own_relays_ticks = rx_ticks;
+    }
+    return by_others;
+}
+
+/* Whether fewer anchors in use are still received than a fix takes, so that relays of any anchor confirm.
+ *
+ * A tag may come to where none of its anchors is received, nor receives the next ones: out of a lift. */
+INTERNAL bool has_too_few(State *s, int64_t rx_ticks) {
+    int32_t heard = 0;
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        Anchor *a = &s->anchors[anchor];
+        if (a->packets > 0 && (real)(rx_ticks - a->rx_ticks) * TICK_S <= s->settings.drop_s) {
+            heard += 1;
+        }
+    }
+    return heard < MIN_ANCHORS;
+}
+
+/* Keep where an anchor says that it is; whether that is used from now on instead of another place. */
+INTERNAL bool keep_place(Neighbour *n, StatedPlace *place) {
+    if (n->has_place && is_same(&n->place, place)) {
+        n->has_other = false;
+        return false;
+    }
+    bool has_moved = n->has_place && n->has_other && is_same(&n->other, place);
+    if (has_moved || !n->has_place) {
+        n->place = *place;
+        n->has_place = true;
+        n->has_other = false;
+    } else {
+        n->other = *place;
+        n->has_other = true;
+    }
+    return has_moved;
+}
+
+INTERNAL bool is_same(StatedPlace *one, StatedPlace *other) {
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        if (one->position_mm[axis] != other->position_mm[axis]) {
+            return false;
+        }
+    }
+    return one->std_mm == other->std_mm && one->floor_ == other->floor_ && one->zone == other->zone;
+}
+
+/* Write the beacon at hand as the filter takes it, but for its relays. */
+INTERNAL void fill_packet(Packet *packet, Hearing *h, Neighbour *n, real factor) {
+    Place *place = &packet->place;
+    place->anchor = n->anchor;
+    place->std_m = (real)n->place.std_mm / (real)MM_PER_M;
+    place->is_open = n->is_misfit;
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        place->position_m[axis] = (real)n->place.position_mm[axis] / (real)MM_PER_M;
+    }
+    packet->sequence = n->sequence;
+    packet->rx_ticks = h->admission.rx_ticks;
+    packet->tx_ticks = n->tx_ticks;
+    packet->variance_factor = factor;
+    packet->master = -1;
+    packet->relay_count = 0;
+    packet->report_variance_m2 = REAL(0.0);
 }
 
 /* States from which the iterations start: from TDoAs in closed form, without a guess.

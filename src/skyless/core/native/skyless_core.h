@@ -1,5 +1,12 @@
 /* Made by tools/make_core.py from these modules; do not edit.
 
+ * skyless.core.air.anchor_stamps
+ * skyless.core.air.beacon_fields
+ * skyless.core.air.first_path
+ * skyless.core.air.instants
+ * skyless.core.air.neighbours
+ * skyless.core.air.page_check
+ * skyless.core.air.site_choice
  * skyless.core.estimator.faults
  * skyless.core.estimator.kalman
  * skyless.core.estimator.levels
@@ -8,14 +15,20 @@
  * skyless.core.estimator.process
  * skyless.core.estimator.state
  * skyless.core.estimator.steady_state
+ * skyless.core.estimator.verdicts
  * skyless.core.native.arithmetic
  * skyless.core.native.small_matrices
  * skyless.core.native.tails
+ * skyless.core.tag.admission
+ * skyless.core.tag.course
  * skyless.core.tag.descent
+ * skyless.core.tag.hearing
  * skyless.core.tag.minima
  * skyless.core.tag.position
  * skyless.core.tag.problem
+ * skyless.core.tag.selection
  * skyless.core.tag.starts
+ * skyless.core.ticks
  */
 
 #ifndef SKYLESS_CORE_H
@@ -37,11 +50,35 @@ typedef double real;
 #endif
 
 #define ACCEPTED 1
+#define ACCURACY_PAGE 5
+#define ADMITTED 0
 #define AFTER_ALL_TICKS INT64_C(4611686018427387904)
 #define ALL_RANGE_ERRORS 2
+#define ANCHOR_PAGE 1
+#define ANCHOR_RESTART 4
+/* Lowest 16 bits of the interval, then the code. */
+#define AUTHENTICATION_BYTES 10
 #define AXES 3
+#define BAD_FCS 3
+#define BAD_FLAGS 6
+#define BAD_GEOMETRY 24
+#define BAD_HEARD 8
+#define BAD_LENGTH 7
+#define BAD_PAGE 9
+#define BAD_PERIOD 10
+#define BEACON_MAGIC 45139
+/* Up to the former nothing changes, from the latter on all that can: the maker's 6 and 10, and 1 dB. Lines of sight of
+ * the UTIL data set have up to 8.4 dB, paths through metal, the only ones that are much later, from 11.3. */
+#define BLOCKED_DB REAL(11.0)
 #define BOUND_SIGMAS REAL(3.0)
+#define BROADCAST 65535
+/* Length of a certificate (``skyless.core.keys.chain``). */
+#define CERTIFICATE_BYTES 94
+#define CHANGED 2
 #define CHANGING_RANGE_ERRORS 1
+/* A whole turn in steps of 1e-7 degree. */
+#define CIRCLE INT64_C(3600000000)
+#define CLEAR_DB REAL(7.0)
 #define CLOCK_JUMPED 2
 #define CLOCK_RATE_VARIANCE REAL(224688794.68420443)
 #define COLLINEAR REAL(1e-06)
@@ -49,102 +86,398 @@ typedef double real;
 #define COMPLETE_CHANGE REAL(0.001)
 #define CONTRADICTED 2
 #define CONVERGED 0
+#define COUNTER_JUMPED 1
+/* Stamps that go back farther than radios and hosts reorder them mean that the tag's own counter has restarted. */
+#define COUNTER_JUMP_TICKS INT64_C(63897600000)
+#define COUNT_BITS 4
+/* Number of receptions, and which of them are weak. */
+#define COUNT_BYTES 2
+#define COUNT_MASK 15
 #define CREEPING 2
+#define DELAYED_TX_GRANULARITY_TICKS 512
 /* Columns are not independent if their smallest singular value is below this part of the largest. */
 #define DEPENDENT REAL(1e-06)
 #define DISTINCT_MINIMA_CHI2 REAL(9.0)
 #define DIVERGED 2
+#define DUPLICATE 1
 #define EXHAUSTED 3
 #define FAR_EXTENTS REAL(10000.0)
 /* From here on the normal tail's continued fraction converges faster than its series. */
 #define FAR_TAIL REAL(3.0)
 #define FAULT_KINDS 3
+#define FCS_BYTES 2
 #define FIRST_DAMPING REAL(0.01)
 /* Where ``protect`` writes the tests of all kinds of faults, after ``HPL`` and ``VPL``. */
 #define FIRST_TEST 2
+#define FIX 20
+/* The fields that every beacon has. */
+#define FIXED_BYTES 20
+#define FLAGS_AT 11
 #define FLAT REAL(1e-09)
+#define FLIGHT_SLACK_TICKS 63898
+#define FOREIGN 0
+#define FOREIGN_SITE 5
 #define FOUND 0
+#define FRAME_CONTROL 34881
 #define FREE 0
 #define GAIN_TOLERANCE REAL(1e-13)
-#define HALF_WRAP_TICKS INT64_C(549755813888)
+#define GEOREFERENCE_PAGE 4
+#define HAS_AUTHENTICATION 4
+#define HAS_CERTIFICATE 8
+#define HAS_PAGE 2
+#define HAS_POSITION 1
+/* Up to the magic number. */
+#define HEADER_BYTES 11
+/* One reception: anchor, sequence number, 40 bits of the RX stamp. */
+#define HEARD_BYTES 8
 #define HEIGHT 1
+#define HOST_JUMPED 2
 #define HPL 0
 #define IMPOSSIBLE 3
+#define IMPOSSIBLE_HOST_TIME 6
 #define IMPOSSIBLE_SIGMAS REAL(6.0)
+#define IMPOSSIBLE_STAMP 3
 #define IMPULSES 4
+#define INTACT 0
+/* A beacon is admitted, and its sender's row is up to date; the rest is its owner's. */
+#define IS_RARE 30
 #define JOINED 2
 /* Numbers in a vector of 256 bits. */
 #define LANES 4
 #define LASTING 0
+#define LAST_TICKS INT64_C(2305843009213693952)
 #define LEVELS 5
 /* The leading bits of ln 2: products with small whole numbers are exact. */
 #define LN_2_HIGH REAL(0.6931471803691238)
 #define LN_2_LOW REAL(1.9082149292705877e-10)
+#define LOG_FACTOR REAL(3.58351893845611)
+/* No jump of a host's clock counts as a longer one: the ticks of three years fit 64 bits. */
+#define LONGEST_JUMP_S REAL(100000000.0)
+#define LONGEST_PERIOD_CODE 159
+#define LOST 22
 /* Its exponential counts as 0. */
 #define LOWEST REAL(-700.0)
+#define MAGIC_MASK 61695
+/* The bytes are no beacon; the fault's number is added. */
+#define MALFORMED 40
 #define MAX_ANCHORS 32
+/* Coordinates and heights beyond 1000 km from the origin are errors; a page has 32-bit millimetres, ±2147 km. */
+#define MAX_COORDINATE_MM 1000000000
+/* Largest number of anchors of one site that is counted. */
+#define MAX_COUNTED 32
+/* Larger ones are no powers. */
+#define MAX_DIFFERENCE_DB REAL(1000.0)
+#define MAX_DRIFT REAL(5e-05)
 #define MAX_FAULTS 2
+#define MAX_FRAME_BYTES 127
+#define MAX_HEARD 12
 #define MAX_ITERATIONS 200
+/* More anchors than there are in reach: forged ones cannot use more memory. */
+#define MAX_NEIGHBOURS 256
+/* 2⁻¹⁹ as a float32: those from 0 on are in the order of their bits. */
+#define MAX_NOISE_BITS 905969664
+/* No radio reports more, nor less than its negative. */
+#define MAX_POWER_DBM REAL(1000.0)
 #define MAX_RATE_MPS REAL(29979.2458)
 /* Most relays with a packet; 13 fit into a frame. */
 #define MAX_RELAYS 32
+#define MAX_SITES 8
 #define MAX_STARTS 9
+/* A superframe is shorter than half a wrap of the counter (8.6 s), else stamps become ambiguous. */
+#define MAX_SUPERFRAME_TICKS INT64_C(549755813887)
 /* Rotations of all pairs of columns; they converge quadratically, with four columns after about six. */
 #define MAX_SWEEPS 12
+/* Factor on the variance of a blocked path: metal made messages 0.2 to 0.4 m late, 4 to 8 times what noise does. */
+#define MAX_VARIANCE_FACTOR REAL(36.0)
 #define MERGED_SIGMAS REAL(2.0)
+/* That other one has at least as many: with fewer there is no fix. */
+#define MIN_ANCHORS 3
 #define MIN_DAMPING REAL(0.0001)
+#define MIN_FITTING 2
 #define MIRROR 7
+#define MM_PER_M 1000
+/* A larger share of late packets counts as this. */
+#define MOST_LATE REAL(0.45)
 #define MOST_WAITING 8
 /* A smaller square of a distance counts as this. */
 #define NEAREST_M2 REAL(1e-18)
-/* A time before all others. */
 #define NEVER (INT64_C(-4611686018427387904))
+#define NOISE_PAGE 3
+#define NOISE_TICKS 64
+#define NOT_A_BEACON 4
 #define NO_COVARIANCE 1
 #define NO_RANGE_ERRORS 0
+#define NO_SITE (-1)
 #define OBSTRUCTED 1
 /* Columns are orthogonal if the cosine of their angle is not larger. */
 #define ORTHOGONAL REAL(1e-14)
+#define OUTLIER 21
+#define OUT_OF_ORDER 2
 /* Bytes of a relay in a frame: identifier (2), sequence number (1), stamp (5), the lowest first. */
 #define PACKED_BYTES 8
 /* Packets of each anchor that are kept for relays to come; divides the range of sequence numbers. */
 #define PACKETS_KEPT 16
+#define PAGE_BYTES 17
 #define PLANE 2
 #define POSITION 0
+#define POSITION_BYTES 12
+/* Weight of the newest value in the running mean of an anchor's received power. */
+#define POWER_GAIN REAL(0.1)
+/* Anchors received within this time count. */
+#define PRESENT_TICKS INT64_C(63897600000)
 #define PROTECTION 9
 #define QUALITY 4
 #define RECENT 1
 #define REJECTED 0
+/* A reception by an anchor in use, or by one that is confirmed itself, confirms its sender for this time. */
+#define RELAYED_TICKS INT64_C(127795200000)
+#define RESERVED_FLAGS 240
 #define RESIDUALS 6
 #define RESTARTED_CLOCK 4
+#define RESTART_SILENCE_PERIODS 4
+#define RESTART_SILENCE_TICKS INT64_C(12779520000)
 #define RIVAL_MINIMUM_CHI2 REAL(9.0)
 #define ROOT_2_PI REAL(2.5066282746310002)
 #define SAME_POINT REAL(1e-06)
+#define SCHEDULE_PAGE 2
+/* The highest of four bytes' bits; as a float32 alone it is −0. */
+#define SIGN INT64_C(2147483648)
 #define SINGULAR 5
 /* A pivot below this part of its diagonal element is rounding noise: the matrix is singular. */
 #define SINGULAR_PIVOT REAL(1e-12)
+#define SITE_CHANGED 4
+#define SITE_PAGE 6
+/* A tag that may choose its site leaves one that has been silent, or has given no fix, for this time. */
+#define SITE_SILENCE_TICKS INT64_C(127795200000)
 #define SOUND 0
 #define SPEED_OF_LIGHT_MPS REAL(299792458.0)
 #define SQRT_2_PI REAL(2.5066282746310002)
 #define STALE 3
+#define STAMPS_BEFORE_RESTART 3
+#define STAMP_FITS 0
+#define START_CONTRADICTED 23
 #define STATE 2
+#define STEPS 16
 #define STEP_TOLERANCE REAL(1e-10)
 #define SUBTICKS 256
 #define SUBTICK_MASK INT64_C(281474976710655)
+/* Silences up to this need no check of the filter. */
+#define SURELY_IN_REACH_TICKS INT64_C(6389759999)
 /* Of Jacobi's rotations: each squares what is left off the diagonal. */
 #define SWEEPS 8
 #define TERMS 60
 #define THIN_SIGMAS REAL(0.1)
 #define TICK_M REAL(0.0046917639786157855)
 #define TICK_MASK INT64_C(1099511627775)
+#define TICK_RATE_HZ REAL(63897600000.0)
 #define TICK_S REAL(1.5650040064102565e-11)
+#define TOO_LONG 2
+#define TOO_SHORT 1
+/* A site that has given no fix for this time is left for another one: none holds a tag by its number of anchors. */
+#define TRIAL_TICKS INT64_C(319488000000)
 #define UNAVAILABLE 3
 #define UNCERTAIN 8
 #define UNDETERMINED 1
+/* 31,200 steps of the delayed transmission: a quarter of a millisecond, the unit of periods. */
+#define UNIT_STEPS 31200
+#define UNKNOWN_VERSION 5
 #define UNSETTLED 4
 #define UNUSED 0
 #define USED 1
 #define VELOCITY 5
+#define VERSION_2 45651
 #define VPL 1
+
+/* Where an anchor says that it is, as frames carry it. */
+typedef struct StatedPlace {
+    int32_t position_mm[3];
+    int32_t std_mm;
+    int32_t floor_;
+    int32_t zone;
+} StatedPlace;
+
+/* All that a frame says, and where it has the parts that are only passed on. */
+typedef struct BeaconFields {
+    int32_t site;
+    int32_t anchor;
+    int32_t sequence;
+    int64_t tx_ticks;  /* In the sender's clock, 40 bits. */
+    int32_t almanac_issue;
+    int32_t period_code;
+    bool has_place;
+    StatedPlace place;
+    int32_t heard_at;  /* Where the receptions of other anchors stand. */
+    int32_t heard_count;
+    int32_t weak;  /* Bit k is set where the first path of reception k was weak: it may be late. */
+    int32_t page_at;  /* Where the page stands; 0 where there is none, as in the next two. */
+    int32_t certificate_at;
+    int32_t authentication_at;
+    int32_t relay_bytes;
+    uint8_t relays[96];  /* The receptions without the weak ones, as in the frame. */
+} BeaconFields;
+
+/* One anchor. */
+typedef struct Neighbour {
+    int32_t anchor;  /* Its identifier. */
+    int64_t changed_ticks;  /* The receiver's reading when anything was last learnt of it. */
+    int32_t frames;  /* Whose stamps have fitted since its counter began: 0, 1, or 2 for more. */
+    int32_t sequence;  /* Of the newest one. */
+    int64_t rx_ticks;  /* The receiver's own stamp of it. */
+    int64_t tx_ticks;  /* The anchor's, unwrapped. */
+    int32_t impossible;  /* Stamps in a row that do not fit. */
+    bool has_rival;  /* Whether one of those may be right, as only one frame stands against it. */
+    int64_t rival_rx_ticks;
+    int64_t rival_tx_ticks;
+    int32_t almanac_issue;
+    int32_t period_code;
+    bool has_place;
+    StatedPlace place;  /* The one that is used. */
+    bool has_other;
+    StatedPlace other;  /* Another one, stated once; used when it is stated twice in a row. */
+    bool is_confirmed;  /* Whether others had received it at its newest frame. */
+    int64_t relayed_ticks;  /* The receiver's reading when another anchor last relayed that it had received this one. */
+    /* The receiver's reading when the anchor's own relays last fitted, where no other has relayed it since. */
+    int64_t own_relays_ticks;
+    bool has_power;
+    real power_dbm;  /* Running mean of the received power. */
+    bool is_misfit;  /* Whether it contradicted the others at the start. */
+} Neighbour;
+
+/* All of them. */
+typedef struct Neighbours {
+    int32_t count;
+    int32_t row;  /* Of the anchor whose frame is processed; it is not forgotten meanwhile. */
+    bool has_newest;
+    /* RX stamp of the newest accepted frame: one impossible stamp must not make others late. */
+    int64_t newest_rx_ticks;
+    Neighbour rows[256];
+} Neighbours;
+
+/* Turns one counter's wrapped stamps into int64 ticks that never wrap (``unwrap``). */
+typedef struct Unwrapper {
+    int32_t bits;  /* Width of the counter, 62 at most. */
+    bool has_stamp;
+    int64_t last_ticks;
+    real last_host_s;  /* NaN where no stamp has had a host time. */
+} Unwrapper;
+
+/* An anchor of a site. */
+typedef struct CountedAnchor {
+    int32_t anchor;
+    int64_t rx_ticks;  /* RX stamp of its last beacon. */
+} CountedAnchor;
+
+/* A site that is received. */
+typedef struct CountedSite {
+    int32_t site;
+    int64_t newest_ticks;  /* RX stamp of its last beacon. */
+    int32_t count;
+    CountedAnchor anchors[32];
+} CountedSite;
+
+/* The site in use and, where the tag may choose, how many anchors of others it receives.
+ *
+ * It uses the first site that it receives, but until there are fixes one with more anchors, so that a single foreign
+ * anchor cannot hold it. One that gives no fix makes way for others, and returns only after those have failed. */
+typedef struct SiteChoice {
+    int32_t only_site;  /* The site that was configured; ``NO_SITE`` where the tag may choose. */
+    int32_t site;  /* The site in use, by its PAN identifier. */
+    int64_t heard_ticks;  /* RX stamp of the last beacon of it that was accepted. */
+    int64_t since_ticks;  /* RX stamp of the beacon with which it was chosen. */
+    bool has_fix;
+    int64_t fix_ticks;  /* RX stamp of the last fix. */
+    int32_t failed_count;
+    int32_t failed[8];  /* Sites that were left since the last fix as they gave none, the newest last. */
+    int32_t count;
+    CountedSite sites[8];
+} SiteChoice;
+
+/* Counts from the first fix of a receiver and never goes back, even if the master or the method changes. */
+typedef struct FixTime {
+    bool has_fix;
+    int64_t first_ticks_master;
+    int64_t last_ticks_master;
+    int64_t last_rx_ticks_tag;
+} FixTime;
+
+/* What a tag knows of its own counter, of sites and of anchors. */
+typedef struct Admission {
+    Unwrapper own;
+    SiteChoice choice;
+    FixTime time;
+    Neighbours neighbours;
+    int64_t rx_ticks;  /* The tag's stamp of the frame at hand, unwrapped. */
+    int32_t events;  /* What has happened since its owner last looked. */
+} Admission;
+
+/* An anchor and where it stands. */
+typedef struct Place {
+    int32_t anchor;  /* Identifier. */
+    real position_m[3];
+    real std_m;  /* Standard deviation of each coordinate; below 0 for that of the settings. */
+    bool is_open;  /* Whether it joins with range errors beyond those of the settings. */
+} Place;
+
+/* When an anchor, that of the packet as a rule, received a packet of another. */
+typedef struct Relay {
+    int32_t listener;  /* Identifier of the one that received it. */
+    int32_t anchor;  /* Identifier of the other. */
+    int32_t sequence;
+    int64_t rx_ticks;  /* The listener's stamp, unwrapped. */
+} Relay;
+
+/* A packet that the tag received; all stamps are unwrapped. */
+typedef struct Packet {
+    Place place;
+    int32_t sequence;
+    int64_t rx_ticks;  /* The tag's stamp. */
+    int64_t tx_ticks;  /* The anchor's own. */
+    real variance_factor;  /* On the variance of the tag's reception. */
+    /* Identifier of the anchor against whose clock this one reports its own; −1 where it reports nothing. */
+    int32_t master;
+    int64_t subticks;  /* The anchor's reading less the master's at the packet's TX stamp, modulo 2⁴⁸. */
+    real report_variance_m2;
+    int32_t relay_count;
+    Relay relays[32];
+} Packet;
+
+/* What a tag of protocol 2 keeps beside its filter. */
+typedef struct Hearing {
+    Admission admission;
+    BeaconFields beacon;  /* The one at hand. */
+    Packet packet;  /* The same for the filter. */
+    int32_t almanac_issue;  /* Issue of the pages in use. */
+    bool is_starting;  /* Whether it does not know where it is. */
+    bool is_moving;  /* Whether anchors of the site have moved recently. */
+    bool has_moved;  /* Whether the sender of the beacon at hand has. */
+} Hearing;
+
+/* An anchor in use. */
+typedef struct UsedAnchor {
+    int32_t anchor;
+    real position_m[3];
+    int64_t rx_ticks;  /* The tag's stamp of its last accepted packet. */
+} UsedAnchor;
+
+/* What has become of the starts so far, and whose packets were accepted recently. */
+typedef struct Course {
+    bool open_range_errors;  /* Whether the next start expects larger range errors than the settings state. */
+    bool is_open;  /* Whether the last start did. */
+    bool start_was_contradicted;
+    bool relays_may_contradict;
+    bool may_begin_again;  /* Whether a start that fits badly from the beginning is given up: not twice in a row. */
+    int32_t heights_rejected;
+    int64_t master_less_tag_ticks;
+    int64_t started_ticks;
+    int64_t newest_ticks;
+    real in_use_s;  /* An anchor counts as in use while its last accepted packet is younger than this. */
+    int64_t checked_ticks;  /* When that was checked last. */
+    real extent_m;  /* The largest span in x, y or z that anchors in use have had since the start. */
+    int64_t changes;  /* How often the anchors in use, or their positions, have changed. */
+    int32_t count;
+    UsedAnchor used[32];
+    real time_s;  /* Of the newest fix. */
+} Course;
 
 /* What the filter assumes; standard deviations are one sigma. */
 typedef struct EstimatorSettings {
@@ -489,37 +822,6 @@ typedef struct State {
     real fix[10][3];  /* What a fix carries (``POSITION`` and the following). */
 } State;
 
-/* An anchor and where it stands. */
-typedef struct Place {
-    int32_t anchor;  /* Identifier. */
-    real position_m[3];
-    real std_m;  /* Standard deviation of each coordinate; below 0 for that of the settings. */
-    bool is_open;  /* Whether it joins with range errors beyond those of the settings. */
-} Place;
-
-/* When an anchor, that of the packet as a rule, received a packet of another. */
-typedef struct Relay {
-    int32_t listener;  /* Identifier of the one that received it. */
-    int32_t anchor;  /* Identifier of the other. */
-    int32_t sequence;
-    int64_t rx_ticks;  /* The listener's stamp, unwrapped. */
-} Relay;
-
-/* A packet that the tag received; all stamps are unwrapped. */
-typedef struct Packet {
-    Place place;
-    int32_t sequence;
-    int64_t rx_ticks;  /* The tag's stamp. */
-    int64_t tx_ticks;  /* The anchor's own. */
-    real variance_factor;  /* On the variance of the tag's reception. */
-    /* Identifier of the anchor against whose clock this one reports its own; −1 where it reports nothing. */
-    int32_t master;
-    int64_t subticks;  /* The anchor's reading less the master's at the packet's TX stamp, modulo 2⁴⁸. */
-    real report_variance_m2;
-    int32_t relay_count;
-    Relay relays[32];
-} Packet;
-
 /* A packet of a batch. */
 typedef struct BatchPacket {
     int32_t place;  /* Row of its anchor in the table of places. */
@@ -635,6 +937,9 @@ typedef struct Equations {
     real v[4];
 } Equations;
 
+SKYLESS_EXPORT int32_t skyless_unwrap_stamp(Neighbours *t, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t
+        rx_ticks, int64_t period_ticks);
+SKYLESS_EXPORT int32_t skyless_read_frame(uint8_t *frame, int32_t length, BeaconFields *b);
 SKYLESS_EXPORT void skyless_prepare(State *s);
 SKYLESS_EXPORT int32_t skyless_find_anchor(State *s, int32_t identifier);
 SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *position_m, real std_m, bool is_open);
@@ -649,6 +954,16 @@ SKYLESS_EXPORT void skyless_find_steady_state(State *s, PlannedMessage *messages
         int32_t most, int32_t step, SteadyState *found);
 SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_ticks, real *position_m, uint8_t *known,
         int32_t first, real elapsed_s, real walked_m);
+SKYLESS_EXPORT int32_t skyless_admit_sender(Admission *a, int32_t site, int32_t anchor, int64_t rx_counter, real
+        host_s);
+SKYLESS_EXPORT int32_t skyless_admit_stamp(Admission *a, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t
+        period_ticks);
+SKYLESS_EXPORT int32_t skyless_process_in_course(Course *c, State *s, FixTime *time, Packet *packet, uint8_t *packed,
+        int32_t packed_bytes);
+SKYLESS_EXPORT int32_t skyless_hear_frame(Hearing *h, Course *c, State *s, uint8_t *frame, int32_t length, int64_t
+        rx_counter, real host_s, real rx_power_dbm, real first_path_power_dbm);
+SKYLESS_EXPORT int32_t skyless_hear_fields(Hearing *h, Course *c, State *s, int64_t rx_counter, real host_s, real
+        rx_power_dbm, real first_path_power_dbm);
 SKYLESS_EXPORT int32_t skyless_find_position(LocateProblem *p, Found *found);
 
 #endif

@@ -19,7 +19,8 @@ from skyless.core.air.almanac import (
 )
 from skyless.core.air.frame import Malformed
 from skyless.core.air.local_almanac import filter_pages_of, georeference_page_of
-from skyless.core.air.page_codec import PAGE_BYTES, decode_page, encode_page
+from skyless.core.air.page_check import PAGE_BYTES
+from skyless.core.air.page_codec import decode_page, encode_page
 from skyless.core.protocol1.schedule import first_slots, schedule_of
 from skyless.core.site import AccuracySite, Site
 

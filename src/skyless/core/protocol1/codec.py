@@ -23,7 +23,8 @@ from skyless.core.air.frame import (
     not_a_beacon,
 )
 from skyless.core.air.ieee802154 import fcs, is_intact
-from skyless.core.air.page_codec import PAGE_BYTES, decode_page, encode_page
+from skyless.core.air.page_check import PAGE_BYTES
+from skyless.core.air.page_codec import decode_page, encode_page
 from skyless.core.protocol1.beacon import Beacon, MasterTime
 
 AUTHENTICATION_BYTES: Final = 16

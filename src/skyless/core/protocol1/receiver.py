@@ -3,17 +3,24 @@
 It needs nothing but beacons: anchors, schedule and noise figures come from the almanac on the air.
 """
 
+from math import nan
+from typing import Final
+
 import numpy as np
 from msgspec import Struct
 
 from skyless.core.air.almanac import AccuracyPage, NoisePage, SchedulePage
+from skyless.core.air.first_path import variance_factor_of
 from skyless.core.air.frame import Heard, Malformed
 from skyless.core.air.reception import Reception
+from skyless.core.air.site_choice import note_fix
 from skyless.core.arrays import Array
 from skyless.core.constants import SUBTICKS, TICK_M
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, METHODS
+from skyless.core.native.library import compiled
+from skyless.core.native.records import packed, unpacked
 from skyless.core.observation import Observation
 from skyless.core.protocol1._master_scale import MasterScale
 from skyless.core.protocol1._master_term import FollowedMaster, master_term_of
@@ -22,13 +29,8 @@ from skyless.core.protocol1.beacon import Beacon
 from skyless.core.protocol1.codec import decode_cached, packed_relays
 from skyless.core.protocol1.schedule import Schedule, schedule_from_page
 from skyless.core.protocol1.snapshots import SnapshotMethod, Snapshots, SnapshotSettings, SnapshotsState
-from skyless.core.tag.beacon_receiver import (
-    AdmissionState,
-    BeaconReceiver,
-    HeardSite,
-    MethodOptions,
-    variance_factor_of,
-)
+from skyless.core.tag.admission import ADMITTED, Admission, admit_sender, admit_stamp, check
+from skyless.core.tag.beacon_receiver import AdmissionState, BeaconReceiver, HeardSite, MethodOptions
 from skyless.core.tag.factory import as_required, estimator_settings, stamp_variances
 from skyless.core.tag.joint import Estimation, EstimationState
 from skyless.core.ticks import FLIGHT_SLACK_TICKS, may_elapse, nearest, to_seconds
@@ -38,6 +40,7 @@ class ReceiverState(Struct, frozen=True, tag="protocol-1"):
     """All that a ``Receiver`` keeps."""
 
     admission: AdmissionState
+    admitted: bytes
     almanac: AlmanacState
     followed: FollowedMaster
     master: int | None
@@ -49,7 +52,7 @@ class ReceiverState(Struct, frozen=True, tag="protocol-1"):
     method: EstimationState | SnapshotsState | None
 
 
-class Receiver(BeaconReceiver[Beacon]):
+class Receiver(BeaconReceiver):
     """One listening tag of protocol 1."""
 
     def __init__(
@@ -72,6 +75,9 @@ class Receiver(BeaconReceiver[Beacon]):
         if method not in METHODS:
             raise ValueError(f"method {method!r} is not one of {', '.join(METHODS)}")
         super().__init__(MethodOptions(method, qa, z_bounds_m, integrity or IntegrityRequirement()), site)
+        self._admission = Admission()
+        if site is not None:
+            self._admission.choice.only_site = site
         self.almanac = AlmanacAssembly()
         self._schedule: Schedule | None = None
         self._scale: tuple[int, int] | None = None
@@ -89,6 +95,7 @@ class Receiver(BeaconReceiver[Beacon]):
         """All that it keeps, as it is now; to be used or encoded before its next frame, as parts are shared."""
         return ReceiverState(
             admission=self._admission_state(),
+            admitted=packed(self._admission),
             almanac=self.almanac.state(),
             followed=self._followed,
             master=self._master,
@@ -108,6 +115,8 @@ class Receiver(BeaconReceiver[Beacon]):
         """
         made = cls(state.admission.options.method)
         made._restore_admission(state.admission)
+        made._admission = unpacked(Admission, state.admitted)
+        check(made._admission)
         made._superframe_ticks, made._followed = state.superframe_ticks, state.followed
         made.almanac.restore(state.almanac)
         made._read_positions()
@@ -126,6 +135,11 @@ class Receiver(BeaconReceiver[Beacon]):
         return made
 
     @property
+    def admission(self) -> Admission:
+        """What it knows of its own counter, of sites and of anchors."""
+        return self._admission
+
+    @property
     def method(self) -> Estimation | Snapshots | None:
         """The positioning method in use, None before the almanac is known."""
         return self._method
@@ -142,30 +156,52 @@ class Receiver(BeaconReceiver[Beacon]):
             return None
         return HeardSite(almanac.anchors_m, almanac.georeference, is_complete=almanac.georeference is not None)
 
-    def _decode(self, frame: bytes) -> Beacon | Malformed:
-        return decode_cached(frame)
+    def hear(self, reception: Reception) -> Fix | None:
+        """Process a frame from the air; a fix if it made one, else ``reason`` is set.
 
-    def _period_ticks(self, beacon: Beacon) -> int:  # noqa: ARG002 (the same for all anchors)
-        return self._superframe_ticks
+        What does not belong here is counted in ``counters`` and dropped; nothing on the air raises.
+        """
+        beacon = decode_cached(reception.frame)
+        if isinstance(beacon, Malformed):
+            self.counters[beacon] += 1
+            return None
+        return self.hear_beacon(beacon, reception)
 
-    def _is_of_site(self, beacon: Beacon, rx_ticks: int) -> bool:
-        """Whether a beacon is of an anchor of the site in use."""
-        if not super()._is_of_site(beacon, rx_ticks):
+    def hear_beacon(self, beacon: Beacon, reception: Reception) -> Fix | None:
+        """Process a beacon that is decoded already, as ``hear`` does."""
+        if not self._admit(beacon, reception):
+            return None
+        self.counters["heard"] += 1
+        result = self._process(beacon, reception)
+        if isinstance(result, Fix):
+            note_fix(self._admission.choice, self._admission.rx_ticks)
+        return self._judge(result)
+
+    def _admit(self, beacon: Beacon, reception: Reception) -> bool:
+        """Whether a beacon is of an anchor of the site in use and of the present master, with possible stamps."""
+        admission, host_s = self._admission, reception.host_s
+        outcome = _admit_sender(
+            admission, beacon.site, beacon.anchor, reception.rx_ticks, nan if host_s is None else host_s
+        )
+        self._handle_events()
+        if outcome == ADMITTED:
+            if beacon.anchor not in self._positions and self.almanac.complete:
+                self.counters["unknown-anchor"] += 1
+                return False
+            stamps = beacon.anchor, beacon.sequence, beacon.tx_ticks
+            outcome = _admit_stamp(admission, *stamps, self._superframe_ticks)
+        self._count_drop(outcome)
+        if outcome != ADMITTED:
             return False
-        if beacon.anchor not in self._positions and self.almanac.complete:
-            self.counters["unknown-anchor"] += 1
-            return False
-        return True
-
-    def _admit(self, beacon: Beacon, rx_ticks: int) -> int | None:
-        """TX stamp, unwrapped, of a beacon that may be used, by the present master."""
-        tx_ticks = super()._admit(beacon, rx_ticks)
-        if tx_ticks is None or self._followed.on_beacon(beacon, rx_ticks, self._superframe_ticks):
-            return tx_ticks
+        if self._followed.on_beacon(beacon, admission.rx_ticks, self._superframe_ticks):
+            return True
         self.counters["stale-master"] += 1
-        return None
+        return False
 
-    def _process(self, beacon: Beacon, reception: Reception, rx_ticks: int, tx_ticks: int) -> Fix | NoFixReason:
+    def _process(self, beacon: Beacon, reception: Reception) -> Fix | NoFixReason:
+        """Process a beacon that is admitted."""
+        neighbours, rx_ticks = self._admission.neighbours, self._admission.rx_ticks
+        tx_ticks = neighbours.rows[neighbours.row].tx_ticks
         self._read_almanac(beacon)
         method, anchor_m = self._method, self._positions.get(beacon.anchor)
         if method is None or anchor_m is None:
@@ -177,7 +213,7 @@ class Receiver(BeaconReceiver[Beacon]):
     ) -> Observation:
         """A beacon with relays and the master's term, or with its round and the stamp of the master's frame."""
         ticks_master, fraction, variance_m2 = self._master_time(beacon, rx_ticks)
-        factor = variance_factor_of(reception)
+        factor = variance_factor_of(reception.diagnostics)
         if self._options.method not in FILTERS:
             heard = beacon.master_heard if beacon.master == self._master else None
             master_sequence, master_rx_ticks = _stamp_of(heard, tx_ticks)
@@ -280,12 +316,16 @@ class Receiver(BeaconReceiver[Beacon]):
         if options.method not in FILTERS:
             variances = stamp_variances(noise)
             settings = SnapshotSettings(master, schedule.anchors, *variances, height_m, options.z_bounds_m)
-            return Snapshots(SnapshotMethod(options.method), settings, self._time)
+            return Snapshots(SnapshotMethod(options.method), settings, self._admission.time)
         superframe_s = to_seconds(self._superframe_ticks)
         assumed = estimator_settings(options.qa, height_m, noise, accuracy, superframe_s)
-        return Estimation(as_required(assumed, options), options.z_bounds_m, self._time, superframe_s)
+        return Estimation(as_required(assumed, options), options.z_bounds_m, self._admission.time, superframe_s)
 
 
 def _stamp_of(heard: Heard | None, tx_ticks: int) -> tuple[int, int] | tuple[None, None]:
     """Sequence number and unwrapped RX stamp of what the sender of a beacon received before that."""
     return (None, None) if heard is None else (heard.sequence, nearest(heard.rx_ticks, tx_ticks))
+
+
+_admit_sender: Final = compiled(admit_sender)
+_admit_stamp: Final = compiled(admit_stamp)

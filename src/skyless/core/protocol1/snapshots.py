@@ -16,7 +16,7 @@ from skyless.core.constants import TICK_M
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.observation import Observation
 from skyless.core.tag.locate import NoSolution, Solution, locate
-from skyless.core.ticks import FLIGHT_SLACK_TICKS, FixTime, may_elapse
+from skyless.core.ticks import FLIGHT_SLACK_TICKS, FixTime, fix_time_s, may_elapse
 
 
 class SnapshotMethod(StrEnum):
@@ -269,7 +269,7 @@ class Snapshots:
         residuals = solution.residuals_m
         quality = np.array((solution.chi2, residuals @ residuals / len(residuals), 0.0))
         return Fix(
-            time_s=self._time.time_s(message.tx_ticks_anchor, message.rx_ticks_tag),
+            time_s=fix_time_s(self._time, message.tx_ticks_anchor, message.rx_ticks_tag),
             rows=np.vstack((solution.position_m, solution.covariance_m2, quality)).tobytes(),
             anchors=anchors,
             anchors_m=anchors_m,

@@ -1,33 +1,23 @@
-"""What the receivers of both protocols have in common: which beacons are admitted.
-
-A beacon is admitted if it is of the site in use, and its stamps are possible on its sender's and the tag's counter.
-"""
+"""What the receivers of both protocols have in common."""
 
 from abc import ABC, abstractmethod
 from collections import Counter
 from math import inf, isfinite
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Final, Protocol
 
 from msgspec import Struct
 
 from skyless.core.air.almanac import GeoreferencePage
-from skyless.core.air.anchor_stamps import AnchorStamps, StampTracks
-from skyless.core.air.first_path import variance_factor
-from skyless.core.air.frame import AnyBeacon, Malformed
 from skyless.core.air.reception import Reception
-from skyless.core.air.site_choice import SiteChoice, SiteUse
+from skyless.core.air.site_choice import NO_SITE
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
+from skyless.core.tag.admission import COUNTER_JUMPED, DROP_COUNTERS, HOST_JUMPED, SITE_CHANGED, Admission
 from skyless.core.tag.joint import Estimation
-from skyless.core.ticks import LAST_TICKS, FixTime, Unwrapper, from_seconds
+from skyless.core.ticks import FixTime
 
 NOT_DROPS: Final = frozenset({"heard", "fixes", "anchor-restart", "counter-jump", "site-change"})
 """Counters of a receiver that do not count dropped frames."""
-
-COUNTER_JUMP_TICKS: Final = from_seconds(1.0)
-"""Stamps that go back farther than radios and hosts reorder them mean that the tag's own counter has restarted."""
-
-B = TypeVar("B", bound=AnyBeacon)
 
 
 class MethodOptions(Struct, frozen=True):
@@ -87,15 +77,12 @@ class AdmissionState(Struct, frozen=True):
     """What a ``BeaconReceiver`` keeps itself."""
 
     options: MethodOptions
-    choice: SiteChoice
+    only_site: int | None
     counters: dict[str, int]
     reason: NoFixReason
-    time: FixTime
-    own_ticks: Unwrapper
-    stamps: StampTracks
 
 
-class BeaconReceiver(ABC, Generic[B]):
+class BeaconReceiver(ABC):
     """One listening tag that understands one protocol."""
 
     def __init__(self, options: MethodOptions, site: int | None) -> None:
@@ -103,15 +90,18 @@ class BeaconReceiver(ABC, Generic[B]):
         self.counters: Counter[str] = Counter()
         self.reason: NoFixReason = NoFixReason.NO_BEACONS
         self._options = options
-        self._choice = SiteChoice(site)
-        self._time = FixTime()
-        self._own_ticks = Unwrapper()
-        self._stamps = AnchorStamps(self.counters)
+        self._only_site = site
+
+    @property
+    @abstractmethod
+    def admission(self) -> Admission:
+        """What it knows of its own counter, of sites and of anchors."""
 
     @property
     def site(self) -> int | None:
         """Identifier of the site that it receives, None before the first beacon."""
-        return self._choice.only_site if self._choice.site is None else self._choice.site
+        site = self.admission.choice.site
+        return self._only_site if site == NO_SITE else site
 
     @property
     @abstractmethod
@@ -144,45 +134,9 @@ class BeaconReceiver(ABC, Generic[B]):
         method = self._estimation
         return method is not None and method.update_height(height_m, std_m)
 
-    def hear(self, reception: Reception) -> Fix | None:
-        """Process a frame from the air; a fix if it made one, else ``reason`` is set.
-
-        What does not belong here is counted in ``counters`` and dropped; nothing on the air raises.
-        """
-        beacon = self._decode(reception.frame)
-        if isinstance(beacon, Malformed):
-            self.counters[beacon] += 1
-            return None
-        return self.hear_beacon(beacon, reception)
-
-    def hear_beacon(self, beacon: B, reception: Reception) -> Fix | None:
-        """Process a beacon that is decoded already, as ``hear`` does."""
-        rx_ticks = self._own_ticks.unwrap(reception.rx_ticks, reception.host_s)
-        tx_ticks = self._admit(beacon, rx_ticks)
-        if tx_ticks is None:
-            return None
-        self.counters["heard"] += 1
-        result = self._process(beacon, reception, rx_ticks, tx_ticks)
-        if isinstance(result, Fix):
-            self.counters["fixes"] += 1
-            self._choice.on_fix(rx_ticks)
-            return result
-        self.reason = result
-        if result is NoFixReason.RESIDUALS:
-            self.counters["outlier"] += 1
-        return None
-
-    @abstractmethod
-    def _decode(self, frame: bytes) -> B | Malformed:
-        """The beacon in a frame."""
-
-    @abstractmethod
-    def _process(self, beacon: B, reception: Reception, rx_ticks: int, tx_ticks: int) -> Fix | NoFixReason:
-        """Process a beacon that is admitted; stamps are unwrapped."""
-
-    @abstractmethod
-    def _period_ticks(self, beacon: B) -> int:
-        """Mean time between two beacons of an anchor, as far as it is known."""
+    def continue_time_of(self, other: "BeaconReceiver", fix_time: FixTime) -> None:
+        """Count the tag's counter on as another receiver does, and the time of fixes from ``fix_time`` on."""
+        self.admission.time, self.admission.own = fix_time, other.admission.own
 
     @abstractmethod
     def _forget_site(self) -> None:
@@ -192,66 +146,37 @@ class BeaconReceiver(ABC, Generic[B]):
     def _forget_stamps(self) -> None:
         """The tag's counter has restarted: forget all but what the site has in common."""
 
-    def _admit(self, beacon: B, rx_ticks: int) -> int | None:
-        """TX stamp, unwrapped, of a beacon that may be used; None for others, which are counted."""
-        newest = self._stamps.tracks.newest_rx_ticks
-        jumped = newest is not None and rx_ticks < newest - COUNTER_JUMP_TICKS
-        if (jumped or not -LAST_TICKS <= rx_ticks <= LAST_TICKS) and not self._restart(rx_ticks):
-            return None
-        if not self._is_of_site(beacon, rx_ticks):
-            return None
-        tx_ticks = self._stamps.unwrap(beacon, rx_ticks, self._period_ticks(beacon))
-        if tx_ticks is not None:
-            self._choice.heard_ticks = rx_ticks
-        return tx_ticks
-
-    def _restart(self, rx_ticks: int) -> bool:
-        """Forget all stamps, as the tag's counter restarted; False where the host's clock jumped by over a year."""
-        self._stamps.forget()
-        self._forget_stamps()
-        if abs(rx_ticks) <= LAST_TICKS:
+    def _handle_events(self) -> None:
+        """Count what has happened to the tag's counter and site, and forget what that makes useless."""
+        events, self.admission.events = self.admission.events, 0
+        if events & COUNTER_JUMPED:
             self.counters["counter-jump"] += 1
-            self._choice.restart(rx_ticks)
-            return True
-        self.counters["impossible-host-time"] += 1
-        self._own_ticks = Unwrapper()
-        self._choice.restart(0)
-        return False
-
-    def _is_of_site(self, beacon: B, rx_ticks: int) -> bool:
-        """Whether a beacon is of the site in use, which may have changed."""
-        had_site = self._choice.site is not None
-        use = self._choice.on_beacon(beacon.site, beacon.anchor, rx_ticks)
-        if use is SiteUse.FOREIGN:
-            self.counters["foreign-site"] += 1
-            return False
-        if use is SiteUse.CHANGED and had_site:
+        if events & (COUNTER_JUMPED | HOST_JUMPED):
+            self._forget_stamps()
+        if events & SITE_CHANGED:
             self.counters["site-change"] += 1
             self._forget_site()
-            self._stamps.forget()
             self._forget_stamps()
-        return True
+
+    def _count_drop(self, outcome: int) -> None:
+        """Count a frame that is not used."""
+        for name in DROP_COUNTERS[outcome]:
+            self.counters[name] += 1
+
+    def _judge(self, result: Fix | NoFixReason) -> Fix | None:
+        """Count what a beacon that is used has led to."""
+        if isinstance(result, Fix):
+            self.counters["fixes"] += 1
+            return result
+        self.reason = result
+        if result is NoFixReason.RESIDUALS:
+            self.counters["outlier"] += 1
+        return None
 
     def _admission_state(self) -> AdmissionState:
-        return AdmissionState(
-            self._options,
-            self._choice,
-            dict(self.counters),
-            self.reason,
-            self._time,
-            self._own_ticks,
-            self._stamps.tracks,
-        )
+        return AdmissionState(self._options, self._only_site, dict(self.counters), self.reason)
 
     def _restore_admission(self, state: AdmissionState) -> None:
-        self._options, self._choice = state.options, state.choice
+        self._options, self._only_site = state.options, state.only_site
         self.counters.update(state.counters)
         self.reason = state.reason
-        self._time, self._own_ticks = state.time, state.own_ticks
-        self._stamps = AnchorStamps(self.counters, state.stamps)
-
-
-def variance_factor_of(reception: Reception) -> float:
-    """Factor on the variance of a reception, from what the radio measured of it."""
-    measured = reception.diagnostics
-    return 1.0 if measured is None else variance_factor(measured.rx_power_dbm, measured.first_path_power_dbm)

@@ -11,7 +11,7 @@ from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.observation import Observation
 from skyless.core.tag.beacon_receiver import AdmissionState, MethodOptions
 from skyless.core.tag.joint import Estimation, EstimationState
-from skyless.core.tag.selection import MAX_ANCHORS_IN_USE, AnchorSelection
+from skyless.core.tag.selection import MAX_ANCHORS_IN_USE
 from skyless.core.ticks import FixTime, to_seconds
 
 DROP_S: Final = 2.0
@@ -76,10 +76,10 @@ class ReceiverState(Struct, frozen=True, tag="protocol-2"):
     """All that a ``Receiver`` keeps; to be used or encoded before its next frame, as they share some parts."""
 
     admission: AdmissionState
+    hearing: bytes
     almanac: LocalAlmanacState
     method_period_ticks: int
     method: EstimationState | None
-    selection: AnchorSelection
     waiting: tuple[Observation, ...]
     moved_ticks: dict[int, int]
     uses_moved: bool

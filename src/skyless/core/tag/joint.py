@@ -1,5 +1,6 @@
 """``joint``: the estimator as a positioning method: cold start, packet by packet updates, new starts when lost."""
 
+from collections.abc import Iterable
 from math import sqrt
 from typing import Final
 
@@ -8,42 +9,30 @@ from msgspec import Struct
 
 from skyless.core.arrays import Array
 from skyless.core.constants import TICK_S
+from skyless.core.estimator.compiled import process_frame
 from skyless.core.estimator.estimator import NO_REPORT, Estimator, Report, SavedEstimator
-from skyless.core.estimator.process import ACCEPTED, REJECTED, STALE
+from skyless.core.estimator.process import ACCEPTED, Packet, Place
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
-from skyless.core.fix import POSITION, PROTECTED_ROWS, PROTECTION, QUALITY, VELOCITY, Fix, NoFixReason
+from skyless.core.fix import POSITION, PROTECTED_ROWS, PROTECTION, VELOCITY, Fix, NoFixReason
 from skyless.core.integrity import UNAVAILABLE, IntegrityRequirement
+from skyless.core.native.library import compiled
+from skyless.core.native.records import packed, unpacked, view
+from skyless.core.native.sizes import MAX_ANCHORS
 from skyless.core.observation import Observation
 from skyless.core.tag._acquisition import Acquisition, Start
-from skyless.core.ticks import FixTime, from_seconds
-
-SURELY_IN_REACH_TICKS: Final = from_seconds(TUNING.short_silence_s) - 1
-"""Silences up to this need no check of the filter."""
-
-
-class AnchorsInUseState(Struct, frozen=True):
-    """What ``AnchorsInUse`` keeps."""
-
-    used: tuple[Observation, ...]
-    checked_ticks: int
-    extent_m: float
-
-
-class _Course(Struct):
-    """What has become of the starts so far."""
-
-    open_range_errors: bool = False
-    """Whether the next start expects larger range errors than the settings state."""
-    is_open: bool = False
-    """Whether the last start did."""
-    start_was_contradicted: bool = False
-    relays_may_contradict: bool = True
-    may_begin_again: bool = True
-    """Whether a start that fits badly from the beginning is given up: not twice in a row."""
-    master_less_tag_ticks: int = 0
-    started_ticks: int = 0
-    newest_ticks: int = 0
-    heights_rejected: int = 0
+from skyless.core.tag.course import (
+    BAD_GEOMETRY,
+    FIX,
+    LOST,
+    OUTLIER,
+    START_CONTRADICTED,
+    Course,
+    is_surely_in_reach,
+    process_in_course,
+    settle,
+    use_anchor,
+)
+from skyless.core.ticks import FixTime, fix_time_s
 
 
 class EstimationState(Struct, frozen=True, tag="joint"):
@@ -51,8 +40,7 @@ class EstimationState(Struct, frozen=True, tag="joint"):
 
     estimator: SavedEstimator
     start: Acquisition | None
-    in_use: AnchorsInUseState
-    course: _Course
+    course: bytes
 
 
 class Estimation:
@@ -84,15 +72,19 @@ class Estimation:
             TUNING.curved_std if superframe_s < TUNING.slow_superframe_s else TUNING.slow_curved_std
         )
         self._z_bounds_m = z_bounds_m
-        self._course = _Course()
+        # one counts as in use while its last accepted message is younger than this
+        self.course = Course(in_use_s=max(TUNING.short_silence_s, 1.5 * superframe_s))
         self._estimator = Estimator(settings)
         self._start: Acquisition | None = self._new_start()
         self._time = fix_time or FixTime()
-        self._in_use = AnchorsInUse(superframe_s)
+        self._listed = -1
+        """The course's changes for which these are the anchors in use."""
+        self._anchors: tuple[int, ...] = ()
+        self._anchors_m: Array = np.empty((0, 3))
 
     def state(self) -> EstimationState:
         """All that it keeps, as it is now."""
-        return EstimationState(self._estimator.save(), self._start, self._in_use.state(), self._course)
+        return EstimationState(self._estimator.save(), self._start, packed(self.course))
 
     def restore(self, state: EstimationState) -> None:
         """Continue from the state of one with the same settings.
@@ -100,10 +92,12 @@ class Estimation:
         Raises:
             ValueError: the estimator's arrays are not sound.
         """
+        course = unpacked(Course, state.course)
+        if not 0 <= course.count <= MAX_ANCHORS:
+            raise ValueError(f"{course.count} anchors are in use; there can be {MAX_ANCHORS}")
         self._start = state.start
         self._estimator.restore(state.estimator)
-        self._in_use.restore(state.in_use)
-        self._course = state.course
+        self.course, self._listed = course, -1
 
     @property
     def estimator(self) -> Estimator:
@@ -136,26 +130,37 @@ class Estimation:
         """Process one observation; a fix for every accepted packet once started."""
         ticks_master, rx_ticks = observation.tx_ticks_master, observation.rx_ticks_tag
         if ticks_master is not None:
-            self._course.master_less_tag_ticks = ticks_master - rx_ticks
-        if (
-            self._start is None
-            and not 0 <= rx_ticks - self._course.newest_ticks < SURELY_IN_REACH_TICKS
-            and self._is_out_of_reach(observation)
-        ):
+            self.course.master_less_tag_ticks = ticks_master - rx_ticks
+        is_near = is_surely_in_reach(self.course, rx_ticks)
+        if self._start is None and not is_near and self._is_out_of_reach(observation):
             self._start = self._new_start()
         if self._start is not None:
             return self._try_start(self._start, observation)
-        outcome = self._process(observation)
-        self._course.newest_ticks = max(self._course.newest_ticks, rx_ticks)
-        if outcome in {REJECTED, STALE}:
-            if self._estimator.is_lost:
-                self._start = self._new_start()
-            return NoFixReason.RESIDUALS
-        if self._is_contradicted(rx_ticks):
+        packet, relays = self._packet(observation), observation.packed_relays
+        estimator = self._estimator
+        return self.result_of(_process_in_course(self.course, estimator.state, self._time, packet, relays, len(relays)))
+
+    def result_of(self, outcome: int) -> Fix | NoFixReason:
+        """What the outcome of a packet in the course means; the next one may be a start."""
+        if outcome == FIX:
+            return self.fix()
+        if outcome in {LOST, START_CONTRADICTED}:
             self._start = self._new_start()
-            return NoFixReason.ACQUIRING
-        self._in_use.add(observation)
-        return self._fix(observation)
+        return _REASONS[outcome]
+
+    def fix(self) -> Fix:
+        """The fix of the packet that was processed last."""
+        course, requirement = self.course, self._requirement
+        if course.changes != self._listed:
+            self._list_anchors()
+        rows, anchors, anchors_m = self._estimator.rows, self._anchors, self._anchors_m
+        # in the order of the fields: with their names it takes as long as all the rest
+        return Fix(course.time_s, rows, anchors, anchors_m, "joint", self._height_known, 1, requirement)
+
+    def _list_anchors(self) -> None:
+        used = view(self.course.used)[: self.course.count]
+        self._anchors, self._anchors_m = tuple(used["anchor"].tolist()), used["position_m"].copy()
+        self._listed = self.course.changes
 
     def _try_start(self, starting: Acquisition, observation: Observation) -> Fix | NoFixReason:
         starting.add_relays(observation)
@@ -166,7 +171,7 @@ class Estimation:
             return NoFixReason.RESIDUALS  # single packets are late: others will not be
         if self._superframe_s > TUNING.longest_superframe_s:
             return self._fix_of(start, observation)
-        return self._fix(observation) if self._begin(start, starting.packets()) else NoFixReason.ACQUIRING
+        return self._settled(observation) if self._begin(start, starting.packets()) else NoFixReason.ACQUIRING
 
     def update_height(self, height_m: float, std_m: float) -> bool:
         """Process the tag's height as a sensor measures it, at the newest packet; True if it was used.
@@ -178,45 +183,19 @@ class Estimation:
             self._start.expect_height(height_m - margin_m, height_m + margin_m)
             return False
         used = self._estimator.process_height(height_m, std_m) == ACCEPTED
-        self._course.heights_rejected = 0 if used else self._course.heights_rejected + 1
-        if self._course.heights_rejected >= TUNING.heights_in_row and not self._height_known:
-            self._course.heights_rejected = 0
+        self.course.heights_rejected = 0 if used else self.course.heights_rejected + 1
+        if self.course.heights_rejected >= TUNING.heights_in_row and not self._height_known:
+            self.course.heights_rejected = 0
             self._start = self._new_start()
         return used
 
     def coast(self, observation: Observation) -> Fix | NoFixReason:
         """A fix when a packet came that was not used itself: by all others, and by what was relayed with it."""
-        return NoFixReason.RESIDUALS if self._start is not None else self._fix(observation)
+        return NoFixReason.RESIDUALS if self._start is not None else self._settled(observation)
 
-    def _is_contradicted(self, rx_ticks: int) -> bool:
-        """Whether a new start is needed, as relays or faults contradict this one; decides what that has to expect."""
-        if self._course.start_was_contradicted and self._estimator.is_late_often:
-            self._course.open_range_errors = self._course.start_was_contradicted = (
-                False  # it was by single late packets
-            )
-            return True
-        age_s = (rx_ticks - self._course.started_ticks) * TICK_S
-        if age_s >= TUNING.new_start_s:
-            self._course.may_begin_again = True
-        elif self._course.may_begin_again and self._estimator.state.fix[QUALITY][0] > TUNING.early_nis:
-            self._course.may_begin_again = False  # if it does not help, all is noisier than stated
-            return True
-        if self._course.is_open and age_s > TUNING.new_start_s and self._estimator.fits_settings:
-            self._course.open_range_errors = False
-            return True
-        if self._estimator.state.fix[QUALITY][2] > TUNING.sure_chi2:
-            limit = TUNING.sure_chi2 if self._course.start_was_contradicted else TUNING.uncovered_chi2
-            if self._estimator.fault_test > limit and (not self._course.is_open or age_s > TUNING.new_start_s):
-                self._course.open_range_errors = not self._estimator.is_late_often
-                return True
-        if not self._course.relays_may_contradict:
-            self._course.relays_may_contradict = self._estimator.relays_fit
-        elif self._estimator.is_contradicted:
-            self._course.relays_may_contradict = (
-                False  # if a new start does not help, the anchors are wrong, not the position
-            )
-            return True
-        return False
+    def _settled(self, observation: Observation) -> Fix | NoFixReason:
+        """The state as a fix, if it is one."""
+        return self.result_of(settle(self.course, self._estimator.state, self._time, observation.rx_ticks_tag))
 
     def _new_start(self) -> Acquisition:
         settings = self._settings
@@ -228,14 +207,27 @@ class Estimation:
 
     def _is_out_of_reach(self, observation: Observation) -> bool:
         """Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back."""
-        silent_s = (observation.rx_ticks_tag - self._course.newest_ticks) * TICK_S
+        silent_s = (observation.rx_ticks_tag - self.course.newest_ticks) * TICK_S
         if not -TUNING.short_silence_s <= silent_s <= TUNING.longest_silence_s:
             return True
         if silent_s < TUNING.short_silence_s:
             return False
         std_m = sqrt(self._estimator.horizontal_variance_m2(silent_s))
-        mean_range_m = self._in_use.mean_range_m(self._estimator.position_m())
-        return std_m > self._max_relative_std * mean_range_m
+        return std_m > self._max_relative_std * self._mean_range_m(self._estimator.position_m())
+
+    def _mean_range_m(self, position_m: Array) -> float:
+        """From a position, shape (2,) or (3,), to the anchors in use."""
+        self._list_anchors()
+        away = self._anchors_m[:, : len(position_m)] - position_m
+        return float(np.linalg.norm(away, axis=1).mean())
+
+    def _use_only(self, observations: Iterable[Observation]) -> None:
+        """Use the anchors of these observations and no others."""
+        self.course.count, self.course.extent_m = 0, 0.0
+        for one in observations:
+            place = Place(anchor=one.anchor)
+            view(place.position_m)[:] = one.anchor_m
+            use_anchor(self.course, place, one.rx_ticks_tag)
 
     def _begin(self, start: Start, packets: list[Observation]) -> bool:
         """Begin at the start's position, and process the packets that led there.
@@ -247,43 +239,45 @@ class Estimation:
             kept = _nearest(start, self._most_anchors)
             packets = [packet for packet in packets if packet.anchor in kept]
         is_contradicted = start.is_contradicted and not self._estimator.is_late_often
-        is_open = self._course.open_range_errors or (is_contradicted and not start.misfitting)
+        is_open = self.course.open_range_errors or (is_contradicted and not start.misfitting)
         expected_m2 = settings.tx_variance_m2 + settings.rx_variance_m2 + _error_variance_m2(settings)
         inflation = 1.0 + TUNING.late_std_m**2 / expected_m2 if is_open or is_contradicted else TUNING.start_margin
         begin_ticks, speed_m2ps2 = packets[0].rx_ticks_tag, settings.start_speed_std_mps**2
         age_s = (start.rx_ticks_tag - begin_ticks) * TICK_S
         covariance = inflation * start.covariance[:dim, :dim] + age_s**2 * speed_m2ps2 * np.eye(dim)
-        self._in_use.begin(start.used)
-        if np.trace(covariance[:2, :2]) > self._in_use.mean_range_m(start.solution[:dim]) ** 2:
+        self._use_only(start.used)
+        if np.trace(covariance[:2, :2]) > self._mean_range_m(start.solution[:dim]) ** 2:
             return False
         self._start = None
-        self._course.newest_ticks = self._course.started_ticks = packets[-1].rx_ticks_tag
-        self._course.is_open, self._course.start_was_contradicted = is_open, is_open or is_contradicted
+        self.course.newest_ticks = self.course.started_ticks = packets[-1].rx_ticks_tag
+        self.course.is_open, self.course.start_was_contradicted = is_open, is_open or is_contradicted
         self._estimator.start(
             begin_ticks,
             start.solution[:dim],
             covariance,
             speed_m2ps2,
             is_open,
-            TUNING.late_std_m if self._course.start_was_contradicted else TUNING.lasting_std_m,
+            TUNING.late_std_m if self.course.start_was_contradicted else TUNING.lasting_std_m,
             start.misfitting if is_contradicted else (),
         )
         for packet in packets:
             self._process(packet)
         return True
 
-    def _process(self, observation: Observation) -> int:
-        estimator, relays = self._estimator, observation.relays
-        estimator.know_anchor(observation.anchor, observation.anchor_m, observation.anchor_std_m)
-        return estimator.process(
+    def _process(self, observation: Observation) -> None:
+        relays = observation.packed_relays
+        process_frame(self._estimator.state, self._packet(observation), relays, len(relays))
+
+    def _packet(self, observation: Observation) -> Packet:
+        self._estimator.know_anchor(observation.anchor, observation.anchor_m, observation.anchor_std_m)
+        return self._estimator.packet_of(
             observation.anchor,
             observation.sequence,
             observation.rx_ticks_tag,
             observation.tx_ticks_anchor,
-            relays,
-            packed=observation.packed_relays,
-            report=self._report(observation),
-            variance_factor=observation.rx_variance_factor,
+            observation.relays,
+            self._report(observation),
+            observation.rx_variance_factor,
         )
 
     def _report(self, observation: Observation) -> Report:
@@ -301,21 +295,22 @@ class Estimation:
         rows[POSITION + 1 : POSITION + 1 + dim, :dim] = start.covariance[:dim, :dim]
         rows[VELOCITY + 1 : VELOCITY + 1 + dim, :dim] = self._settings.start_speed_std_mps**2 * np.eye(dim)
         rows[PROTECTION, 2] = UNAVAILABLE
-        self._in_use.begin(start.used)
-        rx_ticks, in_use = observation.rx_ticks_tag, self._in_use
-        time_s = self._time.time_s(rx_ticks + self._course.master_less_tag_ticks, rx_ticks)
-        return Fix(
-            time_s, rows.tobytes(), in_use.anchors, in_use.anchors_m, "joint", self._height_known, 1, self._requirement
-        )
-
-    def _fix(self, observation: Observation) -> Fix | NoFixReason:
-        in_use, estimator, known = self._in_use, self._estimator, self._height_known
-        if not known and estimator.state.P[2][2] > in_use.extent_m**2:
-            return NoFixReason.BAD_GEOMETRY
+        self._use_only(start.used)
         rx_ticks = observation.rx_ticks_tag
-        time_s = self._time.time_s(rx_ticks + self._course.master_less_tag_ticks, rx_ticks)
-        # in the order of the fields: with their names it takes as long as all the rest
-        return Fix(time_s, estimator.rows, in_use.anchors, in_use.anchors_m, "joint", known, 1, self._requirement)
+        time_s = fix_time_s(self._time, rx_ticks + self.course.master_less_tag_ticks, rx_ticks)
+        self._list_anchors()
+        anchors, anchors_m = self._anchors, self._anchors_m
+        return Fix(time_s, rows.tobytes(), anchors, anchors_m, "joint", self._height_known, 1, self._requirement)
+
+
+_REASONS: Final = {
+    OUTLIER: NoFixReason.RESIDUALS,
+    LOST: NoFixReason.RESIDUALS,
+    START_CONTRADICTED: NoFixReason.ACQUIRING,
+    BAD_GEOMETRY: NoFixReason.BAD_GEOMETRY,
+}
+
+_process_in_course: Final = compiled(process_in_course)
 
 
 def _error_variance_m2(settings: EstimatorSettings) -> float:
@@ -329,63 +324,3 @@ def _nearest(start: Start, most: int) -> set[int]:
     away = [float(np.linalg.norm(one.anchor_m[:dim] - start.solution[:dim])) for one in start.used]
     nearest = np.argsort(away, kind="stable")[:most]
     return {start.used[index].anchor for index in nearest} | set(start.misfitting)
-
-
-# Anchors in use
-
-
-class AnchorsInUse:
-    """The anchors whose messages were accepted recently. Their list is made again only when it changes."""
-
-    def __init__(self, superframe_s: float) -> None:
-        # one counts as in use while its last accepted message is younger than this
-        self._in_use_s = max(TUNING.short_silence_s, 1.5 * superframe_s)
-        self._used: dict[int, Observation] = {}
-        self._checked_ticks = 0
-        self.anchors: tuple[int, ...] = ()
-        self.anchors_m: Array = np.empty((0, 3))
-        """Their positions, shape (len(anchors), 3)."""
-        self.extent_m = 0.0
-        """The largest span in x, y or z that anchors in use have had since the start."""
-
-    def state(self) -> AnchorsInUseState:
-        """All that it keeps."""
-        return AnchorsInUseState(tuple(self._used.values()), self._checked_ticks, self.extent_m)
-
-    def restore(self, state: AnchorsInUseState) -> None:
-        """Continue from a state."""
-        self._used = {observation.anchor: observation for observation in state.used}
-        self._checked_ticks, self.extent_m = state.checked_ticks, state.extent_m
-        self._list()
-
-    def begin(self, observations: tuple[Observation, ...]) -> None:
-        """Keep only the anchors of these observations."""
-        self._used.clear()
-        self.extent_m = 0.0
-        for observation in observations:
-            self.add(observation)
-
-    def add(self, observation: Observation) -> None:
-        """Add an accepted message."""
-        now = observation.rx_ticks_tag
-        before = self._used.get(observation.anchor)
-        changed = before is None or before.anchor_m is not observation.anchor_m
-        self._used[observation.anchor] = observation
-        if (now - self._checked_ticks) * TICK_S > self._in_use_s:
-            self._checked_ticks = now
-            stale = [a for a, o in self._used.items() if (now - o.rx_ticks_tag) * TICK_S > self._in_use_s]
-            changed = changed or bool(stale)
-            for anchor in stale:
-                del self._used[anchor]
-        if changed:
-            self._list()
-            self.extent_m = max(self.extent_m, float(np.ptp(self.anchors_m, axis=0).max()))
-
-    def _list(self) -> None:
-        self.anchors = tuple(self._used)
-        self.anchors_m = np.array([o.anchor_m for o in self._used.values()]).reshape(-1, 3)
-
-    def mean_range_m(self, position_m: Array) -> float:
-        """From a position, shape (2,) or (3,), to the anchors."""
-        away = self.anchors_m[:, : len(position_m)] - position_m
-        return float(np.linalg.norm(away, axis=1).mean())

@@ -3,25 +3,34 @@
 It needs nothing but beacons of protocol 2: anchors state their positions, and the common pages of a site the rest.
 """
 
-from typing import Final
+from math import nan
+from typing import Final, cast
 
 import numpy as np
 
+from skyless.core.air.almanac import Page
 from skyless.core.air.beacon import Beacon
-from skyless.core.air.codec import decode_cached, packed_relays
-from skyless.core.air.frame import Malformed
-from skyless.core.air.instants import period_ticks
+from skyless.core.air.codec import FAULTS, fields_of, page_of
+from skyless.core.air.first_path import powers_dbm
 from skyless.core.air.local_almanac import MIN_ANCHORS, PRESENT_TICKS, LocalAlmanac
+from skyless.core.air.neighbours import find_neighbour, is_confirmed
 from skyless.core.air.reception import Reception
+from skyless.core.air.site_choice import note_fix
+from skyless.core.estimator.state import State
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD
+from skyless.core.native.library import compiled
+from skyless.core.native.records import packed, unpacked, view
 from skyless.core.observation import Observation
-from skyless.core.tag.beacon_receiver import BeaconReceiver, HeardSite, MethodOptions, variance_factor_of
+from skyless.core.tag.admission import DROP_COUNTERS, Admission, check
+from skyless.core.tag.beacon_receiver import BeaconReceiver, HeardSite, MethodOptions
+from skyless.core.tag.course import FIX, Course
 from skyless.core.tag.factory import ReceiverState, new_method
+from skyless.core.tag.hearing import IS_RARE, MALFORMED, NO_ISSUE, Hearing, hear_fields, hear_frame
 from skyless.core.tag.joint import Estimation
-from skyless.core.tag.selection import MIN_FITTING, AnchorSelection, fitting_relays, is_full
-from skyless.core.ticks import from_seconds
+from skyless.core.tag.selection import is_full, replaced_by
+from skyless.core.ticks import NEVER, from_seconds
 
 MAX_WAITING: Final = 128
 """Beacons that are kept while the site's pages are not complete."""
@@ -33,8 +42,11 @@ must not be mixed. So a tag uses either the anchors that have stated another pos
 has moved for ``MOVE_TICKS``. It switches to the moved ones once they are the majority and none has moved for
 ``MOVED_HOLD_TICKS``."""
 
+_NOT_STARTED: Final = cast("tuple[Course, State]", (None, None))
+"""Null pointers: neither is used while a tag is starting."""
 
-class Receiver(BeaconReceiver[Beacon]):
+
+class Receiver(BeaconReceiver):
     """One listening tag of protocol 2; its positioning method is ``joint``."""
 
     def __init__(
@@ -52,12 +64,16 @@ class Receiver(BeaconReceiver[Beacon]):
         levels.
         """
         super().__init__(MethodOptions(DEFAULT_METHOD, qa, z_bounds_m, integrity or IntegrityRequirement()), site)
-        self.almanac = LocalAlmanac()
+        self._hearing = Hearing()
+        if site is not None:
+            self.admission.choice.only_site = site
+        self.almanac = LocalAlmanac(self.admission.neighbours)
         self._method: Estimation | None = None
         self._method_key: object = None
         self._method_period_ticks = 0
         """Mean time between two beacons of an anchor for which the method was made."""
-        self._selection = AnchorSelection()
+        self._course, self._state = _NOT_STARTED
+        """The method's course, and the state of its filter."""
         self._waiting: list[Observation] = []
         self._moved_ticks: dict[int, int] = {}
         """When anchors stated another position than before, until all are used together again."""
@@ -68,10 +84,10 @@ class Receiver(BeaconReceiver[Beacon]):
         """All that it keeps, as it is now; to be used or encoded before its next frame, as parts are shared."""
         return ReceiverState(
             admission=self._admission_state(),
+            hearing=packed(self._hearing),
             method_period_ticks=self._method_period_ticks,
             method=None if self._method is None else self._method.state(),
             almanac=self.almanac.state(),
-            selection=self._selection,
             waiting=tuple(self._waiting),
             moved_ticks=dict(self._moved_ticks),
             uses_moved=self._uses_moved,
@@ -86,8 +102,10 @@ class Receiver(BeaconReceiver[Beacon]):
         """
         made = cls()
         made._restore_admission(state.admission)
+        made._hearing = unpacked(Hearing, state.hearing)
+        check(made.admission)
+        made.almanac = LocalAlmanac(made.admission.neighbours)
         made.almanac.restore(state.almanac)
-        made._selection = state.selection
         made._waiting = list(state.waiting)
         made._moved_ticks, made._uses_moved = dict(state.moved_ticks), state.uses_moved
         if state.method is not None:
@@ -96,7 +114,13 @@ class Receiver(BeaconReceiver[Beacon]):
             made._choose_method(state.method_period_ticks)
             assert made._method is not None
             made._method.restore(state.method)
+        made._note_method()
         return made
+
+    @property
+    def admission(self) -> Admission:
+        """What it knows of its own counter, of sites and of anchors."""
+        return self._hearing.admission
 
     @property
     def method(self) -> Estimation | None:
@@ -113,49 +137,119 @@ class Receiver(BeaconReceiver[Beacon]):
         pages = self.almanac.pages
         return None if pages is None else HeardSite(self.almanac.points_m(), pages.georeference, is_complete=True)
 
-    def _decode(self, frame: bytes) -> Beacon | Malformed:
-        return decode_cached(frame)
+    def hear(self, reception: Reception) -> Fix | None:
+        """Process a frame from the air; a fix if it made one, else ``reason`` is set.
 
-    def _period_ticks(self, beacon: Beacon) -> int:
-        return period_ticks(beacon.period_code)
+        What does not belong here is counted in ``counters`` and dropped; nothing on the air raises.
+        """
+        frame, diagnostics, host_s = reception.frame, reception.diagnostics, reception.host_s
+        rx_dbm, first_path_dbm = (nan, nan) if diagnostics is None else powers_dbm(diagnostics)
+        outcome = _hear_frame(
+            self._hearing,
+            self._course,
+            self._state,
+            frame,
+            len(frame),
+            reception.rx_ticks,
+            nan if host_s is None else host_s,
+            rx_dbm,
+            first_path_dbm,
+        )
+        if outcome == FIX:
+            counters, method = self.counters, self._method
+            counters["heard"] += 1
+            counters["fixes"] += 1
+            return method.fix()  # type: ignore[union-attr]  # a fix is of a method
+        if outcome > MALFORMED:
+            self.counters[FAULTS[outcome - MALFORMED - 1]] += 1
+            return None
+        return self._after(outcome, frame, None)
 
-    def _process(self, beacon: Beacon, reception: Reception, rx_ticks: int, tx_ticks: int) -> Fix | NoFixReason:
-        """Process a beacon: its own position counts, and whom its relays confirm."""
-        anchor, relays = beacon.anchor, packed_relays(beacon)
-        diagnostics = reception.diagnostics
-        if diagnostics is not None and diagnostics.rx_power_dbm is not None:
-            self._selection.add_power(anchor, diagnostics.rx_power_dbm)
+    def hear_beacon(self, beacon: Beacon, reception: Reception) -> Fix | None:
+        """Process a beacon that is decoded already, as ``hear`` does; the frame itself may be empty."""
+        self._hearing.beacon = fields_of(beacon)
+        host_s = nan if reception.host_s is None else reception.host_s
+        powers = powers_dbm(reception.diagnostics)
+        outcome = _hear_fields(self._hearing, self._course, self._state, reception.rx_ticks, host_s, *powers)
+        return self._after(outcome, b"", beacon.page)
+
+    def hear_height(self, height_m: float, std_m: float) -> bool:
+        """Process a reading of the tag's height sensor; see ``BeaconReceiver``."""
+        used = super().hear_height(height_m, std_m)
+        self._note_method()
+        return used
+
+    def _after(self, outcome: int, frame: bytes, page: Page | None) -> Fix | None:
+        """What has become of a beacon; the page in it stands in its frame, or is given."""
+        if self.admission.events:
+            self._handle_events()
+        if outcome < len(DROP_COUNTERS):
+            self._count_drop(outcome)
+            return None
+        self.counters["heard"] += 1
+        if outcome == IS_RARE:
+            result = self._process(frame, page)
+            if isinstance(result, Fix):
+                note_fix(self.admission.choice, self.admission.rx_ticks)
+        else:
+            assert self._method is not None
+            result = self._method.result_of(outcome)
+        self._note_method()
+        return self._judge(result)
+
+    def _note_method(self) -> None:
+        """Let the compiled part know whether the tag knows where it is, and by which pages."""
+        method = self._method
+        is_starting = method is None or method.is_starting
+        self._hearing.is_starting, self._hearing.is_moving = is_starting, bool(self._moved_ticks)
+        self._hearing.almanac_issue = NO_ISSUE if self.almanac.issue is None else self.almanac.issue
+        self._course, self._state = _NOT_STARTED if method is None else (method.course, method.estimator.state)
+
+    def _process(self, frame: bytes, page: Page | None) -> Fix | NoFixReason:
+        """Process a beacon that is admitted, with its pages, its position, and a method that may be starting."""
+        hearing, beacon = self._hearing, self._hearing.beacon
+        anchor, rx_ticks = beacon.anchor, self.admission.rx_ticks
         was_starting = self._method is None or self._method.is_starting
-        before_m = self.almanac.position_m(anchor)
-        if self.almanac.on_beacon(beacon, rx_ticks, self._confirm(anchor, relays, rx_ticks, tx_ticks)):
+        if beacon.almanac_issue != self.almanac.issue and page is None:
+            page = page_of(frame, beacon)
+        if self.almanac.on_beacon(page, rx_ticks):
             self._choose_method()
-        anchor_m = self.almanac.position_m(anchor)
-        if anchor_m is not before_m and before_m is not None:
+        if hearing.has_moved:
             self._separate_moved(anchor, rx_ticks)
         if self._is_kept_apart(anchor, rx_ticks):
             self.counters["moved-anchor"] += 1
             return NoFixReason.ACQUIRING
-        if anchor_m is None:
+        neighbour = self.almanac.newest
+        if not neighbour.has_place:
             self.counters["no-position"] += 1
             return NoFixReason.NO_ALMANAC
+        packet = hearing.packet
+        relays = bytes(beacon.relays)[: beacon.relay_bytes]
         observation = Observation(
-            anchor, anchor_m, 0, beacon.sequence, rx_ticks, tx_ticks, None, None, None, 0.0, 0.0, (), None,
-            variance_factor_of(reception), relays, self.almanac.std_m(anchor),
+            anchor, view(packet.place.position_m).copy(), 0, beacon.sequence, rx_ticks, packet.tx_ticks, None, None,
+            None, 0.0, 0.0, (), None, packet.variance_factor, relays, packet.place.std_m,
         )  # fmt: skip
         method = self._method
         if method is None:
             self._waiting = [*self._waiting[1 - MAX_WAITING :], observation]
             return NoFixReason.NO_ALMANAC
         for waiting in self._waiting:
-            if self._selection.is_confirmed(waiting.anchor, rx_ticks):
+            if self._is_confirmed(waiting.anchor):
                 method.update(waiting)
         self._waiting = []
         if not self._may_join(method, observation):
             return NoFixReason.TOO_FEW_ANCHORS
         result = method.update(observation)
         if was_starting and not method.is_starting:
-            self._selection.forget_times()  # from now on what anchors in use have received counts, and what those have
+            self._begin(method)
         return result
+
+    def _begin(self, method: Estimation) -> None:
+        """From now on what anchors in use have received counts, and what those have."""
+        misfits = method.estimator.misfits
+        for row in self.almanac.rows:
+            row.relayed_ticks = row.own_relays_ticks = NEVER
+            row.is_misfit = row.anchor in misfits
 
     def _separate_moved(self, anchor: int, rx_ticks: int) -> None:
         """An anchor states another position: it leaves, and where too few are left that have not, all begin again."""
@@ -191,51 +285,30 @@ class Receiver(BeaconReceiver[Beacon]):
         self._method_key = None
         self._choose_method()
 
-    def _confirm(self, anchor: int, relays: bytes, rx_ticks: int, tx_ticks: int) -> bool:
-        """Process which anchors a beacon confirms by its relays; whether other anchors confirm its sender."""
-        method = self._method
-        is_starting = method is None or method.is_starting
-        in_use = method is not None and not is_starting and method.estimator.has_anchor(anchor)
-        by_others = self._selection.is_confirmed_by_others(anchor, rx_ticks, in_use=in_use)
-        if by_others or is_starting or self._has_too_few(rx_ticks):
-            self._selection.add_relays(relays, rx_ticks)
-        elif fitting_relays(relays, tx_ticks, rx_ticks, self._packet_in_use) >= MIN_FITTING:
-            self._selection.confirm_by_own_relays(anchor, rx_ticks)
-        return by_others
-
-    def _packet_in_use(self, anchor: int) -> tuple[int, int] | None:
-        """Sequence number and own RX stamp of the last beacon of an anchor in use."""
-        track = self._stamps.tracks.of_anchor.get(anchor)
-        in_use = self._method is not None and self._method.estimator.has_anchor(anchor)
-        return (track.sequence, track.rx_ticks_tag) if track is not None and in_use else None
-
-    def _has_too_few(self, rx_ticks: int) -> bool:
-        """Whether fewer anchors in use are still received than a fix takes, so that relays of any anchor confirm.
-
-        A tag may come to where none of its anchors is received, nor receives the next ones: out of a lift.
-        """
-        assert self._method is not None
-        estimator = self._method.estimator
-        return estimator.heard_since(rx_ticks - from_seconds(estimator.settings.drop_s)) < MIN_ANCHORS
+    def _is_confirmed(self, anchor: int) -> bool:
+        """Whether other anchors have recently received an anchor, or its own relays have fitted."""
+        row = find_neighbour(self.admission.neighbours, anchor)
+        return row >= 0 and is_confirmed(self.admission.neighbours.rows[row], self.admission.rx_ticks)
 
     def _may_join(self, method: Estimation, observation: Observation) -> bool:
         """Whether an anchor is in use or may be: others have received it, and it is not weaker than 24 in use."""
         estimator, anchor = method.estimator, observation.anchor
         if estimator.has_anchor(anchor) and not method.is_starting:
             return True
-        if not self._selection.is_confirmed(anchor, observation.rx_ticks_tag):
+        if not self._is_confirmed(anchor):
             self.counters["unconfirmed-anchor"] += 1
             return False
         in_use = estimator.anchors
         if method.is_starting or not is_full(in_use):
             return True
-        position_m = estimator.position_m()
-        ranges_m = {anchor: float(np.linalg.norm(observation.anchor_m[: estimator.dim] - position_m))}
-        for one in in_use:
-            one_m = self.almanac.position_m(one)
-            if one_m is not None:
-                ranges_m[one] = float(np.linalg.norm(one_m[: estimator.dim] - position_m))
-        replaced = self._selection.replaced_by(anchor, ranges_m)
+        position_m, points_m = estimator.position_m(), self.almanac.points_m()
+        ranges_m = {
+            one: float(np.linalg.norm(np.array(points_m[one][: estimator.dim]) - position_m))
+            for one in (anchor, *in_use)
+            if one in points_m
+        }
+        powers_dbm = {row.anchor: row.power_dbm for row in self.almanac.rows if row.has_power}
+        replaced = replaced_by(anchor, powers_dbm, ranges_m)
         if replaced is None:
             self.counters["weaker-anchor"] += 1
             return False
@@ -243,11 +316,10 @@ class Receiver(BeaconReceiver[Beacon]):
         return True
 
     def _forget_site(self) -> None:
-        self.almanac = LocalAlmanac()
+        self.almanac = LocalAlmanac(self.admission.neighbours)
 
     def _forget_stamps(self) -> None:
         self.almanac.forget_times()
-        self._selection.forget_times()
         self._waiting = []
         self._moved_ticks, self._uses_moved = {}, False
         self._method = self._method_key = None
@@ -265,4 +337,8 @@ class Receiver(BeaconReceiver[Beacon]):
         if method_key != self._method_key:
             self._method_key = method_key
             self._method_period_ticks = method_period_ticks or self.almanac.longest_period_ticks()
-            self._method = new_method(self._options, pages, self._method_period_ticks, self._time)
+            self._method = new_method(self._options, pages, self._method_period_ticks, self.admission.time)
+
+
+_hear_frame: Final = compiled(hear_frame)
+_hear_fields: Final = compiled(hear_fields)

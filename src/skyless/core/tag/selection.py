@@ -1,13 +1,15 @@
 """Which anchors of a large site a tag uses: the strongest of those that other anchors receive too."""
 
 import math
-from collections.abc import Callable, Collection
-from typing import Final, TypeVar
+from collections.abc import Collection
+from typing import Final
 
-from msgspec import Struct
-
-from skyless.core.air.frame import HEARD
-from skyless.core.ticks import FLIGHT_SLACK_TICKS, from_seconds, may_elapse, nearest
+from skyless.core.air.beacon_fields import HEARD_BYTES, BeaconFields
+from skyless.core.air.neighbours import Neighbour, Neighbours, find_neighbour, neighbour_of
+from skyless.core.air.page_check import unsigned
+from skyless.core.estimator.state import State, find_anchor
+from skyless.core.native.records import Ticks
+from skyless.core.ticks import FLIGHT_SLACK_TICKS, NEVER, may_elapse, nearest
 
 MAX_ANCHORS_IN_USE: Final = 24
 """In the estimator's state; more cost accuracy, as each then sends less, and time."""
@@ -15,96 +17,63 @@ MAX_ANCHORS_IN_USE: Final = 24
 BETTER_DB: Final = 3.0
 """By which another anchor must be stronger to replace the weakest."""
 
-RELAYED_TICKS: Final = from_seconds(2.0)
-"""A reception by an anchor in use, or by one that is confirmed itself, confirms its sender for this time."""
-
 MIN_FITTING: Final = 2
 """An anchor that relays this number of receptions of anchors in use, and they fit, is there."""
 
-MAX_KEPT: Final = 256
-"""Identifiers kept: more than there are in reach. Forged ones cannot use more memory."""
-
 POWER_GAIN: Final = 0.1
 """Weight of the newest value in the running mean of an anchor's received power."""
+
+MAX_POWER_DBM: Final = 1000.0
+"""No radio reports more, nor less than its negative."""
 
 NOMINAL_POWER_DBM: Final = -63.0
 """Assumed power at 1 m where the radio reports none, so that nearer anchors count as stronger."""
 
 
-Value = TypeVar("Value")
+def add_power(n: Neighbour, power_dbm: float) -> None:
+    """Process the power of a beacon; NaN where the radio reports none."""
+    if abs(power_dbm) <= MAX_POWER_DBM:
+        n.power_dbm = n.power_dbm + POWER_GAIN * (power_dbm - n.power_dbm) if n.has_power else power_dbm
+        n.has_power = True
 
 
-class AnchorSelection(Struct):
-    """Which anchors have been received by others, and with which power by the tag."""
-
-    relayed_ticks: dict[int, int] = {}
-    """The tag's reading when another anchor last relayed that it had received this one."""
-    own_relays_ticks: dict[int, int] = {}
-    """The tag's reading when the anchor's own relays last fitted, for anchors that no other has relayed since."""
-    power_dbm: dict[int, float] = {}
-
-    def forget_times(self) -> None:
-        """The tag's counter has restarted."""
-        self.relayed_ticks = {}
-        self.own_relays_ticks = {}
-
-    def add_power(self, anchor: int, power_dbm: float) -> None:
-        """Process the power of a beacon."""
-        if math.isfinite(power_dbm):
-            mean = self.power_dbm.pop(anchor, power_dbm)
-            _keep(self.power_dbm, anchor, mean + POWER_GAIN * (power_dbm - mean))
-
-    def add_relays(self, relays: bytes, rx_ticks: int) -> None:
-        """Process what an anchor relays (``packed_relays_2``), so that it confirms others."""
-        for anchor, _, _, _ in HEARD.iter_unpack(relays):
-            self.own_relays_ticks.pop(anchor, None)
-            self.relayed_ticks.pop(anchor, None)
-            _keep(self.relayed_ticks, anchor, rx_ticks)
-
-    def confirm_by_own_relays(self, anchor: int, rx_ticks: int) -> None:
-        """An anchor is there, as what it relays fits (``fitting_relays``), but no other has received it."""
-        self.own_relays_ticks.pop(anchor, None)
-        _keep(self.own_relays_ticks, anchor, rx_ticks)
-
-    def is_confirmed_by_others(self, anchor: int, rx_ticks: int, *, in_use: bool) -> bool:
-        """Whether others have recently received an anchor, or had when it came into use.
-
-        Only then its pages take part in the majority, and its relays confirm others.
-        """
-        return _is_recent(self.relayed_ticks, anchor, rx_ticks) or (in_use and anchor not in self.own_relays_ticks)
-
-    def is_confirmed(self, anchor: int, rx_ticks: int) -> bool:
-        """Whether another anchor has recently received this one, or its own relays have fitted."""
-        return _is_recent(self.relayed_ticks, anchor, rx_ticks) or _is_recent(self.own_relays_ticks, anchor, rx_ticks)
-
-    def replaced_by(self, anchor: int, ranges_m: dict[int, float]) -> int | None:
-        """The anchor in use that ``anchor`` should replace, None if ``anchor`` is too weak.
-
-        ``ranges_m``: ranges of ``anchor`` and of all anchors in use.
-        """
-        powers = {one: self.power_dbm.get(one, _nominal_dbm(range_m)) for one, range_m in ranges_m.items()}
-        own_dbm = powers.pop(anchor)
-        weakest = min(powers, key=lambda one: powers[one])
-        return weakest if own_dbm > powers[weakest] + BETTER_DB else None
+def add_relays(t: Neighbours, b: BeaconFields, rx_ticks: Ticks) -> None:
+    """Process what an anchor relays, so that it confirms others."""
+    for begin in range(0, b.relay_bytes, HEARD_BYTES):
+        anchor = b.relays[begin] | b.relays[begin + 1] << 8
+        row = neighbour_of(t, anchor, rx_ticks)
+        t.rows[row].relayed_ticks = rx_ticks
+        t.rows[row].own_relays_ticks = NEVER
 
 
-def fitting_relays(
-    relays: bytes, tx_ticks_anchor: int, rx_ticks_tag: int, packets: Callable[[int], tuple[int, int] | None]
-) -> int:
+def fitting_relays(t: Neighbours, s: State, b: BeaconFields, rx_ticks: Ticks) -> int:
     """How many receptions that an anchor relays fit what the tag has received itself: so it really receives them.
 
-    The stamps are those of the anchor's beacon; ``packets`` gives sequence number and the tag's stamp of the last
-    beacon of another anchor, None for one that does not count. A reception fits if, on the anchor's counter, it lies as
-    long before its own frame as on the tag's, to 1 µs (300 m) and the drift of crystals.
+    Only packets of anchors in use count. A reception fits if, on the anchor's counter, it lies as long before its own
+    frame as on the tag's, to 1 µs (300 m) and the drift of crystals.
     """
     fitting = 0
-    for anchor, sequence, low, high in HEARD.iter_unpack(relays):
-        packet = packets(anchor)
-        if packet is not None and packet[0] == sequence:
-            elapsed = rx_ticks_tag - packet[1]
-            received_ticks = nearest(low | high << 32, tx_ticks_anchor - elapsed)
-            fitting += may_elapse(tx_ticks_anchor - received_ticks, elapsed, FLIGHT_SLACK_TICKS)
+    tx_ticks = t.rows[t.row].tx_ticks
+    for begin in range(0, b.relay_bytes, HEARD_BYTES):
+        anchor = b.relays[begin] | b.relays[begin + 1] << 8
+        row = find_neighbour(t, anchor)
+        if row >= 0 and t.rows[row].frames > 0 and t.rows[row].sequence == b.relays[begin + 2]:
+            elapsed = rx_ticks - t.rows[row].rx_ticks
+            received_ticks = nearest(unsigned(b.relays, begin + 3, 5), tx_ticks - elapsed)
+            if find_anchor(s, anchor) >= 0 and may_elapse(tx_ticks - received_ticks, elapsed, FLIGHT_SLACK_TICKS):
+                fitting += 1
     return fitting
+
+
+def replaced_by(anchor: int, powers_dbm: dict[int, float], ranges_m: dict[int, float]) -> int | None:
+    """The anchor in use that ``anchor`` should replace, None if ``anchor`` is too weak.
+
+    ``ranges_m``: ranges of ``anchor`` and of all anchors in use; ``powers_dbm``: those that are known.
+    """
+    powers = {one: powers_dbm.get(one, _nominal_dbm(range_m)) for one, range_m in ranges_m.items()}
+    own_dbm = powers.pop(anchor)
+    weakest = min(powers, key=lambda one: powers[one])
+    return weakest if own_dbm > powers[weakest] + BETTER_DB else None
 
 
 def is_full(anchors: Collection[int]) -> bool:
@@ -112,17 +81,5 @@ def is_full(anchors: Collection[int]) -> bool:
     return len(anchors) >= MAX_ANCHORS_IN_USE
 
 
-def _is_recent(times: dict[int, int], anchor: int, rx_ticks: int) -> bool:
-    ticks = times.get(anchor)
-    return ticks is not None and rx_ticks - ticks < RELAYED_TICKS
-
-
 def _nominal_dbm(range_m: float) -> float:
     return NOMINAL_POWER_DBM - 20.0 * math.log10(max(range_m, 0.1))
-
-
-def _keep(kept: dict[int, Value], anchor: int, value: Value) -> None:
-    """Set the value of an anchor as the newest one; that kept longest is forgotten."""
-    kept[anchor] = value
-    if len(kept) > MAX_KEPT:
-        del kept[next(iter(kept))]

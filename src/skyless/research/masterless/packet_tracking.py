@@ -12,12 +12,12 @@ from typing import Final
 import numpy as np
 
 from skyless.core.air.masterless_packets import Packet, Point, Relay
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ, TICK_S
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.observation import Observation
 from skyless.core.tag.joint import Estimation
-from skyless.core.ticks import LAST_TICKS, FixTime, Unwrapper, continued, nearest
+from skyless.core.ticks import LAST_TICKS, FixTime, Unwrapper, continued, fix_time_s, nearest
 from skyless.research.masterless.difference_tracking import DIFFERENCES, is_within, neighbourhood_m
 from skyless.research.masterless.pair_engine import MAX_ANCHORS, remember
 from skyless.site.survey.anchor_errors import NO_BIAS, SLOPE_NEAREST_M, DifferenceCalibration, RelayDelays
@@ -114,7 +114,7 @@ class PacketTracking:
         self._anchors: dict[int, _Anchor] = {}
         self._delays = RelayDelays(self._positions_m, estimate=calibration is None)
         self._calibration = calibration
-        self._tag_clock = Unwrapper(TICK_BITS)
+        self._tag_clock = Unwrapper()
         self._newest_rx_ticks: int | None = None
         self._back_in_row = 0
         self._time = FixTime()
@@ -140,7 +140,7 @@ class PacketTracking:
     @property
     def newest_s(self) -> float:
         """When the newest packet that could be used was received, on the scale of fixes' times."""
-        return ((self._newest_rx_ticks or 0) - (self._time.first_ticks_master or 0)) * TICK_S
+        return ((self._newest_rx_ticks or 0) - self._time.first_ticks_master) * TICK_S
 
     @property
     def drops(self) -> Counter[str]:
@@ -235,7 +235,7 @@ class PacketTracking:
             self._forget_clocks()
             return None
         if self._newest_rx_ticks is None:
-            self._time.time_s(rx_ticks, rx_ticks)
+            fix_time_s(self._time, rx_ticks, rx_ticks)
         elif rx_ticks <= self._newest_rx_ticks and not self._has_new_counter(packet, rx_ticks):
             return None
         self._back_in_row = 0
@@ -277,7 +277,7 @@ class PacketTracking:
         return True
 
     def _forget_clocks(self) -> None:
-        self._tag_clock = Unwrapper(TICK_BITS)
+        self._tag_clock = Unwrapper()
         self._newest_rx_ticks = None
         self._anchors.clear()
 

@@ -17,7 +17,7 @@ from typing import Final
 
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point, Relay
 from skyless.core.clock_filter import MAX_RELATIVE_RATE, TwoState, predict, update
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_BITS, TICK_M, TICK_RATE_HZ, TICK_S
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.core.ticks import Unwrapper, difference, nearest
 from skyless.site.survey.anchor_errors import AnchorFlights, distance_ticks
 
@@ -187,7 +187,7 @@ class PairEngine:
     def __init__(self, tx_bits: int = 32, anchors_m: dict[int, Point] | None = None) -> None:
         self.drops: Counter[str] = Counter()
         self._tx_bits = tx_bits
-        self._tag_clock = Unwrapper(TICK_BITS)
+        self._tag_clock = Unwrapper()
         self._first_ticks: int | None = None
         self._anchors: dict[int, _Anchor] = {}
         self._carried_m: dict[int, Point] = {}

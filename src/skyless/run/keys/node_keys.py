@@ -11,7 +11,7 @@ from typing import Final
 import msgspec
 from msgspec import Struct
 
-from skyless.core.air.codec import CERTIFICATE_BYTES
+from skyless.core.air.beacon_fields import CERTIFICATE_BYTES
 from skyless.core.anchor.authentication import BeaconAuthentication
 from skyless.core.errors import SkylessError
 from skyless.core.keys.chain import Chain, ChainRing

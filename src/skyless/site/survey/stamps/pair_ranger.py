@@ -335,7 +335,7 @@ class PairRanger:
     def _clock(self, anchor: int) -> Unwrapper:
         clock = self._clocks.get(anchor)
         if clock is None:
-            clock = self._clocks[anchor] = Unwrapper(self._bits)
+            clock = self._clocks[anchor] = Unwrapper(bits=self._bits)
         return clock
 
     def _pass_to(self, t_s: float) -> None:

@@ -1,0 +1,137 @@
+"""What is kept of each anchor that is received, or that others relay: one table with a row for each."""
+
+from typing import Annotated, Final
+
+from skyless.core.native.records import Array, Integers, Record, Ticks, record
+from skyless.core.ticks import NEVER, from_seconds
+
+MAX_NEIGHBOURS: Final = 256
+"""More anchors than there are in reach: forged ones cannot use more memory."""
+
+RELAYED_TICKS: Final = from_seconds(2.0)
+"""A reception by an anchor in use, or by one that is confirmed itself, confirms its sender for this time."""
+
+
+@record
+class StatedPlace(Record):
+    """Where an anchor says that it is, as frames carry it."""
+
+    position_mm: Annotated[Integers, 3]
+    std_mm: int
+    floor: int
+    zone: int
+
+
+@record
+class Neighbour(Record):
+    """One anchor."""
+
+    anchor: int
+    """Its identifier."""
+    changed_ticks: Ticks
+    """The receiver's reading when anything was last learnt of it."""
+    # Its stamps
+    frames: int
+    """Whose stamps have fitted since its counter began: 0, 1, or 2 for more."""
+    sequence: int
+    """Of the newest one."""
+    rx_ticks: Ticks
+    """The receiver's own stamp of it."""
+    tx_ticks: Ticks
+    """The anchor's, unwrapped."""
+    impossible: int
+    """Stamps in a row that do not fit."""
+    has_rival: bool
+    """Whether one of those may be right, as only one frame stands against it."""
+    rival_rx_ticks: Ticks
+    rival_tx_ticks: Ticks
+    # What it states of itself
+    almanac_issue: int
+    period_code: int
+    has_place: bool
+    place: StatedPlace
+    """The one that is used."""
+    has_other: bool
+    other: StatedPlace
+    """Another one, stated once; used when it is stated twice in a row."""
+    # What others state of it
+    is_confirmed: bool
+    """Whether others had received it at its newest frame."""
+    relayed_ticks: Ticks
+    """The receiver's reading when another anchor last relayed that it had received this one."""
+    own_relays_ticks: Ticks
+    """The receiver's reading when the anchor's own relays last fitted, where no other has relayed it since."""
+    has_power: bool
+    power_dbm: float
+    """Running mean of the received power."""
+    is_misfit: bool
+    """Whether it contradicted the others at the start."""
+
+
+@record
+class Neighbours(Record):
+    """All of them."""
+
+    count: int
+    row: int
+    """Of the anchor whose frame is processed; it is not forgotten meanwhile."""
+    has_newest: bool
+    newest_rx_ticks: Ticks
+    """RX stamp of the newest accepted frame: one impossible stamp must not make others late."""
+    rows: Annotated[Array[Neighbour], MAX_NEIGHBOURS]
+
+
+def find_neighbour(t: Neighbours, anchor: int) -> int:
+    """The row of an anchor, −1 where there is none."""
+    for row in range(t.count):
+        if t.rows[row].anchor == anchor:
+            return row
+    return -1
+
+
+def neighbour_of(t: Neighbours, anchor: int, rx_ticks: Ticks) -> int:
+    """The row of an anchor of which something is learnt; a new one may take that of the least important."""
+    row = find_neighbour(t, anchor)
+    if row < 0:
+        row = t.count if t.count < MAX_NEIGHBOURS else _least_important(t, rx_ticks)
+        t.count = max(t.count, row + 1)
+        fresh = Neighbour()
+        t.rows[row] = fresh
+        t.rows[row].anchor = anchor
+        t.rows[row].relayed_ticks = t.rows[row].own_relays_ticks = NEVER
+    t.rows[row].changed_ticks = rx_ticks
+    return row
+
+
+def _least_important(t: Neighbours, rx_ticks: Ticks) -> int:
+    """The row to be forgotten: of an anchor that nobody confirms, of a single frame before others; the longest silent."""
+    least = -1
+    least_rank = 0
+    for row in range(t.count):
+        n = t.rows[row]
+        rank = 2 if is_confirmed(n, rx_ticks) else 1 if n.frames > 1 else 0
+        is_less = least < 0 or rank < least_rank
+        if not is_less and rank == least_rank:
+            is_less = n.changed_ticks < t.rows[least].changed_ticks
+        if row != t.row and is_less:
+            least, least_rank = row, rank
+    return least
+
+
+def is_confirmed(n: Neighbour, rx_ticks: Ticks) -> bool:
+    """Whether another anchor has recently received this one, or its own relays have fitted."""
+    return rx_ticks - max(n.relayed_ticks, n.own_relays_ticks) < RELAYED_TICKS
+
+
+def is_relayed(n: Neighbour, rx_ticks: Ticks) -> bool:
+    """Whether another anchor has recently received this one."""
+    return rx_ticks - n.relayed_ticks < RELAYED_TICKS
+
+
+def forget_times(t: Neighbours) -> None:
+    """The receiver's counter has restarted: who was received when is not known any more."""
+    t.has_newest = False
+    for row in range(t.count):
+        n = t.rows[row]
+        n.frames, n.impossible, n.has_rival, n.is_confirmed = 0, 0, False, False
+        n.relayed_ticks = n.own_relays_ticks = n.changed_ticks = NEVER

@@ -1,0 +1,96 @@
+"""Which frames a tag admits: of the site in use, with stamps that are possible on its sender's and its own counter."""
+
+from typing import Final
+
+from skyless.core.air.anchor_stamps import STAMP_COUNTERS, STAMP_FITS, unwrap_stamp
+from skyless.core.air.neighbours import MAX_NEIGHBOURS, Neighbours, forget_times
+from skyless.core.air.site_choice import (
+    CHANGED,
+    FOREIGN,
+    MAX_COUNTED,
+    MAX_SITES,
+    NO_SITE,
+    SiteChoice,
+    choose_site,
+    restart_choice,
+)
+from skyless.core.native.records import Record, Ticks, record
+from skyless.core.ticks import LAST_TICKS, FixTime, Unwrapper, from_seconds, unwrap
+
+COUNTER_JUMP_TICKS: Final = from_seconds(1.0)
+"""Stamps that go back farther than radios and hosts reorder them mean that the tag's own counter has restarted."""
+
+ADMITTED: Final = STAMP_FITS
+FOREIGN_SITE, IMPOSSIBLE_HOST_TIME = range(len(STAMP_COUNTERS), len(STAMP_COUNTERS) + 2)
+"""What becomes of a frame, beside what its stamp is."""
+DROP_COUNTERS: Final = (*STAMP_COUNTERS, ("foreign-site",), ("impossible-host-time",))
+"""By what each is counted."""
+
+COUNTER_JUMPED, HOST_JUMPED, SITE_CHANGED = 1, 2, 4
+"""What has happened: the tag's counter has restarted, its host's clock was set, or it uses another site."""
+
+
+@record
+class Admission(Record):
+    """What a tag knows of its own counter, of sites and of anchors."""
+
+    own: Unwrapper
+    choice: SiteChoice
+    time: FixTime
+    neighbours: Neighbours
+    rx_ticks: Ticks
+    """The tag's stamp of the frame at hand, unwrapped."""
+    events: int
+    """What has happened since its owner last looked."""
+
+
+def admit_sender(a: Admission, site: int, anchor: int, rx_counter: Ticks, host_s: float) -> int:
+    """Unwrap the tag's stamp of a frame, and find out whether its site is in use; ``ADMITTED`` or why not.
+
+    ``host_s``: the host's time of it, NaN where that is not known.
+    """
+    a.rx_ticks = unwrap(a.own, rx_counter, host_s)
+    t = a.neighbours
+    is_possible = -LAST_TICKS <= a.rx_ticks <= LAST_TICKS
+    if not is_possible or (t.has_newest and a.rx_ticks < t.newest_rx_ticks - COUNTER_JUMP_TICKS):
+        forget_times(t)
+        a.events |= COUNTER_JUMPED if is_possible else HOST_JUMPED
+        restart_choice(a.choice, a.rx_ticks if is_possible else 0)
+        if not is_possible:
+            a.own.has_stamp = False
+            return IMPOSSIBLE_HOST_TIME
+    had_site = a.choice.site != NO_SITE
+    use = choose_site(a.choice, site, anchor, a.rx_ticks)
+    if use == FOREIGN:
+        return FOREIGN_SITE
+    if use == CHANGED and had_site:
+        t.count, t.has_newest = 0, False
+        a.events |= SITE_CHANGED
+    return ADMITTED
+
+
+def admit_stamp(a: Admission, anchor: int, sequence: int, tx_counter: Ticks, period_ticks: Ticks) -> int:
+    """Unwrap the TX stamp of a frame of the site in use; ``ADMITTED`` or why it is not used."""
+    stamp = unwrap_stamp(a.neighbours, anchor, sequence, tx_counter, a.rx_ticks, period_ticks)
+    if stamp == STAMP_FITS:
+        a.choice.heard_ticks = a.rx_ticks
+    return stamp
+
+
+def check(a: Admission) -> None:
+    """Check what compiled functions use as indices, in a record that may come from anywhere.
+
+    Raises:
+        ValueError: one is beyond its table.
+    """
+    limits = [
+        ("anchors", a.neighbours.count, MAX_NEIGHBOURS),
+        ("rows", a.neighbours.row, MAX_NEIGHBOURS - 1),
+        ("sites", a.choice.count, MAX_SITES),
+        ("failed sites", a.choice.failed_count, MAX_SITES),
+        ("bits", a.own.bits - 1, 61),
+        *(("anchors of a site", one.count, MAX_COUNTED) for one in a.choice.sites),
+    ]
+    for name, number, most in limits:
+        if not 0 <= number <= most:
+            raise ValueError(f"the receiver's state has {number} {name}; it can have up to {most}")

@@ -1,0 +1,55 @@
+"""A tag's receiver in Python and in C: the same bits after every frame, also of forged, repeated and damaged ones."""
+
+import numpy as np
+from msgspec.structs import replace
+from test_same_bits import bits
+
+from machines.bench import ROOM, tape
+from skyless.core.air.codec import decode, encode
+from skyless.core.air.reception import Diagnostics
+from skyless.core.tag import joint, receiver
+from skyless.core.tag.course import process_in_course
+from skyless.core.tag.hearing import hear_frame
+
+FREE = replace(ROOM, schedule=replace(ROOM.schedule, mode="free", rate_hz=60.0))
+
+
+def disturbed(heard, draw):
+    """Frames repeated, damaged, under other names or sites, with other stamps; and a counter that restarts."""
+    for number, received in enumerate(heard):
+        beacon, change = decode(received.frame), draw.random()
+        powers = Diagnostics(-80.0, -80.0 - 14.0 * draw.random())
+        shift = 10**9 if number < 0.8 * len(heard) else 5 * 10**11
+        one = replace(received, diagnostics=powers, rx_ticks=(received.rx_ticks + shift) % 2**40)
+        yield one
+        if change < 0.05:
+            yield one
+        elif change < 0.1:
+            yield replace(one, frame=one.frame[:-1] + b"\0", rx_ticks=one.rx_ticks + 10)
+        elif change < 0.2:
+            forged = replace(beacon, tx_ticks=int(draw.integers(2**40)), anchor=int(draw.integers(1, 12)), heard=())
+            yield replace(one, frame=encode(replace(forged, weak=0)), rx_ticks=one.rx_ticks + 10**6)
+        elif change < 0.25:
+            yield replace(one, frame=encode(replace(beacon, site=77)), rx_ticks=one.rx_ticks + 10**6)
+        elif change < 0.3:
+            yield replace(one, rx_ticks=one.rx_ticks + 10**6, host_s=1e300)
+
+
+def test_a_receiver_gives_the_same_bits(monkeypatch):
+    draw = np.random.default_rng(4)
+    compiled, plain = receiver.Receiver(), receiver.Receiver()
+    fixes = 0
+    for one in disturbed([one.reception for one in tape(FREE, 1.2)], draw):
+        expected = compiled.hear(one)
+        with monkeypatch.context() as patched:
+            patched.setattr(receiver, "_hear_frame", hear_frame)
+            patched.setattr(joint, "_process_in_course", process_in_course)
+            found = plain.hear(one)
+        assert (None if found is None else (found.rows, found.time_s, found.anchors)) == (
+            None if expected is None else (expected.rows, expected.time_s, expected.anchors)
+        )
+        assert bits(plain._hearing) == bits(compiled._hearing)
+        assert (plain.reason, plain.counters) == (compiled.reason, compiled.counters)
+        fixes += found is not None
+    assert fixes > 100
+    assert {"duplicate", "bad-fcs", "impossible-stamp", "foreign-site", "impossible-host-time"} <= plain.counters.keys()
