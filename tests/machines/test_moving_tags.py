@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from skyless.core.estimator.estimator import Estimator
 from skyless.core.estimator.kalman import predict
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
-from skyless.core.native.records import view
+from skyless.core.native.views import view
 from skyless.core.site import EXACT
 from skyless.core.ticks import from_seconds
 from skyless.sim.evaluation.fleet import Fleet, FleetSettings

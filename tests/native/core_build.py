@@ -94,9 +94,9 @@ def has(*programs):
     return all(shutil.which(program) for program in programs)
 
 
-def damaged_program(folder):
-    """The program of ``damaged.c``, which ends at an access out of bounds, an overflow and the like."""
-    made, sources = folder / "damaged", [NATIVE / "skyless_core.c", Path(__file__).with_name("damaged.c")]
+def damaged_program(folder, name):
+    """A program beside this file, which ends at an access out of bounds, an overflow and the like."""
+    made, sources = folder / name, [NATIVE / "skyless_core.c", Path(__file__).with_name(f"{name}.c")]
     checks = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     subprocess.run(["gcc", *EXACT, *checks, f"-I{NATIVE}", *sources, "-o", made], check=True)
     return made

@@ -1,6 +1,6 @@
-"""Damaged packets lead the compiled estimator neither out of its arrays nor to numbers that are none.
+"""Damaged packets and frames lead compiled code neither out of its arrays nor to numbers that are none.
 
-python tests/native/test_damaged_packets.py 10000000 1        # number of packets, seed
+python tests/native/test_damaged_packets.py 10000000 1        # number of packets, and of frames; seed
 """
 
 import os
@@ -9,13 +9,20 @@ import sys
 import tempfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 from core_build import damaged_program, has, input_of
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parents[1] / "positioning"))
 
 from estimator_builders import MESH, ROOM_M, begun, episode_of, settings_of
+from msgspec.structs import replace
 
+from machines.bench import ROOM, tape
+from skyless.core.tag.receiver import Receiver
+
+HEARD = np.dtype([("length", "<i4"), ("bytes", "u1", 140), ("rx_ticks", "<i8")], align=True)
 pytestmark = pytest.mark.skipif(not has("gcc"), reason="there is no gcc")
 
 ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
@@ -27,22 +34,52 @@ def damaged(program, count, seed, height_m):
     episode = episode_of(MESH, 120, 3, ROOM_M)
     estimator = begun(episode, settings_of(height_m=height_m, stationary_s=0.5, **ERRORS), ROOM_M, std_m=0.1)
     given = input_of(estimator, episode.packets, ROOM_M)
-    done = subprocess.run(
-        [program, str(count), str(seed)], input=given, capture_output=True, env=WITHOUT_LEAKS, check=False
-    )
+    return numbers(program, count, seed, given)
+
+
+def numbers(program, count, seed, given):
+    """What a program prints."""
+    command = [program, str(count), str(seed)]
+    done = subprocess.run(command, input=given, capture_output=True, env=WITHOUT_LEAKS, check=False)
     assert done.returncode == 0, done.stderr.decode()[:2000]
     return [int(number) for number in done.stdout.split()]
 
 
 @pytest.mark.parametrize("height_m", [0.0, None])
 def test_sanitizers_find_nothing_and_every_fix_is_a_number(tmp_path, height_m):
-    found = damaged(damaged_program(tmp_path), 20_000, 1, height_m)
+    found = damaged(damaged_program(tmp_path, "damaged"), 20_000, 1, height_m)
     assert found[0] > 5_000
     assert found[1] > 300  # a filter that lost its state takes none until its next start
+    assert found[2] == 0
+
+
+def damaged_frames(program, count, seed, height_m):
+    """How many frames were damaged, how many made a fix, and how many of these should not have."""
+    site = replace(ROOM, schedule=replace(ROOM.schedule, mode="free"), tags=replace(ROOM.tags, height_m=height_m))
+    heard = [one.reception for one in tape(site, 3.0)]
+    warm = len(heard) // 2
+    tag = Receiver()
+    for reception in heard[:warm]:
+        tag.hear(reception)
+    rows = np.zeros(len(heard) - warm, HEARD)
+    for row, reception in zip(rows, heard[warm:], strict=True):
+        row["length"], row["rx_ticks"] = len(reception.frame), reception.rx_ticks
+        row["bytes"][: len(reception.frame)] = np.frombuffer(reception.frame, np.uint8)
+    parts = [np.array([len(rows)], np.int32), tag._hearing, tag.method.course, tag.method.estimator.state, rows]
+    return numbers(program, count, seed, b"".join(bytes(one) for one in parts))
+
+
+@pytest.mark.parametrize("height_m", [0.0, None])
+def test_damaged_frames_do_no_harm(tmp_path, height_m):
+    found = damaged_frames(damaged_program(tmp_path, "damaged_frames"), 20_000, 1, height_m)
+    assert found[0] > 5_000
+    assert found[1] > 1_000
     assert found[2] == 0
 
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as folder:
         for fixed_m in (0.0, None):
-            print(*damaged(damaged_program(Path(folder)), int(sys.argv[1]), int(sys.argv[2]), fixed_m))
+            print(*damaged(damaged_program(Path(folder), "damaged"), int(sys.argv[1]), int(sys.argv[2]), fixed_m))
+            frames = damaged_program(Path(folder), "damaged_frames")
+            print(*damaged_frames(frames, int(sys.argv[1]), int(sys.argv[2]), fixed_m))

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from skyless.core.native.library import compiled
-from skyless.core.native.records import view
 from skyless.core.native.sizes import MAX_ANCHORS
+from skyless.core.native.views import view
 from skyless.core.tag.position import FOUND, IMPOSSIBLE, MIRROR, RESIDUALS, SINGULAR, UNCERTAIN, Found, find_position
 from skyless.core.tag.problem import FREE, HEIGHT, PLANE, LocateProblem
 

@@ -28,8 +28,9 @@ from skyless.core.estimator.saved import packed_state
 from skyless.core.estimator.state import WORK_ROWS, State
 from skyless.core.estimator.steady_state import PlannedMessage, PlannedRelay
 from skyless.core.native import small_matrices, tails
-from skyless.core.native.records import c_type, view
+from skyless.core.native.records import c_type
 from skyless.core.native.sizes import MAX_ANCHORS
+from skyless.core.native.views import view
 from skyless.core.tag import descent, minima, position, problem, starts
 from translator.body import Translator
 from translator.files import translate

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.core.native.records import view
 from skyless.core.native.small_matrices import (
     DEPENDENT,
     Columns,
@@ -17,6 +16,7 @@ from skyless.core.native.small_matrices import (
     solve,
     solve_lower,
 )
+from skyless.core.native.views import view
 
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -17,7 +17,7 @@ from skyless.core.estimator.estimator import Estimator, Packets
 from skyless.core.estimator.saved import packed_state
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import FAULT_KINDS
-from skyless.core.native.records import view
+from skyless.core.native.views import view
 from skyless.core.observation import Observation
 from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM, random_path
 from skyless.sim.lab import paper_lab_site

@@ -38,7 +38,7 @@ from skyless.core.estimator.state import (
     new_state,
 )
 from skyless.core.integrity import CONTRADICTED, HPL, Alert, IntegrityRequirement, integrity_of, limits_of
-from skyless.core.native.records import view
+from skyless.core.native.views import view
 
 pytestmark = pytest.mark.site
 

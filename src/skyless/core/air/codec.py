@@ -42,7 +42,7 @@ from skyless.core.air.instants import LONGEST_PERIOD_CODE
 from skyless.core.air.page_check import PAGE_BYTES
 from skyless.core.air.page_codec import decode_page, encode_page
 from skyless.core.native.library import compiled
-from skyless.core.native.records import view
+from skyless.core.native.views import view
 
 FAULTS: Final = tuple(Malformed)
 """In the order of the numbers that ``read_frame`` returns."""

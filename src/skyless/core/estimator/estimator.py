@@ -30,7 +30,7 @@ from skyless.core.estimator.state import (
     new_state,
 )
 from skyless.core.estimator.verdicts import is_late_often, is_lost, rejects_most
-from skyless.core.native.records import records, view
+from skyless.core.native.views import records, view
 from skyless.core.ticks import NEVER
 
 MAX_ANCHORS_KNOWN: Final = 256

@@ -16,8 +16,8 @@ from skyless.core.estimator.state import (
     new_state,
     set_layout,
 )
-from skyless.core.native.records import view
 from skyless.core.native.sizes import MAX_ANCHORS
+from skyless.core.native.views import view
 
 VERSION: Final = 1
 """Changes with the fields of ``State`` and of the records in it."""

@@ -24,8 +24,9 @@ from skyless.core.estimator.settings import TUNING, EstimatorSettings, Tuning
 from skyless.core.fix import PROTECTED_ROWS
 from skyless.core.integrity import limits_of
 from skyless.core.native.arithmetic import square
-from skyless.core.native.records import Array, Count, Integers, Matrix, Reals, Record, Ticks, aligned, record
+from skyless.core.native.records import Array, Count, Integers, Matrix, Reals, Record, Ticks, record
 from skyless.core.native.sizes import MAX_ANCHORS
+from skyless.core.native.views import aligned
 from skyless.core.ticks import NEVER
 
 PACKETS_KEPT: Final = 16

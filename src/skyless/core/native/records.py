@@ -33,9 +33,6 @@ from typing import (
 from zlib import compress, decompressobj
 from zlib import error as zlib_error
 
-import numpy as np
-from numpy.typing import NDArray
-
 Value = TypeVar("Value")
 Read_co = TypeVar("Read_co", covariant=True)
 Made = TypeVar("Made", bound="Record")
@@ -51,7 +48,6 @@ Byte = Annotated[int, ctypes.c_uint8]
 REAL: Final = ctypes.c_double
 """What a ``float`` of a record is; C's ``real``."""
 
-_CACHE_LINE: Final = 64
 _C_TYPES: Final[dict[object, Any]] = {int: ctypes.c_int32, bool: ctypes.c_bool, float: REAL}
 
 
@@ -156,21 +152,6 @@ def c_type(hint: Any) -> Any:  # noqa: ANN401 - types have no type
     return found
 
 
-def view(array: Any) -> NDArray[Any]:  # noqa: ANN401 - ctypes' arrays have no common type
-    """A record, or an array of numbers or records, as NumPy sees the same memory."""
-    element: Any = type(array)
-    shape: list[int] = []
-    while issubclass(element, ctypes.Array):
-        shape.append(element._length_)
-        element = element._type_
-    return np.frombuffer(array, np.dtype(element)).reshape(shape)
-
-
-def records(made: type[Made], array: NDArray[np.void]) -> Array[Made]:
-    """The records of a NumPy array of their type, shape (n,), in the same memory."""
-    return (made * len(array)).from_buffer(array.data)
-
-
 def packed(one: Record) -> bytes:
     """A record's bytes, compressed: what is not in use is zeros."""
     return compress(bytes(one), level=1)
@@ -190,10 +171,3 @@ def unpacked(made: type[Made], data: bytes) -> Made:
     if len(content) != size or not reader.eof or reader.unused_data:
         raise ValueError(f"{made.__name__} has {size} bytes, not what these are")
     return made.from_buffer_copy(content)
-
-
-def aligned(made: type[Made]) -> Made:
-    """A record of zeros that begins at a cache line. Pages of it that are never used take no memory."""
-    memory = np.zeros(ctypes.sizeof(made) + _CACHE_LINE, np.uint8)
-    begin = -memory.ctypes.data % _CACHE_LINE
-    return made.from_buffer(memory[begin : begin + ctypes.sizeof(made)].data)

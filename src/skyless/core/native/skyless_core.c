@@ -436,7 +436,9 @@ INTERNAL int32_t neighbour_of(Neighbours *t, int32_t anchor, int64_t rx_ticks) {
     return row;
 }
 
-/* The row to be forgotten: of an anchor that nobody confirms, of a single frame before others; the longest silent. */
+/* The row to be forgotten: the longest silent one of those that nobody confirms, of a single frame if there are any.
+ *
+ * Only where all are confirmed it is the longest silent of all. */
 INTERNAL int32_t least_important(Neighbours *t, int64_t rx_ticks) {
     int32_t least = -1;
     int32_t least_rank = 0;

@@ -16,8 +16,9 @@ from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.fix import POSITION, PROTECTED_ROWS, PROTECTION, VELOCITY, Fix, NoFixReason
 from skyless.core.integrity import UNAVAILABLE, IntegrityRequirement
 from skyless.core.native.library import compiled
-from skyless.core.native.records import packed, unpacked, view
+from skyless.core.native.records import packed, unpacked
 from skyless.core.native.sizes import MAX_ANCHORS
+from skyless.core.native.views import view
 from skyless.core.observation import Observation
 from skyless.core.tag._acquisition import Acquisition, Start
 from skyless.core.tag.course import (

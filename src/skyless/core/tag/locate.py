@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 from skyless.core.arrays import Array, Integers
 from skyless.core.fix import NoFixReason
 from skyless.core.native.library import compiled
-from skyless.core.native.records import view
 from skyless.core.native.sizes import MAX_ANCHORS
+from skyless.core.native.views import view
 from skyless.core.tag.position import (
     COLLINEAR_ANCHORS,
     FOUND,

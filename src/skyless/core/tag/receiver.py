@@ -21,7 +21,8 @@ from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.native.library import compiled
-from skyless.core.native.records import packed, unpacked, view
+from skyless.core.native.records import packed, unpacked
+from skyless.core.native.views import view
 from skyless.core.observation import Observation
 from skyless.core.tag.admission import DROP_COUNTERS, Admission, check
 from skyless.core.tag.beacon_receiver import BeaconReceiver, HeardSite, MethodOptions

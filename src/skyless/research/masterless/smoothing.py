@@ -23,7 +23,7 @@ from skyless.core.estimator.compiled import find_anchor
 from skyless.core.estimator.kalman import is_stationary, range_error_decay
 from skyless.core.estimator.settings import TUNING
 from skyless.core.fix import POSITION, VELOCITY, Fix
-from skyless.core.native.records import view
+from skyless.core.native.views import view
 from skyless.research.masterless.difference_tracking import DifferenceTracking
 
 CHUNK: Final = 2_000

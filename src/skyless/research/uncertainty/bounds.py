@@ -19,7 +19,7 @@ from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.core.estimator.compiled import add_anchor, process_known
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import State, new_state
-from skyless.core.native.records import view
+from skyless.core.native.views import view
 
 # What is known before the first frame, almost nothing: 30 m, 33 µs, ±10 ppm.
 POSITION_STD_M: Final = 30.0

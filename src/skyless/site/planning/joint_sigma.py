@@ -12,8 +12,8 @@ from skyless.core.estimator.compiled import add_anchor, find_steady_state
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import State, new_state
 from skyless.core.estimator.steady_state import PlannedMessage, PlannedRelay, SteadyState
-from skyless.core.native.records import records, view
 from skyless.core.native.sizes import MAX_ANCHORS
+from skyless.core.native.views import records, view
 from skyless.site.planning.anchor_clocks import AnchorClocks, Relays
 from skyless.site.planning.links import FIX_SHARE, SIGMA, Scene, fill_dops, fill_errors
 
