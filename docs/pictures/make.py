@@ -203,10 +203,10 @@ def layers() -> Figure:
 
 STAGES: Sequence[tuple[str, str, str]] = (
     ("radio", "frame of a beacon, RX stamp, diagnostics", SOFT_ORANGE),
-    ("Receiver.hear", "decode the frame, unwrap the stamps, keep the almanac page", SOFT_BLUE),
-    ("Observation", "one beacon with every stamp unwrapped on its own clock", SOFT),
-    ("positioning method", "the filter joint, after a cold start", SOFT_BLUE),
-    ("Estimator", "time update · own reception · relays · report · faults · levels", SOFT_BLUE),
+    ("Receiver.hear", "one compiled call; pages, starts and moved anchors come back to it", SOFT_BLUE),
+    ("hearing", "read the frame, unwrap the stamps, which anchors are confirmed", SOFT_BLUE),
+    ("course", "process the packet, or begin again", SOFT_BLUE),
+    ("estimator", "time update · own reception · relays · report · faults · levels", SOFT_BLUE),
     ("Fix", "position, velocity, covariance, protection level, alert", SOFT_GREEN),
     ("outputs", "MQTT, page, recording, CSV", SOFT_ORANGE),
 )

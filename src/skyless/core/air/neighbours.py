@@ -104,10 +104,7 @@ def neighbour_of(t: Neighbours, anchor: int, rx_ticks: Ticks) -> int:
 
 
 def _least_important(t: Neighbours, rx_ticks: Ticks) -> int:
-    """The row to be forgotten: the longest silent one of those that nobody confirms, of a single frame if there are any.
-
-    Only where all are confirmed it is the longest silent of all.
-    """
+    """The row to be forgotten: of what nobody confirms, if there is any, the longest silent; single frames go first."""
     least = -1
     least_rank = 0
     for row in range(t.count):

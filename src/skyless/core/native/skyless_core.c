@@ -436,9 +436,7 @@ INTERNAL int32_t neighbour_of(Neighbours *t, int32_t anchor, int64_t rx_ticks) {
     return row;
 }
 
-/* The row to be forgotten: the longest silent one of those that nobody confirms, of a single frame if there are any.
- *
- * Only where all are confirmed it is the longest silent of all. */
+/* The row to be forgotten: of what nobody confirms, if there is any, the longest silent; single frames go first. */
 INTERNAL int32_t least_important(Neighbours *t, int64_t rx_ticks) {
     int32_t least = -1;
     int32_t least_rank = 0;
