@@ -11,7 +11,7 @@ from typing import Any, Final
 from skyless.core.air import anchor_stamps, beacon_fields
 from skyless.core.estimator import levels, process, state, steady_state
 from skyless.core.native import arithmetic
-from skyless.core.tag import admission, course, hearing, position
+from skyless.core.tag import acquisition, admission, course, hearing, position
 from translator.files import translate
 
 EXPORTS: Final[tuple[Callable[..., Any], ...]] = (
@@ -34,6 +34,8 @@ EXPORTS: Final[tuple[Callable[..., Any], ...]] = (
     steady_state.find_steady_state,
     steady_state.process_known,
     position.find_position,
+    acquisition.try_start,
+    acquisition.forget_packets,
 )
 """What is called from outside."""
 

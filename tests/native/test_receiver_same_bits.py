@@ -8,6 +8,7 @@ from machines.bench import ROOM, tape
 from skyless.core.air.codec import decode, encode
 from skyless.core.air.reception import Diagnostics
 from skyless.core.tag import joint, receiver
+from skyless.core.tag.acquisition import try_start
 from skyless.core.tag.course import process_in_course
 from skyless.core.tag.hearing import hear_frame
 
@@ -44,6 +45,7 @@ def test_a_receiver_gives_the_same_bits(monkeypatch):
         with monkeypatch.context() as patched:
             patched.setattr(receiver, "_hear_frame", hear_frame)
             patched.setattr(joint, "_process_in_course", process_in_course)
+            patched.setattr(joint, "_try_to_start", try_start)
             found = plain.hear(one)
         assert (None if found is None else (found.rows, found.time_s, found.anchors)) == (
             None if expected is None else (expected.rows, expected.time_s, expected.anchors)

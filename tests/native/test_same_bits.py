@@ -179,7 +179,9 @@ FEW = 6
 def fill(one, draw):
     """Small numbers in all fields, so that they fit any table, and stamps of seconds."""
     for name, kind in one._fields_:
-        if issubclass(kind, ctypes.Structure | ctypes.Array):
+        if name == "parent":
+            view(one.parent)[:] = np.arange(-1, len(one.parent) - 1)
+        elif issubclass(kind, ctypes.Structure | ctypes.Array):
             fill_elements(getattr(one, name), draw)
         elif name == "bits":
             one.bits = 40
@@ -201,7 +203,7 @@ def fill_elements(array, draw):
 def drawn_scalar(kind, draw):
     if kind is ctypes.c_int64:
         return int(draw.integers(2 * 10**11))
-    return float(draw.normal(0.0, 10.0)) if kind is ctypes.c_double else kind(int(draw.integers(FEW))).value
+    return float(draw.normal(0.0, 10.0)) if kind is ctypes.c_double else kind(int(draw.integers(1, FEW))).value
 
 
 def hints(function):

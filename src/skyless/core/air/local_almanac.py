@@ -15,6 +15,7 @@ from skyless.core.air.instants import period_ticks
 from skyless.core.air.neighbours import Neighbour, Neighbours, StatedPlace
 from skyless.core.air.page_check import PAGE_BYTES
 from skyless.core.air.page_codec import decode_page, encode_page
+from skyless.core.native.records import first
 from skyless.core.site import AnchorSite, Site
 from skyless.core.ticks import from_seconds
 
@@ -149,7 +150,7 @@ class LocalAlmanac:
     @property
     def rows(self) -> list[Neighbour]:
         """All anchors, also those that are only relayed."""
-        return [self._neighbours.rows[row] for row in range(self._neighbours.count)]
+        return first(self._neighbours.rows, self._neighbours.count)
 
     def points_m(self) -> dict[int, tuple[float, float, float]]:
         """Position of each anchor that has stated one."""

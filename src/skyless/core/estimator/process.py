@@ -103,6 +103,12 @@ def process(s: State, packet: Packet) -> int:
 
 def process_frame(s: State, packet: Packet, packed: Bytes, packed_bytes: int) -> int:
     """``process`` with more relays, as frames carry them."""
+    take_relays(packet, packed, packed_bytes)
+    return process(s, packet)
+
+
+def take_relays(packet: Packet, packed: Bytes, packed_bytes: int) -> None:
+    """Add relays as frames carry them to those of a packet, as far as there is space."""
     for begin in range(0, packed_bytes, PACKED_BYTES):
         if packet.relay_count < MAX_RELAYS:
             relayed = packet.relays[packet.relay_count]
@@ -111,7 +117,6 @@ def process_frame(s: State, packet: Packet, packed: Bytes, packed_bytes: int) ->
             relayed.sequence = packed[begin + 2]
             relayed.rx_ticks = nearest(unsigned(packed, begin + 3, PACKED_BYTES - 3), packet.tx_ticks)
             packet.relay_count += 1
-    return process(s, packet)
 
 
 def _process_packet(s: State, packet: Packet) -> int:

@@ -152,6 +152,11 @@ def c_type(hint: Any) -> Any:  # noqa: ANN401 - types have no type
     return found
 
 
+def first(array: Array[Value], count: int) -> list[Value]:
+    """The first elements of an array; records are references."""
+    return [array[index] for index in range(count)]
+
+
 def packed(one: Record) -> bytes:
     """A record's bytes, compressed: what is not in use is zeros."""
     return compress(bytes(one), level=1)

@@ -19,6 +19,7 @@
  * skyless.core.native.arithmetic
  * skyless.core.native.small_matrices
  * skyless.core.native.tails
+ * skyless.core.tag.acquisition
  * skyless.core.tag.admission
  * skyless.core.tag.course
  * skyless.core.tag.descent
@@ -207,6 +208,7 @@ INTERNAL void bound_changes(State *s);
 INTERNAL int32_t height(State *s, real height_m, real std_m, bool is_barometer);
 INTERNAL void zero_velocity(State *s);
 INTERNAL int32_t process(State *s, Packet *packet);
+INTERNAL void take_relays(Packet *packet, uint8_t *packed, int32_t packed_bytes);
 INTERNAL int32_t process_packet(State *s, Packet *packet);
 INTERNAL int32_t present(State *s, Place *place);
 INTERNAL void remove_silent(State *s, int64_t rx_ticks);
@@ -244,13 +246,6 @@ INTERNAL real normal_tail(real z);
 INTERNAL real continued_fraction(real z, int32_t first);
 INTERNAL real chi2_tail(int32_t dof, real chi2);
 INTERNAL real mean_if_positive(real mean, real sigma);
-INTERNAL int32_t settle(Course *c, State *s, FixTime *time, int64_t rx_ticks);
-INTERNAL bool is_surely_in_reach(Course *c, int64_t rx_ticks);
-INTERNAL bool is_contradicted(Course *c, State *s, int64_t rx_ticks);
-INTERNAL void use_anchor(Course *c, Place *place, int64_t rx_ticks);
-INTERNAL int32_t longest_silent(Course *c);
-INTERNAL void forget_silent(Course *c, int64_t rx_ticks);
-INTERNAL void widen(Course *c, int32_t axis);
 INTERNAL bool choose_axes(LocateProblem *p);
 INTERNAL real sigma_m(LocateProblem *p, int32_t index_);
 INTERNAL real least_sigma_m(LocateProblem *p);
@@ -261,14 +256,6 @@ INTERNAL void whiten_system(LocateProblem *p);
 INTERNAL bool find_damped_step(LocateProblem *p, real damping);
 INTERNAL bool is_far(LocateProblem *p);
 INTERNAL real eased(real damping, real ratio);
-INTERNAL void add_power(Neighbour *n, real power_dbm);
-INTERNAL void add_relays(Neighbours *t, BeaconFields *b, int64_t rx_ticks);
-INTERNAL int32_t fitting_relays(Neighbours *t, State *s, BeaconFields *b, int64_t rx_ticks);
-INTERNAL bool confirm(Hearing *h, State *s);
-INTERNAL bool has_too_few(State *s, int64_t rx_ticks);
-INTERNAL bool keep_place(Neighbour *n, StatedPlace *place);
-INTERNAL bool is_same(StatedPlace *one, StatedPlace *other);
-INTERNAL void fill_packet(Packet *packet, Hearing *h, Neighbour *n, real factor);
 INTERNAL void add_algebraic_starts(LocateProblem *p);
 INTERNAL void add_intersections(LocateProblem *p, int32_t coordinates);
 INTERNAL void add_at_distance(LocateProblem *p, Equations *e, real distance_m);
@@ -293,6 +280,41 @@ INTERNAL void fill_position(LocateProblem *p, Minimum *minimum, real *position_m
 INTERNAL real site_coordinate(LocateProblem *p, Minimum *minimum, int32_t k);
 INTERNAL real site_covariance(LocateProblem *p, Minimum *minimum, int32_t a, int32_t b);
 INTERNAL void fill_residuals(LocateProblem *p, Found *found, Minimum *minimum);
+INTERNAL int32_t find_heard(Acquisition *q, int32_t anchor);
+INTERNAL void remove_heard(Acquisition *q, int32_t place);
+INTERNAL void forget_old_packets(Acquisition *q, int64_t now);
+INTERNAL bool keep_packet_of(Acquisition *q, int32_t anchor, HeardPacket *given);
+INTERNAL void add_links(Acquisition *q, Packet *packet);
+INTERNAL void add_link(Acquisition *q, Packet *listener, Packet *sent, int64_t rx_ticks);
+INTERNAL void forget_links_before(Acquisition *q, int64_t now);
+INTERNAL void choose_pairs(Acquisition *q, int64_t now);
+INTERNAL int32_t anchor_of(Acquisition *q, int32_t pair);
+INTERNAL void put_on_one_scale(Acquisition *q, int64_t now);
+INTERNAL void find_rate(Acquisition *q, int32_t pair, Packet *first, Packet *second);
+INTERNAL void reach_from(Acquisition *q, int32_t reference);
+INTERNAL int32_t find_pair(Acquisition *q, int32_t anchor);
+INTERNAL void convert(Acquisition *q, int32_t pair, HeardPacket *one);
+INTERNAL real clock_rate_mps(HeardAnchor *one);
+INTERNAL void drop_impossible(Acquisition *q);
+INTERNAL int32_t solve_start(Acquisition *q, int32_t left_out, int64_t now, real residual_tail);
+INTERNAL int32_t locate(Acquisition *q, int32_t count, real residual_tail);
+INTERNAL bool is_wide(Acquisition *q);
+INTERNAL int32_t solve_without_one(Acquisition *q, int64_t now);
+INTERNAL int32_t settle(Course *c, State *s, FixTime *time, int64_t rx_ticks);
+INTERNAL bool is_surely_in_reach(Course *c, int64_t rx_ticks);
+INTERNAL bool is_contradicted(Course *c, State *s, int64_t rx_ticks);
+INTERNAL void use_anchor(Course *c, Place *place, int64_t rx_ticks);
+INTERNAL int32_t longest_silent(Course *c);
+INTERNAL void forget_silent(Course *c, int64_t rx_ticks);
+INTERNAL void widen(Course *c, int32_t axis);
+INTERNAL void add_power(Neighbour *n, real power_dbm);
+INTERNAL void add_relays(Neighbours *t, BeaconFields *b, int64_t rx_ticks);
+INTERNAL int32_t fitting_relays(Neighbours *t, State *s, BeaconFields *b, int64_t rx_ticks);
+INTERNAL bool confirm(Hearing *h, State *s);
+INTERNAL bool has_too_few(State *s, int64_t rx_ticks);
+INTERNAL bool keep_place(Neighbour *n, StatedPlace *place);
+INTERNAL bool is_same(StatedPlace *one, StatedPlace *other);
+INTERNAL void fill_packet(Packet *packet, Hearing *h, Neighbour *n, real factor);
 
 /* Arithmetic of the functions that are also translated to C: the same bits on every processor, without a C library. */
 
@@ -3050,6 +3072,12 @@ INTERNAL int32_t process(State *s, Packet *packet) {
 
 /* ``process`` with more relays, as frames carry them. */
 SKYLESS_EXPORT int32_t skyless_process_frame(State *s, Packet *packet, uint8_t *packed, int32_t packed_bytes) {
+    take_relays(packet, packed, packed_bytes);
+    return process(s, packet);
+}
+
+/* Add relays as frames carry them to those of a packet, as far as there is space. */
+INTERNAL void take_relays(Packet *packet, uint8_t *packed, int32_t packed_bytes) {
     for (int32_t begin = 0; begin < packed_bytes; begin += 8) {
         if (packet->relay_count < MAX_RELAYS) {
             Relay *relayed = &packet->relays[packet->relay_count];
@@ -3060,7 +3088,6 @@ SKYLESS_EXPORT int32_t skyless_process_frame(State *s, Packet *packet, uint8_t *
             packet->relay_count += 1;
         }
     }
-    return process(s, packet);
 }
 
 /* Process a packet; its anchor joins where it is not in the state. */
@@ -3792,181 +3819,6 @@ INTERNAL real mean_if_positive(real mean, real sigma) {
     return mean + sigma * exp_(-REAL(0.5) * z * z) / (SQRT_2_PI * normal_tail(-z));
 }
 
-/* Which frames a tag admits: of the site in use, with stamps that are possible on its sender's and its own counter. */
-
-/* Unwrap the tag's stamp of a frame, and find out whether its site is in use; ``ADMITTED`` or why not.
- *
- * ``host_s``: the host's time of it, NaN where that is not known. */
-SKYLESS_EXPORT int32_t skyless_admit_sender(Admission *a, int32_t site, int32_t anchor, int64_t rx_counter, real host_s)
-        {
-    a->rx_ticks = unwrap(&a->own, rx_counter, host_s);
-    Neighbours *t = &a->neighbours;
-    bool is_possible = -LAST_TICKS <= a->rx_ticks && a->rx_ticks <= LAST_TICKS;
-    if (!is_possible || (t->has_newest && a->rx_ticks < t->newest_rx_ticks - COUNTER_JUMP_TICKS)) {
-        forget_times(t);
-        a->events = a->events | (is_possible ? COUNTER_JUMPED : HOST_JUMPED);
-        restart_choice(&a->choice, is_possible ? a->rx_ticks : 0);
-        if (!is_possible) {
-            a->own.has_stamp = false;
-            return IMPOSSIBLE_HOST_TIME;
-        }
-    }
-    bool had_site = a->choice.site != NO_SITE;
-    int32_t use = choose_site(&a->choice, site, anchor, a->rx_ticks);
-    if (use == FOREIGN) {
-        return FOREIGN_SITE;
-    }
-    if (use == CHANGED && had_site) {
-        t->count = 0;
-        t->has_newest = false;
-        a->events = a->events | SITE_CHANGED;
-    }
-    return ADMITTED;
-}
-
-/* Unwrap the TX stamp of a frame of the site in use; ``ADMITTED`` or why it is not used. */
-SKYLESS_EXPORT int32_t skyless_admit_stamp(Admission *a, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t
-        period_ticks) {
-    int32_t stamp = skyless_unwrap_stamp(&a->neighbours, anchor, sequence, tx_counter, a->rx_ticks, period_ticks);
-    if (stamp == STAMP_FITS) {
-        a->choice.heard_ticks = a->rx_ticks;
-    }
-    return stamp;
-}
-
-/* A tag that knows where it is: what becomes of a packet, and when it has to begin again. */
-
-/* Process a packet of a tag that knows where it is, as ``process_frame``; what becomes of it. */
-SKYLESS_EXPORT int32_t skyless_process_in_course(Course *c, State *s, FixTime *time, Packet *packet, uint8_t *packed,
-        int32_t packed_bytes) {
-    int32_t outcome = skyless_process_frame(s, packet, packed, packed_bytes);
-    c->newest_ticks = max_64(c->newest_ticks, packet->rx_ticks);
-    if (outcome == REJECTED || outcome == STALE) {
-        return is_lost(s) ? LOST : OUTLIER;
-    }
-    if (is_contradicted(c, s, packet->rx_ticks)) {
-        return START_CONTRADICTED;
-    }
-    use_anchor(c, &packet->place, packet->rx_ticks);
-    return settle(c, s, time, packet->rx_ticks);
-}
-
-/* Whether the state is a fix: in three dimensions its height may be worse than the anchors' extent. */
-INTERNAL int32_t settle(Course *c, State *s, FixTime *time, int64_t rx_ticks) {
-    if (s->dim == AXES && s->P[2][2] > square(c->extent_m)) {
-        return BAD_GEOMETRY;
-    }
-    c->time_s = fix_time_s(time, rx_ticks + c->master_less_tag_ticks, rx_ticks);
-    return FIX;
-}
-
-/* Whether the last packet is so recent that the filter can predict from it without a check. */
-INTERNAL bool is_surely_in_reach(Course *c, int64_t rx_ticks) {
-    return 0 <= rx_ticks - c->newest_ticks && rx_ticks - c->newest_ticks < SURELY_IN_REACH_TICKS;
-}
-
-/* Whether a new start is needed, as relays or faults contradict this one; decides what that has to expect. */
-INTERNAL bool is_contradicted(Course *c, State *s, int64_t rx_ticks) {
-    Tuning *tuning = &s->tuning;
-    if (c->start_was_contradicted && is_late_often(s)) {
-        c->start_was_contradicted = false;  /* it was by single late packets */
-        c->open_range_errors = false;
-        return true;
-    }
-    real age_s = (real)(rx_ticks - c->started_ticks) * TICK_S;
-    if (age_s >= tuning->new_start_s) {
-        c->may_begin_again = true;
-    } else if (c->may_begin_again && s->fix[QUALITY][0] > tuning->early_nis) {
-        c->may_begin_again = false;  /* if it does not help, all is noisier than stated */
-        return true;
-    }
-    if (c->is_open && age_s > tuning->new_start_s && fits_settings(s)) {
-        c->open_range_errors = false;
-        return true;
-    }
-    real limit = c->start_was_contradicted ? tuning->sure_chi2 : tuning->uncovered_chi2;
-    if (largest_test(s) > limit && (!c->is_open || age_s > tuning->new_start_s)) {
-        c->open_range_errors = !is_late_often(s);
-        return true;
-    }
-    if (!c->relays_may_contradict) {
-        c->relays_may_contradict = relays_fit(s);
-    } else if (relays_contradict(s)) {
-        c->relays_may_contradict = false;  /* if a new start does not help, the anchors are wrong, not the position */
-        return true;
-    }
-    return false;
-}
-
-/* Anchors in use */
-
-/* Note that a packet of an anchor was accepted, and forget those that have been silent for too long. */
-INTERNAL void use_anchor(Course *c, Place *place, int64_t rx_ticks) {
-    int32_t index_ = 0;
-    while (index_ < c->count && c->used[index_].anchor != place->anchor) {
-        index_ += 1;
-    }
-    bool is_new = index_ == c->count;
-    if (is_new && c->count == MAX_ANCHORS) {
-        index_ = longest_silent(c);
-    }
-    c->count = max_32(c->count, index_ + 1);
-    UsedAnchor *used = &c->used[index_];
-    bool has_changed = is_new;
-    for (int32_t axis = 0; axis < AXES; axis++) {
-        has_changed = has_changed || used->position_m[axis] != place->position_m[axis];
-        used->position_m[axis] = place->position_m[axis];
-    }
-    used->anchor = place->anchor;
-    used->rx_ticks = rx_ticks;
-    if ((real)(rx_ticks - c->checked_ticks) * TICK_S > c->in_use_s) {
-        c->checked_ticks = rx_ticks;
-        int32_t before = c->count;
-        forget_silent(c, rx_ticks);
-        has_changed = has_changed || c->count < before;
-    }
-    if (has_changed) {
-        c->changes += 1;
-        for (int32_t axis = 0; axis < AXES; axis++) {
-            widen(c, axis);
-        }
-    }
-}
-
-INTERNAL int32_t longest_silent(Course *c) {
-    int32_t oldest = 0;
-    for (int32_t index_ = 0, index__end = c->count; index_ < index__end; index_++) {
-        if (c->used[index_].rx_ticks < c->used[oldest].rx_ticks) {
-            oldest = index_;
-        }
-    }
-    return oldest;
-}
-
-INTERNAL void forget_silent(Course *c, int64_t rx_ticks) {
-    int32_t kept = 0;
-    for (int32_t index_ = 0, index__end = c->count; index_ < index__end; index_++) {
-        if ((real)(rx_ticks - c->used[index_].rx_ticks) * TICK_S <= c->in_use_s) {
-            if (kept < index_) {
-                c->used[kept] = c->used[index_];
-            }
-            kept += 1;
-        }
-    }
-    c->count = kept;
-}
-
-/* Take the anchors' span along an axis into account. */
-INTERNAL void widen(Course *c, int32_t axis) {
-    real highest = c->used[0].position_m[axis];
-    real lowest = c->used[0].position_m[axis];
-    for (int32_t index_ = 1, index__end = c->count; index_ < index__end; index_++) {
-        lowest = min_real(lowest, c->used[index_].position_m[axis]);
-        highest = max_real(highest, c->used[index_].position_m[axis]);
-    }
-    c->extent_m = max_real(c->extent_m, highest - lowest);
-}
-
 /* A set of TDoAs, in the axes in which their solution is simplest. */
 
 /* Anchors are in one plane if they leave it by less than this part of the smallest TDoA sigma. */
@@ -4198,174 +4050,6 @@ INTERNAL real eased(real damping, real ratio) {
     real excess = REAL(2.0) * ratio - REAL(1.0);
     real eased = damping * max_real(REAL(1.0) / REAL(3.0), REAL(1.0) - excess * excess * excess);
     return eased > MIN_DAMPING ? eased : REAL(0.0);
-}
-
-/* Which anchors of a large site a tag uses: the strongest of those that other anchors receive too. */
-
-/* Process the power of a beacon; NaN where the radio reports none. */
-INTERNAL void add_power(Neighbour *n, real power_dbm) {
-    if (abs_real(power_dbm) <= MAX_POWER_DBM) {
-        n->power_dbm = n->has_power ? n->power_dbm + POWER_GAIN * (power_dbm - n->power_dbm) : power_dbm;
-        n->has_power = true;
-    }
-}
-
-/* Process what an anchor relays, so that it confirms others. */
-INTERNAL void add_relays(Neighbours *t, BeaconFields *b, int64_t rx_ticks) {
-    for (int32_t begin = 0, begin_end = b->relay_bytes; begin < begin_end; begin += 8) {
-        int32_t anchor = b->relays[begin] | (int32_t)((uint32_t)b->relays[begin + 1] << 8);
-        int32_t row = neighbour_of(t, anchor, rx_ticks);
-        t->rows[row].relayed_ticks = rx_ticks;
-        t->rows[row].own_relays_ticks = NEVER;
-    }
-}
-
-/* How many receptions that an anchor relays fit what the tag has received itself: so it really receives them.
- *
- * Only packets of anchors in use count. A reception fits if, on the anchor's counter, it lies as long before its own
- * frame as on the tag's, to 1 µs (300 m) and the drift of crystals. */
-INTERNAL int32_t fitting_relays(Neighbours *t, State *s, BeaconFields *b, int64_t rx_ticks) {
-    int32_t fitting = 0;
-    int64_t tx_ticks = t->rows[t->row].tx_ticks;
-    for (int32_t begin = 0, begin_end = b->relay_bytes; begin < begin_end; begin += 8) {
-        int32_t anchor = b->relays[begin] | (int32_t)((uint32_t)b->relays[begin + 1] << 8);
-        int32_t row = find_neighbour(t, anchor);
-        if (row >= 0 && t->rows[row].frames > 0 && t->rows[row].sequence == b->relays[begin + 2]) {
-            int64_t elapsed = rx_ticks - t->rows[row].rx_ticks;
-            int64_t received_ticks = nearest(unsigned_(b->relays, begin + 3, 5), tx_ticks - elapsed, 40);
-            if (skyless_find_anchor(s, anchor) >= 0 && may_elapse(tx_ticks - received_ticks, elapsed,
-                    (real)FLIGHT_SLACK_TICKS)) {
-                fitting += 1;
-            }
-        }
-    }
-    return fitting;
-}
-
-/* A tag of protocol 2: from a frame's bytes to a fix, as long as it knows its site and where it is.
- *
- * What is rare is left to its owner (``Receiver``): pages of the site, starts, anchors that join or have moved. */
-
-/* Process a frame from the air; what becomes of it: of ``DROP_COUNTERS``, of a course, or one of the above.
- *
- * ``host_s`` and the powers are NaN where they are not known. Course and state are not used while it is starting. */
-SKYLESS_EXPORT int32_t skyless_hear_frame(Hearing *h, Course *c, State *s, uint8_t *frame, int32_t length, int64_t
-        rx_counter, real host_s, real rx_power_dbm, real first_path_power_dbm) {
-    int32_t fault = skyless_read_frame(frame, length, &h->beacon);
-    if (fault != INTACT) {
-        return MALFORMED + fault;
-    }
-    return skyless_hear_fields(h, c, s, rx_counter, host_s, rx_power_dbm, first_path_power_dbm);
-}
-
-/* The same of a beacon that has been read already. */
-SKYLESS_EXPORT int32_t skyless_hear_fields(Hearing *h, Course *c, State *s, int64_t rx_counter, real host_s, real
-        rx_power_dbm, real first_path_power_dbm) {
-    Admission *a = &h->admission;
-    BeaconFields *b = &h->beacon;
-    int32_t outcome = skyless_admit_sender(a, b->site, b->anchor, rx_counter, host_s);
-    if (outcome == ADMITTED) {
-        outcome = skyless_admit_stamp(a, b->anchor, b->sequence, b->tx_ticks, period_ticks(b->period_code));
-    }
-    h->is_starting = h->is_starting || a->events != 0;
-    if (outcome != ADMITTED) {
-        return outcome;
-    }
-    Neighbour *n = &a->neighbours.rows[a->neighbours.row];
-    add_power(n, rx_power_dbm);
-    n->is_confirmed = confirm(h, s);
-    n->almanac_issue = b->almanac_issue;
-    n->period_code = b->period_code;
-    h->has_moved = b->has_place && keep_place(n, &b->place);
-    fill_packet(&h->packet, h, n, variance_factor(rx_power_dbm, first_path_power_dbm));
-    if (h->is_starting || h->has_moved || h->is_moving || b->almanac_issue != h->almanac_issue) {
-        return IS_RARE;
-    }
-    if (skyless_find_anchor(s, b->anchor) < 0 || !is_surely_in_reach(c, a->rx_ticks)) {
-        return IS_RARE;
-    }
-    outcome = skyless_process_in_course(c, s, &a->time, &h->packet, b->relays, b->relay_bytes);
-    if (outcome == FIX) {
-        note_fix(&a->choice, a->rx_ticks);
-    }
-    return outcome;
-}
-
-/* Process which anchors a beacon confirms by its relays; whether other anchors confirm its sender.
- *
- * Only then its pages take part in the majority, and its relays confirm others. */
-INTERNAL bool confirm(Hearing *h, State *s) {
-    BeaconFields *b = &h->beacon;
-    Neighbours *t = &h->admission.neighbours;
-    int64_t rx_ticks = h->admission.rx_ticks;
-    Neighbour *n = &t->rows[t->row];
-    bool in_use = !h->is_starting && skyless_find_anchor(s, b->anchor) >= 0;
-    bool by_others = is_relayed(n, rx_ticks) || (in_use && n->own_relays_ticks == NEVER);
-    if (by_others || h->is_starting || has_too_few(s, rx_ticks)) {
-        add_relays(t, b, rx_ticks);
-    } else if (fitting_relays(t, s, b, rx_ticks) >= MIN_FITTING) {
-        n->own_relays_ticks = rx_ticks;
-    }
-    return by_others;
-}
-
-/* Whether fewer anchors in use are still received than a fix takes, so that relays of any anchor confirm.
- *
- * A tag may come to where none of its anchors is received, nor receives the next ones: out of a lift. */
-INTERNAL bool has_too_few(State *s, int64_t rx_ticks) {
-    int32_t heard = 0;
-    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
-        Anchor *a = &s->anchors[anchor];
-        if (a->packets > 0 && (real)(rx_ticks - a->rx_ticks) * TICK_S <= s->settings.drop_s) {
-            heard += 1;
-        }
-    }
-    return heard < MIN_ANCHORS;
-}
-
-/* Keep where an anchor says that it is; whether that is used from now on instead of another place. */
-INTERNAL bool keep_place(Neighbour *n, StatedPlace *place) {
-    if (n->has_place && is_same(&n->place, place)) {
-        n->has_other = false;
-        return false;
-    }
-    bool has_moved = n->has_place && n->has_other && is_same(&n->other, place);
-    if (has_moved || !n->has_place) {
-        n->place = *place;
-        n->has_place = true;
-        n->has_other = false;
-    } else {
-        n->other = *place;
-        n->has_other = true;
-    }
-    return has_moved;
-}
-
-INTERNAL bool is_same(StatedPlace *one, StatedPlace *other) {
-    for (int32_t axis = 0; axis < AXES; axis++) {
-        if (one->position_mm[axis] != other->position_mm[axis]) {
-            return false;
-        }
-    }
-    return one->std_mm == other->std_mm && one->floor_ == other->floor_ && one->zone == other->zone;
-}
-
-/* Write the beacon at hand as the filter takes it, but for its relays. */
-INTERNAL void fill_packet(Packet *packet, Hearing *h, Neighbour *n, real factor) {
-    Place *place = &packet->place;
-    place->anchor = n->anchor;
-    place->std_m = (real)n->place.std_mm / (real)MM_PER_M;
-    place->is_open = n->is_misfit;
-    for (int32_t axis = 0; axis < AXES; axis++) {
-        place->position_m[axis] = (real)n->place.position_mm[axis] / (real)MM_PER_M;
-    }
-    packet->sequence = n->sequence;
-    packet->rx_ticks = h->admission.rx_ticks;
-    packet->tx_ticks = n->tx_ticks;
-    packet->variance_factor = factor;
-    packet->master = -1;
-    packet->relay_count = 0;
-    packet->report_variance_m2 = REAL(0.0);
 }
 
 /* States from which the iterations start: from TDoAs in closed form, without a guess.
@@ -4850,4 +4534,804 @@ INTERNAL void fill_residuals(LocateProblem *p, Found *found, Minimum *minimum) {
     for (int32_t i = 0, i_end = p->anchors - 1; i < i_end; i++) {
         found->residuals_m[i] = p->system[i][p->dims];
     }
+}
+
+/* The cold start: where the tag is, from packets alone and without a guess.
+ *
+ * When anchor i relays its reception of a packet of anchor j that the tag received too, the difference of their clocks at
+ * that moment is known but for noise. Along such links all TX times are carried to the clock of one anchor,
+ * unless more anchors state theirs on the master's. The tag's clock runs up to 20 ppm off, so pseudoranges of one
+ * superframe drift by tens of metres. Two messages of the same anchor give the drift; then all anchors' newest
+ * pseudoranges are carried to one time and solved in closed form. */
+
+/* Forget what was received of an anchor, because its position has changed. */
+SKYLESS_EXPORT void skyless_forget_packets(Acquisition *q, int32_t anchor) {
+    int32_t place = find_heard(q, anchor);
+    if (place >= 0) {
+        remove_heard(q, place);
+    }
+    int32_t kept = 0;
+    for (int32_t one = 0, one_end = q->link_count; one < one_end; one++) {
+        if (q->links[one].listener != anchor && q->links[one].sender != anchor) {
+            q->links[kept] = q->links[one];
+            kept += 1;
+        }
+    }
+    q->link_count = kept;
+}
+
+/* Add one packet with more relays, as frames carry them; try to start each time an anchor comes around again.
+ *
+ * Returns why there is no start, ``FOUND`` if ``start`` is one. */
+SKYLESS_EXPORT int32_t skyless_try_start(Acquisition *q, HeardPacket *given, uint8_t *packed, int32_t packed_bytes) {
+    take_relays(&given->packet, packed, packed_bytes);
+    add_links(q, &given->packet);
+    int64_t now = given->packet.rx_ticks;
+    int32_t anchor = given->packet.place.anchor;
+    forget_old_packets(q, now);
+    bool came_around = keep_packet_of(q, anchor, given);
+    choose_pairs(q, now);
+    put_on_one_scale(q, now);
+    drop_impossible(q);
+    int32_t needed = q->knows_height ? 3 : 4;
+    if (q->pair_count < needed) {
+        return TOO_FEW_ANCHORS;
+    }
+    bool is_first = anchor_of(q, 0) == anchor;
+    if (!came_around || (q->pair_count == q->rival_count && !is_first)) {
+        return q->rival_count > 0 ? MIRROR : ACQUIRING;
+    }
+    int32_t reason = solve_start(q, -1, now, q->tuning.start_tail);
+    q->rival_count = reason == MIRROR ? q->pair_count : 0;
+    if (reason == FOUND) {
+        return !is_wide(q) ? FOUND : ACQUIRING;
+    }
+    if (reason == MIRROR || q->pair_count <= needed + 1 || !is_first) {
+        return reason;
+    }
+    return solve_without_one(q, now);
+}
+
+/* Packets and links */
+
+INTERNAL int32_t find_heard(Acquisition *q, int32_t anchor) {
+    for (int32_t place = 0, place_end = q->count; place < place_end; place++) {
+        if (q->heard[place].newer.packet.place.anchor == anchor) {
+            return place;
+        }
+    }
+    return -1;
+}
+
+INTERNAL void remove_heard(Acquisition *q, int32_t place) {
+    q->count -= 1;
+    for (int32_t one = place, one_end = q->count; one < one_end; one++) {
+        q->heard[one] = q->heard[one + 1];
+    }
+}
+
+INTERNAL void forget_old_packets(Acquisition *q, int64_t now) {
+    for (int32_t place = q->count - 1; place > -1; place--) {
+        if ((real)(now - q->heard[place].newer.packet.rx_ticks) * TICK_S > q->max_age_s) {
+            remove_heard(q, place);
+        }
+    }
+}
+
+/* Keep an anchor's two newest packets; whether it had two before. With too many anchors a new one is left out. */
+INTERNAL bool keep_packet_of(Acquisition *q, int32_t anchor, HeardPacket *given) {
+    int32_t place = find_heard(q, anchor);
+    if (place < 0) {
+        if (q->count == MAX_ANCHORS) {
+            return false;
+        }
+        place = q->count;
+        q->count += 1;
+        q->heard[place].count = 0;
+    }
+    HeardAnchor *one = &q->heard[place];
+    bool had_two = one->count == 2;
+    if (one->count > 0) {
+        one->older = one->newer;
+    }
+    one->newer = *given;
+    one->count = min_32(one->count + 1, 2);
+    return had_two;
+}
+
+/* Keep what an anchor relays of packets that the tag has received. */
+INTERNAL void add_links(Acquisition *q, Packet *packet) {
+    for (int32_t index_ = 0, index__end = packet->relay_count; index_ < index__end; index_++) {
+        Relay *relayed = &packet->relays[index_];
+        int32_t place = find_heard(q, relayed->anchor);
+        if (place >= 0) {
+            if (q->heard[place].newer.packet.sequence == relayed->sequence) {
+                add_link(q, packet, &q->heard[place].newer.packet, relayed->rx_ticks);
+            } else if (q->heard[place].count == 2 && q->heard[place].older.packet.sequence == relayed->sequence) {
+                add_link(q, packet, &q->heard[place].older.packet, relayed->rx_ticks);
+            }
+        }
+    }
+}
+
+INTERNAL void add_link(Acquisition *q, Packet *listener, Packet *sent, int64_t rx_ticks) {
+    real total = REAL(0.0);
+    for (int32_t axis = 0; axis < 3; axis++) {
+        total += square(listener->place.position_m[axis] - sent->place.position_m[axis]);
+    }
+    int32_t index_ = 0;
+    while (index_ < q->link_count && !(q->links[index_].listener == listener->place.anchor && q->links[index_].sender ==
+            sent->place.anchor)) {
+        index_ += 1;
+    }
+    if (index_ == MAX_LINKS) {
+        return;
+    }
+    q->link_count = max_32(q->link_count, index_ + 1);
+    ClockLink *link = &q->links[index_];
+    link->listener = listener->place.anchor;
+    link->sender = sent->place.anchor;
+    link->rx_ticks_tag = sent->rx_ticks;
+    const int64_t new_1 = rx_ticks - sent->tx_ticks;
+    const real new_2 = -SQRT(total) / TICK_M;
+    link->ticks = new_1;
+    link->fraction_ticks = new_2;
+}
+
+INTERNAL void forget_links_before(Acquisition *q, int64_t now) {
+    int32_t kept = 0;
+    for (int32_t one = 0, one_end = q->link_count; one < one_end; one++) {
+        if ((real)(now - q->links[one].rx_ticks_tag) * TICK_S < REAL(2.0) * q->max_age_s) {
+            q->links[kept] = q->links[one];
+            kept += 1;
+        }
+    }
+    q->link_count = kept;
+}
+
+/* Choose the anchors with two packets, the newer of them young. */
+INTERNAL void choose_pairs(Acquisition *q, int64_t now) {
+    q->pair_count = 0;
+    for (int32_t place = 0, place_end = q->count; place < place_end; place++) {
+        real age_s = (real)(now - q->heard[place].newer.packet.rx_ticks) * TICK_S;
+        if (q->heard[place].count == 2 && age_s < q->tuning.start_age_s) {
+            q->pairs[q->pair_count] = place;
+            q->pair_count += 1;
+        }
+    }
+}
+
+INTERNAL int32_t anchor_of(Acquisition *q, int32_t pair) {
+    return q->heard[q->pairs[pair]].newer.packet.place.anchor;
+}
+
+/* One scale for all TX times */
+
+/* Put packets on the scale of the anchor that reaches most others, or on the master's if that is more. */
+INTERNAL void put_on_one_scale(Acquisition *q, int64_t now) {
+    int32_t stated = 0;
+    for (int32_t pair = 0, pair_end = q->pair_count; pair < pair_end; pair++) {
+        HeardAnchor *one = &q->heard[q->pairs[pair]];
+        stated += one->older.is_stated && one->newer.is_stated ? 1 : 0;
+        find_rate(q, pair, &one->older.packet, &one->newer.packet);
+    }
+    forget_links_before(q, now);
+    q->best.count = 0;
+    for (int32_t pair = 0, pair_end = q->pair_count; pair < pair_end; pair++) {
+        if (q->best.count == 0 || q->best.is_reached[pair] == 0) {  /* it would reach the same anchors as before */
+            reach_from(q, pair);
+            if (q->reach.count > q->best.count) {
+                q->best = q->reach;
+            }
+        }
+    }
+    int32_t kept = 0;
+    for (int32_t pair = 0, pair_end = q->pair_count; pair < pair_end; pair++) {
+        HeardAnchor *one = &q->heard[q->pairs[pair]];
+        bool is_kept = one->older.is_stated && one->newer.is_stated;
+        one->older.scaled = one->older.stated;
+        one->newer.scaled = one->newer.stated;
+        if (q->best.count >= stated) {
+            is_kept = q->best.is_reached[pair] == 1;
+            if (is_kept) {
+                convert(q, pair, &one->older);
+                convert(q, pair, &one->newer);
+            }
+        }
+        if (is_kept) {
+            q->clock_rates_mps[kept] = clock_rate_mps(one);
+            q->pairs[kept] = q->pairs[pair];
+            kept += 1;
+        }
+    }
+    q->pair_count = kept;
+}
+
+INTERNAL void find_rate(Acquisition *q, int32_t pair, Packet *first, Packet *second) {
+    int64_t elapsed = second->rx_ticks - first->rx_ticks;
+    q->rate_variances[pair] = REAL(0.0);
+    q->rates[pair] = REAL(0.0);
+    if (elapsed > 0) {
+        q->rates[pair] = (real)(second->tx_ticks - first->tx_ticks - elapsed) / (real)elapsed;
+        q->rate_variances[pair] = REAL(2.0) * q->variance_m2 / square((real)elapsed * TICK_S);
+    }
+}
+
+/* Find every anchor to which links lead, by as few of them as can be. */
+INTERNAL void reach_from(Acquisition *q, int32_t reference) {
+    Reach *r = &q->reach;
+    for (int32_t pair = 0, pair_end = q->pair_count; pair < pair_end; pair++) {
+        r->is_reached[pair] = 0;
+    }
+    r->count = 1;
+    r->order[0] = reference;
+    r->is_reached[reference] = 1;
+    r->parent[reference] = -1;
+    int32_t next_one = 0;
+    while (next_one < r->count) {
+        int32_t known = r->order[next_one];
+        int32_t anchor = anchor_of(q, known);
+        for (int32_t index_ = 0, index__end = q->link_count; index_ < index__end; index_++) {
+            ClockLink *link = &q->links[index_];
+            bool is_listener = link->listener == anchor;
+            if (is_listener || link->sender == anchor) {
+                int32_t other = find_pair(q, is_listener ? link->sender : link->listener);
+                if (other >= 0 && r->is_reached[other] == 0) {
+                    r->is_reached[other] = 1;
+                    r->parent[other] = known;
+                    r->link[other] = index_;
+                    r->sign[other] = is_listener ? 1 : -1;
+                    r->order[r->count] = other;
+                    r->count += 1;
+                }
+            }
+        }
+        next_one += 1;
+    }
+}
+
+INTERNAL int32_t find_pair(Acquisition *q, int32_t anchor) {
+    for (int32_t pair = 0, pair_end = q->pair_count; pair < pair_end; pair++) {
+        if (anchor_of(q, pair) == anchor) {
+            return pair;
+        }
+    }
+    return -1;
+}
+
+/* Convert a packet's TX time to the clock of the reference; links go out of date at the difference of two rates. */
+INTERNAL void convert(Acquisition *q, int32_t pair, HeardPacket *one) {
+    Reach *r = &q->best;
+    int64_t rx_ticks = one->packet.rx_ticks;
+    int64_t ticks = one->packet.tx_ticks;
+    real fraction = REAL(0.0);
+    real variance_m2 = REAL(0.0);
+    int32_t place = pair;
+    while (r->parent[place] >= 0) {
+        ClockLink *link = &q->links[r->link[place]];
+        int32_t parent = r->parent[place];
+        int64_t elapsed = rx_ticks - link->rx_ticks_tag;
+        ticks += r->sign[place] * link->ticks;
+        fraction += (real)r->sign[place] * link->fraction_ticks + (q->rates[parent] - q->rates[place]) * (real)elapsed;
+        real rate_variance = q->rate_variances[parent] + q->rate_variances[place];
+        variance_m2 += REAL(2.0) * q->variance_m2 + rate_variance * square((real)elapsed * TICK_S);
+        place = parent;
+    }
+    int64_t whole = floor_real(fraction);
+    one->scaled.ticks = ticks + whole;
+    one->scaled.fraction_ticks = fraction - (real)whole;
+    one->scaled.variance_m2 = variance_m2;
+}
+
+/* Rate of the tag's clock against the common scale in m/s, from two messages; that of light where out of order. */
+INTERNAL real clock_rate_mps(HeardAnchor *one) {
+    int64_t elapsed = one->newer.packet.rx_ticks - one->older.packet.rx_ticks;
+    if (elapsed <= 0) {
+        return SPEED_OF_LIGHT_MPS;
+    }
+    int64_t change_ticks = elapsed - (one->newer.scaled.ticks - one->older.scaled.ticks);
+    real change_m = ((real)change_ticks - (one->newer.scaled.fraction_ticks - one->older.scaled.fraction_ticks)) *
+            TICK_M;
+    return change_m / ((real)elapsed * TICK_S);
+}
+
+/* Drop pairs of messages that no crystal can have sent. */
+INTERNAL void drop_impossible(Acquisition *q) {
+    int32_t kept = 0;
+    for (int32_t pair = 0, pair_end = q->pair_count; pair < pair_end; pair++) {
+        if (abs_real(q->clock_rates_mps[pair]) <= MAX_DRIFT * SPEED_OF_LIGHT_MPS) {
+            q->clock_rates_mps[kept] = q->clock_rates_mps[pair];
+            q->pairs[kept] = q->pairs[pair];
+            kept += 1;
+        }
+    }
+    q->pair_count = kept;
+}
+
+/* Positions */
+
+/* Locate the tag by the newest packets of all pairs but one (−1: of all); returns why there is no start. */
+INTERNAL int32_t solve_start(Acquisition *q, int32_t left_out, int64_t now, real residual_tail) {
+    Start *start = &q->start;
+    int32_t count = 0;
+    real shortest_s = q->max_age_s;
+    for (int32_t pair = 0, pair_end = q->pair_count; pair < pair_end; pair++) {
+        if (pair != left_out) {
+            HeardAnchor *one = &q->heard[q->pairs[pair]];
+            real rate_mps = clock_rate_mps(one);
+            int32_t place = count;
+            while (place > 0 && q->clock_rates_mps[place - 1] > rate_mps) {
+                q->clock_rates_mps[place] = q->clock_rates_mps[place - 1];
+                place -= 1;
+            }
+            q->clock_rates_mps[place] = rate_mps;
+            shortest_s = min_real(shortest_s, (real)(one->newer.packet.rx_ticks - one->older.packet.rx_ticks) * TICK_S);
+            start->used[count] = q->pairs[pair];
+            count += 1;
+        }
+    }
+    real median_mps = REAL(0.5) * (q->clock_rates_mps[floor_div_32(count, 2)] + q->clock_rates_mps[floor_div_32(count -
+            1, 2)]);
+    real rate_variance = REAL(2.0) * q->variance_m2 / square(shortest_s) + square(q->speed_std_mps);
+    HeardPacket *reference = &q->heard[start->used[0]].newer;
+    int64_t base_ticks = reference->packet.rx_ticks - reference->scaled.ticks;
+    for (int32_t index_ = 0; index_ < count; index_++) {
+        HeardPacket *newest = &q->heard[start->used[index_]].newer;
+        real age_s = (real)(now - newest->packet.rx_ticks) * TICK_S;
+        int64_t whole = newest->packet.rx_ticks - newest->scaled.ticks - base_ticks;
+        q->ranges_m[index_] = ((real)whole - newest->scaled.fraction_ticks) * TICK_M + median_mps * age_s;
+        real aged_m2 = square(age_s) * (rate_variance / (real)count + square(q->speed_std_mps));
+        real stamps_m2 = newest->packet.variance_factor * q->variance_m2 + newest->scaled.variance_m2;
+        q->variances_m2[index_] = stamps_m2 + q->error_variance_m2 + aged_m2;
+    }
+    int32_t reason = locate(q, count, residual_tail);
+    if (reason == FOUND) {
+        start->count = count;
+        start->rx_ticks_tag = now;
+        start->has_misfit = false;
+        start->is_contradicted = false;
+        for (int32_t axis = 0; axis < 3; axis++) {
+            start->position_m[axis] = q->found.position_m[axis];
+            for (int32_t other = 0; other < 3; other++) {
+                start->covariance_m2[axis][other] = q->found.covariance_m2[axis][other];
+            }
+        }
+    }
+    return reason;
+}
+
+/* Locate the tag by pseudoranges: by their differences against the first, with its variance in common. */
+INTERNAL int32_t locate(Acquisition *q, int32_t count, real residual_tail) {
+    LocateProblem *p = &q->problem;
+    p->anchors = count;
+    p->knows_height = q->knows_height;
+    p->height_m = q->height_m;
+    p->is_weighted = true;
+    p->has_bounds = q->has_bounds;
+    p->low_m = q->low_m;
+    p->high_m = q->high_m;
+    p->residual_tail = residual_tail;
+    for (int32_t i = 0; i < count; i++) {
+        Place *place = &q->heard[q->start.used[i]].newer.packet.place;
+        real difference_m = q->ranges_m[i] - q->ranges_m[0];
+        bool is_usable = abs_real(difference_m) < LARGEST && (REAL(0.0) < q->variances_m2[i] && q->variances_m2[i] <
+                LARGEST);
+        for (int32_t axis = 0; axis < 3; axis++) {
+            p->anchors_m[i][axis] = place->position_m[axis];
+            is_usable = is_usable && abs_real(place->position_m[axis]) < LARGEST;
+        }
+        if (!is_usable) {
+            return UNUSABLE;
+        }
+        if (i > 0) {
+            p->tdoa_m[i - 1] = difference_m;
+            int32_t row = floor_div_32((i - 1) * i, 2);
+            for (int32_t j = 0; j < i; j++) {
+                p->covariance[row + j] = q->variances_m2[0] + (j == i - 1 ? q->variances_m2[i] : REAL(0.0));
+            }
+        }
+    }
+    return skyless_find_position(p, &q->found);
+}
+
+/* Whether a start is held back: ranges are curved within its standard deviation by more than their noise.
+ *
+ * Updates would then make the filter sure of a wrong position. More anchors may come; if they do not, a start that
+ * at least one anchor more than needed agrees with is used. */
+INTERNAL bool is_wide(Acquisition *q) {
+    Start *start = &q->start;
+    int32_t dims = q->knows_height ? 2 : 3;
+    real range_m = REAL(0.0);
+    for (int32_t index_ = 0, index__end = start->count; index_ < index__end; index_++) {
+        real total = REAL(0.0);
+        for (int32_t axis = 0; axis < dims; axis++) {
+            total += square(q->heard[start->used[index_]].newer.packet.place.position_m[axis] -
+                    start->position_m[axis]);
+        }
+        range_m += SQRT(total) / (real)start->count;
+    }
+    real curvature_m = REAL(0.5) * (start->covariance_m2[0][0] + start->covariance_m2[1][1]) / range_m;
+    if (square(curvature_m) < q->variance_m2 + q->error_variance_m2) {
+        return false;
+    }
+    if (!q->has_been_wide) {
+        q->has_been_wide = true;
+        q->wide_ticks = start->rx_ticks_tag;
+    }
+    real waited_s = (real)(start->rx_ticks_tag - q->wide_ticks) * TICK_S;
+    return start->count <= dims + 1 || waited_s <= q->tuning.start_patience_s;
+}
+
+/* If exactly one anchor contradicts all others, leave it out. The others must still be able to contradict.
+ *
+ * If there is no such anchor for half a second, start from all of them as they are. */
+INTERNAL int32_t solve_without_one(Acquisition *q, int64_t now) {
+    if (!q->is_contradicted) {
+        q->is_contradicted = true;
+        q->contradicted_ticks = now;
+    }
+    int32_t starts = 0;
+    for (int32_t pair = 0, pair_end = q->pair_count; pair < pair_end; pair++) {
+        if (solve_start(q, pair, now, q->tuning.start_tail) == FOUND) {
+            starts += 1;
+            q->found_alone = q->start;
+            const bool new_1 = true;
+            const int32_t new_2 = anchor_of(q, pair);
+            q->found_alone.has_misfit = new_1;
+            q->found_alone.misfit = new_2;
+        }
+    }
+    int32_t reason = FOUND;
+    if (starts == 1) {
+        q->start = q->found_alone;
+    } else if ((real)(now - q->contradicted_ticks) * TICK_S < q->tuning.start_patience_s) {
+        return RESIDUALS;
+    } else {
+        reason = solve_start(q, -1, now, REAL(0.0));
+    }
+    q->start.is_contradicted = reason == FOUND;
+    return reason;
+}
+
+/* Which frames a tag admits: of the site in use, with stamps that are possible on its sender's and its own counter. */
+
+/* Unwrap the tag's stamp of a frame, and find out whether its site is in use; ``ADMITTED`` or why not.
+ *
+ * ``host_s``: the host's time of it, NaN where that is not known. */
+SKYLESS_EXPORT int32_t skyless_admit_sender(Admission *a, int32_t site, int32_t anchor, int64_t rx_counter, real host_s)
+        {
+    a->rx_ticks = unwrap(&a->own, rx_counter, host_s);
+    Neighbours *t = &a->neighbours;
+    bool is_possible = -LAST_TICKS <= a->rx_ticks && a->rx_ticks <= LAST_TICKS;
+    if (!is_possible || (t->has_newest && a->rx_ticks < t->newest_rx_ticks - COUNTER_JUMP_TICKS)) {
+        forget_times(t);
+        a->events = a->events | (is_possible ? COUNTER_JUMPED : HOST_JUMPED);
+        restart_choice(&a->choice, is_possible ? a->rx_ticks : 0);
+        if (!is_possible) {
+            a->own.has_stamp = false;
+            return IMPOSSIBLE_HOST_TIME;
+        }
+    }
+    bool had_site = a->choice.site != NO_SITE;
+    int32_t use = choose_site(&a->choice, site, anchor, a->rx_ticks);
+    if (use == FOREIGN) {
+        return FOREIGN_SITE;
+    }
+    if (use == CHANGED && had_site) {
+        t->count = 0;
+        t->has_newest = false;
+        a->events = a->events | SITE_CHANGED;
+    }
+    return ADMITTED;
+}
+
+/* Unwrap the TX stamp of a frame of the site in use; ``ADMITTED`` or why it is not used. */
+SKYLESS_EXPORT int32_t skyless_admit_stamp(Admission *a, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t
+        period_ticks) {
+    int32_t stamp = skyless_unwrap_stamp(&a->neighbours, anchor, sequence, tx_counter, a->rx_ticks, period_ticks);
+    if (stamp == STAMP_FITS) {
+        a->choice.heard_ticks = a->rx_ticks;
+    }
+    return stamp;
+}
+
+/* A tag that knows where it is: what becomes of a packet, and when it has to begin again. */
+
+/* Process a packet of a tag that knows where it is, as ``process_frame``; what becomes of it. */
+SKYLESS_EXPORT int32_t skyless_process_in_course(Course *c, State *s, FixTime *time, Packet *packet, uint8_t *packed,
+        int32_t packed_bytes) {
+    int32_t outcome = skyless_process_frame(s, packet, packed, packed_bytes);
+    c->newest_ticks = max_64(c->newest_ticks, packet->rx_ticks);
+    if (outcome == REJECTED || outcome == STALE) {
+        return is_lost(s) ? LOST : OUTLIER;
+    }
+    if (is_contradicted(c, s, packet->rx_ticks)) {
+        return START_CONTRADICTED;
+    }
+    use_anchor(c, &packet->place, packet->rx_ticks);
+    return settle(c, s, time, packet->rx_ticks);
+}
+
+/* Whether the state is a fix: in three dimensions its height may be worse than the anchors' extent. */
+INTERNAL int32_t settle(Course *c, State *s, FixTime *time, int64_t rx_ticks) {
+    if (s->dim == AXES && s->P[2][2] > square(c->extent_m)) {
+        return BAD_GEOMETRY;
+    }
+    c->time_s = fix_time_s(time, rx_ticks + c->master_less_tag_ticks, rx_ticks);
+    return FIX;
+}
+
+/* Whether the last packet is so recent that the filter can predict from it without a check. */
+INTERNAL bool is_surely_in_reach(Course *c, int64_t rx_ticks) {
+    return 0 <= rx_ticks - c->newest_ticks && rx_ticks - c->newest_ticks < SURELY_IN_REACH_TICKS;
+}
+
+/* Whether a new start is needed, as relays or faults contradict this one; decides what that has to expect. */
+INTERNAL bool is_contradicted(Course *c, State *s, int64_t rx_ticks) {
+    Tuning *tuning = &s->tuning;
+    if (c->start_was_contradicted && is_late_often(s)) {
+        c->start_was_contradicted = false;  /* it was by single late packets */
+        c->open_range_errors = false;
+        return true;
+    }
+    real age_s = (real)(rx_ticks - c->started_ticks) * TICK_S;
+    if (age_s >= tuning->new_start_s) {
+        c->may_begin_again = true;
+    } else if (c->may_begin_again && s->fix[QUALITY][0] > tuning->early_nis) {
+        c->may_begin_again = false;  /* if it does not help, all is noisier than stated */
+        return true;
+    }
+    if (c->is_open && age_s > tuning->new_start_s && fits_settings(s)) {
+        c->open_range_errors = false;
+        return true;
+    }
+    real limit = c->start_was_contradicted ? tuning->sure_chi2 : tuning->uncovered_chi2;
+    if (largest_test(s) > limit && (!c->is_open || age_s > tuning->new_start_s)) {
+        c->open_range_errors = !is_late_often(s);
+        return true;
+    }
+    if (!c->relays_may_contradict) {
+        c->relays_may_contradict = relays_fit(s);
+    } else if (relays_contradict(s)) {
+        c->relays_may_contradict = false;  /* if a new start does not help, the anchors are wrong, not the position */
+        return true;
+    }
+    return false;
+}
+
+/* Anchors in use */
+
+/* Note that a packet of an anchor was accepted, and forget those that have been silent for too long. */
+INTERNAL void use_anchor(Course *c, Place *place, int64_t rx_ticks) {
+    int32_t index_ = 0;
+    while (index_ < c->count && c->used[index_].anchor != place->anchor) {
+        index_ += 1;
+    }
+    bool is_new = index_ == c->count;
+    if (is_new && c->count == MAX_ANCHORS) {
+        index_ = longest_silent(c);
+    }
+    c->count = max_32(c->count, index_ + 1);
+    UsedAnchor *used = &c->used[index_];
+    bool has_changed = is_new;
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        has_changed = has_changed || used->position_m[axis] != place->position_m[axis];
+        used->position_m[axis] = place->position_m[axis];
+    }
+    used->anchor = place->anchor;
+    used->rx_ticks = rx_ticks;
+    if ((real)(rx_ticks - c->checked_ticks) * TICK_S > c->in_use_s) {
+        c->checked_ticks = rx_ticks;
+        int32_t before = c->count;
+        forget_silent(c, rx_ticks);
+        has_changed = has_changed || c->count < before;
+    }
+    if (has_changed) {
+        c->changes += 1;
+        for (int32_t axis = 0; axis < AXES; axis++) {
+            widen(c, axis);
+        }
+    }
+}
+
+INTERNAL int32_t longest_silent(Course *c) {
+    int32_t oldest = 0;
+    for (int32_t index_ = 0, index__end = c->count; index_ < index__end; index_++) {
+        if (c->used[index_].rx_ticks < c->used[oldest].rx_ticks) {
+            oldest = index_;
+        }
+    }
+    return oldest;
+}
+
+INTERNAL void forget_silent(Course *c, int64_t rx_ticks) {
+    int32_t kept = 0;
+    for (int32_t index_ = 0, index__end = c->count; index_ < index__end; index_++) {
+        if ((real)(rx_ticks - c->used[index_].rx_ticks) * TICK_S <= c->in_use_s) {
+            if (kept < index_) {
+                c->used[kept] = c->used[index_];
+            }
+            kept += 1;
+        }
+    }
+    c->count = kept;
+}
+
+/* Take the anchors' span along an axis into account. */
+INTERNAL void widen(Course *c, int32_t axis) {
+    real highest = c->used[0].position_m[axis];
+    real lowest = c->used[0].position_m[axis];
+    for (int32_t index_ = 1, index__end = c->count; index_ < index__end; index_++) {
+        lowest = min_real(lowest, c->used[index_].position_m[axis]);
+        highest = max_real(highest, c->used[index_].position_m[axis]);
+    }
+    c->extent_m = max_real(c->extent_m, highest - lowest);
+}
+
+/* Which anchors of a large site a tag uses: the strongest of those that other anchors receive too. */
+
+/* Process the power of a beacon; NaN where the radio reports none. */
+INTERNAL void add_power(Neighbour *n, real power_dbm) {
+    if (abs_real(power_dbm) <= MAX_POWER_DBM) {
+        n->power_dbm = n->has_power ? n->power_dbm + POWER_GAIN * (power_dbm - n->power_dbm) : power_dbm;
+        n->has_power = true;
+    }
+}
+
+/* Process what an anchor relays, so that it confirms others. */
+INTERNAL void add_relays(Neighbours *t, BeaconFields *b, int64_t rx_ticks) {
+    for (int32_t begin = 0, begin_end = b->relay_bytes; begin < begin_end; begin += 8) {
+        int32_t anchor = b->relays[begin] | (int32_t)((uint32_t)b->relays[begin + 1] << 8);
+        int32_t row = neighbour_of(t, anchor, rx_ticks);
+        t->rows[row].relayed_ticks = rx_ticks;
+        t->rows[row].own_relays_ticks = NEVER;
+    }
+}
+
+/* How many receptions that an anchor relays fit what the tag has received itself: so it really receives them.
+ *
+ * Only packets of anchors in use count. A reception fits if, on the anchor's counter, it lies as long before its own
+ * frame as on the tag's, to 1 µs (300 m) and the drift of crystals. */
+INTERNAL int32_t fitting_relays(Neighbours *t, State *s, BeaconFields *b, int64_t rx_ticks) {
+    int32_t fitting = 0;
+    int64_t tx_ticks = t->rows[t->row].tx_ticks;
+    for (int32_t begin = 0, begin_end = b->relay_bytes; begin < begin_end; begin += 8) {
+        int32_t anchor = b->relays[begin] | (int32_t)((uint32_t)b->relays[begin + 1] << 8);
+        int32_t row = find_neighbour(t, anchor);
+        if (row >= 0 && t->rows[row].frames > 0 && t->rows[row].sequence == b->relays[begin + 2]) {
+            int64_t elapsed = rx_ticks - t->rows[row].rx_ticks;
+            int64_t received_ticks = nearest(unsigned_(b->relays, begin + 3, 5), tx_ticks - elapsed, 40);
+            if (skyless_find_anchor(s, anchor) >= 0 && may_elapse(tx_ticks - received_ticks, elapsed,
+                    (real)FLIGHT_SLACK_TICKS)) {
+                fitting += 1;
+            }
+        }
+    }
+    return fitting;
+}
+
+/* A tag of protocol 2: from a frame's bytes to a fix, as long as it knows its site and where it is.
+ *
+ * What is rare is left to its owner (``Receiver``): pages of the site, starts, anchors that join or have moved. */
+
+/* Process a frame from the air; what becomes of it: of ``DROP_COUNTERS``, of a course, or one of the above.
+ *
+ * ``host_s`` and the powers are NaN where they are not known. Course and state are not used while it is starting. */
+SKYLESS_EXPORT int32_t skyless_hear_frame(Hearing *h, Course *c, State *s, uint8_t *frame, int32_t length, int64_t
+        rx_counter, real host_s, real rx_power_dbm, real first_path_power_dbm) {
+    int32_t fault = skyless_read_frame(frame, length, &h->beacon);
+    if (fault != INTACT) {
+        return MALFORMED + fault;
+    }
+    return skyless_hear_fields(h, c, s, rx_counter, host_s, rx_power_dbm, first_path_power_dbm);
+}
+
+/* The same of a beacon that has been read already. */
+SKYLESS_EXPORT int32_t skyless_hear_fields(Hearing *h, Course *c, State *s, int64_t rx_counter, real host_s, real
+        rx_power_dbm, real first_path_power_dbm) {
+    Admission *a = &h->admission;
+    BeaconFields *b = &h->beacon;
+    int32_t outcome = skyless_admit_sender(a, b->site, b->anchor, rx_counter, host_s);
+    if (outcome == ADMITTED) {
+        outcome = skyless_admit_stamp(a, b->anchor, b->sequence, b->tx_ticks, period_ticks(b->period_code));
+    }
+    h->is_starting = h->is_starting || a->events != 0;
+    if (outcome != ADMITTED) {
+        return outcome;
+    }
+    Neighbour *n = &a->neighbours.rows[a->neighbours.row];
+    add_power(n, rx_power_dbm);
+    n->is_confirmed = confirm(h, s);
+    n->almanac_issue = b->almanac_issue;
+    n->period_code = b->period_code;
+    h->has_moved = b->has_place && keep_place(n, &b->place);
+    fill_packet(&h->packet, h, n, variance_factor(rx_power_dbm, first_path_power_dbm));
+    if (h->is_starting || h->has_moved || h->is_moving || b->almanac_issue != h->almanac_issue) {
+        return IS_RARE;
+    }
+    if (skyless_find_anchor(s, b->anchor) < 0 || !is_surely_in_reach(c, a->rx_ticks)) {
+        return IS_RARE;
+    }
+    outcome = skyless_process_in_course(c, s, &a->time, &h->packet, b->relays, b->relay_bytes);
+    if (outcome == FIX) {
+        note_fix(&a->choice, a->rx_ticks);
+    }
+    return outcome;
+}
+
+/* Process which anchors a beacon confirms by its relays; whether other anchors confirm its sender.
+ *
+ * Only then its pages take part in the majority, and its relays confirm others. */
+INTERNAL bool confirm(Hearing *h, State *s) {
+    BeaconFields *b = &h->beacon;
+    Neighbours *t = &h->admission.neighbours;
+    int64_t rx_ticks = h->admission.rx_ticks;
+    Neighbour *n = &t->rows[t->row];
+    bool in_use = !h->is_starting && skyless_find_anchor(s, b->anchor) >= 0;
+    bool by_others = is_relayed(n, rx_ticks) || (in_use && n->own_relays_ticks == NEVER);
+    if (by_others || h->is_starting || has_too_few(s, rx_ticks)) {
+        add_relays(t, b, rx_ticks);
+    } else if (fitting_relays(t, s, b, rx_ticks) >= MIN_FITTING) {
+        n->own_relays_ticks = rx_ticks;
+    }
+    return by_others;
+}
+
+/* Whether fewer anchors in use are still received than a fix takes, so that relays of any anchor confirm.
+ *
+ * A tag may come to where none of its anchors is received, nor receives the next ones: out of a lift. */
+INTERNAL bool has_too_few(State *s, int64_t rx_ticks) {
+    int32_t heard = 0;
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        Anchor *a = &s->anchors[anchor];
+        if (a->packets > 0 && (real)(rx_ticks - a->rx_ticks) * TICK_S <= s->settings.drop_s) {
+            heard += 1;
+        }
+    }
+    return heard < MIN_ANCHORS;
+}
+
+/* Keep where an anchor says that it is; whether that is used from now on instead of another place. */
+INTERNAL bool keep_place(Neighbour *n, StatedPlace *place) {
+    if (n->has_place && is_same(&n->place, place)) {
+        n->has_other = false;
+        return false;
+    }
+    bool has_moved = n->has_place && n->has_other && is_same(&n->other, place);
+    if (has_moved || !n->has_place) {
+        n->place = *place;
+        n->has_place = true;
+        n->has_other = false;
+    } else {
+        n->other = *place;
+        n->has_other = true;
+    }
+    return has_moved;
+}
+
+INTERNAL bool is_same(StatedPlace *one, StatedPlace *other) {
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        if (one->position_mm[axis] != other->position_mm[axis]) {
+            return false;
+        }
+    }
+    return one->std_mm == other->std_mm && one->floor_ == other->floor_ && one->zone == other->zone;
+}
+
+/* Write the beacon at hand as the filter takes it, but for its relays. */
+INTERNAL void fill_packet(Packet *packet, Hearing *h, Neighbour *n, real factor) {
+    Place *place = &packet->place;
+    place->anchor = n->anchor;
+    place->std_m = (real)n->place.std_mm / (real)MM_PER_M;
+    place->is_open = n->is_misfit;
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        place->position_m[axis] = (real)n->place.position_mm[axis] / (real)MM_PER_M;
+    }
+    packet->sequence = n->sequence;
+    packet->rx_ticks = h->admission.rx_ticks;
+    packet->tx_ticks = n->tx_ticks;
+    packet->variance_factor = factor;
+    packet->master = -1;
+    packet->relay_count = 0;
+    packet->report_variance_m2 = REAL(0.0);
 }

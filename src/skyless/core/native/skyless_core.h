@@ -19,6 +19,7 @@
  * skyless.core.native.arithmetic
  * skyless.core.native.small_matrices
  * skyless.core.native.tails
+ * skyless.core.tag.acquisition
  * skyless.core.tag.admission
  * skyless.core.tag.course
  * skyless.core.tag.descent
@@ -51,6 +52,7 @@ typedef double real;
 
 #define ACCEPTED 1
 #define ACCURACY_PAGE 5
+#define ACQUIRING 22
 #define ADMITTED 0
 #define AFTER_ALL_TICKS INT64_C(4611686018427387904)
 #define ALL_RANGE_ERRORS 2
@@ -144,6 +146,8 @@ typedef double real;
 #define JOINED 2
 /* Numbers in a vector of 256 bits. */
 #define LANES 4
+/* Metres, or m²: anything beyond is no site, and no number here overflows before it. */
+#define LARGEST REAL(1000000000.0)
 #define LASTING 0
 #define LAST_TICKS INT64_C(2305843009213693952)
 #define LEVELS 5
@@ -172,6 +176,7 @@ typedef double real;
 #define MAX_FRAME_BYTES 127
 #define MAX_HEARD 12
 #define MAX_ITERATIONS 200
+#define MAX_LINKS 992
 /* More anchors than there are in reach: forged ones cannot use more memory. */
 #define MAX_NEIGHBOURS 256
 /* 2⁻¹⁹ as a float32: those from 0 on are in the order of their bits. */
@@ -271,6 +276,7 @@ typedef double real;
 #define TICK_MASK INT64_C(1099511627775)
 #define TICK_RATE_HZ REAL(63897600000.0)
 #define TICK_S REAL(1.5650040064102565e-11)
+#define TOO_FEW_ANCHORS 21
 #define TOO_LONG 2
 #define TOO_SHORT 1
 /* A site that has given no fix for this time is left for another one: none holds a tag by its number of anchors. */
@@ -282,6 +288,7 @@ typedef double real;
 #define UNIT_STEPS 31200
 #define UNKNOWN_VERSION 5
 #define UNSETTLED 4
+#define UNUSABLE 20
 #define UNUSED 0
 #define USED 1
 #define VELOCITY 5
@@ -937,6 +944,97 @@ typedef struct Equations {
     real v[4];
 } Equations;
 
+/* A TX time on a scale that packets of several anchors have in common. */
+typedef struct ScaledTime {
+    int64_t ticks;
+    real fraction_ticks;
+    real variance_m2;
+} ScaledTime;
+
+/* A packet. */
+typedef struct HeardPacket {
+    Packet packet;
+    bool is_stated;  /* Whether the anchor states its TX time on the master's scale … */
+    ScaledTime stated;  /* … and that time. */
+    ScaledTime scaled;  /* The time on the scale of the trial at hand. */
+} HeardPacket;
+
+/* An anchor's newest packets. */
+typedef struct HeardAnchor {
+    int32_t count;
+    HeardPacket older;
+    HeardPacket newer;
+} HeardAnchor;
+
+/* Reading of one anchor's clock less that of another's, when the tag's read ``rx_ticks_tag``. */
+typedef struct ClockLink {
+    int32_t listener;
+    int32_t sender;
+    int64_t rx_ticks_tag;
+    int64_t ticks;
+    real fraction_ticks;
+} ClockLink;
+
+/* A first position. */
+typedef struct Start {
+    int64_t rx_ticks_tag;
+    int32_t count;
+    int32_t used[32];  /* Where the anchors that it uses stand in the table of those that are heard. */
+    real position_m[3];
+    real covariance_m2[3][3];
+    bool is_contradicted;  /* Whether the messages of all anchors contradict each other. */
+    bool has_misfit;
+    int32_t misfit;  /* An anchor that is not in ``used``: without it there is no contradiction. */
+} Start;
+
+/* Along which links an anchor's TX times become those of the reference: a tree. */
+typedef struct Reach {
+    int32_t count;
+    int32_t order[32];  /* Pairs in the order in which they are reached; the first is the reference. */
+    int32_t is_reached[32];
+    int32_t parent[32];
+    int32_t link[32];
+    int32_t sign[32];
+} Reach;
+
+/* Gathers packets until a start is possible. */
+typedef struct Acquisition {
+    bool knows_height;
+    real height_m;
+    bool has_bounds;
+    real low_m;
+    real high_m;
+    real variance_m2;  /* Of a TX and an RX stamp together. */
+    real max_age_s;
+    real speed_std_mps;  /* Assumed speed of the tag. */
+    real error_variance_m2;  /* Of survey and ranges. */
+    Tuning tuning;
+    int32_t count;
+    HeardAnchor heard[32];  /* In the order in which they were first heard. */
+    int32_t link_count;
+    ClockLink links[992];
+    bool has_been_wide;
+    int64_t wide_ticks;  /* When a start was first possible, but wide. */
+    bool is_contradicted;
+    int64_t contradicted_ticks;  /* When packets first contradicted each other. */
+    /* Anchors with which two positions fitted alike; as many of them are tried again once a superframe only. */
+    int32_t rival_count;
+    Start start;
+    int32_t pair_count;
+    int32_t pairs[32];  /* Anchors with two packets, by their place in ``heard``. */
+    real rates[32];  /* How much faster the clock of each runs than the tag's, as a fraction … */
+    real rate_variances[32];  /* … and the variance of that in m²/s². */
+    /* Rates of the tag's clock against the common scale, one of each anchor; ``_solve_start`` sorts them. */
+    real clock_rates_mps[32];
+    Reach reach;
+    Reach best;
+    Start found_alone;
+    real ranges_m[32];  /* Pseudoranges at one time … */
+    real variances_m2[32];  /* … and their variances. */
+    LocateProblem problem;
+    Found found;
+} Acquisition;
+
 SKYLESS_EXPORT int32_t skyless_unwrap_stamp(Neighbours *t, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t
         rx_ticks, int64_t period_ticks);
 SKYLESS_EXPORT int32_t skyless_read_frame(uint8_t *frame, int32_t length, BeaconFields *b);
@@ -954,6 +1052,9 @@ SKYLESS_EXPORT void skyless_find_steady_state(State *s, PlannedMessage *messages
         int32_t most, int32_t step, SteadyState *found);
 SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_ticks, real *position_m, uint8_t *known,
         int32_t first, real elapsed_s, real walked_m);
+SKYLESS_EXPORT int32_t skyless_find_position(LocateProblem *p, Found *found);
+SKYLESS_EXPORT void skyless_forget_packets(Acquisition *q, int32_t anchor);
+SKYLESS_EXPORT int32_t skyless_try_start(Acquisition *q, HeardPacket *given, uint8_t *packed, int32_t packed_bytes);
 SKYLESS_EXPORT int32_t skyless_admit_sender(Admission *a, int32_t site, int32_t anchor, int64_t rx_counter, real
         host_s);
 SKYLESS_EXPORT int32_t skyless_admit_stamp(Admission *a, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t
@@ -964,6 +1065,5 @@ SKYLESS_EXPORT int32_t skyless_hear_frame(Hearing *h, Course *c, State *s, uint8
         rx_counter, real host_s, real rx_power_dbm, real first_path_power_dbm);
 SKYLESS_EXPORT int32_t skyless_hear_fields(Hearing *h, Course *c, State *s, int64_t rx_counter, real host_s, real
         rx_power_dbm, real first_path_power_dbm);
-SKYLESS_EXPORT int32_t skyless_find_position(LocateProblem *p, Found *found);
 
 #endif

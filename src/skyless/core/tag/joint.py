@@ -1,6 +1,5 @@
 """``joint``: the estimator as a positioning method: cold start, packet by packet updates, new starts when lost."""
 
-from collections.abc import Iterable
 from math import sqrt
 from typing import Final
 
@@ -11,16 +10,24 @@ from skyless.core.arrays import Array
 from skyless.core.constants import TICK_S
 from skyless.core.estimator.compiled import process_frame
 from skyless.core.estimator.estimator import NO_REPORT, Estimator, Report, SavedEstimator
-from skyless.core.estimator.process import ACCEPTED, Packet, Place
+from skyless.core.estimator.process import ACCEPTED, MAX_RELAYS, Packet
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.fix import POSITION, PROTECTED_ROWS, PROTECTION, VELOCITY, Fix, NoFixReason
 from skyless.core.integrity import UNAVAILABLE, IntegrityRequirement
 from skyless.core.native.library import compiled
-from skyless.core.native.records import packed, unpacked
+from skyless.core.native.records import first, packed, unpacked
 from skyless.core.native.sizes import MAX_ANCHORS
 from skyless.core.native.views import view
 from skyless.core.observation import Observation
-from skyless.core.tag._acquisition import Acquisition, Start
+from skyless.core.tag.acquisition import (
+    ACQUIRING,
+    MAX_LINKS,
+    TOO_FEW_ANCHORS,
+    Acquisition,
+    HeardPacket,
+    forget_packets,
+    try_start,
+)
 from skyless.core.tag.course import (
     BAD_GEOMETRY,
     FIX,
@@ -33,6 +40,7 @@ from skyless.core.tag.course import (
     settle,
     use_anchor,
 )
+from skyless.core.tag.position import FOUND, IMPOSSIBLE, MIRROR, RESIDUALS, UNSETTLED
 from skyless.core.ticks import FixTime, fix_time_s
 
 
@@ -40,7 +48,7 @@ class EstimationState(Struct, frozen=True, tag="joint"):
     """All that an ``Estimation`` keeps."""
 
     estimator: SavedEstimator
-    start: Acquisition | None
+    start: bytes | None
     course: bytes
 
 
@@ -85,7 +93,8 @@ class Estimation:
 
     def state(self) -> EstimationState:
         """All that it keeps, as it is now."""
-        return EstimationState(self._estimator.save(), self._start, packed(self.course))
+        start = None if self._start is None else packed(self._start)
+        return EstimationState(self._estimator.save(), start, packed(self.course))
 
     def restore(self, state: EstimationState) -> None:
         """Continue from the state of one with the same settings.
@@ -96,7 +105,7 @@ class Estimation:
         course = unpacked(Course, state.course)
         if not 0 <= course.count <= MAX_ANCHORS:
             raise ValueError(f"{course.count} anchors are in use; there can be {MAX_ANCHORS}")
-        self._start = state.start
+        self._start = None if state.start is None else _restored_start(state.start)
         self._estimator.restore(state.estimator)
         self.course, self._listed = course, -1
 
@@ -110,7 +119,7 @@ class Estimation:
         self._estimator.remove_anchor(anchor)
         if self._start is None:
             return len(self._estimator.anchors)
-        self._start.remove_anchor(anchor)
+        forget_packets(self._start, anchor)
         return 0
 
     @property
@@ -164,15 +173,20 @@ class Estimation:
         self._listed = self.course.changes
 
     def _try_start(self, starting: Acquisition, observation: Observation) -> Fix | NoFixReason:
-        starting.add_relays(observation)
-        start = starting.add(observation)
-        if isinstance(start, NoFixReason):
-            return start
-        if start.is_contradicted and not start.misfitting and self._estimator.is_late_often:
+        given, relays = HeardPacket(packet=self._packet(observation)), observation.packed_relays
+        if observation.tx_ticks_master is not None:
+            given.is_stated, given.stated.ticks = True, observation.tx_ticks_master
+            given.stated.fraction_ticks = observation.tx_fraction_ticks
+            given.stated.variance_m2 = observation.tx_variance_m2
+        reason = _try_to_start(starting, given, relays, len(relays))
+        if reason != FOUND:
+            return _NO_START.get(reason, NoFixReason.BAD_GEOMETRY)
+        start = starting.start
+        if start.is_contradicted and not start.has_misfit and self._estimator.is_late_often:
             return NoFixReason.RESIDUALS  # single packets are late: others will not be
         if self._superframe_s > TUNING.longest_superframe_s:
-            return self._fix_of(start, observation)
-        return self._settled(observation) if self._begin(start, starting.packets()) else NoFixReason.ACQUIRING
+            return self._fix_of(starting, observation)
+        return self._settled(observation) if self._begin(starting) else NoFixReason.ACQUIRING
 
     def update_height(self, height_m: float, std_m: float) -> bool:
         """Process the tag's height as a sensor measures it, at the newest packet; True if it was used.
@@ -181,7 +195,8 @@ class Estimation:
         """
         if self._start is not None:
             margin_m = TUNING.height_sigmas * std_m
-            self._start.expect_height(height_m - margin_m, height_m + margin_m)
+            self._start.has_bounds = True
+            self._start.low_m, self._start.high_m = height_m - margin_m, height_m + margin_m
             return False
         used = self._estimator.process_height(height_m, std_m) == ACCEPTED
         self.course.heights_rejected = 0 if used else self.course.heights_rejected + 1
@@ -199,12 +214,20 @@ class Estimation:
         return self.result_of(settle(self.course, self._estimator.state, self._time, observation.rx_ticks_tag))
 
     def _new_start(self) -> Acquisition:
-        settings = self._settings
-        max_age_s = max(TUNING.start_age_s, 2.5 * self._superframe_s)
-        variance = settings.tx_variance_m2 + settings.rx_variance_m2
-        errors = _error_variance_m2(settings)
-        speed_mps = settings.start_speed_std_mps
-        return Acquisition(self._height_m, variance, self._z_bounds_m, max_age_s, speed_mps, errors)
+        settings, bounds_m = self._settings, self._z_bounds_m
+        low_m, high_m = (0.0, 0.0) if bounds_m is None else bounds_m
+        return Acquisition(
+            knows_height=self._height_known,
+            height_m=0.0 if self._height_m is None else self._height_m,
+            has_bounds=bounds_m is not None,
+            low_m=low_m,
+            high_m=high_m,
+            variance_m2=settings.tx_variance_m2 + settings.rx_variance_m2,
+            max_age_s=max(TUNING.start_age_s, 2.5 * self._superframe_s),
+            speed_std_mps=settings.start_speed_std_mps,
+            error_variance_m2=_error_variance_m2(settings),
+            tuning=TUNING,
+        )
 
     def _is_out_of_reach(self, observation: Observation) -> bool:
         """Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back."""
@@ -222,52 +245,60 @@ class Estimation:
         away = self._anchors_m[:, : len(position_m)] - position_m
         return float(np.linalg.norm(away, axis=1).mean())
 
-    def _use_only(self, observations: Iterable[Observation]) -> None:
-        """Use the anchors of these observations and no others."""
+    def _use_only(self, starting: Acquisition) -> None:
+        """Use the anchors of a start and no others."""
         self.course.count, self.course.extent_m = 0, 0.0
-        for one in observations:
-            place = Place(anchor=one.anchor)
-            view(place.position_m)[:] = one.anchor_m
-            use_anchor(self.course, place, one.rx_ticks_tag)
+        for place in first(starting.start.used, starting.start.count):
+            newest = starting.heard[place].newer.packet
+            use_anchor(self.course, newest.place, newest.rx_ticks)
 
-    def _begin(self, start: Start, packets: list[Observation]) -> bool:
+    def _begin(self, starting: Acquisition) -> bool:
         """Begin at the start's position, and process the packets that led there.
 
         False where anchors that are late may have moved it by more than their distance: it says nothing then.
         """
-        settings, dim = self._settings, self._estimator.dim
-        if self._most_anchors is not None:
-            kept = _nearest(start, self._most_anchors)
-            packets = [packet for packet in packets if packet.anchor in kept]
+        settings, dim, start = self._settings, self._estimator.dim, starting.start
+        packets = self._packets_of(starting)
         is_contradicted = start.is_contradicted and not self._estimator.is_late_often
-        is_open = self.course.open_range_errors or (is_contradicted and not start.misfitting)
+        is_open = self.course.open_range_errors or (is_contradicted and not start.has_misfit)
         expected_m2 = settings.tx_variance_m2 + settings.rx_variance_m2 + _error_variance_m2(settings)
         inflation = 1.0 + TUNING.late_std_m**2 / expected_m2 if is_open or is_contradicted else TUNING.start_margin
-        begin_ticks, speed_m2ps2 = packets[0].rx_ticks_tag, settings.start_speed_std_mps**2
+        begin_ticks, speed_m2ps2 = packets[0].rx_ticks, settings.start_speed_std_mps**2
         age_s = (start.rx_ticks_tag - begin_ticks) * TICK_S
-        covariance = inflation * start.covariance[:dim, :dim] + age_s**2 * speed_m2ps2 * np.eye(dim)
-        self._use_only(start.used)
-        if np.trace(covariance[:2, :2]) > self._mean_range_m(start.solution[:dim]) ** 2:
+        position_m = view(start.position_m)[:dim].copy()
+        covariance = inflation * view(start.covariance_m2)[:dim, :dim] + age_s**2 * speed_m2ps2 * np.eye(dim)
+        self._use_only(starting)
+        if np.trace(covariance[:2, :2]) > self._mean_range_m(position_m) ** 2:
             return False
         self._start = None
-        self.course.newest_ticks = self.course.started_ticks = packets[-1].rx_ticks_tag
+        self.course.newest_ticks = self.course.started_ticks = packets[-1].rx_ticks
         self.course.is_open, self.course.start_was_contradicted = is_open, is_open or is_contradicted
         self._estimator.start(
             begin_ticks,
-            start.solution[:dim],
+            position_m,
             covariance,
             speed_m2ps2,
             is_open,
             TUNING.late_std_m if self.course.start_was_contradicted else TUNING.lasting_std_m,
-            start.misfitting if is_contradicted else (),
+            (start.misfit,) if is_contradicted and start.has_misfit else (),
         )
         for packet in packets:
-            self._process(packet)
+            packet.place.is_open = packet.place.anchor in self._estimator.misfits
+            process_frame(self._estimator.state, packet, b"", 0)
         return True
 
-    def _process(self, observation: Observation) -> None:
-        relays = observation.packed_relays
-        process_frame(self._estimator.state, self._packet(observation), relays, len(relays))
+    def _packets_of(self, starting: Acquisition) -> list[Packet]:
+        """The last packets of each anchor with which to begin, in the order of their receptions."""
+        heard, start, dim = first(starting.heard, starting.count), starting.start, self._estimator.dim
+        if self._most_anchors is not None:
+            places = first(start.used, start.count)
+            anchors_m = np.array([view(heard[place].newer.packet.place.position_m)[:dim] for place in places])
+            away_m = np.linalg.norm(anchors_m - view(start.position_m)[:dim], axis=1)
+            nearest = {places[index] for index in np.argsort(away_m, kind="stable")[: self._most_anchors]}
+            is_misfit = [start.has_misfit and one.newer.packet.place.anchor == start.misfit for one in heard]
+            heard = [one for place, one in enumerate(heard) if place in nearest or is_misfit[place]]
+        packets = [one.newer.packet for one in heard] + [one.older.packet for one in heard if one.count > 1]
+        return sorted(packets, key=lambda packet: packet.rx_ticks)
 
     def _packet(self, observation: Observation) -> Packet:
         self._estimator.know_anchor(observation.anchor, observation.anchor_m, observation.anchor_std_m)
@@ -287,16 +318,16 @@ class Estimation:
             return NO_REPORT
         return Report(*observation.report, observation.tx_variance_m2)
 
-    def _fix_of(self, start: Start, observation: Observation) -> Fix:
+    def _fix_of(self, starting: Acquisition, observation: Observation) -> Fix:
         """What a start knows by itself: a position, and of the velocity that it is a tag's; no protection level."""
-        dim, rows = self._estimator.dim, np.zeros((PROTECTED_ROWS, 3))
-        rows[POSITION, :dim] = start.solution[:dim]
+        dim, rows, start = self._estimator.dim, np.zeros((PROTECTED_ROWS, 3)), starting.start
+        rows[POSITION, :dim] = view(start.position_m)[:dim]
         if self._height_m is not None:
             rows[POSITION, 2] = self._height_m
-        rows[POSITION + 1 : POSITION + 1 + dim, :dim] = start.covariance[:dim, :dim]
+        rows[POSITION + 1 : POSITION + 1 + dim, :dim] = view(start.covariance_m2)[:dim, :dim]
         rows[VELOCITY + 1 : VELOCITY + 1 + dim, :dim] = self._settings.start_speed_std_mps**2 * np.eye(dim)
         rows[PROTECTION, 2] = UNAVAILABLE
-        self._use_only(start.used)
+        self._use_only(starting)
         rx_ticks = observation.rx_ticks_tag
         time_s = fix_time_s(self._time, rx_ticks + self.course.master_less_tag_ticks, rx_ticks)
         self._list_anchors()
@@ -311,7 +342,18 @@ _REASONS: Final = {
     BAD_GEOMETRY: NoFixReason.BAD_GEOMETRY,
 }
 
+_NO_START: Final = {
+    TOO_FEW_ANCHORS: NoFixReason.TOO_FEW_ANCHORS,
+    ACQUIRING: NoFixReason.ACQUIRING,
+    MIRROR: NoFixReason.MIRROR,
+    IMPOSSIBLE: NoFixReason.RESIDUALS,
+    RESIDUALS: NoFixReason.RESIDUALS,
+    UNSETTLED: NoFixReason.NOT_CONVERGED,
+}
+"""Other reasons are those of a bad geometry."""
+
 _process_in_course: Final = compiled(process_in_course)
+_try_to_start: Final = compiled(try_start)
 
 
 def _error_variance_m2(settings: EstimatorSettings) -> float:
@@ -319,9 +361,21 @@ def _error_variance_m2(settings: EstimatorSettings) -> float:
     return settings.range_std_m**2 + settings.survey_std_m**2
 
 
-def _nearest(start: Start, most: int) -> set[int]:
-    """The anchors of a start that are nearest to its position, and those that do not fit."""
-    dim = len(start.solution) - 1
-    away = [float(np.linalg.norm(one.anchor_m[:dim] - start.solution[:dim])) for one in start.used]
-    nearest = np.argsort(away, kind="stable")[:most]
-    return {start.used[index].anchor for index in nearest} | set(start.misfitting)
+def _restored_start(data: bytes) -> Acquisition:
+    """An acquisition from bytes that may come from anywhere: what compiled functions use as an index is checked.
+
+    Raises:
+        ValueError: they are no bytes of one, or an index is beyond its table.
+    """
+    made = unpacked(Acquisition, data)
+    made.tuning = TUNING
+    packets = [one.packet for heard in made.heard for one in (heard.older, heard.newer)]
+    counts = [
+        (made.count, MAX_ANCHORS),
+        (made.link_count, MAX_LINKS),
+        *((heard.count, 2) for heard in made.heard),
+        *((packet.relay_count, MAX_RELAYS) for packet in packets),
+    ]
+    if not all(0 <= count <= most for count, most in counts):
+        raise ValueError("the start's state has more anchors, links or relays than there can be")
+    return made
