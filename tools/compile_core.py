@@ -67,15 +67,19 @@ def build(native: Path) -> list[Path]:
 def compiled(native: Path, name: str, flags: list[str]) -> Path:
     """Compile one library. It is there as a whole, or as it was before."""
     source, library = native / "skyless_core.c", native / name
-    digest = hashlib.sha256(source.read_bytes() + source.with_suffix(".h").read_bytes()).hexdigest()[:16]
     new = library.with_name(f"{library.stem}-{os.getpid()}.so")
-    given = f'-DSKYLESS_SOURCE_DIGEST="{digest}"'
     try:
-        _run([*(compiler() or _zig()), *FLAGS, *flags, given, str(source), "-o", str(new)])
+        _run([*(compiler() or _zig()), *FLAGS, *flags, digest_of(source), str(source), "-o", str(new)])
         new.replace(library)
     finally:
         new.unlink(missing_ok=True)
     return library
+
+
+def digest_of(source: Path) -> str:
+    """The option that tells a library from which source it was made."""
+    digest = hashlib.sha256(source.read_bytes() + source.with_suffix(".h").read_bytes()).hexdigest()[:16]
+    return f'-DSKYLESS_SOURCE_DIGEST="{digest}"'
 
 
 def _zig() -> list[str]:

@@ -69,6 +69,7 @@ def batch_of(packets, places_m):
     )
     given["place"], given["sequence"], given["end"] = packets.anchors, packets.sequences, packets.ends
     given["rx_ticks"], given["tx_ticks"] = packets.rx_ticks, packets.tx_ticks
+    given["variance_factor"] = 1.0
     for column, name in enumerate(("listener", "anchor", "sequence", "rx_ticks")):
         relays[name] = packets.relays[:, column]
     return places, given, relays

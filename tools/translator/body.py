@@ -526,7 +526,7 @@ class Body:
         if op is ast.LShift:
             unsigned = "uint64_t" if left.kind == LONG else "uint32_t"
             kind = LONG if left.kind == LONG else INT
-            return Value(f"({kind.name})(({unsigned}){as_operand(left, 15)} << {as_operand(right, 12)})", kind, 15)
+            return Value(f"({kind.name})(({unsigned}){as_operand(left, 15)} << {as_operand(right, 13)})", kind, 15)
         if op is ast.RShift:
             return Value(f"{as_operand(left, 20)} >> {as_operand(right, 20)}", left.kind, 11)
         bitwise = {ast.BitAnd: "&", ast.BitOr: "|", ast.BitXor: "^"}.get(op)

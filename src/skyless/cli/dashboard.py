@@ -64,6 +64,7 @@ def dashboard(
     from skyless.page.playback import Playback
     from skyless.page.serve import bind, serve
     from skyless.page.sites import LiveSites
+    from skyless.page.what_if import WhatIfs
 
     address = broker.address()
     if address is None:
@@ -87,7 +88,7 @@ def dashboard(
         sys.stdout.flush()
     else:
         print(f"page    {page}\nbroker  {address}", flush=True)
-    services = Services(LiveSites(live, make), Overlays(), Playback(recordings))
+    services = Services(LiveSites(live, make), Overlays(), Playback(recordings), WhatIfs())
     with contextlib.suppress(KeyboardInterrupt):
         asyncio.run(serve(services, rules, sock, address, known.site.id if known is not None else site_id))
 

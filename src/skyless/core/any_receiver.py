@@ -94,6 +94,11 @@ class AnyReceiver:
         return made
 
     @property
+    def receiver(self) -> Receiver | protocol1.Receiver:
+        """The receiver of the protocol in use."""
+        return self._receiver
+
+    @property
     def counters(self) -> Counter[str]:
         """Frames by what became of them."""
         return self._receiver.counters

@@ -27,6 +27,7 @@ from skyless.page.live import LiveSite, NoBrokerError, NoSiteError, NotAllowedEr
 from skyless.page.overlays import KINDS, NoOverlayError, Overlays
 from skyless.page.playback import NoRecordingError, Playback, RecordingFile
 from skyless.page.sites import LiveSites
+from skyless.page.what_if import NoWhatIfError, WhatIfs, WhatIfTask
 from skyless.run.mqtt.survey_facts import BadFactsError
 from skyless.run.zones.zone_list import BadZonesError, read_zones
 from skyless.site.file.check import image_size
@@ -36,6 +37,7 @@ PAGE_TIMEOUT_S: Final = 10.0
 """A page that accepts no message for this long is disconnected."""
 
 _MAX_STATES_S: Final = 60.01
+_MAX_WHAT_IF_S: Final = 60.0
 _MAX_BODY_BYTES: Final = 1_000_000
 MAX_FLOOR_PLAN_BYTES: Final = 8_000_000
 """As on MQTT (``docs/mqtt.md``). The page's ``survey/plan.js`` has the same limit."""
@@ -52,6 +54,7 @@ _STATUSES: Final[dict[type[Exception], int]] = {
     NoSiteError: 404,
     NoResultError: 409,
     NoOverlayError: 422,
+    NoWhatIfError: 422,
     NotAllowedError: 403,
     NoBrokerError: 503,
 }
@@ -63,12 +66,14 @@ class Services(Struct, frozen=True):
     sites: LiveSites
     overlays: Overlays
     playback: Playback
+    what_ifs: WhatIfs
 
 
 def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Starlette:
     """The server's application."""
     mimetypes.add_type("text/javascript", ".js")  # some systems map it otherwise, and browsers refuse the modules
     mimetypes.add_type("text/javascript", ".mjs")
+    mimetypes.add_type("application/wasm", ".wasm")
 
     async def index(_request: Request) -> Response:
         path = page / "index.html"
@@ -91,6 +96,7 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
         Route("/api/recordings/{name}/file", _recorded(Playback.open_file, _download)),
         Route("/api/recordings/{name}/states", _recorded_states),
         Route("/api/recordings/{name}/floor_plan", _recorded(Playback.floor_plan, _image)),
+        Route("/api/recordings/{name}/what_if", _what_if),
         WebSocketRoute("/live", _live),
         Mount("/page", _Files(directory=page, check_dir=False)),
     ]
@@ -250,6 +256,15 @@ async def _recorded_states(request: Request) -> Response:
     playback, name = _services(request).playback, request.path_params["name"]
     states = await asyncio.to_thread(playback.states, name, begin_s, end_s, rate_hz)
     return Response(b'{"states":[' + b",".join(states) + b"]}", media_type="application/json")
+
+
+async def _what_if(request: Request) -> Response:
+    playback, tag = _services(request).playback, request.query_params.get("tag", "")
+    from_s = _number(request, "from_s", 0.0, 0.0, 1e9)
+    seconds = _number(request, "seconds", 30.0, 1.0, _MAX_WHAT_IF_S)
+    path, start_s = await asyncio.to_thread(playback.path_and_start, request.path_params["name"])
+    answer = await _services(request).what_ifs.get(WhatIfTask(path, tag, start_s + from_s, seconds))
+    return Response(answer, media_type="application/json")
 
 
 async def _live(socket: WebSocket) -> None:

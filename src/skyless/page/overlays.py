@@ -1,7 +1,6 @@
 """Overlays of the map, computed in a separate process so that they never delay the pages."""
 
 import asyncio
-import sys
 from collections import Counter, OrderedDict
 from typing import Any, Final, Literal
 
@@ -11,6 +10,7 @@ from msgspec.structs import replace
 
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.site import Site
+from skyless.page.task_process import TaskError, TaskProcess
 from skyless.site.file.check import image_size
 from skyless.site.planning.colours import COLOUR_STOPS, scale_of
 
@@ -20,7 +20,6 @@ MAX_CELLS: Final = 40_000
 _STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 
 _MAX_CACHED: Final = 8
-_TIMEOUT_S: Final = 120.0
 Box = tuple[float, float, float, float]
 
 
@@ -57,14 +56,11 @@ class Overlays:
     def __init__(self) -> None:
         self._cached: OrderedDict[bytes, OverlayGrids] = OrderedDict()
         self._lock = asyncio.Lock()
-        self._process: asyncio.subprocess.Process | None = None
-        self._stopped = False
+        self._process = TaskProcess("skyless.page.overlay_process")
 
     def stop(self) -> None:
         """Stop the computation. No other starts."""
-        self._stopped = True
-        if self._process is not None and self._process.returncode is None:
-            self._process.kill()
+        self._process.stop()
 
     async def get(
         self, site: Site, floor_plan: bytes | None, methods: list[str], kind: Kind, step_m: float
@@ -85,25 +81,12 @@ class Overlays:
         return _answer(task, kind, grids)
 
     async def _compute(self, task: bytes) -> OverlayGrids:
-        if self._stopped:
-            raise NoOverlayError("the dashboard is stopping")
-        self._process = process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "skyless.page.overlay_process"),
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-            start_new_session=True,  # Ctrl-C stops the dashboard, which kills this process itself
-        )
         try:
-            async with asyncio.timeout(_TIMEOUT_S):
-                output, _ = await process.communicate(task)
-            return msgspec.json.decode(output, type=OverlayGrids)
-        except TimeoutError:
-            raise NoOverlayError("this overlay takes too long to compute") from None
+            return msgspec.json.decode(await self._process.run(task), type=OverlayGrids)
+        except TaskError as error:
+            raise NoOverlayError(f"the overlay cannot be computed: {error}") from None
         except msgspec.MsgspecError:
             raise NoOverlayError("this overlay could not be computed; the dashboard's terminal shows why") from None
-        finally:
-            if process.returncode is None:
-                process.kill()
 
 
 def overlay_task(site: Site, floor_plan: bytes | None, method: str, step_m: float) -> OverlayTask:

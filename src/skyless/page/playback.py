@@ -156,6 +156,10 @@ class Playback:
             raise NoRecordingError(f"{name!r} cannot be read: {error.strerror}") from None
         return RecordingFile(name, os.fstat(file.fileno()).st_size, file)
 
+    def path_and_start(self, name: str) -> tuple[str, float]:
+        """Where a recording lies, and the Unix time of its first message. Raises NoRecordingError."""
+        return str(self._path(name)), self.summary(name).start_unix_s
+
     def floor_plan(self, name: str) -> bytes | None:
         """The floor plan's image. Raises NoRecordingError."""
         with self._lock:

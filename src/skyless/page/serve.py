@@ -128,6 +128,7 @@ def _stop(server: "_Server", services: Services) -> None:
             live.close()
         services.playback.stop()
         services.overlays.stop()
+        services.what_ifs.stop()
         asyncio.get_running_loop().call_later(_GRACE_S, server.drop_connections)
 
 

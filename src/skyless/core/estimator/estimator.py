@@ -278,6 +278,7 @@ class Estimator:
         given, relays = np.zeros(count, np.dtype(BatchPacket)), np.zeros(len(packets.relays), np.dtype(Relay))
         given["place"], given["sequence"], given["end"] = indices, packets.sequences, packets.ends
         given["rx_ticks"], given["tx_ticks"] = packets.rx_ticks, packets.tx_ticks
+        given["variance_factor"] = 1.0
         for column, name in enumerate(("listener", "anchor", "sequence", "rx_ticks")):
             relays[name] = packets.relays[:, column]
         rows = np.zeros(count, np.dtype(BatchRow))

@@ -333,6 +333,7 @@ class BatchPacket(Record):
     sequence: int
     rx_ticks: Ticks
     tx_ticks: Ticks
+    variance_factor: float = 1.0
     end: int
     """Where its relays end in their table; they begin where those of the packet before end."""
 
@@ -361,7 +362,6 @@ def track(
 ) -> None:
     """Process many packets, and write a row for each."""
     packet = Packet()
-    packet.variance_factor = 1.0
     packet.master = -1
     begin = 0
     for one in range(count):
@@ -370,6 +370,7 @@ def track(
         packet.sequence = given.sequence
         packet.rx_ticks = given.rx_ticks
         packet.tx_ticks = given.tx_ticks
+        packet.variance_factor = given.variance_factor
         packet.relay_count = min(given.end - begin, MAX_RELAYS)
         for place in range(packet.relay_count):
             packet.relays[place] = relays[begin + place]

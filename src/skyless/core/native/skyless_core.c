@@ -377,7 +377,7 @@ INTERNAL real square(real x) {
 /* The unwrapped time that the counter shows and that lies nearest to the expected one. */
 INTERNAL int64_t nearest(int64_t counter, int64_t expected_ticks, int32_t bits) {
     int64_t half = 1;
-    half = (int64_t)((uint64_t)half << bits - 1);
+    half = (int64_t)((uint64_t)half << (bits - 1));
     return expected_ticks - half + ((counter - expected_ticks + half) & (2 * half - 1));
 }
 
@@ -3338,7 +3338,6 @@ SKYLESS_EXPORT int32_t skyless_process_height(State *s, real height_m, real std_
 SKYLESS_EXPORT void skyless_track(State *s, Place *places, BatchPacket *packets, Relay *relays, BatchRow *rows, int32_t
         count, bool has_levels) {
     Packet packet = {0};
-    packet.variance_factor = REAL(1.0);
     packet.master = -1;
     int32_t begin = 0;
     for (int32_t one = 0; one < count; one++) {
@@ -3347,6 +3346,7 @@ SKYLESS_EXPORT void skyless_track(State *s, Place *places, BatchPacket *packets,
         packet.sequence = given->sequence;
         packet.rx_ticks = given->rx_ticks;
         packet.tx_ticks = given->tx_ticks;
+        packet.variance_factor = given->variance_factor;
         packet.relay_count = min_32(given->end - begin, MAX_RELAYS);
         for (int32_t place = 0, place_end = packet.relay_count; place < place_end; place++) {
             packet.relays[place] = relays[begin + place];

@@ -835,6 +835,7 @@ typedef struct BatchPacket {
     int32_t sequence;
     int64_t rx_ticks;
     int64_t tx_ticks;
+    real variance_factor;
     int32_t end;  /* Where its relays end in their table; they begin where those of the packet before end. */
 } BatchPacket;
 

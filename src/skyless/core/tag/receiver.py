@@ -119,6 +119,11 @@ class Receiver(BeaconReceiver):
         return made
 
     @property
+    def hearing(self) -> Hearing:
+        """What it keeps beside its filter, and the beacon at hand."""
+        return self._hearing
+
+    @property
     def admission(self) -> Admission:
         """What it knows of its own counter, of sites and of anchors."""
         return self._hearing.admission

@@ -89,3 +89,9 @@ export async function recordedStates(name, from_s, to_s, rate_hz) {
   const query = `from_s=${from_s.toFixed(3)}&to_s=${to_s.toFixed(3)}&rate_hz=${rate_hz}`;
   return (await fetchJson(`api/recordings/${encodeURIComponent(name)}/states?${query}`)).states;
 }
+
+/** The packets of one tag from a time on, for the page to recompute them. */
+export function whatIf(name, tag, from_s, seconds) {
+  const query = `tag=${encodeURIComponent(tag)}&from_s=${from_s.toFixed(3)}&seconds=${seconds}`;
+  return fetchJson(`api/recordings/${encodeURIComponent(name)}/what_if?${query}`);
+}

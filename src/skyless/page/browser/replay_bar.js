@@ -3,6 +3,7 @@
 import { on, state } from "./store.js";
 import { byId, h, options, s, text } from "./dom.js";
 import { fileOf } from "./api.js";
+import { whatIfButton } from "./what_if.js";
 import { clock, dateTime } from "./format.js";
 import { SPEEDS, STEP_S, close, markedEvents, seek, seekEvent, setSpeed, step, stepEvent, stepSpeed, toggle } from "./player.js";
 
@@ -60,6 +61,7 @@ export function start() {
     ...jumps,
     h("div", { class: "along" }, track, h("div", { class: "under" }, time, name, problem)),
     speeds,
+    whatIfButton(),
     download,
     back,
   );

@@ -1,0 +1,177 @@
+"""A piece of a recording is recomputed by WebAssembly in the browser, as the library does it on the host."""
+
+import asyncio
+import socket
+import sys
+import threading
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import msgspec
+import numpy as np
+import pytest
+import uvicorn
+from msgspec.structs import replace
+from page_browser import until
+
+from recordings import live_site
+from skyless.core.estimator import compiled
+from skyless.core.estimator.process import REJECTED, STALE, BatchPacket, BatchRow, Place, Relay
+from skyless.core.estimator.state import State
+from skyless.core.native.library import SOURCE, source_digest
+from skyless.core.native.views import records
+from skyless.page.app import Services, make_app
+from skyless.page.guard import AccessRules
+from skyless.page.live import LiveSite
+from skyless.page.overlays import Overlays
+from skyless.page.playback import Playback
+from skyless.page.sites import LiveSites
+from skyless.page.what_if import NoWhatIfError, WhatIf, WhatIfs, WhatIfTask
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+import wasm_core
+
+TAG = "a"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A recording of a tag at a site without a master."""
+    made = tmp_path_factory.mktemp("recordings")
+    with pytest.MonkeyPatch.context() as patched:
+        for name in ("LAB", "SITE"):
+            site = getattr(live_site, name)
+            patched.setattr(live_site, name, replace(site, schedule=replace(site.schedule, mode="free")))
+        live_site.record(made / "lab.mcap", live_site.messages(4.0, (TAG,)))
+    return made
+
+
+@pytest.fixture
+def server(folder, times):
+    """The page's own server, with that recording."""
+    live = LiveSite("here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s)
+    app = make_app(Services(LiveSites(live), Overlays(), Playback(folder), WhatIfs()), AccessRules())
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        running = uvicorn.Server(uvicorn.Config(app, ws="websockets-sansio", log_config=None))
+        thread = threading.Thread(target=running.run, args=([sock],), daemon=True)
+        thread.start()
+        while not running.started:
+            time.sleep(0.02)
+        yield SimpleNamespace(address=f"http://127.0.0.1:{sock.getsockname()[1]}")
+        running.should_exit = True
+        thread.join()
+
+
+@pytest.fixture
+def prepared(folder):
+    answer = asyncio.run(WhatIfs().get(WhatIfTask(str(folder / "lab.mcap"), TAG, live_site.UNIX_S, 3.0)))
+    return msgspec.json.decode(answer, type=WhatIf)
+
+
+def on_the_host(found, without=(), moved_m=(0.0, 0.0, 0.0), noise=1.0):
+    """What the library makes of the same tables, with the same changes."""
+    content = bytearray(found.layout["State"])
+    for at, page in found.state:
+        content[at : at + len(page)] = page
+    state = State.from_buffer(content)
+    state.settings.tx_variance_m2 *= noise**2
+    state.settings.rx_variance_m2 *= noise**2
+    places = np.frombuffer(bytearray(found.places), np.dtype(Place))
+    places["position_m"][0] += moved_m
+    given, relays = np.frombuffer(found.packets, np.dtype(BatchPacket)), np.frombuffer(found.relays, np.dtype(Relay))
+    begins = np.append(0, given["end"][:-1])
+    kept = [k for k, one in enumerate(given["place"]) if found.anchors[one].id not in without]
+    parts = [relays[begins[k] : given["end"][k]] for k in kept]
+    packets = given[kept].copy()
+    packets["end"] = np.cumsum([len(part) for part in parts])
+    rows = np.zeros(len(kept), np.dtype(BatchRow))
+    compiled.track(
+        state,
+        records(Place, places),
+        records(BatchPacket, packets),
+        records(Relay, np.concatenate(parts)),
+        records(BatchRow, rows),
+        len(kept),
+        True,
+    )
+    return rows
+
+
+RECOMPUTE = """async ([name, tag, without, moved, noise]) => {
+  const { whatIf } = await import("/page/api.js");
+  const { recompute } = await import("/page/estimator.js");
+  const found = await whatIf(name, tag, 0, 3);
+  const moved_m = new Map([[found.anchors[0].id, moved]]);
+  const rows = await recompute(found, { without: new Set(without), moved_m, noise });
+  return rows.map(({ used, position_m, hpl_m }) => [used, ...position_m, hpl_m]);
+}"""
+
+
+@pytest.mark.parametrize("change", [{}, {"without": "first"}, {"moved_m": (0.3, -0.2, 0.1)}, {"noise": 3.0}])
+@pytest.mark.statistical
+def test_the_browser_gives_the_bits_of_the_host(server, prepared, visit, change):
+    change = {name: [prepared.anchors[0].id] if name == "without" else value for name, value in change.items()}
+    expected = on_the_host(prepared, **change)
+    page = visit(server).page
+    moved = list(change.get("moved_m", (0.0, 0.0, 0.0)))
+    rows = page.evaluate(RECOMPUTE, ["lab.mcap", TAG, change.get("without", []), moved, change.get("noise", 1.0)])
+    assert [row[1:4] for row in rows] == expected["position_m"].tolist()
+    assert [row[0] for row in rows] == [outcome not in (REJECTED, STALE) for outcome in expected["outcome"]]
+    assert sum(row[0] for row in rows) > 200
+
+
+def test_nothing_changed_is_what_the_tag_computed(prepared):
+    """But for where the filter begins: it knows less of clocks and range errors than the tag's did."""
+    rows = on_the_host(prepared)
+    pairs = [(then[:2], row["position_m"][:2]) for then, row in zip(prepared.recorded, rows, strict=True) if then]
+    away_m = np.array([np.hypot(*(np.array(then) - now)) for then, now in pairs])
+    assert len(pairs) > 200
+    assert np.median(away_m) < 0.02
+    assert away_m[len(away_m) // 2 :].max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("task", "words"),
+    [
+        ({"tag": "nobody"}, "tag nobody has no fix"),
+        ({"begin_unix_s": 2e9}, "has no fix from there on"),
+        ({"path": "/nowhere.mcap"}, "nowhere.mcap"),
+    ],
+)
+def test_why_there_is_nothing_to_recompute(folder, task, words):
+    usual = WhatIfTask(str(folder / "lab.mcap"), TAG, live_site.UNIX_S, 3.0)
+    with pytest.raises(NoWhatIfError, match=words):
+        asyncio.run(WhatIfs().get(replace(usual, **task)))
+
+
+@pytest.mark.statistical
+def test_the_dialog(server, visit):
+    shown = visit(server)
+    page = shown.page
+    page.click("#tab-recordings")
+    page.click(".recording")
+    until(page, "skyless.state.mode === 'replay' && !skyless.state.player.waiting")
+    page.click("#what-if")
+    until(page, "document.querySelectorAll('#what-if-figures tr').length === 5", timeout_s=20.0)
+    rows = page.locator("#what-if-dialog table").first.locator("tr")
+    for number in (1, 2, 3, 4):
+        rows.nth(number).locator("input[type=checkbox]").uncheck()
+    page.click("#what-if-run")
+    until(page, "document.querySelector('#what-if-dialog .problem').textContent.includes('needs 3 anchors')")
+    rows.nth(1).locator("input[type=checkbox]").check()
+    page.fill("#what-if-noise", "1000")
+    page.click("#what-if-run")
+    until(page, "document.querySelector('#what-if-dialog .problem').textContent.includes('from 0.1 to 100')")
+    page.fill("#what-if-noise", "2")
+    page.click("#what-if-run")
+    until(page, "document.querySelector('#what-if-dialog .problem').textContent === ''")
+    page.click("#what-if-dialog > button")
+    until(page, "document.querySelector('#what-if-dialog') === null")
+
+
+def test_the_webassembly_is_of_the_source():
+    """It is committed, as browsers need it where there is no clang; another version of clang gives other bytes."""
+    committed = wasm_core.PAGE.read_bytes()
+    assert source_digest(SOURCE).encode() in committed, "run python tools/wasm_core.py"
