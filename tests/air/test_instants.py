@@ -16,7 +16,7 @@ from skyless.core.air.instants import (
     ticks_ahead,
 )
 from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS
-from skyless.core.ticks import HALF_WRAP_TICKS, from_seconds, to_seconds
+from skyless.core.ticks import WRAP_TICKS, from_seconds, to_seconds
 from skyless.sim.cells import _timetable as timetable
 from skyless.site.kernels.compiled import kernel
 
@@ -39,7 +39,7 @@ def test_python_and_kernels_agree(anchor_id, sequence, code):
 def test_gaps_are_steps_of_the_radio_around_their_period(anchor_id, sequence, code):
     gap, period = gap_ticks(anchor_id, sequence, code), period_ticks(code)
     assert gap % DELAYED_TX_GRANULARITY_TICKS == 0
-    assert period // 2 <= gap < period + period // 2 < HALF_WRAP_TICKS
+    assert period // 2 <= gap < period + period // 2 < WRAP_TICKS // 2
     assert gap >= from_seconds(1.3e-3), "the driver's lead time, and a frame after its RMARKER"
 
 

@@ -31,6 +31,7 @@ from skyless.core.estimator.monitor import gate_of
 from skyless.core.estimator.process import ACCEPTED, REJECTED
 from skyless.core.estimator.settings import TUNING
 from skyless.core.estimator.state import find_anchor
+from skyless.core.estimator.verdicts import is_lost
 from skyless.core.ticks import TICK_MASK
 from skyless.research.studies.episodes import WHITE_FM
 
@@ -127,7 +128,7 @@ def test_a_tags_clock_that_jumps_is_followed():
     """All packets are late at once: no anchor is blamed for long, and the position comes back."""
     episode = walking(superframes=400)
     run = run_of(episode, late(episode.packets, np.where(np.arange(len(episode.path_m)) >= 600, 1.0, 0.0)))
-    assert np.linalg.norm(run.errors(episode)[1800:], axis=1).max() < 0.3 or run.estimator.is_lost
+    assert np.linalg.norm(run.errors(episode)[1800:], axis=1).max() < 0.3 or is_lost(run.estimator.state)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3])
@@ -174,7 +175,7 @@ def test_hard_turns_are_followed():
     assert rmse(run.errors(episode)[200:1900]) < 0.03
     assert errors.max() < 0.3
     assert rmse(run.errors(episode)[2200:]) < 0.06
-    assert not run.estimator.is_lost
+    assert not is_lost(run.estimator.state)
 
 
 def test_what_the_tag_has_lost_says_nothing():

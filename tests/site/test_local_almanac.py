@@ -52,7 +52,7 @@ class Tag:
         t, fields = self.neighbours, fields_of(one)
         t.row = neighbour_of(t, one.anchor, rx_ticks)
         n = t.rows[t.row]
-        n.frames, n.rx_ticks, n.is_confirmed = min(n.frames + 1, 2), rx_ticks, is_confirmed
+        n.frames, n.rx_ticks, n.was_relayed = min(n.frames + 1, 2), rx_ticks, is_confirmed
         n.almanac_issue, n.period_code = one.almanac_issue, one.period_code
         if is_confirmed:
             n.relayed_ticks = rx_ticks

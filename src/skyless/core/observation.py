@@ -1,12 +1,8 @@
 """One beacon as the positioning methods see it: every stamp unwrapped on its own clock."""
 
-from collections.abc import Iterator
-
 from msgspec import Struct
 
-from skyless.core.air.frame import HEARD
 from skyless.core.arrays import Array
-from skyless.core.ticks import nearest
 
 
 class Observation(Struct, frozen=True, gc=False):
@@ -42,9 +38,3 @@ class Observation(Struct, frozen=True, gc=False):
     """More relays, as frames carry them (``codec.packed_relays``)."""
     anchor_std_m: float | None = None
     """Standard deviation of each coordinate of the anchor; None to use the site's; for ``joint`` only."""
-
-    def all_relays(self) -> Iterator[tuple[int, int, int]]:
-        """``relays`` and ``packed_relays``."""
-        yield from self.relays
-        for anchor, sequence, low, high in HEARD.iter_unpack(self.packed_relays):
-            yield anchor, sequence, nearest(low | high << 32, self.tx_ticks_anchor)

@@ -12,7 +12,6 @@ from skyless.core.native.arithmetic import floor
 from skyless.core.native.records import Record, Ticks, record
 
 WRAP_TICKS: Final = 1 << TICK_BITS
-HALF_WRAP_TICKS: Final = WRAP_TICKS // 2
 TICK_MASK: Final = WRAP_TICKS - 1
 
 LAST_TICKS: Final = 1 << 61

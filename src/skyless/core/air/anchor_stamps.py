@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from skyless.core.air.neighbours import Neighbour, Neighbours, neighbour_of
+from skyless.core.air.neighbours import Neighbour, Neighbours, find_neighbour, neighbour_of
 from skyless.core.native.records import Ticks
 from skyless.core.ticks import NOISE_TICKS, TICK_MASK, from_seconds, may_elapse, nearest
 
@@ -32,12 +32,13 @@ def unwrap_stamp(
     ``rx_ticks`` is the receiver's own reading, unwrapped; ``period_ticks`` the time between two frames of an anchor,
     as far as it is known. Where the stamp fits, ``row`` is the anchor's, and holds it; a first one keeps its own value.
     """
-    row = neighbour_of(t, anchor, rx_ticks)
-    n = t.rows[row]
-    t.row = row
-    is_repeated = n.frames > 0 and n.tx_ticks & TICK_MASK == tx_counter and n.sequence == sequence
+    t.row = -1
+    known = find_neighbour(t, anchor)
+    is_repeated = known >= 0 and _is_newest(t.rows[known], sequence, tx_counter)
     if t.has_newest and rx_ticks <= t.newest_rx_ticks:
         return DUPLICATE if is_repeated else OUT_OF_ORDER
+    t.row = neighbour_of(t, anchor, rx_ticks)
+    n = t.rows[t.row]
     if n.frames > 0:
         elapsed = rx_ticks - n.rx_ticks
         tx_ticks = nearest(tx_counter, n.tx_ticks + elapsed)
@@ -49,6 +50,10 @@ def unwrap_stamp(
         _keep(n, sequence, tx_counter, rx_ticks, 1)
     t.has_newest, t.newest_rx_ticks = True, rx_ticks
     return STAMP_FITS
+
+
+def _is_newest(n: Neighbour, sequence: int, tx_counter: Ticks) -> bool:
+    return n.frames > 0 and n.tx_ticks & TICK_MASK == tx_counter and n.sequence == sequence
 
 
 def _keep(n: Neighbour, sequence: int, tx_ticks: Ticks, rx_ticks: Ticks, frames: int) -> None:

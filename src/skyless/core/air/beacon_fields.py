@@ -3,10 +3,19 @@
 from typing import Annotated, Final
 
 from skyless.core.air.beacon import MAX_HEARD
-from skyless.core.air.frame import BEACON_MAGIC, BROADCAST, FCS_BYTES, FRAME_CONTROL, MAGIC_MASK, MAX_FRAME_BYTES
+from skyless.core.air.frame import (
+    BEACON_MAGIC,
+    BROADCAST,
+    FCS_BYTES,
+    FRAME_CONTROL,
+    HEARD_BYTES,
+    MAGIC_MASK,
+    MAX_FRAME_BYTES,
+)
 from skyless.core.air.instants import LONGEST_PERIOD_CODE
+from skyless.core.air.little_endian import two_bytes, unsigned
 from skyless.core.air.neighbours import StatedPlace
-from skyless.core.air.page_check import PAGE_BYTES, is_possible_page, unsigned
+from skyless.core.air.page_check import PAGE_BYTES, is_possible_page
 from skyless.core.native.records import Array, Byte, Bytes, Record, Ticks, record
 
 INTACT: Final = 0
@@ -32,8 +41,6 @@ COUNT_BYTES: Final = 2
 """Number of receptions, and which of them are weak."""
 COUNT_BITS: Final = 4
 COUNT_MASK: Final = 15
-HEARD_BYTES: Final = 8
-"""One reception: anchor, sequence number, 40 bits of the RX stamp."""
 CERTIFICATE_BYTES: Final = 94
 """Length of a certificate (``skyless.core.keys.chain``)."""
 AUTHENTICATION_BYTES: Final = 10
@@ -74,7 +81,7 @@ def read_frame(frame: Bytes, length: int, b: BeaconFields) -> int:
         return fault
     flags, at = frame[FLAGS_AT], FIXED_BYTES
     b.sequence, b.period_code = frame[2], frame[19]
-    b.site, b.anchor, b.almanac_issue = _two(frame, 3), _two(frame, 7), _two(frame, 17)
+    b.site, b.anchor, b.almanac_issue = two_bytes(frame, 3), two_bytes(frame, 7), two_bytes(frame, 17)
     b.tx_ticks = unsigned(frame, 12, 5)
     b.has_place = flags & HAS_POSITION != 0
     b.heard_at = b.heard_count = b.weak = b.page_at = b.certificate_at = b.relay_bytes = 0
@@ -85,7 +92,7 @@ def read_frame(frame: Bytes, length: int, b: BeaconFields) -> int:
         b.certificate_at = at
         at += CERTIFICATE_BYTES
     else:
-        entries = _two(frame, at)
+        entries = two_bytes(frame, at)
         b.heard_at, b.heard_count, b.weak = at + COUNT_BYTES, entries & COUNT_MASK, entries >> COUNT_BITS
         at = b.heard_at + b.heard_count * HEARD_BYTES
     if flags & HAS_PAGE != 0:
@@ -107,9 +114,9 @@ def _header_fault(frame: Bytes, length: int) -> int:  # noqa: PLR0911 - one for 
         return TOO_SHORT
     if checksum(frame, length) != 0:
         return BAD_FCS
-    if length < HEADER_BYTES + FCS_BYTES or _two(frame, 0) != FRAME_CONTROL or _two(frame, 5) != BROADCAST:
+    if length < HEADER_BYTES + FCS_BYTES or two_bytes(frame, 0) != FRAME_CONTROL or two_bytes(frame, 5) != BROADCAST:
         return NOT_A_BEACON
-    magic = _two(frame, 9)
+    magic = two_bytes(frame, 9)
     if magic & MAGIC_MASK != BEACON_MAGIC:
         return NOT_A_BEACON
     if magic != VERSION_2:
@@ -128,7 +135,7 @@ def _length_fault(frame: Bytes, length: int) -> int:
         return BAD_LENGTH
     if flags & HAS_CERTIFICATE == 0:
         at = FIXED_BYTES + (POSITION_BYTES if flags & HAS_POSITION != 0 else 0)
-        bare += (_two(frame, at) & COUNT_MASK) * HEARD_BYTES
+        bare += (two_bytes(frame, at) & COUNT_MASK) * HEARD_BYTES
     return INTACT if length == bare else BAD_LENGTH
 
 
@@ -142,7 +149,7 @@ def bare_bytes(flags: int) -> int:
 
 def _read_place(frame: Bytes, at: int, place: StatedPlace) -> None:
     for axis in range(3):
-        low, high = _two(frame, at + 3 * axis), frame[at + 3 * axis + 2]
+        low, high = two_bytes(frame, at + 3 * axis), frame[at + 3 * axis + 2]
         place.position_mm[axis] = low + 65536 * (high - 256 if high > 127 else high)
     floor = frame[at + 10]
     place.std_mm, place.floor, place.zone = frame[at + 9], floor - 256 if floor > 127 else floor, frame[at + 11]
@@ -152,11 +159,11 @@ def _read_relays(frame: Bytes, b: BeaconFields) -> bool:
     """Copy the receptions that are not weak; False where one is of the sender, or two of the same anchor."""
     for one in range(b.heard_count):
         at = b.heard_at + one * HEARD_BYTES
-        anchor = _two(frame, at)
+        anchor = two_bytes(frame, at)
         if anchor == b.anchor:
             return False
         for before in range(one):
-            if _two(frame, b.heard_at + before * HEARD_BYTES) == anchor:
+            if two_bytes(frame, b.heard_at + before * HEARD_BYTES) == anchor:
                 return False
         if b.weak >> one & 1 == 0:
             for byte in range(HEARD_BYTES):
@@ -165,15 +172,11 @@ def _read_relays(frame: Bytes, b: BeaconFields) -> bool:
     return True
 
 
-def _two(data: Bytes, at: int) -> int:
-    """A whole number of two bytes."""
-    return data[at] | data[at + 1] << 8
-
-
 def checksum(data: Bytes, length: int) -> int:
     """CRC-16 of x¹⁶ + x¹² + x⁵ + 1, initially 0, bit 0 of each byte first (clause 7.2.10); 0 with a frame's FCS.
 
-    A byte's four low and four high bits each shift the polynomial in once, so no table is needed.
+    A byte's four low and four high bits each shift the polynomial in once, so no table is needed. Python's own frames
+    have theirs from ``ieee802154.fcs``, which is faster there.
     """
     crc = 0
     for at in range(length):

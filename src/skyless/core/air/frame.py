@@ -7,7 +7,7 @@ word of 32 bits and a high byte.
 import struct
 from collections.abc import Iterator
 from enum import StrEnum
-from typing import Final, Protocol
+from typing import Final
 
 from msgspec import Struct
 
@@ -26,6 +26,7 @@ _START: Final = struct.Struct("<HBHHHH")
 
 HEARD: Final = struct.Struct("<HBIB")
 """One ``heard`` entry in a frame: anchor, sequence number, low word and high byte of the RX stamp."""
+HEARD_BYTES: Final = HEARD.size
 
 
 class Heard(Struct, frozen=True, gc=False):
@@ -59,26 +60,6 @@ class PackedHeard(Struct, frozen=True, gc=False, eq=False):
 
     def __hash__(self) -> int:
         return hash(tuple(self))
-
-
-class AnyBeacon(Protocol):
-    """What the beacons of both protocols have in common."""
-
-    @property
-    def site(self) -> int:
-        """Site identifier, 16 bits."""
-
-    @property
-    def anchor(self) -> int:
-        """Identifier of the sending anchor, 16 bits."""
-
-    @property
-    def sequence(self) -> int:
-        """Frame counter of the sender, 8 bits."""
-
-    @property
-    def tx_ticks(self) -> int:
-        """TX stamp in the sender's own clock, 40 bits."""
 
 
 class Malformed(StrEnum):

@@ -158,7 +158,7 @@ class LocalAlmanac:
 
     def placed_since(self, rx_ticks: int) -> set[int]:
         """Anchors with a position that were received later than this, and by other anchors, too."""
-        return {row.anchor for row in self.rows if row.has_place and row.is_confirmed and row.rx_ticks > rx_ticks}
+        return {row.anchor for row in self.rows if row.has_place and row.was_relayed and row.rx_ticks > rx_ticks}
 
     def longest_period_ticks(self) -> int:
         """Longest mean time between two beacons of an anchor, of the anchors that were received last."""
@@ -192,17 +192,17 @@ class LocalAlmanac:
 
     def _issue_support(self, issue: int) -> int:
         """By how many anchors an issue is stated, of those that others have received: strangers are any number."""
-        return sum(row.is_confirmed and row.almanac_issue == issue for row in self.rows)
+        return sum(row.was_relayed and row.almanac_issue == issue for row in self.rows)
 
     def _page_support(self, anchors: set[int]) -> int:
         """How many of the anchors that have sent a page others have received."""
-        return sum(row.is_confirmed and row.anchor in anchors for row in self.rows)
+        return sum(row.was_relayed and row.anchor in anchors for row in self.rows)
 
     def _is_majority(self, issue: int, rx_ticks: int) -> bool:
         """Whether most of the anchors that are there state this issue."""
         assert self._first_ticks is not None
         oldest = rx_ticks - PRESENT_TICKS
-        present = [row.almanac_issue for row in self.rows if row.is_confirmed and row.rx_ticks > oldest]
+        present = [row.almanac_issue for row in self.rows if row.was_relayed and row.rx_ticks > oldest]
         enough = len(present) >= MIN_ANCHORS or (present and self._first_ticks <= oldest)
         return bool(enough) and 2 * present.count(issue) > len(present)
 

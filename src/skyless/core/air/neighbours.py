@@ -55,12 +55,14 @@ class Neighbour(Record):
     other: StatedPlace
     """Another one, stated once; used when it is stated twice in a row."""
     # What others state of it
-    is_confirmed: bool
+    was_relayed: bool
     """Whether others had received it at its newest frame."""
     relayed_ticks: Ticks
     """The receiver's reading when another anchor last relayed that it had received this one."""
     own_relays_ticks: Ticks
     """The receiver's reading when the anchor's own relays last fitted, where no other has relayed it since."""
+    used_ticks: Ticks
+    """The receiver's reading when the filter, where it has the anchor, last got a packet of it."""
     has_power: bool
     power_dbm: float
     """Running mean of the received power."""
@@ -74,7 +76,7 @@ class Neighbours(Record):
 
     count: int
     row: int
-    """Of the anchor whose frame is processed; it is not forgotten meanwhile."""
+    """Of the anchor whose frame is processed, which is not forgotten meanwhile; −1 while that is not known."""
     has_newest: bool
     newest_rx_ticks: Ticks
     """RX stamp of the newest accepted frame: one impossible stamp must not make others late."""
@@ -98,18 +100,24 @@ def neighbour_of(t: Neighbours, anchor: int, rx_ticks: Ticks) -> int:
         fresh = Neighbour()
         t.rows[row] = fresh
         t.rows[row].anchor = anchor
-        t.rows[row].relayed_ticks = t.rows[row].own_relays_ticks = NEVER
+        t.rows[row].relayed_ticks = t.rows[row].own_relays_ticks = t.rows[row].used_ticks = NEVER
     t.rows[row].changed_ticks = rx_ticks
     return row
 
 
 def _least_important(t: Neighbours, rx_ticks: Ticks) -> int:
-    """The row to be forgotten: of what nobody confirms, if there is any, the longest silent; single frames go first."""
+    """The row to be forgotten: that of the lowest rank, and of several the longest silent.
+
+    Anchors in use rank highest, then those that others confirm, then strangers of several frames.
+    """
     least = -1
     least_rank = 0
     for row in range(t.count):
         n = t.rows[row]
-        rank = 2 if is_confirmed(n, rx_ticks) else 1 if n.frames > 1 else 0
+        rank = 0
+        if n.frames > 0:
+            is_used = rx_ticks - n.used_ticks < RELAYED_TICKS
+            rank = 3 if is_used else 2 if is_confirmed(n, rx_ticks) else 1 if n.frames > 1 else 0
         is_less = least < 0 or rank < least_rank
         if not is_less and rank == least_rank:
             is_less = n.changed_ticks < t.rows[least].changed_ticks
@@ -133,5 +141,5 @@ def forget_times(t: Neighbours) -> None:
     t.has_newest = False
     for row in range(t.count):
         n = t.rows[row]
-        n.frames, n.impossible, n.has_rival, n.is_confirmed = 0, 0, False, False
-        n.relayed_ticks = n.own_relays_ticks = n.changed_ticks = NEVER
+        n.frames, n.impossible, n.has_rival, n.was_relayed = 0, 0, False, False
+        n.relayed_ticks = n.own_relays_ticks = n.used_ticks = n.changed_ticks = NEVER

@@ -2,6 +2,7 @@
 
 from typing import Final
 
+from skyless.core.air.little_endian import unsigned
 from skyless.core.native.records import Bytes, Ticks
 
 PAGE_BYTES: Final = 17
@@ -25,14 +26,6 @@ _MAX_NOISE_BITS: Final = 0x36000000
 """2⁻¹⁹ as a float32: those from 0 on are in the order of their bits."""
 _SIGN: Final = 0x80000000
 """The highest of four bytes' bits; as a float32 alone it is −0."""
-
-
-def unsigned(data: Bytes, at: int, size: int) -> Ticks:
-    """A whole number in this number of bytes, the lowest first."""
-    number: Ticks = 0
-    for byte in range(size - 1, -1, -1):
-        number = number << 8 | data[at + byte]
-    return number
 
 
 def _signed(data: Bytes, at: int) -> Ticks:

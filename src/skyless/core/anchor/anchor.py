@@ -23,7 +23,7 @@ from skyless.core.anchor.authentication import BeaconAuthentication, Contents
 from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS
 from skyless.core.native.library import compiled
 from skyless.core.site import AnchorSite, Site, UnplacedAnchor
-from skyless.core.ticks import Unwrapper, from_seconds, to_seconds, wrap
+from skyless.core.ticks import LAST_TICKS, Unwrapper, from_seconds, to_seconds, wrap
 
 MAX_RELAY_AGE_TICKS: Final = from_seconds(1.0)
 """Older stamps are not relayed: sequence numbers come around after 256 frames, and then name another frame."""
@@ -106,6 +106,9 @@ class Anchor:
             self.counters[fault] += 1
             return
         rx_ticks = self._own_ticks.unwrap(reception.rx_ticks, reception.host_s)
+        if abs(rx_ticks) > LAST_TICKS:
+            self.counters["impossible-host-time"] += 1
+            return
         stamps = beacon.anchor, beacon.sequence, beacon.tx_ticks
         stamp = _unwrap_stamp(self._neighbours, *stamps, rx_ticks, period_ticks(beacon.period_code))
         if stamp != STAMP_FITS:

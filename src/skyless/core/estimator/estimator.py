@@ -29,7 +29,7 @@ from skyless.core.estimator.state import (
     make_uncertain,
     new_state,
 )
-from skyless.core.estimator.verdicts import is_late_often, is_lost, rejects_most
+from skyless.core.estimator.verdicts import is_late_often, rejects_most
 from skyless.core.native.views import records, view
 from skyless.core.ticks import NEVER
 
@@ -299,11 +299,6 @@ class Estimator:
     def is_late_often(self) -> bool:
         """Whether single packets are late often."""
         return is_late_often(self._state)
-
-    @property
-    def is_lost(self) -> bool:
-        """Whether more packets are rejected than a right state would reject."""
-        return is_lost(self._state)
 
     @property
     def rejects_most(self) -> bool:

@@ -2,7 +2,8 @@
 
 from typing import Annotated, Final
 
-from skyless.core.air.page_check import unsigned
+from skyless.core.air.frame import HEARD_BYTES
+from skyless.core.air.little_endian import two_bytes, unsigned
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.core.estimator.faults import fade_faults, open_faults
 from skyless.core.estimator.kalman import finish_updates, is_stationary, predict
@@ -40,8 +41,6 @@ REJECTED, ACCEPTED, JOINED, STALE, RESTARTED_CLOCK = range(5)
 MAX_RATE_MPS: Final = 100e-6 * SPEED_OF_LIGHT_MPS  # between two clocks that are still crystals
 MAX_RELAYS: Final = 32
 """Most relays with a packet; 13 fit into a frame."""
-PACKED_BYTES: Final = 8
-"""Bytes of a relay in a frame: identifier (2), sequence number (1), stamp (5), the lowest first."""
 
 
 @record
@@ -109,13 +108,13 @@ def process_frame(s: State, packet: Packet, packed: Bytes, packed_bytes: int) ->
 
 def take_relays(packet: Packet, packed: Bytes, packed_bytes: int) -> None:
     """Add relays as frames carry them to those of a packet, as far as there is space."""
-    for begin in range(0, packed_bytes, PACKED_BYTES):
+    for begin in range(0, packed_bytes, HEARD_BYTES):
         if packet.relay_count < MAX_RELAYS:
             relayed = packet.relays[packet.relay_count]
             relayed.listener = packet.place.anchor
-            relayed.anchor = packed[begin] | packed[begin + 1] << 8
+            relayed.anchor = two_bytes(packed, begin)
             relayed.sequence = packed[begin + 2]
-            relayed.rx_ticks = nearest(unsigned(packed, begin + 3, PACKED_BYTES - 3), packet.tx_ticks)
+            relayed.rx_ticks = nearest(unsigned(packed, begin + 3, HEARD_BYTES - 3), packet.tx_ticks)
             packet.relay_count += 1
 
 

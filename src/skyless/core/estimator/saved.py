@@ -48,6 +48,8 @@ def unpacked_state(settings: EstimatorSettings, packed: bytes) -> State:
     for part in _parts(s):
         size, dtype = part.size * _packed(part).itemsize, _packed(part).dtype
         part[...] = np.frombuffer(packed[place : place + size].ljust(size, b"\0"), dtype).reshape(part.shape)
+        if any((part[name].view(np.uint8) > 1).any() for name in dtype.names or () if part[name].dtype == np.bool_):
+            raise ValueError("the estimator's state has a field that is neither true nor false")
         place += size
     identifiers = {s.anchors[anchor].identifier for anchor in range(s.count)}
     if place != len(packed) or len(identifiers) != s.count:

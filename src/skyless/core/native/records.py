@@ -17,7 +17,9 @@ An element that is itself an array or a record is a reference: ``row = P[one]`` 
 
 import ctypes
 from collections.abc import Iterator
+from functools import cache
 from math import nan
+from struct import Struct as Format
 from typing import (
     Annotated,
     Any,
@@ -44,6 +46,10 @@ Count = Annotated[int, ctypes.c_int64]
 """The same, for what grows for years."""
 
 Byte = Annotated[int, ctypes.c_uint8]
+
+LARGEST_TICKS: Final = 1 << 62
+"""Differences of two whole numbers up to this fit 64 bits."""
+_TICKS: Final = Format("<q")
 
 REAL: Final = ctypes.c_double
 """What a ``float`` of a record is; C's ``real``."""
@@ -166,7 +172,7 @@ def unpacked(made: type[Made], data: bytes) -> Made:
     """The record that ``packed`` has turned into bytes.
 
     Raises:
-        ValueError: they are no bytes of such a record.
+        ValueError: they are no bytes of such a record, or C may not have such values in it.
     """
     size, reader = ctypes.sizeof(made), decompressobj()
     try:
@@ -175,4 +181,20 @@ def unpacked(made: type[Made], data: bytes) -> Made:
         raise ValueError(f"the bytes of {made.__name__} are damaged: {error}") from None
     if len(content) != size or not reader.eof or reader.unused_data:
         raise ValueError(f"{made.__name__} has {size} bytes, not what these are")
+    if any(content[at] > 1 for at in _offsets(made, ctypes.c_bool)):
+        raise ValueError(f"{made.__name__} has a field that is neither true nor false")
+    if any(abs(_TICKS.unpack_from(content, at)[0]) > LARGEST_TICKS for at in _offsets(made, ctypes.c_int64)):
+        raise ValueError(f"{made.__name__} has ticks whose differences do not fit 64 bits")
     return made.from_buffer_copy(content)
+
+
+@cache
+def _offsets(made: Any, kind: type) -> tuple[int, ...]:  # noqa: ANN401 - types have no type
+    """Where the numbers of a type stand in a record or an array."""
+    if made is kind:
+        return (0,)
+    if issubclass(made, ctypes.Array):
+        size, inner = ctypes.sizeof(made._type_), _offsets(made._type_, kind)
+        return tuple(size * index + at for index in range(made._length_) for at in inner)
+    fields = made._fields_ if issubclass(made, Record) else ()
+    return tuple(getattr(made, name).offset + at for name, field in fields for at in _offsets(field, kind))

@@ -4,6 +4,7 @@
  * skyless.core.air.beacon_fields
  * skyless.core.air.first_path
  * skyless.core.air.instants
+ * skyless.core.air.little_endian
  * skyless.core.air.neighbours
  * skyless.core.air.page_check
  * skyless.core.air.site_choice
@@ -86,10 +87,12 @@ INTERNAL int32_t least_important(Neighbours *t, int64_t rx_ticks);
 INTERNAL bool is_confirmed(Neighbour *n, int64_t rx_ticks);
 INTERNAL bool is_relayed(Neighbour *n, int64_t rx_ticks);
 INTERNAL void forget_times(Neighbours *t);
+INTERNAL bool is_newest(Neighbour *n, int32_t sequence, int64_t tx_counter);
 INTERNAL void keep(Neighbour *n, int32_t sequence, int64_t tx_ticks, int64_t rx_ticks, int32_t frames);
 INTERNAL int32_t reject(Neighbour *n, int32_t sequence, int64_t tx_counter, int64_t rx_ticks, bool is_silent);
 INTERNAL int64_t period_ticks(int32_t code);
 INTERNAL int64_t unsigned_(uint8_t *data, int32_t at, int32_t size);
+INTERNAL int32_t two_bytes(uint8_t *data, int32_t at);
 INTERNAL int64_t signed_(uint8_t *data, int32_t at);
 INTERNAL bool is_possible_page(uint8_t *data, int32_t at);
 INTERNAL bool is_coordinate(uint8_t *data, int32_t at);
@@ -99,7 +102,6 @@ INTERNAL int32_t length_fault(uint8_t *frame, int32_t length);
 INTERNAL int32_t bare_bytes(int32_t flags);
 INTERNAL void read_place(uint8_t *frame, int32_t at, StatedPlace *place);
 INTERNAL bool read_relays(uint8_t *frame, BeaconFields *b);
-INTERNAL int32_t two(uint8_t *data, int32_t at);
 INTERNAL int32_t checksum(uint8_t *data, int32_t length);
 INTERNAL real variance_factor(real rx_power_dbm, real first_path_power_dbm);
 INTERNAL int32_t choose_site(SiteChoice *choice, int32_t site, int32_t anchor, int64_t rx_ticks);
@@ -284,8 +286,10 @@ INTERNAL int32_t find_heard(Acquisition *q, int32_t anchor);
 INTERNAL void remove_heard(Acquisition *q, int32_t place);
 INTERNAL void forget_old_packets(Acquisition *q, int64_t now);
 INTERNAL bool keep_packet_of(Acquisition *q, int32_t anchor, HeardPacket *given);
+INTERNAL int32_t longest_unfitting(Acquisition *q);
 INTERNAL void add_links(Acquisition *q, Packet *packet);
 INTERNAL void add_link(Acquisition *q, Packet *listener, Packet *sent, int64_t rx_ticks);
+INTERNAL int32_t oldest_link(Acquisition *q);
 INTERNAL void forget_links_before(Acquisition *q, int64_t now);
 INTERNAL void choose_pairs(Acquisition *q, int64_t now);
 INTERNAL int32_t anchor_of(Acquisition *q, int32_t pair);
@@ -295,7 +299,7 @@ INTERNAL void reach_from(Acquisition *q, int32_t reference);
 INTERNAL int32_t find_pair(Acquisition *q, int32_t anchor);
 INTERNAL void convert(Acquisition *q, int32_t pair, HeardPacket *one);
 INTERNAL real clock_rate_mps(HeardAnchor *one);
-INTERNAL void drop_impossible(Acquisition *q);
+INTERNAL void drop_impossible(Acquisition *q, int64_t now);
 INTERNAL int32_t solve_start(Acquisition *q, int32_t left_out, int64_t now, real residual_tail);
 INTERNAL int32_t locate(Acquisition *q, int32_t count, real residual_tail);
 INTERNAL bool is_wide(Acquisition *q);
@@ -451,6 +455,7 @@ INTERNAL int32_t neighbour_of(Neighbours *t, int32_t anchor, int64_t rx_ticks) {
         fresh = (Neighbour){0};
         t->rows[row] = fresh;
         t->rows[row].anchor = anchor;
+        t->rows[row].used_ticks = NEVER;
         t->rows[row].own_relays_ticks = NEVER;
         t->rows[row].relayed_ticks = NEVER;
     }
@@ -458,13 +463,19 @@ INTERNAL int32_t neighbour_of(Neighbours *t, int32_t anchor, int64_t rx_ticks) {
     return row;
 }
 
-/* The row to be forgotten: of what nobody confirms, if there is any, the longest silent; single frames go first. */
+/* The row to be forgotten: that of the lowest rank, and of several the longest silent.
+ *
+ * Anchors in use rank highest, then those that others confirm, then strangers of several frames. */
 INTERNAL int32_t least_important(Neighbours *t, int64_t rx_ticks) {
     int32_t least = -1;
     int32_t least_rank = 0;
     for (int32_t row = 0, row_end = t->count; row < row_end; row++) {
         Neighbour *n = &t->rows[row];
-        int32_t rank = is_confirmed(n, rx_ticks) ? 2 : n->frames > 1 ? 1 : 0;
+        int32_t rank = 0;
+        if (n->frames > 0) {
+            bool is_used = rx_ticks - n->used_ticks < RELAYED_TICKS;
+            rank = is_used ? 3 : is_confirmed(n, rx_ticks) ? 2 : n->frames > 1 ? 1 : 0;
+        }
         bool is_less = least < 0 || rank < least_rank;
         if (!is_less && rank == least_rank) {
             is_less = n->changed_ticks < t->rows[least].changed_ticks;
@@ -495,8 +506,9 @@ INTERNAL void forget_times(Neighbours *t) {
         n->frames = 0;
         n->impossible = 0;
         n->has_rival = false;
-        n->is_confirmed = false;
+        n->was_relayed = false;
         n->changed_ticks = NEVER;
+        n->used_ticks = NEVER;
         n->own_relays_ticks = NEVER;
         n->relayed_ticks = NEVER;
     }
@@ -512,13 +524,14 @@ INTERNAL void forget_times(Neighbours *t) {
  * as far as it is known. Where the stamp fits, ``row`` is the anchor's, and holds it; a first one keeps its own value. */
 SKYLESS_EXPORT int32_t skyless_unwrap_stamp(Neighbours *t, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t
         rx_ticks, int64_t period_ticks) {
-    int32_t row = neighbour_of(t, anchor, rx_ticks);
-    Neighbour *n = &t->rows[row];
-    t->row = row;
-    bool is_repeated = n->frames > 0 && (n->tx_ticks & TICK_MASK) == tx_counter && n->sequence == sequence;
+    t->row = -1;
+    int32_t known = find_neighbour(t, anchor);
+    bool is_repeated = known >= 0 && is_newest(&t->rows[known], sequence, tx_counter);
     if (t->has_newest && rx_ticks <= t->newest_rx_ticks) {
         return is_repeated ? DUPLICATE : OUT_OF_ORDER;
     }
+    t->row = neighbour_of(t, anchor, rx_ticks);
+    Neighbour *n = &t->rows[t->row];
     if (n->frames > 0) {
         int64_t elapsed = rx_ticks - n->rx_ticks;
         int64_t tx_ticks = nearest(tx_counter, n->tx_ticks + elapsed, 40);
@@ -533,6 +546,10 @@ SKYLESS_EXPORT int32_t skyless_unwrap_stamp(Neighbours *t, int32_t anchor, int32
     t->has_newest = true;
     t->newest_rx_ticks = rx_ticks;
     return STAMP_FITS;
+}
+
+INTERNAL bool is_newest(Neighbour *n, int32_t sequence, int64_t tx_counter) {
+    return n->frames > 0 && (n->tx_ticks & TICK_MASK) == tx_counter && n->sequence == sequence;
 }
 
 INTERNAL void keep(Neighbour *n, int32_t sequence, int64_t tx_ticks, int64_t rx_ticks, int32_t frames) {
@@ -581,9 +598,9 @@ INTERNAL int64_t period_ticks(int32_t code) {
     return unit * (int32_t)((uint32_t)(STEPS + (code & 15)) << (code >> 4));
 }
 
-/* Which contents of a page are possible (``docs/protocol.md``, "Pages"); what frames carry may be anything. */
+/* Whole numbers in frames, the lowest byte first. */
 
-/* A whole number in this number of bytes, the lowest first. */
+/* That in this number of bytes. */
 INTERNAL int64_t unsigned_(uint8_t *data, int32_t at, int32_t size) {
     int64_t number = 0;
     for (int32_t byte = size - 1; byte > -1; byte--) {
@@ -591,6 +608,13 @@ INTERNAL int64_t unsigned_(uint8_t *data, int32_t at, int32_t size) {
     }
     return number;
 }
+
+/* That in two bytes, which needs no 64 bits. */
+INTERNAL int32_t two_bytes(uint8_t *data, int32_t at) {
+    return data[at] | (int32_t)((uint32_t)data[at + 1] << 8);
+}
+
+/* Which contents of a page are possible (``docs/protocol.md``, "Pages"); what frames carry may be anything. */
 
 /* The same of a number of four bytes that may be negative. */
 INTERNAL int64_t signed_(uint8_t *data, int32_t at) {
@@ -652,9 +676,9 @@ SKYLESS_EXPORT int32_t skyless_read_frame(uint8_t *frame, int32_t length, Beacon
     int32_t at = FIXED_BYTES;
     b->sequence = frame[2];
     b->period_code = frame[19];
-    const int32_t new_1 = two(frame, 3);
-    const int32_t new_2 = two(frame, 7);
-    const int32_t new_3 = two(frame, 17);
+    const int32_t new_1 = two_bytes(frame, 3);
+    const int32_t new_2 = two_bytes(frame, 7);
+    const int32_t new_3 = two_bytes(frame, 17);
     b->site = new_1;
     b->anchor = new_2;
     b->almanac_issue = new_3;
@@ -674,7 +698,7 @@ SKYLESS_EXPORT int32_t skyless_read_frame(uint8_t *frame, int32_t length, Beacon
         b->certificate_at = at;
         at += CERTIFICATE_BYTES;
     } else {
-        int32_t entries = two(frame, at);
+        int32_t entries = two_bytes(frame, at);
         b->heard_at = at + COUNT_BYTES;
         b->heard_count = entries & COUNT_MASK;
         b->weak = entries >> COUNT_BITS;
@@ -705,10 +729,10 @@ INTERNAL int32_t header_fault(uint8_t *frame, int32_t length) {
     if (checksum(frame, length) != 0) {
         return BAD_FCS;
     }
-    if (length < HEADER_BYTES + FCS_BYTES || two(frame, 0) != FRAME_CONTROL || two(frame, 5) != BROADCAST) {
+    if (length < HEADER_BYTES + FCS_BYTES || two_bytes(frame, 0) != FRAME_CONTROL || two_bytes(frame, 5) != BROADCAST) {
         return NOT_A_BEACON;
     }
-    int32_t magic = two(frame, 9);
+    int32_t magic = two_bytes(frame, 9);
     if ((magic & MAGIC_MASK) != BEACON_MAGIC) {
         return NOT_A_BEACON;
     }
@@ -732,7 +756,7 @@ INTERNAL int32_t length_fault(uint8_t *frame, int32_t length) {
     }
     if ((flags & HAS_CERTIFICATE) == 0) {
         int32_t at = FIXED_BYTES + ((flags & HAS_POSITION) != 0 ? POSITION_BYTES : 0);
-        bare += (two(frame, at) & COUNT_MASK) * HEARD_BYTES;
+        bare += (two_bytes(frame, at) & COUNT_MASK) * HEARD_BYTES;
     }
     return length == bare ? INTACT : BAD_LENGTH;
 }
@@ -747,7 +771,7 @@ INTERNAL int32_t bare_bytes(int32_t flags) {
 
 INTERNAL void read_place(uint8_t *frame, int32_t at, StatedPlace *place) {
     for (int32_t axis = 0; axis < 3; axis++) {
-        int32_t low = two(frame, at + 3 * axis);
+        int32_t low = two_bytes(frame, at + 3 * axis);
         int32_t high = frame[at + 3 * axis + 2];
         place->position_mm[axis] = low + 65536 * (high > 127 ? high - 256 : high);
     }
@@ -761,12 +785,12 @@ INTERNAL void read_place(uint8_t *frame, int32_t at, StatedPlace *place) {
 INTERNAL bool read_relays(uint8_t *frame, BeaconFields *b) {
     for (int32_t one = 0, one_end = b->heard_count; one < one_end; one++) {
         int32_t at = b->heard_at + one * HEARD_BYTES;
-        int32_t anchor = two(frame, at);
+        int32_t anchor = two_bytes(frame, at);
         if (anchor == b->anchor) {
             return false;
         }
         for (int32_t before = 0; before < one; before++) {
-            if (two(frame, b->heard_at + before * HEARD_BYTES) == anchor) {
+            if (two_bytes(frame, b->heard_at + before * HEARD_BYTES) == anchor) {
                 return false;
             }
         }
@@ -780,14 +804,10 @@ INTERNAL bool read_relays(uint8_t *frame, BeaconFields *b) {
     return true;
 }
 
-/* A whole number of two bytes. */
-INTERNAL int32_t two(uint8_t *data, int32_t at) {
-    return data[at] | (int32_t)((uint32_t)data[at + 1] << 8);
-}
-
 /* CRC-16 of x¹⁶ + x¹² + x⁵ + 1, initially 0, bit 0 of each byte first (clause 7.2.10); 0 with a frame's FCS.
  *
- * A byte's four low and four high bits each shift the polynomial in once, so no table is needed. */
+ * A byte's four low and four high bits each shift the polynomial in once, so no table is needed. Python's own frames
+ * have theirs from ``ieee802154.fcs``, which is faster there. */
 INTERNAL int32_t checksum(uint8_t *data, int32_t length) {
     int32_t crc = 0;
     for (int32_t at = 0; at < length; at++) {
@@ -3082,9 +3102,9 @@ INTERNAL void take_relays(Packet *packet, uint8_t *packed, int32_t packed_bytes)
         if (packet->relay_count < MAX_RELAYS) {
             Relay *relayed = &packet->relays[packet->relay_count];
             relayed->listener = packet->place.anchor;
-            relayed->anchor = packed[begin] | (int32_t)((uint32_t)packed[begin + 1] << 8);
+            relayed->anchor = two_bytes(packed, begin);
             relayed->sequence = packed[begin + 2];
-            relayed->rx_ticks = nearest(unsigned_(packed, begin + 3, PACKED_BYTES - 3), packet->tx_ticks, 40);
+            relayed->rx_ticks = nearest(unsigned_(packed, begin + 3, HEARD_BYTES - 3), packet->tx_ticks, 40);
             packet->relay_count += 1;
         }
     }
@@ -4572,7 +4592,7 @@ SKYLESS_EXPORT int32_t skyless_try_start(Acquisition *q, HeardPacket *given, uin
     bool came_around = keep_packet_of(q, anchor, given);
     choose_pairs(q, now);
     put_on_one_scale(q, now);
-    drop_impossible(q);
+    drop_impossible(q, now);
     int32_t needed = q->knows_height ? 3 : 4;
     if (q->pair_count < needed) {
         return TOO_FEW_ANCHORS;
@@ -4618,16 +4638,19 @@ INTERNAL void forget_old_packets(Acquisition *q, int64_t now) {
     }
 }
 
-/* Keep an anchor's two newest packets; whether it had two before. With too many anchors a new one is left out. */
+/* Keep an anchor's two newest packets; whether it had two before.
+ *
+ * With too many anchors a new one takes the place of that which has not fitted the others for longest. */
 INTERNAL bool keep_packet_of(Acquisition *q, int32_t anchor, HeardPacket *given) {
     int32_t place = find_heard(q, anchor);
     if (place < 0) {
         if (q->count == MAX_ANCHORS) {
-            return false;
+            remove_heard(q, longest_unfitting(q));
         }
         place = q->count;
         q->count += 1;
         q->heard[place].count = 0;
+        q->heard[place].fitted_ticks = NEVER;
     }
     HeardAnchor *one = &q->heard[place];
     bool had_two = one->count == 2;
@@ -4637,6 +4660,16 @@ INTERNAL bool keep_packet_of(Acquisition *q, int32_t anchor, HeardPacket *given)
     one->newer = *given;
     one->count = min_32(one->count + 1, 2);
     return had_two;
+}
+
+INTERNAL int32_t longest_unfitting(Acquisition *q) {
+    int32_t longest = 0;
+    for (int32_t place = 1, place_end = q->count; place < place_end; place++) {
+        if (q->heard[place].fitted_ticks < q->heard[longest].fitted_ticks) {
+            longest = place;
+        }
+    }
+    return longest;
 }
 
 /* Keep what an anchor relays of packets that the tag has received. */
@@ -4665,7 +4698,7 @@ INTERNAL void add_link(Acquisition *q, Packet *listener, Packet *sent, int64_t r
         index_ += 1;
     }
     if (index_ == MAX_LINKS) {
-        return;
+        index_ = oldest_link(q);
     }
     q->link_count = max_32(q->link_count, index_ + 1);
     ClockLink *link = &q->links[index_];
@@ -4676,6 +4709,16 @@ INTERNAL void add_link(Acquisition *q, Packet *listener, Packet *sent, int64_t r
     const real new_2 = -SQRT(total) / TICK_M;
     link->ticks = new_1;
     link->fraction_ticks = new_2;
+}
+
+INTERNAL int32_t oldest_link(Acquisition *q) {
+    int32_t oldest = 0;
+    for (int32_t index_ = 1, index__end = q->link_count; index_ < index__end; index_++) {
+        if (q->links[index_].rx_ticks_tag < q->links[oldest].rx_ticks_tag) {
+            oldest = index_;
+        }
+    }
+    return oldest;
 }
 
 INTERNAL void forget_links_before(Acquisition *q, int64_t now) {
@@ -4836,12 +4879,13 @@ INTERNAL real clock_rate_mps(HeardAnchor *one) {
 }
 
 /* Drop pairs of messages that no crystal can have sent. */
-INTERNAL void drop_impossible(Acquisition *q) {
+INTERNAL void drop_impossible(Acquisition *q, int64_t now) {
     int32_t kept = 0;
     for (int32_t pair = 0, pair_end = q->pair_count; pair < pair_end; pair++) {
         if (abs_real(q->clock_rates_mps[pair]) <= MAX_DRIFT * SPEED_OF_LIGHT_MPS) {
             q->clock_rates_mps[kept] = q->clock_rates_mps[pair];
             q->pairs[kept] = q->pairs[pair];
+            q->heard[q->pairs[kept]].fitted_ticks = now;
             kept += 1;
         }
     }
@@ -4852,6 +4896,9 @@ INTERNAL void drop_impossible(Acquisition *q) {
 
 /* Locate the tag by the newest packets of all pairs but one (−1: of all); returns why there is no start. */
 INTERNAL int32_t solve_start(Acquisition *q, int32_t left_out, int64_t now, real residual_tail) {
+    if (q->pair_count < 3 + (left_out >= 0 ? 1 : 0)) {
+        return TOO_FEW_ANCHORS;
+    }
     Start *start = &q->start;
     int32_t count = 0;
     real shortest_s = q->max_age_s;
@@ -5181,7 +5228,7 @@ INTERNAL void add_power(Neighbour *n, real power_dbm) {
 /* Process what an anchor relays, so that it confirms others. */
 INTERNAL void add_relays(Neighbours *t, BeaconFields *b, int64_t rx_ticks) {
     for (int32_t begin = 0, begin_end = b->relay_bytes; begin < begin_end; begin += 8) {
-        int32_t anchor = b->relays[begin] | (int32_t)((uint32_t)b->relays[begin + 1] << 8);
+        int32_t anchor = two_bytes(b->relays, begin);
         int32_t row = neighbour_of(t, anchor, rx_ticks);
         t->rows[row].relayed_ticks = rx_ticks;
         t->rows[row].own_relays_ticks = NEVER;
@@ -5196,7 +5243,7 @@ INTERNAL int32_t fitting_relays(Neighbours *t, State *s, BeaconFields *b, int64_
     int32_t fitting = 0;
     int64_t tx_ticks = t->rows[t->row].tx_ticks;
     for (int32_t begin = 0, begin_end = b->relay_bytes; begin < begin_end; begin += 8) {
-        int32_t anchor = b->relays[begin] | (int32_t)((uint32_t)b->relays[begin + 1] << 8);
+        int32_t anchor = two_bytes(b->relays, begin);
         int32_t row = find_neighbour(t, anchor);
         if (row >= 0 && t->rows[row].frames > 0 && t->rows[row].sequence == b->relays[begin + 2]) {
             int64_t elapsed = rx_ticks - t->rows[row].rx_ticks;
@@ -5241,15 +5288,19 @@ SKYLESS_EXPORT int32_t skyless_hear_fields(Hearing *h, Course *c, State *s, int6
     }
     Neighbour *n = &a->neighbours.rows[a->neighbours.row];
     add_power(n, rx_power_dbm);
-    n->is_confirmed = confirm(h, s);
+    n->was_relayed = confirm(h, s);
     n->almanac_issue = b->almanac_issue;
     n->period_code = b->period_code;
     h->has_moved = b->has_place && keep_place(n, &b->place);
     fill_packet(&h->packet, h, n, variance_factor(rx_power_dbm, first_path_power_dbm));
-    if (h->is_starting || h->has_moved || h->is_moving || b->almanac_issue != h->almanac_issue) {
+    if (h->is_starting || h->has_moved || h->is_moving || b->almanac_issue != h->almanac_issue || !n->has_place) {
         return IS_RARE;
     }
-    if (skyless_find_anchor(s, b->anchor) < 0 || !is_surely_in_reach(c, a->rx_ticks)) {
+    if (skyless_find_anchor(s, b->anchor) < 0) {
+        return IS_RARE;
+    }
+    n->used_ticks = a->rx_ticks;
+    if (!is_surely_in_reach(c, a->rx_ticks)) {
         return IS_RARE;
     }
     outcome = skyless_process_in_course(c, s, &a->time, &h->packet, b->relays, b->relay_bytes);

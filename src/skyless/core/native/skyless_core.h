@@ -4,6 +4,7 @@
  * skyless.core.air.beacon_fields
  * skyless.core.air.first_path
  * skyless.core.air.instants
+ * skyless.core.air.little_endian
  * skyless.core.air.neighbours
  * skyless.core.air.page_check
  * skyless.core.air.site_choice
@@ -130,7 +131,6 @@ typedef double real;
 #define HAS_POSITION 1
 /* Up to the magic number. */
 #define HEADER_BYTES 11
-/* One reception: anchor, sequence number, 40 bits of the RX stamp. */
 #define HEARD_BYTES 8
 #define HEIGHT 1
 #define HOST_JUMPED 2
@@ -146,7 +146,6 @@ typedef double real;
 #define JOINED 2
 /* Numbers in a vector of 256 bits. */
 #define LANES 4
-/* Metres, or m²: anything beyond is no site, and no number here overflows before it. */
 #define LARGEST REAL(1000000000.0)
 #define LASTING 0
 #define LAST_TICKS INT64_C(2305843009213693952)
@@ -218,8 +217,6 @@ typedef double real;
 #define ORTHOGONAL REAL(1e-14)
 #define OUTLIER 21
 #define OUT_OF_ORDER 2
-/* Bytes of a relay in a frame: identifier (2), sequence number (1), stamp (5), the lowest first. */
-#define PACKED_BYTES 8
 /* Packets of each anchor that are kept for relays to come; divides the range of sequence numbers. */
 #define PACKETS_KEPT 16
 #define PAGE_BYTES 17
@@ -341,10 +338,11 @@ typedef struct Neighbour {
     StatedPlace place;  /* The one that is used. */
     bool has_other;
     StatedPlace other;  /* Another one, stated once; used when it is stated twice in a row. */
-    bool is_confirmed;  /* Whether others had received it at its newest frame. */
+    bool was_relayed;  /* Whether others had received it at its newest frame. */
     int64_t relayed_ticks;  /* The receiver's reading when another anchor last relayed that it had received this one. */
     /* The receiver's reading when the anchor's own relays last fitted, where no other has relayed it since. */
     int64_t own_relays_ticks;
+    int64_t used_ticks;  /* The receiver's reading when the filter, where it has the anchor, last got a packet of it. */
     bool has_power;
     real power_dbm;  /* Running mean of the received power. */
     bool is_misfit;  /* Whether it contradicted the others at the start. */
@@ -353,7 +351,8 @@ typedef struct Neighbour {
 /* All of them. */
 typedef struct Neighbours {
     int32_t count;
-    int32_t row;  /* Of the anchor whose frame is processed; it is not forgotten meanwhile. */
+    /* Of the anchor whose frame is processed, which is not forgotten meanwhile; −1 while that is not known. */
+    int32_t row;
     bool has_newest;
     /* RX stamp of the newest accepted frame: one impossible stamp must not make others late. */
     int64_t newest_rx_ticks;
@@ -963,6 +962,7 @@ typedef struct HeardPacket {
 /* An anchor's newest packets. */
 typedef struct HeardAnchor {
     int32_t count;
+    int64_t fitted_ticks;  /* The tag's reading when it last had a place on the common scale, at a possible rate. */
     HeardPacket older;
     HeardPacket newer;
 } HeardAnchor;

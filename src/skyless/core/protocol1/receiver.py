@@ -13,7 +13,7 @@ from skyless.core.air.almanac import AccuracyPage, NoisePage, SchedulePage
 from skyless.core.air.first_path import variance_factor_of
 from skyless.core.air.frame import Heard, Malformed
 from skyless.core.air.reception import Reception
-from skyless.core.air.site_choice import note_fix
+from skyless.core.air.site_choice import NO_SITE, note_fix
 from skyless.core.arrays import Array
 from skyless.core.constants import SUBTICKS, TICK_M
 from skyless.core.fix import Fix, NoFixReason
@@ -29,7 +29,7 @@ from skyless.core.protocol1.beacon import Beacon
 from skyless.core.protocol1.codec import decode_cached, packed_relays
 from skyless.core.protocol1.schedule import Schedule, schedule_from_page
 from skyless.core.protocol1.snapshots import SnapshotMethod, Snapshots, SnapshotSettings, SnapshotsState
-from skyless.core.tag.admission import ADMITTED, Admission, admit_sender, admit_stamp, check
+from skyless.core.tag.admission import ADMITTED, Admission, admit_sender, admit_stamp
 from skyless.core.tag.beacon_receiver import AdmissionState, BeaconReceiver, HeardSite, MethodOptions
 from skyless.core.tag.factory import as_required, estimator_settings, stamp_variances
 from skyless.core.tag.joint import Estimation, EstimationState
@@ -74,10 +74,9 @@ class Receiver(BeaconReceiver):
         """
         if method not in METHODS:
             raise ValueError(f"method {method!r} is not one of {', '.join(METHODS)}")
-        super().__init__(MethodOptions(method, qa, z_bounds_m, integrity or IntegrityRequirement()), site)
+        super().__init__(MethodOptions(method, qa, z_bounds_m, integrity or IntegrityRequirement()))
         self._admission = Admission()
-        if site is not None:
-            self._admission.choice.only_site = site
+        self._admission.choice.only_site = NO_SITE if site is None else site
         self.almanac = AlmanacAssembly()
         self._schedule: Schedule | None = None
         self._scale: tuple[int, int] | None = None
@@ -114,9 +113,8 @@ class Receiver(BeaconReceiver):
             ValueError: no receiver has such a state.
         """
         made = cls(state.admission.options.method)
-        made._restore_admission(state.admission)
         made._admission = unpacked(Admission, state.admitted)
-        check(made._admission)
+        made._restore_admission(state.admission)
         made._superframe_ticks, made._followed = state.superframe_ticks, state.followed
         made.almanac.restore(state.almanac)
         made._read_positions()
@@ -190,8 +188,8 @@ class Receiver(BeaconReceiver):
                 return False
             stamps = beacon.anchor, beacon.sequence, beacon.tx_ticks
             outcome = _admit_stamp(admission, *stamps, self._superframe_ticks)
-        self._count_drop(outcome)
         if outcome != ADMITTED:
+            self._count_drop(outcome)
             return False
         if self._followed.on_beacon(beacon, admission.rx_ticks, self._superframe_ticks):
             return True

@@ -16,13 +16,11 @@ from skyless.core.native.arithmetic import floor, sqrt, square
 from skyless.core.native.records import Array, Bytes, Integers, Matrix, Reals, Record, Ticks, record
 from skyless.core.native.sizes import MAX_ANCHORS
 from skyless.core.tag.position import FOUND, MIRROR, RESIDUALS, Found, find_position
-from skyless.core.tag.problem import LocateProblem
+from skyless.core.tag.problem import LARGEST, LocateProblem
+from skyless.core.ticks import NEVER
 
 UNUSABLE, TOO_FEW_ANCHORS, ACQUIRING = range(20, 23)
 """Why there is no start, beside the reasons of ``find_position``; ``FOUND`` if there is one. Numbers may be absurd."""
-
-LARGEST: Final = 1e9
-"""Metres, or m²: anything beyond is no site, and no number here overflows before it."""
 
 MAX_LINKS: Final = MAX_ANCHORS * (MAX_ANCHORS - 1)
 
@@ -54,6 +52,8 @@ class HeardAnchor(Record):
     """An anchor's newest packets."""
 
     count: int
+    fitted_ticks: Ticks
+    """The tag's reading when it last had a place on the common scale, at a possible rate."""
     older: HeardPacket
     newer: HeardPacket
 
@@ -177,7 +177,7 @@ def try_start(q: Acquisition, given: HeardPacket, packed: Bytes, packed_bytes: i
     came_around = _keep_packet_of(q, anchor, given)
     _choose_pairs(q, now)
     _put_on_one_scale(q, now)
-    _drop_impossible(q)
+    _drop_impossible(q, now)
     needed = 3 if q.knows_height else 4
     if q.pair_count < needed:
         return TOO_FEW_ANCHORS
@@ -216,14 +216,17 @@ def _forget_old_packets(q: Acquisition, now: Ticks) -> None:
 
 
 def _keep_packet_of(q: Acquisition, anchor: int, given: HeardPacket) -> bool:
-    """Keep an anchor's two newest packets; whether it had two before. With too many anchors a new one is left out."""
+    """Keep an anchor's two newest packets; whether it had two before.
+
+    With too many anchors a new one takes the place of that which has not fitted the others for longest.
+    """
     place = _find_heard(q, anchor)
     if place < 0:
         if q.count == MAX_ANCHORS:
-            return False
+            _remove_heard(q, _longest_unfitting(q))
         place = q.count
         q.count += 1
-        q.heard[place].count = 0
+        q.heard[place].count, q.heard[place].fitted_ticks = 0, NEVER
     one = q.heard[place]
     had_two = one.count == 2
     if one.count > 0:
@@ -231,6 +234,14 @@ def _keep_packet_of(q: Acquisition, anchor: int, given: HeardPacket) -> bool:
     one.newer = given
     one.count = min(one.count + 1, 2)
     return had_two
+
+
+def _longest_unfitting(q: Acquisition) -> int:
+    longest = 0
+    for place in range(1, q.count):
+        if q.heard[place].fitted_ticks < q.heard[longest].fitted_ticks:
+            longest = place
+    return longest
 
 
 def _add_links(q: Acquisition, packet: Packet) -> None:
@@ -255,11 +266,19 @@ def _add_link(q: Acquisition, listener: Packet, sent: Packet, rx_ticks: Ticks) -
     ):
         index += 1
     if index == MAX_LINKS:
-        return
+        index = _oldest_link(q)
     q.link_count = max(q.link_count, index + 1)
     link = q.links[index]
     link.listener, link.sender, link.rx_ticks_tag = listener.place.anchor, sent.place.anchor, sent.rx_ticks
     link.ticks, link.fraction_ticks = rx_ticks - sent.tx_ticks, -sqrt(total) / TICK_M
+
+
+def _oldest_link(q: Acquisition) -> int:
+    oldest = 0
+    for index in range(1, q.link_count):
+        if q.links[index].rx_ticks_tag < q.links[oldest].rx_ticks_tag:
+            oldest = index
+    return oldest
 
 
 def _forget_links_before(q: Acquisition, now: Ticks) -> None:
@@ -385,12 +404,13 @@ def _clock_rate_mps(one: HeardAnchor) -> float:
     return change_m / (elapsed * TICK_S)
 
 
-def _drop_impossible(q: Acquisition) -> None:
+def _drop_impossible(q: Acquisition, now: Ticks) -> None:
     """Drop pairs of messages that no crystal can have sent."""
     kept = 0
     for pair in range(q.pair_count):
         if abs(q.clock_rates_mps[pair]) <= MAX_DRIFT * SPEED_OF_LIGHT_MPS:
             q.clock_rates_mps[kept], q.pairs[kept] = q.clock_rates_mps[pair], q.pairs[pair]
+            q.heard[q.pairs[kept]].fitted_ticks = now
             kept += 1
     q.pair_count = kept
 
@@ -400,6 +420,8 @@ def _drop_impossible(q: Acquisition) -> None:
 
 def _solve_start(q: Acquisition, left_out: int, now: Ticks, residual_tail: float) -> int:
     """Locate the tag by the newest packets of all pairs but one (−1: of all); returns why there is no start."""
+    if q.pair_count < 3 + (1 if left_out >= 0 else 0):
+        return TOO_FEW_ANCHORS
     start, count = q.start, 0
     shortest_s = q.max_age_s
     for pair in range(q.pair_count):

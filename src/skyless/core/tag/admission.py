@@ -3,6 +3,7 @@
 from typing import Final
 
 from skyless.core.air.anchor_stamps import STAMP_COUNTERS, STAMP_FITS, unwrap_stamp
+from skyless.core.air.instants import LONGEST_PERIOD_CODE
 from skyless.core.air.neighbours import MAX_NEIGHBOURS, Neighbours, forget_times
 from skyless.core.air.site_choice import (
     CHANGED,
@@ -14,7 +15,8 @@ from skyless.core.air.site_choice import (
     choose_site,
     restart_choice,
 )
-from skyless.core.native.records import Record, Ticks, record
+from skyless.core.constants import TICK_BITS
+from skyless.core.native.records import Record, Ticks, first, record
 from skyless.core.ticks import LAST_TICKS, FixTime, Unwrapper, from_seconds, unwrap
 
 COUNTER_JUMP_TICKS: Final = from_seconds(1.0)
@@ -85,11 +87,15 @@ def check(a: Admission) -> None:
     """
     limits = [
         ("anchors", a.neighbours.count, MAX_NEIGHBOURS),
-        ("rows", a.neighbours.row, MAX_NEIGHBOURS - 1),
+        ("rows", a.neighbours.row + 1, MAX_NEIGHBOURS),
         ("sites", a.choice.count, MAX_SITES),
         ("failed sites", a.choice.failed_count, MAX_SITES),
-        ("bits", a.own.bits - 1, 61),
-        *(("anchors of a site", one.count, MAX_COUNTED) for one in a.choice.sites),
+        ("bits other than a radio's", abs(a.own.bits - TICK_BITS), 0),
+        *(("anchors of a site", one.count, MAX_COUNTED) for one in first(a.choice.sites, MAX_SITES)),
+        *(
+            ("as a period's code", one.period_code, LONGEST_PERIOD_CODE)
+            for one in first(a.neighbours.rows, MAX_NEIGHBOURS)
+        ),
     ]
     for name, number, most in limits:
         if not 0 <= number <= most:

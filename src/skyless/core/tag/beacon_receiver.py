@@ -12,7 +12,7 @@ from skyless.core.air.reception import Reception
 from skyless.core.air.site_choice import NO_SITE
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.tag.admission import COUNTER_JUMPED, DROP_COUNTERS, HOST_JUMPED, SITE_CHANGED, Admission
+from skyless.core.tag.admission import COUNTER_JUMPED, DROP_COUNTERS, HOST_JUMPED, SITE_CHANGED, Admission, check
 from skyless.core.tag.joint import Estimation
 from skyless.core.ticks import FixTime
 
@@ -85,12 +85,11 @@ class AdmissionState(Struct, frozen=True):
 class BeaconReceiver(ABC):
     """One listening tag that understands one protocol."""
 
-    def __init__(self, options: MethodOptions, site: int | None) -> None:
-        """``site``: the only one to listen to; None for that with most anchors."""
+    def __init__(self, options: MethodOptions) -> None:
+        """Make one that has heard nothing."""
         self.counters: Counter[str] = Counter()
         self.reason: NoFixReason = NoFixReason.NO_BEACONS
         self._options = options
-        self._only_site = site
 
     @property
     @abstractmethod
@@ -100,8 +99,8 @@ class BeaconReceiver(ABC):
     @property
     def site(self) -> int | None:
         """Identifier of the site that it receives, None before the first beacon."""
-        site = self.admission.choice.site
-        return self._only_site if site == NO_SITE else site
+        choice = self.admission.choice
+        return _site_of(choice.only_site if choice.site == NO_SITE else choice.site)
 
     @property
     @abstractmethod
@@ -174,9 +173,18 @@ class BeaconReceiver(ABC):
         return None
 
     def _admission_state(self) -> AdmissionState:
-        return AdmissionState(self._options, self._only_site, dict(self.counters), self.reason)
+        only_site = _site_of(self.admission.choice.only_site)
+        return AdmissionState(self._options, only_site, dict(self.counters), self.reason)
 
     def _restore_admission(self, state: AdmissionState) -> None:
-        self._options, self._only_site = state.options, state.only_site
+        """Continue; raises ValueError where the admission, which has been restored already, is of another site."""
+        check(self.admission)
+        if state.only_site != _site_of(self.admission.choice.only_site):
+            raise ValueError(f"the receiver's state is of site {state.only_site}, and listens to another one")
+        self._options = state.options
         self.counters.update(state.counters)
         self.reason = state.reason
+
+
+def _site_of(site: int) -> int | None:
+    return None if site == NO_SITE else site

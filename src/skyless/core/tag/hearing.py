@@ -8,9 +8,8 @@ from typing import Final
 from skyless.core.air.beacon_fields import INTACT, BeaconFields, read_frame
 from skyless.core.air.first_path import variance_factor
 from skyless.core.air.instants import period_ticks
-from skyless.core.air.local_almanac import MIN_ANCHORS
 from skyless.core.air.neighbours import Neighbour, StatedPlace, is_relayed
-from skyless.core.air.site_choice import note_fix
+from skyless.core.air.site_choice import MIN_ANCHORS, note_fix
 from skyless.core.constants import TICK_S
 from skyless.core.estimator.process import Packet
 from skyless.core.estimator.state import AXES, State, find_anchor
@@ -87,13 +86,16 @@ def hear_fields(
         return outcome
     n = a.neighbours.rows[a.neighbours.row]
     add_power(n, rx_power_dbm)
-    n.is_confirmed = _confirm(h, s)
+    n.was_relayed = _confirm(h, s)
     n.almanac_issue, n.period_code = b.almanac_issue, b.period_code
     h.has_moved = b.has_place and keep_place(n, b.place)
     _fill_packet(h.packet, h, n, variance_factor(rx_power_dbm, first_path_power_dbm))
-    if h.is_starting or h.has_moved or h.is_moving or b.almanac_issue != h.almanac_issue:
+    if h.is_starting or h.has_moved or h.is_moving or b.almanac_issue != h.almanac_issue or not n.has_place:
         return IS_RARE
-    if find_anchor(s, b.anchor) < 0 or not is_surely_in_reach(c, a.rx_ticks):
+    if find_anchor(s, b.anchor) < 0:
+        return IS_RARE
+    n.used_ticks = a.rx_ticks
+    if not is_surely_in_reach(c, a.rx_ticks):
         return IS_RARE
     outcome = process_in_course(c, s, a.time, h.packet, b.relays, b.relay_bytes)
     if outcome == FIX:

@@ -105,7 +105,7 @@ class Estimation:
         course = unpacked(Course, state.course)
         if not 0 <= course.count <= MAX_ANCHORS:
             raise ValueError(f"{course.count} anchors are in use; there can be {MAX_ANCHORS}")
-        self._start = None if state.start is None else _restored_start(state.start)
+        self._start = None if state.start is None else _restored_start(state.start, self._new_start())
         self._estimator.restore(state.estimator)
         self.course, self._listed = course, -1
 
@@ -352,6 +352,17 @@ _NO_START: Final = {
 }
 """Other reasons are those of a bad geometry."""
 
+_START_SETTINGS: Final = (
+    "knows_height",
+    "height_m",
+    "variance_m2",
+    "max_age_s",
+    "speed_std_mps",
+    "error_variance_m2",
+    "tuning",
+)
+"""Fields of an acquisition that follow from the settings; bounds of the height may be a sensor's."""
+
 _process_in_course: Final = compiled(process_in_course)
 _try_to_start: Final = compiled(try_start)
 
@@ -361,14 +372,17 @@ def _error_variance_m2(settings: EstimatorSettings) -> float:
     return settings.range_std_m**2 + settings.survey_std_m**2
 
 
-def _restored_start(data: bytes) -> Acquisition:
+def _restored_start(data: bytes, fresh: Acquisition) -> Acquisition:
     """An acquisition from bytes that may come from anywhere: what compiled functions use as an index is checked.
+
+    ``fresh``: one with the settings of this site.
 
     Raises:
         ValueError: they are no bytes of one, or an index is beyond its table.
     """
     made = unpacked(Acquisition, data)
-    made.tuning = TUNING
+    for setting in _START_SETTINGS:
+        setattr(made, setting, getattr(fresh, setting))
     packets = [one.packet for heard in made.heard for one in (heard.older, heard.newer)]
     counts = [
         (made.count, MAX_ANCHORS),

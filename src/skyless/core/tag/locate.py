@@ -29,12 +29,11 @@ from skyless.core.tag.position import (
     Found,
     find_position,
 )
-from skyless.core.tag.problem import LocateProblem
+from skyless.core.tag.problem import LARGEST, LocateProblem
 
 _find_position = compiled(find_position)
 
 RESIDUAL_TAIL: Final = 1e-9  # residuals that noise exceeds this rarely are not noise
-LARGEST: Final = 1e9  # metres (or m²); anything beyond is no site, and no number here overflows before it
 
 _REASONS: Final = {
     NO_COVARIANCE: (NoFixReason.BAD_GEOMETRY, "the TDoAs' covariance is not positive definite"),

@@ -22,6 +22,10 @@ THIN_SIGMAS: Final = 0.1
 FLAT: Final = 1e-9  # or if they leave it by less than this part of their extent
 
 
+LARGEST: Final = 1e9
+"""Metres, or m²: anything beyond is no site, and no number here overflows before it."""
+
+
 @record
 class Minimum(Record):
     """A minimum of the cost, in the problem's axes."""

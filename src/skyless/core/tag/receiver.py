@@ -15,7 +15,7 @@ from skyless.core.air.first_path import powers_dbm
 from skyless.core.air.local_almanac import MIN_ANCHORS, PRESENT_TICKS, LocalAlmanac
 from skyless.core.air.neighbours import find_neighbour, is_confirmed
 from skyless.core.air.reception import Reception
-from skyless.core.air.site_choice import note_fix
+from skyless.core.air.site_choice import NO_SITE, note_fix
 from skyless.core.estimator.state import State
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
@@ -24,7 +24,7 @@ from skyless.core.native.library import compiled
 from skyless.core.native.records import packed, unpacked
 from skyless.core.native.views import view
 from skyless.core.observation import Observation
-from skyless.core.tag.admission import DROP_COUNTERS, Admission, check
+from skyless.core.tag.admission import DROP_COUNTERS, Admission
 from skyless.core.tag.beacon_receiver import BeaconReceiver, HeardSite, MethodOptions
 from skyless.core.tag.course import FIX, Course
 from skyless.core.tag.factory import ReceiverState, new_method
@@ -64,10 +64,9 @@ class Receiver(BeaconReceiver):
         m²/s³; ``z_bounds_m`` decides between mirror solutions; ``integrity`` is the requirement for the protection
         levels.
         """
-        super().__init__(MethodOptions(DEFAULT_METHOD, qa, z_bounds_m, integrity or IntegrityRequirement()), site)
+        super().__init__(MethodOptions(DEFAULT_METHOD, qa, z_bounds_m, integrity or IntegrityRequirement()))
         self._hearing = Hearing()
-        if site is not None:
-            self.admission.choice.only_site = site
+        self.admission.choice.only_site = NO_SITE if site is None else site
         self.almanac = LocalAlmanac(self.admission.neighbours)
         self._method: Estimation | None = None
         self._method_key: object = None
@@ -102,9 +101,8 @@ class Receiver(BeaconReceiver):
             ValueError: no receiver has such a state.
         """
         made = cls()
-        made._restore_admission(state.admission)
         made._hearing = unpacked(Hearing, state.hearing)
-        check(made.admission)
+        made._restore_admission(state.admission)
         made.almanac = LocalAlmanac(made.admission.neighbours)
         made.almanac.restore(state.almanac)
         made._waiting = list(state.waiting)
@@ -189,6 +187,7 @@ class Receiver(BeaconReceiver):
         """What has become of a beacon; the page in it stands in its frame, or is given."""
         if self.admission.events:
             self._handle_events()
+            self._note_method()
         if outcome < len(DROP_COUNTERS):
             self._count_drop(outcome)
             return None
@@ -330,19 +329,21 @@ class Receiver(BeaconReceiver):
         self._moved_ticks, self._uses_moved = {}, False
         self._method = self._method_key = None
         if self.almanac.pages is not None:
-            self._choose_method()
+            self._choose_method(self._method_period_ticks)
 
     def _choose_method(self, method_period_ticks: int | None = None) -> None:
         """Make the method that the common pages require, unless it is in use already.
 
-        ``method_period_ticks``: for which it was made, where it continues from a state.
+        ``method_period_ticks``: for which it was made, where it continues from a state, or begins again at the site.
         """
         pages = self.almanac.pages
         assert pages is not None
         method_key = (pages.site.tag_height_m, pages.noise, pages.accuracy)
         if method_key != self._method_key:
             self._method_key = method_key
-            self._method_period_ticks = method_period_ticks or self.almanac.longest_period_ticks()
+            if method_period_ticks is None:
+                method_period_ticks = self.almanac.longest_period_ticks()
+            self._method_period_ticks = method_period_ticks
             self._method = new_method(self._options, pages, self._method_period_ticks, self.admission.time)
 
 

@@ -4,9 +4,10 @@ import math
 from collections.abc import Collection
 from typing import Final
 
-from skyless.core.air.beacon_fields import HEARD_BYTES, BeaconFields
+from skyless.core.air.beacon_fields import BeaconFields
+from skyless.core.air.frame import HEARD_BYTES
+from skyless.core.air.little_endian import two_bytes, unsigned
 from skyless.core.air.neighbours import Neighbour, Neighbours, find_neighbour, neighbour_of
-from skyless.core.air.page_check import unsigned
 from skyless.core.estimator.state import State, find_anchor
 from skyless.core.native.records import Ticks
 from skyless.core.ticks import FLIGHT_SLACK_TICKS, NEVER, may_elapse, nearest
@@ -40,7 +41,7 @@ def add_power(n: Neighbour, power_dbm: float) -> None:
 def add_relays(t: Neighbours, b: BeaconFields, rx_ticks: Ticks) -> None:
     """Process what an anchor relays, so that it confirms others."""
     for begin in range(0, b.relay_bytes, HEARD_BYTES):
-        anchor = b.relays[begin] | b.relays[begin + 1] << 8
+        anchor = two_bytes(b.relays, begin)
         row = neighbour_of(t, anchor, rx_ticks)
         t.rows[row].relayed_ticks = rx_ticks
         t.rows[row].own_relays_ticks = NEVER
@@ -55,7 +56,7 @@ def fitting_relays(t: Neighbours, s: State, b: BeaconFields, rx_ticks: Ticks) ->
     fitting = 0
     tx_ticks = t.rows[t.row].tx_ticks
     for begin in range(0, b.relay_bytes, HEARD_BYTES):
-        anchor = b.relays[begin] | b.relays[begin + 1] << 8
+        anchor = two_bytes(b.relays, begin)
         row = find_neighbour(t, anchor)
         if row >= 0 and t.rows[row].frames > 0 and t.rows[row].sequence == b.relays[begin + 2]:
             elapsed = rx_ticks - t.rows[row].rx_ticks
@@ -72,6 +73,8 @@ def replaced_by(anchor: int, powers_dbm: dict[int, float], ranges_m: dict[int, f
     """
     powers = {one: powers_dbm.get(one, _nominal_dbm(range_m)) for one, range_m in ranges_m.items()}
     own_dbm = powers.pop(anchor)
+    if not powers:
+        return None
     weakest = min(powers, key=lambda one: powers[one])
     return weakest if own_dbm > powers[weakest] + BETTER_DB else None
 
