@@ -1,0 +1,100 @@
+"""What a tag of protocol 2 keeps when its counter restarts, an anchor's row is lost, or strangers were there first."""
+
+from zlib import compress
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from bench import ROOM, tape
+from skyless.core.air.beacon import Beacon, StatedPosition
+from skyless.core.air.codec import decode, encode
+from skyless.core.air.frame import Heard
+from skyless.core.air.neighbours import Neighbour, find_neighbour
+from skyless.core.estimator.state import find_anchor
+from skyless.core.native.records import unpacked
+from skyless.core.tag.acquisition import Acquisition
+from skyless.core.tag.receiver import Receiver
+from skyless.core.ticks import from_seconds, to_seconds, wrap
+
+pytestmark = pytest.mark.site
+
+
+def free_room(rate_hz, seconds):
+    return [
+        one.reception
+        for one in tape(replace(ROOM, schedule=replace(ROOM.schedule, mode="free", rate_hz=rate_hz)), seconds)
+    ]
+
+
+@pytest.mark.parametrize("jump", ["host", "counter"])
+def test_the_period_of_a_slow_site_survives_a_restart(jump):
+    heard = free_room(2.0, 20.0)
+    half, receiver = len(heard) // 2, Receiver()
+    for one in heard[:half]:
+        receiver.hear(replace(one, host_s=1e9 + one.host_s))
+    period_s = to_seconds(receiver.state().method_period_ticks)
+    assert period_s == pytest.approx(0.512)
+    fixes = 0
+    for one in heard[half:]:
+        if jump == "host":
+            later = replace(one, host_s=3e9 + one.host_s)
+        else:
+            later = replace(one, host_s=None, rx_ticks=wrap(one.rx_ticks - from_seconds(5.0)))
+        fixes += receiver.hear(later) is not None
+    assert {"impossible-host-time", "counter-jump"} & receiver.counters.keys()
+    assert to_seconds(receiver.state().method_period_ticks) == period_s
+    assert fixes > 60
+
+
+def test_an_anchor_without_a_known_place_is_not_used():
+    """Its row may have gone to a stranger's, and its frames with a certificate carry no position."""
+    heard, receiver = free_room(30.0, 2.0), Receiver()
+    half = len(heard) // 2
+    for one in heard[:half]:
+        receiver.hear(one)
+    beacon, t = decode(heard[half].frame), receiver.admission.neighbours
+    t.rows[find_neighbour(t, beacon.anchor)] = Neighbour(anchor=60_000)
+    state = receiver.method.estimator.state
+    before_m = list(state.anchors[find_anchor(state, beacon.anchor)].position_m)
+    bare = encode(replace(beacon, position=None, page=None))
+    assert receiver.hear(replace(heard[half], frame=bare)) is None
+    assert receiver.counters["no-position"] == 1
+    assert list(state.anchors[find_anchor(state, beacon.anchor)].position_m) == before_m
+
+
+@pytest.mark.parametrize(("strangers", "every_s", "first_s"), [(40, 0.25, 0.0), (36, 0.25, 0.5)])
+def test_strangers_that_were_first_do_not_keep_the_anchors_out(strangers, every_s, first_s):
+    """They state places near the site's anchors, and relay each other's frames at stamps that fit nothing."""
+    heard, draw = free_room(10.0, 4.0), np.random.default_rng(2)
+    begin, of_site = heard[0].rx_ticks, decode(heard[0].frame)
+    events = [(one.rx_ticks, one) for one in heard if one.rx_ticks - begin > from_seconds(first_s)]
+    for k in range(int(4.0 * strangers / every_s)):
+        rx_ticks, anchor = begin + from_seconds(k * every_s / strangers), 1000 + k % strangers
+        others = tuple(
+            Heard(1000 + (k + 1 + j) % strangers, int(draw.integers(256)), int(draw.integers(2**40))) for j in range(8)
+        )
+        place = StatedPosition(float(anchor % 7), float(anchor % 5), 3.0, 0.02)
+        issue, code, sequence = of_site.almanac_issue, of_site.period_code, k // strangers % 256
+        forged = Beacon(of_site.site, anchor, sequence, wrap(rx_ticks), issue, code, place, others, 0, None)
+        events.append((rx_ticks, replace(heard[0], frame=encode(forged), rx_ticks=wrap(rx_ticks))))
+    receiver, last, fixes = Receiver(), -(10**9), 0
+    for rx_ticks, one in sorted(events, key=lambda event: event[0]):
+        if rx_ticks - last > 20_000:  # others collide
+            fixes += receiver.hear(replace(one, host_s=None)) is not None
+            last = rx_ticks
+    assert fixes > 100
+
+
+@pytest.mark.parametrize("byte", [2, 128, 255])
+def test_a_state_with_a_bool_that_is_none_is_refused(byte):
+    """C takes one with another value than 0 or 1 for any number."""
+    receiver, heard = Receiver(), iter(free_room(30.0, 2.0))
+    while receiver.method is None:
+        receiver.hear(next(heard))
+    assert receiver.method.is_starting
+    state = receiver.state()
+    content = bytearray(bytes(unpacked(Acquisition, state.method.start)))
+    content[Acquisition.is_contradicted.offset] = byte
+    with pytest.raises(ValueError, match="neither true nor false"):
+        Receiver.from_state(replace(state, method=replace(state.method, start=compress(bytes(content), 1))))
