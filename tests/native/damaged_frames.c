@@ -3,8 +3,8 @@
  * Bytes are changed, as a rule with the right check sequence afterwards, frames are cut, prolonged, repeated and forged,
  * and stamps, host times and powers are wrong. Each frame lies in memory of its own size. A fix has to be finite, and
  * of a frame whose check sequence is right. When the tag has to begin again, and every few hundred frames, it is what it
- * was at the beginning. Prints how many frames were damaged, made a fix, and how many fixes were not finite or of a
- * frame with a wrong check sequence. */
+ * was at the beginning, or every other time one that looks for a start. Prints how many frames were damaged, made a fix,
+ * made a start, and how many fixes and starts were not finite or of a frame with a wrong check sequence. */
 
 #include <math.h>
 #include <stdio.h>
@@ -79,11 +79,13 @@ int main(int count, char **words) {
     const Hearing *first = read_bytes(sizeof(Hearing));
     const Course *first_course = read_bytes(sizeof(Course));
     const State *first_state = read_bytes(sizeof(State));
+    const Acquisition *first_start = read_bytes(sizeof(Acquisition));
     const Heard *heard = read_bytes(frames * sizeof(Heard));
     Hearing *h = malloc(sizeof(Hearing));
     Course *c = malloc(sizeof(Course));
     State *s = malloc(sizeof(State));
-    long damaged = 0, fixes = 0, wrong = 0;
+    Acquisition *q = malloc(sizeof(Acquisition));
+    long damaged = 0, fixes = 0, starts = 0, wrong = 0;
     int32_t next = frames;
     for (long n = 0; n < total; n++) {
         if (next == frames) {
@@ -91,6 +93,8 @@ int main(int count, char **words) {
             memcpy(h, first, sizeof(Hearing));
             memcpy(c, first_course, sizeof(Course));
             memcpy(s, first_state, sizeof(State));
+            memcpy(q, first_start, sizeof(Acquisition));
+            h->is_starting = draw() % 2;
         }
         Heard one = heard[next++];
         double host_s = NAN, power_dbm = -80;
@@ -108,8 +112,19 @@ int main(int count, char **words) {
             wrong += !is_finite(s) || crc(one.bytes, one.length) != 0;
         }
         h->admission.events = 0;
-        if (outcome == LOST || outcome == START_CONTRADICTED || (h->is_starting && draw() % 64 == 0)) next = frames;
+        if (outcome == LOST || outcome == START_CONTRADICTED || (h->is_starting && draw() % 256 == 0)) next = frames;
+        if (outcome == IS_RARE && h->is_starting) {
+            HeardPacket given = {.packet = h->packet};
+            if (skyless_try_start(q, &given, h->beacon.relays, h->beacon.relay_bytes) == FOUND) {
+                starts++;
+                for (int axis = 0; axis < 3; axis++) {
+                    const real x = q->start.position_m[axis], variance = q->start.covariance_m2[axis][axis];
+                    if (!(x - x == 0 && variance >= 0)) wrong++;
+                }
+                next = frames;
+            }
+        }
     }
-    printf("%ld %ld %ld\n", damaged, fixes, wrong);
+    printf("%ld %ld %ld %ld\n", damaged, fixes, starts, wrong);
     return 0;
 }
