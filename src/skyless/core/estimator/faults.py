@@ -15,7 +15,7 @@ the filter would have, had that error been open from the beginning.
 from typing import Final
 
 from skyless.core.constants import TICK_S
-from skyless.core.estimator.kalman import reset_state
+from skyless.core.estimator.kalman import open_direction, reset_state
 from skyless.core.estimator.state import (
     ALL_RANGE_ERRORS,
     CHANGING_RANGE_ERRORS,
@@ -236,13 +236,10 @@ def _open_fault(s: State, kind: int, anchor: int) -> None:
     for one in range(faults):
         shared[one] = gain * s.information[max(one, chosen)][min(one, chosen)]
     shared[chosen] = 0.0
-    for one in range(s.used):
-        s.x[one] += opened[one] * fault_m
-        for other in range(s.n):
-            s.P[one][other] += opened[one] * opened[other] * variance
-        for fault in range(faults):
-            s.V[one][fault] += shared[fault] * opened[one]
-        s.V[one][chosen] = 0.0
+    open_direction(s, variance, faults)
+    for state in range(s.used):
+        s.x[state] += opened[state] * fault_m
+        s.V[state][chosen] = 0.0
     for one in range(faults):
         s.evidence[one] -= shared[one] * s.evidence[chosen]
         for other in range(one + 1):

@@ -147,6 +147,16 @@ def reset_state(s: State, state: int, variance: float) -> None:
         s.V[state][fault] = 0.0
 
 
+def open_direction(s: State, variance: float, faults: int) -> None:
+    """Let what was taken for known err along the first of ``U``, which holds so much of each fault as ``G`` says."""
+    opened, shared = s.U[0], s.G[0]
+    for one in range(s.used):
+        for other in range(s.n):
+            s.P[one][other] += opened[one] * opened[other] * variance
+        for fault in range(faults):
+            s.V[one][fault] += shared[fault] * opened[one]
+
+
 # Measurement update
 
 

@@ -235,7 +235,7 @@ def _keep_packet(s: State, anchor: int, packet: Packet) -> None:
 def _process_relay(s: State, relayed: Relay) -> None:
     """Process a relayed reception once, if the tag has received that very packet."""
     listener, sender = find_anchor(s, relayed.listener), find_anchor(s, relayed.anchor)
-    if listener < 0 or sender < 0 or sender == listener:
+    if listener < 0 or sender < 0 or sender == listener or not s.anchors[listener].has_rate:
         return
     kept, link = s.packets[sender][relayed.sequence % PACKETS_KEPT], s.links[listener][sender]
     is_young = (s.status.epoch_ticks - kept.rx_ticks) * TICK_S < s.settings.relay_age_s

@@ -19,7 +19,7 @@ from skyless.core.estimator.state import (
 from skyless.core.native.records import view
 from skyless.core.native.sizes import MAX_ANCHORS
 
-VERSION: Final = 1
+VERSION: Final = 2
 """Changes with the fields of ``State`` and of the records in it."""
 _HEAD: Final = Format("<HBB")
 """Version, dimensions, anchors."""

@@ -265,7 +265,6 @@ TUNING: Final = Tuning()
 
 
 MAX_CLOCK_RATE: Final = 50e-6  # two crystals of ±20 ppm, and margin
-CLOCK_RATE_VARIANCE: Final = (MAX_CLOCK_RATE * SPEED_OF_LIGHT_MPS) ** 2  # m²/s²
 # Standard deviation of the constant error of the range between two anchors, without that of their survey.
 PAIR_STD_M: Final = 0.02
 

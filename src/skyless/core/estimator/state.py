@@ -82,6 +82,8 @@ class Anchor(Record):
     """The tag's walked distance at its newest packet."""
     is_relayed: bool
     """Whether others relay its packets."""
+    has_rate: bool
+    """Whether its clock's rate is known: more than its first packet has shown its offset."""
     has_tx_noise: bool
     """Whether its newest packet's TX noise is a state."""
     packets: Count

@@ -80,6 +80,7 @@ INTERNAL range_error_decay_results range_error_decay(State *s, int32_t anchor, r
 INTERNAL void relax_range_error(State *s, int32_t anchor, real dt, real walked_m);
 INTERNAL void decay(State *s, int32_t state, real kept, real variance);
 INTERNAL void reset_state(State *s, int32_t state, real variance);
+INTERNAL void open_direction(State *s, real variance, int32_t faults);
 INTERNAL real compute_ph(State *s);
 INTERNAL real h_dot(State *s, real *states);
 INTERNAL void compute_fault_input(State *s, int32_t own);
@@ -141,6 +142,7 @@ INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64
 INTERNAL void carry_ticks(State *s, int32_t anchor);
 INTERNAL real jump(State *s, int32_t anchor, real innovation, real rx_variance);
 INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks);
+INTERNAL void find_rate(State *s, int32_t anchor, real innovation, real innovation_variance, real elapsed_s);
 INTERNAL void relay_terms(State *s, int32_t listener, int32_t sender, real age_s, bool has_tx_noise);
 INTERNAL real relay_variance(State *s, int32_t listener, int32_t sender, real age_s);
 INTERNAL void relay(State *s, int32_t listener, int32_t sender, int64_t tx_ticks, int64_t packet_rx_ticks, int64_t
@@ -764,6 +766,20 @@ INTERNAL void reset_state(State *s, int32_t state, real variance) {
     }
 }
 
+/* Let what was taken for known err along the first of ``U``, which holds so much of each fault as ``G`` says. */
+INTERNAL void open_direction(State *s, real variance, int32_t faults) {
+    real *opened = s->U[0];
+    real *shared = s->G[0];
+    for (int32_t one = 0, one_end = s->used; one < one_end; one++) {
+        for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
+            s->P[one][other] += opened[one] * opened[other] * variance;
+        }
+        for (int32_t fault = 0; fault < faults; fault++) {
+            s->V[one][fault] += shared[fault] * opened[one];
+        }
+    }
+}
+
 /* Measurement update */
 
 /* Write P·h of the measurement in ``h`` into the next of ``U``; returns hᵀ·P·h. Counts updates that wait. */
@@ -1227,15 +1243,10 @@ INTERNAL void open_fault(State *s, int32_t kind, int32_t anchor) {
         shared[one] = gain * s->information[max_32(one, chosen)][min_32(one, chosen)];
     }
     shared[chosen] = REAL(0.0);
-    for (int32_t one = 0, one_end = s->used; one < one_end; one++) {
-        s->x[one] += opened[one] * fault_m;
-        for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
-            s->P[one][other] += opened[one] * opened[other] * variance;
-        }
-        for (int32_t fault = 0; fault < faults; fault++) {
-            s->V[one][fault] += shared[fault] * opened[one];
-        }
-        s->V[one][chosen] = REAL(0.0);
+    open_direction(s, variance, faults);
+    for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
+        s->x[state] += opened[state] * fault_m;
+        s->V[state][chosen] = REAL(0.0);
     }
     for (int32_t one = 0; one < faults; one++) {
         s->evidence[one] -= shared[one] * s->evidence[chosen];
@@ -1955,6 +1966,13 @@ INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64
     real innovation = (real)(rx_ticks - tx_ticks - a->offset_ticks) * TICK_M - expected_m;
     real innovation_variance = compute_ph(s) + rx_variance;
     a->range_m = range_m;
+    if (!a->has_rate) {
+        innovation_variance += (variance_factor - REAL(1.0)) * settings->rx_variance_m2;
+        compute_fault_input(s, anchor);
+        find_rate(s, anchor, innovation, innovation_variance, elapsed_s);
+        carry_ticks(s, anchor);
+        return USED;
+    }
     a->innovation = innovation / SQRT(innovation_variance);
     if (status->late_share <= tuning->late_often_share) {  /* late packets are no multipath */
         learn_place(s, anchor, innovation + s->x[where->change + anchor]);
@@ -2027,7 +2045,7 @@ INTERNAL real jump(State *s, int32_t anchor, real innovation, real rx_variance) 
 
 /* Initialise an anchor's clock: the limit of an update of an offset of which nothing was known.
  *
- * All errors of the position and of the range are then in the offset. */
+ * All errors of the position and of the range are then in the offset. Its rate follows (``find_rate``). */
 INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks) {
     EstimatorSettings *settings = &s->settings;
     Layout *where = &s->layout;
@@ -2035,7 +2053,8 @@ INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_
     int32_t offset = where->offset + anchor;
     int32_t noise = where->tx_noise + anchor;
     reset_state(s, noise, settings->tx_variance_m2);
-    reset_state(s, where->rate + anchor, CLOCK_RATE_VARIANCE);
+    reset_state(s, where->rate + anchor, REAL(0.0));
+    a->has_rate = false;
     reset_state(s, offset, REAL(0.0));
     s->terms = 0;
     real range_m = add_direction(s, anchor, REAL(1.0));
@@ -2058,6 +2077,27 @@ INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_
     s->x[offset] = rest_m - range_m - curvature_m - h_dot_x(s, direction_terms(s));
     a->has_tx_noise = true;
     a->range_m = range_m;
+}
+
+/* Initialise the rate of an anchor's clock by the first measurement of its offset after that of its first packet.
+ *
+ * The limit of an update of a rate of which nothing was known: the offset takes all of the innovation. With a variance
+ * of the rate in P instead, what is left of it were the difference of large numbers. P·h of the measurement and its
+ * shares of faults are the first of ``U`` and ``G``. */
+INTERNAL void find_rate(State *s, int32_t anchor, real innovation, real innovation_variance, real elapsed_s) {
+    int32_t offset = s->layout.offset + anchor;
+    int32_t rate = s->layout.rate + anchor;
+    real *opened = s->U[0];
+    update(s, REAL(0.0), innovation_variance, REAL(1.0));
+    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+        opened[state] = -opened[state];
+    }
+    opened[offset] += SQRT(innovation_variance);
+    opened[rate] += SQRT(innovation_variance) / elapsed_s;
+    open_direction(s, REAL(1.0), s->rows);
+    s->x[offset] += innovation;
+    s->x[rate] += innovation / elapsed_s;
+    s->anchors[anchor].has_rate = true;
 }
 
 /* An anchor received another */
@@ -2248,6 +2288,14 @@ INTERNAL void report(State *s, int32_t anchor, int32_t master, int64_t subticks,
         off -= SUBTICK_MASK + 1;
     }
     real innovation = (real)off * (TICK_M / (real)SUBTICKS) - h_dot_x(s, 0);
+    if (!s->anchors[master].has_rate) {
+        real elapsed_s = (real)(status->epoch_ticks - s->anchors[master].rx_ticks) * TICK_S;
+        real innovation_variance = compute_ph(s) + variance_m2;
+        compute_fault_input(s, -1);
+        find_rate(s, master, innovation, innovation_variance, elapsed_s);
+        status->reports_used += 1;
+        return;
+    }
     if (own_variance <= variance_m2) {
         return;
     }
@@ -2559,7 +2607,7 @@ INTERNAL void keep_packet(State *s, int32_t anchor, Packet *packet) {
 INTERNAL void process_relay(State *s, Relay *relayed) {
     int32_t listener = skyless_find_anchor(s, relayed->listener);
     int32_t sender = skyless_find_anchor(s, relayed->anchor);
-    if (listener < 0 || sender < 0 || sender == listener) {
+    if (listener < 0 || sender < 0 || sender == listener || !s->anchors[listener].has_rate) {
         return;
     }
     KeptPacket *kept = &s->packets[sender][floor_mod_32(relayed->sequence, PACKETS_KEPT)];
@@ -2823,13 +2871,18 @@ INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks) {
         first_reception(s, message->anchor, rx_ticks, rx_ticks);
         s->V[where->offset + message->anchor][walls(s)] += message->late_m;
     } else {
-        relax_range_error(s, message->anchor, (real)(rx_ticks - a->rx_ticks) * TICK_S, REAL(0.0));
+        real elapsed_s = (real)(rx_ticks - a->rx_ticks) * TICK_S;
+        relax_range_error(s, message->anchor, elapsed_s, REAL(0.0));
         reset_state(s, where->tx_noise + message->anchor, s->settings.tx_variance_m2 / message->share);
         reception_terms(s, message->anchor, true);
         real variance = compute_ph(s) + s->settings.rx_variance_m2 / message->share;
         compute_fault_input(s, message->anchor);
         s->G[s->waiting][walls(s)] += message->late_m;
-        update(s, REAL(0.0), variance, REAL(1.0));
+        if (a->has_rate) {
+            update(s, REAL(0.0), variance, REAL(1.0));
+        } else {
+            find_rate(s, message->anchor, REAL(0.0), variance, elapsed_s);
+        }
     }
     a->rx_ticks = rx_ticks;
     a->packets += 1;

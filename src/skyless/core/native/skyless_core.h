@@ -43,7 +43,6 @@ typedef double real;
 #define BOUND_SIGMAS REAL(3.0)
 #define CHANGING_RANGE_ERRORS 1
 #define CLOCK_JUMPED 2
-#define CLOCK_RATE_VARIANCE REAL(224688794.68420443)
 #define COLLINEAR REAL(1e-06)
 #define COLLINEAR_ANCHORS 2
 #define COMPLETE_CHANGE REAL(0.001)
@@ -419,6 +418,7 @@ typedef struct Anchor {
     real held_range_m;  /* Distance of that point. */
     real walked_m;  /* The tag's walked distance at its newest packet. */
     bool is_relayed;  /* Whether others relay its packets. */
+    bool has_rate;  /* Whether its clock's rate is known: more than its first packet has shown its offset. */
     bool has_tx_noise;  /* Whether its newest packet's TX noise is a state. */
     int64_t packets;
     real innovation;  /* Its newest one, normalised. */
