@@ -4,7 +4,14 @@ All loops run over the states that are not exact (``State.n``); what stands behi
 """
 
 from skyless.core.constants import TICK_S
-from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, FAULT_KINDS, MOST_WAITING, State, make_uncertain
+from skyless.core.estimator.state import (
+    CHANGING_RANGE_ERRORS,
+    FAULT_KINDS,
+    MOST_WAITING,
+    State,
+    learn_lasting,
+    make_uncertain,
+)
 from skyless.core.native.arithmetic import exp, sqrt, square
 from skyless.core.native.records import Reals, Ticks
 
@@ -220,12 +227,14 @@ def update_later(s: State, innovation: float, innovation_variance: float) -> Non
     """The same for a measurement that shows faults: y ← y + s·ν/S and M ← M + s·sᵀ/S.
 
     P, V and M wait for ``finish_updates``; until then only ``compute_ph`` and ``compute_fault_input`` may read P and V.
+    What is known of lasting faults does not wait.
     """
     g = s.G[s.waiting]
-    _note_update(s, innovation, innovation_variance, 1.0)
     normalised = innovation / sqrt(innovation_variance)
+    _note_update(s, innovation, innovation_variance, 1.0)
     for fault in range(FAULT_KINDS * s.count):
         s.evidence[fault] += g[fault] * normalised
+    learn_lasting(s, g, 1.0, normalised)
 
 
 def _note_update(s: State, innovation: float, innovation_variance: float, gain_scale: float) -> None:

@@ -73,6 +73,8 @@ def _parts(s: State) -> list[NDArray[Any]]:
         view(s.V)[:n, : faults + s.dim],
         view(s.information)[:faults, :faults],
         view(s.evidence)[:faults],
+        view(s.lasting_covariance)[:count, :count],
+        view(s.lasting_m)[:count],
         view(s.anchors)[:count],
         view(s.packets)[:count],
         view(s.links)[:count, :count],

@@ -3,7 +3,6 @@
 from math import erf, erfc, exp, inf, isnan, nan, pi, sqrt
 from typing import Final
 
-from skyless.core.constants import SPEED_OF_LIGHT_MPS
 from skyless.core.integrity import RISK
 from skyless.core.native.records import Record, record
 

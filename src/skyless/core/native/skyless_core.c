@@ -69,8 +69,12 @@ INTERNAL void insert_state(State *s, int32_t index_);
 INTERNAL void remove_state(State *s, int32_t index_);
 INTERNAL void insert_fault(State *s, int32_t index_, int32_t faults);
 INTERNAL void remove_fault(State *s, int32_t index_, int32_t faults);
+INTERNAL void remove_lasting(State *s, int32_t anchor);
 INTERNAL void insert(real *numbers, int32_t index_, int32_t end);
 INTERNAL void remove_(real *numbers, int32_t index_, int32_t end);
+INTERNAL void learn_lasting(State *s, real *m, real weight, real shown);
+INTERNAL void forget_lasting(State *s, int32_t anchor);
+INTERNAL void weigh_zero(State *s, int32_t anchor, real weight);
 INTERNAL void predict(State *s, int64_t rx_ticks);
 INTERNAL bool is_stationary(State *s);
 INTERNAL void advance(State *s, real dt);
@@ -407,6 +411,7 @@ SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *po
     a->tx_ticks = NEVER;
     a->walk_scale = REAL(1.0);
     a->change_variance_m2 = square(settings->place_std_m);
+    s->lasting_covariance[anchor][anchor] = square(s->status.fault_std_m[LASTING]);
     for (int32_t kept = 0; kept < PACKETS_KEPT; kept++) {
         KeptPacket *packet = &s->packets[anchor][kept];
         packet->sequence = -1;
@@ -459,6 +464,7 @@ SKYLESS_EXPORT void skyless_remove_anchor(State *s, int32_t anchor) {
     remove_state(s, where->tx_noise + anchor);
     remove_state(s, where->rate + anchor);
     remove_state(s, where->offset + anchor);
+    remove_lasting(s, anchor);
     for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
         remove_fault(s, (FAULT_KINDS - 1 - kind) * s->count + anchor, FAULT_KINDS * s->count - kind);
     }
@@ -570,6 +576,25 @@ INTERNAL void remove_fault(State *s, int32_t index_, int32_t faults) {
     remove_(s->evidence, index_, faults);
 }
 
+/* The same of what is known of lasting faults, given that this anchor has none. */
+INTERNAL void remove_lasting(State *s, int32_t anchor) {
+    real (*covariance)[32] = s->lasting_covariance;
+    int32_t end = s->count;
+    weigh_zero(s, anchor, REAL(1.0) / ROUNDING_M2);
+    for (int32_t row = anchor; row < end - 1; row++) {
+        for (int32_t other = 0; other < end; other++) {
+            covariance[row][other] = covariance[row + 1][other];
+        }
+    }
+    for (int32_t other = 0; other < end; other++) {
+        covariance[end - 1][other] = REAL(0.0);
+    }
+    for (int32_t row = 0; row < end; row++) {
+        remove_(covariance[row], anchor, end);
+    }
+    remove_(s->lasting_m, anchor, end);
+}
+
 /* Move numbers from an index up to an end one place back. */
 INTERNAL void insert(real *numbers, int32_t index_, int32_t end) {
     for (int32_t place = end; place > index_; place--) {
@@ -584,6 +609,55 @@ INTERNAL void remove_(real *numbers, int32_t index_, int32_t end) {
         numbers[place] = numbers[place + 1];
     }
     numbers[end - 1] = REAL(0.0);
+}
+
+/* What is known of lasting faults */
+
+/* M of the lasting faults gains weight·m·mᵀ, and y weight·m·shown (Sherman and Morrison 1950). */
+INTERNAL void learn_lasting(State *s, real *m, real weight, real shown) {
+    real *c = s->work[1];
+    real variance = REAL(1.0);
+    real innovation = shown;
+    for (int32_t one = 0, one_end = s->count; one < one_end; one++) {
+        real total = REAL(0.0);
+        real *row = s->lasting_covariance[one];
+        for (int32_t other = 0, other_end = s->count; other < other_end; other++) {
+            total += row[other] * m[other];
+        }
+        c[one] = total;
+        variance += weight * m[one] * total;
+        innovation -= m[one] * s->lasting_m[one];
+    }
+    real gain = weight / variance;
+    for (int32_t one = 0, one_end = s->count; one < one_end; one++) {
+        real share = gain * c[one];
+        real *row = s->lasting_covariance[one];
+        s->lasting_m[one] += share * innovation;
+        for (int32_t other = 0, other_end = s->count; other < other_end; other++) {
+            row[other] -= share * c[other];
+        }
+    }
+}
+
+/* The lasting fault of an anchor becomes a state, with its own variance beforehand; another one may follow. */
+INTERNAL void forget_lasting(State *s, int32_t anchor) {
+    real variance = square(s->status.fault_std_m[LASTING]);
+    weigh_zero(s, anchor, REAL(1.0) / square(s->tuning.late_std_m) - REAL(1.0) / variance);
+    for (int32_t other = 0, other_end = s->count; other < other_end; other++) {
+        s->lasting_covariance[other][anchor] = REAL(0.0);
+        s->lasting_covariance[anchor][other] = REAL(0.0);
+    }
+    s->lasting_covariance[anchor][anchor] = variance;
+    s->lasting_m[anchor] = REAL(0.0);
+}
+
+/* It is known with this weight besides that the lasting fault of an anchor is zero. */
+INTERNAL void weigh_zero(State *s, int32_t anchor, real weight) {
+    real *m = s->work[2];
+    for (int32_t one = 0, one_end = s->count; one < one_end; one++) {
+        m[one] = one == anchor ? REAL(1.0) : REAL(0.0);
+    }
+    learn_lasting(s, m, weight, REAL(0.0));
 }
 
 /* The filter itself: time update and scalar measurement update of state, covariance and fault sensitivities.
@@ -859,14 +933,16 @@ INTERNAL void update(State *s, real innovation, real innovation_variance, real g
 
 /* The same for a measurement that shows faults: y ← y + s·ν/S and M ← M + s·sᵀ/S.
  *
- * P, V and M wait for ``finish_updates``; until then only ``compute_ph`` and ``compute_fault_input`` may read P and V. */
+ * P, V and M wait for ``finish_updates``; until then only ``compute_ph`` and ``compute_fault_input`` may read P and V.
+ * What is known of lasting faults does not wait. */
 INTERNAL void update_later(State *s, real innovation, real innovation_variance) {
     real *g = s->G[s->waiting];
-    note_update(s, innovation, innovation_variance, REAL(1.0));
     real normalised = innovation / SQRT(innovation_variance);
+    note_update(s, innovation, innovation_variance, REAL(1.0));
     for (int32_t fault = 0, fault_end = FAULT_KINDS * s->count; fault < fault_end; fault++) {
         s->evidence[fault] += g[fault] * normalised;
     }
+    learn_lasting(s, g, REAL(1.0), normalised);
 }
 
 /* Update x, and make u = P·h/√S and g = s/√S of what stands in ``U`` and ``G``, for P and V. */
@@ -1046,12 +1122,36 @@ INTERNAL void whiten(State *s, int32_t count, int32_t vectors) {
     }
 }
 
-/* The test of all faults of a kind; leaves L⁻¹·y, and L⁻¹·V of that number of axes, in the rows of ``work``.
+/* The test of all faults of a kind; leaves what they do to that number of axes, as factors, in rows of ``work``.
  *
- * L·Lᵀ is M + I/σ_f². */
+ * In row ``count`` f, in those behind it A: A·f is how far the estimate of the faults moves a position. With L·Lᵀ =
+ * M + I/σ_f² these are L⁻¹·y and L⁻¹·V, and A·Aᵀ is the covariance of that; for lasting faults A·Bᵀ, with B behind A. */
 INTERNAL real fault_chi2(State *s, int32_t kind, int32_t axes) {
     int32_t count = s->count;
     int32_t begin = kind * s->count;
+    int32_t first = s->count + 1;
+    real total = REAL(0.0);
+    if (kind == LASTING) {  /* their covariance is known as it is */
+        for (int32_t axis = 0; axis < axes; axis++) {
+            real *a = s->work[first + axis];
+            real *b = s->work[first + AXES + axis];
+            for (int32_t one = 0; one < count; one++) {
+                total = REAL(0.0);
+                real *row = s->lasting_covariance[one];
+                for (int32_t other = 0; other < count; other++) {
+                    total += row[other] * s->V[axis][other];
+                }
+                a[one] = s->V[axis][one];
+                b[one] = total;
+            }
+        }
+        total = REAL(0.0);
+        for (int32_t one = 0; one < count; one++) {
+            s->work[count][one] = s->lasting_m[one];
+            total += s->lasting_m[one] * s->evidence[one];
+        }
+        return total;
+    }
     for (int32_t one = 0; one < count; one++) {
         for (int32_t other = 0; other < one + 1; other++) {
             s->work[one][other] = s->information[begin + one][begin + other];
@@ -1059,11 +1159,10 @@ INTERNAL real fault_chi2(State *s, int32_t kind, int32_t axes) {
         s->work[one][one] += REAL(1.0) / square(s->status.fault_std_m[kind]);
         s->work[count][one] = s->evidence[begin + one];
         for (int32_t axis = 0; axis < axes; axis++) {
-            s->work[count + 1 + axis][one] = s->V[axis][begin + one];
+            s->work[first + axis][one] = s->V[axis][begin + one];
         }
     }
     whiten(s, count, 1 + axes);
-    real total = REAL(0.0);
     for (int32_t one = 0; one < count; one++) {
         total += square(s->work[count][one]);
     }
@@ -1243,6 +1342,11 @@ INTERNAL void open_fault(State *s, int32_t kind, int32_t anchor) {
         shared[one] = gain * s->information[max_32(one, chosen)][min_32(one, chosen)];
     }
     shared[chosen] = REAL(0.0);
+    if (is_lasting) {
+        forget_lasting(s, anchor);
+    } else {
+        learn_lasting(s, shared, -REAL(1.0) / gain, fault_m);
+    }
     open_direction(s, variance, faults);
     for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
         s->x[state] += opened[state] * fault_m;
@@ -1562,6 +1666,10 @@ INTERNAL void protect(State *s) {
         real *x = s->work[s->count + 1];
         real *y = s->work[s->count + 2];
         real *z = s->work[s->count + 3];
+        int32_t first = s->count + 1 + (kind == LASTING ? AXES : 0);
+        real *of_x = s->work[first];
+        real *of_y = s->work[first + 1];
+        real *of_z = s->work[first + 2];
         real shift_x = REAL(0.0);
         real shift_y = REAL(0.0);
         real shift_z = REAL(0.0);
@@ -1572,12 +1680,12 @@ INTERNAL void protect(State *s) {
         for (int32_t one = 0, one_end = s->count; one < one_end; one++) {
             shift_x += x[one] * faults[one];
             shift_y += y[one] * faults[one];
-            xx += x[one] * x[one];
-            xy += x[one] * y[one];
-            yy += y[one] * y[one];
+            xx += x[one] * of_x[one];
+            xy += x[one] * of_y[one];
+            yy += y[one] * of_y[one];
             if (s->dim == 3) {
                 shift_z += z[one] * faults[one];
-                zz += z[one] * z[one];
+                zz += z[one] * of_z[one];
             }
         }
         real largest = REAL(0.5) * (xx + yy) + SQRT(REAL(0.25) * square(xx - yy) + xy * xy);

@@ -117,6 +117,8 @@ typedef double real;
 #define RESTARTED_CLOCK 4
 #define RIVAL_MINIMUM_CHI2 REAL(9.0)
 #define ROOT_2_PI REAL(2.5066282746310002)
+/* What rounding in single precision may make of a variance of lasting faults that is smaller. */
+#define ROUNDING_M2 REAL(1e-07)
 #define SAME_POINT REAL(1e-06)
 #define SINGULAR 5
 /* A pivot below this part of its diagonal element is rounding noise: the matrix is singular. */
@@ -474,6 +476,9 @@ typedef struct State {
     Status status;
     real information[96][96];  /* Information of the innovations on all faults; the lower half. */
     real evidence[96];  /* What innovations show of them. */
+    /* Of the lasting faults: (M + I/σ_f²)⁻¹. Their M grows without end, next to which 1/σ_f² would be lost. */
+    real lasting_covariance[32][32];
+    real lasting_m[32];  /* Their estimate: that times y. */
     Anchor anchors[32];
     KeptPacket packets[32][16];
     Link links[32][32];  /* Of listener and sender. */
@@ -484,7 +489,7 @@ typedef struct State {
     real U[8][264];  /* Of each its u = P·h/√S; then P·h of the measurement at hand. */
     /* Of each, over √S, by how much each fault is in its innovation; then the same of the measurement at hand. */
     real G[8][112];
-    real work[36][32];  /* Scratch for systems of equations of all faults of one kind. */
+    real work[39][32];  /* Scratch for systems of equations of all faults of one kind. */
     real levels[5];
     real fix[10][3];  /* What a fix carries (``POSITION`` and the following). */
 } State;
