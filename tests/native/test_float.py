@@ -18,6 +18,7 @@ from skyless.sim.lab import paper_lab_site
 
 pytestmark = pytest.mark.skipif(not has("gcc"), reason="there is no gcc")
 
+WITH_FLOAT = Path(__file__).with_name("with_float.py")
 ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
 WALKING = {"lab": (LAB_M, 0.0, {}), "room": (ROOM_M, 0.0, ERRORS), "3-D": (ROOM_M, None, ERRORS)}
 SLOW = Case(qa=0.02)
@@ -51,7 +52,7 @@ def found():
 def both(tmp_path_factory):
     """Results for ``double`` and for ``float``, the latter of a process of its own."""
     file = tmp_path_factory.mktemp("float") / "found.npz"
-    subprocess.run([sys.executable, Path(__file__).with_name("with_float.py"), __file__, file], check=True)
+    subprocess.run([sys.executable, WITH_FLOAT, __file__, file], check=True)
     return found(), np.load(file)
 
 
@@ -71,6 +72,17 @@ def test_levels_are_the_same(both, name):
 def test_a_receiver_starts_at_the_same_place(both):
     double, single = (one["from power-on"] for one in both)
     np.testing.assert_allclose(single, double, atol=1e-3)
+
+
+def test_damaged_packets_leave_numbers():
+    """What 64 bits hold may be no number in 32."""
+    command = [WITH_FLOAT, Path(__file__).with_name("test_damaged_packets.py"), "20000", "1"]
+    output = subprocess.run([sys.executable, *command], capture_output=True, text=True, check=True).stdout
+    for line in output.splitlines():
+        damaged, accepted, not_finite = map(int, line.split())
+        assert damaged > 5_000
+        assert accepted > 300
+        assert not_finite == 0
 
 
 @pytest.mark.skipif(not has("arm-none-eabi-gcc"), reason="there is no compiler for it")

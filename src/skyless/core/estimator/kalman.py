@@ -3,6 +3,8 @@
 All loops run over the states that are not exact (``State.n``); what stands behind them stays as it is.
 """
 
+from typing import Final
+
 from skyless.core.constants import TICK_S
 from skyless.core.estimator.state import (
     CHANGING_RANGE_ERRORS,
@@ -15,6 +17,9 @@ from skyless.core.estimator.state import (
 from skyless.core.native.arithmetic import exp, sqrt, square
 from skyless.core.native.records import Reals, Ticks
 
+LONGEST_S: Final = 1000.0
+"""The longest time update: of more, squares of variances are no numbers in single precision."""
+
 # Time update
 
 
@@ -24,7 +29,7 @@ def predict(s: State, rx_ticks: Ticks) -> None:
     The tag's oscillator is in all offsets, so its noise is common to them.
     """
     status, settings, where = s.status, s.settings, s.layout
-    dt = (rx_ticks - status.epoch_ticks) * TICK_S
+    dt = min((rx_ticks - status.epoch_ticks) * TICK_S, LONGEST_S)
     speed_squared = 0.0
     for axis in range(s.dim):
         speed_squared += square(s.x[where.velocity + axis])

@@ -45,6 +45,9 @@ from skyless.core.ticks import TICK_MASK
 
 SUBTICK_MASK: Final = SUBTICKS * (TICK_MASK + 1) - 1
 
+SHORTEST_S: Final = 50e-6
+"""Time between two packets of an anchor at least: a frame takes longer."""
+
 UNUSED, USED, CLOCK_JUMPED = range(3)
 """What became of a reception; after a jump of its clock the anchor has to join again."""
 
@@ -457,8 +460,9 @@ def report(s: State, anchor: int, master: int, subticks: Ticks, variance_m2: flo
         elapsed_s = (status.epoch_ticks - s.anchors[master].rx_ticks) * TICK_S
         innovation_variance = compute_ph(s) + variance_m2
         compute_fault_input(s, -1)
-        find_rate(s, master, innovation, innovation_variance, elapsed_s)
-        status.reports_used += 1
+        if elapsed_s > SHORTEST_S:
+            find_rate(s, master, innovation, innovation_variance, elapsed_s)
+            status.reports_used += 1
         return
     if own_variance <= variance_m2:
         return

@@ -8,6 +8,7 @@ from skyless.core.estimator.kalman import finish_updates, is_stationary, predict
 from skyless.core.estimator.levels import fit_plane, integrity_state, largest_test, protect
 from skyless.core.estimator.measurements import (
     CLOCK_JUMPED,
+    SHORTEST_S,
     USED,
     difference,
     first_reception,
@@ -199,7 +200,7 @@ def _admit(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> int:
     a, status = s.anchors[anchor], s.status
     if a.packets == 0:
         return JOINED
-    if tx_ticks == a.tx_ticks:
+    if tx_ticks == a.tx_ticks or (rx_ticks - a.rx_ticks) * TICK_S < SHORTEST_S:
         status.impossible += 1
         return REJECTED
     if _is_impossible(s, anchor, rx_ticks, tx_ticks):

@@ -674,7 +674,7 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
     Status *status = &s->status;
     EstimatorSettings *settings = &s->settings;
     Layout *where = &s->layout;
-    real dt = (real)(rx_ticks - status->epoch_ticks) * TICK_S;
+    real dt = min_real((real)(rx_ticks - status->epoch_ticks) * TICK_S, LONGEST_S);
     real speed_squared = REAL(0.0);
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
         speed_squared += square(s->x[where->velocity + axis]);
@@ -2400,8 +2400,10 @@ INTERNAL void report(State *s, int32_t anchor, int32_t master, int64_t subticks,
         real elapsed_s = (real)(status->epoch_ticks - s->anchors[master].rx_ticks) * TICK_S;
         real innovation_variance = compute_ph(s) + variance_m2;
         compute_fault_input(s, -1);
-        find_rate(s, master, innovation, innovation_variance, elapsed_s);
-        status->reports_used += 1;
+        if (elapsed_s > SHORTEST_S) {
+            find_rate(s, master, innovation, innovation_variance, elapsed_s);
+            status->reports_used += 1;
+        }
         return;
     }
     if (own_variance <= variance_m2) {
@@ -2674,7 +2676,7 @@ INTERNAL int32_t admit(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ti
     if (a->packets == 0) {
         return JOINED;
     }
-    if (tx_ticks == a->tx_ticks) {
+    if (tx_ticks == a->tx_ticks || (real)(rx_ticks - a->rx_ticks) * TICK_S < SHORTEST_S) {
         status->impossible += 1;
         return REJECTED;
     }

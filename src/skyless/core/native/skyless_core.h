@@ -79,6 +79,8 @@ typedef double real;
 /* The leading bits of ln 2: products with small whole numbers are exact. */
 #define LN_2_HIGH REAL(0.6931471803691238)
 #define LN_2_LOW REAL(1.9082149292705877e-10)
+/* The longest time update: of more, squares of variances are no numbers in single precision. */
+#define LONGEST_S REAL(1000.0)
 /* Its exponential counts as 0. */
 #define LOWEST REAL(-700.0)
 #define MAX_ANCHORS 32
@@ -120,6 +122,7 @@ typedef double real;
 /* What rounding in single precision may make of a variance of lasting faults that is smaller. */
 #define ROUNDING_M2 REAL(1e-07)
 #define SAME_POINT REAL(1e-06)
+#define SHORTEST_S REAL(5e-05)
 #define SINGULAR 5
 /* A pivot below this part of its diagonal element is rounding noise: the matrix is singular. */
 #define SINGULAR_PIVOT REAL(1e-12)
