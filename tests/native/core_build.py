@@ -10,6 +10,7 @@ import numpy as np
 from skyless.core.estimator.process import BatchPacket, BatchRow, Place, Relay
 from skyless.core.estimator.state import State
 from skyless.core.native import library
+from skyless.core.native.records import c_type
 
 NATIVE = Path(library.__file__).parent
 EXACT = ("-std=c99", "-ffp-contract=off", "-fno-math-errno")
@@ -99,5 +100,6 @@ def damaged_program(folder, name):
     """A program beside this file, which ends at an access out of bounds, an overflow and the like."""
     made, sources = folder / name, [NATIVE / "skyless_core.c", Path(__file__).with_name(f"{name}.c")]
     checks = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-    subprocess.run(["gcc", *EXACT, *checks, f"-I{NATIVE}", *sources, "-o", made], check=True)
+    real = ["-DSKYLESS_FLOAT"] if c_type(float) is ctypes.c_float else []
+    subprocess.run(["gcc", *EXACT, *real, *checks, f"-I{NATIVE}", *sources, "-o", made], check=True)
     return made

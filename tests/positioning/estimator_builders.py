@@ -49,19 +49,19 @@ class Episode(Struct, frozen=True):
     """The tag's place at each packet, shape (n, 3)."""
 
 
-def episode_of(case=MESH, superframes=40, seed=1, anchors_m=LAB_M, rate_of=None, path_m=None):
+def episode_of(case=MESH, superframes=40, seed=1, anchors_m=LAB_M, rate_of=None, path_m=None, slot_s=SLOT_S):
     """``rate_of``: what the tag's clock does besides, m/s at times; ``path_m``: the way, at random if None."""
     draw, n = np.random.default_rng(seed), len(anchors_m)
     frames = superframes * n
     low, high = anchors_m[:, :2].min(axis=0), anchors_m[:, :2].max(axis=0)
-    drawn_m = random_path(draw, (low + high) / 2.0, (high - low) / 4.0, SLOT_S, frames, case.qa)
+    drawn_m = random_path(draw, (low + high) / 2.0, (high - low) / 4.0, slot_s, frames, case.qa)
     path_m = drawn_m if path_m is None else path_m
-    senders, time_s = np.arange(frames) % n, np.arange(frames) * SLOT_S
-    offsets, rates = clocks(draw, frames, n + 1, case.random_walk_fm)
+    senders, time_s = np.arange(frames) % n, np.arange(frames) * slot_s
+    offsets, rates = clocks(draw, frames, n + 1, case.random_walk_fm, slot_s)
     if rate_of is not None:
         extra = rate_of(time_s)
         rates[:, n] += extra
-        offsets[:, n] += np.concatenate([[0.0], np.cumsum(0.5 * (extra[1:] + extra[:-1]) * SLOT_S)])
+        offsets[:, n] += np.concatenate([[0.0], np.cumsum(0.5 * (extra[1:] + extra[:-1]) * slot_s)])
     noise_m = case.noise_ps * 1e-12 * SPEED_OF_LIGHT_MPS
     ideal = time_s * SPEED_OF_LIGHT_MPS + offsets[np.arange(frames), senders]
     tx_ticks = ticks(ideal)
@@ -80,18 +80,18 @@ def ticks(metres):
     return np.rint(metres / TICK_M).astype(np.int64)
 
 
-def clocks(draw, frames, count, random_walk_fm):
+def clocks(draw, frames, count, random_walk_fm, slot_s=SLOT_S):
     """Offsets in metres and rates in m/s at every frame, shape (frames, count)."""
     light = SPEED_OF_LIGHT_MPS
     kicks = draw.normal(size=(2, frames - 1, count))
-    walks = kicks[0] * (random_walk_fm * light * np.sqrt(SLOT_S))
-    own = kicks[1] * (light * np.sqrt(SLOT_S * (WHITE_FM**2 + random_walk_fm**2 * SLOT_S**2 / 12.0)))
+    walks = kicks[0] * (random_walk_fm * light * np.sqrt(slot_s))
+    own = kicks[1] * (light * np.sqrt(slot_s * (WHITE_FM**2 + random_walk_fm**2 * slot_s**2 / 12.0)))
     rates = np.empty((frames, count))
     rates[0] = draw.uniform(-10.0, 10.0, count) * (1e-6 * light)
     rates[1:] = rates[0] + np.cumsum(walks, axis=0)
     offsets = np.empty((frames, count))
     offsets[0] = draw.uniform(0.0, 1e6, count)
-    offsets[1:] = offsets[0] + np.cumsum(rates[:-1] * SLOT_S + walks * (SLOT_S / 2.0) + own, axis=0)
+    offsets[1:] = offsets[0] + np.cumsum(rates[:-1] * slot_s + walks * (slot_s / 2.0) + own, axis=0)
     return offsets, rates
 
 
@@ -214,6 +214,8 @@ def seen(state):
         V=view(state.V)[:n, : faults + state.dim].T,
         information=view(state.information)[:faults, :faults],
         evidence=view(state.evidence)[:faults],
+        lasting_covariance=view(state.lasting_covariance)[:count, :count],
+        lasting_m=view(state.lasting_m)[:count],
         anchors=view(state.anchors)[:count],
         packets=view(state.packets)[:count],
         links=view(state.links)[:count, :count],

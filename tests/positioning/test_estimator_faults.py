@@ -164,6 +164,44 @@ def test_how_much_one_or_two_faults_explain():
             assert explained_chi2(state, one, other) == pytest.approx(y @ np.linalg.solve(M[np.ix_(both, both)], y))
 
 
+def lasting(s):
+    """Covariance and estimate of the lasting faults as their information and evidence have them."""
+    n = len(s.anchors)
+    lower = np.tril(s.information[:n, :n])
+    std_m = s.status["fault_std_m"][LASTING]
+    covariance = np.linalg.inv(lower + np.tril(lower, -1).T + np.eye(n) / std_m**2)
+    return covariance, covariance @ s.evidence[:n]
+
+
+def agree(s, rtol=1e-6):
+    """What is known of lasting faults, against their information and evidence."""
+    covariance, lasting_m = lasting(s)
+    scale = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose((s.lasting_covariance - covariance) / np.outer(scale, scale), 0.0, atol=rtol)
+    np.testing.assert_allclose(s.lasting_m, lasting_m, rtol=rtol, atol=rtol * scale.max())
+
+
+def test_lasting_faults_are_known_as_their_information_has_it():
+    """While anchors join, fall silent, come again, and have faults that are opened."""
+    episode = episode_of(MESH, 300, 4, ROOM_M)
+    frames = np.arange(len(episode.packets.anchors))
+    packets = late_from(episode.packets, 1, 0.6)
+    packets = late_from(packets, 5, 0.3, begin=1600)
+    silent = (packets.anchors == 3) & (frames > 400) & (frames < 1200)
+    packets = kept(packets, ~silent & ((packets.anchors != 6) | (frames > 100)))
+    estimator = begun(episode, settings_of(MESH, drop_s=0.5, **ROOM_ERRORS), ROOM_M, std_m=0.1)
+    counts = set()
+    for packet in one_by_one(packets):
+        estimator.process(*packet)
+        counts.add(estimator.state.count)
+        agree(seen(estimator.state), 1e-4)
+    status = seen(estimator.state).status
+    assert counts == set(range(1, 9))
+    assert len(estimator.anchors) == 8
+    assert estimator.anchors[-1] == 3
+    assert status["faults_opened"] > 0
+
+
 # Opening
 
 
@@ -211,6 +249,7 @@ def test_other_faults_are_conditioned_on_one_that_is_opened(kind):
     root = draw.normal(size=(18, 40))
     whole, y = root @ root.T, draw.normal(size=18)
     s.information[:], s.evidence[:] = whole, y
+    s.lasting_covariance[:], s.lasting_m[:] = lasting(s)
     faults._open_fault(state, kind, anchor)
     chosen = 6 * kind + anchor
     others = np.delete(np.arange(18), chosen)
@@ -220,6 +259,7 @@ def test_other_faults_are_conditioned_on_one_that_is_opened(kind):
     np.testing.assert_allclose(s.evidence[others], y[others] - share * y[chosen], rtol=1e-9)
     assert not s.information[chosen, :chosen].any()
     assert not s.information[chosen:, chosen].any()
+    agree(s)
     assert np.array_equal(s.P, s.P.T)
 
 
@@ -337,7 +377,9 @@ def test_too_few_anchors_single_nobody_out():
     packets = kept(episode.packets, episode.packets.anchors < 4)
     estimator = begun(episode, settings_of(MESH))
     estimator.track(packets)
-    seen(estimator.state).evidence[:4] = [1e4, 0.0, 0.0, 0.0]
+    s = seen(estimator.state)
+    s.evidence[:4] = [1e4, 0.0, 0.0, 0.0]
+    s.lasting_m[:] = lasting(s)[1]
     assert fault_chi2(estimator.state, LASTING, 0) > 10.0 * TUNING.sure_chi2
     open_faults(estimator.state)
     assert seen(estimator.state).status["faults_opened"] == 0
@@ -357,6 +399,7 @@ def test_levels_are_the_ellipse_and_the_shift_of_all_faults():
     estimator.track(episode.packets)
     s, n, k = seen(estimator.state), len(ROOM_M), limits_of(RISK)
     s.evidence[:] = np.random.default_rng(3).normal(0.0, 10.0, s.evidence.shape)
+    s.lasting_m[:] = lasting(s)[1]
     protect(estimator.state)
     levels = view(estimator.state.levels)
     hpl, vpl = [], []

@@ -79,11 +79,8 @@ def test_a_textbook_filter_says_the_same(case, anchors_m, height_m, height_std_m
         estimator.process(*packet)
         textbook.update(packet, status["q_scale"], status["walk_scale"], scales)
         s, n = seen(estimator.state), estimator.state.count
-        np.testing.assert_allclose(s.x[:dim], textbook.x[textbook.p], rtol=0.0, atol=1e-6)
-        if n == len(anchors_m):
-            tolerance = (
-                1e-5 if s.anchors["packets"].min() > 1 else 1e-3
-            )  # rates are known to 15 km/s before, which rounding recalls
+        np.testing.assert_allclose(s.x[:dim], textbook.x[textbook.p], rtol=0.0, atol=1e-5)
+        if n == len(anchors_m) and s.anchors["has_rate"].all():
             size = where(estimator).end
             assert not s.P[size:].any()
             assert not s.x[size:].any()
@@ -94,8 +91,9 @@ def test_a_textbook_filter_says_the_same(case, anchors_m, height_m, height_std_m
             apart = np.setdiff1d(used, textbook.b)  # whole ticks of offsets stand elsewhere
             scale = np.sqrt(np.maximum(np.diag(textbook.P), 1e-9))
             off = ((s.P[np.ix_(kept, kept)] - textbook.P) / np.outer(scale, scale))[np.ix_(used, used)]
-            np.testing.assert_allclose(off, 0.0, atol=tolerance)
-            np.testing.assert_allclose((s.x[kept] - textbook.x)[apart] / scale[apart], 0.0, atol=10 * tolerance)
+            np.testing.assert_allclose(off, 0.0, atol=1e-5)
+            # Relays of a first packet are carried back by some 10 ns without the rate: some 10 µm.
+            np.testing.assert_allclose((s.x[kept] - textbook.x)[apart] / scale[apart], 0.0, atol=1e-3)
         assert np.array_equal(s.P, s.P.T)
     status = s.status
     assert status["obstructions"] == status["rejected"] == status["faults_opened"] == 0

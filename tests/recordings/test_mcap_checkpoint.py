@@ -143,7 +143,7 @@ def with_record(made, change):
         (["only_site"], "1"),
         (["admitted"], "x"),
         (["admitted"], with_record(Admission, lambda one: setattr(one.neighbours, "count", 1 << 20))),
-        (["admitted"], with_record(Admission, lambda one: setattr(one.neighbours, "row", -1))),
+        (["admitted"], with_record(Admission, lambda one: setattr(one.neighbours, "row", 256))),
         (["admitted"], with_record(Admission, lambda one: setattr(one.choice, "count", 9))),
         (["admitted"], with_record(Admission, lambda one: setattr(one.choice, "failed_count", -1))),
         (["admitted"], with_record(Admission, lambda one: setattr(one.choice.sites[2], "count", 33))),

@@ -15,15 +15,18 @@ the filter would have, had that error been open from the beginning.
 from typing import Final
 
 from skyless.core.constants import TICK_S
-from skyless.core.estimator.kalman import reset_state
+from skyless.core.estimator.kalman import open_direction, reset_state
 from skyless.core.estimator.state import (
     ALL_RANGE_ERRORS,
+    AXES,
     CHANGING_RANGE_ERRORS,
     CREEPING,
     FAULT_KINDS,
     LASTING,
     RECENT,
     State,
+    forget_lasting,
+    learn_lasting,
     make_uncertain,
 )
 from skyless.core.native.arithmetic import exp, sqrt, square
@@ -83,20 +86,34 @@ def whiten(s: State, count: int, vectors: int) -> None:
 
 
 def fault_chi2(s: State, kind: int, axes: int) -> float:
-    """The test of all faults of a kind; leaves L⁻¹·y, and L⁻¹·V of that number of axes, in the rows of ``work``.
+    """The test of all faults of a kind; leaves what they do to that number of axes, as factors, in rows of ``work``.
 
-    L·Lᵀ is M + I/σ_f².
+    In row ``count`` f, in those behind it A: A·f is how far the estimate of the faults moves a position. With L·Lᵀ =
+    M + I/σ_f² these are L⁻¹·y and L⁻¹·V, and A·Aᵀ is the covariance of that; for lasting faults A·Bᵀ, with B behind A.
     """
-    count, begin = s.count, kind * s.count
+    count, begin, first, total = s.count, kind * s.count, s.count + 1, 0.0
+    if kind == LASTING:  # their covariance is known as it is
+        for axis in range(axes):
+            a, b = s.work[first + axis], s.work[first + AXES + axis]
+            for one in range(count):
+                total, row = 0.0, s.lasting_covariance[one]
+                for other in range(count):
+                    total += row[other] * s.V[axis][other]
+                a[one] = s.V[axis][one]
+                b[one] = total
+        total = 0.0
+        for one in range(count):
+            s.work[count][one] = s.lasting_m[one]
+            total += s.lasting_m[one] * s.evidence[one]
+        return total
     for one in range(count):
         for other in range(one + 1):
             s.work[one][other] = s.information[begin + one][begin + other]
         s.work[one][one] += 1.0 / square(s.status.fault_std_m[kind])
         s.work[count][one] = s.evidence[begin + one]
         for axis in range(axes):
-            s.work[count + 1 + axis][one] = s.V[axis][begin + one]
+            s.work[first + axis][one] = s.V[axis][begin + one]
     whiten(s, count, 1 + axes)
-    total = 0.0
     for one in range(count):
         total += square(s.work[count][one])
     return total
@@ -236,13 +253,14 @@ def _open_fault(s: State, kind: int, anchor: int) -> None:
     for one in range(faults):
         shared[one] = gain * s.information[max(one, chosen)][min(one, chosen)]
     shared[chosen] = 0.0
-    for one in range(s.used):
-        s.x[one] += opened[one] * fault_m
-        for other in range(s.n):
-            s.P[one][other] += opened[one] * opened[other] * variance
-        for fault in range(faults):
-            s.V[one][fault] += shared[fault] * opened[one]
-        s.V[one][chosen] = 0.0
+    if is_lasting:
+        forget_lasting(s, anchor)
+    else:
+        learn_lasting(s, shared, -1.0 / gain, fault_m)
+    open_direction(s, variance, faults)
+    for state in range(s.used):
+        s.x[state] += opened[state] * fault_m
+        s.V[state][chosen] = 0.0
     for one in range(faults):
         s.evidence[one] -= shared[one] * s.evidence[chosen]
         for other in range(one + 1):

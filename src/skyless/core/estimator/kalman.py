@@ -3,10 +3,22 @@
 All loops run over the states that are not exact (``State.n``); what stands behind them stays as it is.
 """
 
+from typing import Final
+
 from skyless.core.constants import TICK_S
-from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, FAULT_KINDS, MOST_WAITING, State, make_uncertain
+from skyless.core.estimator.state import (
+    CHANGING_RANGE_ERRORS,
+    FAULT_KINDS,
+    MOST_WAITING,
+    State,
+    learn_lasting,
+    make_uncertain,
+)
 from skyless.core.native.arithmetic import exp, sqrt, square
 from skyless.core.native.records import Reals, Ticks
+
+LONGEST_S: Final = 1000.0
+"""The longest time update: of more, squares of variances are no numbers in single precision."""
 
 # Time update
 
@@ -17,7 +29,7 @@ def predict(s: State, rx_ticks: Ticks) -> None:
     The tag's oscillator is in all offsets, so its noise is common to them.
     """
     status, settings, where = s.status, s.settings, s.layout
-    dt = (rx_ticks - status.epoch_ticks) * TICK_S
+    dt = min((rx_ticks - status.epoch_ticks) * TICK_S, LONGEST_S)
     speed_squared = 0.0
     for axis in range(s.dim):
         speed_squared += square(s.x[where.velocity + axis])
@@ -147,6 +159,16 @@ def reset_state(s: State, state: int, variance: float) -> None:
         s.V[state][fault] = 0.0
 
 
+def open_direction(s: State, variance: float, faults: int) -> None:
+    """Let what was taken for known err along the first of ``U``, which holds so much of each fault as ``G`` says."""
+    opened, shared = s.U[0], s.G[0]
+    for one in range(s.used):
+        for other in range(s.n):
+            s.P[one][other] += opened[one] * opened[other] * variance
+        for fault in range(faults):
+            s.V[one][fault] += shared[fault] * opened[one]
+
+
 # Measurement update
 
 
@@ -210,12 +232,14 @@ def update_later(s: State, innovation: float, innovation_variance: float) -> Non
     """The same for a measurement that shows faults: y ← y + s·ν/S and M ← M + s·sᵀ/S.
 
     P, V and M wait for ``finish_updates``; until then only ``compute_ph`` and ``compute_fault_input`` may read P and V.
+    What is known of lasting faults does not wait.
     """
     g = s.G[s.waiting]
-    _note_update(s, innovation, innovation_variance, 1.0)
     normalised = innovation / sqrt(innovation_variance)
+    _note_update(s, innovation, innovation_variance, 1.0)
     for fault in range(FAULT_KINDS * s.count):
         s.evidence[fault] += g[fault] * normalised
+    learn_lasting(s, g, 1.0, normalised)
 
 
 def _note_update(s: State, innovation: float, innovation_variance: float, gain_scale: float) -> None:

@@ -34,17 +34,19 @@ def protect(s: State) -> None:
     for kind in range(FAULT_KINDS):
         levels[FIRST_TEST + kind] = fault_chi2(s, kind, s.dim)
         faults, x, y, z = s.work[s.count], s.work[s.count + 1], s.work[s.count + 2], s.work[s.count + 3]
+        first = s.count + 1 + (AXES if kind == LASTING else 0)
+        of_x, of_y, of_z = s.work[first], s.work[first + 1], s.work[first + 2]
         shift_x, shift_y, shift_z = 0.0, 0.0, 0.0
         xx, xy, yy, zz = scale * s.P[0][0], scale * s.P[0][1], scale * s.P[1][1], 0.0
         for one in range(s.count):
             shift_x += x[one] * faults[one]
             shift_y += y[one] * faults[one]
-            xx += x[one] * x[one]
-            xy += x[one] * y[one]
-            yy += y[one] * y[one]
+            xx += x[one] * of_x[one]
+            xy += x[one] * of_y[one]
+            yy += y[one] * of_y[one]
             if s.dim == 3:
                 shift_z += z[one] * faults[one]
-                zz += z[one] * z[one]
+                zz += z[one] * of_z[one]
         largest = 0.5 * (xx + yy) + sqrt(0.25 * square(xx - yy) + xy * xy)
         levels[HPL] = max(levels[HPL], hypot(shift_x, shift_y) + s.horizontal_k * sqrt(largest))
         if s.dim == 3:

@@ -19,6 +19,7 @@ from skyless.core.estimator.kalman import (
     compute_ph,
     finish_updates,
     jump_share,
+    open_direction,
     relax_range_error,
     reset_state,
     update,
@@ -37,13 +38,15 @@ from skyless.core.estimator.monitor import (
     open_range_error,
     variance_scale,
 )
-from skyless.core.estimator.settings import CLOCK_RATE_VARIANCE
 from skyless.core.estimator.state import ALL_RANGE_ERRORS, AXES, NO_RANGE_ERRORS, Link, State, make_uncertain
 from skyless.core.native.arithmetic import floor, sqrt, square
 from skyless.core.native.records import Ticks
 from skyless.core.ticks import TICK_MASK
 
 SUBTICK_MASK: Final = SUBTICKS * (TICK_MASK + 1) - 1
+
+SHORTEST_S: Final = 50e-6
+"""Time between two packets of an anchor at least: a frame takes longer."""
 
 UNUSED, USED, CLOCK_JUMPED = range(3)
 """What became of a reception; after a jump of its clock the anchor has to join again."""
@@ -176,6 +179,12 @@ def own_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, varia
     innovation = (rx_ticks - tx_ticks - a.offset_ticks) * TICK_M - expected_m
     innovation_variance = compute_ph(s) + rx_variance
     a.range_m = range_m
+    if not a.has_rate:
+        innovation_variance += (variance_factor - 1.0) * settings.rx_variance_m2
+        compute_fault_input(s, anchor)
+        find_rate(s, anchor, innovation, innovation_variance, elapsed_s)
+        _carry_ticks(s, anchor)
+        return USED
     a.innovation = innovation / sqrt(innovation_variance)
     if status.late_share <= tuning.late_often_share:  # late packets are no multipath
         learn_place(s, anchor, innovation + s.x[where.change + anchor])
@@ -240,12 +249,13 @@ def _jump(s: State, anchor: int, innovation: float, rx_variance: float) -> float
 def first_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> None:
     """Initialise an anchor's clock: the limit of an update of an offset of which nothing was known.
 
-    All errors of the position and of the range are then in the offset.
+    All errors of the position and of the range are then in the offset. Its rate follows (``find_rate``).
     """
     settings, where, a = s.settings, s.layout, s.anchors[anchor]
     offset, noise = where.offset + anchor, where.tx_noise + anchor
     reset_state(s, noise, settings.tx_variance_m2)
-    reset_state(s, where.rate + anchor, CLOCK_RATE_VARIANCE)
+    reset_state(s, where.rate + anchor, 0.0)
+    a.has_rate = False
     reset_state(s, offset, 0.0)
     s.terms = 0
     range_m = _add_direction(s, anchor, 1.0)
@@ -266,6 +276,25 @@ def first_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> 
     s.x[offset] = rest_m - range_m - curvature_m - _h_dot_x(s, _direction_terms(s))
     a.has_tx_noise = True
     a.range_m = range_m
+
+
+def find_rate(s: State, anchor: int, innovation: float, innovation_variance: float, elapsed_s: float) -> None:
+    """Initialise the rate of an anchor's clock by the first measurement of its offset after that of its first packet.
+
+    The limit of an update of a rate of which nothing was known: the offset takes all of the innovation. With a variance
+    of the rate in P instead, what is left of it were the difference of large numbers. P·h of the measurement and its
+    shares of faults are the first of ``U`` and ``G``.
+    """
+    offset, rate, opened = s.layout.offset + anchor, s.layout.rate + anchor, s.U[0]
+    update(s, 0.0, innovation_variance)
+    for state in range(s.n):
+        opened[state] = -opened[state]
+    opened[offset] += sqrt(innovation_variance)
+    opened[rate] += sqrt(innovation_variance) / elapsed_s
+    open_direction(s, 1.0, s.rows)
+    s.x[offset] += innovation
+    s.x[rate] += innovation / elapsed_s
+    s.anchors[anchor].has_rate = True
 
 
 # An anchor received another
@@ -427,6 +456,14 @@ def report(s: State, anchor: int, master: int, subticks: Ticks, variance_m2: flo
     if off > SUBTICK_MASK // 2:
         off -= SUBTICK_MASK + 1
     innovation = off * (TICK_M / SUBTICKS) - _h_dot_x(s, 0)
+    if not s.anchors[master].has_rate:
+        elapsed_s = (status.epoch_ticks - s.anchors[master].rx_ticks) * TICK_S
+        innovation_variance = compute_ph(s) + variance_m2
+        compute_fault_input(s, -1)
+        if elapsed_s > SHORTEST_S:
+            find_rate(s, master, innovation, innovation_variance, elapsed_s)
+            status.reports_used += 1
+        return
     if own_variance <= variance_m2:
         return
     if innovation * innovation > square(s.settings.gate) * (own_variance + variance_m2):

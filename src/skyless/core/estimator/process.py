@@ -10,6 +10,7 @@ from skyless.core.estimator.kalman import finish_updates, is_stationary, predict
 from skyless.core.estimator.levels import fit_plane, integrity_state, largest_test, protect
 from skyless.core.estimator.measurements import (
     CLOCK_JUMPED,
+    SHORTEST_S,
     USED,
     difference,
     first_reception,
@@ -200,7 +201,7 @@ def _admit(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> int:
     a, status = s.anchors[anchor], s.status
     if a.packets == 0:
         return JOINED
-    if tx_ticks == a.tx_ticks:
+    if tx_ticks == a.tx_ticks or (rx_ticks - a.rx_ticks) * TICK_S < SHORTEST_S:
         status.impossible += 1
         return REJECTED
     if _is_impossible(s, anchor, rx_ticks, tx_ticks):
@@ -236,7 +237,7 @@ def _keep_packet(s: State, anchor: int, packet: Packet) -> None:
 def _process_relay(s: State, relayed: Relay) -> None:
     """Process a relayed reception once, if the tag has received that very packet."""
     listener, sender = find_anchor(s, relayed.listener), find_anchor(s, relayed.anchor)
-    if listener < 0 or sender < 0 or sender == listener:
+    if listener < 0 or sender < 0 or sender == listener or not s.anchors[listener].has_rate:
         return
     kept, link = s.packets[sender][relayed.sequence % PACKETS_KEPT], s.links[listener][sender]
     is_young = (s.status.epoch_ticks - kept.rx_ticks) * TICK_S < s.settings.relay_age_s

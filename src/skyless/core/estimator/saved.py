@@ -19,7 +19,7 @@ from skyless.core.estimator.state import (
 from skyless.core.native.sizes import MAX_ANCHORS
 from skyless.core.native.views import view
 
-VERSION: Final = 1
+VERSION: Final = 2
 """Changes with the fields of ``State`` and of the records in it."""
 _HEAD: Final = Format("<HBB")
 """Version, dimensions, anchors."""
@@ -75,6 +75,8 @@ def _parts(s: State) -> list[NDArray[Any]]:
         view(s.V)[:n, : faults + s.dim],
         view(s.information)[:faults, :faults],
         view(s.evidence)[:faults],
+        view(s.lasting_covariance)[:count, :count],
+        view(s.lasting_m)[:count],
         view(s.anchors)[:count],
         view(s.packets)[:count],
         view(s.links)[:count, :count],

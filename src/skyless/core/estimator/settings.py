@@ -3,7 +3,6 @@
 from math import erf, erfc, exp, inf, isnan, nan, pi, sqrt
 from typing import Final
 
-from skyless.core.constants import SPEED_OF_LIGHT_MPS
 from skyless.core.integrity import RISK
 from skyless.core.native.records import Record, record
 
@@ -265,7 +264,6 @@ TUNING: Final = Tuning()
 
 
 MAX_CLOCK_RATE: Final = 50e-6  # two crystals of ±20 ppm, and margin
-CLOCK_RATE_VARIANCE: Final = (MAX_CLOCK_RATE * SPEED_OF_LIGHT_MPS) ** 2  # m²/s²
 # Standard deviation of the constant error of the range between two anchors, without that of their survey.
 PAIR_STD_M: Final = 0.02
 

@@ -42,6 +42,9 @@ MOST_WAITING: Final = 8
 MOST_TERMS: Final = 2 * (AXES + 3) + 8
 """Most terms of a measurement: a difference of two distances has the most."""
 
+ROUNDING_M2: Final = 1e-7
+"""What rounding in single precision may make of a variance of lasting faults that is smaller."""
+
 LASTING, RECENT, CREEPING = range(3)
 """Kinds of faults: there since an anchor joined, begun within its last packets, or growing for seconds."""
 FAULT_KINDS: Final = 3
@@ -50,7 +53,7 @@ EXTRA_ROWS: Final = 1 + 4 * AXES
 """Columns of V for what planning adds."""
 SENSITIVITIES: Final = FAULTS + AXES + EXTRA_ROWS
 """Capacity for columns of V."""
-WORK_ROWS: Final = MAX_ANCHORS + 1 + AXES
+WORK_ROWS: Final = MAX_ANCHORS + 1 + 2 * AXES
 
 NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS, ALL_RANGE_ERRORS = range(3)
 """Which range errors are not known to be zero: none, those that change, or all of them, and surveys."""
@@ -81,6 +84,8 @@ class Anchor(Record):
     """The tag's walked distance at its newest packet."""
     is_relayed: bool
     """Whether others relay its packets."""
+    has_rate: bool
+    """Whether its clock's rate is known: more than its first packet has shown its offset."""
     has_tx_noise: bool
     """Whether its newest packet's TX noise is a state."""
     packets: Count
@@ -265,6 +270,10 @@ class State(Record):
     """Information of the innovations on all faults; the lower half."""
     evidence: Annotated[Reals, FAULTS]
     """What innovations show of them."""
+    lasting_covariance: Annotated[Matrix, MAX_ANCHORS, MAX_ANCHORS]
+    """Of the lasting faults: (M + I/σ_f²)⁻¹. Their M grows without end, next to which 1/σ_f² would be lost."""
+    lasting_m: Annotated[Reals, MAX_ANCHORS]
+    """Their estimate: that times y."""
     anchors: Annotated[Array[Anchor], MAX_ANCHORS]
     packets: Annotated[Array[Array[KeptPacket]], MAX_ANCHORS, PACKETS_KEPT]
     links: Annotated[Array[Array[Link]], MAX_ANCHORS, MAX_ANCHORS]
@@ -387,6 +396,7 @@ def add_anchor(s: State, identifier: int, position_m: Reals, std_m: float, is_op
     a.tx_ticks = a.rx_ticks = NEVER
     a.walk_scale = 1.0
     a.change_variance_m2 = square(settings.place_std_m)
+    s.lasting_covariance[anchor][anchor] = square(s.status.fault_std_m[LASTING])
     for kept in range(PACKETS_KEPT):
         packet = s.packets[anchor][kept]
         packet.sequence = -1
@@ -428,6 +438,7 @@ def remove_anchor(s: State, anchor: int) -> None:
     _remove_state(s, where.tx_noise + anchor)
     _remove_state(s, where.rate + anchor)
     _remove_state(s, where.offset + anchor)
+    _remove_lasting(s, anchor)
     for kind in range(FAULT_KINDS):
         _remove_fault(s, (FAULT_KINDS - 1 - kind) * s.count + anchor, FAULT_KINDS * s.count - kind)
     for moved in range(anchor, last):
@@ -511,6 +522,20 @@ def _remove_fault(s: State, index: int, faults: int) -> None:
     _remove(s.evidence, index, faults)
 
 
+def _remove_lasting(s: State, anchor: int) -> None:
+    """The same of what is known of lasting faults, given that this anchor has none."""
+    covariance, end = s.lasting_covariance, s.count
+    _weigh_zero(s, anchor, 1.0 / ROUNDING_M2)
+    for row in range(anchor, end - 1):
+        for other in range(end):
+            covariance[row][other] = covariance[row + 1][other]
+    for other in range(end):
+        covariance[end - 1][other] = 0.0
+    for row in range(end):
+        _remove(covariance[row], anchor, end)
+    _remove(s.lasting_m, anchor, end)
+
+
 def _insert(numbers: Reals, index: int, end: int) -> None:
     """Move numbers from an index up to an end one place back."""
     for place in range(end, index, -1):
@@ -523,3 +548,42 @@ def _remove(numbers: Reals, index: int, end: int) -> None:
     for place in range(index, end - 1):
         numbers[place] = numbers[place + 1]
     numbers[end - 1] = 0.0
+
+
+# What is known of lasting faults
+
+
+def learn_lasting(s: State, m: Reals, weight: float, shown: float) -> None:
+    """M of the lasting faults gains weight·m·mᵀ, and y weight·m·shown (Sherman and Morrison 1950)."""
+    c, variance, innovation = s.work[1], 1.0, shown
+    for one in range(s.count):
+        total, row = 0.0, s.lasting_covariance[one]
+        for other in range(s.count):
+            total += row[other] * m[other]
+        c[one] = total
+        variance += weight * m[one] * total
+        innovation -= m[one] * s.lasting_m[one]
+    gain = weight / variance
+    for one in range(s.count):
+        share, row = gain * c[one], s.lasting_covariance[one]
+        s.lasting_m[one] += share * innovation
+        for other in range(s.count):
+            row[other] -= share * c[other]
+
+
+def forget_lasting(s: State, anchor: int) -> None:
+    """The lasting fault of an anchor becomes a state, with its own variance beforehand; another one may follow."""
+    variance = square(s.status.fault_std_m[LASTING])
+    _weigh_zero(s, anchor, 1.0 / square(s.tuning.late_std_m) - 1.0 / variance)
+    for other in range(s.count):
+        s.lasting_covariance[anchor][other] = s.lasting_covariance[other][anchor] = 0.0
+    s.lasting_covariance[anchor][anchor] = variance
+    s.lasting_m[anchor] = 0.0
+
+
+def _weigh_zero(s: State, anchor: int, weight: float) -> None:
+    """It is known with this weight besides that the lasting fault of an anchor is zero."""
+    m = s.work[2]
+    for one in range(s.count):
+        m[one] = 1.0 if one == anchor else 0.0
+    learn_lasting(s, m, weight, 0.0)

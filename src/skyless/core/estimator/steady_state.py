@@ -25,6 +25,7 @@ from skyless.core.estimator.kalman import (
 )
 from skyless.core.estimator.measurements import (
     add_pair_survey,
+    find_rate,
     first_reception,
     reception_terms,
     relay_terms,
@@ -188,13 +189,17 @@ def _receive(s: State, message: PlannedMessage, rx_ticks: Ticks) -> None:
         first_reception(s, message.anchor, rx_ticks, rx_ticks)
         s.V[where.offset + message.anchor][_walls(s)] += message.late_m
     else:
-        relax_range_error(s, message.anchor, (rx_ticks - a.rx_ticks) * TICK_S, 0.0)
+        elapsed_s = (rx_ticks - a.rx_ticks) * TICK_S
+        relax_range_error(s, message.anchor, elapsed_s, 0.0)
         reset_state(s, where.tx_noise + message.anchor, s.settings.tx_variance_m2 / message.share)
         reception_terms(s, message.anchor, True)
         variance = compute_ph(s) + s.settings.rx_variance_m2 / message.share
         compute_fault_input(s, message.anchor)
         s.G[s.waiting][_walls(s)] += message.late_m
-        update(s, 0.0, variance)
+        if a.has_rate:
+            update(s, 0.0, variance)
+        else:
+            find_rate(s, message.anchor, 0.0, variance, elapsed_s)
     a.rx_ticks = rx_ticks
     a.packets += 1
 

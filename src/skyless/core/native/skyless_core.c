@@ -121,8 +121,12 @@ INTERNAL void insert_state(State *s, int32_t index_);
 INTERNAL void remove_state(State *s, int32_t index_);
 INTERNAL void insert_fault(State *s, int32_t index_, int32_t faults);
 INTERNAL void remove_fault(State *s, int32_t index_, int32_t faults);
+INTERNAL void remove_lasting(State *s, int32_t anchor);
 INTERNAL void insert(real *numbers, int32_t index_, int32_t end);
 INTERNAL void remove_(real *numbers, int32_t index_, int32_t end);
+INTERNAL void learn_lasting(State *s, real *m, real weight, real shown);
+INTERNAL void forget_lasting(State *s, int32_t anchor);
+INTERNAL void weigh_zero(State *s, int32_t anchor, real weight);
 INTERNAL void predict(State *s, int64_t rx_ticks);
 INTERNAL bool is_stationary(State *s);
 INTERNAL void advance(State *s, real dt);
@@ -132,6 +136,7 @@ INTERNAL range_error_decay_results range_error_decay(State *s, int32_t anchor, r
 INTERNAL void relax_range_error(State *s, int32_t anchor, real dt, real walked_m);
 INTERNAL void decay(State *s, int32_t state, real kept, real variance);
 INTERNAL void reset_state(State *s, int32_t state, real variance);
+INTERNAL void open_direction(State *s, real variance, int32_t faults);
 INTERNAL real compute_ph(State *s);
 INTERNAL real h_dot(State *s, real *states);
 INTERNAL void compute_fault_input(State *s, int32_t own);
@@ -193,6 +198,7 @@ INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64
 INTERNAL void carry_ticks(State *s, int32_t anchor);
 INTERNAL real jump(State *s, int32_t anchor, real innovation, real rx_variance);
 INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks);
+INTERNAL void find_rate(State *s, int32_t anchor, real innovation, real innovation_variance, real elapsed_s);
 INTERNAL void relay_terms(State *s, int32_t listener, int32_t sender, real age_s, bool has_tx_noise);
 INTERNAL real relay_variance(State *s, int32_t listener, int32_t sender, real age_s);
 INTERNAL void relay(State *s, int32_t listener, int32_t sender, int64_t tx_ticks, int64_t packet_rx_ticks, int64_t
@@ -294,7 +300,7 @@ INTERNAL void forget_links_before(Acquisition *q, int64_t now);
 INTERNAL void choose_pairs(Acquisition *q, int64_t now);
 INTERNAL int32_t anchor_of(Acquisition *q, int32_t pair);
 INTERNAL void put_on_one_scale(Acquisition *q, int64_t now);
-INTERNAL void find_rate(Acquisition *q, int32_t pair, Packet *first, Packet *second);
+INTERNAL void measure_rate(Acquisition *q, int32_t pair, Packet *first, Packet *second);
 INTERNAL void reach_from(Acquisition *q, int32_t reference);
 INTERNAL int32_t find_pair(Acquisition *q, int32_t anchor);
 INTERNAL void convert(Acquisition *q, int32_t pair, HeardPacket *one);
@@ -1103,6 +1109,7 @@ SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *po
     a->tx_ticks = NEVER;
     a->walk_scale = REAL(1.0);
     a->change_variance_m2 = square(settings->place_std_m);
+    s->lasting_covariance[anchor][anchor] = square(s->status.fault_std_m[LASTING]);
     for (int32_t kept = 0; kept < PACKETS_KEPT; kept++) {
         KeptPacket *packet = &s->packets[anchor][kept];
         packet->sequence = -1;
@@ -1155,6 +1162,7 @@ SKYLESS_EXPORT void skyless_remove_anchor(State *s, int32_t anchor) {
     remove_state(s, where->tx_noise + anchor);
     remove_state(s, where->rate + anchor);
     remove_state(s, where->offset + anchor);
+    remove_lasting(s, anchor);
     for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
         remove_fault(s, (FAULT_KINDS - 1 - kind) * s->count + anchor, FAULT_KINDS * s->count - kind);
     }
@@ -1266,6 +1274,25 @@ INTERNAL void remove_fault(State *s, int32_t index_, int32_t faults) {
     remove_(s->evidence, index_, faults);
 }
 
+/* The same of what is known of lasting faults, given that this anchor has none. */
+INTERNAL void remove_lasting(State *s, int32_t anchor) {
+    real (*covariance)[32] = s->lasting_covariance;
+    int32_t end = s->count;
+    weigh_zero(s, anchor, REAL(1.0) / ROUNDING_M2);
+    for (int32_t row = anchor; row < end - 1; row++) {
+        for (int32_t other = 0; other < end; other++) {
+            covariance[row][other] = covariance[row + 1][other];
+        }
+    }
+    for (int32_t other = 0; other < end; other++) {
+        covariance[end - 1][other] = REAL(0.0);
+    }
+    for (int32_t row = 0; row < end; row++) {
+        remove_(covariance[row], anchor, end);
+    }
+    remove_(s->lasting_m, anchor, end);
+}
+
 /* Move numbers from an index up to an end one place back. */
 INTERNAL void insert(real *numbers, int32_t index_, int32_t end) {
     for (int32_t place = end; place > index_; place--) {
@@ -1282,6 +1309,55 @@ INTERNAL void remove_(real *numbers, int32_t index_, int32_t end) {
     numbers[end - 1] = REAL(0.0);
 }
 
+/* What is known of lasting faults */
+
+/* M of the lasting faults gains weight·m·mᵀ, and y weight·m·shown (Sherman and Morrison 1950). */
+INTERNAL void learn_lasting(State *s, real *m, real weight, real shown) {
+    real *c = s->work[1];
+    real variance = REAL(1.0);
+    real innovation = shown;
+    for (int32_t one = 0, one_end = s->count; one < one_end; one++) {
+        real total = REAL(0.0);
+        real *row = s->lasting_covariance[one];
+        for (int32_t other = 0, other_end = s->count; other < other_end; other++) {
+            total += row[other] * m[other];
+        }
+        c[one] = total;
+        variance += weight * m[one] * total;
+        innovation -= m[one] * s->lasting_m[one];
+    }
+    real gain = weight / variance;
+    for (int32_t one = 0, one_end = s->count; one < one_end; one++) {
+        real share = gain * c[one];
+        real *row = s->lasting_covariance[one];
+        s->lasting_m[one] += share * innovation;
+        for (int32_t other = 0, other_end = s->count; other < other_end; other++) {
+            row[other] -= share * c[other];
+        }
+    }
+}
+
+/* The lasting fault of an anchor becomes a state, with its own variance beforehand; another one may follow. */
+INTERNAL void forget_lasting(State *s, int32_t anchor) {
+    real variance = square(s->status.fault_std_m[LASTING]);
+    weigh_zero(s, anchor, REAL(1.0) / square(s->tuning.late_std_m) - REAL(1.0) / variance);
+    for (int32_t other = 0, other_end = s->count; other < other_end; other++) {
+        s->lasting_covariance[other][anchor] = REAL(0.0);
+        s->lasting_covariance[anchor][other] = REAL(0.0);
+    }
+    s->lasting_covariance[anchor][anchor] = variance;
+    s->lasting_m[anchor] = REAL(0.0);
+}
+
+/* It is known with this weight besides that the lasting fault of an anchor is zero. */
+INTERNAL void weigh_zero(State *s, int32_t anchor, real weight) {
+    real *m = s->work[2];
+    for (int32_t one = 0, one_end = s->count; one < one_end; one++) {
+        m[one] = one == anchor ? REAL(1.0) : REAL(0.0);
+    }
+    learn_lasting(s, m, weight, REAL(0.0));
+}
+
 /* The filter itself: time update and scalar measurement update of state, covariance and fault sensitivities.
  *
  * All loops run over the states that are not exact (``State.n``); what stands behind them stays as it is. */
@@ -1296,7 +1372,7 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
     Status *status = &s->status;
     EstimatorSettings *settings = &s->settings;
     Layout *where = &s->layout;
-    real dt = (real)(rx_ticks - status->epoch_ticks) * TICK_S;
+    real dt = min_real((real)(rx_ticks - status->epoch_ticks) * TICK_S, LONGEST_S);
     real speed_squared = REAL(0.0);
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
         speed_squared += square(s->x[where->velocity + axis]);
@@ -1462,6 +1538,20 @@ INTERNAL void reset_state(State *s, int32_t state, real variance) {
     }
 }
 
+/* Let what was taken for known err along the first of ``U``, which holds so much of each fault as ``G`` says. */
+INTERNAL void open_direction(State *s, real variance, int32_t faults) {
+    real *opened = s->U[0];
+    real *shared = s->G[0];
+    for (int32_t one = 0, one_end = s->used; one < one_end; one++) {
+        for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
+            s->P[one][other] += opened[one] * opened[other] * variance;
+        }
+        for (int32_t fault = 0; fault < faults; fault++) {
+            s->V[one][fault] += shared[fault] * opened[one];
+        }
+    }
+}
+
 /* Measurement update */
 
 /* Write P·h of the measurement in ``h`` into the next of ``U``; returns hᵀ·P·h. Counts updates that wait. */
@@ -1541,14 +1631,16 @@ INTERNAL void update(State *s, real innovation, real innovation_variance, real g
 
 /* The same for a measurement that shows faults: y ← y + s·ν/S and M ← M + s·sᵀ/S.
  *
- * P, V and M wait for ``finish_updates``; until then only ``compute_ph`` and ``compute_fault_input`` may read P and V. */
+ * P, V and M wait for ``finish_updates``; until then only ``compute_ph`` and ``compute_fault_input`` may read P and V.
+ * What is known of lasting faults does not wait. */
 INTERNAL void update_later(State *s, real innovation, real innovation_variance) {
     real *g = s->G[s->waiting];
-    note_update(s, innovation, innovation_variance, REAL(1.0));
     real normalised = innovation / SQRT(innovation_variance);
+    note_update(s, innovation, innovation_variance, REAL(1.0));
     for (int32_t fault = 0, fault_end = FAULT_KINDS * s->count; fault < fault_end; fault++) {
         s->evidence[fault] += g[fault] * normalised;
     }
+    learn_lasting(s, g, REAL(1.0), normalised);
 }
 
 /* Update x, and make u = P·h/√S and g = s/√S of what stands in ``U`` and ``G``, for P and V. */
@@ -1728,12 +1820,36 @@ INTERNAL void whiten(State *s, int32_t count, int32_t vectors) {
     }
 }
 
-/* The test of all faults of a kind; leaves L⁻¹·y, and L⁻¹·V of that number of axes, in the rows of ``work``.
+/* The test of all faults of a kind; leaves what they do to that number of axes, as factors, in rows of ``work``.
  *
- * L·Lᵀ is M + I/σ_f². */
+ * In row ``count`` f, in those behind it A: A·f is how far the estimate of the faults moves a position. With L·Lᵀ =
+ * M + I/σ_f² these are L⁻¹·y and L⁻¹·V, and A·Aᵀ is the covariance of that; for lasting faults A·Bᵀ, with B behind A. */
 INTERNAL real fault_chi2(State *s, int32_t kind, int32_t axes) {
     int32_t count = s->count;
     int32_t begin = kind * s->count;
+    int32_t first = s->count + 1;
+    real total = REAL(0.0);
+    if (kind == LASTING) {  /* their covariance is known as it is */
+        for (int32_t axis = 0; axis < axes; axis++) {
+            real *a = s->work[first + axis];
+            real *b = s->work[first + AXES + axis];
+            for (int32_t one = 0; one < count; one++) {
+                total = REAL(0.0);
+                real *row = s->lasting_covariance[one];
+                for (int32_t other = 0; other < count; other++) {
+                    total += row[other] * s->V[axis][other];
+                }
+                a[one] = s->V[axis][one];
+                b[one] = total;
+            }
+        }
+        total = REAL(0.0);
+        for (int32_t one = 0; one < count; one++) {
+            s->work[count][one] = s->lasting_m[one];
+            total += s->lasting_m[one] * s->evidence[one];
+        }
+        return total;
+    }
     for (int32_t one = 0; one < count; one++) {
         for (int32_t other = 0; other < one + 1; other++) {
             s->work[one][other] = s->information[begin + one][begin + other];
@@ -1741,11 +1857,10 @@ INTERNAL real fault_chi2(State *s, int32_t kind, int32_t axes) {
         s->work[one][one] += REAL(1.0) / square(s->status.fault_std_m[kind]);
         s->work[count][one] = s->evidence[begin + one];
         for (int32_t axis = 0; axis < axes; axis++) {
-            s->work[count + 1 + axis][one] = s->V[axis][begin + one];
+            s->work[first + axis][one] = s->V[axis][begin + one];
         }
     }
     whiten(s, count, 1 + axes);
-    real total = REAL(0.0);
     for (int32_t one = 0; one < count; one++) {
         total += square(s->work[count][one]);
     }
@@ -1925,15 +2040,15 @@ INTERNAL void open_fault(State *s, int32_t kind, int32_t anchor) {
         shared[one] = gain * s->information[max_32(one, chosen)][min_32(one, chosen)];
     }
     shared[chosen] = REAL(0.0);
-    for (int32_t one = 0, one_end = s->used; one < one_end; one++) {
-        s->x[one] += opened[one] * fault_m;
-        for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
-            s->P[one][other] += opened[one] * opened[other] * variance;
-        }
-        for (int32_t fault = 0; fault < faults; fault++) {
-            s->V[one][fault] += shared[fault] * opened[one];
-        }
-        s->V[one][chosen] = REAL(0.0);
+    if (is_lasting) {
+        forget_lasting(s, anchor);
+    } else {
+        learn_lasting(s, shared, -REAL(1.0) / gain, fault_m);
+    }
+    open_direction(s, variance, faults);
+    for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
+        s->x[state] += opened[state] * fault_m;
+        s->V[state][chosen] = REAL(0.0);
     }
     for (int32_t one = 0; one < faults; one++) {
         s->evidence[one] -= shared[one] * s->evidence[chosen];
@@ -2249,6 +2364,10 @@ INTERNAL void protect(State *s) {
         real *x = s->work[s->count + 1];
         real *y = s->work[s->count + 2];
         real *z = s->work[s->count + 3];
+        int32_t first = s->count + 1 + (kind == LASTING ? AXES : 0);
+        real *of_x = s->work[first];
+        real *of_y = s->work[first + 1];
+        real *of_z = s->work[first + 2];
         real shift_x = REAL(0.0);
         real shift_y = REAL(0.0);
         real shift_z = REAL(0.0);
@@ -2259,12 +2378,12 @@ INTERNAL void protect(State *s) {
         for (int32_t one = 0, one_end = s->count; one < one_end; one++) {
             shift_x += x[one] * faults[one];
             shift_y += y[one] * faults[one];
-            xx += x[one] * x[one];
-            xy += x[one] * y[one];
-            yy += y[one] * y[one];
+            xx += x[one] * of_x[one];
+            xy += x[one] * of_y[one];
+            yy += y[one] * of_y[one];
             if (s->dim == 3) {
                 shift_z += z[one] * faults[one];
-                zz += z[one] * z[one];
+                zz += z[one] * of_z[one];
             }
         }
         real largest = REAL(0.5) * (xx + yy) + SQRT(REAL(0.25) * square(xx - yy) + xy * xy);
@@ -2653,6 +2772,13 @@ INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64
     real innovation = (real)(rx_ticks - tx_ticks - a->offset_ticks) * TICK_M - expected_m;
     real innovation_variance = compute_ph(s) + rx_variance;
     a->range_m = range_m;
+    if (!a->has_rate) {
+        innovation_variance += (variance_factor - REAL(1.0)) * settings->rx_variance_m2;
+        compute_fault_input(s, anchor);
+        find_rate(s, anchor, innovation, innovation_variance, elapsed_s);
+        carry_ticks(s, anchor);
+        return USED;
+    }
     a->innovation = innovation / SQRT(innovation_variance);
     if (status->late_share <= tuning->late_often_share) {  /* late packets are no multipath */
         learn_place(s, anchor, innovation + s->x[where->change + anchor]);
@@ -2725,7 +2851,7 @@ INTERNAL real jump(State *s, int32_t anchor, real innovation, real rx_variance) 
 
 /* Initialise an anchor's clock: the limit of an update of an offset of which nothing was known.
  *
- * All errors of the position and of the range are then in the offset. */
+ * All errors of the position and of the range are then in the offset. Its rate follows (``find_rate``). */
 INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks) {
     EstimatorSettings *settings = &s->settings;
     Layout *where = &s->layout;
@@ -2733,7 +2859,8 @@ INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_
     int32_t offset = where->offset + anchor;
     int32_t noise = where->tx_noise + anchor;
     reset_state(s, noise, settings->tx_variance_m2);
-    reset_state(s, where->rate + anchor, CLOCK_RATE_VARIANCE);
+    reset_state(s, where->rate + anchor, REAL(0.0));
+    a->has_rate = false;
     reset_state(s, offset, REAL(0.0));
     s->terms = 0;
     real range_m = add_direction(s, anchor, REAL(1.0));
@@ -2756,6 +2883,27 @@ INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_
     s->x[offset] = rest_m - range_m - curvature_m - h_dot_x(s, direction_terms(s));
     a->has_tx_noise = true;
     a->range_m = range_m;
+}
+
+/* Initialise the rate of an anchor's clock by the first measurement of its offset after that of its first packet.
+ *
+ * The limit of an update of a rate of which nothing was known: the offset takes all of the innovation. With a variance
+ * of the rate in P instead, what is left of it were the difference of large numbers. P·h of the measurement and its
+ * shares of faults are the first of ``U`` and ``G``. */
+INTERNAL void find_rate(State *s, int32_t anchor, real innovation, real innovation_variance, real elapsed_s) {
+    int32_t offset = s->layout.offset + anchor;
+    int32_t rate = s->layout.rate + anchor;
+    real *opened = s->U[0];
+    update(s, REAL(0.0), innovation_variance, REAL(1.0));
+    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+        opened[state] = -opened[state];
+    }
+    opened[offset] += SQRT(innovation_variance);
+    opened[rate] += SQRT(innovation_variance) / elapsed_s;
+    open_direction(s, REAL(1.0), s->rows);
+    s->x[offset] += innovation;
+    s->x[rate] += innovation / elapsed_s;
+    s->anchors[anchor].has_rate = true;
 }
 
 /* An anchor received another */
@@ -2946,6 +3094,16 @@ INTERNAL void report(State *s, int32_t anchor, int32_t master, int64_t subticks,
         off -= SUBTICK_MASK + 1;
     }
     real innovation = (real)off * (TICK_M / (real)SUBTICKS) - h_dot_x(s, 0);
+    if (!s->anchors[master].has_rate) {
+        real elapsed_s = (real)(status->epoch_ticks - s->anchors[master].rx_ticks) * TICK_S;
+        real innovation_variance = compute_ph(s) + variance_m2;
+        compute_fault_input(s, -1);
+        if (elapsed_s > SHORTEST_S) {
+            find_rate(s, master, innovation, innovation_variance, elapsed_s);
+            status->reports_used += 1;
+        }
+        return;
+    }
     if (own_variance <= variance_m2) {
         return;
     }
@@ -3216,7 +3374,7 @@ INTERNAL int32_t admit(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ti
     if (a->packets == 0) {
         return JOINED;
     }
-    if (tx_ticks == a->tx_ticks) {
+    if (tx_ticks == a->tx_ticks || (real)(rx_ticks - a->rx_ticks) * TICK_S < SHORTEST_S) {
         status->impossible += 1;
         return REJECTED;
     }
@@ -3257,7 +3415,7 @@ INTERNAL void keep_packet(State *s, int32_t anchor, Packet *packet) {
 INTERNAL void process_relay(State *s, Relay *relayed) {
     int32_t listener = skyless_find_anchor(s, relayed->listener);
     int32_t sender = skyless_find_anchor(s, relayed->anchor);
-    if (listener < 0 || sender < 0 || sender == listener) {
+    if (listener < 0 || sender < 0 || sender == listener || !s->anchors[listener].has_rate) {
         return;
     }
     KeptPacket *kept = &s->packets[sender][floor_mod_32(relayed->sequence, PACKETS_KEPT)];
@@ -3521,13 +3679,18 @@ INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks) {
         first_reception(s, message->anchor, rx_ticks, rx_ticks);
         s->V[where->offset + message->anchor][walls(s)] += message->late_m;
     } else {
-        relax_range_error(s, message->anchor, (real)(rx_ticks - a->rx_ticks) * TICK_S, REAL(0.0));
+        real elapsed_s = (real)(rx_ticks - a->rx_ticks) * TICK_S;
+        relax_range_error(s, message->anchor, elapsed_s, REAL(0.0));
         reset_state(s, where->tx_noise + message->anchor, s->settings.tx_variance_m2 / message->share);
         reception_terms(s, message->anchor, true);
         real variance = compute_ph(s) + s->settings.rx_variance_m2 / message->share;
         compute_fault_input(s, message->anchor);
         s->G[s->waiting][walls(s)] += message->late_m;
-        update(s, REAL(0.0), variance, REAL(1.0));
+        if (a->has_rate) {
+            update(s, REAL(0.0), variance, REAL(1.0));
+        } else {
+            find_rate(s, message->anchor, REAL(0.0), variance, elapsed_s);
+        }
     }
     a->rx_ticks = rx_ticks;
     a->packets += 1;
@@ -4756,7 +4919,7 @@ INTERNAL void put_on_one_scale(Acquisition *q, int64_t now) {
     for (int32_t pair = 0, pair_end = q->pair_count; pair < pair_end; pair++) {
         HeardAnchor *one = &q->heard[q->pairs[pair]];
         stated += one->older.is_stated && one->newer.is_stated ? 1 : 0;
-        find_rate(q, pair, &one->older.packet, &one->newer.packet);
+        measure_rate(q, pair, &one->older.packet, &one->newer.packet);
     }
     forget_links_before(q, now);
     q->best.count = 0;
@@ -4790,7 +4953,7 @@ INTERNAL void put_on_one_scale(Acquisition *q, int64_t now) {
     q->pair_count = kept;
 }
 
-INTERNAL void find_rate(Acquisition *q, int32_t pair, Packet *first, Packet *second) {
+INTERNAL void measure_rate(Acquisition *q, int32_t pair, Packet *first, Packet *second) {
     int64_t elapsed = second->rx_ticks - first->rx_ticks;
     q->rate_variances[pair] = REAL(0.0);
     q->rates[pair] = REAL(0.0);

@@ -83,7 +83,6 @@ typedef double real;
 #define CIRCLE INT64_C(3600000000)
 #define CLEAR_DB REAL(7.0)
 #define CLOCK_JUMPED 2
-#define CLOCK_RATE_VARIANCE REAL(224688794.68420443)
 #define COLLINEAR REAL(1e-06)
 #define COLLINEAR_ANCHORS 2
 #define COMPLETE_CHANGE REAL(0.001)
@@ -157,6 +156,8 @@ typedef double real;
 /* No jump of a host's clock counts as a longer one: the ticks of three years fit 64 bits. */
 #define LONGEST_JUMP_S REAL(100000000.0)
 #define LONGEST_PERIOD_CODE 159
+/* The longest time update: of more, squares of variances are no numbers in single precision. */
+#define LONGEST_S REAL(1000.0)
 #define LOST 22
 /* Its exponential counts as 0. */
 #define LOWEST REAL(-700.0)
@@ -240,8 +241,11 @@ typedef double real;
 #define RESTART_SILENCE_TICKS INT64_C(12779520000)
 #define RIVAL_MINIMUM_CHI2 REAL(9.0)
 #define ROOT_2_PI REAL(2.5066282746310002)
+/* What rounding in single precision may make of a variance of lasting faults that is smaller. */
+#define ROUNDING_M2 REAL(1e-07)
 #define SAME_POINT REAL(1e-06)
 #define SCHEDULE_PAGE 2
+#define SHORTEST_S REAL(5e-05)
 /* The highest of four bytes' bits; as a float32 alone it is −0. */
 #define SIGN INT64_C(2147483648)
 #define SINGULAR 5
@@ -758,6 +762,7 @@ typedef struct Anchor {
     real held_range_m;  /* Distance of that point. */
     real walked_m;  /* The tag's walked distance at its newest packet. */
     bool is_relayed;  /* Whether others relay its packets. */
+    bool has_rate;  /* Whether its clock's rate is known: more than its first packet has shown its offset. */
     bool has_tx_noise;  /* Whether its newest packet's TX noise is a state. */
     int64_t packets;
     real innovation;  /* Its newest one, normalised. */
@@ -813,6 +818,9 @@ typedef struct State {
     Status status;
     real information[96][96];  /* Information of the innovations on all faults; the lower half. */
     real evidence[96];  /* What innovations show of them. */
+    /* Of the lasting faults: (M + I/σ_f²)⁻¹. Their M grows without end, next to which 1/σ_f² would be lost. */
+    real lasting_covariance[32][32];
+    real lasting_m[32];  /* Their estimate: that times y. */
     Anchor anchors[32];
     KeptPacket packets[32][16];
     Link links[32][32];  /* Of listener and sender. */
@@ -823,7 +831,7 @@ typedef struct State {
     real U[8][264];  /* Of each its u = P·h/√S; then P·h of the measurement at hand. */
     /* Of each, over √S, by how much each fault is in its innovation; then the same of the measurement at hand. */
     real G[8][112];
-    real work[36][32];  /* Scratch for systems of equations of all faults of one kind. */
+    real work[39][32];  /* Scratch for systems of equations of all faults of one kind. */
     real levels[5];
     real fix[10][3];  /* What a fix carries (``POSITION`` and the following). */
 } State;

@@ -313,7 +313,7 @@ def _put_on_one_scale(q: Acquisition, now: Ticks) -> None:
     for pair in range(q.pair_count):
         one = q.heard[q.pairs[pair]]
         stated += 1 if one.older.is_stated and one.newer.is_stated else 0
-        _find_rate(q, pair, one.older.packet, one.newer.packet)
+        _measure_rate(q, pair, one.older.packet, one.newer.packet)
     _forget_links_before(q, now)
     q.best.count = 0
     for pair in range(q.pair_count):
@@ -338,7 +338,7 @@ def _put_on_one_scale(q: Acquisition, now: Ticks) -> None:
     q.pair_count = kept
 
 
-def _find_rate(q: Acquisition, pair: int, first: Packet, second: Packet) -> None:
+def _measure_rate(q: Acquisition, pair: int, first: Packet, second: Packet) -> None:
     elapsed = second.rx_ticks - first.rx_ticks
     q.rates[pair] = q.rate_variances[pair] = 0.0
     if elapsed > 0:
