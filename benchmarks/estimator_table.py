@@ -53,7 +53,7 @@ MECHANISMS: dict[str, dict[str, float]] = {
     "… narrow the gate": {"late_probability_density": 0.0},
     "… need more in a row for a jump": {"in_row_where_late": 2},
     "… less weight of large innovations": {"reception_huber": OFF},
-    "… weak first paths": {"skyless.core.air.first_path:MAX_VARIANCE_FACTOR": 1.0},
+    "… weak first paths": {"skyless.core.air.first_path:CLEAR_DB": OFF},
     "Faults are opened": {"sure_chi2": OFF},
     "… lasting ones": {"rival_chi2": -1.0},
     "… creeping ones": {"creeping_std_m": 1e-6},

@@ -3,6 +3,7 @@
 import pytest
 from estimator_table import MECHANISMS, switched
 
+from skyless.core.air.first_path import variance_factor
 from skyless.core.estimator import estimator, settings
 from skyless.core.estimator.state import new_state
 
@@ -16,3 +17,9 @@ def test_a_mechanism_can_be_switched_off_and_is_on_again(changes):
         assert all(getattr(new_state(settings.EstimatorSettings()).tuning, name) == fields[name] for name in fields)
     assert settings.TUNING is before
     assert estimator.TUNING is before
+
+
+def test_weak_first_paths_count_as_others_where_that_is_off():
+    assert variance_factor(-80.0, -89.0) > 1.0
+    with switched(MECHANISMS["… weak first paths"]):
+        assert variance_factor(-80.0, -89.0) == variance_factor(-80.0, -95.0) == 1.0
