@@ -220,16 +220,18 @@ def _frame_bound(
         if known[frame, n]:
             newest[sender] = frame
 
-    newest = [0] * n
+    newest, present = [0] * n, State.from_buffer_copy(s)
+    all_of_it, P, P_present = memoryview(s).cast("B"), view(s.P)[:dim, :dim], view(present.P)[:dim, :dim]
     for frame in range(len(path)):
         if not at_once and frame % n == 0:  # without what anchors whose turn is earlier relay in the next superframe
-            present, newest_present = State.from_buffer_copy(s), list(newest)
+            memoryview(present).cast("B")[:] = all_of_it
+            newest_present = list(newest)
             for own in range(frame, frame + n):
                 process(present, own, senders[own] + 1, newest_present)
-                bound[own] = view(present.P)[:dim, :dim]
+                bound[own] = P_present
         process(s, frame, 0, newest)
         if at_once:
-            bound[frame] = view(s.P)[:dim, :dim]
+            bound[frame] = P
     return bound
 
 
