@@ -9,26 +9,38 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from skyless.cli.api.plan import PlanResult, plan
-    from skyless.cli.api.rate_plan import RatePlanResult
-    from skyless.cli.api.replay import ReplayResult, open_recording, replay
-    from skyless.cli.api.simulate import SimulationResult, simulate
-    from skyless.cli.api.study import StudyResult, study
-    from skyless.cli.api.survey import BiasResult, SurveyResult, survey_site
-    from skyless.core.air.masterless_packets import PairTdoa
-    from skyless.core.air.reception import Reception, Transmission
-    from skyless.core.anchor.anchor import Anchor
-    from skyless.core.errors import SkylessError
-    from skyless.core.fix import Fix, NoFixReason
-    from skyless.core.method_names import METHODS
-    from skyless.core.site import Site
-    from skyless.core.tag.locate import locate
-    from skyless.core.tag.receiver import Receiver
-    from skyless.core.trusted_receiver import SiteTrust, Trust, TrustedReceiver
-    from skyless.sim.evaluation.fleet import Fleet
-    from skyless.sim.evaluation.scenarios import Request, fleet_of
-    from skyless.sim.lab import lab_site
-    from skyless.site.file.load import load_site
+    from skyless.cli.api.plan import PlanResult as PlanResult
+    from skyless.cli.api.plan import plan as plan
+    from skyless.cli.api.rate_plan import RatePlanResult as RatePlanResult
+    from skyless.cli.api.replay import ReplayResult as ReplayResult
+    from skyless.cli.api.replay import open_recording as open_recording
+    from skyless.cli.api.replay import replay as replay
+    from skyless.cli.api.simulate import SimulationResult as SimulationResult
+    from skyless.cli.api.simulate import simulate as simulate
+    from skyless.cli.api.study import StudyResult as StudyResult
+    from skyless.cli.api.study import study as study
+    from skyless.cli.api.survey import BiasResult as BiasResult
+    from skyless.cli.api.survey import SurveyResult as SurveyResult
+    from skyless.cli.api.survey import survey_site as survey_site
+    from skyless.core.air.masterless_packets import PairTdoa as PairTdoa
+    from skyless.core.air.reception import Reception as Reception
+    from skyless.core.air.reception import Transmission as Transmission
+    from skyless.core.anchor.anchor import Anchor as Anchor
+    from skyless.core.errors import SkylessError as SkylessError
+    from skyless.core.fix import Fix as Fix
+    from skyless.core.fix import NoFixReason as NoFixReason
+    from skyless.core.method_names import METHODS as METHODS
+    from skyless.core.site import Site as Site
+    from skyless.core.tag.locate import locate as locate
+    from skyless.core.tag.receiver import Receiver as Receiver
+    from skyless.core.trusted_receiver import SiteTrust as SiteTrust
+    from skyless.core.trusted_receiver import Trust as Trust
+    from skyless.core.trusted_receiver import TrustedReceiver as TrustedReceiver
+    from skyless.sim.evaluation.fleet import Fleet as Fleet
+    from skyless.sim.evaluation.scenarios import Request as Request
+    from skyless.sim.evaluation.scenarios import fleet_of as fleet_of
+    from skyless.sim.lab import lab_site as lab_site
+    from skyless.site.file.load import load_site as load_site
 
     __version__: str
 
@@ -67,40 +79,7 @@ _MODULES: Final = {
     "survey_site": "skyless.cli.api.survey",
 }
 
-__all__ = [
-    "METHODS",
-    "Anchor",
-    "BiasResult",
-    "Fix",
-    "Fleet",
-    "NoFixReason",
-    "PairTdoa",
-    "PlanResult",
-    "RatePlanResult",
-    "Receiver",
-    "Reception",
-    "ReplayResult",
-    "Request",
-    "SimulationResult",
-    "Site",
-    "SiteTrust",
-    "SkylessError",
-    "StudyResult",
-    "SurveyResult",
-    "Transmission",
-    "Trust",
-    "TrustedReceiver",
-    "fleet_of",
-    "lab_site",
-    "load_site",
-    "locate",
-    "open_recording",
-    "plan",
-    "replay",
-    "simulate",
-    "study",
-    "survey_site",
-]
+__all__ = list(_MODULES)
 
 
 def __getattr__(name: str) -> object:
