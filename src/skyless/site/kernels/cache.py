@@ -5,15 +5,13 @@ calls, nor of constants from elsewhere, so a digest of all files with kernels, a
 its name. Folders of other sources are removed when they have not been used for long.
 
 The first of these is used that can be written, or that cannot but holds kernels (an image): ``NUMBA_CACHE_DIR``, next
-to the sources, the user's cache, a private folder among the temporary ones.
+to the sources, the user's cache. Where there is none, every program compiles for itself.
 """
 
 import hashlib
 import os
 import re
 import shutil
-import stat
-import tempfile
 import time
 from collections.abc import Iterable
 from contextlib import suppress
@@ -28,16 +26,17 @@ _KEPT_S: Final = 7 * 86_400.0
 
 
 @cache
-def kernel_folder() -> Path:
-    """Where this program keeps compiled kernels; it exists unless no folder can be written."""
+def kernel_folder() -> Path | None:
+    """Where this program keeps compiled kernels; None where no folder can be written."""
     if asked := os.environ.get("NUMBA_CACHE_DIR"):
         # absolute for the programs that this one starts, too: they may change their working folder
         os.environ["NUMBA_CACHE_DIR"] = str(Path(asked).absolute())
     name = f"kernels-{digest(_PACKAGE)}"
-    found = choose_folder(_homes(), name) or _temporary_folder(name)
-    with suppress(OSError):
-        os.utime(found)  # its time is that of its last use
-        _remove_unused(found)
+    found = choose_folder(_homes(), name)
+    if found is not None:
+        with suppress(OSError):
+            os.utime(found)  # its time is that of its last use
+            _remove_unused(found)
     return found
 
 
@@ -62,19 +61,6 @@ def _homes() -> Iterable[Path]:
         yield cached / "skyless"
     with suppress(RuntimeError):  # a user without a home
         yield Path.home() / ".cache" / "skyless"
-
-
-def _temporary_folder(name: str) -> Path:
-    """One folder for all programs of this user; another user's of that name is not trusted, as kernels are code."""
-    home = Path(tempfile.gettempdir()) / f"skyless-{os.getuid() if hasattr(os, 'getuid') else 'kernels'}"
-    with suppress(OSError):  # nothing can be written at all: every program compiles for itself
-        home.mkdir(mode=0o700, exist_ok=True)
-        found = home.lstat()
-        if hasattr(os, "getuid") and (found.st_uid != os.getuid() or stat.S_IMODE(found.st_mode) & 0o022):
-            home = Path(tempfile.mkdtemp(prefix="skyless-"))
-            os.environ["NUMBA_CACHE_DIR"] = str(home)  # for the programs that this one starts
-        (home / name).mkdir(exist_ok=True)
-    return home / name
 
 
 def digest(package: Path) -> str:

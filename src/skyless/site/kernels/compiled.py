@@ -55,7 +55,7 @@ def threaded_kernel(function: Function) -> Function:
 
 def _compile(function: Function, options: dict[str, Any]) -> Function:
     compiled = njit(error_model="numpy", **options)(function)
-    if not _CONFIG.DISABLE_JIT:
+    if not _CONFIG.DISABLE_JIT and kernel_folder() is not None:
         compiled._cache = _KernelCache(function)  # type: ignore[no-untyped-call]
     return cast("Function", compiled)
 
@@ -65,14 +65,16 @@ class _Locator(UserProvidedCacheLocator):
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
         self._py_file, self._lineno = file, function.__code__.co_firstlineno
-        folder = kernel_folder() / self.get_suitable_cache_subpath(file)  # type: ignore[no-untyped-call]
-        self._cache_path = str(folder)
+        home = kernel_folder()
+        assert home is not None, "without a folder kernels have no cache"
+        folder = home / self.get_suitable_cache_subpath(file)  # type: ignore[no-untyped-call]
+        self._cache_path, self._stamp = str(folder), home.name
         with suppress(OSError):
             folder.mkdir(exist_ok=True)
 
     def get_source_stamp(self) -> str:
         """The folder's name holds a digest of the sources; times of files change on their way into an image."""
-        return kernel_folder().name
+        return self._stamp
 
     @classmethod
     def from_function(cls, function: Callable[..., Any], file: str) -> "_Locator":
