@@ -19,12 +19,15 @@ class Reception(Struct, frozen=True, gc=False):
 
     ``frame`` is the whole PSDU, FCS included. ``rx_ticks`` is the receiver's own 40-bit counter at the frame's
     RMARKER, antenna delay already subtracted. ``host_s`` is the host's clock, needed only to bridge gaps over 8.6 s.
+    ``carrier_phase_cycles`` is the phase of the carrier at the first path, in [0, 1) cycles, where the radio measured it:
+    it falls by one cycle while ``rx_ticks`` grows by the time of one cycle (docs/phases.md).
     """
 
     frame: bytes
     rx_ticks: int
     host_s: float | None = None
     diagnostics: Diagnostics | None = None
+    carrier_phase_cycles: float | None = None
 
 
 class Transmission(Struct, frozen=True, gc=False):
