@@ -38,3 +38,5 @@ class Observation(Struct, frozen=True, gc=False):
     """More relays, as frames carry them (``codec.packed_relays``)."""
     anchor_std_m: float | None = None
     """Standard deviation of each coordinate of the anchor; None to use the site's; for ``joint`` only."""
+    phase_cycles: float = -1.0
+    """Phase of the carrier as the tag received it, below 0 where it is not known; for ``joint`` only."""

@@ -4,6 +4,7 @@ import math
 
 from msgspec import Struct
 
+from skyless.sim.carrier import CarrierModel
 from skyless.sim.oscillator import OscillatorModel
 from skyless.sim.range_errors import RangeErrorModel
 from skyless.site.channel import ChannelModel
@@ -116,6 +117,8 @@ class Impairments(Struct, frozen=True, forbid_unknown_fields=True):
     range_errors: RangeErrorModel = RangeErrorModel()
     body: Body | None = None
     warm_ups: tuple[WarmUp, ...] = ()
+    carrier: CarrierModel | None = None
+    """Phases of the carrier; None where radios do not measure them."""
     diagnostics: bool = False
     """Whether receptions carry power and carrier offset."""
 

@@ -53,6 +53,9 @@ RECEPTION_RECORD: Final = np.dtype(
         ("rx_power_dbm", np.float64),
         ("first_path_power_dbm", np.float64),
         ("carrier_offset_ppm", np.float64),
+        ("reading_ticks", np.float64),  # the listener's counter modulo 128 when the carrier arrived, without noise
+        ("extra_m", np.float64),  # by how much the way was longer than the distance
+        ("phase_cycles", np.float64),  # of the carrier (``Carriers``), where that is simulated
     ],
     align=True,
 )
@@ -256,6 +259,10 @@ def receive_frame(
             error_ticks = station["rx_error_ticks"] + channel[0]["power_bias"] * power_bias_m(power_dbm) / TICK_M
             row["rx_ticks"] = stamp(
                 clocks, normals, cursors, stations, node, emission_ticks, arrival_ticks, error_ticks
+            )
+            row["extra_m"] = extra_m
+            row["reading_ticks"] = (
+                (clocks[node]["local_ticks"] & 127) + clocks[node]["local_fraction"] - error_m / TICK_M
             )
             count += 1
             anchors += 1 - station["is_tag"]

@@ -22,6 +22,7 @@ from skyless.core.arrays import Array, Records
 from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ, TICK_S
 from skyless.core.site import Site
 from skyless.core.ticks import difference, from_seconds, wrap
+from skyless.sim.carrier import Carriers
 from skyless.sim.impairments import Impairments
 from skyless.sim.listening import OUTCOMES, RECEPTION_RECORD, receive_frame
 from skyless.sim.oscillator import advance, emit, foresee, make_clocks, restart_counter, warm_up
@@ -207,6 +208,10 @@ class Medium(Generic[Result]):
         for error in impairments.anchor_pair_errors:
             a, b = self.node_of[error.a], self.node_of[error.b]
             self.range_errors.present_m[[a, b], [b, a]] += math.inf if error.blocked else error.late_m
+        self._carriers: Carriers | None = None
+        if impairments.carrier is not None:
+            identifiers = [anchor.id for anchor in site.anchors]
+            self._carriers = Carriers(impairments.carrier, identifiers, len(self._tags), seed)
         self._plan_changes()
         self._channel, self._walls = pack_channel(impairments.channel), pack_walls(site.walls)
         self._air = OnAir()
@@ -240,6 +245,8 @@ class Medium(Generic[Result]):
         self.stations[node]["on"] = 1
         if self.timeline.now_ticks > 0:
             self._restart_counter(node)
+            if self._carriers is not None:
+                self._carriers.restart(node)
 
     # Clocks
 
@@ -341,6 +348,11 @@ class Medium(Generic[Result]):
             self._counts,
         )
         streams.refill(highest)
+        if self._carriers is not None:
+            clock, heard = self.clocks[node], self._received[:count]
+            late_ticks = (ticks - int(clock["true_ticks"])) + (fraction - float(clock["true_fraction"]))
+            self._carriers.advance_to(t_s, self.stations)
+            heard["phase_cycles"] = self._carriers.phases_cycles(node, local_ticks, late_ticks, heard)
         self._transmissions += 1
         delivery = Delivery(flight, self._received[:anchors].copy(), self._received[anchors:count].copy())
         self.timeline.at(flight.end_ticks, partial(self._deliver, delivery))

@@ -60,7 +60,8 @@ def slope_error_m(slope_m: float, distance_m: float) -> float:
 class RangeErrors:
     """The present errors of all pairs. Those of a tag depend on the seed, its number and its path alone."""
 
-    def __init__(self, model: RangeErrorModel, tags: int, anchors: int, seed: int) -> None:
+    def __init__(self, model: RangeErrorModel, tags: int, anchors: int, seed: int, purpose: int = _PURPOSE) -> None:
+        """``purpose``: that of the tags' streams of random numbers."""
         self.present_m: Array = np.zeros((anchors + tags, anchors))
         """Shape (nodes, anchors) as the kernels count them, without the slope part; those of anchors stay as set."""
         self._model, self._anchors = model, anchors
@@ -73,7 +74,7 @@ class RangeErrors:
         self._before_m, self._after_m = np.zeros((tags, anchors)), np.zeros((tags, anchors))
         self._draws: list[np.random.Generator] = []
         if model.constant_m > 0.0 or model.changing_m > 0.0:
-            self._draws = [stream(seed, TAG_KEY, tag, _PURPOSE) for tag in range(tags)]
+            self._draws = [stream(seed, TAG_KEY, tag, purpose) for tag in range(tags)]
         for tag, draw in enumerate(self._draws):
             self._constant_m[tag] = draw.uniform(-model.constant_m, model.constant_m, anchors)
             self._before_m[tag] = model.changing_m * draw.standard_normal(anchors)

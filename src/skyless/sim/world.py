@@ -45,6 +45,8 @@ class Broadcast:
     """Their true positions at the emission, shape (n, 3)."""
     diagnostics: tuple[Diagnostics, ...] | None
     """What their radios measured, where the impairments ask for it."""
+    phases_cycles: Array | None = None
+    """Phases of the carrier, shape (n,), where they are simulated."""
 
     @property
     def emission_s(self) -> float:
@@ -55,9 +57,10 @@ class Broadcast:
         """Tag index, reception and true position, shape (3,), of every tag that received the frame."""
         frame, host_s = self.frame, self.end_s
         measured = self.diagnostics or (None,) * len(self.tags)
-        rows = zip(self.tags.tolist(), self.rx_ticks.tolist(), self.positions_m, measured, strict=True)
-        for tag, rx_ticks, position_m, diagnostics in rows:
-            yield tag, Reception(frame, rx_ticks, host_s, diagnostics), position_m
+        phases = (None,) * len(self.tags) if self.phases_cycles is None else self.phases_cycles.tolist()
+        rows = zip(self.tags.tolist(), self.rx_ticks.tolist(), self.positions_m, measured, phases, strict=True)
+        for tag, rx_ticks, position_m, diagnostics, phase in rows:
+            yield tag, Reception(frame, rx_ticks, host_s, diagnostics, phase), position_m
 
 
 def diagnostics_of(row: np.void) -> Diagnostics:
@@ -165,12 +168,14 @@ class World:
         """Pass the frame to the anchors that received it; returns the receptions of the tags."""
         flight, by_anchors, by_tags = delivery.flight, delivery.by_anchors, delivery.by_tags
         end_s, diagnostics = self.now_s, self._impairments.diagnostics
+        has_phases = self._impairments.carrier is not None
         rows = zip(by_anchors, by_anchors["node"].tolist(), by_anchors["rx_ticks"].tolist(), strict=True)
         for row, node, rx_ticks in rows:
             machine = self._machines[node]
             if machine is not None:
                 measured = diagnostics_of(row) if diagnostics else None
-                machine.hear(Reception(flight.frame, rx_ticks, end_s, measured))
+                phase = float(row["phase_cycles"]) if has_phases else None
+                machine.hear(Reception(flight.frame, rx_ticks, end_s, measured, phase))
         self._timeline.at(self._timeline.now_ticks, partial(self._ask, flight.sender, flight.boot))
         return Broadcast(
             self._anchors[flight.sender].id,
@@ -182,4 +187,5 @@ class World:
             by_tags["rx_ticks"],
             by_tags["position_m"],
             tuple(diagnostics_of(row) for row in by_tags) if diagnostics else None,
+            by_tags["phase_cycles"] if has_phases else None,
         )

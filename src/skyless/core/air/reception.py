@@ -19,8 +19,8 @@ class Reception(Struct, frozen=True, gc=False):
 
     ``frame`` is the whole PSDU, FCS included. ``rx_ticks`` is the receiver's own 40-bit counter at the frame's
     RMARKER, antenna delay already subtracted. ``host_s`` is the host's clock, needed only to bridge gaps over 8.6 s.
-    ``carrier_phase_cycles`` is the phase of the carrier at the first path, in [0, 1) cycles, where the radio measured it:
-    it falls by one cycle while ``rx_ticks`` grows by the time of one cycle (docs/phases.md).
+    ``carrier_phase_cycles`` is the phase of the carrier at the first path, in [0, 1), where the radio measured it: it
+    falls by one cycle while ``rx_ticks`` grows by the time of one (docs/phases.md).
     """
 
     frame: bytes
@@ -28,6 +28,11 @@ class Reception(Struct, frozen=True, gc=False):
     host_s: float | None = None
     diagnostics: Diagnostics | None = None
     carrier_phase_cycles: float | None = None
+
+
+def phase_of(reception: Reception) -> float:
+    """The phase of a reception's carrier in cycles, below 0 where it is not known: as compiled functions take it."""
+    return -1.0 if reception.carrier_phase_cycles is None else reception.carrier_phase_cycles
 
 
 class Transmission(Struct, frozen=True, gc=False):

@@ -64,6 +64,8 @@ class Packets(Struct, frozen=True):
     """[listener, sender, sequence number, RX stamp of the listener], shape (relays, 4)."""
     ends: Integers
     """Where the relays of each packet end."""
+    phases_cycles: Vector | None = None
+    """Phases of the carrier as the tag received it, shape (n,); below 0 where one is not known."""
 
 
 class SavedEstimator(Struct, frozen=True):
@@ -226,13 +228,15 @@ class Estimator:
         packed: bytes = b"",
         report: Report = NO_REPORT,
         variance_factor: float = 1.0,
+        phase_cycles: float = -1.0,
     ) -> int:
         """Process one packet of a known anchor; returns what became of it (``ACCEPTED`` …) and leaves ``rows``.
 
         ``relays``: identifier, sequence number and RX stamp; ``packed``: relays as frames carry them
-        (``codec.packed_relays``); ``variance_factor``: on the variance of the tag's reception.
+        (``codec.packed_relays``); ``variance_factor``: on the variance of the tag's reception; ``phase_cycles``:
+        of the carrier as the tag received it, in [0, 1), below 0 where it is not known.
         """
-        packet = self.packet_of(anchor, sequence, rx_ticks, tx_ticks, relays, report, variance_factor)
+        packet = self.packet_of(anchor, sequence, rx_ticks, tx_ticks, relays, report, variance_factor, phase_cycles)
         return compiled.process_frame(self._state, packet, packed, len(packed))
 
     def packet_of(
@@ -244,12 +248,14 @@ class Estimator:
         relays: Sequence[tuple[int, int, int]] = (),
         report: Report = NO_REPORT,
         variance_factor: float = 1.0,
+        phase_cycles: float = -1.0,
     ) -> Packet:
         """A packet of a known anchor as compiled functions take it, in the same memory each time; see ``process``."""
         packet = self._packet
         packet.place = self._known[anchor][1]
         packet.sequence, packet.rx_ticks, packet.tx_ticks = sequence, rx_ticks, tx_ticks
         packet.variance_factor = variance_factor
+        packet.has_phase, packet.phase_cycles = phase_cycles >= 0.0, phase_cycles
         packet.master, packet.subticks = report.master, report.subticks
         packet.report_variance_m2 = report.variance_m2
         packet.relay_count = min(len(relays), MAX_RELAYS)
@@ -279,6 +285,8 @@ class Estimator:
         given["place"], given["sequence"], given["end"] = indices, packets.sequences, packets.ends
         given["rx_ticks"], given["tx_ticks"] = packets.rx_ticks, packets.tx_ticks
         given["variance_factor"] = 1.0
+        if packets.phases_cycles is not None:
+            given["has_phase"], given["phase_cycles"] = packets.phases_cycles >= 0.0, packets.phases_cycles
         for column, name in enumerate(("listener", "anchor", "sequence", "rx_ticks")):
             relays[name] = packets.relays[:, column]
         rows = np.zeros(count, np.dtype(BatchRow))

@@ -55,14 +55,14 @@ UNUSED, USED, CLOCK_JUMPED = range(3)
 # The terms of a measurement
 
 
-def _add_term(s: State, state: int, weight: float) -> None:
+def add_term(s: State, state: int, weight: float) -> None:
     """The measurement holds so much of a state."""
     s.h[s.terms] = weight
     s.h_index[s.terms] = state
     s.terms += 1
 
 
-def _h_dot_x(s: State, begin: int) -> float:
+def h_dot_x(s: State, begin: int) -> float:
     """h·x of the terms from ``begin`` on."""
     total = 0.0
     for term in range(begin, s.terms):
@@ -70,15 +70,15 @@ def _h_dot_x(s: State, begin: int) -> float:
     return total
 
 
-def _direction_terms(s: State) -> int:
+def direction_terms(s: State) -> int:
     """Terms of a distance: the position, the anchor's survey error and, in two dimensions, the height's error."""
     return s.dim + 3
 
 
-def _add_direction(s: State, anchor: int, sign: float) -> float:
+def add_direction(s: State, anchor: int, sign: float) -> float:
     """The measurement holds the distance to an anchor, by the unit vector from there; returns the distance.
 
-    The anchor's survey error follows with the opposite sign, and the height's: ``_direction_terms`` in all. The vector
+    The anchor's survey error follows with the opposite sign, and the height's: ``direction_terms`` in all. The vector
     is that of the held point, of the surveyed anchor and of the given height: were it that of the newest estimate, its
     noise would seem to give information on what the ranges leave open.
     """
@@ -90,11 +90,11 @@ def _add_direction(s: State, anchor: int, sign: float) -> float:
         squared += square(up_m + s.x[where.height])
     for axis in range(s.dim):
         squared += square(s.x[axis] - a.position_m[axis] - s.x[survey + axis])
-        _add_term(s, axis, sign * (a.held_m[axis] - a.position_m[axis]) / a.held_range_m)
+        add_term(s, axis, sign * (a.held_m[axis] - a.position_m[axis]) / a.held_range_m)
     for axis in range(s.dim):
-        _add_term(s, survey + axis, -(sign * (a.held_m[axis] - a.position_m[axis]) / a.held_range_m))
+        add_term(s, survey + axis, -(sign * (a.held_m[axis] - a.position_m[axis]) / a.held_range_m))
     if s.dim == 2:
-        _add_term(s, where.height, sign * up_m / a.held_range_m)
+        add_term(s, where.height, sign * up_m / a.held_range_m)
     return max(sqrt(squared), 1e-6)
 
 
@@ -120,10 +120,10 @@ def _hold_direction(s: State, anchor: int) -> None:
 def _add_range_errors(s: State, anchor: int, sign: float) -> None:
     """The measurement holds an anchor's range errors: the part that changes, the part that stays, and the slope."""
     where, from_m = s.layout, s.tuning.slope_from_m
-    _add_term(s, where.change + anchor, sign)
-    _add_term(s, where.constant + anchor, sign)
+    add_term(s, where.change + anchor, sign)
+    add_term(s, where.constant + anchor, sign)
     far = min(max((s.anchors[anchor].held_range_m - from_m) / from_m, -1.0), 1.0)
-    _add_term(s, where.slope, sign * far)
+    add_term(s, where.slope, sign * far)
 
 
 def _find_curvature_m(s: State, range_m: float, variance: float) -> float:
@@ -149,10 +149,10 @@ def _find_curvature_m(s: State, range_m: float, variance: float) -> float:
 def reception_terms(s: State, anchor: int, has_tx_noise: bool) -> float:
     """Write the tag's reception of an anchor into ``h``; returns their distance."""
     s.terms = 0
-    range_m = _add_direction(s, anchor, 1.0)
-    _add_term(s, s.layout.offset + anchor, 1.0)
+    range_m = add_direction(s, anchor, 1.0)
+    add_term(s, s.layout.offset + anchor, 1.0)
     if has_tx_noise:
-        _add_term(s, s.layout.tx_noise + anchor, 1.0)
+        add_term(s, s.layout.tx_noise + anchor, 1.0)
     _add_range_errors(s, anchor, 1.0)
     return range_m
 
@@ -175,7 +175,7 @@ def own_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, varia
     range_m = reception_terms(s, anchor, a.is_relayed)
     curvature_m = _find_curvature_m(s, range_m, rx_variance)
     rx_variance += 2.0 * curvature_m * curvature_m
-    expected_m = range_m + curvature_m + _h_dot_x(s, _direction_terms(s))
+    expected_m = range_m + curvature_m + h_dot_x(s, direction_terms(s))
     innovation = (rx_ticks - tx_ticks - a.offset_ticks) * TICK_M - expected_m
     innovation_variance = compute_ph(s) + rx_variance
     a.range_m = range_m
@@ -230,13 +230,13 @@ def _jump(s: State, anchor: int, innovation: float, rx_variance: float) -> float
     """
     a, tuning = s.anchors[anchor], s.tuning
     if innovation < 0.0:
-        before_m = _h_dot_x(s, 0)
+        before_m = h_dot_x(s, 0)
         if a.is_obstructed:
             variance = a.change_variance_m2 + jump_share(s) * square(tuning.obstructed_std_m)
             reset_state(s, s.layout.change + anchor, variance)
         else:
             end_lasting_fault(s, anchor)
-        innovation += before_m - _h_dot_x(s, 0)
+        innovation += before_m - h_dot_x(s, 0)
         a.is_obstructed = False
         a.outliers_in_row = 0
         s.status.ends_of_obstructions += 1
@@ -255,27 +255,36 @@ def first_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> 
     offset, noise = where.offset + anchor, where.tx_noise + anchor
     reset_state(s, noise, settings.tx_variance_m2)
     reset_state(s, where.rate + anchor, 0.0)
-    a.has_rate = False
+    a.has_rate = a.has_phase = False
     reset_state(s, offset, 0.0)
     s.terms = 0
-    range_m = _add_direction(s, anchor, 1.0)
-    _add_term(s, noise, 1.0)
+    range_m = add_direction(s, anchor, 1.0)
+    add_term(s, noise, 1.0)
     _add_range_errors(s, anchor, 1.0)
     variance = settings.rx_variance_m2
     curvature_m = _find_curvature_m(s, range_m, variance)
     variance += 2.0 * curvature_m * curvature_m + compute_ph(s)
-    compute_fault_input(s, anchor)
-    for state in range(s.n):
-        s.P[state][offset] = -s.U[0][state]
-        s.P[offset][state] = -s.U[0][state]
-    s.P[offset][offset] = variance
-    for fault in range(s.rows):
-        s.V[offset][fault] = s.G[0][fault]
+    open_state(s, offset, anchor, variance)
     a.offset_ticks = rx_ticks - tx_ticks - floor(range_m / TICK_M)
     rest_m = (rx_ticks - tx_ticks - a.offset_ticks) * TICK_M
-    s.x[offset] = rest_m - range_m - curvature_m - _h_dot_x(s, _direction_terms(s))
+    s.x[offset] = rest_m - range_m - curvature_m - h_dot_x(s, direction_terms(s))
     a.has_tx_noise = True
     a.range_m = range_m
+
+
+def open_state(s: State, state: int, own: int, variance: float) -> None:
+    """Initialise the covariance of a state by a measurement: the limit of an update when nothing was known of it.
+
+    All errors of the measurement, of that variance, are in it then. ``h`` holds all but the state, which has been reset;
+    P·h of that is the first of ``U``. ``own``: the anchor whose reception by the tag it is, or −1.
+    """
+    compute_fault_input(s, own)
+    for other in range(s.n):
+        s.P[other][state] = -s.U[0][other]
+        s.P[state][other] = -s.U[0][other]
+    s.P[state][state] = variance
+    for fault in range(s.rows):
+        s.V[state][fault] = s.G[0][fault]
 
 
 def find_rate(s: State, anchor: int, innovation: float, innovation_variance: float, elapsed_s: float) -> None:
@@ -304,12 +313,12 @@ def relay_terms(s: State, listener: int, sender: int, age_s: float, has_tx_noise
     """Write an anchor's reception of another, ``age_s`` ago, into ``h``."""
     where = s.layout
     s.terms = 0
-    _add_term(s, where.offset + sender, 1.0)
-    _add_term(s, where.offset + listener, -1.0)
-    _add_term(s, where.rate + sender, -age_s)
-    _add_term(s, where.rate + listener, age_s)
+    add_term(s, where.offset + sender, 1.0)
+    add_term(s, where.offset + listener, -1.0)
+    add_term(s, where.rate + sender, -age_s)
+    add_term(s, where.rate + listener, age_s)
     if has_tx_noise:
-        _add_term(s, where.tx_noise + sender, 1.0)
+        add_term(s, where.tx_noise + sender, 1.0)
 
 
 def relay_variance(s: State, listener: int, sender: int, age_s: float) -> float:
@@ -337,7 +346,7 @@ def relay(s: State, listener: int, sender: int, tx_ticks: Ticks, packet_rx_ticks
     if not has_tx_noise:
         variance += settings.tx_variance_m2
     whole = j.offset_ticks - i.offset_ticks
-    innovation = (rx_ticks - tx_ticks - whole) * TICK_M - distance_m - link.constant_m - _h_dot_x(s, 0)
+    innovation = (rx_ticks - tx_ticks - whole) * TICK_M - distance_m - link.constant_m - h_dot_x(s, 0)
     innovation_variance = compute_ph(s) + variance + link.variance_m2
     normalised = innovation / sqrt(innovation_variance)
     if is_warm(s):
@@ -417,7 +426,7 @@ def _pair_range(s: State, one: int, other: int) -> None:
     link = _pair(s, one, other)
     s.terms = 0
     add_pair_survey(s, one, other)
-    innovation = link.constant_m - _h_dot_x(s, 0)
+    innovation = link.constant_m - h_dot_x(s, 0)
     innovation_variance = compute_ph(s) + square(s.settings.pair_std_m) + link.variance_m2
     link.contradicts = innovation * innovation > square(s.tuning.suspect) * innovation_variance
     if not link.contradicts:
@@ -429,8 +438,8 @@ def add_pair_survey(s: State, one: int, other: int) -> None:
     a, b, distance_m = s.anchors[one], s.anchors[other], _find_distance_m(s, one, other)
     for axis in range(s.dim):
         towards = (a.position_m[axis] - b.position_m[axis]) / distance_m
-        _add_term(s, s.layout.survey + s.dim * one + axis, towards)
-        _add_term(s, s.layout.survey + s.dim * other + axis, -towards)
+        add_term(s, s.layout.survey + s.dim * one + axis, towards)
+        add_term(s, s.layout.survey + s.dim * other + axis, -towards)
 
 
 # An anchor reports what its clock reads against the master's
@@ -455,7 +464,7 @@ def report(s: State, anchor: int, master: int, subticks: Ticks, variance_m2: flo
     off = (subticks - SUBTICKS * whole) & SUBTICK_MASK
     if off > SUBTICK_MASK // 2:
         off -= SUBTICK_MASK + 1
-    innovation = off * (TICK_M / SUBTICKS) - _h_dot_x(s, 0)
+    innovation = off * (TICK_M / SUBTICKS) - h_dot_x(s, 0)
     if not s.anchors[master].has_rate:
         elapsed_s = (status.epoch_ticks - s.anchors[master].rx_ticks) * TICK_S
         innovation_variance = compute_ph(s) + variance_m2
@@ -486,9 +495,9 @@ def difference_terms(s: State, a: int, b: int) -> float:
     Its gradient stands in the first terms, as the other kinds' directions do.
     """
     s.terms = 0
-    far_m = _add_direction(s, b, 1.0)
+    far_m = add_direction(s, b, 1.0)
     near = s.terms
-    near_m = _add_direction(s, a, -1.0)
+    near_m = add_direction(s, a, -1.0)
     s.anchors[b].range_m = far_m
     s.anchors[a].range_m = near_m
     for axis in range(s.dim):
@@ -511,7 +520,7 @@ def difference(s: State, a: int, b: int, rx_ticks: Ticks, difference_m: float) -
     relax_range_error(s, a, a_elapsed_s, walked_m - s.anchors[a].walked_m)
     relax_range_error(s, b, b_elapsed_s, walked_m - s.anchors[b].walked_m)
     expected_m = difference_terms(s, a, b)
-    innovation = difference_m - expected_m - _h_dot_x(s, 2 * _direction_terms(s))
+    innovation = difference_m - expected_m - h_dot_x(s, 2 * direction_terms(s))
     innovation_variance = compute_ph(s) + square(settings.difference_std_m)
     scale = variance_scale(s, innovation, innovation_variance, True)
     if scale == 0.0:
@@ -552,7 +561,7 @@ def height(s: State, height_m: float, std_m: float, is_barometer: bool) -> int:
     if s.dim == 2:
         innovation -= settings.height_m
     s.terms = 0
-    _add_term(s, where.height, 1.0)
+    add_term(s, where.height, 1.0)
     if is_barometer:
         zero = where.zero
         if s.P[zero][zero] == 0.0:
@@ -562,7 +571,7 @@ def height(s: State, height_m: float, std_m: float, is_barometer: bool) -> int:
         else:
             s.P[zero][zero] += settings.barometer_walk * ((status.epoch_ticks - status.height_ticks) * TICK_S)
         innovation -= s.x[zero]
-        _add_term(s, zero, 1.0)
+        add_term(s, zero, 1.0)
     innovation_variance = compute_ph(s) + square(std_m)
     if innovation * innovation > square(settings.gate) * innovation_variance:
         return UNUSED
@@ -580,7 +589,7 @@ def zero_velocity(s: State) -> None:
     for axis in range(s.dim):
         speed = s.layout.velocity + axis
         s.terms = 0
-        _add_term(s, speed, 1.0)
+        add_term(s, speed, 1.0)
         variance = compute_ph(s) + square(s.tuning.stationary_std_mps)
         compute_fault_input(s, -1)
         update(s, -s.x[speed], variance)

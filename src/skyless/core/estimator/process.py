@@ -21,6 +21,7 @@ from skyless.core.estimator.measurements import (
     zero_velocity,
 )
 from skyless.core.estimator.monitor import covariance_scale, update_stationary
+from skyless.core.estimator.phases import close_phases, own_phase
 from skyless.core.estimator.state import (
     AXES,
     LEVELS,
@@ -82,6 +83,9 @@ class Packet(Record):
     """The anchor's own."""
     variance_factor: float
     """On the variance of the tag's reception."""
+    has_phase: bool
+    phase_cycles: float
+    """Phase of the carrier as the tag received it, in [0, 1)."""
     master: int
     """Identifier of the anchor against whose clock this one reports its own; −1 where it reports nothing."""
     subticks: Ticks
@@ -179,6 +183,11 @@ def _process_of(s: State, anchor: int, packet: Packet) -> int:
         if result == CLOCK_JUMPED:
             return RESTARTED_CLOCK
         outcome = ACCEPTED if result == USED else REJECTED
+        if packet.has_phase:
+            if result == USED:
+                own_phase(s, anchor, packet.phase_cycles)
+            elif a.outliers_in_row > 1:
+                close_phases(s)
     is_known = a.packets > 0
     status.packets += 1
     _keep_packet(s, anchor, packet)
@@ -334,6 +343,8 @@ class BatchPacket(Record):
     rx_ticks: Ticks
     tx_ticks: Ticks
     variance_factor: float = 1.0
+    has_phase: bool
+    phase_cycles: float
     end: int
     """Where its relays end in their table; they begin where those of the packet before end."""
 
@@ -371,6 +382,7 @@ def track(
         packet.rx_ticks = given.rx_ticks
         packet.tx_ticks = given.tx_ticks
         packet.variance_factor = given.variance_factor
+        packet.has_phase, packet.phase_cycles = given.has_phase, given.phase_cycles
         packet.relay_count = min(given.end - begin, MAX_RELAYS)
         for place in range(packet.relay_count):
             packet.relays[place] = relays[begin + place]

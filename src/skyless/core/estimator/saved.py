@@ -19,15 +19,17 @@ from skyless.core.estimator.state import (
 from skyless.core.native.sizes import MAX_ANCHORS
 from skyless.core.native.views import view
 
-VERSION: Final = 2
+VERSION: Final = 3
 """Changes with the fields of ``State`` and of the records in it."""
-_HEAD: Final = Format("<HBB")
-"""Version, dimensions, anchors."""
+_HEAD: Final = Format("<HBBB")
+"""Version, dimensions, anchors, and whether there are ambiguities."""
 
 
 def packed_state(s: State) -> bytes:
     """A state as bytes: a head, then what is in use of each array."""
-    return _HEAD.pack(VERSION, s.dim, s.count) + b"".join(_packed(part).tobytes() for part in _parts(s))
+    return _HEAD.pack(VERSION, s.dim, s.count, s.status.has_phases) + b"".join(
+        _packed(part).tobytes() for part in _parts(s)
+    )
 
 
 def unpacked_state(settings: EstimatorSettings, packed: bytes) -> State:
@@ -41,7 +43,8 @@ def unpacked_state(settings: EstimatorSettings, packed: bytes) -> State:
     if len(packed) < _HEAD.size or _HEAD.unpack_from(packed)[:2] != (VERSION, settings.dim):
         raise ValueError("the estimator's state is of another version or of other settings")
     s, place = new_state(settings), _HEAD.size
-    s.count = _HEAD.unpack_from(packed)[2]
+    s.count, has_phases = _HEAD.unpack_from(packed)[2:]
+    s.status.has_phases = has_phases == 1
     if s.count > MAX_ANCHORS:
         raise ValueError(f"the estimator's state has {s.count} anchors; it can have {MAX_ANCHORS}")
     set_layout(s)
@@ -52,6 +55,8 @@ def unpacked_state(settings: EstimatorSettings, packed: bytes) -> State:
             raise ValueError("the estimator's state has a field that is neither true nor false")
         place += size
     identifiers = {s.anchors[anchor].identifier for anchor in range(s.count)}
+    if s.status.has_phases is not (has_phases == 1):
+        raise ValueError("the estimator's state has ambiguities and has none")
     if place != len(packed) or len(identifiers) != s.count:
         raise ValueError("the estimator's state is incomplete or holds an anchor twice")
     if not NO_RANGE_ERRORS <= s.status.range_errors <= ALL_RANGE_ERRORS:

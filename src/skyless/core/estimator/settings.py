@@ -242,6 +242,30 @@ class Tuning(Record):
     zero_variance_m2: float = 1e4
     """Variance of a barometer's zero at first [m²]."""
 
+    # Phases of the carrier
+    phase_std_m: float = 0.002
+    """Standard deviation of a phase before innovations show another [m] …"""
+    phase_min_std_m: float = 0.0005
+    phase_max_std_m: float = 0.006
+    """… its bounds [m] …"""
+    phase_forgetting: float = 0.005
+    """… and the weight of the newest in it."""
+    phase_wander: float = 25.0
+    """What reflections change in an ambiguity as the tag walks, in variances of a phase for each metre [1/m]."""
+    phase_gate: float = 0.35
+    """Part of a wavelength beyond which no innovation is used: half a wavelength may be the other way round."""
+    phase_share: float = 0.1
+    """Part of a wavelength up to which the standard deviation of a predicted phase leaves no doubt of the cycle."""
+    phase_former_s: float = 0.5
+    """Time for which an ambiguity from before a gap is kept to find by how many cycles it has changed [s]."""
+    phases_in_row: float = 4
+    """Number of phases of an anchor in a row beyond the gate at which its ambiguity begins again."""
+    phase_nis: float = 2.0
+    """Mean NIS of stamps beyond which a phase has a wrong cycle."""
+    phase_after_s: float = 1.0
+    """Time after the start from which phases are used [s]: places that still move by the stamps' noise would turn the
+    directions to the anchors, which phases would take for motion."""
+
     # Levels that are withheld
     uncovered_chi2: float = 240.0
     """Test beyond which faults are larger than levels cover."""
@@ -292,6 +316,8 @@ class EstimatorSettings(Record):
     lowest_m: float = -inf
     highest_m: float = inf
     """Bounds of the tag's height."""
+    carrier_cycles: int = 13
+    """Cycles of the carrier in 128 ticks, 13 of channel 5; its phases count where packets have them."""
     drop_s: float = 2.0
     """Anchors that are silent for longer leave the state."""
     relay_age_s: float = 1.0

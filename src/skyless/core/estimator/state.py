@@ -6,6 +6,8 @@ The state vector, all clocks against the tag's own counter, in metres and m/s:
                 whole ticks stand in ``Anchor``)
     rates       velocity (dim), then the rate of each offset
     tx noises   of each anchor's newest TX stamp, which all who received it share
+    ambiguities for each anchor what its carrier's phase shows beyond range and offset, once phases are used
+    formers     for each anchor its ambiguity up to a gap, while it is not known by how many cycles it has changed since
     changes     for each anchor the part of the tag's range error to it that changes as the tag moves
     constants   the part that stays
     slope       how ranges lengthen with distance
@@ -35,7 +37,7 @@ LANES: Final = 4
 """Numbers in a vector of 256 bits."""
 
 AXES: Final = 3
-STATES: Final = 2 * (AXES + MAX_ANCHORS) + (3 + AXES) * MAX_ANCHORS + 2
+STATES: Final = 2 * (AXES + MAX_ANCHORS) + (5 + AXES) * MAX_ANCHORS + 2
 """Capacity for states; a multiple of ``LANES``."""
 MOST_WAITING: Final = 8
 """Most updates that wait."""
@@ -115,6 +117,14 @@ class Anchor(Record):
     """The tag's walked distance at the newest of them."""
     place_residual_m: Annotated[Reals, 2]
     """What its reception left after the last two."""
+    has_phase: bool
+    """Whether its ambiguity is known."""
+    has_former: bool
+    former_ticks: Ticks
+    """The tag's reading when its former ambiguity ended."""
+    phases_refused_in_row: int
+    phase_walked_m: float
+    """The tag's walked distance at its newest phase."""
 
 
 @record
@@ -210,6 +220,18 @@ class Status(Record):
     """A point of the plane that lies closest to the anchors."""
     plane_normal: Annotated[Reals, AXES]
     """Normal of that plane."""
+    has_phases: bool
+    """Whether phases are used, so that there are ambiguities."""
+    phase_variance_m2: float
+    """Of a phase, as innovations show it."""
+    wild_share: float
+    """Running share of phases beyond the gate."""
+    phases_used: Count
+    phases_refused: Count
+    phases_opened: Count
+    """Ambiguities that began, or began again …"""
+    phases_rejoined: Count
+    """… and of these the ones of which it was then found by how many cycles they differ from the former."""
     has_open_ranges: bool
     """Whether anchors join with range errors beyond those of the settings."""
     range_errors: int
@@ -227,6 +249,9 @@ class Layout(Record):
     velocity: int
     rate: int
     tx_noise: int
+    ambiguity: int
+    former: int
+    """Both where phases are used; else they are the change's place, and not used."""
     change: int
     constant: int
     slope: int
@@ -319,6 +344,7 @@ def prepare(s: State) -> None:
     status.fault_std_m[CREEPING] = tuning.creeping_std_m
     status.place_square_m2[0] = status.place_square_m2[1] = status.mean_square_m2 = stamps_m2
     status.place_distance_m = settings.place_distance_m
+    status.phase_variance_m2 = square(tuning.phase_std_m)
     if settings.place_std_m > 0.0:
         status.range_errors = CHANGING_RANGE_ERRORS
     stated = max(settings.survey_std_m, settings.range_std_m, settings.slope_std_m, settings.height_std_m)
@@ -337,7 +363,10 @@ def set_layout(s: State) -> None:
     where.velocity = dim + count
     where.rate = where.velocity + dim
     where.tx_noise = where.rate + count
-    where.change = where.tx_noise + count
+    where.ambiguity = where.tx_noise + count
+    ambiguities = count if s.status.has_phases else 0
+    where.former = where.ambiguity + ambiguities
+    where.change = where.former + ambiguities
     where.constant = where.change + count
     where.slope = where.constant + count
     where.height = where.slope + 1 if dim == 2 else 2
@@ -382,7 +411,10 @@ def add_anchor(s: State, identifier: int, position_m: Reals, std_m: float, is_op
         _insert_state(s, where.end)
     _insert_state(s, where.slope)  # behind the block of constants, and so on: from the last to the first
     _insert_state(s, where.constant)
-    _insert_state(s, where.change)
+    if s.status.has_phases:
+        _insert_state(s, where.change)
+        _insert_state(s, where.former)
+    _insert_state(s, where.ambiguity)
     _insert_state(s, where.tx_noise)
     _insert_state(s, where.velocity)
     for kind in range(FAULT_KINDS):
@@ -418,6 +450,15 @@ def add_anchor(s: State, identifier: int, position_m: Reals, std_m: float, is_op
     return anchor
 
 
+def use_phases(s: State) -> None:
+    """From now on there are ambiguities, all of which are still to begin."""
+    if not s.status.has_phases:
+        for _ in range(2 * s.count):
+            _insert_state(s, s.layout.change)
+        s.status.has_phases = True
+        set_layout(s)
+
+
 def _clear_link(link: Link, variance_m2: float) -> None:
     """Nothing has been relayed from one anchor to another yet."""
     link.tx_ticks = NEVER
@@ -435,6 +476,9 @@ def remove_anchor(s: State, anchor: int) -> None:
         _remove_state(s, where.survey + dim * anchor)
     _remove_state(s, where.constant + anchor)
     _remove_state(s, where.change + anchor)
+    if s.status.has_phases:
+        _remove_state(s, where.former + anchor)
+        _remove_state(s, where.ambiguity + anchor)
     _remove_state(s, where.tx_noise + anchor)
     _remove_state(s, where.rate + anchor)
     _remove_state(s, where.offset + anchor)

@@ -13,6 +13,7 @@
  * skyless.core.estimator.levels
  * skyless.core.estimator.measurements
  * skyless.core.estimator.monitor
+ * skyless.core.estimator.phases
  * skyless.core.estimator.process
  * skyless.core.estimator.state
  * skyless.core.estimator.steady_state
@@ -116,6 +117,7 @@ INTERNAL void note_failed(SiteChoice *choice);
 INTERNAL int32_t received(SiteChoice *choice, int32_t counted, int64_t rx_ticks);
 INTERNAL void set_layout(State *s);
 INTERNAL void make_uncertain(State *s, int32_t range_errors);
+INTERNAL void use_phases(State *s);
 INTERNAL void clear_link(Link *link, real variance_m2);
 INTERNAL void insert_state(State *s, int32_t index_);
 INTERNAL void remove_state(State *s, int32_t index_);
@@ -198,6 +200,7 @@ INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64
 INTERNAL void carry_ticks(State *s, int32_t anchor);
 INTERNAL real jump(State *s, int32_t anchor, real innovation, real rx_variance);
 INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks);
+INTERNAL void open_state(State *s, int32_t state, int32_t own, real variance);
 INTERNAL void find_rate(State *s, int32_t anchor, real innovation, real innovation_variance, real elapsed_s);
 INTERNAL void relay_terms(State *s, int32_t listener, int32_t sender, real age_s, bool has_tx_noise);
 INTERNAL real relay_variance(State *s, int32_t listener, int32_t sender, real age_s);
@@ -215,6 +218,17 @@ INTERNAL int32_t difference(State *s, int32_t a, int32_t b, int64_t rx_ticks, re
 INTERNAL void bound_changes(State *s);
 INTERNAL int32_t height(State *s, real height_m, real std_m, bool is_barometer);
 INTERNAL void zero_velocity(State *s);
+INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles);
+INTERNAL real limit_m2(State *s, real variance, real wavelength_m);
+INTERNAL void learn_noise(State *s, real shown_m2);
+INTERNAL bool may_count(State *s, int32_t anchor);
+INTERNAL void close_phases(State *s);
+INTERNAL real phase_terms(State *s, int32_t anchor);
+INTERNAL real offset_cycles(State *s, int32_t anchor);
+INTERNAL void open(State *s, int32_t anchor, real innovation, real variance);
+INTERNAL void keep_former(State *s, int32_t anchor);
+INTERNAL real former_age_s(State *s, int32_t anchor);
+INTERNAL void rejoin(State *s, int32_t anchor, real wavelength_m);
 INTERNAL int32_t process(State *s, Packet *packet);
 INTERNAL void take_relays(Packet *packet, uint8_t *packed, int32_t packed_bytes);
 INTERNAL int32_t process_packet(State *s, Packet *packet);
@@ -989,6 +1003,8 @@ INTERNAL int32_t received(SiteChoice *choice, int32_t counted, int64_t rx_ticks)
  *                 whole ticks stand in ``Anchor``)
  *     rates       velocity (dim), then the rate of each offset
  *     tx noises   of each anchor's newest TX stamp, which all who received it share
+ *     ambiguities for each anchor what its carrier's phase shows beyond range and offset, once phases are used
+ *     formers     for each anchor its ambiguity up to a gap, while it is not known by how many cycles it has changed since
  *     changes     for each anchor the part of the tag's range error to it that changes as the tag moves
  *     constants   the part that stays
  *     slope       how ranges lengthen with distance
@@ -1017,6 +1033,7 @@ SKYLESS_EXPORT void skyless_prepare(State *s) {
     status->place_square_m2[1] = stamps_m2;
     status->place_square_m2[0] = stamps_m2;
     status->place_distance_m = settings->place_distance_m;
+    status->phase_variance_m2 = square(tuning->phase_std_m);
     if (settings->place_std_m > REAL(0.0)) {
         status->range_errors = CHANGING_RANGE_ERRORS;
     }
@@ -1041,7 +1058,10 @@ INTERNAL void set_layout(State *s) {
     where->velocity = dim + count;
     where->rate = where->velocity + dim;
     where->tx_noise = where->rate + count;
-    where->change = where->tx_noise + count;
+    where->ambiguity = where->tx_noise + count;
+    int32_t ambiguities = s->status.has_phases ? count : 0;
+    where->former = where->ambiguity + ambiguities;
+    where->change = where->former + ambiguities;
     where->constant = where->change + count;
     where->slope = where->constant + count;
     where->height = dim == 2 ? where->slope + 1 : 2;
@@ -1092,7 +1112,11 @@ SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *po
     }
     insert_state(s, where->slope);  /* behind the block of constants, and so on: from the last to the first */
     insert_state(s, where->constant);
-    insert_state(s, where->change);
+    if (s->status.has_phases) {
+        insert_state(s, where->change);
+        insert_state(s, where->former);
+    }
+    insert_state(s, where->ambiguity);
     insert_state(s, where->tx_noise);
     insert_state(s, where->velocity);
     for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
@@ -1139,6 +1163,17 @@ SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *po
     return anchor;
 }
 
+/* From now on there are ambiguities, all of which are still to begin. */
+INTERNAL void use_phases(State *s) {
+    if (!s->status.has_phases) {
+        for (int32_t time_1 = 0, time_1_end = 2 * s->count; time_1 < time_1_end; time_1++) {
+            insert_state(s, s->layout.change);
+        }
+        s->status.has_phases = true;
+        set_layout(s);
+    }
+}
+
 /* Nothing has been relayed from one anchor to another yet. */
 INTERNAL void clear_link(Link *link, real variance_m2) {
     link->tx_ticks = NEVER;
@@ -1159,6 +1194,10 @@ SKYLESS_EXPORT void skyless_remove_anchor(State *s, int32_t anchor) {
     }
     remove_state(s, where->constant + anchor);
     remove_state(s, where->change + anchor);
+    if (s->status.has_phases) {
+        remove_state(s, where->former + anchor);
+        remove_state(s, where->ambiguity + anchor);
+    }
     remove_state(s, where->tx_noise + anchor);
     remove_state(s, where->rate + anchor);
     remove_state(s, where->offset + anchor);
@@ -2647,7 +2686,7 @@ INTERNAL int32_t direction_terms(State *s) {
 
 /* The measurement holds the distance to an anchor, by the unit vector from there; returns the distance.
  *
- * The anchor's survey error follows with the opposite sign, and the height's: ``_direction_terms`` in all. The vector
+ * The anchor's survey error follows with the opposite sign, and the height's: ``direction_terms`` in all. The vector
  * is that of the held point, of the surveyed anchor and of the given height: were it that of the newest estimate, its
  * noise would seem to give information on what the ranges leave open. */
 INTERNAL real add_direction(State *s, int32_t anchor, real sign) {
@@ -2860,6 +2899,7 @@ INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_
     int32_t noise = where->tx_noise + anchor;
     reset_state(s, noise, settings->tx_variance_m2);
     reset_state(s, where->rate + anchor, REAL(0.0));
+    a->has_phase = false;
     a->has_rate = false;
     reset_state(s, offset, REAL(0.0));
     s->terms = 0;
@@ -2869,20 +2909,28 @@ INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_
     real variance = settings->rx_variance_m2;
     real curvature_m = find_curvature_m(s, range_m, variance);
     variance += REAL(2.0) * curvature_m * curvature_m + compute_ph(s);
-    compute_fault_input(s, anchor);
-    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-        s->P[state][offset] = -s->U[0][state];
-        s->P[offset][state] = -s->U[0][state];
-    }
-    s->P[offset][offset] = variance;
-    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-        s->V[offset][fault] = s->G[0][fault];
-    }
+    open_state(s, offset, anchor, variance);
     a->offset_ticks = rx_ticks - tx_ticks - floor_real(range_m / TICK_M);
     real rest_m = (real)(rx_ticks - tx_ticks - a->offset_ticks) * TICK_M;
     s->x[offset] = rest_m - range_m - curvature_m - h_dot_x(s, direction_terms(s));
     a->has_tx_noise = true;
     a->range_m = range_m;
+}
+
+/* Initialise the covariance of a state by a measurement: the limit of an update when nothing was known of it.
+ *
+ * All errors of the measurement, of that variance, are in it then. ``h`` holds all but the state, which has been reset;
+ * P·h of that is the first of ``U``. ``own``: the anchor whose reception by the tag it is, or −1. */
+INTERNAL void open_state(State *s, int32_t state, int32_t own, real variance) {
+    compute_fault_input(s, own);
+    for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
+        s->P[other][state] = -s->U[0][other];
+        s->P[state][other] = -s->U[0][other];
+    }
+    s->P[state][state] = variance;
+    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+        s->V[state][fault] = s->G[0][fault];
+    }
 }
 
 /* Initialise the rate of an anchor's clock by the first measurement of its offset after that of its first packet.
@@ -3237,6 +3285,196 @@ INTERNAL void zero_velocity(State *s) {
     }
 }
 
+/* The phase of the carrier: what the tag's receptions show besides their stamps, 20 times as fine but modulo a wavelength.
+ *
+ *     R − X  =  |p − a| + b + ambiguity + noise      (mod λ)
+ *
+ * X is when the anchor's counter says that the frame left: carriers start at a phase that the counter gives, so the noise of
+ * its TX stamp is not in it. The ambiguity holds what is constant as long as both radios keep their supply, and what
+ * reflections add, which changes as the tag walks. It stays a real number: as the tag walks, directions to the anchors turn,
+ * and ranges that are known to millimetres but for a constant tell where it is. ``docs/maths.md`` section 6.7.
+ *
+ * A wrong cycle in fast motion looks consistent and drags the position by metres. So a phase counts only with a stamp that was
+ * used, where it is predicted to a tenth of a wavelength; else its ambiguity begins again, from which nothing is learnt. Where
+ * stamps contradict, all begin again. */
+
+/* Process the phase of a reception of the tag's whose stamp was used; it is in [0, 1) and falls as stamps grow. */
+INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
+    Status *status = &s->status;
+    Tuning *tuning = &s->tuning;
+    Anchor *a = &s->anchors[anchor];
+    use_phases(s);
+    finish_updates(s);
+    if (!a->has_rate || !may_count(s, anchor)) {
+        a->has_former = false;
+        a->has_phase = false;
+        return;
+    }
+    int32_t ambiguity = s->layout.ambiguity + anchor;
+    real wavelength_m = (real)CYCLE_TICKS * TICK_M / (real)s->settings.carrier_cycles;
+    if (a->has_phase) {
+        real walked_m = status->walked_m - a->phase_walked_m;
+        s->P[ambiguity][ambiguity] += tuning->phase_wander * status->phase_variance_m2 * walked_m;
+    }
+    a->phase_walked_m = status->walked_m;
+    real expected_m = phase_terms(s, anchor);
+    real cycles = -phase_cycles - offset_cycles(s, anchor) - expected_m / wavelength_m;
+    real innovation = (cycles - (real)floor_real(cycles + REAL(0.5))) * wavelength_m;
+    real variance = status->phase_variance_m2;
+    real predicted = compute_ph(s);
+    if (!a->has_phase || predicted > square(tuning->phase_share * wavelength_m)) {
+        if (a->has_phase) {
+            keep_former(s, anchor);
+        }
+        open(s, anchor, innovation, variance);
+        return;
+    }
+    real squared = square(innovation);
+    bool is_beyond = squared > limit_m2(s, predicted + variance, wavelength_m);
+    status->wild_share += tuning->phase_forgetting * ((is_beyond ? REAL(1.0) : REAL(0.0)) - status->wild_share);
+    if (is_beyond) {
+        status->phases_refused += 1;
+        a->phases_refused_in_row += 1;
+        if (a->phases_refused_in_row >= truncated(tuning->phases_in_row)) {
+            open(s, anchor, innovation, variance);
+        }
+        return;
+    }
+    learn_noise(s, squared - predicted);
+    a->phases_refused_in_row = 0;
+    status->phases_used += 1;
+    compute_fault_input(s, -1);
+    update(s, innovation, predicted + variance, REAL(1.0));
+    if (a->has_former) {
+        rejoin(s, anchor, wavelength_m);
+    }
+}
+
+/* Square of the innovation beyond which a phase is more likely any than noise, or may be the other way round. */
+INTERNAL real limit_m2(State *s, real variance, real wavelength_m) {
+    real gate_squared = square(s->settings.gate);
+    real odds = min_real(s->status.wild_share, REAL(0.5)) * SQRT(TWO_PI * variance) / wavelength_m;
+    if (odds > REAL(1e-06)) {
+        gate_squared = min_real(gate_squared, -REAL(2.0) * log_(odds));
+    }
+    return min_real(gate_squared * variance, square(s->tuning.phase_gate * wavelength_m));
+}
+
+/* Let the variance of phases follow what innovations show beyond their prediction: more where reflections do more. */
+INTERNAL void learn_noise(State *s, real shown_m2) {
+    Tuning *tuning = &s->tuning;
+    Status *status = &s->status;
+    status->phase_variance_m2 += tuning->phase_forgetting * (shown_m2 - status->phase_variance_m2);
+    status->phase_variance_m2 = min_real(max_real(status->phase_variance_m2, square(tuning->phase_min_std_m)),
+            square(tuning->phase_max_std_m));
+}
+
+/* Whether phases of an anchor may count: not just after the start, nor where stamps contradict or come late. */
+INTERNAL bool may_count(State *s, int32_t anchor) {
+    Status *status = &s->status;
+    Tuning *tuning = &s->tuning;
+    Anchor *a = &s->anchors[anchor];
+    if (status->mean_nis > tuning->phase_nis) {
+        close_phases(s);
+    }
+    bool is_settled = (real)(status->epoch_ticks - status->start_ticks) * TICK_S >= tuning->phase_after_s;
+    return is_settled && status->mean_nis <= tuning->phase_nis && !(a->is_obstructed || a->has_fault);
+}
+
+/* Let all ambiguities begin again: what they were taken for may be wrong by cycles. */
+INTERNAL void close_phases(State *s) {
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        s->anchors[anchor].has_former = false;
+        s->anchors[anchor].has_phase = false;
+    }
+}
+
+/* Write a phase of the tag's into ``h``; returns what is expected of it but for whole ticks of the offset. */
+INTERNAL real phase_terms(State *s, int32_t anchor) {
+    s->terms = 0;
+    real range_m = add_direction(s, anchor, REAL(1.0));
+    int32_t first = s->terms;
+    add_term(s, s->layout.offset + anchor, REAL(1.0));
+    add_term(s, s->layout.ambiguity + anchor, REAL(1.0));
+    return range_m + h_dot_x(s, first);
+}
+
+/* Cycles in the whole ticks of an offset, in [0, 1). */
+INTERNAL real offset_cycles(State *s, int32_t anchor) {
+    return (real)floor_mod_64((s->anchors[anchor].offset_ticks & (CYCLE_TICKS - 1)) * s->settings.carrier_cycles,
+            CYCLE_TICKS) / (real)CYCLE_TICKS;
+}
+
+/* Let an anchor's ambiguity begin, so that this phase is as expected. */
+INTERNAL void open(State *s, int32_t anchor, real innovation, real variance) {
+    Anchor *a = &s->anchors[anchor];
+    s->status.phases_opened += 1;
+    a->has_phase = true;
+    a->phases_refused_in_row = truncated(s->tuning.phases_in_row) - 1;  /* one that the next does not confirm was wrong */
+    int32_t state = s->layout.ambiguity + anchor;
+    real ambiguity_m = s->x[state] + innovation;
+    reset_state(s, state, REAL(0.0));
+    s->terms -= 1;  /* all but the ambiguity, which is the last */
+    open_state(s, state, -1, variance + compute_ph(s));
+    s->x[state] = ambiguity_m;
+}
+
+/* By how many cycles an ambiguity has changed over a gap */
+
+/* Keep an ambiguity that ends, unless there is one already that has not been kept for long. */
+INTERNAL void keep_former(State *s, int32_t anchor) {
+    Anchor *a = &s->anchors[anchor];
+    int32_t former = s->layout.former + anchor;
+    int32_t ambiguity = s->layout.ambiguity + anchor;
+    if (a->has_former && former_age_s(s, anchor) < s->tuning.phase_former_s) {
+        return;
+    }
+    a->has_former = true;
+    a->former_ticks = s->status.epoch_ticks;
+    s->x[former] = s->x[ambiguity];
+    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+        s->P[former][state] = s->P[ambiguity][state];
+    }
+    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+        s->P[state][former] = s->P[state][ambiguity];
+    }
+    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+        s->V[former][fault] = s->V[ambiguity][fault];
+    }
+}
+
+INTERNAL real former_age_s(State *s, int32_t anchor) {
+    return (real)(s->status.epoch_ticks - s->anchors[anchor].former_ticks) * TICK_S;
+}
+
+/* Let an ambiguity and its former one be the same but for whole cycles, once their number is beyond doubt.
+ *
+ * What was received after a gap shows how clocks and tag have moved within it. */
+INTERNAL void rejoin(State *s, int32_t anchor, real wavelength_m) {
+    Tuning *tuning = &s->tuning;
+    Anchor *a = &s->anchors[anchor];
+    if (former_age_s(s, anchor) > tuning->phase_former_s) {
+        a->has_former = false;
+        return;
+    }
+    s->terms = 0;
+    add_term(s, s->layout.ambiguity + anchor, REAL(1.0));
+    add_term(s, s->layout.former + anchor, -REAL(1.0));
+    real predicted = compute_ph(s);
+    real variance = s->status.phase_variance_m2;
+    if (predicted > square(tuning->phase_share * wavelength_m)) {
+        return;
+    }
+    real cycles = -h_dot_x(s, 0) / wavelength_m;
+    real innovation = (cycles - (real)floor_real(cycles + REAL(0.5))) * wavelength_m;
+    a->has_former = false;
+    if (square(innovation) <= limit_m2(s, predicted + variance, wavelength_m)) {
+        s->status.phases_rejoined += 1;
+        compute_fault_input(s, -1);
+        update(s, innovation, predicted + variance, REAL(1.0));
+    }
+}
+
 /* What the estimator does with a packet, a ready-made difference or a height; and with many packets in one loop. */
 
 /* One packet */
@@ -3345,6 +3583,13 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet) {
             return RESTARTED_CLOCK;
         }
         outcome = result == USED ? ACCEPTED : REJECTED;
+        if (packet->has_phase) {
+            if (result == USED) {
+                own_phase(s, anchor, packet->phase_cycles);
+            } else if (a->outliers_in_row > 1) {
+                close_phases(s);
+            }
+        }
     }
     bool is_known = a->packets > 0;
     status->packets += 1;
@@ -3525,6 +3770,8 @@ SKYLESS_EXPORT void skyless_track(State *s, Place *places, BatchPacket *packets,
         packet.rx_ticks = given->rx_ticks;
         packet.tx_ticks = given->tx_ticks;
         packet.variance_factor = given->variance_factor;
+        packet.has_phase = given->has_phase;
+        packet.phase_cycles = given->phase_cycles;
         packet.relay_count = min_32(given->end - begin, MAX_RELAYS);
         for (int32_t place = 0, place_end = packet.relay_count; place < place_end; place++) {
             packet.relays[place] = relays[begin + place];
@@ -5426,19 +5673,19 @@ INTERNAL int32_t fitting_relays(Neighbours *t, State *s, BeaconFields *b, int64_
 
 /* Process a frame from the air; what becomes of it: of ``DROP_COUNTERS``, of a course, or one of the above.
  *
- * ``host_s`` and the powers are NaN where they are not known. Course and state are not used while it is starting. */
+ * ``host_s`` and the powers are NaN, and the phase is below 0, where they are not known. Course and state are not used while it is starting. */
 SKYLESS_EXPORT int32_t skyless_hear_frame(Hearing *h, Course *c, State *s, uint8_t *frame, int32_t length, int64_t
-        rx_counter, real host_s, real rx_power_dbm, real first_path_power_dbm) {
+        rx_counter, real host_s, real rx_power_dbm, real first_path_power_dbm, real phase_cycles) {
     int32_t fault = skyless_read_frame(frame, length, &h->beacon);
     if (fault != INTACT) {
         return MALFORMED + fault;
     }
-    return skyless_hear_fields(h, c, s, rx_counter, host_s, rx_power_dbm, first_path_power_dbm);
+    return skyless_hear_fields(h, c, s, rx_counter, host_s, rx_power_dbm, first_path_power_dbm, phase_cycles);
 }
 
 /* The same of a beacon that has been read already. */
 SKYLESS_EXPORT int32_t skyless_hear_fields(Hearing *h, Course *c, State *s, int64_t rx_counter, real host_s, real
-        rx_power_dbm, real first_path_power_dbm) {
+        rx_power_dbm, real first_path_power_dbm, real phase_cycles) {
     Admission *a = &h->admission;
     BeaconFields *b = &h->beacon;
     int32_t outcome = skyless_admit_sender(a, b->site, b->anchor, rx_counter, host_s);
@@ -5456,6 +5703,8 @@ SKYLESS_EXPORT int32_t skyless_hear_fields(Hearing *h, Course *c, State *s, int6
     n->period_code = b->period_code;
     h->has_moved = b->has_place && keep_place(n, &b->place);
     fill_packet(&h->packet, h, n, variance_factor(rx_power_dbm, first_path_power_dbm));
+    h->packet.has_phase = phase_cycles >= REAL(0.0);
+    h->packet.phase_cycles = phase_cycles;
     if (h->is_starting || h->has_moved || h->is_moving || b->almanac_issue != h->almanac_issue || !n->has_place) {
         return IS_RARE;
     }

@@ -13,6 +13,7 @@
  * skyless.core.estimator.levels
  * skyless.core.estimator.measurements
  * skyless.core.estimator.monitor
+ * skyless.core.estimator.phases
  * skyless.core.estimator.process
  * skyless.core.estimator.state
  * skyless.core.estimator.steady_state
@@ -96,6 +97,8 @@ typedef double real;
 #define COUNT_BYTES 2
 #define COUNT_MASK 15
 #define CREEPING 2
+/* In so many ticks there are whole cycles of each channel's carrier: ``EstimatorSettings.carrier_cycles``. */
+#define CYCLE_TICKS 128
 #define DELAYED_TX_GRANULARITY_TICKS 512
 /* Columns are not independent if their smallest singular value is below this part of the largest. */
 #define DEPENDENT REAL(1e-06)
@@ -282,6 +285,7 @@ typedef double real;
 #define TOO_SHORT 1
 /* A site that has given no fix for this time is left for another one: none holds a tag by its number of anchors. */
 #define TRIAL_TICKS INT64_C(319488000000)
+#define TWO_PI REAL(6.283185307179586)
 #define UNAVAILABLE 3
 #define UNCERTAIN 8
 #define UNDETERMINED 1
@@ -443,6 +447,8 @@ typedef struct Packet {
     int64_t rx_ticks;  /* The tag's stamp. */
     int64_t tx_ticks;  /* The anchor's own. */
     real variance_factor;  /* On the variance of the tag's reception. */
+    bool has_phase;
+    real phase_cycles;  /* Phase of the carrier as the tag received it, in [0, 1). */
     /* Identifier of the anchor against whose clock this one reports its own; −1 where it reports nothing. */
     int32_t master;
     int64_t subticks;  /* The anchor's reading less the master's at the packet's TX stamp, modulo 2⁴⁸. */
@@ -503,6 +509,8 @@ typedef struct EstimatorSettings {
     real height_std_m;  /* Standard deviation of the given height. */
     real lowest_m;
     real highest_m;  /* Bounds of the tag's height. */
+    /* Cycles of the carrier in 128 ticks, 13 of channel 5; its phases count where packets have them. */
+    int32_t carrier_cycles;
     real drop_s;  /* Anchors that are silent for longer leave the state. */
     real relay_age_s;  /* Older packets are not relayed, as sequence numbers come around. */
     real survey_std_m;  /* Standard deviation of each coordinate of an anchor. */
@@ -673,6 +681,24 @@ typedef struct Tuning {
     real neighbourhood;
     real most_horizontal_std_m;  /* While its horizontal standard deviation is larger, there is no fix [m]. */
     real zero_variance_m2;  /* Variance of a barometer's zero at first [m²]. */
+    real phase_std_m;  /* Standard deviation of a phase before innovations show another [m] … */
+    real phase_min_std_m;
+    real phase_max_std_m;  /* … its bounds [m] … */
+    real phase_forgetting;  /* … and the weight of the newest in it. */
+    /* What reflections change in an ambiguity as the tag walks, in variances of a phase for each metre [1/m]. */
+    real phase_wander;
+    /* Part of a wavelength beyond which no innovation is used: half a wavelength may be the other way round. */
+    real phase_gate;
+    /* Part of a wavelength up to which the standard deviation of a predicted phase leaves no doubt of the cycle. */
+    real phase_share;
+    /* Time for which an ambiguity from before a gap is kept to find by how many cycles it has changed [s]. */
+    real phase_former_s;
+    /* Number of phases of an anchor in a row beyond the gate at which its ambiguity begins again. */
+    real phases_in_row;
+    real phase_nis;  /* Mean NIS of stamps beyond which a phase has a wrong cycle. */
+    /* Time after the start from which phases are used [s]: places that still move by the stamps' noise would turn the
+     * directions to the anchors, which phases would take for motion. */
+    real phase_after_s;
     real uncovered_chi2;  /* Test beyond which faults are larger than levels cover. */
     /* Part of the mean range beyond which, where all range errors are open, a standard deviation has no level. */
     real max_open_level_std;
@@ -692,6 +718,8 @@ typedef struct Layout {
     int32_t velocity;
     int32_t rate;
     int32_t tx_noise;
+    int32_t ambiguity;
+    int32_t former;  /* Both where phases are used; else they are the change's place, and not used. */
     int32_t change;
     int32_t constant;
     int32_t slope;
@@ -745,6 +773,14 @@ typedef struct Status {
     int64_t height_ticks;  /* The tag's reading when a sensor's height was used last. */
     real plane_m[3];  /* A point of the plane that lies closest to the anchors. */
     real plane_normal[3];  /* Normal of that plane. */
+    bool has_phases;  /* Whether phases are used, so that there are ambiguities. */
+    real phase_variance_m2;  /* Of a phase, as innovations show it. */
+    real wild_share;  /* Running share of phases beyond the gate. */
+    int64_t phases_used;
+    int64_t phases_refused;
+    int64_t phases_opened;  /* Ambiguities that began, or began again … */
+    /* … and of these the ones of which it was then found by how many cycles they differ from the former. */
+    int64_t phases_rejoined;
     bool has_open_ranges;  /* Whether anchors join with range errors beyond those of the settings. */
     int32_t range_errors;  /* NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS or ALL_RANGE_ERRORS. */
     real fault_std_m[3];  /* Of each kind of faults, beforehand. */
@@ -779,6 +815,11 @@ typedef struct Anchor {
     int32_t place_steps;  /* Steps of the tag after which its range error was compared, in a row. */
     real place_walked_m;  /* The tag's walked distance at the newest of them. */
     real place_residual_m[2];  /* What its reception left after the last two. */
+    bool has_phase;  /* Whether its ambiguity is known. */
+    bool has_former;
+    int64_t former_ticks;  /* The tag's reading when its former ambiguity ended. */
+    int32_t phases_refused_in_row;
+    real phase_walked_m;  /* The tag's walked distance at its newest phase. */
 } Anchor;
 
 /* A packet that others may relay. */
@@ -800,11 +841,11 @@ typedef struct Link {
 
 /* Everything that the estimator keeps of one tag. What loops run over stands first: its rows fill cache lines. */
 typedef struct State {
-    real x[264];
-    real P[264][264];  /* Symmetric to the bit. */
+    real x[328];
+    real P[328][328];  /* Symmetric to the bit. */
     /* What faults do to x: of each kind for each metre by which receptions of an anchor are late, then for each m/s² of
      * acceleration along an axis, then what planning adds. */
-    real V[264][112];
+    real V[328][112];
     EstimatorSettings settings;
     Tuning tuning;
     real horizontal_k;  /* How many standard deviations the risk of levels allows. */
@@ -828,7 +869,7 @@ typedef struct State {
     real h[20];  /* The measurement where it is not zero, at the indices in ``h_index``. */
     int32_t h_index[20];
     int32_t waiting;  /* Updates that are not in P and V yet: those of a packet's relays go there together. */
-    real U[8][264];  /* Of each its u = P·h/√S; then P·h of the measurement at hand. */
+    real U[8][328];  /* Of each its u = P·h/√S; then P·h of the measurement at hand. */
     /* Of each, over √S, by how much each fault is in its innovation; then the same of the measurement at hand. */
     real G[8][112];
     real work[39][32];  /* Scratch for systems of equations of all faults of one kind. */
@@ -843,6 +884,8 @@ typedef struct BatchPacket {
     int64_t rx_ticks;
     int64_t tx_ticks;
     real variance_factor;
+    bool has_phase;
+    real phase_cycles;
     int32_t end;  /* Where its relays end in their table; they begin where those of the packet before end. */
 } BatchPacket;
 
@@ -1071,8 +1114,8 @@ SKYLESS_EXPORT int32_t skyless_admit_stamp(Admission *a, int32_t anchor, int32_t
 SKYLESS_EXPORT int32_t skyless_process_in_course(Course *c, State *s, FixTime *time, Packet *packet, uint8_t *packed,
         int32_t packed_bytes);
 SKYLESS_EXPORT int32_t skyless_hear_frame(Hearing *h, Course *c, State *s, uint8_t *frame, int32_t length, int64_t
-        rx_counter, real host_s, real rx_power_dbm, real first_path_power_dbm);
+        rx_counter, real host_s, real rx_power_dbm, real first_path_power_dbm, real phase_cycles);
 SKYLESS_EXPORT int32_t skyless_hear_fields(Hearing *h, Course *c, State *s, int64_t rx_counter, real host_s, real
-        rx_power_dbm, real first_path_power_dbm);
+        rx_power_dbm, real first_path_power_dbm, real phase_cycles);
 
 #endif

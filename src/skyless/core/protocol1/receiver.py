@@ -12,7 +12,7 @@ from msgspec import Struct
 from skyless.core.air.almanac import AccuracyPage, NoisePage, SchedulePage
 from skyless.core.air.first_path import variance_factor_of
 from skyless.core.air.frame import Heard, Malformed
-from skyless.core.air.reception import Reception
+from skyless.core.air.reception import Reception, phase_of
 from skyless.core.air.site_choice import NO_SITE, note_fix
 from skyless.core.arrays import Array
 from skyless.core.constants import SUBTICKS, TICK_M
@@ -222,7 +222,7 @@ class Receiver(BeaconReceiver):
         return Observation(
             beacon.anchor, anchor_m, 0, beacon.sequence, rx_ticks, tx_ticks, None, None, ticks_master, fraction,
             variance_m2, (), self._report(beacon, tx_ticks, ticks_master), factor,
-            packed_relays(reception.frame, beacon),
+            packed_relays(reception.frame, beacon), None, phase_of(reception),
         )  # fmt: skip
 
     def _report(self, beacon: Beacon, tx_ticks: int, ticks_master: int | None) -> tuple[int, int] | None:

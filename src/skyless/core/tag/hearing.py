@@ -56,15 +56,16 @@ def hear_frame(
     host_s: float,
     rx_power_dbm: float,
     first_path_power_dbm: float,
+    phase_cycles: float,
 ) -> int:
     """Process a frame from the air; what becomes of it: of ``DROP_COUNTERS``, of a course, or one of the above.
 
-    ``host_s`` and the powers are NaN where they are not known. Course and state are not used while it is starting.
+    ``host_s`` and the powers are NaN, and the phase is below 0, where they are not known. Course and state are not used while it is starting.
     """
     fault = read_frame(frame, length, h.beacon)
     if fault != INTACT:
         return MALFORMED + fault
-    return hear_fields(h, c, s, rx_counter, host_s, rx_power_dbm, first_path_power_dbm)
+    return hear_fields(h, c, s, rx_counter, host_s, rx_power_dbm, first_path_power_dbm, phase_cycles)
 
 
 def hear_fields(
@@ -75,6 +76,7 @@ def hear_fields(
     host_s: float,
     rx_power_dbm: float,
     first_path_power_dbm: float,
+    phase_cycles: float,
 ) -> int:
     """The same of a beacon that has been read already."""
     a, b = h.admission, h.beacon
@@ -90,6 +92,7 @@ def hear_fields(
     n.almanac_issue, n.period_code = b.almanac_issue, b.period_code
     h.has_moved = b.has_place and keep_place(n, b.place)
     _fill_packet(h.packet, h, n, variance_factor(rx_power_dbm, first_path_power_dbm))
+    h.packet.has_phase, h.packet.phase_cycles = phase_cycles >= 0.0, phase_cycles
     if h.is_starting or h.has_moved or h.is_moving or b.almanac_issue != h.almanac_issue or not n.has_place:
         return IS_RARE
     if find_anchor(s, b.anchor) < 0:

@@ -310,6 +310,7 @@ class Estimation:
             observation.relays,
             self._report(observation),
             observation.rx_variance_factor,
+            observation.phase_cycles,
         )
 
     def _report(self, observation: Observation) -> Report:

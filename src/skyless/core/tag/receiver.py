@@ -14,7 +14,7 @@ from skyless.core.air.codec import FAULTS, fields_of, page_of
 from skyless.core.air.first_path import powers_dbm
 from skyless.core.air.local_almanac import MIN_ANCHORS, PRESENT_TICKS, LocalAlmanac
 from skyless.core.air.neighbours import find_neighbour, is_confirmed
-from skyless.core.air.reception import Reception
+from skyless.core.air.reception import Reception, phase_of
 from skyless.core.air.site_choice import NO_SITE, note_fix
 from skyless.core.estimator.state import State
 from skyless.core.fix import Fix, NoFixReason
@@ -158,6 +158,7 @@ class Receiver(BeaconReceiver):
             nan if host_s is None else host_s,
             rx_dbm,
             first_path_dbm,
+            phase_of(reception),
         )
         if outcome == FIX:
             counters, method = self.counters, self._method
@@ -174,7 +175,9 @@ class Receiver(BeaconReceiver):
         self._hearing.beacon = fields_of(beacon)
         host_s = nan if reception.host_s is None else reception.host_s
         powers = powers_dbm(reception.diagnostics)
-        outcome = _hear_fields(self._hearing, self._course, self._state, reception.rx_ticks, host_s, *powers)
+        outcome = _hear_fields(
+            self._hearing, self._course, self._state, reception.rx_ticks, host_s, *powers, phase_of(reception)
+        )
         return self._after(outcome, b"", beacon.page)
 
     def hear_height(self, height_m: float, std_m: float) -> bool:
@@ -233,6 +236,7 @@ class Receiver(BeaconReceiver):
         observation = Observation(
             anchor, view(packet.place.position_m).copy(), 0, beacon.sequence, rx_ticks, packet.tx_ticks, None, None,
             None, 0.0, 0.0, (), None, packet.variance_factor, relays, packet.place.std_m,
+            packet.phase_cycles if packet.has_phase else -1.0,
         )  # fmt: skip
         method = self._method
         if method is None:
