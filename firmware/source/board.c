@@ -6,7 +6,8 @@
 static const uint8_t VERSION[3] = {0u, 2u, 0u};
 
 /* How long before its time a frame is handed to the chip: a reception that is being reported then (0.29 ms), what is
- * written over the SPI until it starts (0.14 ms; docs/hardware.md) and its preamble (0.14 ms). */
+ * written over the SPI until it starts (0.14 ms; docs/hardware.md) and its preamble (0.14 ms). Phases, which take 0.03 ms
+ * more, are for boards that only listen. */
 #define LEAD_US 600
 /* A time closer than this is not checked again against the chip's counter. */
 #define CLOSE_US 30
