@@ -16,7 +16,7 @@
 #include "board.h"
 #include "dw1000_registers.h"
 
-#define MAX_FRAMES 64u
+#define MAX_FRAMES 256u
 
 static uint64_t state = 1u;
 static uint64_t line_bytes;
@@ -183,7 +183,7 @@ static void know(const uint8_t *frame, uint32_t size)
     uint32_t at = known_count % MAX_FRAMES;
 
     if (known_count >= MAX_FRAMES) {
-        at = any(MAX_FRAMES - 1u); /* the last one may wait to be sent */
+        at = any(MAX_FRAMES / 2u); /* a younger one may wait to be sent */
         (void)memmove(&known_frames[at], &known_frames[at + 1u], sizeof known_frames[0] * (MAX_FRAMES - 1u - at));
         (void)memmove(&known_bytes[at], &known_bytes[at + 1u], sizeof known_bytes[0] * (MAX_FRAMES - 1u - at));
         at = MAX_FRAMES - 1u;
@@ -278,7 +278,7 @@ static bool write_line(const uint8_t *line, uint32_t size)
     if (has_number && (reader.record[1] != next_number)) {
         fail("the board's numbers do not follow one another");
     }
-    if ((reader.record[0] < LINK_HELLO) || (reader.record[0] > LINK_REFUSED)) {
+    if ((reader.record[0] < LINK_HELLO) || (reader.record[0] > LINK_RX_PHASE)) {
         fail("the board wrote a record of an unknown kind");
     }
     heard_kinds[reader.record[0]]++;
@@ -337,7 +337,7 @@ int main(int count, char **words)
         fail("the board does not work again");
     }
     (void)printf("%" PRIu64 " bytes in, %" PRIu64 " out; %" PRIu64 " frames to the chip; records:", line_bytes, written, sent);
-    for (uint32_t kind = LINK_HELLO; kind <= LINK_REFUSED; kind++) {
+    for (uint32_t kind = LINK_HELLO; kind <= LINK_RX_PHASE; kind++) {
         (void)printf(" %" PRIu64, heard_kinds[kind]);
         if (heard_kinds[kind] == 0u) {
             fail("a kind of record never came");

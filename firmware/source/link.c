@@ -119,11 +119,12 @@ void link_write_hello(struct link_writer *writer, const struct link_hello *hello
 void link_write_rx(struct link_writer *writer, uint64_t rx_ticks, const struct link_measured *measured,
                    const uint8_t *frame, uint32_t frame_bytes)
 {
-    begin(writer, LINK_RX);
+    begin(writer, (measured->phase < 0) ? LINK_RX : LINK_RX_PHASE);
     append(writer, rx_ticks, LINK_STAMP_BYTES);
     append(writer, (uint32_t)measured->rx_power_cdbm, 2u);
     append(writer, (uint32_t)measured->first_path_cdbm, 2u);
     append(writer, (uint32_t)measured->offset_ppb, 2u);
+    append(writer, (uint32_t)measured->phase, (measured->phase < 0) ? 0u : 2u);
     append_bytes(writer, frame, frame_bytes);
     end(writer);
 }

@@ -10,7 +10,7 @@
 #include <stdint.h>
 
 #define LINK_MAJOR 1u
-#define LINK_MINOR 1u
+#define LINK_MINOR 2u
 
 /* From the board */
 #define LINK_HELLO 0x01u
@@ -19,6 +19,7 @@
 #define LINK_TX_LATE 0x04u
 #define LINK_STATUS 0x05u
 #define LINK_REFUSED 0x06u
+#define LINK_RX_PHASE 0x07u
 
 /* From the host */
 #define LINK_ASK_HELLO 0x41u
@@ -37,6 +38,8 @@
 #define LINK_NO_VOLTAGE 0xFFFFu
 
 #define LINK_CAN_TRANSMIT 0x01u
+#define LINK_HAS_PHASES 0x02u
+#define LINK_WANTS_PHASES 0x01u /* flag in CONFIG */
 
 /* State in STATUS */
 #define LINK_IS_CONFIGURED 0x01u
@@ -75,6 +78,7 @@ struct link_measured {
     int32_t rx_power_cdbm;
     int32_t first_path_cdbm;
     int32_t offset_ppb;
+    int32_t phase; /* negative where there is none */
 };
 
 struct link_status {
@@ -98,6 +102,7 @@ struct link_hello {
 };
 
 void link_write_hello(struct link_writer *writer, const struct link_hello *hello);
+/* RX_PHASE with a phase, RX without. */
 void link_write_rx(struct link_writer *writer, uint64_t rx_ticks, const struct link_measured *measured,
                    const uint8_t *frame, uint32_t frame_bytes);
 void link_write_tx_done(struct link_writer *writer, uint64_t dx_ticks, uint64_t tx_ticks);

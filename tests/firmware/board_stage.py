@@ -22,7 +22,7 @@ TICKS_PER_US = TICK_RATE_HZ / 1e6
 DEVICE_ID = b"identity"
 SLOW_HZ, FAST_HZ = 2_000_000, 8_000_000
 
-HELLO, RX, TX_DONE, TX_LATE, STATUS, REFUSED = range(1, 7)
+HELLO, RX, TX_DONE, TX_LATE, STATUS, REFUSED, RX_PHASE = range(1, 8)
 ASK_HELLO, CONFIG, TX_AT, RX_ON, ASK_STATUS = range(0x41, 0x46)
 
 needs_compiler = pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")
@@ -104,9 +104,9 @@ class BoardStage:
     def send(self, kind, body=b""):
         self.bus.to_board += line_of(kind, body, next(self._numbers) & 0xFF)
 
-    def config(self):
+    def config(self, flags=0):
         words = (128).to_bytes(2, "little"), *(d.to_bytes(2, "little") for d in (DELAYS.tx_ticks, DELAYS.rx_ticks))
-        self.send(CONFIG, bytes((5, 64, 2, 9)) + b"".join(words) + b"\0")
+        self.send(CONFIG, bytes((5, 64, 2, 9)) + b"".join(words) + bytes((flags,)))
 
     def tx_at(self, ahead_us, frame):
         """Ask for a frame; the tick of its RMARKER at the antenna."""
@@ -150,8 +150,9 @@ class BoardStage:
         self.reports()
         return self
 
-    def arrive(self, frame, *, fault=None, power_dbm=-80.0):
+    def arrive(self, frame, *, fault=None, power_dbm=-80.0, phase_cycles=None):
         """A frame whose end is now; its RX stamp."""
         stamp = wrap(self.air.ticks - from_seconds(after_rmarker_s(len(frame))))
-        self.outcome = self.chip.receive(frame, stamp, Diagnostics(power_dbm, power_dbm - 3.0, 1.0), fault)
+        told = Diagnostics(power_dbm, power_dbm - 3.0, 1.0)
+        self.outcome = self.chip.receive(frame, stamp, told, fault, carrier_phase_cycles=phase_cycles)
         return stamp

@@ -51,7 +51,8 @@ def test_a_board_reports_itself_and_is_configured_by_its_host():
     stage.send(ASK_HELLO)
     stage.turn(2)
     for hello in stage.reports():
-        assert (hello.major, hello.minor, hello.device_id, hello.can_transmit) == (1, 1, b"identity", True)
+        assert (hello.major, hello.minor, hello.device_id, hello.can_transmit) == (1, 2, b"identity", True)
+        assert hello.has_phases
         assert (hello.rate_khz, hello.counter_bits, hello.reset_cause) == (63_897_600, 40, 0x82)
     stage.send(RX_ON)
     stage.turn(2)
@@ -115,6 +116,25 @@ def test_receptions_are_reported_with_the_chips_own_stamp(size):
     assert heard.diagnostics.rx_power_dbm == pytest.approx(-80.0, abs=0.03)
     assert heard.diagnostics.carrier_offset_ppm == pytest.approx(1.0, abs=0.002)
     assert stage.board.chip.state == dw1000.LISTENING
+
+
+@given(st.lists(st.tuples(st.integers(0, 255), st.none() | st.floats(0.0, 1.0)), min_size=1, max_size=4))
+def test_phases_are_reported_as_long_as_the_host_wants_them(receptions):
+    stage = BoardStage().ready()
+    for flags, phase_cycles in receptions:
+        stage.config(flags)
+        stage.send(RX_ON)
+        stage.turn(8)
+        stage.air.pass_s(1e-3)
+        stage.reports()
+        stamp = stage.arrive(FRAME, phase_cycles=phase_cycles)
+        stage.turn()
+        (heard,) = stage.reports()
+        assert (heard.frame, heard.rx_ticks) == (FRAME, stamp)
+        assert (heard.carrier_phase_cycles is not None) == (flags & 1 == 1 and phase_cycles is not None)
+        if heard.carrier_phase_cycles is not None:
+            assert abs((heard.carrier_phase_cycles - phase_cycles + 0.5) % 1.0 - 0.5) < 2e-4
+    assert not +stage.chip.misuse
 
 
 def test_errors_are_counted_and_it_listens_on():

@@ -26,7 +26,7 @@ NOISE = st.one_of(st.binary(max_size=300), st.binary(max_size=40).map(lambda pie
 
 
 class Measured(ctypes.Structure):
-    _fields_ = tuple((name, ctypes.c_int32) for name in ("rx_power_cdbm", "first_path_cdbm", "offset_ppb"))
+    _fields_ = tuple((name, ctypes.c_int32) for name in ("rx_power_cdbm", "first_path_cdbm", "offset_ppb", "phase"))
 
 
 class StatusFields(ctypes.Structure):
@@ -109,12 +109,15 @@ def test_the_check_is_the_published_one():
     assert library().link_fcs(b"123456789", 9) == 0x2189
 
 
-@given(STAMPS, SIXTEEN, SIXTEEN, SIXTEEN, FRAMES)
-def test_a_reception_arrives_as_it_was(ticks, rx_power, first_path, offset, frame):
-    record = Writer().write("rx", u64(ticks), ctypes.byref(Measured(rx_power, first_path, offset)), frame, len(frame))
+@given(STAMPS, SIXTEEN, SIXTEEN, SIXTEEN, st.integers(-1, 0xFFFF), FRAMES)
+def test_a_reception_arrives_as_it_was(ticks, rx_power, first_path, offset, phase, frame):
+    measured = Measured(rx_power, first_path, offset, phase)
+    record = Writer().write("rx", u64(ticks), ctypes.byref(measured), frame, len(frame))
+    assert record[0] == (link.RX if phase < 0 else link.RX_PHASE)
     heard = decode(record)
     assert isinstance(heard, Heard)
     assert (heard.rx_ticks, heard.frame) == (ticks, frame)
+    assert heard.carrier_phase_cycles == (None if phase < 0 else phase / 2**16)
     values = [
         heard.diagnostics.rx_power_dbm,
         heard.diagnostics.first_path_power_dbm,
@@ -145,14 +148,14 @@ def test_the_status_arrives_as_it_was(ticks, state, counts, temperature, millivo
     assert status.supply_v == (None if millivolts == 0xFFFF else millivolts / 1000)
 
 
-@given(st.binary(min_size=3, max_size=3), st.binary(min_size=8, max_size=8), st.booleans(), st.integers(0, 255))
-def test_the_identity_arrives_as_it_was(firmware, identity, can_transmit, cause):
-    fields = HelloFields((ctypes.c_uint8 * 3)(*firmware), (ctypes.c_uint8 * 8)(*identity), can_transmit, cause)
+@given(st.binary(min_size=3, max_size=3), st.binary(min_size=8, max_size=8), st.integers(0, 3), st.integers(0, 255))
+def test_the_identity_arrives_as_it_was(firmware, identity, abilities, cause):
+    fields = HelloFields((ctypes.c_uint8 * 3)(*firmware), (ctypes.c_uint8 * 8)(*identity), abilities, cause)
     hello = decode(Writer().write("hello", ctypes.byref(fields)))
     assert isinstance(hello, Hello)
     assert (hello.major, hello.minor) == (link.MAJOR, link.MINOR)
     assert (hello.firmware, hello.device_id) == (tuple(firmware), identity)
-    assert (hello.can_transmit, hello.reset_cause) == (can_transmit, cause)
+    assert (hello.can_transmit, hello.has_phases, hello.reset_cause) == (abilities & 1, abilities > 1, cause)
     assert (hello.rate_khz * 1000, hello.counter_bits) == (499_200_000 * 128, 40)
 
 

@@ -72,7 +72,7 @@ class Host:
 def test_it_greets_and_is_configured_step_by_step():
     host = Host(can_transmit=False)
     (hello,) = host.say(host.writer.ask_hello())
-    assert hello == Hello(1, 1, (0, 0, 0), b"a board ", 63_897_600, 40, can_transmit=False, reset_cause=0)
+    assert hello == Hello(1, 2, (0, 0, 0), b"a board ", 63_897_600, 40, False, 0, True)
     (status,) = host.say(host.writer.ask_status())
     assert (status.ticks, status.configured, status.receiving) == (77, False, False)
     assert host.say(host.writer.rx_on()) == [NotDone(link.RX_ON, link.REFUSED_MALFORMED)]
@@ -87,6 +87,18 @@ def test_it_greets_and_is_configured_step_by_step():
     assert isinstance(hello, Hello)
     (status,) = host.say(host.writer.ask_status())
     assert not status.configured
+
+
+@pytest.mark.parametrize("flags", [0, link.WANTS_PHASES])
+def test_phases_are_reported_where_the_host_wants_them(flags):
+    host = Host()
+    host.say(host.writer.config(DELAY, DELAY, flags))
+    host.say(host.writer.rx_on())
+    host.said.clear()
+    for phase_cycles in (0.75, None, 0.999_999_9):
+        host.board.on_radio_event(Reception(b"frame", 5, carrier_phase_cycles=phase_cycles))
+    wanted = [0.75, None, 0.0] if flags else [None] * 3
+    assert [heard.carrier_phase_cycles for heard in host.said] == wanted
 
 
 @pytest.mark.parametrize("at", range(6))

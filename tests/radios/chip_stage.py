@@ -39,10 +39,11 @@ class HandClock:
 class ChipNode:
     """A chip, its driver, and what both tell."""
 
-    def __init__(self, air, delays=DELAYS, true_delays=DELAYS):
+    def __init__(self, air, delays=DELAYS, true_delays=DELAYS, *, phases=True):
         self.air, self.events, self.counters = air, [], Counter()
         self.chip = Chip(air, true_delays.tx_ticks, true_delays.rx_ticks, air.now_s)
-        self.session = ChipSession(ModelBus(self.chip, self.pause), delays, self.events.append, self.counters)
+        bus = ModelBus(self.chip, self.pause)
+        self.session = ChipSession(bus, delays, self.events.append, self.counters, phases=phases)
 
     def pause(self, seconds):
         """Only what the driver waits for takes time, and only on the chip's own clock."""
@@ -50,9 +51,9 @@ class ChipNode:
     def start(self):
         self.session.start()
 
-    def hear(self, frame, rx_ticks, diagnostics=None, host_s=None, fault=None):
+    def hear(self, frame, rx_ticks, diagnostics=None, host_s=None, fault=None, phase_cycles=None):
         """A frame comes in, and the host serves its interrupt; the reception, if it became one."""
-        self.chip.receive(frame, rx_ticks, diagnostics or Diagnostics(), fault)
+        self.chip.receive(frame, rx_ticks, diagnostics or Diagnostics(), fault, carrier_phase_cycles=phase_cycles)
         told = len(self.events)
         while self.chip.irq:
             self.session.serve(host_s)

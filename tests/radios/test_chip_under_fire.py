@@ -49,9 +49,10 @@ class Fire(RuleBasedStateMachine):
         size=st.integers(1, 110),
         power=st.integers(-95, -60),
         offset=st.integers(-20, 20),
+        phase=st.one_of(st.none(), st.floats(0.0, 1.0, exclude_max=True)),
         served=st.booleans(),
     )
-    def arrive(self, us, fault, size, power, offset, served):
+    def arrive(self, us, fault, size, power, offset, phase, served):
         """A frame that ends after so much time; the host may fetch it at once."""
         self.air.pass_s(1e-6 * us)
         self.serial += 1
@@ -59,13 +60,14 @@ class Fire(RuleBasedStateMachine):
         frame = body + (fcs(body) if fault != "fcs" else bytes(x ^ 1 for x in fcs(body)))
         stamp = wrap(self.air.ticks - from_seconds(after_rmarker_s(len(frame))))
         told = Diagnostics(float(power), power - 3.0, float(offset))
-        outcome = self.node.chip.receive(frame, stamp, told, None if fault == "fcs" else fault)
+        fault = None if fault == "fcs" else fault
+        outcome = self.node.chip.receive(frame, stamp, told, fault, carrier_phase_cycles=phase)
         if outcome in ("heard", "spoilt", "suspect"):
             assert self.waits is None, "a frame came over one that had not been fetched"
             self.waits = outcome
             self.heard += outcome != "spoilt"
             self.spoilt += outcome == "spoilt"
-            self.flown[frame] = (stamp, told)
+            self.flown[frame] = (stamp, told, phase)
         assert outcome not in ("suspect", "other-settings", "without-microcode")
         if served:
             self.serve()
@@ -164,11 +166,14 @@ class Fire(RuleBasedStateMachine):
     @invariant()
     def no_stamp_is_torn(self):
         for one in self.of(Reception)[self.told_frames :]:
-            stamp, told = self.flown.pop(one.frame)
+            stamp, told, phase = self.flown.pop(one.frame)
             assert one.rx_ticks == stamp
             assert abs(one.diagnostics.rx_power_dbm - told.rx_power_dbm) < 0.06
             assert abs(one.diagnostics.first_path_power_dbm - told.first_path_power_dbm) < 0.06
             assert abs(one.diagnostics.carrier_offset_ppm - told.carrier_offset_ppm) < 0.002
+            assert (one.carrier_phase_cycles is None) == (phase is None)
+            if phase is not None:
+                assert abs((one.carrier_phase_cycles - phase + 0.5) % 1.0 - 0.5) < 2e-4
         self.told_frames = len(self.of(Reception))
 
     @invariant()
@@ -201,7 +206,7 @@ class Fire(RuleBasedStateMachine):
         for _ in range(2):
             self.air.pass_s(1e-3)
             before = len(self.of(Reception)), len(self.of(Sent))
-            self.arrive(500, None, 20, -80, 1, served=False)
+            self.arrive(500, None, 20, -80, 1, 0.5, served=False)
             assert self.node.chip.irq
             self.serve()
             self.air.pass_s(1e-3)

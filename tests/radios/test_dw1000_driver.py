@@ -3,6 +3,7 @@
 import ctypes
 import math
 import re
+import struct
 from itertools import pairwise
 
 import pytest
@@ -23,6 +24,7 @@ LISTEN_AGAIN = ["w f603 e0", "w f603 f0", "w 8d 0001"]
 FORGET_ALL = ["w 8d 40", "w 8f f8ffff3707"]
 DX, FRAME = 0xEFCDABFFFF, bytes(range(100, 240))
 U16 = st.integers(0, 0xFFFF)
+I16 = st.integers(-0x8000, 0x7FFF)
 
 
 class ScriptedBus:
@@ -351,6 +353,10 @@ def test_transactions_per_frame_are_few(listening):
         bus.put(0x0F, 0, b"\x83\0\0\0\0")
     assert costs[:2] == [(8, 148), (7, 126)]
     assert costs[2][0] == 6
+    chip.reads_phases = True
+    script_frame(bus, bytes(100))
+    assert chip.poll() == dw1000.RECEIVED
+    assert (len(octets), sum(octets)) == (12, 165)
 
 
 # Arithmetic
@@ -394,6 +400,69 @@ def test_carrier_offset_is_the_manuals_formula(integrator):
     else:
         assert abs(ppb - exact) < 0.51 + 2e-5 * abs(exact)
         assert abs(ppb) < 2**15
+
+
+def turns(vector):
+    return math.atan2(vector.imag, vector.real) / (2.0 * math.pi)
+
+
+def distance_turns(one, other):
+    return abs((one - other + 0.5) % 1.0 - 0.5)
+
+
+@given(I16, I16)
+def test_the_angle_is_that_of_floating_point(x, y):
+    angle = dw1000.library().dw1000_angle(x, y)
+    assert 0 <= angle < 2**16
+    if x or y:
+        assert distance_turns(angle / 2**16, turns(complex(x, y))) <= 2**-15
+
+
+def test_the_angle_is_right_where_its_pieces_meet():
+    at_45 = [(9, 0, 0), (9, 9, 1), (0, 9, 2), (-9, 9, 3), (-9, 0, 4), (-9, -9, 5), (0, -9, 6), (9, -9, 7)]
+    steps = [(dw1000.library().dw1000_angle(x, y) - k * 2**13 + 2**15) % 2**16 - 2**15 for x, y, k in at_45]
+    assert max(map(abs, steps)) <= 1
+    assert all(
+        distance_turns(dw1000.library().dw1000_angle(x, y) / 2**16, turns(complex(x, y))) <= 2**-15
+        for x in (-32768, 32767) for step in range(33) for y in range(1024 * step - 2, min(1024 * step + 3, 32768))
+    )  # fmt: skip
+
+
+@given(I16, I16, st.integers(0, 127), U16, st.one_of(U16, st.integers(0, 200)))
+def test_the_phase_is_the_angle_of_the_sample_behind_the_first_path_less_rcphase(x, y, rcphase, first_path, noise):
+    bus, chip = started()
+    chip.reads_phases = True
+    chip.receive()
+    bus.take()
+    script_frame(bus, FRAME[:20])
+    at = (first_path >> 6) + 1
+    bus.put(0x12, 0, noise.to_bytes(2, "little"))
+    bus.put(0x14, 4, bytes((rcphase,)))
+    bus.put(0x15, 5, first_path.to_bytes(2, "little"))
+    bus.files[0x25] = bytearray(b"\x55" * 0x1100)
+    bus.put(0x25, 4 * at, b"\xff" + struct.pack("<2h", x, y))
+    assert chip.poll() == dw1000.RECEIVED
+    log = bus.take()
+    assert log[-1] == "w 8d 0001"  # the receiver comes on at last
+    if at >= 1016:
+        assert chip.phase == dw1000.NO_PHASE
+        assert not any(line.startswith("w b6") for line in log)
+    else:
+        begin = log.index("w b6 4882")
+        assert log[begin + 1].startswith("r 65") and log[begin + 2] == "w b6 0002"
+        if x * x + y * y <= 9 * noise * noise:
+            assert chip.phase == dw1000.NO_PHASE
+        else:
+            assert distance_turns(chip.phase / 2**16, turns(complex(x, y)) - rcphase / 128) <= 2**-15
+    assert 0 <= chip.phase < 2**16 or chip.phase == dw1000.NO_PHASE
+
+
+def test_phases_are_read_only_where_they_are_asked_for(listening):
+    bus, chip = listening
+    script_frame(bus, FRAME[:20])
+    assert chip.poll() == dw1000.RECEIVED
+    assert chip.phase == dw1000.NO_PHASE
+    assert not any(line.startswith(("w b6", "r 65", "r 54")) for line in bus.take())
 
 
 @given(st.integers(0, 2**40 - 1), st.integers(-(2**39) + 2**17, 2**39 - 2**17))

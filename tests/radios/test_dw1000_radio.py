@@ -20,7 +20,10 @@ from skyless.core.ticks import difference, wrap
 from skyless.radio.dw1000 import spi
 from skyless.radio.dw1000.radio import Dw1000Radio
 from skyless.radio.dw1000.spi import SpiPort
+from skyless.radio.emulated import EtherConnection
+from skyless.radio.ether_wire import Arrival, HeardRow, Join
 from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Restarted, Sent
+from skyless.run._dw1000_model import ModelPort
 from skyless.run.open_radio import is_simulated, open_radios
 from skyless.sim.compile_ahead import compile_kernels
 from skyless.sim.dw1000.chip import ModelBus
@@ -351,6 +354,38 @@ async def test_what_fails_once_it_has_started_is_tried_again(monkeypatch):
     async with radio_events(radio) as host:
         await host.until(Restarted)
         assert (len(host.of(Gone)), len(failures), len(buses)) == (1, 3, 1)
+
+
+@pytest.mark.parametrize("spec", ["serial:/dev/a", "model:127.0.0.1", "spi:0.0"])
+@pytest.mark.usefixtures("pi")
+def test_tags_have_phases_and_anchors_where_they_are_asked_for(spec):
+    for kind in ("tag", "anchor"):
+        for phases, has_phases in ((None, kind == "tag"), (True, True), (False, False)):
+            assert open_radios(spec, kind, ("1",), phases=phases)[0]._phases is has_phases
+
+
+def test_a_phase_on_the_emulated_air_reaches_the_program_by_both_radios():
+    """Over the model it is rounded: the sample has 16 bits a part, the driver 2**-16 turns."""
+    connection = EtherConnection("127.0.0.1", 7784, Join("tag", ("tag1",)))
+    (node,) = connection.radios
+    port = ModelPort(node, AntennaDelays())
+    port._radio, heard = Dw1000Radio(port, "tag1", AntennaDelays(), phases=True), []
+    port._radio._listener = heard.append
+    frame = b"some frame" + fcs(b"some frame")
+
+    def arrive(phase_cycles):
+        row = HeardRow(0, wrap(node.now_ticks() + 10**7), -80.0, -82.0, 1.0, phase_cycles)
+        connection.on_message(Arrival(frame, time.monotonic(), (row,)), 0.0)
+        return heard[-1].carrier_phase_cycles
+
+    node.set_clock(10**9, time.monotonic())
+    node._listener = heard.append
+    assert [arrive(phase_cycles) for phase_cycles in (0.123456789, None)] == [0.123456789, None]
+    node._listener = port._on_event
+    port._on_event(Restarted())
+    assert arrive(0.123456789) == pytest.approx(0.123456789, abs=2e-4)
+    assert arrive(None) is None
+    assert not +port.chip.misuse
 
 
 @pytest.mark.usefixtures("pi")

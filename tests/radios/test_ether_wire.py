@@ -32,7 +32,8 @@ TO_ETHER = st.one_of(
     st.builds(Join, st.sampled_from(["anchor", "tag"]), st.lists(st.text(max_size=20)).map(tuple)),
     st.builds(Send, NODES, TICKS, st.binary(max_size=127)),
 )
-ROWS = st.builds(HeardRow, NODES, TICKS, FINITE, FINITE, FINITE)
+PHASES = st.one_of(st.none(), st.floats(0.0, 1.0, exclude_max=True))
+ROWS = st.builds(HeardRow, NODES, TICKS, FINITE, FINITE, FINITE, PHASES)
 FROM_ETHER = st.one_of(
     st.builds(Joined, st.text(max_size=40), FINITE, st.lists(TICKS).map(tuple)),
     st.builds(Refused, st.text()),
@@ -83,8 +84,15 @@ def test_a_length_beyond_all_messages_is_refused_before_it_is_waited_for():
 
 
 def test_the_largest_arrival_of_a_large_site_fits():
-    rows = tuple(HeardRow(node, 2**40 - 1, -80.0, -85.0, 1.5) for node in range(1000))
+    rows = tuple(HeardRow(node, 2**40 - 1, -80.0, -85.0, 1.5, 0.1) for node in range(1000))
     assert len(pack(Arrival(bytes(127), 1.0, rows))) < MAX_MESSAGE_BYTES
+
+
+def test_a_row_of_an_older_ether_has_no_phase():
+    body = msgspec.msgpack.encode(
+        {"type": "arrival", "frame": b"f", "host_s": 1.0, "rows": [[0, 5, -80.0, -85.0, 1.5]]}
+    )
+    assert from_ether.decode(body) == Arrival(b"f", 1.0, (HeardRow(0, 5, -80.0, -85.0, 1.5),))
 
 
 def test_a_machine_without_a_boot_identifier_shares_its_clock_with_itself_only_by_name(monkeypatch):

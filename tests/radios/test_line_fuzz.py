@@ -67,7 +67,8 @@ class LinkLine:
         self.session.on_data(data, 0.0)
 
     def record(self, number, rng):
-        return self._writer.rx(number, 1, 2, 3, rng.randbytes(rng.randrange(1, 128)))
+        phase = rng.choice((None, rng.randrange(1 << 16)))
+        return self._writer.rx(number, 1, 2, 3, rng.randbytes(rng.randrange(1, 128)), phase)
 
 
 class ListenerLine:

@@ -6,13 +6,14 @@ import random
 import struct
 from binascii import crc_hqx
 
+import msgspec
 import pytest
 from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.radio.serial import link
-from skyless.radio.serial.link import Hello, Status, decode
+from skyless.radio.serial.link import Heard, Hello, Status, decode
 
 TICKS = st.integers(0, 2**40 - 1)
 SIXTEEN = st.integers(-0x8000, 0x7FFF)
@@ -55,6 +56,7 @@ def makers_of(writer):
     """Every record that there is, with what stands in it."""
     ticks, frame = 0x0403020100, bytes(range(60))
     yield lambda: writer.rx(ticks, -7953, -8312, 12, frame)
+    yield lambda: writer.rx(ticks, -7953, -8312, 12, frame, 0x8001)
     yield lambda: writer.tx_done(ticks, ticks)
     yield lambda: writer.tx_late(ticks, 1)
     yield lambda: writer.status(ticks, 3, [1, 2, 3, 4, 5, 6])
@@ -99,22 +101,44 @@ def test_a_reception_comes_back(ticks, rx_power, first_path, offset, frame):
     assert record[link.RX_FRAME_AT :] == frame
 
 
-@given(TICKS, FRAMES, st.integers(0, 0xFFFF), st.integers(0, 0xFFFF))
-def test_commands_come_back(dx_ticks, frame, tx_delay, rx_delay):
+@given(TICKS, SIXTEEN, st.integers(0, 0xFFFF), FRAMES)
+def test_a_reception_with_a_phase_comes_back(ticks, power, phase, frame):
+    (record,), _ = read(link.Writer().rx(ticks, power, power, power, frame, phase))
+    assert record[0] == link.RX_PHASE
+    assert struct.unpack_from("<3hH", record, 7) == (power, power, power, phase)
+    heard = decode(record)
+    if not frame:
+        assert heard == "malformed-record"
+        return
+    assert heard == Heard(ticks, link.from_steps(power, power, power), frame, phase / 2**16)
+    assert link.to_turn(heard.carrier_phase_cycles) == phase
+    (without,), _ = read(link.Writer().rx(ticks, power, power, power, frame))
+    assert decode(without) == msgspec.structs.replace(heard, carrier_phase_cycles=None)
+
+
+@given(st.floats(0.0, 1.0))
+def test_a_phase_is_rounded_to_the_next_step_on_the_circle(phase_cycles):
+    steps = link.to_turn(phase_cycles)
+    assert 0 <= steps < 2**16
+    assert abs((link.cycles(steps) - phase_cycles + 0.5) % 1.0 - 0.5) <= 2**-17
+
+
+@given(TICKS, FRAMES, st.integers(0, 0xFFFF), st.integers(0, 0xFFFF), st.integers(0, 1))
+def test_commands_come_back(dx_ticks, frame, tx_delay, rx_delay, flags):
     writer = link.Writer()
     (record,), _ = read(writer.tx_at(dx_ticks, frame))
     assert (record[0], record[link.TX_FRAME_AT :]) == (link.TX_AT, frame)
     assert int.from_bytes(record[2:7], "little") == dx_ticks
-    (record,), _ = read(writer.config(tx_delay, rx_delay))
+    (record,), _ = read(writer.config(tx_delay, rx_delay, flags))
     assert len(record) == link.CONFIG_BYTES
-    assert struct.unpack_from("<2H", record, 8) == (tx_delay, rx_delay)
+    assert struct.unpack_from("<2HB", record, 8) == (tx_delay, rx_delay, flags)
 
 
-@given(st.binary(min_size=8, max_size=8), st.integers(0, 1), st.integers(0, 255))
+@given(st.binary(min_size=8, max_size=8), st.integers(0, 3), st.integers(0, 255))
 def test_an_identity_comes_back_and_one_of_version_1_0_has_no_cause(device_id, capabilities, cause):
     writer = link.Writer()
     (record,), _ = read(writer.hello((1, 2, 3), device_id, capabilities, cause))
-    hello = Hello(1, link.MINOR, (1, 2, 3), device_id, 63_897_600, 40, bool(capabilities), cause)
+    hello = Hello(1, link.MINOR, (1, 2, 3), device_id, 63_897_600, 40, bool(capabilities & 1), cause, capabilities > 1)
     assert decode(record) == hello
     assert decode(record[: link.HELLO_BYTES]).reset_cause is None
     assert decode(record + b"more") == hello

@@ -40,8 +40,8 @@ class Talk:
     def hear(self, data):
         self.session.on_data(data, self.now_s)
 
-    def hello(self, cause=0):
-        self.hear(self.board.hello((1, 2, 3), b"board-01", link.CAN_TRANSMIT, cause))
+    def hello(self, cause=0, abilities=link.CAN_TRANSMIT):
+        self.hear(self.board.hello((1, 2, 3), b"board-01", abilities, cause))
 
     def status(self, state=ON, ticks=T0):
         self.hear(self.board.status(ticks, state, COUNTS, 2150, 3300))
@@ -98,6 +98,28 @@ def test_receptions_come_through_with_their_measurements_in_the_line_s_units():
     told = Diagnostics(-79.5314, None, 40.0)
     assert quantised(told) == Diagnostics(-79.53, None, None)  # ±32.767 ppm fit
     assert quantised(quantised(told)) == quantised(told)
+
+
+@pytest.mark.parametrize("abilities", [link.CAN_TRANSMIT, link.CAN_TRANSMIT | link.HAS_PHASES])
+@pytest.mark.parametrize("phases", [False, True])
+def test_phases_are_asked_only_of_a_board_that_has_them_and_come_through(phases, abilities):
+    talk = Talk(phases=phases)
+    talk.hello(abilities=abilities)
+    (config,) = (command for command in talk.commands if command[0] == link.CONFIG)
+    assert config[12] == (phases and abilities > 1)
+    talk.status()
+    talk.hear(talk.board.rx(5, -7953, -8312, 12, b"frame", 0xC000))
+    assert talk.events[1:] == [Reception(b"frame", 5, talk.now_s, Diagnostics(-79.53, -83.12, 0.012), 0.75)]
+
+
+def test_a_host_of_version_1_1_counts_a_record_that_it_does_not_know(monkeypatch):
+    """Such a host never asks; a board that sends it all the same costs it nothing else."""
+    monkeypatch.delitem(link._DECODERS, link.RX_PHASE)
+    talk = Talk().ready()
+    talk.hear(talk.board.rx(5, 1, 2, 3, b"frame", 7))
+    talk.hear(talk.board.rx(5, 1, 2, 3, b"frame"))
+    assert talk.counters == {"unknown-record": 1}
+    assert len(talk.events) == 2
 
 
 def test_transmissions_are_asked_for_by_dx_and_their_end_is_reported_by_tx_ticks():
@@ -178,7 +200,7 @@ def test_a_board_of_another_major_version_is_refused_once_and_taken_when_it_has_
         talk.poll(STATUS_S)
     (gone,) = talk.events
     assert gone == Gone(
-        "the board at /dev/board has version 2.0 of the serial link, this program 1.1; bring the board's firmware "
+        "the board at /dev/board has version 2.0 of the serial link, this program 1.2; bring the board's firmware "
         "and Skyless to the same release"
     )
     assert set(talk.kinds()) == {link.ASK_HELLO}

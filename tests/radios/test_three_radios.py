@@ -1,7 +1,8 @@
 """One seed, three radios: emulated, serial over a pseudo-terminal, driver and register model. The same fixes.
 
-What chips and lines round is rounded alike before: the measured powers and carrier offsets, which may decide what a
-reception weighs. The emulated radio and the board are given them as the driver reads them from the model's registers.
+What chips and lines round is rounded alike before: the measured powers, carrier offsets and phases, which may decide
+what a reception weighs. The emulated radio and the board are given them as the driver reads them from the model's
+registers.
 """
 
 import asyncio
@@ -41,10 +42,18 @@ def world_of(make_anchor):
     return world, machines
 
 
+def phased(reception):
+    """A reception with a phase, any one where the air gives none."""
+    if reception.carrier_phase_cycles is not None:
+        return reception
+    return msgspec.structs.replace(reception, carrier_phase_cycles=reception.rx_ticks * 0.618 % 1.0)
+
+
 def tape(make_anchor=lambda machine, _: machine):
     """What the tag's antenna gets."""
     world, machines = world_of(make_anchor)
-    return [reception for broadcast in world.run(SECONDS) for _, reception, _ in broadcast.receptions()], machines
+    heard = [phased(reception) for broadcast in world.run(SECONDS) for _, reception, _ in broadcast.receptions()]
+    return heard, machines
 
 
 def through_the_chip():
@@ -55,14 +64,16 @@ def through_the_chip():
     heard = []
     for broadcast in world.run(SECONDS):
         for _, reception, _ in broadcast.receptions():
-            heard.append(tag.hear(reception.frame, reception.rx_ticks, reception.diagnostics, reception.host_s))
+            one = phased(reception)
+            told = one.frame, one.rx_ticks, one.diagnostics, one.host_s
+            heard.append(tag.hear(*told, phase_cycles=one.carrier_phase_cycles))
     return heard, machines, tag
 
 
 async def over_the_line(heard):
     """The same receptions behind a board and a serial port."""
     board = PlayedBoard()
-    async with board, radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1")) as host:
+    async with board, radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1", phases=True)) as host:
         await host.until(Restarted)
         for at in range(0, len(heard), 20):
             for reception in heard[at : at + 20]:
@@ -77,7 +88,8 @@ def ways():
     emulated, _ = tape()
     chip, machines, tag = through_the_chip()
     rounded = [
-        msgspec.structs.replace(one, diagnostics=other.diagnostics) for one, other in zip(emulated, chip, strict=True)
+        msgspec.structs.replace(one, diagnostics=other.diagnostics, carrier_phase_cycles=other.carrier_phase_cycles)
+        for one, other in zip(emulated, chip, strict=True)
     ]
     return emulated, rounded, asyncio.run(over_the_line(rounded)), chip, machines, tag
 
@@ -88,6 +100,7 @@ def test_the_same_frames_at_the_same_ticks_from_a_whole_site_on_driver_and_model
     assert len(emulated) > 1000
     for way in (serial, chip):
         assert [(one.frame, one.rx_ticks) for one in way] == [(one.frame, one.rx_ticks) for one in emulated]
+    assert [one.carrier_phase_cycles for one in serial] == [one.carrier_phase_cycles for one in chip]
     for node in (tag, *(machine.node for machine in machines.values())):
         assert not +node.chip.misuse
         assert not +node.counters
@@ -101,6 +114,7 @@ def test_what_the_chip_measures_is_what_the_air_gives_but_for_rounding(ways):
         assert other.diagnostics.rx_power_dbm == pytest.approx(one.diagnostics.rx_power_dbm, abs=0.03)
         assert other.diagnostics.first_path_power_dbm == pytest.approx(one.diagnostics.first_path_power_dbm, abs=0.03)
         assert other.diagnostics.carrier_offset_ppm == pytest.approx(one.diagnostics.carrier_offset_ppm, abs=0.0011)
+        assert abs((other.carrier_phase_cycles - one.carrier_phase_cycles + 0.5) % 1.0 - 0.5) < 2e-4
 
 
 @pytest.mark.parametrize("method", ["joint", "bracketed"])

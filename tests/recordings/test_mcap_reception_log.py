@@ -2,10 +2,13 @@
 
 import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from machines.bench import LAB, tape
 from skyless.core.air.reception import Diagnostics, Reception
 from skyless.core.any_receiver import AnyReceiver
+from skyless.research.replays.site import reception_of
 from skyless.run.mqtt.messages import RawReception, ReceptionsMessage, RequestMessage
 from skyless.run.recordings.reception_log import MAX_PENDING_RECEPTIONS, ReceptionLog, load, raw, receiver_settings
 
@@ -121,9 +124,22 @@ def test_a_log_that_nobody_collects_takes_no_memory():
     assert log.collect(1.0, 0.0) is None
 
 
-@pytest.mark.parametrize("diagnostics", [None, Diagnostics(-80.5, -81.25, 3.0)])
-def test_raw_receptions_keep_every_bit(diagnostics):
-    reception = Reception(bytes(range(127)), (1 << 40) - 1, 0.1 + 1.7e9, diagnostics)
+@given(
+    st.sampled_from([None, Diagnostics(-80.5, -81.25, 3.0)]),
+    st.one_of(st.none(), st.floats(0.0, 1.0, exclude_max=True)),
+)
+def test_raw_receptions_keep_every_bit(diagnostics, phase_cycles):
+    reception = Reception(bytes(range(127)), (1 << 40) - 1, 0.1 + 1.7e9, diagnostics, phase_cycles)
     again = msgspec.json.decode(msgspec.json.encode(raw(reception)), type=RawReception)
     assert again == raw(reception)
-    assert again.host_s == reception.host_s
+    assert reception_of(again) == reception
+
+
+def test_receptions_of_an_older_recording_have_no_phase():
+    old = msgspec.json.decode(b'["AAAA", 5, 1.5, -80.5, -81.25, 3.0]', type=RawReception)
+    assert reception_of(old) == Reception(bytes(3), 5, 1.5, Diagnostics(-80.5, -81.25, 3.0))
+
+
+@pytest.mark.parametrize("phase_cycles", [-0.001, 1.0, 1e300])
+def test_no_radio_gives_such_a_phase(phase_cycles):
+    assert reception_of(RawReception(b"frame", 5, 1.0, carrier_phase_cycles=phase_cycles)) is None

@@ -1,9 +1,10 @@
 """Registers of the DW1000, typed from a published source: a third table, against which driver and model are held.
 
 Zephyr, drivers/ieee802154/ieee802154_dw1000_regs.h (Apache 2.0; from Decawave's mynewt-dw1000-core), at commit
-0c3cce8c, read on 20 November 2026. Names are the manual's. It departs from the manual v2.12 in two places: AGC_TUNE3 is
-0x0055 there (and 0x0035 in the manual's table 26 and in Bitcraze's libdw1000), FS_PLLCFG has five octets there (four
-in 7.2.44: the fifth would be FS_PLLTUNE).
+0c3cce8c, read on 20 November 2026. Names are the manual's. It departs from the manual v2.12 in three places: AGC_TUNE3
+is 0x0055 there (and 0x0035 in the manual's table 26 and in Bitcraze's libdw1000), FS_PLLCFG has five octets there (four
+in 7.2.44: the fifth would be FS_PLLTUNE), and the mask of RCPHASE lies behind the end of RX_TTCKO (the manual has it in
+its last octet).
 """
 
 REGISTERS = {
@@ -42,6 +43,7 @@ REGISTERS = {
     "AGC_TUNE1": (0x23, 0x04, 2),
     "AGC_TUNE2": (0x23, 0x0C, 4),
     "EC_CTRL": (0x24, 0x00, 4),
+    "ACC_MEM": (0x25, 0x00, 4064),
     "GPIO_CTRL": (0x26, 0x00, 44),
     "DRX_TUNE0B": (0x27, 0x02, 2),
     "DRX_TUNE1A": (0x27, 0x04, 2),
@@ -141,7 +143,15 @@ CONFIG = {
     "RXWTOE": 0x10000000,
     "RXAUTR": 0x20000000,
 }
-OTHER_BITS = {"LDERUNE": 0x00020000, "OTPRDEN": 0x0001, "OTPREAD": 0x0002, "LDELOAD": 0x8000, "SYSCLKS_XTI": 0x1}
+OTHER_BITS = {
+    "LDERUNE": 0x00020000,
+    "OTPRDEN": 0x0001,
+    "OTPREAD": 0x0002,
+    "LDELOAD": 0x8000,
+    "SYSCLKS_XTI": 0x1,
+    "FACE": 0x40,
+    "AMCE": 0x8000,  # within the access mask there; Decawave's driver switches it on together with FACE
+}
 
 VALUES = {
     # channel 5, PRF 64 MHz, 6.8 Mbit/s, standard SFD, preamble of 128, PAC 8, code 9

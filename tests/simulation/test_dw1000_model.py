@@ -1,8 +1,12 @@
 """The register model of the DW1000, told octet by octet what the manual tells; no driver here."""
 
+import cmath
 import math
+import struct
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from skyless.core.air.ieee802154 import after_rmarker_s, fcs, preamble_s
 from skyless.core.air.reception import Diagnostics
@@ -82,10 +86,18 @@ class Bench:
         self.write(r.SYS_CTRL, r.RXENAB)
         self.now_s += 1e-3
 
-    def hear(self, frame=FRAME, told=None, fault=None):
+    def hear(self, frame=FRAME, told=None, fault=None, phase_cycles=None):
         """A frame ends now; its stamp and what became of it."""
         stamp = wrap(self.now_ticks() - round(after_rmarker_s(len(frame)) * TICK_RATE_HZ))
-        return stamp, self.chip.receive(frame, stamp, told or Diagnostics(-80.0, -84.0, 2.0), fault)
+        told = told or Diagnostics(-80.0, -84.0, 2.0)
+        return stamp, self.chip.receive(frame, stamp, told, fault, carrier_phase_cycles=phase_cycles)
+
+    def sample(self, behind=1):
+        """The accumulator's sample so far behind FP_INDEX, as a complex number."""
+        at = 4 * ((self.read(r.FP_INDEX) >> 6) + behind)
+        header = bytes((0x40 | r.ACC_MEM.file, 0x80 | at & 0x7F, at >> 7))
+        reply = self.chip.transfer(header + bytes(5), SLOW)[len(header) + 1 :]
+        return complex(*struct.unpack("<2h", reply))
 
 
 @pytest.fixture
@@ -225,6 +237,45 @@ def test_a_received_frame_its_stamp_and_what_was_measured(bench):
     integrator = bench.read(r.DRX_CAR_INT)
     hertz = (integrator - (integrator >> 20 << 21)) * HZ_PER_STEP
     assert -hertz / 6489.6 == pytest.approx(told.carrier_offset_ppm, abs=0.0003)
+
+
+@given(st.floats(0.0, 1.0, exclude_max=True), st.binary(min_size=1, max_size=20), st.floats(-95.0, -75.0))
+def test_the_sample_behind_the_first_path_less_rcphase_has_the_carrier_s_phase(phase_cycles, body, power_dbm):
+    bench = Bench()
+    bench.configure()
+    bench.listen()
+    bench.hear(body + fcs(body), Diagnostics(power_dbm, power_dbm, 0.0), phase_cycles=phase_cycles)
+    bench.write(r.PMSC_CTRL0, 0x8248, length=2)
+    turned = bench.read(r.RX_TTCKO) >> 32
+    assert (turned + 4) % 128 <= 8
+    found = [cmath.phase(bench.sample(behind)) / (2.0 * math.pi) - turned / 128 for behind in range(4)]
+    errors = [abs((phase - phase_cycles + 0.5) % 1.0 - 0.5) for phase in found]
+    assert errors[1] < 0.5 / abs(bench.sample())  # half a step of the sample's parts
+    assert all(error > 0.1 for error in (errors[0], *errors[2:]))
+    sizes = [abs(bench.sample(behind)) for behind in (1, 2, 3)]
+    assert sizes == pytest.approx([bench.read(one) for one in (r.FP_AMPL3, r.FP_AMPL2, r.FP_AMPL1)], abs=1)
+    assert not +bench.chip.misuse
+
+
+def test_without_a_phase_the_accumulator_is_empty(bench):
+    for phase_cycles in (0.25, None):
+        bench.listen()
+        bench.hear(phase_cycles=phase_cycles)
+        bench.write(r.PMSC_CTRL0, 0x8248, length=2)
+        assert (bench.sample() == 0) is (phase_cycles is None)
+
+
+def test_the_accumulator_needs_its_clock_and_is_overwritten_when_the_receiver_is_on_again(bench):
+    bench.listen()
+    bench.hear(phase_cycles=0.25)
+    for clocks in (0x0200, 0x0240, 0x8200):
+        bench.write(r.PMSC_CTRL0, clocks, length=2)
+        assert bench.sample() == 0
+    assert bench.chip.misuse == {"accumulator-without-its-clock": 3}
+    bench.write(r.PMSC_CTRL0, 0x8248, length=2)
+    bench.write(r.SYS_CTRL, r.RXENAB)
+    bench.sample()
+    assert bench.chip.misuse["accumulator-while-receiving"] == 1
 
 
 def test_the_stamp_is_less_the_antenna_delay_that_is_set(bench):

@@ -138,7 +138,7 @@ def _receptions(recording: McapRecording, tag: str) -> Iterator[tuple[SegmentSta
 
 def _reception_of(raw: RawReception) -> Reception:
     diagnostics = Diagnostics(raw.rx_power_dbm, raw.first_path_power_dbm, raw.carrier_offset_ppm)
-    return Reception(raw.frame, raw.rx_ticks, raw.host_s, diagnostics)
+    return Reception(raw.frame, raw.rx_ticks, raw.host_s, diagnostics, raw.carrier_phase_cycles)
 
 
 def _receiver_of(start: SegmentStart) -> AnyReceiver:

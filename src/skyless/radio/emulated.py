@@ -145,7 +145,9 @@ class EtherConnection:
             host_s = message.host_s + shift_s
             for row in message.rows:
                 measured = Diagnostics(row.rx_power_dbm, row.first_path_power_dbm, row.carrier_offset_ppm)
-                self.radios[row.node].notify(Reception(message.frame, row.rx_ticks, host_s, measured))
+                self.radios[row.node].notify(
+                    Reception(message.frame, row.rx_ticks, host_s, measured, row.carrier_phase_cycles)
+                )
         elif isinstance(message, wire.Done):
             event = Late(message.tx_ticks) if message.late else Sent(message.tx_ticks)
             self.radios[message.node].notify(event)

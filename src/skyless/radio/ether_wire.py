@@ -65,6 +65,7 @@ class HeardRow(Struct, frozen=True, array_like=True, gc=False):
     rx_power_dbm: float
     first_path_power_dbm: float
     carrier_offset_ppm: float
+    carrier_phase_cycles: float | None = None
 
 
 class Arrival(Struct, frozen=True, tag="arrival"):

@@ -43,7 +43,8 @@ class ModelPort:
         elif isinstance(event, Gone):
             radio.end(event.reason)
         elif isinstance(event, Reception):
-            chip.receive(event.frame, event.rx_ticks, event.diagnostics or Diagnostics())
+            measured, phase_cycles = event.diagnostics or Diagnostics(), event.carrier_phase_cycles
+            chip.receive(event.frame, event.rx_ticks, measured, carrier_phase_cycles=phase_cycles)
         elif isinstance(event, Sent):
             chip.transceiver.finish()
         elif isinstance(event, Late):

@@ -74,7 +74,7 @@ class LinkProtocol:
     def __init__(self, radio: Radio, send: Send, *, can_transmit: bool) -> None:
         self._radio, self._send, self._can_transmit = radio, send, can_transmit
         self._reader, self._writer = link.Reader(), link.Writer()
-        self._configured = self._receiving = False
+        self._configured = self._receiving = self._wants_phases = False
         self._tx_delay_ticks = 0
         self._waiting: dict[int, int] = {}
         """dx by TX stamp, of frames that have not left."""
@@ -102,7 +102,9 @@ class LinkProtocol:
             return
         self.counts["received"] += 1
         measured = to_steps(reception.diagnostics or Diagnostics())
-        self._write(self._writer.rx(reception.rx_ticks, *measured, reception.frame))
+        phase_cycles = reception.carrier_phase_cycles if self._wants_phases else None
+        phase = None if phase_cycles is None else link.to_turn(phase_cycles)
+        self._write(self._writer.rx(reception.rx_ticks, *measured, reception.frame, phase))
 
     def on_host_data(self, data: bytes) -> None:
         """Execute commands; a board whose radio is dead does nothing."""
@@ -131,7 +133,8 @@ class LinkProtocol:
 
     def _hello(self) -> None:
         name = self._radio.name.encode()[:8].ljust(8, b"\0")
-        self._write(self._writer.hello(_EMULATED_FIRMWARE, name, link.CAN_TRANSMIT if self._can_transmit else 0))
+        abilities = link.HAS_PHASES | self._can_transmit * link.CAN_TRANSMIT
+        self._write(self._writer.hello(_EMULATED_FIRMWARE, name, abilities))
 
     def _status(self) -> None:
         ticks = self._radio.now_ticks()
@@ -147,6 +150,7 @@ class LinkProtocol:
             self._write(self._writer.refused(link.CONFIG, reason))
             return
         self._tx_delay_ticks = int.from_bytes(record[8:10], "little")
+        self._wants_phases = bool(record[link.CONFIG_BYTES - 1] & link.WANTS_PHASES)
         self._configured, self._receiving = True, False
         self._status()
 

@@ -58,10 +58,13 @@ def open_radios(
     kind: Literal["anchor", "tag"],
     names: tuple[str, ...],
     delays: Sequence[AntennaDelays] | None = None,
+    *,
+    phases: bool | None = None,
 ) -> tuple[Radio, ...]:
     """Radios for the nodes of one process, in the order of their names; nothing is connected yet.
 
-    ``delays`` are the nodes' antenna delays, which their radios are set to.
+    ``delays`` are the nodes' antenna delays, which their radios are set to. ``phases``: whether receptions are to have
+    the phase of their carrier, where the radio can measure it; None for those of tags.
 
     Raises:
         SkylessError: there is no such radio; the message says what would be right.
@@ -72,20 +75,25 @@ def open_radios(
         host, port = host_and_port(spec, where, DEFAULT_PORT)
         return EtherConnection(host, port, join).radios
     settings = delays or [AntennaDelays()] * len(names)
+    phases = kind == "tag" if phases is None else phases
     if driver == "model":
         host, port = host_and_port(spec, where, DEFAULT_PORT)
         nodes = EtherConnection(host, port, join).radios
         return tuple(
-            Dw1000Radio(ModelPort(node, own), node.name, own) for node, own in zip(nodes, settings, strict=True)
+            Dw1000Radio(ModelPort(node, own), node.name, own, phases=phases)
+            for node, own in zip(nodes, settings, strict=True)
         )
     if driver == "spi":
         if len(names) != 1:
             raise SkylessError(f"--radio is {spec!r}; a chip on SPI carries one node, not {len(names)}")
-        return (Dw1000Radio(spi_port(spec, where), names[0], settings[0]),)
+        return (Dw1000Radio(spi_port(spec, where), names[0], settings[0], phases=phases),)
     if driver == "serial":
         ports = _ports(spec, where, _SERIAL_BAUD, names)
         transmits = kind == "anchor"
-        return tuple(SerialRadio(*ports[i], name, settings[i], transmits=transmits) for i, name in enumerate(names))
+        return tuple(
+            SerialRadio(*ports[i], name, settings[i], transmits=transmits, phases=phases)
+            for i, name in enumerate(names)
+        )
     if driver in ("listener", "sniffer", "uci") and kind == "anchor":
         raise SkylessError(f"--radio is {spec!r}; it should be one that can transmit: a {driver} only listens")
     if driver == "listener":

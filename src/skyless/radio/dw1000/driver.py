@@ -44,6 +44,7 @@ frame waits, or the chip is OFF."""
 
 NOT_MEASURED: Final = -32768
 """A measured value that is missing."""
+NO_PHASE: Final = -1
 MIN_PSDU_BYTES: Final = 3
 MAX_PSDU_BYTES: Final = 127
 """FCS included, which the chip makes and checks (UM p. 80)."""
@@ -90,6 +91,7 @@ def declare(loaded: ctypes.CDLL) -> None:
     """State the types of the driver's functions in a library that contains them."""
     for name in ("log10", "accumulated", "power_cdbm", "first_path_cdbm", "carrier_offset_ppb", "micros_until"):
         getattr(loaded, f"dw1000_{name}").restype = ctypes.c_int32
+    loaded.dw1000_angle.restype = ctypes.c_uint32
     for name in ("start", "cancel", "check", "measure"):
         getattr(loaded, f"dw1000_{name}").restype = ctypes.c_bool
     loaded.dw1000_now.restype = ctypes.c_uint64
@@ -183,11 +185,13 @@ class Hardware(ctypes.Structure):
 class DW1000(ctypes.Structure):
     """``struct dw1000`` of ``c/dw1000.h``: one chip. A bus that fails leaves it OFF.
 
-    Until the next ``poll``, what was received is in ``rx_ticks``, ``frame``, ``rx_power_cdbm``, ``first_path_cdbm`` and
-    ``offset_ppb``, the stamp of what was SENT in ``tx_ticks``. ``errors`` are failed receptions of any kind.
+    Until the next ``poll``, what was received is in ``rx_ticks``, ``frame``, ``rx_power_cdbm``, ``first_path_cdbm``,
+    ``offset_ppb`` and ``phase``: that of the carrier in 2**-16 turns if ``reads_phases`` is set, or NO_PHASE. The stamp
+    of what was SENT is in ``tx_ticks``. ``errors`` are failed receptions of any kind.
     """
 
     state: int
+    reads_phases: bool
     received: int
     errors: int
     sent: int
@@ -196,6 +200,7 @@ class DW1000(ctypes.Structure):
     rx_power_cdbm: int
     first_path_cdbm: int
     offset_ppb: int
+    phase: int
     tx_ticks: int
     temperature_cc: int
     millivolts: int
@@ -203,11 +208,12 @@ class DW1000(ctypes.Structure):
         ("_functions", ctypes.c_void_p),
         ("state", ctypes.c_int),
         ("_is_listening", ctypes.c_bool),
+        ("reads_phases", ctypes.c_bool),
         *((name, ctypes.c_uint32) for name in ("received", "errors", "sent", "late")),
         ("rx_ticks", ctypes.c_uint64),
         ("_frame", ctypes.c_void_p),
         ("_frame_bytes", ctypes.c_uint32),
-        *((name, ctypes.c_int32) for name in ("rx_power_cdbm", "first_path_cdbm", "offset_ppb")),
+        *((name, ctypes.c_int32) for name in ("rx_power_cdbm", "first_path_cdbm", "offset_ppb", "phase")),
         ("tx_ticks", ctypes.c_uint64),
         ("temperature_cc", ctypes.c_int32),
         *((name, ctypes.c_uint32) for name in ("millivolts", "_temperature_23", "_voltage_33")),

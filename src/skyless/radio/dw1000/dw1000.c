@@ -44,6 +44,13 @@ static const uint16_t LOG10_TABLE[33] = {
     22724u, 23521u, 24304u, 25072u, 25828u, 26570u, 27300u, 28018u, 28724u, 29419u, 30103u,
 };
 
+/* 65536 atan(i/32) / 2 pi */
+static const uint16_t ANGLE_TABLE[33] = {
+    0u,    326u,  651u,  975u,  1297u, 1617u, 1933u, 2246u, 2555u, 2860u, 3159u,
+    3453u, 3742u, 4025u, 4302u, 4572u, 4836u, 5094u, 5344u, 5589u, 5826u, 6058u,
+    6282u, 6500u, 6712u, 6917u, 7117u, 7310u, 7498u, 7679u, 7856u, 8026u, 8192u,
+};
+
 /* Arithmetic */
 
 /* Towards minus infinity; the divisor is positive. */
@@ -113,6 +120,23 @@ int32_t dw1000_carrier_offset_ppb(int32_t integrator)
         return DW1000_NOT_MEASURED;
     }
     return floor_divide(8192 - (integrator * 9390), 16384);
+}
+
+/* Angle of a vector whose components have 16 bits, from 0 to 65535 in 2^-16 turns; within 2 of them. */
+uint32_t dw1000_angle(int32_t x, int32_t y)
+{
+    uint32_t along = (uint32_t)((x < 0) ? -x : x);
+    uint32_t across = (uint32_t)((y < 0) ? -y : y);
+    bool is_steep = across > along;
+    uint32_t longer = is_steep ? across : along;
+    uint32_t ratio = (longer > 0u) ? (((is_steep ? along : across) * 0x7FFFu) / longer) : 0u;
+    uint32_t low = ANGLE_TABLE[ratio >> 10];
+    uint32_t high = ANGLE_TABLE[(ratio >> 10) + 1u];
+    uint32_t angle = low + ((((high - low) * (ratio & 0x3FFu)) + 0x200u) >> 10);
+
+    angle = is_steep ? (0x4000u - angle) : angle;
+    angle = (x < 0) ? (0x8000u - angle) : angle;
+    return ((y < 0) ? (0x10000u - angle) : angle) & 0xFFFFu;
 }
 
 int32_t dw1000_micros_until(uint64_t now_ticks, uint64_t then_ticks)
@@ -274,7 +298,7 @@ static void load_microcode(struct dw1000 *chip)
 /* Let the PLL lock, without a transaction while the clock changes (UM 2.3.2). */
 static bool lock(struct dw1000 *chip)
 {
-    write_register(chip, 0x36u, 0x00u, 2u, 0x0200u); /* PMSC_CTRL0: clocks by themselves */
+    write_register(chip, 0x36u, 0x00u, 2u, PMSC_RUNNING);
     for (uint32_t tries = 0u; tries < LOCK_TRIES; tries++) {
         chip->hardware->pause_us(100u);
         read_status(chip);
@@ -294,6 +318,7 @@ void dw1000_init(struct dw1000 *chip, const struct hardware *hardware)
     chip->rx_power_cdbm = DW1000_NOT_MEASURED;
     chip->first_path_cdbm = DW1000_NOT_MEASURED;
     chip->offset_ppb = DW1000_NOT_MEASURED;
+    chip->phase = DW1000_NO_PHASE;
     chip->temperature_cc = DW1000_NOT_MEASURED;
 }
 
@@ -423,10 +448,44 @@ static uint32_t recover(struct dw1000 *chip)
     return DW1000_FAILED;
 }
 
-/* Powers and carrier offset (UM 4.7, 7.2.18, 7.2.20, 7.2.23, 7.2.40.11); `symbols` is RXPACC. */
-static void read_measured(struct dw1000 *chip, uint32_t symbols, uint32_t f1)
+static int32_t signed_sixteen(const uint8_t *data)
+{
+    int32_t value = (int32_t)sixteen(data);
+
+    return (value >= 0x8000) ? (value - 0x10000) : value;
+}
+
+/* The carrier's phase at the first path (UM 7.2.22, 7.2.23, 7.2.38): the angle of the accumulator's sample behind FP_INDEX,
+ * less RCPHASE of 128 steps a turn; none where the sample is within three standard deviations of the noise. */
+static int32_t read_phase(struct dw1000 *chip, uint32_t first_path, uint32_t noise)
+{
+    uint32_t at = (first_path >> 6) + 1u;
+
+    if (at >= ACC_SAMPLES) {
+        return DW1000_NO_PHASE;
+    }
+
+    uint32_t turned = read_register(chip, 0x14u, 4u, 1u)[0] & 0x7Fu; /* RCPHASE */
+
+    write_register(chip, 0x36u, 0u, 2u, PMSC_FOR_ACC);
+
+    const uint8_t *sample = read_register(chip, 0x25u, 4u * at, 5u); /* the first octet means nothing */
+    int32_t x = signed_sixteen(&sample[1]);
+    int32_t y = signed_sixteen(&sample[3]);
+
+    write_register(chip, 0x36u, 0u, 2u, PMSC_RUNNING);
+    if (((uint64_t)(x * (int64_t)x) + (uint64_t)(y * (int64_t)y)) <= (9u * (uint64_t)noise * noise)) {
+        return DW1000_NO_PHASE;
+    }
+    return (int32_t)((dw1000_angle(x, y) - (turned << 9)) & 0xFFFFu);
+}
+
+/* Powers, carrier offset and phase (UM 4.7, 7.2.18, 7.2.20, 7.2.23, 7.2.40.11); `symbols` is RXPACC, the last two are
+ * FP_INDEX and FP_AMPL1. */
+static void read_measured(struct dw1000 *chip, uint32_t symbols, uint32_t first_path, uint32_t f1)
 {
     const uint8_t *data = read_register(chip, 0x12u, 0u, 8u);
+    uint32_t noise = sixteen(data);
     uint32_t f2 = sixteen(&data[2]);
     uint32_t f3 = sixteen(&data[4]);
     uint32_t cir_power = sixteen(&data[6]);
@@ -446,6 +505,7 @@ static void read_measured(struct dw1000 *chip, uint32_t symbols, uint32_t f1)
     chip->rx_power_cdbm = dw1000_power_cdbm(cir_power, level);
     chip->first_path_cdbm = dw1000_first_path_cdbm(f1, f2, f3, level);
     chip->offset_ppb = dw1000_carrier_offset_ppb(integrator);
+    chip->phase = chip->reads_phases ? read_phase(chip, first_path, noise) : DW1000_NO_PHASE;
 }
 
 /* Read a frame and all that was measured of it, and listen on. */
@@ -478,7 +538,7 @@ static uint32_t read_frame(struct dw1000 *chip)
 
     chip->rx_ticks = forty(time);
     chip->frame_bytes = size;
-    read_measured(chip, symbols, sixteen(&time[7]));
+    read_measured(chip, symbols, sixteen(&time[5]), sixteen(&time[7]));
     chip->received++;
     clear_seen(chip);
     write_register(chip, 0x0Du, 0u, 2u, RXENAB);

@@ -31,6 +31,7 @@ enum dw1000_state { DW1000_OFF, DW1000_IDLE, DW1000_LISTENING, DW1000_SENDING };
 enum dw1000_queued { DW1000_QUEUED = 0, DW1000_LATE = 1, DW1000_BUSY = 2, DW1000_NOT_READY = 3 };
 
 #define DW1000_NOT_MEASURED (-32768)
+#define DW1000_NO_PHASE (-1)
 #define DW1000_MIN_PSDU_BYTES 3u
 #define DW1000_MAX_PSDU_BYTES 127u
 #define DW1000_MAX_TRANSFER_BYTES 132u
@@ -39,6 +40,7 @@ struct dw1000 {
     const struct hardware *hardware;
     enum dw1000_state state;
     bool is_listening;
+    bool reads_phases; /* set by the caller: receptions have a phase, which takes four more transactions */
     uint32_t received;
     uint32_t errors;
     uint32_t sent;
@@ -51,6 +53,7 @@ struct dw1000 {
     int32_t rx_power_cdbm;
     int32_t first_path_cdbm;
     int32_t offset_ppb;
+    int32_t phase; /* of the carrier at the first path, in 2^-16 turns from 0 to 65535; DW1000_NO_PHASE where there is none */
 
     /* Of the last frame that was sent */
     uint64_t tx_ticks;
@@ -104,5 +107,6 @@ int32_t dw1000_accumulated(uint32_t symbols);
 int32_t dw1000_power_cdbm(uint32_t cir_power, int32_t level);
 int32_t dw1000_first_path_cdbm(uint32_t f1, uint32_t f2, uint32_t f3, int32_t level);
 int32_t dw1000_carrier_offset_ppb(int32_t integrator);
+uint32_t dw1000_angle(int32_t x, int32_t y);
 
 #endif

@@ -53,6 +53,11 @@
 #define LOCK_TRIES 50u /* of 100 us */
 #define LDE_TRIES 10u /* of 20 us */
 
+/* The accumulator (UM 7.2.38) */
+#define PMSC_RUNNING 0x0200u /* PMSC_CTRL0, low half: clocks by themselves (UM 7.2.50.1) */
+#define PMSC_FOR_ACC 0x8248u /* the same with AMCE, FACE and the receiver's clock from the PLL */
+#define ACC_SAMPLES 1016u /* at PRF 64 MHz */
+
 /* Power and carrier offset */
 #define SFD_ACCUMULATED 5u /* standard SFD in RXPACC where it did not saturate (UM 7.2.18, p. 95, Table 18) */
 #define POWER_A 1217400 /* A at PRF 64 MHz, 121.74 dB, in 1e-4 dB (UM 4.7.1, p. 46) */

@@ -11,7 +11,7 @@ from skyless.core.ticks import difference, from_seconds, wrap
 from skyless.radio.dw1000 import driver as dw1000
 from skyless.radio.dw1000.driver import DW1000, Bus, ChipError
 from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Listener, RadioEvent, Restarted, Sent, ignore
-from skyless.radio.serial.link import from_steps
+from skyless.radio.serial.link import cycles, from_steps
 
 OVERDUE_TICKS: Final = from_seconds(1e-3)
 """A frame whose end is not reported within this time after its RMARKER is cancelled."""
@@ -28,8 +28,18 @@ _FAILURES: Final = {dw1000.FAILED: "rx-error", dw1000.CLOCK_SLIPPED: "clock-slip
 class ChipSession:
     """One chip from its start until it is lost. No I/O but the driver's bus, no clock."""
 
-    def __init__(self, bus: Bus, delays: AntennaDelays, listener: Listener, counters: Counter[str]) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        delays: AntennaDelays,
+        listener: Listener,
+        counters: Counter[str],
+        *,
+        phases: bool = False,
+    ) -> None:
+        """``phases``: receptions have the phase of their carrier."""
         self.driver = DW1000(bus)
+        self.driver.reads_phases = phases
         self._delays, self._listener, self._counters = delays, listener, counters
         self._pending: int | None = None
         self.idle = False
@@ -81,7 +91,8 @@ class ChipSession:
             self._on_sent()
         if events & dw1000.RECEIVED:
             measured = from_steps(driver.rx_power_cdbm, driver.first_path_cdbm, driver.offset_ppb)
-            self._listener(Reception(driver.frame, driver.rx_ticks, host_s, measured))
+            phase_cycles = None if driver.phase == dw1000.NO_PHASE else cycles(driver.phase)
+            self._listener(Reception(driver.frame, driver.rx_ticks, host_s, measured, phase_cycles))
         return True
 
     def is_alive(self) -> bool:
@@ -120,13 +131,16 @@ class Port(Protocol):
 class Dw1000Radio:
     """One node's chip (``skyless.radio.interface.Radio``)."""
 
-    def __init__(self, port: Port, name: str, delays: AntennaDelays) -> None:
-        """Raises SkylessError where the driver cannot be compiled."""
+    def __init__(self, port: Port, name: str, delays: AntennaDelays, *, phases: bool = False) -> None:
+        """``phases``: receptions have the phase of their carrier.
+
+        Raises SkylessError where the driver cannot be compiled.
+        """
         dw1000.library()
         self.name = name
         self.counters: Counter[str] = Counter()
         self.lead_s = SPI_LEAD_S
-        self._port, self._delays = port, delays
+        self._port, self._delays, self._phases = port, delays, phases
         self._listener: Listener = ignore
         self._session: ChipSession | None = None
         self._reported = ""
@@ -230,7 +244,7 @@ class Dw1000Radio:
         """Start the chip that has been found. Raises OSError and ChipError."""
         self._end_session()
         self._trouble = None
-        session = ChipSession(bus, self._delays, self._on_event, self.counters)
+        session = ChipSession(bus, self._delays, self._on_event, self.counters, phases=self._phases)
         session.start()
         self._session, self._reported = session, ""
         self._listener(Restarted())

@@ -16,7 +16,7 @@ from skyless.core.air.reception import Diagnostics
 
 MAJOR: Final = 1
 """Ends with different major versions cannot work together."""
-MINOR: Final = 1
+MINOR: Final = 2
 """Grows with fields that are appended and kinds that are added, which an older end ignores."""
 
 # From the board
@@ -26,6 +26,7 @@ TX_DONE: Final = 0x03
 TX_LATE: Final = 0x04
 STATUS: Final = 0x05
 REFUSED: Final = 0x06
+RX_PHASE: Final = 0x07
 
 # From the host
 ASK_HELLO: Final = 0x41
@@ -37,6 +38,7 @@ ASK_STATUS: Final = 0x45
 BODY_AT: Final = 2
 """Where a record's body begins, after kind and number."""
 RX_FRAME_AT: Final = 13
+RX_PHASE_FRAME_AT: Final = 15
 TX_FRAME_AT: Final = 7
 MAX_FRAME_BYTES: Final = 127
 
@@ -51,7 +53,10 @@ NOT_MEASURED: Final = -32768
 NO_VOLTAGE: Final = 0xFFFF
 
 CAN_TRANSMIT: Final = 0x01
-"""Capability in HELLO."""
+HAS_PHASES: Final = 0x02
+"""Capabilities in HELLO."""
+WANTS_PHASES: Final = 0x01
+"""Flag in CONFIG: receptions with a phase are to be reported as RX_PHASE."""
 RESET_BY_PIN: Final = 0x01
 RESET_BY_WATCHDOG: Final = 0x02
 RESET_BY_SOFTWARE: Final = 0x04
@@ -132,11 +137,20 @@ class Writer:
         fixed = struct.pack("<5B8sIBB", MAJOR, MINOR, *firmware, device_id, RATE_KHZ, COUNTER_BITS, capabilities)
         return self.record(HELLO, fixed + bytes((reset_cause,)))
 
-    def rx(self, rx_ticks: int, rx_power_cdbm: int, first_path_cdbm: int, offset_ppb: int, frame: bytes) -> bytes:
-        """A frame, its stamp, powers in 0.01 dBm, the sender's carrier offset in 1e-9."""
-        return self.record(
-            RX, _stamp(rx_ticks) + struct.pack("<3h", rx_power_cdbm, first_path_cdbm, offset_ppb) + frame
-        )
+    def rx(
+        self,
+        rx_ticks: int,
+        rx_power_cdbm: int,
+        first_path_cdbm: int,
+        offset_ppb: int,
+        frame: bytes,
+        phase: int | None = None,
+    ) -> bytes:
+        """A frame, its stamp, powers in 0.01 dBm, the sender's carrier offset in 1e-9, and, in RX_PHASE, its phase."""
+        fixed = _stamp(rx_ticks) + struct.pack("<3h", rx_power_cdbm, first_path_cdbm, offset_ppb)
+        if phase is None:
+            return self.record(RX, fixed + frame)
+        return self.record(RX_PHASE, fixed + phase.to_bytes(2, "little") + frame)
 
     def tx_done(self, dx_ticks: int, tx_ticks: int) -> bytes:
         """The frame of ``dx_ticks`` has left with this TX stamp."""
@@ -174,9 +188,9 @@ class Writer:
         """Have the board receive."""
         return self.record(RX_ON)
 
-    def config(self, tx_delay_ticks: int, rx_delay_ticks: int) -> bytes:
+    def config(self, tx_delay_ticks: int, rx_delay_ticks: int, flags: int = 0) -> bytes:
         """Channel 5, 64 MHz PRF, 6.8 Mbit/s, preamble of 128 symbols with code 9; antenna delays."""
-        return self.record(CONFIG, struct.pack("<4B3HB", 5, 64, 2, 9, 128, tx_delay_ticks, rx_delay_ticks, 0))
+        return self.record(CONFIG, struct.pack("<4B3HB", 5, 64, 2, 9, 128, tx_delay_ticks, rx_delay_ticks, flags))
 
     def tx_at(self, dx_ticks: int, frame: bytes) -> bytes:
         """Send ``frame`` so that its RMARKER leaves the radio at ``dx_ticks``."""
@@ -239,6 +253,7 @@ class Reader:
 _STEPS: Final = (100, 100, 1000)
 """Units of powers and carrier offset: steps per dB and per ppm."""
 _GREATEST: Final = 0x7FFF
+_TURN: Final = 1 << 16
 
 
 class Hello(Struct, frozen=True):
@@ -253,6 +268,7 @@ class Hello(Struct, frozen=True):
     can_transmit: bool
     reset_cause: int | None
     """Why it has started, as bits (``RESET_BY_PIN`` …); None for a board of version 1.0."""
+    has_phases: bool = False
 
 
 class Heard(Struct, frozen=True, gc=False):
@@ -261,6 +277,7 @@ class Heard(Struct, frozen=True, gc=False):
     rx_ticks: int
     diagnostics: Diagnostics
     frame: bytes
+    carrier_phase_cycles: float | None = None
 
 
 class Done(Struct, frozen=True, gc=False):
@@ -329,6 +346,16 @@ def from_steps(rx_power: int, first_path: int, offset: int) -> Diagnostics:
     )
 
 
+def to_turn(phase_cycles: float) -> int:
+    """A phase rounded to the link's unit, 2**-16 turns."""
+    return round(phase_cycles * _TURN) % _TURN
+
+
+def cycles(phase: int) -> float:
+    """A phase in the link's unit in cycles; exact."""
+    return phase / _TURN
+
+
 def _value(steps: int, per_unit: int) -> float | None:
     return None if steps == NOT_MEASURED else steps / per_unit
 
@@ -349,13 +376,21 @@ def _hello(record: bytes) -> Hello | None:
     *firmware, device_id, rate_khz, bits, abilities = struct.unpack_from("<3B8sIBB", record, 4)
     can_transmit = bool(abilities & CAN_TRANSMIT)
     reset_cause = record[HELLO_BYTES] if len(record) > HELLO_BYTES else None
-    return Hello(major, minor, tuple(firmware), device_id, rate_khz, bits, can_transmit, reset_cause)
+    has_phases = bool(abilities & HAS_PHASES)
+    return Hello(major, minor, tuple(firmware), device_id, rate_khz, bits, can_transmit, reset_cause, has_phases)
 
 
 def _heard(record: bytes) -> Heard | None:
     if not 1 <= len(record) - RX_FRAME_AT <= MAX_FRAME_BYTES:
         return None
     return Heard(_ticks(record), from_steps(*struct.unpack_from("<3h", record, 7)), record[RX_FRAME_AT:])
+
+
+def _heard_with_phase(record: bytes) -> Heard | None:
+    if not 1 <= len(record) - RX_PHASE_FRAME_AT <= MAX_FRAME_BYTES:
+        return None
+    *measured, phase = struct.unpack_from("<3hH", record, 7)
+    return Heard(_ticks(record), from_steps(*measured), record[RX_PHASE_FRAME_AT:], cycles(phase))
 
 
 def _done(record: bytes) -> Done | None:
@@ -395,4 +430,5 @@ _DECODERS: Final = {
     TX_LATE: _late,
     STATUS: _status,
     REFUSED: _refused,
+    RX_PHASE: _heard_with_phase,
 }

@@ -59,8 +59,12 @@ class LinkSession:
         counters: Counter[str],
         *,
         transmits: bool = False,
+        phases: bool = False,
     ) -> None:
-        """``port`` is its name in messages; ``transmits``: refuse a board that only listens."""
+        """``port`` is its name in messages; ``transmits``: refuse a board that only listens.
+
+        ``phases``: ask a board that can for the phases of carriers.
+        """
         self.clock = BoardClock()
         self.ready = False
         self.hello: Hello | None = None
@@ -68,7 +72,7 @@ class LinkSession:
         """The newest one."""
         self.counters = counters
         self._port, self._delays, self._send, self._listener = port, delays, send, listener
-        self._transmits = transmits
+        self._transmits, self._phases = transmits, phases
         self._reader, self._writer = link.Reader(), link.Writer()
         self._expected: int | None = None
         """Number of the next record."""
@@ -171,7 +175,9 @@ class LinkSession:
         if isinstance(record, Heard):
             if self.ready:
                 self.clock.update(record.rx_ticks, host_s)
-                self._listener(Reception(record.frame, record.rx_ticks, host_s, record.diagnostics))
+                self._listener(
+                    Reception(record.frame, record.rx_ticks, host_s, record.diagnostics, record.carrier_phase_cycles)
+                )
         elif isinstance(record, Done):
             self._on_sent(record)
         elif isinstance(record, TooLate):
@@ -251,7 +257,9 @@ class LinkSession:
             self.counters["refused-command"] += 1
 
     def _configure(self) -> None:
-        self._send(self._writer.config(self._delays.tx_ticks, self._delays.rx_ticks))
+        asks = self._phases and self.hello is not None and self.hello.has_phases
+        flags = link.WANTS_PHASES if asks else 0
+        self._send(self._writer.config(self._delays.tx_ticks, self._delays.rx_ticks, flags))
         self._send(self._writer.rx_on())
 
     def _on_status(self, status: Status, host_s: float) -> None:
@@ -311,14 +319,21 @@ class SerialRadio:
     """One node's board (``skyless.radio.interface.Radio``)."""
 
     def __init__(
-        self, path: str, baud: int, name: str, delays: AntennaDelays | None = None, *, transmits: bool = False
+        self,
+        path: str,
+        baud: int,
+        name: str,
+        delays: AntennaDelays | None = None,
+        *,
+        transmits: bool = False,
+        phases: bool = False,
     ) -> None:
-        """``transmits``: refuse a board that only listens."""
+        """``transmits``: refuse a board that only listens; ``phases``: ask one that can for the phases of carriers."""
         self.name = name
         self.counters: Counter[str] = Counter()
         self.lead_s = _LEAD_S
         self._delays = AntennaDelays() if delays is None else delays
-        self._transmits = transmits
+        self._transmits, self._phases = transmits, phases
         self._port = SerialPort(path, baud, lambda reason: self._listener(Gone(reason)))
         self._listener: Listener = ignore
         self._session: LinkSession | None = None
@@ -368,7 +383,13 @@ class SerialRadio:
     def on_open(self, send: Callable[[bytes], None]) -> None:
         """Begin a session with the board."""
         self._session = LinkSession(
-            self._port.path, self._delays, send, self._on_event, self.counters, transmits=self._transmits
+            self._port.path,
+            self._delays,
+            send,
+            self._on_event,
+            self.counters,
+            transmits=self._transmits,
+            phases=self._phases,
         )
         self._session.begin(time.monotonic())
 

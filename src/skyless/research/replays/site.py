@@ -334,8 +334,12 @@ def reception_of(raw: RawReception) -> Reception | None:
     """A recorded reception; None for one that no radio gives."""
     if not 0 <= raw.rx_ticks < WRAP_TICKS or (raw.host_s is not None and not abs(raw.host_s) < 1e12):
         return None
+    phase_cycles = raw.carrier_phase_cycles
+    if phase_cycles is not None and not 0.0 <= phase_cycles < 1.0:
+        return None
     diagnostics = Diagnostics(raw.rx_power_dbm, raw.first_path_power_dbm, raw.carrier_offset_ppm)
-    return Reception(raw.frame, raw.rx_ticks, raw.host_s, None if diagnostics == Diagnostics() else diagnostics)
+    measured = None if diagnostics == Diagnostics() else diagnostics
+    return Reception(raw.frame, raw.rx_ticks, raw.host_s, measured, phase_cycles)
 
 
 def _receiver_of(start: SegmentStart, method: str | None, integrity: IntegrityRequirement | None) -> AnyReceiver | None:

@@ -297,6 +297,7 @@ class RawReception(Struct, frozen=True, array_like=True):
     rx_power_dbm: float | None = None
     first_path_power_dbm: float | None = None
     carrier_offset_ppm: float | None = None
+    carrier_phase_cycles: float | None = None
 
 
 class ReceptionsMessage(Struct, frozen=True):

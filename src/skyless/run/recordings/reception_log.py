@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.air.reception import Reception
+from skyless.core.air.reception import Diagnostics, Reception
 from skyless.core.any_receiver import AnyReceiver, AnyReceiverState
 from skyless.core.arrays import Array
 from skyless.core.integrity import IntegrityRequirement
@@ -218,9 +218,7 @@ def receiver_settings(
 
 def raw(reception: Reception) -> RawReception:
     """A reception as it is published."""
-    diagnostics = reception.diagnostics
-    if diagnostics is None:
-        return RawReception(reception.frame, reception.rx_ticks, reception.host_s)
+    diagnostics = reception.diagnostics or Diagnostics()
     return RawReception(
         reception.frame,
         reception.rx_ticks,
@@ -228,4 +226,5 @@ def raw(reception: Reception) -> RawReception:
         diagnostics.rx_power_dbm,
         diagnostics.first_path_power_dbm,
         diagnostics.carrier_offset_ppm,
+        reception.carrier_phase_cycles,
     )

@@ -220,7 +220,19 @@ class Chip:
             return bytes(length)
         elif access.file == r.SYS_CTRL.file:
             return bytes(length)  # its bits clear themselves
+        elif access.file == r.ACC_MEM.file:
+            return self._read_accumulator(access.sub, length)
         return self.memory.read(access.file, access.sub, length)
+
+    def _read_accumulator(self, sub: int, length: int) -> bytes:
+        """Behind one octet that means nothing, and only on a clock of its own (UM 7.2.38, 7.2.50.1)."""
+        clocks = r.FACE | r.AMCE
+        if self.memory.get(r.PMSC_CTRL0) & clocks != clocks:
+            self.misuse["accumulator-without-its-clock"] += 1
+            return bytes(length)
+        if self.transceiver.listening_since is not None:
+            self.misuse["accumulator-while-receiving"] += 1
+        return b"\xff" + self.memory.read(r.ACC_MEM.file, sub, length - 1)
 
     def _write(self, access: Access, data: bytes) -> None:
         if self.clocking.in_reset and access.file != r.PMSC.file:
@@ -264,11 +276,24 @@ class Chip:
 
     # The air
 
-    def receive(self, frame: bytes, rx_ticks: int, diagnostics: Diagnostics, fault: Fault | None = None) -> str:
-        """A frame has ended whose RMARKER reached the antenna at ``rx_ticks`` of the counter; what became of it."""
+    def receive(
+        self,
+        frame: bytes,
+        rx_ticks: int,
+        diagnostics: Diagnostics,
+        fault: Fault | None = None,
+        *,
+        carrier_phase_cycles: float | None = None,
+    ) -> str:
+        """A frame has ended whose RMARKER reached the antenna at ``rx_ticks`` of the counter; what became of it.
+
+        ``carrier_phase_cycles`` is that of its first path (``Reception``); None where the air has none.
+        """
         self._update()
         ticks, microcode = wrap(rx_ticks + self._rx_delay_ticks), self.clocking.microcode_loaded
-        outcome = self.transceiver.receive(frame, ticks, diagnostics, microcode=microcode, fault=fault)
+        outcome = self.transceiver.receive(
+            frame, ticks, diagnostics, microcode=microcode, fault=fault, carrier_phase_cycles=carrier_phase_cycles
+        )
         self.arrivals[outcome] += 1
         return outcome
 

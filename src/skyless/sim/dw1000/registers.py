@@ -36,10 +36,13 @@ SYS_STATUS: Final = Register(0x0F, 0x00, 5)  # 7.2.17, pp. 86-93
 # What was received and sent (UM 7.2.18 to 7.2.26, pp. 94-103)
 RX_FINFO: Final = Register(0x10, 0x00, 4, 0, "RO")
 RX_BUFFER: Final = Register(0x11, 0x00, 1024, 0, "RO")
+STD_NOISE: Final = Register(0x12, 0x00, 2, 0, "RO")
 FP_AMPL2: Final = Register(0x12, 0x02, 2, 0, "RO")
 FP_AMPL3: Final = Register(0x12, 0x04, 2, 0, "RO")
 CIR_PWR: Final = Register(0x12, 0x06, 2, 0, "RO")
+RX_TTCKO: Final = Register(0x14, 0x00, 5, 0, "RO")  # 7.2.22; octet 4 is RCPHASE
 RX_STAMP: Final = Register(0x15, 0x00, 5, 0, "RO")
+FP_INDEX: Final = Register(0x15, 0x05, 2, 0, "RO")
 FP_AMPL1: Final = Register(0x15, 0x07, 2, 0, "RO")
 TX_STAMP: Final = Register(0x17, 0x00, 5, 0, "RO")
 TX_ANTD: Final = Register(0x18, 0x00, 2)
@@ -53,6 +56,7 @@ AGC_TUNE2: Final = Register(0x23, 0x0C, 4)
 AGC_TUNE3: Final = Register(0x23, 0x12, 2)
 EXT_SYNC: Final = Register(0x24, 0x00, 12)
 EC_CTRL: Final = Register(0x24, 0x00, 4)
+ACC_MEM: Final = Register(0x25, 0x00, 4064, 0, "RO")  # 7.2.38
 DRX_CONF: Final = Register(0x27, 0x00, 46)
 DRX_TUNE0B: Final = Register(0x27, 0x02, 2)
 DRX_TUNE1A: Final = Register(0x27, 0x04, 2, 0x0087)
@@ -148,6 +152,8 @@ SOFTRESET_ALL: Final = 0x0
 SOFTRESET_RX: Final = 0xE
 SOFTRESET_NONE: Final = 0xF
 LDERUNE: Final = 1 << 17  # of PMSC_CTRL1
+FACE: Final = 1 << 6
+AMCE: Final = 1 << 15
 PMSC_FOR_LDE: Final = 0x0301
 """Low half of PMSC_CTRL0 while the microcode is loaded (UM 2.5.5.10)."""
 
@@ -219,9 +225,10 @@ class Memory:
         octets = value.to_bytes(register.length, "little")
         self._files[register.file][register.sub : register.sub + register.length] = octets
 
-    def fill(self, register: Register, octets: bytes) -> None:
-        """Set the first octets of a buffer from within the chip."""
-        self._files[register.file][register.sub : register.sub + len(octets)] = octets
+    def fill(self, register: Register, octets: bytes, at: int = 0) -> None:
+        """Set octets of a buffer from within the chip."""
+        begin = register.sub + at
+        self._files[register.file][begin : begin + len(octets)] = octets
 
     def octets(self, register: Register) -> bytes:
         """A register's octets, lowest first."""

@@ -4,7 +4,10 @@ Only delayed transmission is modelled, and reception until a frame or an error; 
 acknowledgement, sniffing, sleep, long frames or timeouts.
 """
 
+import cmath
 import math
+import struct
+import zlib
 from collections import Counter
 from typing import Final, Literal, Protocol
 
@@ -60,6 +63,15 @@ HZ_PER_STEP: Final = CHIP_RATE_HZ / 1024 / 131072
 _CARRIER_HALF: Final = 1 << 20
 """The integrator has 21 bits, in two's complement."""
 _GREATEST: Final = 0xFFFF
+
+RCPHASE_STEPS: Final = 128
+"""Steps of RCPHASE in a turn."""
+_STD_NOISE: Final = 40
+"""Of the accumulator's samples (assumed)."""
+_FIRST_PATH_SAMPLE: Final = 740
+"""Where about the first path lies in the accumulator (assumed)."""
+_GREATEST_SAMPLE: Final = 0x7FFF
+_SAMPLE: Final = struct.Struct("<2h")
 
 
 class Air(Protocol):
@@ -222,6 +234,7 @@ class Transceiver:
         *,
         microcode: bool,
         fault: Fault | None = None,
+        carrier_phase_cycles: float | None = None,
     ) -> str:
         """Receive a frame whose RMARKER was at the antenna at that reading of the counter; what became of it.
 
@@ -237,6 +250,7 @@ class Transceiver:
         is_good = is_intact(frame)
         stamped = bool(memory.get(r.PMSC_CTRL1) & r.LDERUNE)
         self._fill_registers(frame, diagnostics)
+        self._fill_accumulator(frame, carrier_phase_cycles)
         if stamped and not microcode:
             self._end_reception(_COMPLETE, is_error=False)  # neither good nor bad: it waits for the stamp for ever
             return "without-microcode"
@@ -284,6 +298,28 @@ class Transceiver:
         offset = 1e-6 * (diagnostics.carrier_offset_ppm or 0.0)
         carrier = round(-offset * CHANNEL_5_HZ / HZ_PER_STEP)  # UM p. 151: the minus comes from how it is measured
         memory.set(r.DRX_CAR_INT, min(max(carrier, -_CARRIER_HALF), _CARRIER_HALF - 1) & (2 * _CARRIER_HALF - 1))
+
+    def _fill_accumulator(self, frame: bytes, phase_cycles: float | None) -> None:
+        """RCPHASE, FP_INDEX, and four samples from there; zeros for what the air does not report.
+
+        The second one's angle less RCPHASE is the phase; its neighbours have others. Where the first path lies, and
+        RCPHASE within four steps, follow from the frame's octets in the place of chance. FP_AMPL3, FP_AMPL2 and
+        FP_AMPL1 are the sizes of the second, third and fourth (UM 7.2.20, 7.2.23).
+        """
+        memory, chance = self._memory, zlib.crc32(frame)
+        turned = chance % 9 - 4
+        index = (_FIRST_PATH_SAMPLE << 6) + (chance >> 8) % 1024
+        memory.set(r.RX_TTCKO, turned % RCPHASE_STEPS << 32)
+        memory.set(r.FP_INDEX, index)
+        memory.set(r.STD_NOISE, _STD_NOISE)
+        memory.fill(r.ACC_MEM, bytes(r.ACC_MEM.length))
+        if phase_cycles is None:
+            return
+        angle = 2.0 * math.pi * (phase_cycles + turned / RCPHASE_STEPS)
+        sizes = [min(memory.get(one), _GREATEST_SAMPLE) for one in (r.FP_AMPL3, r.FP_AMPL2, r.FP_AMPL1)]
+        values = [cmath.rect(size, angle + step) for step, size in enumerate([sizes[0] // 2, *sizes], -1)]
+        samples = b"".join(_SAMPLE.pack(round(one.real), round(one.imag)) for one in values)
+        memory.fill(r.ACC_MEM, samples, _SAMPLE.size * (index >> 6))
 
 
 def _cir_power(power_dbm: float | None) -> tuple[int, int]:
