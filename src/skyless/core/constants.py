@@ -32,5 +32,8 @@ DEFAULT_ANTENNA_DELAY_TICKS: Final = 16_436
 MAX_DRIFT: Final = 50e-6
 """Two clocks cannot drift apart faster: each within 20 ppm (IEEE 802.15.4-2015, 16.4.9), and room for motion."""
 
+CARRIER_CYCLES: Final = {1: 7, 2: 8, 3: 9, 4: 8, 5: 13, 7: 13}
+"""Cycles of each channel's carrier in 128 ticks: the centre frequencies over half the chipping rate (table 16-3)."""
+
 CHANNEL_5_HZ: Final = 6489.6e6
 """Centre frequency of channel 5 (IEEE 802.15.4-2015, table 16-3)."""

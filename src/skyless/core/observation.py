@@ -40,3 +40,5 @@ class Observation(Struct, frozen=True, gc=False):
     """Standard deviation of each coordinate of the anchor; None to use the site's; for ``joint`` only."""
     phase_cycles: float = -1.0
     """Phase of the carrier as the tag received it, below 0 where it is not known; for ``joint`` only."""
+    relay_phases: tuple[float, ...] = ()
+    """The same of ``relays``, as anchors received each other."""

@@ -21,6 +21,8 @@ class Relay(Struct, frozen=True, gc=False):
     """When it was heard, in the clock of the sender of this relay; as many bits as its TX stamps."""
     tof_ticks: float | None
     """Time of flight between the two anchors, antenna delays included where the stamps include them."""
+    carrier_phase_cycles: float | None = None
+    """Phase of the carrier as it was heard (``Reception.carrier_phase_cycles``)."""
 
 
 class Packet(Struct, frozen=True, gc=False):
@@ -38,6 +40,8 @@ class Packet(Struct, frozen=True, gc=False):
     relays: tuple[Relay, ...]
     position_m: Point | None = None
     """The sender's position, as it reports it."""
+    carrier_phase_cycles: float | None = None
+    """Phase of the carrier as the tag received it (``Reception.carrier_phase_cycles``)."""
 
 
 class PairTdoa(Struct, frozen=True, gc=False):

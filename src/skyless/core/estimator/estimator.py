@@ -249,6 +249,7 @@ class Estimator:
         report: Report = NO_REPORT,
         variance_factor: float = 1.0,
         phase_cycles: float = -1.0,
+        relay_phases: Sequence[float] = (),
     ) -> Packet:
         """A packet of a known anchor as compiled functions take it, in the same memory each time; see ``process``."""
         packet = self._packet
@@ -261,6 +262,9 @@ class Estimator:
         packet.relay_count = min(len(relays), MAX_RELAYS)
         for relayed, (sender, number, stamp) in zip(packet.relays, relays, strict=False):
             relayed.listener, relayed.anchor, relayed.sequence, relayed.rx_ticks = anchor, sender, number, stamp
+            relayed.has_phase = False
+        for relayed, cycles in zip(packet.relays, relay_phases, strict=False):
+            relayed.has_phase, relayed.phase_cycles = cycles >= 0.0, cycles
         return packet
 
     def process_difference(self, a: int, b: int, rx_ticks: int, difference_m: float) -> int:

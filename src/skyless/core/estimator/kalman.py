@@ -36,6 +36,8 @@ def predict(s: State, rx_ticks: Ticks) -> None:
     status.walked_m += sqrt(speed_squared) * dt
     if status.obstruction > 0.0:
         status.obstruction *= exp(-dt / s.tuning.obstruction_memory_s)
+    for axis in range(s.dim):
+        status.line_m[axis] += s.x[where.velocity + axis] * dt
     _advance(s, dt)
     motion, white_m2 = settings.qa * status.q_scale, settings.white * dt
     if is_stationary(s):
@@ -58,8 +60,11 @@ def predict(s: State, rx_ticks: Ticks) -> None:
 
 
 def is_stationary(s: State) -> bool:
-    """Whether the tag has shown no motion for long enough to count as stationary."""
-    return 0.0 < s.settings.stationary_s < s.status.stationary_s
+    """Whether the tag has shown no motion for long enough to count as stationary.
+
+    Phases show that it rests by themselves, and what it then begins to do: ambiguities would take that up first.
+    """
+    return 0.0 < s.settings.stationary_s < s.status.stationary_s and not s.status.has_phases
 
 
 def _advance(s: State, dt: float) -> None:

@@ -58,6 +58,9 @@ def protect(s: State) -> None:
             up += square(s.V[2][row])
     levels[HPL] += settings.max_acceleration_mps2 * sqrt(squared)
     levels[VPL] += settings.max_acceleration_mps2 * sqrt(up)
+    if s.status.has_phases:
+        levels[HPL] *= s.tuning.phase_levels
+        levels[VPL] *= s.tuning.phase_levels
 
 
 def largest_test(s: State) -> float:

@@ -40,7 +40,7 @@ from skyless.core.estimator.monitor import (
 )
 from skyless.core.estimator.state import ALL_RANGE_ERRORS, AXES, NO_RANGE_ERRORS, Link, State, make_uncertain
 from skyless.core.native.arithmetic import floor, sqrt, square
-from skyless.core.native.records import Ticks
+from skyless.core.native.records import Reals, Ticks
 from skyless.core.ticks import TICK_MASK
 
 SUBTICK_MASK: Final = SUBTICKS * (TICK_MASK + 1) - 1
@@ -82,19 +82,25 @@ def add_direction(s: State, anchor: int, sign: float) -> float:
     is that of the held point, of the surveyed anchor and of the given height: were it that of the newest estimate, its
     noise would seem to give information on what the ranges leave open.
     """
+    a = s.anchors[anchor]
+    _hold_direction(s, anchor)
+    return add_direction_from(s, anchor, sign, a.held_m, a.held_range_m)
+
+
+def add_direction_from(s: State, anchor: int, sign: float, point_m: Reals, point_range_m: float) -> float:
+    """The same with the direction from a point at a distance from the anchor."""
     where, a = s.layout, s.anchors[anchor]
     survey, squared, up_m = where.survey + s.dim * anchor, 0.0, 0.0
-    _hold_direction(s, anchor)
     if s.dim == 2:
         up_m = s.settings.height_m - a.position_m[2]
         squared += square(up_m + s.x[where.height])
     for axis in range(s.dim):
         squared += square(s.x[axis] - a.position_m[axis] - s.x[survey + axis])
-        add_term(s, axis, sign * (a.held_m[axis] - a.position_m[axis]) / a.held_range_m)
+        add_term(s, axis, sign * (point_m[axis] - a.position_m[axis]) / point_range_m)
     for axis in range(s.dim):
-        add_term(s, survey + axis, -(sign * (a.held_m[axis] - a.position_m[axis]) / a.held_range_m))
+        add_term(s, survey + axis, -(sign * (point_m[axis] - a.position_m[axis]) / point_range_m))
     if s.dim == 2:
-        add_term(s, where.height, sign * up_m / a.held_range_m)
+        add_term(s, where.height, sign * up_m / point_range_m)
     return max(sqrt(squared), 1e-6)
 
 
@@ -255,7 +261,7 @@ def first_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> 
     offset, noise = where.offset + anchor, where.tx_noise + anchor
     reset_state(s, noise, settings.tx_variance_m2)
     reset_state(s, where.rate + anchor, 0.0)
-    a.has_rate = a.has_phase = False
+    a.has_rate = a.own.is_known = a.mesh.is_known = False
     reset_state(s, offset, 0.0)
     s.terms = 0
     range_m = add_direction(s, anchor, 1.0)
@@ -328,8 +334,16 @@ def relay_variance(s: State, listener: int, sender: int, age_s: float) -> float:
     return settings.rx_variance_m2 + 2.0 * age_s * (settings.white + walk * age_s * age_s / 3.0)
 
 
-def relay(s: State, listener: int, sender: int, tx_ticks: Ticks, packet_rx_ticks: Ticks, rx_ticks: Ticks) -> None:
+def relay_age_s(s: State, listener: int, sender: int, packet_rx_ticks: Ticks) -> float:
+    """How long ago an anchor received a packet of another, which the tag received as well."""
+    flown_m = s.anchors[sender].range_m - find_distance_m(s, listener, sender)
+    return (s.status.epoch_ticks - packet_rx_ticks) * TICK_S + flown_m / SPEED_OF_LIGHT_MPS
+
+
+def relay(s: State, listener: int, sender: int, tx_ticks: Ticks, packet_rx_ticks: Ticks, rx_ticks: Ticks) -> bool:
     """Process the reception, by the anchor ``listener``, of a packet of ``sender`` that the tag has received as well.
+
+    Whether it was used.
 
     S − T = |aᵢ − aⱼ| + bⱼ − bᵢ + wⱼ + constant of the pair + noise, when the packet reached anchor i. Both offsets go
     back to that moment by their rates; what their oscillators have done since counts as noise. The pair's constant,
@@ -338,7 +352,7 @@ def relay(s: State, listener: int, sender: int, tx_ticks: Ticks, packet_rx_ticks
     """
     tuning, settings, status = s.tuning, s.settings, s.status
     i, j, link = s.anchors[listener], s.anchors[sender], _pair(s, listener, sender)
-    distance_m = _find_distance_m(s, listener, sender)
+    distance_m = find_distance_m(s, listener, sender)
     age_s = (status.epoch_ticks - packet_rx_ticks) * TICK_S + (j.range_m - distance_m) / SPEED_OF_LIGHT_MPS
     has_tx_noise = j.tx_ticks == tx_ticks and j.has_tx_noise
     relay_terms(s, listener, sender, age_s, has_tx_noise)
@@ -365,7 +379,7 @@ def relay(s: State, listener: int, sender: int, tx_ticks: Ticks, packet_rx_ticks
             link.outliers_in_row = 0
             link.variance_m2 += tuning.pair_jump_m2
             forth.relays = back.relays = 0
-        return
+        return False
     status.relays_used += 1
     status.relays_lately_accepted += 1.0
     i.relay_outliers_in_row = j.relay_outliers_in_row = link.outliers_in_row = 0
@@ -376,6 +390,7 @@ def relay(s: State, listener: int, sender: int, tx_ticks: Ticks, packet_rx_ticks
     forth.relays += 1
     if forth.relays == tuning.pair_relays and back.relays >= tuning.pair_relays:
         _survey_pair(s, listener, sender)
+    return True
 
 
 def _pair(s: State, one: int, other: int) -> Link:
@@ -383,7 +398,7 @@ def _pair(s: State, one: int, other: int) -> Link:
     return s.links[min(one, other)][max(one, other)]
 
 
-def _find_distance_m(s: State, one: int, other: int) -> float:
+def find_distance_m(s: State, one: int, other: int) -> float:
     """How far two anchors are apart in the almanac."""
     squared = 0.0
     for axis in range(AXES):
@@ -435,7 +450,7 @@ def _pair_range(s: State, one: int, other: int) -> None:
 
 def add_pair_survey(s: State, one: int, other: int) -> None:
     """The measurement holds what survey errors change in the distance of two anchors."""
-    a, b, distance_m = s.anchors[one], s.anchors[other], _find_distance_m(s, one, other)
+    a, b, distance_m = s.anchors[one], s.anchors[other], find_distance_m(s, one, other)
     for axis in range(s.dim):
         towards = (a.position_m[axis] - b.position_m[axis]) / distance_m
         add_term(s, s.layout.survey + s.dim * one + axis, towards)

@@ -16,13 +16,27 @@ from typing import Final
 
 from skyless.core.constants import TICK_M, TICK_S
 from skyless.core.estimator.kalman import compute_fault_input, compute_ph, finish_updates, reset_state, update
-from skyless.core.estimator.measurements import add_direction, add_term, h_dot_x, open_state
-from skyless.core.estimator.state import State, use_phases
+from skyless.core.estimator.measurements import (
+    add_direction_from,
+    add_term,
+    find_distance_m,
+    h_dot_x,
+    open_state,
+    relay_age_s,
+    relay_terms,
+    relay_variance,
+)
+from skyless.core.estimator.state import Ambiguity, State, use_phases
 from skyless.core.native.arithmetic import floor, log, sqrt, square
+from skyless.core.native.records import Reals, Ticks
 
 CYCLE_TICKS: Final = 128
 """In so many ticks there are whole cycles of each channel's carrier: ``EstimatorSettings.carrier_cycles``."""
 _TWO_PI: Final = 6.283185307179586
+
+
+PHASE_BEGINS, PHASE_REFUSED, PHASE_USED = range(3)
+"""What became of a phase."""
 
 
 def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
@@ -30,48 +44,104 @@ def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
     status, tuning, a = s.status, s.tuning, s.anchors[anchor]
     use_phases(s)
     finish_updates(s)
-    if not a.has_rate or not _may_count(s, anchor):
-        a.has_phase = a.has_former = False
+    if not a.has_rate or not _may_count(s):
+        a.own.is_known = a.has_former = False
         return
-    ambiguity, wavelength_m = s.layout.ambiguity + anchor, CYCLE_TICKS * TICK_M / s.settings.carrier_cycles
-    if a.has_phase:
+    ambiguity = s.layout.ambiguity + anchor
+    if a.own.is_known:
         walked_m = status.walked_m - a.phase_walked_m
-        s.P[ambiguity][ambiguity] += tuning.phase_wander * status.phase_variance_m2 * walked_m
+        wander = max(tuning.phase_wander * status.phase_variance_m2, s.settings.phase_wander)
+        s.P[ambiguity][ambiguity] += wander * walked_m
     a.phase_walked_m = status.walked_m
+    _follow_line(s)
     expected_m = _phase_terms(s, anchor)
-    cycles = -phase_cycles - _offset_cycles(s, anchor) - expected_m / wavelength_m
-    innovation = (cycles - floor(cycles + 0.5)) * wavelength_m
-    variance, predicted = status.phase_variance_m2, compute_ph(s)
-    if not a.has_phase or predicted > square(tuning.phase_share * wavelength_m):
-        if a.has_phase:
-            _keep_former(s, anchor)
-        _open(s, anchor, innovation, variance)
+    cycles = -phase_cycles - _whole_cycles(s, a.offset_ticks)
+    innovation, variance = _innovation_m(s, cycles, expected_m), status.phase_variance_m2
+    predicted = compute_ph(s)
+    if a.own.is_known and predicted > _certain_m2(s):
+        _keep_former(s, anchor)
+    outcome = _use_phase(s, ambiguity, a.own, innovation, variance)
+    if outcome == PHASE_REFUSED:
+        status.wild_share += tuning.phase_forgetting * (1.0 - status.wild_share)
+    elif outcome == PHASE_USED:
+        status.wild_share -= tuning.phase_forgetting * status.wild_share
+        _learn_noise(s, square(innovation) - predicted)
+        if a.has_former:
+            _rejoin(s, anchor)
+
+
+def relay_phase(s: State, listener: int, sender: int, packet_rx_ticks: Ticks, phase_cycles: float) -> None:
+    """Process the phase of an anchor's reception of its partner, whose stamp was used; of others' it does nothing.
+
+    S − X = |aᵢ − aⱼ| + bⱼ − bᵢ + ambiguity of the mesh + noise (mod λ). The partner is the anchor of lowest identifier that
+    it relays, so that all clocks are tied to one.
+    """
+    i, j, settings, where = s.anchors[listener], s.anchors[sender], s.settings, s.layout
+    finish_updates(s)
+    is_silent = (s.status.epoch_ticks - i.mesh.ticks) * TICK_S > settings.relay_age_s
+    if not i.mesh.is_known or j.identifier < i.partner or is_silent:
+        i.mesh.is_known = i.mesh.is_known and i.partner == j.identifier and not is_silent
+        i.partner = j.identifier
+    if i.partner != j.identifier or not j.has_rate:
         return
-    squared = square(innovation)
-    is_beyond = squared > _limit_m2(s, predicted + variance, wavelength_m)
-    status.wild_share += tuning.phase_forgetting * ((1.0 if is_beyond else 0.0) - status.wild_share)
-    if is_beyond:
+    age_s = relay_age_s(s, listener, sender, packet_rx_ticks)
+    relay_terms(s, listener, sender, age_s, False)
+    expected_m = find_distance_m(s, listener, sender) + h_dot_x(s, 0)
+    add_term(s, where.mesh + listener, 1.0)
+    cycles = -phase_cycles - _whole_cycles(s, j.offset_ticks - i.offset_ticks)
+    variance = square(s.tuning.phase_mesh_std_m) + relay_variance(s, listener, sender, age_s) - settings.rx_variance_m2
+    innovation = _innovation_m(s, cycles, expected_m + s.x[where.mesh + listener])
+    _use_phase(s, where.mesh + listener, i.mesh, innovation, variance)
+
+
+def _whole_cycles(s: State, ticks: Ticks) -> float:
+    """Cycles in whole ticks, in [0, 1)."""
+    return ((ticks & (CYCLE_TICKS - 1)) * s.settings.carrier_cycles) % CYCLE_TICKS / CYCLE_TICKS
+
+
+def _wavelength_m(s: State) -> float:
+    return CYCLE_TICKS * TICK_M / s.settings.carrier_cycles
+
+
+def _certain_m2(s: State) -> float:
+    """Variance of a prediction up to which there is no doubt of the cycle."""
+    return square(s.tuning.phase_share * _wavelength_m(s))
+
+
+def _innovation_m(s: State, cycles: float, expected_m: float) -> float:
+    """By how much a phase is off what is expected, without whole cycles."""
+    off = cycles - expected_m / _wavelength_m(s)
+    return (off - floor(off + 0.5)) * _wavelength_m(s)
+
+
+def _use_phase(s: State, state: int, one: Ambiguity, innovation: float, variance: float) -> int:
+    """Process the phase in ``h``, whose last term is its ambiguity, the state of that index."""
+    status = s.status
+    predicted = compute_ph(s)
+    one.ticks = status.epoch_ticks
+    if not one.is_known or predicted > _certain_m2(s):
+        _open(s, state, one, innovation, variance)
+        return PHASE_BEGINS
+    if square(innovation) > _limit_m2(s, predicted + variance):
         status.phases_refused += 1
-        a.phases_refused_in_row += 1
-        if a.phases_refused_in_row >= int(tuning.phases_in_row):
-            _open(s, anchor, innovation, variance)
-        return
-    _learn_noise(s, squared - predicted)
-    a.phases_refused_in_row = 0
+        one.refused_in_row += 1
+        if one.refused_in_row >= int(s.tuning.phases_in_row):
+            _open(s, state, one, innovation, variance)
+        return PHASE_REFUSED
+    one.refused_in_row = 0
     status.phases_used += 1
     compute_fault_input(s, -1)
     update(s, innovation, predicted + variance)
-    if a.has_former:
-        _rejoin(s, anchor, wavelength_m)
+    return PHASE_USED
 
 
-def _limit_m2(s: State, variance: float, wavelength_m: float) -> float:
+def _limit_m2(s: State, variance: float) -> float:
     """Square of the innovation beyond which a phase is more likely any than noise, or may be the other way round."""
     gate_squared = square(s.settings.gate)
-    odds = min(s.status.wild_share, 0.5) * sqrt(_TWO_PI * variance) / wavelength_m
+    odds = min(s.status.wild_share, 0.5) * sqrt(_TWO_PI * variance) / _wavelength_m(s)
     if odds > 1e-6:
         gate_squared = min(gate_squared, -2.0 * log(odds))
-    return min(gate_squared * variance, square(s.tuning.phase_gate * wavelength_m))
+    return min(gate_squared * variance, square(s.tuning.phase_gate * _wavelength_m(s)))
 
 
 def _learn_noise(s: State, shown_m2: float) -> None:
@@ -79,52 +149,102 @@ def _learn_noise(s: State, shown_m2: float) -> None:
     tuning, status = s.tuning, s.status
     status.phase_variance_m2 += tuning.phase_forgetting * (shown_m2 - status.phase_variance_m2)
     status.phase_variance_m2 = min(
-        max(status.phase_variance_m2, square(tuning.phase_min_std_m)), square(tuning.phase_max_std_m)
+        max(status.phase_variance_m2, square(s.settings.phase_std_m)),
+        square(max(tuning.phase_max_std_m, s.settings.phase_std_m)),
     )
 
 
-def _may_count(s: State, anchor: int) -> bool:
-    """Whether phases of an anchor may count: not just after the start, nor where stamps contradict or come late."""
-    status, tuning, a = s.status, s.tuning, s.anchors[anchor]
+def _may_count(s: State) -> bool:
+    """Whether the tag's phases may count: not just after the start, nor where stamps contradict or come late."""
+    status, tuning = s.status, s.tuning
     if status.mean_nis > tuning.phase_nis:
         close_phases(s)
     is_settled = (status.epoch_ticks - status.start_ticks) * TICK_S >= tuning.phase_after_s
-    return is_settled and status.mean_nis <= tuning.phase_nis and not (a.is_obstructed or a.has_fault)
+    return is_settled and status.mean_nis <= tuning.phase_nis
 
 
 def close_phases(s: State) -> None:
-    """Let all ambiguities begin again: what they were taken for may be wrong by cycles."""
+    """Let all ambiguities of the tag's phases begin again: what they were taken for may be wrong by cycles."""
     for anchor in range(s.count):
-        s.anchors[anchor].has_phase = s.anchors[anchor].has_former = False
+        s.anchors[anchor].own.is_known = s.anchors[anchor].has_former = False
+
+
+def _follow_line(s: State) -> None:
+    """See that the point at which phases are linearised is near the tag.
+
+    It moves as the tag does, but not as estimates of its place are corrected. Were it the newest estimate, corrections
+    would turn the directions to the anchors, and phases would seem to show where the tag is.
+    """
+    away_m2, is_in_use = 0.0, False
+    for axis in range(s.dim):
+        away_m2 += square(s.x[axis] - s.status.line_m[axis])
+    for anchor in range(s.count):
+        is_in_use = is_in_use or s.anchors[anchor].own.is_known
+    if is_in_use and away_m2 <= square(s.tuning.phase_line_m):
+        return
+    if away_m2 > square(s.tuning.held_max_m):
+        close_phases(s)
+    for anchor in range(s.count):
+        if s.anchors[anchor].own.is_known:
+            _turn(s, anchor, s.layout.ambiguity + anchor)
+        if s.anchors[anchor].has_former:
+            _turn(s, anchor, s.layout.former + anchor)
+    for axis in range(s.dim):
+        s.status.line_m[axis] = s.x[axis]
+
+
+def _turn(s: State, anchor: int, ambiguity: int) -> None:
+    """Let an ambiguity's error hold that of the place by the direction from the estimate instead of that from the line.
+
+    a ← a − (h' − h)·(p − δa): what is known of the place by itself does not change.
+    """
+    a, survey = s.anchors[anchor], s.layout.survey + s.dim * anchor
+    old_m, new_m = _line_range_m(s, anchor, s.status.line_m), _line_range_m(s, anchor, s.x)
+    for axis in range(s.dim):
+        turned = (s.x[axis] - a.position_m[axis]) / new_m - (s.status.line_m[axis] - a.position_m[axis]) / old_m
+        _subtract(s, ambiguity, axis, turned)
+        _subtract(s, ambiguity, survey + axis, -turned)
+
+
+def _subtract(s: State, state: int, other: int, weight: float) -> None:
+    """A state's error loses so much of that of another."""
+    for one in range(s.n):
+        s.P[state][one] -= weight * s.P[other][one]
+    for one in range(s.n):
+        s.P[one][state] -= weight * s.P[one][other]
+    for fault in range(s.rows):
+        s.V[state][fault] -= weight * s.V[other][fault]
+
+
+def _line_range_m(s: State, anchor: int, point_m: Reals) -> float:
+    """Distance of a point, at the given height, from an anchor."""
+    a, squared = s.anchors[anchor], 0.0
+    if s.dim == 2:
+        squared += square(s.settings.height_m - a.position_m[2])
+    for axis in range(s.dim):
+        squared += square(point_m[axis] - a.position_m[axis])
+    return max(sqrt(squared), 1e-6)
 
 
 def _phase_terms(s: State, anchor: int) -> float:
     """Write a phase of the tag's into ``h``; returns what is expected of it but for whole ticks of the offset."""
     s.terms = 0
-    range_m = add_direction(s, anchor, 1.0)
+    line_m = s.status.line_m
+    range_m = add_direction_from(s, anchor, 1.0, line_m, _line_range_m(s, anchor, line_m))
     first = s.terms
     add_term(s, s.layout.offset + anchor, 1.0)
     add_term(s, s.layout.ambiguity + anchor, 1.0)
     return range_m + h_dot_x(s, first)
 
 
-def _offset_cycles(s: State, anchor: int) -> float:
-    """Cycles in the whole ticks of an offset, in [0, 1)."""
-    return (
-        ((s.anchors[anchor].offset_ticks & (CYCLE_TICKS - 1)) * s.settings.carrier_cycles) % CYCLE_TICKS / CYCLE_TICKS
-    )
-
-
-def _open(s: State, anchor: int, innovation: float, variance: float) -> None:
-    """Let an anchor's ambiguity begin, so that this phase is as expected."""
-    a = s.anchors[anchor]
+def _open(s: State, state: int, one: Ambiguity, innovation: float, variance: float) -> None:
+    """Let an ambiguity, the last term of ``h``, begin, so that this phase is as expected."""
     s.status.phases_opened += 1
-    a.has_phase = True
-    a.phases_refused_in_row = int(s.tuning.phases_in_row) - 1  # one that the next does not confirm was wrong
-    state = s.layout.ambiguity + anchor
+    one.is_known = True
+    one.refused_in_row = int(s.tuning.phases_in_row) - 1  # one that the next does not confirm was wrong
     ambiguity_m = s.x[state] + innovation
     reset_state(s, state, 0.0)
-    s.terms -= 1  # all but the ambiguity, which is the last
+    s.terms -= 1
     open_state(s, state, -1, variance + compute_ph(s))
     s.x[state] = ambiguity_m
 
@@ -151,25 +271,24 @@ def _former_age_s(s: State, anchor: int) -> float:
     return (s.status.epoch_ticks - s.anchors[anchor].former_ticks) * TICK_S
 
 
-def _rejoin(s: State, anchor: int, wavelength_m: float) -> None:
+def _rejoin(s: State, anchor: int) -> None:
     """Let an ambiguity and its former one be the same but for whole cycles, once their number is beyond doubt.
 
     What was received after a gap shows how clocks and tag have moved within it.
     """
-    tuning, a = s.tuning, s.anchors[anchor]
-    if _former_age_s(s, anchor) > tuning.phase_former_s:
+    a = s.anchors[anchor]
+    if _former_age_s(s, anchor) > s.tuning.phase_former_s:
         a.has_former = False
         return
     s.terms = 0
     add_term(s, s.layout.ambiguity + anchor, 1.0)
     add_term(s, s.layout.former + anchor, -1.0)
     predicted, variance = compute_ph(s), s.status.phase_variance_m2
-    if predicted > square(tuning.phase_share * wavelength_m):
+    if predicted > _certain_m2(s):
         return
-    cycles = -h_dot_x(s, 0) / wavelength_m
-    innovation = (cycles - floor(cycles + 0.5)) * wavelength_m
+    innovation = _innovation_m(s, 0.0, h_dot_x(s, 0))
     a.has_former = False
-    if square(innovation) <= _limit_m2(s, predicted + variance, wavelength_m):
+    if square(innovation) <= _limit_m2(s, predicted + variance):
         s.status.phases_rejoined += 1
         compute_fault_input(s, -1)
         update(s, innovation, predicted + variance)

@@ -21,7 +21,7 @@ from skyless.core.estimator.measurements import (
     zero_velocity,
 )
 from skyless.core.estimator.monitor import covariance_scale, update_stationary
-from skyless.core.estimator.phases import close_phases, own_phase
+from skyless.core.estimator.phases import close_phases, own_phase, relay_phase
 from skyless.core.estimator.state import (
     AXES,
     LEVELS,
@@ -69,6 +69,9 @@ class Relay(Record):
     sequence: int
     rx_ticks: Ticks
     """The listener's stamp, unwrapped."""
+    has_phase: bool
+    phase_cycles: float
+    """Phase of the carrier as the listener received it, in [0, 1)."""
 
 
 @record
@@ -119,6 +122,7 @@ def take_relays(packet: Packet, packed: Bytes, packed_bytes: int) -> None:
             relayed.listener = packet.place.anchor
             relayed.anchor = two_bytes(packed, begin)
             relayed.sequence = packed[begin + 2]
+            relayed.has_phase = False
             relayed.rx_ticks = nearest(unsigned(packed, begin + 3, HEARD_BYTES - 3), packet.tx_ticks)
             packet.relay_count += 1
 
@@ -252,7 +256,9 @@ def _process_relay(s: State, relayed: Relay) -> None:
     is_young = (s.status.epoch_ticks - kept.rx_ticks) * TICK_S < s.settings.relay_age_s
     if kept.sequence == relayed.sequence and kept.tx_ticks > link.tx_ticks and is_young:
         link.tx_ticks = kept.tx_ticks
-        relay(s, listener, sender, kept.tx_ticks, kept.rx_ticks, relayed.rx_ticks)
+        is_used = relay(s, listener, sender, kept.tx_ticks, kept.rx_ticks, relayed.rx_ticks)
+        if is_used and relayed.has_phase and s.status.has_phases:
+            relay_phase(s, listener, sender, kept.rx_ticks, relayed.phase_cycles)
 
 
 def _check_motion_and_faults(s: State, elapsed_s: float) -> None:

@@ -243,25 +243,30 @@ class Tuning(Record):
     """Variance of a barometer's zero at first [m²]."""
 
     # Phases of the carrier
-    phase_std_m: float = 0.002
+    phase_start_std_m: float = 0.002
     """Standard deviation of a phase before innovations show another [m] …"""
-    phase_min_std_m: float = 0.0005
     phase_max_std_m: float = 0.006
-    """… its bounds [m] …"""
+    """… its upper bound, or that of the settings [m] …"""
     phase_forgetting: float = 0.005
-    """… and the weight of the newest in it."""
+    """… and the weight of the newest in it, and in the share of phases beyond the gate."""
+    phase_mesh_std_m: float = 0.0012
+    """Standard deviation of a phase that an anchor measured of another [m]."""
     phase_wander: float = 25.0
     """What reflections change in an ambiguity as the tag walks, in variances of a phase for each metre [1/m]."""
     phase_gate: float = 0.35
     """Part of a wavelength beyond which no innovation is used: half a wavelength may be the other way round."""
     phase_share: float = 0.1
     """Part of a wavelength up to which the standard deviation of a predicted phase leaves no doubt of the cycle."""
+    phase_line_m: float = 0.03
+    """Distance of the estimate from the point at which phases are linearised, at which that moves [m]."""
     phase_former_s: float = 0.5
     """Time for which an ambiguity from before a gap is kept to find by how many cycles it has changed [s]."""
     phases_in_row: float = 4
     """Number of phases of an anchor in a row beyond the gate at which its ambiguity begins again."""
     phase_nis: float = 2.0
     """Mean NIS of stamps beyond which a phase has a wrong cycle."""
+    phase_levels: float = 2.0
+    """Factor on levels where phases are in use: stamps that err alike for long show in no test."""
     phase_after_s: float = 1.0
     """Time after the start from which phases are used [s]: places that still move by the stamps' noise would turn the
     directions to the anchors, which phases would take for motion."""
@@ -318,6 +323,10 @@ class EstimatorSettings(Record):
     """Bounds of the tag's height."""
     carrier_cycles: int = 13
     """Cycles of the carrier in 128 ticks, 13 of channel 5; its phases count where packets have them."""
+    phase_std_m: float = 0.0005
+    """Least standard deviation of a phase as the tag measures it."""
+    phase_wander: float = 3e-5
+    """What reflections at least change in the phases of an anchor as the tag walks, m²/m."""
     drop_s: float = 2.0
     """Anchors that are silent for longer leave the state."""
     relay_age_s: float = 1.0

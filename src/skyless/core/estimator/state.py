@@ -7,6 +7,7 @@ The state vector, all clocks against the tag's own counter, in metres and m/s:
     rates       velocity (dim), then the rate of each offset
     tx noises   of each anchor's newest TX stamp, which all who received it share
     ambiguities for each anchor what its carrier's phase shows beyond range and offset, once phases are used
+    meshes      for each anchor the ambiguity of its own receptions of its partner, another anchor
     formers     for each anchor its ambiguity up to a gap, while it is not known by how many cycles it has changed since
     changes     for each anchor the part of the tag's range error to it that changes as the tag moves
     constants   the part that stays
@@ -37,7 +38,7 @@ LANES: Final = 4
 """Numbers in a vector of 256 bits."""
 
 AXES: Final = 3
-STATES: Final = 2 * (AXES + MAX_ANCHORS) + (5 + AXES) * MAX_ANCHORS + 2
+STATES: Final = 2 * (AXES + MAX_ANCHORS) + (6 + AXES) * MAX_ANCHORS + 2
 """Capacity for states; a multiple of ``LANES``."""
 MOST_WAITING: Final = 8
 """Most updates that wait."""
@@ -62,6 +63,17 @@ NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS, ALL_RANGE_ERRORS = range(3)
 
 LEVELS: Final = 2 + FAULT_KINDS
 """Numbers that ``levels.protect`` writes: ``HPL``, ``VPL``, and the tests of all kinds of faults."""
+
+
+@record
+class Ambiguity(Record):
+    """What is kept of an ambiguity in addition to its state."""
+
+    is_known: bool
+    refused_in_row: int
+    """Phases beyond the gate."""
+    ticks: Ticks
+    """The tag's reading at its newest phase."""
 
 
 @record
@@ -117,12 +129,15 @@ class Anchor(Record):
     """The tag's walked distance at the newest of them."""
     place_residual_m: Annotated[Reals, 2]
     """What its reception left after the last two."""
-    has_phase: bool
-    """Whether its ambiguity is known."""
+    own: Ambiguity
+    """Of the tag's receptions of it."""
+    mesh: Ambiguity
+    """Of its receptions of its partner."""
+    partner: int
+    """Identifier of that, −1 for none."""
     has_former: bool
     former_ticks: Ticks
     """The tag's reading when its former ambiguity ended."""
-    phases_refused_in_row: int
     phase_walked_m: float
     """The tag's walked distance at its newest phase."""
 
@@ -222,6 +237,8 @@ class Status(Record):
     """Normal of that plane."""
     has_phases: bool
     """Whether phases are used, so that there are ambiguities."""
+    line_m: Annotated[Reals, AXES]
+    """Where phases are linearised: a place of the tag, from there on moved by its velocity alone."""
     phase_variance_m2: float
     """Of a phase, as innovations show it."""
     wild_share: float
@@ -250,8 +267,9 @@ class Layout(Record):
     rate: int
     tx_noise: int
     ambiguity: int
+    mesh: int
     former: int
-    """Both where phases are used; else they are the change's place, and not used."""
+    """All where phases are used; else they are the change's place, and not used."""
     change: int
     constant: int
     slope: int
@@ -344,7 +362,7 @@ def prepare(s: State) -> None:
     status.fault_std_m[CREEPING] = tuning.creeping_std_m
     status.place_square_m2[0] = status.place_square_m2[1] = status.mean_square_m2 = stamps_m2
     status.place_distance_m = settings.place_distance_m
-    status.phase_variance_m2 = square(tuning.phase_std_m)
+    status.phase_variance_m2 = square(max(tuning.phase_start_std_m, settings.phase_std_m))
     if settings.place_std_m > 0.0:
         status.range_errors = CHANGING_RANGE_ERRORS
     stated = max(settings.survey_std_m, settings.range_std_m, settings.slope_std_m, settings.height_std_m)
@@ -365,7 +383,8 @@ def set_layout(s: State) -> None:
     where.tx_noise = where.rate + count
     where.ambiguity = where.tx_noise + count
     ambiguities = count if s.status.has_phases else 0
-    where.former = where.ambiguity + ambiguities
+    where.mesh = where.ambiguity + ambiguities
+    where.former = where.mesh + ambiguities
     where.change = where.former + ambiguities
     where.constant = where.change + count
     where.slope = where.constant + count
@@ -414,6 +433,7 @@ def add_anchor(s: State, identifier: int, position_m: Reals, std_m: float, is_op
     if s.status.has_phases:
         _insert_state(s, where.change)
         _insert_state(s, where.former)
+        _insert_state(s, where.mesh)
     _insert_state(s, where.ambiguity)
     _insert_state(s, where.tx_noise)
     _insert_state(s, where.velocity)
@@ -426,6 +446,7 @@ def add_anchor(s: State, identifier: int, position_m: Reals, std_m: float, is_op
     for axis in range(AXES):
         a.position_m[axis] = position_m[axis]
     a.tx_ticks = a.rx_ticks = NEVER
+    a.partner = -1
     a.walk_scale = 1.0
     a.change_variance_m2 = square(settings.place_std_m)
     s.lasting_covariance[anchor][anchor] = square(s.status.fault_std_m[LASTING])
@@ -453,7 +474,7 @@ def add_anchor(s: State, identifier: int, position_m: Reals, std_m: float, is_op
 def use_phases(s: State) -> None:
     """From now on there are ambiguities, all of which are still to begin."""
     if not s.status.has_phases:
-        for _ in range(2 * s.count):
+        for _ in range(3 * s.count):
             _insert_state(s, s.layout.change)
         s.status.has_phases = True
         set_layout(s)
@@ -478,6 +499,7 @@ def remove_anchor(s: State, anchor: int) -> None:
     _remove_state(s, where.change + anchor)
     if s.status.has_phases:
         _remove_state(s, where.former + anchor)
+        _remove_state(s, where.mesh + anchor)
         _remove_state(s, where.ambiguity + anchor)
     _remove_state(s, where.tx_noise + anchor)
     _remove_state(s, where.rate + anchor)

@@ -192,6 +192,7 @@ INTERNAL void add_term(State *s, int32_t state, real weight);
 INTERNAL real h_dot_x(State *s, int32_t begin);
 INTERNAL int32_t direction_terms(State *s);
 INTERNAL real add_direction(State *s, int32_t anchor, real sign);
+INTERNAL real add_direction_from(State *s, int32_t anchor, real sign, real *point_m, real point_range_m);
 INTERNAL void hold_direction(State *s, int32_t anchor);
 INTERNAL void add_range_errors(State *s, int32_t anchor, real sign);
 INTERNAL real find_curvature_m(State *s, real range_m, real variance);
@@ -204,7 +205,8 @@ INTERNAL void open_state(State *s, int32_t state, int32_t own, real variance);
 INTERNAL void find_rate(State *s, int32_t anchor, real innovation, real innovation_variance, real elapsed_s);
 INTERNAL void relay_terms(State *s, int32_t listener, int32_t sender, real age_s, bool has_tx_noise);
 INTERNAL real relay_variance(State *s, int32_t listener, int32_t sender, real age_s);
-INTERNAL void relay(State *s, int32_t listener, int32_t sender, int64_t tx_ticks, int64_t packet_rx_ticks, int64_t
+INTERNAL real relay_age_s(State *s, int32_t listener, int32_t sender, int64_t packet_rx_ticks);
+INTERNAL bool relay(State *s, int32_t listener, int32_t sender, int64_t tx_ticks, int64_t packet_rx_ticks, int64_t
         rx_ticks);
 INTERNAL Link *pair(State *s, int32_t one, int32_t other);
 INTERNAL real find_distance_m(State *s, int32_t one, int32_t other);
@@ -219,16 +221,25 @@ INTERNAL void bound_changes(State *s);
 INTERNAL int32_t height(State *s, real height_m, real std_m, bool is_barometer);
 INTERNAL void zero_velocity(State *s);
 INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles);
-INTERNAL real limit_m2(State *s, real variance, real wavelength_m);
+INTERNAL void relay_phase(State *s, int32_t listener, int32_t sender, int64_t packet_rx_ticks, real phase_cycles);
+INTERNAL real whole_cycles(State *s, int64_t ticks);
+INTERNAL real wavelength_m(State *s);
+INTERNAL real certain_m2(State *s);
+INTERNAL real innovation_m(State *s, real cycles, real expected_m);
+INTERNAL int32_t use_phase(State *s, int32_t state, Ambiguity *one, real innovation, real variance);
+INTERNAL real limit_m2(State *s, real variance);
 INTERNAL void learn_noise(State *s, real shown_m2);
-INTERNAL bool may_count(State *s, int32_t anchor);
+INTERNAL bool may_count(State *s);
 INTERNAL void close_phases(State *s);
+INTERNAL void follow_line(State *s);
+INTERNAL void turn(State *s, int32_t anchor, int32_t ambiguity);
+INTERNAL void subtract(State *s, int32_t state, int32_t other, real weight);
+INTERNAL real line_range_m(State *s, int32_t anchor, real *point_m);
 INTERNAL real phase_terms(State *s, int32_t anchor);
-INTERNAL real offset_cycles(State *s, int32_t anchor);
-INTERNAL void open(State *s, int32_t anchor, real innovation, real variance);
+INTERNAL void open(State *s, int32_t state, Ambiguity *one, real innovation, real variance);
 INTERNAL void keep_former(State *s, int32_t anchor);
 INTERNAL real former_age_s(State *s, int32_t anchor);
-INTERNAL void rejoin(State *s, int32_t anchor, real wavelength_m);
+INTERNAL void rejoin(State *s, int32_t anchor);
 INTERNAL int32_t process(State *s, Packet *packet);
 INTERNAL void take_relays(Packet *packet, uint8_t *packed, int32_t packed_bytes);
 INTERNAL int32_t process_packet(State *s, Packet *packet);
@@ -1004,6 +1015,7 @@ INTERNAL int32_t received(SiteChoice *choice, int32_t counted, int64_t rx_ticks)
  *     rates       velocity (dim), then the rate of each offset
  *     tx noises   of each anchor's newest TX stamp, which all who received it share
  *     ambiguities for each anchor what its carrier's phase shows beyond range and offset, once phases are used
+ *     meshes      for each anchor the ambiguity of its own receptions of its partner, another anchor
  *     formers     for each anchor its ambiguity up to a gap, while it is not known by how many cycles it has changed since
  *     changes     for each anchor the part of the tag's range error to it that changes as the tag moves
  *     constants   the part that stays
@@ -1033,7 +1045,7 @@ SKYLESS_EXPORT void skyless_prepare(State *s) {
     status->place_square_m2[1] = stamps_m2;
     status->place_square_m2[0] = stamps_m2;
     status->place_distance_m = settings->place_distance_m;
-    status->phase_variance_m2 = square(tuning->phase_std_m);
+    status->phase_variance_m2 = square(max_real(tuning->phase_start_std_m, settings->phase_std_m));
     if (settings->place_std_m > REAL(0.0)) {
         status->range_errors = CHANGING_RANGE_ERRORS;
     }
@@ -1060,7 +1072,8 @@ INTERNAL void set_layout(State *s) {
     where->tx_noise = where->rate + count;
     where->ambiguity = where->tx_noise + count;
     int32_t ambiguities = s->status.has_phases ? count : 0;
-    where->former = where->ambiguity + ambiguities;
+    where->mesh = where->ambiguity + ambiguities;
+    where->former = where->mesh + ambiguities;
     where->change = where->former + ambiguities;
     where->constant = where->change + count;
     where->slope = where->constant + count;
@@ -1115,6 +1128,7 @@ SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *po
     if (s->status.has_phases) {
         insert_state(s, where->change);
         insert_state(s, where->former);
+        insert_state(s, where->mesh);
     }
     insert_state(s, where->ambiguity);
     insert_state(s, where->tx_noise);
@@ -1131,6 +1145,7 @@ SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *po
     }
     a->rx_ticks = NEVER;
     a->tx_ticks = NEVER;
+    a->partner = -1;
     a->walk_scale = REAL(1.0);
     a->change_variance_m2 = square(settings->place_std_m);
     s->lasting_covariance[anchor][anchor] = square(s->status.fault_std_m[LASTING]);
@@ -1166,7 +1181,7 @@ SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *po
 /* From now on there are ambiguities, all of which are still to begin. */
 INTERNAL void use_phases(State *s) {
     if (!s->status.has_phases) {
-        for (int32_t time_1 = 0, time_1_end = 2 * s->count; time_1 < time_1_end; time_1++) {
+        for (int32_t time_1 = 0, time_1_end = 3 * s->count; time_1 < time_1_end; time_1++) {
             insert_state(s, s->layout.change);
         }
         s->status.has_phases = true;
@@ -1196,6 +1211,7 @@ SKYLESS_EXPORT void skyless_remove_anchor(State *s, int32_t anchor) {
     remove_state(s, where->change + anchor);
     if (s->status.has_phases) {
         remove_state(s, where->former + anchor);
+        remove_state(s, where->mesh + anchor);
         remove_state(s, where->ambiguity + anchor);
     }
     remove_state(s, where->tx_noise + anchor);
@@ -1420,6 +1436,9 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
     if (status->obstruction > REAL(0.0)) {
         status->obstruction *= exp_(-dt / s->tuning.obstruction_memory_s);
     }
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        status->line_m[axis] += s->x[where->velocity + axis] * dt;
+    }
     advance(s, dt);
     real motion = settings->qa * status->q_scale;
     real white_m2 = settings->white * dt;
@@ -1448,9 +1467,12 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
     status->epoch_ticks = rx_ticks;
 }
 
-/* Whether the tag has shown no motion for long enough to count as stationary. */
+/* Whether the tag has shown no motion for long enough to count as stationary.
+ *
+ * Phases show that it rests by themselves, and what it then begins to do: ambiguities would take that up first. */
 INTERNAL bool is_stationary(State *s) {
-    return REAL(0.0) < s->settings.stationary_s && s->settings.stationary_s < s->status.stationary_s;
+    return (REAL(0.0) < s->settings.stationary_s && s->settings.stationary_s < s->status.stationary_s) &&
+            !s->status.has_phases;
 }
 
 /* The values, which are the first states, gain dt·(their rates), which follow in the same order: F·P·Fᵀ. */
@@ -2441,6 +2463,10 @@ INTERNAL void protect(State *s) {
     }
     levels[HPL] += settings->max_acceleration_mps2 * SQRT(squared);
     levels[VPL] += settings->max_acceleration_mps2 * SQRT(up);
+    if (s->status.has_phases) {
+        levels[HPL] *= s->tuning.phase_levels;
+        levels[VPL] *= s->tuning.phase_levels;
+    }
 }
 
 /* The largest test of faults, χ² with as many degrees of freedom as there are anchors if there are none. */
@@ -2690,25 +2716,31 @@ INTERNAL int32_t direction_terms(State *s) {
  * is that of the held point, of the surveyed anchor and of the given height: were it that of the newest estimate, its
  * noise would seem to give information on what the ranges leave open. */
 INTERNAL real add_direction(State *s, int32_t anchor, real sign) {
+    Anchor *a = &s->anchors[anchor];
+    hold_direction(s, anchor);
+    return add_direction_from(s, anchor, sign, a->held_m, a->held_range_m);
+}
+
+/* The same with the direction from a point at a distance from the anchor. */
+INTERNAL real add_direction_from(State *s, int32_t anchor, real sign, real *point_m, real point_range_m) {
     Layout *where = &s->layout;
     Anchor *a = &s->anchors[anchor];
     int32_t survey = where->survey + s->dim * anchor;
     real squared = REAL(0.0);
     real up_m = REAL(0.0);
-    hold_direction(s, anchor);
     if (s->dim == 2) {
         up_m = s->settings.height_m - a->position_m[2];
         squared += square(up_m + s->x[where->height]);
     }
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
         squared += square(s->x[axis] - a->position_m[axis] - s->x[survey + axis]);
-        add_term(s, axis, sign * (a->held_m[axis] - a->position_m[axis]) / a->held_range_m);
+        add_term(s, axis, sign * (point_m[axis] - a->position_m[axis]) / point_range_m);
     }
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
-        add_term(s, survey + axis, -(sign * (a->held_m[axis] - a->position_m[axis]) / a->held_range_m));
+        add_term(s, survey + axis, -(sign * (point_m[axis] - a->position_m[axis]) / point_range_m));
     }
     if (s->dim == 2) {
-        add_term(s, where->height, sign * up_m / a->held_range_m);
+        add_term(s, where->height, sign * up_m / point_range_m);
     }
     return max_real(SQRT(squared), REAL(1e-06));
 }
@@ -2899,7 +2931,8 @@ INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_
     int32_t noise = where->tx_noise + anchor;
     reset_state(s, noise, settings->tx_variance_m2);
     reset_state(s, where->rate + anchor, REAL(0.0));
-    a->has_phase = false;
+    a->mesh.is_known = false;
+    a->own.is_known = false;
     a->has_rate = false;
     reset_state(s, offset, REAL(0.0));
     s->terms = 0;
@@ -2976,13 +3009,21 @@ INTERNAL real relay_variance(State *s, int32_t listener, int32_t sender, real ag
     return settings->rx_variance_m2 + REAL(2.0) * age_s * (settings->white + walk * age_s * age_s / REAL(3.0));
 }
 
+/* How long ago an anchor received a packet of another, which the tag received as well. */
+INTERNAL real relay_age_s(State *s, int32_t listener, int32_t sender, int64_t packet_rx_ticks) {
+    real flown_m = s->anchors[sender].range_m - find_distance_m(s, listener, sender);
+    return (real)(s->status.epoch_ticks - packet_rx_ticks) * TICK_S + flown_m / SPEED_OF_LIGHT_MPS;
+}
+
 /* Process the reception, by the anchor ``listener``, of a packet of ``sender`` that the tag has received as well.
+ *
+ * Whether it was used.
  *
  * S − T = |aᵢ − aⱼ| + bⱼ − bᵢ + wⱼ + constant of the pair + noise, when the packet reached anchor i. Both offsets go
  * back to that moment by their rates; what their oscillators have done since counts as noise. The pair's constant,
  * in which the survey is, is estimated outside the filter: as both directions of a pair hold it with the same sign
  * and the offsets with opposite ones, neither depends on the other. */
-INTERNAL void relay(State *s, int32_t listener, int32_t sender, int64_t tx_ticks, int64_t packet_rx_ticks, int64_t
+INTERNAL bool relay(State *s, int32_t listener, int32_t sender, int64_t tx_ticks, int64_t packet_rx_ticks, int64_t
         rx_ticks) {
     Tuning *tuning = &s->tuning;
     EstimatorSettings *settings = &s->settings;
@@ -3023,7 +3064,7 @@ INTERNAL void relay(State *s, int32_t listener, int32_t sender, int64_t tx_ticks
             back->relays = 0;
             forth->relays = 0;
         }
-        return;
+        return false;
     }
     status->relays_used += 1;
     status->relays_lately_accepted += REAL(1.0);
@@ -3038,6 +3079,7 @@ INTERNAL void relay(State *s, int32_t listener, int32_t sender, int64_t tx_ticks
     if ((real)forth->relays == tuning->pair_relays && (real)back->relays >= tuning->pair_relays) {
         survey_pair(s, listener, sender);
     }
+    return true;
 }
 
 /* What is kept of two anchors in common, in the row of the lower index. */
@@ -3305,59 +3347,121 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
     Anchor *a = &s->anchors[anchor];
     use_phases(s);
     finish_updates(s);
-    if (!a->has_rate || !may_count(s, anchor)) {
+    if (!a->has_rate || !may_count(s)) {
         a->has_former = false;
-        a->has_phase = false;
+        a->own.is_known = false;
         return;
     }
     int32_t ambiguity = s->layout.ambiguity + anchor;
-    real wavelength_m = (real)CYCLE_TICKS * TICK_M / (real)s->settings.carrier_cycles;
-    if (a->has_phase) {
+    if (a->own.is_known) {
         real walked_m = status->walked_m - a->phase_walked_m;
-        s->P[ambiguity][ambiguity] += tuning->phase_wander * status->phase_variance_m2 * walked_m;
+        real wander = max_real(tuning->phase_wander * status->phase_variance_m2, s->settings.phase_wander);
+        s->P[ambiguity][ambiguity] += wander * walked_m;
     }
     a->phase_walked_m = status->walked_m;
+    follow_line(s);
     real expected_m = phase_terms(s, anchor);
-    real cycles = -phase_cycles - offset_cycles(s, anchor) - expected_m / wavelength_m;
-    real innovation = (cycles - (real)floor_real(cycles + REAL(0.5))) * wavelength_m;
+    real cycles = -phase_cycles - whole_cycles(s, a->offset_ticks);
+    real innovation = innovation_m(s, cycles, expected_m);
     real variance = status->phase_variance_m2;
     real predicted = compute_ph(s);
-    if (!a->has_phase || predicted > square(tuning->phase_share * wavelength_m)) {
-        if (a->has_phase) {
-            keep_former(s, anchor);
-        }
-        open(s, anchor, innovation, variance);
-        return;
+    if (a->own.is_known && predicted > certain_m2(s)) {
+        keep_former(s, anchor);
     }
-    real squared = square(innovation);
-    bool is_beyond = squared > limit_m2(s, predicted + variance, wavelength_m);
-    status->wild_share += tuning->phase_forgetting * ((is_beyond ? REAL(1.0) : REAL(0.0)) - status->wild_share);
-    if (is_beyond) {
-        status->phases_refused += 1;
-        a->phases_refused_in_row += 1;
-        if (a->phases_refused_in_row >= truncated(tuning->phases_in_row)) {
-            open(s, anchor, innovation, variance);
+    int32_t outcome = use_phase(s, ambiguity, &a->own, innovation, variance);
+    if (outcome == PHASE_REFUSED) {
+        status->wild_share += tuning->phase_forgetting * (REAL(1.0) - status->wild_share);
+    } else if (outcome == PHASE_USED) {
+        status->wild_share -= tuning->phase_forgetting * status->wild_share;
+        learn_noise(s, square(innovation) - predicted);
+        if (a->has_former) {
+            rejoin(s, anchor);
         }
-        return;
-    }
-    learn_noise(s, squared - predicted);
-    a->phases_refused_in_row = 0;
-    status->phases_used += 1;
-    compute_fault_input(s, -1);
-    update(s, innovation, predicted + variance, REAL(1.0));
-    if (a->has_former) {
-        rejoin(s, anchor, wavelength_m);
     }
 }
 
+/* Process the phase of an anchor's reception of its partner, whose stamp was used; of others' it does nothing.
+ *
+ * S − X = |aᵢ − aⱼ| + bⱼ − bᵢ + ambiguity of the mesh + noise (mod λ). The partner is the anchor of lowest identifier that
+ * it relays, so that all clocks are tied to one. */
+INTERNAL void relay_phase(State *s, int32_t listener, int32_t sender, int64_t packet_rx_ticks, real phase_cycles) {
+    Anchor *i = &s->anchors[listener];
+    Anchor *j = &s->anchors[sender];
+    EstimatorSettings *settings = &s->settings;
+    Layout *where = &s->layout;
+    finish_updates(s);
+    bool is_silent = (real)(s->status.epoch_ticks - i->mesh.ticks) * TICK_S > settings->relay_age_s;
+    if (!i->mesh.is_known || j->identifier < i->partner || is_silent) {
+        i->mesh.is_known = i->mesh.is_known && i->partner == j->identifier && !is_silent;
+        i->partner = j->identifier;
+    }
+    if (i->partner != j->identifier || !j->has_rate) {
+        return;
+    }
+    real age_s = relay_age_s(s, listener, sender, packet_rx_ticks);
+    relay_terms(s, listener, sender, age_s, false);
+    real expected_m = find_distance_m(s, listener, sender) + h_dot_x(s, 0);
+    add_term(s, where->mesh + listener, REAL(1.0));
+    real cycles = -phase_cycles - whole_cycles(s, j->offset_ticks - i->offset_ticks);
+    real variance = square(s->tuning.phase_mesh_std_m) + relay_variance(s, listener, sender, age_s) -
+            settings->rx_variance_m2;
+    real innovation = innovation_m(s, cycles, expected_m + s->x[where->mesh + listener]);
+    use_phase(s, where->mesh + listener, &i->mesh, innovation, variance);
+}
+
+/* Cycles in whole ticks, in [0, 1). */
+INTERNAL real whole_cycles(State *s, int64_t ticks) {
+    return (real)floor_mod_64((ticks & (CYCLE_TICKS - 1)) * s->settings.carrier_cycles, CYCLE_TICKS) /
+            (real)CYCLE_TICKS;
+}
+
+INTERNAL real wavelength_m(State *s) {
+    return (real)CYCLE_TICKS * TICK_M / (real)s->settings.carrier_cycles;
+}
+
+/* Variance of a prediction up to which there is no doubt of the cycle. */
+INTERNAL real certain_m2(State *s) {
+    return square(s->tuning.phase_share * wavelength_m(s));
+}
+
+/* By how much a phase is off what is expected, without whole cycles. */
+INTERNAL real innovation_m(State *s, real cycles, real expected_m) {
+    real off = cycles - expected_m / wavelength_m(s);
+    return (off - (real)floor_real(off + REAL(0.5))) * wavelength_m(s);
+}
+
+/* Process the phase in ``h``, whose last term is its ambiguity, the state of that index. */
+INTERNAL int32_t use_phase(State *s, int32_t state, Ambiguity *one, real innovation, real variance) {
+    Status *status = &s->status;
+    real predicted = compute_ph(s);
+    one->ticks = status->epoch_ticks;
+    if (!one->is_known || predicted > certain_m2(s)) {
+        open(s, state, one, innovation, variance);
+        return PHASE_BEGINS;
+    }
+    if (square(innovation) > limit_m2(s, predicted + variance)) {
+        status->phases_refused += 1;
+        one->refused_in_row += 1;
+        if (one->refused_in_row >= truncated(s->tuning.phases_in_row)) {
+            open(s, state, one, innovation, variance);
+        }
+        return PHASE_REFUSED;
+    }
+    one->refused_in_row = 0;
+    status->phases_used += 1;
+    compute_fault_input(s, -1);
+    update(s, innovation, predicted + variance, REAL(1.0));
+    return PHASE_USED;
+}
+
 /* Square of the innovation beyond which a phase is more likely any than noise, or may be the other way round. */
-INTERNAL real limit_m2(State *s, real variance, real wavelength_m) {
+INTERNAL real limit_m2(State *s, real variance) {
     real gate_squared = square(s->settings.gate);
-    real odds = min_real(s->status.wild_share, REAL(0.5)) * SQRT(TWO_PI * variance) / wavelength_m;
+    real odds = min_real(s->status.wild_share, REAL(0.5)) * SQRT(TWO_PI * variance) / wavelength_m(s);
     if (odds > REAL(1e-06)) {
         gate_squared = min_real(gate_squared, -REAL(2.0) * log_(odds));
     }
-    return min_real(gate_squared * variance, square(s->tuning.phase_gate * wavelength_m));
+    return min_real(gate_squared * variance, square(s->tuning.phase_gate * wavelength_m(s)));
 }
 
 /* Let the variance of phases follow what innovations show beyond their prediction: more where reflections do more. */
@@ -3365,56 +3469,122 @@ INTERNAL void learn_noise(State *s, real shown_m2) {
     Tuning *tuning = &s->tuning;
     Status *status = &s->status;
     status->phase_variance_m2 += tuning->phase_forgetting * (shown_m2 - status->phase_variance_m2);
-    status->phase_variance_m2 = min_real(max_real(status->phase_variance_m2, square(tuning->phase_min_std_m)),
-            square(tuning->phase_max_std_m));
+    status->phase_variance_m2 = min_real(max_real(status->phase_variance_m2, square(s->settings.phase_std_m)),
+            square(max_real(tuning->phase_max_std_m, s->settings.phase_std_m)));
 }
 
-/* Whether phases of an anchor may count: not just after the start, nor where stamps contradict or come late. */
-INTERNAL bool may_count(State *s, int32_t anchor) {
+/* Whether the tag's phases may count: not just after the start, nor where stamps contradict or come late. */
+INTERNAL bool may_count(State *s) {
     Status *status = &s->status;
     Tuning *tuning = &s->tuning;
-    Anchor *a = &s->anchors[anchor];
     if (status->mean_nis > tuning->phase_nis) {
         close_phases(s);
     }
     bool is_settled = (real)(status->epoch_ticks - status->start_ticks) * TICK_S >= tuning->phase_after_s;
-    return is_settled && status->mean_nis <= tuning->phase_nis && !(a->is_obstructed || a->has_fault);
+    return is_settled && status->mean_nis <= tuning->phase_nis;
 }
 
-/* Let all ambiguities begin again: what they were taken for may be wrong by cycles. */
+/* Let all ambiguities of the tag's phases begin again: what they were taken for may be wrong by cycles. */
 INTERNAL void close_phases(State *s) {
     for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
         s->anchors[anchor].has_former = false;
-        s->anchors[anchor].has_phase = false;
+        s->anchors[anchor].own.is_known = false;
     }
+}
+
+/* See that the point at which phases are linearised is near the tag.
+ *
+ * It moves as the tag does, but not as estimates of its place are corrected. Were it the newest estimate, corrections
+ * would turn the directions to the anchors, and phases would seem to show where the tag is. */
+INTERNAL void follow_line(State *s) {
+    real away_m2 = REAL(0.0);
+    bool is_in_use = false;
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        away_m2 += square(s->x[axis] - s->status.line_m[axis]);
+    }
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        is_in_use = is_in_use || s->anchors[anchor].own.is_known;
+    }
+    if (is_in_use && away_m2 <= square(s->tuning.phase_line_m)) {
+        return;
+    }
+    if (away_m2 > square(s->tuning.held_max_m)) {
+        close_phases(s);
+    }
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        if (s->anchors[anchor].own.is_known) {
+            turn(s, anchor, s->layout.ambiguity + anchor);
+        }
+        if (s->anchors[anchor].has_former) {
+            turn(s, anchor, s->layout.former + anchor);
+        }
+    }
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        s->status.line_m[axis] = s->x[axis];
+    }
+}
+
+/* Let an ambiguity's error hold that of the place by the direction from the estimate instead of that from the line.
+ *
+ * a ← a − (h' − h)·(p − δa): what is known of the place by itself does not change. */
+INTERNAL void turn(State *s, int32_t anchor, int32_t ambiguity) {
+    Anchor *a = &s->anchors[anchor];
+    int32_t survey = s->layout.survey + s->dim * anchor;
+    real old_m = line_range_m(s, anchor, s->status.line_m);
+    real new_m = line_range_m(s, anchor, s->x);
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        real turned = (s->x[axis] - a->position_m[axis]) / new_m - (s->status.line_m[axis] - a->position_m[axis]) /
+                old_m;
+        subtract(s, ambiguity, axis, turned);
+        subtract(s, ambiguity, survey + axis, -turned);
+    }
+}
+
+/* A state's error loses so much of that of another. */
+INTERNAL void subtract(State *s, int32_t state, int32_t other, real weight) {
+    for (int32_t one = 0, one_end = s->n; one < one_end; one++) {
+        s->P[state][one] -= weight * s->P[other][one];
+    }
+    for (int32_t one = 0, one_end = s->n; one < one_end; one++) {
+        s->P[one][state] -= weight * s->P[one][other];
+    }
+    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+        s->V[state][fault] -= weight * s->V[other][fault];
+    }
+}
+
+/* Distance of a point, at the given height, from an anchor. */
+INTERNAL real line_range_m(State *s, int32_t anchor, real *point_m) {
+    Anchor *a = &s->anchors[anchor];
+    real squared = REAL(0.0);
+    if (s->dim == 2) {
+        squared += square(s->settings.height_m - a->position_m[2]);
+    }
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        squared += square(point_m[axis] - a->position_m[axis]);
+    }
+    return max_real(SQRT(squared), REAL(1e-06));
 }
 
 /* Write a phase of the tag's into ``h``; returns what is expected of it but for whole ticks of the offset. */
 INTERNAL real phase_terms(State *s, int32_t anchor) {
     s->terms = 0;
-    real range_m = add_direction(s, anchor, REAL(1.0));
+    real *line_m = s->status.line_m;
+    real range_m = add_direction_from(s, anchor, REAL(1.0), line_m, line_range_m(s, anchor, line_m));
     int32_t first = s->terms;
     add_term(s, s->layout.offset + anchor, REAL(1.0));
     add_term(s, s->layout.ambiguity + anchor, REAL(1.0));
     return range_m + h_dot_x(s, first);
 }
 
-/* Cycles in the whole ticks of an offset, in [0, 1). */
-INTERNAL real offset_cycles(State *s, int32_t anchor) {
-    return (real)floor_mod_64((s->anchors[anchor].offset_ticks & (CYCLE_TICKS - 1)) * s->settings.carrier_cycles,
-            CYCLE_TICKS) / (real)CYCLE_TICKS;
-}
-
-/* Let an anchor's ambiguity begin, so that this phase is as expected. */
-INTERNAL void open(State *s, int32_t anchor, real innovation, real variance) {
-    Anchor *a = &s->anchors[anchor];
+/* Let an ambiguity, the last term of ``h``, begin, so that this phase is as expected. */
+INTERNAL void open(State *s, int32_t state, Ambiguity *one, real innovation, real variance) {
     s->status.phases_opened += 1;
-    a->has_phase = true;
-    a->phases_refused_in_row = truncated(s->tuning.phases_in_row) - 1;  /* one that the next does not confirm was wrong */
-    int32_t state = s->layout.ambiguity + anchor;
+    one->is_known = true;
+    one->refused_in_row = truncated(s->tuning.phases_in_row) - 1;  /* one that the next does not confirm was wrong */
     real ambiguity_m = s->x[state] + innovation;
     reset_state(s, state, REAL(0.0));
-    s->terms -= 1;  /* all but the ambiguity, which is the last */
+    s->terms -= 1;
     open_state(s, state, -1, variance + compute_ph(s));
     s->x[state] = ambiguity_m;
 }
@@ -3450,10 +3620,9 @@ INTERNAL real former_age_s(State *s, int32_t anchor) {
 /* Let an ambiguity and its former one be the same but for whole cycles, once their number is beyond doubt.
  *
  * What was received after a gap shows how clocks and tag have moved within it. */
-INTERNAL void rejoin(State *s, int32_t anchor, real wavelength_m) {
-    Tuning *tuning = &s->tuning;
+INTERNAL void rejoin(State *s, int32_t anchor) {
     Anchor *a = &s->anchors[anchor];
-    if (former_age_s(s, anchor) > tuning->phase_former_s) {
+    if (former_age_s(s, anchor) > s->tuning.phase_former_s) {
         a->has_former = false;
         return;
     }
@@ -3462,13 +3631,12 @@ INTERNAL void rejoin(State *s, int32_t anchor, real wavelength_m) {
     add_term(s, s->layout.former + anchor, -REAL(1.0));
     real predicted = compute_ph(s);
     real variance = s->status.phase_variance_m2;
-    if (predicted > square(tuning->phase_share * wavelength_m)) {
+    if (predicted > certain_m2(s)) {
         return;
     }
-    real cycles = -h_dot_x(s, 0) / wavelength_m;
-    real innovation = (cycles - (real)floor_real(cycles + REAL(0.5))) * wavelength_m;
+    real innovation = innovation_m(s, REAL(0.0), h_dot_x(s, 0));
     a->has_former = false;
-    if (square(innovation) <= limit_m2(s, predicted + variance, wavelength_m)) {
+    if (square(innovation) <= limit_m2(s, predicted + variance)) {
         s->status.phases_rejoined += 1;
         compute_fault_input(s, -1);
         update(s, innovation, predicted + variance, REAL(1.0));
@@ -3500,6 +3668,7 @@ INTERNAL void take_relays(Packet *packet, uint8_t *packed, int32_t packed_bytes)
             relayed->listener = packet->place.anchor;
             relayed->anchor = two_bytes(packed, begin);
             relayed->sequence = packed[begin + 2];
+            relayed->has_phase = false;
             relayed->rx_ticks = nearest(unsigned_(packed, begin + 3, HEARD_BYTES - 3), packet->tx_ticks, 40);
             packet->relay_count += 1;
         }
@@ -3668,7 +3837,10 @@ INTERNAL void process_relay(State *s, Relay *relayed) {
     bool is_young = (real)(s->status.epoch_ticks - kept->rx_ticks) * TICK_S < s->settings.relay_age_s;
     if (kept->sequence == relayed->sequence && kept->tx_ticks > link->tx_ticks && is_young) {
         link->tx_ticks = kept->tx_ticks;
-        relay(s, listener, sender, kept->tx_ticks, kept->rx_ticks, relayed->rx_ticks);
+        bool is_used = relay(s, listener, sender, kept->tx_ticks, kept->rx_ticks, relayed->rx_ticks);
+        if (is_used && relayed->has_phase && s->status.has_phases) {
+            relay_phase(s, listener, sender, kept->rx_ticks, relayed->phase_cycles);
+        }
     }
 }
 

@@ -224,6 +224,9 @@ typedef double real;
 /* Packets of each anchor that are kept for relays to come; divides the range of sequence numbers. */
 #define PACKETS_KEPT 16
 #define PAGE_BYTES 17
+#define PHASE_BEGINS 0
+#define PHASE_REFUSED 1
+#define PHASE_USED 2
 #define PLANE 2
 #define POSITION 0
 #define POSITION_BYTES 12
@@ -438,6 +441,8 @@ typedef struct Relay {
     int32_t anchor;  /* Identifier of the other. */
     int32_t sequence;
     int64_t rx_ticks;  /* The listener's stamp, unwrapped. */
+    bool has_phase;
+    real phase_cycles;  /* Phase of the carrier as the listener received it, in [0, 1). */
 } Relay;
 
 /* A packet that the tag received; all stamps are unwrapped. */
@@ -511,6 +516,8 @@ typedef struct EstimatorSettings {
     real highest_m;  /* Bounds of the tag's height. */
     /* Cycles of the carrier in 128 ticks, 13 of channel 5; its phases count where packets have them. */
     int32_t carrier_cycles;
+    real phase_std_m;  /* Least standard deviation of a phase as the tag measures it. */
+    real phase_wander;  /* What reflections at least change in the phases of an anchor as the tag walks, m²/m. */
     real drop_s;  /* Anchors that are silent for longer leave the state. */
     real relay_age_s;  /* Older packets are not relayed, as sequence numbers come around. */
     real survey_std_m;  /* Standard deviation of each coordinate of an anchor. */
@@ -681,21 +688,24 @@ typedef struct Tuning {
     real neighbourhood;
     real most_horizontal_std_m;  /* While its horizontal standard deviation is larger, there is no fix [m]. */
     real zero_variance_m2;  /* Variance of a barometer's zero at first [m²]. */
-    real phase_std_m;  /* Standard deviation of a phase before innovations show another [m] … */
-    real phase_min_std_m;
-    real phase_max_std_m;  /* … its bounds [m] … */
-    real phase_forgetting;  /* … and the weight of the newest in it. */
+    real phase_start_std_m;  /* Standard deviation of a phase before innovations show another [m] … */
+    real phase_max_std_m;  /* … its upper bound, or that of the settings [m] … */
+    real phase_forgetting;  /* … and the weight of the newest in it, and in the share of phases beyond the gate. */
+    real phase_mesh_std_m;  /* Standard deviation of a phase that an anchor measured of another [m]. */
     /* What reflections change in an ambiguity as the tag walks, in variances of a phase for each metre [1/m]. */
     real phase_wander;
     /* Part of a wavelength beyond which no innovation is used: half a wavelength may be the other way round. */
     real phase_gate;
     /* Part of a wavelength up to which the standard deviation of a predicted phase leaves no doubt of the cycle. */
     real phase_share;
+    /* Distance of the estimate from the point at which phases are linearised, at which that moves [m]. */
+    real phase_line_m;
     /* Time for which an ambiguity from before a gap is kept to find by how many cycles it has changed [s]. */
     real phase_former_s;
     /* Number of phases of an anchor in a row beyond the gate at which its ambiguity begins again. */
     real phases_in_row;
     real phase_nis;  /* Mean NIS of stamps beyond which a phase has a wrong cycle. */
+    real phase_levels;  /* Factor on levels where phases are in use: stamps that err alike for long show in no test. */
     /* Time after the start from which phases are used [s]: places that still move by the stamps' noise would turn the
      * directions to the anchors, which phases would take for motion. */
     real phase_after_s;
@@ -719,7 +729,8 @@ typedef struct Layout {
     int32_t rate;
     int32_t tx_noise;
     int32_t ambiguity;
-    int32_t former;  /* Both where phases are used; else they are the change's place, and not used. */
+    int32_t mesh;
+    int32_t former;  /* All where phases are used; else they are the change's place, and not used. */
     int32_t change;
     int32_t constant;
     int32_t slope;
@@ -774,6 +785,7 @@ typedef struct Status {
     real plane_m[3];  /* A point of the plane that lies closest to the anchors. */
     real plane_normal[3];  /* Normal of that plane. */
     bool has_phases;  /* Whether phases are used, so that there are ambiguities. */
+    real line_m[3];  /* Where phases are linearised: a place of the tag, from there on moved by its velocity alone. */
     real phase_variance_m2;  /* Of a phase, as innovations show it. */
     real wild_share;  /* Running share of phases beyond the gate. */
     int64_t phases_used;
@@ -785,6 +797,13 @@ typedef struct Status {
     int32_t range_errors;  /* NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS or ALL_RANGE_ERRORS. */
     real fault_std_m[3];  /* Of each kind of faults, beforehand. */
 } Status;
+
+/* What is kept of an ambiguity in addition to its state. */
+typedef struct Ambiguity {
+    bool is_known;
+    int32_t refused_in_row;  /* Phases beyond the gate. */
+    int64_t ticks;  /* The tag's reading at its newest phase. */
+} Ambiguity;
 
 /* What is kept of an anchor in addition to its states. */
 typedef struct Anchor {
@@ -815,10 +834,11 @@ typedef struct Anchor {
     int32_t place_steps;  /* Steps of the tag after which its range error was compared, in a row. */
     real place_walked_m;  /* The tag's walked distance at the newest of them. */
     real place_residual_m[2];  /* What its reception left after the last two. */
-    bool has_phase;  /* Whether its ambiguity is known. */
+    Ambiguity own;  /* Of the tag's receptions of it. */
+    Ambiguity mesh;  /* Of its receptions of its partner. */
+    int32_t partner;  /* Identifier of that, −1 for none. */
     bool has_former;
     int64_t former_ticks;  /* The tag's reading when its former ambiguity ended. */
-    int32_t phases_refused_in_row;
     real phase_walked_m;  /* The tag's walked distance at its newest phase. */
 } Anchor;
 
@@ -841,11 +861,11 @@ typedef struct Link {
 
 /* Everything that the estimator keeps of one tag. What loops run over stands first: its rows fill cache lines. */
 typedef struct State {
-    real x[328];
-    real P[328][328];  /* Symmetric to the bit. */
+    real x[360];
+    real P[360][360];  /* Symmetric to the bit. */
     /* What faults do to x: of each kind for each metre by which receptions of an anchor are late, then for each m/s² of
      * acceleration along an axis, then what planning adds. */
-    real V[328][112];
+    real V[360][112];
     EstimatorSettings settings;
     Tuning tuning;
     real horizontal_k;  /* How many standard deviations the risk of levels allows. */
@@ -869,7 +889,7 @@ typedef struct State {
     real h[20];  /* The measurement where it is not zero, at the indices in ``h_index``. */
     int32_t h_index[20];
     int32_t waiting;  /* Updates that are not in P and V yet: those of a packet's relays go there together. */
-    real U[8][328];  /* Of each its u = P·h/√S; then P·h of the measurement at hand. */
+    real U[8][360];  /* Of each its u = P·h/√S; then P·h of the measurement at hand. */
     /* Of each, over √S, by how much each fault is in its innovation; then the same of the measurement at hand. */
     real G[8][112];
     real work[39][32];  /* Scratch for systems of equations of all faults of one kind. */

@@ -311,6 +311,7 @@ class Estimation:
             self._report(observation),
             observation.rx_variance_factor,
             observation.phase_cycles,
+            observation.relay_phases,
         )
 
     def _report(self, observation: Observation) -> Report:

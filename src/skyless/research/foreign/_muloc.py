@@ -6,8 +6,8 @@ the tag. TX stamps were not recorded. A sender answers the packet before its own
     X = ((R + 65536·d) with its low nine bits 0) + A,
 
 R the sender's own reception of that packet, d the delay that was programmed, A its TX antenna delay (Ma, Zhang, Jin,
-Li, Wang, MULoc, INFOCOM 2025). Carrier phases and powers are in further arrays, which
-``arrays_of`` gives once ``_SHAPES`` has them.
+Li, Wang, MULoc, INFOCOM 2025). All radios change the channel after each second round. Stamps and phases of the two
+channels have other constants, so one of them is read where phases are.
 """
 
 import zipfile
@@ -20,8 +20,10 @@ from os import PathLike
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyless.core.air.masterless_packets import Packet, Point, Relay
+from skyless.core.arrays import Array
 from skyless.core.constants import TICK_BITS, TICK_RATE_HZ
 from skyless.core.input_files import Drops, open_source
 from skyless.core.ticks import difference, wrap
@@ -34,6 +36,8 @@ _SHAPES: Final[dict[str, tuple[int, ...]]] = {
     "index": (),
     "channel": (),
     "rx_ticks": (_SENDERS, _SENDERS + 1),
+    "iq": (_SENDERS, _SENDERS + 1, 2),
+    "rcphase": (_SENDERS, _SENDERS + 1),
     "anchors_m": (2,),
     "start_m": (),
     "end_m": (),
@@ -76,12 +80,14 @@ def arrays_of(stream: BufferedIOBase, drops: Drops, *names: str) -> dict[str, An
     return found
 
 
-def read(stream: BufferedIOBase, drops: Drops) -> Iterator[Packet]:
-    """Yield what the tag received."""
-    arrays = arrays_of(stream, drops, "index", "channel", "rx_ticks")
+def read(stream: BufferedIOBase, drops: Drops, channel: int | None = None) -> Iterator[Packet]:
+    """Yield what the tag received; ``channel``: on this one alone, with the phases of its carrier."""
+    names = ("index", "channel", "rx_ticks") if channel is None else ("index", "channel", "rx_ticks", "iq", "rcphase")
+    arrays = arrays_of(stream, drops, *names)
     if arrays is None:
         return
-    index, channel, rounds = (arrays[name].tolist() for name in ("index", "channel", "rx_ticks"))
+    index, channels, rounds = (arrays[name].tolist() for name in ("index", "channel", "rx_ticks"))
+    phases = None if channel is None else phases_cycles(arrays["iq"], arrays["rcphase"])
     before: list[list[int]] = []
     for number, (one, rx_ticks) in enumerate(zip(index, rounds, strict=False)):
         follows = bool(before) and (one - index[number - 1]) % 256 == 1
@@ -89,18 +95,37 @@ def read(stream: BufferedIOBase, drops: Drops) -> Iterator[Packet]:
         if _is_stale([stamps[_TAG] for stamps in rx_ticks]):
             drops["stale-registers"] += 1
             continue
-        retuned = follows and channel[number] != channel[number - 1]
+        retuned = follows and channels[number] != channels[number - 1]
+        if channel not in {None, channels[number]}:
+            continue
         for sender in range(_SENDERS):
             received = [(number, other, rx_ticks[other][sender]) for other in range(sender)]
-            received += [(number - 1, other, last[other][sender]) for other in range(sender + 1, _SENDERS)]
+            if channel is None or not retuned:
+                received += [(number - 1, other, last[other][sender]) for other in range(sender + 1, _SENDERS)]
             heard = rx_ticks[sender - 1][sender] if sender else last[-1][0]
             if min(heard, rx_ticks[sender][_TAG]) < 0:
                 drops["tx-stamp-unknown" if heard < 0 else "unheard-by-the-listener"] += 1
                 continue
             delay = _DELAY * (2 if retuned and not sender else 1)
             tx_ticks = wrap((heard + delay) // _GRID * _GRID + _TX_ANTENNA_TICKS)
-            relays = tuple(Relay(other, k, stamp, None) for k, other, stamp in received if stamp >= 0)
-            yield Packet(None, sender, number, tx_ticks, rx_ticks[sender][_TAG], relays)
+            relays = tuple(
+                Relay(other, k, stamp, None, _phase_at(phases, k, other, sender))
+                for k, other, stamp in received
+                if stamp >= 0
+            )
+            phase = _phase_at(phases, number, sender, _TAG)
+            yield Packet(None, sender, number, tx_ticks, rx_ticks[sender][_TAG], relays, None, phase)
+
+
+def _phase_at(phases: Array | None, number: int, sender: int, observer: int) -> float | None:
+    """The phase of a packet of a round as an observer measured it, where phases are read."""
+    return None if phases is None else float(phases[number, sender, observer])
+
+
+def phases_cycles(iq: NDArray[Any], rcphase: NDArray[Any]) -> Array:
+    """Phases of the carrier in [0, 1), of accumulator samples, shape (…, 2), and RCPHASE in 1/128 cycles, shape (…)."""
+    angles = np.arctan2(iq[..., 1].astype(np.float64), iq[..., 0].astype(np.float64))
+    return np.asarray((angles / (2.0 * np.pi) - rcphase / 128.0) % 1.0, np.float64)
 
 
 def _is_stale(stamps: list[int]) -> bool:

@@ -33,8 +33,11 @@ MASTERLESS: Final = DIFFERENCES.changed(
     drop_s=EstimatorSettings().drop_s,
     rx_variance_m2=2e-3,
     slope_std_m=0.05,
+    phase_std_m=0.006,
+    phase_wander=9e-4,
 )
-"""Ranges err as in ``DIFFERENCES``. In captures of TDoA3 anchors a reception is 4 cm off by itself."""
+"""Ranges err as in ``DIFFERENCES``. In captures of TDoA3 anchors a reception is 4 cm off by itself.
+Phases count less than they could, as heights of recorded anchors are not known, nor are their places to a centimetre."""
 
 DL_TDOA: Final = EstimatorSettings(qa=DIFFERENCES.qa)
 """For FiRa's radios, of which there are no recordings yet: a site with typical errors is assumed."""
@@ -162,13 +165,14 @@ class PacketTracking:
         anchor = self._unwrap(packet)
         if anchor is None:
             return None
-        relays = []
+        relays, phases = [], []
         for relay in packet.relays:
             rx_ticks = self._relayed(packet.anchor, anchor, relay)
             if isinstance(rx_ticks, str):
                 self._drops[rx_ticks] += 1
             else:
                 relays.append((relay.anchor, relay.sequence, rx_ticks))
+                phases.append(_phase_of(relay))
                 if self._pairs is not None:
                     self._look_both_ways(packet.anchor, relay.anchor)
         rx_ticks = anchor.rx_ticks if self._calibration is None else self._calibrated(packet.anchor, anchor)
@@ -185,6 +189,8 @@ class PacketTracking:
             0.0,
             0.0,
             tuple(relays),
+            phase_cycles=_phase_of(packet),
+            relay_phases=tuple(phases),
         )
         if self._delays.contradictions_m:
             self._tracking.estimator.withhold_levels()
@@ -322,3 +328,8 @@ class PacketTracking:
         if rejected < self._rejected_now:
             self._rejected_before += self._rejected_now
         self._rejected_now = rejected
+
+
+def _phase_of(received: Packet | Relay) -> float:
+    """The phase of a carrier as the filter takes it: below 0 where it is not known."""
+    return -1.0 if received.carrier_phase_cycles is None else received.carrier_phase_cycles
