@@ -292,3 +292,25 @@ def _rejoin(s: State, anchor: int) -> None:
         s.status.phases_rejoined += 1
         compute_fault_input(s, -1)
         update(s, innovation, predicted + variance)
+
+
+# Covariance analysis
+
+
+def known_phase(s: State, anchor: int, walked_m: float) -> None:
+    """Process a phase at the tag's true position, with an innovation of zero, for a bound: there are no cycles.
+
+    ``walked_m``: since the phase before of this anchor. Noise and wander are as stated.
+    """
+    ambiguity = s.layout.ambiguity + anchor
+    for axis in range(s.dim):
+        s.status.line_m[axis] = s.x[axis]
+    s.P[ambiguity][ambiguity] += s.settings.phase_wander * walked_m
+    _phase_terms(s, anchor)
+    _use_phase(s, ambiguity, s.anchors[anchor].own, 0.0, s.status.phase_variance_m2)
+
+
+def expected_phase(s: State, anchor: int) -> float:
+    """The phase that is expected of a reception, in cycles: ``own_phase`` then has an innovation of zero."""
+    expected_m = _phase_terms(s, anchor)
+    return -(expected_m / _wavelength_m(s) + _whole_cycles(s, s.anchors[anchor].offset_ticks))

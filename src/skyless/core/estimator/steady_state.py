@@ -31,6 +31,7 @@ from skyless.core.estimator.measurements import (
     relay_terms,
     relay_variance,
 )
+from skyless.core.estimator.phases import expected_phase, known_phase, own_phase
 from skyless.core.estimator.state import ALL_RANGE_ERRORS, AXES, FAULT_KINDS, State
 from skyless.core.native.arithmetic import floor, square
 from skyless.core.native.records import Array, Bytes, Reals, Record, Ticks, record
@@ -244,6 +245,8 @@ def process_known(
         s.anchors[sender].held_range_m = 0.0  # linearise here, not at a held point
         reception_terms(s, sender, True)
         update(s, 0.0, compute_ph(s) + s.settings.rx_variance_m2)
+        if s.status.has_phases:
+            known_phase(s, sender, walked_m)
     for listener in range(first, s.count):
         if known[listener] != 0:
             relay_terms(s, listener, sender, 0.0, True)

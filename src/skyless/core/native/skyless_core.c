@@ -240,6 +240,7 @@ INTERNAL void open(State *s, int32_t state, Ambiguity *one, real innovation, rea
 INTERNAL void keep_former(State *s, int32_t anchor);
 INTERNAL real former_age_s(State *s, int32_t anchor);
 INTERNAL void rejoin(State *s, int32_t anchor);
+INTERNAL void known_phase(State *s, int32_t anchor, real walked_m);
 INTERNAL int32_t process(State *s, Packet *packet);
 INTERNAL void take_relays(Packet *packet, uint8_t *packed, int32_t packed_bytes);
 INTERNAL int32_t process_packet(State *s, Packet *packet);
@@ -3643,6 +3644,21 @@ INTERNAL void rejoin(State *s, int32_t anchor) {
     }
 }
 
+/* Covariance analysis */
+
+/* Process a phase at the tag's true position, with an innovation of zero, for a bound: there are no cycles.
+ *
+ * ``walked_m``: since the phase before of this anchor. Noise and wander are as stated. */
+INTERNAL void known_phase(State *s, int32_t anchor, real walked_m) {
+    int32_t ambiguity = s->layout.ambiguity + anchor;
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        s->status.line_m[axis] = s->x[axis];
+    }
+    s->P[ambiguity][ambiguity] += s->settings.phase_wander * walked_m;
+    phase_terms(s, anchor);
+    use_phase(s, ambiguity, &s->anchors[anchor].own, REAL(0.0), s->status.phase_variance_m2);
+}
+
 /* What the estimator does with a packet, a ready-made difference or a height; and with many packets in one loop. */
 
 /* One packet */
@@ -4148,6 +4164,9 @@ SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_t
         s->anchors[sender].held_range_m = REAL(0.0);  /* linearise here, not at a held point */
         reception_terms(s, sender, true);
         update(s, REAL(0.0), compute_ph(s) + s->settings.rx_variance_m2, REAL(1.0));
+        if (s->status.has_phases) {
+            known_phase(s, sender, walked_m);
+        }
     }
     for (int32_t listener = first, listener_end = s->count; listener < listener_end; listener++) {
         if (known[listener] != 0) {

@@ -2,7 +2,9 @@
 
 With Gaussian noise the (posterior) bound is the covariance of a filter that is linearised at the truth: the estimator's
 own steps with the tag at its true position and innovations of zero. Relayed receptions count without age, and with what
-they say of the survey, both of which the estimator approximates. Equations: ``docs/maths.md`` section 7.
+they say of the survey, both of which the estimator approximates. Phases of the carrier count without doubt of their
+cycles; the ambiguity of each anchor is a real number, of which nothing is known before. Equations: ``docs/maths.md``
+section 7.
 """
 
 import math
@@ -68,6 +70,10 @@ class BoundSettings(Struct, frozen=True):
     height_known: bool = True
     at_once: bool = True
     """Whether anchors' receptions are known at once; else each comes with the listener's next frame, as on the air."""
+    phase_std_m: float = math.inf
+    """Noise of the carrier's phase, one for each reception of the tag; infinite where it measures none."""
+    phase_wander: float = 0.0
+    """What reflections change in the phases of an anchor as the tag walks, m²/m."""
 
     def model(self, biases: Biases = Biases()) -> EstimatorSettings:  # noqa: B008 - a frozen value
         """Settings of an estimator whose model is that of the bound."""
@@ -86,6 +92,7 @@ class BoundSettings(Struct, frozen=True):
             place_std_m=biases.changing_std_m,
             place_time_s=biases.correlation_s,
             place_distance_m=biases.correlation_m,
+            phase_wander=self.phase_wander,
         )
 
 
@@ -242,6 +249,8 @@ def _prior(anchors: Array, settings: BoundSettings, biases: Biases) -> State:
     """
     s, n = new_state(settings.model(biases)), len(anchors)
     s.status.walk_scale = 1.0
+    s.status.has_phases, s.status.phase_variance_m2 = math.isfinite(settings.phase_std_m), settings.phase_std_m**2
+    s.tuning.phase_share = math.inf  # no cycle is ever in doubt
     for row, position_m in enumerate(anchors):
         add_anchor(s, row, position_m, -1.0, False)
     s.rows = 0  # nothing is asked of faults
