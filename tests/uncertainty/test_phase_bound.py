@@ -5,7 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from skyless.core.constants import SPEED_OF_LIGHT_MPS
+from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
+from skyless.core.estimator.compiled import process_known
+from skyless.core.native.views import view
 from skyless.research.studies.episodes import random_path
 from skyless.research.uncertainty.bounds import (
     OFFSET_STD_M,
@@ -14,6 +16,7 @@ from skyless.research.uncertainty.bounds import (
     Biases,
     BoundSettings,
     Sendings,
+    _prior,
     received_bound,
     tracking_bound,
 )
@@ -113,21 +116,38 @@ def test_phases_never_raise_the_bound_and_ones_of_endless_noise_leave_it(biases)
     np.testing.assert_allclose(noisy, without, rtol=1e-6, atol=1e-12)
 
 
-def test_a_tag_at_rest_learns_its_velocity_from_phases_and_one_that_walks_its_place():
-    """Errors of ranges and survey are constant for a tag at rest, and so are ambiguities."""
-    sides = np.linspace(0.0, 1.0, 6 * 70)[:, None]
-    rest, straight = np.tile([2.0, 3.0, 0.0], (6 * 70, 1)), np.array([2.0, 3.0, 0.0]) + sides * [1.0, 0.0, 0.0]
+def last_of(path, phase_std_m):
+    """Covariance of position and velocity after the last frame, by the estimator's own steps."""
+    s = _prior(LAB, settings_of(phase_std_m, WANDER), Biases())
+    for frame, place in enumerate(path):
+        known = np.ones(7, np.uint8)
+        known[frame % 6] = 0
+        process_known(s, frame % 6, round(frame * SLOT_S / TICK_S), place, known, 0, 6 * SLOT_S, 0.0)
+    tag = [0, 1, s.layout.velocity, s.layout.velocity + 1]
+    return view(s.P)[np.ix_(tag, tag)].copy()
 
-    def std_m(path, settings):
+
+def test_a_tag_at_rest_learns_its_velocity_from_phases():
+    path = np.tile([2.0, 3.0, 0.0], (6 * 30, 1))
+    without, found = last_of(path, math.inf), last_of(path, PHASE_STD_M)
+    np.testing.assert_allclose(found, textbook(LAB, path, 2, PHASE_STD_M, WANDER)[-1], rtol=2e-3, atol=1e-7)
+    assert np.sqrt(np.trace(found[2:, 2:]) / np.trace(without[2:, 2:])) < 0.6
+
+
+def test_at_rest_phases_hardly_tell_where_a_tag_is_and_after_a_metre_of_walking_they_do():
+    """What is constant at rest, errors of ranges and ambiguities, changes with the directions as the tag walks."""
+    steps = np.linspace(0.0, 1.0, 6 * 70)[:, None] * [1.0, 0.0, 0.0]
+    walked = [2.0, 3.0, 0.0] + steps
+    rest = np.tile(walked[-1], (len(walked), 1))
+
+    def std_m(path, **phases):
+        settings = settings_of(qa=0.05, **phases)
         return np.sqrt(np.trace(tracking_bound(LAB, path, settings, ROOM)[-1]))
 
-    with_phases = settings_of(PHASE_STD_M, WANDER)
-    print(std_m(rest, with_phases), std_m(rest, settings_of()))
-    print(std_m(straight, with_phases), std_m(straight, settings_of()))
-    v1 = np.sqrt(np.trace(textbook(LAB, rest, 2, PHASE_STD_M, WANDER)[-1, 2:, 2:]))
-    v2 = np.sqrt(np.trace(textbook(LAB, rest, 2, 1e6, WANDER)[-1, 2:, 2:]))
-    print(v1, v2)
-    assert 0
+    phases = {"phase_std_m": 0.0005}
+    assert std_m(rest) > std_m(rest, **phases) > 0.92 * std_m(rest)
+    assert std_m(walked) > 0.9 * std_m(rest)
+    assert std_m(walked, **phases) < 0.85 * std_m(rest)
 
 
 def test_only_what_the_tag_receives_has_a_phase():
