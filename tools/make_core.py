@@ -32,6 +32,7 @@ EXPORTS: Final[tuple[Callable[..., Any], ...]] = (
     process.process_height,
     process.track,
     steady_state.find_steady_state,
+    steady_state.find_walked,
     steady_state.process_known,
     position.find_position,
     acquisition.try_start,

@@ -1,4 +1,4 @@
-"""The Cramér–Rao bound with phases of the carrier: against a textbook's matrices, and against the bound without them."""
+"""The Cramér–Rao bound with phases of the carrier: against a textbook's matrices, and against that without them."""
 
 import math
 
@@ -53,8 +53,8 @@ def walk(superframes=40, height_m=0.0):
 def textbook(anchors, path, dims, phase_std_m, wander):
     """The covariance of position and velocity after each frame, with dense matrices and clocks against true time.
 
-    States: [p, v, (offset, rate) of tag and anchors, ambiguities, of which (1 km)² stands for nothing known]. A stamp of
-    the tag has the noise of the frame's TX stamp, a phase has not.
+    States: [p, v, (offset, rate) of tag and anchors, ambiguities, of which (1 km)² stands for nothing known]. A stamp
+    of the tag has the noise of the frame's TX stamp, a phase has not.
     """
     n = len(anchors)
     tag, first, ambiguity = 2 * dims, 2 * dims + 2, 2 * dims + 2 * (n + 1)
@@ -137,7 +137,7 @@ def test_a_tag_at_rest_learns_its_velocity_from_phases():
 def test_at_rest_phases_hardly_tell_where_a_tag_is_and_after_a_metre_of_walking_they_do():
     """What is constant at rest, errors of ranges and ambiguities, changes with the directions as the tag walks."""
     steps = np.linspace(0.0, 1.0, 6 * 70)[:, None] * [1.0, 0.0, 0.0]
-    walked = [2.0, 3.0, 0.0] + steps
+    walked = np.add([2.0, 3.0, 0.0], steps)
     rest = np.tile(walked[-1], (len(walked), 1))
 
     def std_m(path, **phases):

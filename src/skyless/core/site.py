@@ -60,6 +60,8 @@ class ScheduleSite(Struct, frozen=True, forbid_unknown_fields=True):
     """Time at the end of each slot in which no frame may be on the air."""
     rate_hz: float | None = None
     """Mode free: beacons per second of each anchor; by default it follows from the number of anchors in reach."""
+    carrier_phase: bool = False
+    """Whether radios measure the phase of the carrier with each reception."""
 
     @property
     def needs_master(self) -> bool:

@@ -31,7 +31,7 @@ from skyless.site.planning.links import ANCHORS_IN_VIEW, PLAN_COLUMNS, RMSE, SIG
 from skyless.site.planning.maps import PlanMap, grid_of, plan_map, rows_of, summary_of
 from skyless.site.planning.optimise import OneMore, Optimised, Search
 from skyless.site.planning.predict import MAX_PREDICTED, PlanSettings, Predictor
-from skyless.site.planning.report import Verification, described, plan_report
+from skyless.site.planning.report import AfterMetre, Verification, described, plan_report
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -116,6 +116,8 @@ class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
         if found["walls_bias"]:
             rmse = f"RMSE mean {cm(found['mean_rmse_m'])}, worst {cm(found['worst_rmse_m'])}"
             yield "with the walls' delays", rmse
+        if found["after_metre"] is not None:
+            yield "after 1 m of walking", _after_metre(found["after_metre"])
         if found["target_share"] is not None:
             yield "target met", f"in {found['target_share']:.1%} of the region"
         if found["one_more"] is not None:
@@ -135,6 +137,13 @@ def _map_line(result: dict[str, Any]) -> str:
     if result["computed_every_m"] > result["step_m"]:
         line += f"; {result['method']} computed every {result['computed_every_m']:g} m and interpolated by the PDOP"
     return line
+
+
+def _after_metre(found: AfterMetre) -> str:
+    return (
+        f"median {cm(found.median_sigma_m)}, worst {cm(found.worst_sigma_m)} with phases of the carrier; by stamps "
+        f"alone {cm(found.stamps_median_sigma_m)} and {cm(found.stamps_worst_sigma_m)} ({found.walks} walks)"
+    )
 
 
 def _one_more(more: OneMore) -> str:

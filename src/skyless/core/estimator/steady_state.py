@@ -126,6 +126,32 @@ def find_steady_state(
         found.motion_m2[axis] *= s.settings.qa * (superframe * TICK_S) / (IMPULSES * found.fixes)
 
 
+def find_walked(
+    s: State,
+    messages: Array[PlannedMessage],
+    relays: Array[PlannedRelay],
+    count: int,
+    at_rest: int,
+    velocity_mps: Reals,
+    walked: int,
+    found: SteadyState,
+) -> None:
+    """Find what the filter claims of a tag that has rested for superframes and then walked for others.
+
+    ``found`` has the fixes and variances of the last of them. A state with phases has them of each message of which at
+    least half arrive; what they show is as expected, so that cycles are in doubt where they are for the filter.
+    """
+    s.rows = _walls(s) + 1
+    superframe: Ticks = 0
+    for one in range(count):
+        superframe += messages[one].gap_ticks
+    for number in range(at_rest + walked):
+        if number == at_rest:
+            for axis in range(s.dim):
+                s.x[s.layout.velocity + axis] = velocity_mps[axis]
+        _process_superframe(s, messages, relays, count, number * superframe, AFTER_ALL_TICKS, superframe, found)
+
+
 def _walls(s: State) -> int:
     """The row of V for the walls' delays; those of the impulses follow."""
     return FAULT_KINDS * s.count + s.dim
@@ -191,7 +217,7 @@ def _receive(s: State, message: PlannedMessage, rx_ticks: Ticks) -> None:
         s.V[where.offset + message.anchor][_walls(s)] += message.late_m
     else:
         elapsed_s = (rx_ticks - a.rx_ticks) * TICK_S
-        relax_range_error(s, message.anchor, elapsed_s, 0.0)
+        relax_range_error(s, message.anchor, elapsed_s, s.status.walked_m - a.walked_m)
         reset_state(s, where.tx_noise + message.anchor, s.settings.tx_variance_m2 / message.share)
         reception_terms(s, message.anchor, True)
         variance = compute_ph(s) + s.settings.rx_variance_m2 / message.share
@@ -201,7 +227,9 @@ def _receive(s: State, message: PlannedMessage, rx_ticks: Ticks) -> None:
             update(s, 0.0, variance)
         else:
             find_rate(s, message.anchor, 0.0, variance, elapsed_s)
-    a.rx_ticks = rx_ticks
+        if s.status.has_phases and message.share >= 0.5:
+            own_phase(s, message.anchor, expected_phase(s, message.anchor))
+    a.rx_ticks, a.walked_m = rx_ticks, s.status.walked_m
     a.packets += 1
 
 

@@ -241,6 +241,7 @@ INTERNAL void keep_former(State *s, int32_t anchor);
 INTERNAL real former_age_s(State *s, int32_t anchor);
 INTERNAL void rejoin(State *s, int32_t anchor);
 INTERNAL void known_phase(State *s, int32_t anchor, real walked_m);
+INTERNAL real expected_phase(State *s, int32_t anchor);
 INTERNAL int32_t process(State *s, Packet *packet);
 INTERNAL void take_relays(Packet *packet, uint8_t *packed, int32_t packed_bytes);
 INTERNAL int32_t process_packet(State *s, Packet *packet);
@@ -3659,6 +3660,12 @@ INTERNAL void known_phase(State *s, int32_t anchor, real walked_m) {
     use_phase(s, ambiguity, &s->anchors[anchor].own, REAL(0.0), s->status.phase_variance_m2);
 }
 
+/* The phase that is expected of a reception, in cycles: ``own_phase`` then has an innovation of zero. */
+INTERNAL real expected_phase(State *s, int32_t anchor) {
+    real expected_m = phase_terms(s, anchor);
+    return -(expected_m / wavelength_m(s) + whole_cycles(s, s->anchors[anchor].offset_ticks));
+}
+
 /* What the estimator does with a packet, a ready-made difference or a height; and with many packets in one loop. */
 
 /* One packet */
@@ -4045,6 +4052,27 @@ SKYLESS_EXPORT void skyless_find_steady_state(State *s, PlannedMessage *messages
     }
 }
 
+/* Find what the filter claims of a tag that has rested for superframes and then walked for others.
+ *
+ * ``found`` has the fixes and variances of the last of them. A state with phases has them of each message of which at
+ * least half arrive; what they show is as expected, so that cycles are in doubt where they are for the filter. */
+SKYLESS_EXPORT void skyless_find_walked(State *s, PlannedMessage *messages, PlannedRelay *relays, int32_t count, int32_t
+        at_rest, real *velocity_mps, int32_t walked, SteadyState *found) {
+    s->rows = walls(s) + 1;
+    int64_t superframe = 0;
+    for (int32_t one = 0; one < count; one++) {
+        superframe += messages[one].gap_ticks;
+    }
+    for (int32_t number = 0; number < at_rest + walked; number++) {
+        if (number == at_rest) {
+            for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+                s->x[s->layout.velocity + axis] = velocity_mps[axis];
+            }
+        }
+        process_superframe(s, messages, relays, count, number * superframe, AFTER_ALL_TICKS, superframe, found);
+    }
+}
+
 /* The row of V for the walls' delays; those of the impulses follow. */
 INTERNAL int32_t walls(State *s) {
     return FAULT_KINDS * s->count + s->dim;
@@ -4115,7 +4143,7 @@ INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks) {
         s->V[where->offset + message->anchor][walls(s)] += message->late_m;
     } else {
         real elapsed_s = (real)(rx_ticks - a->rx_ticks) * TICK_S;
-        relax_range_error(s, message->anchor, elapsed_s, REAL(0.0));
+        relax_range_error(s, message->anchor, elapsed_s, s->status.walked_m - a->walked_m);
         reset_state(s, where->tx_noise + message->anchor, s->settings.tx_variance_m2 / message->share);
         reception_terms(s, message->anchor, true);
         real variance = compute_ph(s) + s->settings.rx_variance_m2 / message->share;
@@ -4126,8 +4154,12 @@ INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks) {
         } else {
             find_rate(s, message->anchor, REAL(0.0), variance, elapsed_s);
         }
+        if (s->status.has_phases && message->share >= REAL(0.5)) {
+            own_phase(s, message->anchor, expected_phase(s, message->anchor));
+        }
     }
     a->rx_ticks = rx_ticks;
+    a->walked_m = s->status.walked_m;
     a->packets += 1;
 }
 

@@ -1122,6 +1122,8 @@ SKYLESS_EXPORT void skyless_track(State *s, Place *places, BatchPacket *packets,
         count, bool has_levels);
 SKYLESS_EXPORT void skyless_find_steady_state(State *s, PlannedMessage *messages, PlannedRelay *relays, int32_t count,
         int32_t most, int32_t step, SteadyState *found);
+SKYLESS_EXPORT void skyless_find_walked(State *s, PlannedMessage *messages, PlannedRelay *relays, int32_t count, int32_t
+        at_rest, real *velocity_mps, int32_t walked, SteadyState *found);
 SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_ticks, real *position_m, uint8_t *known,
         int32_t first, real elapsed_s, real walked_m);
 SKYLESS_EXPORT int32_t skyless_find_position(LocateProblem *p, Found *found);

@@ -1,4 +1,4 @@
-"""Predicted errors of ``joint`` for a stationary tag, from the estimator's steady state at points of a site."""
+"""Predicted errors of ``joint``, from the estimator's covariance at points of a site: at rest, and after a walk."""
 
 import math
 from typing import Any, Final
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from skyless.core.arrays import Integers, Matrix, Vector
 from skyless.core.constants import TICK_S
-from skyless.core.estimator.compiled import add_anchor, find_steady_state
+from skyless.core.estimator.compiled import add_anchor, find_steady_state, find_walked
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import State, new_state
 from skyless.core.estimator.steady_state import PlannedMessage, PlannedRelay, SteadyState
@@ -24,6 +24,8 @@ _RARELY: Final = 0.1  # an anchor of whose frames fewer arrive does not help the
 _COMPLETE_OVER_S: Final = 0.1
 _MAX_S: Final = 4.0
 _MAX_SUPERFRAMES: Final = 20
+
+_RESTED_S: Final = 2.0  # before a walk; phases count from a second after the start
 
 _START_VARIANCE: Final = 1.0  # of position and velocity, m² and m²/s²; the steady state does not depend on it
 
@@ -67,10 +69,40 @@ def fill_joint_sigma(
     table[lost, SIGMA:], table[lost, FIX_SHARE] = math.inf, 0.0
 
 
-def _state_at(settings: EstimatorSettings, anchors_m: Matrix, in_view: Integers, point: Vector) -> State:
+def walked_sigma(
+    point: Vector,
+    velocity_mps: Vector,
+    settings: EstimatorSettings,
+    scene: Scene,
+    clocks: AnchorClocks,
+    relays: Relays,
+    most: int | None,
+    has_phases: bool,
+) -> float:
+    """Standard deviation, metres, that the filter claims of a tag that rested at a point and has walked for a second.
+
+    With ``has_phases`` the tag measures the phase of the carrier with the noise and wander that the filter begins with.
+    Infinite where there is no fix.
+    """
+    (share,), (delay_m,) = scene.heard_at(point[None])
+    in_view = scene.strongest(point, np.flatnonzero(share >= _RARELY), most or MAX_ANCHORS)
+    if len(in_view) <= settings.dim:
+        return math.inf
+    s = _state_at(settings, scene.anchors, in_view, point, has_phases)
+    s.tuning.phase_forgetting = 0.0  # nothing is learnt from innovations of zero
+    columns, found, superframe_s = _planned(clocks, relays, share, delay_m, in_view), SteadyState(), clocks.gap_s.sum()
+    walked = max(1, round(1.0 / superframe_s))
+    velocity = np.ascontiguousarray(velocity_mps / (walked * superframe_s))
+    find_walked(s, *columns, len(clocks.sender), math.ceil(_RESTED_S / superframe_s), velocity, walked, found)
+    return math.sqrt(sum(found.variance_m2) / found.fixes)
+
+
+def _state_at(
+    settings: EstimatorSettings, anchors_m: Matrix, in_view: Integers, point: Vector, has_phases: bool = False
+) -> State:
     """The estimator's state at a point, with the anchors in these rows of the site."""
     s = new_state(settings)
-    s.status.walk_scale = 1.0
+    s.status.walk_scale, s.status.has_phases = 1.0, has_phases
     for axis in range(2 * s.dim):
         s.P[axis][axis] = _START_VARIANCE
     for row in in_view.tolist():
@@ -85,6 +117,18 @@ def _steady_state(
     s: State, clocks: AnchorClocks, relays: Relays, share: Vector, delay_m: Vector, in_view: Integers
 ) -> SteadyState:
     """The steady state of a tag that receives these shares of the anchors' messages, late by these delays."""
+    superframe_s, found = float(clocks.gap_s.sum()), SteadyState()
+    most = max(_MAX_SUPERFRAMES, math.ceil(_MAX_S / superframe_s))
+    step = max(1, math.ceil(_COMPLETE_OVER_S / superframe_s))
+    columns = _planned(clocks, relays, share, delay_m, in_view)
+    find_steady_state(s, *columns, len(clocks.sender), most, step, found)
+    return found
+
+
+def _planned(
+    clocks: AnchorClocks, relays: Relays, share: Vector, delay_m: Vector, in_view: Integers
+) -> tuple[Any, Any]:
+    """A superframe's messages and what they relay, as records."""
     index_of = np.full(len(share), -1)
     index_of[in_view] = np.arange(len(in_view))
     messages: NDArray[Any] = np.zeros(len(clocks.sender), np.dtype(PlannedMessage))
@@ -94,9 +138,4 @@ def _steady_state(
     relayed: NDArray[Any] = np.zeros(len(relays.sender), np.dtype(PlannedRelay))
     relayed["sender"], relayed["age_s"], relayed["late_m"] = index_of[relays.sender], relays.age_s, relays.delay_m
     relayed["share"] = share[listeners] * share[relays.sender] * relays.share
-    superframe_s, found = float(clocks.gap_s.sum()), SteadyState()
-    most = max(_MAX_SUPERFRAMES, math.ceil(_MAX_S / superframe_s))
-    step = max(1, math.ceil(_COMPLETE_OVER_S / superframe_s))
-    columns = records(PlannedMessage, messages), records(PlannedRelay, relayed)
-    find_steady_state(s, *columns, len(messages), most, step, found)
-    return found
+    return records(PlannedMessage, messages), records(PlannedRelay, relayed)

@@ -11,7 +11,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.air.local_almanac import filter_pages_of
-from skyless.core.arrays import Matrix
+from skyless.core.arrays import Matrix, Vector
+from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.geometry import anchor_positions
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS
 from skyless.core.protocol1.snapshots import SnapshotMethod
@@ -21,8 +22,8 @@ from skyless.core.tag.factory import estimator_settings
 from skyless.core.tag.selection import MAX_ANCHORS_IN_USE
 from skyless.site.channel import ChannelModel, pack_walls
 from skyless.site.planning._snapshot_sigma import fill_snapshot_sigma, rounds_of
-from skyless.site.planning.anchor_clocks import anchor_clocks, relays_of, row_of_master
-from skyless.site.planning.joint_sigma import fill_joint_sigma
+from skyless.site.planning.anchor_clocks import AnchorClocks, Relays, anchor_clocks, relays_of, row_of_master
+from skyless.site.planning.joint_sigma import fill_joint_sigma, walked_sigma
 from skyless.site.planning.links import (
     PLAN_COLUMNS,
     SIGMA,
@@ -90,15 +91,28 @@ class Predictor:
             points, self.dim, self.scene, master, self.links, rounds, weighted, self.farthest_m, table
         )
 
+    def walked_sigma(self, points_m: Matrix, *, has_phases: bool) -> Vector:
+        """Standard deviations that ``joint`` claims of tags after walks of 1 m, along x and along y, from points.
+
+        Walks go towards the middle of the points, shape (m, 3), at 1 m/s; shape (2·m,). Infinite where there is no fix.
+        """
+        joint, sides = self._joint_site(), np.where(points_m > points_m.mean(axis=0), -1.0, 1.0)
+        walks = ((point, side * axis) for point, side in zip(points_m, sides, strict=True) for axis in np.eye(3)[:2])
+        return np.array([walked_sigma(point, way, *joint, has_phases) for point, way in walks])
+
     def _joint(self) -> Fill:
+        settings, scene, clocks, relays, most = self._joint_site()
+        return lambda points, table: fill_joint_sigma(
+            points, settings, scene, clocks, relays, self.farthest_m, most, table
+        )
+
+    def _joint_site(self) -> tuple[EstimatorSettings, Scene, AnchorClocks, Relays, int | None]:
+        """What the estimator assumes, the anchors as tags and anchors hear them, and how many a tag uses at most."""
         settings = estimator_settings(
             self.settings.qa, self.site.tags.height_m, *filter_pages_of(self.site), superframe_s(self.site)
         )
         relays = relays_of(self.anchors_m, self.master, self.clocks, self.budget, self.walls)
-        most = MAX_ANCHORS_IN_USE if self.master is None else None
-        return lambda points, table: fill_joint_sigma(
-            points, settings, self.scene, self.clocks, relays, self.farthest_m, most, table
-        )
+        return settings, self.scene, self.clocks, relays, MAX_ANCHORS_IN_USE if self.master is None else None
 
     def at(self, points_m: Matrix, progress: Callable[[float], None] | None = None) -> Matrix:
         """Predictions at points, shape (m, 3): a table (m, len(PLAN_COLUMNS)); ``progress`` gets the points done."""

@@ -55,6 +55,17 @@ class Verification(Struct, frozen=True):
     mean_ratio_error: float | None
 
 
+class AfterMetre(Struct, frozen=True):
+    """What ``joint`` claims after a tag has walked a metre, metres; *stamps* without phases of the carrier."""
+
+    walks: int
+    """From places all over the floor, along x and along y; those that have fixes."""
+    median_sigma_m: float
+    worst_sigma_m: float
+    stamps_median_sigma_m: float
+    stamps_worst_sigma_m: float
+
+
 def plan_report(
     predictor: Predictor,
     floor: Floor,
@@ -97,10 +108,27 @@ def plan_report(
             for row, anchor in enumerate(site.anchors)
         ],
         "warnings": plan_warnings(predictor, floor, mapped),
+        "after_metre": _after_metre(predictor, floor, heights),
         "one_more": more,
         "optimised": None if optimised is None else _optimised(optimised),
         "verification": checked,
     }
+
+
+_WALKED_PLACES: Final = 6
+
+
+def _after_metre(predictor: Predictor, floor: Floor, heights_m: tuple[float, ...]) -> AfterMetre | None:
+    """What phases of the carrier give tags that walk; None where the site has none or nothing is estimated."""
+    if not predictor.site.schedule.carrier_phase or predictor.settings.method not in FILTERS:
+        return None
+    points, _ = sample_points(floor, heights_m, _WALKED_PLACES)
+    with_phases, stamps = (predictor.walked_sigma(points, has_phases=has_phases) for has_phases in (True, False))
+    with_phases, stamps = with_phases[stamps < predictor.farthest_m], stamps[stamps < predictor.farthest_m]
+    if len(stamps) == 0:
+        return None
+    figures = (float(figure(sigma_m)) for sigma_m in (with_phases, stamps) for figure in (np.median, np.max))
+    return AfterMetre(len(stamps), *figures)
 
 
 def _optimised(found: Optimised) -> dict[str, Any]:
