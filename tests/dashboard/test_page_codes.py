@@ -1,4 +1,4 @@
-"""The page shows how far each tag's position is verified, and codes and keys of anchors; nothing of it without keys."""
+"""The page shows how far tags' positions are verified, codes and keys of anchors, and phases, if there are any."""
 
 import time
 
@@ -64,6 +64,16 @@ def test_a_tag_says_how_far_its_position_is_verified(hall):
     assert page.locator("#panel-tags button.name:has-text('not verified')").all_inner_texts() == ["robot not verified"]
     server.tag_reports = {}
     page.locator("#panel-tags button.name:text-is('robot')").wait_for()
+
+
+def test_a_tag_names_the_anchors_whose_phases_it_uses(hall):
+    server, page = hall
+    read = facts(page, "tag", "forklift")
+    assert "Carrier phases" not in page.evaluate(read)
+    server.tag_reports = {"forklift": {"carrier_phase_anchors": [1, 2, 5]}}
+    until(page, f"({read})()['Carrier phases']?.[0] === 'of anchors 1, 2, 5'")
+    server.tag_reports = {"forklift": {"carrier_phase_anchors": []}}
+    until(page, f"!('Carrier phases' in ({read})())")
 
 
 def test_an_anchor_shows_its_codes_its_key_chain_and_what_it_does_not_accept(hall):

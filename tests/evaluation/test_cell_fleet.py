@@ -54,7 +54,7 @@ def test_sites_with_more_anchors_than_machines_are_simulated_on_demand():
 
 @pytest.mark.parametrize(
     ("fault", "name"),
-    [({"nlos": 0.1}, "--nlos"), ({"temperature": True}, "--temperature"), ({"power_bias": True}, "--power-bias")],
+    [({"nlos": 0.1}, "--nlos"), ({"temperature": True}, "--temperature"), ({"carrier": True}, "--carrier")],
 )
 def test_what_is_not_modelled_there_is_named(fault, name):
     with pytest.raises(ValueError, match=f"{name}: not modelled"):

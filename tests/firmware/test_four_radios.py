@@ -1,7 +1,7 @@
 """One seed, three radios: emulated, the firmware's C, its ARM image. The same fixes.
 
-A tag gets the frames of one simulated site; powers and carrier offsets are given to the emulated radio as the driver
-reads them from the chip's model, because chips round them.
+A tag gets the frames of one simulated site; powers, carrier offsets and phases are given to the emulated radio as the
+driver reads them from the chip's model, because chips round them.
 """
 
 from collections import Counter
@@ -39,7 +39,7 @@ DELAYS = AntennaDelays()
 def tape():
     """What the tag's antenna gets, and that as the driver reads it; ``host_s`` is when each frame ended."""
     compile_kernels()
-    faults = msgspec.structs.replace(impairments_of(Request(LAB, nlos=0.1), LAB), diagnostics=True)
+    faults = msgspec.structs.replace(impairments_of(Request(LAB, nlos=0.1, carrier=True), LAB), diagnostics=True)
     world = World(LAB, lambda number: Anchor(LAB, number), [TagSpec(Static(2.0, 3.0, 0.0))], faults, SEED)
     tag = TimedNode(WorldAir(world.medium, len(LAB.anchors)))
     tag.start()
@@ -47,9 +47,11 @@ def tape():
     for broadcast in world.run(SECONDS):
         for _, reception, _ in broadcast.receptions():
             emulated.append(msgspec.structs.replace(reception, host_s=world.medium.now_s))
-            driver.append(tag.hear(reception.frame, reception.rx_ticks, reception.diagnostics, world.medium.now_s))
+            told = reception.frame, reception.rx_ticks, reception.diagnostics, world.medium.now_s
+            driver.append(tag.hear(*told, phase_cycles=reception.carrier_phase_cycles))
     rounded = [
-        msgspec.structs.replace(one, diagnostics=other.diagnostics) for one, other in zip(emulated, driver, strict=True)
+        msgspec.structs.replace(one, diagnostics=other.diagnostics, carrier_phase_cycles=other.carrier_phase_cycles)
+        for one, other in zip(emulated, driver, strict=True)
     ]
     return emulated, rounded
 
@@ -82,7 +84,7 @@ def over_a_board(kind, tape):
     chip = Chip(air, DELAYS.tx_ticks, DELAYS.rx_ticks, air.now_s)
     events, counters = [], Counter()
     lines = []
-    session = LinkSession("the line", DELAYS, lines.append, events.append, counters)
+    session = LinkSession("the line", DELAYS, lines.append, events.append, counters, phases=True)
     board = boards(kind)(
         timeline, chip, lambda data: talk(session.on_data, data), can_transmit=False, identity=bytes(8)
     )
@@ -97,7 +99,8 @@ def over_a_board(kind, tape):
     def arrive(reception):
         ended = timeline.now_ticks
         air.reading = wrap(reception.rx_ticks + from_seconds(180e-6)), ended
-        chip.receive(reception.frame, reception.rx_ticks, reception.diagnostics)
+        told = reception.frame, reception.rx_ticks, reception.diagnostics
+        chip.receive(*told, carrier_phase_cycles=reception.carrier_phase_cycles)
         board.notify()
 
     timeline.at(from_seconds(STARTS_S / 2), lambda: talk(session.begin))
@@ -114,13 +117,17 @@ def over_a_board(kind, tape):
     return [event for event in events if isinstance(event, Reception)]
 
 
+def told_of(reception):
+    """What a board says of it but for when it came."""
+    return msgspec.structs.replace(reception, host_s=None)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_board_gives_the_fixes_of_the_emulated_radio_bit_for_bit(kind, tape):
     emulated, rounded = tape
     heard = over_a_board(kind, emulated)
-    assert [(one.frame, one.rx_ticks, one.diagnostics) for one in heard] == [
-        (one.frame, one.rx_ticks, one.diagnostics) for one in rounded
-    ]
+    assert [told_of(one) for one in heard] == [told_of(one) for one in rounded]
     here = fixes_of(rounded)
+    assert here != fixes_of(msgspec.structs.replace(one, carrier_phase_cycles=None) for one in rounded)
     assert sum(fix is not None for fix in here[0]) > 150
     assert fixes_of(heard) == here

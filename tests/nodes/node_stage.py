@@ -150,9 +150,9 @@ class FakeRadio:
             asyncio.get_running_loop().call_later(ahead_s + 0.1e-3, self.listener, Sent(transmission.tx_ticks))
 
 
-def receptions(seconds, seed=1):
+def receptions(seconds, seed=1, **faults):
     """What a tag at ``PLACE_M`` hears in the simulated lab."""
-    return receptions_of(LAB.id, seconds, seed=seed)
+    return receptions_of(LAB.id, seconds, seed=seed, **faults)
 
 
 def undated(heard):
@@ -160,14 +160,14 @@ def undated(heard):
     return [Reception(reception.frame, reception.rx_ticks, None, reception.diagnostics) for reception in heard]
 
 
-def receptions_of(site_id, seconds, *, later_s=0.0, seed=1):
+def receptions_of(site_id, seconds, *, later_s=0.0, seed=1, **faults):
     """The same of a lab with another identifier on the air, and so much later by the host's clock and the counter."""
     site = replace(LAB, id=site_id)
-    faults = impairments_of(Request(site), site)
-    world = World(site, lambda anchor: Anchor(site, anchor), [TagSpec(Static(*PLACE_M))], faults, seed)
+    air = impairments_of(Request(site, **faults), site)
+    world = World(site, lambda anchor: Anchor(site, anchor), [TagSpec(Static(*PLACE_M))], air, seed)
     heard = [reception for broadcast in world.run(seconds) for _, reception, _ in broadcast.receptions()]
     later_ticks = round(later_s * TICK_RATE_HZ)
-    return [Reception(r.frame, wrap(r.rx_ticks + later_ticks), r.host_s + later_s, r.diagnostics) for r in heard]
+    return [replace(r, rx_ticks=wrap(r.rx_ticks + later_ticks), host_s=r.host_s + later_s) for r in heard]
 
 
 @contextlib.asynccontextmanager

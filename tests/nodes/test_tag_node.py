@@ -2,6 +2,7 @@
 
 import asyncio
 import bisect
+from collections import Counter
 
 import msgspec
 import numpy as np
@@ -13,7 +14,7 @@ from skyless.radio.interface import Gone, Restarted
 from skyless.run import anchor, process
 from skyless.run import tag as tag_module
 from skyless.run.mqtt.address import MqttAddress
-from skyless.run.mqtt.messages import FixMessage, SiteMessage, TagHealth
+from skyless.run.mqtt.messages import Counters, FixMessage, SiteMessage, TagHealth
 from skyless.run.tag import Tag, TagNode, TagSettings
 from support.loops import in_loop
 
@@ -67,6 +68,19 @@ def test_no_more_fixes_are_published_than_asked_for_on_average_nor_in_any_second
     assert len(times) - 1 <= publish_hz * made_s + 1.0
     assert len(times) >= min(publish_hz, 395.0) * made_s * 0.95  # and not many fewer
     assert bench.node.fix_log.serial > 1500  # all of them are made
+
+
+def test_a_tag_s_state_names_the_anchors_whose_phases_it_uses():
+    told = []
+    for heard in (HEARD, receptions(6.0, carrier=True)):
+        bench = Bench()
+        bench.hear(heard)
+        numbers = dict.fromkeys(("receptions", "cpu", "memory_bytes", "late_in_link"), 0)
+        counted = bench.node.fix_log.health(
+            method="joint", reason=None, counters=Counter(), mqtt=Counters(0, 0, 0), phases=(), **numbers
+        )
+        told.append(bench.node.complete(counted).carrier_phase_anchors)
+    assert told == [(), tuple(sorted(anchor.id for anchor in LAB.anchors))]
 
 
 def test_pauses_are_not_made_up_for_by_a_burst():

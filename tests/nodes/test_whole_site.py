@@ -57,3 +57,11 @@ def test_the_demo_s_own_broker_keeps_nothing_after_its_end(link, tmp_path, monke
     with pytest.raises(SkylessError, match="enough"):
         asyncio.run(WholeSite(asked, print).run())
     assert [asked.temporary for asked in settings] == [True]
+
+
+@pytest.mark.parametrize("carrier", [False, True])
+def test_the_ether_simulates_carriers_where_the_demo_is_asked_to(tmp_path, carrier):
+    integrity = IntegrityRequirement()
+    asked = SiteRun(lab_site(), "lab", 1, 1.0, None, 1, "joint", integrity, None, None, 1.0, False, tmp_path, carrier)
+    ether = WholeSite(asked, print)._programs(ADDRESS)[0]
+    assert ("--carrier" in ether.arguments) == carrier

@@ -103,7 +103,8 @@ class ChipAnchor:
         self.node.start()
 
     def hear(self, reception):
-        heard = self.node.hear(reception.frame, reception.rx_ticks, reception.diagnostics, reception.host_s)
+        told = reception.frame, reception.rx_ticks, reception.diagnostics, reception.host_s
+        heard = self.node.hear(*told, phase_cycles=reception.carrier_phase_cycles)
         assert heard is not None, (self.node.chip.arrivals, self.node.events[-3:])
         self._machine.hear(heard)
 

@@ -2,6 +2,7 @@
 
 import pytest
 from air_stage import LAB, Stage, in_loop
+from msgspec.structs import replace
 
 from skyless.core.air.ieee802154 import after_rmarker_s
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
@@ -259,3 +260,22 @@ async def test_the_truth_is_where_the_tags_are():
     assert truth.unix_s == pytest.approx(1e9 + 100.5)
     assert truth.tags["tag1"].position_m == (2.0, 3.0, LAB.tags.height_m)
     assert truth.tags["tag2"].velocity_mps == (0.0, 0.0, 0.0)
+
+
+async def test_receptions_have_phases_where_the_ether_simulates_carriers():
+    """One frame at two nodes: phases as drivers give them, none without carriers, and the same stamps."""
+
+    def rows(**faults):
+        stage = Stage(**faults)
+        sender, session = stage.join("anchor", "1")
+        listener, _ = stage.join("tag", "tag1", "tag2")
+        stage.send(sender, session)
+        stage.pass_time(4e-3)
+        return listener.of(Arrival)[0].rows
+
+    plain, phased = rows(), rows(carrier=True)
+    assert [row.carrier_phase_cycles for row in plain] == [None, None]
+    assert len({row.carrier_phase_cycles for row in phased}) == 2
+    assert all(0.0 <= row.carrier_phase_cycles < 1.0 for row in phased)
+    assert all((row.carrier_phase_cycles * 65536).is_integer() for row in phased)
+    assert [replace(row, carrier_phase_cycles=None) for row in phased] == list(plain)

@@ -34,6 +34,7 @@ from skyless.run.mqtt.messages import FixMessage
 from skyless.run.open_radio import open_radios
 from skyless.run.tag import TagNode, Tags, TagSettings
 from skyless.sim.dw1000.chip import Chip
+from skyless.sim.dw1000.transceiver import Fault
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of
 from skyless.sim.medium import Delivery, Medium, Timeline
 from skyless.sim.stations import TagSpec
@@ -165,7 +166,7 @@ class EmulatedSite:
         self.site, self.seed, self.room, self._make_board, self._wire = site, seed, room, make_board, wire
         self._lead_s = lead_s
         self.trajectories = list(trajectories)
-        faults = replace(impairments_of(Request(site, seed=seed, room=room), site), diagnostics=True)
+        faults = replace(impairments_of(Request(site, seed=seed, room=room, carrier=True), site), diagnostics=True)
         tags = [TagSpec(trajectory) for trajectory in trajectories]
         self.medium: Medium[bool] = Medium(site, tags, faults, seed, self._deliver, SITE_TURNAROUND_S)
         self.anchors = [
@@ -302,7 +303,9 @@ class EmulatedSite:
                 if is_whole:
                     node.at_antenna[flight.frame, rx_ticks] = now_s
                 measured = diagnostics_of(row) or Diagnostics()
-                node.chip.receive(flight.frame, rx_ticks, measured, None if is_whole else "parity")
+                fault: Fault | None = None if is_whole else "parity"
+                phase_cycles = float(row["phase_cycles"])
+                node.chip.receive(flight.frame, rx_ticks, measured, fault, carrier_phase_cycles=phase_cycles)
                 _notify(node)
 
     # What came of it

@@ -3,8 +3,8 @@
 What a frame contains depends on what its anchor had been given when it made it, and that depends on how long receptions
 are on their way. So the programs run again with the instants of the run with boards, and nothing else of it: when each
 reception and each end of a frame reached them, which frames were late, and how far the board's counter was estimated
-wrongly. Frames and stamps are made again by the anchors' machines and the medium of the same seed. Powers and carrier
-offsets are those that the boards reported, because chips round them.
+wrongly. Frames and stamps are made again by the anchors' machines and the medium of the same seed. Powers, carrier
+offsets and phases are those that the boards reported, because chips round them.
 """
 
 import asyncio

@@ -51,6 +51,8 @@ class SiteRun(Struct, frozen=True):
     """Whether every anchor and every tag is a process of its own."""
     recordings: Path
     """Folder of recordings that the page shows."""
+    carrier: bool = False
+    """Whether radios measure the phase of the carrier."""
 
 
 class WholeSite:
@@ -119,6 +121,8 @@ class WholeSite:
         ether += ["--speed", str(asked.speed_mps), "--seed", str(asked.seed)]
         if asked.noise_ps is not None:
             ether += ["--noise-ps", str(asked.noise_ps)]
+        if asked.carrier:
+            ether.append("--carrier")
         programs = [Program("ether", tuple(ether))]
         anchors = [str(anchor.id) for anchor in asked.site.anchors]
         programs += [

@@ -126,6 +126,11 @@ class AnyReceiver:
         return self._receiver.multipath_m
 
     @property
+    def phase_anchors(self) -> tuple[int, ...]:
+        """Identifiers of the anchors the phases of whose carriers are in use."""
+        return self._receiver.phase_anchors
+
+    @property
     def heard_site(self) -> HeardSite | None:
         """Anchors and georeference of the site, None before they are known."""
         return self._receiver.heard_site

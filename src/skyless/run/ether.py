@@ -133,6 +133,8 @@ class Ether:
         specs = [TagSpec(trajectory) for trajectory in tags.values()]
         faults = msgspec.structs.replace(impairments, diagnostics=True)
         self.medium: Medium[None] = Medium(site, specs, faults, seed, self._deliver)
+        phase = () if impairments.carrier is None else ("phase_cycles",)
+        self._columns = *("node", "rx_ticks", "rx_power_dbm", "first_path_power_dbm", "carrier_offset_ppm"), *phase
         self._nodes = {("anchor", str(anchor)): node for anchor, node in self.medium.node_of.items()}
         self._nodes |= {("tag", name): len(site.anchors) + index for index, name in enumerate(tags)}
         self._owners: dict[int, Session] = {}
@@ -283,8 +285,7 @@ class Ether:
         flight, host_s = delivery.flight, self.now_host_s
         rows: dict[Session, list[wire.HeardRow]] = {}
         for heard in (delivery.by_anchors, delivery.by_tags):
-            columns = ("node", "rx_ticks", "rx_power_dbm", "first_path_power_dbm", "carrier_offset_ppm")
-            for node, *values in zip(*(heard[column].tolist() for column in columns), strict=True):
+            for node, *values in zip(*(heard[column].tolist() for column in self._columns), strict=True):
                 session = self._owners.get(node)
                 if session is not None:
                     rows.setdefault(session, []).append(wire.HeardRow(session.index[node], *values))

@@ -124,8 +124,8 @@ class TagNode:
         return (trust_reason(trusted) if trusted and needs_trust else None) or str(self.receiver.reason)
 
     def complete(self, health: TagHealth) -> TagHealth:
-        """A tag's state with what it knows of multipath and of verified beacons."""
-        trusted = self._trusted
+        """A tag's state with what it knows of phases, of multipath and of verified beacons."""
+        trusted, health = self._trusted, replace(health, carrier_phase_anchors=self.receiver.phase_anchors)
         if (multipath := self.receiver.multipath_m) is not None:
             health = replace(health, multipath_std_m=multipath[0], multipath_distance_m=multipath[1])
         if trusted is None:

@@ -3,8 +3,9 @@
     phase = f·(X − R) + constants of both chips + reflections + noise      [cycles]
 
 X is the sender's counter when its frame leaves and R the receiver's when it arrives, both without the stamps' noise:
-one crystal drives a chip's counter and its carrier. Reflections change over centimetres of a tag's way. Constants are
-drawn when a radio is switched on. All draws are from streams of their own, so that stamps are the same without carrier.
+one crystal drives a chip's counter and its carrier. Reflections change with the path of a tag, over centimetres.
+Constants are drawn when a radio is switched on. All draws are from streams of their own: stamps are the same with and
+without carrier.
 """
 
 import math
@@ -23,6 +24,7 @@ PERIOD_TICKS: Final = 128
 
 _CYCLES_PER_TICK: Final = CHANNEL_5_HZ / TICK_RATE_HZ
 _WAVELENGTH_M: Final = SPEED_OF_LIGHT_MPS / CHANNEL_5_HZ
+_STEPS: Final = 2.0**16
 
 # Purposes of streams of random numbers.
 _REFLECTIONS: Final = 7
@@ -46,7 +48,7 @@ class CarrierModel(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Carriers:
-    """The carriers of a site's radios; phases are in cycles of the carrier, in [0, 1)."""
+    """The carriers of a site's radios; phases are in cycles, multiples of 2⁻¹⁶ in [0, 1) as drivers give them."""
 
     def __init__(self, model: CarrierModel, anchors: list[int], tags: int, seed: int) -> None:
         """``anchors``: their identifiers, in the order of the nodes."""
@@ -78,7 +80,7 @@ class Carriers:
         flown_ticks = (heard["reading_ticks"] - late_ticks) - tx_ticks % PERIOD_TICKS
         cycles = -_CYCLES_PER_TICK * flown_ticks - reflected_m / _WAVELENGTH_M
         cycles += self._constants[sender, 0] + self._constants[nodes, 1] + self._errors(sender, nodes)
-        return np.asarray(cycles % 1.0, np.float64)
+        return np.asarray(np.round(cycles * _STEPS) % _STEPS / _STEPS, np.float64)
 
     def _errors(self, sender: int, nodes: Integers) -> Array:
         """Noise, and slips of tags, in cycles."""

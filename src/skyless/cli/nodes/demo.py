@@ -68,6 +68,8 @@ class DemoOptions(ProtectionOptions, frozen=True, kw_only=True):
     """Noise of every TX and RX stamp in picoseconds."""
     seed: Seed = 1
     """Same seed, same crystals and noise; what processes do in real time is never the same."""
+    carrier: bool = False
+    """Let radios measure the phase of the carrier, as a DW1000 can."""
     site: Path | None = None
     """Site file; by default the lab, six anchors on the walls of 6 m × 8 m."""
     paper: bool = False
@@ -135,6 +137,7 @@ def _settings(asked: DemoOptions) -> "SiteRun":
         record_limit_mb=1000.0,
         apart=asked.apart,
         recordings=folder,
+        carrier=asked.carrier,
     )
 
 

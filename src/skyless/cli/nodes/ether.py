@@ -42,6 +42,8 @@ class EtherOptions(Options, frozen=True, kw_only=True):
     """Probability that a message is lost."""
     nlos: _Share = 0.0
     """Probability that a message reaches a tag late, as an obstacle delays it."""
+    carrier: bool = False
+    """Let radios measure the phase of the carrier, as a DW1000 can."""
     move: Annotated[tuple[str, ...], Text(lambda _, text: text, "ANCHOR=DX,DY@SECONDS", many=True)] = ()
     """Move an anchor while the air runs, from its position in the site file, as if somebody had hung it elsewhere:
     4=0.3,0@60 by 0.3 m along x after 60 s; a third number is a height. Several times for several moves."""
@@ -68,7 +70,9 @@ def ether(*, asked: EtherOptions, broker: MqttOptions) -> None:
     site, address = site_named(asked.site), broker.address()
     check_live(site)
     host, port = listen_address(asked.listen, DEFAULT_PORT)
-    request = Request(site, noise_ps=asked.noise_ps, loss=asked.loss, nlos=asked.nlos, seed=asked.seed)
+    request = Request(
+        site, noise_ps=asked.noise_ps, loss=asked.loss, nlos=asked.nlos, carrier=asked.carrier, seed=asked.seed
+    )
     moves = tuple(_move(text, [anchor.id for anchor in site.anchors]) for text in asked.move)
     with status("compiling the simulation"):
         compile_kernels()

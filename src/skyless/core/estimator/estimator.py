@@ -323,6 +323,12 @@ class Estimator:
         anchors = (self._state.anchors[index] for index in range(self._state.count))
         return tuple(one.identifier for one in anchors if one.is_obstructed or one.has_fault)
 
+    @property
+    def phase_anchors(self) -> tuple[int, ...]:
+        """Identifiers of the anchors the phases of whose carriers are in use."""
+        anchors = (self._state.anchors[index] for index in range(self._state.count))
+        return tuple(sorted(one.identifier for one in anchors if one.own.is_known))
+
     def position_m(self) -> Vector:
         """The position at the newest packet, shape (dim,)."""
         return view(self._state.x)[: self.dim].copy()

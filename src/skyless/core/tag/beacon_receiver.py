@@ -66,6 +66,10 @@ class TagReceiver(Protocol):
     def multipath_m(self) -> tuple[float, float] | None:
         """Standard deviation by which ranges change, and over which distance, where it exceeds what the site states."""
 
+    @property
+    def phase_anchors(self) -> tuple[int, ...]:
+        """Identifiers of the anchors the phases of whose carriers are in use."""
+
     def hear(self, reception: Reception) -> Fix | None:
         """Process a frame from the air; a fix if it made one, else ``reason`` is set."""
 
@@ -116,6 +120,11 @@ class BeaconReceiver(ABC):
     def multipath_m(self) -> tuple[float, float] | None:
         """Standard deviation by which ranges change, and over which distance, where it exceeds what the site states."""
         return None if self._estimation is None else self._estimation.estimator.multipath_m
+
+    @property
+    def phase_anchors(self) -> tuple[int, ...]:
+        """Identifiers of the anchors the phases of whose carriers are in use."""
+        return () if self._estimation is None else self._estimation.estimator.phase_anchors
 
     def hear_height(self, height_m: float, std_m: float) -> bool:
         """Process a reading of the tag's height sensor, above the site's origin, at the present; True if it was used.

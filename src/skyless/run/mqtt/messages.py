@@ -170,6 +170,8 @@ class TagHealth(Struct, frozen=True):
     """Standard deviation by which ranges change as the tag moves, where that is more than the site file states."""
     multipath_distance_m: float | None = None
     """The distance walked within which they do."""
+    carrier_phase_anchors: tuple[int, ...] = ()
+    """Identifiers of the anchors the phases of whose carriers are in use."""
 
 
 class AnchorHealth(Struct, frozen=True):

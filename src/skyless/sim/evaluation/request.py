@@ -246,6 +246,8 @@ class Conditions(ProtectionOptions, frozen=True, kw_only=True):
     """Give RX stamps the DW1000's bias by received power."""
     temperature: bool = False
     """Let the crystals warm up and swing."""
+    carrier: bool = False
+    """Let radios measure the phase of the carrier, as a DW1000 can; joint uses it, which needs a tag that moves."""
 
     def check(self) -> None:
         """See that the options fit one another. Raises SkylessError."""

@@ -14,6 +14,7 @@ from skyless.core.errors import SkylessError
 from skyless.core.geometry import rectangle_of
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, SNAPSHOTS
 from skyless.core.site import Site
+from skyless.sim.carrier import CarrierModel
 from skyless.sim.evaluation.cell_fleet import MAX_MACHINES, CellFleet
 from skyless.sim.evaluation.fleet import Fleet, FleetSettings, JudgedFix, TagFleet, TagReceiver
 from skyless.sim.evaluation.request import Conditions
@@ -180,6 +181,7 @@ def fleet_of_any_size(request: Request) -> TagFleet:
             ("--nlos", request.nlos),
             ("--power-bias", request.power_bias),
             ("--temperature", request.temperature),
+            ("--carrier", request.carrier),
             ("walls of the site file", site.walls),
         )
         if given
@@ -233,6 +235,7 @@ def impairments_of(request: Request, site: Site) -> Impairments:
         range_errors=RangeErrorModel() if room is None else room.ranges,
         body=request.body,
         warm_ups=request.warm_ups,
+        carrier=CarrierModel() if request.carrier else None,
         diagnostics=request.diagnostics,
     )
 
