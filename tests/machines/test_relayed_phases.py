@@ -15,9 +15,12 @@ from skyless.core.air.reception import Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.protocols import new_anchor
 from skyless.core.ticks import wrap
+from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.research.masterless.own_estimator import OwnReceiver
 from skyless.sim.carrier import CarrierModel
+from skyless.sim.evaluation.scenarios import Request
 from skyless.site.survey.relayed import RelayedDifferences
+from support.keyed_air import AttackedAir, made_keys, run_tag
 
 pytestmark = pytest.mark.site
 
@@ -97,6 +100,22 @@ def test_an_anchor_relays_the_phase_that_its_radio_measured(phase_cycles):
     (entry,) = made.heard
     assert (entry.anchor, entry.rx_ticks, entry.is_short) == (1, 0x1234_5678, True)
     assert entry.phase_cycles == (16 / 128 if phase_cycles == 0.123 else None)
+
+
+def test_keys_protect_beacons_with_phases_as_others():
+    """Frames with a certificate have none; all others are verified, as at a site without."""
+    found = []
+    for phase in (UNSET, True):
+        site = site_of(carrier_phase=phase)
+        keys = made_keys(site.id, -60.0)
+        received = tuple(AttackedAir(Request(site), keys, None).run(1.2))
+        beacons = [decode(one.reception.frame) for one in received]
+        assert {one.has_phases for one in beacons if one.certificate is None} == {phase is True}
+        assert {one.has_phases for one in beacons if one.certificate is not None} == {False}
+        run = run_tag(received, SiteTrust(site.id, keys.public, trust=Trust.VERIFIED))
+        found.append([(one.given_s, one.fix.rows) for one in run.given])
+    assert found[0] == found[1]
+    assert len(found[0]) > 100
 
 
 def test_surveys_and_estimators_of_ones_own_find_the_same_in_both():
