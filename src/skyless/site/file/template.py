@@ -53,7 +53,7 @@ _FREE_SCHEDULE = """\
 [schedule]                      # who sends when
 mode = "free"                   # anchors send at random instants; "master" is the paper's protocol, with slots
 {no_rate}rate_hz = {rate_hz}                # beacons per second of each anchor; as many as fit by default
-{no_phase}carrier_phase = {phase}            # anchors relay phases of the carrier, too; tags of version 0.1 drop that
+{no_phase}carrier_phase = {phase}          # anchors relay phases of the carrier, too; older tags drop such beacons
 """
 
 _MASTER_SCHEDULE = """\
