@@ -105,7 +105,8 @@ int main(int count, char **words) {
         uint8_t *frame = malloc(one.length ? one.length : 1);
         memcpy(frame, one.bytes, one.length);
         const int32_t outcome =
-            skyless_hear_frame(h, c, s, frame, one.length, one.rx_ticks, (real)host_s, (real)power_dbm, -85);
+            skyless_hear_frame(h, c, s, frame, one.length, one.rx_ticks, (real)host_s, (real)power_dbm, -85,
+                               (real)(one.rx_ticks % 997) / 997);
         free(frame);
         if (outcome == FIX) {
             fixes++;

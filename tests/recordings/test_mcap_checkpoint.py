@@ -237,7 +237,7 @@ def with_field(dtype, begin, name, value, size=None):
     """What sets a field of a record that begins at a place, as ``packed_state`` writes it."""
 
     def change(data):
-        packed = repack_fields(np.empty(0, dtype)).dtype
+        packed = repack_fields(np.empty(0, dtype), recurse=True).dtype
         kind, offset = packed.fields[name]
         at = begin(data) + offset
         return data[:at] + np.array(value, kind).tobytes() + data[at + kind.itemsize :]
@@ -248,7 +248,8 @@ def with_field(dtype, begin, name, value, size=None):
 def third_anchor(data):
     """Where the third anchor's record begins: behind it are records of all others, of packets and of links."""
     count = data[3]
-    sizes = [repack_fields(np.empty(0, np.dtype(one))).dtype.itemsize for one in (Anchor, KeptPacket, Link)]
+    kinds = (np.empty(0, np.dtype(one)) for one in (Anchor, KeptPacket, Link))
+    sizes = [repack_fields(kind, recurse=True).dtype.itemsize for kind in kinds]
     behind = count * (sizes[0] + PACKETS_KEPT * sizes[1] + count * sizes[2])
     return len(data) - behind + 2 * sizes[0]
 
@@ -266,13 +267,14 @@ def third_anchor(data):
         with_byte(3, 5),
         with_byte(3, 0),
         with_byte(3, 255),
+        with_byte(4, 1),
         with_field(np.dtype(Anchor), third_anchor, "identifier", 1),
-        with_field(np.dtype(Status), lambda _: 4, "range_errors", -1),
-        with_field(np.dtype(Status), lambda _: 4, "range_errors", 3),
+        with_field(np.dtype(Status), lambda _: 5, "range_errors", -1),
+        with_field(np.dtype(Status), lambda _: 5, "range_errors", 3),
     ],
     ids=[
         "short", "long", "none", "twice", "number", "version", "dimensions", "fewer anchors", "no anchors",
-        "all anchors", "an anchor twice", "range errors -1", "range errors 3",
+        "all anchors", "phases", "an anchor twice", "range errors -1", "range errors 3",
     ],
 )  # fmt: skip
 def test_states_that_would_lead_compiled_code_astray_are_refused(change):

@@ -91,7 +91,7 @@ def test_the_study_of_the_room_tells_levels_and_what_is_missed(run, tmp_path):
     assert ElementTree.fromstring((tmp_path / "folder" / "room.svg").read_bytes()).tag.endswith("svg")
 
 
-@pytest.mark.parametrize("name", ["nlos", "sync", "room", "scale"])
+@pytest.mark.parametrize("name", ["nlos", "sync", "room", "phase", "scale"])
 def test_every_study_can_be_drawn(name, tmp_path):
     """From rows as they may be, without simulating: with numbers, without, with a single world."""
     from skyless.research.studies.catalogue import STUDIES

@@ -66,6 +66,7 @@ _OF_THE_WATCH: Final = (
 _LEGENDS: Final = {
     "integrity": _OF_LEVELS,
     "room": _OF_THE_ROOM,
+    "phase": _OF_THE_ROOM,
     "large": _OF_A_LARGE_SITE,
     "survey": _OF_SURVEYS,
     "survey-room": _OF_SURVEYED_ROOMS,

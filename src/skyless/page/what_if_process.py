@@ -119,6 +119,8 @@ class _Tables:
             rx_ticks=packet.rx_ticks,
             tx_ticks=packet.tx_ticks,
             variance_factor=packet.variance_factor,
+            has_phase=packet.has_phase,
+            phase_cycles=packet.phase_cycles,
             end=len(self._relays),
         )
         self._packets.append(row)

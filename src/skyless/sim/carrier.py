@@ -2,9 +2,9 @@
 
     phase = f·(X − R) + constants of both chips + reflections + noise      [cycles]
 
-X is the sender's counter when its frame leaves and R the receiver's when it arrives, both without the stamps' noise: one
-crystal drives a chip's counter and its carrier. Reflections change with the path of a tag, over centimetres. Constants are
-drawn when a radio is switched on. All draws are from streams of their own, so stamps are the same with and without carrier.
+X is the sender's counter when its frame leaves and R the receiver's when it arrives, both without the stamps' noise:
+one crystal drives a chip's counter and its carrier. Reflections change over centimetres of a tag's way. Constants are
+drawn when a radio is switched on. All draws are from streams of their own, so that stamps are the same without carrier.
 """
 
 import math

@@ -212,11 +212,15 @@ def _replay_site(asked: ReplayOptions, begin: Begin, on_measured: OnMeasured | N
         *("measurements", "uncalibrated", "tag_height_m", "z_bounds_m", "heights", "first_s"),
         why=why,
     )
-    asked.leave_out("smooth", "estimator", why="it is for time differences, and these are receptions of beacons")
+    asked.leave_out(
+        "channel", "smooth", "estimator", why="it is for time differences, and these are receptions of beacons"
+    )
     wanted = None if asked.site is None else site_of(asked.site)[0]
     tags, settle_s = None if asked.tag is None else (asked.tag,), 2.0 if asked.settle_s is None else asked.settle_s
     with McapRecording(path) as recording:
-        run = SiteReplay(recording, tags, asked.method, settle_s, asked.above_m, wanted, asked.requirement)
+        run = SiteReplay(
+            recording, tags, asked.method, settle_s, asked.above_m, wanted, asked.requirement, asked.stamps_only
+        )
         found = recording.summary()
         span_s = max((found.end_s or 0.0) - (found.start_s or 0.0), 1e-9)
         write = begin(tuple(run.tags), asked.method or DEFAULT_METHOD)

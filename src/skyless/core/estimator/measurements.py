@@ -281,8 +281,8 @@ def first_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> 
 def open_state(s: State, state: int, own: int, variance: float) -> None:
     """Initialise the covariance of a state by a measurement: the limit of an update when nothing was known of it.
 
-    All errors of the measurement, of that variance, are in it then. ``h`` holds all but the state, which has been reset;
-    P·h of that is the first of ``U``. ``own``: the anchor whose reception by the tag it is, or −1.
+    All errors of the measurement, of that variance, are in it then. ``h`` holds all but the state, which has been
+    reset; P·h of that is the first of ``U``. ``own``: the anchor whose reception by the tag it is, or −1.
     """
     compute_fault_input(s, own)
     for other in range(s.n):

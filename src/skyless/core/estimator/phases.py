@@ -1,15 +1,16 @@
-"""The phase of the carrier: what the tag's receptions show besides their stamps, 20 times as fine but modulo a wavelength.
+"""The phase of the carrier: what a reception shows besides its stamp, 20 times as fine but modulo a wavelength.
 
-    R − X  =  |p − a| + b + ambiguity + noise      (mod λ)
+    R − X  =  |p − a| + b + ambiguity + noise                 (mod λ)      (the tag receives an anchor)
+    S − X  =  |aᵢ − aⱼ| + bⱼ − bᵢ + ambiguity + noise         (mod λ)      (anchor i receives its partner j)
 
-X is when the anchor's counter says that the frame left: carriers start at a phase that the counter gives, so the noise of
-its TX stamp is not in it. The ambiguity holds what is constant as long as both radios keep their supply, and what
-reflections add, which changes as the tag walks. It stays a real number: as the tag walks, directions to the anchors turn,
-and ranges that are known to millimetres but for a constant tell where it is. ``docs/maths.md`` section 6.7.
+X is when the sender's counter says that the frame left: carriers start at a phase that the counter gives, so the noise
+of its TX stamp is not in it. An ambiguity holds what is constant as long as both radios keep their supply, and what
+reflections add, which changes as the tag walks. It stays a real number: as the tag walks, directions to the anchors
+turn, and ranges that are known to millimetres but for a constant tell where it is. ``docs/maths.md`` section 6.7.
 
-A wrong cycle in fast motion looks consistent and drags the position by metres. So a phase counts only with a stamp that was
-used, where it is predicted to a tenth of a wavelength; else its ambiguity begins again, from which nothing is learnt. Where
-stamps contradict, all begin again.
+A wrong cycle in fast motion looks consistent and drags the position by metres. So a phase counts only with a stamp that
+was used, where it is predicted to a tenth of a wavelength; else its ambiguity begins again, from which nothing is
+learnt. Where stamps contradict, all begin again.
 """
 
 from typing import Final
@@ -73,8 +74,7 @@ def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
 def relay_phase(s: State, listener: int, sender: int, packet_rx_ticks: Ticks, phase_cycles: float) -> None:
     """Process the phase of an anchor's reception of its partner, whose stamp was used; of others' it does nothing.
 
-    S − X = |aᵢ − aⱼ| + bⱼ − bᵢ + ambiguity of the mesh + noise (mod λ). The partner is the anchor of lowest identifier that
-    it relays, so that all clocks are tied to one.
+    The partner is the anchor of lowest identifier that it relays, so that all clocks are tied to one.
     """
     i, j, settings, where = s.anchors[listener], s.anchors[sender], s.settings, s.layout
     finish_updates(s)
@@ -145,7 +145,7 @@ def _limit_m2(s: State, variance: float) -> float:
 
 
 def _learn_noise(s: State, shown_m2: float) -> None:
-    """Let the variance of phases follow what innovations show beyond their prediction: more where reflections do more."""
+    """Let the variance of phases follow what innovations show beyond their prediction: reflections differ."""
     tuning, status = s.tuning, s.status
     status.phase_variance_m2 += tuning.phase_forgetting * (shown_m2 - status.phase_variance_m2)
     status.phase_variance_m2 = min(

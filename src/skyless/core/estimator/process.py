@@ -203,7 +203,7 @@ def _process_of(s: State, anchor: int, packet: Packet) -> int:
         if result == CLOCK_JUMPED:
             return RESTARTED_CLOCK
         outcome = ACCEPTED if result == USED else REJECTED
-        if packet.has_phase:
+        if packet.has_phase and s.settings.carrier_cycles > 0:
             if result == USED:
                 own_phase(s, anchor, packet.phase_cycles)
             elif a.outliers_in_row > 1:

@@ -51,7 +51,7 @@ def unpacked_state(settings: EstimatorSettings, packed: bytes) -> State:
     for part in _parts(s):
         size, dtype = part.size * _packed(part).itemsize, _packed(part).dtype
         part[...] = np.frombuffer(packed[place : place + size].ljust(size, b"\0"), dtype).reshape(part.shape)
-        if any((part[name].view(np.uint8) > 1).any() for name in dtype.names or () if part[name].dtype == np.bool_):
+        if any((flags.view(np.uint8) > 1).any() for flags in _flags(part)):
             raise ValueError("the estimator's state has a field that is neither true nor false")
         place += size
     identifiers = {s.anchors[anchor].identifier for anchor in range(s.count)}
@@ -65,9 +65,15 @@ def unpacked_state(settings: EstimatorSettings, packed: bytes) -> State:
     return s
 
 
+def _flags(part: NDArray[Any]) -> list[NDArray[Any]]:
+    """All fields of records, and of records in these, that are true or false."""
+    fields = [part[name] for name in part.dtype.names or ()]
+    return [one for one in fields if one.dtype == np.bool_] + [flags for one in fields for flags in _flags(one)]
+
+
 def _packed(part: NDArray[Any]) -> NDArray[Any]:
     """Without what lies between the fields of records."""
-    return repack_fields(part) if part.dtype.names else part
+    return repack_fields(part, recurse=True) if part.dtype.names else part
 
 
 def _parts(s: State) -> list[NDArray[Any]]:

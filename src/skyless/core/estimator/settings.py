@@ -322,7 +322,7 @@ class EstimatorSettings(Record):
     highest_m: float = inf
     """Bounds of the tag's height."""
     carrier_cycles: int = 13
-    """Cycles of the carrier in 128 ticks, 13 of channel 5; its phases count where packets have them."""
+    """Cycles of the carrier in 128 ticks, 13 of channel 5, whose phases count where packets have them; 0: never."""
     phase_std_m: float = 0.0005
     """Least standard deviation of a phase as the tag measures it."""
     phase_wander: float = 3e-5

@@ -39,6 +39,20 @@ def relays_fit(s: State) -> bool:
     return status.relays_lately_accepted > max(s.tuning.max_relays_rejected, 4.0 * status.relays_lately_rejected)
 
 
+def has_phase(s: State, anchor: int) -> bool:
+    """Whether phases of an anchor are in use: one has confirmed its ambiguity, and they are not refused."""
+    own = s.anchors[anchor].own
+    return own.is_known and own.refused_in_row < int(s.tuning.phases_in_row) - 1
+
+
+def uses_phases(s: State) -> bool:
+    """Whether phases of any anchor are in use."""
+    number = 0
+    for anchor in range(s.count):
+        number += int(has_phase(s, anchor))
+    return number > 0
+
+
 def fits_settings(s: State) -> bool:
     """Whether the constants of the ranges are as small as the settings state, as far as they are known."""
     first, count = s.layout.constant, s.count

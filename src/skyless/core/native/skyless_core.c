@@ -181,6 +181,14 @@ INTERNAL void adapt_process_noise(State *s, real normalised);
 INTERNAL void adapt_clock_noise(State *s, int32_t anchor, real normalised);
 INTERNAL real walk_scale(State *s, real scale, real mean);
 INTERNAL real covariance_scale(State *s);
+INTERNAL bool is_late_often(State *s);
+INTERNAL bool rejects_most(State *s);
+INTERNAL bool is_lost(State *s);
+INTERNAL bool relays_contradict(State *s);
+INTERNAL bool relays_fit(State *s);
+INTERNAL bool has_phase(State *s, int32_t anchor);
+INTERNAL bool uses_phases(State *s);
+INTERNAL bool fits_settings(State *s);
 INTERNAL void protect(State *s);
 INTERNAL real largest_test(State *s);
 INTERNAL void find_least_axis(State *s, int32_t dim);
@@ -262,12 +270,6 @@ INTERNAL void add_fix(State *s, real share, SteadyState *found);
 INTERNAL void predict_with_impulses(State *s, int64_t now, int64_t impulses_ticks, int64_t superframe);
 INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks);
 INTERNAL void receive_relay(State *s, PlannedMessage *message, PlannedRelay *relayed);
-INTERNAL bool is_late_often(State *s);
-INTERNAL bool rejects_most(State *s);
-INTERNAL bool is_lost(State *s);
-INTERNAL bool relays_contradict(State *s);
-INTERNAL bool relays_fit(State *s);
-INTERNAL bool fits_settings(State *s);
 INTERNAL bool factorise(real *A, int32_t size);
 INTERNAL void solve_lower(real *L, int32_t size, real *x);
 INTERNAL void solve(real *L, int32_t size, real *x);
@@ -2403,6 +2405,72 @@ INTERNAL real covariance_scale(State *s) {
     return nis > s->tuning.inconsistent_nis ? nis * nis : REAL(1.0);
 }
 
+/* What the estimator's counters say of its state: whether a new start is needed, and what that has to expect. */
+
+/* Whether single packets are late often. */
+INTERNAL bool is_late_often(State *s) {
+    return s->status.late_share > s->tuning.late_often_share;
+}
+
+/* Whether most measurements lie beyond the gate. */
+INTERNAL bool rejects_most(State *s) {
+    return s->status.rejected_share > s->tuning.lost_share;
+}
+
+/* Whether more packets are rejected than a right state would reject. */
+INTERNAL bool is_lost(State *s) {
+    int32_t in_row = s->status.rejected_in_row + s->status.stale_in_row;
+    real late = min_real(s->status.late_share, MOST_LATE);
+    return rejects_most(s) || (real)in_row * (REAL(1.0) - REAL(2.0) * late) >= s->tuning.lost_in_row;
+}
+
+/* Whether most of what anchors received of each other does not fit: a wrong position shifts all clocks. */
+INTERNAL bool relays_contradict(State *s) {
+    Status *status = &s->status;
+    return status->relays_lately_rejected > max_real(s->tuning.max_relays_rejected, status->relays_lately_accepted);
+}
+
+/* Whether most of what anchors received of each other fits, and that is more than a few receptions. */
+INTERNAL bool relays_fit(State *s) {
+    Status *status = &s->status;
+    return status->relays_lately_accepted > max_real(s->tuning.max_relays_rejected, REAL(4.0) *
+            status->relays_lately_rejected);
+}
+
+/* Whether phases of an anchor are in use: one has confirmed its ambiguity, and they are not refused. */
+INTERNAL bool has_phase(State *s, int32_t anchor) {
+    Ambiguity *own = &s->anchors[anchor].own;
+    return own->is_known && own->refused_in_row < truncated(s->tuning.phases_in_row) - 1;
+}
+
+/* Whether phases of any anchor are in use. */
+INTERNAL bool uses_phases(State *s) {
+    int32_t number = 0;
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        number += (int32_t)has_phase(s, anchor);
+    }
+    return number > 0;
+}
+
+/* Whether the constants of the ranges are as small as the settings state, as far as they are known. */
+INTERNAL bool fits_settings(State *s) {
+    int32_t first = s->layout.constant;
+    int32_t count = s->count;
+    for (int32_t one = 0; one < count; one++) {
+        for (int32_t other = 0; other < one + 1; other++) {
+            s->work[one][other] = s->P[first + one][first + other];
+        }
+        s->work[one][one] += square(s->settings.range_std_m);
+        s->work[count][one] = s->x[first + one];
+    }
+    whiten(s, count, 1);
+    real chi2 = REAL(0.0);
+    for (int32_t one = 0; one < count; one++) {
+        chi2 += square(s->work[count][one]);
+    }
+    return chi2 < s->tuning.fitting_chi2 * (real)count;
+}
+
 /* Protection levels: how wrong a position may be, even if receptions are late (``docs/maths.md`` section 8).
  *
  * Hypothesis: the tag's receptions of every anchor are late (or early) by a constant of its own, all at once. With the
@@ -2465,7 +2533,7 @@ INTERNAL void protect(State *s) {
     }
     levels[HPL] += settings->max_acceleration_mps2 * SQRT(squared);
     levels[VPL] += settings->max_acceleration_mps2 * SQRT(up);
-    if (s->status.has_phases) {
+    if (uses_phases(s)) {
         levels[HPL] *= s->tuning.phase_levels;
         levels[VPL] *= s->tuning.phase_levels;
     }
@@ -2954,8 +3022,8 @@ INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_
 
 /* Initialise the covariance of a state by a measurement: the limit of an update when nothing was known of it.
  *
- * All errors of the measurement, of that variance, are in it then. ``h`` holds all but the state, which has been reset;
- * P·h of that is the first of ``U``. ``own``: the anchor whose reception by the tag it is, or −1. */
+ * All errors of the measurement, of that variance, are in it then. ``h`` holds all but the state, which has been
+ * reset; P·h of that is the first of ``U``. ``own``: the anchor whose reception by the tag it is, or −1. */
 INTERNAL void open_state(State *s, int32_t state, int32_t own, real variance) {
     compute_fault_input(s, own);
     for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
@@ -3329,18 +3397,19 @@ INTERNAL void zero_velocity(State *s) {
     }
 }
 
-/* The phase of the carrier: what the tag's receptions show besides their stamps, 20 times as fine but modulo a wavelength.
+/* The phase of the carrier: what a reception shows besides its stamp, 20 times as fine but modulo a wavelength.
  *
- *     R − X  =  |p − a| + b + ambiguity + noise      (mod λ)
+ *     R − X  =  |p − a| + b + ambiguity + noise                 (mod λ)      (the tag receives an anchor)
+ *     S − X  =  |aᵢ − aⱼ| + bⱼ − bᵢ + ambiguity + noise         (mod λ)      (anchor i receives its partner j)
  *
- * X is when the anchor's counter says that the frame left: carriers start at a phase that the counter gives, so the noise of
- * its TX stamp is not in it. The ambiguity holds what is constant as long as both radios keep their supply, and what
- * reflections add, which changes as the tag walks. It stays a real number: as the tag walks, directions to the anchors turn,
- * and ranges that are known to millimetres but for a constant tell where it is. ``docs/maths.md`` section 6.7.
+ * X is when the sender's counter says that the frame left: carriers start at a phase that the counter gives, so the noise
+ * of its TX stamp is not in it. An ambiguity holds what is constant as long as both radios keep their supply, and what
+ * reflections add, which changes as the tag walks. It stays a real number: as the tag walks, directions to the anchors
+ * turn, and ranges that are known to millimetres but for a constant tell where it is. ``docs/maths.md`` section 6.7.
  *
- * A wrong cycle in fast motion looks consistent and drags the position by metres. So a phase counts only with a stamp that was
- * used, where it is predicted to a tenth of a wavelength; else its ambiguity begins again, from which nothing is learnt. Where
- * stamps contradict, all begin again. */
+ * A wrong cycle in fast motion looks consistent and drags the position by metres. So a phase counts only with a stamp that
+ * was used, where it is predicted to a tenth of a wavelength; else its ambiguity begins again, from which nothing is
+ * learnt. Where stamps contradict, all begin again. */
 
 /* Process the phase of a reception of the tag's whose stamp was used; it is in [0, 1) and falls as stamps grow. */
 INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
@@ -3384,8 +3453,7 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
 
 /* Process the phase of an anchor's reception of its partner, whose stamp was used; of others' it does nothing.
  *
- * S − X = |aᵢ − aⱼ| + bⱼ − bᵢ + ambiguity of the mesh + noise (mod λ). The partner is the anchor of lowest identifier that
- * it relays, so that all clocks are tied to one. */
+ * The partner is the anchor of lowest identifier that it relays, so that all clocks are tied to one. */
 INTERNAL void relay_phase(State *s, int32_t listener, int32_t sender, int64_t packet_rx_ticks, real phase_cycles) {
     Anchor *i = &s->anchors[listener];
     Anchor *j = &s->anchors[sender];
@@ -3466,7 +3534,7 @@ INTERNAL real limit_m2(State *s, real variance) {
     return min_real(gate_squared * variance, square(s->tuning.phase_gate * wavelength_m(s)));
 }
 
-/* Let the variance of phases follow what innovations show beyond their prediction: more where reflections do more. */
+/* Let the variance of phases follow what innovations show beyond their prediction: reflections differ. */
 INTERNAL void learn_noise(State *s, real shown_m2) {
     Tuning *tuning = &s->tuning;
     Status *status = &s->status;
@@ -3769,7 +3837,7 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet) {
             return RESTARTED_CLOCK;
         }
         outcome = result == USED ? ACCEPTED : REJECTED;
-        if (packet->has_phase) {
+        if (packet->has_phase && s->settings.carrier_cycles > 0) {
             if (result == USED) {
                 own_phase(s, anchor, packet->phase_cycles);
             } else if (a->outliers_in_row > 1) {
@@ -4177,57 +4245,6 @@ SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_t
             update(s, REAL(0.0), compute_ph(s) + s->settings.rx_variance_m2, REAL(1.0));
         }
     }
-}
-
-/* What the estimator's counters say of its state: whether a new start is needed, and what that has to expect. */
-
-/* Whether single packets are late often. */
-INTERNAL bool is_late_often(State *s) {
-    return s->status.late_share > s->tuning.late_often_share;
-}
-
-/* Whether most measurements lie beyond the gate. */
-INTERNAL bool rejects_most(State *s) {
-    return s->status.rejected_share > s->tuning.lost_share;
-}
-
-/* Whether more packets are rejected than a right state would reject. */
-INTERNAL bool is_lost(State *s) {
-    int32_t in_row = s->status.rejected_in_row + s->status.stale_in_row;
-    real late = min_real(s->status.late_share, MOST_LATE);
-    return rejects_most(s) || (real)in_row * (REAL(1.0) - REAL(2.0) * late) >= s->tuning.lost_in_row;
-}
-
-/* Whether most of what anchors received of each other does not fit: a wrong position shifts all clocks. */
-INTERNAL bool relays_contradict(State *s) {
-    Status *status = &s->status;
-    return status->relays_lately_rejected > max_real(s->tuning.max_relays_rejected, status->relays_lately_accepted);
-}
-
-/* Whether most of what anchors received of each other fits, and that is more than a few receptions. */
-INTERNAL bool relays_fit(State *s) {
-    Status *status = &s->status;
-    return status->relays_lately_accepted > max_real(s->tuning.max_relays_rejected, REAL(4.0) *
-            status->relays_lately_rejected);
-}
-
-/* Whether the constants of the ranges are as small as the settings state, as far as they are known. */
-INTERNAL bool fits_settings(State *s) {
-    int32_t first = s->layout.constant;
-    int32_t count = s->count;
-    for (int32_t one = 0; one < count; one++) {
-        for (int32_t other = 0; other < one + 1; other++) {
-            s->work[one][other] = s->P[first + one][first + other];
-        }
-        s->work[one][one] += square(s->settings.range_std_m);
-        s->work[count][one] = s->x[first + one];
-    }
-    whiten(s, count, 1);
-    real chi2 = REAL(0.0);
-    for (int32_t one = 0; one < count; one++) {
-        chi2 += square(s->work[count][one]);
-    }
-    return chi2 < s->tuning.fitting_chi2 * (real)count;
 }
 
 /* Symmetric matrices by Cholesky's method, and least squares of few unknowns by rotations of columns.
@@ -5867,7 +5884,8 @@ INTERNAL int32_t fitting_relays(Neighbours *t, State *s, BeaconFields *b, int64_
 
 /* Process a frame from the air; what becomes of it: of ``DROP_COUNTERS``, of a course, or one of the above.
  *
- * ``host_s`` and the powers are NaN, and the phase is below 0, where they are not known. Course and state are not used while it is starting. */
+ * ``host_s`` and the powers are NaN, and the phase is below 0, where they are not known. Course
+ * and state are not used while it is starting. */
 SKYLESS_EXPORT int32_t skyless_hear_frame(Hearing *h, Course *c, State *s, uint8_t *frame, int32_t length, int64_t
         rx_counter, real host_s, real rx_power_dbm, real first_path_power_dbm, real phase_cycles) {
     int32_t fault = skyless_read_frame(frame, length, &h->beacon);

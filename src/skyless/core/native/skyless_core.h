@@ -524,7 +524,7 @@ typedef struct EstimatorSettings {
     real height_std_m;  /* Standard deviation of the given height. */
     real lowest_m;
     real highest_m;  /* Bounds of the tag's height. */
-    /* Cycles of the carrier in 128 ticks, 13 of channel 5; its phases count where packets have them. */
+    /* Cycles of the carrier in 128 ticks, 13 of channel 5, whose phases count where packets have them; 0: never. */
     int32_t carrier_cycles;
     real phase_std_m;  /* Least standard deviation of a phase as the tag measures it. */
     real phase_wander;  /* What reflections at least change in the phases of an anchor as the tag walks, m²/m. */

@@ -60,7 +60,8 @@ def hear_frame(
 ) -> int:
     """Process a frame from the air; what becomes of it: of ``DROP_COUNTERS``, of a course, or one of the above.
 
-    ``host_s`` and the powers are NaN, and the phase is below 0, where they are not known. Course and state are not used while it is starting.
+    ``host_s`` and the powers are NaN, and the phase is below 0, where they are not known. Course
+    and state are not used while it is starting.
     """
     fault = read_frame(frame, length, h.beacon)
     if fault != INTACT:

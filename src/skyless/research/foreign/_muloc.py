@@ -29,6 +29,8 @@ from skyless.core.input_files import Drops, open_source
 from skyless.core.ticks import difference, wrap
 from skyless.site.tables import Truth
 
+CHANNELS: Final = (1, 3)
+
 _SENDERS: Final = 4
 _TAG: Final = _SENDERS
 _NAMES: Final = (b"anchors_m.npy", b"start_m.npy", b"end_m.npy")

@@ -53,6 +53,8 @@ class Format:
     """Rows of time, height and standard deviation of a sensor that was recorded, from the path and ``is_barometer``."""
     read_anchors: Callable[[str | PathLike[str]], dict[int, Point]] | None = None
     """Where its anchors stand, from the path, where the recording itself holds that for all."""
+    channels: tuple[int, ...] = ()
+    """Of these one can be chosen, and its packets have phases of the carrier then."""
     delays_ticks: int = 0
     """Antenna delays of a sender and a receiver together, where its stamps include them."""
 
@@ -150,6 +152,7 @@ FORMATS: Final = (
         TICK_BITS,
         read_truth=muloc.read_truth,
         read_anchors=muloc.read_anchors,
+        channels=muloc.CHANNELS,
     ),
     _bitcraze("binary", "binary records BC ..", bitcraze.recognise_binary, bitcraze.read_binary),
     _dl_tdoa(
@@ -197,19 +200,26 @@ def open_recording(
     format_name: str | None = None,
     listener: str | None = None,
     anchors_m: Mapping[int, Point] | None = None,
+    channel: int | None = None,
 ) -> Recording:
     """Open a recording of a named format, or of the one that its first bytes show.
 
     ``listener`` chooses one receiver where a recording holds several; by default that of the first row. ``anchors_m``:
-    positions that replace all that the anchors of a recording of DL-TDoA state.
+    positions that replace all that the anchors of a recording of DL-TDoA state. ``channel``: the only one to read, with
+    phases of its carrier.
 
     Raises:
-        ConfigurationError: the file cannot be opened, its format is not known, or the listener makes no sense.
+        ConfigurationError: the file cannot be opened, its format is not known, or listener or channel make no sense.
     """
     chosen = format_of(path, format_name)
     read = _listening(path, chosen, listener)
     if chosen.is_dl_tdoa:
         read = partial(chosen.read, anchors_m=anchors_m)
+    if channel is not None:
+        if channel not in chosen.channels:
+            right = " or ".join(map(str, chosen.channels)) or f"left out: {chosen.name} has one channel only"
+            raise ConfigurationError(path, "channel", channel, right)
+        read = partial(chosen.read, channel=channel)
     stream = open_source(path)
     drops: Drops = Counter()
     return Recording(chosen, fspath(path), read(stream, drops), stream, drops)

@@ -37,7 +37,7 @@ MASTERLESS: Final = DIFFERENCES.changed(
     phase_wander=9e-4,
 )
 """Ranges err as in ``DIFFERENCES``. In captures of TDoA3 anchors a reception is 4 cm off by itself.
-Phases count less than they could, as heights of recorded anchors are not known, nor are their places to a centimetre."""
+Phases count less than they could, as neither heights of recorded anchors are known nor their places to a centimetre."""
 
 DL_TDOA: Final = EstimatorSettings(qa=DIFFERENCES.qa)
 """For FiRa's radios, of which there are no recordings yet: a site with typical errors is assumed."""

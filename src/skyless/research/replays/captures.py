@@ -13,6 +13,7 @@ from msgspec import field, structs
 
 from skyless.core.air.masterless_packets import Packet, Point
 from skyless.core.arguments import process_noise
+from skyless.core.constants import CARRIER_CYCLES
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
@@ -135,7 +136,7 @@ class CaptureReplay:
         self.measurements = self._measurements(kind)
         self._heights = known_heights(asked)
         path, anchors_m = asked.file, self._anchors_m
-        self.recording: Recording = open_recording(path, asked.format, asked.listener, anchors_m)
+        self.recording: Recording = open_recording(path, asked.format, asked.listener, anchors_m, asked.channel)
         self._qa = process_noise(asked.qa, asked.dynamics)
         self._calibration = calibration
         table = asked.anchors if isinstance(asked.anchors, str | Path) and not asked.uncalibrated else None
@@ -156,7 +157,7 @@ class CaptureReplay:
                 raise SkylessError(f"--measurements is 'packets'; {asked.needs_differences} needs differences")
             return DIFFERENCES_MADE
         if asked.measurements is None:
-            suits = kind.is_dl_tdoa or (kind.name in FORMATS_BY_PACKETS and self._anchors_m)
+            suits = self._has_phases or kind.is_dl_tdoa or (kind.name in FORMATS_BY_PACKETS and self._anchors_m)
             return PACKETS if suits and asked.tdoa_std_m is None else DIFFERENCES_MADE
         if asked.measurements == PACKETS and kind.tx_bits is None:
             wanted = f"it should be 'differences': {kind.name} holds no anchors' packets"
@@ -164,6 +165,12 @@ class CaptureReplay:
         if asked.measurements == PACKETS and asked.tdoa_std_m is not None:
             raise SkylessError("--tdoa-std is the noise of differences; --measurements packets makes none")
         return asked.measurements
+
+    @property
+    def _has_phases(self) -> bool:
+        """Whether phases of a channel's carrier are used."""
+        asked = self._asked
+        return asked.channel is not None and not asked.stamps_only and asked.measurements != DIFFERENCES_MADE
 
     def _new_pipeline(self) -> Pipeline:
         if self.measurements == PACKETS:
@@ -184,6 +191,7 @@ class CaptureReplay:
         assert bits is not None
         qa = MASTERLESS.qa if self._qa is None else self._qa
         known = {"qa": qa, "height_m": self.height_m, "height_std_m": self._height_std_m}
+        known["carrier_cycles"] = CARRIER_CYCLES[self._asked.channel or 5] if self._has_phases else 0
         is_dl_tdoa = self.recording.format.is_dl_tdoa
         tracking = PacketTracking(
             (DL_TDOA if is_dl_tdoa else MASTERLESS).changed(**known),
@@ -297,7 +305,7 @@ class CaptureReplay:
             reason=None if fixes else str(reason),
             pairs=pairs,
             method=filtered if own is None else getattr(own, "__name__", "own"),
-            measurements=self.measurements,
+            measurements=f"{self.measurements} and phases" if self._has_phases else self.measurements,
             contradictions_m={f"{a}-{b}": metres for (a, b), metres in by_m},
         )
 

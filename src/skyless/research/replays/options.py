@@ -97,6 +97,8 @@ class RecordingOptions(ComputedOptions, frozen=True, kw_only=True):
     """Name of the format, if the content should not decide."""
     listener: str | None = None
     """Which receiver, in recordings with several."""
+    channel: int | None = None
+    """Which radio channel, in recordings of several; phases of the carrier are used of one channel only."""
     above_m: Annotated[float | None, Option("above")] = None
     """Judge only while the true height exceeds this, in metres; by default 0.3 for a table of differences that starts
     below it and later flies, as tags on the floor hear reflections only."""
@@ -177,6 +179,8 @@ class ReplayOptions(_Recording, frozen=True, kw_only=True):
     measurements: Annotated[str | None, choice(*MEASUREMENTS)] = None
     """What the filter is given of other recordings: packets, as anchors sent them, which is the default for
     Bitcraze's and FiRa's; or differences, which are made of them."""
+    stamps_only: bool = False
+    """Leave out the phases of carriers that were recorded."""
     integrity_risk: IntegrityRisk | None = None
     """Probability, for each fix, that the error exceeds its protection level, in recordings of skyless record (joint);
     by default the tag's own."""

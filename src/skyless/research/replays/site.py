@@ -177,11 +177,15 @@ class TagReplay:
         method: str | None = None,
         delays: dict[int, DelayChange] | None = None,
         integrity: IntegrityRequirement | None = None,
+        stamps_only: bool = False,
     ) -> None:
-        """``method`` and ``integrity``: others than the tag's own; ``delays``: other antenna delays. All begin cold."""
-        self._delays = delays
+        """``method`` and ``integrity``: others than the tag's own; ``delays``: other antenna delays. All begin cold.
+
+        ``stamps_only``: without phases, cold as well.
+        """
+        self._delays, self._stamps_only = delays, stamps_only
         self._integrity = integrity
-        self._is_as_it_was = method is None and delays is None and integrity is None
+        self._is_as_it_was = method is None and delays is None and integrity is None and not stamps_only
         self.tag = tag
         self.method = method
         """As recorded, once known, or as asked for."""
@@ -217,6 +221,8 @@ class TagReplay:
             self.receptions += 1
             if self._delays is not None:
                 reception = with_delays(reception, self._delays)
+            if self._stamps_only:
+                reception = structs.replace(reception, carrier_phase_cycles=None)
             made = self._made(reception)
             yield from self._timed(self._clock.add(reception, message.unix_less_host_s, made))
 
@@ -406,11 +412,12 @@ class SiteReplay:
         above_m: float | None = None,
         wanted: Site | None = None,
         integrity: IntegrityRequirement | None = None,
+        stamps_only: bool = False,
     ) -> None:
         """Replay as the tags computed, or otherwise.
 
         ``method`` and ``integrity`` are used instead of the tags' own, the antenna delays of ``wanted`` instead of the
-        anchors' own.
+        anchors' own, and no phases with ``stamps_only``.
 
         Raises:
             ConfigurationError: the recording has no raw receptions, none of such a tag, or is of another site.
@@ -429,7 +436,7 @@ class SiteReplay:
         delays = None
         if wanted is not None:
             delays = delay_changes(recorded_site(recording, wanted.id), wanted)
-        self.tags = {tag: TagReplay(tag, method, delays, integrity) for tag in tags or summary.raw_tags}
+        self.tags = {tag: TagReplay(tag, method, delays, integrity, stamps_only) for tag in tags or summary.raw_tags}
         self.samples = {tag: FixSamples() for tag in self.tags}
         self._spans: dict[str, tuple[float, float]] = {}
         """First and last fix of each tag, Unix time."""

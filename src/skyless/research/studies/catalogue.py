@@ -13,6 +13,7 @@ from skyless.research.studies import (
     loss,
     motion,
     nlos,
+    phase,
     room,
     scale,
     survey,
@@ -68,6 +69,10 @@ STUDIES: Final = {
             _of_worlds("room", "the room", room.cases, Look("The room", ("rmse", "nees", "level", "exceeded"))),
             cells=room.cells,
             rows=room.rows,
+        ),
+        replace(
+            _of_worlds("phase", "phases of the carrier", phase.cases, Look("Phases of the carrier", ("rmse", "nees"))),
+            rows=phase.rows,
         ),
         Study(
             "large",

@@ -202,7 +202,7 @@ def _rests(plan: Plan) -> list[Case]:
         ("at rest", lab_site(plan.noise_ps), Room()),
         ("at rest, 3-D room", room_3d_site(plan.noise_ps), Room()),
     ):
-        resting = partial(_still, site, plan.tags)
+        resting = partial(still, site, plan.tags)
         first = _case(plan, name, "rest", *limits, site=site, paths=resting, room=room, long=True)
         later = _case(
             plan, f"{name}, later", "rest", *limits, site=site, paths=resting, room=room, long=True, warmup_s=later_s
@@ -211,7 +211,7 @@ def _rests(plan: Plan) -> list[Case]:
     return found
 
 
-def _still(site: Site, tags: int, seed: int) -> Sequence[Trajectory]:
+def still(site: Site, tags: int, seed: int) -> Sequence[Trajectory]:
     """Tags that stay where those that wander begin."""
     return [Static(*path.position(0.0).tolist()) for path in wanderers(site, tags, seed)]
 

@@ -276,10 +276,10 @@ def _axis_stds_m(room: Room, site: Site) -> Array:
     return np.array(position_stds_m(site) if room.is_stated else [room.axis_std_m] * len(site.anchors))
 
 
-def wanderer(low_m: Array, high_m: Array, seed: int, tag: int) -> Roaming:
+def wanderer(low_m: Array, high_m: Array, seed: int, tag: int, qa_m2ps3: float = ROOM_QA_M2PS3) -> Roaming:
     """A tag with random acceleration that is in the box for 99.7 % of the time along each axis."""
     own = int(stream(seed, _ROAM_KEY, tag).integers(2**62))
-    return Roaming((low_m + high_m) / 2.0, (high_m - low_m) / (2.0 * _BOX_SIGMAS), qa_m2ps3=ROOM_QA_M2PS3, seed=own)
+    return Roaming((low_m + high_m) / 2.0, (high_m - low_m) / (2.0 * _BOX_SIGMAS), qa_m2ps3=qa_m2ps3, seed=own)
 
 
 def _with_height(point: Sequence[float], height_m: float) -> tuple[float, float, float]:

@@ -1,0 +1,119 @@
+"""The study ``phase``: the same worlds with and without phases of the carrier.
+
+Each scene is run twice, with the same stamps: by stamps alone, then with the phases of the tag's own receptions, whose
+ratio is the RMSE over that by stamps.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import pairwise
+from typing import Any, Final
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from skyless.core.site import Site
+from skyless.research.studies.common.plan import Limit, Plan, Row, with_limits
+from skyless.research.studies.common.summary import Case, world_rows
+from skyless.research.studies.common.worlds import box, walking, worlds
+from skyless.research.studies.room import WALL, past_wall, still, with_levels
+from skyless.sim.carrier import CarrierModel
+from skyless.sim.evaluation.scenarios import Room, wanderer, wanderers
+from skyless.sim.impairments import Body, Impairments
+from skyless.sim.lab import lab_site, paper_lab_site
+from skyless.sim.range_errors import RangeErrorModel
+from skyless.sim.trajectory import Trajectory
+
+_WARMUP_S: Final = 2.5
+_STAMPS: Final = ", stamps alone"
+_NEVER_WORSE: Final = 1.05
+"""Largest ratio of the RMSE with phases to that by stamps alone."""
+
+_HANDS_QA_M2PS3: Final = 3.0
+_PLAIN_CRYSTAL: Final = 5e-9
+"""Random-walk FM of crystals without temperature compensation, 1/√s."""
+
+
+class _Scene(Struct, frozen=True):
+    name: str
+    carrier: CarrierModel
+    runs: Callable[..., Any]
+    """Worlds, by the function that changes their impairments."""
+    limits: tuple[Limit, ...] = ()
+
+
+def cases(plan: Plan) -> list[Case]:
+    """Two cases of each scene."""
+    found = []
+    for scene in _scenes(plan):
+        alone = Case(scene.name + _STAMPS, scene.name, None, scene.runs(change=partial(_with_carrier, None)))
+        runs = scene.runs(change=partial(_with_carrier, scene.carrier))
+        found += [alone, Case(scene.name, scene.name, None, runs, alone.name, _NEVER_WORSE, scene.limits)]
+    return found
+
+
+def rows(plan: Plan, results: Sequence[Any]) -> Sequence[Row]:
+    """A row for each case with its levels."""
+    each = cases(plan)
+    ends = [0]
+    for case in each:
+        ends.append(ends[-1] + len(case.runs))
+    own = [results[begin:end] for begin, end in pairwise(ends)]
+    table = zip(each, world_rows("phase", plan, each, results), own, strict=True)
+    return [with_limits(with_levels(row, ran), case.limits) for case, row, ran in table]
+
+
+def _scenes(plan: Plan) -> list[_Scene]:
+    usual, exceeded = CarrierModel(), Limit("exceeded", most=1e-3)
+    honest = (Limit("nees", most=1.5), exceeded)
+    room = partial(_room, plan, lab_site(plan.noise_ps))
+    walled = replace(lab_site(plan.noise_ps), walls=(WALL,))
+    stronger = replace(usual, reflections=RangeErrorModel(changing_m=0.008, correlation_m=0.05))
+    quiet = replace(usual, reflections=RangeErrorModel())
+    lab = partial(walking, plan, paper_lab_site(plan.noise_ps), warmup_s=_WARMUP_S)
+    past = partial(past_wall, plan.tags)
+    resting = partial(still, lab_site(plan.noise_ps), plan.tags)
+    return [
+        _Scene("lab, no reflections", quiet, lab, (Limit("rmse_m", most=0.005), *honest)),
+        _Scene("the room", usual, room, (Limit("rmse_m", most=0.022), Limit("nees", 0.7, 1.3), exceeded)),
+        _Scene("at rest", usual, partial(room, paths=resting), honest),
+        _Scene("reflections of 8 mm", stronger, room, honest),
+        _Scene("1 % slips", replace(usual, slips=0.01), room, (Limit("nees", most=1.7), exceeded)),
+        _Scene("10 % wild", replace(usual, wild=0.1), room, honest),
+        _Scene(
+            "past a wall", usual, partial(_room, plan, walled, paths=past, walls_between_anchors=False), (exceeded,)
+        ),
+        _Scene("a body", usual, partial(room, body=Body()), (exceeded,)),
+        *(
+            _Scene(f"hands, {rate_hz:g}/s, {walk:g}", usual, partial(_hands, plan, rate_hz, walk), honest)
+            for rate_hz in (20.0, 10.0)
+            for walk in (_PLAIN_CRYSTAL,)
+        ),
+        _Scene("hands, 20/s, 1e-09", usual, partial(_hands, plan, 20.0, 1e-9), honest),
+    ]
+
+
+def _with_carrier(carrier: CarrierModel | None, impairments: Impairments) -> Impairments:
+    return replace(impairments, carrier=carrier)
+
+
+def _room(plan: Plan, site: Site, **options: Any) -> Any:  # noqa: ANN401 - of ``worlds``
+    paths = options.pop("paths", partial(wanderers, site, plan.tags))
+    return worlds(plan, site, paths, warmup_s=_WARMUP_S, room=Room(), **options)
+
+
+def _hands(plan: Plan, rate_hz: float, random_walk_fm: float, **options: Any) -> Any:  # noqa: ANN401 - of ``worlds``
+    """Tags in hands, of whose motion filters know, with so many beacons of each anchor a second."""
+    site = lab_site(plan.noise_ps)
+    site = replace(
+        site,
+        noise=replace(site.noise, random_walk_fm=random_walk_fm),
+        schedule=replace(site.schedule, rate_hz=rate_hz),
+    )
+    paths = partial(_hand_paths, site, plan.tags)
+    return _room(replace(plan, qa=_HANDS_QA_M2PS3), site, paths=paths, **options)
+
+
+def _hand_paths(site: Site, tags: int, seed: int) -> list[Trajectory]:
+    low_m, high_m = box(site)
+    return [wanderer(low_m, high_m, seed, tag, _HANDS_QA_M2PS3) for tag in range(tags)]

@@ -1,0 +1,123 @@
+"""Phases of the carrier: what they must not depend on, what they must not harm, and what they buy."""
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from skyless.core.any_receiver import AnyReceiver
+from skyless.core.estimator.saved import packed_state, unpacked_state
+from skyless.research.studies.common.worlds import Heard, Run, beacons_of
+from skyless.sim.carrier import CarrierModel
+from skyless.sim.evaluation.scenarios import Request, Room, impairments_of, trajectories_of
+from skyless.sim.lab import lab_site
+from skyless.sim.range_errors import RangeErrorModel
+
+SITE = lab_site()
+USUAL = CarrierModel()
+
+
+def heard(seed, seconds=4.0, tags=1, carrier=USUAL):
+    """What tags of a room receive."""
+    request = Request(SITE, seed=seed, tags=tags, room=Room())
+    impairments = replace(impairments_of(request, SITE), carrier=carrier)
+    paths = tuple(trajectories_of(request))
+    return list(beacons_of(Run(SITE, paths, impairments, seed, "joint", 0.3, True, 0.0, seconds)))
+
+
+@pytest.fixture(scope="module")
+def beacons():
+    return heard(3)
+
+
+def with_phases(beacons: list[Heard], change):
+    """The receptions of the first tag, with other phases."""
+    return [
+        (replace(reception, carrier_phase_cycles=change(beacon, reception)), truth_m)
+        for beacon in beacons
+        for tag, reception, truth_m in beacon.receptions
+        if tag == 0
+    ]
+
+
+def fixes_of(receptions, receiver=None):
+    """Positions after each reception, NaN without a fix, and the state at the end."""
+    receiver = receiver or AnyReceiver()
+    fixes = [receiver.hear(reception) for reception, _ in receptions]
+    positions = [np.full(2, np.nan) if fix is None else fix.position_m[:2] for fix in fixes]
+    return np.array(positions), receiver.receiver.method.estimator.state
+
+
+def test_constants_of_the_radios_do_not_matter(beacons):
+    """Any constant may be in the phases of an anchor: a fraction of a cycle that is not known."""
+    as_they_are, state = fixes_of(with_phases(beacons, lambda _, one: one.carrier_phase_cycles))
+    shifts = np.random.default_rng(1).random(256)
+    shifted, _ = fixes_of(
+        with_phases(beacons, lambda _, one: float((one.carrier_phase_cycles + shifts[one.frame[9]]) % 1.0))
+    )
+    assert state.status.phases_used > 300
+    assert np.nanmax(np.abs(shifted - as_they_are)) < 1e-6
+
+
+def test_noise_instead_of_phases_does_no_harm(beacons):
+    """Phases that have nothing to do with the receptions are opened and refused, and stamps decide."""
+    draw = np.random.default_rng(2)
+    truths = [truth_m for _, truth_m in with_phases(beacons, lambda _, one: None)]
+    stamps, _ = fixes_of(with_phases(beacons, lambda _, one: None))
+    noise, state = fixes_of(with_phases(beacons, lambda _, one: float(draw.random())))
+    truth = np.array(truths)[:, :2]
+    rmse_m = [np.sqrt(np.nanmean(np.sum((found - truth) ** 2, axis=1))) for found in (stamps, noise)]
+    assert state.status.phases_opened > 5 * state.status.phases_used
+    assert rmse_m[1] < 1.3 * rmse_m[0]
+
+
+def test_a_reset_of_a_radio_is_found(beacons):
+    """All phases of an anchor change at once: its ambiguity begins again, and the fixes hardly move."""
+    half = len(beacons) // 2
+    numbers = {id(beacon): number for number, beacon in enumerate(beacons)}
+
+    def reset(beacon, one):
+        late = numbers[id(beacon)] >= half and one.frame[9] == beacons[half].receptions[0][1].frame[9]
+        return float((one.carrier_phase_cycles + 0.5 * late) % 1.0)
+
+    as_they_are, before = fixes_of(with_phases(beacons, lambda _, one: one.carrier_phase_cycles))
+    after, state = fixes_of(with_phases(beacons, reset))
+    assert state.status.phases_opened > before.status.phases_opened
+    assert np.nanmax(np.abs(after - as_they_are)) < 0.03
+
+
+def test_a_saved_state_continues_with_the_same_bits(beacons):
+    receptions = with_phases(beacons, lambda _, one: one.carrier_phase_cycles)
+    middle, receiver = len(receptions) // 2, AnyReceiver()
+    fixes_of(receptions[:middle], receiver)
+    estimator = receiver.receiver.method.estimator
+    assert estimator.state.status.has_phases
+    packed = packed_state(estimator.state)
+    assert packed_state(unpacked_state(estimator.settings, packed)) == packed
+    with pytest.raises(ValueError, match="the estimator's state"):
+        unpacked_state(estimator.settings, packed[:4] + b"\0" + packed[5:])
+    restored = AnyReceiver.from_state(receiver.state())
+    one, other = (fixes_of(receptions[middle:], each)[0] for each in (receiver, restored))
+    assert np.array_equal(one, other, equal_nan=True)
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize(
+    ("carrier", "most"),
+    [
+        (CarrierModel(), 0.9),
+        (CarrierModel(slips=0.01), 1.05),
+        (CarrierModel(wild=0.1), 1.05),
+        (CarrierModel(reflections=RangeErrorModel(changing_m=0.008, correlation_m=0.05)), 1.05),
+    ],
+)
+def test_the_room_with_phases_against_the_room_by_stamps(carrier, most):
+    """Squared errors of the same tags, whose stamps are the same: fewer with phases, never more."""
+    squares = np.zeros(2)
+    for seed in range(1, 7):
+        beacons = heard(100 + seed, 12.0, carrier=carrier)
+        for place, change in enumerate((lambda _, one: None, lambda _, one: one.carrier_phase_cycles)):
+            receptions = with_phases(beacons, change)
+            found, _ = fixes_of(receptions)
+            errors = np.sum((found - np.array([truth_m[:2] for _, truth_m in receptions])) ** 2, axis=1)
+            squares[place] += np.nanmean(errors[len(errors) // 5 :])
+    assert np.sqrt(squares[1] / squares[0]) < most
