@@ -231,10 +231,13 @@ static void refill(bool is_calm)
         record[4] = (uint8_t)any(256u);
         frame[frame_bytes - 2u] = (uint8_t)fcs;
         frame[frame_bytes - 1u] = (uint8_t)(fcs >> 8);
-        know(frame, frame_bytes);
         size = LINK_TX_FRAME_AT + frame_bytes;
     } else {
         /* random contents */
+    }
+    if ((kind == LINK_TX_AT) && (size > (LINK_TX_FRAME_AT + 2u)) &&
+        (link_fcs(&record[LINK_TX_FRAME_AT], size - LINK_TX_FRAME_AT) == 0u)) {
+        know(&record[LINK_TX_FRAME_AT], size - LINK_TX_FRAME_AT); /* now and then of random contents, too */
     }
     pending_bytes = put_record(pending, record, size);
     if (!is_calm && (any(8u) == 0u)) {

@@ -6,9 +6,10 @@
 static const uint8_t VERSION[3] = {0u, 2u, 0u};
 
 /* How long before its time a frame is handed to the chip: a reception that is being reported then (0.29 ms), what is
- * written over the SPI until it starts (0.14 ms; docs/hardware.md) and its preamble (0.14 ms). Phases, which take 0.03 ms
- * more, are for boards that only listen. */
+ * written over the SPI until it starts (0.14 ms; docs/hardware.md) and its preamble (0.14 ms). */
 #define LEAD_US 600
+/* So much longer where receptions are reported with their phases (0.32 ms). */
+#define PHASE_US 40
 /* A time closer than this is not checked again against the chip's counter. */
 #define CLOSE_US 30
 /* After its time a frame is cancelled if the chip has not reported that it was sent. */
@@ -196,11 +197,16 @@ static void hand_over(struct board *board)
     result = dw1000_transmit_at(&board->chip, board->dx_ticks, board->frame, board->frame_bytes);
     if (result == DW1000_QUEUED) {
         board->stage = FRAME_HANDED_OVER;
-        board->due_us = board->hardware->now_us() + LEAD_US + OVERDUE_US;
+        board->due_us = board->hardware->now_us() + LEAD_US + PHASE_US + OVERDUE_US;
     } else {
         board->stage = NO_FRAME;
         report_late(board, board->dx_ticks, (uint32_t)result); /* the driver's reasons have the link's numbers */
     }
+}
+
+static int32_t lead_us(const struct board *board)
+{
+    return LEAD_US + (board->chip.reads_phases ? PHASE_US : 0);
 }
 
 /* The frame is due by the board's clock: hand it over, or cancel it when it is overdue. That clock may be off by a few
@@ -218,7 +224,7 @@ static void serve_frame(struct board *board)
         }
         return;
     }
-    left_us = dw1000_micros_until(dw1000_now(&board->chip), board->dx_ticks) - LEAD_US;
+    left_us = dw1000_micros_until(dw1000_now(&board->chip), board->dx_ticks) - lead_us(board);
     if (left_us > CLOSE_US) {
         board->due_us = hardware->now_us() + (uint32_t)(left_us - (left_us / 16));
     } else {

@@ -26,9 +26,13 @@ pages = st.one_of(
 )
 
 
+phases = st.none() | st.integers(0, 127).map(lambda step: step / 128)
+
+
 @st.composite
 def beacons(draw):
     certificate = draw(st.none() | st.binary(min_size=94, max_size=94))
+    has_phases = certificate is None and draw(st.booleans())
     position = page = None
     if certificate is None:
         position, page = draw(st.none() | positions), draw(st.none() | pages)
@@ -42,11 +46,17 @@ def beacons(draw):
         almanac_issue=draw(unsigned(16)),
         period_code=draw(st.integers(0, LONGEST_PERIOD_CODE)),
         position=position,
-        heard=tuple(Heard(other, draw(unsigned(8)), draw(unsigned(40))) for other in others),
+        heard=tuple(
+            Heard(other, draw(unsigned(8)), draw(unsigned(32)), draw(phases), is_short=True)
+            if has_phases
+            else Heard(other, draw(unsigned(8)), draw(unsigned(40)))
+            for other in others
+        ),
         weak=draw(st.integers(0, (1 << len(others)) - 1)),
         page=page,
         certificate=certificate,
         authentication=draw(st.none() | st.builds(Authentication, unsigned(16), st.binary(min_size=8, max_size=8))),
+        has_phases=has_phases,
     )
 
 

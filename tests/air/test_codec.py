@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from skyless.core.air.almanac import SitePage
 from skyless.core.air.beacon import Authentication, Beacon, StatedPosition
 from skyless.core.air.codec import decode, encode, heard_capacity, packed_relays, signed_bytes, with_authentication
-from skyless.core.air.frame import HEARD, Heard, Malformed
+from skyless.core.air.frame import HEARD, Heard, Malformed, PackedHeard
 from skyless.core.air.ieee802154 import air_time_s, fcs
 from skyless.core.air.instants import LONGEST_PERIOD_CODE
 from skyless.core.air.page_codec import encode_page
@@ -113,7 +113,7 @@ def test_a_certificate_fills_a_frame():
         encode(replace(alone, certificate=bytes(93)))
 
 
-@pytest.mark.parametrize("flag", [0x01, 0x02])
+@pytest.mark.parametrize("flag", [0x01, 0x02, 0x40])
 def test_a_certificate_comes_alone(flag):
     body = bytearray(encode(FULL)[:-2])
     body[FLAGS_AT] = 0x08 | flag
@@ -146,10 +146,49 @@ def test_an_impossible_page_drops_the_frame():
     assert decode(with_fcs(body)) is Malformed.BAD_PAGE
 
 
-@pytest.mark.parametrize("flag", [0x10, 0x20, 0x40, 0x80])
+@pytest.mark.parametrize("flag", [0x10, 0x20, 0x80])
 def test_reserved_flags_drop_the_frame(flag):
     frame = encode(FULL)
     assert decode(changed(frame, FLAGS_AT, frame[FLAGS_AT] | flag)) is Malformed.BAD_FLAGS
+
+
+@given(beacons(), st.data())
+@settings(max_examples=200)
+def test_phases_take_the_place_of_the_high_byte_of_stamps(beacon, data):
+    """Anchors give whole stamps and any phase; frames are as long as without, and have it in the nearest step."""
+    if beacon.certificate is not None:
+        return
+    cycles = [data.draw(st.none() | st.floats(0.0, 1.0, exclude_max=True)) for _ in beacon.heard]
+    heard = [Heard(one.anchor, one.sequence, 0x5A << 32 | one.rx_ticks & 0xFFFFFFFF) for one in beacon.heard]
+    without = replace(beacon, heard=tuple(heard), has_phases=False)
+    given_heard = [replace(one, phase_cycles=phase) for one, phase in zip(heard, cycles, strict=True)]
+    frame = encode(replace(without, heard=tuple(given_heard), has_phases=True))
+    assert len(frame) == len(encode(without))
+    for one, given_one in zip(decode(frame).heard, given_heard, strict=True):
+        assert (one.anchor, one.sequence, one.rx_ticks) == (
+            given_one.anchor,
+            given_one.sequence,
+            given_one.rx_ticks & 0xFFFFFFFF,
+        )
+        if given_one.phase_cycles is None:
+            assert one.phase_cycles is None
+        else:
+            assert abs((one.phase_cycles - given_one.phase_cycles + 0.5) % 1.0 - 0.5) <= 1 / 256
+
+
+@given(st.integers(0, (1 << 40) - 1), st.integers(-(1 << 31), (1 << 31) - 1))
+def test_short_stamps_are_those_nearest_to_what_is_expected(rx_ticks, off_ticks):
+    """Over all wraps of 32 and 40 bits, up to half a wrap of 67 ms away."""
+    expected_ticks = rx_ticks - off_ticks
+    assert Heard(1, 0, rx_ticks & 0xFFFFFFFF, is_short=True).rx_ticks_near(expected_ticks) == rx_ticks
+    assert Heard(1, 0, rx_ticks).rx_ticks_near(expected_ticks) == rx_ticks
+
+
+def test_a_decoder_of_before_drops_beacons_with_phases():
+    """Its reserved flags were 0xF0, and it dropped a frame in which one was set."""
+    frame = encode(replace(FULL, heard=tuple(replace(one, phase_cycles=0.5) for one in FULL.heard), has_phases=True))
+    assert frame[FLAGS_AT] & 0xF0
+    assert not encode(FULL)[FLAGS_AT] & 0xF0
 
 
 def test_periods_that_no_anchor_has_drop_the_frame():
@@ -205,6 +244,11 @@ def test_standard_deviations_are_rounded_up_and_saturate(std_m, stated_m):
         ({"heard": (Heard(1, 0, 0), Heard(1, 0, 0))}, "an anchor twice"),
         ({"heard": (Heard(1, 0, 1 << 40),), "weak": 0}, r"heard\[0\]\.rx_ticks"),
         ({"heard": tuple(Heard(k, 0, 0) for k in range(9))}, "9 entries; 8 fit"),
+        ({"heard": (Heard(1, 0, 0, 0.5),), "weak": 0}, "without phases"),
+        ({"heard": (Heard(1, 0, 0, is_short=True),), "weak": 0}, "without phases"),
+        ({"heard": (Heard(1, 0, 0, 1.0),), "weak": 0, "has_phases": True}, r"heard\[0\]\.phase_cycles is 1\.0"),
+        ({"heard": (Heard(1, 0, 0, float("nan")),), "weak": 0, "has_phases": True}, "phase_cycles is nan"),
+        ({"heard": PackedHeard(bytes(8)), "weak": 0, "has_phases": True}, "packed without phases"),
         ({"weak": 1 << 4}, "weak is 16"),
         ({"page": SitePage(0, None)}, r"SitePage\.pages"),
     ],

@@ -9,8 +9,16 @@ import pytest
 
 from skyless.core.air.almanac import AnchorPage
 from skyless.core.air.beacon import Beacon
+from skyless.core.air.beacon_fields import (
+    HAS_AUTHENTICATION,
+    HAS_CERTIFICATE,
+    HAS_PAGE,
+    HAS_PHASES,
+    HAS_POSITION,
+    RESERVED_FLAGS,
+)
 from skyless.core.air.codec import decode, encode, heard_capacity
-from skyless.core.air.frame import Malformed
+from skyless.core.air.frame import Heard, Malformed, PackedHeard
 from skyless.core.air.ieee802154 import air_time_s
 from skyless.core.air.instants import LONGEST_PERIOD_CODE, OFFERED_HZ, SHORTEST_PERIOD_S, period_ticks
 from skyless.core.air.local_almanac import MAX_ISSUE_PAGES, MAX_ISSUES, MIN_ANCHORS
@@ -109,6 +117,22 @@ def test_length_and_air_time_of_the_table():
     entries = heard_capacity(position=True)
     longest = 53 + 8 * entries
     assert f"| 53 | {entries} | {longest} | {1e6 * air_time_s(longest):.0f} µs |" in SECOND.text
+
+
+def test_flags_of_the_document():
+    stated = {int(flag, 16) for flag in re.findall(r"\*flag (0x[0-9A-F]+)\*", SECOND.text)}
+    flags = {HAS_POSITION, HAS_PAGE, HAS_AUTHENTICATION, HAS_CERTIFICATE, HAS_PHASES}
+    assert stated == flags
+    assert sum(flags) == 0xFF & ~RESERVED_FLAGS
+
+
+def test_the_entry_with_a_phase_of_the_document():
+    (entry,) = re.findall(r"`([0-9a-f ]{23})` is the entry", SECOND.text)
+    heard = PackedHeard(bytes.fromhex(entry), has_phases=True)
+    (first,) = heard
+    example = SECOND.decode(SECOND.frame).relayed[0]
+    assert first == Heard(example.anchor, example.sequence, example.rx_ticks & 0xFFFFFFFF, 0.25, is_short=True)
+    assert first.rx_ticks_near(example.rx_ticks - 10**9) == example.rx_ticks
 
 
 def test_periods_of_the_document():

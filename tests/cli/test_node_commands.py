@@ -9,11 +9,27 @@ import pytest
 import skyless
 from skyless.cli.main import main
 from skyless.cli.nodes.demo import _subscriber
+from skyless.core.errors import SkylessError
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.process import hold_any
 from support.processes import SKYLESS, started
 
 pytestmark = pytest.mark.site
+
+
+@pytest.mark.parametrize(("key", "phases"), [("", False), ("carrier_phase = true\n", True)])
+def test_anchors_of_a_site_that_relays_phases_ask_their_radios_for_them(key, phases, tmp_path, monkeypatch):
+    """Anchors of other sites do not: reading a phase takes a radio's time."""
+    site, asked = tmp_path / "site.toml", []
+
+    def open_radios(*_, **options):
+        asked.append(options["phases"])
+        raise SkylessError("enough")
+
+    monkeypatch.setattr("skyless.run.open_radio.open_radios", open_radios)
+    site.write_text(f'name = "x"\nid = 1\n[schedule]\nmode = "free"\n{key}[[anchors]]\nid = 1\nx_m = 0\ny_m = 0\n')
+    assert main(["anchor", "1", "--site", str(site)]) == 2
+    assert asked == [phases]
 
 
 @pytest.mark.parametrize(

@@ -35,16 +35,19 @@ import wasm_core
 TAG = "a"
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A recording of a tag at a site without a master."""
-    made = tmp_path_factory.mktemp("recordings")
+def recorded_in(made, **schedule):
+    """A folder with a recording of a tag at a site without a master."""
     with pytest.MonkeyPatch.context() as patched:
         for name in ("LAB", "SITE"):
             site = getattr(live_site, name)
-            patched.setattr(live_site, name, replace(site, schedule=replace(site.schedule, mode="free")))
+            patched.setattr(live_site, name, replace(site, schedule=replace(site.schedule, mode="free", **schedule)))
         live_site.record(made / "lab.mcap", live_site.messages(4.0, (TAG,)))
     return made
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return recorded_in(tmp_path_factory.mktemp("recordings"))
 
 
 @pytest.fixture
@@ -66,6 +69,10 @@ def server(folder, times):
 
 @pytest.fixture
 def prepared(folder):
+    return prepared_of(folder)
+
+
+def prepared_of(folder):
     answer = asyncio.run(WhatIfs().get(WhatIfTask(str(folder / "lab.mcap"), TAG, live_site.UNIX_S, 3.0)))
     return msgspec.json.decode(answer, type=WhatIf)
 
@@ -130,6 +137,14 @@ def test_nothing_changed_is_what_the_tag_computed(prepared):
     assert len(pairs) > 200
     assert np.median(away_m) < 0.02
     assert away_m[len(away_m) // 2 :].max() < 0.05
+
+
+def test_relays_with_phases_are_recomputed_like_those_without(prepared, tmp_path):
+    """Their stamps are short, and whole ones are made of them where they are used."""
+    with_phases = prepared_of(recorded_in(tmp_path, carrier_phase=True))
+    assert np.frombuffer(with_phases.relays, np.dtype(Relay))["is_short"].all()
+    assert not np.frombuffer(prepared.relays, np.dtype(Relay))["is_short"].any()
+    assert on_the_host(with_phases).tobytes() == on_the_host(prepared).tobytes()
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from board_stage import (
     CONFIG,
     DELAYS,
     RX_ON,
+    TICKS_PER_US,
     TX_AT,
     BoardStage,
     frame_of,
@@ -177,6 +178,21 @@ def test_frames_leave_at_their_tick_and_the_receiver_is_off_no_longer_than_neede
     assert off_us <= LEAD_US + CLOSE_US + 200 + 3 * step_us
     assert stage.board.chip.state == dw1000.LISTENING
     assert not +stage.chip.misuse
+
+
+@pytest.mark.parametrize(("flags", "lead_us"), [(0, LEAD_US), (1, LEAD_US + 40)])
+def test_a_frame_is_handed_over_earlier_where_receptions_have_phases(flags, lead_us):
+    stage = BoardStage().ready()
+    stage.config(flags)
+    stage.send(RX_ON)
+    stage.turn(8)
+    stage.reports()
+    stage.tx_at(4000, SHORT)
+    due_ticks = stage.air.ticks + 4000 * TICKS_PER_US
+    while stage.board.chip.state == dw1000.LISTENING and stage.air.ticks < due_ticks:
+        before_ticks = stage.air.ticks
+        stage.turn(1, 5)
+    assert 0 <= (due_ticks - before_ticks) / TICKS_PER_US - lead_us <= CLOSE_US + 10, "and its turn"
 
 
 @pytest.mark.parametrize("ahead_us", [120, 0, -1, -5000, -8_000_000])

@@ -21,6 +21,7 @@ from msgspec.structs import replace
 
 from machines.bench import ROOM, tape
 from skyless.core.tag.receiver import Receiver
+from skyless.sim.carrier import CarrierModel
 
 HEARD = np.dtype([("length", "<i4"), ("bytes", "u1", 140), ("rx_ticks", "<i8")], align=True)
 pytestmark = pytest.mark.skipif(not has("gcc"), reason="there is no gcc")
@@ -53,10 +54,11 @@ def test_sanitizers_find_nothing_and_every_fix_is_a_number(tmp_path, height_m):
     assert found[2] == 0
 
 
-def damaged_frames(program, count, seed, height_m):
+def damaged_frames(program, count, seed, height_m, carrier_phase=False):
     """How many frames were damaged, made a fix, made a start, and how many of these should not have."""
-    site = replace(ROOM, schedule=replace(ROOM.schedule, mode="free"), tags=replace(ROOM.tags, height_m=height_m))
-    heard = [one.reception for one in tape(site, 3.0)]
+    schedule = replace(ROOM.schedule, mode="free", carrier_phase=carrier_phase)
+    site = replace(ROOM, schedule=schedule, tags=replace(ROOM.tags, height_m=height_m))
+    heard = [one.reception for one in tape(site, 3.0, carrier=CarrierModel())]
     warm = len(heard) // 2
     tag = Receiver()
     for reception in heard[:warm]:
@@ -70,9 +72,10 @@ def damaged_frames(program, count, seed, height_m):
     return numbers(program, count, seed, b"".join(bytes(one) for one in parts))
 
 
+@pytest.mark.parametrize("carrier_phase", [False, True])
 @pytest.mark.parametrize("height_m", [0.0, None])
-def test_damaged_frames_do_no_harm(tmp_path, height_m):
-    found = damaged_frames(damaged_program(tmp_path, "damaged_frames"), 20_000, 1, height_m)
+def test_damaged_frames_do_no_harm(tmp_path, height_m, carrier_phase):
+    found = damaged_frames(damaged_program(tmp_path, "damaged_frames"), 20_000, 1, height_m, carrier_phase)
     assert found[0] > 5_000
     assert found[1] > 1_000
     assert found[2] > 50
@@ -84,4 +87,5 @@ if __name__ == "__main__":
         for fixed_m in (0.0, None):
             print(*damaged(damaged_program(Path(folder), "damaged"), int(sys.argv[1]), int(sys.argv[2]), fixed_m))
             frames = damaged_program(Path(folder), "damaged_frames")
-            print(*damaged_frames(frames, int(sys.argv[1]), int(sys.argv[2]), fixed_m))
+            for has_phases in (False, True):
+                print(*damaged_frames(frames, int(sys.argv[1]), int(sys.argv[2]), fixed_m, has_phases))

@@ -1,6 +1,7 @@
 """A tag's receiver in Python and in C: the same bits after every frame, also of forged, repeated and damaged ones."""
 
 import numpy as np
+import pytest
 from msgspec.structs import replace
 from test_same_bits import bits
 
@@ -13,6 +14,7 @@ from skyless.core.tag.course import process_in_course
 from skyless.core.tag.hearing import hear_frame
 
 FREE = replace(ROOM, schedule=replace(ROOM.schedule, mode="free", rate_hz=60.0))
+PHASES = replace(FREE, schedule=replace(FREE.schedule, carrier_phase=True))
 
 
 def disturbed(heard, draw):
@@ -37,11 +39,12 @@ def disturbed(heard, draw):
             yield replace(one, rx_ticks=one.rx_ticks + 10**6, host_s=1e300)
 
 
-def test_a_receiver_gives_the_same_bits(monkeypatch):
+@pytest.mark.parametrize("site", [FREE, PHASES], ids=["stamps", "phases"])
+def test_a_receiver_gives_the_same_bits(monkeypatch, site):
     draw = np.random.default_rng(4)
     compiled, plain = receiver.Receiver(), receiver.Receiver()
     fixes = 0
-    for one in disturbed([one.reception for one in tape(FREE, 1.2)], draw):
+    for one in disturbed([one.reception for one in tape(site, 1.2)], draw):
         expected = compiled.hear(one)
         with monkeypatch.context() as patched:
             patched.setattr(receiver, "_hear_frame", hear_frame)

@@ -52,6 +52,17 @@ def test_the_rate_of_anchors_is_that_of_the_file_or_follows_from_how_many_are_in
     assert beacon_period_s(grid_site(475.0, 475.0, 15.0, 4.0)) == pytest.approx(13 / OFFERED_HZ)
 
 
+@pytest.mark.parametrize("value", ["true", "false", None])
+def test_phases_are_relayed_where_the_file_says_so(load, value):
+    """A site without the key has none in messages: earlier versions refuse keys that they do not know."""
+    schedule = FREE if value is None else f"{FREE}carrier_phase = {value}\n"
+    site = load(schedule + anchor(1, 0, 0))
+    assert site.schedule.sends_phases is (value == "true")
+    assert (b"carrier_phase" in msgspec.json.encode(site)) is (value is not None)
+    assert load(site_template(site)) == site
+    assert msgspec.json.decode(msgspec.json.encode(site), type=type(site)) == site
+
+
 def test_a_site_may_begin_with_no_position_at_all(load):
     site = load(FREE + anchor(1) + anchor(2))
     assert (site.anchors, len(site.unplaced)) == ((), 2)
@@ -66,6 +77,7 @@ def test_a_site_may_begin_with_no_position_at_all(load):
         (FREE + "reuse_m = 78.0\n" + anchor(1, 0, 0), "schedule.reuse_m", 78.0, "left out"),
         (FREE + "site_time = true\n" + anchor(1, 0, 0), "schedule.site_time", True, "left out"),
         (FREE + "rate_hz = 201\n" + anchor(1, 0, 0), "schedule.rate_hz", 201.0, "from 1 to 200"),
+        (FREE + "carrier_phase = 1\n" + anchor(1, 0, 0), "schedule.carrier_phase", 1, "true or false"),
         (FREE + anchor(9) + anchor(1, 0, 8389), "anchors[1].y_m (anchor 1)", 8389.0, "from -8388 to 8388"),
         (FREE + anchor(9) + anchor(1, 0, 0, std_m=0.3), "anchors[1].std_m (anchor 1)", 0.3, "from 0 to 0.255"),
         (FREE + anchor(1, 0, 0, floor=128), "anchors[0].floor (anchor 1)", 128, "from -128 to 127"),
@@ -134,7 +146,7 @@ def test_grids():
 TOML_VALUES = [
     "0", "-1", "1", "3", "70000", "1.5", "nan", "inf", "1e300", '"free"', '"slots"', '"master"', "true", "[]", "{}",
 ]  # fmt: skip
-WRITTEN = FREE + "rate_hz = 5\nslot_s = 1e-3\nframes_per_node = 1\nslots = 3\n"
+WRITTEN = FREE + "rate_hz = 5\ncarrier_phase = false\nslot_s = 1e-3\nframes_per_node = 1\nslots = 3\n"
 WRITTEN += anchor(1, 0.5, 0.5, slot=0, floor=1, zone=2, std_m=0.1) + anchor(2, slot=1)
 WRITTEN += anchor(3, 25.5, 0.5) + anchor(4)
 
@@ -175,9 +187,11 @@ def test_keys_that_mean_nothing_in_a_mode_are_warned_of(load):
     slots, slot = warnings_of(load(FREE + "slots = 8\n" + FLAT + CORNERS.replace("id = 3\n", "id = 3\nslot = 2\n")))
     assert slots == "schedule.slots is 8, which has no effect in mode free"
     assert slot == "anchor 3: slot has no effect in mode free"
-    document = 'name = "x"\nid = 1\nmaster = 1\n[schedule]\nrate_hz = 50.0\n' + FLAT + CORNERS
-    rate, floor = warnings_of(load(document.replace("id = 3\n", "id = 3\nfloor = 2\n")))
+    document = 'name = "x"\nid = 1\nmaster = 1\n[schedule]\nrate_hz = 50.0\ncarrier_phase = true\n' + FLAT + CORNERS
+    assert not load(document).schedule.sends_phases
+    rate, phase, floor = warnings_of(load(document.replace("id = 3\n", "id = 3\nfloor = 2\n")))
     assert rate == "schedule.rate_hz is 50.0, which has no effect in mode master"
+    assert phase == "schedule.carrier_phase is true, which has no effect in mode master"
     assert floor == "anchor 3: floor has no effect in mode master, whose beacons do not carry it"
 
 

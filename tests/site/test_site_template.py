@@ -54,7 +54,7 @@ def test_the_lab_is_the_published_one():
 
 
 PAPER = paper_lab_site(accuracy=AccuracySite())
-IN_FREE_MODE = {"rate_hz", "floor", "zone", "std_m"}
+IN_FREE_MODE = {"rate_hz", "carrier_phase", "floor", "zone", "std_m"}
 IN_MASTER_MODE = {"master", "slot_s", "guard_s", "frames_per_node", "slots", "slot"}
 
 

@@ -22,6 +22,7 @@ from skyless.site.survey.stamps.legs import LegCollector, RelayMatcher
 
 LAB = paper_lab_site()
 FREE = lab_site()
+PHASES = msgspec.structs.replace(FREE, schedule=msgspec.structs.replace(FREE.schedule, carrier_phase=True))
 
 
 def _world(site, seconds, **changes):
@@ -40,7 +41,11 @@ def _world(site, seconds, **changes):
     return truth, receptions
 
 
-@pytest.mark.parametrize(("site", "share"), [(LAB, 0.95), (FREE, 0.7)], ids=["protocol 1", "protocol 2"])
+@pytest.mark.parametrize(
+    ("site", "share"),
+    [(LAB, 0.95), (FREE, 0.7), (PHASES, 0.7)],
+    ids=["protocol 1", "protocol 2", "protocol 2 with phases"],
+)
 def test_a_listener_learns_the_legs_that_no_collision_hides(site, share):
     truth, receptions = _world(site, 1.5)
     collector = LegCollector(site.id)

@@ -42,3 +42,5 @@ class Observation(Struct, frozen=True, gc=False):
     """Phase of the carrier as the tag received it, below 0 where it is not known; for ``joint`` only."""
     relay_phases: tuple[float, ...] = ()
     """The same of ``relays``, as anchors received each other."""
+    packed_phases: bool = False
+    """Whether ``packed_relays`` have phases."""

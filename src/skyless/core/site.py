@@ -60,13 +60,19 @@ class ScheduleSite(Struct, frozen=True, forbid_unknown_fields=True):
     """Time at the end of each slot in which no frame may be on the air."""
     rate_hz: float | None = None
     """Mode free: beacons per second of each anchor; by default it follows from the number of anchors in reach."""
-    carrier_phase: bool = False
-    """Whether radios measure the phase of the carrier with each reception."""
+    carrier_phase: bool | UnsetType = UNSET
+    """Mode free: whether anchors relay the phases of carriers, too. Left out where it is not given: earlier versions
+    refuse a site with it, and drop such beacons."""
 
     @property
     def needs_master(self) -> bool:
         """Whether the site speaks protocol 1."""
         return self.mode == "master"
+
+    @property
+    def sends_phases(self) -> bool:
+        """Whether beacons carry the phases of the receptions that they relay."""
+        return self.carrier_phase is True and not self.needs_master
 
 
 class NoiseSite(Struct, frozen=True, forbid_unknown_fields=True):

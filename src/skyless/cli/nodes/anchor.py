@@ -65,7 +65,7 @@ def anchor(
             f"IDS is {given}; it should be one or more of the site's, each once: {' '.join(map(str, nodes))}"
         )
     delays = [AntennaDelays(nodes[i].tx_antenna_delay_ticks, nodes[i].rx_antenna_delay_ticks) for i in ids]
-    radios = open_radios(radio, "anchor", tuple(map(str, ids)), delays)
+    radios = open_radios(radio, "anchor", tuple(map(str, ids)), delays, phases=plan.schedule.sends_phases)
     chains = None
     if keys is not None:
         if plan.schedule.needs_master:

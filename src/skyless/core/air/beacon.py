@@ -62,6 +62,8 @@ class Beacon(Struct, frozen=True, gc=False):
     neither position, receptions nor page."""
     authentication: Authentication | None = None
     """None of anchors without keys."""
+    has_phases: bool = False
+    """Whether ``heard`` has phases; a frame then has only the lowest 32 bits of its stamps."""
 
     @property
     def relayed(self) -> tuple[Heard, ...]:

@@ -32,7 +32,11 @@ HAS_POSITION: Final = 0x01
 HAS_PAGE: Final = 0x02
 HAS_AUTHENTICATION: Final = 0x04
 HAS_CERTIFICATE: Final = 0x08
-RESERVED_FLAGS: Final = 0xF0
+ALONGSIDE_CERTIFICATE: Final = HAS_CERTIFICATE | HAS_AUTHENTICATION
+"""All flags that a frame with a certificate may have."""
+HAS_PHASES: Final = 0x40
+"""The receptions have a phase each and stamps of 32 bits, instead of stamps of 40."""
+RESERVED_FLAGS: Final = 0xB0
 FLAGS_AT: Final = 11
 FIXED_BYTES: Final = 20
 """The fields that every beacon has."""
@@ -65,6 +69,8 @@ class BeaconFields(Record):
     heard_count: int
     weak: int
     """Bit k is set where the first path of reception k was weak: it may be late."""
+    has_phases: bool
+    """Whether the receptions have phases (``SHORT_BITS``)."""
     page_at: int
     """Where the page stands; 0 where there is none, as in the next two."""
     certificate_at: int
@@ -83,7 +89,7 @@ def read_frame(frame: Bytes, length: int, b: BeaconFields) -> int:
     b.sequence, b.period_code = frame[2], frame[19]
     b.site, b.anchor, b.almanac_issue = two_bytes(frame, 3), two_bytes(frame, 7), two_bytes(frame, 17)
     b.tx_ticks = unsigned(frame, 12, 5)
-    b.has_place = flags & HAS_POSITION != 0
+    b.has_place, b.has_phases = flags & HAS_POSITION != 0, flags & HAS_PHASES != 0
     b.heard_at = b.heard_count = b.weak = b.page_at = b.certificate_at = b.relay_bytes = 0
     if b.has_place:
         _read_place(frame, at, b.place)
@@ -128,7 +134,7 @@ def _header_fault(frame: Bytes, length: int) -> int:  # noqa: PLR0911 - one for 
 
 def _length_fault(frame: Bytes, length: int) -> int:
     flags = frame[FLAGS_AT]
-    if flags & RESERVED_FLAGS != 0 or (flags & HAS_CERTIFICATE != 0 and flags & (HAS_POSITION | HAS_PAGE) != 0):
+    if flags & RESERVED_FLAGS != 0 or (flags & HAS_CERTIFICATE != 0 and flags & ~ALONGSIDE_CERTIFICATE != 0):
         return BAD_FLAGS
     bare = bare_bytes(flags)
     if length < bare:

@@ -12,6 +12,7 @@ import numpy as np
 from skyless.core.air.almanac import Page
 from skyless.core.air.beacon import MAX_HEARD, Authentication, Beacon, StatedPosition
 from skyless.core.air.beacon_fields import (
+    ALONGSIDE_CERTIFICATE,
     AUTHENTICATION_BYTES,
     CERTIFICATE_BYTES,
     COUNT_BITS,
@@ -19,6 +20,7 @@ from skyless.core.air.beacon_fields import (
     HAS_AUTHENTICATION,
     HAS_CERTIFICATE,
     HAS_PAGE,
+    HAS_PHASES,
     HAS_POSITION,
     INTACT,
     RESERVED_FLAGS,
@@ -33,6 +35,7 @@ from skyless.core.air.frame import (
     FRAME_CONTROL,
     HEARD,
     MAX_FRAME_BYTES,
+    PHASE_STEPS,
     Heard,
     Malformed,
     PackedHeard,
@@ -85,7 +88,7 @@ def encode(beacon: Beacon) -> bytes:
             names it.
     """
     flags = _flags(beacon)
-    fault = _fault(beacon, _CAPACITY[flags]) or _authentication_fault(beacon, flags)
+    fault = _fault(beacon, _CAPACITY[flags & ~HAS_PHASES]) or _authentication_fault(beacon, flags)
     if fault is not None:
         raise ValueError(fault)
     parts = [
@@ -99,7 +102,7 @@ def encode(beacon: Beacon) -> bytes:
         coordinates = [half for value in (position.x_m, position.y_m, position.z_m) for half in _millimetres(value)]
         parts.append(_POSITION.pack(*coordinates, _std_steps(position.std_m), position.floor, position.zone))
     if beacon.certificate is None:
-        parts += [_COUNT.pack(len(beacon.heard) | beacon.weak << COUNT_BITS), _packed(beacon.heard)]
+        parts += [_COUNT.pack(len(beacon.heard) | beacon.weak << COUNT_BITS), _packed(beacon)]
     else:
         parts.append(beacon.certificate)
     if beacon.page is not None:
@@ -146,8 +149,8 @@ def beacon_of(b: BeaconFields, frame: bytes) -> Beacon:
         authentication = Authentication(*_AUTHENTICATION.unpack_from(frame, b.authentication_at))
     heard = frame[b.heard_at : b.heard_at + b.heard_count * HEARD.size]
     return Beacon(
-        b.site, b.anchor, b.sequence, b.tx_ticks, b.almanac_issue, b.period_code, place, PackedHeard(heard), b.weak,
-        page_of(frame, b), certificate, authentication,
+        b.site, b.anchor, b.sequence, b.tx_ticks, b.almanac_issue, b.period_code, place,
+        PackedHeard(heard, b.has_phases), b.weak, page_of(frame, b), certificate, authentication, b.has_phases,
     )  # fmt: skip
 
 
@@ -172,6 +175,7 @@ def fields_of(beacon: Beacon) -> BeaconFields:
         almanac_issue=beacon.almanac_issue,
         period_code=beacon.period_code,
         has_place=place is not None,
+        has_phases=beacon.has_phases,
         relay_bytes=len(relays),
     )
     view(fields.relays)[: len(relays)] = np.frombuffer(relays, np.uint8)
@@ -186,17 +190,26 @@ decode_cached = lru_cache(maxsize=256)(decode)
 """``decode`` that remembers the last 256 frames: for a program that runs many tags which receive the same bytes."""
 
 
-def _packed(heard: tuple[Heard, ...] | PackedHeard) -> bytes:
-    if isinstance(heard, PackedHeard):
-        return heard.packed
+def _packed(beacon: Beacon) -> bytes:
+    if isinstance(beacon.heard, PackedHeard):
+        return beacon.heard.packed
     return b"".join(
-        HEARD.pack(entry.anchor, entry.sequence, entry.rx_ticks & 0xFFFFFFFF, entry.rx_ticks >> 32) for entry in heard
-    )
+        HEARD.pack(
+            entry.anchor, entry.sequence, entry.rx_ticks & 0xFFFFFFFF,
+            _phase_code(entry) if beacon.has_phases else entry.rx_ticks >> 32,
+        )
+        for entry in beacon.heard
+    )  # fmt: skip
+
+
+def _phase_code(entry: Heard) -> int:
+    """A phase as frames carry it, in the nearest step; 0 where there is none."""
+    return 0 if entry.phase_cycles is None else PHASE_STEPS + round(entry.phase_cycles * PHASE_STEPS) % PHASE_STEPS
 
 
 def packed_relays(beacon: Beacon) -> bytes:
     """The receptions that a beacon relays, ``HEARD`` after ``HEARD``, without those of a weak first path."""
-    packed = _packed(beacon.heard)
+    packed = _packed(beacon)
     if not beacon.weak:
         return packed
     entries = (packed[at : at + HEARD.size] for at in range(0, len(packed), HEARD.size))
@@ -209,14 +222,15 @@ def _flags(beacon: Beacon) -> int:
         | (beacon.page is not None) * HAS_PAGE
         | (beacon.authentication is not None) * HAS_AUTHENTICATION
         | (beacon.certificate is not None) * HAS_CERTIFICATE
+        | beacon.has_phases * HAS_PHASES
     )
 
 
 def _authentication_fault(beacon: Beacon, flags: int) -> str | None:
     certificate, authentication = beacon.certificate, beacon.authentication
     if certificate is not None:
-        if flags & (HAS_POSITION | HAS_PAGE):
-            return "a beacon with a certificate has neither position nor page"
+        if flags & ~ALONGSIDE_CERTIFICATE:
+            return "a beacon with a certificate has neither position nor page nor phases"
         if len(certificate) != CERTIFICATE_BYTES:
             return f"certificate has {len(certificate)} bytes; it must have {CERTIFICATE_BYTES}"
     if authentication is not None:
@@ -242,6 +256,8 @@ def _fault(beacon: Beacon, capacity: int) -> str | None:
     """The first field that is impossible or does not fit its bits, None where there is none."""
     if len(beacon.heard) > capacity:
         return f"heard has {len(beacon.heard)} entries; {capacity} fit"
+    if isinstance(beacon.heard, PackedHeard) and beacon.heard.has_phases is not beacon.has_phases:
+        return f"heard is packed with{'' if beacon.heard.has_phases else 'out'} phases, and has_phases is not so"
     others: tuple[int, ...]
     if isinstance(beacon.heard, PackedHeard):
         others = _HEARD_ANCHORS[len(beacon.heard)].unpack(beacon.heard.packed)
@@ -275,6 +291,16 @@ def _whole_fault(beacon: Beacon) -> str | None:
     for name, value, last in fields:
         if not _is_whole(value) or not 0 <= index(value) <= last:
             return f"{name} is {value!r}; it must be a whole number from 0 to {last}"
+    return None if isinstance(beacon.heard, PackedHeard) else _phase_fault(beacon)
+
+
+def _phase_fault(beacon: Beacon) -> str | None:
+    for number, entry in enumerate(beacon.heard):
+        if entry.is_short and not beacon.has_phases:
+            return f"heard[{number}].is_short, but the beacon is without phases"
+        if entry.phase_cycles is not None and not (beacon.has_phases and 0.0 <= entry.phase_cycles < 1.0):
+            right = "it must be from 0 up to 1" if beacon.has_phases else "the beacon is without phases"
+            return f"heard[{number}].phase_cycles is {entry.phase_cycles!r}; {right}"
     return None
 
 

@@ -11,6 +11,8 @@ from typing import Final
 
 from msgspec import Struct
 
+from skyless.core.ticks import nearest, wrap
+
 MAX_FRAME_BYTES: Final = 127
 """Longest PSDU (IEEE 802.15.4-2015, aMaxPhyPacketSize)."""
 FCS_BYTES: Final = 2
@@ -28,6 +30,12 @@ HEARD: Final = struct.Struct("<HBIB")
 """One ``heard`` entry in a frame: anchor, sequence number, low word and high byte of the RX stamp."""
 HEARD_BYTES: Final = HEARD.size
 
+# In beacons with phases a code takes the place of the stamp's high byte: 128 and the phase in steps, or 0 without one.
+SHORT_BITS: Final = 32
+"""Of the stamp of such an entry."""
+PHASE_STEPS: Final = 128
+"""In a cycle; also the bit that shows that there is a phase."""
+
 
 class Heard(Struct, frozen=True, gc=False):
     """When a beacon of another anchor was last heard: a raw stamp of the relaying anchor's own counter."""
@@ -38,19 +46,32 @@ class Heard(Struct, frozen=True, gc=False):
     """Sequence number (8 bits) of the frame that was heard."""
     rx_ticks: int
     """RX stamp in the relaying anchor's clock, 40 bits."""
+    phase_cycles: float | None = None
+    """Phase of the carrier at this reception, in [0, 1); only beacons with phases carry it."""
+    is_short: bool = False
+    """Whether only the lowest 32 bits of the stamp are known, as of such beacons."""
+
+    def rx_ticks_near(self, expected_ticks: int) -> int:
+        """The stamp, 40 bits; where only the lowest are known, the one nearest to the expected stamp."""
+        return wrap(nearest(self.rx_ticks, expected_ticks, SHORT_BITS)) if self.is_short else self.rx_ticks
 
 
 class PackedHeard(Struct, frozen=True, gc=False, eq=False):
     """``heard`` entries as the bytes of a frame, decoded when they are read; equal to a tuple of them."""
 
     packed: bytes
+    has_phases: bool = False
 
     def __len__(self) -> int:
         return len(self.packed) // HEARD.size
 
     def __iter__(self) -> Iterator[Heard]:
         for anchor, sequence, low, high in HEARD.iter_unpack(self.packed):
-            yield Heard(anchor, sequence, low | high << 32)
+            if self.has_phases:
+                phase_cycles = None if high < PHASE_STEPS else (high - PHASE_STEPS) / PHASE_STEPS
+                yield Heard(anchor, sequence, low, phase_cycles, is_short=True)
+            else:
+                yield Heard(anchor, sequence, low | high << 32)
 
     def __contains__(self, entry: object) -> bool:
         return entry in tuple(self)

@@ -18,7 +18,7 @@ from skyless.core.air.frame import Heard, Malformed
 from skyless.core.air.instants import PERIOD_CHANGES, gap_ticks, period_code, period_ticks, suitable_period_s
 from skyless.core.air.local_almanac import site_issue, site_pages_of, stated_position
 from skyless.core.air.neighbours import Neighbours
-from skyless.core.air.reception import Reception, Transmission
+from skyless.core.air.reception import Reception, Transmission, phase_of
 from skyless.core.anchor.authentication import BeaconAuthentication, Contents
 from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS
 from skyless.core.native.library import compiled
@@ -54,6 +54,7 @@ class Anchor:
         self.counters: Counter[str] = Counter()
         self.authentication = authentication
         self._site = site
+        self._has_phases = site.schedule.sends_phases
         self._known = frozenset(anchor.id for anchor in site.all_anchors) - {anchor_id}
         self._delay_ticks = anchor_of(site, anchor_id).tx_antenna_delay_ticks
         self._correction_ticks = 0
@@ -115,9 +116,11 @@ class Anchor:
             self.counters.update(STAMP_COUNTERS[stamp])
             return
         self.counters["heard"] += 1
-        weak = is_weak_first_path(reception.diagnostics)
+        weak, cycles = is_weak_first_path(reception.diagnostics), phase_of(reception)
+        phase_cycles = cycles if self._has_phases and 0.0 <= cycles < 1.0 else None
         self._heard.pop(beacon.anchor, None)
-        self._heard[beacon.anchor] = (Heard(beacon.anchor, beacon.sequence, reception.rx_ticks), rx_ticks, weak)
+        heard = Heard(beacon.anchor, beacon.sequence, reception.rx_ticks, phase_cycles)
+        self._heard[beacon.anchor] = (heard, rx_ticks, weak)
 
     def next_transmission_ticks(self, now_ticks: int) -> int:
         """TX stamp (40-bit, own counter) of the next frame that can still be made.
@@ -143,7 +146,7 @@ class Anchor:
         beacon = Beacon(
             self._site.id, self.id, self._sequence, wrap(tx_ticks + self._correction_ticks), self._issue,
             self._period_code, position, heard, weak, added.page(self._pages, self._sequence, self.id),
-            added.certificate,
+            added.certificate, has_phases=self._has_phases and added.certificate is None,
         )  # fmt: skip
         self._advance()
         self.counters["sent"] += 1

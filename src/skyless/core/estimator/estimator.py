@@ -262,7 +262,7 @@ class Estimator:
         packet.relay_count = min(len(relays), MAX_RELAYS)
         for relayed, (sender, number, stamp) in zip(packet.relays, relays, strict=False):
             relayed.listener, relayed.anchor, relayed.sequence, relayed.rx_ticks = anchor, sender, number, stamp
-            relayed.has_phase = False
+            relayed.is_short = relayed.has_phase = False
         for relayed, cycles in zip(packet.relays, relay_phases, strict=False):
             relayed.has_phase, relayed.phase_cycles = cycles >= 0.0, cycles
         return packet

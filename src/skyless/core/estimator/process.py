@@ -2,7 +2,7 @@
 
 from typing import Annotated, Final
 
-from skyless.core.air.frame import HEARD_BYTES
+from skyless.core.air.frame import HEARD_BYTES, PHASE_STEPS, SHORT_BITS
 from skyless.core.air.little_endian import two_bytes, unsigned
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.core.estimator.faults import fade_faults, open_faults
@@ -68,7 +68,8 @@ class Relay(Record):
     """Identifier of the other."""
     sequence: int
     rx_ticks: Ticks
-    """The listener's stamp, unwrapped."""
+    """The listener's stamp, unwrapped; where it is short its lowest bits (``relay_rx_ticks``)."""
+    is_short: bool
     has_phase: bool
     phase_cycles: float
     """Phase of the carrier as the listener received it, in [0, 1)."""
@@ -94,6 +95,8 @@ class Packet(Record):
     subticks: Ticks
     """The anchor's reading less the master's at the packet's TX stamp, modulo 2⁴⁸."""
     report_variance_m2: float
+    relays_have_phases: bool
+    """Whether its frame carries phases of its relays, and short stamps."""
     relay_count: int
     relays: Annotated[Array[Relay], MAX_RELAYS]
 
@@ -122,9 +125,22 @@ def take_relays(packet: Packet, packed: Bytes, packed_bytes: int) -> None:
             relayed.listener = packet.place.anchor
             relayed.anchor = two_bytes(packed, begin)
             relayed.sequence = packed[begin + 2]
-            relayed.has_phase = False
-            relayed.rx_ticks = nearest(unsigned(packed, begin + 3, HEARD_BYTES - 3), packet.tx_ticks)
+            relayed.is_short, relayed.has_phase = packet.relays_have_phases, False
+            if relayed.is_short:
+                code = packed[begin + HEARD_BYTES - 1]
+                relayed.rx_ticks = unsigned(packed, begin + 3, SHORT_BITS // 8)
+                relayed.has_phase, relayed.phase_cycles = code >= PHASE_STEPS, (code % PHASE_STEPS) / PHASE_STEPS
+            else:
+                relayed.rx_ticks = nearest(unsigned(packed, begin + 3, HEARD_BYTES - 3), packet.tx_ticks)
             packet.relay_count += 1
+
+
+def relay_rx_ticks(relayed: Relay, tx_ticks: Ticks, elapsed: Ticks) -> Ticks:
+    """The unwrapped stamp of a relay.
+
+    ``tx_ticks`` is the listener's stamp of a packet that the tag received ``elapsed`` later than the relayed one.
+    """
+    return nearest(relayed.rx_ticks, tx_ticks - elapsed, SHORT_BITS) if relayed.is_short else relayed.rx_ticks
 
 
 def _process_packet(s: State, packet: Packet) -> int:
@@ -256,7 +272,9 @@ def _process_relay(s: State, relayed: Relay) -> None:
     is_young = (s.status.epoch_ticks - kept.rx_ticks) * TICK_S < s.settings.relay_age_s
     if kept.sequence == relayed.sequence and kept.tx_ticks > link.tx_ticks and is_young:
         link.tx_ticks = kept.tx_ticks
-        is_used = relay(s, listener, sender, kept.tx_ticks, kept.rx_ticks, relayed.rx_ticks)
+        i = s.anchors[listener]
+        rx_ticks = relay_rx_ticks(relayed, i.tx_ticks, i.rx_ticks - kept.rx_ticks)
+        is_used = relay(s, listener, sender, kept.tx_ticks, kept.rx_ticks, rx_ticks)
         if is_used and relayed.has_phase and s.status.has_phases:
             relay_phase(s, listener, sender, kept.rx_ticks, relayed.phase_cycles)
 

@@ -252,6 +252,7 @@ INTERNAL void known_phase(State *s, int32_t anchor, real walked_m);
 INTERNAL real expected_phase(State *s, int32_t anchor);
 INTERNAL int32_t process(State *s, Packet *packet);
 INTERNAL void take_relays(Packet *packet, uint8_t *packed, int32_t packed_bytes);
+INTERNAL int64_t relay_rx_ticks(Relay *relayed, int64_t tx_ticks, int64_t elapsed);
 INTERNAL int32_t process_packet(State *s, Packet *packet);
 INTERNAL int32_t present(State *s, Place *place);
 INTERNAL void remove_silent(State *s, int64_t rx_ticks);
@@ -323,7 +324,7 @@ INTERNAL void forget_old_packets(Acquisition *q, int64_t now);
 INTERNAL bool keep_packet_of(Acquisition *q, int32_t anchor, HeardPacket *given);
 INTERNAL int32_t longest_unfitting(Acquisition *q);
 INTERNAL void add_links(Acquisition *q, Packet *packet);
-INTERNAL void add_link(Acquisition *q, Packet *listener, Packet *sent, int64_t rx_ticks);
+INTERNAL void add_link(Acquisition *q, Packet *listener, Packet *sent, Relay *relayed);
 INTERNAL int32_t oldest_link(Acquisition *q);
 INTERNAL void forget_links_before(Acquisition *q, int64_t now);
 INTERNAL void choose_pairs(Acquisition *q, int64_t now);
@@ -719,6 +720,7 @@ SKYLESS_EXPORT int32_t skyless_read_frame(uint8_t *frame, int32_t length, Beacon
     b->almanac_issue = new_3;
     b->tx_ticks = unsigned_(frame, 12, 5);
     b->has_place = (flags & HAS_POSITION) != 0;
+    b->has_phases = (flags & HAS_PHASES) != 0;
     b->relay_bytes = 0;
     b->certificate_at = 0;
     b->page_at = 0;
@@ -782,7 +784,7 @@ INTERNAL int32_t header_fault(uint8_t *frame, int32_t length) {
 
 INTERNAL int32_t length_fault(uint8_t *frame, int32_t length) {
     int32_t flags = frame[FLAGS_AT];
-    if ((flags & RESERVED_FLAGS) != 0 || ((flags & HAS_CERTIFICATE) != 0 && (flags & (HAS_POSITION | HAS_PAGE)) != 0)) {
+    if ((flags & RESERVED_FLAGS) != 0 || ((flags & HAS_CERTIFICATE) != 0 && (flags & ~ALONGSIDE_CERTIFICATE) != 0)) {
         return BAD_FLAGS;
     }
     int32_t bare = bare_bytes(flags);
@@ -3759,11 +3761,26 @@ INTERNAL void take_relays(Packet *packet, uint8_t *packed, int32_t packed_bytes)
             relayed->listener = packet->place.anchor;
             relayed->anchor = two_bytes(packed, begin);
             relayed->sequence = packed[begin + 2];
+            relayed->is_short = packet->relays_have_phases;
             relayed->has_phase = false;
-            relayed->rx_ticks = nearest(unsigned_(packed, begin + 3, HEARD_BYTES - 3), packet->tx_ticks, 40);
+            if (relayed->is_short) {
+                int32_t code = packed[begin + HEARD_BYTES - 1];
+                relayed->rx_ticks = unsigned_(packed, begin + 3, floor_div_32(SHORT_BITS, 8));
+                relayed->has_phase = code >= PHASE_STEPS;
+                relayed->phase_cycles = (real)floor_mod_32(code, PHASE_STEPS) / (real)PHASE_STEPS;
+            } else {
+                relayed->rx_ticks = nearest(unsigned_(packed, begin + 3, HEARD_BYTES - 3), packet->tx_ticks, 40);
+            }
             packet->relay_count += 1;
         }
     }
+}
+
+/* The unwrapped stamp of a relay.
+ *
+ * ``tx_ticks`` is the listener's stamp of a packet that the tag received ``elapsed`` later than the relayed one. */
+INTERNAL int64_t relay_rx_ticks(Relay *relayed, int64_t tx_ticks, int64_t elapsed) {
+    return relayed->is_short ? nearest(relayed->rx_ticks, tx_ticks - elapsed, SHORT_BITS) : relayed->rx_ticks;
 }
 
 /* Process a packet; its anchor joins where it is not in the state. */
@@ -3928,7 +3945,9 @@ INTERNAL void process_relay(State *s, Relay *relayed) {
     bool is_young = (real)(s->status.epoch_ticks - kept->rx_ticks) * TICK_S < s->settings.relay_age_s;
     if (kept->sequence == relayed->sequence && kept->tx_ticks > link->tx_ticks && is_young) {
         link->tx_ticks = kept->tx_ticks;
-        bool is_used = relay(s, listener, sender, kept->tx_ticks, kept->rx_ticks, relayed->rx_ticks);
+        Anchor *i = &s->anchors[listener];
+        int64_t rx_ticks = relay_rx_ticks(relayed, i->tx_ticks, i->rx_ticks - kept->rx_ticks);
+        bool is_used = relay(s, listener, sender, kept->tx_ticks, kept->rx_ticks, rx_ticks);
         if (is_used && relayed->has_phase && s->status.has_phases) {
             relay_phase(s, listener, sender, kept->rx_ticks, relayed->phase_cycles);
         }
@@ -5329,15 +5348,16 @@ INTERNAL void add_links(Acquisition *q, Packet *packet) {
         int32_t place = find_heard(q, relayed->anchor);
         if (place >= 0) {
             if (q->heard[place].newer.packet.sequence == relayed->sequence) {
-                add_link(q, packet, &q->heard[place].newer.packet, relayed->rx_ticks);
+                add_link(q, packet, &q->heard[place].newer.packet, relayed);
             } else if (q->heard[place].count == 2 && q->heard[place].older.packet.sequence == relayed->sequence) {
-                add_link(q, packet, &q->heard[place].older.packet, relayed->rx_ticks);
+                add_link(q, packet, &q->heard[place].older.packet, relayed);
             }
         }
     }
 }
 
-INTERNAL void add_link(Acquisition *q, Packet *listener, Packet *sent, int64_t rx_ticks) {
+INTERNAL void add_link(Acquisition *q, Packet *listener, Packet *sent, Relay *relayed) {
+    int64_t rx_ticks = relay_rx_ticks(relayed, listener->tx_ticks, listener->rx_ticks - sent->rx_ticks);
     real total = REAL(0.0);
     for (int32_t axis = 0; axis < 3; axis++) {
         total += square(listener->place.position_m[axis] - sent->place.position_m[axis]);
@@ -5891,13 +5911,15 @@ INTERNAL void add_relays(Neighbours *t, BeaconFields *b, int64_t rx_ticks) {
  * frame as on the tag's, to 1 µs (300 m) and the drift of crystals. */
 INTERNAL int32_t fitting_relays(Neighbours *t, State *s, BeaconFields *b, int64_t rx_ticks) {
     int32_t fitting = 0;
+    int32_t bits = b->has_phases ? SHORT_BITS : TICK_BITS;
     int64_t tx_ticks = t->rows[t->row].tx_ticks;
     for (int32_t begin = 0, begin_end = b->relay_bytes; begin < begin_end; begin += 8) {
         int32_t anchor = two_bytes(b->relays, begin);
         int32_t row = find_neighbour(t, anchor);
         if (row >= 0 && t->rows[row].frames > 0 && t->rows[row].sequence == b->relays[begin + 2]) {
             int64_t elapsed = rx_ticks - t->rows[row].rx_ticks;
-            int64_t received_ticks = nearest(unsigned_(b->relays, begin + 3, 5), tx_ticks - elapsed, 40);
+            int64_t received_ticks = nearest(unsigned_(b->relays, begin + 3, floor_div_32(bits, 8)), tx_ticks - elapsed,
+                    bits);
             if (skyless_find_anchor(s, anchor) >= 0 && may_elapse(tx_ticks - received_ticks, elapsed,
                     (real)FLIGHT_SLACK_TICKS)) {
                 fitting += 1;
@@ -6038,4 +6060,5 @@ INTERNAL void fill_packet(Packet *packet, Hearing *h, Neighbour *n, real factor)
     packet->master = -1;
     packet->relay_count = 0;
     packet->report_variance_m2 = REAL(0.0);
+    packet->relays_have_phases = h->beacon.has_phases;
 }

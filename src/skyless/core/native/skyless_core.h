@@ -58,6 +58,8 @@ typedef double real;
 #define ADMITTED 0
 #define AFTER_ALL_TICKS INT64_C(4611686018427387904)
 #define ALL_RANGE_ERRORS 2
+/* All flags that a frame with a certificate may have. */
+#define ALONGSIDE_CERTIFICATE 12
 #define ANCHOR_PAGE 1
 #define ANCHOR_RESTART 4
 /* Lowest 16 bits of the interval, then the code. */
@@ -130,6 +132,8 @@ typedef double real;
 #define HAS_AUTHENTICATION 4
 #define HAS_CERTIFICATE 8
 #define HAS_PAGE 2
+/* The receptions have a phase each and stamps of 32 bits, instead of stamps of 40. */
+#define HAS_PHASES 64
 #define HAS_POSITION 1
 /* Up to the magic number. */
 #define HEADER_BYTES 11
@@ -226,6 +230,7 @@ typedef double real;
 #define PAGE_BYTES 17
 #define PHASE_BEGINS 0
 #define PHASE_REFUSED 1
+#define PHASE_STEPS 128
 #define PHASE_USED 2
 #define PLANE 2
 #define POSITION 0
@@ -240,7 +245,7 @@ typedef double real;
 #define REJECTED 0
 /* A reception by an anchor in use, or by one that is confirmed itself, confirms its sender for this time. */
 #define RELAYED_TICKS INT64_C(127795200000)
-#define RESERVED_FLAGS 240
+#define RESERVED_FLAGS 176
 #define RESIDUALS 6
 #define RESTARTED_CLOCK 4
 #define RESTART_SILENCE_PERIODS 4
@@ -252,6 +257,7 @@ typedef double real;
 #define SAME_POINT REAL(1e-06)
 #define SCHEDULE_PAGE 2
 #define SHORTEST_S REAL(5e-05)
+#define SHORT_BITS 32
 /* The highest of four bytes' bits; as a float32 alone it is −0. */
 #define SIGN INT64_C(2147483648)
 #define SINGULAR 5
@@ -279,6 +285,7 @@ typedef double real;
 #define SWEEPS 8
 #define TERMS 60
 #define THIN_SIGMAS REAL(0.1)
+#define TICK_BITS 40
 #define TICK_M REAL(0.0046917639786157855)
 #define TICK_MASK INT64_C(1099511627775)
 #define TICK_RATE_HZ REAL(63897600000.0)
@@ -324,6 +331,7 @@ typedef struct BeaconFields {
     int32_t heard_at;  /* Where the receptions of other anchors stand. */
     int32_t heard_count;
     int32_t weak;  /* Bit k is set where the first path of reception k was weak: it may be late. */
+    bool has_phases;  /* Whether the receptions have phases (``SHORT_BITS``). */
     int32_t page_at;  /* Where the page stands; 0 where there is none, as in the next two. */
     int32_t certificate_at;
     int32_t authentication_at;
@@ -440,7 +448,8 @@ typedef struct Relay {
     int32_t listener;  /* Identifier of the one that received it. */
     int32_t anchor;  /* Identifier of the other. */
     int32_t sequence;
-    int64_t rx_ticks;  /* The listener's stamp, unwrapped. */
+    int64_t rx_ticks;  /* The listener's stamp, unwrapped; where it is short its lowest bits (``relay_rx_ticks``). */
+    bool is_short;
     bool has_phase;
     real phase_cycles;  /* Phase of the carrier as the listener received it, in [0, 1). */
 } Relay;
@@ -458,6 +467,7 @@ typedef struct Packet {
     int32_t master;
     int64_t subticks;  /* The anchor's reading less the master's at the packet's TX stamp, modulo 2⁴⁸. */
     real report_variance_m2;
+    bool relays_have_phases;  /* Whether its frame carries phases of its relays, and short stamps. */
     int32_t relay_count;
     Relay relays[32];
 } Packet;

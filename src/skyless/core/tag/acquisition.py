@@ -10,7 +10,7 @@ pseudoranges are carried to one time and solved in closed form.
 from typing import Annotated, Final
 
 from skyless.core.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.core.estimator.process import Packet, take_relays
+from skyless.core.estimator.process import Packet, Relay, relay_rx_ticks, take_relays
 from skyless.core.estimator.settings import Tuning
 from skyless.core.native.arithmetic import floor, sqrt, square
 from skyless.core.native.records import Array, Bytes, Integers, Matrix, Reals, Record, Ticks, record
@@ -251,12 +251,13 @@ def _add_links(q: Acquisition, packet: Packet) -> None:
         place = _find_heard(q, relayed.anchor)
         if place >= 0:
             if q.heard[place].newer.packet.sequence == relayed.sequence:
-                _add_link(q, packet, q.heard[place].newer.packet, relayed.rx_ticks)
+                _add_link(q, packet, q.heard[place].newer.packet, relayed)
             elif q.heard[place].count == 2 and q.heard[place].older.packet.sequence == relayed.sequence:
-                _add_link(q, packet, q.heard[place].older.packet, relayed.rx_ticks)
+                _add_link(q, packet, q.heard[place].older.packet, relayed)
 
 
-def _add_link(q: Acquisition, listener: Packet, sent: Packet, rx_ticks: Ticks) -> None:
+def _add_link(q: Acquisition, listener: Packet, sent: Packet, relayed: Relay) -> None:
+    rx_ticks = relay_rx_ticks(relayed, listener.tx_ticks, listener.rx_ticks - sent.rx_ticks)
     total = 0.0
     for axis in range(3):
         total += square(listener.place.position_m[axis] - sent.place.position_m[axis])

@@ -164,4 +164,4 @@ def _fill_packet(packet: Packet, h: Hearing, n: Neighbour, factor: float) -> Non
         place.position_m[axis] = n.place.position_mm[axis] / _MM_PER_M
     packet.sequence, packet.rx_ticks, packet.tx_ticks = n.sequence, h.admission.rx_ticks, n.tx_ticks
     packet.variance_factor, packet.master, packet.relay_count = factor, -1, 0
-    packet.report_variance_m2 = 0.0
+    packet.report_variance_m2, packet.relays_have_phases = 0.0, h.beacon.has_phases

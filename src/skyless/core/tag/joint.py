@@ -302,7 +302,7 @@ class Estimation:
 
     def _packet(self, observation: Observation) -> Packet:
         self._estimator.know_anchor(observation.anchor, observation.anchor_m, observation.anchor_std_m)
-        return self._estimator.packet_of(
+        packet = self._estimator.packet_of(
             observation.anchor,
             observation.sequence,
             observation.rx_ticks_tag,
@@ -313,6 +313,8 @@ class Estimation:
             observation.phase_cycles,
             observation.relay_phases,
         )
+        packet.relays_have_phases = observation.packed_phases
+        return packet
 
     def _report(self, observation: Observation) -> Report:
         """What the anchor reports of its clock against the master's."""

@@ -236,7 +236,7 @@ class Receiver(BeaconReceiver):
         observation = Observation(
             anchor, view(packet.place.position_m).copy(), 0, beacon.sequence, rx_ticks, packet.tx_ticks, None, None,
             None, 0.0, 0.0, (), None, packet.variance_factor, relays, packet.place.std_m,
-            packet.phase_cycles if packet.has_phase else -1.0,
+            packet.phase_cycles if packet.has_phase else -1.0, (), beacon.has_phases,
         )  # fmt: skip
         method = self._method
         if method is None:

@@ -5,9 +5,10 @@ from collections.abc import Collection
 from typing import Final
 
 from skyless.core.air.beacon_fields import BeaconFields
-from skyless.core.air.frame import HEARD_BYTES
+from skyless.core.air.frame import HEARD_BYTES, SHORT_BITS
 from skyless.core.air.little_endian import two_bytes, unsigned
 from skyless.core.air.neighbours import Neighbour, Neighbours, find_neighbour, neighbour_of
+from skyless.core.constants import TICK_BITS
 from skyless.core.estimator.state import State, find_anchor
 from skyless.core.native.records import Ticks
 from skyless.core.ticks import FLIGHT_SLACK_TICKS, NEVER, may_elapse, nearest
@@ -53,14 +54,14 @@ def fitting_relays(t: Neighbours, s: State, b: BeaconFields, rx_ticks: Ticks) ->
     Only packets of anchors in use count. A reception fits if, on the anchor's counter, it lies as long before its own
     frame as on the tag's, to 1 µs (300 m) and the drift of crystals.
     """
-    fitting = 0
+    fitting, bits = 0, SHORT_BITS if b.has_phases else TICK_BITS
     tx_ticks = t.rows[t.row].tx_ticks
     for begin in range(0, b.relay_bytes, HEARD_BYTES):
         anchor = two_bytes(b.relays, begin)
         row = find_neighbour(t, anchor)
         if row >= 0 and t.rows[row].frames > 0 and t.rows[row].sequence == b.relays[begin + 2]:
             elapsed = rx_ticks - t.rows[row].rx_ticks
-            received_ticks = nearest(unsigned(b.relays, begin + 3, 5), tx_ticks - elapsed)
+            received_ticks = nearest(unsigned(b.relays, begin + 3, bits // 8), tx_ticks - elapsed, bits)
             if find_anchor(s, anchor) >= 0 and may_elapse(tx_ticks - received_ticks, elapsed, FLIGHT_SLACK_TICKS):
                 fitting += 1
     return fitting

@@ -7,7 +7,7 @@ from typing import Protocol
 
 from msgspec import structs
 
-from skyless.core.air.frame import Malformed
+from skyless.core.air.frame import SHORT_BITS, Malformed
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point, Relay
 from skyless.core.air.reception import Reception
 from skyless.core.constants import TICK_BITS
@@ -55,7 +55,8 @@ class OwnReceiver:
         """``site`` says where the anchors are."""
         self._estimator = estimator
         self._anchors_m = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
-        self._engine = PairEngine(TICK_BITS, anchors_m=dict(self._anchors_m))
+        bits = SHORT_BITS if site.schedule.sends_phases else TICK_BITS
+        self._engine = PairEngine(bits, anchors_m=dict(self._anchors_m))
         self.counters: Counter[str] = Counter()
         """Frames by what became of them."""
         self.reason = NoFixReason.NO_BEACONS

@@ -22,7 +22,7 @@ from skyless.core.site import ScheduleSite, Site
 
 _MAX_OVERLOAD: Final = 2.0  # over the best number of frames in reach; half or double of it costs a tag less than 8 %
 _MAX_NAMED: Final = 8
-_ONLY_IN: Final = {"rate_hz": "free", "slots": "master", "frames_per_node": "master"}
+_ONLY_IN: Final = {"rate_hz": "free", "carrier_phase": "free", "slots": "master", "frames_per_node": "master"}
 """Keys of the schedule that mean something in one mode only."""
 _SHORTEST_GUARD_S: Final = 0.35e-3
 """Shortest turn-around of a host that reads one frame and prepares the next (firmware in C)."""

@@ -118,6 +118,7 @@ _MAX_CORNERS: Final = 1000
 
 _OTHERS: Final = {
     "schedule.mode": '"master" or "free"',
+    "schedule.carrier_phase": "true or false",
     "name": "a text",
     "anchors": "a list of [[anchors]] tables, one for each anchor",
     "walls": "a list of [[walls]] tables",

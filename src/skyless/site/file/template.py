@@ -53,6 +53,7 @@ _FREE_SCHEDULE = """\
 [schedule]                      # who sends when
 mode = "free"                   # anchors send at random instants; "master" is the paper's protocol, with slots
 {no_rate}rate_hz = {rate_hz}                # beacons per second of each anchor; as many as fit by default
+{no_phase}carrier_phase = {phase}          # anchors relay phases of the carrier, too; older tags drop such beacons
 """
 
 _MASTER_SCHEDULE = """\
@@ -188,7 +189,10 @@ def _schedule(site: Site) -> str:
     schedule = site.schedule
     if not schedule.needs_master:
         return _FREE_SCHEDULE.format(
-            rate_hz=schedule.rate_hz or _EXAMPLE_RATE_HZ, no_rate=_off(schedule.rate_hz is not None)
+            rate_hz=schedule.rate_hz or _EXAMPLE_RATE_HZ,
+            no_rate=_off(schedule.rate_hz is not None),
+            phase="false" if schedule.carrier_phase is False else "true",
+            no_phase=_off(schedule.carrier_phase is not UNSET),
         )
     return _MASTER_SCHEDULE.format(
         slot_s=schedule.slot_s,

@@ -63,7 +63,8 @@ class RelayedDifferences:
             if frame_ticks is None or relative_rate is None or self._last.get(pair) == heard.rx_ticks:
                 continue
             self._last[pair] = heard.rx_ticks
-            held_ticks, age_ticks = difference(beacon.tx_ticks, heard.rx_ticks), now_ticks - frame_ticks
+            age_ticks = now_ticks - frame_ticks
+            held_ticks = difference(beacon.tx_ticks, heard.rx_ticks_near(beacon.tx_ticks - age_ticks))
             apart_ticks = age_ticks - held_ticks
             if not 0 < held_ticks <= _LONGEST_TICKS or abs(apart_ticks) > _most_apart(held_ticks):
                 continue

@@ -89,14 +89,15 @@ class RelayMatcher:
         # Between the two frames the listener's counter and that of the anchor that relays advance alike: a check that
         # another frame of the same sequence number, or a counter that has restarted, does not pass.
         age_ticks = now_ticks - frame.listener_ticks
-        apart_ticks = abs(difference(tx_ticks, relay.rx_ticks + age_ticks, self._bits))
+        rx_ticks = relay.rx_ticks_near(tx_ticks - age_ticks) if isinstance(relay, Heard) else relay.rx_ticks
+        apart_ticks = abs(difference(tx_ticks, rx_ticks + age_ticks, self._bits))
         if not 0 < age_ticks <= _LONGEST_AGE_TICKS or apart_ticks > 2 * MAX_FLIGHT_TICKS + MAX_BRACKET_RATE * age_ticks:
             self.counters["other-frame"] += 1
             return None
         self._last.pop(pair, None)
         self._last[pair] = relay.rx_ticks
         self.counters["legs"] += 1
-        return AnchorLeg(relay.anchor, anchor, frame.tx_ticks, relay.rx_ticks, frame.t_s)
+        return AnchorLeg(relay.anchor, anchor, frame.tx_ticks, rx_ticks, frame.t_s)
 
     def _prune(self, now_ticks: int) -> None:
         """Remove frames that no relay can name any more."""
