@@ -120,7 +120,7 @@ _WALKED_PLACES: Final = 6
 
 def _after_metre(predictor: Predictor, floor: Floor, heights_m: tuple[float, ...]) -> AfterMetre | None:
     """What phases of the carrier give tags that walk; None where the site has none or nothing is estimated."""
-    if not predictor.site.schedule.sends_phases or predictor.settings.method not in FILTERS:
+    if predictor.site.schedule.carrier_phase is not True or predictor.settings.method not in FILTERS:
         return None
     points, _ = sample_points(floor, heights_m, _WALKED_PLACES)
     with_phases, stamps = (predictor.walked_sigma(points, has_phases=has_phases) for has_phases in (True, False))
