@@ -49,11 +49,11 @@ def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
         a.own.is_known = a.has_former = False
         return
     ambiguity = s.layout.ambiguity + anchor
+    _measure_way(s)
     if a.own.is_known:
-        walked_m = status.walked_m - a.phase_walked_m
         wander = max(tuning.phase_wander * status.phase_variance_m2, s.settings.phase_wander)
-        s.P[ambiguity][ambiguity] += wander * walked_m
-    a.phase_walked_m = status.walked_m
+        s.P[ambiguity][ambiguity] += wander * (status.way_m - a.phase_way_m)
+    a.phase_way_m = status.way_m
     _follow_line(s)
     expected_m = _phase_terms(s, anchor)
     cycles = -phase_cycles - _whole_cycles(s, a.offset_ticks)
@@ -167,6 +167,17 @@ def close_phases(s: State) -> None:
     """Let all ambiguities of the tag's phases begin again: what they were taken for may be wrong by cycles."""
     for anchor in range(s.count):
         s.anchors[anchor].own.is_known = s.anchors[anchor].has_former = False
+
+
+def _measure_way(s: State) -> None:
+    """Add a step to the tag's way where it has gone so far."""
+    squared = 0.0
+    for axis in range(s.dim):
+        squared += square(s.x[axis] - s.status.step_m[axis])
+    if squared > square(s.tuning.phase_step_m):
+        s.status.way_m += sqrt(squared)
+        for axis in range(s.dim):
+            s.status.step_m[axis] = s.x[axis]
 
 
 def _follow_line(s: State) -> None:

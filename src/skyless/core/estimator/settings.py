@@ -257,6 +257,8 @@ class Tuning(Record):
     """Part of a wavelength beyond which no innovation is used: half a wavelength may be the other way round."""
     phase_share: float = 0.1
     """Part of a wavelength up to which the standard deviation of a predicted phase leaves no doubt of the cycle."""
+    phase_step_m: float = 0.02
+    """Length of the steps by which reflections change phases [m]."""
     phase_line_m: float = 0.03
     """Distance of the estimate from the point at which phases are linearised, at which that moves [m]."""
     phase_former_s: float = 0.5

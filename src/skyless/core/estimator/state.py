@@ -138,8 +138,8 @@ class Anchor(Record):
     has_former: bool
     former_ticks: Ticks
     """The tag's reading when its former ambiguity ended."""
-    phase_walked_m: float
-    """The tag's walked distance at its newest phase."""
+    phase_way_m: float
+    """The tag's way at its newest phase."""
 
 
 @record
@@ -239,6 +239,10 @@ class Status(Record):
     """Whether phases are used, so that there are ambiguities."""
     line_m: Annotated[Reals, AXES]
     """Where phases are linearised: a place of the tag, from there on moved by its velocity alone."""
+    step_m: Annotated[Reals, AXES]
+    """The tag's place after its last step …"""
+    way_m: float
+    """… and the sum of all steps: unlike ``walked_m`` it does not grow at rest."""
     phase_variance_m2: float
     """Of a phase, as innovations show it."""
     wild_share: float

@@ -239,6 +239,7 @@ INTERNAL real limit_m2(State *s, real variance);
 INTERNAL void learn_noise(State *s, real shown_m2);
 INTERNAL bool may_count(State *s);
 INTERNAL void close_phases(State *s);
+INTERNAL void measure_way(State *s);
 INTERNAL void follow_line(State *s);
 INTERNAL void turn(State *s, int32_t anchor, int32_t ambiguity);
 INTERNAL void subtract(State *s, int32_t state, int32_t other, real weight);
@@ -3426,12 +3427,12 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
         return;
     }
     int32_t ambiguity = s->layout.ambiguity + anchor;
+    measure_way(s);
     if (a->own.is_known) {
-        real walked_m = status->walked_m - a->phase_walked_m;
         real wander = max_real(tuning->phase_wander * status->phase_variance_m2, s->settings.phase_wander);
-        s->P[ambiguity][ambiguity] += wander * walked_m;
+        s->P[ambiguity][ambiguity] += wander * (status->way_m - a->phase_way_m);
     }
-    a->phase_walked_m = status->walked_m;
+    a->phase_way_m = status->way_m;
     follow_line(s);
     real expected_m = phase_terms(s, anchor);
     real cycles = -phase_cycles - whole_cycles(s, a->offset_ticks);
@@ -3561,6 +3562,20 @@ INTERNAL void close_phases(State *s) {
     for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
         s->anchors[anchor].has_former = false;
         s->anchors[anchor].own.is_known = false;
+    }
+}
+
+/* Add a step to the tag's way where it has gone so far. */
+INTERNAL void measure_way(State *s) {
+    real squared = REAL(0.0);
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        squared += square(s->x[axis] - s->status.step_m[axis]);
+    }
+    if (squared > square(s->tuning.phase_step_m)) {
+        s->status.way_m += SQRT(squared);
+        for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+            s->status.step_m[axis] = s->x[axis];
+        }
     }
 }
 

@@ -708,6 +708,7 @@ typedef struct Tuning {
     real phase_gate;
     /* Part of a wavelength up to which the standard deviation of a predicted phase leaves no doubt of the cycle. */
     real phase_share;
+    real phase_step_m;  /* Length of the steps by which reflections change phases [m]. */
     /* Distance of the estimate from the point at which phases are linearised, at which that moves [m]. */
     real phase_line_m;
     /* Time for which an ambiguity from before a gap is kept to find by how many cycles it has changed [s]. */
@@ -796,6 +797,8 @@ typedef struct Status {
     real plane_normal[3];  /* Normal of that plane. */
     bool has_phases;  /* Whether phases are used, so that there are ambiguities. */
     real line_m[3];  /* Where phases are linearised: a place of the tag, from there on moved by its velocity alone. */
+    real step_m[3];  /* The tag's place after its last step … */
+    real way_m;  /* … and the sum of all steps: unlike ``walked_m`` it does not grow at rest. */
     real phase_variance_m2;  /* Of a phase, as innovations show it. */
     real wild_share;  /* Running share of phases beyond the gate. */
     int64_t phases_used;
@@ -849,7 +852,7 @@ typedef struct Anchor {
     int32_t partner;  /* Identifier of that, −1 for none. */
     bool has_former;
     int64_t former_ticks;  /* The tag's reading when its former ambiguity ended. */
-    real phase_walked_m;  /* The tag's walked distance at its newest phase. */
+    real phase_way_m;  /* The tag's way at its newest phase. */
 } Anchor;
 
 /* A packet that others may relay. */
