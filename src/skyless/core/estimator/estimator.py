@@ -29,7 +29,7 @@ from skyless.core.estimator.state import (
     make_uncertain,
     new_state,
 )
-from skyless.core.estimator.verdicts import is_late_often, rejects_most
+from skyless.core.estimator.verdicts import has_phase, is_late_often, rejects_most
 from skyless.core.native.views import records, view
 from skyless.core.ticks import NEVER
 
@@ -326,8 +326,8 @@ class Estimator:
     @property
     def phase_anchors(self) -> tuple[int, ...]:
         """Identifiers of the anchors the phases of whose carriers are in use."""
-        anchors = (self._state.anchors[index] for index in range(self._state.count))
-        return tuple(sorted(one.identifier for one in anchors if one.own.is_known))
+        s = self._state
+        return tuple(sorted(s.anchors[index].identifier for index in range(s.count) if has_phase(s, index)))
 
     def position_m(self) -> Vector:
         """The position at the newest packet, shape (dim,)."""

@@ -268,7 +268,9 @@ class Tuning(Record):
     phase_nis: float = 2.0
     """Mean NIS of stamps beyond which a phase has a wrong cycle."""
     phase_levels: float = 2.0
-    """Factor on levels where phases are in use: stamps that err alike for long show in no test."""
+    """Factor on levels where phases are in use: stamps that err alike for long show in no test …"""
+    phase_memory_s: float = 5.0
+    """… and the time for which they count as such after the last one [s]."""
     phase_after_s: float = 1.0
     """Time after the start from which phases are used [s]: places that still move by the stamps' noise would turn the
     directions to the anchors, which phases would take for motion."""

@@ -2,6 +2,7 @@
 
 from typing import Final
 
+from skyless.core.constants import TICK_S
 from skyless.core.estimator.faults import whiten
 from skyless.core.estimator.state import State
 from skyless.core.native.arithmetic import square
@@ -46,11 +47,8 @@ def has_phase(s: State, anchor: int) -> bool:
 
 
 def uses_phases(s: State) -> bool:
-    """Whether phases of any anchor are in use."""
-    number = 0
-    for anchor in range(s.count):
-        number += int(has_phase(s, anchor))
-    return number > 0
+    """Whether phases of the tag's own have been used so recently that places still rest on them."""
+    return (s.status.epoch_ticks - s.status.phase_ticks) * TICK_S < s.tuning.phase_memory_s
 
 
 def fits_settings(s: State) -> bool:

@@ -186,7 +186,6 @@ INTERNAL bool rejects_most(State *s);
 INTERNAL bool is_lost(State *s);
 INTERNAL bool relays_contradict(State *s);
 INTERNAL bool relays_fit(State *s);
-INTERNAL bool has_phase(State *s, int32_t anchor);
 INTERNAL bool uses_phases(State *s);
 INTERNAL bool fits_settings(State *s);
 INTERNAL void protect(State *s);
@@ -1043,6 +1042,7 @@ SKYLESS_EXPORT void skyless_prepare(State *s) {
     real stamps_m2 = settings->tx_variance_m2 + settings->rx_variance_m2;
     status->mean_nis = REAL(1.0);
     status->q_scale = REAL(1.0);
+    status->phase_ticks = NEVER;
     status->height_ticks = NEVER;
     status->walk_scale = min_real(tuning->start_walk_scale, settings->max_walk_scale);
     status->fault_std_m[LASTING] = tuning->lasting_std_m;
@@ -2440,19 +2440,9 @@ INTERNAL bool relays_fit(State *s) {
             status->relays_lately_rejected);
 }
 
-/* Whether phases of an anchor are in use: one has confirmed its ambiguity, and they are not refused. */
-INTERNAL bool has_phase(State *s, int32_t anchor) {
-    Ambiguity *own = &s->anchors[anchor].own;
-    return own->is_known && own->refused_in_row < truncated(s->tuning.phases_in_row) - 1;
-}
-
-/* Whether phases of any anchor are in use. */
+/* Whether phases of the tag's own have been used so recently that places still rest on them. */
 INTERNAL bool uses_phases(State *s) {
-    int32_t number = 0;
-    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
-        number += (int32_t)has_phase(s, anchor);
-    }
-    return number > 0;
+    return (real)(s->status.epoch_ticks - s->status.phase_ticks) * TICK_S < s->tuning.phase_memory_s;
 }
 
 /* Whether the constants of the ranges are as small as the settings state, as far as they are known. */
@@ -3446,6 +3436,7 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
     if (outcome == PHASE_REFUSED) {
         status->wild_share += tuning->phase_forgetting * (REAL(1.0) - status->wild_share);
     } else if (outcome == PHASE_USED) {
+        status->phase_ticks = status->epoch_ticks;
         status->wild_share -= tuning->phase_forgetting * status->wild_share;
         learn_noise(s, square(innovation) - predicted);
         if (a->has_former) {

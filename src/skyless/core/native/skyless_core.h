@@ -716,7 +716,8 @@ typedef struct Tuning {
     /* Number of phases of an anchor in a row beyond the gate at which its ambiguity begins again. */
     real phases_in_row;
     real phase_nis;  /* Mean NIS of stamps beyond which a phase has a wrong cycle. */
-    real phase_levels;  /* Factor on levels where phases are in use: stamps that err alike for long show in no test. */
+    real phase_levels;  /* Factor on levels where phases are in use: stamps that err alike for long show in no test … */
+    real phase_memory_s;  /* … and the time for which they count as such after the last one [s]. */
     /* Time after the start from which phases are used [s]: places that still move by the stamps' noise would turn the
      * directions to the anchors, which phases would take for motion. */
     real phase_after_s;
@@ -801,6 +802,7 @@ typedef struct Status {
     real way_m;  /* … and the sum of all steps: unlike ``walked_m`` it does not grow at rest. */
     real phase_variance_m2;  /* Of a phase, as innovations show it. */
     real wild_share;  /* Running share of phases beyond the gate. */
+    int64_t phase_ticks;  /* The tag's reading when a phase of its own was used last. */
     int64_t phases_used;
     int64_t phases_refused;
     int64_t phases_opened;  /* Ambiguities that began, or began again … */
