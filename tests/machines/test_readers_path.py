@@ -21,10 +21,11 @@ SMALL = {
     "core/air/ieee802154.py",
     "core/air/frame.py",
     "core/air/first_path.py",
+    "core/air/reception.py",
     "core/air/site_choice.py",
     "core/ticks.py",
 }
-"""Checksum, kind of frame, weak first path, which of several sites, wrapping counters: a line of each."""
+"""Checksum, kind of frame, weak first path, whether there is a phase, which of several sites, wrapping counters: a line of each."""
 WARM_S = 3.0
 
 

@@ -43,7 +43,8 @@ def test_the_filter_claims_the_bound_of_a_tag_that_has_walked(has_phases):
     for sigma_m, (place, way) in zip(found, ways, strict=True):
         steps_m = np.append(np.zeros(rested), np.arange(1, frames + 1) / frames)
         bound = tracking_bound(anchors, place + steps_m[:, None] * way, settings)[-1]
-        assert sigma_m == pytest.approx(np.sqrt(np.trace(bound)), rel=0.01)
+        # the bound's phases wander with each packet, the filter's with each step of 2 cm
+        assert sigma_m == pytest.approx(np.sqrt(np.trace(bound)), rel=0.02 if has_phases else 0.01)
 
 
 def test_phases_give_nothing_where_packets_are_too_rare_or_crystals_too_poor_for_their_cycles():
