@@ -14,9 +14,9 @@ from typing import Final
 import numpy as np
 from msgspec import Struct, field
 
-from skyless.core.arrays import Array, Integers
-from skyless.core.constants import CARRIER_CYCLES, TICK_BITS, TICK_M, TICK_RATE_HZ
-from skyless.core.ticks import difference, wrap
+from skyless.core.arrays import Array
+from skyless.core.constants import CARRIER_CYCLES, TICK_M, TICK_RATE_HZ
+from skyless.core.ticks import difference
 from skyless.site.survey.stamps.legs import AnchorLeg
 from skyless.site.survey.stamps.repeats import STD_OVER_MAD
 from skyless.site.survey.two_way import MAX_BRACKET_RATE
@@ -139,18 +139,18 @@ def _sum_of(legs: list[AnchorLeg], first: int, cycles_per_tick: float) -> tuple[
 
     None where there are too few legs, or where they do not agree.
     """
-    if not legs:
+    if len(legs) < 2 * _FEWEST:
         return None
-    rows = [(leg.tx_ticks, leg.rx_ticks) if leg.sender == first else (leg.rx_ticks, leg.tx_ticks) for leg in legs]
-    ticks = np.array([(wrap(x_ticks), wrap(y_ticks)) for x_ticks, y_ticks in rows], np.int64)
-    offset_ticks = ticks[:, 1] - ticks[:, 0]
-    gained = _near_zero(offset_ticks - offset_ticks[0])
-    middle = int(np.median(gained))
-    run = np.flatnonzero(np.abs(gained - middle) < 2.0 * BLOCK_S * _DRIFT_TICKS_PER_S)  # of both counters
-    since = _near_zero(ticks[:, 0] - ticks[run[0], 0]) if len(run) else gained
-    run = run[np.argsort(since[run])]
-    t_s, gained = since[run] / TICK_RATE_HZ, (gained[run] - middle).astype(np.float64)
-    is_out = np.array([leg.sender == first for leg in legs])[run]
+    is_out = np.array([leg.sender == first for leg in legs])
+    stamps = [(leg.tx_ticks, leg.rx_ticks) if leg.sender == first else (leg.rx_ticks, leg.tx_ticks) for leg in legs]
+    clock_ticks = stamps[0][1] - stamps[0][0]
+    gained = np.array([difference(y_ticks - x_ticks, clock_ticks) for x_ticks, y_ticks in stamps], np.float64)
+    gained -= (middle := float(np.median(gained)))
+    begin_ticks = stamps[int(np.argmin(np.abs(gained)))][0]
+    t_s = np.array([difference(x_ticks, begin_ticks) for x_ticks, _ in stamps]) / TICK_RATE_HZ
+    run = np.flatnonzero(np.abs(gained) < 2.0 * BLOCK_S * _DRIFT_TICKS_PER_S)  # of both counters
+    run = run[np.argsort(t_s[run])]
+    t_s, gained, is_out = t_s[run], gained[run], is_out[run]
     if min(is_out.sum(), (~is_out).sum()) < _FEWEST:
         return None
     way = np.where(is_out, 1.0, -1.0)
@@ -172,10 +172,4 @@ def _sum_of(legs: list[AnchorLeg], first: int, cycles_per_tick: float) -> tuple[
     cycles, scatter = circular_mean(sums[between])
     if scatter > _LARGEST_SCATTER:
         return None
-    return cycles, scatter / math.sqrt(between.sum()), wrap(int(offset_ticks[0]) + middle)
-
-
-def _near_zero(ticks: Integers) -> Integers:
-    """Differences of counters without their wraps."""
-    half = 1 << (TICK_BITS - 1)
-    return (ticks + half) % (2 * half) - half
+    return cycles, scatter / math.sqrt(between.sum()), clock_ticks + round(middle)
