@@ -51,7 +51,7 @@ def blocks_of(watch):
     return {pair: len(one.usual_cycles) for pair, one in watch._pairs.items()}
 
 
-@pytest.mark.site
+@pytest.mark.statistical
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_nothing_is_found_at_rest(seed):
     """The means of blocks agree within what is recorded: 0.6 mm one way."""
@@ -81,7 +81,7 @@ def test_an_anchor_that_moves_by_5_mm_is_named_within_seconds(anchor, shift):
     assert finding.sentence.startswith(f"anchor {anchor} moved or turned by about 5 mm (or 18, 28, 41 …)")
 
 
-@pytest.mark.site
+@pytest.mark.statistical
 def test_two_anchors_that_move_are_both_named_and_one_that_comes_back_is_not_any_more():
     moved = (
         AnchorDisplacement(2, x_m=0.004, y_m=0.005, from_s=14.0),
@@ -93,7 +93,7 @@ def test_two_anchors_that_move_are_both_named_and_one_that_comes_back_is_not_any
     assert [one.anchors for one in watch.findings] == [(2,)]
 
 
-@pytest.mark.site
+@pytest.mark.statistical
 def test_an_anchor_that_restarts_is_none():
     """Its constants are others then; so are those of one that restarts within a block."""
     outages = (AnchorOutage(2, Outage(14.5, 15.0)), AnchorOutage(4, Outage(16.0, 22.0)))
@@ -113,7 +113,7 @@ def test_without_phases_nothing_is_looked_at():
         assert not watch._pairs
 
 
-@pytest.mark.site
+@pytest.mark.statistical
 @pytest.mark.parametrize("share", [0.1, 0.2])
 def test_wild_phases_and_gaps_raise_nothing_and_hide_nothing(share):
     rng = np.random.default_rng(1)
@@ -187,7 +187,7 @@ def test_any_legs_raise_nothing(legs):
     assert watch.findings == ()
 
 
-@given(st.integers(0, 1 << 32), st.floats(0.0, 1.0), st.floats(0.001, 0.05), st.floats(0.0, 0.25), st.integers(9, 300))
+@given(st.integers(0, 1 << 32), st.floats(0.0, 1.0), st.floats(0.001, 0.05), st.floats(0.0, 0.25), st.integers(40, 300))
 def test_the_circular_mean(seed, mean, std, wild, count):
     """It is near the true one beside any wild phases, knows no whole cycles, and turns with the phases."""
     rng = np.random.default_rng(seed)
@@ -199,7 +199,7 @@ def test_the_circular_mean(seed, mean, std, wild, count):
 
     found, scatter = circular_mean(cycles)
     assert 0.0 <= found < 1.0
-    assert apart(found, mean) < 4.0 * std
-    assert scatter < 3.0 * std
+    assert apart(found, mean) < 2.0 * std  # of 30 phases or more that are not wild
+    assert scatter < 5.0 * std  # what is farther than 3 of their medians off is left out
     assert apart(found, circular_mean(cycles + rng.integers(-9, 9, count))[0]) < 1e-6
     assert apart(found + 0.3, circular_mean(cycles + 0.3)[0]) < 1e-6

@@ -281,7 +281,8 @@ class StampLog:
         if len(self._pending) >= MAX_PENDING_STAMPS:
             self._pending.popleft()
             self._missed += 1
-        self._pending.append(Stamp(anchor, tx_ticks, rx_ticks, phase_cycles))
+        rounded = None if phase_cycles is None else round(phase_cycles, 4) % 1.0  # as text it is short
+        self._pending.append(Stamp(anchor, tx_ticks, rx_ticks, rounded))
 
     def collect(self, now_s: float, unix_s: float) -> StampsMessage | None:
         """The next message if it is due, also one without stamps while an anchor that is asked receives nobody."""

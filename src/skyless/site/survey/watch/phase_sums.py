@@ -135,10 +135,7 @@ class PhaseWatch:
 
 
 def _sum_of(legs: list[AnchorLeg], first: int, cycles_per_tick: float) -> tuple[float, float, int] | None:
-    """The sum of both directions' phases, its standard deviation, in cycles, and the difference of both counters.
-
-    None where there are too few legs, or where they do not agree.
-    """
+    """Both directions' sum and its standard deviation in cycles, and the counters' difference; None of too few legs."""
     if len(legs) < 2 * _FEWEST:
         return None
     is_out = np.array([leg.sender == first for leg in legs])
