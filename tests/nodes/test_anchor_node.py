@@ -5,6 +5,7 @@ import contextlib
 import itertools
 import time
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 from node_stage import LAB, LEAD_S, FakeLink, FakeRadio, played, receptions, running_anchor
@@ -326,10 +327,12 @@ def test_nothing_is_kept_until_somebody_asks():
     assert log.collect(100.0, 0.0) is None
     log.request(request("me"), 100.0)
     log.add(1, 11, 21)
-    log.add(3, 12, 22)
+    log.add(3, 12, 22, 0.2500153)
+    log.add(3, 13, 23, 0.99998)
     message = log.collect(100.1, 5.0)
     assert (message.anchor, message.run, message.unix_s, message.missed) == (2, "a", 5.0, 0)
-    assert message.stamps == (Stamp(1, 11, 21), Stamp(3, 12, 22))
+    assert message.stamps == (Stamp(1, 11, 21), Stamp(3, 12, 22, 0.25), Stamp(3, 13, 23, 0.0))
+    assert msgspec.json.decode(b"[1, 11, 21]", type=Stamp) == Stamp(1, 11, 21), "as earlier versions publish it"
 
 
 def test_messages_come_at_an_interval_also_when_nobody_is_received():

@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 from node_stage import FakeLink, running
@@ -32,8 +33,9 @@ from skyless.run.mqtt.messages import (
 from skyless.run.survey import program as program_module
 from skyless.run.survey._live_survey import ADOPTION_S, NO_DATA_S, LiveSurvey
 from skyless.run.survey.files import FloorImage, is_record_of, save_survey
-from skyless.run.survey.program import SurveyNode, SurveySettings
-from skyless.sim.impairments import DelayError, lab_impairments
+from skyless.run.survey.program import FindingsLog, SurveyNode, SurveySettings
+from skyless.sim.carrier import CarrierModel
+from skyless.sim.impairments import AnchorDisplacement, DelayError, lab_impairments
 from skyless.sim.lab import lab_site
 from skyless.sim.world import World
 from skyless.site.file.check import image_size
@@ -71,8 +73,8 @@ BEGIN_S = 5000.0
 class Collecting:
     """An anchor's machine that keeps the stamps of what it receives, as the anchor's program does."""
 
-    def __init__(self, anchor):
-        self.machine, self.log = new_anchor(FRESH, anchor), StampLog(anchor, "run1")
+    def __init__(self, anchor, site=None):
+        self.machine, self.log = new_anchor(site or FRESH, anchor), StampLog(anchor, "run1")
         self.id, self.next_transmission_ticks = anchor, self.machine.next_transmission_ticks
         self.transmission = self.machine.transmission
         self.log.request(RequestMessage("test", (), 60.0, True), 0.0)
@@ -80,7 +82,7 @@ class Collecting:
     def hear(self, reception):
         self.machine.hear(reception)
         beacon = decode(reception.frame)
-        self.log.add(beacon.anchor, beacon.tx_ticks, reception.rx_ticks)
+        self.log.add(beacon.anchor, beacon.tx_ticks, reception.rx_ticks, reception.carrier_phase_cycles)
 
 
 @cache
@@ -490,6 +492,36 @@ async def test_a_finding_is_logged_once_although_its_size_wavers():
         "watch: over: anchor 4 has moved by about 0.9 m",
     ]
     assert len(again) == 1
+
+
+def test_what_phases_show_is_found_beside_what_stamps_show():
+    """An anchor that moves by 5 mm, by the messages of all; the ranges stay of use."""
+    machines, shown = {}, []
+
+    def make(anchor):
+        return machines.setdefault(anchor, Collecting(anchor, SITE))
+
+    moved = AnchorDisplacement(3, x_m=0.005, from_s=14.0)
+    impairments = replace(lab_impairments(100.0), carrier=CarrierModel(), anchor_displacements=(moved,))
+    world, live = World(SITE, make, [], impairments, 3), LiveSurvey(SITE, Facts())
+    for _ in world.run(24.0):
+        now_s = BEGIN_S + world.now_s
+        for machine in machines.values():
+            message = machine.log.collect(world.now_s, 1e9 + 1000.0 * machine.id + world.now_s)
+            if message is not None:
+                live.add_stamps(msgspec.json.decode(msgspec.json.encode(message), type=StampsMessage), now_s)
+                live.advance_watch(now_s)
+                shown.append(live.watch_message(now_s, 1e9 + world.now_s))
+    (finding,) = shown[-1].findings
+    assert (finding.kind, finding.anchors) == ("check", (3,))
+    assert finding.sentence == (
+        "anchor 3 moved or turned by about 5 mm (or 18, 28, 41 …), by the phases of its carrier"
+    )
+    assert 1e9 + 12.0 <= finding.since_unix_s <= 1e9 + 16.0
+    assert all(one.anchors == (3,) for message in shown for one in message.findings)
+    lines, begins_again = FindingsLog().update(shown[-1].findings)
+    assert lines == [finding.sentence]
+    assert not begins_again
 
 
 def test_ranges_count_from_the_delays_of_the_file_although_the_anchors_run_with_others():

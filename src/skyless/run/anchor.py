@@ -221,7 +221,7 @@ class AnchorNode:
         if isinstance(beacon, Malformed) or beacon.site != self.site.id or beacon.anchor not in self._others:
             return
         self.heard_s[beacon.anchor] = time.monotonic()
-        self.stamps.add(beacon.anchor, beacon.tx_ticks, reception.rx_ticks)
+        self.stamps.add(beacon.anchor, beacon.tx_ticks, reception.rx_ticks, reception.carrier_phase_cycles)
 
     def _wait(self, seconds: float | None, then: Callable[[], None]) -> None:
         """Call a function later, instead of the one planned before. None plans nothing."""
@@ -274,14 +274,15 @@ class StampLog:
         self._run, self._missed = run, 0
         self._pending.clear()
 
-    def add(self, anchor: int, tx_ticks: int, rx_ticks: int) -> None:
-        """Add a reception of another anchor: its stated TX stamp and the own RX stamp, 40 bits each."""
+    def add(self, anchor: int, tx_ticks: int, rx_ticks: int, phase_cycles: float | None = None) -> None:
+        """Add a reception of another anchor: its stated TX stamp and the own RX stamp, 40 bits each, and its phase."""
         if not self._leases.are_held:
             return
         if len(self._pending) >= MAX_PENDING_STAMPS:
             self._pending.popleft()
             self._missed += 1
-        self._pending.append(Stamp(anchor, tx_ticks, rx_ticks))
+        rounded = None if phase_cycles is None else round(phase_cycles, 4) % 1.0  # as text it is short
+        self._pending.append(Stamp(anchor, tx_ticks, rx_ticks, rounded))
 
     def collect(self, now_s: float, unix_s: float) -> StampsMessage | None:
         """The next message if it is due, also one without stamps while an anchor that is asked receives nobody."""

@@ -411,6 +411,8 @@ class Stamp(Struct, frozen=True, array_like=True):
     """Its TX stamp, as its frame states it, 40 bits."""
     rx_ticks: int
     """The publishing anchor's RX stamp, 40 bits."""
+    carrier_phase_cycles: float | None = None
+    """Phase of the carrier at this reception, in [0, 1), where it was measured."""
 
 
 class StampsMessage(Struct, frozen=True):

@@ -19,6 +19,7 @@ from skyless.site.survey.stamps.pair_ranger import PairRanger, StepTable
 from skyless.site.survey.watch.explain import Finding
 from skyless.site.survey.watch.monitor import AnchorWatch
 from skyless.site.survey.watch.moved import Change, with_changes
+from skyless.site.survey.watch.phase_sums import PhaseWatch
 
 NO_DATA_S: Final = 5.0
 """Without stamps for this time a result is out of date."""
@@ -40,6 +41,7 @@ _LAG_S: Final = 30.0
 """For up to twice this time the quickest message counts: a host's clock that was set back is noticed after it."""
 
 _MAX_WAITING_BLOCKS: Final = 100_000  # a minute of a site with 50 anchors
+_MAX_WAITING_LEGS: Final = 100_000
 
 FactsOf = Callable[[Site], Facts]
 """What is known of a site without a user's help."""
@@ -85,12 +87,13 @@ class LiveSurvey:
         t_s = self._sent_s(message.anchor, message.unix_s, now_s)
         for stamp in message.stamps:
             if stamp.anchor in self._known:
-                self._add(stamp.anchor, message.anchor, stamp.tx_ticks, stamp.rx_ticks, t_s, now_s)
+                ticks, phase_cycles = (stamp.tx_ticks, stamp.rx_ticks), stamp.carrier_phase_cycles
+                self._add(AnchorLeg(stamp.anchor, message.anchor, *ticks, t_s, phase_cycles), now_s)
 
     def add_leg(self, leg: AnchorLeg, now_s: float) -> None:
         """Process a reception that was relayed."""
         if leg.sender in self._known and leg.receiver in self._known and not now_s < self._pause_until_s:
-            self._add(leg.sender, leg.receiver, leg.tx_ticks, leg.rx_ticks, leg.t_s, now_s)
+            self._add(leg, now_s)
 
     def set_facts(self, facts: Facts) -> None:
         """Replace what is known. Facts of anchors that the site has not are dropped."""
@@ -222,9 +225,11 @@ class LiveSurvey:
             self._shown = self._ranger.ranges(), now_s
         return self._shown[0]
 
-    def _add(self, sender: int, receiver: int, tx_ticks: int, rx_ticks: int, t_s: float, now_s: float) -> None:
-        self._newest_s = self._heard_s[sender] = self._heard_s[receiver] = now_s
-        self._ranger.add(sender, receiver, tx_ticks, rx_ticks, t_s)
+    def _add(self, leg: AnchorLeg, now_s: float) -> None:
+        self._newest_s = self._heard_s[leg.sender] = self._heard_s[leg.receiver] = now_s
+        self._ranger.add(leg.sender, leg.receiver, leg.tx_ticks, leg.rx_ticks, leg.t_s)
+        if self._watch is not None and leg.carrier_phase_cycles is not None:
+            self._watch.waiting_legs.append(leg)
 
     def _sent_s(self, anchor: int, unix_s: float, now_s: float) -> float:
         """When a message was sent: by its sender's clock, less what the quickest of its messages shows that to be off.
@@ -268,8 +273,9 @@ class _Watched:
 
     def __init__(self, watch: AnchorWatch) -> None:
         self.waiting: deque[PairBlock] = deque(maxlen=_MAX_WAITING_BLOCKS)
+        self.waiting_legs: deque[AnchorLeg] = deque(maxlen=_MAX_WAITING_LEGS)
         self.seen: tuple[Literal["learning", "watching", "no data"], tuple[Finding, ...], int] = ("no data", (), 0)
-        self._watch = watch
+        self._watch, self._phases = watch, PhaseWatch()
 
     def advance(self, now_s: float) -> None:
         """Look at what is waiting."""
@@ -277,4 +283,9 @@ class _Watched:
         while self.waiting:
             watch.add(self.waiting.popleft())
         watch.advance(now_s)
-        self.seen = watch.state, watch.findings, watch.pairs
+        while self.waiting_legs:
+            self._phases.add(self.waiting_legs.popleft())
+        found = watch.findings
+        named = {anchor for one in found if one.kind != "link" for anchor in one.anchors}  # what stamps show is enough
+        found += tuple(one for one in self._phases.findings if not named & set(one.anchors))
+        self.seen = watch.state, found, watch.pairs

@@ -37,6 +37,8 @@ class AnchorLeg(Struct, frozen=True, gc=False):
     """In the counter of the receiver."""
     t_s: float
     """When the listener received the same broadcast, on its own clock."""
+    carrier_phase_cycles: float | None = None
+    """Phase of the carrier as the receiver heard it, where it was measured and relayed."""
 
 
 class _Received(Struct, frozen=True, gc=False):
@@ -97,7 +99,8 @@ class RelayMatcher:
         self._last.pop(pair, None)
         self._last[pair] = relay.rx_ticks
         self.counters["legs"] += 1
-        return AnchorLeg(relay.anchor, anchor, frame.tx_ticks, rx_ticks, frame.t_s)
+        phase_cycles = relay.phase_cycles if isinstance(relay, Heard) else relay.carrier_phase_cycles
+        return AnchorLeg(relay.anchor, anchor, frame.tx_ticks, rx_ticks, frame.t_s, phase_cycles)
 
     def _prune(self, now_ticks: int) -> None:
         """Remove frames that no relay can name any more."""
