@@ -25,7 +25,7 @@ SMALL = {
     "core/air/site_choice.py",
     "core/ticks.py",
 }
-"""Checksum, kind of frame, weak first path, whether there is a phase, which of several sites, wrapping counters: a line of each."""
+"""Checksum, kind of frame, weak first path and phase, which of several sites, wrapping counters: a line of each."""
 WARM_S = 3.0
 
 
