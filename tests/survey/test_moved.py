@@ -14,6 +14,7 @@ from skyless.run.survey.program import SurveyNode, SurveySettings
 from skyless.sim.lab import lab_site
 from skyless.site.survey.facts import Facts, Gauge, PairBlock
 from skyless.site.survey.solve import run_survey
+from skyless.site.survey.stamps.legs import AnchorLeg
 from skyless.site.survey.stamps.pair_ranger import PairRanger, RangeSteps
 from skyless.site.survey.watch.moved import change_of, drop_moved
 
@@ -132,7 +133,7 @@ def test_a_live_survey_goes_on_with_the_time_since_the_motion():
     site = lab_site()
     live = LiveSurvey(site, Facts(heights_m=dict.fromkeys(LAB, 0.0)), watches=False)
     for sender, receiver, tx_ticks, rx_ticks, t_s in legs(LAB, 30.0, hung_elsewhere):
-        live._add(sender, receiver, tx_ticks, rx_ticks, t_s, t_s)
+        live._add(AnchorLeg(sender, receiver, tx_ticks, rx_ticks, t_s), t_s)
     live.finish()
     live.add_result(run_survey(live.ranges(), live.facts), live.ranges())
     change = change_of(live.steps(), live.facts, run_survey)
@@ -150,7 +151,7 @@ def test_the_program_and_the_command_use_the_time_since_the_motion(monkeypatch, 
     node = SurveyNode(SurveySettings(site.id, site), lambda _: Facts(), run_survey, None, lines.append)
     live = node.live = LiveSurvey(site, Facts(heights_m=dict.fromkeys(LAB, 0.0)), watches=False)
     for sender, receiver, tx_ticks, rx_ticks, t_s in legs(LAB, 30.0, hung_elsewhere):
-        live._add(sender, receiver, tx_ticks, rx_ticks, t_s, t_s)
+        live._add(AnchorLeg(sender, receiver, tx_ticks, rx_ticks, t_s), t_s)
         ranger.add(sender, receiver, tx_ticks, rx_ticks, t_s)
     live.finish()
     asyncio.run(node._make_result(live))
