@@ -6,6 +6,7 @@ import pytest
 import skyless
 from recordings.test_formats import muloc_file
 from skyless.core.air.masterless_packets import Relay
+from skyless.core.errors import ConfigurationError
 from skyless.research.foreign import _muloc as muloc
 from skyless.research.foreign.formats import open_recording
 
@@ -23,6 +24,31 @@ def test_stamps_anchors_and_stops(tmp_path):
     truth = muloc.read_truth(path, None)
     assert truth.t_s.tolist() == [0.0, 0.25, 0.5, 0.75, 1.0, 3.0, 3.25, 3.5, 3.75, 4.0]
     assert truth.position_m[[0, -1]].tolist() == [[1.0, 1.0, 0.0], [2.0, 1.0, 0.0]]
+
+
+IQ, RCPHASE = np.zeros((1, 4, 5, 2), dtype=np.int16), np.zeros((1, 4, 5), dtype=np.uint8)
+IQ[0, 0, 1], RCPHASE[0, 0, 1] = (0, 700), 32  # a quarter of a cycle, and the same turned back
+IQ[0, 1, 4], RCPHASE[0, 1, 4] = (-700, 0), 1
+
+
+def read(path, channel, **changed):
+    path.write_bytes(muloc_file(**{"iq": IQ, "rcphase": RCPHASE} | changed))
+    with open_recording(path, channel=channel) as recording:
+        return list(recording), recording.drops
+
+
+def test_one_channel_has_phases(tmp_path):
+    (packet,), _ = read(tmp_path / "one.npz", 1)
+    assert packet.carrier_phase_cycles == 0.5 - 1 / 128
+    assert packet.relays == (Relay(0, 0, 5_000, None, 0.0),)
+    assert read(tmp_path / "one.npz", 3)[0] == []
+    with pytest.raises(ConfigurationError, match="channel is 2; it should be 1 or 3"):
+        read(tmp_path / "one.npz", 2)
+
+
+@pytest.mark.parametrize("changed", [{"iq": IQ[:0]}, {"rcphase": RCPHASE[:0]}, {"iq": RCPHASE}])
+def test_phases_that_do_not_fit_the_rounds_are_damage(tmp_path, changed):
+    assert read(tmp_path / "damaged.npz", 1, **changed) == ([], {"damaged-array": 1})
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ class CarrierModel(Struct, frozen=True, forbid_unknown_fields=True):
     slips: float = 0.0
     """Chance that a tag's phase is half a cycle off from this reception on."""
     wild: float = 0.0
-    """Chance that a tag's phase is any."""
+    """Chance that a tag's phase is random."""
 
 
 class Carriers:

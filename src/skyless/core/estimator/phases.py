@@ -32,9 +32,8 @@ from skyless.core.native.arithmetic import floor, log, sqrt, square
 from skyless.core.native.records import Reals, Ticks
 
 CYCLE_TICKS: Final = 128
-"""In so many ticks there are whole cycles of each channel's carrier: ``EstimatorSettings.carrier_cycles``."""
+"""Whole cycles of each channel's carrier fit into this number of ticks: ``EstimatorSettings.carrier_cycles``."""
 _TWO_PI: Final = 6.283185307179586
-
 
 PHASE_BEGINS, PHASE_REFUSED, PHASE_USED = range(3)
 """What became of a phase."""
@@ -137,7 +136,7 @@ def _use_phase(s: State, state: int, one: Ambiguity, innovation: float, variance
 
 
 def _limit_m2(s: State, variance: float) -> float:
-    """Square of the innovation beyond which a phase is more likely any than noise, or may be the other way round."""
+    """Square of the innovation beyond which a phase is more likely random than noisy, or could be a cycle off."""
     gate_squared = square(s.settings.gate)
     odds = min(s.status.wild_share, 0.5) * sqrt(_TWO_PI * variance) / _wavelength_m(s)
     if odds > 1e-6:
@@ -146,7 +145,7 @@ def _limit_m2(s: State, variance: float) -> float:
 
 
 def _learn_noise(s: State, shown_m2: float) -> None:
-    """Let the variance of phases follow what innovations show beyond their prediction: reflections differ."""
+    """Let the variance of phases follow what innovations show beyond their prediction: reflections differ in size."""
     tuning, status = s.tuning, s.status
     status.phase_variance_m2 += tuning.phase_forgetting * (shown_m2 - status.phase_variance_m2)
     status.phase_variance_m2 = min(
@@ -156,7 +155,7 @@ def _learn_noise(s: State, shown_m2: float) -> None:
 
 
 def _may_count(s: State) -> bool:
-    """Whether the tag's phases may count: not just after the start, nor where stamps contradict or come late."""
+    """Whether the tag's phases may count: neither just after the start nor where stamps contradict the state."""
     status, tuning = s.status, s.tuning
     if status.mean_nis > tuning.phase_nis:
         close_phases(s)

@@ -254,7 +254,7 @@ class Tuning(Record):
     phase_wander: float = 25.0
     """What reflections change in an ambiguity as the tag walks, in variances of a phase for each metre [1/m]."""
     phase_gate: float = 0.35
-    """Part of a wavelength beyond which no innovation is used: half a wavelength may be the other way round."""
+    """Part of a wavelength beyond which no innovation is used: near half of one the sign is not known."""
     phase_share: float = 0.1
     """Part of a wavelength up to which the standard deviation of a predicted phase leaves no doubt of the cycle."""
     phase_step_m: float = 0.02

@@ -3518,7 +3518,7 @@ INTERNAL int32_t use_phase(State *s, int32_t state, Ambiguity *one, real innovat
     return PHASE_USED;
 }
 
-/* Square of the innovation beyond which a phase is more likely any than noise, or may be the other way round. */
+/* Square of the innovation beyond which a phase is more likely random than noisy, or could be a cycle off. */
 INTERNAL real limit_m2(State *s, real variance) {
     real gate_squared = square(s->settings.gate);
     real odds = min_real(s->status.wild_share, REAL(0.5)) * SQRT(TWO_PI * variance) / wavelength_m(s);
@@ -3528,7 +3528,7 @@ INTERNAL real limit_m2(State *s, real variance) {
     return min_real(gate_squared * variance, square(s->tuning.phase_gate * wavelength_m(s)));
 }
 
-/* Let the variance of phases follow what innovations show beyond their prediction: reflections differ. */
+/* Let the variance of phases follow what innovations show beyond their prediction: reflections differ in size. */
 INTERNAL void learn_noise(State *s, real shown_m2) {
     Tuning *tuning = &s->tuning;
     Status *status = &s->status;
@@ -3537,7 +3537,7 @@ INTERNAL void learn_noise(State *s, real shown_m2) {
             square(max_real(tuning->phase_max_std_m, s->settings.phase_std_m)));
 }
 
-/* Whether the tag's phases may count: not just after the start, nor where stamps contradict or come late. */
+/* Whether the tag's phases may count: neither just after the start nor where stamps contradict the state. */
 INTERNAL bool may_count(State *s) {
     Status *status = &s->status;
     Tuning *tuning = &s->tuning;

@@ -99,7 +99,7 @@ typedef double real;
 #define COUNT_BYTES 2
 #define COUNT_MASK 15
 #define CREEPING 2
-/* In so many ticks there are whole cycles of each channel's carrier: ``EstimatorSettings.carrier_cycles``. */
+/* Whole cycles of each channel's carrier fit into this number of ticks: ``EstimatorSettings.carrier_cycles``. */
 #define CYCLE_TICKS 128
 #define DELAYED_TX_GRANULARITY_TICKS 512
 /* Columns are not independent if their smallest singular value is below this part of the largest. */
@@ -704,7 +704,7 @@ typedef struct Tuning {
     real phase_mesh_std_m;  /* Standard deviation of a phase that an anchor measured of another [m]. */
     /* What reflections change in an ambiguity as the tag walks, in variances of a phase for each metre [1/m]. */
     real phase_wander;
-    /* Part of a wavelength beyond which no innovation is used: half a wavelength may be the other way round. */
+    /* Part of a wavelength beyond which no innovation is used: near half of one the sign is not known. */
     real phase_gate;
     /* Part of a wavelength up to which the standard deviation of a predicted phase leaves no doubt of the cycle. */
     real phase_share;

@@ -88,6 +88,9 @@ def read(stream: BufferedIOBase, drops: Drops, channel: int | None = None) -> It
     arrays = arrays_of(stream, drops, *names)
     if arrays is None:
         return
+    if len({len(one) for one in arrays.values()}) > 1:
+        drops["damaged-array"] += 1
+        return
     index, channels, rounds = (arrays[name].tolist() for name in ("index", "channel", "rx_ticks"))
     phases = None if channel is None else phases_cycles(arrays["iq"], arrays["rcphase"])
     before: list[list[int]] = []

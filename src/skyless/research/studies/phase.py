@@ -74,12 +74,11 @@ def _scenes(plan: Plan) -> list[_Scene]:
     quiet = replace(usual, reflections=RangeErrorModel())
     lab = partial(walking, plan, paper_lab_site(plan.noise_ps), warmup_s=_WARMUP_S)
     past = partial(past_wall, plan.tags)
-    resting = partial(still, site, plan.tags)
     return [
         _Scene("lab, no reflections", quiet, lab, (Limit("rmse_m", most=0.005), *honest)),
         _Scene("the room", usual, room, (Limit("rmse_m", most=0.022), Limit("nees", 0.7, 1.3), exceeded)),
         _Scene("the room, phases relayed", usual, partial(_room, plan, relaying), honest),
-        _Scene("at rest", usual, partial(room, paths=resting), honest),
+        _Scene("at rest", usual, partial(room, paths=partial(still, site, plan.tags)), honest),
         _Scene("reflections of 8 mm", stronger, room, honest),
         _Scene("1 % slips", replace(usual, slips=0.01), room, (Limit("nees", most=1.7), exceeded)),
         _Scene("10 % wild", replace(usual, wild=0.1), room, honest),
@@ -104,7 +103,7 @@ def _room(plan: Plan, site: Site, **options: Any) -> Any:  # noqa: ANN401 - of `
 
 
 def _hands(plan: Plan, rate_hz: float, random_walk_fm: float, **options: Any) -> Any:  # noqa: ANN401 - of ``worlds``
-    """Tags in hands, of whose motion filters know, with so many beacons of each anchor a second."""
+    """Tags in hands, with filters that know how hands move, at this rate of beacons of each anchor."""
     site = lab_site(plan.noise_ps)
     site = replace(
         site,

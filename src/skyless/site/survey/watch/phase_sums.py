@@ -33,7 +33,7 @@ _MOST: Final = 4096  # legs in a block
 _LONGEST_GAP_S: Final = 0.1  # between two phases that one is interpolated from
 _LARGEST_SCATTER: Final = 0.12  # cycles of one sum
 _DRIFT_TICKS_PER_S: Final = MAX_BRACKET_RATE * TICK_RATE_HZ
-_LONGEST_JUMP_TICKS: Final = TICK_RATE_HZ  # where clocks may have drifted farther, a restart cannot be told
+_LONGEST_JUMP_TICKS: Final = TICK_RATE_HZ  # where clocks may have drifted farther, a restart cannot be recognised
 
 
 def circular_mean(cycles: Array) -> tuple[float, float]:
