@@ -269,7 +269,7 @@ class Medium(Generic[Result]):
 
     def foresee(self, node: int, local_ticks: int) -> int:
         """True time in whole ticks at which a node's unwrapped counter will show a value."""
-        return foresee(self.clocks, node, local_ticks)
+        return int(foresee(self.clocks, node, local_ticks))
 
     # Anchors
 
