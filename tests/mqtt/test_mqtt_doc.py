@@ -35,6 +35,10 @@ STRUCTS = {
     topics.survey_save_topic(SITE): messages.SurveySaveMessage,
     topics.placement_topic(SITE): messages.PlacementMessage,
     topics.watch_topic(SITE): messages.WatchMessage,
+    topics.assets_topic(SITE): messages.AssetsMessage,
+    topics.alarm_rules_topic(SITE): messages.AlarmRulesMessage,
+    topics.alarm_topic(SITE, "<rule>", "<subject>"): messages.AlarmMessage,
+    topics.acknowledge_topic(SITE, "<rule>", "<subject>"): messages.AcknowledgeMessage,
 }
 
 

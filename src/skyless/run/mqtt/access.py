@@ -63,6 +63,10 @@ _SHOWN: Final = (
     topics.zone_event_topic(EVERY_SITE, "+"),
     topics.tag_zones_topic(EVERY_SITE, EVERY_NODE),
     topics.tag_position_topic(EVERY_SITE, EVERY_NODE),
+    topics.assets_topic(EVERY_SITE),
+    topics.alarm_rules_topic(EVERY_SITE),
+    topics.alarm_topic(EVERY_SITE, "+", "+"),
+    topics.acknowledge_topic(EVERY_SITE, "+", "+"),
 )
 """What the page publishes, whether its users may set up the site or not."""
 

@@ -11,6 +11,7 @@ import msgspec
 from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
 
+from skyless.core.alarm_rule import AlarmRule, RuleKind, Severity
 from skyless.core.site import FloorPlanSite, Outline, Site
 from skyless.site.survey.facts import Facts
 from skyless.site.survey.result import Survey
@@ -37,6 +38,8 @@ class SiteMessage(Struct, frozen=True):
     unix_s: float
     outline_m: Outline | UnsetType = UNSET
     """The room's corners, where the site's file has them."""
+    alarms: tuple[AlarmRule, ...] = ()
+    """The rules of alarms that the site's file has."""
 
     @property
     def whole_site(self) -> Site:
@@ -172,6 +175,8 @@ class TagHealth(Struct, frozen=True):
     """The distance walked within which they do."""
     carrier_phase_anchors: tuple[int, ...] = ()
     """Identifiers of the anchors the phases of whose carriers are in use."""
+    battery_share: float | None = None
+    """What is left in the tag's battery, from 0 to 1; None where it is not known."""
 
 
 class AnchorHealth(Struct, frozen=True):
@@ -514,6 +519,75 @@ class WatchMessage(Struct, frozen=True):
     findings: tuple[WatchFinding, ...]
     pairs: int
     """Pairs of anchors that are watched."""
+
+
+class Asset(Struct, frozen=True):
+    """What a tag is attached to."""
+
+    tag: str
+    """The tag's name."""
+    name: str = ""
+    """What people call it; empty: the tag's name is shown."""
+    group: str = ""
+    icon: str = ""
+    """A few characters, such as an emoji."""
+    colour: str = ""
+    """``#rrggbb``; empty: the group's colour."""
+    owner: str = ""
+    notes: str = ""
+
+
+class AssetsMessage(Struct, frozen=True):
+    """All assets of a site, retained."""
+
+    assets: tuple[Asset, ...]
+    site: str = ""
+    """Name of the site: another one may have the same number."""
+
+
+class AlarmRulesMessage(Struct, frozen=True):
+    """The rules that were made on the page, retained; those of the site's file are in ``SiteMessage``."""
+
+    rules: tuple[AlarmRule, ...]
+    site: str = ""
+    """As of ``AssetsMessage``."""
+
+
+class AlarmMessage(Struct, frozen=True):
+    """One alarm. Its topic names the rule and the subject, which have one alarm at a time."""
+
+    id: str
+    """Of this occurrence: the rule, the subject and the time in milliseconds."""
+    rule: str
+    name: str
+    """The rule's."""
+    kind: RuleKind
+    severity: Severity
+    subject: str
+    """What it is about: ``<tag>``, ``<tag>+<tag>``, ``zone-<id>`` or ``anchor-<id>``."""
+    since_unix_s: float
+    """When the condition began to hold."""
+    unix_s: float
+    """When the alarm was raised."""
+    sentence: str
+    """For people: who, where, what."""
+    tags: tuple[str, ...] = ()
+    zone: str | None = None
+    place: str = ""
+    """Names of the zones that the tag is in, or its coordinates."""
+    position_m: Vector | None = None
+    ended_unix_s: float | None = None
+    acknowledged_unix_s: float | None = None
+    acknowledged_by: str = ""
+
+
+class AcknowledgeMessage(Struct, frozen=True):
+    """Somebody has seen an alarm."""
+
+    id: str
+    """Of the occurrence that was seen; another one is not acknowledged by it."""
+    by: str
+    unix_s: float
 
 
 class WrongMessageError(ValueError):

@@ -98,3 +98,23 @@ def placement_topic(site: int | str) -> str:
 def watch_topic(site: int | str) -> str:
     """Retained ``WatchMessage``: anchors that have moved, delays that have changed, links that are blocked."""
     return f"{ROOT}/{site}/survey/watch"
+
+
+def assets_topic(site: int | str) -> str:
+    """Retained ``AssetsMessage``."""
+    return f"{ROOT}/{site}/assets"
+
+
+def alarm_rules_topic(site: int | str) -> str:
+    """Retained ``AlarmRulesMessage``: the rules that were made on the page."""
+    return f"{ROOT}/{site}/alarm_rules"
+
+
+def alarm_topic(site: int | str, rule: str, subject: str) -> str:
+    """``AlarmMessage``, retained until the alarm has ended and somebody has acknowledged it."""
+    return f"{ROOT}/{site}/alarm/{rule}/{subject}/state"
+
+
+def acknowledge_topic(site: int | str, rule: str, subject: str) -> str:
+    """``AcknowledgeMessage``."""
+    return f"{ROOT}/{site}/alarm/{rule}/{subject}/acknowledge"

@@ -1,0 +1,135 @@
+"""Many fixes in few bytes: the batches that gather, history and the page of a large site exchange.
+
+A batch is a header of 32 bytes and records of 48 bytes, little-endian (``docs/batches.md``). Readers skip what they do
+not know of both, by the sizes that the header states.
+"""
+
+import math
+import struct
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from skyless.core.alert import Alert
+from skyless.run.mqtt.messages import FixMessage
+
+MAGIC: Final = b"SKB2"
+_HEADER: Final = struct.Struct("<4sHHIIQII")
+HEADER_BYTES: Final = _HEADER.size
+
+RECORD: Final = np.dtype(
+    [
+        ("tag", "<u4"),
+        ("flags", "<u2"),
+        ("anchors", "u1"),
+        ("method", "u1"),
+        ("unix_us", "<u8"),
+        ("position_mm", "<i4", 3),
+        ("covariance_m2", "<f4", 3),
+        ("std_z_mm", "<u2"),
+        ("hpl_cm", "<u2"),
+        ("velocity_cmps", "<i2", 2),
+    ]
+)
+"""One fix: the tag's number, flags, anchors used, method (0: not stated), time, position, covariance xx, xy, yy,
+standard deviation of z, protection level and velocity."""
+
+MAX_RECORDS: Final = 1000
+NONE_U16: Final = 65535
+"""No standard deviation of z, or no protection level."""
+
+ALERT_BITS: Final = 0b111
+HEIGHT_GIVEN: Final = 1 << 3
+VERIFIED: Final = 1 << 4
+VELOCITY_KNOWN: Final = 1 << 5
+SIMULATED: Final = 1 << 6
+
+ALERTS: Final = tuple(Alert)
+"""The alert of a record is the number of its value here plus one; 0 for none."""
+
+_MAX_I32: Final = 2**31 - 1
+_MAX_I16: Final = 2**15 - 1
+
+Records = NDArray[Any]
+"""Of dtype ``RECORD``."""
+
+
+class BadBatchError(ValueError):
+    """Bytes that are no batch."""
+
+
+class Batch(Struct, frozen=True):
+    """Fixes of many tags."""
+
+    run: int
+    """Random number of the sender's start."""
+    sequence: int
+    """Number of the batch in this run."""
+    sent_unix_us: int
+    names_issue: int
+    """Number of the table of names that the records' tags are in."""
+    records: Records
+
+
+def encode_batch(batch: Batch) -> bytes:
+    """The bytes of a batch."""
+    head = _HEADER.pack(
+        *(MAGIC, HEADER_BYTES, RECORD.itemsize, batch.run, batch.sequence),
+        *(batch.sent_unix_us, batch.names_issue, len(batch.records)),
+    )
+    return head + batch.records.tobytes()
+
+
+def decode_batch(data: bytes) -> Batch:
+    """The batch of bytes. Raises BadBatchError."""
+    if len(data) < HEADER_BYTES:
+        raise BadBatchError(f"{len(data)} bytes are shorter than a header")
+    magic, header_bytes, record_bytes, run, sequence, sent, issue, count = _HEADER.unpack_from(data)
+    if magic != MAGIC:
+        raise BadBatchError(f"it begins with {magic!r}")
+    if header_bytes < HEADER_BYTES or record_bytes < RECORD.itemsize:
+        raise BadBatchError(f"its header has {header_bytes} bytes and its records {record_bytes}")
+    if count > MAX_RECORDS or len(data) != header_bytes + count * record_bytes:
+        raise BadBatchError(f"{len(data)} bytes are not {count} records")
+    if record_bytes == RECORD.itemsize:
+        records = np.frombuffer(data, RECORD, count, header_bytes)
+    else:
+        whole = np.frombuffer(data, np.uint8, count * record_bytes, header_bytes).reshape(count, record_bytes)
+        records = np.ascontiguousarray(whole[:, : RECORD.itemsize]).view(RECORD).reshape(count)
+    return Batch(run, sequence, sent, issue, records)
+
+
+def records_of(fixes: Sequence[tuple[int, FixMessage]], *, simulated: bool) -> Records:
+    """Records of fixes, each with its tag's number. Values beyond a field's range are given as its limit."""
+    rows = [_row(number, fix, simulated=simulated) for number, fix in fixes]
+    return np.array(rows, RECORD)
+
+
+def _row(number: int, fix: FixMessage, *, simulated: bool) -> tuple[Any, ...]:
+    flags = SIMULATED if simulated else 0
+    flags |= 0 if fix.alert is None else 1 + ALERTS.index(Alert(fix.alert))
+    flags |= HEIGHT_GIVEN if fix.height_known else 0
+    flags |= VERIFIED if fix.verified_until_s is not None else 0
+    velocity = (0, 0)
+    if fix.velocity_mps is not None:
+        flags |= VELOCITY_KNOWN
+        velocity = _scaled(fix.velocity_mps[0], 100.0, _MAX_I16), _scaled(fix.velocity_mps[1], 100.0, _MAX_I16)
+    xx, xy, _, _, yy, _, _, _, zz = fix.covariance_m2
+    std_z_mm = NONE_U16 if fix.height_known else _counted(math.sqrt(max(zz, 0.0)), 1000.0)
+    hpl_cm = NONE_U16 if fix.hpl_m is None else _counted(fix.hpl_m, 100.0)
+    position_mm = tuple(_scaled(value, 1000.0, _MAX_I32) for value in fix.position_m)
+    unix_us = max(0, round(1e6 * fix.unix_s))
+    anchors = min(len(fix.anchors), 255)
+    return number, flags, anchors, 0, unix_us, position_mm, (xx, xy, yy), std_z_mm, hpl_cm, velocity
+
+
+def _scaled(value: float, scale: float, most: int) -> int:
+    return min(max(round(scale * value), -most), most) if math.isfinite(value) else 0
+
+
+def _counted(value: float, scale: float) -> int:
+    """A value that is not negative, below the mark for none."""
+    return min(max(round(scale * value), 0), NONE_U16 - 1) if math.isfinite(value) else NONE_U16

@@ -1,0 +1,74 @@
+"""Where the history of a site lies, and what its files hold (``docs/history.md``).
+
+    FOLDER/site=<n>/day=<yyyy-mm-dd>/<first>-<last>.parquet    fixes; first and last number of the rows in the journal
+    FOLDER/site=<n>/events/<first>-<last>.parquet              events
+    FOLDER/site=<n>/names.parquet                              the tags' numbers and names
+    FOLDER/site=<n>/zones.parquet                              the zones' identifiers, names and corners
+    FOLDER/site=<n>/journal/                                   what is not in Parquet yet
+
+The day is that of arrival, in UTC. Any engine that reads Parquet can read and join them.
+"""
+
+from pathlib import Path
+from typing import Final, Literal
+
+FIX_COLUMNS: Final = {
+    "tag": "uint32",
+    "t": "timestamp[ms, tz=UTC]",
+    "x_mm": "int32",
+    "y_mm": "int32",
+    "z_mm": "int32",
+    "std_mm": "uint16",
+    "hpl_cm": "uint16",
+    "flags": "uint16",
+}
+"""Sorted by tag and t. ``std_mm`` is the one-sigma radial error, ``hpl_cm`` 65535 for no level; ``flags`` are those of
+a record of a batch (``run/fix_batch.py``)."""
+
+EVENT_COLUMNS: Final = {
+    "t": "timestamp[ms, tz=UTC]",
+    "kind": "string",
+    "tag": "string",
+    "zone": "string",
+    "subject": "string",
+    "alarm": "string",
+    "text": "string",
+}
+"""``kind`` is an ``EventKind``. ``tag`` and ``zone`` are the tag's name and the zone's identifier, null where there is
+none; ``subject`` names an anchor or what an alarm is about; ``alarm`` is the alarm's id; ``text`` is for people."""
+
+EventKind = Literal["enter", "leave", "alarm-raised", "alarm-ended", "alarm-acknowledged", "offline", "online"]
+
+NAME_COLUMNS: Final = {"tag": "uint32", "name": "string", "since": "timestamp[ms, tz=UTC]"}
+ZONE_COLUMNS: Final = {"zone": "string", "name": "string", "corners_m": "string"}
+"""``corners_m`` is a list of pairs in JSON."""
+
+NUMBER_DIGITS: Final = 12
+
+
+def site_folder(folder: Path, site: int) -> Path:
+    """Everything of one site."""
+    return folder / f"site={site}"
+
+
+def fixes_pattern(folder: Path, site: int) -> str:
+    """The pattern of all files of fixes, as DuckDB takes it."""
+    return str(site_folder(folder, site) / "day=*" / "*.parquet")
+
+
+def events_pattern(folder: Path, site: int) -> str:
+    """The same of events."""
+    return str(site_folder(folder, site) / "events" / "*.parquet")
+
+
+def file_name(first: int, last: int) -> str:
+    """The name of a file with these rows."""
+    return f"{first:0{NUMBER_DIGITS}}-{last:0{NUMBER_DIGITS}}.parquet"
+
+
+def rows_of(file: Path) -> tuple[int, int] | None:
+    """First and last number in a file's name; None for another file."""
+    first, dash, last = file.stem.partition("-")
+    if file.suffix != ".parquet" or not dash or not (first.isdecimal() and last.isdecimal()):
+        return None
+    return int(first), int(last)
