@@ -140,7 +140,7 @@ def test_strangers_may_call_it_by_its_names_only(stranger, host, status):
 
 
 def test_zones_are_stored(browser, live):
-    zone = {"id": "desk", "name": "Desk", "polygon_m": [[0, 0], [1, 0], [1, 1]], "colour": None}
+    zone = {"id": "desk", "name": "Desk", "polygon_m": [[0, 0], [1, 0], [1, 1]], "colour": None, "floor": 2}
     answer = browser.put("/api/zones", json={"zones": [zone]})
     assert answer.status_code == 200
     assert answer.json() == {"zones": [zone]}
@@ -163,10 +163,10 @@ def test_wrong_zones_are_refused_and_nothing_changes(browser, live):
 )
 def test_the_floor_plan(browser, live, image, kind):
     assert browser.get("/api/floor_plan").status_code == 404
-    live.floor_plan = image
+    live.plans[None] = image
     answer = browser.get("/api/floor_plan")
     assert (answer.content, answer.headers["content-type"]) == (image, kind)
-    live.floor_plan = b"<svg onload='alert(1)'>"
+    live.plans[None] = b"<svg onload='alert(1)'>"
     assert browser.get("/api/floor_plan").status_code == 404
 
 

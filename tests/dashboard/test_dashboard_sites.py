@@ -102,7 +102,7 @@ def test_requests_and_pages_are_of_the_site_that_they_name(stage):
     stage.on_broker(s1=1, s5=1)
     client = stage.client()
     plan = b"\x89PNG\r\n\x1a\n" + bytes(8)
-    stage.sites.of("5").floor_plan = plan
+    stage.sites.of("5").plans[None] = plan
     assert client.get("/api/floor_plan", params={"site": "5"}).content == plan
     assert client.get("/api/floor_plan", params={"site": "1"}).status_code == 404
     assert client.get("/api/floor_plan").status_code == 404

@@ -35,10 +35,8 @@ def pixels(page, canvas):
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGBA"))
 
 
-def send_site(server, page, outline_m=None, **changes):
-    message = made_up.site_message(time.time())
-    if outline_m:
-        message["outline_m"] = outline_m
+def send_site(server, page, beside=None, **changes):
+    message = made_up.site_message(time.time()) | (beside or {})
     message["site"] |= changes
     server.send({"type": "site", "site": message})
     until(page, "name => skyless.state.site.name === name", message["site"]["name"])
@@ -70,7 +68,7 @@ def test_without_walls_the_area_of_the_anchors_is_named_as_such(hall):
 def test_the_outline_of_the_site_is_the_room_and_in_view(hall):
     server, seen = hall
     corners = [[-3, 0], [27, 0], [27, 9], [12, 14], [-3, 14]]
-    send_site(server, seen.page, corners, name="Outlined", walls=[])
+    send_site(server, seen.page, {"outline_m": corners}, name="Outlined", walls=[])
     outline = seen.page.evaluate(modules(["map/room"], "return room.roomOutline();"))
     assert (outline["kind"], outline["corners"]) == ("room", corners)
     assert "room, 30.0 m × 14.0 m" in written(seen.page)
@@ -370,6 +368,25 @@ def test_tags_and_anchors_of_other_floors_are_dimmed(hall):
         ["map/floors"], "const other = floors.otherFloor(); return [other(2.8, 0), other(6, 1), other(3.5)];"
     )
     assert page.evaluate(dimmed) == [False, True, True]
+
+
+def test_floors_of_the_site_s_file(hall):
+    """Their names, zones that lie on one, and tags whose height is given: they are on the floor of their zone."""
+    server, seen = hall
+    page = seen.page
+    floors = [{"number": 0, "low_m": 0.0, "name": "Ground"}, {"number": 1, "low_m": 3.0, "name": "Offices"}]
+    send_site(server, page, name="House", anchors=two_floors(), beside={"floors": floors})
+    page.click("#legend summary")
+    assert page.locator("#floor option").all_inner_texts() == ["all", "Ground", "Offices"]
+    page.select_option("#floor", "1")
+    whole = {"name": "Everywhere", "polygon_m": [[-99, -99], [99, -99], [99, 99], [-99, 99]], "colour": None}
+    server.send({"type": "zones", "zones": [{"id": "all", **whole, "floor": 1}]})
+    until(page, "skyless.state.zones.length === 1")
+    until(page, "skyless.live.all.get('robot')?.count > 3")
+    script = """const row = new Float64Array(21);
+        row[17] = 1;
+        return [tags.floorByZone(row), tags.floorByZone(row.with(17, 0)), floors.chosenFloor().name];"""
+    assert page.evaluate(modules(["map/tags", "map/floors"], script)) == [1, None, "Offices"]
 
 
 def test_anchors_above_each_other_have_one_line_of_names(hall):

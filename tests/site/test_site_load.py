@@ -211,7 +211,7 @@ def test_files_that_are_not_there(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "key", [key for key in SITE_LIMITS if not key.startswith(("walls", "floor_plan", "georeference"))]
+    "key", [key for key in SITE_LIMITS if not key.startswith(("walls", "floors", "floor_plan", "georeference"))]
 )
 @pytest.mark.parametrize("number", ["nan", "inf", "-inf", "true", '"1"', "1979-05-27"])
 def test_no_number_takes_what_is_none(refused, key, number):

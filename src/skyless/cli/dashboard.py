@@ -70,7 +70,7 @@ def dashboard(
     if address is None:
         raise SkylessError("--mqtt is 'none'; it should be the broker of the site to show")
     address.tls_context()
-    known, image = (None, None) if site is None else _load(site)
+    known, images = (None, {}) if site is None else _load(site)
     if known is not None and site_id is not None and known.site.id != site_id:
         raise SkylessError(f"--site-id is {site_id}, but {site} is of site {known.site.id}; give one of them")
     if recordings is not None and not recordings.is_dir():
@@ -81,7 +81,7 @@ def dashboard(
     rules = _rules(sock.getsockname()[0], listening.host, port, token)
     make = partial(LiveSite, _client_name(port), str(address), used_share=ProcessorUse().share)
     live = make(known)
-    live.floor_plan = image
+    live.plans.update(images)
     page = _address(listening.host, port, rules)
     if json:
         print_json({"page": page, "mqtt": str(address), "token": rules.token})
@@ -101,15 +101,16 @@ def _client_name(port: int) -> str:
     return f"{re.sub(r'[^A-Za-z0-9_.-]', '-', socket.gethostname())}-{port}"
 
 
-def _load(name: str) -> "tuple[SiteMessage, bytes | None]":
-    """The site and the image of its floor. Raises SkylessError."""
+def _load(name: str) -> "tuple[SiteMessage, dict[int | None, bytes]]":
+    """The site, and the images of its floors by their numbers. Raises SkylessError."""
     import time
 
     from skyless.run.mqtt.messages import site_message
+    from skyless.site.file.check import plan_files
 
     site = site_named(name)
-    image = None if site.floor_plan is None else (Path(name).parent / site.floor_plan.image).read_bytes()
-    return site_message(site, simulated=False, unix_s=time.time()), image
+    images = {floor: file.read_bytes() for floor, file in plan_files(site, Path(name)).items()}
+    return site_message(site, simulated=False, unix_s=time.time()), images
 
 
 def _listening(listen: str | None) -> "ListenAddress":

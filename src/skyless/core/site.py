@@ -130,6 +130,21 @@ class FloorPlanSite(Struct, frozen=True, forbid_unknown_fields=True):
     """Site coordinates of the image's lower left corner."""
 
 
+class FloorSite(Struct, frozen=True, forbid_unknown_fields=True):
+    """One storey of a building, and the image of its plan where it has one of its own."""
+
+    number: int
+    """As of its anchors."""
+    low_m: float
+    """Height of its ground: a tag above it, and below the next floor's, is on it."""
+    name: str = ""
+    image: str | None = None
+    """As of ``FloorPlanSite``, as are the next three."""
+    width_m: float | None = None
+    x_m: float = 0.0
+    y_m: float = 0.0
+
+
 class GeoreferenceSite(Struct, frozen=True, forbid_unknown_fields=True):
     """Position of the site's origin on the Earth (WGS 84)."""
 
@@ -174,6 +189,8 @@ class Site(Struct, frozen=True, forbid_unknown_fields=True):
     """Those whose positions are not known yet, in protocol 2."""
     outline_m: Outline | UnsetType = UNSET
     """The room, where the file has it. Messages carry it beside the site: earlier versions refuse a site with it."""
+    floors: tuple[FloorSite, ...] | UnsetType = UNSET
+    """The storeys, the lowest first, where the file has them. Messages carry them beside the site as well."""
 
     @property
     def all_anchors(self) -> tuple[AnchorSite | UnplacedAnchor, ...]:

@@ -147,7 +147,10 @@ async def _fixes(request: Request) -> Response:
 
 
 async def _floor_plan(request: Request) -> Response:
-    return _image(_live_of(request).floor_plan)
+    """The image of the whole site, or of the floor that ``?floor=NUMBER`` names."""
+    floor = request.query_params.get("floor")
+    number = None if floor is None else round(_number(request, "floor", 0, -128, 127))
+    return _image(_live_of(request).plans.get(number))
 
 
 def _image(image: bytes | None) -> Response:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 import msgspec
-from msgspec import Struct
+from msgspec import UNSET, Struct
 
 from skyless.bridges.target import bridged_site
 from skyless.core.errors import ConfigurationError
@@ -166,7 +166,8 @@ class LiveSite:
         """
         self.name, self.broker = name, broker
         self.site = site
-        self.floor_plan: bytes | None = None
+        self.plans: dict[int | None, bytes] = {}
+        """The images of the floors by their numbers; None is that of the whole site."""
         self.connected = False
         self.state = SiteState()
         self.monitor = ZoneMonitor()
@@ -185,6 +186,7 @@ class LiveSite:
         self._health_due_s = self._condition_due_s = 0.0
         self.evidence = Evidence(host, clock())
         if site is not None:
+            self._set_floors(site)
             self.evidence.set_site(site.site, clock())
         self.log = EventLog(wall_clock() - clock())
         self._condition_monitor = ConditionMonitor(self.evidence)
@@ -202,6 +204,7 @@ class LiveSite:
         handlers: dict[str, Callable[[str, bytes], None]] = {
             topics.site_topic(site_id): self._on_site,
             topics.floor_plan_topic(site_id): self._on_floor_plan,
+            topics.plan_of_floor_topic(site_id, "+"): self._on_floor_plan,
             topics.fix_topic(site_id, "+"): self._on_fix,
             topics.status_topic(site_id, "+", "+"): self._on_status,
             topics.health_topic(site_id, "+", "+"): self._on_health,
@@ -248,25 +251,36 @@ class LiveSite:
         if message.site.id != self._site_id:
             raise WrongMessageError(f"it is of site {message.site.id}")
         self.site = message
+        self._set_floors(message)
         self.evidence.set_site(message.site, self._clock())
         self._broadcast("site", encode("site", {"site": message}))
         self._assign_zones()
 
+    def _set_floors(self, message: SiteMessage) -> None:
+        self.monitor.floors = () if message.floors is UNSET else message.floors
+
     def _on_floor_plan(self, topic: str, payload: bytes) -> None:
-        image = payload or None
-        if image != self.floor_plan:
+        image, floor = payload or None, _floor_of(topic)
+        if image != self.plans.get(floor):
             if self._link is not None:
                 self._link.forget(topic)  # an image that was stored here must not come back after a reconnect
-            self._show_floor_plan(image)
+            self._show_floor_plan(floor, image)
 
-    def _show_floor_plan(self, image: bytes | None) -> None:
-        self.floor_plan = image
+    @property
+    def floor_plan(self) -> bytes | None:
+        """The image of the whole site's floor."""
+        return self.plans.get(None)
+
+    def _show_floor_plan(self, floor: int | None, image: bytes | None) -> None:
+        self.plans.pop(floor, None)
+        if image is not None:
+            self.plans[floor] = image
         self._broadcast("floor_plan", self._floor_plan_message())
 
     def _floor_plan_message(self) -> bytes:
-        """Lets pages load the image again when it is another one."""
-        digest = None if self.floor_plan is None else f"{zlib.crc32(self.floor_plan):08x}"
-        return encode("floor_plan", {"digest": digest})
+        """Lets pages load an image again when it is another one."""
+        digests = {floor: f"{zlib.crc32(image):08x}" for floor, image in self.plans.items()}
+        return encode("floor_plan", {"digest": digests.pop(None, None), "floors": digests})
 
     def _on_fix(self, topic: str, payload: bytes) -> None:
         fix = read_message(payload, FixMessage)
@@ -398,7 +412,7 @@ class LiveSite:
         """Store the image of the floor, a PNG or JPEG, at the broker. Raises NoBrokerError."""
         link, site_id = self._connected()
         link.publish(topics.floor_plan_topic(site_id), image, qos=1, retain=True)
-        self._show_floor_plan(image)
+        self._show_floor_plan(None, image)
 
     def _connected(self) -> tuple[Link, int]:
         if self._link is None or self._site_id is None or not self.connected:
@@ -436,7 +450,7 @@ class LiveSite:
         self.state.now_s = self._clock()
         page.replace("condition", self._condition_message())
         page.replace("log", encode("log", {"events": self.log.since()}))
-        if self.floor_plan is not None:
+        if self.plans:
             page.replace("floor_plan", self._floor_plan_message())
         if self._sites is not None:
             page.replace("sites", self._sites)
@@ -539,6 +553,17 @@ class LiveSite:
         message = encode("zone_event", msgspec.structs.asdict(event))
         for page in self.pages:
             page.add_event(message)
+
+
+def _floor_of(topic: str) -> int | None:
+    """The number of the floor whose plan a topic carries, or None for the whole site. Raises WrongMessageError."""
+    name = topic.rsplit("/", 1)[-1]
+    if name == "floor_plan":
+        return None
+    try:
+        return int(name)
+    except ValueError:
+        raise WrongMessageError(f"it is of the floor {name[:20]!r}") from None
 
 
 def _qos(topic: str) -> int:

@@ -4,7 +4,7 @@ import asyncio
 import secrets
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Final, Literal
@@ -333,13 +333,13 @@ class Anchors:
         log: Log,
         *,
         simulated: Callable[[], bool],
-        floor_plan: Path | None = None,
+        plans: Mapping[int | None, Path] | None = None,
         keys: AnchorKeys | None = None,
         allow_placement: bool = False,
     ) -> None:
         """``simulated`` is asked again when a radio has restarted: its port may lead to another device."""
         self._site, self._log, self._keys = site, log, keys
-        self._site_publisher = SitePublisher(site, simulated, floor_plan)
+        self._site_publisher = SitePublisher(site, simulated, plans)
         self.nodes = tuple(
             AnchorNode(site, int(radio.name), radio, log, keys, allow_placement=allow_placement) for radio in radios
         )

@@ -16,7 +16,7 @@ import socket
 import sys
 import tempfile
 import time
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -26,7 +26,7 @@ from skyless.core.site import Site
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import RESEND_S, Handler, Link
 from skyless.run.mqtt.messages import SiteMessage, WrongMessageError, read_message, site_message
-from skyless.run.mqtt.topics import floor_plan_topic, site_topic
+from skyless.run.mqtt.topics import floor_plan_topic, plan_of_floor_topic, site_topic
 
 HEALTH_S: Final = 1.0
 """Interval of the health messages."""
@@ -197,13 +197,15 @@ class SitePublisher:
     A broker that others read may have missed it, or lost it.
     """
 
-    def __init__(self, site: Site, is_simulated: Callable[[], bool], floor_plan: Path | None = None) -> None:
-        self._site, self._is_simulated, self._floor_plan = site, is_simulated, floor_plan
+    def __init__(
+        self, site: Site, is_simulated: Callable[[], bool], plans: Mapping[int | None, Path] | None = None
+    ) -> None:
+        """``plans`` are the images of the floors by their numbers; None is that of the whole site."""
+        self._site, self._is_simulated, self._plans = site, is_simulated, dict(plans or {})
         self._restarts: int | None = None
         self._simulated = False
         self._published: SiteMessage | None = None
         self._repeat_s = 0.0  # when it is published again, by the host's monotonic clock
-        self._has_floor_plan = False
 
     def place(self, site: Site) -> None:
         """Publish the site of a survey from now on."""
@@ -224,9 +226,10 @@ class SitePublisher:
             return
         self._repeat_s = now_s + RESEND_S * random.uniform(0.5, 1.0)
         link.publish(site_topic(self._site.id), self._published, qos=1, retain=True)
-        if self._floor_plan is not None and not self._has_floor_plan:
-            self._has_floor_plan = True
-            link.publish(floor_plan_topic(self._site.id), self._floor_plan.read_bytes(), qos=1, retain=True)
+        site, plans, self._plans = self._site.id, self._plans, {}
+        for floor, file in plans.items():
+            topic = floor_plan_topic(site) if floor is None else plan_of_floor_topic(site, floor)
+            link.publish(topic, file.read_bytes(), qos=1, retain=True)
 
 
 # Folders and files

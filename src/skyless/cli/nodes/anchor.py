@@ -56,6 +56,7 @@ def anchor(
     from skyless.run.keys.node_keys import AnchorKeys
     from skyless.run.open_radio import is_simulated, open_radios
     from skyless.run.process import run
+    from skyless.site.file.check import plan_files
 
     plan, address = site_named(site), broker.address()
     nodes = {node.id: node for node in plan.all_anchors}
@@ -74,14 +75,13 @@ def anchor(
                 "free"
             )
         chains = AnchorKeys(keys, plan.id, log)
-    image = None if plan.floor_plan is None else Path(site).parent / plan.floor_plan.image
     anchors = Anchors(
         plan,
         radios,
         address,
         log,
         simulated=lambda: is_simulated(radio),
-        floor_plan=image,
+        plans=plan_files(plan, Path(site)),
         keys=chains,
         allow_placement=allow_placement,
     )

@@ -78,9 +78,13 @@ export function fileOf(name) {
   return new URL(`api/recordings/${encodeURIComponent(name)}/file`, document.baseURI).href;
 }
 
-/** Address of the floor plan's image: of a recording, or with null of the live site, whose digest differs by image. */
-export function floorPlanOf(name, digest) {
-  const path = name === null ? `api/floor_plan${ofSite(`digest=${digest}`)}` : `api/recordings/${encodeURIComponent(name)}/floor_plan`;
+/**
+ * Address of the floor plan's image: of a recording, or with null of the live site, whose digest differs by image; and
+ * there of the floor of a number, or with null of the whole site.
+ */
+export function floorPlanOf(name, digest, floor = null) {
+  const query = floor === null ? `digest=${digest}` : `digest=${digest}&floor=${floor}`;
+  const path = name === null ? `api/floor_plan${ofSite(query)}` : `api/recordings/${encodeURIComponent(name)}/floor_plan`;
   return new URL(path, document.baseURI).href;
 }
 

@@ -237,6 +237,7 @@ const handlers = {
   },
   floor_plan(message) {
     state.floorDigest = message.digest;
+    state.floorDigests = message.floors ?? {};
     changed("site");
   },
   zone_event(message) {
@@ -265,6 +266,7 @@ function forgetOtherSite() {
     live.clear();
     clearHistory();
     state.floorDigest = null;
+    state.floorDigests = {};
     changed("tags");
   }
   keptOf = now;

@@ -71,6 +71,8 @@ export const state = {
   setup: { open: false },
   /** @type {string|null} changes with the floor plan's image */
   floorDigest: null,
+  /** The same of single floors, by their numbers. @type {Record<string, string>} */
+  floorDigests: {},
   /** @type {any[]|null} */
   recordings: null,
   /** @type {any} the recording that `player.js` plays */
@@ -123,9 +125,9 @@ export function healthAge_s(kind, name) {
   return heard === undefined ? Infinity : (performance.now() - heard) / 1e3;
 }
 
-/** The site of a message, with the outline that stands beside it there; null without one. */
+/** The site of a message, with the outline and the floors that stand beside it there; null without one. */
 export function siteOf(message) {
-  return message ? { ...message.site, outline_m: message.outline_m } : null;
+  return message ? { ...message.site, outline_m: message.outline_m, floors: message.floors } : null;
 }
 
 /** Select one tag, anchor or zone, or with null none; its tab opens, also where it is selected already. */

@@ -75,6 +75,7 @@ ACCESS: Final = {
         publish=(
             topics.site_topic(EVERY_SITE),
             topics.floor_plan_topic(EVERY_SITE),
+            topics.plan_of_floor_topic(EVERY_SITE, "+"),
             topics.stamps_topic(EVERY_SITE, EVERY_NODE),
             topics.truth_topic(EVERY_SITE),
             *_status("anchor", "ether"),

@@ -12,7 +12,7 @@ from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
 
 from skyless.core.alarm_rule import AlarmRule, RuleKind, Severity
-from skyless.core.site import FloorPlanSite, Outline, Site
+from skyless.core.site import FloorPlanSite, FloorSite, Outline, Site
 from skyless.site.survey.facts import Facts
 from skyless.site.survey.result import Survey
 
@@ -32,24 +32,27 @@ class SiteMessage(Struct, frozen=True):
     """The site as in its file, retained, so that a new tag or page has it at once."""
 
     site: Site
-    """Without its outline, which earlier versions refuse in it."""
+    """Without its outline and floors, which earlier versions refuse in it."""
     simulated: bool
     """True when its radios are emulated."""
     unix_s: float
     outline_m: Outline | UnsetType = UNSET
     """The room's corners, where the site's file has them."""
+    floors: tuple[FloorSite, ...] | UnsetType = UNSET
+    """The storeys, where the site's file has them."""
     alarms: tuple[AlarmRule, ...] = ()
     """The rules of alarms that the site's file has."""
 
     @property
     def whole_site(self) -> Site:
         """The site as in its file."""
-        return replace(self.site, outline_m=self.outline_m)
+        return replace(self.site, outline_m=self.outline_m, floors=self.floors)
 
 
 def site_message(site: Site, *, simulated: bool, unix_s: float) -> SiteMessage:
-    """The message of a site: its outline stands beside it."""
-    return SiteMessage(replace(site, outline_m=UNSET), simulated, unix_s, site.outline_m)
+    """The message of a site: its outline and its floors stand beside it."""
+    inner = replace(site, outline_m=UNSET, floors=UNSET)
+    return SiteMessage(inner, simulated, unix_s, site.outline_m, site.floors)
 
 
 class StatusMessage(Struct, frozen=True):
@@ -340,6 +343,8 @@ class Zone(Struct, frozen=True):
     name: str
     polygon_m: tuple[tuple[float, float], ...]
     colour: str | None = None
+    floor: int | None = None
+    """Number of the floor that it lies on; None: it reaches over all floors."""
 
 
 class SiteZones(Struct, frozen=True):

@@ -17,6 +17,11 @@ def floor_plan_topic(site: int | str) -> str:
     return f"{ROOT}/{site}/floor_plan"
 
 
+def plan_of_floor_topic(site: int | str, floor: int | str) -> str:
+    """The same of one of several floors, by its number."""
+    return f"{ROOT}/{site}/floor_plan/{floor}"
+
+
 def fix_topic(site: int | str, tag: str) -> str:
     """``FixMessage``."""
     return f"{ROOT}/{site}/tag/{tag}/fix"

@@ -4,10 +4,13 @@ No I/O; the time is passed in. Noise at an edge causes no series of events: a ta
 lies beyond it by the margin, or by half of the margin in every fix for a while. In between, it stays on its side.
 """
 
+import math
 from typing import Final
 
 from skyless.core.ellipse import horizontal_ellipse
+from skyless.core.site import FloorSite
 from skyless.run.mqtt.messages import FixMessage, Vector, Zone, ZoneEvent
+from skyless.run.zones.floors import floor_at
 from skyless.run.zones.zone_list import area_m2, depth_m, perimeter_m
 
 MIN_MARGIN_M: Final = 0.05
@@ -45,6 +48,8 @@ class _TagState:
         self.updated_s = 0.0
         self.position_m: Vector = (0.0, 0.0, 0.0)
         self.inside: set[str] = set()
+        self.floor: int | None = None
+        """The number of its floor; None where its height or the floors are not known."""
         self.beyond_since_s: dict[str, float] = {}
         """By zone: start of the time in which every fix was beyond its edge by half of the margin."""
 
@@ -54,6 +59,8 @@ class ZoneMonitor:
 
     def __init__(self) -> None:
         self.zones: tuple[Zone, ...] = ()
+        self.floors: tuple[FloorSite, ...] = ()
+        """The site's; a tag whose height is known is in zones of its floor only, and in those over all floors."""
         self._monitored: dict[str, _MonitoredZone] = {}
         self._tags: dict[str, _TagState] = {}
 
@@ -75,9 +82,16 @@ class ZoneMonitor:
         tag = self._tags.setdefault(fix.tag, _TagState())
         tag.updated_s, tag.position_m = now_s, fix.position_m
         margin_m = max(MIN_MARGIN_M, _MARGIN_SIGMAS * horizontal_ellipse(fix.covariance_m2)[0])
+        std_z_m = math.sqrt(max(fix.covariance_m2[8], 0.0))
+        tag.floor = None if fix.height_known else floor_at(self.floors, fix.position_m[2], std_z_m, tag.floor)
         events = []
         for zone_id, zone in self._monitored.items():
-            if zone_id not in tag.inside and not zone.may_hold(fix.position_m):
+            if tag.floor is not None and zone.zone.floor not in (None, tag.floor):
+                tag.beyond_since_s.pop(zone_id, None)
+                if zone_id in tag.inside:
+                    tag.inside.discard(zone_id)
+                    events.append(_event(zone.zone, fix.tag, tag, fix.unix_s, entered=False))
+            elif zone_id not in tag.inside and not zone.may_hold(fix.position_m):
                 tag.beyond_since_s.pop(zone_id, None)
             elif _crossed(tag, zone, fix, margin_m):
                 events.append(_event(zone.zone, fix.tag, tag, fix.unix_s, entered=zone_id in tag.inside))
@@ -92,6 +106,12 @@ class ZoneMonitor:
         """The zones that a tag is in, the smallest first."""
         inside = self._tags[name].inside if name in self._tags else set()
         return sorted((self._monitored[zone].zone for zone in inside), key=lambda zone: area_m2(zone.polygon_m))
+
+    def floor_of(self, name: str) -> int | None:
+        """The number of the floor that a tag is on: by its height, or else by the smallest zone that lies on one."""
+        if name in self._tags and self._tags[name].floor is not None:
+            return self._tags[name].floor
+        return next((zone.floor for zone in self.zones_with(name) if zone.floor is not None), None)
 
     def remove_tag(self, name: str, unix_s: float) -> list[ZoneEvent]:
         """Remove a tag from all zones."""

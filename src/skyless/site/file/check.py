@@ -6,7 +6,7 @@ Every violation is a configuration error.
 import math
 import re
 from collections.abc import Iterator, Sequence
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Final
 
@@ -93,6 +93,11 @@ SITE_LIMITS: Final = {
     "walls.y2_m": _COORDINATE,
     "walls.loss_db": Limits(0, 200, "decibels"),
     "walls.delay_m": Limits(0, 100, "metres"),
+    "floors.number": Limits(-128, 127, whole=True),
+    "floors.low_m": _COORDINATE,
+    "floors.width_m": Limits(0, MAX_COORDINATE_M, "metres", above=True),
+    "floors.x_m": _COORDINATE,
+    "floors.y_m": _COORDINATE,
     "floor_plan.width_m": Limits(0, MAX_COORDINATE_M, "metres", above=True),
     "floor_plan.x_m": _COORDINATE,
     "floor_plan.y_m": _COORDINATE,
@@ -123,6 +128,9 @@ _OTHERS: Final = {
     "anchors": "a list of [[anchors]] tables, one for each anchor",
     "walls": "a list of [[walls]] tables",
     "outline_m": f"the room's {_FEWEST_CORNERS} to {_MAX_CORNERS} corners in order, [x, y] each in metres",
+    "floors": "a list of [[floors]] tables, the lowest floor first",
+    "floors.name": "a text",
+    "floors.image": "the path of a PNG or JPEG file, relative to the site file",
     "floor_plan.image": "the path of a PNG or JPEG file, relative to the site file",
 }
 
@@ -140,6 +148,7 @@ HALF_WRAP_S: Final = (1 << (TICK_BITS - 1)) * TICK_S
 
 _CLOSEST_M: Final = 1e-3
 _MAX_LISTED: Final = 20
+_MAX_FLOORS: Final = 100
 
 
 def check_site(site: Site, file: Path) -> None:
@@ -158,6 +167,7 @@ def check_site(site: Site, file: Path) -> None:
             path = key if row is None else f"{name}[{row}].{field}"
             raise ConfigurationError(file, _with_anchor(path, site), value, str(limit))
     _check_outline(site, file)
+    _check_floors(site, file)
     _check_anchors(site, file)
     if site.schedule.needs_master:
         _check_slots(site, file)
@@ -166,25 +176,54 @@ def check_site(site: Site, file: Path) -> None:
         _check_protocol_2(site, file)
 
 
-def check_floor_plan(site: Site, file: Path) -> None:
-    """Check that the floor plan's image is a PNG or JPEG that can be read.
+def _check_floors(site: Site, file: Path) -> None:
+    """Check that floors are listed from the lowest up, each once, and that an image has its width."""
+    if site.floors is UNSET:
+        return
+    if len(site.floors) > _MAX_FLOORS:
+        raise ConfigurationError(file, "floors", f"{len(site.floors)} tables", f"at most {_MAX_FLOORS}")
+    for row, floor in enumerate(site.floors):
+        if (floor.image is None) != (floor.width_m is None):
+            key = "image" if floor.image is None else "width_m"
+            right = "given, as image and width_m belong together"
+            raise ConfigurationError(file, f"floors[{row}].{key}", None, right)
+    for row, (below, floor) in enumerate(pairwise(site.floors), 1):
+        for key in ("number", "low_m"):
+            least = getattr(below, key)
+            if getattr(floor, key) <= least:
+                right = f"above {least}, that of the floor before it: the lowest comes first"
+                raise ConfigurationError(file, f"floors[{row}].{key}", getattr(floor, key), right)
+
+
+def plan_files(site: Site, file: Path) -> dict[int | None, Path]:
+    """The images of a site's floors by their numbers; None is the number of the whole site's."""
+    named: dict[int | None, str | None] = {None: None if site.floor_plan is None else site.floor_plan.image}
+    named |= {floor.number: floor.image for floor in (() if site.floors is UNSET else site.floors)}
+    return {number: file.parent / image for number, image in named.items() if image is not None}
+
+
+def check_floor_plans(site: Site, file: Path) -> None:
+    """Check that the images of all floors are PNGs or JPEGs that can be read.
 
     Raises:
-        ConfigurationError: when it is not.
+        ConfigurationError: when one is not.
     """
-    if site.floor_plan is None:
-        return
-    image = site.floor_plan.image
+    if site.floor_plan is not None:
+        _check_image(file, "floor_plan.image", site.floor_plan.image)
+    for row, floor in enumerate(() if site.floors is UNSET else site.floors):
+        if floor.image is not None:
+            _check_image(file, f"floors[{row}].image", floor.image)
+
+
+def _check_image(file: Path, key: str, image: str) -> None:
     path = file.parent / image
     try:
         size = image_size(path.read_bytes())
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
-        raise ConfigurationError(
-            file, "floor_plan.image", image, f"a file that can be read ({path}: {reason})"
-        ) from None
+        raise ConfigurationError(file, key, image, f"a file that can be read ({path}: {reason})") from None
     if size is None:
-        raise ConfigurationError(file, "floor_plan.image", image, "a PNG or JPEG image")
+        raise ConfigurationError(file, key, image, "a PNG or JPEG image")
 
 
 def with_anchor(path: str, anchors: Sequence[object], unplaced: Sequence[object] = ()) -> str:

@@ -15,6 +15,7 @@ from skyless.core.site import (
     AccuracySite,
     AnchorSite,
     FloorPlanSite,
+    FloorSite,
     GeoreferenceSite,
     NoiseSite,
     ScheduleSite,
@@ -23,7 +24,7 @@ from skyless.core.site import (
     UnplacedAnchor,
     WallSite,
 )
-from skyless.site.file.check import check_floor_plan, check_site, expected, with_anchor
+from skyless.site.file.check import check_floor_plans, check_site, expected, with_anchor
 
 _MAX_BYTES: Final = 1 << 24  # devices do not end
 _TOO_DEEP: Final = re.compile(rb"(?:[\w-]+[ \t]*\.[ \t]*){64}")
@@ -37,7 +38,7 @@ _TABLES: Final[dict[str, type[Struct]]] = {
     "floor_plan": FloorPlanSite,
     "georeference": GeoreferenceSite,
 }
-_LISTS: Final[dict[str, type[Struct]]] = {"anchors": AnchorSite, "walls": WallSite}
+_LISTS: Final[dict[str, type[Struct]]] = {"anchors": AnchorSite, "walls": WallSite, "floors": FloorSite}
 
 _FINDING = re.compile(r"(?P<finding>.*?)(?: - at `\$\.?(?P<path>.*)`)?", re.DOTALL)
 _MISSING = re.compile(r"Object missing required field `(?P<name>\w+)`")
@@ -60,7 +61,7 @@ def load_site(path: Path | str) -> Site:
     except ConfigurationError as error:
         key, right = _in_file(error.key, rows), _in_file(error.expected, rows)
         raise ConfigurationError(path, key, error.value, right) from None
-    check_floor_plan(site, path)
+    check_floor_plans(site, path)
     return site
 
 

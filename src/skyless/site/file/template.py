@@ -9,6 +9,7 @@ from msgspec import UNSET, structs
 from skyless.core.site import (
     AnchorSite,
     FloorPlanSite,
+    FloorSite,
     GeoreferenceSite,
     Outline,
     ScheduleSite,
@@ -141,6 +142,21 @@ _FLOOR_PLAN = """
 {off}y_m = {y_m}
 """
 
+_FLOORS = """
+# Several floors, the lowest first: a tag is on the one that its height says.
+"""
+
+_FLOOR = """\
+{off}[[floors]]
+{off}number = {number}                    # that of its anchors
+{off}low_m = {low_m}                   # height of its ground
+{off}name = {name}
+{off}image = {image}         # a plan of its own, as of [floor_plan]
+{off}width_m = {width_m}
+{off}x_m = {x_m}
+{off}y_m = {y_m}
+"""
+
 _GEOREFERENCE = """
 # Position of the site's origin on the Earth (WGS 84).
 {off}[georeference]
@@ -153,6 +169,7 @@ _GEOREFERENCE = """
 _EXAMPLE_OUTLINE: Final = ((0.0, 0.0), (12.0, 0.0), (12.0, 8.0), (0.0, 8.0))
 _EXAMPLE_RATE_HZ: Final = 30.0
 _EXAMPLE_PLAN = FloorPlanSite(image="floor.png", width_m=6.0)
+_EXAMPLE_FLOOR = FloorSite(number=1, low_m=3.2, name="Upper floor", image="upper.png", width_m=6.0)
 _EXAMPLE_GEOREFERENCE = GeoreferenceSite(latitude_deg=47.3769, longitude_deg=8.5417, height_m=408.0)
 
 
@@ -221,8 +238,21 @@ def _tail(site: Site) -> str:
     return (
         (_WALLS + walls if walls else _NO_WALLS)
         + _FLOOR_PLAN.format(**{**structs.asdict(plan), "image": image}, off=_off(site.floor_plan is not None))
+        + _floors(site)
         + _GEOREFERENCE.format(**structs.asdict(earth), off=_off(site.georeference is not None))
     )
+
+
+def _floors(site: Site) -> str:
+    floors, off = ((_EXAMPLE_FLOOR,), _off(False)) if site.floors is UNSET else (site.floors, "")
+    return _FLOORS + "".join(_floor(floor, off) for floor in floors)
+
+
+def _floor(floor: FloorSite, off: str) -> str:
+    """Its table; a floor without an image has none of the keys of one."""
+    texts = {key: json.dumps(getattr(floor, key), ensure_ascii=False) for key in ("name", "image")}
+    table = _FLOOR.format(**{**structs.asdict(floor), **texts}, off=off)
+    return table if floor.image is not None else "".join(table.splitlines(keepends=True)[:4])
 
 
 def rectangle(width_m: float, depth_m: float) -> Outline:

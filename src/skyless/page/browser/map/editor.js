@@ -4,6 +4,7 @@ import { changed, select, state } from "../store.js";
 import { putZones } from "../api.js";
 import { showStored } from "../live.js";
 import { toast } from "../dom.js";
+import { chosenFloor } from "./floors.js";
 
 const SNAP_M = 0.05;
 const COLOURS = ["#3b8ed0", "#c2763a", "#3f9b6c", "#a05fc4", "#b3a02e", "#c65b78"];
@@ -56,6 +57,7 @@ export async function finish() {
     id: freshId(),
     name: freshName(),
     polygon_m: editor.points,
+    floor: chosenFloor()?.number ?? null,
     colour: COLOURS.find((colour) => !state.zones.some((one) => one.colour === colour)) ?? COLOURS[0],
   };
   cancel();

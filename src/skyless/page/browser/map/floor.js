@@ -6,7 +6,7 @@ import { state } from "../store.js";
 import { metres } from "../format.js";
 import { surveyShown } from "../survey/model.js";
 import { height_m, moving, plan } from "../survey/plan.js";
-import { groundHeight } from "./floors.js";
+import { chosenFloor, groundHeight } from "./floors.js";
 import { drawInMetres, isNarrow, px, py, roundLength, toSite, toX, toY, view } from "./view.js";
 
 /** @type {{image: HTMLImageElement, x_m: number, y_m: number, width_m: number, height_m: number}|null} */
@@ -18,10 +18,16 @@ let retryTimer = 0;
 /** Over a floor plan an overlay is transparent, as in the planner's pictures; elsewhere its colours are those of its scale. */
 const OVER_PLAN = 0.75;
 
-/** Load the floor plan of the live site or of the recording, if it has one, and call `done` when it is loaded. */
+/**
+ * Load the plan of the chosen floor if it has one, else of the live site or of the recording, and call `done` when it is
+ * loaded.
+ */
 export function loadFloor(done) {
-  const stated = state.site?.floor_plan ?? null;
-  const address = floorPlanOf(state.player?.name ?? null, state.floorDigest);
+  const chosen = state.player ? undefined : chosenFloor();
+  const own = chosen?.image ? chosen : null;
+  const stated = own ?? state.site?.floor_plan ?? null;
+  const digest = own ? state.floorDigests[own.number] : state.floorDigest;
+  const address = floorPlanOf(state.player?.name ?? null, digest, own ? own.number : null);
   const key = JSON.stringify([stated, stated && address]);
   if (key === floorOf) return;
   clearTimeout(retryTimer);

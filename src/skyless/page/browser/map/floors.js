@@ -1,4 +1,4 @@
-/** Floors of the site: from the anchors' `floor` in the site file, or heights that the user gives; and the chosen one. */
+/** Floors of the site: those of the site file, else from its anchors' `floor`, or heights that the user gives; and the chosen one. */
 
 import { changed, saveSetting, savedSetting, state } from "../store.js";
 
@@ -7,6 +7,7 @@ const KEY = "skyless-floors";
 /** Floors from the lowest up, with the height of each floor's ground; fewer than two are none. */
 export function floors() {
   const given = givenHeights();
+  if (state.site?.floors?.length > 1) return state.site.floors.map((floor) => ({ ...floor, name: floor.name || `floor ${floor.number}` }));
   if (given.length > 1) return given.map((low_m, index) => ({ name: `floor ${index} (from ${low_m} m)`, low_m }));
   const numbers = [...new Set((state.site?.anchors ?? []).map((anchor) => anchor.floor ?? 0))].sort((a, b) => a - b);
   if (numbers.length < 2) return [];
@@ -47,9 +48,14 @@ export function chooseFloor(index) {
   changed("options");
 }
 
+/** The chosen floor, with its number and plan where the site file has them; undefined while all are shown. */
+export function chosenFloor() {
+  return state.options.floor === null ? undefined : floors()[state.options.floor];
+}
+
 /** Height of the chosen floor's ground; 0 while all are shown. */
 export function groundHeight() {
-  return (state.options.floor !== null && floors()[state.options.floor]?.low_m) || 0;
+  return chosenFloor()?.low_m ?? 0;
 }
 
 /** A test whether something at a height, or an anchor with its floor, belongs to another floor than the chosen one. */

@@ -125,6 +125,7 @@ export function start() {
   });
   let overlay = "none";
   on(["options"], () => {
+    loadFloor(redraw);
     if (overlay !== state.options.overlay && !view.touched) fitAll();
     overlay = state.options.overlay;
   });

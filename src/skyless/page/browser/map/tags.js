@@ -10,6 +10,7 @@ import { drawMark, tagStyle } from "./marks.js";
 import { drawNames } from "./names.js";
 import { drawStub } from "./trails.js";
 import { foreshortening, halfAxes, isSeen, seenCovariance, toX, toY, view } from "./view.js";
+import { inside } from "./zones.js";
 
 /** With more tags than this only the selected one is named. */
 export const NAMED = 40;
@@ -48,9 +49,16 @@ export function visibleTags() {
     if (!isSeen(x, y, MARGIN) && !selected && track.name !== state.followed) return;
     const style = tagStyle(index, list.length);
     const colour = fresh === "fresh" ? style.colour : palette.muted;
-    seen.push({ track, colour, shape: style.shape, fresh, row, selected, other: other(row[Z]), x: 0, y: 0 });
+    seen.push({ track, colour, shape: style.shape, fresh, row, selected, other: other(row[Z], floorByZone(row)), x: 0, y: 0 });
   });
   return { seen, shown, moving, ageing };
+}
+
+/** The floor of the zone that holds a tag whose height was given; undefined where its height says it, or no zone does. */
+export function floorByZone(row) {
+  if (!row[HEIGHT_GIVEN] || !state.site?.floors) return undefined;
+  const zone = state.zones.find((one) => typeof one.floor === "number" && inside(one.polygon_m, row[X], row[Y]));
+  return zone?.floor;
 }
 
 /** Draw all tags. */

@@ -4,7 +4,7 @@ import { state } from "../store.js";
 import { faint, palette } from "../theme.js";
 import { label } from "./anchors.js";
 import { editor } from "./editor.js";
-import { groundHeight } from "./floors.js";
+import { chosenFloor, groundHeight } from "./floors.js";
 import { toX, toY } from "./view.js";
 
 /** A zone's colour; the page's where it has none or one that the browser does not know. */
@@ -24,7 +24,9 @@ export function flash(id) {
 export function drawZones(context) {
   const now = performance.now();
   for (const [id, until] of flashing) if (until < now) flashing.delete(id);
+  const floor = chosenFloor()?.number;
   for (const zone of state.zones) {
+    if (floor !== undefined && (zone.floor ?? floor) !== floor) continue;
     const chosen = state.selection.zone === zone.id;
     const colour = zoneColour(zone);
     outline(context, zone.polygon_m, true);

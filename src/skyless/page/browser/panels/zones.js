@@ -1,14 +1,15 @@
 /** Zones: their names, colours and corners; and the tags that entered and left. */
 
 import { select, state, toggleSelection } from "../store.js";
-import { Rows, h, text, toast } from "../dom.js";
+import { Rows, h, options, text, toast } from "../dom.js";
 import { sentence, timeOfDay } from "../format.js";
 import { add as addZones, change, editor, remove } from "../map/editor.js";
+import { floors } from "../map/floors.js";
 import { startDrawing } from "../map/tools.js";
 import { zoneColour } from "../map/zones.js";
 
 export const title = "Zones";
-export const topics = ["zones", "events", "selection", "mode", "editor"];
+export const topics = ["zones", "events", "selection", "mode", "editor", "site"];
 export const interval_ms = 60;
 
 let parts = null;
@@ -107,7 +108,8 @@ function makeZone(id, zone) {
   );
   const del = h("button", { type: "button", class: "quiet", onclick: () => remove(id) }, "Delete");
   const table = h("div", { class: "corners", hidden: true });
-  const element = h("li", {}, h("div", { class: "zone" }, swatch, name, corners, del), table);
+  const floor = options({ "aria-label": `Floor of ${zone.name}` }, [], (value) => change(id, { floor: value === "" ? null : Number(value) }));
+  const element = h("li", {}, h("div", { class: "zone" }, swatch, name, floor, corners, del), table);
   let shown = "";
   const update = (now) => {
     const chosen = state.selection.zone === id;
@@ -116,8 +118,15 @@ function makeZone(id, zone) {
     const colour = zoneColour(now);
     if (document.activeElement !== swatch && colour.startsWith("#")) swatch.value = colour;
     if (document.activeElement !== name) name.value = now.name;
+    const numbered = floors().filter(({ number }) => number !== undefined);
+    floor.hidden = !numbered.length;
+    if (document.activeElement !== floor) {
+      const choices = [["", "all floors"], ...numbered.map((one) => [one.number, one.name])];
+      floor.replaceChildren(...choices.map(([value, words]) => h("option", { value }, words)));
+      floor.value = String(now.floor ?? "");
+    }
     del.setAttribute("aria-label", `Delete ${now.name}`);
-    for (const input of [swatch, name, del]) input.disabled = state.mode !== "live";
+    for (const input of [swatch, name, floor, del]) input.disabled = state.mode !== "live";
     table.hidden = !chosen;
     const key = JSON.stringify(now.polygon_m);
     if (chosen && key !== shown && !table.contains(document.activeElement)) table.replaceChildren(...cornerRows(now));
