@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from skyless.core.errors import ConfigurationError
 from skyless.core.method_names import DEFAULT_METHOD, METHODS
 from skyless.core.site import AccuracySite, AnchorSite, FloorPlanSite, TagsSite
 from skyless.page.overlay_process import overlay_grids
-from skyless.page.overlays import MAX_CELLS, NoOverlayError, Overlays, overlay_task
+from skyless.page.overlays import MAX_CELLS, MovedAnchor, MovedAnchors, NoOverlayError, Overlays, overlay_task
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.planning.colours import COLOUR_STOPS
 from skyless.site.planning.links import HDOP, PDOP, SIGMA
@@ -74,16 +75,18 @@ def test_the_methods_of_tags_are_predicted_each_as_itself():
     assert len({sigma[5] for sigma in sigmas}) == len(METHODS)
 
 
-def get(overlays, *args):
-    return asyncio.run(overlays.get(*args))
+async def answers_of(*requests):
+    """What one server answers."""
+    overlays = Overlays()
+    try:
+        return [await overlays.get(*request) for request in requests]
+    finally:
+        overlays.stop()
 
 
 def test_one_process_answers_all_three_kinds():
-    async def ask():
-        overlays = Overlays()
-        return [await overlays.get(LAB, None, ["weighted"], kind, 1.0) for kind in ("pdop", "hdop", "sigma")]
-
-    pdop, hdop, sigma = asyncio.run(ask())
+    kinds = ("pdop", "hdop", "sigma")
+    pdop, hdop, sigma = asyncio.run(answers_of(*((LAB, None, ["weighted"], kind, 1.0) for kind in kinds)))
     assert (pdop["unit"], hdop["unit"], sigma["unit"]) == ("1", "1", "m")
     assert (sigma["x_m"], sigma["y_m"], sigma["columns"], sigma["rows"]) == ([0.5, 5.5], [0.5, 7.5], 6, 8)
     assert len(sigma["values"]) == 48
@@ -97,7 +100,29 @@ def test_one_process_answers_all_three_kinds():
 def test_too_few_anchors_are_an_error():
     site = replace(LAB, anchors=LAB.anchors[:3], tags=TagsSite())
     with pytest.raises(NoOverlayError, match="4 anchors or more"):
-        get(Overlays(), site, None, [], "pdop", 1.0)
+        asyncio.run(answers_of((site, None, [], "pdop", 1.0)))
+
+
+def test_a_process_that_has_died_is_started_again():
+    async def ask():
+        overlays = Overlays()
+        try:
+            await overlays.get(LAB, None, ["weighted"], "pdop", 2.0)
+            overlays._process._process.kill()
+            overlays._process._process.wait()
+            return await overlays.get(LAB, None, ["weighted"], "pdop", 1.0)
+        finally:
+            overlays.stop()
+
+    assert asyncio.run(ask())["columns"] == 6
+
+
+def test_anchors_are_moved_in_the_prediction_only():
+    moved = MovedAnchors((MovedAnchor(2, 4.0, 1.0, 2.0),)).site_of(LAB)
+    assert [(a.x_m, a.y_m, a.z_m) for a in moved.anchors if a.id == 2] == [(4.0, 1.0, 2.0)]
+    assert [a for a in moved.anchors if a.id != 2] == [a for a in LAB.anchors if a.id != 2]
+    with pytest.raises(ConfigurationError, match="the same point"):
+        MovedAnchors((MovedAnchor(2, 0.0, 0.0, 0.0),)).site_of(LAB)
 
 
 @pytest.mark.statistical

@@ -18,13 +18,14 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from skyless.core.errors import SkylessError
+from skyless.core.errors import ConfigurationError, SkylessError
+from skyless.core.site import Site
 from skyless.page._geojson import MEDIA_TYPE
 from skyless.page._site_survey import NoResultError
 from skyless.page._state import PageRequest
 from skyless.page.guard import AccessRules, Guard
 from skyless.page.live import LiveSite, NoBrokerError, NoSiteError, NotAllowedError, TooManyPagesError
-from skyless.page.overlays import KINDS, NoOverlayError, Overlays
+from skyless.page.overlays import KINDS, MovedAnchors, NoOverlayError, Overlays
 from skyless.page.playback import NoRecordingError, Playback, RecordingFile
 from skyless.page.sites import LiveSites
 from skyless.page.what_if import NoWhatIfError, WhatIfs, WhatIfTask
@@ -86,7 +87,7 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
         Route("/fixes.geojson", _fixes),
         Route("/api/floor_plan", _floor_plan),
         Route("/api/floor_plan", _put_floor_plan, methods=["PUT"]),
-        Route("/api/overlay", _overlay),
+        Route("/api/overlay", _overlay, methods=["GET", "POST"]),
         Route("/api/zones", _put_zones, methods=["PUT"]),
         Route("/api/survey/facts", _put_facts, methods=["PUT"]),
         Route("/api/survey/save", _save_survey, methods=["POST"]),
@@ -175,7 +176,19 @@ async def _overlay(request: Request) -> Response:
     step_m = _number(request, "step_m", 0.25, 0.01, 100.0)
     if live.site is None:
         raise HTTPException(404, "no site is known yet")
-    return _json(await overlays.get(live.site.whole_site, live.floor_plan, live.state.methods(), kind, step_m))
+    site = await _planned(request, live.site.whole_site)
+    return _json(await overlays.get(site, live.floor_plan, live.state.methods(), kind, step_m))
+
+
+async def _planned(request: Request, site: Site) -> Site:
+    """The site as it would be with the anchors where the request's body has them; as it is where there is none."""
+    body = await _body(request, _MAX_BODY_BYTES, "too many anchors")
+    if not body:
+        return site
+    try:
+        return msgspec.json.decode(body, type=MovedAnchors).site_of(site)
+    except (msgspec.MsgspecError, ValueError, RecursionError, ConfigurationError) as error:
+        raise HTTPException(400, str(error)) from None
 
 
 def _number(request: Request, name: str, default: float, least: float, most: float) -> float:

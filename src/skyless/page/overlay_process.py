@@ -1,7 +1,5 @@
-"""The process that computes overlays: a task from standard input, its grids to standard output."""
+"""The process that computes overlays."""
 
-import os
-import sys
 from typing import Final
 
 import msgspec
@@ -11,20 +9,17 @@ from skyless.core.arrays import Array
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import DEFAULT_METHOD, METHODS
 from skyless.page.overlays import OverlayGrids, OverlayTask
+from skyless.page.task_process import serve_tasks
 from skyless.site.planning.links import FIX_SHARE, HDOP, PDOP, SIGMA
 from skyless.site.planning.maps import Grid, plan_map
 from skyless.site.planning.predict import MAX_PREDICTED, PlanSettings, Predictor
 
-_NICE: Final = 19  # positioning on this machine has priority
-
 _MIN_FIX_SHARE: Final = 0.5
 
 
-def main() -> None:
-    """Compute one task."""
-    os.nice(_NICE)
-    task = msgspec.json.decode(sys.stdin.buffer.read(), type=OverlayTask)
-    sys.stdout.buffer.write(msgspec.json.encode(overlay_grids(task)))
+def answer(task: bytes) -> bytes:
+    """The grids of one task, both as JSON."""
+    return msgspec.json.encode(overlay_grids(msgspec.json.decode(task, type=OverlayTask)))
 
 
 def overlay_grids(task: OverlayTask) -> OverlayGrids:
@@ -66,4 +61,4 @@ def _values(column: Array, digits: int) -> list[float | None]:
 
 
 if __name__ == "__main__":
-    main()
+    serve_tasks(answer)

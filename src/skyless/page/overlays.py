@@ -2,6 +2,7 @@
 
 import asyncio
 from collections import Counter, OrderedDict
+from pathlib import Path
 from typing import Any, Final, Literal
 
 import msgspec
@@ -11,7 +12,7 @@ from msgspec.structs import replace
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.site import Site
 from skyless.page.task_process import TaskError, TaskProcess
-from skyless.site.file.check import image_size
+from skyless.site.file.check import check_site, image_size
 from skyless.site.planning.colours import COLOUR_STOPS, scale_of
 
 Kind = Literal["pdop", "hdop", "sigma"]
@@ -23,12 +24,38 @@ _MAX_CACHED: Final = 8
 Box = tuple[float, float, float, float]
 
 
+class MovedAnchor(Struct, frozen=True):
+    """Where an anchor would be."""
+
+    id: int
+    x_m: float
+    y_m: float
+    z_m: float
+
+
+class MovedAnchors(Struct, frozen=True):
+    """What a page asks about: the site as it would be with some anchors elsewhere."""
+
+    anchors: tuple[MovedAnchor, ...] = ()
+
+    def site_of(self, site: Site) -> Site:
+        """The site with its anchors moved. Raises ConfigurationError."""
+        at = {anchor.id: anchor for anchor in self.anchors}
+        anchors = tuple(
+            replace(one, x_m=at[one.id].x_m, y_m=at[one.id].y_m, z_m=at[one.id].z_m) if one.id in at else one
+            for one in site.anchors
+        )
+        moved = replace(site, anchors=anchors)
+        check_site(moved, Path("the moved anchors"))
+        return moved
+
+
 class NoOverlayError(Exception):
     """Why there is no overlay."""
 
 
 class OverlayTask(Struct, frozen=True):
-    """Input of the process, as JSON on standard input."""
+    """Input of the process, as JSON."""
 
     site: Site
     box_m: Box

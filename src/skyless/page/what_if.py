@@ -16,7 +16,7 @@ class NoWhatIfError(Exception):
 
 
 class WhatIfTask(Struct, frozen=True):
-    """Input of the process, as JSON on standard input."""
+    """Input of the process, as JSON."""
 
     path: str
     tag: str

@@ -1,8 +1,6 @@
-"""The process that prepares a recording for being recomputed: a task from standard input, tables to standard output."""
+"""The process that prepares a recording for being recomputed."""
 
 import ctypes
-import os
-import sys
 from collections.abc import Iterator
 from typing import Any, Final
 
@@ -23,26 +21,24 @@ from skyless.core.native.records import Record
 from skyless.core.native.views import view
 from skyless.core.tag.hearing import Hearing
 from skyless.core.tag.receiver import Receiver
+from skyless.page.task_process import serve_tasks
 from skyless.page.what_if import WhatIf, WhatIfAnchor, WhatIfTask
 from skyless.run.mqtt.messages import RawReception, SegmentStart
 from skyless.run.recordings.reception_log import RefusedError, load
 from skyless.run.recordings.recording import McapRecording
 
-_NICE: Final = 19  # positioning on this machine has priority
 _PAGE_BYTES: Final = 1024
 _LEAST_STD_M: Final = 0.1
 """A filter that begins at a fix is no surer than this: its anchors may stand elsewhere now."""
 
 
-def main() -> None:
-    """Prepare one recording."""
-    os.nice(_NICE)
-    task = msgspec.json.decode(sys.stdin.buffer.read(), type=WhatIfTask)
+def answer(task: bytes) -> bytes:
+    """The tables of one recording; the task and they are JSON."""
     try:
-        found = _Tables(task).filled()
+        found = _Tables(msgspec.json.decode(task, type=WhatIfTask)).filled()
     except SkylessError as error:
         found = WhatIf(error=str(error))
-    sys.stdout.buffer.write(msgspec.json.encode(found))
+    return msgspec.json.encode(found)
 
 
 class _Tables:
@@ -189,4 +185,4 @@ def _bytes_of(rows: list[Any]) -> bytes:
 
 
 if __name__ == "__main__":
-    main()
+    serve_tasks(answer)
