@@ -8,7 +8,8 @@ from typing import Any, Final, TypeVar
 from urllib.parse import quote
 
 import msgspec
-from msgspec import Struct
+from msgspec import Struct, field
+from msgspec.structs import replace
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
@@ -28,6 +29,7 @@ from skyless.page.live import LiveSite, NoBrokerError, NoSiteError, NotAllowedEr
 from skyless.page.overlays import KINDS, MovedAnchors, NoOverlayError, Overlays
 from skyless.page.playback import NoRecordingError, Playback, RecordingFile
 from skyless.page.sites import LiveSites
+from skyless.page.task_process import TaskError, TaskProcess
 from skyless.page.what_if import NoWhatIfError, WhatIfs, WhatIfTask
 from skyless.run.mqtt.survey_facts import BadFactsError
 from skyless.run.zones.zone_list import BadZonesError, read_zones
@@ -68,6 +70,7 @@ class Services(Struct, frozen=True):
     overlays: Overlays
     playback: Playback
     what_ifs: WhatIfs
+    sheets: TaskProcess = field(default_factory=lambda: TaskProcess("skyless.page.sheet_process"))
 
 
 def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Starlette:
@@ -88,6 +91,7 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
         Route("/api/floor_plan", _floor_plan),
         Route("/api/floor_plan", _put_floor_plan, methods=["PUT"]),
         Route("/api/overlay", _overlay, methods=["GET", "POST"]),
+        Route("/api/sheet", _sheet, methods=["POST"]),
         Route("/api/zones", _put_zones, methods=["PUT"]),
         Route("/api/survey/facts", _put_facts, methods=["PUT"]),
         Route("/api/survey/save", _save_survey, methods=["POST"]),
@@ -189,6 +193,21 @@ async def _planned(request: Request, site: Site) -> Site:
         return msgspec.json.decode(body, type=MovedAnchors).site_of(site)
     except (msgspec.MsgspecError, ValueError, RecursionError, ConfigurationError) as error:
         raise HTTPException(400, str(error)) from None
+
+
+async def _sheet(request: Request) -> Response:
+    """The installer's sheet of the site, with anchors where the request's body has them."""
+    live = _live_of(request)
+    if live.site is None:
+        raise HTTPException(404, "no site is known yet")
+    site = await _planned(request, live.site.whole_site)
+    try:
+        pdf = await _services(request).sheets.run(msgspec.json.encode({"site": replace(site, floor_plan=None)}))
+    except TaskError as error:
+        raise HTTPException(503, str(error)) from None
+    if not pdf:
+        raise HTTPException(422, "the sheet could not be drawn; the dashboard's terminal shows why")
+    return Response(pdf, media_type="application/pdf")
 
 
 def _number(request: Request, name: str, default: float, least: float, most: float) -> float:

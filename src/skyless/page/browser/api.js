@@ -53,9 +53,17 @@ export function putFloorPlan(image) {
   return fetchJson(`api/floor_plan${ofSite()}`, { method: "PUT", headers: { "content-type": image.type }, body: image });
 }
 
-/** The values of an overlay on a grid. */
-export function overlay(kind, step_m) {
-  return fetchJson(`api/overlay${ofSite(`kind=${encodeURIComponent(kind)}&step_m=${step_m}`)}`);
+/** The values of an overlay on a grid, also with some anchors elsewhere. */
+export function overlay(kind, step_m, anchors = []) {
+  const body = anchors.length ? { method: "POST", body: JSON.stringify({ anchors }) } : {};
+  return fetchJson(`api/overlay${ofSite(`kind=${encodeURIComponent(kind)}&step_m=${step_m}`)}`, body);
+}
+
+/** The sheet for those who mount the anchors, a PDF, also with some anchors elsewhere. @returns {Promise<Blob>} */
+export async function installersSheet(anchors) {
+  const answer = await fetch(new URL(`api/sheet${ofSite()}`, document.baseURI), { method: "POST", body: JSON.stringify({ anchors }) });
+  if (!answer.ok) throw new Error((await answer.json()).error);
+  return answer.blob();
 }
 
 /** All recordings, newest first. */

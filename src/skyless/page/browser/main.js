@@ -5,6 +5,7 @@ import * as banner from "./banner.js";
 import * as legend from "./legend.js";
 import * as live from "./live.js";
 import * as map from "./map/map.js";
+import * as placing from "./map/placing.js";
 import * as partNote from "./part_note.js";
 import * as replay from "./replay_bar.js";
 import * as sites from "./sites.js";
@@ -25,6 +26,7 @@ if (address.searchParams.has("token")) {
 theme.start();
 map.start();
 tools.start();
+placing.start();
 legend.start();
 tabs.start();
 replay.start();

@@ -2,7 +2,7 @@
  * The one state of the page. Modules change it and notify the topics; callbacks run at most once a frame.
  *
  * Topics: connection, site, zones, events, health, tags, mode, player, recordings, selection, options, overlay, editor,
- * theme, survey, watch, setup, picking, plan, condition, log, read, sites.
+ * theme, survey, watch, setup, picking, plan, placing, condition, log, read, sites.
  */
 
 /** @type {Map<string, Set<() => void>>} */

@@ -5,6 +5,7 @@ import { on, state } from "../store.js";
 import { surveyShown } from "../survey/model.js";
 import { palette } from "../theme.js";
 import { groundHeight, otherFloor } from "./floors.js";
+import { placed } from "./placing.js";
 import { isSeen, toX, toY, view } from "./view.js";
 
 const MARK = 7;
@@ -84,7 +85,9 @@ export function drawAnchors(context) {
   const names = [];
   const master = masterNow();
   const seen = [];
-  for (const anchor of state.site?.anchors ?? []) {
+  for (const own of state.site?.anchors ?? []) {
+    const anchor = placed(own);
+    if (anchor !== own) ghost(context, own);
     const x = toX(anchor.x_m, anchor.y_m);
     const y = toY(anchor.x_m, anchor.y_m, anchor.z_m);
     if (!isSeen(x, y) && !view.spatial) continue;
@@ -119,6 +122,17 @@ export function drawAnchors(context) {
     label(context, words, x, y + MARK + below);
   }
   context.globalAlpha = 1;
+}
+
+/** Where an anchor is, while it is shown at a place that is tried. */
+function ghost(context, { x_m, y_m, z_m }) {
+  context.strokeStyle = palette.muted;
+  context.lineWidth = 1.5;
+  context.setLineDash([2, 3]);
+  context.beginPath();
+  context.arc(toX(x_m, y_m), toY(x_m, y_m, z_m), MARK, 0, 2 * Math.PI);
+  context.stroke();
+  context.setLineDash([]);
 }
 
 /** Whether there are many marks, and more than two in each cell of this size. */

@@ -47,7 +47,8 @@ export function savePicture() {
   mapPicture().toBlob((blob) => blob && save(blob, "png"), "image/png");
 }
 
-function save(blob, ending) {
+/** Save a file that is named after the site and the time. */
+export function save(blob, ending) {
   const site = (state.site?.name ?? "site").replaceAll(/[^\p{L}\p{N}]+/gu, "-");
   const time = dateTime(now_s()).replaceAll(/[: ]/g, "-");
   const link = document.createElement("a");

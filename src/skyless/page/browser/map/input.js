@@ -11,6 +11,7 @@ import { KINDS, valueAt, writeValue } from "./overlay.js";
 import { groundHeight } from "./floors.js";
 import { endFollow, following, toggleFollow } from "./follow.js";
 import { drawnAnchors } from "./anchors.js";
+import { placeAnchor, places, predict } from "./placing.js";
 import { anchorNear } from "./survey.js";
 import { drawn } from "./tags.js";
 import { orbit, pan, px, py, toSite, view, zoom } from "./view.js";
@@ -37,8 +38,8 @@ export function listen(target, redraw, fitAll, toggleSpatial) {
     pointers.set(event.pointerId, at);
     if (pointers.size > 1) return;
     travelled = 0;
-    dragged = cornerAt(at);
-    if (dragged) dragged.before = state.zones;
+    dragged = anchorAt(at) ?? cornerAt(at);
+    if (dragged?.index >= 0) dragged.before = state.zones;
   });
   target.addEventListener("pointermove", (event) => {
     const at = pixel(event);
@@ -48,7 +49,9 @@ export function listen(target, redraw, fitAll, toggleSpatial) {
     travelled += Math.hypot(at.x - before.x, at.y - before.y);
     if (pointers.size === 2) pinch(event.pointerId, before, at);
     else if (travelled >= MAX_TAP_TRAVEL) {
-      if (dragged) moveCorner(dragged.id, dragged.index, toSite(at.x, at.y));
+      const [x_m, y_m] = toSite(at.x, at.y, groundHeight());
+      if (dragged?.anchor !== undefined) placeAnchor(dragged.anchor, { x_m, y_m }, true);
+      else if (dragged) moveCorner(dragged.id, dragged.index, toSite(at.x, at.y));
       else drag(at.x - before.x, at.y - before.y, event.shiftKey);
     }
     pointers.set(event.pointerId, at);
@@ -56,7 +59,9 @@ export function listen(target, redraw, fitAll, toggleSpatial) {
   });
   const release = (event) => {
     if (!pointers.delete(event.pointerId) || pointers.size) return;
-    if (dragged && travelled >= MAX_TAP_TRAVEL) storeShown(dragged.before);
+    const moved = dragged && travelled >= MAX_TAP_TRAVEL;
+    if (moved && dragged.anchor !== undefined) predict(false);
+    else if (moved) storeShown(dragged.before);
     else if (event.type === "pointerup" && travelled < MAX_TAP_TRAVEL) tap(pixel(event));
     dragged = null;
   };
@@ -135,6 +140,13 @@ function pickAt(site, anchor) {
 
 function near(x1, y1, x2, y2) {
   return Math.hypot(x1 - x2, y1 - y2) <= HIT;
+}
+
+/** The anchor at a pixel, while other places are tried; seen from above only. */
+function anchorAt({ x, y }) {
+  if (!places || view.spatial) return null;
+  const anchor = drawnAnchors.find((one) => near(one.x, one.y, x, y))?.id;
+  return anchor === undefined ? null : { anchor };
 }
 
 function cornerAt({ x, y }) {

@@ -142,7 +142,7 @@ export function start() {
     if (state.mode === "live") for (const { zone } of fresh) flash(zone);
     flashedMs = performance.now();
   });
-  const still = ["site", "zones", "events", "health", "overlay", "theme", "options", "selection", "mode", "connection"];
+  const still = ["site", "zones", "events", "health", "overlay", "theme", "options", "selection", "mode", "connection", "placing"];
   on([...still, "survey", "watch", "setup", "plan"], () => redraw(true));
   on(["tags", "editor", "player"], () => redraw(false));
 }

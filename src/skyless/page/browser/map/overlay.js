@@ -5,6 +5,7 @@ import { overlay } from "../api.js";
 import { liveSite } from "../live.js";
 import { toast } from "../dom.js";
 import { length, number } from "../format.js";
+import { movedAnchors } from "./placing.js";
 
 export const KINDS = {
   none: "None",
@@ -54,13 +55,35 @@ export async function choose(kind) {
   }
   state.overlay.pendingSince = performance.now();
   try {
-    const data = await overlay(kind, step());
+    const data = await overlay(kind, step(), movedAnchors());
     if (mine !== serial) return;
     state.overlay = { data, picture: paint(data), error: "", pendingSince: null };
   } catch (error) {
     if (mine !== serial) return;
     state.overlay = { data: null, picture: null, error: error.message, pendingSince: null };
   }
+  changed("overlay");
+}
+
+/**
+ * Compute the overlay again, with anchors where the page tries them; the one before is shown until then. A coarse one has
+ * a 25th of the points.
+ */
+export async function recompute(coarse) {
+  const kind = state.options.overlay;
+  if (kind === "none") return;
+  const mine = ++serial;
+  state.overlay.pendingSince = performance.now();
+  changed("overlay");
+  let next = { data: null, picture: null, error: "", pendingSince: null };
+  try {
+    const data = await overlay(kind, coarse ? 5 * step() : step(), movedAnchors());
+    next = { ...next, data, picture: paint(data) };
+  } catch (error) {
+    next.error = error.message;
+  }
+  if (mine !== serial) return;
+  state.overlay = next;
   changed("overlay");
 }
 

@@ -6,12 +6,13 @@ import { Rows, h, text } from "../dom.js";
 import { DASH, duration, length, number } from "../format.js";
 import { anchorHistory } from "../history.js";
 import { anchorMark, condition, leads, wordsOf } from "../map/anchors.js";
+import { places, startPlacing } from "../map/placing.js";
 import { findingAt, findingWords, findings, markWords } from "../survey/watch.js";
 import { chainWords, codeWords, faultWords } from "./codes.js";
 import { facts, selectionTable, split } from "./parts.js";
 
 export const title = "Anchors";
-export const topics = ["health", "selection", "site", "mode", "watch"];
+export const topics = ["health", "selection", "site", "mode", "watch", "placing"];
 export const interval_ms = 200;
 export const changesWithTime = true;
 
@@ -31,8 +32,9 @@ export function start(panel) {
   const list = h("ul", { class: "reasons findings" });
   const found = new Rows(list, (_key, finding) => ({ element: h("li", { class: "bad" }, findingWords(finding)) }));
   const rows = table.rows;
-  parts = { panel, note, list, found, box, rows, detail: makeDetail(), programs, nodes: new Rows(nodes, makeNode) };
-  panel.append(note, list, box, parts.detail.element, programs);
+  const trying = h("button", { type: "button", class: "quiet", id: "try-places", onclick: startPlacing }, "Try other places …");
+  parts = { panel, note, list, found, box, rows, trying, detail: makeDetail(), programs, nodes: new Rows(nodes, makeNode) };
+  panel.append(note, list, box, parts.detail.element, h("div", { class: "above" }, trying), programs);
 }
 
 /** Bring the tab up to date. */
@@ -40,6 +42,7 @@ export function show() {
   const live = state.mode === "live";
   parts.note.hidden = live;
   parts.programs.hidden = !live || state.connection.phase === "lost"; // without messages none is known to run
+  parts.trying.disabled = !live || !state.site?.anchors.length || places !== null;
   parts.list.hidden = !findings().length;
   parts.found.show(findings().map((finding) => [JSON.stringify(finding), finding]));
   const ids = new Set((state.site?.anchors ?? []).map((anchor) => anchor.id));
