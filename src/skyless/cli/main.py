@@ -36,12 +36,14 @@ _GROUPS: Final = {
             "survey",
             "Find where anchors hang and their antenna delays, from recordings or a running site.",
         ),
+        ("doctor", "nodes.doctor", "Check a computer, its boards and a running site in two minutes."),
     ),
     "Run a site": (
         ("broker", "nodes.broker", "Run the MQTT broker that comes with Skyless."),
         ("anchor", "nodes.anchor", "Run anchors of a site."),
         ("tag", "nodes.tag", "Run listening tags; with --print, --csv or --json their positions on standard output."),
         ("dashboard", "dashboard", "Show a site live in the browser."),
+        ("watch", "nodes.site_watch", "Show a running site as text, for a terminal."),
         ("bridge", "nodes.bridge", "Give positions to other tools: gpsd, ROS 2, autopilots, Home Assistant and more."),
     ),
     "Record and replay": (

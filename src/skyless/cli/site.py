@@ -1,16 +1,17 @@
 """``skyless site``: write and check site files; its keys are in ``site_keys``."""
 
 import secrets
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import msgspec
 from cyclopts import App
 
-from skyless.cli.common.options import command
+from skyless.cli.common.options import check_folder, command
 from skyless.cli.common.output import console, print_json, print_warnings, write_file
 from skyless.cli.nodes.options import SiteId
-from skyless.core.arguments import number, read_height, whole
+from skyless.core.arguments import number, read_height, read_numbers, whole
 from skyless.core.errors import SkylessError
 
 if TYPE_CHECKING:
@@ -186,6 +187,47 @@ def check(file: Path, /, *, json: bool = False) -> None:
         print_json(report)
     else:
         _show(file, report)
+
+
+@app.command(help_epilogue="Example: skyless site sheet site.toml sheet.pdf --cables-from 0.5,0.5")
+@command
+def sheet(
+    file: Path, output: Path, /, *, cables_from: str | None = None, force: bool = False, json: bool = False
+) -> None:
+    """Write the sheet for those who mount the anchors: a page A4 with plan and table for each floor.
+
+    Parameters
+    ----------
+    file
+        The site file.
+    output
+        The sheet to write, .pdf or .png.
+    cables_from
+        Where the cables begin, such as the switch: X,Y or X,Y,HEIGHT in metres, the height 0 by default. The sheet then
+        has their lengths.
+    force
+        Overwrite what is there, if the sheet exists.
+    json
+        Write one JSON object instead of a line.
+    """
+    from skyless.site.file.load import load_site
+    from skyless.site.planning.sheet import mounts, sheet
+
+    kinds: dict[str, Literal["pdf", "png"]] = {".pdf": "pdf", ".png": "png"}
+    if (kind := kinds.get(output.suffix.lower())) is None:
+        raise SkylessError(f"OUTPUT is {str(output)!r}; its ending should be .pdf or .png")
+    check_folder("OUTPUT", output)
+    _check_free(output, force=force)
+    start = None
+    if cables_from is not None:
+        x_m, y_m, *height_m = read_numbers("--cables-from", cables_from, (2, 3))
+        start = (x_m, y_m, height_m[0] if height_m else 0.0)
+    site = load_site(file)
+    write_file(output, sheet(site, file, kind, time.strftime("%Y-%m-%d"), start))
+    if json:
+        print_json({"file": output, "anchors": mounts(site, start)})
+    else:
+        console().print(f"wrote {output}: {len(site.anchors)} anchors", markup=False)
 
 
 def _report(site: "Site") -> dict[str, Any]:

@@ -29,7 +29,7 @@ class Role(StrEnum):
     """Anchors, and the emulated air."""
     TAGS = "tags"
     PAGE = "page"
-    """What shows, records and passes on: dashboard, record, bridge; also Home Assistant itself."""
+    """What shows, records and passes on: dashboard, watch, doctor, record, bridge; also Home Assistant itself."""
     SURVEY = "survey"
     """What moves anchors: survey, and a dashboard whose users set up the site."""
     OPERATOR = "operator"
@@ -96,7 +96,7 @@ ACCESS: Final = {
     Role.PAGE: Access(
         publish=(
             *_SHOWN,
-            *_status("dashboard", "recorder", "bridge", "homeassistant"),
+            *_status("dashboard", "recorder", "bridge", "homeassistant", "watch", "doctor"),
             "homeassistant/device/+/config",
             "homeassistant/status",
         ),
