@@ -5,6 +5,7 @@ By hand: ``PYTHONPATH=tests .venv/bin/python tests/dashboard/page_fake_server.py
 
 import asyncio
 import contextlib
+import json
 import mimetypes
 import socket
 import sys
@@ -56,6 +57,7 @@ class FakeServer:
         self.full = False
         self.overlay_error = None
         self.overlay_waits = False
+        self.overlays, self.sheets = [], []
         self.recorded_plan = None
         self.recorded_site = True
         self.recorded_waits = False
@@ -137,7 +139,13 @@ class FakeServer:
                 await asyncio.sleep(0.02)
             if self.overlay_error:
                 return JSONResponse({"error": self.overlay_error}, status_code=422)
+            body = await request.body()
+            self.overlays.append((float(query["step_m"]), json.loads(body)["anchors"] if body else []))
             return JSONResponse(made_up.overlay(query["kind"], float(query["step_m"])))
+
+        async def sheet(request):
+            self.sheets.append((await request.json())["anchors"])
+            return Response(b"%PDF-1.7 a sheet", media_type="application/pdf")
 
         async def put_zones(request):
             body = await request.json()
@@ -186,7 +194,8 @@ class FakeServer:
                 Route("/api/floor_plan", put_floor_plan, methods=["PUT"]),
                 Route("/api/survey/facts", put_facts, methods=["PUT"]),
                 Route("/api/survey/save", save, methods=["POST"]),
-                Route("/api/overlay", overlay),
+                Route("/api/overlay", overlay, methods=["GET", "POST"]),
+                Route("/api/sheet", sheet, methods=["POST"]),
                 Route("/api/zones", put_zones, methods=["PUT"]),
                 Route("/api/recordings", recordings),
                 Route("/api/recordings/{name}", recording),

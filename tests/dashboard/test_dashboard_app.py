@@ -1,6 +1,7 @@
 """The server as browsers and others meet it, good and bad."""
 
 import asyncio
+import json
 
 import pytest
 from dashboard_builders import HERE, SITE, SITE_ID, SQUARE, browser_of, fix
@@ -20,6 +21,8 @@ from skyless.page.live import (
     TooManyPagesError,
 )
 from skyless.run.mqtt import topics
+from skyless.run.mqtt.messages import site_message
+from skyless.sim.lab import lab_site
 
 pytestmark = pytest.mark.site
 
@@ -177,6 +180,36 @@ def test_overlays_before_the_site_is_known_and_wrong_ones(browser, live):
         answer = browser.get("/api/overlay", params={"kind": "pdop", "step_m": step})
         assert answer.status_code == 400
         assert "step_m" in answer.json()["error"]
+
+
+@pytest.mark.site
+def test_a_site_with_anchors_elsewhere(browser, live, wire):
+    """Its overlay is another one, it has a sheet, and what cannot be is refused."""
+    assert browser.post("/api/sheet").status_code == 404
+    live.site = site_message(lab_site(), simulated=True, unix_s=1.0)
+    anchor = live.site.site.anchors[0]
+    moved = {"anchors": [{"id": anchor.id, "x_m": 3.0, "y_m": 4.0, "z_m": 2.5}]}
+    services = browser.app.state.services
+    try:
+        here, there = (
+            browser.request(verb, "/api/overlay?kind=sigma&step_m=2", json=body)
+            for verb, body in (("GET", None), ("POST", moved))
+        )
+        assert here.status_code == there.status_code == 200
+        assert here.json()["values"] != there.json()["values"]
+        sheet = browser.post("/api/sheet", json=moved)
+        assert (sheet.status_code, sheet.headers["content-type"]) == (200, "application/pdf")
+        assert sheet.content.startswith(b"%PDF-")
+    finally:
+        services.overlays.stop()
+        services.sheets.stop()
+    second = live.site.site.anchors[1]
+    on_another = {"anchors": [{"id": anchor.id, "x_m": second.x_m, "y_m": second.y_m, "z_m": second.z_m}]}
+    for body in (b"{", b'{"anchors": [{"id": 1}]}', json.dumps(on_another).encode()):
+        answer = browser.post("/api/overlay?kind=sigma", content=body)
+        assert answer.status_code == 400
+        assert answer.json()["error"]
+    assert not wire.published
 
 
 def test_without_a_folder_there_are_no_recordings(browser):

@@ -552,3 +552,46 @@ def test_names_with_commas_are_quoted_in_the_table(hall):
         ).replace("const export =", "const module =")
     )
     assert next(csv.reader([lines[1].strip()]))[1] == 'a "b", c'
+
+
+# Other places for anchors
+
+
+def test_an_anchor_is_dragged_and_sigma_predicted_again(hall):
+    """Coarse while it moves, fine where it is dropped; its height is typed; nothing goes to the site."""
+    server, seen = hall
+    page = seen.page
+    page.click("#tab-anchors")
+    page.click("#try-places")
+    page.wait_for_selector("#placing:visible")
+    until(page, "skyless.state.overlay.data?.kind === 'sigma'")
+    at = page.evaluate(modules(["map/anchors"], "return anchors.drawnAnchors[0];"))
+    box = page.locator("#canvas").bounding_box()
+    x, y = box["x"] + at["x"], box["y"] + at["y"]
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 30, y - 20, steps=4)
+    page.mouse.up()
+    until(page, "skyless.state.overlay.pendingSince === null")
+    (moved,) = server.overlays[-1][1]
+    fine, coarse = server.overlays[0][0], max(step for step, _ in server.overlays)
+    assert (moved["id"], coarse / fine, server.overlays[-1][0]) == (at["id"], 5.0, fine)
+    page.fill("#placing-z_m", "4.25")
+    page.keyboard.press("Enter")
+    until(page, "skyless.state.overlay.pendingSince === null")
+    page.wait_for_function("() => document.querySelector('#placing-help').textContent.includes('1 anchor elsewhere')")
+    with page.expect_download() as sheet:
+        page.click("#placing-sheet")
+    assert sheet.value.suggested_filename.endswith(".pdf")
+    assert server.sheets == [[moved | {"z_m": 4.25}]]
+    with page.expect_download() as table:
+        page.click("#placing-table")
+    lines = Path(table.value.path()).read_text().splitlines()
+    assert lines[0] == "id,x_m,y_m,z_m"
+    assert f"{moved['id']},{moved['x_m']:g},{moved['y_m']:g},4.25" in lines
+    page.click("#placing-end")
+    assert page.locator("#placing").is_hidden()
+    own = "skyless.state.site.anchors.find((one) => one.id === id)"
+    assert page.evaluate(f"(id) => {own}.x_m", moved["id"]) != moved["x_m"]
+    until(page, "skyless.state.overlay.pendingSince === null")
+    assert server.overlays[-1] == (fine, [])

@@ -5,7 +5,7 @@ import { on, state } from "../store.js";
 import { surveyShown } from "../survey/model.js";
 import { palette } from "../theme.js";
 import { groundHeight, otherFloor } from "./floors.js";
-import { placed } from "./placing.js";
+import { placed } from "./places.js";
 import { isSeen, toX, toY, view } from "./view.js";
 
 const MARK = 7;

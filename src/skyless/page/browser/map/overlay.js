@@ -5,7 +5,7 @@ import { overlay } from "../api.js";
 import { liveSite } from "../live.js";
 import { toast } from "../dom.js";
 import { length, number } from "../format.js";
-import { movedAnchors } from "./placing.js";
+import { movedAnchors } from "./places.js";
 
 export const KINDS = {
   none: "None",
