@@ -1,0 +1,269 @@
+"""The gather of a site: takes fixes from the subjects of MQTT, and puts them into the stream of the site in batches."""
+
+import asyncio
+import contextlib
+import secrets
+import time
+from collections import Counter
+from collections.abc import Awaitable, Callable
+from typing import Final
+
+import msgspec
+from msgspec import Struct
+from nats.aio.client import Client
+from nats.aio.msg import Msg
+from nats.errors import Error, SlowConsumerError
+from nats.js import JetStreamContext
+from nats.js.errors import APIError
+
+from skyless.core.version import installed_version
+from skyless.run.fix_batch import BadBatchError, decode_batch
+from skyless.run.gather import subjects
+from skyless.run.gather.address import NatsAddress, connect
+from skyless.run.gather.messages import Numbers, NumbersRequest, Summary
+from skyless.run.gather.packer import NamesTable, NoNumberError, Packer, ReadyBatch
+from skyless.run.gather.streams import (
+    LostLockError,
+    NumberTakenError,
+    SiteLock,
+    make_streams,
+    read_names,
+    store_name,
+)
+from skyless.run.process import Log, together
+
+PERIOD_S: Final = 0.1
+SUMMARY_S: Final = 1.0
+_RETRY_S: Final = 0.5
+_LEAVE_S: Final = 2.0
+_SAME_TROUBLE_S: Final = 30.0
+_NAMES_AT_ONCE: Final = 256
+_PENDING_MESSAGES: Final = 100_000
+_PENDING_BYTES: Final = 128 * 1024 * 1024
+
+
+class _SiteName(Struct):
+    """The part of a site that is read here."""
+
+    name: str
+
+
+class _SiteMessage(Struct):
+    """The part of ``SiteMessage`` that is read here."""
+
+    site: _SiteName
+    simulated: bool
+
+
+class _Status(Struct):
+    """The part of ``StatusMessage`` that is read here."""
+
+    online: bool
+
+
+class Gather:
+    """The gather of one site. A second one of the same site waits until the first has ended."""
+
+    def __init__(self, address: NatsAddress, site: int | None, keep_bytes: int, log: Log) -> None:
+        """``site`` None: the first site of which anything is heard."""
+        self.site, self.cuts = site, 0
+        self._address, self._keep_bytes, self._log = address, keep_bytes, log
+        self._host = subjects.own_host()
+        self._packer = Packer(secrets.randbits(32), self._host)
+        self._names = NamesTable({})
+        self._names_lock = asyncio.Lock()
+        self._ready: ReadyBatch | None = None
+        self._site_name = ""
+        self._online: dict[str, set[str]] = {}
+        self._packed = self._batches = 0
+        self._drops: Counter[str] = Counter()
+        self._logged = ("", 0.0)
+
+    @property
+    def summary(self) -> Summary:
+        """What it has done since its start."""
+        waiting = self._packer.waiting + (self._ready.fixes if self._ready is not None else 0)
+        return Summary(
+            unix_s=time.time(),
+            host=self._host,
+            version=installed_version(),
+            site=self._site_name,
+            simulated=self._packer.simulated,
+            names=len(self._names.numbers),
+            online={kind: len(names) for kind, names in self._online.items()},
+            fixes=self._packer.fixes,
+            packed=self._packed,
+            batches=self._batches,
+            waiting=waiting,
+            drops=dict(self._drops + self._packer.drops),
+            cuts=self.cuts,
+        )
+
+    async def run(self) -> None:
+        """Gather until cancelled. What waits is sent before the end."""
+        client = await connect(self._address, "skyless gather", self._on_error, self._on_cut)
+        stream = client.jetstream()
+        try:
+            if self.site is None:
+                self.site = await self._first_site(client)
+            while True:
+                try:
+                    await self._serve(client, stream, self.site)
+                except (LostLockError, NumberTakenError, Error) as error:
+                    self._say(f"site {self.site} is not gathered for a moment: {error or type(error).__name__}")
+                    await asyncio.sleep(_RETRY_S)
+        finally:
+            await client.close()
+
+    async def _first_site(self, client: Client) -> int:
+        found: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+
+        async def on_message(message: Msg) -> None:
+            level = message.subject.split(".")[2]
+            if level.isdecimal() and len(level) < 6 and not found.done():
+                found.set_result(int(level))
+
+        every = (subjects.json_fixes, subjects.statuses, subjects.site_messages)
+        heard = [await client.subscribe(subject(subjects.EVERY), cb=on_message) for subject in every]
+        site = await found
+        for one in heard:
+            await one.unsubscribe()
+        self._log(f"gathers site {site}; --site-id names another")
+        return site
+
+    async def _serve(self, client: Client, stream: JetStreamContext, site: int) -> None:
+        """Gather for as long as no other program does."""
+        await make_streams(stream, site, self._keep_bytes)
+        lock = SiteLock(stream, site, self._log)
+        await lock.acquire()
+        self._names = NamesTable(await read_names(stream, site))
+        handlers: dict[str, Callable[[Msg], Awaitable[None]]] = {
+            subjects.json_fixes(site): self._on_fix,
+            subjects.statuses(site): self._on_status,
+            subjects.site_messages(site): self._on_site,
+            subjects.fixes(site): self._relay(client, subjects.live(site)),
+            subjects.numbers_request(site): self._numbers(stream, site),
+        }
+        heard = [
+            await client.subscribe(
+                subject, cb=handler, pending_msgs_limit=_PENDING_MESSAGES, pending_bytes_limit=_PENDING_BYTES
+            )
+            for subject, handler in handlers.items()
+        ]
+        try:
+            await together(lock.hold(), self._send(stream, site), self._summarise(client, site))
+        finally:
+            for one in heard:
+                with contextlib.suppress(Error):
+                    await one.unsubscribe()
+            for last in (self._send_waiting(stream, site), lock.release()):
+                with contextlib.suppress(Error, TimeoutError, NumberTakenError):
+                    await asyncio.wait_for(last, _LEAVE_S)
+
+    # Messages
+
+    async def _on_fix(self, message: Msg) -> None:
+        self._packer.add(subjects.level_of(message.subject, subjects.NAME_LEVEL), message.data)
+
+    async def _on_site(self, message: Msg) -> None:
+        with contextlib.suppress(msgspec.MsgspecError):
+            site = msgspec.json.decode(message.data, type=_SiteMessage)
+            self._site_name, self._packer.simulated = site.site.name, site.simulated
+
+    async def _on_status(self, message: Msg) -> None:
+        kind, name = message.subject.split(".")[3:5]
+        online = False
+        with contextlib.suppress(msgspec.MsgspecError):
+            online = msgspec.json.decode(message.data, type=_Status).online
+        names = self._online.setdefault(kind, set())
+        (names.add if online else names.discard)(name)
+
+    def _relay(self, client: Client, subject: str) -> Callable[[Msg], Awaitable[None]]:
+        own = subjects.fixes(subject.split(".")[2], self._host)
+
+        async def relay(message: Msg) -> None:
+            try:
+                records = decode_batch(message.data).records
+            except BadBatchError:
+                self._drops["wrong-batch"] += 1
+                return
+            if message.subject != own:
+                self._packed += len(records)
+            await client.publish(subject, message.data)
+
+        return relay
+
+    def _numbers(self, stream: JetStreamContext, site: int) -> Callable[[Msg], Awaitable[None]]:
+        async def answer(message: Msg) -> None:
+            try:
+                asked = msgspec.json.decode(message.data, type=NumbersRequest)
+                numbers = tuple(self._names.number_of(name, asked.host, time.time()) for name in asked.names)
+                await self._store_names(stream, site)
+                reply = Numbers(numbers)
+            except msgspec.MsgspecError as error:
+                reply = Numbers(error=f"this is no request for numbers: {error}")
+            except NoNumberError:
+                reply = Numbers(error="the table of names is full")
+            if message.reply:
+                await message.respond(msgspec.json.encode(reply))
+
+        return answer
+
+    # Sending
+
+    async def _send(self, stream: JetStreamContext, site: int) -> None:
+        while True:
+            await asyncio.sleep(PERIOD_S)
+            await self._send_waiting(stream, site)
+
+    async def _send_waiting(self, stream: JetStreamContext, site: int) -> None:
+        """Send until nothing waits. A batch counts as sent when the stream has acknowledged it.
+
+        A batch that the stream refuses, as on a full disk, has reached those who read now, and is not sent again.
+        """
+        while True:
+            if self._ready is None:
+                ready = self._packer.next_batch(self._names, time.time())
+                if ready is None and not self._packer.waiting:
+                    return
+                await self._store_names(stream, site)  # first, so that every number in a stream has a name
+                self._ready = ready
+            if self._ready is not None:
+                header = {"Nats-Msg-Id": self._ready.id}
+                try:
+                    await stream.publish(subjects.fixes(site, self._host), self._ready.data, headers=header)
+                    self._batches += 1
+                except APIError as error:
+                    self._drops["not-stored"] += self._ready.fixes
+                    self._say(f"the stream of site {site} takes no fixes: {error.description}")
+                self._ready = None
+
+    async def _store_names(self, stream: JetStreamContext, site: int) -> None:
+        async with self._names_lock:
+            unsaved = list(self._names.unsaved.items())
+            for first in range(0, len(unsaved), _NAMES_AT_ONCE):
+                some = unsaved[first : first + _NAMES_AT_ONCE]
+                await asyncio.gather(*(store_name(stream, site, number, tag) for number, tag in some))
+                self._names.mark_saved(number for number, _ in some)
+
+    async def _summarise(self, client: Client, site: int) -> None:
+        while True:
+            await client.publish(subjects.summary(site), msgspec.json.encode(self.summary))
+            await asyncio.sleep(SUMMARY_S)
+
+    # Trouble
+
+    async def _on_error(self, error: Exception) -> None:
+        if isinstance(error, SlowConsumerError):
+            self._drops["unread"] += 1
+        self._say(f"NATS server {self._address}: {error or type(error).__name__}")
+
+    async def _on_cut(self) -> None:
+        self.cuts += 1
+
+    def _say(self, trouble: str) -> None:
+        """Log it once, and again every half minute while it lasts."""
+        now_s = time.monotonic()
+        if trouble != self._logged[0] or now_s > self._logged[1] + _SAME_TROUBLE_S:
+            self._logged = (trouble, now_s)
+            self._log(trouble)

@@ -1,0 +1,133 @@
+"""The streams of a site at its NATS server: what they keep, the names in them, and which gather may fill them."""
+
+import asyncio
+import os
+import platform
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+from nats.errors import Error
+from nats.js.api import ConsumerConfig, DeliverPolicy, KeyValueConfig, StorageType, StreamConfig
+from nats.js.errors import BadRequestError, KeyWrongLastSequenceError
+
+from skyless.run.gather import subjects
+from skyless.run.gather.messages import TagName
+from skyless.run.process import Log
+
+if TYPE_CHECKING:
+    from nats.js import JetStreamContext
+    from nats.js.kv import KeyValue
+
+KEEP_S: Final = 24 * 3600.0
+"""How long the stream keeps fixes."""
+
+_DUPLICATES_S: Final = 120.0
+_READ_S: Final = 10.0
+_LOCK_S: Final = 5.0
+"""A gather that has not renewed its lock for this long has ended."""
+
+_RENEWAL_S: Final = 1.0
+_KEY: Final = "running"
+_NEVER_WRITTEN: Final = {"Nats-Expected-Last-Subject-Sequence": "0"}
+
+
+class NumberTakenError(Exception):
+    """Another gather has given this number."""
+
+
+class LostLockError(Exception):
+    """Another gather may serve the site from now on, or the server is away."""
+
+
+async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -> None:
+    """Make the streams of a site, or set the limits of those that are there."""
+    fixes = StreamConfig(
+        name=subjects.fixes_stream(site),
+        subjects=[subjects.fixes(site)],
+        storage=StorageType.FILE,
+        num_replicas=1,
+        max_age=KEEP_S,
+        max_bytes=keep_bytes,
+        duplicate_window=_DUPLICATES_S,
+    )
+    names = StreamConfig(
+        name=subjects.names_stream(site),
+        subjects=[subjects.name_of(site)],
+        storage=StorageType.FILE,
+        num_replicas=1,
+        max_msgs_per_subject=1,
+    )
+    for config in (fixes, names):
+        try:
+            await stream.add_stream(config)
+        except BadRequestError:  # it is there with other limits
+            await stream.update_stream(config)
+
+
+async def read_names(stream: "JetStreamContext", site: int) -> dict[int, TagName]:
+    """The names of all numbers that were given at a site."""
+    name, found = subjects.names_stream(site), dict[int, TagName]()
+    if (await stream.stream_info(name)).state.messages == 0:
+        return found
+    config = ConsumerConfig(deliver_policy=DeliverPolicy.ALL)
+    reading = await stream.subscribe(subjects.name_of(site), stream=name, ordered_consumer=True, config=config)
+    try:
+        while True:
+            message = await reading.next_msg(_READ_S)
+            number = message.subject.rpartition(".")[2]
+            if number.isdecimal():
+                found[int(number)] = msgspec.json.decode(message.data, type=TagName)
+            if message.metadata.num_pending == 0:
+                return found
+    finally:
+        await reading.unsubscribe()
+
+
+async def store_name(stream: "JetStreamContext", site: int, number: int, tag: TagName) -> None:
+    """Store the name of a new number. Raises NumberTakenError."""
+    data = msgspec.json.encode(tag)
+    try:
+        await stream.publish(subjects.name_of(site, number), data, headers=dict(_NEVER_WRITTEN))
+    except BadRequestError as error:
+        raise NumberTakenError(f"number {number}: {error.description}") from None
+
+
+class SiteLock:
+    """Lets one gather at a time serve a site. It is a key at the server that lasts for ``_LOCK_S`` unless renewed."""
+
+    def __init__(self, stream: "JetStreamContext", site: int, log: Log) -> None:
+        self._stream, self._site, self._log = stream, site, log
+        self._owner = f"{platform.node()} {os.getpid()}".encode()
+        self._bucket: KeyValue | None = None
+        self._revision = 0
+
+    async def acquire(self) -> None:
+        """Wait until no other gather serves the site."""
+        config = KeyValueConfig(subjects.lock_bucket(self._site), ttl=_LOCK_S, storage=StorageType.MEMORY)
+        waits = False
+        while True:
+            self._bucket = await self._stream.create_key_value(config)
+            try:
+                self._revision = await self._bucket.create(_KEY, self._owner)
+            except KeyWrongLastSequenceError:
+                if not waits:
+                    self._log(f"another gather serves site {self._site}; this one waits until it ends")
+                waits = True
+                await asyncio.sleep(_RENEWAL_S)
+            else:
+                return
+
+    async def hold(self) -> None:
+        """Renew the lock until cancelled. Raises LostLockError."""
+        while True:
+            await asyncio.sleep(_RENEWAL_S)
+            try:
+                if self._bucket is not None:
+                    self._revision = await self._bucket.update(_KEY, self._owner, self._revision)
+            except Error as error:
+                raise LostLockError(str(error) or type(error).__name__) from None
+
+    async def release(self) -> None:
+        """Let another gather begin at once."""
+        if self._bucket is not None:
+            await self._bucket.delete(_KEY, self._revision)
