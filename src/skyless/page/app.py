@@ -4,7 +4,7 @@ import asyncio
 import mimetypes
 from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 from urllib.parse import quote
 
 import msgspec
@@ -24,6 +24,7 @@ from skyless.page._site_survey import NoResultError
 from skyless.page._state import PageRequest
 from skyless.page.guard import AccessRules, Guard
 from skyless.page.live import LiveSite, NoBrokerError, NoSiteError, NotAllowedError, TooManyPagesError
+from skyless.page.live2 import serve_page
 from skyless.page.overlays import KINDS, NoOverlayError, Overlays
 from skyless.page.playback import NoRecordingError, Playback, RecordingFile
 from skyless.page.sites import LiveSites
@@ -31,6 +32,9 @@ from skyless.page.what_if import NoWhatIfError, WhatIfs, WhatIfTask
 from skyless.run.mqtt.survey_facts import BadFactsError
 from skyless.run.zones.zone_list import BadZonesError, read_zones
 from skyless.site.file.check import image_size
+
+if TYPE_CHECKING:
+    from skyless.page.gathered import Gathered
 
 _PAGE: Final = Path(__file__).parent / "browser"
 PAGE_TIMEOUT_S: Final = 10.0
@@ -67,6 +71,8 @@ class Services(Struct, frozen=True):
     overlays: Overlays
     playback: Playback
     what_ifs: WhatIfs
+    gathered: "Gathered | None" = None
+    """The batches of a broker with a gather."""
 
 
 def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Starlette:
@@ -98,6 +104,7 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
         Route("/api/recordings/{name}/floor_plan", _recorded(Playback.floor_plan, _image)),
         Route("/api/recordings/{name}/what_if", _what_if),
         WebSocketRoute("/live", _live),
+        WebSocketRoute("/live2", _live2),
         Mount("/page", _Files(directory=page, check_dir=False)),
     ]
     app = Starlette(
@@ -267,12 +274,21 @@ async def _what_if(request: Request) -> Response:
     return Response(answer, media_type="application/json")
 
 
-async def _live(socket: WebSocket) -> None:
+def _live_for(socket: WebSocket) -> LiveSite:
+    """The site that a page asks for, or another for a page that was open before the server's start, if it is gone."""
     sites = _services(socket).sites
     try:
-        live = sites.of(socket.query_params.get("site"))
-    except NoSiteError:  # a page that was open before the server's start, of a site that is gone
-        live = sites.of(None)
+        return sites.of(socket.query_params.get("site"))
+    except NoSiteError:
+        return sites.of(None)
+
+
+async def _live2(socket: WebSocket) -> None:
+    await serve_page(socket, _live_for(socket), _services(socket).gathered)
+
+
+async def _live(socket: WebSocket) -> None:
+    live = _live_for(socket)
     await socket.accept()  # a browser does not show a page why its socket was refused, only why it was closed
     try:
         page = live.open_page(socket.client.host if socket.client is not None else "")

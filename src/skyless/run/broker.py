@@ -103,9 +103,10 @@ class BrokerSettings(Struct, frozen=True):
 
     def nats_address(self, port: int) -> NatsAddress:
         """The address for its gather, with the user that may do everything."""
+        url = f"nats://{_NATS_HOST}:{port}"
         if self.roles is None:
-            return NatsAddress(_NATS_HOST, port, user=self.user, password=self.password)
-        return NatsAddress(_NATS_HOST, port, user=_GATHER_USER, password=secrets.token_urlsafe(_PASSWORD_BYTES))
+            return NatsAddress(url, self.user, self.password)
+        return NatsAddress(url, _GATHER_USER, secrets.token_urlsafe(_PASSWORD_BYTES))
 
     def address(self, port: int) -> MqttAddress:
         """Its address for clients on this machine. Where there are roles, each puts its own user there."""
@@ -121,7 +122,7 @@ def _configuration(settings: BrokerSettings, port: int, data: Path, nats: NatsAd
         mqtt["tls"] = {"cert_file": str(settings.certificate), "key_file": str(settings.key)}
     whole: dict[str, object] = {
         "server_name": "skyless",
-        "listen": "127.0.0.1:-1" if nats is None else f"{nats.host}:{nats.port}",  # NATS itself, which a gather uses
+        "listen": "127.0.0.1:-1" if nats is None else nats.url.partition("://")[2],  # NATS itself
         "max_payload": _MAX_PAYLOAD,
         "jetstream": {"store_dir": str(data), "max_file_store": _MAX_STORED + (settings.gathered_bytes or 0)},
         "log_file": str(data / "nats-server.log"),

@@ -6,6 +6,7 @@ import secrets
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable
+from itertools import islice
 from typing import Final
 
 import msgspec
@@ -20,16 +21,8 @@ from skyless.core.version import installed_version
 from skyless.run.fix_batch import BadBatchError, decode_batch
 from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect
-from skyless.run.gather.messages import Numbers, NumbersRequest, Summary
-from skyless.run.gather.packer import NamesTable, NoNumberError, Packer, ReadyBatch
-from skyless.run.gather.streams import (
-    LostLockError,
-    NumberTakenError,
-    SiteLock,
-    make_streams,
-    read_names,
-    store_name,
-)
+from skyless.run.gather.packer import NamesTable, Packer, ReadyBatch
+from skyless.run.gather.streams import LostLockError, NumberTakenError, lock_site, make_streams, read_names, store_name
 from skyless.run.process import Log, together
 
 PERIOD_S: Final = 0.1
@@ -61,6 +54,33 @@ class _Status(Struct):
     online: bool
 
 
+class Summary(Struct, frozen=True):
+    """What a gather has done since its start, published once a second."""
+
+    unix_s: float
+    host: str
+    version: str
+    site: str
+    """Name of the site; empty until it was published."""
+    simulated: bool
+    names: int
+    """Tags that have a number."""
+    online: dict[str, int]
+    """Programs that are online, by kind."""
+    fixes: int
+    """Fixes taken from JSON."""
+    packed: int
+    """Fixes that came packed from other programs."""
+    batches: int
+    """Batches that the stream has acknowledged."""
+    waiting: int
+    """Fixes that are not in an acknowledged batch yet."""
+    drops: dict[str, int]
+    """Messages and fixes that were dropped, by reason."""
+    cuts: int
+    """How often the connection was lost; the server ends that of a reader which is too slow."""
+
+
 class Gather:
     """The gather of one site. A second one of the same site waits until the first has ended."""
 
@@ -71,7 +91,6 @@ class Gather:
         self._host = subjects.own_host()
         self._packer = Packer(secrets.randbits(32), self._host)
         self._names = NamesTable({})
-        self._names_lock = asyncio.Lock()
         self._ready: ReadyBatch | None = None
         self._site_name = ""
         self._online: dict[str, set[str]] = {}
@@ -119,12 +138,12 @@ class Gather:
         found: asyncio.Future[int] = asyncio.get_running_loop().create_future()
 
         async def on_message(message: Msg) -> None:
-            level = message.subject.split(".")[2]
-            if level.isdecimal() and len(level) < 6 and not found.done():
-                found.set_result(int(level))
+            site = subjects.site_in(message.subject)
+            if site is not None and not found.done():
+                found.set_result(site)
 
-        every = (subjects.json_fixes, subjects.statuses, subjects.site_messages)
-        heard = [await client.subscribe(subject(subjects.EVERY), cb=on_message) for subject in every]
+        every = (subjects.JSON_FIXES, subjects.STATUSES, subjects.SITES)
+        heard = [await client.subscribe(subjects.at(one, subjects.EVERY), cb=on_message) for one in every]
         site = await found
         for one in heard:
             await one.unsubscribe()
@@ -134,19 +153,20 @@ class Gather:
     async def _serve(self, client: Client, stream: JetStreamContext, site: int) -> None:
         """Gather for as long as no other program does."""
         await make_streams(stream, site, self._keep_bytes)
-        lock = SiteLock(stream, site, self._log)
-        await lock.acquire()
+        lock = await lock_site(stream, site, self._log)
         self._names = NamesTable(await read_names(stream, site))
         handlers: dict[str, Callable[[Msg], Awaitable[None]]] = {
-            subjects.json_fixes(site): self._on_fix,
-            subjects.statuses(site): self._on_status,
-            subjects.site_messages(site): self._on_site,
-            subjects.fixes(site): self._relay(client, subjects.live(site)),
-            subjects.numbers_request(site): self._numbers(stream, site),
+            subjects.JSON_FIXES: self._on_fix,
+            subjects.STATUSES: self._on_status,
+            subjects.SITES: self._on_site,
+            subjects.FIXES: self._relay(client, site),
         }
         heard = [
             await client.subscribe(
-                subject, cb=handler, pending_msgs_limit=_PENDING_MESSAGES, pending_bytes_limit=_PENDING_BYTES
+                subjects.at(subject, site),
+                cb=handler,
+                pending_msgs_limit=_PENDING_MESSAGES,
+                pending_bytes_limit=_PENDING_BYTES,
             )
             for subject, handler in handlers.items()
         ]
@@ -163,7 +183,7 @@ class Gather:
     # Messages
 
     async def _on_fix(self, message: Msg) -> None:
-        self._packer.add(subjects.level_of(message.subject, subjects.NAME_LEVEL), message.data)
+        self._packer.add(subjects.tag_in(message.subject), message.data)
 
     async def _on_site(self, message: Msg) -> None:
         with contextlib.suppress(msgspec.MsgspecError):
@@ -178,8 +198,8 @@ class Gather:
         names = self._online.setdefault(kind, set())
         (names.add if online else names.discard)(name)
 
-    def _relay(self, client: Client, subject: str) -> Callable[[Msg], Awaitable[None]]:
-        own = subjects.fixes(subject.split(".")[2], self._host)
+    def _relay(self, client: Client, site: int) -> Callable[[Msg], Awaitable[None]]:
+        own, live = subjects.at(subjects.FIXES, site, self._host), subjects.at(subjects.LIVE, site)
 
         async def relay(message: Msg) -> None:
             try:
@@ -189,25 +209,9 @@ class Gather:
                 return
             if message.subject != own:
                 self._packed += len(records)
-            await client.publish(subject, message.data)
+            await client.publish(live, message.data)
 
         return relay
-
-    def _numbers(self, stream: JetStreamContext, site: int) -> Callable[[Msg], Awaitable[None]]:
-        async def answer(message: Msg) -> None:
-            try:
-                asked = msgspec.json.decode(message.data, type=NumbersRequest)
-                numbers = tuple(self._names.number_of(name, asked.host, time.time()) for name in asked.names)
-                await self._store_names(stream, site)
-                reply = Numbers(numbers)
-            except msgspec.MsgspecError as error:
-                reply = Numbers(error=f"this is no request for numbers: {error}")
-            except NoNumberError:
-                reply = Numbers(error="the table of names is full")
-            if message.reply:
-                await message.respond(msgspec.json.encode(reply))
-
-        return answer
 
     # Sending
 
@@ -229,9 +233,9 @@ class Gather:
                 await self._store_names(stream, site)  # first, so that every number in a stream has a name
                 self._ready = ready
             if self._ready is not None:
-                header = {"Nats-Msg-Id": self._ready.id}
+                subject, header = subjects.at(subjects.FIXES, site, self._host), {"Nats-Msg-Id": self._ready.id}
                 try:
-                    await stream.publish(subjects.fixes(site, self._host), self._ready.data, headers=header)
+                    await stream.publish(subject, self._ready.data, headers=header)
                     self._batches += 1
                 except APIError as error:
                     self._drops["not-stored"] += self._ready.fixes
@@ -239,16 +243,14 @@ class Gather:
                 self._ready = None
 
     async def _store_names(self, stream: JetStreamContext, site: int) -> None:
-        async with self._names_lock:
-            unsaved = list(self._names.unsaved.items())
-            for first in range(0, len(unsaved), _NAMES_AT_ONCE):
-                some = unsaved[first : first + _NAMES_AT_ONCE]
-                await asyncio.gather(*(store_name(stream, site, number, tag) for number, tag in some))
-                self._names.mark_saved(number for number, _ in some)
+        while some := list(islice(self._names.unsaved.items(), _NAMES_AT_ONCE)):
+            await asyncio.gather(*(store_name(stream, site, number, tag) for number, tag in some))
+            for number, _ in some:
+                del self._names.unsaved[number]
 
     async def _summarise(self, client: Client, site: int) -> None:
         while True:
-            await client.publish(subjects.summary(site), msgspec.json.encode(self.summary))
+            await client.publish(subjects.at(subjects.SUMMARY, site), msgspec.json.encode(self.summary))
             await asyncio.sleep(SUMMARY_S)
 
     # Trouble

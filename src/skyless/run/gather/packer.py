@@ -1,7 +1,6 @@
 """Fixes of one site from JSON to batches, and the numbers of its tags. No I/O: the caller passes in the time."""
 
 from collections import Counter, deque
-from collections.abc import Iterable
 from itertools import count
 from typing import Final
 
@@ -9,15 +8,19 @@ import msgspec
 from msgspec import Struct
 
 from skyless.run.fix_batch import MAX_RECORDS, Batch, PackedFix, encode_batch, records_of
-from skyless.run.gather.messages import TagName
 
 MAX_NAMES: Final = 200_000
 MAX_WAITING: Final = 100_000
 """Fixes that wait for the stream. The oldest are dropped beyond it, and counted."""
 
 
-class NoNumberError(Exception):
-    """The table of names is full."""
+class TagName(Struct, frozen=True):
+    """The name of a tag's number. A number is given once and never again."""
+
+    name: str
+    host: str
+    """Where its fixes are packed."""
+    since_unix_s: float
 
 
 class NamesTable:
@@ -27,27 +30,16 @@ class NamesTable:
         self.numbers = {tag.name: number for number, tag in known.items()}
         self.issue = max(known, default=0)
         """The largest number that was given. Readers that know fewer read the names again."""
-        self._new: dict[int, TagName] = {}
-
-    def number_of(self, name: str, host: str, now_unix_s: float) -> int:
-        """The number of a name, a new one for a new name. Raises NoNumberError."""
-        number = self.numbers.get(name)
-        if number is None:
-            if len(self.numbers) >= MAX_NAMES:
-                raise NoNumberError
-            number = self.numbers[name] = self.issue = self.issue + 1
-            self._new[number] = TagName(name, host, now_unix_s)
-        return number
-
-    @property
-    def unsaved(self) -> dict[int, TagName]:
+        self.unsaved: dict[int, TagName] = {}
         """Names that are not in the stream yet."""
-        return dict(self._new)
 
-    def mark_saved(self, numbers: Iterable[int]) -> None:
-        """These are in the stream."""
-        for number in numbers:
-            self._new.pop(number, None)
+    def number_of(self, name: str, host: str, now_unix_s: float) -> int | None:
+        """The number of a name, a new one for a new name; None where the table is full."""
+        number = self.numbers.get(name)
+        if number is None and len(self.numbers) < MAX_NAMES:
+            number = self.numbers[name] = self.issue = self.issue + 1
+            self.unsaved[number] = TagName(name, host, now_unix_s)
+        return number
 
 
 class ReadyBatch(Struct, frozen=True):
@@ -60,10 +52,9 @@ class ReadyBatch(Struct, frozen=True):
 
 
 class Packer:
-    """Takes fixes one by one and gives them in batches."""
+    """Takes fixes one by one and gives them in batches. ``run`` is the random number of this start."""
 
     def __init__(self, run: int, host: str) -> None:
-        """``run`` is the random number of this start."""
         self.fixes, self.simulated = 0, False
         self.drops: Counter[str] = Counter()
         self._run, self._host = run, host
@@ -96,10 +87,11 @@ class Packer:
         taken: list[tuple[int, PackedFix]] = []
         while self._waiting and len(taken) < MAX_RECORDS:
             fix = self._waiting.popleft()
-            try:
-                taken.append((names.number_of(fix.tag, self._host, now_unix_s), fix))
-            except NoNumberError:
+            number = names.number_of(fix.tag, self._host, now_unix_s)
+            if number is None:
                 self.drops["no-number"] += 1
+            else:
+                taken.append((number, fix))
         if not taken:
             return None
         sequence = next(self._sequences)

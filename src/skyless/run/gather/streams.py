@@ -11,7 +11,7 @@ from nats.js.api import ConsumerConfig, DeliverPolicy, KeyValueConfig, StorageTy
 from nats.js.errors import BadRequestError, KeyWrongLastSequenceError
 
 from skyless.run.gather import subjects
-from skyless.run.gather.messages import TagName
+from skyless.run.gather.packer import TagName
 from skyless.run.process import Log
 
 if TYPE_CHECKING:
@@ -42,8 +42,8 @@ class LostLockError(Exception):
 async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -> None:
     """Make the streams of a site, or set the limits of those that are there."""
     fixes = StreamConfig(
-        name=subjects.fixes_stream(site),
-        subjects=[subjects.fixes(site)],
+        name=subjects.at(subjects.FIX_STREAM, site),
+        subjects=[subjects.at(subjects.FIXES, site)],
         storage=StorageType.FILE,
         num_replicas=1,
         max_age=KEEP_S,
@@ -51,8 +51,8 @@ async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -
         duplicate_window=_DUPLICATES_S,
     )
     names = StreamConfig(
-        name=subjects.names_stream(site),
-        subjects=[subjects.name_of(site)],
+        name=subjects.at(subjects.NAMES_STREAM, site),
+        subjects=[subjects.at(subjects.NAMES, site)],
         storage=StorageType.FILE,
         num_replicas=1,
         max_msgs_per_subject=1,
@@ -66,11 +66,13 @@ async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -
 
 async def read_names(stream: "JetStreamContext", site: int) -> dict[int, TagName]:
     """The names of all numbers that were given at a site."""
-    name, found = subjects.names_stream(site), dict[int, TagName]()
+    name, found = subjects.at(subjects.NAMES_STREAM, site), dict[int, TagName]()
     if (await stream.stream_info(name)).state.messages == 0:
         return found
     config = ConsumerConfig(deliver_policy=DeliverPolicy.ALL)
-    reading = await stream.subscribe(subjects.name_of(site), stream=name, ordered_consumer=True, config=config)
+    reading = await stream.subscribe(
+        subjects.at(subjects.NAMES, site), stream=name, ordered_consumer=True, config=config
+    )
     try:
         while True:
             message = await reading.next_msg(_READ_S)
@@ -87,7 +89,7 @@ async def store_name(stream: "JetStreamContext", site: int, number: int, tag: Ta
     """Store the name of a new number. Raises NumberTakenError."""
     data = msgspec.json.encode(tag)
     try:
-        await stream.publish(subjects.name_of(site, number), data, headers=dict(_NEVER_WRITTEN))
+        await stream.publish(subjects.at(subjects.NAMES, site, number), data, headers=dict(_NEVER_WRITTEN))
     except BadRequestError as error:
         raise NumberTakenError(f"number {number}: {error.description}") from None
 
@@ -95,39 +97,37 @@ async def store_name(stream: "JetStreamContext", site: int, number: int, tag: Ta
 class SiteLock:
     """Lets one gather at a time serve a site. It is a key at the server that lasts for ``_LOCK_S`` unless renewed."""
 
-    def __init__(self, stream: "JetStreamContext", site: int, log: Log) -> None:
-        self._stream, self._site, self._log = stream, site, log
-        self._owner = f"{platform.node()} {os.getpid()}".encode()
-        self._bucket: KeyValue | None = None
-        self._revision = 0
-
-    async def acquire(self) -> None:
-        """Wait until no other gather serves the site."""
-        config = KeyValueConfig(subjects.lock_bucket(self._site), ttl=_LOCK_S, storage=StorageType.MEMORY)
-        waits = False
-        while True:
-            self._bucket = await self._stream.create_key_value(config)
-            try:
-                self._revision = await self._bucket.create(_KEY, self._owner)
-            except KeyWrongLastSequenceError:
-                if not waits:
-                    self._log(f"another gather serves site {self._site}; this one waits until it ends")
-                waits = True
-                await asyncio.sleep(_RENEWAL_S)
-            else:
-                return
+    def __init__(self, bucket: "KeyValue", revision: int) -> None:
+        self._bucket, self._revision = bucket, revision
 
     async def hold(self) -> None:
         """Renew the lock until cancelled. Raises LostLockError."""
         while True:
             await asyncio.sleep(_RENEWAL_S)
             try:
-                if self._bucket is not None:
-                    self._revision = await self._bucket.update(_KEY, self._owner, self._revision)
+                self._revision = await self._bucket.update(_KEY, _owner(), self._revision)
             except Error as error:
                 raise LostLockError(str(error) or type(error).__name__) from None
 
     async def release(self) -> None:
         """Let another gather begin at once."""
-        if self._bucket is not None:
-            await self._bucket.delete(_KEY, self._revision)
+        await self._bucket.delete(_KEY, self._revision)
+
+
+async def lock_site(stream: "JetStreamContext", site: int, log: Log) -> SiteLock:
+    """Wait until no other gather serves the site."""
+    config = KeyValueConfig(subjects.at(subjects.LOCK_BUCKET, site), ttl=_LOCK_S, storage=StorageType.MEMORY)
+    waits = False
+    while True:
+        bucket = await stream.create_key_value(config)
+        try:
+            return SiteLock(bucket, await bucket.create(_KEY, _owner()))
+        except KeyWrongLastSequenceError:
+            if not waits:
+                log(f"another gather serves site {site}; this one waits until it ends")
+            waits = True
+            await asyncio.sleep(_RENEWAL_S)
+
+
+def _owner() -> bytes:
+    return f"{platform.node()} {os.getpid()}".encode()

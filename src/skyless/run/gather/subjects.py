@@ -1,16 +1,34 @@
-"""Subjects and streams of NATS, version 2 (``docs/batches.md``).
+"""Subjects and streams of NATS (``docs/batches.md``). ``{}`` is the site's number, or ``*`` for all sites.
 
-MQTT topics are subjects with dots instead of slashes; nats-server writes a dot within a level of a topic as ``//``.
+MQTT topics are subjects with dots instead of slashes. nats-server writes a dot within a level of a topic as ``//``.
 """
 
 import platform
 import re
 from typing import Final
 
-ROOT: Final = "skyless.v2"
+JSON_FIXES: Final = "skyless.v1.{}.tag.*.fix"
+STATUSES: Final = "skyless.v1.{}.*.*.status"
+SITES: Final = "skyless.v1.{}.site"
+FIXES: Final = "skyless.v2.{}.fixes.>"
+"""Batches; the last level is the sender's host."""
+NAMES: Final = "skyless.v2.{}.names.*"
+"""``TagName``; the last level is the tag's number."""
+LIVE: Final = "skyless.v2.{}.live"
+"""Every batch of the site once more, kept by no stream."""
+SUMMARY: Final = "skyless.v2.{}.summary"
+
+FIX_STREAM: Final = "FIX_{}"
+NAMES_STREAM: Final = "NAMES_{}"
+LOCK_BUCKET: Final = "GATHER_{}"
+
 EVERY: Final = "*"
-NAME_LEVEL: Final = 4
-"""Level of a tag's or node's name in the subjects of version 1."""
+
+
+def at(pattern: str, site: int | str, last: int | str = "") -> str:
+    """A subject or stream of a site, with its last level where the pattern leaves it open."""
+    subject = pattern.format(site)
+    return f"{subject[:-1]}{last}" if last else subject
 
 
 def own_host() -> str:
@@ -18,61 +36,12 @@ def own_host() -> str:
     return re.sub(r"[^A-Za-z0-9_-]", "-", platform.node()) or "host"
 
 
-def level_of(subject: str, level: int) -> str:
-    """A level as it was in the MQTT topic."""
-    return subject.split(".")[level].replace("//", ".")
+def tag_in(subject: str) -> str:
+    """Name of the tag in a subject of ``JSON_FIXES``, as in the MQTT topic."""
+    return subject.split(".")[4].replace("//", ".")
 
 
-def json_fixes(site: int | str) -> str:
-    """``FixMessage`` of each tag, version 1."""
-    return f"skyless.v1.{site}.tag.*.fix"
-
-
-def statuses(site: int | str) -> str:
-    """``StatusMessage`` of each program, version 1."""
-    return f"skyless.v1.{site}.*.*.status"
-
-
-def site_messages(site: int | str) -> str:
-    """``SiteMessage``, version 1."""
-    return f"skyless.v1.{site}.site"
-
-
-def fixes(site: int | str, host: str = ">") -> str:
-    """Batches of fixes that a host sends; by default those of every host."""
-    return f"{ROOT}.{site}.fixes.{host}"
-
-
-def name_of(site: int | str, number: int | str = EVERY) -> str:
-    """``TagName`` of a number."""
-    return f"{ROOT}.{site}.names.{number}"
-
-
-def numbers_request(site: int | str) -> str:
-    """A request for the numbers of tags, ``NumbersRequest``; gather answers with ``Numbers``."""
-    return f"{ROOT}.{site}.numbers"
-
-
-def live(site: int | str) -> str:
-    """Every batch of the site, once more, kept by no stream."""
-    return f"{ROOT}.{site}.live"
-
-
-def summary(site: int | str) -> str:
-    """``Summary``, once a second."""
-    return f"{ROOT}.{site}.summary"
-
-
-def fixes_stream(site: int) -> str:
-    """The stream of a site's batches."""
-    return f"FIX_{site}"
-
-
-def names_stream(site: int) -> str:
-    """The stream of a site's names, one message for each number."""
-    return f"NAMES_{site}"
-
-
-def lock_bucket(site: int) -> str:
-    """The bucket of keys and values in which a running gather states itself."""
-    return f"GATHER_{site}"
+def site_in(subject: str) -> int | None:
+    """Number of the site in a subject, or None where it has none."""
+    level = subject.split(".")[2]
+    return int(level) if level.isdecimal() and len(level) < 6 else None
