@@ -121,7 +121,8 @@ def decode_batch(data: bytes) -> Batch:
 def records_of(fixes: Sequence[tuple[int, FixMessage | PackedFix]], *, simulated: bool) -> Records:
     """Records of fixes, each with its tag's number. Values beyond a field's range are given as its limit."""
     rows = [_row(number, fix, simulated=simulated) for number, fix in fixes]
-    return np.array(rows, RECORD)
+    with np.errstate(over="ignore"):  # a covariance beyond 32 bits becomes infinite
+        return np.array(rows, RECORD)
 
 
 def _row(number: int, fix: FixMessage | PackedFix, *, simulated: bool) -> tuple[Any, ...]:
