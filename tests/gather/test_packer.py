@@ -18,6 +18,7 @@ def payload(tag, x_m=1.0):
 def batches(packer, names):
     found = []
     while packer.waiting:
+        packer.give_numbers(names, 2000.0)
         batch = packer.next_batch(names, 2000.0)
         if batch is not None:
             found.append(batch)

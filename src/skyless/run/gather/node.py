@@ -227,11 +227,11 @@ class Gather:
         """
         while True:
             if self._ready is None:
-                ready = self._packer.next_batch(self._names, time.time())
-                if ready is None and not self._packer.waiting:
-                    return
-                await self._store_names(stream, site)  # first, so that every number in a stream has a name
-                self._ready = ready
+                while self._packer.give_numbers(self._names, time.time()):
+                    await self._store_names(stream, site)  # first, so that every number in the stream has a name
+                self._ready = self._packer.next_batch(self._names, time.time())
+            if self._ready is None and not self._packer.waiting:
+                return
             if self._ready is not None:
                 subject, header = subjects.at(subjects.FIXES, site, self._host), {"Nats-Msg-Id": self._ready.id}
                 try:

@@ -1,7 +1,7 @@
 """Fixes of one site from JSON to batches, and the numbers of its tags. No I/O: the caller passes in the time."""
 
 from collections import Counter, deque
-from itertools import count
+from itertools import count, islice
 from typing import Final
 
 import msgspec
@@ -33,13 +33,11 @@ class NamesTable:
         self.unsaved: dict[int, TagName] = {}
         """Names that are not in the stream yet."""
 
-    def number_of(self, name: str, host: str, now_unix_s: float) -> int | None:
-        """The number of a name, a new one for a new name; None where the table is full."""
-        number = self.numbers.get(name)
-        if number is None and len(self.numbers) < MAX_NAMES:
-            number = self.numbers[name] = self.issue = self.issue + 1
-            self.unsaved[number] = TagName(name, host, now_unix_s)
-        return number
+    def add(self, name: str, host: str, now_unix_s: float) -> None:
+        """Give a new name a number. A full table gives none."""
+        if name not in self.numbers and len(self.numbers) < MAX_NAMES:
+            self.numbers[name] = self.issue = self.issue + 1
+            self.unsaved[self.issue] = TagName(name, host, now_unix_s)
 
 
 class ReadyBatch(Struct, frozen=True):
@@ -82,16 +80,18 @@ class Packer:
         self.fixes += 1
         self._waiting.append(fix)
 
+    def give_numbers(self, names: NamesTable, now_unix_s: float) -> bool:
+        """Give the fixes of the next batch their numbers. Whether names are to be saved before it is sent."""
+        for fix in islice(self._waiting, MAX_RECORDS):
+            names.add(fix.tag, self._host, now_unix_s)
+        return bool(names.unsaved)
+
     def next_batch(self, names: NamesTable, now_unix_s: float) -> ReadyBatch | None:
         """The oldest fixes that wait, at most ``MAX_RECORDS``; None without any that has a number."""
-        taken: list[tuple[int, PackedFix]] = []
-        while self._waiting and len(taken) < MAX_RECORDS:
-            fix = self._waiting.popleft()
-            number = names.number_of(fix.tag, self._host, now_unix_s)
-            if number is None:
-                self.drops["no-number"] += 1
-            else:
-                taken.append((number, fix))
+        fixes = [self._waiting.popleft() for _ in range(min(len(self._waiting), MAX_RECORDS))]
+        taken = [(names.numbers[fix.tag], fix) for fix in fixes if fix.tag in names.numbers]
+        if len(taken) < len(fixes):
+            self.drops["no-number"] += len(fixes) - len(taken)
         if not taken:
             return None
         sequence = next(self._sequences)
