@@ -140,6 +140,9 @@ class Given:
     def __init__(self):
         self.pages, self.ending, self.made = set(), False, Columns()
 
+    async def serve(self, socket, live):
+        await live2.serve_page(socket, live, self)
+
     def columns(self, site):
         assert site == SITE_ID
         return self.made

@@ -24,7 +24,6 @@ from skyless.page._site_survey import NoResultError
 from skyless.page._state import PageRequest
 from skyless.page.guard import AccessRules, Guard
 from skyless.page.live import LiveSite, NoBrokerError, NoSiteError, NotAllowedError, TooManyPagesError
-from skyless.page.live2 import serve_page
 from skyless.page.overlays import KINDS, NoOverlayError, Overlays
 from skyless.page.playback import NoRecordingError, Playback, RecordingFile
 from skyless.page.sites import LiveSites
@@ -51,6 +50,7 @@ _Endpoint = Callable[[Request], Coroutine[Any, Any, Response]]
 
 _TRY_LATER: Final = 1013
 _GOING_AWAY: Final = 1001
+_NO_GATHER: Final = 4404
 _STATUSES: Final[dict[type[Exception], int]] = {
     BadZonesError: 400,
     BadFactsError: 400,
@@ -284,7 +284,12 @@ def _live_for(socket: WebSocket) -> LiveSite:
 
 
 async def _live2(socket: WebSocket) -> None:
-    await serve_page(socket, _live_for(socket), _services(socket).gathered)
+    gathered = _services(socket).gathered
+    await socket.accept()
+    if gathered is None:
+        await socket.close(_NO_GATHER, "this server has no gather")
+    else:
+        await gathered.serve(socket, _live_for(socket))
 
 
 async def _live(socket: WebSocket) -> None:

@@ -7,8 +7,11 @@ from typing import Final
 
 from nats.aio.msg import Msg
 from nats.errors import SlowConsumerError
+from starlette.websockets import WebSocket
 
 from skyless.page.columns import Columns
+from skyless.page.live import LiveSite
+from skyless.page.live2 import serve_page
 from skyless.run.fix_batch import BadBatchError, decode_batch
 from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect
@@ -34,6 +37,10 @@ class Gathered:
     def columns(self, site: int | None) -> Columns:
         """The columns of a site, empty before its first batch."""
         return self._sites.get(site, _EMPTY)
+
+    async def serve(self, socket: WebSocket, live: LiveSite) -> None:
+        """Serve one page of ``/live2`` until it closes."""
+        await serve_page(socket, live, self)
 
     async def run(self) -> None:
         """Read until cancelled."""

@@ -28,7 +28,6 @@ _STILL_S: Final = 1.0
 
 _SEND_S: Final = 10.0
 _TRY_LATER: Final = 1013
-_NO_GATHER: Final = 4404
 _MAX_U16: Final = 65_535
 _HEAD: Final = struct.Struct("<BBHQ")
 _COUNTS_HEAD: Final = struct.Struct("<BBHHHQ")
@@ -145,12 +144,8 @@ class _Page:
             self.view = View.read(text) or self.view
 
 
-async def serve_page(socket: WebSocket, live: LiveSite, gathered: "Gathered | None") -> None:
-    """Serve one page until it closes."""
-    await socket.accept()
-    if gathered is None:
-        await socket.close(_NO_GATHER, "this server has no gather")
-        return
+async def serve_page(socket: WebSocket, live: LiveSite, gathered: "Gathered") -> None:
+    """Serve one accepted page until it closes."""
     if len(gathered.pages) >= MAX_PAGES:
         await socket.close(_TRY_LATER, f"too many pages are open: {len(gathered.pages)}")
         return
