@@ -12,11 +12,12 @@ import nats
 import numpy as np
 import pytest
 
+from skyless.core.errors import SkylessError
 from skyless.page.gathered import Gathered
 from skyless.run.broker import BrokerSettings, nats_of, start_broker
 from skyless.run.fix_batch import MAX_RECORDS, RECORD, Batch, PackedFix, decode_batch, encode_batch
 from skyless.run.gather import subjects
-from skyless.run.gather.address import NatsAddress
+from skyless.run.gather.address import NatsAddress, nats_address
 from skyless.run.gather.node import Gather, Summary
 from skyless.run.gather.packer import TagName
 from skyless.run.gather.stream_source import StreamSource
@@ -246,6 +247,33 @@ def test_a_dashboard_reads_batches_with_the_role_of_a_page(tmp_path):
             await asyncio.gather(task, return_exceptions=True)
 
     asyncio.run(check())
+
+
+def test_more_than_the_server_has_room_for_is_refused(tmp_path):
+    async def check():
+        async with broker(tmp_path) as running:
+            with pytest.raises(SkylessError, match=r"--keep-gb is 1000; it should be less"):
+                await Gather(running.nats, SITE, 10**12, print).run()
+
+    asyncio.run(check())
+
+
+WRONG = ("", "4222", "mqtt://a", "nats://", "nats://a:0", "nats://a:x", "nats://a/b", "nats://u:secret@")
+
+
+@pytest.mark.parametrize("url", WRONG)
+def test_a_wrong_address_is_named_without_its_password(url):
+    with pytest.raises(SkylessError, match=r"--nats is .*; it should be nats://") as raised:
+        nats_address(url)
+    assert "secret" not in str(raised.value)
+
+
+def test_addresses(monkeypatch):
+    monkeypatch.setenv("SKYLESS_MQTT_PASSWORD", "from-there")
+    assert nats_address("nats://here") == NatsAddress("nats://here:4222")
+    assert nats_address("tls://ann@[::1]:9") == NatsAddress("tls://[::1]:9", "ann", "from-there")
+    assert str(nats_address("nats://ann:own@here")) == "nats://ann@here:4222"
+    assert nats_address("nats://ann:own@here").password == "own"
 
 
 def test_the_broker_runs_a_gather_and_states_its_address(tmp_path):

@@ -1,6 +1,5 @@
 """``skyless gather``: the fixes of a large site in batches."""
 
-import asyncio
 import contextlib
 import time
 from typing import Annotated
@@ -10,7 +9,6 @@ from cyclopts import App, Parameter
 from skyless.cli.common.options import command
 from skyless.cli.common.output import print_json
 from skyless.cli.nodes.options import USUAL_KEEP_GB, KeepGb, SiteId, log
-from skyless.core.arguments import Positive
 
 app = App(name="gather", help_epilogue="Example: skyless gather --nats nats://127.0.0.1:4222 --site-id 7")
 
@@ -22,7 +20,6 @@ def gather(
     nats: Annotated[str, Parameter(env_var="SKYLESS_NATS")] = "nats://127.0.0.1:4222",
     site_id: SiteId | None = None,
     keep_gb: KeepGb = USUAL_KEEP_GB,
-    duration: Positive | None = None,
     json: bool = False,
 ) -> None:
     """Pack the fixes of a site's tags into batches until Ctrl-C, and keep them in a stream of NATS.
@@ -38,8 +35,6 @@ def gather(
         Number of the site that is gathered; by default the first one of which anything is heard.
     keep_gb
         Gigabytes of fixes that the broker keeps for readers that come later, at most those of 24 hours.
-    duration
-        Seconds to gather; by default until Ctrl-C.
     json
         Write one JSON object at the end: what was gathered and dropped.
     """
@@ -53,13 +48,8 @@ def gather(
     address = nats_address(nats)
     node = Gather(address, site_id, round(1e9 * keep_gb), log)
     begun_s = time.monotonic()
-
-    async def limited() -> None:
-        async with asyncio.timeout(duration):
-            await node.run()
-
-    with contextlib.suppress(KeyboardInterrupt, TimeoutError):
-        run(limited())
+    with contextlib.suppress(KeyboardInterrupt):
+        run(node.run())
     seconds = time.monotonic() - begun_s
     summary = node.summary
     if json:

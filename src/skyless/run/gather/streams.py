@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 from nats.errors import Error
 from nats.js.api import ConsumerConfig, DeliverPolicy, KeyValueConfig, StorageType, StreamConfig
-from nats.js.errors import BadRequestError, KeyWrongLastSequenceError
+from nats.js.errors import APIError, BadRequestError, KeyWrongLastSequenceError
 
+from skyless.core.errors import SkylessError
 from skyless.run.gather import subjects
 from skyless.run.gather.packer import TagName
 from skyless.run.process import Log
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 KEEP_S: Final = 24 * 3600.0
 """How long the stream keeps fixes."""
 
+_NO_ROOM: Final = 10047  # JetStream's code of an error
 _DUPLICATES_S: Final = 120.0
 _READ_S: Final = 10.0
 _LOCK_S: Final = 5.0
@@ -40,7 +42,11 @@ class LostLockError(Exception):
 
 
 async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -> None:
-    """Make the streams of a site, or set the limits of those that are there."""
+    """Make the streams of a site, or set the limits of those that are there.
+
+    Raises:
+        SkylessError: the server has no room for so many bytes.
+    """
     fixes = StreamConfig(
         name=subjects.at(subjects.FIX_STREAM, site),
         subjects=[subjects.at(subjects.FIXES, site)],
@@ -59,9 +65,15 @@ async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -
     )
     for config in (fixes, names):
         try:
-            await stream.add_stream(config)
-        except BadRequestError:  # it is there with other limits
-            await stream.update_stream(config)
+            try:
+                await stream.add_stream(config)
+            except BadRequestError:  # it is there with other limits
+                await stream.update_stream(config)
+        except APIError as error:
+            if error.err_code != _NO_ROOM:
+                raise
+            right = f"less than the server's max_file_store leaves: {error.description}"
+            raise SkylessError(f"--keep-gb is {keep_bytes / 1e9:g}; it should be {right}") from None
 
 
 async def read_names(stream: "JetStreamContext", site: int) -> dict[int, TagName]:
