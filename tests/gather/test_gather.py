@@ -32,7 +32,8 @@ from support.processes import free_port, started
 pytestmark = pytest.mark.site
 
 SITE = 7
-KEEP_BYTES = 50_000_000
+KEEP_BYTES = 5_000_000_000
+"""More than half of what the broker may store, so that its stream fits once only."""
 
 
 def fix(tag, x_m=1.0):
@@ -47,9 +48,9 @@ async def broker(folder, **options):
 
 
 @contextlib.asynccontextmanager
-async def gathering(address, site=SITE):
+async def gathering(address, site=SITE, keep_bytes=KEEP_BYTES):
     lines = []
-    node = Gather(address, site, KEEP_BYTES, lines.append)
+    node = Gather(address, site, keep_bytes, lines.append)
     task = asyncio.ensure_future(node.run())
     try:
         yield node, lines
@@ -137,13 +138,15 @@ def test_a_second_gather_waits_and_takes_over(tmp_path):
                         await publish(client, "a", n / 1000.0)
                     await stored(running.nats, 5)
                     assert (first.summary.fixes, second.summary.fixes) == (5, 0)
-            async with gathering(running.nats) as (third, _):
+            async with gathering(running.nats, keep_bytes=10**6) as (third, _):
                 await serving(client)
                 await publish(client, "a", 0.005)
                 rows, names = await stored(running.nats, 6)
                 assert [x for _, _, x in rows] == list(range(6))
                 assert names == {1: "a"}
                 assert third.summary.names == 1
+                info = await client.jetstream().stream_info(subjects.at(subjects.FIX_STREAM, SITE))
+                assert info.config.max_bytes == 10**6
 
     asyncio.run(check())
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 from nats.errors import Error
 from nats.js.api import ConsumerConfig, DeliverPolicy, KeyValueConfig, StorageType, StreamConfig
-from nats.js.errors import APIError, BadRequestError, KeyWrongLastSequenceError
+from nats.js.errors import APIError, BadRequestError, KeyWrongLastSequenceError, NotFoundError
 
 from skyless.core.errors import SkylessError
 from skyless.run.gather import subjects
@@ -65,15 +65,27 @@ async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -
     )
     for config in (fixes, names):
         try:
-            try:
+            found = await _max_bytes(stream, str(config.name))
+            if found is None:
                 await stream.add_stream(config)
-            except BadRequestError:  # it is there with other limits
+            elif found != (config.max_bytes or -1):
                 await stream.update_stream(config)
         except APIError as error:
             if error.err_code != _NO_ROOM:
                 raise
             right = f"less than the server's max_file_store leaves: {error.description}"
             raise SkylessError(f"--keep-gb is {keep_bytes / 1e9:g}; it should be {right}") from None
+
+
+async def _max_bytes(stream: "JetStreamContext", name: str) -> int | None:
+    """Most bytes of a stream, -1 without a limit; None where there is no such stream.
+
+    A stream is not added again: the server would reserve its bytes twice.
+    """
+    try:
+        return (await stream.stream_info(name)).config.max_bytes or -1
+    except NotFoundError:
+        return None
 
 
 async def read_names(stream: "JetStreamContext", site: int) -> dict[int, TagName]:
