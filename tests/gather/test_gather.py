@@ -11,6 +11,7 @@ import msgspec
 import nats
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError
 from skyless.page.gathered import Gathered
@@ -23,11 +24,11 @@ from skyless.run.gather.packer import TagName
 from skyless.run.gather.stream_source import StreamSource
 from skyless.run.gather.streams import NumberTakenError, store_name
 from skyless.run.mqtt.access import create_access, read_access
-from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.address import MqttAddress, mqtt_address
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import StatusMessage
 from skyless.run.mqtt.topics import fix_topic, status_topic
-from support.processes import free_port, started
+from support.processes import SKYLESS, started
 
 pytestmark = pytest.mark.site
 
@@ -42,7 +43,7 @@ def fix(tag, x_m=1.0):
 
 @contextlib.asynccontextmanager
 async def broker(folder, **options):
-    settings = BrokerSettings(port=free_port(), data=folder / "store", gathered_bytes=KEEP_BYTES, **options)
+    settings = BrokerSettings(data=folder / "store", gathered_bytes=KEEP_BYTES, **options)
     async with await start_broker(settings) as running:
         yield running
 
@@ -280,13 +281,13 @@ def test_addresses(monkeypatch):
 
 
 def test_the_broker_runs_a_gather_and_states_its_address(tmp_path):
-    port = free_port()
-    options = ("--port", str(port), "--data", str(tmp_path / "store"), "--gather", "--site-id", str(SITE), "--json")
-    with started(sys.executable, "-m", "skyless.cli.main", "broker", *options) as process:
+    options = ("--data", str(tmp_path / "store"), "--gather", "--site-id", str(SITE), "--json")
+    with started(*SKYLESS, "broker", *options, stderr=None) as process:
         stated = msgspec.json.decode(process.stdout.readline())
         address = NatsAddress(stated["nats"])
-        assert nats_of(MqttAddress("127.0.0.1", port)) == address
-        assert nats_of(MqttAddress("127.0.0.1", port + 1)) is None
+        mqtt = mqtt_address(stated["mqtt"])
+        assert nats_of(mqtt) == address
+        assert nats_of(replace(mqtt, port=1)) is None
 
         async def check():
             async with client_of(address) as client:
