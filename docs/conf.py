@@ -77,6 +77,7 @@ NAVIGATION = {
         "docs/sites",
         "docs/page",
         "docs/mqtt",
+        "docs/batches",
         "docs/phases",
         "docs/protocol",
         "docs/protocol2",

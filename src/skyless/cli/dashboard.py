@@ -13,8 +13,10 @@ from skyless.cli.nodes.options import MqttOptions, SiteId, listen_address, site_
 from skyless.core.errors import SkylessError
 
 if TYPE_CHECKING:
+    from skyless.page.gathered import Gathered
     from skyless.page.guard import AccessRules
     from skyless.page.serve import ListenAddress
+    from skyless.run.mqtt.address import MqttAddress
     from skyless.run.mqtt.messages import SiteMessage
 
 _SHORTEST_TOKEN = 12
@@ -32,6 +34,7 @@ def dashboard(
     listen: str | None = None,
     recordings: Path | None = None,
     token: Annotated[str | None, Parameter(env_var="SKYLESS_DASHBOARD_TOKEN")] = None,
+    nats: Annotated[str | None, Parameter(env_var="SKYLESS_NATS")] = None,
     json: bool = False,
 ) -> None:
     """Show a site live in the browser; Ctrl-C stops.
@@ -51,6 +54,9 @@ def dashboard(
         Folder of recordings to replay.
     token
         Token that browsers must give; made and printed where other machines can reach the page and none is given.
+    nats
+        NATS server of a site with a gather, nats://[USER@]HOST[:PORT] or tls://...; by default that of the broker, if
+        it runs on this machine with --gather.
     json
         Write one JSON object with the page's address instead of a table.
     """
@@ -88,9 +94,30 @@ def dashboard(
         sys.stdout.flush()
     else:
         print(f"page    {page}\nbroker  {address}", flush=True)
-    services = Services(LiveSites(live, make), Overlays(), Playback(recordings), WhatIfs())
+    services = Services(LiveSites(live, make), Overlays(), Playback(recordings), WhatIfs(), _gathered(nats, address))
     with contextlib.suppress(KeyboardInterrupt):
         asyncio.run(serve(services, rules, sock, address, known.site.id if known is not None else site_id))
+
+
+def _gathered(nats: str | None, broker: "MqttAddress") -> "Gathered | None":
+    """The batches of a gather; None without a gather, of which nothing is loaded then. Raises SkylessError."""
+    from skyless.core.extras import extra_module
+    from skyless.run.broker import nats_of
+    from skyless.run.gather.address import nats_address
+
+    address = nats_of(broker) if nats is None else nats_address(nats)
+    if address is None:
+        return None
+    try:
+        extra_module("nats", "--nats" if nats is not None else f"the gather of {broker}")
+    except SkylessError as error:
+        if nats is not None:
+            raise
+        print(f"without batches: {error}", file=sys.stderr, flush=True)
+        return None
+    from skyless.page.gathered import Gathered
+
+    return Gathered(address)
 
 
 def _client_name(port: int) -> str:

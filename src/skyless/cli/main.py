@@ -40,6 +40,11 @@ _GROUPS: Final = {
     ),
     "Run a site": (
         ("broker", "nodes.broker", "Run the MQTT broker that comes with Skyless."),
+        (
+            "gather",
+            "nodes.gather",
+            "Pack the fixes of a site with thousands of tags, and keep them in a stream of NATS.",
+        ),
         ("anchor", "nodes.anchor", "Run anchors of a site."),
         ("tag", "nodes.tag", "Run listening tags; with --print, --csv or --json their positions on standard output."),
         ("dashboard", "dashboard", "Show a site live in the browser."),

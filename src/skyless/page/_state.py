@@ -229,6 +229,11 @@ class SiteState:
 
     # Healths and statuses
 
+    @property
+    def conditions(self) -> dict[str, str]:
+        """The condition of each anchor, by its name, as of the last ``judge``."""
+        return self._conditions
+
     def judge(self, now_s: float, *, blind: bool) -> None:
         """Find the condition of each anchor: ``good``, ``warn`` (not synchronised) or ``bad`` (offline).
 

@@ -4,7 +4,7 @@ import asyncio
 import mimetypes
 from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 from urllib.parse import quote
 
 import msgspec
@@ -35,6 +35,9 @@ from skyless.run.mqtt.survey_facts import BadFactsError
 from skyless.run.zones.zone_list import BadZonesError, read_zones
 from skyless.site.file.check import image_size
 
+if TYPE_CHECKING:
+    from skyless.page.gathered import Gathered
+
 _PAGE: Final = Path(__file__).parent / "browser"
 PAGE_TIMEOUT_S: Final = 10.0
 """A page that accepts no message for this long is disconnected."""
@@ -50,6 +53,7 @@ _Endpoint = Callable[[Request], Coroutine[Any, Any, Response]]
 
 _TRY_LATER: Final = 1013
 _GOING_AWAY: Final = 1001
+_NO_GATHER: Final = 4404
 _STATUSES: Final[dict[type[Exception], int]] = {
     BadZonesError: 400,
     BadFactsError: 400,
@@ -71,6 +75,8 @@ class Services(Struct, frozen=True):
     playback: Playback
     what_ifs: WhatIfs
     sheets: TaskProcess = field(default_factory=lambda: TaskProcess("skyless.page.sheet_process"))
+    gathered: "Gathered | None" = None
+    """The batches of a broker with a gather."""
 
 
 def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Starlette:
@@ -103,6 +109,7 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
         Route("/api/recordings/{name}/floor_plan", _recorded(Playback.floor_plan, _image)),
         Route("/api/recordings/{name}/what_if", _what_if),
         WebSocketRoute("/live", _live),
+        WebSocketRoute("/live2", _live2),
         Mount("/page", _Files(directory=page, check_dir=False)),
     ]
     app = Starlette(
@@ -302,12 +309,26 @@ async def _what_if(request: Request) -> Response:
     return Response(answer, media_type="application/json")
 
 
-async def _live(socket: WebSocket) -> None:
+def _live_for(socket: WebSocket) -> LiveSite:
+    """The site that a page asks for, or another for a page that was open before the server's start, if it is gone."""
     sites = _services(socket).sites
     try:
-        live = sites.of(socket.query_params.get("site"))
-    except NoSiteError:  # a page that was open before the server's start, of a site that is gone
-        live = sites.of(None)
+        return sites.of(socket.query_params.get("site"))
+    except NoSiteError:
+        return sites.of(None)
+
+
+async def _live2(socket: WebSocket) -> None:
+    gathered = _services(socket).gathered
+    await socket.accept()
+    if gathered is None:
+        await socket.close(_NO_GATHER, "this server has no gather")
+    else:
+        await gathered.serve(socket, _live_for(socket))
+
+
+async def _live(socket: WebSocket) -> None:
+    live = _live_for(socket)
     await socket.accept()  # a browser does not show a page why its socket was refused, only why it was closed
     try:
         page = live.open_page(socket.client.host if socket.client is not None else "")

@@ -196,6 +196,11 @@ class LiveSite:
         self._used_share = used_share
         self._sites: bytes | None = None
 
+    @property
+    def site_id(self) -> int | None:
+        """Number of the site, or None before it is connected."""
+        return self._site_id
+
     # MQTT
 
     def attach(self, link: Link, site_id: int) -> None:

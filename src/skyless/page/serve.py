@@ -102,7 +102,9 @@ async def serve(
         timeout_graceful_shutdown=1,
     )
     server = _Server(config)
-    jobs = (services.sites.run(address, site_id), server.end_unfinished())
+    jobs = [services.sites.run(address, site_id), server.end_unfinished()]
+    if services.gathered is not None:
+        jobs.append(services.gathered.run())
     work = [asyncio.create_task(job) for job in jobs]
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, *ending_signals()):
@@ -126,6 +128,8 @@ def _stop(server: "_Server", services: Services) -> None:
         server.should_exit = True
         for live in services.sites.all:
             live.close()
+        if services.gathered is not None:
+            services.gathered.ending = True
         services.playback.stop()
         services.overlays.stop()
         services.what_ifs.stop()

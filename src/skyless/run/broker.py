@@ -9,6 +9,7 @@ import contextlib
 import fcntl
 import json
 import os
+import secrets
 import shutil
 import signal
 import socket
@@ -16,7 +17,7 @@ import ssl
 import sysconfig
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Final, Self
@@ -26,10 +27,12 @@ from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError
 from skyless.run.children import end
+from skyless.run.gather.address import FIRST_PORT as FIRST_NATS_PORT
+from skyless.run.gather.address import NatsAddress, nats_address
 from skyless.run.mqtt.access import ACCESS, Role
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress, mqtt_address
 from skyless.run.mqtt.connection import check_broker
-from skyless.run.process import data_folder, end_with_parent, is_free, locked, reserve
+from skyless.run.process import data_folder, end_with_parent, is_free, locked, reserve, reserve_next
 
 FIRST_PORT: Final = 1883
 _PORTS_TO_TRY: Final = 100
@@ -38,6 +41,9 @@ _TEMPORARY: Final = "skyless-broker-"  # how the name of a temporary folder begi
 
 _MAX_PAYLOAD: Final = 8 * 1024 * 1024
 _MAX_STORED: Final = 4 * 1024**3
+_NATS_HOST: Final = "127.0.0.1"
+_GATHER_USER: Final = "gather"
+_PASSWORD_BYTES: Final = 24
 _SEND_AGAIN: Final = "3s"  # when a message that a dying subscriber has not acknowledged is sent again; 30 s by default
 
 _ABANDONED_S: Final = 10.0  # a temporary folder of this age that no broker has locked was left by one that was killed
@@ -67,6 +73,8 @@ class BrokerSettings(Struct, frozen=True):
     """Whether clients without user and password have the stranger's role. Otherwise they are refused."""
     temporary: bool = False
     """Whether its data end with it: they are in a temporary folder."""
+    gathered_bytes: int | None = None
+    """What the streams of a gather may take on disk; None without a gather, whose port of NATS nobody uses."""
 
     def check(self) -> None:
         """Check the options for access.
@@ -93,23 +101,30 @@ class BrokerSettings(Struct, frozen=True):
         if (self.password or "").startswith("$2"):
             raise SkylessError("the broker's password should not begin with $2, which nats-server takes for a hash")
 
+    def nats_address(self, port: int) -> NatsAddress:
+        """The address for its gather, with the user that may do everything."""
+        url = f"nats://{_NATS_HOST}:{port}"
+        if self.roles is None:
+            return NatsAddress(url, self.user, self.password)
+        return NatsAddress(url, _GATHER_USER, secrets.token_urlsafe(_PASSWORD_BYTES))
+
     def address(self, port: int) -> MqttAddress:
         """Its address for clients on this machine. Where there are roles, each puts its own user there."""
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.listen, self.listen)
         return MqttAddress(host, port, self.certificate is not None, self.user, self.password)
 
 
-def _configuration(settings: BrokerSettings, port: int, data: Path) -> str:
-    """The file for nats-server, whose format takes JSON."""
+def _configuration(settings: BrokerSettings, port: int, data: Path, nats: NatsAddress | None = None) -> str:
+    """The file for nats-server, whose format takes JSON. ``nats`` is the address for a gather."""
     host = f"[{settings.listen}]" if ":" in settings.listen else settings.listen
     mqtt: dict[str, object] = {"listen": f"{host}:{port}", "ack_wait": _SEND_AGAIN}
     if settings.certificate is not None:
         mqtt["tls"] = {"cert_file": str(settings.certificate), "key_file": str(settings.key)}
     whole: dict[str, object] = {
         "server_name": "skyless",
-        "listen": "127.0.0.1:-1",  # the NATS protocol, which Skyless does not use
+        "listen": "127.0.0.1:-1" if nats is None else nats.url.partition("://")[2],  # NATS itself
         "max_payload": _MAX_PAYLOAD,
-        "jetstream": {"store_dir": str(data), "max_file_store": _MAX_STORED},
+        "jetstream": {"store_dir": str(data), "max_file_store": _MAX_STORED + (settings.gathered_bytes or 0)},
         "log_file": str(data / "nats-server.log"),
         "logfile_size_limit": 1_000_000,
         "logfile_max_num": 2,
@@ -122,6 +137,8 @@ def _configuration(settings: BrokerSettings, port: int, data: Path) -> str:
         if settings.strangers_read:
             users.append(_user(Role.STRANGER, ""))
             whole["no_auth_user"] = str(Role.STRANGER)
+        if nats is not None:
+            users.append({"user": nats.user, "password": nats.password})
         whole["authorization"] = {"users": users}
     return json.dumps(whole, ensure_ascii=False, indent=1) + "\n"
 
@@ -212,12 +229,14 @@ class Broker:
         data: Path,
         process: asyncio.subprocess.Process,
         lock: IO[str],
-        reservation: socket.socket,
+        reservations: tuple[socket.socket, ...],
+        nats: NatsAddress | None = None,
     ) -> None:
         self.address = address  # its address for clients on this machine, credentials included
+        self.nats = nats  # the same for its gather, None without one
         self.data = data
-        self._process, self._lock, self._reservation = process, lock, reservation
-        self._stated = None if address.tls else StatedAddress(address)  # its certificate is for other names
+        self._process, self._lock, self._reservations = process, lock, reservations
+        self._stated = None if address.tls else StatedAddress(address, nats)  # its certificate is for other names
 
     @property
     def pid(self) -> int:
@@ -235,7 +254,8 @@ class Broker:
         await end(self._process)
         if to_restart:
             os.utime(self.data)  # it is not abandoned
-        self._reservation.close()
+        for reservation in self._reservations:
+            reservation.close()
         _release(self.data, self._lock, keep=to_restart)
 
     async def __aenter__(self) -> Self:
@@ -276,21 +296,27 @@ async def _start(program: Path, settings: BrokerSettings, port: int, data: Path,
     reservation = _reserved(settings.listen, port)
     if reservation is None:
         raise _PortTakenError
+    nats: NatsAddress | None = None
+    reservations: tuple[socket.socket, ...] = (reservation,)
+    if settings.gathered_bytes is not None:
+        nats_port, second = reserve_next(_NATS_HOST, FIRST_NATS_PORT)
+        nats, reservations = settings.nats_address(nats_port), (reservation, second)
     try:
-        process = await _spawn(program, settings, port, data, lock)
+        process = await _spawn(program, settings, port, data, lock, nats)
     except BaseException:
-        reservation.close()
+        for held in reservations:
+            held.close()
         raise
-    return Broker(settings.address(port), data, process, lock, reservation)
+    return Broker(settings.address(port), data, process, lock, reservations, nats)
 
 
 async def _spawn(
-    program: Path, settings: BrokerSettings, port: int, data: Path, lock: IO[str]
+    program: Path, settings: BrokerSettings, port: int, data: Path, lock: IO[str], nats: NatsAddress | None
 ) -> asyncio.subprocess.Process:
     """nats-server, when it accepts MQTT."""
     file = data / "nats-server.conf"
     try:
-        _write_private(file, _configuration(settings, port, data))
+        _write_private(file, _configuration(settings, port, data, nats))
     except OSError as error:
         raise SkylessError(f"{file} cannot be written: {error.strerror}") from None
     process = await asyncio.create_subprocess_exec(
@@ -376,16 +402,19 @@ def _unverified() -> ssl.SSLContext:
 
 
 class StatedAddress:
-    """A broker's address, stated until ``withdraw``. Nothing is stated where no file can be written."""
+    """A broker's address, stated until ``withdraw``. Nothing is stated where no file can be written.
 
-    def __init__(self, address: MqttAddress) -> None:
+    The second line of the file is its address for NATS, where it has a gather.
+    """
+
+    def __init__(self, address: MqttAddress, nats: NatsAddress | None = None) -> None:
         self._file: Path | None = None
         self._lock: IO[str] | None = None
         with contextlib.suppress(OSError):
             file = _session_folder() / f"broker-{address.port}"
             self._lock = _locked(file)
             self._lock.truncate(0)
-            self._lock.write(str(address))
+            self._lock.write(f"{address}\n{nats.url}\n" if nats is not None else str(address))
             self._lock.flush()
             self._file = file
 
@@ -414,26 +443,41 @@ def _locked(file: Path) -> IO[str]:
 
 def running_broker() -> MqttAddress | None:
     """The broker that was started last of those that run on this machine, or None without any."""
-    with contextlib.suppress(OSError):
-        files = sorted(_session_folder().glob("broker-*"), key=lambda file: file.stat().st_mtime, reverse=True)
-        for file in files:
-            address = _address_in(file)
-            if address is not None:
-                return address
+    return next((mqtt_address(lines[0]) for lines in _stated()), None)
+
+
+def nats_of(broker: MqttAddress) -> NatsAddress | None:
+    """The address for NATS of a broker that runs on this machine with a gather, with the broker's user."""
+    for lines in _stated():
+        stated = mqtt_address(lines[0])
+        if len(lines) > 1 and (stated.host, stated.port) == (broker.host, broker.port):
+            return replace(nats_address(lines[1]), user=broker.user, password=broker.password)
     return None
 
 
-def _address_in(file: Path) -> MqttAddress | None:
-    """The address in a file, or None where its broker has ended. The file stays: a broker may be about to lock it."""
+def _stated() -> Iterator[list[str]]:
+    """The lines of each broker's file, the newest first."""
+    with contextlib.suppress(OSError):
+        files = sorted(_session_folder().glob("broker-*"), key=lambda file: file.stat().st_mtime, reverse=True)
+        for file in files:
+            lines = _lines_in(file)
+            if lines:
+                yield lines
+
+
+def _lines_in(file: Path) -> list[str]:
+    """The lines of a file, none where its broker has ended. The file stays: a broker may be about to lock it."""
     try:
         with file.open(encoding="utf-8") as stated:
             try:
                 fcntl.flock(stated, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
-                return mqtt_address(stated.read())
+                lines = stated.read().split()
+                mqtt_address(lines[0] if lines else "")
+                return lines
     except (OSError, SkylessError, UnicodeError):  # it has just ended, or begins at this moment
         pass
-    return None
+    return []
 
 
 def _session_folder() -> Path:

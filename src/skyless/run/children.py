@@ -5,6 +5,7 @@ import contextlib
 import os
 import sys
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -33,6 +34,8 @@ class Program(Struct, frozen=True):
     started again when it has ended by itself (a full disk, its limit reached)."""
     start_after_s: float = 0.0
     """Its first start is so much later."""
+    environment: Mapping[str, str] = {}
+    """Variables in addition to those of this program."""
 
     def start(self, number: int) -> tuple[str, ...]:
         """Arguments of its first, second ... start."""
@@ -103,6 +106,7 @@ class Child:
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=asyncio.subprocess.DEVNULL,
                 stderr=stderr,
+                env={**os.environ, **self.program.environment},
                 start_new_session=True,  # Ctrl-C in a terminal is for its parent
                 preexec_fn=end_with_parent(),
             )

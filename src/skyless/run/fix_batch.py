@@ -14,7 +14,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.core.alert import Alert
-from skyless.run.mqtt.messages import FixMessage
+from skyless.run.mqtt.messages import FixMessage, Matrix, Vector
 
 MAGIC: Final = b"SKB2"
 _HEADER: Final = struct.Struct("<4sHHIIQII")
@@ -50,6 +50,7 @@ SIMULATED: Final = 1 << 6
 ALERTS: Final = tuple(Alert)
 """The alert of a record is the number of its value here plus one; 0 for none."""
 
+_MAX_I64: Final = 2**63 - 1
 _MAX_I32: Final = 2**31 - 1
 _MAX_I16: Final = 2**15 - 1
 
@@ -59,6 +60,21 @@ Records = NDArray[Any]
 
 class BadBatchError(ValueError):
     """Bytes that are no batch."""
+
+
+class PackedFix(Struct, frozen=True):
+    """The fields of a ``FixMessage`` that a record is made of."""
+
+    tag: str
+    unix_s: float
+    position_m: Vector
+    covariance_m2: Matrix
+    velocity_mps: Vector | None
+    anchors: tuple[int, ...]
+    height_known: bool
+    hpl_m: float | None = None
+    alert: Alert | None = None
+    verified_until_s: float | None = None
 
 
 class Batch(Struct, frozen=True):
@@ -102,13 +118,14 @@ def decode_batch(data: bytes) -> Batch:
     return Batch(run, sequence, sent, issue, records)
 
 
-def records_of(fixes: Sequence[tuple[int, FixMessage]], *, simulated: bool) -> Records:
+def records_of(fixes: Sequence[tuple[int, FixMessage | PackedFix]], *, simulated: bool) -> Records:
     """Records of fixes, each with its tag's number. Values beyond a field's range are given as its limit."""
     rows = [_row(number, fix, simulated=simulated) for number, fix in fixes]
-    return np.array(rows, RECORD)
+    with np.errstate(over="ignore"):  # a covariance beyond 32 bits becomes infinite
+        return np.array(rows, RECORD)
 
 
-def _row(number: int, fix: FixMessage, *, simulated: bool) -> tuple[Any, ...]:
+def _row(number: int, fix: FixMessage | PackedFix, *, simulated: bool) -> tuple[Any, ...]:
     flags = SIMULATED if simulated else 0
     flags |= 0 if fix.alert is None else 1 + ALERTS.index(Alert(fix.alert))
     flags |= HEIGHT_GIVEN if fix.height_known else 0
@@ -121,15 +138,17 @@ def _row(number: int, fix: FixMessage, *, simulated: bool) -> tuple[Any, ...]:
     std_z_mm = NONE_U16 if fix.height_known else _counted(math.sqrt(max(zz, 0.0)), 1000.0)
     hpl_cm = NONE_U16 if fix.hpl_m is None else _counted(fix.hpl_m, 100.0)
     position_mm = tuple(_scaled(value, 1000.0, _MAX_I32) for value in fix.position_m)
-    unix_us = max(0, round(1e6 * fix.unix_s))
+    unix_us = max(0, _scaled(fix.unix_s, 1e6, _MAX_I64))
     anchors = min(len(fix.anchors), 255)
     return number, flags, anchors, 0, unix_us, position_mm, (xx, xy, yy), std_z_mm, hpl_cm, velocity
 
 
 def _scaled(value: float, scale: float, most: int) -> int:
-    return min(max(round(scale * value), -most), most) if math.isfinite(value) else 0
+    scaled = scale * value
+    return min(max(round(scaled), -most), most) if math.isfinite(scaled) else 0
 
 
 def _counted(value: float, scale: float) -> int:
     """A value that is not negative, below the mark for none."""
-    return min(max(round(scale * value), 0), NONE_U16 - 1) if math.isfinite(value) else NONE_U16
+    scaled = scale * value
+    return min(max(round(scaled), 0), NONE_U16 - 1) if math.isfinite(scaled) else NONE_U16

@@ -11,12 +11,14 @@ from cyclopts import App
 
 from skyless.cli.common.options import command
 from skyless.cli.common.output import print_json
-from skyless.cli.nodes.options import listen_address, log
+from skyless.cli.nodes.options import USUAL_KEEP_GB, KeepGb, SiteId, listen_address, log
 from skyless.core.arguments import whole
 from skyless.core.errors import SkylessError
+from skyless.core.extras import extra_module
 
 if TYPE_CHECKING:
     from skyless.run.broker import BrokerSettings
+    from skyless.run.gather.address import NatsAddress
 
 app = App(name="broker", help_epilogue="Example: skyless broker --port 1883")
 
@@ -33,6 +35,9 @@ def broker(
     strangers_read: bool = False,
     certificate: Path | None = None,
     key: Path | None = None,
+    gather: bool = False,
+    site_id: SiteId | None = None,
+    keep_gb: KeepGb = USUAL_KEEP_GB,
     json: bool = False,
 ) -> None:
     """Run an MQTT broker until Ctrl-C, and print its address when it is ready.
@@ -57,6 +62,12 @@ def broker(
         Certificate in PEM form; with it and --key the broker uses TLS.
     key
         Private key of the certificate in PEM form.
+    gather
+        Also run skyless gather, for a site with thousands of tags: its port of NATS serves this machine alone.
+    site_id
+        Number of the site that is gathered; by default the first one of which anything is heard.
+    keep_gb
+        Gigabytes of fixes that the broker keeps for readers that come later, at most those of 24 hours.
     json
         Write one JSON object instead of the address.
     """
@@ -70,9 +81,20 @@ def broker(
         raise SkylessError(f"--port is {port}, and --listen is {listen!r}; give the port once")
     roles = None if access is None else read_access(access)
     settings = BrokerSettings(
-        port or listen_port, host, data, user, password, certificate, key, roles, strangers_read=strangers_read
+        *(port or listen_port, host, data, user, password, certificate, key, roles),
+        strangers_read=strangers_read,
+        gathered_bytes=round(1e9 * keep_gb) if gather else None,
     )
-    asyncio.run(_serve(settings, json=json))
+    if gather:
+        extra_module("nats", "--gather")
+    elif site_id is not None or keep_gb != USUAL_KEEP_GB:
+        raise SkylessError("--site-id and --keep-gb belong to --gather")
+    asyncio.run(_serve(settings, _gather_arguments(site_id, keep_gb), json=json))
+
+
+def _gather_arguments(site_id: int | None, keep_gb: float) -> tuple[str, ...]:
+    named = () if site_id is None else ("--site-id", str(site_id))
+    return ("gather", "--keep-gb", str(keep_gb), *named)
 
 
 @app.command(name="access", help_epilogue="Example: skyless broker access passwords --mqtt mqtts://hall.local")
@@ -102,7 +124,7 @@ def create_passwords(folder: Path, /, *, mqtt: str = "mqtt://127.0.0.1:1883", js
         log(f"start the broker with --access {folder}; copy each file to the machines of its role only")
 
 
-async def _serve(settings: "BrokerSettings", *, json: bool) -> None:
+async def _serve(settings: "BrokerSettings", gather_arguments: tuple[str, ...], *, json: bool) -> None:
     from skyless.run.broker import start_broker
     from skyless.run.process import ending_signals
 
@@ -110,15 +132,33 @@ async def _serve(settings: "BrokerSettings", *, json: bool) -> None:
     for number in (signal.SIGINT, *ending_signals()):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     async with await start_broker(settings) as running:
+        nats = running.nats
         if json:
-            print_json({"mqtt": str(running.address), "data": running.data, "pid": running.pid})
+            stated = {} if nats is None else {"nats": str(nats)}
+            print_json({"mqtt": str(running.address), "data": running.data, "pid": running.pid, **stated})
         else:
             print(running.address)
+            if nats is not None:
+                print(nats)
         sys.stdout.flush()
+        gathering = None if nats is None else asyncio.ensure_future(_gathering(nats, gather_arguments))
         ended = asyncio.ensure_future(running.wait())
         asked = asyncio.ensure_future(stop.wait())
         await asyncio.wait((ended, asked), return_when=asyncio.FIRST_COMPLETED)
         asked.cancel()
+        if gathering is not None:
+            gathering.cancel()
+            await asyncio.gather(gathering, return_exceptions=True)
         if ended.done():
             raise SkylessError(f"nats-server has ended by itself; {running.data / 'nats-server.log'} may show why")
         ended.cancel()
+
+
+async def _gathering(nats: "NatsAddress", arguments: tuple[str, ...]) -> None:
+    """Run gather as a child process until cancelled."""
+    from skyless.run.children import Child, Program
+    from skyless.run.gather.address import NATS_VARIABLE
+    from skyless.run.mqtt.address import PASSWORD_VARIABLE
+
+    secret = {} if nats.password is None else {PASSWORD_VARIABLE: nats.password}
+    await Child(Program("gather", arguments, environment={NATS_VARIABLE: str(nats), **secret}), log).run()

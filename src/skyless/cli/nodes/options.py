@@ -21,6 +21,8 @@ _MAX_LIVE_HZ: Final = 4000.0
 
 MqttCa = Annotated[Path | None, Parameter(env_var="SKYLESS_MQTT_CA")]
 SiteId = Annotated[int, whole(0, 0xFFFD)]
+KeepGb = Annotated[float, number(above=0.0, most=100_000.0)]
+USUAL_KEEP_GB: Final = 8.0
 WalkingSpeed = Annotated[float, number(above=0.0, most=10.0)]
 
 

@@ -1,0 +1,232 @@
+"""What a gather costs, and how long a fix takes to the page's columns: real broker, real gather, all on this machine.
+
+``.venv/bin/python benchmarks/gather.py [--part json|packed|core|all] [--rate 50000] [--json-rate 4000] [--seconds 60]``
+
+``json``: a program publishes ``FixMessage`` as MQTT's messages reach NATS (with the header of QoS 0), and the gather
+packs them. ``packed``: a program publishes batches of 1,000 records into the site's stream, and a reader takes them
+into the page's columns. ``core``: the same at a site without a gather, so without a stream: the rest is JetStream's.
+Processor time is that of the processes by /proc. Latency is from a record's time to the end of the columns' update.
+"""
+
+import argparse
+import asyncio
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from skyless.page.gathered import Gathered
+from skyless.run.fix_batch import MAX_RECORDS, RECORD, Batch, encode_batch
+from skyless.run.gather import subjects
+from skyless.run.gather.address import NatsAddress, connect
+from skyless.run.gather.stream_source import StreamSource
+from skyless.run.mqtt.messages import FixMessage
+
+SITE, OTHER = 7, 8
+TAGS = 10_000
+VARIANCE = (1.23456e-3, 1e-5, 0.0, 1e-5, 1.3456e-3, 0.0, 0.0, 0.0, 1e-2)
+FIX = FixMessage(
+    *("tag00001", 12345, 1.79e9 + 0.123456, 123.456789, (1.2345678, 2.3456789, 1.0), VARIANCE),
+    *((0.1234567, 0.2345678, 0.0), VARIANCE, 0.0323456, 1.234567, 1.2345678, 1.2345678, None),
+    *((1, 2, 3, 4, 5, 6, 7, 8), 4.56789, 5, 0.012345, "joint", True, 0.0012345, 0.23456),
+)
+
+
+async def ignore(error):
+    print(f"  {error!r}", file=sys.stderr)
+
+
+def cpu_s(pid):
+    """Processor time of a process."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+async def publish_json(client, rate, seconds):
+    names = [f"tag{number:05}" for number in range(TAGS)]
+    payloads = [msgspec.json.encode(msgspec.structs.replace(FIX, tag=name)) for name in names]
+    sent, begin_s = 0, time.monotonic()
+    while sent < rate * seconds:
+        for _ in range(rate // 50):
+            place = sent % TAGS
+            subject = f"skyless.v1.{SITE}.tag.{names[place]}.fix"
+            await client.publish(subject, payloads[place], headers={"Nmqtt-Pub": "0"})
+            sent += 1
+        await asyncio.sleep(max(0.0, begin_s + sent / rate - time.monotonic()))
+    return sent
+
+
+async def publish_packed(client, rate, seconds, site):
+    """Each batch holds fixes that were made since the one before it, at equal intervals."""
+    records = np.zeros(MAX_RECORDS, RECORD)
+    records["covariance_m2"] = (1e-3, 0.0, 1e-3)
+    run, sequence, begin_s = os.getpid(), 0, time.time()
+    while sequence * MAX_RECORDS < rate * seconds:
+        first = sequence * MAX_RECORDS
+        due_s = begin_s + (first + MAX_RECORDS) / rate
+        await asyncio.sleep(max(0.0, due_s - time.time()))
+        serials = first + np.arange(MAX_RECORDS)
+        records["tag"] = serials % TAGS + 1
+        records["unix_us"] = 1e6 * (begin_s + serials / rate)
+        records["position_mm"][:, 0] = serials % 100_000
+        sequence += 1
+        data = encode_batch(Batch(run, sequence, round(1e6 * time.time()), TAGS, records))
+        subject = subjects.at(subjects.FIXES, site, "bench")
+        await client.publish(subject, data, headers={"Nats-Msg-Id": f"{run}-{sequence}"})
+    return sequence * MAX_RECORDS
+
+
+async def publisher(url, part, rate, seconds):
+    client = await connect(NatsAddress(url), "bench", ignore)
+    begin_s = time.process_time()
+    if part == "json":
+        sent = await publish_json(client, rate, seconds)
+    else:
+        sent = await publish_packed(client, rate, seconds, SITE if part == "packed" else OTHER)
+    await client.flush(30)
+    print(json.dumps({"sent": sent, "cpu_s": time.process_time() - begin_s}), flush=True)
+    await client.close()
+
+
+class Measured(Gathered):
+    """The page's reader, which also notes how old each record is once it is in the columns."""
+
+    def __init__(self, address):
+        super().__init__(address)
+        self.ages_ms = np.zeros(20_000, np.int64)
+        self.measuring_s = 0.0
+
+    async def _on_batch(self, message):
+        await super()._on_batch(message)
+        begin_s = time.process_time()
+        records = np.frombuffer(message.data, RECORD, offset=32)
+        ages_ms = (round(1e6 * time.time()) - records["unix_us"].astype(np.int64)) // 1000
+        self.ages_ms += np.bincount(np.clip(ages_ms, 0, 19_999), minlength=20_000)
+        self.measuring_s += time.process_time() - begin_s
+
+
+async def reader(url, expected):
+    """Read until the expected number of fixes is there, or nothing came for 5 s."""
+    measured = Measured(NatsAddress(url))
+    task = asyncio.create_task(measured.run())
+    print("ready", flush=True)
+    begin_s, count, still = time.process_time(), 0, 0
+    while count < expected and still < 20:
+        await asyncio.sleep(0.5)
+        still = still + 1 if count == measured.ages_ms.sum() and count else 0
+        count = int(measured.ages_ms.sum())
+    task.cancel()
+    share = np.cumsum(measured.ages_ms) / max(count, 1)
+    print(
+        json.dumps(
+            {
+                "read": count,
+                "cpu_s": time.process_time() - begin_s - measured.measuring_s,
+                "p50_ms": int(np.searchsorted(share, 0.5)),
+                "p99_ms": int(np.searchsorted(share, 0.99)),
+                "max_ms": int(np.flatnonzero(measured.ages_ms).max(initial=0)),
+                "dropped": measured.dropped,
+            }
+        ),
+        flush=True,
+    )
+
+
+def own(*arguments):
+    return subprocess.Popen([sys.executable, __file__, *map(str, arguments)], stdout=subprocess.PIPE, text=True)
+
+
+def last_line(process):
+    return json.loads(process.communicate()[0].splitlines()[-1])
+
+
+async def stored(url, expected):
+    """Rows in the stream, and whether the numbers of their batches are without a gap."""
+    rows, sequences = 0, []
+    async with StreamSource(NatsAddress(url), SITE, print) as source:
+        try:
+            async with asyncio.timeout(120):
+                async for first, records in source.rows():
+                    rows += len(records)
+                    sequences.append(first // MAX_RECORDS)
+                    if rows >= expected:
+                        break
+        except TimeoutError:
+            pass
+    return rows, sequences == list(range(sequences[0], sequences[0] + len(sequences))) if sequences else False
+
+
+def measure(part, url, pids, rate, seconds):
+    expected = rate * seconds
+    reading = None if part == "json" else own("read", url, expected)
+    if reading is not None:
+        reading.stdout.readline()
+        time.sleep(0.5)
+    before = {name: cpu_s(pid) for name, pid in pids.items()}
+    publishing = own("publish", url, part, rate, seconds)
+    sent = last_line(publishing)
+    read = {} if reading is None else last_line(reading)
+    time.sleep(1.5)
+    used = {name: cpu_s(pid) - before[name] for name, pid in pids.items()}
+    us = {name: round(1e6 * value / sent["sent"], 2) for name, value in used.items()}
+    us["publisher"] = round(1e6 * sent["cpu_s"] / sent["sent"], 2)
+    if read:
+        us["reader"] = round(1e6 * read.pop("cpu_s") / sent["sent"], 2)
+    print(f"{part}: {sent['sent']} fixes, {rate} a second; us of a core for each: {us}; {read}")
+    return sent["sent"]
+
+
+def child_of(pid, word):
+    """The process with a word in its command line among the children of another, once it runs."""
+    for _ in range(200):
+        for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+            if word in Path(f"/proc/{child}/cmdline").read_text().split("\0"):
+                return int(child)
+        time.sleep(0.05)
+    raise RuntimeError(f"{word} has not started")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--part", choices=("json", "packed", "core", "all"), default="all")
+    parser.add_argument("--rate", type=int, default=50_000)
+    parser.add_argument("--json-rate", type=int, default=4_000)
+    parser.add_argument("--seconds", type=int, default=60)
+    chosen = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        command = (sys.executable, "-m", "skyless.cli.main", "broker", "--gather", "--site-id", str(SITE), "--json")
+        broker = subprocess.Popen([*command, "--data", f"{folder}/data"], stdout=subprocess.PIPE, text=True)
+        try:
+            stated = json.loads(broker.stdout.readline())
+            pids = {"broker": stated["pid"], "gather": child_of(broker.pid, "gather")}
+            time.sleep(4.0)
+            total = 0
+            for part in ("json", "core", "packed"):
+                if chosen.part in (part, "all"):
+                    rate = chosen.json_rate if part == "json" else chosen.rate
+                    sent = measure(part, stated["nats"], pids, rate, chosen.seconds)
+                    total += sent if part != "core" else 0
+            rows, whole = asyncio.run(stored(stated["nats"], total))
+            print(
+                f"in the stream: {rows} of {total} fixes, {'no gap' if whole else 'with gaps'} in the batches' numbers"
+            )
+            size = sum(file.stat().st_size for file in Path(folder).rglob("*.blk"))
+            print(f"on disk: {size / max(rows, 1):.1f} bytes for each")
+        finally:
+            broker.terminate()
+            broker.wait()
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["publish"]:
+        asyncio.run(publisher(sys.argv[2], sys.argv[3], int(sys.argv[4]), int(sys.argv[5])))
+    elif sys.argv[1:2] == ["read"]:
+        asyncio.run(reader(sys.argv[2], int(sys.argv[3])))
+    else:
+        main()

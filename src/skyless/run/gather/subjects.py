@@ -1,0 +1,47 @@
+"""Subjects and streams of NATS (``docs/batches.md``). ``{}`` is the site's number, or ``*`` for all sites.
+
+MQTT topics are subjects with dots instead of slashes. nats-server writes a dot within a level of a topic as ``//``.
+"""
+
+import platform
+import re
+from typing import Final
+
+JSON_FIXES: Final = "skyless.v1.{}.tag.*.fix"
+STATUSES: Final = "skyless.v1.{}.*.*.status"
+SITES: Final = "skyless.v1.{}.site"
+FIXES: Final = "skyless.v2.{}.fixes.>"
+"""Batches; the last level is the sender's host."""
+NAMES: Final = "skyless.v2.{}.names.*"
+"""``TagName``; the last level is the tag's number."""
+LIVE: Final = "skyless.v2.{}.live"
+"""Every batch of the site once more, kept by no stream."""
+SUMMARY: Final = "skyless.v2.{}.summary"
+
+FIX_STREAM: Final = "FIX_{}"
+NAMES_STREAM: Final = "NAMES_{}"
+LOCK_BUCKET: Final = "GATHER_{}"
+
+EVERY: Final = "*"
+
+
+def at(pattern: str, site: int | str, last: int | str = "") -> str:
+    """A subject or stream of a site, with its last level where the pattern leaves it open."""
+    subject = pattern.format(site)
+    return f"{subject[:-1]}{last}" if last else subject
+
+
+def own_host() -> str:
+    """Name of the own computer as one level of a subject."""
+    return re.sub(r"[^A-Za-z0-9_-]", "-", platform.node()) or "host"
+
+
+def tag_in(subject: str) -> str:
+    """Name of the tag in a subject of ``JSON_FIXES``, as in the MQTT topic."""
+    return subject.split(".")[4].replace("//", ".")
+
+
+def site_in(subject: str) -> int | None:
+    """Number of the site in a subject, or None where it has none."""
+    level = subject.split(".")[2]
+    return int(level) if level.isdecimal() and len(level) < 6 else None

@@ -1,0 +1,309 @@
+"""The gather at a real nats-server: nothing lost, nothing twice, numbers for good, and one gather at a time."""
+
+import asyncio
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+
+import msgspec
+import nats
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from skyless.core.errors import SkylessError
+from skyless.page.gathered import Gathered
+from skyless.run.broker import BrokerSettings, nats_of, start_broker
+from skyless.run.fix_batch import MAX_RECORDS, RECORD, Batch, PackedFix, decode_batch, encode_batch
+from skyless.run.gather import subjects
+from skyless.run.gather.address import NatsAddress, nats_address
+from skyless.run.gather.node import Gather, Summary
+from skyless.run.gather.packer import TagName
+from skyless.run.gather.stream_source import StreamSource
+from skyless.run.gather.streams import NumberTakenError, store_name
+from skyless.run.mqtt.access import create_access, read_access
+from skyless.run.mqtt.address import MqttAddress, mqtt_address
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.messages import StatusMessage
+from skyless.run.mqtt.topics import fix_topic, status_topic
+from support.processes import SKYLESS, started
+
+pytestmark = pytest.mark.site
+
+SITE = 7
+KEEP_BYTES = 5_000_000_000
+"""More than half of what the broker may store, so that its stream fits once only."""
+
+
+def fix(tag, x_m=1.0):
+    return PackedFix(tag, 1000.0, (x_m, 2.0, 3.0), (1e-4,) * 9, None, (1, 2, 3), height_known=True)
+
+
+@contextlib.asynccontextmanager
+async def broker(folder, **options):
+    settings = BrokerSettings(data=folder / "store", gathered_bytes=KEEP_BYTES, **options)
+    async with await start_broker(settings) as running:
+        yield running
+
+
+@contextlib.asynccontextmanager
+async def gathering(address, site=SITE, keep_bytes=KEEP_BYTES):
+    lines = []
+    node = Gather(address, site, keep_bytes, lines.append)
+    task = asyncio.ensure_future(node.run())
+    try:
+        yield node, lines
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+@contextlib.asynccontextmanager
+async def client_of(address):
+    client = await nats.connect(address.url, user=address.user, password=address.password)
+    try:
+        yield client
+    finally:
+        await client.close()
+
+
+async def summaries(client):
+    return await client.subscribe(subjects.at(subjects.SUMMARY, SITE))
+
+
+async def serving(client):
+    """Until a gather serves the site."""
+    reading = await summaries(client)
+    await reading.next_msg(20)
+    await reading.unsubscribe()
+
+
+async def publish(client, tag, x_m):
+    level = tag.replace(".", "//")
+    await client.publish(f"skyless.v1.{SITE}.tag.{level}.fix", msgspec.json.encode(fix(tag, x_m)))
+
+
+async def stored(address, count, after=-1):
+    """The first rows of the stream: number, tag's number and x in mm."""
+    found = []
+    async with asyncio.timeout(20), StreamSource(address, SITE, lambda _line: None) as source:
+        async for first, records in source.rows(after):
+            found += [(first + n, int(row["tag"]), int(row["position_mm"][0])) for n, row in enumerate(records)]
+            if len(found) >= count:
+                break
+        return found, await source.names()
+
+
+def test_fixes_of_mqtt_and_of_nats_are_in_the_stream_once_and_in_order_and_numbers_survive(tmp_path):
+    async def check():
+        async with broker(tmp_path) as running, client_of(running.nats) as client:
+            async with gathering(running.nats):
+                await serving(client)
+                link = Link(running.address, "t", site=SITE, kind="tag")
+                task = asyncio.ensure_future(link.run())
+                for n in range(50):
+                    link.publish(fix_topic(SITE, f"t.{n % 5}"), fix(f"t.{n % 5}", n / 1000.0), qos=1)
+                first, names = await stored(running.nats, 50)
+                assert [x for _, _, x in first] == list(range(50))
+                assert [names[tag] for _, tag, _ in first] == [f"t.{n % 5}" for n in range(50)]
+                task.cancel()
+            async with gathering(running.nats):  # a new process: nothing in memory
+                await serving(client)
+                for n in range(50, 60):
+                    await publish(client, f"t.{n % 7}", n / 1000.0)
+                rows, again = await stored(running.nats, 60)
+            assert [x for _, _, x in rows] == list(range(60))
+            assert [again[tag] for _, tag, _ in rows[50:]] == [f"t.{n % 7}" for n in range(50, 60)]
+            assert {number: again[number] for number in names} == names
+            assert len(set(again.values())) == len(again) == 7
+            numbers = [number for number, _, _ in rows]
+            assert numbers == sorted(set(numbers))
+            later, _ = await stored(running.nats, 60 - 50, after=rows[49][0])
+            assert [x for _, _, x in later] == list(range(50, 60))
+
+    asyncio.run(check())
+
+
+def test_a_second_gather_waits_and_takes_over(tmp_path):
+    async def check():
+        async with broker(tmp_path) as running, client_of(running.nats) as client:
+            async with gathering(running.nats) as (first, _), asyncio.timeout(30):
+                await serving(client)
+                async with gathering(running.nats) as (second, lines):
+                    while not lines:
+                        await asyncio.sleep(0.02)
+                    assert "another gather serves site 7" in lines[0]
+                    for n in range(5):
+                        await publish(client, "a", n / 1000.0)
+                    await stored(running.nats, 5)
+                    assert (first.summary.fixes, second.summary.fixes) == (5, 0)
+            async with gathering(running.nats, keep_bytes=10**6) as (third, _):
+                await serving(client)
+                await publish(client, "a", 0.005)
+                rows, names = await stored(running.nats, 6)
+                assert [x for _, _, x in rows] == list(range(6))
+                assert names == {1: "a"}
+                assert third.summary.names == 1
+                info = await client.jetstream().stream_info(subjects.at(subjects.FIX_STREAM, SITE))
+                assert info.config.max_bytes == 10**6
+
+    asyncio.run(check())
+
+
+def test_a_number_is_never_given_twice_and_duplicates_of_a_batch_are_dropped(tmp_path):
+    async def check():
+        async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats) as (node, _):
+            await serving(client)
+            stream = client.jetstream()
+            await store_name(stream, SITE, 1, TagName("a", "elsewhere", 1.0))
+            with pytest.raises(NumberTakenError):
+                await store_name(stream, SITE, 1, TagName("b", "elsewhere", 1.0))
+            records = np.zeros(3, RECORD)
+            records["tag"], records["position_mm"][:, 0] = 1, (7, 8, 9)
+            live = await client.subscribe(subjects.at(subjects.LIVE, SITE))
+            subject = subjects.at(subjects.FIXES, SITE, "elsewhere")
+            for sequence in (1, 1, 2, 1):
+                data = encode_batch(Batch(5, sequence, 1, 1, records))
+                await stream.publish(subject, data, headers={"Nats-Msg-Id": f"5-{sequence}"})
+            await client.publish(subject, b"no batch")
+            rows, names = await stored(running.nats, 6)
+            assert [x for _, _, x in rows] == [7, 8, 9] * 2
+            assert names == {1: "a"}
+            assert [decode_batch((await live.next_msg(5)).data).sequence for _ in range(4)] == [1, 1, 2, 1]
+            while node.summary.drops != {"wrong-batch": 1}:
+                await asyncio.sleep(0.02)
+            assert node.summary.packed == 12
+            info = await stream.stream_info(subjects.at(subjects.FIX_STREAM, SITE))
+            assert info.config.max_bytes == KEEP_BYTES
+            assert info.config.max_age == 24 * 3600
+
+    asyncio.run(check())
+
+
+def test_nothing_that_came_is_lost_when_the_server_was_away(tmp_path):
+    """The broker is stopped by a signal while fixes wait, and the gather goes on with the same numbers afterwards."""
+
+    async def check():
+        async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats) as (node, _):
+            await serving(client)
+            for n in range(5):
+                await publish(client, "a", n / 1000.0)
+            await stored(running.nats, 5)
+            os.kill(running.pid, signal.SIGSTOP)
+            for n in range(5, 9):
+                node._packer.add("a", msgspec.json.encode(fix("a", n / 1000.0)))
+            await asyncio.sleep(0.5)
+            os.kill(running.pid, signal.SIGCONT)
+            rows, names = await stored(running.nats, 9)
+            assert [x for _, _, x in rows] == list(range(9))
+            assert names == {1: "a"}
+
+    asyncio.run(check())
+
+
+def test_the_site_is_found_and_its_programs_are_counted(tmp_path):
+    async def check():
+        opened = broker(tmp_path)
+        async with opened as running, client_of(running.nats) as client, gathering(running.nats, None) as (node, _):
+            reading = await summaries(client)
+
+            async def tell(online, name):
+                status = StatusMessage(online=online, kind="anchor", name=name)
+                subject = status_topic(SITE, "anchor", name).replace("/", ".")
+                await client.publish(subject, msgspec.json.encode(status))
+
+            async with asyncio.timeout(20):
+                while node.site is None:
+                    await tell(online=True, name="1")
+                    await asyncio.sleep(0.05)
+                await reading.next_msg(20)
+                for n in range(5):
+                    await tell(online=True, name=str(n))
+                await tell(online=False, name="3")
+                await client.publish(f"skyless.v1.{SITE}.site", b'{"site":{"name":"hall"},"simulated":true}')
+                summary = node.summary
+                while not summary.site or summary.online != {"anchor": 4}:
+                    summary = msgspec.json.decode((await reading.next_msg(20)).data, type=Summary)
+            assert (node.site, summary.site, summary.simulated) == (SITE, "hall", True)
+
+    asyncio.run(check())
+
+
+def test_a_dashboard_reads_batches_with_the_role_of_a_page(tmp_path):
+    async def check():
+        create_access(tmp_path / "access", MqttAddress("127.0.0.1", 1))
+        roles = read_access(tmp_path / "access")
+        async with broker(tmp_path, roles=roles) as running, client_of(running.nats) as client:
+            page = NatsAddress(running.nats.url, "page", roles["page"])
+            gathered = Gathered(page)
+            task = asyncio.ensure_future(gathered.run())
+            async with gathering(running.nats), asyncio.timeout(20):
+                await serving(client)
+                while not gathered.columns(SITE).serial:
+                    await publish(client, "a", 1.5)
+                    await asyncio.sleep(0.05)
+                assert gathered.columns(SITE).visible((0.0, 0.0, 9.0, 9.0), asyncio.get_running_loop().time()).x_m == [
+                    1.5
+                ]
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+    asyncio.run(check())
+
+
+def test_more_than_the_server_has_room_for_is_refused(tmp_path):
+    async def check():
+        async with broker(tmp_path) as running:
+            with pytest.raises(SkylessError, match=r"--keep-gb is 1000; it should be less"):
+                await Gather(running.nats, SITE, 10**12, print).run()
+
+    asyncio.run(check())
+
+
+WRONG = ("", "4222", "mqtt://a", "nats://", "nats://a:0", "nats://a:x", "nats://a/b", "nats://u:secret@")
+
+
+@pytest.mark.parametrize("url", WRONG)
+def test_a_wrong_address_is_named_without_its_password(url):
+    with pytest.raises(SkylessError, match=r"--nats is .*; it should be nats://") as raised:
+        nats_address(url)
+    assert "secret" not in str(raised.value)
+
+
+def test_addresses(monkeypatch):
+    monkeypatch.setenv("SKYLESS_MQTT_PASSWORD", "from-there")
+    assert nats_address("nats://here") == NatsAddress("nats://here:4222")
+    assert nats_address("tls://ann@[::1]:9") == NatsAddress("tls://[::1]:9", "ann", "from-there")
+    assert str(nats_address("nats://ann:own@here")) == "nats://ann@here:4222"
+    assert nats_address("nats://ann:own@here").password == "own"
+
+
+def test_the_broker_runs_a_gather_and_states_its_address(tmp_path):
+    options = ("--data", str(tmp_path / "store"), "--gather", "--site-id", str(SITE), "--json")
+    with started(*SKYLESS, "broker", *options, stderr=None) as process:
+        stated = msgspec.json.decode(process.stdout.readline())
+        address = NatsAddress(stated["nats"])
+        mqtt = mqtt_address(stated["mqtt"])
+        assert nats_of(mqtt) == address
+        assert nats_of(replace(mqtt, port=1)) is None
+
+        async def check():
+            async with client_of(address) as client:
+                await serving(client)
+                await publish(client, "a", 0.0)
+                rows, names = await stored(address, 1)
+                assert rows == [(MAX_RECORDS, 1, 0)]
+                assert names == {1: "a"}
+
+        asyncio.run(check())
+        process.send_signal(signal.SIGINT)
+        assert process.wait(20) == 0
+
+
+@pytest.mark.parametrize("modules", ["cli.nodes.broker, skyless.run.broker", "cli.dashboard, skyless.page.serve"])
+def test_without_a_gather_nothing_of_nats_is_loaded(modules):
+    heavy = "{'nats', 'duckdb', 'pyarrow'} & {name.partition('.')[0] for name in sys.modules}"
+    program = f"import sys, skyless, skyless.{modules}\nassert not {heavy}"
+    subprocess.run([sys.executable, "-c", program], check=True)
