@@ -161,7 +161,8 @@ def _keys(quit_: asyncio.Event) -> Iterator[None]:
     before = termios.tcgetattr(terminal)
 
     def read() -> None:
-        if os.read(terminal, 64).lower() in (b"q", b""):
+        keys = os.read(terminal, 64)
+        if not keys or b"q" in keys.lower():
             quit_.set()
 
     tty.setcbreak(terminal)
