@@ -162,10 +162,10 @@ def _anchor(row: AnchorRow) -> list[Text]:
 
 
 def _table(*columns: str, first: str, width: int) -> Table:
-    """A table whose columns of numbers keep their width; the others are cut where there is no space."""
-    gap = 2 if width >= _WIDE else 1
+    """A table whose columns of numbers keep their width; names are cut, and the last column where there is no space."""
+    gap, most = (2, 28) if width >= _WIDE else (1, 15)
     table = Table(box=None, padding=(0, gap, 0, 0), header_style="dim", pad_edge=False)
-    table.add_column(Text(first, "bold", no_wrap=True))
+    table.add_column(Text(first, "bold"), no_wrap=True, overflow="ellipsis", max_width=most)
     for name in columns:
         table.add_column(Text(name), justify="right", no_wrap=True)
     return table
@@ -176,10 +176,10 @@ def _cut(words: str, style: str = "") -> Text:
 
 
 def duration(seconds: float) -> str:
-    """A time for people, whole: 4 s, 12 min, 3 h."""
+    """A time for people, in whole units that have passed: 4 s, 12 min, 3 h."""
     if seconds < 120.0:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.0f} h"
+        return f"{int(seconds)} s"
+    return f"{int(seconds / 60.0)} min" if seconds < 7200.0 else f"{int(seconds / 3600.0)} h"
 
 
 def _cm(value_m: float | None) -> str:

@@ -70,6 +70,7 @@ async def _watch(
     address: "MqttAddress", site_id: int | None, last: "list[Picture]", *, once: bool, quiet: bool
 ) -> None:
     from skyless.cli.nodes._site_view import SiteView
+    from skyless.page.condition.evidence import ProcessorUse
     from skyless.page.condition.monitor import EVALUATION_S
     from skyless.run.find_site import find_site
     from skyless.run.mqtt.link import Link
@@ -84,7 +85,7 @@ async def _watch(
                 f"no program of a site is online at {address}; --site-id shows one all the same"
             ) from None
     link = Link(address, f"{os.uname().nodename}-{os.getpid()}", site=site_id, kind="watch")
-    view = SiteView(link, site_id)
+    view = SiteView(link, site_id, used_share=ProcessorUse().share)
     ends_s = [time.monotonic() + _FIND_S if once else math.inf]
     if once:
         link.on_state.append(lambda up: ends_s.append(time.monotonic() + _ONCE_S) if up else None)

@@ -9,6 +9,7 @@ from skyless.core.protocols import decode_any
 from skyless.core.site import NoiseSite
 from skyless.core.tag.beacon_receiver import TagReceiver
 from skyless.radio.interface import Gone, Hint, RadioEvent
+from skyless.radio.serial.link import Hello
 from skyless.radio.serial.serial_radio import SerialRadio
 from skyless.run.doctor.check import Check, residuals_check
 from skyless.run.doctor.clocks import CounterPairs, counters_check
@@ -24,6 +25,7 @@ class BoardProbe:
     def __init__(self, radio: SerialRadio, site: int | None) -> None:
         """``site`` is the number of the site that it is to hear; None for the first that is heard."""
         self.radio, self._troubles = radio, list[str]()
+        self._hello: Hello | None = None
         self._heard: Counter[int] = Counter()
         self._fixes: list[FixMessage] = []
         self._pairs = CounterPairs()
@@ -38,6 +40,7 @@ class BoardProbe:
             pass
 
     def _on_event(self, event: RadioEvent) -> None:
+        self._hello = self.radio.hello or self._hello
         if isinstance(event, Gone):
             self._troubles.append(event.reason)
         elif isinstance(event, Hint):
@@ -52,7 +55,7 @@ class BoardProbe:
 
     def checks(self, noise: NoiseSite) -> tuple[Check, ...]:
         """What was found."""
-        name, hello = f"board {self.radio.name}", self.radio.hello
+        name, hello = f"board {self.radio.name}", self._hello
         if hello is None:
             why = self._troubles[-1] if self._troubles else "the port could not be opened yet"
             return (Check(name, "failed", f"{why[0].upper()}{why[1:]}."),)
