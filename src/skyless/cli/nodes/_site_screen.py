@@ -106,16 +106,19 @@ def _fitted(rows: list[Text], most: int) -> list[Text]:
 
 
 def _tags(picture: Picture, most: int, width: int) -> Table:
-    table = _table(
-        "x/m", "y/m", "z/m", "σ/cm", "HPL/cm", "Hz", "from", first=f"tags ({len(picture.tags)})", width=width
-    )
+    numbers = ("x/m", "y/m", "z/m", "σ/cm", "HPL/cm", "Hz", "from")
+    table = _table(f"tags ({len(picture.tags)})", numbers, width)
     for name in ("age", "alert", "zone"):
         table.add_column(Text(name), no_wrap=name != "zone")
-    shown = picture.tags if len(picture.tags) <= most else picture.tags[: max(most - 1, 0)]
-    for row in shown:
-        table.add_row(*_tag(row))
-    if len(shown) < len(picture.tags):
-        table.add_row(_cut(f"and {len(picture.tags) - len(shown)} more", "dim"))
+    return _filled(table, [_tag(row) for row in picture.tags[:most]], len(picture.tags), most)
+
+
+def _filled(table: Table, rows: list[list[Text]], count: int, most: int) -> Table:
+    """The table with at most ``most`` of its ``count`` rows, the last of which says how many more there are."""
+    if count > most:
+        rows = [*rows[: max(most - 1, 0)], [Text(f"and {count - max(most - 1, 0)} more", "dim")]]
+    for row in rows:
+        table.add_row(*row)
     return table
 
 
@@ -139,13 +142,8 @@ def _tag(row: TagRow) -> list[Text]:
 
 
 def _anchors(picture: Picture, most: int, width: int) -> Table:
-    table = _table("role", "hears", "report", "missed", first=f"anchors ({len(picture.anchors)})", width=width)
-    shown = picture.anchors if len(picture.anchors) <= most else picture.anchors[: max(most - 1, 0)]
-    for row in shown:
-        table.add_row(*_anchor(row))
-    if len(shown) < len(picture.anchors):
-        table.add_row(_cut(f"and {len(picture.anchors) - len(shown)} more", "dim"))
-    return table
+    table = _table(f"anchors ({len(picture.anchors)})", ("role", "hears", "report", "missed"), width)
+    return _filled(table, [_anchor(row) for row in picture.anchors[:most]], len(picture.anchors), most)
 
 
 def _anchor(row: AnchorRow) -> list[Text]:
@@ -161,7 +159,7 @@ def _anchor(row: AnchorRow) -> list[Text]:
     ]  # fmt: skip
 
 
-def _table(*columns: str, first: str, width: int) -> Table:
+def _table(first: str, columns: tuple[str, ...], width: int) -> Table:
     """A table whose columns of numbers keep their width; names are cut, and the last column where there is no space."""
     gap, most = (2, 28) if width >= _WIDE else (1, 15)
     table = Table(box=None, padding=(0, gap, 0, 0), header_style="dim", pad_edge=False)

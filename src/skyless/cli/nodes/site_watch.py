@@ -25,6 +25,7 @@ _FIND_S: Final = 5.0
 _ONCE_S: Final = 2.5
 """--once looks for this long once the broker is connected: tags and anchors report every second."""
 _LINE_S: Final = 1.0
+_WAIT_SHARE: Final = 3.0
 _FEW_LINES: Final = 24
 
 app = App(name="watch", help_epilogue="Example: skyless watch --mqtt mqtts://page@hall.example")
@@ -96,11 +97,14 @@ async def _watch(
         with shown as show:
             due_s = time.monotonic()
             while not quit_.is_set() and time.monotonic() < ends_s[-1]:
-                view.evaluate(time.monotonic() - due_s)
+                began_s = time.monotonic()
+                view.evaluate(began_s - due_s)
                 show()
-                due_s = time.monotonic() + EVALUATION_S
+                # Of very many tags it takes longer, and the messages are to be read as well.
+                wait_s = max(EVALUATION_S, _WAIT_SHARE * (time.monotonic() - began_s))
+                due_s = time.monotonic() + wait_s
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(EVALUATION_S):
+                    async with asyncio.timeout(wait_s):
                         await quit_.wait()
     finally:
         last.append(view.picture())

@@ -11,6 +11,9 @@ from skyless.run.doctor.check import Check
 _SHORT_S: Final = 0.5
 _LONG_S: Final = 4.0
 _MIN_SAMPLES: Final = 30
+_STEP_TICKS: Final = round(0.05 / TICK_S)
+"""Stamps of a pair that follow sooner are not needed."""
+_MAX_PAIRS: Final = 1000
 _TOO_NOISY: Final = 1.5
 """Measured over assumed. Pairs share counters, so that six anchors and 25 s give a ratio with a deviation of 0.15."""
 
@@ -23,10 +26,15 @@ class CounterPairs:
 
     def add(self, receiver: str, sender: int, tx_ticks: int, rx_ticks: int) -> None:
         """Add a frame, in order. After a restart of either counter, or a long gap, the pair begins again."""
-        stamps = self._pairs.setdefault((receiver, sender), [])
+        pair = receiver, sender
+        if pair not in self._pairs and len(self._pairs) >= _MAX_PAIRS:
+            return
+        stamps = self._pairs.setdefault(pair, [])
         if stamps:
             last_tx, last_rx = stamps[-1]
             elapsed = (rx_ticks - last_rx) % (1 << 40)
+            if elapsed < _STEP_TICKS:
+                return
             sent_ticks = continued(tx_ticks, last_tx, elapsed)
             if sent_ticks is None:
                 stamps.clear()

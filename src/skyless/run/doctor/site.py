@@ -89,9 +89,9 @@ class SiteProbe:
             return broker, Check("site", "failed", f"The broker has no site of number {self._number}.", advice)
         site = self._site.whole_site
         known = self._site_check(site, file_site)
-        anchors = (self._reporting(site), self._slots(), self._losses(site)) if self._anchors else ()
-        clocks = counters_check(self._pairs, site.noise, "anchors' clocks") if self._stamps else ()
-        return broker, known, *anchors, *self._tag_checks(), *((clocks,) if clocks else ())
+        clocks = counters_check(self._pairs, site.noise, "anchors' clocks")
+        anchors = (self._slots(), self._losses(site), clocks) if self._anchors else ()
+        return broker, known, self._reporting(site), *anchors, *self._tag_checks()
 
     def _broker(self) -> Check:
         if not self._round_trips_s:
@@ -112,6 +112,9 @@ class SiteProbe:
     def _reporting(self, site: Site) -> Check:
         missing = [str(one.id) for one in site.all_anchors if one.id not in self._anchors]
         finding = f"{len(site.all_anchors) - len(missing)} of {len(site.all_anchors)} anchors report"
+        if not self._anchors and self._fixes:
+            finding = "No program of an anchor reports, as where the anchors are another system's."
+            return Check("anchors", "not checked", finding)
         if missing:
             advice = "See their programs' logs, their power and the network."
             return Check("anchors", "failed", f"{finding}; missing: {', '.join(missing[:20])}.", advice)
@@ -119,9 +122,7 @@ class SiteProbe:
 
     def _slots(self) -> Check:
         """Transmissions that were missed."""
-        shares = {
-            anchor: statistics.mean(one.missed_share for one in healths) for anchor, healths in self._anchors.items()
-        }
+        shares = {anchor: statistics.mean(h.missed_share for h in healths) for anchor, healths in self._anchors.items()}
         worst = max(shares, key=lambda anchor: shares[anchor])
         finding = f"Anchor {worst} misses the most transmissions: {shares[worst]:.1%}."
         advice = "Its computer is too slow or busy: end other programs there, or move anchors to another computer."
@@ -129,19 +130,18 @@ class SiteProbe:
 
     def _losses(self, site: Site) -> Check:
         """What anchors receive of those within the range in the open, against what these send."""
-        places = {one.id: (one.x_m, one.y_m, one.z_m) for one in site.anchors}
+        places = {one.id: (one.x_m, one.y_m, one.z_m) for one in site.anchors if one.id in self._anchors}
         shares = {}
-        for (receiver, sender), count in self._stamps.items():
-            first_s, last_s = self._stamps_s[receiver]
-            near = (
-                receiver in places and sender in places and math.dist(places[receiver], places[sender]) < RADIO_REACH_M
-            )
-            if near and last_s - first_s > 1.0:
-                shares[receiver, sender] = count * beacon_period_s(site) / (last_s - first_s)
+        for receiver, (first_s, last_s) in self._stamps_s.items():
+            if receiver not in places or last_s - first_s < 1.0:
+                continue
+            sent = (last_s - first_s) / beacon_period_s(site)
+            for sender, place in places.items():
+                if sender != receiver and math.dist(places[receiver], place) < RADIO_REACH_M:
+                    shares[receiver, sender] = self._stamps[receiver, sender] / sent
         if not shares:
-            return Check(
-                "reception", "not checked", "No anchor has sent its stamps.", "See the user's role at the broker."
-            )
+            advice = "See the user's role at the broker."
+            return Check("reception", "not checked", "No anchor has sent its stamps.", advice)
         (receiver, sender), worst = min(shares.items(), key=lambda one: one[1])
         finding = (
             f"Anchors receive {statistics.mean(shares.values()):.0%} of what those within {RADIO_REACH_M:.0f} m send; "
@@ -156,12 +156,10 @@ class SiteProbe:
         without = {name: healths[-1].reason for name, healths in self._tags.items() if healths[-1].reason is not None}
         finding = f"{len(self._tags) - len(without)} of {len(self._tags)} tags have a fix"
         named = ", ".join(f"{name} ({reason})" for name, reason in list(without.items())[:10])
-        advice = "skyless watch and the page say what each reason means."
-        tags = (
-            Check("tags", "failed", f"{finding}; not: {named}.", advice)
-            if without
-            else Check("tags", "ok", f"{finding}.")
-        )
+        tags = Check("tags", "ok", f"{finding}.")
+        if without:
+            advice = "skyless watch and the page say what each reason means."
+            tags = Check("tags", "failed", f"{finding}; not: {named}.", advice)
         late = sum(healths[-1].late - healths[0].late for healths in self._tags.values())
         received = sum(healths[-1].receptions - healths[0].receptions for healths in self._tags.values())
         share = late / max(received, late, 1)
