@@ -82,7 +82,7 @@ def test_a_page_for_each_floor_and_more_where_anchors_do_not_fit():
     two = replace(ROOM, anchors=(*ROOM.anchors, *upstairs))
     assert pages(sheet(two, None, "pdf", "2026-01-02", (0.0, 0.0, 0.0))) == 2
     assert png_size(sheet(two, None, "png", "2026-01-02")) == (A4_PIXELS[0], 2 * A4_PIXELS[1])
-    many = grid_site(25.0, 25.0, 5.0, 4.0, 1.2)
+    many = grid_site(30.0, 30.0, 5.0, 4.0, 1.2)
     assert len(many.anchors) > 26
     assert pages(sheet(many, None, "pdf", "2026-01-02")) == 1 + math.ceil((len(many.anchors) - 26) / 60)
 
