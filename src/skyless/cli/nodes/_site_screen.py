@@ -106,16 +106,19 @@ def _fitted(rows: list[Text], most: int) -> list[Text]:
 
 
 def _tags(picture: Picture, most: int, width: int) -> Table:
-    table = _table(
-        "x/m", "y/m", "z/m", "σ/cm", "HPL/cm", "Hz", "from", first=f"tags ({len(picture.tags)})", width=width
-    )
+    numbers = ("x/m", "y/m", "z/m", "σ/cm", "HPL/cm", "Hz", "from")
+    table = _table(f"tags ({len(picture.tags)})", numbers, width)
     for name in ("age", "alert", "zone"):
         table.add_column(Text(name), no_wrap=name != "zone")
-    shown = picture.tags if len(picture.tags) <= most else picture.tags[: max(most - 1, 0)]
-    for row in shown:
-        table.add_row(*_tag(row))
-    if len(shown) < len(picture.tags):
-        table.add_row(_cut(f"and {len(picture.tags) - len(shown)} more", "dim"))
+    return _filled(table, [_tag(row) for row in picture.tags[:most]], len(picture.tags), most)
+
+
+def _filled(table: Table, rows: list[list[Text]], count: int, most: int) -> Table:
+    """The table with at most ``most`` of its ``count`` rows, the last of which says how many more there are."""
+    if count > most:
+        rows = [*rows[: max(most - 1, 0)], [Text(f"and {count - max(most - 1, 0)} more", "dim")]]
+    for row in rows:
+        table.add_row(*row)
     return table
 
 
@@ -139,13 +142,8 @@ def _tag(row: TagRow) -> list[Text]:
 
 
 def _anchors(picture: Picture, most: int, width: int) -> Table:
-    table = _table("role", "hears", "report", "missed", first=f"anchors ({len(picture.anchors)})", width=width)
-    shown = picture.anchors if len(picture.anchors) <= most else picture.anchors[: max(most - 1, 0)]
-    for row in shown:
-        table.add_row(*_anchor(row))
-    if len(shown) < len(picture.anchors):
-        table.add_row(_cut(f"and {len(picture.anchors) - len(shown)} more", "dim"))
-    return table
+    table = _table(f"anchors ({len(picture.anchors)})", ("role", "hears", "report", "missed"), width)
+    return _filled(table, [_anchor(row) for row in picture.anchors[:most]], len(picture.anchors), most)
 
 
 def _anchor(row: AnchorRow) -> list[Text]:
@@ -161,11 +159,11 @@ def _anchor(row: AnchorRow) -> list[Text]:
     ]  # fmt: skip
 
 
-def _table(*columns: str, first: str, width: int) -> Table:
-    """A table whose columns of numbers keep their width; the others are cut where there is no space."""
-    gap = 2 if width >= _WIDE else 1
+def _table(first: str, columns: tuple[str, ...], width: int) -> Table:
+    """A table whose columns of numbers keep their width; names are cut, and the last column where there is no space."""
+    gap, most = (2, 28) if width >= _WIDE else (1, 15)
     table = Table(box=None, padding=(0, gap, 0, 0), header_style="dim", pad_edge=False)
-    table.add_column(Text(first, "bold", no_wrap=True))
+    table.add_column(Text(first, "bold"), no_wrap=True, overflow="ellipsis", max_width=most)
     for name in columns:
         table.add_column(Text(name), justify="right", no_wrap=True)
     return table
@@ -176,10 +174,10 @@ def _cut(words: str, style: str = "") -> Text:
 
 
 def duration(seconds: float) -> str:
-    """A time for people, whole: 4 s, 12 min, 3 h."""
+    """A time for people, in whole units that have passed: 4 s, 12 min, 3 h."""
     if seconds < 120.0:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.0f} h"
+        return f"{int(seconds)} s"
+    return f"{int(seconds / 60.0)} min" if seconds < 7200.0 else f"{int(seconds / 3600.0)} h"
 
 
 def _cm(value_m: float | None) -> str:

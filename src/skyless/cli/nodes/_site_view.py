@@ -8,7 +8,7 @@ from typing import Final, Literal
 
 from msgspec import Struct
 
-from skyless.page.condition.evidence import ALERTS, FRESH_S, Evidence, Node, ProcessorUse
+from skyless.page.condition.evidence import ALERTS, FRESH_S, Evidence, Node
 from skyless.page.condition.monitor import Condition, ConditionMonitor
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.link import Link
@@ -95,10 +95,19 @@ class Picture(Struct, frozen=True):
 class SiteView:
     """Subscribes to a site's topics. It publishes nothing but its own status."""
 
-    def __init__(self, link: Link, number: int, clock: Callable[[], float] = time.monotonic) -> None:
-        self.link, self._number, self._clock = link, number, clock
+    def __init__(
+        self,
+        link: Link,
+        number: int,
+        clock: Callable[[], float] = time.monotonic,
+        wall_clock: Callable[[], float] = time.time,
+        used_share: Callable[[float], float | None] | None = None,
+    ) -> None:
+        """``used_share`` is as for the page's ``LiveSite``."""
+        self.link, self._number, self._clock, self._wall_clock = link, number, clock, wall_clock
+        self._used_share = used_share
         self.evidence = Evidence(platform.node(), clock())
-        self._monitor, self._zones, self._processors = ConditionMonitor(self.evidence), ZoneMonitor(), ProcessorUse()
+        self._monitor, self._zones = ConditionMonitor(self.evidence), ZoneMonitor()
         self.condition = self._monitor.evaluate(clock())
         self._site: SiteMessage | None = None
         self._fixes: dict[str, tuple[FixMessage, float]] = {}  # with the time at which its last frame ended
@@ -146,11 +155,11 @@ class SiteView:
         self.evidence.add_status(status, self._clock())
 
     def _on_health(self, kind: str, name: str, health: TagHealth | AnchorHealth | EtherHealth) -> None:
-        self.evidence.add_health(kind, name, health, self._clock(), time.time())
+        self.evidence.add_health(kind, name, health, self._clock(), self._wall_clock())
 
     def _on_watch(self, message: WatchMessage) -> None:
         """Note when it was made: the first after a connection may be an old one that the broker kept."""
-        kept_s = max(0.0, time.time() - message.unix_s) if self._watch is None else 0.0
+        kept_s = max(0.0, self._wall_clock() - message.unix_s) if self._watch is None else 0.0
         self._watch = message, self._clock() - kept_s
 
     def _on_zones(self, _topic: str, payload: bytes) -> None:
@@ -162,7 +171,7 @@ class SiteView:
 
     def _set_zones(self) -> None:
         if self._site is not None:
-            self._zones.set_zones(zones_of(self._kept_zones, self._site.site.name).zones, time.time())
+            self._zones.set_zones(zones_of(self._kept_zones, self._site.site.name).zones, self._wall_clock())
 
     def _on_alarm(self, topic: str, payload: bytes) -> None:
         if not payload:
@@ -181,9 +190,9 @@ class SiteView:
         now_s = self._clock()
         watch, made_s = self._watch or (None, now_s)
         age_s = None if watch is None else now_s - made_s
-        used, unread_s = self._processors.share(now_s), self.link.unread_s
-        self.condition = self._monitor.evaluate(now_s, lag_s, watch, age_s, used, unread_s)
-        self._zones.expire_tags(now_s, time.time())
+        used = None if self._used_share is None else self._used_share(now_s)
+        self.condition = self._monitor.evaluate(now_s, lag_s, watch, age_s, used, self.link.unread_s)
+        self._zones.expire_tags(now_s, self._wall_clock())
 
     def picture(self) -> Picture:
         """The site now."""
@@ -202,7 +211,7 @@ class SiteView:
             site="" if site is None else site.site.name,
             number=self._number,
             simulated=site is not None and site.simulated,
-            unix_s=time.time(),
+            unix_s=self._wall_clock(),
             broker=str(self.link.address),
             trouble=self.link.trouble,
             condition=self.condition,

@@ -25,6 +25,7 @@ _FIND_S: Final = 5.0
 _ONCE_S: Final = 2.5
 """--once looks for this long once the broker is connected: tags and anchors report every second."""
 _LINE_S: Final = 1.0
+_WAIT_SHARE: Final = 3.0
 _FEW_LINES: Final = 24
 
 app = App(name="watch", help_epilogue="Example: skyless watch --mqtt mqtts://page@hall.example")
@@ -70,6 +71,7 @@ async def _watch(
     address: "MqttAddress", site_id: int | None, last: "list[Picture]", *, once: bool, quiet: bool
 ) -> None:
     from skyless.cli.nodes._site_view import SiteView
+    from skyless.page.condition.evidence import ProcessorUse
     from skyless.page.condition.monitor import EVALUATION_S
     from skyless.run.find_site import find_site
     from skyless.run.mqtt.link import Link
@@ -84,7 +86,7 @@ async def _watch(
                 f"no program of a site is online at {address}; --site-id shows one all the same"
             ) from None
     link = Link(address, f"{os.uname().nodename}-{os.getpid()}", site=site_id, kind="watch")
-    view = SiteView(link, site_id)
+    view = SiteView(link, site_id, used_share=ProcessorUse().share)
     ends_s = [time.monotonic() + _FIND_S if once else math.inf]
     if once:
         link.on_state.append(lambda up: ends_s.append(time.monotonic() + _ONCE_S) if up else None)
@@ -95,11 +97,14 @@ async def _watch(
         with shown as show:
             due_s = time.monotonic()
             while not quit_.is_set() and time.monotonic() < ends_s[-1]:
-                view.evaluate(time.monotonic() - due_s)
+                began_s = time.monotonic()
+                view.evaluate(began_s - due_s)
                 show()
-                due_s = time.monotonic() + EVALUATION_S
+                # Of very many tags it takes longer, and the messages are to be read as well.
+                wait_s = max(EVALUATION_S, _WAIT_SHARE * (time.monotonic() - began_s))
+                due_s = time.monotonic() + wait_s
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(EVALUATION_S):
+                    async with asyncio.timeout(wait_s):
                         await quit_.wait()
     finally:
         last.append(view.picture())
@@ -161,7 +166,8 @@ def _keys(quit_: asyncio.Event) -> Iterator[None]:
     before = termios.tcgetattr(terminal)
 
     def read() -> None:
-        if os.read(terminal, 64).lower() in (b"q", b""):
+        keys = os.read(terminal, 64)
+        if not keys or b"q" in keys.lower():
             quit_.set()
 
     tty.setcbreak(terminal)

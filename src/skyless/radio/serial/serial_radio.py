@@ -338,6 +338,11 @@ class SerialRadio:
         self._listener: Listener = ignore
         self._session: LinkSession | None = None
 
+    @property
+    def hello(self) -> Hello | None:
+        """What the board has said of itself; None while none has answered."""
+        return None if self._session is None else self._session.hello
+
     async def run(self, listener: Listener) -> None:
         """Receive until cancelled; a board that is unplugged is looked for."""
         self._listener = listener

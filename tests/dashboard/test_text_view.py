@@ -1,0 +1,216 @@
+"""``skyless watch``: it has the page's condition; its picture fits the terminal and shows nothing old as new."""
+
+import msgspec
+import pytest
+from dashboard_builders import SITE, SITE_ID, SQUARE, Wire, fix, status
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+from rich.console import Console
+
+from skyless.cli.nodes._site_screen import drawn, plain, summary
+from skyless.cli.nodes._site_view import AnchorRow, Picture, SiteView, TagRow
+from skyless.page.condition.monitor import Condition
+from skyless.run.mqtt import topics
+from skyless.run.mqtt.messages import (
+    AlarmMessage,
+    AnchorHealth,
+    Asset,
+    AssetsMessage,
+    Counters,
+    TagHealth,
+    ZonesMessage,
+)
+
+GOOD = Condition("good", "", (), None, None)
+QUIET = Picture("lab", 1, True, 1000.0, "mqtt://here:1", None, GOOD, (), (), (), {}, 0)
+NO_LINK = Counters(0, 0, 0)
+
+
+class StateWire(Wire):
+    trouble = None
+
+    def __init__(self):
+        super().__init__()
+        self.on_state = []
+
+
+@pytest.fixture
+def view(times):
+    """Of a connected broker that has the site."""
+    view = SiteView(StateWire(), SITE_ID, lambda: times.now_s, lambda: times.unix_s)
+    connect(view)
+    view.link.deliver(topics.site_topic(SITE_ID), SITE)
+    return view
+
+
+def connect(view, connected=True):
+    for callback in view.link.on_state:
+        callback(connected)
+
+
+def tag_health(tag, times, **more):
+    health = TagHealth(tag, times.unix_s, 9.0, "joint", 1, 1, 50.0, None, 0.1, None, None, {}, NO_LINK, 0.1, 1, ())
+    return replace(health, **more)
+
+
+def anchor_health(number, times, **more):
+    heard = {str(other): 0.1 for other in range(1, 7) if other != number}
+    health = AnchorHealth(
+        number, times.unix_s, 9.0, "anchor", None, None, True, None, None, None, 1, 0, 1, None, heard, {}, NO_LINK,
+        "free",
+    )  # fmt: skip
+    return replace(health, **more)
+
+
+def alarm(subject, **more):
+    one = AlarmMessage(f"r/{subject}", "r", "Rule", "inside", "warning", subject, 900.0, 900.0, f"{subject} is there")
+    return replace(one, **more)
+
+
+def lines(picture, width=80, height=24, last_line=""):
+    console = Console(width=width, height=height, record=True, file=open("/dev/null", "w"))  # noqa: SIM115, PTH123
+    console.print(drawn(picture, width, height, last_line))
+    return [line.rstrip() for line in console.export_text().splitlines()]
+
+
+def all_is_well(send, times, tags=("t1", "t2"), anchors=range(1, 7)):
+    for tag in tags:
+        send(topics.status_topic(SITE_ID, "tag", tag), status("tag", tag))
+        send(topics.health_topic(SITE_ID, "tag", tag), tag_health(tag, times))
+        send(topics.fix_topic(SITE_ID, tag), fix(tag, times.unix_s))
+    for number in anchors:
+        send(topics.status_topic(SITE_ID, "anchor", number), status("anchor", str(number)))
+        send(topics.health_topic(SITE_ID, "anchor", number), anchor_health(number, times))
+
+
+@pytest.mark.parametrize("trouble", ["none", "no fix", "anchor", "broker", "late", "alert"])
+def test_the_condition_is_that_of_the_page(trouble, view, live, wire, times):
+    def send(topic, message):
+        view.link.deliver(topic, message)
+        wire.deliver(topic, message)
+
+    live.on_connection(True)
+    wire.deliver(topics.site_topic(SITE_ID), SITE)
+    for step in range(30):
+        tags = ("t1",) if trouble == "no fix" and step > 10 else ("t1", "t2")
+        if tags != ("t1", "t2"):
+            send(topics.health_topic(SITE_ID, "tag", "t2"), tag_health("t2", times, reason="too-few-anchors"))
+        all_is_well(send, times, tags, range(1, 6) if trouble == "anchor" and step > 10 else range(1, 7))
+        if trouble == "alert" and step == 29:
+            send(topics.fix_topic(SITE_ID, "t1"), fix("t1", times.unix_s, alert="detected-not-excluded"))
+        if trouble == "late":
+            send(topics.fix_topic(SITE_ID, "t2"), fix("t2", times.unix_s, latency_s=0.4))
+        if trouble == "broker" and step == 29:
+            connect(view, False)
+            live.on_connection(False)
+        times.move(0.5)
+        live.tick()
+        view.evaluate()
+    assert view.condition == live.condition
+    assert (view.condition.level == "good") == (trouble == "none")
+    assert view.picture().condition == view.condition
+
+
+def test_a_tag_without_fixes_comes_first_and_its_age_is_in_words(view, times):
+    view.link.deliver(topics.assets_topic(SITE_ID), AssetsMessage((Asset("t2", "Forklift 3"),), SITE.site.name))
+    view.link.deliver(topics.zones_topic(SITE_ID), ZonesMessage((SQUARE,), SITE.site.name))
+    for _ in range(4):
+        all_is_well(view.link.deliver, times)
+        times.move(0.5)
+    for _ in range(4):
+        all_is_well(view.link.deliver, times, ("t1",))
+        view.link.deliver(topics.health_topic(SITE_ID, "tag", "t2"), tag_health("t2", times, reason="no-beacons"))
+        times.move(1.0)
+    view.evaluate()
+    stale, fresh = view.picture().tags
+    assert (stale.tag, stale.state, stale.name, stale.reason) == ("t2", "no fix", "Forklift 3", "no-beacons")
+    assert stale.age_s == pytest.approx(4.5, abs=0.01)
+    assert (fresh.state, fresh.zones, fresh.anchors) == ("fix", ("Desk",), 4)
+    assert stale.zones == ()
+    shown = lines(view.picture())
+    (row,) = [line for line in shown if line.startswith("Forklift 3 (t2)")]
+    assert "no fix for 4 s" in row
+    assert any("no-beacons" in line for line in lines(view.picture(), 100) if "no fix for 4 s" in line)
+    assert "2 of 2 tags" not in summary(view.picture())
+    assert "1 of 2 tags with a fix; 6 of 6 anchors" in summary(view.picture())
+
+
+def test_nothing_is_fresh_without_the_broker(view, times):
+    all_is_well(view.link.deliver, times)
+    connect(view, False)
+    view.evaluate()
+    assert {row.state for row in view.picture().tags} == {"no fix"}
+
+
+def test_assets_of_another_site_with_this_number_are_not_shown(view, times):
+    view.link.deliver(topics.assets_topic(SITE_ID), AssetsMessage((Asset("t1", "Crane"),), "elsewhere"))
+    all_is_well(view.link.deliver, times)
+    assert {row.name for row in view.picture().tags} == {""}
+
+
+def test_alarms_that_nobody_has_seen_come_first_and_go_with_their_topic(view):
+    old, new = alarm("a", acknowledged_unix_s=950.0, acknowledged_by="Ada"), alarm("b", severity="critical")
+    for one in (old, alarm("c"), new):
+        view.link.deliver(topics.alarm_topic(SITE_ID, "r", one.subject), one)
+    assert [one.subject for one in view.picture().alarms] == ["b", "c", "a"]
+    view.link.deliver(topics.alarm_topic(SITE_ID, "r", "b"), b"")
+    view.link.deliver(topics.alarm_topic(SITE_ID, "r", "c"), b"{}")
+    assert [one.subject for one in view.picture().alarms] == ["c", "a"]
+    assert view.picture().wrong_messages == 1
+    assert "alarms (2)" in lines(view.picture())
+
+
+def test_an_anchor_that_is_silent_comes_first(view, times):
+    all_is_well(view.link.deliver, times)
+    times.move(4.0)
+    all_is_well(view.link.deliver, times, anchors=(1, 2, 4, 5, 6))
+    first, *others = view.picture().anchors
+    assert (first.anchor, first.state, first.hears) == ("3", "silent", 5)
+    assert {row.state for row in others} == {"anchor"}
+    assert any(line.startswith("3 ") and "silent" in line and "4 s ago" in line for line in lines(view.picture()))
+
+
+@given(st.integers(0, 60), st.integers(0, 60), st.integers(0, 20), st.integers(80, 200), st.integers(24, 60))
+def test_a_picture_fits_and_says_how_many_it_leaves_out(tags, anchors, alarms, width, height):
+    rows = tuple(TagRow(f"tag{n}", "fix", "", 0.0, (1.0, 2.0, 3.0), 0.02, 0.2, 50.0, 6) for n in range(tags))
+    picture = replace(
+        QUIET,
+        tags=rows,
+        anchors=tuple(AnchorRow(str(n), "anchor", 0.5, 5, 0.0) for n in range(anchors)),
+        alarms=tuple(alarm(f"t{n}") for n in range(alarms)),
+    )
+    shown = lines(picture, width, height, "a warning of the link " * 20)
+    assert len(shown) <= height
+    assert max(map(len, shown)) <= width
+    left_out = sum(int(line.split()[1]) for line in shown if line.startswith("and "))
+    seen = sum(line.startswith("tag") and not line.startswith("tags") for line in shown)
+    seen += sum(line[:1].isdecimal() and " anchor " in line for line in shown) + sum(
+        " is there" in line for line in shown
+    )
+    assert seen + left_out == tags + anchors + alarms
+    if tags + anchors + alarms < height - 6:
+        assert left_out == 0
+
+
+def test_long_names_and_figures_keep_their_columns_at_80():
+    row = TagRow(
+        "tag123456", "fix", "The forklift of goods in", 0.0, (1234.56, -987.65, 12.34), 0.123, 1.5, 345.0, 24,
+        "detected-not-excluded", "", ("Cold store north", "Aisle 7"),
+    )  # fmt: skip
+    line = lines(replace(QUIET, tags=(row,)))[2]
+    for figure in ("1234.56", "-987.65", "12.34", "12.3", "150", "345", "24", "0.0 s", "FAULT"):
+        assert f" {figure}" in line
+
+
+@given(st.text())
+def test_nothing_from_the_network_controls_the_terminal(text):
+    assert plain(text).isprintable()
+    picture = replace(QUIET, site=text, tags=(TagRow(text, "fix", text),), trouble=text)
+    assert all(line.isprintable() for line in lines(picture))
+
+
+def test_the_picture_is_json(view, times):
+    all_is_well(view.link.deliver, times)
+    view.evaluate()
+    assert msgspec.json.decode(msgspec.json.encode(view.picture()), type=Picture) == view.picture()

@@ -1,0 +1,326 @@
+"""``skyless doctor``: each check against something that is well and something that is not."""
+
+import asyncio
+import json
+import os
+import time
+
+import allantools
+import numpy as np
+import pytest
+from live_nodes import LiveSite
+from mqtt_brokers import Embedded, until
+
+from skyless.cli.main import main
+from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.errors import SkylessError
+from skyless.core.native.library import UNCOMPILED_VARIABLE
+from skyless.core.site import NoiseSite
+from skyless.radio.serial.pseudo_terminal import Pty
+from skyless.radio.serial.serial_radio import SerialRadio
+from skyless.run.doctor import host
+from skyless.run.doctor.board import BoardProbe
+from skyless.run.doctor.check import Check, report
+from skyless.run.doctor.clocks import CounterPairs, assumed_deviation, counters_check
+from skyless.run.doctor.program import Examination, examine
+from skyless.run.mqtt import topics
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.messages import AnchorHealth, Counters, SiteMessage, Stamp, StampsMessage, TagHealth
+from skyless.sim.lab import lab_site
+from support.loops import in_loop
+
+NO_LINK = Counters(0, 0, 0)
+SECOND = round(TICK_RATE_HZ)
+
+
+def by_name(checks):
+    return {check.name: check for check in checks}
+
+
+# Clocks
+
+
+def counters(rng, noise, seconds, rate_hz=50.0):
+    """TX and RX stamps, wrapped, of two counters that do what the filters assume."""
+    steps, dt = int(seconds * rate_hz), 1.0 / rate_hz
+    phases_s = []
+    for _ in range(2):
+        walk = np.cumsum(rng.normal(0.0, noise.random_walk_fm * np.sqrt(dt), steps))
+        phases_s.append(np.cumsum(walk * dt + rng.normal(0.0, noise.white_fm * np.sqrt(dt), steps)))
+    rx = np.arange(steps) * dt
+    tx = rx * (1.0 + 7e-6) + phases_s[0] - phases_s[1] + rng.normal(0.0, noise.tx_stamp_ps * 1e-12, steps)
+    rx = rx + rng.normal(0.0, noise.rx_stamp_ps * 1e-12, steps)
+    ticks = [np.round((stamps + offset) * TICK_RATE_HZ).astype(np.int64) for stamps, offset in ((tx, 3.0), (rx, 16.0))]
+    return [(int(one), int(other)) for one, other in zip(*ticks, strict=True)]
+
+
+def pairs_of(rng, noise, seconds, many=12):
+    pairs = CounterPairs()
+    for pair in range(many):
+        for tx, rx in counters(rng, noise, seconds):
+            pairs.add("r", pair, tx % (1 << 40), rx % (1 << 40))
+    return pairs
+
+
+def test_the_deviation_is_that_of_allantools():
+    stamps = counters(np.random.default_rng(1), NoiseSite(), 120.0, rate_hz=10.0)
+    pairs = CounterPairs()
+    for tx, rx in stamps:
+        pairs.add("r", 1, tx % (1 << 40), rx % (1 << 40))
+    phase_s = np.array([(tx - rx) / TICK_RATE_HZ for tx, rx in stamps])
+    for tau_s in (0.5, 4.0):
+        (_, (expected,), _, _) = allantools.adev(phase_s, rate=10.0, data_type="phase", taus=[tau_s])
+        measured, samples = pairs.deviation(tau_s - 0.005)
+        assert measured == pytest.approx(expected, rel=0.02)
+        assert samples > 10
+
+
+def test_counters_as_assumed_are_well_and_those_of_worse_crystals_are_not():
+    noise = NoiseSite()
+    rng = np.random.default_rng(2)
+    well = pairs_of(rng, noise, 60.0)
+    for tau_s in (0.5, 4.0):
+        assert well.deviation(tau_s)[0] == pytest.approx(assumed_deviation(noise, tau_s), rel=0.15)
+    assert counters_check(well, noise, "clocks").result == "ok"
+    worse = counters_check(pairs_of(rng, NoiseSite(random_walk_fm=4e-9), 60.0), noise, "clocks")
+    assert worse.result == "warning"
+    assert "random_walk_fm" in worse.advice
+    noisy = counters_check(pairs_of(rng, NoiseSite(tx_stamp_ps=600.0), 60.0), noise, "clocks")
+    assert noisy.result == "warning"
+    assert "tx_stamp_ps" in noisy.advice
+    assert counters_check(pairs_of(rng, noise, 3.0, many=1), noise, "clocks").result == "not checked"
+
+
+def test_a_counter_that_restarts_begins_again():
+    pairs = CounterPairs()
+    for start in (0, 12345 * SECOND):
+        for step in range(200):
+            pairs.add("r", 1, (start + step * SECOND // 10) % (1 << 40), step * SECOND // 10 + start // 7)
+    assert pairs.deviation(0.5)[0] < 1e-12
+
+
+# The computer
+
+
+def test_this_computer_is_checked_without_failing():
+    checks = host.host_checks()
+    assert {"Python", "estimator", "clock", "processors", "disk"} <= by_name(checks).keys()
+    assert all(check.finding.endswith(".") for check in checks)
+
+
+def test_ports_that_may_not_be_opened_are_told_with_what_to_type(tmp_path, monkeypatch):
+    assert [check.result for check in host.port_checks(tmp_path)] == ["not checked"]
+    for name in ("ttyACM0", "ttyUSB3", "tty1"):
+        (tmp_path / name).touch()
+    monkeypatch.setattr(os, "access", lambda path, _: path.name == "ttyUSB3")
+    shut, free = host.port_checks(tmp_path)
+    assert (shut.name, shut.result, free.name, free.result) == ("port ttyACM0", "failed", "port ttyUSB3", "ok")
+    assert "sudo usermod -aG " in shut.advice
+
+
+def test_an_estimator_that_is_not_compiled_is_a_warning(monkeypatch):
+    assert host._library().result == "ok"
+    monkeypatch.setenv(UNCOMPILED_VARIABLE, "1")
+    assert host._library().result == "warning"
+    monkeypatch.delenv(UNCOMPILED_VARIABLE)
+
+    def missing():
+        raise SkylessError("the estimator's library: no such file")
+
+    monkeypatch.setattr(host, "library", missing)
+    assert host._library().result == "failed"
+
+
+@pytest.mark.parametrize(("state", "status", "result"), [(0, 0, "ok"), (5, 0x40, "warning"), (-1, 0, "not checked")])
+def test_the_clock_is_as_the_system_says(state, status, result, monkeypatch):
+    class System:
+        @staticmethod
+        def adjtimex(timex):
+            timex._obj.status, timex._obj.maxerror = status, 2500
+            return state
+
+    monkeypatch.setattr(host.ctypes, "CDLL", lambda *_, **__: System)
+    assert host.clock_check().result == result
+
+
+def test_little_space_is_told(tmp_path, monkeypatch):
+    assert host.disk_check(tmp_path).result in ("ok", "warning")
+    for free, result in ((5e8, "warning"), (5e7, "failed"), (5e9, "ok")):
+        monkeypatch.setattr(host.shutil, "disk_usage", lambda _, free=free: type("Use", (), {"free": free}))
+        assert host.disk_check(tmp_path).result == result
+
+
+def test_a_report_has_what_failed_first_and_breaks_no_table():
+    checks = [Check("a", "ok", "fine."), Check("b", "failed", "x | y\nz.", "do it")]
+    text = report(checks, "title")
+    rows = [line for line in text.splitlines() if line.startswith("| ")]
+    assert rows[1:] == ["| b | failed | x \\| y z. | do it |", "| a | ok | fine. |  |"]
+    assert "1 ok, 0 warning, 1 failed, 0 not checked" in text
+
+
+# Boards
+
+
+def examined_board(path, seconds):
+    radio = SerialRadio(str(path), 1_000_000, path.name)
+    probe = BoardProbe(radio, None)
+    asyncio.run(probe.run(seconds))
+    return probe.checks(NoiseSite())
+
+
+@pytest.mark.site
+def test_a_port_that_is_not_there_is_told_and_so_is_a_device_of_another_kind(tmp_path):
+    (check,) = examined_board(tmp_path / "ttyACM7", 0.5)
+    assert check.result == "failed"
+    assert "There is no " in check.finding
+
+    async def play():
+        terminal = Pty(tmp_path / "gps")
+        terminal.start(lambda _: None)
+        probe = BoardProbe(SerialRadio(str(tmp_path / "gps"), 9600, "gps"), None)
+        listening = asyncio.ensure_future(probe.run(4.5))
+        while not listening.done():
+            terminal.send(b"$GPGGA,1\r\n\0")
+            await asyncio.sleep(0.1)
+        return probe.checks(NoiseSite())
+
+    (check,) = asyncio.run(play())
+    assert check.result == "failed"
+    assert "wrong baud rate?" in check.finding
+
+
+@pytest.mark.live
+def test_a_board_at_a_running_site_is_well(tmp_path):
+    async def play():
+        async with LiveSite(tmp_path) as site:
+            for number in (1, 2, 3, 4, 5, 6):
+                site.anchor(number, site.air)
+            site.plug_in("tag1")
+            probe = BoardProbe(SerialRadio(str(tmp_path / "tag1"), 1_000_000, "tag1"), None)
+            await probe.run(8.0)
+            return probe.checks(NoiseSite())
+
+    board, reception, clock = asyncio.run(play())
+    assert (board.result, reception.result) == ("ok", "ok")
+    assert "serial link" in board.finding
+    assert "6 anchors" in reception.finding
+    assert clock.result in ("ok", "warning", "not checked")
+
+
+# A running site
+
+
+def site_messages(now_s, missing=(), late_share=0.0, reason=None):
+    """One second of a small site of six anchors and a tag."""
+    for number in range(1, 7):
+        if number in missing:
+            continue
+        yield topics.health_topic(9, "anchor", number), AnchorHealth(
+            number, now_s, 9.0, "anchor", None, None, True, None, None, None, 1, 0, 1, None, {}, {}, NO_LINK, "free",
+            late_share,
+        )  # fmt: skip
+        ticks = round(now_s * TICK_RATE_HZ) % (1 << 40)
+        stamps = tuple(Stamp(other, ticks, ticks) for other in range(1, 7) if other != number)
+        yield topics.stamps_topic(9, number), StampsMessage(number, "run", now_s, stamps)
+    yield (
+        topics.health_topic(9, "tag", "t1"),
+        TagHealth("t1", now_s, 9.0, "joint", 100, 1, 50.0, reason, 0.1, None, None, {}, NO_LINK, 0.1, 1, ()),
+    )
+
+
+async def examined_site(tmp_path, asked_site=None, **wrong):
+    site = lab_site()
+    site = type(site)(**{name: getattr(site, name) for name in site.__struct_fields__} | {"id": 9})
+    broker = Embedded(tmp_path)
+    await broker.start()
+    link = Link(broker.address, "air", site=9, kind="ether")
+    running = asyncio.ensure_future(link.run())
+
+    async def publish():
+        while True:
+            for topic, message in site_messages(time.time(), **wrong):
+                link.publish(topic, message)
+            await asyncio.sleep(0.2)
+
+    try:
+        await until(lambda: link.connected)
+        link.publish(topics.site_topic(9), SiteMessage(site, simulated=True, unix_s=time.time()), qos=1, retain=True)
+        publishing = asyncio.ensure_future(publish())
+        progress = []
+        asked = Examination(4.0, broker=broker.address, site=asked_site or site)
+        checks = await examine(asked, lambda _: None, progress.append)
+        publishing.cancel()
+        assert progress == sorted(progress)
+        return by_name(checks)
+    finally:
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        await broker.stop()
+
+
+@pytest.mark.site
+@in_loop
+async def test_a_site_that_is_well(tmp_path):
+    found = await examined_site(tmp_path)
+    wanted = ("broker", "site", "anchors", "transmissions", "tags", "tags' computers")
+    assert {name: found[name].result for name in wanted} == dict.fromkeys(wanted, "ok")
+    assert found["reception"].result in ("warning", "failed")  # five beacons a second of each are far too few
+    assert "simulated" in found["site"].finding
+
+
+@pytest.mark.site
+@in_loop
+async def test_a_site_with_faults(tmp_path):
+    found = await examined_site(tmp_path, lab_site(), missing=(6,), late_share=0.3, reason="no-almanac")
+    results = {name: found[name].result for name in ("anchors", "transmissions", "tags", "broker", "site")}
+    assert results == {
+        "anchors": "failed", "transmissions": "warning", "tags": "failed", "broker": "ok", "site": "warning",
+    }  # fmt: skip
+    assert "missing: 6" in found["anchors"].finding
+    assert "t1 (no-almanac)" in found["tags"].finding
+
+
+# The command
+
+
+@pytest.mark.site
+def test_the_command_writes_a_report_and_its_exit_code_says_whether_anything_failed(tmp_path, capsys, monkeypatch):
+    file = tmp_path / "report.md"
+    command = ["doctor", "--mqtt", "none", "--duration", "0.5", "--json", "--report", str(file)]
+    code = main(command)
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert code == (1 if found["failed"] else 0)
+    assert {check["name"] for check in found["checks"]} >= {"Python", "broker"}
+    assert file.read_text(encoding="utf-8").startswith("# skyless doctor, ")
+    assert main(command) == 2
+    assert "--force overwrites it" in capsys.readouterr().err
+    missing = ["doctor", "--radio", f"serial:{tmp_path}/ttyACM0", "--mqtt", "none", "--duration", "0.5"]
+    assert main(missing) == 1
+    assert "There is no " in capsys.readouterr().out
+
+
+@pytest.mark.site
+@pytest.mark.parametrize(
+    ("command", "right"),
+    [
+        ("doctor --radio ether:127.0.0.1", "it should be a board, serial:PATH[@BAUD]"),
+        ("doctor --radio serial:/dev/null@x", "PATH@BAUD"),
+        ("doctor --radio serial:", "it should name one port"),
+        ("doctor --site none.toml", "none.toml"),
+        ("doctor --duration 0", "--duration"),
+        ("doctor --report /nowhere/x.md", "it should be a file in a folder that exists"),
+        ("watch --mqtt none", "it should be the broker of the site to watch"),
+    ],
+)
+def test_wrong_input_is_told_with_what_would_be_right(command, right, capsys):
+    assert main(command.split()) == 2
+    assert right in capsys.readouterr().err
+
+
+@pytest.mark.site
+def test_a_broker_that_is_not_there_fails(capsys):
+    command = ["doctor", "--mqtt", "mqtt://127.0.0.1:1", "--site-id", "4", "--duration", "1", "--json"]
+    assert main(command) == 1
+    found = {one["name"]: one for one in json.loads(capsys.readouterr().out)["checks"]}
+    assert (found["broker"]["result"], found["site"]["result"]) == ("failed", "failed")
+    assert "Connection refused" in found["broker"]["finding"]

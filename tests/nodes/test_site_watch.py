@@ -1,0 +1,142 @@
+"""``skyless watch`` as its user meets it: at a real broker, in a pipe and on a terminal."""
+
+import asyncio
+import contextlib
+import fcntl
+import json
+import os
+import pty
+import struct
+import termios
+import time
+
+import msgspec
+import pytest
+from mqtt_brokers import Embedded, until
+
+from skyless.run.mqtt import topics
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.messages import AlarmMessage, Asset, AssetsMessage, Counters, FixMessage, SiteMessage, TagHealth
+from skyless.sim.lab import lab_site
+from support.loops import in_loop
+from support.processes import SKYLESS, usual_signals
+
+pytestmark = pytest.mark.site
+
+SITE = msgspec.structs.replace(lab_site(), id=9)
+UNIT = (1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 1e-4)
+
+
+def fix(serial):
+    return FixMessage(
+        "t1", serial, time.time(), 0.0, (1.25, 2.5, 0.0), UNIT, None, None, 0.1, None, None, None, None, (1, 2, 3), 0.0,
+        2, 0.0, "joint", True, 1e-3,
+    )  # fmt: skip
+
+
+@contextlib.asynccontextmanager
+async def published_site(folder):
+    """A broker, and a tag whose program publishes."""
+    broker = Embedded(folder)
+    await broker.start()
+    link = Link(broker.address, "t1", site=9, kind="tag")
+    running = asyncio.ensure_future(link.run())
+
+    async def publish():
+        serial = 0
+        while True:
+            serial += 1
+            link.publish(topics.fix_topic(9, "t1"), fix(serial))
+            health = TagHealth(
+                "t1", time.time(), 9.0, "joint", 1, serial, 10.0, None, 0.1, None, None, {"bad-fcs": 3},
+                Counters(0, 0, 0), 0.1, 1, (),
+            )  # fmt: skip
+            link.publish(topics.health_topic(9, "tag", "t1"), health)
+            await asyncio.sleep(0.1)
+
+    publishing = asyncio.ensure_future(publish())
+    try:
+        await until(lambda: link.connected)
+        alarm = AlarmMessage("r/t1", "r", "Rule", "inside", "critical", "t1", 1.0, 1.0, "Crane is in the cold store")
+        for topic, message in (
+            (topics.site_topic(9), SiteMessage(SITE, simulated=True, unix_s=time.time())),
+            (topics.assets_topic(9), AssetsMessage((Asset("t1", "Crane"),), SITE.name)),
+            (topics.alarm_topic(9, "r", "t1"), alarm),
+        ):
+            link.publish(topic, message, qos=1, retain=True)
+        await until(lambda: not link.unacknowledged)
+        yield str(broker.address)
+    finally:
+        for task in (publishing, running):
+            task.cancel()
+        await asyncio.gather(publishing, running, return_exceptions=True)
+        await broker.stop()
+
+
+async def said(*arguments):
+    process = await asyncio.create_subprocess_exec(
+        *SKYLESS, *arguments, stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE, preexec_fn=usual_signals(),
+    )  # fmt: skip
+    out, _ = await process.communicate()
+    return process.returncode, out.decode()
+
+
+async def on_a_terminal(address):
+    """What is drawn on a terminal of 80 columns until q ends it, and the exit code."""
+    host, terminal = pty.openpty()
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    before = termios.tcgetattr(terminal)
+    process = await asyncio.create_subprocess_exec(
+        *SKYLESS, "watch", "--mqtt", address, stdin=terminal, stdout=terminal, stderr=asyncio.subprocess.DEVNULL,
+        env=os.environ | {"TERM": "xterm", "COLUMNS": "", "LINES": ""}, preexec_fn=usual_signals(),
+    )  # fmt: skip
+    drawn = bytearray()
+    asyncio.get_running_loop().add_reader(host, lambda: drawn.extend(os.read(host, 65536)))
+    try:
+        await until(lambda: b"Crane" in drawn and b"cold store" in drawn, 60.0)
+        os.write(host, b"q")
+        async with asyncio.timeout(20.0):
+            code = await process.wait()
+        await until(lambda: b"\x1b[?1049l" in drawn)
+        assert termios.tcgetattr(terminal) == before
+    finally:
+        asyncio.get_running_loop().remove_reader(host)
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        os.close(host)
+        os.close(terminal)
+    return code, drawn.decode(errors="replace")
+
+
+@in_loop
+async def test_a_site_is_shown_in_a_pipe_as_json_and_on_a_terminal(tmp_path):
+    async with published_site(tmp_path) as address:
+        once = ("watch", "--mqtt", address, "--once")
+        (text_code, text), (json_code, line), (code, drawn) = await asyncio.gather(
+            said(*once), said(*once, "--json", "--site-id", "9"), on_a_terminal(address)
+        )
+    picture = json.loads(line.splitlines()[-1])
+    assert (picture["site"], picture["number"], picture["trouble"]) == (SITE.name, 9, None)
+    (tag,) = picture["tags"]
+    assert (tag["name"], tag["state"], tag["position_m"], tag["anchors"]) == ("Crane", "fix", [1.25, 2.5, 0.0], 3)
+    assert len(picture["anchors"]) == 6
+    assert picture["drops"] == {"bad-fcs": 3}
+    assert picture["alarms"][0]["sentence"] == "Crane is in the cold store"
+    assert json_code == text_code == (1 if picture["condition"]["level"] == "bad" else 0)
+    (row,) = [line for line in text.splitlines() if line.startswith("Crane (t1)")]
+    assert "1.25" in row
+    assert "drops bad-fcs 3" in text
+    assert code == 0
+    assert "\x1b[?1049h" in drawn
+
+
+@in_loop
+async def test_a_broker_without_a_site_is_told(tmp_path):
+    broker = Embedded(tmp_path)
+    await broker.start()
+    try:
+        code, out = await said("watch", "--mqtt", str(broker.address), "--once")
+    finally:
+        await broker.stop()
+    assert (code, out) == (2, "")
