@@ -94,7 +94,9 @@ def dashboard(
         sys.stdout.flush()
     else:
         print(f"page    {page}\nbroker  {address}", flush=True)
-    services = Services(LiveSites(live, make), Overlays(), Playback(recordings), WhatIfs(), _gathered(nats, address))
+    services = Services(
+        LiveSites(live, make), Overlays(), Playback(recordings), WhatIfs(), gathered=_gathered(nats, address)
+    )
     with contextlib.suppress(KeyboardInterrupt):
         asyncio.run(serve(services, rules, sock, address, known.site.id if known is not None else site_id))
 
