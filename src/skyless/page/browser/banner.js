@@ -81,8 +81,7 @@ function show() {
   text(byId("condition-more"), further > 0 ? `and ${further} more` : "What to do");
   showList(condition, words);
   say(condition, `${word}. ${words}`);
-  const alarm = state.alarms.some((one) => one.severity === "critical" && isUnseen(one)) ? "✕ Alarm · " : "";
-  text(document.head.querySelector("title"), `${alarm}${mark} ${state.site ? `${state.site.name} · ` : ""}Skyless`);
+  text(document.head.querySelector("title"), `${isCritical() ? "✕ Alarm · " : ""}${mark} ${state.site ? `${state.site.name} · ` : ""}Skyless`);
   showBanner();
 }
 
@@ -155,11 +154,16 @@ function showBanner() {
   const banner = byId("banner");
   banner.hidden = !words;
   banner.className = phase === "lost" ? "lost" : "broker";
-  byId("condition-line").hidden = !banner.hidden;
+  // Beside a critical alarm nothing says that all is well.
+  byId("condition-line").hidden = !banner.hidden || (isCritical() && shownCondition().level === "good");
   byId("banner-button").hidden = phase !== "lost";
   text(byId("banner-text"), words);
   text(byId("banner-age"), phase === "lost" ? age(since) : "");
   document.body.classList.toggle("lost", phase === "lost");
+}
+
+function isCritical() {
+  return state.alarms.some((alarm) => alarm.severity === "critical" && isUnseen(alarm));
 }
 
 function lostWords() {

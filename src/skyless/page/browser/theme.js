@@ -23,14 +23,14 @@ const TAGS = 8;
 /** Colours of groups: each differs from the others, from grey and from the background. */
 const GROUPS = {
   light:
-    "#f208f2 #08082c #f20808 #0808f2 #089808 #620808 #8608bc #5086f2 #083e08 #bc7498 #2c0886 #aa1a62 " +
-    "#aa861a #089898 #985008 #f22c98 #0850aa #aa62f2 #620862 #3e6208 #623ef2 #083e62 #865098 #bc08aa",
+    "#8778e1 #003c00 #87873c #5a0f5a #d2003c #005a87 #2d9696 #693c00 #7800d2 #000096 #0f694b #ff0fc3 " +
+    "#c3784b #874b78 #5a0f0f #5a5a00 #4b87b4 #96001e #b478a5 #965a0f #00964b #005aff #3c3c78 #b400ff",
   dark:
-    "#f2f208 #9808f2 #ce0808 #3e7408 #08ce08 #f250bc #98f2f2 #0874e0 #f28608 #f2aaf2 #866286 #aa74f2 " +
-    "#989808 #aace74 #986208 #bc1a98 #2c8686 #08cef2 #ce6274 #08bc98 #f2bc98 #86f208 #e008f2 #6298f2",
+    "#9669ff #e1f0a5 #69691e #ffc3ff #4bb4a5 #ff7800 #a54b5a #87f0ff #007896 #3ce100 #78b4f0 #d287b4 " +
+    "#a5a55a #ffc396 #2d8769 #785a96 #a5692d #ff0069 #1e5af0 #ff2dff #c3a5ff #00b400 #5affb4 #e1c300",
 };
-/** A colour that somebody has chosen has at least this contrast to the map. */
-const CONTRAST = 2;
+/** A colour that somebody has chosen differs from the map's by at least this in its lightness, of 255. */
+const LIGHTER = 40;
 /** With more tags than this all have one colour and one mark; `map/marks.js` has the marks. */
 export const DISTINCT = 56;
 
@@ -86,26 +86,11 @@ function rgb(hex) {
   return `rgb(${[1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16)).join(", ")})`;
 }
 
-/** A colour `#rrggbb`, changed towards the colour of text as far as it needs to be seen on the map. */
+/** A colour `#rrggbb` as the browser writes it; one that is almost as light as the map is moved towards the text's. */
 export function visible(hex) {
   if (!/^#[0-9a-f]{6}$/i.test(hex)) return "";
-  const wanted = partsOf(rgb(hex));
-  const ground = luminance(partsOf(palette.bg));
-  const text = partsOf(palette.text);
-  for (let share = 0; share < 1; share += 0.1) {
-    const mixed = wanted.map((part, n) => Math.round(part + share * (text[n] - part)));
-    const [dark, light] = [luminance(mixed), ground].sort((a, b) => a - b);
-    if ((light + 0.05) / (dark + 0.05) >= CONTRAST) return `rgb(${mixed.join(", ")})`;
-  }
-  return palette.text;
-}
-
-function partsOf(colour) {
-  return colour.match(/[\d.]+/g).slice(0, 3).map(Number);
-}
-
-/** Relative luminance, as in WCAG. */
-function luminance(parts) {
-  const [red, green, blue] = parts.map((part) => (part <= 10 ? part / 3294 : ((part / 255 + 0.055) / 1.055) ** 2.4));
-  return 0.2126 * red + 0.7152 * green + 0.0722 * blue;
+  const [colour, ground, text] = [rgb(hex), palette.bg, palette.text].map((one) => one.match(/\d+/g).map(Number));
+  const light = ([red, green, blue]) => 0.3 * red + 0.59 * green + 0.11 * blue;
+  if (Math.abs(light(colour) - light(ground)) > LIGHTER) return rgb(hex);
+  return `rgb(${colour.map((part, n) => Math.round((part + text[n]) / 2)).join(", ")})`;
 }

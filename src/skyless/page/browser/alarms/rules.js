@@ -25,11 +25,11 @@ export function rulesSection() {
   const list = h("ul", { class: "rules", "aria-label": "Rules" });
   const none = h("p", { class: "empty" }, "No rules yet: nothing raises an alarm.");
   const place = h("div", {});
-  const add = h("button", { type: "button", id: "add-rule", onclick: () => edit(null) }, "Add a rule");
+  const add = button("Add a rule", () => edit(null), { id: "add-rule" });
   const element = h("section", {}, h("div", { class: "above" }, h("h2", { class: "count" }, "Rules"), add), none, place, list);
   const edit = (rule) => {
-    const form = ruleForm(rule, () => (place.replaceChildren(), add.focus()));
-    place.replaceChildren(form);
+    place.replaceChildren(ruleForm(rule, () => (place.replaceChildren(), add.focus())));
+    const form = place.firstElementChild;
     form.querySelector("input, select").focus();
     form.scrollIntoView({ block: "nearest" });
   };
@@ -47,8 +47,8 @@ function makeRule(rule, own, edit) {
   const name = rule.name || rule.id;
   const words = h("div", {}, h("strong", {}, name), h("p", { class: "fine" }, ruleWords(rule)));
   const file = h("span", { class: "badge", title: "This rule is changed in the site file" }, "site file");
-  const change = h("button", { type: "button", class: "quiet", "aria-label": `Edit ${name}`, onclick: () => edit(rule) }, "Edit");
-  const del = h("button", { type: "button", class: "quiet", "aria-label": `Delete ${name}`, onclick: () => remove(rule) }, "Delete");
+  const change = button("Edit", () => edit(rule), { class: "quiet", "aria-label": `Edit ${name}` });
+  const del = button("Delete", () => remove(rule), { class: "quiet", "aria-label": `Delete ${name}` });
   return { element: h("li", { class: rule.severity ?? "warning" }, words, ...(own ? [change, del] : [file])) };
 }
 
@@ -92,37 +92,47 @@ async function remove(rule) {
   }
 }
 
-/** The form of a rule, or with null of a new one. */
+let serial = 0;
+
+function labelled(words, element) {
+  element.id = `rule-${++serial}`;
+  return h("div", { class: "field" }, h("label", { htmlFor: element.id }, words), element);
+}
+
+function field(value, type = "text") {
+  return h("input", { type, value: String(value ?? ""), autocomplete: "off", ...(type === "number" && { step: "any" }) });
+}
+
+function choice(value, pairs, choose = () => {}) {
+  const list = options({}, pairs, choose);
+  list.value = value;
+  return list;
+}
+
+/** The form of a rule, or with null of a new one. `close` removes it. */
 function ruleForm(rule, close) {
-  let loaded = rule && JSON.stringify(rule);
-  const fault = h("p", { class: "fault", role: "alert", hidden: true });
-  const kind = options({}, Object.entries(KINDS).map(([key, { words }]) => [key, words]), () => fill());
-  kind.value = rule?.kind ?? "inside";
-  const input = (value, type = "text") => h("input", { type, value: String(value ?? ""), autocomplete: "off", ...(type === "number" && { step: "any" }) });
-  const name = input(rule?.name || rule?.id);
-  const zone = options({}, [["", "Choose a zone"], ...state.zones.map(({ id, name: words }) => [id, words])], () => {});
-  zone.value = rule?.zone ?? "";
+  const kinds = Object.entries(KINDS).map(([key, { words }]) => [key, words]);
+  const kind = choice(rule?.kind ?? "inside", kinds, () => fill());
+  const factor = () => KINDS[kind.value].factor ?? 1;
+  const scaled = (value) => (value == null ? "" : Number((value * factor()).toFixed(6)));
+  const name = field(rule?.name || rule?.id);
+  const zone = choice(rule?.zone ?? "", [["", "Choose a zone"], ...state.zones.map((one) => [one.id, one.name])]);
   const tags = whoField("Tags and groups", "all tags", rule?.tags);
   const others = whoField("Not near to", "any other tag", rule?.others);
-  const factor = () => KINDS[kind.value].factor ?? 1;
-  const scaled = (value) => (value === undefined || value === null ? "" : Number((value * factor()).toFixed(6)));
-  const limit = input(scaled(rule?.limit), "number");
-  const hysteresis = input(scaled(rule?.hysteresis ?? 0), "number");
-  const after = input(rule?.after_s ?? "", "number");
-  const clear = input(rule?.clear_after_s ?? 1, "number");
-  const hours = input(rule?.hours);
-  hours.placeholder = "always";
-  const severity = options({}, ["info", "warning", "critical"].map((value) => [value, value]), () => {});
-  severity.value = rule?.severity ?? "warning";
-  const labelled = (words, element) => h("label", { class: "field" }, h("span", {}, words), element);
-  const limitWords = h("span", {});
-  const backWords = h("span", {});
-  const boxes = { zone: labelled("Zone", zone), tags: tags.element, others: others.element, limit: h("label", { class: "field" }, limitWords, limit), hysteresis: h("label", { class: "field" }, backWords, hysteresis) }; // prettier-ignore
+  const limit = field(scaled(rule?.limit), "number");
+  const back = field(scaled(rule?.hysteresis ?? 0), "number");
+  const after = field(rule?.after_s ?? 0, "number");
+  const clear = field(rule?.clear_after_s ?? 1, "number");
+  const hours = field(rule?.hours);
+  const severity = choice(rule?.severity ?? "warning", ["info", "warning", "critical"].map((one) => [one, one]));
+  const fault = h("p", { class: "fault", role: "alert", hidden: true });
+  const boxes = { zone: labelled("Zone", zone), tags: tags.element, others: others.element };
+  const limits = h("div", { class: "fields" }, labelled("Limit", limit), labelled("Ends when back by", back));
   const fill = () => {
     const { fields, limit: words, unit, after: usual } = KINDS[kind.value];
-    for (const [key, box] of Object.entries(boxes)) box.hidden = !fields.includes(key === "hysteresis" ? "limit" : key);
-    text(limitWords, `${words} (${unit})`);
-    text(backWords, `Ends when back by (${unit})`);
+    for (const [key, box] of Object.entries(boxes)) box.hidden = !fields.includes(key);
+    limits.hidden = !fields.includes("limit");
+    text(limits.querySelector("label"), `${words} (${unit})`);
     if (!rule) after.value = String(usual ?? 0);
   };
   const fail = (words, element = null) => {
@@ -138,41 +148,57 @@ function ruleForm(rule, close) {
     const { fields, limit: words } = KINDS[kind.value];
     if (!name.value.trim()) return fail("A name is missing: people read it in the alarm.", name);
     if (fields.includes("zone") && !zone.value) return fail("Choose a zone; zones are drawn in the tab Zones.", zone);
-    const numbers = [[after, "The time"], [clear, "The time until it ends"], ...(fields.includes("limit") ? [[limit, words], [hysteresis, "The way back"]] : [])]; // prettier-ignore
-    for (const [one, what] of numbers) if (one.value === "" || !(Number(one.value) >= 0)) return fail(`${what} is a number of at least 0.`, one);
-    for (const one of [tags, others]) if (!one.take()) return fail(`No tag or group is called "${one.input.value}"; choose one of the list.`, one.input);
-    const known = { zone: zone.value, tags: tags.values(), others: others.values(), limit: Number(limit.value) / factor() };
+    const numbers = new Map([[after, "After"], [clear, "Ends after"]]);
+    if (fields.includes("limit")) numbers.set(limit, words).set(back, "Ends when back by");
+    for (const [one, what] of numbers) {
+      if (one.value === "" || !(Number(one.value) >= 0)) return fail(`${what} is a number of at least 0.`, one);
+    }
+    for (const { input, take } of [tags, others]) {
+      if (!take()) return fail(`No tag or group is called "${input.value}"; choose one of the list.`, input);
+    }
+    const known = { zone: zone.value, tags: tags.values(), others: others.values(), limit: limit.value / factor() };
     const own = Object.fromEntries(fields.map((key) => [key, known[key]]));
-    if ("limit" in own) own.hysteresis = Number(hysteresis.value) / factor();
+    if ("limit" in own) own.hysteresis = back.value / factor();
     const times = { after_s: Number(after.value), clear_after_s: Number(clear.value), hours: hours.value.trim() };
-    return { id: rule?.id ?? freshId(name.value), kind: kind.value, name: name.value.trim(), ...own, ...times, severity: severity.value };
+    const what = { id: rule?.id ?? freshId(name.value), kind: kind.value, name: name.value.trim() };
+    return { ...what, ...own, ...times, severity: severity.value };
+  };
+  let loaded = rule && JSON.stringify(rule);
+  /** The page's rules with this one; null where another page has changed it since it was loaded, which is then said. */
+  const insert = (made) => (now) => {
+    const theirs = now.find(({ id }) => id === made.id);
+    if (loaded && JSON.stringify(theirs) !== loaded) {
+      loaded = theirs ? JSON.stringify(theirs) : null;
+      const what = theirs ? `changed this rule: ${ruleWords(theirs)}` : "deleted this rule";
+      return fail(`Meanwhile another page has ${what}. Save again to store what stands here.`);
+    }
+    return theirs ? now.map((one) => (one.id === made.id ? made : one)) : [...now, made];
   };
   const save = async (event) => {
     event.preventDefault();
     fail("");
     const made = read();
-    if (!made) return;
     try {
-      const stored = await store((now) => {
-        const theirs = now.find(({ id }) => id === made.id);
-        if (loaded && JSON.stringify(theirs) !== loaded) {
-          loaded = theirs ? JSON.stringify(theirs) : null;
-          return fail(`Meanwhile another page has ${theirs ? `changed this rule: ${ruleWords(theirs)}` : "deleted this rule"}. Save again to store what stands here.`);
-        }
-        return theirs ? now.map((one) => (one.id === made.id ? made : one)) : [...now, made];
-      });
-      if (!stored) return;
+      if (!made || !(await store(insert(made)))) return;
       close();
       toast(`${made.name} saved.`);
-    } catch (error) {
-      fail(`Not saved: ${error.message}`, error.message.includes("hours") ? hours : error.message.includes("limit") ? limit : null);
+    } catch ({ message }) {
+      fail(`Not saved: ${message}`, message.includes("hours") ? hours : message.includes("limit") ? limit : null);
     }
   };
-  const buttons = h("div", { class: "above" }, h("button", { type: "submit", class: "primary" }, "Save"), h("button", { type: "button", onclick: close }, "Cancel"));
-  const times = h("div", { class: "fields" }, labelled("After (s)", after), labelled("Ends after (s)", clear), labelled("Severity", severity));
-  const form = h("form", { class: "rule-form", noValidate: true, "aria-label": rule ? `Rule ${rule.name || rule.id}` : "New rule", onsubmit: save },
-    labelled("Raised when", kind), labelled("Name", name), boxes.zone, boxes.tags, boxes.others, h("div", { class: "fields" }, boxes.limit, boxes.hysteresis),
-    times, labelled("Hours", hours), h("p", { class: "fine" }, HELP), fault, buttons); // prettier-ignore
+  const form = h(
+    "form",
+    { class: "rule-form", noValidate: true, "aria-label": rule ? `Rule ${name.value}` : "New rule", onsubmit: save },
+    labelled("Raised when", kind),
+    labelled("Name", name),
+    ...Object.values(boxes),
+    limits,
+    h("div", { class: "fields" }, labelled("After (s)", after), labelled("Ends after (s)", clear), labelled("Severity", severity)),
+    labelled("Hours", hours),
+    h("p", { class: "fine" }, HELP),
+    fault,
+    h("div", { class: "above" }, h("button", { type: "submit", class: "primary" }, "Save"), button("Cancel", close)),
+  );
   fill();
   return form;
 }
@@ -180,40 +206,37 @@ function ruleForm(rule, close) {
 /** An identifier from a name that no rule has yet. */
 function freshId(name) {
   const taken = new Set([...state.rules, ...state.fileRules].map(({ id }) => id));
-  const base = name.normalize("NFKD").toLowerCase().replaceAll(/[^a-z0-9]+/g, "-").replaceAll(/^-|-$/g, "").slice(0, 28) || "rule"; // prettier-ignore
+  const plain = name.normalize("NFKD").toLowerCase().replaceAll(/[^a-z0-9]+/g, "-");
+  const base = plain.replaceAll(/^-|-$/g, "").slice(0, 28) || "rule";
   let id = base;
   for (let number = 2; taken.has(id); number++) id = `${base}-${number}`;
   return id;
 }
 
-let lists = 0;
-
 /** Tags and groups that are chosen from those known, each with a button that removes it. */
 function whoField(label, everybody, chosen = []) {
-  let values = [...chosen];
-  const known = new Map([
-    ...[...allGroups().keys()].map((name) => [`group ${name}`, `group:${name}`]),
-    ...[...new Set([...live.sorted.map(({ name }) => name), ...state.assets.keys()])].map((tag) => [tag, tag]),
-  ]);
-  const list = h("datalist", { id: `who-${++lists}` }, ...[...known].map(([value, tag]) => h("option", { value }, shownName(tag))));
-  const input = h("input", { type: "text", placeholder: "Add one", autocomplete: "off" });
+  const values = new Set(chosen);
+  const tags = new Set([...live.sorted.map(({ name }) => name), ...state.assets.keys()]);
+  const all = [...[...allGroups().keys()].map((name) => `group:${name}`), ...tags];
+  const input = field();
+  const element = labelled(label, input);
+  const list = h("datalist", { id: `${input.id}-list` }, ...all.map((value) => h("option", { value }, whoWords(value))));
   input.setAttribute("list", list.id);
   const chips = h("span", { class: "chips" });
   const show = () => {
     const chip = (who) => {
-      const words = whoWords(who);
-      return h("button", { type: "button", "aria-label": `Remove ${words}`, onclick: () => ((values = values.filter((one) => one !== who)), show(), input.focus()) }, `${words} ✕`);
+      const made = button(`${whoWords(who)} ✕`, () => (values.delete(who), show(), input.focus()));
+      made.setAttribute("aria-label", `Remove ${whoWords(who)}`);
+      return made;
     };
-    chips.replaceChildren(...(values.length ? values.map(chip) : [h("span", { class: "fine" }, everybody)]));
+    chips.replaceChildren(...(values.size ? [...values].map(chip) : [h("span", { class: "fine" }, everybody)]));
   };
-  /** Take over what is typed; false where nobody is called so. */
+  /** Take over what is typed, a name in use at the site; false where nothing is called so. */
   const take = () => {
     const typed = input.value.trim();
-    const named = [...state.assets.values()].filter(({ name }) => name === typed);
-    const who = known.get(typed) ?? (typed.startsWith("group:") ? known.get(`group ${typed.slice(6)}`) : null) ?? (named.length === 1 ? named[0].tag : state.part ? typed : null);
-    if (!typed) return true;
-    if (!who) return false;
-    if (!values.includes(who)) values.push(who);
+    const who = all.find((one) => one === typed) ?? all.find((one) => whoWords(one) === typed) ?? (state.part && typed);
+    if (who) values.add(who);
+    if (typed && !who) return false;
     input.value = "";
     show();
     return true;
@@ -221,6 +244,10 @@ function whoField(label, everybody, chosen = []) {
   input.addEventListener("change", take);
   input.addEventListener("keydown", (event) => event.key === "Enter" && input.value && (event.preventDefault(), take()));
   show();
-  const element = h("div", { class: "field who" }, h("label", {}, label, " ", input), chips, list);
-  return { element, input, take, values: () => values };
+  element.append(chips, list);
+  return { element, input, take, values: () => [...values] };
+}
+
+function button(words, onclick, properties = {}) {
+  return h("button", { type: "button", onclick, ...properties }, words);
 }

@@ -86,7 +86,8 @@ export class Draft {
   faults() {
     const faults = [];
     const seen = new Set();
-    for (const row of this.rows.filter(({ removed }) => !removed)) {
+    const kept = this.rows.filter(({ removed }) => !removed);
+    for (const row of [...kept.filter(({ base }) => base), ...kept.filter(({ base }) => !base)]) {
       const { tag, colour, icon } = row.asset;
       if (!tag) faults.push({ row, field: "tag", words: "The name of the tag is missing." });
       else if (seen.has(tag)) faults.push({ row, field: "tag", words: `Another row has the tag ${tag} already.` });

@@ -76,6 +76,7 @@ export function editAssets(tag = null) {
       input.setAttribute("aria-label", `${HEADS[key]} of ${name || "the new asset"}`);
       if (!swatch) return;
       swatch.disabled = removed;
+      swatch.className = value ? "" : "unset";
       swatch.value = /^#[0-9a-f]{6}$/i.test(value) ? value : "#808080";
       swatch.setAttribute("aria-label", `Choose the colour of ${name || "the new asset"}`);
     };

@@ -43,7 +43,7 @@ function zoneAt(id) {
   return { x: toX(x_m, y_m), y: toY(x_m, y_m, groundHeight()) - 20 };
 }
 
-/** A ring, and a small shield with the severity's mark at its upper right. */
+/** A ring, and a small shield with the severity's mark at its upper left: names stand at the right. */
 function mark(context, { x, y }, { colour, mark: words }) {
   context.strokeStyle = palette[colour];
   context.lineWidth = 2.5;
@@ -51,12 +51,12 @@ function mark(context, { x, y }, { colour, mark: words }) {
   context.arc(x, y, RADIUS, 0, 2 * Math.PI);
   context.stroke();
   context.beginPath();
-  context.arc(x + RADIUS * 0.75, y - RADIUS * 0.75, 7, 0, 2 * Math.PI);
+  context.arc(x - RADIUS * 0.75, y - RADIUS * 0.75, 7, 0, 2 * Math.PI);
   context.fillStyle = palette[colour];
   context.fill();
   context.fillStyle = palette.surface;
   context.font = "700 9px system-ui, sans-serif";
   context.textAlign = "center";
   context.textBaseline = "middle";
-  context.fillText(words, x + RADIUS * 0.75, y - RADIUS * 0.75 + 0.5);
+  context.fillText(words, x - RADIUS * 0.75, y - RADIUS * 0.75 + 0.5);
 }

@@ -78,7 +78,7 @@ export function start(panel) {
   const group = options({ "aria-label": "Group" }, [], choose);
   const zone = options({ "aria-label": "Zone" }, [], choose);
   const all = h("button", { type: "button", class: "quiet", onclick: showAll }, "Show all");
-  const filter = h("div", { class: "above filter" }, search, group, zone, all);
+  const filter = h("div", { class: "above filter" }, search, group, zone);
   const edit = h("button", { type: "button", id: "edit-assets", onclick: () => editAssets() }, "Assets …");
   const table = selectionTable("tag", ["Tag", ...Object.keys(HEADS)], describe);
   Object.values(HEADS).forEach((words, index) => (table.head.cells[index + 2].title = words));
@@ -86,7 +86,7 @@ export function start(panel) {
   const count = h("p", { class: "count" });
   const box = h("div", { class: "scroll-x" }, table.element);
   const detail = makeDetail();
-  panel.append(h("div", { class: "above" }, count, edit), filter, empty, box, detail.element);
+  panel.append(h("div", { class: "above" }, count, all, edit), filter, empty, box, detail.element);
   parts = { panel, box, search, group, zone, all, filter, edit, table, empty, count, detail };
 }
 
@@ -130,6 +130,7 @@ export function show() {
   if (list.length > MANY && key === shown.key && now - shown.at < MANY_MS) return;
   shown = { key, at: now };
   parts.table.element.classList.toggle("no-truth", !state.simulated);
+  parts.table.element.classList.toggle("named", state.assets.size > 0);
   const items = list.map((track, index) => [track.name, { track, style: tagStyle(index, list.length, track.name) }]);
   const found = filtering() ? items.filter(([name, { track }]) => passes(name, stateOf(track))) : items;
   if (state.assets.size) found.sort(([a], [b]) => byName(shownName(a), shownName(b)));
