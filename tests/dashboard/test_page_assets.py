@@ -156,9 +156,9 @@ def test_assets_are_added_changed_and_removed_with_the_keyboard(hall):
     assert dialog.locator(".foot").inner_text().startswith("Not saved yet: 1 new, 0 changed, 1 removed.")
     page.keyboard.press("Escape")
     page.wait_for_selector("#assets-dialog .fault:has-text('not saved')")
-    server.refusal = "asset 'robot': its group is too long"
+    server.refusal = "asset 'robot': group is 'long'; it should have 64 characters at most"
     dialog.get_by_role("button", name="Save").click()
-    page.wait_for_selector("#assets-dialog td .fault:has-text('its group is too long')")
+    page.wait_for_selector("#assets-dialog td .fault:has-text('64 characters at most')")
     assert dialog.get_by_label("Group of robot").get_attribute("aria-invalid") == "true"
     server.refusal = None
     visit.problems.clear()  # the browser's own line about the answer 400

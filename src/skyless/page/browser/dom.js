@@ -26,6 +26,11 @@ export function s(tag, attributes = {}, ...children) {
   return element;
 }
 
+/** A button. */
+export function button(words, onclick, properties = {}) {
+  return h("button", { type: "button", onclick, ...properties }, words);
+}
+
 /** A list of options, pairs of value and words; calls `choose` with the value of the one that is chosen. */
 export function options(properties, pairs, choose) {
   const list = h("select", properties, ...pairs.map(([value, words]) => h("option", { value }, words)));

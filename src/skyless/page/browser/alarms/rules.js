@@ -4,7 +4,7 @@ import { changed, state } from "../store.js";
 import { alarmRules, putAlarmRules } from "../api.js";
 import { allGroups, shownName } from "../assets/model.js";
 import { live } from "../clock.js";
-import { Rows, h, options, text, toast } from "../dom.js";
+import { Rows, button, h, options, text, toast } from "../dom.js";
 
 /** The kinds of rules: words, the fields of each, the words and unit of its limit, and the time that it usually waits. */
 const KINDS = {
@@ -76,8 +76,8 @@ function whoWords(who) {
 async function store(apply) {
   const rules = apply(await alarmRules());
   if (!rules) return false;
-  const answer = await putAlarmRules(rules, state.site?.name ?? "");
-  state.rules = answer.rules ?? rules;
+  await putAlarmRules(rules, state.site?.name ?? "");
+  state.rules = rules;
   changed("rules");
   return true;
 }
@@ -197,7 +197,7 @@ function ruleForm(rule, close) {
     labelled("Hours", hours),
     h("p", { class: "fine" }, HELP),
     fault,
-    h("div", { class: "above" }, h("button", { type: "submit", class: "primary" }, "Save"), button("Cancel", close)),
+    h("div", { class: "above" }, button("Save", null, { type: "submit", class: "primary" }), button("Cancel", close)),
   );
   fill();
   return form;
@@ -246,8 +246,4 @@ function whoField(label, everybody, chosen = []) {
   show();
   element.append(chips, list);
   return { element, input, take, values: () => [...values] };
-}
-
-function button(words, onclick, properties = {}) {
-  return h("button", { type: "button", onclick, ...properties }, words);
 }

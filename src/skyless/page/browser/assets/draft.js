@@ -2,7 +2,8 @@
 
 import { COLUMNS } from "./csv.js";
 
-const MAX_ICON = 8;
+const TAG = /^[\w.-]{1,64}$/;
+const COLOUR = /^#[0-9a-f]{6}$/i;
 
 /** @typedef {{number: number, asset: Record<string, string>, base: Record<string, string>|null, removed: boolean, other: string}} Row */
 
@@ -75,11 +76,16 @@ export class Draft {
     return base === null ? "new" : same(asset, base) ? "" : "changed";
   }
 
-  /** Numbers of rows that are new, changed and removed. */
-  counts() {
-    const counts = { new: 0, changed: 0, removed: 0 };
-    for (const row of this.rows) if (this.kind(row)) counts[this.kind(row)] += 1;
-    return counts;
+  /** Numbers of rows that are new, changed and removed, and whether there is any. */
+  changes() {
+    const counts = { new: 0, changed: 0, removed: 0, "": 0 };
+    for (const row of this.rows) counts[this.kind(row)] += 1;
+    return { counts, any: counts[""] < this.rows.length };
+  }
+
+  /** Set the group of rows that stay. */
+  setGroup(rows, group) {
+    for (const row of rows) if (!row.removed) row.asset.group = group;
   }
 
   /** What is wrong: pairs of row and field with a sentence. @returns {Array<{row: Row, field: string, words: string}>} */
@@ -88,13 +94,12 @@ export class Draft {
     const seen = new Set();
     const kept = this.rows.filter(({ removed }) => !removed);
     for (const row of [...kept.filter(({ base }) => base), ...kept.filter(({ base }) => !base)]) {
-      const { tag, colour, icon } = row.asset;
+      const { tag, colour } = row.asset;
       if (!tag) faults.push({ row, field: "tag", words: "The name of the tag is missing." });
       else if (seen.has(tag)) faults.push({ row, field: "tag", words: `Another row has the tag ${tag} already.` });
-      else if (/[+#/]/.test(tag)) faults.push({ row, field: "tag", words: "A tag's name has none of the characters + # /." });
+      else if (!TAG.test(tag)) faults.push({ row, field: "tag", words: "A tag's name has letters, digits, dots, dashes and underscores only." });
       seen.add(tag);
-      if (colour && !/^#[0-9a-f]{6}$/i.test(colour)) faults.push({ row, field: "colour", words: "A colour is # and six digits, as #c2410c." });
-      if (icon.length > MAX_ICON) faults.push({ row, field: "icon", words: "An icon has a few characters only." });
+      if (colour && !COLOUR.test(colour)) faults.push({ row, field: "colour", words: "A colour is # and six digits, as #c2410c." });
     }
     return faults;
   }

@@ -3,12 +3,16 @@
 import { on, state } from "../store.js";
 import { assets as fetchAssets, assetsFile, putAssets } from "../api.js";
 import { live } from "../clock.js";
-import { Rows, h, text, toast } from "../dom.js";
+import { Rows, button, h, text, toast } from "../dom.js";
 import { COLUMNS, readCsv } from "./csv.js";
 import { Draft } from "./draft.js";
 import { allGroups, receiveAssets } from "./model.js";
 
 const HEADS = { tag: "Tag", name: "Name", group: "Group", icon: "Icon", colour: "Colour", owner: "Owner", notes: "Notes" };
+/** The longest value of each column that the server takes. */
+const LENGTHS = { tag: 64, name: 100, group: 64, icon: 8, colour: 7, owner: 100, notes: 1000 };
+/** Lists of values that two of the fields offer. */
+const LISTS = { tag: "asset-tags", group: "asset-groups" };
 const MARKS = { new: "+ new", changed: "● changed", removed: "✕ removed", "": "" };
 /** Of more rows than this those are shown that are searched; each has eight fields. */
 const MOST = 150;
@@ -16,115 +20,127 @@ const MOST = 150;
 let open = null;
 on(["assets"], () => open?.meanwhile([...state.assets.values()]));
 
+/** A text field of one column, and for colours also a swatch; `apply` is called with a value that was typed. */
+function makeField(key, apply) {
+  const input = h("input", { type: "text", class: `asset-${key}`, autocomplete: "off", maxLength: LENGTHS[key] });
+  if (LISTS[key]) input.setAttribute("list", LISTS[key]);
+  const swatch = key === "colour" ? h("input", { type: "color" }) : null;
+  for (const one of swatch ? [input, swatch] : [input]) one.addEventListener("change", () => apply(one.value.trim()));
+  const show = (value, name, removed) => {
+    if (document.activeElement !== input || input.value.trim() === value) input.value = value;
+    input.disabled = removed;
+    input.setAttribute("aria-label", `${HEADS[key]} of ${name}`);
+    if (!swatch) return;
+    swatch.disabled = removed;
+    swatch.className = value ? "" : "unset";
+    swatch.value = /^#[0-9a-f]{6}$/i.test(value) ? value : "#808080";
+    swatch.setAttribute("aria-label", `Choose the colour of ${name}`);
+  };
+  return { element: swatch ? h("span", { class: "with-swatch" }, swatch, input) : input, input, show };
+}
+
+/** The table of a draft. `changed` is called after each change. @param {Draft} draft */
+function makeTable(draft, changed) {
+  let faults = [];
+  const body = h("tbody", {});
+  const heads = ["State", ...COLUMNS.map((key) => HEADS[key]), "Remove"].map((words) => h("th", { scope: "col" }, words));
+  const element = h("table", { class: "assets" }, h("thead", {}, h("tr", {}, ...heads)), body);
+  const makeRow = (number, row) => {
+    const apply = (key) => (value) => {
+      row.asset[key] = value;
+      faults = faults.filter((one) => one.row !== row || one.field !== key);
+      changed();
+    };
+    const fields = new Map(COLUMNS.map((key) => [key, makeField(key, apply(key))]));
+    const cells = [...fields].map(([key, field]) => h("td", { "data-head": HEADS[key] }, field.element));
+    const words = h("p", { class: "fault", id: `asset-fault-${number}`, hidden: true });
+    cells[0].append(words);
+    const mark = h("td", { class: "state" });
+    const remove = button("", () => (draft.toggle(row), changed()), { class: "quiet" });
+    const line = h("tr", {}, mark, ...cells, h("td", {}, remove));
+    const update = () => {
+      const name = row.asset.tag || "the new asset";
+      const wrong = faults.filter((one) => one.row === row);
+      line.className = draft.kind(row);
+      text(mark, MARKS[draft.kind(row)]);
+      text(remove, row.removed ? "Undo" : "Remove");
+      remove.setAttribute("aria-label", `${row.removed ? "Do not remove" : "Remove"} ${name}`);
+      const other = row.other && `Meanwhile ${row.other}; saving keeps what stands here.`;
+      text(words, [...wrong.map((one) => one.words), other].filter(Boolean).join(" "));
+      words.hidden = !words.textContent;
+      for (const [key, { input, show }] of fields) {
+        show(row.asset[key], name, row.removed);
+        input.setAttribute("aria-invalid", String(wrong.some(({ field }) => field === key)));
+        input.setAttribute("aria-describedby", words.id);
+      }
+    };
+    return { element: line, update };
+  };
+  const rows = new Rows(body, makeRow);
+  const show = (found) => {
+    rows.show(found.map((row) => [row.number, row]));
+    element.hidden = !draft.rows.length;
+  };
+  /** Show what is wrong, and move the focus there. */
+  const blame = (found) => {
+    faults = found;
+    changed();
+    body.querySelector('[aria-invalid="true"]')?.focus();
+  };
+  const isBlamed = (row) => faults.some((one) => one.row === row);
+  const focus = (row) => rows.rows.get(row.number).element.querySelector(row.asset.tag ? ".asset-name" : ".asset-tag").focus();
+  return { element, show, blame, isBlamed, focus };
+}
+
 /** Open the dialog; with a tag, at its row, which is made where it has none. @param {string|null} tag */
 export function editAssets(tag = null) {
   const draft = new Draft([...state.assets.values()]);
-  let faults = [];
-  const title = h("h2", { id: "assets-title" }, "Assets: what the tags are attached to");
-  const search = h("input", { type: "search", placeholder: "Find", "aria-label": "Find in the table", oninput: () => show() });
   const said = h("p", { class: "said", role: "status" });
   const fault = h("p", { class: "fault", role: "alert", hidden: true });
-  const body = h("tbody", {});
-  const heads = ["State", ...COLUMNS.map((key) => HEADS[key]), "Remove"].map((words) => h("th", { scope: "col" }, words));
-  const table = h("table", { class: "assets" }, h("thead", {}, h("tr", {}, ...heads)), body);
-  const tags = h("datalist", { id: "asset-tags" });
-  const groups = h("datalist", { id: "asset-groups" });
   const more = h("p", { class: "fine" });
+  const summary = h("p", { class: "count", role: "status" });
+  const search = h("input", { type: "search", placeholder: "Find", "aria-label": "Find in the table", oninput: () => show() });
+  const group = h("input", { type: "text", placeholder: "Group", autocomplete: "off", maxLength: LENGTHS.group });
+  group.setAttribute("list", LISTS.group);
+  const tags = h("datalist", { id: LISTS.tag });
+  const groups = h("datalist", { id: LISTS.group });
+  const pick = h("input", { type: "file", accept: ".csv,text/csv", hidden: true, "aria-label": "File of assets" });
+  let found = [];
 
-  const makeRow = (_number, row) => {
-    const mark = h("td", { class: "state" });
-    const inputs = Object.fromEntries(COLUMNS.map((key) => [key, fieldOf(key, row)]));
-    const words = h("p", { class: "fault", id: `asset-fault-${row.number}`, hidden: true });
-    const remove = h("button", { type: "button", class: "quiet", onclick: () => (draft.toggle(row), show()) });
-    const cells = COLUMNS.map((key) => h("td", { "data-head": HEADS[key] }, inputs[key].element));
-    cells[0].append(words);
-    const update = () => {
-      const kind = draft.kind(row);
-      element.className = kind;
-      text(mark, MARKS[kind]);
-      for (const key of COLUMNS) inputs[key].show(row.asset[key], row.asset.tag, row.removed);
-      text(remove, row.removed ? "Undo" : "Remove");
-      remove.setAttribute("aria-label", `${row.removed ? "Do not remove" : "Remove"} ${row.asset.tag || "the new asset"}`);
-      const wrong = faults.filter((one) => one.row === row);
-      const notes = [...wrong.map((one) => one.words), row.other && `Meanwhile ${row.other}; saving keeps what stands here.`];
-      text(words, notes.filter(Boolean).join(" "));
-      words.hidden = !words.textContent;
-      for (const key of COLUMNS) {
-        inputs[key].input.setAttribute("aria-invalid", String(wrong.some(({ field }) => field === key)));
-        inputs[key].input.setAttribute("aria-describedby", words.id);
-      }
-    };
-    const element = h("tr", {}, mark, ...cells, h("td", {}, remove));
-    return { element, update };
-  };
-
-  const fieldOf = (key, row) => {
-    const list = { tag: "asset-tags", group: "asset-groups" }[key];
-    const input = h("input", { type: "text", class: `asset-${key}`, autocomplete: "off", maxLength: key === "notes" ? 500 : 100 });
-    if (list) input.setAttribute("list", list);
-    const swatch = key === "colour" ? h("input", { type: "color" }) : null;
-    const apply = (value) => {
-      row.asset[key] = value.trim();
-      faults = faults.filter((one) => one.row !== row || one.field !== key);
-      show();
-    };
-    input.addEventListener("change", () => apply(input.value));
-    swatch?.addEventListener("change", () => apply(swatch.value));
-    const show_ = (value, name, removed) => {
-      if (document.activeElement !== input || input.value.trim() === value) input.value = value;
-      input.disabled = removed;
-      input.setAttribute("aria-label", `${HEADS[key]} of ${name || "the new asset"}`);
-      if (!swatch) return;
-      swatch.disabled = removed;
-      swatch.className = value ? "" : "unset";
-      swatch.value = /^#[0-9a-f]{6}$/i.test(value) ? value : "#808080";
-      swatch.setAttribute("aria-label", `Choose the colour of ${name || "the new asset"}`);
-    };
-    return { element: swatch ? h("span", { class: "with-swatch" }, swatch, input) : input, input, show: show_ };
-  };
-
-  const rows = new Rows(body, makeRow);
   const show = () => {
     const wanted = search.value.trim().toLowerCase();
-    const isWanted = (row) => faults.some((one) => one.row === row) || !row.asset.tag || Object.values(row.asset).some((value) => value.toLowerCase().includes(wanted)); // prettier-ignore
-    const found = draft.rows.filter(isWanted);
-    rows.show(found.slice(0, MOST).map((row) => [row.number, row]));
-    table.hidden = !draft.rows.length;
-    const hidden = found.length - MOST;
-    text(more, !draft.rows.length ? "No assets yet. Add one, or import a file." : hidden > 0 ? `${hidden} more rows: find them by their words.` : "");
+    const has = ({ asset }) => Object.values(asset).some((value) => value.toLowerCase().includes(wanted));
+    found = draft.rows.filter((row) => table.isBlamed(row) || !row.asset.tag || has(row));
+    if (found.length > MOST) found.sort((a, b) => Number(table.isBlamed(b)) - Number(table.isBlamed(a)));
+    table.show(found.slice(0, MOST));
+    const hidden = found.length > MOST ? `${found.length - MOST} more rows: find them by their words.` : "";
+    text(more, draft.rows.length ? hidden : "No assets yet. Add one, or import a file.");
     const missing = withoutAsset(draft);
-    tags.replaceChildren(...missing.slice(0, 200).map((value) => h("option", { value })));
     const names = new Set([...allGroups().keys(), ...draft.rows.map(({ asset }) => asset.group)].filter(Boolean));
-    groups.replaceChildren(...[...names].sort().map((value) => h("option", { value })));
+    for (const [list, values] of [[tags, missing.slice(0, 200)], [groups, [...names].sort()]]) {
+      list.replaceChildren(...values.map((value) => h("option", { value })));
+    }
     addAll.hidden = missing.length < 2;
     text(addAll, `Add the ${missing.length} tags without an asset`);
-    const counts = draft.counts();
-    const any = Object.values(counts).some(Boolean);
+    group.hidden = setGroup.hidden = found.length < 2;
+    group.setAttribute("aria-label", `Group of all ${found.length} rows found`);
+    text(setGroup, `Set for ${found.length} rows`);
+    const { counts, any } = draft.changes();
     text(summary, any ? `Not saved yet: ${counts.new} new, ${counts.changed} changed, ${counts.removed} removed.` : "No changes.");
     save.disabled = !any;
-    setGroup.element.hidden = found.length < 2;
-    setGroup.show(found);
   };
-
-  const setGroup = groupSetter((found, group) => {
-    for (const row of found) if (!row.removed) row.asset.group = group;
-    show();
-  });
-  const add = (asset = {}) => {
+  const fail = (words) => {
+    text(fault, words);
+    fault.hidden = !words;
+  };
+  const add = (asset) => {
     search.value = "";
     const row = draft.add(asset);
     show();
-    const at = asset.tag ? ".asset-name" : ".asset-tag";
-    rows.rows.get(row.number).element.querySelector(at).focus();
+    table.focus(row);
   };
-  const addOne = h("button", { type: "button", onclick: () => add() }, "Add");
-  const addAll = h("button", { type: "button", onclick: () => (withoutAsset(draft).reverse().forEach((name) => draft.add({ tag: name })), show()) });
-  const pick = h("input", { type: "file", accept: ".csv,text/csv", hidden: true, "aria-label": "File of assets" });
-  const load = h("button", { type: "button", onclick: () => pick.click() }, "Import CSV …");
   pick.addEventListener("change", async () => {
     const [file] = pick.files;
-    pick.value = "";
-    if (!file) return;
     fail("");
     try {
       const assets = readCsv(await file.text());
@@ -133,17 +149,9 @@ export function editAssets(tag = null) {
     } catch (error) {
       fail(`${file.name}: ${error.message}`);
     }
+    pick.value = "";
     show();
   });
-  const file = h("a", { class: "button", href: assetsFile(), download: "assets.csv" }, "Export CSV");
-  const summary = h("p", { class: "count", role: "status" });
-  const save = h("button", { type: "button", class: "primary", onclick: () => store() }, "Save");
-  const cancel = h("button", { type: "button", onclick: () => dialog.close() }, "Close");
-
-  const fail = (words) => {
-    text(fault, words);
-    fault.hidden = !words;
-  };
   /** Another page has saved: its changes come into the table. */
   const meanwhile = (assets) => {
     const changed = draft.rebase(assets);
@@ -157,40 +165,44 @@ export function editAssets(tag = null) {
   };
   const store = async () => {
     fail("");
-    faults = draft.faults();
-    show();
-    if (faults.length) return focusFault();
+    const faults = draft.faults();
+    table.blame(faults);
+    if (faults.length) return;
     save.disabled = true;
     try {
       if (meanwhile(await fetchAssets())) return fail("Not saved yet: look at what another page has changed, and save again.");
-      const sent = draft.assets();
-      const answer = await putAssets(sent, state.site?.name ?? "");
+      await putAssets(draft.assets(), state.site?.name ?? "");
       open = null;
-      receiveAssets(answer.assets ?? sent);
+      receiveAssets(draft.assets());
       dialog.close();
       toast("Assets saved.");
-    } catch (error) {
-      const row = draft.rows.find(({ asset }) => asset.tag && error.message.includes(`'${asset.tag}'`));
-      const field = COLUMNS.find((key) => key !== "tag" && error.message.includes(key)) ?? "tag";
-      if (row) faults = [{ row, field, words: `Not saved: ${error.message}` }];
-      else fail(`Not saved: ${error.message}`);
-      show();
-      if (row) focusFault();
+    } catch ({ message }) {
+      // The server names the asset and the field: asset 'tag7': colour is 'red'; it should be …
+      const row = draft.rows.find(({ asset }) => message.startsWith(`asset '${asset.tag}': `));
+      const field = COLUMNS.find((key) => message.includes(`': ${key} is `)) ?? "tag";
+      if (!row) fail(`Not saved: ${message}`);
+      table.blame(row ? [{ row, field, words: `Not saved: ${message}` }] : []);
     }
   };
-  const focusFault = () => {
-    const input = body.querySelector('[aria-invalid="true"]');
-    input?.focus();
-    input?.scrollIntoView({ block: "nearest" });
-  };
 
-  const tools = h("div", { class: "above" }, addOne, addAll, load, file, search, setGroup.element);
-  const foot = h("div", { class: "foot" }, summary, save, cancel);
-  const box = h("div", { class: "assets-box", tabindex: "0", role: "region", "aria-label": "Assets" }, table, more);
-  const dialog = h("dialog", { id: "assets-dialog", "aria-labelledby": "assets-title" }, title, tools, pick, said, fault, box, foot, tags, groups);
-  const unsaved = () => Object.values(draft.counts()).some(Boolean);
+  const table = makeTable(draft, show);
+  const addAll = button("", () => (withoutAsset(draft).reverse().forEach((name) => draft.add({ tag: name })), show()));
+  const setGroup = button("", () => (draft.setGroup(found, group.value.trim()), show()));
+  const file = h("a", { class: "button", href: assetsFile(), download: "assets.csv" }, "Export CSV");
+  const save = button("Save", store, { class: "primary" });
+  const tools = [button("Add", () => add({})), addAll, button("Import CSV …", () => pick.click()), file, search, group, setGroup];
+  const dialog = h(
+    "dialog",
+    { id: "assets-dialog", "aria-labelledby": "assets-title" },
+    h("h2", { id: "assets-title" }, "Assets: what the tags are attached to"),
+    h("div", { class: "above" }, ...tools, pick, tags, groups),
+    said,
+    fault,
+    h("div", { class: "assets-box", tabindex: "0", role: "region", "aria-label": "Assets" }, table.element, more),
+    h("div", { class: "foot" }, summary, save, button("Close", () => dialog.close())),
+  );
   dialog.addEventListener("cancel", (event) => {
-    if (!unsaved() || event.target !== dialog) return;
+    if (!draft.changes().any || event.target !== dialog) return;
     event.preventDefault(); // Escape must not lose what was typed
     fail("There are changes that are not saved: save them, or close without saving.");
   });
@@ -201,29 +213,13 @@ export function editAssets(tag = null) {
   document.body.append(dialog);
   dialog.showModal();
   open = { meanwhile };
+  if (tag !== null && !state.assets.has(tag)) return add({ tag });
+  search.value = tag ?? "";
   show();
-  const row = tag === null ? null : draft.rows.find(({ asset }) => asset.tag === tag);
-  if (row) search.value = tag;
-  if (tag !== null && !row) add({ tag });
-  else if (row) show();
 }
 
 /** Tags of the live site that have no asset yet. */
 function withoutAsset(draft) {
   const known = new Set(draft.rows.map(({ asset }) => asset.tag));
   return live.sorted.map(({ name }) => name).filter((name) => !known.has(name));
-}
-
-/** A field that sets the group of all rows that are found. */
-function groupSetter(apply) {
-  const input = h("input", { type: "text", placeholder: "Group", autocomplete: "off", maxLength: 100 });
-  input.setAttribute("list", "asset-groups");
-  let found = [];
-  const button = h("button", { type: "button", onclick: () => apply(found, input.value.trim()) });
-  const show = (rows) => {
-    found = rows;
-    input.setAttribute("aria-label", `Group of all ${rows.length} rows found`);
-    text(button, `Set for ${rows.length} rows`);
-  };
-  return { element: h("span", { class: "set-group" }, input, button), show };
 }
