@@ -43,7 +43,7 @@ def test_alarms_are_raised_shown_and_acknowledged(hall):
     server.alarms = [
         alarm("anchor-offline", "anchor-8", "warning", "Anchor 8 is offline", 900.0, acknowledged_unix_s=time.time(),
               acknowledged_by="Bea"),
-        alarm("silent", "robot", "info", "Arm has sent nothing for 10 s", 90.0, tags=["robot"], ended_unix_s=time.time()),
+        alarm("silent", "robot", "info", "Arm has sent nothing for 10 s", tags=["robot"], ended_unix_s=time.time()),
         alarm("crowded", "zone-dock", "warning", "5 tags are in Dock", 400.0, zone="dock"),
         alarm("near", "forklift+trolley", "critical", "Linde 3 and trolley are 1.4 m apart", 20.0,
               tags=["forklift", "trolley"]),

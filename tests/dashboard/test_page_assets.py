@@ -187,7 +187,9 @@ def test_a_file_shows_what_it_changes_before_it_is_sent(hall, tmp_path):
         file.write_text(text, encoding="utf-8")
         dialog.locator("input[type=file]").set_input_files(file)
         page.wait_for_selector(f"#assets-dialog .fault:has-text('{words}')")
-    file.write_text('\ufefftag;name;notes\r\nforklift;"Linde; 4";\r\nrobot;"R ""2""";"two\nlines"\r\n\r\n', encoding="utf-8")
+    file.write_text(
+        '\ufefftag;name;notes\r\nforklift;"Linde; 4";\r\nrobot;"R ""2""";"two\nlines"\r\n\r\n', encoding="utf-8"
+    )
     dialog.locator("input[type=file]").set_input_files(file)
     page.wait_for_selector("#assets-dialog .foot:has-text('1 new, 1 changed, 0 removed')")
     assert server.puts == []

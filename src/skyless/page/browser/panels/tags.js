@@ -118,7 +118,7 @@ export function show() {
   const list = tracks().sorted;
   const all = state.mode === "live" && state.part ? state.part.of : list.length;
   const offered = all > SEARCHED || state.assets.size > 0;
-  if (!offered) state.find = state.filter.group = state.filter.zone = "";
+  if (!offered) parts.search.value = state.find = state.filter.group = state.filter.zone = "";
   if (state.filter.zone && !state.zones.some(({ id }) => id === state.filter.zone)) state.filter.zone = "";
   offer(parts.group, "All groups", [...allGroups().keys()].map((name) => [name, name]), state.filter.group);
   offer(parts.zone, "All zones", state.zones.map(({ id, name }) => [id, name]), state.filter.zone);
