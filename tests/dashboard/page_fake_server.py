@@ -5,6 +5,7 @@ By hand: ``PYTHONPATH=tests .venv/bin/python tests/dashboard/page_fake_server.py
 
 import asyncio
 import contextlib
+import json
 import mimetypes
 import socket
 import sys
@@ -65,8 +66,8 @@ class FakeServer:
         self.assets, self.rules, self.file_rules, self.alarms = [], [], [], []
         self.more_alarms = 0
         self.refusal = None
-        """Why assets or rules are refused; the requests that were not are in ``puts``."""
-        self.puts = []
+        """Why assets or rules are refused; the requests that were not are in ``puts``, what pages show in ``asked``."""
+        self.puts, self.asked = [], []
         self.started = time.time()
         self.sockets = {}
         self.port = _usual_port()
@@ -347,7 +348,10 @@ class FakeServer:
 
     async def _pongs(self, websocket, lock):
         while True:
-            if await websocket.receive_text() == "ping" and self.answers_pings and not self.mute:
+            text = await websocket.receive_text()
+            if text != "ping":
+                self.asked.append(json.loads(text))
+            elif self.answers_pings and not self.mute:
                 await _send(websocket, lock, {"type": "pong"})
 
 

@@ -2,6 +2,7 @@
 
 import time
 
+import page_fake_site as made_up
 import pytest
 from page_browser import until
 
@@ -29,16 +30,27 @@ def wait_for_puts(server, count=1):
     return server.puts[-1]
 
 
+def wait_for(server, wanted):
+    end = time.monotonic() + 5
+    while not (server.asked and wanted(server.asked[-1])):
+        assert time.monotonic() < end, server.asked[-1:]
+        time.sleep(0.02)
+
+
 def names(page):
     return page.locator("#panel-tags tbody button.name").all_inner_texts()
 
 
-def styles(page):
-    """Colour of each tag as the map draws it, and whether it is faint."""
-    return page.evaluate("""async () => {
-      const { visibleTags } = await import("/page/map/tags.js");
-      return Object.fromEntries(visibleTags().seen.map(({ track, colour, other }) => [track.name, [colour, other]]));
-    }""")
+STYLES = """async () => {
+  const { visibleTags } = await import("/page/map/tags.js");
+  return Object.fromEntries(visibleTags().seen.map(({ track, colour, other }) => [track.name, [colour, other]]));
+}"""
+
+
+def styles(page, count):
+    """Colour of each tag as the map draws it, and whether it is faint, once there are so many."""
+    until(page, f"count => ({STYLES})().then((found) => Object.keys(found).length === count)", count)
+    return page.evaluate(STYLES)
 
 
 @pytest.fixture
@@ -57,12 +69,12 @@ def test_assets_name_and_colour_their_tags_and_are_filtered(hall):
     until(page, "skyless.live.all.size === 3 && skyless.state.assets.size === 2")
     until(page, "document.querySelectorAll('#panel-tags tbody button.name').length === 3")
     assert names(page) == ["Cart 1", "F Linde 3", "robot"]
-    look = styles(page)
+    look = styles(page, 3)
     assert look["trolley"][0] != "rgb(255, 255, 255)", "white is not seen on a light map"
     assert look["forklift"][0] != look["robot"][0]
     page.get_by_label("Group", exact=True).select_option("forklifts")
     until(page, "document.querySelectorAll('#panel-tags tbody button.name').length === 1")
-    assert {tag: faint for tag, (_, faint) in styles(page).items()} == {
+    assert {tag: faint for tag, (_, faint) in styles(page, 3).items()} == {
         "forklift": False, "trolley": True, "robot": True,
     }  # fmt: skip
     page.wait_for_selector("#part:has-text('faint')")
@@ -98,10 +110,10 @@ def test_five_hundred_assets_are_told_apart(serve, visit):
     server.assets = many(500)
     page = visit(server).page
     until(page, "skyless.live.all.size === 500 && skyless.state.assets.size === 500")
-    assert len({colour for colour, _ in styles(page).values()}) == len(GROUPS)
+    assert len({colour for colour, _ in styles(page, 500).values()}) == len(GROUPS)
     page.get_by_label("Find a tag").fill("ann")
     until(page, "document.querySelector('#panel-tags .count').textContent === '10 of 500 tags found'")
-    assert sum(not faint for _, faint in styles(page).values()) == 10
+    assert sum(not faint for _, faint in styles(page, 500).values()) == 10
     assert page.evaluate("skyless.state.find") == "ann"
     page.click("#edit-assets")
     assert page.locator("#assets-dialog tbody tr").count() == 150
@@ -114,23 +126,26 @@ def test_five_hundred_assets_are_told_apart(serve, visit):
     assert sent[498] == server.assets[498] == asset("tag-499", "Thing 499", "spares")
 
 
-def test_a_server_that_sends_a_part_is_asked_for_the_tags_of_the_assets_found(serve, visit):
+def test_a_server_that_sends_a_part_is_asked_for_the_tags_that_are_found(serve, visit):
     server = serve(tags=0)
     server.assets = many(300)
     page = visit(server).page
-    until(page, "skyless.state.assets.size === 300")
-    found = page.evaluate("""async () => {
-      const { foundByAsset } = await import("/page/assets/model.js");
-      skyless.state.find = "thing 29";
-      return foundByAsset();
-    }""")
-    assert found == ["tag-029", *(f"tag-{n}" for n in range(290, 300))]
+    now = time.time()
+    row = made_up.state_row("tag-001", 0, 1.0, now)
+    server.send({"type": "state", "unix_s": now, "tags": [row], "left": [], "of": 5000, "inside": 10})
+    until(page, "skyless.state.part?.of === 5000")
+    page.get_by_label("Find a tag").fill("thing 29")
+    wait_for(server, lambda asked: asked["find"] == "thing 29")
+    assert set(server.asked[-1]["tags"]) >= {"tag-029", *(f"tag-{n}" for n in range(290, 300))}
+    page.get_by_label("Zone", exact=True).select_option("dock")
+    wait_for(server, lambda asked: asked["view"] == [14, 2.5, 21, 6])
 
 
 def test_assets_are_added_changed_and_removed_with_the_keyboard(hall):
     server, visit = hall
     page = visit.page
     until(page, "skyless.live.all.size === 3 && skyless.state.assets.size === 2")
+    page.wait_for_selector("#edit-assets:enabled")
     page.focus("#edit-assets")
     page.keyboard.press("Enter")
     dialog = page.locator("#assets-dialog")

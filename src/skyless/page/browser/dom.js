@@ -38,6 +38,15 @@ export function options(properties, pairs, choose) {
   return list;
 }
 
+/** Offer other options in a list, pairs of value and words, and choose one; a list of one option is hidden. */
+export function offer(list, pairs, value) {
+  const key = JSON.stringify(pairs);
+  if (list.dataset.offered !== key) list.replaceChildren(...pairs.map(([id, words]) => h("option", { value: id }, words)));
+  list.dataset.offered = key;
+  list.hidden = pairs.length < 2;
+  list.value = pairs.some(([id]) => id === value) ? value : pairs[0][0];
+}
+
 /** Set a node's text where it differs, which avoids needless layout. */
 export function text(element, value) {
   if (element.textContent !== value) element.textContent = value;

@@ -129,11 +129,19 @@ function ask() {
   const tags = [state.selection.tag, state.followed, ...state.listed.tags, ...found].filter((name) => name !== null);
   const anchors = [state.selection.anchor, ...state.listed.anchors].filter((id) => id !== null).map(String);
   const limit = (names) => [...new Set(names)].slice(0, MAX_NAMED);
-  const wanted = { view: state.seenBox(), find: state.find, tags: limit(tags), anchors: limit(anchors), rows: rowLimit() };
+  const wanted = { view: askedBox(), find: state.find, tags: limit(tags), anchors: limit(anchors), rows: rowLimit() };
   const words = JSON.stringify(wanted);
   if (words === asked || socket.readyState !== WebSocket.OPEN) return;
   asked = words;
   socket.send(words);
+}
+
+/** The part of the site of which tags are asked for: the zone of the filter, or what the map shows. */
+function askedBox() {
+  const zone = state.part && state.zones.find(({ id }) => id === state.filter.zone);
+  if (!zone) return state.seenBox();
+  const [x, y] = [0, 1].map((axis) => zone.polygon_m.map((corner) => corner[axis]));
+  return [Math.min(...x), Math.min(...y), Math.max(...x), Math.max(...y)];
 }
 
 function process(text) {

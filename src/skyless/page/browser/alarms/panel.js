@@ -2,7 +2,7 @@
 
 import { state } from "../store.js";
 import { shownName } from "../assets/model.js";
-import { Rows, h, options, text } from "../dom.js";
+import { Rows, h, offer, options, text } from "../dom.js";
 import { dateTime, duration, sentence, timeOfDay } from "../format.js";
 import { now_s } from "../clock.js";
 import { SEVERITIES, acknowledgeAll, acknowledger, isActive, isUnseen, keepAcknowledger, selectSubject } from "./model.js";
@@ -44,13 +44,7 @@ export function show() {
   const rules = [...new Map(state.alarms.map(({ rule, name }) => [`rule ${rule}`, name || rule]))];
   const pairs = [...Object.entries(FILTERS).map(([key, { words }]) => [key, words]), ...rules.map(([key, words]) => [key, `Rule: ${words}`])];
   const { filter } = parts;
-  const offered = JSON.stringify(pairs);
-  if (filter.dataset.offered !== offered) {
-    const before = filter.value;
-    filter.replaceChildren(...pairs.map(([value, words]) => h("option", { value }, words)));
-    filter.value = pairs.some(([key]) => key === before) ? before : "";
-    filter.dataset.offered = offered;
-  }
+  offer(filter, pairs, filter.value);
   const alarms = shownAlarms();
   const unseen = alarms.filter(isUnseen).length;
   filter.hidden = !state.alarms.length;

@@ -5,7 +5,7 @@ import { editAssets } from "../assets/editor.js";
 import { allGroups, labelOf, shownName } from "../assets/model.js";
 import { GONE_S, GREY_S, freshness, now_s, shown_s, tracks } from "../clock.js";
 import { Chart } from "../chart.js";
-import { h, options, text } from "../dom.js";
+import { h, offer, options, text } from "../dom.js";
 import { DASH, bytes, duration, length, metres, number } from "../format.js";
 import { tagHistory } from "../history.js";
 import { filtering, passes } from "../map/filter.js";
@@ -74,7 +74,7 @@ let shown = { key: "", at: -Infinity };
 
 /** Build the tab. */
 export function start(panel) {
-  const search = h("input", { type: "search", placeholder: "Find a tag", "aria-label": "Find a tag", oninput: choose });
+  const search = h("input", { type: "search", placeholder: "Find a tag", "aria-label": "Find a tag", maxLength: 100, oninput: choose });
   const group = options({ "aria-label": "Group" }, [], choose);
   const zone = options({ "aria-label": "Zone" }, [], choose);
   const all = h("button", { type: "button", class: "quiet", onclick: showAll }, "Show all");
@@ -103,16 +103,6 @@ function showAll() {
   choose();
 }
 
-/** Offer the groups and zones that there are; what has gone is no longer chosen. */
-function offer(list, all, entries, value) {
-  const pairs = [["", all], ...entries];
-  const key = JSON.stringify(pairs);
-  if (list.dataset.offered !== key) list.replaceChildren(...pairs.map(([id, words]) => h("option", { value: id }, words)));
-  list.dataset.offered = key;
-  list.hidden = !entries.length;
-  if (list.value !== value) list.value = value;
-}
-
 /** Bring the tab up to date. */
 export function show() {
   const list = tracks().sorted;
@@ -120,8 +110,8 @@ export function show() {
   const offered = all > SEARCHED || state.assets.size > 0;
   if (!offered) parts.search.value = state.find = state.filter.group = state.filter.zone = "";
   if (state.filter.zone && !state.zones.some(({ id }) => id === state.filter.zone)) state.filter.zone = "";
-  offer(parts.group, "All groups", [...allGroups().keys()].map((name) => [name, name]), state.filter.group);
-  offer(parts.zone, "All zones", state.zones.map(({ id, name }) => [id, name]), state.filter.zone);
+  offer(parts.group, [["", "All groups"], ...[...allGroups().keys()].map((name) => [name, name])], state.filter.group);
+  offer(parts.zone, [["", "All zones"], ...state.zones.map(({ id, name }) => [id, name])], state.filter.zone);
   parts.edit.disabled = state.mode !== "live" || !state.site;
   parts.filter.hidden = !offered;
   parts.all.hidden = !filtering();
