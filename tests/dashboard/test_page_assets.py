@@ -179,7 +179,7 @@ def test_assets_are_added_changed_and_removed_with_the_keyboard(hall):
     visit.problems.clear()  # the browser's own line about the answer 400
     dialog.get_by_role("button", name="Save").click()
     assert wait_for_puts(server) == {
-        "assets": [asset("robot", "Robot 1", colour="#c2410c"), server.assets[1]], "site": "Hall 7",
+        "assets": [server.assets[0], asset("robot", "Robot 1", colour="#c2410c")], "site": "Hall 7",
     }  # fmt: skip
     dialog.wait_for(state="detached")
     until(page, "document.querySelector('#panel-tags tbody').innerText.includes('Robot 1')")
@@ -207,6 +207,7 @@ def test_a_file_shows_what_it_changes_before_it_is_sent(hall, tmp_path):
     )
     dialog.locator("input[type=file]").set_input_files(file)
     page.wait_for_selector("#assets-dialog .foot:has-text('1 new, 1 changed, 0 removed')")
+    assert dialog.locator("tbody .state").all_inner_texts() == ["+ new", "● changed", ""]
     assert server.puts == []
     dialog.get_by_role("button", name="Save").click()
     sent = {one["tag"]: one for one in wait_for_puts(server)["assets"]}

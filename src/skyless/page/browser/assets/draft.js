@@ -33,7 +33,7 @@ export class Draft {
     else this.rows = this.rows.filter((one) => one !== row);
   }
 
-  /** Take over the assets of a file, each with the columns that the file has; others stay. */
+  /** Take over the assets of a file, each with the columns that the file has; others stay. What differs comes first. */
   merge(assets) {
     const known = new Map(this.rows.map((row) => [row.asset.tag, row]));
     for (const asset of assets) {
@@ -41,6 +41,7 @@ export class Draft {
       if (row) Object.assign(row, { asset: { ...row.asset, ...asset }, removed: false });
       else this.add(asset);
     }
+    this.rows.sort((a, b) => Number(this.kind(a) === "") - Number(this.kind(b) === ""));
   }
 
   /**
@@ -104,9 +105,10 @@ export class Draft {
     return faults;
   }
 
-  /** All assets as they are to be saved. */
+  /** All assets as they are to be saved: in their order, new ones at the end. */
   assets() {
-    return this.rows.filter(({ removed }) => !removed).map(({ asset }) => asset);
+    const kept = this.rows.filter(({ removed }) => !removed);
+    return kept.sort((a, b) => a.number - b.number).map(({ asset }) => asset);
   }
 }
 
