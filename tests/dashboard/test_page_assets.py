@@ -198,8 +198,9 @@ def test_a_file_shows_what_it_changes_before_it_is_sent(hall, tmp_path):
         ("tag,name\na,b\na,c\n", 'Line 3: the tag "a" is listed twice'),
         ('tag,name\na,"b\n', "quotation mark is not closed"),
         ("tag,name\na,b,c\n", "Line 2 has 3 values for 2 columns"),
+        ("tag,name\na,Säge\n", "not UTF-8"),
     ):
-        file.write_text(text, encoding="utf-8")
+        file.write_text(text, encoding="latin-1")
         dialog.locator("input[type=file]").set_input_files(file)
         page.wait_for_selector(f"#assets-dialog .fault:has-text('{words}')")
     file.write_text(

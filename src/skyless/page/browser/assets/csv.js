@@ -4,11 +4,16 @@ export const COLUMNS = ["tag", "name", "group", "icon", "colour", "owner", "note
 
 /**
  * Read assets; an asset has the columns only that the file has. Throws an Error that names the line.
- * @param {string} text
+ * @param {ArrayBuffer} file
  * @returns {Array<Record<string, string>>}
  */
-export function readCsv(text) {
-  const content = text.replace(/^\uFEFF/, "");
+export function readCsv(file) {
+  let content = "";
+  try {
+    content = new TextDecoder("utf-8", { fatal: true }).decode(file);
+  } catch {
+    throw new Error("The file is not UTF-8; save the table as CSV UTF-8.");
+  }
   const first = content.split(/\r?\n/, 1)[0];
   const mark = [",", ";", "\t"].toSorted((a, b) => first.split(b).length - first.split(a).length)[0];
   const [head, ...lines] = rowsOf(content, mark);

@@ -143,7 +143,7 @@ export function editAssets(tag = null) {
     const [file] = pick.files;
     fail("");
     try {
-      const assets = readCsv(await file.text());
+      const assets = readCsv(await file.arrayBuffer());
       draft.merge(assets);
       text(said, `${file.name} has ${assets.length} assets. The table shows what saving will change; assets that the file has not stay.`);
     } catch (error) {

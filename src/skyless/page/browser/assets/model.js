@@ -3,8 +3,9 @@
 import { changed, on, state } from "../store.js";
 import { palette, visible } from "../theme.js";
 
-/** Searched words of each asset, and the colours and numbers of groups; made again with the assets and the theme. */
+/** Searched words and looks of tags, and groups; made again with the assets and the theme. */
 let words = new Map();
+let looks = new Map();
 let groups = new Map();
 
 /** Keep the site's assets. @param {any[]} assets */
@@ -31,6 +32,13 @@ function placeGroups() {
     taken.add(number);
     groups.set(name, { number, colour: palette.groups[number] });
   }
+  looks = new Map([...state.assets.values()].map((asset) => [asset.tag, lookOf(asset)]));
+}
+
+function lookOf(asset) {
+  const group = groups.get(asset.group);
+  const colour = visible(asset.colour) || group?.colour;
+  return colour ? { colour, number: group?.number ?? 0 } : null;
 }
 
 /** FNV-1a. */
@@ -52,10 +60,7 @@ export function allGroups() {
 
 /** Colour of a tag by its asset or its group, and the group's number; null where the assets say nothing. */
 export function assetLook(tag) {
-  const asset = state.assets.get(tag);
-  const group = groups.get(asset?.group);
-  const colour = asset?.colour ? visible(asset.colour) : group?.colour;
-  return colour ? { colour, number: group?.number ?? 0 } : null;
+  return looks.get(tag) ?? null;
 }
 
 /** What people call a tag: its asset's name, or its own. */
