@@ -36,7 +36,7 @@ export function isUnseen(alarm) {
 /** What an alarm is about: its kind, and the names or numbers. @returns {{kind: "tag"|"anchor"|"zone", ids: any[]}} */
 export function subjectOf({ kind, subject, tags, zone }) {
   if (kind.startsWith("anchor-")) return { kind: "anchor", ids: [Number(subject.replace("anchor-", ""))] };
-  if (kind === "crowded") return { kind: "zone", ids: [zone] };
+  if (kind === "crowded") return { kind: "zone", ids: [zone ?? subject.replace("zone-", "")] };
   return { kind: "tag", ids: tags?.length ? tags : subject.split("+") };
 }
 

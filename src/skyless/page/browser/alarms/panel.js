@@ -42,13 +42,15 @@ export function start(panel) {
 /** Bring the tab up to date. */
 export function show() {
   const rules = [...new Map(state.alarms.map(({ rule, name }) => [`rule ${rule}`, name || rule]))];
-  const pairs = [...Object.entries(FILTERS).map(([key, { words }]) => [key, words]), ...rules.map(([key, words]) => [key, `Rule: ${words}`])];
+  const filters = Object.entries(FILTERS).map(([key, { words }]) => [key, words]);
+  const pairs = [...filters, ...rules.map(([key, words]) => [key, `Rule: ${words}`])];
   const { filter } = parts;
   offer(filter, pairs, filter.value);
   const alarms = shownAlarms();
   const unseen = alarms.filter(isUnseen).length;
   filter.hidden = !state.alarms.length;
-  text(parts.count, state.alarms.length ? `${state.alarms.filter(isActive).length} active, ${state.alarms.filter(isUnseen).length} not acknowledged` : "");
+  const [active, open] = [isActive, isUnseen].map((test) => state.alarms.filter(test).length);
+  text(parts.count, state.alarms.length ? `${active} active, ${open} not acknowledged` : "");
   parts.name.hidden = !state.alarms.length;
   parts.all.hidden = unseen < 2;
   text(parts.all, `Acknowledge all ${unseen} shown`);

@@ -17,7 +17,8 @@ export function drawAlarms(context, still) {
   const marked = new Map();
   for (const alarm of state.alarms.filter(isActive)) {
     const { kind, ids } = subjectOf(alarm);
-    if ((kind !== "tag") === still) for (const id of ids) if (!marked.has(`${kind} ${id}`)) marked.set(`${kind} ${id}`, { alarm, kind, id });
+    if ((kind !== "tag") !== still) continue;
+    for (const id of ids) if (!marked.has(`${kind} ${id}`)) marked.set(`${kind} ${id}`, { alarm, kind, id });
   }
   if (!marked.size) return;
   const tags = still ? null : new Map(drawn.map((one) => [one.name, one]));
