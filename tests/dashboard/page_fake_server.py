@@ -64,6 +64,11 @@ class FakeServer:
         self.events_note = False
         self.site_name = "Hall 7"
         self.zone_events = []
+        self.assets, self.rules, self.file_rules, self.alarms = [], [], [], []
+        self.more_alarms = 0
+        self.refusal = None
+        """Why assets or rules are refused; the requests that were not are in ``puts``, what pages show in ``asked``."""
+        self.puts, self.asked = [], []
         self.started = time.time()
         self.sockets = {}
         self.port = _usual_port()
@@ -155,6 +160,39 @@ class FakeServer:
             self.zones = body["zones"]
             return JSONResponse({"zones": self.zones})
 
+        async def put_assets(request):
+            return await keep(request, "assets")
+
+        async def put_rules(request):
+            return await keep(request, "rules")
+
+        async def keep(request, what):
+            body = await request.json()
+            if self.refusal:
+                return JSONResponse({"error": self.refusal}, status_code=400)
+            self.puts.append(body)
+            setattr(self, what, body[what])
+            return JSONResponse({what: body[what]})
+
+        async def acknowledge(request):
+            body = await request.json()
+            named = [alarm for alarm in self.alarms if alarm["id"] == body["id"]]
+            assert [(one["rule"], one["subject"]) for one in named] == [tuple(request.path_params.values())]
+            named[0] |= {"acknowledged_unix_s": time.time(), "acknowledged_by": body["by"]}
+            self.puts.append(body)
+            return JSONResponse(body)
+
+        async def assets(_request):
+            return JSONResponse({"assets": self.assets})
+
+        async def assets_csv(_request):
+            head = ["tag", "name", "group", "icon", "colour", "owner", "notes"]
+            lines = [head, *([asset.get(key, "") for key in head] for asset in self.assets)]
+            return Response("".join(f"{','.join(line)}\r\n" for line in lines), media_type="text/csv")
+
+        async def alarm_rules(_request):
+            return JSONResponse({"rules": self.rules, "file_rules": self.file_rules})
+
         async def recordings(_request):
             start = {"bytes": 48_300_000, "start_unix_s": 1_780_000_000.0, "complete": True}
             what = {"site": "Hall 7", "tags": 2, "fixes": 1800}
@@ -197,6 +235,12 @@ class FakeServer:
                 Route("/api/overlay", overlay, methods=["GET", "POST"]),
                 Route("/api/sheet", sheet, methods=["POST"]),
                 Route("/api/zones", put_zones, methods=["PUT"]),
+                Route("/api/v1/assets", assets),
+                Route("/api/v1/assets", put_assets, methods=["PUT"]),
+                Route("/api/v1/assets.csv", assets_csv),
+                Route("/api/v1/alarm_rules", alarm_rules),
+                Route("/api/v1/alarm_rules", put_rules, methods=["PUT"]),
+                Route("/api/v1/alarms/{rule}/{subject}/acknowledge", acknowledge, methods=["POST"]),
                 Route("/api/recordings", recordings),
                 Route("/api/recordings/{name}", recording),
                 Route("/api/recordings/{name}/events", events),
@@ -217,6 +261,8 @@ class FakeServer:
         lock = asyncio.Lock()
         await _send(websocket, lock, self._hello())
         await _send(websocket, lock, {"type": "log", "events": self.log})
+        for message in self.site_messages():
+            await _send(websocket, lock, message)
         self.sockets[websocket] = lock
         jobs = [
             asyncio.create_task(job(websocket, lock))
@@ -229,6 +275,19 @@ class FakeServer:
         await asyncio.gather(*jobs, return_exceptions=True)
         self.sockets.pop(websocket, None)
         return None
+
+    def site_messages(self):
+        """The messages of assets, rules and alarms."""
+        return [
+            {"type": "assets", "assets": self.assets},
+            {"type": "alarm_rules", "rules": self.rules, "file_rules": self.file_rules},
+            {"type": "alarms", "alarms": self.alarms, "more": self.more_alarms},
+        ]
+
+    def send_site_messages(self):
+        """Send them to every page, after a change."""
+        for message in self.site_messages():
+            self.send(message)
 
     def _hello(self):
         plan = PLAN if self.floor_plan else None
@@ -297,7 +356,10 @@ class FakeServer:
 
     async def _pongs(self, websocket, lock):
         while True:
-            if await websocket.receive_text() == "ping" and self.answers_pings and not self.mute:
+            text = await websocket.receive_text()
+            if text != "ping":
+                self.asked.append(json.loads(text))
+            elif self.answers_pings and not self.mute:
                 await _send(websocket, lock, {"type": "pong"})
 
 

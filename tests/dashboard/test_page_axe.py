@@ -9,6 +9,8 @@ import page_fake_site as made_up
 import pytest
 from page_browser import THREE_FRAMES, until
 from page_fake_survey import FakeSurvey
+from test_page_alarms import IN_FILE, TOO_NEAR, alarm
+from test_page_assets import asset
 
 pytestmark = pytest.mark.statistical
 
@@ -126,3 +128,35 @@ def test_the_set_up(serve, checks):
         setup.check(step.inner_text(), "#panel")
     setup.check("whole page")
     assert setup.found == {}
+
+
+def test_assets_and_alarms(serve, checks):
+    server = serve(tags=4)
+    server.assets = [asset("forklift", "Linde 3", "forklifts", icon="F"), asset("robot", "Arm", colour="#c2410c")]
+    server.rules, server.file_rules = [TOO_NEAR], [IN_FILE]
+    server.alarms = [
+        alarm("near", "forklift+robot", "critical", "Linde 3 and Arm are 1.4 m apart", tags=["forklift", "robot"]),
+        alarm("crowded", "zone-dock", "warning", "5 tags are in Dock", zone="dock", acknowledged_unix_s=1.0),
+    ]
+    shown = checks(server)
+    page = shown.page
+    page.wait_for_selector("table.tags tr.fresh")
+    page.click("#legend summary")
+    shown.check("tags with assets")
+    page.click("#tab-alarms")
+    page.click("#panel-alarms >> text=Acknowledge >> nth=0")
+    page.click("#add-rule")
+    page.get_by_label("Raised when").select_option("near")
+    page.click(".rule-form >> text=Save")
+    page.wait_for_selector(".rule-form .fault:not([hidden])")
+    shown.check("alarms", "#panel")
+    page.click("#tab-tags")
+    page.click("#edit-assets")
+    page.click("#assets-dialog >> text=Add >> nth=0")
+    page.get_by_label("Name of robot").fill("Arm 2")
+    page.keyboard.press("Tab")
+    page.get_by_label("Remove forklift").click()
+    page.click("#assets-dialog button.primary")
+    page.wait_for_selector("#assets-dialog td .fault:not([hidden])")
+    shown.check("assets", "#assets-dialog")
+    assert shown.found == {}

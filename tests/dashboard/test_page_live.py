@@ -279,7 +279,7 @@ def test_the_search_field_counts_only_where_it_is_shown(serve, visit):
     page.fill("#panel-tags input[type=search]", "003")
     until(page, "document.querySelectorAll('table.tags tbody tr').length === 1")
     page.fill("#panel-tags input[type=search]", "nobody")
-    page.wait_for_selector("#panel-tags :text-is('No tag of this name.')")
+    page.wait_for_selector("#panel-tags :text-is('No tag is found.')")
     assert rows.count() == 0
     server.tags = 3
     until(page, "skyless.live.all.size === 3 || skyless.live.clear()")  # again, if a message of 13 was on its way

@@ -5,7 +5,7 @@ from page_browser import until
 
 pytestmark = pytest.mark.statistical
 
-TABS = ("tags", "anchors", "events", "timing", "zones", "recordings")
+TABS = ("tags", "alarms", "anchors", "events", "timing", "zones", "recordings")
 LUMA = "getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number).reduce((a, b) => a + b)"
 
 
@@ -104,8 +104,8 @@ def test_tabs_move_with_arrows(server, visit):
     page = visit(server).page
     page.focus("#tab-tags")
     page.keyboard.press("ArrowRight")
-    assert page.evaluate("document.activeElement.id") == "tab-anchors"
-    assert page.locator("#panel-anchors").is_visible()
+    assert page.evaluate("document.activeElement.id") == "tab-alarms"
+    assert page.locator("#panel-alarms").is_visible()
     page.keyboard.press("End")
     assert page.locator("#panel-recordings").is_visible()
 

@@ -29,23 +29,53 @@ async function fetchJson(path, options = {}) {
 
 /** Store all zones of the site of a name; returns them as the server has stored them. */
 export async function putZones(zones, site) {
-  const body = JSON.stringify({ zones, site });
+  return (await send("api/zones", { zones, site })).zones;
+}
+
+/** All assets of the live site, as the server has them now. */
+export async function assets() {
+  return (await fetchJson(`api/v1/assets${ofSite()}`)).assets;
+}
+
+/** Store all assets of the site of a name. */
+export function putAssets(assets, site) {
+  return send("api/v1/assets", { assets, site });
+}
+
+/** The rules of alarms that were made on the page, as the server has them now. */
+export async function alarmRules() {
+  return (await fetchJson(`api/v1/alarm_rules${ofSite()}`)).rules;
+}
+
+/** Store all rules of the site of a name. */
+export function putAlarmRules(rules, site) {
+  return send("api/v1/alarm_rules", { rules, site });
+}
+
+/** Tell the server who has seen an alarm. */
+export function acknowledge({ rule, subject, id }, by) {
+  const path = `api/v1/alarms/${encodeURIComponent(rule)}/${encodeURIComponent(subject)}/acknowledge`;
+  return send(path, { id, by }, "POST");
+}
+
+/** Address of the table of assets. */
+export function assetsFile() {
+  return new URL(`api/v1/assets.csv${ofSite()}`, document.baseURI).href;
+}
+
+function send(path, value, method = "PUT") {
   const headers = { "content-type": "application/json" };
-  return (await fetchJson(`api/zones${ofSite()}`, { method: "PUT", headers, body })).zones;
+  return fetchJson(path + ofSite(), { method, headers, body: JSON.stringify(value) });
 }
 
 /** Give the survey program all that the user knows; throws an Error that names the field that is wrong. */
 export function putFacts(facts, floor_plan) {
-  const body = JSON.stringify({ facts, floor_plan });
-  const headers = { "content-type": "application/json" };
-  return fetchJson(`api/survey/facts${ofSite()}`, { method: "PUT", headers, body });
+  return send("api/survey/facts", { facts, floor_plan });
 }
 
 /** Have the survey program save the result of a number. */
 export function saveSurvey(serial) {
-  const body = JSON.stringify({ serial });
-  const headers = { "content-type": "application/json" };
-  return fetchJson(`api/survey/save${ofSite()}`, { method: "POST", headers, body });
+  return send("api/survey/save", { serial }, "POST");
 }
 
 /** Store the image of the floor, a PNG or JPEG. @param {Blob} image */

@@ -5,6 +5,7 @@
  */
 
 import { on, select, state } from "./store.js";
+import { isUnseen } from "./alarms/model.js";
 import { Rows, byId, h, text } from "./dom.js";
 import { now_s } from "./clock.js";
 import { LEVELS, shownCondition } from "./condition.js";
@@ -24,7 +25,7 @@ let list = null;
 
 /** Fill the header and the banner, and keep them up to date. */
 export function start() {
-  on(["connection", "mode", "player", "condition", "site"], show);
+  on(["connection", "mode", "player", "condition", "site", "alarms"], show);
   setInterval(() => {
     show();
     if (state.connection.phase !== "lost") text(byId("time"), timeOfDay(now_s()));
@@ -80,7 +81,7 @@ function show() {
   text(byId("condition-more"), further > 0 ? `and ${further} more` : "What to do");
   showList(condition, words);
   say(condition, `${word}. ${words}`);
-  text(document.head.querySelector("title"), `${mark} ${state.site ? `${state.site.name} · ` : ""}Skyless`);
+  text(document.head.querySelector("title"), `${isCritical() ? "✕ Alarm · " : ""}${mark} ${state.site ? `${state.site.name} · ` : ""}Skyless`);
   showBanner();
 }
 
@@ -153,11 +154,16 @@ function showBanner() {
   const banner = byId("banner");
   banner.hidden = !words;
   banner.className = phase === "lost" ? "lost" : "broker";
-  byId("condition-line").hidden = !banner.hidden;
+  // Beside a critical alarm nothing says that all is well.
+  byId("condition-line").hidden = !banner.hidden || (isCritical() && shownCondition().level === "good");
   byId("banner-button").hidden = phase !== "lost";
   text(byId("banner-text"), words);
   text(byId("banner-age"), phase === "lost" ? age(since) : "");
   document.body.classList.toggle("lost", phase === "lost");
+}
+
+function isCritical() {
+  return state.alarms.some((alarm) => alarm.severity === "critical" && isUnseen(alarm));
 }
 
 function lostWords() {

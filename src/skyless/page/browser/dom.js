@@ -26,11 +26,25 @@ export function s(tag, attributes = {}, ...children) {
   return element;
 }
 
+/** A button. */
+export function button(words, onclick, properties = {}) {
+  return h("button", { type: "button", onclick, ...properties }, words);
+}
+
 /** A list of options, pairs of value and words; calls `choose` with the value of the one that is chosen. */
 export function options(properties, pairs, choose) {
   const list = h("select", properties, ...pairs.map(([value, words]) => h("option", { value }, words)));
   list.addEventListener("change", () => choose(list.value));
   return list;
+}
+
+/** Offer other options in a list, pairs of value and words, and choose one; a list of one option is hidden. */
+export function offer(list, pairs, value) {
+  const key = JSON.stringify(pairs);
+  if (list.dataset.offered !== key) list.replaceChildren(...pairs.map(([id, words]) => h("option", { value: id }, words)));
+  list.dataset.offered = key;
+  list.hidden = pairs.length < 2;
+  list.value = pairs.some(([id]) => id === value) ? value : pairs[0][0];
 }
 
 /** Set a node's text where it differs, which avoids needless layout. */

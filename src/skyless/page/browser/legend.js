@@ -2,6 +2,7 @@
 
 import { changed, on, saveSetting, savedSetting, select, state } from "./store.js";
 import { byId, h, options, text, throttle, toast } from "./dom.js";
+import { allGroups, labelOf } from "./assets/model.js";
 import { DELAY_S, GONE_S, GREY_S, stillMotion, tracks } from "./clock.js";
 import { length } from "./format.js";
 import { CONDITIONS, anchorMark, siteMode, wordsOf } from "./map/anchors.js";
@@ -26,7 +27,7 @@ const MASTER = "master: its clock is the site's time";
 /** Fill the legend. */
 export function start() {
   const sections = [
-    ["Tags", tags()],
+    ["Tags", tags(), groups()],
     ["Anchors", marks()],
     ["Layers", ...Object.entries(SWITCHES).map(switchFor), trails(), overlays()],
     ["Floors", ...floorChoice()],
@@ -51,13 +52,13 @@ function tags() {
   let shown = "";
   const show = () => {
     const all = tracks().sorted;
-    const key = JSON.stringify([state.selection.tag, tagStyle(0, all.length), all.map(({ name }) => name)]);
+    const key = JSON.stringify([state.selection.tag, all.map(({ name }, index) => [labelOf(name), tagStyle(index, all.length, name)])]);
     if (key === shown) return;
     shown = key;
-    many.hidden = all.length <= DISTINCT;
+    many.hidden = all.length <= DISTINCT || state.assets.size > 0;
     const rows = all.slice(0, DISTINCT).map(({ name }, index) => {
-      const mark = tagMark(tagStyle(index, all.length));
-      const button = h("button", { type: "button", class: "quiet", onclick: () => select("tag", name) }, mark, name);
+      const mark = tagMark(tagStyle(index, all.length, name));
+      const button = h("button", { type: "button", class: "quiet", onclick: () => select("tag", name) }, mark, labelOf(name));
       button.setAttribute("aria-pressed", String(name === state.selection.tag));
       return h("li", {}, button);
     });
@@ -67,6 +68,23 @@ function tags() {
   on(["tags", "health", "selection", "theme", "mode"], throttle(400, show));
   show();
   return h("div", {}, list, many);
+}
+
+/** The colours of groups; a click shows one group in the list and dims the others on the map. */
+function groups() {
+  const list = h("ul", { class: "tag-marks", "aria-label": "Groups" });
+  on(["assets"], () => {
+    const rows = [...allGroups()].map(([name, { colour }]) => {
+      const pick = () => {
+        state.filter.group = state.filter.group === name ? "" : name;
+        changed("tags");
+      };
+      const mark = tagMark({ colour, shape: "circle" });
+      return h("li", {}, h("button", { type: "button", class: "quiet", onclick: pick }, mark, `group ${name}`));
+    });
+    list.replaceChildren(...rows);
+  });
+  return list;
 }
 
 /** The marks of anchors, with the words of the site's mode. */

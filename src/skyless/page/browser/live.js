@@ -2,6 +2,8 @@
 
 import { changed, healthAge_s, siteOf, state } from "./store.js";
 import { live, now_s, resetOffset, updateOffset } from "./clock.js";
+import { receiveAlarms } from "./alarms/model.js";
+import { foundByAsset, receiveAssets } from "./assets/model.js";
 import { toast } from "./dom.js";
 import { addHealth, clearHistory } from "./history.js";
 import { chosenSite } from "./sites.js";
@@ -123,14 +125,23 @@ function checkConnection() {
 
 /** Send the server what this page shows of a large site, so that it sends that part only. */
 function ask() {
-  const tags = [state.selection.tag, state.followed, ...state.listed.tags].filter((name) => name !== null);
+  const found = state.part ? foundByAsset() : [];
+  const tags = [state.selection.tag, state.followed, ...state.listed.tags, ...found].filter((name) => name !== null);
   const anchors = [state.selection.anchor, ...state.listed.anchors].filter((id) => id !== null).map(String);
   const limit = (names) => [...new Set(names)].slice(0, MAX_NAMED);
-  const wanted = { view: state.seenBox(), find: state.find, tags: limit(tags), anchors: limit(anchors), rows: rowLimit() };
+  const wanted = { view: askedBox(), find: state.find, tags: limit(tags), anchors: limit(anchors), rows: rowLimit() };
   const words = JSON.stringify(wanted);
   if (words === asked || socket.readyState !== WebSocket.OPEN) return;
   asked = words;
   socket.send(words);
+}
+
+/** The part of the site of which tags are asked for: the zone of the filter, or what the map shows. */
+function askedBox() {
+  const zone = state.part && state.zones.find(({ id }) => id === state.filter.zone);
+  if (!zone) return state.seenBox();
+  const [x, y] = [0, 1].map((axis) => zone.polygon_m.map((corner) => corner[axis]));
+  return [Math.min(...x), Math.min(...y), Math.max(...x), Math.max(...y)];
 }
 
 function process(text) {
@@ -160,6 +171,7 @@ const handlers = {
     changed("connection", "events", "log", "condition");
     handlers.sites({ shown: null, sites: [] });
     handlers.zones(message);
+    handlers.alarms({ alarms: [], more: 0 });
     handlers.site(message);
   },
   site(message) {
@@ -223,6 +235,17 @@ const handlers = {
     state.zones = zones;
     changed("zones");
   },
+  assets(message) {
+    receiveAssets(message.assets);
+  },
+  alarm_rules(message) {
+    state.rules = message.rules;
+    state.fileRules = message.file_rules;
+    changed("rules");
+  },
+  alarms(message) {
+    receiveAlarms(message.alarms, message.more);
+  },
   survey(message) {
     receiveSurvey(message.survey, message.age_s);
   },
@@ -267,6 +290,8 @@ function forgetOtherSite() {
     clearHistory();
     state.floorDigest = null;
     state.floorDigests = {};
+    handlers.assets({ assets: [] });
+    handlers.alarm_rules({ rules: [], file_rules: [] });
     changed("tags");
   }
   keptOf = now;

@@ -1,6 +1,7 @@
 /** Puts the page together. */
 
 import { on, state } from "./store.js";
+import * as alarmLine from "./alarm_line.js";
 import * as banner from "./banner.js";
 import * as legend from "./legend.js";
 import * as live from "./live.js";
@@ -31,6 +32,7 @@ legend.start();
 tabs.start();
 replay.start();
 banner.start();
+alarmLine.start();
 partNote.start();
 sites.start();
 summary.start();

@@ -1,9 +1,10 @@
-/** A line on the map that says how many tags are drawn where the server sends a part of them. */
+/** A line on the map that says how many tags are drawn where the server sends a part of them, and whether a filter dims some. */
 
 import { on, state } from "./store.js";
 import { byId, text, throttle } from "./dom.js";
 import { number } from "./format.js";
 import { live } from "./clock.js";
+import { filtering } from "./map/filter.js";
 import { rowLimit } from "./pace.js";
 
 /** Keep the line up to date. */
@@ -12,10 +13,13 @@ export function start() {
 }
 
 function show() {
-  const { part } = state;
-  byId("part").hidden = !part || state.mode !== "live";
-  if (!part) return;
-  const more = part.inside >= rowLimit() ? ": zoom in to see the others" : "";
-  const here = `${number(live.all.size)} of ${number(part.of)} tags are shown`;
-  text(byId("part"), `${here}${more}`);
+  const part = state.mode === "live" ? state.part : null;
+  byId("part").hidden = !part && !filtering();
+  const words = [];
+  if (part) {
+    const more = part.inside >= rowLimit() ? ": zoom in to see the others" : "";
+    words.push(`${number(live.all.size)} of ${number(part.of)} tags are shown${more}`);
+  }
+  if (filtering()) words.push("tags that the list leaves out are faint");
+  text(byId("part"), words.join("; "));
 }

@@ -2,7 +2,7 @@
  * The one state of the page. Modules change it and notify the topics; callbacks run at most once a frame.
  *
  * Topics: connection, site, zones, events, health, tags, mode, player, recordings, selection, options, overlay, editor,
- * theme, survey, watch, setup, picking, plan, placing, condition, log, read, sites.
+ * theme, survey, watch, setup, picking, plan, placing, condition, log, read, sites, assets, alarms, rules.
  */
 
 /** @type {Map<string, Set<() => void>>} */
@@ -61,6 +61,16 @@ export const state = {
   /** What the page asks the server for besides its view: rows in sight in the lists, a search, the followed tag. */
   listed: { tags: [], anchors: [] },
   find: "",
+  /** Group and zone of which the list shows the tags; empty: all. */
+  filter: { group: "", zone: "" },
+  /** What the tags are attached to, by tag. @type {Map<string, any>} */
+  assets: new Map(),
+  /** The live site's alarms, and how many more the server has. @type {any[]} */
+  alarms: [],
+  moreAlarms: 0,
+  /** Rules of alarms: those made on the page, and those of the site file. @type {any[]} */
+  rules: [],
+  fileRules: [],
   /** @type {string|null} */
   followed: null,
   /** @type {any} the newest message of the survey program; `survey/model.js` says how old it is */

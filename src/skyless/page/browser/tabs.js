@@ -3,6 +3,7 @@
 import { changed, on, state } from "./store.js";
 import { byId, h, throttle } from "./dom.js";
 import { picking } from "./survey/picking.js";
+import * as alarms from "./alarms/panel.js";
 import * as anchors from "./panels/anchors.js";
 import * as events from "./panels/events.js";
 import * as recordings from "./panels/recordings.js";
@@ -12,7 +13,7 @@ import * as zones from "./panels/zones.js";
 import * as setup from "./setup/panel.js";
 
 /** Each has a title, the topics that it shows, the interval at which it shows changes, `start(panel)` and `show()`. */
-const TABS = { tags, anchors, events, timing, zones, setup, recordings };
+const TABS = { tags, alarms, anchors, events, timing, zones, setup, recordings };
 const KEYS = Object.keys(TABS);
 const SHEET = ["low", "half", "high"];
 

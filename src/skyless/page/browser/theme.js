@@ -20,11 +20,22 @@ const NAMES = [
   "wall",
 ];
 const TAGS = 8;
+/** Colours of groups: each differs from the others, from grey and from the background. */
+const GROUPS = {
+  light:
+    "#8778e1 #003c00 #87873c #5a0f5a #d2003c #005a87 #2d9696 #693c00 #7800d2 #000096 #0f694b #ff0fc3 " +
+    "#c3784b #874b78 #5a0f0f #5a5a00 #4b87b4 #96001e #b478a5 #965a0f #00964b #005aff #3c3c78 #b400ff",
+  dark:
+    "#9669ff #e1f0a5 #69691e #ffc3ff #4bb4a5 #ff7800 #a54b5a #87f0ff #007896 #3ce100 #78b4f0 #d287b4 " +
+    "#a5a55a #ffc396 #2d8769 #785a96 #a5692d #ff0069 #1e5af0 #ff2dff #c3a5ff #00b400 #5affb4 #e1c300",
+};
+/** A colour that somebody has chosen differs from the map's by at least this in its lightness, of 255. */
+const LIGHTER = 40;
 /** With more tags than this all have one colour and one mark; `map/marks.js` has the marks. */
 export const DISTINCT = 56;
 
-/** Colours by their names in tokens.css, and `tags`, a few distinct hues. @type {any} */
-export const palette = { tags: [] };
+/** Colours by their names in tokens.css, `tags`, a few distinct hues, and `groups`, the colours of groups. @type {any} */
+export const palette = { tags: [], groups: [] };
 
 /** Whether the page is dark. */
 function isDark() {
@@ -54,6 +65,7 @@ function refresh() {
   };
   for (const name of NAMES) palette[name] = resolve(name);
   palette.tags = Array.from({ length: TAGS }, (_, index) => resolve(`tag-${index}`));
+  palette.groups = GROUPS[isDark() ? "dark" : "light"].split(" ").map(rgb);
   byId("theme").setAttribute("aria-label", isDark() ? "Switch to light colours" : "Switch to dark colours");
   changed("theme");
 }
@@ -67,4 +79,18 @@ export function tagColour(index, count) {
 export function faint(colour, alpha) {
   const parts = colour.match(/[\d.]+/g);
   return parts ? `rgba(${parts[0]}, ${parts[1]}, ${parts[2]}, ${alpha})` : colour;
+}
+
+/** A colour `#rrggbb` as the browser writes it. */
+function rgb(hex) {
+  return `rgb(${[1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16)).join(", ")})`;
+}
+
+/** A colour `#rrggbb` as the browser writes it; one that is almost as light as the map is moved towards the text's. */
+export function visible(hex) {
+  if (!/^#[0-9a-f]{6}$/i.test(hex)) return "";
+  const [colour, ground, text] = [rgb(hex), palette.bg, palette.text].map((one) => one.match(/\d+/g).map(Number));
+  const light = ([red, green, blue]) => 0.3 * red + 0.59 * green + 0.11 * blue;
+  if (Math.abs(light(colour) - light(ground)) > LIGHTER) return rgb(hex);
+  return `rgb(${colour.map((part, n) => Math.round((part + text[n]) / 2)).join(", ")})`;
 }

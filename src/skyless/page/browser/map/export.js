@@ -4,6 +4,7 @@ import { state } from "../store.js";
 import { now_s, shown_s, tracks } from "../clock.js";
 import { byId, toast } from "../dom.js";
 import { dateTime, length } from "../format.js";
+import { labelOf } from "../assets/model.js";
 import { palette } from "../theme.js";
 import { ALERT, ALERTS, HEIGHT_GIVEN, HPL, STD, TIME, X, Y, Z } from "../tracks.js";
 import { CONDITIONS, wordsOf } from "./anchors.js";
@@ -114,8 +115,8 @@ function legendEntries() {
   const drawn = new Set(visibleTags().seen.map(({ track }) => track.name));
   const tags = list.flatMap((track, index) => {
     if (!drawn.has(track.name)) return [];
-    const { colour, shape } = tagStyle(index, list.length);
-    return [{ words: track.name, draw: (context, x, y) => drawMark(context, x, y, colour, shape, false) }];
+    const { colour, shape } = tagStyle(index, list.length, track.name);
+    return [{ words: labelOf(track.name), draw: (context, x, y) => drawMark(context, x, y, colour, shape, false) }];
   });
   const anchors = Object.entries(CONDITIONS).map(([kind, { colour, shape }]) => ({
     words: `anchor ${wordsOf(kind)}`,

@@ -2,6 +2,7 @@
 
 import { changed, on, state } from "../store.js";
 import { byId, text, toast } from "../dom.js";
+import { shownName } from "../assets/model.js";
 import { freshness, tracks } from "../clock.js";
 import { X, Y, Z } from "../tracks.js";
 import { pan, toX, toY, view } from "./view.js";
@@ -56,7 +57,7 @@ function describe() {
   if (followed === null) return;
   const track = tracks().all.get(followed);
   const gone = !track || !["fresh", "stale"].includes(freshness(track));
-  text(byId("following-words"), gone ? `Following ${followed}: no fix` : `Following ${followed}`);
+  text(byId("following-words"), gone ? `Following ${shownName(followed)}: no fix` : `Following ${shownName(followed)}`);
 }
 
 /** Connect the button and the bar. */

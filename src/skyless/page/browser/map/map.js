@@ -3,6 +3,7 @@
 import { on, state } from "../store.js";
 import { byId } from "../dom.js";
 import { surveyShown } from "../survey/model.js";
+import { drawAlarms } from "./alarms.js";
 import { drawAnchors } from "./anchors.js";
 import { drawFindings } from "./findings.js";
 import { drawFloor, drawGrid, drawOverlay, drawScale, drawWalls, floorCorners, loadFloor } from "./floor.js";
@@ -56,6 +57,7 @@ function frame() {
     }
     const context = prepare(byId("moving"));
     drawTags(context, now);
+    drawAlarms(context, false);
     drawDraft(context);
     clearTimeout(later);
     if (now.moving) redraw(false);
@@ -81,6 +83,7 @@ function drawStill() {
   drawAnchors(context);
   drawSurvey(context);
   drawFindings(context);
+  drawAlarms(context, true);
   drawScale(context);
   const surveyed = surveyShown() && state.survey.anchors.length > 0;
   byId("waiting").hidden = state.mode === "replay" || state.site !== null || surveyed;
@@ -142,7 +145,7 @@ export function start() {
     if (state.mode === "live") for (const { zone } of fresh) flash(zone);
     flashedMs = performance.now();
   });
-  const still = ["site", "zones", "events", "health", "overlay", "theme", "options", "selection", "mode", "connection", "placing"];
-  on([...still, "survey", "watch", "setup", "plan"], () => redraw(true));
+  const still = ["site", "zones", "events", "health", "overlay", "theme", "options", "selection", "mode", "connection"];
+  on([...still, "survey", "watch", "setup", "plan", "placing", "alarms"], () => redraw(true));
   on(["tags", "editor", "player"], () => redraw(false));
 }

@@ -7,6 +7,7 @@
 
 import { s } from "../dom.js";
 import { on } from "../store.js";
+import { assetLook } from "../assets/model.js";
 import { DISTINCT, palette, tagColour } from "../theme.js";
 import { view } from "./view.js";
 
@@ -29,9 +30,15 @@ const HALF = 9;
 const sprites = new Map();
 on(["theme"], () => sprites.clear());
 
-/** Colour and shape of a tag by its position among all tags in the order of their names. */
-export function tagStyle(index, count) {
-  return { colour: tagColour(index, count), shape: count <= DISTINCT ? NAMES[index % NAMES.length] : "circle" };
+/**
+ * Colour and shape of a tag: the colour of its asset or group, else by its position among all tags in the order of their
+ * names; of many tags the shape is the group's.
+ */
+export function tagStyle(index, count, name = "") {
+  const look = assetLook(name);
+  const few = count <= DISTINCT;
+  const shape = few ? NAMES[index % NAMES.length] : look ? NAMES[look.number % NAMES.length] : "circle";
+  return { colour: look?.colour ?? tagColour(index, count), shape };
 }
 
 /** Draw a mark, filled, or hollow without a fix; it is painted once for each look. */

@@ -3,8 +3,10 @@
 import { GONE_S, freshness, now_s, shown_s, stillMotion, tracks } from "../clock.js";
 import { faint, palette } from "../theme.js";
 import { state } from "../store.js";
+import { labelOf } from "../assets/model.js";
 import { CXX, CXY, CYY, HEIGHT_GIVEN, HPL, TRUE_X, TRUE_Y, X, Y, Z } from "../tracks.js";
 import { DIMMED, drawnAnchors, dropLine, ring } from "./anchors.js";
+import { filtering, passes } from "./filter.js";
 import { otherFloor } from "./floors.js";
 import { drawMark, tagStyle } from "./marks.js";
 import { drawNames } from "./names.js";
@@ -33,6 +35,7 @@ export function visibleTags() {
   const list = tracks().sorted;
   const seen = [];
   const other = otherFloor();
+  const filtered = filtering();
   let moving = false;
   let ageing = false;
   list.forEach((track, index) => {
@@ -47,9 +50,10 @@ export function visibleTags() {
     }
     const [x, y] = [toX(row[X], row[Y]), toY(row[X], row[Y], row[Z])];
     if (!isSeen(x, y, MARGIN) && !selected && track.name !== state.followed) return;
-    const style = tagStyle(index, list.length);
+    const style = tagStyle(index, list.length, track.name);
     const colour = fresh === "fresh" ? style.colour : palette.muted;
-    seen.push({ track, colour, shape: style.shape, fresh, row, selected, other: other(row[Z], floorByZone(row)), x: 0, y: 0 });
+    const dimmed = other(row[Z], floorByZone(row)) || (filtered && !selected && !passes(track.name, row));
+    seen.push({ track, colour, shape: style.shape, fresh, row, selected, other: dimmed, x: 0, y: 0 });
   });
   return { seen, shown, moving, ageing };
 }
@@ -159,7 +163,8 @@ function names(context, seen) {
   for (const { track, row: at, fresh, selected, x, y } of seen) {
     if (seen.length > NAMED && !selected) continue;
     const quiet = fresh === "fresh" || state.connection.phase === "lost";
-    const words = (quiet ? track.name : `${track.name} · no fix`) + (view.spatial ? heightWords(at, selected) : "");
+    const name = labelOf(track.name);
+    const words = (quiet ? name : `${name} · no fix`) + (view.spatial ? heightWords(at, selected) : "");
     wanted.push({ key: track.name, words, x, y, colour: fresh === "fresh" ? palette.text : palette.muted });
   }
   const anchors = wanted.length ? drawnAnchors.map(({ x, y }) => [x - 8, y - 8, x + 8, y + 20]) : [];

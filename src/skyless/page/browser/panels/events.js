@@ -13,6 +13,7 @@ const GROUPS = {
   all: { words: "All", kinds: null },
   severe: { words: "Warnings and faults", kinds: null },
   condition: { words: "Condition", kinds: ["condition"] },
+  alarms: { words: "Alarms", kinds: ["alarm"] },
   anchors: { words: "Anchors", kinds: ["anchor", "master", "watch"] },
   tags: { words: "Tags", kinds: ["tag", "alert"] },
   programs: { words: "Programs and survey", kinds: ["program", "survey"] },
@@ -101,10 +102,10 @@ function makeEvent(_key, { unix_s, level, name, text: only, count }) {
   return { element };
 }
 
-/** The words, as a button where they are about a tag or an anchor of the map. */
+/** The words, as a button where they are about a tag, an anchor or a zone of the map. */
 function subject(name, words) {
   const [kind, id] = [name.slice(0, name.indexOf("/")), name.slice(name.indexOf("/") + 1)];
-  if (kind !== "tag" && kind !== "anchor") return h("span", {}, words);
+  if (!["tag", "anchor", "zone"].includes(kind)) return h("span", {}, words);
   const go = () => select(kind, kind === "anchor" ? Number(id) : id);
   return h("button", { type: "button", class: "name", onclick: go }, words);
 }

@@ -1,12 +1,16 @@
 /** All tags as a list; the selected one in detail, with its last minute as charts. */
 
-import { MAX_AGE_S, healthAge_s, state } from "../store.js";
+import { MAX_AGE_S, changed, healthAge_s, state } from "../store.js";
+import { editAssets } from "../assets/editor.js";
+import { allGroups, labelOf, shownName } from "../assets/model.js";
 import { GONE_S, GREY_S, freshness, now_s, shown_s, tracks } from "../clock.js";
 import { Chart } from "../chart.js";
-import { h, text } from "../dom.js";
+import { h, offer, options, text } from "../dom.js";
 import { DASH, bytes, duration, length, metres, number } from "../format.js";
 import { tagHistory } from "../history.js";
+import { filtering, passes } from "../map/filter.js";
 import { tagMark, tagStyle } from "../map/marks.js";
+import { inside } from "../map/zones.js";
 import {
   ALERT,
   ALERTS,
@@ -31,7 +35,7 @@ import { clockWords, faultWords, isUnverified, verifiedWords } from "./codes.js"
 import { facts, selectionTable, split } from "./parts.js";
 
 export const title = "Tags";
-export const topics = ["tags", "health", "selection", "mode", "player", "theme", "site"];
+export const topics = ["tags", "health", "selection", "mode", "player", "theme", "site", "assets", "zones"];
 export const interval_ms = 300;
 export const changesWithTime = true;
 
@@ -57,67 +61,98 @@ const HEADS = {
   Latency: "From the end of a frame to its fix, half of them",
   Method: "How positions are computed",
 };
-/** With more tags than this there is a search field. */
+/** With more tags than this, or with assets, there is a search field and a choice of groups and zones. */
 const SEARCHED = 12;
 /** With more tags than this the table is brought up to date less often: laying it out costs as much as a frame. */
 const MANY = 40;
 const MANY_MS = 900;
 const WINDOW_S = 60;
 const row = new Float64Array(COLUMNS);
+const byName = new Intl.Collator("en", { numeric: true }).compare;
 let parts = null;
 let shown = { key: "", at: -Infinity };
 
 /** Build the tab. */
 export function start(panel) {
-  const search = h("input", { type: "search", placeholder: "Find a tag", "aria-label": "Find a tag", oninput: show });
+  const search = h("input", { type: "search", placeholder: "Find a tag", "aria-label": "Find a tag", maxLength: 100, oninput: choose });
+  const group = options({ "aria-label": "Group" }, [], choose);
+  const zone = options({ "aria-label": "Zone" }, [], choose);
+  const all = h("button", { type: "button", class: "quiet", onclick: showAll }, "Show all");
+  const filter = h("div", { class: "above filter" }, search, group, zone);
+  const edit = h("button", { type: "button", id: "edit-assets", onclick: () => editAssets() }, "Assets …");
   const table = selectionTable("tag", ["Tag", ...Object.keys(HEADS)], describe);
   Object.values(HEADS).forEach((words, index) => (table.head.cells[index + 2].title = words));
   const empty = h("p", { class: "empty" });
   const count = h("p", { class: "count" });
   const box = h("div", { class: "scroll-x" }, table.element);
   const detail = makeDetail();
-  panel.append(h("div", { class: "above" }, count, search), empty, box, detail.element);
-  parts = { panel, box, search, table, empty, count, detail };
+  panel.append(h("div", { class: "above" }, count, all, edit), filter, empty, box, detail.element);
+  parts = { panel, box, search, group, zone, all, filter, edit, table, empty, count, detail };
+}
+
+/** Take over the filter that the user has set. */
+function choose() {
+  state.find = parts.search.value.trim().toLowerCase();
+  state.filter = { group: parts.group.value, zone: parts.zone.value };
+  changed("tags");
+  show();
+}
+
+function showAll() {
+  for (const part of [parts.search, parts.group, parts.zone]) part.value = "";
+  choose();
 }
 
 /** Bring the tab up to date. */
 export function show() {
   const list = tracks().sorted;
   const all = state.mode === "live" && state.part ? state.part.of : list.length;
-  const searched = all > SEARCHED;
-  const wanted = searched ? parts.search.value.trim().toLowerCase() : "";
-  state.find = wanted;
-  const key = [state.mode, state.selection.tag, wanted, list.length].join(" ");
+  const offered = all > SEARCHED || state.assets.size > 0;
+  if (!offered) parts.search.value = state.find = state.filter.group = state.filter.zone = "";
+  if (state.filter.zone && !state.zones.some(({ id }) => id === state.filter.zone)) state.filter.zone = "";
+  offer(parts.group, [["", "All groups"], ...[...allGroups().keys()].map((name) => [name, name])], state.filter.group);
+  offer(parts.zone, [["", "All zones"], ...state.zones.map(({ id, name }) => [id, name])], state.filter.zone);
+  parts.edit.disabled = state.mode !== "live" || !state.site;
+  parts.filter.hidden = !offered;
+  parts.all.hidden = !filtering();
+  const key = JSON.stringify([state.mode, state.selection.tag, state.find, state.filter, list.length]);
   const now = performance.now();
   if (list.length > MANY && key === shown.key && now - shown.at < MANY_MS) return;
   shown = { key, at: now };
-  parts.search.hidden = !searched;
   parts.table.element.classList.toggle("no-truth", !state.simulated);
-  const items = list.map((track, index) => [track.name, { track, style: tagStyle(index, list.length) }]);
-  const found = items.filter(([name]) => name.toLowerCase().includes(wanted));
+  parts.table.element.classList.toggle("named", state.assets.size > 0);
+  const items = list.map((track, index) => [track.name, { track, style: tagStyle(index, list.length, track.name) }]);
+  const found = filtering() ? items.filter(([name, { track }]) => passes(name, stateOf(track))) : items;
+  if (state.assets.size) found.sort(([a], [b]) => byName(shownName(a), shownName(b)));
   parts.table.rows.show(found);
   parts.table.element.hidden = !found.length;
   parts.empty.hidden = found.length > 0;
-  text(parts.empty, list.length ? "No tag of this name." : "No tags yet.");
+  text(parts.empty, list.length ? "No tag is found." : "No tags yet.");
   const fresh = list.filter((track) => freshness(track) === "fresh").length;
-  text(parts.count, countWords(fresh, list.length, all));
+  text(parts.count, countWords(fresh, list.length, all, filtering() ? found.length : null));
   parts.detail.show(tracks().all.get(state.selection.tag) ?? null);
   split(parts.panel, parts.box, !parts.detail.element.hidden);
 }
 
 /** How many tags have a fix; of a large site also that only a part of them is listed. */
-function countWords(fresh, listed, all) {
+function countWords(fresh, listed, all, found) {
   if (!listed && !all) return "";
+  if (found !== null && listed >= all) return `${found} of ${listed} tags found`;
   if (listed >= all) return `${fresh} of ${listed} with a fix`;
   return `${number(listed)} of ${number(all)} tags: those on the map, ${number(fresh)} with a fix. Find others by name.`;
 }
 
+/** State of a track at the moment that is shown; NaN where there is none. */
+function stateOf(track) {
+  if (!track.at(shown_s(), row, false)) row.fill(NaN);
+  return row;
+}
+
 function describe(name, { track, style: look }) {
   const condition = freshness(track);
-  const known = condition !== "never" && track.at(shown_s(), row, false);
+  stateOf(track);
   const reports = state.mode === "live" && healthAge_s("tags", name) < MAX_AGE_S;
   const health = reports ? state.health.tags.get(name) : null;
-  if (!known) row.fill(NaN);
   const alert = Object.values(ALERTS)[row[ALERT]];
   const unverified = isUnverified(health);
   return {
@@ -125,7 +160,7 @@ function describe(name, { track, style: look }) {
     words: [WORDS[condition], unverified && "not verified", alert?.grade && alert.words].filter(Boolean).join(", "),
     key: `${condition} ${unverified} ${row[ALERT]} ${look.colour} ${look.shape}`,
     mark: () => (condition === "fresh" ? tagMark(look) : h("span", { "aria-hidden": "true" }, MARKS[condition])),
-    name: unverified ? `${name} not verified` : name,
+    name: unverified ? `${labelOf(name)} not verified` : labelOf(name),
     figures: [
       metres(row[X]),
       metres(row[Y]),
@@ -152,7 +187,13 @@ function age_s(track) {
 function makeDetail() {
   const heading = h("h2", {});
   const reason = h("p", { class: "reason", hidden: true });
+  const edit = h("button", { type: "button", class: "quiet", onclick: () => editAssets(state.selection.tag) }, "Edit");
   const list = facts([
+    "Tag",
+    "Group",
+    "Owner",
+    "Notes",
+    "Zones",
     "Position",
     "Height",
     "Velocity",
@@ -184,7 +225,7 @@ function makeDetail() {
   const element = h(
     "section",
     { class: "detail", "aria-label": "Selected tag", tabindex: "0", hidden: true },
-    heading,
+    h("div", { class: "detail-head" }, heading, edit),
     reason,
     list.element,
     ...[errors, sigmas, rates, used, chi2].map((chart) => chart.element),
@@ -212,13 +253,15 @@ function makeDetail() {
     if (!track) return;
     const reports = state.mode === "live" && healthAge_s("tags", track.name) < MAX_AGE_S;
     const health = reports ? state.health.tags.get(track.name) : null;
-    text(heading, track.name);
+    text(heading, labelOf(track.name));
+    edit.hidden = state.mode !== "live";
     reason.hidden = !health?.reason;
     text(reason, health?.reason ? `No fix: ${health.reason.replaceAll("-", " ")}` : "");
     const known = track.at(shown_s(), row, false);
     if (!known) row.fill(NaN);
     const verified = verifiedWords(health, row[VERIFIED_AGE] + age_s(track), row[UNVERIFIED]);
     list.show({
+      ...assetFacts(track.name),
       ...(known ? fixFacts(track) : {}),
       ...(health ? healthFacts(health) : {}),
       Verified: verified?.words,
@@ -230,6 +273,13 @@ function makeDetail() {
     showCharts(track);
   };
   return { element, show: showDetail };
+}
+
+/** What a tag is attached to, and the zones that it is in. */
+function assetFacts(tag) {
+  const { name, group, owner, notes } = state.assets.get(tag) ?? {};
+  const zones = state.zones.filter(({ polygon_m }) => inside(polygon_m, row[X], row[Y])).map((zone) => zone.name);
+  return { Tag: name ? tag : null, Group: group || null, Owner: owner || null, Notes: notes || null, Zones: zones.join(", ") || null };
 }
 
 /** What `row` holds, the state of a track. */

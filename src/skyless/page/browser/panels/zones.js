@@ -1,6 +1,7 @@
 /** Zones: their names, colours and corners; and the tags that entered and left. */
 
 import { select, state, toggleSelection } from "../store.js";
+import { shownName } from "../assets/model.js";
 import { Rows, h, options, text, toast } from "../dom.js";
 import { sentence, timeOfDay } from "../format.js";
 import { add as addZones, change, editor, remove } from "../map/editor.js";
@@ -168,7 +169,7 @@ function makeEvent(_key, event) {
     { class: entered ? "enter" : "leave" },
     h("span", { class: "when" }, timeOfDay(event.unix_s)),
     h("span", { class: "arrow", "aria-hidden": "true" }, entered ? "→" : "←"),
-    h("button", { type: "button", class: "name", onclick: () => select("tag", event.tag) }, event.tag),
+    h("button", { type: "button", class: "name", onclick: () => select("tag", event.tag) }, shownName(event.tag)),
     h("span", {}, ` ${entered ? "entered" : "left"} ${event.name}`),
   );
   return { element };

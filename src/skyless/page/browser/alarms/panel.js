@@ -1,0 +1,110 @@
+/** Alarms: those first that need somebody, who acknowledges them, and the rules that raise them. */
+
+import { state } from "../store.js";
+import { shownName } from "../assets/model.js";
+import { Rows, h, offer, options, text } from "../dom.js";
+import { dateTime, duration, sentence, timeOfDay } from "../format.js";
+import { now_s } from "../clock.js";
+import { SEVERITIES, acknowledgeAll, acknowledger, isActive, isUnseen, keepAcknowledger, selectSubject } from "./model.js";
+import { rulesSection } from "./rules.js";
+
+export const title = "Alarms";
+export const topics = ["alarms", "rules", "zones", "assets", "mode", "connection"];
+export const interval_ms = 100;
+export const changesWithTime = true;
+
+const FILTERS = {
+  "": { words: "All alarms", has: () => true },
+  unseen: { words: "Not acknowledged", has: isUnseen },
+  active: { words: "Active", has: isActive },
+  critical: { words: "Critical", has: ({ severity }) => severity === "critical" },
+};
+let parts = null;
+
+/** Build the tab. */
+export function start(panel) {
+  const count = h("p", { class: "count" });
+  const filter = options({ "aria-label": "Which alarms" }, [], show);
+  const by = h("input", { type: "text", id: "acknowledged-by", maxLength: 60, autocomplete: "name", value: acknowledger() });
+  const fault = h("p", { class: "fault", role: "alert", id: "by-fault", hidden: true });
+  by.setAttribute("aria-describedby", "by-fault");
+  by.addEventListener("change", () => keepAcknowledger(by.value.trim()));
+  const name = h("label", { class: "field by" }, h("span", {}, "Your name, for acknowledging; kept in this browser"), by);
+  const all = h("button", { type: "button", class: "quiet", onclick: () => see(shownAlarms().filter(isUnseen)) });
+  const none = h("p", { class: "empty" });
+  const more = h("p", { class: "fine" });
+  const list = h("ol", { class: "alarms", "aria-label": "Alarms" });
+  const rules = rulesSection();
+  parts = { count, filter, by, fault, all, none, more, name, rows: new Rows(list, makeAlarm), rules };
+  panel.append(h("div", { class: "above" }, count, filter), name, fault, all, none, list, more, rules.element);
+}
+
+/** Bring the tab up to date. */
+export function show() {
+  const rules = [...new Map(state.alarms.map(({ rule, name }) => [`rule ${rule}`, name || rule]))];
+  const filters = Object.entries(FILTERS).map(([key, { words }]) => [key, words]);
+  const pairs = [...filters, ...rules.map(([key, words]) => [key, `Rule: ${words}`])];
+  const { filter } = parts;
+  offer(filter, pairs, filter.value);
+  const alarms = shownAlarms();
+  const unseen = alarms.filter(isUnseen).length;
+  filter.hidden = !state.alarms.length;
+  const [active, open] = [isActive, isUnseen].map((test) => state.alarms.filter(test).length);
+  text(parts.count, state.alarms.length ? `${active} active, ${open} not acknowledged` : "");
+  parts.name.hidden = !state.alarms.length;
+  parts.all.hidden = unseen < 2;
+  text(parts.all, `Acknowledge all ${unseen} shown`);
+  parts.none.hidden = alarms.length > 0;
+  text(parts.none, state.alarms.length ? "No alarm of this kind." : "No alarms.");
+  parts.rows.show(alarms.map((alarm) => [alarm.id, alarm]));
+  text(parts.more, state.moreAlarms ? `${state.moreAlarms} older alarms are not shown.` : "");
+  parts.rules.show();
+}
+
+function shownAlarms() {
+  const chosen = parts.filter.value;
+  const rule = chosen.startsWith("rule ") ? chosen.slice(5) : null;
+  return state.alarms.filter((alarm) => (rule === null ? (FILTERS[chosen]?.has(alarm) ?? true) : alarm.rule === rule));
+}
+
+/** Acknowledge alarms; without a name, ask for it. */
+function see(alarms) {
+  const name = parts.by.value.trim();
+  parts.fault.hidden = name !== "";
+  text(parts.fault, name ? "" : "Type your name first: others see who has acknowledged an alarm.");
+  if (!name) return parts.by.focus();
+  keepAcknowledger(name);
+  return acknowledgeAll(alarms, name);
+}
+
+function makeAlarm(_id, alarm) {
+  let now = alarm;
+  const { mark } = SEVERITIES[alarm.severity];
+  const what = h("button", { type: "button", class: "name", onclick: () => selectSubject(now) }, sentence(alarm.sentence));
+  const about = h("p", { class: "fine" });
+  const seen = h("button", { type: "button", onclick: () => see([now]) }, "Acknowledge");
+  seen.setAttribute("aria-label", `Acknowledge: ${alarm.sentence}`);
+  const icon = h("span", { class: "log-mark", "aria-hidden": "true" }, mark);
+  const element = h("li", {}, icon, h("div", {}, h("span", { class: "unseen" }, `${alarm.severity}: `), what, about), seen);
+  const update = (next) => {
+    now = next;
+    const state = isActive(next) ? "active" : "ended";
+    element.className = `${next.severity} ${state}${isUnseen(next) ? " open" : ""}`;
+    text(about, aboutWords(next));
+    about.title = dateTime(next.since_unix_s);
+    seen.hidden = !isUnseen(next);
+  };
+  return { element, update };
+}
+
+function aboutWords(alarm) {
+  const { since_unix_s, ended_unix_s, acknowledged_by, place, rule, name, tags } = alarm;
+  const lasts = duration(Math.max(0, (isActive(alarm) ? now_s() : ended_unix_s) - since_unix_s), 1);
+  return [
+    isActive(alarm) ? `Active since ${timeOfDay(since_unix_s)}, ${lasts}` : `Ended ${timeOfDay(ended_unix_s)} after ${lasts}`,
+    place,
+    tags?.map(shownName).join(", "),
+    `rule ${name || rule}`,
+    isUnseen(alarm) ? "" : `acknowledged by ${acknowledged_by || "somebody"}`,
+  ].filter(Boolean).join(" · ");
+}
