@@ -12,6 +12,7 @@ import threading
 import time
 from pathlib import Path
 
+import page_fake_history
 import page_fake_site as made_up
 import uvicorn
 from starlette.applications import Starlette
@@ -60,6 +61,11 @@ class FakeServer:
         self.recorded_site = True
         self.recorded_waits = False
         self.events_note = False
+        self.history = False
+        self.history_error = None
+        self.history_waits = set()
+        """Kinds of questions that are not answered now; and all that were asked, kinds with queries."""
+        self.history_asked = []
         self.site_name = "Hall 7"
         self.zone_events = []
         self.started = time.time()
@@ -179,6 +185,17 @@ class FakeServer:
                 await asyncio.sleep(0.02)
             return JSONResponse({"states": _recorded(float(query["from_s"]), float(query["to_s"]), query["rate_hz"])})
 
+        async def history(request):
+            kind, query = request.path_params["kind"], dict(request.query_params)
+            self.history_asked.append((kind, query))
+            while kind in self.history_waits and not await request.is_disconnected():
+                await asyncio.sleep(0.02)
+            if not self.history or self.history_error:
+                error = self.history_error or "this server keeps no history"
+                return JSONResponse({"error": error}, status_code=422 if self.history else 404)
+            found, status = page_fake_history.answer(kind, query)
+            return JSONResponse(found, status_code=status)
+
         return Starlette(
             routes=[
                 Route("/", index),
@@ -194,6 +211,7 @@ class FakeServer:
                 Route("/api/recordings/{name}/file", file),
                 Route("/api/recordings/{name}/states", states),
                 Route("/api/recordings/{name}/floor_plan", recorded_plan),
+                Route("/api/v1/history/{kind}", history),
                 WebSocketRoute("/live", self._live),
                 Mount("/page", _Modules(directory=PAGE)),
             ]
@@ -226,7 +244,7 @@ class FakeServer:
         site = made_up.site_message(self.started, plan, self.mode, self.placed) if self.site else None
         if site:
             site["site"]["name"] = self.site_name
-        more = {"zones": self.zones, "events": self.zone_events, "mqtt": True}
+        more = {"zones": self.zones, "events": self.zone_events, "mqtt": True, "history": self.history}
         return {"type": "hello", "version": "0.1.0", "site": site, **more}
 
     async def _states(self, websocket, lock):

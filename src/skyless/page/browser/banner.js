@@ -24,7 +24,7 @@ let list = null;
 
 /** Fill the header and the banner, and keep them up to date. */
 export function start() {
-  on(["connection", "mode", "player", "condition", "site"], show);
+  on(["connection", "mode", "player", "condition", "site", "past"], show);
   setInterval(() => {
     show();
     if (state.connection.phase !== "lost") text(byId("time"), timeOfDay(now_s()));
@@ -143,6 +143,7 @@ function makeFigure(name) {
 function statement({ level, text: words }, word) {
   if (level === "good") return "All is well: nothing speaks against the positions shown.";
   if (level === "replay") return "A recording is shown, not the live site.";
+  if (level === "past") return "The map shows the past; nothing speaks against the live positions.";
   return sentence(words || word);
 }
 

@@ -5,6 +5,7 @@ import * as banner from "./banner.js";
 import * as legend from "./legend.js";
 import * as live from "./live.js";
 import * as map from "./map/map.js";
+import * as pastBar from "./past_bar.js";
 import * as partNote from "./part_note.js";
 import * as replay from "./replay_bar.js";
 import * as sites from "./sites.js";
@@ -30,6 +31,7 @@ tabs.start();
 replay.start();
 banner.start();
 partNote.start();
+pastBar.start();
 sites.start();
 summary.start();
 on(["site"], () => {

@@ -9,6 +9,7 @@ import { drawFloor, drawGrid, drawOverlay, drawScale, drawWalls, floorCorners, l
 import { groundHeight } from "./floors.js";
 import { centre } from "./follow.js";
 import { listen } from "./input.js";
+import { drawHeat, drawMoment, drawWay } from "./past.js";
 import { drawRoom, fillRoom } from "./room.js";
 import { drawGround, spaceCorners } from "./space.js";
 import { drawSurvey, surveyCorners, surveyOutOfSight } from "./survey.js";
@@ -26,6 +27,7 @@ let scheduled = false;
 let trailsDrawn = 0;
 let later = 0;
 let flashedMs = 0;
+let pastDrawn = false;
 
 /** Draw in the next frame: everything, or only what moves. */
 export function redraw(still = true) {
@@ -57,6 +59,8 @@ function frame() {
     const context = prepare(byId("moving"));
     drawTags(context, now);
     drawDraft(context);
+    if (state.past || pastDrawn) drawMoment(prepare(byId("moment")));
+    pastDrawn = state.past !== null;
     clearTimeout(later);
     if (now.moving) redraw(false);
     else if (now.ageing) later = setTimeout(redraw, 250, false);
@@ -73,6 +77,7 @@ function drawStill() {
   drawFloor(context);
   fillRoom(context, floorCorners(), ground_m);
   drawOverlay(context);
+  drawHeat(context);
   if (view.spatial) drawGround(context, floorCorners());
   else drawGrid(context);
   const flashes = drawZones(context);
@@ -81,6 +86,7 @@ function drawStill() {
   drawAnchors(context);
   drawSurvey(context);
   drawFindings(context);
+  drawWay(context);
   drawScale(context);
   const surveyed = surveyShown() && state.survey.anchors.length > 0;
   byId("waiting").hidden = state.mode === "replay" || state.site !== null || surveyed;
@@ -91,7 +97,7 @@ function drawStill() {
 export function fitAll() {
   const corners = [...floorCorners(), ...surveyCorners()];
   const further = view.spatial ? [...corners, ...spaceCorners(floorCorners())] : corners;
-  fit(state.site, state.zones, further, state.options.overlay !== "none", state.mode === "replay");
+  fit(state.site, state.zones, further, state.options.overlay !== "none", state.mode === "replay" || state.past !== null);
   redraw();
 }
 
@@ -128,6 +134,7 @@ export function start() {
     if (overlay !== state.options.overlay && !view.touched) fitAll();
     overlay = state.options.overlay;
   });
+  on(["past"], () => !view.touched && fitAll());
   let surveyed = "";
   on(["survey", "setup"], () => {
     if (view.spatial && surveyShown()) showSpatial(false);
@@ -138,10 +145,10 @@ export function start() {
   });
   on(["events"], () => {
     const fresh = state.events.filter(({ cameMs }) => cameMs > flashedMs);
-    if (state.mode === "live") for (const { zone } of fresh) flash(zone);
+    if (state.mode === "live" && !state.past) for (const { zone } of fresh) flash(zone);
     flashedMs = performance.now();
   });
   const still = ["site", "zones", "events", "health", "overlay", "theme", "options", "selection", "mode", "connection"];
-  on([...still, "survey", "watch", "setup", "plan"], () => redraw(true));
-  on(["tags", "editor", "player"], () => redraw(false));
+  on([...still, "survey", "watch", "setup", "plan", "past"], () => redraw(true));
+  on(["tags", "editor", "player", "moment"], () => redraw(false));
 }
