@@ -131,7 +131,7 @@ def test_the_way_of_a_tag_is_shown_and_played(kept):
     page.click("#past-end")
     page.locator("#past-mark").wait_for(state="hidden")
     assert page.locator("#pill").inner_text() != "Past"
-    assert pixels(page, "still") == before
+    assert abs(pixels(page, "still") - before) < 100
     assert shown.position("forklift") is not None
 
 

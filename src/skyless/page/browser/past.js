@@ -4,8 +4,8 @@ import { changed, on, state } from "./store.js";
 
 /** Speeds, multiples of real time. */
 export const SPEEDS = [1, 4, 16, 60, 300, 1000];
-/** Points are joined up to this time, or a multiple of their usual distance in time: answers may be thinned. */
-const MIN_GAP_S = 2;
+/** Points are joined up to this time, as in the server's answers, or a multiple of their usual step: ways are thinned. */
+const MIN_GAP_S = 15;
 const GAP_STEPS = 3;
 
 let lastFrame = 0;
