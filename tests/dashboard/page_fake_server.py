@@ -5,6 +5,7 @@ By hand: ``PYTHONPATH=tests .venv/bin/python tests/dashboard/page_fake_server.py
 
 import asyncio
 import contextlib
+import json
 import mimetypes
 import socket
 import sys
@@ -61,6 +62,8 @@ class FakeServer:
         self.recorded_site = True
         self.recorded_waits = False
         self.events_note = False
+        self.live2 = None
+        """Answers what a page says on the stream of very many tags; without it there is no such stream."""
         self.history = False
         self.history_error = None
         self.history_waits = set()
@@ -213,6 +216,7 @@ class FakeServer:
                 Route("/api/recordings/{name}/floor_plan", recorded_plan),
                 Route("/api/v1/history/{kind}", history),
                 WebSocketRoute("/live", self._live),
+                WebSocketRoute("/live2", self._live2),
                 Mount("/page", _Modules(directory=PAGE)),
             ]
         )
@@ -239,12 +243,26 @@ class FakeServer:
         self.sockets.pop(websocket, None)
         return None
 
+    async def _live2(self, websocket):
+        await websocket.accept()
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            while True:
+                asked = json.loads(await websocket.receive_text())
+                for message in self.live2(asked):
+                    await websocket.send_bytes(message)
+
     def _hello(self):
         plan = PLAN if self.floor_plan else None
         site = made_up.site_message(self.started, plan, self.mode, self.placed) if self.site else None
         if site:
             site["site"]["name"] = self.site_name
-        more = {"zones": self.zones, "events": self.zone_events, "mqtt": True, "history": self.history}
+        more = {
+            "zones": self.zones,
+            "events": self.zone_events,
+            "mqtt": True,
+            "history": self.history,
+            "live2": self.live2 is not None,
+        }
         return {"type": "hello", "version": "0.1.0", "site": site, **more}
 
     async def _states(self, websocket, lock):

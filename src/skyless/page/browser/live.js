@@ -158,6 +158,7 @@ const handlers = {
     state.log = [];
     state.condition = null;
     state.history = message.history === true;
+    state.live2 = message.live2 === true;
     changed("connection", "events", "log", "condition");
     handlers.sites({ shown: null, sites: [] });
     handlers.zones(message);

@@ -4,6 +4,7 @@ import { on, state } from "./store.js";
 import { byId, text, throttle } from "./dom.js";
 import { number } from "./format.js";
 import { live } from "./clock.js";
+import { manyShown } from "./map/many.js";
 import { rowLimit } from "./pace.js";
 
 /** Keep the line up to date. */
@@ -12,10 +13,18 @@ export function start() {
 }
 
 function show() {
+  if (manyShown()) return showMany(state.many);
   const { part } = state;
   byId("part").hidden = !part || state.mode !== "live";
   if (!part) return;
   const more = part.inside >= rowLimit() ? ": zoom in to see the others" : "";
   const here = `${number(live.all.size)} of ${number(part.of)} tags are shown`;
   text(byId("part"), `${here}${more}`);
+}
+
+/** All tags in sight, as points or as counts. */
+function showMany({ kind, count }) {
+  byId("part").hidden = false;
+  const how = kind === "B" ? " tags, shown as counts: zoom in to see single ones" : " tags are shown as points";
+  text(byId("part"), `${number(count)}${how}`);
 }

@@ -77,6 +77,10 @@ export const state = {
   player: null,
   /** Whether the server keeps a history; null until it has said so. @type {boolean|null} */
   history: null,
+  /** Whether the server streams all tags of a large site in binary, and the newest message with its view, see `map/many.js`. */
+  live2: false,
+  /** @type {any} */
+  many: null,
   /** @type {any} the way or the heat map that the map shows instead of the present, see `past.js` */
   past: null,
   selection: { tag: null, anchor: null, zone: null },

@@ -10,6 +10,7 @@ import { groundHeight } from "./floors.js";
 import { centre } from "./follow.js";
 import { listen } from "./input.js";
 import { drawHeat, drawMoment, drawWay } from "./past.js";
+import { drawMany, manyShown, start as startMany } from "./many.js";
 import { drawRoom, fillRoom } from "./room.js";
 import { drawGround, spaceCorners } from "./space.js";
 import { drawSurvey, surveyCorners, surveyOutOfSight } from "./survey.js";
@@ -57,6 +58,7 @@ function frame() {
       if (state.options.trails) drawTrails(context, richOf(now.seen), now.shown, state.options.trails);
     }
     const context = prepare(byId("moving"));
+    drawMany(context);
     drawTags(context, now);
     drawDraft(context);
     if (state.past || pastDrawn) drawMoment(prepare(byId("moment")));
@@ -68,7 +70,7 @@ function frame() {
 }
 
 function richOf(seen) {
-  return seen.length <= RICH ? seen : seen.filter(({ selected }) => selected);
+  return seen.length <= RICH && !manyShown() ? seen : seen.filter(({ selected }) => selected);
 }
 
 function drawStill() {
@@ -113,6 +115,7 @@ export function showSpatial(spatial) {
 export function start() {
   const box = byId("map");
   state.seenBox = seenBox;
+  startMany();
   new ResizeObserver(() => {
     view.width = box.clientWidth;
     view.height = box.clientHeight;
