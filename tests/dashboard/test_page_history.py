@@ -76,7 +76,21 @@ def test_the_way_of_a_tag_is_shown_and_played(kept):
     server, shown = kept
     page = shown.page
     before = pixels(page, "still")
+    page.click("#history-alarms")
+    page.wait_for_selector("#history-result table")
+    page.fill("#history-tag", "forklift")
+    page.keyboard.press("Enter")  # asks for the alarms again
+    page.click("#history-way")
+    page.wait_for_selector("#history-result dl")
+    page.fill("#history-tag", "trolley")
+    page.keyboard.press("Enter")
+    until(page, "skyless.state.past?.track.tag === 'trolley'")
+    asked = len(server.history_asked)
+    page.focus("#past-slider")
+    page.evaluate(THREE_FRAMES)
+    assert len(server.history_asked) == asked, "a field that loses the focus asks for nothing"
     ask(page, "way", "forklift")
+    until(page, "skyless.state.past?.track.tag === 'forklift'")
     past = "skyless.state.past"
     assert page.evaluate(f"{past}.track.tag") == "forklift"
     assert pixels(page, "still") > before + 500

@@ -24,7 +24,7 @@ export function start() {
   const spans = h("div", { class: "spans", "aria-hidden": "true" });
   const time = h("output", { id: "past-time" });
   const speed = options({ id: "past-speed", "aria-label": "Speed" }, SPEEDS.map((value) => [value, `${value} ×`]), (value) => setPast({ speed: Number(value) })); // prettier-ignore
-  const pairs = [["time", "Coloured by time"], ["speed", "Coloured by speed"]]; // prettier-ignore
+  const pairs = [["time", "Colour: time"], ["speed", "Colour: speed"]]; // prettier-ignore
   const colours = options({ id: "past-colours", "aria-label": "Colours of the way" }, pairs, (value) => setPast({ colours: value })); // prettier-ignore
   const way = [play, h("div", { class: "along" }, h("div", { class: "timeline" }, slider, spans), time), speed];
   const words = h("span", { id: "past-scale" });

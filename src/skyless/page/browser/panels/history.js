@@ -31,6 +31,8 @@ let site = null;
 /** @type {string[]|null} names of the tags in the history; null: not asked for yet */
 let tags = null;
 let typing = 0;
+/** The fields as they were asked for last; "" without an answer. */
+let askedFields = "";
 
 /** Build the tab. */
 export function start(panel) {
@@ -88,7 +90,7 @@ export function show() {
       ? "Waiting for the server …"
       : state.history
         ? ""
-        : "This server keeps no history. `skyless dashboard --history FOLDER` starts one that does: it stores the positions and events of the site in that folder, and this tab shows them.";
+        : "This server has no history. `skyless history run --to FOLDER` stores the positions and events of the site, and `skyless dashboard --history FOLDER` shows them here.";
   text(parts.nothing, words);
   parts.nothing.hidden = !words;
   parts.back.hidden = live;
@@ -164,20 +166,26 @@ function chosenSpan() {
   return { from_unix_s, to_unix_s };
 }
 
+function fields() {
+  return JSON.stringify([parts.tag, parts.from, parts.to, parts.zone].map(({ value }) => value));
+}
+
 function typed() {
+  if (fields() === askedFields) return;
   abandon();
   clearTimeout(typing);
   typing = setTimeout(again, TYPING_MS);
 }
 
-/** Ask the same of another tag or range. */
+/** Ask the same of another tag or range; a field that loses the focus after Enter has changed nothing. */
 function again() {
-  if (kind) ask(kind);
+  if (kind && fields() !== askedFields) ask(kind);
 }
 
 /** End the question that is under way, and show no answer. */
 function abandon() {
   serial++;
+  askedFields = "";
   clearTimeout(typing);
   asking.abort();
   endPast();
@@ -203,6 +211,7 @@ async function ask(key) {
   for (const button of parts.buttons) button.setAttribute("aria-pressed", String(button.id === `history-${key}`));
   parts.zones.hidden = !KINDS[key].zone;
   setRange();
+  askedFields = fields();
   const begun = performance.now();
   const progress = setInterval(() => mine === serial && showProgress(begun, mine), PATIENCE_MS);
   try {
