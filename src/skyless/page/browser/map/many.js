@@ -4,7 +4,7 @@
  * Positions are shares of the view that was asked for; kept in metres, they follow a map that is moved meanwhile.
  */
 
-import { changed, on, state } from "../store.js";
+import { changed, state } from "../store.js";
 import { GONE_S, GREY_S, now_s } from "../clock.js";
 import { palette } from "../theme.js";
 import { groundHeight } from "./floors.js";
@@ -24,6 +24,8 @@ const SIDE = 4;
 
 /** @type {WebSocket|null} */
 let socket = null;
+/** The site that it is about. @type {number|null} */
+let site = null;
 let asked = "";
 let askedMs = 0;
 /** The view that is asked for, and the server's time from which messages are of it. */
@@ -143,7 +145,7 @@ function drawCounts(context, many) {
 }
 
 function look() {
-  if (!state.live2 || state.connection.phase !== "open") return end();
+  if (!state.live2 || state.connection.phase !== "open" || (socket && site !== state.liveId)) return end();
   if (!socket) return connect();
   const seen = state.mode === "live" ? state.seenBox() : null;
   if (!seen || socket.readyState !== WebSocket.OPEN) return;
@@ -158,7 +160,8 @@ function look() {
 
 function connect() {
   const address = new URL("live2", document.baseURI);
-  if (state.liveId !== null) address.searchParams.set("site", String(state.liveId));
+  site = state.liveId;
+  if (site !== null) address.searchParams.set("site", String(site));
   address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
   const mine = (socket = new WebSocket(address));
   mine.binaryType = "arraybuffer";
@@ -177,10 +180,5 @@ function end() {
 
 /** Connect where the server says that it has the stream. */
 export function start() {
-  let site = state.liveId;
-  on(["connection", "site"], () => {
-    if (site !== state.liveId) end();
-    site = state.liveId;
-  });
   setInterval(look, LOOK_MS);
 }
