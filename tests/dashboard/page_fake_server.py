@@ -13,6 +13,7 @@ import threading
 import time
 from pathlib import Path
 
+import page_fake_history
 import page_fake_site as made_up
 import uvicorn
 from starlette.applications import Starlette
@@ -62,6 +63,13 @@ class FakeServer:
         self.recorded_site = True
         self.recorded_waits = False
         self.events_note = False
+        self.live2 = None
+        """Answers what a page says on the stream of very many tags; without it there is no such stream."""
+        self.history = False
+        self.history_error = None
+        self.history_waits = set()
+        """Kinds of questions that are not answered now; and all that were asked, kinds with queries."""
+        self.history_asked = []
         self.site_name = "Hall 7"
         self.zone_events = []
         self.assets, self.rules, self.file_rules, self.alarms = [], [], [], []
@@ -225,6 +233,17 @@ class FakeServer:
                 await asyncio.sleep(0.02)
             return JSONResponse({"states": _recorded(float(query["from_s"]), float(query["to_s"]), query["rate_hz"])})
 
+        async def history(request):
+            kind, query = request.path_params["kind"], dict(request.query_params)
+            self.history_asked.append((kind, query))
+            while kind in self.history_waits and not await request.is_disconnected():
+                await asyncio.sleep(0.02)
+            if not self.history or self.history_error:
+                error = self.history_error or "this server keeps no history"
+                return JSONResponse({"error": error}, status_code=422 if self.history else 404)
+            found, status = page_fake_history.answer(kind, query)
+            return JSONResponse(found, status_code=status)
+
         return Starlette(
             routes=[
                 Route("/", index),
@@ -247,7 +266,9 @@ class FakeServer:
                 Route("/api/recordings/{name}/file", file),
                 Route("/api/recordings/{name}/states", states),
                 Route("/api/recordings/{name}/floor_plan", recorded_plan),
+                Route("/api/v1/history/{kind}", history),
                 WebSocketRoute("/live", self._live),
+                WebSocketRoute("/live2", self._live2),
                 Mount("/page", _Modules(directory=PAGE)),
             ]
         )
@@ -289,12 +310,26 @@ class FakeServer:
         for message in self.site_messages():
             self.send(message)
 
+    async def _live2(self, websocket):
+        await websocket.accept()
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            while True:
+                asked = json.loads(await websocket.receive_text())
+                for message in self.live2(asked):
+                    await websocket.send_bytes(message)
+
     def _hello(self):
         plan = PLAN if self.floor_plan else None
         site = made_up.site_message(self.started, plan, self.mode, self.placed) if self.site else None
         if site:
             site["site"]["name"] = self.site_name
-        more = {"zones": self.zones, "events": self.zone_events, "mqtt": True}
+        more = {
+            "zones": self.zones,
+            "events": self.zone_events,
+            "mqtt": True,
+            "history": self.history,
+            "live2": self.live2 is not None,
+        }
         return {"type": "hello", "version": "0.1.0", "site": site, **more}
 
     async def _states(self, websocket, lock):

@@ -132,6 +132,11 @@ export async function recordedStates(name, from_s, to_s, rate_hz) {
   return (await fetchJson(`api/recordings/${encodeURIComponent(name)}/states?${query}`)).states;
 }
 
+/** An answer of the history; `kind` is the end of its address. @param {AbortSignal} signal */
+export function history(kind, query, signal) {
+  return fetchJson(`api/v1/history/${kind}${ofSite(String(new URLSearchParams(query)))}`, { signal });
+}
+
 /** The packets of one tag from a time on, for the page to recompute them. */
 export function whatIf(name, tag, from_s, seconds) {
   const query = `tag=${encodeURIComponent(tag)}&from_s=${from_s.toFixed(3)}&seconds=${seconds}`;

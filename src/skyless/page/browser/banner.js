@@ -25,7 +25,7 @@ let list = null;
 
 /** Fill the header and the banner, and keep them up to date. */
 export function start() {
-  on(["connection", "mode", "player", "condition", "site", "alarms"], show);
+  on(["connection", "mode", "player", "condition", "site", "alarms", "past"], show);
   setInterval(() => {
     show();
     if (state.connection.phase !== "lost") text(byId("time"), timeOfDay(now_s()));
@@ -144,6 +144,7 @@ function makeFigure(name) {
 function statement({ level, text: words }, word) {
   if (level === "good") return "All is well: nothing speaks against the positions shown.";
   if (level === "replay") return "A recording is shown, not the live site.";
+  if (level === "past") return "The map shows the past; nothing speaks against the live positions.";
   return sentence(words || word);
 }
 

@@ -16,6 +16,7 @@ export const LEVELS = {
   waiting: { word: "Waiting", mark: "○" },
   lost: { word: "Disconnected", mark: "✕" },
   replay: { word: "Replay", mark: "▶" },
+  past: { word: "Past", mark: "▶" },
   connecting: { word: "Connecting", mark: "○" },
 };
 
@@ -28,6 +29,11 @@ export function shownCondition() {
   if (phase === "lost") return { level: "lost", text: "", reasons: [lostReason(reason)] };
   if (state.mode === "replay") return { level: "replay", text: "", reasons: [] };
   if (phase !== "open") return { level: "connecting", text: "", reasons: [] };
+  const condition = present();
+  return state.past && condition.level === "good" ? { level: "past", text: "", reasons: [] } : condition;
+}
+
+function present() {
   const stall = stall_s();
   if (stall) return withWarning(judged(), slowReason(stall));
   const behind = behind_s();

@@ -168,6 +168,8 @@ const handlers = {
     state.events = [...(message.events ?? [])].sort((a, b) => b.unix_s - a.unix_s);
     state.log = [];
     state.condition = null;
+    state.history = message.history === true;
+    state.live2 = message.live2 === true;
     changed("connection", "events", "log", "condition");
     handlers.sites({ shown: null, sites: [] });
     handlers.zones(message);

@@ -7,6 +7,7 @@ import * as legend from "./legend.js";
 import * as live from "./live.js";
 import * as map from "./map/map.js";
 import * as placing from "./map/placing.js";
+import * as pastBar from "./past_bar.js";
 import * as partNote from "./part_note.js";
 import * as replay from "./replay_bar.js";
 import * as sites from "./sites.js";
@@ -34,6 +35,7 @@ replay.start();
 banner.start();
 alarmLine.start();
 partNote.start();
+pastBar.start();
 sites.start();
 summary.start();
 on(["site"], () => {

@@ -5,6 +5,7 @@ import { byId, text, throttle } from "./dom.js";
 import { number } from "./format.js";
 import { live } from "./clock.js";
 import { filtering } from "./map/filter.js";
+import { manyShown } from "./map/many.js";
 import { rowLimit } from "./pace.js";
 
 /** Keep the line up to date. */
@@ -13,6 +14,7 @@ export function start() {
 }
 
 function show() {
+  if (manyShown()) return showMany(state.many);
   const part = state.mode === "live" ? state.part : null;
   byId("part").hidden = !part && !filtering();
   const words = [];
@@ -22,4 +24,11 @@ function show() {
   }
   if (filtering()) words.push("tags that the list leaves out are faint");
   text(byId("part"), words.join("; "));
+}
+
+/** All tags in sight, as points or as counts. */
+function showMany({ kind, count }) {
+  byId("part").hidden = false;
+  const how = kind === "B" ? " tags, shown as counts: zoom in to see single ones" : " tags are shown as points";
+  text(byId("part"), `${number(count)}${how}`);
 }

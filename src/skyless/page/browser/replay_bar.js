@@ -7,7 +7,8 @@ import { whatIfButton } from "./what_if.js";
 import { clock, dateTime } from "./format.js";
 import { SPEEDS, STEP_S, close, markedEvents, seek, seekEvent, setSpeed, step, stepEvent, stepSpeed, toggle } from "./player.js";
 
-const ICONS = {
+/** Pictures of buttons, as paths. */
+export const ICONS = {
   play: "M7 4.5v15l12-7.5z",
   pause: "M7 5h3.5v14H7zM13.5 5H17v14h-3.5z",
   back: "M18 5v14L9 12zM6 5h2.5v14H6z",
@@ -105,7 +106,8 @@ function loading(player) {
   return player.waiting ? " · loading" : player.events === null ? " · reading events" : "";
 }
 
-function iconButton(properties, path) {
+/** A button with a picture. */
+export function iconButton(properties, path) {
   const picture = s("svg", { viewBox: "0 0 24 24", class: "solid", "aria-hidden": "true" }, path);
   return h("button", { type: "button", class: "icon", ...properties }, picture);
 }
@@ -121,8 +123,8 @@ function along(player, at_s) {
   return `calc(8px + ${share.toFixed(5)} * (100% - 16px))`;
 }
 
-/** When there are fixes. */
-function showSpans(box, player) {
+/** Show when there are fixes. */
+export function showSpans(box, player) {
   const made = player.fixes.map(([from, to]) => {
     const span = h("i", {});
     span.style.left = along(player, from);

@@ -6,6 +6,7 @@ import { picking } from "./survey/picking.js";
 import * as alarms from "./alarms/panel.js";
 import * as anchors from "./panels/anchors.js";
 import * as events from "./panels/events.js";
+import * as history from "./panels/history.js";
 import * as recordings from "./panels/recordings.js";
 import * as tags from "./panels/tags.js";
 import * as timing from "./panels/timing.js";
@@ -13,12 +14,13 @@ import * as zones from "./panels/zones.js";
 import * as setup from "./setup/panel.js";
 
 /** Each has a title, the topics that it shows, the interval at which it shows changes, `start(panel)` and `show()`. */
-const TABS = { tags, alarms, anchors, events, timing, zones, setup, recordings };
+const TABS = { tags, alarms, anchors, events, timing, zones, setup, history, recordings };
 const KEYS = Object.keys(TABS);
 const SHEET = ["low", "half", "high"];
 
 let current = "tags";
 let offered = false;
+let notLive = false;
 
 /** Build the panel. */
 export function start() {
@@ -42,7 +44,7 @@ export function start() {
   on(["site"], openWhereNothingIsPlaced);
   on(["picking"], () => picking && matchMedia("(max-width: 760px)").matches && sheet("half"));
   setInterval(() => TABS[current].changesWithTime && show(), 1000);
-  on(["mode"], () => state.mode === "replay" && matchMedia("(max-width: 760px)").matches && sheet("low"));
+  on(["mode", "past"], showMap);
   on(["selection"], () => {
     const { tag, anchor, zone } = state.selection;
     if (tag !== null && current !== "timing") open("tags");
@@ -66,6 +68,13 @@ function showUnread() {
   if (button.dataset.unread === String(count)) return;
   button.dataset.unread = String(count);
   button.replaceChildren(events.title, ...(count ? [" ", h("span", { class: "unread" }, String(count), words)] : []));
+}
+
+/** On a phone the sheet makes room where the map begins to show a recording or the past. */
+function showMap() {
+  const now = state.mode === "replay" || state.past !== null;
+  if (now && !notLive && matchMedia("(max-width: 760px)").matches) sheet("low");
+  notLive = now;
 }
 
 /** Bring the open tab up to date, if it is visible. */

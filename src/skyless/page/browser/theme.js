@@ -38,7 +38,7 @@ export const DISTINCT = 56;
 export const palette = { tags: [], groups: [] };
 
 /** Whether the page is dark. */
-function isDark() {
+export function isDark() {
   const chosen = document.documentElement.dataset.theme;
   return chosen ? chosen === "dark" : system.matches;
 }

@@ -75,7 +75,7 @@ export function mapPicture() {
   context.fillRect(0, 0, view.width, height);
   context.fillStyle = palette.bg;
   context.fillRect(0, HEAD, view.width, view.height);
-  for (const id of ["still", "trails", "moving"]) context.drawImage(byId(id), 0, HEAD, view.width, view.height);
+  for (const id of state.past ? ["still", "moment"] : ["still", "trails", "moving"]) context.drawImage(byId(id), 0, HEAD, view.width, view.height);
 
   context.fillStyle = palette.text;
   context.textBaseline = "middle";
@@ -103,6 +103,7 @@ export function mapPicture() {
 
 /** Of what the picture is, and of when; without a connection it shows the state at the loss. */
 function pictured() {
+  if (state.past) return { kind: `the past: ${state.past.title}`, unix_s: state.past.at_s ?? state.past.span.from_unix_s };
   if (state.mode === "replay") return { kind: `recording ${state.player?.name ?? ""}`, unix_s: shown_s() };
   const { phase, since } = state.connection;
   if (phase !== "lost") return { kind: "live", unix_s: shown_s() };

@@ -2,7 +2,7 @@
 
 import { changed, select, state } from "../store.js";
 import { byId, text } from "../dom.js";
-import { metres } from "../format.js";
+import { duration, metres } from "../format.js";
 import { surveyShown } from "../survey/model.js";
 import { picking, stopPicking } from "../survey/picking.js";
 import { move as movePlan, moving as movingPlan } from "../survey/plan.js";
@@ -13,6 +13,7 @@ import { endFollow, following, toggleFollow } from "./follow.js";
 import { drawnAnchors } from "./anchors.js";
 import { places } from "./places.js";
 import { placeAnchor, predict } from "./placing.js";
+import { secondsAt } from "./past.js";
 import { anchorNear } from "./survey.js";
 import { drawn } from "./tags.js";
 import { orbit, pan, px, py, toSite, view, zoom } from "./view.js";
@@ -163,8 +164,10 @@ function hover({ x, y }, type) {
   const value = valueAt(x_m, y_m);
   const { data } = state.overlay;
   const overlay = !data ? "" : ` · ${KINDS[data.kind].split(" (")[0]} ${value === null ? "no fix" : writeValue(value)}`;
+  const seconds = secondsAt(x_m, y_m);
+  const past = seconds === null ? "" : ` · ${seconds ? duration(seconds) : "no tag"}`;
   const where = view.spatial ? " on the ground" : "";
-  text(byId("readout"), `x ${metres(x_m)} m · y ${metres(y_m)} m${where}${overlay}`);
+  text(byId("readout"), `x ${metres(x_m)} m · y ${metres(y_m)} m${where}${overlay}${past}`);
 }
 
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };

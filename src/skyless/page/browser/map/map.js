@@ -10,6 +10,8 @@ import { drawFloor, drawGrid, drawOverlay, drawScale, drawWalls, floorCorners, l
 import { groundHeight } from "./floors.js";
 import { centre } from "./follow.js";
 import { listen } from "./input.js";
+import { drawHeat, drawMoment, drawWay } from "./past.js";
+import { drawMany, manyShown, start as startMany } from "./many.js";
 import { drawRoom, fillRoom } from "./room.js";
 import { drawGround, spaceCorners } from "./space.js";
 import { drawSurvey, surveyCorners, surveyOutOfSight } from "./survey.js";
@@ -27,6 +29,7 @@ let scheduled = false;
 let trailsDrawn = 0;
 let later = 0;
 let flashedMs = 0;
+let pastDrawn = false;
 
 /** Draw in the next frame: everything, or only what moves. */
 export function redraw(still = true) {
@@ -56,9 +59,12 @@ function frame() {
       if (state.options.trails) drawTrails(context, richOf(now.seen), now.shown, state.options.trails);
     }
     const context = prepare(byId("moving"));
+    drawMany(context);
     drawTags(context, now);
     drawAlarms(context, false);
     drawDraft(context);
+    if (state.past || pastDrawn) drawMoment(prepare(byId("moment")));
+    pastDrawn = state.past !== null;
     clearTimeout(later);
     if (now.moving) redraw(false);
     else if (now.ageing) later = setTimeout(redraw, 250, false);
@@ -66,7 +72,7 @@ function frame() {
 }
 
 function richOf(seen) {
-  return seen.length <= RICH ? seen : seen.filter(({ selected }) => selected);
+  return seen.length <= RICH && !manyShown() ? seen : seen.filter(({ selected }) => selected);
 }
 
 function drawStill() {
@@ -75,6 +81,7 @@ function drawStill() {
   drawFloor(context);
   fillRoom(context, floorCorners(), ground_m);
   drawOverlay(context);
+  drawHeat(context);
   if (view.spatial) drawGround(context, floorCorners());
   else drawGrid(context);
   const flashes = drawZones(context);
@@ -84,6 +91,7 @@ function drawStill() {
   drawSurvey(context);
   drawFindings(context);
   drawAlarms(context, true);
+  drawWay(context);
   drawScale(context);
   const surveyed = surveyShown() && state.survey.anchors.length > 0;
   byId("waiting").hidden = state.mode === "replay" || state.site !== null || surveyed;
@@ -94,7 +102,7 @@ function drawStill() {
 export function fitAll() {
   const corners = [...floorCorners(), ...surveyCorners()];
   const further = view.spatial ? [...corners, ...spaceCorners(floorCorners())] : corners;
-  fit(state.site, state.zones, further, state.options.overlay !== "none", state.mode === "replay");
+  fit(state.site, state.zones, further, state.options.overlay !== "none", state.mode === "replay" || state.past !== null);
   redraw();
 }
 
@@ -110,6 +118,7 @@ export function showSpatial(spatial) {
 export function start() {
   const box = byId("map");
   state.seenBox = seenBox;
+  startMany();
   new ResizeObserver(() => {
     view.width = box.clientWidth;
     view.height = box.clientHeight;
@@ -132,6 +141,7 @@ export function start() {
     if (overlay !== state.options.overlay && !view.touched) fitAll();
     overlay = state.options.overlay;
   });
+  on(["past"], () => !view.touched && fitAll());
   let surveyed = "";
   on(["survey", "setup"], () => {
     if (view.spatial && surveyShown()) showSpatial(false);
@@ -142,10 +152,12 @@ export function start() {
   });
   on(["events"], () => {
     const fresh = state.events.filter(({ cameMs }) => cameMs > flashedMs);
-    if (state.mode === "live") for (const { zone } of fresh) flash(zone);
+    if (state.mode === "live" && !state.past) for (const { zone } of fresh) flash(zone);
     flashedMs = performance.now();
   });
   const still = ["site", "zones", "events", "health", "overlay", "theme", "options", "selection", "mode", "connection"];
   on([...still, "survey", "watch", "setup", "plan", "placing", "alarms"], () => redraw(true));
   on(["tags", "editor", "player"], () => redraw(false));
+  on([...still, "survey", "watch", "setup", "plan", "past"], () => redraw(true));
+  on(["tags", "editor", "player", "moment"], () => redraw(false));
 }

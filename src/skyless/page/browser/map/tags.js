@@ -8,6 +8,7 @@ import { CXX, CXY, CYY, HEIGHT_GIVEN, HPL, TRUE_X, TRUE_Y, X, Y, Z } from "../tr
 import { DIMMED, drawnAnchors, dropLine, ring } from "./anchors.js";
 import { filtering, passes } from "./filter.js";
 import { otherFloor } from "./floors.js";
+import { manyShown } from "./many.js";
 import { drawMark, tagStyle } from "./marks.js";
 import { drawNames } from "./names.js";
 import { drawStub } from "./trails.js";
@@ -74,15 +75,15 @@ export function drawTags(context, { seen, shown }) {
     one.y = toY(one.row[X], one.row[Y], one.row[Z]);
   }
   const here = seen.filter((one) => !one.other);
-  const rich = seen.length <= RICH ? here : here.filter(({ selected }) => selected);
+  const rich = seen.length <= RICH && !manyShown() ? here : here.filter(({ selected }) => selected);
   if (options.trails) for (const one of rich) drawStub(context, one, shown);
   if (view.spatial) for (const one of here) dropLine(context, one.row[X], one.row[Y], one.y, faint(one.colour, 0.7));
-  if (options.ellipses) for (const one of here) ellipse(context, one);
-  if (options.levels) for (const one of here) if (seen.length <= NAMED || one.selected) level(context, one);
+  if (options.ellipses) for (const one of manyShown() ? rich : here) ellipse(context, one);
+  if (options.levels) for (const one of here) if ((seen.length <= NAMED && !manyShown()) || one.selected) level(context, one);
   if (options.truth && state.simulated) for (const one of rich) truth(context, one);
-  if (seen.length > DOTS) dots(context, seen);
+  if (seen.length > DOTS || manyShown()) dots(context, seen);
   else for (const one of seen) mark(context, one);
-  if (options.names) names(context, here);
+  if (options.names) names(context, manyShown() ? rich : here);
 }
 
 function ellipse(context, { row: at, colour, selected, x, y }) {
@@ -132,7 +133,7 @@ function dots(context, seen) {
     const key = `${one.colour} ${one.fresh === "fresh"} ${one.other}`;
     groups.has(key) ? groups.get(key).push(one) : groups.set(key, [one]);
   }
-  for (const group of groups.values()) {
+  for (const group of manyShown() ? [] : groups.values()) {
     const [{ colour, fresh, other }] = group;
     context.globalAlpha = other ? DIMMED : 1;
     context.beginPath();

@@ -1,0 +1,184 @@
+/**
+ * Very many tags: the binary stream `/live2` of a large site (`docs/batches.md`), drawn as points or as counts in cells.
+ *
+ * Positions are shares of the view that was asked for; kept in metres, they follow a map that is moved meanwhile.
+ */
+
+import { changed, state } from "../store.js";
+import { GONE_S, GREY_S, now_s } from "../clock.js";
+import { palette } from "../theme.js";
+import { groundHeight } from "./floors.js";
+import { rampColour } from "./past.js";
+import { drawInMetres, toX, toY, view } from "./view.js";
+
+/** So few tags are drawn with names, ellipses and trails instead, from the ordinary stream. */
+export const FEW = 400;
+/** The view is sent when it has changed, looked at in this interval, and at least in the longer one: pages are alive. */
+const LOOK_MS = 100;
+const ALIVE_MS = 2000;
+const CONDITIONS = ["unknown", "good", "warn", "bad"];
+const NOT_EXCLUDED = 3;
+const OVER_LIMIT = 5;
+/** Side of a point, pixels of CSS. */
+const SIDE = 4;
+
+/** @type {WebSocket|null} */
+let socket = null;
+/** The site that it is about. @type {number|null} */
+let site = null;
+let asked = "";
+let askedMs = 0;
+/** The view that is asked for, and the server's time from which messages are of it. */
+let box = null;
+let since_s = Infinity;
+/** Identifiers of the anchors, in the order of messages `H`. */
+let anchors = [];
+
+/**
+ * Read a message; null for one that is none. Numbers of 16 bits are packed in pairs as they lie in the message, which is
+ * little-endian as every browser's computer is.
+ * @param {ArrayBuffer} data
+ */
+export function readMany(data) {
+  if (data.byteLength < 12) return null;
+  const bytes = new DataView(data);
+  const kind = String.fromCharCode(bytes.getUint8(0));
+  const count = bytes.getUint16(2, true);
+  const time = (at) => Number(bytes.getBigUint64(at, true)) / 1e6;
+  const fits = (size) => data.byteLength === size;
+  if (kind === "P" && fits(12 + 12 * count)) return { kind, count, unix_s: time(4), words: new Uint32Array(data, 12) };
+  if (kind === "H" && fits(12 + count)) return { kind, codes: new Uint8Array(data, 12) };
+  if (kind === "A" && fits(12 + 14 * count)) {
+    return { kind, ids: Array.from({ length: count }, (_, n) => bytes.getUint16(12 + 14 * n, true)) };
+  }
+  if (kind !== "B" || data.byteLength < 16) return null;
+  const [columns, rows] = [count, bytes.getUint16(4, true)];
+  if (!fits(16 + 2 * columns * rows)) return null;
+  const counts = new Uint16Array(data, 16);
+  return { kind, columns, rows, unix_s: time(8), cell: bytes.getUint8(1), counts, count: counts.reduce((sum, one) => sum + one, 0) };
+}
+
+/** Take a message in; tags and counts are of the view `seen`, {box, px}. */
+export function receiveMany(data, seen) {
+  const message = readMany(data);
+  if (message?.kind === "A") anchors = message.ids;
+  else if (message?.kind === "H" && message.codes.length === anchors.length) {
+    anchors.forEach((id, n) => state.health.conditions.set(id, CONDITIONS[message.codes[n]] ?? "unknown"));
+    changed("health");
+  } else if (seen && message?.unix_s >= since_s) {
+    state.many = { ...message, ...seen };
+    changed("tags");
+  }
+}
+
+/** Whether the map draws its tags from this stream. */
+export function manyShown() {
+  return state.many !== null && state.mode === "live" && !view.spatial && (state.many.kind === "B" || state.many.count > FEW);
+}
+
+/** Draw the tags, before all else of their canvas: the picture replaces what is there. */
+export function drawMany(context) {
+  if (!manyShown()) return;
+  if (state.many.kind === "P") drawPoints(context, state.many);
+  else drawCounts(context, state.many);
+}
+
+let picture = new ImageData(1, 1);
+
+function drawPoints(context, { words, box: [x0, y0, x1, y1] }) {
+  const { width, height } = context.canvas;
+  if (picture.width !== width || picture.height !== height) picture = new ImageData(width, height);
+  const pixels = new Uint32Array(picture.data.buffer);
+  pixels.fill(0);
+  const { ratio } = view;
+  const [left, low] = [ratio * toX(x0, y0), ratio * toY(x0, y0)];
+  const [across, up] = [(ratio * toX(x1, y1) - left) / 65535, (ratio * toY(x1, y1) - low) / 65535];
+  const side = Math.max(2, Math.round(SIDE * ratio));
+  const [fresh, old, bad] = [palette.accent, palette.muted, palette.bad].map(pixelOf);
+  const [grey, gone] = [10 * GREY_S, 10 * GONE_S];
+  for (let at = 0; at < words.length; at += 3) {
+    const place = words[at + 1];
+    const age = (words[at + 2] >>> 16) & 255;
+    const alert = words[at + 2] >>> 24;
+    const x = (left + across * (place & 65535) - side / 2) | 0;
+    const y = (low + up * (place >>> 16) - side / 2) | 0;
+    if (age >= gone || x < 0 || y < 0 || x + side > width || y + side > height) continue;
+    const colour = age >= grey ? old : alert === NOT_EXCLUDED || alert === OVER_LIMIT ? bad : fresh;
+    for (let row = y * width + x, end = row + side * width; row < end; row += width) {
+      for (let column = 0; column < side; column++) pixels[row + column] = colour;
+    }
+  }
+  context.putImageData(picture, 0, 0);
+}
+
+/** A colour of the palette as a pixel of a picture. */
+function pixelOf(colour) {
+  const [red, green, blue] = colour.match(/[\d.]+/g).map(Number);
+  return ((255 << 24) | (blue << 16) | (green << 8) | red) >>> 0;
+}
+
+let cells = { of: null, canvas: null };
+
+function drawCounts(context, many) {
+  const { columns, rows, cell, counts, box: [x0, y0, x1], px } = many; // prettier-ignore
+  if (cells.of !== counts) {
+    const canvas = Object.assign(document.createElement("canvas"), { width: columns, height: rows });
+    const image = new ImageData(columns, rows);
+    const most = Math.log1p(counts.reduce((top, one) => Math.max(top, one), 1));
+    const line = Array.from({ length: 64 }, (_, n) => pixelOf(rampColour(n / 63).join(" ")));
+    const pixels = new Uint32Array(image.data.buffer);
+    counts.forEach((count, n) => {
+      const at = (rows - 1 - Math.floor(n / columns)) * columns + (n % columns);
+      if (count) pixels[at] = line[Math.round((63 * Math.log1p(count)) / most)];
+    });
+    canvas.getContext("2d").putImageData(image, 0, 0);
+    cells = { of: counts, canvas };
+  }
+  const side_m = (cell * (x1 - x0)) / px[0];
+  context.globalAlpha = 0.9;
+  drawInMetres(context, groundHeight());
+  context.scale(1, -1); // pictures count downwards
+  context.imageSmoothingEnabled = false;
+  context.drawImage(cells.canvas, x0, -(y0 + rows * side_m), columns * side_m, rows * side_m);
+  context.restore();
+  context.globalAlpha = 1;
+}
+
+function look() {
+  if (!state.live2 || state.connection.phase !== "open" || (socket && site !== state.liveId)) return end();
+  if (!socket) return connect();
+  const seen = state.mode === "live" ? state.seenBox() : null;
+  if (!seen || socket.readyState !== WebSocket.OPEN) return;
+  const px = [view.width, view.height].map((value) => Math.max(1, Math.round(value)));
+  const words = JSON.stringify({ view: seen, px, floor: 0, named: [] });
+  const now = performance.now();
+  if (words === asked && now - askedMs < ALIVE_MS) return;
+  if (words !== asked) since_s = now_s() + state.ping.tripMs / 1e3; // until then messages are of the former view
+  [asked, askedMs, box] = [words, now, { box: seen, px }];
+  socket.send(words);
+}
+
+function connect() {
+  const address = new URL("live2", document.baseURI);
+  site = state.liveId;
+  if (site !== null) address.searchParams.set("site", String(site));
+  address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
+  const mine = (socket = new WebSocket(address));
+  mine.binaryType = "arraybuffer";
+  mine.onmessage = ({ data }) => mine === socket && receiveMany(data, box);
+  mine.onclose = () => mine === socket && setTimeout(() => mine === socket && end(), ALIVE_MS);
+}
+
+/** Forget all; the next look connects again where the server has the stream. */
+function end() {
+  const old = socket;
+  [socket, asked, box, anchors, since_s] = [null, "", null, [], Infinity];
+  old?.close();
+  if (state.many) changed("tags");
+  state.many = null;
+}
+
+/** Connect where the server says that it has the stream. */
+export function start() {
+  setInterval(look, LOOK_MS);
+}
