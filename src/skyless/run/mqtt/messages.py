@@ -32,7 +32,7 @@ class SiteMessage(Struct, frozen=True):
     """The site as in its file, retained, so that a new tag or page has it at once."""
 
     site: Site
-    """Without its outline, which earlier versions refuse in it."""
+    """Without its outline and its rules of alarms, which earlier versions refuse in it."""
     simulated: bool
     """True when its radios are emulated."""
     unix_s: float
@@ -44,12 +44,13 @@ class SiteMessage(Struct, frozen=True):
     @property
     def whole_site(self) -> Site:
         """The site as in its file."""
-        return replace(self.site, outline_m=self.outline_m)
+        return replace(self.site, outline_m=self.outline_m, alarms=self.alarms or UNSET)
 
 
 def site_message(site: Site, *, simulated: bool, unix_s: float) -> SiteMessage:
-    """The message of a site: its outline stands beside it."""
-    return SiteMessage(replace(site, outline_m=UNSET), simulated, unix_s, site.outline_m)
+    """The message of a site: its outline and its rules of alarms stand beside it."""
+    alarms = () if site.alarms is UNSET else site.alarms
+    return SiteMessage(replace(site, outline_m=UNSET, alarms=UNSET), simulated, unix_s, site.outline_m, alarms)
 
 
 class StatusMessage(Struct, frozen=True):
@@ -564,7 +565,7 @@ class AlarmMessage(Struct, frozen=True):
     kind: RuleKind
     severity: Severity
     subject: str
-    """What it is about: ``<tag>``, ``<tag>+<tag>``, ``zone-<id>`` or ``anchor-<id>``."""
+    """What it is about: ``<tag>``, ``<tag>~<tag>``, ``zone-<id>`` or ``anchor-<id>``."""
     since_unix_s: float
     """When the condition began to hold."""
     unix_s: float
