@@ -19,6 +19,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyless.core.errors import SkylessError
+from skyless.page._alarms import NoAlarmError
 from skyless.page._geojson import MEDIA_TYPE
 from skyless.page._site_survey import NoResultError
 from skyless.page._state import PageRequest
@@ -30,6 +31,7 @@ from skyless.page.sites import LiveSites
 from skyless.page.what_if import NoWhatIfError, WhatIfs, WhatIfTask
 from skyless.run.mqtt.survey_facts import BadFactsError
 from skyless.run.zones.zone_list import BadZonesError, read_zones
+from skyless.site.alarm_rules import BadAlarmRulesError
 from skyless.site.file.check import image_size
 
 _PAGE: Final = Path(__file__).parent / "browser"
@@ -50,6 +52,8 @@ _GOING_AWAY: Final = 1001
 _STATUSES: Final[dict[type[Exception], int]] = {
     BadZonesError: 400,
     BadFactsError: 400,
+    BadAlarmRulesError: 400,
+    NoAlarmError: 404,
     NoRecordingError: 404,
     NoSiteError: 404,
     NoResultError: 409,

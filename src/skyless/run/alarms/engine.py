@@ -12,7 +12,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Set
 from typing import Final, Literal
 
 from msgspec.structs import replace
@@ -41,7 +41,7 @@ MAX_KEPT: Final = 2_000
 """Alarms that are kept. Beyond it the oldest that have ended go, and where none has, no more are raised."""
 
 _MAX_NAMED: Final = 20
-_CONFIRMED: Final = frozenset({"inside", "near", "crowded", "protection-level", "anchor-offline"})
+_CONFIRMED: Final = frozenset({"inside", "near", "crowded", "protection-level"})
 """Kinds whose condition shows within ``CONFIRM_S`` where it holds. The others hold until there is a sign against it."""
 
 Change = tuple[Literal["raised", "ended", "acknowledged", "dropped"], AlarmMessage]
@@ -230,18 +230,19 @@ class AlarmEngine:
     ) -> None:
         """The anchors that are offline, None where that is not known, and what their watch has found."""
         if offline is not None:
-            before, self._offline = self._offline, frozenset(offline)
-            for own in self._of("anchor-offline"):
-                for name in sorted(before ^ self._offline):
-                    self._update(own, f"anchor-{name}", now_s, unix_s)
+            self._offline = frozenset(offline)
+            self._set_anchors("anchor-offline", self._offline, now_s, unix_s)
         if watch is not None and watch.state == "watching":
             moved = {
                 str(anchor): one.sentence for one in watch.findings if one.kind == "moved" for anchor in one.anchors
             }
-            found, self._displaced = self._displaced.keys() ^ moved.keys(), moved
-            for own in self._of("anchor-moved"):
-                for subject in {f"anchor-{name}" for name in found} | own.cases.keys():
-                    self._set(own, subject, subject.removeprefix("anchor-") in moved, now_s, unix_s)
+            self._displaced = moved
+            self._set_anchors("anchor-moved", moved.keys(), now_s, unix_s)
+
+    def _set_anchors(self, kind: str, names: Set[str], now_s: float, unix_s: float) -> None:
+        for own in self._of(kind):
+            for subject in sorted(own.cases.keys() | {f"anchor-{name}" for name in names}):
+                self._set(own, subject, subject.removeprefix("anchor-") in names, now_s, unix_s)
 
     # Leading, and what people do
 
@@ -323,7 +324,7 @@ class AlarmEngine:
             case "crowded":
                 return self._is_crowded(own, was=case is not None and case.holds) or (False if confirmed else None)
             case "anchor-offline":
-                return subject.removeprefix("anchor-") in self._offline or (False if confirmed else None)
+                return True if subject.removeprefix("anchor-") in self._offline else None
             case "anchor-moved":
                 return True if subject.removeprefix("anchor-") in self._displaced else None
         if subject not in own.concerned or (rule.zone is not None and rule.zone not in self._zones and confirmed):
