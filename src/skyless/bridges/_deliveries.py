@@ -64,7 +64,7 @@ class _Waiting(Struct):
     delivery: Delivery
     since_s: float
     due_s: float
-    pause_s: float = FIRST_PAUSE_S
+    pause_s: float
 
 
 class AlarmTarget(Target):
@@ -109,7 +109,7 @@ class AlarmTarget(Target):
         if what not in self._kinds:
             return
         now_s = time.monotonic()
-        self._waiting.append(_Waiting(Delivery(what, alarm), now_s, now_s))
+        self._waiting.append(_Waiting(Delivery(what, alarm), now_s, now_s, FIRST_PAUSE_S))
         if len(self._waiting) > MAX_WAITING:
             del self._waiting[0]
             self.dropped["too-many"] += 1

@@ -129,7 +129,7 @@ class SiteAlarms:
         try:
             message = read_rules(payload) if payload else AlarmRulesMessage(())
         except BadAlarmRulesError as error:
-            self._fault = f"the rules that the broker keeps at {topic} cannot be read: {error}"
+            self._fault = str(error)
             raise WrongMessageError(str(error)) from None
         if self._drawn is not None:
             if message != self._drawn:
@@ -174,8 +174,8 @@ class SiteAlarms:
         if site and site != self._site:
             raise BadAlarmRulesError(None, "", "their site", site[:100], f"{self._site[:100]!r}, which is shown now")
         if self._fault:
-            right = "cleared to begin again; nothing was overwritten"
-            raise BadAlarmRulesError(None, "", "the topic alarm_rules", self._fault, right)
+            right = f"cleared to begin again; nothing was overwritten ({self._fault})"
+            raise BadAlarmRulesError(None, "", "the topic alarm_rules", "not readable", right)
         check_rules(rules, self.file_rules)
         self._stored = self._drawn = AlarmRulesMessage(tuple(rules), self._site)
         self._rules_changed = True

@@ -250,20 +250,32 @@ class AlarmEngine:
         """Lead from now on, with the alarms that are kept."""
         self.messages = {(one.rule, one.subject): one for one in messages if not is_over(one)}
         self.leading = True
-        for key, message in tuple(self.messages.items()):
-            own = self._rules.get(message.rule)
-            if message.ended_unix_s is not None:
-                continue
-            if own is None or not own.is_on or (own.rule.kind, own.rule.zone) != (message.kind, message.zone):
-                self._end(key, unix_s)
-            elif message.subject not in own.cases:
-                case = own.cases[message.subject] = _Case(own, message.subject)
-                case.holds, case.since_s = True, now_s - (unix_s - message.since_unix_s)
-                case.deadline_s = now_s + CONFIRM_S if message.kind in _CONFIRMED else math.inf
-                if message.kind == "silent":
-                    self._silent.add(message.subject)
+        for message in tuple(self.messages.values()):
+            if message.ended_unix_s is None:
+                self._take_over(message, now_s, unix_s)
+        if self._resync_s is not None:  # a tag may have left a zone unnoticed
+            for own in (*self._of("inside"), *self._of("outside"), *self._of("crowded")):
+                for subject, case in own.cases.items():
+                    if case.holds and case.deadline_s is None and not self._is_active((own.rule.id, subject)):
+                        case.deadline_s = now_s + CONFIRM_S
+        else:
+            for own in self._rules.values():
+                self._refresh(own, now_s, unix_s)
         for own in self._rules.values():
-            self._refresh(own, now_s, unix_s)
+            for case in tuple(own.cases.values()):
+                self._advance(case, now_s, unix_s)
+
+    def _take_over(self, message: AlarmMessage, now_s: float, unix_s: float) -> None:
+        """An active alarm: of its condition there may have been no sign yet."""
+        own = self._rules.get(message.rule)
+        if own is None or not own.is_on or (own.rule.kind, own.rule.zone) != (message.kind, message.zone):
+            self._end((message.rule, message.subject), unix_s)
+        elif message.subject not in own.cases:
+            case = own.cases[message.subject] = _Case(own, message.subject)
+            case.holds, case.since_s = True, now_s - (unix_s - message.since_unix_s)
+            case.deadline_s = now_s + CONFIRM_S if message.kind in _CONFIRMED else math.inf
+            if message.kind == "silent":
+                self._silent.add(message.subject)
 
     def rest(self) -> None:
         """Another one leads: raise nothing from now on."""
@@ -502,8 +514,7 @@ class AlarmEngine:
                     self._pending[case] = None
                 return
             case.holds, case.since_s, case.deadline_s = False, now_s, None
-        message = self.messages.get((rule.id, case.subject))
-        is_active = self.leading and message is not None and message.ended_unix_s is None
+        is_active = self._is_active((rule.id, case.subject))
         if case.holds and not is_active and own.is_on:
             due = now_s - max(case.since_s, own.on_since_s) >= rule.after_s
             if self.leading and not (due and self._raise(case, now_s, unix_s)):
@@ -514,6 +525,9 @@ class AlarmEngine:
             if is_active:
                 self._end((rule.id, case.subject), unix_s)
             own.cases.pop(case.subject, None)
+
+    def _is_active(self, key: Key) -> bool:
+        return self.leading and key in self.messages and self.messages[key].ended_unix_s is None
 
     def _raise(self, case: _Case, now_s: float, unix_s: float) -> bool:
         """Whether there was room for it."""
