@@ -38,6 +38,7 @@ NAVIGATION = {
     "How to": [
         "docs/faq",
         "docs/howto/run_a_site",
+        "docs/howto/alarms",
         "docs/howto/secure_a_site",
         "docs/howto/secure_the_air",
         "docs/setup",

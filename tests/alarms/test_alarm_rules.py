@@ -6,6 +6,7 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from skyless.core.alarm_rule import AlarmRule
 from skyless.core.errors import ConfigurationError
@@ -14,6 +15,7 @@ from skyless.run.mqtt.messages import AlarmRulesMessage, Asset, site_message
 from skyless.sim.lab import lab_site
 from skyless.site.alarm_rules import MAX_RULES, BadAlarmRulesError, check_rules, read_hours
 from skyless.site.file.load import load_site
+from skyless.site.file.template import site_template
 
 DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 MINUTE = st.integers(0, 24 * 60 - 1)
@@ -170,3 +172,11 @@ def test_a_wrong_rule_in_a_site_file(tmp_path, wrong, words):
 def test_the_message_of_rules_is_read_whole():
     message = AlarmRulesMessage((AlarmRule("a", "near", limit=2.0, tags=("group:people",)),), "hall")
     assert read_rules(msgspec.json.encode(message)) == message
+
+
+def test_a_site_file_that_is_written_has_the_rules(tmp_path):
+    near = AlarmRule("near", "near", name='Fork "7" – near', limit=2.5, tags=("group:forks",), others=("t1", "t2"))
+    rules = (near, AlarmRule("cold", "inside", zone="cold", after_s=600.0, severity="critical", hours="22:00-06:00"))
+    path = tmp_path / "s.toml"
+    path.write_text(site_template(replace(lab_site(), alarms=rules)))
+    assert load_site(path).alarms == rules
