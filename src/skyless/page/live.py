@@ -184,6 +184,7 @@ class LiveSite:
         """As the broker keeps them or they were stored here last, including other sites' zones of this number."""
         self._drawn: ZonesMessage | None = None  # zones stored here that have not come back from the broker
         self._zones_fault: str | None = None  # why the zones that the broker keeps cannot be read
+        self._dashboards: dict[str, StatusMessage] = {}
         self._sent_serial = 0
         self._health_due_s = self._condition_due_s = 0.0
         self.evidence = Evidence(host, clock())
@@ -297,6 +298,8 @@ class LiveSite:
         if not self.evidence.roster.admits(status.kind, status.name):
             return
         self.state.add_status(status)
+        if status.kind == "dashboard":
+            self._dashboards[status.name] = status
         self.evidence.add_status(status, self._clock())
         self.log.on_status(status, self._clock())
         if status.kind == "tag" and not status.online:
@@ -389,10 +392,7 @@ class LiveSite:
     def _schedule(self, events: list[ZoneEvent]) -> None:
         if events:
             self.alarms.engine.on_zone_events(events, self._clock(), self._wall_clock())
-            self.events.schedule(events, publisher_rank(self.name, self._dashboards()), self._clock())
-
-    def _dashboards(self) -> list[StatusMessage]:
-        return [status for (kind, _), status in self.state.statuses.items() if kind == "dashboard"]
+            self.events.schedule(events, publisher_rank(self.name, list(self._dashboards.values())), self._clock())
 
     def _publish_events(self, now_s: float) -> None:
         for event in self.events.pop_due(now_s):
@@ -517,7 +517,7 @@ class LiveSite:
             for page in [page for page in self.pages if now_s - page.active_s > GONE_S]:
                 self._close_idle(page)
         self._publish_events(now_s)
-        self.alarms.tick(now_s, unix_s, self._dashboards(), blind=self._condition_monitor.is_blind(now_s))
+        self.alarms.tick(now_s, unix_s, self._dashboards.values(), blind=self._condition_monitor.is_blind(now_s))
         if now_s >= self._condition_due_s:
             self._evaluate(now_s)
         self._send_logged()
