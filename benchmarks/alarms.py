@@ -274,6 +274,7 @@ def main() -> None:
     counts, _ = judge(world, published, slack_s=9.0)
     wrong = len(lost(published, acknowledged, kept))
     print(f"killed {len(down)} times: {counts['twice']} raised twice, {wrong} of {len(acknowledged)} acknowledged lost")
+    print(f"  {counts['missed']} of {counts['expected']} not raised, as no server ran or an earlier one had not ended")
     print(
         f"cost: {cost_us():.2f} us of CPU a fix (500 tags at 20 Hz), {cost_us(hz=1.0, seconds=60.0):.2f} us (at 1 Hz)"
     )
