@@ -39,6 +39,7 @@ NAVIGATION = {
         "docs/faq",
         "docs/howto/run_a_site",
         "docs/howto/watch_and_doctor",
+        "docs/howto/alarms",
         "docs/howto/secure_a_site",
         "docs/howto/secure_the_air",
         "docs/setup",

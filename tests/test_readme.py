@@ -155,6 +155,16 @@ ELSEWHERE = {
     "skyless paper --out quick-report --quick": (
         "tests/paper/test_paper_report.py::test_every_picture_is_there_twice_and_nothing_is_left_over"
     ),
+    "mosquitto_sub -v -t 'skyless/v1/+/alarm/+/+/state'": (
+        "tests/nodes/test_alarms_through_broker.py::test_from_a_fix_to_a_webhook_and_on_to_the_next_dashboard"
+    ),
+    "skyless bridge 'webhook+https://alarms.example.org/skyless?secret_file=webhook.secret'": (
+        "tests/bridges/test_alarm_targets.py::test_what_becomes_of_an_alarm_is_posted_in_order_and_signed"
+    ),
+    "skyless bridge 'smtp://site@mail.example.org:587?starttls&to=ada@example.org,bob@example.org"
+    "&from=site@example.org&password_file=mail.password'": (
+        "tests/bridges/test_alarm_targets.py::test_a_mail_when_an_alarm_is_raised_and_when_it_has_ended"
+    ),
     "python examples/own_radio.py": "tests/examples/test_examples.py::test_own_radio",
 }
 """Lines that run until Ctrl-C, take long or need what is not here, and the tests that run such a command."""

@@ -11,7 +11,7 @@ from msgspec import Struct
 
 from skyless.bridges.target import BridgedSite, Target, is_usable
 from skyless.core.errors import SkylessError
-from skyless.run.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, TagHealth
+from skyless.run.mqtt.messages import AlarmMessage, AnchorHealth, FixMessage, StatusMessage, TagHealth
 from skyless.run.rate_limit import RateLimit
 
 NO_FIX_S: Final = 1.0
@@ -126,6 +126,12 @@ class Hub:
         for route in self.routes:
             if status.kind != "tag" or route.tag in (None, status.name):
                 self._guard(route, lambda target: target.on_status(status))
+
+    def on_alarm(self, alarm: AlarmMessage) -> None:
+        """An alarm as it is now. A target of one tag gets those that concern it."""
+        for route in self.routes:
+            if route.tag is None or route.tag in alarm.tags:
+                self._guard(route, lambda target: target.on_alarm(alarm))
 
     def on_tick(self, now_s: float, unix_s: float) -> None:
         """To be called every ``SILENCE_CHECK_S``."""

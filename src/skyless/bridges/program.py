@@ -21,8 +21,24 @@ from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
-from skyless.run.mqtt.messages import AnchorHealth, FixMessage, SiteMessage, StatusMessage, TagHealth, ZonesMessage
-from skyless.run.mqtt.topics import EVERY_NODE, fix_topic, health_topic, site_topic, status_topic, zones_topic
+from skyless.run.mqtt.messages import (
+    AlarmMessage,
+    AnchorHealth,
+    FixMessage,
+    SiteMessage,
+    StatusMessage,
+    TagHealth,
+    ZonesMessage,
+)
+from skyless.run.mqtt.topics import (
+    EVERY_NODE,
+    alarm_topic,
+    fix_topic,
+    health_topic,
+    site_topic,
+    status_topic,
+    zones_topic,
+)
 from skyless.run.process import HEALTH_S, Log, every, keep, reader, together
 from skyless.run.zones.zone_list import BadZonesError, read_zones, zones_of
 
@@ -71,6 +87,8 @@ class BridgeNode:
             (status_topic(site, "anchor", EVERY_NODE), StatusMessage, self.hub.on_status),
         ):
             self.link.subscribe(topic, reader(kind, act, self._on_malformed))
+        alarms = reader(AlarmMessage, self.hub.on_alarm, self._on_malformed)
+        self.link.subscribe(alarm_topic(site, "+", "+"), alarms, qos=1)
 
     async def run(self) -> None:
         """Serve until cancelled. Raises SkylessError: a target cannot begin, or the site lacks what they need."""

@@ -18,7 +18,16 @@ from skyless.core.alert import Alert
 from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite, Site, WallSite
 from skyless.run.mqtt.address import MqttAddress, hide_password
-from skyless.run.mqtt.messages import AnchorHealth, FixMessage, Matrix, StatusMessage, TagHealth, Vector, Zone
+from skyless.run.mqtt.messages import (
+    AlarmMessage,
+    AnchorHealth,
+    FixMessage,
+    Matrix,
+    StatusMessage,
+    TagHealth,
+    Vector,
+    Zone,
+)
 
 MIN_STD_M: Final = 0.01
 """Least standard deviation of an axis that leaves: the gates of other programs reject fixes with honest millimetres."""
@@ -114,6 +123,9 @@ class Target:
 
     def on_status(self, status: StatusMessage) -> None:
         """A program of the site has come or gone."""
+
+    def on_alarm(self, alarm: AlarmMessage) -> None:
+        """An alarm as it is now: raised, ended, acknowledged, or kept by the broker from before."""
 
     async def run(self) -> None:
         """Serve until cancelled."""

@@ -50,6 +50,12 @@ TARGET_KINDS: Final = {
     "prometheus": Kind("prometheus", 50.0, MAX_HZ, "figures for Prometheus at /metrics"),
     "osc+udp": Kind("osc", 60.0, MAX_HZ, "Open Sound Control: TouchDesigner, Unreal, Max", 9000),
     "psn": Kind("psn", 60.0, 200.0, "PosiStageNet: media servers, lighting consoles"),
+    "webhook+https": Kind(
+        "webhook", 1.0, MAX_HZ, "alarms, posted as signed JSON: webhook+https://HOST/PATH?secret_file="
+    ),
+    "webhook+http": Kind("webhook", 1.0, MAX_HZ, "the same unencrypted"),
+    "smtp": Kind("mail", 1.0, MAX_HZ, "alarms as mails: smtp://USER@HOST?starttls&to=NAME@HOST&password_file="),
+    "smtps": Kind("mail", 1.0, MAX_HZ, "the same over TLS from the first byte"),
 }
 
 
@@ -95,7 +101,7 @@ def open_route(text: str, context: BridgeContext) -> Route:
     hz = url.number("hz", kind.hz, 0.1, kind.max_hz)
     module = import_module(f"skyless.bridges.{kind.module}")
     target: Target
-    if "+" in url.scheme:
+    if hasattr(module, "make_encoder"):
         encoder = cast(Callable[[TargetUrl, BridgeContext], Encoder], module.make_encoder)(url, context)
         target = _stream(url, kind, encoder, context)
     else:

@@ -7,6 +7,7 @@ from typing import Final, Literal
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
+from skyless.core.alarm_rule import AlarmRule
 from skyless.core.constants import DEFAULT_ANTENNA_DELAY_TICKS, TICK_M
 
 ScheduleMode = Literal["master", "free"]
@@ -191,6 +192,8 @@ class Site(Struct, frozen=True, forbid_unknown_fields=True):
     """The room, where the file has it. Messages carry it beside the site: earlier versions refuse a site with it."""
     floors: tuple[FloorSite, ...] | UnsetType = UNSET
     """The storeys, the lowest first, where the file has them. Messages carry them beside the site as well."""
+    alarms: tuple[AlarmRule, ...] | UnsetType = UNSET
+    """The rules of alarms, where the file has any. Beside the site in messages, as its outline is."""
 
     @property
     def all_anchors(self) -> tuple[AnchorSite | UnplacedAnchor, ...]:

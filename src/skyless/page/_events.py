@@ -12,7 +12,15 @@ from msgspec import Struct
 from skyless.page._state import SILENT_S
 from skyless.page.condition.evidence import ALERT_WORDS, ALERTS, Health, LeaderTracker
 from skyless.page.condition.monitor import Condition
-from skyless.run.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, SurveyMessage, WatchMessage, ZoneEvent
+from skyless.run.mqtt.messages import (
+    AlarmMessage,
+    AnchorHealth,
+    FixMessage,
+    StatusMessage,
+    SurveyMessage,
+    WatchMessage,
+    ZoneEvent,
+)
 
 MAX_LOGGED: Final = 500
 """Events that are kept. The oldest are dropped."""
@@ -36,7 +44,7 @@ _SAME_EVENT_S: Final = 2.0
 
 _SUBJECTS: Final = {"ether": "the emulated air", "dashboard": "page server", "survey": "survey program"}
 
-Kind = Literal["anchor", "master", "watch", "alert", "tag", "program", "survey", "condition"]
+Kind = Literal["anchor", "master", "watch", "alert", "tag", "program", "survey", "condition", "alarm"]
 Severity = Literal["good", "note", "warning", "bad"]
 
 
@@ -215,6 +223,19 @@ class EventLog:
             where = f" to {survey.file}" if survey.file else ""
             self._add(now_s, "survey", "note", "", f"survey result {survey.saved_serial} saved{where}")
         self._surveyed_by, self._saved = survey.by, survey.saved_serial
+
+    # Alarms
+
+    def on_alarm(self, what: str, alarm: AlarmMessage, now_s: float) -> None:
+        """An alarm was raised, has ended or was acknowledged."""
+        level: Severity = (
+            "bad" if alarm.severity == "critical" else "warning" if alarm.severity == "warning" else "note"
+        )
+        who = f" by {alarm.acknowledged_by}" if what == "acknowledged" and alarm.acknowledged_by else ""
+        words = "" if what == "raised" else f" {what}{who}"
+        text = f"alarm {alarm.name}{words}: {alarm.sentence}"
+        kind, _, name = alarm.subject.partition("-") if not alarm.tags else ("tag", "", alarm.tags[0])
+        self._add(now_s, "alarm", level if what == "raised" else "note", f"{kind}/{name}", text)
 
     # Condition
 

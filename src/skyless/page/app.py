@@ -21,6 +21,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.site import Site
+from skyless.page._alarms import NoAlarmError
 from skyless.page._geojson import MEDIA_TYPE
 from skyless.page._site_survey import NoResultError
 from skyless.page._state import PageRequest
@@ -33,6 +34,7 @@ from skyless.page.task_process import TaskError, TaskProcess
 from skyless.page.what_if import NoWhatIfError, WhatIfs, WhatIfTask
 from skyless.run.mqtt.survey_facts import BadFactsError
 from skyless.run.zones.zone_list import BadZonesError, read_zones
+from skyless.site.alarm_rules import BadAlarmRulesError
 from skyless.site.file.check import image_size
 
 if TYPE_CHECKING:
@@ -57,6 +59,8 @@ _NO_GATHER: Final = 4404
 _STATUSES: Final[dict[type[Exception], int]] = {
     BadZonesError: 400,
     BadFactsError: 400,
+    BadAlarmRulesError: 400,
+    NoAlarmError: 404,
     NoRecordingError: 404,
     NoSiteError: 404,
     NoResultError: 409,

@@ -10,7 +10,7 @@ import platform
 import time
 import zlib
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -18,14 +18,16 @@ import msgspec
 from msgspec import UNSET, Struct
 
 from skyless.bridges.target import bridged_site
+from skyless.core.alarm_rule import AlarmRule
 from skyless.core.errors import ConfigurationError
 from skyless.core.version import installed_version
+from skyless.page._alarms import SiteAlarms
 from skyless.page._events import MAX_EVENTS, MAX_LOGGED, EventLog, EventQueue, publisher_rank
 from skyless.page._geojson import OLDEST_S, features
 from skyless.page._site_survey import SiteSurvey
 from skyless.page._state import PageRequest, Sent, SiteState, encode
 from skyless.page.condition.evidence import Evidence
-from skyless.page.condition.monitor import EVALUATION_S, Condition, ConditionMonitor
+from skyless.page.condition.monitor import EVALUATION_S, Condition, ConditionMonitor, offline_anchors
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.access import Role
 from skyless.run.mqtt.link import Link
@@ -51,6 +53,7 @@ from skyless.site.file.check import check_site
 
 _STATE_PERIOD_S: Final = 0.05
 _HEALTH_PERIOD_S: Final = 1.0
+_WATCH_FRESH_S: Final = 30.0  # the watch reports at least every 10 s
 _EVALUATION_SHARE: Final = 5.0  # evaluations take at most a sixth of the time
 
 
@@ -182,6 +185,7 @@ class LiveSite:
         """As the broker keeps them or they were stored here last, including other sites' zones of this number."""
         self._drawn: ZonesMessage | None = None  # zones stored here that have not come back from the broker
         self._zones_fault: str | None = None  # why the zones that the broker keeps cannot be read
+        self._dashboards: dict[str, StatusMessage] = {}
         self._sent_serial = 0
         self._health_due_s = self._condition_due_s = 0.0
         self.evidence = Evidence(host, clock())
@@ -189,6 +193,9 @@ class LiveSite:
             self._set_floors(site)
             self.evidence.set_site(site.site, clock())
         self.log = EventLog(wall_clock() - clock())
+        self.alarms = SiteAlarms(name, self.monitor, self._broadcast, self.log.on_alarm)
+        if site is not None:
+            self.alarms.on_site(site, clock(), wall_clock())
         self._condition_monitor = ConditionMonitor(self.evidence)
         self.condition: Condition = self._condition_monitor.evaluate(clock())
         self._logged_serial = 0
@@ -217,6 +224,7 @@ class LiveSite:
             topics.zones_topic(site_id): self._on_zones,
             topics.zone_event_topic(site_id, "+"): self._on_zone_event,
             **self.survey.handlers(site_id),
+            **self.alarms.attach(link, site_id),
         }
         for topic, handler in handlers.items():
             link.subscribe(topic, self._counting(topic.rsplit("/", 1)[-1], handler), _qos(topic))
@@ -230,6 +238,7 @@ class LiveSite:
             self.evidence.set_connected(connected=connected, now_s=self._clock())
             self._evaluate(self._clock())
             self.survey.expect_kept()
+            self.alarms.on_connection(connected, self._clock())
             self._broadcast("mqtt", self._connection())
 
     def set_sites(self, sites: list[tuple[int, str, bool]]) -> None:
@@ -258,6 +267,7 @@ class LiveSite:
         self.site = message
         self._set_floors(message)
         self.evidence.set_site(message.site, self._clock())
+        self.alarms.on_site(message, self._clock(), self._wall_clock())
         self._broadcast("site", encode("site", {"site": message}))
         self._assign_zones()
 
@@ -296,6 +306,7 @@ class LiveSite:
         unix_s = self._wall_clock()
         self.state.add_fix(fix, now_s, unix_s - self.evidence.add_fix(fix, now_s))
         self.log.on_fix(fix, now_s)
+        self.alarms.engine.on_fix(fix, now_s, unix_s)
         self._schedule(self.monitor.update(fix, now_s))
 
     def _on_status(self, topic: str, payload: bytes) -> None:
@@ -306,9 +317,12 @@ class LiveSite:
         if not self.evidence.roster.admits(status.kind, status.name):
             return
         self.state.add_status(status)
+        if status.kind == "dashboard":
+            self._dashboards[status.name] = status
         self.evidence.add_status(status, self._clock())
         self.log.on_status(status, self._clock())
         if status.kind == "tag" and not status.online:
+            self.alarms.engine.on_tag_gone(status.name)
             self._schedule(self.monitor.remove_tag(status.name, self._wall_clock()))
 
     def _on_health(self, topic: str, payload: bytes) -> None:
@@ -319,6 +333,8 @@ class LiveSite:
             self.state.add_health(name, health, now_s)
             self.evidence.add_health(kind, name, health, now_s, unix_s)
             self.log.on_health(kind, name, health, now_s)
+            if isinstance(health, TagHealth):
+                self.alarms.engine.on_health(health, now_s, unix_s)
 
     def _on_truth(self, _topic: str, payload: bytes) -> None:
         self.state.add_truth(read_message(payload, TruthMessage))
@@ -382,6 +398,7 @@ class LiveSite:
         zones = () if is_foreign else zones_of(self._zones, name).zones
         if zones != self.monitor.zones:
             self._schedule(self.monitor.set_zones(zones, self._wall_clock()))
+            self.alarms.engine.set_zones(zones, self._clock(), self._wall_clock())
             changed = True
         if changed:
             self._broadcast("zones", encode("zones", self._zone_fields()))
@@ -393,14 +410,27 @@ class LiveSite:
 
     def _schedule(self, events: list[ZoneEvent]) -> None:
         if events:
-            dashboards = [status for (kind, _), status in self.state.statuses.items() if kind == "dashboard"]
-            self.events.schedule(events, publisher_rank(self.name, dashboards), self._clock())
+            self.alarms.engine.on_zone_events(events, self._clock(), self._wall_clock())
+            self.events.schedule(events, publisher_rank(self.name, list(self._dashboards.values())), self._clock())
 
     def _publish_events(self, now_s: float) -> None:
         for event in self.events.pop_due(now_s):
             self._broadcast_event(event)
             if self._link is not None and self._site_id is not None:
                 self._link.publish(topics.zone_event_topic(self._site_id, event.zone), event, qos=1)
+
+    # Alarms
+
+    def store_alarm_rules(self, rules: Sequence[AlarmRule], site: str = "") -> None:
+        """Store the rules that a page has made at the site of this name. Raises BadAlarmRulesError."""
+        self.alarms.store_rules(rules, site)
+
+    def acknowledge(self, rule: str, subject: str, occurrence: str, by: str) -> None:
+        """Acknowledge an alarm. Raises NoAlarmError and NoBrokerError."""
+        link, site_id = self._connected()
+        message = self.alarms.acknowledge(rule, subject, occurrence, by, self._wall_clock())
+        if message is not None:
+            link.publish(topics.acknowledge_topic(site_id, rule, subject), message, qos=1)
 
     # Survey
 
@@ -459,7 +489,7 @@ class LiveSite:
             page.replace("floor_plan", self._floor_plan_message())
         if self._sites is not None:
             page.replace("sites", self._sites)
-        for kind, message in self.survey.messages().items():
+        for kind, message in (self.survey.messages() | self.alarms.encoded()).items():
             page.replace(kind, message)
         self.pages.add(page)
         return page
@@ -506,6 +536,7 @@ class LiveSite:
             for page in [page for page in self.pages if now_s - page.active_s > GONE_S]:
                 self._close_idle(page)
         self._publish_events(now_s)
+        self.alarms.tick(now_s, unix_s, self._dashboards.values(), blind=self._condition_monitor.is_blind(now_s))
         if now_s >= self._condition_due_s:
             self._evaluate(now_s)
         self._send_logged()
@@ -518,11 +549,16 @@ class LiveSite:
             now_s, self._lag_s, watch, self.survey.watch_age_s, used_share, unread_s
         )
         self._lag_s = 0.0
-        self.state.judge(now_s, blind=self._condition_monitor.is_blind(now_s))
+        blind = self._condition_monitor.is_blind(now_s)
+        self.state.judge(now_s, blind=blind)
+        offline = None if blind else offline_anchors(self.evidence, now_s)
+        age_s = self.survey.watch_age_s
+        fresh = watch if age_s is not None and age_s < _WATCH_FRESH_S else None
+        self.alarms.engine.on_anchors(offline, fresh, now_s, self._wall_clock())
         self.log.on_watch(watch, now_s)
         self.log.on_survey(self.survey.survey, now_s)
         self.log.on_condition(self.condition, now_s)
-        (self.log.pause if self._condition_monitor.is_blind(now_s) else self.log.tick)(now_s)
+        (self.log.pause if blind else self.log.tick)(now_s)
         self._broadcast("condition", self._condition_message())
         # Of very many tags it takes longer, and the messages are to be read as well.
         self._condition_due_s = now_s + max(EVALUATION_S, _EVALUATION_SHARE * (self._clock() - now_s))
@@ -573,7 +609,7 @@ def _floor_of(topic: str) -> int | None:
 
 def _qos(topic: str) -> int:
     """Messages that are sent once only must not be lost."""
-    return 1 if "/zone" in topic or "/survey/" in topic else 0
+    return 1 if any(part in topic for part in ("/zone", "/survey/", "/alarm")) else 0
 
 
 def _check_name(name: str, topic: str) -> None:

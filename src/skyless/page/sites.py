@@ -7,9 +7,11 @@ import asyncio
 from collections.abc import Callable
 
 from skyless.page.live import LiveSite, NoSiteError
+from skyless.run.alarms.engine import MAX_KEPT
 from skyless.run.find_site import SiteOnBroker, watch_sites
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.outbox import Limits
 
 
 class LiveSites:
@@ -80,7 +82,7 @@ class LiveSites:
         async with asyncio.TaskGroup() as tasks:
 
             def connect(live: LiveSite, number: int) -> None:
-                link = Link(address, live.name, site=number, kind="dashboard")
+                link = Link(address, live.name, site=number, kind="dashboard", limits=Limits(topics=2 * MAX_KEPT))
                 link.on_state.append(live.on_connection)
                 live.attach(link, number)
                 tasks.create_task(link.run())

@@ -141,7 +141,7 @@ class AnchorNode:
                 self._fault = fault
                 self._log(f"anchor {self.id}: a survey's positions are ignored: {fault}")
             return False
-        self.site = replace(message.site, outline_m=self.site.outline_m)
+        self.site = replace(message.site, outline_m=self.site.outline_m, alarms=self.site.alarms)
         self.machine.place(self.site)
         self._log(f"anchor {self.id}: positions and antenna delays of the survey adopted ({offered})")
         return True

@@ -311,6 +311,32 @@ def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
     if evidence.site is None:
         return
     names = evidence.site_anchors()
+    offline, cut_off, idle = _anchors(evidence, now_s)
+    if offline:
+        which = f"all {len(names)} anchors are" if len(offline) == len(names) else ""
+        which = which or f"{listed('anchor', offline)} of {len(names)} {verb(offline, 'is', 'are')}"
+        advice = "See whether power and program run there; positions are less accurate without them."
+        too_few = len(names) - len(offline) < _MIN_ANCHORS
+        yield of_anchors("anchors", "bad" if too_few else "warning", f"{which} offline", advice, offline)
+    if cut_off:
+        text = f"{listed('anchor', cut_off)} {verb(cut_off, 'does', 'do')} not report, though on the air"
+        advice = "The program has lost the broker, or the page lost its messages: see its log."
+        yield of_anchors("silent-anchors", "warning", text, advice, cut_off)
+    if idle:
+        text = f"{listed('anchor', idle)} {verb(idle, 'is', 'are')} not synchronised and sends nothing"
+        text = text if len(idle) == 1 else text.replace("sends", "send")
+        advice = "Too few messages of the others arrive there: see what blocks them."
+        yield of_anchors("not-synchronised", "warning", text, advice, idle)
+
+
+def offline_anchors(evidence: Evidence, now_s: float) -> list[str] | None:
+    """Anchors of the site that are offline, or None while nothing can be known of them yet."""
+    return None if evidence.site is None or evidence.in_grace(now_s) else _anchors(evidence, now_s)[0]
+
+
+def _anchors(evidence: Evidence, now_s: float) -> tuple[list[str], list[str], list[str]]:
+    """Anchors of the site that are offline, those only cut off from the broker, and those not synchronised."""
+    names = evidence.site_anchors()
     offline: list[str] = []
     cut_off: list[str] = []
     idle: list[str] = []
@@ -327,21 +353,7 @@ def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
         elif node.since_s is not None or not evidence.in_grace(now_s):  # else an old status, kept by the broker
             offline.append(name)
     unseen = len(offline) == len(names) and all(node.since_s is None for _, node in evidence.of("anchor"))
-    if offline and not (unseen and now_s - evidence.ready_s < START_S):
-        which = f"all {len(names)} anchors are" if len(offline) == len(names) else ""
-        which = which or f"{listed('anchor', offline)} of {len(names)} {verb(offline, 'is', 'are')}"
-        advice = "See whether power and program run there; positions are less accurate without them."
-        too_few = len(names) - len(offline) < _MIN_ANCHORS
-        yield of_anchors("anchors", "bad" if too_few else "warning", f"{which} offline", advice, offline)
-    if cut_off:
-        text = f"{listed('anchor', cut_off)} {verb(cut_off, 'does', 'do')} not report, though on the air"
-        advice = "The program has lost the broker, or the page lost its messages: see its log."
-        yield of_anchors("silent-anchors", "warning", text, advice, cut_off)
-    if idle:
-        text = f"{listed('anchor', idle)} {verb(idle, 'is', 'are')} not synchronised and sends nothing"
-        text = text if len(idle) == 1 else text.replace("sends", "send")
-        advice = "Too few messages of the others arrive there: see what blocks them."
-        yield of_anchors("not-synchronised", "warning", text, advice, idle)
+    return [] if unseen and now_s - evidence.ready_s < START_S else offline, cut_off, idle
 
 
 def _is_idle(health: AnchorHealth) -> bool:

@@ -25,12 +25,15 @@ from skyless.page.condition._reasons import (
     left_out_reason,
     master_reason,
     multipath_reason,
+    offline_anchors,
     rank,
     slow_reason,
     watch_reasons,
 )
 from skyless.page.condition.evidence import FRESH_S, Evidence
 from skyless.run.mqtt.messages import WatchMessage
+
+__all__ = ["Condition", "ConditionMonitor", "offline_anchors"]
 
 EVALUATION_S: Final = 0.5
 """Interval of the evaluations."""

@@ -32,7 +32,7 @@ class SiteMessage(Struct, frozen=True):
     """The site as in its file, retained, so that a new tag or page has it at once."""
 
     site: Site
-    """Without its outline and floors, which earlier versions refuse in it."""
+    """Without its outline, floors and rules of alarms, which earlier versions refuse in it."""
     simulated: bool
     """True when its radios are emulated."""
     unix_s: float
@@ -46,13 +46,14 @@ class SiteMessage(Struct, frozen=True):
     @property
     def whole_site(self) -> Site:
         """The site as in its file."""
-        return replace(self.site, outline_m=self.outline_m, floors=self.floors)
+        return replace(self.site, outline_m=self.outline_m, floors=self.floors, alarms=self.alarms or UNSET)
 
 
 def site_message(site: Site, *, simulated: bool, unix_s: float) -> SiteMessage:
-    """The message of a site: its outline and its floors stand beside it."""
-    inner = replace(site, outline_m=UNSET, floors=UNSET)
-    return SiteMessage(inner, simulated, unix_s, site.outline_m, site.floors)
+    """The message of a site: its outline, floors and rules of alarms stand beside it."""
+    inner = replace(site, outline_m=UNSET, floors=UNSET, alarms=UNSET)
+    alarms = () if site.alarms is UNSET else site.alarms
+    return SiteMessage(inner, simulated, unix_s, site.outline_m, site.floors, alarms)
 
 
 class StatusMessage(Struct, frozen=True):
@@ -569,7 +570,7 @@ class AlarmMessage(Struct, frozen=True):
     kind: RuleKind
     severity: Severity
     subject: str
-    """What it is about: ``<tag>``, ``<tag>+<tag>``, ``zone-<id>`` or ``anchor-<id>``."""
+    """What it is about: ``<tag>``, ``<tag>~<tag>``, ``zone-<id>`` or ``anchor-<id>``."""
     since_unix_s: float
     """When the condition began to hold."""
     unix_s: float

@@ -430,7 +430,9 @@ class SurveyNode:
         if old is not None and site_digest(old.site) == site_digest(before):
             earlier = (old.before, *old.earlier)[:_EARLIER_KEPT]
         unix_s = time.time()
-        self._placement = PlacementMessage(unix_s, site_digest(before), replace(saved.site, outline_m=UNSET), earlier)
+        self._placement = PlacementMessage(
+            unix_s, site_digest(before), replace(saved.site, outline_m=UNSET, alarms=UNSET), earlier
+        )
         if self.link is not None:
             self.link.publish(placement_topic(self._settings.site_id), self._placement, qos=1, retain=True)
         self._running = None  # until the anchors publish it

@@ -20,6 +20,7 @@ from skyless.core.constants import TICK_BITS, TICK_S
 from skyless.core.errors import ConfigurationError
 from skyless.core.protocol1.schedule import Schedule, first_slots, schedule_of
 from skyless.core.site import AnchorSite, Site, UnplacedAnchor
+from skyless.site.alarm_rules import KINDS, BadAlarmRulesError, check_rules
 
 ANY_ADDRESS: Final = 65_533
 """Highest identifier on the air; 65534 means "no short address" and 65535 is broadcast in IEEE 802.15.4."""
@@ -127,6 +128,14 @@ _OTHERS: Final = {
     "name": "a text",
     "anchors": "a list of [[anchors]] tables, one for each anchor",
     "walls": "a list of [[walls]] tables",
+    "alarms": "a list of [[alarms]] tables",
+    "alarms.id": "a text of 1 to 32 letters, digits, dashes and underscores",
+    "alarms.kind": f"one of {', '.join(KINDS)}",
+    "alarms.severity": "info, warning or critical",
+    "alarms.tags": "a list of tags' names and of group:NAME",
+    "alarms.others": "a list of tags' names and of group:NAME",
+    **dict.fromkeys(("alarms.name", "alarms.zone", "alarms.hours"), "a text"),
+    **dict.fromkeys(("alarms.limit", "alarms.hysteresis", "alarms.after_s", "alarms.clear_after_s"), "a number"),
     "outline_m": f"the room's {_FEWEST_CORNERS} to {_MAX_CORNERS} corners in order, [x, y] each in metres",
     "floors": "a list of [[floors]] tables, the lowest floor first",
     "floors.name": "a text",
@@ -160,7 +169,7 @@ def check_site(site: Site, file: Path) -> None:
     if not site.name.strip():
         raise ConfigurationError(file, "name", site.name, "a text of at least one character")
     limits = SITE_LIMITS if site.schedule.needs_master else {**SITE_LIMITS, **PROTOCOL_2_LIMITS}
-    for key, row, value in _numbers(replace(site, outline_m=UNSET)):
+    for key, row, value in _numbers(replace(site, outline_m=UNSET, alarms=UNSET)):
         name, _, field = key.partition(".")
         limit = limits[f"anchors.{field}" if name == "unplaced" else key]
         if not limit.contains(value):
@@ -168,6 +177,7 @@ def check_site(site: Site, file: Path) -> None:
             raise ConfigurationError(file, _with_anchor(path, site), value, str(limit))
     _check_outline(site, file)
     _check_floors(site, file)
+    _check_alarms(site, file)
     _check_anchors(site, file)
     if site.schedule.needs_master:
         _check_slots(site, file)
@@ -277,6 +287,14 @@ def _check_outline(site: Site, file: Path) -> None:
         raise ConfigurationError(file, "outline_m", f"sides {one} and {other}", right)
     if abs(area(outline_m)) < _CLOSEST_M:
         raise ConfigurationError(file, "outline_m", "corners in one line", expected("outline_m"))
+
+
+def _check_alarms(site: Site, file: Path) -> None:
+    try:
+        check_rules(() if site.alarms is UNSET else site.alarms)
+    except BadAlarmRulesError as error:
+        key = "alarms" if error.row is None else f"alarms[{error.row}].{error.key} (rule {error.rule[:40]})"
+        raise ConfigurationError(file, key, error.value, error.expected) from None
 
 
 def _check_anchors(site: Site, file: Path) -> None:

@@ -9,6 +9,7 @@ from typing import Any, Final
 import msgspec
 from msgspec import Struct
 
+from skyless.core.alarm_rule import AlarmRule
 from skyless.core.arguments import existing_file, wrong
 from skyless.core.errors import ConfigurationError
 from skyless.core.site import (
@@ -38,7 +39,12 @@ _TABLES: Final[dict[str, type[Struct]]] = {
     "floor_plan": FloorPlanSite,
     "georeference": GeoreferenceSite,
 }
-_LISTS: Final[dict[str, type[Struct]]] = {"anchors": AnchorSite, "walls": WallSite, "floors": FloorSite}
+_LISTS: Final[dict[str, type[Struct]]] = {
+    "anchors": AnchorSite,
+    "walls": WallSite,
+    "floors": FloorSite,
+    "alarms": AlarmRule,
+}
 
 _FINDING = re.compile(r"(?P<finding>.*?)(?: - at `\$\.?(?P<path>.*)`)?", re.DOTALL)
 _MISSING = re.compile(r"Object missing required field `(?P<name>\w+)`")

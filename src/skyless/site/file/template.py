@@ -6,6 +6,7 @@ from typing import Final
 
 from msgspec import UNSET, structs
 
+from skyless.core.alarm_rule import AlarmRule
 from skyless.core.site import (
     AnchorSite,
     FloorPlanSite,
@@ -133,6 +134,12 @@ loss_db = {loss_db}
 delay_m = {delay_m}
 """
 
+_ALARMS = """
+# Rules that raise alarms; one table for each (docs/howto/alarms.md).
+{rules}"""
+
+_EXAMPLE_RULE = AlarmRule("silent", "silent", after_s=60.0)
+
 _FLOOR_PLAN = """
 # An image of the floor behind the map.
 {off}[floor_plan]
@@ -237,6 +244,7 @@ def _tail(site: Site) -> str:
     image = json.dumps(plan.image, ensure_ascii=False)
     return (
         (_WALLS + walls if walls else _NO_WALLS)
+        + _ALARMS.format(rules="\n".join(map(_rule, site.alarms)) if site.alarms else _rule(_EXAMPLE_RULE, "# "))
         + _FLOOR_PLAN.format(**{**structs.asdict(plan), "image": image}, off=_off(site.floor_plan is not None))
         + _floors(site)
         + _GEOREFERENCE.format(**structs.asdict(earth), off=_off(site.georeference is not None))
@@ -253,6 +261,14 @@ def _floor(floor: FloorSite, off: str) -> str:
     texts = {key: json.dumps(getattr(floor, key), ensure_ascii=False) for key in ("name", "image")}
     table = _FLOOR.format(**{**structs.asdict(floor), **texts}, off=off)
     return table if floor.image is not None else "".join(table.splitlines(keepends=True)[:4])
+
+
+def _rule(rule: AlarmRule, off: str = "") -> str:
+    """The table of a rule, with the keys that are not at their defaults."""
+    values = {key: value for key, value in structs.asdict(rule).items() if value not in (None, "", ())}
+    usual = {field.name: field.default for field in structs.fields(AlarmRule)}
+    lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in values.items() if value != usual[key]]
+    return "".join(f"{off}{line}\n" for line in ("[[alarms]]", *lines))
 
 
 def rectangle(width_m: float, depth_m: float) -> Outline:

@@ -1,0 +1,208 @@
+"""Messages about alarms on their way to one receiver: each is tried until it is accepted, refused or too old.
+
+Attempts block and run in a thread of their own, one at a time. A receiver that hangs, refuses or is slow delays nothing
+but its own messages.
+"""
+
+import asyncio
+import contextlib
+import os
+import random
+import socket
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, Literal
+
+from msgspec import Struct
+
+from skyless.bridges.target import BridgedSite, Target
+from skyless.core.errors import SkylessError
+from skyless.run.mqtt.messages import AlarmMessage
+
+MAX_WAITING: Final = 1000
+"""Messages that wait. Beyond it the oldest is dropped."""
+
+TIMEOUT_S: Final = 10.0
+"""For each attempt, all of it."""
+
+FIRST_PAUSE_S: Final = 1.0
+LONGEST_PAUSE_S: Final = 300.0
+KEPT_S: Final = 86_400.0
+"""A message that has not been delivered for this long is dropped."""
+
+_MAX_KNOWN: Final = 10_000
+_MAX_SECRET_BYTES: Final = 4096
+_OTHERS: Final = 0o077
+
+What = Literal["raised", "ended", "acknowledged"]
+
+
+class RefusedError(Exception):
+    """The receiver will never accept this message."""
+
+
+class Delivery(Struct, frozen=True):
+    """What has become of an alarm."""
+
+    what: What
+    alarm: AlarmMessage
+
+    @property
+    def key(self) -> str:
+        """The same for each attempt, also of another run of the bridge."""
+        return f"{self.alarm.id}/{self.what}"
+
+
+Open = Callable[[socket.socket], None]
+"""To be called with the socket of an attempt, which is closed when its time is over."""
+
+
+class _Waiting(Struct):
+    delivery: Delivery
+    since_s: float
+    due_s: float
+    pause_s: float
+
+
+class AlarmTarget(Target):
+    """Base of targets that get what becomes of alarms. ``attempt`` is called in a thread."""
+
+    def __init__(self, text: str, log: Callable[[str], None], kinds: frozenset[What]) -> None:
+        """``kinds`` are those that are delivered."""
+        super().__init__(text)
+        self.site: BridgedSite | None = None
+        self.delivered = 0
+        self._log, self._kinds = log, kinds
+        self._waiting: list[_Waiting] = []
+        self._known: OrderedDict[str, AlarmMessage] = OrderedDict()
+        self._started_unix_s = time.time()
+        self._trouble = ""
+        self._wake = asyncio.Event()
+
+    def attempt(self, delivery: Delivery, on_open: Open) -> None:
+        """Deliver. Raises RefusedError where it makes no sense to try again, and OSError where it does."""
+        raise NotImplementedError
+
+    def on_site(self, site: BridgedSite) -> None:
+        self.site = site
+
+    def on_alarm(self, alarm: AlarmMessage) -> None:
+        """An alarm as it is now. Of those from before the start, only active ones that nobody has seen are new."""
+        before = self._known.pop(alarm.id, None)
+        self._known[alarm.id] = alarm
+        if len(self._known) > _MAX_KNOWN:
+            self._known.popitem(last=False)
+        is_open = alarm.ended_unix_s is None and alarm.acknowledged_unix_s is None
+        if before is None and not is_open and alarm.unix_s < self._started_unix_s:
+            return
+        if before is None:
+            self._add("raised", alarm)
+        if alarm.acknowledged_unix_s is not None and (before is None or before.acknowledged_unix_s is None):
+            self._add("acknowledged", alarm)
+        if alarm.ended_unix_s is not None and (before is None or before.ended_unix_s is None):
+            self._add("ended", alarm)
+
+    def _add(self, what: What, alarm: AlarmMessage) -> None:
+        if what not in self._kinds:
+            return
+        now_s = time.monotonic()
+        self._waiting.append(_Waiting(Delivery(what, alarm), now_s, now_s, FIRST_PAUSE_S))
+        if len(self._waiting) > MAX_WAITING:
+            del self._waiting[0]
+            self.dropped["too-many"] += 1
+        self._wake.set()
+
+    async def run(self) -> None:
+        """Deliver until cancelled."""
+        while True:
+            self._wake.clear()
+            now_s = time.monotonic()
+            for old in [one for one in self._waiting if now_s - one.since_s > KEPT_S]:
+                self._waiting.remove(old)
+                self.dropped["too-old"] += 1
+            first = self._next()
+            if first is None or first.due_s > now_s:
+                wait_s = None if first is None else first.due_s - now_s
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._wake.wait(), wait_s)
+                continue
+            await self._try(first)
+
+    def _next(self) -> _Waiting | None:
+        """The message whose turn comes first. Those about one alarm keep their order."""
+        firsts: dict[str, _Waiting] = {}
+        for one in self._waiting:
+            firsts.setdefault(one.delivery.alarm.id, one)
+        return min(firsts.values(), key=lambda one: one.due_s, default=None)
+
+    async def _try(self, one: _Waiting) -> None:
+        try:
+            await _in_thread(lambda on_open: self.attempt(one.delivery, on_open))
+        except RefusedError as error:
+            self.dropped["refused"] += 1
+            self._report(f"refused: {error}")
+        except Exception as error:  # noqa: BLE001 - whatever it is, it is tried again
+            self._report(f"cannot be reached: {error or type(error).__name__}")
+            one.due_s = time.monotonic() + one.pause_s * random.uniform(0.5, 1.0)
+            one.pause_s = min(2.0 * one.pause_s, LONGEST_PAUSE_S)
+            return
+        else:
+            self.delivered += 1
+            self._report("")
+        if one in self._waiting:  # it may have been dropped meanwhile
+            self._waiting.remove(one)
+
+    def _report(self, trouble: str) -> None:
+        """Log a trouble when it begins and when it is over."""
+        if trouble != self._trouble:
+            self._trouble = trouble
+            self._log(f"{self.text}: {trouble or 'delivered again'}")
+
+
+async def _in_thread(work: Callable[[Open], None]) -> None:
+    """Run what blocks in a thread that the end of the program does not wait for, for at most ``TIMEOUT_S``."""
+    loop = asyncio.get_running_loop()
+    done: asyncio.Future[None] = loop.create_future()
+    sockets: list[socket.socket] = []
+
+    def finish(error: Exception | None) -> None:
+        if not done.done():
+            done.set_result(None) if error is None else done.set_exception(error)
+
+    def run() -> None:
+        fault: Exception | None = None
+        try:
+            work(sockets.append)
+        except Exception as error:  # noqa: BLE001 - the caller decides
+            fault = error
+        with contextlib.suppress(RuntimeError):  # the loop is closed
+            loop.call_soon_threadsafe(finish, fault)
+
+    threading.Thread(target=run, daemon=True, name="skyless-delivery").start()
+    try:
+        async with asyncio.timeout(TIMEOUT_S):
+            await done
+    except TimeoutError:
+        raise TimeoutError(f"no answer within {TIMEOUT_S:g} s") from None
+    finally:
+        for one in sockets if not done.done() or done.cancelled() else ():
+            with contextlib.suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)  # which ends the thread
+
+
+def read_secret(text: str, key: str, name: str) -> str:
+    """The first line of a file that only its owner may read. Raises SkylessError."""
+    path = Path(name)
+    try:
+        with path.open("rb") as file:
+            mode = os.fstat(file.fileno()).st_mode & 0o777
+            secret = file.read(_MAX_SECRET_BYTES).decode(errors="replace").partition("\n")[0].strip()
+    except OSError as error:
+        raise SkylessError(f"the target {text!r} has {key}={name}, which cannot be read: {error.strerror}") from None
+    if mode & _OTHERS or not secret:
+        right = "a line of text" if not secret else f"readable by its owner only: chmod 600 {path}"
+        raise SkylessError(f"the target {text!r} has {key}={name}, which has mode {mode:03o}; it should be {right}")
+    return secret

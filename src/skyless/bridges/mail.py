@@ -1,0 +1,95 @@
+"""``smtp://[USER@]HOST:PORT?to=…&from=…`` and ``smtps:``: a mail when an alarm is raised, and one when it has ended."""
+
+import re
+import smtplib
+import ssl
+import time
+from email.message import EmailMessage
+from email.utils import formatdate
+from hashlib import sha256
+from typing import Final
+
+from skyless.bridges._deliveries import TIMEOUT_S, AlarmTarget, Delivery, Open, RefusedError, read_secret
+from skyless.bridges.target import BridgeContext, TargetUrl
+from skyless.bridges.webhook import is_loopback
+
+_ADDRESS: Final = re.compile(r"[^\s@,<>]+@[^\s@,<>]+")
+_ENCRYPTED: Final = "smtps: or ?starttls, as a password is given"
+
+
+class Mail(AlarmTarget):
+    """Sends mails to one or more people over one server."""
+
+    def __init__(self, url: TargetUrl, context: BridgeContext) -> None:
+        super().__init__(url.text, context.log, frozenset({"raised", "ended"}))
+        self._host, user = url.host(""), url.netloc().rpartition("@")[0]
+        self._is_tls = url.scheme == "smtps"
+        self._port = url.port(465 if self._is_tls else 25)
+        self._starts_tls = not self._is_tls and url.has("starttls")
+        self._to = url.text_option("to").replace(" ", "").split(",")
+        self._from = url.text_option("from") or self._to[0]
+        name = url.text_option("password_file")
+        if not self._host or ":" in user:
+            raise url.wrong(f"{url.scheme}://[USER@]HOST:PORT?to=NAME@HOST; password_file=FILE has the password")
+        for address in (*self._to, self._from):
+            if not _ADDRESS.fullmatch(address):
+                raise url.wrong(f"with to= and from= as NAME@HOST, several to= with commas; {address!r} is none")
+        if name and not user:
+            raise url.wrong(f"{url.scheme}://USER@HOST, as a password is given")
+        if name and not (self._is_tls or self._starts_tls or is_loopback(self._host)):
+            raise url.wrong(_ENCRYPTED)
+        self._user, self._password = user, read_secret(url.text, "password_file", name) if name else ""
+
+    def attempt(self, delivery: Delivery, on_open: Open) -> None:
+        """Send once."""
+        context = ssl.create_default_context()
+        server: smtplib.SMTP
+        if self._is_tls:
+            server = smtplib.SMTP_SSL(self._host, self._port, timeout=TIMEOUT_S, context=context)
+        else:
+            server = smtplib.SMTP(self._host, self._port, timeout=TIMEOUT_S)
+        try:
+            with server:
+                if server.sock is not None:
+                    on_open(server.sock)
+                if self._starts_tls:
+                    server.starttls(context=context)
+                if self._user:
+                    server.login(self._user, self._password)
+                server.send_message(self._mail(delivery))
+        except smtplib.SMTPRecipientsRefused as error:
+            _refuse(error, *(code for code, _ in error.recipients.values()))
+        except smtplib.SMTPAuthenticationError:
+            raise ConnectionError("the server does not accept user and password") from None
+        except smtplib.SMTPResponseException as error:
+            _refuse(error, error.smtp_code)
+
+    def _mail(self, delivery: Delivery) -> EmailMessage:
+        alarm, site = delivery.alarm, self.site
+        where = "" if site is None else site.name
+        mail = EmailMessage()
+        ended = "" if delivery.what == "raised" else "ended: "
+        mail["Subject"] = " ".join(f"{ended}{alarm.name} [{alarm.severity}] {where}".split())[:200]
+        mail["From"], mail["To"] = self._from, ", ".join(self._to)
+        mail["Date"] = formatdate(localtime=True)
+        mail["Message-ID"] = f"<{sha256(delivery.key.encode()).hexdigest()[:32]}@skyless>"
+        mail["Auto-Submitted"] = "auto-generated"
+        times = {"Since": alarm.since_unix_s, "Raised": alarm.unix_s, "Ended": alarm.ended_unix_s}
+        facts = {"Site": where, "Place": alarm.place, "Severity": alarm.severity}
+        facts |= {name: time.strftime("%Y-%m-%d %H:%M:%S %Z", time.localtime(at)) for name, at in times.items() if at}
+        lines = (f"{name}: {value}" for name, value in facts.items() if value)
+        simulated = "\nThis site is simulated.\n" if site is not None and site.simulated else ""
+        mail.set_content(f"{alarm.sentence}.\n\n" + "\n".join(lines) + f"\n{simulated}\n{alarm.id}\n")
+        return mail
+
+
+def _refuse(error: Exception, *codes: int) -> None:
+    """Raise RefusedError where no code says that a later attempt may succeed, else the error itself."""
+    if codes and all(code >= 500 for code in codes):
+        raise RefusedError(str(error)[:200]) from None
+    raise ConnectionError(str(error)[:200]) from None
+
+
+def make_target(url: TargetUrl, context: BridgeContext) -> Mail:
+    """The target of an address. Raises SkylessError."""
+    return Mail(url, context)

@@ -1,0 +1,1 @@
+"""Alarms: which rules are raised, for whom, and when they end."""

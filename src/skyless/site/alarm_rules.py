@@ -1,0 +1,161 @@
+"""Rules of alarms: what a valid one is, and the hours in which it holds."""
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+from msgspec import Struct
+
+from skyless.core.alarm_rule import AlarmRule
+
+MAX_RULES: Final = 200
+GROUP: Final = "group:"
+"""What stands before the name of a group of assets in ``tags`` and ``others``."""
+
+_MAX_WHO: Final = 1000
+_MAX_S: Final = 30 * 86400.0
+_GROUP: Final = re.compile(rf"{GROUP}[^\x00-\x1f]{{1,100}}")
+_ID: Final = re.compile(r"[A-Za-z0-9_-]{1,32}")
+_ZONE: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+_DAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+_DAY_MIN: Final = 24 * 60
+_WEEK_MIN: Final = 7 * _DAY_MIN
+_HOURS: Final = re.compile(
+    r"(?:(?P<first>[a-z]{3})(?:\s*-\s*(?P<last>[a-z]{3}))?)?\s*"
+    r"(?:(?P<h1>\d{1,2}):(?P<m1>\d\d)\s*-\s*(?P<h2>\d{1,2}):(?P<m2>\d\d))?"
+)
+_RIGHT_HOURS: Final = "days or times or both, as mon-fri 06:00-22:00, sat 08:00-12:00 (mon to sun, 00:00 to 24:00)"
+
+KINDS: Final = {
+    "inside": "tags zone",
+    "outside": "tags zone",
+    "silent": "tags",
+    "near": "tags others limit hysteresis",
+    "crowded": "tags zone limit hysteresis",
+    "anchor-offline": "",
+    "anchor-moved": "",
+    "protection-level": "tags limit hysteresis",
+    "battery": "tags limit hysteresis",
+}
+"""The keys that each kind of rule has in addition to those of all."""
+
+_LIMITS: Final = {
+    "near": (0.1, 1000.0, "a distance in metres from 0.1 to 1000"),
+    "crowded": (0.0, 1e6, "the most tags allowed, a whole number from 0"),
+    "protection-level": (0.01, 1000.0, "a number of metres from 0.01 to 1000"),
+    "battery": (0.0, 1.0, "a share from 0 to 1"),
+}
+_SHORTEST_SILENCE_S: Final = 1.0
+
+
+class BadAlarmRulesError(ValueError):
+    """What is wrong with a list of rules."""
+
+    def __init__(self, row: int | None, rule: str, key: str, value: object, expected: str) -> None:
+        """``row`` is the rule's place in the list from 0, or None where the list as a whole is wrong."""
+        self.row, self.rule, self.key, self.value, self.expected = row, rule, key, value, expected
+        where = "the rules of alarms" if row is None else f"alarm rule {rule[:40]!r}"
+        found = "is missing" if value is None else f"is {str(value)[:60]!r}"
+        super().__init__(f"{where}: {key} {found}; it should be {expected}")
+
+
+class Hours(Struct, frozen=True):
+    """When a rule holds: parts of the week, in minutes since Monday, 00:00."""
+
+    parts: tuple[tuple[int, int], ...] = ()
+    """Begin and end of each; an end beyond the week goes on at its begin. Empty means always."""
+
+    def contain(self, weekday: int, minute: int) -> bool:
+        """Whether a time is within them; ``weekday`` counts from Monday, 0, ``minute`` from midnight."""
+        at = weekday * _DAY_MIN + minute
+        return not self.parts or any(begin <= at < end or at + _WEEK_MIN < end for begin, end in self.parts)
+
+
+def read_hours(text: str) -> Hours:
+    """The hours that a text describes. A range over midnight belongs to the day on which it begins.
+
+    Raises:
+        ValueError: the text describes none; its message says what would be right.
+    """
+    parts = [] if not text.strip() else [part for piece in text.lower().split(",") for part in _parts(piece.strip())]
+    return Hours(tuple(parts))
+
+
+def _parts(piece: str) -> Iterator[tuple[int, int]]:
+    match = _HOURS.fullmatch(piece)
+    if match is None or not piece:
+        raise ValueError(_RIGHT_HOURS)
+    first, last = match["first"] or "mon", match["last"] or match["first"] or "sun"
+    if first not in _DAYS or last not in _DAYS:
+        raise ValueError(_RIGHT_HOURS)
+    begin, end = (
+        (0, _DAY_MIN)
+        if match["h1"] is None
+        else (_minutes(match["h1"], match["m1"]), _minutes(match["h2"], match["m2"]))
+    )
+    if begin in (end, _DAY_MIN):
+        raise ValueError(_RIGHT_HOURS)
+    day, count = _DAYS.index(first), (_DAYS.index(last) - _DAYS.index(first)) % 7 + 1
+    for number in range(day, day + count):
+        start = number % 7 * _DAY_MIN + begin
+        yield start, start + ((end - begin) % _DAY_MIN or _DAY_MIN)
+
+
+def _minutes(hours: str, minutes: str) -> int:
+    total = 60 * int(hours) + int(minutes)
+    if int(minutes) > 59 or total > _DAY_MIN:
+        raise ValueError(_RIGHT_HOURS)
+    return total
+
+
+def check_rules(rules: Sequence[AlarmRule], others: Sequence[AlarmRule] = ()) -> None:
+    """Check rules; no identifier may be one of ``others``. Raises BadAlarmRulesError."""
+    if len(rules) > MAX_RULES:
+        raise BadAlarmRulesError(None, "", "their number", len(rules), f"at most {MAX_RULES}")
+    known = {rule.id for rule in others}
+    for row, rule in enumerate(rules):
+        for key, value, expected in _faults(rule):
+            raise BadAlarmRulesError(row, rule.id, key, value, expected)
+        if rule.id in known:
+            raise BadAlarmRulesError(row, rule.id, "id", rule.id, "one that no other rule of the site has")
+        known.add(rule.id)
+
+
+def _faults(rule: AlarmRule) -> Iterator[tuple[str, object, str]]:
+    """What is wrong with a rule: key, value, and what would be right."""
+    if not _ID.fullmatch(rule.id):
+        yield "id", rule.id, "1 to 32 letters, digits, dashes and underscores"
+    if len(rule.name) > 100 or not rule.name.isprintable():
+        yield "name", rule.name, "a line of at most 100 characters"
+    yield from _faults_of_kind(rule)
+    for key, names in (("tags", rule.tags), ("others", rule.others)):
+        if len(names) > _MAX_WHO:
+            yield key, f"a list of {len(names)}", f"a list of at most {_MAX_WHO}"
+        for name in names:
+            if not _ID.fullmatch(name) and not _GROUP.fullmatch(name):
+                yield key, name, "a tag's name (1 to 32 letters, digits, - or _), or group:NAME of a group of assets"
+    least_s = _SHORTEST_SILENCE_S if rule.kind == "silent" else 0.0
+    for key, seconds, low_s in (("after_s", rule.after_s, least_s), ("clear_after_s", rule.clear_after_s, 0.0)):
+        if not low_s <= seconds <= _MAX_S:
+            yield key, seconds, f"a number of seconds from {low_s:g} to {_MAX_S:.0f}"
+    try:
+        read_hours(rule.hours)
+    except ValueError as error:
+        yield "hours", rule.hours, str(error)
+
+
+def _faults_of_kind(rule: AlarmRule) -> Iterator[tuple[str, object, str]]:
+    """Keys that its kind needs, and those that it does not have."""
+    keys = KINDS[rule.kind].split()
+    given = {key: getattr(rule, key) or None for key in ("tags", "others", "hysteresis")}
+    for key, value in (given | {"zone": rule.zone, "limit": rule.limit}).items():
+        if value is not None and key not in keys:
+            yield key, value, f"left out: it has no meaning for the kind {rule.kind}"
+    if "zone" in keys and (rule.zone is None or not _ZONE.fullmatch(rule.zone)):
+        yield "zone", rule.zone, "the id of a zone"
+    if "limit" in keys:
+        low, high, right = _LIMITS[rule.kind]
+        if rule.limit is None or not low <= rule.limit <= high or (rule.kind == "crowded" and rule.limit % 1):
+            yield "limit", rule.limit, right
+        if not 0.0 <= rule.hysteresis <= high:
+            yield "hysteresis", rule.hysteresis, f"a number from 0 to {high:g}"

@@ -1,0 +1,438 @@
+"""The engine: each kind of rule, hours, what is kept, groups, resuming, and near tags against all pairs."""
+
+import math
+import random
+import time
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skyless.core.alarm_rule import AlarmRule
+from skyless.core.alert import Alert
+from skyless.run.alarms import engine as engine_module
+from skyless.run.alarms.engine import CONFIRM_S, AlarmEngine, is_over
+from skyless.run.alarms.near import STOREY_M, NearTags
+from skyless.run.alarms.rules import Concerned
+from skyless.run.mqtt.messages import Asset, Counters, FixMessage, TagHealth, WatchFinding, WatchMessage, Zone
+from skyless.run.zones.monitor import ZoneMonitor
+
+HALL = Zone("hall", "Hall", ((0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 10.0)))
+IN, OUT = (5.0, 5.0), (15.0, 5.0)
+EPOCH_S = 1_795_000_000.0
+
+
+def fix(tag, at_s, place, *, z=1.0, **more):
+    variance = 1e-4
+    covariance = (variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance)
+    return FixMessage(
+        tag, 1, EPOCH_S + at_s, at_s, (*place, z), covariance, None, None, 0.01, 1.0, 1.0, 1.0, 1.0,
+        (1, 2, 3, 4), 1.0, 1, 0.01, "joint", False, 0.001, **more,
+    )  # fmt: skip
+
+
+class Site:
+    """An engine with its monitor; time goes on while tags send fixes where they are."""
+
+    def __init__(self, *rules, kept=(), assets=None, zones=(HALL,)):
+        self.now_s = 0.0
+        self.hour_shift_s = 0.0
+        self.places = {}
+        self.more = {}
+        self.blind = False
+        self.monitor = ZoneMonitor()
+        self.engine = AlarmEngine(self.monitor, lambda unix_s: time.gmtime(unix_s + self.hour_shift_s))
+        self.happened = []
+        if assets:
+            self.engine.set_assets({asset.tag: asset for asset in assets}, 0.0, EPOCH_S)
+        self.set_zones(zones)
+        self.engine.set_rules(rules, 0.0, EPOCH_S)
+        self.engine.resume(kept, 0.0, EPOCH_S)
+
+    @property
+    def unix_s(self):
+        return EPOCH_S + self.now_s
+
+    def set_zones(self, zones):
+        self.engine.on_zone_events(self.monitor.set_zones(zones, self.unix_s), self.now_s, self.unix_s)
+        self.engine.set_zones(zones, self.now_s, self.unix_s)
+
+    def run(self, seconds):
+        """Happenings of this time, as (what, rule, subject)."""
+        begin = len(self.happened)
+        for _ in range(round(seconds / 0.05)):
+            self.now_s += 0.05
+            for tag, place in self.places.items():
+                message = fix(
+                    tag, self.now_s, place[:2], z=place[2] if len(place) > 2 else 1.0, **self.more.get(tag, {})
+                )
+                self.engine.on_fix(message, self.now_s, self.unix_s)
+                self.engine.on_zone_events(self.monitor.update(message, self.now_s), self.now_s, self.unix_s)
+            events = self.monitor.expire_tags(self.now_s, self.unix_s)
+            self.engine.on_zone_events(events, self.now_s, self.unix_s)
+            self.happened += self.engine.tick(self.now_s, self.unix_s, blind=self.blind)
+        return [(what, one.rule, one.subject) for what, one in self.happened[begin:]]
+
+    def gone(self, tag):
+        del self.places[tag]
+        self.engine.on_tag_gone(tag)
+        self.engine.on_zone_events(self.monitor.remove_tag(tag, self.unix_s), self.now_s, self.unix_s)
+
+    @property
+    def last(self):
+        return self.happened[-1][1]
+
+
+def test_inside_is_raised_after_its_time_and_ends_after_its_time():
+    site = Site(AlarmRule("r", "inside", zone="hall", after_s=5.0, clear_after_s=2.0, name="Too long"))
+    site.places["t"] = IN
+    assert site.run(4.0) == []
+    assert site.run(2.0) == [("raised", "r", "t")]
+    alarm = site.last
+    assert (alarm.name, alarm.kind, alarm.severity, alarm.tags, alarm.zone) == (
+        "Too long",
+        "inside",
+        "warning",
+        ("t",),
+        "hall",
+    )
+    assert alarm.sentence == "t has been in Hall for 5 s"
+    assert (alarm.place, alarm.position_m) == ("Hall", (5.0, 5.0, 1.0))
+    assert alarm.unix_s - alarm.since_unix_s == pytest.approx(5.0, abs=0.06)
+    assert alarm.id == f"r/t/{round(1000 * alarm.unix_s)}"
+    site.places["t"] = OUT
+    assert site.run(1.9) == []
+    assert site.run(0.5) == [("ended", "r", "t")]
+    assert site.last.ended_unix_s == pytest.approx(site.unix_s, abs=0.6)
+
+
+def test_a_short_stay_and_a_short_absence_do_not_count():
+    site = Site(AlarmRule("r", "inside", zone="hall", after_s=5.0, clear_after_s=3.0))
+    for _ in range(3):
+        site.places["t"] = IN
+        assert site.run(4.0) == []
+        site.places["t"] = OUT
+        assert site.run(2.0) == []
+    site.places["t"] = IN
+    assert len(site.run(6.0)) == 1
+    for _ in range(3):
+        site.places["t"] = OUT
+        assert site.run(2.0) == []
+        site.places["t"] = IN
+        assert site.run(2.0) == []
+
+
+def test_outside_holds_for_a_tag_that_is_seen_elsewhere_and_not_for_one_that_is_not_seen():
+    site = Site(AlarmRule("r", "outside", zone="hall"))
+    site.places = {"a": IN, "b": OUT}
+    assert site.run(2.0) == [("raised", "r", "b")]
+    del site.places["a"]  # silent inside
+    del site.places["b"]  # silent outside: nobody knows that it has come back
+    assert site.run(10.0) == []
+    site.places["b"] = IN
+    assert site.run(3.0) == [("ended", "r", "b")]
+    site.gone("b")
+    assert site.run(5.0) == []
+
+
+def test_outside_of_a_zone_that_is_not_drawn_is_nobody():
+    site = Site(AlarmRule("r", "outside", zone="hall"), zones=())
+    site.places["t"] = OUT
+    assert site.run(5.0) == []
+    site.set_zones((HALL,))
+    assert site.run(2.0) == [("raised", "r", "t")]
+    site.set_zones(())
+    assert site.run(3.0) == [("ended", "r", "t")]
+
+
+def test_silent_tags_those_named_and_those_heard():
+    site = Site(AlarmRule("all", "silent", after_s=4.0), AlarmRule("one", "silent", after_s=6.0, tags=("never",)))
+    site.places = {"a": IN, "b": IN}
+    assert site.run(5.0) == []
+    del site.places["a"]
+    assert set(site.run(5.0)) == {("raised", "one", "never"), ("raised", "all", "a")}
+    assert {one.sentence for _, one in site.happened} == {
+        "never has sent no fixes for 6 s",
+        "a has sent no fixes for 4 s",
+    }
+    site.places |= {"a": IN, "never": IN}
+    assert set(site.run(3.0)) == {("ended", "all", "a"), ("ended", "one", "never")}
+
+
+def test_silence_while_messages_cannot_arrive_means_nothing():
+    site = Site(
+        AlarmRule("quiet", "silent", after_s=4.0),
+        AlarmRule("in", "inside", zone="hall"),
+        AlarmRule("near", "near", limit=2.0),
+    )
+    site.places = {"a": IN, "b": (6.0, 5.0)}
+    assert len(site.run(3.0)) == 3
+    places, site.places, site.blind = site.places, {}, True
+    assert site.run(60.0) == []
+    site.blind, site.places = False, places
+    assert site.run(20.0) == []
+    site.blind, site.places = True, {}
+    site.run(10.0)
+    site.blind, site.places = False, {"a": OUT, "b": IN}  # a has left meanwhile
+    assert set(site.run(8.0)) == {("ended", "in", "a"), ("ended", "near", "a~b")}
+
+
+def test_near_with_hysteresis_and_storeys():
+    site = Site(AlarmRule("r", "near", limit=2.0, hysteresis=1.0, clear_after_s=0.0, tags=("fork",)))
+    site.places = {
+        "fork": (0.0, 0.0),
+        "t1": (2.5, 0.0),
+        "t2": (20.0, 0.0),
+        "t3": (20.5, 0.0),
+        "up": (0.0, 1.0, 1.0 + STOREY_M + 0.1),
+    }
+    assert site.run(1.0) == []
+    site.places["t1"] = (1.9, 0.0)
+    assert site.run(1.0) == [("raised", "r", "fork~t1")]
+    assert site.last.sentence == "fork and t1 are 1.9 m apart; at least 2 m is right"
+    site.places["t1"] = (2.9, 0.0)
+    assert site.run(1.0) == []
+    site.places["t1"] = (3.1, 0.0)
+    assert site.run(1.0) == [("ended", "r", "fork~t1")]
+
+
+def test_crowded():
+    site = Site(
+        AlarmRule("r", "crowded", zone="hall", limit=2.0, hysteresis=1.0, clear_after_s=0.0, tags=("a", "b", "c"))
+    )
+    site.places = {"a": IN, "b": IN, "d": IN}
+    assert site.run(1.0) == []
+    site.places["c"] = IN
+    assert site.run(1.0) == [("raised", "r", "zone-hall")]
+    assert site.last.sentence == "3 tags are in Hall; at most 2 are allowed"
+    assert site.last.tags == ("a", "b", "c")
+    site.places["c"] = OUT
+    assert site.run(1.0) == []
+    site.places["b"] = OUT
+    assert site.run(1.0) == [("ended", "r", "zone-hall")]
+
+
+def test_protection_levels():
+    site = Site(AlarmRule("r", "protection-level", limit=1.0, hysteresis=0.2, clear_after_s=0.0))
+    site.places = {"t": IN, "plain": IN}
+    site.more["t"] = {"hpl_m": 0.9, "alert": Alert.NONE.value}
+    assert site.run(1.0) == []
+    site.more["t"] = {"hpl_m": 1.1, "alert": Alert.NONE.value}
+    assert site.run(1.0) == [("raised", "r", "t")]
+    site.more["t"] = {"hpl_m": 0.9, "alert": Alert.NONE.value}
+    assert site.run(1.0) == []
+    site.more["t"] = {"hpl_m": 0.7, "alert": Alert.NONE.value}
+    assert site.run(1.0) == [("ended", "r", "t")]
+    site.more["t"] = {"alert": Alert.NOT_EXCLUDED.value}  # no level can be given
+    assert site.run(1.0) == [("raised", "r", "t")]
+    assert "unknown" in site.last.sentence
+
+
+def health(tag, share):
+    return TagHealth(
+        tag, 0.0, 1.0, "joint", 1, 1, 1.0, None, 0.1, None, None, {}, Counters(0, 0, 0), 0.0, 0, (), battery_share=share
+    )
+
+
+def test_battery():
+    site = Site(AlarmRule("r", "battery", limit=0.2, hysteresis=0.1))
+    for share, expected in (
+        (0.3, []),
+        (None, []),
+        (0.08, [("raised", "r", "t")]),
+        (0.25, []),
+        (0.4, [("ended", "r", "t")]),
+    ):
+        site.engine.on_health(health("t", share), site.now_s, site.unix_s)
+        assert site.run(2.0) == expected
+    assert site.happened[0][1].sentence == "the battery of t is at 8%; 20% is the least"
+
+
+def test_anchors():
+    site = Site(AlarmRule("off", "anchor-offline", after_s=2.0), AlarmRule("moved", "anchor-moved"))
+    watch = WatchMessage(
+        0.0, "watching", (WatchFinding("moved", (4,), 0.3, 0.01, 0.0, "Anchor 4 has moved by 0.30 m."),), 10
+    )
+    site.engine.on_anchors(["3"], watch, site.now_s, site.unix_s)
+    assert site.run(3.0) == [("raised", "moved", "anchor-4"), ("raised", "off", "anchor-3")]
+    assert [one.sentence for _, one in site.happened] == [
+        "Anchor 4 has moved by 0.30 m",
+        "anchor 3 has been offline for 2 s",
+    ]
+    site.engine.on_anchors(None, WatchMessage(0.0, "learning", (), 0), site.now_s, site.unix_s)
+    assert site.run(3.0) == []
+    site.engine.on_anchors([], WatchMessage(0.0, "watching", (), 0), site.now_s, site.unix_s)
+    assert set(site.run(3.0)) == {("ended", "off", "anchor-3"), ("ended", "moved", "anchor-4")}
+
+
+def test_hours_end_an_alarm_and_begin_its_time():
+    site = Site(AlarmRule("r", "inside", zone="hall", after_s=3.0, hours="06:00-22:00"))
+    midnight_s = EPOCH_S % 86400.0
+    site.hour_shift_s = -midnight_s + 22 * 3600.0 - 10.0
+    site.places["t"] = IN
+    assert site.run(5.0) == [("raised", "r", "t")]
+    assert site.run(8.0) == [("ended", "r", "t")]
+    assert site.run(20.0) == []
+    site.hour_shift_s = -midnight_s + 30 * 3600.0 - site.now_s
+    assert site.run(2.0) == []
+    assert site.run(3.0) == [("raised", "r", "t")]
+
+
+def test_an_alarm_is_kept_until_it_has_ended_and_is_acknowledged():
+    site = Site(AlarmRule("r", "inside", zone="hall", clear_after_s=0.0))
+    site.places["t"] = IN
+    site.run(1.0)
+    first = site.last
+    assert not site.engine.acknowledge("r", "t", "another", "Ada", site.unix_s)
+    assert site.engine.acknowledge("r", "t", first.id, "Ada", site.unix_s)
+    assert not site.engine.acknowledge("r", "t", first.id, "Bob", site.unix_s)
+    assert site.run(0.1) == [("acknowledged", "r", "t")]
+    assert site.engine.messages["r", "t"].acknowledged_by == "Ada"
+    site.places["t"] = OUT
+    assert site.run(1.0) == [("ended", "r", "t")]
+    assert is_over(site.last)
+    assert site.engine.messages == {}
+    site.places["t"] = IN
+    site.run(1.0)
+    site.places["t"] = OUT
+    site.run(1.0)
+    second = site.last
+    assert list(site.engine.messages.values()) == [second]  # ended, and nobody has seen it
+    site.places["t"] = IN
+    assert site.run(1.0) == [("raised", "r", "t")]
+    assert len({first.id, second.id, site.last.id}) == 3
+    assert not site.engine.acknowledge("r", "t", second.id, "Ada", site.unix_s)
+
+
+def test_groups_and_names_of_assets():
+    people = [Asset("t1", name="Ada", group="people"), Asset("t2", group="people"), Asset("t3", group="forks")]
+    site = Site(AlarmRule("r", "inside", zone="hall", tags=("group:people",)), assets=people)
+    site.places = {"t1": IN, "t3": IN}
+    assert site.run(1.0) == [("raised", "r", "t1")]
+    assert site.last.sentence == "Ada (t1) is in Hall"
+    site.engine.set_assets({"t3": Asset("t3", group="people")}, site.now_s, site.unix_s)
+    assert set(site.run(3.0)) == {("raised", "r", "t3"), ("ended", "r", "t1")}
+
+
+def test_rules_change():
+    rule = AlarmRule("r", "inside", zone="hall")
+    site = Site(rule)
+    site.places["t"] = IN
+    site.run(1.0)
+    site.engine.set_rules(
+        [AlarmRule("r", "inside", zone="hall", severity="critical"), AlarmRule("x", "silent", after_s=1.0)],
+        site.now_s,
+        site.unix_s,
+    )
+    assert site.run(2.0) == []  # it goes on
+    site.engine.set_rules([AlarmRule("r", "inside", zone="elsewhere")], site.now_s, site.unix_s)
+    assert site.run(0.1) == [("ended", "r", "t")]
+    site.engine.set_rules([rule], site.now_s, site.unix_s)
+    assert site.run(1.0) == [("raised", "r", "t")]
+    site.engine.set_rules([], site.now_s, site.unix_s)
+    assert site.run(1.0) == [("ended", "r", "t")]
+
+
+RULES = (
+    AlarmRule("in", "inside", zone="hall"),
+    AlarmRule("out", "outside", zone="hall"),
+    AlarmRule("quiet", "silent", after_s=4.0),
+    AlarmRule("near", "near", limit=2.0),
+    AlarmRule("many", "crowded", zone="hall", limit=1.0),
+    AlarmRule("low", "battery", limit=0.2),
+)
+
+
+def test_another_engine_goes_on_from_what_is_kept():
+    site = Site(*RULES)
+    site.places = {"a": IN, "b": (5.5, 5.0), "c": OUT, "d": OUT}
+    site.engine.on_health(health("a", 0.1), site.now_s, site.unix_s)
+    site.run(2.0)
+    del site.places["d"]
+    site.run(5.0)
+    kept = dict(site.engine.messages)
+    assert {key[0] for key in kept} == {rule.id for rule in RULES}
+    again = Site(*RULES, kept=kept.values())
+    again.places = dict(site.places)
+    assert again.run(30.0) == []
+    assert again.engine.messages == kept
+    cold = Site(*RULES, kept=kept.values())
+    assert {what for what, *_ in cold.run(2 * CONFIRM_S + 5)} == {"ended"}
+    ended = {one.rule for _, one in cold.happened}
+    assert ended == {"in", "near", "many"}  # the others hold until there is a sign against them
+    gone = Site(*RULES[1:], kept=kept.values())
+    assert ("ended", "in", "a") in gone.run(0.1)
+
+
+def test_an_engine_that_follows_raises_nothing_and_one_that_leads_goes_on():
+    first, second = Site(*RULES), Site(*RULES)
+    second.engine.rest()
+    for site in (first, second):
+        site.places = {"a": IN, "c": OUT}
+    assert len(first.run(5.0)) == 2
+    assert second.run(5.0) == []
+    second.engine.resume(first.engine.messages.values(), second.now_s, second.unix_s)
+    assert second.run(5.0) == []
+    for site in (first, second):
+        site.engine.rest()
+        site.places["c"] = IN
+        assert site.run(5.0) == []
+    second.engine.resume(first.engine.messages.values(), second.now_s, second.unix_s)
+    assert set(second.run(5.0)) == {
+        ("ended", "out", "c"),
+        ("raised", "in", "c"),
+        ("raised", "near", "a~c"),
+        ("raised", "many", "zone-hall"),
+    }
+
+
+def test_the_oldest_that_have_ended_make_room(monkeypatch):
+    monkeypatch.setattr(engine_module, "MAX_KEPT", 3)
+    site = Site(AlarmRule("r", "inside", zone="hall", clear_after_s=0.0))
+    site.places = dict.fromkeys("abcd", IN)
+    assert len(site.run(1.0)) == 3
+    assert site.engine.not_raised > 0
+    left = site.happened[0][1].subject
+    site.places[left] = OUT
+    happened = site.run(1.0)
+    assert [what for what, *_ in happened] == ["ended", "dropped", "raised"]
+    assert happened[1][2] == left
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 10_000), st.floats(0.5, 6.0), st.floats(0.0, 3.0))
+def test_near_tags_are_those_of_all_pairs(seed, limit_m, hysteresis_m):
+    rng = random.Random(seed)
+    first, second = Concerned([f"t{k}" for k in range(6)], {}), Concerned([], {})
+    near = NearTags(limit_m, hysteresis_m, first, second)
+    where, expected = {}, set()
+    for _ in range(150):
+        name = f"t{rng.randrange(14)}"
+        if rng.random() < 0.1:
+            ended = near.remove(name)
+            where.pop(name, None)
+            assert set(ended) == {pair for pair in expected if name in pair}
+            expected -= set(ended)
+            continue
+        where[name] = (rng.uniform(-8, 8), rng.uniform(-8, 8), rng.choice((1.0, 1.0, 6.0)))
+        began, ended = near.move(name, where[name])
+        for other in where.keys() - {name}:
+            if name not in first and other not in first:
+                continue
+            pair = min(name, other), max(name, other)
+            distance_m = math.dist(where[name][:2], where[other][:2])
+            holds = distance_m < (limit_m + hysteresis_m if pair in expected else limit_m)
+            holds &= abs(where[name][2] - where[other][2]) <= STOREY_M
+            assert (pair in began) == (holds and pair not in expected)
+            assert (pair in ended) == (not holds and pair in expected)
+            (expected.add if holds else expected.discard)(pair)
+        assert near.distances_m.keys() == expected
+        assert all(
+            value == pytest.approx(math.dist(where[a][:2], where[b][:2])) for (a, b), value in near.distances_m.items()
+        )
+
+
+def test_positions_that_are_not_on_earth_do_not_stop_it():
+    site = Site(AlarmRule("r", "near", limit=0.5))
+    site.places = {"a": (1e300, 0.0), "b": (1e300, 0.0)}
+    assert site.run(1.0) == []

@@ -1,0 +1,291 @@
+"""Alarms of the live site: one of several dashboards publishes them, and pages are sent them and their rules."""
+
+import asyncio
+import json
+
+import msgspec
+import pytest
+from dashboard_builders import SITE, SITE_ID, SQUARE, Times, Wire, fix, status
+from msgspec.structs import replace
+
+from skyless.core.alarm_rule import AlarmRule
+from skyless.page._alarms import KEPT_WAIT_S, MAX_SENT, NoAlarmError
+from skyless.page.live import LiveSite, NoBrokerError
+from skyless.run.mqtt import topics
+from skyless.run.mqtt.messages import AcknowledgeMessage, AlarmMessage, AlarmRulesMessage, Asset, ZonesMessage
+from skyless.site.alarm_rules import BadAlarmRulesError
+
+RULE = AlarmRule("r", "inside", zone=SQUARE.id, clear_after_s=0.0)
+FILE_RULE = AlarmRule("file", "anchor-moved")
+STATE = topics.alarm_topic(SITE_ID, "r", "t1")
+
+
+class Broker:
+    """Keeps retained messages, and delivers to all dashboards that are connected."""
+
+    def __init__(self):
+        self.times = Times()
+        self.kept = {}
+        self.happened = []
+        self.dashboards = {}
+        self.publish(topics.site_topic(SITE_ID), replace(SITE, alarms=(FILE_RULE,)), retain=True)
+        self.publish(topics.zones_topic(SITE_ID), ZonesMessage((SQUARE,), SITE.site.name), retain=True)
+
+    def publish(self, topic, message, *, retain=False):
+        payload = message if isinstance(message, bytes) else msgspec.json.encode(message)
+        if retain:
+            self.kept.pop(topic, None)
+            if payload:
+                self.kept[topic] = payload
+        if "/alarm/" in topic and topic.endswith("/state") and payload:
+            self.happened.append(msgspec.json.decode(payload, type=AlarmMessage))
+        for live, wire in list(self.dashboards.values()):
+            if live.connected:
+                wire.deliver(topic, payload)
+
+    def start(self, name):
+        live = LiveSite(name, "mqtt://b:1", None, lambda: self.times.now_s, lambda: self.times.unix_s)
+        wire = Wire()
+        live.attach(wire, SITE_ID)
+        self.dashboards[name] = live, wire
+        self.connect(name)
+        return live
+
+    def connect(self, name):
+        live, wire = self.dashboards[name]
+        live.on_connection(connected=True)
+        for topic, payload in list(self.kept.items()):
+            wire.deliver(topic, payload)
+        online = status("dashboard", name, unix_s=self.times.unix_s)
+        self.publish(topics.status_topic(SITE_ID, "dashboard", name), online, retain=True)
+
+    def disconnect(self, name):
+        live, _ = self.dashboards[name]
+        live.on_connection(connected=False)
+        offline = status("dashboard", name, online=False, unix_s=0.0)
+        self.publish(topics.status_topic(SITE_ID, "dashboard", name), offline, retain=True)
+
+    def end(self, name):
+        """Its process is killed: what it has not published is lost."""
+        self.disconnect(name)
+        del self.dashboards[name]
+
+    def run(self, seconds, place=None):
+        for step in range(round(seconds / 0.05)):
+            self.times.move(0.05)
+            if place is not None and step % 2 == 0:
+                message = fix(unix_s=self.times.unix_s, position_m=(*place, 1.0), serial=step)
+                self.publish(topics.fix_topic(SITE_ID, "t1"), message)
+            for live, wire in list(self.dashboards.values()):
+                live.tick()
+                for topic, payload, _, retain in wire.published:
+                    if live.connected and "/alarm" in topic:
+                        self.publish(topic, payload, retain=retain)
+                wire.published.clear()
+
+    def alarm(self, subject="t1"):
+        payload = self.kept.get(topics.alarm_topic(SITE_ID, "r", subject))
+        return None if payload is None else msgspec.json.decode(payload, type=AlarmMessage)
+
+    @property
+    def raised(self):
+        return list(dict.fromkeys(one.id for one in self.happened))
+
+
+IN, OUT = (2.0, 2.0), (8.0, 8.0)
+
+
+@pytest.fixture
+def broker():
+    broker = Broker()
+    rules = AlarmRulesMessage((RULE,), SITE.site.name)
+    broker.publish(topics.alarm_rules_topic(SITE_ID), rules, retain=True)
+    return broker
+
+
+def sent(live, kind):
+    page = live.open_page()
+    messages = [json.loads(text) for text in asyncio.run(asyncio.wait_for(page.drain(live.state), 1.0))]
+    live.pages.discard(page)
+    (found,) = [message for message in messages if message["type"] == kind]
+    return found
+
+
+def test_an_alarm_is_published_kept_acknowledged_and_cleared(broker):
+    live = broker.start("a")
+    broker.run(KEPT_WAIT_S + 1.0, IN)
+    alarm = broker.alarm()
+    assert (alarm.rule, alarm.subject, alarm.place, alarm.ended_unix_s) == ("r", "t1", "Desk", None)
+    assert [one["id"] for one in sent(live, "alarms")["alarms"]] == [alarm.id]
+    assert any("alarm r: t1 is in Desk" in event.text for event in live.log.since())
+    with pytest.raises(NoAlarmError):
+        live.acknowledge("r", "t1", "another", "Ada")
+    live.acknowledge("r", "t1", alarm.id, "Ada")
+    broker.run(0.2, IN)
+    assert broker.alarm().acknowledged_by == "Ada"
+    assert live.alarms.messages[0].acknowledged_by == "Ada"
+    broker.run(1.0, OUT)
+    assert broker.alarm() is None
+    assert broker.happened[-1].ended_unix_s is not None
+    assert live.alarms.messages == ()
+    assert sent(live, "alarms") == {"type": "alarms", "alarms": [], "more": 0}
+
+
+def test_nothing_is_raised_before_what_the_broker_has_kept_is_here(broker):
+    broker.start("a")
+    broker.run(KEPT_WAIT_S - 0.2, IN)
+    assert broker.happened == []
+    broker.run(0.5, IN)
+    assert len(broker.raised) == 1
+
+
+def test_of_two_dashboards_one_raises_and_the_other_goes_on(broker):
+    broker.start("a")
+    broker.run(1.0, OUT)
+    second = broker.start("b")
+    broker.run(4.0, IN)
+    assert len(broker.raised) == 1
+    assert [live.alarms.engine.leading for live, _ in broker.dashboards.values()] == [True, False]
+    second.acknowledge("r", "t1", broker.alarm().id, "Ada")  # the one that leads is asked
+    broker.run(0.3, IN)
+    assert broker.alarm().acknowledged_by == "Ada"
+    assert second.alarms.messages[0].acknowledged_by == "Ada"
+    broker.end("a")
+    broker.run(5.0, IN)
+    assert second.alarms.engine.leading
+    assert len(broker.raised) == 1
+    broker.run(1.0, OUT)
+    assert broker.alarm() is None
+    broker.run(1.0, IN)
+    assert len(broker.raised) == 2
+
+
+@pytest.mark.parametrize("acknowledged", [True, False])
+def test_a_dashboard_that_is_started_again_goes_on(broker, acknowledged):
+    first = broker.start("a")
+    broker.run(4.0, IN)
+    alarm = broker.alarm()
+    if acknowledged:
+        first.acknowledge("r", "t1", alarm.id, "Ada")
+        broker.run(0.2, IN)
+    broker.end("a")
+    broker.run(3.0, IN)
+    live = broker.start("a")
+    broker.run(15.0, IN)
+    assert broker.raised == [alarm.id]
+    assert broker.alarm().acknowledged_by == ("Ada" if acknowledged else "")
+    assert live.alarms.messages == (broker.alarm(),)
+
+
+def test_a_broker_that_has_lost_what_it_kept_gets_it_again(broker):
+    broker.start("a")
+    broker.run(4.0, IN)
+    alarm = broker.alarm()
+    broker.disconnect("a")
+    del broker.kept[STATE]
+    broker.run(2.0)
+    broker.connect("a")
+    broker.run(6.0, IN)
+    assert broker.alarm() == alarm
+    assert broker.raised == [alarm.id]
+
+
+def test_what_another_has_done_meanwhile_is_not_undone_after_a_reconnect(broker):
+    broker.start("a")
+    broker.run(1.0, OUT)
+    second = broker.start("b")
+    broker.run(4.0, IN)
+    broker.disconnect("a")
+    assert STATE in broker.dashboards["a"][1].forgotten
+    broker.run(3.0, IN)
+    second.acknowledge("r", "t1", broker.alarm().id, "Ada")
+    broker.run(2.0, OUT)
+    assert broker.alarm() is None
+    broker.connect("a")
+    broker.run(5.0, OUT)
+    broker.end("b")
+    broker.run(5.0, OUT)
+    assert broker.alarm() is None
+    assert broker.dashboards["a"][0].alarms.messages == ()
+
+
+def test_an_acknowledgement_that_the_first_did_not_publish_is_published_by_the_next(broker):
+    broker.start("a")
+    broker.run(1.0, OUT)
+    broker.start("b")
+    broker.run(4.0, IN)
+    broker.dashboards["a"][0].connected = False  # it hears nothing any more
+    asked = AcknowledgeMessage(broker.alarm().id, "Ada", broker.times.unix_s)
+    broker.publish(topics.acknowledge_topic(SITE_ID, "r", "t1"), asked)
+    broker.end("a")
+    broker.run(3.0, IN)
+    assert broker.alarm().acknowledged_by == "Ada"
+
+
+def test_rules_of_the_page_are_stored_checked_and_sent(broker):
+    live = broker.start("a")
+    broker.run(0.2)
+    assert [rule["id"] for rule in sent(live, "alarm_rules")["rules"]] == ["r"]
+    assert [rule["id"] for rule in sent(live, "alarm_rules")["file_rules"]] == ["file"]
+    new = AlarmRule("quiet", "silent", after_s=5.0)
+    live.store_alarm_rules([RULE, new], SITE.site.name)
+    broker.run(0.2)
+    kept = msgspec.json.decode(broker.kept[topics.alarm_rules_topic(SITE_ID)], type=AlarmRulesMessage)
+    assert kept == AlarmRulesMessage((RULE, new), SITE.site.name)
+    assert live.alarms.engine.rules == (FILE_RULE, RULE, new)
+    for rules, site, words in (
+        ([AlarmRule("file", "anchor-moved")], "", "no other rule"),
+        ([AlarmRule("x", "silent")], "", "after_s"),
+        ([], "elsewhere", "which is shown now"),
+    ):
+        with pytest.raises(BadAlarmRulesError, match=words):
+            live.store_alarm_rules(rules, site)
+    broker.publish(topics.alarm_rules_topic(SITE_ID), AlarmRulesMessage((new,), "another site"), retain=True)
+    broker.run(0.2)
+    assert live.alarms.rules == ()
+
+
+def test_rules_that_cannot_be_read_are_not_overwritten(broker):
+    live = broker.start("a")
+    broker.publish(topics.alarm_rules_topic(SITE_ID), b'{"rules": [{"id": "x", "kind": "new kind"}]}', retain=True)
+    with pytest.raises(BadAlarmRulesError, match="nothing was overwritten"):
+        live.store_alarm_rules([RULE])
+    broker.publish(topics.alarm_rules_topic(SITE_ID), b"", retain=True)
+    live.store_alarm_rules([RULE])
+    assert live.dropped["alarm_rules"] == 1
+
+
+def test_wrong_messages_are_counted(live, wire):
+    message = AlarmMessage("r/t1/1", "r", "r", "inside", "warning", "t1", 1.0, 1.0, "t1 is in Desk")
+    for payload in (b"\xff", b"{}", msgspec.json.encode(message)):
+        wire.deliver(topics.alarm_topic(SITE_ID, "r", "t2"), payload)
+    wire.deliver(topics.acknowledge_topic(SITE_ID, "r", "t2"), b"[]")
+    assert (live.dropped["state"], live.dropped["acknowledge"]) == (3, 1)
+    assert live.alarms.messages == ()
+
+
+def test_pages_are_sent_the_newest_and_those_that_nobody_has_seen_first(live, wire):
+    for k in range(MAX_SENT + 7):
+        seen = 5.0 if k % 2 else None
+        one = AlarmMessage(f"r/t{k}/{k}", "r", "r", "inside", "info", f"t{k}", k, k, "", acknowledged_unix_s=seen)
+        wire.deliver(topics.alarm_topic(SITE_ID, "r", f"t{k}"), one)
+    message = sent(live, "alarms")
+    assert (len(message["alarms"]), message["more"]) == (MAX_SENT, 7)
+    unseen = [one for one in message["alarms"] if one["acknowledged_unix_s"] is None]
+    assert unseen == message["alarms"][: len(unseen)]
+    assert len(unseen) == (MAX_SENT + 8) // 2
+    assert [one["unix_s"] for one in unseen] == sorted((one["unix_s"] for one in unseen), reverse=True)
+
+
+def test_without_a_broker_nothing_can_be_acknowledged(live, wire):
+    one = AlarmMessage("r/t1/1", "r", "r", "inside", "info", "t1", 1.0, 1.0, "")
+    wire.deliver(STATE, one)
+    with pytest.raises(NoBrokerError):
+        live.acknowledge("r", "t1", "r/t1/1", "Ada")
+
+
+def test_alarms_name_assets(broker):
+    live = broker.start("a")
+    live.alarms.assets = lambda: {"t1": Asset("t1", name="Ada")}
+    broker.run(4.0, IN)
+    assert broker.alarm().sentence == "Ada (t1) is in Desk"
