@@ -47,7 +47,7 @@ def browser(live, page):
 @pytest.fixture
 def stranger(live, page):
     """Somebody on another machine."""
-    rules = AccessRules(TOKEN, frozenset({"hall.example"}), remote=True, cookie="skyless-8080")
+    rules = AccessRules(TOKEN, names=frozenset({"hall.example"}), remote=True, cookie="skyless-8080")
     return browser_of(live, page=page, rules=rules, base_url="http://192.168.1.5:8080")
 
 

@@ -22,12 +22,16 @@ from skyless.core.errors import SkylessError
 from skyless.page._geojson import MEDIA_TYPE
 from skyless.page._site_survey import NoResultError
 from skyless.page._state import PageRequest
+from skyless.page.api.call import ApiServices
+from skyless.page.api.past import Past
+from skyless.page.api.routes import api_routes
 from skyless.page.guard import AccessRules, Guard
 from skyless.page.live import LiveSite, NoBrokerError, NoSiteError, NotAllowedError, TooManyPagesError
 from skyless.page.overlays import KINDS, NoOverlayError, Overlays
 from skyless.page.playback import NoRecordingError, Playback, RecordingFile
 from skyless.page.sites import LiveSites
 from skyless.page.what_if import NoWhatIfError, WhatIfs, WhatIfTask
+from skyless.run.assets import BadAssetsError
 from skyless.run.mqtt.survey_facts import BadFactsError
 from skyless.run.zones.zone_list import BadZonesError, read_zones
 from skyless.site.file.check import image_size
@@ -49,6 +53,7 @@ _TRY_LATER: Final = 1013
 _GOING_AWAY: Final = 1001
 _STATUSES: Final[dict[type[Exception], int]] = {
     BadZonesError: 400,
+    BadAssetsError: 400,
     BadFactsError: 400,
     NoRecordingError: 404,
     NoSiteError: 404,
@@ -67,6 +72,7 @@ class Services(Struct, frozen=True):
     overlays: Overlays
     playback: Playback
     what_ifs: WhatIfs
+    past: Past = Past(None)
 
 
 def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Starlette:
@@ -97,6 +103,7 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
         Route("/api/recordings/{name}/states", _recorded_states),
         Route("/api/recordings/{name}/floor_plan", _recorded(Playback.floor_plan, _image)),
         Route("/api/recordings/{name}/what_if", _what_if),
+        *api_routes(ApiServices(services.sites, services.past)),
         WebSocketRoute("/live", _live),
         Mount("/page", _Files(directory=page, check_dir=False)),
     ]

@@ -20,7 +20,6 @@ from msgspec import Struct
 from skyless.bridges.target import bridged_site
 from skyless.core.errors import ConfigurationError
 from skyless.core.version import installed_version
-from skyless.page._assets import AssetsFile, SiteAssets
 from skyless.page._events import MAX_EVENTS, MAX_LOGGED, EventLog, EventQueue, publisher_rank
 from skyless.page._geojson import OLDEST_S, anchor_features, features, zone_features
 from skyless.page._site_survey import SiteSurvey
@@ -28,6 +27,7 @@ from skyless.page._state import PageRequest, Sent, SiteState, encode
 from skyless.page.condition.evidence import Evidence
 from skyless.page.condition.monitor import EVALUATION_S, Condition, ConditionMonitor
 from skyless.page.event_list import EventList
+from skyless.page.site_assets import AssetsFile, SiteAssets
 from skyless.run.assets import BadAssetsError
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.access import Role
@@ -232,6 +232,16 @@ class LiveSite:
     def number(self) -> int | None:
         """The site's number, or None while none is known."""
         return self._site_id if self.site is None else self.site.site.id
+
+    @property
+    def now_s(self) -> float:
+        """The time now, by the clock of the state."""
+        return self._clock()
+
+    @property
+    def unix_s(self) -> float:
+        """The same since 1970."""
+        return self._wall_clock()
 
     def on_connection(self, connected: bool) -> None:
         """Update whether the broker is connected."""

@@ -129,6 +129,7 @@ def _stop(server: "_Server", services: Services) -> None:
         services.playback.stop()
         services.overlays.stop()
         services.what_ifs.stop()
+        services.past.stop()
         asyncio.get_running_loop().call_later(_GRACE_S, server.drop_connections)
 
 
