@@ -8,8 +8,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 from skyless.core.alarm_rule import AlarmRule
 from skyless.core.site import GeoreferenceSite, Outline
 from skyless.page.event_list import SiteEvent
-from skyless.run.history.answers import AlarmRow, Contact, Dwell, Occupancy
-from skyless.run.mqtt.messages import AlarmMessage, Matrix, Vector
+from skyless.run.mqtt.messages import Matrix, Vector
 
 Name = Annotated[str, Meta(max_length=200)]
 Names = Annotated[str, Meta(max_length=20_000, description="Names of tags, separated by commas; empty means all.")]
@@ -118,6 +117,11 @@ class StreamQuery(SiteQuery, frozen=True):
     group: Annotated[Name, Meta(description="Only tags whose asset is in this group.")] = ""
 
 
+def listed(key: str, kind: type) -> type[Struct]:
+    """An answer with one field, a list."""
+    return msgspec.defstruct(f"{kind.__name__.title()}List", [(key, tuple[kind, ...])], frozen=True)  # type: ignore[valid-type]
+
+
 class ErrorAnswer(Struct, frozen=True):
     """Every answer with a status of 400 or more."""
 
@@ -153,12 +157,6 @@ class Anchor(Struct, frozen=True):
     position_m: Vector
     online: bool | None
     """None where it has not reported."""
-
-
-class AnchorsAnswer(Struct, frozen=True):
-    """The anchors whose positions are known."""
-
-    anchors: tuple[Anchor, ...]
 
 
 class TagFix(Struct, frozen=True):
@@ -204,12 +202,6 @@ class TagsAnswer(Struct, frozen=True):
     """What to ask for ``after``; None where these are the last."""
 
 
-class FixesAnswer(Struct, frozen=True):
-    """All fixes of this moment."""
-
-    fixes: tuple[TagFix, ...]
-
-
 class ZoneTags(Struct, frozen=True):
     """A zone, and who is in it."""
 
@@ -220,24 +212,12 @@ class ZoneTags(Struct, frozen=True):
     tags: tuple[str, ...]
 
 
-class ZonesAnswer(Struct, frozen=True):
-    """The zones."""
-
-    zones: tuple[ZoneTags, ...]
-
-
 class EventsAnswer(Struct, frozen=True):
     """Events, the newest first."""
 
     events: tuple[SiteEvent, ...]
     before: int | None
     """What to ask for ``before``; None where these are the oldest."""
-
-
-class AlarmsAnswer(Struct, frozen=True):
-    """Alarms that have not ended, or that nobody has acknowledged."""
-
-    alarms: tuple[AlarmMessage, ...]
 
 
 class AlarmRulesAnswer(Struct, frozen=True):
@@ -256,33 +236,3 @@ class Acknowledgement(Struct, frozen=True):
     id: Name
     """Of the occurrence that was seen."""
     by: Name
-
-
-class HistoryTagsAnswer(Struct, frozen=True):
-    """Tags that the history has."""
-
-    tags: tuple[str, ...]
-
-
-class DwellAnswer(Struct, frozen=True):
-    """How long tags were in zones."""
-
-    dwell: tuple[Dwell, ...]
-
-
-class OccupancyAnswer(Struct, frozen=True):
-    """How many tags were in zones."""
-
-    occupancy: tuple[Occupancy, ...]
-
-
-class ContactsAnswer(Struct, frozen=True):
-    """Whom a tag was near to."""
-
-    contacts: tuple[Contact, ...]
-
-
-class AlarmRowsAnswer(Struct, frozen=True):
-    """Alarms of the past."""
-
-    alarms: tuple[AlarmRow, ...]

@@ -64,6 +64,11 @@ def read_query(given: QueryParams, path: dict[str, str], kind: type[_Query]) -> 
         raise HTTPException(400, f"{key} is {shown!r}; it should be {expected(schema[key])}") from None
 
 
+def names(text: str) -> tuple[str, ...]:
+    """Names that are separated by commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
 @cache
 def parameters_schema(kind: type[Struct]) -> dict[str, dict[str, Any]]:
     """JSON schemas of a struct's fields by the names of the parameters."""

@@ -1,8 +1,10 @@
 """Answers about the site as it is now, and what changes it."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import Final
 
-from msgspec import UNSET
+from msgspec import UNSET, Struct
+from msgspec.structs import asdict
 from starlette.exceptions import HTTPException
 
 from skyless.bridges.target import is_usable
@@ -10,16 +12,12 @@ from skyless.core.version import installed_version
 from skyless.page.api.answers import (
     Acknowledgement,
     AlarmRulesAnswer,
-    AlarmsAnswer,
     Anchor,
-    AnchorsAnswer,
     EventsAnswer,
-    FixesAnswer,
     SiteAnswer,
     Tag,
     TagFix,
     TagsAnswer,
-    ZonesAnswer,
     ZoneTags,
 )
 from skyless.page.api.call import Call
@@ -27,7 +25,9 @@ from skyless.page.live import LiveSite, NoSiteError
 from skyless.run.assets import read_csv, write_csv
 from skyless.run.mqtt.messages import Asset, AssetsMessage, FixMessage, SiteMessage
 
-OLDEST_S = 5.0
+Listed = dict[str, Sequence[Struct]]
+
+OLDEST_S: Final = 5.0
 """A tag whose last fix is older has none."""
 
 
@@ -58,16 +58,16 @@ def site(call: Call) -> SiteAnswer:
     )
 
 
-def anchors(call: Call) -> AnchorsAnswer | bytes:
+def anchors(call: Call) -> Listed | bytes:
     """Its anchors."""
     if call.query.format == "geojson":
         return call.live.features("anchors")
-    return AnchorsAnswer(
-        tuple(
+    return {
+        "anchors": [
             Anchor(anchor.id, (anchor.x_m, anchor.y_m, anchor.z_m), _online(call.live, "anchor", str(anchor.id)))
             for anchor in _known(call.live).site.anchors
-        )
-    )
+        ]
+    }
 
 
 def _online(live: LiveSite, kind: str, name: str) -> bool | None:
@@ -121,12 +121,12 @@ def _zones(live: LiveSite, tag: str) -> tuple[str, ...]:
     return tuple(zone.id for zone in live.monitor.zones_with(tag))
 
 
-def fixes(call: Call) -> FixesAnswer | bytes:
+def fixes(call: Call) -> Listed | bytes:
     """The newest usable fix of each tag."""
     if call.query.format == "geojson":
         return call.live.features("fixes")
     recent = call.live.state.fixes_since(call.live.now_s, OLDEST_S)
-    return FixesAnswer(tuple(sorted(usable(call.live, recent), key=lambda fix: fix.tag)))
+    return {"fixes": usable(call.live, sorted(recent, key=lambda given: given[0].tag))}
 
 
 def usable(live: LiveSite, given: Iterable[tuple[FixMessage, float]]) -> list[TagFix]:
@@ -151,21 +151,18 @@ def usable(live: LiveSite, given: Iterable[tuple[FixMessage, float]]) -> list[Ta
     ]
 
 
-def zones(call: Call) -> ZonesAnswer | bytes:
+def zones(call: Call) -> Listed | bytes:
     """The zones."""
     live = call.live
     if call.query.format == "geojson":
         return live.features("zones")
-    inside: dict[str, list[str]] = {zone.id: [] for zone in live.monitor.zones}
-    for name in sorted(live.state.tags):
-        for zone in live.monitor.zones_with(name):
-            inside[zone.id].append(name)
-    return ZonesAnswer(
-        tuple(
-            ZoneTags(zone.id, zone.name, zone.polygon_m, zone.colour, tuple(inside[zone.id]))
+    inside = {name: _zones(live, name) for name in sorted(live.state.tags)}
+    return {
+        "zones": [
+            ZoneTags(**asdict(zone), tags=tuple(name for name, zones in inside.items() if zone.id in zones))
             for zone in live.monitor.zones
-        )
-    )
+        ]
+    }
 
 
 def events(call: Call) -> EventsAnswer:
@@ -200,9 +197,9 @@ def put_assets_csv(call: Call) -> AssetsMessage:
     return call.live.assets_message
 
 
-def alarms(call: Call) -> AlarmsAnswer:
+def alarms(call: Call) -> Listed:
     """Alarms that are not over."""
-    return AlarmsAnswer(tuple(call.live.alarms.messages))
+    return {"alarms": call.live.alarms.messages}
 
 
 def alarm_rules(call: Call) -> AlarmRulesAnswer:

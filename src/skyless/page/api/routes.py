@@ -12,12 +12,14 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 
 from skyless.core.errors import SkylessError
-from skyless.page.api import answers, past, present, stream
-from skyless.page.api.call import ApiServices, Call, read_body, read_query, site_of
+from skyless.page.api import answers, present, stream
+from skyless.page.api.answers import Anchor, TagFix, ZoneTags, listed
+from skyless.page.api.call import ApiServices, Call, names, read_body, read_query, site_of
 from skyless.page.api.openapi import document
+from skyless.page.api.past import read_span
 from skyless.run.assets import MAX_BYTES
-from skyless.run.history.answers import Heatmap, Track
-from skyless.run.mqtt.messages import AlarmRulesMessage, AssetsMessage
+from skyless.run.history.answers import AlarmRow, Contact, Dwell, Heatmap, Occupancy, Span, Track
+from skyless.run.mqtt.messages import AlarmMessage, AlarmRulesMessage, AssetsMessage
 
 ROOT: Final = "/api/v1"
 JSON: Final = "application/json"
@@ -58,115 +60,74 @@ class ApiRoute(Struct, frozen=True):
         return CSV if self.body is bytes else JSON
 
 
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(",") if name.strip())
+def _past(
+    path: str,
+    summary: str,
+    answer: type[Struct],
+    query: type[answers.SpanQuery],
+    question: Callable[[Any, Span, Any], object],
+) -> ApiRoute:
+    """A question to the history, of a time range and the parameters; it is asked in the history's thread."""
+
+    async def respond(call: Call) -> object:
+        asked, number = call.query, call.live.number
+        return await call.past.ask(number, lambda history: question(history, read_span(asked.begin, asked.end), asked))
+
+    return ApiRoute("GET", f"/history/{path}", summary, respond, answer, query)
 
 
-async def _past_tags(call: Call) -> answers.HistoryTagsAnswer:
-    return answers.HistoryTagsAnswer(await call.past.ask(call.live.number, lambda history: history.tags()))
-
-
-def _asked(question: Callable[[Any, Any, Any], Struct]) -> Callable[[Call], Awaitable[Struct]]:
-    """Answers a question of the history, the time range, and the parameters, in the history's thread."""
-
-    async def respond(call: Call) -> Struct:
-        query = call.query
-        return await call.past.ask(
-            call.live.number, lambda history: question(history, past.read_span(query.begin, query.end), query)
-        )
-
-    return respond
+async def _past_tags(call: Call) -> object:
+    return {"tags": await call.past.ask(call.live.number, lambda history: history.tags())}
 
 
 ROUTES: Final = (
     ApiRoute("GET", "/site", "The site, and how it is", present.site, answers.SiteAnswer),
-    ApiRoute("GET", "/anchors", "Its anchors", present.anchors, answers.AnchorsAnswer, answers.FormatQuery),
+    ApiRoute("GET", "/anchors", "Its anchors", present.anchors, listed("anchors", Anchor), answers.FormatQuery),
     ApiRoute("GET", "/tags", "Tags by name, in pages", present.tags, answers.TagsAnswer, answers.TagsQuery),
     ApiRoute("GET", "/tags/{tag}", "One tag", present.tag, answers.Tag, answers.TagQuery),
-    ApiRoute("GET", "/fixes", "The newest fix of each tag", present.fixes, answers.FixesAnswer, answers.FormatQuery),
-    ApiRoute("GET", "/zones", "Zones, and who is in them", present.zones, answers.ZonesAnswer, answers.FormatQuery),
+    ApiRoute("GET", "/fixes", "The newest fixes", present.fixes, listed("fixes", TagFix), answers.FormatQuery),
     ApiRoute(
-        "GET", "/events", "What has happened, in pages", present.events, answers.EventsAnswer, answers.EventsQuery
+        "GET", "/zones", "Zones, and who is in them", present.zones, listed("zones", ZoneTags), answers.FormatQuery
     ),
+    ApiRoute("GET", "/events", "What has happened", present.events, answers.EventsAnswer, answers.EventsQuery),
     ApiRoute("GET", "/assets", "What tags are attached to", present.assets, AssetsMessage),
     ApiRoute("PUT", "/assets", "Replace all assets", present.put_assets, AssetsMessage, body=AssetsMessage),
     ApiRoute("GET", "/assets.csv", "The assets as a table", present.assets_csv, str, media_type=CSV),
-    ApiRoute("PUT", "/assets.csv", "Replace all assets by a table", present.put_assets_csv, AssetsMessage, body=bytes),
-    ApiRoute("GET", "/alarms", "Alarms that are not over", present.alarms, answers.AlarmsAnswer),
+    ApiRoute("PUT", "/assets.csv", "Replace all by a table", present.put_assets_csv, AssetsMessage, body=bytes),
+    ApiRoute("GET", "/alarms", "Alarms that are not over", present.alarms, listed("alarms", AlarmMessage)),
     ApiRoute(
-        "POST",
-        "/alarms/{rule}/{subject}/acknowledge",
-        "Acknowledge an alarm",
-        present.acknowledge,
-        answers.Acknowledgement,
-        answers.AlarmQuery,
-        answers.Acknowledgement,
+        *("POST", "/alarms/{rule}/{subject}/acknowledge", "Acknowledge an alarm", present.acknowledge),
+        *(answers.Acknowledgement, answers.AlarmQuery, answers.Acknowledgement),
     ),
     ApiRoute("GET", "/alarm_rules", "The rules of alarms", present.alarm_rules, answers.AlarmRulesAnswer),
     ApiRoute(
-        "PUT",
-        "/alarm_rules",
-        "Replace the rules that were made on the page",
-        present.put_alarm_rules,
-        answers.AlarmRulesAnswer,
-        body=AlarmRulesMessage,
+        *("PUT", "/alarm_rules", "Replace the rules that were made on the page", present.put_alarm_rules),
+        *(answers.AlarmRulesAnswer, answers.SiteQuery, AlarmRulesMessage),
     ),
-    ApiRoute("GET", "/history/tags", "Tags that the history has", _past_tags, answers.HistoryTagsAnswer),
-    ApiRoute(
-        "GET",
-        "/history/track",
-        "The way of a tag",
-        _asked(lambda history, span, query: history.track(query.tag, span, query.points)),
-        Track,
-        answers.TrackQuery,
+    ApiRoute("GET", "/history/tags", "Tags that it has", _past_tags, listed("tags", str)),
+    _past(
+        *("track", "The way of a tag", Track, answers.TrackQuery),
+        lambda history, span, asked: history.track(asked.tag, span, asked.points),
     ),
-    ApiRoute(
-        "GET",
-        "/history/heatmap",
-        "How long tags were where",
-        _asked(lambda history, span, query: history.heatmap(span, query.cell_m, _names(query.tag))),
-        Heatmap,
-        answers.HeatmapQuery,
+    _past(
+        *("heatmap", "How long tags were where", Heatmap, answers.HeatmapQuery),
+        lambda history, span, asked: history.heatmap(span, asked.cell_m, names(asked.tag)),
     ),
-    ApiRoute(
-        "GET",
-        "/history/dwell",
-        "How long tags were in zones",
-        _asked(
-            lambda history, span, query: answers.DwellAnswer(history.dwell(span, _names(query.tag), query.zone or None))
-        ),
-        answers.DwellAnswer,
-        answers.DwellQuery,
+    _past(
+        *("dwell", "How long tags were in zones", listed("dwell", Dwell), answers.DwellQuery),
+        lambda history, span, asked: {"dwell": history.dwell(span, names(asked.tag), asked.zone or None)},
     ),
-    ApiRoute(
-        "GET",
-        "/history/occupancy",
-        "How many tags were in zones",
-        _asked(
-            lambda history, span, query: answers.OccupancyAnswer(
-                history.occupancy(span, query.zone or None, query.step_s)
-            )
-        ),
-        answers.OccupancyAnswer,
-        answers.OccupancyQuery,
+    _past(
+        *("occupancy", "How many tags were in zones", listed("occupancy", Occupancy), answers.OccupancyQuery),
+        lambda history, span, asked: {"occupancy": history.occupancy(span, asked.zone or None, asked.step_s)},
     ),
-    ApiRoute(
-        "GET",
-        "/history/contacts",
-        "Whom a tag was near to",
-        _asked(
-            lambda history, span, query: answers.ContactsAnswer(history.contacts(query.tag, span, query.distance_m))
-        ),
-        answers.ContactsAnswer,
-        answers.ContactsQuery,
+    _past(
+        *("contacts", "Whom a tag was near to", listed("contacts", Contact), answers.ContactsQuery),
+        lambda history, span, asked: {"contacts": history.contacts(asked.tag, span, asked.distance_m)},
     ),
-    ApiRoute(
-        "GET",
-        "/history/alarms",
-        "Alarms of the past",
-        _asked(lambda history, span, _query: answers.AlarmRowsAnswer(history.alarms(span))),
-        answers.AlarmRowsAnswer,
-        answers.SpanQuery,
+    _past(
+        *("alarms", "Alarms of the past", listed("alarms", AlarmRow), answers.SpanQuery),
+        lambda history, span, _asked: {"alarms": history.alarms(span)},
     ),
 )
 

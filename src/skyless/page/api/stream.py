@@ -14,7 +14,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyless.core.version import installed_version
 from skyless.page.api.answers import StreamQuery
-from skyless.page.api.call import ApiServices, read_query, site_of
+from skyless.page.api.call import ApiServices, names, read_query, site_of
 from skyless.page.api.present import usable
 from skyless.page.event_list import SiteEvent
 from skyless.page.live import LiveSite, NoSiteError
@@ -115,10 +115,9 @@ def endpoint(services: ApiServices) -> Callable[[WebSocket], Awaitable[None]]:
         if len(open_streams) >= MAX_STREAMS:
             await socket.close(_TRY_LATER, f"{MAX_STREAMS} streams are open")
             return
-        tags = frozenset(name.strip() for name in query.tags.split(",") if name.strip())
         open_streams.add(socket)
         try:
-            await _serve(socket, SiteStream(live, tags, query.group))
+            await _serve(socket, SiteStream(live, frozenset(names(query.tags)), query.group))
         finally:
             open_streams.discard(socket)
 
