@@ -139,7 +139,7 @@ def _listening(listen: str | None) -> "ListenAddress":
     return ListenAddress(*listen_address(listen, PORT))
 
 
-def _rules(bound: str, host: str, port: int, token: str | None, reader_token: str | None) -> "AccessRules":
+def _rules(bound: str, host: str, port: int, token: str | None, reader_token: str | None = None) -> "AccessRules":
     """Who may connect, by the address that the socket is bound to. Raises SkylessError."""
     import ipaddress
     import secrets
