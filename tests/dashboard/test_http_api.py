@@ -205,10 +205,11 @@ def test_events_come_in_pages_while_more_happen(client, site, wire):
     ids = [event["id"] for event in found]
     assert ids == list(range(ids[0], 0, -1))
     crossings = [event for event in found if event["subject"].startswith("tag/x")]
-    assert [event["tag"] for event in crossings] == [f"x{number}" for number in range(9, -1, -1)]
+    assert [event["zone_event"]["tag"] for event in crossings] == [f"x{number}" for number in range(9, -1, -1)]
+    crossing = {"zone": "desk", "name": "Desk", "tag": "x9", "kind": "enter", "unix_s": 9.0}
     assert crossings[0] == {
-        "id": ids[0], "unix_s": 9.0, "kind": "enter", "level": "note", "subject": "tag/x9",
-        "text": "tag x9 entered Desk", "tag": "x9", "zone": "desk", "zone_name": "Desk", "position_m": [1.0, 2.0, 3.0],
+        "id": ids[0], "unix_s": 9.0, "kind": "zone", "level": "note", "subject": "tag/x9",
+        "text": "tag x9 entered Desk", "zone_event": {**crossing, "position_m": [1.0, 2.0, 3.0]},
     }  # fmt: skip
 
 

@@ -3,31 +3,31 @@
 from collections import deque
 from typing import Final, Literal
 
-from msgspec import UNSET, Struct, UnsetType
+from msgspec import Struct
 
-from skyless.run.mqtt.messages import Vector, ZoneEvent
+from skyless.run.mqtt.messages import ZoneEvent
 
 MAX_KEPT: Final = 2_000
 """Events that are kept. The oldest are dropped."""
 
+Kind = Literal["zone", "anchor", "master", "watch", "alert", "tag", "program", "survey", "condition"]
+Level = Literal["good", "note", "warning", "bad"]
 
-class SiteEvent(Struct, frozen=True, omit_defaults=True):
+
+class SiteEvent(Struct, frozen=True):
     """One event: a tag entered or left a zone, or a line of the page's list of events."""
 
     id: int
     """Counts from 1 since the server's start."""
     unix_s: float
-    kind: Literal["enter", "leave", "anchor", "master", "watch", "alert", "tag", "program", "survey", "condition"]
-    level: Literal["good", "note", "warning", "bad"]
+    kind: Kind
+    level: Level
     subject: str
     """What it is about, such as ``tag/t1`` or ``anchor/3``; empty for the site."""
     text: str
     """For people."""
-    tag: str | UnsetType = UNSET
-    """Of ``enter`` and ``leave``, as is all that follows."""
-    zone: str | UnsetType = UNSET
-    zone_name: str | UnsetType = UNSET
-    position_m: Vector | UnsetType = UNSET
+    zone_event: ZoneEvent | None
+    """Of the kind ``zone``."""
 
 
 class EventList:
@@ -38,44 +38,24 @@ class EventList:
         """Number of the newest event."""
         self._events: deque[SiteEvent] = deque(maxlen=MAX_KEPT)
 
-    def add_crossing(self, event: ZoneEvent) -> None:
+    def add_zone_event(self, event: ZoneEvent) -> None:
         """A tag has entered or left a zone."""
-        self.last += 1
         verb = "entered" if event.kind == "enter" else "left"
         text = f"tag {event.tag} {verb} {event.name or event.zone}"
-        self._events.append(
-            SiteEvent(
-                self.last,
-                event.unix_s,
-                event.kind,
-                "note",
-                f"tag/{event.tag}",
-                text,
-                event.tag,
-                event.zone,
-                event.name,
-                event.position_m,
-            )
-        )
+        self.add(event.unix_s, "zone", "note", f"tag/{event.tag}", text, event)
 
-    def add_line(
-        self,
-        unix_s: float,
-        kind: Literal["anchor", "master", "watch", "alert", "tag", "program", "survey", "condition"],
-        level: Literal["good", "note", "warning", "bad"],
-        subject: str,
-        text: str,
+    def add(
+        self, unix_s: float, kind: Kind, level: Level, subject: str, text: str, event: ZoneEvent | None = None
     ) -> None:
-        """A line of the page's list."""
+        """Add an event; the fields are those of ``SiteEvent``."""
         self.last += 1
-        self._events.append(SiteEvent(self.last, unix_s, kind, level, subject, text))
+        self._events.append(SiteEvent(self.last, unix_s, kind, level, subject, text, event))
 
     def before(self, number: int | None, limit: int) -> list[SiteEvent]:
         """At most ``limit`` events before a number, or the newest; the newest first."""
         first = self.last + 1 - len(self._events)
         end = len(self._events) if number is None else min(max(number - first, 0), len(self._events))
-        events = list(self._events)
-        return events[max(end - limit, 0) : end][::-1]
+        return list(self._events)[max(end - limit, 0) : end][::-1]
 
     def since(self, number: int) -> list[SiteEvent]:
         """Events after a number, the oldest first."""

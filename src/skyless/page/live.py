@@ -569,7 +569,7 @@ class LiveSite:
         if events:
             self._logged_serial = self.log.serial
             for event in events:
-                self.event_list.add_line(event.unix_s, event.kind, event.level, event.name, event.text)
+                self.event_list.add(event.unix_s, event.kind, event.level, event.name, event.text)
             message = encode("log", {"events": events})
             for page in self.pages:
                 page.add_logged(message)
@@ -590,7 +590,7 @@ class LiveSite:
             page.replace(kind, message)
 
     def _broadcast_event(self, event: ZoneEvent) -> None:
-        self.event_list.add_crossing(event)
+        self.event_list.add_zone_event(event)
         message = encode("zone_event", msgspec.structs.asdict(event))
         for page in self.pages:
             page.add_event(message)

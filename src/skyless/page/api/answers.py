@@ -6,8 +6,8 @@ import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from skyless.core.alarm_rule import AlarmRule
-from skyless.core.site import GeoreferenceSite, Outline
-from skyless.page.event_list import SiteEvent
+from skyless.core.site import Outline, Site
+from skyless.page.event_list import Level, SiteEvent
 from skyless.run.mqtt.messages import Matrix, Vector
 
 Name = Annotated[str, Meta(max_length=200)]
@@ -132,17 +132,15 @@ class ErrorAnswer(Struct, frozen=True):
 class SiteAnswer(Struct, frozen=True):
     """The site, and how it is."""
 
-    id: int
-    name: str
-    simulated: bool
-    georeference: GeoreferenceSite | None
+    site: Site
+    """As in its file, without the outline."""
     outline_m: Outline | None
-    anchors: int
-    tags: int
-    tags_with_fix: int
-    level: Literal["waiting", "good", "warning", "bad"]
+    simulated: bool
+    level: Level | Literal["waiting"]
     text: str
     """What is wrong, for people; empty where all is well."""
+    tags: int
+    tags_with_fix: int
     connected: bool
     """Whether the page's server is connected to the broker."""
     history: bool

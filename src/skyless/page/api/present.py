@@ -40,18 +40,14 @@ def _known(live: LiveSite) -> SiteMessage:
 def site(call: Call) -> SiteAnswer:
     """The site."""
     message, condition = _known(call.live), call.live.condition
-    outline = message.whole_site.outline_m
     return SiteAnswer(
-        id=message.site.id,
-        name=message.site.name,
+        site=message.site,
+        outline_m=message.outline_m or None,
         simulated=message.simulated,
-        georeference=message.site.georeference,
-        outline_m=None if outline is UNSET else outline,
-        anchors=len(message.site.anchors),
-        tags=condition.tags,
-        tags_with_fix=condition.tags_with_fix,
         level=condition.level,
         text=condition.text,
+        tags=condition.tags,
+        tags_with_fix=condition.tags_with_fix,
         connected=call.live.connected,
         history=call.live.has_history,
         version=installed_version(),

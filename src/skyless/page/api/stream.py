@@ -4,11 +4,12 @@ Each stream looks at the site ten times a second and keeps no queue: after a pau
 """
 
 import asyncio
+import time
 from collections.abc import Awaitable, Callable
 from typing import Final
 
 import msgspec
-from msgspec import UNSET
+from msgspec import Struct
 from starlette.exceptions import HTTPException
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
@@ -16,11 +17,11 @@ from skyless.core.version import installed_version
 from skyless.page.api.answers import StreamQuery
 from skyless.page.api.call import ApiServices, names, read_query, site_of
 from skyless.page.api.present import usable
-from skyless.page.event_list import SiteEvent
 from skyless.page.live import LiveSite, NoSiteError
 from skyless.run.mqtt.messages import AlarmMessage
 
 PERIOD_S: Final = 0.1
+_PAUSES: Final = 9.0  # of very many tags a stream is sent less often, so that it takes a tenth of a processor at most
 MAX_STREAMS: Final = 200
 STREAM_TIMEOUT_S: Final = 10.0
 """A reader that accepts no message for this long is disconnected."""
@@ -54,7 +55,7 @@ class SiteStream:
 
     def new(self) -> list[bytes]:
         """What is new to the reader."""
-        messages = [_crossing(event) for event in self._new_events()] + self._new_alarms()
+        messages = self._new_zone_events() + self._new_alarms()
         serial, self._fixes = self._fixes, self._live.state.serial
         if serial != self._fixes:
             newest = self._live.state.fixes_after(serial)
@@ -69,10 +70,10 @@ class SiteStream:
         asset = self._live.assets.by_tag.get(tag) if self._group else None
         return not self._group or (asset is not None and asset.group == self._group)
 
-    def _new_events(self) -> list[SiteEvent]:
+    def _new_zone_events(self) -> list[bytes]:
         number, self._event = self._event, self._live.event_list.last
-        events = self._live.event_list.since(number) if number != self._event else []
-        return [event for event in events if event.tag is not UNSET and self._carries(event.tag)]
+        events = (event.zone_event for event in self._live.event_list.since(number))
+        return [_message("zone_event", event) for event in events if event is not None and self._carries(event.tag)]
 
     def _new_alarms(self) -> list[bytes]:
         now = {(alarm.rule, alarm.subject): alarm for alarm in self._live.alarms.messages}
@@ -80,23 +81,14 @@ class SiteStream:
         changed = [(alarm, False) for key, alarm in now.items() if before.get(key) != alarm]
         changed += [(alarm, True) for key, alarm in before.items() if key not in now]
         return [
-            msgspec.json.encode({"type": "alarm", "over": over, **msgspec.structs.asdict(alarm)})
+            _message("alarm", alarm, over=over)
             for alarm, over in changed
             if not alarm.tags or any(map(self._carries, alarm.tags))
         ]
 
 
-def _crossing(event: SiteEvent) -> bytes:
-    fields = {
-        "type": "zone_event",
-        "zone": event.zone,
-        "name": event.zone_name,
-        "tag": event.tag,
-        "kind": event.kind,
-        "unix_s": event.unix_s,
-        "position_m": event.position_m,
-    }
-    return msgspec.json.encode(fields)
+def _message(kind: str, value: Struct, **more: object) -> bytes:
+    return msgspec.json.encode({"type": kind, **more, **msgspec.structs.asdict(value)})
 
 
 def endpoint(services: ApiServices) -> Callable[[WebSocket], Awaitable[None]]:
@@ -127,13 +119,15 @@ def endpoint(services: ApiServices) -> Callable[[WebSocket], Awaitable[None]]:
 async def _serve(socket: WebSocket, reader: SiteStream) -> None:
     reading = asyncio.create_task(_until_closed(socket))
     try:
-        messages = [reader.hello()]
+        messages, spent_s = [reader.hello()], 0.0
         while not reading.done():
             async with asyncio.timeout(STREAM_TIMEOUT_S):
                 for message in messages:
                     await socket.send_text(message.decode())
-            await asyncio.wait([reading], timeout=PERIOD_S)
+            await asyncio.wait([reading], timeout=max(PERIOD_S, _PAUSES * spent_s))
+            begin_s = time.monotonic()
             messages = reader.new()
+            spent_s = time.monotonic() - begin_s
     except (WebSocketDisconnect, RuntimeError, TimeoutError):
         pass  # it has gone, or does not read
     finally:
