@@ -10,7 +10,7 @@ from skyless.run.mqtt.messages import ZoneEvent
 MAX_KEPT: Final = 2_000
 """Events that are kept. The oldest are dropped."""
 
-Kind = Literal["zone", "anchor", "master", "watch", "alert", "tag", "program", "survey", "condition"]
+Kind = Literal["zone", "alarm", "anchor", "master", "watch", "alert", "tag", "program", "survey", "condition"]
 Level = Literal["good", "note", "warning", "bad"]
 
 
