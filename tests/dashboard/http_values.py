@@ -4,6 +4,7 @@ import sys
 import threading
 from types import SimpleNamespace
 from typing import ClassVar
+from unittest.mock import MagicMock
 
 from dashboard_builders import SITE, SITE_ID, SQUARE, fix, status
 from msgspec.structs import replace
@@ -125,7 +126,7 @@ def fill(live, wire):
         show(live, wire, name)
     wire.deliver(topics.status_topic(SITE_ID, "tag", "t9"), status(name="t9"))
     wire.deliver(topics.status_topic(SITE_ID, "anchor", "1"), status("anchor", "1"))
-    live.alarms = SimpleNamespace(messages=(ALARM,), rules=(RULE,), file_rules=())
+    live.alarms = MagicMock(messages=(ALARM,), rules=(RULE,), file_rules=())
     live.store_alarm_rules = lambda rules, site: setattr(live.alarms, "rules", rules)
     live.acknowledged = []
     live.acknowledge = lambda *what: live.acknowledged.append(what)
