@@ -53,6 +53,8 @@ class FakeHistory:
     release = threading.Event()
 
     def __init__(self, folder, site):
+        if folder.name == "empty":
+            raise SkylessError(f"{folder} holds no history")
         self.where = folder, site
 
     def _note(self, *question):

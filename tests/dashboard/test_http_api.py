@@ -317,6 +317,12 @@ def test_without_a_history(site, tmp_path, monkeypatch):
         assert "skyless[history]" in answer.json()["error"]
 
 
+def test_a_history_without_this_site(site, tmp_path):
+    with browser_of(site, history=tmp_path / "empty") as client:
+        assert client.get(f"{API}/history/tags").status_code == 404
+        assert client.get(f"{API}/history/alarms", params={"from": "soon"}).status_code == 404
+
+
 # Tokens
 
 OPERATOR, READER = "operators-token", "readers-token-1"

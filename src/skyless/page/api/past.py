@@ -65,6 +65,8 @@ class Past:
             answer.cancel()  # of no effect once it has begun: then the next question waits for its end
             fault = f"the history has not answered within {QUERY_TIMEOUT_S:g} s; ask for a shorter time"
             raise HTTPException(503, fault) from None
+        except _NoHistoryError as error:
+            raise HTTPException(404, str(error)) from None
         except SkylessError as error:
             raise HTTPException(400, str(error)) from None
 
@@ -82,7 +84,15 @@ class Past:
 def _ask(folder: Path, site: int, question: "Callable[[History], _T]") -> _T:
     from skyless.run.history.queries import History  # noqa: PLC0415 - of the extra history
 
-    return question(History(folder, site))
+    try:
+        history = History(folder, site)
+    except SkylessError as error:
+        raise _NoHistoryError(str(error)) from None
+    return question(history)
+
+
+class _NoHistoryError(SkylessError):
+    """The folder has no history of the site."""
 
 
 def read_span(begin: str, end: str) -> Span:

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from msgspec import UNSET, Struct
-from msgspec.structs import asdict
+from msgspec.structs import asdict, replace
 from starlette.exceptions import HTTPException
 
 from skyless.bridges.target import is_usable
@@ -208,7 +208,7 @@ def put_alarm_rules(call: Call) -> AlarmRulesAnswer:
     """Replace the rules that were made on the page."""
     _known(call.live)
     call.live.store_alarm_rules(call.body.rules, call.body.site)
-    return alarm_rules(call)
+    return replace(alarm_rules(call), rules=call.body.rules)  # they hold from the next tick on
 
 
 def acknowledge(call: Call) -> Acknowledgement:
