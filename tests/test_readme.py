@@ -43,6 +43,7 @@ SHORTER = {
 }
 """Lines that take long, and what is run in their stead: less of the same."""
 
+HTTP = "tests/dashboard/test_http_doc.py::test_a_readers_token_and_a_table_that_is_kept"
 DEMO = "tests/cli/test_demo_command.py::"
 KEYED = "tests/nodes/test_no_key_leaves.py::test_no_key_leaves_the_programs"
 SITE = "tests/nodes/test_running_site.py::test_a_site_rides_through_the_death_and_the_freezing_of_every_process"
@@ -76,6 +77,9 @@ ELSEWHERE = {
         "tests/nodes/test_fix_lines.py::test_lines_for_people_have_time_tag_position_and_sigma"
     ),
     "skyless dashboard": "tests/dashboard/test_dashboard_end_to_end.py::test_a_site_is_found_shown_and_watched",
+    "skyless dashboard --assets assets.csv": HTTP,
+    "curl http://127.0.0.1:8080/api/v1/assets.csv > assets.csv": HTTP,
+    "curl -T assets.csv http://127.0.0.1:8080/api/v1/assets.csv": HTTP,
     "skyless bridge foxglove://:8765 jsonl+tcp://:7010": (
         "tests/nodes/test_bridge_nodes.py::test_the_command_serves_readers_until_ctrl_c_and_then_says_what_it_did"
     ),

@@ -4,6 +4,7 @@ import msgspec
 from paho.mqtt.client import topic_matches_sub
 from starlette.testclient import TestClient
 
+from skyless.page.api.past import Past
 from skyless.page.app import Services, make_app
 from skyless.page.guard import AccessRules
 from skyless.page.overlays import Overlays
@@ -101,8 +102,8 @@ class Wire:
 HERE = "http://localhost:8080"
 
 
-def browser_of(live, recordings=None, *, page=None, rules=None, base_url=HERE):
+def browser_of(live, recordings=None, *, page=None, rules=None, base_url=HERE, history=None):
     """A client of a server that shows one live site, or several, and the recordings of a folder."""
     sites = live if isinstance(live, LiveSites) else LiveSites(live)
-    services = Services(sites, Overlays(), Playback(recordings), WhatIfs())
+    services = Services(sites, Overlays(), Playback(recordings), WhatIfs(), Past(history))
     return TestClient(make_app(services, rules or AccessRules(), **({"page": page} if page else {})), base_url=base_url)

@@ -87,6 +87,14 @@ def test_loopback_needs_no_token_and_all_else_gets_one():
     assert _rules("0.0.0.0", "0.0.0.0", 1, "a-token-of-my-own").token == "a-token-of-my-own"
 
 
+def test_a_readers_token_makes_an_operators():
+    for bound in ("127.0.0.1", "0.0.0.0"):
+        rules = _rules(bound, bound, 1, None, "readers-token-1")
+        assert rules.token
+        assert (rules.reader_token, rules.token == rules.reader_token) == ("readers-token-1", False)
+    assert _rules("::1", "::1", 1, "a-token-of-my-own", "readers-token-1").token == "a-token-of-my-own"
+
+
 def test_the_address_that_is_printed_is_one_that_others_can_open():
     rules = _rules("0.0.0.0", "0.0.0.0", 8080, "with/slash&and=more")
     address = _address("0.0.0.0", 8080, rules)
@@ -99,6 +107,13 @@ def test_the_address_that_is_printed_is_one_that_others_can_open():
     ("arguments", "expected"),
     [
         (["--token", "short"], "--token has 5 characters"),
+        (["--reader-token", "short"], "--reader-token has 5 characters"),
+        (
+            ["--token", "one-and-the-same", "--reader-token", "one-and-the-same"],
+            "--reader-token is the same as --token",
+        ),
+        (["--history", "/no/such/folder"], "--history is '/no/such/folder'; it should be a folder"),
+        (["--assets", "/no/such/folder/a.csv"], "--assets is '/no/such/folder/a.csv'"),
         (["--mqtt", "http://x"], "--mqtt is"),
         (["--recordings", "/no/such/folder"], "--recordings is '/no/such/folder'; it should be a folder"),
         (["--site", "/no/such/site.toml"], "site.toml"),

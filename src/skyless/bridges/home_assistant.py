@@ -23,7 +23,7 @@ from skyless.core.errors import SkylessError
 from skyless.core.version import installed_version
 from skyless.run.mqtt.address import MqttAddress, mqtt_address
 from skyless.run.mqtt.link import Link
-from skyless.run.mqtt.messages import FixMessage, StatusMessage, TagPosition, TagZones, Vector, Zone
+from skyless.run.mqtt.messages import Asset, FixMessage, StatusMessage, TagPosition, TagZones, Vector, Zone
 from skyless.run.mqtt.outbox import Limits
 from skyless.run.mqtt.topics import status_topic, tag_position_topic, tag_zones_topic
 from skyless.run.zones.monitor import ZoneMonitor
@@ -62,20 +62,26 @@ def document(site: BridgedSite, tag: str, status_topic: str, removed: Mapping[st
     """The document of a tag.
 
     It has the sensor Accuracy; where there are zones, the sensor Room and a binary sensor for each of them; a tracker
-    where the site is georeferenced. All are unavailable while the bridge is offline or the tag has no usable fix.
+    where the site is georeferenced. A tag with an asset has its name, and the asset's group as identifier of the model:
+    a group is no place, so no area is suggested.
+
+    All are unavailable while the bridge is offline or the tag has no usable fix.
     ``status_topic`` is the bridge's; ``removed`` has the platforms of components that an earlier document had, by key.
     """
     components = _components(site, tag)
     for key, component in components.items():
         component["unique_id"] = f"{device_id(site.id, tag)}_{key}"
     stubs: dict[str, Component] = {key: {"platform": platform} for key, platform in removed.items()}
+    asset = site.assets.get(tag, Asset(tag))
     return msgspec.json.encode(
         {
             "device": {
                 "identifiers": [device_id(site.id, tag)],
-                "name": tag,
+                "name": asset.name or tag,
                 "manufacturer": "Skyless",
                 "model": f"UWB tag at {site.name}" + (" (simulated)" if site.simulated else ""),
+                **({"serial_number": tag} if asset.name else {}),
+                **({"model_id": asset.group} if asset.group else {}),
             },
             "origin": {"name": "Skyless", "sw_version": installed_version(), "support_url": _DOCUMENTS},
             "availability_mode": "all",

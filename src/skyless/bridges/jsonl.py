@@ -3,14 +3,15 @@
 ``type`` says which: ``site``, ``fix`` (the fields of a fix on MQTT, ``docs/mqtt.md``) or ``no_fix``.
 """
 
+from collections.abc import Mapping
 from typing import Final
 
 import msgspec
-from msgspec import Struct
+from msgspec import UNSET, Struct, UnsetType
 
 from skyless.bridges.target import BridgeContext, BridgedSite, Encoder, TargetUrl
 from skyless.core.site import GeoreferenceSite
-from skyless.run.mqtt.messages import FixMessage, Vector
+from skyless.run.mqtt.messages import Asset, FixMessage, Vector
 
 _encode: Final = msgspec.json.Encoder().encode
 
@@ -31,6 +32,16 @@ class NoFixLine(Struct, frozen=True, tag="no_fix"):
     tag: str
     unix_s: float
     reason: str
+    name: str | UnsetType = UNSET
+    """Of the tag's asset, where it has one, as is the group."""
+    group: str | UnsetType = UNSET
+
+
+class _AssetFields(Struct, frozen=True, tag="fix"):
+    """What a line of a fix begins with."""
+
+    name: str | UnsetType = UNSET
+    group: str | UnsetType = UNSET
 
 
 class JsonLines(Encoder):
@@ -38,6 +49,7 @@ class JsonLines(Encoder):
 
     def __init__(self) -> None:
         self._site = b""
+        self._assets: Mapping[str, Asset] = {}
 
     def greeting(self) -> list[bytes]:
         """The site, once it is known."""
@@ -45,16 +57,21 @@ class JsonLines(Encoder):
 
     def on_site(self, site: BridgedSite) -> list[bytes]:
         """The site."""
+        self._assets = site.assets
         self._site = _line(SiteLine(site.id, site.name, site.simulated, site.anchors_m, site.georeference))
         return [self._site]
 
     def on_fix(self, fix: FixMessage) -> list[bytes]:
         """A fix, with its type first."""
-        return [b'{"type":"fix",' + _line(fix)[1:]]
+        return [_encode(_AssetFields(*self._names(fix.tag)))[:-1] + b"," + _line(fix)[1:]]
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> list[bytes]:
         """That there is none."""
-        return [_line(NoFixLine(tag, unix_s, reason))]
+        return [_line(NoFixLine(tag, unix_s, reason, *self._names(tag)))]
+
+    def _names(self, tag: str) -> tuple[str | UnsetType, str | UnsetType]:
+        asset = self._assets.get(tag)
+        return (UNSET, UNSET) if asset is None else (asset.name or UNSET, asset.group or UNSET)
 
 
 def _line(value: Struct) -> bytes:

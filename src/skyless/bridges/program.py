@@ -19,11 +19,13 @@ from skyless.core.air.almanac import GeoreferencePage
 from skyless.core.air.masterless_packets import Point
 from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
+from skyless.run.assets import BadAssetsError, assets_at, read_assets
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
     AlarmMessage,
     AnchorHealth,
+    AssetsMessage,
     FixMessage,
     SiteMessage,
     StatusMessage,
@@ -33,6 +35,7 @@ from skyless.run.mqtt.messages import (
 from skyless.run.mqtt.topics import (
     EVERY_NODE,
     alarm_topic,
+    assets_topic,
     fix_topic,
     health_topic,
     site_topic,
@@ -75,9 +78,11 @@ class BridgeNode:
         self._is_silent = False
         self._site: SiteMessage | None = None
         self._zones = ZonesMessage(())
+        self._assets = AssetsMessage(())
         self._malformed = 0
         self._refused: asyncio.Future[None] | None = None
         self.link.subscribe(zones_topic(site), self._on_zones)
+        self.link.subscribe(assets_topic(site), self._on_assets)
         for topic, kind, act in (
             (site_topic(site), SiteMessage, self._on_site),
             (fix_topic(site, EVERY_NODE), FixMessage, self._on_fix),
@@ -122,13 +127,22 @@ class BridgeNode:
         else:
             self._update_site()
 
+    def _on_assets(self, _topic: str, payload: bytes) -> None:
+        try:
+            self._assets = read_assets(payload) if payload else AssetsMessage(())
+        except BadAssetsError:
+            self._malformed += 1
+        else:
+            self._update_site()
+
     def _update_site(self) -> None:
         if self._site is None:
             return
         site = self._site.site
         zones = zones_of(self._zones, site.name).zones
+        assets = assets_at(self._assets, site.name)
         try:
-            self.hub.on_site(bridged_site(site, zones, simulated=self._site.simulated))
+            self.hub.on_site(bridged_site(site, zones, simulated=self._site.simulated, assets=assets))
         except SkylessError as error:
             if self._refused is not None and not self._refused.done():
                 self._refused.set_exception(error)

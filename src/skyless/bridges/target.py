@@ -7,7 +7,7 @@ of an ``Encoder``, which does no I/O, and a sender (``_senders.py``).
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
 from typing import Final, Literal
 from urllib.parse import parse_qsl, unquote, urlsplit
@@ -21,6 +21,7 @@ from skyless.run.mqtt.address import MqttAddress, hide_password
 from skyless.run.mqtt.messages import (
     AlarmMessage,
     AnchorHealth,
+    Asset,
     FixMessage,
     Matrix,
     StatusMessage,
@@ -51,12 +52,17 @@ class BridgedSite(Struct, frozen=True):
     """The anchor that is the master by the site file; None where there is none, or it is not known."""
     walls: tuple[WallSite, ...] = ()
     """A tag by itself knows none."""
+    assets: Mapping[str, Asset] = {}
+    """What tags are attached to, by tag."""
 
 
-def bridged_site(site: Site, zones: tuple[Zone, ...] = (), *, simulated: bool) -> BridgedSite:
+def bridged_site(
+    site: Site, zones: tuple[Zone, ...] = (), *, simulated: bool, assets: Mapping[str, Asset] | None = None
+) -> BridgedSite:
     """The same of a whole site, as MQTT has it."""
     anchors_m = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
-    return BridgedSite(site.id, site.name, simulated, anchors_m, site.georeference, zones, site.master, site.walls)
+    earth = site.georeference
+    return BridgedSite(site.id, site.name, simulated, anchors_m, earth, zones, site.master, site.walls, assets or {})
 
 
 def is_usable(fix: FixMessage) -> bool:

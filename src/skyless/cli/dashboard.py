@@ -33,8 +33,11 @@ def dashboard(
     site_id: SiteId | None = None,
     listen: str | None = None,
     recordings: Path | None = None,
+    history: Path | None = None,
+    assets: Path | None = None,
     token: Annotated[str | None, Parameter(env_var="SKYLESS_DASHBOARD_TOKEN")] = None,
     nats: Annotated[str | None, Parameter(env_var="SKYLESS_NATS")] = None,
+    reader_token: Annotated[str | None, Parameter(env_var="SKYLESS_DASHBOARD_READER_TOKEN")] = None,
     json: bool = False,
 ) -> None:
     """Show a site live in the browser; Ctrl-C stops.
@@ -52,23 +55,32 @@ def dashboard(
         Where programs connect, here browsers, HOST:PORT; by default 127.0.0.1:8080, or the next free port.
     recordings
         Folder of recordings to replay.
+    history
+        Folder that skyless history writes, for questions about the past.
+    assets
+        CSV file of what the tags are attached to: given to the broker where it has none, and written with each change.
+        It is of the first site that is shown.
     token
         Token that browsers must give; made and printed where other machines can reach the page and none is given.
     nats
         NATS server of a site with a gather, nats://[USER@]HOST[:PORT] or tls://...; by default that of the broker, if
         it runs on this machine with --gather.
+    reader_token
+        Another token for who may only look on; where it is given, changes need the other one on this machine, too.
     json
         Write one JSON object with the page's address instead of a table.
     """
     import asyncio
     from functools import partial
 
+    from skyless.page.api.past import Past
     from skyless.page.app import Services
     from skyless.page.condition.evidence import ProcessorUse
     from skyless.page.live import LiveSite
     from skyless.page.overlays import Overlays
     from skyless.page.playback import Playback
     from skyless.page.serve import bind, serve
+    from skyless.page.site_assets import AssetsFile
     from skyless.page.sites import LiveSites
     from skyless.page.what_if import WhatIfs
 
@@ -81,21 +93,27 @@ def dashboard(
         raise SkylessError(f"--site-id is {site_id}, but {site} is of site {known.site.id}; give one of them")
     if recordings is not None and not recordings.is_dir():
         raise SkylessError(f"--recordings is {str(recordings)!r}; it should be a folder")
+    if history is not None and not history.is_dir():
+        raise SkylessError(f"--history is {str(history)!r}; it should be a folder that skyless history writes")
+    assets_file = None if assets is None else AssetsFile(assets)
+    past = Past(history)
     listening = _listening(listen)
     sock = bind(listening)
     port = sock.getsockname()[1]
-    rules = _rules(sock.getsockname()[0], listening.host, port, token)
-    make = partial(LiveSite, _client_name(port), str(address), used_share=ProcessorUse().share)
-    live = make(known)
+    rules = _rules(sock.getsockname()[0], listening.host, port, token, reader_token)
+    make = partial(
+        LiveSite, _client_name(port), str(address), used_share=ProcessorUse().share, has_history=past.fault is None
+    )
+    live = make(known, assets_file=assets_file)
     live.plans.update(images)
     page = _address(listening.host, port, rules)
     if json:
-        print_json({"page": page, "mqtt": str(address), "token": rules.token})
+        print_json({"page": page, "mqtt": str(address), "token": rules.token, "reader_token": rules.reader_token})
         sys.stdout.flush()
     else:
         print(f"page    {page}\nbroker  {address}", flush=True)
     services = Services(
-        LiveSites(live, make), Overlays(), Playback(recordings), WhatIfs(), gathered=_gathered(nats, address)
+        LiveSites(live, make), Overlays(), Playback(recordings), WhatIfs(), past, gathered=_gathered(nats, address)
     )
     with contextlib.suppress(KeyboardInterrupt):
         asyncio.run(serve(services, rules, sock, address, known.site.id if known is not None else site_id))
@@ -151,7 +169,7 @@ def _listening(listen: str | None) -> "ListenAddress":
     return ListenAddress(*listen_address(listen, PORT))
 
 
-def _rules(bound: str, host: str, port: int, token: str | None) -> "AccessRules":
+def _rules(bound: str, host: str, port: int, token: str | None, reader_token: str | None = None) -> "AccessRules":
     """Who may connect, by the address that the socket is bound to. Raises SkylessError."""
     import ipaddress
     import secrets
@@ -159,14 +177,20 @@ def _rules(bound: str, host: str, port: int, token: str | None) -> "AccessRules"
 
     from skyless.page.guard import AccessRules
 
-    if token is not None and len(token) < _SHORTEST_TOKEN:
-        raise SkylessError(f"--token has {len(token)} characters; it should have {_SHORTEST_TOKEN} or more")
+    for option, value in (("--token", token), ("--reader-token", reader_token)):
+        if value is not None and len(value) < _SHORTEST_TOKEN:
+            raise SkylessError(f"{option} has {len(value)} characters; it should have {_SHORTEST_TOKEN} or more")
+    if reader_token is not None and reader_token == token:
+        raise SkylessError("--reader-token is the same as --token; it should be another one")
     cookie = f"skyless-{port}"
     if ipaddress.ip_address(bound.partition("%")[0]).is_loopback:
-        return AccessRules(token, cookie=cookie)
+        if reader_token is not None:
+            token = token or secrets.token_urlsafe(18)
+        return AccessRules(token, reader_token, cookie=cookie)
     own = socket.gethostname().lower()
     names = {host.lower(), own, own.partition(".")[0], f"{own.partition('.')[0]}.local", socket.getfqdn().lower()}
-    return AccessRules(token or secrets.token_urlsafe(18), frozenset(names), remote=True, cookie=cookie)
+    token = token or secrets.token_urlsafe(18)
+    return AccessRules(token, reader_token, frozenset(names), remote=True, cookie=cookie)
 
 
 def _address(host: str, port: int, rules: "AccessRules") -> str:

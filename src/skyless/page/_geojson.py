@@ -1,4 +1,4 @@
-"""The tags of a site as GeoJSON (RFC 7946), for programs that draw maps. No I/O: the time is passed in."""
+"""Tags, anchors and zones of a site as GeoJSON (RFC 7946), for programs that draw maps. No I/O."""
 
 from collections.abc import Iterable
 from math import hypot, sqrt
@@ -8,7 +8,9 @@ import msgspec
 
 from skyless.bridges.target import BridgedSite, is_usable, require_georeference
 from skyless.core.earth import geodetic
-from skyless.run.mqtt.messages import FixMessage
+from skyless.core.site import GeoreferenceSite
+from skyless.run.mqtt.messages import Asset, FixMessage, Vector
+from skyless.run.zones.zone_list import signed_area_m2
 
 MEDIA_TYPE: Final = "application/geo+json"
 
@@ -26,13 +28,16 @@ def features(site: BridgedSite, fixes: Iterable[tuple[FixMessage, float]], unix_
         SkylessError: the site is not georeferenced.
     """
     origin = require_georeference(site, "/fixes.geojson")
-    collection = []
+    collection: list[dict[str, object]] = []
     for fix, ended_unix_s in fixes:
         if not is_usable(fix):
             continue
-        latitude_deg, longitude_deg, height_m = geodetic(fix.position_m, origin)
+        asset = site.assets.get(fix.tag, Asset(fix.tag))
         properties = {
             "tag": fix.tag,
+            "name": asset.name or None,
+            "group": asset.group or None,
+            "colour": asset.colour or None,
             "unix_s": round(ended_unix_s, 3),
             "age_s": round(max(unix_s - ended_unix_s, 0.0), 3),
             "std_m": round(fix.std_m, 4),
@@ -41,7 +46,40 @@ def features(site: BridgedSite, fixes: Iterable[tuple[FixMessage, float]], unix_
             "method": fix.method,
             "alert": fix.alert,
         }
-        position = [round(longitude_deg, 9), round(latitude_deg, 9), round(height_m, 4)]
-        geometry = {"type": "Point", "coordinates": position}
+        geometry = {"type": "Point", "coordinates": _coordinates(fix.position_m, origin)}
         collection.append({"type": "Feature", "id": fix.tag, "geometry": geometry, "properties": properties})
+    return _encoded(collection)
+
+
+def anchor_features(site: BridgedSite) -> bytes:
+    """A FeatureCollection with a point for each anchor. Raises SkylessError: the site is not georeferenced."""
+    origin = require_georeference(site, "GeoJSON")
+    collection: list[dict[str, object]] = []
+    for number, position_m in site.anchors_m.items():
+        geometry = {"type": "Point", "coordinates": _coordinates(position_m, origin)}
+        properties = {"anchor": number, "position_m": position_m}
+        collection.append({"type": "Feature", "id": number, "geometry": geometry, "properties": properties})
+    return _encoded(collection)
+
+
+def zone_features(site: BridgedSite) -> bytes:
+    """A FeatureCollection with a polygon for each zone. Raises SkylessError: the site is not georeferenced."""
+    origin = require_georeference(site, "GeoJSON")
+    collection: list[dict[str, object]] = []
+    for zone in site.zones:
+        corners = zone.polygon_m if signed_area_m2(zone.polygon_m) >= 0.0 else zone.polygon_m[::-1]
+        ring = [_coordinates((x, y, 0.0), origin)[:2] for x, y in (*corners, corners[0])]
+        geometry = {"type": "Polygon", "coordinates": [ring]}
+        properties = {"zone": zone.id, "name": zone.name, "colour": zone.colour}
+        collection.append({"type": "Feature", "id": zone.id, "geometry": geometry, "properties": properties})
+    return _encoded(collection)
+
+
+def _coordinates(position_m: Vector, origin: GeoreferenceSite) -> list[float]:
+    """Longitude, latitude and height."""
+    latitude_deg, longitude_deg, height_m = geodetic(position_m, origin)
+    return [round(longitude_deg, 9), round(latitude_deg, 9), round(height_m, 4)]
+
+
+def _encoded(collection: list[dict[str, object]]) -> bytes:
     return msgspec.json.encode({"type": "FeatureCollection", "features": collection})

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from itertools import islice
 from typing import Annotated, Any, Final, NamedTuple
 
@@ -162,6 +162,15 @@ class SiteState:
         """The newest fix of each tag that came within the last ``longest_s``, and when it ended, by ``unix_s``."""
         found = [tag for tag in self._tags.values() if now_s - tag.received_s <= longest_s]
         return [(tag.fix, tag.ended_unix_s) for tag in found]
+
+    def fixes_after(self, serial: int) -> list[tuple[FixMessage, float]]:
+        """The newest fix of each tag that has one after a serial, and when it ended, by ``unix_s``."""
+        return [(tag.fix, tag.ended_unix_s) for tag in self._tags.values() if tag.serial > serial]
+
+    @property
+    def tags(self) -> Collection[str]:
+        """Names of the tags that have had a fix lately."""
+        return self._tags.keys()
 
     def methods(self) -> list[str]:
         """The positioning method of each tag whose health is known."""

@@ -25,6 +25,9 @@ from skyless.page._alarms import NoAlarmError
 from skyless.page._geojson import MEDIA_TYPE
 from skyless.page._site_survey import NoResultError
 from skyless.page._state import PageRequest
+from skyless.page.api.call import ApiServices
+from skyless.page.api.past import Past
+from skyless.page.api.routes import api_routes
 from skyless.page.guard import AccessRules, Guard
 from skyless.page.live import LiveSite, NoBrokerError, NoSiteError, NotAllowedError, TooManyPagesError
 from skyless.page.overlays import KINDS, MovedAnchors, NoOverlayError, Overlays
@@ -32,6 +35,7 @@ from skyless.page.playback import NoRecordingError, Playback, RecordingFile
 from skyless.page.sites import LiveSites
 from skyless.page.task_process import TaskError, TaskProcess
 from skyless.page.what_if import NoWhatIfError, WhatIfs, WhatIfTask
+from skyless.run.assets import BadAssetsError
 from skyless.run.mqtt.survey_facts import BadFactsError
 from skyless.run.zones.zone_list import BadZonesError, read_zones
 from skyless.site.alarm_rules import BadAlarmRulesError
@@ -58,6 +62,7 @@ _GOING_AWAY: Final = 1001
 _NO_GATHER: Final = 4404
 _STATUSES: Final[dict[type[Exception], int]] = {
     BadZonesError: 400,
+    BadAssetsError: 400,
     BadFactsError: 400,
     BadAlarmRulesError: 400,
     NoAlarmError: 404,
@@ -78,6 +83,7 @@ class Services(Struct, frozen=True):
     overlays: Overlays
     playback: Playback
     what_ifs: WhatIfs
+    past: Past = Past(None)
     sheets: TaskProcess = field(default_factory=lambda: TaskProcess("skyless.page.sheet_process"))
     gathered: "Gathered | None" = None
     """The batches of a broker with a gather."""
@@ -112,6 +118,7 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
         Route("/api/recordings/{name}/states", _recorded_states),
         Route("/api/recordings/{name}/floor_plan", _recorded(Playback.floor_plan, _image)),
         Route("/api/recordings/{name}/what_if", _what_if),
+        *api_routes(ApiServices(services.sites, services.past)),
         WebSocketRoute("/live", _live),
         WebSocketRoute("/live2", _live2),
         Mount("/page", _Files(directory=page, check_dir=False)),

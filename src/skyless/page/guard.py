@@ -1,4 +1,8 @@
-"""Access control: requests of other sites' pages are refused, and those of other machines need the token."""
+"""Access control: requests of other sites' pages are refused, and those of other machines need a token.
+
+Where the server has tokens, the reader's admits what only reads: GET, HEAD and WebSockets. All else needs the
+operator's.
+"""
 
 import hmac
 import ipaddress
@@ -32,7 +36,9 @@ class AccessRules(Struct, frozen=True):
     """What the guard checks."""
 
     token: str | None = None
-    """What requests must carry, or None where only programs of this machine can reach the server."""
+    """The operator's, which requests must carry; None where only programs of this machine can reach the server."""
+    reader_token: str | None = None
+    """Carried by requests that only read; not without an operator's token."""
     names: frozenset[str] = frozenset()
     """Valid host names, in lower case, in addition to ``localhost``."""
     remote: bool = False
@@ -49,7 +55,9 @@ class Guard:
 
     def __init__(self, app: ASGIApp, rules: AccessRules) -> None:
         self._app, self._rules = app, rules
-        self._secret = sha256(rules.token.encode()).hexdigest() if rules.token is not None else None
+        self._secret = None if rules.token is None else _digest(rules.token)
+        self._reader_secret = None if rules.reader_token is None else _digest(rules.reader_token)
+        self._secrets = {secret for secret in (self._secret, self._reader_secret) if secret is not None}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request to the application, or refuse it."""
@@ -74,8 +82,12 @@ class Guard:
         origin = headers.get("origin")
         if origin is not None and not _same_origin(origin, host):
             return 403, "requests of other sites are refused"
-        if self._secret is not None and not self._has_token(scope, headers, self._secret):
+        if self._secret is None or self._carries(scope, headers, self._secret):
+            return None
+        if self._reader_secret is None or not self._carries(scope, headers, self._reader_secret):
             return 401, "the token is missing or wrong: open the address that the dashboard has printed"
+        if scope["type"] != "websocket" and scope["method"] not in {"GET", "HEAD"}:
+            return 403, "the reader's token does not allow changes: they need the operator's, --token of the dashboard"
         return None
 
     def _is_own_host(self, host: str) -> bool:
@@ -91,8 +103,9 @@ class Guard:
             return False
         return self._rules.remote or address.is_loopback
 
-    def _has_token(self, scope: MutableMapping[str, Any], headers: Headers, secret: str) -> bool:
-        digests = [sha256(token.encode()).hexdigest() for token in _tokens(scope, headers)]
+    def _carries(self, scope: MutableMapping[str, Any], headers: Headers, secret: str) -> bool:
+        """Whether a request carries the token with this digest."""
+        digests = [_digest(token) for token in _tokens(scope, headers)]
         digests += _cookies(headers, self._rules.cookie)
         return any(hmac.compare_digest(digest.encode(), secret.encode()) for digest in digests)
 
@@ -103,12 +116,17 @@ class Guard:
                 for name, value in _HEADERS.items():
                     headers[name] = value
                 headers.setdefault("Cache-Control", "no-store")
-                if self._secret is not None and message["status"] == 200 and b"token=" in scope["query_string"]:
-                    cookie = f"{self._rules.cookie}={self._secret}; Path=/; HttpOnly; SameSite=Strict"
-                    headers.append("Set-Cookie", cookie)
+                if message["status"] == 200 and b"token=" in scope["query_string"]:
+                    for secret in {_digest(token) for token in _tokens(scope, Headers())} & self._secrets:
+                        cookie = f"{self._rules.cookie}={secret}; Path=/; HttpOnly; SameSite=Strict"
+                        headers.append("Set-Cookie", cookie)
             await send(message)
 
         return sending
+
+
+def _digest(token: str) -> str:
+    return sha256(token.encode()).hexdigest()
 
 
 def _same_origin(origin: str, host: str) -> bool:

@@ -12,7 +12,7 @@ import zlib
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import msgspec
 from msgspec import UNSET, Struct
@@ -23,16 +23,21 @@ from skyless.core.errors import ConfigurationError
 from skyless.core.version import installed_version
 from skyless.page._alarms import SiteAlarms
 from skyless.page._events import MAX_EVENTS, MAX_LOGGED, EventLog, EventQueue, publisher_rank
-from skyless.page._geojson import OLDEST_S, features
+from skyless.page._geojson import OLDEST_S, anchor_features, features, zone_features
 from skyless.page._site_survey import SiteSurvey
 from skyless.page._state import PageRequest, Sent, SiteState, encode
 from skyless.page.condition.evidence import Evidence
 from skyless.page.condition.monitor import EVALUATION_S, Condition, ConditionMonitor, offline_anchors
+from skyless.page.event_list import EventList
+from skyless.page.site_assets import AssetsFile, SiteAssets
+from skyless.run.assets import BadAssetsError
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.access import Role
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
     AnchorHealth,
+    Asset,
+    AssetsMessage,
     EtherHealth,
     FixMessage,
     SiteMessage,
@@ -162,6 +167,8 @@ class LiveSite:
         wall_clock: Callable[[], float] = time.time,
         host: str = platform.node(),
         used_share: Callable[[float], float | None] | None = None,
+        assets_file: AssetsFile | None = None,
+        has_history: bool = False,
     ) -> None:
         """``name`` is the dashboard's on MQTT, ``broker`` its address without a password, ``host`` this computer.
 
@@ -177,6 +184,9 @@ class LiveSite:
         self.events = EventQueue()
         self.pages: set[PageQueue] = set()
         self.survey = SiteSurvey(name, self._broadcast, clock, wall_clock)
+        self.assets = SiteAssets(self._broadcast, assets_file)
+        self.event_list = EventList()
+        self.has_history = has_history
         self.dropped = self.state.dropped
         self._clock, self._wall_clock = clock, wall_clock
         self._link: Link | None = None
@@ -192,6 +202,7 @@ class LiveSite:
         if site is not None:
             self._set_floors(site)
             self.evidence.set_site(site.site, clock())
+            self.assets.on_site(site.site.name)
         self.log = EventLog(wall_clock() - clock())
         self.alarms = SiteAlarms(name, self.monitor, self._broadcast, self.log.on_alarm)
         if site is not None:
@@ -223,6 +234,7 @@ class LiveSite:
             topics.truth_topic(site_id): self._on_truth,
             topics.zones_topic(site_id): self._on_zones,
             topics.zone_event_topic(site_id, "+"): self._on_zone_event,
+            topics.assets_topic(site_id): self._on_assets,
             **self.survey.handlers(site_id),
             **self.alarms.attach(link, site_id),
         }
@@ -230,6 +242,22 @@ class LiveSite:
             link.subscribe(topic, self._counting(topic.rsplit("/", 1)[-1], handler), _qos(topic))
         if self._drawn is not None:
             link.publish(topics.zones_topic(site_id), self._drawn, qos=1, retain=True)
+        self.assets.attach(lambda message: link.publish(topics.assets_topic(site_id), message, qos=1, retain=True))
+
+    @property
+    def number(self) -> int | None:
+        """The site's number, or None while none is known."""
+        return self._site_id if self.site is None else self.site.site.id
+
+    @property
+    def now_s(self) -> float:
+        """The time now, by the clock of the state."""
+        return self._clock()
+
+    @property
+    def unix_s(self) -> float:
+        """The same since 1970."""
+        return self._wall_clock()
 
     def on_connection(self, connected: bool) -> None:
         """Update whether the broker is connected."""
@@ -239,6 +267,7 @@ class LiveSite:
             self._evaluate(self._clock())
             self.survey.expect_kept()
             self.alarms.on_connection(connected, self._clock())
+            self.assets.on_connection(connected, self._clock())
             self._broadcast("mqtt", self._connection())
 
     def set_sites(self, sites: list[tuple[int, str, bool]]) -> None:
@@ -252,7 +281,7 @@ class LiveSite:
         def handle(topic: str, payload: bytes) -> None:
             try:
                 handler(topic, payload)
-            except (WrongMessageError, BadZonesError, ConfigurationError) as error:
+            except (WrongMessageError, BadZonesError, BadAssetsError, ConfigurationError) as error:
                 self.dropped[kind] += 1
                 if self.dropped[kind] == 1:
                     _log.warning("dropped a wrong message of %s: %s; there may be more", topic, error)
@@ -269,6 +298,7 @@ class LiveSite:
         self.evidence.set_site(message.site, self._clock())
         self.alarms.on_site(message, self._clock(), self._wall_clock())
         self._broadcast("site", encode("site", {"site": message}))
+        self.assets.on_site(message.site.name)
         self._assign_zones()
 
     def _set_floors(self, message: SiteMessage) -> None:
@@ -364,6 +394,19 @@ class LiveSite:
         if self.events.add_published(event):
             self._broadcast_event(event)
 
+    def _on_assets(self, topic: str, payload: bytes) -> None:
+        if self.assets.on_message(payload) and self._link is not None:
+            self._link.forget(topic)
+
+    def store_assets(self, assets: tuple[Asset, ...], site: str = "") -> None:
+        """Replace the assets of the site of this name, by default of the one shown. Raises BadAssetsError."""
+        self.assets.store(assets, site)
+
+    @property
+    def assets_message(self) -> AssetsMessage:
+        """The assets of the site that is shown."""
+        return AssetsMessage(self.assets.assets, self._site_name)
+
     # Zones
 
     def store_zones(self, zones: tuple[Zone, ...], site: str = "") -> None:
@@ -454,8 +497,8 @@ class LiveSite:
             raise NoBrokerError(f"the broker {self.broker} is not connected; try again when it is")
         return self._link, self._site_id
 
-    def features(self) -> bytes:
-        """The tags as GeoJSON.
+    def features(self, kind: Literal["fixes", "anchors", "zones"] = "fixes") -> bytes:
+        """The tags, the anchors or the zones as GeoJSON.
 
         Raises:
             NoSiteError: no site is known yet.
@@ -464,7 +507,13 @@ class LiveSite:
         if self.site is None:
             raise NoSiteError("no site is known yet")
         now_s, unix_s = self._clock(), self._wall_clock()
-        site = bridged_site(self.site.site, simulated=self.site.simulated)
+        site = bridged_site(
+            self.site.site, self.monitor.zones, simulated=self.site.simulated, assets=self.assets.by_tag
+        )
+        if kind == "anchors":
+            return anchor_features(site)
+        if kind == "zones":
+            return zone_features(site)
         return features(site, self.state.fixes_since(now_s, OLDEST_S), unix_s)
 
     # Pages
@@ -479,12 +528,14 @@ class LiveSite:
             **self._zone_fields(),
             "events": list(self.events.recent),
             "mqtt": self.connected,
+            "history": self.has_history,
         }
         page = PageQueue(encode("hello", hello), address, self._clock())
         page.replace("mqtt", self._connection())
         self.state.now_s = self._clock()
         page.replace("condition", self._condition_message())
         page.replace("log", encode("log", {"events": self.log.since()}))
+        page.replace("assets", self.assets.message())
         if self.plans:
             page.replace("floor_plan", self._floor_plan_message())
         if self._sites is not None:
@@ -537,6 +588,7 @@ class LiveSite:
                 self._close_idle(page)
         self._publish_events(now_s)
         self.alarms.tick(now_s, unix_s, self._dashboards.values(), blind=self._condition_monitor.is_blind(now_s))
+        self.assets.tick(now_s)
         if now_s >= self._condition_due_s:
             self._evaluate(now_s)
         self._send_logged()
@@ -571,6 +623,8 @@ class LiveSite:
         events = self.log.since(self._logged_serial)
         if events:
             self._logged_serial = self.log.serial
+            for event in events:
+                self.event_list.add(event.unix_s, event.kind, event.level, event.name, event.text)
             message = encode("log", {"events": events})
             for page in self.pages:
                 page.add_logged(message)
@@ -591,6 +645,7 @@ class LiveSite:
             page.replace(kind, message)
 
     def _broadcast_event(self, event: ZoneEvent) -> None:
+        self.event_list.add_zone_event(event)
         message = encode("zone_event", msgspec.structs.asdict(event))
         for page in self.pages:
             page.add_event(message)
@@ -609,7 +664,7 @@ def _floor_of(topic: str) -> int | None:
 
 def _qos(topic: str) -> int:
     """Messages that are sent once only must not be lost."""
-    return 1 if any(part in topic for part in ("/zone", "/survey/", "/alarm")) else 0
+    return 1 if any(part in topic for part in ("/zone", "/survey/", "/alarm", "/assets")) else 0
 
 
 def _check_name(name: str, topic: str) -> None:

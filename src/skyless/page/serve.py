@@ -134,6 +134,7 @@ def _stop(server: "_Server", services: Services) -> None:
         services.overlays.stop()
         services.what_ifs.stop()
         services.sheets.stop()
+        services.past.stop()
         asyncio.get_running_loop().call_later(_GRACE_S, server.drop_connections)
 
 

@@ -15,7 +15,12 @@ Polygon = tuple[Point, ...]
 
 def area_m2(polygon: Polygon) -> float:
     """Area, never negative; the polygon must not cross itself."""
-    return abs(0.5 * sum(x1 * y2 - x2 * y1 for (x1, y1), (x2, y2) in sides(polygon)))
+    return abs(signed_area_m2(polygon))
+
+
+def signed_area_m2(polygon: Polygon) -> float:
+    """The same, negative where the corners go clockwise."""
+    return 0.5 * sum(x1 * y2 - x2 * y1 for (x1, y1), (x2, y2) in sides(polygon))
 
 
 def perimeter_m(polygon: Polygon) -> float:

@@ -1,0 +1,136 @@
+"""What tags are attached to: which lists are valid, and their form as CSV for spreadsheets."""
+
+import csv
+import io
+import re
+from collections.abc import Iterable, Iterator
+from typing import Final
+
+import msgspec
+
+from skyless.run.mqtt.messages import Asset, AssetsMessage
+
+MAX_ASSETS: Final = 10_000
+MAX_BYTES: Final = 4_000_000
+"""Of a list in JSON or CSV; brokers take messages of 8 MB."""
+
+COLUMNS: Final = Asset.__struct_fields__
+"""Head of a table in CSV, as it is written."""
+
+_TAG: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+_COLOUR: Final = re.compile(r"#[0-9A-Fa-f]{6}")
+_MAX_LENGTHS: Final = {"name": 100, "group": 64, "icon": 8, "owner": 100, "notes": 1000}
+_MAX_SHOWN: Final = 40
+
+
+class BadAssetsError(ValueError):
+    """What is wrong with a list of assets."""
+
+
+def read_assets(payload: bytes) -> AssetsMessage:
+    """An ``AssetsMessage`` in JSON, all its assets checked. Raises BadAssetsError."""
+    try:
+        message = msgspec.json.decode(payload, type=AssetsMessage)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise BadAssetsError(f"this is no list of assets: {error}") from None
+    check_assets(message.assets)
+    return message
+
+
+def check_assets(assets: tuple[Asset, ...]) -> None:
+    """Check a list of assets. Raises BadAssetsError, which names asset, key, value and what would be right."""
+    if len(assets) > MAX_ASSETS:
+        raise BadAssetsError(f"there are {len(assets)} assets; at most {MAX_ASSETS} are allowed")
+    known: set[str] = set()
+    for asset in assets:
+        fault = _fault(asset)
+        if fault is not None:
+            raise BadAssetsError(f"asset {asset.tag[:_MAX_SHOWN]!r}: {fault}")
+        if asset.tag in known:
+            raise BadAssetsError(f"asset {asset.tag!r}: the tag has two assets; it should have one")
+        known.add(asset.tag)
+    size = len(msgspec.json.encode(assets))
+    if size > MAX_BYTES:
+        raise BadAssetsError(f"the list has {size} bytes; it should have {MAX_BYTES} at most: shorten the notes")
+
+
+def _fault(asset: Asset) -> str | None:
+    if not _TAG.fullmatch(asset.tag):
+        return f"tag is {_shown(asset.tag)}; it should be 1 to 64 letters, digits, dots, dashes and underscores"
+    for key, most in _MAX_LENGTHS.items():
+        value = getattr(asset, key)
+        if len(value) > most:
+            return f"{key} is {_shown(value)}; it should have {most} characters at most, not {len(value)}"
+        if not all(letter.isprintable() or letter in "\u200d\n\t" for letter in value):
+            return f"{key} is {_shown(value)}; it should have no control characters"
+    if asset.colour and not _COLOUR.fullmatch(asset.colour):
+        return f"colour is {_shown(asset.colour)}; it should be #rrggbb, as #c2410c, or empty"
+    return None
+
+
+def _shown(value: str) -> str:
+    return repr(value if len(value) <= _MAX_SHOWN else value[: _MAX_SHOWN - 1] + "…")
+
+
+def write_csv(assets: Iterable[Asset]) -> bytes:
+    """A table in CSV (RFC 4180), UTF-8."""
+    out = io.StringIO()
+    writer = csv.writer(out)
+    writer.writerow(COLUMNS)
+    writer.writerows(msgspec.structs.astuple(asset) for asset in assets)
+    return out.getvalue().encode()
+
+
+def read_csv(data: bytes) -> tuple[Asset, ...]:
+    """The assets of a table, all checked; commas, or semicolons or tabs as spreadsheets of some languages write them.
+
+    The head names the columns: ``tag``, and any of the others in any order.
+
+    Raises:
+        BadAssetsError: it names the line.
+    """
+    if len(data) > MAX_BYTES:
+        raise BadAssetsError(f"the table has {len(data)} bytes; it should have {MAX_BYTES} at most")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise BadAssetsError(f"line {line}: it is not UTF-8; save the table as CSV UTF-8") from None
+    head = text.partition("\n")[0]
+    delimiter = max(",;\t", key=head.count)
+    rows = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
+    assets, lines = [], dict[str, int]()
+    try:
+        for line, asset in _assets(rows, lines):
+            fault = _fault(asset)
+            if fault is not None:
+                raise BadAssetsError(f"line {line}: {fault}")
+            assets.append(asset)
+    except csv.Error as error:
+        raise BadAssetsError(f"line {rows.line_num}: this is no CSV: {error}") from None
+    check_assets(tuple(assets))
+    return tuple(assets)
+
+
+def _assets(rows: Iterator[list[str]], lines: dict[str, int]) -> Iterator[tuple[int, Asset]]:
+    columns = [name.strip().lower() for name in next(rows, [])]
+    wrong = [name for name in columns if name not in COLUMNS or columns.count(name) > 1]
+    if "tag" not in columns or wrong:
+        found = f"the head has {wrong[0][:_MAX_SHOWN]!r}" if wrong else "the head has no column tag"
+        raise BadAssetsError(f"line 1: {found}; it should have tag and any of {', '.join(COLUMNS[1:])}, each once")
+    for row in rows:
+        line: int = rows.line_num  # type: ignore[attr-defined]
+        if not any(cell.strip() for cell in row):
+            continue
+        if len(row) != len(columns):
+            raise BadAssetsError(f"line {line}: it has {len(row)} cells; it should have {len(columns)}, as the head")
+        asset = Asset(**{name: cell.strip() for name, cell in zip(columns, row, strict=True)})
+        if asset.tag in lines:
+            raise BadAssetsError(f"line {line}: tag {asset.tag!r} stands in line {lines[asset.tag]} already")
+        lines[asset.tag] = line
+        yield line, asset
+
+
+def assets_at(message: AssetsMessage, site: str) -> dict[str, Asset]:
+    """The assets by tag at the site of this name; none where they are of another site of the same number."""
+    return {asset.tag: asset for asset in message.assets} if message.site in ("", site) else {}
