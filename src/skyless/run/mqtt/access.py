@@ -95,7 +95,7 @@ ACCESS: Final = {
     Role.PAGE: Access(
         publish=(
             *_SHOWN,
-            *_status("dashboard", "recorder", "bridge", "homeassistant"),
+            *_status("dashboard", "recorder", "history", "bridge", "homeassistant"),
             "homeassistant/device/+/config",
             "homeassistant/status",
         ),
