@@ -11,8 +11,8 @@ REMEMBERED_KINDS: Final = ("alarm-raised", "alarm-ended", "alarm-acknowledged", 
 """Events that retained messages tell of: those of the past must be known."""
 
 _MAX_REMEMBERED: Final = 100_000
-MAX_UNIX_S: Final = 1e11
-"""Times beyond are no times."""
+MAX_UNIX_S: Final = 8e9
+"""Times beyond, in more than 200 years, are no times."""
 
 
 class EventLog:

@@ -1,9 +1,10 @@
 """The history of one site as it is written: numbers of tags, journals, files. One process at a time writes it."""
 
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
 from pathlib import Path
+from threading import Lock
 from typing import Any, Final, Generic, cast
 
 import msgspec
@@ -11,10 +12,11 @@ import pyarrow as pa
 
 from skyless.core.errors import SkylessError
 from skyless.run.fix_batch import Batch, Records, decode_batch, encode_batch
-from skyless.run.history.events import REMEMBERED_KINDS
+from skyless.run.history.events import MAX_UNIX_S, REMEMBERED_KINDS
 from skyless.run.history.journal import Journal
 from skyless.run.history.layout import EVENT_COLUMNS, NAME_COLUMNS, ZONE_COLUMNS, current_events, site_folder
 from skyless.run.history.sink import MAX_ROWS, Event, R, Sink, event_sink, fix_sink, read_table, schema_of, write_table
+from skyless.run.mqtt.messages import FixMessage, Zone
 from skyless.run.process import locked
 
 MAX_WAITING: Final = 500_000
@@ -41,11 +43,17 @@ class Intake(Generic[R]):
         self._encode: Callable[[R, float], bytes] = encode
         self._waiting: deque[tuple[R, float]] = deque()
         self._waiting_rows = 0
+        self._lock = Lock()  # a thread may still be at work when the program ends
         for first, payload in journal.read():
             rows, arrived_unix_s = decode(payload)
             sink.put(rows, first, arrived_unix_s)
         sink.next = max(sink.next, journal.end())
         journal.begin(sink.next)
+
+    @property
+    def waiting(self) -> int:
+        """How many rows are not in the journal yet."""
+        return self._waiting_rows
 
     def add(self, rows: R, arrived_unix_s: float) -> None:
         """Take rows, at most ``MAX_RECORDS`` of ``run/fix_batch.py``. They are in the journal after ``store``."""
@@ -67,16 +75,19 @@ class Intake(Generic[R]):
 
     def begin(self) -> None:
         """Let the journal go on in another file, so that ``write`` can remove the one so far. Raises OSError."""
-        self._journal.begin(self.sink.next)
+        with self._lock:
+            self._journal.begin(self.sink.next)
 
     def write(self) -> None:
         """Turn the rows of the journal into files. Raises OSError. Another thread may call it."""
-        self.sink.write()
-        self._journal.drop_through(self.sink.last)
+        with self._lock:
+            self.sink.write()
+            self._journal.drop_through(self.sink.last)
 
     def sync(self) -> None:
         """Wait until the journal is on the disk. Raises OSError. Another thread may call it."""
-        self._journal.sync()
+        with self._lock:
+            self._journal.sync()
 
 
 class Table:
@@ -110,6 +121,8 @@ class Writer:
     def __init__(self, folder: Path, site: int) -> None:
         """Raises SkylessError: it cannot be written, another program does so, or it is damaged."""
         self.root, self.site = folder, site
+        self.drops: Counter[str] = Counter()
+        """Messages that are not kept, by reason."""
         self.folder = site_folder(folder, site)
         journals, names = self.folder / "journal", self.folder / "names.parquet"
         try:
@@ -128,14 +141,25 @@ class Writer:
         if self.fixes.sink.next > 1 and not self.names.rows:
             raise SkylessError(f"{names} is missing; it should be the table that tells whose the fixes are")
 
-    def number(self, tag: str, unix_s: float) -> int | None:
-        """The number of a tag, which no other ever gets; None where there are too many."""
-        row = self.names.rows.get(tag)
-        if row is None and len(self.names.rows) < MAX_TAGS:
-            row = next(reversed(self.names.rows.values()), {"tag": 0})
-            self.names.set(row["tag"] + 1, tag, round(1000 * unix_s))
-            row = self.names.rows[tag]
-        return None if row is None else int(row["tag"])
+    def number(self, fix: FixMessage, unix_s: float) -> int | None:
+        """The number of a fix's tag, which no other ever gets; None for a fix that is not kept, which is counted."""
+        row = self.names.rows.get(fix.tag)
+        if not 0.0 <= fix.unix_s <= MAX_UNIX_S:
+            self.drops["wrong-time"] += 1
+            return None
+        if row is None and len(self.names.rows) >= MAX_TAGS:
+            self.drops["too-many-tags"] += 1
+            return None
+        if row is None:
+            newest = next(reversed(self.names.rows.values()), {"tag": 0})
+            self.names.set(newest["tag"] + 1, fix.tag, round(1000 * unix_s))
+            row = self.names.rows[fix.tag]
+        return int(row["tag"])
+
+    def set_zones(self, zones: Iterable[Zone]) -> None:
+        """Keep zones; those that were removed stay, as events name them."""
+        for zone in zones:
+            self.zones.set(zone.id, zone.name, msgspec.json.encode(zone.polygon_m).decode())
 
     def past_events(self) -> Iterator[Event]:
         """The events of ``REMEMBERED_KINDS``, in order."""
@@ -151,13 +175,17 @@ class Writer:
         for intake in (self.fixes, self.events):
             intake.store()
 
+    def write(self) -> None:
+        """Turn all rows of the journal into files. Raises OSError: the others stay in the journal."""
+        for intake in (self.fixes, self.events):
+            intake.begin()
+            intake.write()
+
     def close(self) -> None:
         """Turn all rows into files, and let other programs write. Raises OSError."""
         try:
             self.store()
-            for intake in (self.fixes, self.events):
-                intake.begin()
-                intake.write()
+            self.write()
         finally:
             self._lock.close()
 
