@@ -98,7 +98,7 @@ def read_table(file: Path, columns: Sequence[str] | None = None, filters: object
 
 def write_table(table: pa.Table, file: Path) -> None:
     """Write a file that readers find whole, on the disk and under its name, or not at all. Raises OSError."""
-    scratch = file.with_name(f"{file.name}.tmp")
+    scratch = scratch_of(file)
     numbers = [field.name for field in table.schema if not pa.types.is_string(field.type)]
     options: dict[str, Any] = {"use_dictionary": [field.name for field in table.schema if field.name not in numbers]}
     try:
@@ -120,6 +120,11 @@ def write_table(table: pa.Table, file: Path) -> None:
             scratch.unlink()
         raise
     sync_folder(file.parent)
+
+
+def scratch_of(file: Path) -> Path:
+    """The name of a file while it is written; a program that was killed leaves it behind."""
+    return file.with_name(f"{file.name}.tmp")
 
 
 def sync_folder(folder: Path) -> None:

@@ -15,7 +15,18 @@ from skyless.run.fix_batch import Batch, Records, decode_batch, encode_batch
 from skyless.run.history.events import MAX_UNIX_S, REMEMBERED_KINDS
 from skyless.run.history.journal import Journal
 from skyless.run.history.layout import EVENT_COLUMNS, NAME_COLUMNS, ZONE_COLUMNS, current_events, site_folder
-from skyless.run.history.sink import MAX_ROWS, Event, R, Sink, event_sink, fix_sink, read_table, schema_of, write_table
+from skyless.run.history.sink import (
+    MAX_ROWS,
+    Event,
+    R,
+    Sink,
+    event_sink,
+    fix_sink,
+    read_table,
+    schema_of,
+    scratch_of,
+    write_table,
+)
 from skyless.run.mqtt.messages import FixMessage, Zone
 from skyless.run.process import locked
 
@@ -99,6 +110,7 @@ class Table:
         """By the value of the column ``key``."""
         self._file, self._columns, self._key = file, columns, key
         self._is_saved = True
+        scratch_of(file).unlink(missing_ok=True)
         if file.exists():
             self.rows = {row[key]: row for row in read_rows(file, columns)}
 
