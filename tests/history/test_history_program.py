@@ -12,11 +12,13 @@ import pytest
 from made_fixes import fix, in_files, on_disk
 from pyarrow import parquet
 
-from mqtt.mqtt_brokers import Embedded, until
+from mqtt.mqtt_brokers import Embedded, stopped, until
 from skyless.run.history.layout import current_events, current_files, rows_of, site_folder
 from skyless.run.history.program import HistoryNode
 from skyless.run.history.retention import Keep
 from skyless.run.history.writer import Writer
+from skyless.run.mqtt.access import Role, create_access, read_access
+from skyless.run.mqtt.address import MqttAddress, mqtt_address
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import AlarmMessage, SiteMessage, StatusMessage, Zone, ZoneEvent, ZonesMessage
 from skyless.run.mqtt.topics import (
@@ -28,7 +30,7 @@ from skyless.run.mqtt.topics import (
     zones_topic,
 )
 from skyless.sim.lab import lab_site
-from support.processes import SKYLESS, running_program
+from support.processes import SKYLESS, free_port, running_program
 
 pytestmark = pytest.mark.site
 
@@ -209,3 +211,35 @@ def test_what_it_takes_of_a_sites_messages(tmp_path):
     assert parquet.read_table(fixes, partitioning=None)["flags"].to_pylist() == [64]
     zones = parquet.read_table(site_folder(folder, SITE) / "zones.parquet", partitioning=None)
     assert zones["zone"].to_pylist() == ["z1"]
+
+
+def test_a_broker_keeps_the_history_of_the_sites_on_it(tmp_path):
+    """With roles: its history may read everything, and publish nothing but its status."""
+    folder, access, port = tmp_path / "history", tmp_path / "access", free_port()
+    create_access(access, mqtt_address("mqtt://127.0.0.1"))
+    words = ("broker", "--port", str(port), "--data", tmp_path / "store", "--access", access, "--history", folder)
+
+    async def scenario():
+        pipes = {"stdout": asyncio.subprocess.PIPE, "stderr": asyncio.subprocess.PIPE}
+        async with running_program(*SKYLESS, *words, **pipes) as process:
+            await process.stdout.readline()
+            address = MqttAddress("127.0.0.1", port, user="operator", password=read_access(access)[Role.OPERATOR])
+            link, statuses = Link(address, TAG, site=SITE, kind="tag"), []
+            link.subscribe(status_topic(SITE, "history", "+"), lambda _, payload: statuses.append(payload), qos=1)
+            lab = msgspec.structs.replace(lab_site(), id=SITE)
+            link.publish(site_topic(SITE), SiteMessage(lab, False, time.time()), qos=1, retain=True)
+            task = asyncio.ensure_future(link.run())
+            await until(lambda: statuses, 60)
+            for serial in range(1, 200):
+                link.publish(fix_topic(SITE, TAG), numbered_fix(serial))
+                await asyncio.sleep(0.02)
+            await until(lambda: serials(folder), 60)
+            process.send_signal(signal.SIGTERM)
+            _, err = await process.communicate()
+            await stopped(task)
+            return process.returncode, err, statuses
+
+    code, err, statuses = asyncio.run(scenario())
+    assert (code, b"Traceback" in err) == (0, False), err
+    assert b'"online":true' in statuses[0]
+    assert in_files(folder, SITE)[-1] == 199

@@ -19,7 +19,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 from pyarrow import compute, parquet
 
-from skyless.run.history.layout import current_events, current_files, file_name, rows_of, site_folder
+from skyless.run.history.layout import THINNED, current_events, current_files, file_name, rows_of, site_folder
 from skyless.run.history.sink import read_table, write_table
 
 GRACE_S: Final = 60.0
@@ -33,8 +33,6 @@ _MOVING_MS: Final = 10_000
 _REST_MS: Final = 60_000
 _REST_MM: Final = 500
 """A tag is at rest in a minute in which no coordinate changes by more."""
-
-_THINNED: Final = b"skyless_thinned"
 
 
 class Keep(Struct, frozen=True):
@@ -83,7 +81,7 @@ def thinned(table: pa.Table) -> pa.Table:
     extents = [np.maximum.reduceat(place, first) - np.minimum.reduceat(place, first) for place in places]
     moves = np.repeat(np.max(extents, axis=0) > _REST_MM, np.diff(np.append(first, len(tag))))
     kept = table.filter(pa.array(is_minute | (moves & is_step)))
-    return kept.replace_schema_metadata({_THINNED: b"yes"})
+    return kept.replace_schema_metadata({THINNED: b"yes"})
 
 
 def _begins(tag: NDArray[Any], part: NDArray[Any]) -> NDArray[np.bool_]:
@@ -124,7 +122,7 @@ def _remove(files: Sequence[Path]) -> None:
 
 
 def _is_thinned(file: Path) -> bool:
-    return _THINNED in (parquet.read_schema(file).metadata or {})
+    return THINNED in (parquet.read_schema(file).metadata or {})
 
 
 def _newest_ms(file: Path) -> int:
