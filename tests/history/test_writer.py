@@ -11,11 +11,12 @@ from made_fixes import DAY_S, NOON_S, fix, in_files, on_disk, records
 from pyarrow import parquet
 
 from skyless.core.errors import SkylessError
-from skyless.run.fix_batch import records_of
+from skyless.run.fix_batch import RECORD, records_of
 from skyless.run.history import sink as sink_module
 from skyless.run.history import writer as writer_module
+from skyless.run.history.journal import Journal
 from skyless.run.history.layout import FIX_COLUMNS, current_files, rows_of, site_folder
-from skyless.run.history.sink import Event, fix_table
+from skyless.run.history.sink import Event, fix_sink, fix_table
 from skyless.run.history.writer import Writer
 
 
@@ -180,6 +181,29 @@ def test_while_no_file_can_be_written_the_journal_takes_a_bounded_number_of_rows
     assert in_files(tmp_path) == [*range(1, 21), *range(91, 101)]
 
 
+def test_the_journal_leaves_room_for_the_files_of_its_rows(tmp_path, monkeypatch):
+    writer = Writer(tmp_path, 1)
+    writer.number(fix(), NOON_S)
+    used = [0]
+
+    def free_bytes(_):
+        return (1 << 20) + 100_000 - used[0]
+
+    monkeypatch.setattr(Journal, "free_bytes", free_bytes)
+    with pytest.raises(OSError, match="No space"):
+        for serial in range(1, 10**6, 100):
+            writer.fixes.add(records(range(serial, serial + 100)), NOON_S)
+            writer.store()
+            used[0] += 100 * RECORD.itemsize
+    rows = writer.fixes.sink.waiting
+    assert rows > 0
+    assert 16 * rows <= free_bytes(None) - (1 << 20)
+    writer.write()
+    used[0] = 0
+    writer.close()
+    assert len(in_files(tmp_path)) == rows + 100
+
+
 def test_events_go_the_same_way(tmp_path):
     writer = Writer(tmp_path, 1)
     events = tuple(Event(ms, "enter", "ann", "z1", None, None, "ann entered door") for ms in (3, 1, 2))
@@ -193,6 +217,16 @@ def test_events_go_the_same_way(tmp_path):
     table = parquet.read_table(file, partitioning=None)
     assert table["t"].cast("int64").to_pylist() == [1, 2, 3]
     assert (file.name, table["zone"][0].as_py(), table["alarm"][0].as_py()) == (f"{1:012}-{3:012}.parquet", "z1", None)
+
+
+def test_the_first_file_comes_soon_and_the_others_after_ten_minutes(tmp_path):
+    sink, unix_s, ages_s = fix_sink(tmp_path), NOON_S, []
+    for serial in range(1, 9):
+        sink.put(records([serial]), serial, unix_s)
+        ages_s.append(next(age_s for age_s in range(1000) if sink.is_due(unix_s + age_s)))
+        sink.write()
+        assert not sink.is_due(unix_s + 1e6)
+    assert ages_s == [30, 60, 120, 240, 480, 600, 600, 600]
 
 
 def test_only_one_writes(tmp_path):

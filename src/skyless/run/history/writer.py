@@ -1,5 +1,7 @@
 """The history of one site as it is written: numbers of tags, journals, files. One process at a time writes it."""
 
+import errno
+import os
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
@@ -34,6 +36,10 @@ MAX_WAITING: Final = 500_000
 """How many rows wait in memory while the disk does not take them."""
 
 MAX_TAGS: Final = 200_000
+
+_FILE_BYTES: Final = 16
+_SPARE_BYTES: Final = 1 << 20
+"""The journal leaves so much of the disk free, for each of its rows and besides: its rows must find room in files."""
 
 
 class Intake(Generic[R]):
@@ -79,7 +85,10 @@ class Intake(Generic[R]):
         """Bring everything into the journal. Raises OSError: what is not there waits."""
         while self._waiting and self.sink.waiting < MAX_ROWS:
             rows, arrived_unix_s = self._waiting[0]
-            self._journal.append(self.sink.next, self._encode(rows, arrived_unix_s))
+            payload = self._encode(rows, arrived_unix_s)
+            if self._journal.free_bytes() < len(payload) + _SPARE_BYTES + _FILE_BYTES * self.sink.waiting:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            self._journal.append(self.sink.next, payload)
             self._waiting.popleft()
             self._waiting_rows -= len(rows)
             self.sink.put(rows, self.sink.next, arrived_unix_s)
