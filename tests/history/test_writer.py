@@ -163,6 +163,18 @@ def test_a_full_disk_costs_the_oldest_rows_that_wait_and_is_counted(tmp_path, mo
     assert in_files(tmp_path) == [1, 2, *range(10, 20)]
 
 
+def test_a_program_that_ends_with_a_full_disk_makes_files_of_its_journal(tmp_path, monkeypatch):
+    writer = Writer(tmp_path, 1)
+    writer.fixes.add(records([1], writer.number(fix(), NOON_S)), NOON_S)
+    writer.store()
+    writer.fixes.add(records([2]), NOON_S)
+    monkeypatch.setattr(os, "pwrite", no_room)
+    with pytest.raises(OSError, match="No space"):
+        writer.close()
+    assert in_files(tmp_path) == [1]
+    Writer(tmp_path, 1).close()
+
+
 def test_while_no_file_can_be_written_the_journal_takes_a_bounded_number_of_rows(tmp_path, monkeypatch):
     monkeypatch.setattr(writer_module, "MAX_WAITING", 10)
     monkeypatch.setattr(writer_module, "MAX_ROWS", 20)

@@ -19,7 +19,7 @@ from skyless.run.mqtt.link import Link
 
 pytestmark = pytest.mark.site
 
-KINDS = ("tag", "anchor", "ether", "dashboard", "recorder", "survey", "bridge", "homeassistant", "watch")
+KINDS = ("tag", "anchor", "ether", "dashboard", "recorder", "history", "survey", "bridge", "homeassistant", "watch")
 NODES = {
     topics.status_topic: [(7, kind, "n1") for kind in KINDS],
     topics.health_topic: [(7, kind, "n1") for kind in ("tag", "anchor", "ether")],
@@ -32,7 +32,7 @@ def every_topic():
     for name, function in inspect.getmembers(topics, inspect.isfunction):
         count = len(inspect.signature(function).parameters)
         assert name.endswith("_topic")
-        found += [function(*words) for words in NODES.get(function, [(7, "n1")[:count]])]
+        found += [function(*words) for words in NODES.get(function, [(7, "n1", "n1")[:count]])]
     assert len(set(found)) == len(found) > 25
     others = ["homeassistant/status", "homeassistant/device/skyless-7-t/config", "homeassistant/switch/x/set"]
     return found + others + ["skyless/v2/7/site", "skyless/v1/7/tag/n1/fix/more", "skyless", "other"]

@@ -37,10 +37,11 @@ def run(
     full_days: Positive = 7.0,
     event_days: Positive = 365.0,
     json: bool = False,
-) -> None:
+) -> int:
     """Keep the fixes and events of a running site until Ctrl-C, in Parquet files that any tool can read.
 
-    What was received 0.1 s before a kill -9 is kept. Give the same folder at every start.
+    What was received 0.1 s before a kill -9 is kept. Give the same folder at every start. The exit code is 1 where the
+    disk did not take everything.
 
     Parameters
     ----------
@@ -76,6 +77,7 @@ def run(
         print(f"{to}: nothing was kept, as no program of a site was online")
     else:
         print(f"{to}: {_counts(state)} in {state.seconds:.0f} s{_losses(state)}")
+    return 1 if state is not None and (state.disk or state.lost) else 0
 
 
 async def _keep_history(

@@ -205,8 +205,10 @@ class Writer:
     def close(self) -> None:
         """Turn all rows into files, and let other programs write. Raises OSError."""
         try:
-            self.store()
-            self.write()
+            try:
+                self.store()
+            finally:  # on a full disk there is still room for files
+                self.write()
         finally:
             self._lock.close()
 
