@@ -97,6 +97,7 @@ NAVIGATION = {
         "docs/estimator_table",
         "docs/studies",
         "docs/recordings",
+        "docs/history",
         "docs/planning",
         "docs/survey",
         "docs/calibration",

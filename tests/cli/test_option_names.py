@@ -103,3 +103,4 @@ def test_a_number_that_is_none_is_refused_by_every_option(options, capsys):
 _POSITIONAL = dict.fromkeys(("benchmark", "plan", "replay", "site new", "site check", "board"), (__file__,))
 _POSITIONAL |= dict.fromkeys(("site keys new", "site keys rotate", "site keys revoke"), ("x",))
 _POSITIONAL["study"] = ("loss",)
+_POSITIONAL["history run"] = ("--to", "x")

@@ -19,7 +19,7 @@ from skyless.run.mqtt.link import Link
 
 pytestmark = pytest.mark.site
 
-KINDS = ("tag", "anchor", "ether", "dashboard", "recorder", "survey", "bridge", "homeassistant", "watch")
+KINDS = ("tag", "anchor", "ether", "dashboard", "recorder", "history", "survey", "bridge", "homeassistant", "watch")
 NODES = {
     topics.status_topic: [(7, kind, "n1") for kind in KINDS],
     topics.health_topic: [(7, kind, "n1") for kind in ("tag", "anchor", "ether")],

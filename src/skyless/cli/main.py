@@ -54,6 +54,7 @@ _GROUPS: Final = {
     "Record and replay": (
         ("record", "nodes.record", "Record a running site into a file."),
         ("replay", "replay", "Turn a recording into fixes and judge them against the truth."),
+        ("history", "history", "Keep and ask what happened at a site."),
         ("export", "export", "Write a recording as a bag of ROS 2, for its tools, Foxglove, Rerun and PlotJuggler."),
     ),
     "Emulate what is not there": (

@@ -17,8 +17,10 @@ from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module
 
 if TYPE_CHECKING:
-    from skyless.run.broker import BrokerSettings
+    from skyless.run.broker import Broker, BrokerSettings
+    from skyless.run.find_site import SiteOnBroker
     from skyless.run.gather.address import NatsAddress
+    from skyless.run.mqtt.address import MqttAddress
 
 app = App(name="broker", help_epilogue="Example: skyless broker --port 1883")
 
@@ -38,6 +40,7 @@ def broker(
     gather: bool = False,
     site_id: SiteId | None = None,
     keep_gb: KeepGb = USUAL_KEEP_GB,
+    history: Path | None = None,
     json: bool = False,
 ) -> None:
     """Run an MQTT broker until Ctrl-C, and print its address when it is ready.
@@ -68,6 +71,8 @@ def broker(
         Number of the site that is gathered; by default the first one of which anything is heard.
     keep_gb
         Gigabytes of fixes that the broker keeps for readers that come later, at most those of 24 hours.
+    history
+        Folder of the history to keep of every site that runs on this broker; by default none.
     json
         Write one JSON object instead of the address.
     """
@@ -89,7 +94,14 @@ def broker(
         extra_module("nats", "--gather")
     elif site_id is not None or keep_gb != USUAL_KEEP_GB:
         raise SkylessError("--site-id and --keep-gb belong to --gather")
-    asyncio.run(_serve(settings, _gather_arguments(site_id, keep_gb), json=json))
+    if history is not None:
+        extra_module("pyarrow", "--history")
+        if certificate is not None:
+            raise SkylessError(
+                f"--history is {str(history)!r}; with --certificate, whose names only clients know, start "
+                f"skyless history run --to {history} --mqtt mqtts://NAME instead"
+            )
+    asyncio.run(_serve(settings, _gather_arguments(site_id, keep_gb), history, json=json))
 
 
 def _gather_arguments(site_id: int | None, keep_gb: float) -> tuple[str, ...]:
@@ -124,7 +136,9 @@ def create_passwords(folder: Path, /, *, mqtt: str = "mqtt://127.0.0.1:1883", js
         log(f"start the broker with --access {folder}; copy each file to the machines of its role only")
 
 
-async def _serve(settings: "BrokerSettings", gather_arguments: tuple[str, ...], *, json: bool) -> None:
+async def _serve(
+    settings: "BrokerSettings", gather_arguments: tuple[str, ...], history: Path | None, *, json: bool
+) -> None:
     from skyless.run.broker import start_broker
     from skyless.run.process import ending_signals
 
@@ -141,14 +155,16 @@ async def _serve(settings: "BrokerSettings", gather_arguments: tuple[str, ...], 
             if nats is not None:
                 print(nats)
         sys.stdout.flush()
-        gathering = None if nats is None else asyncio.ensure_future(_gathering(nats, gather_arguments))
+        beside = [] if nats is None else [_gathering(nats, gather_arguments)]
+        beside += [] if history is None else [_keep_history(_reader(settings, running), history)]
+        programs = [asyncio.ensure_future(one) for one in beside]
         ended = asyncio.ensure_future(running.wait())
         asked = asyncio.ensure_future(stop.wait())
         await asyncio.wait((ended, asked), return_when=asyncio.FIRST_COMPLETED)
         asked.cancel()
-        if gathering is not None:
-            gathering.cancel()
-            await asyncio.gather(gathering, return_exceptions=True)
+        for program in programs:
+            program.cancel()
+        await asyncio.gather(*programs, return_exceptions=True)
         if ended.done():
             raise SkylessError(f"nats-server has ended by itself; {running.data / 'nats-server.log'} may show why")
         ended.cancel()
@@ -162,3 +178,41 @@ async def _gathering(nats: "NatsAddress", arguments: tuple[str, ...]) -> None:
 
     secret = {} if nats.password is None else {PASSWORD_VARIABLE: nats.password}
     await Child(Program("gather", arguments, environment={NATS_VARIABLE: str(nats), **secret}), log).run()
+
+
+def _reader(settings: "BrokerSettings", running: "Broker") -> "MqttAddress":
+    """The broker's address for a history; where there are roles, as the page, which reads everything."""
+    from msgspec.structs import replace
+
+    from skyless.run.mqtt.access import Role
+    from skyless.run.mqtt.address import PASSWORD_VARIABLE
+
+    if settings.roles is None:
+        return running.address
+    password = os.environ[PASSWORD_VARIABLE] = settings.roles[Role.PAGE]  # its children take it from there
+    return replace(running.address, user=str(Role.PAGE), password=password)
+
+
+async def _keep_history(address: "MqttAddress", folder: Path) -> None:
+    """Run a history of each site whose programs are online, until cancelled."""
+    from msgspec.structs import replace
+
+    from skyless.run.children import Child, Program
+    from skyless.run.find_site import watch_sites
+
+    running: dict[int, asyncio.Task[None]] = {}
+    mqtt = ("--mqtt", str(replace(address, password=None)))
+
+    def on_sites(sites: "list[SiteOnBroker]") -> None:
+        for site in sites:
+            if site.online and site.number not in running:
+                words = ("history", "run", "--to", str(folder), "--site-id", str(site.number), *mqtt)
+                child = Child(Program(f"history of site {site.number}", words), log)
+                running[site.number] = asyncio.ensure_future(child.run())
+
+    try:
+        await watch_sites(address, on_sites)
+    finally:
+        for task in running.values():
+            task.cancel()
+        await asyncio.gather(*running.values(), return_exceptions=True)

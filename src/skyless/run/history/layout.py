@@ -6,9 +6,12 @@
     FOLDER/site=<n>/zones.parquet                              the zones' identifiers, names and corners
     FOLDER/site=<n>/journal/                                   what is not in Parquet yet
 
-The day is that of arrival, in UTC. Any engine that reads Parquet can read and join them.
+The day is that of arrival, in UTC. Any engine that reads Parquet can read and join them. A file may be joined with its
+neighbours to one that covers their numbers; those stay for a while, so that readers should take ``current_files`` or
+``current_events``.
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Final, Literal
 
@@ -35,13 +38,17 @@ EVENT_COLUMNS: Final = {
     "text": "string",
 }
 """``kind`` is an ``EventKind``. ``tag`` and ``zone`` are the tag's name and the zone's identifier, null where there is
-none; ``subject`` names an anchor or what an alarm is about; ``alarm`` is the alarm's id; ``text`` is for people."""
+none; ``subject`` is ``anchor-<id>``, or what an alarm is about; ``alarm`` is the alarm's id; ``text`` is for people,
+and of an acknowledgement who made it."""
 
 EventKind = Literal["enter", "leave", "alarm-raised", "alarm-ended", "alarm-acknowledged", "offline", "online"]
 
 NAME_COLUMNS: Final = {"tag": "uint32", "name": "string", "since": "timestamp[ms, tz=UTC]"}
 ZONE_COLUMNS: Final = {"zone": "string", "name": "string", "corners_m": "string"}
 """``corners_m`` is a list of pairs in JSON."""
+
+THINNED: Final = b"skyless_thinned"
+"""The key in the metadata of files of old fixes, of which one in ten seconds or in a minute is kept."""
 
 NUMBER_DIGITS: Final = 12
 
@@ -72,3 +79,29 @@ def rows_of(file: Path) -> tuple[int, int] | None:
     if file.suffix != ".parquet" or not dash or not (first.isdecimal() and last.isdecimal()):
         return None
     return int(first), int(last)
+
+
+def current_files(folder: Path, site: int) -> tuple[Path, ...]:
+    """The files that hold all fixes once, by number: the ones that no other file replaces.
+
+    A replaced file stays for a minute at least. A reader that takes longer from this list to the opening of a file, and
+    finds it gone, should take the list again.
+    """
+    return _largest(site_folder(folder, site).glob("day=*/*.parquet"))
+
+
+def current_events(folder: Path, site: int) -> tuple[Path, ...]:
+    """The same of events."""
+    return _largest(site_folder(folder, site).glob("events/*.parquet"))
+
+
+def _largest(files: Iterable[Path]) -> tuple[Path, ...]:
+    """Files whose numbers are not all in another file."""
+    found = [(rows[0], -rows[1], file) for file in files if (rows := rows_of(file)) is not None]
+    kept: list[Path] = []
+    end = -1
+    for _, minus_last, file in sorted(found):  # of those that begin together, the longest first
+        if -minus_last > end:
+            kept.append(file)
+            end = -minus_last
+    return tuple(kept)

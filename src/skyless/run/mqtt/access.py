@@ -96,7 +96,7 @@ ACCESS: Final = {
     Role.PAGE: Access(
         publish=(
             *_SHOWN,
-            *_status("dashboard", "recorder", "bridge", "homeassistant", "watch", "doctor"),
+            *_status("dashboard", "recorder", "history", "bridge", "homeassistant", "watch", "doctor"),
             "homeassistant/device/+/config",
             "homeassistant/status",
         ),
