@@ -1,6 +1,11 @@
 """What is asked of a history, and the answers: the command line, the HTTP interface and the page give the same."""
 
+from typing import Final
+
 from msgspec import Struct
+
+GAP_S: Final = 15.0
+"""A tag without a fix for longer is where nobody knows. Days that are thinned have a fix every 10 s."""
 
 
 class Span(Struct, frozen=True):
@@ -30,7 +35,8 @@ class Track(Struct, frozen=True):
     fixes: int
     """How many fixes there are in the range; more than points where the way was thinned."""
     length_m: float
-    """Of the way through the points, gaps of more than ``GAP_S`` left out."""
+    """Of the way through all fixes in the plane, gaps of more than ``GAP_S`` left out. Moves of less than half a metre
+    do not count until they add up to that: they may be noise."""
 
 
 class Heatmap(Struct, frozen=True):

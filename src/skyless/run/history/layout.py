@@ -38,8 +38,8 @@ EVENT_COLUMNS: Final = {
     "text": "string",
 }
 """``kind`` is an ``EventKind``. ``tag`` and ``zone`` are the tag's name and the zone's identifier, null where there is
-none; ``subject`` is ``anchor-<id>``, or what an alarm is about; ``alarm`` is the alarm's id; ``text`` is for people, and
-of an acknowledgement who made it."""
+none; ``subject`` is ``anchor-<id>``, or what an alarm is about; ``alarm`` is the alarm's id; ``text`` is for people,
+and of an acknowledgement who made it."""
 
 EventKind = Literal["enter", "leave", "alarm-raised", "alarm-ended", "alarm-acknowledged", "offline", "online"]
 
