@@ -5,6 +5,7 @@ import json
 import math
 from collections import defaultdict
 from datetime import UTC, datetime
+from itertools import pairwise
 
 import numpy as np
 import pyarrow as pa
@@ -175,7 +176,7 @@ def test_a_thinned_track_keeps_its_ends_and_its_length(history, most):
     assert set(thin.points) <= set(whole.points)
     assert (thin.fixes, thin.length_m) == (whole.fixes, whole.length_m)
     if most >= 100:
-        for before, after in zip(whole.points, whole.points[1:], strict=False):
+        for before, after in pairwise(whole.points):
             assert after.unix_s - before.unix_s <= GAP_S or {before, after} <= set(thin.points)
 
 
@@ -351,8 +352,8 @@ def test_merged_intervals_hold_the_seconds_and_no_longer_pause(seconds, gap_s):
     for begin, end in found:
         inside = [one for one in seconds if begin <= one < end]
         assert (inside[0], inside[-1] + 1) == (begin, end)
-        assert all(b - a - 1 <= gap_s for a, b in zip(inside, inside[1:], strict=False))
-    assert all(after[0] - before[1] > gap_s for before, after in zip(found, found[1:], strict=False))
+        assert all(b - a - 1 <= gap_s for a, b in pairwise(inside))
+    assert all(after[0] - before[1] > gap_s for before, after in pairwise(found))
     assert sum(begin <= one < end for one in seconds for begin, end in found) == len(seconds)
 
 
@@ -363,7 +364,7 @@ VISITS = st.lists(st.tuples(st.integers(-5, 40), st.integers(0, 20)).map(lambda 
 def test_counts_are_those_at_every_instant(visits, step, length):
     edges = np.append(np.arange(0.0, length, step), float(length))
     mean, most = counts(visits, edges)
-    for k, (begin, end) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for k, (begin, end) in enumerate(pairwise(edges)):
         whole = range(int(begin), int(end))  # between whole seconds nothing changes
         at = [sum(b <= second < e for b, e in visits) for second in whole]
         assert mean[k] == pytest.approx(sum(at) / len(at))

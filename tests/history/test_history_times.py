@@ -66,12 +66,12 @@ def test_a_time_of_day_is_that_of_the_day_on_which_the_range_begins():
 
 @pytest.mark.parametrize(
     "text",
-    ["", "nonsense", "12:61", "25:00", "8", "-1", "november", "2026", "nan", "inf", "1e300", "1790000000000", "2026-02-30",
-     "x" * 500, "0001-01-01", "this week", "'; DROP TABLE fixes"],
+    ["", "nonsense", "12:61", "25:00", "8", "-1", "november", "2026", "nan", "inf", "1e300", "1790000000000",
+     "2026-02-30", "x" * 500, "0001-01-01", "this week", "'; DROP TABLE fixes"],
 )  # fmt: skip
 def test_what_is_no_time_is_named(text):
     for given_ in ((text, None), ("today", text)):
-        with pytest.raises(SkylessError, match=r"^(from|to) is ['"].*['"]; it should be a time such as 14:00") as error:
+        with pytest.raises(SkylessError, match=r"^(from|to) is .*; it should be a time such as 14:00") as error:
             span_of(*given_, NOW.timestamp())
         assert len(str(error.value)) < 250
 

@@ -53,6 +53,8 @@ class SiteRun(Struct, frozen=True):
     """Folder of recordings that the page shows."""
     carrier: bool = False
     """Whether radios measure the phase of the carrier."""
+    history: Path | None = None
+    """Folder of the history; None: none is kept."""
 
 
 class WholeSite:
@@ -91,7 +93,9 @@ class WholeSite:
         site = self._asked.site
         link = Link(address, "demo", site=site.id, kind="watch")
         self.watch = Watch(link, site.id, planar=site.tags.height_m is not None)
-        options = ("--recordings", str(self._asked.recordings), "--site-id", str(site.id))
+        options: tuple[str, ...] = ("--recordings", str(self._asked.recordings), "--site-id", str(site.id))
+        if self._asked.history is not None:
+            options += ("--history", str(self._asked.history))
         command = ("dashboard", *_mqtt(address), "--listen", f"{_HOST}:{self.page_port}", *options)
         programs = [*self._programs(address), Program("page", command)]
         self.children = [Child(program, self._log) for program in programs]
@@ -148,6 +152,9 @@ class WholeSite:
             programs.append(
                 Program("recorder", ("record", str(asked.record), *mqtt, *limit, "--site-id", str(asked.site.id)), 1)
             )
+        if asked.history is not None:
+            to = ("--to", str(asked.history), "--site-id", str(asked.site.id))
+            programs.append(Program("history", ("history", "run", *to, *mqtt), start_after_s=_SURVEY_DELAY_S))
         return programs
 
 

@@ -1,5 +1,162 @@
 """``skyless history``: what happened at a site, kept in Parquet files."""
 
-from cyclopts import App
+import asyncio
+import contextlib
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+from cyclopts import App, Parameter
+
+from skyless.cli.common.options import command
+from skyless.cli.common.output import print_json
+from skyless.cli.nodes.options import MqttOptions, SiteId, log
+from skyless.core.arguments import Positive
+from skyless.core.errors import SkylessError
+
+if TYPE_CHECKING:
+    from skyless.run.history.program import HistoryNode, HistoryState
+    from skyless.run.history.retention import Keep
+    from skyless.run.mqtt.address import MqttAddress
+
+_STATUS_S: Final = 0.5
+
+HistoryFolder = Annotated[Path, Parameter(name="--to")]
 
 app = App(name="history", help_epilogue="Example: skyless history run --to history")
+
+
+@app.command(help_epilogue="Example: skyless history run --to history --keep-days 90")
+@command
+def run(
+    *,
+    to: HistoryFolder,
+    broker: MqttOptions,
+    site_id: SiteId | None = None,
+    keep_days: Positive = 400.0,
+    full_days: Positive = 7.0,
+    event_days: Positive = 365.0,
+    json: bool = False,
+) -> None:
+    """Keep the fixes and events of a running site until Ctrl-C, in Parquet files that any tool can read.
+
+    What was received 0.1 s before a kill -9 is kept. Give the same folder at every start.
+
+    Parameters
+    ----------
+    to
+        The history's folder; several sites may share it.
+    site_id
+        Number of the site; by default the one whose programs are online.
+    keep_days
+        Days after which fixes are removed.
+    full_days
+        Days after which fixes are thinned: of a moving tag one in ten seconds stays, of a tag at rest one in a minute.
+    event_days
+        Days after which events are removed: entered and left zones, alarms, anchors and tags that came and went.
+    json
+        Write one JSON object at the end instead of text.
+    """
+    from skyless.run import process
+    from skyless.run.history.retention import Keep
+
+    address = broker.address()
+    if address is None:
+        raise SkylessError("--mqtt is 'none'; it should be the broker of the site whose history to keep")
+    address.tls_context()
+    found: list[HistoryNode] = []
+    with contextlib.suppress(KeyboardInterrupt):
+        process.run(_keep_history(to, address, site_id, Keep(keep_days, full_days, event_days), found))
+    state = found[0].state() if found else None
+    if json:
+        import msgspec
+
+        print_json({"folder": to, **({} if state is None else msgspec.to_builtins(state))})
+    elif state is None:
+        print(f"{to}: nothing was kept, as no program of a site was online")
+    else:
+        print(f"{to}: {_counts(state)} in {state.seconds:.0f} s{_losses(state)}")
+
+
+async def _keep_history(
+    folder: Path, address: "MqttAddress", site_id: int | None, keep: "Keep", found: "list[HistoryNode]"
+) -> None:
+    from skyless.run.find_site import find_site
+    from skyless.run.history.program import HistoryNode
+    from skyless.run.history.writer import Writer
+
+    site = await find_site(address) if site_id is None else site_id
+    node = HistoryNode(Writer(folder, site), address, keep, log)
+    found.append(node)
+    screen = asyncio.ensure_future(_status(node)) if sys.stderr.isatty() else None
+    try:
+        await node.run()
+    finally:
+        if screen is not None:
+            screen.cancel()
+            print(file=sys.stderr)
+
+
+async def _status(node: "HistoryNode") -> None:
+    """One line on a terminal, kept up to date."""
+    while True:
+        await asyncio.sleep(_STATUS_S)
+        now = node.state()
+        trouble = now.disk or (f"no broker, {now.trouble}" if now.trouble else "Ctrl-C ends")
+        line = (
+            f"history, {now.seconds:.0f} s: {_counts(now)}, {now.waiting} rows in the journal{_losses(now)}; {trouble}"
+        )
+        print(f"\r\x1b[2K{line}", end="", file=sys.stderr, flush=True)
+
+
+def _counts(state: "HistoryState") -> str:
+    return f"{state.fixes} fixes of {state.tags} tags and {state.events} events"
+
+
+def _losses(state: "HistoryState") -> str:
+    lost = [f"{count} {reason}" for reason, count in sorted(state.drops.items())]
+    lost += [f"{state.lost} that the disk did not take"] if state.lost else []
+    return f"; not kept: {', '.join(lost)}" if lost else ""
+
+
+@app.command(name="import", help_epilogue="Example: skyless history import walk.mcap --to history")
+@command
+def import_file(recording: Path, /, *, to: HistoryFolder, site_id: SiteId | None = None, json: bool = False) -> None:
+    """Add the fixes, zone events and zones of a recording to a history; what that has already is left out.
+
+    Parameters
+    ----------
+    recording
+        The recording, an MCAP file of skyless record.
+    to
+        The history's folder; several sites may share it.
+    site_id
+        Number of the site; by default the one that was recorded.
+    json
+        Write one JSON object instead of text.
+    """
+    import msgspec
+
+    from skyless.cli.common.progress import progress_bar
+    from skyless.run.history.imports import import_recording
+    from skyless.run.history.writer import Writer
+    from skyless.run.recordings.recording import McapRecording
+
+    with McapRecording(recording) as source:
+        summary = source.summary()
+        site = summary.site if site_id is None else site_id
+        if site is None:
+            raise SkylessError(f"{recording} does not say of which site it is; --site-id should")
+        begin_s, end_s = summary.start_s or 0.0, summary.end_s or 0.0
+        with progress_bar("importing", end_s - begin_s) as bar:
+            writer = Writer(to, site)
+            try:
+                found = import_recording(source, recording, writer, lambda unix_s: bar.reach(unix_s - begin_s))
+            finally:
+                writer.close()
+    if json:
+        print_json({"folder": to, "site": site, **msgspec.to_builtins(found)})
+        return
+    print(f"{to}: {found.fixes} fixes and {found.events} events of site {site}; {found.known_fixes} fixes were there")
+    for reason, number in sorted(found.drops.items()):
+        print(f"  dropped: {reason} {number}")

@@ -14,9 +14,12 @@ from skyless.cli.common.output import print_json
 from skyless.cli.nodes.options import listen_address, log
 from skyless.core.arguments import whole
 from skyless.core.errors import SkylessError
+from skyless.core.extras import extra_module
 
 if TYPE_CHECKING:
-    from skyless.run.broker import BrokerSettings
+    from skyless.run.broker import Broker, BrokerSettings
+    from skyless.run.find_site import SiteOnBroker
+    from skyless.run.mqtt.address import MqttAddress
 
 app = App(name="broker", help_epilogue="Example: skyless broker --port 1883")
 
@@ -33,6 +36,7 @@ def broker(
     strangers_read: bool = False,
     certificate: Path | None = None,
     key: Path | None = None,
+    history: Path | None = None,
     json: bool = False,
 ) -> None:
     """Run an MQTT broker until Ctrl-C, and print its address when it is ready.
@@ -57,6 +61,8 @@ def broker(
         Certificate in PEM form; with it and --key the broker uses TLS.
     key
         Private key of the certificate in PEM form.
+    history
+        Folder of the history to keep of every site that runs on this broker; by default none.
     json
         Write one JSON object instead of the address.
     """
@@ -72,7 +78,14 @@ def broker(
     settings = BrokerSettings(
         port or listen_port, host, data, user, password, certificate, key, roles, strangers_read=strangers_read
     )
-    asyncio.run(_serve(settings, json=json))
+    if history is not None:
+        extra_module("pyarrow", "--history")
+        if certificate is not None:
+            raise SkylessError(
+                f"--history is {str(history)!r}; with --certificate, whose names only clients know, start "
+                f"skyless history run --to {history} --mqtt mqtts://NAME instead"
+            )
+    asyncio.run(_serve(settings, history, json=json))
 
 
 @app.command(name="access", help_epilogue="Example: skyless broker access passwords --mqtt mqtts://hall.local")
@@ -102,7 +115,7 @@ def create_passwords(folder: Path, /, *, mqtt: str = "mqtt://127.0.0.1:1883", js
         log(f"start the broker with --access {folder}; copy each file to the machines of its role only")
 
 
-async def _serve(settings: "BrokerSettings", *, json: bool) -> None:
+async def _serve(settings: "BrokerSettings", history: Path | None, *, json: bool) -> None:
     from skyless.run.broker import start_broker
     from skyless.run.process import ending_signals
 
@@ -115,10 +128,52 @@ async def _serve(settings: "BrokerSettings", *, json: bool) -> None:
         else:
             print(running.address)
         sys.stdout.flush()
+        keeping = None if history is None else asyncio.ensure_future(_keep_history(_reader(settings, running), history))
         ended = asyncio.ensure_future(running.wait())
         asked = asyncio.ensure_future(stop.wait())
         await asyncio.wait((ended, asked), return_when=asyncio.FIRST_COMPLETED)
         asked.cancel()
+        if keeping is not None:
+            keeping.cancel()
+            await asyncio.gather(keeping, return_exceptions=True)
         if ended.done():
             raise SkylessError(f"nats-server has ended by itself; {running.data / 'nats-server.log'} may show why")
         ended.cancel()
+
+
+def _reader(settings: "BrokerSettings", running: "Broker") -> "MqttAddress":
+    """The broker's address for a history; where there are roles, as the page, which reads everything."""
+    from msgspec.structs import replace
+
+    from skyless.run.mqtt.access import Role
+    from skyless.run.mqtt.address import PASSWORD_VARIABLE
+
+    if settings.roles is None:
+        return running.address
+    password = os.environ[PASSWORD_VARIABLE] = settings.roles[Role.PAGE]  # its children take it from there
+    return replace(running.address, user=str(Role.PAGE), password=password)
+
+
+async def _keep_history(address: "MqttAddress", folder: Path) -> None:
+    """Run a history of each site whose programs are online, until cancelled."""
+    from msgspec.structs import replace
+
+    from skyless.run.children import Child, Program
+    from skyless.run.find_site import watch_sites
+
+    running: dict[int, asyncio.Task[None]] = {}
+    mqtt = ("--mqtt", str(replace(address, password=None)))
+
+    def on_sites(sites: "list[SiteOnBroker]") -> None:
+        for site in sites:
+            if site.online and site.number not in running:
+                words = ("history", "run", "--to", str(folder), "--site-id", str(site.number), *mqtt)
+                child = Child(Program(f"history of site {site.number}", words), log)
+                running[site.number] = asyncio.ensure_future(child.run())
+
+    try:
+        await watch_sites(address, on_sites)
+    finally:
+        for task in running.values():
+            task.cancel()
+        await asyncio.gather(*running.values(), return_exceptions=True)

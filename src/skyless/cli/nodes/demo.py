@@ -18,6 +18,7 @@ from skyless.cli.nodes.options import MqttCa, WalkingSpeed, check_live, log, sit
 from skyless.core.alert import Alert
 from skyless.core.arguments import Method, Picoseconds, Positive, Seed, whole
 from skyless.core.errors import SkylessError
+from skyless.core.extras import extra_module
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.run.mqtt.address import PASSWORD_VARIABLE
 from skyless.sim.evaluation.request import ProtectionOptions
@@ -84,6 +85,8 @@ class DemoOptions(ProtectionOptions, frozen=True, kw_only=True):
     """Certificates (PEM) to trust for mqtts."""
     record: str | None = None
     """File for the recording, .mcap, or none; by default one in the folder that the page shows."""
+    history: Path | None = None
+    """Folder of the history to keep, which the page then asks; by default none."""
     json: bool = False
     """Write one JSON object at the end instead of the tables."""
 
@@ -123,6 +126,8 @@ def _settings(asked: DemoOptions) -> "SiteRun":
     site = site_named(name)
     check_live(site, asked.method)
     folder = recordings_folder()
+    if asked.history is not None:
+        extra_module("pyarrow", "--history")
     return SiteRun(
         site=site,
         site_name=name,
@@ -138,6 +143,7 @@ def _settings(asked: DemoOptions) -> "SiteRun":
         apart=asked.apart,
         recordings=folder,
         carrier=asked.carrier,
+        history=None if asked.history is None else asked.history.absolute(),
     )
 
 

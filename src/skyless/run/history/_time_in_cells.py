@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from pyarrow import parquet
 
 from skyless.core.errors import SkylessError
-from skyless.run.history.answers import GAP_S, Heatmap, Span
+from skyless.run.history.answers import GAP_S, THINNED_GAP_S, Heatmap, Span
+from skyless.run.history.layout import THINNED
 
 _COLUMNS: Final = ["tag", "t", "x_mm", "y_mm"]
 _SLICE: Final = 32_768
 """Rows that are computed at a time; their arrays stay in the processor's cache."""
 _MAX_CELLS: Final = 4_000_000
-_GAP_MS: Final = round(1000.0 * GAP_S)
 _KNOWN_SHARE: Final = 1e-3
 """Where single wild fixes make the grid too large, this share of the groups of rows is left out at each side."""
 
@@ -29,12 +29,15 @@ class _Group(Struct, frozen=True):
     file: parquet.ParquetFile
     number: int
     limits: dict[str, tuple[int, int]]
+    gap_ms: int
+    """For how long a fix counts at most."""
 
 
 def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collection[int] | None) -> Heatmap:
     """The time of tags in cells; ``tags`` None means all. Raises SkylessError, OSError.
 
-    A fix counts until the tag's next one in the range, for ``GAP_S`` at most; the tag's last one counts nothing.
+    A fix counts until the tag's next one in the range, for ``GAP_S`` at most, in a thinned file ``THINNED_GAP_S``. The
+    tag's last one counts nothing.
     """
     begin_ms, end_ms = round(1000.0 * span.from_unix_s), round(1000.0 * span.to_unix_s)
     groups = [
@@ -62,7 +65,7 @@ def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collect
             keep &= True if tags is None else np.isin(arrays[0], list(tags))
             arrays = [array[keep] for array in arrays]
         if len(arrays[0]):
-            edges.append(_add(sums, arrays, (x0, y0, columns, rows), cell_mm))
+            edges.append(_add(sums, arrays, (x0, y0, columns, rows), cell_mm, group.gap_ms))
     seen = _add_between(sums, np.concatenate(edges, axis=1)) if edges else 0
     return Heatmap(1e-3 * cell_mm * x0, 1e-3 * cell_mm * y0, 1e-3 * cell_mm, columns, rows, tuple(sums.tolist()), seen)
 
@@ -70,6 +73,7 @@ def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collect
 def _groups(path: Path) -> list[_Group]:
     file = parquet.ParquetFile(path)
     names = {file.metadata.schema.column(k).name: k for k in range(file.metadata.num_columns)}
+    gap_s = THINNED_GAP_S if THINNED in (file.schema_arrow.metadata or {}) else GAP_S
     found = []
     for number in range(file.num_row_groups):
         limits = {}
@@ -79,7 +83,7 @@ def _groups(path: Path) -> list[_Group]:
             low, high = (statistics.min_raw, statistics.max_raw) if raw else (0, -1)
             limits[name] = (low, high)
         if limits["tag"][0] <= limits["tag"][1]:
-            found.append(_Group(file, number, limits))
+            found.append(_Group(file, number, limits, round(1000.0 * gap_s)))
     return found
 
 
@@ -94,17 +98,19 @@ def _extent(groups: Sequence[_Group], column: str, cell_mm: int) -> tuple[int, i
     return first, last - first + 1
 
 
-def _add(sums: NDArray[np.float64], arrays: Sequence[_Ints], grid: tuple[int, int, int, int], cell_mm: int) -> _Ints:
+def _add(
+    sums: NDArray[np.float64], arrays: Sequence[_Ints], grid: tuple[int, int, int, int], cell_mm: int, gap_ms: int
+) -> _Ints:
     """Add the times of rows that are sorted by tag and time; return the first and last row of each tag.
 
-    As columns of tag, time, 1 for the last row, and cell, -1 outside the grid.
+    As columns of tag, time, the most that the row counts (0 for a first row), and cell (-1 outside the grid).
     """
     tag, t, x, y = arrays
-    x0, y0, columns, rows = grid
+    _, _, columns, rows = grid
     changes = np.flatnonzero(tag[1:] != tag[:-1])
     for begin in range(0, len(t) - 1, _SLICE):
         end = min(begin + _SLICE, len(t) - 1)
-        ms = np.clip(t[begin + 1 : end + 1] - t[begin:end], 0, _GAP_MS)
+        ms = np.clip(t[begin + 1 : end + 1] - t[begin:end], 0, gap_ms)
         first, last = np.searchsorted(changes, (begin, end))
         ms[changes[first:last] - begin] = 0
         cells, inside = _cell(x[begin:end], y[begin:end], grid, cell_mm)
@@ -112,8 +118,8 @@ def _add(sums: NDArray[np.float64], arrays: Sequence[_Ints], grid: tuple[int, in
             cells, ms = cells[inside], ms[inside]
         sums += np.bincount(cells, 1e-3 * ms, columns * rows)
     begins, ends = np.append(0, changes + 1), np.append(changes, len(t) - 1)
-    cells, inside = _cell(x[ends], y[ends], (x0, y0, columns, rows), cell_mm)
-    lasts = (tag[ends], t[ends], np.ones(len(ends), np.int64), np.where(inside, cells, -1))
+    cells, inside = _cell(x[ends], y[ends], grid, cell_mm)
+    lasts = (tag[ends], t[ends], np.full(len(ends), gap_ms), np.where(inside, cells, -1))
     firsts = (tag[begins], t[begins], np.zeros(len(begins), np.int64), np.full(len(begins), -1))
     return np.concatenate([np.array(firsts, np.int64), np.array(lasts, np.int64)], axis=1)
 
@@ -126,8 +132,8 @@ def _cell(x: _Ints, y: _Ints, grid: tuple[int, int, int, int], cell_mm: int) -> 
 
 def _add_between(sums: NDArray[np.float64], edges: _Ints) -> int:
     """Add the times from a tag's last row of one group to its first of the next; return how many tags there are."""
-    tag, t, is_last, cell = edges[:, np.lexsort((edges[2], edges[1], edges[0]))]
-    joined = (is_last[:-1] == 1) & (is_last[1:] == 0) & (tag[1:] == tag[:-1]) & (cell[:-1] >= 0)
-    ms = np.clip(t[1:] - t[:-1], 0, _GAP_MS)[joined]
+    tag, t, most_ms, cell = edges[:, np.lexsort((edges[2], edges[1], edges[0]))]
+    joined = (most_ms[:-1] > 0) & (most_ms[1:] == 0) & (tag[1:] == tag[:-1]) & (cell[:-1] >= 0)
+    ms = np.minimum(t[1:] - t[:-1], most_ms[:-1])[joined]
     np.add.at(sums, cell[:-1][joined], 1e-3 * ms)
     return len(np.unique(tag))

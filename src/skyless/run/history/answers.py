@@ -4,8 +4,10 @@ from typing import Final
 
 from msgspec import Struct
 
-GAP_S: Final = 15.0
-"""A tag without a fix for longer is where nobody knows. Days that are thinned have a fix every 10 s."""
+GAP_S: Final = 5.0
+THINNED_GAP_S: Final = 65.0
+"""Where a tag is after its last fix is known for this long; in days that are thinned a fix may be the only one of a
+minute."""
 
 
 class Span(Struct, frozen=True):
@@ -35,7 +37,7 @@ class Track(Struct, frozen=True):
     fixes: int
     """How many fixes there are in the range; more than points where the way was thinned."""
     length_m: float
-    """Of the way through all fixes in the plane, gaps of more than ``GAP_S`` left out. Moves of less than half a metre
+    """Of the way through all fixes in the plane, gaps of more than ``GAP_S`` (``THINNED_GAP_S``) left out. Moves of less than half a metre
     do not count until they add up to that: they may be noise."""
 
 

@@ -47,6 +47,9 @@ NAME_COLUMNS: Final = {"tag": "uint32", "name": "string", "since": "timestamp[ms
 ZONE_COLUMNS: Final = {"zone": "string", "name": "string", "corners_m": "string"}
 """``corners_m`` is a list of pairs in JSON."""
 
+THINNED: Final = b"skyless_thinned"
+"""The key in the metadata of files of old fixes, of which one in ten seconds or in a minute is kept."""
+
 NUMBER_DIGITS: Final = 12
 
 

@@ -1,7 +1,7 @@
 """Questions to the history of a site: ways, times in cells and zones, contacts, alarms; and its fixes as a file.
 
-``DuckDB`` reads the files; times in cells are summed by NumPy, which takes a third of the time. Rows that are in the
-journal only, those of the last ten minutes or so, are not known yet.
+DuckDB reads the files; NumPy sums the times in cells, in a third of the time. Rows that are in the journal only, those of
+the last ten minutes or so, are not known yet.
 """
 
 import contextlib
@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from functools import wraps
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar
 
@@ -31,6 +31,7 @@ from skyless.run.fix_batch import ALERT_BITS, ALERTS, NONE_U16, SIMULATED
 from skyless.run.history._time_in_cells import time_in_cells
 from skyless.run.history.answers import (
     GAP_S,
+    THINNED_GAP_S,
     AlarmRow,
     Contact,
     Dwell,
@@ -40,7 +41,7 @@ from skyless.run.history.answers import (
     Track,
     TrackPoint,
 )
-from skyless.run.history.layout import current_events, current_files, site_folder
+from skyless.run.history.layout import THINNED, current_events, current_files, site_folder
 
 MEMORY: Final = "800MB"
 """What DuckDB may use, which is most of what a question uses."""
@@ -53,8 +54,9 @@ _LATE: Final = timedelta(days=1)
 
 _MOVE_M: Final = 0.5
 """Shorter moves may be noise and do not lengthen a way."""
-_CONTACT_GAP_S: Final = 5
-"""A contact goes on after an interruption of this length or less."""
+_CONTACT_MS: Final = {False: (1000, 5), True: (10_000, 6)}
+"""By whether days are thinned: fixes within the same so many milliseconds are compared, and a contact goes on after an
+interruption of so many such times or less."""
 _MAX_DISTANCE_M: Final = 50.0
 _MAX_STEPS: Final = 100_000
 _NAMED: Final = 5
@@ -84,13 +86,13 @@ leave it there. Of two crossings at one instant the leaving is the first."""
 
 _NEAR: Final = """
     WITH own AS (
-        SELECT epoch_ms(t) // 1000 AS s, x_mm AS x, y_mm AS y FROM read_parquet($files)
+        SELECT epoch_ms(t) // $bucket AS s, x_mm AS x, y_mm AS y FROM read_parquet($files)
         WHERE tag IN ({own}) AND t >= to_timestamp($begin) AND t < to_timestamp($end)
     ), around AS (
         SELECT s, x, y, floor(x / $mm)::INT + i AS cx, floor(y / $mm)::INT + j AS cy
         FROM own, (VALUES (-1), (0), (1)) AS a(i), (VALUES (-1), (0), (1)) AS b(j)
     ), others AS (
-        SELECT tag, epoch_ms(t) // 1000 AS s, x_mm AS x, y_mm AS y,
+        SELECT tag, epoch_ms(t) // $bucket AS s, x_mm AS x, y_mm AS y,
             floor(x_mm / $mm)::INT AS cx, floor(y_mm / $mm)::INT AS cy
         FROM read_parquet($files)
         WHERE tag NOT IN ({own}) AND t >= to_timestamp($begin) AND t < to_timestamp($end)
@@ -199,7 +201,8 @@ class History:
         with _connection() as duck:
             found = duck.execute(sql, _parameters(files, span)).fetchnumpy()
         t_s, x_m, y_m, z_m = (1e-3 * np.asarray(found[name], np.float64) for name in ("t", "x_mm", "y_mm", "z_mm"))
-        kept = _thinned(t_s, max(most_points, 2))
+        gap_s = THINNED_GAP_S if True in self._files_by_kind(span) else GAP_S
+        kept = _thinned(t_s, max(most_points, 2), gap_s)
         columns = (t_s, x_m, y_m, z_m, 1e-3 * np.asarray(found["std_mm"], np.float64), found["hpl_cm"], found["flags"])
         points = tuple(
             TrackPoint(unix_s, x, y, z, std_m, None if hpl_cm == NONE_U16 else hpl_cm / 100.0, _alert(flags))
@@ -207,7 +210,7 @@ class History:
                 *(np.asarray(column)[kept].tolist() for column in columns), strict=True
             )
         )
-        return Track(tag, points, len(t_s), _length_m(t_s, x_m, y_m))
+        return Track(tag, points, len(t_s), _length_m(t_s, x_m, y_m, gap_s))
 
     @_asked
     def heatmap(self, span: Span, cell_m: float = 0.25, tags: Sequence[str] = ()) -> Heatmap:
@@ -258,26 +261,28 @@ class History:
 
     @_asked
     def contacts(self, tag: str, span: Span, distance_m: float = 2.0) -> tuple[Contact, ...]:
-        """When other tags were within a distance in the plane, of fixes within the same second. Raises SkylessError."""
+        """When other tags were within a distance in the plane of each other, by fixes within the same second.
+
+        In days that are thinned by fixes within the same ten seconds. Raises SkylessError.
+        """
         check_number("the distance", distance_m, least=0.01, most=_MAX_DISTANCE_M)
-        own, files, names = self._numbers((tag,)), self._files(span), self._names()
-        if not files:
-            return ()
-        with _connection() as duck:
-            sql, millimetres = _NEAR.format(own=_listed(own)), round(1000.0 * distance_m)
-            rows = duck.execute(sql, _parameters(files, span) | {"mm": millimetres}).fetchall()
-        seconds: dict[str, dict[int, float]] = defaultdict(dict)
-        for number, second, square in rows:
-            near = seconds[names.get(number, f"#{number}")]
-            near[second] = min(square, near.get(second, math.inf))
-        found = [
-            Contact(
-                *(tag, other, max(float(begin), span.from_unix_s), min(float(end), span.to_unix_s)),
-                1e-3 * math.sqrt(min(square for second, square in near.items() if begin <= second < end)),
-            )
-            for other, near in seconds.items()
-            for begin, end in merged(sorted(near), _CONTACT_GAP_S)
-        ]
+        own, names = self._numbers((tag,)), self._names()
+        found: list[Contact] = []
+        for is_thinned, files in self._files_by_kind(span).items():
+            length_ms, gap = _CONTACT_MS[is_thinned]
+            limits = {"mm": round(1000.0 * distance_m), "bucket": length_ms}
+            with _connection() as duck:
+                rows = duck.execute(_NEAR.format(own=_listed(own)), _parameters(files, span) | limits).fetchall()
+            squares: dict[str, dict[int, float]] = defaultdict(dict)
+            for number, bucket, square in rows:
+                near = squares[names.get(number, f"#{number}")]
+                near[bucket] = min(square, near.get(bucket, math.inf))
+            for other, near in squares.items():
+                for begin, end in merged(sorted(near), gap):
+                    least_mm = math.sqrt(min(square for bucket, square in near.items() if begin <= bucket < end))
+                    begin_s = max(1e-3 * length_ms * begin, span.from_unix_s)
+                    end_s = min(1e-3 * length_ms * end, span.to_unix_s)
+                    found.append(Contact(tag, other, begin_s, end_s, 1e-3 * least_mm))
         return tuple(sorted(found, key=lambda one: (one.begin_unix_s, one.other)))
 
     @_asked
@@ -335,6 +340,14 @@ class History:
         files = current_files(self.folder, self.site)
         return [str(file) for file in files if begin <= file.parent.name.removeprefix("day=") <= end]
 
+    def _files_by_kind(self, span: Span) -> dict[bool, list[str]]:
+        """The same files, by whether those of their day are thinned."""
+        found: dict[bool, list[str]] = {}
+        for _, files in groupby(self._files(span), lambda file: Path(file).parent):
+            of_day = list(files)
+            found.setdefault(THINNED in (parquet.read_schema(of_day[0]).metadata or {}), []).extend(of_day)
+        return found
+
     def _names(self) -> dict[int, str]:
         """The newest name of each number."""
         rows = _columns(site_folder(self.folder, self.site) / "names.parquet", ("tag", "name", "since"))
@@ -372,14 +385,14 @@ class History:
 # Plain computations
 
 
-def merged(seconds: Sequence[int], gap_s: int) -> list[tuple[int, int]]:
-    """Intervals of sorted whole seconds, their ends excluded; a pause of ``gap_s`` or less is within an interval."""
-    if not seconds:
+def merged(numbers: Sequence[int], gap: int) -> list[tuple[int, int]]:
+    """Intervals of sorted numbers, their ends excluded; a pause of ``gap`` numbers or less is within an interval."""
+    if not numbers:
         return []
-    breaks = [(before, after) for before, after in pairwise(seconds) if after - before - 1 > gap_s]
+    breaks = [(before, after) for before, after in pairwise(numbers) if after - before - 1 > gap]
     begins, ends = (
-        [seconds[0], *(after for _, after in breaks)],
-        [*(before + 1 for before, _ in breaks), seconds[-1] + 1],
+        [numbers[0], *(after for _, after in breaks)],
+        [*(before + 1 for before, _ in breaks), numbers[-1] + 1],
     )
     return list(zip(begins, ends, strict=True))
 
@@ -404,11 +417,11 @@ def _ramp(times: _Floats, at: _Floats) -> _Floats:
     return ramp
 
 
-def _thinned(t_s: _Floats, most: int) -> NDArray[np.intp]:
+def _thinned(t_s: _Floats, most: int, gap_s: float) -> NDArray[np.intp]:
     """Indices of at most so many rows, evenly among them; the rows at gaps are kept if they are half of it at most."""
     if len(t_s) <= most:
         return np.arange(len(t_s))
-    gaps = np.flatnonzero(np.diff(t_s) > GAP_S)
+    gaps = np.flatnonzero(np.diff(t_s) > gap_s)
     fixed = np.union1d(gaps, gaps + 1)
     if len(fixed) > most // 2:
         fixed = fixed[:0]
@@ -416,12 +429,12 @@ def _thinned(t_s: _Floats, most: int) -> NDArray[np.intp]:
     return np.union1d(evenly, fixed).astype(np.intp)
 
 
-def _length_m(t_s: _Floats, x_m: _Floats, y_m: _Floats) -> float:
+def _length_m(t_s: _Floats, x_m: _Floats, y_m: _Floats, gap_s: float) -> float:
     total_m = x0 = y0 = 0.0
     before_s = -math.inf
     for now_s, x, y in zip(t_s.tolist(), x_m.tolist(), y_m.tolist(), strict=True):
         moved_m = math.hypot(x - x0, y - y0)
-        if now_s - before_s > GAP_S:
+        if now_s - before_s > gap_s:
             x0, y0 = x, y
         elif moved_m >= _MOVE_M:
             total_m += moved_m
