@@ -37,8 +37,8 @@ class Track(Struct, frozen=True):
     fixes: int
     """How many fixes there are in the range; more than points where the way was thinned."""
     length_m: float
-    """Of the way through all fixes in the plane, gaps of more than ``GAP_S`` (``THINNED_GAP_S``) left out. Moves of less than half a metre
-    do not count until they add up to that: they may be noise."""
+    """Of the way through all fixes in the plane, without gaps of more than ``GAP_S`` (``THINNED_GAP_S``). Moves of less
+    than a quarter of a metre, or three standard deviations, count when they add up to that: they may be noise."""
 
 
 class Heatmap(Struct, frozen=True):

@@ -1,7 +1,7 @@
 """Questions to the history of a site: ways, times in cells and zones, contacts, alarms; and its fixes as a file.
 
-DuckDB reads the files; NumPy sums the times in cells, in a third of the time. Rows that are in the journal only, those of
-the last ten minutes or so, are not known yet.
+DuckDB reads the files; NumPy sums the times in cells, in a third of the time. Rows that are in the journal only, those
+of the last ten minutes or so, are not known yet.
 """
 
 import contextlib
@@ -52,8 +52,9 @@ _EARLY: Final = timedelta(hours=1)
 _LATE: Final = timedelta(days=1)
 """How much earlier and later than its time a fix may arrive: clocks differ, and sites keep what a cut line delays."""
 
-_MOVE_M: Final = 0.5
-"""Shorter moves may be noise and do not lengthen a way."""
+_MOVE_M: Final = 0.25
+_MOVE_SIGMAS: Final = 3.0
+"""Moves that are shorter, or within so many standard deviations of the fix, may be noise and do not lengthen a way."""
 _CONTACT_MS: Final = {False: (1000, 5), True: (10_000, 6)}
 """By whether days are thinned: fixes within the same so many milliseconds are compared, and a contact goes on after an
 interruption of so many such times or less."""
@@ -86,19 +87,14 @@ leave it there. Of two crossings at one instant the leaving is the first."""
 
 _NEAR: Final = """
     WITH own AS (
-        SELECT epoch_ms(t) // $bucket AS s, x_mm AS x, y_mm AS y FROM read_parquet($files)
+        SELECT epoch_ms(t) // $bucket AS bucket, x_mm::BIGINT AS x, y_mm::BIGINT AS y FROM read_parquet($files)
         WHERE tag IN ({own}) AND t >= to_timestamp($begin) AND t < to_timestamp($end)
-    ), around AS (
-        SELECT s, x, y, floor(x / $mm)::INT + i AS cx, floor(y / $mm)::INT + j AS cy
-        FROM own, (VALUES (-1), (0), (1)) AS a(i), (VALUES (-1), (0), (1)) AS b(j)
     ), others AS (
-        SELECT tag, epoch_ms(t) // $bucket AS s, x_mm AS x, y_mm AS y,
-            floor(x_mm / $mm)::INT AS cx, floor(y_mm / $mm)::INT AS cy
-        FROM read_parquet($files)
+        SELECT tag, epoch_ms(t) // $bucket AS bucket, x_mm, y_mm FROM read_parquet($files)
         WHERE tag NOT IN ({own}) AND t >= to_timestamp($begin) AND t < to_timestamp($end)
     )
-    SELECT others.tag, s, min((others.x - around.x)::DOUBLE ** 2 + (others.y - around.y)::DOUBLE ** 2) AS square
-    FROM others JOIN around USING (s, cx, cy) GROUP BY others.tag, s HAVING square <= $mm::DOUBLE ** 2 ORDER BY s
+    SELECT tag, bucket, min((x_mm - x) ** 2 + (y_mm - y) ** 2) AS square FROM others JOIN own USING (bucket)
+    WHERE abs(x_mm - x) <= $mm AND abs(y_mm - y) <= $mm GROUP BY tag, bucket HAVING square <= $mm ** 2
 """
 
 _ALARMS: Final = """
@@ -167,7 +163,8 @@ class History:
 
     def zones(self) -> dict[str, tuple[str, tuple[tuple[float, float], ...]]]:
         """Names and corners of all zones by their identifiers."""
-        rows = _columns(site_folder(self.folder, self.site) / "zones.parquet", ("zone", "name", "corners_m"))
+        file = site_folder(self.folder, self.site) / "zones.parquet"
+        rows = _rows("SELECT zone, name, corners_m FROM read_parquet($1)", file)
         kind = tuple[tuple[float, float], ...]
         return {zone: (name or zone, msgspec.json.decode(corners or "[]", type=kind)) for zone, name, corners in rows}
 
@@ -200,17 +197,18 @@ class History:
         """
         with _connection() as duck:
             found = duck.execute(sql, _parameters(files, span)).fetchnumpy()
-        t_s, x_m, y_m, z_m = (1e-3 * np.asarray(found[name], np.float64) for name in ("t", "x_mm", "y_mm", "z_mm"))
+        names = ("t", "x_mm", "y_mm", "z_mm", "std_mm")
+        t_s, x_m, y_m, z_m, std_m = (1e-3 * np.asarray(found[name], np.float64) for name in names)
         gap_s = THINNED_GAP_S if True in self._files_by_kind(span) else GAP_S
         kept = _thinned(t_s, max(most_points, 2), gap_s)
-        columns = (t_s, x_m, y_m, z_m, 1e-3 * np.asarray(found["std_mm"], np.float64), found["hpl_cm"], found["flags"])
+        columns = (t_s, x_m, y_m, z_m, std_m, found["hpl_cm"], found["flags"])
         points = tuple(
             TrackPoint(unix_s, x, y, z, std_m, None if hpl_cm == NONE_U16 else hpl_cm / 100.0, _alert(flags))
             for unix_s, x, y, z, std_m, hpl_cm, flags in zip(
                 *(np.asarray(column)[kept].tolist() for column in columns), strict=True
             )
         )
-        return Track(tag, points, len(t_s), _length_m(t_s, x_m, y_m, gap_s))
+        return Track(tag, points, len(t_s), _length_m(t_s, x_m, y_m, std_m, gap_s))
 
     @_asked
     def heatmap(self, span: Span, cell_m: float = 0.25, tags: Sequence[str] = ()) -> Heatmap:
@@ -350,8 +348,8 @@ class History:
 
     def _names(self) -> dict[int, str]:
         """The newest name of each number."""
-        rows = _columns(site_folder(self.folder, self.site) / "names.parquet", ("tag", "name", "since"))
-        return {tag: name for tag, name, _ in sorted(rows, key=lambda row: row[2])}
+        file = site_folder(self.folder, self.site) / "names.parquet"
+        return dict(_rows("SELECT tag, name FROM read_parquet($1) ORDER BY since", file))
 
     def _numbers(self, tags: Iterable[str]) -> tuple[int, ...]:
         """The numbers of tags. Raises SkylessError for a name that no tag has."""
@@ -429,14 +427,15 @@ def _thinned(t_s: _Floats, most: int, gap_s: float) -> NDArray[np.intp]:
     return np.union1d(evenly, fixed).astype(np.intp)
 
 
-def _length_m(t_s: _Floats, x_m: _Floats, y_m: _Floats, gap_s: float) -> float:
+def _length_m(t_s: _Floats, x_m: _Floats, y_m: _Floats, std_m: _Floats, gap_s: float) -> float:
     total_m = x0 = y0 = 0.0
     before_s = -math.inf
-    for now_s, x, y in zip(t_s.tolist(), x_m.tolist(), y_m.tolist(), strict=True):
+    least_m = np.maximum(_MOVE_M, _MOVE_SIGMAS * std_m)
+    for now_s, x, y, least in zip(*(column.tolist() for column in (t_s, x_m, y_m, least_m)), strict=True):
         moved_m = math.hypot(x - x0, y - y0)
         if now_s - before_s > gap_s:
             x0, y0 = x, y
-        elif moved_m >= _MOVE_M:
+        elif moved_m >= least:
             total_m += moved_m
             x0, y0 = x, y
         before_s = now_s
@@ -467,12 +466,12 @@ def _connection() -> Iterator[duckdb.DuckDBPyConnection]:
         duck.close()
 
 
-def _columns(file: Path, names: Sequence[str]) -> list[tuple[Any, ...]]:
+def _rows(sql: str, file: Path) -> list[tuple[Any, ...]]:
     """The rows of a small file; none where it does not exist yet."""
     if not file.exists():
         return []
-    table = parquet.read_table(file, columns=list(names))
-    return list(zip(*(table.column(name).to_pylist() for name in names), strict=True))
+    with _connection() as duck:
+        return duck.execute(sql, [str(file)]).fetchall()
 
 
 def _parameters(files: list[str], span: Span) -> dict[str, object]:
