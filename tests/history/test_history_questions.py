@@ -161,12 +161,12 @@ def test_a_track_is_all_fixes_of_the_tag(history, within):
 def plain_length(own):
     total, at = 0.0, None
     for k in range(len(own["t"])):
-        here = np.array([own["x_mm"][k], own["y_mm"][k]]) / 1000
+        here = np.array([own["x_mm"][k], own["y_mm"][k]])
         if at is None or own["t"][k] - own["t"][k - 1] > 1000 * GAP_S:
             at = here
-        elif np.hypot(*(here - at)) >= max(0.25, 3 * own["std_mm"][k] / 1000):
+        elif np.hypot(*(here - at)) >= max(250, 3 * own["std_mm"][k]):
             total, at = total + np.hypot(*(here - at)), here
-    return total
+    return total / 1000
 
 
 @pytest.mark.parametrize("most", [2, 3, 100, 2999])

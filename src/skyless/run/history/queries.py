@@ -52,7 +52,7 @@ _EARLY: Final = timedelta(hours=1)
 _LATE: Final = timedelta(days=1)
 """How much earlier and later than its time a fix may arrive: clocks differ, and sites keep what a cut line delays."""
 
-_MOVE_M: Final = 0.25
+_MOVE_MM: Final = 250
 _MOVE_SIGMAS: Final = 3.0
 """Moves that are shorter, or within so many standard deviations of the fix, may be noise and do not lengthen a way."""
 _CONTACT_MS: Final = {False: (1000, 5), True: (10_000, 6)}
@@ -119,6 +119,7 @@ _EXPORT: Final = f"""
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
+_Ints = NDArray[np.int64]
 _Floats = NDArray[np.float64]
 
 
@@ -197,18 +198,27 @@ class History:
         """
         with _connection() as duck:
             found = duck.execute(sql, _parameters(files, span)).fetchnumpy()
-        names = ("t", "x_mm", "y_mm", "z_mm", "std_mm")
-        t_s, x_m, y_m, z_m, std_m = (1e-3 * np.asarray(found[name], np.float64) for name in names)
-        gap_s = THINNED_GAP_S if True in self._files_by_kind(span) else GAP_S
-        kept = _thinned(t_s, max(most_points, 2), gap_s)
-        columns = (t_s, x_m, y_m, z_m, std_m, found["hpl_cm"], found["flags"])
+        ms, x_mm, y_mm, std_mm = (np.asarray(found[name], np.int64) for name in ("t", "x_mm", "y_mm", "std_mm"))
+        gap_ms = 1000.0 * (THINNED_GAP_S if True in self._files_by_kind(span) else GAP_S)
+        kept = _thinned(ms, max(most_points, 2), gap_ms)
+        columns = (
+            1e-3 * ms,
+            1e-3 * x_mm,
+            1e-3 * y_mm,
+            1e-3 * found["z_mm"],
+            1e-3 * std_mm,
+            found["hpl_cm"],
+            found["flags"],
+        )
         points = tuple(
             TrackPoint(unix_s, x, y, z, std_m, None if hpl_cm == NONE_U16 else hpl_cm / 100.0, _alert(flags))
             for unix_s, x, y, z, std_m, hpl_cm, flags in zip(
                 *(np.asarray(column)[kept].tolist() for column in columns), strict=True
             )
         )
-        return Track(tag, points, len(t_s), _length_m(t_s, x_m, y_m, std_m, gap_s))
+        return Track(
+            tag, points, len(ms), 1e-3 * _length_mm(ms, x_mm, y_mm, np.maximum(_MOVE_MM, _MOVE_SIGMAS * std_mm), gap_ms)
+        )
 
     @_asked
     def heatmap(self, span: Span, cell_m: float = 0.25, tags: Sequence[str] = ()) -> Heatmap:
@@ -270,6 +280,7 @@ class History:
             length_ms, gap = _CONTACT_MS[is_thinned]
             limits = {"mm": round(1000.0 * distance_m), "bucket": length_ms}
             with _connection() as duck:
+                duck.execute("SET disabled_optimizers = 'join_order,build_side_probe_side'")  # only `own` is in memory
                 rows = duck.execute(_NEAR.format(own=_listed(own)), _parameters(files, span) | limits).fetchall()
             squares: dict[str, dict[int, float]] = defaultdict(dict)
             for number, bucket, square in rows:
@@ -415,31 +426,31 @@ def _ramp(times: _Floats, at: _Floats) -> _Floats:
     return ramp
 
 
-def _thinned(t_s: _Floats, most: int, gap_s: float) -> NDArray[np.intp]:
+def _thinned(ms: _Ints, most: int, gap_ms: float) -> NDArray[np.intp]:
     """Indices of at most so many rows, evenly among them; the rows at gaps are kept if they are half of it at most."""
-    if len(t_s) <= most:
-        return np.arange(len(t_s))
-    gaps = np.flatnonzero(np.diff(t_s) > gap_s)
+    if len(ms) <= most:
+        return np.arange(len(ms))
+    gaps = np.flatnonzero(np.diff(ms) > gap_ms)
     fixed = np.union1d(gaps, gaps + 1)
     if len(fixed) > most // 2:
         fixed = fixed[:0]
-    evenly = np.linspace(0, len(t_s) - 1, most - len(fixed)).round().astype(np.intp)
+    evenly = np.linspace(0, len(ms) - 1, most - len(fixed)).round().astype(np.intp)
     return np.union1d(evenly, fixed).astype(np.intp)
 
 
-def _length_m(t_s: _Floats, x_m: _Floats, y_m: _Floats, std_m: _Floats, gap_s: float) -> float:
-    total_m = x0 = y0 = 0.0
-    before_s = -math.inf
-    least_m = np.maximum(_MOVE_M, _MOVE_SIGMAS * std_m)
-    for now_s, x, y, least in zip(*(column.tolist() for column in (t_s, x_m, y_m, least_m)), strict=True):
-        moved_m = math.hypot(x - x0, y - y0)
-        if now_s - before_s > gap_s:
+def _length_mm(ms: _Ints, x_mm: _Ints, y_mm: _Ints, least_mm: _Floats, gap_ms: float) -> float:
+    """Length of a way of moves that are not shorter than the least ones, each from the end of the last."""
+    total_mm = x0 = y0 = 0.0
+    before_ms = -math.inf
+    for now_ms, x, y, least in zip(*(column.tolist() for column in (ms, x_mm, y_mm, least_mm)), strict=True):
+        moved_mm = math.hypot(x - x0, y - y0)
+        if now_ms - before_ms > gap_ms:
             x0, y0 = x, y
-        elif moved_m >= least:
-            total_m += moved_m
+        elif moved_mm >= least:
+            total_mm += moved_mm
             x0, y0 = x, y
-        before_s = now_s
-    return total_m
+        before_ms = now_ms
+    return total_mm
 
 
 def _alert(flags: int) -> str | None:
