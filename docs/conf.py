@@ -77,6 +77,7 @@ NAVIGATION = {
         "docs/sites",
         "docs/page",
         "docs/mqtt",
+        "docs/history",
         "docs/phases",
         "docs/protocol",
         "docs/protocol2",

@@ -204,7 +204,10 @@ def test_a_wild_fix_makes_no_grid_of_a_billion_cells(tmp_path, rows):
     wild = {name: values.copy() for name, values in rows.items()}
     wild["x_mm"][50_000], wild["y_mm"][50_010] = 2_000_000_000, -2_000_000_000
     write_fixes(site, wild, 1, len(rows["t"]))
-    heatmap = History(tmp_path, 1).heatmap(Span(BEGIN, BEGIN + 5000.0), 0.25)
+    parquet.write_table(table(NAME_COLUMNS, {"tag": [1], "name": ["tag1"], "since": [0]}), site / "names.parquet")
+    history, span = History(tmp_path, 1), Span(BEGIN, BEGIN + 5000.0)
+    assert len(history.contacts("tag1", span)) > 0
+    heatmap = history.heatmap(span, 0.25)
     assert sum(heatmap.seconds) > 0.5 * TAGS * FIXES
     assert heatmap.columns * heatmap.rows < 1_000_000
 
@@ -372,3 +375,26 @@ def test_counts_are_those_at_every_instant(visits, step, length):
         at = [sum(b <= second < e for b, e in visits) for second in whole]
         assert mean[k] == pytest.approx(sum(at) / len(at))
         assert most[k] == max(at)
+
+
+def test_days_that_are_thinned(tmp_path):
+    """Their fixes, one in ten seconds or in a minute, count longer, and are compared within ten seconds."""
+    site, minutes = site_folder(tmp_path, 2), 60
+    rest = [(1, 60_000 * k + 300, 1000, 1000) for k in range(minutes)]
+    near = [(2, 60_000 * k + 1200, 2500, 1000) for k in range(10, 20)]
+    moving = [(3, 10_000 * k + 900, 500 * k, 9000) for k in range(6 * minutes)]
+    tags, ms, x_mm, y_mm = (np.array(column) for column in zip(*rest, *near, *moving, strict=True))
+    begin_ms = round(1000 * MIDNIGHT)
+    rows = {"tag": tags, "t": begin_ms + ms, "x_mm": x_mm, "y_mm": y_mm}
+    rows |= {name: np.full(len(tags), 10) for name in FIX_COLUMNS if name not in rows}
+    write_fixes(site, rows, 1, len(tags))
+    (file,) = site.glob("day=*/*.parquet")
+    parquet.write_table(parquet.ParquetFile(file).read().replace_schema_metadata({b"skyless_thinned": b"yes"}), file)
+    names = {"tag": [1, 2, 3], "name": ["rest", "near", "moving"], "since": [0, 0, 0]}
+    parquet.write_table(table(NAME_COLUMNS, names), site / "names.parquet")
+    history, span = History(tmp_path, 2), Span(MIDNIGHT, MIDNIGHT + 3600.0)
+    assert sum(history.heatmap(span, tags=("rest",)).seconds) == pytest.approx(59 * 60.0)
+    assert history.track("moving", span).length_m == pytest.approx(0.5 * (6 * minutes - 1))
+    assert history.contacts("rest", span, 2.0) == (
+        Contact("rest", "near", MIDNIGHT + 600.0, MIDNIGHT + 19 * 60.0 + 10.0, 1.5),
+    )

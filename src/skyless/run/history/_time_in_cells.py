@@ -72,17 +72,13 @@ def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collect
 
 def _groups(path: Path) -> list[_Group]:
     file = parquet.ParquetFile(path)
-    names = {file.metadata.schema.column(k).name: k for k in range(file.metadata.num_columns)}
     gap_s = THINNED_GAP_S if THINNED in (file.schema_arrow.metadata or {}) else GAP_S
     found = []
     for number in range(file.num_row_groups):
-        limits = {}
-        for name in _COLUMNS:
-            statistics = file.metadata.row_group(number).column(names[name]).statistics
-            raw = statistics is not None and statistics.has_min_max
-            low, high = (statistics.min_raw, statistics.max_raw) if raw else (0, -1)
-            limits[name] = (low, high)
-        if limits["tag"][0] <= limits["tag"][1]:
+        group = file.metadata.row_group(number)
+        columns = {group.column(k).path_in_schema: group.column(k).statistics for k in range(group.num_columns)}
+        if group.num_rows:
+            limits = {name: (columns[name].min_raw, columns[name].max_raw) for name in _COLUMNS}
             found.append(_Group(file, number, limits, round(1000.0 * gap_s)))
     return found
 

@@ -6,6 +6,7 @@ of the last ten minutes or so, are not known yet.
 
 import contextlib
 import math
+import secrets
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -464,12 +465,8 @@ def _alert(flags: int) -> str | None:
 @contextlib.contextmanager
 def _connection() -> Iterator[duckdb.DuckDBPyConnection]:
     """DuckDB without files of its own but temporary ones, and without the network."""
-    spill = Path(tempfile.gettempdir()) / "skyless-history"
-    options: dict[str, Any] = {
-        "memory_limit": MEMORY,
-        "temp_directory": str(spill),
-        "autoinstall_known_extensions": "false",
-    }
+    spill = str(Path(tempfile.gettempdir()) / f"skyless-history-{secrets.token_hex(8)}")  # made where it is needed
+    options: dict[str, Any] = {"memory_limit": MEMORY, "temp_directory": spill, "autoinstall_known_extensions": "false"}
     duck = duckdb.connect(config=options)
     try:
         yield duck
