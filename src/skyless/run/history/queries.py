@@ -1,7 +1,7 @@
 """Questions to the history of a site: ways, times in cells and zones, contacts, alarms; and its fixes as a file.
 
-DuckDB reads the files; NumPy sums the times in cells, in a third of the time. Rows that are in the journal only, those
-of the last ten minutes or so, are not known yet.
+DuckDB reads the files, and NumPy where a question needs all rows (``_scans.py``). Rows that are in the journal only,
+those of the last ten minutes or so, are not known yet.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
 from skyless.core.whole_files import whole_file
 from skyless.run.fix_batch import ALERT_BITS, ALERTS, NONE_U16, SIMULATED
-from skyless.run.history._time_in_cells import time_in_cells
+from skyless.run.history._scans import near, time_in_cells
 from skyless.run.history.answers import (
     GAP_S,
     THINNED_GAP_S,
@@ -86,16 +86,9 @@ _VISITS: Final = """
 """When tags were in zones. Those that were in a zone at the beginning enter it there; those that are in it at the end
 leave it there. Of two crossings at one instant the leaving is the first."""
 
-_NEAR: Final = """
-    WITH own AS (
-        SELECT epoch_ms(t) // $bucket AS bucket, x_mm::BIGINT AS x, y_mm::BIGINT AS y FROM read_parquet($files)
-        WHERE tag IN ({own}) AND t >= to_timestamp($begin) AND t < to_timestamp($end)
-    ), others AS (
-        SELECT tag, epoch_ms(t) // $bucket AS bucket, x_mm, y_mm FROM read_parquet($files)
-        WHERE tag NOT IN ({own}) AND t >= to_timestamp($begin) AND t < to_timestamp($end)
-    )
-    SELECT tag, bucket, min((x_mm - x) ** 2 + (y_mm - y) ** 2) AS square FROM others JOIN own USING (bucket)
-    WHERE abs(x_mm - x) <= $mm AND abs(y_mm - y) <= $mm GROUP BY tag, bucket HAVING square <= $mm ** 2
+_FIXES: Final = """
+    SELECT epoch_ms(t) AS t, x_mm, y_mm, z_mm, std_mm, hpl_cm, flags FROM read_parquet($files)
+    WHERE tag IN ({tags}) AND t >= to_timestamp($begin) AND t < to_timestamp($end) ORDER BY t
 """
 
 _ALARMS: Final = """
@@ -190,15 +183,9 @@ class History:
 
         Raises SkylessError: there is no such tag.
         """
-        numbers, files = self._numbers((tag,)), self._files(span)
-        if not files:
+        found = self._fixes(self._numbers((tag,)), span, self._files(span))
+        if not found:
             return Track(tag, (), 0, 0.0)
-        sql = f"""
-            SELECT epoch_ms(t) AS t, x_mm, y_mm, z_mm, std_mm, hpl_cm, flags FROM read_parquet($files)
-            WHERE tag IN ({_listed(numbers)}) AND t >= to_timestamp($begin) AND t < to_timestamp($end) ORDER BY t
-        """
-        with _connection() as duck:
-            found = duck.execute(sql, _parameters(files, span)).fetchnumpy()
         ms, x_mm, y_mm, std_mm = (np.asarray(found[name], np.int64) for name in ("t", "x_mm", "y_mm", "std_mm"))
         gap_ms = 1000.0 * (THINNED_GAP_S if True in self._files_by_kind(span) else GAP_S)
         kept = _thinned(ms, max(most_points, 2), gap_ms)
@@ -226,7 +213,7 @@ class History:
         """How long tags, by default all, were in the cells of a grid. Raises SkylessError."""
         check_number("the cells' side", cell_m, least=0.01, most=1000.0)
         numbers = self._numbers(tags) if tags else None
-        return time_in_cells([Path(file) for file in self._files(span)], span, round(1000.0 * cell_m), numbers)
+        return time_in_cells(self._files(span), span, round(1000.0 * cell_m), numbers)
 
     @_asked
     def dwell(self, span: Span, tags: Sequence[str] = (), zone: str | None = None) -> tuple[Dwell, ...]:
@@ -275,21 +262,21 @@ class History:
         In days that are thinned by fixes within the same ten seconds. Raises SkylessError.
         """
         check_number("the distance", distance_m, least=0.01, most=_MAX_DISTANCE_M)
-        own, names = self._numbers((tag,)), self._names()
+        own, names, limit_mm = self._numbers((tag,)), self._names(), round(1000.0 * distance_m)
         found: list[Contact] = []
         for is_thinned, files in self._files_by_kind(span).items():
             length_ms, gap = _CONTACT_MS[is_thinned]
-            limits = {"mm": round(1000.0 * distance_m), "bucket": length_ms}
-            with _connection() as duck:
-                duck.execute("SET disabled_optimizers = 'join_order,build_side_probe_side'")  # only `own` is in memory
-                rows = duck.execute(_NEAR.format(own=_listed(own)), _parameters(files, span) | limits).fetchall()
-            squares: dict[str, dict[int, float]] = defaultdict(dict)
-            for number, bucket, square in rows:
-                near = squares[names.get(number, f"#{number}")]
-                near[bucket] = min(square, near.get(bucket, math.inf))
-            for other, near in squares.items():
-                for begin, end in merged(sorted(near), gap):
-                    least_mm = math.sqrt(min(square for bucket, square in near.items() if begin <= bucket < end))
+            fixes = self._fixes(own, span, files)
+            if not fixes:
+                continue
+            places = [np.asarray(fixes[name], np.int64) for name in ("t", "x_mm", "y_mm")]
+            least: dict[str, dict[int, float]] = defaultdict(dict)
+            for number, bucket, square in zip(*near(files, span, places, own, length_ms, limit_mm), strict=True):
+                of_other = least[names.get(number, f"#{number}")]
+                of_other[bucket] = min(square, of_other.get(bucket, math.inf))
+            for other, squares in least.items():
+                for begin, end in merged(sorted(squares), gap):
+                    least_mm = math.sqrt(min(square for bucket, square in squares.items() if begin <= bucket < end))
                     begin_s = max(1e-3 * length_ms * begin, span.from_unix_s)
                     end_s = min(1e-3 * length_ms * end, span.to_unix_s)
                     found.append(Contact(tag, other, begin_s, end_s, 1e-3 * least_mm))
@@ -349,6 +336,14 @@ class History:
         end = (_utc(span.to_unix_s) + _LATE).date().isoformat()
         files = current_files(self.folder, self.site)
         return [str(file) for file in files if begin <= file.parent.name.removeprefix("day=") <= end]
+
+    def _fixes(self, numbers: Iterable[int], span: Span, files: list[str]) -> dict[str, NDArray[Any]]:
+        """The fixes of tags in order of time, as columns; empty without any."""
+        if not files:
+            return {}
+        with _connection() as duck:
+            found = duck.execute(_FIXES.format(tags=_listed(numbers)), _parameters(files, span)).fetchnumpy()
+        return found if len(found["t"]) else {}
 
     def _files_by_kind(self, span: Span) -> dict[bool, list[str]]:
         """The same files, by whether those of their day are thinned."""
