@@ -73,18 +73,21 @@ _VISITS: Final = """
         UNION ALL
         SELECT tag, zone, arg_max(kind, t), $begin FROM read_parquet($files)
         WHERE kind IN ('enter', 'leave') AND t < to_timestamp($begin / 1000) GROUP BY tag, zone
-    ), changes AS (
-        SELECT *, lag(kind, 1, 'leave') OVER way AS before FROM crossings
+    ), numbered AS (
+        SELECT *, lag(kind, 1, 'leave') OVER (PARTITION BY tag, zone ORDER BY ms, kind DESC) AS before FROM crossings
         WHERE tag IS NOT NULL AND zone IS NOT NULL AND (len($tags) = 0 OR list_contains($tags, tag))
             AND ($zone IS NULL OR zone = $zone)
-        WINDOW way AS (PARTITION BY tag, zone ORDER BY ms, kind DESC)
-    ), visits AS (
-        SELECT tag, zone, kind, ms AS begin, lead(ms, 1, $end) OVER way AS "end" FROM changes WHERE kind != before
-        WINDOW way AS (PARTITION BY tag, zone ORDER BY ms, kind DESC)
-    )
+    ), changes AS (SELECT tag, zone, kind = 'enter' AS enters, ms FROM numbered WHERE kind != before)
 """
-"""When tags were in zones. Those that were in a zone at the beginning enter it there; those that are in it at the end
-leave it there. Of two crossings at one instant the leaving is the first."""
+"""When tags entered and left zones, in turn. Those that were in a zone at the beginning enter it there. Of two
+crossings at one instant the leaving is the first."""
+
+_DWELL: Final = """
+    SELECT tag, zone, count(*) FILTER (enters) AS visits, visits > count(*) FILTER (NOT enters) AS is_open,
+        sum(CASE WHEN enters THEN -ms ELSE ms END) + CASE WHEN is_open THEN $end ELSE 0 END, min(ms),
+        CASE WHEN is_open THEN $end ELSE max(ms) END
+    FROM changes GROUP BY tag, zone ORDER BY tag, zone
+"""
 
 _FIXES: Final = """
     SELECT epoch_ms(t) AS t, x_mm, y_mm, z_mm, std_mm, hpl_cm, flags FROM read_parquet($files)
@@ -222,14 +225,10 @@ class History:
         A visit at an edge of the range counts with its part in it. One that has not ended goes on until the end of the
         range, or of what is known.
         """
-        sql = """
-            SELECT tag, zone, count(*), sum("end" - begin), min(begin), max("end") FROM visits WHERE kind = 'enter'
-            GROUP BY tag, zone ORDER BY tag, zone
-        """
         names = self._zone_names(zone)
         return tuple(
             Dwell(tag, one, names.get(one, one), visits, 1e-3 * float(ms), 1e-3 * first, 1e-3 * last)
-            for tag, one, visits, ms, first, last in self._of_visits(sql, span, tags, zone)
+            for tag, one, visits, _, ms, first, last in self._of_changes(_DWELL, span, tags, zone)
         )
 
     @_asked
@@ -242,17 +241,16 @@ class History:
         length_s = span.to_unix_s - span.from_unix_s
         if length_s / step_s > _MAX_STEPS:
             raise SkylessError(f"steps of {step_s:g} s in a range of {length_s:.0f} s are too many; choose longer ones")
-        visits: dict[str, list[tuple[float, float]]] = defaultdict(list)
-        for one, begin, end in self._of_visits(
-            "SELECT zone, begin, \"end\" FROM visits WHERE kind = 'enter'", span, (), zone
-        ):
-            visits[one].append((1e-3 * begin - span.from_unix_s, 1e-3 * end - span.from_unix_s))
+        times: dict[str, tuple[list[float], list[float]]] = defaultdict(lambda: ([], []))
+        for one, enters, ms in self._of_changes("SELECT zone, enters, ms FROM changes", span, (), zone):
+            times[one][0 if enters else 1].append(1e-3 * ms - span.from_unix_s)
+        until_s = (self.known_until_unix_s() or span.from_unix_s) - span.from_unix_s
         names = self._zone_names(zone)
         edges = np.append(np.arange(0.0, length_s, step_s), length_s)
         return tuple(
             Occupancy(one, names.get(one, one), span.from_unix_s + begin, mean, most)
-            for one in ([zone] if zone is not None else sorted({*names, *visits}))
-            for begin, mean, most in zip(edges[:-1].tolist(), *counts(visits[one], edges), strict=True)
+            for one in ([zone] if zone is not None else sorted({*names, *times}))
+            for begin, mean, most in zip(edges[:-1].tolist(), *counts(*times[one], until_s, edges), strict=True)
         )
 
     @_asked
@@ -375,7 +373,7 @@ class History:
             raise SkylessError(f"the history of site {self.site} has no zone {zone!r}; {_some(names, 'zones')}")
         return names
 
-    def _of_visits(self, sql: str, span: Span, tags: Sequence[str], zone: str | None) -> list[tuple[Any, ...]]:
+    def _of_changes(self, sql: str, span: Span, tags: Sequence[str], zone: str | None) -> list[tuple[Any, ...]]:
         if tags:
             self._numbers(tags)
         until, files = self.known_until_unix_s(), list(map(str, current_events(self.folder, self.site)))
@@ -402,10 +400,11 @@ def merged(numbers: Sequence[int], gap: int) -> list[tuple[int, int]]:
     return list(zip(begins, ends, strict=True))
 
 
-def counts(visits: Sequence[tuple[float, float]], edges: _Floats) -> tuple[list[float], list[int]]:
-    """How many visits go on in each interval between edges: their mean and most. A visit is over at its end."""
-    real = np.array([visit for visit in visits if visit[0] < visit[1]], np.float64).reshape(-1, 2)
-    begins, ends = np.sort(real[:, 0]), np.sort(real[:, 1])
+def counts(
+    entered: Sequence[float], left: Sequence[float], until: float, edges: _Floats
+) -> tuple[list[float], list[int]]:
+    """How many are inside in each interval between edges: their mean and most. Who has not left does so at last."""
+    begins, ends = np.sort(entered), np.sort([*left, *(until for _ in range(len(entered) - len(left)))])
     mean = np.diff(_ramp(begins, edges) - _ramp(ends, edges)) / np.diff(edges)
     most = np.searchsorted(begins, edges[:-1], "right") - np.searchsorted(ends, edges[:-1], "right")
     after = np.arange(1, len(begins) + 1) - np.searchsorted(ends, begins, "right")
