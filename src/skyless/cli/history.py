@@ -47,7 +47,7 @@ def run(
     Parameters
     ----------
     to
-        The history's folder; several sites may share it.
+        Where fixes are kept: a folder, which several sites may share.
     site_id
         Number of the site; by default the one whose programs are online.
     keep_days
@@ -131,7 +131,7 @@ def import_file(recording: Path, /, *, to: HistoryFolder, site_id: SiteId | None
     recording
         The recording, an MCAP file of skyless record.
     to
-        The history's folder; several sites may share it.
+        Where fixes are kept: a folder, which several sites may share.
     site_id
         Number of the site; by default the one that was recorded.
     json

@@ -57,6 +57,11 @@ class Journal:
             raise
         self._length, self._is_torn = self._length + frame_bytes, False
 
+    def free_bytes(self) -> int:
+        """How much the disk has left."""
+        found = os.statvfs(self._folder)
+        return found.f_bavail * found.f_frsize
+
     def sync(self) -> None:
         """Wait until all frames are on the disk: they then survive a power cut, too."""
         if self._handle is not None:

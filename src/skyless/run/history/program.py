@@ -27,7 +27,7 @@ from skyless.run.zones.zone_list import BadZonesError, read_zones
 
 _STORE_S: Final = 0.1
 _SYNC_S: Final = 1.0
-_RETRY_S: Final = 10.0  # after a file could not be written
+_RETRY_S: Final = 10.0  # while the disk is full, or after a file could not be written
 _LATE_S: Final = 2 * FILE_S  # after midnight, the files of the day before are complete
 
 
@@ -151,9 +151,11 @@ class HistoryNode:
             for kind, intake in intakes.items():
                 await asyncio.to_thread(self._try, f"journal of {kind}", intake.sync)
                 files = f"files of {kind}"
-                if time.monotonic() < retry_s or not intake.sink.is_due(now_s):
+                is_full = "journal" in self._trouble and intake.sink.waiting > 0  # files are smaller than the journal
+                if time.monotonic() < retry_s or not (is_full or intake.sink.is_due(now_s)):
                     continue
-                if not self._try(files, intake.begin) or not await asyncio.to_thread(self._try, files, intake.write):
+                is_done = self._try(files, intake.begin) and await asyncio.to_thread(self._try, files, intake.write)
+                if is_full or not is_done:
                     retry_s = time.monotonic() + _RETRY_S
             today = datetime.fromtimestamp(now_s - _LATE_S, UTC).date()
             if today != self._tidied:

@@ -25,6 +25,9 @@ FILE_S: Final = 600.0
 FILE_ROWS: Final = 1_000_000
 """A file is written when its oldest row has waited for so long, or so many rows have come."""
 
+_FIRST_FILE_S: Final = 30.0
+"""The first file comes sooner, each later one after twice the time, so that a new history can soon be asked."""
+
 MAX_ROWS: Final = 2 * FILE_ROWS
 """How many rows a sink takes while none can be written."""
 
@@ -98,7 +101,7 @@ def read_table(file: Path, columns: Sequence[str] | None = None, filters: object
 
 def write_table(table: pa.Table, file: Path) -> None:
     """Write a file that readers find whole, on the disk and under its name, or not at all. Raises OSError."""
-    scratch = file.with_name(f"{file.name}.tmp")
+    scratch = scratch_of(file)
     numbers = [field.name for field in table.schema if not pa.types.is_string(field.type)]
     options: dict[str, Any] = {"use_dictionary": [field.name for field in table.schema if field.name not in numbers]}
     try:
@@ -120,6 +123,11 @@ def write_table(table: pa.Table, file: Path) -> None:
             scratch.unlink()
         raise
     sync_folder(file.parent)
+
+
+def scratch_of(file: Path) -> Path:
+    """The name of a file while it is written; a program that was killed leaves it behind."""
+    return file.with_name(f"{file.name}.tmp")
 
 
 def sync_folder(folder: Path) -> None:
@@ -150,6 +158,7 @@ class Sink(Generic[R]):
         self._table: Callable[[Sequence[R]], pa.Table] = table
         self._batches: list[_Batch[R]] = []
         self._taken = self._written = 0
+        self._file_s = _FIRST_FILE_S
         pattern = f"{folder.format(day='*')}/*.parquet"
         for scratch in site.glob(f"{pattern}.tmp"):
             scratch.unlink()
@@ -171,7 +180,7 @@ class Sink(Generic[R]):
     def is_due(self, unix_s: float) -> bool:
         """Whether a file should be written now."""
         age_s = abs(unix_s - self._batches[0].arrived_unix_s) if self._batches else 0.0  # a clock may be set back
-        return age_s >= FILE_S or self.waiting >= FILE_ROWS
+        return age_s >= self._file_s or self.waiting >= FILE_ROWS
 
     def put(self, rows: R, first: int, arrived_unix_s: float) -> None:
         """Take a batch; ``first`` is the number of its first row."""
@@ -185,6 +194,7 @@ class Sink(Generic[R]):
     def write(self) -> None:
         """Write what waits at the beginning of this call. Raises OSError: what is not in a file still waits."""
         left = len(self._batches)
+        self._file_s = min(2.0 * self._file_s, FILE_S)
         while left:
             group = self._group(left)
             last = group[-1].first + len(group[-1].rows) - 1

@@ -1,5 +1,7 @@
 """The history of one site as it is written: numbers of tags, journals, files. One process at a time writes it."""
 
+import errno
+import os
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
@@ -15,7 +17,18 @@ from skyless.run.fix_batch import Batch, Records, decode_batch, encode_batch
 from skyless.run.history.events import MAX_UNIX_S, REMEMBERED_KINDS
 from skyless.run.history.journal import Journal
 from skyless.run.history.layout import EVENT_COLUMNS, NAME_COLUMNS, ZONE_COLUMNS, current_events, site_folder
-from skyless.run.history.sink import MAX_ROWS, Event, R, Sink, event_sink, fix_sink, read_table, schema_of, write_table
+from skyless.run.history.sink import (
+    MAX_ROWS,
+    Event,
+    R,
+    Sink,
+    event_sink,
+    fix_sink,
+    read_table,
+    schema_of,
+    scratch_of,
+    write_table,
+)
 from skyless.run.mqtt.messages import FixMessage, Zone
 from skyless.run.process import locked
 
@@ -23,6 +36,10 @@ MAX_WAITING: Final = 500_000
 """How many rows wait in memory while the disk does not take them."""
 
 MAX_TAGS: Final = 200_000
+
+_FILE_BYTES: Final = 16
+_SPARE_BYTES: Final = 1 << 20
+"""The journal leaves so much of the disk free, for each of its rows and besides: its rows must find room in files."""
 
 
 class Intake(Generic[R]):
@@ -68,7 +85,10 @@ class Intake(Generic[R]):
         """Bring everything into the journal. Raises OSError: what is not there waits."""
         while self._waiting and self.sink.waiting < MAX_ROWS:
             rows, arrived_unix_s = self._waiting[0]
-            self._journal.append(self.sink.next, self._encode(rows, arrived_unix_s))
+            payload = self._encode(rows, arrived_unix_s)
+            if self._journal.free_bytes() < len(payload) + _SPARE_BYTES + _FILE_BYTES * self.sink.waiting:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            self._journal.append(self.sink.next, payload)
             self._waiting.popleft()
             self._waiting_rows -= len(rows)
             self.sink.put(rows, self.sink.next, arrived_unix_s)
@@ -99,6 +119,7 @@ class Table:
         """By the value of the column ``key``."""
         self._file, self._columns, self._key = file, columns, key
         self._is_saved = True
+        scratch_of(file).unlink(missing_ok=True)
         if file.exists():
             self.rows = {row[key]: row for row in read_rows(file, columns)}
 

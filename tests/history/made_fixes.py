@@ -1,0 +1,63 @@
+"""Fixes whose serial number can be found in a history, and what a folder holds."""
+
+from itertools import chain
+
+import numpy as np
+from pyarrow import parquet
+
+from skyless.run.fix_batch import RECORD, decode_batch
+from skyless.run.history.journal import Journal
+from skyless.run.history.layout import current_files, rows_of, site_folder
+from skyless.run.mqtt.messages import FixMessage
+
+DAY_S = 86_400.0
+NOON_S = 1_795_176_000.0
+"""A noon, UTC."""
+
+
+def records(serials, tag=1, unix_s=None):
+    """Records whose ``x_mm`` are the serials, one a millisecond unless a time is given."""
+    rows = np.zeros(len(serials), RECORD)
+    rows["tag"], rows["std_z_mm"], rows["hpl_cm"] = tag, 65535, 65535
+    rows["position_mm"][:, 0] = serials
+    rows["unix_us"] = [1000 * serial for serial in serials] if unix_s is None else round(1e6 * unix_s)
+    return rows
+
+
+def fix(tag="tag1", serial=1, unix_s=NOON_S, position_m=(1.0, 2.0, 3.0), variances=(4e-4, 9e-4, 1e-4), **more):
+    """A message."""
+    xx, yy, zz = variances
+    given = {
+        "covariance_m2": (xx, 0.0, 0.0, 0.0, yy, 0.0, 0.0, 0.0, zz),
+        "velocity_mps": None,
+        "velocity_covariance": None,
+        "std_m": (xx + yy + zz) ** 0.5,
+        "gdop": None,
+        "pdop": None,
+        "hdop": None,
+        "vdop": None,
+        "anchors": (1, 2, 3),
+        "chi2": 1.0,
+        "dof": 1,
+        "residual_rms_m": 0.01,
+        "method": "joint",
+        "height_known": False,
+        "latency_s": 0.001,
+    }
+    return FixMessage(tag, serial, unix_s, 0.0, position_m, **given | more)
+
+
+def in_files(folder, site=1):
+    """The serials in the current files, in the order of their numbers where each file is sorted by them."""
+    tables = (parquet.read_table(file, partitioning=None) for file in current_files(folder, site))
+    return list(chain.from_iterable(table["x_mm"].to_pylist() for table in tables))
+
+
+def on_disk(folder, site=1):
+    """The serials in files and, after those, in the journal, read as a stranger would."""
+    last = max((rows_of(file)[1] for file in current_files(folder, site)), default=0)
+    found = in_files(folder, site)
+    for first, payload in Journal(site_folder(folder, site) / "journal", "fixes").read():
+        rows = decode_batch(payload).records["position_mm"][:, 0].tolist()
+        found += rows[max(0, last + 1 - first) :]
+    return found

@@ -1,0 +1,173 @@
+"""What is joined, thinned and removed, and that readers see every row once whenever the work stops."""
+
+import contextlib
+import os
+from datetime import UTC, datetime
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_fixes import DAY_S, NOON_S, fix, in_files, records
+from pyarrow import parquet
+from test_writer import Disk, Killed
+
+from skyless.run.fix_batch import records_of
+from skyless.run.history.layout import current_events, current_files, file_name, rows_of, site_folder
+from skyless.run.history.retention import GRACE_S, Keep, remove_replaced, thinned, tidy
+from skyless.run.history.sink import Event, fix_table
+from skyless.run.history.writer import Writer
+
+KEEP = Keep(days=30.0, full_days=7.0, event_days=60.0)
+
+
+def filled(folder, days, files=3):
+    """Three files of two rows a day; the serials go on."""
+    writer = Writer(folder, 1)
+    number, serial = writer.number(fix(), NOON_S), 1
+    for day in days:
+        for _ in range(files):
+            unix_s = NOON_S + DAY_S * day
+            batch = records([serial, serial + 1], number)
+            batch["unix_us"] = [round(1e6 * (unix_s + 300.0 * k)) for k in (serial, serial + 1)]
+            writer.fixes.add(batch, unix_s)
+            event = Event(round(1000 * unix_s) + serial, "enter", "tag1", "z1", None, None, "")
+            writer.events.add((event,), unix_s)
+            writer.store()
+            writer.write()
+            serial += 2
+    writer.close()
+    return list(range(1, serial))
+
+
+def events_in(folder):
+    return [t for file in current_events(folder, 1) for t in parquet.read_table(file)["t"].cast("int64").to_pylist()]
+
+
+def test_a_day_that_is_over_becomes_one_file_and_old_ones_go(tmp_path):
+    serials = filled(tmp_path, (-31, -2, -1, 0))
+    assert len(current_files(tmp_path, 1)) == 12
+    events = events_in(tmp_path)
+    tidy(tmp_path, 1, KEEP, NOON_S)
+    assert in_files(tmp_path) == serials[6:]
+    assert [rows_of(file) for file in current_files(tmp_path, 1)] == [(7, 12), (13, 18), (19, 20), (21, 22), (23, 24)]
+    assert events_in(tmp_path) == events
+    assert not list(site_folder(tmp_path, 1).glob(f"day={datetime.fromtimestamp(NOON_S - 31 * DAY_S, UTC).date()}"))
+    everything = set(site_folder(tmp_path, 1).glob("*/*.parquet"))
+    assert len(everything) > len(current_files(tmp_path, 1)) + len(current_events(tmp_path, 1))
+    remove_replaced(tmp_path, 1, NOON_S)  # "now" lies before the replacement
+    assert set(site_folder(tmp_path, 1).glob("*/*.parquet")) == everything
+    for file in everything - set(current_files(tmp_path, 1)) - set(current_events(tmp_path, 1)):
+        os.utime(file, (NOON_S, NOON_S))
+    remove_replaced(tmp_path, 1, NOON_S + GRACE_S + 1.0)
+    assert set(site_folder(tmp_path, 1).glob("*/*.parquet")) == {
+        *current_files(tmp_path, 1),
+        *current_events(tmp_path, 1),
+    }
+    assert (in_files(tmp_path), events_in(tmp_path)) == (serials[6:], events)
+
+
+def test_numbers_go_on_after_everything_was_removed(tmp_path):
+    serials = filled(tmp_path, (-40,))
+    tidy(tmp_path, 1, KEEP, NOON_S)
+    assert in_files(tmp_path) == []
+    filled(tmp_path, (0,))
+    assert [rows_of(file)[0] for file in current_files(tmp_path, 1)] == [len(serials) + n for n in (1, 3, 5)]
+
+
+def test_events_that_are_too_old_go(tmp_path):
+    filled(tmp_path, (-100, -70, -3))
+    tidy(tmp_path, 1, Keep(days=1000.0, full_days=1000.0, event_days=60.0), NOON_S)
+    assert len(events_in(tmp_path)) == 3
+
+
+def test_readers_see_every_row_once_when_the_work_stops_at_any_operation(tmp_path_factory):
+    operation, finished = 0, False
+    while not finished:
+        folder = tmp_path_factory.mktemp("history")
+        with pytest.MonkeyPatch.context() as patch:
+            Disk(patch, 10**9, 0)
+            serials = filled(folder, (-2, -1), 2)
+        events = events_in(folder)
+        with pytest.MonkeyPatch.context() as patch, contextlib.suppress(Killed):
+            Disk(patch, operation, 0)
+            tidy(folder, 1, KEEP, NOON_S)
+            finished = True
+        assert (in_files(folder), events_in(folder)) == (serials, events)
+        Writer(folder, 1).close()
+        tidy(folder, 1, KEEP, NOON_S)
+        assert (in_files(folder), events_in(folder)) == (serials, events)
+        assert len(current_files(folder, 1)) == 2
+        operation += 1
+    assert operation > 8
+
+
+RANGES = st.lists(st.tuples(st.integers(1, 30), st.integers(0, 9)), max_size=8)
+
+
+@settings(max_examples=50)
+@given(RANGES)
+def test_current_files_are_those_that_no_other_covers(tmp_path_factory, ranges):
+    folder = tmp_path_factory.mktemp("history")
+    day = site_folder(folder, 1) / "day=2026-11-26"
+    day.mkdir(parents=True)
+    spans = {(first, first + more) for first, more in ranges}
+    for first, last in spans:
+        (day / file_name(first, last)).touch()
+    (day / "notes.parquet").touch()
+    (day / f"{file_name(1, 99)}.tmp").touch()
+    expected = {one for one in spans if not any(o != one and o[0] <= one[0] and one[1] <= o[1] for o in spans)}
+    assert [rows_of(file) for file in current_files(folder, 1)] == sorted(expected)
+
+
+def walk(seconds, speed_mps, tag=1):
+    """Records of one tag in a straight line, four a second."""
+    times_s = np.arange(0.0, seconds, 0.25)
+    return records_of(
+        [(tag, fix(unix_s=NOON_S + t, position_m=(speed_mps * t, 0.0, 1.0))) for t in times_s], simulated=False
+    )
+
+
+def test_of_a_moving_tag_one_in_ten_seconds_stays_and_of_one_at_rest_one_in_a_minute():
+    table = thinned(fix_table(np.concatenate([walk(120.0, 1.0, 1), walk(120.0, 0.005, 2)])))
+    found = table.to_pydict()
+    assert found["tag"] == [1] * 12 + [2] * 2
+    seconds = [t.timestamp() - NOON_S for t in found["t"]]
+    assert seconds == [*range(0, 120, 10), 0.0, 60.0]
+    assert found["x_mm"][:3] == [0, 10_000, 20_000]
+
+
+@settings(max_examples=50)
+@given(
+    st.lists(st.tuples(st.integers(1, 3), st.integers(0, 200_000), st.integers(-3000, 3000)), min_size=1, max_size=60)
+)
+def test_thinning_keeps_rows_of_every_tag_and_minute(rows):
+    batch = records(range(len(rows)))
+    for row, (tag, ms, x_mm) in zip(batch, rows, strict=True):
+        row["tag"], row["unix_us"], row["position_mm"][0] = tag, 1000 * ms, x_mm
+    whole = fix_table(batch).to_pylist()
+    kept = thinned(pa.Table.from_pylist(whole, fix_table(batch).schema)).to_pylist()
+    places = [whole.index(row) for row in kept]
+    assert places == sorted(places)
+
+    def parts(some, seconds):
+        return [(row["tag"], int(row["t"].timestamp()) // seconds) for row in some]
+
+    assert set(parts(kept, 60)) == set(parts(whole, 60))
+    assert len(parts(kept, 10)) == len(set(parts(kept, 10)))  # at most one in ten seconds
+    for tag, minute in set(parts(whole, 60)):
+        mine = [row for row in whole if (row["tag"], int(row["t"].timestamp()) // 60) == (tag, minute)]
+        xs = [row["x_mm"] for row in mine]
+        expected = len(set(parts(mine, 10))) if max(xs) - min(xs) > 500 else 1
+        assert parts(kept, 60).count((tag, minute)) == expected
+
+
+def test_a_day_is_thinned_once_and_keeps_its_numbers(tmp_path):
+    filled(tmp_path, (-9, -8))
+    tidy(tmp_path, 1, KEEP, NOON_S)
+    files = current_files(tmp_path, 1)
+    before = {file: file.stat().st_mtime_ns for file in files}
+    assert [rows_of(file) for file in files] == [(1, 6), (7, 12)]
+    tidy(tmp_path, 1, KEEP, NOON_S)
+    assert {file: file.stat().st_mtime_ns for file in current_files(tmp_path, 1)} == before
