@@ -10,6 +10,7 @@ from cyclopts import App, Parameter
 
 from skyless.cli.common.options import command
 from skyless.cli.common.output import print_json
+from skyless.cli.history_queries import questions
 from skyless.cli.nodes.options import MqttOptions, SiteId, log
 from skyless.core.arguments import Positive
 from skyless.core.errors import SkylessError
@@ -24,6 +25,7 @@ _STATUS_S: Final = 0.5
 HistoryFolder = Annotated[Path, Parameter(name="--to")]
 
 app = App(name="history", help_epilogue="Example: skyless history run --to history")
+app.update(questions)
 
 
 @app.command(help_epilogue="Example: skyless history run --to history --keep-days 90")

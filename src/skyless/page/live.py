@@ -204,7 +204,7 @@ class LiveSite:
             self.evidence.set_site(site.site, clock())
             self.assets.on_site(site.site.name)
         self.log = EventLog(wall_clock() - clock())
-        self.alarms = SiteAlarms(name, self.monitor, self._broadcast, self.log.on_alarm)
+        self.alarms = SiteAlarms(name, self.monitor, self._broadcast, self.log.on_alarm, lambda: self.assets.by_tag)
         if site is not None:
             self.alarms.on_site(site, clock(), wall_clock())
         self._condition_monitor = ConditionMonitor(self.evidence)

@@ -1,6 +1,13 @@
 """What is asked of a history, and the answers: the command line, the HTTP interface and the page give the same."""
 
+from typing import Final
+
 from msgspec import Struct
+
+GAP_S: Final = 5.0
+THINNED_GAP_S: Final = 65.0
+"""Where a tag is after its last fix is known for this long; in days that are thinned a fix may be the only one of a
+minute."""
 
 
 class Span(Struct, frozen=True):
@@ -30,7 +37,8 @@ class Track(Struct, frozen=True):
     fixes: int
     """How many fixes there are in the range; more than points where the way was thinned."""
     length_m: float
-    """Of the way through the points, gaps of more than ``GAP_S`` left out."""
+    """Of the way through all fixes in the plane, without gaps of more than ``GAP_S`` (``THINNED_GAP_S``). Moves of less
+    than a quarter of a metre, or three standard deviations, count when they add up to that: they may be noise."""
 
 
 class Heatmap(Struct, frozen=True):

@@ -1,0 +1,89 @@
+"""Pictures of the history's answers."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from skyless.run.history.answers import THINNED_GAP_S, Dwell, Heatmap, Occupancy, Track
+from skyless.site.report.figures import BLUE, MAP, MUTED, panel, report_style
+
+_BARS: Final = 30
+_LINES: Final = 8
+_Zones = Mapping[str, tuple[str, tuple[tuple[float, float], ...]]]
+
+
+def track_figure(track: Track, zones: _Zones, title: str) -> Figure:
+    """The way over the zones, interrupted at gaps."""
+    with report_style():
+        figure, axes = panel(title, 4.2)
+        rows = np.array([(point.unix_s, point.x_m, point.y_m) for point in track.points]).reshape(-1, 3)
+        usual_s = np.median(np.diff(rows[:, 0])) if len(rows) > 1 else 0.0
+        gaps = np.flatnonzero(np.diff(rows[:, 0]) > max(THINNED_GAP_S, 3.0 * usual_s)) + 1
+        for part in np.split(rows, gaps):
+            axes.plot(part[:, 1], part[:, 2], ".-", color=BLUE, markersize=1.5, linewidth=0.7)
+        _plan(axes, zones)
+        return figure
+
+
+def heatmap_figure(heatmap: Heatmap, zones: _Zones, title: str) -> Figure:
+    """The time in each cell over the zones, in colours by its logarithm."""
+    with report_style():
+        figure, axes = panel(title, 4.2)
+        seconds = np.array(heatmap.seconds).reshape(heatmap.rows, heatmap.columns)
+        if (seconds > 0.0).any():
+            x1, y1 = heatmap.x0_m + heatmap.cell_m * heatmap.columns, heatmap.y0_m + heatmap.cell_m * heatmap.rows
+            drawn = axes.imshow(
+                np.ma.masked_equal(seconds, 0.0),
+                extent=(heatmap.x0_m, x1, heatmap.y0_m, y1),
+                origin="lower",
+                cmap=MAP,
+                norm=LogNorm(),
+            )
+            figure.colorbar(drawn, ax=axes, label="time in s")
+        _plan(axes, zones)
+        return figure
+
+
+def dwell_figure(dwell: Sequence[Dwell], title: str) -> Figure:
+    """The longest times as bars."""
+    longest = sorted(dwell, key=lambda one: -one.seconds)[:_BARS][::-1]
+    with report_style():
+        figure, axes = panel(title, 1.2 + 0.2 * max(len(longest), 3))
+        axes.barh(
+            [f"{one.tag}, {one.zone_name}" for one in longest], [one.seconds / 60.0 for one in longest], color=BLUE
+        )
+        axes.set_xlabel("time in min")
+        return figure
+
+
+def occupancy_figure(occupancy: Sequence[Occupancy], title: str) -> Figure:
+    """The mean number of tags over time, of the fullest zones."""
+    zones: dict[str, list[Occupancy]] = defaultdict(list)
+    for one in occupancy:
+        zones[one.zone].append(one)
+    fullest = sorted(zones.values(), key=lambda steps: -sum(step.mean for step in steps))[:_LINES]
+    with report_style():
+        figure, axes = panel(title)
+        for steps in fullest:
+            times = [datetime.fromtimestamp(step.unix_s) for step in steps]
+            axes.step(times, [step.mean for step in steps], where="post", label=steps[0].zone_name)  # type: ignore[arg-type]
+        axes.set_ylabel("tags, mean of each step")
+        figure.autofmt_xdate()
+        if fullest:
+            axes.legend()
+        return figure
+
+
+def _plan(axes: Axes, zones: _Zones) -> None:
+    for name, corners in zones.values():
+        if corners:
+            x_m, y_m = zip(*corners, corners[0], strict=True)
+            axes.plot(x_m, y_m, color=MUTED, linewidth=0.8)
+            axes.annotate(name, (sum(x_m[1:]) / len(corners), sum(y_m[1:]) / len(corners)), fontsize=7.0, ha="center")
+    axes.set(xlabel="x in m", ylabel="y in m", aspect="equal")

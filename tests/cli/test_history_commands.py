@@ -1,0 +1,153 @@
+"""``skyless history``: what it answers on the command line, as a table, as JSON and as a picture."""
+
+import json
+from datetime import UTC, datetime
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+from skyless.cli.main import main
+from skyless.run.history.layout import EVENT_COLUMNS, FIX_COLUMNS, NAME_COLUMNS, ZONE_COLUMNS, file_name, site_folder
+from skyless.sim.lab import lab_site
+from skyless.site.file.template import site_template
+
+pytestmark = pytest.mark.site
+
+BEGIN = datetime(2026, 11, 20, 8, tzinfo=UTC).timestamp()
+RANGE = ("--from", str(BEGIN), "--to", str(BEGIN + 3600.0))
+TYPES = {"timestamp[ms, tz=UTC]": pa.timestamp("ms", tz="UTC")}
+
+
+def write(file, columns, rows):
+    file.parent.mkdir(parents=True, exist_ok=True)
+    arrays = {}
+    for (name, kind), values in zip(columns.items(), zip(*rows, strict=True), strict=True):
+        arrays[name] = pa.array(values, pa.int64()).cast(TYPES[kind]) if kind in TYPES else pa.array(values, kind)
+    parquet.write_table(pa.table(arrays), file)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """An hour of two tags that walk side by side."""
+    folder = tmp_path_factory.mktemp("history")
+    site, s = site_folder(folder, 5), np.arange(0, 3600)
+    x_mm = np.rint(3000.0 + 2000.0 * np.sin(s / 60.0)).astype(int).tolist()
+    ms = [round(1000.0 * (BEGIN + one)) for one in s.tolist()]
+    fixes = [(tag, t, x, 1000 * tag, 1200, 50, 65535, 8) for tag in (1, 2) for t, x in zip(ms, x_mm, strict=True)]
+    write(site / "day=2026-11-20" / file_name(1, 7200), FIX_COLUMNS, fixes)
+    write(site / "names.parquet", NAME_COLUMNS, [(1, "[red]ann", 0), (2, "bob", 0)])
+    write(site / "zones.parquet", ZONE_COLUMNS, [("dock", "Dock", "[[1, 0], [3, 0], [3, 3], [1, 3]]")])
+    events = [
+        (ms[60], "enter", "[red]ann", "dock", None, None, ""),
+        (ms[90], "alarm-raised", None, "dock", "[red]ann", "late/ann/1", "ann is late"),
+        (ms[660], "leave", "[red]ann", "dock", None, None, ""),
+    ]
+    write(site / "events" / file_name(1, 3), EVENT_COLUMNS, events)
+    return folder
+
+
+def run(folder, *words):
+    return main(["history", *words, "--history", str(folder), *RANGE])
+
+
+QUESTIONS = {
+    "track": ("[red]ann",),
+    "heatmap": ("--cell", "0.5"),
+    "dwell": ("--zone", "dock"),
+    "occupancy": ("--every", "60"),
+    "contacts": ("bob",),
+    "alarms": (),
+}
+ANSWERS = {
+    "track": lambda track: (track["fixes"], len(track["points"])) == (3600, 2000) and 65.0 < track["length_m"] < 80.0,
+    "heatmap": lambda heatmap: sum(heatmap["seconds"]) == pytest.approx(2 * 3599.0),
+    "dwell": lambda dwell: (
+        [(one["tag"], one["zone_name"], one["seconds"]) for one in dwell] == [("[red]ann", "Dock", 600.0)]
+    ),
+    "occupancy": lambda steps: sum(one["mean"] * 60.0 for one in steps) == pytest.approx(600.0),
+    "contacts": lambda found: [(one["other"], one["least_m"]) for one in found] == [("[red]ann", 1.0)],
+    "alarms": lambda found: [one["text"] for one in found] == ["ann is late"],
+}
+SHOWN = {
+    "track": "length",
+    "heatmap": "2 tags, 1 h 59 min in all",
+    "dwell": "10 min 00 s",
+    "occupancy": "1.00",
+    "contacts": "1.00 m",
+    "alarms": "ann is late",
+}
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
+def test_answers_as_json_and_as_a_table(folder, question, capsys):
+    assert run(folder, question, *QUESTIONS[question], "--json") == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    answer = json.loads(line)
+    assert (answer["site"], answer["from_unix_s"], answer["known_until_unix_s"]) == (5, BEGIN, BEGIN + 3599.0)
+    assert ANSWERS[question](answer[question])
+    assert run(folder, question, *QUESTIONS[question]) == 0
+    out = capsys.readouterr().out
+    assert SHOWN[question] in out
+    assert "[red]ann" in out or question in {"heatmap", "occupancy"}
+
+
+@pytest.mark.parametrize("question", ["track", "heatmap", "dwell", "occupancy"])
+def test_pictures(folder, question, tmp_path, capsys):
+    picture = tmp_path / "answer.svg"
+    assert run(folder, question, *QUESTIONS[question], "--plot", str(picture)) == 0
+    text = picture.read_text(encoding="utf-8")
+    assert text.startswith("<?xml")
+    assert "Dock" in text
+
+
+def test_exports(folder, tmp_path, capsys):
+    site = tmp_path / "lab.toml"
+    site.write_text(
+        site_template(lab_site()) + "\n[georeference]\nlatitude_deg = 48.0\nlongitude_deg = 11.0\n", encoding="utf-8"
+    )
+    for name in ("fixes.csv", "fixes.parquet", "fixes.geojsonl"):
+        words = ("export", str(tmp_path / name), "bob", "--site", str(site), "--json")
+        assert run(folder, *words) == 0
+        assert json.loads(capsys.readouterr().out)["fixes"] == 3600
+        assert run(folder, *words) == 2
+        assert "--force overwrites it" in capsys.readouterr().err
+        assert run(folder, *words, "--force") == 0
+        capsys.readouterr()
+    assert len((tmp_path / "fixes.csv").read_text().splitlines()) == 3601
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("track", "nobody"), "has no tag 'nobody'; it has [red]ann, bob"),
+        (("dwell", "--zone", "nowhere"), "has no zone 'nowhere'; it has dock"),
+        (("alarms", "--site-id", "6"), "no history of site 6; it holds site 5"),
+        (("heatmap", "--plot", "x.gif"), "--plot is 'x.gif'"),
+        (("heatmap", "--cell", "-1"), "--cell is -1.0"),
+        (("track", "bob", "--points", "1"), "--points is 1"),
+    ],
+)
+def test_a_slip_is_one_line(folder, words, said, capsys):
+    assert run(folder, *words) == 2
+    err = capsys.readouterr().err
+    assert (err.count("\n"), said in err) == (1, True), err
+
+
+def test_where_there_is_no_history_or_no_such_time(tmp_path, folder, capsys):
+    assert main(["history", "alarms"]) == 2
+    assert "it should be the folder of a site's history, and it holds none" in capsys.readouterr().err
+    (folder / "site=9").mkdir()
+    assert main(["history", "alarms", "--history", str(folder)]) == 2
+    assert "the sites 5, 9; --site-id chooses one" in capsys.readouterr().err
+    (folder / "site=9").rmdir()
+    assert main(["history", "alarms", "--history", str(folder), "--from", "soonish"]) == 2
+    assert "--from is 'soonish'; it should be a time such as" in capsys.readouterr().err
+
+
+def test_a_range_without_fixes_ends_with_1(folder, tmp_path, capsys):
+    past = ("--history", str(folder), "--from", "1990-01-01", "--to", "1990-01-02")
+    assert main(["history", "heatmap", *past, "--plot", str(tmp_path / "empty.png")]) == 1
+    assert [main(["history", *words, *past]) for words in (("track", "bob"), ("heatmap",), ("alarms",))] == [1, 1, 0]
+    assert "nothing" in capsys.readouterr().out

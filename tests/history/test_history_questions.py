@@ -1,0 +1,403 @@
+"""The history's answers equal a plain computation over the same rows, file by file or not."""
+
+import csv
+import json
+import math
+from collections import defaultdict
+from datetime import UTC, datetime
+from itertools import pairwise
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pyarrow import parquet
+
+from skyless.core.alert import Alert
+from skyless.core.errors import SkylessError
+from skyless.core.site import GeoreferenceSite
+from skyless.run.history.answers import GAP_S, AlarmRow, Contact, Dwell, Span
+from skyless.run.history.layout import EVENT_COLUMNS, FIX_COLUMNS, NAME_COLUMNS, ZONE_COLUMNS, file_name, site_folder
+from skyless.run.history.queries import History, counts, merged, sites_in
+
+SITE, TAGS, FIXES = 7, 20, 5000
+MIDNIGHT = datetime(2026, 11, 20, tzinfo=UTC).timestamp()
+BEGIN = MIDNIGHT - 2000.0
+SPAN = Span(BEGIN + 500.0, BEGIN + 4000.25)
+ORIGIN = GeoreferenceSite(latitude_deg=48.0, longitude_deg=11.0, height_m=500.0)
+EVENTS = [
+    (-100.0, "enter", "tag1", "a"),  # before the range, never left
+    (-90.0, "enter", "tag2", "a"),
+    (600.0, "leave", "tag2", "a"),
+    (1000.0, "enter", "tag2", "a"),
+    (1100.0, "enter", "tag2", "a"),  # again, as after a restart
+    (1300.0, "leave", "tag2", "a"),
+    (1300.0, "enter", "tag2", "b"),
+    (100.0, "leave", "tag3", "b"),  # that it entered is not known
+    (2000.0, "enter", "tag3", "b"),
+    (4500.0, "leave", "tag3", "b"),  # after the range
+    (200.0, "enter", "tag4", "b"),
+    (300.0, "leave", "tag4", "b"),  # all of it before
+    (4100.0, "enter", "tag5", "a"),  # after the range
+]
+ALARMS = [
+    (100.0, "alarm-raised", "r/tag1/1", "tag1", "one"),
+    (200.0, "alarm-ended", "r/tag1/1", "tag1", ""),
+    (300.0, "alarm-raised", "r/tag1/2", "tag1", "two"),
+    (600.0, "alarm-ended", "r/tag1/2", "tag1", ""),
+    (700.0, "alarm-raised", "s/tag1+tag2/3", "tag1+tag2", "three"),
+    (710.0, "alarm-acknowledged", "s/tag1+tag2/3", "tag1+tag2", "Ada"),
+    (720.0, "alarm-acknowledged", "s/tag1+tag2/3", "tag1+tag2", "Bert"),
+    (4200.0, "alarm-raised", "r/tag2/4", "tag2", "four"),
+]
+
+
+def table(columns, data):
+    types = {"timestamp[ms, tz=UTC]": pa.timestamp("ms", tz="UTC")}
+    kinds = {name: types.get(kind) or pa.type_for_alias(kind) for name, kind in columns.items()}
+    return pa.table({name: pa.array(data[name], pa.int64()).cast(kind) if kind in types.values() else
+                     pa.array(data[name], kind) for name, kind in kinds.items()})  # fmt: skip
+
+
+def made_rows(seed=1):
+    """Fixes of walkers in a room, by the order of arrival, with silences and two tags that walk together."""
+    draw = np.random.default_rng(seed)
+    t = np.repeat(np.arange(FIXES) * 1.0, TAGS).reshape(FIXES, TAGS) + draw.uniform(0.0, 0.4, (FIXES, TAGS))
+    walk = np.cumsum(draw.normal(0.0, 0.3, (FIXES, TAGS, 2)), axis=0) + draw.uniform(-5.0, 15.0, (TAGS, 2))
+    walk[:, 1] = walk[:, 0] + draw.normal(0.0, 1.0, (FIXES, 2))
+    kept = (np.sin(np.arange(FIXES) / 90.0)[:, None] + draw.uniform(0.0, 0.2, (FIXES, TAGS)) < 1.0).ravel()
+    tag = np.tile(np.arange(1, TAGS + 1), FIXES)[kept]
+    flags = draw.integers(0, 6, len(tag)) | 64
+    hpl = np.where(draw.uniform(size=len(tag)) < 0.5, 65535, 120)
+    mm = np.rint(1000.0 * walk.reshape(-1, 2)[kept]).astype(int)
+    ms = np.rint(1000.0 * (BEGIN + t.ravel()[kept])).astype(int)
+    return {"tag": tag, "t": ms, "x_mm": mm[:, 0], "y_mm": mm[:, 1], "z_mm": np.full(len(tag), 1200),
+            "std_mm": draw.integers(20, 200, len(tag)), "hpl_cm": hpl, "flags": flags}  # fmt: skip
+
+
+def write_fixes(site, rows, first, last):
+    """A file of rows by their numbers in the order of arrival, which begin with 1."""
+    part = {name: values[first - 1 : last] for name, values in rows.items()}
+    order = np.lexsort((part["t"], part["tag"]))
+    day = datetime.fromtimestamp(part["t"][0] / 1000, UTC).date()
+    folder = site / f"day={day}"
+    folder.mkdir(parents=True, exist_ok=True)
+    fixes = table(FIX_COLUMNS, {name: values[order] for name, values in part.items()})
+    parquet.write_table(fixes, folder / file_name(first, last), row_group_size=7000)
+
+
+def write_others(site):
+    names = [*((k, f"tag{k}", 0) for k in range(1, TAGS)), (TAGS, "old", 0), (TAGS, "renamed", 5)]
+    parquet.write_table(table(NAME_COLUMNS, dict(zip(NAME_COLUMNS, zip(*names, strict=True), strict=True))),
+                        site / "names.parquet")  # fmt: skip
+    zones = {
+        "zone": ["a", "b", "empty"],
+        "name": ["Hall", "", "Void"],
+        "corners_m": ["[[0, 0], [4, 0], [4, 4]]", None, "[]"],
+    }
+    parquet.write_table(table(ZONE_COLUMNS, zones), site / "zones.parquet")
+    rows = [(round(1000 * (BEGIN + s)), kind, tag, zone, None, None, "") for s, kind, tag, zone in EVENTS]
+    rows += [(round(1000 * (BEGIN + s)), kind, None, None, about, one, text) for s, kind, one, about, text in ALARMS]
+    folder = site / "events"
+    folder.mkdir()
+    for first, part in ((1, rows[:9]), (10, rows[9:])):
+        events = table(EVENT_COLUMNS, dict(zip(EVENT_COLUMNS, zip(*sorted(part), strict=True), strict=True)))
+        parquet.write_table(events, folder / file_name(first, first + len(part) - 1))
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return made_rows()
+
+
+@pytest.fixture(scope="module")
+def history(tmp_path_factory, rows):
+    folder = tmp_path_factory.mktemp("history")
+    site, count = site_folder(folder, SITE), len(rows["t"])
+    for first in range(1, count + 1, 20_000):
+        write_fixes(site, rows, first, min(first + 19_999, count))
+    write_fixes(site, rows, 20_001, 30_000)  # joined into a larger file since
+    write_others(site)
+    return History(folder, SITE)
+
+
+@pytest.fixture(scope="module")
+def within(rows):
+    """The rows in the range, by tag and time."""
+    keep = (rows["t"] >= 1000 * SPAN.from_unix_s) & (rows["t"] < 1000 * SPAN.to_unix_s)
+    part = {name: values[keep] for name, values in rows.items()}
+    order = np.lexsort((part["t"], part["tag"]))
+    return {name: values[order] for name, values in part.items()}
+
+
+def test_tags_and_zones(history):
+    assert history.tags() == tuple(sorted([*(f"tag{k}" for k in range(1, TAGS)), "renamed"]))
+    assert history.zones()["a"] == ("Hall", ((0.0, 0.0), (4.0, 0.0), (4.0, 4.0)))
+    assert history.zones()["b"] == ("b", ())
+    assert sites_in(history.folder) == (SITE,)
+
+
+def test_known_until_the_newest_row(history, rows):
+    assert history.known_until_unix_s() == pytest.approx(rows["t"].max() / 1000)
+
+
+def test_a_track_is_all_fixes_of_the_tag(history, within):
+    track = history.track("tag3", SPAN, most_points=10_000)
+    own = {name: values[within["tag"] == 3] for name, values in within.items()}
+    assert track.fixes == len(track.points) == len(own["t"])
+    assert [point.unix_s for point in track.points] == pytest.approx((own["t"] / 1000).tolist())
+    assert [(point.x_m, point.y_m, point.z_m, point.std_m) for point in track.points] == [
+        pytest.approx((x / 1000, y / 1000, 1.2, std / 1000))
+        for x, y, std in zip(own["x_mm"], own["y_mm"], own["std_mm"], strict=True)
+    ]
+    assert [point.hpl_m for point in track.points] == [None if one == 65535 else 1.2 for one in own["hpl_cm"]]
+    alerts = [None, *map(str, Alert)]
+    assert [point.alert for point in track.points] == [alerts[flags & 7] if flags & 7 < len(alerts) else None
+                                                       for flags in own["flags"]]  # fmt: skip
+    assert track.length_m == pytest.approx(plain_length(own), rel=1e-9)
+
+
+def plain_length(own):
+    total, at = 0.0, None
+    for k in range(len(own["t"])):
+        here = np.array([own["x_mm"][k], own["y_mm"][k]])
+        if at is None or own["t"][k] - own["t"][k - 1] > 1000 * GAP_S:
+            at = here
+        elif np.hypot(*(here - at)) >= max(250, 3 * own["std_mm"][k]):
+            total, at = total + np.hypot(*(here - at)), here
+    return total / 1000
+
+
+@pytest.mark.parametrize("most", [2, 3, 100, 2999])
+def test_a_thinned_track_keeps_its_ends_and_its_length(history, most):
+    whole, thin = history.track("tag3", SPAN, 10_000), history.track("tag3", SPAN, most)
+    assert len(thin.points) <= most
+    assert (thin.points[0], thin.points[-1]) == (whole.points[0], whole.points[-1])
+    assert set(thin.points) <= set(whole.points)
+    assert (thin.fixes, thin.length_m) == (whole.fixes, whole.length_m)
+    if most >= 100:
+        for before, after in pairwise(whole.points):
+            assert after.unix_s - before.unix_s <= GAP_S or {before, after} <= set(thin.points)
+
+
+@pytest.mark.parametrize("tags", [(), ("tag3",), ("tag3", "renamed")])
+def test_a_heatmap_is_the_time_until_the_next_fix(history, within, tags):
+    heatmap = history.heatmap(SPAN, 0.3, tags)
+    numbers = {"tag3": 3, "renamed": TAGS}
+    seconds = defaultdict(float)
+    for tag in [numbers[one] for one in tags] or range(1, TAGS + 1):
+        own = within["tag"] == tag
+        t, cells = within["t"][own], np.column_stack([within["x_mm"][own], within["y_mm"][own]]) // 300
+        for k in range(len(t) - 1):
+            seconds[tuple(cells[k].tolist())] += min(t[k + 1] - t[k], 1000 * GAP_S) / 1000
+    found = np.array(heatmap.seconds).reshape(heatmap.rows, heatmap.columns)
+    x0, y0 = round(heatmap.x0_m / 0.3), round(heatmap.y0_m / 0.3)
+    given_ = {(x0 + int(k), y0 + int(j)): found[j, k] for j, k in zip(*np.nonzero(found), strict=True)}
+    assert given_ == pytest.approx({cell: s for cell, s in seconds.items() if s > 0})
+    assert heatmap.tags == (len(tags) or TAGS)
+    assert heatmap.cell_m == 0.3
+
+
+def test_a_wild_fix_makes_no_grid_of_a_billion_cells(tmp_path, rows):
+    site = site_folder(tmp_path, 1)
+    wild = {name: values.copy() for name, values in rows.items()}
+    wild["x_mm"][50_000], wild["y_mm"][50_010] = 2_000_000_000, -2_000_000_000
+    write_fixes(site, wild, 1, len(rows["t"]))
+    parquet.write_table(table(NAME_COLUMNS, {"tag": [1], "name": ["tag1"], "since": [0]}), site / "names.parquet")
+    history, span = History(tmp_path, 1), Span(BEGIN, BEGIN + 5000.0)
+    assert len(history.contacts("tag1", span)) > 0
+    heatmap = history.heatmap(span, 0.25)
+    assert sum(heatmap.seconds) > 0.5 * TAGS * FIXES
+    assert heatmap.columns * heatmap.rows < 1_000_000
+
+
+def test_dwell_counts_the_part_of_a_visit_in_the_range(history):
+    begin, end = SPAN.from_unix_s, SPAN.to_unix_s
+    expected = (
+        Dwell("tag1", "a", "Hall", 1, end - begin, begin, end),
+        Dwell("tag2", "a", "Hall", 2, 400.0, begin, BEGIN + 1300.0),
+        Dwell("tag2", "b", "b", 1, end - BEGIN - 1300.0, BEGIN + 1300.0, end),
+        Dwell("tag3", "b", "b", 1, end - BEGIN - 2000.0, BEGIN + 2000.0, end),
+    )
+    assert history.dwell(SPAN) == expected
+    assert history.dwell(SPAN, ("tag2", "tag3")) == expected[1:]
+    assert history.dwell(SPAN, zone="b") == expected[2:]
+    assert history.dwell(SPAN, ("tag2",), "a") == expected[1:2]
+    assert history.dwell(SPAN, zone="empty") == ()
+
+
+def test_an_open_visit_ends_where_the_history_does(history, rows):
+    (found,) = history.dwell(Span(BEGIN + 4900.0, BEGIN + 90_000.0), ("tag1",))
+    assert found.last_unix_s == pytest.approx(rows["t"].max() / 1000)
+    assert history.dwell(Span(BEGIN + 50_000.0, BEGIN + 90_000.0)) == ()
+
+
+def test_occupancy_is_the_mean_and_most_in_each_step(history):
+    found = history.occupancy(SPAN, "a", 100.0)
+    assert [one.unix_s - SPAN.from_unix_s for one in found] == [100.0 * k for k in range(36)]
+    assert (found[0].mean, found[0].most) == (2.0, 2)
+    assert (found[1].mean, found[1].most) == (1.0, 1)
+    assert (found[5].mean, found[5].most) == (2.0, 2)
+    assert sum(one.mean for one in found[:35]) * 100.0 == pytest.approx(3500.0 + 400.0)
+    both = history.occupancy(SPAN, None, 1000.0)
+    assert [one.zone for one in both] == ["a"] * 4 + ["b"] * 4 + ["empty"] * 4
+    assert {one.most for one in both[8:]} == {0}
+
+
+@pytest.mark.parametrize("distance_m", [0.5, 2.0])
+def test_contacts_are_pairs_of_the_same_second(history, within, distance_m):
+    found = history.contacts("tag1", SPAN, distance_m)
+    positions = defaultdict(dict)
+    for tag, t, x, y in zip(*(within[name].tolist() for name in ("tag", "t", "x_mm", "y_mm")), strict=True):
+        positions[t // 1000].setdefault(tag, []).append((x, y))
+    near = defaultdict(dict)
+    for second, tags in positions.items():
+        for tag, places in tags.items():
+            least = min((math.dist(a, b) for a in places for b in tags.get(1, ())), default=math.inf)
+            if tag != 1 and least <= 1000.0 * distance_m:
+                near[tag][second] = least / 1000.0
+    expected = []
+    for tag, seconds in near.items():
+        other = "renamed" if tag == TAGS else f"tag{tag}"
+        for begin, end in merged(sorted(seconds), 5):
+            least = min(one for second, one in seconds.items() if begin <= second < end)
+            expected.append(Contact("tag1", other, begin, min(end, SPAN.to_unix_s), least))
+    expected.sort(key=lambda one: (one.begin_unix_s, one.other))
+    assert len({one.other for one in expected}) > 1
+    assert [(one.other, one.begin_unix_s, one.end_unix_s) for one in found] == [
+        (one.other, one.begin_unix_s, one.end_unix_s) for one in expected
+    ]
+    assert [one.least_m for one in found] == pytest.approx([one.least_m for one in expected])
+
+
+def test_alarms_that_overlap_the_range(history):
+    found = history.alarms(SPAN)
+    assert [(one.id, one.rule, one.subject, one.text) for one in found] == [
+        ("r/tag1/2", "r", "tag1", "two"),
+        ("s/tag1+tag2/3", "s", "tag1+tag2", "three"),
+    ]
+    assert found[0].ended_unix_s == BEGIN + 600.0
+    seen = AlarmRow("s/tag1+tag2/3", "s", "tag1+tag2", "three", BEGIN + 700.0, None, BEGIN + 710.0, "Ada")
+    assert found[1] == seen
+
+
+def test_exports_hold_every_fix_of_the_range(history, within, tmp_path):
+    count = len(within["t"])
+    files = [tmp_path / f"fixes{suffix}" for suffix in (".csv", ".parquet", ".geojsonl")]
+    assert [history.export(file, SPAN) for file in files[:2]] == [count] * 2
+    whole = parquet.read_table(files[1]).to_pylist()
+    assert sorted(one["x_m"] for one in whole) == pytest.approx(sorted((within["x_mm"] / 1000).tolist()))
+    with files[0].open(newline="") as file:
+        text = list(csv.DictReader(file))
+    assert [one["tag"] for one in text] == [one["tag"] for one in whole]
+    assert [float(one["y_m"]) for one in text] == [one["y_m"] for one in whole]
+    assert text[0]["time_utc"][:10] == "2026-11-19"
+    whole = [one for one in whole if one["tag"] == "tag3"]
+    assert history.export(files[2], SPAN, ("tag3",), ORIGIN) == len(whole)
+    features = [json.loads(line) for line in files[2].read_text().splitlines()]
+    assert [one["properties"]["alert"] for one in features] == [one["alert"] for one in whole]
+    assert {one["properties"]["hpl_m"] for one in features} == {None, 1.2}
+    longitude, latitude, height_m = features[0]["geometry"]["coordinates"]
+    assert (longitude, latitude, height_m) == pytest.approx((11.0, 48.0, 501.2), abs=0.01)
+    assert history.export(files[0], SPAN, ("tag3",)) == int((within["tag"] == 3).sum())
+
+
+def test_an_empty_range(history, tmp_path):
+    empty = Span(BEGIN - 9e6, BEGIN - 8e6)
+    assert history.track("tag1", empty).points == ()
+    assert history.heatmap(empty).seconds == ()
+    assert history.contacts("tag1", empty) == ()
+    assert history.dwell(empty) == history.alarms(empty) == ()
+    assert {one.most for one in history.occupancy(Span(0.0, 10.0))} == {0}
+    with pytest.raises(SkylessError, match="no fixes in this range"):
+        history.export(tmp_path / "x.csv", empty)
+    assert not (tmp_path / "x.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("ask", "error"),
+    [
+        (lambda h: h.track("tag0", SPAN), "has no tag 'tag0'; it has renamed, tag1, tag10, tag11, tag12 and 15 more"),
+        (lambda h: h.track("old", SPAN), "has no tag 'old'"),
+        (lambda h: h.track("' OR 1=1 --", SPAN), "has no tag"),
+        (lambda h: h.dwell(SPAN, ("x",)), "has no tag 'x'"),
+        (lambda h: h.dwell(SPAN, zone="a' OR 'a'='a"), "has no zone .*; it has a, b, empty"),
+        (lambda h: h.heatmap(SPAN, 0.0), "the cells' side is 0.0"),
+        (lambda h: h.heatmap(SPAN, 0.01), "too many; choose larger"),
+        (lambda h: h.occupancy(Span(0.0, 1e9), step_s=1.0), "too many; choose longer"),
+        (lambda h: h.contacts("tag1", SPAN, 1e6), "the distance is 1000000.0"),
+        (lambda h: h.export(h.folder / "x.xlsx", SPAN), "it should end with .csv or .parquet or .geojsonl"),
+        (lambda h: h.export(h.folder / "x.geojsonl", SPAN), "georeference"),
+        (lambda h: History(h.folder, 8), "no history of site 8; it holds site 7"),
+        (lambda h: History(h.folder / "none", 8), "skyless history run"),
+    ],
+)
+def test_what_cannot_be_answered_is_said(history, ask, error):
+    with pytest.raises(SkylessError, match=error):
+        ask(history)
+
+
+def test_a_file_that_is_replaced_while_it_is_read(history, monkeypatch):
+    """Its rows are found in the larger one at the second try; a file that is no Parquet is an error."""
+    files, whole = history._files, history.track("tag1", SPAN)
+    gone = [["/gone/000000000001-000000000002.parquet"]]
+    monkeypatch.setattr(history, "_files", lambda span: gone.pop() if gone else files(span))
+    assert history.track("tag1", SPAN) == whole
+    gone[:] = [["/gone"], ["/gone"]]
+    with pytest.raises(SkylessError, match="the history cannot be read"):
+        history.heatmap(SPAN)
+
+
+SECONDS = st.lists(st.integers(-50, 50), unique=True).map(sorted)
+
+
+@given(SECONDS, st.integers(0, 5))
+def test_merged_intervals_hold_the_seconds_and_no_longer_pause(seconds, gap_s):
+    found = merged(seconds, gap_s)
+    for begin, end in found:
+        inside = [one for one in seconds if begin <= one < end]
+        assert (inside[0], inside[-1] + 1) == (begin, end)
+        assert all(b - a - 1 <= gap_s for a, b in pairwise(inside))
+    assert all(after[0] - before[1] > gap_s for before, after in pairwise(found))
+    assert sum(begin <= one < end for one in seconds for begin, end in found) == len(seconds)
+
+
+VISITS = st.lists(
+    st.tuples(st.integers(-5, 40), st.integers(0, 20)).map(lambda v: (v[0], 60 if v[1] == 20 else v[0] + v[1]))
+)
+
+
+@given(VISITS, st.integers(1, 9), st.integers(1, 30))
+def test_counts_are_those_at_every_instant(visits, step, length):
+    edges = np.append(np.arange(0.0, length, step), float(length))
+    left = [e for _, e in visits if e < 60]  # the others are open
+    mean, most = counts([b for b, _ in visits], left, 60.0, edges)
+    for k, (begin, end) in enumerate(pairwise(edges)):
+        whole = range(int(begin), int(end))  # between whole seconds nothing changes
+        at = [sum(b <= second < e for b, e in visits) for second in whole]
+        assert mean[k] == pytest.approx(sum(at) / len(at))
+        assert most[k] == max(at)
+
+
+def test_days_that_are_thinned(tmp_path):
+    """Their fixes, one in ten seconds or in a minute, count longer, and are compared within ten seconds."""
+    site, minutes = site_folder(tmp_path, 2), 60
+    rest = [(1, 60_000 * k + 300, 1000, 1000) for k in range(minutes)]
+    near = [(2, 60_000 * k + 1200, 2500, 1000) for k in range(10, 20)]
+    moving = [(3, 10_000 * k + 900, 500 * k, 9000) for k in range(6 * minutes)]
+    tags, ms, x_mm, y_mm = (np.array(column) for column in zip(*rest, *near, *moving, strict=True))
+    begin_ms = round(1000 * MIDNIGHT)
+    rows = {"tag": tags, "t": begin_ms + ms, "x_mm": x_mm, "y_mm": y_mm}
+    rows |= {name: np.full(len(tags), 10) for name in FIX_COLUMNS if name not in rows}
+    write_fixes(site, rows, 1, len(tags))
+    (file,) = site.glob("day=*/*.parquet")
+    parquet.write_table(parquet.ParquetFile(file).read().replace_schema_metadata({b"skyless_thinned": b"yes"}), file)
+    names = {"tag": [1, 2, 3], "name": ["rest", "near", "moving"], "since": [0, 0, 0]}
+    parquet.write_table(table(NAME_COLUMNS, names), site / "names.parquet")
+    history, span = History(tmp_path, 2), Span(MIDNIGHT, MIDNIGHT + 3600.0)
+    assert sum(history.heatmap(span, tags=("rest",)).seconds) == pytest.approx(59 * 60.0)
+    assert history.track("moving", span).length_m == pytest.approx(0.5 * (6 * minutes - 1))
+    assert history.contacts("rest", span, 2.0) == (
+        Contact("rest", "near", MIDNIGHT + 600.0, MIDNIGHT + 19 * 60.0 + 10.0, 1.5),
+    )
