@@ -1,0 +1,92 @@
+"""The tutorial of a site's everyday, line by line against a real demo: names, zones, a rule, an alarm, the history."""
+
+import json
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from urllib.request import Request, urlopen
+
+import pytest
+
+pytest.importorskip("duckdb")
+
+TEXT = Path(__file__).parents[2].joinpath("docs", "tutorials", "everyday.md").read_text(encoding="utf-8")
+PROGRAM = f"{shlex.quote(sys.executable)} -m skyless.cli.main "
+FILES = re.findall(r"as `(\w+\.\w+)`.*?^```text\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
+BLOCKS = re.findall(r"^```sh\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
+LINES = [line for block in BLOCKS for line in block.splitlines()]
+LONGEST_S = 60.0
+
+
+def run(line, folder):
+    """Run a line of the tutorial, and return what it prints."""
+    done = subprocess.run(
+        ["bash", "-ec", re.sub(r"^skyless ", PROGRAM, line)], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def until(look):
+    """The first answer that is something."""
+    end = time.monotonic() + LONGEST_S
+    while time.monotonic() < end:
+        found = look()
+        if found:
+            return found
+        time.sleep(0.2)
+    raise AssertionError("it does not come")
+
+
+@pytest.mark.live
+def test_every_line_of_the_tutorial_runs(tmp_path):
+    for name, text in FILES:
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    made, demo, *others = LINES
+    run(made, tmp_path)
+    words = [sys.executable, "-m", "skyless.cli.main", *shlex.split(demo)[1:]]
+    running = subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
+        page = next(line.split()[1] for line in running.stdout if line.startswith("page "))
+
+        def get(path):
+            with urlopen(f"{page}/api/v1/{path}") as answer:
+                return json.load(answer)
+
+        def ready():
+            try:
+                return len(get("fixes")["fixes"]) == 3
+            except OSError:
+                return False
+
+        until(ready)
+        while not others[0].startswith("skyless history"):
+            line = others.pop(0).replace("http://127.0.0.1:8080", page)
+            if "/alarms" in line:
+                until(lambda: get("alarms")["alarms"])
+            printed = run(line, tmp_path)
+        assert "Forklift 1" in printed  # the text view, the last of them
+        assert {tag["tag"]: tag["name"] for tag in get("tags")["tags"]}["tag3"] == "Ada"
+        (alarm,) = get("alarms")["alarms"]
+        assert {"Forklift 1", "Forklift 2"} <= set(re.findall(r"Forklift \d", alarm["sentence"]))
+        until(lambda: get("events")["events"])
+        path = f"{page}/api/v1/alarms/{alarm['rule']}/{alarm['subject']}/acknowledge"
+        body = json.dumps({"id": alarm["id"], "by": "Ada"}).encode()
+        urlopen(Request(path, body, {"content-type": "application/json"}, method="POST")).close()
+        assert until(lambda: [one for one in get("alarms")["alarms"] if one["acknowledged_by"] == "Ada"])
+    finally:
+        running.send_signal(signal.SIGINT)
+        running.communicate()
+    answers = {shlex.split(line)[2]: run(f'{line} --from "1 hour ago" --json', tmp_path) for line in others}
+    answers = {name: json.loads(text.splitlines()[-1]) for name, text in answers.items()}
+    assert answers["track"]["fixes"] > 100
+    assert {row["zone_name"] for row in answers["dwell"]["dwell"]} <= {"Goods in", "Store"}
+    assert sum(row["seconds"] for row in answers["dwell"]["dwell"]) > 1.0
+    (past,) = answers["alarms"]["alarms"]
+    assert (past["id"], past["acknowledged_by"]) == (alarm["id"], "Ada")
+    assert {file.name for file in tmp_path.glob("*.png")} == {"way.png", "heat.png"}
+    assert len((tmp_path / "fixes.csv").read_text().splitlines()) > 300
