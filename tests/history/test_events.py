@@ -52,7 +52,7 @@ def test_what_the_columns_hold():
 MESSAGES = st.lists(
     st.sampled_from(
         [ALARM, ENDED, SEEN, *(enter(tag, kind=kind) for tag in "ab" for kind in ("enter", "leave"))]
-        + [status(online=online, name=name) for online in (True, False) for name in "12"]
+        + [status(online=s > 0.0, name=name, unix_s=s) for s in (0.0, NOW_S, NOW_S + 1.0) for name in "12"]
     )
 )
 
@@ -70,6 +70,15 @@ def test_a_message_that_comes_again_tells_nothing_even_after_a_restart(messages,
     for subject in ("anchor-1", "anchor-2"):
         states = [event.kind for event in past if event.subject == subject]
         assert all(one != other for one, other in pairwise(states))
+
+
+def test_a_late_copy_of_online_does_not_bring_a_node_back():
+    log = EventLog()
+    before = status(online=True, unix_s=NOW_S - 9.0)
+    assert len(log.of_status(before, NOW_S)) == len(log.of_status(status(online=False), NOW_S)) == 1
+    assert log.of_status(before, NOW_S + 1.0) == []
+    (event,) = log.of_status(status(online=True, unix_s=NOW_S + 1.0), NOW_S + 1.0)
+    assert event.kind == "online"
 
 
 def test_times_that_are_none_give_no_event():

@@ -21,6 +21,7 @@ class EventLog:
     def __init__(self, past: Iterable[Event] = ()) -> None:
         """``past``: the events of ``REMEMBERED_KINDS`` that the history has, in order."""
         self._known: dict[tuple[object, ...], EventKind] = {}
+        self._came_ms: dict[tuple[object, ...], int] = {}
         for event in past:
             self._is_new(event)
 
@@ -62,10 +63,16 @@ class EventLog:
         key: tuple[object, ...] = (event.kind, event.tag, event.zone, event.unix_ms)
         if event.kind in ("online", "offline"):
             key = (event.tag, event.subject)
+            if event.kind == "online" and self._came_ms.get(key) == event.unix_ms:
+                return False  # a late copy, perhaps of before it went
+            if event.kind == "online":
+                self._came_ms[key] = event.unix_ms
         elif event.alarm:
             key = (event.kind, event.alarm)
         before = self._known.pop(key, None)
         self._known[key] = event.kind
         if len(self._known) > _MAX_REMEMBERED:
-            del self._known[next(iter(self._known))]
+            oldest = next(iter(self._known))
+            del self._known[oldest]
+            self._came_ms.pop(oldest, None)
         return before != event.kind
