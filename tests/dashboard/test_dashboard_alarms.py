@@ -160,6 +160,21 @@ def test_of_two_dashboards_one_raises_and_the_other_goes_on(broker):
     assert len(broker.raised) == 2
 
 
+def test_a_dashboard_whose_clock_is_behind_leads_for_a_while(broker):
+    live = broker.start("a")
+    broker.run(4.0, IN)
+    alarm = broker.alarm()
+    behind = topics.status_topic(SITE_ID, "dashboard", "z")
+    broker.publish(behind, status("dashboard", "z", unix_s=1.0), retain=True)
+    broker.run(2.0, IN)
+    assert not live.alarms.engine.leading
+    assert live.alarms.messages == (alarm,)
+    broker.publish(behind, status("dashboard", "z", online=False, unix_s=1.0), retain=True)
+    broker.run(2.0, IN)
+    assert live.alarms.engine.leading
+    assert broker.raised == [alarm.id]
+
+
 @pytest.mark.parametrize("acknowledged", [True, False])
 def test_a_dashboard_that_is_started_again_goes_on(broker, acknowledged):
     first = broker.start("a")
@@ -286,6 +301,6 @@ def test_without_a_broker_nothing_can_be_acknowledged(live, wire):
 
 def test_alarms_name_assets(broker):
     live = broker.start("a")
-    live.alarms.assets = lambda: {"t1": Asset("t1", name="Ada")}
+    live.store_assets((Asset("t1", name="Ada"),))
     broker.run(4.0, IN)
     assert broker.alarm().sentence == "Ada (t1) is in Desk"
