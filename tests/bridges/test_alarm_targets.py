@@ -322,10 +322,10 @@ def test_a_mail_that_is_refused_for_good_is_counted():
 def test_who_is_refused_for_now_gets_a_mail_later_and_the_others_get_it_once():
     box = Mailbox(to_bob=["450 later", "250 OK", "550 nobody"])
     with mail_server(box) as port:
-        target = open_target(f"smtp://127.0.0.1:{port}?to=ada@example.org,bob@example.org")
+        address = f"smtp://127.0.0.1:{port}?to=ada@example.org,bob@example.org"
+        target, another = open_target(address), open_target(address)
         deliver(target, [ALARM], lambda: target.delivered == 1)
         assert [people for people, _ in box.mails] == [["ada@example.org"], ["bob@example.org"]]
-        another = open_target(target.text)
         deliver(another, [replace(ALARM, id="another")], lambda: another.dropped["refused"] == 1)
     assert [people for people, _ in box.mails[2:]] == [["ada@example.org"]]
 
