@@ -71,7 +71,8 @@ def test_any_text_gives_hours_or_an_error_that_says_what_is_right(text):
 
 
 @pytest.mark.parametrize(
-    "text", ["mon-", "25:00-26:00", "06:60-07:00", "mo 06:00-07:00", "06:00", "mon,,tue", "24:00-03:00"]
+    "text",
+    ["mon-", "25:00-26:00", "06:60-07:00", "mo 06:00-07:00", "06:00", "mon,,tue", "24:00-03:00", ",", "24:01-03:00"],
 )
 def test_wrong_hours(text):
     with pytest.raises(ValueError, match="mon-fri"):

@@ -305,7 +305,9 @@ class AlarmEngine:
                 return None if tag is None or tag.battery is None else tag.battery < limit + hysteresis
             case _:
                 level_m = _level_m(tag.fix if tag is not None else None)
-                return None if self._is_missed(subject, now_s) else level_m is not None and level_m > limit - hysteresis
+                if level_m is None:
+                    return None if self._is_missed(subject, now_s) else False
+                return level_m > limit - hysteresis
 
     def _seen_s(self, name: str) -> float:
         return self._tags[name].seen_s if name in self._tags else -math.inf
