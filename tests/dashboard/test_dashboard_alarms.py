@@ -224,17 +224,23 @@ def test_what_another_has_done_meanwhile_is_not_undone_after_a_reconnect(broker)
     assert broker.dashboards["a"][0].alarms.messages == ()
 
 
-def test_an_acknowledgement_that_the_first_did_not_publish_is_published_by_the_next(broker):
+@pytest.mark.parametrize("place", [IN, OUT])
+def test_an_acknowledgement_that_the_first_did_not_publish_is_published_by_the_next(broker, place):
     broker.start("a")
     broker.run(1.0, OUT)
     broker.start("b")
     broker.run(4.0, IN)
+    broker.run(1.0, place)
+    alarm = broker.alarm()
     broker.dashboards["a"][0].connected = False  # it hears nothing any more
-    asked = AcknowledgeMessage(broker.alarm().id, "Ada", broker.times.unix_s)
-    broker.publish(topics.acknowledge_topic(SITE_ID, "r", "t1"), asked)
+    broker.publish(
+        topics.acknowledge_topic(SITE_ID, "r", "t1"), AcknowledgeMessage(alarm.id, "Ada", broker.times.unix_s)
+    )
     broker.end("a")
-    broker.run(3.0, IN)
-    assert broker.alarm().acknowledged_by == "Ada"
+    broker.run(3.0, place)
+    assert (broker.happened[-1].id, broker.happened[-1].acknowledged_by) == (alarm.id, "Ada")
+    assert (broker.alarm() is None) == (place == OUT)
+    assert broker.raised == [alarm.id]
 
 
 def test_rules_of_the_page_are_stored_checked_and_sent(broker):

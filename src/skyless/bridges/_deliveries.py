@@ -75,7 +75,7 @@ class AlarmTarget(Target):
         self.delivered = 0
         self._log, self._kinds = log, kinds
         self._waiting: list[Delivery] = []
-        self._known: dict[str, AlarmMessage] = {}
+        self._known: dict[str, list[What]] = {}
         self._started_unix_s = time.time()
         self._trouble = ""
         self._wake = asyncio.Event()
@@ -89,26 +89,18 @@ class AlarmTarget(Target):
 
     def on_alarm(self, alarm: AlarmMessage) -> None:
         """An alarm as it is now. Of those from before the start, only active ones that nobody has seen are new."""
-        before = self._known.pop(alarm.id, None)
-        self._known[alarm.id] = alarm
+        states = _states(alarm)
+        known = self._known.pop(alarm.id, None)
+        self._known[alarm.id] = states
         if len(self._known) > _MAX_KNOWN:
             del self._known[next(iter(self._known))]
-        is_open = alarm.ended_unix_s is None and alarm.acknowledged_unix_s is None
-        if before is None and not is_open and alarm.unix_s < self._started_unix_s:
-            return
-        if before is None:
-            self._add("raised", alarm)
-        if alarm.acknowledged_unix_s is not None and (before is None or before.acknowledged_unix_s is None):
-            self._add("acknowledged", alarm)
-        if alarm.ended_unix_s is not None and (before is None or before.ended_unix_s is None):
-            self._add("ended", alarm)
-
-    def _add(self, what: What, alarm: AlarmMessage) -> None:
-        if what not in self._kinds:
+        if known is None and len(states) > 1 and alarm.unix_s < self._started_unix_s:
             return
         now_s = time.monotonic()
-        self._waiting.append(Delivery(what, alarm, now_s, now_s, FIRST_PAUSE_S))
-        if len(self._waiting) > MAX_WAITING:
+        for what in states:
+            if what in self._kinds and what not in (known or ()):
+                self._waiting.append(Delivery(what, alarm, now_s, now_s, FIRST_PAUSE_S))
+        while len(self._waiting) > MAX_WAITING:
             del self._waiting[0]
             self.dropped["too-many"] += 1
         self._wake.set()
@@ -157,6 +149,16 @@ class AlarmTarget(Target):
         if trouble != self._trouble:
             self._trouble = trouble
             self._log(f"{self.text}: {trouble or 'delivered again'}")
+
+
+def _states(alarm: AlarmMessage) -> list[What]:
+    """What has become of an alarm so far."""
+    states: list[What] = ["raised"]
+    if alarm.acknowledged_unix_s is not None:
+        states.append("acknowledged")
+    if alarm.ended_unix_s is not None:
+        states.append("ended")
+    return states
 
 
 async def _in_thread(work: Callable[[Open], None]) -> None:
