@@ -266,7 +266,7 @@ class AlarmEngine:
                 return [f"anchor-{name}" for name in self._displaced or ()]
             case "silent":
                 heard = own.concerned.named if own.rule.tags else [n for n, tag in self._tags.items() if tag.fix]
-                return [name for name in heard if now_s - self._seen_s(name) >= own.rule.after_s]
+                return sorted(name for name in heard if now_s - self._seen_s(name) >= own.rule.after_s)
         return changed
 
     def _holds(  # noqa: PLR0911, PLR0912 - some for each kind
