@@ -140,20 +140,20 @@ class Server:
         self.monitor = ZoneMonitor()
         self.engine = AlarmEngine(self.monitor)
         unix_s = UNIX_S + at_s
-        self.engine.on_zone_events(self.monitor.set_zones(ZONES, unix_s), at_s, unix_s)
-        self.engine.set_zones(ZONES, at_s, unix_s)
-        self.engine.set_rules(RULES, at_s, unix_s)
+        self.engine.on_zone_events(self.monitor.set_zones(ZONES, unix_s), at_s)
+        self.engine.set_zones(ZONES, at_s)
+        self.engine.set_rules(RULES)
         self.engine.resume(kept.values(), at_s, unix_s)
         self._expired_s = at_s
 
     def on_fix(self, fix: FixMessage, at_s: float) -> None:
-        self.engine.on_fix(fix, at_s, UNIX_S + at_s)
-        self.engine.on_zone_events(self.monitor.update(fix, at_s), at_s, UNIX_S + at_s)
+        self.engine.on_fix(fix, at_s)
+        self.engine.on_zone_events(self.monitor.update(fix, at_s), at_s)
 
     def tick(self, at_s: float) -> list:
         if at_s - self._expired_s >= 1.0:
             self._expired_s = at_s
-            self.engine.on_zone_events(self.monitor.expire_tags(at_s, UNIX_S + at_s), at_s, UNIX_S + at_s)
+            self.engine.on_zone_events(self.monitor.expire_tags(at_s, UNIX_S + at_s), at_s)
         return self.engine.tick(at_s, UNIX_S + at_s)
 
 
@@ -239,14 +239,14 @@ def cost_us(tags: int = 500, hz: float = 20.0, seconds: float = 10.0) -> float:
         AlarmRule("all", "near", limit=1.9),
         AlarmRule("quiet", "silent", after_s=5.0),
     )
-    server.engine.set_rules(rules, 0.0, UNIX_S)
+    server.engine.set_rules(rules)
     rng = random.Random(1)
     fixes = [fix_of(f"t{k}", UNIX_S, 2.0 * (k % 25) + rng.gauss(0, 0.02), 2.0 * (k // 25)) for k in range(tags)]
     begin_s = time.process_time()
     for step in range(int(seconds * hz)):
         at_s = step / hz
         for fix in fixes:
-            server.engine.on_fix(fix, at_s, UNIX_S + at_s)
+            server.engine.on_fix(fix, at_s)
         server.engine.tick(at_s, UNIX_S + at_s)
     return (time.process_time() - begin_s) / (seconds * hz * tags) * 1e6
 

@@ -255,8 +255,14 @@ def test_unencrypted_posts_to_other_machines_are_warned_of():
 class Mailbox:
     """A mail server's handler: keeps what came, and refuses when told so."""
 
-    def __init__(self, answers=()):
-        self.mails, self.answers = [], list(answers)
+    def __init__(self, answers=(), to_bob=()):
+        self.mails, self.answers, self.to_bob = [], list(answers), list(to_bob)
+
+    async def handle_RCPT(self, _server, _session, envelope, address, _options):  # noqa: N802 - aiosmtpd calls it so
+        answer = self.to_bob.pop(0) if self.to_bob and address.startswith("bob@") else "250 OK"
+        if answer.startswith("250"):
+            envelope.rcpt_tos.append(address)
+        return answer
 
     async def handle_DATA(self, _server, _session, envelope):  # noqa: N802 - aiosmtpd calls it so
         answer = self.answers.pop(0) if self.answers else "250 OK"
@@ -311,6 +317,17 @@ def test_a_mail_that_is_refused_for_good_is_counted():
         target = open_target(f"smtp://127.0.0.1:{port}?to=ada@example.org")
         deliver(target, [ALARM], lambda: target.dropped["refused"] == 1)
     assert box.mails == []
+
+
+def test_who_is_refused_for_now_gets_a_mail_later_and_the_others_get_it_once():
+    box = Mailbox(to_bob=["450 later", "250 OK", "550 nobody"])
+    with mail_server(box) as port:
+        address = f"smtp://127.0.0.1:{port}?to=ada@example.org,bob@example.org"
+        target, another = open_target(address), open_target(address)
+        deliver(target, [ALARM], lambda: target.delivered == 1)
+        assert [people for people, _ in box.mails] == [["ada@example.org"], ["bob@example.org"]]
+        deliver(another, [replace(ALARM, id="another")], lambda: another.dropped["refused"] == 1)
+    assert [people for people, _ in box.mails[2:]] == [["ada@example.org"]]
 
 
 def test_user_and_password(tmp_path):

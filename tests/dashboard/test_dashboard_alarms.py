@@ -160,6 +160,21 @@ def test_of_two_dashboards_one_raises_and_the_other_goes_on(broker):
     assert len(broker.raised) == 2
 
 
+def test_a_dashboard_whose_clock_is_behind_leads_for_a_while(broker):
+    live = broker.start("a")
+    broker.run(4.0, IN)
+    alarm = broker.alarm()
+    behind = topics.status_topic(SITE_ID, "dashboard", "z")
+    broker.publish(behind, status("dashboard", "z", unix_s=1.0), retain=True)
+    broker.run(2.0, IN)
+    assert not live.alarms.engine.leading
+    assert live.alarms.messages == (alarm,)
+    broker.publish(behind, status("dashboard", "z", online=False, unix_s=1.0), retain=True)
+    broker.run(2.0, IN)
+    assert live.alarms.engine.leading
+    assert broker.raised == [alarm.id]
+
+
 @pytest.mark.parametrize("acknowledged", [True, False])
 def test_a_dashboard_that_is_started_again_goes_on(broker, acknowledged):
     first = broker.start("a")
@@ -209,17 +224,23 @@ def test_what_another_has_done_meanwhile_is_not_undone_after_a_reconnect(broker)
     assert broker.dashboards["a"][0].alarms.messages == ()
 
 
-def test_an_acknowledgement_that_the_first_did_not_publish_is_published_by_the_next(broker):
+@pytest.mark.parametrize("place", [IN, OUT])
+def test_an_acknowledgement_that_the_first_did_not_publish_is_published_by_the_next(broker, place):
     broker.start("a")
     broker.run(1.0, OUT)
     broker.start("b")
     broker.run(4.0, IN)
+    broker.run(1.0, place)
+    alarm = broker.alarm()
     broker.dashboards["a"][0].connected = False  # it hears nothing any more
-    asked = AcknowledgeMessage(broker.alarm().id, "Ada", broker.times.unix_s)
-    broker.publish(topics.acknowledge_topic(SITE_ID, "r", "t1"), asked)
+    broker.publish(
+        topics.acknowledge_topic(SITE_ID, "r", "t1"), AcknowledgeMessage(alarm.id, "Ada", broker.times.unix_s)
+    )
     broker.end("a")
-    broker.run(3.0, IN)
-    assert broker.alarm().acknowledged_by == "Ada"
+    broker.run(3.0, place)
+    assert (broker.happened[-1].id, broker.happened[-1].acknowledged_by) == (alarm.id, "Ada")
+    assert (broker.alarm() is None) == (place == OUT)
+    assert broker.raised == [alarm.id]
 
 
 def test_rules_of_the_page_are_stored_checked_and_sent(broker):
@@ -286,6 +307,6 @@ def test_without_a_broker_nothing_can_be_acknowledged(live, wire):
 
 def test_alarms_name_assets(broker):
     live = broker.start("a")
-    live.alarms.assets = lambda: {"t1": Asset("t1", name="Ada")}
+    live.store_assets((Asset("t1", name="Ada"),))
     broker.run(4.0, IN)
     assert broker.alarm().sentence == "Ada (t1) is in Desk"

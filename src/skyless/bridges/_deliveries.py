@@ -11,8 +11,8 @@ import random
 import socket
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Final, Literal
 
@@ -44,11 +44,16 @@ class RefusedError(Exception):
     """The receiver will never accept this message."""
 
 
-class Delivery(Struct, frozen=True):
-    """What has become of an alarm."""
+class Delivery(Struct, eq=False):
+    """What has become of an alarm, until it is delivered."""
 
     what: What
     alarm: AlarmMessage
+    since_s: float
+    due_s: float
+    pause_s: float
+    reached: set[str] = set()
+    """Who has accepted a mail to several people, and does not get it again."""
 
     @property
     def key(self) -> str:
@@ -60,13 +65,6 @@ Open = Callable[[socket.socket], None]
 """To be called with the socket of an attempt, which is closed when its time is over."""
 
 
-class _Waiting(Struct):
-    delivery: Delivery
-    since_s: float
-    due_s: float
-    pause_s: float
-
-
 class AlarmTarget(Target):
     """Base of targets that get what becomes of alarms. ``attempt`` is called in a thread."""
 
@@ -76,8 +74,8 @@ class AlarmTarget(Target):
         self.site: BridgedSite | None = None
         self.delivered = 0
         self._log, self._kinds = log, kinds
-        self._waiting: list[_Waiting] = []
-        self._known: OrderedDict[str, AlarmMessage] = OrderedDict()
+        self._waiting: list[Delivery] = []
+        self._known: dict[str, list[What]] = {}
         self._started_unix_s = time.time()
         self._trouble = ""
         self._wake = asyncio.Event()
@@ -91,26 +89,18 @@ class AlarmTarget(Target):
 
     def on_alarm(self, alarm: AlarmMessage) -> None:
         """An alarm as it is now. Of those from before the start, only active ones that nobody has seen are new."""
-        before = self._known.pop(alarm.id, None)
-        self._known[alarm.id] = alarm
+        states = _states(alarm)
+        known = self._known.pop(alarm.id, None)
+        self._known[alarm.id] = states
         if len(self._known) > _MAX_KNOWN:
-            self._known.popitem(last=False)
-        is_open = alarm.ended_unix_s is None and alarm.acknowledged_unix_s is None
-        if before is None and not is_open and alarm.unix_s < self._started_unix_s:
-            return
-        if before is None:
-            self._add("raised", alarm)
-        if alarm.acknowledged_unix_s is not None and (before is None or before.acknowledged_unix_s is None):
-            self._add("acknowledged", alarm)
-        if alarm.ended_unix_s is not None and (before is None or before.ended_unix_s is None):
-            self._add("ended", alarm)
-
-    def _add(self, what: What, alarm: AlarmMessage) -> None:
-        if what not in self._kinds:
+            del self._known[next(iter(self._known))]
+        if known is None and len(states) > 1 and alarm.unix_s < self._started_unix_s:
             return
         now_s = time.monotonic()
-        self._waiting.append(_Waiting(Delivery(what, alarm), now_s, now_s, FIRST_PAUSE_S))
-        if len(self._waiting) > MAX_WAITING:
+        for what in states:
+            if what in self._kinds and what not in (known or ()):
+                self._waiting.append(Delivery(what, alarm, now_s, now_s, FIRST_PAUSE_S))
+        while len(self._waiting) > MAX_WAITING:
             del self._waiting[0]
             self.dropped["too-many"] += 1
         self._wake.set()
@@ -120,27 +110,26 @@ class AlarmTarget(Target):
         while True:
             self._wake.clear()
             now_s = time.monotonic()
-            for old in [one for one in self._waiting if now_s - one.since_s > KEPT_S]:
-                self._waiting.remove(old)
+            while self._waiting and now_s - self._waiting[0].since_s > KEPT_S:
+                del self._waiting[0]
                 self.dropped["too-old"] += 1
             first = self._next()
-            if first is None or first.due_s > now_s:
-                wait_s = None if first is None else first.due_s - now_s
-                with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(self._wake.wait(), wait_s)
+            if first is not None and first.due_s <= now_s:
+                await self._try(first)
                 continue
-            await self._try(first)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), None if first is None else first.due_s - now_s)
 
-    def _next(self) -> _Waiting | None:
+    def _next(self) -> Delivery | None:
         """The message whose turn comes first. Those about one alarm keep their order."""
-        firsts: dict[str, _Waiting] = {}
+        firsts: dict[str, Delivery] = {}
         for one in self._waiting:
-            firsts.setdefault(one.delivery.alarm.id, one)
+            firsts.setdefault(one.alarm.id, one)
         return min(firsts.values(), key=lambda one: one.due_s, default=None)
 
-    async def _try(self, one: _Waiting) -> None:
+    async def _try(self, one: Delivery) -> None:
         try:
-            await _in_thread(lambda on_open: self.attempt(one.delivery, on_open))
+            await _in_thread(lambda on_open: self.attempt(one, on_open))
         except RefusedError as error:
             self.dropped["refused"] += 1
             self._report(f"refused: {error}")
@@ -162,33 +151,38 @@ class AlarmTarget(Target):
             self._log(f"{self.text}: {trouble or 'delivered again'}")
 
 
+def _states(alarm: AlarmMessage) -> list[What]:
+    """What has become of an alarm so far."""
+    states: list[What] = ["raised"]
+    if alarm.acknowledged_unix_s is not None:
+        states.append("acknowledged")
+    if alarm.ended_unix_s is not None:
+        states.append("ended")
+    return states
+
+
 async def _in_thread(work: Callable[[Open], None]) -> None:
     """Run what blocks in a thread that the end of the program does not wait for, for at most ``TIMEOUT_S``."""
-    loop = asyncio.get_running_loop()
-    done: asyncio.Future[None] = loop.create_future()
+    done: Future[None] = Future()
+    done.set_running_or_notify_cancel()
     sockets: list[socket.socket] = []
 
-    def finish(error: Exception | None) -> None:
-        if not done.done():
-            done.set_result(None) if error is None else done.set_exception(error)
-
     def run() -> None:
-        fault: Exception | None = None
         try:
             work(sockets.append)
         except Exception as error:  # noqa: BLE001 - the caller decides
-            fault = error
-        with contextlib.suppress(RuntimeError):  # the loop is closed
-            loop.call_soon_threadsafe(finish, fault)
+            done.set_exception(error)
+        else:
+            done.set_result(None)
 
     threading.Thread(target=run, daemon=True, name="skyless-delivery").start()
     try:
         async with asyncio.timeout(TIMEOUT_S):
-            await done
+            await asyncio.wrap_future(done)
     except TimeoutError:
         raise TimeoutError(f"no answer within {TIMEOUT_S:g} s") from None
     finally:
-        for one in sockets if not done.done() or done.cancelled() else ():
+        for one in sockets:
             with contextlib.suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)  # which ends the thread
 

@@ -50,13 +50,17 @@ class Mail(AlarmTarget):
             server = smtplib.SMTP(self._host, self._port, timeout=TIMEOUT_S)
         try:
             with server:
-                if server.sock is not None:
-                    on_open(server.sock)
+                _open(server, on_open)
                 if self._starts_tls:
                     server.starttls(context=context)
+                    _open(server, on_open)  # it is another socket now
                 if self._user:
                     server.login(self._user, self._password)
-                server.send_message(self._mail(delivery))
+                waiting = [address for address in self._to if address not in delivery.reached]
+                refused = server.send_message(self._mail(delivery), to_addrs=waiting)
+                delivery.reached.update(set(waiting) - refused.keys())
+                if refused:
+                    raise smtplib.SMTPRecipientsRefused(refused)
         except smtplib.SMTPRecipientsRefused as error:
             _refuse(error, *(code for code, _ in error.recipients.values()))
         except smtplib.SMTPAuthenticationError:
@@ -81,6 +85,11 @@ class Mail(AlarmTarget):
         simulated = "\nThis site is simulated.\n" if site is not None and site.simulated else ""
         mail.set_content(f"{alarm.sentence}.\n\n" + "\n".join(lines) + f"\n{simulated}\n{alarm.id}\n")
         return mail
+
+
+def _open(server: smtplib.SMTP, on_open: Open) -> None:
+    if server.sock is not None:
+        on_open(server.sock)
 
 
 def _refuse(error: Exception, *codes: int) -> None:

@@ -4,8 +4,7 @@ Of the dashboards of a site the first one online leads: it raises the alarms and
 engines that have seen the same, so that the next one goes on where the first has ended.
 """
 
-from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 from msgspec.structs import replace
@@ -19,7 +18,6 @@ from skyless.run.mqtt.messages import (
     AcknowledgeMessage,
     AlarmMessage,
     AlarmRulesMessage,
-    Asset,
     SiteMessage,
     StatusMessage,
     WrongMessageError,
@@ -36,8 +34,6 @@ KEPT_WAIT_S: Final = 2.0
 """After a connection, the messages that the broker has kept are here by then."""
 
 _BROADCAST_S: Final = 0.25
-_ASSETS_S: Final = 1.0
-_MAX_ASKED: Final = 200
 
 Handler = Callable[[str, bytes], None]
 
@@ -54,51 +50,42 @@ class SiteAlarms:
         name: str,
         monitor: ZoneMonitor,
         broadcast: Callable[[str, bytes], None],
-        log: Callable[[str, AlarmMessage, float], None] = lambda _what, _message, _now_s: None,
-        assets: Callable[[], Mapping[str, Asset]] = dict,
+        log: Callable[[str, AlarmMessage, float], None],
     ) -> None:
-        """``name`` is the dashboard's on MQTT; ``log`` is given what becomes of alarms; ``assets`` are by tag."""
+        """``name`` is the dashboard's on MQTT; ``log`` is given what becomes of alarms."""
         self.engine = AlarmEngine(monitor)
         self.rules: tuple[AlarmRule, ...] = ()
         """Those that were made on the page."""
         self.file_rules: tuple[AlarmRule, ...] = ()
         """Those of the site's file."""
-        self.assets = assets
         self._name, self._broadcast, self._log = name, broadcast, log
         self._link: Link | None = None
-        self._site_id: int | None = None
+        self._site_id = 0
         self._site = ""
         self._stored = AlarmRulesMessage(())
         self._drawn: AlarmRulesMessage | None = None  # rules stored here that have not come back from the broker
         self._fault = ""  # why the rules that the broker keeps cannot be read
-        self._kept: dict[Key, AlarmMessage] = {}
         self._received: dict[Key, AlarmMessage] = {}
         """Alarms as the broker has them, since the last connection."""
-        self._asked: deque[tuple[Key, AcknowledgeMessage]] = deque(maxlen=_MAX_ASKED)
-        """Acknowledgements that came while another one led, in case it has not published them."""
         self._connected_s: float | None = None
-        self._rules_changed = self._changed = False
-        self._sent_s = self._assets_s = float("-inf")
+        self._changed = False
+        self._sent_s = float("-inf")
 
     # What pages see
 
     @property
     def messages(self) -> tuple[AlarmMessage, ...]:
         """The alarms that are kept: those that nobody has acknowledged first, then the newest."""
-        kept = self._known().values()
+        kept = self.engine.messages.values()
         return tuple(sorted(kept, key=lambda one: (one.acknowledged_unix_s is not None, -one.unix_s)))
 
     def encoded(self) -> dict[str, bytes]:
         """The messages that a new page needs, by kind."""
         alarms = self.messages
-        fields = {"alarms": alarms[:MAX_SENT], "more": max(0, len(alarms) - MAX_SENT)}
-        return {"alarms": encode("alarms", fields), "alarm_rules": self._encoded_rules()}
-
-    def _encoded_rules(self) -> bytes:
-        return encode("alarm_rules", {"rules": self.rules, "file_rules": self.file_rules})
-
-    def _known(self) -> dict[Key, AlarmMessage]:
-        return self.engine.messages if self.engine.leading else self._kept
+        return {
+            "alarms": encode("alarms", {"alarms": alarms[:MAX_SENT], "more": max(0, len(alarms) - MAX_SENT)}),
+            "alarm_rules": encode("alarm_rules", {"rules": self.rules, "file_rules": self.file_rules}),
+        }
 
     # MQTT
 
@@ -120,10 +107,10 @@ class SiteAlarms:
         if not connected:
             self._rest()
 
-    def on_site(self, site: SiteMessage, now_s: float, unix_s: float) -> None:
+    def on_site(self, site: SiteMessage) -> None:
         """The site is known, with its rules."""
         self._site, self.file_rules = site.site.name, site.alarms
-        self._apply_rules(now_s, unix_s)
+        self._apply_rules()
 
     def _on_rules(self, topic: str, payload: bytes) -> None:
         try:
@@ -137,35 +124,38 @@ class SiteAlarms:
             self._drawn = None
         elif message != self._stored and self._link is not None:
             self._link.forget(topic)
-        self._fault, self._stored, self._rules_changed = "", message, True
+        self._fault, self._stored = "", message
+        self._apply_rules()
 
     def _on_alarm(self, topic: str, payload: bytes) -> None:
         rule, subject = topic.split("/")[-3:-1]
-        key = rule, subject
+        key, kept = (rule, subject), self.engine.messages
+        message = read_message(payload, AlarmMessage) if payload else None
+        if message is not None and (message.rule, message.subject) != key:
+            raise WrongMessageError(f"it is of {message.rule[:40]!r} and {message.subject[:40]!r}")
+        if message is not None and is_over(message):
+            message = None
+        if message is None:
+            self._received.pop(key, None)
+        elif key not in self._received and len(self._received) >= 2 * MAX_KEPT:
+            raise WrongMessageError("there are too many alarms")
+        else:
+            self._received[key] = message
         if self.engine.leading:
-            if not payload and key not in self.engine.messages and self._link is not None:
+            if not payload and key not in kept and self._link is not None:
                 self._link.forget(topic)  # the broker has cleared it
             return
         self._changed = True
-        message = read_message(payload, AlarmMessage) if payload else None
-        if message is None or is_over(message):
-            self._received.pop(key, None)
-            self._kept.pop(key, None)
-            return
-        if (message.rule, message.subject) != key:
-            raise WrongMessageError(f"it is of {message.rule[:40]!r} and {message.subject[:40]!r}")
-        if key not in self._kept and len(self._kept) >= 2 * MAX_KEPT:
-            raise WrongMessageError("there are too many alarms")
-        self._received[key] = message
-        self._kept[key] = _joined(self._kept.get(key), message)
+        if message is None:
+            kept.pop(key, None)
+        else:
+            kept[key] = _joined(kept.get(key), message)
 
     def _on_acknowledge(self, topic: str, payload: bytes) -> None:
+        """All dashboards note it, as the one that leads may end before it has published the alarm with it."""
         rule, subject = topic.split("/")[-3:-1]
         message = read_message(payload, AcknowledgeMessage)
-        if self.engine.leading:
-            self.engine.acknowledge(rule, subject, message.id, message.by[:100], message.unix_s)
-        else:
-            self._asked.append(((rule, subject), message))
+        self._changed |= self.engine.acknowledge(rule, subject, message.id, message.by[:100], message.unix_s)
 
     # What people do
 
@@ -178,41 +168,29 @@ class SiteAlarms:
             raise BadAlarmRulesError(None, "", "the topic alarm_rules", "not readable", right)
         check_rules(rules, self.file_rules)
         self._stored = self._drawn = AlarmRulesMessage(tuple(rules), self._site)
-        self._rules_changed = True
-        if self._link is not None and self._site_id is not None:
+        self._apply_rules()
+        if self._link is not None:
             self._link.publish(alarm_rules_topic(self._site_id), self._drawn, qos=1, retain=True)
 
-    def acknowledge(
-        self, rule: str, subject: str, occurrence: str, by: str, unix_s: float
-    ) -> AcknowledgeMessage | None:
-        """Acknowledge an alarm. Returns what is to be published where another dashboard leads. Raises NoAlarmError."""
-        message = self._known().get((rule, subject))
+    def check_is_kept(self, rule: str, subject: str, occurrence: str) -> None:
+        """Raise NoAlarmError where there is no such alarm."""
+        message = self.engine.messages.get((rule, subject))
         if message is None or message.id != occurrence:
             raise NoAlarmError(f"there is no alarm {occurrence[:120]!r} of {rule[:40]!r} and {subject[:80]!r} any more")
-        if self.engine.leading:
-            self.engine.acknowledge(rule, subject, occurrence, by[:100], unix_s)
-            return None
-        return AcknowledgeMessage(occurrence, by[:100], unix_s)
 
     # Work
 
     def tick(self, now_s: float, unix_s: float, dashboards: Iterable[StatusMessage], *, blind: bool) -> None:
         """Do what is due, 20 times a second. ``dashboards`` are those of the site; ``blind`` as of the engine."""
-        if self._rules_changed:
-            self._apply_rules(now_s, unix_s)
-        if now_s - self._assets_s >= _ASSETS_S:
-            self._assets_s = now_s
-            self.engine.set_assets(self.assets(), now_s, unix_s)
         ready = self._connected_s is not None and now_s - self._connected_s >= KEPT_WAIT_S and bool(self._site)
         if ready and not blind:
             first = min(((one.unix_s, one.name) for one in dashboards if one.online), default=(0.0, ""))[1]
-            if first == self._name and not self.engine.leading:
-                self._lead(now_s, unix_s)
-            elif first != self._name:
+            if first != self._name:
                 self._rest()
-                if first and len(self._kept) > len(self._received):
-                    self._kept = {key: self._kept[key] for key in self._received}
-                    self._changed = True
+                if first:
+                    self._drop_cleared()
+            elif not self.engine.leading:
+                self._lead(now_s, unix_s)
         for what, message in self.engine.tick(now_s, unix_s, blind=blind):
             self._changed = True
             self._log(what, message, now_s)
@@ -221,36 +199,36 @@ class SiteAlarms:
             self._changed, self._sent_s = False, now_s
             self._broadcast("alarms", self.encoded()["alarms"])
 
-    def _apply_rules(self, now_s: float, unix_s: float) -> None:
-        self._rules_changed = False
+    def _drop_cleared(self) -> None:
+        """Keep what the broker has, as another one leads."""
+        kept = self.engine.messages
+        for key in kept.keys() - self._received.keys():
+            del kept[key]
+            self._changed = True
+
+    def _apply_rules(self) -> None:
         ids = {rule.id for rule in self.file_rules}
         mine = self._stored.rules if self._stored.site in ("", self._site) else ()
         self.rules = tuple(rule for rule in mine if rule.id not in ids)
-        self.engine.set_rules((*self.file_rules, *self.rules), now_s, unix_s)
-        self._broadcast("alarm_rules", self._encoded_rules())
+        self.engine.set_rules((*self.file_rules, *self.rules))
+        self._broadcast("alarm_rules", self.encoded()["alarm_rules"])
 
     def _lead(self, now_s: float, unix_s: float) -> None:
         """Go on with the alarms that are kept, and publish those that the broker does not have so."""
-        for key, message in self._kept.items():
+        for key, message in self.engine.messages.items():
             if self._received.get(key) != message:
                 self._publish(message)
-        self.engine.resume(self._kept.values(), now_s, unix_s)
-        for (rule, subject), asked in self._asked:
-            self.engine.acknowledge(rule, subject, asked.id, asked.by[:100], asked.unix_s)
-        self._asked.clear()
+        self.engine.resume(self.engine.messages.values(), now_s, unix_s)
 
     def _rest(self) -> None:
         """Follow. What this one has published must not come back after a reconnect: another one may lead by then."""
-        if not self.engine.leading:
-            return
-        self._kept = dict(self.engine.messages)
-        self.engine.rest()
-        for rule, subject in self._kept:
-            if self._link is not None and self._site_id is not None:
+        if self.engine.leading and self._link is not None:
+            for rule, subject in self.engine.messages:
                 self._link.forget(alarm_topic(self._site_id, rule, subject))
+        self.engine.leading = False
 
     def _publish(self, message: AlarmMessage, *, dropped: bool = False) -> None:
-        if self._link is None or self._site_id is None:
+        if self._link is None:
             return
         topic = alarm_topic(self._site_id, message.rule, message.subject)
         if not dropped:

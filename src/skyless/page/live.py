@@ -35,6 +35,7 @@ from skyless.run.mqtt import topics
 from skyless.run.mqtt.access import Role
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
+    AcknowledgeMessage,
     AnchorHealth,
     Asset,
     AssetsMessage,
@@ -204,9 +205,9 @@ class LiveSite:
             self.evidence.set_site(site.site, clock())
             self.assets.on_site(site.site.name)
         self.log = EventLog(wall_clock() - clock())
-        self.alarms = SiteAlarms(name, self.monitor, self._broadcast, self.log.on_alarm, lambda: self.assets.by_tag)
+        self.alarms = SiteAlarms(name, self.monitor, self._broadcast, self.log.on_alarm)
         if site is not None:
-            self.alarms.on_site(site, clock(), wall_clock())
+            self.alarms.on_site(site)
         self._condition_monitor = ConditionMonitor(self.evidence)
         self.condition: Condition = self._condition_monitor.evaluate(clock())
         self._logged_serial = 0
@@ -296,7 +297,7 @@ class LiveSite:
         self.site = message
         self._set_floors(message)
         self.evidence.set_site(message.site, self._clock())
-        self.alarms.on_site(message, self._clock(), self._wall_clock())
+        self.alarms.on_site(message)
         self._broadcast("site", encode("site", {"site": message}))
         self.assets.on_site(message.site.name)
         self._assign_zones()
@@ -336,7 +337,7 @@ class LiveSite:
         unix_s = self._wall_clock()
         self.state.add_fix(fix, now_s, unix_s - self.evidence.add_fix(fix, now_s))
         self.log.on_fix(fix, now_s)
-        self.alarms.engine.on_fix(fix, now_s, unix_s)
+        self.alarms.engine.on_fix(fix, now_s)
         self._schedule(self.monitor.update(fix, now_s))
 
     def _on_status(self, topic: str, payload: bytes) -> None:
@@ -364,7 +365,7 @@ class LiveSite:
             self.evidence.add_health(kind, name, health, now_s, unix_s)
             self.log.on_health(kind, name, health, now_s)
             if isinstance(health, TagHealth):
-                self.alarms.engine.on_health(health, now_s, unix_s)
+                self.alarms.engine.on_health(health, now_s)
 
     def _on_truth(self, _topic: str, payload: bytes) -> None:
         self.state.add_truth(read_message(payload, TruthMessage))
@@ -441,7 +442,7 @@ class LiveSite:
         zones = () if is_foreign else zones_of(self._zones, name).zones
         if zones != self.monitor.zones:
             self._schedule(self.monitor.set_zones(zones, self._wall_clock()))
-            self.alarms.engine.set_zones(zones, self._clock(), self._wall_clock())
+            self.alarms.engine.set_zones(zones, self._clock())
             changed = True
         if changed:
             self._broadcast("zones", encode("zones", self._zone_fields()))
@@ -453,7 +454,7 @@ class LiveSite:
 
     def _schedule(self, events: list[ZoneEvent]) -> None:
         if events:
-            self.alarms.engine.on_zone_events(events, self._clock(), self._wall_clock())
+            self.alarms.engine.on_zone_events(events, self._clock())
             self.events.schedule(events, publisher_rank(self.name, list(self._dashboards.values())), self._clock())
 
     def _publish_events(self, now_s: float) -> None:
@@ -469,11 +470,11 @@ class LiveSite:
         self.alarms.store_rules(rules, site)
 
     def acknowledge(self, rule: str, subject: str, occurrence: str, by: str) -> None:
-        """Acknowledge an alarm. Raises NoAlarmError and NoBrokerError."""
+        """Ask the dashboard that leads to acknowledge an alarm. Raises NoAlarmError and NoBrokerError."""
         link, site_id = self._connected()
-        message = self.alarms.acknowledge(rule, subject, occurrence, by, self._wall_clock())
-        if message is not None:
-            link.publish(topics.acknowledge_topic(site_id, rule, subject), message, qos=1)
+        self.alarms.check_is_kept(rule, subject, occurrence)
+        message = AcknowledgeMessage(occurrence, by[:100], self._wall_clock())
+        link.publish(topics.acknowledge_topic(site_id, rule, subject), message, qos=1)
 
     # Survey
 
@@ -606,7 +607,8 @@ class LiveSite:
         offline = None if blind else offline_anchors(self.evidence, now_s)
         age_s = self.survey.watch_age_s
         fresh = watch if age_s is not None and age_s < _WATCH_FRESH_S else None
-        self.alarms.engine.on_anchors(offline, fresh, now_s, self._wall_clock())
+        self.alarms.engine.on_anchors(offline, fresh)
+        self.alarms.engine.set_assets(self.assets.by_tag)
         self.log.on_watch(watch, now_s)
         self.log.on_survey(self.survey.survey, now_s)
         self.log.on_condition(self.condition, now_s)

@@ -20,10 +20,9 @@ _ZONE: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 _DAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 _DAY_MIN: Final = 24 * 60
 _WEEK_MIN: Final = 7 * _DAY_MIN
-_HOURS: Final = re.compile(
-    r"(?:(?P<first>[a-z]{3})(?:\s*-\s*(?P<last>[a-z]{3}))?)?\s*"
-    r"(?:(?P<h1>\d{1,2}):(?P<m1>\d\d)\s*-\s*(?P<h2>\d{1,2}):(?P<m2>\d\d))?"
-)
+_DAY: Final = f"({'|'.join(_DAYS)})"
+_TIME: Final = "((?:[01]?[0-9]|2[0-3]):[0-5][0-9]|24:00)"
+_HOURS: Final = re.compile(rf"(?:{_DAY}(?:\s*-\s*{_DAY})?)?\s*(?:{_TIME}\s*-\s*{_TIME})?")
 _RIGHT_HOURS: Final = "days or times or both, as mon-fri 06:00-22:00, sat 08:00-12:00 (mon to sun, 00:00 to 24:00)"
 
 KINDS: Final = {
@@ -77,35 +76,23 @@ def read_hours(text: str) -> Hours:
     Raises:
         ValueError: the text describes none; its message says what would be right.
     """
-    parts = [] if not text.strip() else [part for piece in text.lower().split(",") for part in _parts(piece.strip())]
+    parts = []
+    for piece in text.lower().split(",") if text.strip() else ():
+        match = _HOURS.fullmatch(piece.strip())
+        first, last, begin, end = match.groups() if match is not None else (None,) * 4
+        begin_min, end_min = _minutes(begin or "00:00"), _minutes(end or "24:00")
+        if not (first or begin) or begin_min in (end_min, _DAY_MIN):
+            raise ValueError(_RIGHT_HOURS)
+        day = _DAYS.index(first or "mon")
+        for number in range((_DAYS.index(last or first or "sun") - day) % 7 + 1):
+            start = (day + number) % 7 * _DAY_MIN + begin_min
+            parts.append((start, start + ((end_min - begin_min) % _DAY_MIN or _DAY_MIN)))
     return Hours(tuple(parts))
 
 
-def _parts(piece: str) -> Iterator[tuple[int, int]]:
-    match = _HOURS.fullmatch(piece)
-    if match is None or not piece:
-        raise ValueError(_RIGHT_HOURS)
-    first, last = match["first"] or "mon", match["last"] or match["first"] or "sun"
-    if first not in _DAYS or last not in _DAYS:
-        raise ValueError(_RIGHT_HOURS)
-    begin, end = (
-        (0, _DAY_MIN)
-        if match["h1"] is None
-        else (_minutes(match["h1"], match["m1"]), _minutes(match["h2"], match["m2"]))
-    )
-    if begin in (end, _DAY_MIN):
-        raise ValueError(_RIGHT_HOURS)
-    day, count = _DAYS.index(first), (_DAYS.index(last) - _DAYS.index(first)) % 7 + 1
-    for number in range(day, day + count):
-        start = number % 7 * _DAY_MIN + begin
-        yield start, start + ((end - begin) % _DAY_MIN or _DAY_MIN)
-
-
-def _minutes(hours: str, minutes: str) -> int:
-    total = 60 * int(hours) + int(minutes)
-    if int(minutes) > 59 or total > _DAY_MIN:
-        raise ValueError(_RIGHT_HOURS)
-    return total
+def _minutes(text: str) -> int:
+    hours, minutes = text.split(":")
+    return 60 * int(hours) + int(minutes)
 
 
 def check_rules(rules: Sequence[AlarmRule], others: Sequence[AlarmRule] = ()) -> None:

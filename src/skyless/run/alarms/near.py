@@ -1,7 +1,9 @@
-"""Which tags are near each other, kept up as they move: the work is in proportion to the tags that have moved."""
+"""Which tags are near each other."""
 
 import math
-from collections.abc import Container
+from collections import defaultdict
+from collections.abc import Container, Mapping
+from itertools import product
 from typing import Final
 
 from skyless.run.mqtt.messages import Vector
@@ -11,95 +13,31 @@ STOREY_M: Final = 2.5
 heights are known less well than the rest, and one tag may be on a helmet and the other on a fork."""
 
 _FARTHEST_M: Final = 1e6
-
-Pair = tuple[str, str]
-
-
-class NearTags:
-    """Pairs of tags that are within a distance, one of them of the first list and the other of the second."""
-
-    def __init__(self, limit_m: float, hysteresis_m: float, first: Container[str], second: Container[str]) -> None:
-        """A pair that is near stays near until its distance reaches ``limit_m + hysteresis_m``."""
-        self.distances_m: dict[Pair, float] = {}
-        """The pairs that are near, each in the order of the names."""
-        self._limit_m, self._reach_m = limit_m, limit_m + hysteresis_m
-        self._first, self._second = first, second
-        self._where: dict[str, tuple[tuple[int, int], Vector]] = {}
-        self._cells: dict[tuple[int, int], set[str]] = {}
-        self._partners: dict[str, set[str]] = {}
-
-    def move(self, name: str, position_m: Vector) -> tuple[list[Pair], list[Pair]]:
-        """The pairs that begin and end to be near with a tag's new position."""
-        x, y, _ = position_m
-        if name not in self._first and name not in self._second:
-            return [], []
-        if not (abs(x) < _FARTHEST_M and abs(y) < _FARTHEST_M):
-            return [], self.remove(name)
-        cell = math.floor(x / self._reach_m), math.floor(y / self._reach_m)
-        before = self._where.get(name)
-        self._where[name] = cell, position_m
-        if before is None or before[0] != cell:
-            if before is not None:
-                self._leave(name, before[0])
-            self._cells.setdefault(cell, set()).add(name)
-        partners = self._partners.get(name, set())
-        near = self._near(name, cell, position_m, partners)
-        began = [_pair(name, other) for other in near if other not in partners]
-        ended = [_pair(name, other) for other in partners if other not in near]
-        for other, distance_m in near.items():
-            self.distances_m[_pair(name, other)] = distance_m
-            if other not in partners:
-                self._partners.setdefault(name, set()).add(other)
-                self._partners.setdefault(other, set()).add(name)
-        self._separate(ended)
-        return began, ended
-
-    def remove(self, name: str) -> list[Pair]:
-        """Forget a tag's position. The pairs that have ended with it."""
-        before = self._where.pop(name, None)
-        if before is None:
-            return []
-        self._leave(name, before[0])
-        ended = [_pair(name, other) for other in self._partners.get(name, ())]
-        self._separate(ended)
-        return ended
-
-    @property
-    def names(self) -> list[str]:
-        """The tags whose positions are known."""
-        return list(self._where)
-
-    def _near(self, name: str, cell: tuple[int, int], position_m: Vector, partners: set[str]) -> dict[str, float]:
-        x, y, z = position_m
-        is_first, is_second = name in self._first, name in self._second
-        near = {}
-        for i in range(cell[0] - 1, cell[0] + 2):
-            for j in range(cell[1] - 1, cell[1] + 2):
-                for other in self._cells.get((i, j), ()):
-                    ox, oy, oz = self._where[other][1]
-                    distance_m = math.hypot(x - ox, y - oy)
-                    if (
-                        distance_m < (self._reach_m if other in partners else self._limit_m)
-                        and abs(z - oz) <= STOREY_M
-                        and other != name
-                        and ((is_first and other in self._second) or (is_second and other in self._first))
-                    ):
-                        near[other] = distance_m
-        return near
-
-    def _leave(self, name: str, cell: tuple[int, int]) -> None:
-        self._cells[cell].discard(name)
-        if not self._cells[cell]:
-            del self._cells[cell]
-
-    def _separate(self, pairs: list[Pair]) -> None:
-        for one, other in pairs:
-            del self.distances_m[one, other]
-            for a, b in ((one, other), (other, one)):
-                self._partners[a].discard(b)
-                if not self._partners[a]:
-                    del self._partners[a]
+_AROUND: Final = tuple(product((-1, 0, 1), repeat=2))
 
 
-def _pair(a: str, b: str) -> Pair:
-    return (a, b) if a < b else (b, a)
+def near_tags(
+    positions_m: Mapping[str, Vector], first: Container[str], others: Container[str], reach_m: float
+) -> dict[tuple[str, str], float]:
+    """Distances of the pairs within ``reach_m``, one tag of ``first`` and one of ``others``, in the names' order."""
+    places = {
+        name: (math.floor(x / reach_m), math.floor(y / reach_m))
+        for name, (x, y, _) in positions_m.items()
+        if abs(x) < _FARTHEST_M and abs(y) < _FARTHEST_M
+    }
+    cells: defaultdict[tuple[int, int], list[str]] = defaultdict(list)
+    for name, place in places.items():
+        if name in others:
+            cells[place].append(name)
+    near = {}
+    for name, (i, j) in places.items():
+        if name not in first:
+            continue
+        x, y, z = positions_m[name]
+        for di, dj in _AROUND:
+            for other in cells.get((i + di, j + dj), ()):
+                other_x, other_y, other_z = positions_m[other]
+                distance_m = math.hypot(x - other_x, y - other_y)
+                if distance_m < reach_m and abs(z - other_z) <= STOREY_M and other != name:
+                    near[(name, other) if name < other else (other, name)] = distance_m
+    return near
