@@ -42,11 +42,15 @@ def counters(rng, noise, seconds, rate_hz=50.0):
     return [(int(one), int(other)) for one, other in zip(*ticks, strict=True)]
 
 
+def add(pairs, tx, rx, pair=1):
+    pairs.add("r", pair, tx % (1 << 40), rx % (1 << 40), rx / TICK_RATE_HZ)
+
+
 def pairs_of(rng, noise, seconds, many=12):
     pairs = CounterPairs()
     for pair in range(many):
         for tx, rx in counters(rng, noise, seconds):
-            pairs.add("r", pair, tx % (1 << 40), rx % (1 << 40))
+            add(pairs, tx, rx, pair)
     return pairs
 
 
@@ -54,7 +58,7 @@ def test_the_deviation_is_that_of_allantools():
     stamps = counters(np.random.default_rng(1), NoiseSite(), 120.0, rate_hz=10.0)
     pairs = CounterPairs()
     for tx, rx in stamps:
-        pairs.add("r", 1, tx % (1 << 40), rx % (1 << 40))
+        add(pairs, tx, rx)
     phase_s = np.array([(tx - rx) / TICK_RATE_HZ for tx, rx in stamps])
     for tau_s in (0.5, 4.0):
         (_, (expected,), _, _) = allantools.adev(phase_s, rate=10.0, data_type="phase", taus=[tau_s])
@@ -83,8 +87,17 @@ def test_a_counter_that_restarts_begins_again():
     pairs = CounterPairs()
     for start in (0, 12345 * SECOND):
         for step in range(200):
-            pairs.add("r", 1, (start + step * SECOND // 10) % (1 << 40), step * SECOND // 10 + start // 7)
+            pairs.add("r", 1, (start + step * SECOND // 10) % (1 << 40), step * SECOND // 10 + start // 7, step / 10.0)
     assert pairs.deviation(0.5)[0] < 1e-12
+
+
+def test_a_pair_begins_again_after_a_gap_in_which_its_counters_have_turned():
+    pairs = CounterPairs()
+    for start_s in (0, 40):
+        for step in range(100):
+            rx = start_s * SECOND + step * SECOND // 10
+            add(pairs, rx + rx * 7 // 1_000_000, rx)
+    assert pairs.deviation(0.5)[0] < 1e-9
 
 
 # The computer

@@ -42,7 +42,7 @@ class SiteProbe:
         for stamp in message.stamps:
             if first_s != now_s:  # those of the first message came before the time that is counted
                 self._stamps[anchor, stamp.anchor] += 1
-            self._pairs.add(f"{anchor}/{message.run}", stamp.anchor, stamp.tx_ticks, stamp.rx_ticks)
+            self._pairs.add(f"{anchor}/{message.run}", stamp.anchor, stamp.tx_ticks, stamp.rx_ticks, now_s)
 
     def sample(self) -> None:
         """Gather what the view has now, and ask again for stamps."""

@@ -126,8 +126,7 @@ class SiteView:
             (topics.fix_topic(number, "+"), FixMessage, self._on_fix),
             (topics.status_topic(number, "+", "+"), StatusMessage, lambda m: self.evidence.add_status(m, clock())),
             (topics.health_topic(number, "tag", "+"), TagHealth, lambda m: self._on_health("tag", m.tag, m)),
-            (topics.health_topic(number, "anchor", "+"), AnchorHealth,
-             lambda m: self._on_health("anchor", str(m.anchor), m)),
+            (topics.health_topic(number, "anchor", "+"), AnchorHealth, self._on_anchor),
             (topics.health_topic(number, "ether", "+"), EtherHealth, lambda m: self._on_health("ether", "air", m)),
             (topics.assets_topic(number), AssetsMessage, lambda m: setattr(self, "_assets", m)),
             (topics.watch_topic(number), WatchMessage, self._on_watch),
@@ -152,6 +151,9 @@ class SiteView:
         now_s = self._clock()
         if self.evidence.roster.admits("tag", fix.tag):
             self._fixes[fix.tag] = fix, now_s - self.evidence.add_fix(fix, now_s)
+
+    def _on_anchor(self, health: AnchorHealth) -> None:
+        self._on_health("anchor", str(health.anchor), health)
 
     def _on_health(self, kind: str, name: str, health: TagHealth | AnchorHealth | EtherHealth) -> None:
         self.evidence.add_health(kind, name, health, self._clock(), self._wall_clock())

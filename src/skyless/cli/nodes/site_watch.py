@@ -35,7 +35,7 @@ def watch(*, broker: MqttOptions, site_id: SiteId | None = None, json: bool = Fa
     site_id
         Number of the site; by default the one whose programs are online.
     json
-        Write the picture as one JSON object.
+        Write one JSON object instead of text.
     """
     from skyless.run.process import run
 

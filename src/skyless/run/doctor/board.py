@@ -1,5 +1,6 @@
 """Checks of a board on a serial port: it listens as a tag, and what it receives is judged."""
 
+import time
 from collections import Counter
 
 from skyless.core.air.frame import Malformed
@@ -43,7 +44,7 @@ class BoardProbe:
         beacon = decode_any(reception.frame)
         if not isinstance(beacon, Malformed):
             self._heard[beacon.anchor] += 1
-            self._pairs.add(self.radio.name, beacon.anchor, beacon.tx_ticks, reception.rx_ticks)
+            self._pairs.add(self.radio.name, beacon.anchor, beacon.tx_ticks, reception.rx_ticks, time.monotonic())
 
     def checks(self, noise: NoiseSite) -> tuple[Check, ...]:
         """What was found."""
