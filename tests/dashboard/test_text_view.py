@@ -16,8 +16,6 @@ from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import (
     AlarmMessage,
     AnchorHealth,
-    Asset,
-    AssetsMessage,
     Counters,
     TagHealth,
 )
@@ -105,7 +103,6 @@ def test_the_condition_is_that_of_the_page(trouble, view, live, wire, times):
 
 
 def test_a_tag_without_fixes_comes_first_and_its_age_is_in_words(view, times):
-    view.link.deliver(topics.assets_topic(SITE_ID), AssetsMessage((Asset("t2", "Forklift 3"),), SITE.site.name))
     for _ in range(4):
         all_is_well(view.link.deliver, times)
         times.move(0.5)
@@ -115,11 +112,11 @@ def test_a_tag_without_fixes_comes_first_and_its_age_is_in_words(view, times):
         times.move(1.0)
     view.evaluate()
     stale, fresh = view.picture().tags
-    assert (stale.tag, stale.state, stale.name, stale.health.reason) == ("t2", "no fix", "Forklift 3", "no-beacons")
+    assert (stale.tag, stale.state, stale.health.reason) == ("t2", "no fix", "no-beacons")
     assert stale.age_s == pytest.approx(4.5, abs=0.01)
     assert (fresh.state, fresh.fix.anchors) == ("fix", (1, 2, 3, 4))
     shown = lines(view.picture())
-    (row,) = [line for line in shown if line.startswith("Forklift 3 (t2)")]
+    (row,) = [line for line in shown if line.startswith("t2 ")]
     assert "no fix for 4 s" in row or "no fix for 5 s" in row
     assert "no-beacons" in row
     assert "tags (2)" in "".join(shown)
@@ -130,12 +127,6 @@ def test_nothing_is_fresh_without_the_broker(view, times):
     connect(view, False)
     view.evaluate()
     assert {row.state for row in view.picture().tags} == {"no fix"}
-
-
-def test_assets_of_another_site_with_this_number_are_not_shown(view, times):
-    view.link.deliver(topics.assets_topic(SITE_ID), AssetsMessage((Asset("t1", "Crane"),), "elsewhere"))
-    all_is_well(view.link.deliver, times)
-    assert {row.name for row in view.picture().tags} == {""}
 
 
 def test_alarms_that_nobody_has_seen_come_first_and_go_with_their_topic(view):
@@ -163,7 +154,7 @@ def test_an_anchor_that_is_silent_comes_first(view, times):
 @settings(max_examples=25)
 @given(st.integers(0, 60), st.integers(0, 60), st.integers(0, 20), st.integers(80, 200), st.integers(24, 60))
 def test_a_picture_fits_and_says_how_many_it_leaves_out(tags, anchors, alarms, width, height):
-    rows = tuple(TagRow(f"tag{n}", "fix", "", 0.0, fix()) for n in range(tags))
+    rows = tuple(TagRow(f"tag{n}", "fix", 0.0, fix()) for n in range(tags))
     picture = replace(
         QUIET,
         tags=rows,
@@ -186,7 +177,7 @@ def test_a_picture_fits_and_says_how_many_it_leaves_out(tags, anchors, alarms, w
 def test_long_names_and_figures_keep_their_columns_at_80(times):
     far = fix(position_m=(1234.56, -987.65, 12.34), std_m=0.123, hpl_m=1.5, anchors=tuple(range(24)),
               alert="detected-not-excluded")  # fmt: skip
-    row = TagRow("tag123456", "fix", "The forklift of goods in", 0.0, far, tag_health("", times, updates_per_s=345.0))
+    row = TagRow("tag-of-the-forklift-of-goods-in", "fix", 0.0, far, tag_health("", times, updates_per_s=345.0))
     line = lines(replace(QUIET, tags=(row,)))[2]
     for figure in ("1234.56", "-987.65", "12.34", "12.3", "150.0", "345", "24", "0.0 s", "FAULT"):
         assert f" {figure}" in line
@@ -195,7 +186,7 @@ def test_long_names_and_figures_keep_their_columns_at_80(times):
 @given(st.text())
 def test_nothing_from_the_network_controls_the_terminal(text):
     assert plain(text).isprintable()
-    picture = replace(QUIET, site=text, tags=(TagRow(text, "fix", text),), trouble=text)
+    picture = replace(QUIET, site=text, tags=(TagRow(text, "fix"),), trouble=text)
     assert all(line.isprintable() for line in lines(picture))
 
 

@@ -19,7 +19,7 @@ from skyless.cli.nodes._site_view import site_number
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.link import Link
-from skyless.run.mqtt.messages import AlarmMessage, Asset, AssetsMessage, Counters, FixMessage, SiteMessage, TagHealth
+from skyless.run.mqtt.messages import AlarmMessage, Counters, FixMessage, SiteMessage, TagHealth
 from skyless.sim.lab import lab_site
 from support.loops import in_loop
 from support.processes import SKYLESS, usual_signals
@@ -63,7 +63,6 @@ async def published_site(folder):
         alarm = AlarmMessage("r/t1", "r", "Rule", "inside", "critical", "t1", 1.0, 1.0, "Crane is in the cold store")
         for topic, message in (
             (topics.site_topic(9), SiteMessage(SITE, simulated=True, unix_s=time.time())),
-            (topics.assets_topic(9), AssetsMessage((Asset("t1", "Crane"),), SITE.name)),
             (topics.alarm_topic(9, "r", "t1"), alarm),
         ):
             link.publish(topic, message, qos=1, retain=True)
@@ -120,12 +119,12 @@ async def test_a_site_is_shown_in_a_pipe_as_json_and_on_a_terminal(tmp_path):
     picture = json.loads(line.splitlines()[-1])
     assert (picture["site"], picture["number"], picture["trouble"]) == (SITE.name, 9, None)
     (tag,) = picture["tags"]
-    assert (tag["name"], tag["state"], tag["fix"]["position_m"]) == ("Crane", "fix", [1.25, 2.5, 0.0])
+    assert (tag["tag"], tag["state"], tag["fix"]["position_m"]) == ("t1", "fix", [1.25, 2.5, 0.0])
     assert len(picture["anchors"]) == 6
     assert picture["drops"] == {"bad-fcs": 3}
     assert picture["alarms"][0]["sentence"] == "Crane is in the cold store"
     assert json_code == text_code == (1 if picture["condition"]["level"] == "bad" else 0)
-    (row,) = [line for line in text.splitlines() if line.startswith("Crane (t1)")]
+    (row,) = [line for line in text.splitlines() if line.startswith("t1 ")]
     assert "1.25" in row
     assert "drops bad-fcs 3" in text
     assert code == 0

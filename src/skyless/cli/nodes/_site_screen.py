@@ -105,8 +105,7 @@ def _tag(row: TagRow) -> list[Text]:
     why = _text(_ALERTS.get(alert, ""), "bold red" if ALERTS.get(alert, 0) > 1 else "yellow")
     if not fresh:
         why = _text((health.reason if health is not None else None) or "", "dim")
-    name = f"{row.name} ({row.tag})" if row.name else row.tag
-    return [_text(name, style), *(_text(one, style) for one in figures), age, why]
+    return [_text(row.tag, style), *(_text(one, style) for one in figures), age, why]
 
 
 def _anchor(row: AnchorRow) -> list[Text]:

@@ -25,7 +25,6 @@ from skyless.run.mqtt.messages import (
     NOT_DROPS,
     AlarmMessage,
     AnchorHealth,
-    AssetsMessage,
     EtherHealth,
     FixMessage,
     SiteMessage,
@@ -47,8 +46,6 @@ class TagRow(Struct, frozen=True):
 
     tag: str
     state: Literal["fix", "no fix", "offline"]
-    name: str = ""
-    """What people call it; empty: it has no asset."""
     age_s: float | None = None
     """Since the last frame of the newest fix; None before the first."""
     fix: FixMessage | None = None
@@ -117,7 +114,6 @@ class SiteView:
         self.condition = self._monitor.evaluate(clock())
         self.site: SiteMessage | None = None
         self._fixes: dict[str, tuple[FixMessage, float]] = {}  # with the time at which its last frame ended
-        self._assets = AssetsMessage(())
         self._alarms: dict[str, AlarmMessage] = {}
         self._watch: tuple[WatchMessage, float] | None = None  # with the time at which it was made
         self._wrong = 0
@@ -128,7 +124,6 @@ class SiteView:
             (topics.health_topic(number, "tag", "+"), TagHealth, lambda m: self._on_health("tag", m.tag, m)),
             (topics.health_topic(number, "anchor", "+"), AnchorHealth, self._on_anchor),
             (topics.health_topic(number, "ether", "+"), EtherHealth, lambda m: self._on_health("ether", "air", m)),
-            (topics.assets_topic(number), AssetsMessage, lambda m: setattr(self, "_assets", m)),
             (topics.watch_topic(number), WatchMessage, self._on_watch),
         ):  # fmt: skip
             link.subscribe(topic, reader(kind, handle, self._on_wrong))
@@ -220,9 +215,6 @@ class SiteView:
         )
 
     def _tag_rows(self, tags: list[tuple[str, Node]], now_s: float) -> tuple[TagRow, ...]:
-        names: dict[str, str] = {}
-        if self.site is not None and self._assets.site in ("", self.site.site.name):
-            names = {asset.tag: asset.name for asset in self._assets.assets}
         rows = []
         for tag, node in tags:
             has_fix = self.evidence.connected and node.has_fix(now_s)
@@ -231,7 +223,7 @@ class SiteView:
             state: Literal["fix", "no fix", "offline"] = "fix" if has_fix else "no fix"
             state = "offline" if node.online is False else state
             age_s = None if fix is None else now_s - ended_s
-            rows.append(TagRow(tag, state, names.get(tag, ""), age_s, fix, health))
+            rows.append(TagRow(tag, state, age_s, fix, health))
         return tuple(sorted(rows, key=_tag_rank))
 
 
@@ -247,9 +239,9 @@ def _anchor_row(name: str, node: Node, now_s: float) -> AnchorRow:
     return AnchorRow(name, state, None if health is None else now_s - node.health_s, health)
 
 
-def _tag_rank(row: TagRow) -> tuple[int, str]:
+def _tag_rank(row: TagRow) -> int:
     alert = None if row.fix is None else row.fix.alert
-    return {"no fix": 0, "fix": 3 - ALERTS.get(alert, 0), "offline": 4}[row.state], row.name
+    return {"no fix": 0, "fix": 3 - ALERTS.get(alert, 0), "offline": 4}[row.state]
 
 
 def _alarm_rank(alarm: AlarmMessage) -> tuple[bool, int, float]:

@@ -5,7 +5,7 @@ import contextlib
 import platform
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, get_args
 
@@ -114,7 +114,7 @@ async def _examine(
     file_site: "Site | None",
     seconds: float,
     progress: Callable[[float], None],
-) -> "tuple[Check, ...]":
+) -> "list[Check]":
     """All checks; ``progress`` is called with the seconds that have gone."""
     from skyless.cli.nodes._site_probe import SiteProbe
     from skyless.cli.nodes._site_view import LINK_NAME, SiteView, site_number
@@ -126,30 +126,26 @@ async def _examine(
     from skyless.run.mqtt.link import Link
     from skyless.run.process import every, together
 
-    found = (*port_checks(), clock_check())
+    checks = [*port_checks(), clock_check()]
     probes = [BoardProbe(radio, site_id) for radio in boards]
-    work: list[Awaitable[None]] = [probe.run() for probe in probes]
     site: SiteProbe | None = None
-    if broker is None:
-        found += (Check("broker", "not checked", "No broker was asked for."),)
-    else:
-        try:
+    try:
+        if broker is not None:
             number = await site_number(broker, min(_FIND_S, seconds)) if site_id is None else site_id
             link = Link(broker, LINK_NAME, site=number, kind="doctor")
             site = SiteProbe(SiteView(link, number, used_share=ProcessorUse().share))
-            work.append(site.view.run(None, site.sample))
-        except SkylessError as error:
-            advice = "Start the broker and the site's programs, or give --mqtt or --mqtt none."
-            found += (Check("site", "failed", f"{error}.", advice),)
+    except SkylessError as error:
+        advice = "Start the broker and the site's programs, or give --mqtt or --mqtt none."
+        checks.append(Check("site", "failed", f"{error}.", advice))
+    work = [probe.run() for probe in probes] + ([] if site is None else [site.view.run(None, site.sample)])
     began_s = time.monotonic()
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(seconds if work else 0.0):
             await together(*work, every(1.0, lambda: progress(time.monotonic() - began_s)))
-    on_broker = None if site is None or site.view.site is None else site.view.site.site
-    known = file_site or on_broker
+    known = file_site or (None if site is None or site.view.site is None else site.view.site.site)
     for probe in probes:
-        found += probe.checks(NoiseSite() if known is None else known.noise)
-    return found if site is None else (*found, *site.checks(file_site))
+        checks += probe.checks(NoiseSite() if known is None else known.noise)
+    return checks if site is None else [*checks, *site.checks(file_site)]
 
 
 def _report(checks: "Sequence[Check]") -> str:
