@@ -11,6 +11,7 @@ from rich.console import Console
 from skyless.cli.common.output import plain
 from skyless.cli.nodes._site_screen import drawn
 from skyless.cli.nodes._site_view import AnchorRow, Picture, SiteView, TagRow
+from skyless.page.condition._reasons import Reason
 from skyless.page.condition.monitor import Condition
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import (
@@ -139,6 +140,12 @@ def test_alarms_that_nobody_has_seen_come_first_and_go_with_their_topic(view):
     assert [one.subject for one in view.picture().alarms] == ["c", "a"]
     assert view.picture().wrong_messages == 1
     assert "alarms (2)" in lines(view.picture())
+
+
+def test_reasons_that_are_not_shown_are_counted():
+    reasons = tuple(Reason(f"kind{n}", "warning", f"trouble {n}", f"advice {n}") for n in range(5))
+    shown = lines(replace(QUIET, condition=replace(GOOD, level="warning", text="trouble 0", reasons=reasons)))
+    assert shown[1:6] == ["trouble 0", "trouble 1", "trouble 2", "and 2 more", "advice 0"]
 
 
 def test_an_anchor_that_is_silent_comes_first(view, times):

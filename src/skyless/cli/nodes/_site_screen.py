@@ -30,6 +30,8 @@ def drawn(picture: Picture, height: int = sys.maxsize) -> RenderableType:
     condition, alarms, anchors = picture.condition, picture.alarms, picture.anchors
     reasons = condition.reasons
     head = [_title(picture), *(_text(one.text, _COLOURS[one.level]) for one in reasons[:_MAX_REASONS])]
+    if len(reasons) > _MAX_REASONS:
+        head.append(_text(f"and {len(reasons) - _MAX_REASONS} more", "dim"))
     if reasons or condition.text:
         head.append(_text(reasons[0].advice if reasons else condition.text))
     foot = [_text("drops " + (", ".join(f"{why} {count}" for why, count in picture.drops.items()) or "none"))]
