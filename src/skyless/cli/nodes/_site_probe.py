@@ -7,7 +7,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from typing import Final
 
-from skyless.cli.nodes._site_view import LINK_NAME, SiteView
+from skyless.cli.nodes._site_view import GONE, LINK_NAME, SiteView
 from skyless.core.geometry import RADIO_REACH_M
 from skyless.core.protocols import beacon_period_s
 from skyless.core.site import Site, site_digest
@@ -52,7 +52,7 @@ class SiteProbe:
             if reason.kind not in self._found or result == "failed":
                 self._found[reason.kind] = Check(f"site: {reason.kind}", result, _sentence(reason.text), reason.advice)
         for anchor in picture.anchors:
-            if anchor.health is not None:
+            if anchor.health is not None and anchor.state not in GONE:
                 self._missed.setdefault(anchor.anchor, []).append(anchor.health.missed_share)
         self._fixes.extend(tag.fix for tag in picture.tags if tag.fix is not None and tag.state == "fix")
         request = RequestMessage(LINK_NAME, (), _LEASE_S, stamps=True)

@@ -12,7 +12,7 @@ from skyless.cli.nodes.options import MqttOptions, SiteId
 from skyless.core.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.cli.nodes._site_view import Picture, SiteView
+    from skyless.cli.nodes._site_view import Picture
     from skyless.run.mqtt.address import MqttAddress
 
 _FIND_S: Final = 5.0
@@ -68,12 +68,7 @@ async def _watch(address: "MqttAddress", site_id: int | None, pictures: "list[Pi
     view = SiteView(Link(address, LINK_NAME, site=site_id, kind="watch"), site_id, used_share=ProcessorUse().share)
     if once:
         await view.run(_PICTURE_S, lambda: pictures.append(view.picture()))
-    else:
-        await _show(view)
-
-
-async def _show(view: "SiteView") -> None:
-    """Draw on the terminal's other screen until cancelled."""
+        return
     from rich.live import Live
 
     from skyless.cli.nodes._site_screen import drawn
