@@ -48,6 +48,8 @@ DEMO = "tests/cli/test_demo_command.py::"
 KEYED = "tests/nodes/test_no_key_leaves.py::test_no_key_leaves_the_programs"
 SITE = "tests/nodes/test_running_site.py::test_a_site_rides_through_the_death_and_the_freezing_of_every_process"
 BOARD = "tests/nodes/test_boards_live.py::"
+WATCH = "tests/nodes/test_site_watch.py::test_a_site_is_shown_in_a_pipe_as_json_and_on_a_terminal"
+DOCTOR = "tests/nodes/test_doctor.py::"
 BROKER = "tests/nodes/test_broker.py::"
 ROLES = "tests/nodes/test_site_with_roles.py::"
 MQTT = "tests/cli/test_node_commands.py::test_the_demo_tells_how_to_watch_its_broker"
@@ -64,6 +66,12 @@ ELSEWHERE = {
     ),
     "skyless demo --site hall.toml --tags 3": DEMO
     + "test_programs_that_die_are_started_again_and_ctrl_c_ends_all_with_a_summary",
+    "skyless watch": WATCH,
+    "skyless watch --mqtt mqtts://page@hall.example": WATCH,
+    "skyless watch --json": WATCH,
+    "skyless doctor": DOCTOR,
+    "skyless doctor --site hall.toml --report hall.md": DOCTOR,
+    "skyless doctor --radio serial:/dev/ttyACM0 --mqtt none --duration 30": DOCTOR,
     "skyless broker": BROKER + "test_it_leaves_no_orphan_however_it_ends",
     "skyless ether --site hall.toml --tags 2": SITE,
     "skyless anchor 1 2 3 4 5 6 --site hall.toml": SITE,

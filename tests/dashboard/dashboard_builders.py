@@ -73,9 +73,11 @@ class Wire:
     """In the place of a link: keeps what is published, and echoes it as a broker does."""
 
     unread_s = 0.0
+    trouble = None
 
     def __init__(self):
         self.address = MqttAddress("broker", 1)
+        self.on_state = []
         self.published = []
         self.forgotten = []
         self.handlers = {}

@@ -1,40 +1,28 @@
 """``skyless doctor``: each check against something that is well and something that is not."""
 
 import asyncio
+import contextlib
 import json
 import os
-import time
 
 import allantools
 import numpy as np
 import pytest
 from live_nodes import LiveSite
-from mqtt_brokers import Embedded, until
+from mqtt_brokers import until
 
 from skyless.cli.main import main
+from skyless.cli.nodes.doctor import _report
 from skyless.core.constants import TICK_RATE_HZ
-from skyless.core.errors import SkylessError
-from skyless.core.native.library import UNCOMPILED_VARIABLE
 from skyless.core.site import NoiseSite
 from skyless.radio.serial.pseudo_terminal import Pty
 from skyless.radio.serial.serial_radio import SerialRadio
 from skyless.run.doctor import host
 from skyless.run.doctor.board import BoardProbe
-from skyless.run.doctor.check import Check, report
+from skyless.run.doctor.check import Check
 from skyless.run.doctor.clocks import CounterPairs, assumed_deviation, counters_check
-from skyless.run.doctor.program import Examination, examine
-from skyless.run.mqtt import topics
-from skyless.run.mqtt.link import Link
-from skyless.run.mqtt.messages import AnchorHealth, Counters, SiteMessage, Stamp, StampsMessage, TagHealth
-from skyless.sim.lab import lab_site
-from support.loops import in_loop
 
-NO_LINK = Counters(0, 0, 0)
 SECOND = round(TICK_RATE_HZ)
-
-
-def by_name(checks):
-    return {check.name: check for check in checks}
 
 
 # Clocks
@@ -54,11 +42,15 @@ def counters(rng, noise, seconds, rate_hz=50.0):
     return [(int(one), int(other)) for one, other in zip(*ticks, strict=True)]
 
 
+def add(pairs, tx, rx, pair=1):
+    pairs.add("r", pair, tx % (1 << 40), rx % (1 << 40), rx / TICK_RATE_HZ)
+
+
 def pairs_of(rng, noise, seconds, many=12):
     pairs = CounterPairs()
     for pair in range(many):
         for tx, rx in counters(rng, noise, seconds):
-            pairs.add("r", pair, tx % (1 << 40), rx % (1 << 40))
+            add(pairs, tx, rx, pair)
     return pairs
 
 
@@ -66,7 +58,7 @@ def test_the_deviation_is_that_of_allantools():
     stamps = counters(np.random.default_rng(1), NoiseSite(), 120.0, rate_hz=10.0)
     pairs = CounterPairs()
     for tx, rx in stamps:
-        pairs.add("r", 1, tx % (1 << 40), rx % (1 << 40))
+        add(pairs, tx, rx)
     phase_s = np.array([(tx - rx) / TICK_RATE_HZ for tx, rx in stamps])
     for tau_s in (0.5, 4.0):
         (_, (expected,), _, _) = allantools.adev(phase_s, rate=10.0, data_type="phase", taus=[tau_s])
@@ -95,17 +87,20 @@ def test_a_counter_that_restarts_begins_again():
     pairs = CounterPairs()
     for start in (0, 12345 * SECOND):
         for step in range(200):
-            pairs.add("r", 1, (start + step * SECOND // 10) % (1 << 40), step * SECOND // 10 + start // 7)
+            pairs.add("r", 1, (start + step * SECOND // 10) % (1 << 40), step * SECOND // 10 + start // 7, step / 10.0)
     assert pairs.deviation(0.5)[0] < 1e-12
 
 
+def test_a_pair_begins_again_after_a_gap_in_which_its_counters_have_turned():
+    pairs = CounterPairs()
+    for start_s in (0, 40):
+        for step in range(100):
+            rx = start_s * SECOND + step * SECOND // 10
+            add(pairs, rx + rx * 7 // 1_000_000, rx)
+    assert pairs.deviation(0.5)[0] < 1e-9
+
+
 # The computer
-
-
-def test_this_computer_is_checked_without_failing():
-    checks = host.host_checks()
-    assert {"Python", "estimator", "clock", "processors", "disk"} <= by_name(checks).keys()
-    assert all(check.finding.endswith(".") for check in checks)
 
 
 def test_ports_that_may_not_be_opened_are_told_with_what_to_type(tmp_path, monkeypatch):
@@ -118,53 +113,35 @@ def test_ports_that_may_not_be_opened_are_told_with_what_to_type(tmp_path, monke
     assert "sudo usermod -aG " in shut.advice
 
 
-def test_an_estimator_that_is_not_compiled_is_a_warning(monkeypatch):
-    assert host._library().result == "ok"
-    monkeypatch.setenv(UNCOMPILED_VARIABLE, "1")
-    assert host._library().result == "warning"
-    monkeypatch.delenv(UNCOMPILED_VARIABLE)
+@pytest.mark.parametrize(("state", "result"), [(0, "ok"), (5, "warning"), (-1, "not checked")])
+def test_the_clock_is_as_the_system_says(state, result, monkeypatch):
+    assert host.clock_check().result in ("ok", "warning", "not checked")
 
-    def missing():
-        raise SkylessError("the estimator's library: no such file")
-
-    monkeypatch.setattr(host, "library", missing)
-    assert host._library().result == "failed"
-
-
-@pytest.mark.parametrize(("state", "status", "result"), [(0, 0, "ok"), (5, 0x40, "warning"), (-1, 0, "not checked")])
-def test_the_clock_is_as_the_system_says(state, status, result, monkeypatch):
     class System:
         @staticmethod
         def adjtimex(timex):
-            timex._obj.status, timex._obj.maxerror = status, 2500
+            timex[24:32] = (2500).to_bytes(8, "little")
             return state
 
     monkeypatch.setattr(host.ctypes, "CDLL", lambda *_, **__: System)
-    assert host.clock_check().result == result
+    check = host.clock_check()
+    assert check.result == result
+    assert ("2.5 ms" in check.finding) == (result == "ok")
 
 
-def test_little_space_is_told(tmp_path, monkeypatch):
-    assert host.disk_check(tmp_path).result in ("ok", "warning")
-    for free, result in ((5e8, "warning"), (5e7, "failed"), (5e9, "ok")):
-        monkeypatch.setattr(host.shutil, "disk_usage", lambda _, free=free: type("Use", (), {"free": free}))
-        assert host.disk_check(tmp_path).result == result
-
-
-def test_a_report_has_what_failed_first_and_breaks_no_table():
-    checks = [Check("a", "ok", "fine."), Check("b", "failed", "x | y\nz.", "do it")]
-    text = report(checks, "title")
-    rows = [line for line in text.splitlines() if line.startswith("| ")]
-    assert rows[1:] == ["| b | failed | x \\| y z. | do it |", "| a | ok | fine. |  |"]
-    assert "1 ok, 0 warning, 1 failed, 0 not checked" in text
+def test_a_report_has_what_failed_first_and_nothing_that_controls_a_terminal():
+    text = _report([Check("a", "ok", "fine."), Check("b", "failed", "x\n\x1b[2Jy.", "do it")])
+    assert text.splitlines()[5:] == ["- failed: b: x��[2Jy.", "  do it", "- ok: a: fine."]
+    assert "1 failed, 0 warning, 0 not checked, 1 ok" in text
 
 
 # Boards
 
 
 def examined_board(path, seconds):
-    radio = SerialRadio(str(path), 1_000_000, path.name)
-    probe = BoardProbe(radio, None)
-    asyncio.run(probe.run(seconds))
+    probe = BoardProbe(SerialRadio(str(path), 1_000_000, path.name), None)
+    with contextlib.suppress(TimeoutError):
+        asyncio.run(asyncio.wait_for(probe.run(), seconds))
     return probe.checks(NoiseSite())
 
 
@@ -178,10 +155,12 @@ def test_a_port_that_is_not_there_is_told_and_so_is_a_device_of_another_kind(tmp
         terminal = Pty(tmp_path / "gps")
         terminal.start(lambda _: None)
         probe = BoardProbe(SerialRadio(str(tmp_path / "gps"), 9600, "gps"), None)
-        listening = asyncio.ensure_future(probe.run(4.5))
-        while not listening.done():
-            terminal.send(b"$GPGGA,1\r\n\0")
-            await asyncio.sleep(0.1)
+        listening = asyncio.ensure_future(probe.run())
+        async with asyncio.timeout(20.0):
+            while "wrong baud rate?" not in probe.checks(NoiseSite())[0].finding:
+                terminal.send(b"$GPGGA,1\r\n\0")
+                await asyncio.sleep(0.1)
+        listening.cancel()
         return probe.checks(NoiseSite())
 
     (check,) = asyncio.run(play())
@@ -197,7 +176,9 @@ def test_a_board_at_a_running_site_is_well(tmp_path):
                 site.anchor(number, site.air)
             site.plug_in("tag1")
             probe = BoardProbe(SerialRadio(str(tmp_path / "tag1"), 1_000_000, "tag1"), None)
-            await probe.run(8.0)
+            listening = asyncio.ensure_future(probe.run())
+            await until(lambda: probe.checks(NoiseSite())[1:2] and probe.checks(NoiseSite())[1].result == "ok", 30.0)
+            listening.cancel()
             return probe.checks(NoiseSite())
 
     board, reception, clock = asyncio.run(play())
@@ -205,79 +186,6 @@ def test_a_board_at_a_running_site_is_well(tmp_path):
     assert "serial link" in board.finding
     assert "6 anchors" in reception.finding
     assert clock.result in ("ok", "warning", "not checked")
-
-
-# A running site
-
-
-def site_messages(now_s, missing=(), late_share=0.0, reason=None):
-    """One second of a small site of six anchors and a tag."""
-    for number in range(1, 7):
-        if number in missing:
-            continue
-        yield topics.health_topic(9, "anchor", number), AnchorHealth(
-            number, now_s, 9.0, "anchor", None, None, True, None, None, None, 1, 0, 1, None, {}, {}, NO_LINK, "free",
-            late_share,
-        )  # fmt: skip
-        ticks = round(now_s * TICK_RATE_HZ) % (1 << 40)
-        stamps = tuple(Stamp(other, ticks, ticks) for other in range(1, 7) if other != number)
-        yield topics.stamps_topic(9, number), StampsMessage(number, "run", now_s, stamps)
-    yield (
-        topics.health_topic(9, "tag", "t1"),
-        TagHealth("t1", now_s, 9.0, "joint", 100, 1, 50.0, reason, 0.1, None, None, {}, NO_LINK, 0.1, 1, ()),
-    )
-
-
-async def examined_site(tmp_path, asked_site=None, **wrong):
-    site = lab_site()
-    site = type(site)(**{name: getattr(site, name) for name in site.__struct_fields__} | {"id": 9})
-    broker = Embedded(tmp_path)
-    await broker.start()
-    link = Link(broker.address, "air", site=9, kind="ether")
-    running = asyncio.ensure_future(link.run())
-
-    async def publish():
-        while True:
-            for topic, message in site_messages(time.time(), **wrong):
-                link.publish(topic, message)
-            await asyncio.sleep(0.2)
-
-    try:
-        await until(lambda: link.connected)
-        link.publish(topics.site_topic(9), SiteMessage(site, simulated=True, unix_s=time.time()), qos=1, retain=True)
-        publishing = asyncio.ensure_future(publish())
-        progress = []
-        asked = Examination(4.0, broker=broker.address, site=asked_site or site)
-        checks = await examine(asked, lambda _: None, progress.append)
-        publishing.cancel()
-        assert progress == sorted(progress)
-        return by_name(checks)
-    finally:
-        running.cancel()
-        await asyncio.gather(running, return_exceptions=True)
-        await broker.stop()
-
-
-@pytest.mark.site
-@in_loop
-async def test_a_site_that_is_well(tmp_path):
-    found = await examined_site(tmp_path)
-    wanted = ("broker", "site", "anchors", "transmissions", "tags", "tags' computers")
-    assert {name: found[name].result for name in wanted} == dict.fromkeys(wanted, "ok")
-    assert found["reception"].result in ("warning", "failed")  # five beacons a second of each are far too few
-    assert "simulated" in found["site"].finding
-
-
-@pytest.mark.site
-@in_loop
-async def test_a_site_with_faults(tmp_path):
-    found = await examined_site(tmp_path, lab_site(), missing=(6,), late_share=0.3, reason="no-almanac")
-    results = {name: found[name].result for name in ("anchors", "transmissions", "tags", "broker", "site")}
-    assert results == {
-        "anchors": "failed", "transmissions": "warning", "tags": "failed", "broker": "ok", "site": "warning",
-    }  # fmt: skip
-    assert "missing: 6" in found["anchors"].finding
-    assert "t1 (no-almanac)" in found["tags"].finding
 
 
 # The command
@@ -290,8 +198,8 @@ def test_the_command_writes_a_report_and_its_exit_code_says_whether_anything_fai
     code = main(command)
     found = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert code == (1 if found["failed"] else 0)
-    assert {check["name"] for check in found["checks"]} >= {"Python", "broker"}
-    assert file.read_text(encoding="utf-8").startswith("# skyless doctor, ")
+    assert {check["name"] for check in found["checks"]} >= {"clock"}
+    assert file.read_text(encoding="utf-8").startswith("# skyless doctor ")
     assert main(command) == 2
     assert "--force overwrites it" in capsys.readouterr().err
     missing = ["doctor", "--radio", f"serial:{tmp_path}/ttyACM0", "--mqtt", "none", "--duration", "0.5"]
@@ -322,5 +230,5 @@ def test_a_broker_that_is_not_there_fails(capsys):
     command = ["doctor", "--mqtt", "mqtt://127.0.0.1:1", "--site-id", "4", "--duration", "1", "--json"]
     assert main(command) == 1
     found = {one["name"]: one for one in json.loads(capsys.readouterr().out)["checks"]}
-    assert (found["broker"]["result"], found["site"]["result"]) == ("failed", "failed")
+    assert found["broker"]["result"] == "failed"
     assert "Connection refused" in found["broker"]["finding"]

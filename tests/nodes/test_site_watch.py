@@ -6,6 +6,7 @@ import fcntl
 import json
 import os
 import pty
+import signal
 import struct
 import termios
 import time
@@ -14,9 +15,11 @@ import msgspec
 import pytest
 from mqtt_brokers import Embedded, until
 
+from skyless.cli.nodes._site_view import site_number
+from skyless.core.errors import SkylessError
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.link import Link
-from skyless.run.mqtt.messages import AlarmMessage, Asset, AssetsMessage, Counters, FixMessage, SiteMessage, TagHealth
+from skyless.run.mqtt.messages import AlarmMessage, Counters, FixMessage, SiteMessage, TagHealth
 from skyless.sim.lab import lab_site
 from support.loops import in_loop
 from support.processes import SKYLESS, usual_signals
@@ -60,7 +63,6 @@ async def published_site(folder):
         alarm = AlarmMessage("r/t1", "r", "Rule", "inside", "critical", "t1", 1.0, 1.0, "Crane is in the cold store")
         for topic, message in (
             (topics.site_topic(9), SiteMessage(SITE, simulated=True, unix_s=time.time())),
-            (topics.assets_topic(9), AssetsMessage((Asset("t1", "Crane"),), SITE.name)),
             (topics.alarm_topic(9, "r", "t1"), alarm),
         ):
             link.publish(topic, message, qos=1, retain=True)
@@ -83,10 +85,9 @@ async def said(*arguments):
 
 
 async def on_a_terminal(address):
-    """What is drawn on a terminal of 80 columns until q ends it, and the exit code."""
+    """What is drawn on a terminal of 80 columns until Ctrl-C ends it, and the exit code."""
     host, terminal = pty.openpty()
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
-    before = termios.tcgetattr(terminal)
     process = await asyncio.create_subprocess_exec(
         *SKYLESS, "watch", "--mqtt", address, stdin=terminal, stdout=terminal, stderr=asyncio.subprocess.DEVNULL,
         env=os.environ | {"TERM": "xterm", "COLUMNS": "", "LINES": ""}, preexec_fn=usual_signals(),
@@ -95,11 +96,10 @@ async def on_a_terminal(address):
     asyncio.get_running_loop().add_reader(host, lambda: drawn.extend(os.read(host, 65536)))
     try:
         await until(lambda: b"Crane" in drawn and b"cold store" in drawn, 60.0)
-        os.write(host, b"q")
+        process.send_signal(signal.SIGINT)
         async with asyncio.timeout(20.0):
             code = await process.wait()
         await until(lambda: b"\x1b[?1049l" in drawn)
-        assert termios.tcgetattr(terminal) == before
     finally:
         asyncio.get_running_loop().remove_reader(host)
         with contextlib.suppress(ProcessLookupError):
@@ -112,19 +112,19 @@ async def on_a_terminal(address):
 @in_loop
 async def test_a_site_is_shown_in_a_pipe_as_json_and_on_a_terminal(tmp_path):
     async with published_site(tmp_path) as address:
-        once = ("watch", "--mqtt", address, "--once")
+        once = ("watch", "--mqtt", address)
         (text_code, text), (json_code, line), (code, drawn) = await asyncio.gather(
             said(*once), said(*once, "--json", "--site-id", "9"), on_a_terminal(address)
         )
     picture = json.loads(line.splitlines()[-1])
     assert (picture["site"], picture["number"], picture["trouble"]) == (SITE.name, 9, None)
     (tag,) = picture["tags"]
-    assert (tag["name"], tag["state"], tag["position_m"], tag["anchors"]) == ("Crane", "fix", [1.25, 2.5, 0.0], 3)
+    assert (tag["tag"], tag["state"], tag["fix"]["position_m"]) == ("t1", "fix", [1.25, 2.5, 0.0])
     assert len(picture["anchors"]) == 6
     assert picture["drops"] == {"bad-fcs": 3}
     assert picture["alarms"][0]["sentence"] == "Crane is in the cold store"
     assert json_code == text_code == (1 if picture["condition"]["level"] == "bad" else 0)
-    (row,) = [line for line in text.splitlines() if line.startswith("Crane (t1)")]
+    (row,) = [line for line in text.splitlines() if line.startswith("t1 ")]
     assert "1.25" in row
     assert "drops bad-fcs 3" in text
     assert code == 0
@@ -136,7 +136,7 @@ async def test_a_broker_without_a_site_is_told(tmp_path):
     broker = Embedded(tmp_path)
     await broker.start()
     try:
-        code, out = await said("watch", "--mqtt", str(broker.address), "--once")
+        with pytest.raises(SkylessError, match="no program of a site is online"):
+            await site_number(broker.address, 0.5)
     finally:
         await broker.stop()
-    assert (code, out) == (2, "")

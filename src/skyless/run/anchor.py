@@ -25,6 +25,7 @@ from skyless.run.keys.node_keys import KEYS_S, AnchorKeys, AnchorReport, recent_
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
+    NOT_DROPS,
     AnchorHealth,
     Counters,
     Leases,
@@ -60,8 +61,6 @@ STAMPS_INTERVAL_S: Final = 0.2
 
 MAX_PENDING_STAMPS: Final = 4096
 """Where nobody collects stamps, the oldest are dropped and counted."""
-
-_NOT_DROPS: Final = frozenset({"heard", "sent", "takeover"})
 
 _ROLES: Final[dict[Role, Literal["master", "anchor", "listening"]]] = {
     Role.MASTER: "master",
@@ -191,7 +190,7 @@ class AnchorNode:
     def check_reception(self, now_s: float) -> None:
         """Log where to look if it receives nothing usable. ``now_s`` is the host's monotonic clock."""
         counters = self.machine.counters
-        drops = Counter({reason: count for reason, count in counters.items() if reason not in _NOT_DROPS})
+        drops = Counter({reason: count for reason, count in counters.items() if reason not in NOT_DROPS})
         self.monitor.check(now_s, self._received, counters["heard"], drops + self.radio.counters)
 
     def check_codes(self, unix_s: float, now_s: float) -> None:

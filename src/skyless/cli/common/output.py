@@ -85,6 +85,11 @@ def cm(value_m: float | None) -> str:
     return number(value_m, "{:.2f} cm", 100.0)
 
 
+def plain(text: str) -> str:
+    """A text from the network without characters that would control the terminal."""
+    return "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in text)
+
+
 @contextmanager
 def new_table(path: Path) -> Iterator[TextIO]:
     """A table to be written row by row, which replaces an old one when the block ends: whole or not at all.

@@ -1,73 +1,59 @@
-"""The text view of a site: a picture of it in a given number of columns and lines."""
+"""The text view of a site: a picture of it in a given number of lines."""
 
+import sys
 import time
-from typing import Final
+from collections.abc import Callable, Sequence
+from typing import Final, TypeVar
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from skyless.cli.nodes._site_view import AnchorRow, Picture, TagRow
+from skyless.cli.common.output import number, plain
+from skyless.cli.nodes._site_view import GONE, AnchorRow, Picture, TagRow
 from skyless.page.condition.evidence import ALERTS, FRESH_S
 from skyless.run.mqtt.messages import AlarmMessage
 
 _COLOURS: Final = {"good": "bold green", "waiting": "bold cyan", "warning": "bold yellow", "bad": "bold red"}
-_ALERTS: Final = {
+_ALERTS: Final[dict[str | None, str]] = {
     "detected-excluded": "excluded",
     "detected-not-excluded": "FAULT",
     "alert-limit-exceeded": "LIMIT",
 }
 _MAX_REASONS: Final = 3
-_WIDE: Final = 100
 _MIN_ROWS: Final = 3
-"""Rows that tags, anchors and alarms have each where there is little space, the last saying how many more there are."""
+_T = TypeVar("_T")
 
 
-def drawn(picture: Picture, width: int, height: int, last_line: str = "") -> RenderableType:
-    """The whole picture in ``width`` columns and ``height`` lines; ``last_line`` is the last warning."""
-    head = [_title(picture), *_reasons(picture)]
-    foot = [_line("drops ", ", ".join(f"{why} {count}" for why, count in picture.drops.items()) or "none")]
+def drawn(picture: Picture, height: int = sys.maxsize) -> RenderableType:
+    """The picture in ``height`` lines. What does not fit is counted in the last row of its table."""
+    condition, alarms, anchors = picture.condition, picture.alarms, picture.anchors
+    reasons = condition.reasons
+    head = [_title(picture), *(_text(one.text, _COLOURS[one.level]) for one in reasons[:_MAX_REASONS])]
+    if len(reasons) > _MAX_REASONS:
+        head.append(_text(f"and {len(reasons) - _MAX_REASONS} more", "dim"))
+    if reasons or condition.text:
+        head.append(_text(reasons[0].advice if reasons else condition.text))
+    foot = [_text("drops " + (", ".join(f"{why} {count}" for why, count in picture.drops.items()) or "none"))]
     if picture.wrong_messages:
-        foot.append(_line("unreadable messages ", str(picture.wrong_messages), "yellow"))
-    if last_line:
-        foot.append(_line("log ", last_line, "yellow"))
-    counts = [len(picture.alarms), len(picture.tags), len(picture.anchors)]
-    headings = 2 + bool(counts[0])
-    most = _shares(counts, max(height - len(head) - len(foot) - headings, 0))
-    parts: list[RenderableType] = list(head)
-    if picture.alarms:
-        parts += [
-            _line("", f"alarms ({counts[0]})", "bold"),
-            *_fitted([_alarm(one) for one in picture.alarms], most[0]),
-        ]
-    return Group(*parts, _tags(picture, most[1], width), _anchors(picture, most[2], width), *foot)
-
-
-def summary(picture: Picture) -> str:
-    """One line, for where there is no terminal."""
-    with_fix = sum(row.state == "fix" for row in picture.tags)
-    heard = sum(row.state not in ("silent", "offline") for row in picture.anchors)
-    waiting = sum(one.acknowledged_unix_s is None for one in picture.alarms)
-    condition = picture.condition.level + (f" ({picture.condition.text})" if picture.condition.text else "")
-    return plain(
-        f"{time.strftime('%H:%M:%S', time.localtime(picture.unix_s))} {condition}; {with_fix} of {len(picture.tags)} "
-        f"tags with a fix; {heard} of {len(picture.anchors)} anchors; {waiting} of {len(picture.alarms)} alarms "
-        f"not acknowledged; broker {picture.trouble or 'connected'}"
-    )
-
-
-def plain(text: str) -> str:
-    """A text from the network without characters that would control the terminal."""
-    return "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in text)
-
-
-def _line(label: str, words: str, style: str = "") -> Text:
-    return Text.assemble((label, "dim"), (plain(words), style), no_wrap=True, overflow="ellipsis")
+        foot.append(_text(f"unreadable messages {picture.wrong_messages}", "yellow"))
+    rows = height - len(head) - len(foot) - 2 - bool(alarms)
+    most_alarms = min(len(alarms), max(rows // 4, rows - len(picture.tags) - len(anchors), _MIN_ROWS))
+    rows -= most_alarms
+    most_anchors = min(len(anchors), max(rows // 3, rows - len(picture.tags), _MIN_ROWS))
+    return Group(
+        *head,
+        *([_table("alarms", (), alarms, most_alarms, _alarm)] if alarms else ()),
+        _table("tags", ("x/m", "y/m", "z/m", "σ/cm", "HPL/cm", "Hz", "from", "age", ""), picture.tags,
+               rows - most_anchors, _tag),
+        _table("anchors", ("role", "hears", "report", "missed"), anchors, most_anchors, _anchor),
+        *foot,
+    )  # fmt: skip
 
 
 def _title(picture: Picture) -> Text:
     level, trouble = picture.condition.level, picture.trouble
-    line = _line("", f"{picture.site or 'no site yet'} (site {picture.number})", "bold")
+    line = _text(f"{picture.site or 'no site yet'} (site {picture.number})", "bold")
     line.append(" simulated" if picture.simulated else "", "dim")
     line.append(f"  {level}  ", _COLOURS[level])
     line.append(time.strftime("%H:%M:%S  ", time.localtime(picture.unix_s)))
@@ -75,114 +61,64 @@ def _title(picture: Picture) -> Text:
     return line
 
 
-def _reasons(picture: Picture) -> list[Text]:
-    condition = picture.condition
-    lines = [_line("", reason.text, _COLOURS[reason.level]) for reason in condition.reasons]
-    if not condition.reasons:
-        return [_line("", condition.text)] if condition.text else []
-    return [*_fitted(lines, _MAX_REASONS), _line("", condition.reasons[0].advice)]
+def _text(words: str, style: str = "") -> Text:
+    return Text(plain(words), style, no_wrap=True, overflow="ellipsis")
 
 
-def _alarm(alarm: AlarmMessage) -> Text:
+def _table(
+    name: str, columns: tuple[str, ...], items: Sequence[_T], most: int, cells: Callable[[_T], list[Text]]
+) -> Table:
+    """At most ``most`` rows. Columns of figures keep their width; the first column and an unnamed last one give way."""
+    table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, header_style="dim")
+    table.add_column(Text(f"{name} ({len(items)})", "bold"))
+    for title in columns:
+        table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))
+    shown = len(items) if len(items) <= most else max(most - 1, 0)
+    for item in items[:shown]:
+        table.add_row(*cells(item))
+    if shown < len(items):
+        table.add_row(Text(f"and {len(items) - shown} more", "dim"))
+    return table
+
+
+def _alarm(alarm: AlarmMessage) -> list[Text]:
     seen = alarm.acknowledged_unix_s is not None
-    since = time.strftime("%H:%M:%S ", time.localtime(alarm.since_unix_s))
+    since = time.strftime("%H:%M:%S", time.localtime(alarm.since_unix_s))
     ended = " (ended)" if alarm.ended_unix_s is not None else ""
     by = f" (seen by {alarm.acknowledged_by})" if seen else ""
-    return _line(since, f"{alarm.severity} {alarm.sentence}{ended}{by}", "dim" if seen else "bold red")
-
-
-def _shares(counts: list[int], rows: int) -> list[int]:
-    """How many rows each list may have, alarms, tags and anchors: ``_MIN_ROWS``, and tags most of what is left."""
-    shares = [min(count, _MIN_ROWS) for count in counts]
-    left = max(rows - sum(shares), 0)
-    for index, most in ((0, left // 4), (2, left // 3), (1, left), (2, left), (0, left)):
-        more = min(counts[index] - shares[index], most, left)
-        shares[index], left = shares[index] + more, left - more
-    return shares
-
-
-def _fitted(rows: list[Text], most: int) -> list[Text]:
-    return rows if len(rows) <= most else [*rows[: most - 1], _line("", f"and {len(rows) - most + 1} more", "dim")]
-
-
-def _tags(picture: Picture, most: int, width: int) -> Table:
-    numbers = ("x/m", "y/m", "z/m", "σ/cm", "HPL/cm", "Hz", "from")
-    table = _table(f"tags ({len(picture.tags)})", numbers, width)
-    for name in ("age", "alert", "zone"):
-        table.add_column(Text(name), no_wrap=name != "zone")
-    return _filled(table, [_tag(row) for row in picture.tags[:most]], len(picture.tags), most)
-
-
-def _filled(table: Table, rows: list[list[Text]], count: int, most: int) -> Table:
-    """The table with at most ``most`` of its ``count`` rows, the last of which says how many more there are."""
-    if count > most:
-        rows = [*rows[: max(most - 1, 0)], [Text(f"and {count - max(most - 1, 0)} more", "dim")]]
-    for row in rows:
-        table.add_row(*row)
-    return table
+    return [_text(f"{since} {alarm.severity} {alarm.sentence}{ended}{by}", "dim" if seen else "bold red")]
 
 
 def _tag(row: TagRow) -> list[Text]:
     """The cells of a tag. What is not of now is dim, and its age is in words, in red."""
-    fresh = row.state == "fix"
+    fix, health, fresh = row.fix, row.health, row.state == "fix"
     style = "" if fresh else "dim"
-    x, y, z = ("–",) * 3 if row.position_m is None else (f"{value:.2f}" for value in row.position_m)
-    figures = (x, y, z, _cm(row.std_m), _cm(row.hpl_m), _whole(row.updates_per_s), str(row.anchors or "–"))
-    name = plain(f"{row.name} ({row.tag})" if row.name else row.tag)
-    if fresh:
-        age = Text(f"{max(row.age_s or 0.0, 0.0):.1f} s")
-    elif row.state == "offline":
-        age = Text("offline", "dim")
-    else:
-        age = Text("no fix" if row.age_s is None else f"no fix for {duration(row.age_s)}", "bold red")
-    alert = _ALERTS.get(row.alert, "") if fresh else ""
-    words = plain(", ".join(row.zones)) if fresh else plain(row.reason)
-    colour = "bold red" if ALERTS.get(row.alert, 0) > 1 else "yellow"
-    return [_cut(name, style), *(Text(one, style) for one in figures), age, Text(alert, colour), _cut(words, style)]
-
-
-def _anchors(picture: Picture, most: int, width: int) -> Table:
-    table = _table(f"anchors ({len(picture.anchors)})", ("role", "hears", "report", "missed"), width)
-    return _filled(table, [_anchor(row) for row in picture.anchors[:most]], len(picture.anchors), most)
+    figures = ["–"] * 7
+    if fix is not None:
+        lengths = (number(value, "{:.1f}", 100.0) for value in (fix.std_m, fix.hpl_m))
+        rate = number(None if health is None else health.updates_per_s, "{:.0f}")
+        figures = [*(f"{value:.2f}" for value in fix.position_m), *lengths, rate, str(len(fix.anchors))]
+    age = _text(f"{max(row.age_s or 0.0, 0.0):.1f} s")
+    if row.state == "offline":
+        age = _text("offline", "dim")
+    elif not fresh:
+        age = _text("no fix" if row.age_s is None else f"no fix for {row.age_s:.0f} s", "bold red")
+    alert = fix.alert if fix is not None and fresh else None
+    why = _text(_ALERTS.get(alert, ""), "bold red" if ALERTS.get(alert, 0) > 1 else "yellow")
+    if not fresh:
+        why = _text((health.reason if health is not None else None) or "", "dim")
+    return [_text(row.tag, style), *(_text(one, style) for one in figures), age, why]
 
 
 def _anchor(row: AnchorRow) -> list[Text]:
-    gone = row.state in ("silent", "offline")
+    health, gone = row.health, row.state in GONE
     style = "dim" if gone else ""
-    age = "–" if row.age_s is None else f"{duration(row.age_s)} ago"
     old = row.age_s is not None and row.age_s > FRESH_S
-    missed = "–" if row.missed_share is None else f"{100.0 * row.missed_share:.0f} %"
-    hears = "–" if row.hears is None else str(row.hears)
+    hears, missed = "–", "–"
+    if health is not None:
+        hears = str(sum(heard_s < FRESH_S for heard_s in health.heard_age_s.values()))
+        missed = f"{health.missed_share:.0%}"
     return [
-        _cut(plain(row.anchor), style), Text(row.state, "bold red" if gone else ""), Text(hears, style),
-        Text(age, "bold red" if old else style), Text(missed, style),
+        _text(row.anchor, style), _text(row.state, "bold red" if gone else ""), _text(hears, style),
+        _text(number(row.age_s, "{:.0f} s ago"), "bold red" if old else style), _text(missed, style),
     ]  # fmt: skip
-
-
-def _table(first: str, columns: tuple[str, ...], width: int) -> Table:
-    """A table whose columns of numbers keep their width; names are cut, and the last column where there is no space."""
-    gap, most = (2, 28) if width >= _WIDE else (1, 15)
-    table = Table(box=None, padding=(0, gap, 0, 0), header_style="dim", pad_edge=False)
-    table.add_column(Text(first, "bold"), no_wrap=True, overflow="ellipsis", max_width=most)
-    for name in columns:
-        table.add_column(Text(name), justify="right", no_wrap=True)
-    return table
-
-
-def _cut(words: str, style: str = "") -> Text:
-    return Text(words, style, no_wrap=True, overflow="ellipsis")
-
-
-def duration(seconds: float) -> str:
-    """A time for people, in whole units that have passed: 4 s, 12 min, 3 h."""
-    if seconds < 120.0:
-        return f"{int(seconds)} s"
-    return f"{int(seconds / 60.0)} min" if seconds < 7200.0 else f"{int(seconds / 3600.0)} h"
-
-
-def _cm(value_m: float | None) -> str:
-    return "–" if value_m is None else f"{100.0 * value_m:.1f}" if value_m < 1.0 else f"{100.0 * value_m:.0f}"
-
-
-def _whole(value: float | None) -> str:
-    return "–" if value is None else f"{value:.0f}"

@@ -1,1 +1,1 @@
-"""``skyless doctor``: checks of a computer, its boards and a running site, and the report of them."""
+"""Checks of a computer and its boards, for ``skyless doctor``."""

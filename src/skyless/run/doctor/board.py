@@ -1,6 +1,6 @@
 """Checks of a board on a serial port: it listens as a tag, and what it receives is judged."""
 
-import asyncio
+import time
 from collections import Counter
 
 from skyless.core.air.frame import Malformed
@@ -16,62 +16,55 @@ from skyless.run.doctor.clocks import CounterPairs, counters_check
 from skyless.run.mqtt.messages import FixMessage
 from skyless.run.tag import TagNode, TagSettings
 
-_ADVICE_SILENT = "See whether anchors of the site are on the air, and the board's antenna is free."
-
 
 class BoardProbe:
     """Listens with one board."""
 
     def __init__(self, radio: SerialRadio, site: int | None) -> None:
         """``site`` is the number of the site that it is to hear; None for the first that is heard."""
-        self.radio, self._troubles = radio, list[str]()
+        self.radio = radio
+        self._troubles: dict[str, None] = {}  # without those that have been before
         self._hello: Hello | None = None
         self._heard: Counter[int] = Counter()
         self._fixes: list[FixMessage] = []
         self._pairs = CounterPairs()
         self._node = TagNode(TagSettings(site=site), radio, self._fixes.append, lambda _: None, self._note)
 
-    async def run(self, seconds: float) -> None:
-        """Listen for some time."""
-        try:
-            async with asyncio.timeout(seconds):
-                await self.radio.run(self._on_event)
-        except TimeoutError:
-            pass
+    async def run(self) -> None:
+        """Listen until cancelled."""
+        await self.radio.run(self._on_event)
 
     def _on_event(self, event: RadioEvent) -> None:
         self._hello = self.radio.hello or self._hello
-        if isinstance(event, Gone):
-            self._troubles.append(event.reason)
-        elif isinstance(event, Hint):
-            self._troubles.append(event.text)
+        if isinstance(event, Gone | Hint):
+            self._troubles[event.reason if isinstance(event, Gone) else event.text] = None
         self._node.on_event(event)
 
     def _note(self, _receiver: TagReceiver, reception: Reception, _fixes: int) -> None:
         beacon = decode_any(reception.frame)
         if not isinstance(beacon, Malformed):
             self._heard[beacon.anchor] += 1
-            self._pairs.add(self.radio.name, beacon.anchor, beacon.tx_ticks, reception.rx_ticks)
+            self._pairs.add(self.radio.name, beacon.anchor, beacon.tx_ticks, reception.rx_ticks, time.monotonic())
 
     def checks(self, noise: NoiseSite) -> tuple[Check, ...]:
         """What was found."""
-        name, hello = f"board {self.radio.name}", self._hello
+        name, hello, troubles = f"board {self.radio.name}", self._hello, "; ".join(self._troubles)
         if hello is None:
-            why = self._troubles[-1] if self._troubles else "the port could not be opened yet"
+            why = troubles or "the port could not be opened yet"
             return (Check(name, "failed", f"{why[0].upper()}{why[1:]}."),)
         version = ".".join(map(str, hello.firmware))
         abilities = "can send" if hello.can_transmit else "only listens"
         finding = f"Firmware {version}, version {hello.major}.{hello.minor} of the serial link; it {abilities}."
-        board = Check(name, "warning" if self._troubles else "ok", finding, "; ".join(dict.fromkeys(self._troubles)))
+        board = Check(name, "warning" if troubles else "ok", finding, troubles)
         return board, self._reception(f"{name}, reception"), counters_check(self._pairs, noise, f"{name}, clock")
 
     def _reception(self, name: str) -> Check:
         if not self._heard:
-            return Check(name, "failed", "It has received no beacon.", _ADVICE_SILENT)
+            advice = "See whether anchors of the site are on the air, and the board's antenna is free."
+            return Check(name, "failed", "It has received no beacon.", advice)
         drops = sum(self._node.drops.values())
         finding = f"{sum(self._heard.values())} beacons of {len(self._heard)} anchors, {drops} frames dropped"
         if not self._fixes:
-            return Check(
-                name, "warning", f"{finding}, no fix: {self._node.reason}.", "Listen for longer, or elsewhere."
-            )
+            finding = f"{finding}, no fix: {self._node.reason}."
+            return Check(name, "warning", finding, "Listen for longer, or elsewhere.")
         return residuals_check(name, f"{finding}, {len(self._fixes)} fixes", self._fixes)

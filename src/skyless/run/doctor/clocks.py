@@ -8,12 +8,12 @@ from skyless.core.site import NoiseSite
 from skyless.core.ticks import continued
 from skyless.run.doctor.check import Check
 
-_SHORT_S: Final = 0.5
-_LONG_S: Final = 4.0
+_TIMES_S: Final = (0.5, 4.0)
 _MIN_SAMPLES: Final = 30
 _STEP_TICKS: Final = round(0.05 / TICK_S)
 """Stamps of a pair that follow sooner are not needed."""
 _MAX_PAIRS: Final = 1000
+_MAX_GAP_S: Final = 8.0  # half a turn of the counters
 _TOO_NOISY: Final = 1.5
 """Measured over assumed. Pairs share counters, so that six anchors and 25 s give a ratio with a deviation of 0.15."""
 
@@ -23,13 +23,17 @@ class CounterPairs:
 
     def __init__(self) -> None:
         self._pairs: dict[tuple[str, int], list[tuple[int, int]]] = {}
+        self._added_s: dict[tuple[str, int], float] = {}
 
-    def add(self, receiver: str, sender: int, tx_ticks: int, rx_ticks: int) -> None:
+    def add(self, receiver: str, sender: int, tx_ticks: int, rx_ticks: int, now_s: float) -> None:
         """Add a frame, in order. After a restart of either counter, or a long gap, the pair begins again."""
         pair = receiver, sender
         if pair not in self._pairs and len(self._pairs) >= _MAX_PAIRS:
             return
         stamps = self._pairs.setdefault(pair, [])
+        gap_s, self._added_s[pair] = now_s - self._added_s.get(pair, now_s), now_s
+        if gap_s > _MAX_GAP_S:
+            stamps.clear()
         if stamps:
             last_tx, last_rx = stamps[-1]
             elapsed = (rx_ticks - last_rx) % (1 << 40)
@@ -69,19 +73,15 @@ def assumed_deviation(noise: NoiseSite, tau_s: float) -> float:
 
 def counters_check(pairs: CounterPairs, noise: NoiseSite, name: str) -> Check:
     """Whether the counters are as steady as the filters assume, at a short and at a long time."""
-    ratios = []
-    for tau_s in (_SHORT_S, _LONG_S):
-        measured, samples = pairs.deviation(tau_s)
-        if samples < _MIN_SAMPLES:
-            finding = f"Too few stamps for a time of {tau_s:g} s: {samples} samples of the {_MIN_SAMPLES} needed."
-            return Check(name, "not checked", finding, "Listen for longer with --duration.")
-        ratios.append(measured / assumed_deviation(noise, tau_s))
-    short, long_ = ratios
-    finding = (
-        f"Counters differ by {short:.2f} of what the site's noise figures allow over {_SHORT_S:g} s, "
-        f"and by {long_:.2f} over {_LONG_S:g} s."
-    )
-    if max(ratios) <= _TOO_NOISY:
+    measured = [pairs.deviation(tau_s) for tau_s in _TIMES_S]
+    samples = min(count for _, count in measured)
+    if samples < _MIN_SAMPLES:
+        finding = f"Too few stamps: {samples} samples of the {_MIN_SAMPLES} needed."
+        return Check(name, "not checked", finding, "Listen for longer with --duration.")
+    short, long_ = (one / assumed_deviation(noise, tau_s) for (one, _), tau_s in zip(measured, _TIMES_S, strict=True))
+    finding = "Counters differ by {:.2f} of what the site's noise figures allow over {:g} s, and by {:.2f} over {:g} s."
+    finding = finding.format(short, _TIMES_S[0], long_, _TIMES_S[1])
+    if max(short, long_) <= _TOO_NOISY:
         return Check(name, "ok", finding)
     if long_ >= short:
         advice = f"Set random_walk_fm in [noise] of the site file to {noise.random_walk_fm * long_:.1g}"

@@ -183,6 +183,10 @@ class TagHealth(Struct, frozen=True):
     """What is left in the tag's battery, from 0 to 1; None where it is not known."""
 
 
+NOT_DROPS: Final = frozenset({"heard", "sent", "takeover"})
+"""Counters of anchors that count something else than dropped frames."""
+
+
 class AnchorHealth(Struct, frozen=True):
     """An anchor's state, once a second."""
 
