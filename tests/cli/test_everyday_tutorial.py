@@ -83,7 +83,7 @@ def test_every_line_of_the_tutorial_runs(tmp_path):
         running.communicate()
     answers = {shlex.split(line)[2]: run(f'{line} --from "1 hour ago" --json', tmp_path) for line in others}
     answers = {name: json.loads(text.splitlines()[-1]) for name, text in answers.items()}
-    assert answers["track"]["fixes"] > 100
+    assert answers["track"]["track"]["fixes"] > 100
     assert {row["zone_name"] for row in answers["dwell"]["dwell"]} <= {"Goods in", "Store"}
     assert sum(row["seconds"] for row in answers["dwell"]["dwell"]) > 1.0
     (past,) = answers["alarms"]["alarms"]
