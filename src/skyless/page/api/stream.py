@@ -14,10 +14,10 @@ from starlette.exceptions import HTTPException
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyless.core.version import installed_version
-from skyless.page.api.answers import StreamQuery
-from skyless.page.api.call import ApiServices, names, read_query, site_of
+from skyless.page.api.parameters import Group, SiteQuery, TagNames, names, read_query
 from skyless.page.api.present import usable
 from skyless.page.live import LiveSite, NoSiteError
+from skyless.page.sites import LiveSites
 from skyless.run.mqtt.messages import AlarmMessage
 
 PERIOD_S: Final = 0.1
@@ -29,6 +29,13 @@ STREAM_TIMEOUT_S: Final = 10.0
 _POLICY_VIOLATION: Final = 1008
 _TRY_LATER: Final = 1013
 _MAX_REASON_BYTES: Final = 120  # of the 123 that the protocol allows
+
+
+class StreamQuery(SiteQuery, frozen=True):
+    """Which tags a stream is about."""
+
+    tags: TagNames = ""
+    group: Group = ""
 
 
 class SiteStream:
@@ -58,8 +65,8 @@ class SiteStream:
         messages = self._new_zone_events() + self._new_alarms()
         serial, self._fixes = self._fixes, self._live.state.serial
         if serial != self._fixes:
-            newest = self._live.state.fixes_after(serial)
-            found = usable(self._live, (given for given in newest if self._carries(given[0].tag)))
+            newest = self._live.recent_fixes(after=serial)
+            found = usable(given for given in newest if self._carries(given[0].tag))
             if found:
                 messages.insert(0, msgspec.json.encode({"type": "fixes", "fixes": found}))
         return messages
@@ -91,15 +98,15 @@ def _message(kind: str, value: Struct, **more: object) -> bytes:
     return msgspec.json.encode({"type": kind, **more, **msgspec.structs.asdict(value)})
 
 
-def endpoint(services: ApiServices) -> Callable[[WebSocket], Awaitable[None]]:
+def endpoint(sites: LiveSites) -> Callable[[WebSocket], Awaitable[None]]:
     """The WebSocket's handler."""
     open_streams: set[WebSocket] = set()
 
     async def serve(socket: WebSocket) -> None:
         await socket.accept()
         try:
-            query = read_query(socket.query_params, {}, StreamQuery)
-            live = site_of(services.sites, query)
+            query = read_query(socket.query_params, StreamQuery)
+            live = sites.of(query.site_text)
         except (HTTPException, NoSiteError) as error:
             reason = error.detail if isinstance(error, HTTPException) else str(error)
             await socket.close(_POLICY_VIOLATION, reason.encode()[:_MAX_REASON_BYTES].decode(errors="ignore"))
