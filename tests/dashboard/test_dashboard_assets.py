@@ -106,6 +106,27 @@ def test_the_file_is_written_with_each_change(start, file, wire):
     assert [path.name for path in file.parent.iterdir()] == ["assets.csv"]
 
 
+def test_assets_that_come_before_their_site_is_known_are_written(times, wire, file):
+    live = LiveSite(
+        "here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s, assets_file=AssetsFile(file)
+    )
+    live.attach(wire, SITE_ID)
+    wire.deliver(TOPIC, AssetsMessage((PALLET,), NAME))
+    assert not file.exists()
+    wire.deliver(topics.site_topic(SITE_ID), SITE)
+    assert read_csv(file.read_bytes()) == (PALLET,)
+
+
+def test_an_empty_list_of_the_broker_comes_before_the_file(start, file, wire, times):
+    file.write_bytes(write_csv([FORKLIFT]))
+    live = start(file)
+    wire.deliver(TOPIC, AssetsMessage((), NAME))
+    settle(live, times)
+    assert kept(wire) == []
+    assert read_csv(file.read_bytes()) == ()
+    assert read_csv((file.parent / "assets.csv.old").read_bytes()) == (FORKLIFT,)
+
+
 def test_a_file_that_cannot_be_written_costs_no_change(start, file, caplog):
     live = start(file)
     file.parent.rename(file.parent.with_name("gone"))
