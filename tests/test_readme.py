@@ -43,7 +43,7 @@ SHORTER = {
 }
 """Lines that take long, and what is run in their stead: less of the same."""
 
-HTTP = "tests/dashboard/test_http_doc.py::test_a_readers_token_and_a_table_that_is_kept"
+HTTP = "tests/dashboard/test_http_doc.py::test_clients_of_a_running_server"
 DEMO = "tests/cli/test_demo_command.py::"
 KEYED = "tests/nodes/test_no_key_leaves.py::test_no_key_leaves_the_programs"
 SITE = "tests/nodes/test_running_site.py::test_a_site_rides_through_the_death_and_the_freezing_of_every_process"

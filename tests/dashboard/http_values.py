@@ -115,7 +115,6 @@ def fake_history(patch):
     FakeHistory.release.clear()
     patch.setitem(sys.modules, "skyless.run.history.queries", SimpleNamespace(History=FakeHistory))
     patch.setitem(sys.modules, "skyless.run.history.times", SimpleNamespace(span_of=span_of))
-    patch.setattr("skyless.page.api.past.find_spec", lambda name: name)
 
 
 def fill(live, wire):
@@ -123,7 +122,7 @@ def fill(live, wire):
     site = replace(SITE, site=replace(SITE.site, georeference=HALL))
     wire.deliver(topics.site_topic(SITE_ID), site)
     live.store_zones((SQUARE,))
-    live.store_assets(ASSETS)
+    live.assets.store(ASSETS)
     for name in NAMES:
         show(live, wire, name)
     wire.deliver(topics.status_topic(SITE_ID, "tag", "t9"), status(name="t9"))
@@ -137,4 +136,4 @@ def fill(live, wire):
 
 def show(live, wire, name, x=2.0, **more):
     """A fix of a tag."""
-    wire.deliver(topics.fix_topic(SITE_ID, name), fix(name, live.unix_s, (x, 2.0, 1.0), **more))
+    wire.deliver(topics.fix_topic(SITE_ID, name), fix(name, live._wall_clock(), (x, 2.0, 1.0), **more))

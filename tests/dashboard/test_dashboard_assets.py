@@ -55,7 +55,7 @@ def test_pages_get_them_first_and_with_each_change(start, wire):
     live = start()
     page = live.open_page()
     assert json.loads(page._latest["assets"]) == {"type": "assets", "assets": []}
-    live.store_assets((FORKLIFT,))
+    live.assets.store((FORKLIFT,))
     assert json.loads(page._latest["assets"])["assets"][0]["name"] == "Forklift 1"
     assert kept(wire)[-1]["site"] == NAME
     wire.deliver(TOPIC, AssetsMessage((FORKLIFT,), NAME))  # the echo
@@ -68,7 +68,7 @@ def test_pages_get_them_first_and_with_each_change(start, wire):
 
 def test_what_is_on_its_way_is_not_undone_by_what_is_older(start, wire):
     live = start()
-    live.store_assets((FORKLIFT,))
+    live.assets.store((FORKLIFT,))
     wire.deliver(TOPIC, AssetsMessage((PALLET,), NAME))
     assert live.assets.by_tag == {"t1": FORKLIFT}
 
@@ -98,7 +98,7 @@ def test_what_the_broker_has_comes_before_the_file(start, file, wire, times):
 def test_the_file_is_written_with_each_change(start, file, wire):
     live = start(file)
     assert not file.exists()
-    live.store_assets((FORKLIFT, PALLET))
+    live.assets.store((FORKLIFT, PALLET))
     assert read_csv(file.read_bytes()) == (FORKLIFT, PALLET)
     wire.deliver(TOPIC, AssetsMessage((FORKLIFT, PALLET), NAME))
     wire.deliver(TOPIC, AssetsMessage((PALLET,), NAME))
@@ -106,10 +106,31 @@ def test_the_file_is_written_with_each_change(start, file, wire):
     assert [path.name for path in file.parent.iterdir()] == ["assets.csv"]
 
 
+def test_assets_that_come_before_their_site_is_known_are_written(times, wire, file):
+    live = LiveSite(
+        "here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s, assets_file=AssetsFile(file)
+    )
+    live.attach(wire, SITE_ID)
+    wire.deliver(TOPIC, AssetsMessage((PALLET,), NAME))
+    assert not file.exists()
+    wire.deliver(topics.site_topic(SITE_ID), SITE)
+    assert read_csv(file.read_bytes()) == (PALLET,)
+
+
+def test_an_empty_list_of_the_broker_comes_before_the_file(start, file, wire, times):
+    file.write_bytes(write_csv([FORKLIFT]))
+    live = start(file)
+    wire.deliver(TOPIC, AssetsMessage((), NAME))
+    settle(live, times)
+    assert kept(wire) == []
+    assert read_csv(file.read_bytes()) == ()
+    assert read_csv((file.parent / "assets.csv.old").read_bytes()) == (FORKLIFT,)
+
+
 def test_a_file_that_cannot_be_written_costs_no_change(start, file, caplog):
     live = start(file)
     file.parent.rename(file.parent.with_name("gone"))
-    live.store_assets((FORKLIFT,))
+    live.assets.store((FORKLIFT,))
     assert live.assets.by_tag == {"t1": FORKLIFT}
     assert "cannot be written" in caplog.text
 
@@ -130,7 +151,7 @@ def test_another_sites_are_neither_shown_nor_overwritten(start, wire, file):
     wire.deliver(TOPIC, AssetsMessage((FORKLIFT,), "another"))
     assert live.assets.by_tag == {}
     with pytest.raises(BadAssetsError, match="'another'"):
-        live.store_assets((PALLET,))
+        live.assets.store((PALLET,))
     assert kept(wire) == []
     assert not file.exists()
 
@@ -140,16 +161,16 @@ def test_what_cannot_be_read_is_not_overwritten(start, wire):
     wire.deliver(TOPIC, b'{"assets": [{"tag": "a b"}]}')
     assert live.dropped["assets"] == 1
     with pytest.raises(BadAssetsError, match="'a b'"):
-        live.store_assets((PALLET,))
+        live.assets.store((PALLET,))
     wire.deliver(TOPIC, b"")
-    live.store_assets((PALLET,))
+    live.assets.store((PALLET,))
 
 
 def test_assets_that_were_stored_before_the_broker_was_known(times):
     live = LiveSite("here", "mqtt://broker:1", SITE, lambda: times.now_s, lambda: times.unix_s)
-    live.store_assets((PALLET,), NAME)
+    live.assets.store((PALLET,), NAME)
     with pytest.raises(BadAssetsError, match="another"):
-        live.store_assets((FORKLIFT,), "another")
+        live.assets.store((FORKLIFT,), "another")
     wire = Wire()
     live.attach(wire, SITE_ID)
     assert [asset["tag"] for asset in kept(wire)[-1]["assets"]] == ["t2"]

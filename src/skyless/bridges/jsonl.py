@@ -37,13 +37,6 @@ class NoFixLine(Struct, frozen=True, tag="no_fix"):
     group: str | UnsetType = UNSET
 
 
-class _AssetFields(Struct, frozen=True, tag="fix"):
-    """What a line of a fix begins with."""
-
-    name: str | UnsetType = UNSET
-    group: str | UnsetType = UNSET
-
-
 class JsonLines(Encoder):
     """Encodes all that there is."""
 
@@ -62,16 +55,16 @@ class JsonLines(Encoder):
         return [self._site]
 
     def on_fix(self, fix: FixMessage) -> list[bytes]:
-        """A fix, with its type first."""
-        return [_encode(_AssetFields(*self._names(fix.tag)))[:-1] + b"," + _line(fix)[1:]]
+        """A fix, with its type and its asset's name first."""
+        return [_encode({"type": "fix", **self._names(fix.tag)})[:-1] + b"," + _line(fix)[1:]]
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> list[bytes]:
         """That there is none."""
-        return [_line(NoFixLine(tag, unix_s, reason, *self._names(tag)))]
+        return [_line(NoFixLine(tag, unix_s, reason, **self._names(tag)))]
 
-    def _names(self, tag: str) -> tuple[str | UnsetType, str | UnsetType]:
-        asset = self._assets.get(tag)
-        return (UNSET, UNSET) if asset is None else (asset.name or UNSET, asset.group or UNSET)
+    def _names(self, tag: str) -> dict[str, str]:
+        asset = self._assets.get(tag, Asset(tag))
+        return {key: value for key, value in (("name", asset.name), ("group", asset.group)) if value}
 
 
 def _line(value: Struct) -> bytes:

@@ -11,6 +11,7 @@ from skyless.cli.common.options import command
 from skyless.cli.common.output import print_json
 from skyless.cli.nodes.options import MqttOptions, SiteId, listen_address, site_named
 from skyless.core.errors import SkylessError
+from skyless.core.extras import extra_module
 
 if TYPE_CHECKING:
     from skyless.page.gathered import Gathered
@@ -95,14 +96,15 @@ def dashboard(
         raise SkylessError(f"--recordings is {str(recordings)!r}; it should be a folder")
     if history is not None and not history.is_dir():
         raise SkylessError(f"--history is {str(history)!r}; it should be a folder that skyless history writes")
+    if history is not None:
+        extra_module("duckdb", "--history")
     assets_file = None if assets is None else AssetsFile(assets)
-    past = Past(history)
     listening = _listening(listen)
     sock = bind(listening)
     port = sock.getsockname()[1]
     rules = _rules(sock.getsockname()[0], listening.host, port, token, reader_token)
     make = partial(
-        LiveSite, _client_name(port), str(address), used_share=ProcessorUse().share, has_history=past.fault is None
+        LiveSite, _client_name(port), str(address), used_share=ProcessorUse().share, has_history=history is not None
     )
     live = make(known, assets_file=assets_file)
     live.plans.update(images)
@@ -113,7 +115,8 @@ def dashboard(
     else:
         print(f"page    {page}\nbroker  {address}", flush=True)
     services = Services(
-        LiveSites(live, make), Overlays(), Playback(recordings), WhatIfs(), past, gathered=_gathered(nats, address)
+        *(LiveSites(live, make), Overlays(), Playback(recordings), WhatIfs(), Past(history)),
+        gathered=_gathered(nats, address),
     )
     with contextlib.suppress(KeyboardInterrupt):
         asyncio.run(serve(services, rules, sock, address, known.site.id if known is not None else site_id))
@@ -121,7 +124,6 @@ def dashboard(
 
 def _gathered(nats: str | None, broker: "MqttAddress") -> "Gathered | None":
     """The batches of a gather; None without a gather, of which nothing is loaded then. Raises SkylessError."""
-    from skyless.core.extras import extra_module
     from skyless.run.broker import nats_of
     from skyless.run.gather.address import nats_address
 

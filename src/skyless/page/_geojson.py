@@ -1,6 +1,6 @@
 """Tags, anchors and zones of a site as GeoJSON (RFC 7946), for programs that draw maps. No I/O."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from math import hypot, sqrt
 from typing import Final
 
@@ -11,8 +11,6 @@ from skyless.core.earth import geodetic
 from skyless.core.site import GeoreferenceSite
 from skyless.run.mqtt.messages import Asset, FixMessage, Vector
 from skyless.run.zones.zone_list import signed_area_m2
-
-MEDIA_TYPE: Final = "application/geo+json"
 
 OLDEST_S: Final = 5.0
 """A tag whose last fix is older is not on the map."""
@@ -28,7 +26,7 @@ def features(site: BridgedSite, fixes: Iterable[tuple[FixMessage, float]], unix_
         SkylessError: the site is not georeferenced.
     """
     origin = require_georeference(site, "/fixes.geojson")
-    collection: list[dict[str, object]] = []
+    found = []
     for fix, ended_unix_s in fixes:
         if not is_usable(fix):
             continue
@@ -46,33 +44,34 @@ def features(site: BridgedSite, fixes: Iterable[tuple[FixMessage, float]], unix_
             "method": fix.method,
             "alert": fix.alert,
         }
-        geometry = {"type": "Point", "coordinates": _coordinates(fix.position_m, origin)}
-        collection.append({"type": "Feature", "id": fix.tag, "geometry": geometry, "properties": properties})
-    return _encoded(collection)
+        found.append(_feature(fix.tag, "Point", _coordinates(fix.position_m, origin), properties))
+    return _encoded(found)
 
 
 def anchor_features(site: BridgedSite) -> bytes:
     """A FeatureCollection with a point for each anchor. Raises SkylessError: the site is not georeferenced."""
     origin = require_georeference(site, "GeoJSON")
-    collection: list[dict[str, object]] = []
-    for number, position_m in site.anchors_m.items():
-        geometry = {"type": "Point", "coordinates": _coordinates(position_m, origin)}
-        properties = {"anchor": number, "position_m": position_m}
-        collection.append({"type": "Feature", "id": number, "geometry": geometry, "properties": properties})
-    return _encoded(collection)
+    return _encoded(
+        _feature(number, "Point", _coordinates(position_m, origin), {"anchor": number, "position_m": position_m})
+        for number, position_m in site.anchors_m.items()
+    )
 
 
 def zone_features(site: BridgedSite) -> bytes:
     """A FeatureCollection with a polygon for each zone. Raises SkylessError: the site is not georeferenced."""
     origin = require_georeference(site, "GeoJSON")
-    collection: list[dict[str, object]] = []
+    found = []
     for zone in site.zones:
         corners = zone.polygon_m if signed_area_m2(zone.polygon_m) >= 0.0 else zone.polygon_m[::-1]
         ring = [_coordinates((x, y, 0.0), origin)[:2] for x, y in (*corners, corners[0])]
-        geometry = {"type": "Polygon", "coordinates": [ring]}
         properties = {"zone": zone.id, "name": zone.name, "colour": zone.colour}
-        collection.append({"type": "Feature", "id": zone.id, "geometry": geometry, "properties": properties})
-    return _encoded(collection)
+        found.append(_feature(zone.id, "Polygon", [ring], properties))
+    return _encoded(found)
+
+
+def _feature(name: str | int, kind: str, coordinates: object, properties: Mapping[str, object]) -> dict[str, object]:
+    geometry = {"type": kind, "coordinates": coordinates}
+    return {"type": "Feature", "id": name, "geometry": geometry, "properties": properties}
 
 
 def _coordinates(position_m: Vector, origin: GeoreferenceSite) -> list[float]:
@@ -81,5 +80,5 @@ def _coordinates(position_m: Vector, origin: GeoreferenceSite) -> list[float]:
     return [round(longitude_deg, 9), round(latitude_deg, 9), round(height_m, 4)]
 
 
-def _encoded(collection: list[dict[str, object]]) -> bytes:
-    return msgspec.json.encode({"type": "FeatureCollection", "features": collection})
+def _encoded(features: Iterable[dict[str, object]]) -> bytes:
+    return msgspec.json.encode({"type": "FeatureCollection", "features": list(features)})

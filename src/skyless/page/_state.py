@@ -158,14 +158,13 @@ class SiteState:
             for name in [name for name, known in healths.items() if now_s - known.received_s > EXPIRY_S]:
                 del healths[name]
 
-    def fixes_since(self, now_s: float, longest_s: float) -> list[tuple[FixMessage, float]]:
-        """The newest fix of each tag that came within the last ``longest_s``, and when it ended, by ``unix_s``."""
-        found = [tag for tag in self._tags.values() if now_s - tag.received_s <= longest_s]
-        return [(tag.fix, tag.ended_unix_s) for tag in found]
+    def fixes_since(self, now_s: float, longest_s: float, serial: int = 0) -> list[tuple[FixMessage, float]]:
+        """The newest fix of each tag that has one after a serial and within the last ``longest_s``.
 
-    def fixes_after(self, serial: int) -> list[tuple[FixMessage, float]]:
-        """The newest fix of each tag that has one after a serial, and when it ended, by ``unix_s``."""
-        return [(tag.fix, tag.ended_unix_s) for tag in self._tags.values() if tag.serial > serial]
+        Each is given with when it ended, by ``unix_s``.
+        """
+        newer = [tag for tag in self._tags.values() if tag.serial > serial and now_s - tag.received_s <= longest_s]
+        return [(tag.fix, tag.ended_unix_s) for tag in newer]
 
     @property
     def tags(self) -> Collection[str]:

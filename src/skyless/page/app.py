@@ -19,15 +19,13 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from skyless.core.errors import ConfigurationError, SkylessError
+from skyless.core.errors import ConfigurationError
 from skyless.core.site import Site
 from skyless.page._alarms import NoAlarmError
-from skyless.page._geojson import MEDIA_TYPE
 from skyless.page._site_survey import NoResultError
 from skyless.page._state import PageRequest
-from skyless.page.api.call import ApiServices
 from skyless.page.api.past import Past
-from skyless.page.api.routes import api_routes
+from skyless.page.api.routes import api_routes, geojson, read_bytes
 from skyless.page.guard import AccessRules, Guard
 from skyless.page.live import LiveSite, NoBrokerError, NoSiteError, NotAllowedError, TooManyPagesError
 from skyless.page.overlays import KINDS, MovedAnchors, NoOverlayError, Overlays
@@ -118,7 +116,7 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
         Route("/api/recordings/{name}/states", _recorded_states),
         Route("/api/recordings/{name}/floor_plan", _recorded(Playback.floor_plan, _image)),
         Route("/api/recordings/{name}/what_if", _what_if),
-        *api_routes(ApiServices(services.sites, services.past)),
+        *api_routes(services.sites, services.past),
         WebSocketRoute("/live", _live),
         WebSocketRoute("/live2", _live2),
         Mount("/page", _Files(directory=page, check_dir=False)),
@@ -162,11 +160,7 @@ def _live_of(request: Request) -> LiveSite:
 
 
 async def _fixes(request: Request) -> Response:
-    try:
-        features = _live_of(request).features()
-    except SkylessError as error:
-        raise HTTPException(409, str(error)) from None
-    return Response(features, media_type=MEDIA_TYPE, headers={"Cache-Control": "no-store"})
+    return geojson(_live_of(request), "fixes")
 
 
 async def _floor_plan(request: Request) -> Response:
@@ -204,7 +198,7 @@ async def _overlay(request: Request) -> Response:
 
 async def _planned(request: Request, site: Site) -> Site:
     """The site as it would be with the anchors where the request's body has them; as it is where there is none."""
-    body = await _body(request, _MAX_BODY_BYTES, "too many anchors")
+    body = await read_bytes(request, _MAX_BODY_BYTES, "too many anchors")
     if not body:
         return site
     try:
@@ -240,7 +234,9 @@ def _number(request: Request, name: str, default: float, least: float, most: flo
 
 
 async def _put_floor_plan(request: Request) -> Response:
-    image = await _body(request, MAX_FLOOR_PLAN_BYTES, f"the image is larger than {MAX_FLOOR_PLAN_BYTES // 10**6} MB")
+    image = await read_bytes(
+        request, MAX_FLOOR_PLAN_BYTES, f"the image is larger than {MAX_FLOOR_PLAN_BYTES // 10**6} MB"
+    )
     if _image_type(image) is None or image_size(image) is None:
         raise HTTPException(400, "this is no image that can be read; it should be a PNG or JPEG")
     _live_of(request).store_floor_plan(image)
@@ -249,30 +245,20 @@ async def _put_floor_plan(request: Request) -> Response:
 
 async def _put_facts(request: Request) -> Response:
     live = _live_of(request)
-    message = live.survey.facts_message(await _body(request, _MAX_BODY_BYTES, "too many facts"))
+    message = live.survey.facts_message(await read_bytes(request, _MAX_BODY_BYTES, "too many facts"))
     live.publish_survey(message)
     return _json(message)
 
 
 async def _save_survey(request: Request) -> Response:
     live = _live_of(request)
-    message = live.survey.save_message(await _body(request, _MAX_BODY_BYTES, "the request is too long"))
+    message = live.survey.save_message(await read_bytes(request, _MAX_BODY_BYTES, "the request is too long"))
     live.publish_survey(message)
     return _json(message)
 
 
-async def _body(request: Request, most_bytes: int, fault: str) -> bytes:
-    """The request's body. One that is too long is answered with status 413 and the given words."""
-    body = bytearray()
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > most_bytes:
-            raise HTTPException(413, fault)
-    return bytes(body)
-
-
 async def _put_zones(request: Request) -> Response:
-    body = await _body(request, _MAX_BODY_BYTES, "too many zones")
+    body = await read_bytes(request, _MAX_BODY_BYTES, "too many zones")
     live = _live_of(request)
     message = read_zones(body)
     live.store_zones(message.zones, message.site)

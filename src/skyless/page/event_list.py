@@ -1,17 +1,16 @@
 """What has happened at a site since the server's start, with a number for each event: programs read it in pages."""
 
 from collections import deque
+from itertools import islice, takewhile
 from typing import Final, Literal
 
 from msgspec import Struct
 
+from skyless.page import _events
 from skyless.run.mqtt.messages import ZoneEvent
 
 MAX_KEPT: Final = 2_000
 """Events that are kept. The oldest are dropped."""
-
-Kind = Literal["zone", "alarm", "anchor", "master", "watch", "alert", "tag", "program", "survey", "condition"]
-Level = Literal["good", "note", "warning", "bad"]
 
 
 class SiteEvent(Struct, frozen=True):
@@ -20,13 +19,13 @@ class SiteEvent(Struct, frozen=True):
     id: int
     """Counts from 1 since the server's start."""
     unix_s: float
-    kind: Kind
-    level: Level
+    kind: _events.Kind | Literal["zone"]
+    level: _events.Severity
     subject: str
     """What it is about, such as ``tag/t1`` or ``anchor/3``; empty for the site."""
     text: str
     """For people."""
-    zone_event: ZoneEvent | None
+    zone_event: ZoneEvent | None = None
     """Of the kind ``zone``."""
 
 
@@ -40,23 +39,19 @@ class EventList:
 
     def add_zone_event(self, event: ZoneEvent) -> None:
         """A tag has entered or left a zone."""
-        verb = "entered" if event.kind == "enter" else "left"
-        text = f"tag {event.tag} {verb} {event.name or event.zone}"
-        self.add(event.unix_s, "zone", "note", f"tag/{event.tag}", text, event)
-
-    def add(
-        self, unix_s: float, kind: Kind, level: Level, subject: str, text: str, event: ZoneEvent | None = None
-    ) -> None:
-        """Add an event; the fields are those of ``SiteEvent``."""
         self.last += 1
-        self._events.append(SiteEvent(self.last, unix_s, kind, level, subject, text, event))
+        text = f"tag {event.tag} {'entered' if event.kind == 'enter' else 'left'} {event.name or event.zone}"
+        self._events.append(SiteEvent(self.last, event.unix_s, "zone", "note", f"tag/{event.tag}", text, event))
 
-    def before(self, number: int | None, limit: int) -> list[SiteEvent]:
-        """At most ``limit`` events before a number, or the newest; the newest first."""
-        first = self.last + 1 - len(self._events)
-        end = len(self._events) if number is None else min(max(number - first, 0), len(self._events))
-        return list(self._events)[max(end - limit, 0) : end][::-1]
+    def add_logged(self, event: _events.Event) -> None:
+        """A line of the page's list."""
+        self.last += 1
+        self._events.append(SiteEvent(self.last, event.unix_s, event.kind, event.level, event.name, event.text))
+
+    def before(self, number: int, limit: int) -> list[SiteEvent]:
+        """At most ``limit`` events before a number, the newest first."""
+        return list(islice((event for event in reversed(self._events) if event.id < number), limit))
 
     def since(self, number: int) -> list[SiteEvent]:
         """Events after a number, the oldest first."""
-        return self.before(None, max(self.last - number, 0))[::-1]
+        return list(takewhile(lambda event: event.id > number, reversed(self._events)))[::-1]

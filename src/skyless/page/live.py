@@ -37,8 +37,6 @@ from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
     AcknowledgeMessage,
     AnchorHealth,
-    Asset,
-    AssetsMessage,
     EtherHealth,
     FixMessage,
     SiteMessage,
@@ -250,16 +248,6 @@ class LiveSite:
         """The site's number, or None while none is known."""
         return self._site_id if self.site is None else self.site.site.id
 
-    @property
-    def now_s(self) -> float:
-        """The time now, by the clock of the state."""
-        return self._clock()
-
-    @property
-    def unix_s(self) -> float:
-        """The same since 1970."""
-        return self._wall_clock()
-
     def on_connection(self, connected: bool) -> None:
         """Update whether the broker is connected."""
         if connected != self.connected:
@@ -399,15 +387,6 @@ class LiveSite:
         if self.assets.on_message(payload) and self._link is not None:
             self._link.forget(topic)
 
-    def store_assets(self, assets: tuple[Asset, ...], site: str = "") -> None:
-        """Replace the assets of the site of this name, by default of the one shown. Raises BadAssetsError."""
-        self.assets.store(assets, site)
-
-    @property
-    def assets_message(self) -> AssetsMessage:
-        """The assets of the site that is shown."""
-        return AssetsMessage(self.assets.assets, self._site_name)
-
     # Zones
 
     def store_zones(self, zones: tuple[Zone, ...], site: str = "") -> None:
@@ -507,7 +486,6 @@ class LiveSite:
         """
         if self.site is None:
             raise NoSiteError("no site is known yet")
-        now_s, unix_s = self._clock(), self._wall_clock()
         site = bridged_site(
             self.site.site, self.monitor.zones, simulated=self.site.simulated, assets=self.assets.by_tag
         )
@@ -515,7 +493,11 @@ class LiveSite:
             return anchor_features(site)
         if kind == "zones":
             return zone_features(site)
-        return features(site, self.state.fixes_since(now_s, OLDEST_S), unix_s)
+        return features(site, self.recent_fixes(), self._wall_clock())
+
+    def recent_fixes(self, after: int = 0) -> list[tuple[FixMessage, float]]:
+        """The newest fix of each tag that has one within ``OLDEST_S`` and after a serial, and when it ended."""
+        return self.state.fixes_since(self._clock(), OLDEST_S, after)
 
     # Pages
 
@@ -536,7 +518,7 @@ class LiveSite:
         self.state.now_s = self._clock()
         page.replace("condition", self._condition_message())
         page.replace("log", encode("log", {"events": self.log.since()}))
-        page.replace("assets", self.assets.message())
+        page.replace("assets", self.assets.encoded())
         if self.plans:
             page.replace("floor_plan", self._floor_plan_message())
         if self._sites is not None:
@@ -626,7 +608,7 @@ class LiveSite:
         if events:
             self._logged_serial = self.log.serial
             for event in events:
-                self.event_list.add(event.unix_s, event.kind, event.level, event.name, event.text)
+                self.event_list.add_logged(event)
             message = encode("log", {"events": events})
             for page in self.pages:
                 page.add_logged(message)

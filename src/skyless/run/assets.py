@@ -3,7 +3,7 @@
 import csv
 import io
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Final
 
 import msgspec
@@ -18,7 +18,7 @@ COLUMNS: Final = Asset.__struct_fields__
 """Head of a table in CSV, as it is written."""
 
 _TAG: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
-_COLOUR: Final = re.compile(r"#[0-9A-Fa-f]{6}")
+_COLOUR: Final = re.compile(r"(#[0-9A-Fa-f]{6})?")
 _MAX_LENGTHS: Final = {"name": 100, "group": 64, "icon": 8, "owner": 100, "notes": 1000}
 _MAX_SHOWN: Final = 40
 
@@ -43,18 +43,17 @@ def check_assets(assets: tuple[Asset, ...]) -> None:
         raise BadAssetsError(f"there are {len(assets)} assets; at most {MAX_ASSETS} are allowed")
     known: set[str] = set()
     for asset in assets:
-        fault = _fault(asset)
-        if fault is not None:
+        fault = "the tag has two assets; it should have one" if asset.tag in known else _fault(asset)
+        if fault:
             raise BadAssetsError(f"asset {asset.tag[:_MAX_SHOWN]!r}: {fault}")
-        if asset.tag in known:
-            raise BadAssetsError(f"asset {asset.tag!r}: the tag has two assets; it should have one")
         known.add(asset.tag)
     size = len(msgspec.json.encode(assets))
     if size > MAX_BYTES:
         raise BadAssetsError(f"the list has {size} bytes; it should have {MAX_BYTES} at most: shorten the notes")
 
 
-def _fault(asset: Asset) -> str | None:
+def _fault(asset: Asset) -> str:
+    """What is wrong with an asset, empty where nothing is."""
     if not _TAG.fullmatch(asset.tag):
         return f"tag is {_shown(asset.tag)}; it should be 1 to 64 letters, digits, dots, dashes and underscores"
     for key, most in _MAX_LENGTHS.items():
@@ -63,9 +62,9 @@ def _fault(asset: Asset) -> str | None:
             return f"{key} is {_shown(value)}; it should have {most} characters at most, not {len(value)}"
         if not all(letter.isprintable() or letter in "\u200d\n\t" for letter in value):
             return f"{key} is {_shown(value)}; it should have no control characters"
-    if asset.colour and not _COLOUR.fullmatch(asset.colour):
+    if not _COLOUR.fullmatch(asset.colour):
         return f"colour is {_shown(asset.colour)}; it should be #rrggbb, as #c2410c, or empty"
-    return None
+    return ""
 
 
 def _shown(value: str) -> str:
@@ -97,38 +96,36 @@ def read_csv(data: bytes) -> tuple[Asset, ...]:
         line = data[: error.start].count(b"\n") + 1
         raise BadAssetsError(f"line {line}: it is not UTF-8; save the table as CSV UTF-8") from None
     head = text.partition("\n")[0]
-    delimiter = max(",;\t", key=head.count)
-    rows = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
-    assets, lines = [], dict[str, int]()
+    rows = csv.reader(io.StringIO(text, newline=""), delimiter=max(",;\t", key=head.count), strict=True)
+    found: dict[str, tuple[int, Asset]] = {}
     try:
-        for line, asset in _assets(rows, lines):
-            fault = _fault(asset)
-            if fault is not None:
-                raise BadAssetsError(f"line {line}: {fault}")
-            assets.append(asset)
+        columns = _columns(next(rows, []))
+        for row in rows:
+            if not any(cell.strip() for cell in row):
+                continue
+            fault = f"it has {len(row)} cells; it should have {len(columns)}, as the head"
+            if len(row) == len(columns):
+                asset = Asset(**{name: cell.strip() for name, cell in zip(columns, row, strict=True)})
+                fault = _fault(asset)
+                if asset.tag in found:
+                    fault = f"tag {asset.tag!r} stands in line {found[asset.tag][0]} already"
+                found[asset.tag] = rows.line_num, asset
+            if fault:
+                raise BadAssetsError(f"line {rows.line_num}: {fault}")
     except csv.Error as error:
         raise BadAssetsError(f"line {rows.line_num}: this is no CSV: {error}") from None
-    check_assets(tuple(assets))
-    return tuple(assets)
+    assets = tuple(asset for _, asset in found.values())
+    check_assets(assets)
+    return assets
 
 
-def _assets(rows: Iterator[list[str]], lines: dict[str, int]) -> Iterator[tuple[int, Asset]]:
-    columns = [name.strip().lower() for name in next(rows, [])]
+def _columns(head: list[str]) -> list[str]:
+    columns = [name.strip().lower() for name in head]
     wrong = [name for name in columns if name not in COLUMNS or columns.count(name) > 1]
     if "tag" not in columns or wrong:
-        found = f"the head has {wrong[0][:_MAX_SHOWN]!r}" if wrong else "the head has no column tag"
-        raise BadAssetsError(f"line 1: {found}; it should have tag and any of {', '.join(COLUMNS[1:])}, each once")
-    for row in rows:
-        line: int = rows.line_num  # type: ignore[attr-defined]
-        if not any(cell.strip() for cell in row):
-            continue
-        if len(row) != len(columns):
-            raise BadAssetsError(f"line {line}: it has {len(row)} cells; it should have {len(columns)}, as the head")
-        asset = Asset(**{name: cell.strip() for name, cell in zip(columns, row, strict=True)})
-        if asset.tag in lines:
-            raise BadAssetsError(f"line {line}: tag {asset.tag!r} stands in line {lines[asset.tag]} already")
-        lines[asset.tag] = line
-        yield line, asset
+        fault = f"the head has {wrong[0][:_MAX_SHOWN]!r}" if wrong else "the head has no column tag"
+        raise BadAssetsError(f"line 1: {fault}; it should have tag and any of {', '.join(COLUMNS[1:])}, each once")
+    return columns
 
 
 def assets_at(message: AssetsMessage, site: str) -> dict[str, Asset]:

@@ -2,19 +2,24 @@
 
 import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 from msgspec import Struct
 
 from skyless.core.version import installed_version
 from skyless.page.api.answers import ErrorAnswer
-from skyless.page.api.call import parameters_schema
+from skyless.page.api.parameters import parameters_schema
 
 if TYPE_CHECKING:
     from skyless.page.api.routes import ApiRoute
 
-_NOTES = (
+ROOT: Final = "/api/v1"
+JSON: Final = "application/json"
+GEOJSON: Final = "application/geo+json"
+CSV: Final = "text/csv"
+
+_NOTES: Final = (
     "Positions are in metres in the site's own frame, times in seconds since 1970. Where the server has tokens, GET "
     "needs one of them, and PUT and POST need the operator's."
 )
@@ -26,7 +31,7 @@ def document(routes: "Sequence[ApiRoute]") -> dict[str, Any]:
     _, components = msgspec.json.schema_components(kinds, ref_template="#/components/schemas/{name}")
     paths: dict[str, dict[str, Any]] = {}
     for route in routes:
-        paths.setdefault("/api/v1" + route.path, {})[route.method.lower()] = _operation(route)
+        paths.setdefault(ROOT + route.path, {})[route.method.lower()] = _operation(route)
     return {
         "openapi": "3.1.0",
         "info": {"title": "Skyless", "version": installed_version(), "summary": "A site's tags", "description": _NOTES},
@@ -40,58 +45,49 @@ def document(routes: "Sequence[ApiRoute]") -> dict[str, Any]:
     }
 
 
-def _is_struct(kind: object) -> TypeGuard[type[Struct]]:
-    return isinstance(kind, type) and issubclass(kind, Struct)
-
-
 def _operation(route: "ApiRoute") -> dict[str, Any]:
-    name = re.sub(r"\W+", "_", f"{route.method.lower()}{route.path}").strip("_")
+    answers = {kind: {"type": "object"} if kind == GEOJSON else _schema(route.answer) for kind in route.media_types}
     operation: dict[str, Any] = {
-        "operationId": name,
+        "operationId": re.sub(r"\W+", "_", f"{route.method.lower()}{route.path}").strip("_"),
         "summary": route.summary,
         "description": f"Role: {route.role}.",
-        "tags": ["history" if route.path.startswith("/history") else "site"],
+        "tags": ["history" if route.is_past else "site"],
         "parameters": _parameters(route),
         "responses": {
-            "200": {
-                "description": route.summary,
-                "content": {kind: {"schema": _answer_schema(route, kind)} for kind in route.media_types},
-            },
-            "default": {
-                "description": "An error.",
-                "content": {"application/json": {"schema": {"$ref": "#/components/schemas/ErrorAnswer"}}},
-            },
+            "200": {"description": route.summary, **_content(answers)},
+            "default": {"description": "An error.", **_content({JSON: _schema(ErrorAnswer)})},
         },
     }
     if route.body is not None:
-        operation["requestBody"] = {"required": True, "content": {route.body_type: {"schema": _schema(route.body)}}}
+        kind = CSV if route.body is bytes else JSON
+        operation["requestBody"] = {"required": True, **_content({kind: _schema(route.body)})}
     return operation
+
+
+def _content(schemas: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    return {"content": {kind: {"schema": schema} for kind, schema in schemas.items()}}
 
 
 def _parameters(route: "ApiRoute") -> list[dict[str, Any]]:
     required = {field.encode_name for field in msgspec.structs.fields(route.query) if field.required}
-    found = []
-    for name, schema in parameters_schema(route.query).items():
-        place = "path" if f"{{{name}}}" in route.path else "query"
-        value = {key: part for key, part in schema.items() if key != "description"}
-        found.append(
-            {
-                "name": name,
-                "in": place,
-                "required": name in required,
-                "description": schema["description"],
-                "schema": value,
-            }
-        )
-    return found
+    return [
+        {
+            "name": name,
+            "in": "path" if f"{{{name}}}" in route.path else "query",
+            "required": name in required,
+            "description": schema["description"],
+            "schema": {key: part for key, part in schema.items() if key != "description"},
+        }
+        for name, schema in parameters_schema(route.query).items()
+    ]
 
 
-def _answer_schema(route: "ApiRoute", media_type: str) -> dict[str, Any]:
-    return {"type": "object"} if media_type.endswith("geo+json") else _schema(route.answer)
-
-
-def _schema(kind: object) -> dict[str, Any]:
+def _schema(kind: type) -> dict[str, Any]:
     return {"$ref": f"#/components/schemas/{kind.__name__}"} if _is_struct(kind) else {"type": "string"}
+
+
+def _is_struct(kind: type | None) -> bool:
+    return kind is not None and issubclass(kind, Struct)
 
 
 def _plain(schema: object) -> object:

@@ -4,14 +4,14 @@ import asyncio
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from starlette.exceptions import HTTPException
 
 from skyless.core.errors import SkylessError
-from skyless.run.history.answers import Span
+from skyless.page.api.parameters import Begin, CellSize, Distance, End, Points, Step, TagName, TagNames, ZoneId, names
+from skyless.run.history.answers import AlarmRow, Contact, Dwell, Heatmap, Occupancy, Span, Track
 
 if TYPE_CHECKING:
     from skyless.run.history.queries import History
@@ -22,63 +22,38 @@ QUERY_TIMEOUT_S: Final = 60.0
 MAX_WAITING: Final = 20
 """Questions that may wait for their turn."""
 
-_LIBRARIES: Final = ("duckdb", "pyarrow", "dateparser")
-
 
 class Past:
-    """The history of the sites that the server shows, or why there is none."""
+    """The history of the sites that the server shows."""
 
     def __init__(self, folder: Path | None) -> None:
+        """Without a folder there is none."""
         self._folder = folder
-        self._pool: ThreadPoolExecutor | None = None
+        self._pool = ThreadPoolExecutor(1, "history")  # its thread begins with the first question
         self._waiting = 0
-
-    @property
-    def fault(self) -> str | None:
-        """Why there is no history; None where there is one."""
-        if self._folder is None:
-            return "this server has no history: start the page's server with --history FOLDER"
-        missing = [name for name in _LIBRARIES if find_spec(name) is None]
-        if missing:
-            return (
-                f"this server has no history: it needs {missing[0]}; pip install 'skyless[history]', then start the "
-                "page's server with --history FOLDER"
-            )
-        return None
 
     async def ask(self, site: int | None, question: "Callable[[History], _T]") -> _T:
         """The answer of a site's history. Raises HTTPException, also where it takes too long."""
-        if self.fault is not None or self._folder is None:
-            raise HTTPException(404, self.fault or "")
+        if self._folder is None:
+            raise HTTPException(404, "this server has no history: start the page's server with --history FOLDER")
         if site is None:
             raise HTTPException(404, "no site is known yet")
         if self._waiting >= MAX_WAITING:
             raise HTTPException(503, f"{MAX_WAITING} questions to the history are waiting; ask again later")
-        self._pool = self._pool or ThreadPoolExecutor(1, "history")
         self._waiting += 1
-        answer = asyncio.get_running_loop().run_in_executor(self._pool, _ask, self._folder, site, question)
-        answer.add_done_callback(self._on_done)
         try:
-            async with asyncio.timeout(QUERY_TIMEOUT_S):
-                return await asyncio.shield(answer)
+            async with asyncio.timeout(QUERY_TIMEOUT_S):  # one that has begun goes on, and the next waits for its end
+                loop = asyncio.get_running_loop()
+                return await loop.run_in_executor(self._pool, _ask, self._folder, site, question)
         except TimeoutError:
-            answer.cancel()  # of no effect once it has begun: then the next question waits for its end
             fault = f"the history has not answered within {QUERY_TIMEOUT_S:g} s; ask for a shorter time"
             raise HTTPException(503, fault) from None
-        except _NoHistoryError as error:
-            raise HTTPException(404, str(error)) from None
-        except SkylessError as error:
-            raise HTTPException(400, str(error)) from None
-
-    def _on_done(self, answer: "asyncio.Future[_T]") -> None:
-        self._waiting -= 1
-        if not answer.cancelled():
-            answer.exception()  # it was seen: nobody may be waiting for it any more
+        finally:
+            self._waiting -= 1
 
     def stop(self) -> None:
         """Begin no further question."""
-        if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
+        self._pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _ask(folder: Path, site: int, question: "Callable[[History], _T]") -> _T:
@@ -87,16 +62,55 @@ def _ask(folder: Path, site: int, question: "Callable[[History], _T]") -> _T:
     try:
         history = History(folder, site)
     except SkylessError as error:
-        raise _NoHistoryError(str(error)) from None
-    return question(history)
+        raise HTTPException(404, str(error)) from None
+    try:
+        return question(history)
+    except SkylessError as error:
+        raise HTTPException(400, str(error)) from None
 
 
-class _NoHistoryError(SkylessError):
-    """The folder has no history of the site."""
-
-
-def read_span(begin: str, end: str) -> Span:
-    """The time range between two texts, as people type them. Raises SkylessError."""
+def _span(begin: str, end: str) -> Span:
     from skyless.run.history.times import span_of  # noqa: PLC0415 - of the extra history
 
     return span_of(begin, end or None, time.time())
+
+
+def tags(history: "History") -> tuple[str, ...]:
+    """Tags that it has."""
+    return history.tags()
+
+
+def track(history: "History", *, tag: TagName, begin: Begin, end: End = "", points: Points = 2000) -> Track:
+    """The way of a tag."""
+    return history.track(tag, _span(begin, end), points)
+
+
+def heatmap(history: "History", *, begin: Begin, end: End = "", cell_m: CellSize = 0.25, tag: TagNames = "") -> Heatmap:
+    """How long tags were where."""
+    return history.heatmap(_span(begin, end), cell_m, names(tag))
+
+
+def dwell(
+    history: "History", *, begin: Begin, end: End = "", tag: TagNames = "", zone: ZoneId = ""
+) -> tuple[Dwell, ...]:
+    """How long tags were in zones."""
+    return history.dwell(_span(begin, end), names(tag), zone or None)
+
+
+def occupancy(
+    history: "History", *, begin: Begin, end: End = "", zone: ZoneId = "", step_s: Step = 300.0
+) -> tuple[Occupancy, ...]:
+    """How many tags were in zones."""
+    return history.occupancy(_span(begin, end), zone or None, step_s)
+
+
+def contacts(
+    history: "History", *, tag: TagName, begin: Begin, end: End = "", distance_m: Distance = 2.0
+) -> tuple[Contact, ...]:
+    """Whom a tag was near to."""
+    return history.contacts(tag, _span(begin, end), distance_m)
+
+
+def alarms(history: "History", *, begin: Begin, end: End = "") -> tuple[AlarmRow, ...]:
+    """Alarms of the past."""
+    return history.alarms(_span(begin, end))

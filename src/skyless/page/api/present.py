@@ -1,9 +1,8 @@
 """Answers about the site as it is now, and what changes it."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Final
 
-from msgspec import UNSET, Struct
 from msgspec.structs import asdict, replace
 from starlette.exceptions import HTTPException
 
@@ -16,19 +15,22 @@ from skyless.page.api.answers import (
     EventsAnswer,
     SiteAnswer,
     Tag,
-    TagFix,
     TagsAnswer,
     ZoneTags,
 )
-from skyless.page.api.call import Call
+from skyless.page.api.parameters import After, Before, Find, Group, Limit, RuleId, Subject, TagName, ZoneId
 from skyless.page.live import LiveSite, NoSiteError
 from skyless.run.assets import read_csv, write_csv
-from skyless.run.mqtt.messages import Asset, AssetsMessage, FixMessage, SiteMessage
+from skyless.run.mqtt.messages import (
+    AlarmMessage,
+    AlarmRulesMessage,
+    Asset,
+    AssetsMessage,
+    FixMessage,
+    SiteMessage,
+)
 
-Listed = dict[str, Sequence[Struct]]
-
-OLDEST_S: Final = 5.0
-"""A tag whose last fix is older has none."""
+_ALL: Final = 2**53
 
 
 def _known(live: LiveSite) -> SiteMessage:
@@ -37,33 +39,23 @@ def _known(live: LiveSite) -> SiteMessage:
     return live.site
 
 
-def site(call: Call) -> SiteAnswer:
-    """The site."""
-    message, condition = _known(call.live), call.live.condition
+def site(live: LiveSite) -> SiteAnswer:
+    """The site, and how it is."""
     return SiteAnswer(
-        site=message.site,
-        outline_m=message.outline_m or None,
-        simulated=message.simulated,
-        level=condition.level,
-        text=condition.text,
-        tags=condition.tags,
-        tags_with_fix=condition.tags_with_fix,
-        connected=call.live.connected,
-        history=call.live.has_history,
+        **asdict(_known(live)),
+        condition=live.condition,
+        connected=live.connected,
+        history=live.has_history,
         version=installed_version(),
     )
 
 
-def anchors(call: Call) -> Listed | bytes:
+def anchors(live: LiveSite) -> tuple[Anchor, ...]:
     """Its anchors."""
-    if call.query.format == "geojson":
-        return call.live.features("anchors")
-    return {
-        "anchors": [
-            Anchor(anchor.id, (anchor.x_m, anchor.y_m, anchor.z_m), _online(call.live, "anchor", str(anchor.id)))
-            for anchor in _known(call.live).site.anchors
-        ]
-    }
+    return tuple(
+        Anchor(anchor.id, (anchor.x_m, anchor.y_m, anchor.z_m), _online(live, "anchor", str(anchor.id)))
+        for anchor in _known(live).site.anchors
+    )
 
 
 def _online(live: LiveSite, kind: str, name: str) -> bool | None:
@@ -71,148 +63,121 @@ def _online(live: LiveSite, kind: str, name: str) -> bool | None:
     return None if status is None else status.online
 
 
-def tags(call: Call) -> TagsAnswer:
-    """Tags, a page of them."""
-    live, query = call.live, call.query
-    statuses = {name for kind, name in live.state.statuses if kind == "tag"}
+def tags(
+    live: LiveSite, *, group: Group = "", zone: ZoneId = "", find: Find = "", limit: Limit = 100, after: After = ""
+) -> TagsAnswer:
+    """Tags by name, in pages."""
+    find = find.casefold()
     found: list[str] = []
-    for name in sorted(statuses.union(live.state.tags)):
+    for name in sorted(name for name in _names(live) if name > after):
         asset = live.assets.by_tag.get(name, Asset(name))
-        if name <= query.after and query.after:
+        if group and asset.group != group:
             continue
-        if query.group and asset.group != query.group:
+        if find not in name.casefold() and find not in asset.name.casefold():
             continue
-        if query.find.casefold() not in name.casefold() and query.find.casefold() not in asset.name.casefold():
-            continue
-        if query.zone and query.zone not in _zones(live, name):
+        if zone and zone not in _zones(live, name):
             continue
         found.append(name)
-        if len(found) > query.limit:
+        if len(found) > limit:
             break
-    shown = found[: query.limit]
-    return TagsAnswer(_tags(live, shown), shown[-1] if len(found) > len(shown) else None)
+    shown = found[:limit]
+    return TagsAnswer(_tags(live, shown), shown[-1] if len(found) > limit else None)
 
 
-def tag(call: Call) -> Tag:
+def _names(live: LiveSite) -> set[str]:
+    return {name for kind, name in live.state.statuses if kind == "tag"}.union(live.state.tags)
+
+
+def tag(live: LiveSite, *, tag: TagName) -> Tag:
     """One tag."""
-    live, name = call.live, call.query.tag
-    if name not in live.state.tags and ("tag", name) not in live.state.statuses:
-        raise HTTPException(404, f"tag is {name[:60]!r}; no tag of this name has reported at this site")
-    return _tags(live, [name])[0]
+    if tag not in _names(live):
+        raise HTTPException(404, f"tag is {tag[:60]!r}; no tag of this name has reported at this site")
+    return _tags(live, [tag])[0]
 
 
 def _tags(live: LiveSite, names: list[str]) -> tuple[Tag, ...]:
-    wanted = set(names)
-    recent = live.state.fixes_since(live.now_s, OLDEST_S)
-    fixes = {fix.tag: fix for fix in usable(live, (given for given in recent if given[0].tag in wanted))}
-    found = []
-    for name in names:
-        asset = live.assets.by_tag.get(name, Asset(name))
-        what = (asset.name, asset.group, asset.icon, asset.colour)
-        found.append(Tag(name, *what, _online(live, "tag", name), _zones(live, name), fixes.get(name)))
-    return tuple(found)
+    fixes = {fix.tag: fix for fix in usable(given for given in live.recent_fixes() if given[0].tag in names)}
+    return tuple(
+        Tag(
+            **asdict(live.assets.by_tag.get(name, Asset(name))),
+            online=_online(live, "tag", name),
+            zones=_zones(live, name),
+            fix=fixes.get(name),
+        )
+        for name in names
+    )
 
 
 def _zones(live: LiveSite, tag: str) -> tuple[str, ...]:
     return tuple(zone.id for zone in live.monitor.zones_with(tag))
 
 
-def fixes(call: Call) -> Listed | bytes:
+def fixes(live: LiveSite) -> tuple[FixMessage, ...]:
     """The newest usable fix of each tag."""
-    if call.query.format == "geojson":
-        return call.live.features("fixes")
-    recent = call.live.state.fixes_since(call.live.now_s, OLDEST_S)
-    return {"fixes": usable(call.live, sorted(recent, key=lambda given: given[0].tag))}
+    return tuple(sorted(usable(live.recent_fixes()), key=lambda fix: fix.tag))
 
 
-def usable(live: LiveSite, given: Iterable[tuple[FixMessage, float]]) -> list[TagFix]:
-    """Those of fixes that may be used; each is given with when it ended."""
-    unix_s = live.unix_s
-    return [
-        TagFix(
-            tag=fix.tag,
-            unix_s=round(ended_unix_s, 4),
-            age_s=round(max(unix_s - ended_unix_s, 0.0), 3),
-            position_m=fix.position_m,
-            covariance_m2=fix.covariance_m2,
-            velocity_mps=fix.velocity_mps,
-            std_m=fix.std_m,
-            hpl_m=fix.hpl_m,
-            alert=fix.alert,
-            method=fix.method,
-            anchors=fix.anchors,
-        )
-        for fix, ended_unix_s in given
-        if is_usable(fix)
-    ]
+def usable(given: Iterable[tuple[FixMessage, float]]) -> list[FixMessage]:
+    """Those of fixes that may be used, with the time by the server's clock, which is given with each."""
+    return [replace(fix, unix_s=round(ended_unix_s, 4)) for fix, ended_unix_s in given if is_usable(fix)]
 
 
-def zones(call: Call) -> Listed | bytes:
-    """The zones."""
-    live = call.live
-    if call.query.format == "geojson":
-        return live.features("zones")
+def zones(live: LiveSite) -> tuple[ZoneTags, ...]:
+    """Zones, and who is in them."""
     inside = {name: _zones(live, name) for name in sorted(live.state.tags)}
-    return {
-        "zones": [
-            ZoneTags(**asdict(zone), tags=tuple(name for name, zones in inside.items() if zone.id in zones))
-            for zone in live.monitor.zones
-        ]
-    }
+    return tuple(
+        ZoneTags(**asdict(zone), tags=tuple(name for name, zones in inside.items() if zone.id in zones))
+        for zone in live.monitor.zones
+    )
 
 
-def events(call: Call) -> EventsAnswer:
-    """What has happened, a page of it."""
-    before = None if call.query.before is UNSET else call.query.before
-    found = call.live.event_list.before(before, call.query.limit + 1)
-    shown = tuple(found[: call.query.limit])
-    return EventsAnswer(shown, shown[-1].id if len(found) > len(shown) else None)
+def events(live: LiveSite, *, limit: Limit = 100, before: Before = _ALL) -> EventsAnswer:
+    """What has happened, the newest first, in pages."""
+    found = live.event_list.before(before, limit + 1)
+    return EventsAnswer(tuple(found[:limit]), found[limit - 1].id if len(found) > limit else None)
 
 
-def assets(call: Call) -> AssetsMessage:
+def assets(live: LiveSite) -> AssetsMessage:
     """What tags are attached to."""
-    return call.live.assets_message
+    return live.assets.message
 
 
-def assets_csv(call: Call) -> bytes:
-    """The same as a table."""
-    return write_csv(call.live.assets.assets)
-
-
-def put_assets(call: Call) -> AssetsMessage:
+def put_assets(live: LiveSite, *, body: AssetsMessage) -> AssetsMessage:
     """Replace all assets."""
-    _known(call.live)
-    call.live.store_assets(call.body.assets, call.body.site)
-    return call.live.assets_message
+    _known(live)
+    live.assets.store(body.assets, body.site)
+    return live.assets.message
 
 
-def put_assets_csv(call: Call) -> AssetsMessage:
-    """Replace all assets by those of a table."""
-    _known(call.live)
-    call.live.store_assets(read_csv(call.body))
-    return call.live.assets_message
+def assets_csv(live: LiveSite) -> bytes:
+    """The assets as a table."""
+    return write_csv(live.assets.message.assets)
 
 
-def alarms(call: Call) -> Listed:
+def put_assets_csv(live: LiveSite, *, body: bytes) -> AssetsMessage:
+    """Replace all assets by a table."""
+    return put_assets(live, body=AssetsMessage(read_csv(body)))
+
+
+def alarms(live: LiveSite) -> tuple[AlarmMessage, ...]:
     """Alarms that are not over."""
-    return {"alarms": call.live.alarms.messages}
+    return live.alarms.messages
 
 
-def alarm_rules(call: Call) -> AlarmRulesAnswer:
+def alarm_rules(live: LiveSite) -> AlarmRulesAnswer:
     """The rules of alarms."""
-    name = "" if call.live.site is None else call.live.site.site.name
-    return AlarmRulesAnswer(tuple(call.live.alarms.rules), tuple(call.live.alarms.file_rules), name)
+    name = "" if live.site is None else live.site.site.name
+    return AlarmRulesAnswer(live.alarms.rules, name, file_rules=live.alarms.file_rules)
 
 
-def put_alarm_rules(call: Call) -> AlarmRulesAnswer:
+def put_alarm_rules(live: LiveSite, *, body: AlarmRulesMessage) -> AlarmRulesAnswer:
     """Replace the rules that were made on the page."""
-    _known(call.live)
-    call.live.store_alarm_rules(call.body.rules, call.body.site)
-    return replace(alarm_rules(call), rules=call.body.rules)  # they hold from the next tick on
+    _known(live)
+    live.store_alarm_rules(body.rules, body.site)
+    return replace(alarm_rules(live), rules=body.rules)  # they hold from the next tick on
 
 
-def acknowledge(call: Call) -> Acknowledgement:
-    """Somebody has seen an alarm."""
-    call.live.acknowledge(call.query.rule, call.query.subject, call.body.id, call.body.by)
-    acknowledged: Acknowledgement = call.body
-    return acknowledged
+def acknowledge(live: LiveSite, *, rule: RuleId, subject: Subject, body: Acknowledgement) -> Acknowledgement:
+    """Acknowledge an alarm."""
+    live.acknowledge(rule, subject, body.id, body.by)
+    return body

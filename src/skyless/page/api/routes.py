@@ -1,138 +1,97 @@
-"""The table of routes: from it come what the server answers and the OpenAPI document."""
+"""All routes: what the server answers, and its OpenAPI document, come from it and the functions' signatures."""
 
 import inspect
 from collections.abc import Awaitable, Callable
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_origin
 
 import msgspec
 from msgspec import Struct
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 
 from skyless.core.errors import SkylessError
-from skyless.page.api import answers, present, stream
-from skyless.page.api.answers import Anchor, TagFix, ZoneTags, listed
-from skyless.page.api.call import ApiServices, Call, names, read_body, read_query, site_of
-from skyless.page.api.openapi import document
-from skyless.page.api.past import read_span
+from skyless.page.api import past, present, stream
+from skyless.page.api.openapi import CSV, GEOJSON, JSON, ROOT, document
+from skyless.page.api.parameters import RENAMED, MapQuery, SiteQuery, read_query
+from skyless.page.api.past import Past
+from skyless.page.live import LiveSite
+from skyless.page.sites import LiveSites
 from skyless.run.assets import MAX_BYTES
-from skyless.run.history.answers import AlarmRow, Contact, Dwell, Heatmap, Occupancy, Span, Track
-from skyless.run.mqtt.messages import AlarmMessage, AlarmRulesMessage, AssetsMessage
 
-ROOT: Final = "/api/v1"
-JSON: Final = "application/json"
-GEOJSON: Final = "application/geo+json"
-CSV: Final = "text/csv"
-_MAX_BODY_BYTES: Final = 2 * MAX_BYTES
-
-Role = Literal["reader", "operator"]
+MAX_BODY_BYTES: Final = 2 * MAX_BYTES
 
 
-class ApiRoute(Struct, frozen=True):
-    """One thing that programs can ask for."""
+class ApiRoute:
+    """One thing that programs can ask for.
 
-    method: Literal["GET", "PUT", "POST"]
-    path: str
-    """Below ``ROOT``."""
-    summary: str
-    respond: Callable[[Call], Any]
-    answer: type[Struct] | type[str]
-    """The struct of the answer, or a text of ``media_type``."""
-    query: type[answers.SiteQuery] = answers.SiteQuery
-    body: type[Struct] | type[bytes] | None = None
-    media_type: str = JSON
+    Keyword-only arguments of its function are the parameters, ``body`` is the body, and the docstring is the summary.
+    A tuple is answered as an object with one key, the last part of the path.
+    """
 
-    @property
-    def role(self) -> Role:
+    def __init__(
+        self,
+        method: Literal["GET", "PUT", "POST"],
+        path: str,
+        answer: Callable[..., Any],
+        media_type: str = JSON,
+        *,
+        is_map: bool = False,
+    ) -> None:
+        """``path`` is below ``ROOT``; ``media_type`` is that of bytes."""
+        self.method, self.path, self.is_map, self.function = method, path, is_map, answer
+        self.is_past = path.startswith("/history/")
+        self.key = path.rsplit("/", 1)[-1]
+        self.summary = (answer.__doc__ or "").rstrip(".")
+        self.media_types = (JSON, GEOJSON) if is_map else (media_type,)
+        self.role: Final = "reader" if method == "GET" else "operator"
         """Whose token is needed where the server has tokens."""
-        return "reader" if self.method == "GET" else "operator"
-
-    @property
-    def media_types(self) -> tuple[str, ...]:
-        """Those of the answer."""
-        return (JSON, GEOJSON) if issubclass(self.query, answers.FormatQuery) else (self.media_type,)
-
-    @property
-    def body_type(self) -> str:
-        """That of the body."""
-        return CSV if self.body is bytes else JSON
-
-
-def _past(
-    path: str,
-    summary: str,
-    answer: type[Struct],
-    query: type[answers.SpanQuery],
-    question: Callable[[Any, Span, Any], object],
-) -> ApiRoute:
-    """A question to the history, of a time range and the parameters; it is asked in the history's thread."""
-
-    async def respond(call: Call) -> object:
-        asked, number = call.query, call.live.number
-        return await call.past.ask(number, lambda history: question(history, read_span(asked.begin, asked.end), asked))
-
-    return ApiRoute("GET", f"/history/{path}", summary, respond, answer, query)
-
-
-async def _past_tags(call: Call) -> object:
-    return {"tags": await call.past.ask(call.live.number, lambda history: history.tags())}
+        signature = inspect.signature(answer)
+        given = {name: one for name, one in signature.parameters.items() if one.kind is one.KEYWORD_ONLY}
+        self.body: type | None = given.pop("body").annotation if "body" in given else None
+        fields = [
+            (name, one.annotation) if one.default is one.empty else (name, one.annotation, one.default)
+            for name, one in given.items()
+        ]
+        base = MapQuery if is_map else SiteQuery
+        self.query: type[SiteQuery] = msgspec.defstruct(  # type: ignore[assignment]
+            "Query", fields, bases=(base,), rename=RENAMED, frozen=True, kw_only=True, forbid_unknown_fields=True
+        )
+        self.parameters = tuple(given)
+        self.answer = kind = signature.return_annotation
+        if get_origin(kind) is tuple:
+            name = "".join(part.title() for part in path.split("/")) + "Answer"
+            self.answer = msgspec.defstruct(name, [(self.key, kind)], frozen=True)
 
 
 ROUTES: Final = (
-    ApiRoute("GET", "/site", "The site, and how it is", present.site, answers.SiteAnswer),
-    ApiRoute("GET", "/anchors", "Its anchors", present.anchors, listed("anchors", Anchor), answers.FormatQuery),
-    ApiRoute("GET", "/tags", "Tags by name, in pages", present.tags, answers.TagsAnswer, answers.TagsQuery),
-    ApiRoute("GET", "/tags/{tag}", "One tag", present.tag, answers.Tag, answers.TagQuery),
-    ApiRoute("GET", "/fixes", "The newest fixes", present.fixes, listed("fixes", TagFix), answers.FormatQuery),
-    ApiRoute(
-        "GET", "/zones", "Zones, and who is in them", present.zones, listed("zones", ZoneTags), answers.FormatQuery
-    ),
-    ApiRoute("GET", "/events", "What has happened", present.events, answers.EventsAnswer, answers.EventsQuery),
-    ApiRoute("GET", "/assets", "What tags are attached to", present.assets, AssetsMessage),
-    ApiRoute("PUT", "/assets", "Replace all assets", present.put_assets, AssetsMessage, body=AssetsMessage),
-    ApiRoute("GET", "/assets.csv", "The assets as a table", present.assets_csv, str, media_type=CSV),
-    ApiRoute("PUT", "/assets.csv", "Replace all by a table", present.put_assets_csv, AssetsMessage, body=bytes),
-    ApiRoute("GET", "/alarms", "Alarms that are not over", present.alarms, listed("alarms", AlarmMessage)),
-    ApiRoute(
-        *("POST", "/alarms/{rule}/{subject}/acknowledge", "Acknowledge an alarm", present.acknowledge),
-        *(answers.Acknowledgement, answers.AlarmQuery, answers.Acknowledgement),
-    ),
-    ApiRoute("GET", "/alarm_rules", "The rules of alarms", present.alarm_rules, answers.AlarmRulesAnswer),
-    ApiRoute(
-        *("PUT", "/alarm_rules", "Replace the rules that were made on the page", present.put_alarm_rules),
-        *(answers.AlarmRulesAnswer, answers.SiteQuery, AlarmRulesMessage),
-    ),
-    ApiRoute("GET", "/history/tags", "Tags that it has", _past_tags, listed("tags", str)),
-    _past(
-        *("track", "The way of a tag", Track, answers.TrackQuery),
-        lambda history, span, asked: history.track(asked.tag, span, asked.points),
-    ),
-    _past(
-        *("heatmap", "How long tags were where", Heatmap, answers.HeatmapQuery),
-        lambda history, span, asked: history.heatmap(span, asked.cell_m, names(asked.tag)),
-    ),
-    _past(
-        *("dwell", "How long tags were in zones", listed("dwell", Dwell), answers.DwellQuery),
-        lambda history, span, asked: {"dwell": history.dwell(span, names(asked.tag), asked.zone or None)},
-    ),
-    _past(
-        *("occupancy", "How many tags were in zones", listed("occupancy", Occupancy), answers.OccupancyQuery),
-        lambda history, span, asked: {"occupancy": history.occupancy(span, asked.zone or None, asked.step_s)},
-    ),
-    _past(
-        *("contacts", "Whom a tag was near to", listed("contacts", Contact), answers.ContactsQuery),
-        lambda history, span, asked: {"contacts": history.contacts(asked.tag, span, asked.distance_m)},
-    ),
-    _past(
-        *("alarms", "Alarms of the past", listed("alarms", AlarmRow), answers.SpanQuery),
-        lambda history, span, _asked: {"alarms": history.alarms(span)},
-    ),
+    ApiRoute("GET", "/site", present.site),
+    ApiRoute("GET", "/anchors", present.anchors, is_map=True),
+    ApiRoute("GET", "/tags", present.tags),
+    ApiRoute("GET", "/tags/{tag}", present.tag),
+    ApiRoute("GET", "/fixes", present.fixes, is_map=True),
+    ApiRoute("GET", "/zones", present.zones, is_map=True),
+    ApiRoute("GET", "/events", present.events),
+    ApiRoute("GET", "/assets", present.assets),
+    ApiRoute("PUT", "/assets", present.put_assets),
+    ApiRoute("GET", "/assets.csv", present.assets_csv, CSV),
+    ApiRoute("PUT", "/assets.csv", present.put_assets_csv),
+    ApiRoute("GET", "/alarms", present.alarms),
+    ApiRoute("POST", "/alarms/{rule}/{subject}/acknowledge", present.acknowledge),
+    ApiRoute("GET", "/alarm_rules", present.alarm_rules),
+    ApiRoute("PUT", "/alarm_rules", present.put_alarm_rules),
+    ApiRoute("GET", "/history/tags", past.tags),
+    ApiRoute("GET", "/history/track", past.track),
+    ApiRoute("GET", "/history/heatmap", past.heatmap),
+    ApiRoute("GET", "/history/dwell", past.dwell),
+    ApiRoute("GET", "/history/occupancy", past.occupancy),
+    ApiRoute("GET", "/history/contacts", past.contacts),
+    ApiRoute("GET", "/history/alarms", past.alarms),
 )
 
 
-def api_routes(services: ApiServices) -> list[BaseRoute]:
+def api_routes(sites: LiveSites, history: Past) -> list[BaseRoute]:
     """The routes of the server."""
     whole = msgspec.json.encode(document(ROUTES))
 
@@ -141,32 +100,54 @@ def api_routes(services: ApiServices) -> list[BaseRoute]:
 
     return [
         Route(f"{ROOT}/openapi.json", openapi),
-        *(Route(ROOT + route.path, _endpoint(route, services), methods=[route.method]) for route in ROUTES),
-        WebSocketRoute(f"{ROOT}/stream", stream.endpoint(services)),
+        *(Route(ROOT + route.path, _endpoint(route, sites, history), methods=[route.method]) for route in ROUTES),
+        WebSocketRoute(f"{ROOT}/stream", stream.endpoint(sites)),
     ]
 
 
-def _endpoint(route: ApiRoute, services: ApiServices) -> Callable[[Request], Awaitable[Response]]:
+def _endpoint(route: ApiRoute, sites: LiveSites, history: Past) -> Callable[[Request], Awaitable[Response]]:
     async def respond(request: Request) -> Response:
-        query = read_query(request.query_params, request.path_params, route.query)
-        live = site_of(services.sites, query)
-        body = None if route.body is None else read_body(await _body(request), route.body)
-        try:
-            answer = route.respond(Call(live, services.past, query, body))
-            answer = await answer if inspect.isawaitable(answer) else answer
-        except SkylessError as error:  # what is asked for needs a georeference
-            return JSONResponse({"error": str(error)}, status_code=409)
-        if isinstance(answer, bytes):
-            return Response(answer, media_type=route.media_types[-1])
-        return Response(msgspec.json.encode(answer), media_type=JSON)
+        query = read_query({**request.query_params, **request.path_params}, route.query)
+        live = sites.of(query.site_text)
+        given = {name: getattr(query, name) for name in route.parameters}
+        if isinstance(query, MapQuery) and query.format == "geojson":
+            return geojson(live, route.key)
+        if route.body is not None:
+            given["body"] = _read_body(await read_bytes(request, MAX_BODY_BYTES), route.body)
+        if route.is_past:
+            answer = await history.ask(live.number, lambda asked: route.function(asked, **given))
+        else:
+            answer = route.function(live, **given)
+        if not isinstance(answer, bytes):
+            answer = msgspec.json.encode({route.key: answer} if isinstance(answer, tuple) else answer)
+        return Response(answer, media_type=route.media_types[0])
 
     return respond
 
 
-async def _body(request: Request) -> bytes:
+def geojson(live: LiveSite, kind: Any) -> Response:  # noqa: ANN401 - one of LiveSite.features
+    """The tags with fixes, the anchors or the zones. Raises HTTPException: the site is not georeferenced."""
+    try:
+        return Response(live.features(kind), media_type=GEOJSON)
+    except SkylessError as error:
+        raise HTTPException(409, str(error)) from None
+
+
+async def read_bytes(request: Request, most_bytes: int, fault: str = "") -> bytes:
+    """The request's body. One that is too long is answered with status 413 and the given words."""
     body = bytearray()
     async for chunk in request.stream():
         body += chunk
-        if len(body) > _MAX_BODY_BYTES:
-            raise HTTPException(413, f"the body should have {_MAX_BODY_BYTES} bytes at most")
+        if len(body) > most_bytes:
+            raise HTTPException(413, fault or f"the body should have {most_bytes} bytes at most")
     return bytes(body)
+
+
+def _read_body(body: bytes, kind: type) -> Struct | bytes:
+    if kind is bytes:
+        return body
+    try:
+        read: Struct = msgspec.json.decode(body, type=kind)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise HTTPException(400, f"the body cannot be read as {kind.__name__}: {error}") from None
+    return read
