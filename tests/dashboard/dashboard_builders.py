@@ -73,6 +73,7 @@ class Wire:
     """In the place of a link: keeps what is published, and echoes it as a broker does."""
 
     unread_s = 0.0
+    unacknowledged = 0
     trouble = None
 
     def __init__(self):

@@ -307,6 +307,6 @@ def test_without_a_broker_nothing_can_be_acknowledged(live, wire):
 
 def test_alarms_name_assets(broker):
     live = broker.start("a")
-    live.store_assets((Asset("t1", name="Ada"),))
+    live.assets.store((Asset("t1", name="Ada"),))
     broker.run(4.0, IN)
     assert broker.alarm().sentence == "Ada (t1) is in Desk"

@@ -178,6 +178,12 @@ class SiteAlarms:
         if message is None or message.id != occurrence:
             raise NoAlarmError(f"there is no alarm {occurrence[:120]!r} of {rule[:40]!r} and {subject[:80]!r} any more")
 
+    def is_acknowledged(self, rule: str, subject: str, occurrence: str) -> bool:
+        """Whether an alarm that is kept has been acknowledged, and what this says of it has been handed to the link."""
+        message = self.engine.messages.get((rule, subject))
+        is_open = message is not None and message.id == occurrence and message.acknowledged_unix_s is None
+        return not is_open and not self.engine.has_changes
+
     # Work
 
     def tick(self, now_s: float, unix_s: float, dashboards: Iterable[StatusMessage], *, blind: bool) -> None:

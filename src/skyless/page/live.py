@@ -455,6 +455,11 @@ class LiveSite:
         message = AcknowledgeMessage(occurrence, by[:100], self._wall_clock())
         link.publish(topics.acknowledge_topic(site_id, rule, subject), message, qos=1)
 
+    def is_acknowledged(self, rule: str, subject: str, occurrence: str) -> bool:
+        """Whether the broker has it that an alarm was acknowledged, so that no restart forgets it."""
+        stored = self._link is not None and not self._link.unacknowledged
+        return stored and self.alarms.is_acknowledged(rule, subject, occurrence)
+
     # Survey
 
     def publish_survey(self, message: SurveyFactsMessage | SurveySaveMessage) -> None:

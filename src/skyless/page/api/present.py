@@ -1,5 +1,6 @@
 """Answers about the site as it is now, and what changes it."""
 
+import asyncio
 from collections.abc import Iterable
 from typing import Final
 
@@ -31,6 +32,8 @@ from skyless.run.mqtt.messages import (
 )
 
 _ALL: Final = 2**53
+_STORED_S: Final = 5.0
+_POLL_S: Final = 0.02
 
 
 def _known(live: LiveSite) -> SiteMessage:
@@ -177,7 +180,13 @@ def put_alarm_rules(live: LiveSite, *, body: AlarmRulesMessage) -> AlarmRulesAns
     return replace(alarm_rules(live), rules=body.rules)  # they hold from the next tick on
 
 
-def acknowledge(live: LiveSite, *, rule: RuleId, subject: Subject, body: Acknowledgement) -> Acknowledgement:
-    """Acknowledge an alarm."""
+async def acknowledge(live: LiveSite, *, rule: RuleId, subject: Subject, body: Acknowledgement) -> Acknowledgement:
+    """Acknowledge an alarm: answered when the broker has it."""
     live.acknowledge(rule, subject, body.id, body.by)
+    try:
+        async with asyncio.timeout(_STORED_S):
+            while not live.is_acknowledged(rule, subject, body.id):
+                await asyncio.sleep(_POLL_S)
+    except TimeoutError:
+        raise HTTPException(503, "the broker has not taken it yet; look whether the alarm is acknowledged") from None
     return body

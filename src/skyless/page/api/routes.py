@@ -118,6 +118,7 @@ def _endpoint(route: ApiRoute, sites: LiveSites, history: Past) -> Callable[[Req
             answer = await history.ask(live.number, lambda asked: route.function(asked, **given))
         else:
             answer = route.function(live, **given)
+            answer = await answer if inspect.isawaitable(answer) else answer
         if not isinstance(answer, bytes):
             answer = msgspec.json.encode({route.key: answer} if isinstance(answer, tuple) else answer)
         return Response(answer, media_type=route.media_types[0])

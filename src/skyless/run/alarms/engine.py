@@ -212,6 +212,11 @@ class AlarmEngine:
                 self._tags.setdefault(message.subject, _Tag(now_s))
         self._evaluate_all()
 
+    @property
+    def has_changes(self) -> bool:
+        """Whether the next ``tick`` has something to say that has happened already."""
+        return bool(self._changes)
+
     def acknowledge(self, rule: str, subject: str, occurrence: str, by: str, unix_s: float) -> bool:
         """Somebody has seen an alarm. False where there is no such occurrence, or somebody has seen it before."""
         message = self.messages.get((rule, subject))
