@@ -32,6 +32,7 @@ NAVIGATION = {
         "docs/start_here",
         "docs/tutorials/first_site",
         "docs/tutorials/first_replay",
+        "docs/tutorials/everyday",
         "docs/tutorials/own_radio",
         "examples/README",
     ],

@@ -19,6 +19,17 @@ ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 PAGES = [README, *sorted(ROOT.glob("docs/tutorials/*.md")), *sorted(ROOT.glob("docs/howto/*.md"))]
 
+
+def blocks(page, language):
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+
+
+def commands(page):
+    """The lines of a page's shell blocks in their order, without comments, continued lines joined."""
+    lines = [line for block in blocks(page, "sh") for line in re.sub(r"\s*\\\n\s*", " ", block).splitlines()]
+    return [command for line in lines if (command := re.sub(r"(^|\s+)#\s.*", "", line).strip())]
+
+
 SHORTER = {
     "skyless plan hall.toml --plot hall.png --target 5": "skyless plan hall.toml --plot hall.png --target 5 --step 4",
     "skyless plan hall.toml --plot hall.png --target 10": "skyless plan hall.toml --plot hall.png --target 10 --step 4",
@@ -44,6 +55,8 @@ SHORTER = {
 """Lines that take long, and what is run in their stead: less of the same."""
 
 HTTP = "tests/dashboard/test_http_doc.py::test_clients_of_a_running_server"
+EVERYDAY_PAGE = ROOT / "docs" / "tutorials" / "everyday.md"
+EVERYDAY = "tests/cli/test_everyday_tutorial.py::test_every_line_of_the_tutorial_runs"
 DEMO = "tests/cli/test_demo_command.py::"
 KEYED = "tests/nodes/test_no_key_leaves.py::test_no_key_leaves_the_programs"
 SITE = "tests/nodes/test_running_site.py::test_a_site_rides_through_the_death_and_the_freezing_of_every_process"
@@ -72,6 +85,7 @@ ELSEWHERE = {
     "skyless doctor": DOCTOR,
     "skyless doctor --site hall.toml --report hall.md": DOCTOR,
     "skyless doctor --radio serial:/dev/ttyACM0 --mqtt none --duration 30": DOCTOR,
+    **dict.fromkeys(commands(EVERYDAY_PAGE)[1:], EVERYDAY),
     "skyless broker": BROKER + "test_it_leaves_no_orphan_however_it_ends",
     "skyless ether --site hall.toml --tags 2": SITE,
     "skyless anchor 1 2 3 4 5 6 --site hall.toml": SITE,
@@ -197,16 +211,6 @@ NEVER_RUN = (
 """Lines that need a Raspberry Pi, systemd or Docker begin like this; the pages that show them say so."""
 
 UNTIL_CTRL_C = {"anchor", "board", "bridge", "broker", "dashboard", "demo", "ether", "record", "tag"}
-
-
-def blocks(page, language):
-    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
-
-
-def commands(page):
-    """The lines of a page's shell blocks in their order, without comments, continued lines joined."""
-    lines = [line for block in blocks(page, "sh") for line in re.sub(r"\s*\\\n\s*", " ", block).splitlines()]
-    return [command for line in lines if (command := re.sub(r"(^|\s+)#\s.*", "", line).strip())]
 
 
 def arguments_of(command):
