@@ -135,7 +135,7 @@ def test_assets_and_alarms(serve, checks):
     server.assets = [asset("forklift", "Linde 3", "forklifts", icon="F"), asset("robot", "Arm", colour="#c2410c")]
     server.rules, server.file_rules = [TOO_NEAR], [IN_FILE]
     server.alarms = [
-        alarm("near", "forklift+robot", "critical", "Linde 3 and Arm are 1.4 m apart", tags=["forklift", "robot"]),
+        alarm("near", "forklift~robot", "critical", "Linde 3 and Arm are 1.4 m apart", tags=["forklift", "robot"]),
         alarm("crowded", "zone-dock", "warning", "5 tags are in Dock", zone="dock", acknowledged_unix_s=1.0),
     ]
     shown = checks(server)
