@@ -31,12 +31,11 @@ export function start(panel) {
   by.addEventListener("change", () => saveSetting(BY, by.value.trim()));
   const name = h("label", { class: "field by" }, h("span", {}, "Your name, for acknowledging; kept in this browser"), by);
   const all = button("", () => see(shownAlarms().filter(isUnseen)), { class: "quiet" });
-  const none = h("p", { class: "empty" });
-  const more = h("p", { class: "fine" });
+  const note = h("p", { class: "fine" });
   const list = h("ol", { class: "alarms", "aria-label": "Alarms" });
   const rules = rulesSection();
-  parts = { count, filter, by, all, none, more, name, rows: new Rows(list, makeAlarm), rules };
-  panel.append(h("div", { class: "above" }, count, filter), name, all, none, list, more, rules.element);
+  parts = { count, filter, by, all, note, name, rows: new Rows(list, makeAlarm), rules };
+  panel.append(h("div", { class: "above" }, count, filter), name, all, list, note, rules.element);
 }
 
 /** Bring the tab up to date. */
@@ -54,10 +53,9 @@ export function show() {
   parts.name.hidden = !state.alarms.length;
   parts.all.hidden = unseen < 2;
   text(parts.all, `Acknowledge all ${unseen} shown`);
-  parts.none.hidden = alarms.length > 0;
-  text(parts.none, state.alarms.length ? "No alarm of this kind." : "No alarms.");
   parts.rows.show(alarms.map((alarm) => [alarm.id, alarm]));
-  text(parts.more, state.moreAlarms ? `${state.moreAlarms} older alarms are not shown.` : "");
+  const none = alarms.length ? "" : state.alarms.length ? "No alarm of this kind. " : "No alarms. ";
+  text(parts.note, none + (state.moreAlarms ? `${state.moreAlarms} older alarms are not shown.` : ""));
   parts.rules.show();
 }
 

@@ -3,7 +3,7 @@
 import { state } from "../store.js";
 import { assetsFile, keep, kept } from "../api.js";
 import { live } from "../clock.js";
-import { Rows, button, h, text, toast } from "../dom.js";
+import { Rows, button, h, offer, text, toast } from "../dom.js";
 import { COLUMNS, readCsv } from "./csv.js";
 import { Draft, kindOf } from "./draft.js";
 import { allGroups, receiveAssets } from "./model.js";
@@ -95,9 +95,8 @@ export function editAssets(tag = null) {
     text(more, draft.rows.length ? hidden : "No assets yet. Add one, or import a file.");
     const missing = withoutAsset(draft);
     const names = new Set([...allGroups().keys(), ...draft.rows.map(({ asset }) => asset.group)].filter(Boolean));
-    for (const [list, values] of [[tags, missing.slice(0, 200)], [groups, [...names].sort()]]) {
-      list.replaceChildren(...values.map((value) => h("option", { value })));
-    }
+    offer(tags, missing.slice(0, 200).map((name) => [name, ""]), "");
+    offer(groups, [...names].sort().map((name) => [name, ""]), "");
     addAll.hidden = missing.length < 2;
     text(addAll, `Add the ${missing.length} tags without an asset`);
     const counts = draft.changes();

@@ -37,12 +37,12 @@ export function start(panel) {
   const range = options({ id: "history-range" }, Object.entries(RANGES), (value) => {
     if (value === "own") return parts.from.focus();
     setRange();
-    again();
+    if (kind) ask(kind);
   });
   const field = (id) => h("input", { type: "datetime-local", id, oninput: () => (range.value = "own") });
   const [from, to] = [field("history-from"), field("history-to")];
   const kinds = Object.entries(KINDS).map(([key, { words }]) => button(words, () => ask(key), { id: `history-${key}`, "aria-pressed": "false" }));
-  const zone = options({ id: "history-zone" }, [], again);
+  const zone = options({ id: "history-zone" }, [], () => ask(kind));
   const zones = h("label", { class: "field", hidden: true }, "Zone", zone);
   const times = h("p", { class: "fine" }, `Times of ${Intl.DateTimeFormat().resolvedOptions().timeZone}`);
   const form = h(
@@ -135,11 +135,6 @@ function chosenSpan() {
   if (!Number.isFinite(from_unix_s) || !Number.isFinite(to_unix_s)) throw new Error("Give a date and a time in both fields.");
   if (from_unix_s >= to_unix_s) throw new Error("The range ends before it begins.");
   return { from_unix_s, to_unix_s };
-}
-
-/** Ask the same of another range or zone. */
-function again() {
-  if (kind) ask(kind);
 }
 
 /** End the question that is under way, and show no answer. */

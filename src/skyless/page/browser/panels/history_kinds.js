@@ -91,11 +91,10 @@ async function askHeat({ get, tag, title, span, signal }) {
 function heatFacts(map, context) {
   const seconds = map.seconds.reduce((sum, value) => sum + value, 0);
   if (!seconds) return nothing(context, "There are no positions");
-  const list = facts(["Tags", "Time of all tags", "Cells with tags", "Longest in a cell"]);
+  const list = facts(["Tags", "Time of all tags", "Longest in a cell"]);
   list.show({
     Tags: number(map.tags),
     "Time of all tags": duration(seconds),
-    "Cells with tags": number(map.seconds.filter((value) => value > 0).length),
     "Longest in a cell": duration(map.seconds.reduce((most, value) => Math.max(most, value), 0)),
   });
   const corner = (index) => [map.x0_m + (index % map.columns) * map.cell_m, map.y0_m + Math.floor(index / map.columns) * map.cell_m];
@@ -137,11 +136,6 @@ function sortedTable(name, columns, rows, sort, foot = null) {
   const csv = columns.map(({ save, head }) => save ?? head.toLowerCase());
   const values = () => rows.map((row) => columns.map((column) => (column.time ? utc(column.value(row)) : column.value(row))));
   return [h("div", { class: "scroll-x" }, table), h("p", { class: "fine" }, count), saveButton(name, csv, values)];
-}
-
-/** A column of times. */
-function timeColumn(head, save, value, show) {
-  return { head, save, value, time: true, show: (row) => show(value(row), row) };
 }
 
 function dwellTable(rows, context) {
@@ -203,7 +197,7 @@ function placeButton(unix_s, tag, context) {
 function contactsTable(rows, context) {
   if (!rows.length) return nothing(context, `No other tag was within ${NEAR_M} m`);
   const columns = [
-    timeColumn("Begin", "begin", (row) => row.begin_unix_s, (unix_s, row) => placeButton(unix_s, row.tag, context)),
+    { head: "Begin", save: "begin", value: (row) => row.begin_unix_s, time: true, show: (row) => placeButton(row.begin_unix_s, row.tag, context) },
     { head: "Other tag", save: "other", value: (row) => row.other, show: (row) => shownName(row.other) },
     { head: "Time", save: "seconds", value: (row) => row.end_unix_s - row.begin_unix_s, show: (row) => duration(row.end_unix_s - row.begin_unix_s, 1), right: true },
     { head: "Nearest", save: "least_m", value: (row) => row.least_m, show: (row) => length(row.least_m), right: true },
@@ -216,11 +210,14 @@ function alarmsTable(rows, context) {
   if (!rows.length) return nothing({ ...context, title: "this site" }, "There were no alarms");
   const known = new Set(context.tags);
   const tagOf = ({ subject }) => subject.split("~").find((name) => known.has(name));
-  const raised = (unix_s, row) => (tagOf(row) ? placeButton(unix_s, tagOf(row), context) : h("time", {}, dateTime(unix_s)));
+  const raised = (row) => {
+    const at_s = row.raised_unix_s;
+    return tagOf(row) ? placeButton(at_s, tagOf(row), context) : h("time", {}, dateTime(at_s));
+  };
   const end = (row) => (row.ended_unix_s === null ? "lasts" : duration(row.ended_unix_s - row.raised_unix_s, 1));
   const by = (row) => (row.acknowledged_unix_s === null ? "nobody" : row.acknowledged_by || "somebody");
   const columns = [
-    timeColumn("Raised", "raised", (row) => row.raised_unix_s, raised),
+    { head: "Raised", save: "raised", value: (row) => row.raised_unix_s, time: true, show: raised },
     { head: "Alarm", save: "text", value: (row) => sentence(row.text) },
     { head: "Lasted", save: "lasted_s", value: (row) => (row.ended_unix_s === null ? null : row.ended_unix_s - row.raised_unix_s), show: end, right: true },
     { head: "Seen by", save: "acknowledged_by", value: (row) => row.acknowledged_by, show: by },
