@@ -135,7 +135,7 @@ def test_assets_and_alarms(serve, checks):
     server.assets = [asset("forklift", "Linde 3", "forklifts", icon="F"), asset("robot", "Arm", colour="#c2410c")]
     server.rules, server.file_rules = [TOO_NEAR], [IN_FILE]
     server.alarms = [
-        alarm("near", "forklift+robot", "critical", "Linde 3 and Arm are 1.4 m apart", tags=["forklift", "robot"]),
+        alarm("near", "forklift~robot", "critical", "Linde 3 and Arm are 1.4 m apart", tags=["forklift", "robot"]),
         alarm("crowded", "zone-dock", "warning", "5 tags are in Dock", zone="dock", acknowledged_unix_s=1.0),
     ]
     shown = checks(server)
@@ -147,6 +147,10 @@ def test_assets_and_alarms(serve, checks):
     page.click("#panel-alarms >> text=Acknowledge >> nth=0")
     page.click("#add-rule")
     page.get_by_label("Raised when").select_option("near")
+    page.click(".rule-form >> text=Save")  # the browser marks the name, which is missing
+    page.get_by_label("Name", exact=True).fill("Near")
+    page.get_by_label("Distance (m)").fill("2")
+    server.refusal = "rule 'near': hours are wrong"
     page.click(".rule-form >> text=Save")
     page.wait_for_selector(".rule-form .fault:not([hidden])")
     shown.check("alarms", "#panel")
@@ -156,7 +160,10 @@ def test_assets_and_alarms(serve, checks):
     page.get_by_label("Name of robot").fill("Arm 2")
     page.keyboard.press("Tab")
     page.get_by_label("Remove forklift").click()
+    page.click("#assets-dialog button.primary")  # the browser marks the tag, which is missing
+    page.locator(".new .asset-tag").fill("trolley")
     page.click("#assets-dialog button.primary")
-    page.wait_for_selector("#assets-dialog td .fault:not([hidden])")
+    page.wait_for_selector("#assets-dialog .fault:not([hidden])")
     shown.check("assets", "#assets-dialog")
+    shown.visit.problems.clear()  # the browser's own lines about the answers 400
     assert shown.found == {}

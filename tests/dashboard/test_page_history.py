@@ -102,7 +102,7 @@ def test_the_way_of_a_tag_is_shown_and_played(kept):
     assert page.locator("#past-mark").inner_text().startswith("Past · forklift · 20")
     assert page.locator("#pill").inner_text() != "Live"  # but Past, or a warning that the browser is busy
     assert page.evaluate("getComputedStyle(document.getElementById('moving')).opacity") == "0.2"
-    assert "Europe/Berlin, UTC+0" in page.locator("#history-form").inner_text()
+    assert "Times of Europe/Berlin" in page.locator("#history-form").inner_text()
 
     # The marker is between the two positions around the moment; a pause has no position.
     points = page.evaluate(f"{past}.track.points")
@@ -115,13 +115,17 @@ def test_the_way_of_a_tag_is_shown_and_played(kept):
     seek(page, pause)
     assert place(page) is None
     assert pixels(page, "moment") == 0
-    assert "no position then" in page.locator("#past-time").inner_text()
+    assert "no position then" in page.locator("#past-play-time").inner_text()
     assert page.evaluate(f"{past}.fixes.length") in {6, 7}
 
     # Played from within a pause, it goes on where there are positions; then the keyboard, to the end.
     page.select_option("#past-speed", "300")
     page.click("#past-play")
-    until(page, f"at => {past}.at_s > at + {made_up.PAUSE_S / 2} && !!document.querySelector('#past-time')", arg=pause)
+    until(
+        page,
+        f"at => {past}.at_s > at + {made_up.PAUSE_S / 2} && !!document.querySelector('#past-play-time')",
+        arg=pause,
+    )
     page.focus("#canvas")
     page.keyboard.press("k")
     until(page, f"!{past}.playing")
@@ -156,10 +160,12 @@ def test_heat_map_zones_occupancy_contacts_and_alarms(kept):
     before = pixels(page, "still")
     ask(page, "heat")
     assert pixels(page, "still") > before + 500
-    assert "Minutes in a cell" in page.locator("#past-scale").inner_text()
-    ticks = [float(text) for text in page.locator("#past .ticks span").all_inner_texts()]
-    assert ticks == sorted(ticks)
-    assert len(ticks) > 1
+    assert "Time in a cell" in page.locator("#past-scale").inner_text()
+    units = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
+    texts = [text.split() for text in page.locator("#past .ticks span").all_inner_texts()]
+    ticks = [sum(float(n) * units[unit] for n, unit in zip(text[::2], text[1::2], strict=True)) for text in texts]
+    times = page.evaluate("skyless.state.past.map.seconds.filter((value) => value > 0)")
+    assert min(times) / 10 <= ticks[0] < ticks[1] < ticks[2] <= max(times)
     cells = page.evaluate("skyless.state.past.map")
     most = max(range(len(cells["seconds"])), key=lambda n: cells["seconds"][n])
     x = cells["x0_m"] + (most % cells["columns"] + 0.5) * cells["cell_m"]
@@ -268,6 +274,7 @@ def test_answers_that_come_late_and_faults(kept):
     assert page.evaluate("skyless.state.past") is None
     server.history_error = None
     page.fill("#history-to", "2020-01-01T00:00")
+    page.press("#history-to", "Enter")
     page.wait_for_selector("#history-fault:has-text('The range ends before it begins.')")
     page.evaluate("""() => {
       const ask = window.fetch;

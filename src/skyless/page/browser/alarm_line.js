@@ -1,7 +1,7 @@
 /** Alarms in the header: how many are open; and below it the severest critical one that nobody has acknowledged. */
 
 import { on, state } from "./store.js";
-import { SEVERITIES, isActive, isUnseen, selectSubject } from "./alarms/model.js";
+import { SEVERITIES, criticals, isActive, isUnseen, selectSubject } from "./alarms/model.js";
 import { byId, h, text } from "./dom.js";
 import { sentence } from "./format.js";
 import { open as openTab } from "./tabs.js";
@@ -12,10 +12,6 @@ export function start() {
   byId("alarm-show").addEventListener("click", () => selectSubject(criticals()[0]));
   on(["alarms"], show);
   show();
-}
-
-function criticals() {
-  return state.alarms.filter((alarm) => alarm.severity === "critical" && isUnseen(alarm));
 }
 
 function show() {

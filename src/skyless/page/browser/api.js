@@ -8,8 +8,8 @@ function ofSite(query = "") {
   return named && `?${named}`;
 }
 
-/** Fetch JSON; throws an Error with the server's message. */
-async function fetchJson(path, options = {}) {
+/** Fetch JSON, or what `read` makes of the answer; throws an Error with the server's message. */
+async function fetchJson(path, options = {}, read = (answer) => answer.json()) {
   let answer;
   try {
     answer = await fetch(new URL(path, document.baseURI), { cache: "no-store", ...options });
@@ -18,7 +18,7 @@ async function fetchJson(path, options = {}) {
   }
   let body = null;
   try {
-    body = await answer.json();
+    body = await (answer.ok ? read(answer) : answer.json());
   } catch {
     // an error page of a proxy
   }
@@ -32,24 +32,14 @@ export async function putZones(zones, site) {
   return (await send("api/zones", { zones, site })).zones;
 }
 
-/** All assets of the live site, as the server has them now. */
-export async function assets() {
-  return (await fetchJson(`api/v1/assets${ofSite()}`)).assets;
+/** What the server keeps now for the live site: {assets} of "assets", or {rules} of "alarm_rules", those of the page. */
+export function kept(what) {
+  return fetchJson(`api/v1/${what}${ofSite()}`);
 }
 
-/** Store all assets of the site of a name. */
-export function putAssets(assets, site) {
-  return send("api/v1/assets", { assets, site });
-}
-
-/** The rules of alarms that were made on the page, as the server has them now. */
-export async function alarmRules() {
-  return (await fetchJson(`api/v1/alarm_rules${ofSite()}`)).rules;
-}
-
-/** Store all rules of the site of a name. */
-export function putAlarmRules(rules, site) {
-  return send("api/v1/alarm_rules", { rules, site });
+/** Store the same for the site of a name, all of it. */
+export function keep(what, value, site) {
+  return send(`api/v1/${what}`, { ...value, site });
 }
 
 /** Tell the server who has seen an alarm. */
@@ -90,10 +80,8 @@ export function overlay(kind, step_m, anchors = []) {
 }
 
 /** The sheet for those who mount the anchors, a PDF, also with some anchors elsewhere. @returns {Promise<Blob>} */
-export async function installersSheet(anchors) {
-  const answer = await fetch(new URL(`api/sheet${ofSite()}`, document.baseURI), { method: "POST", body: JSON.stringify({ anchors }) });
-  if (!answer.ok) throw new Error((await answer.json()).error);
-  return answer.blob();
+export function installersSheet(anchors) {
+  return fetchJson(`api/sheet${ofSite()}`, { method: "POST", body: JSON.stringify({ anchors }) }, (answer) => answer.blob());
 }
 
 /** All recordings, newest first. */

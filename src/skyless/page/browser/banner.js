@@ -5,7 +5,7 @@
  */
 
 import { on, select, state } from "./store.js";
-import { isUnseen } from "./alarms/model.js";
+import { criticals } from "./alarms/model.js";
 import { Rows, byId, h, text } from "./dom.js";
 import { now_s } from "./clock.js";
 import { LEVELS, shownCondition } from "./condition.js";
@@ -81,7 +81,7 @@ function show() {
   text(byId("condition-more"), further > 0 ? `and ${further} more` : "What to do");
   showList(condition, words);
   say(condition, `${word}. ${words}`);
-  text(document.head.querySelector("title"), `${isCritical() ? "✕ Alarm · " : ""}${mark} ${state.site ? `${state.site.name} · ` : ""}Skyless`);
+  text(document.head.querySelector("title"), `${criticals().length ? "✕ Alarm · " : ""}${mark} ${state.site ? `${state.site.name} · ` : ""}Skyless`);
   showBanner();
 }
 
@@ -156,15 +156,11 @@ function showBanner() {
   banner.hidden = !words;
   banner.className = phase === "lost" ? "lost" : "broker";
   // Beside a critical alarm nothing says that all is well.
-  byId("condition-line").hidden = !banner.hidden || (isCritical() && shownCondition().level === "good");
+  byId("condition-line").hidden = !banner.hidden || (criticals().length > 0 && ["good", "past"].includes(shownCondition().level));
   byId("banner-button").hidden = phase !== "lost";
   text(byId("banner-text"), words);
   text(byId("banner-age"), phase === "lost" ? age(since) : "");
   document.body.classList.toggle("lost", phase === "lost");
-}
-
-function isCritical() {
-  return state.alarms.some((alarm) => alarm.severity === "critical" && isUnseen(alarm));
 }
 
 function lostWords() {

@@ -61,14 +61,7 @@ export class Chart {
     this.data = data;
     this.window = window;
     text(this.value, words);
-    this.rebuild();
-    this.resize();
-  }
-
-  /** Forget the chart; its element is to be removed. */
-  remove() {
-    charts.delete(this);
-    this.plot?.destroy();
+    this.plot?.setData(data);
   }
 
   resize() {

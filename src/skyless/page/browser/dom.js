@@ -38,13 +38,13 @@ export function options(properties, pairs, choose) {
   return list;
 }
 
-/** Offer other options in a list, pairs of value and words, and choose one; a list of one option is hidden. */
+/** Offer other options in a list, pairs of value and words, and choose one, or where it is none of them the first. */
 export function offer(list, pairs, value) {
   const key = JSON.stringify(pairs);
   if (list.dataset.offered !== key) list.replaceChildren(...pairs.map(([id, words]) => h("option", { value: id }, words)));
   list.dataset.offered = key;
-  list.hidden = pairs.length < 2;
-  list.value = pairs.some(([id]) => id === value) ? value : pairs[0][0];
+  list.value = String(value);
+  if (list.selectedIndex < 0) list.selectedIndex = 0;
 }
 
 /** Set a node's text where it differs, which avoids needless layout. */

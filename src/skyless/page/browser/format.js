@@ -70,14 +70,6 @@ export function dateTime(unix_s) {
   return `${day} ${date.toLocaleTimeString("en-GB")}`;
 }
 
-/** The browser's time zone with its offset at a time. */
-export function zoneWords(unix_s) {
-  const parts = (timeZoneName) => new Intl.DateTimeFormat("en", { timeZoneName }).formatToParts(new Date(unix_s * 1e3));
-  const name = Intl.DateTimeFormat().resolvedOptions().timeZone;
-  const offset = parts("longOffset").find(({ type }) => type === "timeZoneName").value.replace("GMT", "UTC");
-  return name === offset ? name : `${name}, ${offset}`;
-}
-
 /** Size of a file or of memory. */
 export function bytes(value) {
   if (!known(value)) return DASH;

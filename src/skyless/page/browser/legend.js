@@ -1,7 +1,7 @@
 /** The legend next to the map: marks of tags and anchors, switches for layers, floors, and saving; and the scale of an overlay. */
 
 import { changed, on, saveSetting, savedSetting, select, state } from "./store.js";
-import { byId, h, options, text, throttle, toast } from "./dom.js";
+import { byId, h, offer, options, text, throttle, toast } from "./dom.js";
 import { allGroups, labelOf } from "./assets/model.js";
 import { DELAY_S, GONE_S, GREY_S, stillMotion, tracks } from "./clock.js";
 import { length } from "./format.js";
@@ -9,8 +9,9 @@ import { CONDITIONS, anchorMark, siteMode, wordsOf } from "./map/anchors.js";
 import { savePicture, savePositions } from "./map/export.js";
 import { chooseFloor, floors, giveHeights, givenHeights } from "./map/floors.js";
 import { tagMark, tagStyle } from "./map/marks.js";
-import { KINDS, choose, colourAt, fractionOf, writeValue } from "./map/overlay.js";
+import { KINDS, choose, fractionOf, writeValue } from "./map/overlay.js";
 import { NAMED } from "./map/tags.js";
+import { paintScale } from "./pictures.js";
 import { DISTINCT } from "./theme.js";
 
 const KEY = "skyless-legend";
@@ -140,8 +141,7 @@ function floorChoice() {
   const fill = () => {
     const found = floors();
     choice.hidden = found.length < 2;
-    list.replaceChildren(...[["", "all"], ...found.map(({ name }, n) => [n, name])].map(([value, words]) => h("option", { value }, words))); // prettier-ignore
-    list.value = state.options.floor === null ? "" : String(state.options.floor);
+    offer(list, [["", "all"], ...found.map(({ name }, n) => [n, name])], state.options.floor ?? "");
     if (document.activeElement !== heights) heights.value = givenHeights().join(", ");
   };
   on(["site", "mode"], () => {
@@ -177,17 +177,9 @@ function scale() {
     return;
   }
   text(byId("ramp-title"), title + (data.unit === "m" ? " in cm or m" : ", a factor"));
-  const context = byId("ramp").getContext("2d");
-  const image = context.createImageData(256, 1);
-  for (let x = 0; x < 256; x++) image.data.set([...colourAt(x / 255, data.scale).map(Math.round), 255], 4 * x);
-  context.putImageData(image, 0, 0);
-  byId("ramp-ticks").replaceChildren(
-    ...data.scale.ticks.map((tick) => {
-      const mark = h("span", {}, data.unit === "m" ? length(tick).replace(/\.0+(?= )/, "") : String(tick));
-      mark.style.left = `${100 * fractionOf(tick, data.scale)}%`;
-      return mark;
-    }),
-  );
+  const words = (tick) => (data.unit === "m" ? length(tick).replace(/\.0+(?= )/, "") : String(tick));
+  const ticks = data.scale.ticks.map((tick) => [fractionOf(tick, data.scale), words(tick)]);
+  paintScale(byId("ramp"), data.scale, byId("ramp-ticks"), ticks);
   text(byId("ramp-good"), `least ${writeValue(data.least, data)}`);
   text(byId("ramp-bad"), `largest ${writeValue(data.most, data)}`);
   const height = Number.isFinite(data.height_m) ? ` for tags at ${Number(data.height_m.toFixed(2))} m` : "";

@@ -237,17 +237,13 @@ const handlers = {
     state.zones = zones;
     changed("zones");
   },
-  assets(message) {
-    receiveAssets(message.assets);
-  },
+  assets: ({ assets }) => receiveAssets(assets),
   alarm_rules(message) {
     state.rules = message.rules;
     state.fileRules = message.file_rules;
     changed("rules");
   },
-  alarms(message) {
-    receiveAlarms(message.alarms, message.more);
-  },
+  alarms: ({ alarms, more }) => receiveAlarms(alarms, more),
   survey(message) {
     receiveSurvey(message.survey, message.age_s);
   },

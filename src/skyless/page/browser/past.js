@@ -35,7 +35,7 @@ export function endPast() {
   changed("past", "moment");
 }
 
-/** When there are fixes, in s since the first one. */
+/** When there are fixes: begin and end of each time without a gap, in s since the first one. */
 function spans(times, gap_s) {
   const found = [];
   times.forEach((time, index) => {
@@ -48,13 +48,7 @@ function spans(times, gap_s) {
 
 /** Index of the last point up to a moment; -1 before the first. */
 function find(times, unix_s) {
-  let [low, high] = [0, times.length];
-  while (low < high) {
-    const middle = (low + high) >> 1;
-    if (times[middle] <= unix_s) low = middle + 1;
-    else high = middle;
-  }
-  return low - 1;
+  return times.findLastIndex((time) => time <= unix_s);
 }
 
 /** Where the tag was at the shown moment, interpolated: x, y, z in m, and the point before; null in a gap. */
@@ -80,7 +74,6 @@ export function seekPast(unix_s) {
 /** Play or pause; at the end, from the start. */
 export function togglePast() {
   const { past } = state;
-  if (past?.kind !== "way") return;
   past.playing = !past.playing;
   lastFrame = 0;
   if (past.playing && past.at_s >= past.start_s + past.duration_s) past.at_s = past.start_s;

@@ -7,8 +7,7 @@ import { whatIfButton } from "./what_if.js";
 import { clock, dateTime } from "./format.js";
 import { SPEEDS, STEP_S, close, markedEvents, seek, seekEvent, setSpeed, step, stepEvent, stepSpeed, toggle } from "./player.js";
 
-/** Pictures of buttons, as paths. */
-export const ICONS = {
+const ICONS = {
   play: "M7 4.5v15l12-7.5z",
   pause: "M7 5h3.5v14H7zM13.5 5H17v14h-3.5z",
   back: "M18 5v14L9 12zM6 5h2.5v14H6z",
@@ -30,24 +29,10 @@ const NAMED = 3;
 
 /** Build the bar. */
 export function start() {
-  const icon = s("path", { d: ICONS.play });
-  const button = iconButton({ id: "play", onclick: toggle }, icon);
-  const slider = h("input", {
-    type: "range",
-    id: "slider",
-    min: "0",
-    step: String(STEP_S),
-    "aria-label": "Time since the recording's start",
-  });
-  slider.addEventListener("input", () => seek(Number(slider.value)));
-  const spans = h("div", { class: "spans", "aria-hidden": "true" });
+  const controls = playControls("", "Time since the recording's start", { toggle, seek, setSpeed, speeds: SPEEDS });
+  const { button, slider, spans, time, speeds } = controls;
+  slider.step = String(STEP_S);
   const marks = h("div", { class: "event-marks", role: "group", "aria-label": "Events" });
-  const time = h("output", { id: "play-time" });
-  const speeds = options(
-    { id: "speed", "aria-label": "Speed" },
-    SPEEDS.map((speed) => [speed, `${speed} ×`]),
-    (value) => setSpeed(Number(value)),
-  );
   const name = h("span", { class: "recording-name" });
   const problem = h("span", { class: "problem", role: "alert" });
   const jumps = [
@@ -77,9 +62,6 @@ export function start() {
     byId("player").hidden = badge.hidden = !player;
     document.body.classList.toggle("replaying", Boolean(player));
     if (!player) return;
-    const playing = player.playing ? "Pause" : "Play";
-    button.setAttribute("aria-label", `${playing} (K)`);
-    icon.setAttribute("d", player.playing ? ICONS.pause : ICONS.play);
     if (shown !== player) {
       slider.max = String(player.duration_s);
       download.href = fileOf(player.name);
@@ -91,9 +73,7 @@ export function start() {
     for (const jump of jumps) jump.disabled = !markedEvents(player).length;
     shown = player;
     marked = player.events;
-    slider.value = String(player.at_s);
-    slider.setAttribute("aria-valuetext", `${clock(player.at_s)} of ${clock(player.duration_s)}`);
-    speeds.value = String(player.speed);
+    controls.show(player, player.at_s, `${clock(player.at_s)} of ${clock(player.duration_s)}`);
     const day = dateTime(player.start_unix_s + player.at_s);
     text(badge, `Replay · recorded ${day}`);
     text(time, `${clock(player.at_s)} / ${clock(player.duration_s)}`);
@@ -106,8 +86,28 @@ function loading(player) {
   return player.waiting ? " · loading" : player.events === null ? " · reading events" : "";
 }
 
+/** The button, the slider with the times of fixes, the time and the speeds of a player. */
+export function playControls(prefix, label, { toggle, seek, setSpeed, speeds: choices }) {
+  const icon = s("path", {});
+  const button = iconButton({ id: `${prefix}play`, onclick: toggle }, icon);
+  const slider = h("input", { type: "range", id: `${prefix}slider`, min: "0", "aria-label": label });
+  slider.addEventListener("input", () => seek(Number(slider.value)));
+  const spans = h("div", { class: "spans", "aria-hidden": "true" });
+  const time = h("output", { id: `${prefix}play-time` });
+  const pairs = choices.map((speed) => [speed, `${speed} ×`]);
+  const speeds = options({ id: `${prefix}speed`, "aria-label": "Speed" }, pairs, (value) => setSpeed(Number(value)));
+  const show = ({ playing, speed }, at_s, words) => {
+    button.setAttribute("aria-label", `${playing ? "Pause" : "Play"} (K)`);
+    icon.setAttribute("d", playing ? ICONS.pause : ICONS.play);
+    slider.value = String(at_s);
+    slider.setAttribute("aria-valuetext", words);
+    speeds.value = String(speed);
+  };
+  return { button, slider, spans, time, speeds, show };
+}
+
 /** A button with a picture. */
-export function iconButton(properties, path) {
+function iconButton(properties, path) {
   const picture = s("svg", { viewBox: "0 0 24 24", class: "solid", "aria-hidden": "true" }, path);
   return h("button", { type: "button", class: "icon", ...properties }, picture);
 }
@@ -182,14 +182,24 @@ function moveAlong(event, index, count) {
   marks[to].focus();
 }
 
-function playKey(event) {
-  const { player } = state;
-  if (!player || event.ctrlKey || event.metaKey || event.altKey) return;
+/** Run what a key means, `actions` by key; space is K's where the focus has no use for it. Not while somebody types. */
+export function runKey(event, actions) {
   const { target, key } = event;
+  if (event.ctrlKey || event.metaKey || event.altKey) return;
   if (target.matches?.("input:not([type=range]), select, textarea")) return;
   const free = !target.closest?.("button, input, summary, a, [role=tab]");
-  const onMap = target.id === "canvas";
-  const actions = {
+  const action = actions[key === " " && free ? "k" : key.toLowerCase()];
+  if (!action) return;
+  action();
+  event.preventDefault();
+}
+
+function playKey(event) {
+  const { player } = state;
+  if (!player) return;
+  const tenths = Array.from({ length: 10 }, (_, n) => [n, () => seek((n / 10) * player.duration_s)]);
+  runKey(event, {
+    ...(event.target.id !== "canvas" && Object.fromEntries(tenths)), // the map has digits of its own
     k: toggle,
     j: () => seek(player.at_s - 5),
     l: () => seek(player.at_s + 5),
@@ -199,11 +209,5 @@ function playKey(event) {
     "]": () => stepEvent(1),
     "<": () => stepSpeed(-1),
     ">": () => stepSpeed(1),
-  };
-  const action = actions[key.toLowerCase()];
-  if (action) action();
-  else if (key === " " && free) toggle();
-  else if (/^[0-9]$/.test(key) && !onMap) seek((Number(key) / 10) * player.duration_s);
-  else return;
-  event.preventDefault();
+  });
 }

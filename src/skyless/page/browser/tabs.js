@@ -2,6 +2,7 @@
 
 import { changed, on, state } from "./store.js";
 import { byId, h, throttle } from "./dom.js";
+import { places } from "./map/places.js";
 import { picking } from "./survey/picking.js";
 import * as alarms from "./alarms/panel.js";
 import * as anchors from "./panels/anchors.js";
@@ -44,7 +45,7 @@ export function start() {
   on(["site"], openWhereNothingIsPlaced);
   on(["picking"], () => picking && matchMedia("(max-width: 760px)").matches && sheet("half"));
   setInterval(() => TABS[current].changesWithTime && show(), 1000);
-  on(["mode", "past"], showMap);
+  on(["mode", "past", "placing"], showMap);
   on(["selection"], () => {
     const { tag, anchor, zone } = state.selection;
     if (tag !== null && current !== "timing") open("tags");
@@ -70,9 +71,9 @@ function showUnread() {
   button.replaceChildren(events.title, ...(count ? [" ", h("span", { class: "unread" }, String(count), words)] : []));
 }
 
-/** On a phone the sheet makes room where the map begins to show a recording or the past. */
+/** On a phone the sheet makes room where the map begins to show a recording, the past or other places of anchors. */
 function showMap() {
-  const now = state.mode === "replay" || state.past !== null;
+  const now = state.mode === "replay" || state.past !== null || places !== null;
   if (now && !notLive && matchMedia("(max-width: 760px)").matches) sheet("low");
   notLive = now;
 }

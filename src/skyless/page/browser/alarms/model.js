@@ -1,6 +1,6 @@
 /** Alarms of the live site: their order, what they are about, and who acknowledges them. */
 
-import { changed, saveSetting, savedSetting, select, state } from "../store.js";
+import { changed, select, state } from "../store.js";
 import { acknowledge } from "../api.js";
 import { toast } from "../dom.js";
 
@@ -11,7 +11,6 @@ export const SEVERITIES = {
   info: { colour: "accent", mark: "●" },
 };
 const RANKS = Object.keys(SEVERITIES);
-const BY = "skyless-acknowledged-by";
 
 /** Keep the alarms: first those that nobody has acknowledged and those that last, of these the severest and newest. */
 export function receiveAlarms(alarms, more = 0) {
@@ -33,27 +32,25 @@ export function isUnseen(alarm) {
   return (alarm.acknowledged_unix_s ?? null) === null;
 }
 
-/** What an alarm is about: its kind, and the names or numbers. @returns {{kind: "tag"|"anchor"|"zone", ids: any[]}} */
-export function subjectOf({ kind, subject, tags, zone }) {
+/** The critical ones that nobody has acknowledged. */
+export function criticals() {
+  return state.alarms.filter((alarm) => alarm.severity === "critical" && isUnseen(alarm));
+}
+
+/**
+ * What an alarm is about, from its subject: `<tag>`, `<tag>~<tag>`, `zone-<id>` or `anchor-<id>`.
+ * @returns {{kind: "tag"|"anchor"|"zone", ids: any[]}}
+ */
+export function subjectOf({ kind, subject }) {
   if (kind.startsWith("anchor-")) return { kind: "anchor", ids: [Number(subject.replace("anchor-", ""))] };
-  if (kind === "crowded") return { kind: "zone", ids: [zone ?? subject.replace("zone-", "")] };
-  return { kind: "tag", ids: tags?.length ? tags : subject.split("+") };
+  if (kind === "crowded") return { kind: "zone", ids: [subject.replace("zone-", "")] };
+  return { kind: "tag", ids: subject.split("~") };
 }
 
 /** Select what an alarm is about. */
 export function selectSubject(alarm) {
   const { kind, ids } = subjectOf(alarm);
   select(kind, ids[0]);
-}
-
-/** The name of the user of this browser. */
-export function acknowledger() {
-  return savedSetting(BY) ?? "";
-}
-
-/** Keep the name of the user of this browser. */
-export function keepAcknowledger(name) {
-  saveSetting(BY, name);
 }
 
 /** Acknowledge alarms, one after the other. @param {any[]} alarms */

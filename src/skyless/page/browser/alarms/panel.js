@@ -1,11 +1,11 @@
 /** Alarms: those first that need somebody, who acknowledges them, and the rules that raise them. */
 
-import { state } from "../store.js";
+import { saveSetting, savedSetting, state } from "../store.js";
 import { shownName } from "../assets/model.js";
-import { Rows, h, offer, options, text } from "../dom.js";
+import { Rows, button, h, offer, options, text } from "../dom.js";
 import { dateTime, duration, sentence, timeOfDay } from "../format.js";
 import { now_s } from "../clock.js";
-import { SEVERITIES, acknowledgeAll, acknowledger, isActive, isUnseen, keepAcknowledger, selectSubject } from "./model.js";
+import { SEVERITIES, acknowledgeAll, isActive, isUnseen, selectSubject } from "./model.js";
 import { rulesSection } from "./rules.js";
 
 export const title = "Alarms";
@@ -19,24 +19,23 @@ const FILTERS = {
   active: { words: "Active", has: isActive },
   critical: { words: "Critical", has: ({ severity }) => severity === "critical" },
 };
+const BY = "skyless-acknowledged-by";
 let parts = null;
 
 /** Build the tab. */
 export function start(panel) {
   const count = h("p", { class: "count" });
   const filter = options({ "aria-label": "Which alarms" }, [], show);
-  const by = h("input", { type: "text", id: "acknowledged-by", maxLength: 60, autocomplete: "name", value: acknowledger() });
-  const fault = h("p", { class: "fault", role: "alert", id: "by-fault", hidden: true });
-  by.setAttribute("aria-describedby", "by-fault");
-  by.addEventListener("change", () => keepAcknowledger(by.value.trim()));
+  const needed = { required: true, maxLength: 60, pattern: ".*\\S.*", title: "Others see who has acknowledged an alarm" };
+  const by = h("input", { type: "text", id: "acknowledged-by", autocomplete: "name", value: savedSetting(BY) ?? "", ...needed });
+  by.addEventListener("change", () => saveSetting(BY, by.value.trim()));
   const name = h("label", { class: "field by" }, h("span", {}, "Your name, for acknowledging; kept in this browser"), by);
-  const all = h("button", { type: "button", class: "quiet", onclick: () => see(shownAlarms().filter(isUnseen)) });
-  const none = h("p", { class: "empty" });
-  const more = h("p", { class: "fine" });
+  const all = button("", () => see(shownAlarms().filter(isUnseen)), { class: "quiet" });
+  const note = h("p", { class: "fine" });
   const list = h("ol", { class: "alarms", "aria-label": "Alarms" });
   const rules = rulesSection();
-  parts = { count, filter, by, fault, all, none, more, name, rows: new Rows(list, makeAlarm), rules };
-  panel.append(h("div", { class: "above" }, count, filter), name, fault, all, none, list, more, rules.element);
+  parts = { count, filter, by, all, note, name, rows: new Rows(list, makeAlarm), rules };
+  panel.append(h("div", { class: "above" }, count, filter), name, all, list, note, rules.element);
 }
 
 /** Bring the tab up to date. */
@@ -54,10 +53,9 @@ export function show() {
   parts.name.hidden = !state.alarms.length;
   parts.all.hidden = unseen < 2;
   text(parts.all, `Acknowledge all ${unseen} shown`);
-  parts.none.hidden = alarms.length > 0;
-  text(parts.none, state.alarms.length ? "No alarm of this kind." : "No alarms.");
   parts.rows.show(alarms.map((alarm) => [alarm.id, alarm]));
-  text(parts.more, state.moreAlarms ? `${state.moreAlarms} older alarms are not shown.` : "");
+  const none = alarms.length ? "" : state.alarms.length ? "No alarm of this kind. " : "No alarms. ";
+  text(parts.note, none + (state.moreAlarms ? `${state.moreAlarms} older alarms are not shown.` : ""));
   parts.rules.show();
 }
 
@@ -67,23 +65,17 @@ function shownAlarms() {
   return state.alarms.filter((alarm) => (rule === null ? (FILTERS[chosen]?.has(alarm) ?? true) : alarm.rule === rule));
 }
 
-/** Acknowledge alarms; without a name, ask for it. */
+/** Acknowledge alarms; without a name, the browser asks for it. */
 function see(alarms) {
-  const name = parts.by.value.trim();
-  parts.fault.hidden = name !== "";
-  text(parts.fault, name ? "" : "Type your name first: others see who has acknowledged an alarm.");
-  if (!name) return parts.by.focus();
-  keepAcknowledger(name);
-  return acknowledgeAll(alarms, name);
+  if (parts.by.reportValidity()) acknowledgeAll(alarms, parts.by.value.trim());
 }
 
 function makeAlarm(_id, alarm) {
   let now = alarm;
   const { mark } = SEVERITIES[alarm.severity];
-  const what = h("button", { type: "button", class: "name", onclick: () => selectSubject(now) }, sentence(alarm.sentence));
+  const what = button(sentence(alarm.sentence), () => selectSubject(now), { class: "name" });
   const about = h("p", { class: "fine" });
-  const seen = h("button", { type: "button", onclick: () => see([now]) }, "Acknowledge");
-  seen.setAttribute("aria-label", `Acknowledge: ${alarm.sentence}`);
+  const seen = button("Acknowledge", () => see([now]), { "aria-label": `Acknowledge: ${alarm.sentence}` });
   const icon = h("span", { class: "log-mark", "aria-hidden": "true" }, mark);
   const element = h("li", {}, icon, h("div", {}, h("span", { class: "unseen" }, `${alarm.severity}: `), what, about), seen);
   const update = (next) => {

@@ -1,10 +1,10 @@
 /** The rules that raise alarms: those of the site file, which only it changes, and those of the page, with a form. */
 
 import { changed, state } from "../store.js";
-import { alarmRules, putAlarmRules } from "../api.js";
+import { keep, kept } from "../api.js";
 import { allGroups, shownName } from "../assets/model.js";
 import { live } from "../clock.js";
-import { Rows, button, h, options, text, toast } from "../dom.js";
+import { Rows, button, h, offer, options, text, toast } from "../dom.js";
 
 /** The kinds of rules: words, the fields of each, the words and unit of its limit, and the time that it usually waits. */
 const KINDS = {
@@ -29,9 +29,8 @@ export function rulesSection() {
   const element = h("section", {}, h("div", { class: "above" }, h("h2", { class: "count" }, "Rules"), add), none, place, list);
   const edit = (rule) => {
     place.replaceChildren(ruleForm(rule, () => (place.replaceChildren(), add.focus())));
-    const form = place.firstElementChild;
-    form.querySelector("input, select").focus();
-    form.scrollIntoView({ block: "nearest" });
+    place.querySelector("select").focus();
+    place.scrollIntoView({ block: "nearest" });
   };
   const rows = new Rows(list, (_key, { rule, own }) => makeRule(rule, own, edit));
   const show = () => {
@@ -74,12 +73,10 @@ function whoWords(who) {
 
 /** Store the page's rules after a change to the newest that the server has. */
 async function store(apply) {
-  const rules = apply(await alarmRules());
-  if (!rules) return false;
-  await putAlarmRules(rules, state.site?.name ?? "");
+  const rules = apply((await kept("alarm_rules")).rules);
+  await keep("alarm_rules", { rules }, state.site?.name ?? "");
   state.rules = rules;
   changed("rules");
-  return true;
 }
 
 async function remove(rule) {
@@ -99,63 +96,50 @@ function labelled(words, element) {
   return h("div", { class: "field" }, h("label", { htmlFor: element.id }, words), element);
 }
 
-function field(value, type = "text") {
-  return h("input", { type, value: String(value ?? ""), autocomplete: "off", ...(type === "number" && { step: "any" }) });
+function field(value, properties = {}) {
+  return h("input", { type: "text", value: String(value ?? ""), autocomplete: "off", ...properties });
 }
 
-function choice(value, pairs, choose = () => {}) {
-  const list = options({}, pairs, choose);
+function choice(value, pairs, properties = {}, choose = () => {}) {
+  const list = options(properties, pairs, choose);
   list.value = value;
   return list;
 }
 
-/** The form of a rule, or with null of a new one. `close` removes it. */
+/** The form of a rule, or with null of a new one. `close` removes it. The browser says what is missing. */
 function ruleForm(rule, close) {
   const kinds = Object.entries(KINDS).map(([key, { words }]) => [key, words]);
-  const kind = choice(rule?.kind ?? "inside", kinds, () => fill());
+  const zones = state.zones.map(({ id, name }) => [id, name]);
+  const kind = choice(rule?.kind ?? "inside", kinds, {}, () => fill());
   const factor = () => KINDS[kind.value].factor ?? 1;
   const scaled = (value) => (value == null ? "" : Number((value * factor()).toFixed(6)));
-  const name = field(rule?.name || rule?.id);
-  const zone = choice(rule?.zone ?? "", [["", "Choose a zone"], ...state.zones.map((one) => [one.id, one.name])]);
+  const atLeast0 = { type: "number", step: "any", min: "0", required: true };
+  const name = field(rule?.name || rule?.id, { required: true, pattern: ".*\\S.*", title: "People read it in the alarm" });
+  const words = zones.length ? "Choose a zone" : "The tab Zones makes zones";
+  const zone = choice(rule?.zone ?? "", [["", words], ...zones], { required: true });
   const tags = whoField("Tags and groups", "all tags", rule?.tags);
   const others = whoField("Not near to", "any other tag", rule?.others);
-  const limit = field(scaled(rule?.limit), "number");
-  const back = field(scaled(rule?.hysteresis ?? 0), "number");
-  const after = field(rule?.after_s ?? 0, "number");
-  const clear = field(rule?.clear_after_s ?? 1, "number");
+  const limit = field(scaled(rule?.limit), atLeast0);
+  const back = field(scaled(rule?.hysteresis ?? 0), atLeast0);
+  const after = field(rule?.after_s ?? 0, atLeast0);
+  const clear = field(rule?.clear_after_s ?? 1, atLeast0);
   const hours = field(rule?.hours);
   const severity = choice(rule?.severity ?? "warning", ["info", "warning", "critical"].map((one) => [one, one]));
   const fault = h("p", { class: "fault", role: "alert", hidden: true });
-  const boxes = { zone: labelled("Zone", zone), tags: tags.element, others: others.element };
   const limits = h("div", { class: "fields" }, labelled("Limit", limit), labelled("Ends when back by", back));
+  const boxes = { zone: labelled("Zone", zone), tags: tags.element, others: others.element, limit: limits };
   const fill = () => {
-    const { fields, limit: words, unit, after: usual } = KINDS[kind.value];
-    for (const [key, box] of Object.entries(boxes)) box.hidden = !fields.includes(key);
-    limits.hidden = !fields.includes("limit");
-    text(limits.querySelector("label"), `${words} (${unit})`);
+    const { fields, limit: what, unit, after: usual } = KINDS[kind.value];
+    for (const [key, box] of Object.entries(boxes)) {
+      box.hidden = !fields.includes(key);
+      for (const one of box.querySelectorAll("input, select")) one.disabled = box.hidden; // need not be filled in
+    }
+    text(limits.querySelector("label"), `${what} (${unit})`);
     if (!rule) after.value = String(usual ?? 0);
   };
-  const fail = (words, element = null) => {
-    text(fault, words);
-    fault.hidden = !words;
-    for (const one of form.querySelectorAll("[aria-invalid]")) one.removeAttribute("aria-invalid");
-    element?.setAttribute("aria-invalid", "true");
-    element?.focus();
-    return null;
-  };
-  /** The rule as it is typed; null where something is wrong, which is then said. */
+  /** The rule as it is typed. */
   const read = () => {
-    const { fields, limit: words } = KINDS[kind.value];
-    if (!name.value.trim()) return fail("A name is missing: people read it in the alarm.", name);
-    if (fields.includes("zone") && !zone.value) return fail("Choose a zone; zones are drawn in the tab Zones.", zone);
-    const numbers = new Map([[after, "After"], [clear, "Ends after"]]);
-    if (fields.includes("limit")) numbers.set(limit, words).set(back, "Ends when back by");
-    for (const [one, what] of numbers) {
-      if (one.value === "" || !(Number(one.value) >= 0)) return fail(`${what} is a number of at least 0.`, one);
-    }
-    for (const { input, take } of [tags, others]) {
-      if (!take()) return fail(`No tag or group is called "${input.value}"; choose one of the list.`, input);
-    }
+    const { fields } = KINDS[kind.value];
     const known = { zone: zone.value, tags: tags.values(), others: others.values(), limit: limit.value / factor() };
     const own = Object.fromEntries(fields.map((key) => [key, known[key]]));
     if ("limit" in own) own.hysteresis = back.value / factor();
@@ -163,36 +147,32 @@ function ruleForm(rule, close) {
     const what = { id: rule?.id ?? freshId(name.value), kind: kind.value, name: name.value.trim() };
     return { ...what, ...own, ...times, severity: severity.value };
   };
-  let loaded = rule && JSON.stringify(rule);
-  /** The page's rules with this one; null where another page has changed it since it was loaded, which is then said. */
+  let loaded = JSON.stringify(rule);
   const insert = (made) => (now) => {
-    const theirs = now.find(({ id }) => id === made.id);
-    if (loaded && JSON.stringify(theirs) !== loaded) {
-      loaded = theirs ? JSON.stringify(theirs) : null;
-      const what = theirs ? `changed this rule: ${ruleWords(theirs)}` : "deleted this rule";
-      return fail(`Meanwhile another page has ${what}. Save again to store what stands here.`);
-    }
-    return theirs ? now.map((one) => (one.id === made.id ? made : one)) : [...now, made];
+    const theirs = JSON.stringify(now.find(({ id }) => id === made.id) ?? null);
+    const isOurs = theirs === loaded;
+    loaded = theirs;
+    if (!isOurs) throw new Error("another page has changed or deleted this rule meanwhile. Save again to store what stands here.");
+    return [...new Map([...now, made].map((one) => [one.id, one])).values()];
   };
   const save = async (event) => {
     event.preventDefault();
-    fail("");
     const made = read();
     try {
-      if (!made || !(await store(insert(made)))) return;
+      await store(insert(made));
       close();
       toast(`${made.name} saved.`);
     } catch ({ message }) {
-      fail(`Not saved: ${message}`, message.includes("hours") ? hours : message.includes("limit") ? limit : null);
+      text(fault, `Not saved: ${message}`);
+      fault.hidden = false;
     }
   };
   const form = h(
     "form",
-    { class: "rule-form", noValidate: true, "aria-label": rule ? `Rule ${name.value}` : "New rule", onsubmit: save },
+    { class: "rule-form", "aria-label": rule ? `Rule ${name.value}` : "New rule", onsubmit: save },
     labelled("Raised when", kind),
     labelled("Name", name),
     ...Object.values(boxes),
-    limits,
     h("div", { class: "fields" }, labelled("After (s)", after), labelled("Ends after (s)", clear), labelled("Severity", severity)),
     labelled("Hours", hours),
     h("p", { class: "fine" }, HELP),
@@ -218,32 +198,19 @@ function whoField(label, everybody, chosen = []) {
   const values = new Set(chosen);
   const tags = new Set([...live.sorted.map(({ name }) => name), ...state.assets.keys()]);
   const all = [...[...allGroups().keys()].map((name) => `group:${name}`), ...tags];
-  const input = field();
-  const element = labelled(label, input);
-  const list = h("datalist", { id: `${input.id}-list` }, ...all.map((value) => h("option", { value }, whoWords(value))));
-  input.setAttribute("list", list.id);
+  const list = options({}, [], (who) => (values.add(who), show()));
   const chips = h("span", { class: "chips" });
+  const chip = (who) => {
+    const remove = () => (values.delete(who), show(), list.focus());
+    return button(`${whoWords(who)} ✕`, remove, { "aria-label": `Remove ${whoWords(who)}` });
+  };
   const show = () => {
-    const chip = (who) => {
-      const made = button(`${whoWords(who)} ✕`, () => (values.delete(who), show(), input.focus()));
-      made.setAttribute("aria-label", `Remove ${whoWords(who)}`);
-      return made;
-    };
-    chips.replaceChildren(...(values.size ? [...values].map(chip) : [h("span", { class: "fine" }, everybody)]));
+    chips.replaceChildren(...[...values].map(chip));
+    const free = all.filter((who) => !values.has(who)).map((who) => [who, whoWords(who)]);
+    offer(list, [["", values.size ? "Add …" : everybody], ...free], "");
   };
-  /** Take over what is typed, a name in use at the site; false where nothing is called so. */
-  const take = () => {
-    const typed = input.value.trim();
-    const who = all.find((one) => one === typed) ?? all.find((one) => whoWords(one) === typed) ?? (state.part && typed);
-    if (who) values.add(who);
-    if (typed && !who) return false;
-    input.value = "";
-    show();
-    return true;
-  };
-  input.addEventListener("change", take);
-  input.addEventListener("keydown", (event) => event.key === "Enter" && input.value && (event.preventDefault(), take()));
   show();
-  element.append(chips, list);
-  return { element, input, take, values: () => [...values] };
+  const element = labelled(label, list);
+  element.append(chips);
+  return { element, values: () => [...values] };
 }

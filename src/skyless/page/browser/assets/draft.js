@@ -1,23 +1,24 @@
-/** Assets while they are edited: the site's as they were loaded, and the changes that are not saved yet. No elements. */
+/** Assets while they are edited: the site's, and the changes that are not saved yet. No elements. */
 
 import { COLUMNS } from "./csv.js";
 
-const TAG = /^[\w.-]{1,64}$/;
-const COLOUR = /^#[0-9a-f]{6}$/i;
-
-/** @typedef {{number: number, asset: Record<string, string>, base: Record<string, string>|null, removed: boolean, other: string}} Row */
+/**
+ * One asset; `base` is what the site has, null for a new one. The tag of one that the site has is never changed.
+ * @typedef {{number: number, asset: Record<string, string>, base: Record<string, string>|null, removed: boolean}} Row
+ */
 
 export class Draft {
   /** @param {any[]} assets the site's */
   constructor(assets) {
     this.serial = 0;
     /** @type {Row[]} */
-    this.rows = assets.map((asset) => this.row(asset, filled(asset)));
+    this.rows = [];
+    this.rebase(assets);
   }
 
-  /** @returns {Row} `base` is the asset as the site has it, null for a new one */
+  /** @returns {Row} */
   row(asset, base = null) {
-    return { number: ++this.serial, asset: filled(asset), base, removed: false, other: "" };
+    return { number: ++this.serial, asset: filled(asset), base, removed: false };
   }
 
   /** Add an asset, above the others. */
@@ -41,68 +42,41 @@ export class Draft {
       if (row) Object.assign(row, { asset: { ...row.asset, ...asset }, removed: false });
       else this.add(asset);
     }
-    this.rows.sort((a, b) => Number(this.kind(a) === "") - Number(this.kind(b) === ""));
+    this.rows.sort((a, b) => Number(kindOf(a) === "") - Number(kindOf(b) === ""));
   }
 
   /**
-   * Take over what another page has saved meanwhile; where both have changed an asset, this page's change stays and the
-   * row says so. Returns the tags that the other has changed.
+   * Take over what the site has now. Where another page and this one have changed an asset, this page's change stays.
+   * @returns {{changed: string[], both: string[]}} tags that the other page has changed, and those that both have
    */
   rebase(assets) {
     const now = new Map(assets.map((asset) => [asset.tag, filled(asset)]));
-    const changed = [];
-    for (const row of [...this.rows]) {
-      const { base } = row;
-      const tag = base?.tag ?? row.asset.tag;
-      const theirs = now.get(tag) ?? null;
-      now.delete(tag);
-      if (same(base, theirs)) continue;
-      changed.push(tag);
-      const mine = this.kind(row) !== "";
+    const [changed, both] = [[], []];
+    const kept = new Set(this.rows.filter(({ base }) => base).map(({ asset }) => asset.tag));
+    this.rows = this.rows.filter((row) => {
+      if (!row.base && kept.has(row.asset.tag)) return true; // a second row of a tag; the server refuses both
+      const theirs = now.get(row.asset.tag) ?? null;
+      now.delete(row.asset.tag);
+      if (same(row.base, theirs)) return true;
+      changed.push(row.asset.tag);
+      const mine = kindOf(row) !== "";
       row.base = theirs;
-      if (mine && !(theirs && same(row.asset, theirs))) row.other = theirs ? `saved elsewhere as ${words(theirs)}` : "removed elsewhere";
+      if (mine) both.push(row.asset.tag);
       else if (theirs) row.asset = { ...theirs };
-      else this.rows = this.rows.filter((one) => one !== row);
-    }
+      return mine || theirs;
+    });
     for (const [tag, theirs] of now) {
       changed.push(tag);
       this.rows.push(this.row(theirs, theirs));
     }
-    return changed;
+    return { changed, both };
   }
 
-  /** What saving does to a row: "new", "changed", "removed" or "". @param {Row} row */
-  kind({ asset, base, removed }) {
-    if (removed) return "removed";
-    return base === null ? "new" : same(asset, base) ? "" : "changed";
-  }
-
-  /** Numbers of rows that are new, changed and removed, and whether there is any. */
+  /** Numbers of rows that are new, changed, removed and, under "", none of these. */
   changes() {
     const counts = { new: 0, changed: 0, removed: 0, "": 0 };
-    for (const row of this.rows) counts[this.kind(row)] += 1;
-    return { counts, any: counts[""] < this.rows.length };
-  }
-
-  /** Set the group of rows that stay. */
-  setGroup(rows, group) {
-    for (const row of rows) if (!row.removed) row.asset.group = group;
-  }
-
-  /** What is wrong: pairs of row and field with a sentence. @returns {Array<{row: Row, field: string, words: string}>} */
-  faults() {
-    const faults = [];
-    const seen = new Set();
-    const kept = this.rows.filter(({ removed }) => !removed);
-    for (const row of [...kept.filter(({ base }) => base), ...kept.filter(({ base }) => !base)]) {
-      const { tag, colour } = row.asset;
-      if (!tag) faults.push({ row, field: "tag", words: "The name of the tag is missing." });
-      else if (seen.has(tag)) faults.push({ row, field: "tag", words: `Another row has the tag ${tag} already.` });
-      else if (!TAG.test(tag)) faults.push({ row, field: "tag", words: "A tag's name has letters, digits, dots, dashes and underscores only." });
-      seen.add(tag);
-      if (colour && !COLOUR.test(colour)) faults.push({ row, field: "colour", words: "A colour is # and six digits, as #c2410c." });
-    }
-    return faults;
+    for (const row of this.rows) counts[kindOf(row)] += 1;
+    return counts;
   }
 
   /** All assets as they are to be saved: in their order, new ones at the end. */
@@ -112,14 +86,16 @@ export class Draft {
   }
 }
 
+/** What saving does to a row: "new", "changed", "removed" or "". @param {Row} row */
+export function kindOf({ asset, base, removed }) {
+  if (removed) return "removed";
+  return base === null ? "new" : same(asset, base) ? "" : "changed";
+}
+
 function filled(asset) {
   return Object.fromEntries(COLUMNS.map((key) => [key, asset[key] ?? ""]));
 }
 
 function same(one, other) {
   return one === other || (one !== null && other !== null && COLUMNS.every((key) => one[key] === other[key]));
-}
-
-function words(asset) {
-  return [asset.name, asset.group, asset.colour, asset.owner, asset.notes].filter(Boolean).join(", ") || asset.tag;
 }

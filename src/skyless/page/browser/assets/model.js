@@ -41,11 +41,9 @@ function lookOf(asset) {
   return colour ? { colour, number: group?.number ?? 0 } : null;
 }
 
-/** FNV-1a. */
+/** A number that only the name decides. */
 function hash(name) {
-  let value = 0x811c9dc5;
-  for (const byte of new TextEncoder().encode(name)) value = Math.imul(value ^ byte, 0x01000193) >>> 0;
-  return value;
+  return [...name].reduce((sum, letter) => (31 * sum + letter.codePointAt(0)) % 65_521, 0);
 }
 
 on(["theme"], () => {

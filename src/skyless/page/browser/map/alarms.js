@@ -7,7 +7,7 @@ import { drawnAnchors } from "./anchors.js";
 import { groundHeight } from "./floors.js";
 import { drawn } from "./tags.js";
 import { toX, toY } from "./view.js";
-import { middle } from "./zones.js";
+import { isOnFloor, middle } from "./zones.js";
 
 const RADIUS = 12;
 
@@ -38,7 +38,7 @@ function anchorAt(id) {
 }
 
 function zoneAt(id) {
-  const zone = state.zones.find((one) => one.id === id);
+  const zone = state.zones.find((one) => one.id === id && isOnFloor(one));
   if (!zone) return null;
   const [x_m, y_m] = middle(zone.polygon_m);
   return { x: toX(x_m, y_m), y: toY(x_m, y_m, groundHeight()) - 20 };

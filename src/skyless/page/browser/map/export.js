@@ -3,13 +3,15 @@
 import { state } from "../store.js";
 import { now_s, shown_s, tracks } from "../clock.js";
 import { byId, toast } from "../dom.js";
+import { csvOf, saveFile, utc } from "../files.js";
 import { dateTime, length } from "../format.js";
 import { labelOf } from "../assets/model.js";
+import { colourAt } from "../pictures.js";
 import { palette } from "../theme.js";
 import { ALERT, ALERTS, HEIGHT_GIVEN, HPL, STD, TIME, X, Y, Z } from "../tracks.js";
 import { CONDITIONS, wordsOf } from "./anchors.js";
 import { drawMark, tagStyle } from "./marks.js";
-import { KINDS, colourAt, fractionOf, writeValue } from "./overlay.js";
+import { KINDS, fractionOf, writeValue } from "./overlay.js";
 import { visibleTags } from "./tags.js";
 import { view } from "./view.js";
 
@@ -20,27 +22,26 @@ export const COLUMNS = ["time", "tag", "x_m", "y_m", "z_m", "sigma_m", "level_m"
 
 /** All positions up to the moment that is shown, as CSV: oldest first for each tag, time in UTC. */
 export function positionsCsv(list = tracks().sorted, until_s = shown_s()) {
-  const parts = [`${COLUMNS.join(",")}\r\n`];
+  return csvOf(COLUMNS, rowsOf(list, until_s));
+}
+
+function* rowsOf(list, until_s) {
   const alerts = Object.keys(ALERTS);
   const write = (value, digits) => (Number.isFinite(value) ? value.toFixed(digits) : "");
   for (const track of list) {
-    const name = /[",\r\n]/.test(track.name) ? `"${track.name.replaceAll('"', '""')}"` : track.name;
     for (let index = 0; index <= track.find(until_s); index++) {
       const at = (column) => track.value(index, column);
-      const time = new Date(Math.round(at(TIME) * 1e3)).toISOString();
       const metres = [write(at(X), 4), write(at(Y), 4), write(at(Z), 4), write(at(STD), 5), write(at(HPL), 4)];
-      const given = at(HEIGHT_GIVEN) === 1 ? "yes" : "no";
-      parts.push(`${time},${name},${metres.join(",")},${alerts[at(ALERT)] ?? ""},${given}\r\n`);
+      yield [utc(at(TIME)), track.name, ...metres, alerts[at(ALERT)], at(HEIGHT_GIVEN) === 1 ? "yes" : "no"];
     }
   }
-  return parts;
 }
 
 /** Save the positions as a file. */
 export function savePositions() {
-  const parts = positionsCsv();
-  if (parts.length < 2) return toast("There are no positions yet.");
-  save(new Blob(parts, { type: "text/csv" }), "csv");
+  const table = positionsCsv();
+  if (table.indexOf("\n") === table.length - 1) return toast("There are no positions yet.");
+  save(new Blob([table], { type: "text/csv" }), "csv");
 }
 
 /** Save the map as a picture. */
@@ -50,13 +51,7 @@ export function savePicture() {
 
 /** Save a file that is named after the site and the time. */
 export function save(blob, ending) {
-  const site = (state.site?.name ?? "site").replaceAll(/[^\p{L}\p{N}]+/gu, "-");
-  const time = dateTime(now_s()).replaceAll(/[: ]/g, "-");
-  const link = document.createElement("a");
-  link.download = `skyless-${site}-${time}.${ending}`;
-  link.href = URL.createObjectURL(blob);
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+  saveFile(blob, `skyless-${state.site?.name ?? "site"}-${dateTime(now_s())}.${ending}`);
 }
 
 /** The map as it is shown, with site and time above it and the legend below. */
@@ -151,7 +146,7 @@ function inLines(context, entries) {
 function drawScaleOf(context, data, y) {
   const wide = Math.min(320, view.width - 2 * EDGE);
   for (let n = 0; n < wide; n++) {
-    context.fillStyle = `rgb(${colourAt(n / (wide - 1), data.scale).map(Math.round).join(",")})`;
+    context.fillStyle = `rgb(${colourAt(n / (wide - 1), data.scale).join(",")})`;
     context.fillRect(EDGE + n, y + LINE - 8, 1.5, 10);
   }
   context.fillStyle = palette.text;

@@ -67,7 +67,7 @@ export function drawFloor(context) {
 }
 
 /** Lay a picture on the ground of the chosen floor, its lower left corner at a position. */
-function drawPicture(context, picture, x_m, y_m, width_m, height_m) {
+export function drawPicture(context, picture, x_m, y_m, width_m, height_m) {
   drawInMetres(context, groundHeight());
   context.scale(1, -1); // pictures count downwards
   context.drawImage(picture, x_m, -(y_m + height_m), width_m, height_m);

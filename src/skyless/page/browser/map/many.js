@@ -7,16 +7,16 @@
 import { changed, state } from "../store.js";
 import { GONE_S, GREY_S, now_s } from "../clock.js";
 import { palette } from "../theme.js";
-import { groundHeight } from "./floors.js";
-import { rampColour } from "./past.js";
-import { drawInMetres, toX, toY, view } from "./view.js";
+import { colourAt, paintGrid } from "../pictures.js";
+import { drawPicture } from "./floor.js";
+import { ramp } from "./past.js";
+import { toX, toY, view } from "./view.js";
 
 /** So few tags are drawn with names, ellipses and trails instead, from the ordinary stream. */
 export const FEW = 400;
 /** The view is sent when it has changed, looked at in this interval, and at least in the longer one: pages are alive. */
 const LOOK_MS = 100;
 const ALIVE_MS = 2000;
-const CONDITIONS = ["unknown", "good", "warn", "bad"];
 const NOT_EXCLUDED = 3;
 const OVER_LIMIT = 5;
 /** Side of a point, pixels of CSS. */
@@ -31,15 +31,13 @@ let askedMs = 0;
 /** The view that is asked for, and the server's time from which messages are of it. */
 let box = null;
 let since_s = Infinity;
-/** Identifiers of the anchors, in the order of messages `H`. */
-let anchors = [];
 
 /**
- * Read a message; null for one that is none. Numbers of 16 bits are packed in pairs as they lie in the message, which is
- * little-endian as every browser's computer is.
+ * Read a message of tags or of counts; null for another one: the anchors come by the other stream. Numbers of 16 bits are
+ * packed in pairs as they lie in the message, which is little-endian as every browser's computer is.
  * @param {ArrayBuffer} data
  */
-export function readMany(data) {
+function readMany(data) {
   if (data.byteLength < 12) return null;
   const bytes = new DataView(data);
   const kind = String.fromCharCode(bytes.getUint8(0));
@@ -47,10 +45,6 @@ export function readMany(data) {
   const time = (at) => Number(bytes.getBigUint64(at, true)) / 1e6;
   const fits = (size) => data.byteLength === size;
   if (kind === "P" && fits(12 + 12 * count)) return { kind, count, unix_s: time(4), words: new Uint32Array(data, 12) };
-  if (kind === "H" && fits(12 + count)) return { kind, codes: new Uint8Array(data, 12) };
-  if (kind === "A" && fits(12 + 14 * count)) {
-    return { kind, ids: Array.from({ length: count }, (_, n) => bytes.getUint16(12 + 14 * n, true)) };
-  }
   if (kind !== "B" || data.byteLength < 16) return null;
   const [columns, rows] = [count, bytes.getUint16(4, true)];
   if (!fits(16 + 2 * columns * rows)) return null;
@@ -58,17 +52,12 @@ export function readMany(data) {
   return { kind, columns, rows, unix_s: time(8), cell: bytes.getUint8(1), counts, count: counts.reduce((sum, one) => sum + one, 0) };
 }
 
-/** Take a message in; tags and counts are of the view `seen`, {box, px}. */
-export function receiveMany(data, seen) {
+/** Take a message of the view `seen`, {box, px}, in. */
+function receiveMany(data, seen) {
   const message = readMany(data);
-  if (message?.kind === "A") anchors = message.ids;
-  else if (message?.kind === "H" && message.codes.length === anchors.length) {
-    anchors.forEach((id, n) => state.health.conditions.set(id, CONDITIONS[message.codes[n]] ?? "unknown"));
-    changed("health");
-  } else if (seen && message?.unix_s >= since_s) {
-    state.many = { ...message, ...seen };
-    changed("tags");
-  }
+  if (!seen || !(message?.unix_s >= since_s)) return;
+  state.many = { ...message, ...seen };
+  changed("tags");
 }
 
 /** Whether the map draws its tags from this stream. */
@@ -117,30 +106,19 @@ function pixelOf(colour) {
   return ((255 << 24) | (blue << 16) | (green << 8) | red) >>> 0;
 }
 
-let cells = { of: null, canvas: null };
+let cells = { of: null, picture: null };
 
 function drawCounts(context, many) {
   const { columns, rows, cell, counts, box: [x0, y0, x1], px } = many; // prettier-ignore
   if (cells.of !== counts) {
-    const canvas = Object.assign(document.createElement("canvas"), { width: columns, height: rows });
-    const image = new ImageData(columns, rows);
     const most = Math.log1p(counts.reduce((top, one) => Math.max(top, one), 1));
-    const line = Array.from({ length: 64 }, (_, n) => pixelOf(rampColour(n / 63).join(" ")));
-    const pixels = new Uint32Array(image.data.buffer);
-    counts.forEach((count, n) => {
-      const at = (rows - 1 - Math.floor(n / columns)) * columns + (n % columns);
-      if (count) pixels[at] = line[Math.round((63 * Math.log1p(count)) / most)];
-    });
-    canvas.getContext("2d").putImageData(image, 0, 0);
-    cells = { of: counts, canvas };
+    const colourOf = (count) => (count ? colourAt(Math.log1p(count) / most, ramp()) : null);
+    cells = { of: counts, picture: paintGrid(many, counts, colourOf) };
   }
   const side_m = (cell * (x1 - x0)) / px[0];
   context.globalAlpha = 0.9;
-  drawInMetres(context, groundHeight());
-  context.scale(1, -1); // pictures count downwards
   context.imageSmoothingEnabled = false;
-  context.drawImage(cells.canvas, x0, -(y0 + rows * side_m), columns * side_m, rows * side_m);
-  context.restore();
+  drawPicture(context, cells.picture, x0, y0, columns * side_m, rows * side_m);
   context.globalAlpha = 1;
 }
 
@@ -172,7 +150,7 @@ function connect() {
 /** Forget all; the next look connects again where the server has the stream. */
 function end() {
   const old = socket;
-  [socket, asked, box, anchors, since_s] = [null, "", null, [], Infinity];
+  [socket, asked, box, since_s] = [null, "", null, Infinity];
   old?.close();
   if (state.many) changed("tags");
   state.many = null;

@@ -156,8 +156,6 @@ export function start() {
     flashedMs = performance.now();
   });
   const still = ["site", "zones", "events", "health", "overlay", "theme", "options", "selection", "mode", "connection"];
-  on([...still, "survey", "watch", "setup", "plan", "placing", "alarms"], () => redraw(true));
-  on(["tags", "editor", "player"], () => redraw(false));
-  on([...still, "survey", "watch", "setup", "plan", "past"], () => redraw(true));
+  on([...still, "survey", "watch", "setup", "plan", "placing", "alarms", "past"], () => redraw(true));
   on(["tags", "editor", "player", "moment"], () => redraw(false));
 }

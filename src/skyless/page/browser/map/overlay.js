@@ -5,6 +5,7 @@ import { overlay } from "../api.js";
 import { liveSite } from "../live.js";
 import { toast } from "../dom.js";
 import { length, number } from "../format.js";
+import { colourAt, paintGrid } from "../pictures.js";
 import { movedAnchors } from "./places.js";
 
 export const KINDS = {
@@ -25,18 +26,6 @@ export function fractionOf(value, { low, high }) {
   return value > low ? Math.min(Math.log(value / low) / Math.log(high / low), 1) : 0;
 }
 
-/** Red, green and blue, 0 to 255, at a position on a scale. */
-export function colourAt(fraction, { stops }) {
-  const at = Math.min(Math.max(fraction, 0), 1) * (stops.length - 1);
-  const index = Math.min(Math.floor(at), stops.length - 2);
-  const [one, other] = [parts(stops[index]), parts(stops[index + 1])];
-  return one.map((value, part) => value + (at - index) * (other[part] - value));
-}
-
-function parts(stop) {
-  return [1, 3, 5].map((at) => parseInt(stop.slice(at, at + 2), 16));
-}
-
 /** A value with its unit. */
 export function writeValue(value, data = state.overlay.data) {
   return data.unit === "m" ? length(value) : number(value, 2);
@@ -44,7 +33,7 @@ export function writeValue(value, data = state.overlay.data) {
 
 /** Show another overlay, or none. */
 export async function choose(kind) {
-  const mine = ++serial;
+  serial++;
   state.options.overlay = kind;
   state.overlay = { data: null, picture: null, error: "", pendingSince: null };
   changed("overlay", "options");
@@ -53,37 +42,25 @@ export async function choose(kind) {
     toast("Overlays are computed for the live site; this recording has different anchors.");
     return choose("none");
   }
-  state.overlay.pendingSince = performance.now();
-  try {
-    const data = await overlay(kind, step(), movedAnchors());
-    if (mine !== serial) return;
-    state.overlay = { data, picture: paint(data), error: "", pendingSince: null };
-  } catch (error) {
-    if (mine !== serial) return;
-    state.overlay = { data: null, picture: null, error: error.message, pendingSince: null };
-  }
-  changed("overlay");
+  await recompute();
 }
 
 /**
  * Compute the overlay again, with anchors where the page tries them; the one before is shown until then. A coarse one has
  * a 25th of the points.
  */
-export async function recompute(coarse) {
+export async function recompute(coarse = false) {
   const kind = state.options.overlay;
   if (kind === "none") return;
   const mine = ++serial;
   state.overlay.pendingSince = performance.now();
   changed("overlay");
-  let next = { data: null, picture: null, error: "", pendingSince: null };
-  try {
-    const data = await overlay(kind, coarse ? 5 * step() : step(), movedAnchors());
-    next = { ...next, data, picture: paint(data) };
-  } catch (error) {
-    next.error = error.message;
-  }
+  const found = await overlay(kind, coarse ? 5 * step() : step(), movedAnchors()).then(
+    (data) => ({ data, picture: paint(data), error: "" }),
+    (error) => ({ data: null, picture: null, error: error.message }),
+  );
   if (mine !== serial) return;
-  state.overlay = next;
+  state.overlay = { ...found, pendingSince: null };
   changed("overlay");
 }
 
@@ -96,21 +73,8 @@ function step() {
 }
 
 function paint(data) {
-  const picture = document.createElement("canvas");
-  picture.width = data.columns;
-  picture.height = data.rows;
-  const context = picture.getContext("2d");
-  const image = context.createImageData(data.columns, data.rows);
-  for (let line = 0; line < data.rows; line++) {
-    for (let column = 0; column < data.columns; column++) {
-      const value = data.values[(data.rows - 1 - line) * data.columns + column];
-      if (value === null) continue;
-      const [red, green, blue] = colourAt(fractionOf(value, data.scale), data.scale);
-      image.data.set([red, green, blue, 255], 4 * (line * data.columns + column));
-    }
-  }
-  context.putImageData(image, 0, 0);
-  return picture;
+  const { scale } = data;
+  return paintGrid(data, data.values, (value) => (value === null ? null : colourAt(fractionOf(value, scale), scale)));
 }
 
 /** The overlay's value at a position, null where there is none. */

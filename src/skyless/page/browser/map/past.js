@@ -1,54 +1,41 @@
 /** The past on the map: a heat map below the walls, a tag's way above the zones, and the tag at the shown moment. */
 
 import { state } from "../store.js";
-import { roundStep } from "../format.js";
+import { duration } from "../format.js";
 import { placeNow } from "../past.js";
+import { colourAt, paintGrid } from "../pictures.js";
 import { faint, isDark, palette } from "../theme.js";
 import { DIMMED, label } from "./anchors.js";
-import { groundHeight, otherFloor } from "./floors.js";
-import { colourAt } from "./overlay.js";
-import { drawInMetres, toX, toY, view } from "./view.js";
+import { drawPicture } from "./floor.js";
+import { otherFloor } from "./floors.js";
+import { fractionOf } from "./overlay.js";
+import { toX, toY, view } from "./view.js";
 
 /** Viridis without the end that the page's background is like: what is more, or later, stands out more. */
-const DARK_STOPS = ["#414487", "#355f8d", "#2a788e", "#21918c", "#22a884", "#44bf70", "#7ad151", "#bddf26", "#fde725"];
-const LIGHT_STOPS = ["#7ad151", "#44bf70", "#22a884", "#21918c", "#2a788e", "#355f8d", "#414487", "#482475", "#440154"];
-/** A way has so many colours, each drawn at once. */
-const BINS = 24;
-/** A scale that is wider than this is logarithmic, and it is at most as wide as the second. */
-const LOG_FROM = 10;
+const DARK = { stops: ["#414487", "#355f8d", "#2a788e", "#21918c", "#22a884", "#44bf70", "#7ad151", "#bddf26", "#fde725"] };
+const LIGHT = { stops: ["#7ad151", "#44bf70", "#22a884", "#21918c", "#2a788e", "#355f8d", "#414487", "#482475", "#440154"] };
+/** The ratio of the ends of a heat map's scale, which is logarithmic, is between these. */
+const MIN_RATIO = 10;
 const MAX_RATIO = 1000;
 const HEAT_ALPHA = 0.85;
 
-/** Red, green and blue at a position on the ramp, 0 to 1. */
-export function rampColour(fraction) {
-  return colourAt(fraction, { stops: isDark() ? DARK_STOPS : LIGHT_STOPS }).map(Math.round);
+/** The colours of the past, from less or earlier to more or later. */
+export function ramp() {
+  return isDark() ? DARK : LIGHT;
 }
 
-/** The scale of a heat map in s; null where no tag was anywhere. */
+/** The scale of a heat map in s, logarithmic; null where no tag was anywhere. */
 export function heatScale({ seconds }) {
   const sorted = Float64Array.from(seconds.filter((value) => value > 0)).sort();
   if (!sorted.length) return null;
   const high = sorted[Math.floor(0.99 * (sorted.length - 1))];
-  const low = Math.max(sorted[Math.floor(0.01 * (sorted.length - 1))], high / MAX_RATIO);
-  const log = high / low > LOG_FROM;
-  return { low: log ? low : 0, high, log };
+  const low = sorted[Math.floor(0.01 * (sorted.length - 1))];
+  return { low: Math.min(Math.max(low, high / MAX_RATIO), high / MIN_RATIO), high };
 }
 
-/** Where a value lies on a heat map's scale, 0 to 1. */
-export function heatFraction(value, { low, high, log }) {
-  if (value <= low) return 0;
-  return Math.min(log ? Math.log(value / low) / Math.log(high / low) : (value - low) / (high - low), 1);
-}
-
-/** Round values on a heat map's scale, in minutes. */
-export function heatTicks({ low, high, log }) {
-  const [from, to] = [low / 60, high / 60];
-  if (!log) {
-    const step = roundStep(to / 3);
-    return Array.from({ length: Math.floor(to / step) + 1 }, (_, n) => Number((n * step).toPrecision(6)));
-  }
-  const decades = Array.from({ length: 9 }, (_, n) => 10 ** (n - 4)).filter((value) => value >= from && value <= to);
-  return decades.length > 1 ? decades : [from, Math.sqrt(from * to), to].map((value) => Number(value.toPrecision(1)));
+/** Marks of a heat map's scale. */
+export function heatTicks({ low, high }) {
+  return [0, 0.5, 1].map((at) => [at, duration(low * (high / low) ** at)]);
 }
 
 /** Seconds that tags were at a position by the heat map that is shown; null without one, and outside it. */
@@ -60,38 +47,21 @@ export function secondsAt(x_m, y_m) {
   return column < 0 || row < 0 || column >= columns || row >= rows ? null : seconds[row * columns + column];
 }
 
-let painted = { key: null, dark: false, picture: null };
-
-function heatPicture(map) {
-  if (painted.key === map && painted.dark === isDark()) return painted.picture;
-  const { columns, rows, seconds } = map;
-  const scale = heatScale(map);
-  const picture = document.createElement("canvas");
-  picture.width = columns;
-  picture.height = rows;
-  const context = picture.getContext("2d");
-  const image = context.createImageData(columns, rows);
-  seconds.forEach((value, index) => {
-    if (!(value > 0)) return;
-    const at = (rows - 1 - Math.floor(index / columns)) * columns + (index % columns);
-    image.data.set([...rampColour(heatFraction(value, scale)), 255], 4 * at);
-  });
-  context.putImageData(image, 0, 0);
-  painted = { key: map, dark: isDark(), picture };
-  return picture;
-}
+let painted = { of: null, colours: null, picture: null };
 
 /** Draw the heat map, if one is shown. */
 export function drawHeat(context) {
-  if (state.past?.kind !== "heat" || !state.past.map.seconds.length) return;
-  const { map } = state.past;
+  const { past } = state;
+  if (past?.kind !== "heat") return;
+  const { map } = past;
+  if (painted.of !== map || painted.colours !== ramp()) {
+    const scale = heatScale(map);
+    const picture = paintGrid(map, map.seconds, (value) => (value > 0 ? colourAt(fractionOf(value, scale), ramp()) : null));
+    painted = { of: map, colours: ramp(), picture };
+  }
   context.globalAlpha = HEAT_ALPHA;
-  drawInMetres(context, groundHeight());
-  context.scale(1, -1); // pictures count downwards
   context.imageSmoothingEnabled = false;
-  const [wide, high] = [map.columns * map.cell_m, map.rows * map.cell_m];
-  context.drawImage(heatPicture(map), map.x0_m, -(map.y0_m + high), wide, high);
-  context.restore();
+  drawPicture(context, painted.picture, map.x0_m, map.y0_m, map.columns * map.cell_m, map.rows * map.cell_m);
   context.globalAlpha = 1;
 }
 
@@ -114,38 +84,28 @@ export function drawWay(context) {
   const { past } = state;
   if (past?.kind !== "way") return;
   const { points } = past.track;
-  const of = speeds(past);
   const top = topSpeed(past);
   const other = otherFloor();
-  const groups = new Map();
-  for (let n = 0; n < of.length; n++) {
-    if (Number.isNaN(of[n])) continue;
-    const share = past.colours === "speed" ? of[n] / top : (points[n][0] - past.start_s) / (past.duration_s || 1);
-    const key = Math.min(Math.floor(share * BINS), BINS - 1) + (other(points[n][3]) ? BINS : 0);
-    if (!groups.has(key)) groups.set(key, []);
-    groups.get(key).push(n);
-  }
-  const stroke = (pieces) => {
-    context.beginPath();
-    for (const n of pieces) {
-      context.moveTo(...pixel(points[n]));
-      context.lineTo(...pixel(points[n + 1]));
-    }
-    context.stroke();
-  };
-  context.lineCap = context.lineJoin = "round";
+  const pieces = speeds(past).flatMap((speed, n) => {
+    if (Number.isNaN(speed)) return [];
+    const share = past.colours === "speed" ? speed / top : (points[n][0] - past.start_s) / (past.duration_s || 1);
+    const path = new Path2D();
+    path.moveTo(...pixel(points[n]));
+    path.lineTo(...pixel(points[n + 1]));
+    return [{ path, share, alpha: other(points[n][3]) ? DIMMED : 1 }];
+  });
+  context.save();
+  context.lineCap = "round";
   context.strokeStyle = faint(palette.surface, 0.8); // an edge keeps the way apart from what is below it
   context.lineWidth = 5;
-  for (const [key, pieces] of groups) if (key < BINS) stroke(pieces);
+  for (const { path, alpha } of pieces) if (alpha === 1) context.stroke(path);
   context.lineWidth = 2.5;
-  for (const [key, pieces] of [...groups].sort(([a], [b]) => a - b)) {
-    context.globalAlpha = key < BINS ? 1 : DIMMED;
-    context.strokeStyle = `rgb(${rampColour((key % BINS) / (BINS - 1)).join(",")})`;
-    stroke(pieces);
+  for (const { path, share, alpha } of pieces.toSorted((a, b) => b.alpha - a.alpha)) {
+    context.globalAlpha = alpha;
+    context.strokeStyle = `rgb(${colourAt(share, ramp()).join(",")})`;
+    context.stroke(path);
   }
-  context.globalAlpha = 1;
-  context.lineCap = "butt";
-  context.lineJoin = "miter";
+  context.restore();
   const [x, y] = pixel(points[0]);
   context.fillStyle = palette.text;
   context.fillRect(x - 3, y - 3, 6, 6);

@@ -6,6 +6,7 @@
 import { on, select, state } from "../store.js";
 import { installersSheet } from "../api.js";
 import { byId, h, text, toast } from "../dom.js";
+import { csvOf } from "../files.js";
 import { save } from "./export.js";
 import { choose, recompute } from "./overlay.js";
 import { movedAnchors, place, placed, places, setPlaces } from "./places.js";
@@ -72,8 +73,9 @@ function show() {
   if (!places) return;
   const anchor = state.site?.anchors.find((one) => one.id === state.selection.anchor);
   const moved = places.size === 1 ? "1 anchor elsewhere" : `${places.size} anchors elsewhere`;
+  const nothing = places.size ? `${moved}; nothing` : "Nothing";
   const what = anchor ? `Anchor ${anchor.id}:` : "Drag an anchor, or select one.";
-  text(byId("placing-help"), `Predicted σ, ${moved}; nothing is sent to the site. ${what}`);
+  text(byId("placing-help"), `${nothing} is sent to the site. ${what}`);
   byId("placing-fields").hidden = !anchor;
   byId("placing-reset").disabled = !places.size;
   if (!anchor) return;
@@ -95,6 +97,6 @@ async function saveSheet() {
 }
 
 function saveTable() {
-  const rows = state.site.anchors.map(placed).map(({ id, x_m, y_m, z_m }) => `${id},${x_m},${y_m},${z_m}\n`);
-  save(new Blob(["id,x_m,y_m,z_m\n", ...rows], { type: "text/csv" }), "csv");
+  const rows = state.site.anchors.map(placed).map((anchor) => [anchor.id, ...AXES.map((axis) => anchor[axis])]);
+  save(new Blob([csvOf(["id", ...AXES], rows)], { type: "text/csv" }), "csv");
 }

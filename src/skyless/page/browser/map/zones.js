@@ -7,6 +7,12 @@ import { editor } from "./editor.js";
 import { chosenFloor, groundHeight } from "./floors.js";
 import { toX, toY } from "./view.js";
 
+/** Whether a zone is on the chosen floor, or on all. */
+export function isOnFloor(zone) {
+  const floor = chosenFloor()?.number;
+  return floor === undefined || (zone.floor ?? floor) === floor;
+}
+
 /** A zone's colour; the page's where it has none or one that the browser does not know. */
 export function zoneColour(zone) {
   return zone.colour && CSS.supports("color", zone.colour) ? zone.colour : palette.accent;
@@ -24,9 +30,7 @@ export function flash(id) {
 export function drawZones(context) {
   const now = performance.now();
   for (const [id, until] of flashing) if (until < now) flashing.delete(id);
-  const floor = chosenFloor()?.number;
-  for (const zone of state.zones) {
-    if (floor !== undefined && (zone.floor ?? floor) !== floor) continue;
+  for (const zone of state.zones.filter(isOnFloor)) {
     const chosen = state.selection.zone === zone.id;
     const colour = zoneColour(zone);
     outline(context, zone.polygon_m, true);

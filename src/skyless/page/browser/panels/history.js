@@ -2,109 +2,88 @@
 
 import { on, state } from "../store.js";
 import { history } from "../api.js";
+import { shownName } from "../assets/model.js";
 import { now_s } from "../clock.js";
-import { h, options, text } from "../dom.js";
-import { zoneWords } from "../format.js";
+import { button, h, offer, options, text } from "../dom.js";
 import { endPast } from "../past.js";
 import { close } from "../player.js";
 import { KINDS } from "./history_kinds.js";
 
 export const title = "History";
-export const topics = ["connection", "site", "zones", "mode"];
+export const topics = ["connection", "site", "zones", "mode", "assets"];
 export const interval_ms = 200;
 
 /** Progress is shown after this time. */
 const PATIENCE_MS = 300;
-/** Times are asked for so long after a change of a field of time, which changes with every digit. */
-const TYPING_MS = 700;
-/** The list of suggestions is not longer. */
-const MAX_SUGGESTED = 100;
 const DAY_S = 86_400;
 const RANGES = { hour: "Last hour", today: "Today", yesterday: "Yesterday", week: "Last 7 days", own: "From … to …" };
+const NONE =
+  "This server has no history. `skyless history run --to FOLDER` stores the positions and events of the site, and " +
+  "`skyless dashboard --history FOLDER` shows them here.";
 
 let parts = null;
-/** The kind that is chosen, the number of the newest question, what ends it, and the site that it is about. */
-let kind = null;
-let serial = 0;
+/** The kind that is chosen, what ends the newest question, and the site that it is about. */
+let kind = "";
 let asking = new AbortController();
 let site = null;
 /** @type {string[]|null} names of the tags in the history; null: not asked for yet */
 let tags = null;
-let typing = 0;
-/** The fields as they were asked for last; "" without an answer. */
-let askedFields = "";
 
 /** Build the tab. */
 export function start(panel) {
   const names = h("datalist", { id: "history-tags" });
-  const tag = h("input", { id: "history-tag", placeholder: "all tags", autocomplete: "off", spellcheck: false });
+  const tag = h("input", { type: "text", id: "history-tag", placeholder: "all tags", autocomplete: "off", spellcheck: false });
   tag.setAttribute("list", names.id);
-  tag.addEventListener("input", () => suggest(tag.value));
-  tag.addEventListener("change", again);
   const range = options({ id: "history-range" }, Object.entries(RANGES), (value) => {
     if (value === "own") return parts.from.focus();
     setRange();
-    again();
+    if (kind) ask(kind);
   });
-  const field = (id) => h("input", { type: "datetime-local", id, onchange: typed, oninput: () => (range.value = "own") });
+  const field = (id) => h("input", { type: "datetime-local", id, oninput: () => (range.value = "own") });
   const [from, to] = [field("history-from"), field("history-to")];
-  const buttons = Object.entries(KINDS).map(([key, { words }]) =>
-    h("button", { type: "button", id: `history-${key}`, "aria-pressed": "false", onclick: () => ask(key) }, words),
-  );
-  const zone = options({ id: "history-zone" }, [], again);
-  const zones = h("label", { hidden: true }, "Zone", zone);
-  const times = h("p", { class: "fine" });
+  const kinds = Object.entries(KINDS).map(([key, { words }]) => button(words, () => ask(key), { id: `history-${key}`, "aria-pressed": "false" }));
+  const zone = options({ id: "history-zone" }, [], () => ask(kind));
+  const zones = h("label", { class: "field", hidden: true }, "Zone", zone);
+  const times = h("p", { class: "fine" }, `Times of ${Intl.DateTimeFormat().resolvedOptions().timeZone}`);
   const form = h(
     "form",
-    { id: "history-form" },
-    h("label", {}, "Tag", tag),
-    h("label", {}, "Time", range),
-    h("label", {}, "From", from),
-    h("label", {}, "To", to),
+    { id: "history-form", oninput: abandon },
+    ...Object.entries({ Tag: tag, Time: range, From: from, To: to }).map(([words, one]) => h("label", { class: "field" }, words, one)),
     times,
-    h("div", { id: "history-kinds", role: "group", "aria-label": "What to show" }, ...buttons),
+    h("div", { id: "history-kinds", role: "group", "aria-label": "What to show" }, ...kinds),
     zones,
     names,
   );
   form.addEventListener("keydown", (event) => {
     if (event.key !== "Enter" || !event.target.matches("input")) return;
     event.preventDefault();
-    ask(kind ?? "way");
+    ask(kind || "way");
   });
   const nothing = h("p", { class: "empty" });
-  const back = h("button", { type: "button", class: "primary", onclick: close }, "Back to live");
+  const back = button("Back to live", close, { class: "primary" });
   const progress = h("p", { id: "history-state", role: "status" });
   const fault = h("p", { id: "history-fault", role: "alert" });
   const result = h("div", { id: "history-result" });
-  parts = { tag, names, range, from, to, buttons, zone, zones, times, form, nothing, back, progress, fault, result };
+  parts = { tag, names, range, from, to, kinds, zone, zones, form, nothing, back, progress, fault, result };
   panel.append(nothing, back, form, progress, fault, result);
   on(["connection", "site"], forgetOtherSite);
 }
 
 /** Bring the tab up to date: whether there is a history, and the tags and zones to choose from. */
 export function show() {
-  const live = state.mode === "live";
-  const words = !live
-    ? "A recording is shown. The history is that of the live site."
-    : state.history === null
-      ? "Waiting for the server …"
-      : state.history
-        ? ""
-        : "This server has no history. `skyless history run --to FOLDER` stores the positions and events of the site, and `skyless dashboard --history FOLDER` shows them here.";
+  const isLive = state.mode === "live";
+  const none = state.history === null ? "Waiting for the server …" : NONE;
+  const words = !isLive ? "A recording is shown. The history is that of the live site." : state.history ? "" : none;
   text(parts.nothing, words);
   parts.nothing.hidden = !words;
-  parts.back.hidden = live;
+  parts.back.hidden = isLive;
   for (const part of [parts.form, parts.result]) part.hidden = Boolean(words);
   if (words) return;
   if (!parts.from.value) setRange();
   const zones = state.zones.map(({ id, name }) => [id, name]);
-  if (JSON.stringify(zones) !== parts.zone.dataset.shown) {
-    const chosen = parts.zone.value;
-    parts.zone.replaceChildren(...zones.map(([value, name]) => h("option", { value }, name)));
-    if (zones.some(([id]) => id === chosen)) parts.zone.value = chosen;
-    parts.zone.dataset.shown = JSON.stringify(zones);
-  }
+  offer(parts.zone, zones.length ? zones : [["", "No zones yet"]], parts.zone.value);
   if (tags === null) loadTags();
+  else suggest();
 }
 
 async function loadTags() {
@@ -113,29 +92,21 @@ async function loadTags() {
     const found = (await history("tags", {}, undefined)).tags;
     if (tags !== mine) return;
     tags = found;
-    suggest(parts.tag.value);
+    suggest();
   } catch (error) {
     if (tags === mine) text(parts.fault, `The tags cannot be read: ${error.message}`);
   }
 }
 
-/** What people call a tag. */
-function nameOf(tag) {
-  return state.assets?.get(tag)?.name || tag;
-}
-
-function suggest(words) {
-  const sought = words.trim().toLowerCase();
-  const fits = tags.filter((tag) => `${tag} ${nameOf(tag)}`.toLowerCase().includes(sought));
-  const found = fits.slice(0, MAX_SUGGESTED).map((tag) => h("option", { value: tag }, nameOf(tag) === tag ? "" : nameOf(tag)));
-  parts.names.replaceChildren(...found);
+function suggest() {
+  offer(parts.names, tags.map((tag) => [tag, shownName(tag) === tag ? "" : shownName(tag)]), "");
 }
 
 /** The tag that is meant: its name, or that of its asset; "" for all. Throws an Error for one that is not there. */
 function chosenTag() {
   const words = parts.tag.value.trim();
   if (!words || !tags?.length) return words;
-  const found = tags.find((tag) => tag === words) ?? tags.find((tag) => nameOf(tag).toLowerCase() === words.toLowerCase());
+  const found = tags.find((tag) => tag === words) ?? tags.find((tag) => shownName(tag).toLowerCase() === words.toLowerCase());
   if (!found) throw new Error(`The history has no tag ${words}.`);
   return found;
 }
@@ -166,32 +137,12 @@ function chosenSpan() {
   return { from_unix_s, to_unix_s };
 }
 
-function fields() {
-  return JSON.stringify([parts.tag, parts.from, parts.to, parts.zone].map(({ value }) => value));
-}
-
-function typed() {
-  if (fields() === askedFields) return;
-  abandon();
-  clearTimeout(typing);
-  typing = setTimeout(again, TYPING_MS);
-}
-
-/** Ask the same of another tag or range; a field that loses the focus after Enter has changed nothing. */
-function again() {
-  if (kind && fields() !== askedFields) ask(kind);
-}
-
 /** End the question that is under way, and show no answer. */
 function abandon() {
-  serial++;
-  askedFields = "";
-  clearTimeout(typing);
   asking.abort();
   endPast();
-  text(parts.progress, "");
+  parts.progress.replaceChildren();
   text(parts.fault, "");
-  KINDS[kind]?.end?.();
   parts.result.replaceChildren();
 }
 
@@ -206,37 +157,23 @@ function forgetOtherSite() {
 async function ask(key) {
   abandon();
   kind = key;
-  const mine = serial;
-  const abort = (asking = new AbortController());
-  for (const button of parts.buttons) button.setAttribute("aria-pressed", String(button.id === `history-${key}`));
+  asking = new AbortController();
+  const { signal } = asking;
+  for (const one of parts.kinds) one.setAttribute("aria-pressed", String(one.id === `history-${key}`));
   parts.zones.hidden = !KINDS[key].zone;
   setRange();
-  askedFields = fields();
-  const begun = performance.now();
-  const progress = setInterval(() => mine === serial && showProgress(begun, mine), PATIENCE_MS);
+  const waiting = setTimeout(() => parts.progress.append("Reading the history …", button("Cancel", abandon)), PATIENCE_MS);
+  signal.addEventListener("abort", () => clearTimeout(waiting));
   try {
     const asked = { tag: chosenTag(), span: chosenSpan(), zone: parts.zone.value };
-    text(parts.times, `Times of ${zoneWords(asked.span.from_unix_s)}`);
-    const get = (path, query = {}) => {
-      const { from_unix_s, to_unix_s } = asked.span;
-      return history(path, { from: from_unix_s, to: to_unix_s, ...query }, abort.signal);
-    };
-    const context = { ...asked, get, title: asked.tag ? nameOf(asked.tag) : "all tags", tags, isNew: () => mine === serial };
+    const { from_unix_s: from, to_unix_s: to } = asked.span;
+    const get = (path, query = {}) => history(path, { from, to, ...query }, signal);
+    const context = { ...asked, get, signal, title: asked.tag ? shownName(asked.tag) : "all tags", tags };
     const found = await KINDS[key].ask(context);
-    if (mine !== serial) return;
-    parts.result.replaceChildren(...KINDS[key].show(found, context));
+    if (!signal.aborted) parts.result.replaceChildren(...KINDS[key].show(found, context));
   } catch (error) {
-    if (mine === serial) text(parts.fault, error.message);
-  } finally {
-    clearInterval(progress);
-    if (mine === serial) text(parts.progress, "");
+    if (!signal.aborted) text(parts.fault, error.message);
   }
-}
-
-function showProgress(begun, mine) {
-  const seconds = Math.round((performance.now() - begun) / 1e3);
-  const words = `Reading the history … ${seconds ? `${seconds} s` : ""}`;
-  if (parts.progress.firstChild) return text(parts.progress.firstChild, words);
-  const cancel = () => mine === serial && abandon();
-  parts.progress.append(h("span", {}, words), h("button", { type: "button", onclick: cancel }, "Cancel"));
+  clearTimeout(waiting);
+  if (!signal.aborted) parts.progress.replaceChildren();
 }

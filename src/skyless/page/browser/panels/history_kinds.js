@@ -5,8 +5,9 @@
 
 import { state } from "../store.js";
 import { Chart } from "../chart.js";
-import { saveCsv, utc } from "../csv.js";
-import { h } from "../dom.js";
+import { shownName } from "../assets/model.js";
+import { button, h } from "../dom.js";
+import { saveCsv, utc } from "../files.js";
 import { dateTime, duration, length, number, sentence } from "../format.js";
 import { seekPast, showHeat, showWay } from "../past.js";
 import { facts } from "./parts.js";
@@ -25,13 +26,14 @@ export const KINDS = {
   way: { words: "Way of a tag", ask: askWay, show: wayFacts },
   heat: { words: "Heat map", ask: askHeat, show: heatFacts },
   dwell: { words: "Time in zones", ask: async ({ get, tag }) => (await get("dwell", tag && { tag })).dwell, show: dwellTable },
-  occupancy: { words: "Occupancy", zone: true, ask: askOccupancy, show: occupancyChart, end: () => chart?.remove() },
+  occupancy: { words: "Occupancy", zone: true, ask: askOccupancy, show: occupancyChart },
   contacts: { words: "Contacts", ask: askContacts, show: contactsTable },
   alarms: { words: "Past alarms", ask: async ({ get }) => (await get("alarms")).alarms, show: alarmsTable },
 };
 
-/** @type {Chart|null} */
-let chart = null;
+const SERIES = [{ name: "most", colour: "muted", steps: true }, { name: "mean", colour: "accent", steps: true }]; // prettier-ignore
+const OCCUPANCY = "Tags in the zone: most (grey) and mean of each step";
+const chart = new Chart(OCCUPANCY, SERIES, (value) => number(value, 1), 1, { whole: true, past: true });
 
 function needsTag(tag, what) {
   if (!tag) throw new Error(`Choose a tag: ${what}.`);
@@ -44,15 +46,15 @@ function nothing({ title, span }, what) {
 }
 
 function saveButton(name, heads, rows) {
-  return h("button", { type: "button", class: "save-csv", onclick: () => saveCsv(name, heads, rows()) }, "Save as CSV");
+  return button("Save as CSV", () => saveCsv(name, heads, rows()), { class: "save-csv" });
 }
 
 /* The way of a tag. */
 
-async function askWay({ get, tag, title, isNew }) {
+async function askWay({ get, tag, title, signal }) {
   needsTag(tag, "the way is that of one tag");
   const track = await get("track", { tag, points: 2000 });
-  if (isNew() && track.points.length) showWay(track, title);
+  if (!signal.aborted && track.points.length) showWay(track, title);
   return track;
 }
 
@@ -76,24 +78,23 @@ function wayFacts(track, context) {
 
 /* The heat map. */
 
-async function askHeat({ get, tag, title, span, isNew }) {
+async function askHeat({ get, tag, title, span, signal }) {
   const anchors = state.site?.anchors ?? [];
   const extent = (key) => Math.max(...anchors.map((one) => one[key])) - Math.min(...anchors.map((one) => one[key]));
   const area = anchors.length ? (extent("x_m") + 4) * (extent("y_m") + 4) : 100;
   const cell_m = CELLS_M.find((value) => area / value ** 2 < MAX_CELLS) ?? CELLS_M.at(-1);
   const map = await get("heatmap", { cell_m, ...(tag && { tag }) });
-  if (isNew() && map.seconds.some((value) => value > 0)) showHeat(map, title, span);
+  if (!signal.aborted && map.seconds.some((value) => value > 0)) showHeat(map, title, span);
   return map;
 }
 
 function heatFacts(map, context) {
   const seconds = map.seconds.reduce((sum, value) => sum + value, 0);
   if (!seconds) return nothing(context, "There are no positions");
-  const list = facts(["Tags", "Time of all tags", "Cells with tags", "Longest in a cell"]);
+  const list = facts(["Tags", "Time of all tags", "Longest in a cell"]);
   list.show({
     Tags: number(map.tags),
     "Time of all tags": duration(seconds),
-    "Cells with tags": number(map.seconds.filter((value) => value > 0).length),
     "Longest in a cell": duration(map.seconds.reduce((most, value) => Math.max(most, value), 0)),
   });
   const corner = (index) => [map.x0_m + (index % map.columns) * map.cell_m, map.y0_m + Math.floor(index / map.columns) * map.cell_m];
@@ -110,8 +111,8 @@ function sortedTable(name, columns, rows, sort, foot = null) {
   const body = h("tbody", {});
   const cell = (column, child) => h("td", { class: column.right ? "right" : "" }, child);
   const heads = columns.map((column, index) => {
-    const button = h("button", { type: "button", class: "quiet", onclick: () => order(index) }, column.head);
-    return h("th", { scope: "col", class: column.right ? "right" : "" }, button);
+    const words = button(column.head, () => order(index), { class: "quiet" });
+    return h("th", { scope: "col", class: column.right ? "right" : "" }, words);
   });
   let [by, up] = sort;
   const fill = () => {
@@ -137,17 +138,12 @@ function sortedTable(name, columns, rows, sort, foot = null) {
   return [h("div", { class: "scroll-x" }, table), h("p", { class: "fine" }, count), saveButton(name, csv, values)];
 }
 
-/** A column of times. */
-function timeColumn(head, save, value, show = (unix_s) => h("time", {}, dateTime(unix_s))) {
-  return { head, save, value, time: true, show: (row) => show(value(row), row) };
-}
-
 function dwellTable(rows, context) {
   if (!rows.length) return nothing(context, "No zone was entered, or there are no positions,");
   const sum = (key) => rows.reduce((total, row) => total + row[key], 0);
   const columns = [
     { head: "Zone", value: (row) => row.zone_name },
-    { head: "Tag", value: (row) => row.tag, show: (row) => state.assets?.get(row.tag)?.name || row.tag },
+    { head: "Tag", value: (row) => row.tag, show: (row) => shownName(row.tag) },
     { head: "Visits", value: (row) => row.visits, right: true },
     { head: "Time", save: "seconds", value: (row) => row.seconds, show: (row) => duration(row.seconds), right: true },
   ];
@@ -169,10 +165,8 @@ function occupancyChart(rows, context) {
   if (!rows.length) return nothing(what, "Nothing is known");
   const sorted = rows.toSorted((a, b) => a.unix_s - b.unix_s);
   const most = Math.max(...rows.map((row) => row.most));
-  const series = [{ name: "most", colour: "muted", steps: true }, { name: "mean", colour: "accent", steps: true }]; // prettier-ignore
-  chart = new Chart(`Tags in ${name}: most (grey) and mean of each step`, series, (value) => number(value, 1), 1, { whole: true, past: true });
   const data = [sorted.map((row) => row.unix_s), sorted.map((row) => row.most), sorted.map((row) => row.mean)];
-  chart.showPast(data, [context.span.from_unix_s, context.span.to_unix_s], `at most ${most}`);
+  chart.showPast(data, [context.span.from_unix_s, context.span.to_unix_s], `${name}: at most ${most}`);
   const csv = () => sorted.map((row) => [utc(row.unix_s), row.zone, row.zone_name, row.mean, row.most]);
   return [chart.element, saveButton(`occupancy ${name}`, ["time", "zone", "zone_name", "mean", "most"], csv)];
 }
@@ -189,22 +183,22 @@ function placeButton(unix_s, tag, context) {
   const go = async ({ target }) => {
     target.disabled = true;
     try {
-      if (state.past?.track?.tag !== tag) await askWay({ ...context, tag, title: state.assets?.get(tag)?.name || tag });
-      if (context.isNew()) seekPast(unix_s);
+      if (state.past?.track?.tag !== tag) await askWay({ ...context, tag, title: shownName(tag) });
+      if (!context.signal.aborted) seekPast(unix_s);
     } catch (error) {
-      if (context.isNew()) target.after(h("span", { role: "alert" }, ` ${error.message}`));
+      if (!context.signal.aborted) target.after(h("span", { role: "alert" }, ` ${error.message}`));
     }
     target.disabled = false;
   };
   const words = dateTime(unix_s);
-  return h("button", { type: "button", class: "name", "aria-label": `${words}: show where ${tag} was`, onclick: go }, words);
+  return button(words, go, { class: "name", "aria-label": `${words}: show where ${tag} was` });
 }
 
 function contactsTable(rows, context) {
   if (!rows.length) return nothing(context, `No other tag was within ${NEAR_M} m`);
   const columns = [
-    timeColumn("Begin", "begin", (row) => row.begin_unix_s, (unix_s, row) => placeButton(unix_s, row.tag, context)),
-    { head: "Other tag", save: "other", value: (row) => row.other, show: (row) => state.assets?.get(row.other)?.name || row.other },
+    { head: "Begin", save: "begin", value: (row) => row.begin_unix_s, time: true, show: (row) => placeButton(row.begin_unix_s, row.tag, context) },
+    { head: "Other tag", save: "other", value: (row) => row.other, show: (row) => shownName(row.other) },
     { head: "Time", save: "seconds", value: (row) => row.end_unix_s - row.begin_unix_s, show: (row) => duration(row.end_unix_s - row.begin_unix_s, 1), right: true },
     { head: "Nearest", save: "least_m", value: (row) => row.least_m, show: (row) => length(row.least_m), right: true },
   ]; // prettier-ignore
@@ -215,12 +209,15 @@ function contactsTable(rows, context) {
 function alarmsTable(rows, context) {
   if (!rows.length) return nothing({ ...context, title: "this site" }, "There were no alarms");
   const known = new Set(context.tags);
-  const tagOf = ({ subject }) => [subject, subject.split("+")[0]].find((name) => known.has(name));
-  const raised = (unix_s, row) => (tagOf(row) ? placeButton(unix_s, tagOf(row), context) : h("time", {}, dateTime(unix_s)));
+  const tagOf = ({ subject }) => subject.split("~").find((name) => known.has(name));
+  const raised = (row) => {
+    const at_s = row.raised_unix_s;
+    return tagOf(row) ? placeButton(at_s, tagOf(row), context) : h("time", {}, dateTime(at_s));
+  };
   const end = (row) => (row.ended_unix_s === null ? "lasts" : duration(row.ended_unix_s - row.raised_unix_s, 1));
   const by = (row) => (row.acknowledged_unix_s === null ? "nobody" : row.acknowledged_by || "somebody");
   const columns = [
-    timeColumn("Raised", "raised", (row) => row.raised_unix_s, raised),
+    { head: "Raised", save: "raised", value: (row) => row.raised_unix_s, time: true, show: raised },
     { head: "Alarm", save: "text", value: (row) => sentence(row.text) },
     { head: "Lasted", save: "lasted_s", value: (row) => (row.ended_unix_s === null ? null : row.ended_unix_s - row.raised_unix_s), show: end, right: true },
     { head: "Seen by", save: "acknowledged_by", value: (row) => row.acknowledged_by, show: by },

@@ -112,6 +112,7 @@ export function show() {
   if (state.filter.zone && !state.zones.some(({ id }) => id === state.filter.zone)) state.filter.zone = "";
   offer(parts.group, [["", "All groups"], ...[...allGroups().keys()].map((name) => [name, name])], state.filter.group);
   offer(parts.zone, [["", "All zones"], ...state.zones.map(({ id, name }) => [id, name])], state.filter.zone);
+  for (const list of [parts.group, parts.zone]) list.hidden = list.length < 2;
   parts.edit.disabled = state.mode !== "live" || !state.site;
   parts.filter.hidden = !offered;
   parts.all.hidden = !filtering();

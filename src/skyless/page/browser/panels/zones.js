@@ -2,7 +2,7 @@
 
 import { select, state, toggleSelection } from "../store.js";
 import { shownName } from "../assets/model.js";
-import { Rows, h, options, text, toast } from "../dom.js";
+import { Rows, h, offer, options, text, toast } from "../dom.js";
 import { sentence, timeOfDay } from "../format.js";
 import { add as addZones, change, editor, remove } from "../map/editor.js";
 import { floors } from "../map/floors.js";
@@ -121,11 +121,7 @@ function makeZone(id, zone) {
     if (document.activeElement !== name) name.value = now.name;
     const numbered = floors().filter(({ number }) => number !== undefined);
     floor.hidden = !numbered.length;
-    if (document.activeElement !== floor) {
-      const choices = [["", "all floors"], ...numbered.map((one) => [one.number, one.name])];
-      floor.replaceChildren(...choices.map(([value, words]) => h("option", { value }, words)));
-      floor.value = String(now.floor ?? "");
-    }
+    offer(floor, [["", "all floors"], ...numbered.map((one) => [one.number, one.name])], now.floor ?? "");
     del.setAttribute("aria-label", `Delete ${now.name}`);
     for (const input of [swatch, name, floor, del]) input.disabled = state.mode !== "live";
     table.hidden = !chosen;
