@@ -439,7 +439,7 @@ class LiveSite:
 
     # Pages
 
-    def open_page(self, address: str = "") -> PageQueue:
+    def open_page(self, address: str = "", *, live2: bool = False) -> PageQueue:
         """The queue of a new page of a computer, with what it needs first. Raises TooManyPagesError."""
         self._make_room(address)
         self._send_logged()
@@ -449,6 +449,7 @@ class LiveSite:
             **self._zone_fields(),
             "events": list(self.events.recent),
             "mqtt": self.connected,
+            "live2": live2,
         }
         page = PageQueue(encode("hello", hello), address, self._clock())
         page.replace("mqtt", self._connection())

@@ -5,7 +5,7 @@ import os
 import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App
 
@@ -18,7 +18,6 @@ from skyless.core.extras import extra_module
 
 if TYPE_CHECKING:
     from skyless.run.broker import BrokerSettings
-    from skyless.run.gather.address import NatsAddress
 
 app = App(name="broker", help_epilogue="Example: skyless broker --port 1883")
 
@@ -89,12 +88,8 @@ def broker(
         extra_module("nats", "--gather")
     elif site_id is not None or keep_gb != USUAL_KEEP_GB:
         raise SkylessError("--site-id and --keep-gb belong to --gather")
-    asyncio.run(_serve(settings, _gather_arguments(site_id, keep_gb), json=json))
-
-
-def _gather_arguments(site_id: int | None, keep_gb: float) -> tuple[str, ...]:
     named = () if site_id is None else ("--site-id", str(site_id))
-    return ("gather", "--keep-gb", str(keep_gb), *named)
+    asyncio.run(_serve(settings, ("--keep-gb", str(keep_gb), *named), json=json))
 
 
 @app.command(name="access", help_epilogue="Example: skyless broker access passwords --mqtt mqtts://hall.local")
@@ -124,8 +119,10 @@ def create_passwords(folder: Path, /, *, mqtt: str = "mqtt://127.0.0.1:1883", js
         log(f"start the broker with --access {folder}; copy each file to the machines of its role only")
 
 
-async def _serve(settings: "BrokerSettings", gather_arguments: tuple[str, ...], *, json: bool) -> None:
+async def _serve(settings: "BrokerSettings", of_gather: tuple[str, ...], *, json: bool) -> None:
     from skyless.run.broker import start_broker
+    from skyless.run.children import Child, Program
+    from skyless.run.mqtt.address import PASSWORD_VARIABLE
     from skyless.run.process import ending_signals
 
     stop = asyncio.Event()
@@ -137,28 +134,17 @@ async def _serve(settings: "BrokerSettings", gather_arguments: tuple[str, ...], 
             stated = {} if nats is None else {"nats": str(nats)}
             print_json({"mqtt": str(running.address), "data": running.data, "pid": running.pid, **stated})
         else:
-            print(running.address)
-            if nats is not None:
-                print(nats)
+            print(running.address, *(() if nats is None else (nats,)), sep="\n")
         sys.stdout.flush()
-        gathering = None if nats is None else asyncio.ensure_future(_gathering(nats, gather_arguments))
         ended = asyncio.ensure_future(running.wait())
-        asked = asyncio.ensure_future(stop.wait())
-        await asyncio.wait((ended, asked), return_when=asyncio.FIRST_COMPLETED)
-        asked.cancel()
-        if gathering is not None:
-            gathering.cancel()
-            await asyncio.gather(gathering, return_exceptions=True)
+        parts: list[asyncio.Future[Any]] = [ended, asyncio.ensure_future(stop.wait())]
+        if nats is not None:
+            secret = {} if nats.password is None else {PASSWORD_VARIABLE: nats.password}
+            gather = Program("gather", ("gather", "--nats", str(nats), *of_gather), environment=secret)
+            parts.append(asyncio.ensure_future(Child(gather, log).run()))
+        await asyncio.wait(parts, return_when=asyncio.FIRST_COMPLETED)
         if ended.done():
             raise SkylessError(f"nats-server has ended by itself; {running.data / 'nats-server.log'} may show why")
-        ended.cancel()
-
-
-async def _gathering(nats: "NatsAddress", arguments: tuple[str, ...]) -> None:
-    """Run gather as a child process until cancelled."""
-    from skyless.run.children import Child, Program
-    from skyless.run.gather.address import NATS_VARIABLE
-    from skyless.run.mqtt.address import PASSWORD_VARIABLE
-
-    secret = {} if nats.password is None else {PASSWORD_VARIABLE: nats.password}
-    await Child(Program("gather", arguments, environment={NATS_VARIABLE: str(nats), **secret}), log).run()
+        for part in parts:
+            part.cancel()
+        await asyncio.gather(*parts, return_exceptions=True)
