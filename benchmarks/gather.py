@@ -21,12 +21,12 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from skyless.run.gather.streams import messages
 
 from skyless.page.gathered import Gathered
 from skyless.run.fix_batch import MAX_RECORDS, RECORD, Batch, decode_batch, encode_batch
 from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect
+from skyless.run.gather.streams import messages
 from skyless.run.mqtt.messages import FixMessage
 
 SITE, OTHER = 7, 8
