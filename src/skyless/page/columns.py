@@ -34,12 +34,12 @@ class Columns:
         self.serial += 1
         allowed = records["tag"] <= MAX_NUMBER
         self.dropped += int(len(records) - allowed.sum())
-        records = records[allowed]
-        records = records[np.argsort(records["unix_us"], kind="stable")]  # of several fixes of a tag the last one stays
+        records = records.compress(allowed)  # ten times as fast as an index
+        records = records.take(np.argsort(records["unix_us"], kind="stable"))  # of several of a tag the last one stays
         unix_us = records["unix_us"].astype(np.int64)
         before_us = self._newest["unix_us"][records["tag"]]
         is_new = (unix_us >= before_us) | (unix_us < before_us - _SET_BACK_US)
-        records, unix_us = records[is_new], unix_us[is_new]
+        records, unix_us = records.compress(is_new), unix_us.compress(is_new)
         self._used = max(self._used, int(records["tag"].max(initial=0)) + 1)
         with np.errstate(invalid="ignore", over="ignore"):
             sigma_mm = 1000.0 * np.sqrt(records["covariance_m2"][:, 0] + records["covariance_m2"][:, 2])
@@ -48,7 +48,7 @@ class Columns:
         newest["sigma_mm"] = np.minimum(np.nan_to_num(sigma_mm, nan=_MAX_U16), _MAX_U16)
         newest["alert"] = records["flags"] & ALERT_BITS
         newest["unix_us"], newest["arrived_s"] = unix_us, now_s
-        self._newest[records["tag"]] = newest
+        self._newest.put(records["tag"], newest)
 
     def visible(self, view: tuple[float, float, float, float], now_s: float) -> tuple[Array, Array]:
         """Numbers and newest fixes of the tags heard recently between least x, y and largest x, y of a view in m."""
@@ -58,4 +58,4 @@ class Columns:
         inside = (x_mm >= low_x) & (x_mm <= high_x) & (y_mm >= low_y) & (y_mm <= high_y)
         inside &= newest["arrived_s"] > max(0.0, now_s - UNHEARD_S)
         tags = np.flatnonzero(inside)
-        return tags, newest[tags]
+        return tags, newest.take(tags)
