@@ -147,7 +147,7 @@ def test_two_gathers_share_the_fixes_and_what_one_leaves_the_other_takes(tmp_pat
             client_of(running.nats) as client,
             gathering(running.nats) as (first, _),
         ):
-            async with gathering(running.nats, keep_bytes=10**6) as (second, _), asyncio.timeout(20):
+            async with gathering(running.nats) as (second, _), asyncio.timeout(20):
                 while first._names is None or second._names is None:
                     await asyncio.sleep(0.02)
                 for n in range(400):
@@ -165,6 +165,9 @@ def test_two_gathers_share_the_fixes_and_what_one_leaves_the_other_takes(tmp_pat
             assert sorted(x for _, _, x in rows) == list(range(800))
             assert all(names[tag] == f"t{x % 40}" for _, tag, x in rows)
             assert len(set(names.values())) == len(names) == 40
+            async with gathering(running.nats, keep_bytes=10**6) as (third, _), asyncio.timeout(20):
+                while third._names is None:
+                    await asyncio.sleep(0.02)
             info = await client.jetstream().stream_info(subjects.at(subjects.FIX_STREAM, SITE))
             assert info.config.max_bytes == 10**6
 

@@ -1,6 +1,5 @@
 """The numbers of a site's tags, as its stream of names has them."""
 
-import asyncio
 import contextlib
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final
@@ -45,24 +44,27 @@ class Names:
             self._read = message.metadata.sequence.stream
             with contextlib.suppress(msgspec.MsgspecError, ValueError):
                 number = int(message.subject.rpartition(".")[2])
-                tag = msgspec.json.decode(message.data, type=TagName)
-                self.tags[number], self.numbers[tag.name] = tag, number
                 self.issue = max(self.issue, number)
+                self._add(number, msgspec.json.decode(message.data, type=TagName))
 
     async def give(self, names: Iterable[str], host: str, now_unix_s: float) -> None:
         """Give numbers to those names that have none; a full table gives none. Raises nats.errors.Error.
 
-        Another program may give the same numbers at this moment: the stream takes each once, and who was refused finds
-        there what the other one has given.
+        Several programs may do so. The stream takes each number once, and a program gives a number only when it knows
+        the names of all smaller ones, so no name has two.
         """
-        wanted = dict.fromkeys(names)
-        while new := [name for name in wanted if name not in self.numbers][: max(0, MAX_NAMES - len(self.numbers))]:
-            stores = [self._store(self.issue + n, TagName(name, host, now_unix_s)) for n, name in enumerate(new, 1)]
-            for fault in await asyncio.gather(*stores, return_exceptions=True):
-                if isinstance(fault, BaseException) and not (isinstance(fault, APIError) and fault.err_code == _TAKEN):
-                    raise fault
-            await self.read()
+        for name in dict.fromkeys(names):
+            while name not in self.numbers and len(self.numbers) < MAX_NAMES:
+                number, tag = self.issue + 1, TagName(name, host, now_unix_s)
+                subject = subjects.at(subjects.NAMES, self._site, number)
+                try:
+                    await self._stream.publish(subject, msgspec.json.encode(tag), headers=dict(_NEVER_WRITTEN))
+                    self._add(number, tag)
+                except APIError as error:
+                    if error.err_code != _TAKEN:
+                        raise
+                    await self.read()
 
-    async def _store(self, number: int, tag: TagName) -> None:
-        subject, data = subjects.at(subjects.NAMES, self._site, number), msgspec.json.encode(tag)
-        await self._stream.publish(subject, data, headers=dict(_NEVER_WRITTEN))
+    def _add(self, number: int, tag: TagName) -> None:
+        self.tags[number], self.numbers[tag.name] = tag, number
+        self.issue = max(self.issue, number)
