@@ -16,16 +16,17 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
 from skyless.page.gathered import Gathered
-from skyless.run.fix_batch import MAX_RECORDS, RECORD, Batch, encode_batch
+from skyless.run.fix_batch import MAX_RECORDS, RECORD, Batch, decode_batch, encode_batch
 from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect
-from skyless.run.gather.stream_source import StreamSource
+from skyless.run.gather.streams import messages
 from skyless.run.mqtt.messages import FixMessage
 
 SITE, OTHER = 7, 8
@@ -36,10 +37,6 @@ FIX = FixMessage(
     *((0.1234567, 0.2345678, 0.0), VARIANCE, 0.0323456, 1.234567, 1.2345678, 1.2345678, None),
     *((1, 2, 3, 4, 5, 6, 7, 8), 4.56789, 5, 0.012345, "joint", True, 0.0012345, 0.23456),
 )
-
-
-async def ignore(error):
-    print(f"  {error!r}", file=sys.stderr)
 
 
 def cpu_s(pid):
@@ -83,7 +80,7 @@ async def publish_packed(client, rate, seconds, site):
 
 
 async def publisher(url, part, rate, seconds):
-    client = await connect(NatsAddress(url), "bench", ignore)
+    client = await connect(NatsAddress(url), "bench", print, Counter())
     begin_s = time.process_time()
     if part == "json":
         sent = await publish_json(client, rate, seconds)
@@ -131,7 +128,7 @@ async def reader(url, expected):
                 "p50_ms": int(np.searchsorted(share, 0.5)),
                 "p99_ms": int(np.searchsorted(share, 0.99)),
                 "max_ms": int(np.flatnonzero(measured.ages_ms).max(initial=0)),
-                "dropped": measured.dropped,
+                "dropped": dict(measured.drops),
             }
         ),
         flush=True,
@@ -146,19 +143,14 @@ def last_line(process):
     return json.loads(process.communicate()[0].splitlines()[-1])
 
 
-async def stored(url, expected):
+async def stored(url):
     """Rows in the stream, and whether the numbers of their batches are without a gap."""
     rows, sequences = 0, []
-    async with StreamSource(NatsAddress(url), SITE, print) as source:
-        try:
-            async with asyncio.timeout(120):
-                async for first, records in source.rows():
-                    rows += len(records)
-                    sequences.append(first // MAX_RECORDS)
-                    if rows >= expected:
-                        break
-        except TimeoutError:
-            pass
+    client = await connect(NatsAddress(url), "bench", print, Counter())
+    async for message in messages(client.jetstream(), subjects.at(subjects.FIX_STREAM, SITE)):
+        rows += len(decode_batch(message.data).records)
+        sequences.append(message.metadata.sequence.stream)
+    await client.close()
     return rows, sequences == list(range(sequences[0], sequences[0] + len(sequences))) if sequences else False
 
 
@@ -212,7 +204,7 @@ def main():
                     rate = chosen.json_rate if part == "json" else chosen.rate
                     sent = measure(part, stated["nats"], pids, rate, chosen.seconds)
                     total += sent if part != "core" else 0
-            rows, whole = asyncio.run(stored(stated["nats"], total))
+            rows, whole = asyncio.run(stored(stated["nats"]))
             print(
                 f"in the stream: {rows} of {total} fixes, {'no gap' if whole else 'with gaps'} in the batches' numbers"
             )

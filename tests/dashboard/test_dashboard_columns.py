@@ -16,11 +16,13 @@ from starlette.websockets import WebSocketDisconnect
 from skyless.page import live2
 from skyless.page.app import Services, make_app
 from skyless.page.columns import Columns
+from skyless.page.gathered import Gathered
 from skyless.page.guard import AccessRules
 from skyless.page.live import LiveSite
 from skyless.page.live2 import View, anchors_message, conditions_message, tags_message
 from skyless.page.sites import LiveSites
 from skyless.run.fix_batch import RECORD
+from skyless.run.gather.address import NatsAddress
 
 VIEW = View((0.0, 0.0, 10.0, 5.0), (1000, 500))
 
@@ -52,10 +54,9 @@ def test_the_columns_are_those_of_a_dictionary_of_newest_fixes(batches):
             if unix_us >= newest.get(tag, (0,))[0]:
                 newest[tag] = (unix_us, x_mm, y_mm)
     inside = {tag: xy for tag, (_, *xy) in newest.items() if 0 <= xy[0] <= 10_000 and 0 <= xy[1] <= 5000}
-    found = columns.visible(VIEW.view, 51.0)
-    assert found.numbers.tolist() == sorted(inside)
-    assert np.rint(1000 * found.x_m).tolist() == [inside[n][0] for n in sorted(inside)]
-    assert np.rint(1000 * found.y_m).tolist() == [inside[n][1] for n in sorted(inside)]
+    numbers, found = columns.visible(VIEW.view, 51.0)
+    assert numbers.tolist() == sorted(inside)
+    assert list(zip(found["x_mm"], found["y_mm"], strict=True)) == [tuple(inside[n]) for n in sorted(inside)]
     message = tags_message(columns, VIEW, 51.0, 123_456)
     kind, zero, count, unix_us = struct.unpack_from("<BBHQ", message)
     assert (chr(kind), zero, count, unix_us) == ("P", 0, len(inside), 123_456)
@@ -71,16 +72,16 @@ def test_a_late_fix_changes_nothing_but_a_clock_that_was_set_back_does():
     columns = Columns()
     for unix_us, x_mm in ((10**15, 1000), (10**15 - 9_000_000, 2000), (10**15 - 3_600_000_000, 3000)):
         columns.update(records_of([(5, unix_us, x_mm, 1000)]), 1.0)
-        shown = columns.visible(VIEW.view, 1.0).x_m.tolist()
-        assert shown == ([3.0] if x_mm == 3000 else [1.0])
+        shown = columns.visible(VIEW.view, 1.0)[1]["x_mm"].tolist()
+        assert shown == ([3000] if x_mm == 3000 else [1000])
 
 
 def test_tags_that_are_unheard_leave_the_map_and_too_large_numbers_are_counted():
     columns = Columns()
     columns.update(records_of([(5, 10**15, 1000, 1000), (2**31, 10**15, 1000, 1000)]), 1.0)
     assert columns.dropped == 1
-    assert columns.visible(VIEW.view, 10.9).numbers.tolist() == [5]
-    assert columns.visible(VIEW.view, 11.1).numbers.tolist() == []
+    assert columns.visible(VIEW.view, 10.9)[0].tolist() == [5]
+    assert columns.visible(VIEW.view, 11.1)[0].tolist() == []
 
 
 @settings(max_examples=20)
@@ -134,43 +135,32 @@ def test_a_wrong_view_is_none(text):
     assert View.read(text) is None
 
 
-class Given:
-    """In the place of what reads NATS."""
-
-    def __init__(self):
-        self.pages, self.ending, self.made = set(), False, Columns()
-
-    async def serve(self, socket, live):
-        await live2.serve_page(socket, live, self)
-
-    def columns(self, site):
-        assert site == SITE_ID
-        return self.made
-
-
-def test_a_page_is_sent_anchors_conditions_and_the_tags_of_its_view():
-    live, gathered = LiveSite("here", "mqtt://broker:1", SITE), Given()
+def test_a_page_is_sent_anchors_conditions_and_the_tags_of_its_view(monkeypatch):
+    live, gathered, columns = LiveSite("here", "mqtt://broker:1", SITE), Gathered(NatsAddress("nats://none")), Columns()
     live.attach(Wire(), SITE_ID)
-    app = make_app(Services(LiveSites(live), None, None, None, gathered), AccessRules())
-    gathered.made.update(records_of([(5, 10**15, 1000, 1000)]), time.monotonic())
-    with TestClient(app, base_url="http://localhost:8080").websocket_connect("ws://localhost:8080/live2") as socket:
+    monkeypatch.setattr(gathered, "columns", {SITE_ID: columns}.get)
+    app = make_app(Services(LiveSites(live), None, None, None, gathered=gathered), AccessRules())
+    browser = TestClient(app, base_url="http://localhost:8080")
+    columns.update(records_of([(5, 10**15, 1000, 1000)]), time.monotonic())
+    with browser.websocket_connect("ws://localhost:8080/live2") as socket:
         assert [chr(socket.receive_bytes()[0]) for _ in range(2)] == ["A", "H"]
         socket.send_text(json.dumps({"view": [0, 0, 10, 5], "px": [1000, 500], "floor": 0, "named": ["t1"]}))
         message = socket.receive_bytes()
         assert (chr(message[0]), struct.unpack_from("<I", message, 12)[0]) == ("P", 5)
-        gathered.made.update(records_of([(5, 10**15 + 1, 2000, 1000), (6, 10**15, 1, 1)]), time.monotonic())
+        columns.update(records_of([(5, 10**15 + 1, 2000, 1000), (6, 10**15, 1, 1)]), time.monotonic())
         while struct.unpack_from("<H", message, 2)[0] != 2:
             message = socket.receive_bytes()
-        assert len(gathered.pages) == 1
-        gathered.ending = True
-        with pytest.raises(WebSocketDisconnect):
-            while True:
-                socket.receive_bytes()
-    assert not gathered.pages
+        assert gathered.pages == 1
+        socket.close()
+        while gathered.pages:
+            time.sleep(0.01)
+    with browser.websocket_connect("ws://localhost:8080/live") as socket:
+        assert socket.receive_json()["live2"] is True
 
 
 def test_a_server_without_a_gather_says_so():
     browser = browser_of(LiveSite("here", "mqtt://broker:1"))
-    with browser.websocket_connect("ws://localhost:8080/live2") as socket, pytest.raises(WebSocketDisconnect) as ended:
-        socket.receive_bytes()
-    assert ended.value.code == 4404
+    with browser.websocket_connect("ws://localhost:8080/live") as socket:
+        assert socket.receive_json()["live2"] is False
+    with pytest.raises(WebSocketDisconnect), browser.websocket_connect("ws://localhost:8080/live2"):
+        pass

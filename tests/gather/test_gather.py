@@ -6,28 +6,32 @@ import os
 import signal
 import subprocess
 import sys
+import time
 
 import msgspec
 import nats
 import numpy as np
 import pytest
+from gathered_fixes import of_tag, payload
 from msgspec.structs import replace
+from nats.js.errors import NotFoundError
 
 from skyless.core.errors import SkylessError
 from skyless.page.gathered import Gathered
 from skyless.run.broker import BrokerSettings, nats_of, start_broker
-from skyless.run.fix_batch import MAX_RECORDS, RECORD, Batch, PackedFix, decode_batch, encode_batch
+from skyless.run.fix_batch import MAX_RECORDS, RECORD, Batch, decode_batch, encode_batch
+from skyless.run.gather import names as names_module
 from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, nats_address
+from skyless.run.gather.names import Names
 from skyless.run.gather.node import Gather, Summary
-from skyless.run.gather.packer import TagName
-from skyless.run.gather.stream_source import StreamSource
-from skyless.run.gather.streams import NumberTakenError, store_name
+from skyless.run.gather.streams import messages
 from skyless.run.mqtt.access import create_access, read_access
 from skyless.run.mqtt.address import MqttAddress, mqtt_address
 from skyless.run.mqtt.link import Link
-from skyless.run.mqtt.messages import StatusMessage
+from skyless.run.mqtt.messages import StatusMessage, site_message
 from skyless.run.mqtt.topics import fix_topic, status_topic
+from skyless.sim.lab import lab_site
 from support.processes import SKYLESS, started
 
 pytestmark = pytest.mark.site
@@ -35,10 +39,6 @@ pytestmark = pytest.mark.site
 SITE = 7
 KEEP_BYTES = 5_000_000_000
 """More than half of what the broker may store, so that its stream fits once only."""
-
-
-def fix(tag, x_m=1.0):
-    return PackedFix(tag, 1000.0, (x_m, 2.0, 3.0), (1e-4,) * 9, None, (1, 2, 3), height_known=True)
 
 
 @contextlib.asynccontextmanager
@@ -78,22 +78,34 @@ async def serving(client):
     reading = await summaries(client)
     await reading.next_msg(20)
     await reading.unsubscribe()
+    async with asyncio.timeout(20):
+        while subjects.at(subjects.NAMES_STREAM, SITE) not in await stream_names(client):
+            await asyncio.sleep(0.02)
+
+
+async def stream_names(client):
+    return [info.config.name for info in await client.jetstream().streams_info()]
 
 
 async def publish(client, tag, x_m):
     level = tag.replace(".", "//")
-    await client.publish(f"skyless.v1.{SITE}.tag.{level}.fix", msgspec.json.encode(fix(tag, x_m)))
+    await client.publish(f"skyless.v1.{SITE}.tag.{level}.fix", payload(tag, x_m))
 
 
 async def stored(address, count, after=-1):
     """The first rows of the stream: number, tag's number and x in mm."""
-    found = []
-    async with asyncio.timeout(20), StreamSource(address, SITE, lambda _line: None) as source:
-        async for first, records in source.rows(after):
-            found += [(first + n, int(row["tag"]), int(row["position_mm"][0])) for n, row in enumerate(records)]
-            if len(found) >= count:
-                break
-        return found, await source.names()
+    found, last = [], max(after, 0) // MAX_RECORDS
+    async with asyncio.timeout(20), client_of(address) as client:
+        stream, names = client.jetstream(), Names(client.jetstream(), SITE)
+        while len(found) < count:
+            with contextlib.suppress(NotFoundError):  # no gather has made it yet
+                async for message in messages(stream, subjects.at(subjects.FIX_STREAM, SITE), last):
+                    last = message.metadata.sequence.stream
+                    rows = enumerate(decode_batch(message.data).records, last * MAX_RECORDS)
+                    found += [(number, int(row["tag"]), int(row["position_mm"][0])) for number, row in rows]
+            await asyncio.sleep(0.02)
+        await names.read()
+        return found, {number: tag.name for number, tag in names.tags.items()}
 
 
 def test_fixes_of_mqtt_and_of_nats_are_in_the_stream_once_and_in_order_and_numbers_survive(tmp_path):
@@ -104,7 +116,7 @@ def test_fixes_of_mqtt_and_of_nats_are_in_the_stream_once_and_in_order_and_numbe
                 link = Link(running.address, "t", site=SITE, kind="tag")
                 task = asyncio.ensure_future(link.run())
                 for n in range(50):
-                    link.publish(fix_topic(SITE, f"t.{n % 5}"), fix(f"t.{n % 5}", n / 1000.0), qos=1)
+                    link.publish(fix_topic(SITE, f"t.{n % 5}"), of_tag(f"t.{n % 5}", n / 1000.0), qos=1)
                 first, names = await stored(running.nats, 50)
                 assert [x for _, _, x in first] == list(range(50))
                 assert [names[tag] for _, tag, _ in first] == [f"t.{n % 5}" for n in range(50)]
@@ -126,58 +138,85 @@ def test_fixes_of_mqtt_and_of_nats_are_in_the_stream_once_and_in_order_and_numbe
     asyncio.run(check())
 
 
-def test_a_second_gather_waits_and_takes_over(tmp_path):
+def test_two_gathers_share_the_fixes_and_what_one_leaves_the_other_takes(tmp_path):
+    """Each fix is in the stream once, under one number of its tag, whoever packed it and while one of them ends."""
+
     async def check():
-        async with broker(tmp_path) as running, client_of(running.nats) as client:
-            async with gathering(running.nats) as (first, _), asyncio.timeout(30):
-                await serving(client)
-                async with gathering(running.nats) as (second, lines):
-                    while not lines:
-                        await asyncio.sleep(0.02)
-                    assert "another gather serves site 7" in lines[0]
-                    for n in range(5):
-                        await publish(client, "a", n / 1000.0)
-                    await stored(running.nats, 5)
-                    assert (first.summary.fixes, second.summary.fixes) == (5, 0)
-            async with gathering(running.nats, keep_bytes=10**6) as (third, _):
-                await serving(client)
-                await publish(client, "a", 0.005)
-                rows, names = await stored(running.nats, 6)
-                assert [x for _, _, x in rows] == list(range(6))
-                assert names == {1: "a"}
-                assert third.summary.names == 1
-                info = await client.jetstream().stream_info(subjects.at(subjects.FIX_STREAM, SITE))
-                assert info.config.max_bytes == 10**6
+        async with (
+            broker(tmp_path) as running,
+            client_of(running.nats) as client,
+            gathering(running.nats) as (first, _),
+        ):
+            async with gathering(running.nats) as (second, _), asyncio.timeout(20):
+                while first._names is None or second._names is None:
+                    await asyncio.sleep(0.02)
+                for n in range(400):
+                    await publish(client, f"t{n % 40}", n / 1000.0)
+                await client.flush()
+                rows, names = await stored(running.nats, 400)
+                assert first.summary.fixes > 0
+                assert second.summary.fixes == 400 - first.summary.fixes > 0
+                for n in range(400, 600):
+                    await publish(client, f"t{n % 40}", n / 1000.0)
+                await client.flush()
+            for n in range(600, 800):
+                await publish(client, f"t{n % 40}", n / 1000.0)
+            rows, names = await stored(running.nats, 800)
+            assert sorted(x for _, _, x in rows) == list(range(800))
+            assert all(names[tag] == f"t{x % 40}" for _, tag, x in rows)
+            assert len(set(names.values())) == len(names) == 40
+            async with gathering(running.nats, keep_bytes=10**6) as (third, _), asyncio.timeout(20):
+                while third._names is None:
+                    await asyncio.sleep(0.02)
+            info = await client.jetstream().stream_info(subjects.at(subjects.FIX_STREAM, SITE))
+            assert info.config.max_bytes == 10**6
 
     asyncio.run(check())
 
 
-def test_a_number_is_never_given_twice_and_duplicates_of_a_batch_are_dropped(tmp_path):
+def test_programs_that_give_numbers_at_the_same_time_give_each_once_and_duplicates_of_a_batch_are_dropped(tmp_path):
     async def check():
-        async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats) as (node, _):
+        async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats):
             await serving(client)
             stream = client.jetstream()
-            await store_name(stream, SITE, 1, TagName("a", "elsewhere", 1.0))
-            with pytest.raises(NumberTakenError):
-                await store_name(stream, SITE, 1, TagName("b", "elsewhere", 1.0))
+            given = [Names(stream, SITE) for _ in range(3)]
+            wanted = [("a", "b", "a"), ("c", "b", "d"), ("d", "e", "a")]
+            gives = [names.give(tags, "elsewhere", 1.0) for names, tags in zip(given, wanted, strict=True)]
+            await asyncio.gather(*gives)
+            for names in given:
+                await names.read()
+                assert sorted(names.numbers) == sorted(tag.name for tag in names.tags.values()) == list("abcde")
+                assert sorted(names.tags) == [1, 2, 3, 4, 5]
+                assert (names.issue, names.numbers) == (5, given[0].numbers)
             records = np.zeros(3, RECORD)
             records["tag"], records["position_mm"][:, 0] = 1, (7, 8, 9)
             live = await client.subscribe(subjects.at(subjects.LIVE, SITE))
             subject = subjects.at(subjects.FIXES, SITE, "elsewhere")
             for sequence in (1, 1, 2, 1):
-                data = encode_batch(Batch(5, sequence, 1, 1, records))
-                await stream.publish(subject, data, headers={"Nats-Msg-Id": f"5-{sequence}"})
-            await client.publish(subject, b"no batch")
-            rows, names = await stored(running.nats, 6)
+                batch = Batch(5, sequence, 1, 1, records)
+                await stream.publish(subject, encode_batch(batch), headers={"Nats-Msg-Id": batch.id})
+            rows, _ = await stored(running.nats, 6)
             assert [x for _, _, x in rows] == [7, 8, 9] * 2
-            assert names == {1: "a"}
-            assert [decode_batch((await live.next_msg(5)).data).sequence for _ in range(4)] == [1, 1, 2, 1]
-            while node.summary.drops != {"wrong-batch": 1}:
-                await asyncio.sleep(0.02)
-            assert node.summary.packed == 12
+            assert [decode_batch((await live.next_msg(5)).data).sequence for _ in range(2)] == [1, 2]
             info = await stream.stream_info(subjects.at(subjects.FIX_STREAM, SITE))
             assert info.config.max_bytes == KEEP_BYTES
             assert info.config.max_age == 24 * 3600
+
+    asyncio.run(check())
+
+
+def test_a_full_table_of_names_gives_no_more_numbers(tmp_path, monkeypatch):
+    monkeypatch.setattr(names_module, "MAX_NAMES", 2)
+
+    async def check():
+        async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats) as (node, _):
+            await serving(client)
+            for n, tag in enumerate("abcab"):
+                await publish(client, tag, n / 1000.0)
+            rows, names = await stored(running.nats, 4)
+            assert [x for _, _, x in rows] == [0, 1, 3, 4]
+            assert names == {1: "a", 2: "b"}
+            assert node.summary.drops == {"no-number": 1}
 
     asyncio.run(check())
 
@@ -193,7 +232,7 @@ def test_nothing_that_came_is_lost_when_the_server_was_away(tmp_path):
             await stored(running.nats, 5)
             os.kill(running.pid, signal.SIGSTOP)
             for n in range(5, 9):
-                node._packer.add("a", msgspec.json.encode(fix("a", n / 1000.0)))
+                node._packer.add("a", payload("a", n / 1000.0))
             await asyncio.sleep(0.5)
             os.kill(running.pid, signal.SIGCONT)
             rows, names = await stored(running.nats, 9)
@@ -222,7 +261,8 @@ def test_the_site_is_found_and_its_programs_are_counted(tmp_path):
                 for n in range(5):
                     await tell(online=True, name=str(n))
                 await tell(online=False, name="3")
-                await client.publish(f"skyless.v1.{SITE}.site", b'{"site":{"name":"hall"},"simulated":true}')
+                hall = site_message(replace(lab_site(100.0), name="hall"), simulated=True, unix_s=1.0)
+                await client.publish(f"skyless.v1.{SITE}.site", msgspec.json.encode(hall))
                 summary = node.summary
                 while not summary.site or summary.online != {"anchor": 4}:
                     summary = msgspec.json.decode((await reading.next_msg(20)).data, type=Summary)
@@ -244,9 +284,8 @@ def test_a_dashboard_reads_batches_with_the_role_of_a_page(tmp_path):
                 while not gathered.columns(SITE).serial:
                     await publish(client, "a", 1.5)
                     await asyncio.sleep(0.05)
-                assert gathered.columns(SITE).visible((0.0, 0.0, 9.0, 9.0), asyncio.get_running_loop().time()).x_m == [
-                    1.5
-                ]
+                _, newest = gathered.columns(SITE).visible((0.0, 0.0, 9.0, 9.0), time.monotonic())
+                assert newest["x_mm"].tolist() == [1500]
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
 

@@ -130,13 +130,7 @@ def _gathered(nats: str | None, broker: "MqttAddress") -> "Gathered | None":
     address = nats_of(broker) if nats is None else nats_address(nats)
     if address is None:
         return None
-    try:
-        extra_module("nats", "--nats" if nats is not None else f"the gather of {broker}")
-    except SkylessError as error:
-        if nats is not None:
-            raise
-        print(f"without batches: {error}", file=sys.stderr, flush=True)
-        return None
+    extra_module("nats", "--nats" if nats is not None else f"the gather of {broker}")
     from skyless.page.gathered import Gathered
 
     return Gathered(address)

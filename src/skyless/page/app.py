@@ -57,7 +57,6 @@ _Endpoint = Callable[[Request], Coroutine[Any, Any, Response]]
 
 _TRY_LATER: Final = 1013
 _GOING_AWAY: Final = 1001
-_NO_GATHER: Final = 4404
 _STATUSES: Final[dict[type[Exception], int]] = {
     BadZonesError: 400,
     BadAssetsError: 400,
@@ -118,7 +117,7 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
         Route("/api/recordings/{name}/what_if", _what_if),
         *api_routes(services.sites, services.past),
         WebSocketRoute("/live", _live),
-        WebSocketRoute("/live2", _live2),
+        *(() if services.gathered is None else (WebSocketRoute("/live2", _live2),)),
         Mount("/page", _Files(directory=page, check_dir=False)),
     ]
     app = Starlette(
@@ -316,19 +315,18 @@ def _live_for(socket: WebSocket) -> LiveSite:
 
 
 async def _live2(socket: WebSocket) -> None:
-    gathered = _services(socket).gathered
+    live, gathered = _live_for(socket), _services(socket).gathered
     await socket.accept()
-    if gathered is None:
-        await socket.close(_NO_GATHER, "this server has no gather")
-    else:
-        await gathered.serve(socket, _live_for(socket))
+    if gathered is not None:
+        await gathered.serve(socket, live)
 
 
 async def _live(socket: WebSocket) -> None:
     live = _live_for(socket)
     await socket.accept()  # a browser does not show a page why its socket was refused, only why it was closed
     try:
-        page = live.open_page(socket.client.host if socket.client is not None else "")
+        address = socket.client.host if socket.client is not None else ""
+        page = live.open_page(address, live2=_services(socket).gathered is not None)
     except TooManyPagesError as error:
         await socket.close(_TRY_LATER, str(error))
         return

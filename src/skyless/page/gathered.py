@@ -1,57 +1,50 @@
-"""Batches of fixes from NATS into the columns of each site, for a dashboard whose broker has a gather."""
+"""Batches of a broker with a gather, read from NATS into columns, and the pages that see them by ``/live2``."""
 
 import asyncio
 import logging
 import time
+from collections import Counter
 from typing import Final
 
 from nats.aio.msg import Msg
-from nats.errors import SlowConsumerError
-from starlette.websockets import WebSocket
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from skyless.core.site import AnchorSite
 from skyless.page.columns import Columns
-from skyless.page.live import LiveSite
-from skyless.page.live2 import serve_page
+from skyless.page.live import MAX_PAGES, LiveSite
+from skyless.page.live2 import View, anchors_message, conditions_message, tags_message
 from skyless.run.fix_batch import BadBatchError, decode_batch
 from skyless.run.gather import subjects
-from skyless.run.gather.address import NatsAddress, connect
+from skyless.run.gather.address import NatsAddress, connect, rarely
+from skyless.run.process import together
 
-_PENDING_MESSAGES: Final = 2_000
-_PENDING_BYTES: Final = 64 * 1024 * 1024
+PERIOD_S: Final = 0.1
 _MAX_SITES: Final = 64
 _EMPTY: Final = Columns()
-_log = logging.getLogger("skyless.page")
+_SEND_S: Final = 10.0
+_TRY_LATER: Final = 1013
 
 
 class Gathered:
-    """The columns of all sites whose batches arrive."""
+    """The columns of all sites whose batches arrive, and the pages that are shown them."""
 
     def __init__(self, address: NatsAddress) -> None:
-        self.dropped = 0
-        """Batches that could not be read, or not in time."""
-        self.pages: set[object] = set()
-        self.ending = False
+        self.drops: Counter[str] = Counter()
+        """Batches that were dropped, by reason."""
+        self.pages = 0
         self._address = address
         self._sites: dict[int | None, Columns] = {}
+        self._say = rarely(logging.getLogger("skyless.page").warning)
 
     def columns(self, site: int | None) -> Columns:
         """The columns of a site, empty before its first batch."""
         return self._sites.get(site, _EMPTY)
 
-    async def serve(self, socket: WebSocket, live: LiveSite) -> None:
-        """Serve one page of ``/live2`` until it closes."""
-        await serve_page(socket, live, self)
-
     async def run(self) -> None:
         """Read until cancelled."""
-        client = await connect(self._address, "skyless dashboard", self._on_error)
+        client = await connect(self._address, "skyless dashboard", self._say, self.drops)
         try:
-            await client.subscribe(
-                subjects.at(subjects.FIXES, subjects.EVERY),
-                cb=self._on_batch,
-                pending_msgs_limit=_PENDING_MESSAGES,
-                pending_bytes_limit=_PENDING_BYTES,
-            )
+            await client.subscribe(subjects.at(subjects.FIXES, subjects.EVERY), cb=self._on_batch)
             await asyncio.Event().wait()
         finally:
             await client.close()
@@ -60,12 +53,62 @@ class Gathered:
         site = subjects.site_in(message.subject)
         try:
             if site is None or (site not in self._sites and len(self._sites) >= _MAX_SITES):
-                raise BadBatchError("site")
+                raise BadBatchError(f"it is of a wrong site, or of more than {_MAX_SITES}")
             self._sites.setdefault(site, Columns()).update(decode_batch(message.data).records, time.monotonic())
-        except BadBatchError:
-            self.dropped += 1
+        except BadBatchError as error:
+            self.drops["wrong-batch"] += 1
+            self._say(f"a batch under {message.subject} is not shown: {error}")
 
-    async def _on_error(self, error: Exception) -> None:
-        if isinstance(error, SlowConsumerError):
-            self.dropped += 1
-        _log.warning("NATS server %s: %s", self._address, error or type(error).__name__)
+    async def serve(self, socket: WebSocket, live: LiveSite) -> None:
+        """Serve one accepted page until it closes."""
+        if self.pages >= MAX_PAGES:
+            await socket.close(_TRY_LATER, f"too many pages are open: {self.pages}")
+            return
+        self.pages += 1
+        page = _Page()
+        try:
+            await together(page.read(socket), self._send(socket, live, page))
+        except (WebSocketDisconnect, KeyError, RuntimeError, TimeoutError):
+            pass  # the page was closed meanwhile, does not respond, or sent bytes
+        finally:
+            self.pages -= 1
+
+    async def _send(self, socket: WebSocket, live: LiveSite, page: "_Page") -> None:
+        while True:
+            now_s = time.monotonic()
+            async with asyncio.timeout(_SEND_S):
+                for message in page.news(live, self.columns(live.site_id), now_s):
+                    await socket.send_bytes(message)
+            await asyncio.sleep(PERIOD_S)
+
+
+class _Page:
+    """One page. Messages are made when they are sent, so that a slow page gets only the newest."""
+
+    def __init__(self) -> None:
+        self._view: View | None = None
+        self._shown: tuple[View, int, int] | None = None
+        self._anchors: tuple[AnchorSite, ...] | None = None
+        self._conditions: dict[str, str] | None = None
+
+    async def read(self, socket: WebSocket) -> None:
+        """Take the views that the page sends until it closes."""
+        while True:
+            self._view = View.read(await socket.receive_text()) or self._view
+
+    def news(self, live: LiveSite, columns: Columns, now_s: float) -> list[bytes]:
+        """What is new to the page."""
+        found, unix_us = [], round(1e6 * time.time())
+        anchors, conditions = () if live.site is None else live.site.site.anchors, live.state.conditions
+        if anchors != self._anchors:
+            self._anchors, self._conditions = anchors, None
+            found.append(anchors_message(anchors, unix_us))
+        if conditions != self._conditions:
+            self._conditions = conditions
+            found.append(conditions_message(anchors, conditions, unix_us))
+        if self._view is not None:
+            shown = self._view, columns.serial, int(now_s)  # without a new fix each second: their ages grow
+            if shown != self._shown:
+                self._shown = shown
+                found.append(tags_message(columns, self._view, now_s, unix_us))
+        return found

@@ -506,7 +506,7 @@ class LiveSite:
 
     # Pages
 
-    def open_page(self, address: str = "") -> PageQueue:
+    def open_page(self, address: str = "", *, live2: bool = False) -> PageQueue:
         """The queue of a new page of a computer, with what it needs first. Raises TooManyPagesError."""
         self._make_room(address)
         self._send_logged()
@@ -517,6 +517,7 @@ class LiveSite:
             "events": list(self.events.recent),
             "mqtt": self.connected,
             "history": self.has_history,
+            "live2": live2,
         }
         page = PageQueue(encode("hello", hello), address, self._clock())
         page.replace("mqtt", self._connection())

@@ -128,8 +128,6 @@ def _stop(server: "_Server", services: Services) -> None:
         server.should_exit = True
         for live in services.sites.all:
             live.close()
-        if services.gathered is not None:
-            services.gathered.ending = True
         services.playback.stop()
         services.overlays.stop()
         services.what_ifs.stop()

@@ -9,7 +9,6 @@ import contextlib
 import fcntl
 import json
 import os
-import secrets
 import shutil
 import signal
 import socket
@@ -28,7 +27,7 @@ from msgspec.structs import replace
 from skyless.core.errors import SkylessError
 from skyless.run.children import end
 from skyless.run.gather.address import FIRST_PORT as FIRST_NATS_PORT
-from skyless.run.gather.address import NatsAddress, nats_address
+from skyless.run.gather.address import NatsAddress
 from skyless.run.mqtt.access import ACCESS, Role
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress, mqtt_address
 from skyless.run.mqtt.connection import check_broker
@@ -42,8 +41,6 @@ _TEMPORARY: Final = "skyless-broker-"  # how the name of a temporary folder begi
 _MAX_PAYLOAD: Final = 8 * 1024 * 1024
 _MAX_STORED: Final = 4 * 1024**3
 _NATS_HOST: Final = "127.0.0.1"
-_GATHER_USER: Final = "gather"
-_PASSWORD_BYTES: Final = 24
 _SEND_AGAIN: Final = "3s"  # when a message that a dying subscriber has not acknowledged is sent again; 30 s by default
 
 _ABANDONED_S: Final = 10.0  # a temporary folder of this age that no broker has locked was left by one that was killed
@@ -101,12 +98,12 @@ class BrokerSettings(Struct, frozen=True):
         if (self.password or "").startswith("$2"):
             raise SkylessError("the broker's password should not begin with $2, which nats-server takes for a hash")
 
-    def nats_address(self, port: int) -> NatsAddress:
-        """The address for its gather, with the user that may do everything."""
-        url = f"nats://{_NATS_HOST}:{port}"
+    @property
+    def operator(self) -> tuple[str | None, str | None]:
+        """User and password that may do everything; None without access control."""
         if self.roles is None:
-            return NatsAddress(url, self.user, self.password)
-        return NatsAddress(url, _GATHER_USER, secrets.token_urlsafe(_PASSWORD_BYTES))
+            return self.user, self.password
+        return str(Role.OPERATOR), self.roles[Role.OPERATOR]
 
     def address(self, port: int) -> MqttAddress:
         """Its address for clients on this machine. Where there are roles, each puts its own user there."""
@@ -137,8 +134,6 @@ def _configuration(settings: BrokerSettings, port: int, data: Path, nats: NatsAd
         if settings.strangers_read:
             users.append(_user(Role.STRANGER, ""))
             whole["no_auth_user"] = str(Role.STRANGER)
-        if nats is not None:
-            users.append({"user": nats.user, "password": nats.password})
         whole["authorization"] = {"users": users}
     return json.dumps(whole, ensure_ascii=False, indent=1) + "\n"
 
@@ -229,13 +224,13 @@ class Broker:
         data: Path,
         process: asyncio.subprocess.Process,
         lock: IO[str],
-        reservations: tuple[socket.socket, ...],
-        nats: NatsAddress | None = None,
+        reservation: socket.socket,
+        nats: NatsAddress | None,
     ) -> None:
         self.address = address  # its address for clients on this machine, credentials included
         self.nats = nats  # the same for its gather, None without one
         self.data = data
-        self._process, self._lock, self._reservations = process, lock, reservations
+        self._process, self._lock, self._reservation = process, lock, reservation
         self._stated = None if address.tls else StatedAddress(address, nats)  # its certificate is for other names
 
     @property
@@ -254,8 +249,7 @@ class Broker:
         await end(self._process)
         if to_restart:
             os.utime(self.data)  # it is not abandoned
-        for reservation in self._reservations:
-            reservation.close()
+        self._reservation.close()
         _release(self.data, self._lock, keep=to_restart)
 
     async def __aenter__(self) -> Self:
@@ -296,18 +290,18 @@ async def _start(program: Path, settings: BrokerSettings, port: int, data: Path,
     reservation = _reserved(settings.listen, port)
     if reservation is None:
         raise _PortTakenError
-    nats: NatsAddress | None = None
-    reservations: tuple[socket.socket, ...] = (reservation,)
-    if settings.gathered_bytes is not None:
-        nats_port, second = reserve_next(_NATS_HOST, FIRST_NATS_PORT)
-        nats, reservations = settings.nats_address(nats_port), (reservation, second)
     try:
-        process = await _spawn(program, settings, port, data, lock, nats)
+        with contextlib.ExitStack() as until_it_listens:
+            nats: NatsAddress | None = None
+            if settings.gathered_bytes is not None:
+                nats_port, held = reserve_next(_NATS_HOST, FIRST_NATS_PORT)
+                until_it_listens.enter_context(held)
+                nats = NatsAddress(f"nats://{_NATS_HOST}:{nats_port}", *settings.operator)
+            process = await _spawn(program, settings, port, data, lock, nats)
     except BaseException:
-        for held in reservations:
-            held.close()
+        reservation.close()
         raise
-    return Broker(settings.address(port), data, process, lock, reservations, nats)
+    return Broker(settings.address(port), data, process, lock, reservation, nats)
 
 
 async def _spawn(
@@ -328,11 +322,9 @@ async def _spawn(
         pass_fds=(lock.fileno(),),  # the folder stays locked while nats-server writes there
         preexec_fn=end_with_parent(signal.SIGKILL),
     )
-    address = settings.address(port)
-    if settings.roles is not None:
-        address = replace(address, user=str(Role.OPERATOR), password=settings.roles[Role.OPERATOR])
+    user, password = settings.operator
     try:
-        await _until_ready(process, address, data)
+        await _until_ready(process, replace(settings.address(port), user=user, password=password), data)
     except BaseException:
         await end(process)
         raise
@@ -414,7 +406,7 @@ class StatedAddress:
             file = _session_folder() / f"broker-{address.port}"
             self._lock = _locked(file)
             self._lock.truncate(0)
-            self._lock.write(f"{address}\n{nats.url}\n" if nats is not None else str(address))
+            self._lock.write(f"{address}\n{nats.url}" if nats is not None else str(address))
             self._lock.flush()
             self._file = file
 
@@ -443,41 +435,39 @@ def _locked(file: Path) -> IO[str]:
 
 def running_broker() -> MqttAddress | None:
     """The broker that was started last of those that run on this machine, or None without any."""
-    return next((mqtt_address(lines[0]) for lines in _stated()), None)
+    return next((mqtt for mqtt, _ in _stated()), None)
 
 
 def nats_of(broker: MqttAddress) -> NatsAddress | None:
     """The address for NATS of a broker that runs on this machine with a gather, with the broker's user."""
-    for lines in _stated():
-        stated = mqtt_address(lines[0])
-        if len(lines) > 1 and (stated.host, stated.port) == (broker.host, broker.port):
-            return replace(nats_address(lines[1]), user=broker.user, password=broker.password)
+    for mqtt, nats in _stated():
+        if nats and (mqtt.host, mqtt.port) == (broker.host, broker.port):
+            return NatsAddress(nats, broker.user, broker.password)
     return None
 
 
-def _stated() -> Iterator[list[str]]:
-    """The lines of each broker's file, the newest first."""
+def _stated() -> Iterator[tuple[MqttAddress, str]]:
+    """The addresses in each broker's file, the newest first; that for NATS is empty where there is no gather."""
     with contextlib.suppress(OSError):
         files = sorted(_session_folder().glob("broker-*"), key=lambda file: file.stat().st_mtime, reverse=True)
         for file in files:
-            lines = _lines_in(file)
-            if lines:
-                yield lines
+            addresses = _addresses_in(file)
+            if addresses is not None:
+                yield addresses
 
 
-def _lines_in(file: Path) -> list[str]:
-    """The lines of a file, none where its broker has ended. The file stays: a broker may be about to lock it."""
+def _addresses_in(file: Path) -> tuple[MqttAddress, str] | None:
+    """The addresses in a file, or None where its broker has ended. The file stays: a broker may be about to lock it."""
     try:
         with file.open(encoding="utf-8") as stated:
             try:
                 fcntl.flock(stated, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
-                lines = stated.read().split()
-                mqtt_address(lines[0] if lines else "")
-                return lines
+                mqtt, _, nats = stated.read().partition("\n")
+                return mqtt_address(mqtt), nats
     except (OSError, SkylessError, UnicodeError):  # it has just ended, or begins at this moment
         pass
-    return []
+    return None
 
 
 def _session_folder() -> Path:

@@ -14,7 +14,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.core.alert import Alert
-from skyless.run.mqtt.messages import FixMessage, Matrix, Vector
+from skyless.run.mqtt.messages import FixMessage
 
 MAGIC: Final = b"SKB2"
 _HEADER: Final = struct.Struct("<4sHHIIQII")
@@ -50,6 +50,8 @@ SIMULATED: Final = 1 << 6
 ALERTS: Final = tuple(Alert)
 """The alert of a record is the number of its value here plus one; 0 for none."""
 
+_ALERT_NUMBERS: Final[dict[str | None, int]] = {None: 0} | {alert: number for number, alert in enumerate(ALERTS, 1)}
+
 _MAX_I64: Final = 2**63 - 1
 _MAX_I32: Final = 2**31 - 1
 _MAX_I16: Final = 2**15 - 1
@@ -60,21 +62,6 @@ Records = NDArray[Any]
 
 class BadBatchError(ValueError):
     """Bytes that are no batch."""
-
-
-class PackedFix(Struct, frozen=True):
-    """The fields of a ``FixMessage`` that a record is made of."""
-
-    tag: str
-    unix_s: float
-    position_m: Vector
-    covariance_m2: Matrix
-    velocity_mps: Vector | None
-    anchors: tuple[int, ...]
-    height_known: bool
-    hpl_m: float | None = None
-    alert: Alert | None = None
-    verified_until_s: float | None = None
 
 
 class Batch(Struct, frozen=True):
@@ -88,6 +75,11 @@ class Batch(Struct, frozen=True):
     names_issue: int
     """Number of the table of names that the records' tags are in."""
     records: Records
+
+    @property
+    def id(self) -> str:
+        """Streams drop a second message with the same id."""
+        return f"{self.run}-{self.sequence}"
 
 
 def encode_batch(batch: Batch) -> bytes:
@@ -110,24 +102,20 @@ def decode_batch(data: bytes) -> Batch:
         raise BadBatchError(f"its header has {header_bytes} bytes and its records {record_bytes}")
     if count > MAX_RECORDS or len(data) != header_bytes + count * record_bytes:
         raise BadBatchError(f"{len(data)} bytes are not {count} records")
-    if record_bytes == RECORD.itemsize:
-        records = np.frombuffer(data, RECORD, count, header_bytes)
-    else:
-        whole = np.frombuffer(data, np.uint8, count * record_bytes, header_bytes).reshape(count, record_bytes)
-        records = np.ascontiguousarray(whole[:, : RECORD.itemsize]).view(RECORD).reshape(count)
+    records = np.ndarray(count, RECORD, data, header_bytes, record_bytes)
     return Batch(run, sequence, sent, issue, records)
 
 
-def records_of(fixes: Sequence[tuple[int, FixMessage | PackedFix]], *, simulated: bool) -> Records:
+def records_of(fixes: Sequence[tuple[int, FixMessage]], *, simulated: bool) -> Records:
     """Records of fixes, each with its tag's number. Values beyond a field's range are given as its limit."""
     rows = [_row(number, fix, simulated=simulated) for number, fix in fixes]
     with np.errstate(over="ignore"):  # a covariance beyond 32 bits becomes infinite
         return np.array(rows, RECORD)
 
 
-def _row(number: int, fix: FixMessage | PackedFix, *, simulated: bool) -> tuple[Any, ...]:
+def _row(number: int, fix: FixMessage, *, simulated: bool) -> tuple[Any, ...]:
     flags = SIMULATED if simulated else 0
-    flags |= 0 if fix.alert is None else 1 + ALERTS.index(Alert(fix.alert))
+    flags |= _ALERT_NUMBERS.get(fix.alert, _ALERT_NUMBERS[Alert.UNAVAILABLE])  # one of a later version promises nothing
     flags |= HEIGHT_GIVEN if fix.height_known else 0
     flags |= VERIFIED if fix.verified_until_s is not None else 0
     velocity = (0, 0)

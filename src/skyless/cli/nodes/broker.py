@@ -5,7 +5,7 @@ import os
 import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App
 
@@ -19,7 +19,6 @@ from skyless.core.extras import extra_module
 if TYPE_CHECKING:
     from skyless.run.broker import Broker, BrokerSettings
     from skyless.run.find_site import SiteOnBroker
-    from skyless.run.gather.address import NatsAddress
     from skyless.run.mqtt.address import MqttAddress
 
 app = App(name="broker", help_epilogue="Example: skyless broker --port 1883")
@@ -101,12 +100,8 @@ def broker(
                 f"--history is {str(history)!r}; with --certificate, whose names only clients know, start "
                 f"skyless history run --to {history} --mqtt mqtts://NAME instead"
             )
-    asyncio.run(_serve(settings, _gather_arguments(site_id, keep_gb), history, json=json))
-
-
-def _gather_arguments(site_id: int | None, keep_gb: float) -> tuple[str, ...]:
     named = () if site_id is None else ("--site-id", str(site_id))
-    return ("gather", "--keep-gb", str(keep_gb), *named)
+    asyncio.run(_serve(settings, ("--keep-gb", str(keep_gb), *named), history, json=json))
 
 
 @app.command(name="access", help_epilogue="Example: skyless broker access passwords --mqtt mqtts://hall.local")
@@ -136,10 +131,10 @@ def create_passwords(folder: Path, /, *, mqtt: str = "mqtt://127.0.0.1:1883", js
         log(f"start the broker with --access {folder}; copy each file to the machines of its role only")
 
 
-async def _serve(
-    settings: "BrokerSettings", gather_arguments: tuple[str, ...], history: Path | None, *, json: bool
-) -> None:
+async def _serve(settings: "BrokerSettings", of_gather: tuple[str, ...], history: Path | None, *, json: bool) -> None:
     from skyless.run.broker import start_broker
+    from skyless.run.children import Child, Program
+    from skyless.run.mqtt.address import PASSWORD_VARIABLE
     from skyless.run.process import ending_signals
 
     stop = asyncio.Event()
@@ -151,33 +146,22 @@ async def _serve(
             stated = {} if nats is None else {"nats": str(nats)}
             print_json({"mqtt": str(running.address), "data": running.data, "pid": running.pid, **stated})
         else:
-            print(running.address)
-            if nats is not None:
-                print(nats)
+            print(running.address, *(() if nats is None else (nats,)), sep="\n")
         sys.stdout.flush()
-        beside = [] if nats is None else [_gathering(nats, gather_arguments)]
-        beside += [] if history is None else [_keep_history(_reader(settings, running), history)]
-        programs = [asyncio.ensure_future(one) for one in beside]
         ended = asyncio.ensure_future(running.wait())
-        asked = asyncio.ensure_future(stop.wait())
-        await asyncio.wait((ended, asked), return_when=asyncio.FIRST_COMPLETED)
-        asked.cancel()
-        for program in programs:
-            program.cancel()
-        await asyncio.gather(*programs, return_exceptions=True)
+        parts: list[asyncio.Future[Any]] = [ended, asyncio.ensure_future(stop.wait())]
+        if nats is not None:
+            secret = {} if nats.password is None else {PASSWORD_VARIABLE: nats.password}
+            gather = Program("gather", ("gather", "--nats", str(nats), *of_gather), environment=secret)
+            parts.append(asyncio.ensure_future(Child(gather, log).run()))
+        if history is not None:
+            parts.append(asyncio.ensure_future(_keep_history(_reader(settings, running), history)))
+        await asyncio.wait(parts, return_when=asyncio.FIRST_COMPLETED)
         if ended.done():
             raise SkylessError(f"nats-server has ended by itself; {running.data / 'nats-server.log'} may show why")
-        ended.cancel()
-
-
-async def _gathering(nats: "NatsAddress", arguments: tuple[str, ...]) -> None:
-    """Run gather as a child process until cancelled."""
-    from skyless.run.children import Child, Program
-    from skyless.run.gather.address import NATS_VARIABLE
-    from skyless.run.mqtt.address import PASSWORD_VARIABLE
-
-    secret = {} if nats.password is None else {PASSWORD_VARIABLE: nats.password}
-    await Child(Program("gather", arguments, environment={NATS_VARIABLE: str(nats), **secret}), log).run()
+        for part in parts:
+            part.cancel()
+        await asyncio.gather(*parts, return_exceptions=True)
 
 
 def _reader(settings: "BrokerSettings", running: "Broker") -> "MqttAddress":

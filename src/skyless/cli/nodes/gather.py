@@ -1,7 +1,6 @@
 """``skyless gather``: the fixes of a large site in batches."""
 
 import contextlib
-import time
 from typing import Annotated
 
 from cyclopts import App, Parameter
@@ -24,7 +23,7 @@ def gather(
 ) -> None:
     """Pack the fixes of a site's tags into batches until Ctrl-C, and keep them in a stream of NATS.
 
-    skyless broker --gather runs it. A second gather of the same site waits until the first has ended.
+    skyless broker --gather runs it. Several gathers of one site share its fixes.
 
     Parameters
     ----------
@@ -45,14 +44,13 @@ def gather(
     extra_module("nats", "skyless gather")
     from skyless.run.gather.node import Gather
 
-    address = nats_address(nats)
-    node = Gather(address, site_id, round(1e9 * keep_gb), log)
-    begun_s = time.monotonic()
+    node = Gather(nats_address(nats), site_id, round(1e9 * keep_gb), log)
     with contextlib.suppress(KeyboardInterrupt):
         run(node.run())
-    seconds = time.monotonic() - begun_s
     summary = node.summary
     if json:
-        print_json({"site_id": node.site, "seconds": round(seconds, 1), "summary": summary})
+        print_json({"site_id": node.site, "summary": summary})
     else:
-        log(f"site {node.site}: {seconds:.0f} s, {summary.fixes} fixes in {summary.batches} batches, {summary.drops}")
+        log(
+            f"site {node.site}: {summary.fixes} fixes, {summary.batches} batches in the stream, dropped {summary.drops}"
+        )

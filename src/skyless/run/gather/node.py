@@ -4,54 +4,32 @@ import asyncio
 import contextlib
 import secrets
 import time
-from collections import Counter
-from collections.abc import Awaitable, Callable
-from itertools import islice
 from typing import Final
 
 import msgspec
 from msgspec import Struct
 from nats.aio.client import Client
 from nats.aio.msg import Msg
-from nats.errors import Error, SlowConsumerError
+from nats.aio.subscription import Subscription
+from nats.errors import Error
 from nats.js import JetStreamContext
 from nats.js.errors import APIError
 
 from skyless.core.version import installed_version
-from skyless.run.fix_batch import BadBatchError, decode_batch
+from skyless.run.fix_batch import Batch, encode_batch
 from skyless.run.gather import subjects
-from skyless.run.gather.address import NatsAddress, connect
-from skyless.run.gather.packer import NamesTable, Packer, ReadyBatch
-from skyless.run.gather.streams import LostLockError, NumberTakenError, lock_site, make_streams, read_names, store_name
+from skyless.run.gather.address import NatsAddress, connect, rarely
+from skyless.run.gather.names import Names
+from skyless.run.gather.packer import Packer
+from skyless.run.gather.streams import make_streams
+from skyless.run.mqtt.messages import SiteMessage, StatusMessage, WrongMessageError, read_message
 from skyless.run.process import Log, together
 
 PERIOD_S: Final = 0.1
 SUMMARY_S: Final = 1.0
 _RETRY_S: Final = 0.5
 _LEAVE_S: Final = 2.0
-_SAME_TROUBLE_S: Final = 30.0
-_NAMES_AT_ONCE: Final = 256
-_PENDING_MESSAGES: Final = 100_000
-_PENDING_BYTES: Final = 128 * 1024 * 1024
-
-
-class _SiteName(Struct):
-    """The part of a site that is read here."""
-
-    name: str
-
-
-class _SiteMessage(Struct):
-    """The part of ``SiteMessage`` that is read here."""
-
-    site: _SiteName
-    simulated: bool
-
-
-class _Status(Struct):
-    """The part of ``StatusMessage`` that is read here."""
-
-    online: bool
+_QUEUE: Final = "gather"
 
 
 class Summary(Struct, frozen=True):
@@ -69,8 +47,6 @@ class Summary(Struct, frozen=True):
     """Programs that are online, by kind."""
     fixes: int
     """Fixes taken from JSON."""
-    packed: int
-    """Fixes that came packed from other programs."""
     batches: int
     """Batches that the stream has acknowledged."""
     waiting: int
@@ -78,107 +54,68 @@ class Summary(Struct, frozen=True):
     drops: dict[str, int]
     """Messages and fixes that were dropped, by reason."""
     cuts: int
-    """How often the connection was lost; the server ends that of a reader which is too slow."""
+    """How often the connection was made again; the server ends that of a reader which is too slow."""
 
 
 class Gather:
-    """The gather of one site. A second one of the same site waits until the first has ended."""
+    """One gather of a site. Several of one site share the fixes: the server gives each message to one of them."""
 
     def __init__(self, address: NatsAddress, site: int | None, keep_bytes: int, log: Log) -> None:
         """``site`` None: the first site of which anything is heard."""
-        self.site, self.cuts = site, 0
+        self.site = site
         self._address, self._keep_bytes, self._log = address, keep_bytes, log
+        self._say = rarely(log)
         self._host = subjects.own_host()
-        self._packer = Packer(secrets.randbits(32), self._host)
-        self._names = NamesTable({})
-        self._ready: ReadyBatch | None = None
+        self._packer = Packer(secrets.randbits(32))
+        self._client: Client | None = None
+        self._names: Names | None = None
+        self._ready: Batch | None = None
         self._site_name = ""
         self._online: dict[str, set[str]] = {}
-        self._packed = self._batches = 0
-        self._drops: Counter[str] = Counter()
-        self._logged = ("", 0.0)
+        self._batches = 0
 
     @property
     def summary(self) -> Summary:
         """What it has done since its start."""
-        waiting = self._packer.waiting + (self._ready.fixes if self._ready is not None else 0)
         return Summary(
             unix_s=time.time(),
             host=self._host,
             version=installed_version(),
             site=self._site_name,
             simulated=self._packer.simulated,
-            names=len(self._names.numbers),
+            names=0 if self._names is None else len(self._names.numbers),
             online={kind: len(names) for kind, names in self._online.items()},
             fixes=self._packer.fixes,
-            packed=self._packed,
             batches=self._batches,
-            waiting=waiting,
-            drops=dict(self._drops + self._packer.drops),
-            cuts=self.cuts,
+            waiting=self._packer.waiting + (0 if self._ready is None else len(self._ready.records)),
+            drops=dict(self._packer.drops),
+            cuts=0 if self._client is None else self._client.stats["reconnects"],
         )
 
     async def run(self) -> None:
         """Gather until cancelled. What waits is sent before the end."""
-        client = await connect(self._address, "skyless gather", self._on_error, self._on_cut)
+        client = self._client = await connect(self._address, "skyless gather", self._say, self._packer.drops)
         stream = client.jetstream()
         try:
-            if self.site is None:
-                self.site = await self._first_site(client)
-            while True:
-                try:
-                    await self._serve(client, stream, self.site)
-                except (LostLockError, NumberTakenError, Error) as error:
-                    self._say(f"site {self.site} is not gathered for a moment: {error or type(error).__name__}")
-                    await asyncio.sleep(_RETRY_S)
+            site = self.site = await self._first_site(client) if self.site is None else self.site
+            fixes = await client.subscribe(subjects.at(subjects.JSON_FIXES, site), _QUEUE, self._on_fix)
+            await client.subscribe(subjects.at(subjects.STATUSES, site), cb=self._on_status)
+            await client.subscribe(subjects.at(subjects.SITES, site), cb=self._on_site)
+            try:
+                await together(self._send(stream, site), self._summarise(client, site))
+            finally:
+                with contextlib.suppress(Error, TimeoutError):
+                    await asyncio.wait_for(self._leave(fixes, stream, site), _LEAVE_S)
         finally:
             await client.close()
 
     async def _first_site(self, client: Client) -> int:
-        found: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-
-        async def on_message(message: Msg) -> None:
-            site = subjects.site_in(message.subject)
-            if site is not None and not found.done():
-                found.set_result(site)
-
-        every = (subjects.JSON_FIXES, subjects.STATUSES, subjects.SITES)
-        heard = [await client.subscribe(subjects.at(one, subjects.EVERY), cb=on_message) for one in every]
-        site = await found
-        for one in heard:
-            await one.unsubscribe()
+        heard = await client.subscribe("skyless.v1.*.>")
+        while (site := subjects.site_in((await heard.next_msg(None)).subject)) is None:
+            pass
+        await heard.unsubscribe()
         self._log(f"gathers site {site}; --site-id names another")
         return site
-
-    async def _serve(self, client: Client, stream: JetStreamContext, site: int) -> None:
-        """Gather for as long as no other program does."""
-        await make_streams(stream, site, self._keep_bytes)
-        lock = await lock_site(stream, site, self._log)
-        self._names = NamesTable(await read_names(stream, site))
-        handlers: dict[str, Callable[[Msg], Awaitable[None]]] = {
-            subjects.JSON_FIXES: self._on_fix,
-            subjects.STATUSES: self._on_status,
-            subjects.SITES: self._on_site,
-            subjects.FIXES: self._relay(client, site),
-        }
-        heard = [
-            await client.subscribe(
-                subjects.at(subject, site),
-                cb=handler,
-                pending_msgs_limit=_PENDING_MESSAGES,
-                pending_bytes_limit=_PENDING_BYTES,
-            )
-            for subject, handler in handlers.items()
-        ]
-        try:
-            await together(lock.hold(), self._send(stream, site), self._summarise(client, site))
-        finally:
-            for one in heard:
-                with contextlib.suppress(Error):
-                    await one.unsubscribe()
-            for last in (self._send_waiting(stream, site), lock.release()):
-                with contextlib.suppress(Error, TimeoutError, NumberTakenError):
-                    await asyncio.wait_for(last, _LEAVE_S)
 
     # Messages
 
@@ -186,86 +123,61 @@ class Gather:
         self._packer.add(subjects.tag_in(message.subject), message.data)
 
     async def _on_site(self, message: Msg) -> None:
-        with contextlib.suppress(msgspec.MsgspecError):
-            site = msgspec.json.decode(message.data, type=_SiteMessage)
+        with contextlib.suppress(WrongMessageError):
+            site = read_message(message.data, SiteMessage)
             self._site_name, self._packer.simulated = site.site.name, site.simulated
 
     async def _on_status(self, message: Msg) -> None:
         kind, name = message.subject.split(".")[3:5]
         online = False
-        with contextlib.suppress(msgspec.MsgspecError):
-            online = msgspec.json.decode(message.data, type=_Status).online
+        with contextlib.suppress(WrongMessageError):
+            online = read_message(message.data, StatusMessage).online
         names = self._online.setdefault(kind, set())
         (names.add if online else names.discard)(name)
-
-    def _relay(self, client: Client, site: int) -> Callable[[Msg], Awaitable[None]]:
-        own, live = subjects.at(subjects.FIXES, site, self._host), subjects.at(subjects.LIVE, site)
-
-        async def relay(message: Msg) -> None:
-            try:
-                records = decode_batch(message.data).records
-            except BadBatchError:
-                self._drops["wrong-batch"] += 1
-                return
-            if message.subject != own:
-                self._packed += len(records)
-            await client.publish(live, message.data)
-
-        return relay
 
     # Sending
 
     async def _send(self, stream: JetStreamContext, site: int) -> None:
+        """Send for ever. While the server cannot take fixes, they wait."""
         while True:
-            await asyncio.sleep(PERIOD_S)
-            await self._send_waiting(stream, site)
+            try:
+                await make_streams(stream, site, self._keep_bytes)
+                names = Names(stream, site)
+                await names.read()
+                self._names = names
+                while True:
+                    await self._send_waiting(stream, site, names)
+                    await asyncio.sleep(PERIOD_S)
+            except Error as error:
+                self._say(f"the fixes of site {site} wait: {error or type(error).__name__}")
+                await asyncio.sleep(_RETRY_S)
 
-    async def _send_waiting(self, stream: JetStreamContext, site: int) -> None:
+    async def _send_waiting(self, stream: JetStreamContext, site: int, names: Names) -> None:
         """Send until nothing waits. A batch counts as sent when the stream has acknowledged it.
 
         A batch that the stream refuses, as on a full disk, has reached those who read now, and is not sent again.
         """
-        while True:
+        subject = subjects.at(subjects.FIXES, site, self._host)
+        while self._ready is not None or (tags := self._packer.next_tags()):
             if self._ready is None:
-                while self._packer.give_numbers(self._names, time.time()):
-                    await self._store_names(stream, site)  # first, so that every number in the stream has a name
-                self._ready = self._packer.next_batch(self._names, time.time())
-            if self._ready is None and not self._packer.waiting:
-                return
+                await names.give(tags, self._host, time.time())  # first: every number in the stream has a name
+                self._ready = self._packer.next_batch(names.numbers, names.issue, time.time())
             if self._ready is not None:
-                subject, header = subjects.at(subjects.FIXES, site, self._host), {"Nats-Msg-Id": self._ready.id}
                 try:
-                    await stream.publish(subject, self._ready.data, headers=header)
+                    await stream.publish(subject, encode_batch(self._ready), headers={"Nats-Msg-Id": self._ready.id})
                     self._batches += 1
                 except APIError as error:
-                    self._drops["not-stored"] += self._ready.fixes
+                    self._packer.drops["not-stored"] += len(self._ready.records)
                     self._say(f"the stream of site {site} takes no fixes: {error.description}")
                 self._ready = None
 
-    async def _store_names(self, stream: JetStreamContext, site: int) -> None:
-        while some := list(islice(self._names.unsaved.items(), _NAMES_AT_ONCE)):
-            await asyncio.gather(*(store_name(stream, site, number, tag) for number, tag in some))
-            for number, _ in some:
-                del self._names.unsaved[number]
+    async def _leave(self, fixes: Subscription, stream: JetStreamContext, site: int) -> None:
+        """Take no more, and send what has come; another gather gets the rest at once."""
+        await fixes.drain()  # type: ignore[no-untyped-call]
+        if self._names is not None:
+            await self._send_waiting(stream, site, self._names)
 
     async def _summarise(self, client: Client, site: int) -> None:
         while True:
             await client.publish(subjects.at(subjects.SUMMARY, site), msgspec.json.encode(self.summary))
             await asyncio.sleep(SUMMARY_S)
-
-    # Trouble
-
-    async def _on_error(self, error: Exception) -> None:
-        if isinstance(error, SlowConsumerError):
-            self._drops["unread"] += 1
-        self._say(f"NATS server {self._address}: {error or type(error).__name__}")
-
-    async def _on_cut(self) -> None:
-        self.cuts += 1
-
-    def _say(self, trouble: str) -> None:
-        """Log it once, and again every half minute while it lasts."""
-        now_s = time.monotonic()
-        if trouble != self._logged[0] or now_s > self._logged[1] + _SAME_TROUBLE_S:
-            self._logged = (trouble, now_s)
-            self._log(trouble)

@@ -10,7 +10,7 @@ from typing import Final
 JSON_FIXES: Final = "skyless.v1.{}.tag.*.fix"
 STATUSES: Final = "skyless.v1.{}.*.*.status"
 SITES: Final = "skyless.v1.{}.site"
-FIXES: Final = "skyless.v2.{}.fixes.>"
+FIXES: Final = "skyless.v2.{}.fixes.*"
 """Batches; the last level is the sender's host."""
 NAMES: Final = "skyless.v2.{}.names.*"
 """``TagName``; the last level is the tag's number."""
@@ -20,7 +20,6 @@ SUMMARY: Final = "skyless.v2.{}.summary"
 
 FIX_STREAM: Final = "FIX_{}"
 NAMES_STREAM: Final = "NAMES_{}"
-LOCK_BUCKET: Final = "GATHER_{}"
 
 EVERY: Final = "*"
 
