@@ -52,9 +52,11 @@ class Gathered:
     async def _on_batch(self, message: Msg) -> None:
         site = subjects.site_in(message.subject)
         try:
-            if site is None or (site not in self._sites and len(self._sites) >= _MAX_SITES):
-                raise BadBatchError(f"it is of a wrong site, or of more than {_MAX_SITES}")
-            self._sites.setdefault(site, Columns()).update(decode_batch(message.data).records, time.monotonic())
+            if site not in self._sites:
+                if site is None or len(self._sites) >= _MAX_SITES:
+                    raise BadBatchError(f"it is of a wrong site, or of more than {_MAX_SITES}")
+                self._sites[site] = Columns()
+            self._sites[site].update(decode_batch(message.data).records, time.monotonic())
         except BadBatchError as error:
             self.drops["wrong-batch"] += 1
             self._say(f"a batch under {message.subject} is not shown: {error}")
