@@ -1,5 +1,6 @@
 """The streams of a site at its NATS server: what they keep, and how they are read."""
 
+import contextlib
 from collections.abc import AsyncGenerator
 from typing import TYPE_CHECKING, Final
 
@@ -46,15 +47,26 @@ async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -
     )
     for config in (fixes, names):
         try:
-            try:
-                await stream.update_stream(config)  # to add it again would reserve its bytes twice
-            except NotFoundError:
-                await stream.add_stream(config)
+            await _make(stream, config)
         except APIError as error:
             if error.err_code != _NO_ROOM:
                 raise
             right = f"less than the server's max_file_store leaves: {error.description}"
             raise SkylessError(f"--keep-gb is {keep_bytes / 1e9:g}; it should be {right}") from None
+
+
+async def _make(stream: "JetStreamContext", config: StreamConfig) -> None:
+    """Make a stream, or change the one that is there: to add it again would reserve its bytes twice."""
+    try:
+        await stream.update_stream(config)
+    except NotFoundError:
+        try:
+            await stream.add_stream(config)
+        except APIError:
+            with contextlib.suppress(NotFoundError):
+                await stream.update_stream(config)  # another gather has made it at this moment
+                return
+            raise
 
 
 async def messages(stream: "JetStreamContext", name: str, after: int = 0) -> AsyncGenerator["Msg", None]:
