@@ -1,5 +1,6 @@
 """The streams of a site at its NATS server: what they keep, and how they are read."""
 
+import contextlib
 from collections.abc import AsyncGenerator
 from typing import TYPE_CHECKING, Final
 
@@ -61,11 +62,11 @@ async def _make(stream: "JetStreamContext", config: StreamConfig) -> None:
     except NotFoundError:
         try:
             await stream.add_stream(config)
-        except APIError as error:
-            try:
-                await stream.update_stream(config)  # another gather has made it at the same moment
-            except NotFoundError:
-                raise error from None
+        except APIError:
+            with contextlib.suppress(NotFoundError):
+                await stream.update_stream(config)  # another gather has made it at this moment
+                return
+            raise
 
 
 async def messages(stream: "JetStreamContext", name: str, after: int = 0) -> AsyncGenerator["Msg", None]:
