@@ -44,7 +44,7 @@ def folder(tmp_path_factory):
         (ms[90], "alarm-raised", None, "dock", "[red]ann", "late/ann/1", "ann is late"),
         (ms[660], "leave", "[red]ann", "dock", None, None, ""),
     ]
-    write(site / "events" / file_name(1, 3), EVENT_COLUMNS, events)
+    write(site / "events" / "day=2026-11-20" / file_name(1, 3), EVENT_COLUMNS, events)
     return folder
 
 
