@@ -56,7 +56,7 @@ def dashboard(
     recordings
         Folder of recordings to replay.
     history
-        Folder that skyless history writes, for questions about the past.
+        Folder of the history that skyless history writes, for questions about the past.
     assets
         CSV file of what the tags are attached to: given to the broker where it has none, and written with each change.
         It is of the first site that is shown.

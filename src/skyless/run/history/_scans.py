@@ -110,7 +110,7 @@ def read_rows(
     if tags is not None:
         wanted &= dataset.field("tag").isin(list(tags))
     for file in files:
-        whole = parquet.ParquetFile(file)
+        whole = parquet.ParquetFile(file, memory_map=True, pre_buffer=False)
         first, last = time_limits(whole.metadata)
         if last < begin or first >= end:
             continue
