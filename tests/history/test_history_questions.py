@@ -143,6 +143,14 @@ def test_known_until_the_newest_row(history, rows):
     assert history.known_until_unix_s() == pytest.approx(rows["t"].max() / 1000)
 
 
+def test_an_import_of_an_older_recording_does_not_hide_the_newest_row(tmp_path, rows):
+    site, earlier = site_folder(tmp_path, 1), dict(rows, t=rows["t"] - 10 * 86_400_000)
+    write_fixes(site, rows, 1, 100)
+    for first in (101, 201, 301):
+        write_fixes(site, earlier, first, first + 99)
+    assert History(tmp_path, 1).known_until_unix_s() == pytest.approx(rows["t"][:100].max() / 1000)
+
+
 def test_a_track_is_all_fixes_of_the_tag(history, within):
     track = history.track("tag3", SPAN, most_points=10_000)
     own = {name: values[within["tag"] == 3] for name, values in within.items()}
