@@ -22,7 +22,7 @@ import pyarrow as pa
 from skyless.run.history.answers import Span
 from skyless.run.history.layout import EVENT_COLUMNS, FIX_COLUMNS, NAME_COLUMNS, ZONE_COLUMNS, file_name, site_folder
 from skyless.run.history.queries import History
-from skyless.run.history.sink import schema_of, write_table
+from skyless.run.history.tables import schema_of, write_table
 
 SITE, TAGS, HOUR_S = 1, 500, 3600
 HALL_M = np.array([100.0, 60.0])
@@ -60,7 +60,6 @@ def write_history(folder, rows):
             "hpl_cm": draw.integers(20, 50, count), "flags": np.full(count, 16),
         }  # fmt: skip
         file = site / f"day={begin.date()}" / file_name(first, first + count - 1)
-        file.parent.mkdir(parents=True, exist_ok=True)
         write_table(table_of(FIX_COLUMNS, columns), file)
         first, size = first + count, size + file.stat().st_size
         strip = (way[:, ::30, 0] / HALL_M[0] * ZONES).astype(int).clip(0, ZONES - 1)  # zones are strips of the hall
@@ -74,7 +73,6 @@ def write_history(folder, rows):
 
 
 def write_events(site, events):
-    (site / "events").mkdir()
     events.sort()
     ms, kinds, tags, zones = zip(*events, strict=True)
     none = [None] * len(events)
@@ -82,7 +80,7 @@ def write_events(site, events):
         "t": ms, "kind": kinds, "tag": [f"tag{tag + 1}" for tag in tags], "zone": [f"zone{zone}" for zone in zones],
         "subject": none, "alarm": none, "text": [""] * len(events),
     }  # fmt: skip
-    write_table(table_of(EVENT_COLUMNS, columns), site / "events" / file_name(1, len(events)))
+    write_table(table_of(EVENT_COLUMNS, columns), site / "events" / f"day={BEGIN.date()}" / file_name(1, len(events)))
     names = {"tag": range(1, TAGS + 1), "name": [f"tag{k}" for k in range(1, TAGS + 1)], "since": [0] * TAGS}
     write_table(table_of(NAME_COLUMNS, names), site / "names.parquet")
     zones = [f"zone{k}" for k in range(ZONES)]

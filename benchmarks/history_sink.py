@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from skyless.run.fix_batch import MAX_RECORDS, RECORD, Batch, decode_batch, encode_batch
-from skyless.run.history.journal import Journal
 from skyless.run.history.layout import current_files
 from skyless.run.history.retention import Keep, tidy
-from skyless.run.history.sink import fix_sink
+from skyless.run.history.writer import Writer
 
+FILE_S = 600.0
 BEGIN_S = 1_795_154_400.0
 DAY_S = 86_400.0
 NOISE_M = 0.03
@@ -61,26 +61,23 @@ def main():
     batches = list(tracks(asked.tags, 60 * asked.minutes, asked.seed))
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
-        site = root / "site=1"
-        (site / "journal").mkdir(parents=True)
-        sink, journal = fix_sink(site), Journal(site / "journal", "fixes")
-        journal.begin(1)
-        begun_s, written_s = time.process_time(), 0.0
+        writer = Writer(root, 1)
+        begun_s, written_s, file_s = time.process_time(), 0.0, BEGIN_S + FILE_S
         for sent_us, batch in batches:
+            writer.fixes.add(decode_batch(batch).records, 1e-6 * sent_us)
             begin_s = time.process_time()
-            journal.append(sink.next, batch)
+            writer.store()
             written_s += time.process_time() - begin_s
-            sink.put(decode_batch(batch).records, sink.next, 1e-6 * sent_us)
-            if sink.is_due(1e-6 * sent_us):
-                sink.write()
-        sink.write()
-        journal.close()
+            if 1e-6 * sent_us >= file_s:
+                writer.write()
+                file_s += FILE_S
+        writer.write()
         took_s = time.process_time() - begun_s
         size = sum(file.stat().st_size for file in current_files(root, 1))
-        fixes = sink.last
+        fixes = writer.fixes.last
         print(f"{fixes} fixes of {asked.tags} tags in {len(current_files(root, 1))} files")
         print(f"bytes a fix                 {size / fixes:6.2f}")
-        print(f"CPU of a fix: sink          {1e6 * (took_s - written_s) / fixes:6.2f} us")
+        print(f"CPU of a fix: files         {1e6 * (took_s - written_s) / fixes:6.2f} us")
         print(f"CPU of a fix: journal       {1e6 * written_s / fixes:6.2f} us")
         for what, days in (("joined", 2), ("thinned", 10)):
             begin_s = time.process_time()

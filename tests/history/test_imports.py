@@ -4,14 +4,13 @@ import json
 
 import msgspec
 import pytest
-from made_fixes import DAY_S, NOON_S, fix, in_files
+from made_fixes import NOON_S, fix
 from pyarrow import parquet
 
 from skyless.cli.main import main
 from skyless.core.site import Site
 from skyless.run.fix_batch import records_of
 from skyless.run.history.layout import current_events, current_files, rows_of, site_folder
-from skyless.run.history.retention import Keep, tidy
 from skyless.run.history.writer import Writer
 from skyless.run.mqtt.messages import SiteMessage, Zone, ZoneEvent, ZonesMessage
 from skyless.run.mqtt.topics import fix_topic, site_topic, zone_event_topic, zones_topic
@@ -90,16 +89,6 @@ def test_a_longer_recording_and_one_beside_the_running_history_add_what_is_new(t
         number for file in current_files(folder, SITE) for number in range(rows_of(file)[0], rows_of(file)[1] + 1)
     ]
     assert numbers == list(range(1, 201))
-
-
-def test_what_was_thinned_does_not_come_back(tmp_path, capsys):
-    path, folder = recording(tmp_path / "walk.mcap", range(100)), tmp_path / "history"
-    imported(capsys, path, folder)
-    tidy(folder, SITE, Keep(), NOON_S + 20 * DAY_S)
-    left = in_files(folder, SITE)
-    assert left == [0, 0]
-    assert imported(capsys, path, folder)["fixes"] == 0
-    assert in_files(folder, SITE) == left
 
 
 def test_a_recording_of_no_site_needs_one(tmp_path, capsys):

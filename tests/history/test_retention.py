@@ -1,22 +1,19 @@
 """What is joined, thinned and removed, and that readers see every row once whenever the work stops."""
 
-import contextlib
-import os
 from datetime import UTC, datetime
 
 import numpy as np
 import pyarrow as pa
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_fixes import DAY_S, NOON_S, fix, in_files, records
 from pyarrow import parquet
-from test_writer import Disk, Killed
+from test_writer import dying
 
 from skyless.run.fix_batch import records_of
 from skyless.run.history.layout import current_events, current_files, file_name, rows_of, site_folder
-from skyless.run.history.retention import GRACE_S, Keep, remove_replaced, thinned, tidy
-from skyless.run.history.sink import Event, fix_table
+from skyless.run.history.retention import Keep, thinned, tidy
+from skyless.run.history.tables import Event, fix_table
 from skyless.run.history.writer import Writer
 
 KEEP = Keep(days=30.0, full_days=7.0, event_days=60.0)
@@ -32,7 +29,7 @@ def filled(folder, days, files=3):
             batch = records([serial, serial + 1], number)
             batch["unix_us"] = [round(1e6 * (unix_s + 300.0 * k)) for k in (serial, serial + 1)]
             writer.fixes.add(batch, unix_s)
-            event = Event(round(1000 * unix_s) + serial, "enter", "tag1", "z1", None, None, "")
+            event = Event(datetime.fromtimestamp(unix_s + 1e-3 * serial, UTC), "enter", "tag1", "z1")
             writer.events.add((event,), unix_s)
             writer.store()
             writer.write()
@@ -47,33 +44,15 @@ def events_in(folder):
 
 def test_a_day_that_is_over_becomes_one_file_and_old_ones_go(tmp_path):
     serials = filled(tmp_path, (-31, -2, -1, 0))
-    assert len(current_files(tmp_path, 1)) == 12
+    assert len(current_files(tmp_path, 1)) == len(current_events(tmp_path, 1)) == 12
     events = events_in(tmp_path)
     tidy(tmp_path, 1, KEEP, NOON_S)
-    assert in_files(tmp_path) == serials[6:]
-    assert [rows_of(file) for file in current_files(tmp_path, 1)] == [(7, 12), (13, 18), (19, 20), (21, 22), (23, 24)]
-    assert events_in(tmp_path) == events
-    assert not list(site_folder(tmp_path, 1).glob(f"day={datetime.fromtimestamp(NOON_S - 31 * DAY_S, UTC).date()}"))
-    everything = set(site_folder(tmp_path, 1).glob("*/*.parquet"))
-    assert len(everything) > len(current_files(tmp_path, 1)) + len(current_events(tmp_path, 1))
-    remove_replaced(tmp_path, 1, NOON_S)  # "now" lies before the replacement
-    assert set(site_folder(tmp_path, 1).glob("*/*.parquet")) == everything
-    for file in everything - set(current_files(tmp_path, 1)) - set(current_events(tmp_path, 1)):
-        os.utime(file, (NOON_S, NOON_S))
-    remove_replaced(tmp_path, 1, NOON_S + GRACE_S + 1.0)
-    assert set(site_folder(tmp_path, 1).glob("*/*.parquet")) == {
-        *current_files(tmp_path, 1),
-        *current_events(tmp_path, 1),
-    }
     assert (in_files(tmp_path), events_in(tmp_path)) == (serials[6:], events)
-
-
-def test_numbers_go_on_after_everything_was_removed(tmp_path):
-    serials = filled(tmp_path, (-40,))
-    tidy(tmp_path, 1, KEEP, NOON_S)
-    assert in_files(tmp_path) == []
-    filled(tmp_path, (0,))
-    assert [rows_of(file)[0] for file in current_files(tmp_path, 1)] == [len(serials) + n for n in (1, 3, 5)]
+    assert [rows_of(file) for file in current_files(tmp_path, 1)] == [(7, 12), (13, 18), (19, 20), (21, 22), (23, 24)]
+    assert len(current_events(tmp_path, 1)) == 6
+    assert not list(site_folder(tmp_path, 1).glob(f"day={datetime.fromtimestamp(NOON_S - 31 * DAY_S, UTC).date()}"))
+    everything = set(site_folder(tmp_path, 1).glob("**/day=*/*"))
+    assert everything == {*current_files(tmp_path, 1), *current_events(tmp_path, 1)}
 
 
 def test_events_that_are_too_old_go(tmp_path):
@@ -86,14 +65,12 @@ def test_readers_see_every_row_once_when_the_work_stops_at_any_operation(tmp_pat
     operation, finished = 0, False
     while not finished:
         folder = tmp_path_factory.mktemp("history")
-        with pytest.MonkeyPatch.context() as patch:
-            Disk(patch, 10**9, 0)
+        with dying(10**9):
             serials = filled(folder, (-2, -1), 2)
         events = events_in(folder)
-        with pytest.MonkeyPatch.context() as patch, contextlib.suppress(Killed):
-            Disk(patch, operation, 0)
+        with dying(operation) as disk:
             tidy(folder, 1, KEEP, NOON_S)
-            finished = True
+        finished = not disk.dead
         assert (in_files(folder), events_in(folder)) == (serials, events)
         Writer(folder, 1).close()
         tidy(folder, 1, KEEP, NOON_S)

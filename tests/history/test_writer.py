@@ -4,6 +4,8 @@ import contextlib
 import errno
 import os
 import random
+import sqlite3
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -11,13 +13,11 @@ from made_fixes import DAY_S, NOON_S, fix, in_files, on_disk, records
 from pyarrow import parquet
 
 from skyless.core.errors import SkylessError
-from skyless.run.fix_batch import RECORD, records_of
-from skyless.run.history import sink as sink_module
+from skyless.run.fix_batch import records_of
 from skyless.run.history import writer as writer_module
-from skyless.run.history.journal import Journal
-from skyless.run.history.layout import FIX_COLUMNS, current_files, rows_of, site_folder
-from skyless.run.history.sink import Event, fix_sink, fix_table
-from skyless.run.history.writer import Writer
+from skyless.run.history.layout import FIX_COLUMNS, current_events, current_files, rows_of, site_folder
+from skyless.run.history.tables import Event, fix_table
+from skyless.run.history.writer import Journal, Writer
 
 
 class Killed(BaseException):
@@ -25,28 +25,60 @@ class Killed(BaseException):
 
 
 class Disk:
-    """Lets a program die at the n-th operation on the disk; the last write may be torn."""
+    """Lets a program die at the n-th operation on the disk."""
 
-    def __init__(self, patch, operations, torn):
-        self.left, self.torn, self.dead = operations, torn, False
-        patch.setattr(os, "fsync", self._counted(lambda _: None))  # a death by a signal costs nothing that was written
-        for name in ("pwrite", "ftruncate", "open"):
-            patch.setattr(os, name, self._counted(getattr(os, name), torn=name == "pwrite"))
+    def __init__(self, patch, operations):
+        self.left, self.dead, self.opened = operations, False, []
+        patch.setattr(sqlite3, "connect", self._opening(sqlite3.connect))
+        patch.setattr(os, "fsync", lambda _: self.operate())  # a death by a signal costs nothing that was written
         for name in ("replace", "unlink", "mkdir"):
             patch.setattr(Path, name, self._counted(getattr(Path, name)))
+        patch.setattr(Journal, "transaction", self._transaction(Journal.transaction))
 
-    def _counted(self, act, *, torn=False):
+    def operate(self):
+        self.left -= not self.dead
+        if self.left < 0:
+            self.dead = True
+            raise Killed
+
+    def end(self):
+        """What the system does for a program that has ended."""
+        for connection in self.opened:
+            connection.close()
+
+    def _opening(self, connect):
+        def opening(*arguments, **named):
+            self.opened.append(connect(*arguments, **named))
+            return self.opened[-1]
+
+        return opening
+
+    def _counted(self, act):
         def counted(*arguments, **named):
-            self.left -= not self.dead
-            if self.left < 0:
-                if torn and not self.dead:
-                    handle, data, at = arguments
-                    act(handle, data[: self.torn], at)
-                self.dead = True
-                raise Killed
+            self.operate()
             return act(*arguments, **named)
 
         return counted
+
+    def _transaction(self, transaction):
+        @contextlib.contextmanager
+        def counted(journal):
+            with transaction(journal) as sql:
+                yield sql
+                self.operate()  # before it is committed
+            self.operate()
+
+        return counted
+
+
+@contextlib.contextmanager
+def dying(operations):
+    """A program in the block dies at the operation with this number."""
+    with pytest.MonkeyPatch.context() as patch:
+        disk = Disk(patch, operations)
+        with contextlib.suppress(Killed):
+            yield disk
+        disk.end()
 
 
 def one_life(folder, serials, write_after):
@@ -68,18 +100,13 @@ def test_a_writer_that_dies_at_any_operation_loses_nothing_and_repeats_nothing(t
     while not finished:
         folder = tmp_path_factory.mktemp("history")
         acknowledged = []
-        try:
-            with pytest.MonkeyPatch.context() as patch:
-                Disk(patch, operation, 7 * operation % 40)
-                acknowledged.extend(one_life(folder, range(1, 22), 4))
-            finished = True
-        except Killed:
-            pass
-        stored = on_disk(folder) if folder.joinpath("site=1", "journal").exists() else []
+        with dying(operation) as disk:
+            acknowledged.extend(one_life(folder, range(1, 22), 4))
+        finished = not disk.dead
+        stored = on_disk(folder)
         assert stored[: len(acknowledged)] == acknowledged, operation
         assert stored == sorted(set(stored))  # a batch that was not acknowledged may be there
-        with pytest.MonkeyPatch.context() as patch:
-            Disk(patch, 10**9, 0)
+        with dying(10**9):
             later = list(one_life(folder, range(101, 110), 2))
         assert in_files(folder) == stored + later == on_disk(folder)
         assert numbers(folder) == list(range(1, len(stored + later) + 1))
@@ -96,12 +123,10 @@ def numbers(folder):
 def test_a_random_series_of_deaths(tmp_path):
     chance, expected, serial = random.Random(36), [], 1
     for _ in range(20):
-        with pytest.MonkeyPatch.context() as patch:
-            Disk(patch, chance.randrange(120), chance.randrange(200))
-            acknowledged = []
-            with contextlib.suppress(Killed):
-                acknowledged.extend(one_life(tmp_path, range(serial, serial + 40), 5))
-        before, expected = expected, on_disk(tmp_path) if (tmp_path / "site=1/journal").exists() else []
+        acknowledged = []
+        with dying(chance.randrange(120)):
+            acknowledged.extend(one_life(tmp_path, range(serial, serial + 40), 5))
+        before, expected = expected, on_disk(tmp_path)
         assert expected[: len(before) + len(acknowledged)] == before + acknowledged
         serial += 100
     assert len(expected) > 150
@@ -143,102 +168,87 @@ def no_room(*_):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+@contextlib.contextmanager
+def full_disk(writer):
+    """SQLite's own error of a full disk: its file may not grow."""
+    with writer.journal.transaction() as sql:
+        sql.execute("PRAGMA max_page_count = 1")
+    yield
+    with writer.journal.transaction() as sql:
+        sql.execute("PRAGMA max_page_count = 1000000")
+
+
 def test_a_full_disk_costs_the_oldest_rows_that_wait_and_is_counted(tmp_path, monkeypatch):
-    monkeypatch.setattr(writer_module, "MAX_WAITING", 10)
+    monkeypatch.setattr(writer_module, "MAX_WAITING", 1000)
     writer = Writer(tmp_path, 1)
     writer.number(fix(), NOON_S)
     writer.fixes.add(records([1, 2]), NOON_S)
     writer.store()
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "pwrite", no_room)
-        for serial in range(3, 20):
-            writer.fixes.add(records([serial]), NOON_S)
-            with pytest.raises(OSError, match="No space"):
+    with full_disk(writer):
+        for first in range(3, 2003, 100):
+            writer.fixes.add(records(range(first, first + 100)), NOON_S)
+            with pytest.raises(OSError, match="database or disk is full"):
                 writer.store()
-    assert (writer.fixes.dropped, writer.fixes.waiting) == (7, 10)
+    assert (writer.fixes.lost, writer.fixes.waiting) == (1000, 1000)
     assert on_disk(tmp_path) == [1, 2]
     writer.store()
-    assert on_disk(tmp_path) == [1, 2, *range(10, 20)]
+    assert on_disk(tmp_path) == [1, 2, *range(1003, 2003)]
     writer.close()
-    assert in_files(tmp_path) == [1, 2, *range(10, 20)]
+    assert in_files(tmp_path) == [1, 2, *range(1003, 2003)]
 
 
-def test_a_program_that_ends_with_a_full_disk_makes_files_of_its_journal(tmp_path, monkeypatch):
+def test_a_program_that_ends_with_a_full_disk_makes_files_of_its_journal(tmp_path):
     writer = Writer(tmp_path, 1)
     writer.fixes.add(records([1], writer.number(fix(), NOON_S)), NOON_S)
     writer.store()
-    writer.fixes.add(records([2]), NOON_S)
-    monkeypatch.setattr(os, "pwrite", no_room)
-    with pytest.raises(OSError, match="No space"):
+    writer.fixes.add(records(range(2, 1000)), NOON_S)
+    with writer.journal.transaction() as sql:
+        sql.execute("PRAGMA max_page_count = 1")
+    with pytest.raises(OSError, match="database or disk is full"):
         writer.close()
     assert in_files(tmp_path) == [1]
     Writer(tmp_path, 1).close()
 
 
-def test_while_no_file_can_be_written_the_journal_takes_a_bounded_number_of_rows(tmp_path, monkeypatch):
-    monkeypatch.setattr(writer_module, "MAX_WAITING", 10)
-    monkeypatch.setattr(writer_module, "MAX_ROWS", 20)
+def test_what_cannot_become_a_file_stays_in_the_journal(tmp_path, monkeypatch):
+    monkeypatch.setattr(writer_module, "FILE_ROWS", 20)
     writer = Writer(tmp_path, 1)
     writer.number(fix(), NOON_S)
+    writer.store()
     with monkeypatch.context() as patch:
-        patch.setattr(sink_module, "write_table", no_room)
+        patch.setattr(writer_module, "write_table", no_room)
         for serial in range(1, 101):
             writer.fixes.add(records([serial]), NOON_S)
             writer.store()
             with pytest.raises(OSError, match="No space"):
                 writer.write()
-    assert (writer.fixes.dropped, writer.fixes.waiting, writer.fixes.sink.waiting) == (70, 10, 20)
-    writer.write()
+    assert (writer.unwritten, on_disk(tmp_path)) == (100, [*range(1, 101)])
     writer.close()
-    assert in_files(tmp_path) == [*range(1, 21), *range(91, 101)]
+    assert in_files(tmp_path) == [*range(1, 101)]
+    assert len(current_files(tmp_path, 1)) == 5
 
 
-def test_the_journal_leaves_room_for_the_files_of_its_rows(tmp_path, monkeypatch):
-    writer = Writer(tmp_path, 1)
-    writer.number(fix(), NOON_S)
-    used = [0]
-
-    def free_bytes(_):
-        return (1 << 20) + 100_000 - used[0]
-
-    monkeypatch.setattr(Journal, "free_bytes", free_bytes)
-    with pytest.raises(OSError, match="No space"):
-        for serial in range(1, 10**6, 100):
-            writer.fixes.add(records(range(serial, serial + 100)), NOON_S)
-            writer.store()
-            used[0] += 100 * RECORD.itemsize
-    rows = writer.fixes.sink.waiting
-    assert rows > 0
-    assert 16 * rows <= free_bytes(None) - (1 << 20)
-    writer.write()
-    used[0] = 0
-    writer.close()
-    assert len(in_files(tmp_path)) == rows + 100
+def test_a_journal_that_is_damaged_is_named(tmp_path):
+    Writer(tmp_path, 1).close()
+    (site_folder(tmp_path, 1) / "journal.sqlite").write_bytes(b"no database" * 1000)
+    with pytest.raises(SkylessError, match=r"journal\.sqlite cannot be written: file is not a database"):
+        Writer(tmp_path, 1)
 
 
 def test_events_go_the_same_way(tmp_path):
     writer = Writer(tmp_path, 1)
-    events = tuple(Event(ms, "enter", "ann", "z1", None, None, "ann entered door") for ms in (3, 1, 2))
-    writer.events.add(events, NOON_S)
+    times = [datetime.fromtimestamp(NOON_S + s, UTC) for s in (0.003, 0.001, 0.002)]
+    writer.events.add([Event(t, "enter", "ann", "z1", text="ann entered door") for t in times], NOON_S)
     writer.store()
+    writer.journal.close()
     del writer  # as if it had been killed
     writer = Writer(tmp_path, 1)
-    assert writer.events.sink.unwritten == [events]
+    assert writer.unwritten == 3
     writer.close()
-    (file,) = site_folder(tmp_path, 1).glob("events/*.parquet")
+    (file,) = current_events(tmp_path, 1)
     table = parquet.read_table(file, partitioning=None)
-    assert table["t"].cast("int64").to_pylist() == [1, 2, 3]
+    assert table["t"].to_pylist() == sorted(times)
     assert (file.name, table["zone"][0].as_py(), table["alarm"][0].as_py()) == (f"{1:012}-{3:012}.parquet", "z1", None)
-
-
-def test_the_first_file_comes_soon_and_the_others_after_ten_minutes(tmp_path):
-    sink, unix_s, ages_s = fix_sink(tmp_path), NOON_S, []
-    for serial in range(1, 9):
-        sink.put(records([serial]), serial, unix_s)
-        ages_s.append(next(age_s for age_s in range(1000) if sink.is_due(unix_s + age_s)))
-        sink.write()
-        assert not sink.is_due(unix_s + 1e6)
-    assert ages_s == [30, 60, 120, 240, 480, 600, 600, 600]
 
 
 def test_only_one_writes(tmp_path):

@@ -155,7 +155,7 @@ def import_file(recording: Path, /, *, to: HistoryFolder, site_id: SiteId | None
         with progress_bar("importing", end_s - begin_s) as bar:
             writer = Writer(to, site)
             try:
-                found = import_recording(source, recording, writer, lambda unix_s: bar.reach(unix_s - begin_s))
+                found = import_recording(source, writer, lambda unix_s: bar.reach(unix_s - begin_s))
             finally:
                 writer.close()
     if json:

@@ -1,5 +1,6 @@
 """Pictures of the history's answers."""
 
+import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from datetime import datetime
@@ -10,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from skyless.run.history.answers import THINNED_GAP_S, Dwell, Heatmap, Occupancy, Track
+from skyless.run.history.answers import THINNED_GAP_S, AlarmRow, Contact, Dwell, Heatmap, Occupancy, Track
 from skyless.site.report.figures import BLUE, MAP, MUTED, panel, report_style
 
 _BARS: Final = 30
@@ -77,6 +78,30 @@ def occupancy_figure(occupancy: Sequence[Occupancy], title: str) -> Figure:
         figure.autofmt_xdate()
         if fullest:
             axes.legend()
+        return figure
+
+
+def contacts_figure(contacts: Sequence[Contact], title: str) -> Figure:
+    """When each other tag was near."""
+    return _times_figure([(one.other, one.begin_unix_s, one.end_unix_s) for one in contacts], title)
+
+
+def alarms_figure(alarms: Sequence[AlarmRow], title: str) -> Figure:
+    """From when to when each rule's alarms lasted; those that have not ended, until now."""
+    now_s = time.time()
+    return _times_figure([(f"{a.rule}, {a.subject}", a.raised_unix_s, a.ended_unix_s or now_s) for a in alarms], title)
+
+
+def _times_figure(times: Sequence[tuple[str, float, float]], title: str) -> Figure:
+    """A line of bars for each of the first names, from the one Unix time to the other."""
+    names = list(dict.fromkeys(name for name, _, _ in times))[:_BARS][::-1]
+    with report_style():
+        figure, axes = panel(title, 1.2 + 0.2 * max(len(names), 3))
+        for name, begin_s, end_s in times:
+            if name in names:
+                begin, end = datetime.fromtimestamp(begin_s), datetime.fromtimestamp(end_s)
+                axes.barh(name, end - begin, left=begin, color=BLUE)  # type: ignore[arg-type]
+        figure.autofmt_xdate()
         return figure
 
 

@@ -1,20 +1,24 @@
 """``skyless history track``, ``heatmap``, ``dwell``, ``occupancy``, ``contacts``, ``alarms`` and ``export``."""
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App
+from msgspec import Struct
+from msgspec.structs import asdict
 
 from skyless.cli.common.options import check_folder, check_picture, command
-from skyless.cli.common.output import NO_FIX, console, print_facts, print_json, write_picture
+from skyless.cli.common.output import NO_FIX, console, print_json, write_picture
 from skyless.cli.nodes.options import SiteId
 from skyless.core.arguments import Option, Options, Positive, whole
 from skyless.core.errors import SkylessError
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     from matplotlib.figure import Figure
 
     from skyless.run.history.answers import Span
@@ -22,6 +26,10 @@ if TYPE_CHECKING:
 
 _LONGEST_TABLE = 40
 """Rows that are shown; --json gives all."""
+_LONGEST_LIST = 10
+"""Cells of a heat map that are shown."""
+
+_HEADINGS = {"zone_name": "zone", "subject": "of", "acknowledged_unix_s": "seen", "acknowledged_by": "by"}
 
 questions = App(name="history")
 
@@ -47,9 +55,8 @@ class _Asked(Options, frozen=True, kw_only=True):
         folder = self.history or data_folder() / "history"
         sites = sites_in(folder)
         if self.site_id is None and len(sites) != 1:
-            held = (
-                f"it holds the sites {', '.join(map(str, sites))}; --site-id chooses one" if sites else "it holds none"
-            )
+            several = f"the sites {', '.join(map(str, sites))}; --site-id chooses one"
+            held = f"it holds {several if sites else 'none'}"
             raise SkylessError(f"--history is '{folder}'; it should be the folder of a site's history, and {held}")
         history = History(folder, sites[0] if self.site_id is None else self.site_id)
         try:
@@ -66,10 +73,24 @@ class _Drawn(_Asked, frozen=True, kw_only=True):
         """See that the picture can be written."""
         check_picture(self.plot)
 
-    def draw(self, figure: "Figure") -> None:
-        """Write the picture."""
-        assert self.plot is not None
-        write_picture(self.plot, figure)
+    def show(
+        self,
+        asked: "tuple[History, Span]",
+        name: str,
+        found: Struct | Sequence[Struct],
+        rows: Iterable[Mapping[str, object]],
+        draw: "Callable[[ModuleType, str], Figure]",
+    ) -> None:
+        """Write the answer as JSON or a table; ``draw`` gets ``history_pictures`` and a title to make its picture."""
+        title = _range(asked[1])
+        if self.json:
+            _print(*asked, {name: found})
+        else:
+            _table(title, list(rows))
+        if self.plot is not None:
+            from skyless.cli import history_pictures
+
+            write_picture(self.plot, draw(history_pictures, title))
 
 
 @questions.command(help_epilogue="Example: skyless history track tag7 --from 8:00 --to 16:00 --plot way.png")
@@ -86,20 +107,13 @@ def track(tag: str, /, *, asked: _Drawn, points: Annotated[int, whole(2, 1_000_0
     """
     history, span = asked.opened()
     way = history.track(tag, span, points)
-    if asked.json:
-        _print(history, span, track=way)
-    else:
-        ends = [f"({p.x_m:.2f}, {p.y_m:.2f}) m at {_time(p.unix_s)}" for p in (*way.points[:1], *way.points[-1:])]
-        facts = [
-            ("fixes", str(way.fixes)),
-            ("length", f"{way.length_m:.1f} m"),
-            *zip(("first", "last"), ends, strict=False),
-        ]
-        print_facts(f"{tag}, {_range(span)}", facts)
-    if asked.plot is not None:
-        from skyless.cli.history_pictures import track_figure
-
-        asked.draw(track_figure(way, history.zones(), f"{tag}, {_range(span)}"))
+    row = {"tag": tag, "fixes": way.fixes, "length_m": way.length_m}
+    for end, point in zip(("first", "last"), (*way.points[:1], *way.points[-1:]), strict=False):
+        row[end] = f"({point.x_m:.2f}, {point.y_m:.2f}) m at {_time(point.unix_s)}"
+    rows = [row] if way.fixes else []
+    asked.show(
+        (history, span), "track", way, rows, lambda pictures, title: pictures.track_figure(way, history.zones(), title)
+    )
     return 0 if way.fixes else NO_FIX
 
 
@@ -117,28 +131,24 @@ def heatmap(*tags: str, asked: _Drawn, cell: Positive = 0.25) -> int:
     """
     history, span = asked.opened()
     found = history.heatmap(span, cell, tags)
-    if asked.json:
-        _print(history, span, heatmap=found)
-    else:
-        best = sorted(enumerate(found.seconds), key=lambda one: -one[1])[:10]
-        places = [
-            (
-                found.x0_m + found.cell_m * (k % found.columns + 0.5),
-                found.y0_m + found.cell_m * (k // found.columns + 0.5),
-                s,
-            )
-            for k, s in best
-        ]
-        rows = [(f"{x:.2f}", f"{y:.2f}", _length(seconds)) for x, y, seconds in places if seconds > 0.0]
-        _table(
-            f"{found.tags} tags, {_length(sum(found.seconds))} in all, {_range(span)}",
-            ("x in m", "y in m", "time"),
-            rows,
-        )
-    if asked.plot is not None:
-        from skyless.cli.history_pictures import heatmap_figure
 
-        asked.draw(heatmap_figure(found, history.zones(), _range(span)))
+    longest = sorted(enumerate(found.seconds), key=lambda one: -one[1])[:_LONGEST_LIST]
+    rows: list[dict[str, object]] = [
+        {
+            "x_m": found.x0_m + cell * (k % found.columns + 0.5),
+            "y_m": found.y0_m + cell * (k // found.columns + 0.5),
+            "seconds": seconds,
+        }
+        for k, seconds in longest
+    ]
+    rows += [{"x_m": "all", "y_m": f"{found.tags} tags", "seconds": sum(found.seconds)}] if rows else []
+    asked.show(
+        (history, span),
+        "heatmap",
+        found,
+        rows,
+        lambda pictures, title: pictures.heatmap_figure(found, history.zones(), title),
+    )
     return 0 if found.tags else NO_FIX
 
 
@@ -156,18 +166,9 @@ def dwell(*tags: str, asked: _Drawn, zone: str | None = None) -> None:
     """
     history, span = asked.opened()
     found = history.dwell(span, tags, zone)
-    if asked.json:
-        _print(history, span, dwell=found)
-    else:
-        rows = [
-            (d.tag, d.zone_name, str(d.visits), _length(d.seconds), _time(d.first_unix_s), _time(d.last_unix_s))
-            for d in found
-        ]
-        _table(_range(span), ("tag", "zone", "visits", "time", "from", "to"), rows)
-    if asked.plot is not None:
-        from skyless.cli.history_pictures import dwell_figure
-
-        asked.draw(dwell_figure(found, _range(span)))
+    asked.show(
+        (history, span), "dwell", found, map(asdict, found), lambda pictures, title: pictures.dwell_figure(found, title)
+    )
 
 
 @questions.command(help_epilogue="Example: skyless history occupancy --from 6:00 --zone canteen --every 600")
@@ -184,20 +185,18 @@ def occupancy(*, asked: _Drawn, zone: str | None = None, every: Positive = 300.0
     """
     history, span = asked.opened()
     found = history.occupancy(span, zone, every)
-    if asked.json:
-        _print(history, span, occupancy=found)
-    else:
-        rows = [(one.zone_name, _time(one.unix_s), f"{one.mean:.2f}", str(one.most)) for one in found if one.most]
-        _table(_range(span), ("zone", "step from", "mean", "most"), rows)
-    if asked.plot is not None:
-        from skyless.cli.history_pictures import occupancy_figure
-
-        asked.draw(occupancy_figure(found, _range(span)))
+    asked.show(
+        (history, span),
+        "occupancy",
+        found,
+        (asdict(one) for one in found if one.most),
+        lambda pictures, title: pictures.occupancy_figure(found, title),
+    )
 
 
 @questions.command(help_epilogue="Example: skyless history contacts tag7 --from yesterday --within 1.5")
 @command
-def contacts(tag: str, /, *, asked: _Asked, within: Positive = 2.0) -> None:
+def contacts(tag: str, /, *, asked: _Drawn, within: Positive = 2.0) -> None:
     """Which tags were near a tag, and when.
 
     Parameters
@@ -209,38 +208,28 @@ def contacts(tag: str, /, *, asked: _Asked, within: Positive = 2.0) -> None:
     """
     history, span = asked.opened()
     found = history.contacts(tag, span, within)
-    if asked.json:
-        _print(history, span, contacts=found)
-        return
-    rows = [
-        (one.other, _time(one.begin_unix_s), _length(one.end_unix_s - one.begin_unix_s), f"{one.least_m:.2f} m")
-        for one in found
-    ]
-    _table(f"{tag}, {_range(span)}", ("near", "from", "time", "least distance"), rows)
+    asked.show(
+        (history, span),
+        "contacts",
+        found,
+        map(asdict, found),
+        lambda pictures, title: pictures.contacts_figure(found, title),
+    )
 
 
 @questions.command(help_epilogue="Example: skyless history alarms --from yesterday")
 @command
-def alarms(*, asked: _Asked) -> None:
+def alarms(*, asked: _Drawn) -> None:
     """Alarms of the range, with those that had begun before it and had not ended."""
     history, span = asked.opened()
     found = history.alarms(span)
-    if asked.json:
-        _print(history, span, alarms=found)
-        return
-    rows = [
-        (
-            a.rule,
-            a.subject,
-            a.text,
-            _time(a.raised_unix_s),
-            _time(a.ended_unix_s),
-            _time(a.acknowledged_unix_s),
-            a.acknowledged_by,
-        )
-        for a in found
-    ]
-    _table(_range(span), ("rule", "of", "what", "raised", "ended", "seen", "by"), rows)
+    asked.show(
+        (history, span),
+        "alarms",
+        found,
+        map(asdict, found),
+        lambda pictures, title: pictures.alarms_figure(found, title),
+    )
 
 
 @questions.command(help_epilogue="Example: skyless history export fixes.csv --from yesterday --to today")
@@ -270,40 +259,48 @@ def export(file: Path, /, *tags: str, asked: _Asked, site: Path | None = None, f
         origin = load_site(site).georeference
     count = history.export(file, span, tags, origin)
     if asked.json:
-        _print(history, span, file=file, fixes=count)
+        _print(history, span, {"file": file, "fixes": count})
     else:
         console().print(f"{file}: {count} fixes, {_range(span)}", markup=False)
 
 
-def _print(history: "History", span: "Span", **answer: Any) -> None:  # noqa: ANN401 - structs of answers
-    until = history.known_until_unix_s()
-    known = {"from_unix_s": span.from_unix_s, "to_unix_s": span.to_unix_s, "known_until_unix_s": until}
-    print_json({"site": history.site, **known, **answer})
+def _print(history: "History", span: "Span", answer: dict[str, Any]) -> None:
+    known = {"from_unix_s": span.from_unix_s, "to_unix_s": span.to_unix_s}
+    print_json({"site": history.site, **known, "known_until_unix_s": history.known_until_unix_s(), **answer})
 
 
-def _table(title: str, columns: Iterable[str], rows: Sequence[tuple[str, ...]]) -> None:
-    from rich.markup import escape
+def _table(title: str, rows: Sequence[Mapping[str, object]]) -> None:
+    """A table whose columns are the fields of its rows, by name."""
     from rich.table import Table
     from rich.text import Text
 
     more = len(rows) - _LONGEST_TABLE
-    table = Table(title=escape(title), caption=f"{more} more rows: --json gives all" if more > 0 else None)
-    for column in columns:
-        table.add_column(column, overflow="fold")
+    table = Table(title=title, caption=f"{more} more rows: --json gives all" if more > 0 else None)
+    names = [name for name in rows[0] if name not in {"id", "zone"}] if rows else []  # people read zone_name
+    for name in names:
+        table.add_column(_HEADINGS.get(name) or name.removesuffix("_unix_s").replace("_", " "), overflow="fold")
     for row in rows[:_LONGEST_TABLE]:
-        table.add_row(*map(Text, row))
+        table.add_row(*(Text(_shown(name, row[name])) for name in names))
     console().print(table if rows else f"{title}: nothing", markup=False)
 
 
-def _time(unix_s: float | None) -> str:
-    return "–" if unix_s is None else datetime.fromtimestamp(unix_s).isoformat(" ", "seconds")
+def _shown(name: str, value: object) -> str:
+    if value is None:
+        return "–"
+    if not isinstance(value, float):
+        return str(value)
+    if name.endswith("unix_s"):
+        return _time(value)
+    if name != "seconds":
+        return f"{value:.2f}"
+    minutes, seconds = divmod(round(value), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02} min" if hours else f"{minutes} min {seconds:02} s"
+
+
+def _time(unix_s: float) -> str:
+    return datetime.fromtimestamp(unix_s).isoformat(" ", "seconds")
 
 
 def _range(span: "Span") -> str:
     return f"{_time(span.from_unix_s)} to {_time(span.to_unix_s)}"
-
-
-def _length(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes:02} min" if hours else f"{minutes} min {rest:02} s"

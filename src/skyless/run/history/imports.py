@@ -1,10 +1,7 @@
 """Recordings become history, without what it has already, from the same file or from the running site."""
 
-import hashlib
-from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
-from itertools import chain
-from pathlib import Path
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 from typing import Any, Final, cast
 
 import numpy as np
@@ -12,17 +9,17 @@ import pyarrow as pa
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.run.fix_batch import MAX_RECORDS, Records, records_of
+from skyless.run.fix_batch import records_of
 from skyless.run.history.events import EventLog
-from skyless.run.history.layout import EVENT_COLUMNS, current_events, current_files
-from skyless.run.history.sink import FILE_ROWS, Event, read_table
-from skyless.run.history.writer import Table, Writer, read_rows
+from skyless.run.history.layout import FIX_COLUMNS, current_events, current_files, day_of
+from skyless.run.history.tables import Event, read_events, read_table, unix_ms
+from skyless.run.history.writer import FILE_ROWS, Writer
 from skyless.run.mqtt.messages import FixMessage, ZoneEvent
 from skyless.run.recordings.recording import McapRecording
 
-_COLUMNS: Final = {"sha256": "string", "file": "string", "t": "timestamp[ms, tz=UTC]"}
 _CHUNK: Final = 100_000
-_DAY_S: Final = 86_400.0
+_MARGIN: Final = timedelta(days=1)
+"""A message may have arrived a little earlier or later at the running history."""
 
 
 class Imported(Struct, frozen=True):
@@ -35,101 +32,74 @@ class Imported(Struct, frozen=True):
     drops: dict[str, int]
 
 
-def import_recording(recording: McapRecording, file: Path, writer: Writer, reach: Callable[[float], None]) -> Imported:
+def import_recording(recording: McapRecording, writer: Writer, reach: Callable[[float], None]) -> Imported:
     """Write its fixes, zone events and zones. ``reach`` is called with the time that has been read, Unix time in s.
+
+    A tag has one fix in a millisecond.
 
     Raises:
         SkylessError: the history cannot be read.
         OSError: the disk does not take it; what it took is there, and a repetition adds the rest.
     """
-    with file.open("rb") as content:
-        digest = hashlib.file_digest(content, "sha256").hexdigest()
-    imports = Table(writer.folder / "imports.parquet", _COLUMNS, "sha256")
-    if digest in imports.rows:
-        return Imported(0, recording.summary().messages.get("fix", 0), 0, {})
+    writer.write()  # what an earlier import, or a run, has left in the journal
     writer.set_zones(() if recording.zones is None else recording.zones.zones)
     simulated = recording.site is not None and recording.site.simulated
-    log = EventLog(_known_events(recording, writer))
-    chunk: list[tuple[float, int, FixMessage]] = []
+    known, known_events = _known(recording, writer)
+    log = EventLog()
+    chunk: list[tuple[int, FixMessage]] = []
     counts = {"fixes": 0, "known_fixes": 0, "events": 0}
+    day, arrived_s = None, 0.0
 
     def add() -> None:
-        added = _add(chunk, writer, simulated=simulated) if chunk else 0
-        counts["fixes"] += added
-        counts["known_fixes"] += len(chunk) - added
+        records = records_of(chunk, simulated=simulated)
+        keys, rows = np.unique(_keys(records["tag"], unix_ms(records)), return_index=True)
+        new = records[rows[~np.isin(keys, known)]]
+        writer.fixes.add(new, arrived_s)
+        writer.store()
+        if writer.unwritten >= FILE_ROWS:
+            writer.write()
+        counts["fixes"] += len(new)
+        counts["known_fixes"] += len(chunk) - len(new)
         chunk.clear()
 
     for found in recording.messages({"fix", "event"}):
         if isinstance(found.message, ZoneEvent):
-            if events := tuple(log.of_zone(found.message)):
-                writer.events.add(events, found.time_s)
-                counts["events"] += len(events)
+            events = [event for event in log.of_zone(found.message) if event not in known_events]
+            writer.events.add(events, found.time_s)
+            counts["events"] += len(events)
             continue
+        of_day = datetime.fromtimestamp(found.time_s, UTC).date()
+        if chunk and (of_day != day or len(chunk) >= _CHUNK):
+            add()
+            reach(found.time_s)
+        day, arrived_s = of_day, found.time_s
         fix = cast("FixMessage", found.message)
         number = writer.number(fix, found.time_s)
         if number is not None:
-            chunk.append((found.time_s, number, fix))
-        if len(chunk) >= _CHUNK:
-            add()
-            reach(found.time_s)
+            chunk.append((number, fix))
     add()
     writer.write()
-    imports.set(digest, file.name, round(1000 * datetime.now(UTC).timestamp()))
-    imports.save()
     return Imported(**counts, drops=dict(writer.drops + recording.drops))
 
 
-def _known_events(recording: McapRecording, writer: Writer) -> Iterator[Event]:
-    """The events that the history has of the time of a recording."""
-    found = recording.summary()
-    if found.start_s is not None and found.end_s is not None:
-        span = [("t", ">=", _time(1000 * (found.start_s - _DAY_S))), ("t", "<=", _time(1000 * (found.end_s + _DAY_S)))]
-        for path in current_events(writer.root, writer.site):
-            yield from (Event(*row.values()) for row in read_rows(path, EVENT_COLUMNS, span))
-    yield from chain.from_iterable(writer.events.sink.unwritten)
-
-
-def _add(chunk: list[tuple[float, int, FixMessage]], writer: Writer, *, simulated: bool) -> int:
-    """Add the fixes that the history lacks; how many these are. A tag has one fix in a millisecond."""
-    records = records_of([(number, fix) for _, number, fix in chunk], simulated=simulated)
-    times_s = np.array([time_s for time_s, _, _ in chunk])
-    keys = _keys_of(records)
-    known = [_known_keys(records, times_s, writer), *map(_keys_of, writer.fixes.sink.unwritten)]
-    is_new = ~np.isin(keys, np.concatenate(known))
-    is_new &= np.isin(np.arange(len(keys)), np.unique(keys, return_index=True)[1])
-    new, new_s = records[is_new], times_s[is_new]
-    for first in range(0, len(new), MAX_RECORDS):
-        writer.fixes.add(new[first : first + MAX_RECORDS], float(new_s[first]))
-    writer.store()
-    if writer.fixes.sink.waiting >= FILE_ROWS:
-        writer.write()
-    return len(new)
-
-
-def _known_keys(records: Records, times_s: NDArray[np.float64], writer: Writer) -> NDArray[np.int64]:
-    """Keys in files of the days of a recording's piece; a message may have arrived a little earlier or later there."""
-    ms, margin_s = _ms(records), np.array([-_DAY_S, _DAY_S])
-    days = np.array([times_s.min(), times_s.max()]) + margin_s
-    first, last = (f"day={datetime.fromtimestamp(unix_s, UTC).date()}" for unix_s in days)
-    span = [("t", ">=", _time(ms.min())), ("t", "<=", _time(ms.max()))]
-    files = [file for file in current_files(writer.root, writer.site) if first <= file.parent.name <= last]
-    tables = [read_table(file, ["tag", "t"], span) for file in files]
-    found = [_keys(table["tag"].to_numpy(), table["t"].cast(pa.int64()).to_numpy()) for table in tables]
-    return np.concatenate([np.empty(0, np.int64), *found])
-
-
-def _keys_of(records: Records) -> NDArray[np.int64]:
-    return _keys(records["tag"], _ms(records))
-
-
-def _ms(records: Records) -> NDArray[np.int64]:
-    return (records["unix_us"] // np.uint64(1000)).astype(np.int64)
+def _known(recording: McapRecording, writer: Writer) -> tuple[NDArray[np.int64], set[Event]]:
+    """Keys of the fixes, and the events, that the history has of the time of a recording."""
+    summary = recording.summary()
+    if summary.start_s is None or summary.end_s is None:
+        return np.empty(0, np.int64), set()
+    begin = datetime.fromtimestamp(summary.start_s, UTC) - _MARGIN
+    end = datetime.fromtimestamp(summary.end_s, UTC) + _MARGIN
+    span = [("t", ">=", begin), ("t", "<=", end)]
+    files, events = (
+        [file for file in current(writer.root, writer.site) if str(begin.date()) <= day_of(file) <= str(end.date())]
+        for current in (current_files, current_events)
+    )
+    columns = {name: FIX_COLUMNS[name] for name in ("tag", "t")}
+    tables = [read_table(file, columns, span) for file in files]
+    keys = [_keys(table["tag"].to_numpy(), table["t"].cast(pa.int64()).to_numpy()) for table in tables]
+    return np.concatenate([np.empty(0, np.int64), *keys]), set(read_events(events, span))
 
 
 def _keys(tag: NDArray[Any], ms: NDArray[np.int64]) -> NDArray[np.int64]:
     """A number for each tag and millisecond; times have 43 bits (``MAX_UNIX_S``), tags fewer than 20."""
     return (tag.astype(np.int64) << 43) | ms
-
-
-def _time(ms: float) -> pa.Scalar:
-    return pa.scalar(int(ms), pa.timestamp("ms", tz="UTC"))

@@ -1,17 +1,15 @@
 """Where the history of a site lies, and what its files hold (``docs/history.md``).
 
-    FOLDER/site=<n>/day=<yyyy-mm-dd>/<first>-<last>.parquet    fixes; first and last number of the rows in the journal
-    FOLDER/site=<n>/events/<first>-<last>.parquet              events
-    FOLDER/site=<n>/names.parquet                              the tags' numbers and names
-    FOLDER/site=<n>/zones.parquet                              the zones' identifiers, names and corners
-    FOLDER/site=<n>/journal/                                   what is not in Parquet yet
+    FOLDER/site=<n>/day=<yyyy-mm-dd>/<first>-<last>.parquet           fixes; numbers of the first and last row
+    FOLDER/site=<n>/events/day=<yyyy-mm-dd>/<first>-<last>.parquet    events
+    FOLDER/site=<n>/names.parquet                                     the tags' numbers and names
+    FOLDER/site=<n>/zones.parquet                                     the zones' identifiers, names and corners
+    FOLDER/site=<n>/journal.sqlite                                    what is not in Parquet yet
 
-The day is that of arrival, in UTC. Any engine that reads Parquet can read and join them. A file may be joined with its
-neighbours to one that covers their numbers; those stay for a while, so that readers should take ``current_files`` or
-``current_events``.
+The day is that of arrival, in UTC. Any engine that reads Parquet can read and join them. A file whose numbers lie
+within those of another has been joined into it, and is about to be removed.
 """
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Final, Literal
 
@@ -50,54 +48,47 @@ ZONE_COLUMNS: Final = {"zone": "string", "name": "string", "corners_m": "string"
 THINNED: Final = b"skyless_thinned"
 """The key in the metadata of files of old fixes, of which one in ten seconds or in a minute is kept."""
 
-NUMBER_DIGITS: Final = 12
-
 
 def site_folder(folder: Path, site: int) -> Path:
     """Everything of one site."""
     return folder / f"site={site}"
 
 
-def fixes_pattern(folder: Path, site: int) -> str:
-    """The pattern of all files of fixes, as DuckDB takes it."""
-    return str(site_folder(folder, site) / "day=*" / "*.parquet")
-
-
-def events_pattern(folder: Path, site: int) -> str:
-    """The same of events."""
-    return str(site_folder(folder, site) / "events" / "*.parquet")
-
-
 def file_name(first: int, last: int) -> str:
     """The name of a file with these rows."""
-    return f"{first:0{NUMBER_DIGITS}}-{last:0{NUMBER_DIGITS}}.parquet"
+    return f"{first:012}-{last:012}.parquet"
 
 
 def rows_of(file: Path) -> tuple[int, int] | None:
     """First and last number in a file's name; None for another file."""
     first, dash, last = file.stem.partition("-")
-    if file.suffix != ".parquet" or not dash or not (first.isdecimal() and last.isdecimal()):
+    if not dash or not (first.isdecimal() and last.isdecimal()):
         return None
     return int(first), int(last)
 
 
-def current_files(folder: Path, site: int) -> tuple[Path, ...]:
-    """The files that hold all fixes once, by number: the ones that no other file replaces.
+def day_of(file: Path) -> str:
+    """The day in the name of a file's folder."""
+    return file.parent.name.removeprefix("day=")
 
-    A replaced file stays for a minute at least. A reader that takes longer from this list to the opening of a file, and
-    finds it gone, should take the list again.
+
+def current_files(folder: Path, site: int) -> tuple[Path, ...]:
+    """The files that hold all fixes once, by number.
+
+    A file may be joined into a larger one and removed after that. A reader that finds it gone should take the list
+    again.
     """
-    return _largest(site_folder(folder, site).glob("day=*/*.parquet"))
+    return largest_files(site_folder(folder, site))
 
 
 def current_events(folder: Path, site: int) -> tuple[Path, ...]:
     """The same of events."""
-    return _largest(site_folder(folder, site).glob("events/*.parquet"))
+    return largest_files(site_folder(folder, site) / "events")
 
 
-def _largest(files: Iterable[Path]) -> tuple[Path, ...]:
-    """Files whose numbers are not all in another file."""
-    found = [(rows[0], -rows[1], file) for file in files if (rows := rows_of(file)) is not None]
+def largest_files(folder: Path) -> tuple[Path, ...]:
+    """Files in a folder's days whose numbers are not all in another file."""
+    found = [(rows[0], -rows[1], file) for file in folder.glob("day=*/*.parquet") if (rows := rows_of(file))]
     kept: list[Path] = []
     end = -1
     for _, minus_last, file in sorted(found):  # of those that begin together, the longest first

@@ -1,23 +1,23 @@
 """``skyless history run``: what a site's programs publish, into its history."""
 
 import asyncio
-import math
 import platform
 import re
 import time
 import zlib
 from collections.abc import Callable
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime
 from typing import Any, Final
 
 from msgspec import Struct
 
 from skyless.core.errors import SkylessError
 from skyless.run.fix_batch import MAX_RECORDS, records_of
-from skyless.run.history.events import EventLog
-from skyless.run.history.retention import GRACE_S, Keep, remove_replaced, tidy
-from skyless.run.history.sink import FILE_S, Event
-from skyless.run.history.writer import Intake, Writer
+from skyless.run.history.events import REMEMBERED_KINDS, EventLog
+from skyless.run.history.layout import current_events
+from skyless.run.history.retention import Keep, tidy
+from skyless.run.history.tables import read_events
+from skyless.run.history.writer import FILE_ROWS, Writer
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
@@ -27,8 +27,10 @@ from skyless.run.zones.zone_list import BadZonesError, read_zones
 
 _STORE_S: Final = 0.1
 _SYNC_S: Final = 1.0
-_RETRY_S: Final = 10.0  # while the disk is full, or after a file could not be written
-_LATE_S: Final = 2 * FILE_S  # after midnight, the files of the day before are complete
+_FIRST_FILE_S: Final = 30.0
+FILE_S: Final = 600.0
+"""The first files come soon, so that a new history can be asked, later ones after twice the time, up to this."""
+_RETRY_S: Final = 10.0  # after a file could not be written
 
 
 class HistoryState(Struct, frozen=True):
@@ -59,12 +61,13 @@ class HistoryNode:
         name = f"{host}-{zlib.crc32(str(writer.folder.resolve()).encode()):08x}"
         self.link = Link(address, name, site=writer.site, kind="history")
         self._writer, self._keep, self._log = writer, keep, log
-        self._events = EventLog(writer.past_events())
+        self._trouble: dict[str, str] = {}
+        self._try("files", writer.write)  # so that all events of the past are in files
+        past = read_events(current_events(writer.root, writer.site), [("kind", "in", REMEMBERED_KINDS)])
+        self._events = EventLog(past)
         self._fixes: list[tuple[int, FixMessage]] = []
         self._taken = {"fixes": 0, "events": 0}
         self._simulated = False
-        self._trouble: dict[str, str] = {}
-        self._tidied: date | None = None
         self._started_s = time.monotonic()
         self._subscribe(topics.site_topic, SiteMessage, self._on_site)
         self._subscribe(topics.fix_topic, FixMessage, self._on_fix, "+", qos=0)
@@ -89,8 +92,8 @@ class HistoryNode:
             seconds=time.monotonic() - self._started_s,
             **self._taken,
             tags=len(self._writer.names.rows),
-            waiting=sum(intake.sink.waiting + intake.waiting for intake in intakes),
-            lost=sum(intake.dropped for intake in intakes),
+            waiting=self._writer.unwritten + sum(intake.waiting for intake in intakes),
+            lost=sum(intake.lost for intake in intakes),
             drops=dict(self._writer.drops),
             trouble=self.link.trouble,
             disk=next(iter(self._trouble.values()), None),
@@ -120,7 +123,6 @@ class HistoryNode:
 
     def _on_event(self, message: ZoneEvent | AlarmMessage | StatusMessage) -> None:
         now_s = time.time()
-        events: list[Event]
         if isinstance(message, ZoneEvent):
             events = self._events.of_zone(message)
         elif isinstance(message, AlarmMessage):
@@ -129,7 +131,7 @@ class HistoryNode:
             events = self._events.of_status(message, now_s)
         if events:
             self._taken["events"] += len(events)
-            self._writer.events.add(tuple(events), now_s)
+            self._writer.events.add(events, now_s)
 
     def _on_zones(self, _topic: str, payload: bytes) -> None:
         try:
@@ -143,33 +145,21 @@ class HistoryNode:
 
     async def _work(self) -> None:
         """What another thread does: sync the journal, write files, tidy."""
-        retry_s, replaced_s = 0.0, math.inf
-        intakes: dict[str, Intake[Any]] = {"fixes": self._writer.fixes, "events": self._writer.events}
+        due_s, file_s, tidied = time.monotonic() + _FIRST_FILE_S, _FIRST_FILE_S, None
         while True:
             await asyncio.sleep(_SYNC_S)
-            now_s = time.time()
-            for kind, intake in intakes.items():
-                await asyncio.to_thread(self._try, f"journal of {kind}", intake.sync)
-                files = f"files of {kind}"
-                is_full = "journal" in self._trouble and intake.sink.waiting > 0  # files are smaller than the journal
-                if time.monotonic() < retry_s or not (is_full or intake.sink.is_due(now_s)):
-                    continue
-                is_done = self._try(files, intake.begin) and await asyncio.to_thread(self._try, files, intake.write)
-                if is_full or not is_done:
-                    retry_s = time.monotonic() + _RETRY_S
-            today = datetime.fromtimestamp(now_s - _LATE_S, UTC).date()
-            if today != self._tidied:
-                self._tidied, replaced_s = today, time.monotonic()
+            await asyncio.to_thread(self._try, "journal", self._writer.journal.sync)
+            if time.monotonic() >= due_s or (self._writer.unwritten >= FILE_ROWS and "files" not in self._trouble):
+                await asyncio.to_thread(self._try, "files", self._writer.write)
+                file_s = min(2.0 * file_s, FILE_S)
+                due_s = time.monotonic() + (_RETRY_S if "files" in self._trouble else file_s)
+            today = datetime.fromtimestamp(time.time() - 2.0 * FILE_S, UTC).date()  # the day before is complete
+            if today != tidied:
+                tidied = today
                 await asyncio.to_thread(self._try, "daily work", self._tidy)
-            elif time.monotonic() > replaced_s + 2.0 * GRACE_S:
-                replaced_s = math.inf
-                await asyncio.to_thread(self._try, "daily work", self._remove_replaced)
 
     def _tidy(self) -> None:
         tidy(self._writer.root, self._writer.site, self._keep, time.time())
-
-    def _remove_replaced(self) -> None:
-        remove_replaced(self._writer.root, self._writer.site, time.time())
 
     def _try(self, what: str, act: Callable[[], None]) -> bool:
         """Do something with the disk; when its trouble begins and ends, a line says so."""

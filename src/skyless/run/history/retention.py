@@ -1,13 +1,13 @@
 """What a history does once a day: join small files, thin what is old, remove what is too old.
 
 Readers take no row twice and miss none, whenever the program is killed: a joined file has a name that covers those of
-the files that it replaces, so that these are no longer current (``layout.py``), and they are removed later; a thinned
-file takes the place of the whole one in one step.
+the files that it replaces, so that these are no longer current (``layout.py``); a thinned file takes the place of the
+whole one in one step.
 """
 
 import contextlib
-import os
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, date, datetime
 from itertools import groupby
 from pathlib import Path
@@ -17,18 +17,23 @@ import numpy as np
 import pyarrow as pa
 from msgspec import Struct
 from numpy.typing import NDArray
-from pyarrow import compute, parquet
+from pyarrow import parquet
 
-from skyless.run.history.layout import THINNED, current_events, current_files, file_name, rows_of, site_folder
-from skyless.run.history.sink import read_table, write_table
-
-GRACE_S: Final = 60.0
-"""A file that was replaced is kept for so long, for readers that have it in their lists."""
+from skyless.run.history.layout import (
+    EVENT_COLUMNS,
+    FIX_COLUMNS,
+    THINNED,
+    day_of,
+    file_name,
+    largest_files,
+    rows_of,
+    site_folder,
+)
+from skyless.run.history.tables import read_table, write_table
 
 _JOINED_ROWS: Final = 2_000_000
 """Rows of a joined file: what fits into memory several times."""
 
-_DAY_MS: Final = 86_400_000
 _MOVING_MS: Final = 10_000
 _REST_MS: Final = 60_000
 _REST_MM: Final = 500
@@ -46,30 +51,44 @@ class Keep(Struct, frozen=True):
 
 def tidy(root: Path, site: int, keep: Keep, unix_s: float) -> None:
     """Do what is due in a site's folder. Raises OSError or SkylessError; what has been done by then stays so."""
-    remove_replaced(root, site, unix_s)
-    today = datetime.fromtimestamp(unix_s, UTC).date()
-    for day, found in groupby(current_files(root, site), lambda file: file.parent.name.removeprefix("day=")):
-        files, age_days = list(found), (today - date.fromisoformat(day)).days
-        if age_days > keep.days:
-            _remove(files)
-        elif age_days > 0:
-            for file in _joined(files, ("tag", "t")):
-                if age_days > keep.full_days and not _is_thinned(file):
-                    write_table(thinned(read_table(file)), file)
-    ends_ms = {file: _newest_ms(file) for file in current_events(root, site)}
-    now_ms = 1000.0 * unix_s
-    _remove([file for file, end_ms in ends_ms.items() if now_ms - end_ms > _DAY_MS * keep.event_days])
-    whole = [file for file, end_ms in ends_ms.items() if _DAY_MS < now_ms - end_ms <= _DAY_MS * keep.event_days]
-    for _, found in groupby(whole, lambda file: datetime.fromtimestamp(ends_ms[file] / 1000.0, UTC).timetuple()[:2]):
-        _joined(list(found), ("t",))
+    folder = site_folder(root, site)
+    _tidy(folder, FIX_COLUMNS, ("tag", "t"), keep.days, keep.full_days, unix_s)
+    _tidy(folder / "events", EVENT_COLUMNS, ("t",), keep.event_days, math.inf, unix_s)
 
 
-def remove_replaced(root: Path, site: int, unix_s: float) -> None:
-    """Remove the files that another one has replaced for a while. Raises OSError."""
-    current = {*current_files(root, site), *current_events(root, site)}
-    for file in site_folder(root, site).glob("*/*.parquet"):
-        if file not in current and rows_of(file) is not None and unix_s - file.stat().st_mtime > GRACE_S:
-            file.unlink()
+def _tidy(
+    folder: Path, columns: dict[str, str], order: Sequence[str], days: float, full_days: float, unix_s: float
+) -> None:
+    current = largest_files(folder)
+    _remove(file for file in folder.glob("day=*/*.parquet") if rows_of(file) and file not in current)
+    for day, of_day in groupby(current, day_of):
+        age_days = (datetime.fromtimestamp(unix_s, UTC).date() - date.fromisoformat(day)).days
+        if age_days > days:
+            _remove(of_day)
+            continue
+        for files, first, last in _groups(of_day) if age_days > 0 else ():
+            is_thinned = age_days <= full_days or all(
+                THINNED in (parquet.read_schema(file).metadata or {}) for file in files
+            )
+            if is_thinned and len(files) == 1:
+                continue
+            table = pa.concat_tables([read_table(file, columns) for file in files])
+            table = table.sort_by([(name, "ascending") for name in order])
+            joined = files[0].with_name(file_name(first, last))
+            write_table(thinned(table) if age_days > full_days else table, joined)
+            _remove(file for file in files if file != joined)
+
+
+def _groups(files: Iterable[Path]) -> Iterator[tuple[list[Path], int, int]]:
+    """Files with consecutive numbers, and their first and last number: those of one group are to be joined."""
+    group, first, last = list[Path](), 0, 0
+    for file in files:
+        begin, end = rows_of(file) or (0, 0)
+        if group and (begin != last + 1 or end - first >= _JOINED_ROWS):
+            yield group, first, last
+            group = []
+        group, first, last = [*group, file], first if group else begin, end
+    yield group, first, last
 
 
 def thinned(table: pa.Table) -> pa.Table:
@@ -89,41 +108,8 @@ def _begins(tag: NDArray[Any], part: NDArray[Any]) -> NDArray[np.bool_]:
     return np.append(True, (np.diff(tag) != 0) | (np.diff(part) != 0))
 
 
-def _joined(files: Sequence[Path], order: Sequence[str]) -> list[Path]:
-    """Join files with consecutive numbers as far as they are alike; the files that there are then."""
-    groups: list[list[Path]] = []
-    for file in files:
-        first, last = rows_of(file) or (0, 0)
-        if groups:
-            begin, end = (rows_of(groups[-1][0]) or (0, 0))[0], (rows_of(groups[-1][-1]) or (0, 0))[1]
-            fits = first == end + 1 and last - begin < _JOINED_ROWS
-            if fits and _is_thinned(file) == _is_thinned(groups[-1][0]):
-                groups[-1].append(file)
-                continue
-        groups.append([file])
-    return [_join(group, order) if len(group) > 1 else group[0] for group in groups]
-
-
-def _join(files: Sequence[Path], order: Sequence[str]) -> Path:
-    numbers = [number for file in files for number in rows_of(file) or ()]
-    joined = files[0].with_name(file_name(numbers[0], numbers[-1]))
-    table = pa.concat_tables([read_table(file) for file in files])
-    write_table(table.sort_by([(name, "ascending") for name in order]), joined)
-    for file in files:
-        os.utime(file)  # the time from which on it is replaced
-    return joined
-
-
-def _remove(files: Sequence[Path]) -> None:
+def _remove(files: Iterable[Path]) -> None:
     for file in files:
         file.unlink()
         with contextlib.suppress(OSError):  # other files are there
             file.parent.rmdir()
-
-
-def _is_thinned(file: Path) -> bool:
-    return THINNED in (parquet.read_schema(file).metadata or {})
-
-
-def _newest_ms(file: Path) -> int:
-    return int(compute.max(read_table(file, ["t"])["t"].cast(pa.int64())).as_py())

@@ -1,113 +1,154 @@
-"""The history of one site as it is written: numbers of tags, journals, files. One process at a time writes it."""
+"""The history of one site as it is written: rows wait in memory, then in a journal (SQLite), then are in Parquet.
 
+Rows are numbered. A row whose number is within a file's name is in Parquet, whatever the journal says: so no row is
+lost or written twice, wherever a program is killed. One process at a time writes a site.
+"""
+
+import contextlib
 import errno
-import os
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+import sqlite3
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
 from threading import Lock
-from typing import Any, Final, Generic, cast
+from typing import Any, Final
 
 import msgspec
+import numpy as np
 import pyarrow as pa
 
 from skyless.core.errors import SkylessError
-from skyless.run.fix_batch import Batch, Records, decode_batch, encode_batch
-from skyless.run.history.events import MAX_UNIX_S, REMEMBERED_KINDS
-from skyless.run.history.journal import Journal
-from skyless.run.history.layout import EVENT_COLUMNS, NAME_COLUMNS, ZONE_COLUMNS, current_events, site_folder
-from skyless.run.history.sink import (
-    MAX_ROWS,
-    Event,
-    R,
-    Sink,
-    event_sink,
-    fix_sink,
-    read_table,
-    schema_of,
-    scratch_of,
-    write_table,
-)
+from skyless.run.fix_batch import RECORD, Records
+from skyless.run.history.layout import NAME_COLUMNS, ZONE_COLUMNS, file_name, largest_files, rows_of, site_folder
+from skyless.run.history.tables import Event, event_table, fix_table, read_table, schema_of, write_table
 from skyless.run.mqtt.messages import FixMessage, Zone
 from skyless.run.process import locked
 
+FILE_ROWS: Final = 1_000_000
+"""Rows of a file, nearly: one more batch would be too many."""
+
 MAX_WAITING: Final = 500_000
-"""How many rows wait in memory while the disk does not take them."""
+"""How many rows of a kind wait in memory while the disk does not take them."""
 
 MAX_TAGS: Final = 200_000
-
-_FILE_BYTES: Final = 16
-_SPARE_BYTES: Final = 1 << 20
-"""The journal leaves so much of the disk free, for each of its rows and besides: its rows must find room in files."""
+MAX_UNIX_S: Final = 8e9
+"""Times beyond, in more than 200 years, are no times."""
 
 
-class Intake(Generic[R]):
-    """Rows of one kind on their way: first into the journal, then into files."""
+class Intake:
+    """Rows of one kind. Another thread than the others' may call ``write``."""
 
     def __init__(
         self,
-        journal: Journal,
-        sink: Sink[R],
-        encode: Callable[[R, float], bytes],
-        decode: Callable[[bytes], tuple[R, float]],
+        journal: "Journal",
+        kind: str,
+        folder: Path,
+        encode: Callable[[Any], bytes],
+        table: Callable[[Sequence[bytes]], pa.Table],
     ) -> None:
-        """Take over what an earlier run has left in the journal. Raises OSError or ValueError."""
-        self.sink: Sink[R] = sink
-        self.dropped = 0
-        """Rows that the disk did not take in time."""
-        self._journal = journal
-        self._encode: Callable[[R, float], bytes] = encode
-        self._waiting: deque[tuple[R, float]] = deque()
-        self._waiting_rows = 0
-        self._lock = Lock()  # a thread may still be at work when the program ends
-        for first, payload in journal.read():
-            rows, arrived_unix_s = decode(payload)
-            sink.put(rows, first, arrived_unix_s)
-        sink.next = max(sink.next, journal.end())
-        journal.begin(sink.next)
+        self.lost = 0
+        """Rows that were dropped, as the disk did not take them in time."""
+        self._journal, self._kind, self._folder = journal, kind, folder
+        self._encode, self._table = encode, table
+        self._batches: list[tuple[Records | Sequence[Event], float]] = []
+        files = [rows for file in largest_files(folder) if (rows := rows_of(file))]
+        self.last = max((last for _, last in files), default=0)
+        """Number of the last row in a file."""
+        with journal.transaction() as sql:
+            sql.execute(f"CREATE TABLE IF NOT EXISTS {kind} (first INTEGER PRIMARY KEY, rows, unix_s, data)")
+            (end,) = sql.execute(f"SELECT max(first + rows) FROM {kind}").fetchone()
+        self.next = max(self.last + 1, end or 1)
+        """Number of the next row that comes to the journal."""
+
+    def add(self, rows: Records | Sequence[Event], arrived_unix_s: float) -> None:
+        """Take rows, which are in the journal after ``store``."""
+        if len(rows):
+            self._batches.append((rows, arrived_unix_s))
 
     @property
     def waiting(self) -> int:
-        """How many rows are not in the journal yet."""
-        return self._waiting_rows
-
-    def add(self, rows: R, arrived_unix_s: float) -> None:
-        """Take rows, at most ``MAX_RECORDS`` of ``run/fix_batch.py``. They are in the journal after ``store``."""
-        self._waiting.append((rows, arrived_unix_s))
-        self._waiting_rows += len(rows)
-        while self._waiting_rows > MAX_WAITING:
-            lost = len(self._waiting.popleft()[0])
-            self._waiting_rows -= lost
-            self.dropped += lost
+        """Rows that are not in the journal yet."""
+        return sum(len(rows) for rows, _ in self._batches)
 
     def store(self) -> None:
-        """Bring everything into the journal. Raises OSError: what is not there waits."""
-        while self._waiting and self.sink.waiting < MAX_ROWS:
-            rows, arrived_unix_s = self._waiting[0]
-            payload = self._encode(rows, arrived_unix_s)
-            if self._journal.free_bytes() < len(payload) + _SPARE_BYTES + _FILE_BYTES * self.sink.waiting:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            self._journal.append(self.sink.next, payload)
-            self._waiting.popleft()
-            self._waiting_rows -= len(rows)
-            self.sink.put(rows, self.sink.next, arrived_unix_s)
-
-    def begin(self) -> None:
-        """Let the journal go on in another file, so that ``write`` can remove the one so far. Raises OSError."""
-        with self._lock:
-            self._journal.begin(self.sink.next)
+        """Bring all rows into the journal. Raises OSError: none is, and the oldest that are too many are dropped."""
+        number, values = self.next, []
+        for rows, unix_s in self._batches:
+            values.append((number, len(rows), unix_s, self._encode(rows)))
+            number += len(rows)
+        if not values:
+            return
+        try:
+            with self._journal.transaction() as sql:
+                sql.executemany(f"INSERT INTO {self._kind} VALUES (?, ?, ?, ?)", values)
+        except OSError:
+            while self.waiting > MAX_WAITING:
+                self.lost += len(self._batches.pop(0)[0])
+            raise
+        self._batches.clear()
+        self.next = number
 
     def write(self) -> None:
-        """Turn the rows of the journal into files. Raises OSError. Another thread may call it."""
-        with self._lock:
-            self.sink.write()
-            self._journal.drop_through(self.sink.last)
+        """Turn what is in the journal at the beginning of this call into files. Raises OSError: the rest stays."""
+        end = self.next
+        while self.last + 1 < end:
+            day, last, batches = self._next_file(end)
+            if batches:
+                write_table(self._table(batches), self._folder / f"day={day}" / file_name(self.last + 1, last))
+            self.last = last
+            with self._journal.transaction() as sql:
+                sql.execute(f"DELETE FROM {self._kind} WHERE first <= ?", (last,))
+
+    def _next_file(self, end: int) -> tuple[str, int, list[bytes]]:
+        """Day, last row and rows of the next file: they came on one day."""
+        day, last, batches = "", self.last, list[bytes]()
+        query = f"SELECT first, rows, unix_s, data FROM {self._kind} WHERE first > ? AND first < ? ORDER BY first"
+        with self._journal.transaction() as sql:
+            for first, rows, unix_s, data in sql.execute(query, (self.last, end)):
+                of_day = datetime.fromtimestamp(unix_s, UTC).date().isoformat()
+                if batches and (of_day != day or first + rows - self.last - 1 > FILE_ROWS):
+                    break
+                day, last = of_day, first + rows - 1
+                batches.append(data)
+        return day, last if batches else end - 1, batches
+
+
+class Journal:
+    """An SQLite file. What is committed outlives the program, and after ``sync`` a power cut."""
+
+    def __init__(self, file: Path) -> None:
+        """Raises OSError."""
+        self._file, self._lock = file, Lock()
+        with self._errors():
+            self._sql = sqlite3.connect(file, check_same_thread=False)
+            self._sql.execute("PRAGMA locking_mode = EXCLUSIVE")  # no shared memory, which network disks lack
+            self._sql.execute("PRAGMA journal_mode = WAL")
+            self._sql.execute("PRAGMA synchronous = NORMAL")
+
+    @contextlib.contextmanager
+    def transaction(self) -> Iterator[sqlite3.Connection]:
+        """All of a block, or where it fails nothing. Raises OSError."""
+        with self._lock, self._errors(), self._sql:
+            yield self._sql
 
     def sync(self) -> None:
-        """Wait until the journal is on the disk. Raises OSError. Another thread may call it."""
+        """Wait until all that is committed is on the disk. Raises OSError."""
+        with self._lock, self._errors():
+            self._sql.execute("PRAGMA wal_checkpoint").fetchall()
+
+    def close(self) -> None:
+        """Let other programs open it."""
         with self._lock:
-            self._journal.sync()
+            self._sql.close()
+
+    @contextlib.contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except sqlite3.Error as error:
+            raise OSError(errno.EIO, str(error), str(self._file)) from None
 
 
 class Table:
@@ -117,11 +158,9 @@ class Table:
         """Raises SkylessError: the file is damaged."""
         self.rows: dict[str, dict[str, Any]] = {}
         """By the value of the column ``key``."""
-        self._file, self._columns, self._key = file, columns, key
-        self._is_saved = True
-        scratch_of(file).unlink(missing_ok=True)
+        self._file, self._columns, self._key, self._is_saved = file, columns, key, True
         if file.exists():
-            self.rows = {row[key]: row for row in read_rows(file, columns)}
+            self.rows = {row[key]: row for row in read_table(file, columns).to_pylist()}
 
     def set(self, *values: object) -> None:
         """Add or replace a row; its values are in the order of the columns."""
@@ -141,102 +180,82 @@ class Writer:
 
     def __init__(self, folder: Path, site: int) -> None:
         """Raises SkylessError: it cannot be written, another program does so, or it is damaged."""
-        self.root, self.site = folder, site
+        self.root, self.site, self.folder = folder, site, site_folder(folder, site)
         self.drops: Counter[str] = Counter()
         """Messages that are not kept, by reason."""
-        self.folder = site_folder(folder, site)
-        journals, names = self.folder / "journal", self.folder / "names.parquet"
+        self._writing = Lock()  # a thread may still be at work when the program ends
+        names = self.folder / "names.parquet"
         try:
-            journals.mkdir(parents=True, exist_ok=True)
+            self.folder.mkdir(parents=True, exist_ok=True)
             self._lock = locked(self.folder / "lock")
+            for scratch in self.folder.rglob("*.tmp"):
+                scratch.unlink()
             self.names = Table(names, NAME_COLUMNS, "name")
             self.zones = Table(self.folder / "zones.parquet", ZONE_COLUMNS, "zone")
-            self.fixes = Intake(Journal(journals, "fixes"), fix_sink(self.folder), _fix_bytes, _fixes_in)
-            self.events = Intake(Journal(journals, "events"), event_sink(self.folder), _event_bytes, _events_in)
+            self.journal = Journal(self.folder / "journal.sqlite")
+            self.fixes = Intake(self.journal, "fixes", self.folder, _fix_bytes, _fixes_in)
+            self.events = Intake(self.journal, "events", self.folder / "events", msgspec.json.encode, _events_in)
         except BlockingIOError:
             raise SkylessError(f"{self.folder} is written by another program; each needs a folder of its own") from None
         except OSError as error:
             raise SkylessError(f"{error.filename or folder} cannot be written: {error.strerror}") from None
-        except ValueError as error:
-            raise SkylessError(f"{journals} is damaged, or of another version of Skyless: {error}") from None
-        if self.fixes.sink.next > 1 and not self.names.rows:
+        if self.fixes.next > 1 and not self.names.rows:
+            self.journal.close()
             raise SkylessError(f"{names} is missing; it should be the table that tells whose the fixes are")
+
+    @property
+    def unwritten(self) -> int:
+        """Rows in the journal that are in no file yet."""
+        return sum(intake.next - 1 - intake.last for intake in (self.fixes, self.events))
 
     def number(self, fix: FixMessage, unix_s: float) -> int | None:
         """The number of a fix's tag, which no other ever gets; None for a fix that is not kept, which is counted."""
-        row = self.names.rows.get(fix.tag)
         if not 0.0 <= fix.unix_s <= MAX_UNIX_S:
             self.drops["wrong-time"] += 1
             return None
-        if row is None and len(self.names.rows) >= MAX_TAGS:
-            self.drops["too-many-tags"] += 1
-            return None
-        if row is None:
+        if fix.tag not in self.names.rows:
+            if len(self.names.rows) >= MAX_TAGS:
+                self.drops["too-many-tags"] += 1
+                return None
             newest = next(reversed(self.names.rows.values()), {"tag": 0})
-            self.names.set(newest["tag"] + 1, fix.tag, round(1000 * unix_s))
-            row = self.names.rows[fix.tag]
-        return int(row["tag"])
+            self.names.set(newest["tag"] + 1, fix.tag, datetime.fromtimestamp(unix_s, UTC))
+        return int(self.names.rows[fix.tag]["tag"])
 
     def set_zones(self, zones: Iterable[Zone]) -> None:
         """Keep zones; those that were removed stay, as events name them."""
         for zone in zones:
             self.zones.set(zone.id, zone.name, msgspec.json.encode(zone.polygon_m).decode())
 
-    def past_events(self) -> Iterator[Event]:
-        """The events of ``REMEMBERED_KINDS``, in order."""
-        for file in current_events(self.root, self.site):
-            for row in read_rows(file, EVENT_COLUMNS, [("kind", "in", REMEMBERED_KINDS)]):
-                yield Event(*row.values())
-        yield from chain.from_iterable(self.events.sink.unwritten)
-
     def store(self) -> None:
         """Bring all that was added into the journal. Raises OSError: what is not there waits."""
         for table in (self.names, self.zones):  # the journal uses the numbers
             table.save()
-        for intake in (self.fixes, self.events):
-            intake.store()
+        self.fixes.store()
+        self.events.store()
 
     def write(self) -> None:
         """Turn all rows of the journal into files. Raises OSError: the others stay in the journal."""
-        for intake in (self.fixes, self.events):
-            intake.begin()
-            intake.write()
+        with self._writing:
+            self.fixes.write()
+            self.events.write()
 
     def close(self) -> None:
         """Turn all rows into files, and let other programs write. Raises OSError."""
-        try:
-            try:
-                self.store()
-            finally:  # on a full disk there is still room for files
-                self.write()
-        finally:
-            self._lock.close()
+        with contextlib.ExitStack() as stack:  # in reverse order, each even if another fails
+            stack.callback(self._lock.close)
+            stack.callback(self.journal.close)
+            stack.callback(self.write)
+            self.store()
 
 
-def read_rows(file: Path, columns: dict[str, str], filters: object = None) -> list[dict[str, Any]]:
-    """The rows of a file, times in ms. Raises SkylessError: it cannot be read, or lacks a column."""
-    table = read_table(file, filters=filters)
-    if not set(columns) <= set(table.column_names):
-        raise SkylessError(f"{file} has columns {', '.join(table.column_names)}; it should have {', '.join(columns)}")
-    for name, kind in columns.items():
-        if kind.startswith("timestamp"):
-            table = table.set_column(table.column_names.index(name), name, table[name].cast(pa.int64()))
-    return cast("list[dict[str, Any]]", table.select(list(columns)).to_pylist())
+def _fix_bytes(records: Records) -> bytes:
+    return records.tobytes()
 
 
-def _fix_bytes(records: Records, arrived_unix_s: float) -> bytes:
-    return encode_batch(Batch(0, 0, round(1e6 * arrived_unix_s), 0, records))
+def _fixes_in(batches: Sequence[bytes]) -> pa.Table:
+    return fix_table(np.frombuffer(b"".join(batches), RECORD))
 
 
-def _fixes_in(payload: bytes) -> tuple[Records, float]:
-    batch = decode_batch(payload)
-    return batch.records, 1e-6 * batch.sent_unix_us
-
-
-def _event_bytes(events: tuple[Event, ...], arrived_unix_s: float) -> bytes:
-    return msgspec.json.encode((arrived_unix_s, events))
-
-
-def _events_in(payload: bytes) -> tuple[tuple[Event, ...], float]:
-    arrived_unix_s, events = msgspec.json.decode(payload, type=tuple[float, tuple[Event, ...]])
-    return events, arrived_unix_s
+def _events_in(batches: Sequence[bytes]) -> pa.Table:
+    found = (msgspec.json.decode(data, type=list[Event]) for data in batches)
+    return event_table(tuple(chain.from_iterable(found)))
