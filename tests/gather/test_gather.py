@@ -346,3 +346,62 @@ def test_without_a_gather_nothing_of_nats_is_loaded(modules):
     heavy = "{'nats', 'duckdb', 'pyarrow'} & {name.partition('.')[0] for name in sys.modules}"
     program = f"import sys, skyless, skyless.{modules}\nassert not {heavy}"
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_a_history_of_the_stream_has_each_fix_once_wherever_it_is_killed(tmp_path):
+    """Rows that were taken and not stored are taken again; tags have the history's own numbers."""
+    pytest.importorskip("pyarrow")
+    from skyless.run.history.layout import FIX_COLUMNS, NAME_COLUMNS, current_files
+    from skyless.run.history.stream_source import take_stream
+    from skyless.run.history.tables import read_table
+    from skyless.run.history.writer import Writer
+
+    folder = tmp_path / "history"
+
+    @contextlib.asynccontextmanager
+    async def taking(address, rows):
+        writer = Writer(folder, SITE)
+        task = asyncio.ensure_future(take_stream(address, writer, lambda _line: None))
+        try:
+            async with asyncio.timeout(20):
+                while writer.fixes.taken < rows:
+                    await asyncio.sleep(0.02)
+            yield writer
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+    def kill(writer):
+        writer.journal.close()
+        writer._lock.close()
+
+    async def check():
+        async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats):
+            await serving(client)
+            for n in range(30):
+                await publish(client, f"t{n % 3}", n / 1000.0)
+            async with taking(running.nats, 30) as writer:
+                writer.store()
+                writer.write()
+                for n in range(30, 60):
+                    await publish(client, f"t{n % 4}", n / 1000.0)
+                async with asyncio.timeout(20):
+                    while writer.fixes.taken < 60:
+                        await asyncio.sleep(0.02)
+                kill(writer)  # before the rest was stored
+            async with taking(running.nats, 30) as writer:
+                writer.store()
+                kill(writer)  # after it was stored, and before it was a file
+            for n in range(60, 70):
+                await publish(client, "t9", n / 1000.0)
+            async with taking(running.nats, 10) as writer:
+                writer.close()
+
+    asyncio.run(check())
+    names = {
+        row["tag"]: row["name"]
+        for row in read_table(folder / f"site={SITE}" / "names.parquet", NAME_COLUMNS).to_pylist()
+    }
+    rows = [row for file in current_files(folder, SITE) for row in read_table(file, FIX_COLUMNS).to_pylist()]
+    tags = [f"t{n % 3}" if n < 30 else f"t{n % 4}" if n < 60 else "t9" for n in range(70)]
+    assert sorted((row["x_mm"], names[row["tag"]]) for row in rows) == list(enumerate(tags))

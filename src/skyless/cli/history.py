@@ -16,6 +16,7 @@ from skyless.core.arguments import Positive
 from skyless.core.errors import SkylessError
 
 if TYPE_CHECKING:
+    from skyless.run.gather.address import NatsAddress
     from skyless.run.history.program import HistoryNode, HistoryState
     from skyless.run.history.retention import Keep
     from skyless.run.mqtt.address import MqttAddress
@@ -34,6 +35,7 @@ def run(
     *,
     to: HistoryFolder,
     broker: MqttOptions,
+    nats: Annotated[str | None, Parameter(env_var="SKYLESS_NATS")] = None,
     site_id: SiteId | None = None,
     keep_days: Positive = 400.0,
     full_days: Positive = 7.0,
@@ -49,6 +51,8 @@ def run(
     ----------
     to
         Where fixes are kept: a folder, which several sites may share.
+    nats
+        NATS server of a site with a gather, nats://[USER@]HOST[:PORT] or tls://...: its stream then gives the fixes.
     site_id
         Number of the site; by default the one whose programs are online.
     keep_days
@@ -61,15 +65,17 @@ def run(
         Write one JSON object at the end instead of text.
     """
     from skyless.run import process
+    from skyless.run.gather.address import nats_address
     from skyless.run.history.retention import Keep
 
     address = broker.address()
     if address is None:
         raise SkylessError("--mqtt is 'none'; it should be the broker of the site whose history to keep")
     address.tls_context()
+    stream = None if nats is None else nats_address(nats)
     found: list[HistoryNode] = []
     with contextlib.suppress(KeyboardInterrupt):
-        process.run(_keep_history(to, address, site_id, Keep(keep_days, full_days, event_days), found))
+        process.run(_keep_history(to, address, site_id, Keep(keep_days, full_days, event_days), found, stream))
     state = found[0].state() if found else None
     if json:
         import msgspec
@@ -83,14 +89,19 @@ def run(
 
 
 async def _keep_history(
-    folder: Path, address: "MqttAddress", site_id: int | None, keep: "Keep", found: "list[HistoryNode]"
+    folder: Path,
+    address: "MqttAddress",
+    site_id: int | None,
+    keep: "Keep",
+    found: "list[HistoryNode]",
+    nats: "NatsAddress | None",
 ) -> None:
     from skyless.run.find_site import find_site
     from skyless.run.history.program import HistoryNode
     from skyless.run.history.writer import Writer
 
     site = await find_site(address) if site_id is None else site_id
-    node = HistoryNode(Writer(folder, site), address, keep, log)
+    node = HistoryNode(Writer(folder, site), address, keep, log, nats)
     found.append(node)
     screen = asyncio.ensure_future(_status(node)) if sys.stderr.isatty() else None
     try:

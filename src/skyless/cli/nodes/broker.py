@@ -19,6 +19,7 @@ from skyless.core.extras import extra_module
 if TYPE_CHECKING:
     from skyless.run.broker import Broker, BrokerSettings
     from skyless.run.find_site import SiteOnBroker
+    from skyless.run.gather.address import NatsAddress
     from skyless.run.mqtt.address import MqttAddress
 
 app = App(name="broker", help_epilogue="Example: skyless broker --port 1883")
@@ -155,7 +156,7 @@ async def _serve(settings: "BrokerSettings", of_gather: tuple[str, ...], history
             gather = Program("gather", ("gather", "--nats", str(nats), *of_gather), environment=secret)
             parts.append(asyncio.ensure_future(Child(gather, log).run()))
         if history is not None:
-            parts.append(asyncio.ensure_future(_keep_history(_reader(settings, running), history)))
+            parts.append(asyncio.ensure_future(_keep_history(_reader(settings, running), history, nats)))
         await asyncio.wait(parts, return_when=asyncio.FIRST_COMPLETED)
         if ended.done():
             raise SkylessError(f"nats-server has ended by itself; {running.data / 'nats-server.log'} may show why")
@@ -165,7 +166,7 @@ async def _serve(settings: "BrokerSettings", of_gather: tuple[str, ...], history
 
 
 def _reader(settings: "BrokerSettings", running: "Broker") -> "MqttAddress":
-    """The broker's address for a history; where there are roles, as the page, which reads everything."""
+    """The broker's address for a history; where there are roles, as one that reads everything, the stream included."""
     from msgspec.structs import replace
 
     from skyless.run.mqtt.access import Role
@@ -173,11 +174,12 @@ def _reader(settings: "BrokerSettings", running: "Broker") -> "MqttAddress":
 
     if settings.roles is None:
         return running.address
-    password = os.environ[PASSWORD_VARIABLE] = settings.roles[Role.PAGE]  # its children take it from there
-    return replace(running.address, user=str(Role.PAGE), password=password)
+    role = Role.PAGE if running.nats is None else Role.OPERATOR
+    password = os.environ[PASSWORD_VARIABLE] = settings.roles[role]  # its children take it from there
+    return replace(running.address, user=str(role), password=password)
 
 
-async def _keep_history(address: "MqttAddress", folder: Path) -> None:
+async def _keep_history(address: "MqttAddress", folder: Path, nats: "NatsAddress | None") -> None:
     """Run a history of each site whose programs are online, until cancelled."""
     from msgspec.structs import replace
 
@@ -185,7 +187,9 @@ async def _keep_history(address: "MqttAddress", folder: Path) -> None:
     from skyless.run.find_site import watch_sites
 
     running: dict[int, asyncio.Task[None]] = {}
-    mqtt = ("--mqtt", str(replace(address, password=None)))
+    mqtt = ["--mqtt", str(replace(address, password=None))]
+    if nats is not None:
+        mqtt += ["--nats", str(nats)]
 
     def on_sites(sites: "list[SiteOnBroker]") -> None:
         for site in sites:

@@ -13,6 +13,7 @@ from msgspec import Struct
 
 from skyless.core.errors import SkylessError
 from skyless.run.fix_batch import MAX_RECORDS, records_of
+from skyless.run.gather.address import NatsAddress
 from skyless.run.history.events import REMEMBERED_KINDS, EventLog
 from skyless.run.history.layout import current_events
 from skyless.run.history.retention import Keep, tidy
@@ -55,8 +56,13 @@ class HistoryState(Struct, frozen=True):
 class HistoryNode:
     """Keeps the history of one site until cancelled."""
 
-    def __init__(self, writer: Writer, address: MqttAddress, keep: Keep, log: Log) -> None:
-        """Raises SkylessError: the events of the past cannot be read."""
+    def __init__(
+        self, writer: Writer, address: MqttAddress, keep: Keep, log: Log, nats: NatsAddress | None = None
+    ) -> None:
+        """``nats`` is the server of a site with a gather, whose stream then gives the fixes.
+
+        Raises SkylessError: the events of the past cannot be read.
+        """
         host = re.sub(r"[^A-Za-z0-9_.-]", "-", platform.node())
         name = f"{host}-{zlib.crc32(str(writer.folder.resolve()).encode()):08x}"
         self.link = Link(address, name, site=writer.site, kind="history")
@@ -66,11 +72,12 @@ class HistoryNode:
         past = read_events(current_events(writer.root, writer.site), [("kind", "in", REMEMBERED_KINDS)])
         self._events = EventLog(past)
         self._fixes: list[tuple[int, FixMessage]] = []
-        self._taken = {"fixes": 0, "events": 0}
         self._simulated = False
         self._started_s = time.monotonic()
         self._subscribe(topics.site_topic, SiteMessage, self._on_site)
-        self._subscribe(topics.fix_topic, FixMessage, self._on_fix, "+", qos=0)
+        self._nats = nats
+        if nats is None:
+            self._subscribe(topics.fix_topic, FixMessage, self._on_fix, "+", qos=0)
         self._subscribe(topics.zone_event_topic, ZoneEvent, self._on_event, "+")
         self._subscribe(topics.alarm_topic, AlarmMessage, self._on_event, "+", "+")
         for kind in ("tag", "anchor"):
@@ -80,7 +87,12 @@ class HistoryNode:
     async def run(self) -> None:
         """Keep it. Finally everything becomes files; what cannot waits in the journal for the next start."""
         try:
-            await together(keep(self.link, self._log), every(_STORE_S, self._store), self._work())
+            parts = [keep(self.link, self._log), every(_STORE_S, self._store), self._work()]
+            if self._nats is not None:
+                from skyless.run.history.stream_source import take_stream  # noqa: PLC0415 - only large sites have NATS
+
+                parts.append(take_stream(self._nats, self._writer, self._log))
+            await together(*parts)
         finally:
             self._store()
             self._try("files", self._writer.close)
@@ -90,7 +102,8 @@ class HistoryNode:
         intakes = (self._writer.fixes, self._writer.events)
         return HistoryState(
             seconds=time.monotonic() - self._started_s,
-            **self._taken,
+            fixes=self._writer.fixes.taken,
+            events=self._writer.events.taken,
             tags=len(self._writer.names.rows),
             waiting=self._writer.unwritten + sum(intake.waiting for intake in intakes),
             lost=sum(intake.lost for intake in intakes),
@@ -117,7 +130,6 @@ class HistoryNode:
 
     def _add_fixes(self) -> None:
         if self._fixes:
-            self._taken["fixes"] += len(self._fixes)
             self._writer.fixes.add(records_of(self._fixes, simulated=self._simulated), time.time())
             self._fixes.clear()
 
@@ -130,7 +142,6 @@ class HistoryNode:
         else:
             events = self._events.of_status(message, now_s)
         if events:
-            self._taken["events"] += len(events)
             self._writer.events.add(events, now_s)
 
     def _on_zones(self, _topic: str, payload: bytes) -> None:

@@ -50,22 +50,31 @@ class Intake:
     ) -> None:
         self.lost = 0
         """Rows that were dropped, as the disk did not take them in time."""
+        self.taken = 0
+        """Rows since the start."""
         self._journal, self._kind, self._folder = journal, kind, folder
         self._encode, self._table = encode, table
         self._batches: list[tuple[Records | Sequence[Event], float]] = []
+        self.position = 0
+        """Place in the source of the newest rows, where it has places."""
         files = [rows for file in largest_files(folder) if (rows := rows_of(file))]
         self.last = max((last for _, last in files), default=0)
         """Number of the last row in a file."""
         with journal.transaction() as sql:
             sql.execute(f"CREATE TABLE IF NOT EXISTS {kind} (first INTEGER PRIMARY KEY, rows, unix_s, data)")
             (end,) = sql.execute(f"SELECT max(first + rows) FROM {kind}").fetchone()
+            sql.execute("CREATE TABLE IF NOT EXISTS positions (kind PRIMARY KEY, position)")
+            for (position,) in sql.execute("SELECT position FROM positions WHERE kind = ?", (kind,)):
+                self.position = position
         self.next = max(self.last + 1, end or 1)
         """Number of the next row that comes to the journal."""
 
-    def add(self, rows: Records | Sequence[Event], arrived_unix_s: float) -> None:
-        """Take rows, which are in the journal after ``store``."""
+    def add(self, rows: Records | Sequence[Event], arrived_unix_s: float, position: int = 0) -> None:
+        """Take rows, which are in the journal after ``store``, and with them their place in the source."""
         if len(rows):
             self._batches.append((rows, arrived_unix_s))
+        self.taken += len(rows)
+        self.position = position
 
     @property
     def waiting(self) -> int:
@@ -83,6 +92,7 @@ class Intake:
         try:
             with self._journal.transaction() as sql:
                 sql.executemany(f"INSERT INTO {self._kind} VALUES (?, ?, ?, ?)", values)
+                sql.execute("INSERT OR REPLACE INTO positions VALUES (?, ?)", (self._kind, self.position))
         except OSError:
             while self.waiting > MAX_WAITING:
                 self.lost += len(self._batches.pop(0)[0])
@@ -213,13 +223,17 @@ class Writer:
         if not 0.0 <= fix.unix_s <= MAX_UNIX_S:
             self.drops["wrong-time"] += 1
             return None
-        if fix.tag not in self.names.rows:
+        return self.tag_number(fix.tag, unix_s)
+
+    def tag_number(self, name: str, unix_s: float) -> int | None:
+        """The number of a tag; None where too many have one, which is counted."""
+        if name not in self.names.rows:
             if len(self.names.rows) >= MAX_TAGS:
                 self.drops["too-many-tags"] += 1
                 return None
             newest = next(reversed(self.names.rows.values()), {"tag": 0})
-            self.names.set(newest["tag"] + 1, fix.tag, datetime.fromtimestamp(unix_s, UTC))
-        return int(self.names.rows[fix.tag]["tag"])
+            self.names.set(newest["tag"] + 1, name, datetime.fromtimestamp(unix_s, UTC))
+        return int(self.names.rows[name]["tag"])
 
     def set_zones(self, zones: Iterable[Zone]) -> None:
         """Keep zones; those that were removed stay, as events name them."""
