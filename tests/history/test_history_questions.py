@@ -319,6 +319,7 @@ def test_an_empty_range(history, tmp_path):
     assert history.track("tag1", empty).points == ()
     assert history.heatmap(empty).seconds == ()
     assert history.contacts("tag1", empty) == ()
+    assert history.contacts("tag1", SPAN, 0.01) == ()
     assert history.dwell(empty) == history.alarms(empty) == ()
     assert {one.most for one in history.occupancy(Span(0.0, 10.0))} == {0}
     with pytest.raises(SkylessError, match="no fixes in this range"):

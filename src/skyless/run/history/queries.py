@@ -257,10 +257,12 @@ class History:
         order = np.argsort(fixes[0], kind="stable")
         found = near(files, span, [column[order] for column in fixes], length_ms, round(1000.0 * distance_m))
         found = found[:, ~np.isin(found[0], own)]
+        if not found.size:
+            return ()
         number, bucket, square = found[:, np.lexsort((found[1], found[0]))]
         begins = np.flatnonzero((np.diff(number, prepend=-1) != 0) | (np.diff(bucket, prepend=0) > gap + 1))
         ends = np.append(begins[1:], len(number)) - 1
-        least_m = 1e-3 * np.sqrt(np.minimum.reduceat(square, begins)) if len(begins) else begins
+        least_m = 1e-3 * np.sqrt(np.minimum.reduceat(square, begins))
         contacts = [
             Contact(
                 tag,
