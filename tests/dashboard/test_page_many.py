@@ -64,13 +64,15 @@ class Crowd:
 
 
 def test_points_and_counts(serve, visit):
-    server = serve()
+    server = serve(tags=0)
     crowd = server.live2 = Crowd()
     shown = visit(server)
     page = shown.page
     part = "document.getElementById('part').textContent"
     until(page, f"{part} === '1\\u202f000 tags are shown as points'")
     page.evaluate(THREE_FRAMES)
+    assert "this list does not" in page.locator("#panel-tags").inner_text()
+    until(page, "document.getElementById('summary').textContent.includes('1000 in view')")
 
     def seen(x_m):
         page.evaluate(THREE_FRAMES)

@@ -1,6 +1,6 @@
 /** The map: three canvases, each drawn only when something in it has changed. */
 
-import { on, state } from "../store.js";
+import { changed, on, state } from "../store.js";
 import { byId } from "../dom.js";
 import { surveyShown } from "../survey/model.js";
 import { drawAlarms } from "./alarms.js";
@@ -111,6 +111,7 @@ export function showSpatial(spatial) {
   setSpatial(spatial && !surveyShown());
   byId("spatial").setAttribute("aria-pressed", String(view.spatial));
   byId("draw").disabled = view.spatial || state.mode === "replay";
+  changed("tags"); // very many are not drawn in 3-D
   fitAll();
 }
 
