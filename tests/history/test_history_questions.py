@@ -314,6 +314,31 @@ def test_exports_hold_every_fix_of_the_range(history, within, tmp_path):
     assert history.export(files[0], SPAN, ("tag3",)) == int((within["tag"] == 3).sum())
 
 
+@pytest.mark.parametrize(
+    "spoilt", [lambda data: b"", lambda data: data[:-20], lambda data: data[: len(data) // 2], bytes]
+)
+def test_a_damaged_file_is_named_and_no_traceback(tmp_path, rows, spoilt):
+    """Empty, cut off, half, and a sound file whose middle was overwritten."""
+    site = site_folder(tmp_path, 1)
+    write_fixes(site, {name: values[:2000] for name, values in rows.items()}, 1, 2000)
+    parquet.write_table(table(NAME_COLUMNS, {"tag": [1], "name": ["tag1"], "since": [0]}), site / "names.parquet")
+    (file,) = site.glob("day=*/*.parquet")
+    data = file.read_bytes()
+    file.write_bytes(
+        spoilt(data) if spoilt is not bytes else data[:100] + bytes(len(data) // 2) + data[100 + len(data) // 2 :]
+    )
+    history, span = History(tmp_path, 1), Span(BEGIN - 10.0, BEGIN + 5000.0)
+    for ask in (
+        lambda: history.heatmap(span),
+        lambda: history.track("tag1", span),
+        lambda: history.contacts("tag1", span),
+        lambda: history.export(tmp_path / "x.csv", span),
+    ):
+        with pytest.raises(SkylessError, match="cannot be read"):
+            ask()
+    assert not (tmp_path / "x.csv").exists()
+
+
 def test_an_empty_range(history, tmp_path):
     empty = Span(BEGIN - 9e6, BEGIN - 8e6)
     assert history.track("tag1", empty).points == ()

@@ -168,7 +168,7 @@ class SiteState:
 
     @property
     def tags(self) -> Collection[str]:
-        """Names of the tags that have had a fix lately."""
+        """Names of the tags whose newest fix is kept."""
         return self._tags.keys()
 
     def methods(self) -> list[str]:

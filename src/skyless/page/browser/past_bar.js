@@ -9,7 +9,7 @@ import { paintScale } from "./pictures.js";
 import { playControls, runKey, showSpans } from "./replay_bar.js";
 import { ALERTS } from "./tracks.js";
 
-/** A step by J or L, a share of the way's time, and at least so many seconds. */
+/** A step by J or L: a share of the way's time, and its least length in seconds. */
 const STEP = 0.01;
 const MIN_STEP_S = 5;
 

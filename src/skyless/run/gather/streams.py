@@ -26,7 +26,7 @@ async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -
     """Make the streams of a site, or set the limits of those that are there.
 
     Raises:
-        SkylessError: the server has no room for so many bytes.
+        SkylessError: the server has no room for these bytes.
     """
     fixes = StreamConfig(
         name=subjects.at(subjects.FIX_STREAM, site),

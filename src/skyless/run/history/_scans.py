@@ -110,8 +110,11 @@ def read_rows(
     if tags is not None:
         wanted &= dataset.field("tag").isin(list(tags))
     for file in files:
-        whole = parquet.ParquetFile(file, memory_map=True, pre_buffer=False)
-        first, last = time_limits(whole.metadata)
+        try:
+            whole = parquet.ParquetFile(file, memory_map=True, pre_buffer=False)
+            first, last = time_limits(whole.metadata)
+        except ValueError as error:  # ArrowInvalid is one
+            raise SkylessError(f"{file} cannot be read; it should be a Parquet file of fixes: {error}") from None
         if last < begin or first >= end:
             continue
         gap_s = THINNED_GAP_S if THINNED in (whole.schema_arrow.metadata or {}) else GAP_S

@@ -65,6 +65,6 @@ class EventLog:
             self._last[about] = ("offline", since)
             return before != "offline"
         if event.t == since and event.kind in ("online", before):
-            return False  # a copy; of one that is online perhaps a late one, of before it went
+            return False  # a copy; of "online" perhaps a late one, which was sent before the node went offline
         self._last[about] = (event.kind, event.t)
         return not event.kind == before == "online"

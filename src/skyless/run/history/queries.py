@@ -64,10 +64,10 @@ _LATE: Final = timedelta(days=1)
 _TRIES: Final = 3
 _MOVE_M: Final = 0.25
 _MOVE_SIGMAS: Final = 3.0
-"""Moves that are shorter, or within so many standard deviations of the fix, may be noise and do not lengthen a way."""
+"""A shorter move, or one within this many standard deviations of the fix, may be noise and does not lengthen a way."""
 _CONTACT_MS: Final = {False: (1000, 5), True: (10_000, 6)}
-"""By whether days are thinned: fixes within the same so many milliseconds are compared, and a contact goes on after an
-interruption of so many such times or less."""
+"""By whether days are thinned: the length in milliseconds of the intervals within which fixes are compared, and the
+longest interruption of a contact in such intervals."""
 _MAX_DISTANCE_M: Final = 50.0
 _MAX_STEPS: Final = 100_000
 _NAMED: Final = 5
@@ -135,10 +135,10 @@ def _asked(question: Callable[_P, _R]) -> Callable[_P, _R]:
 
     @wraps(question)
     def ask(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-        for _ in range(_TRIES - 1):
-            with contextlib.suppress(FileNotFoundError, duckdb.IOException):
-                return question(*args, **kwargs)
         try:
+            for _ in range(_TRIES - 1):
+                with contextlib.suppress(FileNotFoundError, duckdb.IOException):
+                    return question(*args, **kwargs)
             return question(*args, **kwargs)
         except (OSError, duckdb.Error, pyarrow.ArrowException) as error:
             reason = str(error).partition("\n")[0]
@@ -381,7 +381,7 @@ def _ramp(times: _Floats, at: _Floats) -> _Floats:
 
 
 def _thinned(times_s: _Floats, most: int, gap_s: float) -> list[int]:
-    """Indices of at most so many rows, evenly among them; the rows at gaps are kept if they are half of it at most."""
+    """Indices of rows, evenly among them, ``most`` at most; rows at gaps are kept if they are half of it or less."""
     if len(times_s) <= most:
         return list(range(len(times_s)))
     gaps = np.flatnonzero(np.diff(times_s) > gap_s)

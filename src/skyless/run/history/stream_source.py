@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _PERIOD_S: Final = 0.2
 _MAX_WAITING: Final = 100_000
-"""While so many rows wait for the disk, others stay in the stream."""
+"""While more rows than this wait for the disk, others stay in the stream."""
 
 
 async def take_stream(address: NatsAddress, writer: Writer, log: Log) -> None:

@@ -14,10 +14,10 @@ import { facts } from "./parts.js";
 
 /** Of more rows only the first ones are shown; the file has all. */
 const MAX_ROWS = 500;
-/** A heat map has at most so many cells. */
+/** The most cells of a heat map. */
 const MAX_CELLS = 40_000;
 const CELLS_M = [0.25, 0.5, 1, 2, 5, 10];
-/** An occupancy has at most so many steps. */
+/** The most steps of an occupancy. */
 const MAX_STEPS = 300;
 const STEPS_S = [60, 300, 900, 3600, 4 * 3600];
 const NEAR_M = 2;
