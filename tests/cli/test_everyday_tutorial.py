@@ -59,7 +59,7 @@ def test_every_line_of_the_tutorial_runs(tmp_path):
 
         def ready():
             try:
-                return len(get("fixes")["fixes"]) == 3
+                return get("site")["connected"] and len(get("fixes")["fixes"]) == 3
             except OSError:
                 return False
 
@@ -69,6 +69,7 @@ def test_every_line_of_the_tutorial_runs(tmp_path):
             if "/alarms" in line:
                 until(lambda: get("alarms")["alarms"])
             printed = run(line, tmp_path)
+            assert not printed.startswith('{"error"')
         assert "Forklift 1" in printed  # the text view, the last of them
         assert {tag["tag"]: tag["name"] for tag in get("tags")["tags"]}["tag3"] == "Ada"
         (alarm,) = get("alarms")["alarms"]
@@ -81,7 +82,8 @@ def test_every_line_of_the_tutorial_runs(tmp_path):
         until(lambda: any(b"Ada" in file.read_bytes() for file in kept.rglob("journal*")))
     finally:
         running.send_signal(signal.SIGINT)
-        running.communicate()
+        said, _ = running.communicate()
+    assert "started again" not in said
     answers = {shlex.split(line)[2]: run(f'{line} --from "1 hour ago" --json', tmp_path) for line in others}
     answers = {name: json.loads(text.splitlines()[-1]) for name, text in answers.items()}
     assert answers["track"]["track"]["fixes"] > 100

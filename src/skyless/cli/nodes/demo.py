@@ -128,6 +128,10 @@ def _settings(asked: DemoOptions) -> "SiteRun":
     folder = recordings_folder()
     if asked.history is not None:
         extra_module("pyarrow", "--history")
+        try:
+            asked.history.mkdir(parents=True, exist_ok=True)  # the page asks it before the history's first file
+        except OSError as error:
+            raise SkylessError(f"--history is {str(asked.history)!r}, which is no folder: {error.strerror}") from None
     return SiteRun(
         site=site,
         site_name=name,
