@@ -168,6 +168,23 @@ def until(found, wait_s=60.0):
     return result
 
 
+def test_an_interrupt_during_an_import_that_drops_it_is_not_lost(tmp_path):
+    """As NumPy's modules drop it, and callbacks of Python's import system."""
+    (tmp_path / "dropping.py").write_text(
+        "import os, signal\ntry:\n    os.kill(os.getpid(), signal.SIGINT)\n    list(range(9))\n"
+        "except KeyboardInterrupt:\n    pass\n"
+    )
+    code = (
+        "import sys, time\nfrom skyless.cli import main\n"
+        "def command(_):\n    import dropping\n    print('imported', flush=True)\n    time.sleep(60)\n"
+        "main.program = lambda: command\nsys.exit(main.main())"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), *sys.path))}
+    words = ["env", "--default-signal=INT", sys.executable, "-c", code]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, env=environment, timeout=50)
+    assert (done.returncode, done.stderr) == (130, "")
+
+
 def test_json_is_the_last_line(lab):
     done = skyless("site", "check", lab, "--json")
     report = json.loads(done.stdout.splitlines()[-1])

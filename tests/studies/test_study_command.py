@@ -146,7 +146,7 @@ def test_wrong_input_is_one_line(run, arguments, said):
 def test_an_interrupt_leaves_no_file_and_no_traceback(tmp_path):
     """As a terminal sends it: to the whole group, workers among them, at the start and in the middle."""
     for patience_s in (2.0, 12.0):
-        command = [*COMMAND, "loss", "--method", "joint", "--out", str(tmp_path / "out")]
+        command = ["env", "--default-signal=INT", *COMMAND, "loss", "--method", "joint", "--out", str(tmp_path / "out")]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
         time.sleep(patience_s)
         os.killpg(process.pid, signal.SIGINT)

@@ -75,6 +75,8 @@ _TERMINATED = 143
 _BROKEN_PIPE = 1
 _CANNOT_WRITE = (ENOSPC, EDQUOT, EFBIG, EIO)
 _USER_ERROR = 2
+_IMPORT_SYSTEM: Final = "<frozen importlib._bootstrap>"
+_TRY_AGAIN_S: Final = 0.02
 
 
 class _Help(DefaultFormatter):
@@ -126,7 +128,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _write_any_character()
     interrupted = [_INTERRUPTED]
     try:
-        with _ended_by_sigterm(lambda: interrupted.append(_TERMINATED)):
+        with _interrupts_between_imports(), _ended_by_sigterm(lambda: interrupted.append(_TERMINATED)):
             result = program()(arguments)
         if sys.stdout is not None:
             sys.stdout.flush()
@@ -150,6 +152,31 @@ def _line_for_the_user(error: Exception) -> str | None:
     if isinstance(error, ModuleNotFoundError):
         return what_to_install(error)
     return " ".join(str(error).split()) if isinstance(error, CycloptsError) else str(error)
+
+
+@contextmanager
+def _interrupts_between_imports() -> Iterator[None]:
+    """Let Ctrl-C wait for the end of an import, in which Python itself and the modules of NumPy can drop it."""
+    if threading.current_thread() is not threading.main_thread() or not callable(signal.getsignal(signal.SIGINT)):
+        yield
+        return
+
+    def interrupt(_: int, frame: FrameType | None) -> None:
+        caller = frame
+        while caller is not None and caller.f_code.co_filename != _IMPORT_SYSTEM:
+            caller = caller.f_back
+        if caller is None:
+            signal.default_int_handler(signal.SIGINT, frame)
+        signal.signal(signal.SIGALRM, interrupt)
+        signal.setitimer(signal.ITIMER_REAL, _TRY_AGAIN_S)
+
+    before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if signal.getsignal(signal.SIGALRM) is interrupt:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
 @contextmanager

@@ -15,6 +15,7 @@ import signal
 import socket
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path
@@ -62,6 +63,8 @@ def run(main: Coroutine[Any, Any, None], *, punctual: bool = False) -> None:
             os.setpriority(os.PRIO_PROCESS, 0, _RADIO_NICE)
     gc.collect()
     gc.freeze()
+    if callable(signal.getsignal(signal.SIGINT)) and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # the only one that asyncio's own takes the place of
     with asyncio.Runner(loop_factory=_new_loop) as runner, contextlib.suppress(asyncio.CancelledError):
         runner.run(_until_terminated(main))
 
