@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.run.assets import COLUMNS, MAX_ASSETS, BadAssetsError, assets_at, check_assets, read_csv, write_csv
-from skyless.run.mqtt.messages import Asset, AssetsMessage
+from skyless.run.assets import COLUMNS, MAX_ASSETS, assets_at, check_assets, read_csv, write_csv
+from skyless.run.mqtt.messages import Asset, AssetsMessage, WrongMessageError
 
 TAGS = st.text(string.ascii_letters + string.digits + "_.-", min_size=1, max_size=64)
 TEXTS = st.text(st.characters(categories=["L", "N", "P", "S"]), max_size=8)
@@ -61,7 +61,7 @@ def test_columns_in_another_order_and_empty_lines():
     ],
 )
 def test_a_wrong_table_names_its_line(table, words):
-    with pytest.raises(BadAssetsError) as caught:
+    with pytest.raises(WrongMessageError) as caught:
         read_csv(table)
     assert all(word in str(caught.value) for word in words), caught.value
 
@@ -70,7 +70,7 @@ def test_a_wrong_table_names_its_line(table, words):
 def test_any_bytes_are_a_table_or_refused(data):
     try:
         check_assets(read_csv(data))
-    except BadAssetsError as error:
+    except WrongMessageError as error:
         assert str(error)
 
 
@@ -82,7 +82,7 @@ def test_limits():
         ((Asset("t1", colour="#12345"),), "asset 't1': colour is '#12345'; it should be #rrggbb"),
         (tuple(Asset(f"t{n}", notes="x" * 900) for n in range(5000)), "shorten the notes"),
     ):
-        with pytest.raises(BadAssetsError, match=words):
+        with pytest.raises(WrongMessageError, match=words):
             check_assets(assets)
 
 

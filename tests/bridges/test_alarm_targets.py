@@ -34,6 +34,7 @@ ALARM = AlarmMessage(
 def quick(monkeypatch):
     monkeypatch.setattr(_deliveries, "FIRST_PAUSE_S", 0.02)
     monkeypatch.setattr(_deliveries, "LONGEST_PAUSE_S", 0.05)
+    monkeypatch.setattr(_deliveries, "LAST_S", 0.5)
 
 
 def open_target(text, log=lambda _line: None):
@@ -122,8 +123,18 @@ def test_a_receiver_that_is_not_there_is_tried_until_it_is():
     lines = []
     target = open_target(f"webhook+http://127.0.0.1:{port}/", lines.append)
     deliver(target, [ALARM], lambda: any("cannot be reached" in line for line in lines))
-    assert len(lines) == 1
-    assert target.delivered == 0
+    assert (len(lines), lines[-1]) == (2, f"{target.text}: stopped; messages that were not delivered: 1")
+    assert (target.delivered, target.dropped) == (0, {"stopped": 1})
+
+
+def test_what_waits_when_the_bridge_stops_is_tried_once_more(monkeypatch):
+    monkeypatch.setattr(_deliveries, "FIRST_PAUSE_S", 1000.0)
+    lines = []
+    with Receiver([500, 503, 204, 500]) as receiver:
+        target = open_target(f"webhook+http://127.0.0.1:{receiver.port}/", lines.append)
+        other = replace(ALARM, id="b")
+        deliver(target, [ALARM, other, replace(other, ended_unix_s=4e9)], lambda: len(lines) == 2)
+        assert (len(receiver.requests), target.delivered, target.dropped) == (4, 1, {"stopped": 2})
 
 
 def test_receivers_that_hang_or_drip_cost_only_their_own_messages(monkeypatch):

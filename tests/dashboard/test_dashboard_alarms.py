@@ -12,7 +12,14 @@ from skyless.core.alarm_rule import AlarmRule
 from skyless.page._alarms import KEPT_WAIT_S, MAX_SENT, NoAlarmError
 from skyless.page.live import LiveSite, NoBrokerError
 from skyless.run.mqtt import topics
-from skyless.run.mqtt.messages import AcknowledgeMessage, AlarmMessage, AlarmRulesMessage, Asset, ZonesMessage
+from skyless.run.mqtt.messages import (
+    AcknowledgeMessage,
+    AlarmMessage,
+    AlarmRulesMessage,
+    Asset,
+    WrongMessageError,
+    ZonesMessage,
+)
 from skyless.site.alarm_rules import BadAlarmRulesError
 
 RULE = AlarmRule("r", "inside", zone=SQUARE.id, clear_after_s=0.0)
@@ -249,7 +256,7 @@ def test_rules_of_the_page_are_stored_checked_and_sent(broker):
     assert [rule["id"] for rule in sent(live, "alarm_rules")["rules"]] == ["r"]
     assert [rule["id"] for rule in sent(live, "alarm_rules")["file_rules"]] == ["file"]
     new = AlarmRule("quiet", "silent", after_s=5.0)
-    live.store_alarm_rules([RULE, new], SITE.site.name)
+    live.alarms.store_rules([RULE, new], SITE.site.name)
     broker.run(0.2)
     kept = msgspec.json.decode(broker.kept[topics.alarm_rules_topic(SITE_ID)], type=AlarmRulesMessage)
     assert kept == AlarmRulesMessage((RULE, new), SITE.site.name)
@@ -259,8 +266,8 @@ def test_rules_of_the_page_are_stored_checked_and_sent(broker):
         ([AlarmRule("x", "silent")], "", "after_s"),
         ([], "elsewhere", "which is shown now"),
     ):
-        with pytest.raises(BadAlarmRulesError, match=words):
-            live.store_alarm_rules(rules, site)
+        with pytest.raises((BadAlarmRulesError, WrongMessageError), match=words):
+            live.alarms.store_rules(rules, site)
     broker.publish(topics.alarm_rules_topic(SITE_ID), AlarmRulesMessage((new,), "another site"), retain=True)
     broker.run(0.2)
     assert live.alarms.rules == ()
@@ -269,10 +276,10 @@ def test_rules_of_the_page_are_stored_checked_and_sent(broker):
 def test_rules_that_cannot_be_read_are_not_overwritten(broker):
     live = broker.start("a")
     broker.publish(topics.alarm_rules_topic(SITE_ID), b'{"rules": [{"id": "x", "kind": "new kind"}]}', retain=True)
-    with pytest.raises(BadAlarmRulesError, match="nothing was overwritten"):
-        live.store_alarm_rules([RULE])
+    with pytest.raises(WrongMessageError, match="nothing was overwritten"):
+        live.alarms.store_rules([RULE])
     broker.publish(topics.alarm_rules_topic(SITE_ID), b"", retain=True)
-    live.store_alarm_rules([RULE])
+    live.alarms.store_rules([RULE])
     assert live.dropped["alarm_rules"] == 1
 
 

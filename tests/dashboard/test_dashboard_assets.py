@@ -8,9 +8,9 @@ from dashboard_builders import SITE, SITE_ID, Wire
 from skyless.core.errors import SkylessError
 from skyless.page.live import LiveSite
 from skyless.page.site_assets import SETTLE_S, AssetsFile
-from skyless.run.assets import BadAssetsError, read_csv, write_csv
+from skyless.run.assets import read_csv, write_csv
 from skyless.run.mqtt import topics
-from skyless.run.mqtt.messages import Asset, AssetsMessage
+from skyless.run.mqtt.messages import Asset, AssetsMessage, WrongMessageError
 
 TOPIC = topics.assets_topic(SITE_ID)
 NAME = SITE.site.name
@@ -150,7 +150,7 @@ def test_another_sites_are_neither_shown_nor_overwritten(start, wire, file):
     live = start(file)
     wire.deliver(TOPIC, AssetsMessage((FORKLIFT,), "another"))
     assert live.assets.by_tag == {}
-    with pytest.raises(BadAssetsError, match="'another'"):
+    with pytest.raises(WrongMessageError, match="'another'"):
         live.assets.store((PALLET,))
     assert kept(wire) == []
     assert not file.exists()
@@ -160,7 +160,7 @@ def test_what_cannot_be_read_is_not_overwritten(start, wire):
     live = start()
     wire.deliver(TOPIC, b'{"assets": [{"tag": "a b"}]}')
     assert live.dropped["assets"] == 1
-    with pytest.raises(BadAssetsError, match="'a b'"):
+    with pytest.raises(WrongMessageError, match="'a b'"):
         live.assets.store((PALLET,))
     wire.deliver(TOPIC, b"")
     live.assets.store((PALLET,))
@@ -169,7 +169,7 @@ def test_what_cannot_be_read_is_not_overwritten(start, wire):
 def test_assets_that_were_stored_before_the_broker_was_known(times):
     live = LiveSite("here", "mqtt://broker:1", SITE, lambda: times.now_s, lambda: times.unix_s)
     live.assets.store((PALLET,), NAME)
-    with pytest.raises(BadAssetsError, match="another"):
+    with pytest.raises(WrongMessageError, match="another"):
         live.assets.store((FORKLIFT,), "another")
     wire = Wire()
     live.attach(wire, SITE_ID)

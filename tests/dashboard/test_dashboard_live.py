@@ -12,9 +12,8 @@ from test_dashboard_condition import anchor_health
 from skyless.page._events import MAX_EVENTS, SILENT_S
 from skyless.page.live import LiveSite
 from skyless.run.mqtt import topics
-from skyless.run.mqtt.messages import SiteZones, ZoneEvent, ZonesMessage
+from skyless.run.mqtt.messages import SiteZones, WrongMessageError, ZoneEvent, ZonesMessage
 from skyless.run.zones.monitor import TAG_TIMEOUT_S
-from skyless.run.zones.zone_list import BadZonesError
 
 FIX = topics.fix_topic(SITE_ID, "t1")
 ZONES = topics.zones_topic(SITE_ID)
@@ -250,7 +249,7 @@ def test_a_site_does_not_show_the_zones_of_another_with_its_number(live, wire):
 
 def test_a_page_that_shows_another_site_does_not_store_its_zones(live, wire):
     wire.deliver(topics.site_topic(SITE_ID), named("Hall"))
-    with pytest.raises(BadZonesError, match="'Lab', but 'Hall' is shown now"):
+    with pytest.raises(WrongMessageError, match="'Lab'; it should be 'Hall'"):
         live.store_zones((SQUARE,), "Lab")
     assert wire.topics() == []
 
@@ -289,7 +288,7 @@ def test_damaged_zones_at_the_broker_are_not_overwritten(live, wire):
     fault = drained(live, live.open_page())[0]["zones_fault"]
     assert ZONES in fault
     assert "\n" not in fault
-    with pytest.raises(BadZonesError, match="nothing was overwritten"):
+    with pytest.raises(WrongMessageError, match="nothing was overwritten"):
         live.store_zones((SQUARE,))
     assert wire.topics() == []
     wire.deliver(ZONES, b"")

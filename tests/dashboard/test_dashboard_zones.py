@@ -11,9 +11,9 @@ from matplotlib.path import Path
 from msgspec.structs import replace
 
 from skyless.page._events import TAKEOVER_S, EventQueue, publisher_rank
-from skyless.run.mqtt.messages import Zone, ZoneEvent, ZonesMessage
+from skyless.run.mqtt.messages import WrongMessageError, Zone, ZoneEvent, ZonesMessage
 from skyless.run.zones.monitor import CROSSING_S, MIN_MARGIN_M, TAG_TIMEOUT_S, ZoneMonitor
-from skyless.run.zones.zone_list import BadZonesError, read_zones, zones_of
+from skyless.run.zones.zone_list import read_zones, zones_of
 
 INSIDE, OUTSIDE = (2.0, 2.0, 1.0), (8.0, 2.0, 1.0)
 
@@ -162,11 +162,11 @@ GOOD = {"id": "a", "name": "A", "polygon_m": [[0, 0], [1, 0], [1, 1]]}
         ({"id": ""}, "id"),
         ({"name": "x" * 101}, "name"),
         ({"colour": "red;background:url(x)"}, "colour"),
-        ({"polygon_m": [[0, 0], [1, "x"], [1, 1]]}, "no list of zones"),
+        ({"polygon_m": [[0, 0], [1, "x"], [1, 1]]}, "polygon_m"),
     ],
 )
 def test_invalid_zones_are_refused_with_a_reason(change, expected):
-    with pytest.raises(BadZonesError, match=expected):
+    with pytest.raises(WrongMessageError, match=expected):
         read_zones(json.dumps({"zones": [GOOD | change]}).encode())
 
 
@@ -184,14 +184,14 @@ def test_invalid_zones_are_refused_with_a_reason(change, expected):
     ],
 )
 def test_anything_but_a_list_of_zones_is_refused(payload):
-    with pytest.raises(BadZonesError):
+    with pytest.raises(WrongMessageError):
         read_zones(payload)
 
 
 def test_ids_are_unique_and_zones_not_too_many():
-    with pytest.raises(BadZonesError, match="two zones"):
+    with pytest.raises(WrongMessageError, match="two zones"):
         read_zones(json.dumps({"zones": [GOOD, GOOD]}).encode())
-    with pytest.raises(BadZonesError, match="101 zones"):
+    with pytest.raises(WrongMessageError, match="101 zones"):
         read_zones(json.dumps({"zones": [GOOD | {"id": str(k)} for k in range(101)]}).encode())
     assert read_zones(json.dumps({"zones": [GOOD, GOOD | {"id": "b"}]}).encode()).zones[1].id == "b"
 

@@ -93,6 +93,13 @@ def test_no_error_shows_the_password(scheme, user, rest):
     assert SECRET not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    "url", ["smtp://h:25/?to=a@b", "smtp://[::1]:25?starttls&to=a@b", "smtps://h?to=a@b", "smtp://ann@h:25/?to=a@b"]
+)
+def test_an_address_without_a_password_is_shown_as_it_is(url):
+    assert hide_password(url) == url
+
+
 def test_neither_text_of_an_address_shows_it():
     address = mqtt_address(f"mqtts://ann:{SECRET}@h")
     assert str(address) == "mqtts://ann@h:8883"

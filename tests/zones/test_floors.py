@@ -11,8 +11,7 @@ from msgspec.structs import replace
 from skyless.core.errors import ConfigurationError
 from skyless.core.site import FloorSite
 from skyless.run.mqtt.messages import FixMessage, SiteMessage, Zone, read_message, site_message
-from skyless.run.zones.floors import floor_at
-from skyless.run.zones.monitor import ZoneMonitor
+from skyless.run.zones.monitor import ZoneMonitor, floor_at
 from skyless.sim.lab import lab_site
 from skyless.site.file.check import plan_files
 from skyless.site.file.load import load_site
@@ -73,12 +72,9 @@ def test_a_zone_on_a_floor_holds_its_tags_only():
     monitor.floors = FLOORS
     monitor.set_zones((Zone("up", "Up", square, floor=2), Zone("all", "All", square)), 0.0)
     assert {(e.zone, e.kind) for e in monitor.update(fix(1.0), 0.0)} == {("all", "enter")}
-    assert monitor.floor_of("t1") == 0
     assert [(e.zone, e.kind) for e in monitor.update(fix(8.0), 0.1)] == [("up", "enter")]
-    assert monitor.floor_of("t1") == 2
     assert [(e.zone, e.kind) for e in monitor.update(fix(1.0), 0.2)] == [("up", "leave")]
     assert {e.zone for e in monitor.update(fix(1.0, height_known=True), 0.3)} == {"up"}
-    assert monitor.floor_of("t1") == 2  # its height says nothing, and the zone does
 
 
 def test_the_file_s_floors_travel_beside_the_site(tmp_path):

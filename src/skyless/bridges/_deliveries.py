@@ -33,6 +33,9 @@ LONGEST_PAUSE_S: Final = 300.0
 KEPT_S: Final = 86_400.0
 """A message that has not been delivered for this long is dropped."""
 
+LAST_S: Final = 3.0
+"""For all that waits when the bridge stops."""
+
 _MAX_KNOWN: Final = 10_000
 _MAX_SECRET_BYTES: Final = 4096
 _OTHERS: Final = 0o077
@@ -61,7 +64,7 @@ class Delivery(Struct, eq=False):
         return f"{self.alarm.id}/{self.what}"
 
 
-Open = Callable[[socket.socket], None]
+Open = Callable[[socket.socket | None], None]
 """To be called with the socket of an attempt, which is closed when its time is over."""
 
 
@@ -106,7 +109,14 @@ class AlarmTarget(Target):
         self._wake.set()
 
     async def run(self) -> None:
-        """Deliver until cancelled."""
+        """Deliver until cancelled; what waits then is tried once more."""
+        try:
+            await self._deliver()
+        except asyncio.CancelledError:
+            await self._try_all()
+            raise
+
+    async def _deliver(self) -> None:
         while True:
             self._wake.clear()
             now_s = time.monotonic()
@@ -119,6 +129,19 @@ class AlarmTarget(Target):
                 continue
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._wake.wait(), None if first is None else first.due_s - now_s)
+
+    async def _try_all(self) -> None:
+        failed = set()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(LAST_S):
+                for one in tuple(self._waiting):
+                    if one.alarm.id not in failed:
+                        await self._try(one)
+                    if one in self._waiting:
+                        failed.add(one.alarm.id)
+        if self._waiting:
+            self.dropped["stopped"] += len(self._waiting)
+            self._log(f"{self.text}: stopped; messages that were not delivered: {len(self._waiting)}")
 
     def _next(self) -> Delivery | None:
         """The message whose turn comes first. Those about one alarm keep their order."""
@@ -148,7 +171,7 @@ class AlarmTarget(Target):
         """Log a trouble when it begins and when it is over."""
         if trouble != self._trouble:
             self._trouble = trouble
-            self._log(f"{self.text}: {trouble or 'delivered again'}")
+            self._log(f"{self.text}: {trouble[:240] or 'delivered again'}")
 
 
 def _states(alarm: AlarmMessage) -> list[What]:
@@ -165,7 +188,7 @@ async def _in_thread(work: Callable[[Open], None]) -> None:
     """Run what blocks in a thread that the end of the program does not wait for, for at most ``TIMEOUT_S``."""
     done: Future[None] = Future()
     done.set_running_or_notify_cancel()
-    sockets: list[socket.socket] = []
+    sockets: list[socket.socket | None] = []
 
     def run() -> None:
         try:
@@ -182,7 +205,7 @@ async def _in_thread(work: Callable[[Open], None]) -> None:
     except TimeoutError:
         raise TimeoutError(f"no answer within {TIMEOUT_S:g} s") from None
     finally:
-        for one in sockets:
+        for one in filter(None, sockets):
             with contextlib.suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)  # which ends the thread
 

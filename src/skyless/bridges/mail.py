@@ -6,15 +6,15 @@ import ssl
 import time
 from email.message import EmailMessage
 from email.utils import formatdate
+from functools import partial
 from hashlib import sha256
 from typing import Final
 
 from skyless.bridges._deliveries import TIMEOUT_S, AlarmTarget, Delivery, Open, RefusedError, read_secret
 from skyless.bridges.target import BridgeContext, TargetUrl
-from skyless.bridges.webhook import is_loopback
+from skyless.run.mqtt.address import is_loopback
 
 _ADDRESS: Final = re.compile(r"[^\s@,<>]+@[^\s@,<>]+")
-_ENCRYPTED: Final = "smtps: or ?starttls, as a password is given"
 
 
 class Mail(AlarmTarget):
@@ -23,9 +23,9 @@ class Mail(AlarmTarget):
     def __init__(self, url: TargetUrl, context: BridgeContext) -> None:
         super().__init__(url.text, context.log, frozenset({"raised", "ended"}))
         self._host, user = url.host(""), url.netloc().rpartition("@")[0]
-        self._is_tls = url.scheme == "smtps"
-        self._port = url.port(465 if self._is_tls else 25)
-        self._starts_tls = not self._is_tls and url.has("starttls")
+        is_tls = url.scheme == "smtps"
+        self._port = url.port(465 if is_tls else 25)
+        self._starts_tls = not is_tls and url.has("starttls")
         self._to = url.text_option("to").replace(" ", "").split(",")
         self._from = url.text_option("from") or self._to[0]
         name = url.text_option("password_file")
@@ -36,24 +36,21 @@ class Mail(AlarmTarget):
                 raise url.wrong(f"with to= and from= as NAME@HOST, several to= with commas; {address!r} is none")
         if name and not user:
             raise url.wrong(f"{url.scheme}://USER@HOST, as a password is given")
-        if name and not (self._is_tls or self._starts_tls or is_loopback(self._host)):
-            raise url.wrong(_ENCRYPTED)
+        if name and not (is_tls or self._starts_tls or is_loopback(self._host)):
+            raise url.wrong("smtps: or ?starttls, as a password is given")
+        self._tls = ssl.create_default_context()
+        self._connect = partial(smtplib.SMTP_SSL, context=self._tls) if is_tls else smtplib.SMTP
         self._user, self._password = user, read_secret(url.text, "password_file", name) if name else ""
 
     def attempt(self, delivery: Delivery, on_open: Open) -> None:
         """Send once."""
-        context = ssl.create_default_context()
-        server: smtplib.SMTP
-        if self._is_tls:
-            server = smtplib.SMTP_SSL(self._host, self._port, timeout=TIMEOUT_S, context=context)
-        else:
-            server = smtplib.SMTP(self._host, self._port, timeout=TIMEOUT_S)
+        server = self._connect(self._host, self._port, timeout=TIMEOUT_S)
         try:
             with server:
-                _open(server, on_open)
+                on_open(server.sock)
                 if self._starts_tls:
-                    server.starttls(context=context)
-                    _open(server, on_open)  # it is another socket now
+                    server.starttls(context=self._tls)
+                    on_open(server.sock)  # it is another one now
                 if self._user:
                     server.login(self._user, self._password)
                 waiting = [address for address in self._to if address not in delivery.reached]
@@ -61,12 +58,16 @@ class Mail(AlarmTarget):
                 delivery.reached.update(set(waiting) - refused.keys())
                 if refused:
                     raise smtplib.SMTPRecipientsRefused(refused)
-        except smtplib.SMTPRecipientsRefused as error:
-            _refuse(error, *(code for code, _ in error.recipients.values()))
         except smtplib.SMTPAuthenticationError:
             raise ConnectionError("the server does not accept user and password") from None
+        except smtplib.SMTPRecipientsRefused as error:
+            if all(code >= 500 for code, _ in error.recipients.values()):
+                raise RefusedError(str(error)) from None
+            raise
         except smtplib.SMTPResponseException as error:
-            _refuse(error, error.smtp_code)
+            if error.smtp_code >= 500:
+                raise RefusedError(str(error)) from None
+            raise
 
     def _mail(self, delivery: Delivery) -> EmailMessage:
         alarm, site = delivery.alarm, self.site
@@ -85,18 +86,6 @@ class Mail(AlarmTarget):
         simulated = "\nThis site is simulated.\n" if site is not None and site.simulated else ""
         mail.set_content(f"{alarm.sentence}.\n\n" + "\n".join(lines) + f"\n{simulated}\n{alarm.id}\n")
         return mail
-
-
-def _open(server: smtplib.SMTP, on_open: Open) -> None:
-    if server.sock is not None:
-        on_open(server.sock)
-
-
-def _refuse(error: Exception, *codes: int) -> None:
-    """Raise RefusedError where no code says that a later attempt may succeed, else the error itself."""
-    if codes and all(code >= 500 for code in codes):
-        raise RefusedError(str(error)[:200]) from None
-    raise ConnectionError(str(error)[:200]) from None
 
 
 def make_target(url: TargetUrl, context: BridgeContext) -> Mail:

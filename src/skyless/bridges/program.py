@@ -19,7 +19,7 @@ from skyless.core.air.almanac import GeoreferencePage
 from skyless.core.air.masterless_packets import Point
 from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
-from skyless.run.assets import BadAssetsError, assets_at, read_assets
+from skyless.run.assets import assets_at, read_assets
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
@@ -30,6 +30,7 @@ from skyless.run.mqtt.messages import (
     SiteMessage,
     StatusMessage,
     TagHealth,
+    WrongMessageError,
     ZonesMessage,
 )
 from skyless.run.mqtt.topics import (
@@ -43,7 +44,7 @@ from skyless.run.mqtt.topics import (
     zones_topic,
 )
 from skyless.run.process import HEALTH_S, Log, every, keep, reader, together
-from skyless.run.zones.zone_list import BadZonesError, read_zones, zones_of
+from skyless.run.zones.zone_list import read_zones, zones_of
 
 if TYPE_CHECKING:  # it compiles kernels, which a bridge of a broker does not need
     from skyless.core.tag.beacon_receiver import TagReceiver
@@ -122,7 +123,7 @@ class BridgeNode:
             return
         try:
             self._zones = read_zones(payload)
-        except BadZonesError:
+        except WrongMessageError:
             self._malformed += 1
         else:
             self._update_site()
@@ -130,7 +131,7 @@ class BridgeNode:
     def _on_assets(self, _topic: str, payload: bytes) -> None:
         try:
             self._assets = read_assets(payload) if payload else AssetsMessage(())
-        except BadAssetsError:
+        except WrongMessageError:
             self._malformed += 1
         else:
             self._update_site()

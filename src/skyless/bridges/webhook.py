@@ -5,9 +5,9 @@ The signature is HMAC-SHA256 of the timestamp, a dot and the body (docs/howto/al
 
 import hmac
 import http.client
-import ipaddress
 import ssl
 import time
+from functools import partial
 from typing import Final
 from urllib.parse import quote
 
@@ -16,6 +16,7 @@ import msgspec
 from skyless.bridges._deliveries import TIMEOUT_S, AlarmTarget, Delivery, Open, RefusedError, read_secret
 from skyless.bridges.target import BridgeContext, TargetUrl
 from skyless.core.version import installed_version
+from skyless.run.mqtt.address import is_loopback
 
 TIMESTAMP_HEADER: Final = "Skyless-Timestamp"
 SIGNATURE_HEADER: Final = "Skyless-Signature"
@@ -32,12 +33,14 @@ class Webhook(AlarmTarget):
         self._host = url.host("")
         if not self._host:
             raise url.wrong(f"{url.scheme}://HOST/PATH")
-        self._tls = ssl.create_default_context() if url.scheme == "webhook+https" else None
-        self._port = url.port(80 if self._tls is None else 443)
+        is_tls = url.scheme == "webhook+https"
+        self._port = url.port(443 if is_tls else 80)
+        https = partial(http.client.HTTPSConnection, context=ssl.create_default_context())
+        self._connection = https if is_tls else http.client.HTTPConnection
         self._path = quote(url.path() or "/", safe="/:@!$&'()*+,;=~?%")
         name = url.text_option("secret_file")
         self._secret = read_secret(url.text, "secret_file", name).encode() if name else None
-        if self._tls is None and not is_loopback(self._host):
+        if not is_tls and not is_loopback(self._host):
             context.log(f"{url.text}: alarms leave this computer unencrypted; webhook+https: encrypts")
 
     def attempt(self, delivery: Delivery, on_open: Open) -> None:
@@ -54,10 +57,7 @@ class Webhook(AlarmTarget):
         }
         if self._secret is not None:
             headers[SIGNATURE_HEADER] = hmac.new(self._secret, f"{stamp}.".encode() + body, "sha256").hexdigest()
-        if self._tls is None:
-            connection = http.client.HTTPConnection(self._host, self._port, timeout=TIMEOUT_S)
-        else:
-            connection = http.client.HTTPSConnection(self._host, self._port, timeout=TIMEOUT_S, context=self._tls)
+        connection = self._connection(self._host, self._port, timeout=TIMEOUT_S)
         try:
             connection.connect()
             on_open(connection.sock)
@@ -71,14 +71,6 @@ class Webhook(AlarmTarget):
         if answer.status >= 500 or answer.status in _TRY_AGAIN:
             raise ConnectionError(fault)
         raise RefusedError(fault)
-
-
-def is_loopback(host: str) -> bool:
-    """Whether a host is this computer."""
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def make_target(url: TargetUrl, context: BridgeContext) -> Webhook:

@@ -10,9 +10,9 @@ from typing import Final
 from msgspec.structs import replace
 
 from skyless.core.alarm_rule import AlarmRule
+from skyless.page._kept import Kept
 from skyless.page._state import encode
 from skyless.run.alarms.engine import MAX_KEPT, AlarmEngine, Key, is_over
-from skyless.run.alarms.rules import read_rules
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
     AcknowledgeMessage,
@@ -25,7 +25,7 @@ from skyless.run.mqtt.messages import (
 )
 from skyless.run.mqtt.topics import acknowledge_topic, alarm_rules_topic, alarm_topic
 from skyless.run.zones.monitor import ZoneMonitor
-from skyless.site.alarm_rules import BadAlarmRulesError, check_rules
+from skyless.site.alarm_rules import check_rules
 
 MAX_SENT: Final = 500
 """Alarms that a page is sent: those that nobody has acknowledged first, then the newest."""
@@ -62,9 +62,7 @@ class SiteAlarms:
         self._link: Link | None = None
         self._site_id = 0
         self._site = ""
-        self._stored = AlarmRulesMessage(())
-        self._drawn: AlarmRulesMessage | None = None  # rules stored here that have not come back from the broker
-        self._fault = ""  # why the rules that the broker keeps cannot be read
+        self._kept_rules = Kept(AlarmRulesMessage(()), read_rules)
         self._received: dict[Key, AlarmMessage] = {}
         """Alarms as the broker has them, since the last connection."""
         self._connected_s: float | None = None
@@ -92,8 +90,7 @@ class SiteAlarms:
     def attach(self, link: Link, site_id: int) -> dict[str, Handler]:
         """What is to be subscribed to, and who handles it."""
         self._link, self._site_id = link, site_id
-        if self._drawn is not None:
-            link.publish(alarm_rules_topic(site_id), self._drawn, qos=1, retain=True)
+        self._kept_rules.attach(link, alarm_rules_topic(site_id))
         return {
             alarm_rules_topic(site_id): self._on_rules,
             alarm_topic(site_id, "+", "+"): self._on_alarm,
@@ -112,20 +109,9 @@ class SiteAlarms:
         self._site, self.file_rules = site.site.name, site.alarms
         self._apply_rules()
 
-    def _on_rules(self, topic: str, payload: bytes) -> None:
-        try:
-            message = read_rules(payload) if payload else AlarmRulesMessage(())
-        except BadAlarmRulesError as error:
-            self._fault = str(error)
-            raise WrongMessageError(str(error)) from None
-        if self._drawn is not None:
-            if message != self._drawn:
-                return  # older than the rules stored here, which are on their way
-            self._drawn = None
-        elif message != self._stored and self._link is not None:
-            self._link.forget(topic)
-        self._fault, self._stored = "", message
-        self._apply_rules()
+    def _on_rules(self, _topic: str, payload: bytes) -> None:
+        if self._kept_rules.receive(payload):
+            self._apply_rules()
 
     def _on_alarm(self, topic: str, payload: bytes) -> None:
         rule, subject = topic.split("/")[-3:-1]
@@ -160,17 +146,11 @@ class SiteAlarms:
     # What people do
 
     def store_rules(self, rules: Sequence[AlarmRule], site: str = "") -> None:
-        """Store the rules of a page, for the site of this name. Raises BadAlarmRulesError."""
-        if site and site != self._site:
-            raise BadAlarmRulesError(None, "", "their site", site[:100], f"{self._site[:100]!r}, which is shown now")
-        if self._fault:
-            right = f"cleared to begin again; nothing was overwritten ({self._fault})"
-            raise BadAlarmRulesError(None, "", "the topic alarm_rules", "not readable", right)
+        """Store the rules of a page of this site. Raises WrongMessageError and BadAlarmRulesError."""
+        self._kept_rules.check_store(site, self._site)
         check_rules(rules, self.file_rules)
-        self._stored = self._drawn = AlarmRulesMessage(tuple(rules), self._site)
+        self._kept_rules.store(AlarmRulesMessage(tuple(rules), self._site))
         self._apply_rules()
-        if self._link is not None:
-            self._link.publish(alarm_rules_topic(self._site_id), self._drawn, qos=1, retain=True)
 
     def check_is_kept(self, rule: str, subject: str, occurrence: str) -> None:
         """Raise NoAlarmError where there is no such alarm."""
@@ -179,10 +159,11 @@ class SiteAlarms:
             raise NoAlarmError(f"there is no alarm {occurrence[:120]!r} of {rule[:40]!r} and {subject[:80]!r} any more")
 
     def is_acknowledged(self, rule: str, subject: str, occurrence: str) -> bool:
-        """Whether an alarm that is kept has been acknowledged, and what this says of it has been handed to the link."""
+        """Whether the broker has it that an alarm was acknowledged, so that no restart forgets it."""
         message = self.engine.messages.get((rule, subject))
         is_open = message is not None and message.id == occurrence and message.acknowledged_unix_s is None
-        return not is_open and not self.engine.has_changes
+        is_stored = self._link is not None and not self._link.unacknowledged and not self.engine.has_changes
+        return is_stored and not is_open
 
     # Work
 
@@ -213,8 +194,8 @@ class SiteAlarms:
             self._changed = True
 
     def _apply_rules(self) -> None:
-        ids = {rule.id for rule in self.file_rules}
-        mine = self._stored.rules if self._stored.site in ("", self._site) else ()
+        ids, kept = {rule.id for rule in self.file_rules}, self._kept_rules.message
+        mine = kept.rules if kept.site in ("", self._site) else ()
         self.rules = tuple(rule for rule in mine if rule.id not in ids)
         self.engine.set_rules((*self.file_rules, *self.rules))
         self._broadcast("alarm_rules", self.encoded()["alarm_rules"])
@@ -241,6 +222,13 @@ class SiteAlarms:
             self._link.publish(topic, message, qos=1, retain=not is_over(message))
         if dropped or is_over(message):
             self._link.publish(topic, b"", qos=1, retain=True)
+
+
+def read_rules(payload: bytes) -> AlarmRulesMessage:
+    """An ``AlarmRulesMessage`` in JSON, all its rules checked. Raises WrongMessageError and BadAlarmRulesError."""
+    message = read_message(payload, AlarmRulesMessage)
+    check_rules(message.rules)
+    return message
 
 
 def _joined(mine: AlarmMessage | None, theirs: AlarmMessage) -> AlarmMessage:

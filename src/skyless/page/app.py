@@ -33,9 +33,9 @@ from skyless.page.playback import NoRecordingError, Playback, RecordingFile
 from skyless.page.sites import LiveSites
 from skyless.page.task_process import TaskError, TaskProcess
 from skyless.page.what_if import NoWhatIfError, WhatIfs, WhatIfTask
-from skyless.run.assets import BadAssetsError
+from skyless.run.mqtt.messages import WrongMessageError
 from skyless.run.mqtt.survey_facts import BadFactsError
-from skyless.run.zones.zone_list import BadZonesError, read_zones
+from skyless.run.zones.zone_list import read_zones
 from skyless.site.alarm_rules import BadAlarmRulesError
 from skyless.site.file.check import image_size
 
@@ -58,8 +58,7 @@ _Endpoint = Callable[[Request], Coroutine[Any, Any, Response]]
 _TRY_LATER: Final = 1013
 _GOING_AWAY: Final = 1001
 _STATUSES: Final[dict[type[Exception], int]] = {
-    BadZonesError: 400,
-    BadAssetsError: 400,
+    WrongMessageError: 400,
     BadFactsError: 400,
     BadAlarmRulesError: 400,
     NoAlarmError: 404,

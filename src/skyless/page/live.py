@@ -10,7 +10,7 @@ import platform
 import time
 import zlib
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Literal
 
@@ -18,19 +18,18 @@ import msgspec
 from msgspec import UNSET, Struct
 
 from skyless.bridges.target import bridged_site
-from skyless.core.alarm_rule import AlarmRule
 from skyless.core.errors import ConfigurationError
 from skyless.core.version import installed_version
 from skyless.page._alarms import SiteAlarms
 from skyless.page._events import MAX_EVENTS, MAX_LOGGED, EventLog, EventQueue, publisher_rank
 from skyless.page._geojson import OLDEST_S, anchor_features, features, zone_features
+from skyless.page._kept import Kept
 from skyless.page._site_survey import SiteSurvey
 from skyless.page._state import PageRequest, Sent, SiteState, encode
 from skyless.page.condition.evidence import Evidence
 from skyless.page.condition.monitor import EVALUATION_S, Condition, ConditionMonitor, offline_anchors
 from skyless.page.event_list import EventList
 from skyless.page.site_assets import AssetsFile, SiteAssets
-from skyless.run.assets import BadAssetsError
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.access import Role
 from skyless.run.mqtt.link import Link
@@ -52,7 +51,7 @@ from skyless.run.mqtt.messages import (
     read_message,
 )
 from skyless.run.zones.monitor import ZoneMonitor
-from skyless.run.zones.zone_list import BadZonesError, check_zones, read_zones, zones_of
+from skyless.run.zones.zone_list import check_zones, read_zones, zones_of
 from skyless.site.file.check import check_site
 
 _STATE_PERIOD_S: Final = 0.05
@@ -190,10 +189,8 @@ class LiveSite:
         self._clock, self._wall_clock = clock, wall_clock
         self._link: Link | None = None
         self._site_id: int | None = None
-        self._zones = ZonesMessage(())
-        """As the broker keeps them or they were stored here last, including other sites' zones of this number."""
-        self._drawn: ZonesMessage | None = None  # zones stored here that have not come back from the broker
-        self._zones_fault: str | None = None  # why the zones that the broker keeps cannot be read
+        self._zones = Kept(ZonesMessage(()), self._read_zones)
+        """With other sites' zones of this number."""
         self._dashboards: dict[str, StatusMessage] = {}
         self._sent_serial = 0
         self._health_due_s = self._condition_due_s = 0.0
@@ -233,15 +230,14 @@ class LiveSite:
             topics.truth_topic(site_id): self._on_truth,
             topics.zones_topic(site_id): self._on_zones,
             topics.zone_event_topic(site_id, "+"): self._on_zone_event,
-            topics.assets_topic(site_id): self._on_assets,
+            topics.assets_topic(site_id): lambda _topic, payload: self.assets.on_message(payload),
             **self.survey.handlers(site_id),
             **self.alarms.attach(link, site_id),
         }
         for topic, handler in handlers.items():
             link.subscribe(topic, self._counting(topic.rsplit("/", 1)[-1], handler), _qos(topic))
-        if self._drawn is not None:
-            link.publish(topics.zones_topic(site_id), self._drawn, qos=1, retain=True)
-        self.assets.attach(lambda message: link.publish(topics.assets_topic(site_id), message, qos=1, retain=True))
+        self._zones.attach(link, topics.zones_topic(site_id))
+        self.assets.kept.attach(link, topics.assets_topic(site_id))
 
     @property
     def number(self) -> int | None:
@@ -270,7 +266,7 @@ class LiveSite:
         def handle(topic: str, payload: bytes) -> None:
             try:
                 handler(topic, payload)
-            except (WrongMessageError, BadZonesError, BadAssetsError, ConfigurationError) as error:
+            except (WrongMessageError, ConfigurationError) as error:
                 self.dropped[kind] += 1
                 if self.dropped[kind] == 1:
                     _log.warning("dropped a wrong message of %s: %s; there may be more", topic, error)
@@ -358,24 +354,20 @@ class LiveSite:
     def _on_truth(self, _topic: str, payload: bytes) -> None:
         self.state.add_truth(read_message(payload, TruthMessage))
 
-    def _on_zones(self, topic: str, payload: bytes) -> None:
+    def _read_zones(self, payload: bytes) -> ZonesMessage:
+        message = read_zones(payload)
+        if not message.site and not message.others:  # of an older program, which knows of no other sites
+            message = msgspec.structs.replace(message, others=self._zones.message.others)
+        return message
+
+    def _on_zones(self, _topic: str, payload: bytes) -> None:
+        fault = self._zones.fault
         try:
-            message = read_zones(payload) if payload else ZonesMessage(())
-        except BadZonesError as error:
-            self._zones_fault = f"the zones that the broker keeps at {topic} cannot be read: {error}"
-            self._broadcast("zones", encode("zones", self._zone_fields()))
-            raise
-        if payload and not message.site and not message.others:  # of an older program, which knows of no other sites
-            message = ZonesMessage(message.zones, "", self._zones.others)
-        if self._drawn is not None:
-            if message != self._drawn:
-                return  # older than the zones stored here, which are on their way
-            self._drawn = None
-        elif message != self._zones and self._link is not None:
-            self._link.forget(topic)
-        fault, self._zones_fault = self._zones_fault, None
-        self._zones = message
-        self._assign_zones(changed=fault is not None)
+            if self._zones.receive(payload):
+                self._assign_zones()
+        finally:
+            if self._zones.fault != fault:
+                self._broadcast("zones", encode("zones", self._zone_fields()))
 
     def _on_zone_event(self, topic: str, payload: bytes) -> None:
         event = read_message(payload, ZoneEvent)
@@ -383,53 +375,36 @@ class LiveSite:
         if self.events.add_published(event):
             self._broadcast_event(event)
 
-    def _on_assets(self, topic: str, payload: bytes) -> None:
-        if self.assets.on_message(payload) and self._link is not None:
-            self._link.forget(topic)
-
     # Zones
 
     def store_zones(self, zones: tuple[Zone, ...], site: str = "") -> None:
-        """Store the zones that a page has drawn at the site of this name, by default at the site shown.
-
-        Raises BadZonesError; also where the broker keeps zones that cannot be read, which are not overwritten.
-        """
+        """Store the zones of a page, which shows the site of this name. Raises WrongMessageError."""
         check_zones(zones)
         shown = self._site_name
-        if site and site != shown:
-            raise BadZonesError(f"they are of the site {site[:100]!r}, but {shown[:100]!r} is shown now")
-        if self._zones_fault is not None:
-            raise BadZonesError(f"{self._zones_fault}; nothing was overwritten. Clear that topic to begin again")
-        self._store(ZonesMessage(zones, shown, zones_of(self._zones, shown).others))
+        self._zones.check_store(site, shown)
+        self._zones.store(ZonesMessage(zones, shown, zones_of(self._zones.message, shown).others))
         self._assign_zones()
 
     @property
     def _site_name(self) -> str:
         return "" if self.site is None else self.site.site.name
 
-    def _store(self, message: ZonesMessage) -> None:
-        self._zones = self._drawn = message
-        if self._link is not None and self._site_id is not None:
-            self._link.publish(topics.zones_topic(self._site_id), message, qos=1, retain=True)
-
-    def _assign_zones(self, *, changed: bool = False) -> None:
+    def _assign_zones(self) -> None:
         """Show the zones of the present site. Zones without a site become its own, for good."""
-        name = self._site_name
-        if name and not self._zones.site and self._zones.zones:
-            self._store(zones_of(self._zones, name))
-        is_foreign = not name and self._zones.site  # whose they are is known, but not whether that site is shown
-        zones = () if is_foreign else zones_of(self._zones, name).zones
+        name, kept = self._site_name, self._zones.message
+        if name and not kept.site and kept.zones:
+            self._zones.store(zones_of(kept, name))
+        is_foreign = not name and kept.site  # whose they are is known, but not whether that site is shown
+        zones = () if is_foreign else zones_of(kept, name).zones
         if zones != self.monitor.zones:
             self._schedule(self.monitor.set_zones(zones, self._wall_clock()))
             self.alarms.engine.set_zones(zones, self._clock())
-            changed = True
-        if changed:
             self._broadcast("zones", encode("zones", self._zone_fields()))
 
     def _zone_fields(self) -> dict[str, object]:
         """The zones of the present site, those of others that have its number, and why they cannot be read."""
-        others = zones_of(self._zones, self._site_name).others
-        return {"zones": self.monitor.zones, "other_zones": others, "zones_fault": self._zones_fault}
+        others = zones_of(self._zones.message, self._site_name).others
+        return {"zones": self.monitor.zones, "other_zones": others, "zones_fault": self._zones.fault}
 
     def _schedule(self, events: list[ZoneEvent]) -> None:
         if events:
@@ -444,21 +419,12 @@ class LiveSite:
 
     # Alarms
 
-    def store_alarm_rules(self, rules: Sequence[AlarmRule], site: str = "") -> None:
-        """Store the rules that a page has made at the site of this name. Raises BadAlarmRulesError."""
-        self.alarms.store_rules(rules, site)
-
     def acknowledge(self, rule: str, subject: str, occurrence: str, by: str) -> None:
         """Ask the dashboard that leads to acknowledge an alarm. Raises NoAlarmError and NoBrokerError."""
         link, site_id = self._connected()
         self.alarms.check_is_kept(rule, subject, occurrence)
         message = AcknowledgeMessage(occurrence, by[:100], self._wall_clock())
         link.publish(topics.acknowledge_topic(site_id, rule, subject), message, qos=1)
-
-    def is_acknowledged(self, rule: str, subject: str, occurrence: str) -> bool:
-        """Whether the broker has it that an alarm was acknowledged, so that no restart forgets it."""
-        stored = self._link is not None and not self._link.unacknowledged
-        return stored and self.alarms.is_acknowledged(rule, subject, occurrence)
 
     # Survey
 

@@ -7,9 +7,10 @@ from typing import Final
 
 from skyless.core.errors import SkylessError
 from skyless.core.whole_files import replace_files
+from skyless.page._kept import Kept
 from skyless.page._state import encode
-from skyless.run.assets import BadAssetsError, assets_at, check_assets, read_assets, read_csv, write_csv
-from skyless.run.mqtt.messages import Asset, AssetsMessage
+from skyless.run.assets import assets_at, check_assets, read_assets, read_csv, write_csv
+from skyless.run.mqtt.messages import Asset, AssetsMessage, WrongMessageError
 
 _NONE: Final = AssetsMessage(())
 _log = logging.getLogger("skyless.page")
@@ -34,7 +35,7 @@ class AssetsFile:
                 raise SkylessError(f"--assets is {str(path)!r}; it should be a file in a folder that exists")
         except OSError as error:
             raise SkylessError(f"--assets is {str(path)!r}, which cannot be read: {error.strerror}") from None
-        except BadAssetsError as error:
+        except WrongMessageError as error:
             raise SkylessError(f"{path}: {error}") from None
 
     def write(self, assets: tuple[Asset, ...]) -> None:
@@ -58,11 +59,7 @@ class SiteAssets:
     def __init__(self, broadcast: Callable[[str, bytes], None], file: AssetsFile | None = None) -> None:
         self._broadcast, self._file = broadcast, file
         self._site = ""
-        self._publish: Callable[[AssetsMessage], None] = lambda _message: None
-        self._kept = _NONE
-        """As the broker keeps them or they were stored here last."""
-        self._stored: AssetsMessage | None = None  # stored here, and not come back from the broker yet
-        self._fault: str | None = None  # why the assets that the broker keeps cannot be read
+        self.kept = Kept(_NONE, read_assets)
         self._due_s: float | None = None  # when a broker that has sent none has none
         self.by_tag: Mapping[str, Asset] = {}
         """The assets of the site that is shown."""
@@ -76,12 +73,6 @@ class SiteAssets:
         """What a page is sent."""
         return encode("assets", {"assets": self.message.assets})
 
-    def attach(self, publish: Callable[[AssetsMessage], None]) -> None:
-        """``publish`` gives a message to the broker, which keeps it."""
-        self._publish = publish
-        if self._stored is not None:
-            publish(self._stored)
-
     def on_connection(self, connected: bool, now_s: float) -> None:
         """The broker sends what it has kept soon after a connection."""
         self._due_s = now_s + SETTLE_S if connected else None
@@ -91,62 +82,39 @@ class SiteAssets:
         self._site = name
         self._show()
 
-    def on_message(self, payload: bytes) -> bool:
-        """Assets from the broker. False where they are only an echo. Raises BadAssetsError."""
-        try:
-            message = read_assets(payload) if payload else _NONE
-        except BadAssetsError as error:
-            self._fault = str(error)
-            raise
-        self._fault = None
-        if self._stored is not None:
-            if message == self._stored:
-                self._stored = None
-            return False  # the echo, or older than what was stored here and is on its way
+    def on_message(self, payload: bytes) -> None:
+        """Assets from the broker. Raises WrongMessageError."""
+        if self.kept.receive(payload):
+            self._show()
         if payload:
             self._due_s = None
-        if message == self._kept:
-            return False
-        self._kept = message
-        self._show()
-        return True
 
     def store(self, assets: tuple[Asset, ...], site: str = "") -> None:
-        """Replace all assets of the site of this name, by default of the one shown.
-
-        Raises BadAssetsError; also where the broker keeps assets that cannot be read or are of another site.
-        """
+        """Replace all assets; ``site`` names the site of the page that does. Raises WrongMessageError."""
         check_assets(assets)
-        if site and site != self._site:
-            raise BadAssetsError(f"site is {site[:100]!r}; it should be {self._site[:100]!r}, which is shown now")
-        if self._fault is not None:
-            raise BadAssetsError(f"the assets that the broker keeps cannot be read: {self._fault}; clear their topic")
-        if self._kept.assets and not self._is_own:
-            other = repr(self._kept.site[:100])
-            raise BadAssetsError(
-                f"the broker keeps assets of the site {other}, which has this number; clear their topic"
+        self.kept.check_store(site, self._site)
+        kept = self.kept.message
+        if kept.assets and kept.site not in ("", self._site):
+            raise WrongMessageError(
+                f"the broker keeps assets of the site {kept.site[:100]!r}, which has this number; clear their topic"
             )
         self._due_s = None
-        self._kept = self._stored = AssetsMessage(assets, self._site)
-        self._publish(self._stored)
+        self.kept.store(AssetsMessage(assets, self._site))
         self._show()
 
     def tick(self, now_s: float) -> None:
         """Give the broker the file's assets where it has none."""
         if self._due_s is not None and now_s >= self._due_s and self._site:
             self._due_s = None
-            if self._kept == _NONE and self._fault is None and self._file is not None and self._file.assets:
+            has_none = self.kept.message == _NONE and self.kept.fault is None
+            if has_none and self._file is not None and self._file.assets:
                 self.store(self._file.assets)
 
-    @property
-    def _is_own(self) -> bool:
-        """Whether what is kept is of the site that is shown."""
-        return self._kept.site in ("", self._site)
-
     def _show(self) -> None:
-        by_tag = assets_at(self._kept, self._site)
+        kept = self.kept.message
+        by_tag = assets_at(kept, self._site)
         if by_tag != self.by_tag:
             self.by_tag = by_tag
             self._broadcast("assets", self.encoded())
-        if self._file is not None and self._site and self._kept != _NONE and self._is_own:
+        if self._file is not None and self._site and kept != _NONE and kept.site in ("", self._site):
             self._file.write(self.message.assets)

@@ -8,7 +8,7 @@ from typing import Final
 
 import msgspec
 
-from skyless.run.mqtt.messages import Asset, AssetsMessage
+from skyless.run.mqtt.messages import Asset, AssetsMessage, WrongMessageError, read_message
 
 MAX_ASSETS: Final = 10_000
 MAX_BYTES: Final = 4_000_000
@@ -20,55 +20,43 @@ COLUMNS: Final = Asset.__struct_fields__
 _TAG: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 _COLOUR: Final = re.compile(r"(#[0-9A-Fa-f]{6})?")
 _MAX_LENGTHS: Final = {"name": 100, "group": 64, "icon": 8, "owner": 100, "notes": 1000}
-_MAX_SHOWN: Final = 40
-
-
-class BadAssetsError(ValueError):
-    """What is wrong with a list of assets."""
 
 
 def read_assets(payload: bytes) -> AssetsMessage:
-    """An ``AssetsMessage`` in JSON, all its assets checked. Raises BadAssetsError."""
-    try:
-        message = msgspec.json.decode(payload, type=AssetsMessage)
-    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise BadAssetsError(f"this is no list of assets: {error}") from None
+    """An ``AssetsMessage`` in JSON, all its assets checked. Raises WrongMessageError."""
+    message = read_message(payload, AssetsMessage)
     check_assets(message.assets)
     return message
 
 
 def check_assets(assets: tuple[Asset, ...]) -> None:
-    """Check a list of assets. Raises BadAssetsError, which names asset, key, value and what would be right."""
+    """Check a list of assets. Raises WrongMessageError, which names asset, key, value and what would be right."""
     if len(assets) > MAX_ASSETS:
-        raise BadAssetsError(f"there are {len(assets)} assets; at most {MAX_ASSETS} are allowed")
+        raise WrongMessageError(f"there are {len(assets)} assets; at most {MAX_ASSETS} are allowed")
     known: set[str] = set()
     for asset in assets:
         fault = "the tag has two assets; it should have one" if asset.tag in known else _fault(asset)
         if fault:
-            raise BadAssetsError(f"asset {asset.tag[:_MAX_SHOWN]!r}: {fault}")
+            raise WrongMessageError(f"asset {asset.tag[:40]!r}: {fault}")
         known.add(asset.tag)
     size = len(msgspec.json.encode(assets))
     if size > MAX_BYTES:
-        raise BadAssetsError(f"the list has {size} bytes; it should have {MAX_BYTES} at most: shorten the notes")
+        raise WrongMessageError(f"the list has {size} bytes; it should have {MAX_BYTES} at most: shorten the notes")
 
 
 def _fault(asset: Asset) -> str:
     """What is wrong with an asset, empty where nothing is."""
     if not _TAG.fullmatch(asset.tag):
-        return f"tag is {_shown(asset.tag)}; it should be 1 to 64 letters, digits, dots, dashes and underscores"
+        return f"tag is {asset.tag[:40]!r}; it should be 1 to 64 letters, digits, dots, dashes and underscores"
     for key, most in _MAX_LENGTHS.items():
         value = getattr(asset, key)
         if len(value) > most:
-            return f"{key} is {_shown(value)}; it should have {most} characters at most, not {len(value)}"
+            return f"{key} is {value[:40]!r}; it should have {most} characters at most, not {len(value)}"
         if not all(letter.isprintable() or letter in "\u200d\n\t" for letter in value):
-            return f"{key} is {_shown(value)}; it should have no control characters"
+            return f"{key} is {value[:40]!r}; it should have no control characters"
     if not _COLOUR.fullmatch(asset.colour):
-        return f"colour is {_shown(asset.colour)}; it should be #rrggbb, as #c2410c, or empty"
+        return f"colour is {asset.colour[:40]!r}; it should be #rrggbb, as #c2410c, or empty"
     return ""
-
-
-def _shown(value: str) -> str:
-    return repr(value if len(value) <= _MAX_SHOWN else value[: _MAX_SHOWN - 1] + "…")
 
 
 def write_csv(assets: Iterable[Asset]) -> bytes:
@@ -86,15 +74,15 @@ def read_csv(data: bytes) -> tuple[Asset, ...]:
     The head names the columns: ``tag``, and any of the others in any order.
 
     Raises:
-        BadAssetsError: it names the line.
+        WrongMessageError: it names the line.
     """
     if len(data) > MAX_BYTES:
-        raise BadAssetsError(f"the table has {len(data)} bytes; it should have {MAX_BYTES} at most")
+        raise WrongMessageError(f"the table has {len(data)} bytes; it should have {MAX_BYTES} at most")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
-        raise BadAssetsError(f"line {line}: it is not UTF-8; save the table as CSV UTF-8") from None
+        raise WrongMessageError(f"line {line}: it is not UTF-8; save the table as CSV UTF-8") from None
     head = text.partition("\n")[0]
     rows = csv.reader(io.StringIO(text, newline=""), delimiter=max(",;\t", key=head.count), strict=True)
     found: dict[str, tuple[int, Asset]] = {}
@@ -111,9 +99,9 @@ def read_csv(data: bytes) -> tuple[Asset, ...]:
                     fault = f"tag {asset.tag!r} stands in line {found[asset.tag][0]} already"
                 found[asset.tag] = rows.line_num, asset
             if fault:
-                raise BadAssetsError(f"line {rows.line_num}: {fault}")
+                raise WrongMessageError(f"line {rows.line_num}: {fault}")
     except csv.Error as error:
-        raise BadAssetsError(f"line {rows.line_num}: this is no CSV: {error}") from None
+        raise WrongMessageError(f"line {rows.line_num}: this is no CSV: {error}") from None
     assets = tuple(asset for _, asset in found.values())
     check_assets(assets)
     return assets
@@ -123,8 +111,8 @@ def _columns(head: list[str]) -> list[str]:
     columns = [name.strip().lower() for name in head]
     wrong = [name for name in columns if name not in COLUMNS or columns.count(name) > 1]
     if "tag" not in columns or wrong:
-        fault = f"the head has {wrong[0][:_MAX_SHOWN]!r}" if wrong else "the head has no column tag"
-        raise BadAssetsError(f"line 1: {fault}; it should have tag and any of {', '.join(COLUMNS[1:])}, each once")
+        fault = f"the head has {wrong[0][:40]!r}" if wrong else "the head has no column tag"
+        raise WrongMessageError(f"line 1: {fault}; it should have tag and any of {', '.join(COLUMNS[1:])}, each once")
     return columns
 
 

@@ -133,10 +133,10 @@ def _faults(rule: AlarmRule) -> Iterator[tuple[str, object, str]]:
 
 def _faults_of_kind(rule: AlarmRule) -> Iterator[tuple[str, object, str]]:
     """Keys that its kind needs, and those that it does not have."""
-    keys = KINDS[rule.kind].split()
-    given = {key: getattr(rule, key) or None for key in ("tags", "others", "hysteresis")}
-    for key, value in (given | {"zone": rule.zone, "limit": rule.limit}).items():
-        if value is not None and key not in keys:
+    keys, plain = KINDS[rule.kind].split(), AlarmRule(rule.id, rule.kind)
+    for key in ("tags", "others", "hysteresis", "zone", "limit"):
+        value = getattr(rule, key)
+        if key not in keys and value != getattr(plain, key):
             yield key, value, f"left out: it has no meaning for the kind {rule.kind}"
     if "zone" in keys and (rule.zone is None or not _ZONE.fullmatch(rule.zone)):
         yield "zone", rule.zone, "the id of a zone"

@@ -176,7 +176,7 @@ def alarm_rules(live: LiveSite) -> AlarmRulesAnswer:
 def put_alarm_rules(live: LiveSite, *, body: AlarmRulesMessage) -> AlarmRulesAnswer:
     """Replace the rules that were made on the page."""
     _known(live)
-    live.store_alarm_rules(body.rules, body.site)
+    live.alarms.store_rules(body.rules, body.site)
     return replace(alarm_rules(live), rules=body.rules)  # they hold from the next tick on
 
 
@@ -185,7 +185,7 @@ async def acknowledge(live: LiveSite, *, rule: RuleId, subject: Subject, body: A
     live.acknowledge(rule, subject, body.id, body.by)
     try:
         async with asyncio.timeout(_STORED_S):
-            while not live.is_acknowledged(rule, subject, body.id):
+            while not live.alarms.is_acknowledged(rule, subject, body.id):
                 await asyncio.sleep(_POLL_S)
     except TimeoutError:
         raise HTTPException(503, "the broker has not taken it yet; look whether the alarm is acknowledged") from None

@@ -15,19 +15,18 @@ Conditions are evaluated five times a second, and of zones with each event as we
 import math
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Final, Literal
 
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.alarm_rule import AlarmRule
+from skyless.core.alarm_rule import AlarmRule, RuleKind
 from skyless.core.alert import Alert
 from skyless.run.alarms.near import near_tags
-from skyless.run.alarms.rules import Concerned
 from skyless.run.mqtt.messages import AlarmMessage, Asset, FixMessage, TagHealth, WatchMessage, Zone, ZoneEvent
 from skyless.run.zones.monitor import TAG_TIMEOUT_S, ZoneMonitor
-from skyless.site.alarm_rules import read_hours
+from skyless.site.alarm_rules import GROUP, read_hours
 
 EVALUATION_S: Final = 0.2
 
@@ -73,6 +72,10 @@ class _Tag(Struct):
         return self.fixes >= 2 and now_s - self.first_s >= SETTLE_S
 
 
+_UNHEARD: Final = _Tag(math.inf)
+"""A tag of which nothing has been heard."""
+
+
 class _Case(Struct):
     """The condition of a rule for one subject."""
 
@@ -80,7 +83,19 @@ class _Case(Struct):
     since_s: float
     known_s: float
     """When it was last known whether the condition holds."""
-    has_no_room: bool = False
+
+
+class Concerned:
+    """The tags that ``tags`` or ``others`` of a rule name; all where the list is empty."""
+
+    def __init__(self, names: Sequence[str], assets: Mapping[str, Asset]) -> None:
+        self.named = {name for name in names if not name.startswith(GROUP)}
+        self.named |= {tag for tag, asset in assets.items() if f"{GROUP}{asset.group}" in names}
+        """Tags that are expected even if nothing has been heard of them."""
+        self._all = not names
+
+    def __contains__(self, tag: object) -> bool:
+        return self._all or tag in self.named
 
 
 class _Rule:
@@ -112,8 +127,6 @@ class AlarmEngine:
         """The alarms that are kept; those of another engine while that one leads."""
         self.leading = False
         """Whether it raises alarms: from ``resume`` on."""
-        self.not_raised = 0
-        """Alarms that had to wait until others ended, as there were too many."""
         self._monitor, self._local_time = monitor, local_time
         self._assets: Mapping[str, Asset] = {}
         self._zones: dict[str, Zone] = {}
@@ -121,8 +134,8 @@ class AlarmEngine:
         self._rules: dict[str, _Rule] = {}
         self._tags: dict[str, _Tag] = {}
         self._changed: dict[str, None] = {}  # tags with something new since the last evaluation
-        self._offline: frozenset[str] | None = None
-        self._displaced: dict[str, str] | None = None  # anchors that have moved, and the watch's sentence
+        self._anchors: dict[RuleKind, dict[str, str]] = {}
+        """What is known of anchors, by kind of rule: subjects for which the condition holds, and a sentence."""
         self._changes: list[Change] = []
         self._blind_s = self._evaluated_s = -math.inf
         self._unix_offset_s = 0.0
@@ -160,9 +173,7 @@ class AlarmEngine:
 
     def on_fix(self, fix: FixMessage, now_s: float) -> None:
         """A fix of a tag; to be called before the events that the monitor finds with it."""
-        tag = self._tags.get(fix.tag)
-        if tag is None:
-            tag = self._tags[fix.tag] = _Tag(now_s)
+        tag = self._tags.setdefault(fix.tag, _Tag(now_s))
         if not tag.is_fresh(now_s):
             tag.first_s, tag.fixes = now_s, 0
         tag.fix, tag.seen_s, tag.gone = fix, now_s, False
@@ -192,10 +203,10 @@ class AlarmEngine:
     def on_anchors(self, offline: Iterable[str] | None, watch: WatchMessage | None) -> None:
         """The anchors that are offline, None where that is not known, and what their watch has found."""
         if offline is not None:
-            self._offline = frozenset(offline)
+            self._anchors["anchor-offline"] = {f"anchor-{name}": "" for name in sorted(offline)}
         if watch is not None and watch.state == "watching":
             moved = [one for one in watch.findings if one.kind == "moved"]
-            self._displaced = {str(anchor): one.sentence for one in moved for anchor in one.anchors}
+            self._anchors["anchor-moved"] = {f"anchor-{name}": one.sentence for one in moved for name in one.anchors}
 
     # Leading, and what people do
 
@@ -265,20 +276,18 @@ class AlarmEngine:
                 return own.distances_m
             case "crowded":
                 return (f"zone-{own.rule.zone}",)
-            case "anchor-offline":
-                return [f"anchor-{name}" for name in sorted(self._offline or ())]
-            case "anchor-moved":
-                return [f"anchor-{name}" for name in self._displaced or ()]
+            case "anchor-offline" | "anchor-moved" as kind:
+                return self._anchors.get(kind, ())
             case "silent":
                 heard = own.concerned.named if own.rule.tags else [n for n, tag in self._tags.items() if tag.fix]
-                return sorted(name for name in heard if now_s - self._seen_s(name) >= own.rule.after_s)
+                return sorted(name for name in heard if now_s - self._tag(name).seen_s >= own.rule.after_s)
         return changed
 
     def _holds(  # noqa: PLR0911, PLR0912 - some for each kind
         self, own: _Rule, subject: str, now_s: float, *, held: bool
     ) -> bool | None:
         """Whether the condition holds; None where that is not known, so that it stays as it was."""
-        rule, tag, inside = own.rule, self._tags.get(subject), self._members[own.rule.zone or ""]
+        rule, tag, inside = own.rule, self._tag(subject), self._members[own.rule.zone or ""]
         limit, hysteresis = rule.limit or 0.0, rule.hysteresis if held else 0.0
         if rule.zone is not None and rule.zone not in self._zones:
             return False
@@ -289,13 +298,11 @@ class AlarmEngine:
                 return None if any(self._is_missed(name, now_s) for name in subject.split("~")) else False
             case "crowded":
                 return len(self._crowd(own)) > limit - hysteresis or (None if self._was_blind(now_s) else False)
-            case "anchor-offline":
-                return None if self._offline is None else subject.removeprefix("anchor-") in self._offline
-            case "anchor-moved":
-                return None if self._displaced is None else subject.removeprefix("anchor-") in self._displaced
+            case "anchor-offline" | "anchor-moved" as kind:
+                return subject in self._anchors[kind] if kind in self._anchors else None
         if subject not in own.concerned:
             return False
-        is_fresh, is_settled = tag is not None and tag.is_fresh(now_s), tag is not None and tag.is_settled(now_s)
+        is_fresh, is_settled = tag.is_fresh(now_s), tag.is_settled(now_s)
         match rule.kind:
             case "inside":
                 is_unknown = self._is_missed(subject, now_s) or (is_fresh and not is_settled)
@@ -303,26 +310,26 @@ class AlarmEngine:
             case "outside":
                 return False if subject in inside else True if is_fresh and is_settled else None
             case "silent":
-                if now_s - self._seen_s(subject) < rule.after_s:
+                if now_s - tag.seen_s < rule.after_s:
                     return False
                 return None if now_s - self._blind_s < rule.after_s else True
             case "battery":
-                return None if tag is None or tag.battery is None else tag.battery < limit + hysteresis
+                return None if tag.battery is None else tag.battery < limit + hysteresis
             case _:
-                level_m = _level_m(tag.fix if tag is not None else None)
+                level_m = _level_m(tag)
                 if level_m is None:
                     return None if self._is_missed(subject, now_s) else False
                 return level_m > limit - hysteresis
 
-    def _seen_s(self, name: str) -> float:
-        return self._tags[name].seen_s if name in self._tags else -math.inf
+    def _tag(self, name: str) -> _Tag:
+        return self._tags.get(name, _UNHEARD)
 
     def _was_blind(self, now_s: float) -> bool:
         return now_s - self._blind_s < CONFIRM_S
 
     def _is_missed(self, name: str, now_s: float) -> bool:
         """Whether a tag may be there though nothing has come from it."""
-        return self._was_blind(now_s) and self._seen_s(name) <= self._blind_s
+        return self._was_blind(now_s) and self._tag(name).seen_s <= self._blind_s
 
     def _crowd(self, own: _Rule) -> list[str]:
         return sorted(tag for tag in self._members[own.rule.zone or ""] if tag in own.concerned)
@@ -348,7 +355,7 @@ class AlarmEngine:
             case.known_s = now_s
             if holds != case.holds:
                 is_silent = holds and rule.kind == "silent"
-                case.holds, case.since_s = holds, max(self._seen_s(subject), self._blind_s) if is_silent else now_s
+                case.holds, case.since_s = holds, max(self._tag(subject).seen_s, self._blind_s) if is_silent else now_s
         message = self.messages.get((rule.id, subject))
         is_active = self.leading and message is not None and message.ended_unix_s is None
         if message is not None and is_active:
@@ -369,11 +376,10 @@ class AlarmEngine:
     def _raise(self, own: _Rule, subject: str, case: _Case, now_s: float) -> None:
         rule, unix_s = own.rule, now_s + self._unix_offset_s
         if (rule.id, subject) not in self.messages and not self._make_room():
-            self.not_raised += not case.has_no_room
-            case.has_no_room = True
             return
-        tags = self._tags_of(own, subject)
-        fix = self._tags[tags[0]].fix if tags and tags[0] in self._tags and rule.kind != "crowded" else None
+        is_of_tags = rule.kind not in ("crowded", "anchor-offline", "anchor-moved")
+        tags = tuple(subject.split("~") if is_of_tags else self._crowd(own))
+        fix = self._tag(tags[0]).fix if is_of_tags else None
         message = AlarmMessage(
             id=f"{rule.id}/{subject}/{round(1000.0 * unix_s)}",
             rule=rule.id,
@@ -386,7 +392,7 @@ class AlarmEngine:
             sentence=self._sentence(own, subject, now_s - case.since_s),
             tags=tags[:_MAX_NAMED],
             zone=rule.zone,
-            place=self._place(tags[0], fix) if tags and rule.kind != "crowded" else self._zone_name(rule.zone),
+            place=self._place(tags[0], fix) if is_of_tags else self._zone_name(rule.zone),
             position_m=None if fix is None else fix.position_m,
         )
         self._keep(message, "raised")
@@ -414,16 +420,6 @@ class AlarmEngine:
 
     # Words
 
-    def _tags_of(self, own: _Rule, subject: str) -> tuple[str, ...]:
-        match own.rule.kind:
-            case "near":
-                return tuple(subject.split("~"))
-            case "crowded":
-                return tuple(self._crowd(own))
-            case "anchor-offline" | "anchor-moved":
-                return ()
-        return (subject,)
-
     def _who(self, tag: str) -> str:
         name = self._assets[tag].name if tag in self._assets else ""
         return f"{name} ({tag})" if name and name != tag else tag
@@ -435,33 +431,25 @@ class AlarmEngine:
         names = [zone.name or zone.id for zone in self._monitor.zones_with(tag)]
         return ", ".join(names) or ("" if fix is None else "at x {:.1f}, y {:.1f} m".format(*fix.position_m))
 
-    def _sentence(self, own: _Rule, subject: str, held_s: float) -> str:  # noqa: PLR0911 - one for each kind
+    def _sentence(self, own: _Rule, subject: str, held_s: float) -> str:
         rule, limit, zone = own.rule, own.rule.limit or 0.0, self._zone_name(own.rule.zone)
-        who, tag, anchor = self._who(subject), self._tags.get(subject), subject.replace("-", " ", 1)
+        who = " and ".join(map(self._who, subject.split("~")))
+        tag, anchor = self._tag(subject), subject.replace("-", " ", 1)
         lasting = f" for {_span(max(rule.after_s, held_s))}" if rule.after_s >= 1.0 else ""
-        match rule.kind:
-            case "inside":
-                return f"{who} {'has been' if lasting else 'is'} in {zone}{lasting}"
-            case "outside":
-                return f"{who} {'has not been' if lasting else 'is not'} in {zone}{lasting}"
-            case "silent":
-                return f"{who} has sent no fixes{lasting}"
-            case "near":
-                both = " and ".join(map(self._who, subject.split("~")))
-                return f"{both} are {own.distances_m.get(subject, limit):.1f} m apart; at least {limit:g} m is right"
-            case "crowded":
-                return f"{len(self._crowd(own))} tags are in {zone}; at most {limit:g} are allowed"
-            case "anchor-offline":
-                return f"{anchor} {'has been' if lasting else 'is'} offline{lasting}"
-            case "anchor-moved":
-                return (self._displaced or {}).get(subject.removeprefix("anchor-"), f"{anchor} has moved").rstrip(".")
-            case "battery":
-                share = 0.0 if tag is None or tag.battery is None else tag.battery
-                return f"the battery of {who} is at {share:.0%}; {limit:.0%} is the least"
-            case _:
-                level_m = _level_m(tag.fix if tag is not None else None)
-                level = "unknown" if level_m is None or level_m == math.inf else f"{level_m:.2f} m"
-                return f"the protection level of {who} is {level}; at most {limit:g} m is allowed"
+        share, level_m = tag.battery or 0.0, _level_m(tag)
+        level = "unknown" if level_m is None or level_m == math.inf else f"{level_m:.2f} m"
+        apart_m, moved = own.distances_m.get(subject, limit), self._anchors.get("anchor-moved", {}).get(subject)
+        return {
+            "inside": f"{who} {'has been' if lasting else 'is'} in {zone}{lasting}",
+            "outside": f"{who} {'has not been' if lasting else 'is not'} in {zone}{lasting}",
+            "silent": f"{who} has sent no fixes{lasting}",
+            "near": f"{who} are {apart_m:.1f} m apart; at least {limit:g} m is right",
+            "crowded": f"{len(self._crowd(own))} tags are in {zone}; at most {limit:g} are allowed",
+            "anchor-offline": f"{anchor} {'has been' if lasting else 'is'} offline{lasting}",
+            "anchor-moved": (moved or f"{anchor} has moved").rstrip("."),
+            "battery": f"the battery of {who} is at {share:.0%}; {limit:.0%} is the least",
+            "protection-level": f"the protection level of {who} is {level}; at most {limit:g} m is allowed",
+        }[rule.kind]
 
 
 def is_over(message: AlarmMessage) -> bool:
@@ -469,8 +457,9 @@ def is_over(message: AlarmMessage) -> bool:
     return message.ended_unix_s is not None and message.acknowledged_unix_s is not None
 
 
-def _level_m(fix: FixMessage | None) -> float | None:
+def _level_m(tag: _Tag) -> float | None:
     """The horizontal protection level; infinite where none can be given, None of a method that has none."""
+    fix = tag.fix
     if fix is None or fix.hpl_m is not None:
         return None if fix is None else fix.hpl_m
     return math.inf if fix.alert in (Alert.UNAVAILABLE, Alert.NOT_EXCLUDED) else None

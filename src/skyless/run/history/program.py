@@ -22,9 +22,9 @@ from skyless.run.history.writer import FILE_ROWS, Writer
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
-from skyless.run.mqtt.messages import AlarmMessage, FixMessage, SiteMessage, StatusMessage, ZoneEvent
+from skyless.run.mqtt.messages import AlarmMessage, FixMessage, SiteMessage, StatusMessage, WrongMessageError, ZoneEvent
 from skyless.run.process import Log, every, keep, reader, together
-from skyless.run.zones.zone_list import BadZonesError, read_zones
+from skyless.run.zones.zone_list import read_zones
 
 _STORE_S: Final = 0.1
 _SYNC_S: Final = 1.0
@@ -147,7 +147,7 @@ class HistoryNode:
     def _on_zones(self, _topic: str, payload: bytes) -> None:
         try:
             self._writer.set_zones(read_zones(payload).zones if payload else ())
-        except BadZonesError:
+        except WrongMessageError:
             self._writer.drops["wrong-message"] += 1
 
     def _store(self) -> None:

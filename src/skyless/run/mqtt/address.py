@@ -15,6 +15,10 @@ from skyless.core.errors import SkylessError
 PASSWORD_VARIABLE: Final = "SKYLESS_MQTT_PASSWORD"
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
 _LOOPBACK: Final = re.compile(r"localhost|127(\.\d{1,3}){3}|::1")
+_PASSWORD: Final = re.compile(
+    r"^((?>(?:[^:/?#]*://)?)(?>\[[\da-fA-F:.]+\]|[^:/?#@]*)):(?!\d{1,5}(?:/[^?#@]*)?\?\w+(?:[=&]|$)).*@"
+)
+"""What comes after a colon behind user or host, up to the last ``@``; not a port and a query such as ``?to=a@b``."""
 
 
 class MqttAddress(Struct, frozen=True):
@@ -41,7 +45,7 @@ class MqttAddress(Struct, frozen=True):
     @property
     def loopback(self) -> bool:
         """Whether the broker, and each of several, is on this machine."""
-        return all(_LOOPBACK.fullmatch(host) for host, _ in self._hosts)
+        return all(is_loopback(host) for host, _ in self._hosts)
 
     @property
     def brokers(self) -> "tuple[MqttAddress, ...]":
@@ -126,4 +130,9 @@ def _wrong(url: str, expected: str) -> SkylessError:
 
 def hide_password(url: str) -> str:
     """The URL with asterisks in place of its password, however wrong the rest is."""
-    return re.sub(r"^((?:[^:/?#]*://)?[^:/?#@]*):.*@", r"\1:***@", url)
+    return _PASSWORD.sub(r"\1:***@", url)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host is this machine."""
+    return _LOOPBACK.fullmatch(host) is not None

@@ -601,7 +601,7 @@ class AcknowledgeMessage(Struct, frozen=True):
 
 
 class WrongMessageError(ValueError):
-    """A message that does not fit its topic."""
+    """A message that does not fit its topic: what is wrong with it."""
 
 
 def read_message(payload: bytes, kind: type[_T]) -> _T:

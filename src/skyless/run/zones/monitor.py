@@ -7,15 +7,17 @@ lies beyond it by the margin, or by half of the margin in every fix for a while.
 import math
 from typing import Final
 
+from msgspec import Struct
+
 from skyless.core.ellipse import horizontal_ellipse
 from skyless.core.site import FloorSite
 from skyless.run.mqtt.messages import FixMessage, Vector, Zone, ZoneEvent
-from skyless.run.zones.floors import floor_at
 from skyless.run.zones.zone_list import area_m2, depth_m, perimeter_m
 
 MIN_MARGIN_M: Final = 0.05
+_MIN_FLOOR_MARGIN_M: Final = 0.1
 _MARGIN_SIGMAS: Final = 3.0
-"""The margin in standard deviations of the fix in its worst direction; it is at least ``MIN_MARGIN_M``."""
+"""Margins in standard deviations of the fix, for a zone in its worst direction; they are at least those above."""
 
 CROSSING_S: Final = 0.3
 """Fixes beyond the edge by half of the margin must last this long."""
@@ -34,24 +36,30 @@ class _MonitoredZone:
         # So that a zone smaller than the error can be entered; for a disc it is half of the radius.
         self.max_margin_m = area_m2(zone.polygon_m) / perimeter_m(zone.polygon_m)
 
-    def may_hold(self, position_m: Vector) -> bool:
-        """Whether a position lies in the box around the zone, a quick first test."""
+    def beyond_m(self, tag: "_TagState") -> float:
+        """How far a tag has crossed the edge, from the side where it was; negative where it has not."""
         x1, y1, x2, y2 = self.box
-        x, y, _ = position_m
-        return x1 < x < x2 and y1 < y < y2
+        x, y, _ = tag.position_m
+        was_inside = self.zone.id in tag.inside
+        if tag.floor is not None and self.zone.floor not in (None, tag.floor):
+            depth = -math.inf
+        elif was_inside or (x1 < x < x2 and y1 < y < y2):
+            depth = depth_m((x, y), self.zone.polygon_m)
+        else:
+            return -math.inf  # a quick first test
+        return -depth if was_inside else depth
 
 
-class _TagState:
+class _TagState(Struct):
     """The last fix of a tag and the zones that it is in."""
 
-    def __init__(self) -> None:
-        self.updated_s = 0.0
-        self.position_m: Vector = (0.0, 0.0, 0.0)
-        self.inside: set[str] = set()
-        self.floor: int | None = None
-        """The number of its floor; None where its height or the floors are not known."""
-        self.beyond_since_s: dict[str, float] = {}
-        """By zone: start of the time in which every fix was beyond its edge by half of the margin."""
+    updated_s: float = 0.0
+    position_m: Vector = (0.0, 0.0, 0.0)
+    inside: set[str] = set()
+    floor: int | None = None
+    """The number of its floor; None where its height or the floors are not known."""
+    beyond_since_s: dict[str, float] = {}
+    """By zone: start of the time in which every fix was beyond its edge by half of the margin."""
 
 
 class ZoneMonitor:
@@ -84,18 +92,11 @@ class ZoneMonitor:
         margin_m = max(MIN_MARGIN_M, _MARGIN_SIGMAS * horizontal_ellipse(fix.covariance_m2)[0])
         std_z_m = math.sqrt(max(fix.covariance_m2[8], 0.0))
         tag.floor = None if fix.height_known else floor_at(self.floors, fix.position_m[2], std_z_m, tag.floor)
-        events = []
-        for zone_id, zone in self._monitored.items():
-            if tag.floor is not None and zone.zone.floor not in (None, tag.floor):
-                tag.beyond_since_s.pop(zone_id, None)
-                if zone_id in tag.inside:
-                    tag.inside.discard(zone_id)
-                    events.append(_event(zone.zone, fix.tag, tag, fix.unix_s, entered=False))
-            elif zone_id not in tag.inside and not zone.may_hold(fix.position_m):
-                tag.beyond_since_s.pop(zone_id, None)
-            elif _crossed(tag, zone, fix, margin_m):
-                events.append(_event(zone.zone, fix.tag, tag, fix.unix_s, entered=zone_id in tag.inside))
-        return events
+        return [
+            _event(zone.zone, fix.tag, tag, fix.unix_s, entered=zone.zone.id in tag.inside)
+            for zone in self._monitored.values()
+            if _crossed(tag, zone, fix.unix_s, margin_m)
+        ]
 
     def expire_tags(self, now_s: float, unix_s: float) -> list[ZoneEvent]:
         """Remove tags that had no fix for ``TAG_TIMEOUT_S`` from their zones."""
@@ -107,12 +108,6 @@ class ZoneMonitor:
         inside = self._tags[name].inside if name in self._tags else set()
         return sorted((self._monitored[zone].zone for zone in inside), key=lambda zone: area_m2(zone.polygon_m))
 
-    def floor_of(self, name: str) -> int | None:
-        """The number of the floor that a tag is on: by its height, or else by the smallest zone that lies on one."""
-        if name in self._tags and self._tags[name].floor is not None:
-            return self._tags[name].floor
-        return next((zone.floor for zone in self.zones_with(name) if zone.floor is not None), None)
-
     def remove_tag(self, name: str, unix_s: float) -> list[ZoneEvent]:
         """Remove a tag from all zones."""
         tag = self._tags.pop(name, None)
@@ -121,23 +116,37 @@ class ZoneMonitor:
         return [_event(self._monitored[z].zone, name, tag, unix_s, entered=False) for z in sorted(tag.inside)]
 
 
-def _crossed(tag: _TagState, zone: _MonitoredZone, fix: FixMessage, margin_m: float) -> bool:
+def floor_at(floors: tuple[FloorSite, ...], z_m: float, std_m: float, before: int | None) -> int | None:
+    """The number of the floor at a height, whose standard deviation is given; None at a site without floors.
+
+    A tag stays on the floor where it was before until it is beyond the boundary by the margin, so that noise on a
+    ladder or a stair changes nothing. The margin is at most a third of the height between two floors.
+    """
+    if not floors:
+        return None
+    row = max((index for index, floor in enumerate(floors) if floor.low_m <= z_m), default=0)
+    rows = {floor.number: index for index, floor in enumerate(floors)}
+    if before not in rows or abs(row - rows[before]) != 1:
+        return floors[row].number
+    low, high = sorted((row, rows[before]))
+    boundary_m = floors[high].low_m
+    margin_m = min(max(_MIN_FLOOR_MARGIN_M, _MARGIN_SIGMAS * std_m), (boundary_m - floors[low].low_m) / 3.0)
+    return before if abs(z_m - boundary_m) < margin_m else floors[row].number
+
+
+def _crossed(tag: _TagState, zone: _MonitoredZone, unix_s: float, margin_m: float) -> bool:
     """Whether the tag has changed sides; if so, ``tag.inside`` is updated."""
     zone_id = zone.zone.id
-    margin_m = min(margin_m, zone.max_margin_m)
-    was_inside = zone_id in tag.inside
-    depth = depth_m(fix.position_m[:2], zone.zone.polygon_m)
-    beyond_m = -depth if was_inside else depth
+    margin_m, beyond_m = min(margin_m, zone.max_margin_m), zone.beyond_m(tag)
     if beyond_m < 0.5 * margin_m:
         tag.beyond_since_s.pop(zone_id, None)
         return False
-    since_s = tag.beyond_since_s.setdefault(zone_id, fix.unix_s)
-    if fix.unix_s < since_s:  # the tag's host has set its clock back
-        since_s = tag.beyond_since_s[zone_id] = fix.unix_s
-    if beyond_m < margin_m and fix.unix_s - since_s < CROSSING_S:
+    since_s = min(tag.beyond_since_s.get(zone_id, unix_s), unix_s)  # its host may set its clock back
+    tag.beyond_since_s[zone_id] = since_s
+    if beyond_m < margin_m and unix_s - since_s < CROSSING_S:
         return False
     del tag.beyond_since_s[zone_id]
-    (tag.inside.discard if was_inside else tag.inside.add)(zone_id)
+    tag.inside ^= {zone_id}
     return True
 
 

@@ -1,16 +1,28 @@
-"""Zones as polygons (corners in order, metres), and lists of them: which are valid, and which belong to a site."""
+"""Zones as polygons (corners in order, metres), and lists of them: which are valid, and which belong to a site.
+
+Plain arithmetic: bridges and the page's server start without NumPy.
+"""
 
 import math
 import re
-from itertools import pairwise
+from collections.abc import Iterator
+from itertools import combinations, pairwise
 from typing import Final
 
-import msgspec
-
-from skyless.run.mqtt.messages import SiteZones, Zone, ZonesMessage
+from skyless.run.mqtt.messages import SiteZones, WrongMessageError, Zone, ZonesMessage, read_message
 
 Point = tuple[float, float]
 Polygon = tuple[Point, ...]
+
+_MAX_ZONES: Final = 100
+_MAX_CORNERS: Final = 100
+_MAX_CORNER_M: Final = 1e5
+
+MAX_OTHER_SITES: Final = 20
+"""Other sites of one number whose zones are kept; the ones not seen for longest are dropped."""
+
+_ID: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+_COLOUR: Final = re.compile(r"#[0-9A-Fa-f]{3,8}|[A-Za-z]{1,32}")
 
 
 def area_m2(polygon: Polygon) -> float:
@@ -51,21 +63,9 @@ def depth_m(point: Point, polygon: Polygon) -> float:
 
 def is_simple(polygon: Polygon) -> bool:
     """Whether no two sides touch or cross, except neighbours in their common corner."""
-    segments = sides(polygon)
-    last = len(segments) - 1
-    for i, (a, b) in enumerate(segments):
-        if a == b or _folds_back(a, b, segments[(i + 1) % len(segments)][1]):
-            return False
-        for j in range(i + 2, len(segments)):
-            if (i, j) != (0, last) and _touch(a, b, *segments[j]):
-                return False
-    return True
-
-
-def _folds_back(a: Point, b: Point, c: Point) -> bool:
-    """Whether the side b–c runs back along a–b."""
-    towards = (a[0] - b[0]) * (c[0] - b[0]) + (a[1] - b[1]) * (c[1] - b[1])
-    return _turn(a, b, c) == 0.0 and towards > 0.0
+    segments = list(enumerate(sides(polygon)))
+    pairs = ((one, other) for (i, one), (j, other) in combinations(segments, 2) if 1 < j - i < len(segments) - 1)
+    return area_m2(polygon) > 0.0 and not any(_touch(*one, *other) for one, other in pairs)
 
 
 def _touch(a: Point, b: Point, c: Point, d: Point) -> bool:
@@ -82,30 +82,11 @@ def _turn(a: Point, b: Point, c: Point) -> float:
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
-_MAX_ZONES: Final = 100
-_MAX_CORNERS: Final = 100
-_MAX_CORNER_M: Final = 1e5
-
-MAX_OTHER_SITES: Final = 20
-"""Other sites of one number whose zones are kept; the ones not seen for longest are dropped."""
-
-_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}")
-_COLOUR = re.compile(r"#[0-9A-Fa-f]{3,8}|[A-Za-z]{1,32}")
-
-
-class BadZonesError(ValueError):
-    """What is wrong with a list of zones."""
-
-
 def read_zones(payload: bytes) -> ZonesMessage:
-    """A ``ZonesMessage`` in JSON, all its zones checked. Raises BadZonesError."""
-    try:
-        message = msgspec.json.decode(payload, type=ZonesMessage)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise BadZonesError(f"this is no list of zones: {error}") from None
-    check_zones(message.zones)
-    for other in message.others:
-        check_zones(other.zones)
+    """A ``ZonesMessage`` in JSON, all its zones checked. Raises WrongMessageError."""
+    message = read_message(payload, ZonesMessage)
+    for zones in (message.zones, *(other.zones for other in message.others)):
+        check_zones(zones)
     return message
 
 
@@ -124,34 +105,29 @@ def zones_of(message: ZonesMessage, site: str) -> ZonesMessage:
 
 
 def check_zones(zones: tuple[Zone, ...]) -> None:
-    """Check that zones can be monitored and named in topics. Raises BadZonesError."""
+    """Check that zones can be monitored and named in topics. Raises WrongMessageError."""
     if len(zones) > _MAX_ZONES:
-        raise BadZonesError(f"there are {len(zones)} zones; at most {_MAX_ZONES} are allowed")
+        raise WrongMessageError(f"there are {len(zones)} zones; at most {_MAX_ZONES} are allowed")
     known: set[str] = set()
     for zone in zones:
-        fault = _text_fault(zone) or _shape_fault(zone.polygon_m)
-        if fault:
-            raise BadZonesError(f"zone {(zone.name or zone.id)[:40]!r} {fault}")
+        for fault in _faults(zone):
+            raise WrongMessageError(f"zone {(zone.name or zone.id)[:40]!r} {fault}")
         if zone.id in known:
-            raise BadZonesError(f"two zones have the id {zone.id!r}")
+            raise WrongMessageError(f"two zones have the id {zone.id!r}")
         known.add(zone.id)
 
 
-def _text_fault(zone: Zone) -> str | None:
+def _faults(zone: Zone) -> Iterator[str]:
+    corners = zone.polygon_m
     if not _ID.fullmatch(zone.id):
-        return "has an id that is not 1 to 64 letters, digits, dots, dashes and underscores"
+        yield "has an id that is not 1 to 64 letters, digits, dots, dashes and underscores"
     if len(zone.name) > 100:
-        return "has a name of more than 100 characters"
+        yield "has a name of more than 100 characters"
     if zone.colour is not None and not _COLOUR.fullmatch(zone.colour):
-        return "has a colour that is neither #rrggbb nor a name"
-    return None
-
-
-def _shape_fault(corners: Polygon) -> str | None:
+        yield "has a colour that is neither #rrggbb nor a name"
     if not 3 <= len(corners) <= _MAX_CORNERS:
-        return f"has {len(corners)} corners; it should have 3 to {_MAX_CORNERS}"
+        yield f"has {len(corners)} corners; it should have 3 to {_MAX_CORNERS}"
     if not all(math.isfinite(value) and abs(value) <= _MAX_CORNER_M for corner in corners for value in corner):
-        return f"has a corner that is not finite or farther than {_MAX_CORNER_M:g} m"
+        yield f"has a corner that is not finite or farther than {_MAX_CORNER_M:g} m"
     if not is_simple(corners):
-        return "crosses or touches itself"
-    return None
+        yield "crosses or touches itself"
