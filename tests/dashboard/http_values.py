@@ -128,7 +128,7 @@ def fill(live, wire):
     wire.deliver(topics.status_topic(SITE_ID, "tag", "t9"), status(name="t9"))
     wire.deliver(topics.status_topic(SITE_ID, "anchor", "1"), status("anchor", "1"))
     live.alarms = MagicMock(messages=(ALARM,), rules=(RULE,), file_rules=())
-    live.store_alarm_rules = lambda rules, site: setattr(live.alarms, "rules", rules)
+    live.alarms.store_rules = lambda rules, site: setattr(live.alarms, "rules", rules)
     live.acknowledged = []
     live.acknowledge = lambda *what: live.acknowledged.append(what)
     live.tick()
@@ -136,4 +136,4 @@ def fill(live, wire):
 
 def show(live, wire, name, x=2.0, **more):
     """A fix of a tag."""
-    wire.deliver(topics.fix_topic(SITE_ID, name), fix(name, live._wall_clock(), (x, 2.0, 1.0), **more))
+    wire.deliver(topics.fix_topic(SITE_ID, name), fix(name, live.wall_clock(), (x, 2.0, 1.0), **more))

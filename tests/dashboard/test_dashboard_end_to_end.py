@@ -18,10 +18,8 @@ from websockets.protocol import State
 from skyless.page.app import Services, make_app
 from skyless.page.guard import AccessRules
 from skyless.page.live import IDLE_S, MAX_PAGES_PER_ADDRESS
-from skyless.page.overlays import Overlays
 from skyless.page.playback import Playback
 from skyless.page.sites import LiveSites
-from skyless.page.what_if import WhatIfs
 from skyless.run.broker import BrokerSettings, start_broker
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.link import Link
@@ -198,7 +196,7 @@ async def test_without_a_broker_the_page_opens_and_shows_it():
 
 def test_idle_connections_shut_nobody_out_and_a_page_too_many_gets_the_reason(live, times):
     async def check():
-        services = Services(LiveSites(live), Overlays(), Playback(None), WhatIfs())
+        services = Services(LiveSites(live), Playback(None))
         with socket.socket() as sock:
             sock.bind(("127.0.0.1", 0))
             config = uvicorn.Config(make_app(services, AccessRules()), ws="websockets-sansio", log_config=None)
