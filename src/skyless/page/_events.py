@@ -5,6 +5,7 @@ or the recording's times.
 """
 
 from collections import deque
+from collections.abc import Callable
 from typing import Final, Literal
 
 from msgspec import Struct
@@ -78,9 +79,9 @@ class _Alert:
 class EventLog:
     """Gathers events. Readers ask for what is new since a serial."""
 
-    def __init__(self, unix_offset_s: float = 0.0) -> None:
-        """``unix_offset_s`` is Unix time less the owner's time. It follows a clock that is set."""
-        self.unix_offset_s = unix_offset_s
+    def __init__(self, unix_offset_s: float = 0.0, add: Callable[[Event], None] = lambda _event: None) -> None:
+        """``add`` is given each event. ``unix_offset_s``, Unix time less the owner's, is to be kept up to date."""
+        self.unix_offset_s, self._add_to_list = unix_offset_s, add
         self.serial = 0
         self._events: deque[Event] = deque(maxlen=MAX_LOGGED)
         self._statuses: dict[tuple[str, str], StatusMessage] = {}
@@ -258,7 +259,9 @@ class EventLog:
         if kind == "master" and self._events and self._events[-1].kind == kind:
             last = self._events.pop()
             count, first = last.count + 1, last.first
-        self._events.append(Event(self.serial, now_s + self.unix_offset_s, kind, level, name, text, count, first))
+        event = Event(self.serial, now_s + self.unix_offset_s, kind, level, name, text, count, first)
+        self._events.append(event)
+        self._add_to_list(event)
 
 
 def _first(condition: Condition) -> tuple[str, str]:

@@ -9,9 +9,7 @@ import logging
 import platform
 import time
 import zlib
-from collections import deque
 from collections.abc import Callable
-from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -22,7 +20,7 @@ from starlette.exceptions import HTTPException
 from skyless.core.errors import ConfigurationError
 from skyless.core.version import installed_version
 from skyless.page._alarms import SiteAlarms
-from skyless.page._events import MAX_EVENTS, MAX_LOGGED, EventLog, EventQueue, publisher_rank
+from skyless.page._events import EventLog, EventQueue, publisher_rank
 from skyless.page._site_survey import SiteSurvey
 from skyless.page._state import PageRequest, Sent, SiteState, encode
 from skyless.page.condition.evidence import Evidence
@@ -82,14 +80,14 @@ class TooManyPagesError(Exception):
 class PageQueue:
     """Messages that wait for one page: the newest of each kind, so that a slow page's queue stays short."""
 
-    def __init__(self, hello: bytes, address: str = "", now_s: float = 0.0) -> None:
-        """``address`` is its computer's."""
+    def __init__(self, hello: bytes, events: EventList, address: str = "", now_s: float = 0.0) -> None:
+        """``address`` is its computer's. Of ``events`` it is sent those that are new."""
         self.closed, self.reason = False, ""
         """Whether its connection is to be ended, and why."""
         self.address, self.active_s = address, now_s
         """When it last sent something."""
         self._latest: dict[str, bytes] = {"hello": hello}
-        self._lines = {most: deque[bytes](maxlen=most) for most in (MAX_EVENTS, MAX_LOGGED)}
+        self._events, self._event = events, events.last
         self._sent = Sent()
         self._state_due = self._health_due = True
         self._wake = asyncio.Event()
@@ -100,13 +98,8 @@ class PageQueue:
         self._latest[kind] = message
         self._wake.set()
 
-    def add(self, message: bytes, most: int) -> None:
-        """Add a message that replaces no other. The oldest is dropped beyond ``MAX_EVENTS`` or ``MAX_LOGGED``."""
-        self._lines[most].append(message)
-        self._wake.set()
-
     def request_state(self, *, health: bool = False) -> None:
-        """Send the state, or also the healths, with the next messages if there is anything new."""
+        """Send the events and the state, or also the healths, if there is anything new."""
         self._state_due = True
         self._health_due |= health
         self._wake.set()
@@ -125,10 +118,9 @@ class PageQueue:
         """Wait for messages and return them all, in the order in which the page needs them."""
         await self._wake.wait()
         self._wake.clear()
-        messages = [*self._latest.values(), *chain(*self._lines.values())]
+        messages = [*self._latest.values(), *(message for _, message in self._events.since(self._event))]
+        self._event = self._events.last
         self._latest.clear()
-        for lines in self._lines.values():
-            lines.clear()
         if self._health_due:
             messages.append(state.new_health(self._sent))
         new = state.new_state(self._sent) if self._state_due else None
@@ -179,16 +171,15 @@ class LiveSite:
         self._drawn: ZonesMessage | None = None  # zones stored here that have not come back from the broker
         self._zones_fault: str | None = None  # why the zones that the broker keeps cannot be read
         self._dashboards: dict[str, StatusMessage] = {}
-        self._sent_serial = 0
+        self._sent_serials = 0, 0  # of the newest fix and event that pages were told of
         self._health_due_s = self._condition_due_s = 0.0
         self.evidence = Evidence(host, clock())
-        self.log = EventLog(wall_clock() - clock())
+        self.log = EventLog(wall_clock() - clock(), self.event_list.add_logged)
         self.alarms = SiteAlarms(name, self.monitor, self._broadcast, self.log.on_alarm)
         if site is not None:
             self._use_site(site)
         self._condition_monitor = ConditionMonitor(self.evidence)
         self.condition: Condition = self._condition_monitor.evaluate(clock())
-        self._logged_serial = 0
         self._lag_s = 0.0
         self._used_share = used_share
         self._sites: bytes | None = None
@@ -357,7 +348,7 @@ class LiveSite:
         event = read_message(payload, ZoneEvent)
         _check_name(event.zone, topic)
         if self.events.add_published(event):
-            self._broadcast_event(event)
+            self.event_list.add_zone_event(event)
 
     def _on_assets(self, topic: str, payload: bytes) -> None:
         if self.assets.on_message(payload) and self._link is not None:
@@ -414,7 +405,7 @@ class LiveSite:
 
     def _publish_events(self, now_s: float) -> None:
         for event in self.events.pop_due(now_s):
-            self._broadcast_event(event)
+            self.event_list.add_zone_event(event)
             if self._link is not None and self._site_id is not None:
                 self._link.publish(topics.zone_event_topic(self._site_id, event.zone), event, qos=1)
 
@@ -465,7 +456,6 @@ class LiveSite:
     def open_page(self, address: str = "", *, live2: bool = False) -> PageQueue:
         """The queue of a new page of a computer, with what it needs first. Raises TooManyPagesError."""
         self._make_room(address)
-        self._send_logged()
         hello = {
             "version": installed_version(),
             "site": self.site,
@@ -475,7 +465,7 @@ class LiveSite:
             "history": self.has_history,
             "live2": live2,
         }
-        page = PageQueue(encode("hello", hello), address, self._clock())
+        page = PageQueue(encode("hello", hello), self.event_list, address, self._clock())
         page.replace("mqtt", self._connection())
         self.state.now_s = self._clock()
         page.replace("condition", self._condition_message())
@@ -519,10 +509,6 @@ class LiveSite:
         now_s, unix_s = self._clock(), self.wall_clock()
         self.state.now_s, self.state.unix_s = now_s, unix_s
         self.log.unix_offset_s = unix_s - now_s
-        if self.state.serial != self._sent_serial:
-            self._sent_serial = self.state.serial
-            for page in self.pages:
-                page.request_state()
         if now_s >= self._health_due_s:
             self._health_due_s = now_s + _HEALTH_PERIOD_S
             self._schedule(self.monitor.expire_tags(now_s, unix_s))
@@ -536,7 +522,11 @@ class LiveSite:
         self.assets.tick(now_s)
         if now_s >= self._condition_due_s:
             self._evaluate(now_s)
-        self._send_logged()
+        serials = self.state.serial, self.event_list.last
+        if serials != self._sent_serials:
+            self._sent_serials = serials
+            for page in self.pages:
+                page.request_state()
 
     def _evaluate(self, now_s: float) -> None:
         watch, age_s = self.survey.watch.message, self.survey.watch.age_s()
@@ -562,16 +552,6 @@ class LiveSite:
         """Its time gives pages the server's clock where no tag moves."""
         return encode("condition", {"unix_s": self.wall_clock(), **msgspec.structs.asdict(self.condition)})
 
-    def _send_logged(self) -> None:
-        events = self.log.since(self._logged_serial)
-        if events:
-            self._logged_serial = self.log.serial
-            for event in events:
-                self.event_list.add_logged(event)
-            message = encode("log", {"events": events})
-            for page in self.pages:
-                page.add(message, MAX_LOGGED)
-
     async def run(self) -> None:
         """Tick until cancelled."""
         due_s = self._clock()
@@ -586,12 +566,6 @@ class LiveSite:
     def _broadcast(self, kind: str, message: bytes) -> None:
         for page in self.pages:
             page.replace(kind, message)
-
-    def _broadcast_event(self, event: ZoneEvent) -> None:
-        self.event_list.add_zone_event(event)
-        message = encode("zone_event", msgspec.structs.asdict(event))
-        for page in self.pages:
-            page.add(message, MAX_EVENTS)
 
 
 def _floor_of(topic: str) -> int | None:

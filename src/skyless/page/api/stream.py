@@ -66,7 +66,7 @@ class SiteStream:
 
     def _new_zone_events(self) -> list[bytes]:
         number, self._event = self._event, self._live.event_list.last
-        events = (event.zone_event for event in self._live.event_list.since(number))
+        events = (event.zone_event for event, _ in self._live.event_list.since(number))
         return [_message("zone_event", event) for event in events if event is not None and self._carries(event.tag)]
 
     def _new_alarms(self) -> list[bytes]:
