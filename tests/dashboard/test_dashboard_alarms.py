@@ -118,7 +118,7 @@ def test_an_alarm_is_published_kept_acknowledged_and_cleared(broker):
     alarm = broker.alarm()
     assert (alarm.rule, alarm.subject, alarm.place, alarm.ended_unix_s) == ("r", "t1", "Desk", None)
     assert [one["id"] for one in sent(live, "alarms")["alarms"]] == [alarm.id]
-    assert any("alarm r: t1 is in Desk" in event.text for event in live.log.since())
+    assert any("alarm r: t1 is in Desk" in event.text for event in live.log.events)
     with pytest.raises(NoAlarmError):
         live.acknowledge("r", "t1", "another", "Ada")
     live.acknowledge("r", "t1", alarm.id, "Ada")

@@ -69,7 +69,7 @@ def test_what_is_not_taken_in_is_counted_and_not_judged(live, wire, times, monke
     messages = drained(live, live.open_page())
     assert len(of("state", messages)[0]["tags"]) == 5
     assert len(of("health", messages)[0]["conditions"]) == 6
-    assert [event.text for event in live.log.since() if event.name in {"anchor/7", "anchor/8", "anchor/9"}] == []
+    assert [event.text for event in live.log.events if event.name in {"anchor/7", "anchor/8", "anchor/9"}] == []
 
 
 def test_invented_kinds_and_names_do_not_fill_the_memory(live, wire, monkeypatch):

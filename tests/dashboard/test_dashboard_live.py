@@ -327,7 +327,7 @@ def test_neither_a_clock_that_is_set_nor_an_absent_broker_nor_a_stall_makes_anch
     pass_time(8.0, lag_s=8.0)
     pass_time(0.5)
     pass_time(0.5)
-    assert [event for event in live.log.since() if event.kind == "anchor"] == []
+    assert [event for event in live.log.events if event.kind == "anchor"] == []
     pass_time(SILENT_S)
-    (event,) = [event for event in live.log.since() if event.kind == "anchor"]
+    (event,) = [event for event in live.log.events if event.kind == "anchor"]
     assert (event.text, event.unix_s) == ("anchor 1 does not report any more", times.unix_s)

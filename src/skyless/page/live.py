@@ -469,7 +469,7 @@ class LiveSite:
         page.replace("mqtt", self._connection())
         self.state.now_s = self._clock()
         page.replace("condition", self._condition_message())
-        page.replace("log", encode("log", {"events": self.log.since()}))
+        page.replace("log", encode("log", {"events": list(self.log.events)}))
         page.replace("assets", self.assets.encoded())
         if self.plans:
             page.replace("floor_plan", self._floor_plan_message())

@@ -219,8 +219,8 @@ def _version(file: Path) -> _Version:
 @lru_cache(_MAX_OPEN)
 def _events(path: Path, _of: _Version, stopped: threading.Event) -> RecordedEvents:
     """The events of the same log that the live page has, by the recording's times."""
-    log = EventLog()
     events: list[Event] = []
+    log = EventLog(add=events.append)
     due_s, last_s = 0.0, float("-inf")
     with McapRecording(path) as recording:
         for found in recording.messages({"status", "health", "fix", "watch"}):
@@ -233,7 +233,6 @@ def _events(path: Path, _of: _Version, stopped: threading.Event) -> RecordedEven
                 due_s = found.time_s + _TICK_S
             last_s = found.time_s
             _log_message(log, found)
-            events += log.since(len(events))
     return RecordedEvents(tuple(events[:MAX_RECORDED_EVENTS]), len(events) < MAX_RECORDED_EVENTS)
 
 
