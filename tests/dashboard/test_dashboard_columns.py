@@ -14,6 +14,7 @@ from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
 from skyless.page import live2
+from skyless.page._state import read_request
 from skyless.page.app import Services, make_app
 from skyless.page.columns import Columns
 from skyless.page.gathered import Gathered
@@ -132,7 +133,7 @@ def test_anchors_and_their_conditions():
     ],
 )
 def test_a_wrong_view_is_none(text):
-    assert View.read(text) is None
+    assert read_request(text, View) is None
 
 
 def test_a_page_is_sent_anchors_conditions_and_the_tags_of_its_view(monkeypatch):

@@ -25,7 +25,7 @@ from skyless.core.errors import ConfigurationError
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.site import Site
 from skyless.page._alarms import NoAlarmError
-from skyless.page._state import PageRequest
+from skyless.page._state import PageRequest, read_request
 from skyless.page.api import geojson
 from skyless.page.api.past import Past
 from skyless.page.api.routes import api_routes, read_bytes
@@ -310,7 +310,7 @@ async def _live(socket: WebSocket) -> None:
 
     def receive(text: str) -> None:
         live.keep_page(page)
-        wanted = None if text == "ping" else PageRequest.read(text)
+        wanted = None if text == "ping" else read_request(text, PageRequest)
         if text == "ping":
             page.replace("pong", b'{"type":"pong"}')
         elif wanted is not None:

@@ -10,6 +10,7 @@ from nats.aio.msg import Msg
 from starlette.websockets import WebSocket
 
 from skyless.core.site import AnchorSite
+from skyless.page._state import read_request
 from skyless.page.columns import Columns
 from skyless.page.live import MAX_PAGES, LiveSite
 from skyless.page.live2 import View, anchors_message, conditions_message, tags_message
@@ -89,7 +90,7 @@ class _Page:
 
     def ask(self, text: str) -> None:
         """The page has another view."""
-        self._view = View.read(text) or self._view
+        self._view = read_request(text, View) or self._view
 
     def news(self, live: LiveSite, columns: Columns, now_s: float) -> list[bytes]:
         """What is new to the page."""
