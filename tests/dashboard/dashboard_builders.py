@@ -7,10 +7,8 @@ from starlette.testclient import TestClient
 from skyless.page.api.past import Past
 from skyless.page.app import Services, make_app
 from skyless.page.guard import AccessRules
-from skyless.page.overlays import Overlays
 from skyless.page.playback import Playback
 from skyless.page.sites import LiveSites
-from skyless.page.what_if import WhatIfs
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.messages import FixMessage, SiteMessage, StatusMessage, TruthMessage, Zone
 from skyless.sim.lab import lab_site
@@ -108,5 +106,5 @@ HERE = "http://localhost:8080"
 def browser_of(live, recordings=None, *, page=None, rules=None, base_url=HERE, history=None):
     """A client of a server that shows one live site, or several, and the recordings of a folder."""
     sites = live if isinstance(live, LiveSites) else LiveSites(live)
-    services = Services(sites, Overlays(), Playback(recordings), WhatIfs(), Past(history))
+    services = Services(sites, Playback(recordings), Past(history))
     return TestClient(make_app(services, rules or AccessRules(), **({"page": page} if page else {})), base_url=base_url)

@@ -136,4 +136,4 @@ def fill(live, wire):
 
 def show(live, wire, name, x=2.0, **more):
     """A fix of a tag."""
-    wire.deliver(topics.fix_topic(SITE_ID, name), fix(name, live._wall_clock(), (x, 2.0, 1.0), **more))
+    wire.deliver(topics.fix_topic(SITE_ID, name), fix(name, live.wall_clock(), (x, 2.0, 1.0), **more))

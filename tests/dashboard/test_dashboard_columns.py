@@ -14,6 +14,7 @@ from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
 from skyless.page import live2
+from skyless.page._state import read_request
 from skyless.page.app import Services, make_app
 from skyless.page.columns import Columns
 from skyless.page.gathered import Gathered
@@ -132,14 +133,14 @@ def test_anchors_and_their_conditions():
     ],
 )
 def test_a_wrong_view_is_none(text):
-    assert View.read(text) is None
+    assert read_request(text, View) is None
 
 
 def test_a_page_is_sent_anchors_conditions_and_the_tags_of_its_view(monkeypatch):
     live, gathered, columns = LiveSite("here", "mqtt://broker:1", SITE), Gathered(NatsAddress("nats://none")), Columns()
     live.attach(Wire(), SITE_ID)
     monkeypatch.setattr(gathered, "columns", {SITE_ID: columns}.get)
-    app = make_app(Services(LiveSites(live), None, None, None, gathered=gathered), AccessRules())
+    app = make_app(Services(LiveSites(live), None, gathered=gathered), AccessRules())
     browser = TestClient(app, base_url="http://localhost:8080")
     columns.update(records_of([(5, 10**15, 1000, 1000)]), time.monotonic())
     with browser.websocket_connect("ws://localhost:8080/live2") as socket:

@@ -1,9 +1,12 @@
 """``skyless dashboard``: its options, its port, and connections that never finish their first request."""
 
 import asyncio
+import json
+import signal
 import socket
 import subprocess
 import sys
+from urllib.parse import urlsplit
 
 import pytest
 import uvicorn
@@ -174,3 +177,31 @@ def test_a_request_that_is_never_finished_is_ended(sent):
     ended, answer = asyncio.run(run())
     assert ended == b""
     assert answer.endswith(b"done")
+
+
+BUSY = """
+import sys, threading
+from skyless.cli.main import main
+from skyless.run.history import queries
+
+class History:
+    def __init__(self, folder, site): ...
+    def tags(self):
+        print("asked", flush=True)
+        threading.Event().wait()
+
+queries.History = History
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_question_to_the_history_that_never_ends_does_not_keep_the_dashboard(tmp_path):
+    options = ["--mqtt", f"mqtt://127.0.0.1:{free_port()}", "--site", "lab", "--history", str(tmp_path), "--json"]
+    command = [sys.executable, "-c", BUSY, "dashboard", *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        page = json.loads(process.stdout.readline())["page"]
+        with socket.create_connection(("127.0.0.1", urlsplit(page).port)) as asking:
+            asking.sendall(b"GET /api/v1/history/tags HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            assert process.stdout.readline() == "asked\n"
+            process.send_signal(signal.SIGINT)
+            assert process.wait() == 0

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from test_dashboard_condition import anchor_health
 from test_dashboard_live import drained, of
 
-from skyless.page._state import MAX_ROWS, PageRequest
+from skyless.page._state import MAX_ROWS, PageRequest, read_request
 from skyless.page.condition import evidence
 from skyless.run.mqtt import topics
 
@@ -69,7 +69,7 @@ def test_what_is_not_taken_in_is_counted_and_not_judged(live, wire, times, monke
     messages = drained(live, live.open_page())
     assert len(of("state", messages)[0]["tags"]) == 5
     assert len(of("health", messages)[0]["conditions"]) == 6
-    assert [event.text for event in live.log.since() if event.name in {"anchor/7", "anchor/8", "anchor/9"}] == []
+    assert [event.text for event in live.log.events if event.name in {"anchor/7", "anchor/8", "anchor/9"}] == []
 
 
 def test_invented_kinds_and_names_do_not_fill_the_memory(live, wire, monkeypatch):
@@ -118,5 +118,7 @@ def test_a_page_gets_the_tags_of_its_view_and_those_that_it_names_or_looks_for(l
 
 @pytest.mark.parametrize("text", ["", "pong", "[]", '{"view": 3}', '{"rows": 0}', '{"tags": "t1"}', "[" * 5000])
 def test_a_request_that_is_none_changes_nothing(text):
-    assert PageRequest.read(text) is None
-    assert PageRequest.read(json.dumps({"rows": 5, "view": [0, 1, 2, 3]})) == PageRequest((0.0, 1.0, 2.0, 3.0), rows=5)
+    assert read_request(text, PageRequest) is None
+    assert read_request(json.dumps({"rows": 5, "view": [0, 1, 2, 3]}), PageRequest) == PageRequest(
+        (0.0, 1.0, 2.0, 3.0), rows=5
+    )

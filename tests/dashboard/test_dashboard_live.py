@@ -9,7 +9,8 @@ from dashboard_builders import SITE, SITE_ID, SQUARE, fix, status, truth
 from msgspec.structs import replace
 from test_dashboard_condition import anchor_health
 
-from skyless.page._events import MAX_EVENTS, SILENT_S
+from skyless.page._events import SILENT_S
+from skyless.page.event_list import MAX_KEPT
 from skyless.page.live import LiveSite
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import SiteZones, WrongMessageError, ZoneEvent, ZonesMessage
@@ -162,15 +163,16 @@ def test_the_echo_of_an_own_event_is_not_sent_again(live, wire):
     drained(live, page)
     wire.deliver(EVENT, wire.published[-1][1])
     wire.deliver(EVENT, ZoneEvent("desk", "Desk", "t9", "enter", 1.0, (0.0, 0.0, 0.0)))
+    live.tick()
     assert [event["tag"] for event in of("zone_event", drained(live, page))] == ["t9"]
 
 
 def test_events_of_a_slow_page_are_bounded(live, wire):
     page = live.open_page()
-    for k in range(3 * MAX_EVENTS):
+    for k in range(MAX_KEPT + 10):
         wire.deliver(EVENT, ZoneEvent("desk", "Desk", f"t{k}", "enter", 1.0, (0.0, 0.0, 0.0)))
     events = of("zone_event", drained(live, page))
-    assert [event["tag"] for event in events] == [f"t{k}" for k in range(2 * MAX_EVENTS, 3 * MAX_EVENTS)]
+    assert [event["tag"] for event in events] == [f"t{k}" for k in range(10, MAX_KEPT + 10)]
 
 
 def test_a_second_dashboard_leaves_publishing_to_the_first(live, wire, times):
@@ -324,7 +326,7 @@ def test_neither_a_clock_that_is_set_nor_an_absent_broker_nor_a_stall_makes_anch
     pass_time(8.0, lag_s=8.0)
     pass_time(0.5)
     pass_time(0.5)
-    assert [event for event in live.log.since() if event.kind == "anchor"] == []
+    assert [event for event in live.log.events if event.kind == "anchor"] == []
     pass_time(SILENT_S)
-    (event,) = [event for event in live.log.since() if event.kind == "anchor"]
+    (event,) = [event for event in live.log.events if event.kind == "anchor"]
     assert (event.text, event.unix_s) == ("anchor 1 does not report any more", times.unix_s)

@@ -6,10 +6,11 @@ import msgspec
 import page_fake_site as made_up
 import pytest
 from dashboard_builders import SITE, SITE_ID, SQUARE, Wire, browser_of, fix, truth
+from starlette.exceptions import HTTPException
 
 from skyless.page.guard import AccessRules
 from skyless.page.live import LiveSite
-from skyless.page.playback import NoRecordingError, Playback
+from skyless.page.playback import Playback
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import WatchFinding, WatchMessage, ZonesMessage
 from skyless.run.recordings.recorder import McapFile, McapRecorder
@@ -126,7 +127,7 @@ def test_nothing_outside_the_folder_is_read(folder, name):
         Playback(None).summary,
     )
     for read in opening:
-        with pytest.raises(NoRecordingError):
+        with pytest.raises(HTTPException):
             read(name)
     assert [found.name for found in Playback(folder).recordings()] == ["first.mcap"]
 
@@ -224,7 +225,7 @@ def test_the_events_of_a_recording_are_those_that_a_live_page_would_have_listed(
         ("watch", "anchor/2", 13),
     ]
     assert playback.events("events.mcap") is found, "it is read once"
-    with pytest.raises(NoRecordingError):
+    with pytest.raises(HTTPException):
         playback.events("../events.mcap")
 
 

@@ -6,8 +6,9 @@ import json
 import msgspec
 import pytest
 from dashboard_builders import SITE, Times, Wire, browser_of
+from starlette.exceptions import HTTPException
 
-from skyless.page.live import LiveSite, NoSiteError
+from skyless.page.live import LiveSite
 from skyless.page.sites import LiveSites
 from skyless.run.find_site import SiteOnBroker
 from skyless.run.mqtt import topics
@@ -93,7 +94,7 @@ def test_a_page_without_a_choice_stays_where_programs_are_online(stage):
 @pytest.mark.parametrize("asked", ["7", "-1", "x", "٥", "5 ", "99999999999"])
 def test_a_site_that_is_not_there_is_named(stage, asked):
     stage.on_broker(s5=1)
-    with pytest.raises(NoSiteError, match="no such site"):
+    with pytest.raises(HTTPException, match="no such site"):
         stage.sites.of(asked)
     assert stage.client().get("/fixes.geojson", params={"site": asked}).status_code == 404
 
@@ -120,5 +121,5 @@ def test_a_server_of_one_site_shows_that_and_offers_none(stage):
     sites = LiveSites(stage.make())
     live = sites.of(None)
     assert "sites" not in messages_of(live)
-    with pytest.raises(NoSiteError):
+    with pytest.raises(HTTPException):
         sites.of("1")

@@ -11,10 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from skyless.core.errors import SkylessError
 from skyless.core.site import FloorPlanSite, UnplacedAnchor
 from skyless.page._site_survey import SiteSurvey
 from skyless.page.app import MAX_FLOOR_PLAN_BYTES
-from skyless.page.overlays import NoOverlayError, overlay_task
+from skyless.page.overlay_process import overlay
+from skyless.page.tasks import OverlayTask
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.access import Role
 from skyless.run.mqtt.address import MqttAddress
@@ -221,5 +223,5 @@ def test_a_site_without_positions_has_no_overlay_yet(live, wire):
     site = replace(SITE.site, anchors=(), unplaced=unplaced, schedule=schedule)
     wire.deliver(topics.site_topic(SITE_ID), replace(SITE, site=site))
     assert live.dropped == {}
-    with pytest.raises(NoOverlayError, match="no anchor of this site has a position yet"):
-        overlay_task(site, None, "joint", 0.25)
+    with pytest.raises(SkylessError, match="no anchor of this site has a position yet"):
+        overlay(OverlayTask(site, "pdop", "joint", 0.25, None))

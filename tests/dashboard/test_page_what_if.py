@@ -1,6 +1,5 @@
 """A piece of a recording is recomputed by WebAssembly in the browser, as the library does it on the host."""
 
-import asyncio
 import socket
 import sys
 import threading
@@ -8,7 +7,6 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
-import msgspec
 import numpy as np
 import pytest
 import uvicorn
@@ -16,6 +14,7 @@ from msgspec.structs import replace
 from page_browser import until
 
 from recordings import live_site
+from skyless.core.errors import SkylessError
 from skyless.core.estimator import compiled
 from skyless.core.estimator.process import REJECTED, STALE, BatchPacket, BatchRow, Place, Relay
 from skyless.core.estimator.state import State
@@ -24,10 +23,10 @@ from skyless.core.native.views import records
 from skyless.page.app import Services, make_app
 from skyless.page.guard import AccessRules
 from skyless.page.live import LiveSite
-from skyless.page.overlays import Overlays
 from skyless.page.playback import Playback
 from skyless.page.sites import LiveSites
-from skyless.page.what_if import NoWhatIfError, WhatIf, WhatIfs, WhatIfTask
+from skyless.page.tasks import WhatIfTask
+from skyless.page.what_if_process import what_if
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import wasm_core
@@ -54,7 +53,7 @@ def folder(tmp_path_factory):
 def server(folder, times):
     """The page's own server, with that recording."""
     live = LiveSite("here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s)
-    app = make_app(Services(LiveSites(live), Overlays(), Playback(folder), WhatIfs()), AccessRules())
+    app = make_app(Services(LiveSites(live), Playback(folder)), AccessRules())
     with socket.socket() as sock:
         sock.bind(("127.0.0.1", 0))
         running = uvicorn.Server(uvicorn.Config(app, ws="websockets-sansio", log_config=None))
@@ -73,8 +72,7 @@ def prepared(folder):
 
 
 def prepared_of(folder):
-    answer = asyncio.run(WhatIfs().get(WhatIfTask(str(folder / "lab.mcap"), TAG, live_site.UNIX_S, 3.0)))
-    return msgspec.json.decode(answer, type=WhatIf)
+    return what_if(WhatIfTask(str(folder / "lab.mcap"), TAG, live_site.UNIX_S, 3.0))
 
 
 def on_the_host(found, without=(), moved_m=(0.0, 0.0, 0.0), noise=1.0):
@@ -157,8 +155,8 @@ def test_relays_with_phases_are_recomputed_like_those_without(prepared, tmp_path
 )
 def test_why_there_is_nothing_to_recompute(folder, task, words):
     usual = WhatIfTask(str(folder / "lab.mcap"), TAG, live_site.UNIX_S, 3.0)
-    with pytest.raises(NoWhatIfError, match=words):
-        asyncio.run(WhatIfs().get(replace(usual, **task)))
+    with pytest.raises(SkylessError, match=words):
+        what_if(replace(usual, **task))
 
 
 @pytest.mark.statistical

@@ -1,6 +1,7 @@
 """``skyless dashboard``: the live page."""
 
 import contextlib
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -78,12 +79,10 @@ def dashboard(
     from skyless.page.app import Services
     from skyless.page.condition.evidence import ProcessorUse
     from skyless.page.live import LiveSite
-    from skyless.page.overlays import Overlays
     from skyless.page.playback import Playback
     from skyless.page.serve import bind, serve
     from skyless.page.site_assets import AssetsFile
     from skyless.page.sites import LiveSites
-    from skyless.page.what_if import WhatIfs
 
     address = broker.address()
     if address is None:
@@ -114,12 +113,12 @@ def dashboard(
         sys.stdout.flush()
     else:
         print(f"page    {page}\nbroker  {address}", flush=True)
-    services = Services(
-        *(LiveSites(live, make), Overlays(), Playback(recordings), WhatIfs(), Past(history)),
-        gathered=_gathered(nats, address),
-    )
+    services = Services(LiveSites(live, make), Playback(recordings), Past(history), gathered=_gathered(nats, address))
     with contextlib.suppress(KeyboardInterrupt):
         asyncio.run(serve(services, rules, sock, address, known.site.id if known is not None else site_id))
+    if services.past.is_busy:  # Python would wait for the thread that answers
+        sys.stdout.flush()
+        os._exit(0)
 
 
 def _gathered(nats: str | None, broker: "MqttAddress") -> "Gathered | None":

@@ -5,6 +5,7 @@ or the recording's times.
 """
 
 from collections import deque
+from collections.abc import Callable
 from typing import Final, Literal
 
 from msgspec import Struct
@@ -76,13 +77,14 @@ class _Alert:
 
 
 class EventLog:
-    """Gathers events. Readers ask for what is new since a serial."""
+    """Gathers events."""
 
-    def __init__(self, unix_offset_s: float = 0.0) -> None:
-        """``unix_offset_s`` is Unix time less the owner's time. It follows a clock that is set."""
-        self.unix_offset_s = unix_offset_s
+    def __init__(self, unix_offset_s: float = 0.0, add: Callable[[Event], None] = lambda _event: None) -> None:
+        """``add`` is given each event. ``unix_offset_s``, Unix time less the owner's, is to be kept up to date."""
+        self.unix_offset_s, self._add_to_list = unix_offset_s, add
         self.serial = 0
-        self._events: deque[Event] = deque(maxlen=MAX_LOGGED)
+        self.events: deque[Event] = deque(maxlen=MAX_LOGGED)
+        """The oldest first."""
         self._statuses: dict[tuple[str, str], StatusMessage] = {}
         self._reported: dict[tuple[str, str], float] = {}  # nodes whose health comes, and when it came last
         self._silent: set[tuple[str, str]] = set()
@@ -92,11 +94,6 @@ class EventLog:
         self._saved: int | None = None
         self._surveyed_by: str | None = None
         self._condition: Condition | None = None
-
-    def since(self, serial: int = 0) -> list[Event]:
-        """Events after a serial, the oldest first."""
-        new = min(self.serial - serial, len(self._events))
-        return [] if new <= 0 else [event for event in list(self._events)[-new:] if event.serial > serial]
 
     # Nodes
 
@@ -255,10 +252,12 @@ class EventLog:
     def _add(self, now_s: float, kind: Kind, level: Severity, name: str, text: str) -> None:
         self.serial += 1
         count, first = 1, self.serial
-        if kind == "master" and self._events and self._events[-1].kind == kind:
-            last = self._events.pop()
+        if kind == "master" and self.events and self.events[-1].kind == kind:
+            last = self.events.pop()
             count, first = last.count + 1, last.first
-        self._events.append(Event(self.serial, now_s + self.unix_offset_s, kind, level, name, text, count, first))
+        event = Event(self.serial, now_s + self.unix_offset_s, kind, level, name, text, count, first)
+        self.events.append(event)
+        self._add_to_list(event)
 
 
 def _first(condition: Condition) -> tuple[str, str]:

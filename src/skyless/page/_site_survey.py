@@ -9,6 +9,7 @@ from typing import Generic, TypeVar
 
 from msgspec import Struct
 from msgspec.structs import replace
+from starlette.exceptions import HTTPException
 
 from skyless.page._state import encode
 from skyless.run.mqtt.messages import (
@@ -26,10 +27,6 @@ Handler = Callable[[str, bytes], None]
 _M = TypeVar("_M", SurveyMessage, WatchMessage)
 
 
-class NoResultError(Exception):
-    """Why there is no result that could be saved."""
-
-
 class Newest(Generic[_M]):
     """The newest message of a retained topic, and how old it is.
 
@@ -37,7 +34,8 @@ class Newest(Generic[_M]):
     new when they arrive; their sender's clock does not matter.
     """
 
-    def __init__(self, kind: type[_M], clock: Callable[[], float], wall_clock: Callable[[], float]) -> None:
+    def __init__(self, name: str, kind: type[_M], clock: Callable[[], float], wall_clock: Callable[[], float]) -> None:
+        self.name = name
         self.message: _M | None = None
         self._kind: type[_M] = kind
         self._clock, self._wall_clock = clock, wall_clock
@@ -60,6 +58,10 @@ class Newest(Generic[_M]):
         """Seconds since the message was made, or None without one."""
         return None if self.message is None else self._clock() - self._made_s
 
+    def encoded(self) -> bytes:
+        """What a page is sent."""
+        return encode(self.name, {self.name: self.message, "age_s": self.age_s()})
+
 
 class SiteSurvey:
     """The newest messages of the survey program. Each change is handed to ``broadcast`` for the open pages."""
@@ -73,40 +75,26 @@ class SiteSurvey:
     ) -> None:
         """``name`` is the dashboard's on MQTT."""
         self._name, self._broadcast = name, broadcast
-        self._survey = Newest(SurveyMessage, clock, wall_clock)
-        self._watch = Newest(WatchMessage, clock, wall_clock)
-        self._newest: dict[str, Newest[SurveyMessage] | Newest[WatchMessage]] = {
-            "survey": self._survey,
-            "watch": self._watch,
-        }
+        self.survey = Newest("survey", SurveyMessage, clock, wall_clock)
+        """State of the survey program."""
+        self.watch = Newest("watch", WatchMessage, clock, wall_clock)
+        """What the watch of the anchors has found."""
 
     def handlers(self, site_id: int) -> dict[str, Handler]:
         """What is to be subscribed to, and who handles it."""
-        return {survey_topic(site_id): partial(self._on, "survey"), watch_topic(site_id): partial(self._on, "watch")}
-
-    @property
-    def watch(self) -> WatchMessage | None:
-        """What the watch of the anchors has found."""
-        return self._watch.message
-
-    @property
-    def watch_age_s(self) -> float | None:
-        """Seconds since the watch reported, or None where it has not."""
-        return self._watch.age_s()
-
-    @property
-    def survey(self) -> SurveyMessage | None:
-        """State of the survey program."""
-        return self._survey.message
+        return {
+            survey_topic(site_id): partial(self._on, self.survey),
+            watch_topic(site_id): partial(self._on, self.watch),
+        }
 
     def messages(self) -> dict[str, bytes]:
         """The messages that a new page needs, by kind."""
-        return {kind: self._encoded(kind) for kind, newest in self._newest.items() if newest.message is not None}
+        return {one.name: one.encoded() for one in (self.survey, self.watch) if one.message is not None}
 
     def expect_kept(self) -> None:
         """The broker is connected again: it sends the messages that it kept."""
-        for newest in self._newest.values():
-            newest.expect_kept()
+        self.survey.expect_kept()
+        self.watch.expect_kept()
 
     def facts_message(self, body: bytes) -> SurveyFactsMessage:
         """What a page's user knows, ready to be published. Raises BadFactsError."""
@@ -118,25 +106,21 @@ class SiteSurvey:
         return replace(message, by=self._name)
 
     def save_message(self, body: bytes) -> SurveySaveMessage:
-        """The request to save a result, ready to be published. Raises BadFactsError and NoResultError."""
+        """The request to save a result, ready to be published. Raises BadFactsError and HTTPException."""
         try:
             serial = read_message(body, _SaveRequest).serial
         except WrongMessageError as error:
             raise BadFactsError(f'this is no request to save, such as {{"serial": 12}}: {error}') from None
-        newest = self._survey.message
+        newest = self.survey.message
         if newest is None or newest.survey is None:
-            raise NoResultError("the survey has no result yet")
+            raise HTTPException(409, "the survey has no result yet")
         if not 0 <= serial <= newest.serial:
-            raise NoResultError(f"there is no result {serial}; the newest is {newest.serial}")
+            raise HTTPException(409, f"there is no result {serial}; the newest is {newest.serial}")
         return SurveySaveMessage(self._name, serial)
 
-    def _on(self, kind: str, _topic: str, payload: bytes) -> None:
-        self._newest[kind].read(payload)
-        self._broadcast(kind, self._encoded(kind))
-
-    def _encoded(self, kind: str) -> bytes:
-        newest = self._newest[kind]
-        return encode(kind, {kind: newest.message, "age_s": newest.age_s()})
+    def _on(self, newest: Newest[_M], _topic: str, payload: bytes) -> None:
+        newest.read(payload)
+        self._broadcast(newest.name, newest.encoded())
 
 
 class _SaveRequest(Struct):

@@ -4,7 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Collection, Iterable
 from itertools import islice
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
@@ -36,6 +36,7 @@ MAX_REQUEST_BYTES: Final = 16_384
 _MAX_NAMED: Final = 200
 
 _MAX_ENCODED: Final = 16
+_Request = TypeVar("_Request", bound=Struct)
 _KINDS: Final[dict[type, str]] = {AnchorHealth: "anchors", TagHealth: "tags", EtherHealth: "ether"}
 
 CHOICE_S: Final = 0.5
@@ -61,13 +62,13 @@ class PageRequest(Struct, frozen=True):
     rows: Annotated[int, Meta(ge=1)] = MAX_ROWS
     """Tags that its browser can draw in time."""
 
-    @classmethod
-    def read(cls, text: str) -> "PageRequest | None":
-        """A page's request, or None for a text that is none."""
-        try:
-            return msgspec.json.decode(text, type=cls)
-        except (msgspec.MsgspecError, ValueError, RecursionError):
-            return None
+
+def read_request(text: str, kind: type[_Request]) -> _Request | None:
+    """What a page asks for, or None for a text that is nothing of this kind."""
+    try:
+        return msgspec.json.decode(text, type=kind)
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        return None
 
 
 class Sent:

@@ -2,7 +2,9 @@
 
 import asyncio
 import mimetypes
+from collections import Counter
 from collections.abc import Callable, Coroutine
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 from urllib.parse import quote
@@ -17,22 +19,23 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket
 
 from skyless.core.errors import ConfigurationError
+from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.site import Site
 from skyless.page._alarms import NoAlarmError
-from skyless.page._site_survey import NoResultError
-from skyless.page._state import PageRequest
+from skyless.page._state import PageRequest, read_request
+from skyless.page.api import geojson
 from skyless.page.api.past import Past
-from skyless.page.api.routes import api_routes, geojson, read_bytes
+from skyless.page.api.routes import api_routes, read_bytes
 from skyless.page.guard import AccessRules, Guard
-from skyless.page.live import LiveSite, NoBrokerError, NoSiteError, NotAllowedError, TooManyPagesError
-from skyless.page.overlays import KINDS, MovedAnchors, NoOverlayError, Overlays
-from skyless.page.playback import NoRecordingError, Playback, RecordingFile
+from skyless.page.live import LiveSite, TooManyPagesError
+from skyless.page.playback import Playback, RecordingFile
 from skyless.page.sites import LiveSites
-from skyless.page.task_process import TaskError, TaskProcess
-from skyless.page.what_if import NoWhatIfError, WhatIfs, WhatIfTask
+from skyless.page.sockets import GOING_AWAY, TRY_LATER, send, serve_socket
+from skyless.page.task_process import TaskProcess
+from skyless.page.tasks import KINDS, MovedAnchors, OverlayTask, WhatIfTask
 from skyless.run.mqtt.messages import WrongMessageError
 from skyless.run.mqtt.survey_facts import BadFactsError
 from skyless.run.zones.zone_list import read_zones
@@ -43,9 +46,6 @@ if TYPE_CHECKING:
     from skyless.page.gathered import Gathered
 
 _PAGE: Final = Path(__file__).parent / "browser"
-PAGE_TIMEOUT_S: Final = 10.0
-"""A page that accepts no message for this long is disconnected."""
-
 _MAX_STATES_S: Final = 60.01
 _MAX_WHAT_IF_S: Final = 60.0
 _MAX_BODY_BYTES: Final = 1_000_000
@@ -55,20 +55,11 @@ MAX_FLOOR_PLAN_BYTES: Final = 8_000_000
 _T = TypeVar("_T")
 _Endpoint = Callable[[Request], Coroutine[Any, Any, Response]]
 
-_TRY_LATER: Final = 1013
-_GOING_AWAY: Final = 1001
 _STATUSES: Final[dict[type[Exception], int]] = {
     WrongMessageError: 400,
     BadFactsError: 400,
     BadAlarmRulesError: 400,
     NoAlarmError: 404,
-    NoRecordingError: 404,
-    NoSiteError: 404,
-    NoResultError: 409,
-    NoOverlayError: 422,
-    NoWhatIfError: 422,
-    NotAllowedError: 403,
-    NoBrokerError: 503,
 }
 
 
@@ -76,11 +67,11 @@ class Services(Struct, frozen=True):
     """What the server serves."""
 
     sites: LiveSites
-    overlays: Overlays
     playback: Playback
-    what_ifs: WhatIfs
     past: Past = Past(None)
-    sheets: TaskProcess = field(default_factory=lambda: TaskProcess("skyless.page.sheet_process"))
+    overlays: TaskProcess = field(default_factory=partial(TaskProcess, "skyless.page.overlay_process"))
+    sheets: TaskProcess = field(default_factory=partial(TaskProcess, "skyless.page.sheet_process"))
+    what_ifs: TaskProcess = field(default_factory=partial(TaskProcess, "skyless.page.what_if_process"))
     gathered: "Gathered | None" = None
     """The batches of a broker with a gather."""
 
@@ -95,7 +86,7 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
         path = page / "index.html"
         if not path.is_file():
             raise HTTPException(404, "this installation has no page")
-        return FileResponse(path, headers={"Cache-Control": "no-cache"})
+        return FileResponse(path)
 
     routes = [
         Route("/", index),
@@ -117,7 +108,7 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
         *api_routes(services.sites, services.past),
         WebSocketRoute("/live", _live),
         *(() if services.gathered is None else (WebSocketRoute("/live2", _live2),)),
-        Mount("/page", _Files(directory=page, check_dir=False)),
+        Mount("/page", StaticFiles(directory=page, check_dir=False)),
     ]
     app = Starlette(
         routes=routes,
@@ -126,15 +117,6 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
     )
     app.state.services = services
     return app
-
-
-class _Files(StaticFiles):
-    """Files that browsers check for changes each time."""
-
-    def file_response(self, *args: object, **kwargs: object) -> Response:
-        response = super().file_response(*args, **kwargs)  # type: ignore[arg-type]
-        response.headers["Cache-Control"] = "no-cache"
-        return response
 
 
 async def _error(_request: Request, error: Exception) -> Response:
@@ -153,12 +135,12 @@ def _services(request: Request | WebSocket) -> Services:
 
 
 def _live_of(request: Request) -> LiveSite:
-    """The site that ``?site=NUMBER`` names. Raises NoSiteError."""
+    """The site that ``?site=NUMBER`` names. Raises HTTPException."""
     return _services(request).sites.of(request.query_params.get("site"))
 
 
 async def _fixes(request: Request) -> Response:
-    return geojson(_live_of(request), "fixes")
+    return geojson.collection(_live_of(request), "fixes")
 
 
 async def _floor_plan(request: Request) -> Response:
@@ -183,19 +165,22 @@ def _image_type(image: bytes) -> str | None:
 
 
 async def _overlay(request: Request) -> Response:
-    overlays, live = _services(request).overlays, _live_of(request)
+    live = _live_of(request)
     kind = request.query_params.get("kind", "pdop")
     if kind not in KINDS:
         raise HTTPException(400, f"kind is {kind!r}; it should be one of {', '.join(KINDS)}")
     step_m = _number(request, "step_m", 0.25, 0.01, 100.0)
-    if live.site is None:
-        raise HTTPException(404, "no site is known yet")
-    site = await _planned(request, live.site.whole_site)
-    return _json(await overlays.get(site, live.floor_plan, live.state.methods(), kind, step_m))
+    site = await _planned(request, live)
+    method = next((method for method, _ in Counter(live.state.methods()).most_common(1)), DEFAULT_METHOD)
+    plan = live.plans.get(None)
+    plan_px = None if plan is None else image_size(plan)
+    answer = await _services(request).overlays.run(OverlayTask(site, kind, method, step_m, plan_px))
+    return Response(answer, media_type="application/json")
 
 
-async def _planned(request: Request, site: Site) -> Site:
+async def _planned(request: Request, live: LiveSite) -> Site:
     """The site as it would be with the anchors where the request's body has them; as it is where there is none."""
+    site = live.require_site().whole_site
     body = await read_bytes(request, _MAX_BODY_BYTES, "too many anchors")
     if not body:
         return site
@@ -207,17 +192,9 @@ async def _planned(request: Request, site: Site) -> Site:
 
 async def _sheet(request: Request) -> Response:
     """The installer's sheet of the site, with anchors where the request's body has them."""
-    live = _live_of(request)
-    if live.site is None:
-        raise HTTPException(404, "no site is known yet")
-    site = await _planned(request, live.site.whole_site)
-    try:
-        pdf = await _services(request).sheets.run(msgspec.json.encode({"site": replace(site, floor_plan=None)}))
-    except TaskError as error:
-        raise HTTPException(503, str(error)) from None
-    if not pdf:
-        raise HTTPException(422, "the sheet could not be drawn; the dashboard's terminal shows why")
-    return Response(pdf, media_type="application/pdf")
+    site = await _planned(request, _live_of(request))
+    answer = await _services(request).sheets.run(replace(site, floor_plan=None))
+    return Response(msgspec.json.decode(answer, type=bytes), media_type="application/pdf")
 
 
 def _number(request: Request, name: str, default: float, least: float, most: float) -> float:
@@ -300,7 +277,7 @@ async def _what_if(request: Request) -> Response:
     from_s = _number(request, "from_s", 0.0, 0.0, 1e9)
     seconds = _number(request, "seconds", 30.0, 1.0, _MAX_WHAT_IF_S)
     path, start_s = await asyncio.to_thread(playback.path_and_start, request.path_params["name"])
-    answer = await _services(request).what_ifs.get(WhatIfTask(path, tag, start_s + from_s, seconds))
+    answer = await _services(request).what_ifs.run(WhatIfTask(path, tag, start_s + from_s, seconds))
     return Response(answer, media_type="application/json")
 
 
@@ -309,7 +286,7 @@ def _live_for(socket: WebSocket) -> LiveSite:
     sites = _services(socket).sites
     try:
         return sites.of(socket.query_params.get("site"))
-    except NoSiteError:
+    except HTTPException:
         return sites.of(None)
 
 
@@ -327,36 +304,23 @@ async def _live(socket: WebSocket) -> None:
         address = socket.client.host if socket.client is not None else ""
         page = live.open_page(address, live2=_services(socket).gathered is not None)
     except TooManyPagesError as error:
-        await socket.close(_TRY_LATER, str(error))
+        await socket.close(TRY_LATER, str(error))
         return
 
     def receive(text: str) -> None:
         live.keep_page(page)
-        wanted = None if text == "ping" else PageRequest.read(text)
+        wanted = None if text == "ping" else read_request(text, PageRequest)
         if text == "ping":
             page.replace("pong", b'{"type":"pong"}')
         elif wanted is not None:
             page.ask(wanted)
 
-    reading = asyncio.create_task(_read(socket, page.close, receive))
-    try:
+    async def send_news() -> None:
         while not page.closed:
-            messages = await page.drain(live.state)
-            async with asyncio.timeout(PAGE_TIMEOUT_S):
-                for message in messages:
-                    await socket.send_text(message)
-        await socket.close(_GOING_AWAY, page.reason)
-    except (WebSocketDisconnect, RuntimeError, TimeoutError):
-        pass  # the page was closed meanwhile, or does not respond
+            await send(socket, await page.drain(live.state))
+        await socket.close(GOING_AWAY, page.reason)
+
+    try:
+        await serve_socket(socket, send_news(), receive)
     finally:
         live.pages.discard(page)
-        reading.cancel()
-
-
-async def _read(socket: WebSocket, close: Callable[[], None], receive: Callable[[str], None]) -> None:
-    """Hand over what the page sends until it closes."""
-    try:
-        while True:
-            receive(await socket.receive_text())
-    except (WebSocketDisconnect, KeyError, RuntimeError):
-        close()

@@ -7,22 +7,21 @@ from collections import Counter
 from typing import Final
 
 from nats.aio.msg import Msg
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket
 
 from skyless.core.site import AnchorSite
+from skyless.page._state import read_request
 from skyless.page.columns import Columns
 from skyless.page.live import MAX_PAGES, LiveSite
 from skyless.page.live2 import View, anchors_message, conditions_message, tags_message
+from skyless.page.sockets import TRY_LATER, send, serve_socket
 from skyless.run.fix_batch import BadBatchError, decode_batch
 from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect, rarely
-from skyless.run.process import together
 
 PERIOD_S: Final = 0.1
 _MAX_SITES: Final = 64
 _EMPTY: Final = Columns()
-_SEND_S: Final = 10.0
-_TRY_LATER: Final = 1013
 
 
 class Gathered:
@@ -64,24 +63,20 @@ class Gathered:
     async def serve(self, socket: WebSocket, live: LiveSite) -> None:
         """Serve one accepted page until it closes."""
         if self.pages >= MAX_PAGES:
-            await socket.close(_TRY_LATER, f"too many pages are open: {self.pages}")
+            await socket.close(TRY_LATER, f"too many pages are open: {self.pages}")
             return
-        self.pages += 1
         page = _Page()
+
+        async def send_news() -> None:
+            while True:
+                await send(socket, page.news(live, self.columns(live.number), time.monotonic()), "bytes")
+                await asyncio.sleep(PERIOD_S)
+
+        self.pages += 1
         try:
-            await together(page.read(socket), self._send(socket, live, page))
-        except (WebSocketDisconnect, KeyError, RuntimeError, TimeoutError):
-            pass  # the page was closed meanwhile, does not respond, or sent bytes
+            await serve_socket(socket, send_news(), page.ask)
         finally:
             self.pages -= 1
-
-    async def _send(self, socket: WebSocket, live: LiveSite, page: "_Page") -> None:
-        while True:
-            now_s = time.monotonic()
-            async with asyncio.timeout(_SEND_S):
-                for message in page.news(live, self.columns(live.site_id), now_s):
-                    await socket.send_bytes(message)
-            await asyncio.sleep(PERIOD_S)
 
 
 class _Page:
@@ -93,10 +88,9 @@ class _Page:
         self._anchors: tuple[AnchorSite, ...] | None = None
         self._conditions: dict[str, str] | None = None
 
-    async def read(self, socket: WebSocket) -> None:
-        """Take the views that the page sends until it closes."""
-        while True:
-            self._view = View.read(await socket.receive_text()) or self._view
+    def ask(self, text: str) -> None:
+        """The page has another view."""
+        self._view = read_request(text, View) or self._view
 
     def news(self, live: LiveSite, columns: Columns, now_s: float) -> list[bytes]:
         """What is new to the page."""

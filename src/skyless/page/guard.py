@@ -7,14 +7,13 @@ operator's.
 import hmac
 import ipaddress
 import re
-from collections.abc import MutableMapping
 from hashlib import sha256
-from http.cookies import CookieError, SimpleCookie
-from typing import Any, Final
-from urllib.parse import parse_qs, urlsplit
+from typing import Final
+from urllib.parse import urlsplit
 
 from msgspec import Struct
-from starlette.datastructures import Headers, MutableHeaders
+from starlette.datastructures import MutableHeaders
+from starlette.requests import HTTPConnection
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -64,29 +63,29 @@ class Guard:
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
-        headers = Headers(scope=scope)
-        fault = self._fault(scope, headers)
+        request = HTTPConnection(scope)
+        fault = self._fault(request)
         if fault is None:
-            await self._app(scope, receive, self._with_headers(scope, send))
+            await self._app(scope, receive, self._with_headers(request, send))
         elif scope["type"] == "websocket":
             await send({"type": "websocket.close", "code": _POLICY_VIOLATION, "reason": fault[1]})
         else:
             answer = JSONResponse({"error": fault[1]}, status_code=fault[0])
-            await answer(scope, receive, self._with_headers(scope, send))
+            await answer(scope, receive, self._with_headers(request, send))
 
-    def _fault(self, scope: MutableMapping[str, Any], headers: Headers) -> tuple[int, str] | None:
-        hosts = headers.getlist("host")
+    def _fault(self, request: HTTPConnection) -> tuple[int, str] | None:
+        hosts = request.headers.getlist("host")
         host = hosts[0].lower() if len(hosts) == 1 else ""
         if not self._is_own_host(host):
             return 421, "unknown host name: open the address that the dashboard has printed"
-        origin = headers.get("origin")
+        origin = request.headers.get("origin")
         if origin is not None and not _same_origin(origin, host):
             return 403, "requests of other sites are refused"
-        if self._secret is None or self._carries(scope, headers, self._secret):
+        if self._secret is None or self._carries(request, self._secret):
             return None
-        if self._reader_secret is None or not self._carries(scope, headers, self._reader_secret):
+        if self._reader_secret is None or not self._carries(request, self._reader_secret):
             return 401, "the token is missing or wrong: open the address that the dashboard has printed"
-        if scope["type"] != "websocket" and scope["method"] not in {"GET", "HEAD"}:
+        if request.scope.get("method", "GET") not in {"GET", "HEAD"}:
             return 403, "the reader's token does not allow changes: they need the operator's, --token of the dashboard"
         return None
 
@@ -103,21 +102,21 @@ class Guard:
             return False
         return self._rules.remote or address.is_loopback
 
-    def _carries(self, scope: MutableMapping[str, Any], headers: Headers, secret: str) -> bool:
-        """Whether a request carries the token with this digest."""
-        digests = [_digest(token) for token in _tokens(scope, headers)]
-        digests += _cookies(headers, self._rules.cookie)
+    def _carries(self, request: HTTPConnection, secret: str) -> bool:
+        """Whether a request carries the token with this digest, or the digest as a cookie."""
+        digests = [*map(_digest, _tokens(request)), request.cookies.get(self._rules.cookie, "")]
         return any(hmac.compare_digest(digest.encode(), secret.encode()) for digest in digests)
 
-    def _with_headers(self, scope: MutableMapping[str, Any], send: Send) -> Send:
+    def _with_headers(self, request: HTTPConnection, send: Send) -> Send:
         async def sending(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 for name, value in _HEADERS.items():
                     headers[name] = value
-                headers.setdefault("Cache-Control", "no-store")
-                if message["status"] == 200 and b"token=" in scope["query_string"]:
-                    for secret in {_digest(token) for token in _tokens(scope, Headers())} & self._secrets:
+                # Browsers keep files, and check each time whether they have changed.
+                headers.setdefault("Cache-Control", "no-cache" if "etag" in headers else "no-store")
+                if message["status"] == 200:
+                    for secret in {*map(_digest, request.query_params.getlist("token")[:1])} & self._secrets:
                         cookie = f"{self._rules.cookie}={secret}; Path=/; HttpOnly; SameSite=Strict"
                         headers.append("Set-Cookie", cookie)
             await send(message)
@@ -137,20 +136,7 @@ def _same_origin(origin: str, host: str) -> bool:
     return parts.scheme in {"http", "https"} and parts.netloc == host
 
 
-def _tokens(scope: MutableMapping[str, Any], headers: Headers) -> list[str]:
+def _tokens(request: HTTPConnection) -> list[str]:
     """Tokens in the query or as a bearer token."""
-    query = scope["query_string"].decode("latin-1")
-    kind, _, bearer = headers.get("authorization", "").partition(" ")
-    try:
-        tokens = parse_qs(query, max_num_fields=20).get("token", [])[:1]
-    except ValueError:
-        tokens = []
-    return tokens + ([bearer.strip()] if kind.lower() == "bearer" else [])
-
-
-def _cookies(headers: Headers, name: str) -> list[str]:
-    try:
-        morsel = SimpleCookie(headers.get("cookie", "")).get(name)
-    except CookieError:
-        return []
-    return [] if morsel is None else [morsel.value]
+    kind, _, bearer = request.headers.get("authorization", "").partition(" ")
+    return request.query_params.getlist("token")[:1] + ([bearer.strip()] if kind.lower() == "bearer" else [])

@@ -9,20 +9,18 @@ import logging
 import platform
 import time
 import zlib
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import msgspec
 from msgspec import UNSET, Struct
+from starlette.exceptions import HTTPException
 
-from skyless.bridges.target import bridged_site
 from skyless.core.errors import ConfigurationError
 from skyless.core.version import installed_version
 from skyless.page._alarms import SiteAlarms
-from skyless.page._events import MAX_EVENTS, MAX_LOGGED, EventLog, EventQueue, publisher_rank
-from skyless.page._geojson import OLDEST_S, anchor_features, features, zone_features
+from skyless.page._events import EventLog, EventQueue, publisher_rank
 from skyless.page._kept import Kept
 from skyless.page._site_survey import SiteSurvey
 from skyless.page._state import PageRequest, Sent, SiteState, encode
@@ -63,6 +61,9 @@ _EVALUATION_SHARE: Final = 5.0  # evaluations take at most a sixth of the time
 _HEALTHS: Final[dict[str, type[Struct]]] = {"tag": TagHealth, "anchor": AnchorHealth, "ether": EtherHealth}
 _log = logging.getLogger("skyless.page")
 
+OLDEST_S: Final = 5.0
+"""A fix that is older is not given to programs."""
+
 MAX_PAGES: Final = 400
 MAX_PAGES_PER_ADDRESS: Final = 100
 IDLE_S: Final = 12.0
@@ -72,18 +73,6 @@ GONE_S: Final = 180.0
 """A page that has sent nothing for this long is disconnected. Browsers let a hidden one send once a minute."""
 
 
-class NotAllowedError(Exception):
-    """The broker would drop the message: the role of this page may not publish it."""
-
-
-class NoBrokerError(Exception):
-    """Nothing can be published now."""
-
-
-class NoSiteError(Exception):
-    """No site is known yet."""
-
-
 class TooManyPagesError(Exception):
     """No other page can be opened now."""
 
@@ -91,15 +80,14 @@ class TooManyPagesError(Exception):
 class PageQueue:
     """Messages that wait for one page: the newest of each kind, so that a slow page's queue stays short."""
 
-    def __init__(self, hello: bytes, address: str = "", now_s: float = 0.0) -> None:
-        """``address`` is its computer's."""
+    def __init__(self, hello: bytes, events: EventList, address: str = "", now_s: float = 0.0) -> None:
+        """``address`` is its computer's. Of ``events`` it is sent those that are new."""
         self.closed, self.reason = False, ""
         """Whether its connection is to be ended, and why."""
         self.address, self.active_s = address, now_s
         """When it last sent something."""
         self._latest: dict[str, bytes] = {"hello": hello}
-        self._events: deque[bytes] = deque(maxlen=MAX_EVENTS)
-        self._logged: deque[bytes] = deque(maxlen=MAX_LOGGED)
+        self._events, self._event = events, events.last
         self._sent = Sent()
         self._state_due = self._health_due = True
         self._wake = asyncio.Event()
@@ -110,18 +98,8 @@ class PageQueue:
         self._latest[kind] = message
         self._wake.set()
 
-    def add_event(self, message: bytes) -> None:
-        """Add a message that replaces no other. The oldest is dropped beyond ``MAX_EVENTS``."""
-        self._events.append(message)
-        self._wake.set()
-
-    def add_logged(self, message: bytes) -> None:
-        """Add a line of the list of events. The oldest is dropped beyond ``MAX_LOGGED``."""
-        self._logged.append(message)
-        self._wake.set()
-
     def request_state(self, *, health: bool = False) -> None:
-        """Send the state, or also the healths, with the next messages if there is anything new."""
+        """Send the events and the state, or also the healths, if there is anything new."""
         self._state_due = True
         self._health_due |= health
         self._wake.set()
@@ -136,21 +114,20 @@ class PageQueue:
         self.closed, self.reason = True, reason
         self._wake.set()
 
-    async def drain(self, state: SiteState) -> list[str]:
+    async def drain(self, state: SiteState) -> list[bytes]:
         """Wait for messages and return them all, in the order in which the page needs them."""
         await self._wake.wait()
         self._wake.clear()
-        messages = [*self._latest.values(), *self._events, *self._logged]
+        messages = [*self._latest.values(), *(message for _, message in self._events.since(self._event))]
+        self._event = self._events.last
         self._latest.clear()
-        self._events.clear()
-        self._logged.clear()
         if self._health_due:
             messages.append(state.new_health(self._sent))
         new = state.new_state(self._sent) if self._state_due else None
         if new is not None:
             messages.append(new)
         self._state_due = self._health_due = False
-        return [message.decode() for message in messages]
+        return messages
 
 
 class LiveSite:
@@ -173,7 +150,7 @@ class LiveSite:
         ``used_share`` gives the share of its processors in use at a time of ``clock``: ``ProcessorUse.share``.
         """
         self.name, self.broker = name, broker
-        self.site = site
+        self.site: SiteMessage | None = None
         self.plans: dict[int | None, bytes] = {}
         """The images of the floors by their numbers; None is that of the whole site."""
         self.connected = False
@@ -186,34 +163,30 @@ class LiveSite:
         self.event_list = EventList()
         self.has_history = has_history
         self.dropped = self.state.dropped
-        self._clock, self._wall_clock = clock, wall_clock
+        self._clock, self.wall_clock = clock, wall_clock
         self._link: Link | None = None
         self._site_id: int | None = None
         self._zones = Kept(ZonesMessage(()), self._read_zones)
         """With other sites' zones of this number."""
         self._dashboards: dict[str, StatusMessage] = {}
-        self._sent_serial = 0
+        self._sent_serials = 0, 0  # of the newest fix and event that pages were told of
         self._health_due_s = self._condition_due_s = 0.0
         self.evidence = Evidence(host, clock())
-        if site is not None:
-            self._set_floors(site)
-            self.evidence.set_site(site.site, clock())
-            self.assets.on_site(site.site.name)
-        self.log = EventLog(wall_clock() - clock())
+        self.log = EventLog(wall_clock() - clock(), self.event_list.add_logged)
         self.alarms = SiteAlarms(name, self.monitor, self._broadcast, self.log.on_alarm)
         if site is not None:
-            self.alarms.on_site(site)
+            self._use_site(site)
         self._condition_monitor = ConditionMonitor(self.evidence)
         self.condition: Condition = self._condition_monitor.evaluate(clock())
-        self._logged_serial = 0
         self._lag_s = 0.0
         self._used_share = used_share
         self._sites: bytes | None = None
 
-    @property
-    def site_id(self) -> int | None:
-        """Number of the site, or None before it is connected."""
-        return self._site_id
+    def require_site(self) -> SiteMessage:
+        """The site. Raises HTTPException while none is known."""
+        if self.site is None:
+            raise HTTPException(404, "no site is known yet")
+        return self.site
 
     # MQTT
 
@@ -278,16 +251,16 @@ class LiveSite:
         check_site(message.whole_site, Path("the site on MQTT"))
         if message.site.id != self._site_id:
             raise WrongMessageError(f"it is of site {message.site.id}")
-        self.site = message
-        self._set_floors(message)
-        self.evidence.set_site(message.site, self._clock())
-        self.alarms.on_site(message)
+        self._use_site(message)
         self._broadcast("site", encode("site", {"site": message}))
-        self.assets.on_site(message.site.name)
         self._assign_zones()
 
-    def _set_floors(self, message: SiteMessage) -> None:
+    def _use_site(self, message: SiteMessage) -> None:
+        self.site = message
         self.monitor.floors = () if message.floors is UNSET else message.floors
+        self.evidence.set_site(message.site, self._clock())
+        self.alarms.on_site(message)
+        self.assets.on_site(message.site.name)
 
     def _on_floor_plan(self, topic: str, payload: bytes) -> None:
         image, floor = payload or None, _floor_of(topic)
@@ -295,11 +268,6 @@ class LiveSite:
             if self._link is not None:
                 self._link.forget(topic)  # an image that was stored here must not come back after a reconnect
             self._show_floor_plan(floor, image)
-
-    @property
-    def floor_plan(self) -> bytes | None:
-        """The image of the whole site's floor."""
-        return self.plans.get(None)
 
     def _show_floor_plan(self, floor: int | None, image: bytes | None) -> None:
         self.plans.pop(floor, None)
@@ -318,7 +286,7 @@ class LiveSite:
         if not self.evidence.roster.admits("tag", fix.tag):
             return
         now_s = self._clock()
-        unix_s = self._wall_clock()
+        unix_s = self.wall_clock()
         self.state.add_fix(fix, now_s, unix_s - self.evidence.add_fix(fix, now_s))
         self.log.on_fix(fix, now_s)
         self.alarms.engine.on_fix(fix, now_s)
@@ -338,13 +306,13 @@ class LiveSite:
         self.log.on_status(status, self._clock())
         if status.kind == "tag" and not status.online:
             self.alarms.engine.on_tag_gone(status.name)
-            self._schedule(self.monitor.remove_tag(status.name, self._wall_clock()))
+            self._schedule(self.monitor.remove_tag(status.name, self.wall_clock()))
 
     def _on_health(self, topic: str, payload: bytes) -> None:
         _, kind, name, _ = topic.rsplit("/", 3)
         if kind in _HEALTHS and self.evidence.roster.admits(kind, name):
             health: TagHealth | AnchorHealth | EtherHealth = read_message(payload, _HEALTHS[kind])  # type: ignore[assignment]
-            now_s, unix_s = self._clock(), self._wall_clock()
+            now_s, unix_s = self._clock(), self.wall_clock()
             self.state.add_health(name, health, now_s)
             self.evidence.add_health(kind, name, health, now_s, unix_s)
             self.log.on_health(kind, name, health, now_s)
@@ -373,7 +341,7 @@ class LiveSite:
         event = read_message(payload, ZoneEvent)
         _check_name(event.zone, topic)
         if self.events.add_published(event):
-            self._broadcast_event(event)
+            self.event_list.add_zone_event(event)
 
     # Zones
 
@@ -397,7 +365,7 @@ class LiveSite:
         is_foreign = not name and kept.site  # whose they are is known, but not whether that site is shown
         zones = () if is_foreign else zones_of(kept, name).zones
         if zones != self.monitor.zones:
-            self._schedule(self.monitor.set_zones(zones, self._wall_clock()))
+            self._schedule(self.monitor.set_zones(zones, self.wall_clock()))
             self.alarms.engine.set_zones(zones, self._clock())
             self._broadcast("zones", encode("zones", self._zone_fields()))
 
@@ -413,58 +381,42 @@ class LiveSite:
 
     def _publish_events(self, now_s: float) -> None:
         for event in self.events.pop_due(now_s):
-            self._broadcast_event(event)
+            self.event_list.add_zone_event(event)
             if self._link is not None and self._site_id is not None:
                 self._link.publish(topics.zone_event_topic(self._site_id, event.zone), event, qos=1)
 
     # Alarms
 
     def acknowledge(self, rule: str, subject: str, occurrence: str, by: str) -> None:
-        """Ask the dashboard that leads to acknowledge an alarm. Raises NoAlarmError and NoBrokerError."""
+        """Ask the dashboard that leads to acknowledge an alarm. Raises NoAlarmError and HTTPException."""
         link, site_id = self._connected()
         self.alarms.check_is_kept(rule, subject, occurrence)
-        message = AcknowledgeMessage(occurrence, by[:100], self._wall_clock())
+        message = AcknowledgeMessage(occurrence, by[:100], self.wall_clock())
         link.publish(topics.acknowledge_topic(site_id, rule, subject), message, qos=1)
 
     # Survey
 
     def publish_survey(self, message: SurveyFactsMessage | SurveySaveMessage) -> None:
-        """Give the survey program facts or the request to save. Raises NoBrokerError and NotAllowedError."""
+        """Give the survey program facts or the request to save. Raises HTTPException."""
         link, site_id = self._connected()
         if link.address.user == Role.PAGE:  # the broker would drop it without an answer
-            raise NotAllowedError("the role page may not set up a site; start this page with the user survey instead")
+            raise HTTPException(
+                403, "the role page may not set up a site; start this page with the user survey instead"
+            )
         is_facts = isinstance(message, SurveyFactsMessage)
         topic = topics.survey_facts_topic(site_id) if is_facts else topics.survey_save_topic(site_id)
         link.publish(topic, message, qos=1)
 
     def store_floor_plan(self, image: bytes) -> None:
-        """Store the image of the floor, a PNG or JPEG, at the broker. Raises NoBrokerError."""
+        """Store the image of the floor, a PNG or JPEG, at the broker. Raises HTTPException."""
         link, site_id = self._connected()
         link.publish(topics.floor_plan_topic(site_id), image, qos=1, retain=True)
         self._show_floor_plan(None, image)
 
     def _connected(self) -> tuple[Link, int]:
         if self._link is None or self._site_id is None or not self.connected:
-            raise NoBrokerError(f"the broker {self.broker} is not connected; try again when it is")
+            raise HTTPException(503, f"the broker {self.broker} is not connected; try again when it is")
         return self._link, self._site_id
-
-    def features(self, kind: Literal["fixes", "anchors", "zones"] = "fixes") -> bytes:
-        """The tags, the anchors or the zones as GeoJSON.
-
-        Raises:
-            NoSiteError: no site is known yet.
-            SkylessError: it is not georeferenced.
-        """
-        if self.site is None:
-            raise NoSiteError("no site is known yet")
-        site = bridged_site(
-            self.site.site, self.monitor.zones, simulated=self.site.simulated, assets=self.assets.by_tag
-        )
-        if kind == "anchors":
-            return anchor_features(site)
-        if kind == "zones":
-            return zone_features(site)
-        return features(site, self.recent_fixes(), self._wall_clock())
 
     def recent_fixes(self, after: int = 0) -> list[tuple[FixMessage, float]]:
         """The newest fix of each tag that has one within ``OLDEST_S`` and after a serial, and when it ended."""
@@ -475,7 +427,6 @@ class LiveSite:
     def open_page(self, address: str = "", *, live2: bool = False) -> PageQueue:
         """The queue of a new page of a computer, with what it needs first. Raises TooManyPagesError."""
         self._make_room(address)
-        self._send_logged()
         hello = {
             "version": installed_version(),
             "site": self.site,
@@ -485,11 +436,11 @@ class LiveSite:
             "history": self.has_history,
             "live2": live2,
         }
-        page = PageQueue(encode("hello", hello), address, self._clock())
+        page = PageQueue(encode("hello", hello), self.event_list, address, self._clock())
         page.replace("mqtt", self._connection())
         self.state.now_s = self._clock()
         page.replace("condition", self._condition_message())
-        page.replace("log", encode("log", {"events": self.log.since()}))
+        page.replace("log", encode("log", {"events": list(self.log.events)}))
         page.replace("assets", self.assets.encoded())
         if self.plans:
             page.replace("floor_plan", self._floor_plan_message())
@@ -526,13 +477,9 @@ class LiveSite:
     def tick(self, lag_s: float = 0.0) -> None:
         """Do what is due. Call it 20 times a second. ``lag_s`` is the delay of this call."""
         self._lag_s = max(self._lag_s, lag_s)
-        now_s, unix_s = self._clock(), self._wall_clock()
+        now_s, unix_s = self._clock(), self.wall_clock()
         self.state.now_s, self.state.unix_s = now_s, unix_s
         self.log.unix_offset_s = unix_s - now_s
-        if self.state.serial != self._sent_serial:
-            self._sent_serial = self.state.serial
-            for page in self.pages:
-                page.request_state()
         if now_s >= self._health_due_s:
             self._health_due_s = now_s + _HEALTH_PERIOD_S
             self._schedule(self.monitor.expire_tags(now_s, unix_s))
@@ -546,25 +493,26 @@ class LiveSite:
         self.assets.tick(now_s)
         if now_s >= self._condition_due_s:
             self._evaluate(now_s)
-        self._send_logged()
+        serials = self.state.serial, self.event_list.last
+        if serials != self._sent_serials:
+            self._sent_serials = serials
+            for page in self.pages:
+                page.request_state()
 
     def _evaluate(self, now_s: float) -> None:
-        watch = self.survey.watch
+        watch, age_s = self.survey.watch.message, self.survey.watch.age_s()
         unread_s = 0.0 if self._link is None else self._link.unread_s
         used_share = None if self._used_share is None else self._used_share(now_s)
-        self.condition = self._condition_monitor.evaluate(
-            now_s, self._lag_s, watch, self.survey.watch_age_s, used_share, unread_s
-        )
+        self.condition = self._condition_monitor.evaluate(now_s, self._lag_s, watch, age_s, used_share, unread_s)
         self._lag_s = 0.0
         blind = self._condition_monitor.is_blind(now_s)
         self.state.judge(now_s, blind=blind)
         offline = None if blind else offline_anchors(self.evidence, now_s)
-        age_s = self.survey.watch_age_s
         fresh = watch if age_s is not None and age_s < _WATCH_FRESH_S else None
         self.alarms.engine.on_anchors(offline, fresh)
         self.alarms.engine.set_assets(self.assets.by_tag)
         self.log.on_watch(watch, now_s)
-        self.log.on_survey(self.survey.survey, now_s)
+        self.log.on_survey(self.survey.survey.message, now_s)
         self.log.on_condition(self.condition, now_s)
         (self.log.pause if blind else self.log.tick)(now_s)
         self._broadcast("condition", self._condition_message())
@@ -573,17 +521,7 @@ class LiveSite:
 
     def _condition_message(self) -> bytes:
         """Its time gives pages the server's clock where no tag moves."""
-        return encode("condition", {"unix_s": self._wall_clock(), **msgspec.structs.asdict(self.condition)})
-
-    def _send_logged(self) -> None:
-        events = self.log.since(self._logged_serial)
-        if events:
-            self._logged_serial = self.log.serial
-            for event in events:
-                self.event_list.add_logged(event)
-            message = encode("log", {"events": events})
-            for page in self.pages:
-                page.add_logged(message)
+        return encode("condition", {"unix_s": self.wall_clock(), **msgspec.structs.asdict(self.condition)})
 
     async def run(self) -> None:
         """Tick until cancelled."""
@@ -599,12 +537,6 @@ class LiveSite:
     def _broadcast(self, kind: str, message: bytes) -> None:
         for page in self.pages:
             page.replace(kind, message)
-
-    def _broadcast_event(self, event: ZoneEvent) -> None:
-        self.event_list.add_zone_event(event)
-        message = encode("zone_event", msgspec.structs.asdict(event))
-        for page in self.pages:
-            page.add_event(message)
 
 
 def _floor_of(topic: str) -> int | None:

@@ -4,7 +4,6 @@ import math
 import struct
 from typing import Annotated, Final
 
-import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
@@ -39,15 +38,11 @@ class View(Struct, frozen=True):
     """Least x and y, and largest x and y in m."""
     px: tuple[_Pixels, _Pixels]
 
-    @classmethod
-    def read(cls, text: str) -> "View | None":
-        """A page's view, or None for a text that is none."""
-        try:
-            view = msgspec.json.decode(text, type=cls)
-        except (msgspec.MsgspecError, ValueError, RecursionError):
-            return None
-        x0, y0, x1, y1 = view.view
-        return view if x0 < x1 and y0 < y1 else None
+    def __post_init__(self) -> None:
+        """Raise ValueError where it has no area."""
+        x0, y0, x1, y1 = self.view
+        if not (x0 < x1 and y0 < y1):
+            raise ValueError("it has no area")
 
 
 def tags_message(columns: Columns, view: View, now_s: float, unix_us: int) -> bytes:

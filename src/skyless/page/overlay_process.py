@@ -1,59 +1,101 @@
-"""The process that computes overlays."""
+"""The process that computes overlays of the map."""
 
-from typing import Final
+from functools import lru_cache
+from typing import Any, Final
 
 import msgspec
 import numpy as np
+from msgspec import UNSET
+from msgspec.structs import replace
 
 from skyless.core.arrays import Array
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import DEFAULT_METHOD, METHODS
-from skyless.page.overlays import OverlayGrids, OverlayTask
+from skyless.core.site import Site
 from skyless.page.task_process import serve_tasks
+from skyless.page.tasks import OverlayTask
+from skyless.site.planning.colours import COLOUR_STOPS, scale_of
 from skyless.site.planning.links import FIX_SHARE, HDOP, PDOP, SIGMA
 from skyless.site.planning.maps import Grid, plan_map
 from skyless.site.planning.predict import MAX_PREDICTED, PlanSettings, Predictor
 
+MAX_CELLS: Final = 40_000
+_STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+
+_MAX_CACHED: Final = 8
 _MIN_FIX_SHARE: Final = 0.5
 
 
-def answer(task: bytes) -> bytes:
-    """The grids of one task, both as JSON."""
-    return msgspec.json.encode(overlay_grids(msgspec.json.decode(task, type=OverlayTask)))
+def overlay(task: OverlayTask) -> dict[str, Any]:
+    """The answer to ``/api/overlay``. Raises SkylessError."""
+    grid, grids = _grids(msgspec.json.encode(replace(task, kind="pdop")))  # of all kinds, so for all the same
+    values = grids[task.kind]
+    known = sorted(value for value in values if value is not None)
+    scale = scale_of(known)
+    if scale is None:
+        raise SkylessError("nowhere at this site is there a fix")
+    return {
+        "kind": task.kind,
+        "unit": "m" if task.kind == "sigma" else "1",
+        "x_m": [float(grid.x_m[0]), float(grid.x_m[-1])],
+        "y_m": [float(grid.y_m[0]), float(grid.y_m[-1])],
+        "step_m": grid.step_m,
+        "columns": len(grid.x_m),
+        "rows": len(grid.y_m),
+        "values": values,
+        "method": task.method,
+        "height_m": float(grid.heights_m[0]),
+        "least": known[0],
+        "most": known[-1],
+        "scale": {"low": scale.low, "high": scale.high, "ticks": scale.ticks, "stops": COLOUR_STOPS},
+    }
 
 
-def overlay_grids(task: OverlayTask) -> OverlayGrids:
-    """PDOP, HDOP and predicted sigma at the known height of the tags, or half-way up the anchors."""
-    if len(task.site.anchors) > MAX_PREDICTED:
-        return OverlayGrids(error=f"errors are predicted for sites of at most {MAX_PREDICTED} anchors")
-    needed = 4 if task.site.tags.height_m is None else 3
-    if len(task.site.anchors) < needed:
-        return OverlayGrids(error=f"a position needs {needed} anchors or more; this site has {len(task.site.anchors)}")
-    settings = PlanSettings(task.method if task.method in METHODS else DEFAULT_METHOD)
+@lru_cache(_MAX_CACHED)
+def _grids(task: bytes) -> tuple[Grid, dict[str, list[float | None]]]:
+    """PDOP, HDOP and predicted sigma row by row from the lowest y, None where there is no fix."""
+    asked = msgspec.json.decode(task, type=OverlayTask)
+    count, needed = len(asked.site.anchors), 4 if asked.site.tags.height_m is None else 3
+    if count > MAX_PREDICTED:
+        raise SkylessError(f"errors are predicted for sites of at most {MAX_PREDICTED} anchors")
+    if not count:
+        raise SkylessError("no anchor of this site has a position yet; survey it first")
+    if count < needed:
+        raise SkylessError(f"a position needs {needed} anchors or more; this site has {count}")
+    grid = grid_of(asked.site, asked.plan_px, asked.step_m)
+    settings = PlanSettings(asked.method if asked.method in METHODS else DEFAULT_METHOD)
     try:
-        grid = _grid(task)
-        table = plan_map(Predictor(task.site, settings), grid).table[0]
-    except (SkylessError, ValueError) as error:
-        return OverlayGrids(error=str(error))
+        table = plan_map(Predictor(asked.site, settings), grid).table[0]
+    except ValueError as error:
+        raise SkylessError(str(error)) from None
     covered = table[..., FIX_SHARE] >= _MIN_FIX_SHARE
-    return OverlayGrids(
-        pdop=_values(table[..., PDOP], 3),
-        hdop=_values(table[..., HDOP], 3),
-        sigma=_values(np.where(covered, table[..., SIGMA], np.inf), 5),
-        height_m=float(grid.heights_m[0]),
-    )
+    return grid, {
+        "pdop": _values(table[..., PDOP], 3),
+        "hdop": _values(table[..., HDOP], 3),
+        "sigma": _values(np.where(covered, table[..., SIGMA], np.inf), 5),
+    }
 
 
-def _grid(task: OverlayTask) -> Grid:
-    x1, y1, _, _ = task.box_m
-    heights = [anchor.z_m for anchor in task.site.anchors]
-    height_m = task.site.tags.height_m
-    if height_m is None:
-        height_m = (min(heights) + max(heights)) / 2
-    xs: Array = x1 + (np.arange(task.columns, dtype=np.float64) + 0.5) * task.step_m
-    ys: Array = y1 + (np.arange(task.rows, dtype=np.float64) + 0.5) * task.step_m
-    everywhere = np.ones((task.rows, task.columns), dtype=np.bool_)
-    return Grid(xs, ys, np.array([height_m], dtype=np.float64), task.step_m, everywhere)
+def grid_of(site: Site, plan_px: tuple[int, int] | None, least_step_m: float) -> Grid:
+    """Cells over the floor plan, the outline and all anchors, larger ones where there would be too many.
+
+    They are at the known height of the tags, or half-way up the anchors.
+    """
+    points = [(anchor.x_m, anchor.y_m) for anchor in site.anchors]
+    points += () if site.outline_m is UNSET else site.outline_m
+    plan = site.floor_plan
+    if plan is not None and plan_px is not None:
+        length_m = plan.width_m * plan_px[1] / plan_px[0]
+        points += [(plan.x_m, plan.y_m), (plan.x_m + plan.width_m, plan.y_m + length_m)]
+    low, high = np.min(points, axis=0), np.max(points, axis=0)
+    for step_m in (least_step_m, *(step_m for step_m in _STEPS_M if step_m > least_step_m)):
+        columns, rows = (max(1, -int(-length_m // step_m)) for length_m in high - low)
+        if columns * rows <= MAX_CELLS:
+            break
+    xs, ys = (start + (np.arange(count) + 0.5) * step_m for start, count in zip(low, (columns, rows), strict=True))
+    heights_m = [anchor.z_m for anchor in site.anchors]
+    height_m = site.tags.height_m if site.tags.height_m is not None else (min(heights_m) + max(heights_m)) / 2
+    return Grid(xs, ys, np.array([height_m]), step_m, np.ones((rows, columns), dtype=np.bool_))
 
 
 def _values(column: Array, digits: int) -> list[float | None]:
@@ -61,4 +103,4 @@ def _values(column: Array, digits: int) -> list[float | None]:
 
 
 if __name__ == "__main__":
-    serve_tasks(answer)
+    serve_tasks(OverlayTask, overlay)

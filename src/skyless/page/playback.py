@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 from msgspec import Struct
+from starlette.exceptions import HTTPException
 
 from skyless.core.errors import SkylessError
 from skyless.page._events import Event, EventLog
@@ -41,10 +42,6 @@ _PIECE_BYTES: Final = 1 << 18
 _Version = tuple[int, int, int]  # a file's inode, size and time of change
 
 _log = logging.getLogger("skyless.page")
-
-
-class NoRecordingError(Exception):
-    """There is no such recording, or it cannot be read."""
 
 
 class ListedRecording(Struct, frozen=True):
@@ -124,51 +121,51 @@ class Playback:
                     break
                 try:
                     self._list(file, known)
-                except (NoRecordingError, OSError) as error:
+                except (HTTPException, OSError) as error:
                     _log.debug("%s is not listed: %s", file, error)
             found = [listed for _, listed in self._listed.values()]
         return sorted(found, key=lambda listed: listed.start_unix_s or 0.0, reverse=True)
 
     def summary(self, name: str) -> PlaybackSummary:
-        """Site, times, tags and zones of a recording. Raises NoRecordingError."""
+        """Site, times, tags and zones of a recording. Raises HTTPException."""
         with self._lock:
             recording = self._recording(name)
             found = recording.summary()
             if found.start_s is None or found.end_s is None:
-                raise NoRecordingError(f"{name!r} holds no messages yet")
+                raise HTTPException(404, f"{name!r} holds no messages yet")
             zones = _zones(recording)
             spans = _fix_spans(recording)
             return PlaybackSummary(name, recording.site, found.start_s, found.end_s, found.tags, zones, spans)
 
     def events(self, name: str) -> RecordedEvents:
-        """What has happened in a recording. All of it is read while others are served. Raises NoRecordingError."""
+        """What has happened in a recording. All of it is read while others are served. Raises HTTPException."""
         path = self._path(name)
         try:
             return _events(path, _version(path), self._stopped)
         except (SkylessError, OSError) as error:
-            raise NoRecordingError(f"{name!r} cannot be read: {error}") from None
+            raise HTTPException(404, f"{name!r} cannot be read: {error}") from None
 
     def open_file(self, name: str) -> RecordingFile:
-        """The file, to be downloaded. Raises NoRecordingError."""
+        """The file, to be downloaded. Raises HTTPException."""
         try:
             file = self._path(name).open("rb")
         except OSError as error:
-            raise NoRecordingError(f"{name!r} cannot be read: {error.strerror}") from None
+            raise HTTPException(404, f"{name!r} cannot be read: {error.strerror}") from None
         return RecordingFile(name, os.fstat(file.fileno()).st_size, file)
 
     def path_and_start(self, name: str) -> tuple[str, float]:
-        """Where a recording lies, and the Unix time of its first message. Raises NoRecordingError."""
+        """Where a recording lies, and the Unix time of its first message. Raises HTTPException."""
         return str(self._path(name)), self.summary(name).start_unix_s
 
     def floor_plan(self, name: str) -> bytes | None:
-        """The floor plan's image. Raises NoRecordingError."""
+        """The floor plan's image. Raises HTTPException."""
         with self._lock:
             return self._recording(name).floor_plan
 
     def states(self, name: str, begin_s: float, end_s: float, rate_hz: float) -> list[bytes]:
         """The ``state`` messages from ``begin_s`` on and before ``end_s``, seconds since the recording's start.
 
-        Raises NoRecordingError.
+        Raises HTTPException.
         """
         start_s = self.summary(name).start_unix_s
         with self._lock:
@@ -188,7 +185,7 @@ class Playback:
         self._listed[file.name] = old
 
     def _recording(self, name: str) -> McapRecording:
-        """The recording, open and up to date. Raises NoRecordingError."""
+        """The recording, open and up to date. Raises HTTPException."""
         path = self._path(name)
         try:
             key = name, path.stat().st_ino
@@ -198,20 +195,20 @@ class Playback:
             else:
                 recording.refresh()
         except (SkylessError, OSError) as error:
-            raise NoRecordingError(f"{name!r} cannot be read: {error}") from None
+            raise HTTPException(404, f"{name!r} cannot be read: {error}") from None
         self._open[key] = recording
         while len(self._open) > _MAX_OPEN:
             self._open.popitem(last=False)[1].close()
         return recording
 
     def _path(self, name: str) -> Path:
-        """A file that lies in the folder itself. Raises NoRecordingError."""
+        """A file that lies in the folder itself. Raises HTTPException."""
         plain = name.endswith(_SUFFIX) and not name.startswith(".") and not {"/", "\\", "\0", os.sep} & set(name)
         if self._folder is not None and plain:
             path = self._folder / name
             if path.is_file() and path.resolve().parent == self._folder.resolve():
                 return path
-        raise NoRecordingError(f"there is no recording {name[:100]!r}")
+        raise HTTPException(404, f"there is no recording {name[:100]!r}")
 
 
 def _version(file: Path) -> _Version:
@@ -222,8 +219,8 @@ def _version(file: Path) -> _Version:
 @lru_cache(_MAX_OPEN)
 def _events(path: Path, _of: _Version, stopped: threading.Event) -> RecordedEvents:
     """The events of the same log that the live page has, by the recording's times."""
-    log = EventLog()
     events: list[Event] = []
+    log = EventLog(add=events.append)
     due_s, last_s = 0.0, float("-inf")
     with McapRecording(path) as recording:
         for found in recording.messages({"status", "health", "fix", "watch"}):
@@ -236,7 +233,6 @@ def _events(path: Path, _of: _Version, stopped: threading.Event) -> RecordedEven
                 due_s = found.time_s + _TICK_S
             last_s = found.time_s
             _log_message(log, found)
-            events += log.since(len(events))
     return RecordedEvents(tuple(events[:MAX_RECORDED_EVENTS]), len(events) < MAX_RECORDED_EVENTS)
 
 

@@ -13,8 +13,9 @@ from msgspec import Struct
 
 from skyless.core.errors import SkylessError
 from skyless.page._state import MAX_REQUEST_BYTES
-from skyless.page.app import PAGE_TIMEOUT_S, Services, make_app
+from skyless.page.app import Services, make_app
 from skyless.page.guard import AccessRules
+from skyless.page.sockets import SEND_TIMEOUT_S
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.process import ending_signals, reserve
 
@@ -66,7 +67,7 @@ def _bind(host: str, port: int) -> socket.socket:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)  # every page's socket inherits it
             if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux; elsewhere the system's own time-out applies
-                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * PAGE_TIMEOUT_S))
+                sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * SEND_TIMEOUT_S))
             sock.bind(address)
             sock.listen(socket.SOMAXCONN)  # two sockets may be bound to one port, but not both listen
         except BaseException:
@@ -97,7 +98,7 @@ async def serve(
         ws="websockets-sansio",
         ws_per_message_deflate=False,  # on the same machine it would only cost time
         ws_ping_interval=_PING_S,
-        ws_ping_timeout=PAGE_TIMEOUT_S,
+        ws_ping_timeout=SEND_TIMEOUT_S,
         ws_max_size=MAX_REQUEST_BYTES,
         timeout_graceful_shutdown=1,
     )

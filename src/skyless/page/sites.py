@@ -6,7 +6,9 @@ A page is connected to one of them for as long as it is open, so that it cannot 
 import asyncio
 from collections.abc import Callable
 
-from skyless.page.live import LiveSite, NoSiteError
+from starlette.exceptions import HTTPException
+
+from skyless.page.live import LiveSite
 from skyless.run.alarms.engine import MAX_KEPT
 from skyless.run.find_site import SiteOnBroker, watch_sites
 from skyless.run.mqtt.address import MqttAddress
@@ -31,16 +33,12 @@ class LiveSites:
         return [self._first, *(live for live in self._by_number.values() if live is not self._first)]
 
     def of(self, asked: str | None) -> LiveSite:
-        """The site of a number, or without a number a site that is alive.
-
-        Raises:
-            NoSiteError: the broker has no site of this number.
-        """
+        """The site of a number, or without a number a site that is alive. Raises HTTPException."""
         if not asked:
             return self._usual()
         number = int(asked) if asked.isascii() and asked.isdecimal() and len(asked) < 6 else -1
         if number not in self._by_number and (number not in self._on_broker or self._make is None):
-            raise NoSiteError(f"site is {asked[:20]!r}; this broker has no such site, or it is not shown here")
+            raise HTTPException(404, f"site is {asked[:20]!r}; this broker has no such site, or it is not shown here")
         return self._shown(number)
 
     def _usual(self) -> LiveSite:

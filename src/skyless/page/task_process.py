@@ -1,22 +1,33 @@
-"""A process of its own for what would delay the pages, or would load NumPy into the server: one task at a time."""
+"""A process of its own for what would delay the pages, or would load NumPy into the server: one task at a time.
+
+Tasks and answers are lines of JSON.
+"""
 
 import asyncio
 import os
 import subprocess
 import sys
 from collections.abc import Callable
-from typing import Final
+from typing import Final, TypeVar
+
+import msgspec
+from msgspec import Raw, Struct
+from starlette.exceptions import HTTPException
+
+from skyless.core.errors import SkylessError
 
 _TIMEOUT_S: Final = 120.0
 _IDLE_S: Final = 60.0
 """A process without a task for this long is ended: it has loaded a hundred megabytes."""
 
-_LENGTH_BYTES: Final = 8
 _NICE: Final = 19  # positioning on this machine has priority
 
+_Task = TypeVar("_Task", bound=Struct)
 
-class TaskError(Exception):
-    """Why a task was not done."""
+
+class _Answer(Struct):
+    value: Raw = Raw(b"null")
+    error: str | None = None
 
 
 class TaskProcess:
@@ -25,6 +36,7 @@ class TaskProcess:
     def __init__(self, module: str) -> None:
         """``module`` calls ``serve_tasks`` when it is run."""
         self._module = module
+        self._lock = asyncio.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._idle: asyncio.TimerHandle | None = None
         self._stopped = False
@@ -34,25 +46,32 @@ class TaskProcess:
         self._stopped = True
         self._kill()
 
-    async def run(self, task: bytes) -> bytes:
-        """The result of a task, empty where the process failed and has written why. Raises TaskError."""
-        if self._stopped:
-            raise TaskError("the dashboard is stopping")
-        if self._idle is not None:
-            self._idle.cancel()
-        try:
-            async with asyncio.timeout(_TIMEOUT_S):
-                result = await asyncio.to_thread(self._exchange, task)
-        except TimeoutError:
-            self._kill()
-            raise TaskError("it takes too long") from None
-        except BaseException:
-            self._kill()  # what it would answer belongs to no later task
-            raise
-        self._idle = asyncio.get_running_loop().call_later(_IDLE_S, self._kill)
-        return result
+    async def run(self, task: Struct) -> bytes:
+        """The answer to a task, as JSON. Raises HTTPException."""
+        async with self._lock:
+            if self._stopped:
+                raise HTTPException(422, "the dashboard is stopping")
+            if self._idle is not None:
+                self._idle.cancel()
+            try:
+                async with asyncio.timeout(_TIMEOUT_S):
+                    line = await asyncio.to_thread(self._exchange, msgspec.json.encode(task))
+            except TimeoutError:
+                self._kill()
+                raise HTTPException(422, f"it takes longer than {_TIMEOUT_S:g} s") from None
+            except BaseException:
+                self._kill()  # what it would answer belongs to no later task
+                raise
+            self._idle = asyncio.get_running_loop().call_later(_IDLE_S, self._kill)
+        if not line:
+            raise HTTPException(422, "it could not be computed; the dashboard's terminal shows why")
+        answer = msgspec.json.decode(line, type=_Answer)
+        if answer.error is not None:
+            raise HTTPException(422, answer.error)
+        return bytes(answer.value)
 
     def _exchange(self, task: bytes) -> bytes:
+        """The process's answer, empty where it has failed."""
         process = self._process
         if process is None or process.poll() is not None:
             self._process = process = subprocess.Popen(
@@ -62,12 +81,11 @@ class TaskProcess:
                 start_new_session=True,  # Ctrl-C stops the dashboard, which kills this process itself
             )
         if process.stdin is None or process.stdout is None:
-            raise TaskError("its process has no pipes")
+            raise HTTPException(422, "its process has no pipes")
         try:
-            process.stdin.write(len(task).to_bytes(_LENGTH_BYTES, "little") + task)
+            process.stdin.write(task + b"\n")
             process.stdin.flush()
-            head = process.stdout.read(_LENGTH_BYTES)
-            return process.stdout.read(int.from_bytes(head, "little"))
+            return process.stdout.readline()
         except (OSError, ValueError):  # ValueError: it was killed meanwhile, and its pipes are closed
             return b""
 
@@ -78,11 +96,13 @@ class TaskProcess:
             self._process = None
 
 
-def serve_tasks(answer: Callable[[bytes], bytes]) -> None:
-    """Answer the tasks of standard input on standard output, until it is closed."""
+def serve_tasks(kind: type[_Task], answer: Callable[[_Task], object]) -> None:
+    """Answer the tasks of standard input on standard output, until it is closed. A SkylessError is an answer, too."""
     os.nice(_NICE)
-    tasks, results = sys.stdin.buffer, sys.stdout.buffer
-    while len(head := tasks.read(_LENGTH_BYTES)) == _LENGTH_BYTES:
-        result = answer(tasks.read(int.from_bytes(head, "little")))
-        results.write(len(result).to_bytes(_LENGTH_BYTES, "little") + result)
-        results.flush()
+    for line in sys.stdin.buffer:
+        try:
+            found = _Answer(Raw(msgspec.json.encode(answer(msgspec.json.decode(line, type=kind)))))
+        except SkylessError as error:
+            found = _Answer(error=str(error))
+        sys.stdout.buffer.write(msgspec.json.encode(found) + b"\n")
+        sys.stdout.buffer.flush()

@@ -1,11 +1,11 @@
-"""The process that prepares a recording for being recomputed."""
+"""The process that prepares a recording for being recomputed by a page, which runs the estimator's WebAssembly."""
 
 import ctypes
 from collections.abc import Iterator
 from typing import Any, Final
 
-import msgspec
 import numpy as np
+from msgspec import Struct
 
 from skyless.core.air.reception import Diagnostics, Reception
 from skyless.core.any_receiver import AnyReceiver
@@ -22,7 +22,7 @@ from skyless.core.native.views import view
 from skyless.core.tag.hearing import Hearing
 from skyless.core.tag.receiver import Receiver
 from skyless.page.task_process import serve_tasks
-from skyless.page.what_if import WhatIf, WhatIfAnchor, WhatIfTask
+from skyless.page.tasks import WhatIfTask
 from skyless.run.mqtt.messages import RawReception, SegmentStart
 from skyless.run.recordings.reception_log import RefusedError, load
 from skyless.run.recordings.recording import McapRecording
@@ -32,13 +32,37 @@ _LEAST_STD_M: Final = 0.1
 """A filter that begins at a fix is no surer than this: its anchors may stand elsewhere now."""
 
 
-def answer(task: bytes) -> bytes:
-    """The tables of one recording; the task and they are JSON."""
-    try:
-        found = _Tables(msgspec.json.decode(task, type=WhatIfTask)).filled()
-    except SkylessError as error:
-        found = WhatIf(error=str(error))
-    return msgspec.json.encode(found)
+class WhatIfAnchor(Struct, frozen=True):
+    """An anchor of the packets, in the order of their table."""
+
+    id: int
+    position_m: tuple[float, float, float]
+
+
+class WhatIf(Struct, frozen=True):
+    """Tables in the memory layout of ``skyless_core.h``, for ``browser/estimator.js``."""
+
+    digest: str
+    """Of the source from which the WebAssembly has to be made."""
+    begin_s: float
+    """Since ``begin_unix_s``."""
+    times_s: list[float]
+    """Of the packets, since the first."""
+    recorded: list[tuple[float, float, float, float | None] | None]
+    """What the tag made of each packet: position and horizontal protection level, or no fix."""
+    anchors: list[WhatIfAnchor]
+    layout: dict[str, int]
+    """Sizes of records, and offsets of the fields that the page reads or changes."""
+    state: list[tuple[int, bytes]]
+    """Where the filter's first state is not zero, and what stands there."""
+    places: bytes
+    packets: bytes
+    relays: bytes
+
+
+def what_if(task: WhatIfTask) -> WhatIf:
+    """The tables of one recording. Raises SkylessError where there is nothing to recompute."""
+    return _Tables(task).filled()
 
 
 class _Tables:
@@ -55,11 +79,7 @@ class _Tables:
         self._begin_s = 0.0
 
     def filled(self) -> WhatIf:
-        """All of them.
-
-        Raises:
-            SkylessError: there is nothing to recompute.
-        """
+        """All of them. Raises SkylessError."""
         task, receiver = self._task, None
         with McapRecording(task.path) as recording:
             for start, raw, unix_s in _receptions(recording, task.tag):
@@ -185,4 +205,4 @@ def _bytes_of(rows: list[Any]) -> bytes:
 
 
 if __name__ == "__main__":
-    serve_tasks(answer)
+    serve_tasks(WhatIfTask, what_if)

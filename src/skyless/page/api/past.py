@@ -31,6 +31,8 @@ class Past:
         self._folder = folder
         self._pool = ThreadPoolExecutor(1, "history")  # its thread begins with the first question
         self._waiting = 0
+        self.is_busy = False
+        """Whether a question is being answered. Nothing can end that, but the end of the process."""
 
     async def ask(self, site: int | None, question: "Callable[[History], _T]") -> _T:
         """The answer of a site's history. Raises HTTPException, also where it takes too long."""
@@ -44,7 +46,7 @@ class Past:
         try:
             async with asyncio.timeout(QUERY_TIMEOUT_S):  # one that has begun goes on, and the next waits for its end
                 loop = asyncio.get_running_loop()
-                return await loop.run_in_executor(self._pool, _ask, self._folder, site, question)
+                return await loop.run_in_executor(self._pool, self._answer, self._folder, site, question)
         except TimeoutError:
             fault = f"the history has not answered within {QUERY_TIMEOUT_S:g} s; ask for a shorter time"
             raise HTTPException(503, fault) from None
@@ -55,18 +57,19 @@ class Past:
         """Begin no further question."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
+    def _answer(self, folder: Path, site: int, question: "Callable[[History], _T]") -> _T:
+        from skyless.run.history.queries import History  # noqa: PLC0415 - of the extra history
 
-def _ask(folder: Path, site: int, question: "Callable[[History], _T]") -> _T:
-    from skyless.run.history.queries import History  # noqa: PLC0415 - of the extra history
-
-    try:
-        history = History(folder, site)
-    except SkylessError as error:
-        raise HTTPException(404, str(error)) from None
-    try:
-        return question(history)
-    except SkylessError as error:
-        raise HTTPException(400, str(error)) from None
+        self.is_busy = True
+        status = 404  # there is no such history
+        try:
+            history = History(folder, site)
+            status = 400
+            return question(history)
+        except SkylessError as error:
+            raise HTTPException(status, str(error)) from None
+        finally:
+            self.is_busy = False
 
 
 def _span(begin: str, end: str) -> Span:

@@ -20,7 +20,7 @@ from skyless.page.api.answers import (
     ZoneTags,
 )
 from skyless.page.api.parameters import After, Before, Find, Group, Limit, RuleId, Subject, TagName, ZoneId
-from skyless.page.live import LiveSite, NoSiteError
+from skyless.page.live import LiveSite
 from skyless.run.assets import read_csv, write_csv
 from skyless.run.mqtt.messages import (
     AlarmMessage,
@@ -28,7 +28,6 @@ from skyless.run.mqtt.messages import (
     Asset,
     AssetsMessage,
     FixMessage,
-    SiteMessage,
 )
 
 _ALL: Final = 2**53
@@ -36,16 +35,10 @@ _STORED_S: Final = 5.0
 _POLL_S: Final = 0.02
 
 
-def _known(live: LiveSite) -> SiteMessage:
-    if live.site is None:
-        raise NoSiteError("no site is known yet")
-    return live.site
-
-
 def site(live: LiveSite) -> SiteAnswer:
     """The site, and how it is."""
     return SiteAnswer(
-        **asdict(_known(live)),
+        **asdict(live.require_site()),
         condition=live.condition,
         connected=live.connected,
         history=live.has_history,
@@ -57,7 +50,7 @@ def anchors(live: LiveSite) -> tuple[Anchor, ...]:
     """Its anchors."""
     return tuple(
         Anchor(anchor.id, (anchor.x_m, anchor.y_m, anchor.z_m), _online(live, "anchor", str(anchor.id)))
-        for anchor in _known(live).site.anchors
+        for anchor in live.require_site().site.anchors
     )
 
 
@@ -147,7 +140,7 @@ def assets(live: LiveSite) -> AssetsMessage:
 
 def put_assets(live: LiveSite, *, body: AssetsMessage) -> AssetsMessage:
     """Replace all assets."""
-    _known(live)
+    live.require_site()
     live.assets.store(body.assets, body.site)
     return live.assets.message
 
@@ -175,7 +168,7 @@ def alarm_rules(live: LiveSite) -> AlarmRulesAnswer:
 
 def put_alarm_rules(live: LiveSite, *, body: AlarmRulesMessage) -> AlarmRulesAnswer:
     """Replace the rules that were made on the page."""
-    _known(live)
+    live.require_site()
     live.alarms.store_rules(body.rules, body.site)
     return replace(alarm_rules(live), rules=body.rules)  # they hold from the next tick on
 

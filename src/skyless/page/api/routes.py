@@ -11,12 +11,10 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 
-from skyless.core.errors import SkylessError
-from skyless.page.api import past, present, stream
+from skyless.page.api import geojson, past, present, stream
 from skyless.page.api.openapi import CSV, GEOJSON, JSON, ROOT, document
 from skyless.page.api.parameters import RENAMED, MapQuery, SiteQuery, read_query
 from skyless.page.api.past import Past
-from skyless.page.live import LiveSite
 from skyless.page.sites import LiveSites
 from skyless.run.assets import MAX_BYTES
 
@@ -111,7 +109,7 @@ def _endpoint(route: ApiRoute, sites: LiveSites, history: Past) -> Callable[[Req
         live = sites.of(query.site_text)
         given = {name: getattr(query, name) for name in route.parameters}
         if isinstance(query, MapQuery) and query.format == "geojson":
-            return geojson(live, route.key)
+            return geojson.collection(live, route.key)
         if route.body is not None:
             given["body"] = _read_body(await read_bytes(request, MAX_BODY_BYTES), route.body)
         if route.is_past:
@@ -124,14 +122,6 @@ def _endpoint(route: ApiRoute, sites: LiveSites, history: Past) -> Callable[[Req
         return Response(answer, media_type=route.media_types[0])
 
     return respond
-
-
-def geojson(live: LiveSite, kind: Any) -> Response:  # noqa: ANN401 - one of LiveSite.features
-    """The tags with fixes, the anchors or the zones. Raises HTTPException: the site is not georeferenced."""
-    try:
-        return Response(live.features(kind), media_type=GEOJSON)
-    except SkylessError as error:
-        raise HTTPException(409, str(error)) from None
 
 
 async def read_bytes(request: Request, most_bytes: int, fault: str = "") -> bytes:

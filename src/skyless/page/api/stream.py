@@ -11,23 +11,19 @@ from typing import Final
 import msgspec
 from msgspec import Struct
 from starlette.exceptions import HTTPException
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket
 
 from skyless.core.version import installed_version
 from skyless.page.api.parameters import SiteQuery, TagNames, names, read_query
 from skyless.page.api.present import usable
-from skyless.page.live import LiveSite, NoSiteError
+from skyless.page.live import LiveSite
 from skyless.page.sites import LiveSites
+from skyless.page.sockets import POLICY_VIOLATION, TRY_LATER, send, serve_socket
 from skyless.run.mqtt.messages import AlarmMessage
 
 PERIOD_S: Final = 0.1
 _PAUSES: Final = 9.0  # of very many tags a stream is sent less often, so that it takes a tenth of a processor at most
 MAX_STREAMS: Final = 200
-STREAM_TIMEOUT_S: Final = 10.0
-"""A reader that accepts no message for this long is disconnected."""
-
-_POLICY_VIOLATION: Final = 1008
-_TRY_LATER: Final = 1013
 _MAX_REASON_BYTES: Final = 120  # of the 123 that the protocol allows
 
 
@@ -70,7 +66,7 @@ class SiteStream:
 
     def _new_zone_events(self) -> list[bytes]:
         number, self._event = self._event, self._live.event_list.last
-        events = (event.zone_event for event in self._live.event_list.since(number))
+        events = (event.zone_event for event, _ in self._live.event_list.since(number))
         return [_message("zone_event", event) for event in events if event is not None and self._carries(event.tag)]
 
     def _new_alarms(self) -> list[bytes]:
@@ -98,39 +94,26 @@ def endpoint(sites: LiveSites) -> Callable[[WebSocket], Awaitable[None]]:
         try:
             query = read_query(socket.query_params, StreamQuery)
             live = sites.of(query.site_text)
-        except (HTTPException, NoSiteError) as error:
-            reason = error.detail if isinstance(error, HTTPException) else str(error)
-            await socket.close(_POLICY_VIOLATION, reason.encode()[:_MAX_REASON_BYTES].decode(errors="ignore"))
+        except HTTPException as error:
+            await socket.close(POLICY_VIOLATION, error.detail.encode()[:_MAX_REASON_BYTES].decode(errors="ignore"))
             return
         if len(open_streams) >= MAX_STREAMS:
-            await socket.close(_TRY_LATER, f"{MAX_STREAMS} streams are open")
+            await socket.close(TRY_LATER, f"{MAX_STREAMS} streams are open")
             return
         open_streams.add(socket)
-        reading = asyncio.create_task(_until_closed(socket))
         try:
-            await _send(socket, reading, SiteStream(live, frozenset(names(query.tags))))
-        except (WebSocketDisconnect, RuntimeError, TimeoutError):
-            pass  # it has gone, or does not read
+            await serve_socket(socket, _send_news(socket, SiteStream(live, frozenset(names(query.tags)))))
         finally:
-            reading.cancel()
             open_streams.discard(socket)
 
     return serve
 
 
-async def _send(socket: WebSocket, reading: asyncio.Task[None], stream: SiteStream) -> None:
+async def _send_news(socket: WebSocket, stream: SiteStream) -> None:
     messages, spent_s = [stream.hello()], 0.0
-    while not reading.done():
-        async with asyncio.timeout(STREAM_TIMEOUT_S):
-            for message in messages:
-                await socket.send_text(message.decode())
-        await asyncio.wait([reading], timeout=max(PERIOD_S, _PAUSES * spent_s))
+    while True:
+        await send(socket, messages)
+        await asyncio.sleep(max(PERIOD_S, _PAUSES * spent_s))
         begin_s = time.monotonic()
         messages = stream.new()
         spent_s = time.monotonic() - begin_s
-
-
-async def _until_closed(socket: WebSocket) -> None:
-    """Read, and drop, what the reader sends until it closes."""
-    while (await socket.receive())["type"] != "websocket.disconnect":
-        pass

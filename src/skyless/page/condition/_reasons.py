@@ -111,14 +111,9 @@ class Reason(Struct, frozen=True):
     """The tags or anchors concerned, as ``tag/t1`` or ``anchor/3``; of many only the first."""
 
 
-def of_tags(kind: str, level: _Severity, text: str, advice: str, names: Iterable[str]) -> Reason:
-    """A reason that concerns these tags."""
-    return Reason(kind, level, text, advice, tuple(f"tag/{name}" for name in list(names)[:_MAX_NAMED]))
-
-
-def of_anchors(kind: str, level: _Severity, text: str, advice: str, names: Iterable[str]) -> Reason:
-    """A reason that concerns these anchors."""
-    return Reason(kind, level, text, advice, tuple(f"anchor/{name}" for name in list(names)[:_MAX_NAMED]))
+def _of(what: str, kind: str, level: _Severity, text: str, advice: str, names: Iterable[str]) -> Reason:
+    """A reason that concerns these tags or anchors."""
+    return Reason(kind, level, text, advice, tuple(f"{what}/{name}" for name in list(names)[:_MAX_NAMED]))
 
 
 def broker_reason() -> Reason:
@@ -145,7 +140,7 @@ def late_reason(evidence: Evidence, ages: Mapping[str, tuple[float, float]]) -> 
         if host not in {"", evidence.host}:
             advice += f" Measured against the quickest message from {host} in the last minutes, not by its clock."
     text = f"{whose} are {age_s:.1f} s behind: {why}"
-    return of_tags("late", "bad" if age_s > VERY_LATE_S else "warning", text, advice, late)
+    return _of("tag", "late", "bad" if age_s > VERY_LATE_S else "warning", text, advice, late)
 
 
 def _key_wait_s(evidence: Evidence, tag: str) -> float:
@@ -156,7 +151,9 @@ def _key_wait_s(evidence: Evidence, tag: str) -> float:
 
 def slow_reason(evidence: Evidence, now_s: float, lag_s: float) -> Reason | None:
     """Computers do not keep up: one reason for all signs of it. ``lag_s`` is the delay of the page's server."""
-    signs = [*_lag(evidence, lag_s), *_missed(evidence, now_s), *_dropped(evidence, now_s)]
+    signs = [*_missed(evidence, now_s), *_dropped(evidence, now_s)]
+    if lag_s > LAG_S:
+        signs.insert(0, (evidence.host, 0.0, f"the page's server was delayed by {lag_s:.1f} s"))
     if not signs:
         return None
     computers: dict[str, list[str]] = {}
@@ -203,11 +200,6 @@ def busy_reason(evidence: Evidence, used_share: float | None) -> Reason | None:
 _Sign = tuple[str, float, str]  # computer, share of what was lost, and words
 
 
-def _lag(evidence: Evidence, lag_s: float) -> Iterable[_Sign]:
-    if lag_s > LAG_S:
-        yield evidence.host, 0.0, f"the page's server was delayed by {lag_s:.1f} s"
-
-
 def _missed(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
     """Transmissions of the emulated air, and of anchors."""
     for _, air in evidence.of("ether"):
@@ -248,26 +240,23 @@ def fix_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
     if not without:
         return
     silent = [name for name, tag in without if not tag.reports(now_s)]
-    causes = {name: _cause(tag) for name, tag in without if tag.reports(now_s)}
+    healths = {name: tag.health for name, tag in without if tag.reports(now_s)}
+    causes = {name: health.reason or "" for name, health in healths.items() if isinstance(health, TagHealth)}
     if len(without) == len(online):
         though = "a tag is online" if len(online) == 1 else f"{len(online)} tags are online"
         why, advice = _causes(causes, len(without))
         if not causes:
             why, advice = ": they do not report", "See whether their programs and computers still run."
-        yield of_tags("no-fixes", "bad", f"no positions, although {though}{why}", advice, [n for n, _ in without])
+        yield _of("tag", "no-fixes", "bad", f"no positions, although {though}{why}", advice, [n for n, _ in without])
         return
     if causes:
         why, advice = _causes(causes, len(causes))
         text = f"{listed('tag', list(causes))} {verb(causes, 'has', 'have')} no fix{why}"
-        yield of_tags("no-fix", "warning", text, advice, causes)
+        yield _of("tag", "no-fix", "warning", text, advice, causes)
     if silent:
         text = f"{listed('tag', silent)} {verb(silent, 'does', 'do')} not report any more"
         advice = "Its program does not respond, or its computer is cut off: see there, and start it again."
-        yield of_tags("silent", "warning", text, advice, silent)
-
-
-def _cause(tag: Node) -> str:
-    return (tag.health.reason or "") if isinstance(tag.health, TagHealth) else ""
+        yield _of("tag", "silent", "warning", text, advice, silent)
 
 
 def _causes(causes: Mapping[str, str], tags: int) -> tuple[str, str]:
@@ -303,7 +292,7 @@ def alert_reasons(evidence: Evidence) -> Iterable[Reason]:
         alerts = {name: str(tag.alert) for name, tag in evidence.of("tag") if ALERTS.get(tag.alert, 0) == grade}
         if alerts:
             text = "; ".join(f"{listed('tag', names)}: {ALERT_WORDS[alert]}" for alert, names in alike(alerts))
-            yield of_tags(kind, level, text, advice, alerts)
+            yield _of("tag", kind, level, text, advice, alerts)
 
 
 def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
@@ -317,16 +306,16 @@ def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
         which = which or f"{listed('anchor', offline)} of {len(names)} {verb(offline, 'is', 'are')}"
         advice = "See whether power and program run there; positions are less accurate without them."
         too_few = len(names) - len(offline) < _MIN_ANCHORS
-        yield of_anchors("anchors", "bad" if too_few else "warning", f"{which} offline", advice, offline)
+        yield _of("anchor", "anchors", "bad" if too_few else "warning", f"{which} offline", advice, offline)
     if cut_off:
         text = f"{listed('anchor', cut_off)} {verb(cut_off, 'does', 'do')} not report, though on the air"
         advice = "The program has lost the broker, or the page lost its messages: see its log."
-        yield of_anchors("silent-anchors", "warning", text, advice, cut_off)
+        yield _of("anchor", "silent-anchors", "warning", text, advice, cut_off)
     if idle:
         text = f"{listed('anchor', idle)} {verb(idle, 'is', 'are')} not synchronised and sends nothing"
         text = text if len(idle) == 1 else text.replace("sends", "send")
         advice = "Too few messages of the others arrive there: see what blocks them."
-        yield of_anchors("not-synchronised", "warning", text, advice, idle)
+        yield _of("anchor", "not-synchronised", "warning", text, advice, idle)
 
 
 def offline_anchors(evidence: Evidence, now_s: float) -> list[str] | None:
@@ -381,7 +370,7 @@ def multipath_reason(evidence: Evidence, now_s: float) -> Reason | None:
         f"Set place_std_m = {std_m:.2f} and place_distance_m = {distance_m:.2f} under [accuracy] of the site file:"
         " tags then start with that instead of learning it."
     )
-    return of_tags("multipath", "warning", text, advice, more)
+    return _of("tag", "multipath", "warning", text, advice, more)
 
 
 def master_reason(evidence: Evidence, now_s: float) -> Reason | None:
@@ -407,7 +396,7 @@ def watch_reasons(watch: WatchMessage | None, age_s: float | None) -> Iterable[R
         text += " (the watch does not report any more)" if ended else ""
         advice = "Move it back, or survey again." if kind == "moved" else "See there; survey again where it stays so."
         names = dict.fromkeys(str(anchor) for finding in chosen for anchor in finding.anchors)
-        yield of_anchors(kind, "bad" if kind == "moved" and not ended else "warning", text, advice, names)
+        yield _of("anchor", kind, "bad" if kind == "moved" and not ended else "warning", text, advice, names)
 
 
 # Codes and keys: nothing is found at a site without keys and of tags without its public key
@@ -456,7 +445,7 @@ def _clock(tags: Mapping[str, TagHealth]) -> Iterable[Reason]:
         text = f"the clocks of {listed('tag', list(errors_s))} differ from the site's by up to {size}"
     advice = "Synchronise the clocks of its computer and of the anchors', as by NTP: they decide what came in time."
     verified = all(tags[name].is_verified for name in errors_s)
-    yield of_tags("clock", "warning" if verified else "bad", text, advice, errors_s)
+    yield _of("tag", "clock", "warning" if verified else "bad", text, advice, errors_s)
 
 
 def _not_verified(evidence: Evidence, tags: Mapping[str, TagHealth], now_s: float) -> Iterable[Reason]:
@@ -475,7 +464,7 @@ def _not_verified(evidence: Evidence, tags: Mapping[str, TagHealth], now_s: floa
         "Its positions may be forged. See whether the anchors send codes, whether its clock is right, and whether "
         "it has this site's public key."
     )
-    yield of_tags("not-verified", "bad", text, advice, found)
+    yield _of("tag", "not-verified", "bad", text, advice, found)
 
 
 def _receives(tag: Node, now_s: float) -> bool:
@@ -494,13 +483,13 @@ def _chains(keyed: Mapping[str, AnchorHealth]) -> Iterable[Reason]:
         text = (
             f"the key chain of {_all_or_some(ended, keyed)} has ended: {verb(ended, 'it sends', 'they send')} no codes"
         )
-        yield of_anchors("chain-ended", "bad", text, advice, ended)
+        yield _of("anchor", "chain-ended", "bad", text, advice, ended)
     soon = {name: _left_s(health) for name, health in keyed.items() if 0.0 < _left_s(health) < CHAIN_ENDS_S}
     if soon:
         least_s = min(soon.values())
         left = f"{least_s // 86400.0:.0f} days" if least_s >= 2 * 86400.0 else f"{least_s // 3600.0:.0f} hours"
         text = f"the key chain of {_all_or_some(list(soon), keyed)} ends in {left}"
-        yield of_anchors("chain", "warning", text, advice, soon)
+        yield _of("anchor", "chain", "warning", text, advice, soon)
 
 
 def _all_or_some(names: list[str], keyed: Mapping[str, AnchorHealth]) -> str:
@@ -523,7 +512,7 @@ def _codes(evidence: Evidence, keyed: Mapping[str, AnchorHealth], now_s: float) 
     text = f"{listed('anchor', list(without))} {verb(without, 'sends', 'send')} no codes: "
     text += "; ".join(why if len(groups) == 1 else f"{why} ({listed('anchor', names)})" for why, names in whys)
     advice = _ADVICE_NO_CODES.get(groups[0][0], "See the log of its program.")
-    yield of_anchors("codes", "warning", text, advice, without)
+    yield _of("anchor", "codes", "warning", text, advice, without)
 
 
 def _keys(
@@ -537,7 +526,7 @@ def _keys(
         others = f"{len(keyed)} other{verb(keyed, ' has', 's have')}"
         text = f"{listed('anchor', without)} {verb(without, 'has', 'have')} no keys, though {others} them"
         advice = "Start it with the site's keys (--keys): tags that verify beacons do not use it."
-        yield of_anchors("keys", "warning", text, advice, without)
+        yield _of("anchor", "keys", "warning", text, advice, without)
 
 
 def _forged(
@@ -565,7 +554,7 @@ def _forged(
         advice += (
             f" Do not rely on {listed('tag', without_key)}: {verb(without_key, 'it verifies', 'they verify')} nothing."
         )
-    yield of_anchors("forged", level, "; ".join(parts), advice, faults)
+    yield _of("anchor", "forged", level, "; ".join(parts), advice, faults)
 
 
 def _statements(

@@ -5,7 +5,6 @@ its level, too, falls only after that time. The condition is good only on fresh 
 tag has a fix that has just arrived, and nothing speaks against it. Where nothing is known it is "waiting".
 """
 
-from collections.abc import Iterable
 from typing import Final, Literal
 
 from msgspec import Struct
@@ -93,7 +92,24 @@ class ConditionMonitor:
                 return Condition("waiting", "waiting for the broker", (), None, None)
             reason = broker_reason()
             return Condition(reason.level, reason.text, (reason,), None, None)
-        for reason in (*self._find(ages, now_s, lag_s, used_share, unread_s), *watch_reasons(watch, watch_age_s)):
+        behind = behind_reason(ages, unread_s)
+        found = [
+            behind,
+            slow_reason(evidence, now_s, lag_s),
+            busy_reason(evidence, used_share) if evidence.nodes else None,
+            late_reason(evidence, ages) if behind is None else None,
+            left_out_reason(evidence, now_s),
+            master_reason(evidence, now_s),
+            multipath_reason(evidence, now_s),
+            *alert_reasons(evidence),
+            *authentication_reasons(evidence, now_s),
+            *watch_reasons(watch, watch_age_s),
+        ]
+        if lag_s > LAG_S or behind is not None:
+            self._blind_until_s = now_s + 2 * EVALUATION_S  # what has arrived meanwhile is still to be read
+        if not self.is_blind(now_s):
+            found += [*fix_reasons(evidence, now_s), *anchor_reasons(evidence, now_s)]
+        for reason in filter(None, found):
             self._hold(reason, now_s)
         self._held = {kind: held for kind, held in self._held.items() if now_s - held[0] < HOLD_S}
         tags = evidence.of("tag")
@@ -118,36 +134,6 @@ class ConditionMonitor:
         elif now_s - self._bad_s.get(reason.kind, float("-inf")) < HOLD_S:
             reason = replace(reason, level="bad")
         self._held[reason.kind] = now_s, reason
-
-    def _find(
-        self,
-        ages: dict[str, tuple[float, float]],
-        now_s: float,
-        lag_s: float,
-        used_share: float | None,
-        unread_s: float,
-    ) -> Iterable[Reason]:
-        evidence = self.evidence
-        behind = behind_reason(ages, unread_s)
-        yield from filter(
-            None,
-            (
-                behind,
-                slow_reason(evidence, now_s, lag_s),
-                busy_reason(evidence, used_share) if evidence.nodes else None,
-                late_reason(evidence, ages) if behind is None else None,
-                left_out_reason(evidence, now_s),
-                master_reason(evidence, now_s),
-                multipath_reason(evidence, now_s),
-            ),
-        )
-        yield from alert_reasons(evidence)
-        yield from authentication_reasons(evidence, now_s)
-        if lag_s > LAG_S or behind is not None:
-            self._blind_until_s = now_s + 2 * EVALUATION_S  # what has arrived meanwhile is still to be read
-        if not self.is_blind(now_s):
-            yield from fix_reasons(evidence, now_s)
-            yield from anchor_reasons(evidence, now_s)
 
     def _awaited(self) -> str:
         if self.evidence.site is None:

@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from pyarrow import parquet
 
 from skyless.core.arguments import check_number
-from skyless.core.earth import geodetic
 from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
 from skyless.core.whole_files import whole_file
 from skyless.run.fix_batch import ALERT_BITS, ALERTS, NONE_U16, SIMULATED
+from skyless.run.geojson import coordinates, feature
 from skyless.run.history._scans import near, read_rows, time_in_cells, time_limits, utc
 from skyless.run.history.answers import (
     GAP_S,
@@ -445,10 +445,8 @@ def _write_features(file: Path, found: duckdb.DuckDBPyConnection, origin: Georef
         while rows := found.fetchmany(10_000):
             for row in rows:
                 facts = dict(zip(names, row, strict=True))
-                latitude, longitude, height_m = geodetic((facts.pop("x_m"), facts.pop("y_m"), facts.pop("z_m")), origin)
+                at = coordinates((facts.pop("x_m"), facts.pop("y_m"), facts.pop("z_m")), origin)
                 facts["time_utc"] = f"{facts['time_utc'].isoformat(timespec='milliseconds')}Z"
-                place = [round(longitude, 9), round(latitude, 9), round(height_m, 4)]
-                geometry = {"type": "Point", "coordinates": place}
-                out.write(msgspec.json.encode({"type": "Feature", "geometry": geometry, "properties": facts}) + b"\n")
+                out.write(msgspec.json.encode(feature("Point", at, facts)) + b"\n")
             count += len(rows)
     return count
