@@ -52,7 +52,7 @@ from skyless.run.history.layout import (
     day_of,
     site_folder,
 )
-from skyless.run.history.tables import read_table, schema_of
+from skyless.run.history.tables import read_table
 
 MEMORY: Final = "800MB"
 """What DuckDB may use, which is most of what a question uses."""
@@ -168,15 +168,14 @@ class History:
 
     def assets(self) -> dict[str, str]:
         """What people call tags, by the tags' names, as the site's programs told last."""
-        rows = self._table("assets.parquet", ASSET_COLUMNS).to_pylist()
-        return {row["tag"]: row["name"] for row in rows if row["name"]}
+        return {row["tag"]: row["name"] for row in self._table("assets.parquet", ASSET_COLUMNS) if row["name"]}
 
     def zones(self) -> dict[str, tuple[str, tuple[tuple[float, float], ...]]]:
         """Names and corners of all zones by their identifiers."""
         kind = tuple[tuple[float, float], ...]
         return {
             row["zone"]: (row["name"] or row["zone"], msgspec.json.decode(row["corners_m"] or "[]", type=kind))
-            for row in self._table("zones.parquet", ZONE_COLUMNS).to_pylist()
+            for row in self._table("zones.parquet", ZONE_COLUMNS)
         }
 
     @_asked
@@ -321,14 +320,14 @@ class History:
         begin, end = _day(span.from_unix_s, -_EARLY), _day(span.to_unix_s, _LATE)
         return [file for file in current_files(self.folder, self.site) if begin <= day_of(file) <= end]
 
-    def _table(self, name: str, columns: dict[str, str]) -> pyarrow.Table:
+    def _table(self, name: str, columns: dict[str, str]) -> list[dict[str, Any]]:
         file = self._site_folder / name
-        return read_table(file, columns) if file.exists() else schema_of(columns).empty_table()
+        return read_table(file, columns).to_pylist() if file.exists() else []
 
     def _names(self) -> dict[int, str]:
         """The newest name of each number."""
-        rows = self._table("names.parquet", NAME_COLUMNS).sort_by("since").select(["tag", "name"]).to_pylist()
-        return {row["tag"]: row["name"] for row in rows}
+        rows = self._table("names.parquet", NAME_COLUMNS | {"since": "int64"})
+        return {row["tag"]: row["name"] for row in sorted(rows, key=lambda row: row["since"])}
 
     def _tags(self, asked: Iterable[str]) -> dict[str, list[int]]:
         """Tags by their names or those of their assets, and their numbers. Raises SkylessError."""
