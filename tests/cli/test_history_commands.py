@@ -9,7 +9,15 @@ import pytest
 from pyarrow import parquet
 
 from skyless.cli.main import main
-from skyless.run.history.layout import EVENT_COLUMNS, FIX_COLUMNS, NAME_COLUMNS, ZONE_COLUMNS, file_name, site_folder
+from skyless.run.history.layout import (
+    ASSET_COLUMNS,
+    EVENT_COLUMNS,
+    FIX_COLUMNS,
+    NAME_COLUMNS,
+    ZONE_COLUMNS,
+    file_name,
+    site_folder,
+)
 from skyless.sim.lab import lab_site
 from skyless.site.file.template import site_template
 
@@ -38,6 +46,7 @@ def folder(tmp_path_factory):
     fixes = [(tag, t, x, 1000 * tag, 1200, 50, 65535, 8) for tag in (1, 2) for t, x in zip(ms, x_mm, strict=True)]
     write(site / "day=2026-11-20" / file_name(1, 7200), FIX_COLUMNS, fixes)
     write(site / "names.parquet", NAME_COLUMNS, [(1, "[red]ann", 0), (2, "bob", 0)])
+    write(site / "assets.parquet", ASSET_COLUMNS, [("bob", "Forklift 3")])
     write(site / "zones.parquet", ZONE_COLUMNS, [("dock", "Dock", "[[1, 0], [3, 0], [3, 3], [1, 3]]")])
     events = [
         (ms[60], "enter", "[red]ann", "dock", None, None, ""),
@@ -57,7 +66,7 @@ QUESTIONS = {
     "heatmap": ("--cell", "0.5"),
     "dwell": ("--zone", "dock"),
     "occupancy": ("--every", "60"),
-    "contacts": ("bob",),
+    "contacts": ("forklift 3",),
     "alarms": (),
 }
 ANSWERS = {
@@ -67,7 +76,10 @@ ANSWERS = {
         [(one["tag"], one["zone_name"], one["seconds"]) for one in dwell] == [("[red]ann", "Dock", 600.0)]
     ),
     "occupancy": lambda steps: sum(one["mean"] * 60.0 for one in steps) == pytest.approx(600.0),
-    "contacts": lambda found: [(one["other"], one["least_m"]) for one in found] == [("[red]ann", 1.0)],
+    "contacts": lambda found: (
+        [(one["tag"], one["tag_name"], one["other"], one["least_m"]) for one in found]
+        == [("bob", "Forklift 3", "[red]ann", 1.0)]
+    ),
     "alarms": lambda found: [one["text"] for one in found] == ["ann is late"],
 }
 SHOWN = {
@@ -75,7 +87,7 @@ SHOWN = {
     "heatmap": "1 h 59 min",
     "dwell": "10 min 00 s",
     "occupancy": "1.00",
-    "contacts": "1.00",
+    "contacts": "Forklift 3",
     "alarms": "ann is late",
 }
 
@@ -100,6 +112,13 @@ def test_pictures(folder, question, tmp_path, capsys):
     text = picture.read_text(encoding="utf-8")
     assert text.startswith("<?xml")
     assert {"contacts": "[red]ann", "alarms": "late, [red]ann"}.get(question, "Dock") in text
+
+
+def test_a_picture_names_the_asset(folder, tmp_path, capsys):
+    picture = tmp_path / "contacts.svg"
+    assert run(folder, "contacts", "[red]ann", "--plot", str(picture)) == 0
+    assert "Forklift 3" in picture.read_text(encoding="utf-8")
+    assert "bob" not in capsys.readouterr().out
 
 
 def test_exports(folder, tmp_path, capsys):

@@ -32,24 +32,22 @@ def ms(event):
 
 
 def told(log, message):
-    if isinstance(message, ZoneEvent):
-        return log.of_zone(message)
-    return log.of_alarm(message) if isinstance(message, AlarmMessage) else log.of_status(message, NOW_S)
+    return log.of(message, NOW_S)
 
 
 def test_what_the_columns_hold():
     log = EventLog()
-    (zone,) = log.of_zone(enter())
+    (zone,) = told(log, enter())
     assert (ms(zone), zone.kind, zone.tag, zone.zone) == (round(1000 * NOW_S), "enter", "ann", "z1")
     assert (zone.subject, zone.alarm, zone.text) == (None, None, "ann entered door")
-    raised, ended, seen = log.of_alarm(SEEN)
+    raised, ended, seen = told(log, SEEN)
     assert [event.kind for event in (raised, ended, seen)] == ["alarm-raised", "alarm-ended", "alarm-acknowledged"]
     assert [ms(event) / 1000 - NOW_S for event in (raised, ended, seen)] == [1.0, 2.0, 3.0]
     assert (raised.tag, raised.zone, raised.subject, raised.alarm) == ("tag7", "z1", "tag7", "cold/tag7/1")
     assert (raised.text, seen.text) == ("tag7 is in Cold store", "Ada")
-    (gone,) = log.of_status(status(online=False), NOW_S)
+    (gone,) = log.of(status(online=False), NOW_S)
     assert (ms(gone), gone.kind, gone.tag, gone.subject) == (round(1000 * NOW_S), "offline", None, "anchor-4")
-    (come,) = log.of_status(status(online=True, name="ann", kind="tag", unix_s=NOW_S - 5.0), NOW_S)
+    (come,) = log.of(status(online=True, name="ann", kind="tag", unix_s=NOW_S - 5.0), NOW_S)
     assert (ms(come), come.kind, come.tag, come.subject) == (round(1000 * (NOW_S - 5)), "online", "ann", None)
 
 
@@ -79,11 +77,11 @@ def test_a_message_that_comes_again_tells_nothing_even_after_a_restart(messages,
 def test_a_late_copy_of_online_does_not_bring_a_node_back():
     log = EventLog()
     before = status(online=True, unix_s=NOW_S - 9.0)
-    assert len(log.of_status(before, NOW_S)) == len(log.of_status(status(online=False), NOW_S)) == 1
-    assert log.of_status(before, NOW_S + 1.0) == []
-    (event,) = log.of_status(status(online=True, unix_s=NOW_S + 1.0), NOW_S + 1.0)
+    assert len(log.of(before, NOW_S)) == len(log.of(status(online=False), NOW_S)) == 1
+    assert log.of(before, NOW_S + 1.0) == []
+    (event,) = log.of(status(online=True, unix_s=NOW_S + 1.0), NOW_S + 1.0)
     assert event.kind == "online"
 
 
 def test_times_that_are_none_give_no_event():
-    assert EventLog().of_zone(enter(unix_s=1e300)) == EventLog().of_zone(enter(unix_s=-1.0)) == []
+    assert told(EventLog(), enter(unix_s=1e300)) == told(EventLog(), enter(unix_s=-1.0)) == []

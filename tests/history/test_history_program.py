@@ -15,14 +15,25 @@ from mqtt.mqtt_brokers import Embedded, stopped
 from mqtt.mqtt_brokers import until as until_
 from skyless.run.history.layout import current_events, current_files, rows_of, site_folder
 from skyless.run.history.program import HistoryNode
+from skyless.run.history.queries import History
 from skyless.run.history.retention import Keep
 from skyless.run.history.writer import Writer
 from skyless.run.mqtt.access import Role, create_access, read_access
 from skyless.run.mqtt.address import MqttAddress, mqtt_address
 from skyless.run.mqtt.link import Link
-from skyless.run.mqtt.messages import AlarmMessage, SiteMessage, StatusMessage, Zone, ZoneEvent, ZonesMessage
+from skyless.run.mqtt.messages import (
+    AlarmMessage,
+    Asset,
+    AssetsMessage,
+    SiteMessage,
+    StatusMessage,
+    Zone,
+    ZoneEvent,
+    ZonesMessage,
+)
 from skyless.run.mqtt.topics import (
     alarm_topic,
+    assets_topic,
     fix_topic,
     site_topic,
     status_topic,
@@ -185,6 +196,7 @@ def test_what_it_takes_of_a_sites_messages(tmp_path):
         lab = msgspec.structs.replace(lab_site(), id=SITE)
         publish(site_topic(SITE), SiteMessage(lab, True, now_s), qos=1, retain=True)
         publish(zones_topic(SITE), ZonesMessage((ZONE,)), qos=1, retain=True)
+        publish(assets_topic(SITE), AssetsMessage((Asset(TAG, "Forklift"), Asset("bob"))), qos=1, retain=True)
         publish(status_topic(SITE, "anchor", 3), StatusMessage(True, "anchor", "3", unix_s=now_s), qos=1, retain=True)
         publish(alarm_topic(SITE, "cold", "ann"), alarm, qos=1, retain=True)
         publish(zone_event_topic(SITE, "z1"), ZoneEvent("z1", "door", "ann", "enter", now_s, (0.0, 0.0, 0.0)), qos=1)
@@ -211,6 +223,7 @@ def test_what_it_takes_of_a_sites_messages(tmp_path):
 
     stage = Stage(tmp_path / "broker")
     asyncio.run(whole())
+    assert History(folder, SITE).assets() == {TAG: "Forklift"}
     found = [parquet.read_table(file, partitioning=None).to_pylist() for file in current_events(folder, SITE)]
     kinds = sorted((row["kind"], row["tag"] or row["subject"]) for table in found for row in table)
     assert kinds == [

@@ -19,7 +19,15 @@ from skyless.core.alert import Alert
 from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
 from skyless.run.history.answers import GAP_S, AlarmRow, Contact, Dwell, Span
-from skyless.run.history.layout import EVENT_COLUMNS, FIX_COLUMNS, NAME_COLUMNS, ZONE_COLUMNS, file_name, site_folder
+from skyless.run.history.layout import (
+    ASSET_COLUMNS,
+    EVENT_COLUMNS,
+    FIX_COLUMNS,
+    NAME_COLUMNS,
+    ZONE_COLUMNS,
+    file_name,
+    site_folder,
+)
 from skyless.run.history.queries import History, counts, sites_in
 
 SITE, TAGS, FIXES = 7, 20, 5000
@@ -92,6 +100,9 @@ def write_others(site):
     names = [*((k, f"tag{k}", 0) for k in range(1, TAGS)), (TAGS, "old", 0), (TAGS, "renamed", 5)]
     parquet.write_table(table(NAME_COLUMNS, dict(zip(NAME_COLUMNS, zip(*names, strict=True), strict=True))),
                         site / "names.parquet")  # fmt: skip
+    assets = {"tag": ["tag3", "tag4", "tag5", "tag6", "tag7", "gone"],
+              "name": ["Forklift", "Twin", "Twin", "tag3", "", "Forklift"]}  # fmt: skip
+    parquet.write_table(table(ASSET_COLUMNS, assets), site / "assets.parquet")
     zones = {
         "zone": ["a", "b", "empty"],
         "name": ["Hall", "", "Void"],
@@ -165,6 +176,13 @@ def test_a_track_is_all_fixes_of_the_tag(history, within):
     assert [point.alert for point in track.points] == [alerts[flags & 7] if flags & 7 < len(alerts) else None
                                                        for flags in own["flags"]]  # fmt: skip
     assert track.length_m == pytest.approx(plain_length(own), rel=1e-9)
+
+
+def test_tags_are_found_by_the_names_of_their_assets(history):
+    assert history.track("forklift", SPAN, 100) == history.track("tag3", SPAN, 100)
+    assert history.heatmap(SPAN, 0.3, ("Forklift",)) == history.heatmap(SPAN, 0.3, ("tag3",))
+    assert history.contacts("Forklift", SPAN) == history.contacts("tag3", SPAN)
+    assert history.dwell(SPAN, ("Forklift",)) == history.dwell(SPAN, ("tag3",)) != ()
 
 
 def plain_length(own):
@@ -357,6 +375,8 @@ def test_an_empty_range(history, tmp_path):
     [
         (lambda h: h.track("tag0", SPAN), "has no tag 'tag0'; it has renamed, tag1, tag10, tag11, tag12 and 15 more"),
         (lambda h: h.track("old", SPAN), "has no tag 'old'"),
+        (lambda h: h.track("twin", SPAN), "'twin' is the name of tag4 and tag5; it should be one of these"),
+        (lambda h: h.track("", SPAN), "has no tag ''"),
         (lambda h: h.track("' OR 1=1 --", SPAN), "has no tag"),
         (lambda h: h.dwell(SPAN, ("x",)), "has no tag 'x'"),
         (lambda h: h.dwell(SPAN, zone="a' OR 'a'='a"), "has no zone .*; it has a, b, empty"),

@@ -4,26 +4,28 @@ import time
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from datetime import datetime
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from skyless.run.history.answers import THINNED_GAP_S, AlarmRow, Contact, Dwell, Heatmap, Occupancy, Track
+from skyless.run.history.answers import THINNED_GAP_S
 from skyless.site.report.figures import BLUE, MAP, MUTED, panel, report_style
 
 _BARS: Final = 30
 _LINES: Final = 8
 _Zones = Mapping[str, tuple[str, tuple[tuple[float, float], ...]]]
+_Row = Mapping[str, Any]
+"""An answer (``run/history/answers.py``) by its fields, with names beside identifiers."""
 
 
-def track_figure(track: Track, zones: _Zones, title: str) -> Figure:
+def track_figure(track: _Row, zones: _Zones, title: str) -> Figure:
     """The way over the zones, interrupted at gaps."""
     with report_style():
-        figure, axes = panel(title, 4.2)
-        rows = np.array([(point.unix_s, point.x_m, point.y_m) for point in track.points]).reshape(-1, 3)
+        figure, axes = panel(f"{track['tag_name']}, {title}", 4.2)
+        rows = np.array([(point.unix_s, point.x_m, point.y_m) for point in track["points"]]).reshape(-1, 3)
         usual_s = np.median(np.diff(rows[:, 0])) if len(rows) > 1 else 0.0
         gaps = np.flatnonzero(np.diff(rows[:, 0]) > max(THINNED_GAP_S, 3.0 * usual_s)) + 1
         for part in np.split(rows, gaps):
@@ -32,48 +34,43 @@ def track_figure(track: Track, zones: _Zones, title: str) -> Figure:
         return figure
 
 
-def heatmap_figure(heatmap: Heatmap, zones: _Zones, title: str) -> Figure:
+def heatmap_figure(heatmap: _Row, zones: _Zones, title: str) -> Figure:
     """The time in each cell over the zones, in colours by its logarithm."""
     with report_style():
         figure, axes = panel(title, 4.2)
-        seconds = np.array(heatmap.seconds).reshape(heatmap.rows, heatmap.columns)
+        seconds = np.array(heatmap["seconds"]).reshape(heatmap["rows"], heatmap["columns"])
         if (seconds > 0.0).any():
-            x1, y1 = heatmap.x0_m + heatmap.cell_m * heatmap.columns, heatmap.y0_m + heatmap.cell_m * heatmap.rows
-            drawn = axes.imshow(
-                np.ma.masked_equal(seconds, 0.0),
-                extent=(heatmap.x0_m, x1, heatmap.y0_m, y1),
-                origin="lower",
-                cmap=MAP,
-                norm=LogNorm(),
-            )
+            x0_m, y0_m, cell_m = (heatmap[name] for name in ("x0_m", "y0_m", "cell_m"))
+            extent = (x0_m, x0_m + cell_m * seconds.shape[1], y0_m, y0_m + cell_m * seconds.shape[0])
+            shown = np.ma.masked_equal(seconds, 0.0)
+            drawn = axes.imshow(shown, extent=extent, origin="lower", cmap=MAP, norm=LogNorm())
             figure.colorbar(drawn, ax=axes, label="time in s")
         _plan(axes, zones)
         return figure
 
 
-def dwell_figure(dwell: Sequence[Dwell], title: str) -> Figure:
+def dwell_figure(dwell: Sequence[_Row], _zones: _Zones, title: str) -> Figure:
     """The longest times as bars."""
-    longest = sorted(dwell, key=lambda one: -one.seconds)[:_BARS][::-1]
+    longest = sorted(dwell, key=lambda one: -one["seconds"])[:_BARS][::-1]
     with report_style():
         figure, axes = panel(title, 1.2 + 0.2 * max(len(longest), 3))
-        axes.barh(
-            [f"{one.tag}, {one.zone_name}" for one in longest], [one.seconds / 60.0 for one in longest], color=BLUE
-        )
+        names = [f"{one['tag_name']}, {one['zone_name']}" for one in longest]
+        axes.barh(names, [one["seconds"] / 60.0 for one in longest], color=BLUE)
         axes.set_xlabel("time in min")
         return figure
 
 
-def occupancy_figure(occupancy: Sequence[Occupancy], title: str) -> Figure:
+def occupancy_figure(occupancy: Sequence[_Row], _zones: _Zones, title: str) -> Figure:
     """The mean number of tags over time, of the fullest zones."""
-    zones: dict[str, list[Occupancy]] = defaultdict(list)
+    zones: dict[str, list[_Row]] = defaultdict(list)
     for one in occupancy:
-        zones[one.zone].append(one)
-    fullest = sorted(zones.values(), key=lambda steps: -sum(step.mean for step in steps))[:_LINES]
+        zones[one["zone"]].append(one)
+    fullest = sorted(zones.values(), key=lambda steps: -sum(step["mean"] for step in steps))[:_LINES]
     with report_style():
         figure, axes = panel(title)
         for steps in fullest:
-            times = [datetime.fromtimestamp(step.unix_s) for step in steps]
-            axes.step(times, [step.mean for step in steps], where="post", label=steps[0].zone_name)  # type: ignore[arg-type]
+            times: list[Any] = [datetime.fromtimestamp(step["unix_s"]) for step in steps]
+            axes.step(times, [step["mean"] for step in steps], where="post", label=steps[0]["zone_name"])
         axes.set_ylabel("tags, mean of each step")
         figure.autofmt_xdate()
         if fullest:
@@ -81,15 +78,16 @@ def occupancy_figure(occupancy: Sequence[Occupancy], title: str) -> Figure:
         return figure
 
 
-def contacts_figure(contacts: Sequence[Contact], title: str) -> Figure:
+def contacts_figure(contacts: Sequence[_Row], _zones: _Zones, title: str) -> Figure:
     """When each other tag was near."""
-    return _times_figure([(one.other, one.begin_unix_s, one.end_unix_s) for one in contacts], title)
+    return _times_figure([(one["other_name"], one["begin_unix_s"], one["end_unix_s"]) for one in contacts], title)
 
 
-def alarms_figure(alarms: Sequence[AlarmRow], title: str) -> Figure:
+def alarms_figure(alarms: Sequence[_Row], _zones: _Zones, title: str) -> Figure:
     """From when to when each rule's alarms lasted; those that have not ended, until now."""
-    now_s = time.time()
-    return _times_figure([(f"{a.rule}, {a.subject}", a.raised_unix_s, a.ended_unix_s or now_s) for a in alarms], title)
+    times = [(one["raised_unix_s"], one["ended_unix_s"] or time.time()) for one in alarms]
+    names = [f"{one['rule']}, {one['subject_name']}" for one in alarms]
+    return _times_figure([(name, *span) for name, span in zip(names, times, strict=True)], title)
 
 
 def _times_figure(times: Sequence[tuple[str, float, float]], title: str) -> Figure:

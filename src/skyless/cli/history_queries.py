@@ -1,7 +1,7 @@
 """``skyless history track``, ``heatmap``, ``dwell``, ``occupancy``, ``contacts``, ``alarms`` and ``export``."""
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,10 +17,6 @@ from skyless.core.arguments import Option, Options, Positive, whole
 from skyless.core.errors import SkylessError
 
 if TYPE_CHECKING:
-    from types import ModuleType
-
-    from matplotlib.figure import Figure
-
     from skyless.run.history.answers import Span
     from skyless.run.history.queries import History
 
@@ -29,7 +25,9 @@ _LONGEST_TABLE = 40
 _LONGEST_LIST = 10
 """Cells of a heat map that are shown."""
 
-_HEADINGS = {"zone_name": "zone", "subject": "of", "acknowledged_unix_s": "seen", "acknowledged_by": "by"}
+_HEADINGS = {"subject_name": "of", "acknowledged_unix_s": "seen", "acknowledged_by": "by"}
+_OF_TAGS = ("tag", "other", "subject")
+_Row = dict[str, Any]
 
 questions = App(name="history")
 
@@ -73,24 +71,59 @@ class _Drawn(_Asked, frozen=True, kw_only=True):
         """See that the picture can be written."""
         check_picture(self.plot)
 
-    def show(
-        self,
-        asked: "tuple[History, Span]",
-        name: str,
-        found: Struct | Sequence[Struct],
-        rows: Iterable[Mapping[str, object]],
-        draw: "Callable[[ModuleType, str], Figure]",
-    ) -> None:
-        """Write the answer as JSON or a table; ``draw`` gets ``history_pictures`` and a title to make its picture."""
-        title = _range(asked[1])
+    def answer(self, name: str, ask: "Callable[[History, Span], Struct | Sequence[Struct]]") -> int:
+        """Ask, and write the answer as JSON or a table, and as the picture that ``history_pictures`` has for it."""
+        history, span = self.opened()
+        found = ask(history, span)
+        assets = history.assets()
+        given: Any = _named(found, assets) if isinstance(found, Struct) else [_named(one, assets) for one in found]
+        rows = _ROWS[name](given) if name in _ROWS else given
         if self.json:
-            _print(*asked, {name: found})
+            _print(history, span, {name: given})
         else:
-            _table(title, list(rows))
+            _table(_range(span), rows)
         if self.plot is not None:
             from skyless.cli import history_pictures
 
-            write_picture(self.plot, draw(history_pictures, title))
+            draw = getattr(history_pictures, f"{name}_figure")
+            write_picture(self.plot, draw(given, history.zones(), _range(span)))
+        return NO_FIX if isinstance(given, dict) and not rows else 0
+
+
+def _named(answer: Struct, assets: Mapping[str, str]) -> _Row:
+    """The fields of an answer; what names tags is followed by what people call them."""
+    row = {}
+    for key, value in asdict(answer).items():
+        row[key] = value
+        if key in _OF_TAGS:
+            row[f"{key}_name"] = "~".join(assets.get(tag, tag) for tag in value.split("~"))
+    return row
+
+
+def _track_rows(way: _Row) -> list[_Row]:
+    row = {name: way[name] for name in ("tag_name", "fixes", "length_m")}
+    for end, point in zip(("first", "last"), (*way["points"][:1], *way["points"][-1:]), strict=False):
+        row[end] = f"({point.x_m:.2f}, {point.y_m:.2f}) m at {_time(point.unix_s)}"
+    return [row] if way["fixes"] else []
+
+
+def _heatmap_rows(found: _Row) -> list[_Row]:
+    longest = sorted(enumerate(found["seconds"]), key=lambda one: -one[1])[:_LONGEST_LIST]
+    rows = []
+    for k, seconds in longest:
+        row, column = divmod(k, found["columns"])
+        x_m, y_m = (found[f"{name}0_m"] + found["cell_m"] * (n + 0.5) for name, n in (("x", column), ("y", row)))
+        rows.append({"x_m": x_m, "y_m": y_m, "seconds": seconds})
+    whole = {"x_m": "all", "y_m": f"{found['tags']} tags", "seconds": sum(found["seconds"])}
+    return [*rows, whole] if found["tags"] else []
+
+
+_ROWS: Mapping[str, Callable[[Any], list[_Row]]] = {
+    "track": _track_rows,
+    "heatmap": _heatmap_rows,
+    "occupancy": lambda found: [row for row in found if row["most"]],
+}
+"""The rows of the tables that do not show the answer as it is."""
 
 
 @questions.command(help_epilogue="Example: skyless history track tag7 --from 8:00 --to 16:00 --plot way.png")
@@ -101,20 +134,11 @@ def track(tag: str, /, *, asked: _Drawn, points: Annotated[int, whole(2, 1_000_0
     Parameters
     ----------
     tag
-        Name of the tag.
+        Name of the tag, or of its asset.
     points
         How many points of the way are given at most.
     """
-    history, span = asked.opened()
-    way = history.track(tag, span, points)
-    row = {"tag": tag, "fixes": way.fixes, "length_m": way.length_m}
-    for end, point in zip(("first", "last"), (*way.points[:1], *way.points[-1:]), strict=False):
-        row[end] = f"({point.x_m:.2f}, {point.y_m:.2f}) m at {_time(point.unix_s)}"
-    rows = [row] if way.fixes else []
-    asked.show(
-        (history, span), "track", way, rows, lambda pictures, title: pictures.track_figure(way, history.zones(), title)
-    )
-    return 0 if way.fixes else NO_FIX
+    return asked.answer("track", lambda history, span: history.track(tag, span, points))
 
 
 @questions.command(help_epilogue="Example: skyless history heatmap --from yesterday --to today --plot heat.png")
@@ -125,55 +149,31 @@ def heatmap(*tags: str, asked: _Drawn, cell: Positive = 0.25) -> int:
     Parameters
     ----------
     tags
-        Names of tags.
+        Names of tags, or of their assets.
     cell
         Side of a cell in metres.
     """
-    history, span = asked.opened()
-    found = history.heatmap(span, cell, tags)
-
-    longest = sorted(enumerate(found.seconds), key=lambda one: -one[1])[:_LONGEST_LIST]
-    rows: list[dict[str, object]] = [
-        {
-            "x_m": found.x0_m + cell * (k % found.columns + 0.5),
-            "y_m": found.y0_m + cell * (k // found.columns + 0.5),
-            "seconds": seconds,
-        }
-        for k, seconds in longest
-    ]
-    rows += [{"x_m": "all", "y_m": f"{found.tags} tags", "seconds": sum(found.seconds)}] if rows else []
-    asked.show(
-        (history, span),
-        "heatmap",
-        found,
-        rows,
-        lambda pictures, title: pictures.heatmap_figure(found, history.zones(), title),
-    )
-    return 0 if found.tags else NO_FIX
+    return asked.answer("heatmap", lambda history, span: history.heatmap(span, cell, tags))
 
 
 @questions.command(help_epilogue="Example: skyless history dwell --from monday --zone dock")
 @command
-def dwell(*tags: str, asked: _Drawn, zone: str | None = None) -> None:
+def dwell(*tags: str, asked: _Drawn, zone: str | None = None) -> int:
     """How long tags, by default all, were in zones.
 
     Parameters
     ----------
     tags
-        Names of tags.
+        Names of tags, or of their assets.
     zone
         Identifier of the only zone; by default all.
     """
-    history, span = asked.opened()
-    found = history.dwell(span, tags, zone)
-    asked.show(
-        (history, span), "dwell", found, map(asdict, found), lambda pictures, title: pictures.dwell_figure(found, title)
-    )
+    return asked.answer("dwell", lambda history, span: history.dwell(span, tags, zone))
 
 
 @questions.command(help_epilogue="Example: skyless history occupancy --from 6:00 --zone canteen --every 600")
 @command
-def occupancy(*, asked: _Drawn, zone: str | None = None, every: Positive = 300.0) -> None:
+def occupancy(*, asked: _Drawn, zone: str | None = None, every: Positive = 300.0) -> int:
     """How many tags were in zones, over time.
 
     Parameters
@@ -183,53 +183,29 @@ def occupancy(*, asked: _Drawn, zone: str | None = None, every: Positive = 300.0
     every
         Seconds of a step of time.
     """
-    history, span = asked.opened()
-    found = history.occupancy(span, zone, every)
-    asked.show(
-        (history, span),
-        "occupancy",
-        found,
-        (asdict(one) for one in found if one.most),
-        lambda pictures, title: pictures.occupancy_figure(found, title),
-    )
+    return asked.answer("occupancy", lambda history, span: history.occupancy(span, zone, every))
 
 
 @questions.command(help_epilogue="Example: skyless history contacts tag7 --from yesterday --within 1.5")
 @command
-def contacts(tag: str, /, *, asked: _Drawn, within: Positive = 2.0) -> None:
+def contacts(tag: str, /, *, asked: _Drawn, within: Positive = 2.0) -> int:
     """Which tags were near a tag, and when.
 
     Parameters
     ----------
     tag
-        Name of the tag.
+        Name of the tag, or of its asset.
     within
         Metres in the plane at which tags are near each other.
     """
-    history, span = asked.opened()
-    found = history.contacts(tag, span, within)
-    asked.show(
-        (history, span),
-        "contacts",
-        found,
-        map(asdict, found),
-        lambda pictures, title: pictures.contacts_figure(found, title),
-    )
+    return asked.answer("contacts", lambda history, span: history.contacts(tag, span, within))
 
 
 @questions.command(help_epilogue="Example: skyless history alarms --from yesterday")
 @command
-def alarms(*, asked: _Drawn) -> None:
+def alarms(*, asked: _Drawn) -> int:
     """Alarms of the range, with those that had begun before it and had not ended."""
-    history, span = asked.opened()
-    found = history.alarms(span)
-    asked.show(
-        (history, span),
-        "alarms",
-        found,
-        map(asdict, found),
-        lambda pictures, title: pictures.alarms_figure(found, title),
-    )
+    return asked.answer("alarms", lambda history, span: history.alarms(span))
 
 
 @questions.command(help_epilogue="Example: skyless history export fixes.csv --from yesterday --to today")
@@ -242,7 +218,7 @@ def export(file: Path, /, *tags: str, asked: _Asked, site: Path | None = None, f
     file
         The file to write; its ending .csv, .parquet or .geojsonl is its format.
     tags
-        Names of tags.
+        Names of tags, or of their assets.
     site
         Site file with a georeference, which GeoJSON needs.
     force
@@ -269,16 +245,17 @@ def _print(history: "History", span: "Span", answer: dict[str, Any]) -> None:
     print_json({"site": history.site, **known, "known_until_unix_s": history.known_until_unix_s(), **answer})
 
 
-def _table(title: str, rows: Sequence[Mapping[str, object]]) -> None:
+def _table(title: str, rows: Sequence[_Row]) -> None:
     """A table whose columns are the fields of its rows, by name."""
     from rich.table import Table
     from rich.text import Text
 
     more = len(rows) - _LONGEST_TABLE
     table = Table(title=title, caption=f"{more} more rows: --json gives all" if more > 0 else None)
-    names = [name for name in rows[0] if name not in {"id", "zone"}] if rows else []  # people read zone_name
+    names = [name for name in rows[0] if name != "id" and f"{name}_name" not in rows[0]] if rows else []
     for name in names:
-        table.add_column(_HEADINGS.get(name) or name.removesuffix("_unix_s").replace("_", " "), overflow="fold")
+        heading = name.removesuffix("_name").removesuffix("_unix_s").replace("_", " ")
+        table.add_column(_HEADINGS.get(name, heading), overflow="fold")
     for row in rows[:_LONGEST_TABLE]:
         table.add_row(*(Text(_shown(name, row[name])) for name in names))
     console().print(table if rows else f"{title}: nothing", markup=False)

@@ -24,27 +24,23 @@ class EventLog:
         for event in past:
             self._is_new(event)
 
-    def of_zone(self, message: ZoneEvent) -> list[Event]:
-        """The event of a tag that has entered or left a zone."""
-        text = f"{message.tag} {'entered' if message.kind == 'enter' else 'left'} {message.name}"
-        return self._new(message.unix_s, message.kind, tag=message.tag, zone=message.zone, text=text)
-
-    def of_alarm(self, message: AlarmMessage) -> list[Event]:
-        """What an alarm has come to."""
-        about = {"zone": message.zone, "subject": message.subject, "alarm": message.id}
-        about["tag"] = message.tags[0] if message.tags else None
-        return [
-            *self._new(message.unix_s, "alarm-raised", text=message.sentence, **about),
-            *self._new(message.ended_unix_s, "alarm-ended", text=message.sentence, **about),
-            *self._new(message.acknowledged_unix_s, "alarm-acknowledged", text=message.acknowledged_by, **about),
-        ]
-
-    def of_status(self, message: StatusMessage, now_unix_s: float) -> list[Event]:
-        """Whether a tag or an anchor has come or gone."""
+    def of(self, message: ZoneEvent | AlarmMessage | StatusMessage, now_unix_s: float) -> list[Event]:
+        """What is new: a tag entered or left a zone, an alarm came to something, a tag or an anchor came or went."""
+        if isinstance(message, ZoneEvent):
+            text = f"{message.tag} {'entered' if message.kind == 'enter' else 'left'} {message.name}"
+            return self._new(message.unix_s, message.kind, tag=message.tag, zone=message.zone, text=text)
+        if isinstance(message, AlarmMessage):
+            about = {"zone": message.zone, "subject": message.subject, "alarm": message.id}
+            about["tag"] = message.tags[0] if message.tags else None
+            return [
+                *self._new(message.unix_s, "alarm-raised", text=message.sentence, **about),
+                *self._new(message.ended_unix_s, "alarm-ended", text=message.sentence, **about),
+                *self._new(message.acknowledged_unix_s, "alarm-acknowledged", text=message.acknowledged_by, **about),
+            ]
         kind: EventKind = "online" if message.online else "offline"
-        about = {"tag": message.name} if message.kind == "tag" else {"subject": f"{message.kind}-{message.name}"}
+        who = {"tag": message.name} if message.kind == "tag" else {"subject": f"{message.kind}-{message.name}"}
         unix_s = message.unix_s if message.online and message.unix_s else now_unix_s
-        return self._new(unix_s, kind, text=f"{message.kind} {message.name} is {kind}", **about)
+        return self._new(unix_s, kind, text=f"{message.kind} {message.name} is {kind}", **who)
 
     def _new(self, unix_s: float | None, kind: EventKind, **about: Any) -> list[Event]:  # noqa: ANN401 - Event's fields
         if unix_s is None or not 0.0 <= unix_s <= MAX_UNIX_S:

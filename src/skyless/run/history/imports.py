@@ -6,6 +6,7 @@ from typing import Any, Final, cast
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from msgspec import Struct
 from numpy.typing import NDArray
 
@@ -64,7 +65,7 @@ def import_recording(recording: McapRecording, writer: Writer, reach: Callable[[
 
     for found in recording.messages({"fix", "event"}):
         if isinstance(found.message, ZoneEvent):
-            events = [event for event in log.of_zone(found.message) if event not in known_events]
+            events = [event for event in log.of(found.message, found.time_s) if event not in known_events]
             writer.events.add(events, found.time_s)
             counts["events"] += len(events)
             continue
@@ -89,7 +90,7 @@ def _known(recording: McapRecording, writer: Writer) -> tuple[NDArray[np.int64],
         return np.empty(0, np.int64), set()
     begin = datetime.fromtimestamp(summary.start_s, UTC) - _MARGIN
     end = datetime.fromtimestamp(summary.end_s, UTC) + _MARGIN
-    span = [("t", ">=", begin), ("t", "<=", end)]
+    span = (pc.field("t") >= begin) & (pc.field("t") <= end)
     files, events = (
         [file for file in current(writer.root, writer.site) if str(begin.date()) <= day_of(file) <= str(end.date())]
         for current in (current_files, current_events)

@@ -3,6 +3,7 @@
     FOLDER/site=<n>/day=<yyyy-mm-dd>/<first>-<last>.parquet           fixes; numbers of the first and last row
     FOLDER/site=<n>/events/day=<yyyy-mm-dd>/<first>-<last>.parquet    events
     FOLDER/site=<n>/names.parquet                                     the tags' numbers and names
+    FOLDER/site=<n>/assets.parquet                                    the tags' names and what people call them
     FOLDER/site=<n>/zones.parquet                                     the zones' identifiers, names and corners
     FOLDER/site=<n>/journal.sqlite                                    what is not in Parquet yet
 
@@ -42,6 +43,7 @@ and of an acknowledgement who made it."""
 EventKind = Literal["enter", "leave", "alarm-raised", "alarm-ended", "alarm-acknowledged", "offline", "online"]
 
 NAME_COLUMNS: Final = {"tag": "uint32", "name": "string", "since": "timestamp[ms, tz=UTC]"}
+ASSET_COLUMNS: Final = {"tag": "string", "name": "string"}
 ZONE_COLUMNS: Final = {"zone": "string", "name": "string", "corners_m": "string"}
 """``corners_m`` is a list of pairs in JSON."""
 

@@ -7,8 +7,10 @@ import time
 import zlib
 from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any, Final
 
+import pyarrow.compute as pc
 from msgspec import Struct
 
 from skyless.core.errors import SkylessError
@@ -22,7 +24,15 @@ from skyless.run.history.writer import FILE_ROWS, Writer
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
-from skyless.run.mqtt.messages import AlarmMessage, FixMessage, SiteMessage, StatusMessage, WrongMessageError, ZoneEvent
+from skyless.run.mqtt.messages import (
+    AlarmMessage,
+    AssetsMessage,
+    FixMessage,
+    SiteMessage,
+    StatusMessage,
+    WrongMessageError,
+    ZoneEvent,
+)
 from skyless.run.process import Log, every, keep, reader, together
 from skyless.run.zones.zone_list import read_zones
 
@@ -69,8 +79,8 @@ class HistoryNode:
         self._writer, self._keep, self._log = writer, keep, log
         self._trouble: dict[str, str] = {}
         self._try("files", writer.write)  # so that all events of the past are in files
-        past = read_events(current_events(writer.root, writer.site), [("kind", "in", REMEMBERED_KINDS)])
-        self._events = EventLog(past)
+        remembered = pc.field("kind").isin(REMEMBERED_KINDS)
+        self._events = EventLog(read_events(current_events(writer.root, writer.site), remembered))
         self._fixes: list[tuple[int, FixMessage]] = []
         self._simulated = False
         self._started_s = time.monotonic()
@@ -82,6 +92,7 @@ class HistoryNode:
         self._subscribe(topics.alarm_topic, AlarmMessage, self._on_event, "+", "+")
         for kind in ("tag", "anchor"):
             self._subscribe(topics.status_topic, StatusMessage, self._on_event, kind, "+")
+        self._subscribe(topics.assets_topic, AssetsMessage, lambda message: writer.set_assets(message.assets))
         self.link.subscribe(topics.zones_topic(writer.site), self._on_zones, qos=1)
 
     async def run(self) -> None:
@@ -135,14 +146,7 @@ class HistoryNode:
 
     def _on_event(self, message: ZoneEvent | AlarmMessage | StatusMessage) -> None:
         now_s = time.time()
-        if isinstance(message, ZoneEvent):
-            events = self._events.of_zone(message)
-        elif isinstance(message, AlarmMessage):
-            events = self._events.of_alarm(message)
-        else:
-            events = self._events.of_status(message, now_s)
-        if events:
-            self._writer.events.add(events, now_s)
+        self._writer.events.add(self._events.of(message, now_s), now_s)
 
     def _on_zones(self, _topic: str, payload: bytes) -> None:
         try:
@@ -167,12 +171,10 @@ class HistoryNode:
             today = datetime.fromtimestamp(time.time() - 2.0 * FILE_S, UTC).date()  # the day before is complete
             if today != tidied:
                 tidied = today
-                await asyncio.to_thread(self._try, "daily work", self._tidy)
+                work = partial(tidy, self._writer.root, self._writer.site, self._keep, time.time())
+                await asyncio.to_thread(self._try, "daily work", work)
 
-    def _tidy(self) -> None:
-        tidy(self._writer.root, self._writer.site, self._keep, time.time())
-
-    def _try(self, what: str, act: Callable[[], None]) -> bool:
+    def _try(self, what: str, act: Callable[[], None]) -> None:
         """Do something with the disk; when its trouble begins and ends, a line says so."""
         try:
             act()
@@ -181,7 +183,6 @@ class HistoryNode:
             if self._trouble.get(what) != text:
                 self._log(text)
             self._trouble[what] = text
-            return False
-        if self._trouble.pop(what, None) is not None:
-            self._log(f"the history's {what} can be written again; {self.state().lost} rows were lost so far")
-        return True
+        else:
+            if self._trouble.pop(what, None) is not None:
+                self._log(f"the history's {what} can be written again; {self.state().lost} rows were lost so far")

@@ -10,8 +10,9 @@ import secrets
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from functools import wraps
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar
 
@@ -28,7 +29,7 @@ from skyless.core.site import GeoreferenceSite
 from skyless.core.whole_files import whole_file
 from skyless.run.fix_batch import ALERT_BITS, ALERTS, NONE_U16, SIMULATED
 from skyless.run.geojson import coordinates, feature
-from skyless.run.history._scans import near, read_rows, time_in_cells, time_limits, utc
+from skyless.run.history._scans import limits, near, read_rows, time_in_cells
 from skyless.run.history.answers import (
     GAP_S,
     THINNED_GAP_S,
@@ -42,6 +43,7 @@ from skyless.run.history.answers import (
     TrackPoint,
 )
 from skyless.run.history.layout import (
+    ASSET_COLUMNS,
     NAME_COLUMNS,
     THINNED,
     ZONE_COLUMNS,
@@ -83,16 +85,16 @@ _FIXES: Final = f"""
 
 _STAYS: Final = """
     WITH crossings AS (
-        SELECT tag, zone, kind = 'enter' AS enters, epoch_ms(t) AS ms FROM read_parquet($files)
-        WHERE kind IN ('enter', 'leave') AND t >= to_timestamp($begin / 1000) AND t < to_timestamp($end / 1000)
+        SELECT tag, zone, kind = 'enter' AS enters, epoch_ms(t) / 1000 AS s FROM read_parquet($files)
+        WHERE kind IN ('enter', 'leave') AND t >= to_timestamp($begin) AND t < to_timestamp($end)
         UNION ALL
         SELECT tag, zone, arg_max(kind, t) = 'enter', $begin FROM read_parquet($files)
-        WHERE kind IN ('enter', 'leave') AND t < to_timestamp($begin / 1000) GROUP BY tag, zone
+        WHERE kind IN ('enter', 'leave') AND t < to_timestamp($begin) GROUP BY tag, zone
     ), stays AS (
-        SELECT tag, zone, enters, ms AS since, lead(ms, 1, $end) OVER of_tag AS until,
+        SELECT tag, zone, enters, s AS since, lead(s, 1, $end) OVER of_tag AS until,
             lag(enters, 1, false) OVER of_tag AS was_inside
         FROM crossings WHERE (len($tags) = 0 OR list_contains($tags, tag)) AND ($zone IS NULL OR zone = $zone)
-        WINDOW of_tag AS (PARTITION BY hash(tag, zone) ORDER BY ms, enters)
+        WINDOW of_tag AS (PARTITION BY hash(tag, zone) ORDER BY s, enters)
     )
 """
 """The time from each crossing of a zone's border to the tag's next one. Tags that were in a zone at the beginning enter
@@ -100,8 +102,7 @@ it there. Of two crossings at one instant the leaving is the first. Sorting by a
 sorting by two texts."""
 
 _DWELL: Final = f"""
-    {_STAYS} SELECT tag, zone, count(*) FILTER (NOT was_inside), sum(until - since) / 1000, min(since) / 1000,
-        max(until) / 1000
+    {_STAYS} SELECT tag, zone, count(*) FILTER (NOT was_inside), sum(until - since), min(since), max(until)
     FROM stays WHERE enters GROUP BY tag, zone ORDER BY tag, zone
 """
 
@@ -165,6 +166,10 @@ class History:
         """Names of all tags."""
         return tuple(sorted(set(self._names().values())))
 
+    def assets(self) -> dict[str, str]:
+        """What people call tags, by the tags' names, as the site's programs told last."""
+        return {row["tag"]: row["name"] for row in self._table("assets.parquet", ASSET_COLUMNS) if row["name"]}
+
     def zones(self) -> dict[str, tuple[str, tuple[tuple[float, float], ...]]]:
         """Names and corners of all zones by their identifiers."""
         kind = tuple[tuple[float, float], ...]
@@ -176,11 +181,11 @@ class History:
     @_asked
     def known_until_unix_s(self) -> float | None:
         """The time of the newest row that is in a file; None without any."""
-        found = []
-        for files in (current_files(self.folder, self.site), current_events(self.folder, self.site)):
-            last_day = max(map(day_of, files), default="")
-            found += [time_limits(parquet.read_metadata(file))[1] for file in files if day_of(file) == last_day]
-        return max(found).timestamp() if found else None
+        files = (*current_files(self.folder, self.site), *current_events(self.folder, self.site))
+        last_day = max(map(day_of, files), default="")
+        newest = [parquet.read_metadata(file) for file in files if day_of(file) == last_day]
+        times = [limits(one, group, "t")[1] for one in newest for group in range(one.num_row_groups)]
+        return max(times) / 1000 if times else None
 
     # Questions
 
@@ -190,11 +195,10 @@ class History:
 
         Raises SkylessError: there is no such tag.
         """
-        numbers, files = self._numbers((tag,)), self._files(span)
-        columns = "ms / 1000, x_m, y_m, z_m, std_m, hpl_m, alert"
-        with _connection() as duck:
-            sql = f"SELECT {columns} FROM ({_FIXES} AND tag IN ({_listed(numbers)})) ORDER BY ms"
-            rows = duck.execute(sql, _parameters(files, span)).fetchall() if files else []
+        ((tag, numbers),) = self._tags((tag,)).items()
+        files, columns = self._files(span), "ms / 1000, x_m, y_m, z_m, std_m, hpl_m, alert"
+        sql = f"SELECT {columns} FROM ({_FIXES} AND tag IN ({_listed(numbers)})) ORDER BY ms"
+        rows = _rows(sql, files, span)
         if not rows:
             return Track(tag, (), 0, 0.0)
         gap_s = THINNED_GAP_S if _are_thinned(files) else GAP_S
@@ -205,7 +209,7 @@ class History:
     def heatmap(self, span: Span, cell_m: float = 0.25, tags: Sequence[str] = ()) -> Heatmap:
         """How long tags, by default all, were in the cells of a grid. Raises SkylessError."""
         check_number("the cells' side", cell_m, least=0.01, most=1000.0)
-        numbers = self._numbers(tags) if tags else None
+        numbers = [*chain(*self._tags(tags).values())] if tags else None
         return time_in_cells(self._files(span), span, round(1000.0 * cell_m), numbers)
 
     @_asked
@@ -236,7 +240,7 @@ class History:
         edges = np.append(np.arange(0.0, length_s, step_s), length_s)
         found = []
         for one in [zone] if zone is not None else sorted({*names, *stays}):
-            begins, ends = (1e-3 * np.array(times) - span.from_unix_s for times in stays.get(one, ((), ())))
+            begins, ends = (np.array(times) - span.from_unix_s for times in stays.get(one, ((), ())))
             for begin, mean, most in zip(edges[:-1].tolist(), *counts(begins, ends, edges), strict=True):
                 found.append(Occupancy(one, names.get(one, one), span.from_unix_s + begin, mean, most))
         return tuple(found)
@@ -248,7 +252,8 @@ class History:
         In a range with thinned days it is the first fix of ten seconds. Raises SkylessError.
         """
         check_number("the distance", distance_m, least=0.01, most=_MAX_DISTANCE_M)
-        own, names, files = self._numbers((tag,)), self._names(), self._files(span)
+        ((tag, own),) = self._tags((tag,)).items()
+        names, files = self._names(), self._files(span)
         length_ms, gap = _CONTACT_MS[_are_thinned(files)]
         batches = [columns for columns, _ in read_rows(files, span, own)]
         if not batches:
@@ -278,11 +283,7 @@ class History:
     @_asked
     def alarms(self, span: Span) -> tuple[AlarmRow, ...]:
         """Alarms that were raised before the range's end and had not ended at its beginning. Raises SkylessError."""
-        files = current_events(self.folder, self.site)
-        if not files:
-            return ()
-        with _connection() as duck:
-            return tuple(AlarmRow(*row) for row in duck.execute(_ALARMS, _parameters(files, span)).fetchall())
+        return tuple(AlarmRow(*row) for row in _rows(_ALARMS, current_events(self.folder, self.site), span))
 
     @_asked
     def export(self, file: Path, span: Span, tags: Sequence[str] = (), origin: GeoreferenceSite | None = None) -> int:
@@ -294,7 +295,7 @@ class History:
             raise SkylessError(f"{file} ends with {file.suffix!r}; it should end with {' or '.join(EXPORT_SUFFIXES)}")
         if file.suffix == ".geojsonl" and origin is None:
             raise SkylessError("GeoJSON has degrees: it needs a site with [georeference] (latitude_deg, longitude_deg)")
-        of_tags = f"AND tag IN ({_listed(self._numbers(tags))})" if tags else ""
+        of_tags = f"AND tag IN ({_listed(chain(*self._tags(tags).values()))})" if tags else ""
         names, files = self._names(), self._files(span)
         if not files:
             raise SkylessError("there are no fixes in this range: nothing is written")
@@ -309,15 +310,14 @@ class History:
         with _connection() as duck, whole_file(file) as scratch:
             if origin is not None and file.suffix == ".geojsonl":
                 return _write_features(scratch, duck.execute(sql, parameters), origin)
-            found, kind = duck.sql(sql, params=parameters), file.suffix[1:]
-            (found.write_parquet if kind == "parquet" else found.write_csv)(str(scratch))
-            return int(duck.execute(f"SELECT count(*) FROM read_{kind}($1)", [str(scratch)]).fetchall()[0][0])
+            copied = duck.execute(f"COPY ({sql}) TO $to (FORMAT {file.suffix[1:]})", parameters | {"to": str(scratch)})
+            return int(copied.fetchall()[0][0])
 
     # What they share
 
     def _files(self, span: Span) -> list[Path]:
         """Files in which fixes of the range may be: they lie by the day of arrival."""
-        begin, end = str((utc(span.from_unix_s) - _EARLY).date()), str((utc(span.to_unix_s) + _LATE).date())
+        begin, end = _day(span.from_unix_s, -_EARLY), _day(span.to_unix_s, _LATE)
         return [file for file in current_files(self.folder, self.site) if begin <= day_of(file) <= end]
 
     def _table(self, name: str, columns: dict[str, str]) -> list[dict[str, Any]]:
@@ -326,18 +326,24 @@ class History:
 
     def _names(self) -> dict[int, str]:
         """The newest name of each number."""
-        rows = sorted(self._table("names.parquet", NAME_COLUMNS), key=lambda row: row["since"])
-        return {row["tag"]: row["name"] for row in rows}
+        rows = self._table("names.parquet", NAME_COLUMNS | {"since": "int64"})
+        return {row["tag"]: row["name"] for row in sorted(rows, key=lambda row: row["since"])}
 
-    def _numbers(self, tags: Iterable[str]) -> tuple[int, ...]:
-        """The numbers of tags. Raises SkylessError for a name that no tag has."""
+    def _tags(self, asked: Iterable[str]) -> dict[str, list[int]]:
+        """Tags by their names or those of their assets, and their numbers. Raises SkylessError."""
         numbers = defaultdict(list)
         for number, name in self._names().items():
             numbers[name].append(number)
-        for tag in tags:
-            if tag not in numbers:
-                raise SkylessError(f"the history of site {self.site} has no tag {tag!r}; {_some(numbers, 'tags')}")
-        return tuple(number for tag in tags for number in numbers[tag])
+        found, assets = {}, self.assets()
+        for one in asked:
+            tags = [tag for tag, name in assets.items() if tag in numbers and name.casefold() == one.casefold()]
+            tags = [one] if one in numbers else tags
+            if len(tags) > 1:
+                raise SkylessError(f"{one!r} is the name of {' and '.join(sorted(tags))}; it should be one of these")
+            if not tags:
+                raise SkylessError(f"the history of site {self.site} has no tag {one!r}; {_some(numbers, 'tags')}")
+            found[tags[0]] = numbers[tags[0]]
+        return found
 
     def _zone_names(self, zone: str | None) -> dict[str, str]:
         """Names by identifier. Raises SkylessError where ``zone`` is not among them."""
@@ -346,16 +352,12 @@ class History:
             raise SkylessError(f"the history of site {self.site} has no zone {zone!r}; {_some(names, 'zones')}")
         return names
 
-    def _of_stays(self, sql: str, span: Span, tags: Sequence[str], zone: str | None) -> list[tuple[Any, ...]]:
-        if tags:
-            self._numbers(tags)
-        until, files = self.known_until_unix_s(), current_events(self.folder, self.site)
-        if not files or until is None or until <= span.from_unix_s:
+    def _of_stays(self, sql: str, span: Span, asked: Sequence[str], zone: str | None) -> list[tuple[Any, ...]]:
+        tags, until = [*self._tags(asked)], self.known_until_unix_s()
+        if until is None or until <= span.from_unix_s:
             return []
-        begin, end = round(1000.0 * span.from_unix_s), round(1000.0 * min(until, span.to_unix_s))
-        parameters = {"files": list(map(str, files)), "begin": begin, "end": end, "tags": list(tags), "zone": zone}
-        with _connection() as duck:
-            return duck.execute(sql, parameters).fetchall()
+        known = Span(span.from_unix_s, min(until, span.to_unix_s))
+        return _rows(sql, current_events(self.folder, self.site), known, tags=tags, zone=zone)
 
 
 # Plain computations
@@ -420,8 +422,20 @@ def _connection() -> Iterator[duckdb.DuckDBPyConnection]:
         yield duck
 
 
+def _rows(sql: str, files: Iterable[Path], span: Span, **more: object) -> list[tuple[Any, ...]]:
+    parameters = _parameters(files, span) | more
+    if not parameters["files"]:
+        return []
+    with _connection() as duck:
+        return duck.execute(sql, parameters).fetchall()
+
+
 def _parameters(files: Iterable[Path], span: Span) -> dict[str, Any]:
     return {"files": list(map(str, files)), "begin": span.from_unix_s, "end": span.to_unix_s}
+
+
+def _day(unix_s: float, later: timedelta) -> str:
+    return (datetime.fromtimestamp(unix_s, UTC) + later).date().isoformat()
 
 
 def _are_thinned(files: Iterable[Path]) -> bool:

@@ -10,6 +10,7 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from msgspec import Struct
 from numpy.typing import NDArray
 from pyarrow import parquet
@@ -69,22 +70,20 @@ def event_table(events: Sequence[Event]) -> pa.Table:
     return pa.Table.from_pylist(rows, schema_of(EVENT_COLUMNS))
 
 
-def read_table(file: Path, columns: dict[str, str], filters: object = None) -> pa.Table:
-    """Columns of a file. Raises SkylessError: it cannot be read, or lacks one."""
+def read_table(file: Path, columns: dict[str, str], wanted: pc.Expression | None = None) -> pa.Table:
+    """Columns of the wanted rows of a file. Raises SkylessError: it cannot be read, or lacks one."""
     try:
-        return parquet.read_table(file, columns=list(columns), filters=filters, partitioning=None).cast(
-            schema_of(columns)
-        )
+        table = parquet.ParquetFile(file).read(columns=list(columns)).cast(schema_of(columns))
     except (OSError, ValueError, pa.ArrowException) as error:
-        raise SkylessError(
-            f"{file} cannot be read; it should be a Parquet file with {', '.join(columns)}: {error}"
-        ) from None
+        should = f"it should be a Parquet file with {', '.join(columns)}"
+        raise SkylessError(f"{file} cannot be read; {should}: {error}") from None
+    return table if wanted is None else table.filter(wanted)
 
 
-def read_events(files: Iterable[Path], filters: object = None) -> Iterator[Event]:
-    """The events in files, in order. Raises SkylessError."""
+def read_events(files: Iterable[Path], wanted: pc.Expression) -> Iterator[Event]:
+    """The wanted events in files, in order. Raises SkylessError."""
     for file in files:
-        yield from (Event(**row) for row in read_table(file, EVENT_COLUMNS, filters).to_pylist())
+        yield from (Event(**row) for row in read_table(file, EVENT_COLUMNS, wanted).to_pylist())
 
 
 def write_table(table: pa.Table, file: Path) -> None:
@@ -96,8 +95,8 @@ def write_table(table: pa.Table, file: Path) -> None:
     scratch = file.with_name(f"{file.name}.tmp")
     texts = [field.name for field in table.schema if pa.types.is_string(field.type)]
     numbers = [name for name in table.column_names if name not in texts]
-    options: dict[str, Any] = {"use_dictionary": texts, "compression": "zstd", "compression_level": 3}
-    options |= {"column_encoding": dict.fromkeys(numbers, "DELTA_BINARY_PACKED"), "row_group_size": ROW_GROUP}
+    options: dict[str, Any] = {"use_dictionary": texts, "compression": "lz4", "row_group_size": ROW_GROUP}
+    options["column_encoding"] = dict.fromkeys(numbers, "DELTA_BINARY_PACKED")
     try:
         with scratch.open("wb") as out:
             parquet.write_table(table, out, **options)

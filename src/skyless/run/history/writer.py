@@ -21,9 +21,17 @@ import pyarrow as pa
 
 from skyless.core.errors import SkylessError
 from skyless.run.fix_batch import RECORD, Records
-from skyless.run.history.layout import NAME_COLUMNS, ZONE_COLUMNS, file_name, largest_files, rows_of, site_folder
+from skyless.run.history.layout import (
+    ASSET_COLUMNS,
+    NAME_COLUMNS,
+    ZONE_COLUMNS,
+    file_name,
+    largest_files,
+    rows_of,
+    site_folder,
+)
 from skyless.run.history.tables import Event, event_table, fix_table, read_table, schema_of, write_table
-from skyless.run.mqtt.messages import FixMessage, Zone
+from skyless.run.mqtt.messages import Asset, FixMessage, Zone
 from skyless.run.process import locked
 
 FILE_ROWS: Final = 1_000_000
@@ -201,9 +209,10 @@ class Writer:
             for scratch in self.folder.rglob("*.tmp"):
                 scratch.unlink()
             self.names = Table(names, NAME_COLUMNS, "name")
+            self.assets = Table(self.folder / "assets.parquet", ASSET_COLUMNS, "tag")
             self.zones = Table(self.folder / "zones.parquet", ZONE_COLUMNS, "zone")
             self.journal = Journal(self.folder / "journal.sqlite")
-            self.fixes = Intake(self.journal, "fixes", self.folder, _fix_bytes, _fixes_in)
+            self.fixes = Intake(self.journal, "fixes", self.folder, np.ndarray.tobytes, _fixes_in)
             self.events = Intake(self.journal, "events", self.folder / "events", msgspec.json.encode, _events_in)
         except BlockingIOError:
             raise SkylessError(f"{self.folder} is written by another program; each needs a folder of its own") from None
@@ -240,9 +249,14 @@ class Writer:
         for zone in zones:
             self.zones.set(zone.id, zone.name, msgspec.json.encode(zone.polygon_m).decode())
 
+    def set_assets(self, assets: Iterable[Asset]) -> None:
+        """Keep what people call tags; a tag that has no asset any more has an empty name."""
+        for tag, name in (dict.fromkeys(self.assets.rows, "") | {one.tag: one.name for one in assets}).items():
+            self.assets.set(tag, name)
+
     def store(self) -> None:
         """Bring all that was added into the journal. Raises OSError: what is not there waits."""
-        for table in (self.names, self.zones):  # the journal uses the numbers
+        for table in (self.names, self.assets, self.zones):  # the journal uses the numbers
             table.save()
         self.fixes.store()
         self.events.store()
@@ -260,10 +274,6 @@ class Writer:
             stack.callback(self.journal.close)
             stack.callback(self.write)
             self.store()
-
-
-def _fix_bytes(records: Records) -> bytes:
-    return records.tobytes()
 
 
 def _fixes_in(batches: Sequence[bytes]) -> pa.Table:
