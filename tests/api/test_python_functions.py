@@ -507,8 +507,8 @@ def test_a_lever_arm_without_a_truth_to_move_is_refused(folder, capsys):
 STUDY = [
     ({"name": "everything"}, "name is 'everything'; it should be one of efficiency"),
     ({"method": "best"}, "method is 'best'"),
-    ({"episodes": 3}, "episodes is for the studies efficiency and integrity; loss takes worlds and seconds"),
-    ({"integrity_risk": 0.01}, "integrity_risk and alert_limit_m are for the study integrity"),
+    ({"episodes": 3}, "it is for the studies efficiency and integrity; loss takes worlds and seconds"),
+    ({"integrity_risk": 0.01}, "integrity_risk is 0.01; it should be left out: it is for the study integrity"),
     ({"worlds": 1}, "worlds is 1; it should be a whole number, at least 2"),
     ({"noise_ps": float("nan")}, "noise_ps is nan"),
     ({"processes": 1, "scheduler": "tcp://127.0.0.1:9"}, "give either"),

@@ -26,7 +26,7 @@ def test_anchors_of_a_site_that_relays_phases_ask_their_radios_for_them(key, pha
         asked.append(options["phases"])
         raise SkylessError("enough")
 
-    monkeypatch.setattr("skyless.run.open_radio.open_radios", open_radios)
+    monkeypatch.setattr("skyless.cli.nodes.anchor.open_radios", open_radios)
     site.write_text(f'name = "x"\nid = 1\n[schedule]\nmode = "free"\n{key}[[anchors]]\nid = 1\nx_m = 0\ny_m = 0\n')
     assert main(["anchor", "1", "--site", str(site)]) == 2
     assert asked == [phases]
@@ -44,7 +44,7 @@ def test_anchors_of_a_site_that_relays_phases_ask_their_radios_for_them(key, pha
         ("tag t --method magic", "it should be one of literal"),
         ("tag t --radio serial:", "it should name one port, as serial:/dev/ttyACM0"),
         ("tag t --radio sniffer:/dev/ttyACM0", "--anchors is missing; a sniffer needs a table"),
-        ("tag t --anchors a.csv", "--anchors and --tag-height are for sniffers"),
+        ("tag t --anchors a.csv", "--anchors is 'a.csv'; it should be left out: it is for sniffers"),
         ("tag t --radio wifi:x", "it should be ether:HOST[:PORT], serial:PATH[@BAUD]"),
         ("anchor 1 2 --radio serial:/dev/ttyACM0", "it should name 2 ports, one for each node, with commas"),
         ("anchor 1 --radio listener:/dev/ttyACM0", "it should be one that can transmit: a listener only listens"),
@@ -58,7 +58,10 @@ def test_anchors_of_a_site_that_relays_phases_ask_their_radios_for_them(key, pha
         ("tag t --max-acceleration -10", "--max-acceleration"),
         ("demo --max-acceleration inf", "--max-acceleration"),
         ("tag t --method weighted --max-acceleration 10", "--max-acceleration is 10; it should be left out: weighted"),
-        ("tag t --radio sniffer:/dev/x --max-acceleration 10", "and --max-acceleration are not for sniffers"),
+        (
+            "tag t --radio sniffer:/dev/x --max-acceleration 10",
+            "--max-acceleration is 10; it should be left out: it is not for sniffers",
+        ),
         ("demo --integrity-risk high", "--integrity-risk"),
         ("demo --alert-limit-m inf", "--alert-limit-m"),
         ("ether --site lab:loud", "--site is 'lab:loud'; it should be a site file, lab, paper, or lab:PICOSECONDS"),

@@ -13,9 +13,9 @@ pytestmark = pytest.mark.site
 WORK = """
 from skyless.cli.common import progress
 progress._HIDDEN_S = {patience}
-with progress.progress_bar("replaying", 3) as bar:
+with progress.progress_bar("replaying", 3) as reach:
     for done in range(4):
-        bar.reach(done)
+        reach(done)
 """
 
 

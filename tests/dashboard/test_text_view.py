@@ -17,6 +17,8 @@ from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import (
     AlarmMessage,
     AnchorHealth,
+    Asset,
+    AssetsMessage,
     Counters,
     TagHealth,
 )
@@ -121,6 +123,18 @@ def test_a_tag_without_fixes_comes_first_and_its_age_is_in_words(view, times):
     assert "no fix for 4 s" in row or "no fix for 5 s" in row
     assert "no-beacons" in row
     assert "tags (2)" in "".join(shown)
+
+
+def test_a_tag_has_the_name_of_its_asset_at_this_site(view, times):
+    all_is_well(view.link.deliver, times)
+    for site, shown in ((SITE.site.name, "Forklift 2"), ("", "Forklift 2"), ("another", "t2")):
+        assets = AssetsMessage((Asset("t1", group="people"), Asset("t2", "Forklift 2")), site)
+        view.link.deliver(topics.assets_topic(SITE_ID), assets)
+        rows = [line for line in lines(view.picture()) if line.startswith(("t1 ", shown))]
+        assert len(rows) == 2
+        assert [row.tag for row in view.picture().tags] == ["t1", "t2"]
+    view.link.deliver(topics.assets_topic(SITE_ID), b"{}")
+    assert view.picture().wrong_messages == 1
 
 
 def test_nothing_is_fresh_without_the_broker(view, times):

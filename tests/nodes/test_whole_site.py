@@ -4,12 +4,10 @@ import asyncio
 
 import pytest
 
-from skyless.cli import demo
-from skyless.cli.demo import SiteRun, WholeSite
+from skyless.cli.nodes import _demo_site
+from skyless.cli.nodes._demo_site import DemoOptions, WholeSite
 from skyless.core.errors import SkylessError
-from skyless.core.integrity import IntegrityRequirement
 from skyless.run.mqtt.address import MqttAddress
-from skyless.sim.lab import lab_site
 
 ADDRESS = MqttAddress("127.0.0.1", 1)
 
@@ -38,30 +36,25 @@ class Lasting:
 @pytest.fixture
 def link(monkeypatch):
     link = Lasting()
-    monkeypatch.setattr(demo, "Link", lambda *_arguments, **_options: link)
-    monkeypatch.setattr(demo, "Child", Lasting)
+    monkeypatch.setattr(_demo_site, "Link", lambda *_arguments, **_options: link)
+    monkeypatch.setattr(_demo_site, "Child", Lasting)
     return link
 
 
-def test_the_demo_s_own_broker_keeps_nothing_after_its_end(link, tmp_path, monkeypatch):
+def test_the_demo_s_own_broker_keeps_nothing_after_its_end(link, monkeypatch):
     settings = []
 
     async def start(asked):
         settings.append(asked)
         raise SkylessError("enough is known")
 
-    monkeypatch.setattr(demo, "start_broker", start)
-    asked = SiteRun(
-        lab_site(), "lab", 1, 1.0, None, 1, "joint", IntegrityRequirement(), None, None, 1.0, False, tmp_path
-    )
+    monkeypatch.setattr(_demo_site, "start_broker", start)
     with pytest.raises(SkylessError, match="enough"):
-        asyncio.run(WholeSite(asked, print).run())
+        asyncio.run(WholeSite(DemoOptions(record="none"), print).run())
     assert [asked.temporary for asked in settings] == [True]
 
 
 @pytest.mark.parametrize("carrier", [False, True])
-def test_the_ether_simulates_carriers_where_the_demo_is_asked_to(tmp_path, carrier):
-    integrity = IntegrityRequirement()
-    asked = SiteRun(lab_site(), "lab", 1, 1.0, None, 1, "joint", integrity, None, None, 1.0, False, tmp_path, carrier)
-    ether = WholeSite(asked, print)._programs(ADDRESS)[0]
+def test_the_ether_simulates_carriers_where_the_demo_is_asked_to(carrier):
+    ether = WholeSite(DemoOptions(record="none", carrier=carrier), print)._programs(ADDRESS)[0]
     assert ("--carrier" in ether.arguments) == carrier

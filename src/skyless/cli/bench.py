@@ -4,7 +4,9 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 from cyclopts import App
 
-from skyless.cli.common.options import command
+from skyless.cli.common.options import JsonOptions, command
+from skyless.cli.common.output import console, print_json
+from skyless.cli.common.progress import status
 from skyless.core.arguments import whole
 
 if TYPE_CHECKING:
@@ -23,7 +25,7 @@ def bench(
     draws: Annotated[int, whole(100, 10**9)] = 1_000_000,
     anchor_count: Annotated[int, whole(1, 1000)] = 10,
     quick: bool = False,
-    json: bool = False,
+    output: JsonOptions,
 ) -> None:
     """Measure filters and Monte Carlo draws next to plain NumPy, filterpy, scipy and plain compiled loops.
 
@@ -37,11 +39,7 @@ def bench(
         How many anchors each draw has.
     quick
         Compute a fraction: a few seconds only, with fewer and shorter runs and at most a tenth of a million draws.
-    json
-        Write one JSON object instead of a table.
     """
-    from skyless.cli.common.output import print_json
-    from skyless.cli.common.progress import status
     from skyless.research.bench.measure import FULL_EFFORT, QUICK_EFFORT, measure_all
     from skyless.research.bench.monte_carlo_speed import measure
 
@@ -50,7 +48,7 @@ def bench(
         speed = measure_all(QUICK_EFFORT if quick else FULL_EFFORT)
     with status(f"{draws:,} draws of {anchor_count} anchors"):
         chain = measure(draws, anchor_count)
-    if json:
+    if output.json:
         from msgspec.structs import asdict
 
         print_json({**asdict(speed), "monte_carlo": chain})
@@ -59,8 +57,6 @@ def bench(
 
 
 def _print_table(speed: "Speed", chain: "MonteCarloSpeed") -> None:
-    from skyless.cli.common.output import console
-
     out = console()
     load = "" if speed.load is None else f", load {speed.load:.1f}"
     out.print(f"{speed.cores} cores{load}; filters on one core, medians")
@@ -86,11 +82,10 @@ def _print_table(speed: "Speed", chain: "MonteCarloSpeed") -> None:
         out.print(f"{'tags at once, ' + name:<24}{each} tags; {all_cores}")
     if speed.filterpy_missing:
         out.print(speed.filterpy_missing)
-    rows = [
+    for name, rate in (
         ("NumPy loop, one core", chain.numpy_loop_draws_per_s),
         ("compiled, one core", chain.one_core_draws_per_s),
         (f"compiled, {chain.cores} cores", chain.all_cores_draws_per_s),
-    ]
-    for name, rate in rows:
+    ):
         out.print(f"{name:<24}{rate:>14,.0f} draws/s")
     out.print(f"compiled over NumPy loop, one core: {chain.ratio:.1f} times")

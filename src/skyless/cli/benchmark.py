@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 from cyclopts import App
 
-from skyless.cli.common.options import command
-from skyless.cli.common.output import console, print_json
+from skyless.cli.common.options import JsonOptions, command
+from skyless.cli.common.output import console, print_json, print_table
 from skyless.cli.common.progress import progress_bar
 from skyless.core.air.page_codec import MAX_COORDINATE_M
 from skyless.core.arguments import Option, Options, Positive, Rule, Text, numbers, point
@@ -50,13 +50,11 @@ class BenchmarkOptions(Options, frozen=True, kw_only=True):
     """Replay only this number of seconds of each recording."""
     quick: bool = False
     """Compute a fraction: the first twelve seconds of each recording, without smoothing; about a minute for thirty."""
-    json: bool = False
-    """Write one JSON object instead of the table."""
 
 
 @app.default
 @command
-def benchmark(folder: Path, /, *, asked: BenchmarkOptions) -> int:
+def benchmark(folder: Path, /, *, asked: BenchmarkOptions, output: JsonOptions) -> None:
     """Compare methods on every recording below a folder.
 
     Finds what skyless replay can read, and beside NAME_tdoa.csv its truth, NAME_pose.csv, and above it the anchors,
@@ -84,8 +82,8 @@ def benchmark(folder: Path, /, *, asked: BenchmarkOptions) -> int:
     programs = () if code is None else (Path(code.co_filename),)
     how = Asked(asked.lever_arm_m, first_s, asked.calibrate_on, estimators, programs, not asked.quick)
     try:
-        with progress_bar("replaying", 1.0) as bar:
-            results = list(results_of(found, how, kept, bar.reach))
+        with progress_bar("replaying") as reach:
+            results = list(results_of(found, how, kept, reach))
         title = f"{len(found)} recordings" + ("" if first_s is None else f", the first {first_s:g} s of each")
         write(asked.out, results, title, shlex.join(["skyless", *sys.argv[1:]]))
     except KeyboardInterrupt:
@@ -94,17 +92,9 @@ def benchmark(folder: Path, /, *, asked: BenchmarkOptions) -> int:
     except OSError as error:
         raise SkylessError(f"{asked.out} cannot be written: {error.strerror}") from None
     summary = list(summary_rows(results))
-    if asked.json:
+    if output.json:
         rows = [dict(zip(SUMMARY_HEADS, row, strict=True)) for row in summary]
         print_json({"recordings": len(found), "seconds": first_s, "methods": rows})
-        return 0
-    from rich.table import Table
-
-    table = Table(title=title)
-    for head in SUMMARY_HEADS:
-        table.add_column(head, overflow="fold")
-    for row in summary:
-        table.add_row(*row)
-    console().print(table)
+        return
+    print_table(title, SUMMARY_HEADS, summary)
     console().print(f"{asked.out / 'index.html'}: each recording; results.csv and results.json beside it")
-    return 0

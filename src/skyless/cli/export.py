@@ -5,19 +5,18 @@ from typing import TYPE_CHECKING, Literal
 
 from cyclopts import App
 
-from skyless.cli.common.options import check_output
-from skyless.cli.common.output import console, print_json, print_warnings
+from skyless.cli.common.options import JsonOptions, check_output, command
+from skyless.cli.common.output import NO_FIX, print_json, print_table, print_warnings
+from skyless.core.errors import SkylessError
 
 if TYPE_CHECKING:
     from skyless.bridges.exports.rosbag import Bag
-
-NO_FIX = 1
-"""Exit code where the recording holds no fix of the tag."""
 
 app = App(name="export", help_epilogue="Example: skyless export walk.mcap --to walk_bag")
 
 
 @app.default
+@command
 def export(
     file: Path,
     /,
@@ -27,7 +26,7 @@ def export(
     frame: str = "site",
     transforms: bool = False,
     bag_version: Literal["9", "8"] = "9",
-    json: bool = False,
+    output: JsonOptions,
 ) -> int:
     """Write a recording of skyless record as a bag of ROS 2: MCAP, for ros2 bag play, Foxglove, Rerun, PlotJuggler.
 
@@ -48,19 +47,16 @@ def export(
         Write a transform from that frame to each tag's, too (/tf).
     bag_version
         Of the bag's metadata: 9 for ROS 2 from Jazzy on, 8 for Humble and Iron.
-    json
-        Write one JSON object instead of a table.
     """
     from skyless.bridges.exports.rosbag import write_bag
     from skyless.bridges.ros2.messages import FRAME_NAME, FRAME_RULE, RosSettings
-    from skyless.core.errors import SkylessError
 
     check_output("to", to, file)
     if not FRAME_NAME.fullmatch(frame):
         raise SkylessError(f"--frame is {frame!r}; it should be {FRAME_RULE}")
     settings = RosSettings(frame=frame, transforms=transforms)
     bag = write_bag(file, to, settings, tag, 8 if bag_version == "8" else 9)
-    if json:
+    if output.json:
         print_json(bag)
     else:
         _show(bag)
@@ -68,17 +64,8 @@ def export(
 
 
 def _show(bag: "Bag") -> None:
-    from rich.markup import escape
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(title=escape(f"{bag.path}, {bag.end_s - bag.start_s:.1f} s"))
-    table.add_column("topic", no_wrap=True)
-    table.add_column("type", overflow="fold")
-    table.add_column("messages", justify="right")
-    for topic, count in bag.topics.items():
-        table.add_row(Text(topic), Text(bag.types[topic]), str(count))
-    console().print(table)
+    rows = ((topic, bag.types[topic], str(count)) for topic, count in bag.topics.items())
+    print_table(f"{bag.path}, {bag.end_s - bag.start_s:.1f} s", ("topic", "type", "messages"), rows)
     warnings = [f"not readable: {reason} {count}" for reason, count in bag.drops.items()]
     if not bag.finished:
         warnings.append(

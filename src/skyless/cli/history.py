@@ -163,10 +163,10 @@ def import_file(recording: Path, /, *, to: HistoryFolder, site_id: SiteId | None
         if site is None:
             raise SkylessError(f"{recording} does not say of which site it is; --site-id should")
         begin_s, end_s = summary.start_s or 0.0, summary.end_s or 0.0
-        with progress_bar("importing", end_s - begin_s) as bar:
+        with progress_bar("importing", end_s - begin_s) as reach:
             writer = Writer(to, site)
             try:
-                found = import_recording(source, writer, lambda unix_s: bar.reach(unix_s - begin_s))
+                found = import_recording(source, writer, lambda unix_s: reach(unix_s - begin_s))
             finally:
                 writer.close()
     if json:

@@ -31,20 +31,12 @@ _GROUPS: Final = {
     "Set up and check a site": (
         ("site", "site", "Write and check site files."),
         ("plan", "plan", "Predict a site's errors before it is mounted, and place its anchors."),
-        (
-            "survey",
-            "survey",
-            "Find where anchors hang and their antenna delays, from recordings or a running site.",
-        ),
+        ("survey", "survey", "Find where anchors hang, and their antenna delays."),
         ("doctor", "nodes.doctor", "Check a computer, its boards and a running site in two minutes."),
     ),
     "Run a site": (
         ("broker", "nodes.broker", "Run the MQTT broker that comes with Skyless."),
-        (
-            "gather",
-            "nodes.gather",
-            "Pack the fixes of a site with thousands of tags, and keep them in a stream of NATS.",
-        ),
+        ("gather", "nodes.gather", "Pack the fixes of a site with thousands of tags into a stream of NATS."),
         ("anchor", "nodes.anchor", "Run anchors of a site."),
         ("tag", "nodes.tag", "Run listening tags; with --print, --csv or --json their positions on standard output."),
         ("dashboard", "dashboard", "Show a site live in the browser."),

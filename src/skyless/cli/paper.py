@@ -3,30 +3,21 @@
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import msgspec
 from cyclopts import App
 
-from skyless.cli.common.options import command
-from skyless.cli.common.output import console, json_form, print_json
+from skyless.cli.common.options import JsonOptions, command
+from skyless.cli.common.output import console, json_form, print_json, print_table
 from skyless.cli.common.progress import progress_bar
 from skyless.core.arguments import Seed
-
-if TYPE_CHECKING:
-    from skyless.research.paper.run import Report
 
 app = App(name="paper", help_epilogue="Example: skyless paper --out report --seed 1")
 
 
 @app.default
 @command
-def paper(
-    *,
-    out: Path,
-    seed: Seed = 1,
-    quick: bool = False,
-    json: bool = False,
-) -> None:
+def paper(*, out: Path, seed: Seed = 1, quick: bool = False, output: JsonOptions) -> None:
     """Reproduce every figure and claim of the paper, and judge which hold.
 
     Writes report.html, which needs no other file, every picture as PNG and SVG, and numbers.json. The full report takes
@@ -40,33 +31,20 @@ def paper(
         Same seed, same numbers, except for times that are measured.
     quick
         Compute a fraction: ready in well under a minute, with more scatter.
-    json
-        Write one JSON object instead of the table.
     """
     from skyless.research.paper.plan import plan_of
     from skyless.research.paper.run import write_report
 
     started_s = time.perf_counter()
     try:
-        with progress_bar("simulating the paper", 1.0) as bar:
-            report = write_report(plan_of(seed, quick=quick), out, bar.reach)
+        with progress_bar("simulating the paper") as reach:
+            report = write_report(plan_of(seed, quick=quick), out, reach)
     except KeyboardInterrupt:
         print("stopped; nothing was written", file=sys.stderr)
         raise
-    if json:
-        import msgspec
-
+    if output.json:
         print_json({**msgspec.to_builtins(report, enc_hook=json_form), "wall_s": time.perf_counter() - started_s})
-    else:
-        _show(report)
-
-
-def _show(report: "Report") -> None:
-    """Show the verdicts as a table."""
-    from rich.table import Table
-
-    table = Table("", "figure", "verdict", title="the paper, reproduced and corrected")
-    for number, section in enumerate(report.sections, start=1):
-        table.add_row(str(number), str(section["title"]), str(section["verdict"]))
-    console().print(table)
+        return
+    rows = ((f"{n}", f"{one['title']}", f"{one['verdict']}") for n, one in enumerate(report.sections, start=1))
+    print_table("the paper, reproduced and corrected", ("", "figure", "verdict"), rows)
     console().print(f"{report.report}: {len(report.figures)} pictures and numbers.json next to it")

@@ -4,20 +4,17 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-import msgspec
 from cyclopts import App
 from msgspec.structs import replace
 
 from skyless.cli.api.options import PlanOptions
-from skyless.cli.common.options import check_output, check_picture, command
+from skyless.cli.common.options import JsonOptions, check_output, check_picture, command
 from skyless.cli.common.output import new_table, print_facts, print_json, print_warnings, write_file, write_picture
 from skyless.cli.common.progress import progress_bar
-from skyless.core.arguments import Options
 from skyless.core.errors import ConfigurationError, SkylessError
 
 if TYPE_CHECKING:
     from skyless.cli.api.plan import PlanResult
-    from skyless.cli.api.rate_plan import RatePlanResult
     from skyless.core.site import Site
     from skyless.site.planning.picture import Background
 
@@ -35,7 +32,7 @@ _NOTES: Final = (
 )
 
 
-class _Output(Options, frozen=True, kw_only=True):
+class _Output(JsonOptions, frozen=True, kw_only=True):
     plot: Path | None = None
     """Draw the picture into this file (PNG, SVG or PDF): the map of the predicted error."""
     grid: Path | None = None
@@ -44,8 +41,6 @@ class _Output(Options, frozen=True, kw_only=True):
     """Write a page with all maps, numbers and warnings into this file; it needs no other file."""
     out: Path | None = None
     """Write the result here: the optimised site, into a file that must not exist."""
-    json: bool = False
-    """Write one JSON object instead of the tables."""
 
 
 @app.default
@@ -64,19 +59,22 @@ def plan(asked: PlanOptions, output: _Output) -> None:
     from skyless.cli.api.rate_plan import RatePlanResult
     from skyless.site.planning.report import described
 
-    with progress_bar("planning", 1.0) as bar:
-        result = run_plan(replace(asked, progress=bar.reach))
+    with progress_bar("planning") as reach:
+        result = run_plan(replace(asked, progress=reach))
+    title = f"{site.name} ({file})"
     if isinstance(result, RatePlanResult):
         output.leave_out("grid", "html", "out", why="errors are not predicted for so large a site")
-        _show_rates(result, file, output)
-        return
-    if output.out is not None:
-        _write_site(output.out, replace(result.site, noise=site.noise), file)
-    _write_files(result, output)
+    else:
+        title = f"{title}: {described(result.summary)}"
+        if output.out is not None:
+            _write_site(output.out, replace(result.site, noise=site.noise), file)
+        _write_files(result, output)
+    if output.plot is not None:
+        write_picture(output.plot, result.plot())
     if output.json:
         print_json(result.summary)
     else:
-        print_facts(f"{site.name} ({file}): {described(result.summary)}", result.facts())
+        print_facts(title, result.facts())
         print_warnings(result.summary["warnings"])
 
 
@@ -110,17 +108,6 @@ def _check_image(file: Path, site: "Site", image: Path) -> None:
         shown = site.floor_plan.image if site.floor_plan else ""
         right = f"an image that can be read to its end ({' '.join(str(error).split())})"
         raise ConfigurationError(file, "floor_plan.image", shown, right) from None
-
-
-def _show_rates(result: "RatePlanResult", file: Path, output: _Output) -> None:
-    """Show the plan of a site without a master, and draw it."""
-    if output.plot is not None:
-        write_picture(output.plot, result.plot())
-    if output.json:
-        print_json(result.summary)
-    else:
-        print_facts(f"{result.site.name} ({file})", result.facts())
-        print_warnings(result.summary["warnings"])
 
 
 def _page(plan: "PlanResult", background: "Background") -> str:
@@ -159,21 +146,19 @@ def _write_site(out: Path, site: "Site", source: Path) -> None:
 
     if site.floor_plan is not None:
         image = os.path.relpath(source.parent / site.floor_plan.image, out.parent)
-        site = msgspec.structs.replace(site, floor_plan=msgspec.structs.replace(site.floor_plan, image=image))
+        site = replace(site, floor_plan=replace(site.floor_plan, image=image))
     check_site(site, out)
     write_file(out, site_template(site).encode())
 
 
 def _write_files(plan: "PlanResult", output: _Output) -> None:
-    """Write the files that were asked for. Raises SkylessError when one cannot be written."""
+    """Write table and page, where they were asked for. Raises SkylessError when one cannot be written."""
     if (grid := output.grid) is not None:
         from skyless.site.planning.maps import csv_lines, geojson_lines
 
         with new_table(grid) as table:
             is_csv = grid.suffix.lower() == ".csv"
             table.writelines(csv_lines(plan.map) if is_csv else geojson_lines(plan.map, plan.site.georeference))
-    if output.plot is not None:
-        write_picture(output.plot, plan.plot())
     if output.html is not None:
         from skyless.site.planning.picture import Background
         from skyless.site.planning.report import described

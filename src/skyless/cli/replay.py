@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any, Final
 from cyclopts import App
 from msgspec.structs import replace
 
-from skyless.cli.common.options import check_output, check_picture, command
+from skyless.cli.common.options import JsonOptions, check_output, check_picture, command
 from skyless.cli.common.output import (
     NO_FIX,
     USER_ERROR,
+    dropped,
     new_table,
     print_facts,
     print_json,
@@ -20,7 +21,7 @@ from skyless.cli.common.output import (
     write_picture,
 )
 from skyless.cli.common.progress import progress_bar
-from skyless.core.arguments import Options, existing_file
+from skyless.core.arguments import existing_file
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import METHODS, SNAPSHOTS
 from skyless.research.replays.options import ReplayOptions
@@ -44,22 +45,17 @@ _MANY_UNKNOWN: Final = 0.5
 _FEW_MEMBERS: Final = 0.8
 """Mean number of a snapshot's anchors over the largest, below which it is warned of."""
 
-_MAX_DROPS: Final = 3
-"""Reasons for drops that are named when there is no fix."""
-
 app = App(
     name="replay",
     help_epilogue="Example: skyless replay flight_tdoa.csv.gz --anchors anchors.csv --truth flight_pose.csv.gz --json",
 )
 
 
-class _Output(Options, frozen=True, kw_only=True):
+class _Output(JsonOptions, frozen=True, kw_only=True):
     fixes_csv: Path | None = None
     """Write every fix into this table."""
     plot: Path | None = None
     """Draw the picture into this file (PNG, SVG or PDF): track, errors and histograms."""
-    json: bool = False
-    """Write one JSON object instead of the table."""
 
 
 @app.default
@@ -113,7 +109,7 @@ def _replayed(asked: ReplayOptions, output: _Output, name: str = "") -> tuple[in
     from skyless.cli.api.replay import replay_recording
 
     with ExitStack() as until_done:
-        bar = until_done.enter_context(progress_bar("replaying", 1.0))
+        reach = until_done.enter_context(progress_bar("replaying"))
 
         def begin(tags: tuple[str, ...], given: str) -> "OnFix | None":
             if output.plot is not None and len(tags) > 1:
@@ -125,7 +121,7 @@ def _replayed(asked: ReplayOptions, output: _Output, name: str = "") -> tuple[in
             write((*FIXES_COLUMNS, "tag") if of_site else FIXES_COLUMNS)
             return lambda tag, time_s, fix: write([*_row(time_s, fix), *([tag] if of_site else [])])
 
-        result = replay_recording(replace(asked, progress=bar.reach), begin)
+        result = replay_recording(replace(asked, progress=reach), begin)
     if output.plot is not None:
         write_picture(output.plot, result.plot())
     for tag, report in result.reports.items():
@@ -195,8 +191,7 @@ def _likely_reason(report: "ReplayReport", asked: ReplayOptions) -> str:
         found += how_to_find_anchors(asked.file, format_of(asked.file, asked.format))
     else:
         found = _REASONS.get(report.reason or "", report.reason or "unknown")
-    drops = sorted(report.drops.items(), key=lambda item: -item[1])[:_MAX_DROPS]
-    return found + (f" (dropped: {', '.join(f'{count} × {name}' for name, count in drops)})" if drops else "")
+    return found + (f" ({dropped(report.drops)})" if report.drops else "")
 
 
 def _row(time_s: float, fix: "Fix") -> list[str]:

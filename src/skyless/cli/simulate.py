@@ -10,11 +10,10 @@ from cyclopts import App
 from msgspec.structs import replace
 
 from skyless.cli.api.options import SimulateOptions
-from skyless.cli.common.options import check_output, command
-from skyless.cli.common.output import NO_FIX, new_table, print_facts, print_json
+from skyless.cli.common.options import JsonOptions, check_output, command
+from skyless.cli.common.output import NO_FIX, dropped, new_table, print_facts, print_json
 from skyless.cli.common.progress import progress_bar, status
 from skyless.cli.nodes.options import name_unplaced
-from skyless.core.arguments import Options
 
 if TYPE_CHECKING:
     from skyless.cli.api.simulate import Simulation
@@ -35,11 +34,9 @@ app = App(
 )
 
 
-class _Output(Options, frozen=True, kw_only=True):
+class _Output(JsonOptions, frozen=True, kw_only=True):
     fixes_csv: Path | None = None
     """Write every fix with its truth into this file."""
-    json: bool = False
-    """Write one JSON object instead of the table."""
 
 
 @app.default
@@ -56,8 +53,8 @@ def simulate(*, asked: SimulateOptions, output: _Output) -> int:
     from skyless.cli.api.simulate import Simulation, SimulationResult
     from skyless.sim.compile_ahead import compile_kernels
 
-    with progress_bar("simulating", 1.0) as bar:
-        simulation = Simulation(replace(asked, progress=bar.reach))
+    with progress_bar("simulating") as reach:
+        simulation = Simulation(replace(asked, progress=reach))
         name_unplaced(simulation.request.site)
         if asked.estimator is None:
             with status("compiling the simulation"):
@@ -92,8 +89,7 @@ def _why_none(result: "FleetReport", simulation: "Simulation") -> str:
         return f"the tags heard nothing: {reach}"
     if result.drops.get("radio-off") == result.messages:
         return f"the tags' radios were off all the time (--silence); {result.messages} messages were lost on them"
-    most = sorted(result.drops.items(), key=lambda item: -item[1])[:3]
-    drops = f"; dropped: {', '.join(f'{count} × {name}' for name, count in most)}" if most else ""
+    drops = f"; {dropped(result.drops)}" if result.drops else ""
     reason = simulation.fleet.receivers[0].reason
     return f"tags heard {result.messages} messages in {result.simulated_s:g} s, and had no position: {reason}{drops}"
 

@@ -4,21 +4,37 @@ import time
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Any, Final
 
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cyclopts import App
+from msgspec.structs import replace
 
-from skyless.cli.common.options import command
+from skyless.cli.common.options import JsonOptions, command
 from skyless.cli.common.output import console, print_facts, print_json, print_warnings
 from skyless.cli.common.progress import progress_bar
 from skyless.cli.nodes.options import site_named
 from skyless.core.arguments import Options, number
 from skyless.core.errors import SkylessError
-
-if TYPE_CHECKING:
-    from skyless.core.keys.chain import Chain
-    from skyless.core.site import Site
-    from skyless.run.keys.key_files import SitePublic
+from skyless.core.keys.chain import Chain, ChainRing, new_chain
+from skyless.core.site import Site
+from skyless.core.whole_files import replace_files
+from skyless.run.keys.key_files import (
+    MAX_SERIAL,
+    SITE_PRIVATE,
+    SITE_PUBLIC,
+    SitePublic,
+    chain_public_bytes,
+    chain_public_file,
+    chain_seed_file,
+    private_bytes,
+    read_chain_public,
+    read_folder_public,
+    read_private,
+    seed_bytes,
+    serials_in,
+    site_public_bytes,
+)
 
 _DAY_S: Final = 86_400.0
 _YEAR_S: Final = 365.25 * _DAY_S
@@ -37,16 +53,26 @@ app = App(
 )
 
 
-class _Site(Options, frozen=True):
+class _KeysOptions(JsonOptions, frozen=True, kw_only=True):
     site: str
     """Site file, of mode free."""
-
-
-class _KeysOptions(_Site, frozen=True, kw_only=True):
     keys: Path | None = None
     """Folder of the site's keys; by default keys in that of the site file."""
-    json: bool = False
-    """Write one JSON object instead of the table, or of what is to be done next."""
+
+    @property
+    def plan(self) -> Site:
+        """The site, whose beacons can carry codes. Raises SkylessError."""
+        plan = site_named(self.site)
+        if plan.schedule.needs_master:
+            raise SkylessError(
+                f'{self.site}: schedule.mode is "master", whose beacons carry no codes; it should be free'
+            )
+        return plan
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the keys."""
+        return Path(self.site).parent / "keys" if self.keys is None else self.keys
 
 
 class _ChainOptions(Options, frozen=True, kw_only=True):
@@ -68,14 +94,7 @@ def new(asked: _KeysOptions, made: _StartOptions) -> None:
 
     Two years take five minutes of one processor; all are used.
     """
-    site, keys, years, starts = asked.site, asked.keys, made.years, made.starts
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-
-    from skyless.run.keys.key_files import SITE_PRIVATE, SITE_PUBLIC, SitePublic, private_bytes, serials_in
-    from skyless.run.keys.key_files import site_public_bytes as public_bytes
-
-    plan = _site_with_codes(site)
-    folder = _folder(site, keys)
+    plan, folder = asked.plan, asked.folder
     if folder.exists() and not folder.is_dir():
         raise SkylessError(f"{folder} is no folder; --keys should name a folder to make")
     present = [file for file in (folder / SITE_PRIVATE, folder / SITE_PUBLIC) if file.exists()]
@@ -83,23 +102,20 @@ def new(asked: _KeysOptions, made: _StartOptions) -> None:
         raise SkylessError(
             f"{folder} holds keys already; skyless site keys rotate makes another chain, --keys names another folder"
         )
-    starts_s = time.time() - _OVERLAP_S if starts is None else _planned(starts)
+    starts_s = time.time() - _OVERLAP_S if made.starts is None else _planned(made.starts)
     private = Ed25519PrivateKey.generate()
     public = SitePublic(plan.id, private.public_key().public_bytes_raw())
-    chain = _made(public, 1, starts_s, years, private.private_bytes_raw())
-    files = {folder / SITE_PRIVATE: private_bytes(private), folder / SITE_PUBLIC: public_bytes(public)}
+    chain = _made(public, 1, starts_s, made.years, private.private_bytes_raw())
+    files = {folder / SITE_PRIVATE: private_bytes(private), folder / SITE_PUBLIC: site_public_bytes(public)}
     _write(folder, chain, files)
-    if asked.json:
-        _print_json(site, keys)
-        return
-    console().print(
-        f"{_written(folder, chain)}; fingerprint of the public key: {public.fingerprint}\n"
+    _report_new(
+        asked,
+        chain,
+        f"; fingerprint of the public key: {public.fingerprint}\n"
         f"next: 1. keep {SITE_PRIVATE} where only you can read it; no anchor and no tag needs it\n"
         f"2. copy {SITE_PUBLIC}, chain-1.public and chain-1.seed to each host of anchors: skyless anchor … --keys "
         "FOLDER\n"
         f"3. copy {SITE_PUBLIC} to each tag: skyless tag … --site-key {SITE_PUBLIC}",
-        markup=False,
-        soft_wrap=True,
     )
 
 
@@ -107,53 +123,40 @@ def new(asked: _KeysOptions, made: _StartOptions) -> None:
 @command
 def rotate(asked: _KeysOptions, made: _StartOptions) -> None:
     """Make the next key chain of a site, which counts from a planned time on; until then the present one does."""
-    site, keys, years, starts = asked.site, asked.keys, made.years, made.starts
-    folder, public, chains = _present(site, keys)
-    starts_s = time.time() + _DAY_S if starts is None else _planned(starts)
-    chain = _successor(folder, public, chains, starts_s, years)
-    _write(folder, chain, {})
+    public, chains = _present(asked)
+    starts_s = time.time() + _DAY_S if made.starts is None else _planned(made.starts)
+    chain = _successor(asked.folder, public, chains, starts_s, made.years)
+    _write(asked.folder, chain, {})
     warnings = []
     last = chains[-1]
     ends_s = _ends_s(last)
     if ends_s < starts_s:
         warnings.append(f"chain {last.serial} ends {_when(ends_s)}: until {_when(starts_s)} beacons carry no codes")
-    if asked.json:
-        _print_json(site, keys, warnings)
-        return
-    console().print(
-        f"{_written(folder, chain)}\n"
-        f"next: copy chain-{chain.serial}.public and chain-{chain.serial}.seed to each host of anchors before it "
+    _report_new(
+        asked,
+        chain,
+        f"\nnext: copy chain-{chain.serial}.public and chain-{chain.serial}.seed to each host of anchors before it "
         "begins; anchors that run use them without a restart, and tags need nothing",
-        markup=False,
-        soft_wrap=True,
+        warnings,
     )
-    print_warnings(warnings)
 
 
 @app.command(help_epilogue="Example: skyless site keys revoke site.toml --years 0.1")
 @command
 def revoke(asked: _KeysOptions, made: _ChainOptions) -> None:
     """Replace all key chains of a site at once, as a seed was stolen or an anchor's host lost."""
-    site, keys, years = asked.site, asked.keys, made.years
-    from msgspec.structs import replace
-
-    from skyless.run.keys.key_files import SITE_PUBLIC, site_public_bytes
-
-    folder, public, chains = _present(site, keys)
-    chain = _successor(folder, public, chains, time.time() - _OVERLAP_S, years)
+    public, chains = _present(asked)
+    chain = _successor(asked.folder, public, chains, time.time() - _OVERLAP_S, made.years)
     raised = replace(public, least_serial=chain.serial)
-    _write(folder, chain, {folder / SITE_PUBLIC: site_public_bytes(raised)})
-    if asked.json:
-        _print_json(site, keys)
-        return
-    console().print(
-        f"{_written(folder, chain)}; chains before it are revoked\n"
+    _write(asked.folder, chain, {asked.folder / SITE_PUBLIC: site_public_bytes(raised)})
+    _report_new(
+        asked,
+        chain,
+        "; chains before it are revoked\n"
         f"next: 1. copy chain-{chain.serial}.public and chain-{chain.serial}.seed at once to each host of anchors that "
         "you trust; anchors that run use them without a restart, and tags that receive them refuse the earlier chain\n"
         f"2. copy {SITE_PUBLIC} to each host of anchors and each tag, so that tags that were off refuse it as well\n"
         "3. delete the seeds of earlier chains",
-        markup=False,
-        soft_wrap=True,
     )
 
 
@@ -161,9 +164,8 @@ def revoke(asked: _KeysOptions, made: _ChainOptions) -> None:
 @command
 def show(asked: _KeysOptions) -> None:
     """Show the key chains of a site: from when to when, and which counts now. No secret is shown."""
-    site, keys = asked.site, asked.keys
-    folder, public, chains = _present(site, keys)
-    report = _report(folder, public, chains, time.time())
+    public, chains = _present(asked)
+    report = _report(asked.folder, public, chains, time.time())
     if asked.json:
         print_json(report)
         return
@@ -174,21 +176,24 @@ def show(asked: _KeysOptions) -> None:
         span = f"{_when(chain['begins_unix_s'])} to {_when(chain['ends_unix_s'])}"
         rows.append((f"chain {chain['serial']}", ", ".join(filter(None, (span, state, seed)))))
     rows.append(("left", f"{report['days_left']:.0f} days"))
-    print_facts(f"keys of site {public.site} ({folder})", rows)
+    print_facts(f"keys of site {public.site} ({asked.folder})", rows)
     print_warnings(report["warnings"])
 
 
-def _print_json(site: str, keys: Path | None, warnings: Sequence[str] = ()) -> None:
-    """The report of ``show`` on what is there now."""
-    report = _report(*_present(site, keys), time.time())
-    print_json({**report, "warnings": [*warnings, *report["warnings"]]})
+def _report_new(asked: _KeysOptions, chain: Chain, next_steps: str, warnings: Sequence[str] = ()) -> None:
+    """What was made, and what is to be done next; as JSON the report of ``show`` on what is there now."""
+    if asked.json:
+        report = _report(asked.folder, *_present(asked), time.time())
+        print_json({**report, "warnings": [*warnings, *report["warnings"]]})
+        return
+    span = f"from {_when(chain.timing.start_s(chain.first))} to {_when(_ends_s(chain))}"
+    made = f"wrote chain {chain.serial} to {asked.folder}: it counts {span}"
+    console().print(made + next_steps, markup=False, soft_wrap=True)
+    print_warnings(warnings)
 
 
-def _report(folder: Path, public: "SitePublic", chains: "list[Chain]", now_s: float) -> dict[str, Any]:
+def _report(folder: Path, public: SitePublic, chains: list[Chain], now_s: float) -> dict[str, Any]:
     """What is to be said of the chains."""
-    from skyless.core.keys.chain import ChainRing
-    from skyless.run.keys.key_files import chain_seed_file
-
     ring = ChainRing(chains)
     at = None if ring.timing is None else ring.at(ring.timing.interval_at(now_s))
     present = None if at is None or at.chain.serial < public.least_serial else at.chain.serial
@@ -224,34 +229,18 @@ def _report(folder: Path, public: "SitePublic", chains: "list[Chain]", now_s: fl
 # Parts of the commands
 
 
-def _site_with_codes(site: str) -> "Site":
-    """The site, whose beacons can carry codes. Raises SkylessError."""
-    plan = site_named(site)
-    if plan.schedule.needs_master:
-        raise SkylessError(f'{site}: schedule.mode is "master", whose beacons carry no codes; it should be free')
-    return plan
-
-
-def _folder(site: str, keys: Path | None) -> Path:
-    return Path(site).parent / "keys" if keys is None else keys
-
-
-def _present(site: str, keys: Path | None) -> "tuple[Path, SitePublic, list[Chain]]":
-    """Folder, public key and chains, without their seeds, of a site that has keys. Raises SkylessError."""
-    from skyless.run.keys.key_files import read_chain_public, read_folder_public, serials_in
-
-    plan, folder = _site_with_codes(site), _folder(site, keys)
+def _present(asked: _KeysOptions) -> tuple[SitePublic, list[Chain]]:
+    """Public key and chains, without their seeds, of a site that has keys. Raises SkylessError."""
+    plan, folder = asked.plan, asked.folder
     public = read_folder_public(folder, plan.id)
     chains = [read_chain_public(folder, serial, plan.id) for serial in serials_in(folder)]
     if not chains:
         raise SkylessError(f"{folder} holds no chain-N.public; it should be the folder of skyless site keys new")
-    return folder, public, chains
+    return public, chains
 
 
-def _successor(folder: Path, public: "SitePublic", chains: "list[Chain]", starts_s: float, years: float) -> "Chain":
+def _successor(folder: Path, public: SitePublic, chains: list[Chain], starts_s: float, years: float) -> Chain:
     """The next chain of a site. Raises SkylessError."""
-    from skyless.run.keys.key_files import MAX_SERIAL, read_private
-
     private = read_private(folder, public)
     serial = max(chains[-1].serial, public.least_serial) + 1
     if serial > MAX_SERIAL:
@@ -259,25 +248,14 @@ def _successor(folder: Path, public: "SitePublic", chains: "list[Chain]", starts
     return _made(public, serial, starts_s, years, private.private_bytes_raw())
 
 
-def _made(public: "SitePublic", serial: int, starts_s: float, years: float, private: bytes) -> "Chain":
+def _made(public: SitePublic, serial: int, starts_s: float, years: float, private: bytes) -> Chain:
     """A new chain, with a bar while it is made."""
-    from skyless.core.keys.chain import new_chain
-
-    with progress_bar("making the key chain", 1.0) as bar:
-        return new_chain(public.site, serial, starts_s, starts_s + years * _YEAR_S, private, bar.reach)
+    with progress_bar("making the key chain") as reach:
+        return new_chain(public.site, serial, starts_s, starts_s + years * _YEAR_S, private, reach)
 
 
-def _write(folder: Path, chain: "Chain", more: dict[Path, bytes]) -> None:
+def _write(folder: Path, chain: Chain, more: dict[Path, bytes]) -> None:
     """Write the files of a chain and others. Raises SkylessError, and then none is there."""
-    from skyless.core.whole_files import replace_files
-    from skyless.run.keys.key_files import (
-        SITE_PRIVATE,
-        chain_public_bytes,
-        chain_public_file,
-        chain_seed_file,
-        seed_bytes,
-    )
-
     seed, chain_public = chain_seed_file(folder, chain.serial), chain_public_file(folder, chain.serial)
     for file in (seed, chain_public):
         if file.exists():
@@ -303,15 +281,10 @@ def _planned(text: str) -> float:
     return starts_s
 
 
-def _ends_s(chain: "Chain") -> float:
+def _ends_s(chain: Chain) -> float:
     return chain.timing.start_s(chain.end)
 
 
 def _when(unix_s: float) -> str:
     """Local date and time for people."""
     return datetime.fromtimestamp(unix_s).astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")
-
-
-def _written(folder: Path, chain: "Chain") -> str:
-    begins_s = chain.timing.start_s(chain.first)
-    return f"wrote chain {chain.serial} to {folder}: it counts from {_when(begins_s)} to {_when(_ends_s(chain))}"

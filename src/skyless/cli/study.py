@@ -13,10 +13,9 @@ from cyclopts import App
 from msgspec.structs import replace
 
 from skyless.cli.api.options import StudyOptions
-from skyless.cli.common.options import check_picture, command
+from skyless.cli.common.options import JsonOptions, check_picture, command
 from skyless.cli.common.output import console, print_json, to_json
 from skyless.cli.common.progress import progress_bar, status
-from skyless.core.arguments import Options
 from skyless.core.errors import SkylessError
 from skyless.core.whole_files import write_whole
 
@@ -77,9 +76,7 @@ _LEGENDS: Final = {
 app = App(name="study", help_epilogue="Example: skyless study loss --seed 7 --plot loss.png")
 
 
-class _Output(Options, frozen=True, kw_only=True):
-    json: bool = False
-    """Write one JSON object instead of the table."""
+class _Output(JsonOptions, frozen=True, kw_only=True):
     plot: Path | None = None
     """Draw the picture into this file."""
     out: Path | None = None
@@ -99,8 +96,8 @@ def study(asked: StudyOptions, output: _Output) -> None:
         with status("compiling the simulation"):
             compile_kernels(asked.method)
     try:
-        with progress_bar(f"studying {asked.name}", 1.0) as bar:
-            result = run_study(replace(asked, progress=bar.reach))
+        with progress_bar(f"studying {asked.name}") as reach:
+            result = run_study(replace(asked, progress=reach))
     except KeyboardInterrupt:
         print("stopped; nothing was written", file=sys.stderr)
         raise
@@ -202,11 +199,6 @@ def _percent(share: float | None) -> str:
     return "" if share is None else f"{100.0 * share:.1f} %"
 
 
-def _tenths(share: float) -> str:
-    """In 10⁻⁴, to two digits."""
-    return f"{1e4 * share:.2f}"
-
-
 def _figure(value: float | None, factor: float = 1.0, error: float | None = None, digits: int = 2) -> str:
     if value is None:
         return ""
@@ -221,12 +213,8 @@ def _number(name: str, factor: float = 1.0, digits: int = 2, error: str = "") ->
     return lambda row: _figure(getattr(row, name, None), factor, getattr(row, error, None), digits)
 
 
-def _share(name: str) -> _Cell:
-    return lambda row: _percent(getattr(row, name, None))
-
-
-def _probability(name: str) -> _Cell:
-    return lambda row: _rare(getattr(row, name, None))
+def _share(name: str, words: Callable[[float | None], str] = _percent) -> _Cell:
+    return lambda row: words(getattr(row, name, None))
 
 
 def _span(name: str, words: Callable[[float], str]) -> _Cell:
@@ -252,12 +240,12 @@ _COLUMNS: Final[tuple[tuple[str, _Cell], ...]] = (
     ("HPL in cm", _number("hpl_m", 100.0, 1)),
     ("VPL", _number("vpl_m", 100.0, 1)),
     ("misleading", _number("hmi", 1e4)),
-    ("", _span("hmi_interval", _tenths)),
+    ("", _span("hmi_interval", lambda share: f"{1e4 * share:.2f}")),
     ("vertical", _number("hmi_vertical", 1e4)),
-    ("", _span("hmi_vertical_interval", _tenths)),
-    ("exceeded", _probability("exceeded")),
+    ("", _span("hmi_vertical_interval", lambda share: f"{1e4 * share:.2f}")),
+    ("exceeded", _share("exceeded", _rare)),
     ("", _span("exceeded_interval", _rare)),
-    ("unwarned", _probability("exceeded_unwarned")),
+    ("unwarned", _share("exceeded_unwarned", _rare)),
     ("beacons/s", _number("beacons_per_s", digits=0)),
     ("first fix in s", _number("first_fix_s", digits=3)),
     ("gap in s", _number("gap_s", digits=3)),

@@ -8,26 +8,24 @@ from typing import TYPE_CHECKING, Final
 from cyclopts import App
 from msgspec.structs import replace
 
-from skyless.cli.common.options import check_folder, check_output, check_picture, command
+from skyless.cli.common.options import JsonOptions, check_folder, check_output, check_picture, command
 from skyless.cli.common.output import (
     cm,
     console,
     number,
     print_facts,
     print_json,
+    print_table,
     print_warnings,
     write_file,
     write_picture,
 )
 from skyless.cli.common.progress import progress_bar
 from skyless.cli.nodes.survey_live import LiveOptions, gather_live, serve_live
-from skyless.core.arguments import Options
 from skyless.core.errors import SkylessError
 from skyless.research.calibration.options import SurveyOptions
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from skyless.cli.api.survey import BiasResult, SurveyResult
     from skyless.site.survey.result import Survey, SurveyedPair, TapeAdvice
 
@@ -43,13 +41,11 @@ app = App(
 )
 
 
-class _Output(Options, frozen=True, kw_only=True):
+class _Output(JsonOptions, frozen=True, kw_only=True):
     out: Path | None = None
     """Write the result here: the site file of --site with the survey in it (.toml), or a table of anchors (.csv)."""
     force: bool = False
     """Overwrite what is there, if --out exists; what was there is kept under another name."""
-    json: bool = False
-    """Write one JSON object instead of the tables."""
     plot: Path | None = None
     """Draw the picture into this file (PNG, SVG or PDF): the anchors from above."""
 
@@ -72,14 +68,18 @@ def survey(*, asked: SurveyOptions, live: LiveOptions, output: _Output) -> int:
     from skyless.cli.api.survey import BiasResult, Gathered, gathered, is_of_biases, run_survey_site, surveyed
 
     if is_of_biases(asked):
-        _check_table(output)
-        with progress_bar("surveying", 1.0) as bar:
-            biases = run_survey_site(replace(asked, progress=bar.reach))
+        if output.out is not None and output.out.suffix.lower() != ".csv":
+            raise SkylessError(
+                f"--out is {str(output.out)!r}; it should be a table, .csv: a site file holds antenna delays, which "
+                "only a recording of skyless record can correct"
+            )
+        with progress_bar("surveying") as reach:
+            biases = run_survey_site(replace(asked, progress=reach))
         assert isinstance(biases, BiasResult)
         _report_biases(biases, output)
         return 0
-    with progress_bar("surveying", 1.0) as bar:
-        asked = replace(asked, progress=bar.reach)
+    with progress_bar("surveying") as reach:
+        asked = replace(asked, progress=reach)
         given = Gathered(*gather_live(live, asked)) if live.is_live else gathered(asked)
         found = surveyed(asked, given, lambda counted: None if output.json else console().print(counted.sentence))
     written, more = ((), ()) if output.out is None or not found.usable else _written(found, output.out)
@@ -121,14 +121,6 @@ def _check(asked: SurveyOptions, live: LiveOptions, output: _Output) -> None:
         )
     if out.exists() and not output.force:
         raise SkylessError(f"{out} exists; --force overwrites it")
-
-
-def _check_table(output: _Output) -> None:
-    if output.out is not None and output.out.suffix.lower() != ".csv":
-        raise SkylessError(
-            f"--out is {str(output.out)!r}; it should be a table, .csv: a site file holds antenna delays, which only a "
-            "recording of skyless record can correct"
-        )
 
 
 # Files
@@ -210,10 +202,10 @@ def _show(found: "SurveyResult", written: tuple[str, ...]) -> None:
     )
     for note in survey.notes:
         screen.print(f"note: {note}", markup=False)
-    screen.print(_anchors(survey))
+    _print_anchors(survey)
     checked = [pair for pair in survey.pairs if pair.residual_m is not None]
     if checked:
-        screen.print(_pairs(checked))
+        _print_pairs(checked)
     excluded = ", ".join(f"{pair.a}–{pair.b}{_late(pair)}" for pair in survey.pairs if pair.excluded)
     lines = [
         f"left out as late: {excluded or 'no pair'}",
@@ -230,34 +222,25 @@ def _show(found: "SurveyResult", written: tuple[str, ...]) -> None:
         screen.print(line, markup=False)
 
 
-def _anchors(survey: "Survey") -> "Table":
-    from rich.table import Table
-
-    table = Table(title="anchors")
-    for name in ("anchor", "x / m", "y / m", "z / m", "± / cm", "delay / cm", "± / cm"):
-        table.add_column(name, justify="right")
-    table.add_column("")
+def _print_anchors(survey: "Survey") -> None:
+    rows = []
     for one in survey.anchors:
         position = [number(value) for value in (one.x_m, one.y_m, one.z_m)]
         others = [number(value, "{:.2f}", 100.0) for value in (one.std_m, one.delay_m, one.delay_std_m)]
-        table.add_row(str(one.id), *position, *others, "" if one.determined else "not determined")
-    return table
+        rows.append((str(one.id), *position, *others, "" if one.determined else "not determined"))
+    heads = ("anchor", "x / m", "y / m", "z / m", "± / cm", "delay / cm", "± / cm", "")
+    print_table("anchors", heads, rows, figures=True)
 
 
-def _pairs(checked: Sequence["SurveyedPair"]) -> "Table":
+def _print_pairs(checked: Sequence["SurveyedPair"]) -> None:
     """Those whose ranges differ most from the result."""
-    from rich.table import Table
-
     worst = sorted(checked, key=lambda pair: -abs(pair.residual_m or 0.0))[:_WORST]
     shown = "all pairs" if len(worst) == len(checked) else f"the {len(worst)} of {len(checked)} pairs that fit worst"
-    table = Table(title=shown)
-    for name in ("pair", "range / m", "range − result / cm", "± / cm"):
-        table.add_column(name, justify="right")
-    table.add_column("")
+    rows = []
     for pair in worst:
         figures = [number(pair.residual_m, "{:+.2f}", 100.0), number(pair.std_m, "{:.2f}", 100.0)]
-        table.add_row(f"{pair.a}–{pair.b}", number(pair.range_m), *figures, "left out" if pair.excluded else "")
-    return table
+        rows.append((f"{pair.a}–{pair.b}", number(pair.range_m), *figures, "left out" if pair.excluded else ""))
+    print_table(shown, ("pair", "range / m", "range − result / cm", "± / cm", ""), rows, figures=True)
 
 
 def _late(pair: "SurveyedPair") -> str:

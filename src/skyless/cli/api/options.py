@@ -242,18 +242,13 @@ class StudyOptions(_Studied, frozen=True, kw_only=True):
         process_noise(self.qa, self.dynamics)
         if self.scheduler is not None and self.processes is not None:
             raise SkylessError("--processes are on this machine, --scheduler is for others; give either")
-        name, given = self.name, self.given("worlds", "seconds", "noise_ps", "qa", "dynamics")
-        if name != "integrity" and (self.integrity_risk is not None or self.alert_limit_m is not None):
-            raise SkylessError("--integrity-risk and --alert-limit-m are for the study integrity")
-        if name not in OF_EPISODES and self.episodes is not None:
-            raise SkylessError(
-                f"--episodes is for the studies efficiency and integrity; {name} takes --worlds and --seconds"
-            )
-        amounts = [one for one in given if one in {"worlds", "seconds"}]
-        if name == "integrity" and amounts:
-            raise SkylessError(f"--{amounts[0]} is not for the study integrity; give --episodes")
-        if name == "efficiency" and given:
-            option = given[0].replace("_", "-")
-            raise SkylessError(
-                f"--{option} is not for the study efficiency, which has cases of its own; give --episodes"
-            )
+        if self.name != "integrity":
+            self.leave_out("integrity_risk", "alert_limit_m", why="it is for the study integrity")
+        if self.name not in OF_EPISODES:
+            why = f"it is for the studies efficiency and integrity; {self.name} takes --worlds and --seconds"
+            self.leave_out("episodes", why=why)
+        elif self.name == "integrity":
+            self.leave_out("worlds", "seconds", why="the study integrity takes --episodes")
+        else:
+            why = "the study efficiency has cases of its own, and takes --episodes"
+            self.leave_out("worlds", "seconds", "noise_ps", "qa", "dynamics", why=why)

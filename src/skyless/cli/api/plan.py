@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from skyless.cli.api.options import PlanOptions
 from skyless.cli.api.rate_plan import RatePlanResult, plan_rates
 from skyless.cli.common.output import cm
 from skyless.core.arguments import check_choice, check_whole, process_noise, python_function, wrong
-from skyless.core.arrays import Array, Matrix
+from skyless.core.arrays import Array
 from skyless.core.errors import SkylessError
 from skyless.core.geometry import Box
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS
@@ -21,12 +22,7 @@ from skyless.research.verify import random_points, verify
 from skyless.site.channel import ChannelModel
 from skyless.site.file.advice import anchors_needed
 from skyless.site.file.load import site_of
-from skyless.site.planning.floor import (
-    check_anchor_count,
-    floor_of,
-    mounts_of,
-    usual_tag_heights,
-)
+from skyless.site.planning.floor import Floor, check_anchor_count, floor_of, mounts_of, usual_tag_heights
 from skyless.site.planning.links import ANCHORS_IN_VIEW, PLAN_COLUMNS, RMSE, SIGMA, with_range
 from skyless.site.planning.maps import PlanMap, grid_of, plan_map, rows_of, summary_of
 from skyless.site.planning.optimise import OneMore, Optimised, Search
@@ -99,10 +95,8 @@ class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
         found = self.summary
         worst_at, dimensions = found["worst_at_m"], f"{found['dimensions']}-D"
         where = "" if worst_at is None else " at ({:.2f}, {:.2f}, {:.2f}) m".format(*worst_at)
-        yield (
-            "anchors",
-            f"{len(found['anchors'])}, {_master(found)}, range {found['range_m']:.0f} m in the open",
-        )
+        master = "no master" if found["master"] is None else f"master {found['master']}"
+        yield "anchors", f"{len(found['anchors'])}, {master}, range {found['range_m']:.0f} m in the open"
         yield "map", _map_line(found)
         yield (
             "covered",
@@ -126,10 +120,6 @@ class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
             yield "optimised", _against_even(found["optimised"])
         if found["verification"] is not None:
             yield "simulated", _verified(found["verification"])
-
-
-def _master(result: dict[str, Any]) -> str:
-    return "no master" if result["master"] is None else f"master {result['master']}"
 
 
 def _map_line(result: dict[str, Any]) -> str:
@@ -193,17 +183,9 @@ def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
             *("search_s", "verify_points", "verify_rounds", "seed"),
             why=f"errors are predicted for sites of at most {MAX_PREDICTED} anchors; this one has {len(site.anchors)}",
         )
-        heights_m = heights_of(asked, site)
-        rates = plan_rates(
-            site,
-            file,
-            outline_of(asked),
-            region_of(asked),
-            heights_m,
-            asked.step_m,
-            asked.range_m,
-            asked.exponent or 2.0,
-        )
+        heights_m, exponent = _heights_m(asked, site), asked.exponent or 2.0
+        floor = _floor(asked, site, file)
+        rates = plan_rates(site, file, floor, heights_m, asked.step_m, asked.range_m, exponent)
         asked.progress(1.0)
         return rates
     asked.leave_out("exponent", why=f"it is for sites of more than {MAX_PREDICTED} anchors")
@@ -215,7 +197,7 @@ def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
         check_anchor_count(site, file)
     else:
         check_whole("--optimise", asked.optimise, least=anchors_needed(site)[0], most=60)
-    floor, heights_m = floor_of(site, file, outline_of(asked), region_of(asked)), heights_of(asked, site)
+    floor, heights_m = _floor(asked, site, file), _heights_m(asked, site)
     walls_m = None if asked.mounts_m is None else np.array(asked.mounts_m)
     levels_m = None if asked.anchor_heights_m is None else tuple(asked.anchor_heights_m)
     mounts = mounts_of(site, floor, walls_m, levels_m)
@@ -239,7 +221,7 @@ def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
     return PlanResult(predictor.site, file, floor, mapped, {**found, "wall_s": time.perf_counter() - started_s})
 
 
-def heights_of(asked: PlanOptions, site: Site) -> tuple[float, ...]:
+def _heights_m(asked: PlanOptions, site: Site) -> tuple[float, ...]:
     """Heights of the tags. Raises SkylessError when they are given at a site that knows its tags' height."""
     if asked.tag_heights_m is None:
         return usual_tag_heights(site) if site.anchors else (0.0,)
@@ -248,17 +230,14 @@ def heights_of(asked: PlanOptions, site: Site) -> tuple[float, ...]:
     return tuple(asked.tag_heights_m)
 
 
-def outline_of(asked: PlanOptions) -> Matrix | None:
-    """Corners of the floor, shape (n, 2), None where they are not given."""
-    return None if asked.outline_m is None else np.array(asked.outline_m)
-
-
-def region_of(asked: PlanOptions) -> Box | None:
-    """The region of interest, None where it is not given."""
-    if asked.region_m is None:
-        return None
-    x1_m, y1_m, x2_m, y2_m = asked.region_m
-    return x1_m, y1_m, x2_m, y2_m
+def _floor(asked: PlanOptions, site: Site, file: Path) -> Floor:
+    """Outline and region of interest, as they are given. Raises ConfigurationError."""
+    outline_m = None if asked.outline_m is None else np.array(asked.outline_m)
+    region_m: Box | None = None
+    if asked.region_m is not None:
+        x1_m, y1_m, x2_m, y2_m = asked.region_m
+        region_m = x1_m, y1_m, x2_m, y2_m
+    return floor_of(site, file, outline_m, region_m)
 
 
 plan = python_function(PlanOptions, run_plan)

@@ -9,12 +9,11 @@ import numpy as np
 
 from skyless.cli.api._floor_result import FloorResult
 from skyless.cli.api._result import data_frame
-from skyless.core.arrays import Array, Matrix
+from skyless.core.arrays import Array
 from skyless.core.errors import SkylessError
-from skyless.core.geometry import Box
 from skyless.core.site import Site
 from skyless.site.channel import ChannelModel
-from skyless.site.planning.floor import floor_of
+from skyless.site.planning.floor import Floor
 from skyless.site.planning.links import with_range
 from skyless.site.planning.rates import RateMap, described_rates, rate_map, rate_report
 
@@ -39,14 +38,8 @@ class RatePlanResult(FloorResult[RateMap], frozen=True, eq=False):
         """
         z_m, y_m, x_m = np.meshgrid(self.heights_m, self.y_m, self.x_m, indexing="ij")
         within = np.isfinite(self.beacons_per_s)
-        return data_frame(
-            {
-                "x_m": x_m[within],
-                "y_m": y_m[within],
-                "z_m": z_m[within],
-                "beacons_per_s": self.beacons_per_s[within],
-            }
-        )
+        columns = {"x_m": x_m, "y_m": y_m, "z_m": z_m, "beacons_per_s": self.beacons_per_s}
+        return data_frame({name: values[within] for name, values in columns.items()})
 
     def plot(self) -> "Figure":
         """The anchors over the beacons per second."""
@@ -74,8 +67,7 @@ class RatePlanResult(FloorResult[RateMap], frozen=True, eq=False):
 def plan_rates(
     site: Site,
     file: Path,
-    outline_m: Matrix | None,
-    region_m: Box | None,
+    floor: Floor,
     heights_m: tuple[float, ...],
     step_m: float | None,
     range_m: float | None,
@@ -83,10 +75,7 @@ def plan_rates(
 ) -> RatePlanResult:
     """Plan a site of protocol 2. Raises SkylessError."""
     started_s = time.perf_counter()
-    if not site.anchors:
-        raise SkylessError("site has no anchor with a position; it should have some, to plan what reaches tags")
     channel = ChannelModel() if range_m is None else with_range(ChannelModel(), range_m, exponent)
-    floor = floor_of(site, file, outline_m, region_m)
     try:
         mapped = rate_map(site, floor, heights_m, step_m, channel, exponent)
     except ValueError as error:

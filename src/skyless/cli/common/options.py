@@ -12,6 +12,13 @@ from skyless.core.arguments import OptionError, OptionField, Options, option_fie
 from skyless.core.errors import SkylessError
 
 
+class JsonOptions(Options, frozen=True, kw_only=True):
+    """What every command has."""
+
+    json: bool = False
+    """Write one JSON object instead of text."""
+
+
 def command(run: Callable[..., int | None]) -> Callable[..., int | None]:
     """A function as cyclopts calls it: the fields of each parameter that is a struct of options are options.
 

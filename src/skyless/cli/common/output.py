@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TextIO
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 NO_FIX: Final = 1
-"""Exit code of a simulation or replay without any fix."""
+"""Exit code of a simulation, a replay or an export without any fix."""
 
 USER_ERROR: Final = 2
 """Exit code of a command that was asked for what is not possible."""
@@ -67,12 +67,32 @@ def print_facts(title: str, facts: Iterable[tuple[str, str]]) -> None:
     console().print(table)
 
 
+def print_table(title: str, heads: Iterable[str], rows: Iterable[Iterable[str]], *, figures: bool = False) -> None:
+    """Show a table. ``figures``: it is of numbers, which stand on the right; columns without a name hold words."""
+    from rich.markup import escape
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=escape(title))
+    for head in heads:
+        table.add_column(head, justify="right" if figures and head else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*map(Text, row))
+    console().print(table)
+
+
 def print_warnings(warnings: Iterable[str]) -> None:
     """Show warnings, one a line."""
     from rich.text import Text
 
     for warning in warnings:
         console().print(Text.assemble(("warning: ", "bold yellow"), warning))
+
+
+def dropped(drops: Mapping[str, int]) -> str:
+    """The most frequent reasons for which something was dropped."""
+    most = sorted(drops.items(), key=lambda item: -item[1])[:3]
+    return f"dropped: {', '.join(f'{count} × {name}' for name, count in most)}"
 
 
 def number(value: float | None, form: str = "{:.3f}", scale: float = 1.0) -> str:

@@ -2,69 +2,61 @@
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
+from typing import Any, Final
 
 _HIDDEN_S: Final = 1.5
 _REDRAW_S: Final = 0.1
-
-
-class Bar:
-    """A bar that appears on standard error when the work turns out to be long."""
-
-    def __init__(self, description: str, total: float | None) -> None:
-        self._description = description
-        self._total = total
-        self._wanted = sys.stderr is not None and sys.stderr.isatty()
-        self._next_s = time.monotonic() + _HIDDEN_S
-        self._shown: tuple[Progress, TaskID] | None = None
-
-    def reach(self, done: float) -> None:
-        """Show how much of the total is done; cheap enough to be called for every chunk of work."""
-        if not self._wanted or time.monotonic() < self._next_s:
-            return
-        self._next_s = time.monotonic() + _REDRAW_S
-        if self._shown is None:
-            self._shown = self._show()
-        progress, task = self._shown
-        progress.update(task, completed=done)
-
-    def close(self) -> None:
-        """Remove the bar."""
-        if self._shown is not None:
-            self._shown[0].stop()
-
-    def _show(self) -> "tuple[Progress, TaskID]":
-        from rich.console import Console
-        from rich.progress import Progress
-
-        progress = Progress(console=Console(stderr=True), transient=True)
-        task = progress.add_task(self._description, total=self._total)
-        progress.start()
-        return progress, task
+_STATUS_S: Final = 0.5
 
 
 @contextmanager
-def progress_bar(description: str, total: float | None) -> Iterator[Bar]:
-    """A bar for the work in the block; ``total`` is None where it is not known."""
-    bar = Bar(description, total)
-    try:
-        yield bar
-    finally:
-        bar.close()
+def progress_bar(description: str, total: float = 1.0) -> Iterator[Callable[[float], None]]:
+    """A bar on standard error, which appears when the work in the block turns out to be long.
 
-
-@contextmanager
-def status(description: str) -> Iterator[None]:
-    """A spinner for work whose length is not known, on a terminal only."""
+    What it gives says how much of the total is done; it is cheap enough to be called for every chunk of work.
+    """
     if sys.stderr is None or not sys.stderr.isatty():
-        yield
+        yield lambda _: None
         return
     from rich.console import Console
+    from rich.progress import Progress
 
-    with Console(stderr=True).status(description):
-        yield
+    progress = Progress(console=Console(stderr=True), transient=True)
+    task = progress.add_task(description, total=total)
+    next_s = time.monotonic() + _HIDDEN_S
+
+    def reach(done: float) -> None:
+        nonlocal next_s
+        if time.monotonic() >= next_s:
+            next_s = time.monotonic() + _REDRAW_S
+            progress.start()
+            progress.update(task, completed=done)
+
+    try:
+        yield reach
+    finally:
+        if progress.live.is_started:
+            progress.stop()
+
+
+@contextmanager
+def status(description: str) -> Iterator[Callable[[str], None]]:
+    """A spinner for work whose length is not known, on a terminal only. What it gives changes the description."""
+    if sys.stderr is None or not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.console import Console
+    from rich.markup import escape
+
+    with Console(stderr=True).status(description) as shown:
+        yield lambda words: shown.update(escape(words))
+
+
+async def with_status(work: Coroutine[Any, Any, None], words: Callable[[], str]) -> None:
+    """Do work; meanwhile a line on a terminal says ``words``, which are asked for twice a second."""
+    from skyless.run.process import every, outlasting
+
+    with status("") as show:
+        await outlasting(every(_STATUS_S, lambda: show(words())), work)

@@ -11,7 +11,7 @@ from skyless.cli.nodes._site_view import GONE, LINK_NAME, SiteView
 from skyless.core.geometry import RADIO_REACH_M
 from skyless.core.protocols import beacon_period_s
 from skyless.core.site import Site, site_digest
-from skyless.run.doctor.check import Check, Result, judged, residuals_check
+from skyless.run.doctor.check import Check, Result, judged, residuals_check, sentence
 from skyless.run.doctor.clocks import CounterPairs, counters_check
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import FixMessage, RequestMessage, StampsMessage
@@ -50,7 +50,7 @@ class SiteProbe:
         for reason in picture.condition.reasons:
             result: Result = "failed" if reason.level == "bad" else "warning"
             if reason.kind not in self._found or result == "failed":
-                self._found[reason.kind] = Check(f"site: {reason.kind}", result, _sentence(reason.text), reason.advice)
+                self._found[reason.kind] = Check(f"site: {reason.kind}", result, sentence(reason.text), reason.advice)
         for anchor in picture.anchors:
             if anchor.health is not None and anchor.state not in GONE:
                 self._missed.setdefault(anchor.anchor, []).append(anchor.health.missed_share)
@@ -62,7 +62,7 @@ class SiteProbe:
         """What was found; ``file_site`` is that of a site file that the running one should be."""
         trouble, message = self._picture.trouble, self.view.site
         if trouble is not None:
-            return (Check("broker", "failed", _sentence(trouble), "Start it, or give --mqtt."),)
+            return (broker_failed(trouble),)
         if message is None:
             advice = "Start the site's anchors, or give the right --site-id."
             return (Check("site", "failed", f"The broker has no site of number {self.view.number}.", advice),)
@@ -116,5 +116,7 @@ class SiteProbe:
         return judged("reception", -worst, -0.4, -0.05, finding, advice)
 
 
-def _sentence(words: str) -> str:
-    return f"{words[0].upper()}{words[1:]}."
+def broker_failed(trouble: str) -> Check:
+    """The check of a broker that cannot be used."""
+    advice = "Start it (skyless broker), or give another with --mqtt; --mqtt none checks no site."
+    return Check("broker", "failed", sentence(trouble), advice)

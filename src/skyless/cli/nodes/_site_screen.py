@@ -2,7 +2,8 @@
 
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Final, TypeVar
 
 from rich.console import Group, RenderableType
@@ -25,8 +26,13 @@ _MIN_ROWS: Final = 3
 _T = TypeVar("_T")
 
 
-def drawn(picture: Picture, height: int = sys.maxsize) -> RenderableType:
-    """The picture in ``height`` lines. What does not fit is counted in the last row of its table."""
+def drawn(
+    picture: Picture, height: int = sys.maxsize, errors_m: Mapping[str, float | None] | None = None
+) -> RenderableType:
+    """The picture in ``height`` lines. What does not fit is counted in the last row of its table.
+
+    ``errors_m`` are those of the tags' fixes, where the truth is known.
+    """
     condition, alarms, anchors = picture.condition, picture.alarms, picture.anchors
     reasons = condition.reasons
     head = [_title(picture), *(_text(one.text, _COLOURS[one.level]) for one in reasons[:_MAX_REASONS])]
@@ -41,11 +47,12 @@ def drawn(picture: Picture, height: int = sys.maxsize) -> RenderableType:
     most_alarms = min(len(alarms), max(rows // 4, rows - len(picture.tags) - len(anchors), _MIN_ROWS))
     rows -= most_alarms
     most_anchors = min(len(anchors), max(rows // 3, rows - len(picture.tags), _MIN_ROWS))
+    columns = ("x/m", "y/m", "z/m") if errors_m is None else ("x/m", "y/m", "z/m", "error/cm")
     return Group(
         *head,
         *([_table("alarms", (), alarms, most_alarms, _alarm)] if alarms else ()),
-        _table("tags", ("x/m", "y/m", "z/m", "σ/cm", "HPL/cm", "Hz", "from", "age", ""), picture.tags,
-               rows - most_anchors, _tag),
+        _table("tags", (*columns, "σ/cm", "HPL/cm", "Hz", "from", "age", ""), picture.tags, rows - most_anchors,
+               partial(_tag, errors_m=errors_m)),
         _table("anchors", ("role", "hears", "report", "missed"), anchors, most_anchors, _anchor),
         *foot,
     )  # fmt: skip
@@ -89,13 +96,14 @@ def _alarm(alarm: AlarmMessage) -> list[Text]:
     return [_text(f"{since} {alarm.severity} {alarm.sentence}{ended}{by}", "dim" if seen else "bold red")]
 
 
-def _tag(row: TagRow) -> list[Text]:
+def _tag(row: TagRow, errors_m: Mapping[str, float | None] | None) -> list[Text]:
     """The cells of a tag. What is not of now is dim, and its age is in words, in red."""
     fix, health, fresh = row.fix, row.health, row.state == "fix"
     style = "" if fresh else "dim"
-    figures = ["–"] * 7
+    errors = () if errors_m is None else (errors_m.get(row.tag),)
+    figures = ["–"] * (7 + len(errors))
     if fix is not None:
-        lengths = (number(value, "{:.1f}", 100.0) for value in (fix.std_m, fix.hpl_m))
+        lengths = (number(value, "{:.1f}", 100.0) for value in (*errors, fix.std_m, fix.hpl_m))
         rate = number(None if health is None else health.updates_per_s, "{:.0f}")
         figures = [*(f"{value:.2f}" for value in fix.position_m), *lengths, rate, str(len(fix.anchors))]
     age = _text(f"{max(row.age_s or 0.0, 0.0):.1f} s")
@@ -107,7 +115,7 @@ def _tag(row: TagRow) -> list[Text]:
     why = _text(_ALERTS.get(alert, ""), "bold red" if ALERTS.get(alert, 0) > 1 else "yellow")
     if not fresh:
         why = _text((health.reason if health is not None else None) or "", "dim")
-    return [_text(row.tag, style), *(_text(one, style) for one in figures), age, why]
+    return [_text(row.name or row.tag, style), *(_text(one, style) for one in figures), age, why]
 
 
 def _anchor(row: AnchorRow) -> list[Text]:

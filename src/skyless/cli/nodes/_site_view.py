@@ -15,8 +15,9 @@ from msgspec import Struct
 
 from skyless.cli.nodes.options import log
 from skyless.core.errors import SkylessError
-from skyless.page.condition.evidence import ALERTS, FRESH_S, Evidence, Node
+from skyless.page.condition.evidence import ALERTS, FRESH_S, Evidence, Health, Node
 from skyless.page.condition.monitor import EVALUATION_S, Condition, ConditionMonitor
+from skyless.run.assets import BadAssetsError, assets_at, read_assets
 from skyless.run.find_site import find_site
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress
@@ -25,6 +26,7 @@ from skyless.run.mqtt.messages import (
     NOT_DROPS,
     AlarmMessage,
     AnchorHealth,
+    AssetsMessage,
     EtherHealth,
     FixMessage,
     SiteMessage,
@@ -51,6 +53,8 @@ class TagRow(Struct, frozen=True):
     fix: FixMessage | None = None
     health: TagHealth | None = None
     """None where it does not report."""
+    name: str = ""
+    """What people call it, as the page shows it; empty where no asset names it."""
 
 
 class AnchorRow(Struct, frozen=True):
@@ -117,6 +121,11 @@ class SiteView:
         self._alarms: dict[str, AlarmMessage] = {}
         self._watch: tuple[WatchMessage, float] | None = None  # with the time at which it was made
         self._wrong = 0
+        self._assets = AssetsMessage(())
+        self.on_fix: list[Callable[[FixMessage], None]] = []
+        """Called with every fix."""
+        self.on_health: list[Callable[[Health], None]] = []
+        """Called with every health of a tag, an anchor or the air."""
         for topic, kind, handle in (
             (topics.site_topic(number), SiteMessage, self._on_site),
             (topics.fix_topic(number, "+"), FixMessage, self._on_fix),
@@ -127,6 +136,7 @@ class SiteView:
             (topics.watch_topic(number), WatchMessage, self._on_watch),
         ):  # fmt: skip
             link.subscribe(topic, reader(kind, handle, self._on_wrong))
+        link.subscribe(topics.assets_topic(number), self._on_assets)
         link.subscribe(topics.alarm_topic(number, "+", "+"), self._on_alarm, qos=1)
         link.on_state.append(self._on_state)
 
@@ -146,17 +156,27 @@ class SiteView:
         now_s = self._clock()
         if self.evidence.roster.admits("tag", fix.tag):
             self._fixes[fix.tag] = fix, now_s - self.evidence.add_fix(fix, now_s)
+            for listener in self.on_fix:
+                listener(fix)
 
     def _on_anchor(self, health: AnchorHealth) -> None:
         self._on_health("anchor", str(health.anchor), health)
 
-    def _on_health(self, kind: str, name: str, health: TagHealth | AnchorHealth | EtherHealth) -> None:
+    def _on_health(self, kind: str, name: str, health: Health) -> None:
         self.evidence.add_health(kind, name, health, self._clock(), self._wall_clock())
+        for listener in self.on_health:
+            listener(health)
 
     def _on_watch(self, message: WatchMessage) -> None:
         """Note when it was made: the first after a connection may be an old one that the broker kept."""
         kept_s = max(0.0, self._wall_clock() - message.unix_s) if self._watch is None else 0.0
         self._watch = message, self._clock() - kept_s
+
+    def _on_assets(self, _topic: str, payload: bytes) -> None:
+        try:
+            self._assets = read_assets(payload) if payload else AssetsMessage(())
+        except BadAssetsError:
+            self._on_wrong()
 
     def _on_alarm(self, topic: str, payload: bytes) -> None:
         if payload:
@@ -216,6 +236,7 @@ class SiteView:
 
     def _tag_rows(self, tags: list[tuple[str, Node]], now_s: float) -> tuple[TagRow, ...]:
         rows = []
+        assets = {} if self.site is None else assets_at(self._assets, self.site.site.name)
         for tag, node in tags:
             has_fix = self.evidence.connected and node.has_fix(now_s)
             fix, ended_s = self._fixes.get(tag, (None, now_s))
@@ -223,7 +244,8 @@ class SiteView:
             state: Literal["fix", "no fix", "offline"] = "fix" if has_fix else "no fix"
             state = "offline" if node.online is False else state
             age_s = None if fix is None else now_s - ended_s
-            rows.append(TagRow(tag, state, age_s, fix, health))
+            name = assets[tag].name if tag in assets else ""
+            rows.append(TagRow(tag, state, age_s, fix, health, name))
         return tuple(sorted(rows, key=_tag_rank))
 
 

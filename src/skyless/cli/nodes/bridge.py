@@ -1,21 +1,20 @@
 """``skyless bridge``: a running site's fixes for programs and devices of other kinds."""
 
-import contextlib
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
+import msgspec
 from cyclopts import App, Parameter
 
 from skyless.bridges.hub import Hub, open_hub
+from skyless.bridges.program import BridgeNode, BridgeState
 from skyless.bridges.target import BridgeContext
 from skyless.bridges.targets import TARGET_KINDS, open_route
-from skyless.cli.common.options import command
+from skyless.cli.common.options import JsonOptions, command
 from skyless.cli.common.output import print_json
-from skyless.cli.nodes.options import MqttOptions, SiteId, log
+from skyless.cli.nodes.options import SiteOptions, log, run_until_stopped
 from skyless.core.errors import SkylessError
-
-if TYPE_CHECKING:
-    from skyless.bridges.program import BridgeNode, BridgeState
-    from skyless.run.mqtt.address import MqttAddress
+from skyless.run.find_site import find_site
+from skyless.run.mqtt.address import MqttAddress
 
 _EXAMPLE = "Example: skyless bridge nmea+tcp://:10110, and then: gpsd -N -n tcp://127.0.0.1:10110"
 
@@ -32,12 +31,7 @@ app = App(name="bridge", help_epilogue=_targets())
 
 @app.default
 @command
-def bridge(
-    *targets: Annotated[str, Parameter(name="TARGETS")],
-    broker: MqttOptions,
-    site_id: SiteId | None = None,
-    json: bool = False,
-) -> int:
+def bridge(*targets: Annotated[str, Parameter(name="TARGETS")], live: SiteOptions, output: JsonOptions) -> None:
     """Give a running site's fixes to programs and devices of other kinds until Ctrl-C.
 
     A reader that is too slow misses fixes and delays nobody. Where a tag has no fix, readers get to know that, in the
@@ -47,38 +41,24 @@ def bridge(
     ----------
     targets
         Addresses of one or more targets, as listed below.
-    site_id
-        Number of the site; by default the one whose programs are online.
-    json
-        Write one JSON object at the end instead of text.
     """
-    from skyless.run.process import run
-
-    address = broker.address()
-    if address is None:
-        raise SkylessError("--mqtt is 'none'; it should be the site's broker (skyless tag --to needs none)")
-    address.tls_context()
+    address = live.required("the site's broker (skyless tag --to needs none)")
     if not targets:
         raise SkylessError("TARGETS is missing; it should be one or more, as nmea+tcp://:10110 (see --help)")
     hub = hub_of(targets, address)
     nodes: list[BridgeNode] = []
-    with contextlib.suppress(KeyboardInterrupt):
-        run(_bridge(hub, address, site_id, nodes))
+    run_until_stopped(_bridge(hub, address, live.site_id, nodes))
     if nodes:
-        _report(nodes[0].state(), json=json)
-    return 0
+        _report(nodes[0].state(), json=output.json)
 
 
-def hub_of(targets: tuple[str, ...], address: "MqttAddress | None") -> Hub:
+def hub_of(targets: tuple[str, ...], address: MqttAddress | None) -> Hub:
     """What gives fixes to targets. Raises SkylessError: one of them is not right."""
     context = BridgeContext(log, address)
     return open_hub([open_route(target, context) for target in targets], log)
 
 
-async def _bridge(hub: Hub, address: "MqttAddress", site_id: int | None, nodes: "list[BridgeNode]") -> None:
-    from skyless.bridges.program import BridgeNode
-    from skyless.run.find_site import find_site
-
+async def _bridge(hub: Hub, address: MqttAddress, site_id: int | None, nodes: list[BridgeNode]) -> None:
     site = await find_site(address) if site_id is None else site_id
     node = BridgeNode(hub, address, site, log)
     nodes.append(node)
@@ -86,9 +66,7 @@ async def _bridge(hub: Hub, address: "MqttAddress", site_id: int | None, nodes: 
     await node.run()
 
 
-def _report(state: "BridgeState", *, json: bool) -> None:
-    import msgspec
-
+def _report(state: BridgeState, *, json: bool) -> None:
     if json:
         print_json(msgspec.to_builtins(state))
         return

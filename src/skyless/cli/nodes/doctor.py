@@ -7,97 +7,91 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, get_args
+from typing import Final, get_args
 
 from cyclopts import App
 
-from skyless.cli.common.options import check_folder, command
+from skyless.cli.common.options import JsonOptions, check_folder, command
 from skyless.cli.common.output import plain, print_json, write_file
-from skyless.cli.nodes.options import MqttOptions, SiteId, log
-from skyless.core.arguments import Positive
+from skyless.cli.common.progress import progress_bar
+from skyless.cli.nodes._site_probe import SiteProbe, broker_failed
+from skyless.cli.nodes._site_view import LINK_NAME, SiteView, site_number
+from skyless.cli.nodes.options import SiteOptions, log
+from skyless.core.arguments import Options, Positive
 from skyless.core.errors import SkylessError
-
-if TYPE_CHECKING:
-    from skyless.core.site import Site
-    from skyless.radio.serial.serial_radio import SerialRadio
-    from skyless.run.doctor.check import Check
-    from skyless.run.mqtt.address import MqttAddress
+from skyless.core.site import NoiseSite, Site
+from skyless.core.version import installed_version
+from skyless.page.condition.evidence import ProcessorUse
+from skyless.radio.serial.serial_radio import SerialRadio
+from skyless.run.doctor.board import BoardProbe
+from skyless.run.doctor.check import Check, Result, sentence
+from skyless.run.doctor.host import clock_check, port_checks
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.connection import Introduction, Reactions, RefusedError, open_connection, trouble_with
+from skyless.run.mqtt.link import Link
+from skyless.run.open_radio import open_radios
+from skyless.run.process import every, run, together
+from skyless.site.file.load import load_site
 
 _FIND_S: Final = 8.0
 
 app = App(name="doctor", help_epilogue="Example: skyless doctor --radio serial:/dev/ttyACM0 --mqtt none --duration 30")
 
 
+class DoctorOptions(Options, frozen=True, kw_only=True):
+    """Options of ``skyless doctor``."""
+
+    site: Path | None = None
+    """Site file that the running site should have, and by default its number; its noise figures are those that clocks
+    are compared with."""
+    radio: str | None = None
+    """Radio of a board that no other program uses, to listen with it: serial:PATH[@BAUD], or several with commas."""
+    duration: Positive = 120.0
+    """Seconds to listen; 120 by default."""
+    report: Path | None = None
+    """File to write the report to as well, Markdown."""
+    force: bool = False
+    """Overwrite what is there, if the report exists."""
+
+
 @app.default
 @command
-def doctor(
-    *,
-    broker: MqttOptions,
-    site: Path | None = None,
-    site_id: SiteId | None = None,
-    radio: str | None = None,
-    duration: Positive = 120.0,
-    report: Path | None = None,
-    force: bool = False,
-    json: bool = False,
-) -> int:
+def doctor(*, asked: DoctorOptions, live: SiteOptions, output: JsonOptions) -> int:
     """Check this computer, its boards and a running site, and say what to do next.
 
     The exit code is 1 if anything has failed.
-
-    Parameters
-    ----------
-    site
-        Site file that the running site should have; its noise figures are those that clocks are compared with.
-    site_id
-        Number of the site; by default the site file's, or the one whose programs are online.
-    radio
-        Radio of a board that no other program uses, to listen with it: serial:PATH[@BAUD], or several with commas.
-    duration
-        Seconds to listen; 120 by default.
-    report
-        File to write the report to as well, Markdown.
-    force
-        Overwrite what is there, if the report exists.
-    json
-        Write one JSON object instead of the report.
     """
-    from skyless.cli.common.progress import progress_bar
-    from skyless.run.process import run
-    from skyless.site.file.load import load_site
-
+    report = asked.report
     if report is not None:
         check_folder("report", report)
-        if report.exists() and not force:
+        if report.exists() and not asked.force:
             raise SkylessError(f"{report} exists; --force overwrites it")
-    file_site = None if site is None else load_site(site)
-    if site_id is None and file_site is not None:
-        site_id = file_site.id
-    boards, address = _boards(radio), broker.address()
+    file_site = None if asked.site is None else load_site(asked.site)
+    site_id = file_site.id if live.site_id is None and file_site is not None else live.site_id
+    boards, address = _boards(asked.radio), live.address()
     checks: list[Check] = []
 
     async def work() -> None:
-        with progress_bar("listening", duration) as bar:
-            checks.extend(await _examine(boards, address, site_id, file_site, duration, bar.reach))
+        with progress_bar("listening", asked.duration) as reach:
+            checks.extend(await _examine(boards, address, site_id, file_site, asked.duration, reach))
 
-    log(f"checking for {duration:.0f} s")
+    log(f"checking for {asked.duration:.0f} s")
     run(work())
     if not checks:
         return 1
+    failed = sum(one.result == "failed" for one in checks)
+    text = _report(checks)
     if report is not None:
-        write_file(report, _report(checks).encode())
-    if json:
-        print_json({"checks": checks, "failed": sum(one.result == "failed" for one in checks), "report": report})
+        write_file(report, text.encode())
+    if output.json:
+        print_json({"checks": checks, "failed": failed, "report": report})
     else:
-        print(_report(checks), end="")
-    return 1 if any(one.result == "failed" for one in checks) else 0
+        print(text, end="")
+    return 1 if failed else 0
 
 
-def _boards(radio: str | None) -> "tuple[SerialRadio, ...]":
+def _boards(radio: str | None) -> tuple[SerialRadio, ...]:
     """The boards that are to listen. Raises SkylessError."""
-    from skyless.radio.serial.serial_radio import SerialRadio
-    from skyless.run.open_radio import open_radios
-
     if radio is None:
         return ()
     kind, _, ports = radio.partition(":")
@@ -108,35 +102,31 @@ def _boards(radio: str | None) -> "tuple[SerialRadio, ...]":
 
 
 async def _examine(
-    boards: "Sequence[SerialRadio]",
-    broker: "MqttAddress | None",
+    boards: Sequence[SerialRadio],
+    broker: MqttAddress | None,
     site_id: int | None,
-    file_site: "Site | None",
+    file_site: Site | None,
     seconds: float,
     progress: Callable[[float], None],
-) -> "list[Check]":
+) -> list[Check]:
     """All checks; ``progress`` is called with the seconds that have gone."""
-    from skyless.cli.nodes._site_probe import SiteProbe
-    from skyless.cli.nodes._site_view import LINK_NAME, SiteView, site_number
-    from skyless.core.site import NoiseSite
-    from skyless.page.condition.evidence import ProcessorUse
-    from skyless.run.doctor.board import BoardProbe
-    from skyless.run.doctor.check import Check
-    from skyless.run.doctor.host import clock_check, port_checks
-    from skyless.run.mqtt.link import Link
-    from skyless.run.process import every, together
-
     checks = [*port_checks(), clock_check()]
     probes = [BoardProbe(radio, site_id) for radio in boards]
     site: SiteProbe | None = None
     try:
         if broker is not None:
-            number = await site_number(broker, min(_FIND_S, seconds)) if site_id is None else site_id
-            link = Link(broker, LINK_NAME, site=number, kind="doctor")
-            site = SiteProbe(SiteView(link, number, used_share=ProcessorUse().share))
+            if site_id is None:
+                connection = await open_connection(broker, broker.tls_context(), Introduction("", 10), Reactions())
+                await connection.leave()
+                site_id = await site_number(broker, min(_FIND_S, seconds))
+            link = Link(broker, LINK_NAME, site=site_id, kind="doctor")
+            site = SiteProbe(SiteView(link, site_id, used_share=ProcessorUse().share))
+    except (OSError, RefusedError) as error:
+        assert broker is not None
+        checks.append(broker_failed(trouble_with(broker, error)))
     except SkylessError as error:
-        advice = "Start the broker and the site's programs, or give --mqtt or --mqtt none."
-        checks.append(Check("site", "failed", f"{error}.", advice))
+        advice = "Start the site's anchors and tags, or give another broker with --mqtt; --mqtt none checks no site."
+        checks.append(Check("site", "failed", sentence(str(error)), advice))
     work = [probe.run() for probe in probes] + ([] if site is None else [site.view.run(None, site.sample)])
     began_s = time.monotonic()
     with contextlib.suppress(TimeoutError):
@@ -148,11 +138,8 @@ async def _examine(
     return checks if site is None else [*checks, *site.checks(file_site)]
 
 
-def _report(checks: "Sequence[Check]") -> str:
+def _report(checks: Sequence[Check]) -> str:
     """The report as Markdown, what has failed first."""
-    from skyless.core.version import installed_version
-    from skyless.run.doctor.check import Result
-
     order = get_args(Result)
     counts = Counter(check.result for check in checks)
     lines = [

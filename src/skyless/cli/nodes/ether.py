@@ -1,19 +1,27 @@
 """``skyless ether``: the emulated air."""
 
-import contextlib
 import time
 from collections.abc import Iterable
 from errno import EADDRINUSE
 from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
+import msgspec
 from cyclopts import App
 from msgspec.structs import replace
 
-from skyless.cli.common.options import command
+from skyless.cli.common.options import JsonOptions, command
 from skyless.cli.common.output import print_json
 from skyless.cli.common.progress import status
-from skyless.cli.nodes.options import MqttOptions, WalkingSpeed, check_live, listen_address, log, site_named
+from skyless.cli.nodes.options import (
+    MqttOptions,
+    WalkingSpeed,
+    check_live,
+    listen_address,
+    log,
+    run_until_stopped,
+    site_named,
+)
 from skyless.core.arguments import Options, Picoseconds, Seed, Text, number, read_numbers, whole
 from skyless.core.errors import SkylessError
 from skyless.core.ticks import from_seconds
@@ -51,19 +59,17 @@ class EtherOptions(Options, frozen=True, kw_only=True):
     """Same seed, same crystals and noise; what processes do in real time is never the same."""
     listen: str = f"127.0.0.1:{DEFAULT_PORT}"
     """Where programs connect, HOST:PORT."""
-    json: bool = False
-    """Write one JSON object at the end: what the air has carried."""
 
 
 @app.default
 @command
-def ether(*, asked: EtherOptions, broker: MqttOptions) -> None:
+def ether(*, asked: EtherOptions, broker: MqttOptions, output: JsonOptions) -> None:
     """Emulate a site's air in real time: anchors and tags in other processes hear each other through it.
 
-    It is a simulation of radios, clocks and motion; nothing is transmitted.
+    It is a simulation of radios, clocks and motion; nothing is transmitted. With --json it writes at the end what the
+    air has carried.
     """
     from skyless.run.ether import Ether, EtherNode
-    from skyless.run.process import run
     from skyless.sim.compile_ahead import compile_kernels
     from skyless.sim.evaluation.scenarios import Request, impairments_of, patrols
 
@@ -82,8 +88,8 @@ def ether(*, asked: EtherOptions, broker: MqttOptions) -> None:
         say = partial(log, f"anchor {one.anchor} is moved by {one.x_m:g}, {one.y_m:g}, {one.z_m:g} m")
         emulated.medium.timeline.at(from_seconds(one.from_s), say)
     try:
-        with contextlib.suppress(KeyboardInterrupt):
-            run(EtherNode(emulated, host, DEFAULT_PORT if port is None else port, address, log).run(), punctual=True)
+        air = EtherNode(emulated, host, DEFAULT_PORT if port is None else port, address, log)
+        run_until_stopped(air.run(), punctual=True)
     except OSError as error:
         if error.errno == EADDRINUSE:
             raise SkylessError(
@@ -91,9 +97,7 @@ def ether(*, asked: EtherOptions, broker: MqttOptions) -> None:
                 f"another port, and the same one to anchors and tags (--radio ether:{host}:PORT)"
             ) from None
         raise SkylessError(f"--listen is {asked.listen!r}, which cannot be used: {error.strerror or error}") from None
-    if asked.json:
-        import msgspec
-
+    if output.json:
         print_json(msgspec.to_builtins(emulated.health(time.time())))
 
 

@@ -1,18 +1,19 @@
 """Options that the commands of a running site share."""
 
+import contextlib
 import sys
+from collections.abc import Coroutine
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Any, Final
 
 from cyclopts import Parameter
 
 from skyless.core.arguments import Options, number, read_numbers, whole
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import DEFAULT_METHOD
-
-if TYPE_CHECKING:
-    from skyless.core.site import Site
-    from skyless.run.mqtt.address import MqttAddress
+from skyless.core.site import AccuracySite, Site
+from skyless.run.broker import running_broker
+from skyless.run.mqtt.address import MqttAddress, mqtt_address
 
 _DEFAULT_MQTT: Final = "mqtt://127.0.0.1:1883"
 
@@ -21,8 +22,6 @@ _MAX_LIVE_HZ: Final = 4000.0
 
 MqttCa = Annotated[Path | None, Parameter(env_var="SKYLESS_MQTT_CA")]
 SiteId = Annotated[int, whole(0, 0xFFFD)]
-KeepGb = Annotated[float, number(above=0.0, most=100_000.0)]
-USUAL_KEEP_GB: Final = 8.0
 WalkingSpeed = Annotated[float, number(above=0.0, most=10.0)]
 
 
@@ -35,34 +34,49 @@ class MqttOptions(Options, frozen=True, kw_only=True):
     mqtt_ca: MqttCa = None
     """Certificates (PEM) to trust for mqtts."""
 
-    def address(self) -> "MqttAddress | None":
+    def address(self) -> MqttAddress | None:
         """The broker's address; None for ``none``. Raises SkylessError.
 
         By default the broker that runs on this machine, which is said in one line; else the usual address.
         """
-        from skyless.run.broker import running_broker
-        from skyless.run.mqtt.address import mqtt_address
-
-        if self.mqtt is None and self.mqtt_ca is None:
-            found = running_broker()
-            if found is not None:
-                log(f"broker {found}, which runs on this machine (--mqtt names another)")
-                return found
-        if self.mqtt is None:
-            return mqtt_address(_DEFAULT_MQTT, self.mqtt_ca)
+        if self.mqtt is None and self.mqtt_ca is None and (found := running_broker()) is not None:
+            log(f"broker {found}, which runs on this machine (--mqtt names another)")
+            return found
         if self.mqtt == "none":
             if self.mqtt_ca is not None:
                 raise SkylessError("--mqtt is 'none'; give a broker's address together with --mqtt-ca")
             return None
-        return mqtt_address(self.mqtt, self.mqtt_ca)
+        return mqtt_address(self.mqtt or _DEFAULT_MQTT, self.mqtt_ca)
+
+    def required(self, right: str) -> MqttAddress:
+        """The broker's address. Raises SkylessError for ``none``; ``right`` says what it should be."""
+        if (address := self.address()) is None:
+            raise SkylessError(f"--mqtt is 'none'; it should be {right}")
+        address.tls_context()
+        return address
 
 
-def site_named(site: str) -> "Site":
+class SiteOptions(MqttOptions, frozen=True, kw_only=True):
+    """A running site."""
+
+    site_id: SiteId | None = None
+    """Number of the site; by default the one whose programs are online."""
+
+
+class GatherOptions(Options, frozen=True, kw_only=True):
+    """What is gathered of a site with thousands of tags."""
+
+    site_id: SiteId | None = None
+    """Number of the site that is gathered; by default the first one of which anything is heard."""
+    keep_gb: Annotated[float, number(above=0.0, most=100_000.0)] = 8.0
+    """Gigabytes of fixes that the broker keeps for readers that come later, at most those of 24 hours."""
+
+
+def site_named(site: str) -> Site:
     """The site in a file, or a built-in one: ``lab``, or ``paper``, the same with the paper's protocol.
 
     With other noise than 100 ps as ``lab:PS``. Raises SkylessError.
     """
-    from skyless.core.site import AccuracySite
     from skyless.sim.lab import lab_site, paper_lab_site
     from skyless.site.file.load import load_site
 
@@ -92,19 +106,27 @@ def listen_address(text: str, usual_port: int) -> tuple[str, int | None]:
     return host, int(digits) if digits else None
 
 
+def run_until_stopped(program: Coroutine[Any, Any, None], *, punctual: bool = False) -> None:
+    """Run it until it ends, or Ctrl-C or a signal ends it. ``punctual`` is as for ``skyless.run.process.run``."""
+    from skyless.run.process import run
+
+    with contextlib.suppress(KeyboardInterrupt):
+        run(program, punctual=punctual)
+
+
 def log(line: str) -> None:
     """Show a line to a person, on standard error."""
     print(line, file=sys.stderr, flush=True)
 
 
-def name_unplaced(site: "Site") -> None:
+def name_unplaced(site: Site) -> None:
     """Name the anchors of a simulated site that take no part, on standard error."""
     if site.unplaced:
         names = ", ".join(str(anchor.id) for anchor in site.unplaced)
-        print(f"not simulated, as the site file has no position: anchor {names}", file=sys.stderr)
+        log(f"not simulated, as the site file has no position: anchor {names}")
 
 
-def check_live(site: "Site", method: str = DEFAULT_METHOD) -> None:
+def check_live(site: Site, method: str = DEFAULT_METHOD) -> None:
     """See that tags of an emulated site can have fixes, and warn of one that sends too much for real time.
 
     Raises SkylessError.
@@ -116,8 +138,7 @@ def check_live(site: "Site", method: str = DEFAULT_METHOD) -> None:
     name_unplaced(site)
     sent_hz = len(site.anchors) / beacon_period_s(site)
     if sent_hz > _MAX_LIVE_HZ:
-        print(
+        log(
             f"warning: {len(site.anchors)} anchors send {sent_hz:.0f} beacons/s, too many to emulate in real time: "
-            "fixes will be late or none; skyless simulate does not need real time",
-            file=sys.stderr,
+            "fixes will be late or none; skyless simulate does not need real time"
         )

@@ -1,19 +1,19 @@
 """``skyless watch``: a running site as text."""
 
-import contextlib
 import sys
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from cyclopts import App
+from rich.live import Live
 
-from skyless.cli.common.options import command
+from skyless.cli.common.options import JsonOptions, command
 from skyless.cli.common.output import console, print_json
-from skyless.cli.nodes.options import MqttOptions, SiteId
-from skyless.core.errors import SkylessError
-
-if TYPE_CHECKING:
-    from skyless.cli.nodes._site_view import Picture
-    from skyless.run.mqtt.address import MqttAddress
+from skyless.cli.nodes._site_screen import drawn
+from skyless.cli.nodes._site_view import LINK_NAME, Picture, SiteView, site_number
+from skyless.cli.nodes.options import SiteOptions, run_until_stopped
+from skyless.page.condition.evidence import ProcessorUse
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.link import Link
 
 _FIND_S: Final = 5.0
 _PICTURE_S: Final = 3.0
@@ -24,55 +24,32 @@ app = App(name="watch", help_epilogue="Example: skyless watch --mqtt mqtts://pag
 
 @app.default
 @command
-def watch(*, broker: MqttOptions, site_id: SiteId | None = None, json: bool = False) -> int:
+def watch(*, live: SiteOptions, output: JsonOptions) -> int:
     """Show a running site as text until Ctrl-C: its condition, alarms, tags, anchors and dropped frames.
 
     With --json, or where standard output is no terminal, one picture is written after some seconds. The exit code is
     then 1 for a site whose condition is bad.
-
-    Parameters
-    ----------
-    site_id
-        Number of the site; by default the one whose programs are online.
-    json
-        Write one JSON object instead of text.
     """
-    from skyless.run.process import run
-
-    address = broker.address()
-    if address is None:
-        raise SkylessError("--mqtt is 'none'; it should be the broker of the site to watch")
-    address.tls_context()
-    once = json or not sys.stdout.isatty()
+    address = live.required("the broker of the site to watch")
+    once = output.json or not sys.stdout.isatty()
     pictures: list[Picture] = []
-    with contextlib.suppress(KeyboardInterrupt):
-        run(_watch(address, site_id, pictures, once=once))
+    run_until_stopped(_watch(address, live.site_id, pictures, once=once))
     if not once:
         return 0
-    if json:
+    if output.json:
         print_json(pictures[-1] if pictures else {"site": None})
     elif pictures:
-        from skyless.cli.nodes._site_screen import drawn
-
         console().print(drawn(pictures[-1]))
     return 0 if pictures and pictures[-1].condition.level != "bad" else 1
 
 
-async def _watch(address: "MqttAddress", site_id: int | None, pictures: "list[Picture]", *, once: bool) -> None:
-    from skyless.cli.nodes._site_view import LINK_NAME, SiteView, site_number
-    from skyless.page.condition.evidence import ProcessorUse
-    from skyless.run.mqtt.link import Link
-
+async def _watch(address: MqttAddress, site_id: int | None, pictures: list[Picture], *, once: bool) -> None:
     if site_id is None:
         site_id = await site_number(address, _FIND_S if once else None)
     view = SiteView(Link(address, LINK_NAME, site=site_id, kind="watch"), site_id, used_share=ProcessorUse().share)
     if once:
         await view.run(_PICTURE_S, lambda: pictures.append(view.picture()))
         return
-    from rich.live import Live
-
-    from skyless.cli.nodes._site_screen import drawn
-
     out = console()
     with Live(console=out, screen=True, auto_refresh=False) as live:
         await view.run(None, lambda: live.update(drawn(view.picture(), out.height), refresh=True))

@@ -2,29 +2,30 @@
 
 import asyncio
 import contextlib
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skyless.cli.nodes.options import MqttCa, SiteId, log
+from skyless.cli.common.progress import with_status
+from skyless.cli.nodes.options import MqttCa, SiteId, log, run_until_stopped
 from skyless.core.arguments import Options, Positive
 from skyless.core.errors import SkylessError
+from skyless.core.site import Site
 from skyless.research.calibration.options import SurveyOptions
+from skyless.run.find_site import find_site
+from skyless.run.mqtt.address import mqtt_address
+from skyless.run.open_radio import open_radios
+from skyless.run.process import run
+from skyless.site.file.load import load_site
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from skyless.core.site import Site
-    from skyless.radio.interface import Radio
     from skyless.run.survey.program import SurveyNode
     from skyless.site.survey.facts import Facts, PairRanges
     from skyless.site.survey.stamps.pair_ranger import PairRanger
 
 _USUAL_S = 30.0
-_STATUS_S = 0.5
-_ERASED = "\r\x1b[2K"
-"""Erases a terminal's line."""
 
 
 class LiveOptions(Options, frozen=True, kw_only=True):
@@ -65,8 +66,6 @@ class LiveOptions(Options, frozen=True, kw_only=True):
 
 def gather_live(asked: LiveOptions, known: SurveyOptions) -> "tuple[Site, Callable[[], PairRanges], PairRanger]":
     """The site, the ranges between its anchors after some seconds, and what makes them. Raises SkylessError."""
-    from skyless.run.process import run
-
     found: list[SurveyNode] = []
     run(_gather(asked, known, found))
     live = found[0].live if found else None
@@ -82,14 +81,12 @@ def gather_live(asked: LiveOptions, known: SurveyOptions) -> "tuple[Site, Callab
 
 def serve_live(asked: LiveOptions, known: SurveyOptions) -> None:
     """Be the survey program of a site until Ctrl-C. Raises SkylessError."""
-    from skyless.run.process import run
 
-    with contextlib.suppress(KeyboardInterrupt):
-        run(_serve(asked, known))
+    async def serve() -> None:
+        node = await _node(asked, known, serves=True)
+        await with_status(node.run(), lambda: _line(node, None))
 
-
-async def _serve(asked: LiveOptions, known: SurveyOptions) -> None:
-    await _run(await _node(asked, known, serves=True), None)
+    run_until_stopped(serve())
 
 
 async def _gather(asked: LiveOptions, known: SurveyOptions, found: "list[SurveyNode]") -> None:
@@ -98,27 +95,12 @@ async def _gather(asked: LiveOptions, known: SurveyOptions, found: "list[SurveyN
         async with asyncio.timeout(seconds + 1.0):  # a moment for the broker and the anchors to answer
             node = await _node(asked, known, serves=False)
             found.append(node)
-            await _run(node, seconds)
-
-
-async def _run(node: "SurveyNode", seconds: float | None) -> None:
-    """Run it, on a terminal with a status line."""
-    screen = asyncio.ensure_future(_status(node, seconds)) if sys.stderr.isatty() else None
-    try:
-        await node.run()
-    finally:
-        if screen is not None:
-            screen.cancel()
-            print(file=sys.stderr)
+            await with_status(node.run(), lambda: _line(node, seconds))
 
 
 async def _node(asked: LiveOptions, known: SurveyOptions, *, serves: bool) -> "SurveyNode":
     """Raises SkylessError."""
-    from skyless.run.find_site import find_site
-    from skyless.run.mqtt.address import mqtt_address
-    from skyless.run.open_radio import open_radios
     from skyless.run.survey.program import SurveyNode, SurveySettings
-    from skyless.site.file.load import load_site
     from skyless.site.survey.solve import run_survey
 
     address = None if asked.mqtt is None else mqtt_address(asked.mqtt, asked.mqtt_ca)
@@ -127,34 +109,20 @@ async def _node(asked: LiveOptions, known: SurveyOptions, *, serves: bool) -> "S
     site_id = site.id if asked.site_id is None and site is not None else asked.site_id
     if site is not None:
         _facts(known, site)  # options that do not fit it are refused before the program serves
-    if site is not None and site_id != site.id:
-        raise SkylessError(f"--site-id is {site_id}; the site of {known.site} is number {site.id}")
+        if site_id != site.id:
+            raise SkylessError(f"--site-id is {site_id}; the site of {known.site} is number {site.id}")
     if site_id is None:
         assert address is not None  # a radio needs a site file
         site_id = await find_site(address)
-    radio: Radio | None = None if asked.radio is None else open_radios(asked.radio, "tag", (asked.radio_name,))[0]
+    radio = None if asked.radio is None else open_radios(asked.radio, "tag", (asked.radio_name,))[0]
     settings = SurveySettings(site_id, site, file, not asked.no_watch, serves)
-    return SurveyNode(settings, lambda one: _facts(known, one), run_survey, address, _log, radio)
+    return SurveyNode(settings, lambda one: _facts(known, one), run_survey, address, log, radio)
 
 
-def _facts(known: SurveyOptions, site: "Site") -> "Facts":
+def _facts(known: SurveyOptions, site: Site) -> "Facts":
     from skyless.research.calibration.facts import facts_of
 
     return facts_of(known, (anchor.id for anchor in site.all_anchors), site)
-
-
-def _log(line: str) -> None:
-    """Show a line in place of the status line, which follows again below it."""
-    if sys.stderr.isatty():
-        print(_ERASED, end="", file=sys.stderr)
-    log(line)
-
-
-async def _status(node: "SurveyNode", seconds: float | None) -> None:
-    """One line on a terminal, kept up to date."""
-    while True:
-        await asyncio.sleep(_STATUS_S)
-        print(f"{_ERASED}{_line(node, seconds)}", end="", file=sys.stderr, flush=True)
 
 
 def _line(node: "SurveyNode", seconds: float | None) -> str:

@@ -1,19 +1,27 @@
 """``skyless tag``: tags as a program."""
 
-import contextlib
 import re
 from collections.abc import Coroutine, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from cyclopts import App, Parameter
+from msgspec.structs import replace
 
+from skyless.bridges.program import TagBridge, heard_site
 from skyless.cli.common.options import command
 from skyless.cli.nodes._fix_lines import FixLines, LineOptions
-from skyless.cli.nodes.options import MqttOptions, SiteId, log
+from skyless.cli.nodes.bridge import hub_of
+from skyless.cli.nodes.options import MqttOptions, SiteId, log, run_until_stopped
 from skyless.core.arguments import Method, NotNegative, Positive, Text, number, process_noise, read_height
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import DEFAULT_METHOD, Dynamics
+from skyless.core.site import GeoreferenceSite
+from skyless.core.trusted_receiver import SiteTrust, Trust
+from skyless.run.fix_log import FixListener
+from skyless.run.keys.key_files import read_site_public
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.messages import FixMessage
 from skyless.run.open_radio import (
     DEFAULT_RADIO,
     hears_positions,
@@ -22,17 +30,13 @@ from skyless.run.open_radio import (
     open_sniffers,
     receives_packets,
 )
+from skyless.run.process import together
+from skyless.run.tag import Tags, TagSettings
 from skyless.sim.evaluation.request import ProtectionOptions
 
 if TYPE_CHECKING:
-    from skyless.bridges.program import TagBridge
     from skyless.core.air.masterless_packets import Point
-    from skyless.core.site import GeoreferenceSite
-    from skyless.core.trusted_receiver import SiteTrust
     from skyless.research.live.packet_tags import PacketTagSettings
-    from skyless.run.fix_log import FixListener
-    from skyless.run.mqtt.address import MqttAddress
-    from skyless.run.mqtt.messages import FixMessage
 
 _TAG_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
@@ -100,8 +104,6 @@ def tag(
     names
         Names of one or more tags: letters, digits, - and _.
     """
-    from skyless.run.process import run, together
-
     address, lines = broker.address(), shown.lines(log)
     if not names or len(set(names)) < len(names) or not all(map(_TAG_NAME.fullmatch, names)):
         given = repr(" ".join(names)) if names else "missing"
@@ -109,60 +111,40 @@ def tag(
             f"NAMES is {given}; it should be one or more names, each once, of 1 to 32 letters, digits, - or _"
         )
     if receives_packets(asked.radio):
-        if (asked.site_key, asked.trust, asked.clock_bound_ms) != (None,) * 3:
-            raise SkylessError("--site-key, --trust and --clock-bound-ms are not for sniffers and FiRa boards")
-        if asked.protection_given:
-            raise SkylessError(
-                "--integrity-risk, --alert-limit-m and --max-acceleration are not for sniffers and FiRa boards"
-            )
-        tags = _on_sniffers
-    elif asked.anchors is not None or asked.tag_height is not None:
-        raise SkylessError(
-            "--anchors and --tag-height are for sniffers and FiRa boards; other tags hear from the air where anchors "
-            "stand"
+        asked.leave_out(
+            *("site_key", "trust", "clock_bound_ms", "integrity_risk", "alert_limit_m", "max_acceleration_mps2"),
+            why="it is not for sniffers and FiRa boards",
         )
+        tags = _on_sniffers
     else:
+        why = "it is for sniffers and FiRa boards; other tags hear from the air where anchors stand"
+        asked.leave_out("anchors", "tag_height", why=why)
         tags = _on_radios
-    bridge = _bridge(asked, address)
+    bridge = TagBridge(hub_of(asked.to, address), lambda: is_simulated(asked.radio), log) if asked.to else None
     serve = tags(names, asked, address, _listener(lines, bridge), bridge)
     others = [part.run() for part in (lines, bridge) if part is not None]
-    with contextlib.suppress(KeyboardInterrupt):
-        run(together(serve, *others), punctual=True)
+    run_until_stopped(together(serve, *others), punctual=True)
 
 
-def _bridge(asked: TagOptions, address: "MqttAddress | None") -> "TagBridge | None":
-    """What gives fixes to --to; None where nobody gets them. Raises SkylessError."""
-    if not asked.to:
-        return None
-    from skyless.bridges.program import TagBridge
-    from skyless.cli.nodes.bridge import hub_of
-
-    return TagBridge(hub_of(asked.to, address), lambda: is_simulated(asked.radio), log)
-
-
-def _listener(lines: "FixLines | None", bridge: "TagBridge | None") -> "FixListener | None":
+def _listener(lines: FixLines | None, bridge: TagBridge | None) -> FixListener | None:
     """Calls all that want fixes; None where nobody does."""
     listeners = [part.on_fix for part in (lines, bridge) if part is not None]
-    if len(listeners) < 2:
-        return listeners[0] if listeners else None
 
-    def on_fix(fix: "FixMessage") -> None:
+    def on_fix(fix: FixMessage) -> None:
         for listener in listeners:
             listener(fix)
 
-    return on_fix
+    return on_fix if listeners else None
 
 
 def _on_radios(
     names: tuple[str, ...],
     asked: TagOptions,
-    address: "MqttAddress | None",
-    on_fix: "FixListener | None",
-    bridge: "TagBridge | None",
-) -> "Coroutine[Any, Any, None]":
+    address: MqttAddress | None,
+    on_fix: FixListener | None,
+    bridge: TagBridge | None,
+) -> Coroutine[Any, Any, None]:
     """Tags that hear beacons."""
-    from skyless.run.tag import Tags, TagSettings
-
     required = asked.requirement(asked.method, asked.tag_height_std)
     trust = _site_trust(asked)
     settings = TagSettings(
@@ -177,11 +159,8 @@ def _on_radios(
     return Tags(settings, radios, address, log, on_fix, None if bridge is None else bridge.on_health).run()
 
 
-def _site_trust(asked: TagOptions) -> "SiteTrust | None":
+def _site_trust(asked: TagOptions) -> SiteTrust | None:
     """Which beacons and fixes are accepted; None without a public key. Raises SkylessError."""
-    from skyless.core.trusted_receiver import SiteTrust, Trust
-    from skyless.run.keys.key_files import read_site_public
-
     if asked.site_key is None:
         option = "--clock-bound-ms" if asked.trust is None else f"--trust {asked.trust}"
         if (asked.trust, asked.clock_bound_ms) != (None, None):
@@ -197,26 +176,23 @@ def _site_trust(asked: TagOptions) -> "SiteTrust | None":
 def _on_sniffers(
     names: tuple[str, ...],
     asked: TagOptions,
-    address: "MqttAddress | None",
-    on_fix: "FixListener | None",
-    bridge: "TagBridge | None",
-) -> "Coroutine[Any, Any, None]":
+    address: MqttAddress | None,
+    on_fix: FixListener | None,
+    bridge: TagBridge | None,
+) -> Coroutine[Any, Any, None]:
     """Tags that hear the packets of another system."""
-    from msgspec import structs
-
-    from skyless.bridges.program import heard_site
     from skyless.research.live.packet_tags import PacketTags
 
     settings = _system(asked)
     radios = open_sniffers(asked.radio, names, settings.anchors_m)
-    if bridge is not None and settings.anchors_m:
-        bridge.on_site(heard_site(settings.site, settings.anchors_m, simulated=is_simulated(asked.radio)))
 
-    def on_anchors(anchors_m: Mapping[int, "Point"], origin: "GeoreferenceSite | None") -> None:
+    def on_anchors(anchors_m: Mapping[int, "Point"], origin: GeoreferenceSite | None) -> None:
         if bridge is not None:
             site = heard_site(settings.site, anchors_m, simulated=is_simulated(asked.radio))
-            bridge.on_site(structs.replace(site, georeference=origin))
+            bridge.on_site(replace(site, georeference=origin))
 
+    if settings.anchors_m:
+        on_anchors(settings.anchors_m, None)
     tags = PacketTags(
         settings,
         radios,

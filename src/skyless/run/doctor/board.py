@@ -11,7 +11,7 @@ from skyless.core.tag.beacon_receiver import TagReceiver
 from skyless.radio.interface import Gone, Hint, RadioEvent
 from skyless.radio.serial.link import Hello
 from skyless.radio.serial.serial_radio import SerialRadio
-from skyless.run.doctor.check import Check, residuals_check
+from skyless.run.doctor.check import Check, residuals_check, sentence
 from skyless.run.doctor.clocks import CounterPairs, counters_check
 from skyless.run.mqtt.messages import FixMessage
 from skyless.run.tag import TagNode, TagSettings
@@ -50,8 +50,10 @@ class BoardProbe:
         """What was found."""
         name, hello, troubles = f"board {self.radio.name}", self._hello, "; ".join(self._troubles)
         if hello is None:
-            why = troubles or "the port could not be opened yet"
-            return (Check(name, "failed", f"{why[0].upper()}{why[1:]}."),)
+            advice = (
+                "See its cable, the path of its port, its baud rate (serial:PATH@BAUD), and whether it has firmware."
+            )
+            return (Check(name, "failed", sentence(troubles or "the port could not be opened yet"), advice),)
         version = ".".join(map(str, hello.firmware))
         abilities = "can send" if hello.can_transmit else "only listens"
         finding = f"Firmware {version}, version {hello.major}.{hello.minor} of the serial link; it {abilities}."

@@ -21,6 +21,11 @@ class Check(Struct, frozen=True):
     """What to do next; empty where nothing is to be done."""
 
 
+def sentence(words: str) -> str:
+    """Words that begin with a capital letter and end with a full stop."""
+    return f"{words[0].upper()}{words[1:]}."
+
+
 def judged(name: str, value: float, warn: float, fail: float, finding: str, advice: str) -> Check:
     """A check of a value that is better the smaller it is."""
     result: Result = "failed" if value > fail else "warning" if value > warn else "ok"

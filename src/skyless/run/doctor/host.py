@@ -21,7 +21,8 @@ def port_checks(devices: Path = Path("/dev")) -> tuple[Check, ...]:
     """Which serial ports there are, and whether this user may open them."""
     ports = [port for pattern in _PORTS for port in sorted(devices.glob(pattern))]
     if not ports:
-        return (Check("serial ports", "not checked", "There is no serial port (ttyACM*, ttyUSB*) on this computer."),)
+        finding = "There is no serial port (ttyACM*, ttyUSB*) on this computer."
+        return (Check("serial ports", "not checked", finding, "Plug a board in, if this computer should have one."),)
     return tuple(_port(port) for port in ports)
 
 

@@ -43,11 +43,12 @@ class Mount(Struct, frozen=True):
 def mounts(site: Site, cables_from: Point | None = None) -> tuple[Mount, ...]:
     """The rows of all placed anchors, by floor and identifier."""
     ordered = sorted(site.anchors, key=lambda one: (one.floor, one.id))
-    if cables_from is None:
-        return tuple(Mount(anchor, None) for anchor in ordered)
-    x_m, y_m, z_m = cables_from
-    steps_m = [(abs(one.x_m - x_m), abs(one.y_m - y_m), abs(one.z_m - z_m)) for one in ordered]
-    return tuple(Mount(one, (math.hypot(*step_m), sum(step_m))) for one, step_m in zip(ordered, steps_m, strict=True))
+    return tuple(Mount(one, None if cables_from is None else _cable_m(one, cables_from)) for one in ordered)
+
+
+def _cable_m(anchor: AnchorSite, start: Point) -> tuple[float, float]:
+    steps_m = [abs(to - of) for to, of in zip((anchor.x_m, anchor.y_m, anchor.z_m), start, strict=True)]
+    return math.hypot(*steps_m), sum(steps_m)
 
 
 def sheet(

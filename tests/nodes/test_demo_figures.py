@@ -1,12 +1,14 @@
-"""Watches a site: fixes beside the truth, rates, latencies, and messages that make no sense."""
+"""Figures of a demo: fixes beside the truth, rates, latencies, what was too old, and alerts."""
 
 import time
 
+import msgspec
 import pytest
 from node_stage import FakeLink
 
-from skyless.cli.watch import Watch
-from skyless.run.mqtt.messages import Counters, EtherHealth, FixMessage, TagHealth, TrueMotion, TruthMessage
+from skyless.cli.nodes._demo_figures import DemoFigures, sentence
+from skyless.cli.nodes._site_view import SiteView
+from skyless.run.mqtt.messages import Counters, FixMessage, TagHealth, TrueMotion, TruthMessage
 
 NOW_S = time.time()
 UNIT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
@@ -31,8 +33,9 @@ def health(unix_s, fixes, tag="t1"):
 
 @pytest.fixture
 def site():
-    link = FakeLink()
-    return link, Watch(link, 7, planar=True)
+    link, figures = FakeLink(), DemoFigures(planar=True)
+    figures.follow(SiteView(link, 7))
+    return link, figures
 
 
 def test_a_fix_is_judged_beside_the_truth_at_its_own_time(site):
@@ -104,12 +107,20 @@ def test_latencies_are_those_of_the_tag_and_those_to_here(site):
     assert 0.5 <= median_s < 5.0
 
 
-@pytest.mark.parametrize("wrong", [b"{}", b"[1]", b"\xff\xfe", b'{"tag": 5}', b"9" * 5000])
-def test_what_makes_no_sense_is_counted_and_nothing_else(site, wrong):
+def test_alerts_are_counted_and_words_that_are_none_are_not(site):
     link, watch = site
-    for end in ("/fix", "truth", "tag/+/health", "anchor/+/health", "ether/+/health"):
-        link.receive(end, wrong)
-    assert watch.wrong == 5
-    assert (watch.tags, watch.anchors, watch.ether) == ({}, {}, None)
-    link.receive("ether/+/health", EtherHealth(NOW_S, 1.0, 5, 0, {}, {}, 0, 0))
-    assert watch.ether.transmissions == 5
+    assert watch.summary()["alerts"] == {}
+    for alert in (None, "none", "detected-excluded", "none", "\x1b[2Jboo"):
+        link.receive("/fix", msgspec.structs.replace(fix(), alert=alert))
+    assert watch.summary()["alerts"] == {"detected-excluded": 1, "none": 2}
+
+
+def test_what_was_too_old_is_named_where_there_was_any(site):
+    link, watch = site
+    link.receive("/fix", fix())
+    for counters, late in (({"malformed": 4}, (0, 0)), ({"late-reception": 250, "late-fix": 3}, (250, 3))):
+        link.receive("tag/+/health", msgspec.structs.replace(health(NOW_S, 9), counters=counters))
+        found = watch.summary()
+        assert (found["late_receptions"], found["late_fixes"]) == late
+        words = "this computer is too slow: 250 receptions dropped and 3 fixes withheld as too old"
+        assert (words in sentence(found)) == (late != (0, 0))

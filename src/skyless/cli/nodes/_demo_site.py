@@ -1,0 +1,254 @@
+"""The site of ``skyless demo``: broker, ether, anchors, tags, page, survey and recorder as processes."""
+
+import asyncio
+import contextlib
+from pathlib import Path
+from typing import Annotated, Final
+
+from cyclopts import Parameter
+from msgspec.structs import replace
+
+from skyless.cli.nodes._demo_figures import DemoFigures
+from skyless.cli.nodes._site_view import SiteView
+from skyless.cli.nodes.options import MqttCa, WalkingSpeed, check_live, site_named
+from skyless.core.arguments import Method, Picoseconds, Positive, Seed, whole
+from skyless.core.errors import SkylessError
+from skyless.core.extras import extra_module
+from skyless.core.method_names import DEFAULT_METHOD
+from skyless.page.condition.evidence import ProcessorUse
+from skyless.run.broker import Broker, BrokerSettings, start_broker
+from skyless.run.children import Child, Program
+from skyless.run.mqtt.address import MqttAddress, mqtt_address
+from skyless.run.mqtt.connection import Introduction, Reactions, RefusedError, open_connection, trouble_with
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.messages import StatusMessage, WrongMessageError, read_message
+from skyless.run.mqtt.topics import site_topic, status_topic, survey_topic, watch_topic
+from skyless.run.process import (
+    Log,
+    hold_any,
+    new_recording,
+    outlasting,
+    recordings_folder,
+    reserve_next,
+    together,
+)
+from skyless.sim.evaluation.request import ProtectionOptions
+
+_HOST: Final = "127.0.0.1"
+_PAGE_PORT: Final = 8080
+_TAGS_PER_PROCESS: Final = 25
+_BROKER_RESTART_S: Final = 0.2
+_KEEPALIVE_S: Final = 10
+_RECORDING_LIMIT_MB: Final = "1000"
+_CLEAR_S: Final = 0.5  # retained messages have come by then
+
+_SURVEY_DELAY_S: Final = 4.0
+"""Nothing else waits for the survey. Started with the others it would delay the first fix by a second on two cores."""
+
+
+class DemoOptions(ProtectionOptions, frozen=True, kw_only=True):
+    """Options of ``skyless demo``."""
+
+    duration: Positive | None = None
+    """Seconds to run, from when all tags have a fix; by default until Ctrl-C."""
+    tags: Annotated[int, whole(1, 200)] = 3
+    """How many tags walk."""
+    speed: WalkingSpeed = 1.0
+    """How fast they walk in m/s."""
+    noise_ps: Picoseconds = 100.0
+    """Noise of every TX and RX stamp in picoseconds."""
+    seed: Seed = 1
+    """Same seed, same crystals and noise; what processes do in real time is never the same."""
+    carrier: bool = False
+    """Let radios measure the phase of the carrier, as a DW1000 can."""
+    site: Path | None = None
+    """Site file; by default the lab, six anchors on the walls of 6 m × 8 m."""
+    paper: bool = False
+    """Use the paper's protocol for the lab: one anchor is the master, and another takes over when it fails."""
+    method: Method = DEFAULT_METHOD
+    """How positions are computed."""
+    apart: bool = False
+    """Run every anchor and every tag as a process of its own, to kill and to freeze."""
+    mqtt: Annotated[str | None, Parameter(env_var="SKYLESS_MQTT")] = None
+    """Broker to use instead of the embedded one."""
+    mqtt_ca: MqttCa = None
+    """Certificates (PEM) to trust for mqtts."""
+    record: str | None = None
+    """File for the recording, .mcap, or none; by default one in the folder that the page shows."""
+    history: Path | None = None
+    """Folder of the history to keep, which the page then asks; by default none."""
+
+
+class WholeSite:
+    """Starts everything and keeps it alive."""
+
+    def __init__(self, asked: DemoOptions, log: Log) -> None:
+        """Raises SkylessError."""
+        if asked.mqtt == "none":
+            raise SkylessError("--mqtt is 'none'; the demo needs a broker, and brings one where --mqtt is not given")
+        if asked.mqtt is None and asked.mqtt_ca is not None:
+            raise SkylessError("--mqtt-ca is for another broker; give it together with --mqtt")
+        if asked.paper and asked.site is not None:
+            raise SkylessError(
+                "--paper is for the demo's own site; the mode of a site file stands in it (schedule.mode)"
+            )
+        lab = f"{'paper' if asked.paper else 'lab'}:{asked.noise_ps:g}"
+        self._asked, self._log = asked, log
+        self._site_name = lab if asked.site is None else str(asked.site.absolute())
+        self.site = site_named(self._site_name)
+        self._number = "--site-id", str(self.site.id)
+        check_live(self.site, asked.method)
+        asked.requirement(asked.method)
+        if asked.history is not None:
+            extra_module("pyarrow", "--history")
+            try:
+                asked.history.mkdir(parents=True, exist_ok=True)  # the page asks it before the history's first file
+            except OSError as error:
+                why = f"which is no folder: {error.strerror}"
+                raise SkylessError(f"--history is {str(asked.history)!r}, {why}") from None
+        self.address = None if asked.mqtt is None else mqtt_address(asked.mqtt, asked.mqtt_ca)
+        self._recordings = recordings_folder()
+        self.recording = _recording(asked.record, self._recordings)
+        self.ether_port, self._ether_held = hold_any(_HOST)
+        self.page_port, self._page_held = reserve_next(_HOST, _PAGE_PORT)
+        self.figures = DemoFigures(planar=self.site.tags.height_m is not None)
+        self.view: SiteView | None = None
+        self.children: list[Child] = []
+        self.ready = asyncio.Event()  # the broker is there and the page is starting
+
+    @property
+    def page(self) -> str:
+        """Address of the page."""
+        return f"http://{_HOST}:{self.page_port}"
+
+    async def run(self) -> None:
+        """Keep everything alive until cancelled.
+
+        Raises:
+            SkylessError: the embedded broker cannot be started.
+        """
+        with self._ether_held, self._page_held:
+            if self.address is not None:
+                whole = self._run_with(self.address, None)
+                await outlasting(_cleared_at_the_end(self.address, self.site.id, self._log), whole)
+            else:
+                broker = await start_broker(BrokerSettings(temporary=True))
+                await self._run_with(broker.address, broker)
+
+    async def _run_with(self, address: MqttAddress, broker: Broker | None) -> None:
+        self.address = address
+        link = Link(address, "demo", site=self.site.id, kind="watch")
+        self.view = SiteView(link, self.site.id, used_share=ProcessorUse().share)
+        self.figures.follow(self.view)
+        self.children = [Child(program, self._log) for program in self._programs(address)]
+        self.ready.set()
+        nodes = outlasting(link.run(), together(*(child.run() for child in self.children)))  # its end is published
+        await (nodes if broker is None else outlasting(self._keep(broker), nodes))  # they publish their end to it
+
+    async def _keep(self, broker: Broker) -> None:
+        """Start the embedded broker again, on the same port and with the same store, whenever it ends."""
+        settings = BrokerSettings(port=broker.address.port, data=broker.data)
+        try:
+            while True:
+                code = await broker.wait()
+                self._log(f"broker ended (exit code {code}); started again")
+                await broker.stop(to_restart=True)
+                await asyncio.sleep(_BROKER_RESTART_S)
+                broker = await start_broker(settings)
+        finally:
+            await asyncio.shield(broker.stop())
+
+    def _programs(self, address: MqttAddress) -> list[Program]:
+        asked, mqtt = self._asked, _mqtt(address)
+        radio, site = ("--radio", f"ether:{_HOST}:{self.ether_port}"), ("--site", self._site_name)
+        walks = _options(tags=asked.tags, speed=asked.speed, noise_ps=asked.noise_ps, seed=asked.seed)
+        ether = ("ether", *site, *mqtt, "--listen", f"{_HOST}:{self.ether_port}", *walks)
+        computing = _options(
+            method=asked.method,
+            integrity_risk=asked.integrity_risk,
+            alert_limit_m=asked.alert_limit_m,
+            max_acceleration=asked.max_acceleration_mps2,
+        )
+        anchors = [str(anchor.id) for anchor in self.site.anchors]
+        tags = [f"tag{number}" for number in range(1, asked.tags + 1)]
+        programs = [
+            Program("ether", (*ether, "--carrier") if asked.carrier else ether),
+            *(
+                Program(_named("anchor", some), ("anchor", *some, *site, *radio, *mqtt))
+                for some in _groups(anchors, 1 if asked.apart else len(anchors))
+            ),
+            *(
+                Program(_named("tag", some), ("tag", *some, *radio, *mqtt, *computing))
+                for some in _groups(tags, 1 if asked.apart else _TAGS_PER_PROCESS)
+            ),
+            Program("survey", ("survey", "--serve", *mqtt, *self._number), start_after_s=_SURVEY_DELAY_S),
+        ]
+        if self.recording is not None:
+            limit = ("--limit-mb", _RECORDING_LIMIT_MB)
+            programs.append(Program("recorder", ("record", str(self.recording), *mqtt, *limit, *self._number), 1))
+        if asked.history is not None:
+            history = ("history", "run", "--to", str(asked.history), *self._number, *mqtt)
+            programs.append(Program("history", history, start_after_s=_SURVEY_DELAY_S))
+        shown = _options(recordings=self._recordings, history=asked.history)
+        page = ("dashboard", *mqtt, "--listen", f"{_HOST}:{self.page_port}", *shown, *self._number)
+        return [*programs, Program("page", page)]
+
+
+def _recording(asked: str | None, folder: Path) -> Path | None:
+    """Where to record; None: nowhere. Raises SkylessError."""
+    if asked == "none":
+        return None
+    file = new_recording(folder, "demo") if asked is None else Path(asked)
+    if file.exists() or not file.parent.is_dir():
+        raise SkylessError(f"--record is {asked!r}; it should be a new file in a folder that exists, or none")
+    return file
+
+
+async def _cleared_at_the_end(address: MqttAddress, site: int, log: Log) -> None:
+    """Wait until cancelled. Then clear what the site's programs, which have ended, have left retained at the broker."""
+    try:
+        await asyncio.Event().wait()
+    finally:
+        try:
+            await asyncio.shield(_clear_retained(address, site))
+        except (OSError, RefusedError) as error:
+            log(f"{trouble_with(address, error)}: the demo's site stays there")
+
+
+async def _clear_retained(address: MqttAddress, site: int) -> None:
+    left: set[str] = set()
+
+    def note(topic: str, payload: bytes) -> None:
+        with contextlib.suppress(WrongMessageError):  # of another program than the demo's
+            if payload and not (topic.endswith("/status") and read_message(payload, StatusMessage).online):
+                left.add(topic)
+
+    who = Introduction("", _KEEPALIVE_S)
+    connection = await open_connection(address, address.tls_context(), who, Reactions(message=note))
+    own = (site_topic(site), survey_topic(site), watch_topic(site), status_topic(site, "+", "+"))
+    connection.subscribe(dict.fromkeys(own, 1))
+    await asyncio.sleep(_CLEAR_S)
+    for topic in left:
+        connection.publish(topic, b"", 1, retain=True)
+    await connection.leave()
+
+
+def _mqtt(address: MqttAddress) -> tuple[str, ...]:
+    """The options that name the broker. A password is in the programs' environment."""
+    option = ("--mqtt", str(replace(address, password=None)))
+    return option if address.ca is None else (*option, "--mqtt-ca", str(address.ca))
+
+
+def _options(**values: float | str | Path | None) -> list[str]:
+    """Options of a program, without those that are None."""
+    given = ((f"--{name.replace('_', '-')}", str(value)) for name, value in values.items() if value is not None)
+    return [word for option in given for word in option]
+
+
+def _groups(names: list[str], size: int) -> list[list[str]]:
+    return [names[first : first + size] for first in range(0, len(names), size)]
+
+
+def _named(kind: str, names: list[str]) -> str:
+    """The name of a process in messages."""
+    return f"{kind} {names[0]}" if len(names) == 1 else f"{kind}s {names[0]} to {names[-1]}"
