@@ -17,7 +17,7 @@ from skyless.cli.nodes.options import log
 from skyless.core.errors import SkylessError
 from skyless.page.condition.evidence import ALERTS, FRESH_S, Evidence, Health, Node
 from skyless.page.condition.monitor import EVALUATION_S, Condition, ConditionMonitor
-from skyless.run.assets import BadAssetsError, assets_at, read_assets
+from skyless.run.assets import assets_at, read_assets
 from skyless.run.find_site import find_site
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress
@@ -33,6 +33,7 @@ from skyless.run.mqtt.messages import (
     StatusMessage,
     TagHealth,
     WatchMessage,
+    WrongMessageError,
 )
 from skyless.run.process import keep, reader, together
 
@@ -175,7 +176,7 @@ class SiteView:
     def _on_assets(self, _topic: str, payload: bytes) -> None:
         try:
             self._assets = read_assets(payload) if payload else AssetsMessage(())
-        except BadAssetsError:
+        except WrongMessageError:
             self._on_wrong()
 
     def _on_alarm(self, topic: str, payload: bytes) -> None:
