@@ -79,9 +79,8 @@ class ZoneMonitor:
 
     def update(self, fix: FixMessage, now_s: float) -> list[ZoneEvent]:
         """Process a fix; ``now_s`` is its time of arrival, by the clock of ``expire_tags``."""
-        tag = self._tags.setdefault(fix.tag, _TagState())
+        tag = self._tags.get(fix.tag) or self._tags.setdefault(fix.tag, _TagState())
         tag.updated_s, tag.position_m = now_s, fix.position_m
-        margin_m = max(MIN_MARGIN_M, _MARGIN_SIGMAS * horizontal_ellipse(fix.covariance_m2)[0])
         std_z_m = math.sqrt(max(fix.covariance_m2[8], 0.0))
         tag.floor = None if fix.height_known else floor_at(self.floors, fix.position_m[2], std_z_m, tag.floor)
         events = []
@@ -93,9 +92,14 @@ class ZoneMonitor:
                     events.append(_event(zone.zone, fix.tag, tag, fix.unix_s, entered=False))
             elif zone_id not in tag.inside and not zone.may_hold(fix.position_m):
                 tag.beyond_since_s.pop(zone_id, None)
-            elif _crossed(tag, zone, fix, margin_m):
+            elif _crossed(tag, zone, fix):
                 events.append(_event(zone.zone, fix.tag, tag, fix.unix_s, entered=zone_id in tag.inside))
         return events
+
+    def hear(self, name: str, now_s: float) -> None:
+        """A tag has had a fix that is not given to ``update``."""
+        if name in self._tags:
+            self._tags[name].updated_s = now_s
 
     def expire_tags(self, now_s: float, unix_s: float) -> list[ZoneEvent]:
         """Remove tags that had no fix for ``TAG_TIMEOUT_S`` from their zones."""
@@ -121,10 +125,11 @@ class ZoneMonitor:
         return [_event(self._monitored[z].zone, name, tag, unix_s, entered=False) for z in sorted(tag.inside)]
 
 
-def _crossed(tag: _TagState, zone: _MonitoredZone, fix: FixMessage, margin_m: float) -> bool:
+def _crossed(tag: _TagState, zone: _MonitoredZone, fix: FixMessage) -> bool:
     """Whether the tag has changed sides; if so, ``tag.inside`` is updated."""
     zone_id = zone.zone.id
-    margin_m = min(margin_m, zone.max_margin_m)
+    sigma_m = horizontal_ellipse(fix.covariance_m2)[0]
+    margin_m = min(max(MIN_MARGIN_M, _MARGIN_SIGMAS * sigma_m), zone.max_margin_m)
     was_inside = zone_id in tag.inside
     depth = depth_m(fix.position_m[:2], zone.zone.polygon_m)
     beyond_m = -depth if was_inside else depth
