@@ -109,6 +109,14 @@ def test_the_newest_fix_of_each_tag_is_due_once_and_who_waits_longest_comes_firs
                 popped[tag] = now_s
 
 
+def test_tags_that_are_to_be_first_do_not_wait():
+    columns = Columns()
+    for time_s, first, due in ((100.0, [], [5, 6]), (100.2, [5], [5]), (100.4, [6], [6])):
+        columns.update(records_of([(5, 10**15, 1, 1), (6, 10**15, 1, 1)]), time_s)
+        assert columns.pop_due(time_s + 0.1, first)[0]["tag"].tolist() == due
+    assert len(columns.pop_due(100.6, [6])[0]) == 0
+
+
 @settings(max_examples=20)
 @given(st.integers(1, 16_384), st.integers(1, 16_384), st.randoms(use_true_random=False))
 def test_many_tags_are_counts_of_cells_that_add_up(width, height, random):
