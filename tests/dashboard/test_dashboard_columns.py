@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
+from skyless.page import columns as columns_module
 from skyless.page import live2
 from skyless.page._state import read_request
 from skyless.page.app import Services, make_app
@@ -55,9 +56,10 @@ def test_the_columns_are_those_of_a_dictionary_of_newest_fixes(batches):
             if unix_us >= newest.get(tag, (0,))[0]:
                 newest[tag] = (unix_us, x_mm, y_mm)
     inside = {tag: xy for tag, (_, *xy) in newest.items() if 0 <= xy[0] <= 10_000 and 0 <= xy[1] <= 5000}
-    numbers, found = columns.visible(VIEW.view, 51.0)
-    assert numbers.tolist() == sorted(inside)
-    assert list(zip(found["x_mm"], found["y_mm"], strict=True)) == [tuple(inside[n]) for n in sorted(inside)]
+    found, ages_s = columns.visible(VIEW.view, 51.0)
+    assert found["tag"].tolist() == sorted(inside)
+    assert found["position_mm"][:, :2].tolist() == [inside[n] for n in sorted(inside)]
+    assert ages_s.tolist() == [1.0] * len(inside)
     message = tags_message(columns, VIEW, 51.0, 123_456)
     kind, zero, count, unix_us = struct.unpack_from("<BBHQ", message)
     assert (chr(kind), zero, count, unix_us) == ("P", 0, len(inside), 123_456)
@@ -73,7 +75,7 @@ def test_a_late_fix_changes_nothing_but_a_clock_that_was_set_back_does():
     columns = Columns()
     for unix_us, x_mm in ((10**15, 1000), (10**15 - 9_000_000, 2000), (10**15 - 3_600_000_000, 3000)):
         columns.update(records_of([(5, unix_us, x_mm, 1000)]), 1.0)
-        shown = columns.visible(VIEW.view, 1.0)[1]["x_mm"].tolist()
+        shown = columns.visible(VIEW.view, 1.0)[0]["position_mm"][:, 0].tolist()
         assert shown == ([3000] if x_mm == 3000 else [1000])
 
 
@@ -81,8 +83,39 @@ def test_tags_that_are_unheard_leave_the_map_and_too_large_numbers_are_counted()
     columns = Columns()
     columns.update(records_of([(5, 10**15, 1000, 1000), (2**31, 10**15, 1000, 1000)]), 1.0)
     assert columns.dropped == 1
-    assert columns.visible(VIEW.view, 10.9)[0].tolist() == [5]
-    assert columns.visible(VIEW.view, 11.1)[0].tolist() == []
+    assert columns.visible(VIEW.view, 10.9)[0]["tag"].tolist() == [5]
+    assert len(columns.visible(VIEW.view, 11.1)[0]) == 0
+
+
+@settings(max_examples=30)
+@given(st.lists(st.sets(st.integers(1, 50), min_size=1), min_size=1, max_size=12), st.integers(1, 60))
+def test_the_newest_fix_of_each_tag_is_due_once_and_who_waits_longest_comes_first(batches, most):
+    columns, now_s, popped, waiting = Columns(), 100.0, {}, {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(columns_module, "MAX_DUE", most)
+        for index, tags in enumerate(batches):
+            now_s += 0.1
+            columns.update(records_of([(tag, 10**15 + index, index, 1) for tag in tags]), now_s)
+            waiting |= dict.fromkeys(tags, (index, now_s))
+            assert columns.heard_since(now_s - 0.1) == sorted(tags)
+            now_s += 0.1
+            records, arrived_s = columns.pop_due(now_s)
+            due = {tag for tag in waiting if now_s - popped.get(tag, 0.0) >= 0.5 - 1e-9}
+            found = records["tag"].tolist()
+            assert len(found) == min(len(due), most)
+            assert set(found) <= due
+            assert all(popped.get(a, 0.0) <= popped.get(b, 0.0) for a in found for b in due - set(found))
+            for tag, x_mm, at_s in zip(found, records["position_mm"][:, 0], arrived_s, strict=True):
+                assert (x_mm, at_s) == waiting.pop(tag)
+                popped[tag] = now_s
+
+
+def test_tags_that_are_to_be_first_do_not_wait():
+    columns = Columns()
+    for time_s, first, due in ((100.0, [], [5, 6]), (100.2, [5], [5]), (100.4, [6], [6])):
+        columns.update(records_of([(5, 10**15, 1, 1), (6, 10**15, 1, 1)]), time_s)
+        assert columns.pop_due(time_s + 0.1, first)[0]["tag"].tolist() == due
+    assert len(columns.pop_due(100.6, [6])[0]) == 0
 
 
 @settings(max_examples=20)
@@ -143,9 +176,13 @@ def test_a_page_is_sent_anchors_conditions_and_the_tags_of_its_view(monkeypatch)
     app = make_app(Services(LiveSites(live), None, gathered=gathered), AccessRules())
     browser = TestClient(app, base_url="http://localhost:8080")
     columns.update(records_of([(5, 10**15, 1000, 1000)]), time.monotonic())
+    columns.names.update({5: "t5", 6: ""})
     with browser.websocket_connect("ws://localhost:8080/live2") as socket:
         assert [chr(socket.receive_bytes()[0]) for _ in range(2)] == ["A", "H"]
-        socket.send_text(json.dumps({"view": [0, 0, 10, 5], "px": [1000, 500], "floor": 0, "named": ["t1"]}))
+        socket.send_text(json.dumps({"view": [0, 0, 10, 5], "px": [1000, 500], "named": [5, 6]}))
+        names = socket.receive_bytes()
+        assert struct.unpack_from("<BBH", names) == (ord("N"), 0, 1)
+        assert json.loads(names[12:]) == {"5": "t5"}
         message = socket.receive_bytes()
         assert (chr(message[0]), struct.unpack_from("<I", message, 12)[0]) == ("P", 5)
         columns.update(records_of([(5, 10**15 + 1, 2000, 1000), (6, 10**15, 1, 1)]), time.monotonic())

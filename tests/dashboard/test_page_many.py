@@ -1,5 +1,6 @@
 """Very many tags: the page asks the binary stream for its view, and draws points, or counts in cells."""
 
+import json
 import math
 import struct
 import time
@@ -38,7 +39,13 @@ class Crowd:
         unix_us = round(1e6 * (time.time() + 1.0))  # later than any delay that the page reckons with
         anchors = np.array([(1, 1000, 1000, 280, 0, 0), (2, 8500, 1000, 280, 0, 0)], ANCHOR)
         found = self.counts(asked, unix_us) if self.counted else self.points(asked, unix_us)
-        return [head("A", 2, unix_us) + anchors.tobytes(), found[:-1] if self.spoilt else found]
+        names = {number: f"t{number}" for number in asked["named"]}
+        named = head("N", len(names), unix_us) + json.dumps(names).encode()
+        return [
+            *([named] if names else []),
+            head("A", 2, unix_us) + anchors.tobytes(),
+            found[:-1] if self.spoilt else found,
+        ]
 
     def points(self, asked, unix_us):
         x0, y0, x1, y1 = asked["view"]
@@ -71,8 +78,6 @@ def test_points_and_counts(serve, visit):
     part = "document.getElementById('part').textContent"
     until(page, f"{part} === '1\\u202f000 tags are shown as points'")
     page.evaluate(THREE_FRAMES)
-    assert "this list does not" in page.locator("#panel-tags").inner_text()
-    until(page, "document.getElementById('summary').textContent.includes('1000 in view')")
 
     def seen(x_m):
         page.evaluate(THREE_FRAMES)
@@ -81,6 +86,10 @@ def test_points_and_counts(serve, visit):
     fresh, old = seen(LEFT_M), seen(RIGHT_M)
     assert [fresh[3], old[3]] == [255, 255]
     assert max(fresh[:3]) - min(fresh[:3]) > 60 > max(old[:3]) - min(old[:3]), "tags that are not heard are grey"
+
+    # The nearest point is selected; the server is asked for its name.
+    page.mouse.click(*shown.at(LEFT_M, Y_M))
+    until(page, "/^t[0-9]*[13579]$/.test(skyless.state.selection.tag)")
 
     # The map is moved: points stay where they are in the hall, and the new view is asked for.
     views = len({tuple(asked["view"]) for asked in crowd.asked})

@@ -14,21 +14,24 @@ from skyless.core.alert import Alert
 from skyless.run.fix_batch import (
     ALERT_BITS,
     ALERTS,
+    FIELDS,
     HEADER_BYTES,
     HEIGHT_GIVEN,
     NONE_U16,
     RECORD,
+    SIMULATED,
     VELOCITY_KNOWN,
     VERIFIED,
     BadBatchError,
     Batch,
     decode_batch,
     encode_batch,
+    fix_of,
     records_of,
 )
 
 HEADER = "<4sHHIIQII"
-FIELDS = "<IHBBQiiifffHHhh"  # as docs/batches.md states them
+STATED = "<IHBBQiiifffHHhh"  # as docs/batches.md states them
 u32 = st.integers(0, 2**32 - 1)
 u64 = st.integers(0, 2**64 - 1)
 numbers = st.floats(allow_nan=False, allow_infinity=False)
@@ -56,9 +59,9 @@ def test_a_batch_has_the_stated_layout(batch):
     magic, header, size, run, sequence, sent, issue, count = struct.unpack_from(HEADER, data)
     assert (magic, header, size, count) == (b"SKB2", 32, 48, len(batch.records))
     assert (run, sequence, sent, issue) == (batch.run, batch.sequence, batch.sent_unix_us, batch.names_issue)
-    assert struct.calcsize(FIELDS) == 48
+    assert struct.calcsize(STATED) == 48
     assert len(data) == 32 + 48 * count
-    for row, record in zip(struct.iter_unpack(FIELDS, data[32:]), batch.records, strict=True):
+    for row, record in zip(struct.iter_unpack(STATED, data[32:]), batch.records, strict=True):
         stated = (*record.tolist()[:5], *record["position_mm"], *record["covariance_m2"], *record.tolist()[7:9])
         np.testing.assert_array_equal(row[:13], stated)
         np.testing.assert_array_equal(row[13:], record["velocity_cmps"])
@@ -117,3 +120,22 @@ def test_records_hold_what_fixes_state(numbered, simulated):
         assert record["unix_us"] == 0 or near(record["unix_us"], fix.unix_s, 1e6, 2**63 - 1)
         assert (record["hpl_cm"] == NONE_U16) >= (fix.hpl_m is None)
         assert not fix.height_known or record["std_z_mm"] == NONE_U16
+
+
+@given(raw_records, st.booleans())
+def test_the_fix_of_a_record_gives_the_same_record_again(records, simulated):
+    """But for the number of anchors and the method, which have no place in a fix, and alerts of later versions."""
+    finite = np.isfinite(records["covariance_m2"]).all(axis=1)
+    records = records[finite & (records["unix_us"] < 2**50)].copy()
+    records["covariance_m2"] = np.abs(records["covariance_m2"])
+    flags = records["flags"]
+    flags[:] = (flags & (VERIFIED | VELOCITY_KNOWN | HEIGHT_GIVEN)) | (flags & ALERT_BITS) % (1 + len(ALERTS))
+    flags[:] |= SIMULATED * simulated
+    flags[records["std_z_mm"] == NONE_U16] |= HEIGHT_GIVEN
+    records["std_z_mm"][flags & HEIGHT_GIVEN > 0] = NONE_U16
+    records["velocity_cmps"][flags & VELOCITY_KNOWN == 0] = 0
+    for field in ("position_mm", "velocity_cmps"):
+        records[field] = np.maximum(records[field], -np.iinfo(records[field].dtype).max)
+    records["anchors"], records["method"] = 0, 0
+    numbered = [(row[0], fix_of("a", row)) for row in FIELDS.iter_unpack(records.tobytes())]
+    np.testing.assert_array_equal(records_of(numbered, simulated=simulated), records)

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from unittest.mock import Mock
 
 import msgspec
 import nats
@@ -18,6 +19,8 @@ from nats.js.errors import NotFoundError
 
 from skyless.core.errors import SkylessError
 from skyless.page.gathered import Gathered
+from skyless.page.live import LiveSite
+from skyless.page.sites import LiveSites
 from skyless.run.broker import BrokerSettings, nats_of, start_broker
 from skyless.run.fix_batch import MAX_RECORDS, RECORD, Batch, decode_batch, encode_batch
 from skyless.run.gather import names as names_module
@@ -271,21 +274,30 @@ def test_the_site_is_found_and_its_programs_are_counted(tmp_path):
     asyncio.run(check())
 
 
-def test_a_dashboard_reads_batches_with_the_role_of_a_page(tmp_path):
+def test_a_dashboard_reads_batches_and_names_with_the_role_of_a_page(tmp_path):
     async def check():
         create_access(tmp_path / "access", MqttAddress("127.0.0.1", 1))
         roles = read_access(tmp_path / "access")
         async with broker(tmp_path, roles=roles) as running, client_of(running.nats) as client:
             page = NatsAddress(running.nats.url, "page", roles["page"])
             gathered = Gathered(page)
-            task = asyncio.ensure_future(gathered.run())
+            live = LiveSite("here", "mqtt://here:1")
+            live.attach(Mock(), SITE)
+            task = asyncio.ensure_future(gathered.run(LiveSites(live)))
             async with gathering(running.nats), asyncio.timeout(20):
                 await serving(client)
                 while not gathered.columns(SITE).serial:
                     await publish(client, "a", 1.5)
                     await asyncio.sleep(0.05)
-                _, newest = gathered.columns(SITE).visible((0.0, 0.0, 9.0, 9.0), time.monotonic())
-                assert newest["x_mm"].tolist() == [1500]
+                newest, _ = gathered.columns(SITE).visible((0.0, 0.0, 9.0, 9.0), time.monotonic())
+                assert newest["position_mm"][:, 0].tolist() == [1500]
+                while not live.state.tags:
+                    await asyncio.sleep(0.02)
+                assert [*live.state.tags] == ["a"]
+                assert gathered.columns(SITE).names == {1: "a"}
+            async with client_of(page) as reading:
+                with pytest.raises(TimeoutError):
+                    await reading.request("$JS.API.DIRECT.GET." + subjects.at(subjects.FIX_STREAM, SITE), timeout=0.5)
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
 

@@ -335,7 +335,7 @@ def _row(fix: FixMessage, true_m: Vector | None, ended_unix_s: float) -> list[An
         None if true_m is None else round(error_m(fix, true_m), 4),
         None if true_m is None else round(true_m[0], 4),
         None if true_m is None else round(true_m[1], 4),
-        len(fix.anchors),
+        len(fix.anchors) or None,
         round(fix.chi2, 3),
         round(unix_s, 4),
         None if fix.hpl_m is None else round(fix.hpl_m, 4),

@@ -6,20 +6,29 @@ import time
 from collections import Counter
 from typing import Final
 
+from nats.aio.client import Client
 from nats.aio.msg import Msg
+from nats.errors import Error
 from starlette.websockets import WebSocket
 
 from skyless.core.site import AnchorSite
 from skyless.page._state import read_request
-from skyless.page.columns import Columns
+from skyless.page.columns import MAX_DUE, Columns
 from skyless.page.live import MAX_PAGES, LiveSite
-from skyless.page.live2 import View, anchors_message, conditions_message, tags_message
+from skyless.page.live2 import View, anchors_message, conditions_message, names_message, tags_message
+from skyless.page.sites import LiveSites
 from skyless.page.sockets import TRY_LATER, send, serve_socket
-from skyless.run.fix_batch import BadBatchError, decode_batch
+from skyless.run.fix_batch import FIELDS, BadBatchError, decode_batch, fix_of
 from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect, rarely
+from skyless.run.gather.names import name_of
 
 PERIOD_S: Final = 0.1
+_HAND_OVER_S: Final = 0.05
+_HEARD_S: Final = 1.0
+"""In this interval a site is told which tags batches have fixes of."""
+_MAX_ASKED: Final = 200
+
 _MAX_SITES: Final = 64
 _EMPTY: Final = Columns()
 
@@ -39,14 +48,47 @@ class Gathered:
         """The columns of a site, empty before its first batch."""
         return self._sites.get(site, _EMPTY)
 
-    async def run(self) -> None:
-        """Read until cancelled."""
-        client = await connect(self._address, "skyless dashboard", self._say, self.drops)
+    async def run(self, sites: LiveSites) -> None:
+        """Read until cancelled, and hand fixes over to the sites that are shown."""
+        client = await connect(self._address, "skyless dashboard", self._say, self.drops, subjects.PAGE_INBOX)
         try:
             await client.subscribe(subjects.at(subjects.FIXES, subjects.EVERY), cb=self._on_batch)
-            await asyncio.Event().wait()
+            async with asyncio.TaskGroup() as tasks:
+                served: set[int] = set()
+                while True:
+                    for live in sites.all:
+                        live.evidence.batches_connected = client.is_connected
+                        site = live.number
+                        if site is not None and site in self._sites and site not in served:
+                            served.add(site)
+                            tasks.create_task(self._hand_over(client, site, live))
+                    await asyncio.sleep(PERIOD_S)
         finally:
             await client.close()
+
+    async def _hand_over(self, client: Client, site: int, live: LiveSite) -> None:
+        """Give a site fixes of its batches for ever, for all that its messages are for: zones, alarms, lists."""
+        columns, heard_s = self._sites[site], 0.0
+        stream, names, numbers = client.jetstream(), columns.names, dict[str, int]()
+        while True:
+            now_s = time.monotonic()
+            if now_s - heard_s >= _HEARD_S:
+                heard, heard_s = columns.heard_since(heard_s), now_s
+                live.on_batches([name for number in heard if (name := names.get(number))], now_s)
+            named = {name for page in live.pages for name in page.named}
+            records, arrived_s = columns.pop_due(now_s, [numbers[name] for name in named if name in numbers])
+            asked = [number for number in records["tag"].tolist() if number not in names][:_MAX_ASKED]
+            try:
+                answers = await asyncio.gather(*(name_of(stream, site, number) for number in asked))
+                names.update(zip(asked, answers, strict=True))
+                numbers.update(zip(answers, asked, strict=True))
+            except Error as error:
+                self._say(f"the names of site {site} cannot be read: {error or type(error).__name__}")
+            for record, at_s in zip(FIELDS.iter_unpack(records.tobytes()), arrived_s.tolist(), strict=True):
+                if name := names.get(record[0]):
+                    live.on_batched_fix(fix_of(name, record), at_s)
+            # At least as long as it took, so that batches are read in time, of which the newest fixes are due next.
+            await asyncio.sleep(max(_HAND_OVER_S if len(records) < MAX_DUE else 0.0, time.monotonic() - now_s))
 
     async def _on_batch(self, message: Msg) -> None:
         site = subjects.site_in(message.subject)
@@ -84,13 +126,15 @@ class _Page:
 
     def __init__(self) -> None:
         self._view: View | None = None
+        self._named: tuple[int, ...] = ()
         self._shown: tuple[View, int, int] | None = None
         self._anchors: tuple[AnchorSite, ...] | None = None
         self._conditions: dict[str, str] | None = None
 
     def ask(self, text: str) -> None:
-        """The page has another view."""
-        self._view = read_request(text, View) or self._view
+        """The page has another view, or asks for names."""
+        if (view := read_request(text, View)) is not None:
+            self._view, self._named = view, view.named or self._named
 
     def news(self, live: LiveSite, columns: Columns, now_s: float) -> list[bytes]:
         """What is new to the page."""
@@ -102,6 +146,9 @@ class _Page:
         if conditions != self._conditions:
             self._conditions = conditions
             found.append(conditions_message(anchors, conditions, unix_us))
+        if self._named:
+            found.append(names_message(columns, self._named, unix_us))
+            self._named = ()
         if self._view is not None:
             shown = self._view, columns.serial, int(now_s)  # without a new fix each second: their ages grow
             if shown != self._shown:

@@ -9,7 +9,7 @@ import logging
 import platform
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
@@ -103,6 +103,11 @@ class PageQueue:
         self._state_due = True
         self._health_due |= health
         self._wake.set()
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """Tags that the page has selected or lists in sight."""
+        return self._sent.wanted.tags
 
     def ask(self, wanted: PageRequest) -> None:
         """Send from now on what the page asks for."""
@@ -283,11 +288,24 @@ class LiveSite:
     def _on_fix(self, topic: str, payload: bytes) -> None:
         fix = read_message(payload, FixMessage)
         _check_name(fix.tag, topic)
-        if not self.evidence.roster.admits("tag", fix.tag):
-            return
         now_s = self._clock()
-        unix_s = self.wall_clock()
-        self.state.add_fix(fix, now_s, unix_s - self.evidence.add_fix(fix, now_s))
+        if self.evidence.roster.admits("tag", fix.tag):
+            self._take_fix(fix, now_s, self.evidence.add_fix(fix, now_s))
+
+    def on_batched_fix(self, fix: FixMessage, now_s: float) -> None:
+        """A fix that has arrived in a batch at this time; ignored where the tag's messages arrive as well."""
+        if not self.evidence.sends_messages(fix.tag, now_s):
+            self._take_fix(fix, now_s, self.evidence.add_batched(fix, now_s))
+
+    def on_batches(self, tags: Iterable[str], now_s: float) -> None:
+        """Batches have fixes of these tags, handed over or not: they are not silent."""
+        for name in tags:
+            self.evidence.hear(name, now_s)
+            self.alarms.engine.hear(name, now_s)
+            self.monitor.hear(name, now_s)
+
+    def _take_fix(self, fix: FixMessage, now_s: float, age_s: float) -> None:
+        self.state.add_fix(fix, now_s, self.wall_clock() - self._clock() + now_s - age_s)
         self.log.on_fix(fix, now_s)
         self.alarms.engine.on_fix(fix, now_s)
         self._schedule(self.monitor.update(fix, now_s))

@@ -2,19 +2,23 @@
 
 import math
 import struct
+from collections.abc import Sequence
 from typing import Annotated, Final
 
+import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
 from skyless.core.site import AnchorSite
 from skyless.page._state import UNHEARD_S
 from skyless.page.columns import Array, Columns
+from skyless.run.fix_batch import ALERT_BITS
 
 MAX_POINTS: Final = 5_000
 MAX_CELLS: Final = 16_384
 MIN_CELL_PX: Final = 8
 
+_MAX_NAMED: Final = 200
 _MAX_U16: Final = 65_535
 _HEAD: Final = struct.Struct("<BBHQ")
 _COUNTS_HEAD: Final = struct.Struct("<BBHHHQ")
@@ -37,6 +41,8 @@ class View(Struct, frozen=True):
     view: tuple[_Edge, _Edge, _Edge, _Edge]
     """Least x and y, and largest x and y in m."""
     px: tuple[_Pixels, _Pixels]
+    named: Annotated[tuple[int, ...], Meta(max_length=_MAX_NAMED)] = ()
+    """Numbers of tags whose names it asks for."""
 
     def __post_init__(self) -> None:
         """Raise ValueError where it has no area."""
@@ -47,15 +53,19 @@ class View(Struct, frozen=True):
 
 def tags_message(columns: Columns, view: View, now_s: float, unix_us: int) -> bytes:
     """``P``, or ``B`` where more than ``MAX_POINTS`` tags are visible."""
-    numbers, newest = columns.visible(view.view, now_s)
+    records, ages_s = columns.visible(view.view, now_s)
     x0, y0, x1, y1 = view.view
-    x_share, y_share = (newest["x_mm"] / 1000.0 - x0) / (x1 - x0), (newest["y_mm"] / 1000.0 - y0) / (y1 - y0)
-    if len(numbers) > MAX_POINTS:
+    x_m, y_m, _ = records["position_mm"].T / 1000.0
+    x_share, y_share = (x_m - x0) / (x1 - x0), (y_m - y0) / (y1 - y0)
+    if len(records) > MAX_POINTS:
         return _counts(x_share, y_share, view.px, unix_us)
-    points = np.empty(len(numbers), POINT)
-    points["tag"], points["sigma_mm"], points["alert"] = numbers, newest["sigma_mm"], newest["alert"]
+    with np.errstate(invalid="ignore", over="ignore"):
+        sigma_mm = 1000.0 * np.sqrt(records["covariance_m2"][:, 0] + records["covariance_m2"][:, 2])
+    points = np.empty(len(records), POINT)
+    points["tag"], points["alert"] = records["tag"], records["flags"] & ALERT_BITS
     points["x"], points["y"] = np.rint(_MAX_U16 * x_share), np.rint(_MAX_U16 * y_share)
-    points["freshness"] = np.clip(10.0 * (now_s - newest["arrived_s"]), 0.0, 10.0 * UNHEARD_S)
+    points["sigma_mm"] = np.minimum(np.nan_to_num(sigma_mm, nan=_MAX_U16), _MAX_U16)
+    points["freshness"] = np.clip(10.0 * ages_s, 0.0, 10.0 * UNHEARD_S)
     return _HEAD.pack(ord("P"), 0, len(points), unix_us) + points.tobytes()
 
 
@@ -69,6 +79,12 @@ def _counts(x_share: Array, y_share: Array, px: tuple[int, int], unix_us: int) -
     counts = np.bincount(row * columns + column, minlength=columns * rows)
     head = _COUNTS_HEAD.pack(ord("B"), cell, columns, rows, 0, unix_us)
     return head + np.minimum(counts, _MAX_U16).astype("<u2").tobytes()
+
+
+def names_message(columns: Columns, numbers: Sequence[int], unix_us: int) -> bytes:
+    """``N``: the names of those numbers that have one, in JSON."""
+    names = {number: columns.names[number] for number in numbers if columns.names.get(number)}
+    return _HEAD.pack(ord("N"), 0, len(names), unix_us) + msgspec.json.encode(names)
 
 
 def anchors_message(anchors: tuple[AnchorSite, ...], unix_us: int) -> bytes:

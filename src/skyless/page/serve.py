@@ -105,7 +105,7 @@ async def serve(
     server = _Server(config)
     jobs = [services.sites.run(address, site_id), server.end_unfinished()]
     if services.gathered is not None:
-        jobs.append(services.gathered.run())
+        jobs.append(services.gathered.run(services.sites))
     work = [asyncio.create_task(job) for job in jobs]
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, *ending_signals()):

@@ -19,7 +19,7 @@ import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Final, Self
+from typing import IO, Any, Final, Self
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -28,6 +28,7 @@ from skyless.core.errors import SkylessError
 from skyless.run.children import end
 from skyless.run.gather.address import FIRST_PORT as FIRST_NATS_PORT
 from skyless.run.gather.address import NatsAddress
+from skyless.run.gather.subjects import NAME_REQUESTS, PAGE_INBOX
 from skyless.run.mqtt.access import ACCESS, Role
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress, mqtt_address
 from skyless.run.mqtt.connection import check_broker
@@ -131,6 +132,10 @@ def _configuration(settings: BrokerSettings, port: int, data: Path, nats: NatsAd
         whole["authorization"] = {"user": settings.user, "password": settings.password}
     if settings.roles is not None:
         users = [_user(role, password) for role, password in settings.roles.items()]
+        if nats is not None:
+            for permissions in (user["permissions"] for user in users if user["user"] in {Role.PAGE, Role.SURVEY}):
+                permissions["publish"]["allow"].append(NAME_REQUESTS)
+                permissions["subscribe"]["allow"].append(f"{PAGE_INBOX}.>")
         if settings.strangers_read:
             users.append(_user(Role.STRANGER, ""))
             whole["no_auth_user"] = str(Role.STRANGER)
@@ -138,7 +143,7 @@ def _configuration(settings: BrokerSettings, port: int, data: Path, nats: NatsAd
     return json.dumps(whole, ensure_ascii=False, indent=1) + "\n"
 
 
-def _user(role: Role, password: str) -> dict[str, object]:
+def _user(role: Role, password: str) -> dict[str, Any]:
     access = ACCESS[role]
     permissions = {"publish": _permission(access.publish), "subscribe": _permission(access.subscribe)}
     return {"user": str(role), "password": password, "permissions": permissions}

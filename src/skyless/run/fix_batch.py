@@ -37,6 +37,9 @@ RECORD: Final = np.dtype(
 """One fix: the tag's number, flags, anchors used, method (0: not stated), time, position, covariance xx, xy, yy,
 standard deviation of z, protection level and velocity."""
 
+FIELDS: Final = struct.Struct("<IHBBQiiifffHHhh")
+"""The same as plain numbers."""
+
 MAX_RECORDS: Final = 1000
 NONE_U16: Final = 65535
 """No standard deviation of z, or no protection level."""
@@ -129,6 +132,40 @@ def _row(number: int, fix: FixMessage, *, simulated: bool) -> tuple[Any, ...]:
     unix_us = max(0, _scaled(fix.unix_s, 1e6, _MAX_I64))
     anchors = min(len(fix.anchors), 255)
     return number, flags, anchors, 0, unix_us, position_mm, (xx, xy, yy), std_z_mm, hpl_cm, velocity
+
+
+def fix_of(name: str, record: tuple[Any, ...]) -> FixMessage:
+    """The fix of a record that ``FIELDS`` has unpacked. What it does not hold is empty, 0 or not a number."""
+    _, flags, _, _, unix_us, x_mm, y_mm, z_mm, xx, xy, yy, std_z_mm, hpl_cm, vx_cmps, vy_cmps = record
+    zz = 0.0 if std_z_mm == NONE_U16 else (0.001 * std_z_mm) ** 2
+    alert = min(flags & ALERT_BITS, len(ALERTS))
+    is_verified = bool(flags & VERIFIED)
+    return FixMessage(
+        tag=name,
+        serial=0,
+        unix_s=1e-6 * unix_us,
+        time_s=0.0,
+        position_m=(0.001 * x_mm, 0.001 * y_mm, 0.001 * z_mm),
+        covariance_m2=(xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, zz),
+        velocity_mps=(0.01 * vx_cmps, 0.01 * vy_cmps, 0.0) if flags & VELOCITY_KNOWN else None,
+        velocity_covariance=None,
+        std_m=math.sqrt(max(xx + yy + zz, 0.0)),
+        gdop=None,
+        pdop=None,
+        hdop=None,
+        vdop=None,
+        anchors=(),
+        chi2=math.nan,
+        dof=0,
+        residual_rms_m=math.nan,
+        method="",
+        height_known=bool(flags & HEIGHT_GIVEN),
+        latency_s=0.0,
+        hpl_m=None if hpl_cm == NONE_U16 else 0.01 * hpl_cm,
+        alert=ALERTS[alert - 1] if alert else None,
+        verified_until_s=0.0 if is_verified else None,
+        unverified=0.0 if is_verified else 1.0,
+    )
 
 
 def _scaled(value: float, scale: float, most: int) -> int:

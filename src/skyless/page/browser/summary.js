@@ -58,7 +58,7 @@ export function summaryFacts() {
   }
   const { tags_with_fix, tags } = (state.mode === "live" && state.part && freshCondition()) || {};
   const facts = [
-    ["Tags", lost ? DASH : tags ? `${tags_with_fix}/${tags}` : !all.length && state.many ? `${state.many.count} in view` : `${count}/${all.length}`],
+    ["Tags", lost ? DASH : tags ? `${tags_with_fix}/${tags}`  : `${count}/${all.length}`],
     ["σ", length(median(fresh.std))],
   ];
   if (state.simulated) facts.push(["Error", length(median(fresh.error))]);

@@ -237,17 +237,19 @@ def fix_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
     """Tags that are online and have no fix, with what they give as the cause, or without any word."""
     online = [(name, tag) for name, tag in evidence.of("tag") if tag.online]
     without = [(n, tag) for n, tag in online if not tag.has_fix(now_s) and not evidence.in_grace(now_s, tag)]
-    if not without:
+    missed = evidence.missed(now_s)
+    names = [*(name for name, _ in without), *missed]
+    if not names:
         return
-    silent = [name for name, tag in without if not tag.reports(now_s)]
+    silent = [*(name for name, tag in without if not tag.reports(now_s)), *missed]
     healths = {name: tag.health for name, tag in without if tag.reports(now_s)}
     causes = {name: health.reason or "" for name, health in healths.items() if isinstance(health, TagHealth)}
-    if len(without) == len(online):
-        though = "a tag is online" if len(online) == 1 else f"{len(online)} tags are online"
-        why, advice = _causes(causes, len(without))
+    if len(names) == len(online) + len(evidence.batched_s):
+        though = "a tag is online" if len(names) == 1 else f"{len(names)} tags are online"
+        why, advice = _causes(causes, len(names))
         if not causes:
             why, advice = ": they do not report", "See whether their programs and computers still run."
-        yield _of("tag", "no-fixes", "bad", f"no positions, although {though}{why}", advice, [n for n, _ in without])
+        yield _of("tag", "no-fixes", "bad", f"no positions, although {though}{why}", advice, names)
         return
     if causes:
         why, advice = _causes(causes, len(causes))
@@ -289,7 +291,7 @@ _ALERT_REASONS: Final[tuple[tuple[str, int, _Severity, str], ...]] = (
 def alert_reasons(evidence: Evidence) -> Iterable[Reason]:
     """Alerts of integrity in the fixes since the last evaluation."""
     for kind, grade, level, advice in _ALERT_REASONS:
-        alerts = {name: str(tag.alert) for name, tag in evidence.of("tag") if ALERTS.get(tag.alert, 0) == grade}
+        alerts = {name: alert for name, alert in evidence.alerts.items() if ALERTS[alert] == grade}
         if alerts:
             text = "; ".join(f"{listed('tag', names)}: {ALERT_WORDS[alert]}" for alert, names in alike(alerts))
             yield _of("tag", kind, level, text, advice, alerts)

@@ -27,6 +27,12 @@ ALERT_WORDS: Final = {
     "alert-limit-exceeded": "the protection level is above the alert limit",
 }
 
+EXPECTED_S: Final = 600.0
+"""A tag that is known from batches alone, so without a status, is missed for this long after its last fix."""
+
+_MESSAGES_S: Final = 3.0
+"""A fix in a batch follows the message of the same fix, if there is one, within this time."""
+
 MAX_NAMES: Final = {"tag": 200_000, "anchor": 20_000}
 """Names of a kind that are taken in."""
 
@@ -57,7 +63,9 @@ _IDLE, _IO_WAIT = 3, 4
 class Node:
     """A tag, an anchor or the emulated air."""
 
-    __slots__ = ("alert", "codes_s", "fix_s", "health", "health_s", "host", "online", "previous", "since_s", "used_s")
+    __slots__ = (
+        *("batched_s", "codes_s", "fix_s", "health", "health_s", "host", "online", "previous", "since_s", "used_s"),
+    )
 
     def __init__(self) -> None:
         self.online: bool | None = None  # by its status; None without one
@@ -66,9 +74,9 @@ class Node:
         self.previous: Health | None = None  # the health before
         self.since_s: float | None = None  # when it came online, or its first message came
         self.health_s = float("-inf")  # when the last health came
-        self.fix_s = float("-inf")  # when the last fix came
+        self.fix_s = float("-inf")  # when the last fix came, as a message or in a batch
+        self.batched_s = float("-inf")  # when the last one came in a batch
         self.used_s = float("-inf")  # when the last fix came that used it as an anchor
-        self.alert: str | None = None  # the worst of its fixes since the last evaluation
         self.codes_s: float | None = None  # since when it states that its beacons have codes
 
     def begin(self, now_s: float) -> None:
@@ -99,6 +107,9 @@ class Evidence:
         self.ready_s = now_s  # when it began to wait for messages
         self.site: Site | None = None
         self.nodes: dict[tuple[str, str], Node] = {}  # by kind and name
+        self.batched_s: dict[str, float] = {}  # when the last fix came of tags that are known from batches alone
+        self.batches_connected = True  # where a site has batches, whether they can arrive
+        self.alerts: dict[str, str] = {}  # by tag: the worst of its fixes since the last evaluation
         self.roster = Roster()
         self._sorted: dict[str, list[tuple[str, Node]]] = {}
         self.ages = FixAges()
@@ -131,7 +142,8 @@ class Evidence:
             node.since_s = now_s
         node.online, node.host = status.online, status.host or node.host
         if not status.online:
-            node.alert, node.previous, node.codes_s = None, None, None
+            node.previous, node.codes_s = None, None
+            self.alerts.pop(status.name, None)
             self.ages.remove(status.name)
 
     def add_health(self, kind: str, name: str, health: Health, now_s: float, unix_s: float) -> None:
@@ -157,13 +169,35 @@ class Evidence:
             return 0.0
         node.begin(now_s)
         node.fix_s = now_s
-        if ALERTS.get(fix.alert, 0) > ALERTS.get(node.alert, 0):
-            node.alert = fix.alert
         for anchor in fix.anchors:
             used = self._node("anchor", str(anchor))
             if used is not None:
                 used.used_s = now_s
+        return self.add_batched(fix, now_s)
+
+    def add_batched(self, fix: FixMessage, now_s: float) -> float:
+        """A fix that came in a batch, of a tag that ``hear`` is given as well. Returns its age."""
+        if fix.alert is not None and ALERTS.get(fix.alert, 0) > ALERTS.get(self.alerts.get(fix.tag), 0):
+            self.alerts[fix.tag] = fix.alert
         return self.ages.add_fix(fix.tag, fix.unix_s, fix.latency_s, now_s)
+
+    def hear(self, tag: str, now_s: float) -> None:
+        """A batch has a fix of a tag."""
+        node = self.nodes.get(("tag", tag))
+        if node is None:
+            self.batched_s[tag] = now_s
+        elif not self.sends_messages(tag, now_s):
+            node.fix_s = node.batched_s = now_s
+
+    def sends_messages(self, tag: str, now_s: float) -> bool:
+        """Whether a tag's fixes arrive as messages, so that those in batches are the same once more."""
+        node = self.nodes.get(("tag", tag))
+        return node is not None and node.fix_s > node.batched_s and now_s - node.fix_s < _MESSAGES_S
+
+    def missed(self, now_s: float) -> list[str]:
+        """The tags, known from batches alone, that have no fixes any more."""
+        self.batched_s = {tag: fix_s for tag, fix_s in self.batched_s.items() if now_s - fix_s < EXPECTED_S}
+        return [tag for tag, fix_s in self.batched_s.items() if now_s - fix_s >= FRESH_S]
 
     def of(self, kind: str) -> list[tuple[str, Node]]:
         """Names and nodes of a kind, in their natural order."""
@@ -186,6 +220,8 @@ class Evidence:
         node = self.nodes.get((kind, name))
         if node is None and self.roster.admits(kind, name):
             node = self.nodes[kind, name] = Node()
+            if kind == "tag":
+                self.batched_s.pop(name, None)
             self._sorted.pop(kind, None)
         return node
 

@@ -112,12 +112,12 @@ class ConditionMonitor:
         for reason in filter(None, found):
             self._hold(reason, now_s)
         self._held = {kind: held for kind, held in self._held.items() if now_s - held[0] < HOLD_S}
-        tags = evidence.of("tag")
-        for _, tag in tags:
-            tag.alert = None
+        evidence.alerts.clear()
         reasons = tuple(sorted((reason for _, reason in self._held.values()), key=rank))
+        tags, batched_s = evidence.of("tag"), evidence.batched_s
         with_fix = sum(tag.has_fix(now_s) for _, tag in tags)
-        figures = *latencies, len(tags), with_fix, evidence.roster.size("anchor")
+        with_fix += sum(now_s - fix_s < FRESH_S for fix_s in batched_s.values())
+        figures = *latencies, len(tags) + len(batched_s), with_fix, evidence.roster.size("anchor")
         if reasons:
             return Condition(reasons[0].level, reasons[0].text, reasons, *figures)
         if with_fix:
@@ -126,7 +126,7 @@ class ConditionMonitor:
 
     def is_blind(self, now_s: float) -> bool:
         """Whether messages may be missing: the broker is not connected, or the server itself was delayed."""
-        return not self.evidence.connected or now_s < self._blind_until_s
+        return not (self.evidence.connected and self.evidence.batches_connected) or now_s < self._blind_until_s
 
     def _hold(self, reason: Reason, now_s: float) -> None:
         if reason.level == "bad":
@@ -138,6 +138,6 @@ class ConditionMonitor:
     def _awaited(self) -> str:
         if self.evidence.site is None:
             return "waiting for the site's anchors"
-        if not any(tag.online for _, tag in self.evidence.of("tag")):
+        if not self.evidence.batched_s and not any(tag.online for _, tag in self.evidence.of("tag")):
             return "no tag is online"
         return "waiting for the first position"

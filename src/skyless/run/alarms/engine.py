@@ -180,6 +180,11 @@ class AlarmEngine:
         tag.fixes += 1
         self._changed[fix.tag] = None
 
+    def hear(self, name: str, now_s: float) -> None:
+        """A tag has had a fix that is not given to ``on_fix``."""
+        if name in self._tags:
+            self._tags[name].seen_s = now_s
+
     def on_zone_events(self, events: Iterable[ZoneEvent], now_s: float) -> None:
         """Tags have entered or left zones."""
         for event in events:

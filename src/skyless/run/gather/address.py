@@ -71,10 +71,11 @@ def rarely(log: Log) -> Log:
     return say
 
 
-async def connect(address: NatsAddress, name: str, say: Log, drops: Counter[str]) -> "Client":
+async def connect(address: NatsAddress, name: str, say: Log, drops: Counter[str], inbox: str = "_INBOX") -> "Client":
     """A connection, made again whenever it is lost; waits for a server that is not there yet.
 
-    Messages that came faster than they were read are counted under ``unread``. Raises SkylessError without nats-py.
+    ``inbox`` is how the subjects of answers begin. Messages that came faster than they were read are counted under
+    ``unread``. Raises SkylessError without nats-py.
     """
     nats = extra_module("nats", "NATS")
 
@@ -89,6 +90,7 @@ async def connect(address: NatsAddress, name: str, say: Log, drops: Counter[str]
         user=address.user,
         password=address.password,
         error_cb=on_error,
+        inbox_prefix=inbox,
         max_reconnect_attempts=-1,
         reconnect_time_wait=_RETRY_S,
     )

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 from msgspec import Struct
-from nats.js.errors import APIError
+from nats.js.errors import APIError, NotFoundError
 
 from skyless.run.gather import subjects
 from skyless.run.gather.streams import messages
@@ -26,6 +26,16 @@ class TagName(Struct, frozen=True):
     host: str
     """Where its fixes are packed."""
     since_unix_s: float
+
+
+async def name_of(stream: "JetStreamContext", site: int, number: int) -> str:
+    """The name of a tag's number, empty where it has none. Raises nats.errors.Error."""
+    names = subjects.at(subjects.NAMES_STREAM, site)
+    try:
+        message = await stream.get_last_msg(names, subjects.at(subjects.NAMES, site, number), direct=True)
+        return msgspec.json.decode(message.data or b"", type=TagName).name
+    except (NotFoundError, msgspec.MsgspecError, ValueError):
+        return ""
 
 
 class Names:

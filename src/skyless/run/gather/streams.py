@@ -44,6 +44,7 @@ async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -
         storage=StorageType.FILE,
         num_replicas=1,
         max_msgs_per_subject=1,
+        allow_direct=True,
     )
     for config in (fixes, names):
         try:

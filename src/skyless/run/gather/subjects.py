@@ -21,6 +21,11 @@ SUMMARY: Final = "skyless.v2.{}.summary"
 FIX_STREAM: Final = "FIX_{}"
 NAMES_STREAM: Final = "NAMES_{}"
 
+NAME_REQUESTS: Final = "$JS.API.DIRECT.GET.*.skyless.v2.*.names.*"
+"""Where the server is asked for the name of one number."""
+PAGE_INBOX: Final = "_INBOX_PAGE"
+"""How the subjects begin under which pages are answered."""
+
 EVERY: Final = "*"
 
 

@@ -87,16 +87,20 @@ class ZoneMonitor:
 
     def update(self, fix: FixMessage, now_s: float) -> list[ZoneEvent]:
         """Process a fix; ``now_s`` is its time of arrival, by the clock of ``expire_tags``."""
-        tag = self._tags.setdefault(fix.tag, _TagState())
+        tag = self._tags.get(fix.tag) or self._tags.setdefault(fix.tag, _TagState())
         tag.updated_s, tag.position_m = now_s, fix.position_m
-        margin_m = max(MIN_MARGIN_M, _MARGIN_SIGMAS * horizontal_ellipse(fix.covariance_m2)[0])
         std_z_m = math.sqrt(max(fix.covariance_m2[8], 0.0))
         tag.floor = None if fix.height_known else floor_at(self.floors, fix.position_m[2], std_z_m, tag.floor)
         return [
             _event(zone.zone, fix.tag, tag, fix.unix_s, entered=zone.zone.id in tag.inside)
             for zone in self._monitored.values()
-            if _crossed(tag, zone, fix.unix_s, margin_m)
+            if _crossed(tag, zone, fix)
         ]
+
+    def hear(self, name: str, now_s: float) -> None:
+        """A tag has had a fix that is not given to ``update``."""
+        if name in self._tags:
+            self._tags[name].updated_s = now_s
 
     def expire_tags(self, now_s: float, unix_s: float) -> list[ZoneEvent]:
         """Remove tags that had no fix for ``TAG_TIMEOUT_S`` from their zones."""
@@ -134,10 +138,14 @@ def floor_at(floors: tuple[FloorSite, ...], z_m: float, std_m: float, before: in
     return before if abs(z_m - boundary_m) < margin_m else floors[row].number
 
 
-def _crossed(tag: _TagState, zone: _MonitoredZone, unix_s: float, margin_m: float) -> bool:
+def _crossed(tag: _TagState, zone: _MonitoredZone, fix: FixMessage) -> bool:
     """Whether the tag has changed sides; if so, ``tag.inside`` is updated."""
-    zone_id = zone.zone.id
-    margin_m, beyond_m = min(margin_m, zone.max_margin_m), zone.beyond_m(tag)
+    zone_id, unix_s, beyond_m = zone.zone.id, fix.unix_s, zone.beyond_m(tag)
+    if beyond_m <= 0.0:
+        tag.beyond_since_s.pop(zone_id, None)
+        return False
+    margin_m = max(MIN_MARGIN_M, _MARGIN_SIGMAS * horizontal_ellipse(fix.covariance_m2)[0])
+    margin_m = min(margin_m, zone.max_margin_m)
     if beyond_m < 0.5 * margin_m:
         tag.beyond_since_s.pop(zone_id, None)
         return False

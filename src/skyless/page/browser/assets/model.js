@@ -79,8 +79,7 @@ export function isFound(tag) {
   return !state.find || (words.get(tag) ?? tag.toLowerCase()).includes(state.find);
 }
 
-/** Tags whose assets are searched, for a server that sends a part of the tags and knows their own names only. */
+/** Tags with assets that the filter leaves, for a server that sends a part of the tags and knows their own names only. */
 export function foundByAsset() {
-  if (!state.find && !state.filter.group) return [];
   return [...state.assets.keys()].filter(isFound);
 }

@@ -12,6 +12,7 @@ import { groundHeight } from "./floors.js";
 import { endFollow, following, toggleFollow } from "./follow.js";
 import { drawnAnchors } from "./anchors.js";
 import { places } from "./places.js";
+import { selectPoint } from "./many.js";
 import { placeAnchor, predict } from "./placing.js";
 import { secondsAt } from "./past.js";
 import { anchorNear } from "./survey.js";
@@ -124,6 +125,7 @@ function tap({ x, y }) {
     addPoint(site);
     return setCursor(null);
   }
+  if (selectPoint(x, y, HIT)) return;
   const tag = drawn.findLast((one) => near(one.x, one.y, x, y));
   if (tag) return select("tag", tag.name);
   const anchor = surveyShown()

@@ -1,10 +1,11 @@
 /**
  * Very many tags: the binary stream `/live2` of a large site (`docs/batches.md`), drawn as points or as counts in cells.
  *
- * Positions are shares of the view that was asked for; kept in metres, they follow a map that is moved meanwhile.
+ * Positions are shares of the view that was asked for; kept in metres, they follow a map that is moved meanwhile. Points
+ * have the numbers of their tags; the name of one that is clicked is asked for.
  */
 
-import { changed, state } from "../store.js";
+import { changed, select, state } from "../store.js";
 import { GONE_S, GREY_S, now_s } from "../clock.js";
 import { palette } from "../theme.js";
 import { colourAt, paintGrid } from "../pictures.js";
@@ -26,6 +27,8 @@ const SIDE = 4;
 let socket = null;
 /** The site that it is about. @type {number|null} */
 let site = null;
+/** The number of a tag that was clicked, until its name is here. @type {number|null} */
+let clicked = null;
 let asked = "";
 let askedMs = 0;
 /** The view that is asked for, and the server's time from which messages are of it. */
@@ -54,10 +57,33 @@ function readMany(data) {
 
 /** Take a message of the view `seen`, {box, px}, in. */
 function receiveMany(data, seen) {
+  if (new Uint8Array(data)[0] === 78 /* N */) return receiveNames(JSON.parse(new TextDecoder().decode(data.slice(12))));
   const message = readMany(data);
   if (!seen || !(message?.unix_s >= since_s)) return;
   state.many = { ...message, ...seen };
   changed("tags");
+}
+
+/** Select the tag that was clicked; one without a name stays unknown. @param {Record<string, string>} names by number */
+function receiveNames(names) {
+  if (clicked in names) select("tag", names[clicked]);
+  clicked = null;
+}
+
+/** Select the tag whose point is nearest to a pixel, if it is within a distance; false where there is none. */
+export function selectPoint(x, y, reach) {
+  if (!manyShown() || state.many.kind !== "P") return false;
+  const { words, box: [x0, y0, x1, y1] } = state.many; // prettier-ignore
+  const [left, low] = [toX(x0, y0), toY(x0, y0)];
+  const [across, up] = [(toX(x1, y1) - left) / 65535, (toY(x1, y1) - low) / 65535];
+  let [nearest, found] = [reach, null];
+  for (let at = 0; at < words.length; at += 3) {
+    const place = words[at + 1];
+    const apart = Math.hypot(left + across * (place & 65535) - x, low + up * (place >>> 16) - y);
+    if (apart <= nearest) [nearest, found] = [apart, words[at]];
+  }
+  clicked = found ?? clicked;
+  return found !== null;
 }
 
 /** Whether the map draws its tags from this stream. */
@@ -128,7 +154,7 @@ function look() {
   const seen = state.mode === "live" ? state.seenBox() : null;
   if (!seen || socket.readyState !== WebSocket.OPEN) return;
   const px = [view.width, view.height].map((value) => Math.max(1, Math.round(value)));
-  const words = JSON.stringify({ view: seen, px, floor: 0, named: [] });
+  const words = JSON.stringify({ view: seen, px, named: clicked === null ? [] : [clicked] });
   const now = performance.now();
   if (words === asked && now - askedMs < ALIVE_MS) return;
   if (words !== asked) since_s = now_s() + state.ping.tripMs / 1e3; // until then messages are of the former view

@@ -128,8 +128,7 @@ export function show() {
   parts.table.rows.show(found);
   parts.table.element.hidden = !found.length;
   parts.empty.hidden = found.length > 0;
-  const none = state.many?.count ? "The tags come in batches: the map shows them, and this list does not." : "No tags yet.";
-  text(parts.empty, list.length ? "No tag is found." : none);
+  text(parts.empty, list.length ? "No tag is found." : "No tags yet.");
   const fresh = list.filter((track) => freshness(track) === "fresh").length;
   text(parts.count, countWords(fresh, list.length, all, filtering() ? found.length : null));
   parts.detail.show(tracks().all.get(state.selection.tag) ?? null);

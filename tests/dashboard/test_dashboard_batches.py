@@ -1,0 +1,118 @@
+"""Tags whose fixes come in batches alone are seen as those of messages: zones, alarms, condition, lists."""
+
+import msgspec
+import pytest
+from dashboard_builders import SITE, SITE_ID, SQUARE, Times, Wire, fix, status
+from msgspec.structs import replace
+
+from skyless.core.alarm_rule import AlarmRule
+from skyless.page._alarms import KEPT_WAIT_S
+from skyless.page._state import Sent
+from skyless.page.condition.evidence import EXPECTED_S, FRESH_S, GRACE_S
+from skyless.page.live import LiveSite
+from skyless.run.fix_batch import FIELDS, fix_of, records_of
+from skyless.run.mqtt import topics
+from skyless.run.mqtt.messages import AlarmMessage, AlarmRulesMessage, ZoneEvent, ZonesMessage
+
+RULES = (AlarmRule("in", "inside", zone=SQUARE.id), AlarmRule("quiet", "silent", after_s=4.0))
+IN_M, OUT_M = (sum(x for x, _ in SQUARE.polygon_m) / 4, 2.5, 1.0), (9.0, 9.0, 1.0)
+
+
+class Dashboard:
+    """One that leads at a site with a zone and rules, and is given fixes in one of both ways."""
+
+    def __init__(self, *, batched):
+        self.times, self.wire, self.batched = Times(), Wire(), batched
+        self.live = LiveSite("here", "mqtt://b:1", SITE, lambda: self.times.now_s, lambda: self.times.unix_s)
+        self.live.attach(self.wire, SITE_ID)
+        self.live.on_connection(connected=True)
+        self.wire.deliver(topics.zones_topic(SITE_ID), ZonesMessage((SQUARE,), SITE.site.name))
+        self.wire.deliver(topics.alarm_rules_topic(SITE_ID), AlarmRulesMessage(RULES, SITE.site.name))
+        self.wire.deliver(topics.status_topic(SITE_ID, "dashboard", "here"), status("dashboard", "here"))
+        self.run(KEPT_WAIT_S + GRACE_S)
+
+    def run(self, seconds, **places):
+        """Pass time, with a fix of each tag that has a place ten times a second."""
+        for _ in range(round(10 * seconds)):
+            self.times.move(0.1)
+            fixes = [fix(name, self.times.unix_s - 0.05, place) for name, place in places.items()]
+            for number, one in enumerate(fixes if self.batched else ()):
+                (record,) = FIELDS.iter_unpack(records_of([(number, one)], simulated=False).tobytes())
+                self.live.on_batched_fix(fix_of(one.tag, record), self.times.now_s)
+            for one in () if self.batched else fixes:
+                self.wire.deliver(topics.fix_topic(SITE_ID, one.tag), one)
+            if self.batched:
+                self.live.on_batches(places, self.times.now_s)
+            self.live.tick()
+
+    def said(self):
+        """Zone events and alarms as published, and the rows of the list."""
+        events, alarms = [], []
+        for topic, payload, _, _ in self.wire.published:
+            if topic == topics.zone_event_topic(SITE_ID, SQUARE.id):
+                event = msgspec.json.decode(payload, type=ZoneEvent)
+                events.append((event.tag, event.kind, round(event.unix_s, 3)))
+            elif topic.endswith("/state") and payload:
+                alarm = msgspec.json.decode(payload, type=AlarmMessage)
+                alarms.append((alarm.rule, alarm.subject, alarm.ended_unix_s is None, round(alarm.unix_s, 1)))
+        rows = msgspec.json.decode(self.live.state.new_state(Sent()))["tags"]
+        return events, alarms, sorted((row[0], *row[1:4], row[9], row[15]) for row in rows)
+
+
+def test_zones_alarms_and_lists_are_those_of_messages():
+    said = []
+    for batched in (False, True):
+        dashboard = Dashboard(batched=batched)
+        dashboard.run(2.0, t1=OUT_M, t2=OUT_M)
+        dashboard.run(2.0, t1=IN_M, t2=OUT_M)
+        assert dashboard.live.condition.tags_with_fix == 2
+        dashboard.run(6.0, t2=OUT_M)
+        assert (dashboard.live.condition.tags, dashboard.live.condition.tags_with_fix) == (2, 1)
+        said.append(dashboard.said())
+    events, alarms, rows = said[0]
+    assert [event[:2] for event in events] == [("t1", "enter"), ("t1", "leave")]
+    assert [alarm[:3] for alarm in alarms] == [("in", "t1", True), ("quiet", "t1", True), ("in", "t1", False)]
+    assert said[1][:2] == (events, alarms)
+    for mine, other in zip(rows, said[1][2], strict=True):
+        assert mine[0] == other[0]
+        assert mine[1:] == pytest.approx(other[1:], abs=1e-3)
+
+
+def test_the_condition_names_tags_that_batches_have_no_longer_and_forgets_them():
+    dashboard = Dashboard(batched=True)
+    dashboard.run(2.0, t1=OUT_M, t2=OUT_M)
+    dashboard.run(FRESH_S + 1.0, t1=OUT_M)
+    condition = dashboard.live.condition
+    found = {reason.kind: reason for reason in condition.reasons}
+    assert "t2" in found["silent"].text
+    assert found["silent"].names == ("tag/t2",)
+    dashboard.live.evidence.batches_connected = False  # silence means nothing
+    dashboard.run(10.0)
+    assert "silent" not in {reason.kind for reason in dashboard.live.condition.reasons}
+    dashboard.live.evidence.batches_connected = True
+    dashboard.run(FRESH_S + 1.0)
+    assert "no-fixes" in {reason.kind for reason in dashboard.live.condition.reasons}
+    dashboard.times.move(EXPECTED_S)
+    dashboard.run(4.0)
+    assert dashboard.live.condition.tags == 0
+
+
+def test_alerts_of_batches_are_reasons():
+    dashboard = Dashboard(batched=True)
+    dashboard.live.on_batched_fix(replace(fix("t1"), alert="alert-limit-exceeded"), dashboard.times.now_s)
+    dashboard.run(1.0)
+    assert "limit" in {reason.kind for reason in dashboard.live.condition.reasons}
+
+
+def test_the_same_fix_in_a_message_and_a_batch_counts_once():
+    dashboard = Dashboard(batched=False)
+    dashboard.run(1.0, t1=OUT_M)
+    serial = dashboard.live.state.serial
+    dashboard.live.on_batched_fix(fix("t1"), dashboard.times.now_s + 0.1)
+    dashboard.live.on_batches(["t1"], dashboard.times.now_s + 0.1)
+    dashboard.run(0.5)
+    assert dashboard.live.state.serial == serial
+    assert dashboard.live.condition.tags == 1
+    dashboard.run(4.0)
+    dashboard.live.on_batched_fix(fix("t1"), dashboard.times.now_s)  # its messages have ended
+    assert dashboard.live.state.serial == serial + 1
