@@ -222,19 +222,15 @@ def test_wrong_settings_are_named(text, words):
         target_of(text)
 
 
-def test_the_domain_is_that_of_ros(monkeypatch, domain):
+async def test_the_domain_is_that_of_ros(monkeypatch, domain):
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-
-    async def drive():
-        target = target_of("ros2://?namespace=of_ros")
-        participant = DomainParticipant(domain)
-        reader = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
-        async with running(target):
-            target.on_site(SITE)
-            names = set()
-            await until(lambda: names.update(one.topic_name for one in reader.take(50)) or "rt/of_ros/anchors" in names)
-
-    asyncio.run(drive())
+    target = target_of("ros2://?namespace=of_ros")
+    participant = DomainParticipant(domain)
+    reader = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
+    async with running(target):
+        target.on_site(SITE)
+        names = set()
+        await until(lambda: names.update(one.topic_name for one in reader.take(50)) or "rt/of_ros/anchors" in names)
 
 
 @pytest.mark.parametrize("number", ["233", "seven", "-1"])

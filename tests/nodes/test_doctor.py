@@ -9,7 +9,6 @@ import allantools
 import numpy as np
 import pytest
 from live_nodes import LiveSite
-from mqtt_brokers import until
 
 from skyless.cli.main import main
 from skyless.cli.nodes.doctor import _report
@@ -21,6 +20,7 @@ from skyless.run.doctor import host
 from skyless.run.doctor.board import BoardProbe
 from skyless.run.doctor.check import Check
 from skyless.run.doctor.clocks import CounterPairs, assumed_deviation, counters_check
+from support.waiting import until
 
 SECOND = round(TICK_RATE_HZ)
 

@@ -11,7 +11,7 @@ import time
 
 import pytest
 from mcap.reader import make_reader
-from mqtt_brokers import Embedded, until
+from mqtt_brokers import Embedded
 from site_programs import START_S, Program
 
 from skyless.cli.main import main
@@ -20,6 +20,7 @@ from skyless.run.keys.key_files import read_keys
 from skyless.run.mqtt.link import Link
 from skyless.sim.compile_ahead import compile_kernels
 from support.processes import free_port
+from support.waiting import until
 
 pytestmark = pytest.mark.site
 

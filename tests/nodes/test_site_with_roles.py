@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from mqtt_brokers import Embedded, until
+from mqtt_brokers import Embedded
 from site_programs import START_S, Program, site_file
 
 from skyless.core.errors import SkylessError
@@ -19,8 +19,8 @@ from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.connection import check_broker
 from skyless.run.mqtt.link import Link
 from skyless.sim.compile_ahead import compile_kernels
-from support.loops import in_loop
 from support.processes import free_port
+from support.waiting import until
 
 pytestmark = pytest.mark.site
 
@@ -54,7 +54,6 @@ def address_of(broker, role, ca):
     return msgspec.structs.replace(broker.address, user=str(role), password=password, ca=ca)
 
 
-@in_loop
 async def test_a_broker_with_another_certificate_gets_no_password(broker, tmp_path):
     await broker.start()
     await check_broker(address_of(broker, Role.TAGS, tmp_path / "certificate.pem"))
