@@ -256,16 +256,13 @@ async def test_more_clients_than_it_serves_are_closed(monkeypatch):
         assert server.dropped == {"too-many-clients": 1}
 
 
-def test_a_port_in_use_is_named():
-    async def run():
-        with socket.socket() as taken:
-            taken.bind(("127.0.0.1", 0))
-            taken.listen()
-            port = taken.getsockname()[1]
-            with pytest.raises(SkylessError, match=f"cannot listen on 127.0.0.1:{port}"):
-                await FoxgloveTarget(f"foxglove://:{port}", "127.0.0.1", port).run()
-
-    asyncio.run(run())
+async def test_a_port_in_use_is_named():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(SkylessError, match=f"cannot listen on 127.0.0.1:{port}"):
+            await FoxgloveTarget(f"foxglove://:{port}", "127.0.0.1", port).run()
 
 
 numbers = st.integers(0, 2**32 - 1)

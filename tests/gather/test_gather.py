@@ -324,7 +324,7 @@ def test_without_a_gather_nothing_of_nats_is_loaded(modules):
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-def test_a_history_of_the_stream_has_each_fix_once_wherever_it_is_killed(tmp_path):
+async def test_a_history_of_the_stream_has_each_fix_once_wherever_it_is_killed(tmp_path):
     """Rows that were taken and not stored are taken again; tags have the history's own numbers."""
     pytest.importorskip("pyarrow")
     from skyless.run.history.layout import FIX_COLUMNS, NAME_COLUMNS, current_files
@@ -349,27 +349,24 @@ def test_a_history_of_the_stream_has_each_fix_once_wherever_it_is_killed(tmp_pat
         writer.journal.close()
         writer._lock.close()
 
-    async def check():
-        async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats):
-            await serving(client)
-            for n in range(30):
-                await publish(client, f"t{n % 3}", n / 1000.0)
-            async with taking(running.nats, 30) as writer:
-                writer.store()
-                writer.write()
-                for n in range(30, 60):
-                    await publish(client, f"t{n % 4}", n / 1000.0)
-                await until(lambda: writer.fixes.taken >= 60)
-                kill(writer)  # before the rest was stored
-            async with taking(running.nats, 30) as writer:
-                writer.store()
-                kill(writer)  # after it was stored, and before it was a file
-            for n in range(60, 70):
-                await publish(client, "t9", n / 1000.0)
-            async with taking(running.nats, 10) as writer:
-                writer.close()
-
-    asyncio.run(check())
+    async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats):
+        await serving(client)
+        for n in range(30):
+            await publish(client, f"t{n % 3}", n / 1000.0)
+        async with taking(running.nats, 30) as writer:
+            writer.store()
+            writer.write()
+            for n in range(30, 60):
+                await publish(client, f"t{n % 4}", n / 1000.0)
+            await until(lambda: writer.fixes.taken >= 60)
+            kill(writer)  # before the rest was stored
+        async with taking(running.nats, 30) as writer:
+            writer.store()
+            kill(writer)  # after it was stored, and before it was a file
+        for n in range(60, 70):
+            await publish(client, "t9", n / 1000.0)
+        async with taking(running.nats, 10) as writer:
+            writer.close()
     names = {
         row["tag"]: row["name"]
         for row in read_table(folder / f"site={SITE}" / "names.parquet", NAME_COLUMNS).to_pylist()

@@ -138,32 +138,28 @@ def test_a_report_has_what_failed_first_and_nothing_that_controls_a_terminal():
 # Boards
 
 
-def examined_board(path, seconds):
+async def examined_board(path, seconds):
     probe = BoardProbe(SerialRadio(str(path), 1_000_000, path.name), None)
     with contextlib.suppress(TimeoutError):
-        asyncio.run(asyncio.wait_for(probe.run(), seconds))
+        await asyncio.wait_for(probe.run(), seconds)
     return probe.checks(NoiseSite())
 
 
 @pytest.mark.site
-def test_a_port_that_is_not_there_is_told_and_so_is_a_device_of_another_kind(tmp_path):
-    (check,) = examined_board(tmp_path / "ttyACM7", 0.5)
+async def test_a_port_that_is_not_there_is_told_and_so_is_a_device_of_another_kind(tmp_path):
+    (check,) = await examined_board(tmp_path / "ttyACM7", 0.5)
     assert check.result == "failed"
     assert "There is no " in check.finding
-
-    async def play():
-        terminal = Pty(tmp_path / "gps")
-        terminal.start(lambda _: None)
-        probe = BoardProbe(SerialRadio(str(tmp_path / "gps"), 9600, "gps"), None)
-        listening = asyncio.ensure_future(probe.run())
-        async with asyncio.timeout(20.0):
-            while "wrong baud rate?" not in probe.checks(NoiseSite())[0].finding:
-                terminal.send(b"$GPGGA,1\r\n\0")
-                await asyncio.sleep(0.1)
-        listening.cancel()
-        return probe.checks(NoiseSite())
-
-    (check,) = asyncio.run(play())
+    terminal = Pty(tmp_path / "gps")
+    terminal.start(lambda _: None)
+    probe = BoardProbe(SerialRadio(str(tmp_path / "gps"), 9600, "gps"), None)
+    listening = asyncio.ensure_future(probe.run())
+    async with asyncio.timeout(20.0):
+        while "wrong baud rate?" not in probe.checks(NoiseSite())[0].finding:
+            terminal.send(b"$GPGGA,1\r\n\0")
+            await asyncio.sleep(0.1)
+    listening.cancel()
+    (check,) = probe.checks(NoiseSite())
     assert check.result == "failed"
     assert "wrong baud rate?" in check.finding
 

@@ -71,7 +71,7 @@ def test_a_shell_reads_the_file_of_a_role(broker, tmp_path):
 
 
 @pytest.mark.statistical
-def test_the_programs_of_a_site_may_do_all_that_they_do(broker, tmp_path):
+async def test_the_programs_of_a_site_may_do_all_that_they_do(broker, tmp_path):
     def program(role, *arguments):
         password = {"SKYLESS_MQTT": f"mqtts://{role}@127.0.0.1:{broker.address.port}"}
         password |= {
@@ -80,38 +80,33 @@ def test_the_programs_of_a_site_may_do_all_that_they_do(broker, tmp_path):
         }
         return Program(*arguments, environment=os.environ | password)
 
-    async def check():
-        site, air = ("--site", site_file(tmp_path)), f"127.0.0.1:{free_port()}"
-        mqtts = ("--mqtt", f"mqtts://survey@127.0.0.1:{broker.address.port}")
-        programs = [
-            program(Role.ANCHORS, "ether", *site, "--tags", 1, "--listen", air),
-            program(Role.ANCHORS, "anchor", *range(1, 8), *site, "--radio", f"ether:{air}"),
-            program(Role.TAGS, "tag", "tag1", "--radio", f"ether:{air}"),
-            program(Role.PAGE, "dashboard", "--listen", f"127.0.0.1:{free_port()}"),
-            program(Role.PAGE, "record", tmp_path / "walk.mcap"),
-            program(Role.SURVEY, "survey", "--serve", *mqtts, "--mqtt-ca", tmp_path / "certificate.pem"),
-            program(Role.PAGE, "bridge", f"jsonl+tcp://127.0.0.1:{free_port()}"),
-        ]
-        await broker.start()
-        seen = set()
-        observer = Link(
-            address_of(broker, Role.OPERATOR, tmp_path / "certificate.pem"), "observer", site=77, kind="watch"
-        )
-        observer.subscribe(f"{SITE}#", lambda topic, _: seen.add(topic.removeprefix(SITE)))
-        watching = asyncio.ensure_future(observer.run())
-        await until(lambda: observer.connected)
-        try:
-            await asyncio.gather(*(program.start() for program in programs))
-            await until(lambda: kinds(seen) >= EXPECTED, START_S)
-        finally:
-            await asyncio.gather(*(program.stop() for program in programs))
-            watching.cancel()
-            await asyncio.wait([watching])
-            await broker.stop()
-        return [line for program in programs for _, line in program.said]
-
     compile_kernels()
-    lines = asyncio.run(check())
+    site, air = ("--site", site_file(tmp_path)), f"127.0.0.1:{free_port()}"
+    mqtts = ("--mqtt", f"mqtts://survey@127.0.0.1:{broker.address.port}")
+    programs = [
+        program(Role.ANCHORS, "ether", *site, "--tags", 1, "--listen", air),
+        program(Role.ANCHORS, "anchor", *range(1, 8), *site, "--radio", f"ether:{air}"),
+        program(Role.TAGS, "tag", "tag1", "--radio", f"ether:{air}"),
+        program(Role.PAGE, "dashboard", "--listen", f"127.0.0.1:{free_port()}"),
+        program(Role.PAGE, "record", tmp_path / "walk.mcap"),
+        program(Role.SURVEY, "survey", "--serve", *mqtts, "--mqtt-ca", tmp_path / "certificate.pem"),
+        program(Role.PAGE, "bridge", f"jsonl+tcp://127.0.0.1:{free_port()}"),
+    ]
+    await broker.start()
+    seen = set()
+    observer = Link(address_of(broker, Role.OPERATOR, tmp_path / "certificate.pem"), "observer", site=77, kind="watch")
+    observer.subscribe(f"{SITE}#", lambda topic, _: seen.add(topic.removeprefix(SITE)))
+    watching = asyncio.ensure_future(observer.run())
+    await until(lambda: observer.connected)
+    try:
+        await asyncio.gather(*(program.start() for program in programs))
+        await until(lambda: kinds(seen) >= EXPECTED, START_S)
+    finally:
+        await asyncio.gather(*(program.stop() for program in programs))
+        watching.cancel()
+        await asyncio.wait([watching])
+        await broker.stop()
+    lines = [line for program in programs for _, line in program.said]
     assert not [line for line in lines if "does not let" in line or "refuses" in line]
     assert "Violation" not in (tmp_path / "store" / "nats-server.log").read_text(encoding="utf-8")
 

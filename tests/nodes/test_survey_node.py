@@ -274,34 +274,31 @@ async def test_a_second_survey_names_the_sites_before_it(monkeypatch):
     assert stage.node.saved.written == ()  # there is no file
 
 
-def test_what_cannot_be_saved_is_said_and_changes_nothing(monkeypatch, tmp_path):
-    async def main():
-        file = tmp_path / "lab.toml"
-        file.write_text(TEXT, encoding="utf-8")
-        stage = Stage(monkeypatch, site=load_site(file), file=file)
+async def test_what_cannot_be_saved_is_said_and_changes_nothing(monkeypatch, tmp_path):
+    file = tmp_path / "lab.toml"
+    file.write_text(TEXT, encoding="utf-8")
+    stage = Stage(monkeypatch, site=load_site(file), file=file)
 
-        def refused(serial):
-            stage.link.receive(topics.survey_save_topic(1), SurveySaveMessage("page", serial))
-            assert stage.link.newest(PlacementMessage) is None
-            return stage.link.newest(SurveyMessage).error
+    def refused(serial):
+        stage.link.receive(topics.survey_save_topic(1), SurveySaveMessage("page", serial))
+        assert stage.link.newest(PlacementMessage) is None
+        return stage.link.newest(SurveyMessage).error
 
-        assert "result 1 is not there" in refused(1)
-        stage.found = true_survey(())
-        await stage.play(0.0, 3.0)
-        assert "determines no anchor" in refused(stage.node.live.serial)
-        stage.found = true_survey()
-        await stage.play(3.0, 6.0)
-        stage.link.receive(topics.site_topic(1), SiteMessage(SITE, True, 0.0))
-        assert "another site" in refused(stage.node.live.serial)
-        stage.link.receive(topics.site_topic(1), SiteMessage(load_site(file), True, 0.0))
-        file.write_text(TEXT.replace('mode = "free"', 'mode = "free"\nrate_hz = 20.0'), encoding="utf-8")
-        changed = file.read_text(encoding="utf-8")
-        assert "has been changed" in refused(stage.node.live.serial)
-        assert file.read_text(encoding="utf-8") == changed
-        file.write_text("nonsense", encoding="utf-8")
-        assert str(file) in refused(stage.node.live.serial)
-
-    asyncio.run(main())
+    assert "result 1 is not there" in refused(1)
+    stage.found = true_survey(())
+    await stage.play(0.0, 3.0)
+    assert "determines no anchor" in refused(stage.node.live.serial)
+    stage.found = true_survey()
+    await stage.play(3.0, 6.0)
+    stage.link.receive(topics.site_topic(1), SiteMessage(SITE, True, 0.0))
+    assert "another site" in refused(stage.node.live.serial)
+    stage.link.receive(topics.site_topic(1), SiteMessage(load_site(file), True, 0.0))
+    file.write_text(TEXT.replace('mode = "free"', 'mode = "free"\nrate_hz = 20.0'), encoding="utf-8")
+    changed = file.read_text(encoding="utf-8")
+    assert "has been changed" in refused(stage.node.live.serial)
+    assert file.read_text(encoding="utf-8") == changed
+    file.write_text("nonsense", encoding="utf-8")
+    assert str(file) in refused(stage.node.live.serial)
 
 
 async def test_a_solver_that_fails_is_reported_and_asked_again(monkeypatch):
