@@ -7,8 +7,6 @@ and ``b_m`` in metres, and ``tdoa_m``, the range to b less the range to a. The s
     skyless simulate --scenario room --estimator own_estimator.py:Filter
 """
 
-from collections import deque
-
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -16,17 +14,18 @@ import skyless
 
 
 class LeastSquares:
-    """The position that fits the newest 60 differences, at the height of 1.2 m."""
+    """The position that fits 60 differences, at the height of 1.2 m."""
 
     def __init__(self):
-        self.newest = deque(maxlen=60)
+        self.heard = []
 
     def hear(self, one):
         """Process one observation."""
-        self.newest.append(one)
-        if len(self.newest) < self.newest.maxlen:
+        self.heard.append(one)
+        if len(self.heard) < 60:
             return None
-        a_m, b_m, tdoa_m = (np.array([getattr(o, name) for o in self.newest]) for name in ("a_m", "b_m", "tdoa_m"))
+        a_m, b_m, tdoa_m = (np.array([getattr(o, name) for o in self.heard]) for name in ("a_m", "b_m", "tdoa_m"))
+        self.heard.clear()
         ranges = lambda p, anchors_m: np.linalg.norm(np.append(p, 1.2) - anchors_m, axis=1)  # noqa: E731
         found = least_squares(lambda p: ranges(p, b_m) - ranges(p, a_m) - tdoa_m, a_m.mean(axis=0)[:2])
         return skyless.Fix.of(one.time_s, [*found.x, 1.2])

@@ -22,6 +22,7 @@ from skyless.bridges.target import BridgeContext
 from skyless.bridges.targets import open_route
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt.messages import AlarmMessage
+from support.waiting import until
 
 ALARM = AlarmMessage(
     "cold/t1/1795000000000", "cold", "Too long in the cold store", "inside", "critical", "t1",
@@ -41,12 +42,6 @@ def open_target(text, log=lambda _line: None):
     route = open_route(text, BridgeContext(log))
     route.target.on_site(SITE)
     return route.target
-
-
-async def until(condition, limit_s=20.0):
-    async with asyncio.timeout(limit_s):
-        while not condition():
-            await asyncio.sleep(0.005)
 
 
 def deliver(target, alarms, condition):

@@ -28,6 +28,7 @@ from skyless.core.earth import geodetic
 from skyless.core.errors import SkylessError
 from skyless.core.site import WallSite
 from skyless.run.mqtt.messages import Zone
+from support.waiting import until
 
 SITE = BridgedSite(
     1, "hall", simulated=False, anchors_m={1: (0.0, 0.0, 2.0), 2: (6.0, 0.0, 2.0)}, georeference=HALL, master=1,
@@ -44,9 +45,7 @@ async def served(site=SITE):
         server.on_site(site)
     running = asyncio.create_task(server.run())
     try:
-        async with asyncio.timeout(ANSWER_S):
-            while server.port == 0:
-                await asyncio.sleep(0.001)
+        await until(lambda: server.port)
         yield server
     finally:
         running.cancel()
@@ -141,114 +140,92 @@ def test_a_client_gets_each_form_of_a_fix(subprotocol):
         assert found[name].keys() == schema["properties"].keys()
 
 
-def test_a_client_of_another_protocol_is_refused():
-    async def run():
-        async with served() as server:
-            for subprotocols in (["x-something-else"], []):
-                with pytest.raises(InvalidHandshake):
-                    async with client_of(server, subprotocols):
-                        pass
-
-    asyncio.run(run())
+async def test_a_client_of_another_protocol_is_refused():
+    async with served() as server:
+        for subprotocols in (["x-something-else"], []):
+            with pytest.raises(InvalidHandshake):
+                async with client_of(server, subprotocols):
+                    pass
 
 
-def test_without_a_georeference_there_is_no_location():
-    async def run():
-        async with served(msgspec.structs.replace(SITE, georeference=None)) as server, client_of(server) as client:
-            server.on_fix(FIX)
-            await client.text(advertised("/tag/tag1/ellipse"))
-            assert set(client.channels) == {
-                "/site/scene",
-                "/tf",
-                "/tag/tag1/fix",
-                "/tag/tag1/pose",
-                "/tag/tag1/ellipse",
-            }
-
-    asyncio.run(run())
+async def test_without_a_georeference_there_is_no_location():
+    async with served(msgspec.structs.replace(SITE, georeference=None)) as server, client_of(server) as client:
+        server.on_fix(FIX)
+        await client.text(advertised("/tag/tag1/ellipse"))
+        assert set(client.channels) == {
+            "/site/scene",
+            "/tf",
+            "/tag/tag1/fix",
+            "/tag/tag1/pose",
+            "/tag/tag1/ellipse",
+        }
 
 
-def test_what_cannot_be_done_is_answered_with_a_status_and_costs_nothing():
-    async def run():
-        async with served() as server, client_of(server) as client:
-            for request in (
-                {"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 77}]},
-                {"op": "subscribe", "subscriptions": [{"id": -1, "channelId": 1}]},
-                {"op": "advertise", "channels": []},
-                {"op": "getParameters", "parameterNames": []},
-            ):
-                client.texts.clear()
-                await client.ask(**request)
-                assert (await client.text(is_status))["level"] == 1
-            await client.ask(op="subscribe", subscriptions=[{"id": 5, "channelId": 1}])
-            assert (await client.receive())[0] == 5
+async def test_what_cannot_be_done_is_answered_with_a_status_and_costs_nothing():
+    async with served() as server, client_of(server) as client:
+        for request in (
+            {"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 77}]},
+            {"op": "subscribe", "subscriptions": [{"id": -1, "channelId": 1}]},
+            {"op": "advertise", "channels": []},
+            {"op": "getParameters", "parameterNames": []},
+        ):
             client.texts.clear()
-            await client.ask(op="subscribe", subscriptions=[{"id": 6, "channelId": 1}])
-            await client.text(is_status)
-            await client.ask(op="unsubscribe", subscriptionIds=[5])
-            await client.ask(op="subscribe", subscriptions=[{"id": 6, "channelId": 1}])
-            assert (await client.receive())[0] == 6
-            assert server.dropped == {"request-not-understood": 5}
-
-    asyncio.run(run())
-
-
-def test_figures_that_no_tag_publishes_are_dropped():
-    async def run():
-        async with served() as server, client_of(server) as client:
-            server.on_fix(FIX)
-            await client.text(advertised("/tag/tag1/location"))
-            wanted = [{"id": channel["id"], "channelId": channel["id"]} for channel in client.channels.values()]
-            await client.ask(op="subscribe", subscriptions=wanted)
-            await client.receive()
-            await until(lambda: all(one.wants(number["id"]) for one in server._sessions for number in wanted))
-            for unix_s in (float("nan"), float("inf"), -1.0, 1e30):
-                server.on_fix(msgspec.structs.replace(FIX, unix_s=unix_s))
-            server.on_fix(msgspec.structs.replace(FIX, position_m=(1e300, 1e300, 1e300), covariance_m2=(1e308,) * 9))
-            server.on_fix(FIX)
-            while (await client.receive())[1] != round(FIX.unix_s * 1e9):
-                pass
-            assert server.dropped["out-of-range"] >= 4 * 5
-
-    asyncio.run(run())
+            await client.ask(**request)
+            assert (await client.text(is_status))["level"] == 1
+        await client.ask(op="subscribe", subscriptions=[{"id": 5, "channelId": 1}])
+        assert (await client.receive())[0] == 5
+        client.texts.clear()
+        await client.ask(op="subscribe", subscriptions=[{"id": 6, "channelId": 1}])
+        await client.text(is_status)
+        await client.ask(op="unsubscribe", subscriptionIds=[5])
+        await client.ask(op="subscribe", subscriptions=[{"id": 6, "channelId": 1}])
+        assert (await client.receive())[0] == 6
+        assert server.dropped == {"request-not-understood": 5}
 
 
-def test_a_client_that_never_reads_is_disconnected_and_others_get_every_fix(monkeypatch):
+async def test_figures_that_no_tag_publishes_are_dropped():
+    async with served() as server, client_of(server) as client:
+        server.on_fix(FIX)
+        await client.text(advertised("/tag/tag1/location"))
+        wanted = [{"id": channel["id"], "channelId": channel["id"]} for channel in client.channels.values()]
+        await client.ask(op="subscribe", subscriptions=wanted)
+        await client.receive()
+        await until(lambda: all(one.wants(number["id"]) for one in server._sessions for number in wanted))
+        for unix_s in (float("nan"), float("inf"), -1.0, 1e30):
+            server.on_fix(msgspec.structs.replace(FIX, unix_s=unix_s))
+        server.on_fix(msgspec.structs.replace(FIX, position_m=(1e300, 1e300, 1e300), covariance_m2=(1e308,) * 9))
+        server.on_fix(FIX)
+        while (await client.receive())[1] != round(FIX.unix_s * 1e9):
+            pass
+        assert server.dropped["out-of-range"] >= 4 * 5
+
+
+async def test_a_client_that_never_reads_is_disconnected_and_others_get_every_fix(monkeypatch):
     monkeypatch.setattr(foxglove, "STUCK_S", 0.2)
     fixes = 6000
-
-    async def run():
-        async with served() as server, client_of(server) as client:
+    async with served() as server, client_of(server) as client:
+        server.on_fix(FIX)
+        await client.text(advertised("/tag/tag1/location"))
+        _, writer = await asyncio.open_connection(
+            sock=await stuck_socket(server.port, [channel["id"] for channel in client.channels.values()])
+        )
+        number = client.channels["/tag/tag1/pose"]["id"]
+        await client.ask(op="subscribe", subscriptions=[{"id": 1, "channelId": number}])
+        await until(lambda: sum(one.wants(number) for one in server._sessions) == 2)
+        got = 0
+        for serial in range(fixes):
+            server.on_fix(msgspec.structs.replace(FIX, serial=serial, unix_s=FIX.unix_s + 0.001 * serial))
+            _, time_ns, _ = await client.receive()
+            got += time_ns == round((FIX.unix_s + 0.001 * serial) * 1e9)
+            if len(server._sessions) == 1 and serial > fixes // 2:
+                break
+        else:
+            await asyncio.sleep(0.3)
             server.on_fix(FIX)
-            await client.text(advertised("/tag/tag1/location"))
-            _, writer = await asyncio.open_connection(
-                sock=await stuck_socket(server.port, [channel["id"] for channel in client.channels.values()])
-            )
-            number = client.channels["/tag/tag1/pose"]["id"]
-            await client.ask(op="subscribe", subscriptions=[{"id": 1, "channelId": number}])
-            await until(lambda: sum(one.wants(number) for one in server._sessions) == 2)
-            got = 0
-            for serial in range(fixes):
-                server.on_fix(msgspec.structs.replace(FIX, serial=serial, unix_s=FIX.unix_s + 0.001 * serial))
-                _, time_ns, _ = await client.receive()
-                got += time_ns == round((FIX.unix_s + 0.001 * serial) * 1e9)
-                if len(server._sessions) == 1 and serial > fixes // 2:
-                    break
-            else:
-                await asyncio.sleep(0.3)
-                server.on_fix(FIX)
-            await until(lambda: len(server._sessions) == 1)
-            writer.close()
-            assert got == serial + 1
-            assert server.dropped["slow-client"] > 0
-
-    asyncio.run(run())
-
-
-async def until(condition):
-    async with asyncio.timeout(ANSWER_S):
-        while not condition():
-            await asyncio.sleep(0.005)
+        await until(lambda: len(server._sessions) == 1)
+        writer.close()
+        assert got == serial + 1
+        assert server.dropped["slow-client"] > 0
 
 
 async def stuck_socket(port, channels):
@@ -269,30 +246,23 @@ async def stuck_socket(port, channels):
     return sock
 
 
-def test_more_clients_than_it_serves_are_closed(monkeypatch):
+async def test_more_clients_than_it_serves_are_closed(monkeypatch):
     monkeypatch.setattr(foxglove, "MAX_CLIENTS", 1)
-
-    async def run():
-        async with served() as server, client_of(server) as first:
-            await first.text(lambda text: text["op"] == "serverInfo")
-            async with client_of(server) as second:
-                with pytest.raises(ConnectionClosed):
-                    await second.receive()
-            assert server.dropped == {"too-many-clients": 1}
-
-    asyncio.run(run())
+    async with served() as server, client_of(server) as first:
+        await first.text(lambda text: text["op"] == "serverInfo")
+        async with client_of(server) as second:
+            with pytest.raises(ConnectionClosed):
+                await second.receive()
+        assert server.dropped == {"too-many-clients": 1}
 
 
-def test_a_port_in_use_is_named():
-    async def run():
-        with socket.socket() as taken:
-            taken.bind(("127.0.0.1", 0))
-            taken.listen()
-            port = taken.getsockname()[1]
-            with pytest.raises(SkylessError, match=f"cannot listen on 127.0.0.1:{port}"):
-                await FoxgloveTarget(f"foxglove://:{port}", "127.0.0.1", port).run()
-
-    asyncio.run(run())
+async def test_a_port_in_use_is_named():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(SkylessError, match=f"cannot listen on 127.0.0.1:{port}"):
+            await FoxgloveTarget(f"foxglove://:{port}", "127.0.0.1", port).run()
 
 
 numbers = st.integers(0, 2**32 - 1)

@@ -65,83 +65,74 @@ async def until(condition):
         await asyncio.sleep(0.01)
 
 
-def test_fixes_arrive_in_order_also_where_the_reader_comes_later(domain):
-    async def drive():
-        target = target_of(f"ros2://?domain={domain}")
-        participant = DomainParticipant(domain)
-        found = []
-        async with running(target):
-            target.on_site(SITE)
-            serial = 0
-            for _ in range(2):
-                reader = reader_of(participant, "rt/skyless/tag1/pose", POSE)
-                stamps = []
+async def test_fixes_arrive_in_order_also_where_the_reader_comes_later(domain):
+    target = target_of(f"ros2://?domain={domain}")
+    participant = DomainParticipant(domain)
+    found = []
+    async with running(target):
+        target.on_site(SITE)
+        serial = 0
+        for _ in range(2):
+            reader = reader_of(participant, "rt/skyless/tag1/pose", POSE)
+            stamps = []
 
-                def more(reader=reader, stamps=stamps):
-                    nonlocal serial
-                    serial += 1
-                    target.on_fix(a_fix(unix_s=1000.0 + serial, position_m=(serial, 2.0, 3.0)))
-                    for one in reader.take(100):
-                        assert one.pose.pose.position.x == one.header.stamp.sec - 1000.0
-                        stamps.append(one.header.stamp.sec)
-                    return len(stamps) >= 10
+            def more(reader=reader, stamps=stamps):
+                nonlocal serial
+                serial += 1
+                target.on_fix(a_fix(unix_s=1000.0 + serial, position_m=(serial, 2.0, 3.0)))
+                for one in reader.take(100):
+                    assert one.pose.pose.position.x == one.header.stamp.sec - 1000.0
+                    stamps.append(one.header.stamp.sec)
+                return len(stamps) >= 10
 
-                await until(more)
-                assert stamps == sorted(set(stamps))  # a starved reader may miss some: writers keep the last ten
-                found += stamps
-        return found, target.dropped
-
-    found, dropped = asyncio.run(drive())
+            await until(more)
+            assert stamps == sorted(set(stamps))  # a starved reader may miss some: writers keep the last ten
+            found += stamps
+    dropped = target.dropped
     assert len(found) >= 20
     assert not dropped
 
 
-def test_anchors_last_and_writers_name_their_types_hash(domain):
-    async def drive():
-        target = target_of(f"ros2://?domain={domain}&namespace=hall&frame=map&tf=yes")
-        participant = DomainParticipant(domain)
-        async with running(target):
-            target.on_site(SITE)
-            target.on_fix(a_fix())
-            publications = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
-            known = {}
-
-            def all_known():
-                known.update({one.topic_name: one for one in publications.take(100) if one.sample_info.valid_data})
-                return {"rt/hall/anchors", "rt/hall/tag1/fix", "rt/tf"} <= known.keys()
-
-            await until(all_known)
-            pose = known["rt/hall/tag1/pose"]
-            assert pose.type_name == "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_"
-            assert pose.qos[Policy.Userdata].data == f"typehash={DDS_TYPES.hash(POSE)};".encode()
-            assert pose.qos[Policy.Durability] == Policy.Durability.Volatile
-            late = reader_of(participant, "rt/hall/anchors", MARKERS, Policy.Durability.TransientLocal)
-            read = []
-            await until(lambda: read.extend(late.take(10)) or read)
-            assert len(read[0].markers) == 2 * len(SITE.anchors_m)
-
-    asyncio.run(drive())
-
-
-def test_the_writers_are_gone_once_the_target_has_ended(domain):
-    async def drive():
-        target = target_of(f"ros2://?domain={domain}&namespace=for_a_while")
-        participant = DomainParticipant(domain)
+async def test_anchors_last_and_writers_name_their_types_hash(domain):
+    target = target_of(f"ros2://?domain={domain}&namespace=hall&frame=map&tf=yes")
+    participant = DomainParticipant(domain)
+    async with running(target):
+        target.on_site(SITE)
+        target.on_fix(a_fix())
         publications = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
-        ours = {}
+        known = {}
 
-        def seen():
-            for one in publications.take(100):
-                if one.topic_name == "rt/for_a_while/anchors" if one.sample_info.valid_data else one.key in ours:
-                    ours[one.key] = one.sample_info.valid_data
-            return list(ours.values())
+        def all_known():
+            known.update({one.topic_name: one for one in publications.take(100) if one.sample_info.valid_data})
+            return {"rt/hall/anchors", "rt/hall/tag1/fix", "rt/tf"} <= known.keys()
 
-        async with running(target):
-            target.on_site(SITE)
-            await until(lambda: seen() == [True])
-        await until(lambda: seen() == [False])
+        await until(all_known)
+        pose = known["rt/hall/tag1/pose"]
+        assert pose.type_name == "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_"
+        assert pose.qos[Policy.Userdata].data == f"typehash={DDS_TYPES.hash(POSE)};".encode()
+        assert pose.qos[Policy.Durability] == Policy.Durability.Volatile
+        late = reader_of(participant, "rt/hall/anchors", MARKERS, Policy.Durability.TransientLocal)
+        read = []
+        await until(lambda: read.extend(late.take(10)) or read)
+        assert len(read[0].markers) == 2 * len(SITE.anchors_m)
 
-    asyncio.run(drive())
+
+async def test_the_writers_are_gone_once_the_target_has_ended(domain):
+    target = target_of(f"ros2://?domain={domain}&namespace=for_a_while")
+    participant = DomainParticipant(domain)
+    publications = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
+    ours = {}
+
+    def seen():
+        for one in publications.take(100):
+            if one.topic_name == "rt/for_a_while/anchors" if one.sample_info.valid_data else one.key in ours:
+                ours[one.key] = one.sample_info.valid_data
+        return list(ours.values())
+
+    async with running(target):
+        target.on_site(SITE)
+        await until(lambda: seen() == [True])
+    await until(lambda: seen() == [False])
 
 
 class StuckPublisher:
@@ -158,26 +149,23 @@ class StuckPublisher:
         self.written.append(message)
 
 
-def test_dds_that_waits_holds_nobody_up_and_loses_the_oldest():
-    async def drive():
-        publisher = StuckPublisher()
-        target = Ros2Target("ros2://", publisher, RosSettings(), BridgeContext(print))
-        async with running(target):
-            target.on_site(BARE_SITE)
-            await until(target._waiting.empty)  # the thread waits in the first write
-            for serial in range(2000):
-                target.on_fix(a_fix(velocity_mps=None, unix_s=float(serial)))
-            publisher.go_on.set()
-            await until(target._waiting.empty)
-        return publisher.written, target.dropped
-
-    written, dropped = asyncio.run(drive())
+async def test_dds_that_waits_holds_nobody_up_and_loses_the_oldest():
+    publisher = StuckPublisher()
+    target = Ros2Target("ros2://", publisher, RosSettings(), BridgeContext(print))
+    async with running(target):
+        target.on_site(BARE_SITE)
+        await until(target._waiting.empty)  # the thread waits in the first write
+        for serial in range(2000):
+            target.on_fix(a_fix(velocity_mps=None, unix_s=float(serial)))
+        publisher.go_on.set()
+        await until(target._waiting.empty)
+    written, dropped = publisher.written, target.dropped
     assert dropped == {"slow-dds": 1500}
     assert len(written) == 501  # the anchors and the newest fixes
     assert [one.data[4:8] for one in written[1:]] == [serial.to_bytes(4, "little") for serial in range(1500, 2000)]
 
 
-def test_a_fault_of_dds_is_counted_and_logged_once_for_each_topic():
+async def test_a_fault_of_dds_is_counted_and_logged_once_for_each_topic():
     class Broken:
         def write(self, message):
             raise OSError("no memory")
@@ -185,17 +173,13 @@ def test_a_fault_of_dds_is_counted_and_logged_once_for_each_topic():
         def close(self):
             pass
 
-    async def drive():
-        said = []
-        target = Ros2Target("ros2://", Broken(), RosSettings(), BridgeContext(said.append))
-        async with running(target):
-            target.on_site(SITE)
-            for _ in range(10):
-                target.on_fix(a_fix())
-            await until(lambda: target.dropped["not-sent"] == 31)
-        return said
-
-    said = asyncio.run(drive())
+    said = []
+    target = Ros2Target("ros2://", Broken(), RosSettings(), BridgeContext(said.append))
+    async with running(target):
+        target.on_site(SITE)
+        for _ in range(10):
+            target.on_fix(a_fix())
+        await until(lambda: target.dropped["not-sent"] == 31)
     assert [line.split(" ")[1] for line in said] == [
         "/skyless/anchors",
         "/skyless/tag1/pose",
@@ -222,19 +206,15 @@ def test_wrong_settings_are_named(text, words):
         target_of(text)
 
 
-def test_the_domain_is_that_of_ros(monkeypatch, domain):
+async def test_the_domain_is_that_of_ros(monkeypatch, domain):
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-
-    async def drive():
-        target = target_of("ros2://?namespace=of_ros")
-        participant = DomainParticipant(domain)
-        reader = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
-        async with running(target):
-            target.on_site(SITE)
-            names = set()
-            await until(lambda: names.update(one.topic_name for one in reader.take(50)) or "rt/of_ros/anchors" in names)
-
-    asyncio.run(drive())
+    target = target_of("ros2://?namespace=of_ros")
+    participant = DomainParticipant(domain)
+    reader = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
+    async with running(target):
+        target.on_site(SITE)
+        names = set()
+        await until(lambda: names.update(one.topic_name for one in reader.take(50)) or "rt/of_ros/anchors" in names)
 
 
 @pytest.mark.parametrize("number", ["233", "seven", "-1"])

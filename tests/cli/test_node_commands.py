@@ -73,6 +73,13 @@ def test_anchors_of_a_site_that_relays_phases_ask_their_radios_for_them(key, pha
         ("ether --move 4=1,0@0", "the time after @ should be more than 0 s"),
         ("demo --mqtt none", "the demo needs a broker"),
         ("record --mqtt none", "it should be the broker of the site to record"),
+        ("doctor --radio ether:127.0.0.1", "it should be a board, serial:PATH[@BAUD]"),
+        ("doctor --radio serial:/dev/null@x", "PATH@BAUD"),
+        ("doctor --radio serial:", "it should name one port"),
+        ("doctor --site none.toml", "none.toml"),
+        ("doctor --duration 0", "--duration"),
+        ("doctor --report /nowhere/x.md", "it should be a file in a folder that exists"),
+        ("watch --mqtt none", "it should be the broker of the site to watch"),
     ],
 )
 def test_wrong_input_is_told_with_what_would_be_right(command, right, capsys):

@@ -84,14 +84,15 @@ def test_a_broker_without_any_is_given_the_files(start, file, wire, times):
     assert len(kept(wire)) == 1
 
 
-def test_what_the_broker_has_comes_before_the_file(start, file, wire, times):
+@pytest.mark.parametrize("assets", [(PALLET,), ()])
+def test_what_the_broker_has_comes_before_the_file(start, file, wire, times, assets):
     file.write_bytes(write_csv([FORKLIFT]))
     live = start(file)
-    wire.deliver(TOPIC, AssetsMessage((PALLET,), NAME))
+    wire.deliver(TOPIC, AssetsMessage(assets, NAME))
     settle(live, times)
     assert kept(wire) == []
-    assert live.assets.by_tag == {"t2": PALLET}
-    assert read_csv(file.read_bytes()) == (PALLET,)
+    assert live.assets.by_tag == {one.tag: one for one in assets}
+    assert read_csv(file.read_bytes()) == assets
     assert read_csv((file.parent / "assets.csv.old").read_bytes()) == (FORKLIFT,)
 
 
@@ -115,16 +116,6 @@ def test_assets_that_come_before_their_site_is_known_are_written(times, wire, fi
     assert not file.exists()
     wire.deliver(topics.site_topic(SITE_ID), SITE)
     assert read_csv(file.read_bytes()) == (PALLET,)
-
-
-def test_an_empty_list_of_the_broker_comes_before_the_file(start, file, wire, times):
-    file.write_bytes(write_csv([FORKLIFT]))
-    live = start(file)
-    wire.deliver(TOPIC, AssetsMessage((), NAME))
-    settle(live, times)
-    assert kept(wire) == []
-    assert read_csv(file.read_bytes()) == ()
-    assert read_csv((file.parent / "assets.csv.old").read_bytes()) == (FORKLIFT,)
 
 
 def test_a_file_that_cannot_be_written_costs_no_change(start, file, caplog):

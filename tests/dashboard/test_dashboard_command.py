@@ -146,35 +146,31 @@ def test_the_server_loads_nothing_heavy():
 
 
 @pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nHost: localhost\r\n"])
-def test_a_request_that_is_never_finished_is_ended(sent):
+async def test_a_request_that_is_never_finished_is_ended(sent):
     async def slow(_request):
         await asyncio.sleep(1.0)
         return PlainTextResponse("done")
 
-    async def run():
-        port = free_port()
-        config = uvicorn.Config(Starlette(routes=[Route("/", slow)]), port=port, log_config=None, lifespan="off")
-        server = _Server(config)
-        serving = asyncio.create_task(server.serve())
-        while not server.started:
-            await asyncio.sleep(0.01)
-        ending = asyncio.create_task(server.end_unfinished(0.2))
-        idle_reader, idle_writer = await asyncio.open_connection("127.0.0.1", port, family=socket.AF_INET)
-        idle_writer.write(sent)
-        reader, writer = await asyncio.open_connection("127.0.0.1", port, family=socket.AF_INET)
-        writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
-        async with asyncio.timeout(20.0):
-            try:
-                ended = await idle_reader.read()
-            except ConnectionResetError:
-                ended = b""
-            answer = await reader.read()
-        ending.cancel()
-        server.should_exit = True
-        await serving
-        return ended, answer
-
-    ended, answer = asyncio.run(run())
+    port = free_port()
+    config = uvicorn.Config(Starlette(routes=[Route("/", slow)]), port=port, log_config=None, lifespan="off")
+    server = _Server(config)
+    serving = asyncio.create_task(server.serve())
+    while not server.started:
+        await asyncio.sleep(0.01)
+    ending = asyncio.create_task(server.end_unfinished(0.2))
+    idle_reader, idle_writer = await asyncio.open_connection("127.0.0.1", port, family=socket.AF_INET)
+    idle_writer.write(sent)
+    reader, writer = await asyncio.open_connection("127.0.0.1", port, family=socket.AF_INET)
+    writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+    async with asyncio.timeout(20.0):
+        try:
+            ended = await idle_reader.read()
+        except ConnectionResetError:
+            ended = b""
+        answer = await reader.read()
+    ending.cancel()
+    server.should_exit = True
+    await serving
     assert ended == b""
     assert answer.endswith(b"done")
 

@@ -24,7 +24,6 @@ from skyless.run.broker import BrokerSettings, start_broker
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import ZonesMessage
-from support.loops import in_loop
 from support.processes import SKYLESS, free_port, running_program
 
 pytestmark = pytest.mark.site
@@ -90,7 +89,6 @@ async def settled(condition):
             await asyncio.sleep(0.01)
 
 
-@in_loop
 @pytest.mark.statistical
 async def test_a_site_is_found_shown_and_watched(tmp_path):
     where = BrokerSettings(port=free_port(), data=tmp_path / "broker")
@@ -137,7 +135,6 @@ async def test_a_site_is_found_shown_and_watched(tmp_path):
     await broker.stop()
 
 
-@in_loop
 @pytest.mark.statistical
 async def test_a_page_that_does_not_read_delays_no_other(tmp_path):
     settings = BrokerSettings(port=free_port(), data=tmp_path / "broker")
@@ -178,7 +175,6 @@ async def never_read(port):
     return sock
 
 
-@in_loop
 async def test_without_a_broker_the_page_opens_and_shows_it():
     nobody = f"mqtt://127.0.0.1:{free_port()}"
     async with dashboard("--mqtt", nobody) as (output, _), live_page(output) as page:
@@ -216,7 +212,6 @@ def test_idle_connections_shut_nobody_out_and_a_page_too_many_gets_the_reason(li
     asyncio.run(asyncio.wait_for(check(), 60.0))
 
 
-@in_loop
 async def test_other_machines_need_the_token_that_is_printed():
     async with dashboard("--listen", f"0.0.0.0:{free_port()}") as (output, _):
         address = httpx.URL(output["page"])

@@ -20,7 +20,6 @@ from skyless.run.assets import read_csv
 from skyless.run.broker import BrokerSettings, start_broker
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.link import Link
-from support.loops import in_loop
 from support.processes import SKYLESS, free_port, running_program
 
 pytestmark = pytest.mark.site
@@ -80,7 +79,6 @@ async def first_lines(page, file, text, *command):
         return [(await asyncio.wait_for(process.stdout.readline(), PATIENCE_S)).decode() for _ in range(3)]
 
 
-@in_loop
 async def test_clients_of_a_running_server(tmp_path, monkeypatch):
     file = tmp_path / "assets.csv"
     file.write_text(TABLE)

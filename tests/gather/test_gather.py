@@ -36,6 +36,7 @@ from skyless.run.mqtt.messages import StatusMessage, site_message
 from skyless.run.mqtt.topics import fix_topic, status_topic
 from skyless.sim.lab import lab_site
 from support.processes import SKYLESS, started
+from support.waiting import until
 
 pytestmark = pytest.mark.site
 
@@ -111,206 +112,181 @@ async def stored(address, count, after=-1):
         return found, {number: tag.name for number, tag in names.tags.items()}
 
 
-def test_fixes_of_mqtt_and_of_nats_are_in_the_stream_once_and_in_order_and_numbers_survive(tmp_path):
-    async def check():
-        async with broker(tmp_path) as running, client_of(running.nats) as client:
-            async with gathering(running.nats):
-                await serving(client)
-                link = Link(running.address, "t", site=SITE, kind="tag")
-                task = asyncio.ensure_future(link.run())
-                for n in range(50):
-                    link.publish(fix_topic(SITE, f"t.{n % 5}"), of_tag(f"t.{n % 5}", n / 1000.0), qos=1)
-                first, names = await stored(running.nats, 50)
-                assert [x for _, _, x in first] == list(range(50))
-                assert [names[tag] for _, tag, _ in first] == [f"t.{n % 5}" for n in range(50)]
-                task.cancel()
-            async with gathering(running.nats):  # a new process: nothing in memory
-                await serving(client)
-                for n in range(50, 60):
-                    await publish(client, f"t.{n % 7}", n / 1000.0)
-                rows, again = await stored(running.nats, 60)
-            assert [x for _, _, x in rows] == list(range(60))
-            assert [again[tag] for _, tag, _ in rows[50:]] == [f"t.{n % 7}" for n in range(50, 60)]
-            assert {number: again[number] for number in names} == names
-            assert len(set(again.values())) == len(again) == 7
-            numbers = [number for number, _, _ in rows]
-            assert numbers == sorted(set(numbers))
-            later, _ = await stored(running.nats, 60 - 50, after=rows[49][0])
-            assert [x for _, _, x in later] == list(range(50, 60))
-
-    asyncio.run(check())
-
-
-def test_two_gathers_share_the_fixes_and_what_one_leaves_the_other_takes(tmp_path):
-    """Each fix is in the stream once, under one number of its tag, whoever packed it and while one of them ends."""
-
-    async def check():
-        async with (
-            broker(tmp_path) as running,
-            client_of(running.nats) as client,
-            gathering(running.nats) as (first, _),
-        ):
-            async with gathering(running.nats) as (second, _), asyncio.timeout(20):
-                while first._names is None or second._names is None:
-                    await asyncio.sleep(0.02)
-                for n in range(400):
-                    await publish(client, f"t{n % 40}", n / 1000.0)
-                await client.flush()
-                rows, names = await stored(running.nats, 400)
-                assert first.summary.fixes > 0
-                assert second.summary.fixes == 400 - first.summary.fixes > 0
-                for n in range(400, 600):
-                    await publish(client, f"t{n % 40}", n / 1000.0)
-                await client.flush()
-            for n in range(600, 800):
-                await publish(client, f"t{n % 40}", n / 1000.0)
-            rows, names = await stored(running.nats, 800)
-            assert sorted(x for _, _, x in rows) == list(range(800))
-            assert all(names[tag] == f"t{x % 40}" for _, tag, x in rows)
-            assert len(set(names.values())) == len(names) == 40
-            async with gathering(running.nats, keep_bytes=10**6) as (third, _), asyncio.timeout(20):
-                while third._names is None:
-                    await asyncio.sleep(0.02)
-            info = await client.jetstream().stream_info(subjects.at(subjects.FIX_STREAM, SITE))
-            assert info.config.max_bytes == 10**6
-
-    asyncio.run(check())
-
-
-def test_programs_that_give_numbers_at_the_same_time_give_each_once_and_duplicates_of_a_batch_are_dropped(tmp_path):
-    async def check():
-        async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats):
+async def test_fixes_of_mqtt_and_of_nats_are_in_the_stream_once_and_in_order_and_numbers_survive(tmp_path):
+    async with broker(tmp_path) as running, client_of(running.nats) as client:
+        async with gathering(running.nats):
             await serving(client)
-            stream = client.jetstream()
-            given = [Names(stream, SITE) for _ in range(3)]
-            wanted = [("a", "b", "a"), ("c", "b", "d"), ("d", "e", "a")]
-            gives = [names.give(tags, "elsewhere", 1.0) for names, tags in zip(given, wanted, strict=True)]
-            await asyncio.gather(*gives)
-            for names in given:
-                await names.read()
-                assert sorted(names.numbers) == sorted(tag.name for tag in names.tags.values()) == list("abcde")
-                assert sorted(names.tags) == [1, 2, 3, 4, 5]
-                assert (names.issue, names.numbers) == (5, given[0].numbers)
-            records = np.zeros(3, RECORD)
-            records["tag"], records["position_mm"][:, 0] = 1, (7, 8, 9)
-            live = await client.subscribe(subjects.at(subjects.LIVE, SITE))
-            subject = subjects.at(subjects.FIXES, SITE, "elsewhere")
-            for sequence in (1, 1, 2, 1):
-                batch = Batch(5, sequence, 1, 1, records)
-                await stream.publish(subject, encode_batch(batch), headers={"Nats-Msg-Id": batch.id})
-            rows, _ = await stored(running.nats, 6)
-            assert [x for _, _, x in rows] == [7, 8, 9] * 2
-            assert [decode_batch((await live.next_msg(5)).data).sequence for _ in range(2)] == [1, 2]
-            info = await stream.stream_info(subjects.at(subjects.FIX_STREAM, SITE))
-            assert info.config.max_bytes == KEEP_BYTES
-            assert info.config.max_age == 24 * 3600
-
-    asyncio.run(check())
-
-
-def test_a_full_table_of_names_gives_no_more_numbers(tmp_path, monkeypatch):
-    monkeypatch.setattr(names_module, "MAX_NAMES", 2)
-
-    async def check():
-        async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats) as (node, _):
-            await serving(client)
-            for n, tag in enumerate("abcab"):
-                await publish(client, tag, n / 1000.0)
-            rows, names = await stored(running.nats, 4)
-            assert [x for _, _, x in rows] == [0, 1, 3, 4]
-            assert names == {1: "a", 2: "b"}
-            assert node.summary.drops == {"no-number": 1}
-
-    asyncio.run(check())
-
-
-def test_nothing_that_came_is_lost_when_the_server_was_away(tmp_path):
-    """The broker is stopped by a signal while fixes wait, and the gather goes on with the same numbers afterwards."""
-
-    async def check():
-        async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats) as (node, _):
-            await serving(client)
-            for n in range(5):
-                await publish(client, "a", n / 1000.0)
-            await stored(running.nats, 5)
-            os.kill(running.pid, signal.SIGSTOP)
-            for n in range(5, 9):
-                node._packer.add("a", payload("a", n / 1000.0))
-            await asyncio.sleep(0.5)
-            os.kill(running.pid, signal.SIGCONT)
-            rows, names = await stored(running.nats, 9)
-            assert [x for _, _, x in rows] == list(range(9))
-            assert names == {1: "a"}
-
-    asyncio.run(check())
-
-
-def test_the_site_is_found_and_its_programs_are_counted(tmp_path):
-    async def check():
-        opened = broker(tmp_path)
-        async with opened as running, client_of(running.nats) as client, gathering(running.nats, None) as (node, _):
-            reading = await summaries(client)
-
-            async def tell(online, name):
-                status = StatusMessage(online=online, kind="anchor", name=name)
-                subject = status_topic(SITE, "anchor", name).replace("/", ".")
-                await client.publish(subject, msgspec.json.encode(status))
-
-            async with asyncio.timeout(20):
-                while node.site is None:
-                    await tell(online=True, name="1")
-                    await asyncio.sleep(0.05)
-                await reading.next_msg(20)
-                for n in range(5):
-                    await tell(online=True, name=str(n))
-                await tell(online=False, name="3")
-                hall = site_message(replace(lab_site(100.0), name="hall"), simulated=True, unix_s=1.0)
-                await client.publish(f"skyless.v1.{SITE}.site", msgspec.json.encode(hall))
-                summary = node.summary
-                while not summary.site or summary.online != {"anchor": 4}:
-                    summary = msgspec.json.decode((await reading.next_msg(20)).data, type=Summary)
-            assert (node.site, summary.site, summary.simulated) == (SITE, "hall", True)
-
-    asyncio.run(check())
-
-
-def test_a_dashboard_reads_batches_and_names_with_the_role_of_a_page(tmp_path):
-    async def check():
-        create_access(tmp_path / "access", MqttAddress("127.0.0.1", 1))
-        roles = read_access(tmp_path / "access")
-        async with broker(tmp_path, roles=roles) as running, client_of(running.nats) as client:
-            page = NatsAddress(running.nats.url, "page", roles["page"])
-            gathered = Gathered(page)
-            live = LiveSite("here", "mqtt://here:1")
-            live.attach(Mock(), SITE)
-            task = asyncio.ensure_future(gathered.run(LiveSites(live)))
-            async with gathering(running.nats), asyncio.timeout(20):
-                await serving(client)
-                while not gathered.columns(SITE).serial:
-                    await publish(client, "a", 1.5)
-                    await asyncio.sleep(0.05)
-                newest, _ = gathered.columns(SITE).visible((0.0, 0.0, 9.0, 9.0), time.monotonic())
-                assert newest["position_mm"][:, 0].tolist() == [1500]
-                while not live.state.tags:
-                    await asyncio.sleep(0.02)
-                assert [*live.state.tags] == ["a"]
-                assert gathered.columns(SITE).names == {1: "a"}
-            async with client_of(page) as reading:
-                with pytest.raises(TimeoutError):
-                    await reading.request("$JS.API.DIRECT.GET." + subjects.at(subjects.FIX_STREAM, SITE), timeout=0.5)
+            link = Link(running.address, "t", site=SITE, kind="tag")
+            task = asyncio.ensure_future(link.run())
+            for n in range(50):
+                link.publish(fix_topic(SITE, f"t.{n % 5}"), of_tag(f"t.{n % 5}", n / 1000.0), qos=1)
+            first, names = await stored(running.nats, 50)
+            assert [x for _, _, x in first] == list(range(50))
+            assert [names[tag] for _, tag, _ in first] == [f"t.{n % 5}" for n in range(50)]
             task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
+        async with gathering(running.nats):  # a new process: nothing in memory
+            await serving(client)
+            for n in range(50, 60):
+                await publish(client, f"t.{n % 7}", n / 1000.0)
+            rows, again = await stored(running.nats, 60)
+        assert [x for _, _, x in rows] == list(range(60))
+        assert [again[tag] for _, tag, _ in rows[50:]] == [f"t.{n % 7}" for n in range(50, 60)]
+        assert {number: again[number] for number in names} == names
+        assert len(set(again.values())) == len(again) == 7
+        numbers = [number for number, _, _ in rows]
+        assert numbers == sorted(set(numbers))
+        later, _ = await stored(running.nats, 60 - 50, after=rows[49][0])
+        assert [x for _, _, x in later] == list(range(50, 60))
 
-    asyncio.run(check())
+
+async def test_two_gathers_share_the_fixes_and_what_one_leaves_the_other_takes(tmp_path):
+    """Each fix is in the stream once, under one number of its tag, whoever packed it and while one of them ends."""
+    async with (
+        broker(tmp_path) as running,
+        client_of(running.nats) as client,
+        gathering(running.nats) as (first, _),
+    ):
+        async with gathering(running.nats) as (second, _), asyncio.timeout(20):
+            while first._names is None or second._names is None:
+                await asyncio.sleep(0.02)
+            for n in range(400):
+                await publish(client, f"t{n % 40}", n / 1000.0)
+            await client.flush()
+            rows, names = await stored(running.nats, 400)
+            assert first.summary.fixes > 0
+            assert second.summary.fixes == 400 - first.summary.fixes > 0
+            for n in range(400, 600):
+                await publish(client, f"t{n % 40}", n / 1000.0)
+            await client.flush()
+        for n in range(600, 800):
+            await publish(client, f"t{n % 40}", n / 1000.0)
+        rows, names = await stored(running.nats, 800)
+        assert sorted(x for _, _, x in rows) == list(range(800))
+        assert all(names[tag] == f"t{x % 40}" for _, tag, x in rows)
+        assert len(set(names.values())) == len(names) == 40
+        async with gathering(running.nats, keep_bytes=10**6) as (third, _), asyncio.timeout(20):
+            while third._names is None:
+                await asyncio.sleep(0.02)
+        info = await client.jetstream().stream_info(subjects.at(subjects.FIX_STREAM, SITE))
+        assert info.config.max_bytes == 10**6
 
 
-def test_more_than_the_server_has_room_for_is_refused(tmp_path):
-    async def check():
-        async with broker(tmp_path) as running:
-            with pytest.raises(SkylessError, match=r"--keep-gb is 1000; it should be less"):
-                await Gather(running.nats, SITE, 10**12, print).run()
+async def test_programs_that_give_numbers_at_once_give_each_once_and_duplicates_of_a_batch_are_dropped(
+    tmp_path,
+):
+    async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats):
+        await serving(client)
+        stream = client.jetstream()
+        given = [Names(stream, SITE) for _ in range(3)]
+        wanted = [("a", "b", "a"), ("c", "b", "d"), ("d", "e", "a")]
+        gives = [names.give(tags, "elsewhere", 1.0) for names, tags in zip(given, wanted, strict=True)]
+        await asyncio.gather(*gives)
+        for names in given:
+            await names.read()
+            assert sorted(names.numbers) == sorted(tag.name for tag in names.tags.values()) == list("abcde")
+            assert sorted(names.tags) == [1, 2, 3, 4, 5]
+            assert (names.issue, names.numbers) == (5, given[0].numbers)
+        records = np.zeros(3, RECORD)
+        records["tag"], records["position_mm"][:, 0] = 1, (7, 8, 9)
+        live = await client.subscribe(subjects.at(subjects.LIVE, SITE))
+        subject = subjects.at(subjects.FIXES, SITE, "elsewhere")
+        for sequence in (1, 1, 2, 1):
+            batch = Batch(5, sequence, 1, 1, records)
+            await stream.publish(subject, encode_batch(batch), headers={"Nats-Msg-Id": batch.id})
+        rows, _ = await stored(running.nats, 6)
+        assert [x for _, _, x in rows] == [7, 8, 9] * 2
+        assert [decode_batch((await live.next_msg(5)).data).sequence for _ in range(2)] == [1, 2]
+        info = await stream.stream_info(subjects.at(subjects.FIX_STREAM, SITE))
+        assert info.config.max_bytes == KEEP_BYTES
+        assert info.config.max_age == 24 * 3600
 
-    asyncio.run(check())
+
+async def test_a_full_table_of_names_gives_no_more_numbers(tmp_path, monkeypatch):
+    monkeypatch.setattr(names_module, "MAX_NAMES", 2)
+    async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats) as (node, _):
+        await serving(client)
+        for n, tag in enumerate("abcab"):
+            await publish(client, tag, n / 1000.0)
+        rows, names = await stored(running.nats, 4)
+        assert [x for _, _, x in rows] == [0, 1, 3, 4]
+        assert names == {1: "a", 2: "b"}
+        assert node.summary.drops == {"no-number": 1}
+
+
+async def test_nothing_that_came_is_lost_when_the_server_was_away(tmp_path):
+    """The broker is stopped by a signal while fixes wait, and the gather goes on with the same numbers afterwards."""
+    async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats) as (node, _):
+        await serving(client)
+        for n in range(5):
+            await publish(client, "a", n / 1000.0)
+        await stored(running.nats, 5)
+        os.kill(running.pid, signal.SIGSTOP)
+        for n in range(5, 9):
+            node._packer.add("a", payload("a", n / 1000.0))
+        await asyncio.sleep(0.5)
+        os.kill(running.pid, signal.SIGCONT)
+        rows, names = await stored(running.nats, 9)
+        assert [x for _, _, x in rows] == list(range(9))
+        assert names == {1: "a"}
+
+
+async def test_the_site_is_found_and_its_programs_are_counted(tmp_path):
+    opened = broker(tmp_path)
+    async with opened as running, client_of(running.nats) as client, gathering(running.nats, None) as (node, _):
+        reading = await summaries(client)
+
+        async def tell(online, name):
+            status = StatusMessage(online=online, kind="anchor", name=name)
+            subject = status_topic(SITE, "anchor", name).replace("/", ".")
+            await client.publish(subject, msgspec.json.encode(status))
+
+        async with asyncio.timeout(20):
+            while node.site is None:
+                await tell(online=True, name="1")
+                await asyncio.sleep(0.05)
+            await reading.next_msg(20)
+            for n in range(5):
+                await tell(online=True, name=str(n))
+            await tell(online=False, name="3")
+            hall = site_message(replace(lab_site(100.0), name="hall"), simulated=True, unix_s=1.0)
+            await client.publish(f"skyless.v1.{SITE}.site", msgspec.json.encode(hall))
+            summary = node.summary
+            while not summary.site or summary.online != {"anchor": 4}:
+                summary = msgspec.json.decode((await reading.next_msg(20)).data, type=Summary)
+        assert (node.site, summary.site, summary.simulated) == (SITE, "hall", True)
+
+
+async def test_a_dashboard_reads_batches_and_names_with_the_role_of_a_page(tmp_path):
+    create_access(tmp_path / "access", MqttAddress("127.0.0.1", 1))
+    roles = read_access(tmp_path / "access")
+    async with broker(tmp_path, roles=roles) as running, client_of(running.nats) as client:
+        page = NatsAddress(running.nats.url, "page", roles["page"])
+        gathered = Gathered(page)
+        live = LiveSite("here", "mqtt://here:1")
+        live.attach(Mock(), SITE)
+        task = asyncio.ensure_future(gathered.run(LiveSites(live)))
+        async with gathering(running.nats), asyncio.timeout(20):
+            await serving(client)
+            while not gathered.columns(SITE).serial:
+                await publish(client, "a", 1.5)
+                await asyncio.sleep(0.05)
+            newest, _ = gathered.columns(SITE).visible((0.0, 0.0, 9.0, 9.0), time.monotonic())
+            assert newest["position_mm"][:, 0].tolist() == [1500]
+            while not live.state.tags:
+                await asyncio.sleep(0.02)
+            assert [*live.state.tags] == ["a"]
+            assert gathered.columns(SITE).names == {1: "a"}
+        async with client_of(page) as reading:
+            with pytest.raises(TimeoutError):
+                await reading.request("$JS.API.DIRECT.GET." + subjects.at(subjects.FIX_STREAM, SITE), timeout=0.5)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_more_than_the_server_has_room_for_is_refused(tmp_path):
+    async with broker(tmp_path) as running:
+        with pytest.raises(SkylessError, match=r"--keep-gb is 1000; it should be less"):
+            await Gather(running.nats, SITE, 10**12, print).run()
 
 
 WRONG = ("", "4222", "mqtt://a", "nats://", "nats://a:0", "nats://a:x", "nats://a/b", "nats://u:secret@")
@@ -360,7 +336,7 @@ def test_without_a_gather_nothing_of_nats_is_loaded(modules):
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-def test_a_history_of_the_stream_has_each_fix_once_wherever_it_is_killed(tmp_path):
+async def test_a_history_of_the_stream_has_each_fix_once_wherever_it_is_killed(tmp_path):
     """Rows that were taken and not stored are taken again; tags have the history's own numbers."""
     pytest.importorskip("pyarrow")
     from skyless.run.history.layout import FIX_COLUMNS, NAME_COLUMNS, current_files
@@ -375,9 +351,7 @@ def test_a_history_of_the_stream_has_each_fix_once_wherever_it_is_killed(tmp_pat
         writer = Writer(folder, SITE)
         task = asyncio.ensure_future(take_stream(address, writer, lambda _line: None))
         try:
-            async with asyncio.timeout(20):
-                while writer.fixes.taken < rows:
-                    await asyncio.sleep(0.02)
+            await until(lambda: writer.fixes.taken >= rows)
             yield writer
         finally:
             task.cancel()
@@ -387,29 +361,24 @@ def test_a_history_of_the_stream_has_each_fix_once_wherever_it_is_killed(tmp_pat
         writer.journal.close()
         writer._lock.close()
 
-    async def check():
-        async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats):
-            await serving(client)
-            for n in range(30):
-                await publish(client, f"t{n % 3}", n / 1000.0)
-            async with taking(running.nats, 30) as writer:
-                writer.store()
-                writer.write()
-                for n in range(30, 60):
-                    await publish(client, f"t{n % 4}", n / 1000.0)
-                async with asyncio.timeout(20):
-                    while writer.fixes.taken < 60:
-                        await asyncio.sleep(0.02)
-                kill(writer)  # before the rest was stored
-            async with taking(running.nats, 30) as writer:
-                writer.store()
-                kill(writer)  # after it was stored, and before it was a file
-            for n in range(60, 70):
-                await publish(client, "t9", n / 1000.0)
-            async with taking(running.nats, 10) as writer:
-                writer.close()
-
-    asyncio.run(check())
+    async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats):
+        await serving(client)
+        for n in range(30):
+            await publish(client, f"t{n % 3}", n / 1000.0)
+        async with taking(running.nats, 30) as writer:
+            writer.store()
+            writer.write()
+            for n in range(30, 60):
+                await publish(client, f"t{n % 4}", n / 1000.0)
+            await until(lambda: writer.fixes.taken >= 60)
+            kill(writer)  # before the rest was stored
+        async with taking(running.nats, 30) as writer:
+            writer.store()
+            kill(writer)  # after it was stored, and before it was a file
+        for n in range(60, 70):
+            await publish(client, "t9", n / 1000.0)
+        async with taking(running.nats, 10) as writer:
+            writer.close()
     names = {
         row["tag"]: row["name"]
         for row in read_table(folder / f"site={SITE}" / "names.parquet", NAME_COLUMNS).to_pylist()

@@ -12,7 +12,6 @@ from made_fixes import fix, in_files, on_disk
 from pyarrow import parquet
 
 from mqtt.mqtt_brokers import Embedded, stopped
-from mqtt.mqtt_brokers import until as until_
 from skyless.run.history.layout import current_events, current_files, rows_of, site_folder
 from skyless.run.history.program import HistoryNode
 from skyless.run.history.queries import History
@@ -42,6 +41,7 @@ from skyless.run.mqtt.topics import (
 )
 from skyless.sim.lab import lab_site
 from support.processes import SKYLESS, free_port, running_program
+from support.waiting import until as until_
 
 pytestmark = pytest.mark.site
 

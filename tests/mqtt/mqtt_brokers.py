@@ -14,6 +14,7 @@ from pathlib import Path
 from skyless.run.broker import BrokerSettings, start_broker
 from skyless.run.mqtt.address import MqttAddress
 from support.processes import free_port
+from support.waiting import until
 
 MOSQUITTO = shutil.which("mosquitto", path=os.environ.get("PATH", "") + ":/usr/sbin")
 
@@ -128,13 +129,6 @@ async def running(broker, *links):
 async def subscribed(link):
     """Wait until the broker has a link's subscriptions: the link subscribes to its own status among them."""
     await until(lambda: link.connected and link._has_echo)
-
-
-async def until(condition, limit_s=20.0):
-    """Wait for something that should come; a test that waits in vain fails."""
-    async with asyncio.timeout(limit_s):
-        while not condition():
-            await asyncio.sleep(0.01)
 
 
 async def stopped(task):

@@ -96,10 +96,13 @@ def has(*programs):
     return all(shutil.which(program) for program in programs)
 
 
-def damaged_program(folder, name):
-    """A program beside this file, which ends at an access out of bounds, an overflow and the like."""
-    made, sources = folder / name, [NATIVE / "skyless_core.c", Path(__file__).with_name(f"{name}.c")]
-    checks = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+def damaged_programs(folder):
+    """The two programs beside this file, by name; they end at an access out of bounds, an overflow and the like."""
     real = ["-DSKYLESS_FLOAT"] if c_type(float) is ctypes.c_float else []
-    subprocess.run(["gcc", *EXACT, *real, *checks, f"-I{NATIVE}", *sources, "-o", made], check=True)
+    checks = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    command, core = ["gcc", *EXACT, *real, *checks, f"-I{NATIVE}"], folder / "core.o"
+    subprocess.run([*command, "-c", NATIVE / "skyless_core.c", "-o", core], check=True)
+    made = {name: folder / name for name in ("damaged", "damaged_frames")}
+    for name, program in made.items():
+        subprocess.run([*command, core, Path(__file__).with_name(f"{name}.c"), "-o", program], check=True)
     return made

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from core_build import damaged_program, has, input_of
+from core_build import damaged_programs, has, input_of
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parents[1] / "positioning"))
@@ -46,9 +46,14 @@ def numbers(program, count, seed, given):
     return [int(number) for number in done.stdout.split()]
 
 
+@pytest.fixture(scope="module")
+def programs(tmp_path_factory):
+    return damaged_programs(tmp_path_factory.mktemp("damaged"))
+
+
 @pytest.mark.parametrize("height_m", [0.0, None])
-def test_sanitizers_find_nothing_and_every_fix_is_a_number(tmp_path, height_m):
-    found = damaged(damaged_program(tmp_path, "damaged"), 20_000, 1, height_m)
+def test_sanitizers_find_nothing_and_every_fix_is_a_number(programs, height_m):
+    found = damaged(programs["damaged"], 20_000, 1, height_m)
     assert found[0] > 5_000
     assert found[1] > 300  # a filter that lost its state takes none until its next start
     assert found[2] == 0
@@ -74,8 +79,8 @@ def damaged_frames(program, count, seed, height_m, carrier_phase=False):
 
 @pytest.mark.parametrize("carrier_phase", [False, True])
 @pytest.mark.parametrize("height_m", [0.0, None])
-def test_damaged_frames_do_no_harm(tmp_path, height_m, carrier_phase):
-    found = damaged_frames(damaged_program(tmp_path, "damaged_frames"), 20_000, 1, height_m, carrier_phase)
+def test_damaged_frames_do_no_harm(programs, height_m, carrier_phase):
+    found = damaged_frames(programs["damaged_frames"], 20_000, 1, height_m, carrier_phase)
     assert found[0] > 5_000
     assert found[1] > 1_000
     assert found[2] > 50
@@ -83,9 +88,10 @@ def test_damaged_frames_do_no_harm(tmp_path, height_m, carrier_phase):
 
 
 if __name__ == "__main__":
+    given = int(sys.argv[1]), int(sys.argv[2])
     with tempfile.TemporaryDirectory() as folder:
+        made = damaged_programs(Path(folder))
         for fixed_m in (0.0, None):
-            print(*damaged(damaged_program(Path(folder), "damaged"), int(sys.argv[1]), int(sys.argv[2]), fixed_m))
-            frames = damaged_program(Path(folder), "damaged_frames")
+            print(*damaged(made["damaged"], *given, fixed_m))
             for has_phases in (False, True):
-                print(*damaged_frames(frames, int(sys.argv[1]), int(sys.argv[2]), fixed_m, has_phases))
+                print(*damaged_frames(made["damaged_frames"], *given, fixed_m, has_phases))

@@ -5,7 +5,7 @@ import contextlib
 import time
 
 import pytest
-from mqtt_brokers import Embedded, until
+from mqtt_brokers import Embedded
 from msgspec import structs
 from node_stage import running
 
@@ -21,7 +21,7 @@ from skyless.page.live import LiveSite
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import AlarmRulesMessage, SiteMessage, Zone, ZonesMessage
 from skyless.run.mqtt.topics import alarm_rules_topic, alarm_topic, fix_topic, site_topic, zones_topic
-from support.loops import in_loop
+from support.waiting import until
 
 pytestmark = pytest.mark.site
 
@@ -43,7 +43,6 @@ async def dashboard(name, address):
         yield live
 
 
-@in_loop
 async def test_from_a_fix_to_a_webhook_and_on_to_the_next_dashboard(tmp_path):
     broker = Embedded(tmp_path)
     await broker.start()

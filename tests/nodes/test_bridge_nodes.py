@@ -7,7 +7,7 @@ import signal
 from types import SimpleNamespace
 
 import pytest
-from mqtt_brokers import Embedded, until
+from mqtt_brokers import Embedded
 from msgspec import structs
 from node_stage import running
 
@@ -24,8 +24,8 @@ from skyless.core.tag.beacon_receiver import HeardSite
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import SiteMessage, StatusMessage, Zone, ZonesMessage
 from skyless.run.mqtt.topics import EVERY_NODE, fix_topic, health_topic, site_topic, status_topic, zones_topic
-from support.loops import in_loop
 from support.processes import SKYLESS, free_port, running_program
+from support.waiting import until
 
 pytestmark = pytest.mark.site
 
@@ -73,7 +73,6 @@ async def brokered(folder):
         await broker.stop()
 
 
-@in_loop
 async def test_all_that_targets_need_comes_from_the_broker_and_nonsense_is_counted(tmp_path):
     target, said = Recorded(), []
     async with brokered(tmp_path) as (broker, programs):
@@ -99,7 +98,6 @@ async def test_all_that_targets_need_comes_from_the_broker_and_nonsense_is_count
             assert (state.fixes, state.malformed, state.dropped) == (1, 2, {"test:": {}})
 
 
-@in_loop
 async def test_a_site_that_lacks_what_the_only_target_needs_ends_the_bridge_with_the_reason(tmp_path):
     async with brokered(tmp_path) as (broker, programs):
         programs.publish(site_topic(LAB.id), SiteMessage(LAB, True, 0.0), retain=True)
@@ -240,7 +238,6 @@ def test_that_no_target_can_serve_a_growing_site_is_logged_once():
     assert said == ["test: needs more"]
 
 
-@in_loop
 async def test_a_target_that_has_ended_gets_nothing_more():
     target, said = Recorded(), []
     route = Route(target, None, 1e3)
@@ -254,7 +251,6 @@ async def test_a_target_that_has_ended_gets_nothing_more():
     assert (len(target.fixes), target.none, said) == (1, [], [])
 
 
-@in_loop
 async def test_a_bridge_that_is_started_again_leaves_no_second_status_on_the_broker(tmp_path):
     async with brokered(tmp_path) as (broker, programs):
         statuses = {}

@@ -22,7 +22,6 @@ from skyless.run.broker import BrokerSettings, StatedAddress, running_broker, st
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.connection import check_broker
 from skyless.run.mqtt.link import Link
-from support.loops import in_loop
 from support.processes import SKYLESS, free_port, started
 
 pytestmark = pytest.mark.site
@@ -81,7 +80,6 @@ def test_it_is_an_error_when_nats_server_dies(port, tmp_path):
         assert process.wait(20) == 2
 
 
-@in_loop
 async def test_its_store_is_private(port, tmp_path):
     settings = BrokerSettings(port=port, data=tmp_path / "store", user="ann", password='pä"\\ss#$ word')
     async with await start_broker(settings) as broker:
@@ -106,7 +104,6 @@ async def retained_by(broker, topic, name):
     return found
 
 
-@in_loop
 async def test_retained_messages_survive_its_death(port, tmp_path):
     """Once others get them: nats-server acknowledges a retained message some milliseconds before it stores it."""
     settings = BrokerSettings(port=port, data=tmp_path / "store")
@@ -131,7 +128,6 @@ def test_a_taken_port_is_an_error_when_it_was_asked_for(taken, tmp_path, capsys)
     assert f"--port is {taken}, where another program listens" in capsys.readouterr().err
 
 
-@in_loop
 async def test_without_a_port_the_next_free_one_is_taken(taken, tmp_path, monkeypatch):
     monkeypatch.setattr(broker_module, "FIRST_PORT", taken)
 
@@ -139,7 +135,6 @@ async def test_without_a_port_the_next_free_one_is_taken(taken, tmp_path, monkey
         assert taken < broker.address.port < taken + 100
 
 
-@in_loop
 async def test_a_second_broker_of_the_same_user_gets_a_folder_of_its_own(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
 
@@ -151,7 +146,6 @@ async def test_a_second_broker_of_the_same_user_gets_a_folder_of_its_own(tmp_pat
     assert not second.data.exists()
 
 
-@in_loop
 async def test_temporary_data_last_while_the_broker_is_started_again_and_end_with_it(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
 
@@ -163,7 +157,6 @@ async def test_temporary_data_last_while_the_broker_is_started_again_and_end_wit
     assert list(tmp_path.iterdir()) == []
 
 
-@in_loop
 async def test_data_of_a_broker_that_was_killed_with_its_owner_are_deleted_by_the_next(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     abandoned = tmp_path / "skyless-broker-dead"
@@ -176,7 +169,6 @@ async def test_data_of_a_broker_that_was_killed_with_its_owner_are_deleted_by_th
             assert {*tmp_path.iterdir()} == {running.data, other.data}
 
 
-@in_loop
 async def test_a_home_that_cannot_be_written_costs_nothing(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("in the way", encoding="utf-8")
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "file"))

@@ -5,7 +5,7 @@ import inspect
 import re
 
 import pytest
-from mqtt_brokers import Embedded, until
+from mqtt_brokers import Embedded
 from paho.mqtt import client as paho
 from paho.mqtt.enums import CallbackAPIVersion
 
@@ -16,6 +16,7 @@ from skyless.run.mqtt.access import ACCESS, USERS, Role, create_access, read_acc
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.connection import check_broker
 from skyless.run.mqtt.link import Link
+from support.waiting import until
 
 pytestmark = pytest.mark.site
 
@@ -351,14 +352,10 @@ def test_a_user_and_roles_exclude_each_other(tmp_path, monkeypatch, capsys):
     assert "--user and --access exclude each other" in capsys.readouterr().err
 
 
-def test_roles_open_the_broker_to_other_machines(tmp_path):
+async def test_roles_open_the_broker_to_other_machines(tmp_path):
     create_access(tmp_path / "passwords", MqttAddress("127.0.0.1", 1883))
-
-    async def check():
-        broker = Embedded(tmp_path, roles=read_access(tmp_path / "passwords"), listen="0.0.0.0")
-        await broker.start()
-        with pytest.raises(SkylessError, match=r"wrong user name or password.*has no user: it should be USER@HOST"):
-            await check_broker(broker.address)
-        await broker.stop()
-
-    asyncio.run(check())
+    broker = Embedded(tmp_path, roles=read_access(tmp_path / "passwords"), listen="0.0.0.0")
+    await broker.start()
+    with pytest.raises(SkylessError, match=r"wrong user name or password.*has no user: it should be USER@HOST"):
+        await check_broker(broker.address)
+    await broker.stop()

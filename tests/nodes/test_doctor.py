@@ -9,7 +9,6 @@ import allantools
 import numpy as np
 import pytest
 from live_nodes import LiveSite
-from mqtt_brokers import until
 
 from skyless.cli.main import main
 from skyless.cli.nodes.doctor import _report
@@ -21,6 +20,7 @@ from skyless.run.doctor import host
 from skyless.run.doctor.board import BoardProbe
 from skyless.run.doctor.check import Check
 from skyless.run.doctor.clocks import CounterPairs, assumed_deviation, counters_check
+from support.waiting import until
 
 SECOND = round(TICK_RATE_HZ)
 
@@ -138,32 +138,28 @@ def test_a_report_has_what_failed_first_and_nothing_that_controls_a_terminal():
 # Boards
 
 
-def examined_board(path, seconds):
+async def examined_board(path, seconds):
     probe = BoardProbe(SerialRadio(str(path), 1_000_000, path.name), None)
     with contextlib.suppress(TimeoutError):
-        asyncio.run(asyncio.wait_for(probe.run(), seconds))
+        await asyncio.wait_for(probe.run(), seconds)
     return probe.checks(NoiseSite())
 
 
 @pytest.mark.site
-def test_a_port_that_is_not_there_is_told_and_so_is_a_device_of_another_kind(tmp_path):
-    (check,) = examined_board(tmp_path / "ttyACM7", 0.5)
+async def test_a_port_that_is_not_there_is_told_and_so_is_a_device_of_another_kind(tmp_path):
+    (check,) = await examined_board(tmp_path / "ttyACM7", 0.5)
     assert check.result == "failed"
     assert "There is no " in check.finding
-
-    async def play():
-        terminal = Pty(tmp_path / "gps")
-        terminal.start(lambda _: None)
-        probe = BoardProbe(SerialRadio(str(tmp_path / "gps"), 9600, "gps"), None)
-        listening = asyncio.ensure_future(probe.run())
-        async with asyncio.timeout(20.0):
-            while "wrong baud rate?" not in probe.checks(NoiseSite())[0].finding:
-                terminal.send(b"$GPGGA,1\r\n\0")
-                await asyncio.sleep(0.1)
-        listening.cancel()
-        return probe.checks(NoiseSite())
-
-    (check,) = asyncio.run(play())
+    terminal = Pty(tmp_path / "gps")
+    terminal.start(lambda _: None)
+    probe = BoardProbe(SerialRadio(str(tmp_path / "gps"), 9600, "gps"), None)
+    listening = asyncio.ensure_future(probe.run())
+    async with asyncio.timeout(20.0):
+        while "wrong baud rate?" not in probe.checks(NoiseSite())[0].finding:
+            terminal.send(b"$GPGGA,1\r\n\0")
+            await asyncio.sleep(0.1)
+    listening.cancel()
+    (check,) = probe.checks(NoiseSite())
     assert check.result == "failed"
     assert "wrong baud rate?" in check.finding
 
@@ -205,24 +201,6 @@ def test_the_command_writes_a_report_and_its_exit_code_says_whether_anything_fai
     missing = ["doctor", "--radio", f"serial:{tmp_path}/ttyACM0", "--mqtt", "none", "--duration", "0.5"]
     assert main(missing) == 1
     assert "There is no " in capsys.readouterr().out
-
-
-@pytest.mark.site
-@pytest.mark.parametrize(
-    ("command", "right"),
-    [
-        ("doctor --radio ether:127.0.0.1", "it should be a board, serial:PATH[@BAUD]"),
-        ("doctor --radio serial:/dev/null@x", "PATH@BAUD"),
-        ("doctor --radio serial:", "it should name one port"),
-        ("doctor --site none.toml", "none.toml"),
-        ("doctor --duration 0", "--duration"),
-        ("doctor --report /nowhere/x.md", "it should be a file in a folder that exists"),
-        ("watch --mqtt none", "it should be the broker of the site to watch"),
-    ],
-)
-def test_wrong_input_is_told_with_what_would_be_right(command, right, capsys):
-    assert main(command.split()) == 2
-    assert right in capsys.readouterr().err
 
 
 @pytest.mark.site

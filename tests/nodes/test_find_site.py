@@ -18,7 +18,6 @@ from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import SiteMessage, StatusMessage
 from skyless.run.mqtt.topics import site_topic, status_topic
 from skyless.sim.lab import lab_site
-from support.loops import in_loop
 from support.processes import SKYLESS, free_port
 
 pytestmark = pytest.mark.site
@@ -72,7 +71,6 @@ async def alive_at_the_broker(address, *numbers):
         await asyncio.gather(watching, return_exceptions=True)
 
 
-@in_loop
 async def test_a_site_of_which_nothing_is_online_is_not_chosen_though_its_number_is_lower(tmp_path, caplog):
     broker = Embedded(tmp_path)
     await broker.start()
@@ -94,7 +92,6 @@ async def test_a_site_of_which_nothing_is_online_is_not_chosen_though_its_number
     await broker.stop()
 
 
-@in_loop
 @pytest.mark.statistical
 async def test_commands_name_the_sites_that_are_alive_and_ask_for_one(tmp_path):
     broker = Embedded(tmp_path)

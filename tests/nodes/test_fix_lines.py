@@ -104,7 +104,7 @@ def test_one_kind_of_lines_at_a_time(capfd, options):
     assert f"{' and '.join(options)} exclude each other" in capfd.readouterr().err
 
 
-def test_a_reader_that_takes_nothing_delays_no_fix(monkeypatch):
+async def test_a_reader_that_takes_nothing_delays_no_fix(monkeypatch):
     """Its pipe is full: lines wait, then are dropped and counted; nobody waits for it."""
     taken, free = threading.Event(), threading.Event()
 
@@ -117,19 +117,15 @@ def test_a_reader_that_takes_nothing_delays_no_fix(monkeypatch):
     logged = []
     monkeypatch.setattr("skyless.cli.nodes._fix_lines._standard_output", Slow)
     monkeypatch.setattr("skyless.cli.nodes._fix_lines._CLOSE_S", 0.0)
-
-    async def play():
-        lines = FixLines(str, None, logged.append)
-        writing = asyncio.ensure_future(lines.run())
-        await asyncio.sleep(0)
-        for number in range(5000):
-            lines.on_fix(number)
-        assert await asyncio.to_thread(taken.wait, 30.0)
-        writing.cancel()
-        await asyncio.gather(writing, return_exceptions=True)
-        return lines.dropped
-
-    dropped = asyncio.run(play())
+    lines = FixLines(str, None, logged.append)
+    writing = asyncio.ensure_future(lines.run())
+    await asyncio.sleep(0)
+    for number in range(5000):
+        lines.on_fix(number)
+    assert await asyncio.to_thread(taken.wait, 30.0)
+    writing.cancel()
+    await asyncio.gather(writing, return_exceptions=True)
+    dropped = lines.dropped
     free.set()
     assert dropped >= 4000
     assert "fixes were not written on standard output: its reader is too slow" in logged[0]

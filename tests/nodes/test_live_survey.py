@@ -10,7 +10,7 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from mqtt_brokers import MOSQUITTO, Mosquitto, until
+from mqtt_brokers import MOSQUITTO, Mosquitto
 from site_programs import Program
 
 from skyless.run.mqtt import topics
@@ -29,6 +29,7 @@ from skyless.sim.compile_ahead import compile_kernels
 from skyless.site.file.load import load_site
 from skyless.site.survey.facts import Facts, Gauge
 from support.processes import free_port
+from support.waiting import until
 
 pytestmark = pytest.mark.live
 

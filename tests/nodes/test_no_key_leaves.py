@@ -11,7 +11,7 @@ import time
 
 import pytest
 from mcap.reader import make_reader
-from mqtt_brokers import Embedded, until
+from mqtt_brokers import Embedded
 from site_programs import START_S, Program
 
 from skyless.cli.main import main
@@ -20,6 +20,7 @@ from skyless.run.keys.key_files import read_keys
 from skyless.run.mqtt.link import Link
 from skyless.sim.compile_ahead import compile_kernels
 from support.processes import free_port
+from support.waiting import until
 
 pytestmark = pytest.mark.site
 
@@ -73,45 +74,41 @@ def site(tmp_path):
 
 
 @pytest.mark.statistical
-def test_no_key_leaves_the_programs(site, tmp_path):
+async def test_no_key_leaves_the_programs(site, tmp_path):
     seen = []
-
-    async def check():
-        broker = Embedded(tmp_path)
-        air, mqtt = f"127.0.0.1:{free_port()}", ("--mqtt", str(broker.address))
-        keys, radio = tmp_path / "keys", ("--radio", f"ether:{air}")
-        home = os.environ | {"XDG_DATA_HOME": str(tmp_path / "data")}
-        anchors = Program("anchor", *ANCHORS, "--site", site, *radio, *mqtt, "--keys", keys)
-        key = ("--site-key", keys / "site.public", "--trust", "verified", "--json")
-        tag = Program("tag", "tag1", *radio, *mqtt, *key, environment=home)
-        programs = [
-            Program("ether", "--site", site, "--tags", 1, "--listen", air, *mqtt),
-            anchors,
-            tag,
-            Program("record", tmp_path / "walk.mcap", *mqtt),
-        ]
-        await broker.start()
-        observer = Link(broker.address, "observer", site=SITE, kind="watch")
-        observer.subscribe(f"{TOPICS}#", lambda topic, payload: seen.append((topic, bytes(payload))))
-        watching = asyncio.ensure_future(observer.run())
-        await until(lambda: observer.connected)
-        try:
-            await asyncio.gather(*(program.start() for program in programs))
-            await tag.heard("are verified (key chain 1)")
-            await until(lambda: sum(topic.endswith("receptions") for topic, _ in seen) > 10, START_S)
-            assert main(["site", "keys", "revoke", str(site), "--years", "0.0001"]) == 0
-            await tag.heard("are verified (key chain 2)")
-            count = len(seen)
-            await until(lambda: sum(topic.endswith("fix") for topic, _ in seen[count:]) > 50, START_S)
-        finally:
-            await asyncio.gather(*(program.stop() for program in programs))
-            watching.cancel()
-            await asyncio.wait([watching])
-            await broker.stop()
-        return [line for program in programs for _, line in program.said]
-
     compile_kernels()
-    lines = asyncio.run(check())
+    broker = Embedded(tmp_path)
+    air, mqtt = f"127.0.0.1:{free_port()}", ("--mqtt", str(broker.address))
+    keys, radio = tmp_path / "keys", ("--radio", f"ether:{air}")
+    home = os.environ | {"XDG_DATA_HOME": str(tmp_path / "data")}
+    anchors = Program("anchor", *ANCHORS, "--site", site, *radio, *mqtt, "--keys", keys)
+    key = ("--site-key", keys / "site.public", "--trust", "verified", "--json")
+    tag = Program("tag", "tag1", *radio, *mqtt, *key, environment=home)
+    programs = [
+        Program("ether", "--site", site, "--tags", 1, "--listen", air, *mqtt),
+        anchors,
+        tag,
+        Program("record", tmp_path / "walk.mcap", *mqtt),
+    ]
+    await broker.start()
+    observer = Link(broker.address, "observer", site=SITE, kind="watch")
+    observer.subscribe(f"{TOPICS}#", lambda topic, payload: seen.append((topic, bytes(payload))))
+    watching = asyncio.ensure_future(observer.run())
+    await until(lambda: observer.connected)
+    try:
+        await asyncio.gather(*(program.start() for program in programs))
+        await tag.heard("are verified (key chain 1)")
+        await until(lambda: sum(topic.endswith("receptions") for topic, _ in seen) > 10, START_S)
+        assert main(["site", "keys", "revoke", str(site), "--years", "0.0001"]) == 0
+        await tag.heard("are verified (key chain 2)")
+        count = len(seen)
+        await until(lambda: sum(topic.endswith("fix") for topic, _ in seen[count:]) > 50, START_S)
+    finally:
+        await asyncio.gather(*(program.stop() for program in programs))
+        watching.cancel()
+        await asyncio.wait([watching])
+        await broker.stop()
+    lines = [line for program in programs for _, line in program.said]
     ended_s = time.time()
     written = {
         "lines": "\n".join(lines).encode(),

@@ -32,7 +32,6 @@ from skyless.run.process import (
 )
 from skyless.run.record import RecorderNode, _client_key, _own_name
 from skyless.run.recordings.recorder import McapFile
-from support.loops import in_loop
 from support.processes import started
 
 pytestmark = pytest.mark.site
@@ -242,7 +241,6 @@ def test_an_address_of_another_machine_is_never_free():
 # Running together
 
 
-@in_loop
 async def test_parts_stand_and_fall_together():
     ended = []
 
@@ -268,7 +266,6 @@ async def test_parts_stand_and_fall_together():
     assert ended[2:] == ["c"]
 
 
-@in_loop
 async def test_something_is_done_again_and_again():
     done = []
     task = asyncio.ensure_future(every(0.01, lambda: done.append(1)))

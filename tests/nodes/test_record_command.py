@@ -11,7 +11,7 @@ from collections import Counter
 
 import msgspec
 import pytest
-from mqtt_brokers import MOSQUITTO, Embedded, Mosquitto, until
+from mqtt_brokers import MOSQUITTO, Embedded, Mosquitto
 
 from machines.bench import LAB, tape
 from skyless.cli.main import main
@@ -28,6 +28,7 @@ from skyless.run.recordings.recording import McapRecording
 from skyless.run.tag import Tags, TagSettings
 from skyless.sim.compile_ahead import compile_kernels
 from support.processes import SKYLESS, usual_signals
+from support.waiting import until
 
 pytestmark = pytest.mark.site
 

@@ -14,12 +14,13 @@ import time
 import urllib.request
 
 import pytest
-from mqtt_brokers import MOSQUITTO, until
+from mqtt_brokers import MOSQUITTO
 from site_observer import Observer
 from site_programs import ANCHORS, SITE, TAGS, SevenAnchors
 
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.topics import zone_event_topic
+from support.waiting import until
 
 pytestmark = pytest.mark.live
 

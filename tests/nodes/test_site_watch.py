@@ -13,7 +13,7 @@ import time
 
 import msgspec
 import pytest
-from mqtt_brokers import Embedded, until
+from mqtt_brokers import Embedded
 
 from skyless.cli.nodes._site_view import site_number
 from skyless.core.errors import SkylessError
@@ -21,8 +21,8 @@ from skyless.run.mqtt import topics
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import AlarmMessage, Counters, FixMessage, SiteMessage, TagHealth
 from skyless.sim.lab import lab_site
-from support.loops import in_loop
 from support.processes import SKYLESS, usual_signals
+from support.waiting import until
 
 pytestmark = pytest.mark.site
 
@@ -109,7 +109,6 @@ async def on_a_terminal(address):
     return code, drawn.decode(errors="replace")
 
 
-@in_loop
 async def test_a_site_is_shown_in_a_pipe_as_json_and_on_a_terminal(tmp_path):
     async with published_site(tmp_path) as address:
         once = ("watch", "--mqtt", address)
@@ -131,7 +130,6 @@ async def test_a_site_is_shown_in_a_pipe_as_json_and_on_a_terminal(tmp_path):
     assert "\x1b[?1049h" in drawn
 
 
-@in_loop
 async def test_a_broker_without_a_site_is_told(tmp_path):
     broker = Embedded(tmp_path)
     await broker.start()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from mqtt_brokers import Embedded, until
+from mqtt_brokers import Embedded
 from site_programs import START_S, Program, site_file
 
 from skyless.core.errors import SkylessError
@@ -19,8 +19,8 @@ from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.connection import check_broker
 from skyless.run.mqtt.link import Link
 from skyless.sim.compile_ahead import compile_kernels
-from support.loops import in_loop
 from support.processes import free_port
+from support.waiting import until
 
 pytestmark = pytest.mark.site
 
@@ -54,7 +54,6 @@ def address_of(broker, role, ca):
     return msgspec.structs.replace(broker.address, user=str(role), password=password, ca=ca)
 
 
-@in_loop
 async def test_a_broker_with_another_certificate_gets_no_password(broker, tmp_path):
     await broker.start()
     await check_broker(address_of(broker, Role.TAGS, tmp_path / "certificate.pem"))
@@ -72,7 +71,7 @@ def test_a_shell_reads_the_file_of_a_role(broker, tmp_path):
 
 
 @pytest.mark.statistical
-def test_the_programs_of_a_site_may_do_all_that_they_do(broker, tmp_path):
+async def test_the_programs_of_a_site_may_do_all_that_they_do(broker, tmp_path):
     def program(role, *arguments):
         password = {"SKYLESS_MQTT": f"mqtts://{role}@127.0.0.1:{broker.address.port}"}
         password |= {
@@ -81,38 +80,33 @@ def test_the_programs_of_a_site_may_do_all_that_they_do(broker, tmp_path):
         }
         return Program(*arguments, environment=os.environ | password)
 
-    async def check():
-        site, air = ("--site", site_file(tmp_path)), f"127.0.0.1:{free_port()}"
-        mqtts = ("--mqtt", f"mqtts://survey@127.0.0.1:{broker.address.port}")
-        programs = [
-            program(Role.ANCHORS, "ether", *site, "--tags", 1, "--listen", air),
-            program(Role.ANCHORS, "anchor", *range(1, 8), *site, "--radio", f"ether:{air}"),
-            program(Role.TAGS, "tag", "tag1", "--radio", f"ether:{air}"),
-            program(Role.PAGE, "dashboard", "--listen", f"127.0.0.1:{free_port()}"),
-            program(Role.PAGE, "record", tmp_path / "walk.mcap"),
-            program(Role.SURVEY, "survey", "--serve", *mqtts, "--mqtt-ca", tmp_path / "certificate.pem"),
-            program(Role.PAGE, "bridge", f"jsonl+tcp://127.0.0.1:{free_port()}"),
-        ]
-        await broker.start()
-        seen = set()
-        observer = Link(
-            address_of(broker, Role.OPERATOR, tmp_path / "certificate.pem"), "observer", site=77, kind="watch"
-        )
-        observer.subscribe(f"{SITE}#", lambda topic, _: seen.add(topic.removeprefix(SITE)))
-        watching = asyncio.ensure_future(observer.run())
-        await until(lambda: observer.connected)
-        try:
-            await asyncio.gather(*(program.start() for program in programs))
-            await until(lambda: kinds(seen) >= EXPECTED, START_S)
-        finally:
-            await asyncio.gather(*(program.stop() for program in programs))
-            watching.cancel()
-            await asyncio.wait([watching])
-            await broker.stop()
-        return [line for program in programs for _, line in program.said]
-
     compile_kernels()
-    lines = asyncio.run(check())
+    site, air = ("--site", site_file(tmp_path)), f"127.0.0.1:{free_port()}"
+    mqtts = ("--mqtt", f"mqtts://survey@127.0.0.1:{broker.address.port}")
+    programs = [
+        program(Role.ANCHORS, "ether", *site, "--tags", 1, "--listen", air),
+        program(Role.ANCHORS, "anchor", *range(1, 8), *site, "--radio", f"ether:{air}"),
+        program(Role.TAGS, "tag", "tag1", "--radio", f"ether:{air}"),
+        program(Role.PAGE, "dashboard", "--listen", f"127.0.0.1:{free_port()}"),
+        program(Role.PAGE, "record", tmp_path / "walk.mcap"),
+        program(Role.SURVEY, "survey", "--serve", *mqtts, "--mqtt-ca", tmp_path / "certificate.pem"),
+        program(Role.PAGE, "bridge", f"jsonl+tcp://127.0.0.1:{free_port()}"),
+    ]
+    await broker.start()
+    seen = set()
+    observer = Link(address_of(broker, Role.OPERATOR, tmp_path / "certificate.pem"), "observer", site=77, kind="watch")
+    observer.subscribe(f"{SITE}#", lambda topic, _: seen.add(topic.removeprefix(SITE)))
+    watching = asyncio.ensure_future(observer.run())
+    await until(lambda: observer.connected)
+    try:
+        await asyncio.gather(*(program.start() for program in programs))
+        await until(lambda: kinds(seen) >= EXPECTED, START_S)
+    finally:
+        await asyncio.gather(*(program.stop() for program in programs))
+        watching.cancel()
+        await asyncio.wait([watching])
+        await broker.stop()
+    lines = [line for program in programs for _, line in program.said]
     assert not [line for line in lines if "does not let" in line or "refuses" in line]
     assert "Violation" not in (tmp_path / "store" / "nats-server.log").read_text(encoding="utf-8")
 

@@ -42,7 +42,6 @@ from skyless.site.file.check import image_size
 from skyless.site.file.load import load_site
 from skyless.site.survey.facts import Facts, Gauge, PairRanges, Tape
 from skyless.site.survey.result import Survey, SurveyedAnchor, read_record, record_path
-from support.loops import in_loop
 
 pytestmark = pytest.mark.site
 
@@ -219,7 +218,6 @@ class Stage:
         self.now_s += 0.001
 
 
-@in_loop
 async def test_results_are_published_and_saved_and_anchors_get_their_placement(monkeypatch, tmp_path):
     file = tmp_path / "lab.toml"
     file.write_text(TEXT, encoding="utf-8")
@@ -264,7 +262,6 @@ async def test_results_are_published_and_saved_and_anchors_get_their_placement(m
     assert stage.link.newest(WatchMessage).findings == ()
 
 
-@in_loop
 async def test_a_second_survey_names_the_sites_before_it(monkeypatch):
     stage = Stage(monkeypatch, site=SITE)
     first = replace(SITE, anchors=(replace(SITE.anchors[0], x_m=0.5), *SITE.anchors[1:]))
@@ -277,37 +274,33 @@ async def test_a_second_survey_names_the_sites_before_it(monkeypatch):
     assert stage.node.saved.written == ()  # there is no file
 
 
-def test_what_cannot_be_saved_is_said_and_changes_nothing(monkeypatch, tmp_path):
-    async def main():
-        file = tmp_path / "lab.toml"
-        file.write_text(TEXT, encoding="utf-8")
-        stage = Stage(monkeypatch, site=load_site(file), file=file)
+async def test_what_cannot_be_saved_is_said_and_changes_nothing(monkeypatch, tmp_path):
+    file = tmp_path / "lab.toml"
+    file.write_text(TEXT, encoding="utf-8")
+    stage = Stage(monkeypatch, site=load_site(file), file=file)
 
-        def refused(serial):
-            stage.link.receive(topics.survey_save_topic(1), SurveySaveMessage("page", serial))
-            assert stage.link.newest(PlacementMessage) is None
-            return stage.link.newest(SurveyMessage).error
+    def refused(serial):
+        stage.link.receive(topics.survey_save_topic(1), SurveySaveMessage("page", serial))
+        assert stage.link.newest(PlacementMessage) is None
+        return stage.link.newest(SurveyMessage).error
 
-        assert "result 1 is not there" in refused(1)
-        stage.found = true_survey(())
-        await stage.play(0.0, 3.0)
-        assert "determines no anchor" in refused(stage.node.live.serial)
-        stage.found = true_survey()
-        await stage.play(3.0, 6.0)
-        stage.link.receive(topics.site_topic(1), SiteMessage(SITE, True, 0.0))
-        assert "another site" in refused(stage.node.live.serial)
-        stage.link.receive(topics.site_topic(1), SiteMessage(load_site(file), True, 0.0))
-        file.write_text(TEXT.replace('mode = "free"', 'mode = "free"\nrate_hz = 20.0'), encoding="utf-8")
-        changed = file.read_text(encoding="utf-8")
-        assert "has been changed" in refused(stage.node.live.serial)
-        assert file.read_text(encoding="utf-8") == changed
-        file.write_text("nonsense", encoding="utf-8")
-        assert str(file) in refused(stage.node.live.serial)
-
-    asyncio.run(main())
+    assert "result 1 is not there" in refused(1)
+    stage.found = true_survey(())
+    await stage.play(0.0, 3.0)
+    assert "determines no anchor" in refused(stage.node.live.serial)
+    stage.found = true_survey()
+    await stage.play(3.0, 6.0)
+    stage.link.receive(topics.site_topic(1), SiteMessage(SITE, True, 0.0))
+    assert "another site" in refused(stage.node.live.serial)
+    stage.link.receive(topics.site_topic(1), SiteMessage(load_site(file), True, 0.0))
+    file.write_text(TEXT.replace('mode = "free"', 'mode = "free"\nrate_hz = 20.0'), encoding="utf-8")
+    changed = file.read_text(encoding="utf-8")
+    assert "has been changed" in refused(stage.node.live.serial)
+    assert file.read_text(encoding="utf-8") == changed
+    file.write_text("nonsense", encoding="utf-8")
+    assert str(file) in refused(stage.node.live.serial)
 
 
-@in_loop
 async def test_a_solver_that_fails_is_reported_and_asked_again(monkeypatch):
     stage = Stage(monkeypatch, site=SITE)
     for until_s, error in ((3.0, SkylessError("too few ranges")), (6.0, ZeroDivisionError("no"))):
@@ -322,7 +315,6 @@ async def test_a_solver_that_fails_is_reported_and_asked_again(monkeypatch):
     assert stage.link.newest(SurveyMessage).error is None
 
 
-@in_loop
 async def test_the_site_on_mqtt_does_where_there_is_no_file_and_bad_messages_are_counted(monkeypatch):
     stage = Stage(monkeypatch)
     await stage.step()
@@ -341,7 +333,6 @@ async def test_the_site_on_mqtt_does_where_there_is_no_file_and_bad_messages_are
     assert stage.node.problems == 3
 
 
-@in_loop
 async def test_what_is_retained_and_the_lease_end_with_the_program(monkeypatch):
     stage = Stage(monkeypatch, site=SITE)
     async with running(stage.node.run()):
@@ -354,7 +345,6 @@ async def test_what_is_retained_and_the_lease_end_with_the_program(monkeypatch):
     assert not stage.link.newest(RequestMessage).stamps
 
 
-@in_loop
 async def test_one_that_gathers_computes_and_publishes_nothing_but_its_request(monkeypatch):
     stage = Stage(monkeypatch, site=SITE, serves=False)
     await stage.play(0.0, 3.0)
@@ -363,7 +353,6 @@ async def test_one_that_gathers_computes_and_publishes_nothing_but_its_request(m
     assert {type(message) for _, message, _ in stage.link.published} <= {RequestMessage}
 
 
-@in_loop
 async def test_a_result_that_was_begun_before_it_was_saved_is_dropped(monkeypatch):
     """Its delays are those against the site before: with them, every delay would be corrected twice."""
     stage = Stage(monkeypatch, site=SITE)
@@ -404,7 +393,6 @@ def test_ranges_go_on_when_the_clock_of_an_anchors_host_is_set(step_s):
         Facts(gauge=Gauge(1, 1)),
     ],
 )
-@in_loop
 async def test_facts_that_cannot_be_computed_with_are_counted_and_ignored(monkeypatch, facts):
     stage = Stage(monkeypatch, site=SITE)
     stage.link.receive(topics.survey_facts_topic(1), SurveyFactsMessage(facts))
@@ -413,7 +401,6 @@ async def test_facts_that_cannot_be_computed_with_are_counted_and_ignored(monkey
     assert stage.link.newest(SurveyMessage).facts == Facts()
 
 
-@in_loop
 async def test_numbers_that_are_no_stamps_spoil_nothing(monkeypatch):
     stage = Stage(monkeypatch, site=SITE)
     await stage.play(0.0, 2.0)
@@ -425,7 +412,6 @@ async def test_numbers_that_are_no_stamps_spoil_nothing(monkeypatch):
     assert len(stage.asked[-1][0].pairs) == 15
 
 
-@in_loop
 async def test_of_two_programs_at_one_site_the_later_one_waits_until_the_other_has_ended(monkeypatch):
     stage = Stage(monkeypatch, site=SITE)
     await stage.play(0.0, 2.0)
@@ -469,7 +455,6 @@ def test_where_not_all_files_can_be_written_none_is(tmp_path, monkeypatch, faili
     assert file.read_text(encoding="utf-8") == TEXT
 
 
-@in_loop
 async def test_a_finding_is_logged_once_although_its_size_wavers():
     said, again = [], []
     node = SurveyNode(SurveySettings(1), lambda _: Facts(), None, None, said.append)

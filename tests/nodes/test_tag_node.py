@@ -16,7 +16,6 @@ from skyless.run import tag as tag_module
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.messages import Counters, FixMessage, SiteMessage, TagHealth
 from skyless.run.tag import Tag, TagNode, TagSettings
-from support.loops import in_loop
 
 pytestmark = pytest.mark.site
 
@@ -149,7 +148,6 @@ def test_without_the_host_s_time_a_frame_counts_from_when_it_came():
     assert all(fix.latency_s == 0.0 for fix in bench.published)
 
 
-@in_loop
 async def test_it_listens_until_it_is_cancelled():
     bench = Bench()
     async with running(bench.node.run()):
@@ -195,7 +193,6 @@ async def settled():
         await asyncio.sleep(0)
 
 
-@in_loop
 async def test_the_link_comes_with_the_site_and_goes_with_it(monkeypatch, links):
     monkeypatch.setattr(tag_module, "Link", FakeLink)
 
@@ -228,7 +225,6 @@ async def test_the_link_comes_with_the_site_and_goes_with_it(monkeypatch, links)
     assert second.state == "left"
 
 
-@in_loop
 async def test_without_a_broker_it_works_and_publishes_nothing(monkeypatch, links):
     monkeypatch.setattr(tag_module, "Link", FakeLink)
 
@@ -241,7 +237,6 @@ async def test_without_a_broker_it_works_and_publishes_nothing(monkeypatch, link
     assert links == []
 
 
-@in_loop
 async def test_a_link_that_fails_is_reported_of_and_started_again(monkeypatch):
     monkeypatch.setattr(process, "HEALTH_S", 0.01)
     said = []

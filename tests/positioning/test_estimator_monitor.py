@@ -157,7 +157,7 @@ def test_oscillators_as_assumed_are_left_alone(case):
         estimator, scales = begun(run, assumed, std_m=0.1), []
         for packet in one_by_one(run.packets):
             estimator.process(*packet)
-            scales.append((seen(estimator.state).status["q_scale"], seen(estimator.state).status["walk_scale"]))
+            scales.append((estimator.state.status.q_scale, estimator.state.status.walk_scale))
         shares.append(np.mean(np.array(scales)[900:] > 1.5, axis=0))
     assert np.all(np.mean(shares, axis=0) < 0.1)
 

@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyless.core.air.beacon import Beacon
@@ -89,6 +89,7 @@ def test_receptions_that_an_anchor_relays_show_whether_it_is_there(off_ticks, fi
     assert fitting_relays(t, s, relays(*heard), rx_ticks) == fitting
 
 
+@settings(max_examples=20)
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(1, 1000)), min_size=400, max_size=500))
 def test_memory_is_bounded_and_those_that_others_receive_stay(rows):
     """Strangers come with any number of frames; anchors 1 to 9 are relayed by an anchor in use all the time."""

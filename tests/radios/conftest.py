@@ -1,18 +1,6 @@
-"""Tests that are coroutines have an event loop each; the DW1000's driver runs with a sanitizer."""
-
-import asyncio
-import inspect
+"""The DW1000's driver runs with a sanitizer."""
 
 import pytest
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_pyfunc_call(pyfuncitem):
-    if not inspect.iscoroutinefunction(pyfuncitem.obj):
-        return None
-    arguments = inspect.signature(pyfuncitem.obj).parameters
-    asyncio.run(pyfuncitem.obj(**{name: pyfuncitem.funcargs[name] for name in arguments}))
-    return True
 
 
 @pytest.fixture(scope="session", autouse=True)

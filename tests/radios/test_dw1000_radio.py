@@ -27,6 +27,7 @@ from skyless.run._dw1000_model import ModelPort
 from skyless.run.open_radio import is_simulated, open_radios
 from skyless.sim.compile_ahead import compile_kernels
 from skyless.sim.dw1000.chip import ModelBus
+from support.waiting import until
 
 pytestmark = pytest.mark.site
 
@@ -51,9 +52,7 @@ async def test_frames_fly_between_models_on_the_emulated_air_and_late_ones_do_no
             tx_ticks = wrap((now_ticks + round(0.02 * TICK_RATE_HZ)) & ~0x1FF) + 16_436
             body = b"frame %d  " % number
             anchor.transmit(Transmission(body, wrap(tx_ticks)))
-            async with asyncio.timeout(10):
-                while len(sender.of(Sent)) + len(sender.of(Late)) <= number:
-                    await asyncio.sleep(0.002)
+            await until(lambda number=number: len(sender.of(Sent)) + len(sender.of(Late)) > number)
         assert len(sender.of(Sent)) > 5
         await listener.until(Reception)
         assert listener.of(Reception)[0].frame.startswith(b"frame ")
@@ -209,13 +208,9 @@ async def test_an_interrupt_line_that_is_stuck_is_reported_once_and_the_chip_is_
         assert (await host.until(Reception)).frame.startswith(b"it is heard")
         buses[0].stuck = False
         looks = buses[0].looks
-        async with asyncio.timeout(30):
-            while buses[0].looks < looks + 3:  # back to waiting for the line
-                await asyncio.sleep(0.002)
+        await until(lambda: buses[0].looks >= looks + 3)  # back to waiting for the line
         buses[0].stuck = True
-        async with asyncio.timeout(30):
-            while radio.counters["irq-in-vain"] < 2:
-                await asyncio.sleep(0.002)
+        await until(lambda: radio.counters["irq-in-vain"] >= 2)
         assert len(host.of(Hint)) == 1
         assert len(host.of(Restarted)) == 1
 

@@ -17,6 +17,7 @@ from skyless.radio.ether_wire import Join, Joined, Refused, Send, Unpacker, from
 from skyless.radio.interface import Gone, Late, Restarted, Sent
 from skyless.run.ether import Client
 from skyless.run.open_radio import host_and_port, is_simulated, open_radios
+from support.waiting import until
 
 pytestmark = pytest.mark.site
 
@@ -81,9 +82,7 @@ async def speak(node, listener):
         heard, done = len(listener.of(Reception)), len(node.of(Sent)) + len(node.of(Late))
         tx_ticks = ahead(node.radio, 20e-3)
         node.radio.transmit(Transmission(WORD, tx_ticks))
-        async with asyncio.timeout(20):
-            while len(node.of(Sent)) + len(node.of(Late)) == done:
-                await asyncio.sleep(0.001)
+        await until(lambda done=done: len(node.of(Sent)) + len(node.of(Late)) > done)
         if Sent(tx_ticks) in node.events:
             await listener.until(Reception, heard + 1)
             return tx_ticks
@@ -172,9 +171,7 @@ async def test_a_cancelled_radio_leaves_the_air():
         async with nodes(air.port, "tag", "tag1") as (tag,):
             await tag.until(Restarted)
             assert set(air.ether.truth(0.0).tags) == {"tag1"}
-        async with asyncio.timeout(20):
-            while air.ether.truth(0.0).tags:
-                await asyncio.sleep(0.005)
+        await until(lambda: not air.ether.truth(0.0).tags)
 
 
 async def test_a_name_that_the_ether_has_not_or_that_is_taken_is_reported_and_asked_for_again():

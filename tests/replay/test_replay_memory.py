@@ -9,7 +9,7 @@ import synthetic_recordings as synthetic
 
 pytestmark = pytest.mark.statistical
 
-ROWS = {"tdoa-table": 15_000, "bitcraze-binary": 4_000, "avalue": 4_000}
+ROWS = {"tdoa-table": 8_000, "bitcraze-binary": 2_000, "avalue": 2_000}
 PEAKS = """
 import sys
 from pathlib import Path

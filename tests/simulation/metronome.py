@@ -3,6 +3,8 @@
 import struct
 from dataclasses import dataclass, field
 
+import msgspec
+
 from skyless.core.air.reception import Reception, Transmission
 from skyless.core.site import AnchorSite, Site
 from skyless.core.ticks import TICK_MASK, from_seconds
@@ -12,6 +14,11 @@ from skyless.sim.oscillator import OscillatorModel
 DELAY_TICKS = 16_436
 QUIET_CRYSTALS = OscillatorModel(offset_ppm=0.0, white_fm=0.0, random_walk_fm=0.0)
 IDEAL = Impairments(tx_stamp_ps=0.0, rx_stamp_ps=0.0, oscillator=QUIET_CRYSTALS)
+
+
+def faulty(**changes) -> Impairments:
+    """Ideal but for what is given."""
+    return msgspec.structs.replace(IDEAL, **changes)
 
 
 @dataclass

@@ -7,10 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
-from metronome import DELAY_TICKS, IDEAL, Metronome, sent, site_of, staggered
+from metronome import DELAY_TICKS, IDEAL, Metronome, faulty, sent, site_of, staggered
 from scipy.stats import binom, chi2, expon, kstest
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
@@ -37,12 +36,8 @@ def unwrapped(counters):
     return np.array([unwrapper.unwrap(int(counter)) for counter in counters])
 
 
-def _with(**changes):
-    return msgspec.structs.replace(IDEAL, **changes)
-
-
 def _channel(**changes):
-    return _with(channel=ChannelModel(**changes))
+    return faulty(channel=ChannelModel(**changes))
 
 
 def _receptions(world, until_s, tag=0):
@@ -85,7 +80,7 @@ def test_stamps_reproduce_the_distances_to_the_rounding():
 
 def test_claimed_and_received_stamps_differ_by_flight_and_both_noises():
     """With noise σ on each stamp, RX - claimed TX has variance 2σ² + tick²/12 (RX alone is rounded)."""
-    world = World(LAB, staggered(), [AT_P1], _with(tx_stamp_ps=150.0, rx_stamp_ps=150.0), 2)
+    world = World(LAB, staggered(), [AT_P1], faulty(tx_stamp_ps=150.0, rx_stamp_ps=150.0), 2)
     for rows in _receptions(world, 12.0).values():
         ticks = np.array([difference(rx, tx) for tx, rx, _, _ in rows], dtype=np.float64)
         theory = 2.0 * (150e-12 / TICK_S) ** 2 + 1.0 / 12.0
@@ -94,7 +89,7 @@ def test_claimed_and_received_stamps_differ_by_flight_and_both_noises():
 
 
 def test_the_truth_knows_of_the_emission_noise():
-    world = World(LAB, staggered(), [AT_P1], _with(tx_stamp_ps=5000.0), 2)
+    world = World(LAB, staggered(), [AT_P1], faulty(tx_stamp_ps=5000.0), 2)
     for metres in _flights_m(world, 2.0).values():
         assert np.ptp(metres) <= 2 * TICK_M
 
@@ -102,7 +97,7 @@ def test_the_truth_knows_of_the_emission_noise():
 def test_crystals_run_at_their_own_rates():
     """RX against TX is a straight line; its slope differs from 1 by both offsets, and only noise is left over."""
     crystals = OscillatorModel(offset_ppm=10.0, white_fm=0.0, random_walk_fm=0.0)
-    world = World(LAB, staggered(), [AT_P1], _with(oscillator=crystals, rx_stamp_ps=100.0), 3)
+    world = World(LAB, staggered(), [AT_P1], faulty(oscillator=crystals, rx_stamp_ps=100.0), 3)
     slopes = []
     for rows in _receptions(world, 20.0).values():
         tx, rx = (unwrapped([row[k] for row in rows]) for k in (0, 1))
@@ -132,7 +127,7 @@ def test_counters_wrap_for_hours_without_a_jump():
     """One frame in 8 s over 10 h: 2000 wraps; the line of RX over true time is straight to a tick."""
     crystals = OscillatorModel(offset_ppm=10.0, white_fm=0.0, random_walk_fm=0.0)
     site = site_of((0, 0))
-    world = World(site, lambda a: Metronome(a, period_s=8.0), [AT_P1], _with(oscillator=crystals), 4)
+    world = World(site, lambda a: Metronome(a, period_s=8.0), [AT_P1], faulty(oscillator=crystals), 4)
     rows = _receptions(world, 36_000.0)[1]
     rx = unwrapped([row[1] for row in rows])
     tx = unwrapped([row[0] for row in rows])
@@ -263,7 +258,7 @@ def test_late_messages_are_as_frequent_and_as_late_as_asked():
 
 def test_persistent_and_bursty_biases_fall_on_their_anchors():
     always, bursts = AnchorBias(2, 0.3), AnchorBias(4, 1.5, burst_s=0.5, pause_s=1.0)
-    extra = _excess_m(_with(anchor_biases=(always, bursts)), 4.0)
+    extra = _excess_m(faulty(anchor_biases=(always, bursts)), 4.0)
     assert np.abs(extra[1][:, 1]).max() == 0.0
     assert extra[2][:, 1] == pytest.approx(np.full(len(extra[2]), 0.3), abs=TICK_M)
     in_burst = extra[4][:, 0] % 1.5 >= 1.0
@@ -276,7 +271,7 @@ def test_walls_delay_and_weaken():
     plain, walled = site_of((0, 0), (6, 0)), site_of((0, 0), (6, 0), walls=[wall])
     seen = []
     for site in (plain, walled):
-        world = World(site, staggered(), [AT_P1], _with(diagnostics=True, channel=ChannelModel(power_noise_db=0.0)), 1)
+        world = World(site, staggered(), [AT_P1], faulty(diagnostics=True, channel=ChannelModel(power_noise_db=0.0)), 1)
         seen.append({b.anchor: (int(b.rx_ticks[0]), b.diagnostics[0]) for b in world.run(0.03)})
     for anchor, metres, loss_db in ((1, 0.25, 7.0), (2, 0.0, 0.0)):
         (clear_ticks, clear), (late_ticks, late) = seen[0][anchor], seen[1][anchor]
@@ -296,7 +291,7 @@ def test_power_bias_follows_the_table():
 
 def test_antenna_delay_errors_shift_their_stamps():
     errors = (DelayError(2, tx_ticks=70.0), DelayError(3, rx_ticks=900.0))
-    extra = _excess_m(_with(delay_errors=errors), 0.2)
+    extra = _excess_m(faulty(delay_errors=errors), 0.2)
     assert extra[2][:, 1] == pytest.approx(np.full(len(extra[2]), 70.0 * TICK_M), abs=TICK_M)
     assert np.abs(extra[3][:, 1]).max() == 0.0
 
@@ -305,7 +300,7 @@ def test_diagnostics_tell_power_offset_and_doppler():
     crystals = OscillatorModel(offset_ppm=10.0, white_fm=0.0, random_walk_fm=0.0)
     model = ChannelModel(power_noise_db=0.0, carrier_noise_ppm=0.0)
     still, fleeing = TagSpec(Static(3, 4)), TagSpec(Waypoints([(0, 1), (0, 5000)], 30.0))
-    impairments = _with(oscillator=crystals, channel=model, diagnostics=True)
+    impairments = faulty(oscillator=crystals, channel=model, diagnostics=True)
     world = World(site_of((0, 0)), staggered(), [still, fleeing], impairments, 8)
     tx, rx, seen, offsets = [], [[], []], [], [[], []]
     for broadcast in world.run(1.0):
@@ -345,7 +340,7 @@ def test_a_restarted_anchor_is_a_new_machine_with_a_new_counter():
         return Metronome(anchor, first_s=5e-3 + 2e-3 * anchor)
 
     outage = AnchorOutage(2, Outage(0.2, 0.5))
-    world = World(LAB, factory, [AT_P1], _with(anchor_outages=(outage,)), 9)
+    world = World(LAB, factory, [AT_P1], faulty(anchor_outages=(outage,)), 9)
     rows = _receptions(world, 1.0)
     assert made.count(2) == 2
     assert made.count(1) == 1
@@ -381,7 +376,7 @@ def test_overlapping_outages_end_with_the_last():
         return Metronome(anchor)
 
     outages = (AnchorOutage(1, Outage(0.0, 0.3)), AnchorOutage(1, Outage(0.1, 0.5)))
-    world = World(site_of((0, 0)), factory, [AT_P1], _with(anchor_outages=outages), 1)
+    world = World(site_of((0, 0)), factory, [AT_P1], faulty(anchor_outages=outages), 1)
     times = [broadcast.emission_s for broadcast in world.run(1.0)]
     assert made == [1]
     assert times[0] == pytest.approx(0.505, abs=1e-7)
@@ -390,7 +385,7 @@ def test_overlapping_outages_end_with_the_last():
 
 def test_impairments_of_unknown_anchors_are_refused():
     with pytest.raises(ValueError, match=r"anchor_biases names anchor 9; .*1, 2, 3, 4, 5, 6"):
-        World(LAB, staggered(), [], _with(anchor_biases=(AnchorBias(9, 1.0),)), 1)
+        World(LAB, staggered(), [], faulty(anchor_biases=(AnchorBias(9, 1.0),)), 1)
 
 
 def test_the_lab_is_as_the_mathematics_says():
@@ -403,7 +398,7 @@ def test_the_lab_is_as_the_mathematics_says():
 
 
 PRINT_STAMPS = """
-from metronome import staggered
+from metronome import faulty, staggered
 from test_radio_world import _busy_world
 for b in _busy_world(3).run(0.12):
     print(b.anchor, b.emission_ticks, *b.tags, *b.rx_ticks)

@@ -6,7 +6,7 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from metronome import IDEAL, Metronome, site_of, staggered
+from metronome import IDEAL, Metronome, faulty, site_of, staggered
 from scipy.integrate import quad
 from scipy.stats import chi2, kstest, uniform
 
@@ -30,10 +30,6 @@ LAB = paper_lab_site()
 PLACES_M = {anchor.id: np.array([anchor.x_m, anchor.y_m]) for anchor in LAB.anchors}
 MIDDLE = Static(3.0, 4.0)
 AT_REST = TagSpec(MIDDLE)
-
-
-def _with(**changes):
-    return msgspec.structs.replace(IDEAL, **changes)
 
 
 def _late_m(changed, until_s, *, tag=AT_REST, sites=(LAB, LAB)):
@@ -77,7 +73,7 @@ def _late_at_anchors_m(changed, sites=(LAB, LAB)):
 def test_displaced_anchors_are_heard_from_where_they_truly_are():
     """By tags and by other anchors; and they themselves hear there."""
     shift = np.array([0.3, -0.2])
-    changed = _with(anchor_displacements=(AnchorDisplacement(3, *shift),))
+    changed = faulty(anchor_displacements=(AnchorDisplacement(3, *shift),))
     for anchor, rows in _late_m(changed, 0.2).items():
         moved = PLACES_M[anchor] + (shift if anchor == 3 else 0.0)
         longer_m = math.dist(moved, (3.0, 4.0)) - math.dist(PLACES_M[anchor], (3.0, 4.0))
@@ -89,14 +85,14 @@ def test_displaced_anchors_are_heard_from_where_they_truly_are():
 
 
 def test_machines_are_told_the_places_of_the_site_file():
-    world = World(LAB, staggered(), [], _with(anchor_displacements=(AnchorDisplacement(3, 1.0),)), 1)
+    world = World(LAB, staggered(), [], faulty(anchor_displacements=(AnchorDisplacement(3, 1.0),)), 1)
     assert tuple(world.medium.stations[2]["position_m"]) == (7.0, 4.0, 0.0)
     assert (LAB.anchors[2].x_m, LAB.anchors[2].y_m) == (6.0, 4.0)
 
 
 def test_drawn_constants_are_uniform_stay_and_belong_to_their_pair():
     tags = [TagSpec(Static(2.0 + 0.01 * k, 3.0)) for k in range(120)]
-    worlds = [World(LAB, staggered(), tags, i, 3) for i in (IDEAL, _with(range_errors=RangeErrorModel(0.05)))]
+    worlds = [World(LAB, staggered(), tags, i, 3) for i in (IDEAL, faulty(range_errors=RangeErrorModel(0.05)))]
     late = {}
     for plain, changed in zip(*(world.run(0.1) for world in worlds), strict=True):
         late.setdefault(plain.anchor, []).append((changed.rx_ticks - plain.rx_ticks) * TICK_M)
@@ -104,9 +100,9 @@ def test_drawn_constants_are_uniform_stay_and_belong_to_their_pair():
     drawn = worlds[1].medium.range_errors.present_m[6:]
     assert np.abs(found - drawn.T[:, None]).max() <= 1.01 * TICK_M
     assert kstest(drawn.ravel(), uniform(-0.05, 0.1).cdf).pvalue > 1e-4
-    few = World(LAB, staggered(), tags[:3], _with(range_errors=RangeErrorModel(0.05)), 3)
+    few = World(LAB, staggered(), tags[:3], faulty(range_errors=RangeErrorModel(0.05)), 3)
     assert (few.medium.range_errors.present_m[6:] == drawn[:3]).all()
-    other = World(LAB, staggered(), tags[:3], _with(range_errors=RangeErrorModel(0.05)), 4)
+    other = World(LAB, staggered(), tags[:3], faulty(range_errors=RangeErrorModel(0.05)), 4)
     assert not (other.medium.range_errors.present_m[6:] == drawn[:3]).any()
     assert not worlds[1].medium.range_errors.present_m[:6].any()
 
@@ -114,7 +110,7 @@ def test_drawn_constants_are_uniform_stay_and_belong_to_their_pair():
 def test_the_slope_grows_with_the_distance_at_tags_alone():
     for distance_m, share in ((0.0, -1.0), (2.0, -0.5), (4.0, 0.0), (7.0, 0.75), (8.0, 1.0), (30.0, 1.0)):
         assert slope_error_m(0.05, distance_m) == pytest.approx(0.05 * share)
-    model = _with(range_errors=RangeErrorModel(slope_m=0.08))
+    model = faulty(range_errors=RangeErrorModel(slope_m=0.08))
     place = Static(0.5, 1.5)
     for anchor, rows in _late_m(model, 0.2, tag=TagSpec(place)).items():
         expected_m = 0.08 * np.clip((math.dist(PLACES_M[anchor], (0.5, 1.5)) - 4.0) / 4.0, -1.0, 1.0)
@@ -153,7 +149,7 @@ def test_changing_errors_forget_with_their_correlation_length(along):
 
 
 def test_changing_errors_reach_the_stamps():
-    model = _with(range_errors=RangeErrorModel(changing_m=0.1, correlation_s=0.2))
+    model = faulty(range_errors=RangeErrorModel(changing_m=0.1, correlation_s=0.2))
     world = World(LAB, staggered(), [TagSpec(MIDDLE)], model, 7)
     plain = World(LAB, staggered(), [TagSpec(MIDDLE)], IDEAL, 7)
     seen = set()
@@ -178,7 +174,7 @@ def test_a_wall_delays_while_it_stands_between(between_anchors):
     wall = WallSite(4.2, 2.6, 4.3, 4.6, delay_m=0.25)
     walled = msgspec.structs.replace(LAB, walls=(wall,))
     path = Waypoints([(3.0, 1.0), (3.0, 7.0)], 1.0)
-    changed = _with(channel=ChannelModel(walls_between_anchors=between_anchors))
+    changed = faulty(channel=ChannelModel(walls_between_anchors=between_anchors))
     late = _late_m(changed, 6.0, tag=TagSpec(path), sites=(LAB, walled))
     behind_s = {}
     for anchor, rows in late.items():
@@ -195,7 +191,7 @@ def test_a_wall_delays_while_it_stands_between(between_anchors):
 def test_a_body_shadows_its_sector_behind_the_tag_and_turns_with_it():
     body = Body(delay_m=0.2, sector_rad=math.radians(100.0))
     path = Waypoints([(2.0, 3.0), (4.0, 3.0), (4.0, 5.0)], 1.0)
-    late = _late_m(_with(body=body), 4.0, tag=TagSpec(path))
+    late = _late_m(faulty(body=body), 4.0, tag=TagSpec(path))
     shadowed = 0
     for anchor, rows in late.items():
         for t_s, late_m in rows:
@@ -205,18 +201,18 @@ def test_a_body_shadows_its_sector_behind_the_tag_and_turns_with_it():
             assert late_m == pytest.approx(0.2 if off <= 50.0 else 0.0, abs=1.01 * TICK_M)
             shadowed += off <= 50.0
     assert 0.2 < shadowed / sum(map(len, late.values())) < 0.5
-    assert {value for values in _late_at_anchors_m(_with(body=body)).values() for value in values} == {0.0}
+    assert {value for values in _late_at_anchors_m(faulty(body=body)).values() for value in values} == {0.0}
 
 
 def test_a_body_in_front_of_a_tag_at_rest_looks_along_x():
-    late = _late_m(_with(body=Body(0.2, math.radians(20.0), 0.0)), 0.2)
+    late = _late_m(faulty(body=Body(0.2, math.radians(20.0), 0.0)), 0.2)
     assert {anchor for anchor, rows in late.items() if rows[:, 1].mean() > 0.1} == {3}  # at (6, 4), seen from (3, 4)
 
 
 def test_a_bias_lasts_from_one_time_to_another():
     """Within it bursts come and go as always."""
     biases = (AnchorBias(2, 0.3, from_s=0.5, to_s=1.25), AnchorBias(4, 1.0, 0.2, 0.3, from_s=1.0))
-    late = _late_m(_with(anchor_biases=biases), 2.0)
+    late = _late_m(faulty(anchor_biases=biases), 2.0)
     t_s, late_m = late[2].T
     assert late_m == pytest.approx(np.where((t_s >= 0.5) & (t_s < 1.25), 0.3, 0.0), abs=1.01 * TICK_M)
     t_s, late_m = late[4].T
@@ -224,7 +220,7 @@ def test_a_bias_lasts_from_one_time_to_another():
 
 
 def test_a_bias_that_creeps_grows_from_its_beginning_and_ends_at_once():
-    late = _late_m(_with(anchor_biases=(AnchorBias(2, 0.1, from_s=0.5, to_s=1.5, creep_mps=0.4),)), 2.0)
+    late = _late_m(faulty(anchor_biases=(AnchorBias(2, 0.1, from_s=0.5, to_s=1.5, creep_mps=0.4),)), 2.0)
     t_s, late_m = late[2].T
     grown_m = np.where((t_s >= 0.5) & (t_s < 1.5), 0.1 + 0.4 * (t_s - 0.5), 0.0)
     assert late_m == pytest.approx(grown_m, abs=1.01 * TICK_M)
@@ -234,7 +230,7 @@ def test_a_bias_that_creeps_grows_from_its_beginning_and_ends_at_once():
 @pytest.mark.statistical
 def test_a_warming_crystal_gains_what_its_curve_says(ppm):
     """The tag's stamps run ahead by ppm·(t − τ(1 − e^(−t/τ))), t from the start of the warm-up."""
-    rows = np.vstack(list(_late_m(_with(warm_ups=(WarmUp(ppm, 20.0, 1.0),)), 10.0).values()))
+    rows = np.vstack(list(_late_m(faulty(warm_ups=(WarmUp(ppm, 20.0, 1.0),)), 10.0).values()))
     since_s = np.maximum(rows[:, 0] - 1.0, 0.0)
     ahead_s = ppm * 1e-6 * (since_s - 20.0 * (1.0 - np.exp(-since_s / 20.0)))
     assert rows[:, 1] == pytest.approx(ahead_s * SPEED_OF_LIGHT_MPS, abs=1.01 * TICK_M + 1e-5)
@@ -258,7 +254,7 @@ def test_the_phase_of_a_warm_up_is_the_integral_of_its_rate():
 
 def test_an_anchors_crystal_warms_alone():
     """It speaks too early, as its counter runs ahead; the others speak as before."""
-    changed = _with(warm_ups=(WarmUp(2.0, 20.0, anchor=3),))
+    changed = faulty(warm_ups=(WarmUp(2.0, 20.0, anchor=3),))
     worlds = [World(LAB, staggered(), [TagSpec(MIDDLE)], impairments, 7) for impairments in (IDEAL, changed)]
     for plain, warm in zip(*(world.run(2.0) for world in worlds), strict=True):
         t_s = plain.emission_s
@@ -304,11 +300,11 @@ def test_the_lab_is_what_it_was():
         (lambda: RangeErrorModel(correlation_s=1.0, correlation_m=1.0), "either correlation_s or correlation_m"),
         (lambda: RangeErrorModel(changing_m=0.03, correlation_m=0.0), "more than 0"),
         (
-            lambda: World(LAB, Metronome, [], _with(warm_ups=(WarmUp(1.0, 1.0, anchor=9),)), 1),
+            lambda: World(LAB, Metronome, [], faulty(warm_ups=(WarmUp(1.0, 1.0, anchor=9),)), 1),
             "warm_ups names anchor 9",
         ),
         (
-            lambda: World(LAB, Metronome, [], _with(anchor_displacements=(AnchorDisplacement(9),)), 1),
+            lambda: World(LAB, Metronome, [], faulty(anchor_displacements=(AnchorDisplacement(9),)), 1),
             "anchor_displacements names anchor 9",
         ),
     ],

@@ -61,7 +61,7 @@ def test_errors_that_last_widen_the_standard_errors():
     """A reflection that stays for five seconds is one error and not five hundred."""
     rng = np.random.default_rng(5)
     squares = []
-    for _ in range(30):
+    for _ in range(15):
         data = measured(rng, 12_000, noise_m=0.03)
         block = (data.t_s / 5.0).astype(int)
         lasting = rng.normal(0.0, 0.1, (block.max() + 1, 8))

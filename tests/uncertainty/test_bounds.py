@@ -4,24 +4,16 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from textbook_bound import LAB, RAISED, SLOT_S, STAMP_S, positions, settings_of, textbook, walk
 
 from dense_covariance import position_covariance
 from skyless.core.constants import SPEED_OF_LIGHT_MPS
 from skyless.core.processors import cores
 from skyless.core.protocol1.snapshots import bracketed_covariance, literal_covariance
 from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, EPISODE_SUPERFRAMES, WHITE_FM, random_path
-from skyless.research.uncertainty.bounds import (
-    OFFSET_STD_M,
-    POSITION_STD_M,
-    RATE_STD_MPS,
-    BoundSettings,
-    tracking_bound,
-)
+from skyless.research.uncertainty.bounds import BoundSettings, tracking_bound
 from skyless.sim.lab import paper_lab_site
 
-LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
-SLOT_S = 2.5e-3
-STAMP_S = 100e-12
 STAMP_M = SPEED_OF_LIGHT_MPS * STAMP_S
 TABLE = [
     (100e-12, 1e-9, 0.5, 0.02207, 0.01698, 500),
@@ -71,9 +63,7 @@ def lab_tracking_bound_m(
 
 def snapshot_bound(place, *, superframes=2, mesh=False):
     """Bound of a tag at rest from all raw stamps of these superframes; all clocks are unknown, straight lines."""
-    settings = BoundSettings(
-        STAMP_S, white_fm=0.0, random_walk_fm=0.0, qa=0.0, slot_s=SLOT_S, speed_std_mps=0.0, mesh=mesh
-    )
+    settings = settings_of(white_fm=0.0, random_walk_fm=0.0, qa=0.0, speed_std_mps=0.0, mesh=mesh)
     return tracking_bound(LAB, np.tile(place, (superframes * len(LAB), 1)), settings)[-1]
 
 
@@ -88,64 +78,13 @@ def test_the_published_bounds_of_the_lab(stamp_s, walk, qa, without, with_mesh, 
         assert found == pytest.approx(expected, rel=0.02)
 
 
-def textbook(anchors, path, stamp_m, walk, white, qa, speed_std, mesh, dims):
-    """The same bound with dense matrices: clocks against true time, all receptions of a frame in one update.
-
-    The states are another set on purpose: here every clock has its own offset and rate, the first anchor's too, and
-    its prior is exact; TX noise is in the measurements' covariance. States: [p, v, (offset, rate) of tag and anchors].
-    """
-    n = len(anchors)
-    size = 2 * dims + 2 * (n + 1)
-    clock = np.square([OFFSET_STD_M, RATE_STD_MPS])
-    first = 2 * dims + 2
-    P = np.diag([POSITION_STD_M**2] * dims + [speed_std**2] * dims + [*clock] * (n + 1))
-    P[first, first] = P[first + 1, first + 1] = 0.0
-    dt = SLOT_S
-    F = np.eye(size)
-    Q = np.zeros((size, size))
-    for value, rate, w, q in [(a, dims + a, 0.0, qa) for a in range(dims)] + [
-        (i, i + 1, white, walk) for i in range(2 * dims, size, 2)
-    ]:
-        F[value, rate] = dt
-        Q[np.ix_([value, rate], [value, rate])] = [[w * dt + q * dt**3 / 3, q * dt**2 / 2], [q * dt**2 / 2, q * dt]]
-    bounds = []
-    for frame, place in enumerate(path):
-        if frame:
-            P = F @ P @ F.T + Q
-        sender = frame % n
-        listeners = [i for i in range(n) if i != sender and (mesh or sender == 0)]
-        H = np.zeros((1 + len(listeners), size))
-        H[0, :dims] = ((place - anchors[sender]) / np.linalg.norm(place - anchors[sender]))[:dims]
-        H[0, 2 * dims] = 1.0
-        for row, listener in enumerate(listeners, start=1):
-            H[row, first + 2 * listener] = 1.0
-        H[:, first + 2 * sender] -= 1.0
-        R = stamp_m**2 * (np.eye(len(H)) + 1.0)
-        P -= P @ H.T @ np.linalg.solve(H @ P @ H.T + R, H @ P)
-        if sender == n - 1:
-            bounds.append(P[:dims, :dims].copy())
-    return np.array(bounds)
-
-
 @pytest.mark.parametrize("mesh", [False, True])
 @pytest.mark.parametrize("dims", [2, 3])
 def test_the_recursion_is_the_textbooks(mesh, dims):
-    anchors = LAB if dims == 2 else LAB + np.column_stack([np.zeros((6, 2)), [0.5, 2.5] * 3])
-    path = random_path(np.random.default_rng(5), np.array([3.0, 4.0]), np.array([1.0, 1.0]), SLOT_S, 30 * 6, 0.5)
-    path += [0.0, 0.0, 0.0 if dims == 2 else 1.2]
-    settings = BoundSettings(
-        STAMP_S,
-        white_fm=2e-11,
-        random_walk_fm=1e-9,
-        qa=0.5,
-        slot_s=SLOT_S,
-        speed_std_mps=0.4,
-        mesh=mesh,
-        height_known=dims == 2,
-    )
-    c2 = SPEED_OF_LIGHT_MPS**2
-    expected = textbook(anchors, path, STAMP_M, c2 * 1e-18, c2 * 4e-22, 0.5, 0.4, mesh, dims)
-    np.testing.assert_allclose(tracking_bound(anchors, path, settings)[2:], expected[2:], rtol=1e-4, atol=1e-9)
+    anchors, path = (LAB, walk(30)) if dims == 2 else (RAISED, walk(30, 1.2))
+    settings = settings_of(mesh=mesh, height_known=dims == 2)
+    expected = positions(textbook(anchors, path, settings), dims)
+    np.testing.assert_allclose(tracking_bound(anchors, path, settings)[2:], expected, rtol=1e-4, atol=1e-9)
 
 
 @pytest.mark.parametrize("mesh", [False, True])
@@ -196,16 +135,7 @@ def test_more_information_never_makes_the_bound_worse():
     path = np.tile([2.0, 3.0, 0.0], (6 * 20, 1))
 
     def last(**changes):
-        base = {
-            "white_fm": 2e-11,
-            "random_walk_fm": 1e-9,
-            "qa": 0.5,
-            "slot_s": SLOT_S,
-            "speed_std_mps": 0.4,
-            "mesh": False,
-        }
-        stamp_s = changes.pop("stamp_s", STAMP_S)
-        return tracking_bound(LAB, path, BoundSettings(stamp_s, **(base | changes)))[-1]
+        return tracking_bound(LAB, path, settings_of(**({"mesh": False} | changes)))[-1]
 
     base = last()
     for better in ({"stamp_s": 50e-12}, {"mesh": True}, {"qa": 0.1}, {"random_walk_fm": 1e-10}):
@@ -213,8 +143,5 @@ def test_more_information_never_makes_the_bound_worse():
 
 
 def test_a_path_must_have_whole_superframes():
-    settings = BoundSettings(
-        STAMP_S, white_fm=0.0, random_walk_fm=0.0, qa=0.0, slot_s=SLOT_S, speed_std_mps=0.0, mesh=False
-    )
     with pytest.raises(ValueError, match="7 positions, no multiple of 6 anchors"):
-        tracking_bound(LAB, np.zeros((7, 3)), settings)
+        tracking_bound(LAB, np.zeros((7, 3)), settings_of())
