@@ -39,7 +39,7 @@ def test_rows_of_few_runs(monkeypatch):
     chosen, plan = STUDIES["survey"], Plan(worlds=2, seconds=1.0, seed=5, quick=True)
     cells = chosen.cells(plan)
     assert [cell.name for cell in cells] == ["lab, exact", "lab, late"]
-    results = [cell.function(cell.argument) for cell in cells]
+    results = [cell.function() for cell in cells]
     assert results[0] == cells[0].function(cells[0].argument)
     exact, kept, late = chosen.rows(plan, results)
     assert exact.case == "lab, delays known"

@@ -40,7 +40,7 @@ def test_cells_compute_and_runs_of_one_seed_are_the_same(few):
     cells = STUDIES["watch"].cells(Plan(worlds=1, seed=4))
     for name in ("lab, a person on some links", "lab, nothing, drift of 10 s", "lab, 10⁶ windows of noise"):
         (cell,) = [one for one in cells if one.name == name]
-        assert cell.function(cell.argument) == cell.function(cell.argument)
+        assert cell.function() == cell.function()
 
 
 def test_a_late_link_is_no_displacement():

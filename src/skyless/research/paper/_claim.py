@@ -1,5 +1,6 @@
 """Figure 9: for which stamp noise the largest of 30 000 errors stays below 20 cm (abstract, section 5)."""
 
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -16,10 +17,10 @@ from skyless.research.paper.plan import (
     Plan,
     Results,
     Section,
-    Task,
     Verdict,
     grouped,
 )
+from skyless.research.studies.common.plan import Cell
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
@@ -55,13 +56,12 @@ class Worst(Struct, frozen=True):
     """5 % and 95 % of the largest of ``_CLAIM_FIXES`` independent errors of this covariance over its median."""
 
 
-def tasks(plan: Plan) -> list[Task]:
+def cells(plan: Plan) -> list[Cell]:
     """One world for each stamp noise, each with a seed of its own, so that their scatter is independent."""
     return [
-        Task(
+        Cell(
             f"claim/{noise_ps:g}",
-            run_world,
-            {"noise_ps": noise_ps, "seed": seed_of(plan, noise_ps), "fixes": plan.fixes},
+            partial(run_world, noise_ps=noise_ps, seed=seed_of(plan, noise_ps), fixes=plan.fixes),
             plan.fixes * 0.8e-3,
         )
         for noise_ps in plan.noises_ps

@@ -1,6 +1,7 @@
 """Figure 3: the distribution of one DTDoA's error, Gaussian and uniform stamps (fig:TDoAApprox, E10)."""
 
 import math
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -10,7 +11,8 @@ from scipy.stats import norm
 from skyless.core.arrays import Array, Integers
 from skyless.research.paper._checks import NOISES, draw_seed, first_number, paper_chain
 from skyless.research.paper.monte_carlo import draw_lambdas
-from skyless.research.paper.plan import Panel, Plan, Results, Section, Task, Verdict, grouped
+from skyless.research.paper.plan import Panel, Plan, Results, Section, Verdict, grouped
+from skyless.research.studies.common.plan import Cell
 from skyless.research.uncertainty.chain import CORRECTED, PRINTED
 from skyless.site.report.figures import BLUE, INK, RED, panel
 
@@ -60,9 +62,9 @@ def _distribution(seed: int, noise: str, draws: int, bins: int) -> LambdaDistrib
     )
 
 
-def tasks(plan: Plan) -> list[Task]:
+def cells(plan: Plan) -> list[Cell]:
     """One anchor, two kinds of noise."""
-    return [Task("distributions", lambda_distributions, {"seed": plan.seed, "draws": plan.draws}, plan.draws * 3e-6)]
+    return [Cell("distributions", partial(lambda_distributions, seed=plan.seed, draws=plan.draws), plan.draws * 3e-6)]
 
 
 def shape_distance(one: LambdaDistribution) -> float:

@@ -8,7 +8,8 @@ from skyless.core.arrays import Array
 from skyless.core.constants import SPEED_OF_LIGHT_MPS
 from skyless.core.dop import dops_at
 from skyless.core.protocol1.snapshots import literal_covariance
-from skyless.research.paper.plan import P1, P2, RADIO_PS, Panel, Plan, Results, Section, Task, Verdict
+from skyless.research.paper.plan import P1, P2, RADIO_PS, Panel, Plan, Results, Section, Verdict
+from skyless.research.studies.common.plan import Cell
 from skyless.sim.lab import paper_lab_site
 from skyless.site.report.figures import MAP, MAP_WHITE, draw_floor_plan, panel
 
@@ -20,7 +21,7 @@ EXPLAINING_CORRELATION: Final = 0.8
 """Correlation above which one thing explains another."""
 
 
-def tasks(plan: Plan) -> list[Task]:  # noqa: ARG001 - nothing to simulate
+def cells(plan: Plan) -> list[Cell]:  # noqa: ARG001 - nothing to simulate
     """None: the maps are computed."""
     return []
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import time
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -11,7 +12,8 @@ from numpy.typing import ArrayLike
 
 from skyless.core.arrays import Array, Integers
 from skyless.core.protocol1.receiver import Receiver
-from skyless.research.paper.plan import P1, RADIO_PS, Panel, Plan, Results, Section, Task, Verdict, grouped
+from skyless.research.paper.plan import P1, RADIO_PS, Panel, Plan, Results, Section, Verdict, grouped
+from skyless.research.studies.common.plan import Cell
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import paper_lab_site
@@ -52,10 +54,10 @@ class FleetResult(Struct, frozen=True):
     """CPU time of one tag per second of true time, measured on this machine."""
 
 
-def tasks(plan: Plan) -> list[Task]:
+def cells(plan: Plan) -> list[Cell]:
     """One world for each size."""
     return [
-        Task(f"scale/{tags}", run_world, {"tags": tags, "seed": plan.seed}, 2.0 + tags * 8e-3)
+        Cell(f"scale/{tags}", partial(run_world, tags=tags, seed=plan.seed), 2.0 + tags * 8e-3)
         for tags in plan.fleet_sizes
     ]
 

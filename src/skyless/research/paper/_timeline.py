@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -11,7 +12,8 @@ from skyless.core.constants import SPEED_OF_LIGHT_MPS
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.protocol1.receiver import Receiver
 from skyless.core.protocol1.schedule import schedule_of
-from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Task, Verdict
+from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Verdict
+from skyless.research.studies.common.plan import Cell
 from skyless.sim.impairments import Outage, lab_impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.stations import TagSpec
@@ -56,9 +58,9 @@ class Phase(Struct, frozen=True):
     processing_s: float
 
 
-def tasks(plan: Plan) -> list[Task]:
+def cells(plan: Plan) -> list[Cell]:
     """Three receivers for a few seconds."""
-    return [Task("timeline", run_world, {"seed": plan.seed, "until_s": 4.0 if plan.quick else 12.0}, 6.0)]
+    return [Cell("timeline", partial(run_world, seed=plan.seed, until_s=4.0 if plan.quick else 12.0), 6.0)]
 
 
 def run_world(seed: int, until_s: float) -> list[TimedReception]:

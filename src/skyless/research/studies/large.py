@@ -6,7 +6,7 @@ and nothing else. Nothing that keeps time for the site is on the air.
 
 import math
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Final
 
 import numpy as np
@@ -361,7 +361,7 @@ def tag_runs(plan: Plan, case: LargeCase) -> list[LargeRun]:
 def cells(plan: Plan) -> list[Cell]:
     """One cell for each tag, or for some cold starts."""
     return [
-        Cell(case.name, run_large, run, _TAG_COST_S * run.tags * (case.seconds or plan.seconds) + 1.0)
+        Cell(case.name, partial(run_large, run), _TAG_COST_S * run.tags * (case.seconds or plan.seconds) + 1.0)
         for case in cases(plan)
         for run in tag_runs(plan, case)
     ]

@@ -6,6 +6,7 @@ and a tag at rest in the middle of the lab.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Final
 
 from msgspec import Struct
@@ -102,7 +103,7 @@ def limits_of(group: Group, file: str) -> tuple[Limit, ...]:
 
 def cells(plan: Plan) -> list[Cell]:
     """One cell for each world."""
-    return [Cell(run.group.name, room_results, run, _weight_s(run)) for run in _all_runs(plan)]
+    return [Cell(run.group.name, partial(room_results, run), _weight_s(run)) for run in _all_runs(plan)]
 
 
 def _all_runs(plan: Plan) -> list[RoomRun]:

@@ -5,6 +5,7 @@ come one after another, each on another anchor or link, and end when they are fo
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -74,11 +75,6 @@ class WatchRow(Row, frozen=True, kw_only=True):
     """How many of them there were, or how many windows struck."""
 
 
-class _Noise(Struct, frozen=True):
-    windows: int
-    seed: int
-
-
 def _cases() -> list[_Case]:
     found = []
     for layout in _LAYOUTS:
@@ -127,16 +123,14 @@ def cells(plan: Plan) -> list[Cell]:
                 events,
                 seed_of(plan.seed, number, world),
             )
-            worlds.append(Cell(case.name, run_watch, run, events * (_WINDOW_S if case.event == "none" else _EVENT_S)))
+            weight_s = events * (_WINDOW_S if case.event == "none" else _EVENT_S)
+            worlds.append(Cell(case.name, partial(run_watch, run), weight_s))
     windows = _NOISE_WINDOWS // plan.worlds
     for world in range(plan.worlds):
-        noise = _Noise(windows, seed_of(plan.seed, len(_cases()), world))
-        worlds.append(Cell(_NOISE_CASE, _run_noise, noise, 4e-6 * windows))
+        seed = seed_of(plan.seed, len(_cases()), world)
+        noise = partial(striking_windows, watched_layout("lab"), _NOISE_WINDOW_S, _NOISE_ALARM, windows, seed)
+        worlds.append(Cell(_NOISE_CASE, noise, 4e-6 * windows))
     return worlds
-
-
-def _run_noise(noise: _Noise) -> int:
-    return striking_windows(watched_layout("lab"), _NOISE_WINDOW_S, _NOISE_ALARM, noise.windows, noise.seed)
 
 
 def rows(plan: Plan, results: Sequence[Any]) -> Sequence[Row]:

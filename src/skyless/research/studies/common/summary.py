@@ -1,6 +1,7 @@
 """From the worlds of a case to a row: standard errors from the scatter between worlds, intervals of rare shares."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -57,7 +58,7 @@ class WorldRow(Row, frozen=True, kw_only=True):
 
 def world_cells(cases: Sequence[Case]) -> list[Cell]:
     """One cell for each world."""
-    return [Cell(case.name, run_world, run, _weight_s(run)) for case in cases for run in case.runs]
+    return [Cell(case.name, partial(run_world, run), _weight_s(run)) for case in cases for run in case.runs]
 
 
 def _weight_s(run: Run) -> float:
