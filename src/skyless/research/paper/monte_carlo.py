@@ -10,9 +10,8 @@ draws depend on the seed alone, and sums have the same bits for any number of th
 """
 
 import math
-from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from enum import IntEnum
 from typing import Final, NamedTuple
 
@@ -260,57 +259,6 @@ class ChainMoments(Struct, frozen=True):
         return error
 
 
-class _Merge:
-    """Mean, squares about the mean and products of all chunks so far (T. Chan, G. Golub, R. LeVeque 1979)."""
-
-    def __init__(self, anchors: int) -> None:
-        self._count = 0
-        self._mean = np.zeros((len(Quantity), anchors))
-        self._squares = np.zeros((len(Quantity), anchors))
-        self._fourth = np.zeros((len(Quantity), anchors))
-        self._epsilon = np.zeros(anchors)
-        self._lambda = np.zeros((anchors, anchors))
-
-    def add(self, sums: "_Sums") -> None:
-        """Add the sums of a chunk."""
-        mean = sums.powers[:, :, 0] / sums.draws
-        self._merge_squares(mean, sums.powers[:, :, 1] - sums.draws * mean**2, sums.draws)
-        self._fourth += sums.powers[:, :, 2]
-        self._epsilon += sums.epsilon_products
-        self._lambda += sums.lambda_products
-
-    def _merge_squares(self, mean: Array, squares: Array, count: int) -> None:
-        total = self._count + count
-        difference = mean - self._mean
-        self._squares += squares + difference**2 * (self._count * count / total)
-        self._mean += difference * (count / total)
-        self._count = total
-
-    def moments(self) -> ChainMoments:
-        """The moments of all draws."""
-        draws, mean = self._count, self._mean
-        epsilon = self._epsilon / draws - mean[Quantity.EPSILON_FIRST] * mean[Quantity.EPSILON_DELAYED]
-        lower = self._lambda / draws
-        products = lower + np.tril(lower, -1).T - np.outer(mean[Quantity.LAMBDA], mean[Quantity.LAMBDA])
-        return ChainMoments(
-            draws=draws,
-            mean=mean * _UNITS,
-            variance=self._squares / (draws - 1) * _UNITS**2,
-            fourth=self._fourth / draws * _UNITS**4,
-            epsilon_covariance_s2=epsilon * TICK_S**2,
-            lambda_covariance_m2=products * TICK_M**2,
-        )
-
-
-class _Sums(NamedTuple):
-    """Sums over the draws of a chunk, as ``add_draws`` makes them."""
-
-    draws: int
-    powers: Array
-    epsilon_products: Array
-    lambda_products: Array
-
-
 def draw_moments(
     chain: Chain,
     seed: int,
@@ -325,19 +273,34 @@ def draw_moments(
     ``uniform``: noise uniform within ±√3·σ instead of Gaussian. ``threads``: as many as the machine has unless given.
     """
     readings = readings_of(chain, reference)
-    ideal = ideal_values(readings)
-    merge = _Merge(len(readings.tof))
+    ideal, n = ideal_values(readings), len(readings.tof)
 
-    def sums_of(chunk: int, count: int) -> _Sums:
-        n = len(readings.tof)
-        sums = _Sums(count, np.zeros((len(Quantity), n, 3)), np.zeros(n), np.zeros((n, n)))
-        for noise in noise_batches(seed, chunk, count, noise_size(n), uniform=uniform):
-            add_draws(readings, ideal, noise, sums.powers, sums.epsilon_products, sums.lambda_products)
+    def zeros() -> tuple[Array, Array, Array]:
+        return np.zeros((len(Quantity), n, 3)), np.zeros(n), np.zeros((n, n))
+
+    def sums_of(chunk: tuple[int, int]) -> tuple[Array, Array, Array]:
+        sums = zeros()
+        for noise in noise_batches(seed, *chunk, noise_size(n), uniform=uniform):
+            add_draws(readings, ideal, noise, *sums)
         return sums
 
-    for sums in _in_order(sums_of, draws, threads or cores()):
-        merge.add(sums)
-    return merge.moments()
+    powers, epsilons, lambdas = zeros()
+    with ThreadPoolExecutor(threads or cores()) as pool:
+        for of_chunk in pool.map(sums_of, _chunks(draws)):
+            for whole, part in zip((powers, epsilons, lambdas), of_chunk, strict=True):
+                np.add(whole, part, out=whole)
+    first, second, fourth = np.moveaxis(powers, 2, 0) / draws
+    lower = lambdas / draws
+    products = lower + np.tril(lower, -1).T - np.outer(first[Quantity.LAMBDA], first[Quantity.LAMBDA])
+    epsilon = epsilons / draws - first[Quantity.EPSILON_FIRST] * first[Quantity.EPSILON_DELAYED]
+    return ChainMoments(
+        draws=draws,
+        mean=first * _UNITS,
+        variance=(second - first**2) * (draws / (draws - 1)) * _UNITS**2,
+        fourth=fourth * _UNITS**4,
+        epsilon_covariance_s2=epsilon * TICK_S**2,
+        lambda_covariance_m2=products * TICK_M**2,
+    )
 
 
 def draw_lambdas(
@@ -357,15 +320,3 @@ def _chunks(draws: int) -> Iterator[tuple[int, int]]:
     """Number and draws of every chunk."""
     for chunk in range(-(-draws // CHUNK_DRAWS)):
         yield chunk, min(CHUNK_DRAWS, draws - chunk * CHUNK_DRAWS)
-
-
-def _in_order(sums_of: Callable[[int, int], _Sums], draws: int, threads: int) -> Iterator[_Sums]:
-    """Sums of every chunk, in the order of the chunks; at most twice as many are under way as there are threads."""
-    with ThreadPoolExecutor(threads) as pool:
-        under_way: deque[Future[_Sums]] = deque()
-        for chunk, count in _chunks(draws):
-            under_way.append(pool.submit(sums_of, chunk, count))
-            if len(under_way) >= 2 * threads:
-                yield under_way.popleft().result()
-        for future in under_way:
-            yield future.result()
