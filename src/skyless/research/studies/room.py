@@ -26,6 +26,7 @@ from skyless.research.studies.common.plan import Cell, Limit, Plan, Row, seed_of
 from skyless.research.studies.common.summary import (
     Case,
     WorldRow,
+    by_case,
     clustered_interval,
     jackknife,
     world_cells,
@@ -421,10 +422,9 @@ def rows(plan: Plan, results: Sequence[Any]) -> Sequence[Row]:
     """A row for each case; the results stand in the order of ``cells``."""
     each = cases(plan)
     count = sum(len(case.runs) for case in each)
-    ran, bounds = iter(results[:count]), iter(results[count:])
+    worlds, bounds = results[:count], iter(results[count:])
     found = []
-    for case, row in zip(each, world_rows("room", plan, each, results[:count]), strict=True):
-        own: list[RunResult] = [next(ran) for _ in case.runs]
+    for case, row, own in zip(each, world_rows("room", plan, each, worlds), by_case(each, worlds), strict=True):
         bounded = row if case.biases is None else with_bound(row, own, [next(bounds) for _ in case.runs])
         found.append(with_limits(with_levels(bounded, own), case.limits))
     return found

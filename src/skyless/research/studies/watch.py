@@ -15,7 +15,6 @@ from msgspec.structs import replace
 from skyless.research.studies.common.plan import Cell, Limit, Plan, Row, missed_limits, seed_of
 from skyless.research.surveys.drawn_faults import (
     Event,
-    WatchedLayout,
     WatchResult,
     WatchRun,
     run_watch,
@@ -54,6 +53,11 @@ class _Case(Struct, frozen=True):
     lively_m: float = 0.0
     missing: float = 0.0
     limits: tuple[Limit, ...] = ()
+
+    def run(self, events: int, seed: int) -> WatchRun:
+        """Some of its events, or windows without any."""
+        drift = (self.drift_m, self.drift_s, self.lively_m)
+        return WatchRun(survey_layouts()[self.layout], self.event, self.size_m, *drift, self.missing, events, seed)
 
 
 class WatchRow(Row, frozen=True, kw_only=True):
@@ -100,35 +104,19 @@ def _cases() -> list[_Case]:
     return found
 
 
-def watched_layout(name: str) -> WatchedLayout:
-    """A layout of ``survey_layouts``, by name."""
-    layout = survey_layouts()[name]
-    return WatchedLayout(layout.dimensions, tuple((x, y, z) for x, y, z in layout.position_m.tolist()))
-
-
 def cells(plan: Plan) -> list[Cell]:
     """One for each case and world."""
     worlds = []
     for number, case in enumerate(_cases()):
         events = _QUIET_WINDOWS if case.event == "none" else _EVENTS
         for world in range(plan.worlds):
-            run = WatchRun(
-                watched_layout(case.layout),
-                case.event,
-                case.size_m,
-                case.drift_m,
-                case.drift_s,
-                case.lively_m,
-                case.missing,
-                events,
-                seed_of(plan.seed, number, world),
-            )
+            run = case.run(events, seed_of(plan.seed, number, world))
             weight_s = events * (_WINDOW_S if case.event == "none" else _EVENT_S)
             worlds.append(Cell(case.name, partial(run_watch, run), weight_s))
     windows = _NOISE_WINDOWS // plan.worlds
     for world in range(plan.worlds):
         seed = seed_of(plan.seed, len(_cases()), world)
-        noise = partial(striking_windows, watched_layout("lab"), _NOISE_WINDOW_S, _NOISE_ALARM, windows, seed)
+        noise = partial(striking_windows, survey_layouts()["lab"], _NOISE_WINDOW_S, _NOISE_ALARM, windows, seed)
         worlds.append(Cell(_NOISE_CASE, noise, 4e-6 * windows))
     return worlds
 

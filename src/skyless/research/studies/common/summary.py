@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from msgspec import Struct
@@ -68,12 +68,17 @@ def _weight_s(run: Run) -> float:
 
 def world_rows(study: str, plan: Plan, cases: Sequence[Case], results: Sequence[RunResult]) -> list[WorldRow]:
     """A row for each case; the results stand in the order of ``world_cells``."""
-    rest = iter(results)
-    worlds = {case.name: [next(rest) for _ in case.runs] for case in cases}
+    worlds = {case.name: own for case, own in zip(cases, by_case(cases, results), strict=True)}
     return [
         case_row(study, plan, case, worlds[case.name], worlds[case.of][: len(case.runs)] if case.of else None)
         for case in cases
     ]
+
+
+def by_case(cases: Sequence[Case], results: Sequence[Any]) -> list[list[Any]]:
+    """The results of each case's worlds, of those in the order of ``world_cells``."""
+    rest = iter(results)
+    return [[next(rest) for _ in case.runs] for case in cases]
 
 
 def case_row(
