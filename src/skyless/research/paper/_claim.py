@@ -5,6 +5,7 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
+from scipy.optimize import brentq
 
 from skyless.core.arrays import Array
 from skyless.research.paper._listening import listen
@@ -100,13 +101,8 @@ def largest_of_m(covariance_m2: Array, count: float, quantile: float) -> float:
     along = np.stack([np.cos(angles), np.sin(angles)])
     variances_m2 = 1.0 / np.einsum("ia,ij,ja->a", along, np.linalg.inv(covariance_m2), along)
     weight = variances_m2 / np.sqrt(np.linalg.det(covariance_m2))
-    exceed = -np.expm1(np.log(quantile) / count)
-    low, high = 0.0, 12.0 * float(np.sqrt(np.trace(covariance_m2)))
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        tail = float(np.mean(np.exp(-0.5 * middle**2 / variances_m2) * weight))
-        low, high = (middle, high) if tail > exceed else (low, middle)
-    return 0.5 * (low + high)
+    exceed, most_m = -np.expm1(np.log(quantile) / count), 12.0 * float(np.sqrt(np.trace(covariance_m2)))
+    return float(brentq(lambda r: np.mean(np.exp(-0.5 * r**2 / variances_m2) * weight) - exceed, 0.0, most_m))
 
 
 class Trend(Struct, frozen=True):
@@ -120,9 +116,9 @@ class Trend(Struct, frozen=True):
         """Largest error of a run that is ``factor`` times a typical one."""
         return factor * self.coefficient * noise_ps**self.exponent
 
-    def crossing_ps(self, factor: float = 1.0, limit_m: float = CLAIM_M) -> float:
+    def crossing_ps(self, factor: float = 1.0) -> float:
         """Stamp noise at which such a run reaches the limit."""
-        return float((limit_m / (factor * self.coefficient)) ** (1.0 / self.exponent))
+        return float((CLAIM_M / (factor * self.coefficient)) ** (1.0 / self.exponent))
 
     @property
     def crossings_ps(self) -> tuple[float, float, float]:

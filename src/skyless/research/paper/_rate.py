@@ -4,7 +4,7 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, to_builtins
 from msgspec.structs import replace
 
 from skyless.core.protocol1.receiver import Receiver
@@ -117,20 +117,7 @@ def section(plan: Plan, results: Results) -> Section:
         reason=reason,
         panels=(_bars(counts),),
         table=tuple(rows),
-        numbers={
-            "counts": [
-                {
-                    "site": c.site,
-                    "method": c.method,
-                    "rate_hz": c.rate_hz,
-                    "foreseen_hz": c.foreseen_hz,
-                    "updates": c.updates,
-                    "counted_s": c.counted_s,
-                    "longest_gap_s": c.longest_gap_s,
-                }
-                for c in counts
-            ]
-        },
+        numbers={"counts": [{**to_builtins(count), "rate_hz": count.rate_hz} for count in counts]},
         command=f"skyless simulate --method joint --position 3,4 --duration 10 --seed {plan.seed}",
     )
 
