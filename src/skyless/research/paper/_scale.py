@@ -218,5 +218,6 @@ def _cpu(fleets: list[FleetResult]) -> Panel:
     right, frames = axes.twinx(), [fleet.frames_per_s for fleet in fleets]
     (line,) = right.plot(tags, frames, "o--", color=INK, label="frames on the air (right)")
     right.set(ylabel="frames per second", ylim=(0, 1.3 * max(frames)))
+    right.grid(visible=False)
     axes.legend(handles=[*axes.lines, line], loc="upper left")
     return Panel("10-load", "CPU time of one tag per second (measured on this machine) and frames on the air.", figure)
