@@ -14,7 +14,7 @@ import hashlib
 import json
 import resource
 import time
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from msgspec.structs import replace
@@ -38,9 +38,8 @@ def site_of(anchors):
     return replace(grid_site(side_m, side_m, SPACING_M, 4.0, 1.0), accuracy=EXACT), side_m
 
 
-def run_tags(work):
+def run_tags(anchors, tags, own, seconds, seed):
     """Some of the tags: digest of the fixes of each, squared errors, seconds of a core and of the wall, memory."""
-    anchors, tags, own, seconds, seed = work
     site, side_m = site_of(anchors)
     draw = np.random.default_rng(seed)
     middles_m = draw.uniform(50.0, side_m - 50.0, (tags, 2))
@@ -66,7 +65,10 @@ def run_tags(work):
 
 def measure(asked, workers):
     shares = [list(range(first, asked.tags, workers)) for first in range(workers)]
-    cells = [Cell("tags", run_tags, (asked.anchors, asked.tags, own, asked.seconds, asked.seed), 1.0) for own in shares]
+    cells = [
+        Cell("tags", partial(run_tags, asked.anchors, asked.tags, own, asked.seconds, asked.seed), 1.0)
+        for own in shares
+    ]
     if asked.scheduler is None:
         results = run_cells(cells, lambda _: None, workers)
     else:

@@ -21,7 +21,6 @@ from skyless.research.studies.integrity import (
     cells,
     faulty,
     rows,
-    run_chunk,
 )
 from skyless.sim.lab import paper_lab_site
 from skyless.site.report.figures import picture
@@ -140,14 +139,15 @@ def test_cells_carry_what_is_asked():
     asked = plan_of("joint", 1, episodes=60, integrity_risk=1e-3, alert_limit_m=0.5)
     found = cells(asked)
     assert len(found) == 2 * len(FAULTS)
-    assert {(cell.argument[0].risk, cell.argument[0].alert_limit_m) for cell in found} == {(1e-3, 0.5)}
-    assert [len(cell.argument[1]) for cell in found[:2]] == [50, 10]
+    asked_of = [cell.function.args for cell in found]
+    assert {(setting.risk, setting.alert_limit_m) for setting, _ in asked_of} == {(1e-3, 0.5)}
+    assert [len(seeds) for _, seeds in asked_of[:2]] == [50, 10]
 
 
 @pytest.mark.parametrize("place", ["lab", "room"])
 def test_levels_hold_in_clean_episodes(place):
     cell = next(cell for cell in cells(plan_of("joint", 1, episodes=3)) if cell.name == f"{place}, clean")
-    told = run_chunk(cell.argument)
+    told = cell.function()
     fixes, promised, across, above = told.counts.T
     assert (fixes > 350).all()
     assert (promised == fixes).all()

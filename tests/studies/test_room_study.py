@@ -366,7 +366,7 @@ def test_the_bound_of_the_room():
     plan = replace(plan_of("joint", 11, study="room", worlds=2), tags=3)
     base, air = room.cases(plan)[:2]
     for case, bound_m in ((base, 0.0249), (air, 0.0167)):
-        variances_m2 = [cell.function(cell.argument) for cell in bound_cells([case])]
+        variances_m2 = [cell.function() for cell in bound_cells([case])]
         assert math.sqrt(np.mean(variances_m2)) == pytest.approx(bound_m, rel=0.02)
 
 

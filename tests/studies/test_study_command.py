@@ -107,7 +107,7 @@ def test_every_study_can_be_drawn(name, tmp_path):
     cells = study.cells(plan)
     for results in ([some], [none], [some, none]):
         worlds = cycle(results)
-        rows = study.rows(plan, [next(worlds) if cell.function is run_world else 0.02**2 for cell in cells])
+        rows = study.rows(plan, [next(worlds) if cell.function.func is run_world else 0.02**2 for cell in cells])
         assert picture(study.draw(rows), "png", 50.0).startswith(b"\x89PNG")
 
 

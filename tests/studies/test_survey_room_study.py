@@ -63,7 +63,7 @@ def test_rows_of_few_worlds(monkeypatch):
     chosen, plan = STUDIES["survey-room"], Plan(worlds=2, seconds=1.0, tags=2, seed=5, quick=True)
     cells = chosen.cells(plan)
     assert [cell.name for cell in cells] == ["lab, at rest"] * 2 + ["lab, room"] * 2
-    rows = chosen.rows(plan, [cell.function(cell.argument) for cell in cells])
+    rows = chosen.rows(plan, [cell.function() for cell in cells])
     assert [row.case for row in rows] == [f"{group.name}, {file}" for group in small for file in (TRUTH, SURVEYED)]
     still, still_surveyed, truth, surveyed = rows
     assert still.ratio is None

@@ -39,8 +39,8 @@ def test_rows_of_few_runs(monkeypatch):
     chosen, plan = STUDIES["survey"], Plan(worlds=2, seconds=1.0, seed=5, quick=True)
     cells = chosen.cells(plan)
     assert [cell.name for cell in cells] == ["lab, exact", "lab, late"]
-    results = [cell.function(cell.argument) for cell in cells]
-    assert results[0] == cells[0].function(cells[0].argument)
+    results = [cell.function() for cell in cells]
+    assert results[0] == cells[0].function()
     exact, kept, late = chosen.rows(plan, results)
     assert exact.case == "lab, delays known"
     assert 0.2 < exact.ratio < 3.0  # two runs of 12 coordinates

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyless.research.calibration.recorded_stamps import ranges_of
-from skyless.research.studies.watch import watched_layout
 from skyless.research.surveys.drawn_faults import WatchRun, run_watch, striking_windows
+from skyless.research.surveys.layouts import survey_layouts
 from skyless.site.survey.facts import PairBlock
 from skyless.site.survey.watch.explain import sentence_of
 from skyless.site.survey.watch.monitor import AnchorWatch
@@ -50,7 +50,7 @@ class Ranges:
 
 
 def drawn(layout, event, size_m, events, seed, drift_m=(0.02, 0.02), *, missing=0.0):
-    return run_watch(WatchRun(watched_layout(layout), event, size_m, drift_m, 60.0, 0.0, missing, events, seed))
+    return run_watch(WatchRun(survey_layouts()[layout], event, size_m, drift_m, 60.0, 0.0, missing, events, seed))
 
 
 def test_noise_strikes_no_more_often_than_stated():
@@ -58,10 +58,10 @@ def test_noise_strikes_no_more_often_than_stated():
     expected = 1e-3 * 100_000
     assert (
         expected / 10.0
-        < striking_windows(watched_layout("lab"), 0.1, 1e-3, 100_000, 81)
+        < striking_windows(survey_layouts()["lab"], 0.1, 1e-3, 100_000, 81)
         < expected + 5.0 * math.sqrt(expected)
     )
-    assert striking_windows(watched_layout("lab"), 0.1, 1e-7, 100_000, 82) == 0
+    assert striking_windows(survey_layouts()["lab"], 0.1, 1e-7, 100_000, 82) == 0
 
 
 @pytest.mark.parametrize("event", ["moved", "two moved", "link"])
@@ -80,7 +80,7 @@ def test_an_anchor_that_creeps_is_found():
 
 
 def test_drift_of_a_real_room_is_no_finding():
-    run = WatchRun(watched_layout("lab"), "none", 0.0, (0.008, 0.025), 60.0, 0.09, 0.0, 500, seed=87)
+    run = WatchRun(survey_layouts()["lab"], "none", 0.0, (0.008, 0.025), 60.0, 0.09, 0.0, 500, seed=87)
     assert run_watch(run).alarms == 0
 
 

@@ -3,7 +3,7 @@
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
@@ -16,6 +16,7 @@ from scipy.optimize import least_squares
 
 from skyless.core.air.reception import Reception
 from skyless.core.arrays import Array
+from skyless.core.estimator.estimator import Estimator
 from skyless.core.processors import cores
 from skyless.core.protocol1.codec import decode_cached
 from skyless.core.tag.locate import PseudorangeSolution, locate_pseudoranges
@@ -33,9 +34,6 @@ _TAGS: Final = (1, 100, 10_000)
 _CHUNK_SUPERFRAMES: Final = 10
 """Superframes of each tag in one call."""
 _CHUNKS: Final = 64
-
-Tag = Callable[[int], None]
-"""Processes the chunk of that number."""
 
 
 class Effort(Struct, frozen=True):
@@ -194,13 +192,8 @@ def _snapshots(effort: Effort) -> SnapshotSpeed:
         for row in rows:
             least_squares(residuals, middle, method="lm", args=(row,))
 
-    ours, scipys = (len(rows) / seconds(partial(_unprepared, run), 3) for run in (own, other))
+    ours, scipys = len(rows) / seconds(lambda: own, 3), len(rows) / seconds(lambda: other, 3)
     return SnapshotSpeed(ours, scipys, ours / scipys)
-
-
-def _unprepared(run: Run) -> Run:
-    """A run that needs no preparation."""
-    return run
 
 
 @contextmanager
@@ -219,43 +212,27 @@ def one_core() -> Iterator[None]:
 
 def _many_joints() -> TagsSpeed:
     """Measure ``joint``."""
-    runs = JointRuns(_CHUNK_SUPERFRAMES * _CHUNKS, mesh=False)
-    parts = [
-        runs.part(k * _CHUNK_SUPERFRAMES * BENCH_NODES, (k + 1) * _CHUNK_SUPERFRAMES * BENCH_NODES)
-        for k in range(_CHUNKS)
-    ]
+    runs, size = JointRuns(_CHUNK_SUPERFRAMES * _CHUNKS, mesh=False), _CHUNK_SUPERFRAMES * BENCH_NODES
+    parts = [runs.part(k * size, (k + 1) * size) for k in range(_CHUNKS)]
 
-    def tag() -> Tag:
-        estimator = runs.new_estimator()
+    def process(tags: Iterable[Estimator], chunk: int) -> None:
+        for tag in tags:
+            tag.track(parts[chunk])
 
-        def run(chunk: int) -> None:
-            estimator.track(parts[chunk])
-
-        return run
-
-    return _many(tag)
-
-
-def _many(new_tag: Callable[[], Tag]) -> TagsSpeed:
-    by_tags, size = {}, _CHUNK_SUPERFRAMES * BENCH_NODES
+    by_tags: dict[int, float] = {}
     for count in _TAGS:
-        tags = [new_tag() for _ in range(count)]
-        _process_chunk(tags, 0)
+        tags = [runs.new_estimator() for _ in range(count)]
+        process(tags, 0)
         rounds = range(1, min(_CHUNKS - 1, max(4, 2000 // count)))
         with one_core():
             times = []
             for chunk in rounds:
                 started_s = time.thread_time()
-                _process_chunk(tags, chunk)
+                process(tags, chunk)
                 times.append(time.thread_time() - started_s)
         by_tags[count] = 1e9 * statistics.median(times) / (count * size)
     shares = [tags[k :: cores()] for k in range(cores())]
     started_s = time.perf_counter()
     with ThreadPoolExecutor(cores()) as pool:
-        list(pool.map(lambda share: _process_chunk(share, len(rounds) + 1), shares))
+        list(pool.map(lambda share: process(share, len(rounds) + 1), shares))
     return TagsSpeed(by_tags, len(tags) * size / (time.perf_counter() - started_s))
-
-
-def _process_chunk(tags: list[Tag], chunk: int) -> None:
-    for tag in tags:
-        tag(chunk)

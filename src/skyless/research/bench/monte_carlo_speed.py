@@ -1,4 +1,4 @@
-"""How fast ``research/paper/monte_carlo.py`` is, compared with a plain NumPy loop over draws of the same chain."""
+"""How fast ``research/paper/monte_carlo.py`` is, compared with a plain loop over its draws."""
 
 import time
 from collections.abc import Callable
@@ -6,20 +6,19 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.random import Generator
 
 from skyless.core.arrays import Array
 from skyless.core.constants import TICK_S
 from skyless.core.processors import cores
-from skyless.research.paper.monte_carlo import Quantity, draw_moments
-from skyless.research.uncertainty.chain import Chain
+from skyless.research.paper.monte_carlo import draw_moments, ideal_values, noise_size, run_chain
+from skyless.research.uncertainty.chain import Chain, Reference
 
 _ROUNDS: Final = 3
 """Measurements of each in turn; the best counts, as other work on the machine only slows down."""
 
 
 class MonteCarloSpeed(Struct, frozen=True):
-    """Draws per second of the whole chain and its sums; ``ratio`` is compiled over NumPy loop, both on one core."""
+    """Draws per second of the whole chain and its sums; ``ratio`` is batches over the loop, both on one core."""
 
     anchors: int
     numpy_loop_draws_per_s: float
@@ -54,55 +53,22 @@ def bench_chain(anchors: int = 10, seed: int = 1) -> Chain:
     )
 
 
-def numpy_loop(chain: Chain, draws: int, generator: Generator) -> tuple[Array, Array]:
-    """Means and variances of all quantities, shape (quantities, n), by a loop over draws with NumPy over anchors.
-
-    In seconds, and λ in seconds of the tag. What anyone would write first, without its own kernels.
-    """
-    n = len(chain.anchor_rate)
-    ideal = numpy_draw(chain, np.zeros((4 + 6 * n,)))
-    total, squares = np.zeros((len(Quantity), n)), np.zeros((len(Quantity), n))
+def draw_loop(chain: Chain, draws: int) -> Array:
+    """Variances of all quantities, shape (quantities, n), by a loop over draws, as anyone would write it first."""
+    generator, ideal = np.random.default_rng(1), ideal_values(chain, Reference.APART)
+    squares = np.zeros_like(ideal)
     for _ in range(draws):
-        error = numpy_draw(chain, generator.standard_normal(4 + 6 * n)) - ideal
-        total += error
-        squares += error**2
-    mean = total / draws
-    return mean, squares / draws - mean**2
-
-
-def numpy_draw(chain: Chain, noise: Array) -> Array:
-    """All quantities of one draw, shape (quantities, n), for noise of unit variance, four shared and six per anchor."""
-    c = chain
-    shared, own = noise[:4], noise[4 : 4 + 6 * len(c.anchor_rate)].reshape(-1, 6)
-    s1_noise, s2_noise, a1_noise, a2_noise = (c.sigma_anchor_s * own[:, k] for k in range(4))
-    t2, t_i = c.sync_s + c.sync_spacing_s, c.reference_s + c.delay_s
-    m1 = c.master_offset_s + c.master_rate * c.sync_s + c.sigma_master_s * shared[0]
-    m2 = c.master_offset_s + c.master_rate * t2 + c.sigma_master_s * shared[1]
-    tm = c.master_offset_s + c.master_rate * c.reference_s + c.sigma_master_s * shared[2]
-    rm = c.tag_offset_s + c.tag_rate * (c.reference_s + c.tag_master_tof_s) + c.sigma_tag_s * shared[3]
-    s1 = c.anchor_offset_s + c.anchor_rate * (c.sync_s + c.anchor_tof_s) + s1_noise
-    s2 = c.anchor_offset_s + c.anchor_rate * (t2 + c.anchor_tof_s) + s2_noise
-    a1 = c.anchor_offset_s + c.anchor_rate * t_i + a1_noise
-    a2 = c.anchor_offset_s + c.anchor_rate * (t_i + c.spacing_s) + a2_noise
-    r1 = c.tag_offset_s + c.tag_rate * (t_i + c.tag_tof_s) + c.sigma_tag_s * own[:, 4]
-    r2 = c.tag_offset_s + c.tag_rate * (t_i + c.spacing_s + c.tag_tof_s) + c.sigma_tag_s * own[:, 5]
-    rate = (s2 - s1) / (m2 - m1)
-    first = s1 - rate * m1 - c.anchor_tof_s
-    delayed = s2 - rate * m2 - c.anchor_tof_s
-    offset = (first + delayed) / 2
-    sent1, sent2 = (a1 - offset) / rate, (a2 - offset) / rate
-    tags_rate = (r2 - r1) / (sent2 - sent1)
-    interval = tags_rate * (sent1 - tm)
-    return np.array([rate, first, delayed, offset, sent1, sent2, tags_rate, interval, (r1 - rm) - interval])
+        noise = generator.standard_normal((1, noise_size(chain)))
+        squares += (run_chain(chain, Reference.APART, noise)[:, 0] - ideal) ** 2
+    return squares / draws
 
 
 def measure(draws: int, anchors: int = 10) -> MonteCarloSpeed:
-    """Measure both; the NumPy loop makes a hundredth of ``draws``, and all is compiled before."""
+    """Measure both; the NumPy loop makes a hundredth of ``draws``."""
     chain = bench_chain(anchors)
-    draw_moments(chain, 1, 2)
     loops, ones, boths = [], [], []
     for _ in range(_ROUNDS):
-        loops.append(_rate(max(draws // 100, 100), lambda n: numpy_loop(chain, n, np.random.default_rng(1))))
+        loops.append(_rate(max(draws // 100, 100), lambda n: draw_loop(chain, n)))
         ones.append(_rate(draws, lambda n: draw_moments(chain, 1, n, threads=1)))
         boths.append(_rate(draws, lambda n: draw_moments(chain, 1, n)))
     loop, one = max(loops), max(ones)

@@ -21,7 +21,9 @@ from skyless.radio.foreign.bitcraze import decode_payload
 
 MAX_DOCUMENT_BYTES: Final = 1 << 13
 _SEPARATOR: Final = b"\n---"
-_START: Final = b"\ndata: !!binary |\n  "
+_DOCUMENT: Final = re.compile(
+    rb"\ndata: !!binary \|\n  (.*?)\nfrom: ([^\n]*)(?=\n).*?\nrxSys: ([^\n]*)(?=\n).*?\nts: ([^\n]*)\n", re.DOTALL
+)
 _LAST_STAMP: Final = (1 << TICK_BITS) - 1
 _LAST_HOST_S: Final = 1e11
 _DEEPEST: Final = 8
@@ -68,21 +70,12 @@ def _documents(stream: BufferedIOBase, drops: Drops) -> Iterator[bytes]:
 
 def _scan_document(document: bytes) -> Packet | str | None:
     """Packet of a document of the tool's own shape; None for any other shape."""
-    if not document.startswith(_START):
+    match = _DOCUMENT.match(document)
+    if match is None:
         return None
-    end = document.find(b"\nfrom: ", 20)
-    host = document.find(b"\nrxSys: ", end)
-    stamp = document.find(b"\nts: ", host)
-    stop = document.find(b"\n", stamp + 5)
-    if end < 0 or host < 0 or stamp < 0 or stop < 0:
-        return None
+    base64, sender, host, stamp = match.groups()
     try:
-        return _packet_of_document(
-            document[20:end],
-            int(document[end + 7 : document.find(b"\n", end + 7)]),
-            int(document[stamp + 5 : stop]),
-            float(document[host + 8 : document.find(b"\n", host + 8)]),
-        )
+        return _packet_of_document(base64, int(sender), int(stamp), float(host))
     except ValueError:
         return None
 

@@ -97,12 +97,15 @@ def read_truth(path: str | PathLike[str], _listener: str | None) -> Truth | None
                     (event.time_s, *(event.values[name] for name in names if name in event.values))
                 )
     for rows in found.values():
-        table = np.array(rows, dtype=np.float64)
-        if len(table):
-            table = table[np.isfinite(table).all(axis=1)]
-            table = table[np.argsort(table[:, 0], kind="stable")]
+        if rows and len(table := in_order(np.array(rows, dtype=np.float64))):
             return Truth(table[:, 0], table[:, 1:4], table[:, 4:8] if table.shape[1] == 8 else None)
     return None
+
+
+def in_order(table: Array) -> Array:
+    """Rows whose numbers are all finite, in the order of their times, which stand first."""
+    table = table[np.isfinite(table).all(axis=1)]
+    return table[np.argsort(table[:, 0], kind="stable")] if len(table) else table
 
 
 def read_heights(path: str | PathLike[str], *, is_barometer: bool) -> Array | None:

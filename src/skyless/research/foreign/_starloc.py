@@ -9,7 +9,6 @@ What a range has too much, such as antenna delays of the tag, cancels in the dif
 """
 
 import re
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from io import BufferedIOBase
@@ -18,12 +17,11 @@ from os import PathLike
 from pathlib import Path
 from typing import Final, NamedTuple
 
-import numpy as np
-
 from skyless.core.air.masterless_packets import PairTdoa, Point
 from skyless.core.constants import TICK_M, TICK_S
-from skyless.core.input_files import Drops, header_of, open_source, rows
+from skyless.core.input_files import Drops, header_of, rows
 from skyless.core.ticks import difference, wrap
+from skyless.research.foreign._tdoa_tables import numbers, rows_of
 from skyless.site.tables import Truth
 
 _STAMPS: Final = ("tx1", "rx1", "tx2", "rx2", "tx3", "rx3")
@@ -55,13 +53,8 @@ def recognise(head: bytes) -> bool:
 
 def read(stream: BufferedIOBase, drops: Drops, listener: str | None = None) -> Iterator[PairTdoa]:
     """Yield differences of one tag's successive ranges; by default those of the tag of the first row."""
-    wanted = None if listener is None else listener.encode()
     before: _Range | None = None
-    for row in rows(stream, drops, COLUMNS):
-        wanted = wanted or row[1]
-        if row[1] != wanted:
-            drops["other-listener"] += 1
-            continue
+    for row in rows_of(rows(stream, drops, COLUMNS), drops, listener):
         found = _range_of(row)
         if isinstance(found, str):
             drops[found] += 1
@@ -110,17 +103,5 @@ def read_anchors(path: str | PathLike[str]) -> dict[int, Point]:
 
 def read_truth(path: str | PathLike[str], listener: str | None) -> Truth | None:
     """Where one tag was by motion capture, by default that of the first row; None where the table has none."""
-    found = []
-    with open_source(path) as stream:
-        if not set(_TRUTH) <= set(header_of(stream.readline())):
-            return None
-        stream.seek(0)
-        for tag, *fields in rows(stream, Counter(), ("from_id", "time_s", *_TRUTH)):
-            listener = listener or tag.decode(errors="replace")
-            if tag == listener.encode():
-                with suppress(ValueError):
-                    found.append([float(field) for field in fields])
-    table = np.array(found, dtype=np.float64).reshape(-1, 4)
-    table = table[np.isfinite(table).all(axis=1)]
-    table = table[np.argsort(table[:, 0], kind="stable")]
+    table = numbers(path, ("time_s", *_TRUTH), ("from_id", listener))
     return Truth(table[:, 0], table[:, 1:], None) if len(table) else None

@@ -1,7 +1,7 @@
 """Tables whose rows are time differences of two anchors: ready ones, and MILUV's stamps of exchanges."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from io import BufferedIOBase
 from math import dist, isfinite
@@ -15,7 +15,7 @@ from skyless.core.arrays import Array
 from skyless.core.constants import TICK_M
 from skyless.core.input_files import Drops, header_of, open_source, rows
 from skyless.core.ticks import difference
-from skyless.research.foreign._crazyflie import heights_of
+from skyless.research.foreign._crazyflie import heights_of, in_order
 from skyless.site.tables import Truth
 
 # Tables of TDoAs: ``t_s,idA,idB,tdoa_m`` with tdoa_m = |p − b| − |p − a|, as the UTIL flights and Crazyflie logs.
@@ -71,30 +71,42 @@ def read_util(stream: BufferedIOBase, drops: Drops) -> Iterator[PairTdoa]:
 
 def read_util_truth(path: str | PathLike[str], _listener: str | None) -> Truth | None:
     """Poses of motion capture in one of UTIL's tables; None where it has none."""
-    table = _numbers(path, _POSE_COLUMNS)
+    table = numbers(path, _POSE_COLUMNS)
     return Truth(table[:, 0], table[:, 1:4], table[:, 4:8]) if len(table) else None
 
 
 def read_util_heights(path: str | PathLike[str], *, is_barometer: bool) -> Array | None:
     """Rows of time, height and standard deviation of its ranger or barometer; None where it has none."""
     columns = ("t_baro", "baro") if is_barometer else ("t_tof", "tof")
-    return heights_of(_numbers(path, columns), is_barometer=is_barometer)
+    return heights_of(numbers(path, columns), is_barometer=is_barometer)
 
 
-def _numbers(path: str | PathLike[str], columns: tuple[str, ...]) -> Array:
-    """Rows of numbers of some columns where all of them are given, in the order of the first."""
+def numbers(path: str | PathLike[str], columns: tuple[str, ...], tag: tuple[str, str | None] | None = None) -> Array:
+    """Rows of numbers of some columns where all of them are given, in the order of the first.
+
+    ``tag``: the column that names whose rows they are, and whose are wanted, by default those of the first row's.
+    """
     found = []
+    names = columns if tag is None else (columns[0], tag[0], *columns[1:])
     with open_source(path) as stream:
-        head = stream.readline()
-        if not set(columns) <= set(header_of(head)):
-            return np.empty((0, len(columns)))
-        stream.seek(0)
-        for row in rows(stream, Counter(), columns):
-            with suppress(ValueError):
-                found.append([float(field) for field in row])
-    table = np.array(found, dtype=np.float64).reshape(-1, len(columns))
-    table = table[np.isfinite(table).all(axis=1)]
-    return table[np.argsort(table[:, 0], kind="stable")]
+        if set(names) <= set(header_of(stream.readline())):
+            stream.seek(0)
+            given = rows(stream, Counter(), names)
+            for row in given if tag is None else rows_of(given, Counter(), tag[1]):
+                with suppress(ValueError):
+                    found.append([float(field) for field in (row if tag is None else row[:1] + row[2:])])
+    return in_order(np.array(found, dtype=np.float64).reshape(-1, len(columns)))
+
+
+def rows_of(given: Iterable[list[bytes]], drops: Drops, listener: str | None) -> Iterator[list[bytes]]:
+    """Rows that one listener made, whom their second field names; by default the one of the first row."""
+    wanted = None if listener is None else listener.encode()
+    for row in given:
+        wanted = wanted or row[1]
+        if row[1] == wanted:
+            yield row
+        else:
+            drops["other-listener"] += 1
 
 
 # MILUV passive ticks: three-message exchanges of two nodes that a third overhears (Shalaby et al., MILUV, 2025).
@@ -126,12 +138,7 @@ def recognise_miluv(head: bytes) -> bool:
 
 def read_miluv(stream: BufferedIOBase, drops: Drops, listener: str | None = None) -> Iterator[PairTdoa]:
     """Yield what one listener overheard; by default the one of the first row."""
-    wanted = None if listener is None else listener.encode()
-    for row in rows(stream, drops, MILUV_COLUMNS):
-        wanted = wanted or row[1]
-        if row[1] != wanted:
-            drops["other-listener"] += 1
-            continue
+    for row in rows_of(rows(stream, drops, MILUV_COLUMNS), drops, listener):
         tdoa = _overheard(row)
         if isinstance(tdoa, str):
             drops[tdoa] += 1

@@ -59,25 +59,23 @@ class Format:
     """Antenna delays of a sender and a receiver together, where its stamps include them."""
 
 
-def _bitcraze(
-    kind: str, summary: str, recognise: Callable[[bytes], bool], read: Callable[..., Iterator[Record]]
-) -> Format:
-    summary = f"Bitcraze sniffer, {summary} (TDoA2, TDoA3)"
-    delays_ticks = bitcraze.ANTENNA_DELAYS_TICKS
-    return Format(f"bitcraze-{kind}", summary, recognise, read, bitcraze.STAMP_BITS, delays_ticks=delays_ticks)
-
-
-def _dl_tdoa(
-    name: str, summary: str, recognise: Callable[[bytes], bool], read: Callable[..., Iterator[Record]]
-) -> Format:
-    return Format(name, f"FiRa {summary}", recognise, read, TICK_BITS, is_dl_tdoa=True)
+_bitcraze: Final = partial(Format, tx_bits=bitcraze.STAMP_BITS, delays_ticks=bitcraze.ANTENNA_DELAYS_TICKS)
+_dl_tdoa: Final = partial(Format, tx_bits=TICK_BITS, is_dl_tdoa=True)
 
 
 FORMATS: Final = (
     _bitcraze(
-        "yaml", "YAML documents with base64 payloads", bitcraze_captures.recognise_yaml, bitcraze_captures.read_yaml
+        "bitcraze-yaml",
+        "Bitcraze sniffer, YAML documents with base64 payloads (TDoA2, TDoA3)",
+        bitcraze_captures.recognise_yaml,
+        bitcraze_captures.read_yaml,
     ),
-    _bitcraze("text", "text lines 'From .. to .. @..: ..'", bitcraze.recognise_text, bitcraze.read_text),
+    _bitcraze(
+        "bitcraze-text",
+        "Bitcraze sniffer, text lines 'From .. to .. @..: ..' (TDoA2, TDoA3)",
+        bitcraze.recognise_text,
+        bitcraze.read_text,
+    ),
     Format(
         "miluv",
         "MILUV passive ticks: three-message exchanges overheard by a listener",
@@ -97,13 +95,13 @@ FORMATS: Final = (
     ),
     _dl_tdoa(
         "dl-tdoa-json",
-        "DL-TDoA records of phones, lines of JSON (iOS NIDLTDOAMeasurement, Android DlTdoaMeasurement)",
+        "FiRa DL-TDoA records of phones, lines of JSON (iOS NIDLTDOAMeasurement, Android DlTdoaMeasurement)",
         phones.recognise,
         phones.read,
     ),
     _dl_tdoa(
         "uci-text",
-        "UCI log, lines with hexadecimal packets (DL-TDoA measurements, versions 1 and 2)",
+        "FiRa UCI log, lines with hexadecimal packets (DL-TDoA measurements, versions 1 and 2)",
         fira.recognise_text,
         fira.read_text,
     ),
@@ -130,7 +128,7 @@ FORMATS: Final = (
     ),
     _dl_tdoa(
         "uci-pcapng",
-        "UCI capture, pcapng of link type 299 (DL-TDoA measurements, versions 1 and 2)",
+        "FiRa UCI capture, pcapng of link type 299 (DL-TDoA measurements, versions 1 and 2)",
         fira.recognise_pcapng,
         fira.read_pcapng,
     ),
@@ -154,10 +152,15 @@ FORMATS: Final = (
         read_anchors=muloc.read_anchors,
         channels=muloc.CHANNELS,
     ),
-    _bitcraze("binary", "binary records BC ..", bitcraze.recognise_binary, bitcraze.read_binary),
+    _bitcraze(
+        "bitcraze-binary",
+        "Bitcraze sniffer, binary records BC .. (TDoA2, TDoA3)",
+        bitcraze.recognise_binary,
+        bitcraze.read_binary,
+    ),
     _dl_tdoa(
         "uci-binary",
-        "UCI log, packets as they came over the line (DL-TDoA measurements, versions 1 and 2)",
+        "FiRa UCI log, packets as they came over the line (DL-TDoA measurements, versions 1 and 2)",
         fira.recognise_binary,
         fira.read_binary,
     ),

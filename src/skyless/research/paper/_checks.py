@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -11,7 +12,8 @@ from msgspec import Struct
 from skyless.core.arrays import Array
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.research.paper.monte_carlo import ChainMoments, Quantity, draw_moments
-from skyless.research.paper.plan import Panel, Plan, Results, Section, Task, Verdict, grouped
+from skyless.research.paper.plan import Panel, Plan, Results, Section, Verdict, grouped
+from skyless.research.studies.common.plan import Cell
 from skyless.research.uncertainty.chain import CORRECTED, PRINTED, Chain
 from skyless.site.report.figures import BLUE, INK, RED, panel
 
@@ -162,14 +164,12 @@ def _error_pct(variance: float, std: float) -> float:
     return 100.0 * abs(math.sqrt(variance) - std) / std
 
 
-def tasks(plan: Plan) -> list[Task]:
+def cells(plan: Plan) -> list[Cell]:
     """All quantities of ten anchors, Gaussian and uniform; and a few draws with clocks that started earlier."""
     few = max(plan.draws // 20, 10_000)
     return [
-        Task("checks", paper_checks, {"seed": plan.seed, "draws": plan.draws}, plan.draws * _SECONDS_PER_DRAW),
-        Task(
-            "checks/far", paper_checks, {"seed": plan.seed, "draws": few, "origin_s": _FAR_S}, few * _SECONDS_PER_DRAW
-        ),
+        Cell("checks", partial(paper_checks, seed=plan.seed, draws=plan.draws), plan.draws * _SECONDS_PER_DRAW),
+        Cell("checks/far", partial(paper_checks, seed=plan.seed, draws=few, origin_s=_FAR_S), few * _SECONDS_PER_DRAW),
     ]
 
 

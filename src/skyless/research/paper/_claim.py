@@ -1,9 +1,11 @@
 """Figure 9: for which stamp noise the largest of 30 000 errors stays below 20 cm (abstract, section 5)."""
 
+from functools import partial
 from typing import Final
 
 import numpy as np
 from msgspec import Struct
+from scipy.optimize import brentq
 
 from skyless.core.arrays import Array
 from skyless.research.paper._listening import listen
@@ -16,10 +18,10 @@ from skyless.research.paper.plan import (
     Plan,
     Results,
     Section,
-    Task,
     Verdict,
     grouped,
 )
+from skyless.research.studies.common.plan import Cell
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
@@ -55,13 +57,12 @@ class Worst(Struct, frozen=True):
     """5 % and 95 % of the largest of ``_CLAIM_FIXES`` independent errors of this covariance over its median."""
 
 
-def tasks(plan: Plan) -> list[Task]:
+def cells(plan: Plan) -> list[Cell]:
     """One world for each stamp noise, each with a seed of its own, so that their scatter is independent."""
     return [
-        Task(
+        Cell(
             f"claim/{noise_ps:g}",
-            run_world,
-            {"noise_ps": noise_ps, "seed": seed_of(plan, noise_ps), "fixes": plan.fixes},
+            partial(run_world, noise_ps=noise_ps, seed=seed_of(plan, noise_ps), fixes=plan.fixes),
             plan.fixes * 0.8e-3,
         )
         for noise_ps in plan.noises_ps
@@ -100,13 +101,8 @@ def largest_of_m(covariance_m2: Array, count: float, quantile: float) -> float:
     along = np.stack([np.cos(angles), np.sin(angles)])
     variances_m2 = 1.0 / np.einsum("ia,ij,ja->a", along, np.linalg.inv(covariance_m2), along)
     weight = variances_m2 / np.sqrt(np.linalg.det(covariance_m2))
-    exceed = -np.expm1(np.log(quantile) / count)
-    low, high = 0.0, 12.0 * float(np.sqrt(np.trace(covariance_m2)))
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        tail = float(np.mean(np.exp(-0.5 * middle**2 / variances_m2) * weight))
-        low, high = (middle, high) if tail > exceed else (low, middle)
-    return 0.5 * (low + high)
+    exceed, most_m = -np.expm1(np.log(quantile) / count), 12.0 * float(np.sqrt(np.trace(covariance_m2)))
+    return float(brentq(lambda r: np.mean(np.exp(-0.5 * r**2 / variances_m2) * weight) - exceed, 0.0, most_m))
 
 
 class Trend(Struct, frozen=True):
@@ -120,9 +116,9 @@ class Trend(Struct, frozen=True):
         """Largest error of a run that is ``factor`` times a typical one."""
         return factor * self.coefficient * noise_ps**self.exponent
 
-    def crossing_ps(self, factor: float = 1.0, limit_m: float = CLAIM_M) -> float:
+    def crossing_ps(self, factor: float = 1.0) -> float:
         """Stamp noise at which such a run reaches the limit."""
-        return float((limit_m / (factor * self.coefficient)) ** (1.0 / self.exponent))
+        return float((CLAIM_M / (factor * self.coefficient)) ** (1.0 / self.exponent))
 
     @property
     def crossings_ps(self) -> tuple[float, float, float]:

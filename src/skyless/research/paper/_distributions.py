@@ -1,16 +1,18 @@
 """Figure 3: the distribution of one DTDoA's error, Gaussian and uniform stamps (fig:TDoAApprox, E10)."""
 
 import math
+from functools import partial
 from typing import Final
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, structs
 from scipy.stats import norm
 
 from skyless.core.arrays import Array, Integers
 from skyless.research.paper._checks import NOISES, draw_seed, first_number, paper_chain
 from skyless.research.paper.monte_carlo import draw_lambdas
-from skyless.research.paper.plan import Panel, Plan, Results, Section, Task, Verdict, grouped
+from skyless.research.paper.plan import Panel, Plan, Results, Section, Verdict, grouped
+from skyless.research.studies.common.plan import Cell
 from skyless.research.uncertainty.chain import CORRECTED, PRINTED
 from skyless.site.report.figures import BLUE, INK, RED, panel
 
@@ -33,17 +35,20 @@ class LambdaDistribution(Struct, frozen=True):
     draws: int
 
 
-def lambda_distributions(seed: int, draws: int, bins: int = 101) -> tuple[LambdaDistribution, ...]:
+_BINS: Final = 101
+
+
+def lambda_distributions(seed: int, draws: int) -> tuple[LambdaDistribution, ...]:
     """Distributions of λ of anchor 1, one for each of ``NOISES``."""
-    return tuple(_distribution(seed, noise, draws, bins) for noise in NOISES)
+    return tuple(_distribution(seed, noise, draws) for noise in NOISES)
 
 
-def _distribution(seed: int, noise: str, draws: int, bins: int) -> LambdaDistribution:
+def _distribution(seed: int, noise: str, draws: int) -> LambdaDistribution:
     chain = paper_chain(seed, 1, noise)
     theory_m = math.sqrt(first_number(CORRECTED.lambda_m2(chain)))
     printed_variance = first_number(PRINTED.lambda_m2(chain))
-    edges = np.linspace(-_REACH_SIGMAS, _REACH_SIGMAS, bins + 1) * theory_m
-    counts = np.zeros(bins, np.int64)
+    edges = np.linspace(-_REACH_SIGMAS, _REACH_SIGMAS, _BINS + 1) * theory_m
+    counts = np.zeros(_BINS, np.int64)
     squares = 0.0
     for lambdas in draw_lambdas(chain, draw_seed(seed, 1), draws, uniform=noise == "uniform"):
         values = lambdas[:, 0]
@@ -60,9 +65,9 @@ def _distribution(seed: int, noise: str, draws: int, bins: int) -> LambdaDistrib
     )
 
 
-def tasks(plan: Plan) -> list[Task]:
+def cells(plan: Plan) -> list[Cell]:
     """One anchor, two kinds of noise."""
-    return [Task("distributions", lambda_distributions, {"seed": plan.seed, "draws": plan.draws}, plan.draws * 3e-6)]
+    return [Cell("distributions", partial(lambda_distributions, seed=plan.seed, draws=plan.draws), plan.draws * 3e-6)]
 
 
 def shape_distance(one: LambdaDistribution) -> float:
@@ -122,15 +127,8 @@ def section(plan: Plan, results: Results) -> Section:
         table=tuple(rows),
         numbers={
             "distributions": [
-                {
-                    "noise": one.noise,
-                    "std_m": one.std_m,
-                    "corrected_std_m": one.corrected_std_m,
-                    "printed_std_m": one.printed_std_m,
-                    "corrected_error_pct": deviation_pct(one),
-                    "shape_distance": shape_distance(one),
-                    "draws": one.draws,
-                }
+                {name: value for name, value in structs.asdict(one).items() if name not in {"edges_m", "counts"}}
+                | {"corrected_error_pct": deviation_pct(one), "shape_distance": shape_distance(one)}
                 for one in both
             ]
         },

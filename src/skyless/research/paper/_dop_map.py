@@ -8,7 +8,8 @@ from skyless.core.arrays import Array
 from skyless.core.constants import SPEED_OF_LIGHT_MPS
 from skyless.core.dop import dops_at
 from skyless.core.protocol1.snapshots import literal_covariance
-from skyless.research.paper.plan import P1, P2, RADIO_PS, Panel, Plan, Results, Section, Task, Verdict
+from skyless.research.paper.plan import P1, P2, RADIO_PS, Panel, Plan, Results, Section, Verdict
+from skyless.research.studies.common.plan import Cell
 from skyless.sim.lab import paper_lab_site
 from skyless.site.report.figures import MAP, MAP_WHITE, draw_floor_plan, panel
 
@@ -20,18 +21,18 @@ EXPLAINING_CORRELATION: Final = 0.8
 """Correlation above which one thing explains another."""
 
 
-def tasks(plan: Plan) -> list[Task]:  # noqa: ARG001 - nothing to simulate
+def cells(plan: Plan) -> list[Cell]:  # noqa: ARG001 - nothing to simulate
     """None: the maps are computed."""
     return []
 
 
-def literal_covariance_m2(position_m: Array, noise_ps: float = RADIO_PS) -> Array:
+def literal_covariance_m2(position_m: Array) -> Array:
     """Covariance of one fix of ``literal`` at a position, shape (2, 2).
 
     G Σ Gᵀ with G = (JᵀJ)⁻¹Jᵀ of the unweighted least squares and Σ the full covariance of its TDoAs. Anchor i sends
     i slots after the master, so κ is i over the slots of the superframe.
     """
-    variance_m2 = (noise_ps * 1e-12 * SPEED_OF_LIGHT_MPS) ** 2
+    variance_m2 = (RADIO_PS * 1e-12 * SPEED_OF_LIGHT_MPS) ** 2
     kappa = np.arange(1, len(LAB_ANCHORS_M)) / len(LAB_ANCHORS_M)
     away = position_m - LAB_ANCHORS_M
     units = away / np.linalg.norm(away, axis=1)[:, None]
@@ -111,25 +112,17 @@ def section(plan: Plan, results: Results) -> Section:  # noqa: ARG001 - computed
         ),
         table=rows,
         numbers={
-            "pdop": {
-                "min": pdop.min(),
-                "median": np.median(pdop),
-                "max": pdop.max(),
-                "p1": pdop_spots[0],
-                "p2": pdop_spots[1],
-            },
-            "literal_sigma_m": {
-                "min": sigma_m.min(),
-                "median": np.median(sigma_m),
-                "max": sigma_m.max(),
-                "p1": sigma_spots[0],
-                "p2": sigma_spots[1],
-            },
+            "pdop": _summary(pdop, pdop_spots),
+            "literal_sigma_m": _summary(sigma_m, sigma_spots),
             "correlation": correlation,
             "sigma_asymmetry": float(ratios.max() - 1.0),
         },
         command="skyless paper --out DIR",
     )
+
+
+def _summary(values: Array, spots: list[float]) -> dict[str, float]:
+    return {"min": values.min(), "median": np.median(values), "max": values.max(), "p1": spots[0], "p2": spots[1]}
 
 
 def _three(values: Array, form: str) -> tuple[str, str, str]:

@@ -1,15 +1,17 @@
 """Figure 8: the update rate (sec:conclusion: 67 Hz)."""
 
+from functools import partial
 from typing import Final
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, to_builtins
 from msgspec.structs import replace
 
 from skyless.core.protocol1.receiver import Receiver
 from skyless.core.protocol1.schedule import schedule_of
 from skyless.core.site import AnchorSite, ScheduleSite, Site
-from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Task, Verdict
+from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Verdict
+from skyless.research.studies.common.plan import Cell
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import paper_lab_site
@@ -46,10 +48,10 @@ def sites() -> dict[str, Site]:
     return {"six nodes, 2.5 ms": lab, "seven nodes, 2.1 ms": seven}
 
 
-def tasks(plan: Plan) -> list[Task]:
+def cells(plan: Plan) -> list[Cell]:
     """One world for each site."""
     return [
-        Task(f"rate/{name}", run_world, {"name": name, "seed": plan.seed, "seconds": plan.rate_s}, plan.rate_s * 0.05)
+        Cell(f"rate/{name}", partial(run_world, name=name, seed=plan.seed, seconds=plan.rate_s), plan.rate_s * 0.05)
         for name in sites()
     ]
 
@@ -115,20 +117,7 @@ def section(plan: Plan, results: Results) -> Section:
         reason=reason,
         panels=(_bars(counts),),
         table=tuple(rows),
-        numbers={
-            "counts": [
-                {
-                    "site": c.site,
-                    "method": c.method,
-                    "rate_hz": c.rate_hz,
-                    "foreseen_hz": c.foreseen_hz,
-                    "updates": c.updates,
-                    "counted_s": c.counted_s,
-                    "longest_gap_s": c.longest_gap_s,
-                }
-                for c in counts
-            ]
-        },
+        numbers={"counts": [{**to_builtins(count), "rate_hz": count.rate_hz} for count in counts]},
         command=f"skyless simulate --method joint --position 3,4 --duration 10 --seed {plan.seed}",
     )
 

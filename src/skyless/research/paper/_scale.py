@@ -2,16 +2,18 @@
 
 import hashlib
 import time
+from functools import partial
 from typing import Final
 
 import numpy as np
+from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from msgspec import Struct
-from numpy.typing import ArrayLike
 
 from skyless.core.arrays import Array, Integers
 from skyless.core.protocol1.receiver import Receiver
-from skyless.research.paper.plan import P1, RADIO_PS, Panel, Plan, Results, Section, Task, Verdict, grouped
+from skyless.research.paper.plan import P1, RADIO_PS, Panel, Plan, Results, Section, Verdict, grouped
+from skyless.research.studies.common.plan import Cell
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import paper_lab_site
@@ -25,10 +27,6 @@ _JUDGED_UNTIL_S: Final = 1.2
 _RANGINGS_OF_TWR: Final = 6
 _MESSAGES_PER_RANGING: Final = 4
 """Double-sided two-way ranging with each of six anchors, as the paper counts its messages."""
-
-
-_FRAMES_PER_MS: Final = 100.0
-"""Frames per second on the right axis for each millisecond on the left."""
 
 
 class FleetResult(Struct, frozen=True):
@@ -52,10 +50,10 @@ class FleetResult(Struct, frozen=True):
     """CPU time of one tag per second of true time, measured on this machine."""
 
 
-def tasks(plan: Plan) -> list[Task]:
+def cells(plan: Plan) -> list[Cell]:
     """One world for each size."""
     return [
-        Task(f"scale/{tags}", run_world, {"tags": tags, "seed": plan.seed}, 2.0 + tags * 8e-3)
+        Cell(f"scale/{tags}", partial(run_world, tags=tags, seed=plan.seed), 2.0 + tags * 8e-3)
         for tags in plan.fleet_sizes
     ]
 
@@ -172,18 +170,18 @@ def section(plan: Plan, results: Results) -> Section:
     )
 
 
-def _logarithmic(title: str, fleets: list[FleetResult], height_in: float = 3.2) -> Panel:
-    figure, axes = panel(title, height_in)
+def _logarithmic(title: str, fleets: list[FleetResult]) -> Figure:
+    figure, axes = panel(title, 3.2)
     axes.set_xscale("log")
     axes.set_xticks([fleet.tags for fleet in fleets])
     axes.xaxis.set_major_formatter(FuncFormatter(lambda tags, _: grouped(round(tags))))
     axes.minorticks_off()
     axes.set_xlabel("tags")
-    return Panel("", "", figure)
+    return figure
 
 
 def _accuracy(fleets: list[FleetResult]) -> Panel:
-    figure = _logarithmic("Accuracy of a tag", fleets).figure
+    figure = _logarithmic("Accuracy of a tag", fleets)
     (axes,) = figure.axes
     tags = [fleet.tags for fleet in fleets]
     low, high = (100 * np.array([fleet.tag_rmse_m[k] for fleet in fleets]) for k in (0, 1))
@@ -195,7 +193,7 @@ def _accuracy(fleets: list[FleetResult]) -> Panel:
 
 
 def _rates(fleets: list[FleetResult]) -> Panel:
-    figure = _logarithmic("Updates of each tag", fleets).figure
+    figure = _logarithmic("Updates of each tag", fleets)
     (axes,) = figure.axes
     tags = np.array([fleet.tags for fleet in fleets], dtype=float)
     slots_hz = 1.0 / (paper_lab_site().schedule.slot_s)
@@ -211,23 +209,15 @@ def _rates(fleets: list[FleetResult]) -> Panel:
 
 
 def _cpu(fleets: list[FleetResult]) -> Panel:
-    figure = _logarithmic("What a tag computes, what the air carries", fleets).figure
+    figure = _logarithmic("What a tag computes, what the air carries", fleets)
     (axes,) = figure.axes
     tags = [fleet.tags for fleet in fleets]
     cpu_ms = [1e3 * fleet.cpu_s_per_tag_s for fleet in fleets]
-    frames = [fleet.frames_per_s / _FRAMES_PER_MS for fleet in fleets]
     axes.plot(tags, cpu_ms, "s-", color=GREEN, label="CPU time of a tag (left), measured here")
-    axes.plot(tags, frames, "o--", color=INK, label="frames on the air (right)")
-    axes.set(ylabel="CPU time in ms per s", ylim=(0, 1.7 * max(*cpu_ms, *frames)))
-    right = axes.secondary_yaxis("right", functions=(_frames_of_ms, _ms_of_frames))
-    right.set_ylabel("frames per second")
-    axes.legend(loc="upper left")
+    axes.set(ylabel="CPU time in ms per s", ylim=(0, 1.7 * max(cpu_ms)))
+    right, frames = axes.twinx(), [fleet.frames_per_s for fleet in fleets]
+    (line,) = right.plot(tags, frames, "o--", color=INK, label="frames on the air (right)")
+    right.set(ylabel="frames per second", ylim=(0, 1.3 * max(frames)))
+    right.grid(visible=False)
+    axes.legend(handles=[*axes.lines, line], loc="upper left")
     return Panel("10-load", "CPU time of one tag per second (measured on this machine) and frames on the air.", figure)
-
-
-def _frames_of_ms(cpu_ms: ArrayLike) -> Array:
-    return _FRAMES_PER_MS * np.asarray(cpu_ms, np.float64)
-
-
-def _ms_of_frames(frames: ArrayLike) -> Array:
-    return np.asarray(frames, np.float64) / _FRAMES_PER_MS

@@ -1,12 +1,14 @@
 """Figure 1: uplink and downlink, and the lab (fig:Scenario)."""
 
+from functools import partial
 from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from skyless.research.paper._dop_map import LAB_ANCHORS_M
-from skyless.research.paper.plan import P1, P2, Panel, Plan, Results, Section, Task, Verdict
+from skyless.research.paper.plan import P1, P2, Panel, Plan, Results, Section, Verdict
+from skyless.research.studies.common.plan import Cell
 from skyless.sim.evaluation.scenarios import Request, fleet_of
 from skyless.sim.lab import paper_lab_site
 from skyless.site.report.figures import BLUE, GREEN, ORANGE, PAPER, RED, draw_floor_plan, panel
@@ -16,10 +18,10 @@ _SECONDS: Final = 1.0
 _MANY: Final = 50
 
 
-def tasks(plan: Plan) -> list[Task]:
+def cells(plan: Plan) -> list[Cell]:
     """The lab with one tag and with many, to count who sends."""
     return [
-        Task(f"scenario/{tags}", count_frames, {"tags": tags, "seed": plan.seed}, 0.2 + tags * 0.02)
+        Cell(f"scenario/{tags}", partial(count_frames, tags=tags, seed=plan.seed), 0.2 + tags * 0.02)
         for tags in (1, _MANY)
     ]
 

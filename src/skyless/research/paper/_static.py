@@ -1,5 +1,6 @@
 """Figure 4: error histograms at two static positions, and what biased stamps leave (fig:HistogramErrorXY)."""
 
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -21,10 +22,10 @@ from skyless.research.paper.plan import (
     Point,
     Results,
     Section,
-    Task,
     Verdict,
     grouped,
 )
+from skyless.research.studies.common.plan import Cell
 from skyless.sim.impairments import DelayError, Impairments, lab_impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
@@ -61,11 +62,11 @@ class Moments(Struct, frozen=True):
     excess_kurtosis: float
 
 
-def tasks(plan: Plan) -> list[Task]:
+def cells(plan: Plan) -> list[Cell]:
     """One world for each kind of stamp error, a tag at each position."""
     weight_s = plan.fixes * 1e-3
     return [
-        Task(f"static/{name}", run_world, {"name": name, "seed": plan.seed, "fixes": plan.fixes}, weight_s)
+        Cell(f"static/{name}", partial(run_world, name=name, seed=plan.seed, fixes=plan.fixes), weight_s)
         for name in _WORLDS
     ]
 

@@ -2,16 +2,19 @@
 
 import time
 from collections.abc import Iterator
+from functools import partial
 from typing import Final
 
 import numpy as np
+from matplotlib.axes import Axes
 from msgspec import Struct
 
 from skyless.core.constants import SPEED_OF_LIGHT_MPS
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.protocol1.receiver import Receiver
 from skyless.core.protocol1.schedule import schedule_of
-from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Task, Verdict
+from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Verdict
+from skyless.research.studies.common.plan import Cell
 from skyless.sim.impairments import Outage, lab_impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.stations import TagSpec
@@ -56,9 +59,9 @@ class Phase(Struct, frozen=True):
     processing_s: float
 
 
-def tasks(plan: Plan) -> list[Task]:
+def cells(plan: Plan) -> list[Cell]:
     """Three receivers for a few seconds."""
-    return [Task("timeline", run_world, {"seed": plan.seed, "until_s": 4.0 if plan.quick else 12.0}, 6.0)]
+    return [Cell("timeline", partial(run_world, seed=plan.seed, until_s=4.0 if plan.quick else 12.0), 6.0)]
 
 
 def run_world(seed: int, until_s: float) -> list[TimedReception]:
@@ -183,24 +186,15 @@ def _cold_start(heard: list[TimedReception], phases: list[Phase]) -> Panel:
     figure, axes = panel("From switching on to a fix in every superframe", 3.4)
     begin_s, end_s = _SWITCHED_ON_S[0] - 0.004, _SWITCHED_ON_S[0] + _SHOWN_S
     for tag, on_s in enumerate(_SWITCHED_ON_S):
-        row = len(_POSITIONS_M) - 1 - tag
+        row = _row(tag)
         own = [phase for phase in phases if phase.tag == tag and phase.end_s < end_s]
         for number, phase in enumerate(own):
-            bar = (1e3 * (phase.begin_s - begin_s), row - 0.2)
-            axes.broken_barh(
-                [(bar[0], 1e3 * (phase.end_s - phase.begin_s))],
-                (row - 0.18, 0.36),
-                facecolors=GRID if number == 0 else METHOD_COLOURS[_METHOD],
-                edgecolors=MUTED,
-                linewidth=0.5,
-            )
+            _bar(axes, phase, begin_s, METHOD_COLOURS[_METHOD] if number else GRID)
             axes.plot(1e3 * (phase.end_s - begin_s), row, "|", color=INK, markersize=17, markeredgewidth=2.0)
         arrivals = [1e3 * (one.arrival_s - begin_s) for one in heard if one.tag == tag and one.end_s < end_s]
         axes.plot(arrivals, [row - 0.3] * len(arrivals), ".", color=MUTED, markersize=2.5)
         axes.plot(1e3 * (on_s - begin_s), row + 0.32, "v", color=GREEN, markersize=6)
-    axes.set_yticks(range(len(_POSITIONS_M)), [f"receiver {len(_POSITIONS_M) - k}" for k in range(len(_POSITIONS_M))])
-    axes.set(xlabel="time in ms", xlim=(0, 1e3 * (end_s - begin_s)), ylim=(-0.5, len(_POSITIONS_M) - 0.4))
-    axes.grid(visible=False, axis="y")
+    _finish(axes, end_s - begin_s)
     caption = (
         "Green: switched on. Grey: gathering the almanac and the first two rounds. Orange: a positioning phase, "
         "from the first message of a superframe to the fix (black). Dots: messages heard."
@@ -211,23 +205,33 @@ def _cold_start(heard: list[TimedReception], phases: list[Phase]) -> Panel:
 def _one_phase(heard: list[TimedReception], settled: list[Phase], superframe_s: float) -> Panel:
     figure, axes = panel("One superframe, three fixes", 3.4)
     begin_s = settled[0].begin_s - 1e-3
-    shown = [one for one in heard if begin_s <= one.arrival_s < begin_s + 2.0 * superframe_s + 1e-3]
-    for tag in range(len(_POSITIONS_M)):
-        row = len(_POSITIONS_M) - 1 - tag
-        for phase in settled:
-            if phase.tag == tag and phase.begin_s < begin_s + 2.0 * superframe_s:
-                span = [(1e3 * (phase.begin_s - begin_s), 1e3 * (phase.end_s - phase.begin_s))]
-                axes.broken_barh(
-                    span, (row - 0.18, 0.36), facecolors=METHOD_COLOURS[_METHOD], edgecolors=MUTED, linewidth=0.5
-                )
-        for one in shown:
-            if one.tag == tag:
-                when = 1e3 * (one.arrival_s - begin_s)
-                axes.plot(when, row, "|", color=INK, markersize=9)
-                colour = RED if one.anchor == 1 else INK
-                axes.annotate(str(one.anchor), (when, row + 0.24), ha="center", fontsize=8.0, color=colour)
-    axes.set_yticks(range(len(_POSITIONS_M)), [f"receiver {len(_POSITIONS_M) - k}" for k in range(len(_POSITIONS_M))])
-    axes.set(xlabel="time in ms", xlim=(0, 1e3 * (2.0 * superframe_s + 1e-3)), ylim=(-0.5, len(_POSITIONS_M) - 0.4))
-    axes.grid(visible=False, axis="y")
+    for phase in settled:
+        if phase.begin_s < begin_s + 2.0 * superframe_s:
+            _bar(axes, phase, begin_s, METHOD_COLOURS[_METHOD])
+    for one in heard:
+        if begin_s <= one.arrival_s < begin_s + 2.0 * superframe_s + 1e-3:
+            when = 1e3 * (one.arrival_s - begin_s)
+            axes.plot(when, _row(one.tag), "|", color=INK, markersize=9)
+            colour = RED if one.anchor == 1 else INK
+            axes.annotate(str(one.anchor), (when, _row(one.tag) + 0.24), ha="center", fontsize=8.0, color=colour)
+    _finish(axes, 2.0 * superframe_s + 1e-3)
     caption = "Two superframes: the numbers are the senders (1 is the master). The phase ends with the sixth one."
     return Panel("07-one-superframe", caption, figure)
+
+
+def _row(tag: int) -> int:
+    """The first receiver is on top."""
+    return len(_POSITIONS_M) - 1 - tag
+
+
+def _bar(axes: Axes, phase: Phase, begin_s: float, colour: str) -> None:
+    span = (1e3 * (phase.begin_s - begin_s), 1e3 * (phase.end_s - phase.begin_s))
+    across = (_row(phase.tag) - 0.18, 0.36)
+    axes.broken_barh([span], across, facecolors=colour, edgecolors=MUTED, linewidth=0.5)
+
+
+def _finish(axes: Axes, seconds: float) -> None:
+    count = len(_POSITIONS_M)
+    axes.set_yticks(range(count), [f"receiver {count - k}" for k in range(count)])
+    axes.set(xlabel="time in ms", xlim=(0, 1e3 * seconds), ylim=(-0.5, count - 0.4))
+    axes.grid(visible=False, axis="y")

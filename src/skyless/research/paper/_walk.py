@@ -1,5 +1,6 @@
 """Figure 5: the walking test (fig:Walk)."""
 
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -8,7 +9,8 @@ from msgspec import Struct
 from skyless.core.arrays import Array
 from skyless.research.paper._dop_map import EXPLAINING_CORRELATION, LAB_ANCHORS_M, literal_covariance_m2, pdop_at
 from skyless.research.paper._listening import Track, listen
-from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Task, Verdict, grouped
+from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Verdict, grouped
+from skyless.research.studies.common.plan import Cell
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Waypoints
@@ -38,9 +40,9 @@ class AlongPath(Struct, frozen=True):
     """Mean of ``rms_m`` over ``predicted_m``."""
 
 
-def tasks(plan: Plan) -> list[Task]:
+def cells(plan: Plan) -> list[Cell]:
     """One walking tag."""
-    return [Task("walk", run_world, {"seed": plan.seed, "laps": plan.laps}, plan.laps * 0.9)]
+    return [Cell("walk", partial(run_world, seed=plan.seed, laps=plan.laps), plan.laps * 0.9)]
 
 
 def run_world(seed: int, laps: int) -> dict[str, Track]:

@@ -1,20 +1,19 @@
 """Monte Carlo of the paper's chain: means, variances and covariances of any number of draws, in constant memory.
 
-One draw is one synchronisation of n anchors and one DTDoA of each, with noise on every stamp. The scalar functions are
-the program's own, of ``positioning/methods/snapshots.py``. Errors are taken against the same chain
-without noise. Ideal readings are float ticks; a hundred-thousandth of a tick is lost where clocks stand a second from
-their origins.
+One draw is one synchronisation of n anchors and one DTDoA of each, with noise on every stamp. The chain's functions
+are the program's own, of ``core/protocol1/snapshots.py``. Errors are taken against the same chain without noise. Ideal
+readings are float ticks; a hundred-thousandth of a tick is lost where clocks stand a second from their origins.
 
 The noise of a chunk of draws comes from NumPy's Philox generator, whose key is the seed and the chunk's number. So the
 draws depend on the seed alone, and sums have the same bits for any number of threads.
 """
 
 import math
-from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from enum import IntEnum
-from typing import Final, NamedTuple
+from functools import reduce
+from typing import Any, Final
 
 import numpy as np
 from msgspec import Struct
@@ -31,15 +30,11 @@ from skyless.core.protocol1.snapshots import (
     to_master,
 )
 from skyless.research.uncertainty.chain import Chain, Reference
-from skyless.site.kernels.compiled import jitted, kernel, threaded_kernel
-
-for _function in (averaged_offset, protocol_interval, relative_offset, relative_rate, tag_rate, to_master):
-    jitted(_function)
 
 CHUNK_DRAWS: Final = 1 << 14
 """Draws with one key, which one thread sums up at a time."""
-_BATCH_DRAWS: Final = 256
-"""Draws whose noise is made at a time: it stays in the processor's cache."""
+_BATCH_DRAWS: Final = 1 << 10
+"""Draws that are computed at a time: they stay in the processor's cache."""
 
 _SHARED_NOISES: Final = 4
 """Noises of a draw: the master's two synchronisation messages, its reference message, the tag's reception of it."""
@@ -61,158 +56,53 @@ class Quantity(IntEnum):
     LAMBDA = 8
 
 
-_EPSILON_FIRST: Final = int(Quantity.EPSILON_FIRST)
-_EPSILON_DELAYED: Final = int(Quantity.EPSILON_DELAYED)
-_LAMBDA: Final = int(Quantity.LAMBDA)
-
 _UNITS: Final = np.array([1.0, *[TICK_S] * 5, 1.0, TICK_S, TICK_M])[:, None]
 """From ticks to what ``ChainMoments`` gives, by ``Quantity``."""
 
 
-class Readings(NamedTuple):
-    """What every clock of a chain would read without noise, and the noise, all in ticks; arrays have shape (n,)."""
+def run_chain(chain: Chain, reference: Reference, noise: Array) -> Array:
+    """Every quantity of the chain in ticks, shape (quantities, draws, n), for stamps with ``noise`` of unit variance.
 
-    sync_first: float
-    """The master's clock at its synchronisation messages."""
-    sync_second: float
-    reference: float
-    """The master's clock when the reference message leaves, and the tag's when it arrives."""
-    reference_at_tag: float
-    received_first: Array
-    """An anchor's clock at its receptions of the synchronisation messages, and at its own two messages."""
-    received_second: Array
-    sent_first: Array
-    sent_second: Array
-    heard_first: Array
-    """The tag's clock at its receptions of these."""
-    heard_second: Array
-    tof: Array
-    sigma_master: float
-    sigma_anchor: float
-    sigma_tag: float
-    reference_noise: int
-    """Which of the shared noises is that of the reference message: its own, or that of a synchronisation message."""
-
-
-def readings_of(chain: Chain, reference: Reference) -> Readings:
-    """The readings of a chain whose reference message is one of its own or a synchronisation message."""
-
-    def master(true_s: float) -> float:
-        return (chain.master_offset_s + chain.master_rate * true_s) / TICK_S
-
-    def anchor(true_s: Array) -> Array:
-        return (chain.anchor_offset_s + chain.anchor_rate * true_s) / TICK_S
-
-    def tag(true_s: Array) -> Array:
-        return (chain.tag_offset_s + chain.tag_rate * true_s) / TICK_S
-
-    second_s = chain.sync_s + chain.sync_spacing_s
-    sent_s = chain.reference_s + chain.delay_s
-    heard_s = sent_s + chain.tag_tof_s
-    at_tag = tag(np.array(chain.reference_s + chain.tag_master_tof_s))
-    return Readings(
-        sync_first=master(chain.sync_s),
-        sync_second=master(second_s),
-        reference=master(chain.reference_s),
-        reference_at_tag=float(at_tag),
-        received_first=anchor(chain.sync_s + chain.anchor_tof_s),
-        received_second=anchor(second_s + chain.anchor_tof_s),
-        sent_first=anchor(sent_s),
-        sent_second=anchor(sent_s + chain.spacing_s),
-        heard_first=tag(heard_s),
-        heard_second=tag(heard_s + chain.spacing_s),
-        tof=chain.anchor_tof_s / TICK_S,
-        sigma_master=chain.sigma_master_s / TICK_S,
-        sigma_anchor=chain.sigma_anchor_s / TICK_S,
-        sigma_tag=chain.sigma_tag_s / TICK_S,
-        reference_noise={Reference.FIRST_SYNC: 0, Reference.SECOND_SYNC: 1, Reference.APART: 2}[reference],
-    )
-
-
-def noise_size(anchors: int) -> int:
-    """Numbers of one draw."""
-    return _SHARED_NOISES + _ANCHOR_NOISES * anchors
-
-
-def ideal_values(readings: Readings) -> Array:
-    """Every quantity of the chain without noise, shape (quantities, n)."""
-    n = len(readings.tof)
-    values = np.empty((len(Quantity), n))
-    run_chain(readings, np.zeros(noise_size(n)), values)
-    return values
-
-
-@kernel
-def run_chain(readings: Readings, noise: Array, values: Array) -> None:
-    """Write every quantity of the chain, shape (quantities, n), for stamps with ``noise`` (of unit variance)."""
-    sigma_master, sigma_anchor, sigma_tag = readings.sigma_master, readings.sigma_anchor, readings.sigma_tag
-    m1 = readings.sync_first + sigma_master * noise[0]
-    m2 = readings.sync_second + sigma_master * noise[1]
-    tm = readings.reference + sigma_master * noise[readings.reference_noise]
-    rm = readings.reference_at_tag + sigma_tag * noise[3]
-    for i in range(len(readings.tof)):
-        own = noise[_SHARED_NOISES + _ANCHOR_NOISES * i : _SHARED_NOISES + _ANCHOR_NOISES * (i + 1)]
-        s1 = readings.received_first[i] + sigma_anchor * own[0]
-        s2 = readings.received_second[i] + sigma_anchor * own[1]
-        a1 = readings.sent_first[i] + sigma_anchor * own[2]
-        a2 = readings.sent_second[i] + sigma_anchor * own[3]
-        r1 = readings.heard_first[i] + sigma_tag * own[4]
-        r2 = readings.heard_second[i] + sigma_tag * own[5]
-        rate = relative_rate(s2 - s1, m2 - m1)
-        first = relative_offset(s1, m1, rate, readings.tof[i])
-        delayed = relative_offset(s2, m2, rate, readings.tof[i])
-        offset = averaged_offset(first, delayed)
-        sent1 = to_master(a1, rate, offset)
-        sent2 = to_master(a2, rate, offset)
-        tags_rate = tag_rate(r2 - r1, sent2 - sent1)
-        interval = protocol_interval(tags_rate, sent1, tm)
-        values[0, i] = rate
-        values[1, i] = first
-        values[2, i] = delayed
-        values[3, i] = offset
-        values[4, i] = sent1
-        values[5, i] = sent2
-        values[6, i] = tags_rate
-        values[7, i] = interval
-        values[8, i] = (r1 - rm) - interval
-
-
-@threaded_kernel
-def add_draws(
-    readings: Readings, ideal: Array, noise: Array, powers: Array, epsilon_products: Array, lambda_products: Array
-) -> None:
-    """Add one draw for each row of ``noise`` to the sums.
-
-    ``powers`` (quantities, n, 3): first, second and fourth power of every error; ``epsilon_products`` (n,):
-    ε(t_i)·ε(t_i + Δ_i); ``lambda_products`` (n, n): λ·λᵀ, its lower triangle.
+    ``noise``: shape (draws, numbers of a draw).
     """
-    quantities, n = ideal.shape
-    errors = np.empty((quantities, n))
-    for k in range(len(noise)):
-        run_chain(readings, noise[k], errors)
-        for quantity in range(quantities):
-            for i in range(n):
-                error = errors[quantity, i] - ideal[quantity, i]
-                errors[quantity, i] = error
-                square = error * error
-                powers[quantity, i, 0] += error
-                powers[quantity, i, 1] += square
-                powers[quantity, i, 2] += square * square
-        for i in range(n):
-            epsilon_products[i] += errors[_EPSILON_FIRST, i] * errors[_EPSILON_DELAYED, i]
-            for j in range(i + 1):
-                lambda_products[i, j] += errors[_LAMBDA, i] * errors[_LAMBDA, j]
+    c, n = chain, len(chain.anchor_rate)
+    shared, own = noise[:, :_SHARED_NOISES, None], noise[:, _SHARED_NOISES:].reshape(-1, n, _ANCHOR_NOISES)
+    of_reference = {Reference.FIRST_SYNC: 0, Reference.SECOND_SYNC: 1, Reference.APART: 2}[reference]
+
+    def master(true_s: float, noise: Array) -> Any:  # noqa: ANN401 - arrays, for functions of numbers
+        return (c.master_offset_s + c.master_rate * true_s + c.sigma_master_s * noise) / TICK_S
+
+    def anchor(true_s: Array, noise: Array) -> Any:  # noqa: ANN401
+        return (c.anchor_offset_s + c.anchor_rate * true_s + c.sigma_anchor_s * noise) / TICK_S
+
+    def tag(true_s: float | Array, noise: Array) -> Any:  # noqa: ANN401
+        return (c.tag_offset_s + c.tag_rate * true_s + c.sigma_tag_s * noise) / TICK_S
+
+    second_s, sent_s = c.sync_s + c.sync_spacing_s, c.reference_s + c.delay_s
+    m1, m2 = master(c.sync_s, shared[:, 0]), master(second_s, shared[:, 1])
+    tm = master(c.reference_s, shared[:, of_reference])
+    rm = tag(c.reference_s + c.tag_master_tof_s, shared[:, 3])
+    s1, s2 = anchor(c.sync_s + c.anchor_tof_s, own[..., 0]), anchor(second_s + c.anchor_tof_s, own[..., 1])
+    a1, a2 = anchor(sent_s, own[..., 2]), anchor(sent_s + c.spacing_s, own[..., 3])
+    r1, r2 = tag(sent_s + c.tag_tof_s, own[..., 4]), tag(sent_s + c.spacing_s + c.tag_tof_s, own[..., 5])
+    tof: Any = c.anchor_tof_s / TICK_S
+    rate = relative_rate(s2 - s1, m2 - m1)
+    first, delayed = relative_offset(s1, m1, rate, tof), relative_offset(s2, m2, rate, tof)
+    offset = averaged_offset(first, delayed)
+    sent1, sent2 = to_master(a1, rate, offset), to_master(a2, rate, offset)
+    tags_rate = tag_rate(r2 - r1, sent2 - sent1)
+    interval = protocol_interval(tags_rate, sent1, tm)
+    return np.array([rate, first, delayed, offset, sent1, sent2, tags_rate, interval, (r1 - rm) - interval])
 
 
-@threaded_kernel
-def list_lambdas(readings: Readings, ideal: Array, noise: Array, lambdas: Array) -> None:
-    """Write the errors of the DTDoAs, in ticks, shape (draws, n): one draw for each row of ``noise``."""
-    n = lambdas.shape[1]
-    errors = np.empty((len(ideal), n))
-    for k in range(len(noise)):
-        run_chain(readings, noise[k], errors)
-        for i in range(n):
-            lambdas[k, i] = errors[_LAMBDA, i] - ideal[_LAMBDA, i]
+def ideal_values(chain: Chain, reference: Reference) -> Array:
+    """Every quantity of the chain without noise, shape (quantities, n)."""
+    return run_chain(chain, reference, np.zeros((1, noise_size(chain))))[:, 0]
+
+
+def noise_size(chain: Chain) -> int:
+    """Numbers of one draw."""
+    return _SHARED_NOISES + _ANCHOR_NOISES * len(chain.anchor_rate)
 
 
 def noise_batches(seed: int, chunk: int, draws: int, size: int, *, uniform: bool) -> Iterator[Array]:
@@ -260,57 +150,6 @@ class ChainMoments(Struct, frozen=True):
         return error
 
 
-class _Merge:
-    """Mean, squares about the mean and products of all chunks so far (T. Chan, G. Golub, R. LeVeque 1979)."""
-
-    def __init__(self, anchors: int) -> None:
-        self._count = 0
-        self._mean = np.zeros((len(Quantity), anchors))
-        self._squares = np.zeros((len(Quantity), anchors))
-        self._fourth = np.zeros((len(Quantity), anchors))
-        self._epsilon = np.zeros(anchors)
-        self._lambda = np.zeros((anchors, anchors))
-
-    def add(self, sums: "_Sums") -> None:
-        """Add the sums of a chunk."""
-        mean = sums.powers[:, :, 0] / sums.draws
-        self._merge_squares(mean, sums.powers[:, :, 1] - sums.draws * mean**2, sums.draws)
-        self._fourth += sums.powers[:, :, 2]
-        self._epsilon += sums.epsilon_products
-        self._lambda += sums.lambda_products
-
-    def _merge_squares(self, mean: Array, squares: Array, count: int) -> None:
-        total = self._count + count
-        difference = mean - self._mean
-        self._squares += squares + difference**2 * (self._count * count / total)
-        self._mean += difference * (count / total)
-        self._count = total
-
-    def moments(self) -> ChainMoments:
-        """The moments of all draws."""
-        draws, mean = self._count, self._mean
-        epsilon = self._epsilon / draws - mean[Quantity.EPSILON_FIRST] * mean[Quantity.EPSILON_DELAYED]
-        lower = self._lambda / draws
-        products = lower + np.tril(lower, -1).T - np.outer(mean[Quantity.LAMBDA], mean[Quantity.LAMBDA])
-        return ChainMoments(
-            draws=draws,
-            mean=mean * _UNITS,
-            variance=self._squares / (draws - 1) * _UNITS**2,
-            fourth=self._fourth / draws * _UNITS**4,
-            epsilon_covariance_s2=epsilon * TICK_S**2,
-            lambda_covariance_m2=products * TICK_M**2,
-        )
-
-
-class _Sums(NamedTuple):
-    """Sums over the draws of a chunk, as ``add_draws`` makes them."""
-
-    draws: int
-    powers: Array
-    epsilon_products: Array
-    lambda_products: Array
-
-
 def draw_moments(
     chain: Chain,
     seed: int,
@@ -324,33 +163,30 @@ def draw_moments(
 
     ``uniform``: noise uniform within ±√3·σ instead of Gaussian. ``threads``: as many as the machine has unless given.
     """
-    readings = readings_of(chain, reference)
-    ideal = ideal_values(readings)
-    merge = _Merge(len(readings.tof))
 
-    def sums_of(chunk: int, count: int) -> _Sums:
-        n = len(readings.tof)
-        sums = _Sums(count, np.zeros((len(Quantity), n, 3)), np.zeros(n), np.zeros((n, n)))
-        for noise in noise_batches(seed, chunk, count, noise_size(n), uniform=uniform):
-            add_draws(readings, ideal, noise, sums.powers, sums.epsilon_products, sums.lambda_products)
-        return sums
+    def sums_of(chunk: tuple[int, int]) -> tuple[Array, ...]:
+        return _total(_sums(errors) for errors in _errors(chain, seed, chunk, reference, uniform=uniform))
 
-    for sums in _in_order(sums_of, draws, threads or cores()):
-        merge.add(sums)
-    return merge.moments()
+    with ThreadPoolExecutor(threads or cores()) as pool:
+        sums = _total(pool.map(sums_of, _chunks(draws)))
+    first, second, fourth, epsilon, lambdas = (one / draws for one in sums)
+    return ChainMoments(
+        draws=draws,
+        mean=first * _UNITS,
+        variance=(second - first**2) * (draws / (draws - 1)) * _UNITS**2,
+        fourth=fourth * _UNITS**4,
+        epsilon_covariance_s2=(epsilon - first[Quantity.EPSILON_FIRST] * first[Quantity.EPSILON_DELAYED]) * TICK_S**2,
+        lambda_covariance_m2=(lambdas - np.outer(first[Quantity.LAMBDA], first[Quantity.LAMBDA])) * TICK_M**2,
+    )
 
 
 def draw_lambdas(
     chain: Chain, seed: int, draws: int, *, reference: Reference = Reference.APART, uniform: bool = False
 ) -> Iterator[Array]:
     """Errors of the DTDoAs of the draws that ``draw_moments`` makes, in metres, shape (up to a batch, n) each."""
-    readings = readings_of(chain, reference)
-    ideal, n = ideal_values(readings), len(readings.tof)
-    for chunk, count in _chunks(draws):
-        for noise in noise_batches(seed, chunk, count, noise_size(n), uniform=uniform):
-            lambdas = np.empty((len(noise), n))
-            list_lambdas(readings, ideal, noise, lambdas)
-            yield lambdas * TICK_M
+    for chunk in _chunks(draws):
+        for errors in _errors(chain, seed, chunk, reference, uniform=uniform):
+            yield errors[Quantity.LAMBDA] * TICK_M
 
 
 def _chunks(draws: int) -> Iterator[tuple[int, int]]:
@@ -359,13 +195,21 @@ def _chunks(draws: int) -> Iterator[tuple[int, int]]:
         yield chunk, min(CHUNK_DRAWS, draws - chunk * CHUNK_DRAWS)
 
 
-def _in_order(sums_of: Callable[[int, int], _Sums], draws: int, threads: int) -> Iterator[_Sums]:
-    """Sums of every chunk, in the order of the chunks; at most twice as many are under way as there are threads."""
-    with ThreadPoolExecutor(threads) as pool:
-        under_way: deque[Future[_Sums]] = deque()
-        for chunk, count in _chunks(draws):
-            under_way.append(pool.submit(sums_of, chunk, count))
-            if len(under_way) >= 2 * threads:
-                yield under_way.popleft().result()
-        for future in under_way:
-            yield future.result()
+def _errors(chain: Chain, seed: int, chunk: tuple[int, int], reference: Reference, *, uniform: bool) -> Iterator[Array]:
+    """Errors of every quantity of a chunk's draws, shape (quantities, up to a batch, n) each."""
+    ideal = ideal_values(chain, reference)[:, None]
+    for noise in noise_batches(seed, *chunk, noise_size(chain), uniform=uniform):
+        yield run_chain(chain, reference, noise) - ideal
+
+
+def _sums(errors: Array) -> tuple[Array, ...]:
+    """First, second and fourth powers, products of both ε, and products of all λ, over the draws."""
+    squares, of_lambda = errors**2, errors[Quantity.LAMBDA]
+    products = errors[Quantity.EPSILON_FIRST] * errors[Quantity.EPSILON_DELAYED]
+    powers = (errors.sum(axis=1), squares.sum(axis=1), (squares**2).sum(axis=1))
+    return *powers, products.sum(axis=0), of_lambda.T @ of_lambda
+
+
+def _total(parts: Iterable[tuple[Array, ...]]) -> tuple[Array, ...]:
+    """Sums added up one after the other."""
+    return reduce(lambda whole, part: tuple(map(np.add, whole, part)), parts)

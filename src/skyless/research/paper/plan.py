@@ -1,6 +1,6 @@
 """What the figures of the report share: amounts, positions, noises, and the pieces that a figure consists of."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from enum import StrEnum
 from typing import Any, Final
 
@@ -60,17 +60,6 @@ def plan_of(seed: int, *, quick: bool) -> Plan:
         rate_s=3.0,
         draws=50_000,
     )
-
-
-class Task(Struct, frozen=True):
-    """A piece of work that shares nothing with the others; it runs in a process of its own."""
-
-    name: str
-    function: Callable[..., Any]
-    """Defined at the top of a module."""
-    arguments: dict[str, Any]
-    weight_s: float
-    """About how long it takes: the longest are begun first."""
 
 
 class Verdict(StrEnum):

@@ -1,10 +1,7 @@
 """Runs all simulations of the report on every core, then draws and writes it."""
 
-import os
-import shutil
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -13,6 +10,7 @@ import msgspec
 from msgspec import Struct
 
 from skyless.core.errors import SkylessError
+from skyless.core.whole_files import replace_files
 from skyless.research.paper import _checks as checks
 from skyless.research.paper import _claim as claim
 from skyless.research.paper import _distributions as distributions
@@ -24,16 +22,12 @@ from skyless.research.paper import _static as static
 from skyless.research.paper import _timeline as timeline
 from skyless.research.paper import _walk as walk
 from skyless.research.paper._html import Heading, report_page
-from skyless.research.paper.plan import Plan, Section, Task
-from skyless.research.studies.common.plan import Cell
+from skyless.research.paper.plan import Plan, Section
 from skyless.research.studies.common.runner import run_cells
 from skyless.site.report.figures import picture, report_style
 
 _FIGURES: Final = (scenario, checks, distributions, static, walk, dop_map, timeline, rate, claim, scale)
 """In the order of the report."""
-
-_REPORT: Final = "report.html"
-_NUMBERS: Final = "numbers.json"
 
 
 class Report(Struct, frozen=True):
@@ -59,76 +53,48 @@ def write_report(plan: Plan, out: Path, reached: Callable[[float], None], proces
     Raises:
         SkylessError: ``out`` cannot be a folder with the report.
     """
-    with _scratch(out) as folder:
-        cells = [Cell(task.name, _run, task, task.weight_s) for figure in _FIGURES for task in figure.tasks(plan)]
-        results = dict(zip((cell.name for cell in cells), run_cells(cells, reached, processes), strict=True))
-        with report_style():
-            sections = [figure.section(plan, results) for figure in _FIGURES]
-            report = _write(plan, sections, results, folder, out)
-        _move(folder, out)
-    return report
-
-
-def _run(task: Task) -> Any:  # noqa: ANN401 - each task has a result of its own
-    return task.function(**task.arguments)
-
-
-@contextmanager
-def _scratch(out: Path) -> Iterator[Path]:
-    """A folder next to ``out`` for unfinished files, removed at the end in any case."""
-    if out.exists() and not out.is_dir():
-        raise SkylessError(f"--out is {str(out)!r}, which is a file; it should be a folder, or not exist yet")
-    parent = out.absolute().parent
+    is_new = not out.exists()
     try:
-        parent.mkdir(parents=True, exist_ok=True)
-        if out.is_dir():
-            tempfile.TemporaryFile(dir=out).close()
-        folder = Path(tempfile.mkdtemp(prefix=f".{out.absolute().name}.", dir=parent))
+        out.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=out).close()
     except OSError as error:
         raise SkylessError(f"--out is {str(out)!r}, where no folder can be written: {error.strerror}") from None
     try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        cells = [cell for figure in _FIGURES for cell in figure.cells(plan)]
+        results = dict(zip((cell.name for cell in cells), run_cells(cells, reached, processes), strict=True))
+        with report_style():
+            return _written(plan, [figure.section(plan, results) for figure in _FIGURES], results, out)
+    except BaseException:
+        if is_new:
+            out.rmdir()
+        raise
 
 
-def _write(plan: Plan, sections: list[Section], results: dict[str, Any], folder: Path, out: Path) -> Report:
-    pictures: dict[str, bytes] = {}
-    files = []
-    for section in sections:
-        for panel in section.panels:
-            pictures[panel.name] = picture(panel.figure, "svg")
-            (folder / f"{panel.name}.svg").write_bytes(pictures[panel.name])
-            (folder / f"{panel.name}.png").write_bytes(picture(panel.figure, "png", 200.0))
-            files += [str(out / f"{panel.name}.{kind}") for kind in ("png", "svg")]
+def _written(plan: Plan, sections: list[Section], results: dict[str, Any], out: Path) -> Report:
+    panels = [panel for section in sections for panel in section.panels]
+    pictures = {panel.name: picture(panel.figure, "svg") for panel in panels}
+    files = {out / f"{panel.name}.png": picture(panel.figure, "png", 200.0) for panel in panels}
+    files |= {out / f"{name}.svg": drawn for name, drawn in pictures.items()}
     command = f"skyless paper --out {out} --seed {plan.seed}{' --quick' if plan.quick else ''}"
-    heading = Heading(plan.seed, plan.quick, version("skyless"), command)
-    (folder / _REPORT).write_text(report_page(heading, sections, pictures), encoding="utf-8")
     report = Report(
         seed=plan.seed,
         quick=plan.quick,
         command=command,
-        report=str(out / _REPORT),
-        figures=tuple(files),
+        report=str(out / "report.html"),
+        figures=tuple(map(str, files)),
         checks=tuple(msgspec.to_builtins(check) for check in results["checks"]),
         sections=tuple(_as_fields(section) for section in sections),
     )
-    (folder / _NUMBERS).write_bytes(msgspec.json.format(msgspec.json.encode(report, enc_hook=_json_value), indent=1))
+    numbers = msgspec.json.format(msgspec.json.encode(report, enc_hook=_json_value), indent=1)
+    page = report_page(Heading(plan.seed, plan.quick, version("skyless"), command), sections, pictures)
+    replace_files({**files, out / "numbers.json": numbers, out / "report.html": page.encode()})
     return report
 
 
 def _as_fields(section: Section) -> dict[str, object]:
-    """A section without its figures."""
-    return {
-        "key": section.key,
-        "title": section.title,
-        "label": section.label,
-        "verdict": str(section.verdict),
-        "reason": section.reason,
-        "pictures": [panel.name for panel in section.panels],
-        "numbers": section.numbers,
-        "command": section.command,
-    }
+    """A section without its texts and figures."""
+    names = ("key", "title", "label", "verdict", "reason", "numbers", "command")
+    return {name: getattr(section, name) for name in names} | {"pictures": [panel.name for panel in section.panels]}
 
 
 def _json_value(value: object) -> object:
@@ -136,19 +102,3 @@ def _json_value(value: object) -> object:
     if hasattr(value, "tolist"):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} has no form in JSON")
-
-
-def _move(folder: Path, out: Path) -> None:
-    """Move the files to where they belong, the page last, so that a page never lacks its pictures."""
-    if not out.exists():
-        folder.chmod(0o777 & ~_umask())
-        folder.rename(out)
-        return
-    for file in sorted(folder.iterdir(), key=lambda file: file.name == _REPORT):
-        file.replace(out / file.name)
-
-
-def _umask() -> int:
-    umask = os.umask(0)
-    os.umask(umask)
-    return umask

@@ -246,7 +246,7 @@ class CaptureReplay:
 
     def _tell(self, on_measured: Callable[[float, Record, bool], None] | None) -> None:
         if on_measured is not None:
-            for measured in self._pipeline.measured():
+            for measured in self._pipeline.measured:
                 on_measured(*measured)
 
     def _is_over(self) -> bool:

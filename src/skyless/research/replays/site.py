@@ -4,7 +4,7 @@ import time
 from collections import Counter, OrderedDict, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from typing import Any, Final, TypeVar, cast
+from typing import Annotated, Any, Final, TypeVar, cast
 
 import msgspec
 import numpy as np
@@ -348,36 +348,34 @@ def reception_of(raw: RawReception) -> Reception | None:
     return Reception(raw.frame, raw.rx_ticks, raw.host_s, measured, phase_cycles)
 
 
+class _TagSettings(Struct, frozen=True):
+    """What a tag's program was told, with the defaults where a recording does not hold it."""
+
+    method: str | None = None
+    site: int | None = None
+    qa: Annotated[float, msgspec.Meta(gt=0.0, lt=1e6)] = 0.3
+    z_low_m: float | None = None
+    z_high_m: float | None = None
+    integrity_risk: float = RISK
+    alert_limit_m: float | None = None
+    max_acceleration_mps2: float = 0.0
+    height_std_m: float = 0.0
+
+
 def _receiver_of(start: SegmentStart, method: str | None, integrity: IntegrityRequirement | None) -> AnyReceiver | None:
     """A receiver that knows nothing, made as the tag's was; None where that makes no sense."""
-    settings = start.settings
-    name, site, qa = method or settings.get("method"), settings.get("site"), settings.get("qa", 0.3)
-    low_m, high_m = settings.get("z_low_m"), settings.get("z_high_m")
-    if not isinstance(name, str) or name not in METHODS or not isinstance(site, int | None):
-        return None
-    if not isinstance(qa, int | float) or not 0.0 < qa < 1e6:
-        return None
-    bounded = isinstance(low_m, int | float) and isinstance(high_m, int | float)
-    bounds_m = (float(low_m), float(high_m)) if bounded else None  # type: ignore[arg-type]
     try:
-        asked = integrity or _integrity_of(start)
-    except (ValueError, TypeError):
+        told = msgspec.convert(start.settings, _TagSettings)
+        integrity = integrity or IntegrityRequirement(
+            told.integrity_risk, told.alert_limit_m, told.max_acceleration_mps2, told.height_std_m
+        )
+    except (msgspec.ValidationError, ValueError, TypeError):
         return None
-    return AnyReceiver(name, site=site, qa=float(qa), z_bounds_m=bounds_m, integrity=asked)
-
-
-def _integrity_of(start: SegmentStart) -> IntegrityRequirement:
-    """What was asked of the tag's levels; the defaults where a recording does not hold it.
-
-    Raises:
-        ValueError, TypeError: it makes no sense.
-    """
-    return IntegrityRequirement(
-        start.settings.get("integrity_risk", RISK),  # type: ignore[arg-type]
-        start.settings.get("alert_limit_m"),  # type: ignore[arg-type]
-        start.settings.get("max_acceleration_mps2", 0.0),  # type: ignore[arg-type]
-        start.settings.get("height_std_m", 0.0),  # type: ignore[arg-type]
-    )
+    name = method or told.method
+    if name not in METHODS:
+        return None
+    bounds_m = None if told.z_low_m is None or told.z_high_m is None else (told.z_low_m, told.z_high_m)
+    return AnyReceiver(name, site=told.site, qa=told.qa, z_bounds_m=bounds_m, integrity=integrity)
 
 
 # Replay of a running site: every tag's receptions once more, judged against the truth and the recorded fixes.

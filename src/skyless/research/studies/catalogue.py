@@ -63,7 +63,10 @@ STUDIES: Final = {
             "protection levels with one faulty anchor",
             integrity.cells,
             integrity.rows,
-            integrity.draw,
+            partial(
+                draw,
+                Look("One faulty anchor", ("hpl", "available", "misleading"), x="size of the fault in m", log=True),
+            ),
         ),
         replace(
             _of_worlds("room", "the room", room.cases, Look("The room", ("rmse", "nees", "level", "exceeded"))),

@@ -5,13 +5,11 @@ drawn by chance become late, at once or more and more, or wrong in other ways (`
 epoch. Misleading is an epoch whose error exceeds the level that the fix gives; available is one that gives a level.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from itertools import groupby
+from collections.abc import Sequence
+from functools import partial
 from typing import Any, Final, Literal
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from msgspec import Struct
 from msgspec.structs import replace
 from numpy.random import Generator, SeedSequence, default_rng
@@ -23,14 +21,6 @@ from skyless.core.errors import SkylessError
 from skyless.core.estimator.estimator import Estimator, Packets
 from skyless.core.estimator.process import ACCEPTED, JOINED
 from skyless.core.integrity import CONTRADICTED, HPL, VPL
-from skyless.research.studies.common.picture import (
-    MIN_DRAWN_SHARE,
-    STATED_RISK,
-    Sides,
-    centimetres,
-    name_sides,
-    shade_sides,
-)
 from skyless.research.studies.common.plan import Cell, Plan, Row
 from skyless.research.studies.common.summary import clustered_interval
 from skyless.research.studies.episodes import (
@@ -42,7 +32,6 @@ from skyless.research.studies.episodes import (
     settings_of,
 )
 from skyless.sim.lab import paper_lab_site
-from skyless.site.report.figures import BLUE, GREEN, INK, MUTED, ORANGE, PURPLE, RED, report_style
 
 _ONSETS: Final = (40, 67)
 """Superframes between which the fault begins; the filter has settled long before."""
@@ -77,12 +66,6 @@ _WORDS: Final[dict[Kind, str]] = {
     "delay": "TX delay",
 }
 
-_WIDTH_IN: Final = 4.4
-_HEIGHT_IN: Final = 3.0
-_COLOURS: Final = (BLUE, ORANGE, GREEN, PURPLE, RED, INK)
-
-_LEVELS: Final = Sides("RMSE near or above the level: too confident", "level far above the RMSE: safe side", "above")
-
 
 class IntegrityRow(Row, frozen=True, kw_only=True):
     """Results of the episodes of a fault."""
@@ -100,9 +83,6 @@ class IntegrityRow(Row, frozen=True, kw_only=True):
     vpl_m: float | None = None
     smallest_m: float
     """Horizontal error that the share ``risk`` of fixes exceeds, with or without a level."""
-
-
-_Values = Callable[[IntegrityRow], float | None]
 
 
 class Fault(Struct, frozen=True):
@@ -209,13 +189,12 @@ def cells(plan: Plan) -> list[Cell]:
         setting = Setting(case, fault, plan.integrity_risk, plan.alert_limit_m)
         own = tuple(seed.spawn(plan.episodes))
         parts = [own[first : first + _CHUNK_EPISODES] for first in range(0, plan.episodes, _CHUNK_EPISODES)]
-        found += [Cell(fault.name, run_chunk, (setting, part), _EPISODE_COST_S * len(part)) for part in parts]
+        found += [Cell(fault.name, partial(run_chunk, setting, part), _EPISODE_COST_S * len(part)) for part in parts]
     return found
 
 
-def run_chunk(argument: tuple[Setting, tuple[SeedSequence, ...]]) -> Chunk:
+def run_chunk(setting: Setting, seeds: Sequence[SeedSequence]) -> Chunk:
     """Run some episodes."""
-    setting, seeds = argument
     episodes = [_run(setting, default_rng(seed)) for seed in seeds]
     counts = [
         (len(across), available.sum(), (available & (across > hpl)).sum(), (available & (above > vpl)).sum())
@@ -315,81 +294,3 @@ def _quantile(largest: Sequence[Array], risk: float, count: float) -> float:
     """The value that the share ``risk`` of ``count`` values exceeds, from the largest of each chunk."""
     values = np.sort(np.concatenate(largest))
     return float(values[-max(int(np.ceil(risk * count)), 1)])
-
-
-def draw(rows: Sequence[IntegrityRow]) -> Figure:
-    """A line of panels for each scene, with a curve for each kind of fault."""
-    single = [row for row in rows if row.x is not None]
-    scenes = {scene: list(group) for scene, group in groupby(single, key=_scene)}
-    with report_style():
-        figure = Figure(figsize=(3.0 * _WIDTH_IN, _HEIGHT_IN * len(scenes) + 0.5), layout="constrained")
-        figure.suptitle("One faulty anchor: joint, simulated", x=0.01, ha="left", fontsize=11.0)
-        grid = figure.subplots(len(scenes), 3, squeeze=False)
-        for line, (scene, group) in zip(grid, scenes.items(), strict=True):
-            _fill(line, group)
-            line[0].set_title(scene, loc="left")
-        grid[0, 1].legend(loc="lower right")
-    return figure
-
-
-def _scene(row: IntegrityRow) -> str:
-    return row.case.partition(",")[0]
-
-
-def _fill(line: Sequence[Axes], rows: list[IntegrityRow]) -> None:
-    levels, available, misleading = line
-    faulty = [row for row in rows if row.x]
-    for colour, (series, group) in zip(_COLOURS, groupby(faulty, key=lambda row: row.series), strict=False):
-        of_kind = list(group)
-        name = series.partition(", ")[2]
-        _curve(levels, of_kind, lambda row: centimetres(row.hpl_m), colour, "-", name)
-        _curve(levels, of_kind, lambda row: centimetres(row.rmse_m), colour, ":", None)
-        _curve(available, of_kind, lambda row: 100.0 * (row.available or 0.0), colour, "-", name)
-        _shares(misleading, of_kind, colour)
-    for row in rows:
-        if not row.x and row.hpl_m is not None:
-            levels.axhline(100.0 * row.hpl_m, color=MUTED, linewidth=1.0, linestyle="--", zorder=1.5)
-    levels.set(ylabel="median HPL (—), RMSE (···) in cm; clean: - -", yscale="log")
-    levels.yaxis.set_major_formatter("{x:g}")
-    levels.yaxis.set_minor_formatter("{x:g}")
-    levels.tick_params(axis="y", which="minor", labelsize=6.0)
-    available.set(ylabel="fixes with a level, %", ylim=(0.0, 103.0))
-    misleading.axhline(rows[0].risk, color=MUTED, linewidth=1.0, linestyle="--", zorder=1.5)
-    misleading.set(
-        ylabel="misleading, with 99 % interval; stated risk: - -", yscale="log", ylim=(0.7 * MIN_DRAWN_SHARE, None)
-    )
-    for axes in line:
-        axes.set(xlabel="size of the fault in m", xscale="log")
-        axes.xaxis.set_major_formatter("{x:g}")
-    name_sides(levels, _LEVELS, along="y")
-    shade_sides(misleading, STATED_RISK, rows[0].risk, along="y")
-
-
-def _numbers(values: Iterable[float | None]) -> list[float]:
-    return [np.nan if value is None else value for value in values]
-
-
-def _curve(axes: Axes, rows: list[IntegrityRow], value: _Values, colour: str, line: str, name: str | None) -> None:
-    axes.plot(
-        _numbers(row.x for row in rows),
-        _numbers(map(value, rows)),
-        line,
-        marker="o",
-        markersize=3.5,
-        color=colour,
-        label=name,
-    )
-
-
-def _shares(axes: Axes, rows: list[IntegrityRow], colour: str) -> None:
-    for row in rows:
-        share, (low, high) = max(row.hmi, MIN_DRAWN_SHARE), row.hmi_interval
-        size_m = row.x or 0.0
-        axes.plot(
-            [size_m, size_m],
-            [max(low, MIN_DRAWN_SHARE), max(high, MIN_DRAWN_SHARE)],
-            color=colour,
-            linewidth=1.0,
-            alpha=0.6,
-        )
-        axes.plot(size_m, share, "o", color=colour, markersize=3.5)

@@ -6,7 +6,8 @@ and nothing else. Nothing that keeps time for the site is on the air.
 
 import math
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
+from itertools import chain
 from typing import Final
 
 import numpy as np
@@ -22,7 +23,8 @@ from skyless.core.tag.joint import Estimation
 from skyless.core.tag.receiver import Receiver
 from skyless.research.studies.common.plan import Cell, Limit, Plan, Row, seed_of, with_limits
 from skyless.research.studies.common.summary import interval, jackknife
-from skyless.research.uncertainty.bounds import Biases, BoundSettings, Sendings, received_bound, relayed_receptions
+from skyless.research.studies.room import biases_of
+from skyless.research.uncertainty.bounds import BoundSettings, Sendings, received_bound, relayed_receptions
 from skyless.sim.cells.world import CellWorld, TagReceptions, anchors_of
 from skyless.sim.evaluation.cell_fleet import SiteBeacons, period_codes_of
 from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3, Room
@@ -288,20 +290,13 @@ class _TagLog:
 
 
 def _sum(tags: Sequence[LargeResult]) -> LargeResult:
-    return LargeResult(
-        fixes=sum(one.fixes for one in tags),
-        squared_m2=sum(one.squared_m2 for one in tags),
-        nees=sum(one.nees for one in tags),
-        variance_m2=sum(one.variance_m2 for one in tags),
-        errors_m=np.concatenate([one.errors_m for one in tags]),
-        bound_m2=sum(one.bound_m2 for one in tags),
-        beacons=sum(one.beacons for one in tags),
-        tag_s=sum(one.tag_s for one in tags),
-        gap_s=max(one.gap_s for one in tags),
-        first_fix_s=tuple(first for one in tags for first in one.first_fix_s),
-        joins=sum(one.joins for one in tags),
-        restarts=sum(one.restarts for one in tags),
-    )
+    own = {name: [getattr(one, name) for one in tags] for name in LargeResult.__struct_fields__}
+    others = {
+        "errors_m": np.concatenate(own.pop("errors_m")),
+        "gap_s": max(own.pop("gap_s")),
+        "first_fix_s": tuple(chain.from_iterable(own.pop("first_fix_s"))),
+    }
+    return LargeResult(**{name: sum(values) for name, values in own.items()}, **others)
 
 
 # The bound
@@ -327,14 +322,7 @@ def _bound_m2(world: CellWorld, site: Site, spans: Sequence[TagReceptions], case
         speed_std_mps=1.0,
         mesh=True,
     )
-    biases = Biases()
-    if case.in_room:
-        ranges = _ROOM.ranges
-        biases = Biases(
-            survey_std_m=_ROOM.axis_std_m,
-            constant_std_m=ranges.constant_m / math.sqrt(3.0),
-            slope_std_m=ranges.slope_m,
-        )
+    biases = biases_of(_ROOM if case.in_room else None)
     path_m = np.concatenate([one.positions_m for one in spans])
     bound = received_bound(anchors_m, path_m, settings, known, Sendings(senders, times_s), biases)
     return np.asarray(np.trace(bound, axis1=1, axis2=2))
@@ -361,7 +349,7 @@ def tag_runs(plan: Plan, case: LargeCase) -> list[LargeRun]:
 def cells(plan: Plan) -> list[Cell]:
     """One cell for each tag, or for some cold starts."""
     return [
-        Cell(case.name, run_large, run, _TAG_COST_S * run.tags * (case.seconds or plan.seconds) + 1.0)
+        Cell(case.name, partial(run_large, run), _TAG_COST_S * run.tags * (case.seconds or plan.seconds) + 1.0)
         for case in cases(plan)
         for run in tag_runs(plan, case)
     ]

@@ -15,42 +15,34 @@ _MIN_S: Final = 3 * _BURST_S
 """Judged time, long enough to hold a burst no matter when it begins."""
 
 _NOTHING_LATE: Final = "clean"
-_DIAGNOSTICS: Final = {"diagnostics": True}
-"""Radios that report powers: those of the emulated air, where late messages have a weak first path."""
 
 
 def cases(plan: Plan) -> list[Case]:
-    """Single messages, then anchors; in each world it is another anchor's turn, the master's among them."""
-    late: list[tuple[str, str, dict[str, Any], float | None]] = [
-        (_NOTHING_LATE, "single messages", {}, None),
-        ("5 % late by exp(1 m)", "single messages", {"nlos": 0.05}, None),
-        ("20 % late by exp(1 m)", "single messages", {"nlos": 0.2}, _MAX_RATIO),
-        ("40 % late by exp(1 m)", "single messages", {"nlos": 0.4}, None),
-        ("20 % late by exp(0.2 m)", "single messages", {"nlos": 0.2, "nlos_mean_m": 0.2}, None),
-        ("one anchor +0.1 m", "one anchor", {"biases": partial(_late, plan, 0.1, None)}, None),
-        ("one anchor +0.3 m", "one anchor", {"biases": partial(_late, plan, 0.3, None)}, _MAX_RATIO),
-        ("one anchor +1.5 m", "one anchor", {"biases": partial(_late, plan, 1.5, None)}, None),
-        ("one anchor +1.5 m in bursts", "one anchor", {"biases": partial(_late, plan, 1.5, _BURST_S)}, _MAX_RATIO),
-        ("20 % late by exp(1 m), reported", "reported by the first path", {"nlos": 0.2, **_DIAGNOSTICS}, None),
-        ("40 % late by exp(1 m), reported", "reported by the first path", {"nlos": 0.4, **_DIAGNOSTICS}, None),
-        (
-            "20 % late by exp(0.2 m), reported",
-            "reported by the first path",
-            {"nlos": 0.2, "nlos_mean_m": 0.2, **_DIAGNOSTICS},
-            None,
-        ),
-        (
-            "one anchor +1.5 m, reported",
-            "reported by the first path",
-            {"biases": partial(_late, plan, 1.5, None), **_DIAGNOSTICS},
-            None,
-        ),
-        (
-            "one anchor +0.3 m, reported",
-            "reported by the first path",
-            {"biases": partial(_late, plan, 0.3, None), **_DIAGNOSTICS},
-            None,
-        ),
+    """Single messages, then anchors, each world another one, and some of both with radios that report powers."""
+    messages: list[tuple[str, dict[str, Any], float | None]] = [
+        ("5 % late by exp(1 m)", {"nlos": 0.05}, None),
+        ("20 % late by exp(1 m)", {"nlos": 0.2}, _MAX_RATIO),
+        ("40 % late by exp(1 m)", {"nlos": 0.4}, None),
+        ("20 % late by exp(0.2 m)", {"nlos": 0.2, "nlos_mean_m": 0.2}, None),
+    ]
+    anchors: list[tuple[str, dict[str, Any], float | None]] = [
+        ("one anchor +0.1 m", {"biases": partial(_late, plan, 0.1, None)}, None),
+        ("one anchor +0.3 m", {"biases": partial(_late, plan, 0.3, None)}, _MAX_RATIO),
+        ("one anchor +1.5 m", {"biases": partial(_late, plan, 1.5, None)}, None),
+        ("one anchor +1.5 m in bursts", {"biases": partial(_late, plan, 1.5, _BURST_S)}, _MAX_RATIO),
+    ]
+    reported = [
+        (f"{name}, reported", {**faults, "diagnostics": True}, None)
+        for name, faults, _ in (*messages[1:], anchors[2], anchors[1])
+    ]
+    late = [
+        (name, series, faults, limit)
+        for series, cases_of in (
+            ("single messages", [(_NOTHING_LATE, {}, None), *messages]),
+            ("one anchor", anchors),
+            ("reported by the first path", reported),
+        )
+        for name, faults, limit in cases_of
     ]
     if plan.quick:
         late = [case for case in late if case[0] == _NOTHING_LATE or case[3] is not None]

@@ -6,7 +6,6 @@ ratio is the RMSE over that by stamps.
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import pairwise
 from typing import Any, Final
 
 from msgspec import Struct
@@ -14,7 +13,7 @@ from msgspec.structs import replace
 
 from skyless.core.site import Site
 from skyless.research.studies.common.plan import Limit, Plan, Row, with_limits
-from skyless.research.studies.common.summary import Case, world_rows
+from skyless.research.studies.common.summary import Case, by_case, world_rows
 from skyless.research.studies.common.worlds import box, walking, worlds
 from skyless.research.studies.room import WALL, past_wall, still, with_levels
 from skyless.sim.carrier import CarrierModel
@@ -55,11 +54,7 @@ def cases(plan: Plan) -> list[Case]:
 def rows(plan: Plan, results: Sequence[Any]) -> Sequence[Row]:
     """A row for each case with its levels."""
     each = cases(plan)
-    ends = [0]
-    for case in each:
-        ends.append(ends[-1] + len(case.runs))
-    own = [results[begin:end] for begin, end in pairwise(ends)]
-    table = zip(each, world_rows("phase", plan, each, results), own, strict=True)
+    table = zip(each, world_rows("phase", plan, each, results), by_case(each, results), strict=True)
     return [with_limits(with_levels(row, ran), case.limits) for case, row, ran in table]
 
 

@@ -15,7 +15,6 @@ from functools import partial
 from typing import Any, Final
 
 import numpy as np
-from msgspec import Struct
 from msgspec.structs import asdict, replace
 
 from skyless.core.air.beacon import Beacon
@@ -27,6 +26,7 @@ from skyless.research.studies.common.plan import Cell, Limit, Plan, Row, seed_of
 from skyless.research.studies.common.summary import (
     Case,
     WorldRow,
+    by_case,
     clustered_interval,
     jackknife,
     world_cells,
@@ -422,10 +422,9 @@ def rows(plan: Plan, results: Sequence[Any]) -> Sequence[Row]:
     """A row for each case; the results stand in the order of ``cells``."""
     each = cases(plan)
     count = sum(len(case.runs) for case in each)
-    ran, bounds = iter(results[:count]), iter(results[count:])
+    worlds, bounds = results[:count], iter(results[count:])
     found = []
-    for case, row in zip(each, world_rows("room", plan, each, results[:count]), strict=True):
-        own: list[RunResult] = [next(ran) for _ in case.runs]
+    for case, row, own in zip(each, world_rows("room", plan, each, worlds), by_case(each, worlds), strict=True):
         bounded = row if case.biases is None else with_bound(row, own, [next(bounds) for _ in case.runs])
         found.append(with_limits(with_levels(bounded, own), case.limits))
     return found
@@ -471,13 +470,6 @@ def _total(counts: Sequence[LevelCounts], name: str) -> np.ndarray[Any, np.dtype
     return np.concatenate([getattr(one, name) for one in counts])
 
 
-class BoundRun(Struct, frozen=True):
-    """A world, and the errors that are drawn in it."""
-
-    run: Run
-    biases: Biases
-
-
 def biases_of(room: Room | None) -> Biases:
     """Standard deviations of the errors of a room's survey and ranges; its slope is one such deviation."""
     if room is None:
@@ -497,7 +489,9 @@ def bound_cells(cases: Sequence[Case]) -> list[Cell]:
     """One cell for each world of the cases that have a bound."""
     return [
         Cell(
-            case.name, bound_variance_m2, BoundRun(run, case.biases), _BOUND_TAG_S * len(run.trajectories) * run.until_s
+            case.name,
+            partial(bound_variance_m2, run, case.biases),
+            _BOUND_TAG_S * len(run.trajectories) * run.until_s,
         )
         for case in cases
         if case.biases is not None
@@ -505,9 +499,8 @@ def bound_cells(cases: Sequence[Case]) -> list[Cell]:
     ]
 
 
-def bound_variance_m2(world: BoundRun) -> float:
+def bound_variance_m2(run: Run, biases: Biases) -> float:
     """Trace of the bound, its mean over all tags of a world and the superframes in which fixes are judged."""
-    run = world.run
     site, noise = run.site, run.impairments
     off_m = {one.anchor: (one.x_m, one.y_m, one.z_m) for one in noise.anchor_displacements}
     anchors_m = np.array(
@@ -528,7 +521,7 @@ def bound_variance_m2(world: BoundRun) -> float:
         times_s = np.array([broadcast.emission_s for broadcast, _ in received])
         path_m = np.array([position_m for _, position_m in received])
         known, senders = _known(site, [broadcast.frame for broadcast, _ in received])
-        bound = received_bound(anchors_m, path_m, settings, known, Sendings(senders, times_s), world.biases)
+        bound = received_bound(anchors_m, path_m, settings, known, Sendings(senders, times_s), biases)
         means.append(np.trace(bound, axis1=1, axis2=2)[times_s >= run.warmup_s].mean())
     return float(np.mean(means))
 

@@ -7,6 +7,7 @@ Several surveys with other facts may use the air of one run.
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -166,7 +167,10 @@ class SurveyRuns(Struct, frozen=True):
 
 def cells(plan: Plan) -> list[Cell]:
     """Some runs of one group on one layout each."""
-    return [Cell(f"{runs.layout}, {runs.group.name}", survey_runs, runs, _weight_s(runs)) for runs in _all_runs(plan)]
+    return [
+        Cell(f"{runs.layout}, {runs.group.name}", partial(survey_runs, runs), _weight_s(runs))
+        for runs in _all_runs(plan)
+    ]
 
 
 def _all_runs(plan: Plan) -> list[SurveyRuns]:

@@ -6,6 +6,7 @@ and a tag at rest in the middle of the lab.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Final
 
 from msgspec import Struct
@@ -64,14 +65,13 @@ class RoomRun(Struct, frozen=True):
     """One world of a group."""
 
     group: Group
-    seed: int
-    seconds: float
-    survey_s: float
-    tags: int
-    method: str
-    qa: float
-    mesh: bool
-    noise_ps: float
+    plan: Plan
+    world: int
+
+    @property
+    def survey_s(self) -> float:
+        """How long its anchors survey themselves."""
+        return min(_SURVEY_S, 2.0 * self.plan.seconds)
 
 
 def groups() -> tuple[Group, ...]:
@@ -102,34 +102,18 @@ def limits_of(group: Group, file: str) -> tuple[Limit, ...]:
 
 def cells(plan: Plan) -> list[Cell]:
     """One cell for each world."""
-    return [Cell(run.group.name, room_results, run, _weight_s(run)) for run in _all_runs(plan)]
-
-
-def _all_runs(plan: Plan) -> list[RoomRun]:
-    return [
-        RoomRun(
-            group=group,
-            seed=seed_of(plan.seed, world),
-            seconds=plan.seconds,
-            survey_s=min(_SURVEY_S, 2.0 * plan.seconds),
-            tags=plan.tags,
-            method=plan.method,
-            qa=plan.qa,
-            mesh=plan.mesh,
-            noise_ps=plan.noise_ps,
-        )
-        for group in groups()
-        for world in range(plan.worlds)
-    ]
+    runs = [RoomRun(group, plan, world) for group in groups() for world in range(plan.worlds)]
+    return [Cell(run.group.name, partial(room_results, run), _weight_s(run)) for run in runs]
 
 
 def _weight_s(run: RoomRun) -> float:
-    return run.survey_s * 0.06 + len(run.group.files) * run.tags * (run.seconds + _WARMUP_S) * _RUN_S
+    return run.survey_s * 0.06 + len(run.group.files) * run.plan.tags * (run.plan.seconds + _WARMUP_S) * _RUN_S
 
 
 def room_results(run: RoomRun) -> tuple[RunResult, ...]:
     """What the tags made of each file of a room."""
-    room = drawn_room(survey_layouts()[run.group.layout], run.group.errors, run.noise_ps, run.seed)
+    plan, seed = run.plan, seed_of(run.plan.seed, run.world)
+    room = drawn_room(survey_layouts()[run.group.layout], run.group.errors, plan.noise_ps, seed)
     paths = _paths(run, room)
     return tuple(
         run_world(
@@ -138,11 +122,11 @@ def room_results(run: RoomRun) -> tuple[RunResult, ...]:
                 trajectories=paths,
                 impairments=air_of(room, site),
                 seed=room.seed,
-                method=run.method,
-                qa=run.qa,
-                mesh=run.mesh,
+                method=plan.method,
+                qa=plan.qa,
+                mesh=plan.mesh,
                 warmup_s=_WARMUP_S,
-                until_s=_WARMUP_S + run.seconds,
+                until_s=_WARMUP_S + plan.seconds,
             )
         )
         for site in _files(run, room)
@@ -151,8 +135,8 @@ def room_results(run: RoomRun) -> tuple[RunResult, ...]:
 
 def _paths(run: RoomRun, room: DrawnRoom) -> tuple[Trajectory, ...]:
     if run.group.at_rest:
-        return (Static(*_AT_REST_M),) * run.tags
-    return tuple(wanderers(site_at(room.layout, room.layout.position_m, run.noise_ps), run.tags, room.seed))
+        return (Static(*_AT_REST_M),) * run.plan.tags
+    return tuple(wanderers(site_at(room.layout, room.layout.position_m, run.plan.noise_ps), run.plan.tags, room.seed))
 
 
 def _files(run: RoomRun, room: DrawnRoom) -> list[Site]:

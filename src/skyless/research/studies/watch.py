@@ -5,6 +5,7 @@ come one after another, each on another anchor or link, and end when they are fo
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -14,7 +15,6 @@ from msgspec.structs import replace
 from skyless.research.studies.common.plan import Cell, Limit, Plan, Row, missed_limits, seed_of
 from skyless.research.surveys.drawn_faults import (
     Event,
-    WatchedLayout,
     WatchResult,
     WatchRun,
     run_watch,
@@ -54,6 +54,11 @@ class _Case(Struct, frozen=True):
     missing: float = 0.0
     limits: tuple[Limit, ...] = ()
 
+    def run(self, events: int, seed: int) -> WatchRun:
+        """Some of its events, or windows without any."""
+        drift = (self.drift_m, self.drift_s, self.lively_m)
+        return WatchRun(survey_layouts()[self.layout], self.event, self.size_m, *drift, self.missing, events, seed)
+
 
 class WatchRow(Row, frozen=True, kw_only=True):
     """What the watch of the anchors found of the events of a case."""
@@ -72,11 +77,6 @@ class WatchRow(Row, frozen=True, kw_only=True):
     """Findings while nothing happened."""
     alarms: int | None = None
     """How many of them there were, or how many windows struck."""
-
-
-class _Noise(Struct, frozen=True):
-    windows: int
-    seed: int
 
 
 def _cases() -> list[_Case]:
@@ -104,39 +104,21 @@ def _cases() -> list[_Case]:
     return found
 
 
-def watched_layout(name: str) -> WatchedLayout:
-    """A layout of ``survey_layouts``, by name."""
-    layout = survey_layouts()[name]
-    return WatchedLayout(layout.dimensions, tuple((x, y, z) for x, y, z in layout.position_m.tolist()))
-
-
 def cells(plan: Plan) -> list[Cell]:
     """One for each case and world."""
     worlds = []
     for number, case in enumerate(_cases()):
         events = _QUIET_WINDOWS if case.event == "none" else _EVENTS
         for world in range(plan.worlds):
-            run = WatchRun(
-                watched_layout(case.layout),
-                case.event,
-                case.size_m,
-                case.drift_m,
-                case.drift_s,
-                case.lively_m,
-                case.missing,
-                events,
-                seed_of(plan.seed, number, world),
-            )
-            worlds.append(Cell(case.name, run_watch, run, events * (_WINDOW_S if case.event == "none" else _EVENT_S)))
+            run = case.run(events, seed_of(plan.seed, number, world))
+            weight_s = events * (_WINDOW_S if case.event == "none" else _EVENT_S)
+            worlds.append(Cell(case.name, partial(run_watch, run), weight_s))
     windows = _NOISE_WINDOWS // plan.worlds
     for world in range(plan.worlds):
-        noise = _Noise(windows, seed_of(plan.seed, len(_cases()), world))
-        worlds.append(Cell(_NOISE_CASE, _run_noise, noise, 4e-6 * windows))
+        seed = seed_of(plan.seed, len(_cases()), world)
+        noise = partial(striking_windows, survey_layouts()["lab"], _NOISE_WINDOW_S, _NOISE_ALARM, windows, seed)
+        worlds.append(Cell(_NOISE_CASE, noise, 4e-6 * windows))
     return worlds
-
-
-def _run_noise(noise: _Noise) -> int:
-    return striking_windows(watched_layout("lab"), _NOISE_WINDOW_S, _NOISE_ALARM, noise.windows, noise.seed)
 
 
 def rows(plan: Plan, results: Sequence[Any]) -> Sequence[Row]:

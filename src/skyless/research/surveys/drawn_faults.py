@@ -8,6 +8,7 @@ from msgspec import Struct
 
 from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.constants import SPEED_OF_LIGHT_MPS
+from skyless.research.surveys.layouts import SurveyLayout
 from skyless.site.survey.facts import PairBlock
 from skyless.site.survey.watch.explain import Finding, Kind, Pairs, is_significant, weight_of
 from skyless.site.survey.watch.monitor import GRACE_S, AnchorWatch
@@ -36,17 +37,10 @@ _Truth = set[tuple[Kind, tuple[int, ...]]]
 """Kinds and anchors of true findings."""
 
 
-class WatchedLayout(Struct, frozen=True):
-    """Anchors 1 to n."""
-
-    dimensions: Literal[2, 3]
-    position_m: tuple[tuple[float, float, float], ...]
-
-
 class WatchRun(Struct, frozen=True):
     """One site that is watched while one thing after another happens."""
 
-    layout: WatchedLayout
+    layout: SurveyLayout
     event: Event
     size_m: float
     """Size of displacements, delays and lateness. Directions and anchors are drawn."""
@@ -91,7 +85,7 @@ class _Site:
 
     def __init__(self, run: WatchRun, draw: np.random.Generator) -> None:
         self.layout = run.layout
-        self.position_m = np.array(run.layout.position_m)
+        self.position_m = run.layout.position_m.copy()
         self.draw = draw
         n = len(self.position_m)
         self.first, self.second = np.triu_indices(n, 1)
@@ -107,8 +101,10 @@ class _Site:
         self._superframe_s = n * _SLOT_S
         self._stamp_m = _STAMP_S * SPEED_OF_LIGHT_MPS
         self.step = 0
-        positions = dict(enumerate(run.layout.position_m, start=1))
-        self.watch = AnchorWatch(positions, self.layout.dimensions)
+        at_m = {
+            anchor: (x, y, z) for anchor, (x, y, z) in zip(run.layout.anchors, self.position_m.tolist(), strict=True)
+        }
+        self.watch = AnchorWatch(at_m, self.layout.dimensions)
 
     def true_m(self) -> Array:
         """Without drift and noise, shape (m,)."""
@@ -241,10 +237,10 @@ def _crossing(site: _Site, person_m: Array) -> Integers:
     return np.flatnonzero(np.linalg.norm(start + part[:, None] * along - person_m, axis=1) < _DOOR_REACH_M)
 
 
-def striking_windows(layout: WatchedLayout, window_s: float, alarm: float, windows: int, seed: int) -> int:
+def striking_windows(layout: SurveyLayout, window_s: float, alarm: float, windows: int, seed: int) -> int:
     """How many windows of white noise alone strike."""
     draw = np.random.default_rng(seed)
-    position_m = np.array(layout.position_m)
+    position_m = layout.position_m
     n = len(position_m)
     first, second = np.triu_indices(n, 1)
     m = len(first)

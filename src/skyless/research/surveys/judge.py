@@ -13,7 +13,7 @@ from skyless.research.surveys.air import DrawnErrors, free_axes
 from skyless.research.surveys.layouts import SLOT_S, SurveyLayout
 from skyless.site.survey.facts import Facts, PairRanges
 from skyless.site.survey.fit.determined import aligned_covariance
-from skyless.site.survey.fit.problem import Problem, jacobian
+from skyless.site.survey.fit.problem import Problem, jacobian, superimposed
 from skyless.site.survey.result import Survey
 
 _GRID: Final = np.linspace(0.15, 0.85, 5)
@@ -118,30 +118,15 @@ def judged(layout: SurveyLayout, survey: Survey, drawn: DrawnErrors, outcome: Ou
         said_m=math.sqrt(float(np.mean(said_m2))),
         nees=float(np.mean(squares)) / k if squares else None,
         delay_m=float(np.std(off_m)),
-        tag_m=tag_error_m(layout, layout.position_m + _turned_back(error_m, true_m, layout), delay_m, drawn.delay_m),
+        tag_m=tag_error_m(layout, aligned(found_m, layout.position_m, k), delay_m, drawn.delay_m),
     )
 
 
 def aligned(true_m: Array, found_m: Array, axes: int) -> Array:
     """True positions, shape (n, 3), turned, mirrored and shifted to fit the found ones best; in 2-D on the floor."""
     moved = true_m.copy()
-    own, other = true_m[:, :axes], found_m[:, :axes]
-    moved[:, :axes] = (own - own.mean(axis=0)) @ _rotation(own, other) + other.mean(axis=0)
+    moved[:, :axes] = superimposed(true_m[:, :axes], found_m[:, :axes], np.ones(len(true_m)))
     return moved
-
-
-def _rotation(own: Array, other: Array) -> Array:
-    """The rotation, or rotation and reflection, that fits the own points to the others best; for row vectors."""
-    u, _, vt = np.linalg.svd((own - own.mean(axis=0)).T @ (other - other.mean(axis=0)))
-    return np.asarray(u @ vt)
-
-
-def _turned_back(error_m: Array, true_m: Array, layout: SurveyLayout) -> Array:
-    """Errors in the frame of the layout."""
-    k = layout.dimensions
-    back = np.zeros_like(error_m)
-    back[:, :k] = error_m[:, :k] @ _rotation(true_m[:, :k], layout.position_m[:, :k])
-    return back
 
 
 def tag_error_m(layout: SurveyLayout, found_m: Array, delay_m: Array, true_delay_m: Array) -> float:

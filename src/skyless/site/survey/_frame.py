@@ -10,7 +10,7 @@ from msgspec import Struct
 
 from skyless.core.arrays import Array, Integers, Mask
 from skyless.site.survey._build import Measured, as_array, levels
-from skyless.site.survey.facts import Gauge
+from skyless.site.survey.facts import Gauge, Point
 from skyless.site.survey.fit.problem import distances_m
 from skyless.site.survey.result import anchors_named, joined
 
@@ -195,10 +195,11 @@ def _motion(
 ) -> tuple[Motion, str, Gauge | None, list[str]]:
     axes = 2 if levels(measured) else 3
     still = Motion(np.eye(3), np.zeros(3))
-    by_points, points_decide = _by_points(measured, anchors, position_m, core, axes)
-    by_sketch, sketch_decides = _by_sketch(measured, anchors, position_m, core, axes)
+    facts = measured.facts
+    by_points, points_decide = _best(facts.points, max(facts.point_std_m, 0.03), anchors, position_m, core, axes)
+    by_sketch, sketch_decides = _best(facts.sketch_m, facts.sketch_std_m, anchors, position_m, core, axes)
     decided = points_decide or sketch_decides
-    gauge, notes = measured.facts.gauge, _level_notes(measured)
+    gauge, notes = facts.gauge, _level_notes(measured)
     if gauge is not None:
         index = {int(anchor): number for number, anchor in enumerate(anchors) if core[number]}
         named = [gauge.origin, gauge.x_axis, *([] if gauge.left is None else [gauge.left])]
@@ -266,14 +267,6 @@ def _by_gauge(
     return found.motion, sentence, _gauge_of(found, anchors), notes
 
 
-def _by_points(
-    measured: Measured, anchors: Integers, position_m: Array, core: Mask, axes: int
-) -> tuple[Motion | None, bool]:
-    """The motion to the known points, and whether they exclude the mirror image."""
-    facts = measured.facts
-    return _best(as_array(facts.points, tuple(anchors.tolist())), position_m, core, axes, max(facts.point_std_m, 0.03))
-
-
 def _left_of_points(measured: Measured, anchors: Integers, motion: Motion, position_m: Array, core: Mask) -> Motion:
     """The mirror image that has the first anchor clearly off the points' line on its left."""
     given = [number for number, anchor in enumerate(anchors) if int(anchor) in measured.facts.points and core[number]]
@@ -289,14 +282,11 @@ def _left_of_points(measured: Measured, anchors: Integers, motion: Motion, posit
     return Motion(mirror @ motion.rotation, whole.moved(motion.shift_m))
 
 
-def _by_sketch(
-    measured: Measured, anchors: Integers, position_m: Array, core: Mask, axes: int
+def _best(
+    points: dict[int, Point], std_m: float, anchors: Integers, position_m: Array, core: Mask, axes: int
 ) -> tuple[Motion | None, bool]:
-    facts = measured.facts
-    return _best(as_array(facts.sketch_m, tuple(anchors.tolist())), position_m, core, axes, facts.sketch_std_m)
-
-
-def _best(there_m: Array, position_m: Array, core: Mask, axes: int, std_m: float) -> tuple[Motion | None, bool]:
+    """The motion to these points, and whether they exclude the mirror image."""
+    there_m = as_array(points, tuple(anchors.tolist()))
     known = core & np.isfinite(there_m[:, :axes]).all(axis=1)
     if known.sum() < axes:
         return None, False

@@ -5,11 +5,12 @@ biases follow by linear regression: Huber's weights, and nothing beyond four sta
 constants can be seen. The zero is their mean.
 """
 
-from collections.abc import Sequence
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from msgspec import Struct
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components
 
 from skyless.core.arrays import Array, Integers, Mask, Vector
 from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
@@ -69,13 +70,13 @@ class Fit(Struct, frozen=True):
 def fit(data: Differences, anchors: Integers, *, slope: bool) -> Fit:
     """Fit one constant for each of the anchors, all of them tied together by the differences, perhaps with a slope."""
     a, b = np.searchsorted(anchors, data.anchor_a), np.searchsorted(anchors, data.anchor_b)
-    x = data.log_ratio if slope else np.zeros(len(a))
+    design = _design(a, b, data.log_ratio if slope else np.zeros(len(a)), len(anchors))
     y = _pair_medians(a, b, data.excess_m, len(anchors))
     weights = np.ones(len(a))
     for step in range(50):
         before = weights
-        solution = _solve(_normal(a, b, x, weights, len(anchors)), _right(a, b, x, weights * y, len(anchors)))
-        residual_m = data.excess_m - _model(solution, a, b, x)
+        solution = np.linalg.solve(_normal(design, weights), design.T @ (weights * y))
+        residual_m = data.excess_m - design @ solution
         scale_m = max(STD_OVER_MAD * float(np.median(np.abs(residual_m))), 1e-6)
         share = np.abs(residual_m) / scale_m
         weights = np.where(share <= _REJECT, np.minimum(1.0, _HUBER / np.maximum(share, _HUBER)), 0.0)
@@ -84,21 +85,19 @@ def fit(data: Differences, anchors: Integers, *, slope: bool) -> Fit:
             break
     used = share <= _REJECT
     counts = np.bincount(a[used], minlength=len(anchors)) + np.bincount(b[used], minlength=len(anchors))
-    covariance = _covariance(data.t_s, a, b, x, residual_m, scale_m, len(anchors))
+    covariance = _covariance(data.t_s, design, residual_m, scale_m)
     if not slope:
         covariance = covariance[:-1, :-1]
-    bias = solution[:-1]
-    return Fit(
-        anchors, bias, covariance, float(solution[-1]) if slope else None, residual_m, used, scale_m, a, b, counts
-    )
+    bias, slope_m = solution[:-1], float(solution[-1]) if slope else None
+    return Fit(anchors, bias, covariance, slope_m, residual_m, used, scale_m, a, b, counts)
 
 
 def moves(data: Differences, found: Fit) -> bool:
     """Whether the ranges change enough; at one position a slope looks like constants."""
-    a, b, count, still = found.a, found.b, len(found.anchors), np.zeros(len(found.a))
-    alike = _solve(_normal(a, b, still, still + 1.0, count), _right(a, b, still, data.log_ratio, count))
-    change = data.log_ratio - _model(alike, a, b, still)
-    return float(np.sqrt(np.mean(change**2))) > _MIN_MOTION
+    still = np.zeros(len(found.a))
+    design = _design(found.a, found.b, still, len(found.anchors))
+    alike = np.linalg.solve(_normal(design, still + 1.0), design.T @ data.log_ratio)
+    return float(np.sqrt(np.mean((data.log_ratio - design @ alike) ** 2))) > _MIN_MOTION
 
 
 def _pair_medians(a: Integers, b: Integers, excess_m: Vector, count: int) -> Vector:
@@ -111,52 +110,33 @@ def _pair_medians(a: Integers, b: Integers, excess_m: Vector, count: int) -> Vec
     return start
 
 
-def _solve(normal: Array, right: Vector) -> Vector:
-    solution: Vector = np.linalg.solve(normal, right).astype(np.float64)
-    return solution
+def _design(a: Integers, b: Integers, x: Vector, count: int) -> Any:  # noqa: ANN401 - a sparse array
+    """Derivatives of the differences by the constants and, in the last column, by the slope; shape (n, count + 1)."""
+    ones, rows = np.ones(len(a)), np.tile(np.arange(len(a)), 3)
+    columns = np.concatenate([b, a, np.full(len(a), count)])
+    return csr_array((np.concatenate([ones, -ones, x]), (rows, columns)), shape=(len(a), count + 1))
 
 
-def _model(solution: Vector, a: Integers, b: Integers, x: Vector) -> Vector:
-    values: Vector = solution[b] - solution[a] + solution[-1] * x
-    return values
-
-
-def _right(a: Integers, b: Integers, x: Vector, values: Vector, count: int) -> Vector:
-    """Hᵀ times values; the slope is the last column."""
-    right: Vector = (np.bincount(b, values, count + 1) - np.bincount(a, values, count + 1)).astype(np.float64)
-    right[-1] = x @ values
-    return right
-
-
-def _normal(a: Integers, b: Integers, x: Vector, weights: Vector, count: int) -> Array:
+def _normal(design: Any, weights: Vector) -> Array:  # noqa: ANN401 - a sparse array
     """Hᵀ W H; the sum of the constants is held at zero, and the slope where nothing determines it."""
-    normal = np.zeros((count + 1, count + 1))
-    flat = normal.reshape(-1)
-    for row, column, sign in ((a, a, 1.0), (b, b, 1.0), (a, b, -1.0), (b, a, -1.0)):
-        flat += sign * np.bincount(row * (count + 1) + column, weights, flat.size)
-    cross = np.bincount(b, weights * x, count + 1) - np.bincount(a, weights * x, count + 1)
-    normal[-1, :] += cross
-    normal[:, -1] += cross
-    normal[-1, -1] = weights @ (x * x)
+    normal: Array = (design.T @ design.multiply(weights[:, None])).toarray()
+    count = len(normal) - 1
     typical = max(float(np.trace(normal[:-1, :-1])) / count, 1e-9)
     normal[:-1, :-1] += typical / count
     normal[-1, -1] += 1e-9 * typical
     return normal
 
 
-def _covariance(
-    t_s: Vector, a: Integers, b: Integers, x: Vector, residual_m: Vector, scale_m: float, count: int
-) -> Array:
+def _covariance(t_s: Vector, design: Any, residual_m: Vector, scale_m: float) -> Array:  # noqa: ANN401 - sparse
     """Errors within a block of time taken as one (sandwich); never less than independent ones would make it."""
     share = np.abs(residual_m) / scale_m
     influence = np.where(share <= _REJECT, np.clip(residual_m, -_HUBER * scale_m, _HUBER * scale_m), 0.0)
-    bread = np.linalg.inv(_normal(a, b, x, (share < _HUBER).astype(np.float64), count))
+    bread = np.linalg.inv(_normal(design, (share < _HUBER).astype(np.float64)))
     block_s = min(_BLOCK_S, (t_s[-1] - t_s[0]) / _FEWEST_BLOCKS)
-    block = ((t_s - t_s[0]) / max(block_s, 1e-9)).astype(np.int64)
-    blocks = [_right(a[here], b[here], x[here], influence[here], count) for here in map(block.__eq__, np.unique(block))]
-    meat = np.array(blocks).T @ np.array(blocks) * len(blocks) / max(len(blocks) - 1, 1)
-    white = _normal(a, b, x, influence**2, count)
-    together, apart = bread @ meat @ bread, bread @ white @ bread
+    _, block = np.unique(((t_s - t_s[0]) / max(block_s, 1e-9)).astype(np.int64), return_inverse=True)
+    sums = (csr_array((influence, (block, np.arange(len(block))))) @ design).toarray()
+    meat = sums.T @ sums * len(sums) / max(len(sums) - 1, 1)
+    together, apart = bread @ meat @ bread, bread @ _normal(design, influence**2) @ bread
     grow = np.sqrt(np.maximum(np.diag(apart) / np.maximum(np.diag(together), 1e-30), 1.0))
     result: Array = together * np.outer(grow, grow)
     return result
@@ -231,9 +211,9 @@ def estimate(differences: Differences) -> CalibrationEstimate:
     Their growth with the range is estimated too, and used if it differs from zero and is one that the radio can have.
     """
     found = np.unique(np.concatenate([differences.anchor_a, differences.anchor_b]))
-    kept, reasons = _connected(differences, found.tolist())
+    kept, reasons = _connected(differences, found)
     data = differences.select(np.isin(differences.anchor_a, kept))
-    plain = fit(data, np.array(kept, dtype=np.int64), slope=False)
+    plain = fit(data, kept, slope=False)
     steep = fit(data, plain.anchors, slope=True) if moves(data, plain) else None
     note = _ALIKE if steep is None else _slope_note(steep)
     chosen = steep if steep is not None and not note else plain
@@ -243,19 +223,14 @@ def estimate(differences: Differences) -> CalibrationEstimate:
     return _estimate(differences, chosen, steep, note or "used", reasons)
 
 
-def _connected(differences: Differences, anchors: Sequence[int]) -> tuple[list[int], dict[int, str]]:
+def _connected(differences: Differences, anchors: Integers) -> tuple[Integers, dict[int, str]]:
     """Anchors of the part with most anchors, and why the others are left out."""
-    part_of = {anchor: {anchor} for anchor in anchors}
-    pairs = np.unique(np.stack([differences.anchor_a, differences.anchor_b], 1), axis=0)
-    for a, b in pairs.tolist():
-        joined, other = part_of[a], part_of[b]
-        if joined is not other:
-            joined |= other
-            part_of.update(dict.fromkeys(other, joined))
-    chosen = max(part_of.values(), key=lambda part: (len(part), -min(part)))
-    kept = sorted(chosen)
-    lost = [anchor for anchor in anchors if anchor not in chosen]
-    return kept, dict.fromkeys(lost, "no chain of differences ties it to the others")
+    ends = np.searchsorted(anchors, differences.anchor_a), np.searchsorted(anchors, differences.anchor_b)
+    links = coo_array((np.ones(len(ends[0])), ends), shape=(len(anchors), len(anchors)))
+    part = connected_components(links, directed=False)[1]
+    is_chosen = part == np.argmax(np.bincount(part))
+    lost = anchors[~is_chosen].tolist()
+    return anchors[is_chosen], dict.fromkeys(lost, "no chain of differences ties it to the others")
 
 
 def _slope_note(found: Fit) -> str:

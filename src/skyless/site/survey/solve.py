@@ -35,7 +35,7 @@ from skyless.site.survey._findings import (
 )
 from skyless.site.survey._frame import Framed, in_frame
 from skyless.site.survey._shape import Fitted, fit_shape, redundancy, with_tags
-from skyless.site.survey.facts import MIN_CHECKS, Facts, PairRange, PairRanges
+from skyless.site.survey.facts import MIN_CHECKS, Facts, PairRanges
 from skyless.site.survey.fit.determined import Links, count_links, position_stds_m
 from skyless.site.survey.fit.problem import Problem, adjacency, delay_weights, unit_vectors
 from skyless.site.survey.fit.robust import OtherFit, RobustFit, find_ambiguities, fit_robustly
@@ -147,18 +147,15 @@ def _anchors(measured: Measured, links: Links, fitted: Fitted, framed: Framed) -
 
 def _pairs(measured: Measured, fitted: Fitted | None) -> tuple[SurveyedPair, ...]:
     number = {} if fitted is None else {(pair.a, pair.b): index for index, pair in enumerate(fitted.pairs)}
-    return tuple(_pair(measured, fitted, pair, number.get((pair.a, pair.b))) for pair in measured.pairs)
-
-
-def _pair(measured: Measured, fitted: Fitted | None, pair: PairRange, index: int | None) -> SurveyedPair:
-    if fitted is None or index is None:
-        std = math.hypot(pair.std_m, measured.facts.pair_std_m)
-        return SurveyedPair(pair.a, pair.b, pair.range_m, None, std, excluded=False)
-    problem = fitted.problem
-    both = fitted.core[problem.first[index]] and fitted.core[problem.second[index]]
-    residual = float(fitted.solution.residual_m[index]) if both else None
-    std = math.sqrt(problem.variance_m2[index])
-    return SurveyedPair(pair.a, pair.b, pair.range_m, residual, std, excluded=not fitted.used[index])
+    found = []
+    for pair in measured.pairs:
+        std_m, residual_m, excluded = math.hypot(pair.std_m, measured.facts.pair_std_m), None, False
+        if fitted is not None and (index := number.get((pair.a, pair.b))) is not None:
+            std_m, excluded = math.sqrt(fitted.problem.variance_m2[index]), not fitted.used[index]
+            if fitted.core[fitted.problem.first[index]] and fitted.core[fitted.problem.second[index]]:
+                residual_m = float(fitted.solution.residual_m[index])
+        found.append(SurveyedPair(pair.a, pair.b, pair.range_m, residual_m, std_m, excluded))
+    return tuple(found)
 
 
 def _ambiguities(fitted: Fitted, framed: Framed, others: tuple[OtherFit, ...]) -> tuple[Ambiguity, ...]:
@@ -268,7 +265,7 @@ def survey_of_kept_positions(measured: Measured) -> Survey:
     ids = tuple(measured.anchors[index] for index in kept)
     linked = {anchor for pair in pairs for anchor in (pair.a, pair.b)}
     delays: dict[int, tuple[float, float]] = {}
-    residuals: dict[tuple[int, int], tuple[float, bool]] = {}
+    residuals: dict[tuple[int, int], tuple[float | None, bool]] = {}
     redundancy, range_std_m = 0, facts.pair_std_m
     notes: tuple[str, ...] = ()
     if pairs:
@@ -282,6 +279,11 @@ def survey_of_kept_positions(measured: Measured) -> Survey:
         incidence = _incidence(fit.problem)[fit.used]
         redundancy = int(fit.used.sum()) - int(np.linalg.matrix_rank(incidence))
         range_std_m = math.sqrt(max(fit.range_std_m**2 - 2.0 * facts.sketch_std_m**2, facts.pair_std_m**2))
+    kept_pairs = []
+    for pair in measured.pairs:
+        residual_m, excluded = residuals.get((pair.a, pair.b), (None, False))
+        std_m = math.sqrt(pair.std_m**2 + facts.pair_std_m**2 + 2.0 * facts.sketch_std_m**2)
+        kept_pairs.append(SurveyedPair(pair.a, pair.b, pair.range_m, residual_m, std_m, excluded))
     missing = [anchor for anchor in measured.anchors if anchor not in ids]
     silent = [anchor for anchor in ids if anchor not in linked]
     sentences = [f"{anchors_named(missing)} {are(missing)} not determined: {_NO_POSITION}"] if missing else []
@@ -289,7 +291,7 @@ def survey_of_kept_positions(measured: Measured) -> Survey:
         sentences.append(f"delays of {anchors_named(silent)} are not determined: no range to an anchor with a position")
     return Survey(
         anchors=tuple(_kept_anchor(measured, anchor, sketch[k], delays) for k, anchor in enumerate(measured.anchors)),
-        pairs=tuple(_kept_pair(measured, pair, residuals.get((pair.a, pair.b))) for pair in measured.pairs),
+        pairs=tuple(kept_pairs),
         range_std_m=range_std_m,
         redundancy=redundancy,
         unchecked=None if redundancy >= MIN_CHECKS else "too few ranges check these delays",
@@ -375,9 +377,3 @@ def _kept_anchor(
         delay_m=delay,
         delay_std_m=std,
     )
-
-
-def _kept_pair(measured: Measured, pair: PairRange, found: tuple[float, bool] | None) -> SurveyedPair:
-    residual, excluded = (None, False) if found is None else found
-    std = math.sqrt(pair.std_m**2 + measured.facts.pair_std_m**2 + 2.0 * measured.facts.sketch_std_m**2)
-    return SurveyedPair(pair.a, pair.b, pair.range_m, residual, std, excluded=excluded)

@@ -116,7 +116,7 @@ def _placed(
 ) -> AnchorSite | UnplacedAnchor:
     if found is None or found.x_m is None or found.y_m is None:
         return anchor
-    old = anchor if isinstance(anchor, AnchorSite) else _at_origin(anchor)
+    old = anchor if isinstance(anchor, AnchorSite) else AnchorSite(x_m=0.0, y_m=0.0, **structs.asdict(anchor))
     z_m = old.z_m if found.z_m is None else found.z_m
     stated = old.std_m if site.schedule.needs_master or found.std_m is None else _up(found.std_m, 1e3)
     return structs.replace(
@@ -126,17 +126,6 @@ def _placed(
         z_m=_rounded(z_m),
         tx_antenna_delay_ticks=_delay_ticks(anchor, found),
         std_m=None if stated is None else min(stated, _MAX_STATED_M),
-    )
-
-
-def _at_origin(anchor: UnplacedAnchor) -> AnchorSite:
-    return AnchorSite(
-        id=anchor.id,
-        x_m=0.0,
-        y_m=0.0,
-        slot=anchor.slot,
-        tx_antenna_delay_ticks=anchor.tx_antenna_delay_ticks,
-        rx_antenna_delay_ticks=anchor.rx_antenna_delay_ticks,
     )
 
 

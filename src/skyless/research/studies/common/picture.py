@@ -63,7 +63,7 @@ def shade_sides(axes: Axes, sides: Sides, limit: float, *, along: Literal["x", "
     set_limits(low, high)
 
 
-def name_sides(axes: Axes, sides: Sides, *, along: Literal["x", "y"]) -> None:
+def _name_sides(axes: Axes, sides: Sides, *, along: Literal["x", "y"]) -> None:
     """Name both directions of an axis without a common limit."""
     for side, words in (("below", sides.below), ("above", sides.above)):
         _name(axes, words, GREEN if side == sides.safe else RED, side, along)
@@ -113,24 +113,23 @@ class _Panel(Struct, frozen=True):
     """Whether the axis of bars is logarithmic; None for where values lie far apart."""
 
 
-def centimetres(value_m: float | None) -> float | None:
-    """A length in centimetres."""
-    return None if value_m is None else 100.0 * value_m
+def _times(factor: float, value: float | None) -> float | None:
+    return None if value is None else factor * value
 
 
-MIN_DRAWN_SHARE: Final = 1e-6
+_MIN_DRAWN_SHARE: Final = 1e-6
 """Smaller shares of exceeded levels, and none, are drawn here."""
 
 
-def _exceeded(row: Any) -> float | None:  # noqa: ANN401 - a row with levels
-    return None if row.exceeded is None else 1e4 * max(row.exceeded, MIN_DRAWN_SHARE)
+def _parts(share: float | None) -> float | None:
+    return None if share is None else 1e4 * max(share, _MIN_DRAWN_SHARE)
 
 
 _PANELS: Final = {
     "rmse": _Panel(
         "RMSE in cm",
-        lambda row: centimetres(row.rmse_m),
-        lambda row: centimetres(row.rmse_error_m),
+        lambda row: _times(100.0, row.rmse_m),
+        lambda row: _times(100.0, row.rmse_error_m),
         limits=True,
         figure="rmse_m",
         scale=100.0,
@@ -139,7 +138,7 @@ _PANELS: Final = {
     "nees": _Panel("NEES per dimension", lambda row: row.nees, target=1.0, figure="nees", sides=CONFIDENCE),
     "level": _Panel(
         "fixes with a level in %",
-        lambda row: None if row.level is None else 100.0 * row.level,
+        lambda row: _times(100.0, row.level),
         figure="level",
         scale=100.0,
         sides=Sides("fewer fixes with a level", "more: better, if they hold", "above"),
@@ -147,15 +146,18 @@ _PANELS: Final = {
     ),
     "exceeded": _Panel(
         "levels exceeded in 10⁻⁴",
-        _exceeded,
+        lambda row: _parts(row.exceeded),
         figure="exceeded",
         scale=1e4,
         sides=STATED_RISK,
         log=True,
     ),
+    "hpl": _Panel("median HPL in cm", lambda row: _times(100.0, row.hpl_m)),
+    "available": _Panel("fixes with a level in %", lambda row: _times(100.0, row.available), log=False),
+    "misleading": _Panel("misleading fixes in 10⁻⁴", lambda row: _parts(row.hmi), sides=STATED_RISK, log=True),
     "found": _Panel(
         "events found in %",
-        lambda row: None if row.found is None else 100.0 * row.found,
+        lambda row: _times(100.0, row.found),
         figure="found",
         scale=100.0,
         sides=Sides("events missed: unsafe", "events found: safe side", "above"),
@@ -219,7 +221,7 @@ def _fill(axes: Axes, panel: _Panel, rows: list[Row], look: Look) -> None:
     if panel.sides is not None:
         limit = panel.target
         if limit is None:
-            name_sides(axes, panel.sides, along="y" if curve else "x")
+            _name_sides(axes, panel.sides, along="y" if curve else "x")
         else:
             shade_sides(axes, panel.sides, limit, along="y" if curve else "x")
 
@@ -229,6 +231,8 @@ def _or_nan(value: float | None) -> float:
 
 
 def _curve(axes: Axes, x: Array, values: Array, errors: Array, look: Look, series: str) -> None:
+    if look.log:  # a logarithmic axis has no 0
+        x, values, errors = x[x > 0.0], values[x > 0.0], errors[x > 0.0]
     axes.errorbar(x, values, errors, fmt="o-", color=BLUE, markersize=4, capsize=2, zorder=3)
     axes.set(xlabel=look.x or series)
     if look.log:

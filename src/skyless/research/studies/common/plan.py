@@ -49,37 +49,11 @@ _USUAL: Final = {
 """Amounts of studies that need others than the usual ones; ``room`` has fewer in all but its main cases."""
 
 
-def plan_of(
-    method: str,
-    seed: int,
-    *,
-    study: str | None = None,
-    quick: bool = False,
-    noise_ps: float = 100.0,
-    qa: float = 0.3,
-    mesh: bool = True,
-    worlds: int | None = None,
-    seconds: float | None = None,
-    episodes: int | None = None,
-    integrity_risk: float = RISK,
-    alert_limit_m: float | None = None,
-) -> Plan:
+def plan_of(method: str, seed: int, *, study: str = "", quick: bool = False, **given: Any) -> Plan:  # noqa: ANN401 - of Plan
     """The usual amounts, or with ``quick`` few, where none are given."""
-    usual = _QUICK_PLAN if quick else _USUAL.get(study or "", Plan())
-    return Plan(
-        method=method,
-        seed=seed,
-        quick=quick,
-        noise_ps=noise_ps,
-        qa=qa,
-        mesh=mesh,
-        worlds=worlds or usual.worlds,
-        seconds=seconds or usual.seconds,
-        tags=usual.tags,
-        episodes=episodes or usual.episodes,
-        integrity_risk=integrity_risk,
-        alert_limit_m=alert_limit_m,
-    )
+    usual = _QUICK_PLAN if quick else _USUAL.get(study, Plan())
+    known = {name: value for name, value in given.items() if value is not None}
+    return replace(usual, method=method, seed=seed, quick=quick, **known)
 
 
 class Cell(Struct, frozen=True):
@@ -87,9 +61,8 @@ class Cell(Struct, frozen=True):
 
     name: str
     """Name of the case to which it belongs."""
-    function: Callable[[Any], Any]
-    """Defined at the top of a module."""
-    argument: Any
+    function: Callable[[], Any]
+    """A function defined at the top of a module, with its arguments."""
     weight_s: float
     """About how long it takes: the longest are begun first."""
 

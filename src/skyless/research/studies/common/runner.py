@@ -49,7 +49,7 @@ def run_cells_here(cells: Sequence[Cell], reached: Reached) -> list[Any]:
     """As ``run_cells``, in this process and thread, one after the other."""
     total_s, done_s, results = sum(cell.weight_s for cell in cells), 0.0, []
     for cell in cells:
-        results.append(cell.function(cell.argument))
+        results.append(cell.function())
         done_s += cell.weight_s
         reached(done_s / total_s)
     return results
@@ -79,9 +79,7 @@ def _map(pool: Executor, cells: Sequence[Cell], reached: Reached) -> list[Any]:
     """The longest cells begin first."""
     order = sorted(range(len(cells)), key=lambda number: -cells[number].weight_s)
     with _uninterrupted():
-        futures: dict[Future[Any], int] = {
-            pool.submit(cells[number].function, cells[number].argument): number for number in order
-        }
+        futures: dict[Future[Any], int] = {pool.submit(cells[number].function): number for number in order}
     total_s = sum(cell.weight_s for cell in cells)
     done_s, waiting = 0.0, set(futures)
     while waiting:

@@ -1,7 +1,8 @@
 """From the worlds of a case to a row: standard errors from the scatter between worlds, intervals of rare shares."""
 
 from collections.abc import Callable, Sequence
-from typing import Final
+from functools import partial
+from typing import Any, Final
 
 import numpy as np
 from msgspec import Struct
@@ -57,7 +58,7 @@ class WorldRow(Row, frozen=True, kw_only=True):
 
 def world_cells(cases: Sequence[Case]) -> list[Cell]:
     """One cell for each world."""
-    return [Cell(case.name, run_world, run, _weight_s(run)) for case in cases for run in case.runs]
+    return [Cell(case.name, partial(run_world, run), _weight_s(run)) for case in cases for run in case.runs]
 
 
 def _weight_s(run: Run) -> float:
@@ -67,12 +68,17 @@ def _weight_s(run: Run) -> float:
 
 def world_rows(study: str, plan: Plan, cases: Sequence[Case], results: Sequence[RunResult]) -> list[WorldRow]:
     """A row for each case; the results stand in the order of ``world_cells``."""
-    rest = iter(results)
-    worlds = {case.name: [next(rest) for _ in case.runs] for case in cases}
+    worlds = {case.name: own for case, own in zip(cases, by_case(cases, results), strict=True)}
     return [
         case_row(study, plan, case, worlds[case.name], worlds[case.of][: len(case.runs)] if case.of else None)
         for case in cases
     ]
+
+
+def by_case(cases: Sequence[Case], results: Sequence[Any]) -> list[list[Any]]:
+    """The results of each case's worlds, of those in the order of ``world_cells``."""
+    rest = iter(results)
+    return [[next(rest) for _ in case.runs] for case in cases]
 
 
 def case_row(

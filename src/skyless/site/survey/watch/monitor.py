@@ -48,8 +48,10 @@ class RangeHistory:
         """Windows that have gone into each row of ``_usual``."""
         self._values = np.full((0, _DRIFT_WINDOWS), np.nan)
         self._windows = 0
-        self._usual_m = np.zeros(0)
-        self._noise_m2 = np.zeros(0)
+        self.usual_m = np.zeros(0)
+        """Shape (m,): the usual range; NaN where it is not known."""
+        self.noise_m2 = np.zeros(0)
+        """Shape (m,): variance of one exchange."""
         self._noise_exchanges = np.zeros(0)
         self.first_m = np.zeros(0)
         """Shape (m,): the range that was given, or the first median over ``usual_windows``; NaN before."""
@@ -60,19 +62,9 @@ class RangeHistory:
         return len(self._usual)
 
     @property
-    def usual_m(self) -> Array:
-        """Shape (m,): the usual range; NaN where it is not known."""
-        return self._usual_m
-
-    @property
     def windows(self) -> Array:
         """Shape (m,): windows that the usual range is made of."""
         return np.minimum(self._used, _USUAL_WINDOWS).astype(np.float64)
-
-    @property
-    def noise_m2(self) -> Array:
-        """Shape (m,): variance of one exchange."""
-        return self._noise_m2
 
     def add_pair(self, given_m: float | None = None) -> int:
         """The number of another pair. ``given_m``: its range by the survey."""
@@ -85,8 +77,8 @@ class RangeHistory:
         self._usual = np.concatenate([self._usual, row])
         self._used = np.append(self._used, used)
         self._values = np.concatenate([self._values, np.full((1, _DRIFT_WINDOWS), np.nan)])
-        self._usual_m = np.append(self._usual_m, first_m)
-        self._noise_m2 = np.append(self._noise_m2, 0.0)
+        self.usual_m = np.append(self.usual_m, first_m)
+        self.noise_m2 = np.append(self.noise_m2, 0.0)
         self._noise_exchanges = np.append(self._noise_exchanges, 0.0)
         self.first_m = np.append(self.first_m, first_m)
         self.presence = np.append(self.presence, 1.0)
@@ -96,9 +88,9 @@ class RangeHistory:
         """Count the noise of a block: variance of one exchange."""
         known = self._noise_exchanges[pair]
         if known > 0.0:
-            variance_m2 = min(variance_m2, _NOISE_JUMP * self._noise_m2[pair])
+            variance_m2 = min(variance_m2, _NOISE_JUMP * self.noise_m2[pair])
         total = known + exchanges
-        self._noise_m2[pair] += (variance_m2 - self._noise_m2[pair]) * exchanges / total
+        self.noise_m2[pair] += (variance_m2 - self.noise_m2[pair]) * exchanges / total
         self._noise_exchanges[pair] = min(total, _NOISE_MEMORY)
 
     def add_window(self, range_m: Array, is_usable: Mask, is_drifting: Mask, is_expected: Mask) -> None:
@@ -114,9 +106,9 @@ class RangeHistory:
         self._usual[rows, self._used[rows] % _USUAL_WINDOWS] = range_m[rows]
         self._used[rows] += 1
         if len(rows):
-            self._usual_m[rows] = np.nanmedian(self._usual[rows], axis=1)
+            self.usual_m[rows] = np.nanmedian(self._usual[rows], axis=1)
         is_full = np.isnan(self.first_m) & (self._used >= _USUAL_WINDOWS)
-        self.first_m[is_full] = self._usual_m[is_full]
+        self.first_m[is_full] = self.usual_m[is_full]
         self.presence[is_expected] += (is_present[is_expected] - self.presence[is_expected]) / _PRESENCE_MEMORY
 
     def drift_m(self) -> Array:
@@ -142,7 +134,7 @@ class RangeHistory:
         """Forget the usual ranges, which are learned from the start."""
         self._used[:] = 0
         self._usual[:] = np.nan
-        self._usual_m[:] = self.first_m[:] = np.nan
+        self.usual_m[:] = self.first_m[:] = np.nan
         self._values[:] = np.nan
 
 
