@@ -23,6 +23,8 @@ import msgspec
 import numpy as np
 
 from skyless.page.gathered import Gathered
+from skyless.page.live import LiveSite
+from skyless.page.sites import LiveSites
 from skyless.run.fix_batch import MAX_RECORDS, RECORD, Batch, decode_batch, encode_batch
 from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect
@@ -111,7 +113,7 @@ class Measured(Gathered):
 async def reader(url, expected):
     """Read until the expected number of fixes is there, or nothing came for 5 s."""
     measured = Measured(NatsAddress(url))
-    task = asyncio.create_task(measured.run())
+    task = asyncio.create_task(measured.run(LiveSites(LiveSite("bench", url))))
     print("ready", flush=True)
     begin_s, count, still = time.process_time(), 0, 0
     while count < expected and still < 20:

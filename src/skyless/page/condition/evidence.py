@@ -272,15 +272,13 @@ class Roster:
 class _Tag:
     """Delays of one tag's messages: ``now_s`` of arrival less ``unix_s`` of sending, so with the clocks' difference."""
 
-    __slots__ = ("before_s", "begun_s", "delay_s", "delay_seen_s", "least_age_s", "least_s", "made_s", "unix_s")
+    __slots__ = ("before_s", "begun_s", "delay_s", "delay_seen_s", "least_s", "unix_s")
 
     def __init__(self, now_s: float) -> None:
         self.begin(now_s)
         self.unix_s = float("-inf")  # of the last fix
         self.delay_s, self.delay_seen_s = 0.0, float("-inf")
         """Delay of the last health message, if this computer sent it, and when that message arrived."""
-        self.least_age_s: float | None = None  # of the fixes since the last ``least_ages_s``
-        self.made_s = 0.0  # its part until the fix was made
 
     def begin(self, now_s: float) -> None:
         """Begin the window. What was before does not count."""
@@ -300,6 +298,7 @@ class FixAges:
 
     def __init__(self) -> None:
         self._tags: dict[str, _Tag] = {}
+        self._least: dict[str, tuple[float, float]] = {}  # what ``least_ages_s`` gives next
         self._recent: deque[tuple[float, float]] = deque(maxlen=_MAX_AGES)  # when fixes arrived, and their ages
 
     def add_fix(self, name: str, unix_s: float, latency_s: float, now_s: float) -> float:
@@ -319,8 +318,8 @@ class FixAges:
         else:
             travelled_s = delay_s - min(tag.least_s, tag.before_s)
         age_s = made_s + travelled_s
-        if tag.least_age_s is None or age_s < tag.least_age_s:
-            tag.least_age_s, tag.made_s = age_s, made_s
+        if name not in self._least or age_s < self._least[name][0]:
+            self._least[name] = age_s, made_s
         self._recent.append((now_s, age_s))
         return age_s
 
@@ -334,11 +333,7 @@ class FixAges:
 
         The least, so that a burst of messages that waited for this program for a moment counts as its youngest.
         """
-        found = {}
-        for name, tag in self._tags.items():
-            if tag.least_age_s is not None:
-                found[name] = tag.least_age_s, tag.made_s
-                tag.least_age_s = None
+        found, self._least = self._least, {}
         return found
 
     def percentiles_s(self, now_s: float) -> tuple[float | None, float | None]:

@@ -38,6 +38,7 @@ SETTLE_S: Final = 0.5
 
 FORGET_S: Final = 86_400.0
 """A tag that no rule names is forgotten after this long without a fix."""
+_FORGET_PERIOD_S: Final = 60.0
 
 MAX_KEPT: Final = 2_000
 """Alarms that are kept. Beyond it the oldest that have ended go, and where none has, no more are raised."""
@@ -133,6 +134,7 @@ class AlarmEngine:
         self._members: defaultdict[str, set[str]] = defaultdict(set)
         self._rules: dict[str, _Rule] = {}
         self._tags: dict[str, _Tag] = {}
+        self._forget_due_s = 0.0
         self._changed: dict[str, None] = {}  # tags with something new since the last evaluation
         self._anchors: dict[RuleKind, dict[str, str]] = {}
         """What is known of anchors, by kind of rule: subjects for which the condition holds, and a sentence."""
@@ -284,8 +286,9 @@ class AlarmEngine:
             case "anchor-offline" | "anchor-moved" as kind:
                 return self._anchors.get(kind, ())
             case "silent":
-                heard = own.concerned.named if own.rule.tags else [n for n, tag in self._tags.items() if tag.fix]
-                return sorted(name for name in heard if now_s - self._tag(name).seen_s >= own.rule.after_s)
+                heard = ((n, tag) for n, tag in self._tags.items() if tag.fix)
+                heard = ((n, self._tag(n)) for n in own.concerned.named) if own.rule.tags else heard
+                return sorted(name for name, tag in heard if now_s - tag.seen_s >= own.rule.after_s)
         return changed
 
     def _holds(  # noqa: PLR0911, PLR0912 - some for each kind
@@ -337,9 +340,12 @@ class AlarmEngine:
         return self._was_blind(now_s) and self._tag(name).seen_s <= self._blind_s
 
     def _crowd(self, own: _Rule) -> list[str]:
-        return sorted(tag for tag in self._members[own.rule.zone or ""] if tag in own.concerned)
+        return [tag for tag in self._members[own.rule.zone or ""] if tag in own.concerned]
 
     def _forget(self, now_s: float) -> None:
+        if now_s < self._forget_due_s:
+            return
+        self._forget_due_s = now_s + _FORGET_PERIOD_S
         for name in [n for n, tag in self._tags.items() if now_s - max(tag.seen_s, tag.first_s) > FORGET_S]:
             if not any(own.rule.kind == "silent" and name in own.concerned.named for own in self._rules.values()):
                 del self._tags[name]
@@ -383,7 +389,7 @@ class AlarmEngine:
         if (rule.id, subject) not in self.messages and not self._make_room():
             return
         is_of_tags = rule.kind not in ("crowded", "anchor-offline", "anchor-moved")
-        tags = tuple(subject.split("~") if is_of_tags else self._crowd(own))
+        tags = tuple(subject.split("~") if is_of_tags else sorted(self._crowd(own)))
         fix = self._tag(tags[0]).fix if is_of_tags else None
         message = AlarmMessage(
             id=f"{rule.id}/{subject}/{round(1000.0 * unix_s)}",
