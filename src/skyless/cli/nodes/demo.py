@@ -6,21 +6,21 @@ import sys
 import time
 from collections.abc import Awaitable
 from shlex import quote
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from cyclopts import App
-from rich.console import RenderableType
-from rich.live import Live
 
 from skyless.cli.common.options import JsonOptions, command
 from skyless.cli.common.output import console, print_json
 from skyless.cli.nodes._demo_figures import sentence
 from skyless.cli.nodes._demo_site import DemoOptions, WholeSite
-from skyless.cli.nodes._site_screen import drawn
 from skyless.cli.nodes._site_view import Picture
 from skyless.cli.nodes.options import log
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress
 from skyless.run.process import run
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
 
 _LONGEST_START_S: Final = 60.0
 """Programs that have not made a fix for every tag by then will not."""
@@ -101,6 +101,8 @@ class _Stage:
 
     async def _watch(self) -> None:
         """Draw, where there is a terminal, until the time is over."""
+        from rich.live import Live  # while the site's programs start
+
         out = console()
         shown = Live(console=out, auto_refresh=False) if out.is_terminal and not self._json else None
         with shown or contextlib.nullcontext(), contextlib.suppress(TimeoutError):
@@ -113,8 +115,10 @@ class _Stage:
                             shown.update(self.drawn(self.picture, out.height - 1), refresh=True)
                     await asyncio.sleep(_FRAME_S)
 
-    def drawn(self, picture: Picture, height: int = sys.maxsize) -> RenderableType:
+    def drawn(self, picture: Picture, height: int = sys.maxsize) -> "RenderableType":
         """The site as ``skyless watch`` shows it, and the errors of its fixes."""
+        from skyless.cli.nodes._site_screen import drawn
+
         return drawn(picture, height, {name: tag.error_m for name, tag in self.whole.figures.tags.items()})
 
     def summary(self) -> dict[str, Any]:
