@@ -90,7 +90,7 @@ def test_intervals_of_clusters_hold_the_true_share():
 
 
 def chunk(misleading, levels_m=(0.1, 0.2)):
-    """What 50 episodes of 100 fixes would have told."""
+    """What 50 episodes of 100 fixes would have found."""
     counts = np.tile([100.0, 90.0, 0.0, 0.0], (50, 1))
     counts[0, 2] = misleading
     return Chunk(counts, 1.0, levels_m, np.linspace(0.1, 0.8, 100), np.linspace(0.01, 0.1, 100))
@@ -99,9 +99,9 @@ def chunk(misleading, levels_m=(0.1, 0.2)):
 def test_rows_are_what_chunks_tell():
     results = [chunk(0)] * 2 * len(FAULTS)
     results[2] = chunk(100)  # of the second row
-    told = {row.case: row for row in rows(PLAN, results)}
-    assert len(told) == len(FAULTS) + 1
-    clean, step = told["lab, clean"], told["lab, step 0.05 m"]
+    found = {row.case: row for row in rows(PLAN, results)}
+    assert len(found) == len(FAULTS) + 1
+    clean, step = found["lab, clean"], found["lab, step 0.05 m"]
     assert (clean.runs, clean.fixes, clean.available, clean.hmi, clean.limit) == (
         100,
         10_000,
@@ -114,9 +114,9 @@ def test_rows_are_what_chunks_tell():
     assert step.hmi == 0.01
     assert step.hmi_interval[0] < 1e-4 < 0.01 < step.hmi_interval[1]  # one cluster proves little
     assert step.passed
-    assert (step.hpl_m, step.vpl_m, told["room, clean"].vpl_m) == (pytest.approx(0.1), None, pytest.approx(0.2))
-    assert told[ALL_FAULTS].hmi == pytest.approx(100 / told[ALL_FAULTS].fixes)
-    assert told[ALL_FAULTS].fixes == 10_000 * (len(FAULTS) - 2)
+    assert (step.hpl_m, step.vpl_m, found["room, clean"].vpl_m) == (pytest.approx(0.1), None, pytest.approx(0.2))
+    assert found[ALL_FAULTS].hmi == pytest.approx(100 / found[ALL_FAULTS].fixes)
+    assert found[ALL_FAULTS].fixes == 10_000 * (len(FAULTS) - 2)
 
 
 def test_levels_that_mislead_often_fail():
@@ -131,8 +131,8 @@ def test_levels_that_mislead_often_fail():
 @pytest.mark.statistical
 def test_it_can_be_drawn(levels_m):
     study = STUDIES["integrity"]
-    told = study.rows(PLAN, [chunk(3, levels_m)] * 2 * len(FAULTS))
-    assert picture(study.draw(told), "png", 50.0).startswith(b"\x89PNG")
+    found = study.rows(PLAN, [chunk(3, levels_m)] * 2 * len(FAULTS))
+    assert picture(study.draw(found), "png", 50.0).startswith(b"\x89PNG")
 
 
 def test_cells_carry_what_is_asked():
@@ -147,13 +147,13 @@ def test_cells_carry_what_is_asked():
 @pytest.mark.parametrize("place", ["lab", "room"])
 def test_levels_hold_in_clean_episodes(place):
     cell = next(cell for cell in cells(plan_of("joint", 1, episodes=3)) if cell.name == f"{place}, clean")
-    told = cell.function()
-    fixes, promised, across, above = told.counts.T
+    found = cell.function()
+    fixes, promised, across, above = found.counts.T
     assert (fixes > 350).all()
     assert (promised == fixes).all()
     assert not across.any()
     assert not above.any()
-    assert 0.0 < told.top.max() < 1.0
+    assert 0.0 < found.top.max() < 1.0
 
 
 def test_other_methods_have_no_levels():

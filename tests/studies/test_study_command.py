@@ -36,18 +36,18 @@ def run(capsys, monkeypatch, tmp_path):
 def test_a_study_tells_its_rows_and_writes_its_files(run, tmp_path):
     code, out, err = run("loss", *SMALL, "--json", "--out", "deep/folder", "--plot", "loss.svg")
     assert (code, err, out.count("\n")) == (0, "", 1)
-    told = json.loads(out)
-    assert (told["study"], told["method"], told["seed"], told["simulated"]) == ("loss", "joint", 1, True)
+    printed = json.loads(out)
+    assert (printed["study"], printed["method"], printed["seed"], printed["simulated"]) == ("loss", "joint", 1, True)
     keys = {"method", "mesh", "noise_ps", "case", "rmse_m", "bound_m", "ratio", "limit", "passed", "nees"}
-    assert all(row.keys() >= keys for row in told["rows"])
-    half = next(row for row in told["rows"] if row["case"] == "50 % lost at tags")
+    assert all(row.keys() >= keys for row in printed["rows"])
+    half = next(row for row in printed["rows"] if row["case"] == "50 % lost at tags")
     assert half["passed"] == (half["ratio"] <= half["limit"])
     folder = tmp_path / "deep" / "folder"
     assert {file.name for file in folder.iterdir()} == {"loss.json", "loss.csv", "loss.png", "loss.svg"}
-    assert json.loads((folder / "loss.json").read_text()) == told["rows"]
+    assert json.loads((folder / "loss.json").read_text()) == printed["rows"]
     with (folder / "loss.csv").open(newline="") as file:
         table = list(csv.DictReader(file))
-    assert [float(row["rmse_m"]) for row in table] == [row["rmse_m"] for row in told["rows"]]
+    assert [float(row["rmse_m"]) for row in table] == [row["rmse_m"] for row in printed["rows"]]
     assert (folder / "loss.png").read_bytes().startswith(b"\x89PNG")
     for picture in (folder / "loss.svg", tmp_path / "loss.svg"):
         assert ElementTree.fromstring(picture.read_bytes()).tag.endswith("svg")

@@ -30,7 +30,7 @@ def test_the_jackknife_finds_the_standard_error_of_a_mean():
 
 
 def worlds_of(errors_m, sigma_m=1.0):
-    """What worlds would have told whose fixes err so, shape (worlds, fixes, 2), and say ``sigma_m`` for each axis."""
+    """What worlds would have found whose fixes err so, shape (worlds, fixes, 2), and say ``sigma_m`` for each axis."""
     squared = np.square(errors_m).sum(axis=2)
     return [
         RunResult(
@@ -201,10 +201,10 @@ def test_rows_of_efficiency_are_those_of_the_episodes():
     wanted = [number for number, cell in enumerate(cells) if cell.name == cells[0].name]
     assert wanted == [0, 1]  # chunks of 50
     results = [cells[number].function() for number in wanted]
-    told = efficiency.row_of(case, efficiency.run_chunk(case, np.random.SeedSequence(4).spawn(60)))
+    found = efficiency.row_of(case, efficiency.run_chunk(case, np.random.SeedSequence(4).spawn(60)))
     row = efficiency.rows(plan, results * len(efficiency.EFFICIENCY_CASES))[0]
-    assert (row.rmse_m, row.bound_m, row.ratio) == (told.rmse_m, told.bound_m, told.ratio)
-    assert row.nees == told.nees
+    assert (row.rmse_m, row.bound_m, row.ratio) == (found.rmse_m, found.bound_m, found.ratio)
+    assert row.nees == found.nees
     assert (row.mesh, row.noise_ps, row.limit, row.runs) == (False, 100.0, 1.02, 60)
     kinds = {(case.mesh, case.noise_ps, case.random_walk_fm, case.qa) for case in efficiency.EFFICIENCY_CASES}
     assert len(kinds) == 16

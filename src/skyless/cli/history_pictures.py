@@ -2,7 +2,7 @@
 
 import time
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from typing import Any, Final
 
@@ -110,3 +110,14 @@ def _plan(axes: Axes, zones: _Zones) -> None:
             axes.plot(x_m, y_m, color=MUTED, linewidth=0.8)
             axes.annotate(name, (sum(x_m[1:]) / len(corners), sum(y_m[1:]) / len(corners)), fontsize=7.0, ha="center")
     axes.set(xlabel="x in m", ylabel="y in m", aspect="equal")
+
+
+FIGURES: Final[Mapping[str, Callable[[Any, _Zones, str], Figure]]] = {
+    "track": track_figure,
+    "heatmap": heatmap_figure,
+    "dwell": dwell_figure,
+    "occupancy": occupancy_figure,
+    "contacts": contacts_figure,
+    "alarms": alarms_figure,
+}
+"""What draws the answer to a question, by the question's name."""

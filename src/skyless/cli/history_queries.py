@@ -83,10 +83,9 @@ class _Drawn(_Asked, frozen=True, kw_only=True):
         else:
             _table(_range(span), rows)
         if self.plot is not None:
-            from skyless.cli import history_pictures
+            from skyless.cli.history_pictures import FIGURES
 
-            draw = getattr(history_pictures, f"{name}_figure")
-            write_picture(self.plot, draw(given, history.zones(), _range(span)))
+            write_picture(self.plot, FIGURES[name](given, history.zones(), _range(span)))
         return NO_FIX if isinstance(given, dict) and not rows else 0
 
 

@@ -51,7 +51,7 @@ class Columns:
     def visible(self, view: tuple[float, float, float, float], now_s: float) -> tuple[Records, Array]:
         """The records of the tags between least x, y and largest x, y of a view in m, and for how long they are here.
 
-        Tags that were not heard lately are left out.
+        Tags without a fix for ``UNHEARD_S`` are left out.
         """
         low_x, low_y, high_x, high_y = (1000.0 * edge for edge in view)
         x_mm, y_mm, _ = self._newest["position_mm"][: self._used].T

@@ -26,7 +26,7 @@ from skyless.run.gather.names import name_of
 PERIOD_S: Final = 0.1
 _HAND_OVER_S: Final = 0.05
 _HEARD_S: Final = 1.0
-"""In this interval a site is told which tags batches have fixes of."""
+"""Interval at which a site is given the names of all tags that were heard."""
 _MAX_ASKED: Final = 200
 
 _MAX_SITES: Final = 64

@@ -174,7 +174,7 @@ class LiveSite:
         self._zones = Kept(ZonesMessage(()), self._read_zones)
         """With other sites' zones of this number."""
         self._dashboards: dict[str, StatusMessage] = {}
-        self._sent_serials = 0, 0  # of the newest fix and event that pages were told of
+        self._sent_serials = 0, 0  # of the newest fix and event that pages were sent
         self._health_due_s = self._condition_due_s = 0.0
         self.evidence = Evidence(host, clock())
         self.log = EventLog(wall_clock() - clock(), self.event_list.add_logged)

@@ -349,7 +349,7 @@ def reception_of(raw: RawReception) -> Reception | None:
 
 
 class _TagSettings(Struct, frozen=True):
-    """What a tag's program was told, with the defaults where a recording does not hold it."""
+    """The settings of a tag's program, with the defaults where a recording does not hold them."""
 
     method: str | None = None
     site: int | None = None
@@ -365,17 +365,17 @@ class _TagSettings(Struct, frozen=True):
 def _receiver_of(start: SegmentStart, method: str | None, integrity: IntegrityRequirement | None) -> AnyReceiver | None:
     """A receiver that knows nothing, made as the tag's was; None where that makes no sense."""
     try:
-        told = msgspec.convert(start.settings, _TagSettings)
+        settings = msgspec.convert(start.settings, _TagSettings)
         integrity = integrity or IntegrityRequirement(
-            told.integrity_risk, told.alert_limit_m, told.max_acceleration_mps2, told.height_std_m
+            settings.integrity_risk, settings.alert_limit_m, settings.max_acceleration_mps2, settings.height_std_m
         )
     except (msgspec.ValidationError, ValueError, TypeError):
         return None
-    name = method or told.method
+    name = method or settings.method
     if name not in METHODS:
         return None
-    bounds_m = None if told.z_low_m is None or told.z_high_m is None else (told.z_low_m, told.z_high_m)
-    return AnyReceiver(name, site=told.site, qa=told.qa, z_bounds_m=bounds_m, integrity=integrity)
+    bounds_m = None if settings.z_low_m is None or settings.z_high_m is None else (settings.z_low_m, settings.z_high_m)
+    return AnyReceiver(name, site=settings.site, qa=settings.qa, z_bounds_m=bounds_m, integrity=integrity)
 
 
 # Replay of a running site: every tag's receptions once more, judged against the truth and the recorded fixes.

@@ -167,7 +167,7 @@ class History:
         return tuple(sorted(set(self._names().values())))
 
     def assets(self) -> dict[str, str]:
-        """What people call tags, by the tags' names, as the site's programs told last."""
+        """Names of assets by the names of their tags, from the newest list that the history has received."""
         return {row["tag"]: row["name"] for row in self._table("assets.parquet", ASSET_COLUMNS) if row["name"]}
 
     def zones(self) -> dict[str, tuple[str, tuple[tuple[float, float], ...]]]:
