@@ -118,6 +118,16 @@ async def test_a_very_long_line_of_a_program_s_does_not_end_its_keeper(monkeypat
     await stop(task)
 
 
+async def test_what_a_program_writes_is_logged_as_it_comes_where_that_is_asked_for(monkeypatch):
+    said = []
+    command = "import sys, time; print('disk full', file=sys.stderr, flush=True); time.sleep(60)"
+    monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", command))
+    task = asyncio.ensure_future(Child(Program("history", (), logs_lines=True), said.append).run())
+    await until(lambda: said or task.done(), 10)
+    assert said == ["history: disk full"]
+    await stop(task)
+
+
 async def test_a_program_with_a_new_file_gets_another_at_every_start_and_ends_when_it_logs_it(monkeypatch, tmp_path):
     program = Program("recorder", ("record", str(tmp_path / "a.mcap"), "--x"), 1)
     assert program.start(1) == program.arguments

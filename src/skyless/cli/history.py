@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 from cyclopts import App, Parameter
 
-from skyless.cli.common.options import command
+from skyless.cli.common.options import command, make_folder
 from skyless.cli.common.output import print_json
 from skyless.cli.history_queries import questions
 from skyless.cli.nodes.options import MqttOptions, SiteId, log
@@ -73,6 +73,7 @@ def run(
         raise SkylessError("--mqtt is 'none'; it should be the broker of the site whose history to keep")
     address.tls_context()
     stream = None if nats is None else nats_address(nats)
+    make_folder("--to", to)
     found: list[HistoryNode] = []
     with contextlib.suppress(KeyboardInterrupt):
         process.run(_keep_history(to, address, site_id, Keep(keep_days, full_days, event_days), found, stream))

@@ -223,7 +223,7 @@ def export(file: Path, /, *tags: str, asked: _Asked, site: Path | None = None, f
     force
         Overwrite what is there, if the file exists.
     """
-    check_folder("file", file)
+    check_folder("FILE", file)
     if file.exists() and not force:
         raise SkylessError(f"{file} exists; --force overwrites it")
     history, span = asked.opened()

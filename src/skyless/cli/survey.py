@@ -112,7 +112,7 @@ def _check(asked: SurveyOptions, live: LiveOptions, output: _Output) -> None:
     if out is None:
         output.leave_out("force", why="nothing is written without --out")
         return
-    check_folder("out", out)
+    check_folder("--out", out)
     if out.suffix.lower() not in {".toml", ".csv"}:
         raise SkylessError(f"--out is {str(out)!r}; its ending should be .toml for a site or .csv for a table")
     if out.suffix.lower() == ".toml" and asked.site is None:

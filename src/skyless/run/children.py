@@ -34,6 +34,8 @@ class Program(Struct, frozen=True):
     started again when it has ended by itself (a full disk, its limit reached)."""
     start_after_s: float = 0.0
     """Its first start is so much later."""
+    logs_lines: bool = False
+    """Whether its lines on standard error are logged as they come; otherwise the last one is, when it ends."""
     environment: Mapping[str, str] = {}
     """Variables in addition to those of this program."""
 
@@ -119,7 +121,10 @@ class Child:
             while piece := os.read(pipe, _LINE_BYTES):
                 *lines, self._line = (self._line + piece).split(b"\n")
                 self._line = self._line[-_LINE_BYTES:]
-                self._last_lines.extend(line.decode(errors="replace").rstrip() for line in lines)
+                for line in (line.decode(errors="replace").rstrip() for line in lines):
+                    self._last_lines.append(line)
+                    if self.program.logs_lines:
+                        self._log(f"{self.program.name}: {line}")
             asyncio.get_running_loop().remove_reader(pipe)
 
     def _last_message(self) -> str:

@@ -109,7 +109,15 @@ def check_output(option: str, output: Path | None, *inputs: Path | None) -> None
 def check_folder(option: str, output: Path) -> None:
     """See that an output is no folder itself, and in one that exists. Raises SkylessError."""
     if output.is_dir() or not output.parent.is_dir():
-        raise SkylessError(f"--{option} is {str(output)!r}; it should be a file in a folder that exists")
+        raise SkylessError(f"{option} is {str(output)!r}; it should be a file in a folder that exists")
+
+
+def make_folder(option: str, folder: Path) -> None:
+    """Make a folder for files that come later, unless it is there. Raises SkylessError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SkylessError(f"{option} is {str(folder)!r}, which is no folder: {error.strerror}") from None
 
 
 def _same(a: Path, b: Path) -> bool:
@@ -127,4 +135,4 @@ def check_picture(plot: Path | None) -> None:
     endings = (".png", ".svg", ".pdf")
     if plot.suffix.lower() not in endings:
         raise SkylessError(f"--plot is {str(plot)!r}; its ending should be one of {', '.join(endings)}")
-    check_folder("plot", plot)
+    check_folder("--plot", plot)

@@ -8,6 +8,7 @@ from typing import Annotated, Final
 from cyclopts import Parameter
 from msgspec.structs import replace
 
+from skyless.cli.common.options import make_folder
 from skyless.cli.nodes._demo_figures import DemoFigures
 from skyless.cli.nodes._site_view import SiteView
 from skyless.cli.nodes.options import MqttCa, WalkingSpeed, check_live, site_named
@@ -101,11 +102,7 @@ class WholeSite:
         asked.requirement(asked.method)
         if asked.history is not None:
             extra_module("pyarrow", "--history")
-            try:
-                asked.history.mkdir(parents=True, exist_ok=True)  # the page asks it before the history's first file
-            except OSError as error:
-                why = f"which is no folder: {error.strerror}"
-                raise SkylessError(f"--history is {str(asked.history)!r}, {why}") from None
+            make_folder("--history", asked.history)  # the page asks it before the history's first file
         self.address = None if asked.mqtt is None else mqtt_address(asked.mqtt, asked.mqtt_ca)
         self._recordings = recordings_folder()
         self.recording = _recording(asked.record, self._recordings)
@@ -188,7 +185,7 @@ class WholeSite:
             programs.append(Program("recorder", ("record", str(self.recording), *mqtt, *limit, *self._number), 1))
         if asked.history is not None:
             history = ("history", "run", "--to", str(asked.history), *self._number, *mqtt)
-            programs.append(Program("history", history, start_after_s=_SURVEY_DELAY_S))
+            programs.append(Program("history", history, start_after_s=_SURVEY_DELAY_S, logs_lines=True))
         shown = _options(recordings=self._recordings, history=asked.history)
         page = ("dashboard", *mqtt, "--listen", f"{_HOST}:{self.page_port}", *shown, *self._number)
         return [*programs, Program("page", page)]

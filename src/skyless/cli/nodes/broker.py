@@ -9,7 +9,7 @@ from typing import Annotated
 from cyclopts import App
 from msgspec.structs import replace
 
-from skyless.cli.common.options import JsonOptions, command
+from skyless.cli.common.options import JsonOptions, command, make_folder
 from skyless.cli.common.output import print_json
 from skyless.cli.nodes.options import GatherOptions, listen_address, log, run_until_stopped
 from skyless.core.arguments import Options, whole
@@ -80,6 +80,7 @@ def broker(*, asked: BrokerOptions, gathered: GatherOptions, output: JsonOptions
         gathered.leave_out("site_id", "keep_gb", why="it belongs to --gather")
     if (history := asked.history) is not None:
         extra_module("pyarrow", "--history")
+        make_folder("--history", history)
         if asked.certificate is not None:
             raise SkylessError(
                 f"--history is {str(history)!r}; with --certificate, whose names only clients know, start "
@@ -156,7 +157,7 @@ async def _keep_history(address: MqttAddress, folder: Path, nats: NatsAddress | 
         for site in sites:
             if site.online and site.number not in running:
                 words = ("history", "run", "--to", str(folder), "--site-id", str(site.number), *mqtt)
-                child = Child(Program(f"history of site {site.number}", words), log)
+                child = Child(Program(f"history of site {site.number}", words, logs_lines=True), log)
                 running[site.number] = asyncio.ensure_future(child.run())
 
     try:

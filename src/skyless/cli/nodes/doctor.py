@@ -63,7 +63,7 @@ def doctor(*, asked: DoctorOptions, live: SiteOptions, output: JsonOptions) -> i
     """
     report = asked.report
     if report is not None:
-        check_folder("report", report)
+        check_folder("--report", report)
         if report.exists() and not asked.force:
             raise SkylessError(f"{report} exists; --force overwrites it")
     file_site = None if asked.site is None else load_site(asked.site)

@@ -143,9 +143,20 @@ def _asked(question: Callable[_P, _R]) -> Callable[_P, _R]:
             return question(*args, **kwargs)
         except (OSError, duckdb.Error, pyarrow.ArrowException) as error:
             reason = str(error).partition("\n")[0]
-            raise SkylessError(f"the history cannot be read: {reason}") from None
+            raise SkylessError(f"{_damaged(args[0]) or 'the history'} cannot be read: {reason}") from None
 
     return ask
+
+
+def _damaged(history: object) -> Path | None:
+    """The first file of a history that cannot be read, which not every error names."""
+    if isinstance(history, History):
+        for file in (*current_files(history.folder, history.site), *current_events(history.folder, history.site)):
+            try:
+                parquet.read_table(file)
+            except (OSError, pyarrow.ArrowException):
+                return file
+    return None
 
 
 class History:
@@ -310,8 +321,13 @@ class History:
         with _connection() as duck, whole_file(file) as scratch:
             if origin is not None and file.suffix == ".geojsonl":
                 return _write_features(scratch, duck.execute(sql, parameters), origin)
-            copied = duck.execute(f"COPY ({sql}) TO $to (FORMAT {file.suffix[1:]})", parameters | {"to": str(scratch)})
-            return int(copied.fetchall()[0][0])
+            try:
+                copy = f"COPY ({sql}) TO $to (FORMAT {file.suffix[1:]})"
+                return int(duck.execute(copy, parameters | {"to": str(scratch)}).fetchall()[0][0])
+            except duckdb.IOException as error:
+                if scratch.name not in str(error):
+                    raise
+                raise SkylessError(f"{file} cannot be written: {error}") from None
 
     # What they share
 
