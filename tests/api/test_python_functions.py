@@ -387,7 +387,7 @@ SIMULATE = [
 
 
 def refused(right, call, arguments):
-    """The mistake is told in one line, and in the words of Python rather than of the command."""
+    """A wrong call raises one line of error that names Python's arguments, not the options of the command."""
     with pytest.raises(skyless.SkylessError, match=right) as found:
         call(**arguments)
     assert "\n" not in str(found.value)

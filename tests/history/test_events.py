@@ -31,16 +31,16 @@ def ms(event):
     return round(1000 * event.t.timestamp())
 
 
-def told(log, message):
+def new_events(log, message):
     return log.of(message, NOW_S)
 
 
 def test_what_the_columns_hold():
     log = EventLog()
-    (zone,) = told(log, enter())
+    (zone,) = new_events(log, enter())
     assert (ms(zone), zone.kind, zone.tag, zone.zone) == (round(1000 * NOW_S), "enter", "ann", "z1")
     assert (zone.subject, zone.alarm, zone.text) == (None, None, "ann entered door")
-    raised, ended, seen = told(log, SEEN)
+    raised, ended, seen = new_events(log, SEEN)
     assert [event.kind for event in (raised, ended, seen)] == ["alarm-raised", "alarm-ended", "alarm-acknowledged"]
     assert [ms(event) / 1000 - NOW_S for event in (raised, ended, seen)] == [1.0, 2.0, 3.0]
     assert (raised.tag, raised.zone, raised.subject, raised.alarm) == ("tag7", "z1", "tag7", "cold/tag7/1")
@@ -65,8 +65,8 @@ def test_a_message_that_comes_again_tells_nothing_even_after_a_restart(messages,
     for count, message in enumerate(messages):
         if count == restart:
             log = EventLog(past)
-        past += told(log, message)
-        assert told(log, message) == []
+        past += new_events(log, message)
+        assert new_events(log, message) == []
     of_alarms = [event.kind for event in past if event.alarm]
     assert len(of_alarms) == len(set(of_alarms))
     for subject in ("anchor-1", "anchor-2"):
@@ -84,4 +84,4 @@ def test_a_late_copy_of_online_does_not_bring_a_node_back():
 
 
 def test_times_that_are_none_give_no_event():
-    assert told(EventLog(), enter(unix_s=1e300)) == told(EventLog(), enter(unix_s=-1.0)) == []
+    assert new_events(EventLog(), enter(unix_s=1e300)) == new_events(EventLog(), enter(unix_s=-1.0)) == []

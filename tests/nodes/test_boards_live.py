@@ -33,9 +33,9 @@ async def test_anchors_and_tags_on_boards_make_the_fixes_of_those_on_the_air_and
 
         await site.stop("board tag1")
         await site.until(lambda: any("unplugged" in line for line in site.said))
-        told = len(site.published["tag1"])
+        before = len(site.published["tag1"])
         await asyncio.sleep(0.3)
-        assert len(site.published["tag1"]) == told
+        assert len(site.published["tag1"]) == before
         site.plug_in("tag1")
         assert are_right(await site.fixes("tag1", 300))
         assert node.monitor.restarts == 2
