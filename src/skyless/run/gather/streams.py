@@ -1,14 +1,18 @@
 """The streams of a site at its NATS server: what they keep, and how they are read."""
 
+import asyncio
 import contextlib
 from collections.abc import AsyncGenerator
+from itertools import count
 from typing import TYPE_CHECKING, Final
 
+from nats.errors import Error
 from nats.js.api import ConsumerConfig, DeliverPolicy, RePublish, StorageType, StreamConfig
 from nats.js.errors import APIError, NotFoundError
 
 from skyless.core.errors import SkylessError
 from skyless.run.gather import subjects
+from skyless.run.process import Log
 
 if TYPE_CHECKING:
     from nats.aio.msg import Msg
@@ -16,14 +20,19 @@ if TYPE_CHECKING:
 
 KEEP_S: Final = 24 * 3600.0
 """How long the stream keeps fixes."""
+KEEP_EVENTS_S: Final = 365 * 24 * 3600.0
+EVENT_BYTES: Final = 500_000_000
 
 _NO_ROOM: Final = 10047  # JetStream's code of an error
 _DUPLICATES_S: Final = 120.0
 _READ_S: Final = 10.0
+_IDLE_S: Final = 2.0
+_ABANDONED_S: Final = 60.0
+_RETRY_S: Final = 1.0
 
 
 async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -> None:
-    """Make the streams of a site, or set the limits of those that are there.
+    """Make the streams of a site, or set the limits of those that are there: what a hub takes from there.
 
     Raises:
         SkylessError: the server has no room for these bytes.
@@ -46,9 +55,21 @@ async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -
         max_msgs_per_subject=1,
         allow_direct=True,
     )
-    for config in (fixes, names):
+    state = StreamConfig(
+        name=subjects.at(subjects.STATE_STREAM, site),
+        subjects=[subjects.at(subject, site) for subject in subjects.STATE],
+        max_msgs_per_subject=1,
+        allow_direct=True,
+    )
+    events = StreamConfig(
+        name=subjects.at(subjects.EVENT_STREAM, site),
+        subjects=[subjects.at(subject, site) for subject in subjects.EVENTS],
+        max_age=KEEP_EVENTS_S,
+        max_bytes=EVENT_BYTES,
+    )
+    for config in (fixes, names, state, events):
         try:
-            await _make(stream, config)
+            await make_stream(stream, config)
         except APIError as error:
             if error.err_code != _NO_ROOM:
                 raise
@@ -56,7 +77,7 @@ async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -
             raise SkylessError(f"--keep-gb is {keep_bytes / 1e9:g}; it should be {right}") from None
 
 
-async def _make(stream: "JetStreamContext", config: StreamConfig) -> None:
+async def make_stream(stream: "JetStreamContext", config: StreamConfig) -> None:
     """Make a stream, or change the one that is there: to add it again would reserve its bytes twice."""
     try:
         await stream.update_stream(config)
@@ -70,21 +91,66 @@ async def _make(stream: "JetStreamContext", config: StreamConfig) -> None:
             raise
 
 
-async def messages(stream: "JetStreamContext", name: str, after: int = 0) -> AsyncGenerator["Msg", None]:
+async def messages(
+    stream: "JetStreamContext", name: str, after: int = 0, subject: str = ">"
+) -> AsyncGenerator["Msg", None]:
     """The messages of a stream after the one with this number, in order, until the last one that it has now.
 
+    Those of ``subject`` only, a pattern.
     ``message.metadata.sequence.stream`` is a message's number. Raises nats.errors.Error where the stream is not there.
     """
     state = (await stream.stream_info(name)).state
     if state.messages == 0 or state.last_seq <= after:
         return
     config = ConsumerConfig(deliver_policy=DeliverPolicy.BY_START_SEQUENCE, opt_start_seq=after + 1)
-    reading = await stream.subscribe(">", stream=name, ordered_consumer=True, config=config)
+    reading = await stream.subscribe(subject, stream=name, ordered_consumer=True, config=config)
     try:
-        while True:
+        found = await reading.consumer_info()
+        is_empty = not found.num_pending and not (found.delivered and found.delivered.consumer_seq)
+        while not is_empty:
             message = await reading.next_msg(_READ_S)
             yield message
-            if message.metadata.num_pending == 0:
-                return
+            is_empty = message.metadata.num_pending == 0
     finally:
         await reading.unsubscribe()
+
+
+async def follow(
+    stream: "JetStreamContext", name: str, subject: str, say: Log, after: int = 0, *, newest_of_each: bool = False
+) -> AsyncGenerator["Msg", None]:
+    """The messages of a stream after the one with this number, in order and each once, until cancelled.
+
+    It waits for a stream that is not there, and goes on at another server when one is lost. ``subject`` is a pattern.
+    With ``newest_of_each`` it begins with the newest message of each subject.
+    """
+    while True:
+        first = DeliverPolicy.LAST_PER_SUBJECT if newest_of_each else DeliverPolicy.ALL
+        config = ConsumerConfig(deliver_policy=first, inactive_threshold=_ABANDONED_S)
+        if after:
+            config.deliver_policy, config.opt_start_seq = DeliverPolicy.BY_START_SEQUENCE, after + 1
+        try:
+            reading = await stream.subscribe(subject, stream=name, ordered_consumer=True, config=config)
+            try:
+                for place in count(1):
+                    message = await _next(reading, place)
+                    if message.metadata.sequence.consumer != place:  # some were lost with a connection
+                        break
+                    after = message.metadata.sequence.stream
+                    yield message
+            finally:
+                with contextlib.suppress(Error):
+                    await reading.unsubscribe()
+        except (Error, TimeoutError) as error:
+            say(f"the stream {name} cannot be read: {error or type(error).__name__}")
+            await asyncio.sleep(_RETRY_S)
+
+
+async def _next(reading: "JetStreamContext.PushSubscription", place: int) -> "Msg":
+    """The next message. Raises nats.errors.Error: it was lost with a connection, or the server has lost the reader."""
+    while True:
+        try:
+            return await reading.next_msg(_IDLE_S)
+        except TimeoutError:
+            sent = (await reading.consumer_info()).delivered
+            if sent is not None and sent.consumer_seq >= place and not reading.pending_msgs:
+                raise Error("messages were lost with a connection") from None

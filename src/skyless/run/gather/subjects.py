@@ -18,8 +18,36 @@ LIVE: Final = "skyless.v2.{}.live"
 """Every batch of the site once more, kept by no stream."""
 SUMMARY: Final = "skyless.v2.{}.summary"
 
+STATE: Final = (
+    "skyless.v1.{}.site",
+    "skyless.v1.{}.floor_plan",
+    "skyless.v1.{}.floor_plan.*",
+    "skyless.v1.{}.*.*.status",
+    "skyless.v1.{}.zones",
+    "skyless.v1.{}.assets",
+    "skyless.v1.{}.alarm_rules",
+    "skyless.v1.{}.survey.state",
+    "skyless.v1.{}.survey.placement",
+    "skyless.v1.{}.survey.watch",
+)
+"""Retained messages of MQTT of which the newest matters."""
+EVENTS: Final = ("skyless.v1.{}.zone.*.event", "skyless.v1.{}.alarm.*.*.state")
+"""Messages of MQTT of which each is an event."""
+
 FIX_STREAM: Final = "FIX_{}"
 NAMES_STREAM: Final = "NAMES_{}"
+STATE_STREAM: Final = "STATE_{}"
+EVENT_STREAM: Final = "EVENTS_{}"
+
+HUB_FIXES: Final = "FIXES"
+HUB_NAMES: Final = "NAMES"
+HUB_STATE: Final = "STATE"
+HUB_EVENTS: Final = "EVENTS"
+"""Streams of a hub, each of all sites of a tenant."""
+SOURCED: Final = "sourced.{}"
+"""How the subjects begin under which a site's messages come to the streams of a hub."""
+DOMAIN: Final = "site{}"
+"""JetStream's domain of a site."""
 
 NAME_REQUESTS: Final = "$JS.API.DIRECT.GET.*.skyless.v2.*.names.*"
 """Where the server is asked for the name of one number."""
@@ -43,6 +71,17 @@ def own_host() -> str:
 def tag_in(subject: str) -> str:
     """Name of the tag in a subject of ``JSON_FIXES``, as in the MQTT topic."""
     return subject.split(".")[4].replace("//", ".")
+
+
+def subject_of(topic: str) -> str:
+    """The subject of a topic of MQTT, or the pattern of a topic filter."""
+    levels = (level.replace(".", "//") for level in topic.split("/"))
+    return ".".join("*" if level == "+" else level for level in levels)
+
+
+def topic_of(subject: str) -> str:
+    """The topic of MQTT of a subject."""
+    return "/".join(level.replace("//", ".") for level in subject.split("."))
 
 
 def site_in(subject: str) -> int | None:

@@ -62,13 +62,16 @@ class MqttAddress(Struct, frozen=True):
         Raises:
             SkylessError: the file of certificates cannot be used.
         """
-        if not self.tls:
-            return None
-        try:
-            return ssl.create_default_context(cafile=self.ca)
-        except OSError as error:
-            reason = "it should hold certificates in PEM form" if isinstance(error, ssl.SSLError) else error.strerror
-            raise SkylessError(f"{self.ca} cannot be used as --mqtt-ca: {reason}") from None
+        return tls_context(self.ca) if self.tls else None
+
+
+def tls_context(ca: Path | None) -> ssl.SSLContext:
+    """The checks of a server's certificate; ``ca`` has those to trust. Raises SkylessError: it cannot be used."""
+    try:
+        return ssl.create_default_context(cafile=ca)
+    except OSError as error:
+        reason = "it should hold certificates in PEM form" if isinstance(error, ssl.SSLError) else error.strerror
+        raise SkylessError(f"{ca} cannot be used as --mqtt-ca: {reason}") from None
 
 
 def mqtt_address(url: str, ca: Path | None = None) -> MqttAddress:

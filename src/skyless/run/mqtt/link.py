@@ -93,7 +93,7 @@ class Link:
         self._status_topic = status_topic(site, kind, name)
         self._offline = StatusMessage(online=False, kind=kind, name=str(name))
         self._outbox = Outbox(limits or Limits())
-        self._subscriptions = _Subscriptions()
+        self._subscriptions = Subscriptions()
         self._reactions = Reactions(self._subscriptions.receive, self._acknowledged, self._pump)
         self._connection: Connection | None = None
         self._brokers = address.brokers
@@ -317,7 +317,7 @@ class Link:
         self._logged = ("", 0.0)
 
 
-class _Subscriptions:
+class Subscriptions:
     """The handlers of one link: a tree of the levels of their filters, and those found for the newest topics."""
 
     def __init__(self) -> None:

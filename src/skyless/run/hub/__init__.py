@@ -1,0 +1,1 @@
+"""The hub: NATS servers where the sites of a company meet (``docs/hub.md``)."""
