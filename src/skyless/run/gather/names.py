@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 MAX_NAMES: Final = 200_000
 _TAKEN: Final = 10071  # JetStream's code of an error
-_NEVER_WRITTEN: Final = {"Nats-Expected-Last-Subject-Sequence": "0"}
+NEVER_WRITTEN: Final = {"Nats-Expected-Last-Subject-Sequence": "0"}
 
 
 class TagName(Struct, frozen=True):
@@ -68,7 +68,7 @@ class Names:
                 number, tag = self.issue + 1, TagName(name, host, now_unix_s)
                 subject = subjects.at(subjects.NAMES, self._site, number)
                 try:
-                    await self._stream.publish(subject, msgspec.json.encode(tag), headers=dict(_NEVER_WRITTEN))
+                    await self._stream.publish(subject, msgspec.json.encode(tag), headers=dict(NEVER_WRITTEN))
                     self._add(number, tag)
                 except APIError as error:
                     if error.err_code != _TAKEN:
