@@ -33,8 +33,8 @@ def gather(
         NATS server with JetStream and MQTT, nats://[USER@]HOST[:PORT] or tls://...; the password is taken from
         SKYLESS_MQTT_PASSWORD.
     mqtt
-        The same server for MQTT, mqtt://[USER@]HOST[:PORT]: zones, plans and the like that it has kept are then in the
-        stream of the site's state from the start, and not from their next change on.
+        Broker to copy kept messages from: the same server, mqtt://[USER@]HOST[:PORT]. Zones, plans and the like are
+        then in the stream of the site's state from the start, and not from their next change on.
     """
     extra_module("nats", "skyless gather")
     from skyless.run.gather.node import Gather
