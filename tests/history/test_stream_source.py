@@ -2,9 +2,11 @@
 
 import asyncio
 from types import SimpleNamespace
+from unittest.mock import AsyncMock
 
 import numpy as np
 import pytest
+from nats.errors import Error
 
 from skyless.run.fix_batch import RECORD, Batch, encode_batch
 from skyless.run.gather.names import TagName
@@ -84,6 +86,17 @@ def test_names_that_never_come_hold_a_history_up_once(writer, monkeypatch):
     readings = names.readings
     take(writer, names, message(2, 5, 2, 1))
     assert (writer.fixes.taken, writer.drops["no-name"], names.readings) == (2, 1, readings)
+
+
+def test_a_batch_whose_names_could_not_be_read_is_taken_when_it_is_given_again(writer, monkeypatch):
+    names, batch = LateNames("a"), message(1, 5, 1, 1)
+    taker = BatchTaker(names, writer)
+    monkeypatch.setattr(names, "read", AsyncMock(side_effect=[Error("timeout")]))
+    with pytest.raises(Error):
+        asyncio.run(taker.take(batch))
+    monkeypatch.undo()
+    asyncio.run(taker.take(batch))
+    assert (writer.fixes.taken, writer.drops["lost-batches"]) == (1, 0)
 
 
 def test_bytes_that_are_no_batch_are_counted(writer):

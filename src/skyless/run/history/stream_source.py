@@ -48,9 +48,9 @@ class BatchTaker:
         except BadBatchError:
             self._writer.drops["wrong-batch"] += 1
             return
-        if not self._is_next(batch):
-            return
         await self._read_names(batch.names_issue)
+        if not self._is_next(batch):  # asked last: a message whose names could not be read is given again
+            return
         now_s = time.time()
         self._writer.fixes.add(self._renumbered(batch.records, now_s), now_s, place)
 
