@@ -69,6 +69,7 @@ NAVIGATION = {
         "docs/tools/prometheus",
         "docs/tools/geojson",
         "docs/tools/json_lines",
+        "docs/tools/omlox",
         "docs/tools/ardupilot",
         "docs/tools/px4",
         "docs/tools/stage",

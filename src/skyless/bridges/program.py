@@ -139,7 +139,7 @@ class BridgeNode:
     def _update_site(self) -> None:
         if self._site is None:
             return
-        site = self._site.site
+        site = self._site.whole_site
         zones = zones_of(self._zones, site.name).zones
         assets = assets_at(self._assets, site.name)
         try:

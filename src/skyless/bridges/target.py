@@ -16,7 +16,7 @@ from msgspec import Struct
 
 from skyless.core.alert import Alert
 from skyless.core.errors import SkylessError
-from skyless.core.site import GeoreferenceSite, Site, WallSite
+from skyless.core.site import FloorSite, GeoreferenceSite, Site, WallSite
 from skyless.run.mqtt.address import MqttAddress, hide_password
 from skyless.run.mqtt.messages import (
     AlarmMessage,
@@ -54,6 +54,7 @@ class BridgedSite(Struct, frozen=True):
     """A tag by itself knows none."""
     assets: Mapping[str, Asset] = {}
     """What tags are attached to, by tag."""
+    floors: tuple[FloorSite, ...] = ()
 
 
 def bridged_site(
@@ -62,7 +63,9 @@ def bridged_site(
     """The same of a whole site, as MQTT has it."""
     anchors_m = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
     earth = site.georeference
-    return BridgedSite(site.id, site.name, simulated, anchors_m, earth, zones, site.master, site.walls, assets or {})
+    return BridgedSite(
+        site.id, site.name, simulated, anchors_m, earth, zones, site.master, site.walls, assets or {}, site.floors or ()
+    )
 
 
 def is_usable(fix: FixMessage) -> bool:
