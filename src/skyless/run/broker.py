@@ -21,7 +21,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Final, Self
-from urllib.parse import urlsplit
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -40,12 +39,10 @@ from skyless.run.process import data_folder, end_with_parent, is_free, locked, r
 FIRST_PORT: Final = 1883
 _PORTS_TO_TRY: Final = 100
 
-_LOG: Final = "nats-server.log"
 _TEMPORARY: Final = "skyless-broker-"  # how the name of a temporary folder begins
 
 _MAX_STORED: Final = 4 * 1024**3
 _NATS_HOST: Final = "127.0.0.1"
-_FIRST_MONITOR: Final = 8222
 _SEND_AGAIN: Final = "3s"  # when a message that a dying subscriber has not acknowledged is sent again; 30 s by default
 
 _ABANDONED_S: Final = 10.0  # a temporary folder of this age that no broker has locked was left by one that was killed
@@ -118,9 +115,7 @@ class BrokerSettings(Struct, frozen=True):
         return MqttAddress(host, port, self.certificate is not None, self.user, self.password)
 
 
-def _configuration(
-    settings: BrokerSettings, port: int, data: Path, nats: NatsAddress | None = None, monitor: str | None = None
-) -> str:
+def _configuration(settings: BrokerSettings, port: int, data: Path, nats: NatsAddress | None = None) -> str:
     """The file for nats-server, whose format takes JSON. ``nats`` is the address for a gather."""
     host = f"[{settings.listen}]" if ":" in settings.listen else settings.listen
     mqtt: dict[str, object] = {"listen": f"{host}:{port}", "ack_wait": _SEND_AGAIN}
@@ -131,7 +126,7 @@ def _configuration(
         "listen": "127.0.0.1:-1" if nats is None else nats.url.partition("://")[2],  # NATS itself
         "max_payload": MAX_PAYLOAD,
         "jetstream": {"store_dir": str(data), "max_file_store": _MAX_STORED + (settings.gathered_bytes or 0)},
-        "log_file": str(data / _LOG),
+        "log_file": str(data / "nats-server.log"),
         "logfile_size_limit": 1_000_000,
         "logfile_max_num": 2,
         "mqtt": mqtt,
@@ -141,8 +136,7 @@ def _configuration(
         # Of two servers with one name the hub keeps the newer only, so that nobody could say that there are two.
         whole["server_name"] = f"{site}-{secrets.token_hex(4)}"
         whole["jetstream"]["domain"] = site
-        whole["leafnodes"] = settings.hub.configuration()
-        whole["http"] = monitor and urlsplit(monitor).netloc
+        whole |= {"leafnodes": settings.hub.configuration(), "connect_error_reports": 1}
     if settings.user is not None:
         whole["authorization"] = {"user": settings.user, "password": settings.password}
     if settings.roles is not None:
@@ -246,11 +240,9 @@ class Broker:
         lock: IO[str],
         reservation: socket.socket,
         nats: NatsAddress | None,
-        monitor: str | None,
     ) -> None:
         self.address = address  # its address for clients on this machine, credentials included
         self.nats = nats  # the same for its gather, None without one
-        self.monitor = monitor  # where nats-server says how it is, by HTTP; None without a hub
         self.data = data
         self._process, self._lock, self._reservation = process, lock, reservation
         self._stated = None if address.tls else StatedAddress(address, nats)  # its certificate is for other names
@@ -259,11 +251,6 @@ class Broker:
     def pid(self) -> int:
         """Process identifier of nats-server."""
         return self._process.pid
-
-    @property
-    def log(self) -> Path:
-        """The log of nats-server."""
-        return self.data / _LOG
 
     async def wait(self) -> int:
         """Wait until it ends. Returns its exit code."""
@@ -296,7 +283,7 @@ async def start_broker(settings: BrokerSettings | None = None) -> Broker:
     """
     settings = settings or BrokerSettings()
     settings.check()
-    program = nats_server()
+    program = _program()
     data, lock = _locked_folder(settings)
     last = FIRST_PORT + _PORTS_TO_TRY - 1
     try:
@@ -324,26 +311,20 @@ async def _start(program: Path, settings: BrokerSettings, port: int, data: Path,
                 nats_port, held = reserve_next(_NATS_HOST, FIRST_NATS_PORT)
                 until_it_listens.enter_context(held)
                 nats = NatsAddress(f"nats://{_NATS_HOST}:{nats_port}", *settings.operator)
-            monitor: str | None = None
-            if settings.hub is not None:
-                monitor_port, held = reserve_next(_NATS_HOST, _FIRST_MONITOR)
-                until_it_listens.enter_context(held)
-                monitor = f"http://{_NATS_HOST}:{monitor_port}"
-            text = _configuration(settings, port, data, nats, monitor)
-            process = await _spawn(program, settings, port, data, lock, text)
+            process = await _spawn(program, settings, port, data, lock, nats)
     except BaseException:
         reservation.close()
         raise
-    return Broker(settings.address(port), data, process, lock, reservation, nats, monitor)
+    return Broker(settings.address(port), data, process, lock, reservation, nats)
 
 
 async def _spawn(
-    program: Path, settings: BrokerSettings, port: int, data: Path, lock: IO[str], configuration: str
+    program: Path, settings: BrokerSettings, port: int, data: Path, lock: IO[str], nats: NatsAddress | None
 ) -> asyncio.subprocess.Process:
     """nats-server, when it accepts MQTT."""
     file = data / "nats-server.conf"
     try:
-        _write_private(file, configuration)
+        _write_private(file, _configuration(settings, port, data, nats))
     except OSError as error:
         raise SkylessError(f"{file} cannot be written: {error.strerror}") from None
     process = await asyncio.create_subprocess_exec(
@@ -386,7 +367,7 @@ async def _failure(process: asyncio.subprocess.Process, data: Path) -> Exception
     """Why nats-server ended at its start, from its log."""
     lines = (await process.stderr.read()).decode(errors="replace").splitlines() if process.stderr else []
     with contextlib.suppress(OSError):
-        log = (data / _LOG).read_text(encoding="utf-8", errors="replace")
+        log = (data / "nats-server.log").read_text(encoding="utf-8", errors="replace")
         lines += [line for line in log.splitlines() if line.startswith(f"[{process.pid}]")]
     faults = [line for line in lines if line.strip() and "[INF]" not in line]
     if any("address already in use" in line for line in faults):
@@ -401,7 +382,7 @@ def _release(data: Path, lock: IO[str], *, keep: bool = False) -> None:
     lock.close()
 
 
-def nats_server() -> Path:
+def _program() -> Path:
     """nats-server of the wheel, which is installed with this Python, else the system's."""
     here = Path(sysconfig.get_path("scripts")) / "nats-server"
     found = str(here) if here.exists() else shutil.which("nats-server")

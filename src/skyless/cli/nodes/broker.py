@@ -20,7 +20,7 @@ from skyless.run.broker import FIRST_PORT, Broker, BrokerSettings, start_broker
 from skyless.run.children import Child, Program
 from skyless.run.find_site import SiteOnBroker, watch_sites
 from skyless.run.gather.address import NatsAddress
-from skyless.run.hub.leaf import StuckLineError, read_leaf
+from skyless.run.hub.leaf import Leaf, StuckLineError, read_json
 from skyless.run.mqtt.access import Role, create_access, read_access
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress, mqtt_address
 from skyless.run.process import together
@@ -66,12 +66,10 @@ def broker(*, asked: BrokerOptions, gathered: GatherOptions, output: JsonOptions
     host, port = listen_address(asked.listen, FIRST_PORT)
     if asked.port is not None and port not in (None, asked.port):
         raise SkylessError(f"--port is {asked.port}, and --listen is {asked.listen!r}; give the port once")
-    leaf, site_id = None, gathered.site_id
-    if asked.hub is not None:
-        leaf = read_leaf(asked.hub)
-        if site_id not in (None, leaf.site):
-            raise SkylessError(f"--site-id is {site_id}; it should be left out, or {leaf.site} as in {asked.hub}")
-        site_id = leaf.site
+    leaf = None if asked.hub is None else read_json(asked.hub, Leaf, "skyless hub init")
+    if leaf is not None:
+        gathered.leave_out("site_id", why=f"{asked.hub} is of site {leaf.site}")
+    site_id = gathered.site_id if leaf is None else leaf.site
     settings = BrokerSettings(
         port=asked.port or port,
         listen=host,
@@ -128,8 +126,7 @@ def create_passwords(folder: Path, /, *, mqtt: str = "mqtt://127.0.0.1:1883", ou
 async def _serve(settings: BrokerSettings, of_gather: tuple[str, ...], history: Path | None, *, json: bool) -> None:
     while True:
         with contextlib.suppress(StuckLineError):
-            await _serve_once(settings, of_gather, history, json=json)
-            return
+            return await _serve_once(settings, of_gather, history, json=json)
         log("nats-server does not try to reach the hub any more; it is started again")
 
 
@@ -163,7 +160,7 @@ async def _serve_once(
 async def _ended(running: Broker) -> None:
     """Wait for the end that a broker should not have. Raises SkylessError then."""
     await running.wait()
-    raise SkylessError(f"nats-server has ended by itself; {running.log} may show why")
+    raise SkylessError(f"nats-server has ended by itself; {running.data / 'nats-server.log'} may show why")
 
 
 def _reader(settings: BrokerSettings, running: Broker) -> MqttAddress:

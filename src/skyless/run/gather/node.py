@@ -64,16 +64,8 @@ class Summary(Struct, frozen=True):
     """Fixes that are not in an acknowledged batch yet."""
     drops: dict[str, int]
     """Messages and fixes that were dropped, by reason."""
-    since: str = ""
-    """When the site's stream of fixes was made, in UTC; empty until it is known."""
-    cuts: int = 0
+    cuts: int
     """How often the connection was made again; the server ends that of a reader which is too slow."""
-
-
-async def since(stream: JetStreamContext, site: int) -> str:
-    """When the site's stream of fixes was made. Raises nats.errors.Error: it is not there."""
-    created = (await stream.stream_info(subjects.at(subjects.FIX_STREAM, site))).created
-    return "" if created is None else created.isoformat(timespec="microseconds")
 
 
 class Gather:
@@ -94,7 +86,6 @@ class Gather:
         self._condition = SiteCondition(time.monotonic())
         self._since = ""
         self._batches = 0
-        self._since = ""
 
     @property
     def summary(self) -> Summary:
@@ -119,7 +110,6 @@ class Gather:
             batches=self._batches,
             waiting=waiting,
             drops=dict(self._packer.drops),
-            since=self._since,
             cuts=0 if self._client is None else self._client.stats["reconnects"],
         )
 
@@ -175,7 +165,6 @@ class Gather:
                 await self._copy_state(stream, site)
                 names = Names(stream, site)
                 await names.read()
-                self._since = await since(stream, site)
                 self._names = names
                 while True:
                     await self._send_waiting(stream, site, names)

@@ -23,9 +23,7 @@ KEEP_S: Final = 24 * 3600.0
 KEEP_EVENTS_S: Final = 365 * 24 * 3600.0
 EVENT_BYTES: Final = 500_000_000
 
-NO_ROOM: Final = 10047
-"""JetStream's code of an error."""
-
+_NO_ROOM: Final = 10047  # JetStream's code of an error
 _DUPLICATES_S: Final = 120.0
 _READ_S: Final = 10.0
 _IDLE_S: Final = 2.0
@@ -73,7 +71,7 @@ async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -
         try:
             await make_stream(stream, config)
         except APIError as error:
-            if error.err_code != NO_ROOM:
+            if error.err_code != _NO_ROOM:
                 raise
             right = f"less than the server's max_file_store leaves: {error.description}"
             raise SkylessError(f"--keep-gb is {keep_bytes / 1e9:g}; it should be {right}") from None

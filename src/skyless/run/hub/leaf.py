@@ -1,12 +1,14 @@
 """The file of a site's line to a hub: ``skyless hub init`` writes it, ``skyless broker --hub`` reads it."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
 
 from skyless.core.errors import SkylessError
+
+Kind = TypeVar("Kind")
 
 
 class StuckLineError(Exception):
@@ -27,10 +29,7 @@ class Leaf(Struct, frozen=True, kw_only=True):
     """Certificates to trust, an absolute path; None without TLS."""
 
     def configuration(self) -> dict[str, Any]:
-        """``leafnodes`` of nats-server.
-
-        MQTT's own subjects stay at the site: sites of a tenant share its account, and each keeps its retained messages.
-        """
+        """What nats-server needs. MQTT's own subjects stay at the site: sites of a tenant share its account."""
         urls = [url.replace("://", f"://{self.user}:{self.password}@", 1) for url in self.urls]
         remote: dict[str, Any] = {"urls": urls, "deny_imports": ["$MQTT.>"], "deny_exports": ["$MQTT.>"]}
         if self.ca is not None:
@@ -38,15 +37,10 @@ class Leaf(Struct, frozen=True, kw_only=True):
         return {"no_advertise": True, "remotes": [remote]}
 
 
-def read_leaf(file: Path) -> Leaf:
-    """The file that ``--hub`` names. Raises SkylessError."""
+def read_json(file: Path, kind: type[Kind], maker: str) -> Kind:
+    """A file of a hub. Raises SkylessError: it cannot be read, or ``maker`` has not made it."""
     try:
-        leaf = msgspec.json.decode(file.read_bytes(), type=Leaf)
-    except OSError as error:
-        raise SkylessError(f"--hub is {str(file)!r}, which cannot be read: {error.strerror}") from None
-    except (msgspec.DecodeError, UnicodeError) as error:
-        right = "a file of the folder sites of skyless hub init"
-        raise SkylessError(f"--hub is {str(file)!r}; it should be {right}: {error}") from None
-    if leaf.ca is not None and not Path(leaf.ca).is_file():
-        raise SkylessError(f"--hub is {str(file)!r}, whose ca {leaf.ca!r} is missing; copy the hub's ca.pem there")
-    return leaf
+        return msgspec.json.decode(file.read_bytes(), type=kind)
+    except (OSError, msgspec.DecodeError, UnicodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise SkylessError(f"{file} cannot be used: {reason}; {maker} makes it") from None
