@@ -88,7 +88,7 @@ def test_a_site_publishes_its_own_and_no_tenant_sees_another(tmp_path, capsys):
 
 
 def test_a_number_that_another_site_has_is_refused(tmp_path, capsys):
-    with running_hub(tmp_path) as (hub, _):
+    with running_hub(tmp_path):
         apply(tmp_path, capsys)
         leaf = tmp_path / "hub" / "sites" / "plant-site7.json"
         broker = (*SKYLESS, "broker", "--gather", "--keep-gb", "0.1", "--hub", str(leaf))
