@@ -112,3 +112,4 @@ _POSITIONAL |= dict.fromkeys(("site keys new", "site keys rotate", "site keys re
 _POSITIONAL["study"] = ("loss",)
 _POSITIONAL |= dict.fromkeys(("history track", "history contacts"), ("x",))
 _POSITIONAL["history run"] = ("--to", "x")
+_POSITIONAL["hub init"] = ("x",)

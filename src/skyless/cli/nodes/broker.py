@@ -69,7 +69,7 @@ def broker(*, asked: BrokerOptions, gathered: GatherOptions, output: JsonOptions
     leaf = None if asked.hub is None else read_json(asked.hub, Leaf, "skyless hub init")
     if leaf is not None:
         gathered.leave_out("site_id", why=f"{asked.hub} is of site {leaf.site}")
-    site_id = gathered.site_id if leaf is None else leaf.site
+        gathered = replace(gathered, site_id=leaf.site)
     settings = BrokerSettings(
         port=asked.port or port,
         listen=host,
@@ -96,9 +96,8 @@ def broker(*, asked: BrokerOptions, gathered: GatherOptions, output: JsonOptions
                 f"--history is {str(history)!r}; with --certificate, whose names only clients know, start "
                 f"skyless history run --to {history} --mqtt mqtts://NAME instead"
             )
-    named = () if site_id is None else ("--site-id", str(site_id))
-    of_gather = ("--keep-gb", str(gathered.keep_gb), *named)
-    run_until_stopped(_serve(settings, of_gather, history, json=output.json))
+    named = () if gathered.site_id is None else ("--site-id", str(gathered.site_id))
+    run_until_stopped(_serve(settings, ("--keep-gb", str(gathered.keep_gb), *named), history, json=output.json))
 
 
 @app.command(name="access", help_epilogue="Example: skyless broker access passwords --mqtt mqtts://hall.local")

@@ -25,10 +25,8 @@ LEAF_PORT: Final = 3200
 MONITOR_PORT: Final = 4000
 """What is added to a node's port for other servers of the hub, for sites, and for monitoring on the node itself."""
 PLAN: Final = "hub.json"
-SERVER: Final = "nats-server.conf"
 
 _NODE: Final = re.compile(r"([A-Za-z0-9][A-Za-z0-9.-]*)(?::(\d{1,5}))?")
-_MAX_PORT: Final = 0xFFFF - MONITOR_PORT
 _CLUSTER: Final = "hub.node"
 _ADMIN: Final = "hub.admin"
 _SITE: Final = "{}.site{}"
@@ -50,8 +48,9 @@ class Node(Struct, frozen=True):
 def read_node(option: str, text: str) -> Node:
     """HOST or HOST:PORT. Raises SkylessError."""
     found = _NODE.fullmatch(text)
-    if found is None or not 1 <= int(found[2] or FIRST_PORT) <= _MAX_PORT:
-        raise SkylessError(f"{option} is {text!r}; it should be HOST or HOST:PORT, the port at most {_MAX_PORT}")
+    most = 0xFFFF - MONITOR_PORT
+    if found is None or not 1 <= int(found[2] or FIRST_PORT) <= most:
+        raise SkylessError(f"{option} is {text!r}; it should be HOST or HOST:PORT, the port at most {most}")
     return Node(found[1], int(found[2] or FIRST_PORT))
 
 
@@ -73,22 +72,17 @@ class Hub(Struct, frozen=True):
         """Certificates that all machines trust; None without TLS, on one machine alone."""
         return None if all(is_loopback(node.host) for node in self.nodes) else f"{self.certificates}/ca.pem"
 
-    def address(self, tenant: str) -> NatsAddress:
-        """Where a tenant's programs connect."""
-        hosts = ",".join(f"{node.host}:{node.port}" for node in self.nodes)
-        return NatsAddress(
-            f"{self._scheme}://{hosts}", tenant, self.passwords[tenant], Path(self.ca) if self.ca else None
-        )
+    def address(self, user: str, added: int = 0) -> NatsAddress:
+        """Where a user connects; what is ``added`` to the ports says for what."""
+        hosts = ",".join(f"{node.host}:{node.port + added}" for node in self.nodes)
+        url, ca = (f"nats://{hosts}", None) if self.ca is None else (f"tls://{hosts}", Path(self.ca))
+        return NatsAddress(url, user, self.passwords[user], ca)
 
     def leaf(self, tenant: str, site: int) -> Leaf:
         """What a site needs."""
-        urls = [f"{self._scheme}://{node.host}:{node.port + LEAF_PORT}" for node in self.nodes]
         user = _SITE.format(tenant, site)
+        urls = self.address(user, LEAF_PORT).servers
         return Leaf(site=site, tenant=tenant, urls=urls, user=user, password=self.passwords[user], ca=self.ca)
-
-    @property
-    def _scheme(self) -> str:
-        return "nats" if self.ca is None else "tls"
 
 
 def with_sites(hub: Hub, tenant: str, sites: Iterable[int]) -> Hub:
@@ -100,7 +94,7 @@ def with_sites(hub: Hub, tenant: str, sites: Iterable[int]) -> Hub:
 
 def write_files(hub: Hub, folder: Path) -> list[Path]:
     """Write what has changed, for the owner alone. The files' paths. Raises SkylessError."""
-    values: dict[Path, object] = {folder / node.name / SERVER: _server(hub, node) for node in hub.nodes}
+    values: dict[Path, object] = {folder / node.name / "nats-server.conf": _server(hub, node) for node in hub.nodes}
     for tenant, sites in hub.sites.items():
         values |= {folder / "sites" / f"{tenant}-site{site}.json": hub.leaf(tenant, site) for site in sites}
     values[folder / PLAN] = hub

@@ -35,23 +35,19 @@ async def watch_line(leaf: Leaf, broker: Broker, log: Log) -> None:
         found = re.findall(rf"^\[{broker.pid}\] (.*leaf.*)$", text, re.MULTILINE | re.IGNORECASE)
         before, newest = newest, found[-1] if found else newest
         faults = [line.partition("] ")[2] for line in found[-2:] if "[ERR]" in line]
-        state, is_up = said, _UP in newest
+        state, is_up = "", _UP in newest
         if is_up and newest == before:
             state = f"the line to the hub is up, as site {leaf.site} of {leaf.tenant}"
         elif faults and not is_up:
             state = f"no line to the hub; the site works on without it: {faults[-1]}"
-        if _kind(state) != _kind(said):
-            said = state
+        kind = re.sub(r"\d+", "", state.rpartition(": ")[2])  # the same at every try
+        if state and kind != said:
+            said = kind
             log(state)
         if is_up or newest != before:
             tried_s = time.monotonic()
         elif time.monotonic() > tried_s + _STUCK_S:
             raise StuckLineError
-
-
-def _kind(state: str) -> str:
-    """What is the same at every try."""
-    return re.sub(r"\d+", "", state.rpartition(": ")[2])
 
 
 async def refuse_second(leaf: Leaf, address: NatsAddress, log: Log) -> None:

@@ -2,11 +2,9 @@
 
 import asyncio
 from collections import Counter
-from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final
 
 import msgspec
-from msgspec import Struct
 from nats.errors import Error
 from nats.js.api import ExternalStream, StreamConfig, StreamSource
 
@@ -27,25 +25,16 @@ _RETRY_S: Final = 1.0
 _LISTEN_S: Final = 2.5
 
 
-class HubLimits(Struct, frozen=True):
-    """What the streams of a tenant may take at each server of a hub."""
-
-    replicas: int = 3
-    fix_bytes: int = 50_000_000_000
-    event_bytes: int = 4 * EVENT_BYTES
-
-
-async def make_hub_streams(stream: "JetStreamContext", sites: Iterable[int], limits: HubLimits) -> None:
+async def make_hub_streams(stream: "JetStreamContext", hub: Hub, tenant: str) -> None:
     """Make the streams of a tenant, or add sites to those that are there. Raises nats.errors.Error."""
-    numbers = sorted(set(sites))
     for config in (
         StreamConfig(name=subjects.HUB_STATE, max_msgs_per_subject=1, allow_direct=True),
         StreamConfig(name=subjects.HUB_NAMES, max_msgs_per_subject=1, allow_direct=True),
-        StreamConfig(name=subjects.HUB_EVENTS, max_age=KEEP_EVENTS_S, max_bytes=limits.event_bytes),
-        StreamConfig(name=subjects.HUB_FIXES, max_age=_KEEP_FIXES_S, max_bytes=limits.fix_bytes),
+        StreamConfig(name=subjects.HUB_EVENTS, max_age=KEEP_EVENTS_S, max_bytes=4 * EVENT_BYTES),
+        StreamConfig(name=subjects.HUB_FIXES, max_age=_KEEP_FIXES_S, max_bytes=round(1e9 * hub.fixes_gb)),
     ):
-        config.num_replicas = limits.replicas
-        config.sources = [_source(_OF_SITE[config.name or ""], site) for site in numbers]
+        config.num_replicas = len(hub.nodes)
+        config.sources = [_source(_OF_SITE[config.name or ""], site) for site in hub.sites[tenant]]
         await make_stream(stream, config)
 
 
@@ -69,13 +58,12 @@ async def make_streams_of(hub: Hub, tenant: str, log: Log) -> dict[int, Summary 
     Raises SkylessError: the hub is not ready within a minute.
     """
     address, say = hub.address(tenant), rarely(lambda trouble: log(f"waits for the hub: {trouble}"))
-    limits = HubLimits(replicas=len(hub.nodes), fix_bytes=round(1e9 * hub.fixes_gb))
     try:
         async with asyncio.timeout(_READY_S):
             client = await connect(address, "skyless hub", say, Counter())
             while True:
                 try:
-                    await make_hub_streams(client.jetstream(), hub.sites[tenant], limits)
+                    await make_hub_streams(client.jetstream(), hub, tenant)
                     break
                 except (Error, TimeoutError) as error:
                     say(str(error) or type(error).__name__)
