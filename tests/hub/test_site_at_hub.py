@@ -6,6 +6,7 @@ import json
 
 import nats
 import pytest
+from nats.errors import NoRespondersError
 
 from skyless.cli.main import main
 from skyless.run.broker import BrokerSettings, _program, start_broker
@@ -79,6 +80,8 @@ def test_a_site_publishes_its_own_and_no_tenant_sees_another(tmp_path, capsys):
             async with asyncio.timeout(60):
                 while (await stored.stream_info("STATE")).state.messages == 0:
                     await asyncio.sleep(0.2)
+            with pytest.raises(NoRespondersError):
+                await plant.request("$JS.site7.API.STREAM.PURGE.STATE_7")
             for client in (plant, other, near, far):
                 await client.close()
 

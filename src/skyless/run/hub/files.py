@@ -154,5 +154,6 @@ def _user(hub: Hub, name: str, access: dict[str, Any] | None = None) -> dict[str
 def _access(site: int) -> dict[str, Any]:
     """A site publishes what is its own, and takes what the hub's streams ask of it, but no command."""
     publish = [f"skyless.v1.{site}.>", f"skyless.v2.{site}.>", f"{at(SOURCED, site)}.>", "$JSC.R.>", "$JS.R.>", "_R_.>"]
-    subscribe = [f"$JS.{at(DOMAIN, site)}.API.>", "$JS.ACK.>", "$JS.FC.>", at(SUMMARY, site)]
-    return {"permissions": {"publish": {"allow": publish}, "subscribe": {"allow": subscribe}}}
+    asked = f"$JS.{at(DOMAIN, site)}.API"
+    subscribe = {"allow": [f"{asked}.>", "$JS.ACK.>", "$JS.FC.>", at(SUMMARY, site)], "deny": [f"{asked}.STREAM.>"]}
+    return {"permissions": {"publish": {"allow": publish}, "subscribe": subscribe}}

@@ -42,5 +42,4 @@ def read_json(file: Path, kind: type[Kind], maker: str) -> Kind:
     try:
         return msgspec.json.decode(file.read_bytes(), type=kind)
     except (OSError, msgspec.DecodeError, UnicodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise SkylessError(f"{file} cannot be used: {reason}; {maker} makes it") from None
+        raise SkylessError(f"{file} cannot be used: {getattr(error, 'strerror', error)}; {maker} makes it") from None
