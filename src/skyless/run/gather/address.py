@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
 
 FIRST_PORT: Final = 4222
+MAX_PAYLOAD: Final = 8 * 1024 * 1024
+"""Bytes of a message, such as a floor plan, that a site's server and a hub take."""
 _RETRY_S: Final = 0.5
 _CONNECT_S: Final = 2
 _PING_S: Final = 5

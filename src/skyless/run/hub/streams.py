@@ -1,39 +1,40 @@
 """The streams of a hub, which take what the sites' own streams have whenever their lines are up."""
 
-from collections.abc import Iterable
+import asyncio
+from collections import Counter
 from typing import TYPE_CHECKING, Final
 
-from msgspec import Struct
+import msgspec
+from nats.errors import Error
 from nats.js.api import ExternalStream, StreamConfig, StreamSource
 
+from skyless.core.errors import SkylessError
 from skyless.run.gather import subjects
+from skyless.run.gather.address import connect, rarely
+from skyless.run.gather.node import Summary
 from skyless.run.gather.streams import EVENT_BYTES, KEEP_EVENTS_S, make_stream
+from skyless.run.hub.files import Hub
+from skyless.run.process import Log
 
 if TYPE_CHECKING:
     from nats.js import JetStreamContext
 
 _KEEP_FIXES_S: Final = 24 * 3600.0
+_READY_S: Final = 60.0
+_RETRY_S: Final = 1.0
+_LISTEN_S: Final = 2.5
 
 
-class HubLimits(Struct, frozen=True):
-    """What the streams of a tenant may take at each server of a hub."""
-
-    replicas: int = 3
-    fix_bytes: int = 50_000_000_000
-    event_bytes: int = 4 * EVENT_BYTES
-
-
-async def make_hub_streams(stream: "JetStreamContext", sites: Iterable[int], limits: HubLimits) -> None:
+async def make_hub_streams(stream: "JetStreamContext", hub: Hub, tenant: str) -> None:
     """Make the streams of a tenant, or add sites to those that are there. Raises nats.errors.Error."""
-    numbers = sorted(set(sites))
     for config in (
         StreamConfig(name=subjects.HUB_STATE, max_msgs_per_subject=1, allow_direct=True),
         StreamConfig(name=subjects.HUB_NAMES, max_msgs_per_subject=1, allow_direct=True),
-        StreamConfig(name=subjects.HUB_EVENTS, max_age=KEEP_EVENTS_S, max_bytes=limits.event_bytes),
-        StreamConfig(name=subjects.HUB_FIXES, max_age=_KEEP_FIXES_S, max_bytes=limits.fix_bytes),
+        StreamConfig(name=subjects.HUB_EVENTS, max_age=KEEP_EVENTS_S, max_bytes=4 * EVENT_BYTES),
+        StreamConfig(name=subjects.HUB_FIXES, max_age=_KEEP_FIXES_S, max_bytes=round(1e9 * hub.fixes_gb)),
     ):
-        config.num_replicas = limits.replicas
-        config.sources = [_source(_OF_SITE[config.name or ""], site) for site in numbers]
+        config.num_replicas = len(hub.nodes)
+        config.sources = [_source(_OF_SITE[config.name or ""], site) for site in hub.sites[tenant]]
         await make_stream(stream, config)
 
 
@@ -49,3 +50,29 @@ def _source(pattern: str, site: int) -> StreamSource:
     api = f"$JS.{subjects.at(subjects.DOMAIN, site)}.API"
     external = ExternalStream(api=api, deliver=subjects.at(subjects.SOURCED, site))
     return StreamSource(name=subjects.at(pattern, site), external=external)
+
+
+async def make_streams_of(hub: Hub, tenant: str, log: Log) -> dict[int, Summary | None]:
+    """Make the streams of a tenant, or extend them. Returns what each site says; None where it is not heard.
+
+    Raises SkylessError: the hub is not ready within a minute.
+    """
+    address, say = hub.address(tenant), rarely(lambda trouble: log(f"waits for the hub: {trouble}"))
+    try:
+        async with asyncio.timeout(_READY_S):
+            client = await connect(address, "skyless hub", say, Counter())
+            while True:
+                try:
+                    await make_hub_streams(client.jetstream(), hub, tenant)
+                    break
+                except (Error, TimeoutError) as error:
+                    say(str(error) or type(error).__name__)
+                await asyncio.sleep(_RETRY_S)
+    except TimeoutError:
+        raise SkylessError(f"the hub {address} is not ready, or has no room for --fixes-gb {hub.fixes_gb:g}") from None
+    async with client:
+        heard = await client.subscribe(subjects.at(subjects.SUMMARY, subjects.EVERY))
+        await asyncio.sleep(_LISTEN_S)
+        messages = [await heard.next_msg() for _ in range(heard.pending_msgs)]
+    found = {subjects.site_in(one.subject): msgspec.json.decode(one.data, type=Summary) for one in messages}
+    return {site: found.get(site) for site in hub.sites[tenant]}

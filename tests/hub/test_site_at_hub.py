@@ -1,0 +1,120 @@
+"""Real sites at a real hub of one server: each publishes its own, no tenant sees another, a number is given once."""
+
+import asyncio
+import contextlib
+import json
+
+import nats
+import pytest
+from nats.errors import NoRespondersError
+
+from skyless.cli.main import main
+from skyless.run.broker import BrokerSettings, _program, start_broker
+from skyless.run.gather.node import Gather
+from skyless.run.hub.files import MONITOR_PORT, Hub
+from skyless.run.hub.leaf import read_json
+from support.processes import SKYLESS, free_port, started
+
+pytestmark = pytest.mark.site
+
+
+@contextlib.contextmanager
+def running_hub(folder):
+    port = next(port for port in iter(free_port, None) if port < 0xFFFF - MONITOR_PORT)
+    for words in (("--sites", "7,8"), ("--sites", "7", "--tenant", "other")):
+        node = ("--node", f"127.0.0.1:{port}", "--data", str(folder / "data"), "--fixes-gb", "0.1")
+        assert main(["hub", "init", str(folder / "hub"), *node, *words]) == 0
+    with started(_program(), "-c", folder / "hub" / f"127.0.0.1-{port}" / "nats-server.conf") as server:
+        yield read_json(folder / "hub" / "hub.json", Hub, ""), server
+
+
+def apply(folder, capsys):
+    capsys.readouterr()
+    assert main(["hub", "apply", str(folder / "hub"), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)["tenants"]
+
+
+async def client_of(address, **more):
+    return await nats.connect(address.servers, user=address.user, password=address.password, **more)
+
+
+@contextlib.asynccontextmanager
+async def site(folder, hub, tenant="plant", number=7):
+    settings = BrokerSettings(
+        port=free_port(), data=folder / f"{tenant}{number}", gathered_bytes=10**8, hub=hub.leaf(tenant, number)
+    )
+    async with await start_broker(settings) as running:
+        gather = asyncio.ensure_future(Gather(running.nats, number, 10**8, print).run())
+        try:
+            yield running
+        finally:
+            gather.cancel()
+            await asyncio.gather(gather, return_exceptions=True)
+
+
+def test_a_site_publishes_its_own_and_no_tenant_sees_another(tmp_path, capsys):
+    async def run(hub):
+        async with site(tmp_path, hub) as one, site(tmp_path, hub, "other") as two:
+            plant, other = await client_of(hub.address("plant")), await client_of(hub.address("other"))
+            near, far = await client_of(one.nats), await client_of(two.nats)
+            seen, unseen, commands = await plant.subscribe("skyless.>"), await other.subscribe(">"), []
+            heard = await near.subscribe("skyless.v1.7.*")
+            for subject in ("skyless.v1.8.site", "skyless.v1.7.zones"):
+                await plant.publish("skyless.v1.7.request", b"a command")
+                await near.publish(subject, subject.encode())
+            await far.publish("skyless.v1.7.assets", b"of the other tenant")
+            subjects, others = set(), set()
+            async with asyncio.timeout(30):
+                while "skyless.v1.7.zones" not in subjects:
+                    await near.publish("skyless.v1.7.zones", b"")
+                    subjects.add((await seen.next_msg(20)).subject)
+                while "skyless.v1.7.assets" not in others:
+                    await far.publish("skyless.v1.7.assets", b"")
+                    others.add((await unseen.next_msg(20)).subject)
+            assert not any(subject.startswith(("skyless.v1.8", "skyless.v1.7.assets")) for subject in subjects)
+            assert "skyless.v1.7.zones" not in others
+            while heard.pending_msgs:
+                commands.append((await heard.next_msg()).subject)
+            assert "skyless.v1.7.request" not in commands
+            stored = plant.jetstream()
+            async with asyncio.timeout(60):
+                while (await stored.stream_info("STATE")).state.messages == 0:
+                    await asyncio.sleep(0.2)
+            with pytest.raises(NoRespondersError):
+                await plant.request("$JS.site7.API.STREAM.PURGE.STATE_7")
+            for client in (plant, other, near, far):
+                await client.close()
+
+    with running_hub(tmp_path) as (hub, _):
+        assert apply(tmp_path, capsys) == {"plant": {"7": None, "8": None}, "other": {"7": None}}
+        asyncio.run(run(hub))
+
+
+def test_a_number_that_another_site_has_is_refused(tmp_path, capsys):
+    with running_hub(tmp_path):
+        apply(tmp_path, capsys)
+        leaf = tmp_path / "hub" / "sites" / "plant-site7.json"
+        broker = (*SKYLESS, "broker", "--gather", "--keep-gb", "0.1", "--hub", str(leaf))
+        with started(*broker, "--port", str(free_port()), "--data", str(tmp_path / "a")) as first:
+            assert "the line to the hub is up" in first.stderr.readline()
+            with started(*broker, "--port", str(free_port()), "--data", str(tmp_path / "b")) as second:
+                lines = second.stderr.read()
+                assert second.wait() == 2
+            assert "--hub is of site 7, which is already at this hub" in lines.splitlines()[-1]
+            assert apply(tmp_path, capsys)["plant"]["7"] is not None
+            assert first.poll() is None
+
+
+def test_a_wrong_password_and_a_hub_that_is_away_are_said_once_and_the_site_works(tmp_path, capsys):
+    with running_hub(tmp_path) as (hub, server):
+        leaf = tmp_path / "leaf.json"
+        text = (tmp_path / "hub" / "sites" / "plant-site7.json").read_text()
+        leaf.write_text(text.replace(hub.leaf("plant", 7).password, "x"))
+        words = ("--gather", "--keep-gb", "0.1", "--hub", str(leaf), "--port", str(free_port()))
+        with started(*SKYLESS, "broker", *words, "--data", str(tmp_path / "a")) as broker:
+            assert broker.stdout.readline().startswith("mqtt://")
+            assert "Authorization Violation" in broker.stderr.readline()
+            server.kill()
+            assert "connection refused" in broker.stderr.readline()
+            broker.terminate()
+            assert broker.stderr.read() == ""
