@@ -69,6 +69,11 @@ class HubSites:
         """Whether the hub is."""
         return self._client is not None and self._client.is_connected
 
+    @property
+    def has_answered(self) -> bool:
+        """Whether the hub has been connected."""
+        return self._client is not None
+
     def add_site(self, topic: str, payload: bytes) -> None:
         """A site has published itself."""
         self._known.add(topic, payload)
