@@ -22,7 +22,10 @@ OF_SEVERAL_TYPES = {
 }
 """Options whose type differs, and what they mean all the same."""
 
-OF_SEVERAL_MEANINGS = {"--to": "where something goes; where the history is asked, when a range of time ends"}
+OF_SEVERAL_MEANINGS = {
+    "--to": "where something goes; where the history is asked, when a range of time ends",
+    "--from": "where something comes from; where the history is asked, when a range of time begins",
+}
 
 
 def commands(app, path=()):

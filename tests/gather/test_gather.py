@@ -256,6 +256,27 @@ async def test_the_site_is_found_and_its_programs_are_counted(tmp_path):
         assert (node.site, summary.site, summary.simulated) == (SITE, "hall", True)
 
 
+async def test_what_the_broker_had_kept_before_is_in_the_stream_of_the_state_and_newer_messages_stay(tmp_path):
+    async with broker(tmp_path) as running, client_of(running.nats) as client:
+        link = Link(running.address, "1", site=SITE, kind="anchor")
+        task = asyncio.ensure_future(link.run())
+        for n in range(2):
+            for topic in ("zones", "floor_plan/2"):
+                link.publish(f"skyless/v1/{SITE}/{topic}", f"{n}".encode(), qos=1, retain=True)
+            await until(lambda: link.connected and not link.unacknowledged)
+            node = Gather(running.nats, SITE, KEEP_BYTES, print, running.address)
+            gathering = asyncio.ensure_future(node.run())
+            await until(lambda node=node: node.summary.online.get("anchor"))
+            stream = client.jetstream()
+            for subject in ("zones", "floor_plan.2"):
+                found = await stream.get_last_msg("STATE_7", f"skyless.v1.{SITE}.{subject}", direct=True)
+                assert found.data == f"{n}".encode()
+            gathering.cancel()
+            await asyncio.gather(gathering, return_exceptions=True)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
 async def test_a_dashboard_reads_batches_and_names_with_the_role_of_a_page(tmp_path):
     create_access(tmp_path / "access", MqttAddress("127.0.0.1", 1))
     roles = read_access(tmp_path / "access")
@@ -289,7 +310,18 @@ async def test_more_than_the_server_has_room_for_is_refused(tmp_path):
             await Gather(running.nats, SITE, 10**12, print).run()
 
 
-WRONG = ("", "4222", "mqtt://a", "nats://", "nats://a:0", "nats://a:x", "nats://a/b", "nats://u:secret@")
+WRONG = (
+    "",
+    "4222",
+    "mqtt://a",
+    "nats://",
+    "nats://a:0",
+    "nats://a:x",
+    "nats://a/b",
+    "nats://u:secret@",
+    "nats://u:secret@a,",
+    "nats://a,b/c",
+)
 
 
 @pytest.mark.parametrize("url", WRONG)
@@ -297,6 +329,13 @@ def test_a_wrong_address_is_named_without_its_password(url):
     with pytest.raises(SkylessError, match=r"--nats is .*; it should be nats://") as raised:
         nats_address(url)
     assert "secret" not in str(raised.value)
+
+
+def test_the_servers_of_a_hub_are_listed_with_commas():
+    address = nats_address("tls://plant:secret@a,b:4223,[::1]:4224")
+    assert address.servers == ["tls://a:4222", "tls://b:4223", "tls://[::1]:4224"]
+    assert (address.user, address.password) == ("plant", "secret")
+    assert str(address) == "tls://plant@a:4222,b:4223,[::1]:4224"
 
 
 def test_addresses(monkeypatch):

@@ -14,9 +14,11 @@ from skyless.cli.history_queries import questions
 from skyless.cli.nodes.options import MqttOptions, SiteId, log
 from skyless.core.arguments import Positive
 from skyless.core.errors import SkylessError
+from skyless.core.extras import extra_module
 
 if TYPE_CHECKING:
     from skyless.run.gather.address import NatsAddress
+    from skyless.run.history.hub_source import HubHistory
     from skyless.run.history.program import HistoryNode, HistoryState
     from skyless.run.history.retention import Keep
     from skyless.run.mqtt.address import MqttAddress
@@ -36,13 +38,14 @@ def run(
     to: HistoryFolder,
     broker: MqttOptions,
     nats: Annotated[str | None, Parameter(env_var="SKYLESS_NATS")] = None,
+    from_: Annotated[str | None, Parameter(name="--from")] = None,
     site_id: SiteId | None = None,
     keep_days: Positive = 400.0,
     full_days: Positive = 7.0,
     event_days: Positive = 365.0,
     json: bool = False,
 ) -> int:
-    """Keep the fixes and events of a running site until Ctrl-C, in Parquet files that any tool can read.
+    """Keep the fixes and events of a running site, or of a hub's, until Ctrl-C, in Parquet files for any tool.
 
     What was received 0.1 s before a kill -9 is kept. Give the same folder at every start. The exit code is 1 where the
     disk did not take everything.
@@ -53,6 +56,8 @@ def run(
         Where fixes are kept: a folder, which several sites may share.
     nats
         NATS server of a site with a gather, nats://[USER@]HOST[:PORT] or tls://...: its stream then gives the fixes.
+    from_
+        Servers of a hub, nats://[USER@]HOST[:PORT],HOST... or tls://...: all its sites are kept, or that of --site-id.
     site_id
         Number of the site; by default the one whose programs are online.
     keep_days
@@ -68,15 +73,21 @@ def run(
     from skyless.run.gather.address import nats_address
     from skyless.run.history.retention import Keep
 
-    address = broker.address()
-    if address is None:
-        raise SkylessError("--mqtt is 'none'; it should be the broker of the site whose history to keep")
-    address.tls_context()
-    stream = None if nats is None else nats_address(nats)
+    keep = Keep(keep_days, full_days, event_days)
+    found: list[HistoryNode | HubHistory] = []
+    if from_ is not None:
+        extra_module("nats", "--from")
+        if broker.mqtt is not None or nats is not None:
+            raise SkylessError(f"--from is {from_!r}; give it without --mqtt and --nats, which are of a single site")
+        hub = nats_address(from_, "--from", broker.mqtt_ca)
+        hub.tls_context()
+        work = _keep_of_hub(to, hub, site_id, keep, found)
+    else:
+        address = broker.required("the broker of the site whose history to keep")
+        work = _keep_history(to, address, site_id, keep, found, None if nats is None else nats_address(nats))
     make_folder("--to", to)
-    found: list[HistoryNode] = []
     with contextlib.suppress(KeyboardInterrupt):
-        process.run(_keep_history(to, address, site_id, Keep(keep_days, full_days, event_days), found, stream))
+        process.run(work)
     state = found[0].state() if found else None
     if json:
         import msgspec
@@ -94,7 +105,7 @@ async def _keep_history(
     address: "MqttAddress",
     site_id: int | None,
     keep: "Keep",
-    found: "list[HistoryNode]",
+    found: "list[HistoryNode | HubHistory]",
     nats: "NatsAddress | None",
 ) -> None:
     from skyless.run.find_site import find_site
@@ -103,6 +114,18 @@ async def _keep_history(
 
     site = await find_site(address) if site_id is None else site_id
     node = HistoryNode(Writer(folder, site), address, keep, log, nats)
+    await _run(node, found)
+
+
+async def _keep_of_hub(
+    folder: Path, hub: "NatsAddress", site_id: int | None, keep: "Keep", found: "list[HistoryNode | HubHistory]"
+) -> None:
+    from skyless.run.history.hub_source import HubHistory
+
+    await _run(HubHistory(folder, hub, site_id, keep, log), found)
+
+
+async def _run(node: "HistoryNode | HubHistory", found: "list[HistoryNode | HubHistory]") -> None:
     found.append(node)
     screen = asyncio.ensure_future(_status(node)) if sys.stderr.isatty() else None
     try:
@@ -113,7 +136,7 @@ async def _keep_history(
             print(file=sys.stderr)
 
 
-async def _status(node: "HistoryNode") -> None:
+async def _status(node: "HistoryNode | HubHistory") -> None:
     """One line on a terminal, kept up to date."""
     while True:
         await asyncio.sleep(_STATUS_S)

@@ -124,7 +124,8 @@ async def _serve(settings: BrokerSettings, of_gather: tuple[str, ...], history: 
         parts = [_ended(running)]
         if nats is not None:
             secret = {} if nats.password is None else {PASSWORD_VARIABLE: nats.password}
-            gather = Program("gather", ("gather", "--nats", str(nats), *of_gather), environment=secret)
+            kept = () if running.address.tls else ("--mqtt", str(replace(running.address, user=nats.user)))
+            gather = Program("gather", ("gather", "--nats", str(nats), *kept, *of_gather), environment=secret)
             parts.append(Child(gather, log).run())
         if history is not None:
             parts.append(_keep_history(_reader(settings, running), history, nats))

@@ -18,6 +18,7 @@ app = App(name="gather", help_epilogue="Example: skyless gather --nats nats://12
 def gather(
     *,
     nats: Annotated[str, Parameter(env_var="SKYLESS_NATS")] = "nats://127.0.0.1:4222",
+    mqtt: str | None = None,
     asked: GatherOptions,
     output: JsonOptions,
 ) -> None:
@@ -31,11 +32,16 @@ def gather(
     nats
         NATS server with JetStream and MQTT, nats://[USER@]HOST[:PORT] or tls://...; the password is taken from
         SKYLESS_MQTT_PASSWORD.
+    mqtt
+        Broker to copy kept messages from: the same server, mqtt://[USER@]HOST[:PORT]. Zones, plans and the like are
+        then in the stream of the site's state from the start, and not from their next change on.
     """
     extra_module("nats", "skyless gather")
     from skyless.run.gather.node import Gather
+    from skyless.run.mqtt.address import mqtt_address
 
-    node = Gather(nats_address(nats), asked.site_id, round(1e9 * asked.keep_gb), log)
+    broker = None if mqtt is None else mqtt_address(mqtt)
+    node = Gather(nats_address(nats), asked.site_id, round(1e9 * asked.keep_gb), log, broker)
     run_until_stopped(node.run())
     summary = node.summary
     if output.json:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 MAX_NAMES: Final = 200_000
 _TAKEN: Final = 10071  # JetStream's code of an error
-_NEVER_WRITTEN: Final = {"Nats-Expected-Last-Subject-Sequence": "0"}
+NEVER_WRITTEN: Final = {"Nats-Expected-Last-Subject-Sequence": "0"}
 
 
 class TagName(Struct, frozen=True):
@@ -40,16 +40,19 @@ async def name_of(stream: "JetStreamContext", names: str, site: int, number: int
 class Names:
     """Numbers and names of a site's tags. Every program that packs fixes gives numbers in this way."""
 
-    def __init__(self, stream: "JetStreamContext", site: int) -> None:
+    def __init__(self, stream: "JetStreamContext", site: int, table: str = "") -> None:
+        """``table`` is the stream of names where it is not the site's own but that of a hub."""
         self.tags: dict[int, TagName] = {}
         self.numbers: dict[str, int] = {}
         self.issue = 0
         """The largest number that was given. Readers that know fewer read the names again."""
         self._stream, self._site, self._read = stream, site, 0
+        self._table = table or subjects.at(subjects.NAMES_STREAM, site)
 
     async def read(self) -> None:
         """Read what the stream has that is not known here yet. Raises nats.errors.Error."""
-        async for message in messages(self._stream, subjects.at(subjects.NAMES_STREAM, self._site), self._read):
+        of_site = subjects.at(subjects.NAMES, self._site)
+        async for message in messages(self._stream, self._table, self._read, of_site):
             self._read = message.metadata.sequence.stream
             with contextlib.suppress(msgspec.MsgspecError, ValueError):
                 number = int(message.subject.rpartition(".")[2])
@@ -67,7 +70,7 @@ class Names:
                 number, tag = self.issue + 1, TagName(name, host, now_unix_s)
                 subject = subjects.at(subjects.NAMES, self._site, number)
                 try:
-                    await self._stream.publish(subject, msgspec.json.encode(tag), headers=dict(_NEVER_WRITTEN))
+                    await self._stream.publish(subject, msgspec.json.encode(tag), headers=dict(NEVER_WRITTEN))
                     self._add(number, tag)
                 except APIError as error:
                     if error.err_code != _TAKEN:

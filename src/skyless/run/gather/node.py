@@ -16,13 +16,15 @@ from nats.js import JetStreamContext
 from nats.js.errors import APIError
 
 from skyless.core.version import installed_version
-from skyless.run.fix_batch import Batch, encode_batch
+from skyless.run.fix_batch import BadBatchError, Batch, decode_batch, encode_batch
 from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect, rarely
-from skyless.run.gather.names import Names
+from skyless.run.gather.condition import ConditionWord, SiteCondition
+from skyless.run.gather.names import NEVER_WRITTEN, Names
 from skyless.run.gather.packer import Packer
-from skyless.run.gather.streams import make_streams
-from skyless.run.mqtt.messages import SiteMessage, StatusMessage, WrongMessageError, read_message
+from skyless.run.gather.streams import make_streams, messages
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.connection import RefusedError, kept_messages, trouble_with
 from skyless.run.process import Log, together
 
 PERIOD_S: Final = 0.1
@@ -41,10 +43,19 @@ class Summary(Struct, frozen=True):
     site: str
     """Name of the site; empty until it was published."""
     simulated: bool
+    since: str
+    """When the site's streams were made, in ISO 8601: of two sites with one number, each has another."""
+    condition: ConditionWord
+    reasons: list[str]
+    """Why the condition is not good."""
+    tags_heard: int
+    """Tags with a fix in the last ten seconds, whoever packed it."""
     names: int
     """Tags that have a number."""
     online: dict[str, int]
     """Programs that are online, by kind."""
+    versions: dict[str, int]
+    """The same by their versions."""
     fixes: int
     """Fixes taken from JSON."""
     batches: int
@@ -60,34 +71,44 @@ class Summary(Struct, frozen=True):
 class Gather:
     """One gather of a site. Several of one site share the fixes: the server gives each message to one of them."""
 
-    def __init__(self, address: NatsAddress, site: int | None, keep_bytes: int, log: Log) -> None:
-        """``site`` None: the first site of which anything is heard."""
+    def __init__(
+        self, address: NatsAddress, site: int | None, keep_bytes: int, log: Log, broker: MqttAddress | None = None
+    ) -> None:
+        """``site`` None: the first site of which anything is heard. ``broker`` is the same server's for MQTT."""
         self.site = site
-        self._address, self._keep_bytes, self._log = address, keep_bytes, log
+        self._address, self._keep_bytes, self._log, self._broker = address, keep_bytes, log, broker
         self._say = rarely(log)
         self._host = subjects.own_host()
         self._packer = Packer(secrets.randbits(32))
         self._client: Client | None = None
         self._names: Names | None = None
         self._ready: Batch | None = None
-        self._site_name = ""
-        self._online: dict[str, set[str]] = {}
+        self._condition = SiteCondition(time.monotonic())
+        self._since = ""
         self._batches = 0
 
     @property
     def summary(self) -> Summary:
         """What it has done since its start."""
+        now_s, site = time.monotonic(), self._condition.site
+        waiting = self._packer.waiting + (0 if self._ready is None else len(self._ready.records))
+        condition, reasons = self._condition.reasons(self._packer.drops, waiting, now_s)
         return Summary(
             unix_s=time.time(),
             host=self._host,
             version=installed_version(),
-            site=self._site_name,
+            site="" if site is None else site.site.name,
             simulated=self._packer.simulated,
+            since=self._since,
+            condition=condition,
+            reasons=reasons,
+            tags_heard=self._condition.tags_heard(now_s),
             names=0 if self._names is None else len(self._names.numbers),
-            online={kind: len(names) for kind, names in self._online.items()},
+            online=self._condition.online(),
+            versions=self._condition.versions(),
             fixes=self._packer.fixes,
             batches=self._batches,
-            waiting=self._packer.waiting + (0 if self._ready is None else len(self._ready.records)),
+            waiting=waiting,
             drops=dict(self._packer.drops),
             cuts=0 if self._client is None else self._client.stats["reconnects"],
         )
@@ -99,8 +120,9 @@ class Gather:
         try:
             site = self.site = await self._first_site(client) if self.site is None else self.site
             fixes = await client.subscribe(subjects.at(subjects.JSON_FIXES, site), _QUEUE, self._on_fix)
-            await client.subscribe(subjects.at(subjects.STATUSES, site), cb=self._on_status)
-            await client.subscribe(subjects.at(subjects.SITES, site), cb=self._on_site)
+            await client.subscribe(subjects.at(subjects.FIXES, site), cb=self._on_batch)
+            for pattern in (subjects.STATUSES, subjects.SITES):
+                await client.subscribe(subjects.at(pattern, site), cb=self._on_message)
             try:
                 await together(self._send(stream, site), self._summarise(client, site))
             finally:
@@ -122,18 +144,15 @@ class Gather:
     async def _on_fix(self, message: Msg) -> None:
         self._packer.add(subjects.tag_in(message.subject), message.data)
 
-    async def _on_site(self, message: Msg) -> None:
-        with contextlib.suppress(WrongMessageError):
-            site = read_message(message.data, SiteMessage)
-            self._site_name, self._packer.simulated = site.site.name, site.simulated
+    async def _on_batch(self, message: Msg) -> None:
+        with contextlib.suppress(BadBatchError):
+            self._condition.on_batch(decode_batch(message.data).records, time.monotonic())
 
-    async def _on_status(self, message: Msg) -> None:
-        kind, name = message.subject.split(".")[3:5]
-        online = False
-        with contextlib.suppress(WrongMessageError):
-            online = read_message(message.data, StatusMessage).online
-        names = self._online.setdefault(kind, set())
-        (names.add if online else names.discard)(name)
+    async def _on_message(self, message: Msg) -> None:
+        levels = message.subject.split(".")
+        self._condition.on_message(levels[3], levels[-2], message.data)
+        if self._condition.site is not None:
+            self._packer.simulated = self._condition.site.simulated
 
     # Sending
 
@@ -142,6 +161,8 @@ class Gather:
         while True:
             try:
                 await make_streams(stream, site, self._keep_bytes)
+                self._since = str((await stream.stream_info(subjects.at(subjects.FIX_STREAM, site))).created)
+                await self._copy_state(stream, site)
                 names = Names(stream, site)
                 await names.read()
                 self._names = names
@@ -151,6 +172,26 @@ class Gather:
             except Error as error:
                 self._say(f"the fixes of site {site} wait: {error or type(error).__name__}")
                 await asyncio.sleep(_RETRY_S)
+
+    async def _copy_state(self, stream: JetStreamContext, site: int) -> None:
+        """Read the state that the stream has. What the broker has kept from before the stream was made is put there."""
+        state, known = subjects.at(subjects.STATE_STREAM, site), set[str]()
+        async for message in messages(stream, state):
+            known.add(message.subject)
+            if message.subject.endswith((".site", ".status")):
+                await self._on_message(message)
+        if self._broker is None:
+            return
+        filters = [subjects.topic_of(subjects.at(one, site)).replace("*", "+") for one in subjects.STATE]
+        try:
+            kept = await kept_messages(self._broker, filters)
+        except (OSError, RefusedError) as error:
+            self._say(f"what the broker has kept is not copied: {trouble_with(self._broker, error)}")
+            return
+        for topic, payload in kept.items():
+            if (subject := subjects.subject_of(topic)) not in known:
+                with contextlib.suppress(APIError):  # it has come at this moment
+                    await stream.publish(subject, payload, headers=dict(NEVER_WRITTEN))
 
     async def _send_waiting(self, stream: JetStreamContext, site: int, names: Names) -> None:
         """Send until nothing waits. A batch counts as sent when the stream has acknowledged it.

@@ -140,7 +140,7 @@ async def follow(
             finally:
                 with contextlib.suppress(Error):
                     await reading.unsubscribe()
-        except (Error, TimeoutError) as error:
+        except Error as error:
             say(f"the stream {name} cannot be read: {error or type(error).__name__}")
             await asyncio.sleep(_RETRY_S)
 

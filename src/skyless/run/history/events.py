@@ -22,7 +22,7 @@ class EventLog:
         self._last: dict[tuple[str | None, ...], tuple[EventKind, datetime | None]] = {}
         """What was last heard of a node, or of a tag in a zone; of one that is offline, when it had come."""
         for event in past:
-            self._is_new(event)
+            self._remember(event)
 
     def of(self, message: ZoneEvent | AlarmMessage | StatusMessage, now_unix_s: float) -> list[Event]:
         """What is new: a tag entered or left a zone, an alarm came to something, a tag or an anchor came or went."""
@@ -49,18 +49,25 @@ class EventLog:
         return [event] if self._is_new(event) else []
 
     def _is_new(self, event: Event) -> bool:
-        """Remember an event; False where it is known."""
+        """Remember an event, unless it is a copy; False also where it says what is known."""
         if event.alarm:
-            key = (event.kind, event.alarm)
-            is_new = key not in self._alarms
-            self._alarms.add(key)
-            return is_new
-        about = (event.tag, event.zone, event.subject)
-        before, since = self._last.get(about, (None, None))
-        if event.kind == "offline":
-            self._last[about] = ("offline", since)
-            return before != "offline"
-        if event.t == since and event.kind in ("online", before):
-            return False  # a copy; of "online" perhaps a late one, which was sent before the node went offline
-        self._last[about] = (event.kind, event.t)
-        return not event.kind == before == "online"
+            is_new = (event.kind, event.alarm) not in self._alarms
+        else:
+            before, since = self._last.get(_about(event), (None, None))
+            if event.kind != "offline" and event.t == since and event.kind in ("online", before):
+                return False  # of "online" perhaps a late copy, which was sent before the node went offline
+            is_new = not (event.kind == before and event.kind in ("online", "offline"))
+        self._remember(event)
+        return is_new
+
+    def _remember(self, event: Event) -> None:
+        if event.alarm:
+            self._alarms.add((event.kind, event.alarm))
+        elif event.kind == "offline":
+            self._last[_about(event)] = ("offline", self._last.get(_about(event), (None, None))[1])
+        else:
+            self._last[_about(event)] = (event.kind, event.t)
+
+
+def _about(event: Event) -> tuple[str | None, ...]:
+    return event.tag, event.zone, event.subject

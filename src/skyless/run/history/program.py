@@ -1,17 +1,18 @@
-"""``skyless history run``: what a site's programs publish, into its history."""
+"""What a site's programs publish, into its history."""
 
 import asyncio
 import platform
 import re
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from datetime import UTC, datetime
 from functools import partial
 from typing import Any, Final
 
 import pyarrow.compute as pc
 from msgspec import Struct
+from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError
 from skyless.run.fix_batch import MAX_RECORDS, records_of
@@ -23,7 +24,7 @@ from skyless.run.history.tables import read_events
 from skyless.run.history.writer import FILE_ROWS, Writer
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress
-from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.link import Handler, Link
 from skyless.run.mqtt.messages import (
     AlarmMessage,
     AssetsMessage,
@@ -63,19 +64,15 @@ class HistoryState(Struct, frozen=True):
     """Why nothing can be written; None while it can."""
 
 
-class HistoryNode:
-    """Keeps the history of one site until cancelled."""
+class SiteHistory:
+    """Keeps the history of one site, from whatever gives its messages."""
 
-    def __init__(
-        self, writer: Writer, address: MqttAddress, keep: Keep, log: Log, nats: NatsAddress | None = None
-    ) -> None:
-        """``nats`` is the server of a site with a gather, whose stream then gives the fixes.
-
-        Raises SkylessError: the events of the past cannot be read.
-        """
-        host = re.sub(r"[^A-Za-z0-9_.-]", "-", platform.node())
-        name = f"{host}-{zlib.crc32(str(writer.folder.resolve()).encode()):08x}"
-        self.link = Link(address, name, site=writer.site, kind="history")
+    def __init__(self, writer: Writer, keep: Keep, log: Log) -> None:
+        """Raises SkylessError: the events of the past cannot be read."""
+        self.trouble: str | None = None
+        """Why there are no messages."""
+        self.event_place = 0
+        """Place in its source of the event that is handled next, where the source has places."""
         self._writer, self._keep, self._log = writer, keep, log
         self._trouble: dict[str, str] = {}
         self._try("files", writer.write)  # so that all events of the past are in files
@@ -84,26 +81,28 @@ class HistoryNode:
         self._fixes: list[tuple[int, FixMessage]] = []
         self._simulated = False
         self._started_s = time.monotonic()
-        self._subscribe(topics.site_topic, SiteMessage, self._on_site)
-        self._nats = nats
-        if nats is None:
-            self._subscribe(topics.fix_topic, FixMessage, self._on_fix, "+", qos=0)
-        self._subscribe(topics.zone_event_topic, ZoneEvent, self._on_event, "+")
-        self._subscribe(topics.alarm_topic, AlarmMessage, self._on_event, "+", "+")
+
+    def attach(self, subscribe: Callable[[str, Handler, int], None], *, fixes: bool) -> None:
+        """Subscribe to what is kept, with topic filters of MQTT; ``fixes``: also to single fixes."""
+        site = self._writer.site
+
+        def take(topic: str, kind: type[Struct], act: Callable[[Any], None], qos: int = 1) -> None:
+            subscribe(topic, reader(kind, act, lambda: self._writer.drops.update(["wrong-message"])), qos)
+
+        take(topics.site_topic(site), SiteMessage, self._on_site)
+        if fixes:
+            take(topics.fix_topic(site, "+"), FixMessage, self._on_fix, 0)
+        take(topics.zone_event_topic(site, "+"), ZoneEvent, self._on_event)
+        take(topics.alarm_topic(site, "+", "+"), AlarmMessage, self._on_event)
         for kind in ("tag", "anchor"):
-            self._subscribe(topics.status_topic, StatusMessage, self._on_event, kind, "+")
-        self._subscribe(topics.assets_topic, AssetsMessage, lambda message: writer.set_assets(message.assets))
-        self.link.subscribe(topics.zones_topic(writer.site), self._on_zones, qos=1)
+            take(topics.status_topic(site, kind, "+"), StatusMessage, self._on_event)
+        take(topics.assets_topic(site), AssetsMessage, lambda message: self._writer.set_assets(message.assets))
+        subscribe(topics.zones_topic(site), self._on_zones, 1)
 
-    async def run(self) -> None:
-        """Keep it. Finally everything becomes files; what cannot waits in the journal for the next start."""
+    async def run(self, *sources: Coroutine[Any, Any, None]) -> None:
+        """Keep what the sources give. Finally it becomes files; what cannot waits in the journal for the next start."""
         try:
-            parts = [keep(self.link, self._log), every(_STORE_S, self._store), self._work()]
-            if self._nats is not None:
-                from skyless.run.history.stream_source import take_stream  # noqa: PLC0415 - only large sites have NATS
-
-                parts.append(take_stream(self._nats, self._writer, self._log))
-            await together(*parts)
+            await together(*sources, every(_STORE_S, self._store), self._work())
         finally:
             self._store()
             self._try("files", self._writer.close)
@@ -119,15 +118,9 @@ class HistoryNode:
             waiting=self._writer.unwritten + sum(intake.waiting for intake in intakes),
             lost=sum(intake.lost for intake in intakes),
             drops=dict(self._writer.drops),
-            trouble=self.link.trouble,
+            trouble=self.trouble,
             disk=next(iter(self._trouble.values()), None),
         )
-
-    def _subscribe(
-        self, topic: Callable[..., str], kind: type[Struct], act: Callable[[Any], None], *names: str, qos: int = 1
-    ) -> None:
-        handler = reader(kind, act, lambda: self._writer.drops.update(["wrong-message"]))
-        self.link.subscribe(topic(self._writer.site, *names), handler, qos=qos)
 
     def _on_site(self, message: SiteMessage) -> None:
         self._simulated = message.simulated
@@ -146,7 +139,7 @@ class HistoryNode:
 
     def _on_event(self, message: ZoneEvent | AlarmMessage | StatusMessage) -> None:
         now_s = time.time()
-        self._writer.events.add(self._events.of(message, now_s), now_s)
+        self._writer.events.add(self._events.of(message, now_s), now_s, self.event_place)
 
     def _on_zones(self, _topic: str, payload: bytes) -> None:
         try:
@@ -186,3 +179,34 @@ class HistoryNode:
         else:
             if self._trouble.pop(what, None) is not None:
                 self._log(f"the history's {what} can be written again; {self.state().lost} rows were lost so far")
+
+
+class HistoryNode:
+    """Keeps the history of one site of a broker until cancelled."""
+
+    def __init__(
+        self, writer: Writer, address: MqttAddress, keep: Keep, log: Log, nats: NatsAddress | None = None
+    ) -> None:
+        """``nats`` is the server of a site with a gather, whose stream then gives the fixes.
+
+        Raises SkylessError: the events of the past cannot be read.
+        """
+        host = re.sub(r"[^A-Za-z0-9_.-]", "-", platform.node())
+        name = f"{host}-{zlib.crc32(str(writer.folder.resolve()).encode()):08x}"
+        self.link = Link(address, name, site=writer.site, kind="history")
+        self._writer, self._nats, self._log = writer, nats, log
+        self._history = SiteHistory(writer, keep, log)
+        self._history.attach(self.link.subscribe, fixes=nats is None)
+
+    async def run(self) -> None:
+        """Keep it until cancelled."""
+        sources = [keep(self.link, self._log)]
+        if self._nats is not None:
+            from skyless.run.history.stream_source import take_stream  # noqa: PLC0415 - only large sites have NATS
+
+            sources.append(take_stream(self._nats, self._writer, self._log))
+        await self._history.run(*sources)
+
+    def state(self) -> HistoryState:
+        """Progress so far."""
+        return replace(self._history.state(), trouble=self.link.trouble)

@@ -8,7 +8,7 @@ import numpy as np
 from nats.errors import Error
 from nats.js.errors import NotFoundError
 
-from skyless.run.fix_batch import BadBatchError, Records, decode_batch
+from skyless.run.fix_batch import BadBatchError, Batch, Records, decode_batch
 from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect, rarely
 from skyless.run.gather.names import Names
@@ -17,11 +17,74 @@ from skyless.run.history.writer import MAX_UNIX_S, Writer
 from skyless.run.process import Log
 
 if TYPE_CHECKING:
+    from nats.aio.msg import Msg
     from nats.js import JetStreamContext
 
-_PERIOD_S: Final = 0.2
-_MAX_WAITING: Final = 100_000
+PERIOD_S: Final = 0.2
+MAX_WAITING: Final = 100_000
 """While more rows than this wait for the disk, others stay in the stream."""
+_NAMES_S: Final = 60.0
+"""How long the names of a batch may come later than itself: at a hub, streams catch up one after the other."""
+_MAX_SENDERS: Final = 1000
+
+
+class BatchTaker:
+    """Gives the batches of a stream to a history, each once."""
+
+    def __init__(self, names: Names, writer: Writer) -> None:
+        self._names, self._writer = names, writer
+        self._sequences: dict[int, int] = {}
+        """The last sequence of each run of a sender."""
+        self._given_up = 0
+        """Names with numbers up to this did not come in time."""
+
+    async def take(self, message: "Msg") -> None:
+        """Take the batch of a message, unless it is known. Raises nats.errors.Error: the names cannot be read."""
+        place = message.metadata.sequence.stream
+        if place <= self._writer.fixes.position:
+            return
+        try:
+            batch = decode_batch(message.data)
+        except BadBatchError:
+            self._writer.drops["wrong-batch"] += 1
+            return
+        await self._read_names(batch.names_issue)
+        if not self._is_next(batch):  # asked last: a message whose names could not be read is given again
+            return
+        now_s = time.time()
+        self._writer.fixes.add(self._renumbered(batch.records, now_s), now_s, place)
+
+    def _is_next(self, batch: Batch) -> bool:
+        """Whether a batch is new. Those before it that the stream does not have any more are counted."""
+        before = self._sequences.pop(batch.run, None)
+        self._sequences[batch.run] = max(batch.sequence, before or 0)
+        if len(self._sequences) > _MAX_SENDERS:
+            del self._sequences[next(iter(self._sequences))]
+        if before is not None and batch.sequence > before + 1:
+            self._writer.drops["lost-batches"] += batch.sequence - before - 1
+        return before is None or batch.sequence > before
+
+    async def _read_names(self, issue: int) -> None:
+        deadline_s = time.monotonic() + _NAMES_S
+        while self._names.issue < issue > self._given_up:
+            await self._names.read()
+            if self._names.issue < issue:
+                if time.monotonic() > deadline_s:
+                    self._given_up = issue
+                await asyncio.sleep(PERIOD_S)
+
+    def _renumbered(self, records: Records, now_s: float) -> Records:
+        """Records that are kept, with the numbers that this history gives to their tags; the others are counted."""
+        writer = self._writer
+        given, rows = np.unique(records["tag"], return_inverse=True)
+        tags = (self._names.tags.get(int(number)) for number in given)
+        own = np.array([(tag and writer.tag_number(tag.name, now_s)) or 0 for tag in tags], np.uint32)[rows]
+        in_time = records["unix_us"] <= 1e6 * MAX_UNIX_S
+        writer.drops["no-name"] += int(np.count_nonzero(own == 0))
+        writer.drops["wrong-time"] += int(np.count_nonzero((own != 0) & ~in_time))
+        kept: Records = records[(own != 0) & in_time].copy()
+        kept["tag"] = own[(own != 0) & in_time]
+        return kept
 
 
 async def take_stream(address: NatsAddress, writer: Writer, log: Log) -> None:
@@ -33,46 +96,24 @@ async def take_stream(address: NatsAddress, writer: Writer, log: Log) -> None:
     client = await connect(address, "skyless history", say, writer.drops)
     try:
         stream = client.jetstream()
-        names = Names(stream, writer.site)
+        taker = BatchTaker(Names(stream, writer.site), writer)
         while True:
             try:
-                await _take_waiting(stream, names, writer)
+                await _take_waiting(stream, taker, writer)
             except NotFoundError:
                 say(f"no gather has gathered site {writer.site} at {address} yet")
             except Error as error:
                 say(f"the stream of site {writer.site} cannot be read: {error or type(error).__name__}")
-            await asyncio.sleep(_PERIOD_S)
+            await asyncio.sleep(PERIOD_S)
     finally:
         await client.close()
 
 
-async def _take_waiting(stream: "JetStreamContext", names: Names, writer: Writer) -> None:
+async def _take_waiting(stream: "JetStreamContext", taker: BatchTaker, writer: Writer) -> None:
     """Take what the stream has now, as long as the disk takes it."""
     found = messages(stream, subjects.at(subjects.FIX_STREAM, writer.site), writer.fixes.position)
     async for message in found:
-        place = message.metadata.sequence.stream
-        try:
-            batch = decode_batch(message.data)
-        except BadBatchError:
-            writer.drops["wrong-batch"] += 1
-            continue
-        if batch.names_issue > names.issue:
-            await names.read()
-        now_s = time.time()
-        writer.fixes.add(_renumbered(batch.records, names, writer, now_s), now_s, place)
-        if writer.fixes.waiting > _MAX_WAITING:
+        await taker.take(message)
+        if writer.fixes.waiting > MAX_WAITING:
             await found.aclose()
             return
-
-
-def _renumbered(records: Records, names: Names, writer: Writer, now_s: float) -> Records:
-    """Records that are kept, with the numbers that this history gives to their tags; the others are counted."""
-    given, rows = np.unique(records["tag"], return_inverse=True)
-    tags = (names.tags.get(int(number)) for number in given)
-    own = np.array([(tag and writer.tag_number(tag.name, now_s)) or 0 for tag in tags], np.uint32)[rows]
-    in_time = records["unix_us"] <= 1e6 * MAX_UNIX_S
-    writer.drops["no-name"] += int(np.count_nonzero(own == 0))
-    writer.drops["wrong-time"] += int(np.count_nonzero((own != 0) & ~in_time))
-    kept: Records = records[(own != 0) & in_time].copy()
-    kept["tag"] = own[(own != 0) & in_time]
-    return kept

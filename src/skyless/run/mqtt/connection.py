@@ -22,6 +22,8 @@ BROKER_ANSWER_S: Final = 3.0
 """How long a broker may take to accept a connection."""
 
 _LEAVE_S: Final = 1.0
+_KEPT_S: Final = 0.5
+_LONGEST_KEPT: Final = 20
 
 _SEND_BUFFER: Final = 262_144
 """Bytes that wait in the kernel, and as many in the process: what is older than the newest fix should not be many."""
@@ -340,6 +342,27 @@ async def check_broker(address: MqttAddress, tls: ssl.SSLContext | None = None) 
     except (OSError, RefusedError) as error:
         raise SkylessError(trouble_with(address, error)) from None
     await connection.leave()
+
+
+async def kept_messages(address: MqttAddress, filters: Iterable[str]) -> dict[str, bytes]:
+    """The messages of some filters that a broker has kept, by their topics, and what comes meanwhile.
+
+    Nothing says that all have come: none has for half a second then. Raises OSError and RefusedError.
+    """
+    found: dict[str, bytes] = {}
+    react = Reactions(message=found.__setitem__)
+    connection = await open_connection(address, address.tls_context(), Introduction("", 60), react)
+    try:
+        connection.subscribe(dict.fromkeys(filters, 1))
+        before = -1
+        for _ in range(_LONGEST_KEPT):
+            if len(found) == before:
+                break
+            before = len(found)
+            await asyncio.sleep(_KEPT_S)
+    finally:
+        connection.abort("all has come")
+    return found
 
 
 def trouble_with(address: MqttAddress, error: OSError | RefusedError) -> str:

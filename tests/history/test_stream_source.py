@@ -1,0 +1,106 @@
+"""Batches of a stream into a history: each once, with the names that come later, and what is missing is counted."""
+
+import asyncio
+from types import SimpleNamespace
+from unittest.mock import AsyncMock
+
+import numpy as np
+import pytest
+from nats.errors import Error
+
+from skyless.run.fix_batch import RECORD, Batch, encode_batch
+from skyless.run.gather.names import TagName
+from skyless.run.history import stream_source
+from skyless.run.history.stream_source import BatchTaker
+from skyless.run.history.writer import Writer
+
+SITE = 7
+
+
+class LateNames:
+    """A table of names of which each reading brings one more."""
+
+    def __init__(self, names):
+        self.tags, self.issue, self.readings = {}, 0, 0
+        self._coming = dict(enumerate(names, 1))
+
+    async def read(self):
+        self.readings += 1
+        if self.issue < len(self._coming):
+            self.issue += 1
+            self.tags[self.issue] = TagName(self._coming[self.issue], "host", 1.0)
+
+
+def message(place, run, sequence, *tags, issue=0):
+    records = np.zeros(len(tags), RECORD)
+    records["tag"], records["unix_us"] = tags, 1_000_000 * place
+    data = encode_batch(Batch(run, sequence, 1, issue or max(tags), records))
+    return SimpleNamespace(data=data, metadata=SimpleNamespace(sequence=SimpleNamespace(stream=place)))
+
+
+@pytest.fixture
+def writer(tmp_path):
+    made = Writer(tmp_path, SITE)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(stream_source, "PERIOD_S", 0.0)
+
+
+def take(writer, names, *messages):
+    taker = BatchTaker(names, writer)
+
+    async def all_of_them():
+        for one in messages:
+            await taker.take(one)
+
+    asyncio.run(all_of_them())
+
+
+def test_each_batch_is_taken_once_and_gaps_are_counted(writer):
+    names = LateNames("a")
+    again = message(3, 5, 2, 1)
+    take(writer, names, message(1, 5, 1, 1), message(2, 5, 2, 1), again, message(4, 5, 6, 1), message(9, 6, 3, 1))
+    assert writer.fixes.taken == 4
+    assert writer.fixes.position == 9
+    assert writer.drops["lost-batches"] == 3  # of run 5; where run 6 began is not known
+    take(writer, names, message(9, 6, 3, 1), message(10, 6, 4, 1))  # another start goes on after its place
+    assert writer.fixes.taken == 5
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_batch_waits_for_its_names(writer):
+    names = LateNames("abc")
+    take(writer, names, message(1, 5, 1, 1, 3), message(2, 5, 2, 2))
+    assert (names.readings, sorted(writer.names.rows), writer.drops["no-name"]) == (3, ["a", "b", "c"], 0)
+
+
+@pytest.mark.usefixtures("quick")
+def test_names_that_never_come_hold_a_history_up_once(writer, monkeypatch):
+    monkeypatch.setattr(stream_source, "_NAMES_S", 0.05)
+    names = LateNames("a")
+    take(writer, names, message(1, 5, 1, 1, 2, issue=2))
+    readings = names.readings
+    take(writer, names, message(2, 5, 2, 1))
+    assert (writer.fixes.taken, writer.drops["no-name"], names.readings) == (2, 1, readings)
+
+
+def test_a_batch_whose_names_could_not_be_read_is_taken_when_it_is_given_again(writer, monkeypatch):
+    names, batch = LateNames("a"), message(1, 5, 1, 1)
+    taker = BatchTaker(names, writer)
+    monkeypatch.setattr(names, "read", AsyncMock(side_effect=[Error("timeout")]))
+    with pytest.raises(Error):
+        asyncio.run(taker.take(batch))
+    monkeypatch.undo()
+    asyncio.run(taker.take(batch))
+    assert (writer.fixes.taken, writer.drops["lost-batches"]) == (1, 0)
+
+
+def test_bytes_that_are_no_batch_are_counted(writer):
+    broken = message(1, 5, 1, 1)
+    broken.data = b"SKB?"
+    take(writer, LateNames(""), broken)
+    assert writer.drops["wrong-batch"] == 1
