@@ -2,8 +2,9 @@
 
 import contextlib
 import json
-import shutil
 import subprocess
+import sys
+from pathlib import Path
 
 from skyless.run.gather.address import NatsAddress
 from support.processes import free_port
@@ -44,7 +45,9 @@ class Servers:
         settings["jetstream"] |= {"store_dir": str(self.folder / name), "max_file_store": 1_000_000_000}
         file = self.folder / f"{name}.json"
         file.write_text(json.dumps(settings))
-        with subprocess.Popen([shutil.which("nats-server") or _packaged(), "-c", file]) as process:
+        with subprocess.Popen(
+            [Path(sys.executable).with_name("nats-server"), "-c", file], stderr=subprocess.DEVNULL
+        ) as process:
             try:
                 yield
             finally:
