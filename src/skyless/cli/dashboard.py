@@ -5,7 +5,7 @@ import os
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 
@@ -18,12 +18,10 @@ from skyless.core.extras import extra_module
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
-    from skyless.page.api.past import Past
     from skyless.page.app import Services
     from skyless.page.gathered import Gathered
     from skyless.page.guard import AccessRules
     from skyless.page.live import LiveSite
-    from skyless.page.playback import Playback
     from skyless.page.serve import ListenAddress
     from skyless.run.mqtt.address import MqttAddress
     from skyless.run.mqtt.messages import SiteMessage
@@ -88,6 +86,9 @@ def dashboard(
     import asyncio
 
     from skyless.page.api.past import Past
+    from skyless.page.app import Services
+    from skyless.page.condition.evidence import ProcessorUse
+    from skyless.page.live import LiveSite
     from skyless.page.playback import Playback
     from skyless.page.serve import bind, serve
 
@@ -101,14 +102,15 @@ def dashboard(
     sock = bind(listening)
     port = sock.getsockname()[1]
     rules = _rules(sock.getsockname()[0], listening.host, port, token, reader_token, read_only=hub is not None)
-    shows = _Shows(_client_name(port), Playback(recordings), Past(history), history is not None)
+    make = partial(LiveSite, _client_name(port), used_share=ProcessorUse().share, has_history=history is not None)
+    serves = partial(Services, playback=Playback(recordings), past=Past(history))
     if hub is None:
-        address, services, work = _at_broker(shows, broker, site, site_id, assets, nats)
+        address, services, work = _at_broker(make, serves, broker, site, site_id, assets, nats)
     else:
         given = {"--mqtt": broker.mqtt, "--nats": nats, "--assets": assets, "--site": site, "--site-id": site_id}
         for option in (option for option, value in given.items() if value is not None):
             raise SkylessError(f"--hub and {option} exclude each other; give one of them")
-        address, services, work = _at_hub(shows, hub, broker.mqtt_ca)
+        address, services, work = _at_hub(make, serves, hub, broker.mqtt_ca)
     page = _address(listening.host, port, rules)
     if json:
         kind = "mqtt" if hub is None else "hub"
@@ -123,28 +125,16 @@ def dashboard(
         os._exit(0)
 
 
-class _Shows(NamedTuple):
-    """What is shown whichever sites these are."""
-
-    name: str
-    playback: "Playback"
-    past: "Past"
-    has_history: bool
-
-    def maker(self, address: str, *, at_hub: bool = False) -> "partial[LiveSite]":
-        """Makes the state of a site of this broker or hub."""
-        from skyless.page.condition.evidence import ProcessorUse
-        from skyless.page.live import LiveSite
-
-        use = ProcessorUse().share
-        return partial(LiveSite, self.name, address, used_share=use, has_history=self.has_history, at_hub=at_hub)
-
-
 def _at_broker(
-    shows: _Shows, broker: MqttOptions, site: str | None, site_id: int | None, assets: Path | None, nats: str | None
+    make: "partial[LiveSite]",
+    serves: "partial[Services]",
+    broker: MqttOptions,
+    site: str | None,
+    site_id: int | None,
+    assets: Path | None,
+    nats: str | None,
 ) -> "_Served":
     """The sites of a broker. Raises SkylessError."""
-    from skyless.page.app import Services
     from skyless.page.site_assets import AssetsFile
     from skyless.page.sites import LiveSites
 
@@ -152,26 +142,23 @@ def _at_broker(
     known, images = (None, {}) if site is None else _load(site)
     if known is not None and site_id is not None and known.site.id != site_id:
         raise SkylessError(f"--site-id is {site_id}, but {site} is of site {known.site.id}; give one of them")
-    make = shows.maker(str(address))
-    live = make(known, assets_file=None if assets is None else AssetsFile(assets))
+    make = partial(make, broker=str(address))
+    live = make(site=known, assets_file=None if assets is None else AssetsFile(assets))
     live.plans.update(images)
     sites = LiveSites(live, make)
-    services = Services(sites, shows.playback, shows.past, gathered=_gathered(nats, address))
+    services = serves(sites=sites, gathered=_gathered(nats, address))
     return str(address), services, sites.run(address, known.site.id if known is not None else site_id)
 
 
-def _at_hub(shows: _Shows, hub: str, ca: Path | None) -> "_Served":
+def _at_hub(make: "partial[LiveSite]", serves: "partial[Services]", hub: str, ca: Path | None) -> "_Served":
     """The sites at a hub. Raises SkylessError."""
-    from skyless.page.app import Services
-
     address = hub_address(hub, ca)
     from skyless.page.gathered import Gathered
     from skyless.page.hub import ShownSites
     from skyless.run.gather.subjects import HUB_NAMES
 
-    sites = ShownSites(address, f"skyless dashboard {shows.name}", shows.maker(str(address), at_hub=True))
-    services = Services(sites, shows.playback, shows.past, gathered=Gathered(address, HUB_NAMES), hub=sites)
-    return str(address), services, sites.run()
+    sites = ShownSites(address, "skyless dashboard", partial(make, broker=str(address), at_hub=True))
+    return str(address), serves(sites=sites, gathered=Gathered(address, HUB_NAMES), hub=sites), sites.run()
 
 
 def _gathered(nats: str | None, broker: "MqttAddress") -> "Gathered | None":

@@ -44,7 +44,8 @@ def sites(*, broker: MqttOptions, hub: HubUrl = None, output: JsonOptions) -> in
         print_json({"sites": found})
     else:
         console().print(_table(found))
-    return 0 if found and all(_is_good(site) for site in found) else 1
+    good = [site.online > 0 if isinstance(site, SiteOnBroker) else site.condition == "good" for site in found]
+    return 0 if good and all(good) else 1
 
 
 def _of_broker(broker: MqttOptions) -> "list[SiteOnBroker | HubSite]":
@@ -74,10 +75,6 @@ async def _listen(listening: Coroutine[Any, Any, None]) -> None:
         task.result()
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
-
-
-def _is_good(site: "SiteOnBroker | HubSite") -> bool:
-    return site.online > 0 if isinstance(site, SiteOnBroker) else site.condition == "good"
 
 
 def _table(found: "list[SiteOnBroker | HubSite]") -> Table:
