@@ -13,16 +13,20 @@ from dashboard_builders import SITE, SQUARE, fix
 from hub_site import SITE as NUMBER
 from hub_site import Servers
 from msgspec.structs import replace
+from starlette.exceptions import HTTPException
 from websockets.asyncio.client import connect as websocket
 
-from skyless.run.gather.address import connect
+from skyless.page import hub
+from skyless.page.live import LiveSite
+from skyless.run.gather.address import NatsAddress, connect
 from skyless.run.gather.node import Gather
-from skyless.run.hub.link import SILENT_S
+from skyless.run.hub.link import SILENT_S, HubLink
 from skyless.run.hub.sites import LISTEN_S, HubSites
 from skyless.run.hub.streams import HubLimits, make_hub_streams
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import StatusMessage, ZonesMessage
 from support.processes import SKYLESS, running_program
+from support.waiting import until
 
 HALL = msgspec.structs.replace(SITE, site=replace(SITE.site, id=NUMBER))
 
@@ -58,20 +62,42 @@ def test_the_table_has_trouble_first_and_nothing_is_good_that_is_not_heard():
     assert {site.condition for site in table.sites(1e3 + LISTEN_S)} == {"cut"}
 
 
+async def test_a_site_is_let_go_when_nobody_looks_and_the_next_look_connects_it_again(monkeypatch):
+    monkeypatch.setattr(hub, "LET_GO_S", 0.0)
+    monkeypatch.setattr(hub, "_CHECK_S", 0.01)
+    for one in (HubLink, HubSites):
+        monkeypatch.setattr(one, "run", lambda *_: asyncio.sleep(60))
+    sites = hub.ShownSites(NatsAddress("nats://none"), "here", lambda: LiveSite("here", "nats://none", at_hub=True))
+    sites.known.add_site(topics.site_topic(NUMBER), msgspec.json.encode({"site": {"name": "Hall"}}))
+    running = asyncio.ensure_future(sites.run())
+    await asyncio.sleep(0)
+    live = sites.of(str(NUMBER))
+    page = live.open_page()
+    await asyncio.sleep(0.1)
+    assert sites.all == [live]
+    live.pages.discard(page)
+    await until(lambda: not sites.all)
+    assert sites.of(str(NUMBER)) is not live
+    with pytest.raises(HTTPException, match="number of a site at this hub"):
+        sites.of("8")
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+
+
 @pytest.mark.site
 async def test_a_page_that_is_started_after_a_cut_shows_the_site_and_changes_nothing(tmp_path):
     servers = Servers(tmp_path)
     with servers.running("hub"):
         with servers.running("site"):
-            async with _client(servers.hub) as hub, _client(servers.site) as site, asyncio.timeout(60):
-                await make_hub_streams(hub.jetstream(), [NUMBER], HubLimits(1, 10**8, 10**7))
+            async with _client(servers.hub) as hub_client, _client(servers.site) as site, asyncio.timeout(60):
+                await make_hub_streams(hub_client.jetstream(), [NUMBER], HubLimits(1, 10**8, 10**7))
                 gather = asyncio.ensure_future(Gather(servers.site, NUMBER, 10**8, print).run())
                 walking = asyncio.ensure_future(_walk(site))
                 async with httpx.AsyncClient() as http, _dashboard(servers, http):
                     await _until(http, "sites", lambda found: found and found[0]["name"] == HALL.site.name)
                     await _until(http, "sites", lambda found: found[0]["condition"] not in {"unknown", "cut"})
                     await _until(http, f"v1/tags?site={NUMBER}", lambda found: found and found[0]["fix"])
-                while (await hub.jetstream().stream_info("STATE")).state.messages < 3:
+                while (await hub_client.jetstream().stream_info("STATE")).state.messages < 3:
                     await asyncio.sleep(0.1)
                 walking.cancel()
                 gather.cancel()
