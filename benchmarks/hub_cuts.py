@@ -3,10 +3,10 @@
 ``.venv/bin/python benchmarks/hub_cuts.py [--part table|random] [--seed 1] [--actions 20]``
 
 The servers' files are those of ``skyless hub init``; the site is ``skyless broker --gather --hub``. Its line goes
-through a proxy that can be cut. A program packs 20 batches of 20 fixes a second into the site's stream and sends each until it
-is acknowledged. ``table``: how long a viewer at the hub sees nothing, and after which time the hub's stream has all
-that was acknowledged. ``random``: kills and cuts in a random order, the history's program among them; then every
-fix must be in its Parquet files once, and the batches in the hub's stream in order. The exit code is 1 otherwise.
+through a proxy that can be cut. A program packs 20 batches of 20 fixes a second into the site's stream and sends each
+until it is acknowledged. ``table``: how long a viewer at the hub sees nothing, and after which time the hub's stream
+has all that was acknowledged. ``random``: kills and cuts in a random order, the history's program among them; then
+every fix must be in its Parquet files once, and the batches in the hub's stream in order. The exit code is 1 otherwise.
 """
 
 import argparse
@@ -30,7 +30,7 @@ from pyarrow import parquet
 
 from skyless.run.fix_batch import RECORD, Batch, decode_batch, encode_batch
 from skyless.run.gather import subjects
-from skyless.run.gather.address import NatsAddress, connect, nats_address
+from skyless.run.gather.address import connect, nats_address
 from skyless.run.gather.names import Names
 from skyless.run.gather.streams import follow
 from skyless.run.history.layout import current_files
@@ -160,8 +160,7 @@ class Stage:
         return self
 
     async def __aexit__(self, *_):
-        self._sending.cancel()
-        await asyncio.gather(self._sending, return_exceptions=True)
+        await self.stop_sending()
         for process in (self.broker, *self.servers):
             if process.runs:
                 process.kill(signal.SIGTERM)
@@ -213,11 +212,9 @@ class Stage:
                 await client.close()
             await asyncio.sleep(0.1)
 
-    async def view(self, servers):
-        """Note when batches arrive at these servers, by core NATS, until cancelled."""
-        hosts = ",".join(f"127.0.0.1:{port}" for port in servers)
-        address = NatsAddress(f"nats://{hosts}", self.address.user, self.address.password)
-        client = await connect(address, "viewer", quiet, Counter())
+    async def view(self):
+        """Note when batches arrive at the hub, by core NATS, until cancelled."""
+        client = self._viewer = await connect(self.address, "viewer", quiet, Counter())
 
         async def note(_message):
             self.arrivals.append(time.monotonic())
@@ -227,6 +224,16 @@ class Stage:
             await asyncio.Event().wait()
         finally:
             await client.close()
+
+    def by_viewer(self):
+        """The servers, first the one that the viewer is connected to."""
+        own = self._ports.index(self._viewer.connected_url.port)
+        return self.servers[own:] + self.servers[:own]
+
+    async def stop_sending(self):
+        """Nothing is sent any more."""
+        self._sending.cancel()
+        await asyncio.gather(self._sending, return_exceptions=True)
 
     async def complete(self):
         """Wait until the hub's stream has what is acknowledged now. Seconds, or infinity."""
@@ -263,10 +270,8 @@ def run(*command):
 
 async def table(stage):
     """Rows of what happened, the longest gap of the live view, and the time until the stream was complete."""
-    ports = stage._ports
 
     async def during(name, act, undo, seconds, settle_s):
-        # The viewer's own server is the first of its list.
         stage.arrivals = [time.monotonic()]
         act()
         await asyncio.sleep(seconds)
@@ -282,25 +287,27 @@ async def table(stage):
         print(f"{name:45} {gap_s:9.2f} {back_s:9.2f} {complete_s:9.1f}", flush=True)
 
     print(f"{'':45} {'gap, s':>9} {'back, s':>9} {'complete, s':>9}   after the end of the trouble")
-    viewing = asyncio.ensure_future(stage.view(ports))
+    viewing = asyncio.ensure_future(stage.view())
     await asyncio.sleep(2)
-    one, _, three = stage.servers
+    own, other, _ = stage.by_viewer()
+    await during("a hub's server that is not the viewer's, 10 s", other.kill, other.start, 10, 5)
+    await during("the viewer's own server, 10 s", own.kill, own.start, 10, 5)
+    await during("the line, 25 s", stage.cut, lambda: stage.cut(is_cut=False), 25, 5)
+    _, *two = stage.by_viewer()
 
-    def two(act):
-        for server in (one, three):
+    def both(act):
+        for server in two:
             act(server)
 
-    await during("a hub's server that is not the viewer's, 10 s", three.kill, three.start, 10, 5)
-    await during("the viewer's own server, 10 s", one.kill, one.start, 10, 5)
-    await during("the line, 25 s", stage.cut, lambda: stage.cut(is_cut=False), 25, 5)
-    await during("two of three servers, 10 s", lambda: two(Process.kill), lambda: two(Process.start), 10, 5)
+    name = "the two servers that are not the viewer's, 10 s"
+    await during(name, lambda: both(Process.kill), lambda: both(Process.start), 10, 5)
     await during("the site's broker, 3 s", stage.kill_broker, stage.start_broker, 3, 5)
+    await stage.stop_sending()
+    await stage.complete()
     viewing.cancel()
     found = await stage.sequences()
     is_ordered = found == list(range(1, len(found) + 1))
-    print(
-        f"{len(found)} of {stage.acknowledged} acknowledged batches are in the stream, each once in order: {is_ordered}"
-    )
+    print(f"{len(found)} of {stage.acknowledged} acknowledged batches at the hub, once and in order: {is_ordered}")
     return is_ordered
 
 
@@ -336,8 +343,7 @@ async def at_random(stage, seed, actions):
                 await asyncio.sleep(seconds)
                 program.start()
         await asyncio.sleep(draw.uniform(0.3, 2.0))
-    stage._sending.cancel()
-    await asyncio.gather(stage._sending, return_exceptions=True)
+    await stage.stop_sending()
     aim, rows = stage.acknowledged * RECORDS, []
     print(f"complete at the hub {await stage.complete():.1f} s after the last one", flush=True)
     for pause_s in (5, 10, 20, 40, 80):
