@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
-from functools import partial
 from multiprocessing.connection import Connection
 from socket import gethostname
 from typing import Any, Final
@@ -27,6 +26,8 @@ from skyless.research.studies.common.plan import Cell
 
 _POLL_S: Final = 0.2
 _CONNECT_S: Final = 10.0
+_WORKERLESS_S: Final = 30.0
+"""For how long a study waits when no worker is left; ``dask worker`` starts a lost one again within seconds."""
 
 _ADDRESS: Final = re.compile(r"((tcp|tls|ws|wss)://)?[^\s/]+:\d{1,5}")
 
@@ -76,18 +77,27 @@ def run_cells_on_dask(
     What a lost worker was computing is computed by another one.
 
     Raises:
-        UnfinishedError: the scheduler has gone, or a cell failed or killed several workers.
+        UnfinishedError: the scheduler or all workers have gone, or a cell failed or killed several workers.
         SkylessError: the scheduler cannot be reached or has no workers, or a worker runs another program.
     """
     killed = extra_module("distributed", "--scheduler").KilledWorker
-    with _cluster(scheduler) as pool:
+    with _cluster(scheduler) as (client, pool):
 
         def submit(cell: Cell) -> Future[Any]:
-            work = partial(_compute_on_worker, program_digest(), cell.function)
-            return pool.submit(work, key=(cell.name, uuid4().hex))
+            return pool.submit(_compute_on_worker, program_digest(), cell.function, key=(cell.name, uuid4().hex))
+
+        def reached_by_workers(share: float) -> None:
+            reached(share)
+            try:
+                if not client.nthreads():
+                    client.wait_for_workers(1, _WORKERLESS_S)
+            except TimeoutError:
+                raise UnfinishedError(f"--scheduler {scheduler}: no worker is left; start some") from None
+            except OSError:
+                raise CancelledError from None
 
         try:
-            return _map(submit, cells, reached, keep)
+            return _map(submit, cells, reached_by_workers, keep)
         except SkylessError:
             raise
         except CancelledError:
@@ -175,7 +185,8 @@ def _start_worker(parent: Connection) -> None:
 
 
 @contextmanager
-def _cluster(scheduler: str) -> Iterator[Executor]:
+def _cluster(scheduler: str) -> Iterator[tuple[Any, Executor]]:
+    """A Dask client, and what it computes with, once all workers have said that they run this program."""
     if not _ADDRESS.fullmatch(scheduler):
         raise SkylessError(f"--scheduler is {scheduler!r}; it should be an address such as tcp://127.0.0.1:8786")
     connect = extra_module("distributed", "--scheduler").Client
@@ -184,12 +195,17 @@ def _cluster(scheduler: str) -> Iterator[Executor]:
         stack.callback(logging.disable, logging.NOTSET)
         try:
             client = stack.enter_context(connect(scheduler, timeout=_CONNECT_S, set_as_default=False))
+            # Not by a task: a worker that cannot unpickle one ends, and the next one gets it.
+            programs = client.run(program_digest, on_error="return", callback_timeout=_CONNECT_S)
         except (OSError, ValueError, TypeError) as error:
-            raise SkylessError(f"--scheduler is {scheduler!r}, where no Dask scheduler answers: {error}") from None
-        if not client.scheduler_info(n_workers=-1)["workers"]:
             raise SkylessError(
-                f"--scheduler is {scheduler!r}, which has no workers; start some: dask worker {scheduler}"
-            )
+                f"--scheduler {scheduler}: no Dask scheduler or not all workers answer: {error}"
+            ) from None
+        if not programs:
+            raise SkylessError(f"--scheduler {scheduler} has no workers; start some: dask worker {scheduler}")
+        for worker, program in programs.items():
+            if program != program_digest() and not isinstance(program, OSError):
+                raise SkylessError(f"the worker {worker} runs another Skyless; it should be of the same source")
         executor = client.get_executor(pure=False)
         stack.callback(executor.shutdown, wait=False)
-        yield executor
+        yield client, executor
