@@ -84,7 +84,8 @@ def run_cells_on_dask(
     with _cluster(scheduler) as (client, pool):
 
         def submit(cell: Cell) -> Future[Any]:
-            return pool.submit(_compute_on_worker, program_digest(), cell.function, key=(cell.name, uuid4().hex))
+            key = (cell.name, uuid4().hex)
+            return pool.submit(_compute_on_worker, program_digest(), cell.function, key=key)  # type: ignore[call-arg]
 
         def reached_by_workers(share: float) -> None:
             reached(share)
@@ -198,9 +199,7 @@ def _cluster(scheduler: str) -> Iterator[tuple[Any, Executor]]:
             # Not by a task: a worker that cannot unpickle one ends, and the next one gets it.
             programs = client.run(program_digest, on_error="return", callback_timeout=_CONNECT_S)
         except (OSError, ValueError, TypeError) as error:
-            raise SkylessError(
-                f"--scheduler {scheduler}: no Dask scheduler or not all workers answer: {error}"
-            ) from None
+            raise SkylessError(f"--scheduler {scheduler}: scheduler or workers do not answer: {error}") from None
         if not programs:
             raise SkylessError(f"--scheduler {scheduler} has no workers; start some: dask worker {scheduler}")
         for worker, program in programs.items():
