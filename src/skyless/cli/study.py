@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from skyless.cli.api.options import StudyOptions
 from skyless.cli.common.options import JsonOptions, check_picture, command
-from skyless.cli.common.output import console, print_json, to_json
+from skyless.cli.common.output import WIDEST, console, print_json, to_json
 from skyless.cli.common.progress import progress_bar, status
 from skyless.core.arguments import Rule, folder_to_write
 from skyless.core.errors import SkylessError
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from skyless.cli.api.study import StudyResult
     from skyless.research.studies.common.plan import Row
 
-_WIDEST: Final = 220
 """Columns of a table that is not shown on a terminal."""
 
 _OF_ERRORS: Final = (
@@ -145,7 +144,7 @@ def print_rows(result: "StudyResult") -> None:
     """Show the rows as a table."""
     out = console()
     if not out.is_terminal:
-        out.width = _WIDEST
+        out.width = WIDEST
     out.print(_table(result))
     for line in _LEGENDS.get(result.name, _OF_ERRORS):
         out.print(line)

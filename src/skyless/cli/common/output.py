@@ -67,6 +67,10 @@ def print_facts(title: str, facts: Iterable[tuple[str, str]]) -> None:
     console().print(table)
 
 
+WIDEST: Final = 220
+"""Columns of a table that goes to a file or a program."""
+
+
 def print_table(title: str, heads: Iterable[str], rows: Iterable[Iterable[str]], *, figures: bool = False) -> None:
     """Show a table. ``figures``: it is of numbers, which stand on the right; columns without a name hold words."""
     from rich.markup import escape
@@ -78,7 +82,10 @@ def print_table(title: str, heads: Iterable[str], rows: Iterable[Iterable[str]],
         table.add_column(head, justify="right" if figures and head else "left", overflow="fold")
     for row in rows:
         table.add_row(*map(Text, row))
-    console().print(table)
+    out = console()
+    if not out.is_terminal:
+        out.width = WIDEST
+    out.print(table)
 
 
 def print_warnings(warnings: Iterable[str]) -> None:

@@ -7,10 +7,9 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Any, Final
 
 from cyclopts import App
-from rich.table import Table
 
 from skyless.cli.common.options import JsonOptions, command
-from skyless.cli.common.output import console, print_json
+from skyless.cli.common.output import print_json, print_table
 from skyless.cli.nodes.options import HubUrl, MqttOptions, hub_address, run_until_stopped
 from skyless.core.errors import SkylessError
 from skyless.run.find_site import SiteOnBroker, watch_sites
@@ -43,7 +42,7 @@ def sites(*, broker: MqttOptions, hub: HubUrl = None, output: JsonOptions) -> in
     if output.json:
         print_json({"sites": found})
     else:
-        console().print(_table(found))
+        _show(found)
     good = [site.online > 0 if isinstance(site, SiteOnBroker) else site.condition == "good" for site in found]
     return 0 if good and all(good) else 1
 
@@ -77,10 +76,10 @@ async def _listen(listening: Coroutine[Any, Any, None]) -> None:
     await asyncio.gather(task, return_exceptions=True)
 
 
-def _table(found: "list[SiteOnBroker | HubSite]") -> Table:
+def _show(found: "list[SiteOnBroker | HubSite]") -> None:
     of_broker = all(isinstance(site, SiteOnBroker) for site in found)
-    more = ("programs online",) if of_broker else ("condition", "tags", "anchors", "last heard", "reason")
-    table = Table("site", "name", "versions", *more)
+    more = ("programs online",) if of_broker else ("condition", "reason", "tags", "anchors", "last heard")
+    rows = []
     for site in found:
         versions = ", ".join(f"{version} ({count})" for version, count in sorted((site.versions or {}).items()))
         if isinstance(site, SiteOnBroker):
@@ -88,6 +87,6 @@ def _table(found: "list[SiteOnBroker | HubSite]") -> Table:
         else:
             counts = [_DASH if count is None else str(count) for count in (site.tags_heard, site.anchors_online)]
             heard = _DASH if site.heard_unix_s is None else f"{datetime.fromtimestamp(site.heard_unix_s):%H:%M:%S}"
-            cells = [site.condition, *counts, heard, site.reason]
-        table.add_row(str(site.number), site.name, versions or _DASH, *cells)
-    return table
+            cells = [site.condition, site.reason, *counts, heard]
+        rows.append((str(site.number), site.name, *cells, versions or _DASH))
+    print_table("Sites" if found else "No site is known there", ("site", "name", *more, "versions"), rows)
