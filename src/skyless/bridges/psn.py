@@ -80,7 +80,7 @@ class PsnFrames:
         if tracker is None:
             return
         velocity = fix.velocity_mps
-        if not all(map(_fits, (*fix.position_m, *(velocity or ())))):
+        if not all(abs(value) < 3e38 for value in (*fix.position_m, *(velocity or ()))):  # what a 32-bit float holds
             self.dropped["psn-value"] += 1
             return
         tracker.position_m = turned(fix.position_m, self._up)
@@ -165,11 +165,6 @@ class PsnFrames:
 
 def _chunk(number: int, data: bytes, *, holds_chunks: bool = False) -> bytes:
     return struct.pack("<HH", number, len(data) | (_HOLDS_CHUNKS if holds_chunks else 0)) + data
-
-
-def _fits(value: float) -> bool:
-    """Whether it is finite and within what a 32-bit float holds."""
-    return abs(value) < 3e38
 
 
 class PsnTarget(Target):

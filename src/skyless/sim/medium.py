@@ -231,14 +231,11 @@ class Medium(Generic[Result]):
         """Switch a node on, with a new counter except at time 0."""
         self.stations[node]["on"] = 1
         if self.timeline.now_ticks > 0:
-            self._restart_counter(node)
+            restart_counter(self.clocks, node, self._setups[node])
             if self._carriers is not None:
                 self._carriers.restart(node)
 
     # Clocks
-
-    def _restart_counter(self, node: int) -> None:
-        restart_counter(self.clocks, node, self._setups[node])
 
     def _warm_up(self) -> None:
         """Let crystals warm up, those of all tags where no anchor is named."""
