@@ -15,7 +15,7 @@ from typing import Final
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.errors import SkylessError
+from skyless.core.errors import SkylessError, writing
 from skyless.core.whole_files import replace_files
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress
@@ -144,12 +144,10 @@ def create_access(folder: Path, address: MqttAddress) -> tuple[Path, ...]:
     missing = {role: folder / f"{role}.env" for role in USERS if not os.path.lexists(folder / f"{role}.env")}
     if not missing:
         raise SkylessError(f"{folder} has the files of all roles; one that is to be replaced should be removed first")
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         files = {file: _text(role, replace(address, user=str(role))).encode() for role, file in missing.items()}
         replace_files(files, secret=files)
-    except OSError as error:
-        raise SkylessError(f"{error.filename or folder} cannot be written: {error.strerror}") from None
     return tuple(missing.values())
 
 
