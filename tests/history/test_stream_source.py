@@ -2,7 +2,6 @@
 
 import asyncio
 from types import SimpleNamespace
-from unittest.mock import AsyncMock
 
 import numpy as np
 import pytest
@@ -47,11 +46,11 @@ def writer(tmp_path):
 
 @pytest.fixture
 def quick(monkeypatch):
-    monkeypatch.setattr(stream_source, "PERIOD_S", 0.0)
+    monkeypatch.setattr(stream_source, "_PERIOD_S", 0.0)
 
 
 def take(writer, names, *messages):
-    taker = BatchTaker(names, writer)
+    taker = BatchTaker(names, writer, lambda _line: None)
 
     async def all_of_them():
         for one in messages:
@@ -88,15 +87,20 @@ def test_names_that_never_come_hold_a_history_up_once(writer, monkeypatch):
     assert (writer.fixes.taken, writer.drops["no-name"], names.readings) == (2, 1, readings)
 
 
-def test_a_batch_whose_names_could_not_be_read_is_taken_when_it_is_given_again(writer, monkeypatch):
-    names, batch = LateNames("a"), message(1, 5, 1, 1)
-    taker = BatchTaker(names, writer)
-    monkeypatch.setattr(names, "read", AsyncMock(side_effect=[Error("timeout")]))
-    with pytest.raises(Error):
-        asyncio.run(taker.take(batch))
-    monkeypatch.undo()
-    asyncio.run(taker.take(batch))
-    assert (writer.fixes.taken, writer.drops["lost-batches"]) == (1, 0)
+@pytest.mark.usefixtures("quick")
+def test_a_batch_waits_while_its_names_cannot_be_read(writer, monkeypatch):
+    names, lines = LateNames("a"), []
+    answers, read = iter([Error("timeout"), Error("timeout")]), names.read
+
+    async def fail_twice():
+        if (error := next(answers, None)) is not None:
+            raise error
+        await read()
+
+    monkeypatch.setattr(names, "read", fail_twice)
+    asyncio.run(BatchTaker(names, writer, lines.append).take(message(1, 5, 1, 1)))
+    assert lines == ["the names of site 7 cannot be read: timeout"]
+    assert (writer.fixes.taken, writer.drops["no-name"]) == (1, 0)
 
 
 def test_bytes_that_are_no_batch_are_counted(writer):

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import socket
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from itertools import count
 from typing import Final
 
@@ -102,7 +102,8 @@ class OmloxServer(Target):
             ws_max_size=_MAX_REQUEST_BYTES,
             timeout_graceful_shutdown=1,
         )
-        server = _Server(config)
+        server = uvicorn.Server(config)
+        server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign,assignment] # its owner has them
         try:
             await server.serve(sockets=[listening])
         finally:
@@ -210,14 +211,6 @@ class OmloxServer(Target):
             waiting.get_nowait()
             self.dropped["slow-client"] += 1
         waiting.put_nowait(msgspec.json.encode(message).decode())
-
-
-class _Server(uvicorn.Server):
-    """A server that does not handle signals. Its owner does."""
-
-    @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        yield
 
 
 def make_target(url: TargetUrl, _context: BridgeContext) -> OmloxServer:

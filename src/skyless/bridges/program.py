@@ -30,7 +30,6 @@ from skyless.run.mqtt.messages import (
     SiteMessage,
     StatusMessage,
     TagHealth,
-    WrongMessageError,
     ZonesMessage,
 )
 from skyless.run.mqtt.topics import (
@@ -82,10 +81,11 @@ class BridgeNode:
         self._assets = AssetsMessage(())
         self._malformed = 0
         self._refused: asyncio.Future[None] | None = None
-        self.link.subscribe(zones_topic(site), self._on_zones)
-        self.link.subscribe(assets_topic(site), self._on_assets)
+        assets = reader(read_assets, self._on_assets, self._on_malformed, AssetsMessage(()))
+        self.link.subscribe(assets_topic(site), assets)
         for topic, kind, act in (
             (site_topic(site), SiteMessage, self._on_site),
+            (zones_topic(site), read_zones, self._on_zones),
             (fix_topic(site, EVERY_NODE), FixMessage, self._on_fix),
             (health_topic(site, "tag", EVERY_NODE), TagHealth, self._on_health),
             (health_topic(site, "anchor", EVERY_NODE), AnchorHealth, self._on_health),
@@ -118,23 +118,13 @@ class BridgeNode:
         self._site = message
         self._update_site()
 
-    def _on_zones(self, _topic: str, payload: bytes) -> None:
-        if not payload:
-            return
-        try:
-            self._zones = read_zones(payload)
-        except WrongMessageError:
-            self._malformed += 1
-        else:
-            self._update_site()
+    def _on_zones(self, message: ZonesMessage) -> None:
+        self._zones = message
+        self._update_site()
 
-    def _on_assets(self, _topic: str, payload: bytes) -> None:
-        try:
-            self._assets = read_assets(payload) if payload else AssetsMessage(())
-        except WrongMessageError:
-            self._malformed += 1
-        else:
-            self._update_site()
+    def _on_assets(self, message: AssetsMessage) -> None:
+        self._assets = message
+        self._update_site()
 
     def _update_site(self) -> None:
         if self._site is None:

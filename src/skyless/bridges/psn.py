@@ -80,7 +80,7 @@ class PsnFrames:
         if tracker is None:
             return
         velocity = fix.velocity_mps
-        if not all(map(_fits, (*fix.position_m, *(velocity or ())))):
+        if not all(abs(value) < 3e38 for value in (*fix.position_m, *(velocity or ()))):  # what a 32-bit float holds
             self.dropped["psn-value"] += 1
             return
         tracker.position_m = turned(fix.position_m, self._up)
@@ -95,7 +95,8 @@ class PsnFrames:
 
     def data_packets(self, unix_s: float) -> list[bytes]:
         """One frame: all trackers; those without a fix have status 0 and no position. Nothing while there is none."""
-        trackers = [_chunk(tracker.number, self._data(tracker), holds_chunks=True) for tracker in self._sorted()]
+        known = sorted(self._trackers.values(), key=lambda tracker: tracker.number)
+        trackers = [_chunk(tracker.number, self._data(tracker), holds_chunks=True) for tracker in known]
         self._frame = (self._frame + 1) & 0xFF
         return self._packets(DATA_PACKET, b"", DATA_TRACKERS, trackers, unix_s)
 
@@ -122,9 +123,6 @@ class PsnFrames:
                 number = next(free for free in range(1, MAX_TRACKERS + 1) if free not in used)
             tracker = self._trackers[tag] = Tracker(number)
         return tracker
-
-    def _sorted(self) -> list[Tracker]:
-        return sorted(self._trackers.values(), key=lambda tracker: tracker.number)
 
     def _data(self, tracker: Tracker) -> bytes:
         if tracker.position_m is None:
@@ -165,11 +163,6 @@ class PsnFrames:
 
 def _chunk(number: int, data: bytes, *, holds_chunks: bool = False) -> bytes:
     return struct.pack("<HH", number, len(data) | (_HOLDS_CHUNKS if holds_chunks else 0)) + data
-
-
-def _fits(value: float) -> bool:
-    """Whether it is finite and within what a 32-bit float holds."""
-    return abs(value) < 3e38
 
 
 class PsnTarget(Target):

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from cyclopts import App, Parameter
 
@@ -17,11 +17,15 @@ from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module
 
 if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
     from skyless.run.gather.address import NatsAddress
     from skyless.run.history.hub_source import HubHistory
     from skyless.run.history.program import HistoryNode, HistoryState
     from skyless.run.history.retention import Keep
     from skyless.run.mqtt.address import MqttAddress
+
+    _History = HistoryNode | HubHistory
 
 _STATUS_S: Final = 0.5
 
@@ -74,20 +78,20 @@ def run(
     from skyless.run.history.retention import Keep
 
     keep = Keep(keep_days, full_days, event_days)
-    found: list[HistoryNode | HubHistory] = []
+    found: list[_History] = []
     if from_ is not None:
         extra_module("nats", "--from")
         if broker.mqtt is not None or nats is not None:
             raise SkylessError(f"--from is {from_!r}; give it without --mqtt and --nats, which are of a single site")
         hub = nats_address(from_, "--from", broker.mqtt_ca)
         hub.tls_context()
-        work = _keep_of_hub(to, hub, site_id, keep, found)
+        opening = _of_hub(to, hub, site_id, keep)
     else:
         address = broker.required("the broker of the site whose history to keep")
-        work = _keep_history(to, address, site_id, keep, found, None if nats is None else nats_address(nats))
+        opening = _of_broker(to, address, site_id, keep, None if nats is None else nats_address(nats))
     make_folder("--to", to)
     with contextlib.suppress(KeyboardInterrupt):
-        process.run(work)
+        process.run(_keep(opening, found))
     state = found[0].state() if found else None
     if json:
         import msgspec
@@ -100,32 +104,26 @@ def run(
     return 1 if state is not None and (state.disk or state.lost) else 0
 
 
-async def _keep_history(
-    folder: Path,
-    address: "MqttAddress",
-    site_id: int | None,
-    keep: "Keep",
-    found: "list[HistoryNode | HubHistory]",
-    nats: "NatsAddress | None",
-) -> None:
+async def _of_broker(
+    folder: Path, address: "MqttAddress", site_id: int | None, keep: "Keep", nats: "NatsAddress | None"
+) -> "_History":
     from skyless.run.find_site import find_site
     from skyless.run.history.program import HistoryNode
     from skyless.run.history.writer import Writer
 
     site = await find_site(address) if site_id is None else site_id
-    node = HistoryNode(Writer(folder, site), address, keep, log, nats)
-    await _run(node, found)
+    return HistoryNode(Writer(folder, site), address, keep, log, nats)
 
 
-async def _keep_of_hub(
-    folder: Path, hub: "NatsAddress", site_id: int | None, keep: "Keep", found: "list[HistoryNode | HubHistory]"
-) -> None:
+async def _of_hub(folder: Path, hub: "NatsAddress", site_id: int | None, keep: "Keep") -> "_History":
     from skyless.run.history.hub_source import HubHistory
 
-    await _run(HubHistory(folder, hub, site_id, keep, log), found)
+    return HubHistory(folder, hub, site_id, keep, log)
 
 
-async def _run(node: "HistoryNode | HubHistory", found: "list[HistoryNode | HubHistory]") -> None:
+async def _keep(opening: "Coroutine[Any, Any, _History]", found: "list[_History]") -> None:
+    """Keep a history until cancelled; ``found`` gets it."""
+    node = await opening
     found.append(node)
     screen = asyncio.ensure_future(_status(node)) if sys.stderr.isatty() else None
     try:
@@ -136,7 +134,7 @@ async def _run(node: "HistoryNode | HubHistory", found: "list[HistoryNode | HubH
             print(file=sys.stderr)
 
 
-async def _status(node: "HistoryNode | HubHistory") -> None:
+async def _status(node: "_History") -> None:
     """One line on a terminal, kept up to date."""
     while True:
         await asyncio.sleep(_STATUS_S)

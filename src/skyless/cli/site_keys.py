@@ -15,7 +15,7 @@ from skyless.cli.common.output import console, print_facts, print_json, print_wa
 from skyless.cli.common.progress import progress_bar
 from skyless.cli.nodes.options import site_named
 from skyless.core.arguments import Options, number
-from skyless.core.errors import SkylessError
+from skyless.core.errors import SkylessError, writing
 from skyless.core.keys.chain import Chain, ChainRing, new_chain
 from skyless.core.site import Site
 from skyless.core.whole_files import replace_files
@@ -260,12 +260,10 @@ def _write(folder: Path, chain: Chain, more: dict[Path, bytes]) -> None:
     for file in (seed, chain_public):
         if file.exists():
             raise SkylessError(f"{file} is there already; nothing was written")
-    try:
+    with writing(folder):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         files = {**more, seed: seed_bytes(chain), chain_public: chain_public_bytes(chain)}
         replace_files(files, secret=(folder / SITE_PRIVATE, seed))
-    except OSError as error:
-        raise SkylessError(f"{folder} cannot be written: {error.strerror}") from None
 
 
 def _planned(text: str) -> float:

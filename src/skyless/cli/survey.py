@@ -22,7 +22,7 @@ from skyless.cli.common.output import (
 )
 from skyless.cli.common.progress import progress_bar
 from skyless.cli.nodes.survey_live import LiveOptions, gather_live, serve_live
-from skyless.core.errors import SkylessError
+from skyless.core.errors import SkylessError, writing
 from skyless.research.calibration.options import SurveyOptions
 
 if TYPE_CHECKING:
@@ -151,11 +151,9 @@ def _write(out: Path, files: dict[Path, bytes]) -> tuple[str, ...]:
     from skyless.core.whole_files import replace_files
     from skyless.run.survey.files import kept_path
 
-    try:
+    with writing(out):
         before = {kept_path(out): out.read_bytes()} if out.exists() else {}
         replace_files(before | files)
-    except OSError as error:
-        raise SkylessError(f"{error.filename or out} cannot be written: {error.strerror}") from None
     return tuple(map(str, (*before, *reversed(files))))
 
 

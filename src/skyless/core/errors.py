@@ -1,6 +1,8 @@
 """Errors for the user: faults that the user can correct, with messages that name what to correct."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from os import PathLike, fspath
 
 _LONGEST_VALUE = 60
@@ -8,6 +10,15 @@ _LONGEST_VALUE = 60
 
 class SkylessError(Exception):
     """A fault outside the program; its message is for the user, and the command line exits with 2."""
+
+
+@contextmanager
+def writing(path: str | PathLike[str]) -> Iterator[None]:
+    """Where files are written: an OSError becomes a SkylessError that names this file or folder."""
+    try:
+        yield
+    except OSError as error:
+        raise SkylessError(f"{path} cannot be written: {error.strerror}") from None
 
 
 class ConfigurationError(SkylessError):

@@ -139,6 +139,11 @@ def header_of(head: bytes) -> tuple[str, ...]:
     return tuple(name.strip() for name in first.decode("utf-8", "replace").split(","))
 
 
+def has_columns(columns: Sequence[str], head: bytes) -> bool:
+    """Whether the first line of a table names these columns."""
+    return set(columns) <= set(header_of(head))
+
+
 def rows(stream: BufferedIOBase, drops: Drops, columns: Sequence[str]) -> Iterator[list[bytes]]:
     """Yield the wanted columns of each row, in the wanted order; rows of another width are counted.
 

@@ -25,7 +25,7 @@ from typing import IO, Any, Final, Self
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.errors import SkylessError
+from skyless.core.errors import SkylessError, writing
 from skyless.core.whole_files import replace_files
 from skyless.run.children import end
 from skyless.run.gather.address import FIRST_PORT as FIRST_NATS_PORT
@@ -324,10 +324,8 @@ async def _spawn(
 ) -> asyncio.subprocess.Process:
     """nats-server, when it accepts MQTT."""
     file = data / "nats-server.conf"
-    try:
+    with writing(file):
         replace_files({file: _configuration(settings, port, data, nats).encode()}, secret=(file,))
-    except OSError as error:
-        raise SkylessError(f"{file} cannot be written: {error.strerror}") from None
     process = await asyncio.create_subprocess_exec(
         *(program, "--config", file),
         stdin=asyncio.subprocess.DEVNULL,

@@ -175,21 +175,27 @@ async def keep(link: Link, log: Log) -> None:
         await asyncio.sleep(HEALTH_S)
 
 
-def reader(kind: type[Struct], act: Callable[[Any], None], on_wrong: Callable[[], None]) -> Handler:
-    """A handler that decodes messages of a kind. ``on_wrong`` is called for those that cannot be read.
+def reader(
+    kind: type[Struct] | Callable[[bytes], Struct],
+    act: Callable[[Any], None],
+    on_wrong: Callable[[], None],
+    withdrawn: Struct | None = None,
+) -> Handler:
+    """A handler that decodes messages of a kind, or as a function does. ``on_wrong`` is called where that fails.
 
-    An empty payload is a retained message that was withdrawn, and is skipped.
+    An empty payload is a retained message that was withdrawn. It is skipped, or counts as the message ``withdrawn``.
     """
 
     def read(_topic: str, payload: bytes) -> None:
-        if not payload:
-            return
+        message = withdrawn
         try:
-            message = read_message(payload, kind)
+            if payload:
+                message = read_message(payload, kind) if isinstance(kind, type) else kind(payload)
         except WrongMessageError:
             on_wrong()
         else:
-            act(message)
+            if message is not None:
+                act(message)
 
     return read
 

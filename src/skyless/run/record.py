@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import os
 import re
 import secrets
 import socket
@@ -14,6 +13,7 @@ from typing import IO, Final
 from msgspec import Struct
 
 from skyless.core.errors import SkylessError
+from skyless.core.whole_files import replace_files
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import ReceptionsMessage, RequestMessage, StatusMessage
@@ -176,19 +176,10 @@ def _client_key() -> str:
     key = secrets.token_hex(16)
     with contextlib.suppress(OSError, UnicodeError):
         file = data_folder() / "recorder_key"
-        draft = file.with_name(f"{file.name}-{key}")
-        with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as out:
-            out.write(key)
-        try:
-            with contextlib.suppress(FileExistsError):
-                os.link(draft, file)
-            kept = file.read_text(encoding="ascii")
-            if not re.fullmatch("[0-9a-f]{32}", kept):
-                draft.replace(file)
-                return key
+        kept = file.read_text(encoding="ascii") if file.exists() else ""
+        if re.fullmatch("[0-9a-f]{32}", kept):
             return kept
-        finally:
-            draft.unlink(missing_ok=True)
+        replace_files({file: key.encode()}, secret=(file,))
     return key
 
 

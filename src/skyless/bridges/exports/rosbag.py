@@ -17,7 +17,7 @@ from msgspec import Struct
 
 from skyless.bridges.ros2.messages import RosEncoder, RosMessage, RosSettings
 from skyless.bridges.target import bridged_site, is_usable
-from skyless.core.errors import ConfigurationError, SkylessError
+from skyless.core.errors import ConfigurationError, SkylessError, writing
 from skyless.core.extras import extra_module
 from skyless.run.mqtt.messages import AnchorHealth, FixMessage, SiteMessage, TagHealth, TruthMessage
 from skyless.run.recordings.recording import NS, McapRecording, Recorded
@@ -72,11 +72,8 @@ def write_bag(
         site = source.site
         if site is None:
             raise SkylessError(f"{source.summary().path} holds no site; it should be a recording of skyless record")
-        try:
-            with _new_folder(Path(folder)) as scratch, _BagWriter(scratch, version) as writer:
-                return _copy(source, site, writer, settings, tag, folder)
-        except OSError as error:
-            raise SkylessError(f"{folder} cannot be written: {error.strerror}") from None
+        with writing(folder), _new_folder(Path(folder)) as scratch, _BagWriter(scratch, version) as writer:
+            return _copy(source, site, writer, settings, tag, folder)
 
 
 def _copy(

@@ -55,10 +55,11 @@ def _parameters(struct: type[Options]) -> Iterator[inspect.Parameter]:
         required = field.default is NODEFAULT
         form = "" if field.text is None or not field.text.form else f" As {field.text.form}."
         described = Parameter(name=None if required else f"--{field.option}", help=helps[name] + form)
+        shown = None if field.text is not None or not field.default else field.default
         yield inspect.Parameter(
             name,
             inspect.Parameter.POSITIONAL_ONLY if required else inspect.Parameter.KEYWORD_ONLY,
-            default=inspect.Parameter.empty if required else _shown_default(field),
+            default=inspect.Parameter.empty if required else shown,
             annotation=Annotated[
                 _token(field), described, *(one for one in field.metadata if isinstance(one, Parameter))
             ],
@@ -69,10 +70,6 @@ def _token(field: OptionField) -> Any:  # noqa: ANN401 - a type
     if field.text is not None:
         return list[str] | None if field.text.many else str | None
     return field.token if field.default is NODEFAULT else field.token | None
-
-
-def _shown_default(field: OptionField) -> Any:  # noqa: ANN401 - any value
-    return None if field.text is not None or not field.default else field.default
 
 
 def _made(struct: type[Options], values: dict[str, Any]) -> Options:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, TextIO
 
 import msgspec
 
-from skyless.core.errors import SkylessError
+from skyless.core.errors import writing
 from skyless.core.whole_files import whole_file, write_whole
 
 if TYPE_CHECKING:
@@ -126,26 +126,21 @@ def new_table(path: Path) -> Iterator[TextIO]:
     Raises:
         SkylessError: the file cannot be written.
     """
-    try:
-        with whole_file(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
-            try:
-                yield file
-            except KeyboardInterrupt as error:
-                interrupt: KeyboardInterrupt | None = error
-            else:
-                interrupt = None
-    except OSError as error:
-        raise SkylessError(f"{path} cannot be written: {error.strerror}") from None
+    with writing(path), whole_file(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
+        try:
+            yield file
+        except KeyboardInterrupt as error:
+            interrupt: KeyboardInterrupt | None = error
+        else:
+            interrupt = None
     if interrupt is not None:
         raise interrupt
 
 
 def write_file(path: Path, data: bytes) -> None:
     """Write a file whole or not at all. Raises SkylessError when it cannot be written."""
-    try:
+    with writing(path):
         write_whole(path, data)
-    except OSError as error:
-        raise SkylessError(f"{path} cannot be written: {error.strerror}") from None
 
 
 def write_picture(path: Path, figure: "Figure") -> None:

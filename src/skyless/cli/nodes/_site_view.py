@@ -33,7 +33,6 @@ from skyless.run.mqtt.messages import (
     StatusMessage,
     TagHealth,
     WatchMessage,
-    WrongMessageError,
 )
 from skyless.run.process import keep, reader, together
 
@@ -137,7 +136,8 @@ class SiteView:
             (topics.watch_topic(number), WatchMessage, self._on_watch),
         ):  # fmt: skip
             link.subscribe(topic, reader(kind, handle, self._on_wrong))
-        link.subscribe(topics.assets_topic(number), self._on_assets)
+        assets = reader(read_assets, self._on_assets, self._on_wrong, AssetsMessage(()))
+        link.subscribe(topics.assets_topic(number), assets)
         link.subscribe(topics.alarm_topic(number, "+", "+"), self._on_alarm, qos=1)
         link.on_state.append(self._on_state)
 
@@ -173,11 +173,8 @@ class SiteView:
         kept_s = max(0.0, self._wall_clock() - message.unix_s) if self._watch is None else 0.0
         self._watch = message, self._clock() - kept_s
 
-    def _on_assets(self, _topic: str, payload: bytes) -> None:
-        try:
-            self._assets = read_assets(payload) if payload else AssetsMessage(())
-        except WrongMessageError:
-            self._on_wrong()
+    def _on_assets(self, message: AssetsMessage) -> None:
+        self._assets = message
 
     def _on_alarm(self, topic: str, payload: bytes) -> None:
         if payload:

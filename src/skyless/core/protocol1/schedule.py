@@ -94,16 +94,14 @@ def first_slots(site: Site) -> dict[int, int]:
     first: dict[int, int] = {}
     taken: set[int] = set()
     for anchor in given + others:
-        slot = _free_slot(schedule, taken) if anchor.slot is None else anchor.slot
+        slot = anchor.slot
+        if slot is None:
+            slot = next((one for one in range(schedule.slots) if taken.isdisjoint(schedule.slots_of(one))), None)
         if slot is None or not 0 <= slot < schedule.slots or not taken.isdisjoint(schedule.slots_of(slot)):
             raise ValueError(_no_slot(anchor.id, slot, schedule))
         taken.update(schedule.slots_of(slot))
         first[anchor.id] = slot
     return {anchor.id: first[anchor.id] for anchor in site.anchors}
-
-
-def _free_slot(schedule: Schedule, taken: set[int]) -> int | None:
-    return next((slot for slot in range(schedule.slots) if taken.isdisjoint(schedule.slots_of(slot))), None)
 
 
 def _no_slot(anchor: int, slot: int | None, schedule: Schedule) -> str:

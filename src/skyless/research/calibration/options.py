@@ -139,11 +139,8 @@ def _check_points(name: str, given: Any) -> dict[int, tuple[float, ...]]:  # noq
 def _read_stay(name: str, text: str) -> Stay:
     position, mark, span = text.partition("@")
     x_m, y_m, *z_m = _metres(name, text, (2, 3), position)
-    stay = Stay(x_m, y_m, *z_m)
-    if not mark:
-        return stay
-    from_s, to_s = _read_span(name, text, span)
-    return Stay(stay.x_m, stay.y_m, stay.z_m, from_s, to_s)
+    times_s = _read_span(name, text, span) if mark else (-inf, inf)
+    return Stay(x_m, y_m, z_m[0] if z_m else None, *times_s)
 
 
 def _read_span(name: str, text: str, span: str) -> tuple[float, float]:

@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 
 from skyless.core.air.masterless_packets import PairTdoa, Point
 from skyless.core.constants import TICK_M, TICK_S
-from skyless.core.input_files import Drops, header_of, rows
+from skyless.core.input_files import Drops, rows
 from skyless.core.ticks import difference, wrap
 from skyless.research.foreign._tdoa_tables import numbers, rows_of
 from skyless.site.tables import Truth
@@ -44,11 +44,6 @@ class _Range(NamedTuple):
     time_s: float
     anchor: int
     range_m: float
-
-
-def recognise(head: bytes) -> bool:
-    """Whether the first line names both radios and the six stamps."""
-    return set(COLUMNS) <= set(header_of(head))
 
 
 def read(stream: BufferedIOBase, drops: Drops, listener: str | None = None) -> Iterator[PairTdoa]:

@@ -13,7 +13,7 @@ import numpy as np
 from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.arrays import Array
 from skyless.core.constants import TICK_M
-from skyless.core.input_files import Drops, header_of, open_source, rows
+from skyless.core.input_files import Drops, has_columns, open_source, rows
 from skyless.core.ticks import difference
 from skyless.research.foreign._crazyflie import heights_of, in_order
 from skyless.site.tables import Truth
@@ -27,16 +27,6 @@ UTIL_COLUMNS: Final = ("t_tdoa", "idA", "idB", "tdoa_meas")
 """The same in UTIL's own tables, which have the columns of other sensors, of other lengths, beside them."""
 
 _POSE_COLUMNS: Final = ("t_pose", "pose_x", "pose_y", "pose_z", "pose_qx", "pose_qy", "pose_qz", "pose_qw")
-
-
-def recognise_tdoas(head: bytes) -> bool:
-    """Whether the first line names the four columns."""
-    return set(TDOA_COLUMNS) <= set(header_of(head))
-
-
-def recognise_util(head: bytes) -> bool:
-    """Whether the first line names those of UTIL."""
-    return set(UTIL_COLUMNS) <= set(header_of(head))
 
 
 def read_tdoas(
@@ -89,7 +79,7 @@ def numbers(path: str | PathLike[str], columns: tuple[str, ...], tag: tuple[str,
     found = []
     names = columns if tag is None else (columns[0], tag[0], *columns[1:])
     with open_source(path) as stream:
-        if set(names) <= set(header_of(stream.readline())):
+        if has_columns(names, stream.readline()):
             stream.seek(0)
             given = rows(stream, Counter(), names)
             for row in given if tag is None else rows_of(given, Counter(), tag[1]):
@@ -129,11 +119,6 @@ _MARGIN_M: Final = 1.0
 """By how much a TDoA may exceed the distance of its nodes; beyond, the messages mostly are of different exchanges."""
 
 _MAX_RATE: Final = 100e-6
-
-
-def recognise_miluv(head: bytes) -> bool:
-    """Whether the first line names the nodes, the nine stamps and the positions."""
-    return set(MILUV_COLUMNS) <= set(header_of(head))
 
 
 def read_miluv(stream: BufferedIOBase, drops: Drops, listener: str | None = None) -> Iterator[PairTdoa]:

@@ -15,11 +15,12 @@ from msgspec import Struct
 
 from skyless.core.air.masterless_packets import Packet, Relay
 from skyless.core.constants import TICK_BITS, TICK_M
-from skyless.core.input_files import Drops, header_of, open_source, rows
+from skyless.core.input_files import Drops, open_source, rows
 from skyless.site.survey.two_way import TwoWayRanging
 
 RECEPTION_COLUMNS: Final = ("t_host", "order", "slave", "master", "status", "tx_ticks_u40", "rx_ticks_u40")
 BLINK_COLUMNS: Final = ("tag", "anchor", "rx_ticks_u40")
+"""Of the same system's tables of tag blinks, which go the other way."""
 _HELD_TRANSMISSIONS: Final = 6
 """Number of newer transmissions that may begin before a row of an older one."""
 
@@ -48,16 +49,6 @@ class _Transmission(Struct):
 
     first: CrossReception
     rx_ticks: dict[int, int]
-
-
-def recognise(head: bytes) -> bool:
-    """Whether the first line names the columns of the anchors' receptions."""
-    return set(RECEPTION_COLUMNS) <= set(header_of(head))
-
-
-def recognise_blinks(head: bytes) -> bool:
-    """Whether this is the same system's table of tag blinks, which go the other way."""
-    return set(BLINK_COLUMNS) <= set(header_of(head))
 
 
 def read(stream: BufferedIOBase, drops: Drops, listener: str | None = None) -> Iterator[Packet]:

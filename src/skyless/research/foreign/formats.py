@@ -14,7 +14,7 @@ from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.core.arrays import Array
 from skyless.core.constants import TICK_BITS
 from skyless.core.errors import ConfigurationError
-from skyless.core.input_files import Drops, open_source, read_head
+from skyless.core.input_files import Drops, has_columns, open_source, read_head
 from skyless.radio.foreign import bitcraze, fira
 from skyless.research.foreign import _bitcraze_captures as bitcraze_captures
 from skyless.research.foreign import _crazyflie as crazyflie
@@ -79,7 +79,7 @@ FORMATS: Final = (
     Format(
         "miluv",
         "MILUV passive ticks: three-message exchanges overheard by a listener",
-        tdoa_tables.recognise_miluv,
+        partial(has_columns, tdoa_tables.MILUV_COLUMNS),
         tdoa_tables.read_miluv,
         None,
         any_listener=True,
@@ -88,7 +88,7 @@ FORMATS: Final = (
     Format(
         "avalue",
         "Avalue anchors' receptions of each other (ccp.csv); one of them plays the tag",
-        avalue.recognise,
+        partial(has_columns, avalue.RECEPTION_COLUMNS),
         avalue.read,
         TICK_BITS,
         any_listener=True,
@@ -105,11 +105,17 @@ FORMATS: Final = (
         fira.recognise_text,
         fira.read_text,
     ),
-    Format("tdoa-table", "Table t_s,idA,idB,tdoa_m", tdoa_tables.recognise_tdoas, tdoa_tables.read_tdoas, None),
+    Format(
+        "tdoa-table",
+        "Table t_s,idA,idB,tdoa_m",
+        partial(has_columns, tdoa_tables.TDOA_COLUMNS),
+        tdoa_tables.read_tdoas,
+        None,
+    ),
     Format(
         "util-table",
         "UTIL's published tables t_tdoa,idA,idB,tdoa_meas, with poses, ranger and barometer",
-        tdoa_tables.recognise_util,
+        partial(has_columns, tdoa_tables.UTIL_COLUMNS),
         tdoa_tables.read_util,
         None,
         read_truth=tdoa_tables.read_util_truth,
@@ -135,7 +141,7 @@ FORMATS: Final = (
     Format(
         "starloc",
         "STARLOC's two-way exchanges of a tag with anchors (uwb.csv), as differences of successive ranges",
-        starloc.recognise,
+        partial(has_columns, starloc.COLUMNS),
         starloc.read,
         None,
         any_listener=True,
@@ -256,7 +262,7 @@ def _recognised(path: str | PathLike[str]) -> Format:
         raise ConfigurationError(path, "the file", "empty", f"a recording {_readable()}")
     if head.startswith(_MCAP):
         raise ConfigurationError(path, "the file", "a compressed MCAP", "unpacked first, as by gunzip")
-    if avalue.recognise_blinks(head):
+    if has_columns(avalue.BLINK_COLUMNS, head):
         expected = "ccp.csv of the same system: what tags send up to anchors cannot be replayed as a tag's receptions"
         raise ConfigurationError(path, "the format", "tag blinks", expected)
     start = head[:24].decode("ascii", "backslashreplace")

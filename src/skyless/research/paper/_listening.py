@@ -72,7 +72,7 @@ def listen(
     listeners = [[(Receiver(method), _Log(site)) for method in methods] for _ in trajectories]
     end_s = until_s if until_s is not None else _WARMUP_S + 1.02 * (fixes or 0) * superframe_s + 1.0
     now_s = 0.0
-    while now_s < end_s and not _enough(listeners, fixes):
+    while now_s < end_s and (fixes is None or any(len(log.rows) < fixes for pairs in listeners for _, log in pairs)):
         now_s = min(now_s + 0.5, end_s)
         for broadcast in world.run(now_s):
             for tag, reception, truth_m in broadcast.receptions():
@@ -81,7 +81,3 @@ def listen(
                     if fix is not None and broadcast.end_s >= _WARMUP_S:
                         log.add(broadcast.end_s, fix, truth_m)
     return [{method: log.track(fixes) for method, (_, log) in zip(methods, pairs, strict=True)} for pairs in listeners]
-
-
-def _enough(listeners: list[list[tuple[Receiver, _Log]]], fixes: int | None) -> bool:
-    return fixes is not None and all(len(log.rows) >= fixes for pairs in listeners for _, log in pairs)

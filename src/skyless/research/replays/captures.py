@@ -226,7 +226,8 @@ class CaptureReplay:
                     if time_s is not None:
                         self._first_s = time_s if self._first_s is None else self._first_s
                         self._last_s = time_s
-                        self._process_heights(time_s)
+                        while self._heights and self._heights[0].time_s <= time_s:
+                            self._pipeline.process_height(self._heights.popleft())
                         if self._is_over():
                             break
                     if fix is not None:
@@ -266,10 +267,6 @@ class CaptureReplay:
             settle_s=settle_s if asked.settle_s is None else asked.settle_s,
             above_m=flight_height(asked.above_m, self._truth),
         )
-
-    def _process_heights(self, until_s: float) -> None:
-        while self._heights and self._heights[0].time_s <= until_s:
-            self._pipeline.process_height(self._heights.popleft())
 
     def _add(self, fix: Fix, on_fix: Callable[[Fix], None] | None) -> None:
         self.samples.add(fix.time_s, fix)

@@ -4,10 +4,10 @@ import asyncio
 import contextlib
 from collections.abc import AsyncGenerator
 from itertools import count
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from nats.errors import Error
-from nats.js.api import ConsumerConfig, DeliverPolicy, RePublish, StorageType, StreamConfig
+from nats.js.api import ConsumerConfig, DeliverPolicy, RePublish, StreamConfig
 from nats.js.errors import APIError, NotFoundError
 
 from skyless.core.errors import SkylessError
@@ -22,6 +22,8 @@ KEEP_S: Final = 24 * 3600.0
 """How long the stream keeps fixes."""
 KEEP_EVENTS_S: Final = 365 * 24 * 3600.0
 EVENT_BYTES: Final = 500_000_000
+NEWEST_OF_EACH: Final[dict[str, Any]] = {"max_msgs_per_subject": 1, "allow_direct": True}
+"""Limits of a stream that keeps the newest message of each subject, which can be asked for."""
 
 _NO_ROOM: Final = 10047  # JetStream's code of an error
 _DUPLICATES_S: Final = 120.0
@@ -37,39 +39,17 @@ async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -
     Raises:
         SkylessError: the server has no room for these bytes.
     """
-    fixes = StreamConfig(
-        name=subjects.at(subjects.FIX_STREAM, site),
-        subjects=[subjects.at(subjects.FIXES, site)],
-        storage=StorageType.FILE,
-        num_replicas=1,
-        max_age=KEEP_S,
-        max_bytes=keep_bytes,
-        duplicate_window=_DUPLICATES_S,
-        republish=RePublish(subjects.at(subjects.FIXES, site), subjects.at(subjects.LIVE, site)),
-    )
-    names = StreamConfig(
-        name=subjects.at(subjects.NAMES_STREAM, site),
-        subjects=[subjects.at(subjects.NAMES, site)],
-        storage=StorageType.FILE,
-        num_replicas=1,
-        max_msgs_per_subject=1,
-        allow_direct=True,
-    )
-    state = StreamConfig(
-        name=subjects.at(subjects.STATE_STREAM, site),
-        subjects=[subjects.at(subject, site) for subject in subjects.STATE],
-        max_msgs_per_subject=1,
-        allow_direct=True,
-    )
-    events = StreamConfig(
-        name=subjects.at(subjects.EVENT_STREAM, site),
-        subjects=[subjects.at(subject, site) for subject in subjects.EVENTS],
-        max_age=KEEP_EVENTS_S,
-        max_bytes=EVENT_BYTES,
-    )
-    for config in (fixes, names, state, events):
+    live = RePublish(subjects.at(subjects.FIXES, site), subjects.at(subjects.LIVE, site))
+    all_fixes = {"max_age": KEEP_S, "max_bytes": keep_bytes, "duplicate_window": _DUPLICATES_S, "republish": live}
+    for name, taken, limits in (
+        (subjects.FIX_STREAM, (subjects.FIXES,), all_fixes),
+        (subjects.NAMES_STREAM, (subjects.NAMES,), NEWEST_OF_EACH),
+        (subjects.STATE_STREAM, subjects.STATE, NEWEST_OF_EACH),
+        (subjects.EVENT_STREAM, subjects.EVENTS, {"max_age": KEEP_EVENTS_S, "max_bytes": EVENT_BYTES}),
+    ):
+        patterns = [subjects.at(subject, site) for subject in taken]
         try:
-            await make_stream(stream, config)
+            await make_stream(stream, StreamConfig(name=subjects.at(name, site), subjects=patterns, **limits))
         except APIError as error:
             if error.err_code != _NO_ROOM:
                 raise

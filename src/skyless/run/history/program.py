@@ -31,8 +31,8 @@ from skyless.run.mqtt.messages import (
     FixMessage,
     SiteMessage,
     StatusMessage,
-    WrongMessageError,
     ZoneEvent,
+    ZonesMessage,
 )
 from skyless.run.process import Log, every, keep, reader, together
 from skyless.run.zones.zone_list import read_zones
@@ -86,8 +86,11 @@ class SiteHistory:
         """Subscribe to what is kept, with topic filters of MQTT; ``fixes``: also to single fixes."""
         site = self._writer.site
 
+        def on_wrong() -> None:
+            self._writer.drops["wrong-message"] += 1
+
         def take(topic: str, kind: type[Struct], act: Callable[[Any], None], qos: int = 1) -> None:
-            subscribe(topic, reader(kind, act, lambda: self._writer.drops.update(["wrong-message"])), qos)
+            subscribe(topic, reader(kind, act, on_wrong), qos)
 
         take(topics.site_topic(site), SiteMessage, self._on_site)
         if fixes:
@@ -97,7 +100,8 @@ class SiteHistory:
         for kind in ("tag", "anchor"):
             take(topics.status_topic(site, kind, "+"), StatusMessage, self._on_event)
         take(topics.assets_topic(site), AssetsMessage, lambda message: self._writer.set_assets(message.assets))
-        subscribe(topics.zones_topic(site), self._on_zones, 1)
+        zones = reader(read_zones, lambda message: self._writer.set_zones(message.zones), on_wrong, ZonesMessage(()))
+        subscribe(topics.zones_topic(site), zones, 1)
 
     async def run(self, *sources: Coroutine[Any, Any, None]) -> None:
         """Keep what the sources give. Finally it becomes files; what cannot waits in the journal for the next start."""
@@ -140,12 +144,6 @@ class SiteHistory:
     def _on_event(self, message: ZoneEvent | AlarmMessage | StatusMessage) -> None:
         now_s = time.time()
         self._writer.events.add(self._events.of(message, now_s), now_s, self.event_place)
-
-    def _on_zones(self, _topic: str, payload: bytes) -> None:
-        try:
-            self._writer.set_zones(read_zones(payload).zones if payload else ())
-        except WrongMessageError:
-            self._writer.drops["wrong-message"] += 1
 
     def _store(self) -> None:
         self._add_fixes()

@@ -2,26 +2,27 @@
 
 import asyncio
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from nats.errors import Error
-from nats.js.errors import NotFoundError
 
 from skyless.run.fix_batch import BadBatchError, Batch, Records, decode_batch
 from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect, rarely
 from skyless.run.gather.names import Names
-from skyless.run.gather.streams import messages
-from skyless.run.history.writer import MAX_UNIX_S, Writer
+from skyless.run.gather.streams import follow
+from skyless.run.history.writer import MAX_UNIX_S, Intake, Writer
 from skyless.run.process import Log
 
 if TYPE_CHECKING:
     from nats.aio.msg import Msg
     from nats.js import JetStreamContext
 
-PERIOD_S: Final = 0.2
-MAX_WAITING: Final = 100_000
+_PERIOD_S: Final = 0.2
+_RETRY_S: Final = 2.0
+_MAX_WAITING: Final = 100_000
 """While more rows than this wait for the disk, others stay in the stream."""
 _NAMES_S: Final = 60.0
 """How long the names of a batch may come later than itself: at a hub, streams catch up one after the other."""
@@ -31,15 +32,17 @@ _MAX_SENDERS: Final = 1000
 class BatchTaker:
     """Gives the batches of a stream to a history, each once."""
 
-    def __init__(self, names: Names, writer: Writer) -> None:
-        self._names, self._writer = names, writer
+    def __init__(self, names: Names, writer: Writer, log: Log) -> None:
+        self._names, self._writer, self._say = names, writer, rarely(log)
         self._sequences: dict[int, int] = {}
         """The last sequence of each run of a sender."""
         self._given_up = 0
         """Names with numbers up to this did not come in time."""
 
     async def take(self, message: "Msg") -> None:
-        """Take the batch of a message, unless it is known. Raises nats.errors.Error: the names cannot be read."""
+        """Take the batch of a message, unless it is known. Waits for the disk, and for the names of its tags."""
+        while self._writer.fixes.waiting > _MAX_WAITING:
+            await asyncio.sleep(_PERIOD_S)
         place = message.metadata.sequence.stream
         if place <= self._writer.fixes.position:
             return
@@ -48,9 +51,9 @@ class BatchTaker:
         except BadBatchError:
             self._writer.drops["wrong-batch"] += 1
             return
-        await self._read_names(batch.names_issue)
-        if not self._is_next(batch):  # asked last: a message whose names could not be read is given again
+        if not self._is_next(batch):
             return
+        await self._read_names(batch.names_issue)
         now_s = time.time()
         self._writer.fixes.add(self._renumbered(batch.records, now_s), now_s, place)
 
@@ -67,11 +70,15 @@ class BatchTaker:
     async def _read_names(self, issue: int) -> None:
         deadline_s = time.monotonic() + _NAMES_S
         while self._names.issue < issue > self._given_up:
-            await self._names.read()
+            try:
+                await self._names.read()
+            except Error as error:
+                self._say(f"the names of site {self._writer.site} cannot be read: {error or type(error).__name__}")
+                deadline_s = time.monotonic() + _NAMES_S
             if self._names.issue < issue:
                 if time.monotonic() > deadline_s:
                     self._given_up = issue
-                await asyncio.sleep(PERIOD_S)
+                await asyncio.sleep(_PERIOD_S)
 
     def _renumbered(self, records: Records, now_s: float) -> Records:
         """Records that are kept, with the numbers that this history gives to their tags; the others are counted."""
@@ -87,33 +94,35 @@ class BatchTaker:
         return kept
 
 
+async def first_place(stream: "JetStreamContext", name: str, intakes_of: Callable[[], list[Intake]], say: Log) -> int:
+    """The place in a stream of which all intakes have what is before. Waits for the stream."""
+    while True:
+        try:
+            last = (await stream.stream_info(name)).state.last_seq
+            break
+        except Error as error:
+            say(f"waits for the stream {name}, which a gather or skyless hub apply makes: {error or 'no answer'}")
+            await asyncio.sleep(_RETRY_S)
+    intakes = intakes_of()
+    for intake in intakes:
+        if intake.position > last:
+            say(f"the stream {name} was made anew; it is taken from its beginning")
+            intake.position = 0
+    return min((intake.position for intake in intakes), default=0)
+
+
 async def take_stream(address: NatsAddress, writer: Writer, log: Log) -> None:
     """Give the batches of a site's stream to a history until cancelled, from where it stopped the last time.
 
     The place in the stream is kept together with the rows, so that each batch is taken once.
     """
-    say = rarely(log)
+    say, name = rarely(log), subjects.at(subjects.FIX_STREAM, writer.site)
     client = await connect(address, "skyless history", say, writer.drops)
     try:
         stream = client.jetstream()
-        taker = BatchTaker(Names(stream, writer.site), writer)
-        while True:
-            try:
-                await _take_waiting(stream, taker, writer)
-            except NotFoundError:
-                say(f"no gather has gathered site {writer.site} at {address} yet")
-            except Error as error:
-                say(f"the stream of site {writer.site} cannot be read: {error or type(error).__name__}")
-            await asyncio.sleep(PERIOD_S)
+        taker = BatchTaker(Names(stream, writer.site), writer, log)
+        after = await first_place(stream, name, lambda: [writer.fixes], say)
+        async for message in follow(stream, name, ">", say, after):
+            await taker.take(message)
     finally:
         await client.close()
-
-
-async def _take_waiting(stream: "JetStreamContext", taker: BatchTaker, writer: Writer) -> None:
-    """Take what the stream has now, as long as the disk takes it."""
-    found = messages(stream, subjects.at(subjects.FIX_STREAM, writer.site), writer.fixes.position)
-    async for message in found:
-        await taker.take(message)
-        if writer.fixes.waiting > MAX_WAITING:
-            await found.aclose()
-            return

@@ -13,7 +13,7 @@ import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.errors import SkylessError
+from skyless.core.errors import SkylessError, writing
 from skyless.core.whole_files import replace_files
 from skyless.run.gather.address import FIRST_PORT, MAX_PAYLOAD, NatsAddress
 from skyless.run.gather.subjects import DOMAIN, SOURCED, SUMMARY, at
@@ -103,13 +103,11 @@ def write_files(hub: Hub, folder: Path) -> list[Path]:
     for tenant in hub.sites:
         text = f"SKYLESS_HUB={hub.address(tenant)}\n{PASSWORD_VARIABLE}={hub.passwords[tenant]}\n{trusted}"
         files[folder / "tenants" / f"{tenant}.env"] = text.encode()
-    try:
+    with writing(folder):
         changed = {file: data for file, data in files.items() if not file.exists() or file.read_bytes() != data}
         for file in changed:
             file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         replace_files(changed, secret=changed)
-    except OSError as error:
-        raise SkylessError(f"{error.filename or folder} cannot be written: {error.strerror}") from None
     return list(changed)
 
 

@@ -82,8 +82,11 @@ class HubLink:
     def _is_live(self, topic_filter: str) -> bool:
         """Whether the messages of a filter are in no stream."""
         levels = subjects.subject_of(topic_filter).split(".")
-        kept = [subjects.at(subject, self.site).split(".") for subject in _KEPT]
-        return not any(len(one) == len(levels) and all(map(_covers, one, levels)) for one in kept)
+        for subject in _KEPT:
+            kept = subjects.at(subject, self.site).split(".")
+            if len(kept) == len(levels) and all(one in ("*", level) for one, level in zip(kept, levels, strict=True)):
+                return False
+        return True
 
     async def _follow(self, client: "Client", name: str) -> None:
         found = follow(client.jetstream(), name, f"skyless.v1.{self.site}.>", self._say, newest_of_each=True)
@@ -113,7 +116,3 @@ class HubLink:
 
     async def _on_message(self, message: "Msg") -> None:
         self._subscriptions.receive(subjects.topic_of(message.subject), message.data)
-
-
-def _covers(pattern: str, level: str) -> bool:
-    return pattern in ("*", level)

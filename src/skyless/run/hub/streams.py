@@ -12,14 +12,13 @@ from skyless.core.errors import SkylessError
 from skyless.run.gather import subjects
 from skyless.run.gather.address import connect, rarely
 from skyless.run.gather.node import Summary
-from skyless.run.gather.streams import EVENT_BYTES, KEEP_EVENTS_S, make_stream
+from skyless.run.gather.streams import EVENT_BYTES, KEEP_EVENTS_S, KEEP_S, NEWEST_OF_EACH, make_stream
 from skyless.run.hub.files import Hub
 from skyless.run.process import Log
 
 if TYPE_CHECKING:
     from nats.js import JetStreamContext
 
-_KEEP_FIXES_S: Final = 24 * 3600.0
 _READY_S: Final = 60.0
 _RETRY_S: Final = 1.0
 _LISTEN_S: Final = 2.5
@@ -27,23 +26,15 @@ _LISTEN_S: Final = 2.5
 
 async def make_hub_streams(stream: "JetStreamContext", hub: Hub, tenant: str) -> None:
     """Make the streams of a tenant, or add sites to those that are there. Raises nats.errors.Error."""
-    for config in (
-        StreamConfig(name=subjects.HUB_STATE, max_msgs_per_subject=1, allow_direct=True),
-        StreamConfig(name=subjects.HUB_NAMES, max_msgs_per_subject=1, allow_direct=True),
-        StreamConfig(name=subjects.HUB_EVENTS, max_age=KEEP_EVENTS_S, max_bytes=4 * EVENT_BYTES),
-        StreamConfig(name=subjects.HUB_FIXES, max_age=_KEEP_FIXES_S, max_bytes=round(1e9 * hub.fixes_gb)),
+    fixes = {"max_age": KEEP_S, "max_bytes": round(1e9 * hub.fixes_gb)}
+    for name, of_site, limits in (
+        (subjects.HUB_STATE, subjects.STATE_STREAM, NEWEST_OF_EACH),
+        (subjects.HUB_NAMES, subjects.NAMES_STREAM, NEWEST_OF_EACH),
+        (subjects.HUB_EVENTS, subjects.EVENT_STREAM, {"max_age": KEEP_EVENTS_S, "max_bytes": 4 * EVENT_BYTES}),
+        (subjects.HUB_FIXES, subjects.FIX_STREAM, fixes),
     ):
-        config.num_replicas = len(hub.nodes)
-        config.sources = [_source(_OF_SITE[config.name or ""], site) for site in hub.sites[tenant]]
-        await make_stream(stream, config)
-
-
-_OF_SITE: Final = {
-    subjects.HUB_STATE: subjects.STATE_STREAM,
-    subjects.HUB_NAMES: subjects.NAMES_STREAM,
-    subjects.HUB_EVENTS: subjects.EVENT_STREAM,
-    subjects.HUB_FIXES: subjects.FIX_STREAM,
-}
+        sources = [_source(of_site, site) for site in hub.sites[tenant]]
+        await make_stream(stream, StreamConfig(name=name, num_replicas=len(hub.nodes), sources=sources, **limits))
 
 
 def _source(pattern: str, site: int) -> StreamSource:

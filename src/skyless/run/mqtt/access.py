@@ -4,7 +4,6 @@ Passwords are in a private folder with one file for each role, ``<role>.env``. A
 of the role reads, in the form of systemd, Docker and the shell: it is copied to the machines of that role only.
 """
 
-import contextlib
 import os
 import re
 import secrets
@@ -16,7 +15,8 @@ from typing import Final
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.errors import SkylessError
+from skyless.core.errors import SkylessError, writing
+from skyless.core.whole_files import replace_files
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress
 from skyless.run.mqtt.topics import EVERY_NODE, EVERY_SITE
@@ -144,12 +144,10 @@ def create_access(folder: Path, address: MqttAddress) -> tuple[Path, ...]:
     missing = {role: folder / f"{role}.env" for role in USERS if not os.path.lexists(folder / f"{role}.env")}
     if not missing:
         raise SkylessError(f"{folder} has the files of all roles; one that is to be replaced should be removed first")
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        for role, file in missing.items():
-            _write_new(file, _text(role, replace(address, user=str(role))))
-    except OSError as error:
-        raise SkylessError(f"{error.filename or folder} cannot be written: {error.strerror}") from None
+        files = {file: _text(role, replace(address, user=str(role))).encode() for role, file in missing.items()}
+        replace_files(files, secret=files)
     return tuple(missing.values())
 
 
@@ -159,18 +157,6 @@ def _text(role: Role, address: MqttAddress) -> str:
         f"SKYLESS_MQTT={address}\n"
         f"{PASSWORD_VARIABLE}={secrets.token_urlsafe(_PASSWORD_BYTES)}\n"
     )
-
-
-def _write_new(file: Path, text: str) -> None:
-    """A file for its owner alone, which appears whole."""
-    scratch = file.with_name(f".{file.name}.{secrets.token_hex(4)}")
-    try:
-        with os.fdopen(os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as out:
-            out.write(text)
-        os.link(scratch, file)  # unlike a rename, it replaces nothing
-    finally:
-        with contextlib.suppress(OSError):
-            scratch.unlink()
 
 
 def read_access(folder: Path) -> Mapping[Role, str]:

@@ -122,7 +122,8 @@ class Connection:
         except BaseException as error:
             self.abort("gave up")
             if isinstance(error, TimeoutError) and not error.args:
-                raise TimeoutError(self._no_answer()) from None
+                late = f"no answer within {BROKER_ANSWER_S:g} s"
+                raise TimeoutError("its answer is not MQTT" if self._has_answered else late) from None
             raise
         self.writable = not self.lost.is_set()
         self._keep_alive()
@@ -182,7 +183,7 @@ class Connection:
             raise ConnectionError(self.reason)
         self._client.on_connect = self._on_connect
         self._client.on_disconnect = self._on_disconnect
-        self._client.on_socket_close = self._on_socket_close
+        self._client.on_socket_close = lambda *_: self._leave_loop()
         self._client.on_message = self._on_message
         self._client.on_subscribe = self._on_subscribe
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -259,9 +260,6 @@ class Connection:
             self._accepted.exception()  # retrieved, in case nothing awaits it
         self.lost.set()
 
-    def _no_answer(self) -> str:
-        return "its answer is not MQTT" if self._has_answered else f"no answer within {BROKER_ANSWER_S:g} s"
-
     # What paho calls
 
     def _on_connect(self, _client: object, _data: object, _flags: object, code: ReasonCode, _more: object) -> None:
@@ -281,9 +279,6 @@ class Connection:
             self._lose("its answer is not MQTT")
         else:
             self._lose(self.reason)
-
-    def _on_socket_close(self, _client: object, _data: object, _socket: object) -> None:
-        self._leave_loop()
 
     def _on_message(self, _client: object, _data: object, message: paho.MQTTMessage) -> None:
         self._messages += 1

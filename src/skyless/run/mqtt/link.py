@@ -143,8 +143,9 @@ class Link:
         """
         payload = message if isinstance(message, bytes) else _encode(message)
         fault = self._outbox.add(topic, payload, qos, retain=retain, until_s=until_s)
-        if fault is not None:
-            self._log_fault(fault)
+        if fault is not None and not self._logged_fault:
+            self._logged_fault = True
+            _log.warning("not published: %s", fault)
         self._pump()
 
     def forget(self, topic: str) -> None:
@@ -302,11 +303,6 @@ class Link:
         if trouble != self._logged[0] or now_s > self._logged[1] + _SAME_TROUBLE_S:
             self._logged = (trouble, now_s)
             _log.warning("%s", trouble)
-
-    def _log_fault(self, fault: str) -> None:
-        if not self._logged_fault:
-            self._logged_fault = True
-            _log.warning("not published: %s", fault)
 
     def _log_return(self) -> None:
         dropped = self._outbox.dropped - self._reported_dropped

@@ -8,7 +8,7 @@ from zlib import crc32
 from msgspec import Struct
 from msgspec.structs import asdict, replace
 
-from skyless.core.errors import SkylessError
+from skyless.core.errors import SkylessError, writing
 from skyless.core.site import FloorPlanSite, Site
 from skyless.core.whole_files import replace_files
 from skyless.run.process import Log
@@ -89,7 +89,7 @@ def save_survey(
     site = load_site(file)
     record, kept = _record(site, survey, ranges, unix_s), kept_path(file)
     image: dict[Path, bytes] = {}
-    try:
+    with writing(file):
         text = surveyed_text(file.read_bytes().decode("utf-8-sig"), survey, site, file)
         if floor is not None:
             image_name, image = _floor_image(file, site, floor)
@@ -98,8 +98,6 @@ def save_survey(
                 text = with_values(text, {}, {"floor_plan": values}, file, "the floor plan")
         files = {kept: file.read_bytes(), record_path(file): encode_record(record), file: text.encode()}
         replace_files(image | files)
-    except OSError as error:
-        raise SkylessError(f"{error.filename or file} cannot be written: {error.strerror}") from None
     return Saved(load_site(file), record, (file, record_path(file), kept, *image))
 
 

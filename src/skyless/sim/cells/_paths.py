@@ -5,7 +5,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from skyless.core.arrays import Records
 from skyless.core.constants import TICK_S
 from skyless.sim.cells._clocks import KNOT_BITS, KNOT_TICKS
 from skyless.sim.cells._receptions import PIECE, Path
@@ -37,7 +36,8 @@ class TagPath:
         for row, piece in zip(pieces, self._pieces, strict=True):
             row["end_s"], row["origin_s"], row["position_m"] = piece.end_s, piece.origin_s, piece.position_m
             row["velocity_mps"], row["acceleration_mps2"] = piece.velocity_mps, piece.acceleration_mps2
-        return Path(pieces[_first_piece(pieces, from_ticks) :], first, np.array(travelled))
+        left = pieces["end_s"] > from_ticks * TICK_S
+        return Path(pieces[left], first, np.array(travelled))
 
     def _extend(self, from_s: float, to_s: float) -> None:
         """Keep the pieces from one time to another."""
@@ -74,7 +74,3 @@ class TagPath:
 
 def _knot_s(knot: int) -> float:
     return knot * KNOT_TICKS * TICK_S
-
-
-def _first_piece(pieces: Records, from_ticks: int) -> int:
-    return int(np.count_nonzero(pieces["end_s"] <= from_ticks * TICK_S))

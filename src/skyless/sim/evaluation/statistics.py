@@ -55,14 +55,11 @@ class EvenSample:
         if seen % self._stride:
             return
         if len(self._store) >= self._most:
-            self._halve()
+            self._store = array("d", self.rows[::2].tobytes())
+            self._stride *= 2
             if seen % self._stride:
                 return
         self._store.extend(row)
-
-    def _halve(self) -> None:
-        self._store = array("d", self.rows[::2].tobytes())
-        self._stride *= 2
 
     @property
     def rows(self) -> Array:

@@ -258,7 +258,8 @@ class Search:
         except KeyboardInterrupt:
             if self._found:
                 judged.append(self._judge(min(self._found, key=lambda found: found[0])[1]))
-        best = min(judged, key=lambda s: _against(s, first))
+        usual = first.mean_sigma_m, first.worst_sigma_m
+        best = min(judged, key=lambda s: relative_score(s.mean_sigma_m, s.worst_sigma_m, *usual))
         met = None if target_m is None else best.covered_share == 1.0 and best.worst_sigma_m <= target_m
         return Optimised(best, first, self.evaluations, finished, met)
 
@@ -376,10 +377,6 @@ class Search:
             site = self._site_of(layout, rank)
             scored.append(Scored(site, *self._sigma(site, self._judge_points)))
         return min(scored, key=lambda s: s.mean_sigma_m * s.worst_sigma_m)
-
-
-def _against(scored: Scored, even: Scored) -> float:
-    return relative_score(scored.mean_sigma_m, scored.worst_sigma_m, even.mean_sigma_m, even.worst_sigma_m)
 
 
 def _candidates(mounts: Mounts, most: int, least: int = 1) -> tuple[Vector, Integers]:

@@ -161,7 +161,8 @@ def rate_map(
     rates = tag_rates(site, points, channel, exponent)
     values = np.full((len(grid.heights_m), *grid.within.shape), np.nan)
     values[:, grid.within] = rates.beacons_per_s.reshape(len(grid.heights_m), -1)
-    return RateMap(grid, values, _reception(rates))
+    found = (_distribution(one) for one in (rates.beacons_per_s, rates.in_reach, rates.received))
+    return RateMap(grid, values, Reception(*found))
 
 
 def _points_in_cells(grid: Grid) -> Matrix:
@@ -174,10 +175,6 @@ def _points_in_cells(grid: Grid) -> Matrix:
     cell_m = [np.diff(axis_m).min(initial=grid.step_m) for axis_m in (grid.x_m, grid.y_m)]
     points: Matrix = centres + shares * cell_m
     return points
-
-
-def _reception(rates: TagRates) -> Reception:
-    return Reception(_distribution(rates.beacons_per_s), _distribution(rates.in_reach), _distribution(rates.received))
 
 
 def _distribution(values: Vector | Integers) -> Distribution:

@@ -143,7 +143,8 @@ def _accuracy(site: Site, found: dict[int, SurveyedAnchor], range_std_m: float) 
         return old
     survey_std_m = old.survey_std_m
     if site.schedule.needs_master:
-        each = [old.survey_std_m if one is None else one for one in (_std(found, anchor.id) for anchor in site.anchors)]
+        stds_m = [found[anchor.id].std_m if anchor.id in found else None for anchor in site.anchors]
+        each = [old.survey_std_m if one is None else one for one in stds_m]
         survey_std_m = (
             _up(math.sqrt(sum(one**2 for one in each) / len(each)), _STD_STEPS_PER_M) if each else old.survey_std_m
         )
@@ -158,10 +159,6 @@ def _another_std(std_m: float) -> float:
     """The next step on the air, or the one before where there is none."""
     more_m = _up(std_m, _STD_STEPS_PER_M) + 1.0 / _STD_STEPS_PER_M
     return round(more_m if _RANGE_STD.contains(more_m) else more_m - 2.0 / _STD_STEPS_PER_M, 4)
-
-
-def _std(found: dict[int, SurveyedAnchor], identifier: int) -> float | None:
-    return found[identifier].std_m if identifier in found else None
 
 
 def _changes(before: AnchorSite | UnplacedAnchor, after: AnchorSite) -> dict[str, float]:

@@ -355,7 +355,8 @@ class PairRanger:
     def _close_block(self) -> None:
         if not self._open or self._block is None:
             return
-        legs = _joined(self._kept, _legs_of(self._open))
+        both = zip(astuple(self._kept), astuple(_legs_of(self._open)), strict=True)
+        legs = Legs(*map(np.concatenate, both))
         self._open = []
         flights, kept, impossible = flights_of(legs, self._longest_ticks)
         self._kept = kept.part(kept.t_s > self._last_s - _KEPT_S)
@@ -534,7 +535,3 @@ def _legs_of(rows: list[tuple[int, int, int, bool, float]]) -> Legs:
         np.zeros(len(rows), bool),
         np.array(t_s, np.float64),
     )
-
-
-def _joined(one: Legs, other: Legs) -> Legs:
-    return Legs(*map(np.concatenate, zip(astuple(one), astuple(other), strict=True)))
