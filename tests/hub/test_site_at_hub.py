@@ -10,9 +10,9 @@ from nats.errors import NoRespondersError
 
 from skyless.cli.main import main
 from skyless.run.broker import BrokerSettings, _program, start_broker
+from skyless.run.gather.leaf import read_json
 from skyless.run.gather.node import Gather
 from skyless.run.hub.files import MONITOR_PORT, Hub
-from skyless.run.hub.leaf import read_json
 from support.processes import SKYLESS, free_port, started
 
 pytestmark = pytest.mark.site

@@ -14,8 +14,8 @@ from skyless.cli.nodes.options import log
 from skyless.core.arguments import Options, Text, number, wrong
 from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module
+from skyless.run.gather.leaf import read_json
 from skyless.run.hub.files import PLAN, Hub, Node, read_node, with_sites, write_files
-from skyless.run.hub.leaf import read_json
 
 app = App(name="hub", help_epilogue="Example: skyless hub init hub --node a.example --node b.example --node c.example")
 

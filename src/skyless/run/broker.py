@@ -30,8 +30,8 @@ from skyless.core.whole_files import replace_files
 from skyless.run.children import end
 from skyless.run.gather.address import FIRST_PORT as FIRST_NATS_PORT
 from skyless.run.gather.address import MAX_PAYLOAD, NatsAddress
+from skyless.run.gather.leaf import PING_INTERVAL, Leaf
 from skyless.run.gather.subjects import DOMAIN, NAME_REQUESTS, PAGE_INBOX, at
-from skyless.run.hub.leaf import PING_INTERVAL, Leaf
 from skyless.run.mqtt.access import ACCESS, Role
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress, mqtt_address
 from skyless.run.mqtt.connection import check_broker

@@ -20,7 +20,7 @@ from skyless.run.broker import FIRST_PORT, Broker, BrokerSettings, start_broker
 from skyless.run.children import Child, Program
 from skyless.run.find_site import SiteOnBroker, watch_sites
 from skyless.run.gather.address import NatsAddress
-from skyless.run.hub.leaf import Leaf, StuckLineError, read_json
+from skyless.run.gather.leaf import Leaf, StuckLineError, read_json
 from skyless.run.mqtt.access import Role, create_access, read_access
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress, mqtt_address
 from skyless.run.process import together

@@ -16,8 +16,8 @@ from msgspec.structs import replace
 from skyless.core.errors import SkylessError, writing
 from skyless.core.whole_files import replace_files
 from skyless.run.gather.address import FIRST_PORT, MAX_PAYLOAD, NatsAddress
+from skyless.run.gather.leaf import PING_INTERVAL, Leaf
 from skyless.run.gather.subjects import DOMAIN, SOURCED, SUMMARY, at
-from skyless.run.hub.leaf import PING_INTERVAL, Leaf
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, is_loopback
 
 CLUSTER_PORT: Final = 2000

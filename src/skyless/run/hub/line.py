@@ -14,8 +14,8 @@ from skyless.core.errors import SkylessError
 from skyless.run.broker import Broker
 from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect, rarely
+from skyless.run.gather.leaf import Leaf, StuckLineError
 from skyless.run.gather.node import Summary
-from skyless.run.hub.leaf import Leaf, StuckLineError
 from skyless.run.process import Log
 
 _CHECK_S: Final = 2.0
