@@ -1,31 +1,16 @@
 """Real sites at a real hub of one server: each publishes its own, no tenant sees another, a number is given once."""
 
 import asyncio
-import contextlib
 import json
 
-import nats
 import pytest
 from nats.errors import NoRespondersError
 
 from skyless.cli.main import main
-from skyless.run.broker import BrokerSettings, _program, start_broker
-from skyless.run.gather.node import Gather
-from skyless.run.hub.files import MONITOR_PORT, Hub
-from skyless.run.hub.leaf import read_json
+from small_hub import client_of, running_hub, site
 from support.processes import SKYLESS, free_port, started
 
 pytestmark = pytest.mark.site
-
-
-@contextlib.contextmanager
-def running_hub(folder):
-    port = next(port for port in iter(free_port, None) if port < 0xFFFF - MONITOR_PORT)
-    for words in (("--sites", "7,8"), ("--sites", "7", "--tenant", "other")):
-        node = ("--node", f"127.0.0.1:{port}", "--data", str(folder / "data"), "--fixes-gb", "0.1")
-        assert main(["hub", "init", str(folder / "hub"), *node, *words]) == 0
-    with started(_program(), "-c", folder / "hub" / f"127.0.0.1-{port}" / "nats-server.conf") as server:
-        yield read_json(folder / "hub" / "hub.json", Hub, ""), server
 
 
 def apply(folder, capsys):
@@ -34,27 +19,9 @@ def apply(folder, capsys):
     return json.loads(capsys.readouterr().out)["tenants"]
 
 
-async def client_of(address, **more):
-    return await nats.connect(address.servers, user=address.user, password=address.password, **more)
-
-
-@contextlib.asynccontextmanager
-async def site(folder, hub, tenant="plant", number=7):
-    settings = BrokerSettings(
-        port=free_port(), data=folder / f"{tenant}{number}", gathered_bytes=10**8, hub=hub.leaf(tenant, number)
-    )
-    async with await start_broker(settings) as running:
-        gather = asyncio.ensure_future(Gather(running.nats, number, 10**8, print).run())
-        try:
-            yield running
-        finally:
-            gather.cancel()
-            await asyncio.gather(gather, return_exceptions=True)
-
-
 def test_a_site_publishes_its_own_and_no_tenant_sees_another(tmp_path, capsys):
     async def run(hub):
-        async with site(tmp_path, hub) as one, site(tmp_path, hub, "other") as two:
+        async with site(tmp_path, hub.leaf("plant", 7)) as one, site(tmp_path, hub.leaf("other", 7)) as two:
             plant, other = await client_of(hub.address("plant")), await client_of(hub.address("other"))
             near, far = await client_of(one.nats), await client_of(two.nats)
             seen, unseen, commands = await plant.subscribe("skyless.>"), await other.subscribe(">"), []

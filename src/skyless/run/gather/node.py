@@ -7,7 +7,7 @@ import time
 from typing import Final
 
 import msgspec
-from msgspec import Struct
+from msgspec import Struct, field
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.aio.subscription import Subscription
@@ -34,8 +34,8 @@ _LEAVE_S: Final = 2.0
 _QUEUE: Final = "gather"
 
 
-class Summary(Struct, frozen=True):
-    """What a gather has done since its start, published once a second."""
+class Summary(Struct, frozen=True, kw_only=True):
+    """What a gather has done since its start, published once a second. A gather of an older version lacks some."""
 
     unix_s: float
     host: str
@@ -43,18 +43,18 @@ class Summary(Struct, frozen=True):
     site: str
     """Name of the site; empty until it was published."""
     simulated: bool
-    since: str
+    since: str = ""
     """When the site's streams were made, in ISO 8601: of two sites with one number, each has another."""
-    condition: ConditionWord
-    reasons: list[str]
+    condition: ConditionWord = "degraded"
+    reasons: list[str] = field(default_factory=lambda: ["the gather is of an older version, which states none"])
     """Why the condition is not good."""
-    tags_heard: int
+    tags_heard: int = 0
     """Tags with a fix in the last ten seconds, whoever packed it."""
     names: int
     """Tags that have a number."""
     online: dict[str, int]
     """Programs that are online, by kind."""
-    versions: dict[str, int]
+    versions: dict[str, int] = {}
     """The same by their versions."""
     fixes: int
     """Fixes taken from JSON."""

@@ -1,0 +1,46 @@
+"""A hub of one server on loopback, and sites there: the server is real, a site's gather runs in the test."""
+
+import asyncio
+import contextlib
+
+import nats
+
+from skyless.cli.main import main
+from skyless.run.broker import BrokerSettings, _program, start_broker
+from skyless.run.gather.node import Gather
+from skyless.run.hub.files import MONITOR_PORT, Hub
+from skyless.run.hub.leaf import read_json
+from support.processes import free_port, started
+
+
+def hub_port():
+    """A free port, with room above it for those of a node."""
+    return next(port for port in iter(free_port, None) if port < 0xFFFF - MONITOR_PORT)
+
+
+@contextlib.contextmanager
+def running_hub(folder, fixes_gb=0.1):
+    port = hub_port()
+    for words in (("--sites", "7,8"), ("--sites", "7", "--tenant", "other")):
+        node = ("--node", f"127.0.0.1:{port}", "--data", str(folder / "data"), "--fixes-gb", str(fixes_gb))
+        assert main(["hub", "init", str(folder / "hub"), *node, *words]) == 0
+    with started(_program(), "-c", folder / "hub" / f"127.0.0.1-{port}" / "nats-server.conf", limit_s=300) as server:
+        yield read_json(folder / "hub" / "hub.json", Hub, ""), server
+
+
+async def client_of(address):
+    return await nats.connect(address.servers, user=address.user, password=address.password)
+
+
+@contextlib.asynccontextmanager
+async def site(folder, leaf, keep_bytes=10**8):
+    """The broker of a site with its gather."""
+    place = folder / f"{leaf.tenant}{leaf.site}"
+    settings = BrokerSettings(port=free_port(), data=place, gathered_bytes=keep_bytes, hub=leaf)
+    async with await start_broker(settings) as running:
+        gather = asyncio.ensure_future(Gather(running.nats, leaf.site, keep_bytes, print).run())
+        try:
+            yield running
+        finally:
+            gather.cancel()
+            await asyncio.gather(gather, return_exceptions=True)
