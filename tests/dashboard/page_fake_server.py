@@ -65,6 +65,8 @@ class FakeServer:
         self.events_note = False
         self.live2 = None
         """Answers what a page says on the stream of very many tags; without it there is no such stream."""
+        self.hub = None
+        """What ``/api/sites`` answers; with it the server is at a hub."""
         self.history = False
         self.history_error = None
         self.history_waits = set()
@@ -123,8 +125,12 @@ class FakeServer:
     def _app(self):
         mimetypes.add_type("text/javascript", ".js")
 
-        async def index(_request):
-            return _guarded(FileResponse(PAGE / "index.html"))
+        async def index(request):
+            lists = self.hub is not None and "site" not in request.query_params
+            return _guarded(FileResponse(PAGE / ("sites.html" if lists else "index.html")))
+
+        async def hub_sites(_request):
+            return JSONResponse(self.hub)
 
         async def floor_plan(_request):
             return Response(self.floor_plan, media_type="image/png")
@@ -247,6 +253,7 @@ class FakeServer:
         return Starlette(
             routes=[
                 Route("/", index),
+                Route("/api/sites", hub_sites),
                 Route("/api/floor_plan", floor_plan),
                 Route("/api/floor_plan", put_floor_plan, methods=["PUT"]),
                 Route("/api/survey/facts", put_facts, methods=["PUT"]),
@@ -328,6 +335,7 @@ class FakeServer:
             "events": self.zone_events,
             "mqtt": True,
             "history": self.history,
+            "hub": self.hub is not None,
             "live2": self.live2 is not None,
         }
         return {"type": "hello", "version": "0.1.0", "site": site, **more}
@@ -426,6 +434,7 @@ def _recorded(from_s, to_s, rate_hz):
 def _guarded(response):
     """What the real server sends: anything from elsewhere is refused by the browser."""
     response.headers["content-security-policy"] = "default-src 'self'; img-src 'self' data: blob:"
+    response.headers["cache-control"] = "no-cache"
     return response
 
 

@@ -231,7 +231,7 @@ def test_the_live_stream(browser, live):
         assert socket.receive_json() == {"type": "pong"}
         assert len(live.pages) == 1
         browser.portal.call(_fix_and_tick, live)
-        messages = [socket.receive_json() for _ in range(4)]  # health, condition, a line of the list, state
+        messages = [socket.receive_json() for _ in range(3)]  # health, condition, state
         assert [message["tags"][0][0] for message in messages if message["type"] == "state"] == ["t1"]
 
 

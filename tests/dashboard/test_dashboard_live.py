@@ -18,7 +18,7 @@ from skyless.run.zones.monitor import TAG_TIMEOUT_S
 
 FIX = topics.fix_topic(SITE_ID, "t1")
 ZONES = topics.zones_topic(SITE_ID)
-HELLO = ("type", "version", "site", "events", "mqtt", "history", "live2")
+HELLO = ("type", "version", "site", "events", "mqtt", "history", "live2", "hub")
 EVENT = topics.zone_event_topic(SITE_ID, "desk")
 
 

@@ -51,3 +51,35 @@ def test_another_site_is_chosen_in_the_header(serve, visit, width):
     until(page, "true")
     (query,) = {one.query for one in asked if one.path == "/api/overlay"}
     assert parse_qs(query)["site"] == [str(mine)], "the site that is shown, whichever was asked for"
+
+
+def test_the_sites_at_a_hub_are_listed_and_their_pages_change_nothing(serve, visit):
+    server = serve(tags=1)
+    visited = visit(server)
+    page = visited.page
+    until(page, "skyless.state.site !== null")
+    assert page.locator("#draw").is_visible()
+    assert page.locator("#all-sites").is_hidden()
+    halls = [hub_site(1, "cut", reason="not heard for 3 min"), hub_site(2, "good", tags_heard=9, versions={"0.2": 4})]
+    server.hub = {"hub": "nats://a:4222", "connected": True, "sites": halls}
+    page.goto(server.address)
+    page.wait_for_selector("tr.cut:has-text('Not heard for 3 min.')")
+    assert "●" not in page.locator("tr.cut").inner_text()
+    page.fill("#find", "hall 2")
+    page.wait_for_selector("tr.cut", state="detached")
+    page.keyboard.press("Tab")
+    page.keyboard.press("Tab")  # after the switch of colours
+    page.keyboard.press("Enter")
+    page.wait_for_url("**/?site=2")
+    page.wait_for_selector("#all-sites")
+    for change in ("#draw", "#tab-setup", "#add-zone"):
+        assert page.locator(change).is_hidden()
+    page.click("#all-sites")
+    page.wait_for_selector("tr.good")
+    server.hub = {**server.hub, "connected": False}
+    page.wait_for_selector("#banner:has-text('cannot be reached')")
+    assert page.locator("tr.good").count() == 0
+
+
+def hub_site(number, condition, reason="", **more):
+    return {"number": number, "name": f"Hall {number}", "condition": condition, "reason": reason, **more}

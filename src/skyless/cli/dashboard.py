@@ -3,23 +3,31 @@
 import contextlib
 import os
 import sys
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 
 from skyless.cli.common.options import command
 from skyless.cli.common.output import print_json
-from skyless.cli.nodes.options import MqttOptions, SiteId, listen_address, site_named
+from skyless.cli.nodes.options import HubUrl, MqttOptions, SiteId, hub_address, listen_address, site_named
 from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module
 
 if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
+    from skyless.page.app import Services
     from skyless.page.gathered import Gathered
     from skyless.page.guard import AccessRules
+    from skyless.page.live import LiveSite
     from skyless.page.serve import ListenAddress
     from skyless.run.mqtt.address import MqttAddress
     from skyless.run.mqtt.messages import SiteMessage
+
+    _Served = tuple[str, Services, Coroutine[Any, Any, None]]
+    """The address of the broker or hub, what the server serves, and what keeps the sites connected."""
 
 _SHORTEST_TOKEN = 12
 
@@ -40,9 +48,10 @@ def dashboard(
     token: Annotated[str | None, Parameter(env_var="SKYLESS_DASHBOARD_TOKEN")] = None,
     nats: Annotated[str | None, Parameter(env_var="SKYLESS_NATS")] = None,
     reader_token: Annotated[str | None, Parameter(env_var="SKYLESS_DASHBOARD_READER_TOKEN")] = None,
+    hub: HubUrl = None,
     json: bool = False,
 ) -> None:
-    """Show a site live in the browser; Ctrl-C stops.
+    """Show a site live in the browser, or the sites at a hub; Ctrl-C stops.
 
     Anyone who opens the page may draw zones. On this machine only, it asks for no token; to other machines it serves
     plain HTTP, so use it in networks that you trust or behind a proxy with TLS.
@@ -69,11 +78,12 @@ def dashboard(
         it runs on this machine with --gather.
     reader_token
         Another token for who may only look on; where it is given, changes need the other one on this machine, too.
+    hub
+        Hub whose sites are shown, nats://[USER@]HOST[:PORT],HOST... or tls://...; nothing is changed from there.
     json
         Write one JSON object with the page's address instead of a table.
     """
     import asyncio
-    from functools import partial
 
     from skyless.page.api.past import Past
     from skyless.page.app import Services
@@ -81,44 +91,74 @@ def dashboard(
     from skyless.page.live import LiveSite
     from skyless.page.playback import Playback
     from skyless.page.serve import bind, serve
-    from skyless.page.site_assets import AssetsFile
-    from skyless.page.sites import LiveSites
 
-    address = broker.address()
-    if address is None:
-        raise SkylessError("--mqtt is 'none'; it should be the broker of the site to show")
-    address.tls_context()
-    known, images = (None, {}) if site is None else _load(site)
-    if known is not None and site_id is not None and known.site.id != site_id:
-        raise SkylessError(f"--site-id is {site_id}, but {site} is of site {known.site.id}; give one of them")
     if recordings is not None and not recordings.is_dir():
         raise SkylessError(f"--recordings is {str(recordings)!r}; it should be a folder")
-    if history is not None and not history.is_dir():
-        raise SkylessError(f"--history is {str(history)!r}; it should be a folder that skyless history writes")
     if history is not None:
+        if not history.is_dir():
+            raise SkylessError(f"--history is {str(history)!r}; it should be a folder that skyless history writes")
         extra_module("duckdb", "--history")
-    assets_file = None if assets is None else AssetsFile(assets)
     listening = _listening(listen)
     sock = bind(listening)
     port = sock.getsockname()[1]
-    rules = _rules(sock.getsockname()[0], listening.host, port, token, reader_token)
-    make = partial(
-        LiveSite, _client_name(port), str(address), used_share=ProcessorUse().share, has_history=history is not None
-    )
-    live = make(known, assets_file=assets_file)
-    live.plans.update(images)
+    rules = _rules(sock.getsockname()[0], listening.host, port, token, reader_token, read_only=hub is not None)
+    make = partial(LiveSite, _client_name(port), used_share=ProcessorUse().share, has_history=history is not None)
+    serves = partial(Services, playback=Playback(recordings), past=Past(history))
+    if hub is None:
+        address, services, work = _at_broker(make, serves, broker, site, site_id, assets, nats)
+    else:
+        given = {"--mqtt": broker.mqtt, "--nats": nats, "--assets": assets, "--site": site, "--site-id": site_id}
+        for option in (option for option, value in given.items() if value is not None):
+            raise SkylessError(f"--hub and {option} exclude each other; give one of them")
+        address, services, work = _at_hub(make, serves, hub, broker.mqtt_ca)
     page = _address(listening.host, port, rules)
     if json:
-        print_json({"page": page, "mqtt": str(address), "token": rules.token, "reader_token": rules.reader_token})
+        kind = "mqtt" if hub is None else "hub"
+        print_json({"page": page, kind: address, "token": rules.token, "reader_token": rules.reader_token})
         sys.stdout.flush()
     else:
-        print(f"page    {page}\nbroker  {address}", flush=True)
-    services = Services(LiveSites(live, make), Playback(recordings), Past(history), gathered=_gathered(nats, address))
+        print(f"page    {page}\n{'broker' if hub is None else 'hub   '}  {address}", flush=True)
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(serve(services, rules, sock, address, known.site.id if known is not None else site_id))
+        asyncio.run(serve(services, rules, sock, work))
     if services.past.is_busy:  # Python would wait for the thread that answers
         sys.stdout.flush()
         os._exit(0)
+
+
+def _at_broker(
+    make: "partial[LiveSite]",
+    serves: "partial[Services]",
+    broker: MqttOptions,
+    site: str | None,
+    site_id: int | None,
+    assets: Path | None,
+    nats: str | None,
+) -> "_Served":
+    """The sites of a broker. Raises SkylessError."""
+    from skyless.page.site_assets import AssetsFile
+    from skyless.page.sites import LiveSites
+
+    address = broker.required("the broker of the site to show")
+    known, images = (None, {}) if site is None else _load(site)
+    if known is not None and site_id is not None and known.site.id != site_id:
+        raise SkylessError(f"--site-id is {site_id}, but {site} is of site {known.site.id}; give one of them")
+    make = partial(make, broker=str(address))
+    live = make(site=known, assets_file=None if assets is None else AssetsFile(assets))
+    live.plans.update(images)
+    sites = LiveSites(live, make)
+    services = serves(sites=sites, gathered=_gathered(nats, address))
+    return str(address), services, sites.run(address, known.site.id if known is not None else site_id)
+
+
+def _at_hub(make: "partial[LiveSite]", serves: "partial[Services]", hub: str, ca: Path | None) -> "_Served":
+    """The sites at a hub. Raises SkylessError."""
+    address = hub_address(hub, ca)
+    from skyless.page.gathered import Gathered
+    from skyless.page.hub import ShownSites
+    from skyless.run.gather.subjects import HUB_NAMES
+
+    sites = ShownSites(address, "skyless dashboard", partial(make, broker=str(address), at_hub=True))
+    return str(address), serves(sites=sites, gathered=Gathered(address, HUB_NAMES), hub=sites), sites.run()
 
 
 def _gathered(nats: str | None, broker: "MqttAddress") -> "Gathered | None":
@@ -164,7 +204,9 @@ def _listening(listen: str | None) -> "ListenAddress":
     return ListenAddress(*listen_address(listen, PORT))
 
 
-def _rules(bound: str, host: str, port: int, token: str | None, reader_token: str | None = None) -> "AccessRules":
+def _rules(
+    bound: str, host: str, port: int, token: str | None, reader_token: str | None = None, *, read_only: bool = False
+) -> "AccessRules":
     """Who may connect, by the address that the socket is bound to. Raises SkylessError."""
     import ipaddress
     import secrets
@@ -181,11 +223,11 @@ def _rules(bound: str, host: str, port: int, token: str | None, reader_token: st
     if ipaddress.ip_address(bound.partition("%")[0]).is_loopback:
         if reader_token is not None:
             token = token or secrets.token_urlsafe(18)
-        return AccessRules(token, reader_token, cookie=cookie)
+        return AccessRules(token, reader_token, read_only=read_only, cookie=cookie)
     own = socket.gethostname().lower()
     names = {host.lower(), own, own.partition(".")[0], f"{own.partition('.')[0]}.local", socket.getfqdn().lower()}
     token = token or secrets.token_urlsafe(18)
-    return AccessRules(token, reader_token, frozenset(names), remote=True, cookie=cookie)
+    return AccessRules(token, reader_token, frozenset(names), read_only=read_only, remote=True, cookie=cookie)
 
 
 def _address(host: str, port: int, rules: "AccessRules") -> str:

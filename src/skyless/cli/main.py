@@ -42,6 +42,7 @@ _GROUPS: Final = {
         ("tag", "nodes.tag", "Run listening tags; with --print, --csv or --json their positions on standard output."),
         ("dashboard", "dashboard", "Show a site live in the browser."),
         ("watch", "nodes.site_watch", "Show a running site as text, for a terminal."),
+        ("sites", "nodes.sites", "List the sites of a broker or at a hub, and how they are."),
         ("bridge", "nodes.bridge", "Give positions to other tools: gpsd, ROS 2, autopilots, Home Assistant and more."),
     ),
     "Record and replay": (

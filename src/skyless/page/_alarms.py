@@ -10,10 +10,9 @@ from typing import Final
 from msgspec.structs import replace
 
 from skyless.core.alarm_rule import AlarmRule
-from skyless.page._kept import Kept
+from skyless.page._kept import Kept, SiteLink
 from skyless.page._state import encode
 from skyless.run.alarms.engine import MAX_KEPT, AlarmEngine, Key, is_over
-from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
     AcknowledgeMessage,
     AlarmMessage,
@@ -59,7 +58,7 @@ class SiteAlarms:
         self.file_rules: tuple[AlarmRule, ...] = ()
         """Those of the site's file."""
         self._name, self._broadcast, self._log = name, broadcast, log
-        self._link: Link | None = None
+        self._link: SiteLink | None = None
         self._site_id = 0
         self._site = ""
         self._kept_rules = Kept(AlarmRulesMessage(()), read_rules)
@@ -87,7 +86,7 @@ class SiteAlarms:
 
     # MQTT
 
-    def attach(self, link: Link, site_id: int) -> dict[str, Handler]:
+    def attach(self, link: SiteLink, site_id: int) -> dict[str, Handler]:
         """What is to be subscribed to, and who handles it."""
         self._link, self._site_id = link, site_id
         self._kept_rules.attach(link, alarm_rules_topic(site_id))

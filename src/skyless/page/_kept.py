@@ -1,12 +1,18 @@
 """A list that pages edit and the broker keeps: zones, rules of alarms, assets."""
 
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeAlias, TypeVar
 
 from msgspec import Struct
 
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import WrongMessageError
+
+if TYPE_CHECKING:
+    from skyless.run.hub.link import HubLink
+
+SiteLink: TypeAlias = "Link | HubLink"
+"""A site's connection: to its broker, or to a hub, where nothing can be stored."""
 
 _Message = TypeVar("_Message", bound=Struct)
 
@@ -20,11 +26,11 @@ class Kept(Generic[_Message]):
         self.fault: str | None = None
         """Why what the broker keeps cannot be read."""
         self._empty, self._read = empty, read
-        self._link: Link | None = None
+        self._link: SiteLink | None = None
         self._topic = ""
         self._is_on_its_way = False  # the message was stored here and has not come back from the broker
 
-    def attach(self, link: Link, topic: str) -> None:
+    def attach(self, link: SiteLink, topic: str) -> None:
         """The broker is known; what was stored here before goes to it."""
         self._link, self._topic = link, topic
         if self._is_on_its_way:

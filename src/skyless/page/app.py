@@ -2,6 +2,7 @@
 
 import asyncio
 import mimetypes
+import time
 from collections import Counter
 from collections.abc import Callable, Coroutine
 from functools import partial
@@ -32,7 +33,7 @@ from skyless.page.api.routes import api_routes, read_bytes
 from skyless.page.guard import AccessRules, Guard
 from skyless.page.live import LiveSite, TooManyPagesError
 from skyless.page.playback import Playback, RecordingFile
-from skyless.page.sites import LiveSites
+from skyless.page.sites import Sites
 from skyless.page.sockets import GOING_AWAY, TRY_LATER, send, serve_socket
 from skyless.page.task_process import TaskProcess
 from skyless.page.tasks import KINDS, MovedAnchors, OverlayTask, WhatIfTask
@@ -44,6 +45,8 @@ from skyless.site.file.check import image_size
 
 if TYPE_CHECKING:
     from skyless.page.gathered import Gathered
+    from skyless.page.hub import ShownSites
+    from skyless.run.hub.sites import HubSites
 
 _PAGE: Final = Path(__file__).parent / "browser"
 _MAX_STATES_S: Final = 60.01
@@ -66,7 +69,7 @@ _STATUSES: Final[dict[type[Exception], int]] = {
 class Services(Struct, frozen=True):
     """What the server serves."""
 
-    sites: LiveSites
+    sites: Sites
     playback: Playback
     past: Past = Past(None)
     overlays: TaskProcess = field(default_factory=partial(TaskProcess, "skyless.page.overlay_process"))
@@ -74,6 +77,8 @@ class Services(Struct, frozen=True):
     what_ifs: TaskProcess = field(default_factory=partial(TaskProcess, "skyless.page.what_if_process"))
     gathered: "Gathered | None" = None
     """The batches of a broker with a gather."""
+    hub: "ShownSites | None" = None
+    """The same as ``sites`` where these are those of a hub."""
 
 
 def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Starlette:
@@ -82,14 +87,18 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
     mimetypes.add_type("text/javascript", ".mjs")
     mimetypes.add_type("application/wasm", ".wasm")
 
-    async def index(_request: Request) -> Response:
-        path = page / "index.html"
+    hub = services.hub
+
+    async def index(request: Request) -> Response:
+        lists = hub is not None and not hub.has(request.query_params.get("site"))
+        path = page / ("sites.html" if lists else "index.html")
         if not path.is_file():
             raise HTTPException(404, "this installation has no page")
         return FileResponse(path)
 
     routes = [
         Route("/", index),
+        *(() if hub is None else (Route("/api/sites", partial(_hub_sites, hub.known)),)),
         Route("/fixes.geojson", _fixes),
         Route("/api/floor_plan", _floor_plan),
         Route("/api/floor_plan", _put_floor_plan, methods=["PUT"]),
@@ -137,6 +146,10 @@ def _services(request: Request | WebSocket) -> Services:
 def _live_of(request: Request) -> LiveSite:
     """The site that ``?site=NUMBER`` names. Raises HTTPException."""
     return _services(request).sites.of(request.query_params.get("site"))
+
+
+async def _hub_sites(known: "HubSites", _request: Request) -> Response:
+    return _json({"hub": str(known.address), "connected": known.connected, "sites": known.sites(time.monotonic())})
 
 
 async def _fixes(request: Request) -> Response:

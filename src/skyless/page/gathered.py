@@ -1,6 +1,7 @@
 """Batches of a broker with a gather, read from NATS into columns, and the pages that see them by ``/live2``."""
 
 import asyncio
+import contextlib
 import logging
 import time
 from collections import Counter
@@ -16,7 +17,7 @@ from skyless.page._state import read_request
 from skyless.page.columns import MAX_DUE, Columns
 from skyless.page.live import MAX_PAGES, LiveSite
 from skyless.page.live2 import View, anchors_message, conditions_message, names_message, tags_message
-from skyless.page.sites import LiveSites
+from skyless.page.sites import Sites
 from skyless.page.sockets import TRY_LATER, send, serve_socket
 from skyless.run.fix_batch import FIELDS, BadBatchError, decode_batch, fix_of
 from skyless.run.gather import subjects
@@ -29,18 +30,20 @@ _HEARD_S: Final = 1.0
 """Interval at which a site is given the names of all tags that were heard."""
 _MAX_ASKED: Final = 200
 
-_MAX_SITES: Final = 64
+_ASK_AGAIN_S: Final = 2.0
+"""A name that the stream did not have yet, as a hub's after a cut, is asked for again."""
 _EMPTY: Final = Columns()
 
 
 class Gathered:
-    """The columns of all sites whose batches arrive, and the pages that are shown them."""
+    """The columns of the sites that are shown, and the pages that see them."""
 
-    def __init__(self, address: NatsAddress) -> None:
+    def __init__(self, address: NatsAddress, names: str = subjects.NAMES_STREAM) -> None:
+        """``names`` is the stream of the names of tags."""
         self.drops: Counter[str] = Counter()
         """Batches that were dropped, by reason."""
         self.pages = 0
-        self._address = address
+        self._address, self._names = address, names
         self._sites: dict[int | None, Columns] = {}
         self._say = rarely(logging.getLogger("skyless.page").warning)
 
@@ -48,28 +51,40 @@ class Gathered:
         """The columns of a site, empty before its first batch."""
         return self._sites.get(site, _EMPTY)
 
-    async def run(self, sites: LiveSites) -> None:
+    async def run(self, sites: Sites) -> None:
         """Read until cancelled, and hand fixes over to the sites that are shown."""
         client = await connect(self._address, "skyless dashboard", self._say, self.drops, subjects.PAGE_INBOX)
         try:
-            await client.subscribe(subjects.at(subjects.FIXES, subjects.EVERY), cb=self._on_batch)
             async with asyncio.TaskGroup() as tasks:
-                served: set[int] = set()
+                served: dict[LiveSite, asyncio.Task[None]] = {}
                 while True:
-                    for live in sites.all:
+                    shown = sites.all
+                    for live in served.keys() - set(shown):
+                        served.pop(live).cancel()
+                    for live in shown:
                         live.evidence.batches_connected = client.is_connected
-                        site = live.number
-                        if site is not None and site in self._sites and site not in served:
-                            served.add(site)
-                            tasks.create_task(self._hand_over(client, site, live))
+                        if live.number is not None and live not in served:
+                            served[live] = tasks.create_task(self._read(client, live.number, live))
                     await asyncio.sleep(PERIOD_S)
         finally:
             await client.close()
+
+    async def _read(self, client: Client, site: int, live: LiveSite) -> None:
+        """Read the batches of a site until cancelled."""
+        self._sites[site] = Columns()
+        reading = await client.subscribe(subjects.at(subjects.FIXES, site), cb=self._on_batch)
+        try:
+            await self._hand_over(client, site, live)
+        finally:
+            del self._sites[site]
+            with contextlib.suppress(Error):
+                await reading.unsubscribe()
 
     async def _hand_over(self, client: Client, site: int, live: LiveSite) -> None:
         """Give a site fixes of its batches for ever, for all that its messages are for: zones, alarms, lists."""
         columns, heard_s = self._sites[site], 0.0
         stream, names, numbers = client.jetstream(), columns.names, dict[str, int]()
+        stream_of_names, missing_s = subjects.at(self._names, site), dict[int, float]()
         while True:
             now_s = time.monotonic()
             if now_s - heard_s >= _HEARD_S:
@@ -77,11 +92,15 @@ class Gathered:
                 live.on_batches([name for number in heard if (name := names.get(number))], now_s)
             named = {name for page in live.pages for name in page.named}
             records, arrived_s = columns.pop_due(now_s, [numbers[name] for name in named if name in numbers])
-            asked = [number for number in records["tag"].tolist() if number not in names][:_MAX_ASKED]
+            unknown = (number for number in records["tag"].tolist() if number not in names)
+            asked = [number for number in unknown if missing_s.get(number, 0.0) <= now_s][:_MAX_ASKED]
             try:
-                answers = await asyncio.gather(*(name_of(stream, site, number) for number in asked))
-                names.update(zip(asked, answers, strict=True))
-                numbers.update(zip(answers, asked, strict=True))
+                answers = await asyncio.gather(*(name_of(stream, stream_of_names, site, number) for number in asked))
+                for number, name in zip(asked, answers, strict=True):
+                    if name:
+                        names[number], numbers[name] = name, number
+                    else:
+                        missing_s[number] = now_s + _ASK_AGAIN_S
             except Error as error:
                 self._say(f"the names of site {site} cannot be read: {error or type(error).__name__}")
             for record, at_s in zip(FIELDS.iter_unpack(records.tobytes()), arrived_s.tolist(), strict=True):
@@ -93,11 +112,8 @@ class Gathered:
     async def _on_batch(self, message: Msg) -> None:
         site = subjects.site_in(message.subject)
         try:
-            if site not in self._sites:
-                if site is None or len(self._sites) >= _MAX_SITES:
-                    raise BadBatchError(f"it is of a wrong site, or of more than {_MAX_SITES}")
-                self._sites[site] = Columns()
-            self._sites[site].update(decode_batch(message.data).records, time.monotonic())
+            if site in self._sites:
+                self._sites[site].update(decode_batch(message.data).records, time.monotonic())
         except BadBatchError as error:
             self.drops["wrong-batch"] += 1
             self._say(f"a batch under {message.subject} is not shown: {error}")

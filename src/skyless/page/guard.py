@@ -28,6 +28,7 @@ _HEADERS: Final = {
 }
 
 _HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::\d{1,5})?")
+_AT_HUB: Final = "this page is at a hub, which only reads; the site's own page changes it"
 _POLICY_VIOLATION: Final = 1008
 
 
@@ -40,6 +41,8 @@ class AccessRules(Struct, frozen=True):
     """Carried by requests that only read; not without an operator's token."""
     names: frozenset[str] = frozenset()
     """Valid host names, in lower case, in addition to ``localhost``."""
+    read_only: bool = False
+    """Whether nothing can be changed here, as at a hub."""
     remote: bool = False
     """Whether other machines can reach the server: then any IP address is a valid host."""
     cookie: str = "skyless"
@@ -81,11 +84,12 @@ class Guard:
         origin = request.headers.get("origin")
         if origin is not None and not _same_origin(origin, host):
             return 403, "requests of other sites are refused"
+        reads = request.scope.get("method", "GET") in {"GET", "HEAD"}
         if self._secret is None or self._carries(request, self._secret):
-            return None
+            return (403, _AT_HUB) if self._rules.read_only and not reads else None
         if self._reader_secret is None or not self._carries(request, self._reader_secret):
             return 401, "the token is missing or wrong: open the address that the dashboard has printed"
-        if request.scope.get("method", "GET") not in {"GET", "HEAD"}:
+        if not reads:
             return 403, "the reader's token does not allow changes: they need the operator's, --token of the dashboard"
         return None
 

@@ -21,7 +21,7 @@ from skyless.core.errors import ConfigurationError
 from skyless.core.version import installed_version
 from skyless.page._alarms import SiteAlarms
 from skyless.page._events import EventLog, EventQueue, publisher_rank
-from skyless.page._kept import Kept
+from skyless.page._kept import Kept, SiteLink
 from skyless.page._site_survey import SiteSurvey
 from skyless.page._state import PageRequest, Sent, SiteState, encode
 from skyless.page.condition.evidence import Evidence
@@ -30,7 +30,6 @@ from skyless.page.event_list import EventList
 from skyless.page.site_assets import AssetsFile, SiteAssets
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.access import Role
-from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
     AcknowledgeMessage,
     AnchorHealth,
@@ -149,8 +148,11 @@ class LiveSite:
         used_share: Callable[[float], float | None] | None = None,
         assets_file: AssetsFile | None = None,
         has_history: bool = False,
+        at_hub: bool = False,
     ) -> None:
         """``name`` is the dashboard's on MQTT, ``broker`` its address without a password, ``host`` this computer.
+
+        ``at_hub``: zone events and alarms are those of the site's own dashboards, and nothing is changed here.
 
         ``used_share`` gives the share of its processors in use at a time of ``clock``: ``ProcessorUse.share``.
         """
@@ -163,13 +165,15 @@ class LiveSite:
         self.monitor = ZoneMonitor()
         self.events = EventQueue()
         self.pages: set[PageQueue] = set()
+        self.streams = 0
+        """How many programs read the site's stream."""
         self.survey = SiteSurvey(name, self._broadcast, clock, wall_clock)
         self.assets = SiteAssets(self._broadcast, assets_file)
         self.event_list = EventList()
-        self.has_history = has_history
+        self.has_history, self._at_hub = has_history, at_hub
         self.dropped = self.state.dropped
         self._clock, self.wall_clock = clock, wall_clock
-        self._link: Link | None = None
+        self._link: SiteLink | None = None
         self._site_id: int | None = None
         self._zones = Kept(ZonesMessage(()), self._read_zones)
         """With other sites' zones of this number."""
@@ -177,6 +181,7 @@ class LiveSite:
         self._sent_serials = 0, 0  # of the newest fix and event that pages were sent
         self._health_due_s = self._condition_due_s = 0.0
         self.evidence = Evidence(host, clock())
+        self.evidence.hub_trouble = "" if at_hub else None
         self.log = EventLog(wall_clock() - clock(), self.event_list.add_logged)
         self.alarms = SiteAlarms(name, self.monitor, self._broadcast, self.log.on_alarm)
         if site is not None:
@@ -195,7 +200,7 @@ class LiveSite:
 
     # MQTT
 
-    def attach(self, link: Link, site_id: int) -> None:
+    def attach(self, link: SiteLink, site_id: int) -> None:
         """Subscribe to a site's topics."""
         self._link, self._site_id = link, site_id
         handlers: dict[str, Callable[[str, bytes], None]] = {
@@ -229,7 +234,8 @@ class LiveSite:
             self.evidence.set_connected(connected=connected, now_s=self._clock())
             self._evaluate(self._clock())
             self.survey.expect_kept()
-            self.alarms.on_connection(connected, self._clock())
+            if not self._at_hub:  # where alarms are kept and complete after every cut
+                self.alarms.on_connection(connected, self._clock())
             self.assets.on_connection(connected, self._clock())
             self._broadcast("mqtt", self._connection())
 
@@ -378,7 +384,7 @@ class LiveSite:
     def _assign_zones(self) -> None:
         """Show the zones of the present site. Zones without a site become its own, for good."""
         name, kept = self._site_name, self._zones.message
-        if name and not kept.site and kept.zones:
+        if name and not kept.site and kept.zones and not self._at_hub:
             self._zones.store(zones_of(kept, name))
         is_foreign = not name and kept.site  # whose they are is known, but not whether that site is shown
         zones = () if is_foreign else zones_of(kept, name).zones
@@ -393,7 +399,7 @@ class LiveSite:
         return {"zones": self.monitor.zones, "other_zones": others, "zones_fault": self._zones.fault}
 
     def _schedule(self, events: list[ZoneEvent]) -> None:
-        if events:
+        if events and not self._at_hub:
             self.alarms.engine.on_zone_events(events, self._clock())
             self.events.schedule(events, publisher_rank(self.name, list(self._dashboards.values())), self._clock())
 
@@ -431,7 +437,7 @@ class LiveSite:
         link.publish(topics.floor_plan_topic(site_id), image, qos=1, retain=True)
         self._show_floor_plan(None, image)
 
-    def _connected(self) -> tuple[Link, int]:
+    def _connected(self) -> tuple[SiteLink, int]:
         if self._link is None or self._site_id is None or not self.connected:
             raise HTTPException(503, f"the broker {self.broker} is not connected; try again when it is")
         return self._link, self._site_id
@@ -453,6 +459,7 @@ class LiveSite:
             "mqtt": self.connected,
             "history": self.has_history,
             "live2": live2,
+            "hub": self._at_hub,
         }
         page = PageQueue(encode("hello", hello), self.event_list, address, self._clock())
         page.replace("mqtt", self._connection())
@@ -521,6 +528,8 @@ class LiveSite:
         watch, age_s = self.survey.watch.message, self.survey.watch.age_s()
         unread_s = 0.0 if self._link is None else self._link.unread_s
         used_share = None if self._used_share is None else self._used_share(now_s)
+        if self._at_hub and self._link is not None:
+            self.evidence.hub_trouble = self._link.trouble
         self.condition = self._condition_monitor.evaluate(now_s, self._lag_s, watch, age_s, used_share, unread_s)
         self._lag_s = 0.0
         blind = self._condition_monitor.is_blind(now_s)

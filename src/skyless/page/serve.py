@@ -5,8 +5,8 @@ import contextlib
 import errno
 import signal
 import socket
-from collections.abc import Iterator
-from typing import Final
+from collections.abc import Coroutine, Iterator
+from typing import Any, Final
 
 import uvicorn
 from msgspec import Struct
@@ -16,7 +16,6 @@ from skyless.page._state import MAX_REQUEST_BYTES
 from skyless.page.app import Services, make_app
 from skyless.page.guard import AccessRules
 from skyless.page.sockets import SEND_TIMEOUT_S
-from skyless.run.mqtt.address import MqttAddress
 from skyless.run.process import ending_signals, reserve
 
 PORT: Final = 8080
@@ -83,10 +82,8 @@ def _bind(host: str, port: int) -> socket.socket:
     return sock
 
 
-async def serve(
-    services: Services, rules: AccessRules, sock: socket.socket, address: MqttAddress, site_id: int | None
-) -> None:
-    """Serve pages until Ctrl-C, SIGTERM or SIGHUP."""
+async def serve(services: Services, rules: AccessRules, sock: socket.socket, sites: Coroutine[Any, Any, None]) -> None:
+    """Serve pages until Ctrl-C, SIGTERM or SIGHUP. ``sites`` keeps the sites connected."""
     config = uvicorn.Config(
         make_app(services, rules),
         lifespan="off",
@@ -103,7 +100,7 @@ async def serve(
         timeout_graceful_shutdown=1,
     )
     server = _Server(config)
-    jobs = [services.sites.run(address, site_id), server.end_unfinished()]
+    jobs = [sites, server.end_unfinished()]
     if services.gathered is not None:
         jobs.append(services.gathered.run(services.sites))
     work = [asyncio.create_task(job) for job in jobs]

@@ -5,6 +5,7 @@ A page is connected to one of them for as long as it is open, so that it cannot 
 
 import asyncio
 from collections.abc import Callable
+from typing import Protocol
 
 from starlette.exceptions import HTTPException
 
@@ -14,6 +15,22 @@ from skyless.run.find_site import SiteOnBroker, watch_sites
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.outbox import Limits
+
+
+def number_of(asked: str | None) -> int:
+    """The number of a site in a request, or -1 where it is none."""
+    return int(asked) if asked and asked.isascii() and asked.isdecimal() and len(asked) < 6 else -1
+
+
+class Sites(Protocol):
+    """The sites that pages are shown: of a broker, or of a hub."""
+
+    @property
+    def all(self) -> list[LiveSite]:
+        """Those that are connected."""
+
+    def of(self, asked: str | None) -> LiveSite:
+        """The site of a number. Raises HTTPException."""
 
 
 class LiveSites:
@@ -36,7 +53,7 @@ class LiveSites:
         """The site of a number, or without a number a site that is alive. Raises HTTPException."""
         if not asked:
             return self._usual()
-        number = int(asked) if asked.isascii() and asked.isdecimal() and len(asked) < 6 else -1
+        number = number_of(asked)
         if number not in self._by_number and (number not in self._on_broker or self._make is None):
             raise HTTPException(404, f"site is {asked[:20]!r}; this broker has no such site, or it is not shown here")
         return self._shown(number)

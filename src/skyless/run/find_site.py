@@ -7,6 +7,7 @@ anchor, a tag or the emulated air, states that it is online. Programs that only 
 import asyncio
 import contextlib
 import logging
+from collections import Counter
 from collections.abc import Callable
 from typing import Final
 
@@ -35,6 +36,8 @@ class SiteOnBroker(Struct, frozen=True):
     name: str
     online: int
     """How many of its programs are online."""
+    versions: dict[str, int] = {}
+    """How many of them have each version."""
 
 
 class KnownSites:
@@ -42,7 +45,8 @@ class KnownSites:
 
     def __init__(self) -> None:
         self._names: dict[int, str] = {}
-        self._online: dict[int, set[str]] = {}
+        self._online: dict[int, dict[str, str]] = {}
+        """By site the topics of programs that are online, with their versions."""
 
     def add(self, topic: str, payload: bytes) -> None:
         """Process a message of a site or of a program's status. One that cannot be read changes nothing."""
@@ -52,9 +56,10 @@ class KnownSites:
         number = int(levels[2])
         with contextlib.suppress(WrongMessageError):
             if levels[-1] != "site":
-                online = bool(payload) and read_message(payload, StatusMessage).online
-                programs = self._online.setdefault(number, set())
-                (programs.add if online else programs.discard)(topic)
+                programs = self._online.setdefault(number, {})
+                programs.pop(topic, None)
+                if payload and (status := read_message(payload, StatusMessage)).online:
+                    programs[topic] = status.version
             elif payload:
                 self._names[number] = read_message(payload, _SiteMessage).site.name
             else:
@@ -62,10 +67,11 @@ class KnownSites:
 
     def sites(self) -> list[SiteOnBroker]:
         """The sites, by number."""
-        return [
-            SiteOnBroker(number, name, len(self._online.get(number, ())))
-            for number, name in sorted(self._names.items())
-        ]
+        found = []
+        for number, name in sorted(self._names.items()):
+            versions = Counter(self._online.get(number, {}).values())
+            found.append(SiteOnBroker(number, name, versions.total(), dict(versions)))
+        return found
 
 
 class _Named(Struct):

@@ -10,9 +10,11 @@ from cyclopts import Parameter
 
 from skyless.core.arguments import Options, number, read_numbers, whole
 from skyless.core.errors import SkylessError
+from skyless.core.extras import extra_module
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.site import AccuracySite, Site
 from skyless.run.broker import running_broker
+from skyless.run.gather.address import NatsAddress, nats_address
 from skyless.run.mqtt.address import MqttAddress, mqtt_address
 
 _DEFAULT_MQTT: Final = "mqtt://127.0.0.1:1883"
@@ -20,6 +22,7 @@ _DEFAULT_MQTT: Final = "mqtt://127.0.0.1:1883"
 _MAX_LIVE_HZ: Final = 4000.0
 """Beacons per second above which the emulated air is expected to fall behind; two cores kept up with 1000."""
 
+HubUrl = Annotated[str | None, Parameter(env_var="SKYLESS_HUB")]
 MqttCa = Annotated[Path | None, Parameter(env_var="SKYLESS_MQTT_CA")]
 SiteId = Annotated[int, whole(0, 0xFFFD)]
 WalkingSpeed = Annotated[float, number(above=0.0, most=10.0)]
@@ -54,6 +57,14 @@ class MqttOptions(Options, frozen=True, kw_only=True):
             raise SkylessError(f"--mqtt is 'none'; it should be {right}")
         address.tls_context()
         return address
+
+
+def hub_address(hub: str, ca: Path | None) -> NatsAddress:
+    """The servers of the hub that ``--hub`` names. Raises SkylessError, also without nats-py."""
+    extra_module("nats", "--hub")
+    address = nats_address(hub, "--hub", ca)
+    address.tls_context()
+    return address
 
 
 class SiteOptions(MqttOptions, frozen=True, kw_only=True):

@@ -15,7 +15,7 @@ from skyless.page.api import geojson, past, present, stream
 from skyless.page.api.openapi import CSV, GEOJSON, JSON, ROOT, document
 from skyless.page.api.parameters import RENAMED, MapQuery, SiteQuery, read_query
 from skyless.page.api.past import Past
-from skyless.page.sites import LiveSites
+from skyless.page.sites import Sites
 from skyless.run.assets import MAX_BYTES
 
 MAX_BODY_BYTES: Final = 2 * MAX_BYTES
@@ -89,7 +89,7 @@ ROUTES: Final = (
 )
 
 
-def api_routes(sites: LiveSites, history: Past) -> list[BaseRoute]:
+def api_routes(sites: Sites, history: Past) -> list[BaseRoute]:
     """The routes of the server."""
     whole = msgspec.json.encode(document(ROUTES))
 
@@ -103,7 +103,7 @@ def api_routes(sites: LiveSites, history: Past) -> list[BaseRoute]:
     ]
 
 
-def _endpoint(route: ApiRoute, sites: LiveSites, history: Past) -> Callable[[Request], Awaitable[Response]]:
+def _endpoint(route: ApiRoute, sites: Sites, history: Past) -> Callable[[Request], Awaitable[Response]]:
     async def respond(request: Request) -> Response:
         query = read_query({**request.query_params, **request.path_params}, route.query)
         live = sites.of(query.site_text)

@@ -17,7 +17,7 @@ from skyless.core.version import installed_version
 from skyless.page.api.parameters import SiteQuery, TagNames, names, read_query
 from skyless.page.api.present import usable
 from skyless.page.live import LiveSite
-from skyless.page.sites import LiveSites
+from skyless.page.sites import Sites
 from skyless.page.sockets import POLICY_VIOLATION, TRY_LATER, send, serve_socket
 from skyless.run.mqtt.messages import AlarmMessage
 
@@ -85,7 +85,7 @@ def _message(kind: str, value: Struct, **more: object) -> bytes:
     return msgspec.json.encode({"type": kind, **more, **msgspec.structs.asdict(value)})
 
 
-def endpoint(sites: LiveSites) -> Callable[[WebSocket], Awaitable[None]]:
+def endpoint(sites: Sites) -> Callable[[WebSocket], Awaitable[None]]:
     """The WebSocket's handler."""
     open_streams: set[WebSocket] = set()
 
@@ -101,10 +101,12 @@ def endpoint(sites: LiveSites) -> Callable[[WebSocket], Awaitable[None]]:
             await socket.close(TRY_LATER, f"{MAX_STREAMS} streams are open")
             return
         open_streams.add(socket)
+        live.streams += 1
         try:
             await serve_socket(socket, _send_news(socket, SiteStream(live, frozenset(names(query.tags)))))
         finally:
             open_streams.discard(socket)
+            live.streams -= 1
 
     return serve
 

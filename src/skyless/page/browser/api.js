@@ -2,6 +2,14 @@
 
 import { state } from "./store.js";
 
+/** The token is now in a cookie; remove it from the address and the history. */
+export function dropToken() {
+  const address = new URL(location.href);
+  if (!address.searchParams.has("token")) return;
+  address.searchParams.delete("token");
+  history.replaceState(null, "", address);
+}
+
 /** The query of what belongs to the live site: it names the one that the page shows, whichever others there are. */
 function ofSite(query = "") {
   const named = state.liveId === null ? query : `site=${state.liveId}&${query}`;
@@ -9,7 +17,7 @@ function ofSite(query = "") {
 }
 
 /** Fetch JSON, or what `read` makes of the answer; throws an Error with the server's message. */
-async function fetchJson(path, options = {}, read = (answer) => answer.json()) {
+export async function fetchJson(path, options = {}, read = (answer) => answer.json()) {
   let answer;
   try {
     answer = await fetch(new URL(path, document.baseURI), { cache: "no-store", ...options });

@@ -176,6 +176,8 @@ function age(since) {
 }
 
 function brokerWords() {
+  const away = state.condition?.reasons.find(({ kind }) => kind === "broker");
+  if (state.hub) return away ? sentence(away.text) : "";
   const broker = state.mqtt.broker ? ` ${state.mqtt.broker}` : "";
   return `The server has lost its broker${broker}: tags and anchors are not updated until it is connected again.`;
 }

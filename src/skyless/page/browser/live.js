@@ -4,7 +4,7 @@ import { changed, healthAge_s, siteOf, state } from "./store.js";
 import { live, now_s, resetOffset, updateOffset } from "./clock.js";
 import { receiveAlarms } from "./alarms/model.js";
 import { foundByAsset, receiveAssets } from "./assets/model.js";
-import { toast } from "./dom.js";
+import { byId, toast } from "./dom.js";
 import { addHealth, clearHistory } from "./history.js";
 import { chosenSite } from "./sites.js";
 import { receiveSurvey, receiveWatch, restart } from "./survey/model.js";
@@ -170,6 +170,9 @@ const handlers = {
     state.condition = null;
     state.history = message.history === true;
     state.live2 = message.live2 === true;
+    state.hub = message.hub === true;
+    document.body.classList.toggle("read-only", state.hub);
+    byId("all-sites").hidden = !state.hub;
     changed("connection", "events", "log", "condition");
     handlers.sites({ shown: null, sites: [] });
     handlers.zones(message);

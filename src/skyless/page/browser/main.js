@@ -1,6 +1,7 @@
 /** Puts the page together. */
 
 import { on, state } from "./store.js";
+import { dropToken } from "./api.js";
 import * as alarmLine from "./alarm_line.js";
 import * as banner from "./banner.js";
 import * as legend from "./legend.js";
@@ -18,13 +19,7 @@ import * as tools from "./map/tools.js";
 import { live as liveTracks, replayed, shown_s } from "./clock.js";
 import { byId, text } from "./dom.js";
 
-// The token is now in a cookie; remove it from the address and the history.
-const address = new URL(location.href);
-if (address.searchParams.has("token")) {
-  address.searchParams.delete("token");
-  history.replaceState(null, "", address);
-}
-
+dropToken();
 theme.start();
 map.start();
 tools.start();

@@ -24,6 +24,8 @@ export const state = {
   simulated: false,
   /** Number of the live site, also while a recording is replayed. @type {number|null} */
   liveId: null,
+  /** Whether the page's server is at a hub, which only reads; then this is one of several sites. */
+  hub: false,
   /** The sites of the broker: number, name, whether programs are online. @type {Array<[number, string, boolean]>} */
   sites: [],
   /** @type {{done: number, total: number, left_s: number|null}|null} while kernels are compiled */
@@ -146,6 +148,11 @@ export function healthAge_s(kind, name) {
 /** The site of a message, with the outline and the floors that stand beside it there; null without one. */
 export function siteOf(message) {
   return message ? { ...message.site, outline_m: message.outline_m, floors: message.floors } : null;
+}
+
+/** Whether the page may change the site. */
+export function isChangeable() {
+  return state.mode === "live" && !state.hub;
 }
 
 /** Select one tag, anchor or zone, or with null none; its tab opens, also where it is selected already. */

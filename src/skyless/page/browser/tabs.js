@@ -1,6 +1,6 @@
 /** The side panel: tabs by the pattern of the ARIA authoring guide, and on a phone a sheet of three heights. */
 
-import { changed, on, state } from "./store.js";
+import { changed, isChangeable, on, state } from "./store.js";
 import { byId, h, throttle } from "./dom.js";
 import { places } from "./map/places.js";
 import { picking } from "./survey/picking.js";
@@ -56,7 +56,7 @@ export function start() {
 
 /** Open the tab Set up at a site without any position, once: there is nothing else to see. */
 function openWhereNothingIsPlaced() {
-  if (offered || state.mode !== "live" || !state.site) return;
+  if (offered || !isChangeable() || !state.site) return;
   offered = true;
   if (!state.site.anchors.length && current === "tags") open("setup");
 }
@@ -108,11 +108,12 @@ function sheet(height) {
 }
 
 function move(event) {
-  const at = KEYS.indexOf(current);
-  const to = { ArrowRight: at + 1, ArrowLeft: at - 1, Home: 0, End: KEYS.length - 1 }[event.key];
+  const keys = KEYS.filter((key) => byId(`tab-${key}`).checkVisibility());
+  const at = keys.indexOf(current);
+  const to = { ArrowRight: at + 1, ArrowLeft: at - 1, Home: 0, End: keys.length - 1 }[event.key];
   if (to === undefined) return;
   event.preventDefault();
-  const key = KEYS[(to + KEYS.length) % KEYS.length];
+  const key = keys[(to + keys.length) % keys.length];
   open(key);
   byId(`tab-${key}`).focus();
 }

@@ -116,8 +116,10 @@ def _of(what: str, kind: str, level: _Severity, text: str, advice: str, names: I
     return Reason(kind, level, text, advice, tuple(f"{what}/{name}" for name in list(names)[:_MAX_NAMED]))
 
 
-def broker_reason() -> Reason:
+def broker_reason(hub_trouble: str | None) -> Reason:
     """Nothing else can be known then."""
+    if hub_trouble is not None:
+        return Reason("broker", "bad", f"{hub_trouble}; nothing is updated", "The page connects by itself.")
     advice = "Start the broker again, or see whether its computer is reachable; the page connects by itself."
     return Reason("broker", "bad", "the broker is not connected: nothing is updated", advice)
 

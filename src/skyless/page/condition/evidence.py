@@ -103,7 +103,8 @@ class Evidence:
     def __init__(self, host: str, now_s: float) -> None:
         """``host`` is this computer's name, as nodes state theirs."""
         self.host = host
-        self.connected = False
+        self.connected = self.was_connected = False
+        self.hub_trouble: str | None = None  # at a hub: why it is not connected
         self.ready_s = now_s  # when it began to wait for messages
         self.site: Site | None = None
         self.nodes: dict[tuple[str, str], Node] = {}  # by kind and name
@@ -119,6 +120,7 @@ class Evidence:
         """Whether the broker is connected."""
         if connected != self.connected:
             self.connected, self.ready_s = connected, now_s
+            self.was_connected = True
 
     def set_site(self, site: Site, now_s: float) -> None:
         """Which anchors there should be."""

@@ -88,9 +88,10 @@ class ConditionMonitor:
         latencies = evidence.ages.percentiles_s(now_s)
         if not evidence.connected:
             self._held.clear()
-            if not evidence.nodes and now_s - evidence.ready_s < FRESH_S:
-                return Condition("waiting", "waiting for the broker", (), None, None)
-            reason = broker_reason()
+            if not evidence.was_connected and now_s - evidence.ready_s < FRESH_S:
+                awaited = "the broker" if evidence.hub_trouble is None else "the site at its hub"
+                return Condition("waiting", f"waiting for {awaited}", (), None, None)
+            reason = broker_reason(evidence.hub_trouble)
             return Condition(reason.level, reason.text, (reason,), None, None)
         behind = behind_reason(ages, unread_s)
         found = [

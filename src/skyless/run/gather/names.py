@@ -28,9 +28,8 @@ class TagName(Struct, frozen=True):
     since_unix_s: float
 
 
-async def name_of(stream: "JetStreamContext", site: int, number: int) -> str:
-    """The name of a tag's number, empty where it has none. Raises nats.errors.Error."""
-    names = subjects.at(subjects.NAMES_STREAM, site)
+async def name_of(stream: "JetStreamContext", names: str, site: int, number: int) -> str:
+    """The name of a tag's number in the stream ``names``, empty where it has none. Raises nats.errors.Error."""
     try:
         message = await stream.get_last_msg(names, subjects.at(subjects.NAMES, site, number), direct=True)
         return msgspec.json.decode(message.data or b"", type=TagName).name

@@ -29,8 +29,8 @@ export function start(panel) {
   const needed = { required: true, maxLength: 60, pattern: ".*\\S.*", title: "Others see who has acknowledged an alarm" };
   const by = h("input", { type: "text", id: "acknowledged-by", autocomplete: "name", value: savedSetting(BY) ?? "", ...needed });
   by.addEventListener("change", () => saveSetting(BY, by.value.trim()));
-  const name = h("label", { class: "field by" }, h("span", {}, "Your name, for acknowledging; kept in this browser"), by);
-  const all = button("", () => see(shownAlarms().filter(isUnseen)), { class: "quiet" });
+  const name = h("label", { class: "field by changes" }, h("span", {}, "Your name, for acknowledging; kept in this browser"), by);
+  const all = button("", () => see(shownAlarms().filter(isUnseen)), { class: "quiet changes" });
   const note = h("p", { class: "fine" });
   const list = h("ol", { class: "alarms", "aria-label": "Alarms" });
   const rules = rulesSection();
@@ -75,7 +75,7 @@ function makeAlarm(_id, alarm) {
   const { mark } = SEVERITIES[alarm.severity];
   const what = button(sentence(alarm.sentence), () => selectSubject(now), { class: "name" });
   const about = h("p", { class: "fine" });
-  const seen = button("Acknowledge", () => see([now]), { "aria-label": `Acknowledge: ${alarm.sentence}` });
+  const seen = button("Acknowledge", () => see([now]), { class: "changes", "aria-label": `Acknowledge: ${alarm.sentence}` });
   const icon = h("span", { class: "log-mark", "aria-hidden": "true" }, mark);
   const element = h("li", {}, icon, h("div", {}, h("span", { class: "unseen" }, `${alarm.severity}: `), what, about), seen);
   const update = (next) => {

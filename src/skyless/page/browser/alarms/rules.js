@@ -46,8 +46,8 @@ function makeRule(rule, own, edit) {
   const name = rule.name || rule.id;
   const words = h("div", {}, h("strong", {}, name), h("p", { class: "fine" }, ruleWords(rule)));
   const file = h("span", { class: "badge", title: "This rule is changed in the site file" }, "site file");
-  const change = button("Edit", () => edit(rule), { class: "quiet", "aria-label": `Edit ${name}` });
-  const del = button("Delete", () => remove(rule), { class: "quiet", "aria-label": `Delete ${name}` });
+  const change = button("Edit", () => edit(rule), { class: "quiet changes", "aria-label": `Edit ${name}` });
+  const del = button("Delete", () => remove(rule), { class: "quiet changes", "aria-label": `Delete ${name}` });
   return { element: h("li", { class: rule.severity ?? "warning" }, words, ...(own ? [change, del] : [file])) };
 }
 

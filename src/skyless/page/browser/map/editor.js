@@ -18,6 +18,7 @@ function snap([x, y]) {
 
 /** Begin a new zone; with `at`, the keyboard's cursor starts there. */
 export function begin(at = null) {
+  if (state.hub) return toast("Zones are drawn on the site's own page.");
   if (state.mode !== "live") return toast("Zones can be drawn on the live site only.");
   select(null);
   Object.assign(editor, { drawing: true, points: [], cursor: at ? snap(at) : null, moving: null });

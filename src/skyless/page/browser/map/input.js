@@ -1,6 +1,6 @@
 /** Mouse, touch and keyboard on the map. */
 
-import { changed, select, state } from "../store.js";
+import { changed, isChangeable, select, state } from "../store.js";
 import { byId, text } from "../dom.js";
 import { duration, metres } from "../format.js";
 import { surveyShown } from "../survey/model.js";
@@ -154,7 +154,7 @@ function anchorAt({ x, y }) {
 }
 
 function cornerAt({ x, y }) {
-  if (editor.drawing || picking || movingPlan || state.mode !== "live" || view.spatial) return null;
+  if (editor.drawing || picking || movingPlan || !isChangeable() || view.spatial) return null;
   const zone = state.zones.find((one) => one.id === state.selection.zone);
   const index = zone?.polygon_m.findIndex(([x_m, y_m]) => near(px(x_m), py(y_m), x, y)) ?? -1;
   return index < 0 ? null : { id: zone.id, index };

@@ -188,7 +188,7 @@ function age_s(track) {
 function makeDetail() {
   const heading = h("h2", {});
   const reason = h("p", { class: "reason", hidden: true });
-  const edit = h("button", { type: "button", class: "quiet", onclick: () => editAssets(state.selection.tag) }, "Edit");
+  const edit = h("button", { type: "button", class: "quiet changes", onclick: () => editAssets(state.selection.tag) }, "Edit");
   const list = facts([
     "Tag",
     "Group",

@@ -1,6 +1,6 @@
 /** Zones: their names, colours and corners; and the tags that entered and left. */
 
-import { select, state, toggleSelection } from "../store.js";
+import { isChangeable, select, state, toggleSelection } from "../store.js";
 import { shownName } from "../assets/model.js";
 import { Rows, h, offer, options, text, toast } from "../dom.js";
 import { sentence, timeOfDay } from "../format.js";
@@ -55,7 +55,7 @@ export function show() {
 function makeOther(_key, { site, zones }) {
   const count = `${zones.length} ${zones.length === 1 ? "zone" : "zones"}`;
   const copy = () => addZones(zones, `${count} of ${site} copied.`);
-  const button = h("button", { type: "button", onclick: copy, "aria-label": `Copy the zones of ${site} here` }, "Copy here");
+  const button = h("button", { type: "button", class: "changes", onclick: copy, "aria-label": `Copy the zones of ${site} here` }, "Copy here");
   return { element: h("li", {}, h("span", {}, `Site ${site}: ${count}`), button) };
 }
 
@@ -63,7 +63,7 @@ function makeOther(_key, { site, zones }) {
 function fileButtons() {
   const save = h("button", { type: "button", onclick: exportZones }, "Export");
   const pick = h("input", { type: "file", accept: ".json,application/json", hidden: true });
-  const load = h("button", { type: "button", onclick: () => pick.click() }, "Import …");
+  const load = h("button", { type: "button", class: "changes", onclick: () => pick.click() }, "Import …");
   pick.addEventListener("change", () => {
     if (pick.files[0]) importZones(pick.files[0]);
     pick.value = "";
@@ -107,7 +107,7 @@ function makeZone(id, zone) {
     { type: "button", class: "quiet", onclick: () => toggleSelection("zone", id) },
     "Corners",
   );
-  const del = h("button", { type: "button", class: "quiet", onclick: () => remove(id) }, "Delete");
+  const del = h("button", { type: "button", class: "quiet changes", onclick: () => remove(id) }, "Delete");
   const table = h("div", { class: "corners", hidden: true });
   const floor = options({ "aria-label": `Floor of ${zone.name}` }, [], (value) => change(id, { floor: value === "" ? null : Number(value) }));
   const element = h("li", {}, h("div", { class: "zone" }, swatch, name, floor, corners, del), table);
@@ -123,7 +123,7 @@ function makeZone(id, zone) {
     floor.hidden = !numbered.length;
     offer(floor, [["", "all floors"], ...numbered.map((one) => [one.number, one.name])], now.floor ?? "");
     del.setAttribute("aria-label", `Delete ${now.name}`);
-    for (const input of [swatch, name, floor, del]) input.disabled = state.mode !== "live";
+    for (const input of [swatch, name, floor, del]) input.disabled = !isChangeable();
     table.hidden = !chosen;
     const key = JSON.stringify(now.polygon_m);
     if (chosen && key !== shown && !table.contains(document.activeElement)) table.replaceChildren(...cornerRows(now));
@@ -140,7 +140,7 @@ function cornerRows(zone) {
         step: "0.05",
         value: String(corner[part]),
         "aria-label": `Corner ${index + 1}, ${axis} in metres`,
-        disabled: state.mode !== "live",
+        disabled: !isChangeable(),
       });
       input.addEventListener("change", () => setCoordinate(zone.id, index, part, Number(input.value)));
       return h("label", {}, `${axis} `, input);
