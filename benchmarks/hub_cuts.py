@@ -3,10 +3,10 @@
 ``.venv/bin/python benchmarks/hub_cuts.py [--part table|random] [--seed 1] [--actions 20]``
 
 The servers' files are those of ``skyless hub init``; the site is ``skyless broker --gather --hub``. Its line goes
-through a proxy that can be cut. A program packs 20 batches of 20 fixes a second into the site's stream and sends each until it
-is acknowledged. ``table``: how long a viewer at the hub sees nothing, and after which time the hub's stream has all
-that was acknowledged. ``random``: kills and cuts in a random order, the history's program among them; then every
-fix must be in its Parquet files once, and the batches in the hub's stream in order. The exit code is 1 otherwise.
+through a proxy that can be cut. A program packs 20 batches of 20 fixes a second into the site's stream and sends each
+until it is acknowledged. ``table``: how long a viewer at the hub sees nothing, and after which time the hub's stream
+has all that was acknowledged. ``random``: kills and cuts in a random order, the history's program among them; then
+every fix must be in its Parquet files once, and the batches in the hub's stream in order. The exit code is 1 otherwise.
 """
 
 import argparse
@@ -160,11 +160,14 @@ class Stage:
         return self
 
     async def __aexit__(self, *_):
-        self._sending.cancel()
-        await asyncio.gather(self._sending, return_exceptions=True)
+        await self.stop_sending()
         for process in (self.broker, *self.servers):
             if process.runs:
                 process.kill(signal.SIGTERM)
+
+    async def stop_sending(self):
+        self._sending.cancel()
+        await asyncio.gather(self._sending, return_exceptions=True)
 
     async def start_broker(self):
         self.broker.start()
@@ -336,8 +339,7 @@ async def at_random(stage, seed, actions):
                 await asyncio.sleep(seconds)
                 program.start()
         await asyncio.sleep(draw.uniform(0.3, 2.0))
-    stage._sending.cancel()
-    await asyncio.gather(stage._sending, return_exceptions=True)
+    await stage.stop_sending()
     aim, rows = stage.acknowledged * RECORDS, []
     print(f"complete at the hub {await stage.complete():.1f} s after the last one", flush=True)
     for pause_s in (5, 10, 20, 40, 80):

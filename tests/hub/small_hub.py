@@ -8,6 +8,7 @@ import nats
 from skyless.cli.main import main
 from skyless.run.broker import BrokerSettings, _program, start_broker
 from skyless.run.gather.node import Gather
+from skyless.run.gather.subjects import EVENT_STREAM, at
 from skyless.run.hub.files import MONITOR_PORT, Hub
 from skyless.run.hub.leaf import read_json
 from support.processes import free_port, started
@@ -32,14 +33,25 @@ async def client_of(address):
     return await nats.connect(address.servers, user=address.user, password=address.password)
 
 
+async def has_stream(client, name):
+    with contextlib.suppress(nats.errors.Error):
+        return await client.jetstream().stream_info(name) is not None
+    return False
+
+
 @contextlib.asynccontextmanager
 async def site(folder, leaf, keep_bytes=10**8):
-    """The broker of a site with its gather."""
+    """The broker of a site with its gather, whose streams are there."""
     place = folder / f"{leaf.tenant}{leaf.site}"
     settings = BrokerSettings(port=free_port(), data=place, gathered_bytes=keep_bytes, hub=leaf)
     async with await start_broker(settings) as running:
         gather = asyncio.ensure_future(Gather(running.nats, leaf.site, keep_bytes, print).run())
         try:
+            client = await client_of(running.nats)
+            async with asyncio.timeout(30):
+                while not await has_stream(client, at(EVENT_STREAM, leaf.site)):
+                    await asyncio.sleep(0.05)
+            await client.close()
             yield running
         finally:
             gather.cancel()

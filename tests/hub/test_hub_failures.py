@@ -1,7 +1,6 @@
 """Cut lines, full stores, clocks and versions that differ: what is lost is counted, and the rest is there once."""
 
 import asyncio
-import contextlib
 import signal
 import subprocess
 import time
@@ -15,6 +14,7 @@ import pytest
 from hub_cuts import Line
 from msgspec.structs import replace
 from pyarrow import parquet
+from small_hub import client_of, hub_port, running_hub, site
 
 from skyless.cli.main import main
 from skyless.run.broker import _program
@@ -27,10 +27,10 @@ from skyless.run.history.hub_source import HubHistory
 from skyless.run.history.layout import current_files, day_of
 from skyless.run.history.retention import Keep
 from skyless.run.hub.files import LEAF_PORT
+from skyless.run.hub.sites import HubSites
 from skyless.run.hub.streams import make_streams_of
 from skyless.run.mqtt.address import mqtt_address
 from skyless.run.mqtt.connection import check_broker
-from small_hub import client_of, hub_port, running_hub, site
 from support.processes import SKYLESS, free_port, started
 
 SITE, ROWS, RUN = 7, 20, 5
@@ -52,7 +52,6 @@ class Stage:
         async with site(self.folder, leaf, keep_bytes) as broker:
             client = await connect(broker.nats, "sender", print, Counter())
             self.stream, self.names = client.jetstream(), Names(client.jetstream(), SITE)
-            await self.until(self.has_streams)
             await self.names.give(["a", "b"], "sender", time.time())
             await make_streams_of(self.hub, "plant", print)
             tenant = self.hub.address("plant")
@@ -66,12 +65,9 @@ class Stage:
                 await asyncio.gather(running, return_exceptions=True)
                 await client.close()
 
-    async def has_streams(self):
-        with contextlib.suppress(Exception):
-            return await self.stream.stream_info(subjects.at(subjects.EVENT_STREAM, SITE)) is not None
-
     async def send(self, count, clock_s=0.0):
-        for self.sent in range(self.sent + 1, self.sent + count + 1):
+        for _ in range(count):
+            self.sent += 1
             records = np.zeros(ROWS, RECORD)
             records["position_mm"][:, 0] = ROWS * self.sent + np.arange(ROWS)
             records["tag"], records["unix_us"] = 1 + np.arange(ROWS) % 2, round(1e6 * (time.time() + clock_s))
@@ -166,15 +162,21 @@ def test_a_full_hub_drops_the_oldest_and_a_history_that_was_away_counts_them(tmp
 def test_a_summary_of_another_version_is_read():
     old = {"unix_s": 1.0, "host": "h", "version": "0.1", "site": "", "simulated": False, "names": 3, "online": {}}
     old |= {"fixes": 1, "batches": 1, "waiting": 0, "drops": {}, "cuts": 0}
-    summary = msgspec.convert(old | {"of the future": 1}, Summary)
-    assert summary.condition == "degraded"
-    assert "older version" in summary.reasons[0]
-    assert msgspec.json.decode(msgspec.json.encode(summary), type=Summary) == summary
+    assert msgspec.convert(old, Summary).condition == ""
+    new = old | {"condition": "splendid", "of the future": 1}
+    assert msgspec.convert(new, Summary).condition == "splendid"
+    sites = HubSites(NatsAddress("nats://127.0.0.1"), 0.0)
+    for number, summary in enumerate((old, new)):
+        sites.add_summary(number, msgspec.json.encode(summary), 0.0, 1.0)
+    found = sites.sites(1.0)
+    assert {site.condition for site in found} == {"unknown"}
+    assert all("states no condition" in site.reason for site in found)
 
 
 CERTIFICATES = """\
-openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 3650 -subj /CN=hub -keyout ca-key.pem -out ca.pem
-openssl req -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -subj /CN=hub.test -addext subjectAltName=IP:127.0.0.1 \
+new="openssl req -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes"
+$new -x509 -days 3650 -subj /CN=hub -keyout ca-key.pem -out ca.pem
+$new -subj /CN=hub.test -addext subjectAltName=IP:127.0.0.1 \
     -addext extendedKeyUsage=serverAuth,clientAuth -keyout key.pem -out a.csr
 openssl x509 -req -in a.csr -CA ca.pem -CAkey ca-key.pem -days -1 -copy_extensions copy -out cert.pem
 openssl x509 -req -in a.csr -CA ca.pem -CAkey ca-key.pem -days 30 -copy_extensions copy -out new.pem

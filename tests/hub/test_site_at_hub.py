@@ -5,9 +5,10 @@ import json
 
 import pytest
 from nats.errors import NoRespondersError
+from small_hub import client_of, running_hub, site
 
 from skyless.cli.main import main
-from small_hub import client_of, running_hub, site
+from skyless.core.version import installed_version
 from support.processes import SKYLESS, free_port, started
 
 pytestmark = pytest.mark.site
@@ -24,6 +25,9 @@ def test_a_site_publishes_its_own_and_no_tenant_sees_another(tmp_path, capsys):
         async with site(tmp_path, hub.leaf("plant", 7)) as one, site(tmp_path, hub.leaf("other", 7)) as two:
             plant, other = await client_of(hub.address("plant")), await client_of(hub.address("other"))
             near, far = await client_of(one.nats), await client_of(two.nats)
+            found = await asyncio.to_thread(apply, tmp_path, capsys)
+            assert found["plant"]["8"] is None
+            assert found["plant"]["7"]["version"] == found["other"]["7"]["version"] == installed_version()
             seen, unseen, commands = await plant.subscribe("skyless.>"), await other.subscribe(">"), []
             heard = await near.subscribe("skyless.v1.7.*")
             for subject in ("skyless.v1.8.site", "skyless.v1.7.zones"):
@@ -53,13 +57,12 @@ def test_a_site_publishes_its_own_and_no_tenant_sees_another(tmp_path, capsys):
                 await client.close()
 
     with running_hub(tmp_path) as (hub, _):
-        assert apply(tmp_path, capsys) == {"plant": {"7": None, "8": None}, "other": {"7": None}}
         asyncio.run(run(hub))
 
 
 def test_a_number_that_another_site_has_is_refused(tmp_path, capsys):
     with running_hub(tmp_path):
-        apply(tmp_path, capsys)
+        assert apply(tmp_path, capsys) == {"plant": {"7": None, "8": None}, "other": {"7": None}}
         leaf = tmp_path / "hub" / "sites" / "plant-site7.json"
         broker = (*SKYLESS, "broker", "--gather", "--keep-gb", "0.1", "--hub", str(leaf))
         with started(*broker, "--port", str(free_port()), "--data", str(tmp_path / "a")) as first:

@@ -35,11 +35,15 @@ _ports = itertools.cycle(range(_FIRST_PORT, _FIRST_PORT + 2000))
 
 def free_port(kind=socket.SOCK_STREAM):
     """A port of loopback where nobody listens, and which no other test of this run gets."""
-    while True:
-        port = next(_ports)
-        with contextlib.suppress(OSError), socket.socket(socket.AF_INET, kind) as probe:
-            probe.bind(("127.0.0.1", port))
-            return port
+    return next(port for port in _ports if is_free_port(port, kind))
+
+
+def is_free_port(port, kind=socket.SOCK_STREAM):
+    """Whether nobody listens at a port of loopback."""
+    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", port))
+        return True
+    return False
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ import time
 from typing import Final
 
 import msgspec
-from msgspec import Struct, field
+from msgspec import Struct
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.aio.subscription import Subscription
@@ -19,7 +19,7 @@ from skyless.core.version import installed_version
 from skyless.run.fix_batch import BadBatchError, Batch, decode_batch, encode_batch
 from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect, rarely
-from skyless.run.gather.condition import ConditionWord, SiteCondition
+from skyless.run.gather.condition import SiteCondition
 from skyless.run.gather.names import NEVER_WRITTEN, Names
 from skyless.run.gather.packer import Packer
 from skyless.run.gather.streams import make_streams, messages
@@ -45,8 +45,9 @@ class Summary(Struct, frozen=True, kw_only=True):
     simulated: bool
     since: str = ""
     """When the site's streams were made, in ISO 8601: of two sites with one number, each has another."""
-    condition: ConditionWord = "degraded"
-    reasons: list[str] = field(default_factory=lambda: ["the gather is of an older version, which states none"])
+    condition: str = ""
+    """A ``ConditionWord``; empty of an older version, which states none, and another word of a newer one perhaps."""
+    reasons: list[str] = []
     """Why the condition is not good."""
     tags_heard: int = 0
     """Tags with a fix in the last ten seconds, whoever packed it."""
