@@ -20,7 +20,7 @@ from skyless.cli.main import main
 from skyless.run.broker import _program
 from skyless.run.fix_batch import RECORD, Batch, encode_batch
 from skyless.run.gather import subjects
-from skyless.run.gather.address import NatsAddress, connect
+from skyless.run.gather.address import NatsAddress, connect, rarely
 from skyless.run.gather.names import Names
 from skyless.run.gather.node import Summary
 from skyless.run.history.hub_source import HubHistory
@@ -205,3 +205,11 @@ def test_a_certificate_that_has_run_out_is_said_and_a_new_one_is_taken(tmp_path)
         (tmp_path / "new.pem").replace(tmp_path / "cert.pem")
         hub.send_signal(signal.SIGHUP)
         assert "the line to the hub is up" in broker.stderr.readline()
+
+
+def test_servers_that_are_away_in_turns_are_said_once_each():
+    said = []
+    say = rarely(said.append)
+    for server in ("a", "b", "c") * 3:
+        say(f"{server}: connection refused")
+    assert len(said) == 3
