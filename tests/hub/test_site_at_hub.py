@@ -25,7 +25,11 @@ def test_a_site_publishes_its_own_and_no_tenant_sees_another(tmp_path, capsys):
         async with site(tmp_path, hub.leaf("plant", 7)) as one, site(tmp_path, hub.leaf("other", 7)) as two:
             plant, other = await client_of(hub.address("plant")), await client_of(hub.address("other"))
             near, far = await client_of(one.nats), await client_of(two.nats)
-            found = await asyncio.to_thread(apply, tmp_path, capsys)
+            applying = asyncio.ensure_future(asyncio.to_thread(apply, tmp_path, capsys))
+            while not applying.done():
+                await near.publish("skyless.v2.7.summary", b"no summary")
+                await asyncio.sleep(0.2)
+            found = await applying
             assert found["plant"]["8"] is None
             assert found["plant"]["7"]["version"] == found["other"]["7"]["version"] == installed_version()
             seen, unseen, commands = await plant.subscribe("skyless.>"), await other.subscribe(">"), []
