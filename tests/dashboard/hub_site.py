@@ -7,47 +7,39 @@ import sys
 from pathlib import Path
 
 from skyless.run.gather.address import NatsAddress
+from skyless.run.hub.files import MONITOR_PORT, Hub, Node, with_sites, write_files
 from support.processes import free_port
 
 SITE = 7
-_PUBLISHED = ("skyless.v1.7.>", "skyless.v2.7.>", "sourced.7.>", "$JSC.R.>", "$JS.R.>", "_R_.>")
-_SUBSCRIBED = ("$JS.site7.API.>", "skyless.v1.7.>", "$JS.ACK.>", "$JS.FC.>")
+TENANT = "plant"
 
 
 class Servers:
-    """The settings and addresses of both."""
+    """Their settings and addresses."""
 
     def __init__(self, folder):
-        self.folder = folder
-        self.ports = {name: free_port() for name in ("hub", "leaf", "site", "mqtt")}
-        self.hub = NatsAddress(f"nats://127.0.0.1:{self.ports['hub']}", "op", "op")
-        self.site = NatsAddress(f"nats://127.0.0.1:{self.ports['site']}")
-        permissions = {"publish": {"allow": _PUBLISHED}, "subscribe": {"allow": _SUBSCRIBED}}
-        users = [{"user": "op", "password": "op"}, {"user": "site7", "password": "s", "permissions": permissions}]
-        leaf = {"urls": [f"nats://site7:s@127.0.0.1:{self.ports['leaf']}"]}
-        self.settings = {
-            "hub": {
-                "leafnodes": {"listen": f"127.0.0.1:{self.ports['leaf']}", "no_advertise": True},
-                "jetstream": {"domain": "hub"},
-                "accounts": {"T1": {"jetstream": "enabled", "users": users}},
-            },
-            "site": {
-                "jetstream": {"domain": "site7"},
-                "mqtt": {"listen": f"127.0.0.1:{self.ports['mqtt']}"},
-                "leafnodes": {"remotes": [leaf | {"deny_imports": ["$MQTT.>"], "deny_exports": ["$MQTT.>"]}]},
-            },
+        port = next(port for port in iter(free_port, None) if port < 0xFFFF - MONITOR_PORT)
+        hub = Hub((Node("127.0.0.1", port),), fixes_gb=0.1, data=str(folder / "data"))
+        self.plan = with_sites(hub, TENANT, [SITE])
+        write_files(self.plan, folder)
+        self.hub = self.plan.address(TENANT)
+        site_port = free_port()
+        self.site = NatsAddress(f"nats://127.0.0.1:{site_port}")
+        site = {
+            "server_name": "site",
+            "listen": f"127.0.0.1:{site_port}",
+            "jetstream": {"domain": f"site{SITE}", "store_dir": str(folder / "site"), "max_file_store": 1_000_000_000},
+            "mqtt": {"listen": f"127.0.0.1:{free_port()}"},
+            "leafnodes": self.plan.leaf(TENANT, SITE).configuration(),
         }
+        self._files = {"hub": folder / self.plan.nodes[0].name / "nats-server.conf", "site": folder / "site.json"}
+        self._files["site"].write_text(json.dumps(site))
 
     @contextlib.contextmanager
     def running(self, name):
         """One of the servers."""
-        settings = {"server_name": name, "listen": f"127.0.0.1:{self.ports[name]}"} | self.settings[name]
-        settings["jetstream"] |= {"store_dir": str(self.folder / name), "max_file_store": 1_000_000_000}
-        file = self.folder / f"{name}.json"
-        file.write_text(json.dumps(settings))
-        with subprocess.Popen(
-            [Path(sys.executable).with_name("nats-server"), "-c", file], stderr=subprocess.DEVNULL
-        ) as process:
+        server = Path(sys.executable).with_name("nats-server")
+        with subprocess.Popen([server, "-c", self._files[name]], stderr=subprocess.DEVNULL) as process:
             try:
                 yield
             finally:

@@ -11,7 +11,7 @@ import msgspec
 import pytest
 from dashboard_builders import SITE, SQUARE, fix
 from hub_site import SITE as NUMBER
-from hub_site import Servers
+from hub_site import TENANT, Servers
 from msgspec.structs import replace
 from starlette.exceptions import HTTPException
 from websockets.asyncio.client import connect as websocket
@@ -22,7 +22,7 @@ from skyless.run.gather.address import NatsAddress, connect
 from skyless.run.gather.node import Gather
 from skyless.run.hub.link import SILENT_S, HubLink
 from skyless.run.hub.sites import LISTEN_S, HubSites
-from skyless.run.hub.streams import HubLimits, make_hub_streams
+from skyless.run.hub.streams import make_hub_streams
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import StatusMessage, ZonesMessage
 from support.processes import SKYLESS, running_program
@@ -90,7 +90,7 @@ async def test_a_page_that_is_started_after_a_cut_shows_the_site_and_changes_not
     with servers.running("hub"):
         with servers.running("site"):
             async with _client(servers.hub) as hub_client, _client(servers.site) as site, asyncio.timeout(60):
-                await make_hub_streams(hub_client.jetstream(), [NUMBER], HubLimits(1, 10**8, 10**7))
+                await make_hub_streams(hub_client.jetstream(), servers.plan, TENANT)
                 gather = asyncio.ensure_future(Gather(servers.site, NUMBER, 10**8, print).run())
                 walking = asyncio.ensure_future(_walk(site))
                 async with httpx.AsyncClient() as http, _dashboard(servers, http):
@@ -149,7 +149,7 @@ async def _client(address):
 
 @contextlib.asynccontextmanager
 async def _dashboard(servers, http):
-    command = (*SKYLESS, "dashboard", "--json", "--hub", servers.hub.url.replace("://", "://op:op@"))
+    command = (*SKYLESS, "dashboard", "--json", "--hub", str(servers.hub).replace("@", f":{servers.hub.password}@"))
     async with running_program(*command, stdout=asyncio.subprocess.PIPE) as process:
         page = json.loads(await process.stdout.readline())["page"]
         http.base_url = page

@@ -15,6 +15,7 @@ from skyless.research.studies.common.plan import Limit, plan_of, with_limits
 from skyless.research.studies.common.summary import clustered_interval
 from skyless.research.studies.common.worlds import RunResult, box, run_world
 from skyless.research.studies.room import biases_of, bound_cells
+from skyless.research.studies.run import Parts
 from skyless.research.uncertainty.bounds import Biases
 from skyless.sim.evaluation.statistics import LevelCounts, LevelTally
 from skyless.sim.impairments import Body
@@ -321,7 +322,7 @@ def test_the_table_and_the_picture_show_levels_and_what_is_missed(capsys):
     plan = plan_of("joint", 1, study="room", worlds=2)
     counts = LevelCounts(*map(np.array, ([4.0, 5.0], [4.0, 2.0], [3.0, 0.0], [1.0, 0.0])), hpl_m=np.array([0.1, 0.4]))
     rows = room.rows(plan, _results(plan, counts))
-    print_rows(StudyResult("room", plan, tuple(rows), 1.0))
+    print_rows(StudyResult("room", plan, tuple(rows), 1.0, Parts(1, 0, ())))
     out = capsys.readouterr().out
     for words in (
         "past a wall",

@@ -133,7 +133,9 @@ def test_every_study_can_be_drawn(name, tmp_path):
         (["loss", "--seconds", "nan"], "--seconds"),
         (["loss", "--plot", "loss.doc"], "--plot is 'loss.doc'"),
         (["loss", "--plot", "nowhere/loss.png"], "a file in a folder that exists"),
-        (["loss", "--out", __file__], "which is a file"),
+        (["loss", "--out", __file__], "--out is '" + __file__ + "', which is a file"),
+        (["loss", "--resume", __file__], "--resume is '" + __file__ + "', which is a file"),
+        (["loss", "--resume", "/proc/parts"], "--resume is '/proc/parts', w"),
         (["loss", "--scheduler", "here"], "it should be an address"),
         (["loss", "--scheduler", "tcp://127.0.0.1:9", "--processes", "2"], "give either"),
     ],
@@ -153,13 +155,17 @@ def computed_s(pid):
 
 def test_an_interrupt_leaves_no_file_and_no_traceback(tmp_path):
     """As a terminal sends it: to the whole group, workers among them, at the start and in the middle."""
-    for begun_s in (0.0, 3.0):
-        command = ["env", "--default-signal=INT", *COMMAND, "loss", "--method", "joint", "--out", str(tmp_path / "out")]
+    parts = ["--resume", str(tmp_path / "parts")]
+    for begun_s, resume in (0.0, []), (3.0, parts):
+        command = ["env", "--default-signal=INT", *COMMAND, "loss", "--out", str(tmp_path / "out"), *resume]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
         while computed_s(process.pid) < begun_s:
             time.sleep(0.1)
         os.killpg(process.pid, signal.SIGINT)
         out, err = process.communicate(timeout=60)
         assert (process.returncode, out) == (130, b"")
-        assert err in {b"", b"stopped; nothing was written\n"}
+        way_on = (
+            f"the same command with {' '.join(resume)} goes on" if resume else "nothing was written; --resume FOLDER"
+        )
+        assert err == b"" or err.startswith(f"stopped; {way_on}".encode())
         assert not (tmp_path / "out").exists()

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -13,9 +14,11 @@ from distributed import Client, LocalCluster
 
 from skyless.core.errors import SkylessError
 from skyless.research.studies import loss
+from skyless.research.studies.common import runner
 from skyless.research.studies.common.plan import MEASURED, Cell, Plan
 from skyless.research.studies.common.runner import run_cells, run_cells_on_dask
 from skyless.research.studies.common.summary import world_cells, world_rows
+from skyless.research.studies.integrity import FAULTS
 
 pytestmark = pytest.mark.statistical
 
@@ -24,7 +27,7 @@ PLAN = Plan(method="joint", seed=3, quick=True, worlds=2, seconds=1.0, tags=1)
 
 @pytest.fixture(scope="module")
 def cluster():
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as made:
+    with LocalCluster(n_workers=8, threads_per_worker=1, dashboard_address=None) as made:
         yield made
 
 
@@ -59,13 +62,50 @@ def cells(function, arguments):
 
 
 @pytest.mark.statistical
-def test_the_same_rows_from_one_process_from_two_and_from_a_cluster(cluster):
+def test_the_same_rows_from_one_process_from_two_and_from_a_cluster_that_loses_a_worker(cluster):
     work = world_cells(CASES)
     told = []
     one, two = (run_cells(work, told.append, processes) for processes in (1, 2))
     assert told[-1] == pytest.approx(1.0)
-    third = run_cells_on_dask(work, told.append, cluster.scheduler_address)
+    killed = []
+
+    def kill_once(share):
+        if not killed:
+            assert share < 1.0
+            killed.append(kill_a_busy_worker(cluster.scheduler_address))
+
+    third = run_cells_on_dask(work, kill_once, cluster.scheduler_address)
+    assert killed
     assert rows_of(one) == rows_of(two) == rows_of(third)
+
+
+def kill_a_busy_worker(address):
+    with Client(address, set_as_default=False) as client:
+        pids = client.run(os.getpid)
+        worker = next(worker for worker, tasks in client.processing().items() if tasks)
+    os.kill(pids[worker], signal.SIGKILL)
+    return worker
+
+
+def test_a_client_of_a_cluster_compiles_nothing(cluster, tmp_path):
+    small = ["integrity", "--episodes", "1", "--scheduler", cluster.scheduler_address, "--json"]
+    command = [sys.executable, "-m", "skyless.cli.main", "study", *small]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    ended = subprocess.run(command, check=False, env=environment, capture_output=True)
+    assert (ended.returncode, ended.stderr) == (0, b"")
+    assert json.loads(ended.stdout)["parts"] == {"computed": len(FAULTS), "resumed": 0, "damaged": []}
+    assert not [*tmp_path.rglob("*.nb?")]
+
+
+@pytest.mark.parametrize(
+    ("digest", "told"),
+    [(lambda: str(os.getpid()), "the worker tcp://"), (lambda: "another", "the worker on ")],
+    ids=["before", "in a cell of a worker that came later"],
+)
+def test_a_worker_with_another_program_is_told(cluster, monkeypatch, digest, told):
+    monkeypatch.setattr(runner, "program_digest", digest)
+    with pytest.raises(SkylessError, match=told + r"\S+ runs another Skyless"):
+        run_cells_on_dask(cells(double, [1]), lambda share: None, cluster.scheduler_address)
 
 
 def test_another_seed_gives_other_rows():
@@ -86,8 +126,8 @@ def test_a_process_that_dies_is_told():
 
 
 @pytest.mark.statistical
-def test_a_worker_of_a_cluster_that_dies_is_told(cluster):
-    with pytest.raises(SkylessError, match="the cluster failed, nothing was written"):
+def test_a_cell_that_kills_its_workers_is_told(cluster):
+    with pytest.raises(SkylessError, match="the cluster failed: several workers died computing 'cell'"):
         run_cells_on_dask(cells(die, [1]), lambda share: None, cluster.scheduler_address)
 
 
@@ -112,7 +152,9 @@ def test_a_scheduler_without_workers_is_told():
         run_cells_on_dask(cells(double, [1]), lambda share: None, empty.scheduler_address)
 
 
-def test_a_scheduler_that_dies_is_told(tmp_path):
+@pytest.mark.parametrize("dies", ["the scheduler has gone", "no worker is left; start some"])
+def test_a_scheduler_or_a_last_worker_that_dies_is_told(dies, tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "_WORKERLESS_S", 0.1)
     dask, told = [sys.executable, "-m", "distributed.cli.dask_scheduler"], tmp_path / "scheduler.json"
     scheduler = subprocess.Popen([*dask, "--port", "0", "--no-dashboard", "--scheduler-file", str(told)])
     work = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(told), "--no-nanny"]
@@ -121,8 +163,9 @@ def test_a_scheduler_that_dies_is_told(tmp_path):
     address = wait_for(lambda: json.loads(told.read_text())["address"])
     try:
         wait_for(lambda: has_workers(address))
-        with pytest.raises(SkylessError, match="the scheduler has gone"):
-            run_cells_on_dask(cells(time.sleep, [600.0]), lambda share: scheduler.kill(), address)
+        victim = scheduler if "scheduler" in dies else worker
+        with pytest.raises(SkylessError, match=dies):
+            run_cells_on_dask(cells(time.sleep, [600.0]), lambda share: victim.kill(), address)
     finally:
         for process in (scheduler, worker):
             process.kill()

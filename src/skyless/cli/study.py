@@ -2,11 +2,10 @@
 
 import csv
 import io
-import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
 import msgspec
 from cyclopts import App
@@ -16,6 +15,7 @@ from skyless.cli.api.options import StudyOptions
 from skyless.cli.common.options import JsonOptions, check_picture, command
 from skyless.cli.common.output import console, print_json, to_json
 from skyless.cli.common.progress import progress_bar, status
+from skyless.core.arguments import Rule, folder_to_write
 from skyless.core.errors import SkylessError
 from skyless.core.whole_files import write_whole
 
@@ -79,7 +79,7 @@ app = App(name="study", help_epilogue="Example: skyless study loss --seed 7 --pl
 class _Output(JsonOptions, frozen=True, kw_only=True):
     plot: Path | None = None
     """Draw the picture into this file."""
-    out: Path | None = None
+    out: Annotated[Path | None, Rule(folder_to_write)] = None
     """Write the result here, into a folder: the rows as JSON and CSV, the picture as PNG and SVG."""
 
 
@@ -87,37 +87,27 @@ class _Output(JsonOptions, frozen=True, kw_only=True):
 @command
 def study(asked: StudyOptions, output: _Output) -> None:
     """Measure errors over many simulated runs: a table with standard errors, a picture, JSON."""
-    _check_outputs(output)
+    check_picture(output.plot)
     from skyless.cli.api.study import run_study
-    from skyless.research.studies.run import WITHOUT_POSITIONS
+    from skyless.research.studies.run import WITHOUT_POSITIONS, way_on
     from skyless.sim.compile_ahead import compile_kernels
 
-    if asked.name not in WITHOUT_POSITIONS:
+    if asked.scheduler is None and asked.name not in WITHOUT_POSITIONS:
         with status("compiling the simulation"):
             compile_kernels(asked.method)
     try:
         with progress_bar(f"studying {asked.name}") as reach:
             result = run_study(replace(asked, progress=reach))
     except KeyboardInterrupt:
-        print("stopped; nothing was written", file=sys.stderr)
+        print(f"stopped; {way_on(asked.resume)}", file=sys.stderr)
         raise
+    for file in result.parts.damaged:
+        print(f"skyless: {file} is damaged; its part was computed again", file=sys.stderr)
     _write(result, output)
     if output.json:
         print_json(result.summary)
     else:
         print_rows(result)
-
-
-def _check_outputs(output: _Output) -> None:
-    """See that the files can be written, before the long work. Raises SkylessError."""
-    check_picture(output.plot)
-    if (out := output.out) is None:
-        return
-    if out.exists() and not out.is_dir():
-        raise SkylessError(f"--out is {str(out)!r}, which is a file; it should be a folder, or not exist yet")
-    parent = next(folder for folder in (out, *out.absolute().parents) if folder.is_dir())
-    if not os.access(parent, os.W_OK):
-        raise SkylessError(f"--out is {str(out)!r}, where no folder can be written")
 
 
 def _write(result: "StudyResult", output: _Output) -> None:

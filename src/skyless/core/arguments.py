@@ -8,6 +8,7 @@ docstrings write ``--option``, which becomes the argument's name in Python.
 
 import inspect
 import math
+import os
 import re
 from ast import AnnAssign, ClassDef, Constant, Expr, Name, parse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -342,6 +343,20 @@ def existing_file(name: str, value: object) -> Path:
         raise wrong(name, value, "a path to a file") from None
     if path.is_dir() or not path.exists():
         raise SkylessError(f"{name} is {str(path)!r}; it should be a file, and there is none")
+    return path
+
+
+def folder_to_write(name: str, value: object) -> Path:
+    """A folder for files, which may not exist yet. Raises SkylessError, before the long work."""
+    try:
+        path = Path(value)  # type: ignore[arg-type]
+        if path.exists() and not path.is_dir():
+            raise SkylessError(f"{name} is {str(path)!r}, which is a file; it should be a folder, or not exist yet")
+        parent = next(folder for folder in (path, *path.absolute().parents) if folder.is_dir())
+    except (TypeError, OSError):
+        raise wrong(name, value, "a path to a folder") from None
+    if not os.access(parent, os.W_OK):
+        raise SkylessError(f"{name} is {str(path)!r}, where no folder can be written")
     return path
 
 

@@ -1,4 +1,6 @@
-"""The version of the installed package."""
+"""The version of the installed package, and what tells its source from all others."""
+
+from functools import cache
 
 
 def installed_version() -> str:
@@ -6,3 +8,15 @@ def installed_version() -> str:
     from importlib.metadata import version  # noqa: PLC0415
 
     return version("skyless")
+
+
+@cache
+def program_digest() -> str:
+    """Digest of the package's own source: checkouts of one version may compute different things."""
+    from hashlib import sha256  # noqa: PLC0415
+    from pathlib import Path  # noqa: PLC0415
+
+    package, found = Path(__file__).parents[1], sha256()
+    for file in sorted((*package.rglob("*.py"), *package.rglob("*.c"))):
+        found.update(file.read_bytes())
+    return found.hexdigest()[:16]

@@ -31,7 +31,7 @@ from skyless.run.children import end
 from skyless.run.gather.address import FIRST_PORT as FIRST_NATS_PORT
 from skyless.run.gather.address import MAX_PAYLOAD, NatsAddress
 from skyless.run.gather.subjects import DOMAIN, NAME_REQUESTS, PAGE_INBOX, at
-from skyless.run.hub.leaf import Leaf
+from skyless.run.hub.leaf import PING_INTERVAL, Leaf
 from skyless.run.mqtt.access import ACCESS, Role
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress, mqtt_address
 from skyless.run.mqtt.connection import check_broker
@@ -137,7 +137,7 @@ def _configuration(settings: BrokerSettings, port: int, data: Path, nats: NatsAd
         # Of two servers with one name the hub keeps the newer only, so that nobody could say that there are two.
         whole["server_name"] = f"{site}-{secrets.token_hex(4)}"
         whole["jetstream"]["domain"] = site
-        whole |= {"leafnodes": settings.hub.configuration(), "connect_error_reports": 1}
+        whole |= {"leafnodes": settings.hub.configuration(), "ping_interval": PING_INTERVAL, "connect_error_reports": 1}
     if settings.user is not None:
         whole["authorization"] = {"user": settings.user, "password": settings.password}
     if settings.roles is not None:

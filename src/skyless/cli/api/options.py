@@ -17,6 +17,7 @@ from skyless.core.arguments import (
     check_choice,
     check_point,
     choice,
+    folder_to_write,
     number,
     numbers,
     points,
@@ -234,6 +235,8 @@ class StudyOptions(_Studied, frozen=True, kw_only=True):
     """Processes on this machine; by default one for each core. 1 is this process."""
     scheduler: str | None = None
     """Address of a Dask scheduler whose workers do the work, for example tcp://127.0.0.1:8786."""
+    resume: Annotated[str | Path | None, Path, Rule(folder_to_write)] = None
+    """Keep each finished part in this folder, and compute only parts that are not there."""
 
     def check(self) -> None:
         """See that the options fit one another. Raises SkylessError."""

@@ -15,6 +15,7 @@ from skyless.core.arrays import Vector
 from skyless.core.integrity import RISK
 from skyless.research.studies.catalogue import STUDIES
 from skyless.research.studies.common.plan import Plan, Row, plan_of
+from skyless.research.studies.run import Parts
 from skyless.research.studies.run import run_study as rows_of_study
 
 if TYPE_CHECKING:
@@ -31,6 +32,8 @@ class StudyResult(Result, frozen=True, eq=False):
     rows: tuple[Row, ...]
     """n rows with all figures."""
     wall_s: float
+    parts: Parts
+    """How many parts of the work were computed, and how many came from the folder ``resume``."""
 
     @property
     def cases(self) -> tuple[str, ...]:
@@ -61,7 +64,7 @@ class StudyResult(Result, frozen=True, eq=False):
         rows = msgspec.to_builtins(self.rows, enc_hook=methodcaller("tolist"))
         return {
             "study": self.name, "simulated": True, **msgspec.to_builtins(self.plan), "wall_s": self.wall_s,
-            "rows": rows,
+            "parts": msgspec.to_builtins(self.parts), "rows": rows,
         }  # fmt: skip
 
     def to_dataframe(self) -> "DataFrame":
@@ -113,9 +116,10 @@ def run_study(asked: StudyOptions) -> StudyResult:
         integrity_risk=asked.integrity_risk or RISK,
         alert_limit_m=asked.alert_limit_m,
     )
-    rows = rows_of_study(STUDIES[asked.name], plan, asked.progress, asked.processes, asked.scheduler)
+    chosen, resume = STUDIES[asked.name], asked.resume
+    rows, parts = rows_of_study(chosen, plan, asked.progress, asked.processes, asked.scheduler, resume)
     asked.progress(1.0)
-    return StudyResult(asked.name, plan, tuple(rows), time.perf_counter() - started_s)
+    return StudyResult(asked.name, plan, tuple(rows), time.perf_counter() - started_s, parts)
 
 
 study = python_function(StudyOptions, run_study)

@@ -86,8 +86,8 @@ def broker(*, asked: BrokerOptions, gathered: GatherOptions, output: JsonOptions
     if asked.gather:
         extra_module("nats", "--gather")
     else:
-        gathered.leave_out("site_id", "keep_gb", why="it belongs to --gather")
         asked.leave_out("hub", why="it belongs to --gather")
+        gathered.leave_out("site_id", "keep_gb", why="it belongs to --gather")
     if (history := asked.history) is not None:
         extra_module("pyarrow", "--history")
         make_folder("--history", history)

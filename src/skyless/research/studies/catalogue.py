@@ -48,6 +48,7 @@ STUDIES: Final = {
         ),
         replace(
             _of_worlds("loss", "lost messages", loss.cases, Look("Lost messages", ("rmse", "nees"), x="share lost")),
+            cells=loss.cells,
             rows=loss.rows,
         ),
         _of_worlds("nlos", "late messages", nlos.cases, Look("Late messages", ("rmse", "nees"))),

@@ -1,13 +1,14 @@
 """The study ``loss``: how the error grows with the share of lost messages, at the tags or between anchors as well."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.research.studies.common.plan import Plan, Row, seed_of
-from skyless.research.studies.common.summary import RAW_METHODS, Case, world_rows
+from skyless.research.studies.common.plan import Cell, Plan, Row, seed_of
+from skyless.research.studies.common.summary import RAW_METHODS, Case, world_cells, world_rows
 from skyless.research.studies.common.worlds import Run, walking
 from skyless.research.uncertainty.bounds import BoundSettings, known_receptions, received_bound
 
@@ -45,17 +46,26 @@ _BOUND_S: Final = 9.0
 _BOUND_FROM_S: Final = 3.0
 _BOUND_EPISODES: Final = 24
 """Episodes from which the bound is computed."""
+_BOUND_COST_S: Final = 1.0
+"""About what the bound of a case takes to compute."""
 
 _SPEED_STD_MPS: Final = 1.0
 _BOUND_KEY: Final = 17
 """Key of the stream of random numbers that decides what is lost."""
 
 
+def cells(plan: Plan) -> list[Cell]:
+    """The worlds of all cases, then the bound of each case."""
+    each = cases(plan)
+    bounds = [Cell(case.name, partial(bound_m, case.runs, plan), _BOUND_COST_S) for case in each]
+    return [*world_cells(each), *bounds]
+
+
 def rows(plan: Plan, results: Sequence[Any]) -> Sequence[Row]:
     """A row for each case, with the bound of all receptions in such worlds."""
     each = cases(plan)
-    bounds = {case.name: bound_m(case.runs, plan) for case in each}
-    return [replace(row, bound_m=bounds[row.case]) for row in world_rows("loss", plan, each, results)]
+    worlds = world_rows("loss", plan, each, results[: -len(each)])
+    return [replace(row, bound_m=bound) for row, bound in zip(worlds, results[-len(each) :], strict=True)]
 
 
 def bound_m(runs: Sequence[Run], plan: Plan) -> float | None:

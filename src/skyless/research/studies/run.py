@@ -1,10 +1,15 @@
 """All of ``skyless study`` but for what it writes."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Final
 
+from msgspec import Struct
+
+from skyless.core.errors import SkylessError
+from skyless.research.studies.common.kept import KeptResults
 from skyless.research.studies.common.plan import Plan, Row, Study
-from skyless.research.studies.common.runner import run_cells, run_cells_here, run_cells_on_dask
+from skyless.research.studies.common.runner import UnfinishedError, run_cells, run_cells_here, run_cells_on_dask
 
 OF_EPISODES: Final = ("efficiency", "integrity")
 """Studies of the filter ``joint`` itself."""
@@ -13,23 +18,57 @@ WITHOUT_POSITIONS: Final = ("watch",)
 """Studies in which nobody computes positions."""
 
 
+class Parts(Struct, frozen=True):
+    """Where the results of a study's cells came from."""
+
+    computed: int
+    resumed: int
+    """From the folder of an earlier call."""
+    damaged: tuple[str, ...]
+    """Files of that folder whose parts were computed again."""
+
+
 def run_study(
     chosen: Study,
     plan: Plan,
     on_progress: Callable[[float], None],
     processes: int | None = None,
     scheduler: str | None = None,
-) -> Sequence[Row]:
+    resume: str | Path | None = None,
+) -> tuple[Sequence[Row], Parts]:
     """The rows of a study; ``on_progress`` gets the share done. One process is this one.
 
+    Finished cells are kept in the folder ``resume``, and those that are there are not computed.
+
     Raises:
-        SkylessError: a process died, or the Dask scheduler cannot be used.
+        SkylessError: a process died, or the Dask scheduler or the folder cannot be used.
     """
     cells = chosen.cells(plan)
-    if scheduler is None and processes == 1:
-        results = run_cells_here(cells, on_progress)
-    elif scheduler is None:
-        results = run_cells(cells, on_progress, processes)
-    else:
-        results = run_cells_on_dask(cells, on_progress, scheduler)
-    return chosen.rows(plan, results)
+    kept = None if resume is None else KeptResults(resume, chosen.name, plan)
+    results, damaged = ({}, ()) if kept is None else kept.read(len(cells))
+    parts = Parts(len(cells) - len(results), len(results), damaged)
+    numbers = [number for number in range(len(cells)) if number not in results]
+    missing = [cells[number] for number in numbers]
+
+    def finished(index: int, result: object) -> None:
+        results[numbers[index]] = result
+        if kept is not None:
+            kept.keep(numbers[index], result)
+
+    try:
+        if processes == 1 or not missing:
+            run_cells_here(missing, on_progress, finished)
+        elif scheduler is None:
+            run_cells(missing, on_progress, processes, finished)
+        else:
+            run_cells_on_dask(missing, on_progress, scheduler, finished)
+    except UnfinishedError as error:
+        raise SkylessError(f"{error}; {way_on(resume)}") from None
+    return chosen.rows(plan, [results[number] for number in range(len(cells))]), parts
+
+
+def way_on(resume: str | Path | None) -> str:
+    """What to do after a study has ended early."""
+    if resume is None:
+        return "nothing was written; --resume FOLDER keeps what is finished"
+    return f"the same command with --resume {resume} goes on"

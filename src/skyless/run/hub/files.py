@@ -17,7 +17,7 @@ from skyless.core.errors import SkylessError
 from skyless.core.whole_files import replace_files
 from skyless.run.gather.address import FIRST_PORT, MAX_PAYLOAD, NatsAddress
 from skyless.run.gather.subjects import DOMAIN, SOURCED, SUMMARY, at
-from skyless.run.hub.leaf import Leaf
+from skyless.run.hub.leaf import PING_INTERVAL, Leaf
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, is_loopback
 
 CLUSTER_PORT: Final = 2000
@@ -128,6 +128,7 @@ def _server(hub: Hub, node: Node) -> dict[str, Any]:
         "listen": f"{host}:{node.port}",
         "http": f"127.0.0.1:{node.port + MONITOR_PORT}",
         "max_payload": MAX_PAYLOAD,
+        "ping_interval": PING_INTERVAL,
         "jetstream": {"domain": "hub", "store_dir": f"{hub.data}/{node.name}"},
         "leafnodes": {"listen": f"{host}:{node.port + LEAF_PORT}", "no_advertise": True, **tls},
         "accounts": accounts,

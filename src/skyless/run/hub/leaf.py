@@ -1,7 +1,7 @@
 """The file of a site's line to a hub: ``skyless hub init`` writes it, ``skyless broker --hub`` reads it."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
@@ -9,6 +9,10 @@ from msgspec import Meta, Struct
 from skyless.core.errors import SkylessError
 
 Kind = TypeVar("Kind")
+
+
+PING_INTERVAL: Final = "10s"
+"""nats-server gives a connection up after two pings without an answer, of 2 minutes each without this."""
 
 
 class StuckLineError(Exception):

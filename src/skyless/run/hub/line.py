@@ -19,6 +19,7 @@ from skyless.run.hub.leaf import Leaf, StuckLineError
 from skyless.run.process import Log
 
 _CHECK_S: Final = 2.0
+_SILENT_CHECKS: Final = 3
 _STUCK_S: Final = 300.0
 _UP: Final = "Leafnode connection created"
 
@@ -26,20 +27,26 @@ _UP: Final = "Leafnode connection created"
 async def watch_line(leaf: Leaf, broker: Broker, log: Log) -> None:
     """Log when the line is lost and when it is back, until cancelled. Raises StuckLineError.
 
-    The log of nats-server names every try. A line that the hub refuses is up for a moment.
+    The log of nats-server names every try. A line that the hub refuses, or where it does not answer,
+    is up for a moment.
     """
-    newest, said, tried_s = "", "", time.monotonic()
+    newest, said, unsteady, tried_s = "", "", 0, time.monotonic()
     while True:
         await asyncio.sleep(_CHECK_S)
         text = (broker.data / "nats-server.log").read_text(encoding="utf-8", errors="replace")
         found = re.findall(rf"^\[{broker.pid}\] (.*leaf.*)$", text, re.MULTILINE | re.IGNORECASE)
         before, newest = newest, found[-1] if found else newest
-        faults = [line.partition("] ")[2] for line in found[-2:] if "[ERR]" in line]
-        state, is_up = "", _UP in newest
-        if is_up and newest == before:
+        newest_lines = found[-3:]
+        faults = [line for line in newest_lines if "[ERR]" in line]
+        if not faults and unsteady >= _SILENT_CHECKS:  # the hub takes connections, and nothing comes back
+            faults = [line for line in newest_lines if _UP not in line]
+        is_up = _UP in newest
+        unsteady = 0 if is_up and newest == before else unsteady + 1
+        state = ""
+        if not unsteady:
             state = f"the line to the hub is up, as site {leaf.site} of {leaf.tenant}"
-        elif faults and not is_up:
-            state = f"no line to the hub; the site works on without it: {faults[-1]}"
+        elif faults:
+            state = f"no line to the hub; the site works on without it: {faults[-1].partition('] ')[2]}"
         kind = re.sub(r"\d+", "", state.rpartition(": ")[2])  # the same at every try
         if state and kind != said:
             said = kind

@@ -1,4 +1,7 @@
-"""Maps cells over all cores of this machine, or over a Dask cluster; the results are the same."""
+"""Maps cells over all cores of this machine, or over a Dask cluster; the results are the same.
+
+``reached`` is called with the share of the work that is done, ``keep`` with number and result of each finished cell.
+"""
 
 import logging
 import multiprocessing
@@ -9,86 +12,123 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
+from socket import gethostname
 from typing import Any, Final
+from uuid import uuid4
 
 from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module
 from skyless.core.processors import cores
+from skyless.core.version import program_digest
 from skyless.research.studies.common.plan import Cell
 
 _POLL_S: Final = 0.2
 _CONNECT_S: Final = 10.0
+_WORKERLESS_S: Final = 30.0
+"""For how long a study waits when no worker is left; ``dask worker`` starts a lost one again within seconds."""
 
 _ADDRESS: Final = re.compile(r"((tcp|tls|ws|wss)://)?[^\s/]+:\d{1,5}")
 
 _ENDING_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 
 Reached = Callable[[float], None]
+Keep = Callable[[int, Any], None]
 
 
-def run_cells(cells: Sequence[Cell], reached: Reached, processes: int | None = None) -> list[Any]:
+class UnfinishedError(SkylessError):
+    """Why work ended early."""
+
+
+def run_cells(
+    cells: Sequence[Cell], reached: Reached, processes: int | None = None, keep: Keep = lambda *_: None
+) -> list[Any]:
     """Results in the order of the cells, computed by ``processes`` processes, by default one for each core.
 
-    ``reached`` is called with the share of the work that is done. An interrupt ends all processes at once.
+    An interrupt ends all processes at once.
 
     Raises:
-        SkylessError: a process died.
+        UnfinishedError: a process died.
     """
     with _pool(min(processes or cores(), len(cells))) as pool:
         try:
-            return _map(pool, cells, reached)
+            return _map(lambda cell: pool.submit(cell.function), cells, reached, keep)
         except BrokenProcessPool:
-            raise SkylessError(
-                "a process died, killed from outside or for want of memory; nothing was written"
-            ) from None
+            raise UnfinishedError("a process died, killed from outside or for want of memory") from None
 
 
-def run_cells_here(cells: Sequence[Cell], reached: Reached) -> list[Any]:
+def run_cells_here(cells: Sequence[Cell], reached: Reached, keep: Keep) -> list[Any]:
     """As ``run_cells``, in this process and thread, one after the other."""
     total_s, done_s, results = sum(cell.weight_s for cell in cells), 0.0, []
-    for cell in cells:
+    for number, cell in enumerate(cells):
         results.append(cell.function())
+        keep(number, results[-1])
         done_s += cell.weight_s
         reached(done_s / total_s)
     return results
 
 
-def run_cells_on_dask(cells: Sequence[Cell], reached: Reached, scheduler: str) -> list[Any]:
-    """As ``run_cells``, on the workers of a Dask scheduler, which need this version of Skyless.
+def run_cells_on_dask(
+    cells: Sequence[Cell], reached: Reached, scheduler: str, keep: Keep = lambda *_: None
+) -> list[Any]:
+    """As ``run_cells``, on the workers of a Dask scheduler, which need the same program.
+
+    What a lost worker was computing is computed by another one.
 
     Raises:
-        SkylessError: the scheduler cannot be reached, has no workers, or workers failed.
+        UnfinishedError: the scheduler or all workers have gone, or a cell failed or killed several workers.
+        SkylessError: the scheduler cannot be reached or has no workers, or a worker runs another program.
     """
-    with _cluster(scheduler) as pool:
+    killed = extra_module("distributed", "--scheduler").KilledWorker
+    with _cluster(scheduler) as (client, pool):
+
+        def submit(cell: Cell) -> Future[Any]:
+            key = (cell.name, uuid4().hex)
+            return pool.submit(_compute_on_worker, program_digest(), cell.function, key=key)  # type: ignore[call-arg]
+
+        def reached_by_workers(share: float) -> None:
+            reached(share)
+            try:
+                if not client.nthreads():
+                    client.wait_for_workers(1, _WORKERLESS_S)
+            except TimeoutError:
+                raise UnfinishedError(f"--scheduler {scheduler}: no worker is left; start some") from None
+            except OSError:
+                raise CancelledError from None
+
         try:
-            return _map(pool, cells, reached)
+            return _map(submit, cells, reached_by_workers, keep)
         except SkylessError:
             raise
-        except (CancelledError, Exception) as error:  # noqa: BLE001 - whatever a worker raised, or the network
-            reason = (
-                "the scheduler has gone" if isinstance(error, CancelledError) else str(error) or type(error).__name__
-            )
-            raise SkylessError(
-                f"--scheduler {scheduler}: the cluster failed, nothing was written: {' '.join(reason.split())}"
-            ) from None
+        except CancelledError:
+            reason = "the scheduler has gone"
+        except killed as error:
+            reason = f"several workers died computing {error.task[0]!r}, killed from outside or for want of memory"
+        except Exception as error:  # noqa: BLE001 - whatever a worker raised, or the network
+            reason = " ".join(str(error).split()) or type(error).__name__
+        raise UnfinishedError(f"--scheduler {scheduler}: the cluster failed: {reason}")
 
 
-def _map(pool: Executor, cells: Sequence[Cell], reached: Reached) -> list[Any]:
-    """The longest cells begin first."""
+def _compute_on_worker(program: str, function: Callable[[], Any]) -> Any:  # noqa: ANN401 - any result
+    if program_digest() != program:
+        raise SkylessError(f"the worker on {gethostname()} runs another Skyless; it should be of the same source")
+    return function()
+
+
+def _map(submit: Callable[[Cell], Future[Any]], cells: Sequence[Cell], reached: Reached, keep: Keep) -> list[Any]:
+    """The longest cells begin first. Futures of finished ones are dropped: a cluster would compute lost ones again."""
     order = sorted(range(len(cells)), key=lambda number: -cells[number].weight_s)
     with _uninterrupted():
-        futures: dict[Future[Any], int] = {pool.submit(cells[number].function): number for number in order}
-    total_s = sum(cell.weight_s for cell in cells)
-    done_s, waiting = 0.0, set(futures)
+        waiting = {submit(cells[number]): number for number in order}
+    total_s, done_s, results = sum(cell.weight_s for cell in cells), 0.0, {}
     while waiting:
-        finished, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
-        for future in finished:
-            future.result()
-            done_s += cells[futures[future]].weight_s
+        for future in wait(waiting, _POLL_S, FIRST_COMPLETED).done:
+            number = waiting.pop(future)
+            results[number] = future.result()
+            keep(number, results[number])
+            done_s += cells[number].weight_s
         reached(done_s / total_s)
-    results = {number: future.result() for future, number in futures.items()}
     return [results[number] for number in range(len(cells))]
 
 
@@ -146,32 +186,25 @@ def _start_worker(parent: Connection) -> None:
 
 
 @contextmanager
-def _cluster(scheduler: str) -> Iterator[Executor]:
+def _cluster(scheduler: str) -> Iterator[tuple[Any, Executor]]:
+    """A Dask client, and what it computes with, once all workers have said that they run this program."""
     if not _ADDRESS.fullmatch(scheduler):
         raise SkylessError(f"--scheduler is {scheduler!r}; it should be an address such as tcp://127.0.0.1:8786")
     connect = extra_module("distributed", "--scheduler").Client
-    logging.disable(logging.ERROR)  # what goes wrong is reported once, by an exception
-    try:
-        yield from _connected(connect, scheduler)
-    finally:
-        logging.disable(logging.NOTSET)
-
-
-def _connected(connect: Callable[..., Any], scheduler: str) -> Iterator[Executor]:
-    try:
-        client = connect(scheduler, timeout=_CONNECT_S, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        raise SkylessError(f"--scheduler is {scheduler!r}, where no Dask scheduler answers: {error}") from None
-    try:
-        if not client.scheduler_info(n_workers=-1)["workers"]:
-            raise SkylessError(
-                f"--scheduler is {scheduler!r}, which has no workers; start some: dask worker {scheduler}"
-            )
-        executor = client.get_executor(pure=False)
+    with ExitStack() as stack:
+        logging.disable(logging.ERROR)  # what goes wrong is reported once, by an exception
+        stack.callback(logging.disable, logging.NOTSET)
         try:
-            yield executor
-        except BaseException:
-            executor.shutdown(wait=False)
-            raise
-    finally:
-        client.close()
+            client = stack.enter_context(connect(scheduler, timeout=_CONNECT_S, set_as_default=False))
+            # Not by a task: a worker that cannot unpickle one ends, and the next one gets it.
+            programs = client.run(program_digest, on_error="return", callback_timeout=_CONNECT_S)
+        except (OSError, ValueError, TypeError) as error:
+            raise SkylessError(f"--scheduler {scheduler}: scheduler or workers do not answer: {error}") from None
+        if not programs:
+            raise SkylessError(f"--scheduler {scheduler} has no workers; start some: dask worker {scheduler}")
+        for worker, program in programs.items():
+            if program != program_digest() and not isinstance(program, OSError):
+                raise SkylessError(f"the worker {worker} runs another Skyless; it should be of the same source")
+        executor = client.get_executor(pure=False)
+        stack.callback(executor.shutdown, wait=False)
+        yield client, executor
