@@ -51,7 +51,7 @@ def quick(monkeypatch):
 
 
 def take(writer, names, *messages):
-    taker = BatchTaker(names, writer)
+    taker = BatchTaker(names, writer, print)
 
     async def all_of_them():
         for one in messages:
@@ -90,7 +90,7 @@ def test_names_that_never_come_hold_a_history_up_once(writer, monkeypatch):
 
 def test_a_batch_whose_names_could_not_be_read_is_taken_when_it_is_given_again(writer, monkeypatch):
     names, batch = LateNames("a"), message(1, 5, 1, 1)
-    taker = BatchTaker(names, writer)
+    taker = BatchTaker(names, writer, print)
     monkeypatch.setattr(names, "read", AsyncMock(side_effect=[Error("timeout")]))
     with pytest.raises(Error):
         asyncio.run(taker.take(batch))

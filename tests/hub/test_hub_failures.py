@@ -44,7 +44,7 @@ class Stage:
     """A site, a hub and its history, with lines between them that can be cut, and a sender of numbered batches."""
 
     def __init__(self, folder, hub):
-        self.folder, self.hub, self.sent = folder, hub, 0
+        self.folder, self.hub, self.sent, self.said = folder, hub, 0, []
         self.to_hub, self.to_history = Line(hub.nodes[0].port + LEAF_PORT), Line(hub.nodes[0].port)
 
     async def run(self, keep_bytes, act):
@@ -56,7 +56,7 @@ class Stage:
             await make_streams_of(self.hub, "plant", print)
             tenant = self.hub.address("plant")
             far = NatsAddress(f"nats://127.0.0.1:{await self.to_history.open()}", tenant.user, tenant.password)
-            self.history = HubHistory(self.folder / "history", far, None, Keep(), print)
+            self.history = HubHistory(self.folder / "history", far, None, Keep(), self.said.append)
             running = asyncio.ensure_future(self.history.run())
             try:
                 await act(self)
@@ -152,6 +152,7 @@ def test_a_full_hub_drops_the_oldest_and_a_history_that_was_away_counts_them(tmp
         stage.to_history.cut(is_cut=False)
         await stage.settled()
         assert stage.lost == stage.first - MANY - 1 > 0
+        assert f"site 7: {stage.lost} batches were dropped before they could be read" in stage.said
 
     with running_hub(tmp_path, FULL_BYTES / 1e9) as (hub, _):
         stage = Stage(tmp_path, hub)
@@ -183,7 +184,7 @@ openssl x509 -req -in a.csr -CA ca.pem -CAkey ca-key.pem -days 30 -copy_extensio
 """
 
 
-@pytest.mark.site
+@pytest.mark.statistical
 def test_a_certificate_that_has_run_out_is_said_and_a_new_one_is_taken(tmp_path):
     subprocess.run(["sh", "-ec", CERTIFICATES], check=True, capture_output=True, cwd=tmp_path)
     port, folder = hub_port(), tmp_path / "hub"

@@ -39,8 +39,8 @@ class _Site:
         self.batches: asyncio.Queue[Msg] = asyncio.Queue(_QUEUE)
         self._subscriptions = Subscriptions()
         self.history.attach(self._subscriptions.add, fixes=False)
-        self._taker = BatchTaker(Names(stream, writer.site, subjects.HUB_NAMES), writer)
         self._say = rarely(log)
+        self._taker = BatchTaker(Names(stream, writer.site, subjects.HUB_NAMES), writer, self._say)
 
     def receive(self, message: "Msg", *, place: int = 0) -> None:
         """Take a message of the site's state, or an event with its place."""

@@ -31,8 +31,8 @@ _MAX_SENDERS: Final = 1000
 class BatchTaker:
     """Gives the batches of a stream to a history, each once."""
 
-    def __init__(self, names: Names, writer: Writer) -> None:
-        self._names, self._writer = names, writer
+    def __init__(self, names: Names, writer: Writer, say: Log) -> None:
+        self._names, self._writer, self._say = names, writer, say
         self._sequences: dict[int, int] = {}
         """The last sequence of each run of a sender."""
         self._given_up = 0
@@ -61,7 +61,9 @@ class BatchTaker:
         if len(self._sequences) > _MAX_SENDERS:
             del self._sequences[next(iter(self._sequences))]
         if before is not None and batch.sequence > before + 1:
-            self._writer.drops["lost-batches"] += batch.sequence - before - 1
+            lost = batch.sequence - before - 1
+            self._writer.drops["lost-batches"] += lost
+            self._say(f"site {self._writer.site}: {lost} batches were dropped before they could be read")
         return before is None or batch.sequence > before
 
     async def _read_names(self, issue: int) -> None:
@@ -96,7 +98,7 @@ async def take_stream(address: NatsAddress, writer: Writer, log: Log) -> None:
     client = await connect(address, "skyless history", say, writer.drops)
     try:
         stream = client.jetstream()
-        taker = BatchTaker(Names(stream, writer.site), writer)
+        taker = BatchTaker(Names(stream, writer.site), writer, say)
         while True:
             try:
                 await _take_waiting(stream, taker, writer)
