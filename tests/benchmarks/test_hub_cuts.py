@@ -10,21 +10,14 @@ from hub_cuts import RECORDS, Stage, at_random
 
 from skyless.run.history.hub_source import HubHistory
 from skyless.run.history.retention import Keep
-from skyless.run.hub.files import CLUSTER_PORT, LEAF_PORT, MONITOR_PORT
-from support.processes import free_port, is_free_port
+from skyless.run.hub.files import MONITOR_PORT
+from support.processes import free_node_port, free_port
 
 pytestmark = pytest.mark.statistical
 
 
 def node_ports():
-    """Three ports of nodes, each with those that belong to it."""
-    found = []
-    while len(found) < 3:
-        port = free_port()
-        others = [port + added for added in (CLUSTER_PORT, LEAF_PORT, MONITOR_PORT)]
-        if port + MONITOR_PORT < 32768 and all(map(is_free_port, others)):
-            found.append(port)
-    return found
+    return [free_node_port() for _ in range(3)]
 
 
 def test_every_fix_is_in_the_history_once_after_kills_and_cuts(tmp_path):

@@ -9,19 +9,14 @@ from skyless.cli.main import main
 from skyless.run.broker import BrokerSettings, _program, start_broker
 from skyless.run.gather.node import Gather
 from skyless.run.gather.subjects import EVENT_STREAM, at
-from skyless.run.hub.files import MONITOR_PORT, Hub
+from skyless.run.hub.files import Hub
 from skyless.run.hub.leaf import read_json
-from support.processes import free_port, started
-
-
-def hub_port():
-    """A free port, with room above it for those of a node."""
-    return next(port for port in iter(free_port, None) if port < 0xFFFF - MONITOR_PORT)
+from support.processes import free_node_port, free_port, started
 
 
 @contextlib.contextmanager
 def running_hub(folder, fixes_gb=0.1):
-    port = hub_port()
+    port = free_node_port()
     for words in (("--sites", "7,8"), ("--sites", "7", "--tenant", "other")):
         node = ("--node", f"127.0.0.1:{port}", "--data", str(folder / "data"), "--fixes-gb", str(fixes_gb))
         assert main(["hub", "init", str(folder / "hub"), *node, *words]) == 0

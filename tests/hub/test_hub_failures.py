@@ -14,7 +14,7 @@ import pytest
 from hub_cuts import Line
 from msgspec.structs import replace
 from pyarrow import parquet
-from small_hub import client_of, hub_port, running_hub, site
+from small_hub import client_of, running_hub, site
 
 from skyless.cli.main import main
 from skyless.run.broker import _program
@@ -31,7 +31,7 @@ from skyless.run.hub.sites import HubSites
 from skyless.run.hub.streams import make_streams_of
 from skyless.run.mqtt.address import mqtt_address
 from skyless.run.mqtt.connection import check_broker
-from support.processes import SKYLESS, free_port, started
+from support.processes import SKYLESS, free_node_port, free_port, started
 
 SITE, ROWS, RUN = 7, 20, 5
 FULL_BYTES = 300_000
@@ -187,7 +187,7 @@ openssl x509 -req -in a.csr -CA ca.pem -CAkey ca-key.pem -days 30 -copy_extensio
 @pytest.mark.statistical
 def test_a_certificate_that_has_run_out_is_said_and_a_new_one_is_taken(tmp_path):
     subprocess.run(["sh", "-ec", CERTIFICATES], check=True, capture_output=True, cwd=tmp_path)
-    port, folder = hub_port(), tmp_path / "hub"
+    port, folder = free_node_port(), tmp_path / "hub"
     node = ("--node", f"hub.test:{port}", "--data", str(tmp_path / "data"), "--certificates", str(tmp_path))
     assert main(["hub", "init", str(folder), *node, "--sites", "7"]) == 0
     server, leaf = folder / f"hub.test-{port}" / "nats-server.conf", folder / "sites" / "plant-site7.json"
