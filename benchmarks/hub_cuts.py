@@ -156,7 +156,7 @@ class Stage:
             *SKYLESS, "broker", "--gather", "--hub", file, *place, "--json", log=self.folder / "broker.log"
         )
         await self.start_broker()
-        self._sending = asyncio.ensure_future(self._send())
+        self._is_sending, self._sending = True, asyncio.ensure_future(self._send())
         return self
 
     async def __aexit__(self, *_):
@@ -187,7 +187,7 @@ class Stage:
         """Number by number, each until it is acknowledged, whatever happens to the server."""
         run_number = random.randrange(1, 2**32)
         names = [f"tag{number}" for number in range(TAGS)]
-        while True:
+        while self._is_sending:
             client = None
             with contextlib.suppress(Error, TimeoutError, OSError, AssertionError):
                 address = nats_address(self._stated["nats"])
@@ -196,7 +196,7 @@ class Stage:
                 table = Names(stream, SITE)
                 await table.read()
                 await table.give(names, "sender", time.time())
-                while self.broker.runs:
+                while self._is_sending and self.broker.runs:
                     records = np.zeros(RECORDS, RECORD)
                     first = self.acknowledged * RECORDS
                     records["position_mm"][:, 0] = np.arange(first, first + RECORDS)
@@ -231,9 +231,9 @@ class Stage:
         return self.servers[own:] + self.servers[:own]
 
     async def stop_sending(self):
-        """Nothing is sent any more."""
-        self._sending.cancel()
-        await asyncio.gather(self._sending, return_exceptions=True)
+        """Nothing is sent any more, and the last batch is acknowledged."""
+        self._is_sending = False
+        await self._sending
 
     async def complete(self):
         """Wait until the hub's stream has what is acknowledged now. Seconds, or infinity."""

@@ -84,6 +84,7 @@ NAVIGATION = {
         "docs/mqtt",
         "docs/batches",
         "docs/hub",
+        "docs/hub_operation",
         "docs/http",
         "docs/history",
         "docs/phases",

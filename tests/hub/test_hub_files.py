@@ -27,7 +27,8 @@ def certificates(tmp_path):
 
 
 @pytest.mark.parametrize("nodes", [NODES, NODES[:2], ("--node", "a", "--node", "b:5000", "--node", "c.example")])
-def test_nats_server_takes_the_files(nodes, certificates, capsys):
+def test_nats_server_takes_the_files(nodes, certificates, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")  # paths in one line
     hub = certificates / "hub"
     assert main(["hub", "init", str(hub), *nodes, "--sites", "7,8", "--certificates", str(certificates)]) == 0
     servers = sorted(hub.glob("*/nats-server.conf"))
@@ -35,7 +36,7 @@ def test_nats_server_takes_the_files(nodes, certificates, capsys):
     for server in servers:
         subprocess.run([_program(), "-t", "-c", server], check=True, capture_output=True)
     out = capsys.readouterr()
-    assert "plant-site7.json" in "".join(out.out.split())
+    assert "plant-site7.json" in out.out
     assert ("ca.pem" in out.err) is ("127.0.0.1" not in nodes)
 
 

@@ -1,31 +1,17 @@
 """Real sites at a real hub of one server: each publishes its own, no tenant sees another, a number is given once."""
 
 import asyncio
-import contextlib
 import json
 
-import nats
 import pytest
 from nats.errors import NoRespondersError
+from small_hub import client_of, running_hub, site
 
 from skyless.cli.main import main
-from skyless.run.broker import BrokerSettings, _program, start_broker
-from skyless.run.gather.leaf import read_json
-from skyless.run.gather.node import Gather
-from skyless.run.hub.files import MONITOR_PORT, Hub
+from skyless.core.version import installed_version
 from support.processes import SKYLESS, free_port, started
 
 pytestmark = pytest.mark.site
-
-
-@contextlib.contextmanager
-def running_hub(folder):
-    port = next(port for port in iter(free_port, None) if port < 0xFFFF - MONITOR_PORT)
-    for words in (("--sites", "7,8"), ("--sites", "7", "--tenant", "other")):
-        node = ("--node", f"127.0.0.1:{port}", "--data", str(folder / "data"), "--fixes-gb", "0.1")
-        assert main(["hub", "init", str(folder / "hub"), *node, *words]) == 0
-    with started(_program(), "-c", folder / "hub" / f"127.0.0.1-{port}" / "nats-server.conf") as server:
-        yield read_json(folder / "hub" / "hub.json", Hub, ""), server
 
 
 def apply(folder, capsys):
@@ -34,29 +20,18 @@ def apply(folder, capsys):
     return json.loads(capsys.readouterr().out)["tenants"]
 
 
-async def client_of(address, **more):
-    return await nats.connect(address.servers, user=address.user, password=address.password, **more)
-
-
-@contextlib.asynccontextmanager
-async def site(folder, hub, tenant="plant", number=7):
-    settings = BrokerSettings(
-        port=free_port(), data=folder / f"{tenant}{number}", gathered_bytes=10**8, hub=hub.leaf(tenant, number)
-    )
-    async with await start_broker(settings) as running:
-        gather = asyncio.ensure_future(Gather(running.nats, number, 10**8, print).run())
-        try:
-            yield running
-        finally:
-            gather.cancel()
-            await asyncio.gather(gather, return_exceptions=True)
-
-
 def test_a_site_publishes_its_own_and_no_tenant_sees_another(tmp_path, capsys):
     async def run(hub):
-        async with site(tmp_path, hub) as one, site(tmp_path, hub, "other") as two:
+        async with site(tmp_path, hub.leaf("plant", 7)) as one, site(tmp_path, hub.leaf("other", 7)) as two:
             plant, other = await client_of(hub.address("plant")), await client_of(hub.address("other"))
             near, far = await client_of(one.nats), await client_of(two.nats)
+            applying = asyncio.ensure_future(asyncio.to_thread(apply, tmp_path, capsys))
+            while not applying.done():
+                await near.publish("skyless.v2.7.summary", b"no summary")
+                await asyncio.sleep(0.2)
+            found = await applying
+            assert found["plant"]["8"] is None
+            assert found["plant"]["7"]["version"] == found["other"]["7"]["version"] == installed_version()
             seen, unseen, commands = await plant.subscribe("skyless.>"), await other.subscribe(">"), []
             heard = await near.subscribe("skyless.v1.7.*")
             for subject in ("skyless.v1.8.site", "skyless.v1.7.zones"):
@@ -86,13 +61,12 @@ def test_a_site_publishes_its_own_and_no_tenant_sees_another(tmp_path, capsys):
                 await client.close()
 
     with running_hub(tmp_path) as (hub, _):
-        assert apply(tmp_path, capsys) == {"plant": {"7": None, "8": None}, "other": {"7": None}}
         asyncio.run(run(hub))
 
 
 def test_a_number_that_another_site_has_is_refused(tmp_path, capsys):
     with running_hub(tmp_path):
-        apply(tmp_path, capsys)
+        assert apply(tmp_path, capsys) == {"plant": {"7": None, "8": None}, "other": {"7": None}}
         leaf = tmp_path / "hub" / "sites" / "plant-site7.json"
         broker = (*SKYLESS, "broker", "--gather", "--keep-gb", "0.1", "--hub", str(leaf))
         with started(*broker, "--port", str(free_port()), "--data", str(tmp_path / "a")) as first:

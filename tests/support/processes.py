@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 
+from skyless.run.hub.files import CLUSTER_PORT, LEAF_PORT, MONITOR_PORT
 from skyless.run.process import end_with_parent
 
 SKYLESS = (sys.executable, "-m", "skyless.cli.main")
@@ -28,18 +29,32 @@ def usual_signals():
     return prepare
 
 
+_WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")) % 10
 # Below the ports that Linux gives to connections (32768 and up), which could take one before the test listens there.
-_FIRST_PORT = 12000 + 2000 * (int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")) % 10)
+_FIRST_PORT = 12000 + 2000 * _WORKER
 _ports = itertools.cycle(range(_FIRST_PORT, _FIRST_PORT + 2000))
+# The four ports of each server of a hub are below and apart from all others: from 5000, 7000, 8200 and 9000 on.
+_FIRST_NODE = 5000 + 80 * _WORKER
+_nodes = itertools.cycle(range(_FIRST_NODE, _FIRST_NODE + 80))
 
 
 def free_port(kind=socket.SOCK_STREAM):
     """A port of loopback where nobody listens, and which no other test of this run gets."""
-    while True:
-        port = next(_ports)
-        with contextlib.suppress(OSError), socket.socket(socket.AF_INET, kind) as probe:
-            probe.bind(("127.0.0.1", port))
-            return port
+    return next(port for port in _ports if is_free_port(port, kind))
+
+
+def free_node_port():
+    """The same for a server of a hub, which listens at four ports."""
+    added = (0, CLUSTER_PORT, LEAF_PORT, MONITOR_PORT)
+    return next(port for port in _nodes if all(is_free_port(port + more) for more in added))
+
+
+def is_free_port(port, kind=socket.SOCK_STREAM):
+    """Whether nobody listens at a port of loopback."""
+    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", port))
+        return True
+    return False
 
 
 @contextlib.contextmanager

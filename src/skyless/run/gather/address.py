@@ -84,14 +84,13 @@ def nats_address(url: str, option: str = "--nats", ca: Path | None = None) -> Na
 
 
 def rarely(log: Log) -> Log:
-    """Log a trouble once, and again every half minute while it lasts."""
-    last, last_s = "", 0.0
+    """Log each trouble once, and again every half minute while it lasts."""
+    said_s: dict[str, float] = {}
 
     def say(trouble: str) -> None:
-        nonlocal last, last_s
         now_s = time.monotonic()
-        if trouble != last or now_s > last_s + _SAME_TROUBLE_S:
-            last, last_s = trouble, now_s
+        if now_s > said_s.get(trouble, float("-inf")) + _SAME_TROUBLE_S:
+            said_s[trouble] = now_s
             log(trouble)
 
     return say

@@ -19,7 +19,7 @@ from skyless.core.version import installed_version
 from skyless.run.fix_batch import BadBatchError, Batch, decode_batch, encode_batch
 from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect, rarely
-from skyless.run.gather.condition import ConditionWord, SiteCondition
+from skyless.run.gather.condition import SiteCondition
 from skyless.run.gather.names import NEVER_WRITTEN, Names
 from skyless.run.gather.packer import Packer
 from skyless.run.gather.streams import make_streams, messages
@@ -34,8 +34,8 @@ _LEAVE_S: Final = 2.0
 _QUEUE: Final = "gather"
 
 
-class Summary(Struct, frozen=True):
-    """What a gather has done since its start, published once a second."""
+class Summary(Struct, frozen=True, kw_only=True):
+    """What a gather has done since its start, published once a second. A gather of an older version lacks some."""
 
     unix_s: float
     host: str
@@ -43,18 +43,19 @@ class Summary(Struct, frozen=True):
     site: str
     """Name of the site; empty until it was published."""
     simulated: bool
-    since: str
+    since: str = ""
     """When the site's streams were made, in ISO 8601: of two sites with one number, each has another."""
-    condition: ConditionWord
-    reasons: list[str]
+    condition: str = ""
+    """A ``ConditionWord``; empty of an older version, which states none, and another word of a newer one perhaps."""
+    reasons: list[str] = []
     """Why the condition is not good."""
-    tags_heard: int
+    tags_heard: int = 0
     """Tags with a fix in the last ten seconds, whoever packed it."""
     names: int
     """Tags that have a number."""
     online: dict[str, int]
     """Programs that are online, by kind."""
-    versions: dict[str, int]
+    versions: dict[str, int] = {}
     """The same by their versions."""
     fixes: int
     """Fixes taken from JSON."""

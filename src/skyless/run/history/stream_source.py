@@ -64,7 +64,9 @@ class BatchTaker:
         if len(self._sequences) > _MAX_SENDERS:
             del self._sequences[next(iter(self._sequences))]
         if before is not None and batch.sequence > before + 1:
-            self._writer.drops["lost-batches"] += batch.sequence - before - 1
+            lost = batch.sequence - before - 1
+            self._writer.drops["lost-batches"] += lost
+            self._say(f"site {self._writer.site}: {lost} batches were dropped before they could be read")
         return before is None or batch.sequence > before
 
     async def _read_names(self, issue: int) -> None:

@@ -1,6 +1,7 @@
 """The streams of a hub, which take what the sites' own streams have whenever their lines are up."""
 
 import asyncio
+import contextlib
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
@@ -65,5 +66,8 @@ async def make_streams_of(hub: Hub, tenant: str, log: Log) -> dict[int, Summary 
         heard = await client.subscribe(subjects.at(subjects.SUMMARY, subjects.EVERY))
         await asyncio.sleep(_LISTEN_S)
         messages = [await heard.next_msg() for _ in range(heard.pending_msgs)]
-    found = {subjects.site_in(one.subject): msgspec.json.decode(one.data, type=Summary) for one in messages}
+    found = dict[int | None, Summary]()
+    for one in messages:
+        with contextlib.suppress(msgspec.MsgspecError):
+            found[subjects.site_in(one.subject)] = msgspec.json.decode(one.data, type=Summary)
     return {site: found.get(site) for site in hub.sites[tenant]}
