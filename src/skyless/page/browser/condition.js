@@ -53,7 +53,8 @@ function judged() {
     return { level: "waiting", text: "the server is silent", reasons: [silentReason()] };
   }
   if (state.mqtt && !state.mqtt.connected && condition.level !== "bad") {
-    return { level: condition.reasons.length ? "warning" : "waiting", text: "no broker", reasons: condition.reasons };
+    const text = state.hub ? "the site is not heard" : "no broker";
+    return { level: condition.reasons.length ? "warning" : "waiting", text, reasons: condition.reasons };
   }
   return condition;
 }

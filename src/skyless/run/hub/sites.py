@@ -12,6 +12,7 @@ from msgspec import Struct
 from skyless.run.find_site import KnownSites
 from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect, rarely
+from skyless.run.gather.node import Summary
 from skyless.run.gather.streams import follow
 from skyless.run.hub.link import SILENT_S
 
@@ -41,18 +42,6 @@ class HubSite(Struct, frozen=True):
     """When this program heard it last."""
 
 
-class _Summary(Struct, frozen=True):
-    """The part of ``Summary`` that is read here; gathers of other versions may state less."""
-
-    version: str = ""
-    site: str = ""
-    condition: str = ""
-    reasons: tuple[str, ...] = ()
-    tags_heard: int | None = None
-    online: dict[str, int] = {}
-    versions: dict[str, int] = {}
-
-
 class HubSites:
     """The sites of a tenant at a hub."""
 
@@ -60,7 +49,7 @@ class HubSites:
         self.address = address
         self._began_s = now_s
         self._known = KnownSites()
-        self._heard: dict[int, tuple[float, float, _Summary]] = {}
+        self._heard: dict[int, tuple[float, float, Summary]] = {}
         """The newest summary of each, and when it came, by both clocks."""
         self._client: Client | None = None
 
@@ -81,7 +70,7 @@ class HubSites:
     def add_summary(self, number: int, payload: bytes, now_s: float, unix_s: float) -> None:
         """The gather of a site has said how it is. What cannot be read changes nothing."""
         with contextlib.suppress(msgspec.MsgspecError):
-            self._heard[number] = now_s, unix_s, msgspec.json.decode(payload, type=_Summary)
+            self._heard[number] = now_s, unix_s, msgspec.json.decode(payload, type=Summary)
 
     def names(self) -> dict[int, str]:
         """The names of the sites by their numbers."""
