@@ -32,7 +32,9 @@ HALL = msgspec.structs.replace(SITE, site=replace(SITE.site, id=NUMBER))
 
 
 def said(**fields):
-    return json.dumps({"version": "0.2", "online": {"anchor": 4}, "tags_heard": 9, "versions": {"0.2": 5}} | fields)
+    counts = dict.fromkeys(("unix_s", "names", "fixes", "batches", "waiting", "cuts"), 1)
+    counts |= {"host": "h", "version": "0.2", "site": "", "simulated": True, "drops": {}, "online": {"anchor": 4}}
+    return json.dumps(counts | {"tags_heard": 9, "versions": {"0.2": 5}} | fields)
 
 
 def test_the_table_has_trouble_first_and_nothing_is_good_that_is_not_heard():
