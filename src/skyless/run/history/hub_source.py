@@ -75,7 +75,8 @@ class HubHistory:
     def state(self) -> HistoryState:
         """Progress so far, of all sites."""
         states = [site.history.state() for site in self._sites.values()]
-        is_connected = self._client is not None and self._client.is_connected
+        client = self._client
+        is_connected = client is not None and (client.is_connected or client.is_closed)  # it is closed at the end
         return HistoryState(
             seconds=time.monotonic() - self._begin_s,
             fixes=sum(state.fixes for state in states),
