@@ -53,7 +53,7 @@ class Timeline(Generic[Result]):
 
     def __init__(self) -> None:
         self.now_ticks = 0
-        self._serial = 0
+        self._serial = self._until_ticks = 0
         self._events: list[tuple[int, int, Callable[[], Result | None]]] = []
 
     @property
@@ -61,13 +61,26 @@ class Timeline(Generic[Result]):
         """When the next event happens; None while nothing is planned."""
         return self._events[0][0] if self._events else None
 
+    @property
+    def until_ticks(self) -> int:
+        """Where the present ``run`` ends."""
+        return self._until_ticks
+
     def at(self, ticks: int, happen: Callable[[], Result | None]) -> None:
         """Plan an event; one in the past happens now."""
         self._serial += 1
         heapq.heappush(self._events, (max(ticks, self.now_ticks), self._serial, happen))
 
+    def pass_to(self, ticks: int) -> bool:
+        """Let time pass up to ``ticks`` at once if no event and no end of ``run`` lies before; whether it did."""
+        if ticks > self._until_ticks or (self._events and self._events[0][0] <= ticks):
+            return False
+        self.now_ticks = max(self.now_ticks, ticks)
+        return True
+
     def run(self, until_ticks: int) -> Iterator[Result]:
         """Run all events up to a time, and yield their results."""
+        self._until_ticks = until_ticks
         while self._events and self._events[0][0] <= until_ticks:
             self.now_ticks, _, happen = heapq.heappop(self._events)
             result = happen()
