@@ -133,7 +133,7 @@ def test_a_cut_line_loses_what_the_site_cannot_keep_and_that_is_counted(tmp_path
     assert len(late) == len(found.times) - FEW * ROWS  # by the clock of the sender
 
 
-@pytest.mark.site
+@pytest.mark.statistical
 def test_a_full_hub_drops_the_oldest_and_a_history_that_was_away_counts_them(tmp_path):
     async def act(stage):
         for _ in range(6):

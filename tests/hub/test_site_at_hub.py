@@ -64,6 +64,7 @@ def test_a_site_publishes_its_own_and_no_tenant_sees_another(tmp_path, capsys):
         asyncio.run(run(hub))
 
 
+@pytest.mark.statistical
 def test_a_number_that_another_site_has_is_refused(tmp_path, capsys):
     with running_hub(tmp_path):
         assert apply(tmp_path, capsys) == {"plant": {"7": None, "8": None}, "other": {"7": None}}
