@@ -7,7 +7,7 @@ export function dropToken() {
   const address = new URL(location.href);
   if (!address.searchParams.has("token")) return;
   address.searchParams.delete("token");
-  history.replaceState(null, "", address);
+  window.history.replaceState(null, "", address);
 }
 
 /** The query of what belongs to the live site: it names the one that the page shows, whichever others there are. */
