@@ -64,9 +64,9 @@ def cells(function, arguments):
 @pytest.mark.statistical
 def test_the_same_rows_from_one_process_from_two_and_from_a_cluster_that_loses_a_worker(cluster):
     work = world_cells(CASES)
-    told = []
-    one, two = (run_cells(work, told.append, processes) for processes in (1, 2))
-    assert told[-1] == pytest.approx(1.0)
+    reached = []
+    one, two = (run_cells(work, reached.append, processes) for processes in (1, 2))
+    assert reached[-1] == pytest.approx(1.0)
     killed = []
 
     def kill_once(share):
@@ -98,13 +98,13 @@ def test_a_client_of_a_cluster_compiles_nothing(cluster, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("digest", "told"),
+    ("digest", "message"),
     [(lambda: str(os.getpid()), "the worker tcp://"), (lambda: "another", "the worker on ")],
     ids=["before", "in a cell of a worker that came later"],
 )
-def test_a_worker_with_another_program_is_told(cluster, monkeypatch, digest, told):
+def test_a_worker_with_another_program_is_named(cluster, monkeypatch, digest, message):
     monkeypatch.setattr(runner, "program_digest", digest)
-    with pytest.raises(SkylessError, match=told + r"\S+ runs another Skyless"):
+    with pytest.raises(SkylessError, match=message + r"\S+ runs another Skyless"):
         run_cells_on_dask(cells(double, [1]), lambda share: None, cluster.scheduler_address)
 
 
@@ -120,13 +120,13 @@ def test_results_stand_in_the_order_of_the_cells():
 
 
 @pytest.mark.statistical
-def test_a_process_that_dies_is_told():
+def test_a_process_that_dies_is_named():
     with pytest.raises(SkylessError, match="a process died"):
         run_cells(cells(die, range(4)), lambda share: None, 2)
 
 
 @pytest.mark.statistical
-def test_a_cell_that_kills_its_workers_is_told(cluster):
+def test_a_cell_that_kills_its_workers_is_named(cluster):
     with pytest.raises(SkylessError, match="the cluster failed: several workers died computing 'cell'"):
         run_cells_on_dask(cells(die, [1]), lambda share: None, cluster.scheduler_address)
 
@@ -139,12 +139,12 @@ def test_what_a_cell_raises_comes_through(cluster):
 
 
 @pytest.mark.parametrize("address", ["nowhere", "tcp://", "127.0.0.1", "tcp://127.0.0.1:x"])
-def test_what_is_no_address_is_told(address):
+def test_what_is_no_address_is_named(address):
     with pytest.raises(SkylessError, match=r"--scheduler is .* it should be an address"):
         run_cells_on_dask(cells(double, [1]), lambda share: None, address)
 
 
-def test_a_scheduler_without_workers_is_told():
+def test_a_scheduler_without_workers_is_named():
     with (
         LocalCluster(n_workers=0, dashboard_address=None, protocol="tcp") as empty,
         pytest.raises(SkylessError, match="has no workers; start some: dask worker tcp:"),
@@ -153,14 +153,14 @@ def test_a_scheduler_without_workers_is_told():
 
 
 @pytest.mark.parametrize("dies", ["the scheduler has gone", "no worker is left; start some"])
-def test_a_scheduler_or_a_last_worker_that_dies_is_told(dies, tmp_path, monkeypatch):
+def test_a_scheduler_or_a_last_worker_that_dies_is_named(dies, tmp_path, monkeypatch):
     monkeypatch.setattr(runner, "_WORKERLESS_S", 0.1)
-    dask, told = [sys.executable, "-m", "distributed.cli.dask_scheduler"], tmp_path / "scheduler.json"
-    scheduler = subprocess.Popen([*dask, "--port", "0", "--no-dashboard", "--scheduler-file", str(told)])
-    work = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(told), "--no-nanny"]
-    wait_for(told.exists)
+    dask, stated = [sys.executable, "-m", "distributed.cli.dask_scheduler"], tmp_path / "scheduler.json"
+    scheduler = subprocess.Popen([*dask, "--port", "0", "--no-dashboard", "--scheduler-file", str(stated)])
+    work = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(stated), "--no-nanny"]
+    wait_for(stated.exists)
     worker = subprocess.Popen([*work, "--no-dashboard"])
-    address = wait_for(lambda: json.loads(told.read_text())["address"])
+    address = wait_for(lambda: json.loads(stated.read_text())["address"])
     try:
         wait_for(lambda: has_workers(address))
         victim = scheduler if "scheduler" in dies else worker

@@ -40,7 +40,7 @@ class SiteCondition:
                 self._programs[kind, name] = read_message(payload, StatusMessage)
 
     def on_batch(self, records: Records, now_s: float) -> None:
-        """Take the fixes of a batch, whoever packed it."""
+        """Take the fixes of a batch of this gather or of another program."""
         self._heard_s.update(dict.fromkeys(records["tag"].tolist(), now_s))
 
     def online(self) -> dict[str, int]:
@@ -53,7 +53,8 @@ class SiteCondition:
 
     def tags_heard(self, now_s: float) -> int:
         """Tags with a fix in the last ten seconds."""
-        return sum(now_s - heard_s < HEARD_S for heard_s in self._heard_s.values())
+        self._heard_s = {tag: heard_s for tag, heard_s in self._heard_s.items() if now_s - heard_s < HEARD_S}
+        return len(self._heard_s)
 
     def reasons(self, drops: Mapping[str, int], waiting: int, now_s: float) -> tuple[ConditionWord, list[str]]:
         """The condition, and why it is not good. ``drops`` are the gather's since its start."""

@@ -50,7 +50,7 @@ class Summary(Struct, frozen=True, kw_only=True):
     reasons: list[str] = []
     """Why the condition is not good."""
     tags_heard: int = 0
-    """Tags with a fix in the last ten seconds, whoever packed it."""
+    """Tags with a fix in the last ten seconds, in batches of this gather or of other programs."""
     names: int
     """Tags that have a number."""
     online: dict[str, int]

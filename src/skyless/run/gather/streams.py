@@ -7,7 +7,7 @@ from itertools import count
 from typing import TYPE_CHECKING, Any, Final
 
 from nats.errors import Error
-from nats.js.api import ConsumerConfig, DeliverPolicy, RePublish, StreamConfig
+from nats.js.api import ConsumerConfig, DeliverPolicy, StreamConfig
 from nats.js.errors import APIError, NotFoundError
 
 from skyless.core.errors import SkylessError
@@ -39,8 +39,7 @@ async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -
     Raises:
         SkylessError: the server has no room for these bytes.
     """
-    live = RePublish(subjects.at(subjects.FIXES, site), subjects.at(subjects.LIVE, site))
-    all_fixes = {"max_age": KEEP_S, "max_bytes": keep_bytes, "duplicate_window": _DUPLICATES_S, "republish": live}
+    all_fixes = {"max_age": KEEP_S, "max_bytes": keep_bytes, "duplicate_window": _DUPLICATES_S}
     for name, taken, limits in (
         (subjects.FIX_STREAM, (subjects.FIXES,), all_fixes),
         (subjects.NAMES_STREAM, (subjects.NAMES,), NEWEST_OF_EACH),
@@ -76,8 +75,8 @@ async def messages(
 ) -> AsyncGenerator["Msg", None]:
     """The messages of a stream after the one with this number, in order, until the last one that it has now.
 
-    Those of ``subject`` only, a pattern.
-    ``message.metadata.sequence.stream`` is a message's number. Raises nats.errors.Error where the stream is not there.
+    ``subject`` is the pattern of those that are wanted; ``message.metadata.sequence.stream`` is a message's number.
+    Raises nats.errors.Error: the stream is not there.
     """
     state = (await stream.stream_info(name)).state
     if state.messages == 0 or state.last_seq <= after:

@@ -14,8 +14,6 @@ FIXES: Final = "skyless.v2.{}.fixes.*"
 """Batches; the last level is the sender's host."""
 NAMES: Final = "skyless.v2.{}.names.*"
 """``TagName``; the last level is the tag's number."""
-LIVE: Final = "skyless.v2.{}.live"
-"""Every batch of the site once more, kept by no stream."""
 SUMMARY: Final = "skyless.v2.{}.summary"
 
 STATE: Final = (

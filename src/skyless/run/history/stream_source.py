@@ -108,7 +108,7 @@ async def first_place(stream: "JetStreamContext", name: str, intakes_of: Callabl
     intakes = intakes_of()
     for intake in intakes:
         if intake.position > last:
-            say(f"the stream {name} was made anew; it is taken from its beginning")
+            say(f"the stream {name} was deleted and made again; it is taken from its beginning")
             intake.position = 0
     return min((intake.position for intake in intakes), default=0)
 

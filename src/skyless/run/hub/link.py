@@ -13,7 +13,6 @@ from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect, rarely
 from skyless.run.gather.streams import follow
 from skyless.run.mqtt.link import Handler, Subscriptions
-from skyless.run.mqtt.messages import Counters
 from skyless.run.process import together
 
 if TYPE_CHECKING:
@@ -23,10 +22,10 @@ if TYPE_CHECKING:
 SILENT_S: Final = 5.0
 """The line to a site counts as cut when its gather has not been heard for so long."""
 _CHECK_S: Final = 0.5
-_log = logging.getLogger("skyless.run.hub")
-
-
 _KEPT: Final = (*subjects.STATE, *subjects.EVENTS, subjects.JSON_FIXES)
+"""What comes from streams, fixes as batches."""
+
+_log = logging.getLogger("skyless.run.hub")
 
 
 class HubLink:
@@ -44,8 +43,7 @@ class HubLink:
         self.trouble: str | None = "not connected yet"
         self.on_state: list[Callable[[bool], None]] = []
         """Called with ``connected`` whenever it changes."""
-        self.unacknowledged, self.unread_s, self.late = 0, 0.0, 0
-        self.counters = Counters(0, 0, 0)
+        self.unacknowledged, self.unread_s = 0, 0.0
         self.drops: Counter[str] = Counter()
         self._name = name
         self._subscriptions = Subscriptions()
