@@ -1,6 +1,6 @@
 """The estimator's C for ``float`` against that for ``double``: the same receptions, fix by fix.
 
-    python benchmarks/float_core.py [--seeds 1 2 3] [--seconds 30] [--rest 3600] [--only WORD …]
+    python benchmarks/float_core.py [--seeds 1 2 3] [--seconds 30] [--rest 3600] [--only WORD …] [--board]
 
 Cases of the studies, three tags each; then a tag that lies still for ``--rest`` seconds, from stamps alone. Each row
 holds the fixes of all seeds; "float" is that over double.
@@ -10,6 +10,7 @@ import argparse
 import subprocess
 import sys
 import tempfile
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +21,12 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "positioning"))
 from estimator_builders import LAB_M, MESH, ROOM_M, begun, episode_of, late, settings_of, tracked
 
 from skyless.core.any_receiver import AnyReceiver
+from skyless.core.tag.receiver import Receiver
 from skyless.research.studies import loss, motion, nlos, room
 from skyless.research.studies.common.plan import plan_of
 from skyless.research.studies.common.worlds import beacons_of
 
+WITH_BOARD_SIZES = Path(__file__).parents[1] / "tests" / "firmware" / "with_board_sizes.py"
 WITH_FLOAT = Path(__file__).parents[1] / "tests" / "native" / "with_float.py"
 STUDIES = (
     "the room", "hall, 8 anchors", "3-D room, 8 anchors", "past a wall", "one anchor 20 cm off",
@@ -53,19 +56,28 @@ def is_asked(name, asked):
     return any(word in name for word in asked.only)
 
 
-def fixes_of(run):
-    """Of each judged fix: tag, time, squared error, its normalised square, horizontal level (NaN where none)."""
+def fixes_of(run, beacons=None):
+    """Of each judged fix: tag, time, squared error, its normalised square, horizontal level and whether it is exceeded.
+
+    The level is NaN where there is none; ``beacons`` are those that the run has, unless others are given.
+    """
     receivers = [AnyReceiver(run.method, qa=run.qa, integrity=run.integrity) for _ in run.trajectories]
     dim, rows = 2 if run.site.tags.height_m is not None else 3, []
-    for beacon in beacons_of(run):
+    for beacon in beacons or beacons_of(run):
         for tag, reception, truth_m in beacon.receptions:
             fix = receivers[tag].hear(reception)
             if fix is not None and beacon.end_s >= run.warmup_s:
-                error_m = (fix.position_m - truth_m)[:dim]
+                error_m = (fix.position_m + origin_m(receivers[tag].receiver) - truth_m)[:dim]
                 nees = error_m @ np.linalg.solve(fix.covariance_m2[:dim, :dim], error_m) / dim
                 level_m = np.nan if fix.hpl_m is None else fix.hpl_m
-                rows.append((tag, beacon.end_s, error_m @ error_m, nees, level_m))
+                across_m = np.hypot(error_m[0], error_m[1])
+                rows.append((tag, beacon.end_s, error_m @ error_m, nees, level_m, across_m > level_m))
     return np.array(rows)
+
+
+def origin_m(receiver):
+    """To be added to positions, which a library with the board's sizes has from a place near the first anchor."""
+    return np.array(receiver.tag.origin_mm[:]) / 1000.0 if isinstance(receiver, Receiver) else 0.0
 
 
 def fixes_at_rest(seconds, seed, anchors_m, height_m, errors):
@@ -92,6 +104,21 @@ def write(folder, asked):
     for name, case in AT_REST.items():
         for seed in asked.seeds if is_asked(name, asked) else ():
             np.save(file_of(folder, name, seed), fixes_at_rest(asked.rest, seed, *case))
+
+
+@contextmanager
+def written(script, launcher):
+    """Two folders with what a script computes for its arguments: as it is, and run by the words of a launcher."""
+    with tempfile.TemporaryDirectory() as folder:
+        places = [Path(folder) / kind for kind in ("double", "float")]
+        runs = []
+        for place, words in zip(places, ([], launcher), strict=True):
+            place.mkdir()
+            runs.append(subprocess.Popen([sys.executable, *words, script, *sys.argv[1:], "--write", place]))
+        codes = [run.wait() for run in runs]
+        if any(codes):
+            sys.exit("a run failed")
+        yield places
 
 
 def file_of(folder, name, seed):
@@ -124,20 +151,13 @@ def main():
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--rest", type=float, default=3600.0)
     parser.add_argument("--only", nargs="*", default=[""], help="words of cases")
+    parser.add_argument("--board", action="store_true", help="the board's library, which speaks protocol 2 alone")
     parser.add_argument("--write", type=Path, help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.write:
         write(asked.write, asked)
         return
-    with tempfile.TemporaryDirectory() as folder:
-        places = [Path(folder) / kind for kind in ("double", "float")]
-        runs = []
-        for place, words in zip(places, ([], [WITH_FLOAT]), strict=True):
-            place.mkdir()
-            runs.append(subprocess.Popen([sys.executable, *words, __file__, *sys.argv[1:], "--write", place]))
-        codes = [run.wait() for run in runs]
-        if any(codes):
-            sys.exit("a run failed")
+    with written(__file__, [WITH_BOARD_SIZES, "float"] if asked.board else [WITH_FLOAT]) as places:
         print("| | fixes | float | RMSE | float | NEES | float | HPL, median | float | beyond 3 % | largest | NaN |")
         print("|---|---|---|---|---|---|---|---|---|---|---|---|")
         for name in (name for name in (*STUDIES, *AT_REST) if is_asked(name, asked)):

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from skyless.core.air import anchor_stamps, beacon_fields
-from skyless.core.estimator import levels, process, state, steady_state
+from skyless.core.estimator import kalman, levels, process, state, steady_state
 from skyless.core.native import arithmetic
-from skyless.core.tag import acquisition, admission, course, hearing, position
+from skyless.core.tag import admission, changes, following, hearing, position
 from translator.files import translate
 
 EXPORTS: Final[tuple[Callable[..., Any], ...]] = (
@@ -19,14 +19,16 @@ EXPORTS: Final[tuple[Callable[..., Any], ...]] = (
     anchor_stamps.unwrap_stamp,
     admission.admit_sender,
     admission.admit_stamp,
+    changes.begin_tag,
+    changes.begin_here,
+    changes.wake,
     hearing.hear_frame,
     hearing.hear_fields,
-    course.process_in_course,
-    state.prepare,
+    state.restart,
     state.add_anchor,
-    state.remove_anchor,
     state.find_anchor,
     levels.fit_plane,
+    process.leave,
     process.process_frame,
     process.process_difference,
     process.process_height,
@@ -35,14 +37,18 @@ EXPORTS: Final[tuple[Callable[..., Any], ...]] = (
     steady_state.find_walked,
     steady_state.process_known,
     position.find_position,
-    acquisition.try_start,
-    acquisition.forget_packets,
+    following.begin_course,
+    following.begin_again,
+    following.follow,
 )
 """What is called from outside."""
+
+BY_HAND: Final = (kalman.compute_ph, kalman.compute_fault_input, kalman._inform, kalman._apply_updates)
+"""What a target may have by hand, in the file that ``SKYLESS_BY_HAND`` names."""
 
 NAME: Final = "skyless_core"
 FOLDER: Final = Path(inspect.getfile(arithmetic)).parent
 
 if __name__ == "__main__":
-    for text, suffix in zip(translate(EXPORTS, NAME), ("h", "c"), strict=True):
+    for text, suffix in zip(translate(EXPORTS, NAME, BY_HAND), ("h", "c"), strict=True):
         (FOLDER / f"{NAME}.{suffix}").write_text(text)

@@ -18,15 +18,15 @@ FLAGS = [
 PAGE = Path(__file__).parents[1] / "src/skyless/page/browser/skyless_core.wasm"
 
 
-def build(wasm: Path) -> None:
-    """Compile.
+def build(wasm: Path, *more: str) -> None:
+    """Compile, with more options.
 
     Raises:
         SystemExit: there is no clang, or it failed.
     """
     source = Path(__file__).parents[1] / NATIVE / "skyless_core.c"
     try:
-        done = subprocess.run(["clang", *FLAGS, digest_of(source), str(source), "-o", str(wasm)], check=False)
+        done = subprocess.run(["clang", *FLAGS, *more, digest_of(source), str(source), "-o", str(wasm)], check=False)
     except OSError as error:
         raise SystemExit(f"skyless: clang cannot be run: {error}; on Debian: apt install clang lld") from None
     if done.returncode:

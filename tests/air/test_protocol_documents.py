@@ -21,13 +21,12 @@ from skyless.core.air.codec import decode, encode, heard_capacity
 from skyless.core.air.frame import Heard, Malformed, PackedHeard
 from skyless.core.air.ieee802154 import air_time_s
 from skyless.core.air.instants import LONGEST_PERIOD_CODE, OFFERED_HZ, SHORTEST_PERIOD_S, period_ticks
-from skyless.core.air.local_almanac import MAX_ISSUE_PAGES, MAX_ISSUES, MIN_ANCHORS
-from skyless.core.air.neighbours import MAX_NEIGHBOURS
+from skyless.core.air.site_pages import MIN_ANCHORS
+from skyless.core.native.sizes import MAX_ANCHORS_IN_USE, MAX_NEIGHBOURS, MAX_PAGES, MAX_SENDERS
 from skyless.core.protocol1 import beacon as protocol1_beacon
 from skyless.core.protocol1 import codec as protocol1_codec
 from skyless.core.protocol1.almanac import page_for, pages_of
 from skyless.core.site import AnchorSite, Site
-from skyless.core.tag.selection import MAX_ANCHORS_IN_USE
 from skyless.core.ticks import to_seconds
 
 SIGNED = {"x_m", "y_m", "z_m", "floor", "tag_height_m"}
@@ -144,4 +143,4 @@ def test_periods_of_the_document():
 
 
 def test_bounds_of_the_document():
-    assert (MAX_ANCHORS_IN_USE, MAX_NEIGHBOURS, MAX_ISSUES, MAX_ISSUE_PAGES, MIN_ANCHORS) == (24, 256, 4, 4, 3)
+    assert (MAX_ANCHORS_IN_USE, MAX_NEIGHBOURS, MAX_PAGES, MAX_SENDERS, MIN_ANCHORS) == (24, 256, 64, 16, 3)

@@ -4,8 +4,6 @@ from hypothesis import strategies as st
 from skyless.core.air.site_choice import (
     CHANGED,
     FOREIGN,
-    MAX_COUNTED,
-    MAX_SITES,
     NO_SITE,
     SITE_SILENCE_TICKS,
     TRIAL_TICKS,
@@ -14,6 +12,7 @@ from skyless.core.air.site_choice import (
     choose_site,
     note_fix,
 )
+from skyless.core.native.sizes import MAX_COUNTED, MAX_SITES
 from skyless.core.ticks import from_seconds
 
 HOME, OTHER = 1, 77

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from skyless.core.estimator.estimator import Estimator
 from skyless.core.estimator.kalman import predict
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
-from skyless.core.native.views import view
+from skyless.core.estimator.state import covariances
 from skyless.core.site import EXACT
 from skyless.core.ticks import from_seconds
 from skyless.sim.evaluation.fleet import Fleet, FleetSettings
@@ -78,7 +78,7 @@ def test_the_spread_ahead_is_that_of_the_prediction():
     for dim in (2, 3):
         root = generator.normal(size=(2 * dim, 2 * dim))
         estimator = Estimator(EstimatorSettings(qa=0.4, height_m=0.0 if dim == 2 else None))
-        P = view(estimator.state.P)
+        P = covariances(estimator.state)
         P[: 2 * dim, : 2 * dim] = root @ root.T
         told, epoch = estimator.horizontal_variance_m2(1.7), estimator.state.status.epoch_ticks
         predict(estimator.state, epoch + from_seconds(1.7))

@@ -10,14 +10,17 @@ from bench import ROOM, tape
 from skyless.core.air.beacon import Beacon, StatedPosition
 from skyless.core.air.codec import decode, encode
 from skyless.core.air.frame import Heard
-from skyless.core.air.neighbours import Neighbour, find_neighbour
+from skyless.core.air.neighbours import RELAYED_TICKS, Neighbour, find_neighbour, is_confirmed, neighbour_of
 from skyless.core.estimator.state import find_anchor
+from skyless.core.native.library import compiled
 from skyless.core.native.records import unpacked
 from skyless.core.tag.acquisition import Acquisition
+from skyless.core.tag.changes import wake
 from skyless.core.tag.receiver import Receiver
-from skyless.core.ticks import from_seconds, to_seconds, wrap
+from skyless.core.ticks import fix_time_ticks, from_seconds, to_seconds, wrap
 
 pytestmark = pytest.mark.site
+_wake = compiled(wake)
 
 
 def free_room(rate_hz, seconds):
@@ -33,7 +36,7 @@ def test_the_period_of_a_slow_site_survives_a_restart(jump):
     half, receiver = len(heard) // 2, Receiver()
     for one in heard[:half]:
         receiver.hear(replace(one, host_s=1e9 + one.host_s))
-    period_s = to_seconds(receiver.state().method_period_ticks)
+    period_s = to_seconds(receiver.tag.period_ticks)
     assert period_s == pytest.approx(0.512)
     fixes = 0
     for one in heard[half:]:
@@ -43,7 +46,7 @@ def test_the_period_of_a_slow_site_survives_a_restart(jump):
             later = replace(one, host_s=None, rx_ticks=wrap(one.rx_ticks - from_seconds(5.0)))
         fixes += receiver.hear(later) is not None
     assert {"impossible-host-time", "counter-jump"} & receiver.counters.keys()
-    assert to_seconds(receiver.state().method_period_ticks) == period_s
+    assert to_seconds(receiver.tag.period_ticks) == period_s
     assert fixes > 60
 
 
@@ -98,3 +101,49 @@ def test_a_state_with_a_bool_that_is_none_is_refused(byte):
     content[Acquisition.is_contradicted.offset] = byte
     with pytest.raises(ValueError, match="neither true nor false"):
         Receiver.from_state(replace(state, method=replace(state.method, start=compress(bytes(content), 1))))
+
+
+def test_a_tag_that_has_slept_begins_again_within_three_rounds():
+    """Its counter begins at zero, and the time of fixes goes on with the sleep in it."""
+    heard, receiver = free_room(50.0, 4.0), Receiver()
+    half = len(heard) // 2
+    fixes = [receiver.hear(one) for one in heard[:half]]
+    _wake(receiver.tag, receiver.method.estimator.state, receiver.method.search, 0, 10.0)
+    assert receiver.method.is_starting
+    assert receiver.method.search.has_bounds
+    for one in heard[half:]:
+        later = replace(one, host_s=None, rx_ticks=wrap(one.rx_ticks - heard[half].rx_ticks))
+        fixes += [receiver.hear(later)]
+    assert not any(fixes[half : half + 8])
+    assert all(fixes[half + 3 * 8 :])
+    assert fixes[-1].time_s - fixes[half - 1].time_s == pytest.approx(12.0, abs=0.1)
+    assert np.linalg.norm(fixes[-1].position_m - fixes[half - 1].position_m) < 0.1
+
+
+def test_anchors_that_were_confirmed_before_a_sleep_are_so_after_it():
+    heard, receiver = free_room(50.0, 2.0), Receiver()
+    for one in heard:
+        receiver.hear(one)
+    t, now = receiver.admission.neighbours, receiver.admission.rx_ticks
+    stranger = t.rows[neighbour_of(t, 60_000, now)]
+    confirmed = {n.anchor for n in t.rows[: t.count] if is_confirmed(n, now)}
+    assert len(confirmed) == len(ROOM.anchors)
+    _wake(receiver.tag, receiver.method.estimator.state, receiver.method.search, 7, 1e-3)
+    assert {n.anchor for n in t.rows[: t.count] if is_confirmed(n, 7)} == confirmed
+    assert not any(is_confirmed(n, 7 + RELAYED_TICKS) for n in t.rows[: t.count])
+    assert not is_confirmed(stranger, 7)
+    assert not any(n.frames for n in t.rows[: t.count])
+
+
+@pytest.mark.parametrize("slept_s", [1e-3, 1.0, 3600.0])
+def test_the_time_of_fixes_goes_on_by_the_sleep(slept_s):
+    """From one clock to the next, whatever the counter reads then."""
+    heard, receiver = free_room(50.0, 2.0), Receiver()
+    for one in heard:
+        receiver.hear(one)
+    time, now = receiver.admission.time, receiver.admission.rx_ticks
+    for counter in (0, 2**40 - 1):
+        before = fix_time_ticks(time, time.last_ticks_master, now)
+        _wake(receiver.tag, receiver.method.estimator.state, receiver.method.search, counter, slept_s)
+        assert to_seconds(fix_time_ticks(time, counter, counter) - before) == pytest.approx(slept_s, abs=1e-9)
+        now = counter

@@ -3,9 +3,14 @@
 import ctypes
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "positioning"))
+
+from estimator_builders import kept, late
 
 from skyless.core.estimator.process import BatchPacket, BatchRow, Place, Relay
 from skyless.core.estimator.state import State
@@ -58,6 +63,14 @@ def runner(folder, compiler, *flags, emulator=()):
     parts = [NATIVE / "skyless_core.c", source]
     subprocess.run([compiler, *EXACT, *flags, f"-I{NATIVE}", *parts, "-o", made], check=True)
     return [*emulator, str(made)]
+
+
+def disturbed(episode, seed):
+    """Some packets are lost and some late; one anchor's are late from some time on."""
+    draw, frames = np.random.default_rng(seed), np.arange(len(episode.packets.anchors))
+    late_m = np.where(draw.random(len(frames)) < 0.05, draw.exponential(1.0, len(frames)), 0.0)
+    late_m[(episode.packets.anchors == 2) & (frames > 60)] += 0.5
+    return kept(late(episode.packets, late_m), draw.random(len(frames)) > 0.1)
 
 
 def batch_of(packets, places_m):

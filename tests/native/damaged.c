@@ -51,6 +51,7 @@ int main(int count, char **words) {
         const int32_t k = (int32_t)(n % sizes[1]);
         if (k == 0) memcpy(s, first, sizeof(State));
         Packet packet = {0};
+        Relays taken = {0};
         const BatchPacket *given = &packets[k];
         packet.place = places[given->place];
         packet.sequence = given->sequence;
@@ -59,8 +60,8 @@ int main(int count, char **words) {
         packet.variance_factor = 1;
         packet.master = -1;
         const int32_t begin = k ? packets[k - 1].end : 0;
-        for (int32_t r = begin; r < given->end && packet.relay_count < MAX_RELAYS; r++) {
-            packet.relays[packet.relay_count++] = relays[r];
+        for (int32_t r = begin; r < given->end && taken.count < MAX_RELAYS; r++) {
+            taken.rows[taken.count++] = relays[r];
         }
         uint8_t packed[104];
         int32_t packed_bytes = 0;
@@ -73,8 +74,8 @@ int main(int count, char **words) {
                 case 3: packet.place.anchor = (int32_t)(draw() % 70000); break;
                 case 4: packet.place.position_m[draw() % 3] += (real)(draw() % 2000) - 1000; break;
                 case 5:
-                    if (packet.relay_count > 0) {
-                        Relay *relay = &packet.relays[draw() % (unsigned)packet.relay_count];
+                    if (taken.count > 0) {
+                        Relay *relay = &taken.rows[draw() % (unsigned)taken.count];
                         relay->rx_ticks = flipped(relay->rx_ticks, 60);
                         relay->sequence = (int32_t)flipped(relay->sequence, 8);
                         relay->anchor = (int32_t)(draw() % 10);
@@ -89,7 +90,7 @@ int main(int count, char **words) {
                     for (int32_t b = 0; b < packed_bytes; b++) packed[b] = (uint8_t)draw();
             }
         }
-        const int32_t outcome = skyless_process_frame(s, &packet, packed, packed_bytes);
+        const int32_t outcome = skyless_process_frame(s, &packet, &taken, packed, packed_bytes);
         accepted += outcome == ACCEPTED;
         not_finite += !is_finite(s);
     }

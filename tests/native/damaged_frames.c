@@ -2,9 +2,9 @@
  *
  * Bytes are changed, as a rule with the right check sequence afterwards, frames are cut, prolonged, repeated and forged,
  * and stamps, host times and powers are wrong. Each frame lies in memory of its own size. A fix has to be finite, and
- * of a frame whose check sequence is right. When the tag has to begin again, and every few hundred frames, it is what it
- * was at the beginning, or every other time one that looks for a start. Prints how many frames were damaged, made a fix,
- * made a start, and how many fixes and starts were not finite or of a frame with a wrong check sequence. */
+ * of a frame whose check sequence is right. After all frames the tag is what it was at the beginning, or has just been
+ * switched on, or has slept. Prints how many frames were damaged, made a fix, made a start, and how many fixes were not
+ * finite or of a frame with a wrong check sequence. */
 
 #include <math.h>
 #include <stdio.h>
@@ -62,10 +62,10 @@ static void damage(Heard *one, double *host_s, double *power_dbm) {
     }
 }
 
-static int is_finite(const State *s) {
+static int is_finite(real rows[10][3]) {
     for (int row = 0; row < 10; row++) {
         for (int axis = 0; axis < 3; axis++) {
-            if (!(s->fix[row][axis] - s->fix[row][axis] == 0)) return 0;
+            if (!(rows[row][axis] - rows[row][axis] == 0)) return 0;
         }
     }
     return 1;
@@ -76,13 +76,10 @@ int main(int count, char **words) {
     const long total = atol(words[1]);
     state_of_draw = strtoull(words[2], NULL, 10) * 2 + 1;
     const int32_t frames = *(int32_t *)read_bytes(sizeof(int32_t));
-    const Hearing *first = read_bytes(sizeof(Hearing));
-    const Course *first_course = read_bytes(sizeof(Course));
+    const Tag *first = read_bytes(sizeof(Tag));
     const State *first_state = read_bytes(sizeof(State));
-    const Acquisition *first_start = read_bytes(sizeof(Acquisition));
     const Heard *heard = read_bytes(frames * sizeof(Heard));
-    Hearing *h = malloc(sizeof(Hearing));
-    Course *c = malloc(sizeof(Course));
+    Tag *t = malloc(sizeof(Tag));
     State *s = malloc(sizeof(State));
     Acquisition *q = malloc(sizeof(Acquisition));
     long damaged = 0, fixes = 0, starts = 0, wrong = 0;
@@ -90,11 +87,12 @@ int main(int count, char **words) {
     for (long n = 0; n < total; n++) {
         if (next == frames) {
             next = 0;
-            memcpy(h, first, sizeof(Hearing));
-            memcpy(c, first_course, sizeof(Course));
+            memcpy(t, first, sizeof(Tag));
             memcpy(s, first_state, sizeof(State));
-            memcpy(q, first_start, sizeof(Acquisition));
-            h->is_starting = draw() % 2;
+            switch (draw() % 3) {
+                case 0: skyless_begin_tag(t, NO_SITE, (real)0.3, -INFINITY, INFINITY, 0, 0, (real)1e-4, NAN); break;
+                case 1: skyless_wake(t, s, q, heard[0].rx_ticks, (real)(draw() % 100));
+            }
         }
         Heard one = heard[next++];
         double host_s = NAN, power_dbm = -80;
@@ -104,26 +102,15 @@ int main(int count, char **words) {
         }
         uint8_t *frame = malloc(one.length ? one.length : 1);
         memcpy(frame, one.bytes, one.length);
+        const bool was_starting = t->course.is_starting;
         const int32_t outcome =
-            skyless_hear_frame(h, c, s, frame, one.length, one.rx_ticks, (real)host_s, (real)power_dbm, -85,
+            skyless_hear_frame(t, s, q, frame, one.length, one.rx_ticks, (real)host_s, (real)power_dbm, -85,
                                (real)(one.rx_ticks % 997) / 997);
         free(frame);
-        if (outcome == FIX) {
+        if (outcome == FIX || outcome == START_FIX) {
             fixes++;
-            wrong += !is_finite(s) || crc(one.bytes, one.length) != 0;
-        }
-        h->admission.events = 0;
-        if (outcome == LOST || outcome == START_CONTRADICTED || (h->is_starting && draw() % 256 == 0)) next = frames;
-        if (outcome == IS_RARE && h->is_starting) {
-            HeardPacket given = {.packet = h->packet};
-            if (skyless_try_start(q, &given, h->beacon.relays, h->beacon.relay_bytes) == FOUND) {
-                starts++;
-                for (int axis = 0; axis < 3; axis++) {
-                    const real x = q->start.position_m[axis], variance = q->start.covariance_m2[axis][axis];
-                    if (!(x - x == 0 && variance >= 0)) wrong++;
-                }
-                next = frames;
-            }
+            starts += was_starting;
+            wrong += !is_finite(outcome == FIX ? s->fix : t->course.alone) || crc(one.bytes, one.length) != 0;
         }
     }
     printf("%ld %ld %ld %ld\n", damaged, fixes, starts, wrong);

@@ -72,8 +72,7 @@ def damaged_frames(program, count, seed, height_m, carrier_phase=False):
     for row, reception in zip(rows, heard[warm:], strict=True):
         row["length"], row["rx_ticks"] = len(reception.frame), reception.rx_ticks
         row["bytes"][: len(reception.frame)] = np.frombuffer(reception.frame, np.uint8)
-    start = tag.method._new_start()
-    parts = [np.array([len(rows)], np.int32), tag.hearing, tag.method.course, tag.method.estimator.state, start, rows]
+    parts = [np.array([len(rows)], np.int32), tag.tag, tag.method.estimator.state, rows]
     return numbers(program, count, seed, b"".join(bytes(one) for one in parts))
 
 

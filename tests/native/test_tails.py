@@ -6,14 +6,19 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.special import chdtrc, erfcx, ndtr
+from scipy.special import chdtrc, erfcx, ndtr, ndtri
 
-from skyless.core.native.tails import FAR_TAIL, chi2_tail, mean_if_positive, normal_tail
+from skyless.core.native.tails import FAR_TAIL, chi2_tail, mean_if_positive, normal_quantile, normal_tail
 
 
 @given(z=st.floats(-9.0, 37.0))
 def test_the_normal_tail(z):
     assert normal_tail(z) == pytest.approx(ndtr(-z), rel=1e-12)
+
+
+@given(tail=st.floats(1e-300, 0.4999))
+def test_the_quantile_of_the_normal_distribution(tail):
+    assert normal_quantile(tail) == pytest.approx(-ndtri(tail), rel=1e-12, abs=1e-12)
 
 
 @given(dof=st.integers(1, 100), chi2=st.floats(0.0, 1399.0))

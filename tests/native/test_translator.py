@@ -105,6 +105,51 @@ def test_functions_of_records_leave_the_bytes_that_python_leaves(library, seed):
     assert bytes(other) == bytes(box)
 
 
+OF_SIZES = """
+from typing import Annotated, Final
+
+from skyless.core.native.records import Reals, Record, record
+from skyless.core.native.sizes import MAX_RELAYS, PACKED
+
+HALF: Final = MAX_RELAYS // 2 if PACKED else MAX_RELAYS
+
+
+@record
+class Sized(Record):
+    numbers: Annotated[Reals, 3 + HALF]
+
+
+def by_hand(one: Sized) -> int:
+    return 1
+
+
+def function(one: Sized) -> int:
+    return HALF + by_hand(one)
+"""
+
+
+@pytest.mark.skipif(not has("gcc"), reason="there is no gcc")
+@pytest.mark.parametrize(
+    ("flags", "length", "half"),
+    [((), 3 + 32, 32), (("-DMAX_RELAYS=9",), 3 + 9, 9), (("-DMAX_RELAYS=9", "-DPACKED=true"), 3 + 4, 4)],
+)
+def test_what_follows_from_sizes_has_those_of_the_compiler(tmp_path, flags, length, half):
+    """And a function that a target has by hand is its own."""
+    module = module_of(tmp_path, OF_SIZES)
+    for text, suffix in zip(translate([module.function], "sized", [module.by_hand]), ("h", "c"), strict=True):
+        (tmp_path / f"sized.{suffix}").write_text(text)
+    (tmp_path / "hand.h").write_text("INTERNAL int32_t by_hand(Sized *one) { return 100 + (one == 0); }\n")
+    (tmp_path / "run.c").write_text(
+        '#include <stdio.h>\n#include "sized.h"\nint main(void) { Sized one; '
+        'printf("%d %d", (int)(sizeof one / sizeof(double)), (int)skyless_function(&one)); }\n'
+    )
+    for own, found in ((), 1), (('-DSKYLESS_BY_HAND="hand.h"',), 100):
+        command = ["gcc", *EXACT, *flags, *own, "sized.c", "run.c", "-o", "run"]
+        subprocess.run(command, cwd=tmp_path, check=True)
+        output = subprocess.run([tmp_path / "run"], capture_output=True, text=True, check=True).stdout
+        assert output == f"{length} {half + found}"
+
+
 @pytest.mark.skipif(not has("gcc"), reason="there is no gcc")
 def test_single_precision_compiles_without_warnings(files):
     command = ["gcc", *EXACT, *WARNINGS, "-DSKYLESS_FLOAT", "-c", "examples.c", "-o", "other.o"]
@@ -178,14 +223,18 @@ REFUSED = {
 }
 
 
-def translate_text(folder, text):
+def module_of(folder, text):
     path = folder / f"refused_{abs(hash(text))}.py"
     path.write_text(text)
     specification = importlib.util.spec_from_file_location(path.stem, path)
     module = importlib.util.module_from_spec(specification)
     sys.modules[path.stem] = module
     specification.loader.exec_module(module)
-    return translate([module.function], "refused")
+    return module
+
+
+def translate_text(folder, text):
+    return translate([module_of(folder, text).function], "refused")
 
 
 @pytest.mark.parametrize("statement", REFUSED)

@@ -90,7 +90,7 @@ def run(name, count, seed):
     compiled, plain = begun(episode, settings, anchors_m), begun(episode, settings, anchors_m)
     outcomes = Counter()
     for number, packet in enumerate(one_by_one(changed(episode.packets, draw))):
-        outcome = process_frame(plain.state, plain.packet_of(*packet), b"", 0)
+        outcome = process_frame(plain.state, *plain.packet_of(*packet), b"", 0)
         assert compiled.process(*packet) == outcome, f"packet {number} of {name}"
         assert compiled.rows == plain.rows, f"packet {number} of {name}"
         assert bits(compiled.state) == bits(plain.state), f"packet {number} of {name}"

@@ -16,7 +16,7 @@ from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.core.estimator.estimator import Estimator, Packets
 from skyless.core.estimator.saved import packed_state
 from skyless.core.estimator.settings import EstimatorSettings
-from skyless.core.estimator.state import FAULT_KINDS
+from skyless.core.estimator.state import FAULT_KINDS, covariances
 from skyless.core.native.views import view
 from skyless.core.observation import Observation
 from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM, random_path
@@ -210,7 +210,7 @@ def seen(state):
     n = where.end
     return SimpleNamespace(
         x=view(state.x)[:n],
-        P=view(state.P)[:n, :n],
+        P=covariances(state)[:n, :n],
         V=view(state.V)[:n, : faults + state.dim].T,
         information=view(state.information)[:faults, :faults],
         evidence=view(state.evidence)[:faults],

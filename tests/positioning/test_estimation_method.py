@@ -110,7 +110,8 @@ def test_starts_from_packets_that_contradict_each_other_are_honest(late_anchors)
         wrong[draw.permutation(6)[:late_anchors]] = draw.uniform(0.5, 2.0, late_anchors)
         episode = episode_of(Case(qa=0.3), 250, seed)
         packets = late(episode.packets, wrong[episode.packets.anchors])
-        method = Estimation(settings_of(Case(qa=0.3), **errors), most_anchors=24 if seed % 2 else None)
+        method = Estimation(settings_of(Case(qa=0.3), **errors))
+        method.course.most_anchors = 24 if seed % 2 else 0
         fixes = list(fixes_of(method, observations_of(packets), episode.path_m))
         assert fixes[0][0] * SLOT_S < 1.0
         exceeded += any(fix.hpl_m is not None and np.linalg.norm(error[:2]) > fix.hpl_m for _, fix, error in fixes)

@@ -9,7 +9,6 @@ from skyless.core.air.beacon import Beacon
 from skyless.core.air.codec import fields_of
 from skyless.core.air.frame import Heard
 from skyless.core.air.neighbours import (
-    MAX_NEIGHBOURS,
     RELAYED_TICKS,
     Neighbour,
     Neighbours,
@@ -19,13 +18,12 @@ from skyless.core.air.neighbours import (
 )
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import add_anchor, new_state
+from skyless.core.native.sizes import MAX_NEIGHBOURS
 from skyless.core.tag.selection import (
     BETTER_DB,
-    MAX_ANCHORS_IN_USE,
     add_power,
     add_relays,
     fitting_relays,
-    is_full,
     replaced_by,
 )
 from skyless.core.ticks import NEVER, from_seconds, wrap
@@ -50,17 +48,29 @@ def test_a_relayed_reception_confirms_for_two_seconds():
     assert t.rows[find_neighbour(t, 8)].own_relays_ticks == NEVER
 
 
+def replaced_anchor(new, used):
+    """Which of those in use, with range and power, makes way for a new anchor."""
+    t, s = Neighbours(), new_state(EstimatorSettings(height_m=0.0))
+    for anchor, (range_m, power_dbm) in {**used, 99: new}.items():
+        t.row = neighbour_of(t, anchor, 0)
+        n = t.rows[t.row]
+        n.has_place, n.place.position_mm[0] = True, round(1000 * range_m)
+        n.has_power, n.power_dbm = power_dbm is not None, power_dbm or 0.0
+        if anchor in used:
+            add_anchor(s, anchor, np.zeros(3), -1.0, False)
+    index = replaced_by(t, s, (0, 0, 0))
+    return None if index < 0 else s.anchors[index].identifier
+
+
 def test_the_weakest_leaves_for_one_that_is_stronger_by_3_db():
-    powers_dbm = {1: -80.0, 2: -75.0, 3: -77.1, 4: -76.9}
-    ranges_m = dict.fromkeys((1, 2), 10.0)
-    assert replaced_by(3, powers_dbm, {**ranges_m, 3: 10.0}) is None
-    assert replaced_by(4, powers_dbm, {**ranges_m, 4: 10.0}) == 1
+    assert replaced_anchor((10.0, -77.1), {1: (10.0, -80.0), 2: (10.0, -75.0)}) is None
+    assert replaced_anchor((10.0, -76.9), {1: (10.0, -80.0), 2: (10.0, -75.0)}) == 1
     assert BETTER_DB == 3.0
 
 
 def test_where_no_power_is_reported_the_farthest_leaves_for_a_nearer_one():
-    assert replaced_by(3, {}, {1: 10.0, 2: 30.0, 3: 20.0}) == 2
-    assert replaced_by(3, {}, {1: 10.0, 2: 30.0, 3: 25.0}) is None
+    assert replaced_anchor((20.0, None), {1: (10.0, None), 2: (30.0, None)}) == 2
+    assert replaced_anchor((25.0, None), {1: (10.0, None), 2: (30.0, None)}) is None
 
 
 @pytest.mark.parametrize("nonsense", [math.nan, math.inf, -math.inf])
@@ -107,8 +117,3 @@ def test_memory_is_bounded_and_those_that_others_receive_stay(rows):
     identifiers = {t.rows[row].anchor for row in range(t.count)}
     assert len(identifiers) == t.count == MAX_NEIGHBOURS
     assert set(range(1, 10)) <= identifiers
-
-
-def test_full_with_24():
-    assert not is_full(range(MAX_ANCHORS_IN_USE - 1))
-    assert is_full(range(MAX_ANCHORS_IN_USE))

@@ -17,13 +17,14 @@ from machines.bench import LAB, PAIRS, ROOM, tape
 from skyless.core.air.page_codec import encode_page
 from skyless.core.air.reception import Reception
 from skyless.core.any_receiver import AnyReceiver
-from skyless.core.estimator.state import PACKETS_KEPT, Anchor, KeptPacket, Link, Status
+from skyless.core.estimator.state import Anchor, KeptPacket, Link, Status
 from skyless.core.method_names import METHODS
 from skyless.core.native.records import packed, unpacked
+from skyless.core.native.sizes import PACKETS_KEPT
 from skyless.core.protocol1.codec import decode, encode
 from skyless.core.tag.admission import Admission
 from skyless.core.tag.course import Course
-from skyless.core.tag.hearing import Hearing
+from skyless.core.tag.tag import Tag
 from skyless.core.ticks import Unwrapper
 from skyless.run.recordings.reception_log import RefusedError, load, save
 
@@ -180,9 +181,13 @@ def test_states_of_other_things_are_refused(path, value):
 @pytest.mark.parametrize(
     ("path", "value"),
     [
-        (["almanac", "collected"], [1]),
-        (["hearing"], with_record(Hearing, lambda one: setattr(one.admission.neighbours, "count", 257))),
-        (["waiting"], [1]),
+        (["tag"], with_record(Tag, lambda one: setattr(one.admission.neighbours, "count", 257))),
+        (["tag"], with_record(Tag, lambda one: setattr(one.pages, "count", -1))),
+        (["tag"], with_record(Tag, lambda one: setattr(one.pages, "issue", -1))),
+        (["tag"], with_record(Tag, lambda one: setattr(one.pages.used[0], "contents", (3, 255, 255, 255, 255)))),
+        (["tag"], with_record(Tag, lambda one: setattr(one.pages.collected[5], "sender_count", 17))),
+        (["tag"], with_record(Tag, lambda one: setattr(one.waiting[9], "relay_bytes", 97))),
+        (["tag"], with_record(Tag, lambda one: setattr(one, "waiting_count", 129))),
     ],
 )
 def test_states_of_other_things_are_refused_at_random_instants(path, value):

@@ -1,3 +1,6 @@
+import struct
+
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
@@ -5,23 +8,21 @@ from msgspec.structs import replace
 from skyless.core.air.almanac import AccuracyPage, NoisePage, SitePage
 from skyless.core.air.beacon import Beacon, StatedPosition
 from skyless.core.air.codec import fields_of
-from skyless.core.air.local_almanac import (
-    MAX_ISSUE_PAGES,
-    MAX_ISSUES,
-    PRESENT_TICKS,
-    LocalAlmanac,
-    site_issue,
-    site_page_for,
-    site_pages_of,
-)
-from skyless.core.air.neighbours import MAX_NEIGHBOURS, Neighbours, find_neighbour, neighbour_of
+from skyless.core.air.local_almanac import LocalAlmanac, site_issue, site_page_for, site_pages_of
+from skyless.core.air.neighbours import Neighbours, find_neighbour, neighbour_of
+from skyless.core.air.page_codec import MAX_NOISE, decode_page, encode_page
+from skyless.core.air.site_pages import PRESENT_TICKS, SAME_PAGES, SitePages, note_page
+from skyless.core.estimator.settings import EstimatorSettings
+from skyless.core.native.sizes import MAX_NEIGHBOURS, MAX_PAGES
 from skyless.core.site import GeoreferenceSite
+from skyless.core.tag.factory import estimator_settings
 from skyless.core.tag.hearing import keep_place
+from skyless.core.tag.site_settings import DROP_S, fill_ages, read_accuracy
 from skyless.core.ticks import from_seconds
 from skyless.sim.lab import lab_site
 
 SITE = replace(lab_site(), schedule=replace(lab_site().schedule, mode="free"))
-PAGES = site_pages_of(SITE)
+PAGES = tuple(decode_page(encode_page(one)) for one in site_pages_of(SITE))
 ISSUE = site_issue(PAGES)
 STEP = from_seconds(0.005)
 
@@ -46,7 +47,8 @@ class Tag:
 
     def __init__(self):
         self.neighbours = Neighbours()
-        self.almanac = LocalAlmanac(self.neighbours)
+        self.pages = SitePages()
+        self.almanac = LocalAlmanac(self.pages, self.neighbours)
 
     def hear(self, one, rx_ticks, is_confirmed=True):
         t, fields = self.neighbours, fields_of(one)
@@ -58,7 +60,8 @@ class Tag:
             n.relayed_ticks = rx_ticks
         if fields.has_place:
             keep_place(n, fields.place)
-        return self.almanac.on_beacon(one.page, rx_ticks)
+        frame = b"" if one.page is None else b"\0" + encode_page(one.page)
+        return note_page(self.pages, t, frame, 1 if frame else 0, rx_ticks) != SAME_PAGES
 
     def run(self, beacons, is_confirmed=True, start=0):
         return [self.hear(one, start + n * STEP, is_confirmed) for n, one in enumerate(beacons)]
@@ -121,7 +124,7 @@ def test_another_issue_of_the_majority_replaces_the_pages_once_they_are_complete
     changed = (replace(PAGES[0], rx_stamp_s=2e-10), *PAGES[1:])
     changes = tag.run(rotation(12, pages=changed), start=from_seconds(1.0))
     assert changes.count(True) == 1
-    assert almanac.pages.noise.rx_stamp_s == 2e-10
+    assert almanac.pages.noise.rx_stamp_s == pytest.approx(2e-10)
 
 
 def test_a_position_is_used_at_once_and_another_one_when_it_comes_twice_in_a_row():
@@ -130,7 +133,7 @@ def test_a_position_is_used_at_once_and_another_one_when_it_comes_twice_in_a_row
     assert tag.almanac.points_m() == {1: (1.0, 2.0, 3.0)}
     tag.run([beacon(1, position=moved)])
     assert tag.almanac.points_m() == {1: (9.0, 2.0, 3.0)}
-    assert tag.almanac.newest.place.std_mm == 50
+    assert tag.neighbours.rows[tag.neighbours.row].place.std_mm == 50
 
 
 def test_an_anchor_without_a_position_has_none():
@@ -144,16 +147,13 @@ def test_an_anchor_without_a_position_has_none():
 @given(
     st.lists(st.tuples(st.integers(0, 65535), st.integers(0, 65535), st.integers(0, 2), st.booleans()), max_size=300)
 )
-def test_memory_is_bounded_whatever_comes_and_a_state_goes_on_the_same(rows):
-    tag, again = Tag(), Tag().almanac
+def test_memory_is_bounded_whatever_comes(rows):
+    tag = Tag()
     for n, (anchor, issue, page, is_confirmed) in enumerate(rows):
         height = replace(PAGES[-1], tag_height_m=float(n)) if page == 2 else PAGES[page]
         tag.hear(beacon(anchor, height, issue % 9), n * STEP, is_confirmed)
-    state = tag.almanac.state()
     assert tag.neighbours.count <= MAX_NEIGHBOURS
-    assert len(state.collected) <= MAX_ISSUES * 3 * MAX_ISSUE_PAGES
-    again.restore(state)
-    assert again.state() == state
+    assert tag.pages.count <= MAX_PAGES
 
 
 def test_the_issue_does_not_depend_on_the_order_of_the_pages():
@@ -173,7 +173,18 @@ def test_strangers_do_not_displace_anchors_that_others_have_received():
             tag.hear(beacon(1000 + n // 2, page, ISSUE if n % 3 else n % 7), n * STEP // 5, False)
     assert find_neighbour(tag.neighbours, 1) >= 0
     assert tag.neighbours.count == MAX_NEIGHBOURS
-    assert any(one.issue == ISSUE for one in almanac.state().collected)
+    assert any(one.issue == ISSUE for one in tag.pages.collected)
     tag.run(rotation(9), start=from_seconds(4.0))
     assert almanac.pages is not None
     assert almanac.issue == ISSUE
+
+
+@given(
+    st.lists(st.floats(0.0, MAX_NOISE), min_size=4, max_size=4), st.lists(st.integers(1, 65535), min_size=6, max_size=6)
+)
+def test_settings_from_the_bytes_of_pages_are_those_from_their_figures(figures, steps):
+    pages = encode_page(NoisePage(*figures)), struct.pack("<B6H4x", 5, *steps)
+    found, expected = EstimatorSettings(), estimator_settings(0.5, None, *map(decode_page, pages), 0.0)
+    read_accuracy(found, *pages)
+    fill_ages(found, 0.0, DROP_S)
+    assert bytes(found) == bytes(expected)

@@ -6,7 +6,7 @@ from textbook_bound import LAB, RAISED, SLOT_S, positions, settings_of, textbook
 
 from skyless.core.constants import TICK_S
 from skyless.core.estimator.compiled import process_known
-from skyless.core.native.views import view
+from skyless.core.estimator.state import covariances
 from skyless.research.uncertainty.bounds import Biases, Sendings, _prior, received_bound, tracking_bound
 
 PHASES = {"phase_std_m": 0.002, "phase_wander": 1e-4}
@@ -43,7 +43,7 @@ def last_of(path, settings):
         known[frame % 6] = 0
         process_known(s, frame % 6, round(frame * SLOT_S / TICK_S), place, known, 0, 6 * SLOT_S, 0.0)
     tag = [0, 1, s.layout.velocity, s.layout.velocity + 1]
-    return view(s.P)[np.ix_(tag, tag)].copy()
+    return covariances(s)[np.ix_(tag, tag)].copy()
 
 
 def test_a_tag_at_rest_learns_its_velocity_from_phases():

@@ -3,12 +3,14 @@
 import ast
 import inspect
 import math
+import sys
 from collections.abc import Callable, Iterator, Sequence
-from types import FunctionType
-from typing import Any, Final, get_type_hints
+from types import FunctionType, ModuleType
+from typing import Any, Final, NamedTuple, get_type_hints
 
-from skyless.core.native import arithmetic
+from skyless.core.native import arithmetic, sizes
 from skyless.core.native.records import Record, has_defaults
+from translator.capacities import expression, follows, home_of, names_in
 from translator.scopes import Scopes, assigned
 from translator.sources import INDENT, c_name, comment, doc_of, source_of, wrapped
 from translator.types import (
@@ -41,6 +43,16 @@ class RefusedError(Exception):
     """A place that cannot be translated."""
 
 
+class Constant(NamedTuple):
+    """A constant of some modules."""
+
+    value: Any
+    code: str
+    """Where it follows from sizes."""
+    doc: str
+    is_size: bool
+
+
 class Translator:
     """All that is translated, as far as it is known that it is needed."""
 
@@ -48,7 +60,8 @@ class Translator:
         self.roots = {root.__name__ for root in roots}
         self.functions: dict[str, FunctionType] = {}
         self.records: dict[str, type[Record]] = {}
-        self.constants: dict[str, tuple[Any, str]] = {}
+        self.constants: dict[str, Constant] = {}
+        self.fields: dict[type[Record], dict[str, Type]] = {}
         self.bodies: dict[str, list[str]] = {}
         self.results: dict[str, Results] = {}
         for root in roots:
@@ -68,23 +81,61 @@ class Translator:
     def need_record(self, made: type[Record]) -> None:
         """A record is needed, and those in it before."""
         if made.__name__ not in self.records:
-            for _, ctype in made._fields_:  # type: ignore[misc]
-                kind = type_of(ctype)
+            for field in self.fields_of(made).values():
+                kind = field
                 while isinstance(kind, Elements):
                     kind = kind.element
                 if isinstance(kind, Struct):
                     self.need_record(kind.made)
             self.records[made.__name__] = made
 
+    def fields_of(self, made: type[Record]) -> dict[str, Type]:
+        """The types of a record's fields."""
+        if made not in self.fields:
+            module = sys.modules[made.__module__]
+            nodes = {node.target.id: node.annotation for node in source_of(module).nodes[made.__name__].body
+                     if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)}  # fmt: skip
+            self.fields[made] = {name: type_of(ctype, self.lengths(module, nodes[name]))
+                                 for name, ctype, *_ in made._fields_}  # fmt: skip
+        return self.fields[made]
+
+    def lengths(self, module: ModuleType, annotation: ast.expr | None) -> list[str]:
+        """The lengths of an array's annotation as C has them, empty where they are numbers."""
+        match annotation:
+            case ast.Subscript(value=ast.Name(id="Annotated"), slice=ast.Tuple(elts=[_, *lengths])):
+                return [self.expression(module, one) for one in lengths]
+        return []
+
+    def expression(self, module: ModuleType, node: ast.expr | None) -> str:
+        """An expression of a module that follows from sizes, in C; its constants are needed. Of others nothing."""
+        if node is None or not follows(module, node):
+            return ""
+        for name in names_in(node):
+            self.need_constant(module, name)
+        return expression(node)
+
+    def need_constant(self, module: ModuleType, name: str) -> Any:  # noqa: ANN401
+        """The value of a constant of a module, which is needed."""
+        home = home_of(module, name)
+        value, source = getattr(home, name), source_of(home)
+        if c_name(name) not in self.constants:
+            code = self.expression(home, source.values.get(name)) if isinstance(value, int) else ""
+            self.constants[c_name(name)] = Constant(value, code, source.docs.get(name, ""), home is sizes)
+        return self.constants[c_name(name)].value
+
     def signature(self, function: FunctionType) -> tuple[list[tuple[str, Type]], Type | None]:
         """Names and types of parameters, and the type of the result."""
         hints = get_type_hints(function, include_extras=True)
+        module = sys.modules[function.__module__]
+        nodes = {one.arg: one.annotation for one in source_of(module).nodes[function.__name__].args.args}  # type: ignore[union-attr]
         place = f"{function.__code__.co_filename}:{function.__code__.co_firstlineno}"
         if hints.keys() != {*function.__code__.co_varnames[: function.__code__.co_argcount], "return"}:
             raise RefusedError(f"{place}: each parameter and the result of {function.__name__} need a type")
         returned = hints.pop("return")
         try:
-            parameters = [(name, parameter_type(hint)) for name, hint in hints.items()]
+            parameters = [
+                (name, parameter_type(hint, self.lengths(module, nodes[name]))) for name, hint in hints.items()
+            ]
             result = None if returned is type(None) else parameter_type(returned)
         except (IndexError, TypeError) as error:
             raise RefusedError(f"{place}: {function.__name__}: {error}") from error
@@ -389,10 +440,10 @@ class Body:
         if isinstance(kind, Struct) and value.rank == NEW:
             self.kinds[name] = (kind, False)
             if indent == INDENT:
-                yield f"{indent}{kind.made.__name__} {variable} = {{0}};"
+                yield f"{indent}{kind.made.__name__} {variable} = {initialiser(kind.made)};"
             else:  # it lives as long as the function runs, as in Python what has a reference does
                 self.hoisted.append(f"{kind.made.__name__} {variable};")
-                yield f"{indent}{variable} = ({kind.made.__name__}){{0}};"
+                yield f"{indent}{variable} = {self.record(value)};"
             return
         self.kinds[name] = (kind, True)
         code = self.reference(value) if isinstance(kind, Struct) else self.fitting(target, value, kind).code
@@ -435,7 +486,7 @@ class Body:
     def record(self, value: Value) -> str:
         """A record itself."""
         if value.rank == NEW:
-            return f"({value.code}){{0}}"
+            return f"({value.code}){initialiser(value.kind.made)}"  # type: ignore[union-attr]
         return f"*{value.code}" if value.is_pointer else value.code
 
     def condition(self, node: ast.expr) -> Value:
@@ -492,7 +543,7 @@ class Body:
         constant = self.globals.get(name)
         if not isinstance(constant, bool | int | float):
             raise self.refuse(node, f"{name} is neither a variable that has a value here nor a constant")
-        known, _ = self.all.constants.setdefault(c_name(name), (constant, self.source.docs.get(name, "")))
+        known = self.all.need_constant(self.source.module, name)
         if known != constant:
             raise self.refuse(node, f"another constant of this name is {known}")
         return literal(constant)._replace(code=c_name(name), rank=20)
@@ -501,10 +552,10 @@ class Body:
         if not isinstance(of.kind, Struct) or of.rank == NEW:
             raise self.refuse(node, "only records that have a name have fields")
         self.all.need_record(of.kind.made)
-        ctype = {one[0]: one[1] for one in of.kind.made._fields_}.get(field)
-        if ctype is None:
+        kind = self.all.fields_of(of.kind.made).get(field)
+        if kind is None:
             raise self.refuse(node, f"{of.kind.made.__name__} has no field {field}")
-        return Value(f"{as_operand(of, 16)}{'->' if of.is_pointer else '.'}{c_name(field)}", type_of(ctype), 16, False)
+        return Value(f"{as_operand(of, 16)}{'->' if of.is_pointer else '.'}{c_name(field)}", kind, 16, False)
 
     def operation(self, node: ast.expr, op: type[ast.operator], left: Value, right: Value) -> Value:
         if not (isinstance(left.kind, Number) and isinstance(right.kind, Number)):
@@ -570,8 +621,6 @@ class Body:
         if isinstance(called, type) and issubclass(called, Record):
             if node.args or node.keywords:
                 raise self.refuse(node, "a new record has no values")
-            if has_defaults(called):
-                raise self.refuse(node, f"a new {called.__name__} would have defaults, which C does not know")
             self.all.need_record(called)
             return Value(called.__name__, Struct(called), NEW)
         if called in BUILTINS.values() or called in (math.sqrt, arithmetic.floor):
@@ -626,6 +675,18 @@ class Body:
         if first.kind == REAL:
             return Value(f"truncated({first.code})", LONG)
         return first if first.kind in (INT, LONG) else Value(f"(int32_t){as_operand(first, 15)}", INT, 15)
+
+
+def initialiser(made: type[Record]) -> str:
+    """What a new record begins with: its defaults, and zeros."""
+    parts = []
+    for name, ctype in made._fields_:  # type: ignore[misc]
+        if name in made._defaults_:
+            value = made._defaults_[name]
+            parts.append(f".{c_name(name)} = {literal(float(value) if type_of(ctype) == REAL else value).code}")
+        elif has_defaults(ctype):
+            parts.append(f".{c_name(name)} = {initialiser(ctype)}")  # type: ignore[arg-type]
+    return f"{{{', '.join(parts) or 0}}}"
 
 
 def _indices(target: ast.expr) -> list[ast.expr]:

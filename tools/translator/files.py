@@ -9,9 +9,9 @@ from types import FunctionType
 from typing import Any, Final
 
 from skyless.core.native.records import Record
-from translator.body import Translator
+from translator.body import Constant, Translator
 from translator.sources import INDENT, WIDTH, Source, c_name, comment, doc_of, source_of, wrapped
-from translator.types import Elements, Number, Results, literal, type_of
+from translator.types import Elements, Number, Results, Type, literal
 
 HEADER: Final = """\
 #include <stdbool.h>
@@ -57,10 +57,20 @@ static inline int64_t max_64(int64_t one, int64_t other) { return other > one ? 
 static inline real abs_real(real x) { return FABS(x); }
 static inline int32_t abs_32(int32_t x) { return x < 0 ? -x : x; }
 static inline int64_t abs_64(int64_t x) { return x < 0 ? -x : x; }
-static inline int64_t truncated(real x) { return REAL(-9e18) < x && x < REAL(9e18) ? (int64_t)x : 0; }
+#ifdef SKYLESS_FLOAT
+/* By two exact halves: a Cortex-M4F has no instruction for 64 bits, and its compiler's function uses double. */
+static inline int64_t whole_of(real x) {
+    const int32_t high = (int32_t)(x * (1 / REAL(4294967296.0)));
+    const real low = x - (real)high * REAL(4294967296.0);
+    return high * INT64_C(4294967296) + (low < 0 ? -(int64_t)(uint32_t)-low : (int64_t)(uint32_t)low);
+}
+#else
+static inline int64_t whole_of(real x) { return (int64_t)x; }
+#endif
+static inline int64_t truncated(real x) { return REAL(-9e18) < x && x < REAL(9e18) ? whole_of(x) : 0; }
 static inline int64_t floor_real(real x) {
-    const int64_t whole = truncated(x);
-    return x > REAL(-9e18) && x < (real)whole ? whole - 1 : whole;
+    const int64_t found = truncated(x);
+    return x > REAL(-9e18) && x < (real)found ? found - 1 : found;
 }
 static inline int32_t floor_div_32(int32_t x, int32_t y) { return x / y - (x % y != 0 && (x < 0) != (y < 0)); }
 static inline int64_t floor_div_64(int64_t x, int64_t y) { return x / y - (x % y != 0 && (x < 0) != (y < 0)); }
@@ -69,8 +79,12 @@ static inline int64_t floor_mod_64(int64_t x, int64_t y) { return x - y * floor_
 """
 
 
-def translate(roots: Sequence[Callable[..., Any]], name: str) -> tuple[str, str]:
+def translate(
+    roots: Sequence[Callable[..., Any]], name: str, by_hand: Sequence[Callable[..., Any]] = ()
+) -> tuple[str, str]:
     """The header and the source of these functions and all that they need; ``name`` is that of the header's file.
+
+    Those ``by_hand`` are left out where ``SKYLESS_BY_HAND`` names a file of C that has them.
 
     Raises:
         RefusedError: something cannot be translated.
@@ -89,15 +103,17 @@ def translate(roots: Sequence[Callable[..., Any]], name: str) -> tuple[str, str]
     ]
     header = [*head, f"#ifndef {name.upper()}_H", f"#define {name.upper()}_H", "", *HEADER.splitlines(), ""]
     header += [*constant_lines(translator.constants), ""]
-    header += [line for made in translator.records.values() for line in record_lines(made)]
+    header += [line for made in translator.records.values() for line in record_lines(made, translator.fields_of(made))]
     header += [line for function in outer for line in wrapped(f"{translator.head(function)};")]
     header += ["", "#endif"]
     source = [*head, f'#include "{name}.h"', "", *HELPERS.splitlines(), "", *result_lines(translator.results)]
     source += [line for function in inner for line in wrapped(f"{translator.head(function)};")]
     before: FunctionType | None = None
     for function in functions:
-        source += ["", *function_lines(translator, function, before)]
+        lines = function_lines(translator, function, before)
+        source += ["", *(["#ifndef SKYLESS_BY_HAND", *lines, "#endif"] if function in by_hand else lines)]
         before = function
+    source += ["", "#ifdef SKYLESS_BY_HAND", "#include SKYLESS_BY_HAND", "#endif"] if by_hand else []
     return "\n".join(header) + "\n", "\n".join(source) + "\n"
 
 
@@ -118,14 +134,14 @@ def in_order(functions: list[FunctionType]) -> list[FunctionType]:
     return sorted(functions, key=lambda one: (ordered.index(one.__module__), one.__code__.co_firstlineno))
 
 
-def constant_lines(constants: dict[str, tuple[Any, str]]) -> list[str]:
+def constant_lines(constants: dict[str, Constant]) -> list[str]:
     lines = []
-    for name, (constant, doc) in sorted(constants.items()):
-        value = literal(constant)
-        lines += [
-            *(comment(doc) if doc else []),
-            f"#define {name} {value.code if value.rank == 20 else f'({value.code})'}",
-        ]
+    for name, one in sorted(constants.items()):
+        value = literal(one.value)
+        code = f"({one.code})" if one.code else value.code if value.rank == 20 else f"({value.code})"
+        lines += comment(one.doc) if one.doc else []
+        defined = [f"#define {name} {code}"]
+        lines += [f"#ifndef {name}", *defined, "#endif"] if one.is_size else defined
     return lines
 
 
@@ -137,17 +153,17 @@ def result_lines(results: dict[str, Results]) -> list[str]:
     return [*lines, ""] if lines else []
 
 
-def record_lines(made: type[Record]) -> list[str]:
+def record_lines(made: type[Record], fields: dict[str, Type]) -> list[str]:
     """The structure of a record."""
     node = source_of(sys.modules[made.__module__]).nodes[made.__name__]
     docs = {}
-    for field, behind in pairwise(node.body):
-        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
-            docs[field.target.id] = doc_of(behind)
+    for declaration, behind in pairwise(node.body):
+        if isinstance(declaration, ast.AnnAssign) and isinstance(declaration.target, ast.Name):
+            docs[declaration.target.id] = doc_of(behind)
     doc = doc_of(node.body[0])
     lines = [*(comment(doc) if doc else []), f"typedef struct {made.__name__} {{"]
-    for name, ctype in made._fields_:  # type: ignore[misc]
-        kind, lengths = type_of(ctype), ""
+    for name, field in fields.items():
+        kind, lengths = field, ""
         while isinstance(kind, Elements):
             lengths, kind = f"{lengths}[{kind.length}]", kind.element
         base = kind.name if isinstance(kind, Number) else kind.made.__name__  # type: ignore[union-attr]

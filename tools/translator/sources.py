@@ -30,6 +30,10 @@ class Source(NamedTuple):
     """Of constants."""
     comments: dict[int, tuple[bool, str]]
     """By line: whether it stands alone, and its text."""
+    values: dict[str, ast.expr]
+    """Of constants."""
+    imported: dict[str, str]
+    """From which modules names are."""
 
 
 def source_of(module: ModuleType, known: dict[str, Source] = {}) -> Source:  # noqa: B006 - a cache
@@ -38,14 +42,20 @@ def source_of(module: ModuleType, known: dict[str, Source] = {}) -> Source:  # n
         text = inspect.getsource(module)
         body = ast.parse(text).body
         nodes = {node.name: node for node in body if isinstance(node, ast.FunctionDef | ast.ClassDef)}
-        docs, comments = {}, {}
+        docs, comments, values = {}, {}, {}
+        imported: dict[str, str] = {}
         for node, behind in pairwise(body):
             if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and (doc := doc_of(behind)):
                 docs[node.target.id] = doc
+        for node in body:
+            if isinstance(node, ast.ImportFrom) and node.module:
+                imported |= {one.name: node.module for one in node.names}
+            elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.value:
+                values[node.target.id] = node.value
         for token in tokenize.generate_tokens(io.StringIO(text).readline):
             if token.type == tokenize.COMMENT and "noqa" not in token.string:
                 comments[token.start[0]] = (not token.line[: token.start[1]].strip(), token.string[1:].strip())
-        known[module.__name__] = Source(module, nodes, docs, comments)
+        known[module.__name__] = Source(module, nodes, docs, comments, values, imported)
     return known[module.__name__]
 
 

@@ -1,6 +1,8 @@
 """Types, and expressions in C that have one."""
 
+from collections.abc import Sequence
 from ctypes import Array, c_bool, c_double, c_int32, c_int64, c_uint8
+from math import isfinite, isnan
 from typing import Any, Final, NamedTuple, get_args, get_origin
 
 from skyless.core.native.records import Record, c_type
@@ -23,10 +25,10 @@ class Struct(NamedTuple):
 
 
 class Elements(NamedTuple):
-    """An array; where it is a parameter, its length is not known."""
+    """An array; its length as C has it, nothing where it is a parameter."""
 
     element: "Type"
-    length: int
+    length: str
 
 
 class Results(NamedTuple):
@@ -39,14 +41,15 @@ class Results(NamedTuple):
 Type = Number | Struct | Elements | Results
 
 
-def type_of(ctype: Any) -> Type:  # noqa: ANN401 - ctypes have no common type
-    """The type of a ctype.
+def type_of(ctype: Any, lengths: Sequence[str] = ()) -> Type:  # noqa: ANN401 - ctypes have no common type
+    """The type of a ctype; of an array with these lengths, or those that it has.
 
     Raises:
         TypeError: C has none for it.
     """
     if isinstance(ctype, type) and issubclass(ctype, Array):
-        return Elements(type_of(ctype._type_), ctype._length_)  # type: ignore[arg-type]
+        length = (lengths and lengths[0]) or str(ctype._length_)
+        return Elements(type_of(ctype._type_, lengths[1:]), length)  # type: ignore[arg-type]
     if isinstance(ctype, type) and issubclass(ctype, Record):
         return Struct(ctype)
     if ctype not in OF_CTYPE:
@@ -69,8 +72,8 @@ def declared(kind: Type, name: str) -> str:
     return f"{base} (*{name}){lengths}" if lengths else f"{base} *{name}"
 
 
-def parameter_type(hint: Any) -> Type:  # noqa: ANN401
-    """The type of an annotation of a parameter or result.
+def parameter_type(hint: Any, lengths: Sequence[str] = ()) -> Type:  # noqa: ANN401
+    """The type of an annotation of a parameter or result, with these lengths.
 
     Raises:
         TypeError: C has none for it.
@@ -83,10 +86,10 @@ def parameter_type(hint: Any) -> Type:  # noqa: ANN401
     origin = get_origin(hint)
     if origin is not None and origin.__name__ in {"Array", "ReadOnly"}:
         element = parameter_type(get_args(hint)[0])
-        if isinstance(element, Elements) and element.length == 0:
+        if isinstance(element, Elements) and not element.length:
             raise TypeError("an array of arrays needs its lengths")
-        return Elements(element, 0)
-    return type_of(c_type(hint))
+        return Elements(element, "")
+    return type_of(c_type(hint), lengths)
 
 
 # Expressions
@@ -133,4 +136,8 @@ def literal(number: float) -> Value:
         kind = INT if -(2**31) <= number < 2**31 else LONG
         code = str(number) if kind == INT else f"INT64_C({number})"
         return Value(code, kind, 20 if number >= 0 else 15)
+    if not isfinite(number):
+        return Value(
+            '(real)__builtin_nan("")' if isnan(number) else f"(real){'-' * (number < 0)}__builtin_inf()", REAL, 15
+        )
     return Value(f"REAL({number!r})", REAL)

@@ -1,14 +1,14 @@
 """Integrity of ``joint``'s fixes: fault tests, protection levels, alerts (``docs/maths.md`` section 8)."""
 
 from collections.abc import Sequence
-from statistics import NormalDist
 from typing import Final
 
 import numpy as np
 from msgspec import Struct
 
 from skyless.core.alert import Alert
-from skyless.core.arrays import Array
+from skyless.core.native.arithmetic import log, sqrt
+from skyless.core.native.tails import normal_quantile
 
 RISK: Final = 1e-4
 
@@ -77,7 +77,7 @@ def integrity_of(levels: Sequence[float], risk: float, height_known: bool, alert
     return Integrity(hpl_m, vpl_m, risk, Alert.LIMIT if exceeded else _ALERTS[state])
 
 
-def limits_of(risk: float = RISK) -> Array:
+def limits_of(risk: float = RISK) -> tuple[float, float]:
     """Multiples of the standard deviation, horizontal and vertical, that errors exceed with this risk, in a fix.
 
     Raises:
@@ -85,4 +85,14 @@ def limits_of(risk: float = RISK) -> Array:
     """
     if not 0.0 < risk <= 0.1:
         raise ValueError(f"risk is {risk!r}; it should be above 0 and at most 0.1")
-    return MARGIN * np.array([np.sqrt(-2.0 * np.log(risk)), -NormalDist().inv_cdf(risk / 2.0)])
+    return horizontal_limit(risk), vertical_limit(risk)
+
+
+def horizontal_limit(risk: float) -> float:
+    """``limits_of`` in the plane."""
+    return MARGIN * sqrt(-2.0 * log(risk))
+
+
+def vertical_limit(risk: float) -> float:
+    """``limits_of`` along one axis."""
+    return MARGIN * normal_quantile(0.5 * risk)

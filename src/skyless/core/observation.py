@@ -36,11 +36,7 @@ class Observation(Struct, frozen=True, gc=False):
     """On the variance of this reception, at least 1: from the radio's diagnostics (``variance_factor``)."""
     packed_relays: bytes = b""
     """More relays, as frames carry them (``codec.packed_relays``)."""
-    anchor_std_m: float | None = None
-    """Standard deviation of each coordinate of the anchor; None to use the site's; for ``joint`` only."""
     phase_cycles: float = -1.0
     """Phase of the carrier as the tag received it, below 0 where it is not known; for ``joint`` only."""
     relay_phases: tuple[float, ...] = ()
     """The same of ``relays``, as anchors received each other."""
-    packed_phases: bool = False
-    """Whether ``packed_relays`` have phases."""

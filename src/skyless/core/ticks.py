@@ -124,8 +124,13 @@ class FixTime(Record):
     last_rx_ticks_tag: Ticks
 
 
-def fix_time_s(time: FixTime, ticks_master: Ticks, rx_ticks_tag: Ticks) -> float:
-    """Time in seconds of a fix that holds at this master time, given the tag's reading for it, both unwrapped."""
+def fix_time_s(time: FixTime, ticks_master: int, rx_ticks_tag: int) -> float:
+    """``fix_time_ticks`` in seconds."""
+    return to_seconds(fix_time_ticks(time, ticks_master, rx_ticks_tag))
+
+
+def fix_time_ticks(time: FixTime, ticks_master: Ticks, rx_ticks_tag: Ticks) -> Ticks:
+    """Time of a fix that holds at this master time, given the tag's reading for it, both unwrapped."""
     if not time.has_fix:
         time.has_fix, time.first_ticks_master = True, ticks_master
     else:
@@ -133,4 +138,4 @@ def fix_time_s(time: FixTime, ticks_master: Ticks, rx_ticks_tag: Ticks) -> float
         if elapsed <= 0 or not may_elapse(gone, elapsed, FLIGHT_SLACK_TICKS):
             time.first_ticks_master += gone - max(elapsed, 1)
     time.last_ticks_master, time.last_rx_ticks_tag = ticks_master, rx_ticks_tag
-    return (ticks_master - time.first_ticks_master) * TICK_S
+    return ticks_master - time.first_ticks_master

@@ -13,14 +13,14 @@ from skyless.core.errors import SkylessError
 from skyless.core.estimator.estimator import Estimator
 from skyless.core.estimator.process import BatchPacket, BatchRow, Place, Relay, take_relays
 from skyless.core.estimator.settings import EstimatorSettings
-from skyless.core.estimator.state import State
+from skyless.core.estimator.state import State, covariances
 from skyless.core.fix import Fix
 from skyless.core.integrity import HPL
 from skyless.core.native.library import SOURCE, source_digest
-from skyless.core.native.records import Record
+from skyless.core.native.records import Record, first
 from skyless.core.native.views import view
-from skyless.core.tag.hearing import Hearing
 from skyless.core.tag.receiver import Receiver
+from skyless.core.tag.tag import Tag
 from skyless.page.task_process import serve_tasks
 from skyless.page.tasks import WhatIfTask
 from skyless.run.mqtt.messages import RawReception, SegmentStart
@@ -117,18 +117,18 @@ class _Tables:
         if not isinstance(receiver, Receiver) or tag.counters["heard"] == heard:
             return
         if self._state is not None:
-            self._add(receiver.hearing, fix, unix_s)
+            self._add(receiver.tag, fix, unix_s)
         elif fix is not None and receiver.method is not None and unix_s >= self._task.begin_unix_s:
             self._begin_s = unix_s - self._task.begin_unix_s
             self._state = _state_at(receiver.method.estimator, receiver.admission.rx_ticks)
 
-    def _add(self, hearing: Hearing, fix: Fix | None, unix_s: float) -> None:
-        packet = hearing.packet
+    def _add(self, heard: Tag, fix: Fix | None, unix_s: float) -> None:
+        packet = heard.packet
         if packet.place.anchor not in self._places:
             self._places[packet.place.anchor] = Place.from_buffer_copy(packet.place)
-        if packet.relay_count == 0:  # the filter has not taken the packet
-            take_relays(packet, hearing.beacon.relays, hearing.beacon.relay_bytes)
-        self._relays += [Relay.from_buffer_copy(packet.relays[k]) for k in range(packet.relay_count)]
+        if heard.relays.count == 0:  # the filter has not taken the packet
+            take_relays(packet, heard.relays, heard.beacon.relays, heard.beacon.relay_bytes)
+        self._relays += [Relay.from_buffer_copy(one) for one in first(heard.relays.rows, heard.relays.count)]
         row = BatchPacket(
             place=list(self._places).index(packet.place.anchor),
             sequence=packet.sequence,
@@ -173,7 +173,7 @@ def _state_at(estimator: Estimator, rx_ticks: int) -> State:
     """A filter without anchors that begins where this one is."""
     settings, dim = estimator.settings, estimator.dim
     fresh = Estimator(settings)
-    covariance = view(estimator.state.P)[:dim, :dim] + _LEAST_STD_M**2 * np.eye(dim)
+    covariance = covariances(estimator.state)[:dim, :dim] + _LEAST_STD_M**2 * np.eye(dim)
     fresh.start(rx_ticks, estimator.position_m(), covariance, settings.start_speed_std_mps**2)
     return fresh.state
 

@@ -12,8 +12,8 @@ from msgspec.structs import replace
 
 from skyless.core.arrays import Matrix
 from skyless.core.method_names import FILTERS
+from skyless.core.native.sizes import MAX_ANCHORS_IN_USE
 from skyless.core.protocols import superframe_s as period_s
-from skyless.core.tag.selection import MAX_ANCHORS_IN_USE
 from skyless.sim.evaluation.fleet import Fleet, FleetSettings
 from skyless.sim.evaluation.scenarios import Request, impairments_of, stated_room
 from skyless.sim.trajectory import Static

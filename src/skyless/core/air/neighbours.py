@@ -3,10 +3,8 @@
 from typing import Annotated, Final
 
 from skyless.core.native.records import Array, Integers, Record, Ticks, record
+from skyless.core.native.sizes import MAX_NEIGHBOURS
 from skyless.core.ticks import NEVER, from_seconds
-
-MAX_NEIGHBOURS: Final = 256
-"""More anchors than there are in reach: forged ones cannot use more memory."""
 
 RELAYED_TICKS: Final = from_seconds(2.0)
 """A reception by an anchor in use, or by one that is confirmed itself, confirms its sender for this time."""
@@ -54,6 +52,8 @@ class Neighbour(Record):
     has_other: bool
     other: StatedPlace
     """Another one, stated once; used when it is stated twice in a row."""
+    has_moved: bool
+    """Whether it has stated another position than before, until all anchors are used together again."""
     # What others state of it
     was_relayed: bool
     """Whether others had received it at its newest frame."""
@@ -140,6 +140,19 @@ def forget_times(t: Neighbours) -> None:
     """The receiver's counter has restarted: who was received when is not known any more."""
     t.has_newest = False
     for row in range(t.count):
-        n = t.rows[row]
-        n.frames, n.impossible, n.has_rival, n.was_relayed = 0, 0, False, False
-        n.relayed_ticks = n.own_relays_ticks = n.used_ticks = n.changed_ticks = NEVER
+        _forget_row(t.rows[row])
+
+
+def wake_times(t: Neighbours, rx_ticks: Ticks, rx_counter: Ticks) -> None:
+    """The same after a sleep from ``rx_ticks`` on: who was confirmed then counts as confirmed at ``rx_counter``."""
+    t.has_newest = False
+    for row in range(t.count):
+        was_confirmed = is_confirmed(t.rows[row], rx_ticks)
+        _forget_row(t.rows[row])
+        if was_confirmed:
+            t.rows[row].relayed_ticks = rx_counter
+
+
+def _forget_row(n: Neighbour) -> None:
+    n.frames, n.impossible, n.has_rival, n.was_relayed = 0, 0, False, False
+    n.relayed_ticks = n.own_relays_ticks = n.used_ticks = n.changed_ticks = NEVER

@@ -2,8 +2,8 @@
 
 from typing import Final
 
-from skyless.core.air.little_endian import unsigned
-from skyless.core.native.records import Bytes, Ticks
+from skyless.core.air.little_endian import SIGN, signed, unsigned
+from skyless.core.native.records import Bytes
 
 PAGE_BYTES: Final = 17
 """A type, then 16 bytes of contents."""
@@ -22,16 +22,18 @@ MAX_SUPERFRAME_TICKS: Final = (1 << 39) - 1
 CIRCLE: Final = 3_600_000_000
 """A whole turn in steps of 1e-7 degree."""
 
+STD_STEPS_PER_M: Final = 10_000
+STEPS_PER_M: Final = 100
+STEPS_PER_S: Final = 10
+"""Units of an accuracy page: of standard deviations, of its distance and of its time."""
+
+HEIGHT_GIVEN: Final = 0x01
+"""The flag of a site or schedule page with the height of the tags."""
+HEIGHT_FLAG_AT: Final = 8
+"""Where it stands in a site page; the height follows."""
+
 _MAX_NOISE_BITS: Final = 0x36000000
 """2⁻¹⁹ as a float32: those from 0 on are in the order of their bits."""
-_SIGN: Final = 0x80000000
-"""The highest of four bytes' bits; as a float32 alone it is −0."""
-
-
-def _signed(data: Bytes, at: int) -> Ticks:
-    """The same of a number of four bytes that may be negative."""
-    number = unsigned(data, at, 4)
-    return number if number < _SIGN else number - 2 * _SIGN
 
 
 def is_possible_page(data: Bytes, at: int) -> bool:  # noqa: PLR0911 - one for each type
@@ -50,19 +52,19 @@ def is_possible_page(data: Bytes, at: int) -> bool:  # noqa: PLR0911 - one for e
             _is_noise(data, at + 1) and _is_noise(data, at + 5) and _is_noise(data, at + 9) and _is_noise(data, at + 13)
         )
     if kind == GEOREFERENCE_PAGE:
-        is_on_earth = abs(_signed(data, at + 1)) <= CIRCLE // 4 and abs(_signed(data, at + 5)) <= CIRCLE // 2
+        is_on_earth = abs(signed(data, at + 1)) <= CIRCLE // 4 and abs(signed(data, at + 5)) <= CIRCLE // 2
         return is_on_earth and _is_coordinate(data, at + 9) and unsigned(data, at + 13, 4) < CIRCLE
     if kind == ACCURACY_PAGE:
         return unsigned(data, at + 9, 2) > 0 and unsigned(data, at + 11, 2) > 0
     if kind == SITE_PAGE:
-        return data[at + 1] > 0 and _is_coordinate(data, at + 9)
+        return data[at + 1] > 0 and _is_coordinate(data, at + HEIGHT_FLAG_AT + 1)
     return True
 
 
 def _is_coordinate(data: Bytes, at: int) -> bool:
-    return abs(_signed(data, at)) <= MAX_COORDINATE_MM
+    return abs(signed(data, at)) <= MAX_COORDINATE_MM
 
 
 def _is_noise(data: Bytes, at: int) -> bool:
     bits = unsigned(data, at, 4)
-    return bits <= _MAX_NOISE_BITS or bits == _SIGN
+    return bits <= _MAX_NOISE_BITS or bits == SIGN

@@ -21,6 +21,7 @@ from skyless.core.air.page_check import (
     ANCHOR_PAGE,
     CIRCLE,
     GEOREFERENCE_PAGE,
+    HEIGHT_GIVEN,
     KEY_PAGE,
     MAX_COORDINATE_MM,
     MAX_SUPERFRAME_TICKS,
@@ -28,6 +29,9 @@ from skyless.core.air.page_check import (
     PAGE_BYTES,
     SCHEDULE_PAGE,
     SITE_PAGE,
+    STD_STEPS_PER_M,
+    STEPS_PER_M,
+    STEPS_PER_S,
     is_possible_page,
 )
 
@@ -41,12 +45,6 @@ _NOISE: Final = struct.Struct("<Bffff")
 _GEOREFERENCE: Final = struct.Struct("<BiiiI")
 _ACCURACY: Final = struct.Struct("<BHHHHHH4x")
 _SITE: Final = struct.Struct("<BB6xBi4x")
-
-
-_HEIGHT_GIVEN: Final = 0x01
-_STD_STEPS_PER_M: Final = 10_000
-_DISTANCE_STEPS_PER_M: Final = 100
-_TIME_STEPS_PER_S: Final = 10
 
 
 @lru_cache(maxsize=1024)
@@ -115,7 +113,7 @@ def _encode_schedule(page: SchedulePage) -> bytes:
         frames_per_node,
         _whole("SchedulePage.master", page.master, 0, 0xFFFF),
         _whole("SchedulePage.anchors", page.anchors, 1, slots // frames_per_node),
-        0 if height_m is None else _HEIGHT_GIVEN,
+        0 if height_m is None else HEIGHT_GIVEN,
         0 if height_m is None else _millimetres("SchedulePage.tag_height_m", height_m),
     )
 
@@ -143,12 +141,12 @@ def _encode_georeference(page: GeoreferencePage) -> bytes:
 def _encode_accuracy(page: AccuracyPage) -> bytes:
     return _ACCURACY.pack(
         ACCURACY_PAGE,
-        _steps("AccuracyPage.survey_std_m", page.survey_std_m, _STD_STEPS_PER_M),
-        _steps("AccuracyPage.range_std_m", page.range_std_m, _STD_STEPS_PER_M),
-        _steps("AccuracyPage.slope_std_m", page.slope_std_m, _STD_STEPS_PER_M),
-        _steps("AccuracyPage.place_std_m", page.place_std_m, _STD_STEPS_PER_M),
-        _steps("AccuracyPage.place_distance_m", page.place_distance_m, _DISTANCE_STEPS_PER_M, least=1),
-        _steps("AccuracyPage.place_time_s", page.place_time_s, _TIME_STEPS_PER_S, least=1),
+        _steps("AccuracyPage.survey_std_m", page.survey_std_m, STD_STEPS_PER_M),
+        _steps("AccuracyPage.range_std_m", page.range_std_m, STD_STEPS_PER_M),
+        _steps("AccuracyPage.slope_std_m", page.slope_std_m, STD_STEPS_PER_M),
+        _steps("AccuracyPage.place_std_m", page.place_std_m, STD_STEPS_PER_M),
+        _steps("AccuracyPage.place_distance_m", page.place_distance_m, STEPS_PER_M, least=1),
+        _steps("AccuracyPage.place_time_s", page.place_time_s, STEPS_PER_S, least=1),
     )
 
 
@@ -157,7 +155,7 @@ def _encode_site(page: SitePage) -> bytes:
     return _SITE.pack(
         SITE_PAGE,
         _whole("SitePage.pages", page.pages, 1, 0xFF),
-        0 if height_m is None else _HEIGHT_GIVEN,
+        0 if height_m is None else HEIGHT_GIVEN,
         0 if height_m is None else _millimetres("SitePage.tag_height_m", height_m),
     )
 
@@ -175,7 +173,7 @@ def _decode_anchor(data: bytes) -> AnchorPage:
 
 def _decode_schedule(data: bytes) -> SchedulePage:
     _, slot_ticks, slots, frames_per_node, master, anchors, flags, height_mm = _SCHEDULE.unpack(data)
-    height_m = height_mm / 1000 if flags & _HEIGHT_GIVEN else None
+    height_m = height_mm / 1000 if flags & HEIGHT_GIVEN else None
     return SchedulePage(slot_ticks, slots, frames_per_node, master, anchors, height_m)
 
 
@@ -192,14 +190,14 @@ def _decode_georeference(data: bytes) -> GeoreferencePage:
 
 def _decode_accuracy(data: bytes) -> AccuracyPage:
     _, *stds, distance, time = _ACCURACY.unpack(data)
-    survey_m, range_m, slope_m, place_m = (std / _STD_STEPS_PER_M for std in stds)
-    distance_m, time_s = distance / _DISTANCE_STEPS_PER_M, time / _TIME_STEPS_PER_S
+    survey_m, range_m, slope_m, place_m = (std / STD_STEPS_PER_M for std in stds)
+    distance_m, time_s = distance / STEPS_PER_M, time / STEPS_PER_S
     return AccuracyPage(survey_m, range_m, slope_m, place_m, distance_m, time_s)
 
 
 def _decode_site(data: bytes) -> SitePage:
     _, pages, flags, height_mm = _SITE.unpack(data)
-    return SitePage(pages, height_mm / 1000 if flags & _HEIGHT_GIVEN else None)
+    return SitePage(pages, height_mm / 1000 if flags & HEIGHT_GIVEN else None)
 
 
 _ENCODERS: Final[dict[type, Callable[[Any], bytes]]] = {

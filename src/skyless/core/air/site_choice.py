@@ -3,6 +3,7 @@
 from typing import Annotated, Final
 
 from skyless.core.native.records import Array, Integers, Record, Ticks, record
+from skyless.core.native.sizes import MAX_COUNTED, MAX_SITES
 from skyless.core.ticks import from_seconds
 
 SITE_SILENCE_TICKS: Final = from_seconds(2.0)
@@ -16,10 +17,6 @@ MIN_ANCHORS: Final = 3
 
 PRESENT_TICKS: Final = from_seconds(1.0)
 """Anchors received within this time count."""
-
-MAX_SITES: Final = 8
-MAX_COUNTED: Final = 32
-"""Largest number of anchors of one site that is counted."""
 
 
 FOREIGN, USED, CHANGED = range(3)

@@ -4,9 +4,10 @@ from skyless.core.estimator import levels, process, state, steady_state
 from skyless.core.native.library import compiled
 
 add_anchor = compiled(state.add_anchor)
-remove_anchor = compiled(state.remove_anchor)
+restart = compiled(state.restart)
 find_anchor = compiled(state.find_anchor)
 fit_plane = compiled(levels.fit_plane)
+leave = compiled(process.leave)
 process_frame = compiled(process.process_frame)
 process_difference = compiled(process.process_difference)
 process_height = compiled(process.process_height)

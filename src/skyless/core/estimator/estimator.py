@@ -1,6 +1,6 @@
 """The estimator of one tag as Python uses it: packet by packet, or many in one compiled loop, with the same bits."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from math import sqrt
 from typing import Annotated, Any, Final
 
@@ -10,26 +10,28 @@ from numpy.typing import NDArray
 
 from skyless.core.arrays import Integers, Matrix, Vector
 from skyless.core.estimator import compiled
-from skyless.core.estimator.compiled import add_anchor, find_anchor, fit_plane, remove_anchor
+from skyless.core.estimator.compiled import add_anchor, find_anchor, fit_plane, restart
 from skyless.core.estimator.process import (
-    MAX_RELAYS,
     REJECTED,
     BatchPacket,
     BatchRow,
     Packet,
     Place,
     Relay,
+    Relays,
 )
 from skyless.core.estimator.saved import packed_state, unpacked_state
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.estimator.state import (
     ALL_RANGE_ERRORS,
-    LASTING,
     State,
+    at,
+    covariances,
     make_uncertain,
     new_state,
 )
-from skyless.core.estimator.verdicts import has_phase, is_late_often, rejects_most
+from skyless.core.estimator.verdicts import has_phase, horizontal_variance_m2, is_late_often, rejects_most
+from skyless.core.native.sizes import MAX_RELAYS
 from skyless.core.native.views import records, view
 from skyless.core.ticks import NEVER
 
@@ -71,10 +73,9 @@ class Packets(Struct, frozen=True):
 class SavedEstimator(Struct, frozen=True):
     """An ``Estimator`` in plain values: the anchors that it knows, and its state as bytes."""
 
-    anchors: Annotated[tuple[tuple[int, float, float, float, float | None], ...], Meta(max_length=MAX_ANCHORS_KNOWN)]
-    """Identifier and position of each anchor, and the standard deviation of its coordinates where that is its own."""
-    misfits: tuple[int, ...]
-    state: bytes
+    anchors: Annotated[tuple[tuple[int, float, float, float], ...], Meta(max_length=MAX_ANCHORS_KNOWN)]
+    """Identifier and position of each anchor."""
+    state: bytes | None
 
 
 class Estimator:
@@ -82,39 +83,46 @@ class Estimator:
 
     def __init__(self, settings: EstimatorSettings, anchors_m: Matrix | None = None) -> None:
         """``anchors_m``: positions of anchors with identifiers 0, 1, …, shape (n, 3); ``know_anchor`` adds others."""
-        self.settings = settings
-        self.dim = settings.dim
         self._known: dict[int, tuple[Vector, Place]] = {}
         """The position of each anchor as it was given, and with what the filter needs besides."""
-        self._misfits: frozenset[int] = frozenset()
-        self._packet = Packet()
+        self._packet, self._relays = Packet(), Relays()
         self._state = new_state(settings)
         for anchor, position_m in enumerate([] if anchors_m is None else anchors_m):
             self.know_anchor(anchor, position_m)
 
-    def save(self) -> SavedEstimator:
-        """All that ``restore`` needs to continue with the same bits."""
+    def save(self, has_state: bool) -> SavedEstimator:
+        """All that ``restore`` needs to continue with the same bits; ``has_state``: whether it has started."""
         places = (place for _, place in self._known.values())
-        anchors = tuple((one.anchor, *one.position_m, one.std_m if one.std_m >= 0.0 else None) for one in places)
-        return SavedEstimator(anchors, tuple(self._misfits), packed_state(self._state))
+        anchors = tuple((one.anchor, *one.position_m) for one in places)
+        return SavedEstimator(anchors, packed_state(self._state) if has_state else None)
 
-    def restore(self, saved: SavedEstimator) -> None:
-        """Continue from what an estimator with the same settings has saved.
+    def restore(self, saved: SavedEstimator, settings: EstimatorSettings) -> None:
+        """Continue from what an estimator with these settings has saved.
 
         Raises:
             ValueError: it is no state of an estimator.
         """
-        self._misfits = frozenset(saved.misfits)
-        for anchor, x_m, y_m, z_m, std_m in saved.anchors:
-            self.know_anchor(anchor, np.array((x_m, y_m, z_m)), std_m)
+        for anchor, *position_m in saved.anchors:
+            self.know_anchor(anchor, np.array(position_m))
         if len(self._known) != len(saved.anchors):
             raise ValueError("the estimator knows an anchor twice")
-        self._state = unpacked_state(self.settings, saved.state)
+        if saved.state is not None:
+            self._state = unpacked_state(settings, saved.state)
 
     @property
     def state(self) -> State:
-        """All states and counters; others after a start."""
+        """All states and counters; others after ``restore``."""
         return self._state
+
+    @property
+    def settings(self) -> EstimatorSettings:
+        """What it assumes."""
+        return self._state.settings
+
+    @property
+    def dim(self) -> int:
+        """Dimensions of the position."""
+        return self._state.dim
 
     @property
     def rows(self) -> bytes:
@@ -124,26 +132,19 @@ class Estimator:
 
     # Anchors
 
-    def know_anchor(self, anchor: int, position_m: Vector, std_m: float | None = None) -> None:
+    def know_anchor(self, anchor: int, position_m: Vector) -> None:
         """Note where an anchor stands, which may have moved, before it is used.
 
-        ``position_m``, shape (3,), counts as unchanged as long as it is the same array. ``std_m`` is that of each
-        coordinate, None for that of the settings; it counts when the anchor joins.
+        ``position_m``, shape (3,), counts as unchanged as long as it is the same array.
         """
         known = self._known.get(anchor)
         if known is not None and known[0] is position_m:
             return
         if known is None and len(self._known) >= MAX_ANCHORS_KNOWN:  # a tag on its way through a large site
             del self._known[next(one for one in self._known if not self.has_anchor(one))]
-            self._misfits &= self._known.keys()
-        place = Place(anchor=anchor, std_m=-1.0 if std_m is None else std_m, is_open=anchor in self._misfits)
+        place = Place(anchor=anchor, std_m=-1.0)
         place.position_m[0], place.position_m[1], place.position_m[2] = map(float, position_m)
         self._known[anchor] = position_m, place
-
-    @property
-    def misfits(self) -> frozenset[int]:
-        """Identifiers of the anchors that contradicted the others at the start."""
-        return self._misfits
 
     @property
     def known_anchors(self) -> tuple[int, ...]:
@@ -161,10 +162,7 @@ class Estimator:
 
     def remove_anchor(self, anchor: int) -> None:
         """Let an anchor leave the state, if it is there."""
-        index = find_anchor(self._state, anchor)
-        if index >= 0:
-            remove_anchor(self._state, index)
-            fit_plane(self._state)
+        compiled.leave(self._state, anchor)
 
     # Starts
 
@@ -178,8 +176,8 @@ class Estimator:
         change, constant = s.layout.change + index, s.layout.constant + index
         staying_m = late_m if may_stay else 0.0
         s.x[change], s.x[constant] = late_m - TUNING.staying_share * staying_m, TUNING.staying_share * staying_m
-        s.P[change][change] += variance_m2
-        s.P[constant][constant] += (TUNING.staying_std * staying_m) ** 2
+        s.P[at(change, change)] += variance_m2
+        s.P[at(constant, constant)] += (TUNING.staying_std * staying_m) ** 2
         make_uncertain(s, ALL_RANGE_ERRORS)
 
     def withhold_levels(self, are_withheld: bool = True) -> None:
@@ -192,28 +190,16 @@ class Estimator:
         position_m: Vector,
         covariance_m2: Matrix,
         speed_variance: float,
-        has_open_ranges: bool = False,
-        fault_std_m: float = TUNING.lasting_std_m,
-        misfitting: Iterable[int] = (),
     ) -> None:
-        """Start at a position, shapes (dim,) and (dim, dim), without any anchor; the share of late packets is kept.
-
-        ``has_open_ranges``: expect ranges to be wrong by half a metre and anchors to be misplaced, since what
-        the settings assume of them has been contradicted. ``misfitting``: do so of these anchors alone.
-        ``fault_std_m``: of range errors of all anchors that the levels are to cover.
-        """
-        s, dim = new_state(self.settings, has_open_ranges=has_open_ranges), self.dim
-        s.status.late_share = self._state.status.late_share
-        s.status.fault_std_m[LASTING] = fault_std_m
-        self._misfits = frozenset(misfitting)
-        for anchor, (_, place) in self._known.items():
-            place.is_open = anchor in self._misfits
+        """Start at a position, shapes (dim,) and (dim, dim), without any anchor; the share of late packets is kept."""
+        s, dim = self._state, self.dim
+        restart(s, rx_ticks, s.status.late_share, TUNING.lasting_std_m, False)
         view(s.x)[:dim] = position_m
-        view(s.P)[:dim, :dim] = covariance_m2
+        for one in range(dim):
+            for other in range(dim):
+                s.P[at(one, other)] = covariance_m2[one, other]
         for axis in range(dim, 2 * dim):
-            s.P[axis][axis] = speed_variance
-        s.status.epoch_ticks = s.status.start_ticks = s.status.faded_ticks = rx_ticks
-        self._state = s
+            s.P[at(axis, axis)] = speed_variance
 
     # Measurements
 
@@ -236,8 +222,8 @@ class Estimator:
         (``codec.packed_relays``); ``variance_factor``: on the variance of the tag's reception; ``phase_cycles``:
         of the carrier as the tag received it, in [0, 1), below 0 where it is not known.
         """
-        packet = self.packet_of(anchor, sequence, rx_ticks, tx_ticks, relays, report, variance_factor, phase_cycles)
-        return compiled.process_frame(self._state, packet, packed, len(packed))
+        given = self.packet_of(anchor, sequence, rx_ticks, tx_ticks, relays, report, variance_factor, phase_cycles)
+        return compiled.process_frame(self._state, *given, packed, len(packed))
 
     def packet_of(
         self,
@@ -250,22 +236,22 @@ class Estimator:
         variance_factor: float = 1.0,
         phase_cycles: float = -1.0,
         relay_phases: Sequence[float] = (),
-    ) -> Packet:
+    ) -> tuple[Packet, Relays]:
         """A packet of a known anchor as compiled functions take it, in the same memory each time; see ``process``."""
-        packet = self._packet
+        packet, taken = self._packet, self._relays
         packet.place = self._known[anchor][1]
         packet.sequence, packet.rx_ticks, packet.tx_ticks = sequence, rx_ticks, tx_ticks
         packet.variance_factor = variance_factor
         packet.has_phase, packet.phase_cycles = phase_cycles >= 0.0, phase_cycles
         packet.master, packet.subticks = report.master, report.subticks
         packet.report_variance_m2 = report.variance_m2
-        packet.relay_count = min(len(relays), MAX_RELAYS)
-        for relayed, (sender, number, stamp) in zip(packet.relays, relays, strict=False):
+        taken.count = min(len(relays), MAX_RELAYS)
+        for relayed, (sender, number, stamp) in zip(taken.rows, relays, strict=False):
             relayed.listener, relayed.anchor, relayed.sequence, relayed.rx_ticks = anchor, sender, number, stamp
             relayed.is_short = relayed.has_phase = False
-        for relayed, cycles in zip(packet.relays, relay_phases, strict=False):
+        for relayed, cycles in zip(taken.rows, relay_phases, strict=False):
             relayed.has_phase, relayed.phase_cycles = cycles >= 0.0, cycles
-        return packet
+        return packet, taken
 
     def process_difference(self, a: int, b: int, rx_ticks: int, difference_m: float) -> int:
         """Process a ready-made difference of ranges, to anchor b less to anchor a; as ``process``."""
@@ -337,16 +323,11 @@ class Estimator:
         """Position and velocity at the newest packet, shape (2·dim,), and their covariance."""
         dim, velocity = self.dim, self._state.layout.velocity
         states = [*range(dim), *range(velocity, velocity + dim)]
-        return view(self._state.x)[states], view(self._state.P)[np.ix_(states, states)]
+        return view(self._state.x)[states], covariances(self._state)[np.ix_(states, states)]
 
     def horizontal_variance_m2(self, ahead_s: float) -> float:
         """Sum of the variances of x and y ``ahead_s`` later, if nothing is received until then."""
-        s, velocity = self._state, self._state.layout.velocity
-        total = 2.0 * self.settings.qa * s.status.q_scale * ahead_s**3 / 3.0
-        for axis in range(2):
-            speed = velocity + axis
-            total += s.P[axis][axis] + ahead_s * (2.0 * s.P[axis][speed] + ahead_s * s.P[speed][speed])
-        return total
+        return horizontal_variance_m2(self._state, ahead_s)
 
     def clock(self, anchor: int) -> tuple[int, float, float] | None:
         """The tag's clock less that of an anchor in the state: whole ticks, the rest in metres, rate in m/s."""

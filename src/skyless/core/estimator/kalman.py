@@ -9,13 +9,17 @@ from skyless.core.constants import TICK_S
 from skyless.core.estimator.state import (
     CHANGING_RANGE_ERRORS,
     FAULT_KINDS,
-    MOST_WAITING,
     State,
+    at,
     learn_lasting,
     make_uncertain,
+    row_end,
+    row_of,
+    set_covariance,
 )
 from skyless.core.native.arithmetic import exp, sqrt, square
 from skyless.core.native.records import Reals, Ticks
+from skyless.core.native.sizes import MOST_WAITING, PACKED
 
 LONGEST_S: Final = 1000.0
 """The longest time update: of more, squares of variances are no numbers in single precision."""
@@ -54,7 +58,7 @@ def predict(s: State, rx_ticks: Ticks) -> None:
         _add_noise(s, offset, offset, white_m2 + walk * cube_s, walk * square_s, walk * dt)
     walk = settings.walk * status.walk_scale
     for one in range(where.offset, where.velocity):
-        for other in range(where.offset, where.velocity):
+        for other in range(where.offset, one + 1):
             _add_noise(s, one, other, white_m2 + walk * cube_s, walk * square_s, walk * dt)
     status.epoch_ticks = rx_ticks
 
@@ -75,26 +79,47 @@ def _advance(s: State, dt: float) -> None:
         effects, of_rate = s.V[value], s.V[values + value]
         for fault in range(s.rows):
             effects[fault] += dt * of_rate[fault]
+    if PACKED:
+        _advance_packed(s, values, dt)
+        return
     for state in range(s.used):
-        row = s.P[state]
+        row = row_of(state)
         for value in range(values):
-            row[value] += dt * row[values + value]
+            s.P[row + value] += dt * s.P[row + values + value]
     for value in range(values):
-        row, rates = s.P[value], s.P[values + value]
+        row, rates = row_of(value), row_of(values + value)
         for state in range(s.n):
-            row[state] += dt * rates[state]
+            s.P[row + state] += dt * s.P[rates + state]
     for value in range(values):
         for other in range(value):
-            s.P[value][other] = s.P[other][value]
+            s.P[at(value, other)] = s.P[at(other, value)]
+
+
+def _advance_packed(s: State, values: int, dt: float) -> None:
+    """The same for the lower triangle: of values among each other in two steps, between which their rates change."""
+    for value in range(values):
+        row, rates = row_of(value), row_of(values + value)
+        for other in range(value + 1):
+            s.P[row + other] += dt * s.P[rates + other]
+    for state in range(values, s.used):
+        row, within = row_of(state), max(min(values, state - values + 1), 0)
+        for value in range(within):
+            s.P[row + value] += dt * s.P[row + values + value]
+        for value in range(within, values):
+            s.P[row + value] += dt * s.P[row_of(values + value) + state]
+    for value in range(values):
+        for other in range(value + 1):
+            s.P[at(value, other)] += dt * s.P[at(values + other, value)]
 
 
 def _add_noise(s: State, value: int, other: int, of_values: float, of_both: float, of_rates: float) -> None:
     """Q of a value and its rate, or what two such pairs have in common: white noise of values, walk of rates."""
     rate, other_rate = s.layout.velocity + value, s.layout.velocity + other
-    s.P[value][other] += of_values
-    s.P[value][other_rate] += of_both
-    s.P[rate][other] += of_both
-    s.P[rate][other_rate] += of_rates
+    set_covariance(s, value, other, s.P[at(value, other)] + of_values)
+    set_covariance(s, rate, other, s.P[at(rate, other)] + of_both)
+    if value != other:
+        set_covariance(s, value, other_rate, s.P[at(value, other_rate)] + of_both)
+    set_covariance(s, rate, other_rate, s.P[at(rate, other_rate)] + of_rates)
 
 
 # Range errors that change
@@ -143,12 +168,9 @@ def relax_range_error(s: State, anchor: int, dt: float, walked_m: float) -> None
 def _decay(s: State, state: int, kept: float, variance: float) -> None:
     """A state decays towards zero and keeps, in the long run, that variance: Gauss–Markov."""
     s.x[state] *= kept
-    row = s.P[state]
-    for other in range(s.n):
-        row[other] *= kept
     for other in range(s.used):
-        s.P[other][state] = row[other]
-    row[state] = kept * row[state] + (1.0 - kept * kept) * variance
+        set_covariance(s, state, other, s.P[at(state, other)] * kept)
+    s.P[at(state, state)] = kept * s.P[at(state, state)] + (1.0 - kept * kept) * variance
     for fault in range(s.rows):
         s.V[state][fault] *= kept
 
@@ -156,10 +178,9 @@ def _decay(s: State, state: int, kept: float, variance: float) -> None:
 def reset_state(s: State, state: int, variance: float) -> None:
     """Forget a state: zero, uncorrelated, with that variance."""
     s.x[state] = 0.0
-    for other in range(s.n):
-        s.P[state][other] = 0.0
-        s.P[other][state] = 0.0
-    s.P[state][state] = variance
+    for other in range(s.used):
+        set_covariance(s, state, other, 0.0)
+    s.P[at(state, state)] = variance
     for fault in range(s.rows):
         s.V[state][fault] = 0.0
 
@@ -168,8 +189,9 @@ def open_direction(s: State, variance: float, faults: int) -> None:
     """Let what was taken for known err along the first of ``U``, which holds so much of each fault as ``G`` says."""
     opened, shared = s.U[0], s.G[0]
     for one in range(s.used):
-        for other in range(s.n):
-            s.P[one][other] += opened[one] * opened[other] * variance
+        row = row_of(one)
+        for other in range(row_end(one, s.n)):
+            s.P[row + other] += opened[one] * opened[other] * variance
         for fault in range(faults):
             s.V[one][fault] += shared[fault] * opened[one]
 
@@ -186,9 +208,12 @@ def compute_ph(s: State) -> float:
         ph[state] = 0.0
     for term in range(s.terms):
         if s.h_index[term] < s.n:
-            weight, row = s.h[term], s.P[s.h_index[term]]
-            for state in range(s.n):
-                ph[state] += weight * row[state]
+            weight, index = s.h[term], s.h_index[term]
+            row, end = row_of(index), row_end(index, s.n)
+            for state in range(end):
+                ph[state] += weight * s.P[row + state]
+            for state in range(end, s.n):
+                ph[state] += weight * s.P[row_of(state) + index]
     for one in range(s.waiting):
         weight, u = _h_dot(s, s.U[one]), s.U[one]
         for state in range(s.n):
@@ -263,10 +288,15 @@ def _note_update(s: State, innovation: float, innovation_variance: float, gain_s
 
 def finish_updates(s: State) -> None:
     """Let P, V and M follow the updates that wait."""
-    if s.waiting == 0:
-        return
-    faults, groups = FAULT_KINDS * s.count, _fill_groups(s)
-    for group in range(groups):
+    if s.waiting > 0:
+        _inform(s)
+        _apply_updates(s)
+
+
+def _inform(s: State) -> None:
+    """M ← M + Σ s·sᵀ/S over the updates that wait, of which ``G`` has s/√S."""
+    faults = FAULT_KINDS * s.count
+    for group in range(_fill_groups(s)):
         k = 4 * group
         for fault in range(faults):
             a, b, c, d = s.G[k][fault], s.G[k + 1][fault], s.G[k + 2][fault], s.G[k + 3][fault]
@@ -274,7 +304,6 @@ def finish_updates(s: State) -> None:
                 s.information[fault][other] += (
                     a * s.G[k][other] + b * s.G[k + 1][other] + c * s.G[k + 2][other] + d * s.G[k + 3][other]
                 )
-    _apply_updates(s)
 
 
 def _fill_groups(s: State) -> int:
@@ -301,9 +330,9 @@ def _apply_updates(s: State) -> None:
 
 def _apply_one(s: State, one: int) -> None:
     for state in range(s.used):
-        u = s.U[one][state]
-        for other in range(s.n):
-            s.P[state][other] -= u * s.U[one][other]
+        u, row = s.U[one][state], row_of(state)
+        for other in range(row_end(state, s.n)):
+            s.P[row + other] -= u * s.U[one][other]
         for fault in range(s.rows):
             s.V[state][fault] += u * s.G[one][fault]
 
@@ -311,8 +340,9 @@ def _apply_one(s: State, one: int) -> None:
 def _apply_four(s: State, k: int) -> None:
     for state in range(s.used):
         a, b, c, d = s.U[k][state], s.U[k + 1][state], s.U[k + 2][state], s.U[k + 3][state]
-        for other in range(s.n):
-            s.P[state][other] -= (
+        row = row_of(state)
+        for other in range(row_end(state, s.n)):
+            s.P[row + other] -= (
                 a * s.U[k][other] + b * s.U[k + 1][other] + c * s.U[k + 2][other] + d * s.U[k + 3][other]
             )
         for fault in range(s.rows):

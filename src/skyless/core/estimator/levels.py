@@ -15,7 +15,7 @@ from typing import Final
 from skyless.core.constants import TICK_S
 from skyless.core.estimator.faults import fault_chi2, whiten
 from skyless.core.estimator.monitor import covariance_scale, is_warm
-from skyless.core.estimator.state import AXES, FAULT_KINDS, LASTING, State
+from skyless.core.estimator.state import AXES, FAULT_KINDS, LASTING, State, at
 from skyless.core.estimator.verdicts import uses_phases
 from skyless.core.integrity import CONTRADICTED, HPL, OBSTRUCTED, SOUND, UNAVAILABLE, VPL
 from skyless.core.native.arithmetic import hypot, sqrt, square
@@ -38,7 +38,7 @@ def protect(s: State) -> None:
         first = s.count + 1 + (AXES if kind == LASTING else 0)
         of_x, of_y, of_z = s.work[first], s.work[first + 1], s.work[first + 2]
         shift_x, shift_y, shift_z = 0.0, 0.0, 0.0
-        xx, xy, yy, zz = scale * s.P[0][0], scale * s.P[0][1], scale * s.P[1][1], 0.0
+        xx, xy, yy, zz = scale * s.P[at(0, 0)], scale * s.P[at(0, 1)], scale * s.P[at(1, 1)], 0.0
         for one in range(s.count):
             shift_x += x[one] * faults[one]
             shift_y += y[one] * faults[one]
@@ -51,7 +51,7 @@ def protect(s: State) -> None:
         largest = 0.5 * (xx + yy) + sqrt(0.25 * square(xx - yy) + xy * xy)
         levels[HPL] = max(levels[HPL], hypot(shift_x, shift_y) + s.horizontal_k * sqrt(largest))
         if s.dim == 3:
-            levels[VPL] = max(levels[VPL], abs(shift_z) + s.vertical_k * sqrt(scale * s.P[2][2] + zz))
+            levels[VPL] = max(levels[VPL], abs(shift_z) + s.vertical_k * sqrt(scale * s.P[at(2, 2)] + zz))
     squared, up = 0.0, 0.0
     for row in range(FAULT_KINDS * s.count, FAULT_KINDS * s.count + s.dim):
         squared += square(s.V[0][row]) + square(s.V[1][row])
@@ -150,7 +150,7 @@ def is_side_open(s: State) -> bool:
     for axis in range(dim):
         off_m += normal[axis] * (s.x[axis] - status.plane_m[axis])
     image_z_m = s.x[2] - 2.0 * off_m * normal[2]
-    is_near = off_m * off_m * square(normal[2]) <= s.P[2][2]
+    is_near = off_m * off_m * square(normal[2]) <= s.P[at(2, 2)]
     if dim == 3 and not (settings.lowest_m <= image_z_m <= settings.highest_m or is_near):
         return False
     variance = square(settings.range_std_m) + square(settings.survey_std_m) + settings.rx_variance_m2
@@ -209,7 +209,7 @@ def integrity_state(s: State) -> int:
             state = OBSTRUCTED
     was_contradicted = status.fault_std_m[LASTING] > tuning.lasting_std_m  # then none are selected
     limit = tuning.sure_chi2 if was_contradicted else tuning.uncovered_chi2
-    share = sqrt(s.P[0][0] + s.P[1][1]) / max(range_m, 1e-6)  # levels are of first order in it
+    share = sqrt(s.P[at(0, 0)] + s.P[at(1, 1)]) / max(range_m, 1e-6)  # levels are of first order in it
     if status.withholds_levels or largest_test(s) > limit:
         state = CONTRADICTED
     if was_contradicted and (status.epoch_ticks - status.start_ticks) * TICK_S < tuning.contradicted_start_s:

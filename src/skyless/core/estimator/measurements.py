@@ -38,7 +38,16 @@ from skyless.core.estimator.monitor import (
     open_range_error,
     variance_scale,
 )
-from skyless.core.estimator.state import ALL_RANGE_ERRORS, AXES, NO_RANGE_ERRORS, Link, State, make_uncertain
+from skyless.core.estimator.state import (
+    ALL_RANGE_ERRORS,
+    AXES,
+    NO_RANGE_ERRORS,
+    Link,
+    State,
+    at,
+    make_uncertain,
+    set_covariance,
+)
 from skyless.core.native.arithmetic import floor, sqrt, square
 from skyless.core.native.records import Reals, Ticks
 from skyless.core.ticks import TICK_MASK
@@ -113,7 +122,7 @@ def _hold_direction(s: State, anchor: int) -> None:
     for axis in range(s.dim):
         moved_m2 += square(s.x[axis] - a.held_m[axis])
         squared += square(s.x[axis] - a.position_m[axis])
-        variance += s.P[axis][axis]
+        variance += s.P[at(axis, axis)]
     step_m2 = max(min(square(tuning.suspect) * variance, square(tuning.held_max_m)), square(tuning.held_step_m))
     if s.status.range_errors == NO_RANGE_ERRORS:
         step_m2 = 0.0  # ranges leave nothing open that noise could seem to measure
@@ -140,12 +149,12 @@ def _find_curvature_m(s: State, range_m: float, variance: float) -> float:
     """
     across = 0.0
     for axis in range(s.dim):
-        across += s.P[axis][axis]
+        across += s.P[at(axis, axis)]
     least = s.tuning.curvature_share * variance * range_m * range_m
     if 0.5 * across * across >= least:
         for one in range(s.dim):
             for other in range(s.dim):
-                across -= s.h[one] * s.P[one][other] * s.h[other]
+                across -= s.h[one] * s.P[at(one, other)] * s.h[other]
     return 0.5 * across / range_m if 0.5 * across * across >= least else 0.0
 
 
@@ -286,9 +295,8 @@ def open_state(s: State, state: int, own: int, variance: float) -> None:
     """
     compute_fault_input(s, own)
     for other in range(s.n):
-        s.P[other][state] = -s.U[0][other]
-        s.P[state][other] = -s.U[0][other]
-    s.P[state][state] = variance
+        set_covariance(s, state, other, 0.0 - s.U[0][other])
+    s.P[at(state, state)] = variance
     for fault in range(s.rows):
         s.V[state][fault] = s.G[0][fault]
 
@@ -430,7 +438,7 @@ def _survey_pair(s: State, one: int, other: int) -> None:
         reset_state(s, s.layout.change + misplaced, a.change_variance_m2)
         a.is_obstructed = False
     for axis in range(s.dim):
-        s.P[survey + axis][survey + axis] += square(s.tuning.lasting_std_m)
+        s.P[at(survey + axis, survey + axis)] += square(s.tuning.lasting_std_m)
     for anchor in range(s.count):
         if _pair(s, misplaced, anchor).contradicts:
             _pair_range(s, misplaced, anchor)
@@ -474,7 +482,7 @@ def report(s: State, anchor: int, master: int, subticks: Ticks, variance_m2: flo
     own_variance = 0.0
     for one in range(s.terms):
         for other in range(s.terms):
-            own_variance += s.h[one] * s.h[other] * s.P[s.h_index[one]][s.h_index[other]]
+            own_variance += s.h[one] * s.h[other] * s.P[at(s.h_index[one], s.h_index[other])]
     whole = (s.anchors[master].offset_ticks - a.offset_ticks) & TICK_MASK
     off = (subticks - SUBTICKS * whole) & SUBTICK_MASK
     if off > SUBTICK_MASK // 2:
@@ -560,7 +568,7 @@ def _bound_changes(s: State) -> None:
         missing_m = s.settings.earliest_m - s.x[change]
         if missing_m > 0.0:
             for state in range(s.n):
-                s.x[state] += s.P[change][state] / s.P[change][change] * missing_m
+                s.x[state] += s.P[at(change, state)] / s.P[at(change, change)] * missing_m
 
 
 # The tag has a sensor of its height
@@ -579,12 +587,12 @@ def height(s: State, height_m: float, std_m: float, is_barometer: bool) -> int:
     add_term(s, where.height, 1.0)
     if is_barometer:
         zero = where.zero
-        if s.P[zero][zero] == 0.0:
+        if s.P[at(zero, zero)] == 0.0:
             s.x[zero] = innovation
             make_uncertain(s, ALL_RANGE_ERRORS)
-            s.P[zero][zero] = s.tuning.zero_variance_m2
+            s.P[at(zero, zero)] = s.tuning.zero_variance_m2
         else:
-            s.P[zero][zero] += settings.barometer_walk * ((status.epoch_ticks - status.height_ticks) * TICK_S)
+            s.P[at(zero, zero)] += settings.barometer_walk * ((status.epoch_ticks - status.height_ticks) * TICK_S)
         innovation -= s.x[zero]
         add_term(s, zero, 1.0)
     innovation_variance = compute_ph(s) + square(std_m)

@@ -20,7 +20,7 @@ from typing import Final
 
 from skyless.core.estimator.faults import begin_obstruction
 from skyless.core.estimator.kalman import finish_updates, jump_share
-from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, State, make_uncertain
+from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, State, at, make_uncertain
 from skyless.core.native.arithmetic import log, sqrt, square
 
 _ROOT_2_PI: Final = 2.5066282746310002
@@ -81,7 +81,7 @@ def open_range_error(s: State, anchor: int, innovation: float) -> None:
     change = s.layout.change + anchor
     s.status.obstructions += 1
     begin_obstruction(s, anchor)
-    s.P[change][change] += max(square(s.tuning.jump_std_m), innovation * innovation)
+    s.P[at(change, change)] += max(square(s.tuning.jump_std_m), innovation * innovation)
     make_uncertain(s, CHANGING_RANGE_ERRORS)
 
 
@@ -104,7 +104,7 @@ def _is_off_zero(s: State, mean: float) -> bool:
 def end_small_obstruction(s: State, anchor: int) -> None:
     """End an obstruction that has gone without a jump back: the range error is known, and is hardly there."""
     tuning, a, change = s.tuning, s.anchors[anchor], s.layout.change + anchor
-    error_m, variance, usual = s.x[change], s.P[change][change], s.status.place_variance_m2
+    error_m, variance, usual = s.x[change], s.P[at(change, change)], s.status.place_variance_m2
     settled = a.is_obstructed and variance < square(tuning.ended_std_m) + usual
     if settled and error_m * error_m < square(tuning.ended) * (variance + usual):
         a.is_obstructed = False
@@ -150,7 +150,7 @@ def adapt_change_variance(s: State, anchor: int, elapsed_s: float) -> None:
     if memory_s > 0.0:
         finish_updates(s)
         change = s.layout.change + anchor
-        present = square(s.x[change]) + s.P[change][change]
+        present = square(s.x[change]) + s.P[at(change, change)]
         variance = a.change_variance_m2 + min(elapsed_s / memory_s, 0.5) * (present - a.change_variance_m2)
         variance = max(variance, square(settings.least_change_std_m))
         a.change_variance_m2 = min(variance, square(tuning.max_change_std_m))
@@ -192,15 +192,15 @@ def update_stationary(s: State, dt: float) -> None:
     """Count for how long the tag has shown no motion: neither its position, nor innovations that stay on one side."""
     status, tuning, chi2 = s.status, s.tuning, 0.0
     for axis in range(s.dim):
-        chi2 += square(s.x[axis] - status.stationary_m[axis]) / s.P[axis][axis]
+        chi2 += square(s.x[axis] - status.stationary_m[axis]) / s.P[at(axis, axis)]
     status.stationary_s += dt
     moved = chi2 > s.dim or status.lag_square > tuning.lag_limit or status.rejected_in_row > 1
     if moved:
         status.stationary_s = 0.0
     for axis in range(s.dim):  # a place that has become known better moves as well
-        if moved or s.P[axis][axis] < tuning.better_known * status.stationary_m2[axis]:
+        if moved or s.P[at(axis, axis)] < tuning.better_known * status.stationary_m2[axis]:
             status.stationary_m[axis] = s.x[axis]
-            status.stationary_m2[axis] = s.P[axis][axis]
+            status.stationary_m2[axis] = s.P[at(axis, axis)]
 
 
 def adapt_process_noise(s: State, normalised: float) -> None:

@@ -27,7 +27,7 @@ from skyless.core.estimator.measurements import (
     relay_terms,
     relay_variance,
 )
-from skyless.core.estimator.state import Ambiguity, State, use_phases
+from skyless.core.estimator.state import Ambiguity, State, at, set_covariance, use_phases
 from skyless.core.native.arithmetic import floor, log, sqrt, square
 from skyless.core.native.records import Reals, Ticks
 
@@ -51,7 +51,7 @@ def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
     _measure_way(s)
     if a.own.is_known:
         wander = max(tuning.phase_wander * status.phase_variance_m2, s.settings.phase_wander)
-        s.P[ambiguity][ambiguity] += wander * (status.way_m - a.phase_way_m)
+        s.P[at(ambiguity, ambiguity)] += wander * (status.way_m - a.phase_way_m)
     a.phase_way_m = status.way_m
     _follow_line(s)
     expected_m = _phase_terms(s, anchor)
@@ -219,10 +219,11 @@ def _turn(s: State, anchor: int, ambiguity: int) -> None:
 
 def _subtract(s: State, state: int, other: int, weight: float) -> None:
     """A state's error loses so much of that of another."""
+    s.P[at(state, state)] -= weight * s.P[at(other, state)]
     for one in range(s.n):
-        s.P[state][one] -= weight * s.P[other][one]
-    for one in range(s.n):
-        s.P[one][state] -= weight * s.P[one][other]
+        if one != state:
+            set_covariance(s, state, one, s.P[at(state, one)] - weight * s.P[at(other, one)])
+    s.P[at(state, state)] -= weight * s.P[at(state, other)]
     for fault in range(s.rows):
         s.V[state][fault] -= weight * s.V[other][fault]
 
@@ -271,9 +272,8 @@ def _keep_former(s: State, anchor: int) -> None:
     a.has_former, a.former_ticks = True, s.status.epoch_ticks
     s.x[former] = s.x[ambiguity]
     for state in range(s.n):
-        s.P[former][state] = s.P[ambiguity][state]
-    for state in range(s.n):
-        s.P[state][former] = s.P[state][ambiguity]
+        set_covariance(s, former, state, s.P[at(ambiguity, state)])
+    s.P[at(former, former)] = s.P[at(ambiguity, ambiguity)]
     for fault in range(s.rows):
         s.V[former][fault] = s.V[ambiguity][fault]
 
@@ -316,7 +316,7 @@ def known_phase(s: State, anchor: int, walked_m: float) -> None:
     ambiguity = s.layout.ambiguity + anchor
     for axis in range(s.dim):
         s.status.line_m[axis] = s.x[axis]
-    s.P[ambiguity][ambiguity] += s.settings.phase_wander * walked_m
+    s.P[at(ambiguity, ambiguity)] += s.settings.phase_wander * walked_m
     _phase_terms(s, anchor)
     _use_phase(s, ambiguity, s.anchors[anchor].own, 0.0, s.status.phase_variance_m2)
 

@@ -25,24 +25,22 @@ from skyless.core.estimator.phases import close_phases, own_phase, relay_phase
 from skyless.core.estimator.state import (
     AXES,
     LEVELS,
-    PACKETS_KEPT,
     State,
     add_anchor,
+    at,
     find_anchor,
     remove_anchor,
 )
 from skyless.core.fix import POSITION, PROTECTION, QUALITY, VELOCITY
 from skyless.core.integrity import HPL, STATE, VPL
 from skyless.core.native.records import Array, Bytes, Matrix, Reals, Record, Ticks, record
-from skyless.core.native.sizes import MAX_ANCHORS
+from skyless.core.native.sizes import MAX_ANCHORS, MAX_RELAYS, PACKETS_KEPT, PHASE_STATES
 from skyless.core.ticks import nearest
 
 REJECTED, ACCEPTED, JOINED, STALE, RESTARTED_CLOCK = range(5)
 """What became of a packet; after the last its anchor joins again, and the packet is processed again."""
 
 MAX_RATE_MPS: Final = 100e-6 * SPEED_OF_LIGHT_MPS  # between two clocks that are still crystals
-MAX_RELAYS: Final = 32
-"""Most relays with a packet; 13 fit into a frame."""
 
 
 @record
@@ -76,6 +74,15 @@ class Relay(Record):
 
 
 @record
+class ScaledTime(Record):
+    """A TX time on a scale that packets of several anchors have in common."""
+
+    ticks: Ticks
+    fraction_ticks: float
+    variance_m2: float
+
+
+@record
 class Packet(Record):
     """A packet that the tag received; all stamps are unwrapped."""
 
@@ -95,33 +102,51 @@ class Packet(Record):
     subticks: Ticks
     """The anchor's reading less the master's at the packet's TX stamp, modulo 2⁴⁸."""
     report_variance_m2: float
+    is_stated: bool
+    """Whether the anchor states its TX time on the master's scale …"""
+    stated: ScaledTime
+    """… and that time, which only starts use."""
     relays_have_phases: bool
     """Whether its frame carries phases of its relays, and short stamps."""
-    relay_count: int
-    relays: Annotated[Array[Relay], MAX_RELAYS]
+
+
+@record
+class Relays(Record):
+    """What came with a packet."""
+
+    count: int
+    rows: Annotated[Array[Relay], MAX_RELAYS]
+
+
+def leave(s: State, identifier: int) -> None:
+    """Let an anchor leave the state, if it is there."""
+    anchor = find_anchor(s, identifier)
+    if anchor >= 0:
+        remove_anchor(s, anchor)
+        fit_plane(s)
 
 
 # One packet
 
 
-def process(s: State, packet: Packet) -> int:
+def process(s: State, packet: Packet, relays: Relays) -> int:
     """Process a packet and what it relays; returns what became of it, and leaves ``levels`` and ``fix``."""
-    outcome = _process_packet(s, packet)
+    outcome = _process_packet(s, packet, relays)
     fill_fix(s)
     return outcome
 
 
-def process_frame(s: State, packet: Packet, packed: Bytes, packed_bytes: int) -> int:
+def process_frame(s: State, packet: Packet, relays: Relays, packed: Bytes, packed_bytes: int) -> int:
     """``process`` with more relays, as frames carry them."""
-    take_relays(packet, packed, packed_bytes)
-    return process(s, packet)
+    take_relays(packet, relays, packed, packed_bytes)
+    return process(s, packet, relays)
 
 
-def take_relays(packet: Packet, packed: Bytes, packed_bytes: int) -> None:
+def take_relays(packet: Packet, relays: Relays, packed: Bytes, packed_bytes: int) -> None:
     """Add relays as frames carry them to those of a packet, as far as there is space."""
     for begin in range(0, packed_bytes, HEARD_BYTES):
-        if packet.relay_count < MAX_RELAYS:
-            relayed = packet.relays[packet.relay_count]
+        if relays.count < MAX_RELAYS:
+            relayed = relays.rows[relays.count]
             relayed.listener = packet.place.anchor
             relayed.anchor = two_bytes(packed, begin)
             relayed.sequence = packed[begin + 2]
@@ -132,7 +157,7 @@ def take_relays(packet: Packet, packed: Bytes, packed_bytes: int) -> None:
                 relayed.has_phase, relayed.phase_cycles = code >= PHASE_STEPS, (code % PHASE_STEPS) / PHASE_STEPS
             else:
                 relayed.rx_ticks = nearest(unsigned(packed, begin + 3, HEARD_BYTES - 3), packet.tx_ticks)
-            packet.relay_count += 1
+            relays.count += 1
 
 
 def relay_rx_ticks(relayed: Relay, tx_ticks: Ticks, elapsed: Ticks) -> Ticks:
@@ -143,7 +168,7 @@ def relay_rx_ticks(relayed: Relay, tx_ticks: Ticks, elapsed: Ticks) -> Ticks:
     return nearest(relayed.rx_ticks, tx_ticks - elapsed, SHORT_BITS) if relayed.is_short else relayed.rx_ticks
 
 
-def _process_packet(s: State, packet: Packet) -> int:
+def _process_packet(s: State, packet: Packet, relays: Relays) -> int:
     """Process a packet; its anchor joins where it is not in the state."""
     status, place = s.status, packet.place
     if status.packets > 0 and packet.rx_ticks < status.epoch_ticks:
@@ -154,12 +179,12 @@ def _process_packet(s: State, packet: Packet) -> int:
     anchor = _present(s, place)
     if anchor < 0:
         return REJECTED
-    outcome = _process_of(s, anchor, packet)
+    outcome = _process_of(s, anchor, packet, relays)
     if outcome == RESTARTED_CLOCK:
         status.clock_restarts += 1
         remove_anchor(s, anchor)
         anchor = _present(s, place)
-        outcome = _process_of(s, anchor, packet)
+        outcome = _process_of(s, anchor, packet, relays)
     return outcome
 
 
@@ -186,7 +211,7 @@ def _remove_silent(s: State, rx_ticks: Ticks) -> None:
             fit_plane(s)
 
 
-def _process_of(s: State, anchor: int, packet: Packet) -> int:
+def _process_of(s: State, anchor: int, packet: Packet, relays: Relays) -> int:
     """Process a packet of an anchor in the state."""
     status, a, rx_ticks, tx_ticks = s.status, s.anchors[anchor], packet.rx_ticks, packet.tx_ticks
     elapsed_s = (rx_ticks - status.epoch_ticks) * TICK_S
@@ -203,7 +228,7 @@ def _process_of(s: State, anchor: int, packet: Packet) -> int:
         if result == CLOCK_JUMPED:
             return RESTARTED_CLOCK
         outcome = ACCEPTED if result == USED else REJECTED
-        if packet.has_phase and s.settings.carrier_cycles > 0:
+        if PHASE_STATES > 0 and packet.has_phase and s.settings.carrier_cycles > 0:
             if result == USED:
                 own_phase(s, anchor, packet.phase_cycles)
             elif a.outliers_in_row > 1:
@@ -214,8 +239,8 @@ def _process_of(s: State, anchor: int, packet: Packet) -> int:
     if is_known:
         status.relays_lately_accepted *= 1.0 - s.tuning.mean_gain
         status.relays_lately_rejected *= 1.0 - s.tuning.mean_gain
-        for one in range(packet.relay_count):
-            _process_relay(s, packet.relays[one])
+        for one in range(relays.count):
+            _process_relay(s, relays.rows[one])
         finish_updates(s)
         if packet.report_variance_m2 > 0.0 and packet.master >= 0:
             master = find_anchor(s, packet.master)
@@ -275,7 +300,7 @@ def _process_relay(s: State, relayed: Relay) -> None:
         i = s.anchors[listener]
         rx_ticks = relay_rx_ticks(relayed, i.tx_ticks, i.rx_ticks - kept.rx_ticks)
         is_used = relay(s, listener, sender, kept.tx_ticks, kept.rx_ticks, rx_ticks)
-        if is_used and relayed.has_phase and s.status.has_phases:
+        if PHASE_STATES > 0 and is_used and relayed.has_phase and s.status.has_phases:
             relay_phase(s, listener, sender, kept.rx_ticks, relayed.phase_cycles)
 
 
@@ -299,8 +324,8 @@ def fill_fix(s: State) -> None:
         s.fix[POSITION][one] = s.x[one]
         s.fix[VELOCITY][one] = s.x[velocity + one]
         for other in range(s.dim):
-            s.fix[POSITION + 1 + one][other] = scale * s.P[one][other]
-            s.fix[VELOCITY + 1 + one][other] = scale * s.P[velocity + one][velocity + other]
+            s.fix[POSITION + 1 + one][other] = scale * s.P[at(one, other)]
+            s.fix[VELOCITY + 1 + one][other] = scale * s.P[at(velocity + one, velocity + other)]
     if s.dim == 2:
         s.fix[POSITION][2] = s.settings.height_m
     protect(s)
@@ -396,7 +421,7 @@ def track(
     has_levels: bool,
 ) -> None:
     """Process many packets, and write a row for each."""
-    packet = Packet()
+    packet, taken = Packet(), Relays()
     packet.master = -1
     begin = 0
     for one in range(count):
@@ -407,11 +432,11 @@ def track(
         packet.tx_ticks = given.tx_ticks
         packet.variance_factor = given.variance_factor
         packet.has_phase, packet.phase_cycles = given.has_phase, given.phase_cycles
-        packet.relay_count = min(given.end - begin, MAX_RELAYS)
-        for place in range(packet.relay_count):
-            packet.relays[place] = relays[begin + place]
+        taken.count = min(given.end - begin, MAX_RELAYS)
+        for place in range(taken.count):
+            taken.rows[place] = relays[begin + place]
         begin = given.end
-        rows[one].outcome = _process_packet(s, packet)
+        rows[one].outcome = _process_packet(s, packet, taken)
         _fill_row(s, rows[one], has_levels)
 
 
@@ -421,7 +446,7 @@ def _fill_row(s: State, row: BatchRow, has_levels: bool) -> None:
         row.position_m[one] = s.x[one]
         row.velocity_mps[one] = s.x[s.layout.velocity + one]
         for other in range(s.dim):
-            row.covariance_m2[one][other] = s.P[one][other]
+            row.covariance_m2[one][other] = s.P[at(one, other)]
     if has_levels:
         protect(s)
         for level in range(LEVELS):

@@ -13,6 +13,7 @@ from skyless.core.estimator.state import (
     FAULT_KINDS,
     NO_RANGE_ERRORS,
     State,
+    covariances,
     new_state,
     set_layout,
 )
@@ -82,7 +83,7 @@ def _parts(s: State) -> list[NDArray[Any]]:
     return [
         view(s.status),
         view(s.x)[:n],
-        view(s.P)[:n, :n],
+        covariances(s)[:n, :n],
         view(s.V)[:n, : faults + s.dim],
         view(s.information)[:faults, :faults],
         view(s.evidence)[:faults],

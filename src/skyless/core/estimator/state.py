@@ -21,27 +21,35 @@ covariance, so it is left out of all arithmetic (``State.n``), until a jump or a
 behind the states in use is zero.
 """
 
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from skyless.core.estimator.settings import TUNING, EstimatorSettings, Tuning
 from skyless.core.fix import PROTECTED_ROWS
 from skyless.core.integrity import limits_of
 from skyless.core.native.arithmetic import square
 from skyless.core.native.records import Array, Count, Integers, Matrix, Reals, Record, Ticks, record
-from skyless.core.native.sizes import MAX_ANCHORS
-from skyless.core.native.views import aligned
+from skyless.core.native.sizes import (
+    MAX_ANCHORS,
+    MOST_WAITING,
+    PACKED,
+    PACKETS_KEPT,
+    PHASE_STATES,
+    PLANNED_FAULTS,
+    SHARES_MEMORY,
+)
+from skyless.core.native.views import aligned, view
 from skyless.core.ticks import NEVER
 
-PACKETS_KEPT: Final = 16
-"""Packets of each anchor that are kept for relays to come; divides the range of sequence numbers."""
-LANES: Final = 4
-"""Numbers in a vector of 256 bits."""
+LANES: Final = 1 if PACKED else 4
+"""Numbers in a vector of 256 bits, where rows of P begin at one."""
 
 AXES: Final = 3
-STATES: Final = 2 * (AXES + MAX_ANCHORS) + (6 + AXES) * MAX_ANCHORS + 2
+STATES: Final = 2 * (AXES + MAX_ANCHORS) + (3 + PHASE_STATES + AXES) * MAX_ANCHORS + 2
 """Capacity for states; a multiple of ``LANES``."""
-MOST_WAITING: Final = 8
-"""Most updates that wait."""
+COVARIANCES: Final = STATES * (STATES + 1) // 2 if PACKED else STATES * STATES
 MOST_TERMS: Final = 2 * (AXES + 3) + 8
 """Most terms of a measurement: a difference of two distances has the most."""
 
@@ -52,11 +60,10 @@ LASTING, RECENT, CREEPING = range(3)
 """Kinds of faults: there since an anchor joined, begun within its last packets, or growing for seconds."""
 FAULT_KINDS: Final = 3
 FAULTS: Final = FAULT_KINDS * MAX_ANCHORS
-EXTRA_ROWS: Final = 1 + 4 * AXES
-"""Columns of V for what planning adds."""
-SENSITIVITIES: Final = FAULTS + AXES + EXTRA_ROWS
+SENSITIVITIES: Final = FAULTS + AXES + PLANNED_FAULTS
 """Capacity for columns of V."""
 WORK_ROWS: Final = MAX_ANCHORS + 1 + 2 * AXES
+
 
 NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS, ALL_RANGE_ERRORS = range(3)
 """Which range errors are not known to be zero: none, those that change, or all of them, and surveys."""
@@ -157,13 +164,13 @@ class Link(Record):
 
     tx_ticks: Ticks
     """Newest packet of the sender whose reception by the listener was processed."""
+    relays: Count
+    """Used in this direction."""
     constant_m: float
     """Estimated constant of the pair, in the row of the lower index."""
     variance_m2: float
     """Variance of that."""
     outliers_in_row: int
-    relays: Count
-    """Used in this direction."""
     contradicts: bool
     """Whether its range contradicts the survey."""
 
@@ -293,8 +300,8 @@ class State(Record):
     """Everything that the estimator keeps of one tag. What loops run over stands first: its rows fill cache lines."""
 
     x: Annotated[Reals, STATES]
-    P: Annotated[Matrix, STATES, STATES]
-    """Symmetric to the bit."""
+    P: Annotated[Reals, COVARIANCES]
+    """Row by row, symmetric to the bit; see ``at``."""
     V: Annotated[Matrix, STATES, SENSITIVITIES]
     """What faults do to x: of each kind for each metre by which receptions of an anchor are late, then for each m/s² of
     acceleration along an axis, then what planning adds."""
@@ -345,15 +352,86 @@ class State(Record):
     """What a fix carries (``POSITION`` and the following)."""
 
 
-def new_state(settings: EstimatorSettings, *, has_open_ranges: bool = False) -> State:
+# Where the covariances stand
+
+
+def row_of(state: int) -> int:
+    """Where a state's row of P begins."""
+    return state * (state + 1) >> 1 if PACKED else state * STATES
+
+
+def row_end(state: int, end: int) -> int:
+    """How many of the first elements of a row of P there are: all, or those up to the diagonal."""
+    return min(state + 1, end) if PACKED else end
+
+
+def at(one: int, other: int) -> int:
+    """Where the covariance of two states stands in P."""
+    return row_of(other) + one if PACKED and other > one else row_of(one) + other
+
+
+def set_covariance(s: State, one: int, other: int, value: float) -> None:
+    """Write the covariance of two states, in both places where P has two."""
+    s.P[at(one, other)] = value
+    if not PACKED:
+        s.P[at(other, one)] = value
+
+
+def covariances(s: State) -> NDArray[Any]:
+    """P as NumPy sees it, square: a copy where it is packed."""
+    P = view(s.P)
+    states = np.arange(STATES)
+    return P[np.vectorize(at)(*np.ix_(states, states))] if PACKED else P.reshape(STATES, STATES)
+
+
+def new_state(settings: EstimatorSettings) -> State:
     """A state without anchors at the origin; see ``Estimator.start``."""
     s = aligned(State)
     s.settings, s.tuning = settings, TUNING
-    s.horizontal_k, s.vertical_k = limits_of(settings.integrity_risk)[:2]
+    s.horizontal_k, s.vertical_k = limits_of(settings.integrity_risk)
     s.dim = settings.dim
-    s.status.has_open_ranges = has_open_ranges
     prepare(s)
     return s
+
+
+def restart(s: State, rx_ticks: Ticks, late_share: float, fault_std_m: float, has_open_ranges: bool) -> None:
+    """Begin again without anchors at the origin, with the same settings.
+
+    ``fault_std_m``: of range errors of all anchors that the levels are to cover; ``has_open_ranges``: expect ranges to
+    be wrong by half a metre and anchors to be misplaced, since what the settings assume of them has been contradicted.
+    """
+    status = Status()
+    _clear(s)
+    s.status = status
+    s.status.has_open_ranges = has_open_ranges
+    prepare(s)
+    s.status.late_share, s.status.fault_std_m[LASTING] = late_share, fault_std_m
+    s.status.epoch_ticks = s.status.start_ticks = s.status.faded_ticks = rx_ticks
+
+
+def _clear(s: State) -> None:
+    """Forget all states and anchors. What is not in use is zero already, unless a search has used the memory."""
+    states, rows, count = s.layout.end, s.rows, s.count
+    if SHARES_MEMORY:
+        states, rows, count = STATES, SENSITIVITIES, MAX_ANCHORS
+    for state in range(states):
+        s.x[state] = 0.0
+        for other in range(states):
+            s.P[at(state, other)] = 0.0
+        for row in range(rows):
+            s.V[state][row] = 0.0
+    for fault in range(FAULT_KINDS * count):
+        s.evidence[fault] = 0.0
+        for other in range(FAULT_KINDS * count):
+            s.information[fault][other] = 0.0
+    for anchor in range(count):
+        s.lasting_m[anchor] = 0.0
+        for other in range(count):
+            s.lasting_covariance[anchor][other] = 0.0
+    for row in range(PROTECTED_ROWS):
+        for axis in range(AXES):
+            s.fix[row][axis] = 0.0
+    s.count = s.waiting = 0
 
 
 def prepare(s: State) -> None:
@@ -375,9 +453,9 @@ def prepare(s: State) -> None:
     if status.has_open_ranges or stated > 0.0:
         status.range_errors = ALL_RANGE_ERRORS
     set_layout(s)
-    s.P[s.layout.slope][s.layout.slope] = square(settings.slope_std_m)
+    s.P[at(s.layout.slope, s.layout.slope)] = square(settings.slope_std_m)
     if s.dim == 2:
-        s.P[s.layout.height][s.layout.height] = square(settings.height_std_m)
+        s.P[at(s.layout.height, s.layout.height)] = square(settings.height_std_m)
 
 
 def set_layout(s: State) -> None:
@@ -469,11 +547,11 @@ def add_anchor(s: State, identifier: int, position_m: Reals, std_m: float, is_op
         range_std_m, survey_std_m = tuning.late_std_m, tuning.open_survey_std_m
     if survey_std_m > 0.0:
         make_uncertain(s, ALL_RANGE_ERRORS)
-    s.P[where.change + anchor][where.change + anchor] = a.change_variance_m2
-    s.P[where.constant + anchor][where.constant + anchor] = square(range_std_m)
+    s.P[at(where.change + anchor, where.change + anchor)] = a.change_variance_m2
+    s.P[at(where.constant + anchor, where.constant + anchor)] = square(range_std_m)
     for axis in range(dim):
         survey = where.survey + dim * anchor + axis
-        s.P[survey][survey] = square(survey_std_m)
+        s.P[at(survey, survey)] = square(survey_std_m)
     return anchor
 
 
@@ -531,17 +609,17 @@ def _insert_state(s: State, index: int) -> None:
     end = s.layout.end
     for state in range(end, index, -1):
         s.x[state] = s.x[state - 1]
-        for other in range(end):
-            s.P[state][other] = s.P[state - 1][other]
         for row in range(s.rows):
             s.V[state][row] = s.V[state - 1][row]
     s.x[index] = 0.0
-    for other in range(end):
-        s.P[index][other] = 0.0
     for row in range(s.rows):
         s.V[index][row] = 0.0
-    for state in range(end + 1):
-        _insert(s.P[state], index, end)
+    for state in range(end, -1, -1):
+        to, source = row_of(state), row_of(state - 1 if state > index else state)
+        for other in range(row_end(state, end + 1) - 1, -1, -1):
+            s.P[to + other] = s.P[source + (other - 1 if other > index else other)]
+    for other in range(end + 1):
+        set_covariance(s, index, other, 0.0)
     s.layout.end = end + 1
 
 
@@ -550,17 +628,17 @@ def _remove_state(s: State, index: int) -> None:
     end = s.layout.end
     for state in range(index, end - 1):
         s.x[state] = s.x[state + 1]
-        for other in range(end):
-            s.P[state][other] = s.P[state + 1][other]
         for row in range(s.rows):
             s.V[state][row] = s.V[state + 1][row]
     s.x[end - 1] = 0.0
-    for other in range(end):
-        s.P[end - 1][other] = 0.0
     for row in range(s.rows):
         s.V[end - 1][row] = 0.0
-    for state in range(end):
-        _remove(s.P[state], index, end)
+    for state in range(end - 1):
+        to, source = row_of(state), row_of(state + 1 if state >= index else state)
+        for other in range(row_end(state, end - 1)):
+            s.P[to + other] = s.P[source + (other + 1 if other >= index else other)]
+    for other in range(end):
+        set_covariance(s, end - 1, other, 0.0)
     s.layout.end = end - 1
 
 

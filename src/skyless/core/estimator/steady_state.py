@@ -32,7 +32,7 @@ from skyless.core.estimator.measurements import (
     relay_variance,
 )
 from skyless.core.estimator.phases import expected_phase, known_phase, own_phase
-from skyless.core.estimator.state import ALL_RANGE_ERRORS, AXES, FAULT_KINDS, State
+from skyless.core.estimator.state import ALL_RANGE_ERRORS, AXES, FAULT_KINDS, State, at
 from skyless.core.native.arithmetic import floor, square
 from skyless.core.native.records import Array, Bytes, Reals, Record, Ticks, record
 
@@ -190,7 +190,7 @@ def _add_fix(s: State, share: float, found: SteadyState) -> None:
     """Add a fix to the sums."""
     found.fixes += share
     for axis in range(s.dim):
-        found.variance_m2[axis] += share * s.P[axis][axis]
+        found.variance_m2[axis] += share * s.P[at(axis, axis)]
         found.square_bias_m2 += share * square(s.V[axis][_walls(s)])
         for row in range(_walls(s) + 1, s.rows):
             found.motion_m2[axis] += share * square(s.V[axis][row])

@@ -4,7 +4,7 @@ from typing import Final
 
 from skyless.core.constants import TICK_S
 from skyless.core.estimator.faults import whiten
-from skyless.core.estimator.state import State
+from skyless.core.estimator.state import State, at
 from skyless.core.native.arithmetic import square
 
 _MOST_LATE: Final = 0.45
@@ -51,12 +51,21 @@ def uses_phases(s: State) -> bool:
     return (s.status.epoch_ticks - s.status.phase_ticks) * TICK_S < s.tuning.phase_memory_s
 
 
+def horizontal_variance_m2(s: State, ahead_s: float) -> float:
+    """Sum of the variances of x and y ``ahead_s`` later, if nothing is received until then."""
+    total = 2.0 * s.settings.qa * s.status.q_scale * ahead_s * ahead_s * ahead_s / 3.0
+    for axis in range(2):
+        speed = s.layout.velocity + axis
+        total += s.P[at(axis, axis)] + ahead_s * (2.0 * s.P[at(axis, speed)] + ahead_s * s.P[at(speed, speed)])
+    return total
+
+
 def fits_settings(s: State) -> bool:
     """Whether the constants of the ranges are as small as the settings state, as far as they are known."""
     first, count = s.layout.constant, s.count
     for one in range(count):
         for other in range(one + 1):
-            s.work[one][other] = s.P[first + one][first + other]
+            s.work[one][other] = s.P[at(first + one, first + other)]
         s.work[one][one] += square(s.settings.range_std_m)
         s.work[count][one] = s.x[first + one]
     whiten(s, count, 1)

@@ -8,6 +8,7 @@
  * skyless.core.air.neighbours
  * skyless.core.air.page_check
  * skyless.core.air.site_choice
+ * skyless.core.air.site_pages
  * skyless.core.estimator.faults
  * skyless.core.estimator.kalman
  * skyless.core.estimator.levels
@@ -18,18 +19,22 @@
  * skyless.core.estimator.state
  * skyless.core.estimator.steady_state
  * skyless.core.estimator.verdicts
+ * skyless.core.integrity
  * skyless.core.native.arithmetic
  * skyless.core.native.small_matrices
  * skyless.core.native.tails
  * skyless.core.tag.acquisition
  * skyless.core.tag.admission
+ * skyless.core.tag.changes
  * skyless.core.tag.course
  * skyless.core.tag.descent
+ * skyless.core.tag.following
  * skyless.core.tag.hearing
  * skyless.core.tag.minima
  * skyless.core.tag.position
  * skyless.core.tag.problem
  * skyless.core.tag.selection
+ * skyless.core.tag.site_settings
  * skyless.core.tag.starts
  * skyless.core.ticks
  */
@@ -62,10 +67,20 @@ static inline int64_t max_64(int64_t one, int64_t other) { return other > one ? 
 static inline real abs_real(real x) { return FABS(x); }
 static inline int32_t abs_32(int32_t x) { return x < 0 ? -x : x; }
 static inline int64_t abs_64(int64_t x) { return x < 0 ? -x : x; }
-static inline int64_t truncated(real x) { return REAL(-9e18) < x && x < REAL(9e18) ? (int64_t)x : 0; }
+#ifdef SKYLESS_FLOAT
+/* By two exact halves: a Cortex-M4F has no instruction for 64 bits, and its compiler's function uses double. */
+static inline int64_t whole_of(real x) {
+    const int32_t high = (int32_t)(x * (1 / REAL(4294967296.0)));
+    const real low = x - (real)high * REAL(4294967296.0);
+    return high * INT64_C(4294967296) + (low < 0 ? -(int64_t)(uint32_t)-low : (int64_t)(uint32_t)low);
+}
+#else
+static inline int64_t whole_of(real x) { return (int64_t)x; }
+#endif
+static inline int64_t truncated(real x) { return REAL(-9e18) < x && x < REAL(9e18) ? whole_of(x) : 0; }
 static inline int64_t floor_real(real x) {
-    const int64_t whole = truncated(x);
-    return x > REAL(-9e18) && x < (real)whole ? whole - 1 : whole;
+    const int64_t found = truncated(x);
+    return x > REAL(-9e18) && x < (real)found ? found - 1 : found;
 }
 static inline int32_t floor_div_32(int32_t x, int32_t y) { return x / y - (x % y != 0 && (x < 0) != (y < 0)); }
 static inline int64_t floor_div_64(int64_t x, int64_t y) { return x / y - (x % y != 0 && (x < 0) != (y < 0)); }
@@ -81,13 +96,15 @@ INTERNAL real square(real x);
 INTERNAL int64_t nearest(int64_t counter, int64_t expected_ticks, int32_t bits);
 INTERNAL bool may_elapse(int64_t counter_ticks, int64_t elapsed_ticks, real slack_ticks);
 INTERNAL int64_t unwrap(Unwrapper *u, int64_t counter, real host_s);
-INTERNAL real fix_time_s(FixTime *time, int64_t ticks_master, int64_t rx_ticks_tag);
+INTERNAL int64_t fix_time_ticks(FixTime *time, int64_t ticks_master, int64_t rx_ticks_tag);
 INTERNAL int32_t find_neighbour(Neighbours *t, int32_t anchor);
 INTERNAL int32_t neighbour_of(Neighbours *t, int32_t anchor, int64_t rx_ticks);
 INTERNAL int32_t least_important(Neighbours *t, int64_t rx_ticks);
 INTERNAL bool is_confirmed(Neighbour *n, int64_t rx_ticks);
 INTERNAL bool is_relayed(Neighbour *n, int64_t rx_ticks);
 INTERNAL void forget_times(Neighbours *t);
+INTERNAL void wake_times(Neighbours *t, int64_t rx_ticks, int64_t rx_counter);
+INTERNAL void forget_row(Neighbour *n);
 INTERNAL bool is_newest(Neighbour *n, int32_t sequence, int64_t tx_counter);
 INTERNAL void keep(Neighbour *n, int32_t sequence, int64_t tx_ticks, int64_t rx_ticks, int32_t frames);
 INTERNAL int32_t reject(Neighbour *n, int32_t sequence, int64_t tx_counter, int64_t rx_ticks, bool is_silent);
@@ -115,10 +132,35 @@ INTERNAL bool prefers(SiteChoice *choice, int32_t other, int64_t rx_ticks);
 INTERNAL bool has_failed(SiteChoice *choice, int64_t rx_ticks);
 INTERNAL void note_failed(SiteChoice *choice);
 INTERNAL int32_t received(SiteChoice *choice, int32_t counted, int64_t rx_ticks);
+INTERNAL int32_t note_page(SitePages *p, Neighbours *t, uint8_t *frame, int32_t page_at, int64_t rx_ticks);
+INTERNAL void collect(SitePages *p, Neighbours *t, uint8_t *frame, int32_t page_at);
+INTERNAL bool is_page(SitePages *p, int32_t place, uint8_t *frame, int32_t page_at);
+INTERNAL int32_t worst(SitePages *p, Neighbours *t);
+INTERNAL int32_t supporters(CollectedPage *one, Neighbours *t);
+INTERNAL bool is_majority(SitePages *p, Neighbours *t, int32_t issue, int64_t rx_ticks);
+INTERNAL int32_t complete(SitePages *p, Neighbours *t, int32_t issue);
+INTERNAL int32_t options(Choices *c, int32_t kind);
+INTERNAL void add_choice(Choices *c, SitePages *p, int32_t place);
+INTERNAL int32_t issue_of(SitePages *p, Choices *c);
+INTERNAL int32_t use_chosen(SitePages *p, Choices *c, int32_t issue);
+INTERNAL real normal_tail(real z);
+INTERNAL real normal_quantile(real tail);
+INTERNAL real continued_fraction(real z, int32_t first);
+INTERNAL real chi2_tail(int32_t dof, real chi2);
+INTERNAL real mean_if_positive(real mean, real sigma);
+INTERNAL real horizontal_limit(real risk);
+INTERNAL real vertical_limit(real risk);
+INTERNAL int32_t row_of(int32_t state);
+INTERNAL int32_t row_end(int32_t state, int32_t end);
+INTERNAL int32_t at(int32_t one, int32_t other);
+INTERNAL void set_covariance(State *s, int32_t one, int32_t other, real value);
+INTERNAL void clear(State *s);
+INTERNAL void prepare(State *s);
 INTERNAL void set_layout(State *s);
 INTERNAL void make_uncertain(State *s, int32_t range_errors);
 INTERNAL void use_phases(State *s);
 INTERNAL void clear_link(Link *link, real variance_m2);
+INTERNAL void remove_anchor(State *s, int32_t anchor);
 INTERNAL void insert_state(State *s, int32_t index_);
 INTERNAL void remove_state(State *s, int32_t index_);
 INTERNAL void insert_fault(State *s, int32_t index_, int32_t faults);
@@ -132,6 +174,7 @@ INTERNAL void weigh_zero(State *s, int32_t anchor, real weight);
 INTERNAL void predict(State *s, int64_t rx_ticks);
 INTERNAL bool is_stationary(State *s);
 INTERNAL void advance(State *s, real dt);
+INTERNAL void advance_packed(State *s, int32_t values, real dt);
 INTERNAL void add_noise(State *s, int32_t value, int32_t other, real of_values, real of_both, real of_rates);
 INTERNAL real jump_share(State *s);
 INTERNAL range_error_decay_results range_error_decay(State *s, int32_t anchor, real dt, real walked_m);
@@ -146,6 +189,7 @@ INTERNAL void update(State *s, real innovation, real innovation_variance, real g
 INTERNAL void update_later(State *s, real innovation, real innovation_variance);
 INTERNAL void note_update(State *s, real innovation, real innovation_variance, real gain_scale);
 INTERNAL void finish_updates(State *s);
+INTERNAL void inform(State *s);
 INTERNAL int32_t fill_groups(State *s);
 INTERNAL void apply_updates(State *s);
 INTERNAL void apply_one(State *s, int32_t one);
@@ -187,6 +231,7 @@ INTERNAL bool is_lost(State *s);
 INTERNAL bool relays_contradict(State *s);
 INTERNAL bool relays_fit(State *s);
 INTERNAL bool uses_phases(State *s);
+INTERNAL real horizontal_variance_m2(State *s, real ahead_s);
 INTERNAL bool fits_settings(State *s);
 INTERNAL void protect(State *s);
 INTERNAL real largest_test(State *s);
@@ -250,13 +295,13 @@ INTERNAL real former_age_s(State *s, int32_t anchor);
 INTERNAL void rejoin(State *s, int32_t anchor);
 INTERNAL void known_phase(State *s, int32_t anchor, real walked_m);
 INTERNAL real expected_phase(State *s, int32_t anchor);
-INTERNAL int32_t process(State *s, Packet *packet);
-INTERNAL void take_relays(Packet *packet, uint8_t *packed, int32_t packed_bytes);
+INTERNAL int32_t process(State *s, Packet *packet, Relays *relays);
+INTERNAL void take_relays(Packet *packet, Relays *relays, uint8_t *packed, int32_t packed_bytes);
 INTERNAL int64_t relay_rx_ticks(Relay *relayed, int64_t tx_ticks, int64_t elapsed);
-INTERNAL int32_t process_packet(State *s, Packet *packet);
+INTERNAL int32_t process_packet(State *s, Packet *packet, Relays *relays);
 INTERNAL int32_t present(State *s, Place *place);
 INTERNAL void remove_silent(State *s, int64_t rx_ticks);
-INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet);
+INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet, Relays *relays);
 INTERNAL int32_t admit(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks);
 INTERNAL bool is_impossible(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks);
 INTERNAL void keep_packet(State *s, int32_t anchor, Packet *packet);
@@ -280,10 +325,6 @@ INTERNAL bool has_rotated(Columns *m, int32_t one, int32_t other);
 INTERNAL real scalar_product(Columns *m, int32_t one, int32_t other);
 INTERNAL void rotate_columns(real (*A)[4], int32_t rows, int32_t one, int32_t other, real cosine, real sine);
 INTERNAL bool least_squares(Columns *m, real *right, real *x);
-INTERNAL real normal_tail(real z);
-INTERNAL real continued_fraction(real z, int32_t first);
-INTERNAL real chi2_tail(int32_t dof, real chi2);
-INTERNAL real mean_if_positive(real mean, real sigma);
 INTERNAL bool choose_axes(LocateProblem *p);
 INTERNAL real sigma_m(LocateProblem *p, int32_t index_);
 INTERNAL real least_sigma_m(LocateProblem *p);
@@ -318,12 +359,14 @@ INTERNAL void fill_position(LocateProblem *p, Minimum *minimum, real *position_m
 INTERNAL real site_coordinate(LocateProblem *p, Minimum *minimum, int32_t k);
 INTERNAL real site_covariance(LocateProblem *p, Minimum *minimum, int32_t a, int32_t b);
 INTERNAL void fill_residuals(LocateProblem *p, Found *found, Minimum *minimum);
+INTERNAL void forget_packets(Acquisition *q, int32_t anchor);
+INTERNAL int32_t try_start(Acquisition *q, Packet *packet, Relays *relays);
 INTERNAL int32_t find_heard(Acquisition *q, int32_t anchor);
 INTERNAL void remove_heard(Acquisition *q, int32_t place);
 INTERNAL void forget_old_packets(Acquisition *q, int64_t now);
-INTERNAL bool keep_packet_of(Acquisition *q, int32_t anchor, HeardPacket *given);
+INTERNAL bool keep_heard(Acquisition *q, Packet *packet, Relays *relays);
 INTERNAL int32_t longest_unfitting(Acquisition *q);
-INTERNAL void add_links(Acquisition *q, Packet *packet);
+INTERNAL void add_links(Acquisition *q, Packet *packet, Relays *relays);
 INTERNAL void add_link(Acquisition *q, Packet *listener, Packet *sent, Relay *relayed);
 INTERNAL int32_t oldest_link(Acquisition *q);
 INTERNAL void forget_links_before(Acquisition *q, int64_t now);
@@ -340,6 +383,8 @@ INTERNAL int32_t solve_start(Acquisition *q, int32_t left_out, int64_t now, real
 INTERNAL int32_t locate(Acquisition *q, int32_t count, real residual_tail);
 INTERNAL bool is_wide(Acquisition *q);
 INTERNAL int32_t solve_without_one(Acquisition *q, int64_t now);
+INTERNAL int32_t process_in_course(Course *c, State *s, FixTime *time, Packet *packet, Relays *relays, uint8_t *packed,
+        int32_t packed_bytes);
 INTERNAL int32_t settle(Course *c, State *s, FixTime *time, int64_t rx_ticks);
 INTERNAL bool is_surely_in_reach(Course *c, int64_t rx_ticks);
 INTERNAL bool is_contradicted(Course *c, State *s, int64_t rx_ticks);
@@ -347,14 +392,45 @@ INTERNAL void use_anchor(Course *c, Place *place, int64_t rx_ticks);
 INTERNAL int32_t longest_silent(Course *c);
 INTERNAL void forget_silent(Course *c, int64_t rx_ticks);
 INTERNAL void widen(Course *c, int32_t axis);
+INTERNAL void begin_search(Course *c, Acquisition *q);
+INTERNAL int32_t outcome_of(int32_t found);
+INTERNAL bool was_late_often(Course *c);
+INTERNAL bool is_out_of_reach(Course *c, State *s, int64_t rx_ticks);
+INTERNAL real mean_range_m(Course *c, real *position_m);
+INTERNAL real distance_m(Course *c, real *one_m, real *other_m);
+INTERNAL void use_only(Course *c, Acquisition *q);
+INTERNAL void fill_alone(Course *c, Acquisition *q);
+INTERNAL bool begin_filter(Course *c, State *s, Acquisition *q, Relays *relays);
+INTERNAL void choose_packets(Course *c, Acquisition *q, Beginning *b);
+INTERNAL void insert_packet(Beginning *b, HeardPacket *one);
+INTERNAL bool is_chosen(Course *c, Acquisition *q, int32_t place);
 INTERNAL void add_power(Neighbour *n, real power_dbm);
 INTERNAL void add_relays(Neighbours *t, BeaconFields *b, int64_t rx_ticks);
 INTERNAL int32_t fitting_relays(Neighbours *t, State *s, BeaconFields *b, int64_t rx_ticks);
-INTERNAL bool confirm(Hearing *h, State *s);
+INTERNAL int32_t replaced_by(Neighbours *t, State *s, int32_t *origin_mm);
+INTERNAL real power_dbm(Neighbour *n, State *s, int32_t *origin_mm);
+INTERNAL real place_m(Neighbour *n, int32_t *origin_mm, int32_t axis);
+INTERNAL void read_accuracy(EstimatorSettings *e, uint8_t *noise, uint8_t *accuracy);
+INTERNAL void fill_noise(EstimatorSettings *e, real tx_stamp_s, real rx_stamp_s, real white_fm, real random_walk_fm);
+INTERNAL void fill_ages(EstimatorSettings *e, real superframe_s, real drop_s);
+INTERNAL real float_at(uint8_t *data, int32_t at);
+INTERNAL void handle_events(Tag *t, Acquisition *q);
+INTERNAL void forget_stamps(Tag *t, Acquisition *q);
+INTERNAL void read_pages(Tag *t);
+INTERNAL void begin_with_pages(Tag *t, Acquisition *q);
+INTERNAL int32_t process_rare(Tag *t, State *s, Acquisition *q, uint8_t *frame);
+INTERNAL void wait(Tag *t);
+INTERNAL int32_t join(Tag *t, State *s, Neighbour *n);
+INTERNAL void forget_moves(Tag *t);
+INTERNAL void separate_moved(Tag *t, State *s, Acquisition *q, Neighbour *n);
+INTERNAL bool is_kept_apart(Tag *t, Acquisition *q, Neighbour *n);
+INTERNAL bool have_most_moved(Tag *t);
+INTERNAL int32_t hear_admitted(Tag *t, State *s, Acquisition *q, Neighbour *n, uint8_t *frame);
+INTERNAL bool confirm(Tag *t, State *s);
 INTERNAL bool has_too_few(State *s, int64_t rx_ticks);
 INTERNAL bool keep_place(Neighbour *n, StatedPlace *place);
 INTERNAL bool is_same(StatedPlace *one, StatedPlace *other);
-INTERNAL void fill_packet(Packet *packet, Hearing *h, Neighbour *n, real factor);
+INTERNAL void fill_packet(Tag *t, Neighbour *n, real factor);
 
 /* Arithmetic of the functions that are also translated to C: the same bits on every processor, without a C library. */
 
@@ -452,8 +528,8 @@ INTERNAL int64_t unwrap(Unwrapper *u, int64_t counter, real host_s) {
     return ticks;
 }
 
-/* Time in seconds of a fix that holds at this master time, given the tag's reading for it, both unwrapped. */
-INTERNAL real fix_time_s(FixTime *time, int64_t ticks_master, int64_t rx_ticks_tag) {
+/* Time of a fix that holds at this master time, given the tag's reading for it, both unwrapped. */
+INTERNAL int64_t fix_time_ticks(FixTime *time, int64_t ticks_master, int64_t rx_ticks_tag) {
     if (!time->has_fix) {
         time->has_fix = true;
         time->first_ticks_master = ticks_master;
@@ -466,7 +542,7 @@ INTERNAL real fix_time_s(FixTime *time, int64_t ticks_master, int64_t rx_ticks_t
     }
     time->last_ticks_master = ticks_master;
     time->last_rx_ticks_tag = rx_ticks_tag;
-    return (real)(ticks_master - time->first_ticks_master) * TICK_S;
+    return ticks_master - time->first_ticks_master;
 }
 
 /* What is kept of each anchor that is received, or that others relay: one table with a row for each. */
@@ -538,16 +614,31 @@ INTERNAL bool is_relayed(Neighbour *n, int64_t rx_ticks) {
 INTERNAL void forget_times(Neighbours *t) {
     t->has_newest = false;
     for (int32_t row = 0, row_end = t->count; row < row_end; row++) {
-        Neighbour *n = &t->rows[row];
-        n->frames = 0;
-        n->impossible = 0;
-        n->has_rival = false;
-        n->was_relayed = false;
-        n->changed_ticks = NEVER;
-        n->used_ticks = NEVER;
-        n->own_relays_ticks = NEVER;
-        n->relayed_ticks = NEVER;
+        forget_row(&t->rows[row]);
     }
+}
+
+/* The same after a sleep from ``rx_ticks`` on: who was confirmed then counts as confirmed at ``rx_counter``. */
+INTERNAL void wake_times(Neighbours *t, int64_t rx_ticks, int64_t rx_counter) {
+    t->has_newest = false;
+    for (int32_t row = 0, row_end = t->count; row < row_end; row++) {
+        bool was_confirmed = is_confirmed(&t->rows[row], rx_ticks);
+        forget_row(&t->rows[row]);
+        if (was_confirmed) {
+            t->rows[row].relayed_ticks = rx_counter;
+        }
+    }
+}
+
+INTERNAL void forget_row(Neighbour *n) {
+    n->frames = 0;
+    n->impossible = 0;
+    n->has_rival = false;
+    n->was_relayed = false;
+    n->changed_ticks = NEVER;
+    n->used_ticks = NEVER;
+    n->own_relays_ticks = NEVER;
+    n->relayed_ticks = NEVER;
 }
 
 /* Every anchor's counter, unwrapped along the receiver's own. */
@@ -650,13 +741,13 @@ INTERNAL int32_t two_bytes(uint8_t *data, int32_t at) {
     return data[at] | (int32_t)((uint32_t)data[at + 1] << 8);
 }
 
-/* Which contents of a page are possible (``docs/protocol.md``, "Pages"); what frames carry may be anything. */
-
-/* The same of a number of four bytes that may be negative. */
+/* That in four bytes, which may be negative. */
 INTERNAL int64_t signed_(uint8_t *data, int32_t at) {
     int64_t number = unsigned_(data, at, 4);
     return number < SIGN ? number : number - 2 * SIGN;
 }
+
+/* Which contents of a page are possible (``docs/protocol.md``, "Pages"); what frames carry may be anything. */
 
 /* Whether the page in these bytes, from ``at`` on, can be; one of a type that is not known here can. */
 INTERNAL bool is_possible_page(uint8_t *data, int32_t at) {
@@ -686,7 +777,7 @@ INTERNAL bool is_possible_page(uint8_t *data, int32_t at) {
         return unsigned_(data, at + 9, 2) > 0 && unsigned_(data, at + 11, 2) > 0;
     }
     if (kind == SITE_PAGE) {
-        return data[at + 1] > 0 && is_coordinate(data, at + 9);
+        return data[at + 1] > 0 && is_coordinate(data, at + HEIGHT_FLAG_AT + 1);
     }
     return true;
 }
@@ -1012,6 +1103,276 @@ INTERNAL int32_t received(SiteChoice *choice, int32_t counted, int64_t rx_ticks)
     return present;
 }
 
+/* Protocol 2: which pages of those that beacons carry count, as the majority of the anchors states. */
+
+/* Process the page at this place of the newest anchor's beacon, if it is not 0; whether others are in use then. */
+INTERNAL int32_t note_page(SitePages *p, Neighbours *t, uint8_t *frame, int32_t page_at, int64_t rx_ticks) {
+    Neighbour *n = &t->rows[t->row];
+    if (!p->has_first) {
+        p->has_first = true;
+        p->first_ticks = rx_ticks;
+    }
+    if (n->almanac_issue == p->issue) {
+        return SAME_PAGES;
+    }
+    if (page_at > 0 && (NOISE_PAGE <= frame[page_at] && frame[page_at] <= SITE_PAGE)) {
+        collect(p, t, frame, page_at);
+    }
+    return is_majority(p, t, n->almanac_issue, rx_ticks) ? complete(p, t, n->almanac_issue) : SAME_PAGES;
+}
+
+/* Note that the newest anchor has sent a page; where there are too many, one takes the place of the worst. */
+INTERNAL void collect(SitePages *p, Neighbours *t, uint8_t *frame, int32_t page_at) {
+    Neighbour *n = &t->rows[t->row];
+    int32_t place = 0;
+    while (place < p->count && !(p->collected[place].issue == n->almanac_issue && is_page(p, place, frame, page_at))) {
+        place += 1;
+    }
+    if (place == p->count) {
+        if (p->count == MAX_PAGES) {
+            place = worst(p, t);
+        }
+        p->count = max_32(p->count, place + 1);
+        p->collected[place].issue = n->almanac_issue;
+        p->collected[place].sender_count = 0;
+        for (int32_t byte = 0; byte < PAGE_BYTES; byte++) {
+            p->collected[place].contents[byte] = frame[page_at + byte];
+        }
+    }
+    CollectedPage *one = &p->collected[place];
+    for (int32_t sender = 0, sender_end = one->sender_count; sender < sender_end; sender++) {
+        if (one->senders[sender] == n->anchor) {
+            return;
+        }
+    }
+    if (one->sender_count < MAX_SENDERS) {
+        one->senders[one->sender_count] = n->anchor;
+        one->sender_count += 1;
+    }
+}
+
+INTERNAL bool is_page(SitePages *p, int32_t place, uint8_t *frame, int32_t page_at) {
+    int32_t same = 0;
+    while (same < PAGE_BYTES && p->collected[place].contents[same] == frame[page_at + same]) {
+        same += 1;
+    }
+    return same == PAGE_BYTES;
+}
+
+/* The page of the issue, and then with the senders, that fewest anchors support which others have received.
+ *
+ * Strangers are any number. */
+INTERNAL int32_t worst(SitePages *p, Neighbours *t) {
+    int32_t worst = 0;
+    int32_t least_issue = 0;
+    int32_t least = 0;
+    for (int32_t place = 0, place_end = p->count; place < place_end; place++) {
+        CollectedPage *one = &p->collected[place];
+        int32_t of_issue = 0;
+        for (int32_t row = 0, row_end = t->count; row < row_end; row++) {
+            if (t->rows[row].was_relayed && t->rows[row].almanac_issue == one->issue) {
+                of_issue += 1;
+            }
+        }
+        int32_t support = supporters(one, t);
+        if (place == 0 || of_issue < least_issue || (of_issue == least_issue && support < least)) {
+            worst = place;
+            least_issue = of_issue;
+            least = support;
+        }
+    }
+    return worst;
+}
+
+INTERNAL int32_t supporters(CollectedPage *one, Neighbours *t) {
+    int32_t support = 0;
+    for (int32_t row = 0, row_end = t->count; row < row_end; row++) {
+        for (int32_t sender = 0, sender_end = one->sender_count; sender < sender_end; sender++) {
+            if (t->rows[row].was_relayed && t->rows[row].anchor == one->senders[sender]) {
+                support += 1;
+            }
+        }
+    }
+    return support;
+}
+
+/* Whether most of the anchors that are there state this issue. */
+INTERNAL bool is_majority(SitePages *p, Neighbours *t, int32_t issue, int64_t rx_ticks) {
+    int64_t oldest = rx_ticks - PRESENT_TICKS;
+    int32_t present = 0;
+    int32_t stating = 0;
+    for (int32_t row = 0, row_end = t->count; row < row_end; row++) {
+        Neighbour *n = &t->rows[row];
+        if (n->was_relayed && n->rx_ticks > oldest) {
+            present += 1;
+            stating += n->almanac_issue == issue ? 1 : 0;
+        }
+    }
+    bool is_enough = present >= MIN_ANCHORS || (present > 0 && p->first_ticks <= oldest);
+    return is_enough && 2 * stating > present;
+}
+
+/* Use the pages of an issue if they are all there; of several contents those of most anchors that fit it. */
+INTERNAL int32_t complete(SitePages *p, Neighbours *t, int32_t issue) {
+    Choices c = {0};
+    int32_t trials = 1;
+    for (int32_t place = 0, place_end = p->count; place < place_end; place++) {
+        if (p->collected[place].issue == issue) {
+            p->collected[place].support = supporters(&p->collected[place], t);
+            add_choice(&c, p, place);
+        }
+    }
+    for (int32_t kind = 0; kind < PAGE_KINDS; kind++) {
+        trials *= options(&c, kind);
+    }
+    for (int32_t trial = 0, trial_end = min_32(trials, MAX_TRIALS); trial < trial_end; trial++) {
+        int32_t rest = trial;
+        int32_t pages = 0;
+        for (int32_t kind = 0; kind < PAGE_KINDS; kind++) {
+            int32_t option = floor_mod_32(rest, options(&c, kind));
+            rest = floor_div_32(rest, options(&c, kind));
+            c.chosen[kind] = option < c.counts[kind] ? c.places[kind][option] : NO_PAGE;
+            pages += option < c.counts[kind] ? 1 : 0;
+        }
+        if (p->collected[c.chosen[SITE_KIND]].contents[1] == pages && issue_of(p, &c) == issue) {
+            return use_chosen(p, &c, issue);
+        }
+    }
+    return SAME_PAGES;
+}
+
+/* How many there are for a page; a site may have no georeference. */
+INTERNAL int32_t options(Choices *c, int32_t kind) {
+    return c->counts[kind] + (kind == EARTH_KIND ? 1 : 0);
+}
+
+/* Add a page to those of its type, behind those that more anchors support. */
+INTERNAL void add_choice(Choices *c, SitePages *p, int32_t place) {
+    int32_t kind = p->collected[place].contents[0] - NOISE_PAGE;
+    int32_t index_ = c->counts[kind];
+    while (index_ > 0 && p->collected[c->places[kind][index_ - 1]].support < p->collected[place].support) {
+        c->places[kind][index_] = c->places[kind][index_ - 1];
+        index_ -= 1;
+    }
+    c->places[kind][index_] = place;
+    c->counts[kind] += 1;
+}
+
+/* ``site_issue`` of the pages that are chosen. */
+INTERNAL int32_t issue_of(SitePages *p, Choices *c) {
+    int64_t crc = ONES;
+    for (int32_t kind = 0; kind < PAGE_KINDS; kind++) {
+        if (c->chosen[kind] != NO_PAGE) {
+            for (int32_t byte = 0; byte < PAGE_BYTES; byte++) {
+                crc = crc ^ p->collected[c->chosen[kind]].contents[byte];
+                for (int32_t time_1 = 0; time_1 < 8; time_1++) {
+                    crc = (crc >> 1) ^ (CRC_32 * (crc & 1));
+                }
+            }
+        }
+    }
+    crc = crc ^ ONES;
+    return (crc ^ (crc >> 16)) & 65535;
+}
+
+/* Use the pages that are chosen. */
+INTERNAL int32_t use_chosen(SitePages *p, Choices *c, int32_t issue) {
+    int32_t outcome = OTHER_PAGES;
+    for (int32_t kind = 0; kind < PAGE_KINDS; kind++) {
+        for (int32_t byte = 0; byte < PAGE_BYTES; byte++) {
+            int32_t place = c->chosen[kind];
+            int32_t value = place != NO_PAGE ? p->collected[place].contents[byte] : 0;
+            bool is_setting = kind != EARTH_KIND && (kind != SITE_KIND || byte >= HEIGHT_FLAG_AT);
+            if (is_setting && value != p->used[kind].contents[byte]) {
+                outcome = OTHER_SETTINGS;
+            }
+            p->used[kind].contents[byte] = value;
+        }
+    }
+    p->issue = issue;
+    p->count = 0;
+    return outcome;
+}
+
+/* Tails of the normal and the chi2 distribution. */
+
+/* Probability that a standard normal variable exceeds z, to 10⁻¹² of itself.
+ *
+ * With its density φ it is ½ − φ(z)·Σ z²ⁿ⁺¹/(1·3·…·(2n + 1)), or φ(z)/(z + 1/(z + 2/(z + …))) after Laplace. */
+INTERNAL real normal_tail(real z) {
+    real tail = 0;
+    real size = abs_real(z);
+    real density = exp_(-REAL(0.5) * size * size) / SQRT_2_PI;
+    if (size < FAR_TAIL) {
+        real term = size;
+        real total = size;
+        for (int32_t n = 1; n < TERMS; n++) {
+            term *= size * size / (real)(2 * n + 1);
+            total += term;
+        }
+        tail = REAL(0.5) - density * total;
+    } else {
+        tail = density / continued_fraction(size, 1);
+    }
+    return z >= REAL(0.0) ? tail : REAL(1.0) - tail;
+}
+
+/* What a standard normal variable exceeds with a probability below ½, by Newton's method for its logarithm. */
+INTERNAL real normal_quantile(real tail) {
+    real z = SQRT(-REAL(2.0) * log_(tail));
+    for (int32_t time_1 = 0; time_1 < NEWTON_STEPS; time_1++) {
+        real found = normal_tail(z);
+        z += (log_(found) - log_(tail)) * found * SQRT_2_PI / exp_(-REAL(0.5) * z * z);
+    }
+    return z;
+}
+
+/* The value of z + n/(z + (n + 1)/(z + …)) for the first n. */
+INTERNAL real continued_fraction(real z, int32_t first) {
+    real fraction = z;
+    for (int32_t n = TERMS; n > first - 1; n--) {
+        fraction = z + (real)n / fraction;
+    }
+    return fraction;
+}
+
+/* Probability that chi2 with at least one degree of freedom exceeds a value, by the finite sum. */
+INTERNAL real chi2_tail(int32_t dof, real chi2) {
+    real half = REAL(0.5) * chi2;
+    if (!(half < REAL(700.0))) {
+        return REAL(0.0);
+    }
+    bool is_odd = floor_mod_32(dof, 2) == 1;
+    real term = is_odd ? REAL(2.0) * SQRT(chi2) / SQRT_2_PI : REAL(1.0);
+    real total = REAL(0.0);
+    for (int32_t k = 0; k < floor_div_32(dof, 2); k++) {
+        total += term;
+        term *= half / ((real)k + (is_odd ? REAL(1.5) : REAL(1.0)));
+    }
+    return (is_odd ? REAL(2.0) * normal_tail(SQRT(chi2)) : REAL(0.0)) + exp_(-half) * total;
+}
+
+/* Mean of a normal variable given that it is positive: E[w²], where w² was measured and may be near 0. */
+INTERNAL real mean_if_positive(real mean, real sigma) {
+    real z = mean / sigma;
+    if (z < -FAR_TAIL) {  /* where the mean and what is added to it would cancel */
+        return sigma / continued_fraction(-z, 2);
+    }
+    return mean + sigma * exp_(-REAL(0.5) * z * z) / (SQRT_2_PI * normal_tail(-z));
+}
+
+/* Integrity of ``joint``'s fixes: fault tests, protection levels, alerts (``docs/maths.md`` section 8). */
+
+/* ``limits_of`` in the plane. */
+INTERNAL real horizontal_limit(real risk) {
+    return MARGIN * SQRT(-REAL(2.0) * log_(risk));
+}
+
+/* ``limits_of`` along one axis. */
+INTERNAL real vertical_limit(real risk) {
+    return MARGIN * normal_quantile(REAL(0.5) * risk);
+}
+
 /* The estimator's state: one record of fixed capacity, and how anchors join and leave by moving blocks in it.
  *
  * The state vector, all clocks against the tag's own counter, in metres and m/s:
@@ -1034,8 +1395,91 @@ INTERNAL int32_t received(SiteChoice *choice, int32_t counted, int64_t rx_ticks)
  * covariance, so it is left out of all arithmetic (``State.n``), until a jump or a fault shows otherwise. All that stands
  * behind the states in use is zero. */
 
+/* Where the covariances stand */
+
+/* Where a state's row of P begins. */
+INTERNAL int32_t row_of(int32_t state) {
+    return PACKED ? (state * (state + 1)) >> 1 : state * STATES;
+}
+
+/* How many of the first elements of a row of P there are: all, or those up to the diagonal. */
+INTERNAL int32_t row_end(int32_t state, int32_t end) {
+    return PACKED ? min_32(state + 1, end) : end;
+}
+
+/* Where the covariance of two states stands in P. */
+INTERNAL int32_t at(int32_t one, int32_t other) {
+    return PACKED && other > one ? row_of(other) + one : row_of(one) + other;
+}
+
+/* Write the covariance of two states, in both places where P has two. */
+INTERNAL void set_covariance(State *s, int32_t one, int32_t other, real value) {
+    s->P[at(one, other)] = value;
+    if (!PACKED) {
+        s->P[at(other, one)] = value;
+    }
+}
+
+/* Begin again without anchors at the origin, with the same settings.
+ *
+ * ``fault_std_m``: of range errors of all anchors that the levels are to cover; ``has_open_ranges``: expect ranges to
+ * be wrong by half a metre and anchors to be misplaced, since what the settings assume of them has been contradicted. */
+SKYLESS_EXPORT void skyless_restart(State *s, int64_t rx_ticks, real late_share, real fault_std_m, bool has_open_ranges)
+        {
+    Status status = {0};
+    clear(s);
+    s->status = status;
+    s->status.has_open_ranges = has_open_ranges;
+    prepare(s);
+    s->status.late_share = late_share;
+    s->status.fault_std_m[LASTING] = fault_std_m;
+    s->status.faded_ticks = rx_ticks;
+    s->status.start_ticks = rx_ticks;
+    s->status.epoch_ticks = rx_ticks;
+}
+
+/* Forget all states and anchors. What is not in use is zero already, unless a search has used the memory. */
+INTERNAL void clear(State *s) {
+    int32_t states = s->layout.end;
+    int32_t rows = s->rows;
+    int32_t count = s->count;
+    if (SHARES_MEMORY) {
+        states = STATES;
+        rows = SENSITIVITIES;
+        count = MAX_ANCHORS;
+    }
+    for (int32_t state = 0; state < states; state++) {
+        s->x[state] = REAL(0.0);
+        for (int32_t other = 0; other < states; other++) {
+            s->P[at(state, other)] = REAL(0.0);
+        }
+        for (int32_t row = 0; row < rows; row++) {
+            s->V[state][row] = REAL(0.0);
+        }
+    }
+    for (int32_t fault = 0; fault < FAULT_KINDS * count; fault++) {
+        s->evidence[fault] = REAL(0.0);
+        for (int32_t other = 0; other < FAULT_KINDS * count; other++) {
+            s->information[fault][other] = REAL(0.0);
+        }
+    }
+    for (int32_t anchor = 0; anchor < count; anchor++) {
+        s->lasting_m[anchor] = REAL(0.0);
+        for (int32_t other = 0; other < count; other++) {
+            s->lasting_covariance[anchor][other] = REAL(0.0);
+        }
+    }
+    for (int32_t row = 0; row < PROTECTED_ROWS; row++) {
+        for (int32_t axis = 0; axis < AXES; axis++) {
+            s->fix[row][axis] = REAL(0.0);
+        }
+    }
+    s->waiting = 0;
+    s->count = 0;
+}
+
 /* Initialise a state that is all zeros but for its settings and dimensions. */
-SKYLESS_EXPORT void skyless_prepare(State *s) {
+INTERNAL void prepare(State *s) {
     Status *status = &s->status;
     EstimatorSettings *settings = &s->settings;
     Tuning *tuning = &s->tuning;
@@ -1062,9 +1506,9 @@ SKYLESS_EXPORT void skyless_prepare(State *s) {
         status->range_errors = ALL_RANGE_ERRORS;
     }
     set_layout(s);
-    s->P[s->layout.slope][s->layout.slope] = square(settings->slope_std_m);
+    s->P[at(s->layout.slope, s->layout.slope)] = square(settings->slope_std_m);
     if (s->dim == 2) {
-        s->P[s->layout.height][s->layout.height] = square(settings->height_std_m);
+        s->P[at(s->layout.height, s->layout.height)] = square(settings->height_std_m);
     }
 }
 
@@ -1176,11 +1620,11 @@ SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *po
     if (survey_std_m > REAL(0.0)) {
         make_uncertain(s, ALL_RANGE_ERRORS);
     }
-    s->P[where->change + anchor][where->change + anchor] = a->change_variance_m2;
-    s->P[where->constant + anchor][where->constant + anchor] = square(range_std_m);
+    s->P[at(where->change + anchor, where->change + anchor)] = a->change_variance_m2;
+    s->P[at(where->constant + anchor, where->constant + anchor)] = square(range_std_m);
     for (int32_t axis = 0; axis < dim; axis++) {
         int32_t survey = where->survey + dim * anchor + axis;
-        s->P[survey][survey] = square(survey_std_m);
+        s->P[at(survey, survey)] = square(survey_std_m);
     }
     return anchor;
 }
@@ -1207,7 +1651,7 @@ INTERNAL void clear_link(Link *link, real variance_m2) {
 }
 
 /* Let an anchor leave the state. */
-SKYLESS_EXPORT void skyless_remove_anchor(State *s, int32_t anchor) {
+INTERNAL void remove_anchor(State *s, int32_t anchor) {
     Layout *where = &s->layout;
     int32_t dim = s->dim;
     int32_t last = s->count - 1;
@@ -1251,22 +1695,23 @@ INTERNAL void insert_state(State *s, int32_t index_) {
     int32_t end = s->layout.end;
     for (int32_t state = end; state > index_; state--) {
         s->x[state] = s->x[state - 1];
-        for (int32_t other = 0; other < end; other++) {
-            s->P[state][other] = s->P[state - 1][other];
-        }
         for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
             s->V[state][row] = s->V[state - 1][row];
         }
     }
     s->x[index_] = REAL(0.0);
-    for (int32_t other = 0; other < end; other++) {
-        s->P[index_][other] = REAL(0.0);
-    }
     for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
         s->V[index_][row] = REAL(0.0);
     }
-    for (int32_t state = 0; state < end + 1; state++) {
-        insert(s->P[state], index_, end);
+    for (int32_t state = end; state > -1; state--) {
+        int32_t to = row_of(state);
+        int32_t source = row_of(state > index_ ? state - 1 : state);
+        for (int32_t other = row_end(state, end + 1) - 1; other > -1; other--) {
+            s->P[to + other] = s->P[source + (other > index_ ? other - 1 : other)];
+        }
+    }
+    for (int32_t other = 0; other < end + 1; other++) {
+        set_covariance(s, index_, other, REAL(0.0));
     }
     s->layout.end = end + 1;
 }
@@ -1276,22 +1721,23 @@ INTERNAL void remove_state(State *s, int32_t index_) {
     int32_t end = s->layout.end;
     for (int32_t state = index_; state < end - 1; state++) {
         s->x[state] = s->x[state + 1];
-        for (int32_t other = 0; other < end; other++) {
-            s->P[state][other] = s->P[state + 1][other];
-        }
         for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
             s->V[state][row] = s->V[state + 1][row];
         }
     }
     s->x[end - 1] = REAL(0.0);
-    for (int32_t other = 0; other < end; other++) {
-        s->P[end - 1][other] = REAL(0.0);
-    }
     for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
         s->V[end - 1][row] = REAL(0.0);
     }
-    for (int32_t state = 0; state < end; state++) {
-        remove_(s->P[state], index_, end);
+    for (int32_t state = 0; state < end - 1; state++) {
+        int32_t to = row_of(state);
+        int32_t source = row_of(state >= index_ ? state + 1 : state);
+        for (int32_t other = 0, other_end = row_end(state, end - 1); other < other_end; other++) {
+            s->P[to + other] = s->P[source + (other >= index_ ? other + 1 : other)];
+        }
+    }
+    for (int32_t other = 0; other < end; other++) {
+        set_covariance(s, end - 1, other, REAL(0.0));
     }
     s->layout.end = end - 1;
 }
@@ -1338,7 +1784,7 @@ INTERNAL void remove_fault(State *s, int32_t index_, int32_t faults) {
 
 /* The same of what is known of lasting faults, given that this anchor has none. */
 INTERNAL void remove_lasting(State *s, int32_t anchor) {
-    real (*covariance)[32] = s->lasting_covariance;
+    real (*covariance)[MAX_ANCHORS] = s->lasting_covariance;
     int32_t end = s->count;
     weigh_zero(s, anchor, REAL(1.0) / ROUNDING_M2);
     for (int32_t row = anchor; row < end - 1; row++) {
@@ -1467,7 +1913,7 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
     }
     walk = settings->walk * status->walk_scale;
     for (int32_t one = where->offset, one_end = where->velocity; one < one_end; one++) {
-        for (int32_t other = where->offset, other_end = where->velocity; other < other_end; other++) {
+        for (int32_t other = where->offset; other < one + 1; other++) {
             add_noise(s, one, other, white_m2 + walk * cube_s, walk * square_s, walk * dt);
         }
     }
@@ -1493,22 +1939,52 @@ INTERNAL void advance(State *s, real dt) {
             effects[fault] += dt * of_rate[fault];
         }
     }
+    if (PACKED) {
+        advance_packed(s, values, dt);
+        return;
+    }
     for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
-        real *row = s->P[state];
+        int32_t row = row_of(state);
         for (int32_t value = 0; value < values; value++) {
-            row[value] += dt * row[values + value];
+            s->P[row + value] += dt * s->P[row + values + value];
         }
     }
     for (int32_t value = 0; value < values; value++) {
-        real *row = s->P[value];
-        real *rates = s->P[values + value];
+        int32_t row = row_of(value);
+        int32_t rates = row_of(values + value);
         for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-            row[state] += dt * rates[state];
+            s->P[row + state] += dt * s->P[rates + state];
         }
     }
     for (int32_t value = 0; value < values; value++) {
         for (int32_t other = 0; other < value; other++) {
-            s->P[value][other] = s->P[other][value];
+            s->P[at(value, other)] = s->P[at(other, value)];
+        }
+    }
+}
+
+/* The same for the lower triangle: of values among each other in two steps, between which their rates change. */
+INTERNAL void advance_packed(State *s, int32_t values, real dt) {
+    for (int32_t value = 0; value < values; value++) {
+        int32_t row = row_of(value);
+        int32_t rates = row_of(values + value);
+        for (int32_t other = 0; other < value + 1; other++) {
+            s->P[row + other] += dt * s->P[rates + other];
+        }
+    }
+    for (int32_t state = values, state_end = s->used; state < state_end; state++) {
+        int32_t row = row_of(state);
+        int32_t within = max_32(min_32(values, state - values + 1), 0);
+        for (int32_t value = 0; value < within; value++) {
+            s->P[row + value] += dt * s->P[row + values + value];
+        }
+        for (int32_t value = within; value < values; value++) {
+            s->P[row + value] += dt * s->P[row_of(values + value) + state];
+        }
+    }
+    for (int32_t value = 0; value < values; value++) {
+        for (int32_t other = 0; other < value + 1; other++) {
+            s->P[at(value, other)] += dt * s->P[at(values + other, value)];
         }
     }
 }
@@ -1517,10 +1993,12 @@ INTERNAL void advance(State *s, real dt) {
 INTERNAL void add_noise(State *s, int32_t value, int32_t other, real of_values, real of_both, real of_rates) {
     int32_t rate = s->layout.velocity + value;
     int32_t other_rate = s->layout.velocity + other;
-    s->P[value][other] += of_values;
-    s->P[value][other_rate] += of_both;
-    s->P[rate][other] += of_both;
-    s->P[rate][other_rate] += of_rates;
+    set_covariance(s, value, other, s->P[at(value, other)] + of_values);
+    set_covariance(s, rate, other, s->P[at(rate, other)] + of_both);
+    if (value != other) {
+        set_covariance(s, value, other_rate, s->P[at(value, other_rate)] + of_both);
+    }
+    set_covariance(s, rate, other_rate, s->P[at(rate, other_rate)] + of_rates);
 }
 
 /* Range errors that change */
@@ -1580,14 +2058,10 @@ INTERNAL void relax_range_error(State *s, int32_t anchor, real dt, real walked_m
 /* A state decays towards zero and keeps, in the long run, that variance: Gauss–Markov. */
 INTERNAL void decay(State *s, int32_t state, real kept, real variance) {
     s->x[state] *= kept;
-    real *row = s->P[state];
-    for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
-        row[other] *= kept;
-    }
     for (int32_t other = 0, other_end = s->used; other < other_end; other++) {
-        s->P[other][state] = row[other];
+        set_covariance(s, state, other, s->P[at(state, other)] * kept);
     }
-    row[state] = kept * row[state] + (REAL(1.0) - kept * kept) * variance;
+    s->P[at(state, state)] = kept * s->P[at(state, state)] + (REAL(1.0) - kept * kept) * variance;
     for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
         s->V[state][fault] *= kept;
     }
@@ -1596,11 +2070,10 @@ INTERNAL void decay(State *s, int32_t state, real kept, real variance) {
 /* Forget a state: zero, uncorrelated, with that variance. */
 INTERNAL void reset_state(State *s, int32_t state, real variance) {
     s->x[state] = REAL(0.0);
-    for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
-        s->P[state][other] = REAL(0.0);
-        s->P[other][state] = REAL(0.0);
+    for (int32_t other = 0, other_end = s->used; other < other_end; other++) {
+        set_covariance(s, state, other, REAL(0.0));
     }
-    s->P[state][state] = variance;
+    s->P[at(state, state)] = variance;
     for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
         s->V[state][fault] = REAL(0.0);
     }
@@ -1611,8 +2084,9 @@ INTERNAL void open_direction(State *s, real variance, int32_t faults) {
     real *opened = s->U[0];
     real *shared = s->G[0];
     for (int32_t one = 0, one_end = s->used; one < one_end; one++) {
-        for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
-            s->P[one][other] += opened[one] * opened[other] * variance;
+        int32_t row = row_of(one);
+        for (int32_t other = 0, other_end = row_end(one, s->n); other < other_end; other++) {
+            s->P[row + other] += opened[one] * opened[other] * variance;
         }
         for (int32_t fault = 0; fault < faults; fault++) {
             s->V[one][fault] += shared[fault] * opened[one];
@@ -1620,6 +2094,7 @@ INTERNAL void open_direction(State *s, real variance, int32_t faults) {
     }
 }
 
+#ifndef SKYLESS_BY_HAND
 /* Measurement update */
 
 /* Write P·h of the measurement in ``h`` into the next of ``U``; returns hᵀ·P·h. Counts updates that wait. */
@@ -1634,9 +2109,14 @@ INTERNAL real compute_ph(State *s) {
     for (int32_t term = 0, term_end = s->terms; term < term_end; term++) {
         if (s->h_index[term] < s->n) {
             real weight = s->h[term];
-            real *row = s->P[s->h_index[term]];
-            for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-                ph[state] += weight * row[state];
+            int32_t index_ = s->h_index[term];
+            int32_t row = row_of(index_);
+            int32_t end = row_end(index_, s->n);
+            for (int32_t state = 0; state < end; state++) {
+                ph[state] += weight * s->P[row + state];
+            }
+            for (int32_t state = end, state_end = s->n; state < state_end; state++) {
+                ph[state] += weight * s->P[row_of(state) + index_];
             }
         }
     }
@@ -1649,6 +2129,7 @@ INTERNAL real compute_ph(State *s) {
     }
     return h_dot(s, ph);
 }
+#endif
 
 /* The measurement in ``h`` times what stands in the order of states. */
 INTERNAL real h_dot(State *s, real *states) {
@@ -1661,6 +2142,7 @@ INTERNAL real h_dot(State *s, real *states) {
     return total;
 }
 
+#ifndef SKYLESS_BY_HAND
 /* Write s = [own reception] − h·V into the next of ``G``; ``own`` is the anchor that the tag received, or −1. */
 INTERNAL void compute_fault_input(State *s, int32_t own) {
     real *shares = s->G[s->waiting];
@@ -1687,6 +2169,7 @@ INTERNAL void compute_fault_input(State *s, int32_t own) {
         }
     }
 }
+#endif
 
 /* Scalar update by a measurement whose P·h and shares of faults are the next of ``U`` and ``G``.
  *
@@ -1732,12 +2215,17 @@ INTERNAL void note_update(State *s, real innovation, real innovation_variance, r
 
 /* Let P, V and M follow the updates that wait. */
 INTERNAL void finish_updates(State *s) {
-    if (s->waiting == 0) {
-        return;
+    if (s->waiting > 0) {
+        inform(s);
+        apply_updates(s);
     }
+}
+
+#ifndef SKYLESS_BY_HAND
+/* M ← M + Σ s·sᵀ/S over the updates that wait, of which ``G`` has s/√S. */
+INTERNAL void inform(State *s) {
     int32_t faults = FAULT_KINDS * s->count;
-    int32_t groups = fill_groups(s);
-    for (int32_t group = 0; group < groups; group++) {
+    for (int32_t group = 0, group_end = fill_groups(s); group < group_end; group++) {
         int32_t k = 4 * group;
         for (int32_t fault = 0; fault < faults; fault++) {
             real a = s->G[k][fault];
@@ -1750,8 +2238,8 @@ INTERNAL void finish_updates(State *s) {
             }
         }
     }
-    apply_updates(s);
 }
+#endif
 
 /* Fill the updates that wait with zeros up to a multiple of four; returns a quarter of their number. */
 INTERNAL int32_t fill_groups(State *s) {
@@ -1767,6 +2255,7 @@ INTERNAL int32_t fill_groups(State *s) {
     return groups;
 }
 
+#ifndef SKYLESS_BY_HAND
 /* P ← P − Σ u·uᵀ and V ← V + Σ u·gᵀ over the updates that wait, four at a time: P is read and written once. */
 INTERNAL void apply_updates(State *s) {
     if (s->waiting <= 2) {
@@ -1780,12 +2269,14 @@ INTERNAL void apply_updates(State *s) {
     }
     s->waiting = 0;
 }
+#endif
 
 INTERNAL void apply_one(State *s, int32_t one) {
     for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
         real u = s->U[one][state];
-        for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
-            s->P[state][other] -= u * s->U[one][other];
+        int32_t row = row_of(state);
+        for (int32_t other = 0, other_end = row_end(state, s->n); other < other_end; other++) {
+            s->P[row + other] -= u * s->U[one][other];
         }
         for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
             s->V[state][fault] += u * s->G[one][fault];
@@ -1799,8 +2290,9 @@ INTERNAL void apply_four(State *s, int32_t k) {
         real b = s->U[k + 1][state];
         real c = s->U[k + 2][state];
         real d = s->U[k + 3][state];
-        for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
-            s->P[state][other] -= a * s->U[k][other] + b * s->U[k + 1][other] + c * s->U[k + 2][other] + d * s->U[k +
+        int32_t row = row_of(state);
+        for (int32_t other = 0, other_end = row_end(state, s->n); other < other_end; other++) {
+            s->P[row + other] -= a * s->U[k][other] + b * s->U[k + 1][other] + c * s->U[k + 2][other] + d * s->U[k +
                     3][other];
         }
         for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
@@ -2211,7 +2703,7 @@ INTERNAL void open_range_error(State *s, int32_t anchor, real innovation) {
     int32_t change = s->layout.change + anchor;
     s->status.obstructions += 1;
     begin_obstruction(s, anchor);
-    s->P[change][change] += max_real(square(s->tuning.jump_std_m), innovation * innovation);
+    s->P[at(change, change)] += max_real(square(s->tuning.jump_std_m), innovation * innovation);
     make_uncertain(s, CHANGING_RANGE_ERRORS);
 }
 
@@ -2239,7 +2731,7 @@ INTERNAL void end_small_obstruction(State *s, int32_t anchor) {
     Anchor *a = &s->anchors[anchor];
     int32_t change = s->layout.change + anchor;
     real error_m = s->x[change];
-    real variance = s->P[change][change];
+    real variance = s->P[at(change, change)];
     real usual = s->status.place_variance_m2;
     bool settled = a->is_obstructed && variance < square(tuning->ended_std_m) + usual;
     if (settled && error_m * error_m < square(tuning->ended) * (variance + usual)) {
@@ -2293,7 +2785,7 @@ INTERNAL void adapt_change_variance(State *s, int32_t anchor, real elapsed_s) {
     if (memory_s > REAL(0.0)) {
         finish_updates(s);
         int32_t change = s->layout.change + anchor;
-        real present = square(s->x[change]) + s->P[change][change];
+        real present = square(s->x[change]) + s->P[at(change, change)];
         real variance = a->change_variance_m2 + min_real(elapsed_s / memory_s, REAL(0.5)) * (present -
                 a->change_variance_m2);
         variance = max_real(variance, square(settings->least_change_std_m));
@@ -2348,7 +2840,7 @@ INTERNAL void update_stationary(State *s, real dt) {
     Tuning *tuning = &s->tuning;
     real chi2 = REAL(0.0);
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
-        chi2 += square(s->x[axis] - status->stationary_m[axis]) / s->P[axis][axis];
+        chi2 += square(s->x[axis] - status->stationary_m[axis]) / s->P[at(axis, axis)];
     }
     status->stationary_s += dt;
     bool moved = chi2 > (real)s->dim || status->lag_square > tuning->lag_limit || status->rejected_in_row > 1;
@@ -2356,9 +2848,9 @@ INTERNAL void update_stationary(State *s, real dt) {
         status->stationary_s = REAL(0.0);
     }
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {  /* a place that has become known better moves as well */
-        if (moved || s->P[axis][axis] < tuning->better_known * status->stationary_m2[axis]) {
+        if (moved || s->P[at(axis, axis)] < tuning->better_known * status->stationary_m2[axis]) {
             status->stationary_m[axis] = s->x[axis];
-            status->stationary_m2[axis] = s->P[axis][axis];
+            status->stationary_m2[axis] = s->P[at(axis, axis)];
         }
     }
 }
@@ -2445,13 +2937,24 @@ INTERNAL bool uses_phases(State *s) {
     return (real)(s->status.epoch_ticks - s->status.phase_ticks) * TICK_S < s->tuning.phase_memory_s;
 }
 
+/* Sum of the variances of x and y ``ahead_s`` later, if nothing is received until then. */
+INTERNAL real horizontal_variance_m2(State *s, real ahead_s) {
+    real total = REAL(2.0) * s->settings.qa * s->status.q_scale * ahead_s * ahead_s * ahead_s / REAL(3.0);
+    for (int32_t axis = 0; axis < 2; axis++) {
+        int32_t speed = s->layout.velocity + axis;
+        total += s->P[at(axis, axis)] + ahead_s * (REAL(2.0) * s->P[at(axis, speed)] + ahead_s * s->P[at(speed,
+                speed)]);
+    }
+    return total;
+}
+
 /* Whether the constants of the ranges are as small as the settings state, as far as they are known. */
 INTERNAL bool fits_settings(State *s) {
     int32_t first = s->layout.constant;
     int32_t count = s->count;
     for (int32_t one = 0; one < count; one++) {
         for (int32_t other = 0; other < one + 1; other++) {
-            s->work[one][other] = s->P[first + one][first + other];
+            s->work[one][other] = s->P[at(first + one, first + other)];
         }
         s->work[one][one] += square(s->settings.range_std_m);
         s->work[count][one] = s->x[first + one];
@@ -2495,9 +2998,9 @@ INTERNAL void protect(State *s) {
         real shift_x = REAL(0.0);
         real shift_y = REAL(0.0);
         real shift_z = REAL(0.0);
-        real xx = scale * s->P[0][0];
-        real xy = scale * s->P[0][1];
-        real yy = scale * s->P[1][1];
+        real xx = scale * s->P[at(0, 0)];
+        real xy = scale * s->P[at(0, 1)];
+        real yy = scale * s->P[at(1, 1)];
         real zz = REAL(0.0);
         for (int32_t one = 0, one_end = s->count; one < one_end; one++) {
             shift_x += x[one] * faults[one];
@@ -2513,7 +3016,7 @@ INTERNAL void protect(State *s) {
         real largest = REAL(0.5) * (xx + yy) + SQRT(REAL(0.25) * square(xx - yy) + xy * xy);
         levels[HPL] = max_real(levels[HPL], hypot_(shift_x, shift_y) + s->horizontal_k * SQRT(largest));
         if (s->dim == 3) {
-            levels[VPL] = max_real(levels[VPL], abs_real(shift_z) + s->vertical_k * SQRT(scale * s->P[2][2] + zz));
+            levels[VPL] = max_real(levels[VPL], abs_real(shift_z) + s->vertical_k * SQRT(scale * s->P[at(2, 2)] + zz));
         }
     }
     real squared = REAL(0.0);
@@ -2577,7 +3080,7 @@ SKYLESS_EXPORT void skyless_fit_plane(State *s) {
 
 /* Write the axis along which the symmetric matrix in ``work`` is smallest into the plane's normal (Jacobi 1846). */
 INTERNAL void find_least_axis(State *s, int32_t dim) {
-    real (*M)[32] = s->work;
+    real (*M)[MAX_ANCHORS] = s->work;
     int32_t axes = AXES;
     for (int32_t one = 0; one < dim; one++) {
         for (int32_t other = 0; other < dim; other++) {
@@ -2606,7 +3109,7 @@ INTERNAL void find_least_axis(State *s, int32_t dim) {
 
 /* Rotate two axes of the matrix in ``work`` so that their common element becomes zero. */
 INTERNAL void rotate(State *s, int32_t dim, int32_t one, int32_t other) {
-    real (*M)[32] = s->work;
+    real (*M)[MAX_ANCHORS] = s->work;
     real half = REAL(0.5) * (M[other][other] - M[one][one]) / M[one][other];
     real tangent = (half >= REAL(0.0) ? REAL(1.0) : -REAL(1.0)) / (abs_real(half) + SQRT(half * half + REAL(1.0)));
     real cosine = REAL(1.0) / SQRT(tangent * tangent + REAL(1.0));
@@ -2645,7 +3148,7 @@ INTERNAL bool is_side_open(State *s) {
         off_m += normal[axis] * (s->x[axis] - status->plane_m[axis]);
     }
     real image_z_m = s->x[2] - REAL(2.0) * off_m * normal[2];
-    bool is_near = off_m * off_m * square(normal[2]) <= s->P[2][2];
+    bool is_near = off_m * off_m * square(normal[2]) <= s->P[at(2, 2)];
     if (dim == 3 && !((settings->lowest_m <= image_z_m && image_z_m <= settings->highest_m) || is_near)) {
         return false;
     }
@@ -2722,7 +3225,7 @@ INTERNAL int32_t integrity_state(State *s) {
     }
     bool was_contradicted = status->fault_std_m[LASTING] > tuning->lasting_std_m;  /* then none are selected */
     real limit = was_contradicted ? tuning->sure_chi2 : tuning->uncovered_chi2;
-    real share = SQRT(s->P[0][0] + s->P[1][1]) / max_real(range_m, REAL(1e-06));  /* levels are of first order in it */
+    real share = SQRT(s->P[at(0, 0)] + s->P[at(1, 1)]) / max_real(range_m, REAL(1e-06));  /* levels are of first order in it */
     if (status->withholds_levels || largest_test(s) > limit) {
         state = CONTRADICTED;
     }
@@ -2821,7 +3324,7 @@ INTERNAL void hold_direction(State *s, int32_t anchor) {
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
         moved_m2 += square(s->x[axis] - a->held_m[axis]);
         squared += square(s->x[axis] - a->position_m[axis]);
-        variance += s->P[axis][axis];
+        variance += s->P[at(axis, axis)];
     }
     real step_m2 = max_real(min_real(square(tuning->suspect) * variance, square(tuning->held_max_m)),
             square(tuning->held_step_m));
@@ -2853,13 +3356,13 @@ INTERNAL void add_range_errors(State *s, int32_t anchor, real sign) {
 INTERNAL real find_curvature_m(State *s, real range_m, real variance) {
     real across = REAL(0.0);
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
-        across += s->P[axis][axis];
+        across += s->P[at(axis, axis)];
     }
     real least = s->tuning.curvature_share * variance * range_m * range_m;
     if (REAL(0.5) * across * across >= least) {
         for (int32_t one = 0, one_end = s->dim; one < one_end; one++) {
             for (int32_t other = 0, other_end = s->dim; other < other_end; other++) {
-                across -= s->h[one] * s->P[one][other] * s->h[other];
+                across -= s->h[one] * s->P[at(one, other)] * s->h[other];
             }
         }
     }
@@ -3020,10 +3523,9 @@ INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_
 INTERNAL void open_state(State *s, int32_t state, int32_t own, real variance) {
     compute_fault_input(s, own);
     for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
-        s->P[other][state] = -s->U[0][other];
-        s->P[state][other] = -s->U[0][other];
+        set_covariance(s, state, other, REAL(0.0) - s->U[0][other]);
     }
-    s->P[state][state] = variance;
+    s->P[at(state, state)] = variance;
     for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
         s->V[state][fault] = s->G[0][fault];
     }
@@ -3188,7 +3690,7 @@ INTERNAL void survey_pair(State *s, int32_t one, int32_t other) {
         a->is_obstructed = false;
     }
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
-        s->P[survey + axis][survey + axis] += square(s->tuning.lasting_std_m);
+        s->P[at(survey + axis, survey + axis)] += square(s->tuning.lasting_std_m);
     }
     for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
         if (pair(s, misplaced, anchor)->contradicts) {
@@ -3238,7 +3740,7 @@ INTERNAL void report(State *s, int32_t anchor, int32_t master, int64_t subticks,
     real own_variance = REAL(0.0);
     for (int32_t one = 0, one_end = s->terms; one < one_end; one++) {
         for (int32_t other = 0, other_end = s->terms; other < other_end; other++) {
-            own_variance += s->h[one] * s->h[other] * s->P[s->h_index[one]][s->h_index[other]];
+            own_variance += s->h[one] * s->h[other] * s->P[at(s->h_index[one], s->h_index[other])];
         }
     }
     int64_t whole = (s->anchors[master].offset_ticks - a->offset_ticks) & TICK_MASK;
@@ -3332,7 +3834,7 @@ INTERNAL void bound_changes(State *s) {
         real missing_m = s->settings.earliest_m - s->x[change];
         if (missing_m > REAL(0.0)) {
             for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-                s->x[state] += s->P[change][state] / s->P[change][change] * missing_m;
+                s->x[state] += s->P[at(change, state)] / s->P[at(change, change)] * missing_m;
             }
         }
     }
@@ -3355,12 +3857,12 @@ INTERNAL int32_t height(State *s, real height_m, real std_m, bool is_barometer) 
     add_term(s, where->height, REAL(1.0));
     if (is_barometer) {
         int32_t zero = where->zero;
-        if (s->P[zero][zero] == REAL(0.0)) {
+        if (s->P[at(zero, zero)] == REAL(0.0)) {
             s->x[zero] = innovation;
             make_uncertain(s, ALL_RANGE_ERRORS);
-            s->P[zero][zero] = s->tuning.zero_variance_m2;
+            s->P[at(zero, zero)] = s->tuning.zero_variance_m2;
         } else {
-            s->P[zero][zero] += settings->barometer_walk * ((real)(status->epoch_ticks - status->height_ticks) *
+            s->P[at(zero, zero)] += settings->barometer_walk * ((real)(status->epoch_ticks - status->height_ticks) *
                     TICK_S);
         }
         innovation -= s->x[zero];
@@ -3420,7 +3922,7 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
     measure_way(s);
     if (a->own.is_known) {
         real wander = max_real(tuning->phase_wander * status->phase_variance_m2, s->settings.phase_wander);
-        s->P[ambiguity][ambiguity] += wander * (status->way_m - a->phase_way_m);
+        s->P[at(ambiguity, ambiguity)] += wander * (status->way_m - a->phase_way_m);
     }
     a->phase_way_m = status->way_m;
     follow_line(s);
@@ -3620,12 +4122,13 @@ INTERNAL void turn(State *s, int32_t anchor, int32_t ambiguity) {
 
 /* A state's error loses so much of that of another. */
 INTERNAL void subtract(State *s, int32_t state, int32_t other, real weight) {
+    s->P[at(state, state)] -= weight * s->P[at(other, state)];
     for (int32_t one = 0, one_end = s->n; one < one_end; one++) {
-        s->P[state][one] -= weight * s->P[other][one];
+        if (one != state) {
+            set_covariance(s, state, one, s->P[at(state, one)] - weight * s->P[at(other, one)]);
+        }
     }
-    for (int32_t one = 0, one_end = s->n; one < one_end; one++) {
-        s->P[one][state] -= weight * s->P[one][other];
-    }
+    s->P[at(state, state)] -= weight * s->P[at(state, other)];
     for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
         s->V[state][fault] -= weight * s->V[other][fault];
     }
@@ -3681,11 +4184,9 @@ INTERNAL void keep_former(State *s, int32_t anchor) {
     a->former_ticks = s->status.epoch_ticks;
     s->x[former] = s->x[ambiguity];
     for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-        s->P[former][state] = s->P[ambiguity][state];
+        set_covariance(s, former, state, s->P[at(ambiguity, state)]);
     }
-    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-        s->P[state][former] = s->P[state][ambiguity];
-    }
+    s->P[at(former, former)] = s->P[at(ambiguity, ambiguity)];
     for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
         s->V[former][fault] = s->V[ambiguity][fault];
     }
@@ -3731,7 +4232,7 @@ INTERNAL void known_phase(State *s, int32_t anchor, real walked_m) {
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
         s->status.line_m[axis] = s->x[axis];
     }
-    s->P[ambiguity][ambiguity] += s->settings.phase_wander * walked_m;
+    s->P[at(ambiguity, ambiguity)] += s->settings.phase_wander * walked_m;
     phase_terms(s, anchor);
     use_phase(s, ambiguity, &s->anchors[anchor].own, REAL(0.0), s->status.phase_variance_m2);
 }
@@ -3744,26 +4245,36 @@ INTERNAL real expected_phase(State *s, int32_t anchor) {
 
 /* What the estimator does with a packet, a ready-made difference or a height; and with many packets in one loop. */
 
+/* Let an anchor leave the state, if it is there. */
+SKYLESS_EXPORT void skyless_leave(State *s, int32_t identifier) {
+    int32_t anchor = skyless_find_anchor(s, identifier);
+    if (anchor >= 0) {
+        remove_anchor(s, anchor);
+        skyless_fit_plane(s);
+    }
+}
+
 /* One packet */
 
 /* Process a packet and what it relays; returns what became of it, and leaves ``levels`` and ``fix``. */
-INTERNAL int32_t process(State *s, Packet *packet) {
-    int32_t outcome = process_packet(s, packet);
+INTERNAL int32_t process(State *s, Packet *packet, Relays *relays) {
+    int32_t outcome = process_packet(s, packet, relays);
     fill_fix(s);
     return outcome;
 }
 
 /* ``process`` with more relays, as frames carry them. */
-SKYLESS_EXPORT int32_t skyless_process_frame(State *s, Packet *packet, uint8_t *packed, int32_t packed_bytes) {
-    take_relays(packet, packed, packed_bytes);
-    return process(s, packet);
+SKYLESS_EXPORT int32_t skyless_process_frame(State *s, Packet *packet, Relays *relays, uint8_t *packed, int32_t
+        packed_bytes) {
+    take_relays(packet, relays, packed, packed_bytes);
+    return process(s, packet, relays);
 }
 
 /* Add relays as frames carry them to those of a packet, as far as there is space. */
-INTERNAL void take_relays(Packet *packet, uint8_t *packed, int32_t packed_bytes) {
+INTERNAL void take_relays(Packet *packet, Relays *relays, uint8_t *packed, int32_t packed_bytes) {
     for (int32_t begin = 0; begin < packed_bytes; begin += 8) {
-        if (packet->relay_count < MAX_RELAYS) {
-            Relay *relayed = &packet->relays[packet->relay_count];
+        if (relays->count < MAX_RELAYS) {
+            Relay *relayed = &relays->rows[relays->count];
             relayed->listener = packet->place.anchor;
             relayed->anchor = two_bytes(packed, begin);
             relayed->sequence = packed[begin + 2];
@@ -3777,7 +4288,7 @@ INTERNAL void take_relays(Packet *packet, uint8_t *packed, int32_t packed_bytes)
             } else {
                 relayed->rx_ticks = nearest(unsigned_(packed, begin + 3, HEARD_BYTES - 3), packet->tx_ticks, 40);
             }
-            packet->relay_count += 1;
+            relays->count += 1;
         }
     }
 }
@@ -3790,7 +4301,7 @@ INTERNAL int64_t relay_rx_ticks(Relay *relayed, int64_t tx_ticks, int64_t elapse
 }
 
 /* Process a packet; its anchor joins where it is not in the state. */
-INTERNAL int32_t process_packet(State *s, Packet *packet) {
+INTERNAL int32_t process_packet(State *s, Packet *packet, Relays *relays) {
     Status *status = &s->status;
     Place *place = &packet->place;
     if (status->packets > 0 && packet->rx_ticks < status->epoch_ticks) {
@@ -3803,12 +4314,12 @@ INTERNAL int32_t process_packet(State *s, Packet *packet) {
     if (anchor < 0) {
         return REJECTED;
     }
-    int32_t outcome = process_of(s, anchor, packet);
+    int32_t outcome = process_of(s, anchor, packet, relays);
     if (outcome == RESTARTED_CLOCK) {
         status->clock_restarts += 1;
-        skyless_remove_anchor(s, anchor);
+        remove_anchor(s, anchor);
         anchor = present(s, place);
-        outcome = process_of(s, anchor, packet);
+        outcome = process_of(s, anchor, packet, relays);
     }
     return outcome;
 }
@@ -3838,14 +4349,14 @@ INTERNAL void remove_silent(State *s, int64_t rx_ticks) {
     for (int32_t anchor = s->count - 1; anchor > -1; anchor--) {
         Anchor *a = &s->anchors[anchor];
         if (a->packets > 0 && (real)(rx_ticks - a->rx_ticks) * TICK_S > s->settings.drop_s) {
-            skyless_remove_anchor(s, anchor);
+            remove_anchor(s, anchor);
             skyless_fit_plane(s);
         }
     }
 }
 
 /* Process a packet of an anchor in the state. */
-INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet) {
+INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet, Relays *relays) {
     Status *status = &s->status;
     Anchor *a = &s->anchors[anchor];
     int64_t rx_ticks = packet->rx_ticks;
@@ -3866,7 +4377,7 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet) {
             return RESTARTED_CLOCK;
         }
         outcome = result == USED ? ACCEPTED : REJECTED;
-        if (packet->has_phase && s->settings.carrier_cycles > 0) {
+        if (PHASE_STATES > 0 && packet->has_phase && s->settings.carrier_cycles > 0) {
             if (result == USED) {
                 own_phase(s, anchor, packet->phase_cycles);
             } else if (a->outliers_in_row > 1) {
@@ -3880,8 +4391,8 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet) {
     if (is_known) {
         status->relays_lately_accepted *= REAL(1.0) - s->tuning.mean_gain;
         status->relays_lately_rejected *= REAL(1.0) - s->tuning.mean_gain;
-        for (int32_t one = 0, one_end = packet->relay_count; one < one_end; one++) {
-            process_relay(s, &packet->relays[one]);
+        for (int32_t one = 0, one_end = relays->count; one < one_end; one++) {
+            process_relay(s, &relays->rows[one]);
         }
         finish_updates(s);
         if (packet->report_variance_m2 > REAL(0.0) && packet->master >= 0) {
@@ -3954,7 +4465,7 @@ INTERNAL void process_relay(State *s, Relay *relayed) {
         Anchor *i = &s->anchors[listener];
         int64_t rx_ticks = relay_rx_ticks(relayed, i->tx_ticks, i->rx_ticks - kept->rx_ticks);
         bool is_used = relay(s, listener, sender, kept->tx_ticks, kept->rx_ticks, rx_ticks);
-        if (is_used && relayed->has_phase && s->status.has_phases) {
+        if (PHASE_STATES > 0 && is_used && relayed->has_phase && s->status.has_phases) {
             relay_phase(s, listener, sender, kept->rx_ticks, relayed->phase_cycles);
         }
     }
@@ -3983,8 +4494,8 @@ INTERNAL void fill_fix(State *s) {
         s->fix[POSITION][one] = s->x[one];
         s->fix[VELOCITY][one] = s->x[velocity + one];
         for (int32_t other = 0, other_end = s->dim; other < other_end; other++) {
-            s->fix[POSITION + 1 + one][other] = scale * s->P[one][other];
-            s->fix[VELOCITY + 1 + one][other] = scale * s->P[velocity + one][velocity + other];
+            s->fix[POSITION + 1 + one][other] = scale * s->P[at(one, other)];
+            s->fix[VELOCITY + 1 + one][other] = scale * s->P[at(velocity + one, velocity + other)];
         }
     }
     if (s->dim == 2) {
@@ -4049,6 +4560,7 @@ SKYLESS_EXPORT int32_t skyless_process_height(State *s, real height_m, real std_
 SKYLESS_EXPORT void skyless_track(State *s, Place *places, BatchPacket *packets, Relay *relays, BatchRow *rows, int32_t
         count, bool has_levels) {
     Packet packet = {0};
+    Relays taken = {0};
     packet.master = -1;
     int32_t begin = 0;
     for (int32_t one = 0; one < count; one++) {
@@ -4060,12 +4572,12 @@ SKYLESS_EXPORT void skyless_track(State *s, Place *places, BatchPacket *packets,
         packet.variance_factor = given->variance_factor;
         packet.has_phase = given->has_phase;
         packet.phase_cycles = given->phase_cycles;
-        packet.relay_count = min_32(given->end - begin, MAX_RELAYS);
-        for (int32_t place = 0, place_end = packet.relay_count; place < place_end; place++) {
-            packet.relays[place] = relays[begin + place];
+        taken.count = min_32(given->end - begin, MAX_RELAYS);
+        for (int32_t place = 0, place_end = taken.count; place < place_end; place++) {
+            taken.rows[place] = relays[begin + place];
         }
         begin = given->end;
-        rows[one].outcome = process_packet(s, &packet);
+        rows[one].outcome = process_packet(s, &packet, &taken);
         fill_row(s, &rows[one], has_levels);
     }
 }
@@ -4076,7 +4588,7 @@ INTERNAL void fill_row(State *s, BatchRow *row, bool has_levels) {
         row->position_m[one] = s->x[one];
         row->velocity_mps[one] = s->x[s->layout.velocity + one];
         for (int32_t other = 0, other_end = s->dim; other < other_end; other++) {
-            row->covariance_m2[one][other] = s->P[one][other];
+            row->covariance_m2[one][other] = s->P[at(one, other)];
         }
     }
     if (has_levels) {
@@ -4202,7 +4714,7 @@ INTERNAL void process_superframe(State *s, PlannedMessage *messages, PlannedRela
 INTERNAL void add_fix(State *s, real share, SteadyState *found) {
     found->fixes += share;
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
-        found->variance_m2[axis] += share * s->P[axis][axis];
+        found->variance_m2[axis] += share * s->P[at(axis, axis)];
         found->square_bias_m2 += share * square(s->V[axis][walls(s)]);
         for (int32_t row = walls(s) + 1, row_end = s->rows; row < row_end; row++) {
             found->motion_m2[axis] += share * square(s->V[axis][row]);
@@ -4455,63 +4967,6 @@ INTERNAL bool least_squares(Columns *m, real *right, real *x) {
         }
     }
     return true;
-}
-
-/* Tails of the normal and the chi2 distribution. */
-
-/* Probability that a standard normal variable exceeds z, to 10⁻¹² of itself.
- *
- * With its density φ it is ½ − φ(z)·Σ z²ⁿ⁺¹/(1·3·…·(2n + 1)), or φ(z)/(z + 1/(z + 2/(z + …))) after Laplace. */
-INTERNAL real normal_tail(real z) {
-    real tail = 0;
-    real size = abs_real(z);
-    real density = exp_(-REAL(0.5) * size * size) / SQRT_2_PI;
-    if (size < FAR_TAIL) {
-        real term = size;
-        real total = size;
-        for (int32_t n = 1; n < TERMS; n++) {
-            term *= size * size / (real)(2 * n + 1);
-            total += term;
-        }
-        tail = REAL(0.5) - density * total;
-    } else {
-        tail = density / continued_fraction(size, 1);
-    }
-    return z >= REAL(0.0) ? tail : REAL(1.0) - tail;
-}
-
-/* The value of z + n/(z + (n + 1)/(z + …)) for the first n. */
-INTERNAL real continued_fraction(real z, int32_t first) {
-    real fraction = z;
-    for (int32_t n = TERMS; n > first - 1; n--) {
-        fraction = z + (real)n / fraction;
-    }
-    return fraction;
-}
-
-/* Probability that chi2 with at least one degree of freedom exceeds a value, by the finite sum. */
-INTERNAL real chi2_tail(int32_t dof, real chi2) {
-    real half = REAL(0.5) * chi2;
-    if (!(half < REAL(700.0))) {
-        return REAL(0.0);
-    }
-    bool is_odd = floor_mod_32(dof, 2) == 1;
-    real term = is_odd ? REAL(2.0) * SQRT(chi2) / SQRT_2_PI : REAL(1.0);
-    real total = REAL(0.0);
-    for (int32_t k = 0; k < floor_div_32(dof, 2); k++) {
-        total += term;
-        term *= half / ((real)k + (is_odd ? REAL(1.5) : REAL(1.0)));
-    }
-    return (is_odd ? REAL(2.0) * normal_tail(SQRT(chi2)) : REAL(0.0)) + exp_(-half) * total;
-}
-
-/* Mean of a normal variable given that it is positive: E[w²], where w² was measured and may be near 0. */
-INTERNAL real mean_if_positive(real mean, real sigma) {
-    real z = mean / sigma;
-    if (z < -FAR_TAIL) {  /* where the mean and what is added to it would cancel */
-        return sigma / continued_fraction(-z, 2);
-    }
-    return mean + sigma * exp_(-REAL(0.5) * z * z) / (SQRT_2_PI * normal_tail(-z));
 }
 
 /* A set of TDoAs, in the axes in which their solution is simplest. */
@@ -5240,7 +5695,7 @@ INTERNAL void fill_residuals(LocateProblem *p, Found *found, Minimum *minimum) {
  * pseudoranges are carried to one time and solved in closed form. */
 
 /* Forget what was received of an anchor, because its position has changed. */
-SKYLESS_EXPORT void skyless_forget_packets(Acquisition *q, int32_t anchor) {
+INTERNAL void forget_packets(Acquisition *q, int32_t anchor) {
     int32_t place = find_heard(q, anchor);
     if (place >= 0) {
         remove_heard(q, place);
@@ -5255,16 +5710,15 @@ SKYLESS_EXPORT void skyless_forget_packets(Acquisition *q, int32_t anchor) {
     q->link_count = kept;
 }
 
-/* Add one packet with more relays, as frames carry them; try to start each time an anchor comes around again.
+/* Add one packet; try to start each time an anchor comes around again.
  *
  * Returns why there is no start, ``FOUND`` if ``start`` is one. */
-SKYLESS_EXPORT int32_t skyless_try_start(Acquisition *q, HeardPacket *given, uint8_t *packed, int32_t packed_bytes) {
-    take_relays(&given->packet, packed, packed_bytes);
-    add_links(q, &given->packet);
-    int64_t now = given->packet.rx_ticks;
-    int32_t anchor = given->packet.place.anchor;
+INTERNAL int32_t try_start(Acquisition *q, Packet *packet, Relays *relays) {
+    add_links(q, packet, relays);
+    int64_t now = packet->rx_ticks;
+    int32_t anchor = packet->place.anchor;
     forget_old_packets(q, now);
-    bool came_around = keep_packet_of(q, anchor, given);
+    bool came_around = keep_heard(q, packet, relays);
     choose_pairs(q, now);
     put_on_one_scale(q, now);
     drop_impossible(q, now);
@@ -5316,8 +5770,8 @@ INTERNAL void forget_old_packets(Acquisition *q, int64_t now) {
 /* Keep an anchor's two newest packets; whether it had two before.
  *
  * With too many anchors a new one takes the place of that which has not fitted the others for longest. */
-INTERNAL bool keep_packet_of(Acquisition *q, int32_t anchor, HeardPacket *given) {
-    int32_t place = find_heard(q, anchor);
+INTERNAL bool keep_heard(Acquisition *q, Packet *packet, Relays *relays) {
+    int32_t place = find_heard(q, packet->place.anchor);
     if (place < 0) {
         if (q->count == MAX_ANCHORS) {
             remove_heard(q, longest_unfitting(q));
@@ -5332,7 +5786,11 @@ INTERNAL bool keep_packet_of(Acquisition *q, int32_t anchor, HeardPacket *given)
     if (one->count > 0) {
         one->older = one->newer;
     }
-    one->newer = *given;
+    one->newer.packet = *packet;
+    one->newer.relay_count = min_32(relays->count, RELAYS_KEPT);
+    for (int32_t relayed = 0, relayed_end = one->newer.relay_count; relayed < relayed_end; relayed++) {
+        one->newer.relays[relayed] = relays->rows[relayed];
+    }
     one->count = min_32(one->count + 1, 2);
     return had_two;
 }
@@ -5348,9 +5806,9 @@ INTERNAL int32_t longest_unfitting(Acquisition *q) {
 }
 
 /* Keep what an anchor relays of packets that the tag has received. */
-INTERNAL void add_links(Acquisition *q, Packet *packet) {
-    for (int32_t index_ = 0, index__end = packet->relay_count; index_ < index__end; index_++) {
-        Relay *relayed = &packet->relays[index_];
+INTERNAL void add_links(Acquisition *q, Packet *packet, Relays *relays) {
+    for (int32_t index_ = 0, index__end = relays->count; index_ < index__end; index_++) {
+        Relay *relayed = &relays->rows[index_];
         int32_t place = find_heard(q, relayed->anchor);
         if (place >= 0) {
             if (q->heard[place].newer.packet.sequence == relayed->sequence) {
@@ -5431,7 +5889,7 @@ INTERNAL void put_on_one_scale(Acquisition *q, int64_t now) {
     int32_t stated = 0;
     for (int32_t pair = 0, pair_end = q->pair_count; pair < pair_end; pair++) {
         HeardAnchor *one = &q->heard[q->pairs[pair]];
-        stated += one->older.is_stated && one->newer.is_stated ? 1 : 0;
+        stated += one->older.packet.is_stated && one->newer.packet.is_stated ? 1 : 0;
         measure_rate(q, pair, &one->older.packet, &one->newer.packet);
     }
     forget_links_before(q, now);
@@ -5447,9 +5905,9 @@ INTERNAL void put_on_one_scale(Acquisition *q, int64_t now) {
     int32_t kept = 0;
     for (int32_t pair = 0, pair_end = q->pair_count; pair < pair_end; pair++) {
         HeardAnchor *one = &q->heard[q->pairs[pair]];
-        bool is_kept = one->older.is_stated && one->newer.is_stated;
-        one->older.scaled = one->older.stated;
-        one->newer.scaled = one->newer.stated;
+        bool is_kept = one->older.packet.is_stated && one->newer.packet.is_stated;
+        one->older.scaled = one->older.packet.stated;
+        one->newer.scaled = one->newer.packet.stated;
         if (q->best.count >= stated) {
             is_kept = q->best.is_reached[pair] == 1;
             if (is_kept) {
@@ -5758,12 +6216,12 @@ SKYLESS_EXPORT int32_t skyless_admit_stamp(Admission *a, int32_t anchor, int32_t
     return stamp;
 }
 
-/* A tag that knows where it is: what becomes of a packet, and when it has to begin again. */
+/* A tag that knows where it is: what becomes of a packet, and when it has to begin again (``following.py``). */
 
 /* Process a packet of a tag that knows where it is, as ``process_frame``; what becomes of it. */
-SKYLESS_EXPORT int32_t skyless_process_in_course(Course *c, State *s, FixTime *time, Packet *packet, uint8_t *packed,
+INTERNAL int32_t process_in_course(Course *c, State *s, FixTime *time, Packet *packet, Relays *relays, uint8_t *packed,
         int32_t packed_bytes) {
-    int32_t outcome = skyless_process_frame(s, packet, packed, packed_bytes);
+    int32_t outcome = skyless_process_frame(s, packet, relays, packed, packed_bytes);
     c->newest_ticks = max_64(c->newest_ticks, packet->rx_ticks);
     if (outcome == REJECTED || outcome == STALE) {
         return is_lost(s) ? LOST : OUTLIER;
@@ -5777,10 +6235,10 @@ SKYLESS_EXPORT int32_t skyless_process_in_course(Course *c, State *s, FixTime *t
 
 /* Whether the state is a fix: in three dimensions its height may be worse than the anchors' extent. */
 INTERNAL int32_t settle(Course *c, State *s, FixTime *time, int64_t rx_ticks) {
-    if (s->dim == AXES && s->P[2][2] > square(c->extent_m)) {
+    if (s->dim == AXES && s->P[at(2, 2)] > square(c->extent_m)) {
         return BAD_GEOMETRY;
     }
-    c->time_s = fix_time_s(time, rx_ticks + c->master_less_tag_ticks, rx_ticks);
+    c->time_ticks = fix_time_ticks(time, rx_ticks + c->master_less_tag_ticks, rx_ticks);
     return FIX;
 }
 
@@ -5891,6 +6349,280 @@ INTERNAL void widen(Course *c, int32_t axis) {
     c->extent_m = max_real(c->extent_m, highest - lowest);
 }
 
+/* A tag from its first packet on: it looks for a start, follows its course, and begins again where it is lost.
+ *
+ * The filter's state and the search for a start are not used at the same time, so that a board may keep both in the same
+ * memory (``SHARES_MEMORY``): a filter begins with copies of what was found. */
+
+/* Begin with the settings in ``c``: nothing has been received. */
+SKYLESS_EXPORT void skyless_begin_course(Course *c, Acquisition *q) {
+    c->in_use_s = max_real(c->tuning.short_silence_s, REAL(1.5) * c->superframe_s);
+    c->start_was_contradicted = false;
+    c->is_open = false;
+    c->open_range_errors = false;
+    c->is_starting = true;
+    c->may_begin_again = true;
+    c->relays_may_contradict = true;
+    c->count = 0;
+    c->heights_rejected = 0;
+    c->checked_ticks = 0;
+    c->newest_ticks = 0;
+    c->started_ticks = 0;
+    c->master_less_tag_ticks = 0;
+    c->extent_m = REAL(0.0);
+    c->late_share = REAL(0.0);
+    c->misfit = NOBODY;
+    c->changes += 1;
+    begin_search(c, q);
+}
+
+/* Give up the filter, but for what it knows of late packets. */
+SKYLESS_EXPORT void skyless_begin_again(Course *c, State *s, Acquisition *q) {
+    c->late_share = s->status.late_share;
+    begin_search(c, q);
+}
+
+/* Look for a start, without anything that was received before. */
+INTERNAL void begin_search(Course *c, Acquisition *q) {
+    EstimatorSettings *settings = &c->settings;
+    Tuning *tuning = &c->tuning;
+    c->is_starting = true;
+    q->tuning = *tuning;
+    q->knows_height = c->dim < AXES;
+    q->height_m = c->dim < AXES ? settings->height_m : REAL(0.0);
+    q->has_bounds = settings->lowest_m > -LARGEST || settings->highest_m < LARGEST;
+    q->low_m = settings->lowest_m;
+    q->high_m = settings->highest_m;
+    q->variance_m2 = settings->tx_variance_m2 + settings->rx_variance_m2;
+    q->max_age_s = max_real(tuning->start_age_s, REAL(2.5) * c->superframe_s);
+    q->speed_std_mps = settings->start_speed_std_mps;
+    q->error_variance_m2 = square(settings->range_std_m) + square(settings->survey_std_m);
+    q->rival_count = 0;
+    q->link_count = 0;
+    q->count = 0;
+    q->is_contradicted = false;
+    q->has_been_wide = false;
+}
+
+/* Process a packet with more relays, as frames carry them; what becomes of it. */
+SKYLESS_EXPORT int32_t skyless_follow(Course *c, State *s, Acquisition *q, FixTime *time, Packet *packet, Relays
+        *relays, uint8_t *packed, int32_t packed_bytes) {
+    int64_t rx_ticks = packet->rx_ticks;
+    if (!c->is_starting && !is_surely_in_reach(c, rx_ticks) && is_out_of_reach(c, s, rx_ticks)) {
+        skyless_begin_again(c, s, q);
+    }
+    if (!c->is_starting) {
+        int32_t outcome = process_in_course(c, s, time, packet, relays, packed, packed_bytes);
+        if (outcome == LOST || outcome == START_CONTRADICTED) {
+            skyless_begin_again(c, s, q);
+        }
+        return outcome;
+    }
+    take_relays(packet, relays, packed, packed_bytes);
+    int32_t found = try_start(q, packet, relays);
+    if (found != FOUND) {
+        return outcome_of(found);
+    }
+    if (q->start.is_contradicted && !q->start.has_misfit && was_late_often(c)) {
+        return OUTLIER;  /* single packets are late: others will not be */
+    }
+    if (c->superframe_s > c->tuning.longest_superframe_s) {
+        fill_alone(c, q);
+        c->time_ticks = fix_time_ticks(time, rx_ticks + c->master_less_tag_ticks, rx_ticks);
+        return START_FIX;
+    }
+    return begin_filter(c, s, q, relays) ? settle(c, s, time, rx_ticks) : SEARCHING;
+}
+
+INTERNAL int32_t outcome_of(int32_t found) {
+    if (found == RESIDUALS || found == IMPOSSIBLE) {
+        return OUTLIER;
+    }
+    if (found == TOO_FEW_ANCHORS) {
+        return HAS_TOO_FEW;
+    }
+    if (found == MIRROR) {
+        return IS_MIRRORED;
+    }
+    if (found == UNSETTLED) {
+        return IS_UNSETTLED;
+    }
+    return found == ACQUIRING ? SEARCHING : BAD_GEOMETRY;
+}
+
+INTERNAL bool was_late_often(Course *c) {
+    return c->late_share > c->tuning.late_often_share;
+}
+
+/* Whether a filter can go on */
+
+/* Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back. */
+INTERNAL bool is_out_of_reach(Course *c, State *s, int64_t rx_ticks) {
+    Tuning *tuning = &c->tuning;
+    real silent_s = (real)(rx_ticks - c->newest_ticks) * TICK_S;
+    if (silent_s < -tuning->short_silence_s || silent_s > tuning->longest_silence_s) {
+        return true;
+    }
+    if (silent_s < tuning->short_silence_s) {
+        return false;
+    }
+    real part = c->superframe_s < tuning->slow_superframe_s ? tuning->curved_std : tuning->slow_curved_std;
+    return SQRT(horizontal_variance_m2(s, silent_s)) > part * mean_range_m(c, s->x);
+}
+
+/* From a position to the anchors in use. */
+INTERNAL real mean_range_m(Course *c, real *position_m) {
+    real total_m = REAL(0.0);
+    for (int32_t index_ = 0, index__end = c->count; index_ < index__end; index_++) {
+        total_m += distance_m(c, c->used[index_].position_m, position_m);
+    }
+    return total_m / (real)max_32(c->count, 1);
+}
+
+/* Of two points, where the height is given a horizontal one. */
+INTERNAL real distance_m(Course *c, real *one_m, real *other_m) {
+    real total = REAL(0.0);
+    for (int32_t axis = 0, axis_end = c->dim; axis < axis_end; axis++) {
+        total += square(one_m[axis] - other_m[axis]);
+    }
+    return SQRT(total);
+}
+
+/* From a start on */
+
+/* Use the anchors of a start and no others. */
+INTERNAL void use_only(Course *c, Acquisition *q) {
+    c->count = 0;
+    c->extent_m = REAL(0.0);
+    for (int32_t index_ = 0, index__end = q->start.count; index_ < index__end; index_++) {
+        Packet *newest = &q->heard[q->start.used[index_]].newer.packet;
+        use_anchor(c, &newest->place, newest->rx_ticks);
+    }
+}
+
+/* Write what a start knows by itself: a position, and of the velocity that it is a tag's; no protection level. */
+INTERNAL void fill_alone(Course *c, Acquisition *q) {
+    use_only(c, q);
+    for (int32_t row = 0; row < PROTECTED_ROWS; row++) {
+        for (int32_t axis = 0; axis < AXES; axis++) {
+            c->alone[row][axis] = REAL(0.0);
+        }
+    }
+    for (int32_t axis = 0, axis_end = c->dim; axis < axis_end; axis++) {
+        c->alone[POSITION][axis] = q->start.position_m[axis];
+        for (int32_t other = 0, other_end = c->dim; other < other_end; other++) {
+            c->alone[POSITION + 1 + axis][other] = q->start.covariance_m2[axis][other];
+        }
+        c->alone[VELOCITY + 1 + axis][axis] = square(c->settings.start_speed_std_mps);
+    }
+    if (c->dim < AXES) {
+        c->alone[POSITION][2] = c->settings.height_m;
+    }
+    c->alone[PROTECTION][STATE] = (real)UNAVAILABLE;
+}
+
+/* Begin at the start's position, and process the packets that led there.
+ *
+ * False where anchors that are late may have moved it by more than their distance: it says nothing then. */
+INTERNAL bool begin_filter(Course *c, State *s, Acquisition *q, Relays *relays) {
+    Beginning b = {0};
+    b.start = q->start;
+    Start *start = &b.start;
+    Tuning *tuning = &c->tuning;
+    choose_packets(c, q, &b);
+    bool is_contradicted = start->is_contradicted && !was_late_often(c);
+    bool is_open = c->open_range_errors || (is_contradicted && !start->has_misfit);
+    real inflation = tuning->start_margin;
+    if (is_open || is_contradicted) {
+        inflation = REAL(1.0) + square(tuning->late_std_m) / (q->variance_m2 + q->error_variance_m2);
+    }
+    int64_t begin_ticks = b.packets[0].packet.rx_ticks;
+    real speed_m2ps2 = square(c->settings.start_speed_std_mps);
+    real moved_m2 = square((real)(start->rx_ticks_tag - begin_ticks) * TICK_S) * speed_m2ps2;
+    use_only(c, q);
+    real horizontal_m2 = inflation * start->covariance_m2[0][0] + moved_m2 + (inflation * start->covariance_m2[1][1] +
+            moved_m2);
+    if (horizontal_m2 > square(mean_range_m(c, start->position_m))) {
+        return false;
+    }
+    c->is_starting = false;
+    c->started_ticks = b.packets[b.count - 1].packet.rx_ticks;
+    c->newest_ticks = b.packets[b.count - 1].packet.rx_ticks;
+    c->is_open = is_open;
+    c->start_was_contradicted = is_open || is_contradicted;
+    c->misfit = is_contradicted && start->has_misfit ? start->misfit : NOBODY;
+    s->settings = c->settings;
+    s->tuning = *tuning;
+    s->dim = c->dim;
+    s->horizontal_k = c->horizontal_k;
+    s->vertical_k = c->vertical_k;
+    skyless_restart(s, begin_ticks, c->late_share, c->start_was_contradicted ? tuning->late_std_m :
+            tuning->lasting_std_m, is_open);
+    for (int32_t axis = 0, axis_end = c->dim; axis < axis_end; axis++) {
+        s->x[axis] = start->position_m[axis];
+        for (int32_t other = 0, other_end = c->dim; other < other_end; other++) {
+            s->P[at(axis, other)] = inflation * start->covariance_m2[axis][other] + (axis == other ? moved_m2 :
+                    REAL(0.0));
+        }
+        s->P[at(c->dim + axis, c->dim + axis)] = speed_m2ps2;
+    }
+    for (int32_t index_ = 0, index__end = b.count; index_ < index__end; index_++) {
+        HeardPacket *one = &b.packets[index_];
+        one->packet.place.is_open = one->packet.place.anchor == c->misfit;
+        relays->count = one->relay_count;
+        for (int32_t relayed = 0, relayed_end = one->relay_count; relayed < relayed_end; relayed++) {
+            relays->rows[relayed] = one->relays[relayed];
+        }
+        process(s, &one->packet, relays);
+    }
+    return true;
+}
+
+/* Copy the last packets of each anchor with which to begin. */
+INTERNAL void choose_packets(Course *c, Acquisition *q, Beginning *b) {
+    for (int32_t place = 0, place_end = q->count; place < place_end; place++) {
+        if (is_chosen(c, q, place)) {
+            insert_packet(b, &q->heard[place].newer);
+        }
+    }
+    for (int32_t place = 0, place_end = q->count; place < place_end; place++) {
+        if (q->heard[place].count > 1 && is_chosen(c, q, place)) {
+            insert_packet(b, &q->heard[place].older);
+        }
+    }
+}
+
+/* Add a packet behind those that were received before it. */
+INTERNAL void insert_packet(Beginning *b, HeardPacket *one) {
+    int32_t place = b->count;
+    while (place > 0 && b->packets[place - 1].packet.rx_ticks > one->packet.rx_ticks) {
+        b->packets[place] = b->packets[place - 1];
+        place -= 1;
+    }
+    b->packets[place] = *one;
+    b->count += 1;
+}
+
+/* Whether a filter begins with an anchor, given its place in the table of those that are heard. */
+INTERNAL bool is_chosen(Course *c, Acquisition *q, int32_t place) {
+    Start *start = &q->start;
+    if (c->most_anchors == 0 || (start->has_misfit && q->heard[place].newer.packet.place.anchor == start->misfit)) {
+        return true;
+    }
+    real own_m = distance_m(c, q->heard[place].newer.packet.place.position_m, start->position_m);
+    bool is_used = false;
+    int32_t nearer = 0;
+    for (int32_t index_ = 0, index__end = start->count; index_ < index__end; index_++) {
+        real range_m = distance_m(c, q->heard[start->used[index_]].newer.packet.place.position_m, start->position_m);
+        if (start->used[index_] == place) {
+            is_used = true;
+        } else if (range_m < own_m || (range_m == own_m && !is_used)) {
+            nearer += 1;
+        }
+    }
+    return is_used && nearer < c->most_anchors;
+}
+
 /* Which anchors of a large site a tag uses: the strongest of those that other anchors receive too. */
 
 /* Process the power of a beacon; NaN where the radio reports none. */
@@ -5935,75 +6667,505 @@ INTERNAL int32_t fitting_relays(Neighbours *t, State *s, BeaconFields *b, int64_
     return fitting;
 }
 
-/* A tag of protocol 2: from a frame's bytes to a fix, as long as it knows its site and where it is.
- *
- * What is rare is left to its owner (``Receiver``): pages of the site, starts, anchors that join or have moved. */
+/* The index of the anchor in use that the newest anchor should replace: the weakest; −1 where none is weaker. */
+INTERNAL int32_t replaced_by(Neighbours *t, State *s, int32_t *origin_mm) {
+    int32_t weakest = -1;
+    real least_dbm = power_dbm(&t->rows[t->row], s, origin_mm) - BETTER_DB;
+    for (int32_t index_ = 0, index__end = s->count; index_ < index__end; index_++) {
+        int32_t row = find_neighbour(t, s->anchors[index_].identifier);
+        if (row >= 0 && t->rows[row].has_place && power_dbm(&t->rows[row], s, origin_mm) < least_dbm) {
+            weakest = index_;
+            least_dbm = power_dbm(&t->rows[row], s, origin_mm);
+        }
+    }
+    return weakest;
+}
 
-/* Process a frame from the air; what becomes of it: of ``DROP_COUNTERS``, of a course, or one of the above.
+/* The mean power of an anchor or, where the radio reports none, a nominal one at its distance. */
+INTERNAL real power_dbm(Neighbour *n, State *s, int32_t *origin_mm) {
+    if (n->has_power) {
+        return n->power_dbm;
+    }
+    real total = REAL(0.0);
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        total += square(place_m(n, origin_mm, axis) - s->x[axis]);
+    }
+    return NOMINAL_POWER_DBM - DB_PER_LOG * log_(max_real(SQRT(total), REAL(0.1)));
+}
+
+/* A coordinate of an anchor from the origin. */
+INTERNAL real place_m(Neighbour *n, int32_t *origin_mm, int32_t axis) {
+    return (real)(n->place.position_mm[axis] - origin_mm[axis]) / (real)MM_PER_M;
+}
+
+/* What the estimator assumes at a site, from its pages of noise and accuracy. */
+
+/* Relays of packets that are older than both are not used. */
+
+/* Fill in what the pages say. */
+INTERNAL void read_accuracy(EstimatorSettings *e, uint8_t *noise, uint8_t *accuracy) {
+    fill_noise(e, float_at(noise, 1), float_at(noise, 5), float_at(noise, 9), float_at(noise, 13));
+    e->survey_std_m = (real)two_bytes(accuracy, 1) / (real)STD_STEPS_PER_M;
+    e->range_std_m = (real)two_bytes(accuracy, 3) / (real)STD_STEPS_PER_M;
+    e->slope_std_m = (real)two_bytes(accuracy, 5) / (real)STD_STEPS_PER_M;
+    e->place_std_m = (real)two_bytes(accuracy, 7) / (real)STD_STEPS_PER_M;
+    e->place_distance_m = (real)two_bytes(accuracy, 9) / (real)STEPS_PER_M;
+    e->place_time_s = (real)two_bytes(accuracy, 11) / (real)STEPS_PER_S;
+}
+
+/* Fill in the variances of stamps and oscillators of this noise (``NoisePage``). */
+INTERNAL void fill_noise(EstimatorSettings *e, real tx_stamp_s, real rx_stamp_s, real white_fm, real random_walk_fm) {
+    e->tx_variance_m2 = LIGHT_2 * square(tx_stamp_s);
+    e->rx_variance_m2 = LIGHT_2 * (square(rx_stamp_s) + ROUNDING_S2);
+    const real new_1 = LIGHT_2 * square(white_fm);
+    const real new_2 = LIGHT_2 * square(random_walk_fm);
+    e->white = new_1;
+    e->walk = new_2;
+}
+
+/* Fill in after which times packets and anchors count no more; anchors after ``drop_s`` at least. */
+INTERNAL void fill_ages(EstimatorSettings *e, real superframe_s, real drop_s) {
+    e->drop_s = max_real(drop_s, REAL(4.0) * superframe_s);
+    e->relay_age_s = max_real(RELAY_AGE_S, RELAY_SUPERFRAMES * superframe_s);
+}
+
+/* The number in four bytes, which is 0 or, in IEEE 754, a positive one below 1; pages have been checked. */
+INTERNAL real float_at(uint8_t *data, int32_t at) {
+    int64_t bits = unsigned_(data, at, 4);
+    int64_t halvings = 150 - (bits >> 23);
+    real value = (real)((bits & 8388607) | 8388608);
+    if (bits < 8388608 || bits >= INT64_C(2147483648)) {
+        halvings = 149;
+        value = (real)(bits & 8388607);
+    }
+    for (int64_t time_1 = 0; time_1 < halvings; time_1++) {
+        value *= REAL(0.5);
+    }
+    return value;
+}
+
+/* What changes rarely for a tag of protocol 2: its site, the site's pages, its counter, anchors that move or join. */
+
+/* Its owner */
+
+/* Begin to listen to a site or, with ``NO_SITE``, that with most anchors; the rest is of ``EstimatorSettings``. */
+SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest_m, real highest_m, real height_std_m,
+        real max_acceleration_mps2, real integrity_risk, real alert_limit_m) {
+    t->owner = (EstimatorSettings){.qa = REAL(0.5), .start_speed_std_mps = REAL(2.0), .white = REAL(3.6e-05), .walk =
+            REAL(0.09), .tx_variance_m2 = REAL(0.0009), .rx_variance_m2 = REAL(0.0009), .gate = REAL(4.0), .height_m =
+            (real)__builtin_nan(""), .height_std_m = REAL(0.0), .lowest_m = (real)-__builtin_inf(), .highest_m =
+            (real)__builtin_inf(), .carrier_cycles = 13, .phase_std_m = REAL(0.0005), .phase_wander = REAL(3e-05),
+            .drop_s = REAL(2.0), .relay_age_s = REAL(1.0), .survey_std_m = REAL(0.02), .range_std_m = REAL(0.03),
+            .pair_std_m = REAL(0.02), .slope_std_m = REAL(0.05), .place_std_m = REAL(0.005), .place_distance_m =
+            REAL(1.0), .place_time_s = REAL(100.0), .change_memory_s = REAL(0.0), .barometer_walk = REAL(0.00025),
+            .least_change_std_m = REAL(0.05), .earliest_m = (real)-__builtin_inf(), .difference_std_m = REAL(0.12),
+            .stationary_s = REAL(0.0), .max_acceleration_mps2 = REAL(0.0), .max_walk_scale = REAL(10000.0),
+            .integrity_risk = REAL(0.0001), .alert_limit_m = (real)__builtin_nan("")};
+    t->admission = (Admission){.own = {.bits = 40, .last_host_s = (real)__builtin_nan("")}, .choice = {.only_site = -1,
+            .site = -1}};
+    t->pages = (SitePages){.issue = -1};
+    t->course = (Course){.settings = {.qa = REAL(0.5), .start_speed_std_mps = REAL(2.0), .white = REAL(3.6e-05), .walk =
+            REAL(0.09), .tx_variance_m2 = REAL(0.0009), .rx_variance_m2 = REAL(0.0009), .gate = REAL(4.0), .height_m =
+            (real)__builtin_nan(""), .height_std_m = REAL(0.0), .lowest_m = (real)-__builtin_inf(), .highest_m =
+            (real)__builtin_inf(), .carrier_cycles = 13, .phase_std_m = REAL(0.0005), .phase_wander = REAL(3e-05),
+            .drop_s = REAL(2.0), .relay_age_s = REAL(1.0), .survey_std_m = REAL(0.02), .range_std_m = REAL(0.03),
+            .pair_std_m = REAL(0.02), .slope_std_m = REAL(0.05), .place_std_m = REAL(0.005), .place_distance_m =
+            REAL(1.0), .place_time_s = REAL(100.0), .change_memory_s = REAL(0.0), .barometer_walk = REAL(0.00025),
+            .least_change_std_m = REAL(0.05), .earliest_m = (real)-__builtin_inf(), .difference_std_m = REAL(0.12),
+            .stationary_s = REAL(0.0), .max_acceleration_mps2 = REAL(0.0), .max_walk_scale = REAL(10000.0),
+            .integrity_risk = REAL(0.0001), .alert_limit_m = (real)__builtin_nan("")}, .tuning = {.restart_m =
+            REAL(300.0), .start_walk_scale = REAL(100.0), .mean_gain = REAL(0.05), .mean_limit = REAL(9.0),
+            .walk_scale_gain = REAL(1.2), .scale_loss = REAL(0.99), .common = REAL(1.5), .relays_in_row = REAL(4.0),
+            .q_scale_gain = REAL(1.05), .max_scale = REAL(100.0), .lag_limit = REAL(2.6), .lag_forgetting = REAL(0.01),
+            .better_known = REAL(0.8), .stationary_noise_share = REAL(2e-07), .stationary_std_mps = REAL(0.01),
+            .held_step_m = REAL(0.15), .held_max_m = REAL(0.4), .curvature_share = REAL(0.01), .slope_from_m =
+            REAL(4.0), .forgetting = REAL(0.02), .inconsistent_nis = REAL(1.6), .late_forgetting = REAL(0.005),
+            .late_often_share = REAL(0.02), .late_probability_density = REAL(0.05), .reception_huber = REAL(1.5),
+            .difference_huber = REAL(1.0), .max_relays_rejected = REAL(4.0), .lost_in_row = REAL(8.0), .lost_share =
+            REAL(0.5), .suspect = REAL(3.0), .in_row = REAL(2.0), .in_row_where_late = REAL(5.0), .together = REAL(7.0),
+            .jump_std_m = REAL(0.2), .first_change_scale = REAL(25.0), .change_growth = REAL(1.2), .change_loss =
+            REAL(0.97), .ended_std_m = REAL(0.05), .ended = REAL(2.0), .obstructed_walk = REAL(0.004),
+            .obstruction_memory_s = REAL(10.0), .obstruction_return_m = REAL(0.2), .obstructed_suspect = REAL(2.2),
+            .obstructed_together = REAL(5.0), .steady_walk_scale = REAL(4.0), .multipath_std_m = REAL(0.06), .jump_rise
+            = REAL(0.5), .obstructed_std_m = REAL(0.08), .obstructed_s = REAL(5.0), .place_step_m = REAL(0.1),
+            .place_limit = REAL(2.0), .place_limited_mean = REAL(0.7421917096296904), .place_first = REAL(20.0),
+            .place_samples = REAL(100.0), .place_memory = REAL(1000.0), .place_min_m2 = REAL(0.0012), .place_kept =
+            REAL(0.1), .max_change_std_m = REAL(0.5), .lasting_std_m = REAL(0.3), .recent_std_m = REAL(0.08),
+            .creeping_std_m = REAL(0.2), .recent_packets = REAL(16.0), .creeping_s = REAL(3.0), .late_std_m = REAL(1.0),
+            .sure_chi2 = REAL(50.0), .rival_chi2 = REAL(20.0), .early_weight = REAL(0.8), .open_pair_std_m = REAL(0.1),
+            .pair_jump_m2 = REAL(0.25), .pair_relays = REAL(12.0), .misplaced_pairs = REAL(2.0), .start_age_s =
+            REAL(0.5), .curved_std = REAL(0.05), .start_patience_s = REAL(0.5), .start_tail = REAL(0.0001), .new_start_s
+            = REAL(1.0), .early_nis = REAL(2.0), .start_margin = REAL(4.0), .short_silence_s = REAL(0.1),
+            .longest_silence_s = REAL(5.0), .slow_superframe_s = REAL(0.2), .slow_curved_std = REAL(0.2),
+            .longest_superframe_s = REAL(2.0), .height_sigmas = REAL(5.0), .heights_in_row = REAL(20.0),
+            .open_survey_std_m = REAL(0.15), .fitting_chi2 = REAL(2.0), .most_late = REAL(2.0), .late_penalty =
+            REAL(2.0), .staying_share = REAL(0.2), .staying_std = REAL(0.5), .window = REAL(60.0), .window_s =
+            REAL(1.0), .median_difference_std_m = REAL(0.08), .late_start_std_m = REAL(0.14), .chance = REAL(0.01),
+            .rival_m = REAL(0.5), .height_margin_m = REAL(1.0), .neighbourhood = REAL(1.5), .most_horizontal_std_m =
+            REAL(3.0), .zero_variance_m2 = REAL(10000.0), .phase_start_std_m = REAL(0.002), .phase_max_std_m =
+            REAL(0.006), .phase_forgetting = REAL(0.005), .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0),
+            .phase_gate = REAL(0.35), .phase_share = REAL(0.1), .phase_step_m = REAL(0.02), .phase_line_m = REAL(0.03),
+            .phase_former_s = REAL(0.5), .phases_in_row = REAL(4.0), .phase_nis = REAL(2.0), .phase_levels = REAL(2.0),
+            .phase_memory_s = REAL(5.0), .phase_after_s = REAL(1.0), .uncovered_chi2 = REAL(240.0), .max_open_level_std
+            = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m = REAL(1.0), .shift_part = REAL(0.25), .apart_chi2
+            = REAL(25.0), .sensor_valid_s = REAL(1.0)}, .is_starting = true, .misfit = -1, .relays_may_contradict =
+            true, .may_begin_again = true};
+    t->owner.qa = qa;
+    t->owner.lowest_m = lowest_m;
+    t->owner.highest_m = highest_m;
+    t->owner.height_std_m = height_std_m;
+    t->owner.max_acceleration_mps2 = max_acceleration_mps2;
+    t->owner.integrity_risk = integrity_risk;
+    t->owner.alert_limit_m = alert_limit_m;
+    t->admission.choice.only_site = site;
+    t->course.most_anchors = MAX_ANCHORS_IN_USE;
+    const real new_1 = horizontal_limit(integrity_risk);
+    const real new_2 = vertical_limit(integrity_risk);
+    t->course.horizontal_k = new_1;
+    t->course.vertical_k = new_2;
+    t->has_origin = false;
+    t->has_settings = false;
+    t->most_relays = MAX_HEARD;
+    t->waiting_count = 0;
+    forget_moves(t);
+}
+
+/* Its counter and its site */
+
+/* Begin again at the same site and near the same height, after a sleep in which the tag's counter was lost.
  *
- * ``host_s`` and the powers are NaN, and the phase is below 0, where they are not known. Course
- * and state are not used while it is starting. */
-SKYLESS_EXPORT int32_t skyless_hear_frame(Hearing *h, Course *c, State *s, uint8_t *frame, int32_t length, int64_t
+ * ``rx_counter``: what it reads now. */
+SKYLESS_EXPORT void skyless_wake(Tag *t, State *s, Acquisition *q, int64_t rx_counter, real slept_s) {
+    Admission *a = &t->admission;
+    Course *c = &t->course;
+    bool had_height = !c->is_starting && c->dim == AXES;
+    real height_m = REAL(0.0);
+    real std_m = REAL(0.0);
+    if (had_height) {
+        height_m = s->x[2];
+        std_m = SQRT(s->P[at(2, 2)]) + slept_s * c->settings.start_speed_std_mps;
+    }
+    wake_times(&a->neighbours, a->rx_ticks, rx_counter);
+    restart_choice(&a->choice, rx_counter);
+    a->own.has_stamp = false;
+    a->time.first_ticks_master += rx_counter - a->time.last_ticks_master - floor_real(slept_s * TICK_RATE_HZ);
+    a->time.last_rx_ticks_tag = rx_counter;
+    a->time.last_ticks_master = rx_counter;
+    forget_stamps(t, q);
+    if (had_height) {
+        q->has_bounds = true;
+        q->low_m = height_m - c->tuning.height_sigmas * std_m;
+        q->high_m = height_m + c->tuning.height_sigmas * std_m;
+    }
+}
+
+/* Forget what has become useless with the beacon at hand. */
+INTERNAL void handle_events(Tag *t, Acquisition *q) {
+    t->events = t->admission.events;
+    t->admission.events = 0;
+    if ((t->events & SITE_CHANGED) != 0) {
+        t->pages = (SitePages){.issue = -1};
+        t->has_origin = false;
+    }
+    if (t->events != 0) {
+        forget_stamps(t, q);
+    }
+}
+
+/* The tag's counter has restarted: forget all but what the site has in common. */
+INTERNAL void forget_stamps(Tag *t, Acquisition *q) {
+    t->has_settings = false;
+    t->pages.has_first = false;
+    t->course.is_starting = true;
+    t->waiting_count = 0;
+    forget_moves(t);
+    if (t->pages.issue != NO_ISSUE) {
+        skyless_begin_here(t, q);
+    }
+}
+
+/* The site's pages */
+
+/* Make the settings that the pages in use require. */
+INTERNAL void read_pages(Tag *t) {
+    Course *c = &t->course;
+    uint8_t *site = t->pages.used[SITE_KIND].contents;
+    c->settings = t->owner;
+    read_accuracy(&c->settings, t->pages.used[NOISE_KIND].contents, t->pages.used[ACCURACY_KIND].contents);
+    c->superframe_s = (real)t->period_ticks * TICK_S;
+    fill_ages(&c->settings, c->superframe_s, CELL_DROP_S);
+    c->dim = AXES;
+    if ((site[HEIGHT_FLAG_AT] & HEIGHT_GIVEN) != 0) {
+        c->settings.height_m = (real)signed_(site, HEIGHT_FLAG_AT + 1) / (real)MM_PER_M;
+        c->dim = AXES - 1;
+    }
+}
+
+/* Begin with the pages in use. */
+SKYLESS_EXPORT void skyless_begin_here(Tag *t, Acquisition *q) {
+    read_pages(t);
+    skyless_begin_course(&t->course, q);
+    t->has_settings = true;
+}
+
+/* Begin with the pages in use, at a site whose anchors have the present periods. */
+INTERNAL void begin_with_pages(Tag *t, Acquisition *q) {
+    int64_t oldest_ticks = 0;
+    Neighbours *neighbours = &t->admission.neighbours;
+    for (int32_t row = 0, row_end = neighbours->count; row < row_end; row++) {
+        if (neighbours->rows[row].frames > 0) {
+            oldest_ticks = max_64(oldest_ticks, neighbours->rows[row].rx_ticks);
+        }
+    }
+    t->period_ticks = 0;
+    for (int32_t row = 0, row_end = neighbours->count; row < row_end; row++) {
+        Neighbour *n = &neighbours->rows[row];
+        if (n->frames > 0 && n->rx_ticks >= oldest_ticks - PRESENT_TICKS) {
+            t->period_ticks = max_64(t->period_ticks, period_ticks(n->period_code));
+        }
+    }
+    skyless_begin_here(t, q);
+}
+
+/* Beacons that are not just the next of an anchor in use */
+
+/* Process the beacon at hand with its page, while anything is new: what becomes of it. */
+INTERNAL int32_t process_rare(Tag *t, State *s, Acquisition *q, uint8_t *frame) {
+    Admission *a = &t->admission;
+    Course *c = &t->course;
+    Neighbour *n = &a->neighbours.rows[a->neighbours.row];
+    bool was_starting = c->is_starting;
+    if (note_page(&t->pages, &a->neighbours, frame, t->beacon.page_at, a->rx_ticks) == OTHER_SETTINGS) {
+        begin_with_pages(t, q);
+    }
+    if (t->has_moved) {
+        separate_moved(t, s, q, n);
+    }
+    if (is_kept_apart(t, q, n)) {
+        return MOVED_ANCHOR;
+    }
+    if (!n->has_place) {
+        return NO_POSITION;
+    }
+    if (!t->has_settings) {
+        wait(t);
+        return NO_PAGES;
+    }
+    for (int32_t one = 0, one_end = t->waiting_count; one < one_end; one++) {
+        WaitingBeacon *waiting = &t->waiting[one];
+        int32_t row = find_neighbour(&a->neighbours, waiting->packet.place.anchor);
+        if (row >= 0 && is_confirmed(&a->neighbours.rows[row], a->rx_ticks)) {
+            t->relays.count = 0;
+            skyless_follow(c, s, q, &a->time, &waiting->packet, &t->relays, waiting->relays, waiting->relay_bytes);
+        }
+    }
+    t->relays.count = 0;
+    t->waiting_count = 0;
+    int32_t outcome = join(t, s, n);
+    if (outcome != JOINS) {
+        return outcome;
+    }
+    outcome = skyless_follow(c, s, q, &a->time, &t->packet, &t->relays, t->beacon.relays, t->beacon.relay_bytes);
+    if (was_starting && !c->is_starting) {  /* from now on what anchors in use have received counts, and what those have */
+        for (int32_t row = 0, row_end = a->neighbours.count; row < row_end; row++) {
+            Neighbour *other = &a->neighbours.rows[row];
+            other->own_relays_ticks = NEVER;
+            other->relayed_ticks = NEVER;
+            other->is_misfit = other->anchor == c->misfit;
+        }
+    }
+    return outcome;
+}
+
+/* Keep the beacon at hand; where there are too many, the oldest is forgotten. */
+INTERNAL void wait(Tag *t) {
+    if (t->waiting_count == MAX_WAITING) {
+        for (int32_t one = 1; one < MAX_WAITING; one++) {
+            t->waiting[one - 1] = t->waiting[one];
+        }
+        t->waiting_count -= 1;
+    }
+    WaitingBeacon *waiting = &t->waiting[t->waiting_count];
+    BeaconFields *b = &t->beacon;
+    waiting->packet = t->packet;
+    waiting->relay_bytes = b->relay_bytes;
+    for (int32_t byte = 0, byte_end = b->relay_bytes; byte < byte_end; byte++) {
+        waiting->relays[byte] = b->relays[byte];
+    }
+    t->waiting_count += 1;
+}
+
+/* Whether an anchor is in use or may be: others have received it, and it is not weaker than those in use. */
+INTERNAL int32_t join(Tag *t, State *s, Neighbour *n) {
+    Course *c = &t->course;
+    if (!c->is_starting && skyless_find_anchor(s, n->anchor) >= 0) {
+        return JOINS;
+    }
+    if (!is_confirmed(n, t->admission.rx_ticks)) {
+        return UNCONFIRMED_ANCHOR;
+    }
+    if (c->is_starting || s->count < MAX_ANCHORS_IN_USE) {
+        return JOINS;
+    }
+    int32_t replaced = replaced_by(&t->admission.neighbours, s, t->origin_mm);
+    if (replaced < 0) {
+        return WEAKER_ANCHOR;
+    }
+    skyless_leave(s, s->anchors[replaced].identifier);
+    return JOINS;
+}
+
+/* Anchors that have moved */
+
+/* Use all anchors together. */
+INTERNAL void forget_moves(Tag *t) {
+    t->is_moving = false;
+    t->uses_moved = false;
+    t->moved_ticks = NEVER;
+    for (int32_t row = 0, row_end = t->admission.neighbours.count; row < row_end; row++) {
+        t->admission.neighbours.rows[row].has_moved = false;
+    }
+}
+
+/* An anchor states another position: it leaves, and where too few are left that have not, all begin again. */
+INTERNAL void separate_moved(Tag *t, State *s, Acquisition *q, Neighbour *n) {
+    if (t->uses_moved && n->has_moved) {  /* those in use move a second time */
+        forget_moves(t);
+    }
+    n->has_moved = true;
+    t->is_moving = true;
+    t->moved_ticks = max_64(t->moved_ticks, t->admission.rx_ticks);
+    int32_t kept = 0;
+    for (int32_t one = 0, one_end = t->waiting_count; one < one_end; one++) {
+        if (t->waiting[one].packet.place.anchor != n->anchor) {
+            t->waiting[kept] = t->waiting[one];
+            kept += 1;
+        }
+    }
+    t->waiting_count = kept;
+    if (t->has_settings && t->course.is_starting) {
+        forget_packets(q, n->anchor);
+    } else if (t->has_settings) {
+        skyless_leave(s, n->anchor);
+        if (s->count < MIN_ANCHORS) {
+            begin_with_pages(t, q);
+        }
+    }
+}
+
+/* Whether an anchor states its position before a move while the anchors in use have moved, or the reverse. */
+INTERNAL bool is_kept_apart(Tag *t, Acquisition *q, Neighbour *n) {
+    if (!t->is_moving) {
+        return false;
+    }
+    int64_t calm_ticks = t->admission.rx_ticks - t->moved_ticks;
+    if (calm_ticks >= MOVE_TICKS) {
+        forget_moves(t);
+        return false;
+    }
+    if (!t->uses_moved && n->has_moved && calm_ticks >= MOVED_HOLD_TICKS && have_most_moved(t)) {
+        t->uses_moved = true;
+        int32_t kept = 0;
+        for (int32_t one = 0, one_end = t->waiting_count; one < one_end; one++) {
+            int32_t row = find_neighbour(&t->admission.neighbours, t->waiting[one].packet.place.anchor);
+            if (row >= 0 && t->admission.neighbours.rows[row].has_moved) {
+                t->waiting[kept] = t->waiting[one];
+                kept += 1;
+            }
+        }
+        t->waiting_count = kept;
+        if (t->has_settings) {
+            begin_with_pages(t, q);
+        }
+    }
+    return n->has_moved != t->uses_moved;
+}
+
+/* Whether most of the anchors that are there, with a position, have moved. */
+INTERNAL bool have_most_moved(Tag *t) {
+    int32_t present = 0;
+    int32_t moved = 0;
+    for (int32_t row = 0, row_end = t->admission.neighbours.count; row < row_end; row++) {
+        Neighbour *n = &t->admission.neighbours.rows[row];
+        if (n->has_place && n->was_relayed && n->rx_ticks > t->admission.rx_ticks - PRESENT_TICKS) {
+            present += 1;
+            moved += n->has_moved ? 1 : 0;
+        }
+    }
+    return 2 * moved > present;
+}
+
+/* A tag of protocol 2: from a frame's bytes to a fix. */
+
+/* Process a frame from the air; what becomes of it.
+ *
+ * That is one of ``DROP_COUNTERS``, of ``course.py``, ``following.py`` or ``changes.py``, or ``MALFORMED`` and more.
+ * ``host_s`` and the powers are NaN, and the phase is below 0, where they are not known. */
+SKYLESS_EXPORT int32_t skyless_hear_frame(Tag *t, State *s, Acquisition *q, uint8_t *frame, int32_t length, int64_t
         rx_counter, real host_s, real rx_power_dbm, real first_path_power_dbm, real phase_cycles) {
-    int32_t fault = skyless_read_frame(frame, length, &h->beacon);
+    int32_t fault = skyless_read_frame(frame, length, &t->beacon);
     if (fault != INTACT) {
         return MALFORMED + fault;
     }
-    return skyless_hear_fields(h, c, s, rx_counter, host_s, rx_power_dbm, first_path_power_dbm, phase_cycles);
+    return skyless_hear_fields(t, s, q, frame, rx_counter, host_s, rx_power_dbm, first_path_power_dbm, phase_cycles);
 }
 
-/* The same of a beacon that has been read already. */
-SKYLESS_EXPORT int32_t skyless_hear_fields(Hearing *h, Course *c, State *s, int64_t rx_counter, real host_s, real
-        rx_power_dbm, real first_path_power_dbm, real phase_cycles) {
-    Admission *a = &h->admission;
-    BeaconFields *b = &h->beacon;
+/* The same of a beacon that has been read already; its page stands in ``frame``. */
+SKYLESS_EXPORT int32_t skyless_hear_fields(Tag *t, State *s, Acquisition *q, uint8_t *frame, int64_t rx_counter, real
+        host_s, real rx_power_dbm, real first_path_power_dbm, real phase_cycles) {
+    Admission *a = &t->admission;
+    BeaconFields *b = &t->beacon;
     int32_t outcome = skyless_admit_sender(a, b->site, b->anchor, rx_counter, host_s);
     if (outcome == ADMITTED) {
         outcome = skyless_admit_stamp(a, b->anchor, b->sequence, b->tx_ticks, period_ticks(b->period_code));
     }
-    h->is_starting = h->is_starting || a->events != 0;
+    handle_events(t, q);
     if (outcome != ADMITTED) {
         return outcome;
     }
     Neighbour *n = &a->neighbours.rows[a->neighbours.row];
     add_power(n, rx_power_dbm);
-    n->was_relayed = confirm(h, s);
+    n->was_relayed = confirm(t, s);
     n->almanac_issue = b->almanac_issue;
     n->period_code = b->period_code;
-    h->has_moved = b->has_place && keep_place(n, &b->place);
-    fill_packet(&h->packet, h, n, variance_factor(rx_power_dbm, first_path_power_dbm));
-    h->packet.has_phase = phase_cycles >= REAL(0.0);
-    h->packet.phase_cycles = phase_cycles;
-    if (h->is_starting || h->has_moved || h->is_moving || b->almanac_issue != h->almanac_issue || !n->has_place) {
-        return IS_RARE;
-    }
-    if (skyless_find_anchor(s, b->anchor) < 0) {
-        return IS_RARE;
-    }
-    n->used_ticks = a->rx_ticks;
-    if (!is_surely_in_reach(c, a->rx_ticks)) {
-        return IS_RARE;
-    }
-    outcome = skyless_process_in_course(c, s, &a->time, &h->packet, b->relays, b->relay_bytes);
-    if (outcome == FIX) {
+    t->has_moved = b->has_place && keep_place(n, &b->place);
+    fill_packet(t, n, variance_factor(rx_power_dbm, first_path_power_dbm));
+    t->packet.has_phase = phase_cycles >= REAL(0.0);
+    t->packet.phase_cycles = phase_cycles;
+    outcome = hear_admitted(t, s, q, n, frame);
+    if (outcome == FIX || outcome == START_FIX) {
         note_fix(&a->choice, a->rx_ticks);
     }
     return outcome;
 }
 
+/* Process a beacon that is admitted. */
+INTERNAL int32_t hear_admitted(Tag *t, State *s, Acquisition *q, Neighbour *n, uint8_t *frame) {
+    Course *c = &t->course;
+    BeaconFields *b = &t->beacon;
+    bool is_new = t->has_moved || t->is_moving || b->almanac_issue != t->pages.issue || !n->has_place;
+    if (c->is_starting || is_new || skyless_find_anchor(s, b->anchor) < 0) {
+        return process_rare(t, s, q, frame);
+    }
+    n->used_ticks = t->admission.rx_ticks;
+    int32_t relay_bytes = min_32(b->relay_bytes, t->most_relays * HEARD_BYTES);
+    return skyless_follow(c, s, q, &t->admission.time, &t->packet, &t->relays, b->relays, relay_bytes);
+}
+
 /* Process which anchors a beacon confirms by its relays; whether other anchors confirm its sender.
  *
  * Only then its pages take part in the majority, and its relays confirm others. */
-INTERNAL bool confirm(Hearing *h, State *s) {
-    BeaconFields *b = &h->beacon;
-    Neighbours *t = &h->admission.neighbours;
-    int64_t rx_ticks = h->admission.rx_ticks;
-    Neighbour *n = &t->rows[t->row];
-    bool in_use = !h->is_starting && skyless_find_anchor(s, b->anchor) >= 0;
+INTERNAL bool confirm(Tag *t, State *s) {
+    BeaconFields *b = &t->beacon;
+    Neighbours *rows = &t->admission.neighbours;
+    int64_t rx_ticks = t->admission.rx_ticks;
+    bool is_starting = t->course.is_starting;
+    Neighbour *n = &rows->rows[rows->row];
+    bool in_use = !is_starting && skyless_find_anchor(s, b->anchor) >= 0;
     bool by_others = is_relayed(n, rx_ticks) || (in_use && n->own_relays_ticks == NEVER);
-    if (by_others || h->is_starting || has_too_few(s, rx_ticks)) {
-        add_relays(t, b, rx_ticks);
-    } else if (fitting_relays(t, s, b, rx_ticks) >= MIN_FITTING) {
+    if (by_others || is_starting || has_too_few(s, rx_ticks)) {
+        add_relays(rows, b, rx_ticks);
+    } else if (fitting_relays(rows, s, b, rx_ticks) >= MIN_FITTING) {
         n->own_relays_ticks = rx_ticks;
     }
     return by_others;
@@ -6051,20 +7213,31 @@ INTERNAL bool is_same(StatedPlace *one, StatedPlace *other) {
 }
 
 /* Write the beacon at hand as the filter takes it, but for its relays. */
-INTERNAL void fill_packet(Packet *packet, Hearing *h, Neighbour *n, real factor) {
-    Place *place = &packet->place;
+INTERNAL void fill_packet(Tag *t, Neighbour *n, real factor) {
+    Packet *packet = &t->packet;
+    Place *place = &t->packet.place;
+    if (HAS_ORIGIN && n->has_place && !t->has_origin) {
+        t->has_origin = true;
+        for (int32_t axis = 0; axis < 2; axis++) {
+            t->origin_mm[axis] = floor_div_32(n->place.position_mm[axis], MM_PER_M) * MM_PER_M;
+        }
+    }
     place->anchor = n->anchor;
     place->std_m = (real)n->place.std_mm / (real)MM_PER_M;
     place->is_open = n->is_misfit;
     for (int32_t axis = 0; axis < AXES; axis++) {
-        place->position_m[axis] = (real)n->place.position_mm[axis] / (real)MM_PER_M;
+        place->position_m[axis] = place_m(n, t->origin_mm, axis);
     }
     packet->sequence = n->sequence;
-    packet->rx_ticks = h->admission.rx_ticks;
+    packet->rx_ticks = t->admission.rx_ticks;
     packet->tx_ticks = n->tx_ticks;
     packet->variance_factor = factor;
     packet->master = -1;
-    packet->relay_count = 0;
+    t->relays.count = 0;
     packet->report_variance_m2 = REAL(0.0);
-    packet->relays_have_phases = h->beacon.has_phases;
+    packet->relays_have_phases = t->beacon.has_phases;
 }
+
+#ifdef SKYLESS_BY_HAND
+#include SKYLESS_BY_HAND
+#endif

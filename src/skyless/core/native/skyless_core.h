@@ -8,6 +8,7 @@
  * skyless.core.air.neighbours
  * skyless.core.air.page_check
  * skyless.core.air.site_choice
+ * skyless.core.air.site_pages
  * skyless.core.estimator.faults
  * skyless.core.estimator.kalman
  * skyless.core.estimator.levels
@@ -18,18 +19,22 @@
  * skyless.core.estimator.state
  * skyless.core.estimator.steady_state
  * skyless.core.estimator.verdicts
+ * skyless.core.integrity
  * skyless.core.native.arithmetic
  * skyless.core.native.small_matrices
  * skyless.core.native.tails
  * skyless.core.tag.acquisition
  * skyless.core.tag.admission
+ * skyless.core.tag.changes
  * skyless.core.tag.course
  * skyless.core.tag.descent
+ * skyless.core.tag.following
  * skyless.core.tag.hearing
  * skyless.core.tag.minima
  * skyless.core.tag.position
  * skyless.core.tag.problem
  * skyless.core.tag.selection
+ * skyless.core.tag.site_settings
  * skyless.core.tag.starts
  * skyless.core.ticks
  */
@@ -53,6 +58,7 @@ typedef double real;
 #endif
 
 #define ACCEPTED 1
+#define ACCURACY_KIND 2
 #define ACCURACY_PAGE 5
 #define ACQUIRING 22
 #define ADMITTED 0
@@ -72,12 +78,17 @@ typedef double real;
 #define BAD_LENGTH 7
 #define BAD_PAGE 9
 #define BAD_PERIOD 10
+/* The bytes 53 B0; the low half of the second is the version. */
 #define BEACON_MAGIC 45139
+/* By which another anchor must be stronger to replace the weakest. */
+#define BETTER_DB REAL(3.0)
 /* Up to the former nothing changes, from the latter on all that can: the maker's 6 and 10, and 1 dB. Lines of sight of
  * the UTIL data set have up to 8.4 dB, paths through metal, the only ones that are much later, from 11.3. */
 #define BLOCKED_DB REAL(11.0)
 #define BOUND_SIGMAS REAL(3.0)
 #define BROADCAST 65535
+/* After which silence an anchor leaves the estimator at least, where tags move from cell to cell. */
+#define CELL_DROP_S REAL(1.0)
 /* Length of a certificate (``skyless.core.keys.chain``). */
 #define CERTIFICATE_BYTES 94
 #define CHANGED 2
@@ -98,19 +109,26 @@ typedef double real;
 /* Number of receptions, and which of them are weak. */
 #define COUNT_BYTES 2
 #define COUNT_MASK 15
+#define COVARIANCES (PACKED ? STATES * (STATES + 1) / 2 : STATES * STATES)
+/* The polynomial of Ethernet's check sequence, its bits in reverse order. */
+#define CRC_32 INT64_C(3988292384)
 #define CREEPING 2
 /* Whole cycles of each channel's carrier fit into this number of ticks: ``EstimatorSettings.carrier_cycles``. */
 #define CYCLE_TICKS 128
+#define DB_PER_LOG REAL(8.685889638065035)
+/* DX_TIME ignores its low nine bits: transmissions start on 8.013 ns boundaries (DW1000 User Manual, p. 26). */
 #define DELAYED_TX_GRANULARITY_TICKS 512
 /* Columns are not independent if their smallest singular value is below this part of the largest. */
 #define DEPENDENT REAL(1e-06)
 #define DISTINCT_MINIMA_CHI2 REAL(9.0)
 #define DIVERGED 2
 #define DUPLICATE 1
+#define EARTH_KIND 1
 #define EXHAUSTED 3
 #define FAR_EXTENTS REAL(10000.0)
 /* From here on the normal tail's continued fraction converges faster than its series. */
 #define FAR_TAIL REAL(3.0)
+#define FAULTS (FAULT_KINDS * MAX_ANCHORS)
 #define FAULT_KINDS 3
 #define FCS_BYTES 2
 #define FIRST_DAMPING REAL(0.01)
@@ -121,24 +139,35 @@ typedef double real;
 #define FIXED_BYTES 20
 #define FLAGS_AT 11
 #define FLAT REAL(1e-09)
+/* Flight times differ between anchors by less than this (300 m). */
 #define FLIGHT_SLACK_TICKS 63898
 #define FOREIGN 0
 #define FOREIGN_SITE 5
 #define FOUND 0
+/* Data frame, PAN identifier compressed, 16-bit addresses. */
 #define FRAME_CONTROL 34881
 #define FREE 0
 #define GAIN_TOLERANCE REAL(1e-13)
 #define GEOREFERENCE_PAGE 4
 #define HAS_AUTHENTICATION 4
 #define HAS_CERTIFICATE 8
+/* Whether positions are from whole metres near the first anchor, as far ones lose millimetres in single precision. */
+#ifndef HAS_ORIGIN
+#define HAS_ORIGIN false
+#endif
 #define HAS_PAGE 2
 /* The receptions have a phase each and stamps of 32 bits, instead of stamps of 40. */
 #define HAS_PHASES 64
 #define HAS_POSITION 1
+#define HAS_TOO_FEW 27
 /* Up to the magic number. */
 #define HEADER_BYTES 11
 #define HEARD_BYTES 8
 #define HEIGHT 1
+/* Where it stands in a site page; the height follows. */
+#define HEIGHT_FLAG_AT 8
+/* The flag of a site or schedule page with the height of the tags. */
+#define HEIGHT_GIVEN 1
 #define HOST_JUMPED 2
 #define HPL 0
 #define IMPOSSIBLE 3
@@ -147,21 +176,27 @@ typedef double real;
 #define IMPOSSIBLE_STAMP 3
 #define IMPULSES 4
 #define INTACT 0
-/* A beacon is admitted, and its sender's row is up to date; the rest is its owner's. */
-#define IS_RARE 30
+#define IS_MIRRORED 28
+#define IS_UNSETTLED 29
 #define JOINED 2
-/* Numbers in a vector of 256 bits. */
-#define LANES 4
+#define JOINS 0
+/* Numbers in a vector of 256 bits, where rows of P begin at one. */
+#define LANES (PACKED ? 1 : 4)
+/* Metres, or m²: anything beyond is no site, and no number here overflows before it. */
 #define LARGEST REAL(1000000000.0)
 #define LASTING 0
+/* A year of ticks, whose differences fit 64 bits; a host's clock that jumps by more was set. */
 #define LAST_TICKS INT64_C(2305843009213693952)
+/* Numbers that ``levels.protect`` writes: ``HPL``, ``VPL``, and the tests of all kinds of faults. */
 #define LEVELS 5
+#define LIGHT_2 REAL(8.987551787368176e+16)
 /* The leading bits of ln 2: products with small whole numbers are exact. */
 #define LN_2_HIGH REAL(0.6931471803691238)
 #define LN_2_LOW REAL(1.9082149292705877e-10)
 #define LOG_FACTOR REAL(3.58351893845611)
 /* No jump of a host's clock counts as a longer one: the ticks of three years fit 64 bits. */
 #define LONGEST_JUMP_S REAL(100000000.0)
+/* 4 s: a gap of one and a half periods is shorter than half a wrap of a counter. */
 #define LONGEST_PERIOD_CODE 159
 /* The longest time update: of more, squares of variances are no numbers in single precision. */
 #define LONGEST_S REAL(1000.0)
@@ -171,80 +206,170 @@ typedef double real;
 #define MAGIC_MASK 61695
 /* The bytes are no beacon; the fault's number is added. */
 #define MALFORMED 40
+/* Factor on all standard deviations, as errors are not quite Gaussian and figures not quite the filter's. */
+#define MARGIN REAL(1.05)
+/* Most anchors at a time. */
+#ifndef MAX_ANCHORS
 #define MAX_ANCHORS 32
+#endif
+/* Most anchors in the estimator's state; more cost accuracy, as each then sends less, and time. */
+#ifndef MAX_ANCHORS_IN_USE
+#define MAX_ANCHORS_IN_USE 24
+#endif
+#define MAX_BEGINNING (2 * MAX_ANCHORS)
 /* Coordinates and heights beyond 1000 km from the origin are errors; a page has 32-bit millimetres, ±2147 km. */
 #define MAX_COORDINATE_MM 1000000000
-/* Largest number of anchors of one site that is counted. */
+/* Most anchors of each that are counted. */
+#ifndef MAX_COUNTED
 #define MAX_COUNTED 32
+#endif
 /* Larger ones are no powers. */
 #define MAX_DIFFERENCE_DB REAL(1000.0)
+/* Two clocks cannot drift apart faster: each within 20 ppm (IEEE 802.15.4-2015, 16.4.9), and room for motion. */
 #define MAX_DRIFT REAL(5e-05)
 #define MAX_FAULTS 2
+/* Longest PSDU (IEEE 802.15.4-2015, aMaxPhyPacketSize). */
 #define MAX_FRAME_BYTES 127
+/* Entries that the number and the flags of ``heard`` have space for. */
 #define MAX_HEARD 12
 #define MAX_ITERATIONS 200
-#define MAX_LINKS 992
-/* More anchors than there are in reach: forged ones cannot use more memory. */
+#define MAX_LINKS (MAX_ANCHORS * (MAX_ANCHORS - 1))
+/* Most anchors that are known by their own beacons. */
+#ifndef MAX_NEIGHBOURS
 #define MAX_NEIGHBOURS 256
+#endif
 /* 2⁻¹⁹ as a float32: those from 0 on are in the order of their bits. */
 #define MAX_NOISE_BITS 905969664
+/* Pages of issues that are not complete. */
+#ifndef MAX_PAGES
+#define MAX_PAGES 64
+#endif
 /* No radio reports more, nor less than its negative. */
 #define MAX_POWER_DBM REAL(1000.0)
 #define MAX_RATE_MPS REAL(29979.2458)
 /* Most relays with a packet; 13 fit into a frame. */
+#ifndef MAX_RELAYS
 #define MAX_RELAYS 32
+#endif
+#define MAX_ROWS (MAX_ANCHORS)
+/* Anchors by whose number one page is preferred to another. */
+#ifndef MAX_SENDERS
+#define MAX_SENDERS 16
+#endif
+/* Most sites of which anchors are counted. */
+#ifndef MAX_SITES
 #define MAX_SITES 8
+#endif
 #define MAX_STARTS 9
 /* A superframe is shorter than half a wrap of the counter (8.6 s), else stamps become ambiguous. */
 #define MAX_SUPERFRAME_TICKS INT64_C(549755813887)
 /* Rotations of all pairs of columns; they converge quadratically, with four columns after about six. */
 #define MAX_SWEEPS 12
+#define MAX_TRIALS 256
 /* Factor on the variance of a blocked path: metal made messages 0.2 to 0.4 m late, 4 to 8 times what noise does. */
 #define MAX_VARIANCE_FACTOR REAL(36.0)
+/* Beacons that are kept while the site's pages are not complete. */
+#ifndef MAX_WAITING
+#define MAX_WAITING 128
+#endif
 #define MERGED_SIGMAS REAL(2.0)
 /* That other one has at least as many: with fewer there is no fix. */
 #define MIN_ANCHORS 3
 #define MIN_DAMPING REAL(0.0001)
+/* An anchor that relays this number of receptions of anchors in use, and they fit, is there. */
 #define MIN_FITTING 2
 #define MIRROR 7
 #define MM_PER_M 1000
 /* A larger share of late packets counts as this. */
 #define MOST_LATE REAL(0.45)
+/* Most updates of the filter that wait. */
+#ifndef MOST_WAITING
 #define MOST_WAITING 8
+#endif
+#define MOVED_ANCHOR 31
+#define MOVED_HOLD_TICKS INT64_C(19169280000)
+/* A survey moves all anchors of a site, some of them seconds after the others, and positions from before and after it
+ * must not be mixed. So a tag uses either the anchors that have stated another position or those that have not, until none
+ * has moved for ``MOVE_TICKS``. It switches to the moved ones once they are the majority and none has moved for
+ * ``MOVED_HOLD_TICKS``. */
+#define MOVE_TICKS INT64_C(638976000000)
 /* A smaller square of a distance counts as this. */
 #define NEAREST_M2 REAL(1e-18)
+/* Earlier than any reading. */
 #define NEVER (INT64_C(-4611686018427387904))
+/* The logarithm is concave, and the first z too large: each step doubles the right digits. */
+#define NEWTON_STEPS 10
+/* The identifier of no anchor. */
+#define NOBODY (-1)
+#define NOISE_KIND 0
 #define NOISE_PAGE 3
+/* 0.3 m allow for the noise of two stamps of one anchor. */
 #define NOISE_TICKS 64
+/* Assumed power at 1 m where the radio reports none, so that nearer anchors count as stronger. */
+#define NOMINAL_POWER_DBM REAL(-63.0)
 #define NOT_A_BEACON 4
 #define NO_COVARIANCE 1
+#define NO_ISSUE (-1)
+#define NO_PAGE (-1)
+#define NO_PAGES 30
+#define NO_POSITION 32
 #define NO_RANGE_ERRORS 0
 #define NO_SITE (-1)
 #define OBSTRUCTED 1
+#define ONES INT64_C(4294967295)
 /* Columns are orthogonal if the cosine of their angle is not larger. */
 #define ORTHOGONAL REAL(1e-14)
+#define OTHER_PAGES 1
+#define OTHER_SETTINGS 2
 #define OUTLIER 21
 #define OUT_OF_ORDER 2
+/* Whether P is kept as its lower triangle alone: half the memory, but rows that vectors do not fit. */
+#ifndef PACKED
+#define PACKED false
+#endif
 /* Packets of each anchor that are kept for relays to come; divides the range of sequence numbers. */
+#ifndef PACKETS_KEPT
 #define PACKETS_KEPT 16
+#endif
+/* A type, then 16 bytes of contents. */
 #define PAGE_BYTES 17
+#define PAGE_KINDS 4
 #define PHASE_BEGINS 0
 #define PHASE_REFUSED 1
+/* States of each anchor for carrier phases; 0 where they are not used. */
+#ifndef PHASE_STATES
+#define PHASE_STATES 3
+#endif
+/* In a cycle; also the bit that shows that there is a phase. */
 #define PHASE_STEPS 128
 #define PHASE_USED 2
 #define PLANE 2
+/* Columns of V for what planning adds: walls, and four impulses along each axis. */
+#ifndef PLANNED_FAULTS
+#define PLANNED_FAULTS 13
+#endif
+/* The position, then three rows of its covariance. */
 #define POSITION 0
 #define POSITION_BYTES 12
 /* Weight of the newest value in the running mean of an anchor's received power. */
 #define POWER_GAIN REAL(0.1)
 /* Anchors received within this time count. */
 #define PRESENT_TICKS INT64_C(63897600000)
+#define PROTECTED_ROWS 10
+/* The first three of the levels (``estimator/levels.py``), for methods that know some. */
 #define PROTECTION 9
+/* Chi-square and mean squared residual in m². */
 #define QUALITY 4
 #define RECENT 1
 #define REJECTED 0
 /* A reception by an anchor in use, or by one that is confirmed itself, confirms its sender for this time. */
 #define RELAYED_TICKS INT64_C(127795200000)
+/* Relays of each packet that are kept for the filter which begins. */
+#ifndef RELAYS_KEPT
+#define RELAYS_KEPT 32
+#endif
+#define RELAY_AGE_S REAL(1.0)
+#define RELAY_SUPERFRAMES REAL(2.5)
 #define RESERVED_FLAGS 176
 #define RESIDUALS 6
 #define RESTARTED_CLOCK 4
@@ -254,29 +379,51 @@ typedef double real;
 #define ROOT_2_PI REAL(2.5066282746310002)
 /* What rounding in single precision may make of a variance of lasting faults that is smaller. */
 #define ROUNDING_M2 REAL(1e-07)
+/* Variance of rounding to whole ticks. */
+#define ROUNDING_S2 REAL(2.0410312834001283e-23)
+#define SAME_PAGES 0
 #define SAME_POINT REAL(1e-06)
 #define SCHEDULE_PAGE 2
+#define SEARCHING 26
+/* Capacity for columns of V. */
+#define SENSITIVITIES (FAULTS + AXES + PLANNED_FAULTS)
+/* Whether the search for a start uses the memory of the state, which is not used meanwhile. */
+#ifndef SHARES_MEMORY
+#define SHARES_MEMORY false
+#endif
+/* Time between two packets of an anchor at least: a frame takes longer. */
 #define SHORTEST_S REAL(5e-05)
+/* Of the stamp of such an entry. */
 #define SHORT_BITS 32
-/* The highest of four bytes' bits; as a float32 alone it is −0. */
+/* The highest bit of four bytes; as a float32 alone it is −0. */
 #define SIGN INT64_C(2147483648)
 #define SINGULAR 5
 /* A pivot below this part of its diagonal element is rounding noise: the matrix is singular. */
 #define SINGULAR_PIVOT REAL(1e-12)
 #define SITE_CHANGED 4
+#define SITE_KIND 3
 #define SITE_PAGE 6
 /* A tag that may choose its site leaves one that has been silent, or has given no fix, for this time. */
 #define SITE_SILENCE_TICKS INT64_C(127795200000)
 #define SOUND 0
+/* Speed of light in vacuum, exact (SI). Air slows it by 0.03 %, 1.6 mm over 6 m, and a calibration absorbs it. */
 #define SPEED_OF_LIGHT_MPS REAL(299792458.0)
 #define SQRT_2_PI REAL(2.5066282746310002)
 #define STALE 3
 #define STAMPS_BEFORE_RESTART 3
 #define STAMP_FITS 0
 #define START_CONTRADICTED 23
+#define START_FIX 25
 #define STATE 2
+/* Capacity for states; a multiple of ``LANES``. */
+#define STATES (2 * (AXES + MAX_ANCHORS) + (3 + PHASE_STATES + AXES) * MAX_ANCHORS + 2)
+#define STD_STEPS_PER_M 10000
 #define STEPS 16
+#define STEPS_PER_M 100
+/* Units of an accuracy page: of standard deviations, of its distance and of its time. */
+#define STEPS_PER_S 10
 #define STEP_TOLERANCE REAL(1e-10)
+/* Parts of a tick; the air's unit of the site's time, of which beacons carry 48 bits. */
 #define SUBTICKS 256
 #define SUBTICK_MASK INT64_C(281474976710655)
 /* Silences up to this need no check of the filter. */
@@ -285,19 +432,25 @@ typedef double real;
 #define SWEEPS 8
 #define TERMS 60
 #define THIN_SIGMAS REAL(0.1)
+/* Width of the timestamp counter (DW1000 User Manual v2.12, 7.2.8); it wraps every 17.2074 s. */
 #define TICK_BITS 40
+/* What light travels in one tick, 4.692 mm. */
 #define TICK_M REAL(0.0046917639786157855)
 #define TICK_MASK INT64_C(1099511627775)
+/* Rate of the DW1000's timestamp counter, 63.8976 GHz (DW1000 User Manual v2.12, 7.2.8). */
 #define TICK_RATE_HZ REAL(63897600000.0)
+/* One tick of the timestamp counter, 15.650040064 ps. */
 #define TICK_S REAL(1.5650040064102565e-11)
 #define TOO_FEW_ANCHORS 21
 #define TOO_LONG 2
 #define TOO_SHORT 1
 /* A site that has given no fix for this time is left for another one: none holds a tag by its number of anchors. */
 #define TRIAL_TICKS INT64_C(319488000000)
+#define TRIANGLE (MAX_ANCHORS * (MAX_ANCHORS - 1) / 2)
 #define TWO_PI REAL(6.283185307179586)
 #define UNAVAILABLE 3
 #define UNCERTAIN 8
+#define UNCONFIRMED_ANCHOR 33
 #define UNDETERMINED 1
 /* 31,200 steps of the delayed transmission: a quarter of a millisecond, the unit of periods. */
 #define UNIT_STEPS 31200
@@ -306,9 +459,12 @@ typedef double real;
 #define UNUSABLE 20
 #define UNUSED 0
 #define USED 1
+/* The velocity, then three rows of its covariance, for methods that know it. */
 #define VELOCITY 5
 #define VERSION_2 45651
 #define VPL 1
+#define WEAKER_ANCHOR 34
+#define WORK_ROWS (MAX_ANCHORS + 1 + 2 * AXES)
 
 /* Where an anchor says that it is, as frames carry it. */
 typedef struct StatedPlace {
@@ -357,6 +513,8 @@ typedef struct Neighbour {
     StatedPlace place;  /* The one that is used. */
     bool has_other;
     StatedPlace other;  /* Another one, stated once; used when it is stated twice in a row. */
+    /* Whether it has stated another position than before, until all anchors are used together again. */
+    bool has_moved;
     bool was_relayed;  /* Whether others had received it at its newest frame. */
     int64_t relayed_ticks;  /* The receiver's reading when another anchor last relayed that it had received this one. */
     /* The receiver's reading when the anchor's own relays last fitted, where no other has relayed it since. */
@@ -375,7 +533,7 @@ typedef struct Neighbours {
     bool has_newest;
     /* RX stamp of the newest accepted frame: one impossible stamp must not make others late. */
     int64_t newest_rx_ticks;
-    Neighbour rows[256];
+    Neighbour rows[MAX_NEIGHBOURS];
 } Neighbours;
 
 /* Turns one counter's wrapped stamps into int64 ticks that never wrap (``unwrap``). */
@@ -397,7 +555,7 @@ typedef struct CountedSite {
     int32_t site;
     int64_t newest_ticks;  /* RX stamp of its last beacon. */
     int32_t count;
-    CountedAnchor anchors[32];
+    CountedAnchor anchors[MAX_COUNTED];
 } CountedSite;
 
 /* The site in use and, where the tag may choose, how many anchors of others it receives.
@@ -412,9 +570,9 @@ typedef struct SiteChoice {
     bool has_fix;
     int64_t fix_ticks;  /* RX stamp of the last fix. */
     int32_t failed_count;
-    int32_t failed[8];  /* Sites that were left since the last fix as they gave none, the newest last. */
+    int32_t failed[MAX_SITES];  /* Sites that were left since the last fix as they gave none, the newest last. */
     int32_t count;
-    CountedSite sites[8];
+    CountedSite sites[MAX_SITES];
 } SiteChoice;
 
 /* Counts from the first fix of a receiver and never goes back, even if the master or the method changes. */
@@ -434,81 +592,6 @@ typedef struct Admission {
     int64_t rx_ticks;  /* The tag's stamp of the frame at hand, unwrapped. */
     int32_t events;  /* What has happened since its owner last looked. */
 } Admission;
-
-/* An anchor and where it stands. */
-typedef struct Place {
-    int32_t anchor;  /* Identifier. */
-    real position_m[3];
-    real std_m;  /* Standard deviation of each coordinate; below 0 for that of the settings. */
-    bool is_open;  /* Whether it joins with range errors beyond those of the settings. */
-} Place;
-
-/* When an anchor, that of the packet as a rule, received a packet of another. */
-typedef struct Relay {
-    int32_t listener;  /* Identifier of the one that received it. */
-    int32_t anchor;  /* Identifier of the other. */
-    int32_t sequence;
-    int64_t rx_ticks;  /* The listener's stamp, unwrapped; where it is short its lowest bits (``relay_rx_ticks``). */
-    bool is_short;
-    bool has_phase;
-    real phase_cycles;  /* Phase of the carrier as the listener received it, in [0, 1). */
-} Relay;
-
-/* A packet that the tag received; all stamps are unwrapped. */
-typedef struct Packet {
-    Place place;
-    int32_t sequence;
-    int64_t rx_ticks;  /* The tag's stamp. */
-    int64_t tx_ticks;  /* The anchor's own. */
-    real variance_factor;  /* On the variance of the tag's reception. */
-    bool has_phase;
-    real phase_cycles;  /* Phase of the carrier as the tag received it, in [0, 1). */
-    /* Identifier of the anchor against whose clock this one reports its own; −1 where it reports nothing. */
-    int32_t master;
-    int64_t subticks;  /* The anchor's reading less the master's at the packet's TX stamp, modulo 2⁴⁸. */
-    real report_variance_m2;
-    bool relays_have_phases;  /* Whether its frame carries phases of its relays, and short stamps. */
-    int32_t relay_count;
-    Relay relays[32];
-} Packet;
-
-/* What a tag of protocol 2 keeps beside its filter. */
-typedef struct Hearing {
-    Admission admission;
-    BeaconFields beacon;  /* The one at hand. */
-    Packet packet;  /* The same for the filter. */
-    int32_t almanac_issue;  /* Issue of the pages in use. */
-    bool is_starting;  /* Whether it does not know where it is. */
-    bool is_moving;  /* Whether anchors of the site have moved recently. */
-    bool has_moved;  /* Whether the sender of the beacon at hand has. */
-} Hearing;
-
-/* An anchor in use. */
-typedef struct UsedAnchor {
-    int32_t anchor;
-    real position_m[3];
-    int64_t rx_ticks;  /* The tag's stamp of its last accepted packet. */
-} UsedAnchor;
-
-/* What has become of the starts so far, and whose packets were accepted recently. */
-typedef struct Course {
-    bool open_range_errors;  /* Whether the next start expects larger range errors than the settings state. */
-    bool is_open;  /* Whether the last start did. */
-    bool start_was_contradicted;
-    bool relays_may_contradict;
-    bool may_begin_again;  /* Whether a start that fits badly from the beginning is given up: not twice in a row. */
-    int32_t heights_rejected;
-    int64_t master_less_tag_ticks;
-    int64_t started_ticks;
-    int64_t newest_ticks;
-    real in_use_s;  /* An anchor counts as in use while its last accepted packet is younger than this. */
-    int64_t checked_ticks;  /* When that was checked last. */
-    real extent_m;  /* The largest span in x, y or z that anchors in use have had since the start. */
-    int64_t changes;  /* How often the anchors in use, or their positions, have changed. */
-    int32_t count;
-    UsedAnchor used[32];
-    real time_s;  /* Of the newest fix. */
-} Course;
 
 /* What the filter assumes; standard deviations are one sigma. */
 typedef struct EstimatorSettings {
@@ -554,6 +637,33 @@ typedef struct EstimatorSettings {
     real integrity_risk;
     real alert_limit_m;  /* Fixes with a higher horizontal protection level have an alert; NaN for none. */
 } EstimatorSettings;
+
+/* A page that is in use. */
+typedef struct UsedPage {
+    uint8_t contents[17];  /* All zeros where there is none. */
+} UsedPage;
+
+/* A page of an issue that is not complete yet. */
+typedef struct CollectedPage {
+    int32_t issue;
+    int32_t support;  /* How many of the anchors that have sent it others have received. */
+    uint8_t contents[17];
+    int32_t sender_count;
+    int32_t senders[MAX_SENDERS];
+} CollectedPage;
+
+/* What a tag has learned of what is common to a site.
+ *
+ * The pages count once a majority of the anchors received recently states their issue, and they fit it; those in use
+ * stay until all pages of another such issue are there. */
+typedef struct SitePages {
+    int32_t issue;  /* Of the pages in use. */
+    UsedPage used[4];
+    bool has_first;
+    int64_t first_ticks;  /* When the first beacon was received. */
+    int32_t count;
+    CollectedPage collected[MAX_PAGES];
+} SitePages;
 
 /* Constants of the estimator, which are the same at every site; ``docs/estimator_table.md`` says what each buys.
  *
@@ -734,6 +844,264 @@ typedef struct Tuning {
     real sensor_valid_s;  /* Time for which a sensor's height decides between them [s]. */
 } Tuning;
 
+/* An anchor in use. */
+typedef struct UsedAnchor {
+    int32_t anchor;
+    real position_m[3];
+    int64_t rx_ticks;  /* The tag's stamp of its last accepted packet. */
+} UsedAnchor;
+
+/* What has become of the starts so far, and whose packets were accepted recently. */
+typedef struct Course {
+    EstimatorSettings settings;  /* Those with which a filter begins, as the next four. */
+    Tuning tuning;
+    int32_t dim;
+    real horizontal_k;
+    real vertical_k;
+    real superframe_s;  /* Of slow sites, else 0. */
+    /* With which a filter begins, the nearest, and none that does not belong to the start; 0: with all. */
+    int32_t most_anchors;
+    bool is_starting;  /* Whether no position is known; else the search is not used, now the state is not. */
+    real late_share;  /* That of the last filter. */
+    int32_t misfit;  /* The anchor that contradicted the others at the start. */
+    real alone[10][3];  /* What a fix carries that is a start's, without a filter. */
+    bool open_range_errors;  /* Whether the next start expects larger range errors than the settings state. */
+    bool is_open;  /* Whether the last start did. */
+    bool start_was_contradicted;
+    bool relays_may_contradict;
+    bool may_begin_again;  /* Whether a start that fits badly from the beginning is given up: not twice in a row. */
+    int32_t heights_rejected;
+    int64_t master_less_tag_ticks;
+    int64_t started_ticks;
+    int64_t newest_ticks;
+    real in_use_s;  /* An anchor counts as in use while its last accepted packet is younger than this. */
+    int64_t checked_ticks;  /* When that was checked last. */
+    real extent_m;  /* The largest span in x, y or z that anchors in use have had since the start. */
+    int64_t changes;  /* How often the anchors in use, or their positions, have changed. */
+    int32_t count;
+    UsedAnchor used[MAX_ANCHORS];
+    int64_t time_ticks;  /* Of the newest fix, since the first one. */
+} Course;
+
+/* An anchor and where it stands. */
+typedef struct Place {
+    int32_t anchor;  /* Identifier. */
+    real position_m[3];
+    real std_m;  /* Standard deviation of each coordinate; below 0 for that of the settings. */
+    bool is_open;  /* Whether it joins with range errors beyond those of the settings. */
+} Place;
+
+/* A TX time on a scale that packets of several anchors have in common. */
+typedef struct ScaledTime {
+    int64_t ticks;
+    real fraction_ticks;
+    real variance_m2;
+} ScaledTime;
+
+/* A packet that the tag received; all stamps are unwrapped. */
+typedef struct Packet {
+    Place place;
+    int32_t sequence;
+    int64_t rx_ticks;  /* The tag's stamp. */
+    int64_t tx_ticks;  /* The anchor's own. */
+    real variance_factor;  /* On the variance of the tag's reception. */
+    bool has_phase;
+    real phase_cycles;  /* Phase of the carrier as the tag received it, in [0, 1). */
+    /* Identifier of the anchor against whose clock this one reports its own; −1 where it reports nothing. */
+    int32_t master;
+    int64_t subticks;  /* The anchor's reading less the master's at the packet's TX stamp, modulo 2⁴⁸. */
+    real report_variance_m2;
+    bool is_stated;  /* Whether the anchor states its TX time on the master's scale … */
+    ScaledTime stated;  /* … and that time, which only starts use. */
+    bool relays_have_phases;  /* Whether its frame carries phases of its relays, and short stamps. */
+} Packet;
+
+/* A beacon that came before the site's pages. */
+typedef struct WaitingBeacon {
+    Packet packet;
+    int32_t relay_bytes;
+    uint8_t relays[96];
+} WaitingBeacon;
+
+/* When an anchor, that of the packet as a rule, received a packet of another. */
+typedef struct Relay {
+    int32_t listener;  /* Identifier of the one that received it. */
+    int32_t anchor;  /* Identifier of the other. */
+    int32_t sequence;
+    int64_t rx_ticks;  /* The listener's stamp, unwrapped; where it is short its lowest bits (``relay_rx_ticks``). */
+    bool is_short;
+    bool has_phase;
+    real phase_cycles;  /* Phase of the carrier as the listener received it, in [0, 1). */
+} Relay;
+
+/* What came with a packet. */
+typedef struct Relays {
+    int32_t count;
+    Relay rows[MAX_RELAYS];
+} Relays;
+
+/* A tag of protocol 2. */
+typedef struct Tag {
+    EstimatorSettings owner;  /* What its owner has chosen; the site's pages state the rest. */
+    Admission admission;
+    SitePages pages;
+    Course course;
+    bool has_settings;  /* Whether the pages are known, so that it looks for a start or follows its course. */
+    int64_t period_ticks;  /* Longest mean time between two beacons of an anchor, when the settings were made. */
+    bool is_moving;  /* Whether anchors of the site have stated other positions recently (``Neighbour.has_moved``). */
+    int64_t moved_ticks;  /* When the last one did. */
+    bool uses_moved;  /* Whether those are in use, and not the others. */
+    int32_t origin_mm[3];  /* To be added to all positions, where ``HAS_ORIGIN``. */
+    bool has_origin;
+    int32_t most_relays;  /* Of a beacon that follows its course, the newest ones: fewer where its processor is late. */
+    int32_t waiting_count;
+    WaitingBeacon waiting[MAX_WAITING];
+    BeaconFields beacon;
+    bool has_moved;  /* Whether its sender states another position than before. */
+    Packet packet;  /* The same for the filter. */
+    Relays relays;
+    int32_t events;  /* What has happened with it (``admission.COUNTER_JUMPED`` and others). */
+} Tag;
+
+/* A packet. */
+typedef struct HeardPacket {
+    Packet packet;
+    int32_t relay_count;
+    Relay relays[RELAYS_KEPT];
+    ScaledTime scaled;  /* Its TX time on the scale of the trial at hand. */
+} HeardPacket;
+
+/* An anchor's newest packets. */
+typedef struct HeardAnchor {
+    int32_t count;
+    int64_t fitted_ticks;  /* The tag's reading when it last had a place on the common scale, at a possible rate. */
+    HeardPacket older;
+    HeardPacket newer;
+} HeardAnchor;
+
+/* Reading of one anchor's clock less that of another's, when the tag's read ``rx_ticks_tag``. */
+typedef struct ClockLink {
+    int32_t listener;
+    int32_t sender;
+    int64_t rx_ticks_tag;
+    int64_t ticks;
+    real fraction_ticks;
+} ClockLink;
+
+/* A first position. */
+typedef struct Start {
+    int64_t rx_ticks_tag;
+    int32_t count;
+    int32_t used[MAX_ANCHORS];  /* Where the anchors that it uses stand in the table of those that are heard. */
+    real position_m[3];
+    real covariance_m2[3][3];
+    bool is_contradicted;  /* Whether the messages of all anchors contradict each other. */
+    bool has_misfit;
+    int32_t misfit;  /* An anchor that is not in ``used``: without it there is no contradiction. */
+} Start;
+
+/* Along which links an anchor's TX times become those of the reference: a tree. */
+typedef struct Reach {
+    int32_t count;
+    int32_t order[MAX_ANCHORS];  /* Pairs in the order in which they are reached; the first is the reference. */
+    int32_t is_reached[MAX_ANCHORS];
+    int32_t parent[MAX_ANCHORS];
+    int32_t link[MAX_ANCHORS];
+    int32_t sign[MAX_ANCHORS];
+} Reach;
+
+/* A minimum of the cost, in the problem's axes. */
+typedef struct Minimum {
+    int32_t iterations;
+    real cost;
+    real chi2;  /* rᵀΣ⁻¹r, also where the cost is not weighted by Σ⁻¹. */
+    real state[3];
+    real covariance[10];  /* A lower triangle; zeros for a given height. */
+} Minimum;
+
+/* A set of TDoAs ``tdoa_m[i] = |p − anchors_m[i + 1]| − |p − anchors_m[0]|``, and how far its solution is. */
+typedef struct LocateProblem {
+    int32_t anchors;
+    bool knows_height;
+    bool is_weighted;
+    bool has_bounds;  /* Whether the height is between ``low_m`` and ``high_m``. */
+    real height_m;
+    real low_m;
+    real high_m;
+    real residual_tail;  /* Residuals that noise exceeds more rarely are not noise. */
+    real anchors_m[MAX_ANCHORS][3];  /* The reference first; ``choose_axes`` moves them into its axes. */
+    real tdoa_m[MAX_ANCHORS];
+    real covariance[TRIANGLE];  /* The lower triangle of Σ, and then of its factor L. */
+    int32_t kind;
+    int32_t dims;  /* Number of unknowns. */
+    real extent_m;  /* Size of the anchors' figure. */
+    real origin_m[3];
+    real axes[3][3];  /* Its rows; a position is origin + axesᵀ·state. */
+    real scale[3];  /* What the extent is for each unknown. */
+    int32_t start_count;
+    int32_t minimum_count;
+    real starts[9][3];
+    Minimum minima[9];  /* The best first. */
+    int32_t iterations;
+    real state[3];
+    real trial[3];
+    real step[3];
+    real system[MAX_ANCHORS][4];  /* Rows [∂TDoA/∂state, measured − predicted]. */
+    real normal[10];  /* The lower triangle of systemᵀ·system. */
+    real next_normal[10];
+    real factor[10];
+} LocateProblem;
+
+/* A position and how well it is known. Metres, site frame. */
+typedef struct Found {
+    bool has_mirror;
+    int32_t dof;
+    int32_t iterations;
+    real chi2;
+    real position_m[3];
+    real mirror_m[3];  /* The other position that fits as well. */
+    real covariance_m2[3][3];
+    real residuals_m[MAX_ANCHORS];  /* Measured minus predicted TDoAs. */
+} Found;
+
+/* Gathers packets until a start is possible. */
+typedef struct Acquisition {
+    bool knows_height;
+    real height_m;
+    bool has_bounds;
+    real low_m;
+    real high_m;
+    real variance_m2;  /* Of a TX and an RX stamp together. */
+    real max_age_s;
+    real speed_std_mps;  /* Assumed speed of the tag. */
+    real error_variance_m2;  /* Of survey and ranges. */
+    Tuning tuning;
+    int32_t count;
+    HeardAnchor heard[MAX_ANCHORS];  /* In the order in which they were first heard. */
+    int32_t link_count;
+    ClockLink links[MAX_LINKS];
+    bool has_been_wide;
+    int64_t wide_ticks;  /* When a start was first possible, but wide. */
+    bool is_contradicted;
+    int64_t contradicted_ticks;  /* When packets first contradicted each other. */
+    /* Anchors with which two positions fitted alike; as many of them are tried again once a superframe only. */
+    int32_t rival_count;
+    Start start;
+    int32_t pair_count;
+    int32_t pairs[MAX_ANCHORS];  /* Anchors with two packets, by their place in ``heard``. */
+    real rates[MAX_ANCHORS];  /* How much faster the clock of each runs than the tag's, as a fraction … */
+    real rate_variances[MAX_ANCHORS];  /* … and the variance of that in m²/s². */
+    /* Rates of the tag's clock against the common scale, one of each anchor; ``_solve_start`` sorts them. */
+    real clock_rates_mps[MAX_ANCHORS];
+    Reach reach;
+    Reach best;
+    Start found_alone;
+    real ranges_m[MAX_ANCHORS];  /* Pseudoranges at one time … */
+    real variances_m2[MAX_ANCHORS];  /* … and their variances. */
+    LocateProblem problem;
+    Found found;
+} Acquisition;
+
 /* Where the states stand: the index of the first of each block. */
 typedef struct Layout {
     int32_t offset;  /* Of the first anchor; the others' follow, as in all blocks. */
@@ -867,20 +1235,20 @@ typedef struct KeptPacket {
 /* A pair of anchors, listener and sender. */
 typedef struct Link {
     int64_t tx_ticks;  /* Newest packet of the sender whose reception by the listener was processed. */
+    int64_t relays;  /* Used in this direction. */
     real constant_m;  /* Estimated constant of the pair, in the row of the lower index. */
     real variance_m2;  /* Variance of that. */
     int32_t outliers_in_row;
-    int64_t relays;  /* Used in this direction. */
     bool contradicts;  /* Whether its range contradicts the survey. */
 } Link;
 
 /* Everything that the estimator keeps of one tag. What loops run over stands first: its rows fill cache lines. */
 typedef struct State {
-    real x[360];
-    real P[360][360];  /* Symmetric to the bit. */
+    real x[STATES];
+    real P[COVARIANCES];  /* Row by row, symmetric to the bit; see ``at``. */
     /* What faults do to x: of each kind for each metre by which receptions of an anchor are late, then for each m/s² of
      * acceleration along an axis, then what planning adds. */
-    real V[360][112];
+    real V[STATES][SENSITIVITIES];
     EstimatorSettings settings;
     Tuning tuning;
     real horizontal_k;  /* How many standard deviations the risk of levels allows. */
@@ -892,25 +1260,56 @@ typedef struct State {
     int32_t rows;  /* Columns of V in use. */
     Layout layout;
     Status status;
-    real information[96][96];  /* Information of the innovations on all faults; the lower half. */
-    real evidence[96];  /* What innovations show of them. */
+    real information[FAULTS][FAULTS];  /* Information of the innovations on all faults; the lower half. */
+    real evidence[FAULTS];  /* What innovations show of them. */
     /* Of the lasting faults: (M + I/σ_f²)⁻¹. Their M grows without end, next to which 1/σ_f² would be lost. */
-    real lasting_covariance[32][32];
-    real lasting_m[32];  /* Their estimate: that times y. */
-    Anchor anchors[32];
-    KeptPacket packets[32][16];
-    Link links[32][32];  /* Of listener and sender. */
+    real lasting_covariance[MAX_ANCHORS][MAX_ANCHORS];
+    real lasting_m[MAX_ANCHORS];  /* Their estimate: that times y. */
+    Anchor anchors[MAX_ANCHORS];
+    KeptPacket packets[MAX_ANCHORS][PACKETS_KEPT];
+    Link links[MAX_ANCHORS][MAX_ANCHORS];  /* Of listener and sender. */
     int32_t terms;  /* Terms of the measurement at hand, which stand in ``h``. */
     real h[20];  /* The measurement where it is not zero, at the indices in ``h_index``. */
     int32_t h_index[20];
     int32_t waiting;  /* Updates that are not in P and V yet: those of a packet's relays go there together. */
-    real U[8][360];  /* Of each its u = P·h/√S; then P·h of the measurement at hand. */
+    real U[MOST_WAITING][STATES];  /* Of each its u = P·h/√S; then P·h of the measurement at hand. */
     /* Of each, over √S, by how much each fault is in its innovation; then the same of the measurement at hand. */
-    real G[8][112];
-    real work[39][32];  /* Scratch for systems of equations of all faults of one kind. */
+    real G[MOST_WAITING][SENSITIVITIES];
+    real work[WORK_ROWS][MAX_ANCHORS];  /* Scratch for systems of equations of all faults of one kind. */
     real levels[5];
     real fix[10][3];  /* What a fix carries (``POSITION`` and the following). */
 } State;
+
+/* What there is for each page of an issue. */
+typedef struct Choices {
+    int32_t counts[4];
+    int32_t places[4][MAX_PAGES];  /* Where they stand in the table, those of most anchors first. */
+    int32_t chosen[4];
+} Choices;
+
+/* A matrix A of few columns; ``orthogonalise`` replaces it by A·V, whose columns are orthogonal. */
+typedef struct Columns {
+    int32_t rows;
+    int32_t columns;
+    real A[MAX_ROWS][4];
+    real V[4][4];  /* A rotation; its columns are the right singular vectors of A. */
+    real squares[4];  /* Squares of the singular values, the largest first. */
+} Columns;
+
+/* Linear equations of a start. */
+typedef struct Equations {
+    Columns left;
+    real right[MAX_ANCHORS];  /* What is known: (|a_i|² − d_i²)/2, less what a given height contributes. */
+    real u[4];
+    real v[4];
+} Equations;
+
+/* What a filter begins with. */
+typedef struct Beginning {
+    Start start;
+    int32_t count;
+    HeardPacket packets[MAX_BEGINNING];  /* In the order of their receptions. */
+} Beginning;
 
 /* A packet of a batch. */
 typedef struct BatchPacket {
@@ -959,178 +1358,17 @@ typedef struct SteadyState {
     real motion_m2[3];  /* What accelerations have of each axis' variance, for one fix. */
 } SteadyState;
 
-/* A minimum of the cost, in the problem's axes. */
-typedef struct Minimum {
-    int32_t iterations;
-    real cost;
-    real chi2;  /* rᵀΣ⁻¹r, also where the cost is not weighted by Σ⁻¹. */
-    real state[3];
-    real covariance[10];  /* A lower triangle; zeros for a given height. */
-} Minimum;
-
-/* A set of TDoAs ``tdoa_m[i] = |p − anchors_m[i + 1]| − |p − anchors_m[0]|``, and how far its solution is. */
-typedef struct LocateProblem {
-    int32_t anchors;
-    bool knows_height;
-    bool is_weighted;
-    bool has_bounds;  /* Whether the height is between ``low_m`` and ``high_m``. */
-    real height_m;
-    real low_m;
-    real high_m;
-    real residual_tail;  /* Residuals that noise exceeds more rarely are not noise. */
-    real anchors_m[32][3];  /* The reference first; ``choose_axes`` moves them into its axes. */
-    real tdoa_m[32];
-    real covariance[496];  /* The lower triangle of Σ, and then of its factor L. */
-    int32_t kind;
-    int32_t dims;  /* Number of unknowns. */
-    real extent_m;  /* Size of the anchors' figure. */
-    real origin_m[3];
-    real axes[3][3];  /* Its rows; a position is origin + axesᵀ·state. */
-    real scale[3];  /* What the extent is for each unknown. */
-    int32_t start_count;
-    int32_t minimum_count;
-    real starts[9][3];
-    Minimum minima[9];  /* The best first. */
-    int32_t iterations;
-    real state[3];
-    real trial[3];
-    real step[3];
-    real system[32][4];  /* Rows [∂TDoA/∂state, measured − predicted]. */
-    real normal[10];  /* The lower triangle of systemᵀ·system. */
-    real next_normal[10];
-    real factor[10];
-} LocateProblem;
-
-/* A position and how well it is known. Metres, site frame. */
-typedef struct Found {
-    bool has_mirror;
-    int32_t dof;
-    int32_t iterations;
-    real chi2;
-    real position_m[3];
-    real mirror_m[3];  /* The other position that fits as well. */
-    real covariance_m2[3][3];
-    real residuals_m[32];  /* Measured minus predicted TDoAs. */
-} Found;
-
-/* A matrix A of few columns; ``orthogonalise`` replaces it by A·V, whose columns are orthogonal. */
-typedef struct Columns {
-    int32_t rows;
-    int32_t columns;
-    real A[32][4];
-    real V[4][4];  /* A rotation; its columns are the right singular vectors of A. */
-    real squares[4];  /* Squares of the singular values, the largest first. */
-} Columns;
-
-/* Linear equations of a start. */
-typedef struct Equations {
-    Columns left;
-    real right[32];  /* What is known: (|a_i|² − d_i²)/2, less what a given height contributes. */
-    real u[4];
-    real v[4];
-} Equations;
-
-/* A TX time on a scale that packets of several anchors have in common. */
-typedef struct ScaledTime {
-    int64_t ticks;
-    real fraction_ticks;
-    real variance_m2;
-} ScaledTime;
-
-/* A packet. */
-typedef struct HeardPacket {
-    Packet packet;
-    bool is_stated;  /* Whether the anchor states its TX time on the master's scale … */
-    ScaledTime stated;  /* … and that time. */
-    ScaledTime scaled;  /* The time on the scale of the trial at hand. */
-} HeardPacket;
-
-/* An anchor's newest packets. */
-typedef struct HeardAnchor {
-    int32_t count;
-    int64_t fitted_ticks;  /* The tag's reading when it last had a place on the common scale, at a possible rate. */
-    HeardPacket older;
-    HeardPacket newer;
-} HeardAnchor;
-
-/* Reading of one anchor's clock less that of another's, when the tag's read ``rx_ticks_tag``. */
-typedef struct ClockLink {
-    int32_t listener;
-    int32_t sender;
-    int64_t rx_ticks_tag;
-    int64_t ticks;
-    real fraction_ticks;
-} ClockLink;
-
-/* A first position. */
-typedef struct Start {
-    int64_t rx_ticks_tag;
-    int32_t count;
-    int32_t used[32];  /* Where the anchors that it uses stand in the table of those that are heard. */
-    real position_m[3];
-    real covariance_m2[3][3];
-    bool is_contradicted;  /* Whether the messages of all anchors contradict each other. */
-    bool has_misfit;
-    int32_t misfit;  /* An anchor that is not in ``used``: without it there is no contradiction. */
-} Start;
-
-/* Along which links an anchor's TX times become those of the reference: a tree. */
-typedef struct Reach {
-    int32_t count;
-    int32_t order[32];  /* Pairs in the order in which they are reached; the first is the reference. */
-    int32_t is_reached[32];
-    int32_t parent[32];
-    int32_t link[32];
-    int32_t sign[32];
-} Reach;
-
-/* Gathers packets until a start is possible. */
-typedef struct Acquisition {
-    bool knows_height;
-    real height_m;
-    bool has_bounds;
-    real low_m;
-    real high_m;
-    real variance_m2;  /* Of a TX and an RX stamp together. */
-    real max_age_s;
-    real speed_std_mps;  /* Assumed speed of the tag. */
-    real error_variance_m2;  /* Of survey and ranges. */
-    Tuning tuning;
-    int32_t count;
-    HeardAnchor heard[32];  /* In the order in which they were first heard. */
-    int32_t link_count;
-    ClockLink links[992];
-    bool has_been_wide;
-    int64_t wide_ticks;  /* When a start was first possible, but wide. */
-    bool is_contradicted;
-    int64_t contradicted_ticks;  /* When packets first contradicted each other. */
-    /* Anchors with which two positions fitted alike; as many of them are tried again once a superframe only. */
-    int32_t rival_count;
-    Start start;
-    int32_t pair_count;
-    int32_t pairs[32];  /* Anchors with two packets, by their place in ``heard``. */
-    real rates[32];  /* How much faster the clock of each runs than the tag's, as a fraction … */
-    real rate_variances[32];  /* … and the variance of that in m²/s². */
-    /* Rates of the tag's clock against the common scale, one of each anchor; ``_solve_start`` sorts them. */
-    real clock_rates_mps[32];
-    Reach reach;
-    Reach best;
-    Start found_alone;
-    real ranges_m[32];  /* Pseudoranges at one time … */
-    real variances_m2[32];  /* … and their variances. */
-    LocateProblem problem;
-    Found found;
-} Acquisition;
-
 SKYLESS_EXPORT int32_t skyless_unwrap_stamp(Neighbours *t, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t
         rx_ticks, int64_t period_ticks);
 SKYLESS_EXPORT int32_t skyless_read_frame(uint8_t *frame, int32_t length, BeaconFields *b);
-SKYLESS_EXPORT void skyless_prepare(State *s);
+SKYLESS_EXPORT void skyless_restart(State *s, int64_t rx_ticks, real late_share, real fault_std_m, bool
+        has_open_ranges);
 SKYLESS_EXPORT int32_t skyless_find_anchor(State *s, int32_t identifier);
 SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *position_m, real std_m, bool is_open);
-SKYLESS_EXPORT void skyless_remove_anchor(State *s, int32_t anchor);
 SKYLESS_EXPORT void skyless_fit_plane(State *s);
-SKYLESS_EXPORT int32_t skyless_process_frame(State *s, Packet *packet, uint8_t *packed, int32_t packed_bytes);
+SKYLESS_EXPORT void skyless_leave(State *s, int32_t identifier);
+SKYLESS_EXPORT int32_t skyless_process_frame(State *s, Packet *packet, Relays *relays, uint8_t *packed, int32_t
+        packed_bytes);
 SKYLESS_EXPORT int32_t skyless_process_difference(State *s, Place *a, Place *b, int64_t rx_ticks, real difference_m);
 SKYLESS_EXPORT int32_t skyless_process_height(State *s, real height_m, real std_m, bool is_barometer);
 SKYLESS_EXPORT void skyless_track(State *s, Place *places, BatchPacket *packets, Relay *relays, BatchRow *rows, int32_t
@@ -1142,17 +1380,21 @@ SKYLESS_EXPORT void skyless_find_walked(State *s, PlannedMessage *messages, Plan
 SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_ticks, real *position_m, uint8_t *known,
         int32_t first, real elapsed_s, real walked_m);
 SKYLESS_EXPORT int32_t skyless_find_position(LocateProblem *p, Found *found);
-SKYLESS_EXPORT void skyless_forget_packets(Acquisition *q, int32_t anchor);
-SKYLESS_EXPORT int32_t skyless_try_start(Acquisition *q, HeardPacket *given, uint8_t *packed, int32_t packed_bytes);
 SKYLESS_EXPORT int32_t skyless_admit_sender(Admission *a, int32_t site, int32_t anchor, int64_t rx_counter, real
         host_s);
 SKYLESS_EXPORT int32_t skyless_admit_stamp(Admission *a, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t
         period_ticks);
-SKYLESS_EXPORT int32_t skyless_process_in_course(Course *c, State *s, FixTime *time, Packet *packet, uint8_t *packed,
-        int32_t packed_bytes);
-SKYLESS_EXPORT int32_t skyless_hear_frame(Hearing *h, Course *c, State *s, uint8_t *frame, int32_t length, int64_t
+SKYLESS_EXPORT void skyless_begin_course(Course *c, Acquisition *q);
+SKYLESS_EXPORT void skyless_begin_again(Course *c, State *s, Acquisition *q);
+SKYLESS_EXPORT int32_t skyless_follow(Course *c, State *s, Acquisition *q, FixTime *time, Packet *packet, Relays
+        *relays, uint8_t *packed, int32_t packed_bytes);
+SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest_m, real highest_m, real height_std_m,
+        real max_acceleration_mps2, real integrity_risk, real alert_limit_m);
+SKYLESS_EXPORT void skyless_wake(Tag *t, State *s, Acquisition *q, int64_t rx_counter, real slept_s);
+SKYLESS_EXPORT void skyless_begin_here(Tag *t, Acquisition *q);
+SKYLESS_EXPORT int32_t skyless_hear_frame(Tag *t, State *s, Acquisition *q, uint8_t *frame, int32_t length, int64_t
         rx_counter, real host_s, real rx_power_dbm, real first_path_power_dbm, real phase_cycles);
-SKYLESS_EXPORT int32_t skyless_hear_fields(Hearing *h, Course *c, State *s, int64_t rx_counter, real host_s, real
-        rx_power_dbm, real first_path_power_dbm, real phase_cycles);
+SKYLESS_EXPORT int32_t skyless_hear_fields(Tag *t, State *s, Acquisition *q, uint8_t *frame, int64_t rx_counter, real
+        host_s, real rx_power_dbm, real first_path_power_dbm, real phase_cycles);
 
 #endif

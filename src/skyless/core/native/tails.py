@@ -2,12 +2,14 @@
 
 from typing import Final
 
-from skyless.core.native.arithmetic import exp, sqrt
+from skyless.core.native.arithmetic import exp, log, sqrt
 
 SQRT_2_PI: Final = 2.5066282746310002
 FAR_TAIL: Final = 3.0
 """From here on the normal tail's continued fraction converges faster than its series."""
 TERMS: Final = 60
+NEWTON_STEPS: Final = 10
+"""The logarithm is concave, and the first z too large: each step doubles the right digits."""
 
 
 def normal_tail(z: float) -> float:
@@ -26,6 +28,15 @@ def normal_tail(z: float) -> float:
     else:
         tail = density / _continued_fraction(size, 1)
     return tail if z >= 0.0 else 1.0 - tail
+
+
+def normal_quantile(tail: float) -> float:
+    """What a standard normal variable exceeds with a probability below ½, by Newton's method for its logarithm."""
+    z = sqrt(-2.0 * log(tail))
+    for _ in range(NEWTON_STEPS):
+        found = normal_tail(z)
+        z += (log(found) - log(tail)) * found * SQRT_2_PI / exp(-0.5 * z * z)
+    return z
 
 
 def _continued_fraction(z: float, first: int) -> float:

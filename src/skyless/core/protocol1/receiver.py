@@ -29,7 +29,7 @@ from skyless.core.protocol1.beacon import Beacon
 from skyless.core.protocol1.codec import decode_cached, packed_relays
 from skyless.core.protocol1.schedule import Schedule, schedule_from_page
 from skyless.core.protocol1.snapshots import SnapshotMethod, Snapshots, SnapshotSettings, SnapshotsState
-from skyless.core.tag.admission import ADMITTED, Admission, admit_sender, admit_stamp
+from skyless.core.tag.admission import ADMITTED, SITE_CHANGED, Admission, admit_sender, admit_stamp
 from skyless.core.tag.beacon_receiver import AdmissionState, BeaconReceiver, HeardSite, MethodOptions
 from skyless.core.tag.factory import as_required, estimator_settings, stamp_variances
 from skyless.core.tag.joint import Estimation, EstimationState
@@ -181,7 +181,13 @@ class Receiver(BeaconReceiver):
         outcome = _admit_sender(
             admission, beacon.site, beacon.anchor, reception.rx_ticks, nan if host_s is None else host_s
         )
-        self._handle_events()
+        events, admission.events = admission.events, 0
+        self._count_events(events)
+        if events & SITE_CHANGED:
+            self.almanac = AlmanacAssembly()
+            self._positions, self._superframe_ticks = {}, 0
+        if events:
+            self._forget_stamps()
         if outcome == ADMITTED:
             if beacon.anchor not in self._positions and self.almanac.complete:
                 self.counters["unknown-anchor"] += 1
@@ -222,7 +228,7 @@ class Receiver(BeaconReceiver):
         return Observation(
             beacon.anchor, anchor_m, 0, beacon.sequence, rx_ticks, tx_ticks, None, None, ticks_master, fraction,
             variance_m2, (), self._report(beacon, tx_ticks, ticks_master), factor,
-            packed_relays(reception.frame, beacon), None, phase_of(reception),
+            packed_relays(reception.frame, beacon), phase_of(reception),
         )  # fmt: skip
 
     def _report(self, beacon: Beacon, tx_ticks: int, ticks_master: int | None) -> tuple[int, int] | None:
@@ -263,10 +269,6 @@ class Receiver(BeaconReceiver):
         if updates:
             self._scale = (whole, rx_ticks)
         return whole, subticks / SUBTICKS, (time.std_ticks * TICK_M) ** 2
-
-    def _forget_site(self) -> None:
-        self.almanac = AlmanacAssembly()
-        self._positions, self._superframe_ticks = {}, 0
 
     def _forget_stamps(self) -> None:
         self._scale = None

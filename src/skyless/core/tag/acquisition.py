@@ -10,11 +10,11 @@ pseudoranges are carried to one time and solved in closed form.
 from typing import Annotated, Final
 
 from skyless.core.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.core.estimator.process import Packet, Relay, relay_rx_ticks, take_relays
+from skyless.core.estimator.process import Packet, Relay, Relays, ScaledTime, relay_rx_ticks
 from skyless.core.estimator.settings import Tuning
 from skyless.core.native.arithmetic import floor, sqrt, square
-from skyless.core.native.records import Array, Bytes, Integers, Matrix, Reals, Record, Ticks, record
-from skyless.core.native.sizes import MAX_ANCHORS
+from skyless.core.native.records import Array, Integers, Matrix, Reals, Record, Ticks, record
+from skyless.core.native.sizes import MAX_ANCHORS, RELAYS_KEPT
 from skyless.core.tag.position import FOUND, MIRROR, RESIDUALS, Found, find_position
 from skyless.core.tag.problem import LARGEST, LocateProblem
 from skyless.core.ticks import NEVER
@@ -26,25 +26,14 @@ MAX_LINKS: Final = MAX_ANCHORS * (MAX_ANCHORS - 1)
 
 
 @record
-class ScaledTime(Record):
-    """A TX time on a scale that packets of several anchors have in common."""
-
-    ticks: Ticks
-    fraction_ticks: float
-    variance_m2: float
-
-
-@record
 class HeardPacket(Record):
     """A packet."""
 
     packet: Packet
-    is_stated: bool
-    """Whether the anchor states its TX time on the master's scale …"""
-    stated: ScaledTime
-    """… and that time."""
+    relay_count: int
+    relays: Annotated[Array[Relay], RELAYS_KEPT]
     scaled: ScaledTime
-    """The time on the scale of the trial at hand."""
+    """Its TX time on the scale of the trial at hand."""
 
 
 @record
@@ -164,17 +153,15 @@ def forget_packets(q: Acquisition, anchor: int) -> None:
     q.link_count = kept
 
 
-def try_start(q: Acquisition, given: HeardPacket, packed: Bytes, packed_bytes: int) -> int:
-    """Add one packet with more relays, as frames carry them; try to start each time an anchor comes around again.
+def try_start(q: Acquisition, packet: Packet, relays: Relays) -> int:
+    """Add one packet; try to start each time an anchor comes around again.
 
     Returns why there is no start, ``FOUND`` if ``start`` is one.
     """
-    take_relays(given.packet, packed, packed_bytes)
-    _add_links(q, given.packet)
-    now = given.packet.rx_ticks
-    anchor = given.packet.place.anchor
+    _add_links(q, packet, relays)
+    now, anchor = packet.rx_ticks, packet.place.anchor
     _forget_old_packets(q, now)
-    came_around = _keep_packet_of(q, anchor, given)
+    came_around = _keep_heard(q, packet, relays)
     _choose_pairs(q, now)
     _put_on_one_scale(q, now)
     _drop_impossible(q, now)
@@ -215,12 +202,12 @@ def _forget_old_packets(q: Acquisition, now: Ticks) -> None:
             _remove_heard(q, place)
 
 
-def _keep_packet_of(q: Acquisition, anchor: int, given: HeardPacket) -> bool:
+def _keep_heard(q: Acquisition, packet: Packet, relays: Relays) -> bool:
     """Keep an anchor's two newest packets; whether it had two before.
 
     With too many anchors a new one takes the place of that which has not fitted the others for longest.
     """
-    place = _find_heard(q, anchor)
+    place = _find_heard(q, packet.place.anchor)
     if place < 0:
         if q.count == MAX_ANCHORS:
             _remove_heard(q, _longest_unfitting(q))
@@ -231,7 +218,10 @@ def _keep_packet_of(q: Acquisition, anchor: int, given: HeardPacket) -> bool:
     had_two = one.count == 2
     if one.count > 0:
         one.older = one.newer
-    one.newer = given
+    one.newer.packet = packet
+    one.newer.relay_count = min(relays.count, RELAYS_KEPT)
+    for relayed in range(one.newer.relay_count):
+        one.newer.relays[relayed] = relays.rows[relayed]
     one.count = min(one.count + 1, 2)
     return had_two
 
@@ -244,10 +234,10 @@ def _longest_unfitting(q: Acquisition) -> int:
     return longest
 
 
-def _add_links(q: Acquisition, packet: Packet) -> None:
+def _add_links(q: Acquisition, packet: Packet, relays: Relays) -> None:
     """Keep what an anchor relays of packets that the tag has received."""
-    for index in range(packet.relay_count):
-        relayed = packet.relays[index]
+    for index in range(relays.count):
+        relayed = relays.rows[index]
         place = _find_heard(q, relayed.anchor)
         if place >= 0:
             if q.heard[place].newer.packet.sequence == relayed.sequence:
@@ -313,7 +303,7 @@ def _put_on_one_scale(q: Acquisition, now: Ticks) -> None:
     stated = 0
     for pair in range(q.pair_count):
         one = q.heard[q.pairs[pair]]
-        stated += 1 if one.older.is_stated and one.newer.is_stated else 0
+        stated += 1 if one.older.packet.is_stated and one.newer.packet.is_stated else 0
         _measure_rate(q, pair, one.older.packet, one.newer.packet)
     _forget_links_before(q, now)
     q.best.count = 0
@@ -325,8 +315,8 @@ def _put_on_one_scale(q: Acquisition, now: Ticks) -> None:
     kept = 0
     for pair in range(q.pair_count):
         one = q.heard[q.pairs[pair]]
-        is_kept = one.older.is_stated and one.newer.is_stated
-        one.older.scaled, one.newer.scaled = one.older.stated, one.newer.stated
+        is_kept = one.older.packet.is_stated and one.newer.packet.is_stated
+        one.older.scaled, one.newer.scaled = one.older.packet.stated, one.newer.packet.stated
         if q.best.count >= stated:
             is_kept = q.best.is_reached[pair] == 1
             if is_kept:

@@ -4,12 +4,10 @@ from typing import Final
 
 from skyless.core.air.anchor_stamps import STAMP_COUNTERS, STAMP_FITS, unwrap_stamp
 from skyless.core.air.instants import LONGEST_PERIOD_CODE
-from skyless.core.air.neighbours import MAX_NEIGHBOURS, Neighbours, forget_times
+from skyless.core.air.neighbours import Neighbours, forget_times
 from skyless.core.air.site_choice import (
     CHANGED,
     FOREIGN,
-    MAX_COUNTED,
-    MAX_SITES,
     NO_SITE,
     SiteChoice,
     choose_site,
@@ -17,6 +15,7 @@ from skyless.core.air.site_choice import (
 )
 from skyless.core.constants import TICK_BITS
 from skyless.core.native.records import Record, Ticks, first, record
+from skyless.core.native.sizes import MAX_COUNTED, MAX_NEIGHBOURS, MAX_SITES
 from skyless.core.ticks import LAST_TICKS, FixTime, Unwrapper, from_seconds, unwrap
 
 COUNTER_JUMP_TICKS: Final = from_seconds(1.0)

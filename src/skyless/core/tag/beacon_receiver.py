@@ -12,7 +12,7 @@ from skyless.core.air.reception import Reception
 from skyless.core.air.site_choice import NO_SITE
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.tag.admission import COUNTER_JUMPED, DROP_COUNTERS, HOST_JUMPED, SITE_CHANGED, Admission, check
+from skyless.core.tag.admission import COUNTER_JUMPED, DROP_COUNTERS, SITE_CHANGED, Admission, check
 from skyless.core.tag.joint import Estimation
 from skyless.core.ticks import FixTime
 
@@ -43,8 +43,8 @@ class HeardSite(Struct, frozen=True):
     """Whether a georeference cannot come any more; protocol 1 does not say whether there is one."""
 
 
-class TagReceiver(Protocol):
-    """What programs, replays and simulations see of a tag. Bytes and ticks in, fixes out; no I/O, no clock."""
+class SiteListener(Protocol):
+    """What programs show of a tag, besides its fixes."""
 
     @property
     def counters(self) -> Counter[str]:
@@ -69,6 +69,10 @@ class TagReceiver(Protocol):
     @property
     def phase_anchors(self) -> tuple[int, ...]:
         """Identifiers of the anchors the phases of whose carriers are in use."""
+
+
+class TagReceiver(SiteListener, Protocol):
+    """What programs, replays and simulations see of a tag. Bytes and ticks in, fixes out; no I/O, no clock."""
 
     def hear(self, reception: Reception) -> Fix | None:
         """Process a frame from the air; a fix if it made one, else ``reason`` is set."""
@@ -146,25 +150,12 @@ class BeaconReceiver(ABC):
         """Count the tag's counter on as another receiver does, and the time of fixes from ``fix_time`` on."""
         self.admission.time, self.admission.own = fix_time, other.admission.own
 
-    @abstractmethod
-    def _forget_site(self) -> None:
-        """Another site is in use from now on: forget all that beacons have made known."""
-
-    @abstractmethod
-    def _forget_stamps(self) -> None:
-        """The tag's counter has restarted: forget all but what the site has in common."""
-
-    def _handle_events(self) -> None:
-        """Count what has happened to the tag's counter and site, and forget what that makes useless."""
-        events, self.admission.events = self.admission.events, 0
+    def _count_events(self, events: int) -> None:
+        """Count what has happened to the tag's counter and site."""
         if events & COUNTER_JUMPED:
             self.counters["counter-jump"] += 1
-        if events & (COUNTER_JUMPED | HOST_JUMPED):
-            self._forget_stamps()
         if events & SITE_CHANGED:
             self.counters["site-change"] += 1
-            self._forget_site()
-            self._forget_stamps()
 
     def _count_drop(self, outcome: int) -> None:
         """Count a frame that is not used."""

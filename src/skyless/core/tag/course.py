@@ -1,24 +1,28 @@
-"""A tag that knows where it is: what becomes of a packet, and when it has to begin again."""
+"""A tag that knows where it is: what becomes of a packet, and when it has to begin again (``following.py``)."""
 
 from typing import Annotated, Final
 
 from skyless.core.constants import TICK_S
 from skyless.core.estimator.levels import largest_test
-from skyless.core.estimator.process import REJECTED, STALE, Packet, Place, process_frame
-from skyless.core.estimator.settings import TUNING
-from skyless.core.estimator.state import AXES, State
+from skyless.core.estimator.process import REJECTED, STALE, Packet, Place, Relays, process_frame
+from skyless.core.estimator.settings import TUNING, EstimatorSettings, Tuning
+from skyless.core.estimator.state import AXES, State, at
 from skyless.core.estimator.verdicts import fits_settings, is_late_often, is_lost, relays_contradict, relays_fit
-from skyless.core.fix import QUALITY
+from skyless.core.fix import PROTECTED_ROWS, QUALITY
 from skyless.core.native.arithmetic import square
-from skyless.core.native.records import Array, Bytes, Count, Reals, Record, Ticks, record
+from skyless.core.native.records import Array, Bytes, Count, Matrix, Reals, Record, Ticks, record
 from skyless.core.native.sizes import MAX_ANCHORS
-from skyless.core.ticks import FixTime, fix_time_s, from_seconds
+from skyless.core.ticks import FixTime, fix_time_ticks, from_seconds
 
 FIX, OUTLIER, LOST, START_CONTRADICTED, BAD_GEOMETRY = range(20, 25)
 """What becomes of a packet. After ``LOST`` and ``START_CONTRADICTED`` the tag has to begin again."""
 
 SURELY_IN_REACH_TICKS: Final = from_seconds(TUNING.short_silence_s) - 1
 """Silences up to this need no check of the filter."""
+
+
+NOBODY: Final = -1
+"""The identifier of no anchor."""
 
 
 @record
@@ -35,6 +39,24 @@ class UsedAnchor(Record):
 class Course(Record):
     """What has become of the starts so far, and whose packets were accepted recently."""
 
+    settings: EstimatorSettings
+    """Those with which a filter begins, as the next four."""
+    tuning: Tuning
+    dim: int
+    horizontal_k: float
+    vertical_k: float
+    superframe_s: float
+    """Of slow sites, else 0."""
+    most_anchors: int
+    """With which a filter begins, the nearest, and none that does not belong to the start; 0: with all."""
+    is_starting: bool = True
+    """Whether no position is known; else the search is not used, now the state is not."""
+    late_share: float
+    """That of the last filter."""
+    misfit: int = NOBODY
+    """The anchor that contradicted the others at the start."""
+    alone: Annotated[Matrix, PROTECTED_ROWS, AXES]
+    """What a fix carries that is a start's, without a filter."""
     open_range_errors: bool
     """Whether the next start expects larger range errors than the settings state."""
     is_open: bool
@@ -57,13 +79,15 @@ class Course(Record):
     """How often the anchors in use, or their positions, have changed."""
     count: int
     used: Annotated[Array[UsedAnchor], MAX_ANCHORS]
-    time_s: float
-    """Of the newest fix."""
+    time_ticks: Ticks
+    """Of the newest fix, since the first one."""
 
 
-def process_in_course(c: Course, s: State, time: FixTime, packet: Packet, packed: Bytes, packed_bytes: int) -> int:
+def process_in_course(
+    c: Course, s: State, time: FixTime, packet: Packet, relays: Relays, packed: Bytes, packed_bytes: int
+) -> int:
     """Process a packet of a tag that knows where it is, as ``process_frame``; what becomes of it."""
-    outcome = process_frame(s, packet, packed, packed_bytes)
+    outcome = process_frame(s, packet, relays, packed, packed_bytes)
     c.newest_ticks = max(c.newest_ticks, packet.rx_ticks)
     if outcome in (REJECTED, STALE):
         return LOST if is_lost(s) else OUTLIER
@@ -75,9 +99,9 @@ def process_in_course(c: Course, s: State, time: FixTime, packet: Packet, packed
 
 def settle(c: Course, s: State, time: FixTime, rx_ticks: Ticks) -> int:
     """Whether the state is a fix: in three dimensions its height may be worse than the anchors' extent."""
-    if s.dim == AXES and s.P[2][2] > square(c.extent_m):
+    if s.dim == AXES and s.P[at(2, 2)] > square(c.extent_m):
         return BAD_GEOMETRY
-    c.time_s = fix_time_s(time, rx_ticks + c.master_less_tag_ticks, rx_ticks)
+    c.time_ticks = fix_time_ticks(time, rx_ticks + c.master_less_tag_ticks, rx_ticks)
     return FIX
 
 

@@ -1,55 +1,34 @@
-"""A tag of protocol 2: from a frame's bytes to a fix, as long as it knows its site and where it is.
-
-What is rare is left to its owner (``Receiver``): pages of the site, starts, anchors that join or have moved.
-"""
+"""A tag of protocol 2: from a frame's bytes to a fix."""
 
 from typing import Final
 
-from skyless.core.air.beacon_fields import INTACT, BeaconFields, read_frame
+from skyless.core.air.beacon_fields import INTACT, read_frame
 from skyless.core.air.first_path import variance_factor
+from skyless.core.air.frame import HEARD_BYTES
 from skyless.core.air.instants import period_ticks
 from skyless.core.air.neighbours import Neighbour, StatedPlace, is_relayed
 from skyless.core.air.site_choice import MIN_ANCHORS, note_fix
 from skyless.core.constants import TICK_S
-from skyless.core.estimator.process import Packet
 from skyless.core.estimator.state import AXES, State, find_anchor
-from skyless.core.native.records import Bytes, Record, Ticks, record
-from skyless.core.tag.admission import ADMITTED, Admission, admit_sender, admit_stamp
-from skyless.core.tag.course import FIX, Course, is_surely_in_reach, process_in_course
-from skyless.core.tag.selection import MIN_FITTING, add_power, add_relays, fitting_relays
+from skyless.core.native.records import Bytes, Ticks
+from skyless.core.native.sizes import HAS_ORIGIN
+from skyless.core.tag.acquisition import Acquisition
+from skyless.core.tag.admission import ADMITTED, admit_sender, admit_stamp
+from skyless.core.tag.changes import handle_events, process_rare
+from skyless.core.tag.course import FIX
+from skyless.core.tag.following import START_FIX, follow
+from skyless.core.tag.selection import MIN_FITTING, MM_PER_M, add_power, add_relays, fitting_relays, place_m
+from skyless.core.tag.tag import Tag
 from skyless.core.ticks import NEVER
 
-IS_RARE: Final = 30
-"""A beacon is admitted, and its sender's row is up to date; the rest is its owner's."""
 MALFORMED: Final = 40
 """The bytes are no beacon; the fault's number is added."""
-NO_ISSUE: Final = -1
-_MM_PER_M: Final = 1000
-
-
-@record
-class Hearing(Record):
-    """What a tag of protocol 2 keeps beside its filter."""
-
-    admission: Admission
-    beacon: BeaconFields
-    """The one at hand."""
-    packet: Packet
-    """The same for the filter."""
-    almanac_issue: int = NO_ISSUE
-    """Issue of the pages in use."""
-    is_starting: bool = True
-    """Whether it does not know where it is."""
-    is_moving: bool
-    """Whether anchors of the site have moved recently."""
-    has_moved: bool
-    """Whether the sender of the beacon at hand has."""
 
 
 def hear_frame(
-    h: Hearing,
-    c: Course,
+    t: Tag,
     s: State,
+    q: Acquisition,
     frame: Bytes,
     length: int,
     rx_counter: Ticks,
@@ -58,67 +37,72 @@ def hear_frame(
     first_path_power_dbm: float,
     phase_cycles: float,
 ) -> int:
-    """Process a frame from the air; what becomes of it: of ``DROP_COUNTERS``, of a course, or one of the above.
+    """Process a frame from the air; what becomes of it.
 
-    ``host_s`` and the powers are NaN, and the phase is below 0, where they are not known. Course
-    and state are not used while it is starting.
+    That is one of ``DROP_COUNTERS``, of ``course.py``, ``following.py`` or ``changes.py``, or ``MALFORMED`` and more.
+    ``host_s`` and the powers are NaN, and the phase is below 0, where they are not known.
     """
-    fault = read_frame(frame, length, h.beacon)
+    fault = read_frame(frame, length, t.beacon)
     if fault != INTACT:
         return MALFORMED + fault
-    return hear_fields(h, c, s, rx_counter, host_s, rx_power_dbm, first_path_power_dbm, phase_cycles)
+    return hear_fields(t, s, q, frame, rx_counter, host_s, rx_power_dbm, first_path_power_dbm, phase_cycles)
 
 
 def hear_fields(
-    h: Hearing,
-    c: Course,
+    t: Tag,
     s: State,
+    q: Acquisition,
+    frame: Bytes,
     rx_counter: Ticks,
     host_s: float,
     rx_power_dbm: float,
     first_path_power_dbm: float,
     phase_cycles: float,
 ) -> int:
-    """The same of a beacon that has been read already."""
-    a, b = h.admission, h.beacon
+    """The same of a beacon that has been read already; its page stands in ``frame``."""
+    a, b = t.admission, t.beacon
     outcome = admit_sender(a, b.site, b.anchor, rx_counter, host_s)
     if outcome == ADMITTED:
         outcome = admit_stamp(a, b.anchor, b.sequence, b.tx_ticks, period_ticks(b.period_code))
-    h.is_starting = h.is_starting or a.events != 0
+    handle_events(t, q)
     if outcome != ADMITTED:
         return outcome
     n = a.neighbours.rows[a.neighbours.row]
     add_power(n, rx_power_dbm)
-    n.was_relayed = _confirm(h, s)
+    n.was_relayed = _confirm(t, s)
     n.almanac_issue, n.period_code = b.almanac_issue, b.period_code
-    h.has_moved = b.has_place and keep_place(n, b.place)
-    _fill_packet(h.packet, h, n, variance_factor(rx_power_dbm, first_path_power_dbm))
-    h.packet.has_phase, h.packet.phase_cycles = phase_cycles >= 0.0, phase_cycles
-    if h.is_starting or h.has_moved or h.is_moving or b.almanac_issue != h.almanac_issue or not n.has_place:
-        return IS_RARE
-    if find_anchor(s, b.anchor) < 0:
-        return IS_RARE
-    n.used_ticks = a.rx_ticks
-    if not is_surely_in_reach(c, a.rx_ticks):
-        return IS_RARE
-    outcome = process_in_course(c, s, a.time, h.packet, b.relays, b.relay_bytes)
-    if outcome == FIX:
+    t.has_moved = b.has_place and keep_place(n, b.place)
+    _fill_packet(t, n, variance_factor(rx_power_dbm, first_path_power_dbm))
+    t.packet.has_phase, t.packet.phase_cycles = phase_cycles >= 0.0, phase_cycles
+    outcome = _hear_admitted(t, s, q, n, frame)
+    if outcome in (FIX, START_FIX):
         note_fix(a.choice, a.rx_ticks)
     return outcome
 
 
-def _confirm(h: Hearing, s: State) -> bool:
+def _hear_admitted(t: Tag, s: State, q: Acquisition, n: Neighbour, frame: Bytes) -> int:
+    """Process a beacon that is admitted."""
+    c, b = t.course, t.beacon
+    is_new = t.has_moved or t.is_moving or b.almanac_issue != t.pages.issue or not n.has_place
+    if c.is_starting or is_new or find_anchor(s, b.anchor) < 0:
+        return process_rare(t, s, q, frame)
+    n.used_ticks = t.admission.rx_ticks
+    relay_bytes = min(b.relay_bytes, t.most_relays * HEARD_BYTES)
+    return follow(c, s, q, t.admission.time, t.packet, t.relays, b.relays, relay_bytes)
+
+
+def _confirm(t: Tag, s: State) -> bool:
     """Process which anchors a beacon confirms by its relays; whether other anchors confirm its sender.
 
     Only then its pages take part in the majority, and its relays confirm others.
     """
-    b, t, rx_ticks = h.beacon, h.admission.neighbours, h.admission.rx_ticks
-    n = t.rows[t.row]
-    in_use = not h.is_starting and find_anchor(s, b.anchor) >= 0
+    b, rows, rx_ticks, is_starting = t.beacon, t.admission.neighbours, t.admission.rx_ticks, t.course.is_starting
+    n = rows.rows[rows.row]
+    in_use = not is_starting and find_anchor(s, b.anchor) >= 0
     by_others = is_relayed(n, rx_ticks) or (in_use and n.own_relays_ticks == NEVER)
-    if by_others or h.is_starting or _has_too_few(s, rx_ticks):
-        add_relays(t, b, rx_ticks)
-    elif fitting_relays(t, s, b, rx_ticks) >= MIN_FITTING:
+    if by_others or is_starting or _has_too_few(s, rx_ticks):
+        add_relays(rows, b, rx_ticks)
+    elif fitting_relays(rows, s, b, rx_ticks) >= MIN_FITTING:
         n.own_relays_ticks = rx_ticks
     return by_others
 
@@ -156,12 +140,16 @@ def _is_same(one: StatedPlace, other: StatedPlace) -> bool:
     return one.std_mm == other.std_mm and one.floor == other.floor and one.zone == other.zone
 
 
-def _fill_packet(packet: Packet, h: Hearing, n: Neighbour, factor: float) -> None:
+def _fill_packet(t: Tag, n: Neighbour, factor: float) -> None:
     """Write the beacon at hand as the filter takes it, but for its relays."""
-    place = packet.place
-    place.anchor, place.std_m, place.is_open = n.anchor, n.place.std_mm / _MM_PER_M, n.is_misfit
+    packet, place = t.packet, t.packet.place
+    if HAS_ORIGIN and n.has_place and not t.has_origin:
+        t.has_origin = True
+        for axis in range(2):
+            t.origin_mm[axis] = n.place.position_mm[axis] // MM_PER_M * MM_PER_M
+    place.anchor, place.std_m, place.is_open = n.anchor, n.place.std_mm / MM_PER_M, n.is_misfit
     for axis in range(AXES):
-        place.position_m[axis] = n.place.position_mm[axis] / _MM_PER_M
-    packet.sequence, packet.rx_ticks, packet.tx_ticks = n.sequence, h.admission.rx_ticks, n.tx_ticks
-    packet.variance_factor, packet.master, packet.relay_count = factor, -1, 0
-    packet.report_variance_m2, packet.relays_have_phases = 0.0, h.beacon.has_phases
+        place.position_m[axis] = place_m(n, t.origin_mm, axis)
+    packet.sequence, packet.rx_ticks, packet.tx_ticks = n.sequence, t.admission.rx_ticks, n.tx_ticks
+    packet.variance_factor, packet.master, t.relays.count = factor, -1, 0
+    packet.report_variance_m2, packet.relays_have_phases = 0.0, t.beacon.has_phases

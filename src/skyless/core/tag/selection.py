@@ -1,7 +1,6 @@
 """Which anchors of a large site a tag uses: the strongest of those that other anchors receive too."""
 
-import math
-from collections.abc import Collection
+from math import log as _log
 from typing import Final
 
 from skyless.core.air.beacon_fields import BeaconFields
@@ -10,11 +9,9 @@ from skyless.core.air.little_endian import two_bytes, unsigned
 from skyless.core.air.neighbours import Neighbour, Neighbours, find_neighbour, neighbour_of
 from skyless.core.constants import TICK_BITS
 from skyless.core.estimator.state import State, find_anchor
-from skyless.core.native.records import Ticks
+from skyless.core.native.arithmetic import log, sqrt, square
+from skyless.core.native.records import Integers, Ticks
 from skyless.core.ticks import FLIGHT_SLACK_TICKS, NEVER, may_elapse, nearest
-
-MAX_ANCHORS_IN_USE: Final = 24
-"""In the estimator's state; more cost accuracy, as each then sends less, and time."""
 
 BETTER_DB: Final = 3.0
 """By which another anchor must be stronger to replace the weakest."""
@@ -30,6 +27,8 @@ MAX_POWER_DBM: Final = 1000.0
 
 NOMINAL_POWER_DBM: Final = -63.0
 """Assumed power at 1 m where the radio reports none, so that nearer anchors count as stronger."""
+_DB_PER_LOG: Final = 20.0 / _log(10.0)
+MM_PER_M: Final = 1000
 
 
 def add_power(n: Neighbour, power_dbm: float) -> None:
@@ -67,23 +66,26 @@ def fitting_relays(t: Neighbours, s: State, b: BeaconFields, rx_ticks: Ticks) ->
     return fitting
 
 
-def replaced_by(anchor: int, powers_dbm: dict[int, float], ranges_m: dict[int, float]) -> int | None:
-    """The anchor in use that ``anchor`` should replace, None if ``anchor`` is too weak.
-
-    ``ranges_m``: ranges of ``anchor`` and of all anchors in use; ``powers_dbm``: those that are known.
-    """
-    powers = {one: powers_dbm.get(one, _nominal_dbm(range_m)) for one, range_m in ranges_m.items()}
-    own_dbm = powers.pop(anchor)
-    if not powers:
-        return None
-    weakest = min(powers, key=lambda one: powers[one])
-    return weakest if own_dbm > powers[weakest] + BETTER_DB else None
+def replaced_by(t: Neighbours, s: State, origin_mm: Integers) -> int:
+    """The index of the anchor in use that the newest anchor should replace: the weakest; −1 where none is weaker."""
+    weakest, least_dbm = -1, _power_dbm(t.rows[t.row], s, origin_mm) - BETTER_DB
+    for index in range(s.count):
+        row = find_neighbour(t, s.anchors[index].identifier)
+        if row >= 0 and t.rows[row].has_place and _power_dbm(t.rows[row], s, origin_mm) < least_dbm:
+            weakest, least_dbm = index, _power_dbm(t.rows[row], s, origin_mm)
+    return weakest
 
 
-def is_full(anchors: Collection[int]) -> bool:
-    """Whether another anchor can only be used instead of one of these."""
-    return len(anchors) >= MAX_ANCHORS_IN_USE
+def _power_dbm(n: Neighbour, s: State, origin_mm: Integers) -> float:
+    """The mean power of an anchor or, where the radio reports none, a nominal one at its distance."""
+    if n.has_power:
+        return n.power_dbm
+    total = 0.0
+    for axis in range(s.dim):
+        total += square(place_m(n, origin_mm, axis) - s.x[axis])
+    return NOMINAL_POWER_DBM - _DB_PER_LOG * log(max(sqrt(total), 0.1))
 
 
-def _nominal_dbm(range_m: float) -> float:
-    return NOMINAL_POWER_DBM - 20.0 * math.log10(max(range_m, 0.1))
+def place_m(n: Neighbour, origin_mm: Integers, axis: int) -> float:
+    """A coordinate of an anchor from the origin."""
+    return (n.place.position_mm[axis] - origin_mm[axis]) / MM_PER_M

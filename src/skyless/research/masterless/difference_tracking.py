@@ -16,6 +16,7 @@ from skyless.core.constants import TICK_RATE_HZ
 from skyless.core.estimator.estimator import Estimator
 from skyless.core.estimator.process import ACCEPTED
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
+from skyless.core.estimator.state import at
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.native.sizes import MAX_ANCHORS
@@ -163,10 +164,10 @@ class DifferenceTracking:
             self.reason = NoFixReason.NOT_CONVERGED
             self._stop()
             return False
-        if state.P[0][0] + state.P[1][1] > TUNING.most_horizontal_std_m**2:
+        if state.P[at(0, 0)] + state.P[at(1, 1)] > TUNING.most_horizontal_std_m**2:
             self.reason = NoFixReason.ACQUIRING
             return False
-        if dim == 3 and state.P[2][2] > TUNING.most_horizontal_std_m**2:
+        if dim == 3 and state.P[at(2, 2)] > TUNING.most_horizontal_std_m**2:
             self.reason = NoFixReason.BAD_GEOMETRY
             return False
         return True

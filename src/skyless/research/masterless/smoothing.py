@@ -22,6 +22,7 @@ from skyless.core.constants import TICK_S
 from skyless.core.estimator.compiled import find_anchor
 from skyless.core.estimator.kalman import is_stationary, range_error_decay
 from skyless.core.estimator.settings import TUNING
+from skyless.core.estimator.state import covariances
 from skyless.core.fix import POSITION, VELOCITY, Fix
 from skyless.core.native.views import view
 from skyless.research.masterless.difference_tracking import DifferenceTracking
@@ -117,7 +118,7 @@ class _States:
         ])  # fmt: skip
         x, P = np.zeros(len(self._prior)), np.diag(self._prior)
         x[here] = view(s.x)[there]
-        P[np.ix_(here, here)] = view(s.P)[np.ix_(there, there)]
+        P[np.ix_(here, here)] = covariances(s)[np.ix_(there, there)]
         return x, P
 
 

@@ -20,8 +20,7 @@ from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.core.estimator.compiled import add_anchor, process_known
 from skyless.core.estimator.settings import EstimatorSettings
-from skyless.core.estimator.state import State, new_state
-from skyless.core.native.views import view
+from skyless.core.estimator.state import State, covariances, new_state
 
 # What is known before the first frame, almost nothing: 30 m, 33 µs, ±10 ppm.
 POSITION_STD_M: Final = 30.0
@@ -228,7 +227,7 @@ def _frame_bound(
             newest[sender] = frame
 
     newest, present = [0] * n, State.from_buffer_copy(s)
-    all_of_it, P, P_present = memoryview(s).cast("B"), view(s.P)[:dim, :dim], view(present.P)[:dim, :dim]
+    all_of_it, P, P_present = memoryview(s).cast("B"), covariances(s)[:dim, :dim], covariances(present)[:dim, :dim]
     for frame in range(len(path)):
         if not at_once and frame % n == 0:  # without what anchors whose turn is earlier relay in the next superframe
             memoryview(present).cast("B")[:] = all_of_it
@@ -254,7 +253,7 @@ def _prior(anchors: Array, settings: BoundSettings, biases: Biases) -> State:
     for row, position_m in enumerate(anchors):
         add_anchor(s, row, position_m, -1.0, False)
     s.rows = 0  # nothing is asked of faults
-    dim, where, P = s.dim, s.layout, view(s.P)
+    dim, where, P = s.dim, s.layout, covariances(s)
     for first, std in ((0, POSITION_STD_M), (where.velocity, settings.speed_std_mps)):
         P[first : first + dim, first : first + dim] = std**2 * np.eye(dim)
     shared = 1.0 + np.diag([0.0] + [1.0] * (n - 1))

@@ -10,7 +10,7 @@ from skyless.core.arrays import Integers, Matrix, Vector
 from skyless.core.constants import TICK_S
 from skyless.core.estimator.compiled import add_anchor, find_steady_state, find_walked
 from skyless.core.estimator.settings import EstimatorSettings
-from skyless.core.estimator.state import State, new_state
+from skyless.core.estimator.state import State, at, new_state
 from skyless.core.estimator.steady_state import PlannedMessage, PlannedRelay, SteadyState
 from skyless.core.native.sizes import MAX_ANCHORS
 from skyless.core.native.views import records, view
@@ -104,7 +104,7 @@ def _state_at(
     s = new_state(settings)
     s.status.walk_scale, s.status.has_phases = 1.0, has_phases
     for axis in range(2 * s.dim):
-        s.P[axis][axis] = _START_VARIANCE
+        s.P[at(axis, axis)] = _START_VARIANCE
     for row in in_view.tolist():
         add_anchor(s, row, anchors_m[row], -1.0, False)
     view(s.x)[: s.dim] = point[: s.dim]

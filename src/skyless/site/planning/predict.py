@@ -15,11 +15,11 @@ from skyless.core.arrays import Matrix, Vector
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.geometry import anchor_positions
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS
+from skyless.core.native.sizes import MAX_ANCHORS_IN_USE
 from skyless.core.protocol1.snapshots import SnapshotMethod
 from skyless.core.protocols import superframe_s
 from skyless.core.site import Site
 from skyless.core.tag.factory import estimator_settings
-from skyless.core.tag.selection import MAX_ANCHORS_IN_USE
 from skyless.site.channel import ChannelModel, pack_walls
 from skyless.site.planning._snapshot_sigma import fill_snapshot_sigma, rounds_of
 from skyless.site.planning.anchor_clocks import AnchorClocks, Relays, anchor_clocks, relays_of, row_of_master

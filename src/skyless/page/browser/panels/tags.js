@@ -174,7 +174,7 @@ function describe(name, { track, style: look }) {
       alert?.short ?? DASH,
       duration(age_s(track), 1),
       duration(health?.latency_p50_s),
-      health?.method ?? DASH,
+      health ? methodWords(health) : DASH,
     ],
   };
 }
@@ -300,14 +300,19 @@ function fixFacts(track) {
   };
 }
 
+/** How positions are computed, and where that is not the tag's program. */
+function methodWords({ method, on_board }) {
+  return on_board ? `${method}, on its board${state.simulated ? " (emulated)" : ""}` : method;
+}
+
 function healthFacts(health) {
-  const { updates_per_s, first_fix_s, latency_p50_s, latency_p99_s, method, counters, cpu, memory_bytes } = health;
+  const { updates_per_s, first_fix_s, latency_p50_s, latency_p99_s, counters, cpu, memory_bytes } = health;
   const dropped = Object.entries(counters).filter(([, count]) => count);
   return {
     Rate: number(updates_per_s, 0, "Hz"),
     "Time to first fix": first_fix_s == null ? null : duration(first_fix_s),
     Latency: latency_p50_s == null ? null : `${duration(latency_p50_s)}, p99 ${duration(latency_p99_s)}`,
-    Method: method,
+    Method: methodWords(health),
     "Carrier phases": health.carrier_phase_anchors?.length ? `of anchors ${health.carrier_phase_anchors.join(", ")}` : null,
     "Not accepted": faultWords(health.faults),
     Clock: clockWords(health),

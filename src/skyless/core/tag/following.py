@@ -1,0 +1,278 @@
+"""A tag from its first packet on: it looks for a start, follows its course, and begins again where it is lost.
+
+The filter's state and the search for a start are not used at the same time, so that a board may keep both in the same
+memory (``SHARES_MEMORY``): a filter begins with copies of what was found.
+"""
+
+from typing import Annotated, Final
+
+from skyless.core.constants import TICK_S
+from skyless.core.estimator.process import Packet, Relays, process, take_relays
+from skyless.core.estimator.state import AXES, State, at, restart
+from skyless.core.estimator.verdicts import horizontal_variance_m2
+from skyless.core.fix import POSITION, PROTECTED_ROWS, PROTECTION, VELOCITY
+from skyless.core.integrity import STATE, UNAVAILABLE
+from skyless.core.native.arithmetic import sqrt, square
+from skyless.core.native.records import Array, Bytes, Reals, Record, Ticks, record
+from skyless.core.native.sizes import MAX_ANCHORS
+from skyless.core.tag.acquisition import (
+    ACQUIRING,
+    TOO_FEW_ANCHORS,
+    Acquisition,
+    HeardPacket,
+    Start,
+    try_start,
+)
+from skyless.core.tag.course import (
+    BAD_GEOMETRY,
+    LOST,
+    NOBODY,
+    OUTLIER,
+    START_CONTRADICTED,
+    Course,
+    is_surely_in_reach,
+    process_in_course,
+    settle,
+    use_anchor,
+)
+from skyless.core.tag.position import FOUND, IMPOSSIBLE, MIRROR, RESIDUALS, UNSETTLED
+from skyless.core.tag.problem import LARGEST
+from skyless.core.ticks import FixTime, fix_time_ticks
+
+START_FIX, SEARCHING, HAS_TOO_FEW, IS_MIRRORED, IS_UNSETTLED = range(25, 30)
+"""What becomes of a packet besides (``course.py``): a fix that is a start's alone (``Course.alone``), or why there is
+no start yet."""
+
+MAX_BEGINNING: Final = 2 * MAX_ANCHORS
+
+
+@record
+class Beginning(Record):
+    """What a filter begins with."""
+
+    start: Start
+    count: int
+    packets: Annotated[Array[HeardPacket], MAX_BEGINNING]
+    """In the order of their receptions."""
+
+
+def begin_course(c: Course, q: Acquisition) -> None:
+    """Begin with the settings in ``c``: nothing has been received."""
+    c.in_use_s = max(c.tuning.short_silence_s, 1.5 * c.superframe_s)
+    c.open_range_errors = c.is_open = c.start_was_contradicted = False
+    c.relays_may_contradict = c.may_begin_again = c.is_starting = True
+    c.heights_rejected = c.count = 0
+    c.master_less_tag_ticks = c.started_ticks = c.newest_ticks = c.checked_ticks = 0
+    c.late_share = c.extent_m = 0.0
+    c.misfit = NOBODY
+    c.changes += 1
+    _begin_search(c, q)
+
+
+def begin_again(c: Course, s: State, q: Acquisition) -> None:
+    """Give up the filter, but for what it knows of late packets."""
+    c.late_share = s.status.late_share
+    _begin_search(c, q)
+
+
+def _begin_search(c: Course, q: Acquisition) -> None:
+    """Look for a start, without anything that was received before."""
+    settings, tuning = c.settings, c.tuning
+    c.is_starting = True
+    q.tuning = tuning
+    q.knows_height, q.height_m = c.dim < AXES, settings.height_m if c.dim < AXES else 0.0
+    q.has_bounds = settings.lowest_m > -LARGEST or settings.highest_m < LARGEST
+    q.low_m, q.high_m = settings.lowest_m, settings.highest_m
+    q.variance_m2 = settings.tx_variance_m2 + settings.rx_variance_m2
+    q.max_age_s = max(tuning.start_age_s, 2.5 * c.superframe_s)
+    q.speed_std_mps = settings.start_speed_std_mps
+    q.error_variance_m2 = square(settings.range_std_m) + square(settings.survey_std_m)
+    q.count = q.link_count = q.rival_count = 0
+    q.has_been_wide = q.is_contradicted = False
+
+
+def follow(
+    c: Course,
+    s: State,
+    q: Acquisition,
+    time: FixTime,
+    packet: Packet,
+    relays: Relays,
+    packed: Bytes,
+    packed_bytes: int,
+) -> int:
+    """Process a packet with more relays, as frames carry them; what becomes of it."""
+    rx_ticks = packet.rx_ticks
+    if not c.is_starting and not is_surely_in_reach(c, rx_ticks) and _is_out_of_reach(c, s, rx_ticks):
+        begin_again(c, s, q)
+    if not c.is_starting:
+        outcome = process_in_course(c, s, time, packet, relays, packed, packed_bytes)
+        if outcome in (LOST, START_CONTRADICTED):
+            begin_again(c, s, q)
+        return outcome
+    take_relays(packet, relays, packed, packed_bytes)
+    found = try_start(q, packet, relays)
+    if found != FOUND:
+        return _outcome_of(found)
+    if q.start.is_contradicted and not q.start.has_misfit and _was_late_often(c):
+        return OUTLIER  # single packets are late: others will not be
+    if c.superframe_s > c.tuning.longest_superframe_s:
+        _fill_alone(c, q)
+        c.time_ticks = fix_time_ticks(time, rx_ticks + c.master_less_tag_ticks, rx_ticks)
+        return START_FIX
+    return settle(c, s, time, rx_ticks) if _begin_filter(c, s, q, relays) else SEARCHING
+
+
+def _outcome_of(found: int) -> int:
+    if found in (RESIDUALS, IMPOSSIBLE):
+        return OUTLIER
+    if found == TOO_FEW_ANCHORS:
+        return HAS_TOO_FEW
+    if found == MIRROR:
+        return IS_MIRRORED
+    if found == UNSETTLED:
+        return IS_UNSETTLED
+    return SEARCHING if found == ACQUIRING else BAD_GEOMETRY
+
+
+def _was_late_often(c: Course) -> bool:
+    return c.late_share > c.tuning.late_often_share
+
+
+# Whether a filter can go on
+
+
+def _is_out_of_reach(c: Course, s: State, rx_ticks: Ticks) -> bool:
+    """Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back."""
+    tuning, silent_s = c.tuning, (rx_ticks - c.newest_ticks) * TICK_S
+    if silent_s < -tuning.short_silence_s or silent_s > tuning.longest_silence_s:
+        return True
+    if silent_s < tuning.short_silence_s:
+        return False
+    part = tuning.curved_std if c.superframe_s < tuning.slow_superframe_s else tuning.slow_curved_std
+    return sqrt(horizontal_variance_m2(s, silent_s)) > part * _mean_range_m(c, s.x)
+
+
+def _mean_range_m(c: Course, position_m: Reals) -> float:
+    """From a position to the anchors in use."""
+    total_m = 0.0
+    for index in range(c.count):
+        total_m += _distance_m(c, c.used[index].position_m, position_m)
+    return total_m / max(c.count, 1)
+
+
+def _distance_m(c: Course, one_m: Reals, other_m: Reals) -> float:
+    """Of two points, where the height is given a horizontal one."""
+    total = 0.0
+    for axis in range(c.dim):
+        total += square(one_m[axis] - other_m[axis])
+    return sqrt(total)
+
+
+# From a start on
+
+
+def _use_only(c: Course, q: Acquisition) -> None:
+    """Use the anchors of a start and no others."""
+    c.count, c.extent_m = 0, 0.0
+    for index in range(q.start.count):
+        newest = q.heard[q.start.used[index]].newer.packet
+        use_anchor(c, newest.place, newest.rx_ticks)
+
+
+def _fill_alone(c: Course, q: Acquisition) -> None:
+    """Write what a start knows by itself: a position, and of the velocity that it is a tag's; no protection level."""
+    _use_only(c, q)
+    for row in range(PROTECTED_ROWS):
+        for axis in range(AXES):
+            c.alone[row][axis] = 0.0
+    for axis in range(c.dim):
+        c.alone[POSITION][axis] = q.start.position_m[axis]
+        for other in range(c.dim):
+            c.alone[POSITION + 1 + axis][other] = q.start.covariance_m2[axis][other]
+        c.alone[VELOCITY + 1 + axis][axis] = square(c.settings.start_speed_std_mps)
+    if c.dim < AXES:
+        c.alone[POSITION][2] = c.settings.height_m
+    c.alone[PROTECTION][STATE] = UNAVAILABLE
+
+
+def _begin_filter(c: Course, s: State, q: Acquisition, relays: Relays) -> bool:
+    """Begin at the start's position, and process the packets that led there.
+
+    False where anchors that are late may have moved it by more than their distance: it says nothing then.
+    """
+    b = Beginning()
+    b.start = q.start
+    start, tuning = b.start, c.tuning
+    _choose_packets(c, q, b)
+    is_contradicted = start.is_contradicted and not _was_late_often(c)
+    is_open = c.open_range_errors or (is_contradicted and not start.has_misfit)
+    inflation = tuning.start_margin
+    if is_open or is_contradicted:
+        inflation = 1.0 + square(tuning.late_std_m) / (q.variance_m2 + q.error_variance_m2)
+    begin_ticks, speed_m2ps2 = b.packets[0].packet.rx_ticks, square(c.settings.start_speed_std_mps)
+    moved_m2 = square((start.rx_ticks_tag - begin_ticks) * TICK_S) * speed_m2ps2
+    _use_only(c, q)
+    horizontal_m2 = (
+        inflation * start.covariance_m2[0][0] + moved_m2 + (inflation * start.covariance_m2[1][1] + moved_m2)
+    )
+    if horizontal_m2 > square(_mean_range_m(c, start.position_m)):
+        return False
+    c.is_starting = False
+    c.newest_ticks = c.started_ticks = b.packets[b.count - 1].packet.rx_ticks
+    c.is_open, c.start_was_contradicted = is_open, is_open or is_contradicted
+    c.misfit = start.misfit if is_contradicted and start.has_misfit else NOBODY
+    s.settings, s.tuning = c.settings, tuning
+    s.dim, s.horizontal_k, s.vertical_k = c.dim, c.horizontal_k, c.vertical_k
+    restart(
+        s, begin_ticks, c.late_share, tuning.late_std_m if c.start_was_contradicted else tuning.lasting_std_m, is_open
+    )
+    for axis in range(c.dim):
+        s.x[axis] = start.position_m[axis]
+        for other in range(c.dim):
+            s.P[at(axis, other)] = inflation * start.covariance_m2[axis][other] + (moved_m2 if axis == other else 0.0)
+        s.P[at(c.dim + axis, c.dim + axis)] = speed_m2ps2
+    for index in range(b.count):
+        one = b.packets[index]
+        one.packet.place.is_open = one.packet.place.anchor == c.misfit
+        relays.count = one.relay_count
+        for relayed in range(one.relay_count):
+            relays.rows[relayed] = one.relays[relayed]
+        process(s, one.packet, relays)
+    return True
+
+
+def _choose_packets(c: Course, q: Acquisition, b: Beginning) -> None:
+    """Copy the last packets of each anchor with which to begin."""
+    for place in range(q.count):
+        if _is_chosen(c, q, place):
+            _insert_packet(b, q.heard[place].newer)
+    for place in range(q.count):
+        if q.heard[place].count > 1 and _is_chosen(c, q, place):
+            _insert_packet(b, q.heard[place].older)
+
+
+def _insert_packet(b: Beginning, one: HeardPacket) -> None:
+    """Add a packet behind those that were received before it."""
+    place = b.count
+    while place > 0 and b.packets[place - 1].packet.rx_ticks > one.packet.rx_ticks:
+        b.packets[place] = b.packets[place - 1]
+        place -= 1
+    b.packets[place] = one
+    b.count += 1
+
+
+def _is_chosen(c: Course, q: Acquisition, place: int) -> bool:
+    """Whether a filter begins with an anchor, given its place in the table of those that are heard."""
+    start = q.start
+    if c.most_anchors == 0 or (start.has_misfit and q.heard[place].newer.packet.place.anchor == start.misfit):
+        return True
+    own_m = _distance_m(c, q.heard[place].newer.packet.place.position_m, start.position_m)
+    is_used, nearer = False, 0
+    for index in range(start.count):
+        range_m = _distance_m(c, q.heard[start.used[index]].newer.packet.place.position_m, start.position_m)
+        if start.used[index] == place:
+            is_used = True
+        elif range_m < own_m or (range_m == own_m and not is_used):
+            nearer += 1
+    return is_used and nearer < c.most_anchors

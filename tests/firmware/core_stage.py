@@ -1,0 +1,61 @@
+"""The estimator on the emulated chip: calls of the image that ``make -C firmware core`` builds."""
+
+import ctypes
+
+from emulator.build import build
+from emulator.processor.cortex_m4 import RAM_BASE, Core, functions_of, load_elf, objects_of
+from emulator.processor.cycles import spent_at
+
+_SYSTEM_CONTROL = (0xE000E000, 0x1000)
+_FLASH_CONTROL = (0x4001E000, 0x1000)
+_CPACR, _ICACHECNF = 0xE000ED88, 0x4001E540
+_FOREVER = 1 << 62
+
+
+class BoardCore:
+    """The processor with the core, one call after the other; records have the board's layout."""
+
+    def __init__(self):
+        self.elf = build("core")
+        self._at = {name: at for at, _, name in objects_of(self.elf)}
+        code = load_elf(self.elf)
+        self._stack_bytes = int.from_bytes(code[:4], "little") - RAM_BASE
+        self.processor = Core(code, [_FLASH_CONTROL, _SYSTEM_CONTROL], self._load, self._store)
+        assert self.processor.run(_FOREVER) == "sleep"
+
+    def _load(self, _address, _size):
+        return 0
+
+    def _store(self, address, _size, value):
+        if address == _CPACR:
+            self.processor.use_fpu(value >> 20 & 0xF == 0xF)
+        elif address == _ICACHECNF:
+            self.processor.use_cache(bool(value & 1))
+
+    def put_state(self, state):
+        self.processor.store(self._at["core_state"], bytes(state))
+
+    def state(self, made):
+        return made.from_buffer_copy(self.processor.load(self._at["core_state"], ctypes.sizeof(made)))
+
+    def process(self, packet, relays):
+        """What becomes of a packet, and the cycles that it takes."""
+        self.processor.store(self._at["core_packet"], bytes(packet))
+        self.processor.store(self._at["core_relays"], bytes(relays))
+        before = self.processor.cycles
+        stopped = self.processor.run(_FOREVER)
+        assert (stopped, self.processor.faults) == ("sleep", [])
+        outcome = int.from_bytes(self.processor.load(self._at["core_outcome"], 4), "little", signed=True)
+        return outcome, self.processor.cycles - before
+
+    @property
+    def stack_bytes(self):
+        """What has been used of the stack."""
+        return self._stack_bytes - self.processor.unused_stack_bytes
+
+    def cycles_by_function(self):
+        """Since they were last asked for, the most first."""
+        spent = spent_at(self.processor.state)
+        found = {name: int(spent[at // 2 : (at + size) // 2].sum()) for at, size, name in functions_of(self.elf)}
+        spent[:] = 0
+        return dict(sorted(found.items(), key=lambda one: -one[1]))
