@@ -9,7 +9,9 @@ from typing import Protocol
 
 from emulator.build import build
 from skyless.radio.dw1000 import driver
+from skyless.radio.serial.board_settings import SETTINGS_BYTES, BoardSettings, unpack
 
+KEPT_BYTES = 80
 STAGES = ("NO_FRAME", "FRAME_HELD", "FRAME_HANDED_OVER")
 
 
@@ -31,8 +33,23 @@ class Processor(driver.Bus, Protocol):
     def restart_line(self) -> None:
         """Start the line's receiver again."""
 
+    def set_rate(self, baud: int) -> None:
+        """Go on at another rate."""
+
     def show(self, lights: int) -> None:
         """Switch the lights."""
+
+    def sleep_for(self, milliseconds: int) -> None:
+        """Sleep with everything off; the clock goes on."""
+
+    def read_settings(self) -> bytes | None:
+        """The ``KEPT_BYTES`` that were written last, if there are any."""
+
+    def write_settings(self, settings: bytes) -> None:
+        """Keep them."""
+
+    def advertise(self, data: bytes) -> bool:
+        """Begin to send a Bluetooth advertisement; False while the last is on its way."""
 
 
 @cache
@@ -44,9 +61,12 @@ def library() -> ctypes.CDLL:
     """
     loaded = ctypes.CDLL(str(build("host")))
     driver.declare(loaded)
-    for name in ("host_board_chip", "host_writer_line", "host_reader_record"):
+    for name in ("host_board_chip", "host_board_settings", "host_writer_line", "host_reader_record"):
         getattr(loaded, name).restype = ctypes.c_void_p
     loaded.link_number.restype = ctypes.c_uint64
+    loaded.host_board_unix_us.restype = ctypes.c_int64
+    for name in ("settings_check", "settings_unpack", "fix_is_due"):
+        getattr(loaded, name).restype = ctypes.c_bool
     return loaded
 
 
@@ -59,7 +79,12 @@ class Hardware(driver.Hardware):
         ("read_line", ctypes.CFUNCTYPE(ctypes.c_uint32, ctypes.c_void_p, ctypes.c_uint32)),
         ("write_line", ctypes.CFUNCTYPE(ctypes.c_bool, ctypes.c_void_p, ctypes.c_uint32)),
         ("restart_line", ctypes.CFUNCTYPE(None)),
+        ("set_rate", ctypes.CFUNCTYPE(None, ctypes.c_uint32)),
         ("show", ctypes.CFUNCTYPE(None, ctypes.c_uint32)),
+        ("sleep_for", ctypes.CFUNCTYPE(None, ctypes.c_uint32)),
+        ("read_settings", ctypes.CFUNCTYPE(ctypes.c_bool, ctypes.c_void_p)),
+        ("write_settings", ctypes.CFUNCTYPE(None, ctypes.c_void_p)),
+        ("advertise", ctypes.CFUNCTYPE(ctypes.c_bool, ctypes.c_void_p, ctypes.c_uint32)),
     )
 
     def __init__(self, processor: Processor) -> None:
@@ -70,13 +95,22 @@ class Hardware(driver.Hardware):
             ctypes.memmove(into, data, len(data))
             return len(data)
 
+        def read_settings(into: int) -> bool:
+            found = self.call(processor.read_settings)
+            if isinstance(found, bytes):
+                ctypes.memmove(into, found, KEPT_BYTES)
+            return isinstance(found, bytes)
+
         self.connect(
             now_us=lambda: self.call(processor.now_us) & 0xFFFF_FFFF,
             read_line=read_line,
             write_line=lambda line, size: self.call(processor.write_line, ctypes.string_at(line, size)),
+            read_settings=read_settings,
+            write_settings=lambda at: self.call(processor.write_settings, ctypes.string_at(at, KEPT_BYTES)),
+            advertise=lambda at, size: self.call(processor.advertise, ctypes.string_at(at, size)),
             **{
                 name: partial(self.call, getattr(processor, name))
-                for name in ("interrupt_line", "restart_line", "show")
+                for name in ("interrupt_line", "restart_line", "set_rate", "show", "sleep_for")
             },
         )
 
@@ -105,6 +139,18 @@ class CBoard:
     def stage(self) -> str:
         """What became of the frame that the host wants to be sent."""
         return STAGES[self._library.host_board_stage(self._board)]
+
+    @property
+    def settings(self) -> BoardSettings | None:
+        """What it works with as a tag."""
+        packed = ctypes.create_string_buffer(SETTINGS_BYTES)
+        self._library.settings_pack(ctypes.c_void_p(self._library.host_board_settings(self._board)), packed)
+        return unpack(packed.raw)
+
+    @property
+    def unix_us(self) -> int:
+        """The time that its host has given."""
+        return int(self._library.host_board_unix_us(self._board))
 
     def begin(self) -> None:
         """``board_begin``: send HELLO."""

@@ -13,10 +13,10 @@ _HAS_MAKE = shutil.which("make") is not None
 HAS_HOST_COMPILER = _HAS_MAKE and shutil.which(os.environ.get("HOST_CC", "gcc")) is not None
 HAS_ARM_COMPILER = _HAS_MAKE and shutil.which(os.environ.get("CROSS", "arm-none-eabi-") + "gcc") is not None
 
-_RESULTS = {"all": "skyless-dwm1001.elf", "host": "libskyless-board.so", "fuzz": "fuzz"}
+_RESULTS = {"all": "skyless-dwm1001.elf", "core": "core.elf", "host": "libskyless-board.so", "fuzz": "fuzz"}
 
 
-def build(target: Literal["all", "host", "fuzz"]) -> Path:
+def build(target: Literal["all", "core", "host", "fuzz"]) -> Path:
     """Bring a target of the Makefile up to date; where it is.
 
     Raises:

@@ -2,51 +2,25 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#include "bluetooth.h"
 #include "board.h"
+#include "clock.h"
+#include "flash.h"
 #include "hardware.h"
 #include "nrf52832.h"
 #include "pins.h"
 #include "serial_port.h"
 #include "startup.h"
 
-#define WATCHDOG_PERIODS (2u * 32768u) /* 2 s; no turn lasts longer than 30 ms, no sleep longer than 0.6 s */
+#define WATCHDOG_PERIODS (2u * 32768u) /* 2 s; no turn lasts longer than 30 ms, no sleep between turns than 0.6 s */
 #define RESET_LOW_US 100u /* the chip needs some ns (DW1000 data sheet, RSTn) */
+#define SELECTED_US 600u  /* longer than the 500 that wake it (UM 2.3) */
 #define PULL_UP_US 20u    /* 13 kOhm load a wire of 100 pF in some us */
 #define FAULT_CAUSE 0x80u /* in HELLO: a fault that the firmware noticed */
 /* Shorter sleeps are waited for: the compare value must still lie ahead when it is written. */
 #define SHORTEST_SLEEP_US 4u
 
 static struct board board; /* in RAM, as the DMA needs its buffers */
-
-/* Time */
-
-static uint32_t now_us(void)
-{
-    TIMER0_CAPTURE1 = 1u;
-    return TIMER0_CC1;
-}
-
-static void pause_us(uint32_t microseconds)
-{
-    uint32_t begin_us = now_us();
-
-    while ((now_us() - begin_us) <= microseconds) {
-    }
-}
-
-static void start_clocks(void)
-{
-    NVMC_ICACHECNF = 1u;
-    CLOCK_HFCLKSTARTED = 0u;
-    CLOCK_HFCLKSTART = 1u; /* the crystal, for the serial line's rate */
-    while (CLOCK_HFCLKSTARTED == 0u) {
-    }
-    TIMER0_BITMODE = TIMER_32_BITS;
-    TIMER0_PRESCALER = TIMER_1_MHZ;
-    TIMER0_INTENSET = TIMER0_INT_COMPARE0;
-    NVIC_ISER0 = 1u << TIMER0_IRQ;
-    TIMER0_START = 1u;
-}
 
 static void start_watchdog(void)
 {
@@ -82,7 +56,7 @@ static void reset_chip(void)
 {
     GPIO_OUTCLR = 1u << PIN_CHIP_RESET;
     GPIO_DIRSET = 1u << PIN_CHIP_RESET;
-    pause_us(RESET_LOW_US);
+    clock_pause_us(RESET_LOW_US);
     GPIO_DIRCLR = 1u << PIN_CHIP_RESET; /* the chip pulls it up */
 }
 
@@ -91,7 +65,22 @@ static bool interrupt_line(void)
     return (GPIO_IN & (1u << PIN_CHIP_IRQ)) != 0u;
 }
 
-static void start_chip_pins(void)
+static void connect_chip(void)
+{
+    GPIOTE_CONFIG0 = GPIOTE_RISING_ON(PIN_CHIP_IRQ);
+    SPIM_ENABLE = SPIM_ENABLED;
+}
+
+/* Chip select low wakes a chip that sleeps from before a restart of the processor; its reset pin does not. It is ready
+ * when the host asks for it. */
+static void wake_chip(void)
+{
+    GPIO_OUTCLR = 1u << PIN_CHIP_SELECT;
+    clock_pause_us(SELECTED_US);
+    GPIO_OUTSET = 1u << PIN_CHIP_SELECT;
+}
+
+static void start_chip_pins(bool may_sleep)
 {
     GPIO_OUTSET = 1u << PIN_CHIP_SELECT;
     GPIO_PIN_CNF(PIN_CHIP_SELECT) = PIN_OUTPUT;
@@ -105,10 +94,12 @@ static void start_chip_pins(void)
     SPIM_PSEL_MISO = PIN_CHIP_MISO;
     SPIM_CONFIG = 0u; /* mode 0, most significant bit first */
     set_spi_fast(false);
-    SPIM_ENABLE = SPIM_ENABLED;
-    GPIOTE_CONFIG0 = GPIOTE_RISING_ON(PIN_CHIP_IRQ);
+    connect_chip();
     GPIOTE_INTENSET = 1u;
     NVIC_ISER0 = 1u << GPIOTE_IRQ;
+    if (may_sleep) {
+        wake_chip();
+    }
     reset_chip(); /* a frame that waits in it from before a restart of the processor is not sent */
 }
 
@@ -153,7 +144,7 @@ static bool can_transmit(void)
     bool is_high;
 
     GPIO_PIN_CNF(PIN_ROLE) = PIN_INPUT_PULL_UP;
-    pause_us(PULL_UP_US);
+    clock_pause_us(PULL_UP_US);
     is_high = (GPIO_IN & (1u << PIN_ROLE)) != 0u;
     GPIO_PIN_CNF(PIN_ROLE) = PIN_DISCONNECTED; /* a pull-up to ground draws current */
     return is_high;
@@ -185,32 +176,53 @@ static void prepare_sleep(void)
  * that came since they were cleared have left their interrupts pending, so that the sleep ends at once. */
 static void sleep_us(uint32_t microseconds)
 {
-    TIMER0_CC0 = now_us() + microseconds;
     GPIO_OUTCLR = 1u << PIN_AWAKE;
-    __asm volatile("dsb\n\twfi" ::: "memory");
+    clock_sleep_us(microseconds);
     GPIO_OUTSET = 1u << PIN_AWAKE;
 }
 
 static void clear_events(void)
 {
     GPIOTE_IN0 = 0u;
-    TIMER0_COMPARE0 = 0u;
     UARTE_RXDRDY = 0u;
+    TIMER0_COMPARE0 = 0u;
     (void)TIMER0_COMPARE0; /* the writes have arrived before the interrupts are cleared (PS 15) */
-    NVIC_ICPR0 = (1u << UARTE_IRQ) | (1u << GPIOTE_IRQ) | (1u << TIMER0_IRQ);
+    NVIC_ICPR0 = (1u << RADIO_IRQ) | (1u << UARTE_IRQ) | (1u << GPIOTE_IRQ) | (1u << TIMER0_IRQ);
+}
+
+/* Sleep with everything off but RAM and the slow clock. An input that is watched, the serial line's receiver, and what
+ * counts would keep the fast clock on. */
+static void sleep_for(uint32_t milliseconds)
+{
+    while (bluetooth_pump()) {
+    }
+    serial_port_stop();
+    GPIOTE_CONFIG0 = 0u;
+    SPIM_ENABLE = 0u;
+    clear_events();
+    GPIO_OUTCLR = 1u << PIN_AWAKE;
+    clock_sleep_ms(milliseconds);
+    GPIO_OUTSET = 1u << PIN_AWAKE;
+    connect_chip();
+    serial_port_start();
 }
 
 static const struct hardware HARDWARE = {
     .transfer = transfer,
     .set_spi_fast = set_spi_fast,
     .reset_chip = reset_chip,
-    .pause_us = pause_us,
-    .now_us = now_us,
+    .pause_us = clock_pause_us,
+    .now_us = clock_now_us,
     .interrupt_line = interrupt_line,
     .read_line = serial_port_read,
     .write_line = serial_port_write,
     .restart_line = serial_port_restart,
+    .set_rate = serial_port_set_rate,
     .show = show,
+    .sleep_for = sleep_for,
+    .read_settings = flash_read,
+    .write_settings = flash_write,
+    .advertise = bluetooth_advertise,
 };
 
 int main(void)
@@ -221,10 +233,10 @@ int main(void)
     start_watchdog();
     start_lights();
     show(LIGHT_FAULT); /* until the crystal runs; if it never does the watchdog starts all again */
-    start_clocks();
+    clock_start();
     show(0u);
     prepare_sleep();
-    start_chip_pins();
+    start_chip_pins(identity.reset_cause != 0u);
     for (uint32_t at = 0u; at < sizeof identity.device_id; at++) {
         identity.device_id[at] = (uint8_t)(FICR_DEVICEID[at / 4u] >> (8u * (at % 4u)));
     }
@@ -236,6 +248,7 @@ int main(void)
         uint32_t idle_us;
 
         WDT_RR0 = WDT_RELOAD;
+        (void)bluetooth_pump();
         clear_events();
         serial_port_pump();
         idle_us = board_turn(&board);

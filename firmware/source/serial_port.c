@@ -9,6 +9,7 @@
 #define OUT_BYTES 1024u /* eight receptions with 100 bytes: 10 ms of the line */
 #define WAIT_TURNS 2000u /* loops of some 0.1 us: longer than the five bytes that a receiver needs to stop */
 
+static uint32_t rate = UARTE_1_MBAUD;
 static uint8_t in_ring[IN_BYTES];
 static uint32_t in_at;
 static uint32_t in_count; /* bytes read since the receiver's start */
@@ -30,6 +31,29 @@ static void start_receiver(void)
     UARTE_STARTRX = 1u;
 }
 
+void serial_port_set_rate(uint32_t baud)
+{
+    serial_port_stop();
+    switch (baud) {
+    case 115200u:
+        rate = UARTE_115200_BAUD;
+        break;
+    case 230400u:
+        rate = UARTE_230400_BAUD;
+        break;
+    case 460800u:
+        rate = UARTE_460800_BAUD;
+        break;
+    case 921600u:
+        rate = UARTE_921600_BAUD;
+        break;
+    default:
+        rate = UARTE_1_MBAUD;
+        break;
+    }
+    serial_port_start();
+}
+
 void serial_port_start(void)
 {
     GPIO_OUTSET = 1u << PIN_UART_TX;
@@ -39,7 +63,7 @@ void serial_port_start(void)
     UARTE_PSEL_CTS = NOT_CONNECTED;
     UARTE_PSEL_TXD = PIN_UART_TX;
     UARTE_PSEL_RXD = PIN_UART_RX;
-    UARTE_BAUDRATE = UARTE_1_MBAUD;
+    UARTE_BAUDRATE = rate;
     UARTE_CONFIG = 0u;
     UARTE_ENABLE = UARTE_ENABLED;
     TIMER1_MODE = TIMER_COUNTS;
@@ -60,7 +84,7 @@ static void wait_for(const volatile uint32_t *event)
 
 /* A receiver that stops keeps up to four bytes more (PS 35), which TIMER1 has counted. They are flushed, or the next
  * start would put them before the bytes that are counted then, and all that comes would be read four bytes late. */
-void serial_port_restart(void)
+static void stop_receiver(void)
 {
     UARTE_SHORTS = 0u;
     UARTE_RXTO = 0u;
@@ -69,7 +93,27 @@ void serial_port_restart(void)
     UARTE_ENDRX = 0u;
     UARTE_FLUSHRX = 1u;
     wait_for(&UARTE_ENDRX);
+}
+
+void serial_port_restart(void)
+{
+    stop_receiver();
     start_receiver();
+}
+
+void serial_port_stop(void)
+{
+    while (out_held > 0u) {
+        serial_port_pump();
+    }
+    stop_receiver();
+    UARTE_TXSTOPPED = 0u;
+    UARTE_STOPTX = 1u;
+    wait_for(&UARTE_TXSTOPPED);
+    UARTE_ENDTX = 0u; /* a transmitter that stops may report an end (PS 35) */
+    UARTE_ENABLE = 0u;
+    TIMER1_STOP = 1u;
+    TIMER1_SHUTDOWN = 1u; /* anomaly 78 */
 }
 
 uint32_t serial_port_read(uint8_t *into, uint32_t size)

@@ -7,6 +7,12 @@
 
 void serial_port_start(void);
 
+/* Send what is queued, and go on at another rate. */
+void serial_port_set_rate(uint32_t baud);
+
+/* Send what is queued, then switch the port off until the next start; what comes is lost. */
+void serial_port_stop(void);
+
 /* Bytes that have come, at most `size`; how many. Those that were overwritten are missing, which the link's check shows. */
 uint32_t serial_port_read(uint8_t *into, uint32_t size);
 

@@ -287,6 +287,9 @@ static void run(void)
 #ifdef CACHED
     NVMC_ICACHECNF = 1u;
 #endif
+#ifdef FPU
+    SCB_CPACR |= CPACR_FPU;
+#endif
     start_timer();
     sleep_us(100u);
     __asm volatile("ldr r0, =" COUNT "\n\t"
@@ -296,7 +299,7 @@ static void run(void)
                    ".balign 16\n"
                    "1: " BODY "\n\t"
                    "subs r0, r0, #1\n\t"
-                   "bne 1b\n\t" ::: "r0", "r1", "r2", "r3", "r4", "r5", "cc", "memory");
+                   "bne 1b\n\t" ::: "r0", "r1", "r2", "r3", "r4", "r5", "s0", "s1", "s2", "s3", "s4", "cc", "memory");
     sleep_for_good();
 }
 #elif PROGRAM == SILENT

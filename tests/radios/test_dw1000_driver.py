@@ -144,7 +144,7 @@ def test_the_chip_is_started_slowly_and_configured_fast():
     assert bus.content(0x0F)[:5] == b"\x02\0\0\0\0"
     bus.take()
     chip.receive()
-    assert bus.log == [*FORGET_ALL, *LISTEN_AGAIN]
+    assert bus.log == ["w 84 00120000", *FORGET_ALL, *LISTEN_AGAIN]
 
 
 def test_what_the_maker_measured_is_read_from_otp_and_used():
@@ -219,7 +219,7 @@ def test_a_frame_is_read_whole_before_the_receiver_goes_on(listening):
         script_frame(bus, bytes(range(size)))
         assert chip.poll() == dw1000.RECEIVED
         assert bus.take() == [
-            "r 0f 5", "r 10 4", f"r 11 {size}", "r 15 9", "r 12 8", "r 6728 6", "w 8f 006f000000", "w 8d 0001",
+            "r 0f 5", "r 6728 6", "r 10 4", f"r 11 {size}", "r 15 9", "r 12 8", "w 8f 006f000000", "w 8d 0001",
         ]  # fmt: skip
         assert (chip.rx_ticks, chip.frame) == (0xFF12FFFFFE, bytes(range(size)))
         assert (chip.received, chip.errors, chip.state) == (received, 0, dw1000.LISTENING)

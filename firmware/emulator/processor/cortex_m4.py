@@ -43,6 +43,7 @@ _FORCED: Final = 1 << 30
 _INSTRUCTION_BUS_ERROR: Final = 1 << 8
 _PRECISE_BUS_ERROR: Final = 1 << 9 | 1 << 15
 _UNDEFINED_INSTRUCTION: Final = 1 << 16
+_NO_COPROCESSOR: Final = 1 << 19
 
 Stop = Literal["limit", "sleep", "lockup"]
 Read = Callable[[int, int], int]
@@ -91,6 +92,10 @@ class Core:
         """Switch the instruction cache."""
         self.state[c.CACHE_ON] = int(on)
         c.forget_fetched(self.state)
+
+    def use_fpu(self, on: bool) -> None:
+        """Switch the floating-point unit, without which its instructions are a fault."""
+        self.state[c.FPU] = c.FPU_ON if on else c.FPU_OFF
 
     # Registers and memory
 
@@ -143,8 +148,9 @@ class Core:
         """What the engine calls."""
         uc = self._uc = Uc(UC_ARCH_ARM, UC_MODE_THUMB | UC_MODE_MCLASS)
         uc.ctl_set_cpu_model(arm.UC_CPU_ARM_CORTEX_M4)
-        uc.mem_map(0, FLASH_BYTES, UC_PROT_READ | UC_PROT_EXEC)
-        uc.mem_write(0, self._code + b"\xff" * (FLASH_BYTES - len(self._code)))
+        flash_bytes = min(FLASH_BYTES, *(base for base, _ in self._windows))
+        uc.mem_map(0, flash_bytes, UC_PROT_READ | UC_PROT_EXEC)
+        uc.mem_write(0, self._code + b"\xff" * (flash_bytes - len(self._code)))
         uc.mem_map_ptr(RAM_BASE, RAM_BYTES, UC_PROT_ALL, ctypes.addressof(self.ram))
         for base, size in self._windows:
             self._map_window(base, size)
@@ -161,6 +167,7 @@ class Core:
         self._next = start & ~1
         self.state[c.BLOCK_END] = -1
         self.use_cache(False)
+        self.use_fpu(False)
 
     def _map_window(self, base: int, size: int) -> None:
         def load(offset: int, width: int) -> int:
@@ -197,7 +204,7 @@ class Core:
             if self._error is not None:
                 failed, self._error = self._error, None
                 raise failed
-            if error is not None or self._exception is not None:
+            if error is not None or self._exception is not None or self.state[c.FPU] == c.FPU_REFUSED:
                 if not self._enter_fault(error):
                     return "lockup"
             elif self._next == self.state[c.BLOCK_END] and self._code[self._next - 2 : self._next] == _WFI:
@@ -215,10 +222,14 @@ class Core:
     def _enter_fault(self, error: UcError | None) -> bool:
         """Record the fault and enter the HardFault handler; False where the processor locks up."""
         at, invalid = self._next, self._invalid
-        what = self._exception or str(error)
+        is_refused = self.state[c.FPU] == c.FPU_REFUSED
+        what = self._exception or ("the floating-point unit is off" if is_refused else str(error))
         self._exception = self._invalid = None
         self.hfsr |= _FORCED
-        if invalid is None:
+        if is_refused:
+            self.cfsr |= _NO_COPROCESSOR
+            self.use_fpu(False)
+        elif invalid is None:
             self.cfsr |= _UNDEFINED_INSTRUCTION
         elif invalid[0] == UC_MEM_FETCH_UNMAPPED:
             self.cfsr |= _INSTRUCTION_BUS_ERROR
@@ -275,6 +286,19 @@ def functions_of(path: Path) -> list[tuple[int, int, str]]:
     Raises:
         EmulationError: it is not an executable for this processor.
     """
+    return [(address & ~1, size, name) for address, size, name in _symbols_of(path, _FUNCTION)]
+
+
+def objects_of(path: Path) -> list[tuple[int, int, str]]:
+    """The same of every variable.
+
+    Raises:
+        EmulationError: it is not an executable for this processor.
+    """
+    return _symbols_of(path, _OBJECT)
+
+
+def _symbols_of(path: Path, wanted: int) -> list[tuple[int, int, str]]:
     data = _read_elf(path)
     found: set[tuple[int, int, str]] = set()
     table, width, count = (struct.unpack_from("<" + kind, data, at)[0] for kind, at in _SECTION_HEADERS)
@@ -285,12 +309,14 @@ def functions_of(path: Path) -> list[tuple[int, int, str]]:
         names = sections[link][4]
         for at in range(offset, offset + size, 16):
             name, address, length, info = struct.unpack_from("<IIIB", data, at)
-            if info & 15 == 2 and length:
+            if info & 15 == wanted and length:
                 end = data.index(b"\0", names + name)
-                found.add((address & ~1, length, data[names + name : end].decode()))
+                found.add((address, length, data[names + name : end].decode()))
     return sorted(found)
 
 
+_OBJECT: Final = 1
+_FUNCTION: Final = 2
 _PROGRAM_HEADERS: Final = (("I", 28), ("H", 42), ("H", 44))
 _SECTION_HEADERS: Final = (("I", 32), ("H", 46), ("H", 48))
 """Type and offset of the tables' address, entry size and count in an ELF file's header."""

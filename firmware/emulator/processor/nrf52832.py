@@ -16,13 +16,14 @@ from msgspec import Struct
 
 from emulator.processor import peripherals as p
 from emulator.processor.cortex_m4 import Core, EmulationError, functions_of, load_elf
-from emulator.processor.cycles import CYCLES, spent_at
+from emulator.processor.cycles import CPU_HZ, CYCLES, spent_at
 from emulator.processor.paths import PathCost, Paths
-from emulator.processor.processors import TICKS_PER_CYCLE, Processors
+from emulator.processor.processors import MIN_TICKS, TICKS_PER_CYCLE, Processors
+from emulator.processor.radio import OnAir, Radio
 from emulator.processor.serial_peripherals import Spim, Uarte
 from skyless.core.constants import TICK_S
 from skyless.sim.dw1000.chip import Chip
-from skyless.sim.dw1000.registers import SYS_STATUS
+from skyless.sim.dw1000.registers import SYS_CTRL, SYS_STATUS
 from skyless.sim.medium import Timeline
 
 WAKE_UP_CYCLES: Final = 3 * 64
@@ -37,6 +38,7 @@ LED_PINS: Final = {"D9": 30, "D10": 31, "D11": 22, "D12": 14}
 """By the names that are printed on a DWM1001-DEV."""
 
 _WINDOWS: Final = [
+    (p.FlashPage.base, 0x1000),
     (0x10000000, 0x1000),
     (0x40000000, 0x20000),
     (0x50000000, 0x1000),
@@ -51,6 +53,7 @@ _COUNT_OF_BYTES: Final = 0x40009040
 _WATCHDOG_FED: Final = 0x40010600
 _READS_STATUS: Final = bytes((SYS_STATUS.file,))
 """Header of the transaction with which the firmware asks what has happened."""
+_COMMANDS: Final = bytes((0x80 | SYS_CTRL.file,))
 
 
 class Latency(Struct, frozen=True):
@@ -102,7 +105,10 @@ class Image:
         self._executing = self._asleep = self._holds_chip = False
         self._asleep_since = self._slept_cycles = 0
         self._life = 0
+        self.advertised: list[OnAir] = []
+        """What has left the Bluetooth antenna."""
         self.core = Core(load_elf(elf), _WINDOWS, self._read, self._write)
+        self.settings = p.FlashPage(self, self.core.spend)
         self._start(cause=0, watchdog=None)
 
     # What the site sees
@@ -151,6 +157,19 @@ class Image:
         return self._asleep
 
     @property
+    def drawing(self) -> frozenset[str]:
+        """What keeps a sleeping processor from drawing a few µA only."""
+        draws = {
+            "crystal": self._clock.crystal_cycles < 1 << 62,
+            "timer": any(timer.draws_current for timer in self._timers),
+            "uarte": self._uarte.registers[0x500] != 0,
+            "spim": self._spim.registers[0x500] != 0,
+            "gpiote": any(self._gpiote.registers.values()),
+            "radio": self.radio.is_busy,
+        }
+        return frozenset(name for name, draw in draws.items() if draw)
+
+    @property
     def busy_share(self) -> float:
         """Share of the time since the first start in which the processor was awake, waits for transfers included."""
         passed = max(self._cycle_at(self._timeline.now_ticks), 1)
@@ -187,19 +206,25 @@ class Image:
         self._reset_asked = False
         self._clock = p.Clock(self, cause)
         self._timers = [p.Timer(self, number) for number in range(3)]
+        self._counters: list[p.Timer | p.Rtc] = [*self._timers, p.Rtc(self)]
         self._gpio = p.Gpio(self, self._level, self._on_output)
         self._gpiote = p.Gpiote(self)
         self._watchdog = watchdog or p.Watchdog(self)
         self._ppi = p.Ppi(self)
-        self._nvmc = p.Nvmc(self, self.core.use_cache)
-        self._nvic = p.Nvic(self, lambda: (self.core.hfsr, self.core.cfsr, self.core.bfar), self._ask_for_reset)
+        self.settings.is_writable = False
+        self._nvmc = p.Nvmc(self, self.core.use_cache, self.settings)
+        status = lambda: (self.core.hfsr, self.core.cfsr, self.core.bfar)  # noqa: E731
+        self._nvic = p.Nvic(self, status, self._ask_for_reset, self.core.use_fpu)
         self._uarte = Uarte(self, self._send)
         self._spim = Spim(self, self)
+        self.radio = Radio(self, lambda: self._clock.crystal_cycles <= self.cycles, self.advertised.append)
         self._pages: dict[int, p.Peripheral] = {
             one.base >> 12: one
             for one in (
                 self._clock,
-                *self._timers,
+                *self._counters,
+                self.radio,
+                self.settings,
                 self._gpio,
                 self._gpiote,
                 self._watchdog,
@@ -212,7 +237,7 @@ class Image:
                 p.Revision(self),
             )
         }
-        self._selected = False
+        self._selected, self._selected_cycles = False, 0
         if self._holds_chip:
             self._chip.pull_reset()
         self._holds_chip = False
@@ -279,7 +304,7 @@ class Image:
         while self.core.cycles < limit:
             if self._stalled_until is not None:
                 if self._spim.end_cycles is not None:
-                    return max(self._ticks_at(self._spim.end_cycles), until_ticks)
+                    return max(self._ticks_at(self._spim.end_cycles) + 1, self._timeline.now_ticks + MIN_TICKS)
                 self._end_stall()
             stop = self._execute(min(limit, self._watchdog.due_cycles))
             if self._after(stop):
@@ -317,7 +342,7 @@ class Image:
         return False
 
     def _sleep_until(self) -> int | None:
-        due = min(self._watchdog.due_cycles, *(timer.due_cycles for timer in self._timers))
+        due = min(self._watchdog.due_cycles, *(counter.due_cycles for counter in self._counters))
         return self._ticks_at(max(due, self._asleep_since)) if due < 1 << 62 else None
 
     def _wake(self) -> int:
@@ -339,8 +364,8 @@ class Image:
     def _update_timers(self) -> None:
         """Up to the processor's present."""
         self._executing = True
-        for timer in self._timers:
-            timer.update()
+        for counter in self._counters:
+            counter.update()
         self._executing = False
 
     # What the peripherals see
@@ -422,6 +447,9 @@ class Image:
         selected = gpio.is_driven(SELECT_PIN, high=False)
         if selected != self._selected:
             self._selected = selected
+            if not selected and not self._holds_chip:
+                self._chip.select((self.cycles - self._selected_cycles) / CPU_HZ)
+            self._selected_cycles = self.cycles
             self._spim.select(selected)
         if gpio.is_driven(RESET_PIN, high=True):
             self.misuse["chip-reset-driven-high"] += 1
@@ -441,6 +469,9 @@ class Image:
             return bytes(len(out))
         answer = self._chip.transfer(out, hz)
         self._sample_interrupt()
+        left_ticks = self._chip.transceiver.window_left_ticks
+        if out[:1] == _COMMANDS and left_ticks is not None:  # the chip's crystal may be slower than true time
+            self._timeline.at(self._timeline.now_ticks + left_ticks + (left_ticks >> 13), self._sample_interrupt)
         return answer
 
     def _sample_interrupt(self) -> None:

@@ -1,8 +1,8 @@
 """Peripherals of the nRF52832 without those that move data: registers as in its product specification (v1.4).
 
 Each has its tasks, events and plain registers by offset; whatever the firmware uses besides is an ``EmulationError``.
-Not modelled: start-up times except those of the clocks, power consumption, flash writes, pins as the processor's
-analogue or debug functions, and timers' events in counter mode.
+Not modelled: start-up times except those of the clocks, power consumption, flash writes outside the last page, pins as
+the processor's analogue or debug functions, and timers' events in counter mode.
 """
 
 from collections import Counter
@@ -13,8 +13,12 @@ from typing import Final, Protocol
 from emulator.processor.cortex_m4 import EmulationError
 
 HFCLK_START_CYCLES: Final = 64 * 360
-LFCLK_START_CYCLES: Final = 64 * 600
-"""Start-up times of the crystal and of the RC oscillator, as the specification gives them."""
+LFCLK_START_CYCLES: Final = 64 * 250_000
+"""Start-up times of the fast and of the slow crystal, as the specification gives them."""
+
+ERASE_CYCLES: Final = 64 * 85_000
+WRITE_CYCLES: Final = 64 * 41
+"""For which the processor stands still, of a page and of a word; the specification's longest."""
 
 RESET_BY_PIN: Final = 1 << 0
 RESET_WATCHDOG: Final = 1 << 1
@@ -130,6 +134,8 @@ class Clock(Peripheral):
         super().__init__(system)
         self.registers[0x400] = cause
         self._ready = {0x100: _NEVER, 0x104: _NEVER}
+        self.crystal_cycles = _NEVER
+        """When the fast crystal is stable."""
 
     def make_tasks(self) -> dict[int, Callable[[], None]]:
         """Both clocks; CONSTLAT, with which the latency stays the one assumed."""
@@ -151,7 +157,7 @@ class Clock(Peripheral):
 
     def start_hfclk(self) -> None:
         """Start the crystal."""
-        self._ready[0x100] = self.system.cycles + HFCLK_START_CYCLES
+        self._ready[0x100] = self.crystal_cycles = self.system.cycles + HFCLK_START_CYCLES
 
     def start_lfclk(self) -> None:
         """Start the slow clock."""
@@ -159,7 +165,7 @@ class Clock(Peripheral):
 
     def stop_hfclk(self) -> None:
         """Go on with the internal oscillator."""
-        self._ready[0x100] = _NEVER
+        self._ready[0x100] = self.crystal_cycles = _NEVER
 
     def stop_lfclk(self) -> None:
         """Stop the slow clock."""
@@ -190,18 +196,20 @@ class Timer(Peripheral):
         super().__init__(system)
         self.registers[0x510] = 4
         self._step_cycles, self._mask, self._counts_events = 64, 0xFFFF, False
+        self.draws_current = False
         self._counted = 0
         """Count when the timer was started or stopped last, or of events."""
         self._started_cycles: int | None = None
         self._next_match = [_NEVER] * 4
 
     def make_tasks(self) -> dict[int, Callable[[], None]]:
-        """START, STOP, COUNT, CLEAR, CAPTURE."""
+        """START, STOP, COUNT, CLEAR, SHUTDOWN, CAPTURE."""
         tasks: dict[int, Callable[[], None]] = {
             0x000: self.start,
             0x004: self.stop,
             0x008: self.count,
             0x00C: self.clear,
+            0x010: self.shut_down,
         }
         return tasks | {0x040 + 4 * n: partial(self.capture, n) for n in range(4)}
 
@@ -224,6 +232,7 @@ class Timer(Peripheral):
 
     def start(self) -> None:
         """Start."""
+        self.draws_current = True
         if self._started_cycles is None:
             self._started_cycles = self.system.cycles
         self._foresee_all()
@@ -243,6 +252,11 @@ class Timer(Peripheral):
         self._counted = 0
         if self._started_cycles is not None:
             self._started_cycles = self.system.cycles
+        self._foresee_all()
+
+    def shut_down(self) -> None:
+        """Stop, at 0, and draw no current any more (anomaly 78)."""
+        self._counted, self._started_cycles, self.draws_current = 0, None, False
         self._foresee_all()
 
     def capture(self, n: int) -> None:
@@ -293,6 +307,59 @@ class Timer(Peripheral):
         if offset in self.event_bits:
             self.update()
         return super().read(offset)
+
+
+class Rtc(Peripheral):
+    """RTC1 without a prescaler, on an ideal slow clock: one comparison; it counts from 0 whenever it is started."""
+
+    base = 0x40011000
+    irq = 17
+    _MASK = 0xFFFFFF
+
+    def __init__(self, system: System) -> None:
+        super().__init__(system)
+        self._zero: int | None = None
+        """Period of 1/32768 s at which the count was 0."""
+        self.due_cycles = _NEVER
+
+    def make_tasks(self) -> dict[int, Callable[[], None]]:
+        """START, STOP; CLEAR of one that is stopped."""
+        return {0x000: self.start, 0x004: self.stop, 0x008: lambda: None}
+
+    def event_offsets(self) -> tuple[int, ...]:
+        """COMPARE0."""
+        return (0x140,)
+
+    def register_offsets(self) -> tuple[int, ...]:
+        """CC0."""
+        return (0x540,)
+
+    def start(self) -> None:
+        """Count from 0."""
+        self._zero = self.system.cycles * 32_768 // 64_000_000
+
+    def stop(self) -> None:
+        """Stop."""
+        self._zero, self.due_cycles = None, _NEVER
+
+    def read(self, offset: int) -> int:
+        """A load; COUNTER."""
+        if offset != 0x504:
+            return super().read(offset)
+        return 0 if self._zero is None else self.system.cycles * 32_768 // 64_000_000 - self._zero & self._MASK
+
+    def write(self, offset: int, value: int) -> None:
+        """A store; a comparison less than two periods ahead may be missed, so it is."""
+        super().write(offset, value)
+        if offset == 0x540 and self._zero is not None:
+            ahead = (value - self.read(0x504) - 2 & self._MASK) + 2
+            self.due_cycles = -(-(self.system.cycles * 32_768 // 64_000_000 + ahead) * 64_000_000 // 32_768)
+
+    def update(self) -> None:
+        """Raise the event of a count that has been reached."""
+        if self.due_cycles <= self.system.cycles:
+            self.due_cycles = _NEVER
+            self.happen(0x140)
 
 
 class Gpio(Peripheral):
@@ -488,36 +555,67 @@ class Ppi(Peripheral):
 
 
 class Nvmc(Peripheral):
-    """The flash's controller: only the cache."""
+    """The flash's controller: the cache, and erasing the page of settings."""
 
     base = 0x4001E000
 
-    def __init__(self, system: System, use_cache: Callable[[bool], None]) -> None:
+    def __init__(self, system: System, use_cache: Callable[[bool], None], page: "FlashPage") -> None:
         super().__init__(system)
         self.registers[0x400] = 1
-        self._use_cache = use_cache
+        self._use_cache, self._page = use_cache, page
 
     def register_offsets(self) -> tuple[int, ...]:
-        """READY, ICACHECNF."""
-        return 0x400, 0x540
+        """READY, CONFIG, ICACHECNF."""
+        return 0x400, 0x504, 0x540
+
+    def write(self, offset: int, value: int) -> None:
+        """A store; ERASEPAGE."""
+        if offset == 0x508:
+            self._page.erase(value, enabled=self.registers[0x504] == 2)
+        elif offset == 0x400:
+            raise self.unknown(offset)
+        else:
+            super().write(offset, value)
+            self._page.is_writable = self.registers[0x504] == 1
+        if offset == 0x540:
+            self._use_cache(bool(value & 1))
+
+
+class FlashPage(Peripheral):
+    """The last page of the flash, for settings; it outlives resets. Writing clears bits."""
+
+    base = 0x7F000
+
+    def __init__(self, system: System, wait: Callable[[int], None]) -> None:
+        super().__init__(system)
+        self.is_writable = False
+        self._wait = wait
+        self.registers = dict.fromkeys(range(0, 0x1000, 4), 0xFFFFFFFF)
+
+    def erase(self, address: int, *, enabled: bool) -> None:
+        """Set all bits."""
+        if address != self.base or not enabled:
+            raise EmulationError(f"the page at 0x{address:08x} is erased, which is not the settings', or not enabled")
+        self._wait(ERASE_CYCLES)
+        self.registers = dict.fromkeys(self.registers, 0xFFFFFFFF)
 
     def write(self, offset: int, value: int) -> None:
         """A store."""
-        if offset != 0x540:
-            raise self.unknown(offset)
-        super().write(offset, value)
-        self._use_cache(bool(value & 1))
+        if not self.is_writable:
+            raise EmulationError(f"flash is written at 0x{self.base + offset:08x}, which NVMC does not allow now")
+        self._wait(WRITE_CYCLES)
+        self.registers[offset] &= value
 
 
 class Ficr(Peripheral):
-    """Factory information: the device identifier, low word first, and the value for anomaly 108."""
+    """Factory information: the device's identifier and Bluetooth address, low words first; what anomaly 108 needs."""
 
     base = 0x10000000
 
     def __init__(self, system: System, identity: bytes) -> None:
         super().__init__(system)
         self.registers = {0x060 + 4 * n: int.from_bytes(identity[4 * n : 4 * n + 4], "little") for n in range(2)}
-        self.registers[0x258] = 0xFFFFFF00 | KEEP_RAM
+        self.registers |= {0x0A4: 0x89ABCDEF, 0x0A8: 0xFFFF0123, 0x258: 0xFFFFFF00 | KEEP_RAM}
 
     def write(self, offset: int, value: int) -> None:  # noqa: ARG002
         """A store, which hardware has not."""
@@ -544,15 +642,19 @@ class Nvic(Peripheral):
     base = 0xE000E000
 
     def __init__(
-        self, system: System, fault_status: Callable[[], tuple[int, int, int]], reset: Callable[[], None]
+        self,
+        system: System,
+        fault_status: Callable[[], tuple[int, int, int]],
+        reset: Callable[[], None],
+        use_fpu: Callable[[bool], None],
     ) -> None:
         super().__init__(system)
         self.enabled = self.pending = self.asserted = 0
-        self._fault_status, self._reset = fault_status, reset
+        self._fault_status, self._reset, self._use_fpu = fault_status, reset, use_fpu
 
     def register_offsets(self) -> tuple[int, ...]:
-        """Priorities of interrupts and exceptions, VTOR, SCR, CCR, SHCSR, CPACR: kept, without effect."""
-        return *range(0x400, 0x428, 4), 0xD08, 0xD10, 0xD14, 0xD18, 0xD1C, 0xD20, 0xD24, 0xD88
+        """Priorities of interrupts and exceptions, VTOR, SCR, CCR, SHCSR, FPCCR: kept, without effect; and CPACR."""
+        return *range(0x400, 0x428, 4), 0xD08, 0xD10, 0xD14, 0xD18, 0xD1C, 0xD20, 0xD24, 0xD88, 0xF34
 
     @property
     def wakes(self) -> bool:
@@ -591,5 +693,8 @@ class Nvic(Peripheral):
         elif offset == 0xD0C:
             if value >> 16 == 0x05FA and value & 4:
                 self._reset()
+        elif offset == 0xD88:
+            super().write(offset, value)
+            self._use_fpu(value >> 20 & 0xF == 0xF)
         elif offset not in {0xD28, 0xD2C}:  # flags that ones clear; nothing reads them again
             super().write(offset, value)

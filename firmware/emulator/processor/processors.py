@@ -16,7 +16,7 @@ from skyless.sim.medium import Timeline
 
 TICKS_PER_CYCLE: Final = TICK_RATE_HZ / CPU_HZ
 SLICE_TICKS: Final = round(2000 * TICKS_PER_CYCLE)
-_MIN_TICKS: Final = round(TICKS_PER_CYCLE) + 1
+MIN_TICKS: Final = round(TICKS_PER_CYCLE) + 1
 """A processor runs at least so far, lest several events at one instant stop time."""
 
 
@@ -26,8 +26,8 @@ class Processor(Protocol):
     def advance(self, due_ticks: int, until_ticks: int) -> int | None:
         """Run from when it is due up to a true time; when to run it again.
 
-        Not before ``until_ticks``, unless it has just been woken or has planned an event; None while it sleeps until
-        something happens.
+        Not before ``until_ticks``, unless it has just been woken, or waits for an event that it has planned: then not
+        before ``MIN_TICKS`` from now. None while it sleeps until something happens.
         """
 
 
@@ -86,4 +86,4 @@ class Processors:
         """The timeline's next event, where it comes before a horizon."""
         if self._timeline.next_ticks is not None:
             horizon = min(horizon, self._timeline.next_ticks)
-        return max(horizon, self._timeline.now_ticks + _MIN_TICKS)
+        return max(horizon, self._timeline.now_ticks + MIN_TICKS)

@@ -12,6 +12,7 @@ import contextlib
 import random
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Final, Literal, Protocol
 
 import numpy as np
@@ -115,6 +116,7 @@ class SiteNode:
         self.delays = delays
         self.air = SiteAir(medium, number)
         self.chip = SiteChip(self.air, delays.tx_ticks, delays.rx_ticks, self.air.now_s)
+        self.chip.on_wake = partial(medium.switch_on, number)
         self.at_antenna: dict[tuple[bytes, int], float] = {}
         """Frames that the antenna got while it was not sending, by their bytes and stamps: when each ended, in s."""
         self.board: Board | None = None
@@ -240,7 +242,7 @@ class EmulatedSite:
         if part != "processor":
             self.medium.switch_off(node.air.node)
             self.medium.switch_on(node.air.node)
-            node.chip.pull_reset()
+            node.chip.power_cycle()
         if part != "chip":
             assert node.board is not None
             node.board.power_cycle()

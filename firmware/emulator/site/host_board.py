@@ -41,6 +41,7 @@ class HostBoard:
         self.chip = chip
         self._can_transmit, self._identity = can_transmit, identity
         self.lights = 0
+        self.settings: bytes | None = None
         self._timeline, self._send = timeline, send
         self._start()
 
@@ -97,6 +98,9 @@ class HostBoard:
         self.process.sleep(_TRANSFER_S + 8 * len(out) / self._hz)
         answer = self.chip.transfer(out, self._hz)
         self.notify()
+        left_ticks = self.chip.transceiver.window_left_ticks
+        if left_ticks is not None:
+            self._timeline.at(self._timeline.now_ticks + left_ticks + (left_ticks >> 13), self.notify)
         return answer
 
     def set_spi_fast(self, fast: bool) -> None:
@@ -118,6 +122,23 @@ class HostBoard:
     def show(self, lights: int) -> None:
         """Switch the lights."""
         self.lights = lights
+
+    def sleep_for(self, milliseconds: int) -> None:
+        """Sleep; what comes on the UART is lost."""
+        self.process.sleep(1e-3 * milliseconds)
+        self._came.clear()
+
+    def read_settings(self) -> bytes | None:
+        """What was written last; it outlives power failures."""
+        return self.settings
+
+    def write_settings(self, settings: bytes) -> None:
+        """Keep settings."""
+        self.settings = settings
+
+    def advertise(self, data: bytes) -> bool:
+        """No Bluetooth here."""
+        return bool(data)
 
     def wait_s(self, seconds: float) -> None:
         """Wait, at most until the interrupt line rises or bytes come."""
@@ -144,6 +165,9 @@ class HostBoard:
         """The bytes have left the pin, unless the supply failed meanwhile."""
         if sender is self.process:
             self._send(data)
+
+    def set_rate(self, baud: int) -> None:
+        """All rates are alike here."""
 
     def restart_line(self) -> None:
         """Discard all that has come."""

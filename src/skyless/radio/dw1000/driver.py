@@ -25,6 +25,7 @@ OFF: Final = 0
 IDLE: Final = 1
 LISTENING: Final = 2
 SENDING: Final = 3
+AWAITING: Final = 4
 """States."""
 
 RECEIVED: Final = 1
@@ -32,15 +33,16 @@ SENT: Final = 2
 FAILED: Final = 4
 CLOCK_SLIPPED: Final = 8
 LOST: Final = 16
+NOTHING: Final = 32
 """Results of ``poll``: a frame was received, ours was sent; a reception failed; the clock's PLL was losing lock (stamps
-around that time are unreliable); the chip does not answer or was reset."""
+around that time are unreliable); the chip does not answer or was reset; no frame came in the window."""
 
 QUEUED: Final = 0
 LATE: Final = 1
 BUSY: Final = 2
 NOT_READY: Final = 3
-"""Results of ``transmit_at``: the frame will be sent at its time; or nothing is sent, because it was too late, another
-frame waits, or the chip is OFF."""
+"""Results of ``transmit_at`` and ``receive_at``: it will happen at its time; or not, as it was too late, the radio is
+busy, or the chip is OFF."""
 
 NOT_MEASURED: Final = -32768
 """A measured value that is missing."""
@@ -92,10 +94,11 @@ def declare(loaded: ctypes.CDLL) -> None:
     for name in ("log10", "accumulated", "power_cdbm", "first_path_cdbm", "carrier_offset_ppb", "micros_until"):
         getattr(loaded, f"dw1000_{name}").restype = ctypes.c_int32
     loaded.dw1000_angle.restype = ctypes.c_uint32
-    for name in ("start", "cancel", "check", "measure"):
+    for name in ("start", "wake", "cancel", "check", "measure"):
         getattr(loaded, f"dw1000_{name}").restype = ctypes.c_bool
     loaded.dw1000_now.restype = ctypes.c_uint64
     loaded.dw1000_micros_until.argtypes = (ctypes.c_uint64, ctypes.c_uint64)
+    loaded.dw1000_receive_at.argtypes = (ctypes.c_void_p, ctypes.c_uint64, ctypes.c_uint32)
     loaded.dw1000_transmit_at.argtypes = (ctypes.c_void_p, ctypes.c_uint64, ctypes.c_char_p, ctypes.c_uint32)
 
 
@@ -187,11 +190,13 @@ class DW1000(ctypes.Structure):
 
     Until the next ``poll``, what was received is in ``rx_ticks``, ``frame``, ``rx_power_cdbm``, ``first_path_cdbm``,
     ``offset_ppb`` and ``phase``: that of the carrier in 2**-16 turns if ``reads_phases`` is set, or NO_PHASE. The stamp
-    of what was SENT is in ``tx_ticks``. ``errors`` are failed receptions of any kind.
+    of what was SENT is in ``tx_ticks``. ``errors`` are failed receptions of any kind. ``uses_both_buffers``, set before
+    the start of a radio that only listens, has the receiver on while a frame is read.
     """
 
     state: int
     reads_phases: bool
+    uses_both_buffers: bool
     received: int
     errors: int
     sent: int
@@ -209,6 +214,7 @@ class DW1000(ctypes.Structure):
         ("state", ctypes.c_int),
         ("_is_listening", ctypes.c_bool),
         ("reads_phases", ctypes.c_bool),
+        ("uses_both_buffers", ctypes.c_bool),
         *((name, ctypes.c_uint32) for name in ("received", "errors", "sent", "late")),
         ("rx_ticks", ctypes.c_uint64),
         ("_frame", ctypes.c_void_p),
@@ -256,6 +262,22 @@ class DW1000(ctypes.Structure):
     def receive(self) -> None:
         """Listen from now on; a frame that waits to be sent is sent before."""
         self._call("receive")
+
+    def idle(self) -> None:
+        """Turn the receiver off; a frame that waits to be sent is sent before."""
+        self._call("idle")
+
+    def receive_at(self, ticks: int, window: int) -> int:
+        """Listen for one frame from ``ticks`` of the counter on, for ``window`` · 65536 ticks; QUEUED, or why not."""
+        return self._call("receive_at", ticks, window)
+
+    def sleep(self) -> None:
+        """Let the chip sleep: it is OFF until ``wake``."""
+        self._call("sleep")
+
+    def wake(self, tx_delay_ticks: int, rx_delay_ticks: int) -> bool:
+        """Wake and configure a chip that sleeps; False where none answers."""
+        return bool(self._call("wake", tx_delay_ticks, rx_delay_ticks))
 
     def transmit_at(self, dx_ticks: int, frame: bytes) -> int:
         """Send a PSDU when the counter is at ``dx_ticks``; QUEUED, or why not.

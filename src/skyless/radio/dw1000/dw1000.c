@@ -15,7 +15,6 @@ struct setting {
 
 /* Channel 5, PRF 64 MHz, 6.8 Mbit/s, preamble of 128 symbols with code 9. */
 static const struct setting CONFIGURATION[] = {
-    {0x04u, 0x0000u, 4u, 0x00001200u}, /* SYS_CFG: IRQ high, smart power; no second buffer, filter, RXAUTR (7.2.6) */
     {0x1Fu, 0x0000u, 4u, CHAN_CTRL},
     {0x08u, 0x0000u, 4u, TX_FCTRL},
     {0x23u, 0x0004u, 2u, 0x889Bu},     /* AGC_TUNE1 (UM 7.2.36, Table 24) */
@@ -322,17 +321,14 @@ void dw1000_init(struct dw1000 *chip, const struct hardware *hardware)
     chip->temperature_cc = DW1000_NOT_MEASURED;
 }
 
-bool dw1000_start(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t rx_antenna_delay)
+static void write_config(struct dw1000 *chip, uint32_t more)
 {
-    chip->state = DW1000_OFF;
-    chip->is_listening = false;
-    chip->hardware->set_spi_fast(false);
-    chip->hardware->reset_chip();
-    chip->hardware->pause_us(RESET_US);
-    if (!is_there(chip)) {
-        return false;
-    }
-    soft_reset(chip);
+    write_register(chip, 0x04u, 0u, 4u, HIRQ_POL | (chip->uses_both_buffers ? 0u : DIS_DRXB) | more);
+}
+
+/* Configure a chip whose registers are as after a reset. */
+static bool configure(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t rx_antenna_delay)
+{
     calibrate(chip);
     load_microcode(chip);
     if (!lock(chip)) {
@@ -342,6 +338,7 @@ bool dw1000_start(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t rx_an
     if (!is_there(chip)) {
         return false;
     }
+    write_config(chip, 0u);
     for (uint32_t at = 0u; at < (sizeof CONFIGURATION / sizeof CONFIGURATION[0]); at++) {
         const struct setting *setting = &CONFIGURATION[at];
 
@@ -356,15 +353,65 @@ bool dw1000_start(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t rx_an
     return true;
 }
 
+bool dw1000_start(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t rx_antenna_delay)
+{
+    chip->state = DW1000_OFF;
+    chip->is_listening = false;
+    chip->hardware->set_spi_fast(false);
+    chip->hardware->reset_chip();
+    chip->hardware->pause_us(RESET_US);
+    if (!is_there(chip)) {
+        return false;
+    }
+    soft_reset(chip);
+    return configure(chip, tx_antenna_delay, rx_antenna_delay);
+}
+
+/* Sleeping */
+
+void dw1000_sleep(struct dw1000 *chip)
+{
+    if (chip->state != DW1000_OFF) {
+        off_and_clear(chip);
+        write_register(chip, 0x2Cu, 0x0Au, 1u, 0u); /* AON_CFG1: no sleep counter */
+        write_register(chip, 0x2Cu, 0x00u, 2u, 0u); /* AON_WCFG: nothing is restored; TX_ANTD would be wrong (UM p. 103) */
+        write_register(chip, 0x2Cu, 0x06u, 1u, AON_CFG0_SLEEP);
+        write_register(chip, 0x2Cu, 0x02u, 1u, 0u);
+        write_register(chip, 0x2Cu, 0x02u, 1u, AON_CTRL_SAVE);
+        chip->state = DW1000_OFF;
+        chip->is_listening = false;
+    }
+}
+
+bool dw1000_wake(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t rx_antenna_delay)
+{
+    chip->hardware->set_spi_fast(false);
+    (void)read_into(chip, chip->frame_into, 0x11u, 0u, WAKE_OCTETS);
+    chip->hardware->pause_us(RESET_US);
+    return is_there(chip) && configure(chip, tx_antenna_delay, rx_antenna_delay);
+}
+
 /* Running */
 
-/* Listen, or be IDLE, after the receiver was turned off, perhaps in the middle of a frame: it must be reset then, or the
- * next stamp may be wrong (UM 4.1.6, pp. 34-35). */
+/* Make ready a receiver that was turned off, perhaps in the middle of a frame: it must be reset then, or the next stamp
+ * may be wrong (UM 4.1.6, pp. 34-35). Of two buffers the host looks at the one that will be filled (UM 4.3.2, p. 37). */
+static void reset_receiver(struct dw1000 *chip)
+{
+    write_register(chip, 0x36u, 3u, 1u, 0xE0u);
+    write_register(chip, 0x36u, 3u, 1u, 0xF0u);
+    if (chip->uses_both_buffers) {
+        read_status(chip);
+        if (((chip->status & BUFFER_POINTERS) != 0u) && ((chip->status & BUFFER_POINTERS) != BUFFER_POINTERS)) {
+            write_register(chip, 0x0Du, 3u, 1u, HRBPT);
+        }
+    }
+}
+
+/* Listen, or be IDLE, after the receiver was turned off. */
 static void listen_again(struct dw1000 *chip)
 {
     if (chip->is_listening) {
-        write_register(chip, 0x36u, 3u, 1u, 0xE0u);
-        write_register(chip, 0x36u, 3u, 1u, 0xF0u);
+        reset_receiver(chip);
         write_register(chip, 0x0Du, 0u, 2u, RXENAB);
         chip->state = DW1000_LISTENING;
     } else {
@@ -382,10 +429,43 @@ void dw1000_receive(struct dw1000 *chip)
 {
     if (chip->state != DW1000_OFF) {
         chip->is_listening = true;
-        if (chip->state == DW1000_IDLE) {
+        if ((chip->state == DW1000_IDLE) || (chip->state == DW1000_AWAITING)) {
+            write_config(chip, 0u);
             resume(chip);
         }
     }
+}
+
+void dw1000_idle(struct dw1000 *chip)
+{
+    chip->is_listening = false;
+    if ((chip->state == DW1000_LISTENING) || (chip->state == DW1000_AWAITING)) {
+        resume(chip);
+    }
+}
+
+enum dw1000_queued dw1000_receive_at(struct dw1000 *chip, uint64_t ticks, uint32_t window)
+{
+    if (chip->state == DW1000_OFF) {
+        return DW1000_NOT_READY;
+    }
+    if (chip->state == DW1000_SENDING) {
+        return DW1000_BUSY;
+    }
+    chip->is_listening = false;
+    off_and_clear(chip);
+    reset_receiver(chip);
+    write_config(chip, RXWTOE);
+    write_register(chip, 0x0Cu, 0u, 2u, window);
+    write_register(chip, 0x0Au, 0u, 5u, ticks & ~(uint64_t)0x1FFu);
+    write_register(chip, 0x0Du, 0u, 2u, RXENAB_RXDLYE);
+    chip->state = DW1000_AWAITING;
+    read_status(chip);
+    if ((chip->status & HPDWARN) != 0u) {
+        dw1000_idle(chip);
+        return DW1000_LATE;
+    }
+    return DW1000_QUEUED;
 }
 
 bool dw1000_cancel(struct dw1000 *chip)
@@ -418,7 +498,7 @@ enum dw1000_queued dw1000_transmit_at(struct dw1000 *chip, uint64_t dx_ticks, co
     if (chip->state == DW1000_OFF) {
         return DW1000_NOT_READY;
     }
-    if (chip->state == DW1000_SENDING) {
+    if ((chip->state == DW1000_SENDING) || (chip->state == DW1000_AWAITING)) {
         return DW1000_BUSY;
     }
 
@@ -480,8 +560,7 @@ static int32_t read_phase(struct dw1000 *chip, uint32_t first_path, uint32_t noi
     return (int32_t)((dw1000_angle(x, y) - (turned << 9)) & 0xFFFFu);
 }
 
-/* Powers, carrier offset and phase (UM 4.7, 7.2.18, 7.2.20, 7.2.23, 7.2.40.11); `symbols` is RXPACC, the last two are
- * FP_INDEX and FP_AMPL1. */
+/* Powers and phase (UM 4.7, 7.2.18, 7.2.20, 7.2.23); `symbols` that were accumulated, FP_INDEX and FP_AMPL1. */
 static void read_measured(struct dw1000 *chip, uint32_t symbols, uint32_t first_path, uint32_t f1)
 {
     const uint8_t *data = read_register(chip, 0x12u, 0u, 8u);
@@ -489,26 +568,27 @@ static void read_measured(struct dw1000 *chip, uint32_t symbols, uint32_t first_
     uint32_t f2 = sixteen(&data[2]);
     uint32_t f3 = sixteen(&data[4]);
     uint32_t cir_power = sixteen(&data[6]);
-
-    data = read_register(chip, 0x27u, 0x28u, 6u);
-
-    int32_t integrator = (int32_t)(sixteen(data) | (((uint32_t)data[2] & 0x1Fu) << 16));
-    if (symbols == sixteen(&data[4])) { /* not saturated: symbols of the SFD are counted, too */
-        symbols = (symbols > SFD_ACCUMULATED) ? (symbols - SFD_ACCUMULATED) : 0u;
-    }
-
     int32_t level = dw1000_accumulated(symbols);
+
+    chip->rx_power_cdbm = dw1000_power_cdbm(cir_power, level);
+    chip->first_path_cdbm = dw1000_first_path_cdbm(f1, f2, f3, level);
+    chip->phase = chip->reads_phases ? read_phase(chip, first_path, noise) : DW1000_NO_PHASE;
+}
+
+/* Read the carrier offset (UM 7.2.40.11); RXPACC_NOSAT. */
+static uint32_t read_carrier(struct dw1000 *chip)
+{
+    const uint8_t *data = read_register(chip, 0x27u, 0x28u, 6u);
+    int32_t integrator = (int32_t)(sixteen(data) | (((uint32_t)data[2] & 0x1Fu) << 16));
 
     if (integrator >= 0x100000) {
         integrator -= 0x200000;
     }
-    chip->rx_power_cdbm = dw1000_power_cdbm(cir_power, level);
-    chip->first_path_cdbm = dw1000_first_path_cdbm(f1, f2, f3, level);
     chip->offset_ppb = dw1000_carrier_offset_ppb(integrator);
-    chip->phase = chip->reads_phases ? read_phase(chip, first_path, noise) : DW1000_NO_PHASE;
+    return sixteen(&data[4]);
 }
 
-/* Read a frame and all that was measured of it, and listen on. */
+/* Read a frame and all that was measured of it, and listen on; with a second buffer once all is read that has none. */
 static uint32_t read_frame(struct dw1000 *chip)
 {
     uint32_t tries = LDE_TRIES;
@@ -525,12 +605,22 @@ static uint32_t read_frame(struct dw1000 *chip)
         }
     }
 
+    uint32_t unsaturated = read_carrier(chip);
+    bool is_early = chip->uses_both_buffers && !chip->reads_phases && (chip->state == DW1000_LISTENING);
+
+    if (is_early) {
+        write_register(chip, 0x0Du, 0u, 2u, RXENAB);
+    }
+
     const uint8_t *info = read_register(chip, 0x10u, 0u, 4u);
     uint32_t size = (uint32_t)info[0] & 0x7Fu;
     uint32_t symbols = ((uint32_t)info[2] >> 4) | ((uint32_t)info[3] << 4);
 
     if (size < DW1000_MIN_PSDU_BYTES) {
         return recover(chip);
+    }
+    if (symbols == unsaturated) { /* symbols of the SFD are counted, too */
+        symbols = (symbols > SFD_ACCUMULATED) ? (symbols - SFD_ACCUMULATED) : 0u;
     }
     (void)read_into(chip, chip->frame_into, 0x11u, 0u, size);
 
@@ -541,7 +631,16 @@ static uint32_t read_frame(struct dw1000 *chip)
     read_measured(chip, symbols, sixteen(&time[5]), sixteen(&time[7]));
     chip->received++;
     clear_seen(chip);
-    write_register(chip, 0x0Du, 0u, 2u, RXENAB);
+    if (chip->uses_both_buffers) {
+        write_register(chip, 0x0Du, 3u, 1u, HRBPT);
+    }
+    if (chip->state == DW1000_AWAITING) {
+        chip->state = DW1000_IDLE;
+    } else if (!is_early) {
+        write_register(chip, 0x0Du, 0u, 2u, RXENAB);
+    } else {
+        /* it is on */
+    }
     return DW1000_RECEIVED;
 }
 
@@ -556,7 +655,7 @@ uint32_t dw1000_poll(struct dw1000 *chip)
 
     uint64_t seen = chip->status;
 
-    if ((((seen & CPLOCK) == 0u) || ((seen & (SLP2INIT | UNUSED)) != 0u)) && !dw1000_check(chip)) {
+    if ((((seen & CPLOCK) == 0u) || ((seen & (SLP2INIT | NO_EVENT)) != 0u)) && !dw1000_check(chip)) {
         return DW1000_LOST;
     }
     if ((seen & CLKPLL_LL) != 0u) {
@@ -567,8 +666,11 @@ uint32_t dw1000_poll(struct dw1000 *chip)
         if ((seen & TXFRS) != 0u) {
             events |= finish_sending(chip);
         }
-    } else if (chip->state == DW1000_LISTENING) {
-        if ((seen & RX_ERRORS) != 0u) {
+    } else if (chip->state != DW1000_IDLE) {
+        if ((chip->state == DW1000_AWAITING) && ((seen & RXRFTO) != 0u)) {
+            dw1000_idle(chip);
+            events |= DW1000_NOTHING;
+        } else if ((seen & RX_ERRORS) != 0u) {
             events |= recover(chip);
         } else if ((seen & RXFCG) != 0u) {
             events |= read_frame(chip);
@@ -616,7 +718,7 @@ static void convert(struct dw1000 *chip, int32_t voltage, int32_t temperature)
 
 bool dw1000_measure(struct dw1000 *chip)
 {
-    if ((chip->state == DW1000_OFF) || (chip->state == DW1000_SENDING)) {
+    if ((chip->state != DW1000_IDLE) && (chip->state != DW1000_LISTENING)) {
         return false;
     }
     off_and_clear(chip);

@@ -3,9 +3,12 @@
  * source. It has never run on a chip.
  *
  * States:
- *   OFF        nothing is known of the chip. `dw1000_start` resets and configures it, and leaves it IDLE.
- *   IDLE       the radio is off. `dw1000_receive` turns the receiver on.
+ *   OFF        nothing is known of the chip, or it sleeps. `dw1000_start` resets and configures it, `dw1000_wake` wakes
+ *              and configures it; both leave it IDLE.
+ *   IDLE       the radio is off. `dw1000_receive` turns the receiver on, `dw1000_receive_at` for a while.
  *   LISTENING  the receiver is on, and stays on: after each frame, after each error, after each transmission.
+ *   AWAITING   the receiver goes on at its time, and off with the first frame, or where none comes in its window. Ends
+ *              with DW1000_RECEIVED, DW1000_FAILED or DW1000_NOTHING from `dw1000_poll`, and IDLE.
  *   SENDING    a frame waits for its time or is on its way; the receiver is off (one DX_TIME, one transceiver), so
  *              `dw1000_transmit_at` is to be called as late as it safely can. Ends with DW1000_SENT from `dw1000_poll`,
  *              or with `dw1000_cancel`, to be called if SENT does not come within 1 ms after the frame's time.
@@ -18,7 +21,7 @@
 
 #include "hardware.h"
 
-enum dw1000_state { DW1000_OFF, DW1000_IDLE, DW1000_LISTENING, DW1000_SENDING };
+enum dw1000_state { DW1000_OFF, DW1000_IDLE, DW1000_LISTENING, DW1000_SENDING, DW1000_AWAITING };
 
 /* What `dw1000_poll` returns, as a sum. */
 #define DW1000_RECEIVED 0x01u
@@ -26,8 +29,9 @@ enum dw1000_state { DW1000_OFF, DW1000_IDLE, DW1000_LISTENING, DW1000_SENDING };
 #define DW1000_FAILED 0x04u
 #define DW1000_CLOCK_SLIPPED 0x08u
 #define DW1000_LOST 0x10u
+#define DW1000_NOTHING 0x20u
 
-/* What `dw1000_transmit_at` returns; the reasons have the link's numbers. */
+/* What `dw1000_transmit_at` and `dw1000_receive_at` return; the reasons have the link's numbers. */
 enum dw1000_queued { DW1000_QUEUED = 0, DW1000_LATE = 1, DW1000_BUSY = 2, DW1000_NOT_READY = 3 };
 
 #define DW1000_NOT_MEASURED (-32768)
@@ -41,6 +45,8 @@ struct dw1000 {
     enum dw1000_state state;
     bool is_listening;
     bool reads_phases; /* set by the caller: receptions have a phase, which takes four more transactions */
+    bool uses_both_buffers; /* set by the caller before the chip's start: the receiver is on again before a frame is read,
+                               unless phases are; for a radio that only listens */
     uint32_t received;
     uint32_t errors;
     uint32_t sent;
@@ -78,6 +84,20 @@ bool dw1000_start(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t rx_an
 
 /* Listen from now on; a frame that waits to be sent is sent before. */
 void dw1000_receive(struct dw1000 *chip);
+
+/* Turn the receiver off and forget what it has; a frame that waits to be sent is sent before. */
+void dw1000_idle(struct dw1000 *chip);
+
+/* Listen for one frame when the counter is at `ticks`, whose low nine bits are ignored, for at most `window` times 65536
+ * ticks (1.026 us; 1 to 65535), in which the frame must have ended (UM 4.2, p. 79). Ends any reception. DW1000_LATE: that
+ * time has passed, and the receiver is off. */
+enum dw1000_queued dw1000_receive_at(struct dw1000 *chip, uint64_t ticks, uint32_t window);
+
+/* Let the chip sleep deeply until it is woken: it draws some uA, forgets its settings and its counter, and is OFF. */
+void dw1000_sleep(struct dw1000 *chip);
+
+/* Wake and configure a chip that sleeps, as `dw1000_start` does one that is awake, in 6.5 ms (SPI at 2 MHz until then). */
+bool dw1000_wake(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t rx_antenna_delay);
 
 /* Send a PSDU of 3 to 127 bytes when the counter is at `dx_ticks`, whose low nine bits are ignored (UM p. 26); the chip
  * makes the last two bytes, its FCS. Poll before, or a frame that has just come is lost. */

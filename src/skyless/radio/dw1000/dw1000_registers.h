@@ -23,15 +23,29 @@
 #define AFFREJ (1ull << 29)
 #define TXPUTE (1ull << 34)
 #define RX_ERRORS (RXPHE | RXFCE | RXRFSL | RXRFTO | LDEERR | RXOVRR | RXPTO | RXSFDTO | AFFREJ)
-#define UNUSED (0xF8ull << 32) /* bits that do not exist */
+#define NO_EVENT (0xF8ull << 32) /* bits that do not exist */
 #define CLEARED 0x0737FFFFF8ull /* written back at most; CPLOCK shows that it runs as it was started */
 #define STATUS_OCTETS 5u
 #define SYS_MASK_EVENTS (TXFRS | RXFCG | RX_ERRORS | CLKPLL_LL) /* what raises the interrupt line (UM 7.2.16) */
+
+#define BUFFER_POINTERS (3ull << 30) /* HSRBP and ICRBP: which receive buffer the host reads, and which the chip fills */
+
+/* SYS_CFG (UM 7.2.6): the interrupt line is high when it says something; smart power, no filter, no RXAUTR */
+#define HIRQ_POL 0x0200u
+#define DIS_DRXB 0x1000u
+#define RXWTOE 0x10000000u
 
 /* SYS_CTRL (UM 7.2.15, pp. 80-84) */
 #define TXSTRT_TXDLYS 0x06u
 #define TRXOFF 0x40u
 #define RXENAB 0x0100u
+#define RXENAB_RXDLYE 0x0300u
+#define HRBPT 0x01u /* in the fourth octet */
+
+/* Sleep (UM 2.3, p. 17; 7.2.45) */
+#define AON_CFG0_SLEEP 0x05u /* SLEEP_EN, WAKE_SPI; deep sleep, since WAKE_CNT is not set */
+#define AON_CTRL_SAVE 0x02u
+#define WAKE_OCTETS 131u /* behind a header, at 2 MHz: chip select low for 528 us of the 500 that it needs */
 
 /* 6.8 Mbit/s, ranging bit, PRF 64 MHz, 128 symbols; the length is added (UM 7.2.10, Table 16) */
 #define TX_FCTRL 0x0016C000u

@@ -11,7 +11,9 @@
 #define LIGHT_SENT 0x04u    /* changes every 4 frames sent */
 #define LIGHT_FAULT 0x08u   /* the chip does not answer, or its interrupt line does not follow its events */
 
-/* Only `transfer` and `pause_us` wait. The driver of the DW1000 uses the first four only. */
+#define KEPT_BYTES 80u /* of settings, in flash */
+
+/* Only `transfer`, `pause_us`, `sleep_for` and `write_settings` wait. The driver of the DW1000 uses the first four only. */
 struct hardware {
     /* One SPI transaction (mode 0) in both directions, 2 to 132 bytes. */
     void (*transfer)(const uint8_t *out, uint8_t *into, uint32_t size);
@@ -30,8 +32,19 @@ struct hardware {
     bool (*write_line)(const uint8_t *line, uint32_t size);
     /* Start the receiver of the serial line again: it may have lost count. */
     void (*restart_line)(void);
+    /* Send the lines that are queued, then go on at another rate. */
+    void (*set_rate)(uint32_t baud);
     /* Switch the lights. */
     void (*show)(uint32_t lights);
+    /* Sleep with everything off but RAM; `now_us` goes on. Lines to be sent are sent before, what comes is lost, and a
+     * chip that is to sleep was told so before. */
+    void (*sleep_for)(uint32_t milliseconds);
+    /* The KEPT_BYTES that were written last; false where there are none. */
+    bool (*read_settings)(uint8_t *into);
+    /* Keep settings when the supply fails; nothing else happens for 90 ms. */
+    void (*write_settings)(const uint8_t *from);
+    /* Begin to send a Bluetooth advertisement of up to 31 bytes; false while the last is on its way. */
+    bool (*advertise)(const uint8_t *data, uint32_t size);
 };
 
 #endif

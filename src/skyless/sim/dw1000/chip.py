@@ -10,6 +10,7 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.core.air.reception import Diagnostics
+from skyless.core.constants import TICK_S
 from skyless.core.ticks import wrap
 from skyless.sim.dw1000 import registers as r
 from skyless.sim.dw1000.registers import Access, Memory, decode_header
@@ -29,6 +30,16 @@ _LOAD_S: Final = 150e-6
 _MAX_CRYSTAL_HZ: Final = 3_000_000
 """Fastest SPI while the chip runs on the crystal (UM 2.3.2: INIT)."""
 _MAX_PLL_HZ: Final = 20_000_000
+
+_SELECTED_S: Final = 500e-6
+"""How long chip select must be low to wake a chip that sleeps (UM 2.3, p. 17)."""
+_WAKE_S: Final = 4e-3
+"""Until it answers then: its crystal has to start (assumed; the data sheet gives some 3 ms)."""
+
+RECEIVING_A: Final = 134e-3
+IDLE_A: Final = 18e-3
+ASLEEP_A: Final = 10e-6
+"""What a DWM1001 draws, by the state of its chip; transmissions count as idle."""
 
 _TEMPERATURE_STEP_C: Final = 1.14
 _REFERENCE_C: Final = 23.0
@@ -149,7 +160,12 @@ class Chip:
         """Violations of the manual by the host."""
         self.arrivals: Counter[str] = Counter()
         """What became of the frames that reached the antenna."""
-        self._air, self._rx_delay_ticks = air, rx_delay_ticks
+        self.on_wake: Callable[[], None] = lambda: None
+        """Called when it wakes: the counter begins anew, and the crystal may have another rate; both are the air's."""
+        self._air, self._rx_delay_ticks, self._seconds = air, rx_delay_ticks, seconds
+        self._begin_s, self._slept_s = seconds(), 0.0
+        self._asleep_since_s: float | None = None
+        self._awake_s = 0.0
         self.memory = Memory(self.misuse)
         self.clocking = Clocking(self.memory, self.misuse, seconds, sensors or Sensors())
         self.transceiver = Transceiver(self.memory, air, tx_delay_ticks, self.misuse)
@@ -157,8 +173,16 @@ class Chip:
 
     # Pins
 
+    def power_cycle(self) -> None:
+        """The supply failed and is back."""
+        self._slept_s, self._asleep_since_s = self.asleep_s, None
+        self.pull_reset()
+
     def pull_reset(self) -> None:
-        """RSTn was low for a moment; as after power-on."""
+        """RSTn was low for a moment; as after power-on. One that sleeps does not notice it (assumed)."""
+        if self._asleep_since_s is not None:
+            self.misuse["reset-while-asleep"] += 1
+            return
         self.transceiver.reset()
         self.memory.reset()
         self.clocking.in_reset = False
@@ -166,9 +190,49 @@ class Chip:
         self._lock_shown = False
         self.memory.set(r.SYS_STATUS, r.SLP2INIT)
 
+    def select(self, seconds: float) -> None:
+        """Chip select was low for so long, which wakes a chip that sleeps."""
+        if self._asleep_since_s is not None and seconds >= _SELECTED_S:
+            self.on_wake()
+            self.power_cycle()
+            self._awake_s = self._seconds() + _WAKE_S
+
+    def _sleep(self) -> None:
+        """SAVE with SLEEP_EN: all registers are lost (UM 2.3; the configuration is not restored here)."""
+        config = self.memory.get(r.AON_CFG0)
+        if self.transceiver.listening_since is not None or self.transceiver.sending is not None:
+            self.misuse["sleep-while-busy"] += 1
+        if not config & r.WAKE_SPI:
+            self.misuse["sleep-without-end"] += 1
+        if self.memory.get(r.AON_CFG1) & r.SLEEP_CEN or self.memory.get(r.AON_WCFG):
+            self.misuse["sleep-with-counter-or-restoration"] += 1
+        self.pull_reset()
+        self.memory.set(r.SYS_STATUS, 0)
+        self._asleep_since_s = self._seconds()
+
+    @property
+    def receiving_s(self) -> float:
+        """How long the receiver has been on in all."""
+        self.transceiver.update()
+        return self.transceiver.receiving_ticks * TICK_S
+
+    @property
+    def asleep_s(self) -> float:
+        """How long the chip has slept in all."""
+        return self._slept_s + (0.0 if self._asleep_since_s is None else self._seconds() - self._asleep_since_s)
+
+    @property
+    def charge_c(self) -> float:
+        """What the module has drawn since its power-on."""
+        receiving_s, asleep_s = self.receiving_s, self.asleep_s
+        idle_s = self._seconds() - self._begin_s - receiving_s - asleep_s
+        return RECEIVING_A * receiving_s + IDLE_A * idle_s + ASLEEP_A * asleep_s
+
     @property
     def irq(self) -> bool:
         """The interrupt line: an event that SYS_MASK lets through, with the polarity of SYS_CFG."""
+        if self._asleep_since_s is not None:
+            return False
         self._update()
         return self._is_pending() == bool(self.memory.get(r.SYS_CFG) & r.HIRQ_POL)
 
@@ -179,6 +243,11 @@ class Chip:
 
     def transfer(self, out: bytes, hz: int) -> bytes:
         """One transaction: the octets that the chip sends while it receives ``out``, as many."""
+        if self._asleep_since_s is not None or self._seconds() < self._awake_s:
+            if self._asleep_since_s is None or 8 * len(out) / hz < _SELECTED_S:
+                self.misuse["spi-while-asleep"] += 1
+            self.select(8 * len(out) / hz)
+            return bytes(len(out))
         access = decode_header(out)
         if access is None:
             self.misuse["transaction-without-header"] += 1
@@ -213,7 +282,7 @@ class Chip:
         if access.file == r.SYS_TIME.file:
             self.memory.set(r.SYS_TIME, self._air.now_ticks() & _STEP_MASK)
         elif access.file == r.SYS_STATUS.file:
-            status = self.memory.get(r.SYS_STATUS) & ~r.IRQS
+            status = self.memory.get(r.SYS_STATUS) & ~(r.IRQS | r.HSRBP | r.ICRBP) | self.transceiver.buffer_pointers
             self.memory.set(r.SYS_STATUS, status | (r.IRQS if self._is_pending() else 0))
         elif access.file == r.TX_BUFFER.file:
             self.misuse["tx-buffer-read"] += 1  # UM p. 77
@@ -259,12 +328,16 @@ class Chip:
             if kind == r.SOFTRESET_ALL:
                 self._soft_reset()
             elif kind == r.SOFTRESET_RX:
-                self.transceiver.listening_since = None
+                self.transceiver.stop_listening()
                 self.transceiver.suspect = False
         elif access.file == r.OTP_IF.file and access.sub < r.OTP_CTRL.sub + 2 and access.sub + length > r.OTP_CTRL.sub:
             self.clocking.on_otp_written()
         elif access.file == r.TX_CAL.file and access.sub == 0:
             self.clocking.on_sensor_written()
+        elif access.file == r.AON.file and self.memory.get(r.AON_CTRL) & r.SAVE:
+            self.memory.set(r.AON_CTRL, self.memory.get(r.AON_CTRL) & ~r.SAVE)  # it clears itself
+            if self.memory.get(r.AON_CFG0) & r.SLEEP_EN:
+                self._sleep()
 
     def _soft_reset(self) -> None:
         """All registers but the bits that hold the chip in reset (UM 7.2.50.1)."""
@@ -289,6 +362,9 @@ class Chip:
 
         ``carrier_phase_cycles`` is that of its first path (``Reception``); None where the air has none.
         """
+        if self._asleep_since_s is not None:
+            self.arrivals["receiver-off"] += 1
+            return "receiver-off"
         self._update()
         ticks, microcode = wrap(rx_ticks + self._rx_delay_ticks), self.clocking.microcode_loaded
         outcome = self.transceiver.receive(

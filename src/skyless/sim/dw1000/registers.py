@@ -29,6 +29,7 @@ SYS_TIME: Final = Register(0x06, 0x00, 5, 0, "RO")  # 7.2.8
 TX_FCTRL: Final = Register(0x08, 0x00, 5, 0x0015400C)  # 7.2.10, pp. 73-77
 TX_BUFFER: Final = Register(0x09, 0x00, 1024, 0, "WO")  # 7.2.11, p. 77
 DX_TIME: Final = Register(0x0A, 0x00, 5)  # 7.2.12
+RX_FWTO: Final = Register(0x0C, 0x00, 2)  # 7.2.14, p. 79
 SYS_CTRL: Final = Register(0x0D, 0x00, 4)  # 7.2.15, pp. 80-84
 SYS_MASK: Final = Register(0x0E, 0x00, 4)  # 7.2.16
 SYS_STATUS: Final = Register(0x0F, 0x00, 5)  # 7.2.17, pp. 86-93
@@ -83,6 +84,7 @@ AON: Final = Register(0x2C, 0x00, 12)
 AON_WCFG: Final = Register(0x2C, 0x00, 2)
 AON_CTRL: Final = Register(0x2C, 0x02, 1)
 AON_CFG0: Final = Register(0x2C, 0x06, 4)
+AON_CFG1: Final = Register(0x2C, 0x0A, 2, 0x0007)
 OTP_IF: Final = Register(0x2D, 0x00, 19)
 OTP_ADDR: Final = Register(0x2D, 0x04, 2)
 OTP_CTRL: Final = Register(0x2D, 0x06, 2)
@@ -108,6 +110,8 @@ TXSTRT: Final = 1 << 1
 TXDLYS: Final = 1 << 2
 TRXOFF: Final = 1 << 6
 RXENAB: Final = 1 << 8
+RXDLYE: Final = 1 << 9
+HRBPT: Final = 1 << 24
 
 # SYS_STATUS (UM 7.2.17, pp. 86-93); SYS_MASK has the same bits
 IRQS: Final = 1 << 0
@@ -125,22 +129,30 @@ RXDFR: Final = 1 << 13
 RXFCG: Final = 1 << 14
 RXFCE: Final = 1 << 15
 RXRFSL: Final = 1 << 16
+RXRFTO: Final = 1 << 17
 LDEERR: Final = 1 << 18
+RXOVRR: Final = 1 << 20
 SLP2INIT: Final = 1 << 23
 CLKPLL_LL: Final = 1 << 25
 RXSFDTO: Final = 1 << 26
 HPDWARN: Final = 1 << 27
+HSRBP: Final = 1 << 30
+ICRBP: Final = 1 << 31
 TXPUTE: Final = 1 << 34
 
-READ_ONLY: Final = IRQS | HPDWARN
+READ_ONLY: Final = IRQS | HPDWARN | HSRBP | ICRBP
 """What writing a 1 does not clear (pp. 86, 91, 92)."""
+OF_BUFFER: Final = LDEDONE | RXDFR | RXFCG | RXFCE
+"""Each of the two receive buffers has its own (UM 4.3.1)."""
 OF_SENDING: Final = TXFRB | TXPRS | TXPHS | TXFRS | TXPUTE
 """Forgotten when the transmitter is enabled again."""
-OF_RECEIVING: Final = RXPRD | RXSFDD | LDEDONE | RXPHD | RXPHE | RXDFR | RXFCG | RXFCE | RXRFSL | LDEERR | RXSFDTO
+OF_RECEIVING: Final = OF_BUFFER | RXPRD | RXSFDD | RXPHD | RXPHE | RXRFSL | RXRFTO | LDEERR | RXSFDTO
 """Forgotten when the receiver is enabled again."""
 
 # SYS_CFG (UM 7.2.6)
 HIRQ_POL: Final = 1 << 9
+DIS_DRXB: Final = 1 << 12
+RXWTOE: Final = 1 << 28
 PHR_MODE: Final = 0b11 << 16
 RXM110K: Final = 1 << 22
 
@@ -156,6 +168,12 @@ FACE: Final = 1 << 6
 AMCE: Final = 1 << 15
 PMSC_FOR_LDE: Final = 0x0301
 """Low half of PMSC_CTRL0 while the microcode is loaded (UM 2.5.5.10)."""
+
+# AON_CTRL, AON_CFG0, AON_CFG1 (UM 7.2.45)
+SAVE: Final = 1 << 1
+SLEEP_EN: Final = 1 << 0
+WAKE_SPI: Final = 1 << 2
+SLEEP_CEN: Final = 1 << 0
 
 # OTP_CTRL (UM 7.2.46.3)
 OTPREAD: Final = 1 << 1
@@ -218,6 +236,11 @@ class Memory:
         """A register's value."""
         octets = self._files[register.file]
         return int.from_bytes(octets[register.sub : register.sub + register.length], "little")
+
+    def exchange(self, hidden: dict[int, bytearray]) -> None:
+        """Let register files and others of the same numbers change places."""
+        for file, octets in hidden.items():
+            hidden[file], self._files[file] = self._files[file], octets
 
     def set(self, register: Register, value: int) -> None:
         """Set a register from within the chip."""

@@ -1,7 +1,7 @@
 """The chip's transmitter and receiver (DW1000 User Manual v2.12, sections 3, 4, 7.2.18 to 7.2.23).
 
-Only delayed transmission is modelled, and reception until a frame or an error; no double buffering, filtering,
-acknowledgement, sniffing, sleep, long frames or timeouts.
+Only delayed transmission is modelled, and reception until a frame, an error or the end of its window, into one buffer
+or two; no reception that goes on by itself (RXAUTR), filtering, acknowledgement, sniffing, long frames, other timeouts.
 """
 
 import cmath
@@ -64,6 +64,9 @@ _CARRIER_HALF: Final = 1 << 20
 """The integrator has 21 bits, in two's complement."""
 _GREATEST: Final = 0xFFFF
 
+_FILES_OF_BUFFER: Final = (r.RX_FINFO, r.RX_BUFFER, r.STD_NOISE, r.RX_TTCKO, r.RX_STAMP)
+"""Register files that each of the two receive buffers has (UM 4.3.1); carrier offset and accumulator have one place."""
+
 RCPHASE_STEPS: Final = 128
 """Steps of RCPHASE in a turn."""
 _STD_NOISE: Final = 40
@@ -105,15 +108,32 @@ class Transceiver:
         self.counts: Counter[str] = Counter()
         self.sending: Sending | None = None
         self.listening_since: int | None = None
+        """When the receiver went on, or will."""
         self.suspect = False
         """After an error the receiver needs a reset, or the next stamp is wrong (UM 4.1.6)."""
+        self.receiving_ticks = 0
+        """How long the receiver has been on in all, up to the last ``update``."""
+        self._counted_ticks = 0
+        self._window_end_ticks: int | None = None
+        self._hidden = {one.file: bytearray(r.FILE_LENGTHS[one.file]) for one in _FILES_OF_BUFFER}
+        """The receive buffer that the host does not see."""
+        self._hidden_events = 0
+        self._host_buffer = self._chip_buffer = 0
+        self._is_exchanged = False
 
     def reset(self) -> None:
         """Everything off."""
         self._withdraw()
-        self.sending, self.listening_since, self.suspect = None, None, False
+        self.stop_listening()
+        self.sending, self.suspect = None, False
+        self._host_buffer = self._chip_buffer = self._hidden_events = 0
 
     # Status
+
+    @property
+    def buffer_pointers(self) -> int:
+        """HSRBP and ICRBP."""
+        return (r.HSRBP if self._host_buffer else 0) | (r.ICRBP if self._chip_buffer else 0)
 
     def raise_bits(self, events: int) -> None:
         """Show events in SYS_STATUS."""
@@ -129,15 +149,19 @@ class Transceiver:
         """Obey what was written into SYS_CTRL."""
         if control & r.TRXOFF:
             self.off()
+        if control & r.HRBPT:
+            self._host_buffer ^= 1
+            self._exchange_buffers()
         if control & r.TXSTRT:
             self._start()
         elif control & r.RXENAB:
-            self._listen()
+            self._listen(delayed=bool(control & r.RXDLYE))
 
     def off(self) -> None:
         """TRXOFF: abort what is under way; HPDWARN goes with what it warned of (UM p. 91)."""
         self._withdraw()
-        self.sending, self.listening_since = None, None
+        self.stop_listening()
+        self.sending = None
         self.drop_bits(r.HPDWARN)
 
     def _withdraw(self) -> None:
@@ -180,20 +204,59 @@ class Transceiver:
         octets = self._memory.octets(r.TX_BUFFER)[offset : offset + length]
         return octets if length < 2 else octets[:-2] + fcs(octets[:-2])
 
-    def _listen(self) -> None:
-        """RXENAB (UM 4.2)."""
+    def _listen(self, *, delayed: bool) -> None:
+        """RXENAB, and RXDLYE: at DX_TIME (UM 4.2)."""
         if self.sending is not None or self.listening_since is not None:
             self._misuse["rxenab-while-busy"] += 1
             return
-        self.drop_bits(r.OF_RECEIVING)
-        self.listening_since = self._air.now_ticks()
+        memory, since = self._memory, self._air.now_ticks()
+        has_two = not memory.get(r.SYS_CFG) & r.DIS_DRXB
+        self.drop_bits(r.OF_RECEIVING & ~r.OF_BUFFER if has_two else r.OF_RECEIVING)
+        if delayed:
+            now, since = since, memory.get(r.DX_TIME) & DX_MASK
+            if difference(since, now) < 0:
+                self.raise_bits(r.HPDWARN)  # it would go on when the counter comes there again, 17 s later
+                return
+        self.listening_since = self._counted_ticks = since
+        self._window_end_ticks = None
+        if memory.get(r.SYS_CFG) & r.RXWTOE:
+            self._window_end_ticks = wrap(since + (memory.get(r.RX_FWTO) << 16))  # of 512 chips (UM 7.2.14)
+
+    def stop_listening(self) -> None:
+        """The receiver is off."""
+        self._count_receiving(self._air.now_ticks())
+        self.listening_since = self._window_end_ticks = None
+
+    def _count_receiving(self, until_ticks: int) -> None:
+        if self.listening_since is not None and difference(until_ticks, self._counted_ticks) > 0:
+            self.receiving_ticks += difference(until_ticks, self._counted_ticks)
+            self._counted_ticks = until_ticks
+
+    def _exchange_buffers(self) -> None:
+        """Show the other receive buffer."""
+        shown = self._memory.get(r.SYS_STATUS)
+        self._memory.exchange(self._hidden)
+        self._memory.set(r.SYS_STATUS, shown & ~r.OF_BUFFER | self._hidden_events)
+        self._hidden_events = shown & r.OF_BUFFER
 
     # What passes with time
 
     def update(self) -> None:
         """Show everything that has happened up to now."""
+        now = self._air.now_ticks()
         if self.sending is not None and not self.sending.missed:
-            self._progress(self.sending, self._air.now_ticks())
+            self._progress(self.sending, now)
+        if self._window_end_ticks is not None and difference(now, self._window_end_ticks) >= 0:
+            self._count_receiving(self._window_end_ticks)
+            self.listening_since = self._window_end_ticks = None
+            self.suspect = True
+            self.raise_bits(r.RXRFTO)
+        self._count_receiving(now)
+
+    @property
+    def window_left_ticks(self) -> int | None:
+        """Until the receiver's window ends, if it has one."""
+        return None if self._window_end_ticks is None else difference(self._window_end_ticks, self._air.now_ticks())
 
     def finish(self) -> None:
         """The air reports that the frame's end has left."""
@@ -247,6 +310,13 @@ class Transceiver:
         if fault in ("header", "parity", "delimiter"):
             self._end_reception(_FAULT_EVENTS[fault], is_error=True)
             return "spoilt"
+        if self._chip_buffer != self._host_buffer:
+            self._exchange_buffers()  # until the reception has ended
+            self._is_exchanged = True
+        if memory.get(r.SYS_STATUS) & r.RXFCG:  # the host has not read it, and this frame spoils it (UM 4.3.5)
+            memory.set(r.RX_STAMP, ~memory.get(r.RX_STAMP))
+            self._end_reception(r.RXOVRR, is_error=True)
+            return "overrun"
         is_good = is_intact(frame)
         stamped = bool(memory.get(r.PMSC_CTRL1) & r.LDERUNE)
         self._fill_registers(frame, diagnostics)
@@ -275,8 +345,13 @@ class Transceiver:
     def _end_reception(self, events: int, *, is_error: bool) -> None:
         """The receiver turns itself off."""
         self.suspect = self.suspect or is_error
-        self.listening_since = None
+        self.stop_listening()
         self.raise_bits(events)
+        if self._is_exchanged:
+            self._exchange_buffers()
+            self._is_exchanged = False
+        if events & r.RXFCG and not self._memory.get(r.SYS_CFG) & r.DIS_DRXB:
+            self._chip_buffer ^= 1
 
     def _fill_registers(self, frame: bytes, diagnostics: Diagnostics) -> None:
         """RX_FINFO, the frame, and what was measured of it; zeros for what the air does not report.

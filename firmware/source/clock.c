@@ -1,0 +1,96 @@
+/* The fast crystal gives the time while the board works, through TIMER0, and the slow one while it sleeps for long,
+ * through RTC1. */
+#include "clock.h"
+
+#include "nrf52832.h"
+
+#define PIECE_PERIODS 49152u /* 1.5 s: the watchdog must be fed after 2 s at the latest */
+#define LEAST_PERIODS 3u     /* the counter may miss a comparison that is closer (PS 25) */
+#define COUNTER_MASK 0xFFFFFFu
+
+static uint32_t offset_us; /* of the time to TIMER0's count */
+
+static void start_crystal(void)
+{
+    CLOCK_HFCLKSTARTED = 0u;
+    CLOCK_HFCLKSTART = 1u; /* for the rates of the serial line and of Bluetooth */
+    while (CLOCK_HFCLKSTARTED == 0u) {
+    }
+}
+
+/* The module's slow crystal takes some 0.25 s to start, and is off by some 100 ppm, as its users report. */
+void clock_start(void)
+{
+    NVMC_ICACHECNF = 1u;
+    CLOCK_LFCLKSRC = LFCLK_CRYSTAL;
+    CLOCK_LFCLKSTART = 1u;
+    start_crystal();
+    TIMER0_BITMODE = TIMER_32_BITS;
+    TIMER0_PRESCALER = TIMER_1_MHZ;
+    TIMER0_INTENSET = TIMER0_INT_COMPARE0;
+    NVIC_ISER0 = 1u << TIMER0_IRQ;
+    TIMER0_START = 1u;
+}
+
+uint32_t clock_now_us(void)
+{
+    TIMER0_CAPTURE1 = 1u;
+    return TIMER0_CC1 + offset_us;
+}
+
+void clock_pause_us(uint32_t microseconds)
+{
+    uint32_t begin_us = clock_now_us();
+
+    while ((clock_now_us() - begin_us) <= microseconds) {
+    }
+}
+
+void clock_sleep_us(uint32_t microseconds)
+{
+    TIMER0_CC0 = clock_now_us() - offset_us + microseconds;
+    __asm volatile("dsb\n\twfi" ::: "memory");
+}
+
+/* Before RTC1 is used the slow clock must run and STOP be given, or its registers are wrong (anomaly 20). */
+static void start_slow_counter(void)
+{
+    while (CLOCK_LFCLKSTARTED == 0u) {
+    }
+    RTC1_STOP = 1u;
+    RTC1_CLEAR = 1u;
+    RTC1_INTENSET = RTC_INT_COMPARE0;
+    NVIC_ISER0 = 1u << RTC1_IRQ;
+    RTC1_START = 1u;
+}
+
+/* The watchdog runs on, or a sleep whose end is lost would never end. So the processor wakes for some us now and then. */
+void clock_sleep_ms(uint32_t milliseconds)
+{
+    uint64_t periods = ((uint64_t)milliseconds * 4096u) / 125u;
+    uint64_t passed = 0u;
+    uint32_t begin_us;
+
+    start_slow_counter();
+    begin_us = clock_now_us();
+    TIMER0_STOP = 1u;
+    TIMER0_SHUTDOWN = 1u; /* one that is only stopped draws current (anomaly 78); it begins at 0 again */
+    TIMER0_COMPARE0 = 0u;
+    CLOCK_HFCLKSTOP = 1u;
+    while ((passed + LEAST_PERIODS) < periods) {
+        uint64_t left = periods - passed;
+
+        WDT_RR0 = WDT_RELOAD;
+        RTC1_CC0 = (uint32_t)(passed + ((left < PIECE_PERIODS) ? left : PIECE_PERIODS)) & COUNTER_MASK;
+        __asm volatile("dsb\n\twfi" ::: "memory");
+        RTC1_COMPARE0 = 0u;
+        (void)RTC1_COMPARE0; /* the write has arrived before the interrupt is cleared (PS 15) */
+        NVIC_ICPR0 = (1u << RTC1_IRQ) | (1u << TIMER0_IRQ);
+        passed += (RTC1_COUNTER - (uint32_t)passed) & COUNTER_MASK;
+    }
+    start_crystal();
+    passed += (RTC1_COUNTER - (uint32_t)passed) & COUNTER_MASK;
+    RTC1_STOP = 1u;
+    TIMER0_START = 1u;
+    offset_us = begin_us + (uint32_t)((passed * 15625u) / 512u);
+}

@@ -1,0 +1,14 @@
+/* A few bytes in the last page of the flash, which a new image leaves as they are. */
+#ifndef FLASH_H
+#define FLASH_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+/* Read KEPT_BYTES (hardware.h); false where none were written whole. */
+bool flash_read(uint8_t *into);
+
+/* Write them in 90 ms, in which the processor stands still. Without supply in between there are none afterwards. */
+void flash_write(const uint8_t *from);
+
+#endif
