@@ -14,6 +14,7 @@ import numpy as np
 from skyless.core.constants import TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.core.estimator.estimator import Estimator, Packets
 from skyless.core.estimator.settings import EstimatorSettings
+from skyless.core.estimator.state import covariances
 from skyless.core.native.views import view
 
 NODES, SUPERFRAMES, SLOT_TICKS = 7, 2048, round(5e-3 * TICK_RATE_HZ)
@@ -78,7 +79,7 @@ class Joint:
     def state(self):
         s = self.filter.state
         clocked = s.layout.tx_noise
-        return view(s.x)[:clocked], view(s.P)[:clocked, :clocked], s.status.rejected
+        return view(s.x)[:clocked], covariances(s)[:clocked, :clocked], s.status.rejected
 
     def position(self):
         return self.filter.motion()[0][:2]

@@ -10,6 +10,8 @@ uint32_t host_reader_bytes(void);
 void host_board_init(struct board *board, const struct hardware *hardware, const uint8_t *device_id, bool can_transmit,
                      uint8_t reset_cause);
 struct dw1000 *host_board_chip(struct board *board);
+struct settings *host_board_settings(struct board *board);
+int64_t host_board_unix_us(const struct board *board);
 uint32_t host_board_stage(const struct board *board);
 const uint8_t *host_writer_line(const struct link_writer *writer);
 uint32_t host_writer_length(const struct link_writer *writer);
@@ -39,7 +41,7 @@ uint32_t host_reader_bytes(void)
 void host_board_init(struct board *board, const struct hardware *hardware, const uint8_t *device_id, bool can_transmit,
                      uint8_t reset_cause)
 {
-    struct board_identity identity = {.can_transmit = can_transmit, .reset_cause = reset_cause};
+    struct board_identity identity = {can_transmit, {0u}, reset_cause};
 
     (void)memcpy(identity.device_id, device_id, sizeof identity.device_id);
     board_init(board, hardware, &identity);
@@ -48,6 +50,16 @@ void host_board_init(struct board *board, const struct hardware *hardware, const
 struct dw1000 *host_board_chip(struct board *board)
 {
     return &board->chip;
+}
+
+struct settings *host_board_settings(struct board *board)
+{
+    return &board->settings;
+}
+
+int64_t host_board_unix_us(const struct board *board)
+{
+    return board->tag.unix_us;
 }
 
 uint32_t host_board_stage(const struct board *board)

@@ -3,7 +3,7 @@
 #include <string.h>
 
 /* Version of the firmware, in HELLO */
-static const uint8_t VERSION[3] = {0u, 2u, 0u};
+static const uint8_t VERSION[3] = {0u, 3u, 0u};
 
 /* How long before its time a frame is handed to the chip: a reception that is being reported then (0.29 ms), what is
  * written over the SPI until it starts (0.14 ms; docs/hardware.md) and its preamble (0.14 ms). */
@@ -36,6 +36,15 @@ static const uint8_t VERSION[3] = {0u, 2u, 0u};
 /* Period of the light that blinks, as a bit of the clock: 0.52 s on, 0.52 s off. */
 #define BLINK_BIT 0x80000u
 #define READ_BYTES 64u
+/* A chip that could not be started for a tag is tried again. */
+#define RETRY_US 1000000u
+
+#ifndef PER_THREAD /* on a computer several boards run side by side */
+#define PER_THREAD
+#endif
+
+/* The one whose estimator computes. */
+static PER_THREAD struct board *computing;
 
 static int32_t from_to(uint32_t earlier_us, uint32_t later_us)
 {
@@ -44,8 +53,24 @@ static int32_t from_to(uint32_t earlier_us, uint32_t later_us)
 
 /* To the host */
 
+static bool is_tag(const struct board *board)
+{
+    return board->settings.mode == MODE_TAG;
+}
+
+/* Whether the chip is configured and awake. */
+static bool has_chip(const struct board *board)
+{
+    return board->is_configured && !(is_tag(board) && board->tag.is_resting);
+}
+
 static void send_line(struct board *board)
 {
+    const uint8_t zero = 0u;
+
+    if (is_tag(board) && (board->settings.output != OUTPUT_RECORDS)) {
+        (void)board->hardware->write_line(&zero, 1u); /* or the text before it would belong to the record */
+    }
     if (!board->hardware->write_line(board->writer.line, board->writer.length)) {
         board->unsent++;
     }
@@ -57,7 +82,8 @@ static void send_hello(struct board *board)
 
     (void)memcpy(hello.firmware, VERSION, sizeof hello.firmware);
     (void)memcpy(hello.identity, board->identity.device_id, sizeof hello.identity);
-    hello.capabilities = LINK_HAS_PHASES | (board->identity.can_transmit ? LINK_CAN_TRANSMIT : 0u);
+    hello.capabilities =
+        LINK_HAS_PHASES | LINK_CAN_COMPUTE | (board->identity.can_transmit ? LINK_CAN_TRANSMIT : 0u);
     hello.reset_cause = board->identity.reset_cause;
     link_write_hello(&board->writer, &hello);
     send_line(board);
@@ -123,7 +149,9 @@ static void on_lost(struct board *board)
     forget_frame(board);
     board->is_configured = false;
     board->is_receiving = false;
-    send_hello(board);
+    if (!is_tag(board)) {
+        send_hello(board);
+    }
 }
 
 /* Compare the interrupt line before a poll with what the poll has found: one that is high without an event, or low with
@@ -151,11 +179,15 @@ static bool poll(struct board *board, bool line_is_high)
     uint32_t events = dw1000_poll(chip);
 
     judge_line(board, line_is_high, events != 0u);
-    if ((events & DW1000_RECEIVED) != 0u) {
+    if (is_tag(board)) {
+        tag_on_chip(&board->tag, events);
+    } else if ((events & DW1000_RECEIVED) != 0u) {
         const struct link_measured measured = {chip->rx_power_cdbm, chip->first_path_cdbm, chip->offset_ppb, chip->phase};
 
         link_write_rx(&board->writer, chip->rx_ticks, &measured, chip->frame, chip->frame_bytes);
         send_line(board);
+    } else {
+        /* nothing to report */
     }
     if (((events & DW1000_SENT) != 0u) && (board->stage == FRAME_HANDED_OVER)) {
         board->stage = NO_FRAME;
@@ -238,7 +270,7 @@ static void accept_frame(struct board *board, const uint8_t *record, uint32_t le
 {
     const uint8_t *frame = &record[LINK_TX_FRAME_AT];
     uint32_t frame_bytes = length - LINK_TX_FRAME_AT;
-    bool is_ready = board->is_configured && board->identity.can_transmit;
+    bool is_ready = board->is_configured && board->identity.can_transmit && !is_tag(board);
     uint64_t dx_ticks;
 
     if ((length < (LINK_TX_FRAME_AT + DW1000_MIN_PSDU_BYTES)) || (frame_bytes > DW1000_MAX_PSDU_BYTES) ||
@@ -260,6 +292,23 @@ static void accept_frame(struct board *board, const uint8_t *record, uint32_t le
     }
 }
 
+/* Configure the chip and begin to look for a position. */
+static void start_tag(struct board *board)
+{
+    struct dw1000 *chip = &board->chip;
+
+    board->tried_us = board->hardware->now_us();
+    chip->reads_phases = false;
+    chip->uses_both_buffers = true;
+    board->is_configured = dw1000_start(chip, board->settings.tx_delay_ticks, board->settings.rx_delay_ticks);
+    board->was_refused = !board->is_configured;
+    board->is_receiving = board->is_configured;
+    board->checked_us = board->tried_us;
+    if (board->is_configured) {
+        tag_begin(&board->tag, board->hardware, &board->settings, chip, &board->writer);
+    }
+}
+
 static bool is_known_setting(const uint8_t *record)
 {
     /* Channel 5, PRF 64 MHz, 6.8 Mbit/s, code 9, 128 symbols */
@@ -277,6 +326,11 @@ static void configure(struct board *board, const uint8_t *record, uint32_t lengt
         refuse(board, LINK_CONFIG, LINK_REFUSED_SETTING);
         return;
     }
+    if (is_tag(board)) { /* until the next start */
+        board->settings.mode = MODE_RADIO;
+        board->is_in_flash = false;
+    }
+    board->chip.uses_both_buffers = false;
     forget_frame(board);
     board->is_receiving = false;
     board->chip.reads_phases = (record[LINK_CONFIG_BYTES - 1u] & LINK_WANTS_PHASES) != 0u;
@@ -305,6 +359,69 @@ static void receive(struct board *board)
     }
 }
 
+static void send_settings(struct board *board)
+{
+    link_write_tag_config(&board->writer, &board->settings, board->is_in_flash);
+    send_line(board);
+}
+
+/* Put the settings into flash, and see whether they are there. */
+static void keep_settings(struct board *board)
+{
+    uint8_t kept[KEPT_BYTES] = {0u};
+    uint8_t found[KEPT_BYTES] = {0u};
+
+    settings_pack(&board->settings, kept);
+    board->hardware->write_settings(kept);
+    board->is_in_flash = board->hardware->read_settings(found) && (memcmp(kept, found, sizeof kept) == 0);
+}
+
+/* Begin as a tag, or as a radio that waits for its host. */
+static void use_settings(struct board *board)
+{
+    forget_frame(board);
+    board->is_configured = false;
+    board->is_receiving = false;
+    board->hardware->set_rate(is_tag(board) ? board->settings.baud : SETTINGS_DEFAULT.baud);
+    if (is_tag(board)) {
+        start_tag(board);
+    }
+}
+
+static void change_settings(struct board *board, const uint8_t *record, uint32_t length)
+{
+    struct settings settings;
+
+    if ((length < (LINK_SETTINGS_AT + SETTINGS_BYTES)) ||
+        !settings_unpack(&record[LINK_SETTINGS_AT], length - LINK_SETTINGS_AT, &settings)) {
+        refuse(board, LINK_SET_TAG_CONFIG, LINK_REFUSED_MALFORMED);
+    } else if (!settings_check(&settings)) {
+        refuse(board, LINK_SET_TAG_CONFIG, LINK_REFUSED_SETTING);
+    } else {
+        board->settings = settings;
+        board->is_in_flash = false;
+        if ((record[LINK_BODY_AT] & LINK_IN_FLASH) != 0u) {
+            keep_settings(board);
+        }
+        send_settings(board);
+        use_settings(board);
+    }
+}
+
+/* What concerns a tag by itself. */
+static void obey_as_tag(struct board *board, const uint8_t *record, uint32_t length)
+{
+    if (record[0] == LINK_SET_TAG_CONFIG) {
+        change_settings(board, record, length);
+    } else if (record[0] == LINK_ASK_TAG_CONFIG) {
+        send_settings(board);
+    } else if (length >= (LINK_BODY_AT + 8u)) {
+        tag_set_time(&board->tag, (int64_t)link_number(&record[LINK_BODY_AT], 8u));
+    } else {
+        /* no time */
+    }
+}
+
 static void obey(struct board *board, const uint8_t *record, uint32_t length)
 {
     switch (record[0]) {
@@ -322,6 +439,11 @@ static void obey(struct board *board, const uint8_t *record, uint32_t length)
         break;
     case LINK_RX_ON:
         receive(board);
+        break;
+    case LINK_SET_TAG_CONFIG:
+    case LINK_ASK_TAG_CONFIG:
+    case LINK_SET_TIME:
+        obey_as_tag(board, record, length);
         break;
     default:
         board->unknown++;
@@ -341,6 +463,7 @@ static bool serve_host(struct board *board)
         at += link_read(reader, &data[at], size - at);
         if (reader->length > 0u) {
             board->understood_until = reader->garbled + reader->overlong;
+            tag_on_host(&board->tag);
             obey(board, reader->record, reader->length);
         }
     }
@@ -368,7 +491,7 @@ static bool is_free(const struct board *board, uint32_t now_us)
 /* Check and measure a chip that is configured; whether something was due. */
 static bool do_chores(struct board *board, uint32_t now_us)
 {
-    bool measures = ((now_us - board->measured_us) >= MEASURE_US) && is_free(board, now_us);
+    bool measures = !is_tag(board) && ((now_us - board->measured_us) >= MEASURE_US) && is_free(board, now_us);
     bool checks = measures || ((now_us - board->checked_us) >= CHECK_US);
 
     if (checks) {
@@ -444,6 +567,8 @@ void board_init(struct board *board, const struct hardware *hardware, const stru
     (void)memset(board, 0, sizeof *board);
     board->hardware = hardware;
     board->identity = *identity;
+    board->settings = SETTINGS_DEFAULT;
+    board->tag.hardware = hardware;
     dw1000_init(&board->chip, hardware);
     board->busy_us = hardware->now_us();
     board->polled_us = board->busy_us;
@@ -452,12 +577,50 @@ void board_init(struct board *board, const struct hardware *hardware, const stru
     board->chip.millivolts = LINK_NO_VOLTAGE;
 }
 
+void board_pause(void)
+{
+    struct board *board = computing;
+
+    if (board != NULL) {
+        bool line_is_high = board->hardware->interrupt_line();
+
+        if (has_chip(board) && (line_is_high || board->is_polled)) {
+            (void)poll(board, line_is_high);
+        }
+    }
+}
+
+/* Let a tag do one thing, or start its chip; for how long nothing is to be done then. */
+static uint32_t serve_tag(struct board *board, uint32_t now_us)
+{
+    uint32_t idle_us = RETRY_US;
+
+    if (board->is_configured) {
+        computing = board;
+        idle_us = tag_turn(&board->tag);
+        computing = NULL;
+    } else if ((now_us - board->tried_us) >= RETRY_US) {
+        start_tag(board);
+    } else {
+        /* the chip was tried a moment ago */
+    }
+    return idle_us;
+}
+
 void board_begin(struct board *board)
 {
     const uint8_t zero = 0u;
+    struct settings settings;
+    uint8_t kept[KEPT_BYTES];
 
     (void)board->hardware->write_line(&zero, 1u);
     send_hello(board);
+    if (board->hardware->read_settings(kept) && settings_unpack(kept, SETTINGS_BYTES, &settings) &&
+        settings_check(&settings)) {
+        board->settings = settings;
+        board->is_in_flash = true;
+        use_settings(board);
+    }
 }
 
 uint32_t board_turn(struct board *board)
@@ -465,9 +628,10 @@ uint32_t board_turn(struct board *board)
     uint32_t now_us = board->hardware->now_us();
     bool line_is_high = board->hardware->interrupt_line();
     bool is_busy = false;
+    uint32_t tag_us = RETRY_US;
 
     board->is_own_slot = false;
-    if (board->is_configured && is_poll_due(board, line_is_high, now_us)) {
+    if (has_chip(board) && is_poll_due(board, line_is_high, now_us)) {
         board->polled_us = now_us;
         is_busy = poll(board, line_is_high) || (line_is_high && !board->is_polled);
     }
@@ -479,11 +643,14 @@ uint32_t board_turn(struct board *board)
     if ((board->stage != NO_FRAME) && (from_to(board->due_us, now_us) >= 0)) {
         serve_frame(board);
         is_busy = true;
-    } else if (board->is_configured) {
+    } else if (has_chip(board)) {
         is_busy = do_chores(board, now_us) || is_busy;
     } else {
         /* nothing to do before the host has configured the chip */
     }
+    if (is_tag(board)) {
+        tag_us = serve_tag(board, now_us);
+    }
     show(board, now_us);
-    return is_busy ? 0u : idle_us(board, now_us);
+    return is_busy ? 0u : least(tag_us, idle_us(board, now_us));
 }

@@ -12,6 +12,7 @@
 #include "dw1000.h"
 #include "hardware.h"
 #include "link.h"
+#include "tag.h"
 
 enum frame_stage { NO_FRAME, FRAME_HELD, FRAME_HANDED_OVER };
 
@@ -37,6 +38,12 @@ struct board {
     uint64_t dx_ticks;
     uint32_t frame_bytes;
     uint8_t frame[DW1000_MAX_PSDU_BYTES];
+
+    /* A tag by itself */
+    struct settings settings;
+    bool is_in_flash; /* they are what flash holds */
+    uint32_t tried_us; /* when the chip was last started for it */
+    struct tag tag;
 
     /* Counts since the start, as in STATUS */
     uint32_t late;
@@ -66,5 +73,8 @@ void board_begin(struct board *board);
 /* Serve chip, host and time once. For how many microseconds nothing is to be done unless the interrupt line rises or
  * bytes come; 0: call it again at once. */
 uint32_t board_turn(struct board *board);
+
+/* What the estimator calls now and then while it computes: serve the chip, if it has something. */
+void board_pause(void);
 
 #endif

@@ -169,6 +169,32 @@ void link_write_refused(struct link_writer *writer, uint32_t kind, uint32_t reas
     end(writer);
 }
 
+void link_write_words(struct link_writer *writer, uint32_t kind, const void *words, uint32_t size)
+{
+    begin(writer, kind);
+    append_bytes(writer, words, size);
+    end(writer);
+}
+
+void link_write_fix(struct link_writer *writer, const struct fix *fix)
+{
+    begin(writer, LINK_FIX);
+    append_bytes(writer, (const uint8_t *)fix, FIX_SENT_BYTES);
+    for (uint32_t at = 0u; at < fix->anchor_count; at++) {
+        append(writer, fix->anchors[at].id, 2u);
+    }
+    end(writer);
+}
+
+void link_write_tag_config(struct link_writer *writer, const struct settings *settings, bool is_in_flash)
+{
+    begin(writer, LINK_TAG_CONFIG);
+    append(writer, is_in_flash ? LINK_IN_FLASH : 0u, 1u);
+    settings_pack(settings, &writer->record[writer->fill]);
+    writer->fill += SETTINGS_BYTES;
+    end(writer);
+}
+
 /* Reading */
 
 /* The inverse of COBS for `line`, which holds no zeros; false where a block lacks its end. */

@@ -9,8 +9,11 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#include "fix.h"
+#include "settings.h"
+
 #define LINK_MAJOR 1u
-#define LINK_MINOR 2u
+#define LINK_MINOR 3u
 
 /* From the board */
 #define LINK_HELLO 0x01u
@@ -20,6 +23,11 @@
 #define LINK_STATUS 0x05u
 #define LINK_REFUSED 0x06u
 #define LINK_RX_PHASE 0x07u
+#define LINK_FIX 0x08u
+#define LINK_TAG_STATUS 0x09u
+#define LINK_ANCHOR_PLACE 0x0Au
+#define LINK_GEOREFERENCE 0x0Bu
+#define LINK_TAG_CONFIG 0x0Cu
 
 /* From the host */
 #define LINK_ASK_HELLO 0x41u
@@ -27,10 +35,14 @@
 #define LINK_TX_AT 0x43u
 #define LINK_RX_ON 0x44u
 #define LINK_ASK_STATUS 0x45u
+#define LINK_SET_TAG_CONFIG 0x46u
+#define LINK_ASK_TAG_CONFIG 0x47u
+#define LINK_SET_TIME 0x48u
 
 #define LINK_BODY_AT 2u /* after kind and number */
 #define LINK_TX_FRAME_AT 7u
 #define LINK_CONFIG_BYTES 13u
+#define LINK_SETTINGS_AT 3u /* in both records of settings, after flags */
 #define LINK_IDENTITY_BYTES 8u
 #define LINK_STAMP_BYTES 5u
 
@@ -39,7 +51,9 @@
 
 #define LINK_CAN_TRANSMIT 0x01u
 #define LINK_HAS_PHASES 0x02u
+#define LINK_CAN_COMPUTE 0x04u
 #define LINK_WANTS_PHASES 0x01u /* flag in CONFIG */
+#define LINK_IN_FLASH 0x01u      /* flag in the records of settings: to be kept, or kept */
 
 /* State in STATUS */
 #define LINK_IS_CONFIGURED 0x01u
@@ -109,6 +123,10 @@ void link_write_tx_done(struct link_writer *writer, uint64_t dx_ticks, uint64_t 
 void link_write_tx_late(struct link_writer *writer, uint64_t dx_ticks, uint32_t reason);
 void link_write_status(struct link_writer *writer, const struct link_status *status);
 void link_write_refused(struct link_writer *writer, uint32_t kind, uint32_t reason);
+/* TAG_STATUS, ANCHOR_PLACE or GEOREFERENCE out of a struct of fix.h. */
+void link_write_words(struct link_writer *writer, uint32_t kind, const void *words, uint32_t size);
+void link_write_fix(struct link_writer *writer, const struct fix *fix);
+void link_write_tag_config(struct link_writer *writer, const struct settings *settings, bool is_in_flash);
 
 /* Finds records in bytes that may hold anything. `record[0..length)` is the one that was found, without its check;
  * `length` is 0 where there is none. */

@@ -48,6 +48,7 @@ class Bus:
         self.transactions = []
         self.restarts = self.lights = 0
         self.room = 1 << 30
+        self.settings, self.advertised = None, []
         self.stuck = None
         """What the interrupt line shows whatever the chip does; None where it works."""
         self.present = True
@@ -83,6 +84,9 @@ class Bus:
         self.from_board += line
         return True
 
+    def set_rate(self, baud):
+        self.baud = baud
+
     def restart_line(self):
         self.restarts += 1
         self.to_board.clear()
@@ -90,15 +94,28 @@ class Bus:
     def show(self, lights):
         self.lights = lights
 
+    def sleep_for(self, milliseconds):
+        self.air.pass_s(1e-3 * milliseconds)
+
+    def read_settings(self):
+        return self.settings
+
+    def write_settings(self, settings):
+        self.settings = settings
+
+    def advertise(self, data):
+        self.advertised.append(data)
+        return True
+
 
 class BoardStage:
     """A board, its chip and a host that writes commands."""
 
-    def __init__(self, *, can_transmit=True, ticks=10**12, reset_cause=0):
+    def __init__(self, *, ticks=10**12, **kind):
         self.air = HandClock(ticks)
         self.chip = Chip(self.air, DELAYS.tx_ticks, DELAYS.rx_ticks, self.air.now_s)
         self.bus = Bus(self.air, self.chip)
-        self.board = CBoard(self.bus, can_transmit=can_transmit, device_id=DEVICE_ID, reset_cause=reset_cause)
+        self.board = CBoard(self.bus, **{"can_transmit": True, "device_id": DEVICE_ID} | kind)
         self._numbers = count()
 
     def send(self, kind, body=b""):

@@ -52,7 +52,7 @@ def test_a_board_reports_itself_and_is_configured_by_its_host():
     stage.send(ASK_HELLO)
     stage.turn(2)
     for hello in stage.reports():
-        assert (hello.major, hello.minor, hello.device_id, hello.can_transmit) == (1, 2, b"identity", True)
+        assert (hello.major, hello.minor, hello.device_id, hello.can_transmit) == (1, 3, b"identity", True)
         assert hello.has_phases
         assert (hello.rate_khz, hello.counter_bits, hello.reset_cause) == (63_897_600, 40, 0x82)
     stage.send(RX_ON)

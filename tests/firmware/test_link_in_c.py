@@ -12,9 +12,13 @@ from emulator.build import FIRMWARE, HAS_HOST_COMPILER
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skyless.core.air.almanac import GeoreferencePage
 from skyless.core.air.ieee802154 import fcs
+from skyless.core.fix import NoFixReason
 from skyless.radio.serial import link
 from skyless.radio.serial.link import Done, Heard, Hello, NotDone, Status, TooLate, decode
+from skyless.radio.tag_reports import AnchorPlace, BoardStatus, board_fix
+from support.board_tag import OriginInC, StatusInC, fix_in_c
 
 pytestmark = pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")
 
@@ -148,15 +152,47 @@ def test_the_status_arrives_as_it_was(ticks, state, counts, temperature, millivo
     assert status.supply_v == (None if millivolts == 0xFFFF else millivolts / 1000)
 
 
-@given(st.binary(min_size=3, max_size=3), st.binary(min_size=8, max_size=8), st.integers(0, 3), st.integers(0, 255))
+@given(st.binary(min_size=3, max_size=3), st.binary(min_size=8, max_size=8), st.integers(0, 7), st.integers(0, 255))
 def test_the_identity_arrives_as_it_was(firmware, identity, abilities, cause):
     fields = HelloFields((ctypes.c_uint8 * 3)(*firmware), (ctypes.c_uint8 * 8)(*identity), abilities, cause)
     hello = decode(Writer().write("hello", ctypes.byref(fields)))
     assert isinstance(hello, Hello)
     assert (hello.major, hello.minor) == (link.MAJOR, link.MINOR)
     assert (hello.firmware, hello.device_id) == (tuple(firmware), identity)
-    assert (hello.can_transmit, hello.has_phases, hello.reset_cause) == (abilities & 1, abilities > 1, cause)
+    known = (hello.can_transmit, hello.has_phases, hello.can_compute)
+    assert (known, hello.reset_cause) == (tuple(bool(abilities & bit) for bit in (1, 2, 4)), cause)
     assert (hello.rate_khz * 1000, hello.counter_bits) == (499_200_000 * 128, 40)
+
+
+COUNTED = ("heard", "fixes", "overload", "overload-superframe", "dropped-on-board")
+
+
+def test_what_a_tag_says_arrives_as_it_was():
+    writer, fix = Writer(), fix_in_c()
+    record = writer.write("fix", ctypes.byref(fix))
+    assert record[2:] == fix.sent()
+    assert repr(decode(record)) == repr(board_fix(record))
+    for kind, body, value in (
+        (link.TAG_STATUS, StatusInC(3, 8, 1, 4, 5, 6, 7, 8, 9000, 1500),
+         BoardStatus(3, NoFixReason.ACQUIRING, dict(zip(COUNTED, (4, 5, 6, 7, 8), strict=True)))),
+        (link.TAG_STATUS, StatusInC(0xFFFF), BoardStatus(None, None, dict.fromkeys(COUNTED, 0))),
+        (link.ANCHOR_PLACE, fix.anchors[1], AnchorPlace(2, (12.0, 0.0, 2.5))),
+        (link.GEOREFERENCE, OriginInC(-525_130_000, 134_000_000, -40_000, 3_599_999_999),
+         GeoreferencePage(-52.513, 13.4, -40.0, 359.9999999)),
+    ):  # fmt: skip
+        assert decode(writer.write("words", kind, ctypes.byref(body), ctypes.sizeof(body))) == value
+
+
+WRONG_FIXES = [
+    {"reason": 1}, {"levels": 4}, {"risk": 0.2}, {"risk": float("nan")}, {"alert_limit_m": -1.0},
+    {"covariance_m2": (float("nan"),) * 6}, {"mean_square_m2": -1.0},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", WRONG_FIXES)
+def test_a_fix_that_cannot_be_is_malformed(wrong):
+    assert decode(bytes((link.FIX, 0)) + fix_in_c(**wrong).sent()) == "malformed-record"
+    assert decode(bytes((link.FIX, 0)) + fix_in_c().sent()[:-1]) == "malformed-record"
 
 
 def test_numbers_wrap_at_256():
