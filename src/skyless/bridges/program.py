@@ -46,7 +46,7 @@ from skyless.run.process import HEALTH_S, Log, every, keep, reader, together
 from skyless.run.zones.zone_list import read_zones, zones_of
 
 if TYPE_CHECKING:  # it compiles kernels, which a bridge of a broker does not need
-    from skyless.core.tag.beacon_receiver import TagReceiver
+    from skyless.core.tag.beacon_receiver import SiteListener
 
 _SILENT_S: Final = 5.0  # after so long without a fix a line says where to look
 
@@ -187,7 +187,7 @@ class TagBridge:
     def __init__(self, hub: Hub, is_simulated: Callable[[], bool], log: Log) -> None:
         self._hub, self._is_simulated, self._log = hub, is_simulated, log
         self._sites: dict[str, _HeardSite] = {}
-        self._receivers: dict[str, TagReceiver] = {}
+        self._receivers: dict[str, SiteListener] = {}
         self._refusal = ""  # why no target can serve the site, as it was logged
 
     def on_fix(self, fix: FixMessage) -> None:
@@ -195,7 +195,7 @@ class TagBridge:
         if self._is_here(fix.tag):
             self._hub.on_fix(fix, time.monotonic())
 
-    def on_health(self, health: TagHealth, receiver: "TagReceiver") -> None:
+    def on_health(self, health: TagHealth, receiver: "SiteListener") -> None:
         """State of one of them, once a second, and what it has learned of the site."""
         now_s = time.monotonic()
         self._receivers[health.tag] = receiver
@@ -240,7 +240,7 @@ class _HeardSite:
         self._number: int | None = None
         self._complete_s: float | None = None  # since when the rest is known
 
-    def update(self, receiver: "TagReceiver", now_s: float, *, simulated: bool) -> BridgedSite | None:
+    def update(self, receiver: "SiteListener", now_s: float, *, simulated: bool) -> BridgedSite | None:
         """The site, or None while it is not complete. ``now_s`` is the host's monotonic clock."""
         number, heard = receiver.site, receiver.heard_site
         if number != self._number:

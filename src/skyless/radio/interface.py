@@ -8,6 +8,7 @@ from msgspec import Struct
 
 from skyless.core.air.reception import Reception, Transmission
 from skyless.core.constants import DEFAULT_ANTENNA_DELAY_TICKS
+from skyless.radio.tag_reports import Reported
 
 
 class AntennaDelays(Struct, frozen=True):
@@ -45,7 +46,7 @@ class Hint(Struct, frozen=True):
     text: str
 
 
-RadioEvent = Reception | Sent | Late | Restarted | Gone | Hint
+RadioEvent = Reception | Sent | Late | Restarted | Gone | Hint | Reported
 Listener = Callable[[RadioEvent], None]
 """Called from the event loop as soon as something happens; must return quickly and not raise."""
 

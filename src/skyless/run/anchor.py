@@ -21,6 +21,7 @@ from skyless.core.protocols import AnchorMachine, decode_any, new_anchor
 from skyless.core.site import Site, is_same_but_placed, largest_change_m, site_digest
 from skyless.core.ticks import difference
 from skyless.radio.interface import Gone, Late, Radio, RadioEvent, Restarted, Sent
+from skyless.radio.tag_reports import Reported
 from skyless.run.keys.node_keys import KEYS_S, AnchorKeys, AnchorReport, recent_faults
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
@@ -178,7 +179,7 @@ class AnchorNode:
             self.transmissions.missed += 1
             self.lead_s = min(self.lead_s * LEAD_GAIN, MAX_LEAD_S)
             self._wait(ASK_AGAIN_S, self._schedule)
-        else:
+        elif not isinstance(event, Reported):
             self.monitor.on_event(event)
             if isinstance(event, Restarted):
                 self.machine = self._new_machine()

@@ -21,8 +21,10 @@ from skyless.core.ticks import difference, wrap
 from skyless.radio.foreign.bitcraze import TDOA3
 from skyless.radio.interface import Gone, Hint, Late, Radio, RadioEvent, Restarted, Sent
 from skyless.radio.serial import link
+from skyless.radio.serial.board_settings import MODES
 from skyless.radio.serial.link import to_steps
 from skyless.radio.serial.pseudo_terminal import Pty
+from skyless.radio.tag_reports import BODY_AT
 from skyless.radio.uci.uci import (
     NO_LOCATION,
     RELATIVE_LOCATION,
@@ -33,7 +35,8 @@ from skyless.radio.uci.uci import (
     encode_relative,
     encode_session_info,
 )
-from skyless.run.process import Log
+from skyless.run.board_tag import BoardTag
+from skyless.run.process import HEALTH_S, Log, every, together
 
 Send = Callable[[bytes], bool]
 _EMULATED_FIRMWARE: Final = (0, 0, 0)
@@ -72,7 +75,9 @@ class LinkProtocol:
     """The serial link, as the firmware of real boards speaks it (``firmware/source/board.c``)."""
 
     def __init__(self, radio: Radio, send: Send, *, can_transmit: bool) -> None:
+        """One that only listens can be a tag by itself."""
         self._radio, self._send, self._can_transmit = radio, send, can_transmit
+        self.tag = None if can_transmit else BoardTag(self.report)
         self._reader, self._writer = link.Reader(), link.Writer()
         self._configured = self._receiving = self._wants_phases = False
         self._tx_delay_ticks = 0
@@ -83,7 +88,7 @@ class LinkProtocol:
     def on_radio_event(self, event: RadioEvent) -> None:
         """Send the records of an event, if the host has asked for them."""
         if isinstance(event, Reception):
-            self._report(event)
+            self._hear(event)
         elif isinstance(event, Sent | Late):
             dx_ticks = self._waiting.pop(event.tx_ticks, None)
             if dx_ticks is not None and isinstance(event, Sent):
@@ -95,9 +100,14 @@ class LinkProtocol:
             self._configured = self._receiving = False
             self._waiting.clear()
             self._send(b"\0")
+            if self.tag is not None:
+                self.tag.begin(self.tag.flash)
             self._hello()
 
-    def _report(self, reception: Reception) -> None:
+    def _hear(self, reception: Reception) -> None:
+        if self.tag is not None and self.tag.is_on:
+            self.tag.hear(reception)
+            return
         if not self._receiving:
             return
         self.counts["received"] += 1
@@ -124,16 +134,18 @@ class LinkProtocol:
             self._receiving = True
             self._status()
         elif kind == link.TX_AT and _is_frame(record[link.TX_FRAME_AT :]):
-            dx_ticks = int.from_bytes(record[link.BODY_AT : link.TX_FRAME_AT], "little")
+            dx_ticks = int.from_bytes(record[BODY_AT : link.TX_FRAME_AT], "little")
             self._transmit(dx_ticks, record[link.TX_FRAME_AT :])
         elif kind in (link.RX_ON, link.TX_AT):
             self._write(self._writer.refused(kind, link.REFUSED_MALFORMED))
+        elif kind in (link.SET_TAG_CONFIG, link.ASK_TAG_CONFIG, link.SET_TIME) and self.tag is not None:
+            self.tag.execute(record)
         else:
             self.counts["garbled"] += 1
 
     def _hello(self) -> None:
         name = self._radio.name.encode()[:8].ljust(8, b"\0")
-        abilities = link.HAS_PHASES | self._can_transmit * link.CAN_TRANSMIT
+        abilities = link.HAS_PHASES | (link.CAN_TRANSMIT if self.tag is None else link.CAN_COMPUTE)
         self._write(self._writer.hello(_EMULATED_FIRMWARE, name, abilities))
 
     def _status(self) -> None:
@@ -152,6 +164,8 @@ class LinkProtocol:
         self._tx_delay_ticks = int.from_bytes(record[8:10], "little")
         self._wants_phases = bool(record[link.CONFIG_BYTES - 1] & link.WANTS_PHASES)
         self._configured, self._receiving = True, False
+        if self.tag is not None:
+            self.tag.settings = replace(self.tag.settings, mode=MODES.index("radio"))
         self._status()
 
     def _transmit(self, dx_ticks: int, frame: bytes) -> None:
@@ -167,6 +181,10 @@ class LinkProtocol:
     def _late(self, dx_ticks: int, reason: int) -> None:
         self.counts["late"] += 1
         self._write(self._writer.tx_late(dx_ticks, reason))
+
+    def report(self, kind: int, body: bytes) -> None:
+        """Send a record of any kind."""
+        self._write(self._writer.record(kind, body))
 
     def _write(self, line: bytes) -> None:
         if not self._send(line):
@@ -412,7 +430,9 @@ class Board:
         """Serve until cancelled."""
         self.pty.start(self.protocol.on_host_data)
         try:
-            await self.radio.run(self._on_event)
+            tag = self.protocol.tag if isinstance(self.protocol, LinkProtocol) else None
+            seconds = () if tag is None else (every(HEALTH_S, tag.each_second),)
+            await together(self.radio.run(self._on_event), *seconds)
         finally:
             self.pty.close()
 

@@ -14,7 +14,7 @@ from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.foreign.foreign_radios import ListenerRadio, SnifferRadio, UciRadio
 from skyless.radio.interface import AntennaDelays, Radio
 from skyless.radio.serial.serial_port import check_path
-from skyless.radio.serial.serial_radio import SerialRadio
+from skyless.radio.serial.serial_radio import Computing, SerialRadio, until_next_start
 from skyless.run._dw1000_model import ModelPort
 
 DEFAULT_RADIO: Final = f"ether:127.0.0.1:{DEFAULT_PORT}"
@@ -60,11 +60,13 @@ def open_radios(
     delays: Sequence[AntennaDelays] | None = None,
     *,
     phases: bool | None = None,
+    computes: bool = False,
 ) -> tuple[Radio, ...]:
     """Radios for the nodes of one process, in the order of their names; nothing is connected yet.
 
     ``delays`` are the nodes' antenna delays, which their radios are set to. ``phases``: whether receptions are to have
-    the phase of their carrier, where the radio can measure it; None for those of tags.
+    the phase of their carrier, where the radio can measure it; None for those of tags. ``computes``: whether boards on
+    serial ports compute their own positions.
 
     Raises:
         SkylessError: there is no such radio; the message says what would be right.
@@ -90,8 +92,9 @@ def open_radios(
     if driver == "serial":
         ports = _ports(spec, where, _SERIAL_BAUD, names)
         transmits = kind == "anchor"
+        computing = Computing(until_next_start, keeps=False) if computes else None
         return tuple(
-            SerialRadio(*ports[i], name, settings[i], transmits=transmits, phases=phases)
+            SerialRadio(*ports[i], name, settings[i], transmits=transmits, phases=phases, computing=computing)
             for i, name in enumerate(names)
         )
     if driver in ("listener", "sniffer", "uci") and kind == "anchor":

@@ -14,10 +14,12 @@ from skyless.core.air.reception import Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD
-from skyless.core.tag.beacon_receiver import NOT_DROPS, TagReceiver
+from skyless.core.tag.beacon_receiver import NOT_DROPS, SiteListener, TagReceiver
 from skyless.core.tag.receiver import Receiver
 from skyless.core.trusted_receiver import GivenFix, SiteTrust, Trust, TrustedReceiver
 from skyless.radio.interface import Gone, Hint, Radio, RadioEvent, Restarted
+from skyless.radio.tag_reports import BoardFix, Reported
+from skyless.run.board_receiver import BoardReceiver
 from skyless.run.fix_log import FIX_LEAVES_S, FixListener, FixLog, PhaseLog
 from skyless.run.keys.node_keys import Remembered, TagMemory, TagReport, trust_reason
 from skyless.run.mqtt.address import MqttAddress
@@ -34,7 +36,7 @@ RECEPTIONS_S: Final = 0.05
 VERIFIED_S: Final = 2.0
 """Beacons that were received before this time do not count as verified any more."""
 
-HealthListener = Callable[[TagHealth, TagReceiver], None]
+HealthListener = Callable[[TagHealth, SiteListener], None]
 """Called with a tag's state, and with its receiver, which knows the site."""
 
 
@@ -50,6 +52,8 @@ class TagSettings(Struct, frozen=True):
     """Largest rate of fixes on MQTT. All of them count."""
     trust: SiteTrust | None = None
     """Which beacons and fixes are accepted, or None for a tag that does not know the site's public key."""
+    from_board: bool = False
+    """The boards compute, with settings of their own; of the others only ``publish_hz`` counts."""
 
 
 class TagNode:
@@ -76,6 +80,7 @@ class TagNode:
         self._memory = memory
         self._trusted = self._new_trusted()
         self._receiver = self.new_receiver()
+        self._board = BoardReceiver() if settings.from_board else None
         self._report = None if settings.trust is None else TagReport(radio.name, settings.trust.site, log)
         self._log, self._has_logged_multipath = log, False
         self._heard_s = 0.0  # when the last reception was processed
@@ -104,8 +109,12 @@ class TagNode:
         return TrustedReceiver(newest, self._new_verified_receiver, known.certificates)
 
     @property
-    def receiver(self) -> TagReceiver:
+    def receiver(self) -> SiteListener:
         """The one whose fixes are given."""
+        return self._hearing if self._board is None else self._board
+
+    @property
+    def _hearing(self) -> TagReceiver:
         return self._receiver if self._trusted is None else self._trusted.receiver
 
     @property
@@ -125,7 +134,8 @@ class TagNode:
 
     def complete(self, health: TagHealth) -> TagHealth:
         """A tag's state with what it knows of phases, of multipath and of verified beacons."""
-        trusted, health = self._trusted, replace(health, carrier_phase_anchors=self.receiver.phase_anchors)
+        trusted, phases = self._trusted, self.receiver.phase_anchors
+        health = replace(health, carrier_phase_anchors=phases, on_board=self._board is not None)
         if (multipath := self.receiver.multipath_m) is not None:
             health = replace(health, multipath_std_m=multipath[0], multipath_distance_m=multipath[1])
         if trusted is None:
@@ -173,18 +183,21 @@ class TagNode:
         """Process an event of the radio."""
         if isinstance(event, Reception):
             self._receive(event)
+        elif isinstance(event, Reported) and self._board is not None:
+            self._take(event, self._board)
         elif isinstance(event, Restarted | Gone | Hint):
             self.monitor.on_event(event)
             if isinstance(event, Restarted) and self.receptions:
                 self.check_trust()
                 self._receiver, self._trusted = self.new_receiver(), self._new_trusted()
+                self._board = self._board and BoardReceiver()
 
     def _receive(self, reception: Reception) -> None:
         self.receptions += 1
         if reception.host_s is not None and not self.fix_log.lateness.admits(reception.host_s, self._clock()):
             return
         if self._before is not None:
-            self._before(self.receiver, reception, self.fix_log.serial)
+            self._before(self._hearing, reception, self.fix_log.serial)
         given = self._fixes_of(reception)
         done_s = self._heard_s = self._clock()
         due_s = done_s if reception.host_s is None else reception.host_s
@@ -192,6 +205,12 @@ class TagNode:
         for one in given:
             ended_s = one.reception.host_s
             self.fix_log.add(one.fix, due_s if ended_s is None else ended_s, done_s, due_s)
+
+    def _take(self, event: Reported, board: BoardReceiver) -> None:
+        report, fix = event.report, board.take(event.report)
+        self.receptions = board.counters.total() - board.counters["fixes"]
+        if fix is not None and isinstance(report, BoardFix):
+            self.fix_log.add(fix, event.host_s - report.latency_s, event.host_s)
 
     def _fixes_of(self, reception: Reception) -> list[GivenFix]:
         """The fixes that a reception makes possible."""

@@ -95,6 +95,7 @@ class DemoFigures:
         here_p50_s, here_p99_s, _ = self.arrivals.drain()
         return {
             "tags": len(self.tags),
+            "boards": sum(health.on_board for health in healths),
             "fixes": sum(health.fixes for health in healths),
             "judged": self.judged,
             "rmse_m": None if errors is None else errors.rmse_3d_m if errors.rmse_2d_m is None else errors.rmse_2d_m,
@@ -131,8 +132,9 @@ def sentence(summary: dict[str, Any]) -> str:
     if summary["rmse_m"] is None or summary["updates_per_s"] is None:
         return f"{summary['tags']} tags with a fix; too short for errors and updates per second{late}"
     alerts = ", ".join(f"{alert} {count}" for alert, count in summary["alerts"].items() if alert != Alert.NONE)
+    boards = f" ({summary['boards']} of them on emulated boards)" if summary["boards"] else ""
     return (
-        f"{summary['tags']} tags, {summary['messages']} messages in {summary['duration_s']:.1f} s: "
+        f"{summary['tags']} tags{boards}, {summary['messages']} messages in {summary['duration_s']:.1f} s: "
         f"RMSE {100 * summary['rmse_m']:.1f} cm, largest error {100 * summary['max_m']:.1f} cm, "
         f"{summary['updates_per_s']:.0f} updates per second and tag, "
         f"99 % of fixes within {1e3 * (summary['fix_latency_p99_s'] or 0.0):.1f} ms of the frame"

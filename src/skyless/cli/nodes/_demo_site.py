@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Final
 
 from cyclopts import Parameter
@@ -54,6 +55,8 @@ class DemoOptions(ProtectionOptions, frozen=True, kw_only=True):
     """Seconds to run, from when all tags have a fix; by default until Ctrl-C."""
     tags: Annotated[int, whole(1, 200)] = 3
     """How many tags walk."""
+    boards: Annotated[int, whole(0, 200)] = 0
+    """How many of them, the last ones, are emulated boards that compute by themselves, with settings of new ones."""
     speed: WalkingSpeed = 1.0
     """How fast they walk in m/s."""
     noise_ps: Picoseconds = 100.0
@@ -99,6 +102,10 @@ class WholeSite:
         self.site = site_named(self._site_name)
         self._number = "--site-id", str(self.site.id)
         check_live(self.site, asked.method)
+        if asked.boards > asked.tags:
+            raise SkylessError(f"--boards is {asked.boards}; it should be at most --tags, which is {asked.tags}")
+        if asked.boards and self.site.schedule.mode != "free":
+            raise SkylessError(f"--boards is {asked.boards}; it should be 0 at a site with a master: boards know none")
         asked.requirement(asked.method)
         if asked.history is not None:
             extra_module("pyarrow", "--history")
@@ -108,6 +115,11 @@ class WholeSite:
         self.recording = _recording(asked.record, self._recordings)
         self.ether_port, self._ether_held = hold_any(_HOST)
         self.page_port, self._page_held = reserve_next(_HOST, _PAGE_PORT)
+        self._ports = TemporaryDirectory(prefix="skyless-demo-")
+        tags = [f"tag{number}" for number in range(1, asked.tags + 1)]
+        self._tags = tags[: asked.tags - asked.boards]
+        self.boards = {tag: Path(self._ports.name, tag) for tag in tags[len(self._tags) :]}
+        """The others, which are boards, and their serial ports."""
         self.figures = DemoFigures(planar=self.site.tags.height_m is not None)
         self.view: SiteView | None = None
         self.children: list[Child] = []
@@ -124,7 +136,7 @@ class WholeSite:
         Raises:
             SkylessError: the embedded broker cannot be started.
         """
-        with self._ether_held, self._page_held:
+        with self._ether_held, self._page_held, self._ports:
             if self.address is not None:
                 whole = self._run_with(self.address, None)
                 await outlasting(_cleared_at_the_end(self.address, self.site.id, self._log), whole)
@@ -167,7 +179,6 @@ class WholeSite:
             max_acceleration=asked.max_acceleration_mps2,
         )
         anchors = [str(anchor.id) for anchor in self.site.anchors]
-        tags = [f"tag{number}" for number in range(1, asked.tags + 1)]
         programs = [
             Program("ether", (*ether, "--carrier") if asked.carrier else ether),
             *(
@@ -176,7 +187,15 @@ class WholeSite:
             ),
             *(
                 Program(_named("tag", some), ("tag", *some, *radio, *mqtt, *computing))
-                for some in _groups(tags, 1 if asked.apart else _TAGS_PER_PROCESS)
+                for some in _groups(self._tags, 1 if asked.apart else _TAGS_PER_PROCESS)
+            ),
+            *(
+                Program(f"board {tag}", ("board", tag, *radio, "--link", str(port)))
+                for tag, port in self.boards.items()
+            ),
+            *(
+                Program(f"tag {tag}", ("tag", tag, "--radio", f"serial:{port}", "--from-board", *mqtt))
+                for tag, port in self.boards.items()
             ),
             Program("survey", ("survey", "--serve", *mqtt, *self._number), start_after_s=_SURVEY_DELAY_S),
         ]

@@ -115,7 +115,8 @@ def _tag(row: TagRow, errors_m: Mapping[str, float | None] | None) -> list[Text]
     why = _text(_ALERTS.get(alert, ""), "bold red" if ALERTS.get(alert, 0) > 1 else "yellow")
     if not fresh:
         why = _text((health.reason if health is not None else None) or "", "dim")
-    return [_text(row.name or row.tag, style), *(_text(one, style) for one in figures), age, why]
+    name = f"{row.name or row.tag}{' board' if health is not None and health.on_board else ''}"
+    return [_text(name, style), *(_text(one, style) for one in figures), age, why]
 
 
 def _anchor(row: AnchorRow) -> list[Text]:

@@ -86,6 +86,10 @@ class _Stage:
         if whole.address is not None:
             lines.append(f"fixes     {_subscriber(whole.address)} -t 'skyless/v1/#' -v")
         lines.append(f"air       --radio ether:127.0.0.1:{whole.ether_port}, for tags and anchors of your own")
+        for tag, port in whole.boards.items():
+            lines.append(
+                f"board     {tag} computes by itself (emulated), at {port}; skyless tag --from-board publishes it"
+            )
         if whole.recording is not None:
             lines.append(f"recording {whole.recording}")
         print(*lines, "Ctrl-C stops", sep="\n", file=sys.stderr if self._json else sys.stdout, flush=True)

@@ -40,6 +40,12 @@ if TYPE_CHECKING:
 
 _TAG_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
+_OF_BOARDS: Final = (
+    *("method", "qa", "dynamics", "tag_height_std", "site_id", "site_key", "trust", "clock_bound_ms"),
+    *("integrity_risk", "alert_limit_m", "max_acceleration_mps2"),
+)
+"""What the program of a board that computes is not told here."""
+
 app = App(name="tag", help_epilogue="Example: skyless tag tag1 --print")
 
 
@@ -72,6 +78,8 @@ class TagOptions(ProtectionOptions, frozen=True, kw_only=True):
     to: Annotated[tuple[str, ...], Text(lambda _, text: text, many=True)] = ()
     """Where fixes go as well, without a broker: a program or device of another kind; may be given several times.
     skyless bridge --help lists the targets, as nmea+tcp://:10110."""
+    from_board: bool = False
+    """Publish what the boards compute themselves (serial:PATH), with the settings of skyless flash-config."""
     site_key: Annotated[Path | None, Parameter(env_var="SKYLESS_SITE_KEY")] = None
     """File with the site's public key, the site.public of skyless site keys: beacons of that site alone are accepted,
     and their codes verified."""
@@ -120,6 +128,12 @@ def tag(
         why = "it is for sniffers and FiRa boards; other tags hear from the air where anchors stand"
         asked.leave_out("anchors", "tag_height", why=why)
         tags = _on_radios
+    if asked.from_board:
+        if not asked.radio.startswith("serial:"):
+            raise SkylessError(
+                f"--radio is {asked.radio!r}; with --from-board it should be a board, serial:PATH[@BAUD]"
+            )
+        asked.leave_out(*_OF_BOARDS, why="the board computes, with the settings of skyless flash-config")
     bridge = TagBridge(hub_of(asked.to, address), lambda: is_simulated(asked.radio), log) if asked.to else None
     serve = tags(names, asked, address, _listener(lines, bridge), bridge)
     others = [part.run() for part in (lines, bridge) if part is not None]
@@ -154,8 +168,9 @@ def _on_radios(
         integrity=required,
         publish_hz=asked.publish_hz,
         trust=trust,
+        from_board=asked.from_board,
     )
-    radios = open_radios(asked.radio, "tag", names)
+    radios = open_radios(asked.radio, "tag", names, computes=asked.from_board)
     return Tags(settings, radios, address, log, on_fix, None if bridge is None else bridge.on_health).run()
 
 

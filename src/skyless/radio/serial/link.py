@@ -7,16 +7,18 @@ what real ones do. Ticks are numbers of 40 bits.
 
 import struct
 from binascii import crc_hqx
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from msgspec import Struct
 
 from skyless.core.air.reception import Diagnostics
+from skyless.radio.serial.board_settings import BoardSettings, pack, unpack
+from skyless.radio.tag_reports import BODY_AT, TagReport, anchor_place, board_fix, board_status, georeference
 
 MAJOR: Final = 1
 """Ends with different major versions cannot work together."""
-MINOR: Final = 2
+MINOR: Final = 3
 """Grows with fields that are appended and kinds that are added, which an older end ignores."""
 
 # From the board
@@ -27,6 +29,11 @@ TX_LATE: Final = 0x04
 STATUS: Final = 0x05
 REFUSED: Final = 0x06
 RX_PHASE: Final = 0x07
+FIX: Final = 0x08
+TAG_STATUS: Final = 0x09
+ANCHOR_PLACE: Final = 0x0A
+GEOREFERENCE: Final = 0x0B
+TAG_CONFIG: Final = 0x0C
 
 # From the host
 ASK_HELLO: Final = 0x41
@@ -34,12 +41,15 @@ CONFIG: Final = 0x42
 TX_AT: Final = 0x43
 RX_ON: Final = 0x44
 ASK_STATUS: Final = 0x45
+SET_TAG_CONFIG: Final = 0x46
+ASK_TAG_CONFIG: Final = 0x47
+SET_TIME: Final = 0x48
 
-BODY_AT: Final = 2
-"""Where a record's body begins, after kind and number."""
 RX_FRAME_AT: Final = 13
 RX_PHASE_FRAME_AT: Final = 15
 TX_FRAME_AT: Final = 7
+SETTINGS_AT: Final = 3
+"""In both records of settings, after flags."""
 MAX_FRAME_BYTES: Final = 127
 
 HELLO_BYTES: Final = 21
@@ -54,9 +64,12 @@ NO_VOLTAGE: Final = 0xFFFF
 
 CAN_TRANSMIT: Final = 0x01
 HAS_PHASES: Final = 0x02
+CAN_COMPUTE: Final = 0x04
 """Capabilities in HELLO."""
 WANTS_PHASES: Final = 0x01
 """Flag in CONFIG: receptions with a phase are to be reported as RX_PHASE."""
+IN_FLASH: Final = 0x01
+"""Flag in the records of settings: they are to be kept in flash, or are kept there."""
 RESET_BY_PIN: Final = 0x01
 RESET_BY_WATCHDOG: Final = 0x02
 RESET_BY_SOFTWARE: Final = 0x04
@@ -196,6 +209,10 @@ class Writer:
         """Send ``frame`` so that its RMARKER leaves the radio at ``dx_ticks``."""
         return self.record(TX_AT, _stamp(dx_ticks) + frame)
 
+    def set_tag_config(self, settings: BoardSettings, *, keep: bool) -> bytes:
+        """Work with these settings from now on; ``keep``: in flash, too."""
+        return self.record(SET_TAG_CONFIG, bytes((keep * IN_FLASH,)) + pack(settings))
+
 
 def _stamp(ticks: int) -> bytes:
     return ticks.to_bytes(5, "little")
@@ -269,6 +286,7 @@ class Hello(Struct, frozen=True):
     reset_cause: int | None
     """Why it has started, as bits (``RESET_BY_PIN`` …); None for a board of version 1.0."""
     has_phases: bool = False
+    can_compute: bool = False
 
 
 class Heard(Struct, frozen=True, gc=False):
@@ -319,7 +337,14 @@ class NotDone(Struct, frozen=True):
     reason: int
 
 
-Record = Hello | Heard | Done | TooLate | Status | NotDone
+class TagConfig(Struct, frozen=True):
+    """The settings in use, and whether flash holds them."""
+
+    settings: BoardSettings
+    in_flash: bool
+
+
+Record = Hello | Heard | Done | TooLate | Status | NotDone | TagConfig | TagReport
 
 
 def decode(record: bytes) -> Record | str:
@@ -376,8 +401,11 @@ def _hello(record: bytes) -> Hello | None:
     *firmware, device_id, rate_khz, bits, abilities = struct.unpack_from("<3B8sIBB", record, 4)
     can_transmit = bool(abilities & CAN_TRANSMIT)
     reset_cause = record[HELLO_BYTES] if len(record) > HELLO_BYTES else None
-    has_phases = bool(abilities & HAS_PHASES)
-    return Hello(major, minor, tuple(firmware), device_id, rate_khz, bits, can_transmit, reset_cause, has_phases)
+    return Hello(
+        *(major, minor, tuple(firmware), device_id, rate_khz, bits, can_transmit, reset_cause),
+        has_phases=bool(abilities & HAS_PHASES),
+        can_compute=bool(abilities & CAN_COMPUTE),
+    )
 
 
 def _heard(record: bytes) -> Heard | None:
@@ -423,7 +451,12 @@ def _refused(record: bytes) -> NotDone | None:
     return NotDone(record[2], record[3]) if len(record) >= 4 else None
 
 
-_DECODERS: Final = {
+def _tag_config(record: bytes) -> TagConfig | None:
+    settings = unpack(record[SETTINGS_AT:])
+    return None if settings is None else TagConfig(settings, bool(record[BODY_AT] & IN_FLASH))
+
+
+_DECODERS: Final[dict[int, Callable[[bytes], Record | None]]] = {
     HELLO: _hello,
     RX: _heard,
     TX_DONE: _done,
@@ -431,4 +464,9 @@ _DECODERS: Final = {
     STATUS: _status,
     REFUSED: _refused,
     RX_PHASE: _heard_with_phase,
+    FIX: board_fix,
+    TAG_STATUS: board_status,
+    ANCHOR_PLACE: anchor_place,
+    GEOREFERENCE: georeference,
+    TAG_CONFIG: _tag_config,
 }

@@ -6,12 +6,17 @@ from collections import Counter, deque
 from collections.abc import Callable
 from typing import Final
 
+from msgspec import Struct
+from msgspec.structs import replace
+
 from skyless.core.air.reception import Reception, Transmission
 from skyless.core.ticks import wrap
 from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Listener, RadioEvent, Restarted, Sent, ignore
 from skyless.radio.serial import link
-from skyless.radio.serial.link import Done, Heard, Hello, NotDone, Record, Status, TooLate, decode
+from skyless.radio.serial.board_settings import MODES, OUTPUTS, BoardSettings, pack
+from skyless.radio.serial.link import Done, Heard, Hello, NotDone, Record, Status, TagConfig, TooLate, decode
 from skyless.radio.serial.serial_port import BoardClock, SerialPort
+from skyless.radio.tag_reports import Reported
 
 STATUS_S: Final = 0.5
 """Interval at which a board is asked for its state."""
@@ -47,6 +52,20 @@ _RESET_CAUSES: Final = {
 }
 
 
+class Computing(Struct, frozen=True):
+    """How a host has a board work that is a tag by itself."""
+
+    change: Callable[[BoardSettings], BoardSettings]
+    """Gets its settings and returns those that it should have."""
+    keeps: bool
+    """Whether flash is to hold them."""
+
+
+def until_next_start(settings: BoardSettings) -> BoardSettings:
+    """A tag that sends records to its host."""
+    return replace(settings, mode=MODES.index("tag"), output=OUTPUTS.index("records"))
+
+
 class LinkSession:
     """The link to one board from the opening of its port. No I/O, no clock."""
 
@@ -60,19 +79,22 @@ class LinkSession:
         *,
         transmits: bool = False,
         phases: bool = False,
+        computing: Computing | None = None,
     ) -> None:
         """``port`` is its name in messages; ``transmits``: refuse a board that only listens.
 
-        ``phases``: ask a board that can for the phases of carriers.
+        ``phases``: ask a board that can for the phases of carriers; ``computing``: it is a tag by itself.
         """
         self.clock = BoardClock()
         self.ready = False
         self.hello: Hello | None = None
         self.status: Status | None = None
         """The newest one."""
+        self.tag_config: TagConfig | None = None
+        """The settings of a board that computes, as it last said."""
         self.counters = counters
         self._port, self._delays, self._send, self._listener = port, delays, send, listener
-        self._transmits, self._phases = transmits, phases
+        self._transmits, self._phases, self._computing = transmits, phases, computing
         self._reader, self._writer = link.Reader(), link.Writer()
         self._expected: int | None = None
         """Number of the next record."""
@@ -188,8 +210,14 @@ class LinkSession:
             self._on_status(record, host_s)
         elif isinstance(record, Hello):
             self._on_hello(record, host_s)
-        else:
+        elif isinstance(record, NotDone):
             self._on_refusal(record)
+        elif self._computing is None:
+            pass  # of a tag
+        elif isinstance(record, TagConfig):
+            self._on_tag_config(record, self._computing)
+        elif self.ready:
+            self._listener(Reported(record, host_s))
 
     def _on_sent(self, record: Done) -> None:
         tx_ticks = self._pending.pop(record.dx_ticks, None)
@@ -203,6 +231,7 @@ class LinkSession:
         """Configure a board of this version; after a repeated HELLO its status shows whether it has restarted."""
         if self.hello is not None and host_s - self._asked_s > _HELLO_ANSWER_S:
             self._count_start(host_s, hello.reset_cause)
+            self.ready = self.ready and self._computing is None  # others say by their status that they have restarted
         is_repeated, self.hello = self.hello is not None and not self._refused, hello
         if hello.major != link.MAJOR:
             self._refuse(
@@ -216,9 +245,13 @@ class LinkSession:
             )
         elif self._transmits and not hello.can_transmit:
             self._refuse(f"the board at {self._port} only listens; an anchor needs one that can transmit")
+        elif self._computing is not None and not hello.can_compute:
+            self._refuse(
+                f"the board at {self._port} computes no positions; it needs the firmware of this release of Skyless"
+            )
         else:
             self._refused = ""
-            if is_repeated:
+            if is_repeated and self._computing is None:
                 self._send(self._writer.ask_status())
             else:
                 self._configure()
@@ -250,24 +283,44 @@ class LinkSession:
 
     def _on_refusal(self, refusal: NotDone) -> None:
         """A board that refuses its configuration cannot be used; other refusals are counted."""
-        if refusal.command == link.CONFIG:
+        if refusal.command in (link.CONFIG, link.SET_TAG_CONFIG):
             why = _REASONS.get(refusal.reason, f"reason {refusal.reason}")
             self._refuse(f"the board at {self._port} refuses its configuration: {why}")
         else:
             self.counters["refused-command"] += 1
 
     def _configure(self) -> None:
+        if self._computing is not None:
+            self._send(self._writer.record(link.SET_TIME, (time.time_ns() // 1000).to_bytes(8, "little")))
+            self._send(self._writer.record(link.ASK_TAG_CONFIG))
+            self.tag_config = None
+            return
         asks = self._phases and self.hello is not None and self.hello.has_phases
         flags = link.WANTS_PHASES if asks else 0
         self._send(self._writer.config(self._delays.tx_ticks, self._delays.rx_ticks, flags))
         self._send(self._writer.rx_on())
+
+    def _on_tag_config(self, config: TagConfig, computing: Computing) -> None:
+        """Ask once for what is to be changed; with the answer to that the board is ready."""
+        is_answer, self.tag_config = self.tag_config is not None, config
+        wanted = computing.change(config.settings)
+        is_same = pack(wanted) == pack(config.settings) and config.in_flash >= computing.keeps
+        if not is_same and not is_answer:
+            self._send(self._writer.set_tag_config(wanted, keep=computing.keeps))
+        elif not self.ready and not self._refused:
+            self._begin_to_report()
+
+    def _begin_to_report(self) -> None:
+        self.ready, self._reported = True, ""
+        self._idle_polls, self._reported_idle = 0, False
+        self._listener(Restarted())
 
     def _on_status(self, status: Status, host_s: float) -> None:
         if self.status is not None:
             self._count("rx-error", max(status.errors - self.status.errors, 0))
         self._check_line(status, was_polled=self.status is not None and self.status.polled)
         self.status = status
-        if self._refused:
+        if self._refused or self._computing is not None:  # which may sleep between its fixes
             return
         if not status.receiving:
             if self.ready:  # it has restarted
@@ -281,9 +334,7 @@ class LinkSession:
             self.clock.reset()
         self.clock.update(status.ticks, host_s)
         if not self.ready:
-            self.ready, self._reported = True, ""
-            self._idle_polls, self._reported_idle = 0, False
-            self._listener(Restarted())
+            self._begin_to_report()
 
     def _check_line(self, status: Status, *, was_polled: bool) -> None:
         """Count when the board begins to poll its radio, and report it once."""
@@ -327,13 +378,14 @@ class SerialRadio:
         *,
         transmits: bool = False,
         phases: bool = False,
+        computing: Computing | None = None,
     ) -> None:
-        """``transmits``: refuse a board that only listens; ``phases``: ask one that can for the phases of carriers."""
+        """``transmits``, ``phases`` and ``computing`` as in ``LinkSession``."""
         self.name = name
         self.counters: Counter[str] = Counter()
         self.lead_s = _LEAD_S
         self._delays = AntennaDelays() if delays is None else delays
-        self._transmits, self._phases = transmits, phases
+        self._transmits, self._phases, self._computing = transmits, phases, computing
         self._port = SerialPort(path, baud, lambda reason: self._listener(Gone(reason)))
         self._listener: Listener = ignore
         self._session: LinkSession | None = None
@@ -342,6 +394,11 @@ class SerialRadio:
     def hello(self) -> Hello | None:
         """What the board has said of itself; None while none has answered."""
         return None if self._session is None else self._session.hello
+
+    @property
+    def tag_config(self) -> TagConfig | None:
+        """The settings of a board that computes; None while it has not said them."""
+        return None if self._session is None else self._session.tag_config
 
     async def run(self, listener: Listener) -> None:
         """Receive until cancelled; a board that is unplugged is looked for."""
@@ -395,6 +452,7 @@ class SerialRadio:
             self.counters,
             transmits=self._transmits,
             phases=self._phases,
+            computing=self._computing,
         )
         self._session.begin(time.monotonic())
 

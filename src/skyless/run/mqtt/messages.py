@@ -179,6 +179,8 @@ class TagHealth(Struct, frozen=True):
     """The distance walked within which they do."""
     carrier_phase_anchors: tuple[int, ...] = ()
     """Identifiers of the anchors the phases of whose carriers are in use."""
+    on_board: bool = False
+    """Whether the tag's board computes, and its program only passes on what that says."""
     battery_share: float | None = None
     """What is left in the tag's battery, from 0 to 1; None where it is not known."""
 

@@ -21,7 +21,7 @@ from skyless.core.tag.beacon_receiver import TagReceiver
 from skyless.core.tag.factory import ReceiverState
 from skyless.run.mqtt.messages import Leases, RawReception, ReceptionsMessage, RequestMessage, SegmentStart
 
-_FORMAT: Final = 20
+_FORMAT: Final = 21
 _MAX_BYTES: Final = 1 << 23
 """Enough for an estimator of a hundred anchors."""
 
