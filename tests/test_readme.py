@@ -70,7 +70,8 @@ PLAN = "tests/cli/test_plan_command.py::"
 BENCHMARK = "tests/replay/test_benchmark.py::"
 REPLAY = "tests/cli/test_replay_command.py::"
 ELSEWHERE = {
-    "scripts/run": DEMO + "test_a_pipe_gets_the_places_and_the_tables_once_also_when_it_is_terminated",
+    "scripts/run": DEMO
+    + "test_a_pipe_gets_the_places_and_the_tables_once_also_when_it_is_terminated_and_a_tag_is_a_board",
     "scripts/test unit": "the run that this test is part of",
     "scripts/run --version": "tests/cli/test_program.py::test_version",
     'export PATH="$PWD/.venv/bin:$PATH"': "the run that this test is part of",
@@ -87,8 +88,8 @@ ELSEWHERE = {
     "skyless doctor --radio serial:/dev/ttyACM0 --mqtt none --duration 30": DOCTOR,
     **dict.fromkeys(commands(EVERYDAY_PAGE)[1:], EVERYDAY),
     "skyless broker": BROKER + "test_it_leaves_no_orphan_however_it_ends",
-    "skyless ether --site hall.toml --tags 2": SITE,
-    "skyless anchor 1 2 3 4 5 6 --site hall.toml": SITE,
+    **dict.fromkeys(("skyless ether", "skyless ether --site hall.toml --tags 2"), SITE),
+    **dict.fromkeys(("skyless anchor 1 2 3 4 5 6", "skyless anchor 1 2 3 4 5 6 --site hall.toml"), SITE),
     "skyless tag tag1 tag2": SITE,
     "skyless anchor 3 --site hall.toml --keys /etc/skyless/keys": KEYED,
     "skyless tag tag1 --site-key site.public --trust verified": KEYED,
@@ -113,6 +114,28 @@ ELSEWHERE = {
     ),
     "skyless tag tag1 --radio serial:/tmp/tag1": (
         BOARD + "test_anchors_and_tags_on_boards_make_the_fixes_of_those_on_the_air_and_survive_pulled_plugs"
+    ),
+    **dict.fromkeys(
+        (
+            "skyless flash-config --radio serial:/dev/ttyACM0 --mode tag --output nmea --rate-hz 10 --baud 115200",
+            "skyless flash-config --radio serial:/tmp/tag1 --mode tag --rate-hz 50",
+            "skyless flash-config --mode tag --sleep-s 1 --receive expected",
+        ),
+        "tests/radios/test_board_setup.py::test_the_command_shows_what_flash_holds",
+    ),
+    **dict.fromkeys(
+        (
+            "skyless tag tag1 --radio serial:/dev/ttyACM0@115200 --from-board",
+            "skyless tag tag1 --radio serial:/tmp/tag1 --from-board --json",
+        ),
+        "tests/nodes/test_tag_on_board.py::test_fixes_states_and_alerts_of_a_board_are_published_and_written_as_lines",
+    ),
+    "skyless demo --boards 1": DEMO
+    + "test_a_pipe_gets_the_places_and_the_tables_once_also_when_it_is_terminated_and_a_tag_is_a_board",
+    **dict.fromkeys(
+        ("gpsd -N -n /dev/ttyACM0", "cgps"),
+        "tests/firmware/test_board_and_gpsd.py::"
+        "test_gpsd_has_the_position_and_its_errors_whether_the_board_knows_the_time_or_not",
     ),
     "mosquitto_sub -t 'skyless/#' -v": MQTT,
     "mosquitto_sub -t 'skyless/v1/+/tag/+/fix'": MQTT,

@@ -1,10 +1,7 @@
 """The real gpsd reads NMEA from each sender, and its clients get the fixes of a simulated tag."""
 
 import asyncio
-import json
-import shutil
 import socket
-from contextlib import asynccontextmanager
 from datetime import UTC, datetime
 from math import atan2, cos, degrees, hypot, radians, sqrt
 
@@ -19,9 +16,9 @@ from skyless.bridges.targets import open_route
 from skyless.core.earth import geodetic, rotated
 from skyless.core.site import GeoreferenceSite
 from skyless.run.mqtt.messages import FixMessage
+from support.gpsd import ANSWER_S, GPSD, connected, gpsd
 from support.processes import free_port
 
-GPSD = shutil.which("gpsd") or shutil.which("gpsd", path="/usr/sbin")
 pytestmark = [pytest.mark.site, pytest.mark.skipif(GPSD is None, reason="gpsd is not installed: apt-get install gpsd")]
 
 HALL = GeoreferenceSite(latitude_deg=52.513, longitude_deg=13.4, height_m=40.0, heading_deg=25.0)
@@ -29,8 +26,6 @@ SITE = BridgedSite(1, "lab", simulated=True, anchors_m={}, georeference=HALL)
 FIRST_S = 1_790_000_000.0
 EPOCHS = 110
 """The first few are for gpsd to learn which sentence ends an epoch; acceptance counts the last hundred."""
-ANSWER_S = 20.0
-"""For gpsd on a machine that does much else."""
 
 
 @pytest.fixture(scope="module")
@@ -50,48 +45,6 @@ def fixes():
         )
         for number in range(EPOCHS)
     ]  # fmt: skip
-
-
-class Client:
-    """One of gpsd's clients."""
-
-    def __init__(self, reader):
-        self._reader = reader
-
-    async def receive(self, wanted):
-        """The first report that is wanted."""
-        while True:
-            report = json.loads(await asyncio.wait_for(self._reader.readline(), ANSWER_S))
-            if wanted(report):
-                return report
-
-
-async def connected(port):
-    """Reader and writer of a connection, as soon as somebody listens."""
-    async with asyncio.timeout(ANSWER_S):
-        while True:
-            try:
-                return await asyncio.open_connection("127.0.0.1", port)
-            except ConnectionRefusedError:
-                await asyncio.sleep(0.05)
-
-
-@asynccontextmanager
-async def gpsd(device):
-    """A gpsd of its own that reads the device, and a client that watches it."""
-    port = free_port()
-    process = await asyncio.create_subprocess_exec(
-        GPSD, "-N", "-n", "-S", str(port), device,
-        stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL,
-    )  # fmt: skip
-    try:
-        reader, writer = await connected(port)
-        writer.write(b'?WATCH={"enable":true,"json":true}\n')
-        yield Client(reader)
-        writer.close()
-    finally:
-        process.terminate()
-        await process.wait()
 
 
 def distance_m(a, b):

@@ -158,8 +158,8 @@ def test_json_also_where_ports_are_taken_and_nothing_can_be_written_at_home(tmp_
     assert summary["broker"] in demo.said
 
 
-def test_a_pipe_gets_the_places_and_the_tables_once_also_when_it_is_terminated(tmp_path):
-    demo = Demo(tmp_path, "--tags", "2")
+def test_a_pipe_gets_the_places_and_the_tables_once_also_when_it_is_terminated_and_a_tag_is_a_board(tmp_path):
+    demo = Demo(tmp_path, "--tags", "2", "--boards", "1")
     demo.wait_until_it_runs(tags=2)
     time.sleep(3.0)  # errors count from a second after the first fix, rates between two reports of health
     code, out = demo.end(signal.SIGTERM)
@@ -170,9 +170,11 @@ def test_a_pipe_gets_the_places_and_the_tables_once_also_when_it_is_terminated(t
     assert re.search(r"^broker    mqtt://127\.0\.0\.1:\d+$", out, re.MULTILINE)
     rows = [line for line in out.splitlines() if line.startswith("tag")]
     assert [row.split()[0] for row in rows] == ["tags", "tag1", "tag2"]
+    assert [" board " in row for row in rows] == [False, False, True]
+    assert re.search(r"^board     tag2 computes by itself \(emulated\), at /", out, re.MULTILINE)
     assert "error/cm" in rows[0]
     assert not any("…" in row for row in rows)
-    assert re.search(r"2 tags, \d+ messages in \d+\.\d s: RMSE", out.splitlines()[-1])
+    assert re.search(r"2 tags \(1 of them on emulated boards\), \d+ messages in \d+\.\d s: RMSE", out.splitlines()[-1])
     assert len(list((tmp_path / "skyless" / "recordings").glob("*.mcap"))) == 1
 
 

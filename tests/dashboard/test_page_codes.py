@@ -66,12 +66,15 @@ def test_a_tag_says_how_far_its_position_is_verified(hall):
     page.locator("#panel-tags button.name:text-is('robot')").wait_for()
 
 
-def test_a_tag_names_the_anchors_whose_phases_it_uses(hall):
+def test_a_tag_names_the_anchors_whose_phases_it_uses_and_whether_its_board_computes(hall):
     server, page = hall
     read = facts(page, "tag", "forklift")
-    assert "Carrier phases" not in page.evaluate(read)
-    server.tag_reports = {"forklift": {"carrier_phase_anchors": [1, 2, 5]}}
+    shown = page.evaluate(read)
+    assert "Carrier phases" not in shown
+    assert shown["Method"][0] == "joint"
+    server.tag_reports = {"forklift": {"carrier_phase_anchors": [1, 2, 5], "on_board": True}}
     until(page, f"({read})()['Carrier phases']?.[0] === 'of anchors 1, 2, 5'")
+    assert page.evaluate(read)["Method"][0].startswith("joint, on its board")
     server.tag_reports = {"forklift": {"carrier_phase_anchors": []}}
     until(page, f"!('Carrier phases' in ({read})())")
 

@@ -1,11 +1,11 @@
-"""The brokers of ``tests/mqtt`` serve here too."""
+"""The brokers of ``tests/mqtt`` and the boards of ``tests/radios`` serve here too."""
 
 import sys
 from pathlib import Path
 
 import pytest
 
-sys.path.append(str(Path(__file__).parents[1] / "mqtt"))
+sys.path += [str(Path(__file__).parents[1] / name) for name in ("mqtt", "radios")]
 
 
 @pytest.fixture

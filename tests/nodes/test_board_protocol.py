@@ -4,22 +4,32 @@ import random
 from collections import Counter
 
 import pytest
+from msgspec.structs import replace
 
+from skyless.core.air.almanac import GeoreferencePage
 from skyless.core.air.frame import Heard
 from skyless.core.air.ieee802154 import fcs
 from skyless.core.air.masterless_packets import Packet, Relay
 from skyless.core.air.reception import Reception, Transmission
+from skyless.core.alert import Alert
+from skyless.core.anchor.anchor import Anchor as FreeAnchor
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
+from skyless.core.integrity import IntegrityRequirement
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.protocol1.beacon import Beacon
 from skyless.core.protocol1.codec import encode
+from skyless.core.site import GeoreferenceSite
+from skyless.core.tag.receiver import Receiver
 from skyless.radio.foreign.foreign_radios import SnifferStream
 from skyless.radio.interface import Late, Restarted, Sent
 from skyless.radio.serial import link
-from skyless.radio.serial.link import Done, Hello, NotDone, Status, TooLate, decode
+from skyless.radio.serial.board_settings import BoardSettings
+from skyless.radio.serial.link import Done, Hello, NotDone, Status, TagConfig, TooLate, decode
+from skyless.radio.serial.link import Heard as HeardFrame
 from skyless.run.board import LinkProtocol, SnifferProtocol
+from skyless.run.board_receiver import BoardReceiver
 from skyless.sim.impairments import lab_impairments
-from skyless.sim.lab import paper_lab_site
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.sim.world import World
@@ -72,7 +82,7 @@ class Host:
 def test_it_greets_and_is_configured_step_by_step():
     host = Host(can_transmit=False)
     (hello,) = host.say(host.writer.ask_hello())
-    assert hello == Hello(1, 2, (0, 0, 0), b"a board ", 63_897_600, 40, False, 0, True)
+    assert hello == Hello(1, 3, (0, 0, 0), b"a board ", 63_897_600, 40, False, 0, True, True)
     (status,) = host.say(host.writer.ask_status())
     assert (status.ticks, status.configured, status.receiving) == (77, False, False)
     assert host.say(host.writer.rx_on()) == [NotDone(link.RX_ON, link.REFUSED_MALFORMED)]
@@ -194,3 +204,45 @@ def test_a_beacon_becomes_a_packet_of_a_tdoa3_system(knows_binary):
     assert packet == Packet(None, 2, 200 % 128, 2**32 - 5, 2**40 - 1, relays)
     assert speech.drops == {"not-translated": 1}
     assert not drops
+
+
+def test_a_tag_on_a_board_makes_the_receiver_s_fixes_and_says_where_its_anchors_are():
+    site = replace(lab_site(), georeference=GeoreferenceSite(52.5, -13.4, 40.0, 120.0))
+    world = World(site, lambda anchor: FreeAnchor(site, anchor), [TagSpec(Static(1.0, 1.0))], lab_impairments(100.0), 1)
+    heard = [reception for broadcast in world.run(2.0) for _, reception, _ in broadcast.receptions()]
+    settings = BoardSettings(mode=1, rate_hz=0, tag=9, qa_m2ps3=0.5, alert_limit_m=0.2)
+    host, integrity = Host(can_transmit=False), IntegrityRequirement(alert_limit_m=0.2)
+    board, receiver = BoardReceiver(), Receiver(qa=0.5, integrity=integrity)
+    assert host.say(host.writer.set_tag_config(settings, keep=False)) == [TagConfig(settings, in_flash=False)]
+    assert host.say(host.writer.record(link.SET_TIME, bytes(8))) == []
+    made = []
+    for reception in heard:
+        host.said.clear()
+        host.board.on_radio_event(replace(reception, host_s=None))
+        expected = receiver.hear(reception)
+        fixes = [fix for fix in map(board.take, host.said) if fix is not None]
+        assert len(fixes) == (expected is not None)
+        made += zip(fixes, [expected], strict=False)
+    assert len(made) > 300
+    for fix, expected in made:
+        assert (fix.anchors, fix.height_known, fix.alert) == (expected.anchors, expected.height_known, expected.alert)
+        assert fix.time_s == pytest.approx(expected.time_s, abs=1e-10)
+        assert fix.position_m == pytest.approx(expected.position_m, abs=5.1e-4)
+        assert fix.anchors_m == pytest.approx(expected.anchors_m, abs=5.1e-4)
+        for name in ("covariance_m2", "velocity_covariance", "chi2", "residual_rms_m"):
+            assert getattr(fix, name) == pytest.approx(getattr(expected, name), rel=1e-6, abs=1e-12)
+        assert (fix.hpl_m or 0.0) == pytest.approx(expected.hpl_m or 0.0, rel=1e-6)
+    assert Alert.LIMIT in {fix.alert for fix, _ in made}
+    assert board.heard_site.georeference == GeoreferencePage(52.5, -13.4, 40.0, 120.0)
+
+    host.said.clear()
+    host.board.tag.each_second()
+    (status,) = host.said
+    assert (status.site, status.reason) == (site.id, None)
+    assert status.counters["heard"] == len(heard)
+    assert status.counters["fixes"] == receiver.counters["fixes"]
+    host.ready()
+    host.said.clear()
+    host.board.tag.each_second()
+    host.board.on_radio_event(heard[0])
+    assert [type(said) for said in host.said] == [HeardFrame]

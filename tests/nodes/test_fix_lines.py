@@ -35,7 +35,7 @@ class PlayedRadio(FakeRadio):
 
 @pytest.fixture
 def played(monkeypatch):
-    monkeypatch.setattr(command, "open_radios", lambda *_: [PlayedRadio("one")])
+    monkeypatch.setattr(command, "open_radios", lambda *_, **__: [PlayedRadio("one")])
 
 
 def test_a_csv_table_names_its_units(played, capfd):
@@ -82,7 +82,7 @@ class Gone(io.StringIO):
 def test_a_reader_that_goes_away_ends_the_program(capfd, monkeypatch, error, code, said):
     monkeypatch.setattr("skyless.cli.nodes._fix_lines._standard_output", lambda: Gone(error))
     monkeypatch.setattr("skyless.cli.main._drop_output", lambda: None)
-    monkeypatch.setattr(command, "open_radios", lambda *_: [Endless("one")])
+    monkeypatch.setattr(command, "open_radios", lambda *_, **__: [Endless("one")])
     assert main([*TAG, "--csv"]) == code
     err = capfd.readouterr().err
     assert said in err

@@ -58,3 +58,19 @@ def test_the_demo_s_own_broker_keeps_nothing_after_its_end(link, monkeypatch):
 def test_the_ether_simulates_carriers_where_the_demo_is_asked_to(carrier):
     ether = WholeSite(DemoOptions(record="none", carrier=carrier), print)._programs(ADDRESS)[0]
     assert ("--carrier" in ether.arguments) == carrier
+
+
+def test_tags_that_are_boards_have_an_emulated_board_and_a_program_that_publishes():
+    whole = WholeSite(DemoOptions(record="none", tags=3, boards=2), print)
+    programs = {program.name: program.arguments for program in whole._programs(ADDRESS)}
+    assert list(whole.boards) == ["tag2", "tag3"]
+    assert programs["tag tag1"][:3] == ("tag", "tag1", "--radio")
+    for name, port in whole.boards.items():
+        assert programs[f"board {name}"][-2:] == ("--link", str(port))
+        assert programs[f"tag {name}"][:5] == ("tag", name, "--radio", f"serial:{port}", "--from-board")
+
+
+@pytest.mark.parametrize("asked", [DemoOptions(tags=2, boards=3), DemoOptions(paper=True, boards=1)])
+def test_boards_that_cannot_be_are_refused(asked):
+    with pytest.raises(SkylessError, match=r"--boards is \d; it should be"):
+        WholeSite(asked, print)

@@ -1,15 +1,18 @@
 """Boards behind pseudo-terminals whose radio the test plays, and hosts that are in touch with them."""
 
 import contextlib
+import ctypes
 from collections import Counter
 
 from radio_events import radio_events
 
 from skyless.radio.interface import Restarted
+from skyless.radio.serial import link
 from skyless.radio.serial.link import from_steps, to_steps
 from skyless.radio.serial.pseudo_terminal import Pty
 from skyless.radio.serial.serial_radio import SerialRadio
 from skyless.run.board import LinkProtocol
+from support.board_tag import ANCHORS, AnchorInC, OriginInC, StatusInC, fix_in_c
 
 
 def quantised(diagnostics):
@@ -34,9 +37,9 @@ class PlayedRadio:
 class PlayedBoard:
     """A board that speaks the link, plugged in as long as the context lasts."""
 
-    def __init__(self, link=None, can_transmit=True):
+    def __init__(self, place=None, can_transmit=True):
         self.radio = PlayedRadio()
-        self.pty = Pty(link)
+        self.pty = Pty(place)
         self.protocol = LinkProtocol(self.radio, self.pty.send, can_transmit=can_transmit)
 
     async def __aenter__(self):
@@ -50,9 +53,28 @@ class PlayedBoard:
         self.protocol.on_radio_event(reception)
 
 
+class ComputingBoard(PlayedBoard):
+    """A board that can be a tag by itself; it hears nothing, and says what the test has it say."""
+
+    def __init__(self):
+        super().__init__(can_transmit=False)
+        self.tag, self.report = self.protocol.tag, self.protocol.report
+
+    def report_all(self):
+        """What a tag with a fix says within ten seconds."""
+        for number, place_mm in ANCHORS:
+            self.report(link.ANCHOR_PLACE, bytes(AnchorInC(number, (ctypes.c_int32 * 3)(*place_mm))))
+        self.report(link.GEOREFERENCE, bytes(OriginInC(525_130_000, 134_000_000, 40_000, 0)))
+        self.report(link.TAG_STATUS, bytes(StatusInC(site=3, heard=100)))
+        self.report(link.FIX, fix_in_c().sent())
+
+
 @contextlib.asynccontextmanager
-async def linked(link=None, **kind):
+async def linked(place=None, **kind):
     """A board and a host that are in touch."""
-    async with PlayedBoard(link, **kind) as board, radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1")) as host:
+    async with (
+        PlayedBoard(place, **kind) as board,
+        radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1")) as host,
+    ):
         await host.until(Restarted)
         yield board, host

@@ -167,7 +167,7 @@ async def test_a_board_of_another_version_is_refused_in_words():
 
     board.protocol.on_host_data = answer
     async with board, radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1")) as host:
-        assert "has version 7.3 of the serial link, this program 1.2" in (await host.until(Gone)).reason
+        assert "has version 7.3 of the serial link, this program 1.3" in (await host.until(Gone)).reason
         await asyncio.sleep(1.2)
         assert len(host.events) == 1
         assert host.radio.now_ticks() is None
