@@ -49,7 +49,7 @@ class _Bench:
 
     def __init__(self, elf: Path) -> None:
         self.board, self.writer = LoneBoard(elf), Writer()
-        self.board.run(2e-3)
+        self.board.run(10e-3)
 
     def start(self, flags: int = 0) -> None:
         """Configure the board, have it receive, and let it measure temperature and supply."""
