@@ -29,7 +29,7 @@ static void real(struct text *text, float value, uint32_t decimals)
     text_real(text, value, decimals);
 }
 
-/* A sentence up to hhmmss.ss, which a board leaves empty that has not been told the time; where it begins. */
+/* A sentence up to hhmmss.ss, which is empty on a board that does not know the time; where it begins. */
 static uint32_t begin(struct text *text, const char *name, int64_t unix_us)
 {
     int64_t hundredths = ((unix_us + 5000) % DAY_US) / 10000;

@@ -1,4 +1,4 @@
-/* What a tag on a board is told once: kept in flash, and sent over the serial link (docs/serial.md), as the same bytes. */
+/* How a tag on a board works: kept in flash, and sent over the serial link (docs/serial.md), as the same bytes. */
 #ifndef SETTINGS_H
 #define SETTINGS_H
 

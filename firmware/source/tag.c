@@ -314,12 +314,12 @@ static void send_line(struct tag *tag)
 }
 
 /* Say where the tag is, or why it does not know. */
-static void tell(struct tag *tag, uint32_t at_us)
+static void say_position(struct tag *tag, uint32_t at_us)
 {
     char text[OUTPUT_MAX_BYTES];
     uint32_t size = 0u;
 
-    tag->told_us = at_us;
+    tag->said_us = at_us;
     if (tag->settings->output == OUTPUT_NMEA) {
         size = nmea_write(&tag->fix, text);
     } else if (tag->settings->output == OUTPUT_JSON) {
@@ -381,11 +381,11 @@ static bool sends_records(const struct tag *tag)
 /* What is due by the clock; whether anything was. */
 static bool say(struct tag *tag, uint32_t at_us)
 {
-    if (is_over(SILENT_US, tag->told_us, at_us) && is_over(SILENT_US, tag->fixed_us, at_us)) {
+    if (is_over(SILENT_US, tag->said_us, at_us) && is_over(SILENT_US, tag->fixed_us, at_us)) {
         tag->fix.reason = tag->reason;
         tag->fix.unix_us = unix_us_at(tag, at_us);
         tag->has_fix = false;
-        tell(tag, at_us);
+        say_position(tag, at_us);
     } else if (sends_records(tag) && is_over(SECOND_US, tag->status_us, at_us)) {
         send_status(tag, at_us);
     } else if (sends_records(tag) && tag->has_fix &&
@@ -430,7 +430,7 @@ static void estimate(struct tag *tag)
             tag->status.fixes++;
             fill_fix(tag, one, outcome == START_FIX);
             if ((tag->settings->sleep_ms == 0u) && fix_is_due(&tag->fix, tag->settings->rate_hz, &tag->slot)) {
-                tell(tag, now_us(tag));
+                say_position(tag, now_us(tag));
             }
         } else {
             tag->reason = reason_of(outcome);
@@ -482,7 +482,7 @@ static void sleep_now(struct tag *tag, uint32_t at_us)
         rest(tag);
     }
     tag->fix.reason = tag->has_fix ? 0u : tag->reason;
-    tell(tag, at_us);
+    say_position(tag, at_us);
     if (sends_records(tag)) {
         send_status(tag, at_us);
     }
@@ -504,7 +504,7 @@ static void sleep_now(struct tag *tag, uint32_t at_us)
     tag->had_fix = tag->has_fix;
     tag->has_fix = false;
     tag->awake_since_us = now_us(tag);
-    tag->told_us = tag->awake_since_us;
+    tag->said_us = tag->awake_since_us;
     tag->status_us = tag->awake_since_us;
     tag->has_host = false;
     if ((tag->settings->predicts != 0u) && tag->had_fix && (tag->schedule.count >= LEAST_EXPECTED)) {
@@ -519,7 +519,6 @@ void tag_begin(struct tag *tag, const struct hardware *hardware, const struct se
 {
     float limit_m = (settings->alert_limit_m > 0.0f) ? settings->alert_limit_m : __builtin_nanf("");
     bool has_bounds = settings->has_bounds != 0u;
-
     int64_t unix_us = tag->unix_us;
     uint32_t unix_at_us = tag->unix_at_us;
 
@@ -538,7 +537,7 @@ void tag_begin(struct tag *tag, const struct hardware *hardware, const struct se
     tag->fix.reason = tag->reason;
     tag->slot = NOT_SENT;
     tag->awake_since_us = now_us(tag);
-    tag->told_us = tag->awake_since_us;
+    tag->said_us = tag->awake_since_us;
     tag->fixed_us = tag->awake_since_us;
     tag->status_us = tag->awake_since_us;
     schedule_forget(&tag->schedule);

@@ -51,9 +51,9 @@ class TagWorld:
         self._world, self._said, self._jump_ppm = world, said, jump_ppm
         first = len(world.medium.boots) - tags
         self.tags = [self._tag(index, first + index, make_board) for index in range(tags)]
-        told, timeline = Writer().set_tag_config(settings, keep=True), world.medium.timeline
+        record, timeline = Writer().set_tag_config(settings, keep=True), world.medium.timeline
         for tag in self.tags:
-            timeline.at(from_seconds(_STARTED_S), partial(tag.board.receive, told))
+            timeline.at(from_seconds(_STARTED_S), partial(tag.board.receive, record))
 
     def _tag(self, index: int, node: int, make_board: MakeBoard) -> TagBoard:
         medium = self._world.medium

@@ -37,7 +37,7 @@ def board(asked: BoardOptions, output: JsonOptions) -> None:
     """Emulate a board with a UWB radio on a pseudo-terminal, until Ctrl-C, to try programs without hardware.
 
     The board is one node of the emulated air. Programs open it as they would open a real one:
-    skyless tag tag1 --radio serial:PATH. A tag's computes by itself where it is told to (skyless flash-config, or
+    skyless tag tag1 --radio serial:PATH. A tag's computes by itself where its settings say so (skyless flash-config, or
     skyless tag --from-board), until it is ended, and says records alone.
     """
     name, wire = asked.name, asked.wire

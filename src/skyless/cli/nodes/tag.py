@@ -44,7 +44,7 @@ _OF_BOARDS: Final = (
     *("method", "qa", "dynamics", "tag_height_std", "site_id", "site_key", "trust", "clock_bound_ms"),
     *("integrity_risk", "alert_limit_m", "max_acceleration_mps2"),
 )
-"""What the program of a board that computes is not told here."""
+"""Options of the filter, which a board that computes has in its own settings."""
 
 app = App(name="tag", help_epilogue="Example: skyless tag tag1 --print")
 

@@ -37,7 +37,7 @@ struct hardware {
     /* Switch the lights. */
     void (*show)(uint32_t lights);
     /* Sleep with everything off but RAM; `now_us` goes on. Lines to be sent are sent before, what comes is lost, and a
-     * chip that is to sleep was told so before. */
+     * chip that is to sleep does so already. */
     void (*sleep_for)(uint32_t milliseconds);
     /* The KEPT_BYTES that were written last; false where there are none. */
     bool (*read_settings)(uint8_t *into);

@@ -1,4 +1,4 @@
-"""What a tag on a board is told once, to the byte: kept in its flash, and sent over the serial link.
+"""How a tag on a board works, to the byte: kept in its flash, and sent over the serial link.
 
 The board's end is ``firmware/source/settings.c``, with the same names; a test compares both.
 """

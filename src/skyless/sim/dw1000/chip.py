@@ -161,7 +161,7 @@ class Chip:
         self.arrivals: Counter[str] = Counter()
         """What became of the frames that reached the antenna."""
         self.on_wake: Callable[[], None] = lambda: None
-        """Called when it wakes: the counter begins anew, and the crystal may have another rate; both are the air's."""
+        """Called when it wakes: the counter begins again, and the crystal may have another rate; both are the air's."""
         self._air, self._rx_delay_ticks, self._seconds = air, rx_delay_ticks, seconds
         self._begin_s, self._slept_s = seconds(), 0.0
         self._asleep_since_s: float | None = None
